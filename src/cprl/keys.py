@@ -1,0 +1,52 @@
+"""Every TensorDict entry that the rooms of cprl hand on: its name, shape, type and meaning.
+
+Axes, the same letters everywhere: B worlds, N agents, H x W the board, K sites, T time, A actions,
+R replicas, X rows and Y columns of an agent's window (its own row included, farthest row first).
+"""
+
+from typing import Final
+
+AGENTS: Final = "agents"
+"""The group of agents, a nested TensorDict of batch size [B, N]."""
+
+OBSERVATION: Final = (AGENTS, "observation")
+"""uint8 [B, N, 3, X, Y]: the RGB window that an agent sees, 0..255."""
+
+ACTION: Final = (AGENTS, "action")
+"""int64 [B, N]: what an agent does, an index into `cprl.commons.rules.ACTIONS`."""
+
+REWARD: Final = (AGENTS, "reward")
+"""float32 [B, N, 1]: what the learner is paid for the turn."""
+
+HARVEST: Final = (AGENTS, "harvest")
+"""float32 [B, N]: apples bitten this turn; rewards may be changed by an institution, this never is."""
+
+IN_PLAY: Final = (AGENTS, "in_play")
+"""bool [B, N]: the action of this very entry will count. Sum it at the root, not at "next"."""
+
+FIRED: Final = (AGENTS, "fired")
+"""bool [B, N]: who fired the beam this turn."""
+
+HIT_BY: Final = (AGENTS, "hit_by")
+"""bool [B, N, N]: row, whose cell a beam crossed this turn; column, whose beam it was."""
+
+TAGGED_BY: Final = (AGENTS, "tagged_by")
+"""bool [B, N, N]: row, who was tagged out this turn; column, by whom."""
+
+STOCK: Final = "stock"
+"""int64 [B, 1]: apples on the board."""
+
+REGROWN: Final = "regrown"
+"""int64 [B, 1]: apples grown this turn."""
+
+STATE: Final = "state"
+"""uint8 [B, 3, H, W]: the whole board as RGB, only where it was asked for."""
+
+DONE: Final = "done"
+"""bool [B, 1]: the episode is over, `terminated` or `truncated`. At the root only."""
+
+TERMINATED: Final = "terminated"
+"""bool [B, 1]: no apple is left and none can come."""
+
+TRUNCATED: Final = "truncated"
+"""bool [B, 1]: the clock ran out."""
