@@ -1,0 +1,22 @@
+"""cprl: common-pool resources and multi-agent reinforcement learning, as a modular TorchRL pipeline.
+
+The rooms, in the order in which the data flow:
+    keys        every TensorDict entry that is handed on
+    commons     the game: maps, rules, turns; numpy and numba alone
+    envs        doors into it: CommonsEnv for TorchRL
+    acting      from seeing to doing: networks, policies, evaluation
+    learning    from what happened to better values: settings, losses, the learner
+    measuring   from what happened to what it meant: social metrics, episodes
+    recording   what is kept: runs, tables, the Rerun recording, figures
+    presets     the published games and learners by name
+    train       the loop: act, store, learn, measure, record
+"""
+
+from cprl import presets
+from cprl.commons import maps
+from cprl.commons.game import Game
+from cprl.commons.maps import Map
+from cprl.commons.rules import Rules
+from cprl.envs import CommonsEnv
+
+__all__ = ["CommonsEnv", "Game", "Map", "Rules", "maps", "presets"]

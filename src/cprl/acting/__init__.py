@@ -1,0 +1,1 @@
+"""From seeing to doing."""

@@ -1,0 +1,1 @@
+"""The game: numpy and numba; knows nothing of torch or of learning."""

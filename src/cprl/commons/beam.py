@@ -1,0 +1,81 @@
+"""The beam: what it covers, whom it hits, and who is out of play for it. All on ONE world."""
+
+from cprl.commons.game import WALL, Tables
+from cprl.commons.moves import cell_of
+from cprl.commons.world import COL_STEP, ROW_STEP, Bools, Worlds
+
+
+def beam_cell(world: Worlds, tables: Tables, shooter: int, ahead: int, side: int) -> int:
+    """The cell so far ahead of a shooter and so far to its right."""
+    heading = world.heading[shooter]
+    right = (heading + 1) % 4
+    row = world.row[shooter] + ahead * ROW_STEP[heading] + side * ROW_STEP[right]
+    col = world.col[shooter] + ahead * COL_STEP[heading] + side * COL_STEP[right]
+    return cell_of(row, col, tables)
+
+
+def beam_reach(world: Worlds, tables: Tables, shooter: int, side: int) -> int:
+    """How many cells the beam's column at this side covers, each column up to its own wall."""
+    reach = 0
+    while (
+        reach < tables.beam_length[world.heading[shooter]]
+        and tables.background[beam_cell(world, tables, shooter, reach + 1, side)] != tables.paints[WALL]
+    ):
+        reach += 1
+    return reach
+
+
+def is_hit(world: Worlds, tables: Tables, target: int, shooter: int) -> bool:
+    """Whether the shooter's beam covers the target's cell."""
+    heading = world.heading[shooter]
+    right = (heading + 1) % 4
+    rows = world.row[target] - world.row[shooter]
+    cols = world.col[target] - world.col[shooter]
+    ahead = rows * ROW_STEP[heading] + cols * COL_STEP[heading]
+    side = rows * ROW_STEP[right] + cols * COL_STEP[right]
+    return (
+        ahead >= 1
+        and ahead <= tables.beam_length[heading]
+        and abs(side) <= tables.beam_half_width
+        and ahead <= beam_reach(world, tables, shooter, side)
+    )
+
+
+def find_hits(world: Worlds, tables: Tables, hit_by: Bools) -> None:
+    """Who in play is hit by whom, on the cells after clashes; `hit_by`: bool [N, N], row hit."""
+    agents = world.row.shape[0]
+    for i in range(agents):
+        for j in range(agents):
+            hit_by[i, j] = world.fired[j] and i != j and world.in_play[i] and is_hit(world, tables, i, j)
+
+
+def tag(world: Worlds, tables: Tables, hit_by: Bools, tagged_by: Bools) -> None:
+    """Hits are counted, one a turn; whoever has taken `hits_to_tag` goes out of play; [N, N] each."""
+    agents = world.row.shape[0]
+    for i in range(agents):
+        freeze = -1
+        for j in range(agents):
+            tagged_by[i, j] = False
+            if hit_by[i, j]:
+                offence = min(world.offences[i], tables.freeze.shape[1] - 1)
+                freeze = max(freeze, tables.freeze[j, offence])
+        if freeze < 0:
+            continue
+        world.hits[i] += 1
+        if world.hits[i] >= tables.hits_to_tag:
+            for j in range(agents):
+                tagged_by[i, j] = hit_by[i, j]
+            put_out(world, tables, i, freeze)
+
+
+def put_out(world: Worlds, tables: Tables, i: int, freeze: int) -> None:
+    """Agent i is out of play from now on, for so many turns."""
+    world.in_play[i] = False
+    world.hits[i] = 0
+    world.offences[i] += 1
+    world.tagged_step[i] = world.step[0]
+    world.out_steps[i] = max(0, freeze - 1) if tables.freeze_counts_tag_turn else freeze
+
+
+FUNCTIONS = (beam_cell, beam_reach, is_hit, find_hits, put_out, tag)
+"""In the order in which they call each other, as `batch.py` compiles them."""

@@ -1,0 +1,48 @@
+"""Counter-based random numbers: what happens by chance is a function of where and when, nothing else.
+
+Philox4x32-10 (Salmon, Moraes, Dror and Shaw, "Parallel random numbers: as easy as 1, 2, 3", SC 2011).
+The key is the seed, the counter says which number is wanted: purpose and site, step, episode, world.
+So a world plays the same game in any batch, on any number of threads and on any device.
+"""
+
+import numpy as np
+
+MULTIPLIER_0 = np.uint64(0xD2511F53)
+MULTIPLIER_1 = np.uint64(0xCD9E8D57)
+KEY_STEP_0 = np.uint64(0x9E3779B9)
+KEY_STEP_1 = np.uint64(0xBB67AE85)
+LOW_WORD = np.uint64(0xFFFFFFFF)
+WORD_BITS = np.uint64(32)
+ROUNDS = 10
+
+LOW_BYTE = 0xFF
+BYTE_BITS = 8
+REST_BITS = 24
+SITES_PER_DRAW = 16
+"""Sites that share one draw for the first bytes of their random words."""
+
+REGROWTH_FIRST_BYTE = 0 << 28
+REGROWTH_REST = 1 << 28
+"""What a draw is for stands in the upper four bits of the first counter word, the draw's number below."""
+
+
+def philox4x32(
+    c0: np.uint64, c1: np.uint64, c2: np.uint64, c3: np.uint64, k0: np.uint64, k1: np.uint64
+) -> tuple[np.uint64, np.uint64, np.uint64, np.uint64]:
+    """Four uniform 32-bit words for a counter of four words and a key of two.
+
+    Words are held in uint64: no product overflows, so plain Python (the CUDA simulator) computes the same.
+    """
+    for _ in range(ROUNDS):
+        p0 = MULTIPLIER_0 * c0
+        p1 = MULTIPLIER_1 * c2
+        c0, c1 = (p1 >> WORD_BITS) ^ c1 ^ k0, p1 & LOW_WORD
+        c2, c3 = (p0 >> WORD_BITS) ^ c3 ^ k1, p0 & LOW_WORD
+        k0 = (k0 + KEY_STEP_0) & LOW_WORD
+        k1 = (k1 + KEY_STEP_1) & LOW_WORD
+    return c0, c1, c2, c3
+
+
+def threshold(probability: float) -> int:
+    """The number that a uniform 32-bit word falls below with this probability, to within 2**-33."""
+    return round(probability * 2**32)

@@ -1,0 +1,68 @@
+"""The rules, compiled: one source, each function rebuilt for the target that is to run it."""
+
+import hashlib
+import os
+from collections.abc import Callable, Iterable
+from functools import cache
+from pathlib import Path
+from types import FunctionType
+from typing import Any
+
+import numba
+from numba.core import config
+
+from cprl.commons.drivers import CALLED_FROM_PYTHON, FUNCTIONS
+
+numba_settings: Any = config
+Compiled = dict[str, Callable[..., Any]]
+
+
+def compiled(functions: Iterable[Any], jit: Callable[[FunctionType], Callable[..., Any]]) -> Compiled:
+    """Each plain function rebuilt so that it calls the compiled ones before it, by name.
+
+    One source of the rules for every target: `jit` says which.
+    """
+    ready: Compiled = {}
+    for function in functions:
+        known = {**function.__globals__, **ready}
+        ready[function.__name__] = jit(FunctionType(function.__code__, known, function.__name__))
+    return ready
+
+
+def _jit_for_cpu(function: FunctionType) -> Callable[..., Any]:
+    """Numba for a CPU thread. `_nrt=False` refuses any allocation inside a rule, and spares the counting
+    of references to the many arrays handed on, which would take fifty times as long as the game."""
+    options: dict[str, Any] = {"nogil": True, "error_model": "numpy", "_nrt": False}
+    if function.__name__ in CALLED_FROM_PYTHON:
+        options |= {"cache": True}
+    else:
+        options |= {"forceinline": True, "no_cpython_wrapper": True, "no_cfunc_wrapper": True}
+    return numba.njit(**options)(function)
+
+
+@cache
+def rules_for_cpu() -> Compiled:
+    """The rules compiled for CPU threads: ten seconds the first time, then kept on disk.
+
+    Numba's own cache looks only at the file of the function called, and would miss a change in a rule that
+    it calls; so the folder is named after the text of all rules.
+    """
+    usual = numba_settings.CACHE_DIR
+    numba_settings.CACHE_DIR = str(_cache_folder() / _fingerprint())
+    try:
+        return compiled(FUNCTIONS, _jit_for_cpu)
+    finally:
+        numba_settings.CACHE_DIR = usual
+
+
+def _cache_folder() -> Path:
+    """$CPRL_CACHE, or cprl in the user's cache folder."""
+    if "CPRL_CACHE" in os.environ:
+        return Path(os.environ["CPRL_CACHE"])
+    return Path(os.environ.get("XDG_CACHE_HOME", Path.home() / ".cache")) / "cprl"
+
+
+def _fingerprint() -> str:
+    """A name for this text of the rules."""
+    sources = sorted(path for path in Path(__file__).parent.glob("*.py"))
+    return hashlib.sha256(b"".join(path.read_bytes() for path in sources)).hexdigest()[:16]

@@ -1,0 +1,134 @@
+"""The loops over worlds that a thread runs; the rules themselves know ONE world."""
+
+from cprl.commons import turn
+from cprl.commons.game import Tables
+from cprl.commons.turn import begin_episode, play_turn
+from cprl.commons.views import draw_board
+from cprl.commons.world import Actions, Bools, Bytes, Scratch, Told, Worlds
+
+
+def one_world(w: Worlds, b: int) -> Worlds:
+    """World b without the axis B, sharing memory."""
+    return Worlds(
+        w.seed[b],
+        w.number[b],
+        w.stock[b],
+        w.stock_before[b],
+        w.near[b],
+        w.stock_left[b],
+        w.row[b],
+        w.col[b],
+        w.heading[b],
+        w.out_steps[b],
+        w.in_play[b],
+        w.on_board[b],
+        w.fired[b],
+        w.hits[b],
+        w.tagged_step[b],
+        w.offences[b],
+        w.step[b],
+        w.episode[b],
+        w.ended[b],
+    )
+
+
+def one_told(t: Told, b: int) -> Told:
+    """What is told of world b, without the axis B, sharing memory."""
+    return Told(
+        t.observation[b],
+        t.harvest[b],
+        t.in_play[b],
+        t.fired[b],
+        t.hit_by[b],
+        t.tagged_by[b],
+        t.stock[b],
+        t.regrown[b],
+        t.terminated[b],
+        t.truncated[b],
+        t.done[b],
+    )
+
+
+def one_scratch(s: Scratch, thread: int) -> Scratch:
+    """The sheet of one thread."""
+    return Scratch(
+        s.start_row[thread],
+        s.start_col[thread],
+        s.blocked[thread],
+        s.words[thread],
+        s.sprouts[thread],
+        s.picture[thread],
+        s.seen[thread],
+    )
+
+
+def play_worlds(
+    worlds: Worlds,
+    tables: Tables,
+    actions: Actions,
+    told: Told,
+    scratch: Scratch,
+    first: int,
+    last: int,
+    thread: int,
+) -> None:
+    """One turn of the worlds first .. last - 1; `actions`: int64 [B, N]."""
+    sheet = one_scratch(scratch, thread)
+    for b in range(first, last):
+        play_turn(one_world(worlds, b), tables, actions[b], one_told(told, b), sheet)
+
+
+def begin_worlds(
+    worlds: Worlds,
+    tables: Tables,
+    which: Bools,
+    told: Told,
+    scratch: Scratch,
+    first: int,
+    last: int,
+    thread: int,
+) -> None:
+    """The next episode of those of the worlds first .. last - 1 that are marked; `which`: bool [B]."""
+    sheet = one_scratch(scratch, thread)
+    for b in range(first, last):
+        if which[b]:
+            begin_episode(one_world(worlds, b), tables, one_told(told, b), sheet)
+
+
+def show_worlds(
+    worlds: Worlds,
+    tables: Tables,
+    boards: Bytes,
+    told: Told,
+    scratch: Scratch,
+    first: int,
+    last: int,
+    thread: int,
+) -> None:
+    """The whole boards of the worlds first .. last - 1; `boards`: uint8 [B, H, W], colour classes."""
+    sheet = one_scratch(scratch, thread)
+    for b in range(first, last):
+        draw_board(one_world(worlds, b), tables, sheet, boards[b])
+
+
+def first_unknown(actions: Actions, known: int) -> int:
+    """The index of the first action outside 0 .. known - 1, or -1; `actions`: int64 [count]."""
+    for n in range(actions.shape[0]):
+        if actions[n] < 0 or actions[n] >= known:
+            return n
+    return -1
+
+
+FUNCTIONS = (
+    *turn.FUNCTIONS,
+    one_world,
+    one_told,
+    one_scratch,
+    play_worlds,
+    begin_worlds,
+    show_worlds,
+    first_unknown,
+)
+"""All rules and loops in the order in which they call each other."""
+
+CALLED_FROM_PYTHON = ("play_worlds", "begin_worlds", "show_worlds", "first_unknown")

@@ -1,0 +1,184 @@
+"""Turning, walking, and what happens when several agents want one cell. All on ONE world."""
+
+from cprl.commons.game import WALL, Tables
+from cprl.commons.world import COL_STEP, ROW_STEP, Actions, Scratch, Worlds
+
+WALK_TURN = (0, 2, 3, 1)
+"""Quarter turns from the heading to the walk: forward, backward, left, right."""
+
+TURN_LEFT, TURN_RIGHT, FIRE = 4, 5, 6
+
+
+def cell_of(row: int, col: int, tables: Tables) -> int:
+    """The index of a cell in the tables and in the picture."""
+    return (row + tables.rim) * tables.stride + col + tables.rim
+
+
+def is_wall(row: int, col: int, tables: Tables) -> bool:
+    """Whether a cell is a wall; everything outside the board is."""
+    return tables.background[cell_of(row, col, tables)] == tables.paints[WALL]
+
+
+def act(world: Worlds, tables: Tables, actions: Actions, scratch: Scratch) -> None:
+    """Everyone in play turns, fires or steps onto the cell it wants; whose step clashes is settled later.
+
+    `actions`: int64 [N]. Nobody steps onto a wall or off the board.
+    """
+    for i in range(world.row.shape[0]):
+        scratch.start_row[i] = world.row[i]
+        scratch.start_col[i] = world.col[i]
+        world.fired[i] = False
+        if not world.in_play[i]:
+            continue
+        action = actions[i]
+        if action < TURN_LEFT:
+            walk(world, tables, i, (world.heading[i] + WALK_TURN[action]) % 4)
+        elif action == TURN_LEFT:
+            world.heading[i] = (world.heading[i] + 3) % 4
+        elif action == TURN_RIGHT:
+            world.heading[i] = (world.heading[i] + 1) % 4
+        elif action == FIRE and tables.has_beam:
+            world.fired[i] = tables.may_fire[i]
+
+
+def walk(world: Worlds, tables: Tables, i: int, direction: int) -> None:
+    """Agent i goes one cell in a direction, unless there is a wall."""
+    row = world.row[i] + ROW_STEP[direction]
+    col = world.col[i] + COL_STEP[direction]
+    if not is_wall(row, col, tables):
+        world.row[i] = row
+        world.col[i] = col
+
+
+def go_back(world: Worlds, scratch: Scratch, i: int) -> None:
+    """Agent i returns to where it began the turn."""
+    world.row[i] = scratch.start_row[i]
+    world.col[i] = scratch.start_col[i]
+
+
+def has_moved(world: Worlds, scratch: Scratch, i: int) -> bool:
+    """Whether agent i stands elsewhere than where it began the turn."""
+    return world.row[i] != scratch.start_row[i] or world.col[i] != scratch.start_col[i]
+
+
+def share_a_cell(world: Worlds, i: int, j: int) -> bool:
+    """Whether two agents stand on one cell."""
+    return world.row[i] == world.row[j] and world.col[i] == world.col[j]
+
+
+def have_swapped(world: Worlds, scratch: Scratch, i: int, j: int) -> bool:
+    """Whether each of two agents stands where the other began the turn."""
+    return (
+        world.row[i] == scratch.start_row[j]
+        and world.col[i] == scratch.start_col[j]
+        and world.row[j] == scratch.start_row[i]
+        and world.col[j] == scratch.start_col[i]
+    )
+
+
+def clash(world: Worlds, scratch: Scratch, i: int, j: int) -> bool:
+    """Whether two agents in play got in each other's way."""
+    return share_a_cell(world, i, j) or have_swapped(world, scratch, i, j)
+
+
+def settle_clashes(world: Worlds, scratch: Scratch) -> None:
+    """All who moved into a clash go back, all at once, again and again until nobody clashes.
+
+    Who went back keeps its cell, which may cancel the move of another: no number matters (DESIGN 3).
+    """
+    unsettled = True
+    while unsettled:
+        unsettled = False
+        for i in range(world.row.shape[0]):
+            scratch.blocked[i] = (
+                world.in_play[i] and has_moved(world, scratch, i) and is_in_a_clash(world, scratch, i)
+            )
+            unsettled = unsettled or scratch.blocked[i]
+        for i in range(world.row.shape[0]):
+            if scratch.blocked[i]:
+                go_back(world, scratch, i)
+
+
+def is_in_a_clash(world: Worlds, scratch: Scratch, i: int) -> bool:
+    """Whether agent i clashes with anybody in play."""
+    for j in range(world.row.shape[0]):
+        if j != i and world.in_play[j] and clash(world, scratch, i, j):
+            return True
+    return False
+
+
+def settle_pairwise(world: Worlds, scratch: Scratch) -> None:
+    """[run] Pair by pair in the order of numbers, both who clash go back, even onto a third."""
+    for i in range(world.row.shape[0]):
+        for j in range(i + 1, world.row.shape[0]):
+            if world.in_play[i] and world.in_play[j] and clash(world, scratch, i, j):
+                go_back(world, scratch, i)
+                go_back(world, scratch, j)
+
+
+def count_down(world: Worlds) -> None:
+    """Everyone out of play misses this turn."""
+    for i in range(world.row.shape[0]):
+        if world.out_steps[i] > 0:
+            world.out_steps[i] -= 1
+
+
+def return_to_play(world: Worlds, tables: Tables, scratch: Scratch) -> None:
+    """Those who have served their time act from the coming turn on, if their cell is free.
+
+    Several waiting for one cell return in the order in which they were tagged; under `pairwise_clashes`
+    nobody waits.
+    """
+    for i in range(world.row.shape[0]):
+        scratch.blocked[i] = not tables.pairwise_clashes and has_to_wait(world, i)
+    for i in range(world.row.shape[0]):
+        if world.out_steps[i] == 0 and not scratch.blocked[i]:
+            world.in_play[i] = True
+
+
+def has_to_wait(world: Worlds, i: int) -> bool:
+    """Whether agent i, out of play, finds its cell taken or another before it in the line."""
+    if world.in_play[i]:
+        return False
+    for j in range(world.row.shape[0]):
+        if j != i and share_a_cell(world, i, j):
+            first_in_line = world.out_steps[j] == 0 and world.tagged_step[j] < world.tagged_step[i]
+            if world.in_play[j] or first_in_line:
+                return True
+    return False
+
+
+def put_at_start(world: Worlds, tables: Tables) -> None:
+    """Everybody in play, where and as the map says."""
+    for i in range(world.row.shape[0]):
+        world.row[i] = tables.start_row[i]
+        world.col[i] = tables.start_col[i]
+        world.heading[i] = tables.start_heading[i]
+        world.out_steps[i] = 0
+        world.in_play[i] = True
+        world.on_board[i] = True
+        world.fired[i] = False
+        world.hits[i] = 0
+        world.tagged_step[i] = 0
+        world.offences[i] = 0
+
+
+FUNCTIONS = (
+    cell_of,
+    is_wall,
+    walk,
+    act,
+    go_back,
+    has_moved,
+    share_a_cell,
+    have_swapped,
+    clash,
+    is_in_a_clash,
+    settle_clashes,
+    settle_pairwise,
+    count_down,
+    has_to_wait,
+    return_to_play,
+    put_at_start,
+)
+"""In the order in which they call each other, as `batch.py` compiles them."""

@@ -1,0 +1,115 @@
+"""The order of a turn, on ONE world."""
+
+from cprl.commons import apples, beam, chance, moves, views
+from cprl.commons.apples import bite, fill, find_sprouts, grow
+from cprl.commons.beam import find_hits, tag
+from cprl.commons.game import Tables
+from cprl.commons.moves import (
+    act,
+    count_down,
+    put_at_start,
+    return_to_play,
+    settle_clashes,
+    settle_pairwise,
+)
+from cprl.commons.views import draw_windows
+from cprl.commons.world import PLAYING, TERMINATED, TRUNCATED, Actions, Scratch, Told, Worlds
+
+
+def play_turn(world: Worlds, tables: Tables, actions: Actions, told: Told, scratch: Scratch) -> None:
+    """One turn; `actions`: int64 [N]. A world that has ended stays as it is and pays nothing."""
+    if world.ended[0] != PLAYING:
+        tell_nothing_happened(told)
+        tell_state(world, tables, told, scratch)
+        return
+    began_empty = world.stock_left[0] == 0
+    keep_old_stock(world, tables)
+    world.step[0] += 1
+    count_down(world)
+    act(world, tables, actions, scratch)
+    if tables.pairwise_clashes:
+        settle_pairwise(world, scratch)
+    else:
+        settle_clashes(world, scratch)
+    sprouts = find_sprouts(world, tables, scratch)
+    if tables.regrow_before_bites:
+        grow(world, tables, scratch, sprouts)
+        bite(world, tables, told.harvest)
+    else:
+        bite(world, tables, told.harvest)
+        grow(world, tables, scratch, sprouts)
+    told.regrown[0] = sprouts
+    find_hits(world, tables, told.hit_by)
+    tag(world, tables, told.hit_by, told.tagged_by)
+    judge_the_end(world, tables, began_empty)
+    for i in range(world.row.shape[0]):
+        told.fired[i] = world.fired[i]
+        world.on_board[i] = world.in_play[i]
+    return_to_play(world, tables, scratch)
+    tell_state(world, tables, told, scratch)
+
+
+def begin_episode(world: Worlds, tables: Tables, told: Told, scratch: Scratch) -> None:
+    """The next episode of a world: full stock, everybody at the start."""
+    world.episode[0] += 1
+    world.step[0] = 0
+    world.ended[0] = PLAYING
+    fill(world, tables)
+    put_at_start(world, tables)
+    tell_nothing_happened(told)
+    tell_state(world, tables, told, scratch)
+
+
+def keep_old_stock(world: Worlds, tables: Tables) -> None:
+    """Remembers the stock as the turn begins, where the picture will show it."""
+    if tables.picture_shows_old_stock:
+        for k in range(world.stock.shape[0]):
+            world.stock_before[k] = world.stock[k]
+
+
+def judge_the_end(world: Worlds, tables: Tables, began_empty: bool) -> None:
+    """TERMINATED if no apple is left and none can come, else TRUNCATED if the clock ran out."""
+    is_empty = began_empty if tables.ends_one_turn_late else world.stock_left[0] == 0
+    if is_empty and tables.never_from_nothing:
+        world.ended[0] = TERMINATED
+    elif world.step[0] >= tables.episode_steps:
+        world.ended[0] = TRUNCATED
+
+
+def tell_nothing_happened(told: Told) -> None:
+    """A turn without harvest, shots, hits and growth."""
+    agents = told.harvest.shape[0]
+    for i in range(agents):
+        told.harvest[i] = 0.0
+        told.fired[i] = False
+        for j in range(agents):
+            told.hit_by[i, j] = False
+            told.tagged_by[i, j] = False
+    told.regrown[0] = 0
+
+
+def tell_state(world: Worlds, tables: Tables, told: Told, scratch: Scratch) -> None:
+    """How the world stands now, and what everybody sees of it."""
+    for i in range(world.row.shape[0]):
+        told.in_play[i] = world.in_play[i]
+    told.stock[0] = world.stock_left[0]
+    told.terminated[0] = world.ended[0] == TERMINATED
+    told.truncated[0] = world.ended[0] == TRUNCATED
+    told.done[0] = world.ended[0] != PLAYING
+    draw_windows(world, tables, scratch, told.observation)
+
+
+FUNCTIONS = (
+    chance.philox4x32,
+    *moves.FUNCTIONS,
+    *beam.FUNCTIONS,
+    *apples.FUNCTIONS,
+    *views.FUNCTIONS,
+    keep_old_stock,
+    judge_the_end,
+    tell_nothing_happened,
+    tell_state,
+    play_turn,
+    begin_episode,
+)
+"""All rules in the order in which they call each other, as `batch.py` compiles them."""

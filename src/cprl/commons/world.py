@@ -1,0 +1,173 @@
+"""What changes in an episode, B games at once, and what the rules hand out and borrow each turn.
+
+The rules are written for ONE world: they get these same tuples with the axis B taken off.
+"""
+
+from typing import Any, NamedTuple, TypeAlias
+
+import numpy as np
+from numpy.typing import NDArray
+
+from cprl.commons.chance import SITES_PER_DRAW
+
+Ints: TypeAlias = NDArray[np.int32]
+Bytes: TypeAlias = NDArray[np.uint8]
+Bools: TypeAlias = NDArray[np.bool_]
+Actions: TypeAlias = NDArray[np.int64]
+Words: TypeAlias = NDArray[np.uint64]
+
+PLAYING, TERMINATED, TRUNCATED = 0, 1, 2
+"""How a world stands: its episode goes on, no apple is left and none can come, the clock ran out."""
+
+UP, RIGHT, DOWN, LEFT = 0, 1, 2, 3
+"""Headings; one more is a quarter turn to the right."""
+
+ROW_STEP = (-1, 0, 1, 0)
+COL_STEP = (0, 1, 0, -1)
+"""One cell ahead, by heading."""
+
+
+class Worlds(NamedTuple):
+    """The state of B worlds; int32 where nothing else is said."""
+
+    seed: Words
+    """uint64 [B, 1], what all chance of a world follows from, together with its number, episode and step."""
+    number: Words
+    """uint64 [B, 1], which world of that seed this is; below 2**32."""
+    stock: Bytes
+    """uint8 [B, K], 1 where an apple hangs."""
+    stock_before: Bytes
+    """uint8 [B, K], the stock as the turn began; kept only under `picture_shows_old_stock`."""
+    near: Ints
+    """[B, K], apples within reach of each site; follows from `stock`."""
+    stock_left: Ints
+    """[B, 1], the sum of `stock`."""
+    row: Ints
+    """[B, N], 0 at the upper edge."""
+    col: Ints
+    """[B, N], 0 at the left edge."""
+    heading: Ints
+    """[B, N], 0 up, 1 right, 2 down, 3 left."""
+    out_steps: Ints
+    """[B, N], turns still to miss."""
+    in_play: Bools
+    """[B, N], who acts in the coming turn."""
+    on_board: Bools
+    """[B, N], who was in play when the last picture was taken."""
+    fired: Bools
+    """[B, N], who fired in the last turn."""
+    hits: Ints
+    """[B, N], hits taken since the last tag."""
+    tagged_step: Ints
+    """[B, N], the step at which an agent was last tagged out, 0 for never."""
+    offences: Ints
+    """[B, N], how often an agent was tagged out in this episode."""
+    step: Ints
+    """[B, 1], turns played in this episode."""
+    episode: Ints
+    """[B, 1], episodes begun since the seed was set, less one."""
+    ended: Ints
+    """[B, 1], PLAYING, TERMINATED or TRUNCATED."""
+
+
+class Told(NamedTuple):
+    """What a turn tells, written into arrays that the caller hands in (torch memory, as a rule)."""
+
+    observation: Bytes
+    """uint8 [B, N, 3, X, Y]."""
+    harvest: NDArray[np.float32]
+    """float32 [B, N]."""
+    in_play: Bools
+    """bool [B, N], who acts in the coming turn."""
+    fired: Bools
+    """bool [B, N]."""
+    hit_by: Bools
+    """bool [B, N, N], row hit, column shooter."""
+    tagged_by: Bools
+    """bool [B, N, N], row tagged out, column shooter."""
+    stock: NDArray[np.int64]
+    """int64 [B, 1]."""
+    regrown: NDArray[np.int64]
+    """int64 [B, 1]."""
+    terminated: Bools
+    """bool [B, 1]."""
+    truncated: Bools
+    """bool [B, 1]."""
+    done: Bools
+    """bool [B, 1]."""
+
+
+class Scratch(NamedTuple):
+    """Paper to write on during a turn, one sheet per thread: the rules allocate nothing."""
+
+    start_row: Ints
+    """[N], where each agent began the turn."""
+    start_col: Ints
+    """[N]."""
+    blocked: Bools
+    """[N], whose move is being cancelled."""
+    words: NDArray[np.int64]
+    """int64 [K / 4, rounded up to draws of 4], random words, four sites a word."""
+    sprouts: Ints
+    """[K], the sites that grow an apple this turn."""
+    picture: Ints
+    """[cells], the board and a rim of wall around it, as paints."""
+    seen: Ints
+    """[X * Y], the paints of the window being cut."""
+
+
+def empty_worlds(*, worlds: int, agents: int, sites: int) -> Worlds:
+    """Room for B worlds, all zero; `begin` makes an episode of it."""
+
+    def ints(*shape: int) -> Ints:
+        return np.zeros((worlds, *shape), np.int32)
+
+    def bools(*shape: int) -> Bools:
+        return np.zeros((worlds, *shape), np.bool_)
+
+    def bytes_(*shape: int) -> Bytes:
+        return np.zeros((worlds, *shape), np.uint8)
+
+    return Worlds(
+        seed=np.zeros((worlds, 1), np.uint64),
+        number=np.zeros((worlds, 1), np.uint64),
+        stock=bytes_(sites),
+        stock_before=bytes_(sites),
+        near=ints(sites),
+        stock_left=ints(1),
+        row=ints(agents),
+        col=ints(agents),
+        heading=ints(agents),
+        out_steps=ints(agents),
+        in_play=bools(agents),
+        on_board=bools(agents),
+        fired=bools(agents),
+        hits=ints(agents),
+        tagged_step=ints(agents),
+        offences=ints(agents),
+        step=ints(1),
+        episode=np.full((worlds, 1), -1, np.int32),
+        ended=ints(1),
+    )
+
+
+def empty_scratch(*, threads: int, agents: int, sites: int, cells: int, window: int) -> Scratch:
+    """A sheet for each thread."""
+
+    def ints(length: int) -> Ints:
+        return np.zeros((threads, length), np.int32)
+
+    return Scratch(
+        start_row=ints(agents),
+        start_col=ints(agents),
+        blocked=np.zeros((threads, agents), np.bool_),
+        words=np.zeros((threads, 4 * -(-sites // SITES_PER_DRAW)), np.int64),
+        sprouts=ints(sites),
+        picture=ints(cells),
+        seen=ints(window),
+    )
+
+
+def shapes(batch: NamedTuple) -> dict[str, tuple[Any, ...]]:
+    """The shape of each array by name, for error messages and tests."""
+    return {name: array.shape for name, array in batch._asdict().items()}

@@ -1,0 +1,175 @@
+"""CommonsEnv: B worlds of a commons as one TorchRL environment."""
+
+from typing import Any
+
+import torch
+from tensordict import TensorDict, TensorDictBase
+from torch import Tensor
+from torchrl.data import Binary, Bounded, Categorical, Composite, Unbounded
+from torchrl.envs import EnvBase
+
+from cprl import keys
+from cprl.commons.batch import Batch
+from cprl.commons.game import COLOURS, Game
+from cprl.commons.world import Told
+
+_AGENT_ENTRIES = ("observation", "harvest", "in_play", "fired", "hit_by", "tagged_by")
+_WORLD_ENTRIES = ("stock", "regrown")
+_DONE_ENTRIES = ("done", "terminated", "truncated")
+_OWN_KEYS = frozenset((*_WORLD_ENTRIES, *_DONE_ENTRIES, keys.STATE, keys.AGENTS, "next", "_reset"))
+_OWN_AGENT_KEYS = frozenset((*_AGENT_ENTRIES, "reward"))
+
+
+class CommonsEnv(EnvBase):
+    """B worlds of a game, batch size [B], all agents in the group "agents"; entries as in `cprl.keys`.
+
+    Dones are at the root only. A world that has ended and is stepped again stays as it is. Every step
+    writes into fresh tensors, so that a TensorDict kept from an earlier step never changes.
+
+    Args:
+        game: what is played, a `Map` and its `Rules`; see `presets.game`.
+        worlds: how many worlds B.
+        seed: what all chance follows from; `set_seed` starts all over.
+        device: only "cpu" so far.
+        threads: how many CPU threads share the worlds; None for all cores where it pays.
+        first_world: the number of the first world: `CommonsEnv(game, 1, first_world=b)` plays what world b
+            of a larger batch plays.
+        state: whether the whole board comes along as "state", uint8 [B, 3, H, W].
+
+    Raises:
+        ValueError: for numbers out of range, and, in `step`, for unknown actions; then nothing has changed.
+    """
+
+    batch_locked = True
+
+    def __init__(
+        self,
+        game: Game,
+        worlds: int = 1,
+        *,
+        seed: int = 0,
+        device: str | torch.device = "cpu",
+        threads: int | None = None,
+        first_world: int = 0,
+        state: bool = False,
+    ) -> None:
+        if torch.device(device).type != "cpu":
+            raise ValueError(f'device is "{device}"; so far the game runs on "cpu" only')
+        super().__init__(device=torch.device("cpu"), batch_size=torch.Size([worlds]))
+        self.game = game
+        self.batch = Batch(game, worlds, seed=seed, first_world=first_world, threads=threads)
+        self.group_map = {keys.AGENTS: list(game.agent_names)}
+        self._agents_size = torch.Size([worlds, game.agents])
+        self._with_state = state
+        self._colours = torch.tensor(COLOURS, dtype=torch.uint8)
+        self._tensors, self._told = self._fresh()
+        self._make_specs()
+
+    def _make_specs(self) -> None:
+        (worlds,), per_agent = self.batch_size, tuple(self._agents_size)
+        agents = self.game.agents
+
+        def flags(*shape: int) -> Binary:
+            return Binary(shape[-1], shape=shape, dtype=torch.bool)
+
+        def group(**specs: Any) -> Composite:
+            return Composite(agents=Composite(**specs, shape=per_agent), shape=(worlds,))
+
+        self.action_spec = group(
+            action=Categorical(len(self.game.actions), shape=per_agent, dtype=torch.int64)
+        )
+        self.reward_spec = group(reward=Unbounded(shape=(*per_agent, 1), dtype=torch.float32))
+        sites = len(self.game.map.sites)
+        observation_spec = group(
+            observation=Bounded(0, 255, shape=(*per_agent, *self.game.window_shape), dtype=torch.uint8),
+            harvest=Bounded(0, 1, shape=per_agent, dtype=torch.float32),
+            in_play=flags(*per_agent),
+            fired=flags(*per_agent),
+            hit_by=flags(*per_agent, agents),
+            tagged_by=flags(*per_agent, agents),
+        )
+        for name in _WORLD_ENTRIES:
+            observation_spec[name] = Bounded(0, sites, shape=(worlds, 1), dtype=torch.int64)
+        if self._with_state:
+            board = self.game.map.height, self.game.map.width
+            observation_spec[keys.STATE] = Bounded(0, 255, shape=(worlds, 3, *board), dtype=torch.uint8)
+        self.observation_spec = observation_spec
+        self.done_spec = Composite({name: flags(worlds, 1) for name in _DONE_ENTRIES}, shape=(worlds,))
+
+    def _fresh(self) -> tuple[dict[str, Tensor], Told]:
+        """New memory for what a turn tells: as tensors by name, and the same as arrays."""
+        worlds, agents = self._agents_size
+        tensors = {
+            "observation": torch.empty((worlds, agents, *self.game.window_shape), dtype=torch.uint8),
+            "harvest": torch.empty((worlds, agents), dtype=torch.float32),
+            "in_play": torch.empty((worlds, agents), dtype=torch.bool),
+            "fired": torch.empty((worlds, agents), dtype=torch.bool),
+            "hit_by": torch.empty((worlds, agents, agents), dtype=torch.bool),
+            "tagged_by": torch.empty((worlds, agents, agents), dtype=torch.bool),
+            "stock": torch.empty((worlds, 1), dtype=torch.int64),
+            "regrown": torch.empty((worlds, 1), dtype=torch.int64),
+            "terminated": torch.empty((worlds, 1), dtype=torch.bool),
+            "truncated": torch.empty((worlds, 1), dtype=torch.bool),
+            "done": torch.empty((worlds, 1), dtype=torch.bool),
+        }
+        return tensors, Told(**{name: tensor.numpy() for name, tensor in tensors.items()})
+
+    def _as_tensordict(self, tensors: dict[str, Tensor], reward: Tensor | None = None) -> TensorDict:
+        """The entries of one moment; without a reward as `reset` returns them."""
+        agents = {name: tensors[name] for name in _AGENT_ENTRIES}
+        if reward is not None:
+            agents["reward"] = reward
+        entries: dict[str, Any] = {name: tensors[name] for name in (*_WORLD_ENTRIES, *_DONE_ENTRIES)}
+        if self._with_state:
+            boards = torch.from_numpy(self.batch.boards(self._told))
+            entries[keys.STATE] = self._colours[boards.long()].permute(0, 3, 1, 2)
+        entries[keys.AGENTS] = TensorDict._new_unsafe(
+            agents, batch_size=self._agents_size, device=self.device
+        )
+        return TensorDict._new_unsafe(entries, batch_size=self.batch_size, device=self.device)
+
+    def _set_seed(self, seed: int | None) -> None:
+        if seed is None:
+            seed = int(torch.empty((), dtype=torch.int64).random_().item())
+        self.batch.set_seed(seed)
+
+    def _reset(self, tensordict: TensorDictBase | None = None, **kwargs: Any) -> TensorDict:
+        which = None if tensordict is None else tensordict.get("_reset", None)
+        return self._as_tensordict(self._begin(which))
+
+    def _begin(self, which: Tensor | None) -> dict[str, Tensor]:
+        """Begins the next episode of the marked worlds (bool [B, 1]; None for all), in fresh tensors."""
+        before = self._tensors
+        self._tensors, self._told = self._fresh()
+        if which is None:
+            self.batch.begin(self._told)
+        else:
+            for name, tensor in self._tensors.items():
+                tensor.copy_(before[name])
+            self.batch.begin(self._told, which.reshape(-1).numpy())
+        return self._tensors
+
+    def _step(self, tensordict: TensorDictBase) -> TensorDict:
+        actions = tensordict.get(keys.AGENTS).get("action").contiguous().numpy()
+        self.batch.check(actions)
+        self._tensors, self._told = self._fresh()
+        self.batch.play_checked(actions, self._told)
+        return self._as_tensordict(self._tensors, self._tensors["harvest"].unsqueeze(-1).clone())
+
+    def _step_and_maybe_reset(self, tensordict: TensorDictBase) -> tuple[TensorDictBase, TensorDictBase]:
+        """What `EnvBase` does here, without its searching for keys: a seventh of its time for one world.
+
+        A test holds it equal to `EnvBase._step_and_maybe_reset`, the entries of policies included.
+        """
+        if "next" in tensordict or "_step" in tensordict:
+            return super()._step_and_maybe_reset(tensordict)  # type: ignore[no-any-return]
+        following = self._step(tensordict)
+        tensordict._set_str("next", following, validated=True, inplace=False, non_blocking=False)
+        done = self._tensors["done"]
+        carried = self._as_tensordict(self._begin(done) if done.any() else self._tensors)
+        others = {name: value for name, value in tensordict.items() if name not in _OWN_KEYS}
+        carried._tensordict.update(others)
+        for name, value in tensordict.get(keys.AGENTS).items():
+            if name not in _OWN_AGENT_KEYS:
+                carried._tensordict[keys.AGENTS]._tensordict[name] = value
+        return tensordict, carried

@@ -1,0 +1,85 @@
+"""The published games and learners by name, as the study is written and as it was run.
+
+Every number is from [W] M. Wiatrak, "Governing the Commons with Multi-Agent Reinforcement Learning" (2019),
+its appendix A, and the parameters and behaviour of the program it was run with.
+"""
+
+from typing import Any, Final, Literal, get_args
+
+from cprl.commons import maps
+from cprl.commons.game import Game
+from cprl.commons.rules import Rules
+from cprl.learning.settings import DQNSettings
+
+Board = Literal["single_basic", "single_complex", "two_complex", "commons"]
+Variant = Literal["published", "as_run"]
+
+BOARDS: Final[tuple[Board, ...]] = get_args(Board)
+VARIANTS: Final[tuple[Variant, ...]] = get_args(Variant)
+
+TO_THE_EDGE_CELLS: Final = 7
+"""A beam of this length crosses all rows of `two_complex`."""
+
+_AS_RUN: Final[dict[str, Any]] = {
+    "hits_to_tag": 2,
+    "pairwise_clashes": True,
+    "regrow_before_bites": True,
+    "freeze_counts_tag_turn": True,
+    "ends_one_turn_late": True,
+    "picture_shows_old_stock": True,
+    "paint_over": True,
+    "mark_behind_if_vertical": True,
+    "self_paint_stays": True,
+}
+_BOARD_RULES: Final[dict[tuple[str, str], dict[str, Any]]] = {
+    ("single_basic", "published"): {"may_fire": False},
+    ("single_complex", "published"): {"may_fire": False},
+    ("two_complex", "published"): {},
+    ("commons", "published"): {"window_rows": 7, "window_columns": 15, "beam_length_cells": 6},
+    ("single_basic", "as_run"): {"window_rows": 5, "may_fire": False},
+    ("single_complex", "as_run"): {"window_rows": 5, "may_fire": False},
+    ("two_complex", "as_run"): {
+        "window_rows": 5,
+        "beam_length_cells": (TO_THE_EDGE_CELLS, 6, TO_THE_EDGE_CELLS, 7),
+    },
+    ("commons", "as_run"): {"window_rows": 7, "window_columns": 15, "beam_length_cells": 6},
+}
+
+
+def game(board: Board, *, variant: Variant = "published") -> Game:
+    """A published board with its rules: `published` as the study is written, `as_run` as its program plays.
+
+    Raises:
+        ValueError: for an unknown board or variant.
+    """
+    _check(board, variant)
+    quirks = _AS_RUN if variant == "as_run" else {}
+    return Game(map=maps.named(board), rules=Rules(**quirks, **_BOARD_RULES[board, variant]))
+
+
+def learner(board: Board, *, variant: Variant = "published") -> DQNSettings:
+    """The hyper-parameters of the DQN agents on a board.
+
+    The text gives the decay of epsilon on `commons` as 1,000,000 steps; versions of the program have
+    500,000, 1,000,000 and, the last one, 5,000,000. Both variants take the text's.
+
+    Raises:
+        ValueError: for an unknown board or variant.
+    """
+    _check(board, variant)
+    as_run = variant == "as_run"
+    return DQNSettings(
+        epsilon_decay_steps=1_000_000 if board == "commons" else 500_000,
+        relu_on_outputs=as_run,
+        glorot_uniform=as_run,
+        adam_eps=1e-7 if as_run else 1e-8,
+        own_target_weights=as_run,
+        mean_over_all_outputs=as_run,
+    )
+
+
+def _check(board: str, variant: str) -> None:
+    if board not in BOARDS:
+        raise ValueError(f"board is {board!r}; allowed: {', '.join(BOARDS)}")
+    if variant not in VARIANTS:
+        raise ValueError(f"variant is {variant!r}; allowed: {', '.join(VARIANTS)}")
