@@ -1,0 +1,88 @@
+"""Helpers of the tests: play a drawn board, and draw what came of it."""
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+
+from cprl import Game, Map, Rules, maps
+from cprl.commons.batch import Batch
+from cprl.commons.maps import SIGN_OF_HEADING
+from cprl.commons.world import Told
+
+RGB_SIGN = {
+    (10, 10, 10): ".",
+    (125, 125, 125): "#",
+    (0, 255, 0): "A",
+    (50, 50, 50): "m",
+    (255, 204, 51): "b",
+    (255, 0, 0): "o",
+    (0, 0, 255): "S",
+}
+
+
+class Play:
+    """One world of a board, played by the names of actions; nothing regrows unless the rules say so.
+
+    The agents of a drawing are numbered in reading order; `order` gives them other numbers.
+    """
+
+    def __init__(self, board: str | Map, *, seed: int = 0, order: Sequence[int] | None = None, **rules):
+        board = maps.parse(board) if isinstance(board, str) else board
+        if order is not None:
+            board = replace(board, starts=tuple(board.starts[i] for i in order))
+        rules = {"regrow_prob": (0.0,), **rules}
+        self.game = Game(map=board, rules=Rules(**rules))
+        self.batch = Batch(self.game, 1, seed=seed)
+        self.told: Told = self.batch.begin(self.batch.new_told())
+
+    def turn(self, *names: str) -> "Play":
+        """One turn; one action for each agent, the same for all if only one is given."""
+        names = names * self.game.agents if len(names) == 1 else names
+        known = list(self.game.actions)
+        actions = np.array([[known.index(name) for name in names]], np.int64)
+        self.batch.play(actions, self.told)
+        return self
+
+    @property
+    def places(self) -> list[tuple[int, int]]:
+        worlds = self.batch.worlds
+        return [(int(r), int(c)) for r, c in zip(worlds.row[0], worlds.col[0], strict=True)]
+
+    @property
+    def board(self) -> str:
+        """Ground, walls, apples and agents in play, each with its heading."""
+        worlds, board = self.batch.worlds, self.game.map
+        signs = [["."] * board.width for _ in range(board.height)]
+        for row, col in board.walls:
+            signs[row][col] = "#"
+        for (row, col), apples in zip(board.sites, worlds.stock[0], strict=True):
+            signs[row][col] = "A" if apples else "."
+        for i in range(self.game.agents):
+            if worlds.in_play[0, i]:
+                signs[worlds.row[0, i]][worlds.col[0, i]] = SIGN_OF_HEADING[int(worlds.heading[0, i])]
+        return "\n".join("".join(row) for row in signs)
+
+    @property
+    def in_play(self) -> list[bool]:
+        return self.batch.worlds.in_play[0].tolist()
+
+    @property
+    def harvest(self) -> list[float]:
+        return self.told.harvest[0].tolist()
+
+    def window(self, agent: int) -> str:
+        """What an agent sees, by the signs of `RGB_SIGN`."""
+        pixels = self.told.observation[0, agent].transpose(1, 2, 0)
+        return "\n".join("".join(RGB_SIGN[tuple(map(int, cell))] for cell in row) for row in pixels)
+
+
+def drawn(text: str) -> str:
+    """A drawing as it stands in a test, without its indentation."""
+    return "\n".join(line.strip() for line in text.strip().splitlines())
+
+
+def random_actions(steps: int, worlds: int, game: Game, *, seed: int = 0) -> np.ndarray:
+    """int64 [steps, worlds, N], every action equally likely."""
+    shape = steps, worlds, game.agents
+    return np.random.default_rng(seed).integers(0, len(game.actions), shape)

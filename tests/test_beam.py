@@ -1,0 +1,88 @@
+"""Beams: whom they hit, what stops them, and what follows."""
+
+from boards import Play
+
+
+def test_a_beam_reaches_its_length_and_no_further():
+    board = "A.......\n.>...^^."
+    assert Play(board, beam_length_cells=4).turn("beam", "stay", "stay").in_play == [True, False, True]
+
+
+def test_a_beam_is_three_wide_and_spares_who_stands_beside_the_shooter():
+    board = """
+        A.v..
+        .....
+        .>v..
+        .v...
+        ..v..
+    """
+    hit = Play(board).turn("stay", "beam", "stay", "stay", "stay")
+    assert hit.in_play == [True, True, False, True, True]
+
+
+def test_a_wall_stops_each_column_of_a_beam_on_its_own():
+    board = """
+        A.....
+        ..#.v.
+        .>..v.
+        ..#.v.
+    """
+    play = Play(board, window_columns=5).turn("stay", "beam", "stay", "stay")
+    assert play.in_play == [True, True, False, True]
+    # Agent 1 looks right: the far agents to its left and right are spared, the one ahead is gone.
+    assert play.window(1).splitlines() == ["#####", "..b.#", ".obo#", "..b.#", ".#b##", "..S.#"]
+
+
+def test_two_who_shoot_each_other_are_both_out():
+    assert Play("A....\n.>.<.").turn("beam").in_play == [False, False]
+
+
+def test_tags_take_effect_at_the_end_of_the_turn_so_the_apple_is_bitten_first():
+    play = Play("..A..\n.>^..").turn("beam", "forward")
+    assert play.harvest == [0, 1]
+    assert play.in_play == [True, False]
+
+
+def test_hits_are_judged_on_the_cells_after_the_moves():
+    assert Play("A....\n.....\n.>.^.", beam_width_cells=1).turn("beam", "forward").in_play == [True, True]
+
+
+def test_with_two_hits_to_tag_a_turn_counts_one_hit_however_many_beams_cross():
+    play = Play("A......\n>..^..<", hits_to_tag=2)
+    play.turn("beam", "stay", "beam")
+    assert play.told.hit_by[0].tolist()[1] == [True, False, True]
+    assert not play.told.tagged_by.any()
+    play.turn("beam", "stay", "stay")
+    assert play.told.tagged_by[0].tolist()[1] == [True, False, False]
+    assert play.in_play == [True, False, True]
+
+
+def test_who_may_not_fire_does_nothing_by_the_beam_action():
+    play = Play("A...\n.>.^", may_fire=(False, True)).turn("beam", "stay")
+    assert not play.told.fired.any()
+    assert play.in_play == [True, True]
+
+
+def test_the_time_out_depends_on_the_shooter_and_on_the_offence():
+    # Agent 0 punishes by 1 turn, then by 3; agent 2 always by 2.
+    rules = {"freeze_steps": ((1, 3), (9, 9), (2, 2))}
+
+    def missed(play, *names):
+        play.turn(*names)
+        turns = 0
+        while not play.in_play[1]:
+            play.turn("stay")
+            turns += 1
+        return turns
+
+    play = Play("A......\n>..^..<", **rules)
+    assert missed(play, "beam", "stay", "stay") == 1
+    assert missed(play, "beam", "stay", "stay") == 3
+    assert missed(play, "stay", "stay", "beam") == 2
+    assert missed(play, "beam", "stay", "beam") == 3, "the longer one counts"
+
+
+def test_the_length_of_a_beam_may_depend_on_the_heading():
+    lengths = (1, 4, 1, 1)
+    assert Play("A.....\n.>...^", beam_length_cells=lengths).turn("beam", "stay").in_play == [True, False]
+    assert Play("A.....\n.v...<", beam_length_cells=lengths).turn("stay", "beam").in_play == [True, True]

@@ -1,0 +1,67 @@
+"""A room imports only from rooms above it (docs of `cprl`, DESIGN section 2)."""
+
+import ast
+from pathlib import Path
+
+import pytest
+
+SOURCE = Path(__file__).parents[1] / "src" / "cprl"
+ROOMS = (
+    "keys",
+    "commons",
+    "envs",
+    "institutions",
+    "acting",
+    "learning",
+    "measuring",
+    "recording",
+    "theory",
+    "presets",
+    "train",
+    "cli",
+)
+MODULES = sorted(path for path in SOURCE.rglob("*.py") if path.parent != SOURCE or path.name != "__init__.py")
+
+
+def room_of(path):
+    return path.relative_to(SOURCE).parts[0].removesuffix(".py")
+
+
+def rooms_imported(text):
+    for node in ast.walk(ast.parse(text)):
+        if isinstance(node, ast.ImportFrom) and node.module and node.module.split(".")[0] == "cprl":
+            parts = node.module.split(".")
+            yield from [parts[1]] if len(parts) > 1 else [alias.name for alias in node.names]
+        elif isinstance(node, ast.Import):
+            names = [alias.name.split(".") for alias in node.names]
+            yield from [parts[1] for parts in names if parts[0] == "cprl" and len(parts) > 1]
+
+
+def wrong_imports(room, text):
+    """What a module of this room imports from below it."""
+    return [other for other in rooms_imported(text) if ROOMS.index(other) > ROOMS.index(room)]
+
+
+@pytest.mark.parametrize("path", MODULES, ids=lambda path: str(path.relative_to(SOURCE)))
+def test_a_room_imports_only_from_rooms_above_it(path):
+    assert wrong_imports(room_of(path), path.read_text()) == []
+
+
+@pytest.mark.parametrize(
+    "line", ["from cprl.train import train", "import cprl.recording.rerun", "from cprl import presets"]
+)
+def test_the_gate_closes(line):
+    assert wrong_imports("commons", line)
+
+
+def test_the_game_knows_nothing_of_torch():
+    for path in (SOURCE / "commons").glob("*.py"):
+        imports = [
+            name.split(".")[0]
+            for node in ast.walk(ast.parse(path.read_text()))
+            if isinstance(node, ast.Import | ast.ImportFrom)
+            for name in (
+                [node.module or ""] if isinstance(node, ast.ImportFrom) else [a.name for a in node.names]
+            )
+        ]
+        assert not {"torch", "tensordict", "torchrl"} & set(imports), path.name

@@ -1,0 +1,126 @@
+"""Who goes where, and who gives way: boards before and after a turn."""
+
+from boards import Play, drawn
+
+
+def test_each_walk_goes_by_the_heading():
+    board = """
+        A......
+        .......
+        ...>...
+        .......
+    """
+    ends = {"forward": (2, 4), "backward": (2, 2), "left": (1, 3), "right": (3, 3), "stay": (2, 3)}
+    for action, place in ends.items():
+        assert Play(board).turn(action).places == [place], action
+
+
+def test_turning_left_and_right_turns_the_heading_by_a_quarter():
+    play = Play(".A.\n.^.")
+    assert play.turn("turn_left").board == ".A.\n.<."
+    assert play.turn("turn_right").turn("turn_right").board == ".A.\n.>."
+
+
+def test_edges_and_inner_walls_stop_a_move():
+    play = Play("#A..\n>#..")
+    assert play.turn("forward").places == [(1, 0)]
+    assert play.turn("left").places == [(1, 0)]
+    assert play.turn("backward").places == [(1, 0)]
+
+
+def test_agents_who_want_the_same_cell_both_stay():
+    play = Play(
+        """
+        A......
+        ..>.<..
+        """
+    )
+    assert play.turn("forward").board == drawn(
+        """
+        A......
+        ..>.<..
+        """
+    )
+
+
+def test_nobody_enters_a_cell_that_someone_keeps():
+    assert Play("A....\n.>>..").turn("forward", "stay").places == [(1, 1), (1, 2)]
+
+
+def test_one_follows_another_into_the_cell_it_leaves():
+    assert Play("A....\n.>>..").turn("forward").places == [(1, 2), (1, 3)]
+
+
+def test_nobody_swaps():
+    assert Play("A...\n.><.").turn("forward").places == [(1, 1), (1, 2)]
+
+
+def test_three_in_a_ring_all_move():
+    play = Play("A....\n.>v..\n.^<..")
+    assert play.turn("forward").places == [(1, 2), (2, 2), (1, 1), (2, 1)]
+
+
+def test_a_cancelled_move_cancels_those_behind_it():
+    # Agents 2 and 3 want the cell between them; 1 wants 2's cell, 0 wants 1's.
+    play = Play("A.......\n.>>>.<..")
+    assert play.turn("forward").places == [(1, 1), (1, 2), (1, 3), (1, 5)]
+
+
+def test_clashes_do_not_depend_on_the_numbers_of_the_agents():
+    drawing = "A.......\n.>>>.<..\n...^...."
+    straight = Play(drawing).turn("forward").places
+    order = [4, 2, 0, 3, 1]
+    shuffled = Play(drawing, order=order).turn("forward").places
+    assert shuffled == [straight[i] for i in order]
+
+
+def test_as_run_a_pair_goes_back_even_onto_a_third():
+    # 0 follows 1; 1 and 2 want one cell. Pair (0, 1): no clash. Pair (1, 2): both go back, 1 onto 0.
+    play = Play("A......\n.>>.<..", pairwise_clashes=True)
+    assert play.turn("forward").places == [(1, 2), (1, 2), (1, 4)]
+
+
+def test_a_tagged_agent_takes_up_no_room_and_waits_until_its_cell_is_free():
+    board = "A.....\n.>.^.."
+    play = Play(board, freeze_steps=2).turn("beam", "stay")
+    assert play.in_play == [True, False]
+    play.turn("forward", "forward").turn("forward", "forward")
+    assert play.places == [(1, 3), (1, 3)], "agent 0 stands where agent 1 was tagged"
+    assert play.in_play == [True, False], "agent 1 has served its time and waits"
+    play.turn("stay", "forward")
+    assert play.in_play == [True, False]
+    play.turn("forward", "forward")
+    assert play.in_play == [True, True], "the cell is free"
+    assert play.turn("stay", "forward").places == [(1, 4), (0, 3)]
+
+
+def test_those_who_wait_for_one_cell_return_in_the_order_in_which_they_were_tagged():
+    # 1 is tagged at (1, 3), then 2 comes there and is tagged too; the freeze of 1 is the longer wait.
+    play = Play(
+        "A......\n.>.^...\n...^...",
+        freeze_steps=((3,), (3,), (3,)),
+        beam_length_cells=2,
+        beam_width_cells=1,
+    )
+    play.turn("beam", "stay", "stay").turn("stay", "stay", "forward")
+    assert play.places == [(1, 1), (1, 3), (1, 3)]
+    play.turn("beam", "stay", "stay")
+    assert play.in_play == [True, False, False]
+    play.turn("stay")
+    assert play.in_play == [True, True, False], "agent 1 was first"
+    play.turn("stay").turn("stay").turn("stay")
+    assert play.in_play == [True, True, False], "agent 2 waits as long as agent 1 keeps the cell"
+    play.turn("stay", "left", "stay")
+    assert play.in_play == [True, True, True]
+
+
+def test_a_time_out_of_three_misses_three_turns_and_as_run_two():
+    for counts_tag_turn, missed in ((False, 3), (True, 2)):
+        play = Play("A....\n.>^..", freeze_steps=3, freeze_counts_tag_turn=counts_tag_turn)
+        play.turn("beam", "stay")
+        for _ in range(missed):
+            assert play.in_play == [True, False]
+            play.turn("stay", "forward")
+        assert play.in_play == [True, True]
+        assert play.places[1] == (1, 2), "no action of an agent out of play counts"
+        assert play.turn("stay", "forward").places[1] == (0, 2)

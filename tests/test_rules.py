@@ -1,0 +1,115 @@
+"""Every field of Rules is checked on construction."""
+
+from dataclasses import fields, replace
+
+import numpy as np
+import pytest
+
+from cprl import Rules, presets
+from cprl.commons.rules import _CHECKS
+
+WRONG = {
+    "regrow_prob": [(), (0.5, 1.5), 0.1, (float("nan"),), ("a",)],
+    "regrow_radius_cells": [-1, float("inf"), "2", None],
+    "regrow_norm": ["l2", None],
+    "beam_length_cells": [0, 2.5, (1, 2, 3), (1, 2, 3, 0), True],
+    "beam_width_cells": [0, 2, 3.0],
+    "hits_to_tag": [0, -1, 1.0],
+    "freeze_steps": [-1, 2.5, ((1, 2), (3,)), (1, 2), ()],
+    "may_fire": [1, (), (True, 0)],
+    "may_bite": [True, ((True,), ()), ((1, 0),)],
+    "window_rows": [0, 1.5, "6"],
+    "window_columns": [0, 12, -3],
+    "episode_steps": [0, 1e3, None],
+    "pairwise_clashes": [0, None, "yes"],
+    "regrow_before_bites": [1],
+    "freeze_counts_tag_turn": [1],
+    "ends_one_turn_late": [1],
+    "picture_shows_old_stock": [1],
+    "paint_over": [1],
+    "mark_behind_if_vertical": [1],
+    "self_paint_stays": [1],
+}
+
+
+def test_every_field_has_a_check_and_a_wrong_value_here():
+    names = [field.name for field in fields(Rules)]
+    assert sorted(_CHECKS) == sorted(names) == sorted(WRONG)
+
+
+@pytest.mark.parametrize(("name", "value"), [(name, value) for name in WRONG for value in WRONG[name]])
+def test_a_wrong_value_is_refused_with_field_value_and_what_is_allowed(name, value):
+    with pytest.raises(ValueError, match=rf"Rules\.{name} is .*; allowed: "):
+        Rules(**{name: value})
+
+
+def test_lists_and_arrays_become_tuples_so_that_rules_compare_and_hash():
+    given = Rules(regrow_prob=[0, 0.5], freeze_steps=np.array([[25], [50]]), may_fire=np.array([True, False]))
+    same = Rules(regrow_prob=(0, 0.5), freeze_steps=((25,), (50,)), may_fire=(True, False))
+    assert given == same
+    assert hash(given) == hash(same)
+
+
+def test_replace_checks_again():
+    with pytest.raises(ValueError, match="window_columns is 4"):
+        replace(Rules(), window_columns=4)
+
+
+def test_every_quirk_is_off_as_published_and_on_as_run():
+    quirks = [field.name for field in fields(Rules) if field.default is False]
+    assert len(quirks) == 8
+    for board in presets.BOARDS:
+        published = presets.game(board).rules
+        as_run = presets.game(board, variant="as_run").rules
+        assert not any(getattr(published, quirk) for quirk in quirks)
+        assert all(getattr(as_run, quirk) for quirk in quirks)
+
+
+@pytest.mark.parametrize(
+    ("board", "published", "as_run"),
+    [("single_basic", (6, 13), (5, 13)), ("two_complex", (6, 13), (5, 13)), ("commons", (7, 15), (7, 15))],
+)
+def test_windows_have_the_published_sizes(board, published, as_run):
+    assert presets.game(board).window_shape == (3, *published)
+    assert presets.game(board, variant="as_run").window_shape == (3, *as_run)
+
+
+def test_without_a_beam_there_are_seven_actions_and_six_is_stay():
+    assert presets.game("single_basic").actions[6] == "stay"
+    assert len(presets.game("single_basic").actions) == 7
+    assert presets.game("commons").actions[6:] == ("beam", "stay")
+
+
+@pytest.mark.parametrize(("board", "variant"), [("pond", "published"), ("commons", "as_writen")])
+def test_an_unknown_preset_says_what_there_is(board, variant):
+    with pytest.raises(ValueError, match="allowed: "):
+        presets.game(board, variant=variant)
+    with pytest.raises(ValueError, match="allowed: "):
+        presets.learner(board, variant=variant)
+
+
+def test_learners_differ_between_boards_and_variants_only_where_the_study_says():
+    assert presets.learner("commons").epsilon_decay_steps == 1_000_000
+    assert presets.learner("two_complex").epsilon_decay_steps == 500_000
+    as_run = presets.learner("single_basic", variant="as_run")
+    assert as_run.relu_on_outputs
+    assert as_run.glorot_uniform
+    assert as_run.own_target_weights
+    assert as_run.mean_over_all_outputs
+    assert as_run.adam_eps == 1e-7
+    written = replace(
+        as_run,
+        relu_on_outputs=False,
+        glorot_uniform=False,
+        own_target_weights=False,
+        mean_over_all_outputs=False,
+        adam_eps=1e-8,
+    )
+    assert written == presets.learner("single_basic")
+
+
+def test_epsilon_holds_then_falls_in_a_line_then_holds():
+    settings = presets.learner("single_basic")
+    assert [settings.epsilon(step) for step in (0, 800)] == [1.0, 1.0]
+    assert settings.epsilon(800 + 250_000) == pytest.approx(0.55)
+    assert [settings.epsilon(step) for step in (500_800, 10**7)] == pytest.approx([0.1, 0.1])

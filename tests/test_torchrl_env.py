@@ -1,0 +1,221 @@
+"""CommonsEnv keeps TorchRL's contracts, and plays the very game of `cprl.commons`."""
+
+import numpy as np
+import pytest
+import torch
+from boards import random_actions
+from tensordict import TensorDict, assert_close
+from tensordict.nn import TensorDictModuleBase
+from torchrl.collectors import Collector
+from torchrl.envs import EnvBase, RewardSum, TransformedEnv
+from torchrl.envs.utils import check_env_specs
+
+from cprl import CommonsEnv, Game, Rules, keys, maps, presets
+from cprl.commons.batch import Batch
+
+SHORT = Game(
+    map=maps.parse(".A>.A\n.A.A.\n..<.A"),
+    rules=Rules(regrow_prob=(0.0, 0.1), window_rows=3, window_columns=5, episode_steps=9),
+)
+EVERYTHING = {  # key -> shape without B, dtype
+    keys.OBSERVATION: ((4, 3, 7, 15), torch.uint8),
+    keys.HARVEST: ((4,), torch.float32),
+    keys.IN_PLAY: ((4,), torch.bool),
+    keys.FIRED: ((4,), torch.bool),
+    keys.HIT_BY: ((4, 4), torch.bool),
+    keys.TAGGED_BY: ((4, 4), torch.bool),
+    keys.STOCK: ((1,), torch.int64),
+    keys.REGROWN: ((1,), torch.int64),
+    keys.STATE: ((3, 12, 24), torch.uint8),
+    keys.DONE: ((1,), torch.bool),
+    keys.TERMINATED: ((1,), torch.bool),
+    keys.TRUNCATED: ((1,), torch.bool),
+}
+
+
+class ByWindow(TensorDictModuleBase):
+    """A policy that follows from the window alone, and leaves entries of its own, as networks do."""
+
+    in_keys = (keys.OBSERVATION,)
+    out_keys = (keys.ACTION,)
+
+    def forward(self, tensordict):
+        window = tensordict[keys.OBSERVATION].long().flatten(-3)
+        jumble = (window * torch.arange(1, window.shape[-1] + 1)).sum(-1)
+        tensordict[keys.ACTION] = jumble // 7 % 8
+        tensordict[keys.AGENTS, "value"] = jumble.float()
+        tensordict["note"] = jumble.sum(-1)
+        return tensordict
+
+
+@pytest.mark.parametrize("state", [False, True])
+@pytest.mark.parametrize("board", presets.BOARDS)
+def test_the_specs_are_kept(board, state):
+    env = CommonsEnv(presets.game(board), worlds=3, state=state)
+    check_env_specs(env)
+    check_env_specs(env, seed=1)
+
+
+def test_entries_have_the_shapes_and_types_of_the_house():
+    env = CommonsEnv(presets.game("commons"), worlds=5, state=True)
+    first = env.reset()
+    after = env.step(env.rand_action(first.clone()))["next"]
+    for moment in (first, after):
+        for key, (shape, dtype) in EVERYTHING.items():
+            assert moment[key].shape == (5, *shape), key
+            assert moment[key].dtype == dtype, key
+    assert after[keys.REWARD].shape == (5, 4, 1)
+    assert after[keys.REWARD].dtype == torch.float32
+    assert env.group_map == {"agents": ["agent_0", "agent_1", "agent_2", "agent_3"]}
+    assert env.full_action_spec[keys.ACTION].n == 8
+
+
+def test_the_reward_is_the_harvest_and_changing_it_leaves_the_harvest_alone():
+    env = CommonsEnv(SHORT, worlds=4)
+    steps = env.rollout(9, break_when_any_done=False)["next"]
+    assert torch.equal(steps[keys.REWARD][..., 0], steps[keys.HARVEST])
+    assert steps[keys.HARVEST].sum() > 0
+    harvest = steps[keys.HARVEST].clone()
+    steps[keys.REWARD].mul_(-1)
+    assert torch.equal(steps[keys.HARVEST], harvest)
+
+
+def test_it_plays_the_game_of_the_batch():
+    actions = random_actions(50, 6, SHORT)
+    env, batch = CommonsEnv(SHORT, worlds=6, seed=4), Batch(SHORT, 6, seed=4)
+    moment, told = env.reset(), batch.begin(batch.new_told())
+    for turn in actions:
+        moment[keys.ACTION] = torch.as_tensor(turn)
+        moment = env.step(moment)["next"]
+        batch.play(turn, told)
+        assert np.array_equal(moment[keys.OBSERVATION], told.observation)
+        assert np.array_equal(moment[keys.TAGGED_BY], told.tagged_by)
+        assert np.array_equal(moment[keys.STOCK], told.stock)
+        assert np.array_equal(moment[keys.TRUNCATED], told.truncated)
+        moment = moment.exclude(keys.REWARD)
+
+
+def test_a_mask_resets_only_the_marked_worlds():
+    env = CommonsEnv(SHORT, worlds=3)
+    played = env.rollout(5)[:, -1]["next"].exclude(keys.REWARD)
+    begun = env.reset(played.clone().set("_reset", torch.tensor([[False], [True], [False]])))
+    for key in EVERYTHING:
+        if key != keys.STATE:
+            assert torch.equal(begun[key][[0, 2]], played[key][[0, 2]]), key
+    assert begun[keys.STOCK][1] == len(SHORT.map.sites)
+    assert env.batch.worlds.step[:, 0].tolist() == [5, 0, 5]
+
+
+@pytest.mark.parametrize("bad", [-1, 8])
+def test_unknown_actions_raise_and_change_nothing(bad):
+    env = CommonsEnv(SHORT, worlds=2)
+    moment = env.reset()
+    kept = moment.clone()
+    moment[keys.ACTION] = torch.tensor([[0, 0], [0, bad]])
+    for step in (env.step, env.step_and_maybe_reset):
+        with pytest.raises(
+            ValueError, match=f"action {bad} of agent 1 in world 1 is unknown; allowed: 0 to 7"
+        ):
+            step(moment.clone())
+    assert env.batch.worlds.step.sum() == 0
+    assert_close(moment.exclude(keys.ACTION), kept)
+
+
+def test_what_was_returned_never_changes_later():
+    env = CommonsEnv(SHORT, worlds=3)
+    kept, copies, moment = [], [], env.reset()
+    for _ in range(25):
+        env.rand_action(moment)
+        now, moment = env.step_and_maybe_reset(moment)
+        kept += [now, moment]
+        copies += [now.clone(), moment.clone()]
+    for entry, copy in zip(kept, copies, strict=True):
+        # The policy's action is written into the carried entry by design.
+        assert_close(entry.exclude(keys.ACTION, "next"), copy.exclude(keys.ACTION, "next"))
+        if "next" in copy:
+            assert_close(entry["next"], copy["next"])
+
+
+def test_the_lean_step_and_maybe_reset_equals_torchrls_own():
+    lean, stock = (CommonsEnv(SHORT, worlds=4, seed=2, state=True) for _ in range(2))
+    moment, other_moment = lean.reset(), stock.reset()
+    ends = 0
+    for turn in torch.as_tensor(random_actions(60, 4, SHORT)):
+        for entry in (moment, other_moment):
+            entry[keys.ACTION] = turn
+            entry[keys.AGENTS, "value"], entry["note"] = turn.float(), turn.sum(-1)
+        now, moment = lean.step_and_maybe_reset(moment)
+        other_now, other_moment = EnvBase._step_and_maybe_reset(stock, other_moment)
+        assert_close(now, other_now)
+        assert_close(moment, other_moment)
+        assert set(now.keys(True, True)) == set(other_now.keys(True, True))
+        assert set(moment.keys(True, True)) == set(other_moment.keys(True, True))
+        ends += int(now["next", "done"].sum())
+    assert ends > 4
+
+
+def test_rollouts_and_collectors_give_the_same_turns():
+    env, other = CommonsEnv(SHORT, worlds=3, seed=1), CommonsEnv(SHORT, worlds=3, seed=1)
+    rolled = env.rollout(20, ByWindow(), break_when_any_done=False)
+    collector = Collector(
+        other,
+        ByWindow(),
+        frames_per_batch=60,
+        total_frames=60,
+        track_traj_ids=False,
+        auto_register_policy_transforms=False,
+    )
+    (collected,) = list(collector)
+    for key in rolled.keys(True, True):
+        assert torch.equal(rolled[key], collected[key]), key
+    assert rolled["next", "done"].any()
+
+
+def test_transforms_wrap_it():
+    env = TransformedEnv(CommonsEnv(SHORT, worlds=2), RewardSum(in_keys=[keys.REWARD]))
+    check_env_specs(env)
+    steps = env.rollout(9, break_when_any_done=False)
+    total = steps["next", "agents", "episode_reward"][:, -1]
+    assert torch.equal(total[..., 0], steps["next", "agents", "harvest"].sum(1))
+
+
+def test_set_seed_starts_the_same_game_again():
+    env = CommonsEnv(presets.game("commons"), worlds=3)
+    actions = torch.as_tensor(random_actions(150, 3, env.game))
+    runs = []
+    for seed in (7, 7, 8):
+        env.set_seed(seed)
+        moment, grown = env.reset(), []
+        for turn in actions:
+            _, moment = env.step_and_maybe_reset(moment.set(keys.ACTION, turn))
+            grown.append(moment["regrown"])
+        runs.append(torch.stack(grown))
+    assert runs[0].sum() > 0
+    assert torch.equal(runs[0], runs[1])
+    assert not torch.equal(runs[0], runs[2])
+
+
+def test_one_world_plays_as_it_does_in_a_larger_batch():
+    many = CommonsEnv(SHORT, worlds=5, seed=3)
+    one = CommonsEnv(SHORT, worlds=1, seed=3, first_world=2)
+    together = many.rollout(30, ByWindow(), break_when_any_done=False)
+    alone = one.rollout(30, ByWindow(), break_when_any_done=False)
+    assert_close(together[2:3], alone)
+
+
+def test_the_state_is_the_whole_board_in_colour():
+    env = CommonsEnv(Game(map=maps.parse("A.#\n.>."), rules=Rules(may_fire=False)), state=True)
+    state = env.reset()[keys.STATE][0].permute(1, 2, 0).tolist()
+    assert state[0] == [[0, 255, 0], [10, 10, 10], [125, 125, 125]]
+    assert state[1] == [[10, 10, 10], [255, 0, 0], [50, 50, 50]]
+
+
+def test_other_devices_are_refused_for_now():
+    with pytest.raises(ValueError, match='device is "cuda"'):
+        CommonsEnv(SHORT, device="cuda")
+
+
+def test_agents_with_entries_of_their_own_batch_size_keep_it():
+    env = CommonsEnv(SHORT, worlds=2)
+    assert isinstance(env.reset()[keys.AGENTS], TensorDict)
+    assert env.reset()[keys.AGENTS].batch_size == (2, 2)

@@ -1,0 +1,112 @@
+"""What agents see: windows drawn as signs, `S` self, `o` others, `m` heading marks, `b` beams."""
+
+import numpy as np
+import pytest
+from boards import Play, drawn
+
+from cprl.commons.game import APPLE, GROUND, MARK, OTHER, WALL
+
+
+def windows(play, *agents):
+    return [play.window(agent).splitlines() for agent in agents]
+
+
+@pytest.mark.parametrize(
+    ("turns", "seen"),
+    [
+        (["stay"], ["A..", ".mA", ".S."]),
+        (["turn_right"], ["###", "Am.", ".S."]),
+        (["turn_left"], ["###", "Am.", ".S."]),
+        (["turn_left", "turn_left"], ["###", ".mA", ".S."]),
+    ],
+)
+def test_the_window_turns_with_the_agent_and_shows_its_own_row_last(turns, seen):
+    board = """
+        A..
+        ..A
+        .^.
+        A..
+    """
+    play = Play(board, window_rows=3, window_columns=3, may_fire=False)
+    for action in turns:
+        play.turn(action)
+    assert windows(play, 0) == [seen]
+
+
+def test_everything_outside_the_board_is_wall():
+    play = Play("A>.\n...", window_rows=4, window_columns=5)
+    assert windows(play, 0) == [["#####", "#####", "##m.#", "##S.#"]]
+
+
+def test_everybody_sees_itself_blue_and_others_red():
+    play = Play("A....\n.>.<.", window_rows=4, window_columns=3)
+    assert windows(play, 0, 1) == [["..#", ".o#", ".m#", ".S#"], ["#.A", "#o.", "#m.", "#S."]]
+
+
+FIRE_OVER_APPLES = drawn(
+    """
+    .AA....
+    .>A.<.^
+    .......
+    """
+)
+
+
+def test_marks_and_beams_are_never_painted_over_apples_or_agents():
+    play = Play(FIRE_OVER_APPLES, window_rows=6, window_columns=3, hits_to_tag=2)
+    play.turn("beam", "stay", "stay")
+    assert windows(play, 0) == [["bob", "bbb", "bob", "bbb", "AAb", "AS."]]
+
+
+def test_as_run_beams_are_painted_over_apples_and_agents():
+    play = Play(FIRE_OVER_APPLES, window_rows=6, window_columns=3, paint_over=True, hits_to_tag=2)
+    play.turn("beam", "stay", "stay")
+    assert play.in_play == [True, True, True]
+    assert windows(play, 0) == [["bbb", "bbb", "bbb", "bbb", "bbb", "AS."]]
+
+
+def test_an_agent_out_of_play_is_not_seen_but_still_sees_itself():
+    play = Play("A....\n.>.<.", window_rows=3, window_columns=3).turn("beam", "stay")
+    assert windows(play, 0, 1) == [["bb#", "bb#", ".S#"], ["#o.", "#bb", "#Sb"]]
+
+
+FACING_DOWN = "....\n.v..\n...A\n>..."
+
+
+def test_the_mark_shows_the_heading_and_as_run_it_is_behind_who_faces_down():
+    ahead = Play(FACING_DOWN, window_rows=4, window_columns=3)
+    behind = Play(FACING_DOWN, window_rows=4, window_columns=3, mark_behind_if_vertical=True)
+    assert windows(ahead, 0, 1) == [["###", ".mo", ".m.", ".S."], ["A.#", "..#", "mm#", ".S#"]]
+    assert windows(behind, 0, 1) == [["###", ".mo", "...", ".S."], ["A.#", "..#", ".m#", ".S#"]]
+
+
+@pytest.mark.parametrize(("old_stock", "ahead"), [(False, "A"), (True, "m")])
+def test_as_run_the_picture_shows_the_apples_as_they_hung_when_the_turn_began(old_stock, ahead):
+    rules = {"regrow_prob": (0.0, 1.0), "picture_shows_old_stock": old_stock}
+    play = Play("A.A\n^..", window_rows=2, window_columns=3, **rules).turn("forward")
+    play.turn("backward")
+    assert play.told.regrown[0, 0] == 1, "the apple bitten has grown again"
+    assert windows(play, 0) == [[f"#{ahead}.", "#S."]]
+    assert windows(play.turn("stay"), 0) == [["#A.", "#S."]]
+
+
+def test_as_run_own_cells_stay_painted_as_self_for_later_agents():
+    board = "A....\n.>.<."
+    stays = Play(board, window_rows=3, window_columns=3, self_paint_stays=True)
+    goes = Play(board, window_rows=3, window_columns=3)
+    assert windows(goes, 0, 1) == [[".o#", ".m#", ".S#"], ["#o.", "#m.", "#S."]]
+    assert windows(stays, 0, 1) == [[".o#", ".m#", ".S#"], ["#S.", "#m.", "#S."]]
+
+
+def test_as_run_a_later_mark_covers_an_earlier_agent():
+    covered = Play("A....\n..<<.", window_rows=3, window_columns=3, paint_over=True)
+    seen = Play("A....\n..<<.", window_rows=3, window_columns=3)
+    assert windows(covered, 1) == [["#m.", "#m.", "#S."]]
+    assert windows(seen, 1) == [["#m.", "#o.", "#S."]]
+
+
+def test_the_whole_board_shows_classes():
+    play = Play("A.#\n.>.\n...")
+    shown = play.batch.boards(play.told)[0]
+    expected = [[APPLE, GROUND, WALL], [GROUND, OTHER, MARK], [GROUND, GROUND, GROUND]]
+    assert np.array_equal(shown, expected)

@@ -1,0 +1,225 @@
+"""What holds in every game, whatever is played: checked on random boards, rules and actions."""
+
+import itertools
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from boards import random_actions
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from cprl import Game, Map, Rules, presets
+from cprl.commons.batch import Batch
+from cprl.commons.game import neighbours
+
+STAY = 7
+
+
+@st.composite
+def games(draw, **fixed):
+    """Small boards with walls, crowded enough for clashes and hits, under rules as published or as run."""
+    height, width = draw(st.integers(2, 5)), draw(st.integers(3, 7))
+    cells = draw(st.permutations([(r, c) for r in range(height) for c in range(width)]))
+    agents = draw(st.integers(1, min(5, len(cells) - 2)))
+    walls = draw(st.integers(0, min(3, len(cells) - agents - 1)))
+    starts, free = cells[:agents], cells[agents + walls :]
+    sites = free[: draw(st.integers(1, len(free)))]
+    headings = draw(st.lists(st.integers(0, 3), min_size=agents, max_size=agents))
+    board = Map(
+        height=height,
+        width=width,
+        sites=tuple(sites),
+        starts=tuple((row, col, heading) for (row, col), heading in zip(starts, headings, strict=True)),
+        walls=tuple(cells[agents : agents + walls]),
+    )
+    rules = {
+        "regrow_prob": draw(st.sampled_from([(0.0, 0.3, 0.9), (0.0,), (0.1, 0.5)])),
+        "regrow_norm": draw(st.sampled_from(["euclidean", "manhattan", "chebyshev"])),
+        "beam_length_cells": draw(st.integers(1, 4)),
+        "hits_to_tag": draw(st.integers(1, 2)),
+        "freeze_steps": draw(st.integers(0, 6)),
+        "window_rows": draw(st.integers(1, 4)),
+        "window_columns": draw(st.sampled_from([1, 3, 5])),
+        "episode_steps": draw(st.integers(1, 60)),
+        **fixed,
+    }
+    return Game(map=board, rules=Rules(**rules))
+
+
+def copied(record):
+    return type(record)(*(array.copy() for array in record))
+
+
+def assert_same(record, other, *, rows=slice(None), other_rows=slice(None)):
+    """Two records of the same kind hold the same, in the worlds named."""
+    for name, array in record._asdict().items():
+        assert np.array_equal(array[rows], getattr(other, name)[other_rows]), name
+
+
+def played(game, actions, *, seed=0, first_world=0, threads=1):
+    """The worlds and what was told, before the first turn and after each."""
+    batch = Batch(game, actions.shape[1], seed=seed, first_world=first_world, threads=threads)
+    told = batch.begin(batch.new_told())
+    moments = [(copied(batch.worlds), copied(told))]
+    for turn in actions:
+        batch.play(turn, told)
+        moments.append((copied(batch.worlds), copied(told)))
+    return moments
+
+
+@settings(max_examples=60, deadline=None)
+@given(games(), st.integers(0, 2**32))
+def test_no_two_agents_in_play_share_a_cell_and_nobody_stands_in_a_wall(game, seed):
+    for worlds, _ in played(game, random_actions(40, 3, game, seed=seed), seed=seed):
+        for b in range(3):
+            places = [
+                (int(r), int(c))
+                for r, c, playing in zip(worlds.row[b], worlds.col[b], worlds.in_play[b], strict=True)
+                if playing
+            ]
+            assert len(set(places)) == len(places)
+            assert not set(places) & set(game.map.walls)
+            assert all(0 <= r < game.map.height and 0 <= c < game.map.width for r, c in places)
+
+
+@settings(max_examples=60, deadline=None)
+@given(games(), st.integers(0, 2**32), st.randoms(use_true_random=False))
+def test_agents_numbers_do_not_matter(game, seed, random):
+    order = list(range(game.agents))
+    random.shuffle(order)
+    renumbered = replace(game, map=replace(game.map, starts=tuple(game.map.starts[i] for i in order)))
+    actions = random_actions(40, 2, game, seed=seed)
+    once = played(game, actions, seed=seed)
+    again = played(renumbered, actions[:, :, order].copy(), seed=seed)
+    for (worlds, told), (other_worlds, other_told) in zip(once, again, strict=True):
+        assert np.array_equal(worlds.stock, other_worlds.stock)
+        for name in ("row", "col", "heading", "in_play", "out_steps", "hits"):
+            assert np.array_equal(getattr(worlds, name)[:, order], getattr(other_worlds, name)), name
+        for name in ("observation", "harvest", "fired"):
+            assert np.array_equal(getattr(told, name)[:, order], getattr(other_told, name)), name
+        assert np.array_equal(told.tagged_by[:, order][:, :, order], other_told.tagged_by)
+
+
+@settings(max_examples=60, deadline=None)
+@given(games(), st.booleans(), st.integers(0, 2**32))
+def test_apples_are_conserved_and_counted(game, regrow_before_bites, seed):
+    game = replace(game, rules=replace(game.rules, regrow_before_bites=regrow_before_bites))
+    moments = played(game, random_actions(40, 3, game, seed=seed), seed=seed)
+    sites = len(game.map.sites)
+    near = neighbours(game.map, game.rules)
+    harvest = np.zeros(3, np.int64)
+    regrown = np.zeros(3, np.int64)
+    for worlds, told in moments:
+        harvest += told.harvest.sum(1).astype(np.int64)
+        regrown += told.regrown[:, 0]
+        assert np.array_equal(told.stock[:, 0] + harvest, sites + regrown)
+        assert np.array_equal(worlds.stock.sum(1), told.stock[:, 0])
+        counted = [[int(stock[list(others)].sum()) for others in near] for stock in worlds.stock]
+        assert np.array_equal(worlds.near, counted)
+
+
+@settings(max_examples=60, deadline=None)
+@given(games(freeze_steps=3), st.booleans(), st.integers(0, 2**32))
+def test_nobody_out_of_play_acts(game, as_run, seed):
+    game = replace(game, rules=replace(game.rules, pairwise_clashes=as_run, freeze_counts_tag_turn=as_run))
+    actions = random_actions(40, 3, game, seed=seed)
+    moments = played(game, actions, seed=seed)
+    for (before, _), (after, told) in itertools.pairwise(moments):
+        out = ~before.in_play
+        for name in ("row", "col", "heading"):
+            assert np.array_equal(getattr(before, name)[out], getattr(after, name)[out]), name
+        assert not told.harvest[out].any()
+        assert not told.fired[out].any()
+        assert not told.hit_by[out].any()
+        assert not told.hit_by.transpose(0, 2, 1)[out].any()
+
+
+@pytest.mark.parametrize("variant", presets.VARIANTS)
+@pytest.mark.parametrize("board", presets.BOARDS)
+def test_a_world_does_not_notice_its_neighbours_nor_the_threads(board, variant):
+    game = presets.game(board, variant=variant)
+    actions = random_actions(60, 9, game, seed=3)
+    together = played(game, actions, seed=5)
+    threaded = played(game, actions, seed=5, threads=2)
+    for b in (0, 4, 8):
+        alone = played(game, actions[:, b : b + 1].copy(), seed=5, first_world=b)
+        for (worlds, told), (many, told_many), (both, told_both) in zip(
+            alone, together, threaded, strict=True
+        ):
+            for one, others in ((worlds, (many, both)), (told, (told_many, told_both))):
+                for other in others:
+                    assert_same(one, other, rows=0, other_rows=b)
+
+
+def test_another_seed_world_or_episode_is_another_game():
+    game = presets.game("commons")
+    actions = random_actions(150, 2, game)
+    actions[:, 1] = actions[:, 0]
+
+    def stocks(**how):
+        return np.array([told.stock for _, told in played(game, actions, **how)])
+
+    base = stocks(seed=1)
+    assert np.array_equal(base, stocks(seed=1))
+    assert not np.array_equal(base, stocks(seed=2))
+    assert not np.array_equal(base[:, 0], base[:, 1]), "two worlds of one seed"
+    assert np.array_equal(base[:, 1], stocks(seed=1, first_world=1)[:, 0])
+    batch = Batch(game, 2, seed=1)
+    told = batch.begin(batch.new_told())
+    told = batch.begin(told)
+    second_episode = []
+    for turn in actions:
+        batch.play(turn, told)
+        second_episode.append(told.stock.copy())
+    assert not np.array_equal(base[1:], second_episode)
+    batch.set_seed(1)
+    assert np.array_equal(batch.begin(told).stock, base[0])
+    assert np.array_equal(batch.play(actions[0], told).stock, base[1])
+
+
+def test_only_marked_worlds_begin_anew():
+    game = presets.game("two_complex")
+    batch = Batch(game, 3, seed=0)
+    told = batch.begin(batch.new_told())
+    for turn in random_actions(30, 3, game):
+        batch.play(turn, told)
+    before, told_before = copied(batch.worlds), copied(told)
+    batch.begin(told, np.array([False, True, False]))
+    assert batch.worlds.step[:, 0].tolist() == [30, 0, 30]
+    assert batch.worlds.episode[:, 0].tolist() == [0, 1, 0]
+    assert_same(batch.worlds, before, rows=[0, 2], other_rows=[0, 2])
+    assert_same(told, told_before, rows=[0, 2], other_rows=[0, 2])
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        ({"worlds": 0}, "worlds is 0"),
+        ({"worlds": 2, "seed": -1}, "seed is -1"),
+        ({"worlds": 2, "first_world": 2**32}, "allowed: 0 to"),
+        ({"worlds": 2, "threads": 0}, "threads is 0"),
+    ],
+)
+def test_a_batch_that_cannot_be_is_refused(arguments, message):
+    with pytest.raises(ValueError, match=message):
+        Batch(presets.game("commons"), **arguments)
+
+
+@pytest.mark.parametrize(
+    ("actions", "message"),
+    [
+        (np.full((2, 4), 8), r"action 8 of agent 0 in world 0 is unknown; allowed: 0 to 7"),
+        (np.array([[0, 0, 0, 0], [0, 0, -1, 0]]), "action -1 of agent 2 in world 1"),
+        (np.zeros((2, 3), np.int64), r"wanted: int64 \(2, 4\)"),
+        (np.zeros((2, 4), np.int32), "int32"),
+    ],
+)
+def test_unknown_actions_raise_and_change_nothing(actions, message):
+    batch = Batch(presets.game("commons"), 2)
+    told = batch.begin(batch.new_told())
+    before, told_before = copied(batch.worlds), copied(told)
+    with pytest.raises(ValueError, match=message):
+        batch.play(actions, told)
+    assert_same(batch.worlds, before)
+    assert_same(told, told_before)
