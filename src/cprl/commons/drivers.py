@@ -49,19 +49,6 @@ def one_told(t: Told, b: int) -> Told:
     )
 
 
-def one_scratch(s: Scratch, thread: int) -> Scratch:
-    """The sheet of one thread."""
-    return Scratch(
-        s.start_row[thread],
-        s.start_col[thread],
-        s.blocked[thread],
-        s.words[thread],
-        s.sprouts[thread],
-        s.picture[thread],
-        s.seen[thread],
-    )
-
-
 def play_worlds(
     worlds: Worlds,
     tables: Tables,
@@ -70,12 +57,10 @@ def play_worlds(
     scratch: Scratch,
     first: int,
     last: int,
-    thread: int,
 ) -> None:
     """One turn of the worlds first .. last - 1; `actions`: int64 [B, N]."""
-    sheet = one_scratch(scratch, thread)
     for b in range(first, last):
-        play_turn(one_world(worlds, b), tables, actions[b], one_told(told, b), sheet)
+        play_turn(one_world(worlds, b), tables, actions[b], one_told(told, b), scratch)
 
 
 def begin_worlds(
@@ -86,13 +71,11 @@ def begin_worlds(
     scratch: Scratch,
     first: int,
     last: int,
-    thread: int,
 ) -> None:
     """The next episode of those of the worlds first .. last - 1 that are marked; `which`: bool [B]."""
-    sheet = one_scratch(scratch, thread)
     for b in range(first, last):
         if which[b]:
-            begin_episode(one_world(worlds, b), tables, one_told(told, b), sheet)
+            begin_episode(one_world(worlds, b), tables, one_told(told, b), scratch)
 
 
 def show_worlds(
@@ -103,12 +86,10 @@ def show_worlds(
     scratch: Scratch,
     first: int,
     last: int,
-    thread: int,
 ) -> None:
     """The whole boards of the worlds first .. last - 1; `boards`: uint8 [B, H, W], colour classes."""
-    sheet = one_scratch(scratch, thread)
     for b in range(first, last):
-        draw_board(one_world(worlds, b), tables, sheet, boards[b])
+        draw_board(one_world(worlds, b), tables, scratch, boards[b])
 
 
 def first_unknown(actions: Actions, known: int) -> int:
@@ -123,7 +104,6 @@ FUNCTIONS = (
     *turn.FUNCTIONS,
     one_world,
     one_told,
-    one_scratch,
     play_worlds,
     begin_worlds,
     show_worlds,

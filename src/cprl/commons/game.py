@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from cprl.commons.chance import REST_BITS, threshold
 from cprl.commons.maps import Map
 from cprl.commons.rules import Norm, Rules
-from cprl.commons.world import COL_STEP, DOWN, LEFT, RIGHT, ROW_STEP, UP, Bools, Ints
+from cprl.commons.world import COL_STEP, DOWN, LEFT, RIGHT, ROW_STEP, UP, Bools, Indices, Ints
 
 GROUND, WALL, APPLE, MARK, BEAM, OTHER, SELF = range(7)
 """Colour classes: what a cell of a picture shows."""
@@ -38,14 +38,14 @@ class Tables(NamedTuple):
 
     background: Ints
     """[cells], the paint of ground or wall; the rim is wall."""
-    site_cell: Ints
-    """[K], the cell of each site."""
+    site_cell: Indices
+    """uint32 [K], the cell of each site."""
     site_at: Ints
     """[cells], the site on each cell, or -1."""
     near_first: Ints
     """[K + 1], where a site's neighbours begin in `near_sites`, and end."""
-    near_sites: Ints
-    """[pairs], the sites within reach of each site, itself left out."""
+    near_sites: Indices
+    """uint32 [pairs], the sites within reach of each site, itself left out."""
     regrow_below: NDArray[np.int64]
     """int64 [most neighbours + 1], an apple grows where a uniform 32-bit word falls below this."""
     regrow_first_byte: Ints
@@ -204,10 +204,10 @@ def _tables(game: Game) -> Tables:
     starts = np.array(board.starts, np.int32).T.copy()
     return Tables(
         background=background.reshape(-1),
-        site_cell=np.array(cells(board.sites), np.int32),
+        site_cell=np.array(cells(board.sites), np.uint32),
         site_at=site_at,
         near_first=np.cumsum([0, *map(len, near)], dtype=np.int32),
-        near_sites=np.array([site for sites in near for site in sites], np.int32),
+        near_sites=np.array([site for sites in near for site in sites], np.uint32),
         regrow_below=below,
         regrow_first_byte=((below - 1) >> REST_BITS).astype(np.int32),
         start_row=starts[0],

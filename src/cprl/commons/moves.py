@@ -130,16 +130,15 @@ def return_to_play(world: Worlds, tables: Tables, scratch: Scratch) -> None:
     nobody waits.
     """
     for i in range(world.row.shape[0]):
-        scratch.blocked[i] = not tables.pairwise_clashes and has_to_wait(world, i)
+        waits = world.in_play[i] or world.out_steps[i] > 0
+        scratch.blocked[i] = waits or (not tables.pairwise_clashes and has_to_wait(world, i))
     for i in range(world.row.shape[0]):
-        if world.out_steps[i] == 0 and not scratch.blocked[i]:
+        if not scratch.blocked[i]:
             world.in_play[i] = True
 
 
 def has_to_wait(world: Worlds, i: int) -> bool:
     """Whether agent i, out of play, finds its cell taken or another before it in the line."""
-    if world.in_play[i]:
-        return False
     for j in range(world.row.shape[0]):
         if j != i and share_a_cell(world, i, j):
             first_in_line = world.out_steps[j] == 0 and world.tagged_step[j] < world.tagged_step[i]

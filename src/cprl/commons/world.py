@@ -13,6 +13,8 @@ from cprl.commons.chance import SITES_PER_DRAW
 Ints: TypeAlias = NDArray[np.int32]
 Bytes: TypeAlias = NDArray[np.uint8]
 Bools: TypeAlias = NDArray[np.bool_]
+Indices: TypeAlias = NDArray[np.uint32]
+"""Unsigned, which spares Numba's test for negative indices."""
 Actions: TypeAlias = NDArray[np.int64]
 Words: TypeAlias = NDArray[np.uint64]
 
@@ -38,8 +40,8 @@ class Worlds(NamedTuple):
     """uint8 [B, K], 1 where an apple hangs."""
     stock_before: Bytes
     """uint8 [B, K], the stock as the turn began; kept only under `picture_shows_old_stock`."""
-    near: Ints
-    """[B, K], apples within reach of each site; follows from `stock`."""
+    near: Indices
+    """uint32 [B, K], apples within reach of each site; follows from `stock`."""
     stock_left: Ints
     """[B, 1], the sum of `stock`."""
     row: Ints
@@ -98,7 +100,7 @@ class Told(NamedTuple):
 
 
 class Scratch(NamedTuple):
-    """Paper to write on during a turn, one sheet per thread: the rules allocate nothing."""
+    """Paper to write on during a turn, a sheet for each thread: the rules allocate nothing."""
 
     start_row: Ints
     """[N], where each agent began the turn."""
@@ -133,7 +135,7 @@ def empty_worlds(*, worlds: int, agents: int, sites: int) -> Worlds:
         number=np.zeros((worlds, 1), np.uint64),
         stock=bytes_(sites),
         stock_before=bytes_(sites),
-        near=ints(sites),
+        near=np.zeros((worlds, sites), np.uint32),
         stock_left=ints(1),
         row=ints(agents),
         col=ints(agents),
@@ -151,23 +153,22 @@ def empty_worlds(*, worlds: int, agents: int, sites: int) -> Worlds:
     )
 
 
-def empty_scratch(*, threads: int, agents: int, sites: int, cells: int, window: int) -> Scratch:
-    """A sheet for each thread."""
+CACHE_LINE_BYTES = 128
+"""Room behind each array of a sheet: threads that write into one line of the cache hinder each other."""
 
-    def ints(length: int) -> Ints:
-        return np.zeros((threads, length), np.int32)
+
+def empty_scratch(*, agents: int, sites: int, cells: int, window: int) -> Scratch:
+    """A sheet for one thread."""
+
+    def room(length: int, dtype: type[np.generic] = np.int32) -> NDArray[Any]:
+        return np.zeros(length + CACHE_LINE_BYTES, dtype)[:length]
 
     return Scratch(
-        start_row=ints(agents),
-        start_col=ints(agents),
-        blocked=np.zeros((threads, agents), np.bool_),
-        words=np.zeros((threads, 4 * -(-sites // SITES_PER_DRAW)), np.int64),
-        sprouts=ints(sites),
-        picture=ints(cells),
-        seen=ints(window),
+        start_row=room(agents),
+        start_col=room(agents),
+        blocked=room(agents, np.bool_),
+        words=room(4 * -(-sites // SITES_PER_DRAW), np.int64),
+        sprouts=room(sites),
+        picture=room(cells),
+        seen=room(window),
     )
-
-
-def shapes(batch: NamedTuple) -> dict[str, tuple[Any, ...]]:
-    """The shape of each array by name, for error messages and tests."""
-    return {name: array.shape for name, array in batch._asdict().items()}

@@ -1,0 +1,85 @@
+"""One independent DQN agent, out of TorchRL's parts."""
+
+from collections.abc import Sequence
+
+import torch
+from tensordict import TensorDictBase
+from torchrl.data import LazyTensorStorage, TensorDictReplayBuffer
+from torchrl.objectives import DQNLoss, HardUpdate, ValueEstimators
+
+from cprl.acting.actors import QActor
+from cprl.acting.networks import QNetwork
+from cprl.learning.settings import DQNSettings
+
+
+class DQNLearner:
+    """A network, its actor, a replay buffer, TorchRL's `DQNLoss` with a target network, and Adam.
+
+    Args:
+        window_shape: (3, X, Y) of a window.
+        actions: how many actions there are.
+        settings: the hyper-parameters; see `presets.learner`.
+        seed: of the replay buffer's sampling. Weights and exploration draw from torch's global generator,
+            as TorchRL's modules do.
+    """
+
+    def __init__(
+        self, window_shape: Sequence[int], actions: int, *, settings: DQNSettings, seed: int = 0
+    ) -> None:
+        self.settings = settings
+        self.network = _network(window_shape, actions, settings)
+        self.actor = QActor(self.network, actions)
+        self.actor.epsilon = settings.epsilon(0)
+        self.loss = DQNLoss(self.actor.greedy, delay_value=True, loss_function="l2", action_space="categorical")
+        self.loss.make_value_estimator(ValueEstimators.TD0, gamma=settings.gamma)
+        # HardUpdate copies at every (interval + 1)-th step, and once when it is made.
+        self._target = HardUpdate(self.loss, value_network_update_interval=settings.target_every_episodes - 1)
+        if settings.own_target_weights:
+            self._give_target(_network(window_shape, actions, settings))
+        self._loss_share = 1 / actions if settings.mean_over_all_outputs else 1.0
+        self._adam = torch.optim.Adam(
+            self.loss.parameters(), lr=settings.learning_rate, eps=settings.adam_eps, fused=True
+        )
+        self.buffer = TensorDictReplayBuffer(
+            storage=LazyTensorStorage(settings.buffer_size),
+            batch_size=settings.batch_size,
+            generator=torch.Generator().manual_seed(seed),
+        )
+        self.steps = 0
+
+    def _give_target(self, network: QNetwork) -> None:
+        """Puts a network's weights into the target network."""
+        weights = dict(network.named_parameters())
+        for path, target in self.loss.target_value_network_params.flatten_keys(".").items():
+            name = next(name for name in weights if path.endswith(name))
+            target.data.copy_(weights[name].data)
+
+    def remember(self, transitions: TensorDictBase) -> None:
+        """Stores transitions, as `transitions_of` gives them; one environment step each."""
+        self.buffer.extend(transitions)
+        self.steps += len(transitions)
+        self.actor.epsilon = self.settings.epsilon(self.steps)
+
+    def learn(self) -> float | None:
+        """One update from a sample; the loss, or None while too little is stored."""
+        if len(self.buffer) < self.settings.learning_starts:
+            return None
+        loss = self.loss(self.buffer.sample())["loss"] * self._loss_share
+        self._adam.zero_grad()
+        loss.backward()
+        self._adam.step()
+        return float(loss.detach())
+
+    def end_episode(self) -> None:
+        """Counts an episode; the target network is replaced after every so many."""
+        self._target.step()
+
+
+def _network(window_shape: Sequence[int], actions: int, settings: DQNSettings) -> QNetwork:
+    return QNetwork(
+        window_shape,
+        actions,
+        hidden_cells=settings.hidden_cells,
+        relu_on_outputs=settings.relu_on_outputs,
+        glorot_uniform=settings.glorot_uniform,
+    )
