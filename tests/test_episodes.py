@@ -1,0 +1,255 @@
+"""EpisodeTracker: whole episodes out of batches of turns."""
+
+import numpy as np
+import pytest
+import torch
+from tensordict import TensorDict
+from torchrl.collectors import Collector
+from torchrl.envs.utils import RandomPolicy
+
+from cprl import CommonsEnv, Game, Map, Rules
+from cprl.measuring import EpisodeTracker, social
+
+GAME = Game(
+    map=Map(height=2, width=4, sites=((0, 0), (0, 1), (1, 3)), starts=((1, 0, 1), (1, 1, 3), (0, 3, 3))),
+    rules=Rules(regrow_prob=(0.0, 0.2), freeze_steps=2, beam_length_cells=2, episode_steps=9),
+)
+
+
+def turn(worlds=1, agents=2, **entries):
+    """A batch of one turn in which nothing happens but what the entries, nested lists [B, ...], say."""
+    flags = {name: torch.zeros(worlds, 1, dtype=torch.bool) for name in ("done", "terminated", "truncated")}
+    two = (worlds, agents, agents)
+    happens = {
+        "reward": torch.zeros(worlds, agents, 1),
+        "harvest": torch.zeros(worlds, agents),
+        "fired": torch.zeros(worlds, agents, dtype=torch.bool),
+        "hit_by": torch.zeros(two, dtype=torch.bool),
+        "tagged_by": torch.zeros(two, dtype=torch.bool),
+    }
+    world = {"stock": torch.ones(worlds, 1, dtype=torch.int64), **flags}
+    in_play = torch.tensor(entries.pop("in_play", [[True] * agents] * worlds))
+    had_ended = torch.tensor(entries.pop("had_ended", [[False]] * worlds))
+    for name, value in entries.items():
+        place = happens if name in happens else world
+        place[name] = torch.tensor(value, dtype=place[name].dtype)
+    return TensorDict(
+        {
+            "agents": TensorDict({"in_play": in_play}, [worlds, agents]),
+            "done": had_ended,
+            "next": TensorDict({**world, "agents": TensorDict(happens, [worlds, agents])}, [worlds]),
+        },
+        [worlds],
+    )
+
+
+def collected(worlds, turns, *, seed=0):
+    """Batches [B, turns] of random play, 60 turns in all."""
+    env = CommonsEnv(GAME, worlds, seed=seed)
+    torch.manual_seed(seed)
+    collector = Collector(
+        env,
+        RandomPolicy(env.action_spec),
+        frames_per_batch=worlds * turns,
+        total_frames=worlds * 60,
+        track_traj_ids=False,
+        auto_register_policy_transforms=False,
+    )
+    batches = [batch.clone() for batch in collector]
+    collector.shutdown()
+    return batches
+
+
+def written_out(episode):
+    """An episode as plain values, to compare."""
+    return {
+        name: value.tolist() if isinstance(value, np.ndarray) else repr(value)
+        for name, value in vars(episode).items()
+    }
+
+
+def all_written_out(tracker, batches):
+    return [written_out(episode) for batch in batches for episode in tracker.add(batch)]
+
+
+def test_an_episode_is_what_we_work_out_by_hand():
+    tracker = EpisodeTracker(1, 2, 10)
+    # Agent 0 fires twice; the first beam crosses agent 1, which is tagged and misses one turn.
+    first = turn(
+        reward=[[[1.0], [0.5]]],
+        harvest=[[1, 0]],
+        fired=[[True, False]],
+        hit_by=[[[False, False], [True, False]]],
+        tagged_by=[[[False, False], [True, False]]],
+    )
+    second = turn(in_play=[[True, False]], fired=[[True, False]], stock=[[0]])
+    third = turn(harvest=[[1, 1]], reward=[[[1.0], [1.0]]], stock=[[0]], done=[[True]], terminated=[[True]])
+    assert tracker.add(first) == []
+    assert tracker.add(second) == []
+    (episode,) = tracker.add(third)
+    told = written_out(episode)
+    metrics = told.pop("metrics")
+    assert told == {
+        "world": "0",
+        "episode": "0",
+        "steps": "3",
+        "terminated": "True",
+        "return_": [2.0, 1.5],
+        "harvest": [2.0, 1.0],
+        "in_play_steps": [3, 2],
+        "shots": [2, 0],
+        "hits": [1, 0],
+        "tagged": [0, 1],
+        "tagged_by": [[0, 0], [1, 0]],
+        "stock_left": "0",
+        "depletion_step": "2",
+    }
+    # collective 3; equality 1 - 2 / (2 * 2 * 3); harvest at steps 1 and 3, and at 3; 5 agent-steps in play
+    assert metrics == repr(
+        {
+            "collective_return": 3.0,
+            "efficiency": 1.0,
+            "equality": 1 - 1 / 6,
+            "sustainability": 2.5,
+            "survival_steps": 3.0,
+            "peace": 5 / 3,
+            "peacefulness": 2.5,
+        }
+    )
+
+
+def test_tagged_by_two_at_once_is_tagged_once():
+    both = [[[False] * 3, [False] * 3, [True, True, False]]]
+    (episode,) = EpisodeTracker(1, 3, 5).add(turn(agents=3, hit_by=both, tagged_by=both, done=[[True]]))
+    assert episode.tagged.tolist() == [0, 0, 1]
+    assert episode.hits.tolist() == [1, 1, 0]
+    assert episode.tagged_by.tolist() == [[0, 0, 0], [0, 0, 0], [1, 1, 0]]
+
+
+def test_a_stock_that_never_ran_out_has_no_depletion_step():
+    (episode,) = EpisodeTracker(1, 2, 5).add(turn(done=[[True]], truncated=[[True]], stock=[[7]]))
+    assert (episode.depletion_step, episode.stock_left, episode.terminated) == (-1, 7, False)
+
+
+def test_each_world_counts_its_own_episodes_and_starts_anew():
+    tracker = EpisodeTracker(2, 2, 5)
+    ended = []
+    for done in ([[True], [False]], [[True], [True]], [[False], [True]]):
+        ended += tracker.add(turn(worlds=2, harvest=[[1, 0], [0, 1]], done=done))
+    assert [(e.world, e.episode, e.steps, e.harvest.tolist()) for e in ended] == [
+        (0, 0, 1, [1, 0]),
+        (0, 1, 1, [1, 0]),
+        (1, 0, 2, [0, 2]),
+        (1, 1, 1, [0, 1]),
+    ]
+
+
+def test_a_world_that_had_ended_ends_no_second_time():
+    tracker = EpisodeTracker(1, 2, 5)
+    assert len(tracker.add(turn(done=[[True]]))) == 1
+    assert tracker.add(turn(done=[[True]], had_ended=[[True]])) == []
+    (episode,) = tracker.add(turn(done=[[True]]))
+    assert (episode.episode, episode.steps) == (1, 1)
+
+
+def test_what_a_collector_yields_is_measured_as_the_whole_episodes_would_be():
+    (batch,) = collected(worlds=3, turns=60)
+    episodes = EpisodeTracker(3, 3, 9).add(batch)
+    assert len(episodes) >= 3 * 6
+    assert any(episode.terminated for episode in episodes)
+    first_step = dict.fromkeys(range(3), 0)
+    for episode in episodes:
+        world, first = episode.world, first_step[episode.world]
+        first_step[world] = end = first + episode.steps
+        root, following = batch[world, first:end], batch["next"][world, first:end]
+        harvest, in_play = following["agents", "harvest"], root["agents", "in_play"]
+        assert following["done"][-1].all()
+        assert following["done"].sum() == 1
+        assert np.array_equal(episode.harvest, harvest.sum(0))
+        assert np.array_equal(episode.in_play_steps, in_play.sum(0))
+        assert np.array_equal(episode.tagged, following["agents", "tagged_by"].any(-1).sum(0))
+        metrics = {name: value.item() for name, value in social.summary(harvest, in_play).items()}
+        assert episode.metrics == pytest.approx(metrics, nan_ok=True)
+
+
+@pytest.mark.parametrize("turns", [1, 7, 20])
+def test_episodes_do_not_depend_on_how_the_turns_are_cut_into_batches(turns):
+    (whole,) = collected(worlds=2, turns=60)
+    pieces = list(whole.split(turns, dim=1))
+    expected = all_written_out(EpisodeTracker(2, 3, 9), [whole])
+    assert all_written_out(EpisodeTracker(2, 3, 9), pieces) == expected
+
+
+def test_a_batch_of_one_turn_needs_no_time_axis():
+    (whole,) = collected(worlds=2, turns=60)
+    expected = all_written_out(EpisodeTracker(2, 3, 9), [whole])
+    assert all_written_out(EpisodeTracker(2, 3, 9), whole.unbind(1)) == expected
+
+
+def test_more_worlds_than_are_measured_at_once_all_come_out():
+    done = [[True]] * 150
+    harvest = [[world % 7, 1] for world in range(150)]
+    episodes = EpisodeTracker(150, 2, 5).add(turn(worlds=150, harvest=harvest, done=done))
+    assert [episode.world for episode in episodes] == list(range(150))
+    assert [episode.metrics["collective_return"] for episode in episodes] == [sum(row) for row in harvest]
+
+
+def test_a_tracker_goes_on_exactly_from_its_state(tmp_path):
+    first, second = collected(worlds=2, turns=30)
+    tracker = EpisodeTracker(2, 3, 9)
+    tracker.add(first[:, :25])
+    torch.save(tracker.state_dict(), tmp_path / "tracker.pt")
+    expected = all_written_out(tracker, [first[:, 25:], second])
+    other = EpisodeTracker(2, 3, 9)
+    other.add(second[:, :4])
+    other.load_state_dict(torch.load(tmp_path / "tracker.pt"))
+    assert all_written_out(other, [first[:, 25:], second]) == expected
+
+
+def test_a_state_is_a_copy():
+    tracker = EpisodeTracker(1, 2, 5)
+    tracker.add(turn(harvest=[[1, 0]]))
+    state = tracker.state_dict()
+    tracker.add(turn(harvest=[[1, 0]]))
+    assert state["steps"].tolist() == [1]
+    assert state["harvest"].tolist() == [[[1, 0]]]
+
+
+def test_an_episode_does_not_change_when_the_next_one_is_played():
+    tracker = EpisodeTracker(1, 2, 5)
+    (episode,) = tracker.add(turn(harvest=[[1, 0]], reward=[[[1.0], [0.0]]], done=[[True]]))
+    before = written_out(episode)
+    tracker.add(turn(harvest=[[1, 1]], reward=[[[1.0], [1.0]]], fired=[[True, True]]))
+    assert written_out(episode) == before
+
+
+def test_a_yield_adds_its_share_to_the_metrics():
+    tracker = EpisodeTracker(1, 2, 5, sustainable_yield=1.5, first_stock=2.5)
+    (episode,) = tracker.add(turn(harvest=[[1, 1]], done=[[True]]))
+    assert episode.metrics["yield_share"] == 0.5
+    assert list(episode.metrics) == [*social.METRICS, "yield_share"]
+
+
+def test_an_episode_longer_than_max_steps_is_refused():
+    tracker = EpisodeTracker(2, 2, 3)
+    for done in ([[True], [False]], [[False], [False]], [[False], [False]]):
+        tracker.add(turn(worlds=2, done=done))
+    with pytest.raises(ValueError, match="the episode of world 1 has not ended after 3 steps"):
+        tracker.add(turn(worlds=2))
+
+
+def test_what_does_not_fit_is_named():
+    tracker = EpisodeTracker(2, 2, 3)
+    with pytest.raises(ValueError, match=r"the batch is \[1\]; \[2\] or \[2, T\] is wanted"):
+        tracker.add(turn(worlds=1))
+    with pytest.raises(ValueError, match=r'"reward" of the batch is \[2, 3, 1\]; \[2, 2, 1\] is wanted'):
+        tracker.add(turn(worlds=2, agents=3))
+    with pytest.raises(ValueError, match="max_steps is 0"):
+        EpisodeTracker(1, 2, 0)
+    with pytest.raises(ValueError, match='"episode" of the state'):
+        tracker.load_state_dict(EpisodeTracker(3, 2, 3).state_dict())
+    longer = EpisodeTracker(2, 2, 9)
+    for _ in range(4):
+        longer.add(turn(worlds=2))
+    with pytest.raises(ValueError, match="the state holds 4 steps; max_steps is 3"):
+        tracker.load_state_dict(longer.state_dict())

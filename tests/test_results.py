@@ -1,0 +1,323 @@
+"""What a run leaves on the disk: its recipe, and a table of episodes that nothing takes away."""
+
+import json
+import os
+import resource
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass, replace
+from enum import Enum
+from pathlib import Path
+
+import numpy as np
+import pyarrow as pa
+import pyarrow.parquet as pq
+import pytest
+import torch
+
+from cprl import Map, Rules, presets
+from cprl.measuring import Episode, social
+from cprl.recording.results import COLUMNS, EpisodeTable, read_episodes
+from cprl.recording.run import start_run, to_jsonable
+
+
+def an_episode(number: int = 0, *, world: int = 0, **metrics: float) -> Episode:
+    """An episode of two agents, told apart by its number."""
+    return Episode(
+        world=world,
+        episode=number,
+        steps=100 + number,
+        terminated=number % 2 == 1,
+        return_=np.array([1.5, -2.0]) + number,
+        harvest=np.array([3.0, 1.0]),
+        in_play_steps=np.array([90, 100]),
+        shots=np.array([7, 0]),
+        hits=np.array([5, 0]),
+        tagged=np.array([0, 2]),
+        tagged_by=np.array([[0, 0], [2, 0]]),
+        stock_left=11,
+        depletion_step=-1,
+        metrics={**dict.fromkeys(social.METRICS, 0.25), "equality": float("nan"), **metrics},
+    )
+
+
+def episode_numbers(table: pa.Table) -> list[int]:
+    """The episodes in a table, having seen that each has the rows of both agents."""
+    assert table["agent"].to_pylist() == [0, 1] * (len(table) // 2)
+    assert table["episode"].to_pylist()[::2] == table["episode"].to_pylist()[1::2]
+    return table["episode"].to_pylist()[::2]
+
+
+@contextmanager
+def full_disk(free_bytes: int, file: Path) -> Iterator[None]:
+    """No file of this process grows beyond the size of that file and so many bytes."""
+    _, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (file.stat().st_size + free_bytes, hard))
+    try:
+        yield
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, (hard, hard))
+
+
+def test_each_agent_of_each_episode_has_a_row(tmp_path):
+    with EpisodeTable(tmp_path / "episodes.parquet") as table:
+        table.add(an_episode(0, world=3))
+        table.add(an_episode(1), an_episode(2), replica=8)
+    told = pq.read_table(tmp_path / "episodes.parquet")
+    assert told.schema == pa.schema([*COLUMNS.items(), *((name, pa.float64()) for name in social.METRICS)])
+    assert len(told) == 6
+    assert told["replica"].to_pylist() == [3, 3, 8, 8, 8, 8]
+    second = told.slice(1, 1).to_pylist()[0]
+    assert np.isnan(second.pop("equality"))
+    assert second == {
+        **dict.fromkeys(set(social.METRICS) - {"equality"}, 0.25),
+        "replica": 3,
+        "episode": 0,
+        "agent": 1,
+        "return": -2.0,
+        "harvest": 1.0,
+        "steps": 100,
+        "in_play_steps": 100,
+        "shots": 0,
+        "hits": 0,
+        "tagged": 2,
+        "stock_left": 11,
+        "depletion_step": -1,
+        "terminated": False,
+    }
+    assert told["terminated"].to_pylist() == [False, False, True, True, False, False]
+
+
+def test_what_was_added_can_be_read_while_the_run_goes_on_and_when_it_is_over(tmp_path):
+    with EpisodeTable(tmp_path / "episodes.parquet") as table:
+        for number in range(3):
+            table.add(an_episode(number))
+            assert episode_numbers(read_episodes(tmp_path)) == list(range(number + 1))
+        going_on = read_episodes(tmp_path)
+    assert [path.name for path in tmp_path.iterdir()] == ["episodes.parquet"]
+    assert str(read_episodes(tmp_path).to_pylist()) == str(going_on.to_pylist())
+
+
+@pytest.mark.filterwarnings("ignore:.*fork.*:DeprecationWarning")
+def test_a_run_killed_at_any_moment_keeps_every_episode_it_added(tmp_path):
+    heard, say = os.pipe()
+    child = os.fork()
+    if child == 0:  # writes until it is killed, and says after each episode that it is added
+        table = EpisodeTable(tmp_path / "episodes.parquet")
+        for number in range(1_000_000):
+            table.add(an_episode(number))
+            os.write(say, b".")
+        os._exit(0)
+    os.close(say)
+    time.sleep(0.15)
+    os.kill(child, signal.SIGKILL)
+    _, status = os.waitpid(child, 0)
+    with os.fdopen(heard, "rb") as pipe:
+        added = len(pipe.read())
+    assert os.WTERMSIG(status) == signal.SIGKILL
+    assert added > 0
+    kept = episode_numbers(read_episodes(tmp_path))
+    assert kept in (list(range(added)), list(range(added + 1)))  # it may die between adding and saying so
+
+
+def test_a_journal_cut_at_any_byte_keeps_every_whole_episode(tmp_path):
+    table = EpisodeTable(tmp_path / "episodes.parquet")
+    sizes = []
+    for number in range(3):
+        table.add(an_episode(number))
+        sizes.append(table.journal.stat().st_size)
+    whole = table.journal.read_bytes()
+    table.close()
+    cut = tmp_path / "cut"
+    cut.mkdir()
+    for size in [*range(0, len(whole), 13), *sizes]:
+        (cut / "episodes.arrows").write_bytes(whole[:size])
+        assert episode_numbers(read_episodes(cut)) == list(range(sum(size >= end for end in sizes))), size
+
+
+def test_a_run_killed_while_it_was_closed_has_no_row_twice(tmp_path):
+    table = EpisodeTable(tmp_path / "episodes.parquet")
+    table.add(an_episode(0), an_episode(1))
+    journal = table.journal.read_bytes()
+    table.close()
+    table.journal.write_bytes(journal)
+    assert episode_numbers(read_episodes(tmp_path)) == [0, 1]
+
+
+def test_a_run_that_crashes_closes_its_table(tmp_path):
+    def crash():
+        with EpisodeTable(tmp_path / "episodes.parquet") as table:
+            table.add(an_episode())
+            raise KeyError("the training")
+
+    with pytest.raises(KeyError, match="the training"):
+        crash()
+    assert len(pq.read_table(tmp_path / "episodes.parquet")) == 2
+
+
+def test_a_full_disk_is_told_and_loses_nothing_that_was_added(tmp_path):
+    table = EpisodeTable(tmp_path / "episodes.parquet")
+    table.add(an_episode(0))
+    with full_disk(700, table.journal), pytest.raises(OSError, match=r"the 2 rows before stay in .*arrows"):
+        table.add(an_episode(1))
+    assert episode_numbers(read_episodes(tmp_path)) == [0]
+    table.add(an_episode(1))
+    table.close()
+    assert episode_numbers(read_episodes(tmp_path)) == [0, 1]
+
+
+def test_a_disk_that_is_full_at_the_end_keeps_the_journal_and_closing_can_be_tried_again(tmp_path):
+    table = EpisodeTable(tmp_path / "episodes.parquet")
+    table.add(an_episode(0))
+    with full_disk(-1000, table.journal), pytest.raises(OSError, match=r"every episode stays in .*arrows"):
+        table.close()
+    assert [path.name for path in tmp_path.iterdir()] == ["episodes.arrows"]
+    assert episode_numbers(read_episodes(tmp_path)) == [0]
+    table.close()
+    assert [path.name for path in tmp_path.iterdir()] == ["episodes.parquet"]
+
+
+def test_a_journal_that_lost_rows_is_never_deleted(tmp_path):
+    table = EpisodeTable(tmp_path / "episodes.parquet")
+    table.add(an_episode(0))
+    table.add(an_episode(1))
+    os.truncate(table.journal, table.journal.stat().st_size - 1)
+    with pytest.raises(OSError, match="holds 2 rows of the 4 that were added"):
+        table.close()
+    assert [path.name for path in tmp_path.iterdir()] == ["episodes.arrows"]
+
+
+@pytest.mark.parametrize("close", [True, False], ids=["finished", "going on"])
+def test_a_table_that_exists_is_not_written_over(tmp_path, close):
+    table = EpisodeTable(tmp_path / "episodes.parquet")
+    table.add(an_episode())
+    if close:
+        table.close()
+    with pytest.raises(FileExistsError, match="exists and is kept"):
+        EpisodeTable(tmp_path / "episodes.parquet")
+    assert len(read_episodes(tmp_path)) == 2
+    table.close()
+
+
+def test_a_run_without_episodes_leaves_an_empty_table(tmp_path):
+    table = EpisodeTable(tmp_path / "episodes.parquet")
+    table.add()
+    assert len(read_episodes(tmp_path)) == 0
+    table.close()
+    assert read_episodes(tmp_path)["equality"].to_pylist() == []
+
+
+def test_a_directory_without_a_table_is_told(tmp_path):
+    with pytest.raises(FileNotFoundError, match="is this a run"):
+        read_episodes(tmp_path)
+
+
+def test_the_metrics_of_a_table_are_those_of_its_first_episode(tmp_path):
+    with EpisodeTable(tmp_path / "episodes.parquet") as table:
+        table.add(an_episode(0, yield_share=0.5))
+        with pytest.raises(ValueError, match=r"the episode has the metrics .* this table has .*yield_share"):
+            table.add(an_episode(1))
+    assert read_episodes(tmp_path)["yield_share"].to_pylist() == [0.5, 0.5]
+
+
+def test_a_run_begins_with_its_recipe(tmp_path, monkeypatch):
+    monkeypatch.setattr(sys, "argv", ["train.py", "--out", "a place"])
+    run = start_run(tmp_path / "deep" / "run", "tragedy", {"seed": 3, "out": tmp_path})
+    told = json.loads((run / "recipe.json").read_text())
+    assert [path.name for path in run.iterdir()] == ["recipe.json"]
+    assert told["recipe"] == "tragedy"
+    assert told["arguments"] == {"seed": 3, "out": str(tmp_path)}
+    assert told["versions"]["torch"] == torch.__version__
+    assert set(told["versions"]) == {
+        "python", "cprl", "torch", "torchrl", "tensordict", "numpy", "numba", "rerun-sdk",
+    }  # fmt: skip
+    assert told["started"].startswith(time.strftime("%Y-"))
+    assert told["command"] == "train.py --out 'a place'"
+
+
+def test_runs_without_a_place_get_one_each(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    runs = {start_run(None, "tragedy", {}) for _ in range(3)}
+    assert len(runs) == 3
+    assert all(run.parent == Path("runs") and run.name.startswith("tragedy-20") for run in runs)
+
+
+def test_a_directory_that_holds_something_is_refused(tmp_path):
+    (tmp_path / "thesis.txt").touch()
+    with pytest.raises(FileExistsError, match="is not empty"):
+        start_run(tmp_path, "tragedy", {})
+    assert [path.name for path in tmp_path.iterdir()] == ["thesis.txt"]
+
+
+def test_a_recipe_that_cannot_be_kept_leaves_no_directory(tmp_path):
+    with pytest.raises(TypeError, match="a Linear cannot be kept"):
+        start_run(tmp_path / "run", "tragedy", {"network": torch.nn.Linear(1, 1)})
+    with pytest.raises(ValueError, match="a name without slashes"):
+        start_run(tmp_path / "run", "../tragedy", {})
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_the_commit_is_kept_and_whether_a_tracked_file_was_changed(tmp_path, monkeypatch):
+    def commit_of_a_run(name):
+        return json.loads((start_run(tmp_path / name, "tragedy", {}) / "recipe.json").read_text())["git"]
+
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setenv("GIT_CEILING_DIRECTORIES", str(tmp_path.parent))
+    assert commit_of_a_run("outside") is None
+    (tmp_path / "map.txt").write_text("A..")
+    me = ["-c", "user.name=me", "-c", "user.email=me@example.org"]
+    for command in (["init", "-q"], ["add", "map.txt"], [*me, "commit", "-q", "-m", "a map"]):
+        subprocess.run(["git", *command], check=True)
+    clean = commit_of_a_run("clean")
+    assert len(clean["commit"]) == 40
+    assert clean["dirty"] is False
+    (tmp_path / "map.txt").write_text("A.A")
+    assert commit_of_a_run("dirty") == {**clean, "dirty": True}
+
+
+class Colour(Enum):
+    RED = "red"
+
+
+@dataclass(frozen=True, kw_only=True)
+class Setting:
+    weights: np.ndarray
+    device: torch.device
+
+
+def test_what_a_recipe_holds_becomes_plain_json():
+    value = {
+        "setting": Setting(weights=np.array([[1.0, np.inf]]), device=torch.device("cpu")),
+        "colour": Colour.RED,
+        "loss": torch.nn.MSELoss,
+        "dtype": torch.float32,
+        "some": (np.int64(3), np.float32(0.5), np.bool_(True), None, float("nan"), frozenset({2, 1})),
+        0: torch.tensor([1, 2]),
+    }
+    plain = to_jsonable(value)
+    assert plain == {
+        "setting": {"weights": [[1.0, "inf"]], "device": "cpu"},
+        "colour": "red",
+        "loss": "torch.nn.modules.loss:MSELoss",
+        "dtype": "torch.float32",
+        "some": [3, 0.5, True, None, "nan", [1, 2]],
+        "0": [1, 2],
+    }
+    assert json.loads(json.dumps(plain, allow_nan=False)) == plain
+
+
+def test_a_function_without_a_name_cannot_be_kept():
+    with pytest.raises(TypeError, match="a function cannot be kept"):
+        to_jsonable(lambda: 0)
+
+
+def test_a_game_can_be_built_again_from_what_was_kept():
+    game = presets.game("commons")
+    game = replace(game, rules=replace(game.rules, freeze_steps=np.array([[1, 2]] * 4)))
+    kept = json.loads(json.dumps(to_jsonable(game)))
+    assert Map(**kept["map"]) == game.map
+    assert Rules(**kept["rules"]) == game.rules

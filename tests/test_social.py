@@ -1,0 +1,172 @@
+"""The social metrics against an episode worked by hand, at their edges, and over episodes at random."""
+
+import math
+
+import pytest
+import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from cprl.measuring import social
+
+# Two agents, four steps.  harvest  in play
+#   step 1                    1 0      yes yes
+#   step 2                    1 1      yes yes
+#   step 3                    0 0      yes no
+#   step 4                    1 0      yes no
+HARVEST = torch.tensor([[1, 0], [1, 1], [0, 0], [1, 0]], dtype=torch.float32)
+IN_PLAY = torch.tensor([[1, 1], [1, 1], [1, 0], [1, 0]], dtype=torch.bool)
+BY_HAND = {
+    "collective_return": 4.0,  # R = 3, 1
+    "efficiency": 1.0,  # 4 apples / 4 steps
+    "equality": 0.75,  # gaps |3-1| + |1-3| = 4; 1 - 4 / (2 * 2 agents * 4 apples)
+    "sustainability": (7 / 3 + 2) / 2,  # agent 0 at steps 1, 2, 4; agent 1 at step 2
+    "survival_steps": 4.0,
+    "peace": 1.5,  # (2 agents * 4 steps - 2 agent-steps out) / 4 steps
+    "peacefulness": 3.0,  # 6 agent-steps in play / 2 agents
+}
+EMPTY = torch.zeros(4, 2)
+
+
+def values(metrics):
+    return {name: value.item() for name, value in metrics.items()}
+
+
+@pytest.mark.parametrize("name", social.METRICS)
+def test_each_metric_is_what_we_work_out_by_hand(name):
+    steps = IN_PLAY if name.startswith("peace") else HARVEST
+    metric = getattr(social, name)(steps)
+    assert metric.item() == pytest.approx(BY_HAND[name], rel=1e-15)
+    assert metric.dtype == torch.float64
+    assert metric.shape == ()
+
+
+def test_a_summary_holds_every_metric_by_its_name():
+    assert values(social.summary(HARVEST, IN_PLAY)) == pytest.approx(BY_HAND)
+    assert tuple(social.summary(HARVEST, IN_PLAY)) == social.METRICS
+
+
+def test_the_yield_share_sets_the_harvest_against_what_the_map_bears():
+    # 4 apples of 0.5 per step * 4 steps + 6 at first = 8
+    share = social.summary(HARVEST, IN_PLAY, sustainable_yield=0.5, first_stock=6)["yield_share"]
+    assert share.item() == 0.5
+
+
+def test_the_yield_share_takes_a_yield_for_each_episode():
+    share = social.yield_share(
+        HARVEST.expand(3, 4, 2),
+        sustainable_yield=torch.tensor([0.0, 0.5, 1.0]),
+        first_stock=torch.tensor([4, 6, 0]),
+    )
+    assert share.tolist() == [1.0, 0.5, 1.0]
+
+
+def test_a_yield_share_of_nothing_is_undefined():
+    assert social.yield_share(HARVEST, sustainable_yield=0, first_stock=0).isnan()
+
+
+def test_without_a_harvest_equality_and_sustainability_are_undefined_and_counted():
+    harvest = torch.stack([HARVEST, EMPTY])
+    assert social.equality(harvest).isnan().tolist() == [False, True]
+    assert social.sustainability(harvest).isnan().tolist() == [False, True]
+    assert social.equality_undefined(harvest).tolist() == [False, True]
+    assert social.agents_without_harvest(harvest).tolist() == [0, 2]
+
+
+def test_an_agent_without_a_harvest_is_left_out_of_sustainability():
+    harvest = HARVEST * torch.tensor([1, 0])
+    assert social.sustainability(harvest).item() == pytest.approx(7 / 3)
+    assert social.agents_without_harvest(harvest).item() == 1
+
+
+def test_an_episode_without_steps_has_no_value_per_step():
+    none = torch.zeros(0, 2)
+    metrics = values(social.summary(none, none.bool()))
+    undefined = {name for name, value in metrics.items() if math.isnan(value)}
+    assert undefined == {"efficiency", "equality", "sustainability", "peace"}
+    assert metrics["survival_steps"] == metrics["peacefulness"] == 0
+
+
+def test_padding_behind_the_end_is_never_read():
+    harvest = torch.cat([HARVEST, torch.full((3, 2), torch.nan)])
+    in_play = torch.cat([IN_PLAY, torch.ones(3, 2, dtype=torch.bool)])
+    played = torch.arange(7) < 4
+    assert values(social.summary(harvest, in_play, played=played)) == pytest.approx(BY_HAND)
+
+
+def test_episodes_of_unlike_length_are_measured_in_one_batch():
+    played = torch.arange(4) < torch.tensor([[4], [2]])
+    both = social.summary(HARVEST.expand(2, 4, 2), IN_PLAY.expand(2, 4, 2), played=played)
+    short = social.summary(HARVEST[:2], IN_PLAY[:2])
+    assert {name: value[0].item() for name, value in both.items()} == pytest.approx(BY_HAND)
+    assert {name: value[1].item() for name, value in both.items()} == values(short)
+
+
+def test_a_long_sum_of_float32_loses_no_apple():
+    harvest = torch.full((3, 1), 2.0**24)
+    harvest[1:] = 1  # a float32 sum would stay at 2**24
+    assert social.collective_return(harvest).item() == 2**24 + 2
+
+
+episodes = st.tuples(st.integers(1, 12), st.integers(1, 5), st.integers(0, 2**32 - 1))
+
+
+@settings(max_examples=60, deadline=None)
+@given(episodes)
+def test_metrics_stay_in_their_ranges(episode):
+    steps, agents, seed = episode
+    chance = torch.Generator().manual_seed(seed)
+    harvest = (torch.rand(steps, agents, generator=chance) < 0.2).float()
+    in_play = torch.rand(steps, agents, generator=chance) < 0.7
+    metrics = values(social.summary(harvest, in_play))
+    assert 0 <= metrics["peace"] <= agents
+    assert 0 <= metrics["peacefulness"] <= steps
+    assert metrics["efficiency"] * steps == pytest.approx(harvest.sum().item())
+    if social.equality_undefined(harvest):
+        assert math.isnan(metrics["equality"])
+    else:
+        assert 1 / agents - 1e-12 <= metrics["equality"] <= 1
+        assert 1 <= metrics["sustainability"] <= steps
+
+
+@given(st.permutations(range(4)))
+@settings(max_examples=10, deadline=None)
+def test_agents_numbers_do_not_matter(order):
+    harvest = torch.tensor([[1.0, 0, 0, 1], [1, 1, 0, 0], [1, 0, 0, 1]])
+    in_play = harvest > 0
+    shuffled = social.summary(harvest[:, order], in_play[:, order])
+    assert values(shuffled) == pytest.approx(values(social.summary(harvest, in_play)))
+
+
+def test_equality_is_one_when_all_have_the_same_and_one_nth_when_one_has_all():
+    assert social.equality(torch.ones(5, 3)).item() == 1
+    assert social.equality(torch.tensor([[1.0, 0, 0, 0]])).item() == pytest.approx(1 / 4)
+
+
+@pytest.mark.parametrize(
+    ("harvest", "played", "error", "message"),
+    [
+        (HARVEST.int(), None, TypeError, "harvest is a tensor of torch.int32; float is wanted"),
+        (HARVEST.numpy(), None, TypeError, "harvest is a ndarray; a torch tensor of float is wanted"),
+        (HARVEST[0], None, ValueError, r"harvest is \[2\]; \[..., T, N\]"),
+        (HARVEST[:, :0], None, ValueError, "at least one agent"),
+        (-HARVEST, None, ValueError, "below 0"),
+        (HARVEST, torch.ones(4), TypeError, "played is a tensor of torch.float32; bool is wanted"),
+        (HARVEST, torch.ones(5, dtype=torch.bool), ValueError, r"played is wanted as \[4\]"),
+        (HARVEST, torch.tensor([True, False, True, False]), ValueError, "turns True again"),
+    ],
+)
+def test_what_does_not_fit_is_named(harvest, played, error, message):
+    with pytest.raises(error, match=message):
+        social.equality(harvest, played=played)
+
+
+def test_a_summary_names_what_does_not_fit_together():
+    with pytest.raises(TypeError, match=r"in_play is a tensor of .*; bool is wanted"):
+        social.summary(HARVEST, HARVEST)
+    with pytest.raises(ValueError, match=r"harvest is \[4, 2\] and in_play \[3, 2\]"):
+        social.summary(HARVEST, IN_PLAY[:3])
+    with pytest.raises(ValueError, match="both sustainable_yield and first_stock"):
+        social.summary(HARVEST, IN_PLAY, first_stock=3)
+    with pytest.raises(ValueError, match="first_stock is -1"):
+        social.summary(HARVEST, IN_PLAY, sustainable_yield=1, first_stock=-1)
