@@ -2,6 +2,7 @@
 
 import itertools
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -10,6 +11,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from cprl import Game, Map, Rules, presets
+from cprl.commons import compiled
 from cprl.commons.batch import Batch
 from cprl.commons.game import neighbours
 
@@ -223,3 +225,19 @@ def test_unknown_actions_raise_and_change_nothing(actions, message):
         batch.play(actions, told)
     assert_same(batch.worlds, before)
     assert_same(told, told_before)
+
+
+def test_rules_that_cannot_be_kept_on_disk_bring_a_warning(tmp_path):
+    blocked = tmp_path / "file"
+    blocked.write_text("")
+    with pytest.warns(RuntimeWarning, match=r"cannot be kept in .*; set CPRL_CACHE"):
+        assert not compiled._can_write(blocked / "folder")
+
+
+def test_a_changed_rule_is_another_folder_of_compiled_rules(tmp_path, monkeypatch):
+    for source in Path(compiled.__file__).parent.glob("*.py"):
+        (tmp_path / source.name).write_bytes(source.read_bytes())
+    monkeypatch.setattr(compiled, "__file__", str(tmp_path / "compiled.py"))
+    before = compiled._fingerprint()
+    (tmp_path / "moves.py").write_text((tmp_path / "moves.py").read_text() + "\n")
+    assert compiled._fingerprint() != before

@@ -11,7 +11,7 @@ from torchrl.data import Categorical
 from torchrl.modules import EGreedyModule, QValueActor
 
 
-class QActor(TensorDictSequential):  # type: ignore[misc]
+class QActor(TensorDictSequential):
     """TorchRL's `QValueActor` followed by its `EGreedyModule`.
 
     Args:
@@ -43,7 +43,7 @@ class QActor(TensorDictSequential):  # type: ignore[misc]
         self.module[1].eps.fill_(chance)
 
 
-class RandomActor(TensorDictModuleBase):  # type: ignore[misc]
+class RandomActor(TensorDictModuleBase):
     """Every action is equally likely, whatever is seen.
 
     Args:

@@ -10,7 +10,7 @@ from torch import nn
 from cprl import keys
 
 
-class Seats(TensorDictModuleBase):  # type: ignore[misc]
+class Seats(TensorDictModuleBase):
     """Lets actor i see the window of agent i alone, and puts the actions together.
 
     Args:

@@ -2,8 +2,9 @@
 
 import hashlib
 import os
+import warnings
 from collections.abc import Callable, Iterable
-from functools import cache
+from functools import cache, partial
 from pathlib import Path
 from types import FunctionType
 from typing import Any
@@ -29,12 +30,12 @@ def compiled(functions: Iterable[Any], jit: Callable[[FunctionType], Callable[..
     return ready
 
 
-def _jit_for_cpu(function: FunctionType) -> Callable[..., Any]:
+def _jit_for_cpu(function: FunctionType, *, keep: bool) -> Callable[..., Any]:
     """Numba for a CPU thread. `_nrt=False` refuses any allocation inside a rule, and spares the counting
     of references to the many arrays handed on, which would take fifty times as long as the game."""
     options: dict[str, Any] = {"nogil": True, "error_model": "numpy", "_nrt": False}
     if function.__name__ in CALLED_FROM_PYTHON:
-        options |= {"cache": True}
+        options |= {"cache": keep}
     else:
         options |= {"forceinline": True, "no_cpython_wrapper": True, "no_cfunc_wrapper": True}
     return numba.njit(**options)(function)
@@ -47,12 +48,32 @@ def rules_for_cpu() -> Compiled:
     Numba's own cache looks only at the file of the function called, and would miss a change in a rule that
     it calls; so the folder is named after the text of all rules.
     """
+    folder = _cache_folder() / _fingerprint()
+    keep = _can_write(folder)
     usual = numba_settings.CACHE_DIR
-    numba_settings.CACHE_DIR = str(_cache_folder() / _fingerprint())
+    numba_settings.CACHE_DIR = str(folder)
     try:
-        return compiled(FUNCTIONS, _jit_for_cpu)
+        return compiled(FUNCTIONS, partial(_jit_for_cpu, keep=keep))
     finally:
         numba_settings.CACHE_DIR = usual
+
+
+def _can_write(folder: Path) -> bool:
+    """Whether compiled rules can be kept there; if not, a warning says what that costs."""
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        if os.access(folder, os.W_OK):
+            return True
+        reason = "it is not writable"
+    except OSError as error:
+        reason = str(error)
+    warnings.warn(
+        f"the compiled rules cannot be kept in {folder} ({reason}): every process compiles them anew, about "
+        "ten seconds; set CPRL_CACHE to a folder that can be written",
+        RuntimeWarning,
+        stacklevel=2,
+    )
+    return False
 
 
 def _cache_folder() -> Path:

@@ -14,8 +14,8 @@ def transitions_of(agent: int, batch: TensorDictBase) -> TensorDict:
 
     Returns:
         A flat TensorDict [transitions] of "observation" uint8 [.., 3, X, Y], "action" int64 [..] and "next":
-        "observation", "reward" float32 [.., 1], "done", "terminated", "truncated" bool [.., 1]. Turns that the
-        agent spends out of play are transitions too, with the action that it chose, as in the study.
+        "observation", "reward" float32 [.., 1], "done", "terminated", "truncated" bool [.., 1].
+        Turns that the agent spends out of play are transitions too, with the action that it chose.
     """
     before, after = batch.get(keys.AGENTS), batch.get("next")
     agents_after = after.get(keys.AGENTS)

@@ -1,0 +1,19 @@
+"""What is kept of a run: its recipe, its table of episodes, its recording, figures and weights."""
+
+from cprl.recording.figures import training_curve
+from cprl.recording.progress import ProgressBar
+from cprl.recording.results import EpisodeTable, read_episodes
+from cprl.recording.run import start_run
+from cprl.recording.summary import summarise
+from cprl.recording.weights import load_weights, save_weights
+
+__all__ = [
+    "EpisodeTable",
+    "ProgressBar",
+    "load_weights",
+    "read_episodes",
+    "save_weights",
+    "start_run",
+    "summarise",
+    "training_curve",
+]

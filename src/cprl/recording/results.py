@@ -6,7 +6,7 @@ no footer. `EpisodeTable.close` turns the journal into `episodes.parquet`; `read
 """
 
 import os
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from errno import EIO
 from io import FileIO
 from pathlib import Path
@@ -16,6 +16,7 @@ from typing import Any, Final, Self
 import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
+from tensordict import TensorDictBase
 
 from cprl.measuring import Episode, social
 
@@ -79,6 +80,13 @@ class EpisodeTable:
         rows = _rows(episodes, replica, self._schema)
         self._write(rows.serialize())
         self._rows += rows.num_rows
+
+    def see_turn(self, batch: TensorDictBase) -> None:
+        """Nothing: a table keeps whole episodes. An observer of `cprl.train`, as `see_episode` is."""
+
+    def see_episode(self, episode: Episode, learning: Mapping[str, float]) -> None:
+        """Adds an episode."""
+        self.add(episode)
 
     def close(self) -> None:
         """Turns the journal into the parquet file. A second call does nothing."""

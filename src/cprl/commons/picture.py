@@ -1,0 +1,100 @@
+"""The board for people: apples, walls, and every agent in its own colour, with its heading."""
+
+from colorsys import hsv_to_rgb
+from typing import Final
+
+import numpy as np
+
+from cprl.commons.game import APPLE, GROUND, WALL, Game
+from cprl.commons.maps import Map
+from cprl.commons.world import COL_STEP, ROW_STEP, Bytes, Ints
+
+GRID_COLOUR: Final = (28, 30, 36)
+CELL_COLOURS: Final = {GROUND: (16, 18, 22), WALL: (125, 125, 125), APPLE: (46, 184, 76)}
+AGENT_COLOURS: Final = (
+    (86, 156, 255),
+    (255, 92, 92),
+    (255, 201, 60),
+    (186, 110, 255),
+    (64, 214, 200),
+    (255, 140, 40),
+    (255, 130, 200),
+    (200, 220, 90),
+)
+
+
+def agent_colour(agent: int) -> tuple[int, int, int]:
+    """An agent's identity colour, 0..255: eight that are easily told apart, then hues in between."""
+    if agent < len(AGENT_COLOURS):
+        return AGENT_COLOURS[agent]
+    red, green, blue = hsv_to_rgb(agent * 0.618034 % 1, 0.65, 1.0)
+    return round(255 * red), round(255 * green), round(255 * blue)
+
+
+def board_image(
+    board: Map,
+    stock: Bytes,
+    row: Ints,
+    col: Ints,
+    heading: Ints,
+    *,
+    cell_pixels: int = 24,
+) -> Bytes:
+    """A picture of one world.
+
+    Args:
+        board: where walls and sites are.
+        stock: uint8 [K], 1 where an apple hangs.
+        row: int [agents shown], and so are col and heading; agents out of play are left out by the caller.
+        col: see row.
+        heading: 0 up, 1 right, 2 down, 3 left.
+        cell_pixels: pixels across a cell, at least 8.
+
+    Returns:
+        uint8 [H * cell_pixels + 1, W * cell_pixels + 1, 3], RGB.
+    """
+    if cell_pixels < 8:
+        raise ValueError(f"cell_pixels is {cell_pixels}; at least 8 is wanted")
+    size = cell_pixels
+    image = np.empty((board.height * size + 1, board.width * size + 1, 3), np.uint8)
+    image[:] = GRID_COLOUR
+    kinds = np.full((board.height, board.width), GROUND)
+    for cell in board.walls:
+        kinds[cell] = WALL
+    for cell, apple in zip(board.sites, stock, strict=True):
+        kinds[cell] = APPLE if apple else GROUND
+    for r in range(board.height):
+        for c in range(board.width):
+            kind = int(kinds[r, c])
+            inset = size // 6 if kind == APPLE else 0
+            image[r * size + 1 : (r + 1) * size, c * size + 1 : (c + 1) * size] = CELL_COLOURS[GROUND]
+            _fill(image, r, c, size, inset, CELL_COLOURS[kind])
+    for i, (r, c, h) in enumerate(zip(row, col, heading, strict=True)):
+        _draw_agent(image, int(r), int(c), int(h), size, agent_colour(i))
+    return image
+
+
+def first_image(game: Game, *, cell_pixels: int = 24) -> Bytes:
+    """The board of a game as an episode begins; see `board_image`."""
+    starts = np.array(game.map.starts, np.int32)
+    full = np.ones(len(game.map.sites), np.uint8)
+    return board_image(game.map, full, *starts.T, cell_pixels=cell_pixels)
+
+
+def _fill(image: Bytes, r: int, c: int, size: int, inset: int, colour: tuple[int, int, int]) -> None:
+    top, left = r * size + 1 + inset, c * size + 1 + inset
+    image[top : (r + 1) * size - inset, left : (c + 1) * size - inset] = colour
+
+
+def _draw_agent(image: Bytes, r: int, c: int, heading: int, size: int, colour: tuple[int, int, int]) -> None:
+    """A square with a triangle of white that points where the agent looks."""
+    _fill(image, r, c, size, 1, colour)
+    middle = size // 2
+    for away in range(size // 2 - 2):
+        half = (size // 2 - 2 - away) // 2
+        row = r * size + middle + ROW_STEP[heading] * away
+        col = c * size + middle + COL_STEP[heading] * away
+        if ROW_STEP[heading]:
+            image[row, col - half : col + half + 1] = 255
+        else:
+            image[row - half : row + half + 1, col] = 255

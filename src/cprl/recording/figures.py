@@ -1,0 +1,57 @@
+"""Figures of a run, drawn from its table of episodes alone."""
+
+from pathlib import Path
+
+import numpy as np
+from matplotlib.figure import Figure
+from numpy.typing import NDArray
+
+from cprl.measuring.episodes import Episode
+from cprl.measuring.evaluate import mean_return
+from cprl.recording.results import read_episodes
+
+SMOOTHED_EPISODES = 100
+"""The study's curves are running means over about so many episodes, drawn at the first of them."""
+
+
+def running_mean(values: NDArray[np.float64], window: int) -> NDArray[np.float64]:
+    """Means over `window` values in a row, [len - window + 1]; over all of them if there are fewer."""
+    window = min(window, len(values))
+    sums = np.cumsum(np.concatenate([[0.0], values]))
+    means: NDArray[np.float64] = (sums[window:] - sums[:-window]) / window
+    return means
+
+
+def training_curve(
+    run: Path, *, title: str, random: list[Episode] | None = None, smoothed: int = SMOOTHED_EPISODES
+) -> Path:
+    """Draws the collective return of every episode of a run, and its running mean.
+
+    Args:
+        run: the run's directory.
+        title: what was run, with its schedule.
+        random: episodes of the random policy, whose mean return becomes a dashed line.
+        smoothed: episodes that the running mean covers, drawn at the first of them as in the study.
+
+    Returns:
+        The PNG, `figures/training_curve.png` of the run.
+    """
+    table = read_episodes(run).select(["replica", "episode", "return"]).to_pydict()
+    episodes = np.array(table["episode"])
+    returns = np.zeros(int(episodes.max()) + 1)
+    np.add.at(returns, episodes, table["return"])
+    figure = Figure(figsize=(8, 4.5), layout="constrained")
+    axes = figure.add_subplot()
+    axes.plot(returns, color="#9ecae1", linewidth=0.8, label="each episode")
+    window = min(smoothed, max(1, len(returns) // 5))
+    mean = running_mean(returns, window)
+    axes.plot(mean, color="#08519c", linewidth=2, label=f"mean of {window} episodes from here")
+    if random:
+        level, _ = mean_return(random)
+        axes.axhline(level, color="#636363", linestyle="--", label=f"random policy, {level:.1f}")
+    axes.set(title=title, xlabel="episode", ylabel="collective return, apples", ylim=(0, None))
+    axes.legend(loc="lower right")
+    path = run / "figures" / "training_curve.png"
+    path.parent.mkdir(exist_ok=True)
+    figure.savefig(path, dpi=120)
+    return path

@@ -1,0 +1,161 @@
+"""One DQN agent: what it stores, its target worked by hand, its clock and its target network."""
+
+from dataclasses import replace
+
+import pytest
+import torch
+from boards import random_actions
+from tensordict import TensorDict
+
+from cprl import CommonsEnv, Game, Rules, keys, maps, presets
+from cprl.learning import DQNLearner, DQNSettings, transitions_of
+
+SHORT = Game(
+    map=maps.parse(".A>.A\n.A.A.\n..<.A"),
+    rules=Rules(regrow_prob=(0.0, 0.1), window_rows=3, window_columns=5, episode_steps=9),
+)
+
+
+def learner(**changes):
+    settings = replace(DQNSettings(buffer_size=100, learning_rate=1e-3), **changes)
+    return DQNLearner((3, 2, 3), 4, settings=settings, seed=0)
+
+
+def transitions(count, *, reward=0.0, terminated=False, truncated=False):
+    def flag(value):
+        return torch.full((count, 1), value)
+
+    following = {
+        "observation": torch.randint(256, (count, 3, 2, 3), dtype=torch.uint8),
+        "reward": torch.full((count, 1), reward),
+        "terminated": flag(terminated),
+        "truncated": flag(truncated),
+        "done": flag(terminated or truncated),
+    }
+    return TensorDict(
+        {
+            "observation": torch.randint(256, (count, 3, 2, 3), dtype=torch.uint8),
+            "action": torch.randint(4, (count,)),
+            "next": TensorDict(following, (count,)),
+        },
+        (count,),
+    )
+
+
+def test_the_transitions_of_an_agent_are_its_own_under_torchrls_default_keys():
+    env = CommonsEnv(SHORT, 2)
+    turns = env.rollout(12, break_when_any_done=False)
+    flat = transitions_of(1, turns)
+    assert flat.batch_size == (24,)
+    assert torch.equal(flat["observation"], turns[keys.OBSERVATION][:, :, 1].flatten(0, 1))
+    assert torch.equal(flat["action"], turns[keys.ACTION][:, :, 1].flatten())
+    assert torch.equal(flat["next", "reward"], turns["next", "agents", "reward"][:, :, 1].flatten(0, 1))
+    assert torch.equal(flat["next", "truncated"], turns["next", "truncated"].flatten(0, 1))
+    assert flat["observation"].dtype == torch.uint8
+
+
+@pytest.mark.parametrize(
+    ("ending", "bootstraps"), [({}, 1.0), ({"truncated": True}, 1.0), ({"terminated": True}, 0.0)]
+)
+def test_the_clock_running_out_is_no_end_for_the_target_but_depletion_is(ending, bootstraps):
+    # target = r + gamma max_a Q'(s', a), without the second term behind a terminal state;
+    # loss = mean (Q - target)^2
+    agent, batch = learner(), transitions(8, reward=1.0, **ending)
+    with torch.no_grad():
+        value = agent.network(batch["observation"]).gather(-1, batch["action"][:, None])[:, 0]
+        best = agent.network(batch["next", "observation"]).amax(-1)
+        by_hand = ((value - (1.0 + bootstraps * 0.995 * best)) ** 2).mean()
+    assert agent.loss(batch)["loss"].item() == pytest.approx(by_hand.item(), rel=1e-5)
+
+
+def test_learning_starts_at_the_stored_transitions_of_the_settings():
+    agent = learner(learning_starts=16)
+    agent.remember(transitions(15))
+    assert agent.learn() is None
+    agent.remember(transitions(1))
+    assert agent.learn() > 0
+
+
+def test_as_run_the_loss_is_averaged_over_all_outputs():
+    losses = []
+    for over_all in (False, True):
+        torch.manual_seed(1)
+        agent = learner(mean_over_all_outputs=over_all)
+        agent.remember(transitions(16, reward=1.0))
+        losses.append(agent.learn())
+    assert losses[1] == pytest.approx(losses[0] / 4)
+
+
+def target_weights(agent):
+    return torch.cat([w.data.flatten() for w in agent.loss.target_value_network_params.values(True, True)])
+
+
+def own_weights(agent):
+    return torch.cat([w.data.flatten() for w in agent.loss.value_network_params.values(True, True)])
+
+
+def test_the_target_network_starts_as_a_copy_and_as_run_with_weights_of_its_own():
+    copy = learner()
+    assert torch.equal(target_weights(copy), own_weights(copy))
+    own = learner(own_target_weights=True)
+    assert not torch.equal(target_weights(own), own_weights(own))
+
+
+@pytest.mark.parametrize("own_target_weights", [False, True])
+def test_the_target_network_is_replaced_after_every_third_episode(own_target_weights):
+    agent = learner(target_every_episodes=3, own_target_weights=own_target_weights)
+    agent.remember(transitions(16, reward=1.0))
+    copied = []
+    for _ in range(7):
+        agent.learn()
+        agent.end_episode()
+        copied.append(torch.equal(target_weights(agent), own_weights(agent)))
+    assert copied == [False, False, True, False, False, True, False]
+
+
+def test_the_target_network_can_go_by_steps():
+    agent = learner(target_every_steps=2)
+    agent.remember(transitions(16))
+    copied = []
+    for _ in range(4):
+        agent.learn()
+        agent.remember(transitions(1))
+        agent.end_episode()
+        copied.append(torch.equal(target_weights(agent), own_weights(agent)))
+    assert copied == [True, False, True, False]
+
+
+def test_the_actor_follows_the_learner_and_epsilon_its_steps():
+    agent = learner(epsilon_hold_steps=10, epsilon_decay_steps=100)
+    assert agent.actor.epsilon == 1.0
+    agent.remember(transitions(60))
+    assert agent.actor.epsilon == pytest.approx(0.55)
+    window = transitions(1)["observation"]
+    before = agent.actor.greedy(TensorDict({"observation": window}, (1,)))["action_value"].clone()
+    for _ in range(20):
+        agent.learn()
+    after = agent.actor.greedy(TensorDict({"observation": window}, (1,)))["action_value"]
+    assert not torch.equal(before, after)
+
+
+def test_the_same_seed_learns_the_same():
+    def weights(seed):
+        torch.manual_seed(seed)
+        agent = DQNLearner(SHORT.window_shape, 8, settings=DQNSettings(buffer_size=100), seed=seed)
+        env = CommonsEnv(SHORT, 1, seed=seed)
+        moment = env.reset()
+        for turn in torch.as_tensor(random_actions(40, 1, SHORT)):
+            now, moment = env.step_and_maybe_reset(moment.set(keys.ACTION, turn))
+            agent.remember(transitions_of(0, now[None]))
+            agent.learn()
+        return own_weights(agent)
+
+    assert torch.equal(weights(0), weights(0))
+    assert not torch.equal(weights(0), weights(1))
+
+
+def test_the_published_learner_learns_from_presets():
+    game = presets.game("single_basic", variant="as_run")
+    settings = presets.learner("single_basic", variant="as_run")
+    agent = DQNLearner(game.window_shape, len(game.actions), settings=settings)
+    assert agent.network(torch.zeros(1, *game.window_shape, dtype=torch.uint8)).shape == (1, 7)

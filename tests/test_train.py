@@ -1,0 +1,123 @@
+"""The loop, and evaluation: whoever watches is told of every turn and every episode."""
+
+import numpy as np
+import pytest
+import torch
+
+from cprl import CommonsEnv, Game, Rules, maps
+from cprl.acting import RandomActor, Seats
+from cprl.learning import DQNLearner, DQNSettings
+from cprl.measuring.evaluate import evaluate, mean_return
+from cprl.recording import EpisodeTable, read_episodes
+from cprl.train import train
+
+GAME = Game(
+    map=maps.parse(".A>.A\n.A.A.\n..<.A"),
+    rules=Rules(regrow_prob=(0.0, 0.1), window_rows=3, window_columns=5, episode_steps=9),
+)
+
+
+class Witness:
+    def __init__(self):
+        self.turns, self.episodes, self.learning = [], [], []
+
+    def see_turn(self, batch):
+        self.turns.append(batch)
+
+    def see_episode(self, episode, learning):
+        self.episodes.append(episode)
+        self.learning.append(dict(learning))
+
+
+def learner(seed=0):
+    return DQNLearner(GAME.window_shape, 8, settings=DQNSettings(buffer_size=200), seed=seed)
+
+
+def test_observers_see_every_turn_and_every_episode_and_the_learner_learns_once_a_turn():
+    witness, agent = Witness(), learner()
+    train(CommonsEnv(GAME), {0: agent}, others={1: RandomActor(8)}, episodes=5, observers=[witness])
+    assert len(witness.turns) == agent.steps == sum(episode.steps for episode in witness.episodes)
+    assert [episode.episode for episode in witness.episodes] == [0, 1, 2, 3, 4]
+    assert set(witness.learning[-1]) == {"agent_0/loss", "agent_0/epsilon"}
+    assert np.isfinite(witness.learning[-1]["agent_0/loss"])
+    harvest = sum(float(turn["next", "agents", "harvest"].sum()) for turn in witness.turns)
+    assert harvest == sum(episode.harvest.sum() for episode in witness.episodes)
+
+
+def test_two_learners_sit_side_by_side_and_each_stores_its_own_turns():
+    learners = {0: learner(0), 1: learner(1)}
+    train(CommonsEnv(GAME), learners, episodes=2)
+    first, second = (learners[agent].buffer[:]["observation"] for agent in (0, 1))
+    assert len(first) == len(second) == learners[0].steps
+    assert not torch.equal(first, second)
+
+
+def test_training_again_with_the_same_seeds_gives_the_same_episodes():
+    def returns():
+        torch.manual_seed(3)
+        witness = Witness()
+        train(CommonsEnv(GAME, seed=3), {0: learner(3), 1: learner(4)}, episodes=4, observers=[witness])
+        return [episode.return_.tolist() for episode in witness.episodes]
+
+    assert returns() == returns()
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        ({"others": {}}, r"sit at \[0\]; the game has the seats \[0, 1\]"),
+        ({"others": {0: RandomActor(8), 1: RandomActor(8)}}, r"sit at \[0, 0, 1\]"),
+        ({"others": {1: RandomActor(8)}, "episodes": 0}, "episodes is 0"),
+    ],
+)
+def test_what_cannot_be_trained_is_refused(arguments, message):
+    with pytest.raises(ValueError, match=message):
+        train(CommonsEnv(GAME), {0: learner()}, **{"episodes": 1, **arguments})
+
+
+def test_one_world_is_trained_at_a_time():
+    with pytest.raises(ValueError, match="has 2 worlds"):
+        train(CommonsEnv(GAME, 2), {0: learner()}, others={1: RandomActor(8)}, episodes=1)
+
+
+def test_what_was_played_before_an_interruption_is_kept(tmp_path):
+    class Interrupting(Witness):
+        def see_episode(self, episode, learning):
+            super().see_episode(episode, learning)
+            if len(self.episodes) == 3:
+                raise KeyboardInterrupt
+
+    seats = {1: RandomActor(8)}
+    table = EpisodeTable(tmp_path / "episodes.parquet")
+    with pytest.raises(KeyboardInterrupt), table:
+        train(CommonsEnv(GAME), {0: learner()}, others=seats, episodes=9, observers=[table, Interrupting()])
+    assert read_episodes(tmp_path)["episode"].to_pylist() == [0, 0, 1, 1, 2, 2]
+
+
+def test_evaluation_plays_one_episode_in_every_world_and_changes_no_seed():
+    state = torch.get_rng_state()
+    episodes = evaluate(CommonsEnv(GAME, 7, seed=1), Seats([RandomActor(8), RandomActor(8, seed=1)]))
+    assert [episode.world for episode in episodes] == list(range(7))
+    assert {episode.steps for episode in episodes} <= set(range(1, 10))
+    assert torch.equal(torch.get_rng_state(), state)
+    mean, error = mean_return(episodes)
+    returns = [episode.return_.sum() for episode in episodes]
+    assert mean == pytest.approx(np.mean(returns))
+    assert error == pytest.approx(np.std(returns, ddof=1) / 7**0.5)
+
+
+def test_evaluation_explores_only_if_asked():
+    agent = learner()
+    agent.actor.epsilon = 1.0
+    seats = Seats([agent.actor, RandomActor(8)])
+
+    def actions(explore):
+        env = CommonsEnv(GAME, 1, seed=1)
+        seen = []
+        step = env.step
+        env.step = lambda td: seen.append(int(td["agents", "action"][0, 0])) or step(td)
+        evaluate(env, seats, explore=explore)
+        return seen
+
+    assert actions(explore=False) == actions(explore=False)
+    assert len(set(actions(explore=True))) > 2
