@@ -62,7 +62,7 @@ class CommonsEnv(EnvBase):
         self._agents_size = torch.Size([worlds, game.agents])
         self._with_state = state
         self._colours = torch.tensor(COLOURS, dtype=torch.uint8)
-        self._tensors, self._told = self._fresh()
+        self._tensors, self.told = self._fresh()
         self._make_specs()
 
     def _make_specs(self) -> None:
@@ -121,7 +121,7 @@ class CommonsEnv(EnvBase):
             agents["reward"] = reward
         entries: dict[str, Any] = {name: tensors[name] for name in (*_WORLD_ENTRIES, *_DONE_ENTRIES)}
         if self._with_state:
-            boards = torch.from_numpy(self.batch.boards(self._told))
+            boards = torch.from_numpy(self.batch.boards(self.told))
             entries[keys.STATE] = self._colours[boards.long()].permute(0, 3, 1, 2)
         entries[keys.AGENTS] = TensorDict._new_unsafe(
             agents, batch_size=self._agents_size, device=self.device
@@ -140,20 +140,20 @@ class CommonsEnv(EnvBase):
     def _begin(self, which: Tensor | None) -> dict[str, Tensor]:
         """Begins the next episode of the marked worlds (bool [B, 1]; None for all), in fresh tensors."""
         before = self._tensors
-        self._tensors, self._told = self._fresh()
+        self._tensors, self.told = self._fresh()
         if which is None:
-            self.batch.begin(self._told)
+            self.batch.begin(self.told)
         else:
             for name, tensor in self._tensors.items():
                 tensor.copy_(before[name])
-            self.batch.begin(self._told, which.reshape(-1).numpy())
+            self.batch.begin(self.told, which.reshape(-1).numpy())
         return self._tensors
 
     def _step(self, tensordict: TensorDictBase) -> TensorDict:
         actions = tensordict.get(keys.AGENTS).get("action").contiguous().numpy()
         self.batch.check(actions)
-        self._tensors, self._told = self._fresh()
-        self.batch.play_checked(actions, self._told)
+        self._tensors, self.told = self._fresh()
+        self.batch.play_checked(actions, self.told)
         return self._as_tensordict(self._tensors, self._tensors["harvest"].unsqueeze(-1).clone())
 
     def _step_and_maybe_reset(self, tensordict: TensorDictBase) -> tuple[TensorDictBase, TensorDictBase]:

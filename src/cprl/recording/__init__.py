@@ -5,11 +5,13 @@ from cprl.recording.progress import ProgressBar
 from cprl.recording.results import EpisodeTable, read_episodes
 from cprl.recording.run import start_run
 from cprl.recording.summary import summarise
+from cprl.recording.watch import Watch
 from cprl.recording.weights import load_weights, save_weights
 
 __all__ = [
     "EpisodeTable",
     "ProgressBar",
+    "Watch",
     "load_weights",
     "read_episodes",
     "save_weights",

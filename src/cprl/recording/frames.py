@@ -1,0 +1,106 @@
+"""Frames of one world, collected step by step in memory and handed on as columns."""
+
+from dataclasses import dataclass
+from typing import Any, Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from cprl.commons.game import COLOURS
+from cprl.commons.world import Bools, Bytes, Ints
+
+UNSEEN: Final = len(COLOURS)
+"""The class of a pixel between windows, and of a colour that is none of the game's."""
+
+_SEPARATOR_PIXELS: Final = 1
+
+
+@dataclass(frozen=True, kw_only=True)
+class Frame:
+    """One world after one step."""
+
+    board: Bytes
+    """uint8 [H, W], colour classes of `cprl.commons.game`."""
+    windows: Bytes
+    """uint8 [N, 3, X, Y], RGB, what each agent sees."""
+    row: Ints
+    """int32 [N]."""
+    col: Ints
+    """int32 [N]."""
+    heading: Ints
+    """int32 [N], 0 up, 1 right, 2 down, 3 left."""
+    in_play: Bools
+    """bool [N]."""
+
+
+class FrameBuffer:
+    """Room for so many frames, allocated once: `add` copies, `take` hands out what there is.
+
+    Args:
+        capacity: frames it holds at most.
+        board: (H, W).
+        windows: (N, 3, X, Y).
+    """
+
+    def __init__(self, capacity: int, *, board: tuple[int, int], windows: tuple[int, int, int, int]) -> None:
+        agents = windows[0]
+        self.capacity, self.size = capacity, 0
+        self._arrays: dict[str, NDArray[Any]] = {
+            "step": np.zeros(capacity, np.int64),
+            "episode": np.zeros(capacity, np.int64),
+            "board": np.zeros((capacity, *board), np.uint8),
+            "windows": np.zeros((capacity, *windows), np.uint8),
+            "row": np.zeros((capacity, agents), np.int32),
+            "col": np.zeros((capacity, agents), np.int32),
+            "heading": np.zeros((capacity, agents), np.int32),
+            "in_play": np.zeros((capacity, agents), np.bool_),
+        }
+
+    @property
+    def is_full(self) -> bool:
+        """Whether there is no room for another frame."""
+        return self.size == self.capacity
+
+    def add(self, step: int, episode: int, frame: Frame) -> None:
+        """Copies a frame; `step` counts environment steps of the whole run."""
+        if self.is_full:
+            raise ValueError(f"the buffer holds {self.capacity} frames; take them before adding another")
+        arrays, at = self._arrays, self.size
+        arrays["step"][at], arrays["episode"][at] = step, episode
+        for name in ("board", "windows", "row", "col", "heading", "in_play"):
+            arrays[name][at] = getattr(frame, name)
+        self.size += 1
+
+    def take(self) -> dict[str, NDArray[Any]]:
+        """Copies of all frames as columns, [T, ...] each; the buffer is empty afterwards."""
+        taken = {name: array[: self.size].copy() for name, array in self._arrays.items()}
+        self.size = 0
+        return taken
+
+
+def mosaic(windows: Bytes) -> Bytes:
+    """All agents' windows side by side, by colour class, a column of UNSEEN between two.
+
+    Args:
+        windows: uint8 [T, N, 3, X, Y], RGB.
+
+    Returns:
+        uint8 [T, X, N * Y + N - 1].
+    """
+    frames, agents, _, rows, columns = windows.shape
+    wide = columns + _SEPARATOR_PIXELS
+    joined = np.full((frames, rows, agents * wide - _SEPARATOR_PIXELS), UNSEEN, np.uint8)
+    classes = _classes(windows)
+    for agent in range(agents):
+        joined[:, :, agent * wide : agent * wide + columns] = classes[:, agent]
+    return joined
+
+
+def _classes(windows: Bytes) -> Bytes:
+    """uint8 [T, N, X, Y]: the class of each pixel, UNSEEN where the colour is none of the game's."""
+    packed = windows.astype(np.uint32)
+    keys = packed[:, :, 0] | packed[:, :, 1] << 8 | packed[:, :, 2] << 16
+    classes = np.full(keys.shape, UNSEEN, np.uint8)
+    for kind, (red, green, blue) in enumerate(COLOURS):
+        classes[keys == (red | green << 8 | blue << 16)] = kind
+    return classes
