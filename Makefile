@@ -8,7 +8,7 @@ INSTALLED := .venv/.installed
 .PHONY: run test test-slow check bench clean
 
 run: $(INSTALLED)
-	$(BIN)/python recipes/single_basic.py short
+	$(BIN)/python recipes/single_basic.py --schedule short --watch serve
 
 test: $(INSTALLED)
 	$(BIN)/python -m pytest

@@ -113,18 +113,6 @@ def test_the_target_network_is_replaced_after_every_third_episode(own_target_wei
     assert copied == [False, False, True, False, False, True, False]
 
 
-def test_the_target_network_can_go_by_steps():
-    agent = learner(target_every_steps=2)
-    agent.remember(transitions(16))
-    copied = []
-    for _ in range(4):
-        agent.learn()
-        agent.remember(transitions(1))
-        agent.end_episode()
-        copied.append(torch.equal(target_weights(agent), own_weights(agent)))
-    assert copied == [True, False, True, False]
-
-
 def test_the_actor_follows_the_learner_and_epsilon_its_steps():
     agent = learner(epsilon_hold_steps=10, epsilon_decay_steps=100)
     assert agent.actor.epsilon == 1.0

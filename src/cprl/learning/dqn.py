@@ -35,8 +35,7 @@ class DQNLearner:
         )
         self.loss.make_value_estimator(ValueEstimators.TD0, gamma=settings.gamma)
         # HardUpdate copies at every (interval + 1)-th step, and once when it is made.
-        every = settings.target_every_steps or settings.target_every_episodes
-        self._target = HardUpdate(self.loss, value_network_update_interval=every - 1)
+        self._target = HardUpdate(self.loss, value_network_update_interval=settings.target_every_episodes - 1)
         if settings.own_target_weights:
             self._give_target(_network(window_shape, actions, settings))
         self._loss_share = 1 / actions if settings.mean_over_all_outputs else 1.0
@@ -61,8 +60,6 @@ class DQNLearner:
         """Stores transitions, as `transitions_of` gives them; one environment step each."""
         self.buffer.extend(transitions)
         self.steps += len(transitions)
-        if self.settings.target_every_steps:
-            self._target.step()
         self.actor.epsilon = self.settings.epsilon(self.steps)
 
     def learn(self) -> float | None:
@@ -77,8 +74,7 @@ class DQNLearner:
 
     def end_episode(self) -> None:
         """Counts an episode; the target network is replaced after every so many."""
-        if not self.settings.target_every_steps:
-            self._target.step()
+        self._target.step()
 
 
 def _network(window_shape: Sequence[int], actions: int, settings: DQNSettings) -> QNetwork:

@@ -37,8 +37,6 @@ class DQNSettings:
     """Chance of a random action in evaluation."""
     target_every_episodes: int = 3
     """Episodes between copies of the network to its target; experiment 5 was run with 3 or 10."""
-    target_every_steps: int | None = None
-    """Steps between copies, where it is not to go by episodes; a shortened schedule needs more of them."""
     relu_on_outputs: bool = False
     """[run] ReLU on the Q values too."""
     glorot_uniform: bool = False

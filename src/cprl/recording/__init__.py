@@ -6,14 +6,16 @@ from cprl.recording.results import EpisodeTable, read_episodes
 from cprl.recording.run import start_run
 from cprl.recording.summary import summarise
 from cprl.recording.watch import Watch
-from cprl.recording.weights import load_weights, save_weights
+from cprl.recording.weights import BestWeights, load_weights, restore_weights, save_weights
 
 __all__ = [
+    "BestWeights",
     "EpisodeTable",
     "ProgressBar",
     "Watch",
     "load_weights",
     "read_episodes",
+    "restore_weights",
     "save_weights",
     "start_run",
     "summarise",

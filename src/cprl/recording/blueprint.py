@@ -32,18 +32,16 @@ def layout(agents: Sequence[str]) -> Any:
     def of_agents(entity: str) -> list[str]:
         return [f"{agent}/{entity}" for agent in agents]
 
-    seen = "What the agent sees" if len(agents) == 1 else f"What each agent sees, {agents[0]} left"
+    seen = "What the agent sees" if len(agents) == 1 else "What each agent sees, the first one left"
     left = rrb.Vertical(
         rrb.Spatial2DView(name="Board", origin="/world"),
         rrb.Spatial2DView(name=seen, origin="/windows"),
         row_shares=[3, 2],
     )
     right = rrb.Vertical(
-        plot("Return of each episode, apples", *of_agents("return")),
+        plot("Return of each episode, apples", *of_agents("return"), "evaluation/greedy_return"),
         rrb.Horizontal(
-            plot(
-                "Survival and mean time of harvest, steps", "social/survival_steps", "social/sustainability"
-            ),
+            plot("Survival, sustainability, steps", "social/survival_steps", "social/sustainability"),
             plot("Equality", "social/equality", share=True),
             plot("Peacefulness, steps in play", "social/peacefulness"),
         ),

@@ -6,11 +6,14 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
-from cprl.commons.game import COLOURS
+from cprl.commons.game import COLOURS, GROUND, OTHER, WALL
 from cprl.commons.world import Bools, Bytes, Ints
 
 UNSEEN: Final = len(COLOURS)
 """The class of a pixel between windows, and of a colour that is none of the game's."""
+
+RIM_CELLS: Final = 1
+"""Cells of wall that are shown around the board."""
 
 _SEPARATOR_PIXELS: Final = 1
 
@@ -76,6 +79,19 @@ class FrameBuffer:
         taken = {name: array[: self.size].copy() for name, array in self._arrays.items()}
         self.size = 0
         return taken
+
+
+def board_with_rim(boards: Bytes) -> Bytes:
+    """Boards with a rim of wall, and without the agents, which are drawn in colours of their own.
+
+    Args:
+        boards: uint8 [T, H, W], colour classes.
+
+    Returns:
+        uint8 [T, H + 2, W + 2].
+    """
+    rimmed = np.pad(boards, ((0, 0), (RIM_CELLS,) * 2, (RIM_CELLS,) * 2), constant_values=WALL)
+    return np.where(rimmed == OTHER, GROUND, rimmed).astype(np.uint8)
 
 
 def mosaic(windows: Bytes) -> Bytes:

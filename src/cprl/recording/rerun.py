@@ -18,7 +18,7 @@ from torchrl.record.loggers import Logger
 from cprl.commons.game import CLASS_NAMES, COLOURS
 from cprl.commons.picture import agent_colour
 from cprl.recording.blueprint import layout
-from cprl.recording.frames import UNSEEN, mosaic
+from cprl.recording.frames import RIM_CELLS, UNSEEN, board_with_rim, mosaic
 
 FILE_NAME: Final = "run.rrd"
 LOCALHOST: Final = "127.0.0.1"
@@ -30,7 +30,8 @@ Numbers: TypeAlias = "Sequence[int] | NDArray[np.integer[Any]]"
 _LIVE_PERIOD_S: Final = 1.0
 _FILE_PERIOD_S: Final = 10.0
 _FLUSH_TIMEOUT_S: Final = 5.0
-_ARROW_CELLS: Final = 0.7
+AGENT_RADIUS_CELLS: Final = 0.48
+_ARROW_CELLS: Final = 0.9
 _OUT_OF_PLAY_ALPHA: Final = 60
 
 
@@ -156,6 +157,8 @@ class RerunLogger(Logger):
         self._static("/", rr.AnnotationContext([*classes, between]))
         for name in ("equality", "sustainability", "survival_steps", "peacefulness"):
             self._static(f"social/{name}", rr.SeriesLines(names=[name]))
+        white = [(255, 255, 255)]
+        self._static("evaluation/greedy_return", rr.SeriesLines(names=["greedy, evaluated"], colors=white))
         if self.scene is None:
             return
         for agent, name in enumerate(self.scene.agents):
@@ -164,7 +167,7 @@ class RerunLogger(Logger):
                 self._static(f"{name}/{entity}", line)
         wide = len(self.scene.agents) * (self.scene.window[1] + 1) - 1
         for entity, width, height in (
-            ("world/board", self.scene.width, self.scene.height),
+            ("world/board", self.scene.width + 2 * RIM_CELLS, self.scene.height + 2 * RIM_CELLS),
             ("windows", wide, self.scene.window[0]),
         ):
             form = rr.components.ImageFormat(
@@ -186,8 +189,9 @@ class RerunLogger(Logger):
                 return
             value = numbers[0]
         when = self._now[0] if step is None else int(step)
+        row = when, self._now[1], self._frames, float(value)
         for waiting in self._waiting.values():
-            waiting.setdefault(name, []).append((when, self._now[1], self._frames, float(value)))
+            waiting.setdefault(name, []).append(row)
         self._send_if_due()
 
     def log_frames(self, frames: Mapping[str, NDArray[Any]]) -> None:
@@ -203,7 +207,7 @@ class RerunLogger(Logger):
         self._frames += count
         times = _times(frames["step"], frames["episode"], numbers)
         agents = len(self.scene.agents)
-        places = np.stack([frames["col"] + 0.5, frames["row"] + 0.5], -1).reshape(-1, 2)
+        places = np.stack([frames["col"], frames["row"]], -1).reshape(-1, 2) + RIM_CELLS + 0.5
         colours = np.array([agent_colour(agent) for agent in range(agents)], np.uint8)
         colours = np.concatenate(
             [np.tile(colours, (count, 1)), np.full((count * agents, 1), 255, np.uint8)], 1
@@ -213,10 +217,12 @@ class RerunLogger(Logger):
         names = list(self.scene.agents) * count
         each = [agents] * count
         columns = {
-            "world/board": rr.SegmentationImage.columns(buffer=frames["board"].reshape(count, -1)),
+            "world/board": rr.SegmentationImage.columns(
+                buffer=board_with_rim(frames["board"]).reshape(count, -1)
+            ),
             "windows": rr.SegmentationImage.columns(buffer=mosaic(frames["windows"]).reshape(count, -1)),
             "world/agents": rr.Points2D.columns(
-                positions=places, colors=colours, radii=[0.42] * len(places), labels=names
+                positions=places, colors=colours, radii=[AGENT_RADIUS_CELLS] * len(places), labels=names
             ).partition(each),
             "world/headings": rr.Arrows2D.columns(
                 origins=places,

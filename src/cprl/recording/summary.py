@@ -1,5 +1,7 @@
 """What a run came to, in the terminal."""
 
+from collections.abc import Mapping
+from math import isnan
 from pathlib import Path
 from statistics import fmean
 
@@ -9,52 +11,54 @@ from rich.table import Table
 from cprl.measuring.episodes import Episode
 from cprl.measuring.evaluate import mean_return
 
+METRICS = ("survival_steps", "sustainability", "equality", "peacefulness")
+
 
 def summarise(
     run: Path,
     *,
     title: str,
-    trained: list[Episode],
-    chance: list[Episode],
+    played: Mapping[str, list[Episode]],
     figure: Path | None = None,
-    published: str | None = None,
     console: Console | None = None,
 ) -> None:
-    """Prints the trained, greedy policy beside the random one, and where everything is kept.
+    """Prints policies beside each other, each by its episodes, and where everything is kept.
 
     Args:
         run: the run's directory.
         title: what was run, with its schedule.
-        trained: episodes of the trained policy on fresh worlds.
-        chance: episodes of the random policy on fresh worlds.
+        played: episodes on fresh worlds by the name of the policy; the others are compared with the first.
         figure: the training curve.
-        published: the command of the published schedule, where this was another.
         console: where to; by default standard output.
     """
     console = console or Console()
-    table = Table(title=title)
-    for column in ("", "trained, greedy", "random"):
-        table.add_column(column, justify="left" if not column else "right")
-    returns = [mean_return(trained), mean_return(chance)]
-    table.add_row("mean return", *(f"{mean:.1f} ± {error:.1f}" for mean, error in returns))
-    for name in ("survival_steps", "sustainability", "equality", "peacefulness"):
-        table.add_row(name, *(f"{_mean(episodes, name):.2f}" for episodes in (trained, chance)))
-    table.add_row("apples left", *(f"{fmean(e.stock_left for e in many):.1f}" for many in (trained, chance)))
-    table.add_row("episodes", *(str(len(episodes)) for episodes in (trained, chance)))
-    console.print(table)
-    console.print(
-        f"The trained policy's return is {returns[0][0] / returns[1][0]:.1f} times the random one's."
-    )
-    if published:
-        console.print(f"This was a shortened schedule. The published one: {published}", soft_wrap=True)
+    console.print(_table(title, played))
     console.print(f"Kept in {run}: recipe.json, episodes.parquet, run.rrd, checkpoints/", soft_wrap=True)
     if figure:
         console.print(f"Training curve: {figure}", soft_wrap=True)
     console.print(f"Watch again: .venv/bin/rerun {run / 'run.rrd'}", soft_wrap=True)
 
 
+def _table(title: str, played: Mapping[str, list[Episode]]) -> Table:
+    """A column for each policy, a row for each number."""
+    table = Table(title=title)
+    table.add_column()
+    for name in played:
+        table.add_column(name, justify="right")
+    means = [mean_return(episodes) for episodes in played.values()]
+    table.add_row("mean return", *(f"{mean:.1f} ± {error:.1f}" for mean, error in means))
+    base, _ = means[0]
+    if base:
+        table.add_row("beside the first", *(f"{mean / base:.1f} x" for mean, _ in means))
+    for metric in METRICS:
+        table.add_row(metric, *(f"{_mean(episodes, metric):.2f}" for episodes in played.values()))
+    left = (fmean(episode.stock_left for episode in episodes) for episodes in played.values())
+    table.add_row("apples left", *(f"{apples:.1f}" for apples in left))
+    table.add_row("episodes", *(str(len(episodes)) for episodes in played.values()))
+    return table
+
+
 def _mean(episodes: list[Episode], name: str) -> float:
     """The mean of a metric over the episodes in which it is defined."""
-    values = [episode.metrics[name] for episode in episodes]
-    defined = [value for value in values if value == value]
+    defined = [value for episode in episodes if not isnan(value := episode.metrics[name])]
     return fmean(defined) if defined else float("nan")

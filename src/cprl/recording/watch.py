@@ -34,6 +34,7 @@ class Watch:
         env: whose first world is shown.
         title: what is going on; the viewer shows it.
         episodes: how many will be played, by which the frames are rationed.
+        recipe: what the viewer shows as the recipe of the run.
         serve: whether to serve the recording live on 127.0.0.1; the addresses are printed at once.
         console: where to; by default standard output.
     """
@@ -45,6 +46,7 @@ class Watch:
         *,
         title: str,
         episodes: int,
+        recipe: Mapping[str, object] | None = None,
         serve: bool = False,
         console: Console | None = None,
     ) -> None:
@@ -63,6 +65,7 @@ class Watch:
         self._sent = self._episode_began = time.perf_counter()
         if serve:
             _tell(self.logger, console or Console())
+        self.logger.log_hparams({"run": str(run), **(recipe or {})})
         self.logger.log_text(f"{title} begins")
 
     def see_turn(self, batch: TensorDictBase) -> None:

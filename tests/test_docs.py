@@ -1,0 +1,48 @@
+"""What the docs say is so: names are compared, code is run."""
+
+import re
+from pathlib import Path
+
+import pytest
+from rerun.chunk import RrdReader
+from test_rerun_logger import trained
+
+ROOT = Path(__file__).parents[1]
+PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md"))]
+
+
+def test_every_logged_name_has_its_line_in_the_docs_and_the_other_way_round(tmp_path):
+    trained(tmp_path, watched=True)
+    logged = set()
+    for chunk in RrdReader(tmp_path / "run.rrd").stream():
+        batch = chunk.to_record_batch()
+        if "step" in batch.schema.names or "TextDocument:text" in batch.schema.names:
+            logged.add(
+                chunk.entity_path.strip("/").replace("agent_0", "agent_<i>").replace("agent_1", "agent_<i>")
+            )
+    text = (ROOT / "docs" / "metrics.md").read_text()
+    told = {
+        name
+        for line in text.splitlines()
+        if line.startswith("| `")
+        for name in re.findall(r"`([^`]+)`", line.split("|")[1])
+    }
+    assert logged == told - {"evaluation/greedy_return"}, "the greedy return is logged by BestWeights alone"
+
+
+def blocks():
+    for page in PAGES:
+        for number, code in enumerate(re.findall(r"```python\n(.*?)```", page.read_text(), re.DOTALL)):
+            yield pytest.param(code, id=f"{page.name}-{number}")
+
+
+@pytest.mark.parametrize("code", list(blocks()))
+def test_python_in_the_docs_runs(code, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    exec(compile(code, "docs", "exec"), {"__name__": "docs"})
+
+
+def test_links_between_pages_lead_somewhere():
+    for page in PAGES:
+        for target in re.findall(r"\]\(([^)#:]+)\)", page.read_text()):
+            assert (page.parent / target).exists(), f"{page.name} links to {target}"

@@ -1,0 +1,259 @@
+"""Recordings are written for real and read back by Rerun's own reader."""
+
+import socket
+import warnings
+
+import numpy as np
+import pytest
+import rerun as rr
+import torch
+from rerun.chunk import RrdReader
+from tensordict import TensorDict
+
+from cprl import CommonsEnv, Game, Rules, maps
+from cprl.acting import RandomActor
+from cprl.commons.game import APPLE, BEAM, COLOURS, GROUND, OTHER, SELF, WALL
+from cprl.learning import DQNLearner, DQNSettings
+from cprl.recording.frames import UNSEEN, Frame, FrameBuffer, board_with_rim, mosaic
+from cprl.recording.rerun import RerunLogger, Scene
+from cprl.recording.watch import Watch
+from cprl.train import train
+
+GAME = Game(
+    map=maps.parse(".A>.A\n.A.A.\n..<.A"),
+    rules=Rules(regrow_prob=(0.0, 0.1), window_rows=3, window_columns=5, episode_steps=20),
+)
+SCENE = Scene(height=3, width=5, agents=GAME.agent_names, window=(3, 5))
+
+
+@pytest.fixture(autouse=True)
+def strict_rerun():
+    rr.set_strict_mode(True)
+    yield
+    rr.set_strict_mode(False)
+
+
+def column(path, entity, component, timeline="step"):
+    """The times and values of one column of a recording."""
+    times, values = [], []
+    for chunk in RrdReader(path).stream().filter(content=f"/{entity}"):
+        batch = chunk.to_record_batch()
+        if component in batch.schema.names and timeline in batch.schema.names:
+            times += batch.column(timeline).to_pylist()
+            values += batch.column(component).to_pylist()
+    return times, values
+
+
+def static(path, entity, component):
+    """The static value of one component."""
+    for chunk in RrdReader(path).stream().filter(content=f"/{entity}"):
+        batch = chunk.to_record_batch()
+        if component in batch.schema.names:
+            return batch.column(component).to_pylist()[0]
+    return None
+
+
+def frames(count, *, first_step=1):
+    """So many frames of two agents, each frame another."""
+    random = np.random.default_rng(0)
+    buffer = FrameBuffer(count, board=(3, 5), windows=(2, 3, 3, 5))
+    colours = np.array(COLOURS, np.uint8)
+    shown = []
+    for step in range(count):
+        frame = Frame(
+            board=random.integers(0, len(COLOURS), (3, 5)).astype(np.uint8),
+            windows=colours[random.integers(0, len(COLOURS), (2, 3, 5))].transpose(0, 3, 1, 2),
+            row=np.array([0, step % 3], np.int32),
+            col=np.array([step % 5, 4], np.int32),
+            heading=np.array([step % 4, 1], np.int32),
+            in_play=np.array([True, step % 2 == 0]),
+        )
+        buffer.add(first_step + step, 7, frame)
+        shown.append(frame)
+    return buffer.take(), shown
+
+
+def test_numbers_are_read_back_under_their_names_with_all_three_timelines(tmp_path):
+    with RerunLogger("run", tmp_path, scene=SCENE) as logger:
+        for episode, value in enumerate([0.5, float("nan"), 0.75]):
+            logger.at(step=100 * episode, episode=episode)
+            logger.log_scalar("social/equality", value)
+            logger.log_scalar("agent_0/loss", torch.tensor(value), step=100 * episode + 1)
+    steps, values = column(tmp_path / "run.rrd", "social/equality", "Scalars:scalars")
+    assert steps == [0, 100, 200]
+    assert np.allclose([value[0] for value in values], [0.5, np.nan, 0.75], equal_nan=True)
+    assert column(tmp_path / "run.rrd", "social/equality", "Scalars:scalars", "episode")[0] == [0, 1, 2]
+    assert column(tmp_path / "run.rrd", "social/equality", "Scalars:scalars", "frame")[0] == [0, 0, 0]
+    assert column(tmp_path / "run.rrd", "agent_0/loss", "Scalars:scalars")[0] == [1, 101, 201]
+
+
+def test_frames_show_the_board_the_agents_and_what_each_sees(tmp_path):
+    taken, shown = frames(6, first_step=40)
+    with RerunLogger("run", tmp_path, scene=SCENE) as logger:
+        logger.log_frames(taken)
+    path = tmp_path / "run.rrd"
+    steps, boards = column(path, "world/board", "SegmentationImage:buffer")
+    assert steps == [40, 41, 42, 43, 44, 45]
+    assert column(path, "world/board", "SegmentationImage:buffer", "frame")[0] == [0, 1, 2, 3, 4, 5]
+    assert column(path, "world/board", "SegmentationImage:buffer", "episode")[0] == [7] * 6
+    for frame, board in zip(shown, boards, strict=True):
+        seen = np.array(board[0], np.uint8).reshape(5, 7)
+        assert (seen[0] == WALL).all()
+        kept = frame.board != OTHER
+        assert np.array_equal(seen[1:-1, 1:-1][kept], frame.board[kept])
+        assert (seen[1:-1, 1:-1][~kept] == GROUND).all()
+    _, places = column(path, "world/agents", "Points2D:positions")
+    assert places[3] == [[3 + 1.5, 0 + 1.5], [4 + 1.5, 0 + 1.5]]
+    _, colours = column(path, "world/agents", "Points2D:colors")
+    assert [rgba & 255 for rgba in colours[3]] == [255, 60], "agent 1 is out of play in frame 3"
+    _, headings = column(path, "world/headings", "Arrows2D:vectors")
+    assert headings[2][0] == pytest.approx([0, 0.9]), "heading 2 points down"
+    _, windows = column(path, "windows", "SegmentationImage:buffer")
+    first = np.array(windows[0][0], np.uint8).reshape(3, 11)
+    assert np.array_equal(np.array(COLOURS)[first[:, :5]].transpose(2, 0, 1), shown[0].windows[0])
+    assert (first[:, 5] == UNSEEN).all()
+
+
+def test_colours_and_names_of_classes_are_in_the_recording(tmp_path):
+    with RerunLogger("run", tmp_path, scene=SCENE):
+        pass
+    (context,) = [
+        chunk.to_record_batch().column("AnnotationContext:context").to_pylist()[0]
+        for chunk in RrdReader(tmp_path / "run.rrd").stream()
+        if "AnnotationContext:context" in chunk.to_record_batch().schema.names
+    ]
+    told = {entry["class_id"]: entry["class_description"]["info"] for entry in context[0]}
+    assert told[APPLE]["label"] == "apple"
+    assert told[APPLE]["color"] >> 8 == 0x00FF00
+    assert static(tmp_path / "run.rrd", "agent_1/return", "SeriesLines:names") == ["agent_1"]
+    assert RrdReader(tmp_path / "run.rrd").blueprints()
+
+
+def test_torchrls_logger_interface_is_there(tmp_path):
+    clip = torch.arange(2 * 3 * 4 * 5).reshape(1, 2, 3, 4, 5).to(torch.uint8)
+    with RerunLogger("run", tmp_path) as logger:
+        nested = TensorDict({"train": {"loss": torch.tensor(2.0)}}, [])
+        logger.log_metrics(nested, step=5)
+        logger.log_metrics({"q": torch.tensor([1.0, 3.0])}, step=5)
+        logger.log_video("clip", clip, step=10)
+        logger.log_histogram("weights", torch.tensor([0.0, 0.0, 1.0]), bins=2, step=6)
+        logger.log_hparams({"gamma": 0.995})
+        logger.log_text("an apple fell")
+        assert "run.rrd" in repr(logger)
+    path = tmp_path / "run.rrd"
+    assert column(path, "train/loss", "Scalars:scalars") == ([5], [[2.0]])
+    assert [column(path, f"q/{i}", "Scalars:scalars") for i in (0, 1)] == [([5], [[1.0]]), ([5], [[3.0]])]
+    steps, images = column(path, "clip", "Image:buffer")
+    assert steps == [10, 11]
+    assert np.array_equal(np.array(images[1][0]).reshape(4, 5, 3), clip[0, 1].permute(1, 2, 0))
+    assert column(path, "weights", "BarChart:values")[0] == [6]
+    assert "gamma" in static(path, "recipe", "TextDocument:text")[0]
+    assert column(path, "log", "TextLog:text")[1] == [["an apple fell"]]
+
+
+def test_a_recording_is_never_written_over(tmp_path):
+    RerunLogger("run", tmp_path).shutdown()
+    before = (tmp_path / "run.rrd").read_bytes()
+    with pytest.raises(FileExistsError, match="exists and is kept"):
+        RerunLogger("run", tmp_path)
+    assert (tmp_path / "run.rrd").read_bytes() == before
+
+
+def test_frames_without_a_scene_are_refused(tmp_path):
+    with RerunLogger("run", tmp_path) as logger, pytest.raises(ValueError, match="no scene"):
+        logger.log_frames(frames(1)[0])
+
+
+def test_a_full_buffer_says_so():
+    buffer = FrameBuffer(1, board=(3, 5), windows=(2, 3, 3, 5))
+    _, (frame,) = frames(1)
+    buffer.add(0, 0, frame)
+    with pytest.raises(ValueError, match="holds 1 frames"):
+        buffer.add(1, 0, frame)
+    assert buffer.take()["step"].tolist() == [0]
+    assert buffer.size == 0
+
+
+def test_mosaics_put_windows_side_by_side_and_mark_foreign_colours():
+    windows = np.zeros((1, 2, 3, 1, 2), np.uint8)
+    windows[0, 0, :, 0, 0] = COLOURS[SELF]
+    windows[0, 0, :, 0, 1] = COLOURS[BEAM]
+    windows[0, 1, :, 0, 0] = (1, 2, 3)
+    windows[0, 1, :, 0, 1] = COLOURS[APPLE]
+    assert mosaic(windows).tolist() == [[[SELF, BEAM, UNSEEN, UNSEEN, APPLE]]]
+
+
+def test_the_rim_is_wall_and_agents_are_left_to_their_own_colours():
+    assert board_with_rim(np.array([[[APPLE, OTHER]]], np.uint8)).tolist() == [
+        [[WALL] * 4, [WALL, APPLE, GROUND, WALL], [WALL] * 4]
+    ]
+
+
+def test_the_live_recording_is_served_on_this_machine(tmp_path):
+    with RerunLogger("run", tmp_path, scene=SCENE, serve=True) as logger:
+        logger.log_scalar("social/equality", 1.0)
+        logger.flush()
+        address = logger.addresses["native"].split()[-1]
+        host, port = address.removeprefix("rerun+http://").removesuffix("/proxy").split(":")
+        assert host == "127.0.0.1"
+        socket.create_connection((host, int(port)), timeout=5).close()
+        page = logger.addresses["browser"]
+        assert page.startswith("http://127.0.0.1:")
+        assert f"127.0.0.1%3A{port}" in page
+        socket.create_connection(("127.0.0.1", int(page.split(":")[2].split("/")[0])), timeout=5).close()
+    assert column(tmp_path / "run.rrd", "social/equality", "Scalars:scalars")[1] == [[1.0]]
+
+
+class Broken:
+    """A stream whose disk is full."""
+
+    def __getattr__(self, name):
+        def fail(*arguments, **named):
+            raise OSError("no space left on device")
+
+        return fail
+
+
+def test_a_stream_that_fails_is_dropped_with_one_warning_and_the_other_goes_on(tmp_path):
+    with RerunLogger("run", tmp_path, scene=SCENE, serve=True) as logger:
+        live = next(stream for stream in logger._streams if stream.name == "live view")
+        live.recording = Broken()
+        with pytest.warns(RuntimeWarning, match="live view is dropped.*no space left") as caught:
+            logger.log_frames(frames(3)[0])
+        assert len(caught) == 1
+        with warnings.catch_warnings():
+            warnings.simplefilter("error")
+            logger.log_frames(frames(3, first_step=10)[0])
+            logger.log_scalar("social/equality", 0.5)
+            logger.flush()
+    assert column(tmp_path / "run.rrd", "world/board", "SegmentationImage:buffer")[0] == [1, 2, 3, 10, 11, 12]
+
+
+def trained(run, *, watched):
+    """The weights after a short training, and what torch's generator stands at."""
+    torch.manual_seed(1)
+    settings = DQNSettings(buffer_size=200, learning_rate=1e-3)
+    learner = DQNLearner(GAME.window_shape, 8, settings=settings, seed=1)
+    env = CommonsEnv(GAME, seed=1)
+    observers = [Watch(run, env, title="run", episodes=4)] if watched else []
+    train(env, {0: learner}, others={1: RandomActor(8)}, episodes=4, observers=observers)
+    for observer in observers:
+        observer.__exit__(None, None, None)
+    return torch.cat([weight.flatten() for weight in learner.network.parameters()]), torch.get_rng_state()
+
+
+def test_a_watched_training_records_every_turn_and_learns_the_very_same(tmp_path):
+    (weights, state), (watched, other_state) = (
+        trained(tmp_path, watched=False),
+        trained(tmp_path, watched=True),
+    )
+    assert torch.equal(weights, watched)
+    assert torch.equal(state, other_state)
+    path = tmp_path / "run.rrd"
+    steps, _ = column(path, "world/board", "SegmentationImage:buffer")
+    episodes, _ = column(path, "world/board", "SegmentationImage:buffer", "episode")
+    assert steps == list(range(1, len(steps) + 1))
+    assert sorted(set(episodes)) == [0, 1, 2, 3, 4], "the last frame is the first of the episode to come"
+    assert column(path, "agent_0/return", "Scalars:scalars", "episode")[0] == [0, 1, 2, 3]
+    assert column(path, "agent_0/loss", "Scalars:scalars", "episode")[0] == [0, 1, 2, 3]
+    assert len(column(path, "social/survival_steps", "Scalars:scalars")[0]) == 4
