@@ -71,7 +71,7 @@ def kernel(game: Game, worlds: int, threads: int, turns: int, repeats: int) -> R
     batch = Batch(game, worlds, threads=threads)
     told, actions = batch.new_told(), actions_for(game, worlds, turns)
     us = best_us(lambda turn: batch.play(actions[turn], told), lambda: batch.begin(told), turns, repeats)
-    return Rate(worlds, threads, us)
+    return Rate(worlds, batch.threads, us)
 
 
 def through_step(game: Game, worlds: int, threads: int, turns: int, repeats: int) -> Rate:
@@ -88,7 +88,7 @@ def through_step(game: Game, worlds: int, threads: int, turns: int, repeats: int
         entry.get(keys.AGENTS).set("action", actions[turn])
         moment["now"] = env.step(entry).get("next")
 
-    return Rate(worlds, threads, best_us(step, begin, turns, repeats))
+    return Rate(worlds, env.batch.threads, best_us(step, begin, turns, repeats))
 
 
 def main(*, worlds: tuple[int, ...] = (1, 16, 256, 1024, 4096), repeats: int = 7) -> None:
@@ -100,16 +100,18 @@ def main(*, worlds: tuple[int, ...] = (1, 16, 256, 1024, 4096), repeats: int = 7
     """
     game = presets.game("commons")
     cores = os.cpu_count() or 1
-    table = Table("worlds", "threads", "what", "us a step of all", "steps / s", "steps / CPU-s")
+    table = Table("threads", "what", title="one step of all worlds, in microseconds; environment steps")
+    for column in ("worlds", "us", "per s", "per CPU-s"):
+        table.add_column(column, justify="right", no_wrap=True)
     for size in worlds:
         turns = max(20, min(STEPS_PER_EPISODE, 200_000 // size))
-        for threads in sorted({1, cores}):
+        for threads in sorted({1, min(cores, size)}):
             for name, measure in (("kernel", kernel), ("CommonsEnv.step", through_step)):
                 rate = measure(game, size, threads, turns, repeats)
                 total = rate.steps_per_cpu_s * threads
-                row = f"{size:,}", f"{threads}", name, f"{rate.step_us:,.1f}"
+                row = f"{rate.threads}", name, f"{size:,}", f"{rate.step_us:,.1f}"
                 table.add_row(*row, f"{total:,.0f}", f"{rate.steps_per_cpu_s:,.0f}")
-    others = Table("measured elsewhere for comparison", "steps / s")
+    others = Table("measured on such a machine for comparison", "per s")
     for name, steps in OTHERS:
         others.add_row(name, steps)
     console = Console()

@@ -80,7 +80,8 @@ class RerunLogger(Logger):
         exp_name: the name that the viewer shows.
         log_dir: the run's directory, where `run.rrd` is written.
         scene: what is on the board; without it no frames can be logged.
-        serve: whether to serve the recording live, gRPC and web viewer; `addresses` tells where.
+        serve: whether to serve the recording live; `addresses` tells where. The recording is served on
+            127.0.0.1 alone; the empty page of the web viewer, which Rerun serves, listens on all interfaces.
 
     Raises:
         FileExistsError: where there is a recording already.
