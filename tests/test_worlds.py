@@ -1,6 +1,7 @@
 """What holds in every game, whatever is played: checked on random boards, rules and actions."""
 
 import itertools
+import pickle
 from dataclasses import replace
 from pathlib import Path
 
@@ -11,9 +12,10 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from cprl import Game, Map, Rules, presets
-from cprl.commons import compiled
+from cprl.commons import compiled, drivers
 from cprl.commons.batch import Batch
 from cprl.commons.game import neighbours
+from cprl.commons.world import empty_scratch
 
 STAY = 7
 
@@ -241,3 +243,35 @@ def test_a_changed_rule_is_another_folder_of_compiled_rules(tmp_path, monkeypatc
     before = compiled._fingerprint()
     (tmp_path / "moves.py").write_text((tmp_path / "moves.py").read_text() + "\n")
     assert compiled._fingerprint() != before
+
+
+@pytest.mark.parametrize("variant", presets.VARIANTS)
+def test_the_rules_are_plain_python_and_uncompiled_play_the_same_game(variant):
+    # This is what Numba's CUDA simulator does with them.
+    game = presets.game("two_complex", variant=variant)
+    plain = compiled.compiled(drivers.FUNCTIONS, lambda function: function)
+    actions = random_actions(25, 2, game, seed=1)
+    batch = Batch(game, 2, seed=1)
+    scratch = empty_scratch(
+        agents=2, sites=45, cells=game.tables.background.size, window=game.tables.window_cells.shape[1]
+    )
+    told = batch.new_told()
+    plain["begin_worlds"](batch.worlds, game.tables, np.ones(2, np.bool_), told, scratch, 0, 2)
+    for turn, (worlds, expected) in zip([None, *actions], played(game, actions, seed=1), strict=True):
+        if turn is not None:
+            plain["play_worlds"](batch.worlds, game.tables, turn, told, scratch, 0, 2)
+        assert_same(batch.worlds, worlds)
+        assert_same(told, expected)
+
+
+def test_a_batch_goes_on_as_it_was_after_pickling():
+    game = presets.game("commons")
+    batch = Batch(game, 2, seed=3)
+    told = batch.begin(batch.new_told())
+    actions = random_actions(20, 2, game)
+    for turn in actions[:10]:
+        batch.play(turn, told)
+    other, other_told = pickle.loads(pickle.dumps(batch)), copied(told)
+    for turn in actions[10:]:
+        assert_same(batch.play(turn, told), other.play(turn, other_told))
+    assert_same(batch.worlds, other.worlds)

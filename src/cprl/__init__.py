@@ -18,5 +18,6 @@ from cprl.commons.game import Game
 from cprl.commons.maps import Map
 from cprl.commons.rules import Rules
 from cprl.envs import CommonsEnv
+from cprl.train import train
 
-__all__ = ["CommonsEnv", "Game", "Map", "Rules", "maps", "presets"]
+__all__ = ["CommonsEnv", "Game", "Map", "Rules", "maps", "presets", "train"]

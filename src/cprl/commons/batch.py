@@ -59,7 +59,6 @@ class Batch:
             )
             for _ in range(self.threads)
         ]
-        self._rules = rules_for_cpu()
         self.set_seed(seed)
 
     def set_seed(self, seed: int) -> None:
@@ -93,7 +92,7 @@ class Batch:
             which: bool [B].
         """
         which = np.ones(self.size, np.bool_) if which is None else which
-        self._share(self._rules["begin_worlds"], which, told)
+        self._share(rules_for_cpu()["begin_worlds"], which, told)
         return told
 
     def play(self, actions: Actions, told: Told) -> Told:
@@ -110,13 +109,13 @@ class Batch:
 
     def play_checked(self, actions: Actions, told: Told) -> Told:
         """`play` for actions that `check` has seen."""
-        self._share(self._rules["play_worlds"], actions, told)
+        self._share(rules_for_cpu()["play_worlds"], actions, told)
         return told
 
     def boards(self, told: Told) -> Bytes:
         """The whole boards as they stand, uint8 [B, H, W], colour classes of `cprl.commons.game`."""
         boards = np.empty((self.size, self.game.map.height, self.game.map.width), np.uint8)
-        self._share(self._rules["show_worlds"], boards, told)
+        self._share(rules_for_cpu()["show_worlds"], boards, told)
         return boards
 
     def check(self, actions: Actions) -> None:
@@ -125,7 +124,7 @@ class Batch:
         if actions.shape != wanted or actions.dtype != np.int64:
             raise ValueError(f"actions are {actions.dtype} {actions.shape}; wanted: int64 {wanted}")
         known = len(self.game.actions)
-        at = self._rules["first_unknown"](actions.reshape(-1), known)
+        at = rules_for_cpu()["first_unknown"](actions.reshape(-1), known)
         if at >= 0:
             world, agent = divmod(at, self.game.agents)
             raise ValueError(

@@ -2,6 +2,7 @@
 
 from cprl.recording.figures import training_curve
 from cprl.recording.progress import ProgressBar
+from cprl.recording.rerun import RerunLogger
 from cprl.recording.results import EpisodeTable, read_episodes
 from cprl.recording.run import start_run
 from cprl.recording.summary import summarise
@@ -12,6 +13,7 @@ __all__ = [
     "BestWeights",
     "EpisodeTable",
     "ProgressBar",
+    "RerunLogger",
     "Watch",
     "load_weights",
     "read_episodes",

@@ -51,6 +51,8 @@ class ProgressBar:
 
     def see_turn(self, batch: TensorDictBase) -> None:
         """Counts the turns of a batch and, now and then, moves the bar."""
+        if not self._steps:  # what came before was starting up
+            self._started = self._then = time.perf_counter()
         self._steps += batch.numel()
         self._steps_this_episode += batch.numel()
         waited = time.perf_counter() - self._then
@@ -72,7 +74,7 @@ class ProgressBar:
         told = f"return {self._told['return']}  epsilon {self._told['epsilon']}  {rate:,.0f} steps/s"
         done = self._episodes + min(1.0, self._steps_this_episode / self._episode_steps)
         self._progress.update(self._task, completed=done, told=told)
-        if not self.console.is_terminal:
+        if not self.console.is_terminal and self._steps:
             spent_s = time.perf_counter() - self._started
             left_s = spent_s / done * (self._left_of - done)
             self.console.print(

@@ -1,6 +1,7 @@
 """RerunLogger: a run as a Rerun recording, to a file and, on request, served live on 127.0.0.1."""
 
 import socket
+import sys
 import time
 import warnings
 from collections.abc import Callable, Mapping, Sequence
@@ -26,6 +27,16 @@ SERVER_MEMORY: Final = "512MB"
 """What the served recording may hold; beyond it the oldest rows are dropped, for viewers alone."""
 
 Numbers: TypeAlias = "Sequence[int] | NDArray[np.integer[Any]]"
+
+LINES: Final = {
+    "social/survival_steps": ("survival_steps", (230, 160, 0)),
+    "social/sustainability": ("sustainability", (0, 158, 115)),
+    "social/equality": ("equality", (86, 180, 233)),
+    "social/peacefulness": ("peacefulness", (204, 121, 167)),
+    "time/env_steps_per_s": ("steps per second", (150, 150, 150)),
+    "evaluation/greedy_return": ("greedy, evaluated", (230, 160, 0)),
+}
+"""The name and colour of a line, since the viewers' own colours differ; agents have theirs."""
 
 _LIVE_PERIOD_S: Final = 1.0
 _FILE_PERIOD_S: Final = 10.0
@@ -156,10 +167,8 @@ class RerunLogger(Logger):
         ]
         between = rr.AnnotationInfo(id=UNSEEN, label="", color=(0, 0, 0, 0))
         self._static("/", rr.AnnotationContext([*classes, between]))
-        for name in ("equality", "sustainability", "survival_steps", "peacefulness"):
-            self._static(f"social/{name}", rr.SeriesLines(names=[name]))
-        white = [(255, 255, 255)]
-        self._static("evaluation/greedy_return", rr.SeriesLines(names=["greedy, evaluated"], colors=white))
+        for entity, (name, colour) in LINES.items():
+            self._static(entity, rr.SeriesLines(names=[name], colors=[colour]))
         if self.scene is None:
             return
         for agent, name in enumerate(self.scene.agents):
@@ -356,11 +365,17 @@ def _free_port() -> int:
         return int(probe.getsockname()[1])
 
 
+def viewer() -> str:
+    """How to start Rerun's own viewer: the one beside this Python, if there is one."""
+    beside = Path(sys.executable).with_name("rerun")
+    return str(beside) if beside.exists() else "rerun"
+
+
 def _addresses(grpc: str) -> dict[str, str]:
     """Starts the web viewer's pages, and tells where to look."""
     import rerun as rr
 
     web = _free_port()
     rr.serve_web_viewer(web_port=web, open_browser=False)
-    query = f"url={quote(grpc, safe='')}&renderer=webgl&persist=0&hide_welcome_screen=1"
-    return {"browser": f"http://{LOCALHOST}:{web}/?{query}", "native": f"rerun --connect {grpc}"}
+    query = f"url={quote(grpc, safe='')}&renderer=webgl&persist=0&hide_welcome_screen=1&theme=dark"
+    return {"browser": f"http://{LOCALHOST}:{web}/?{query}", "native": f"{viewer()} --connect {grpc}"}

@@ -10,6 +10,7 @@ from rich.table import Table
 
 from cprl.measuring.episodes import Episode
 from cprl.measuring.evaluate import mean_return
+from cprl.recording.rerun import viewer
 
 METRICS = ("survival_steps", "sustainability", "equality", "peacefulness")
 
@@ -36,7 +37,7 @@ def summarise(
     console.print(f"Kept in {run}: recipe.json, episodes.parquet, run.rrd, checkpoints/", soft_wrap=True)
     if figure:
         console.print(f"Training curve: {figure}", soft_wrap=True)
-    console.print(f"Watch again: .venv/bin/rerun {run / 'run.rrd'}", soft_wrap=True)
+    console.print(f"Watch again: {viewer()} {run / 'run.rrd'}", soft_wrap=True)
 
 
 def _table(title: str, played: Mapping[str, list[Episode]]) -> Table:
