@@ -15,7 +15,8 @@ from cprl.acting import RandomActor
 from cprl.commons.game import APPLE, BEAM, COLOURS, GROUND, OTHER, SELF, WALL
 from cprl.learning import DQNLearner, DQNSettings
 from cprl.recording.frames import UNSEEN, Frame, FrameBuffer, board_with_rim, mosaic
-from cprl.recording.rerun import RerunLogger, Scene
+from cprl.recording.rerun import RerunLogger
+from cprl.recording.scenery import Scene
 from cprl.recording.watch import Watch
 from cprl.train import train
 

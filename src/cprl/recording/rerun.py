@@ -1,14 +1,9 @@
 """RerunLogger: a run as a Rerun recording, to a file and, on request, served live on 127.0.0.1."""
 
-import socket
-import sys
 import time
-import warnings
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Final, TypeAlias
-from urllib.parse import quote
 
 import numpy as np
 import torch
@@ -16,67 +11,16 @@ from numpy.typing import NDArray
 from torch import Tensor
 from torchrl.record.loggers import Logger
 
-from cprl.commons.game import CLASS_NAMES, COLOURS
-from cprl.commons.picture import agent_colour
 from cprl.recording.blueprint import layout
-from cprl.recording.frames import RIM_CELLS, UNSEEN, board_with_rim, mosaic
+from cprl.recording.scenery import Scene, classes, frame_columns, image_forms, lines
+from cprl.recording.streams import FLUSH_TIMEOUT_S, Stream, open_file, serve_live
 
 FILE_NAME: Final = "run.rrd"
-LOCALHOST: Final = "127.0.0.1"
-SERVER_MEMORY: Final = "512MB"
-"""What the served recording may hold; beyond it the oldest rows are dropped, for viewers alone."""
 
 Numbers: TypeAlias = "Sequence[int] | NDArray[np.integer[Any]]"
 
-LINES: Final = {
-    "social/survival_steps": ("survival_steps", (230, 160, 0)),
-    "social/sustainability": ("sustainability", (0, 158, 115)),
-    "social/equality": ("equality", (86, 180, 233)),
-    "social/peacefulness": ("peacefulness", (204, 121, 167)),
-    "time/env_steps_per_s": ("steps per second", (150, 150, 150)),
-    "evaluation/greedy_return": ("greedy, evaluated", (230, 160, 0)),
-}
-"""The name and colour of a line, since the viewers' own colours differ; agents have theirs."""
-
 _LIVE_PERIOD_S: Final = 1.0
 _FILE_PERIOD_S: Final = 10.0
-_FLUSH_TIMEOUT_S: Final = 5.0
-AGENT_RADIUS_CELLS: Final = 0.48
-_ARROW_CELLS: Final = 0.9
-_OUT_OF_PLAY_ALPHA: Final = 60
-
-
-@dataclass(frozen=True, kw_only=True)
-class Scene:
-    """What is on the board that a recording shows."""
-
-    height: int
-    width: int
-    agents: tuple[str, ...]
-    """Names of the agents, agent 0 first."""
-    window: tuple[int, int]
-    """(X, Y) of a window."""
-
-
-class _Stream:
-    """One recording stream that may fail: then a warning says so once, and the run goes on without it."""
-
-    def __init__(self, name: str, recording: Any) -> None:
-        self.name, self.recording = name, recording
-
-    def do(self, what: Callable[[Any], object]) -> None:
-        """Does something with the stream, if it is still there."""
-        if self.recording is None:
-            return
-        try:
-            what(self.recording)
-        except Exception as error:
-            self.recording = None
-            warnings.warn(
-                f"the Rerun {self.name} is dropped, the run goes on without it: {error}",
-                RuntimeWarning,
-                stacklevel=2,
-            )
 
 
 class RerunLogger(Logger):
@@ -109,42 +53,26 @@ class RerunLogger(Logger):
             )
         self.addresses: dict[str, str] = {}
         self._serve = serve
-        self._streams: list[_Stream] = []
-        self._waiting: dict[str, dict[str, list[tuple[int, int, int, float]]]] = {}
-        self._sent: dict[str, float] = {}
+        self._streams: list[Stream] = []
         self._frames = 0
         self._now = (0, 0)
         super().__init__(exp_name, str(log_dir))
 
     def _create_experiment(self) -> list[Any]:
-        import rerun as rr
-
         recording_id = f"{self.exp_name}-{time.time_ns()}"
-
-        def stream() -> Any:
-            recording = rr.RecordingStream("cprl", recording_id=recording_id)
-            recording.set_log_time_enabled(False)
-            return recording
-
         blueprint = layout(self.scene.agents if self.scene else ())
-        to_file = stream()
-        to_file.save(self.path, default_blueprint=blueprint)
-        self._streams.append(_Stream("file", to_file))
+        self._streams.append(open_file(recording_id, self.path, blueprint, period_s=_FILE_PERIOD_S))
         if self._serve:
-            live = stream()
-            grpc = _free_port()
-            live.set_sinks(
-                rr.GrpcServerSink(LOCALHOST, grpc, server_memory_limit=SERVER_MEMORY),
-                default_blueprint=blueprint,
-            )
-            self._streams.append(_Stream("live view", live))
-            self.addresses = _addresses(f"rerun+http://{LOCALHOST}:{grpc}/proxy")
-        now = time.perf_counter()
-        for each in self._streams:
-            self._waiting[each.name], self._sent[each.name] = {}, now
+            live, self.addresses = serve_live(recording_id, blueprint, period_s=_LIVE_PERIOD_S)
+            self._streams.append(live)
         self._all(lambda recording: recording.send_recording_name(self.exp_name))
-        self._log_scenery()
-        self._all(lambda recording: recording.flush(timeout_sec=_FLUSH_TIMEOUT_S))
+        self._static("/", classes())
+        for entity, style in lines(self.scene).items():
+            self._static(entity, style)
+        if self.scene is not None:
+            for entity, form in image_forms(self.scene).items():
+                self._static(entity, form)
+        self._all(lambda recording: recording.flush(timeout_sec=FLUSH_TIMEOUT_S))
         return [each.recording for each in self._streams]
 
     def _all(self, what: Callable[[Any], object]) -> None:
@@ -156,34 +84,6 @@ class RerunLogger(Logger):
 
     def _send(self, entity: str, times: list[Any], columns: Any) -> None:
         self._all(lambda recording: recording.send_columns(entity, times, columns))
-
-    def _log_scenery(self) -> None:
-        """What never changes: colours of classes and lines, names, sizes of images."""
-        import rerun as rr
-
-        classes = [
-            rr.AnnotationInfo(id=kind, label=CLASS_NAMES[kind], color=COLOURS[kind])
-            for kind in range(len(COLOURS))
-        ]
-        between = rr.AnnotationInfo(id=UNSEEN, label="", color=(0, 0, 0, 0))
-        self._static("/", rr.AnnotationContext([*classes, between]))
-        for entity, (name, colour) in LINES.items():
-            self._static(entity, rr.SeriesLines(names=[name], colors=[colour]))
-        if self.scene is None:
-            return
-        for agent, name in enumerate(self.scene.agents):
-            for entity in ("return", "loss", "epsilon"):
-                line = rr.SeriesLines(names=[name], colors=[agent_colour(agent)])
-                self._static(f"{name}/{entity}", line)
-        wide = len(self.scene.agents) * (self.scene.window[1] + 1) - 1
-        for entity, width, height in (
-            ("world/board", self.scene.width + 2 * RIM_CELLS, self.scene.height + 2 * RIM_CELLS),
-            ("windows", wide, self.scene.window[0]),
-        ):
-            form = rr.components.ImageFormat(
-                width=width, height=height, channel_datatype=rr.ChannelDatatype.U8
-            )
-            self._static(entity, rr.SegmentationImage.from_fields(format=form))
 
     def at(self, *, step: int, episode: int) -> None:
         """Says when it is, for what is logged next without a step of its own."""
@@ -200,14 +100,13 @@ class RerunLogger(Logger):
             value = numbers[0]
         when = self._now[0] if step is None else int(step)
         row = when, self._now[1], self._frames, float(value)
-        for waiting in self._waiting.values():
-            waiting.setdefault(name, []).append(row)
-        self._send_if_due()
+        for each in self._streams:
+            each.waiting.setdefault(name, []).append(row)
+            if each.is_due:
+                _send_waiting(each)
 
     def log_frames(self, frames: Mapping[str, NDArray[Any]]) -> None:
         """Logs what `FrameBuffer.take` gave: the board, agents, headings and windows of each step."""
-        import rerun as rr
-
         if self.scene is None:
             raise ValueError("the logger has no scene; give it one to log frames")
         count = len(frames["step"])
@@ -216,31 +115,7 @@ class RerunLogger(Logger):
         numbers = np.arange(self._frames, self._frames + count)
         self._frames += count
         times = _times(frames["step"], frames["episode"], numbers)
-        agents = len(self.scene.agents)
-        places = np.stack([frames["col"], frames["row"]], -1).reshape(-1, 2) + RIM_CELLS + 0.5
-        colours = np.array([agent_colour(agent) for agent in range(agents)], np.uint8)
-        colours = np.concatenate(
-            [np.tile(colours, (count, 1)), np.full((count * agents, 1), 255, np.uint8)], 1
-        )
-        colours[~frames["in_play"].reshape(-1), 3] = _OUT_OF_PLAY_ALPHA
-        ahead = np.array([(0, -1), (1, 0), (0, 1), (-1, 0)], np.float32) * _ARROW_CELLS
-        names = list(self.scene.agents) * count
-        each = [agents] * count
-        columns = {
-            "world/board": rr.SegmentationImage.columns(
-                buffer=board_with_rim(frames["board"]).reshape(count, -1)
-            ),
-            "windows": rr.SegmentationImage.columns(buffer=mosaic(frames["windows"]).reshape(count, -1)),
-            "world/agents": rr.Points2D.columns(
-                positions=places, colors=colours, radii=[AGENT_RADIUS_CELLS] * len(places), labels=names
-            ).partition(each),
-            "world/headings": rr.Arrows2D.columns(
-                origins=places,
-                vectors=ahead[frames["heading"].reshape(-1)],
-                colors=[(255, 255, 255)] * len(places),
-            ).partition(each),
-        }
-        for entity, what in columns.items():
+        for entity, what in frame_columns(self.scene, frames).items():
             self._send(entity, times, what)
 
     def log_text(self, text: str, level: str = "INFO") -> None:
@@ -302,41 +177,16 @@ class RerunLogger(Logger):
 
         self._all(log)
 
-    def _send_if_due(self) -> None:
-        now = time.perf_counter()
-        for each in self._streams:
-            period = _FILE_PERIOD_S if each.name == "file" else _LIVE_PERIOD_S
-            if now - self._sent[each.name] > period:
-                self._send_waiting(each)
-
-    def _send_waiting(self, each: _Stream) -> None:
-        """Sends what one stream still waits for, one chunk an entity."""
-        import rerun as rr
-
-        waiting, self._waiting[each.name] = self._waiting[each.name], {}
-        self._sent[each.name] = time.perf_counter()
-
-        def send(recording: Any) -> None:
-            for name, rows in waiting.items():
-                steps, episodes, frames, values = zip(*rows, strict=True)
-                recording.send_columns(
-                    name, _times(steps, episodes, frames), rr.Scalars.columns(scalars=values)
-                )
-            recording.flush(timeout_sec=_FLUSH_TIMEOUT_S)
-
-        each.do(send)
-
     def flush(self) -> None:
         """Sends everything that waits, to the file and to the viewer."""
         for each in self._streams:
-            self._send_waiting(each)
+            _send_waiting(each)
 
     def shutdown(self) -> None:
         """Sends everything and closes the recording; the file gets its footer. A second call does nothing."""
         self.flush()
-        self._all(lambda recording: recording.disconnect())
         for each in self._streams:
-            each.recording = None
+            each.close()
 
     close = shutdown
 
@@ -358,24 +208,16 @@ def _times(steps: Numbers, episodes: Numbers, frames: Numbers) -> list[Any]:
     return [rr.TimeColumn(name, sequence=np.asarray(numbers, np.int64)) for name, numbers in named]
 
 
-def _free_port() -> int:
-    """A port of 127.0.0.1 that nobody listens at."""
-    with socket.socket() as probe:
-        probe.bind((LOCALHOST, 0))
-        return int(probe.getsockname()[1])
-
-
-def viewer() -> str:
-    """How to start Rerun's own viewer: the one beside this Python, if there is one."""
-    beside = Path(sys.executable).with_name("rerun")
-    return str(beside) if beside.exists() else "rerun"
-
-
-def _addresses(grpc: str) -> dict[str, str]:
-    """Starts the web viewer's pages, and tells where to look."""
+def _send_waiting(stream: Stream) -> None:
+    """Sends what one stream still waits for, one chunk an entity."""
     import rerun as rr
 
-    web = _free_port()
-    rr.serve_web_viewer(web_port=web, open_browser=False)
-    query = f"url={quote(grpc, safe='')}&renderer=webgl&persist=0&hide_welcome_screen=1&theme=dark"
-    return {"browser": f"http://{LOCALHOST}:{web}/?{query}", "native": f"{viewer()} --connect {grpc}"}
+    waiting = stream.take()
+
+    def send(recording: Any) -> None:
+        for name, rows in waiting.items():
+            steps, episodes, frames, values = zip(*rows, strict=True)
+            recording.send_columns(name, _times(steps, episodes, frames), rr.Scalars.columns(scalars=values))
+        recording.flush(timeout_sec=FLUSH_TIMEOUT_S)
+
+    stream.do(send)

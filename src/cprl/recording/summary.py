@@ -10,7 +10,7 @@ from rich.table import Table
 
 from cprl.measuring.episodes import Episode
 from cprl.measuring.evaluate import mean_return
-from cprl.recording.rerun import viewer
+from cprl.recording.streams import viewer
 
 METRICS = ("survival_steps", "sustainability", "equality", "peacefulness")
 

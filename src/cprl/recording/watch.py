@@ -13,7 +13,8 @@ from tensordict import TensorDictBase
 from cprl.envs.torchrl_env import CommonsEnv
 from cprl.measuring.episodes import Episode
 from cprl.recording.frames import Frame, FrameBuffer
-from cprl.recording.rerun import RerunLogger, Scene
+from cprl.recording.rerun import RerunLogger
+from cprl.recording.scenery import Scene
 
 FRAME_BYTES: Final = 300
 RECORDING_BYTES: Final = 60_000_000
