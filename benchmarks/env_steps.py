@@ -71,7 +71,7 @@ def kernel(game: Game, worlds: int, threads: int, turns: int, repeats: int) -> R
     batch = Batch(game, worlds, threads=threads)
     told, actions = batch.new_told(), actions_for(game, worlds, turns)
     us = best_us(lambda turn: batch.play(actions[turn], told), lambda: batch.begin(told), turns, repeats)
-    return Rate(worlds, batch.threads, us)
+    return Rate(worlds, batch.driver.threads, us)
 
 
 def through_step(game: Game, worlds: int, threads: int, turns: int, repeats: int) -> Rate:
@@ -88,7 +88,7 @@ def through_step(game: Game, worlds: int, threads: int, turns: int, repeats: int
         entry.get(keys.AGENTS).set("action", actions[turn])
         moment["now"] = env.step(entry).get("next")
 
-    return Rate(worlds, env.batch.threads, best_us(step, begin, turns, repeats))
+    return Rate(worlds, env.worlds.driver.threads, best_us(step, begin, turns, repeats))
 
 
 def main(*, worlds: tuple[int, ...] = (1, 16, 256, 1024, 4096), repeats: int = 7) -> None:

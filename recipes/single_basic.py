@@ -70,7 +70,13 @@ def main(
     logging.getLogger("torchrl").setLevel(logging.WARNING)
     run = start_run(out, "single_basic", {**arguments, "game": game, "learner": settings})
     env, trial = CommonsEnv(game, seed=seed), CommonsEnv(game, 16, seed=seed + 1)
-    learner = DQNLearner(game.window_shape, len(game.actions), settings=settings, seed=seed)
+    learner = DQNLearner(
+        game.observation_shape,
+        len(game.actions),
+        settings=settings,
+        highest=game.observation.highest,
+        seed=seed,
+    )
     policy, networks = Seats([learner.actor]), {"agent_0": learner.network}
     with (
         Watch(run, env, title=title, episodes=episodes, recipe=arguments, serve=watch == "serve") as viewer,

@@ -5,8 +5,9 @@ from dataclasses import replace
 
 import numpy as np
 
-from cprl import Game, Map, Rules, maps
+from cprl import Game, Map, Observation, Rules, maps
 from cprl.commons.batch import Batch
+from cprl.commons.colours import CLASS_NAMES, agent_colour
 from cprl.commons.maps import SIGN_OF_HEADING
 from cprl.commons.world import Told
 
@@ -18,7 +19,9 @@ RGB_SIGN = {
     (255, 204, 51): "b",
     (255, 0, 0): "o",
     (0, 0, 255): "S",
+    (0, 0, 0): "?",
 }
+SIGN_OF_NAME = dict(zip(CLASS_NAMES, ".#AmboS?", strict=True))
 
 
 class Play:
@@ -27,12 +30,20 @@ class Play:
     The agents of a drawing are numbered in reading order; `order` gives them other numbers.
     """
 
-    def __init__(self, board: str | Map, *, seed: int = 0, order: Sequence[int] | None = None, **rules):
+    def __init__(
+        self,
+        board: str | Map,
+        *,
+        seed: int = 0,
+        order: Sequence[int] | None = None,
+        observation: Observation | None = None,
+        **rules,
+    ):
         board = maps.parse(board) if isinstance(board, str) else board
         if order is not None:
             board = replace(board, starts=tuple(board.starts[i] for i in order))
         rules = {"regrow_prob": (0.0,), **rules}
-        self.game = Game(map=board, rules=Rules(**rules))
+        self.game = Game(map=board, rules=Rules(**rules), observation=observation or Observation())
         self.batch = Batch(self.game, 1, seed=seed)
         self.told: Told = self.batch.begin(self.batch.new_told())
 
@@ -46,13 +57,13 @@ class Play:
 
     @property
     def places(self) -> list[tuple[int, int]]:
-        worlds = self.batch.worlds
+        worlds = self.batch.now
         return [(int(r), int(c)) for r, c in zip(worlds.row[0], worlds.col[0], strict=True)]
 
     @property
     def board(self) -> str:
         """Ground, walls, apples and agents in play, each with its heading."""
-        worlds, board = self.batch.worlds, self.game.map
+        worlds, board = self.batch.now, self.game.map
         signs = [["."] * board.width for _ in range(board.height)]
         for row, col in board.walls:
             signs[row][col] = "#"
@@ -65,16 +76,26 @@ class Play:
 
     @property
     def in_play(self) -> list[bool]:
-        return self.batch.worlds.in_play[0].tolist()
+        return self.batch.now.in_play[0].tolist()
 
     @property
     def harvest(self) -> list[float]:
         return self.told.harvest[0].tolist()
 
     def window(self, agent: int) -> str:
-        """What an agent sees, by the signs of `RGB_SIGN`."""
+        """What an agent sees, by the signs of `RGB_SIGN`, other agents by number if they are told apart."""
+        if self.game.observation.encoding == "one_hot":
+            return self._one_hot_window(agent)
         pixels = self.told.observation[0, agent].transpose(1, 2, 0)
-        return "\n".join("".join(RGB_SIGN[tuple(map(int, cell))] for cell in row) for row in pixels)
+        numbers = {agent_colour(i): str(i) for i in range(self.game.agents)}
+        signs = {**RGB_SIGN, **(numbers if self.game.observation.agents_apart else {})}
+        return "\n".join("".join(signs[tuple(map(int, cell))] for cell in row) for row in pixels)
+
+    def _one_hot_window(self, agent: int) -> str:
+        planes = self.told.observation[0, agent]
+        assert (planes.sum(0) == 1).all(), "each cell is of one class"
+        signs = [SIGN_OF_NAME.get(name, name[-1]) for name in self.game.channels]
+        return "\n".join("".join(signs[kind] for kind in row) for row in planes.argmax(0))
 
 
 def drawn(text: str) -> str:

@@ -8,7 +8,7 @@ from boards import Play
 
 from cprl import Game, Rules, maps
 from cprl.commons.batch import Batch
-from cprl.commons.game import distance, neighbours
+from cprl.commons.tables import distance, neighbours
 
 
 def test_an_agent_bites_the_apple_that_it_steps_on():
@@ -76,7 +76,7 @@ def test_a_clock_that_runs_out_with_the_last_apple_counts_as_depletion():
 
 def test_a_world_that_has_ended_stays_as_it_is_and_pays_nothing():
     play = Play(">AA\n..<", episode_steps=1, regrow_prob=(1.0,)).turn("forward", "beam")
-    before = {name: array.copy() for name, array in play.batch.worlds._asdict().items()}
+    before = {name: array.copy() for name, array in play.batch.now._asdict().items()}
     windows = play.told.observation.copy()
     play.turn("forward", "beam")
     assert play.harvest == [0, 0]
@@ -84,7 +84,7 @@ def test_a_world_that_has_ended_stays_as_it_is_and_pays_nothing():
     assert play.told.done[0, 0]
     assert play.told.truncated[0, 0]
     assert np.array_equal(play.told.observation, windows)
-    for name, array in play.batch.worlds._asdict().items():
+    for name, array in play.batch.now._asdict().items():
         assert np.array_equal(array, before[name]), name
 
 

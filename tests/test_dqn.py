@@ -129,7 +129,7 @@ def test_the_actor_follows_the_learner_and_epsilon_its_steps():
 def test_the_same_seed_learns_the_same():
     def weights(seed):
         torch.manual_seed(seed)
-        agent = DQNLearner(SHORT.window_shape, 8, settings=DQNSettings(buffer_size=100), seed=seed)
+        agent = DQNLearner(SHORT.observation_shape, 8, settings=DQNSettings(buffer_size=100), seed=seed)
         env = CommonsEnv(SHORT, 1, seed=seed)
         moment = env.reset()
         for turn in torch.as_tensor(random_actions(40, 1, SHORT)):
@@ -145,5 +145,5 @@ def test_the_same_seed_learns_the_same():
 def test_the_published_learner_learns_from_presets():
     game = presets.game("single_basic", variant="as_run")
     settings = presets.learner("single_basic", variant="as_run")
-    agent = DQNLearner(game.window_shape, len(game.actions), settings=settings)
-    assert agent.network(torch.zeros(1, *game.window_shape, dtype=torch.uint8)).shape == (1, 7)
+    agent = DQNLearner(game.observation_shape, len(game.actions), settings=settings)
+    assert agent.network(torch.zeros(1, *game.observation_shape, dtype=torch.uint8)).shape == (1, 7)

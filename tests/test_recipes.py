@@ -83,7 +83,7 @@ def test_a_directory_with_a_run_in_it_is_not_written_over(tmp_path, capsys):
 def test_the_short_schedule_earns_three_times_what_chance_does(tmp_path):
     run = recipe("single_basic").main(schedule="short", out=tmp_path / "run")
     game = presets.game("single_basic")
-    learner = DQNLearner(game.window_shape, 7, settings=presets.learner("single_basic"))
+    learner = DQNLearner(game.observation_shape, 7, settings=presets.learner("single_basic"))
     restore_weights(run / "checkpoints" / "best.pt", {"agent_0": learner.network})
     fresh = CommonsEnv(game, 100, seed=1234)
     greedy, _ = mean_return(evaluate(fresh, Seats([learner.actor])))

@@ -2,6 +2,7 @@
 
 import socket
 import warnings
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -10,11 +11,11 @@ import torch
 from rerun.chunk import RrdReader
 from tensordict import TensorDict
 
-from cprl import CommonsEnv, Game, Rules, maps
+from cprl import CommonsEnv, Game, Observation, Rules, maps
 from cprl.acting import RandomActor
-from cprl.commons.game import APPLE, BEAM, COLOURS, GROUND, OTHER, SELF, WALL
+from cprl.commons.colours import APPLE, BEAM, COLOURS, FIRST_AGENT, GROUND, MARK, OTHER, SELF, WALL
 from cprl.learning import DQNLearner, DQNSettings
-from cprl.recording.frames import UNSEEN, Frame, FrameBuffer, board_with_rim, mosaic
+from cprl.recording.frames import UNSEEN, Frame, FrameBuffer, board_with_rim, classes_seen, mosaic
 from cprl.recording.rerun import RerunLogger
 from cprl.recording.scenery import Scene
 from cprl.recording.watch import Watch
@@ -58,12 +59,12 @@ def frames(count, *, first_step=1):
     """So many frames of two agents, each frame another."""
     random = np.random.default_rng(0)
     buffer = FrameBuffer(count, board=(3, 5), windows=(2, 3, 3, 5))
-    colours = np.array(COLOURS, np.uint8)
+    on_boards = np.array([GROUND, WALL, APPLE, MARK, BEAM, OTHER], np.uint8)
     shown = []
     for step in range(count):
         frame = Frame(
-            board=random.integers(0, len(COLOURS), (3, 5)).astype(np.uint8),
-            windows=colours[random.integers(0, len(COLOURS), (2, 3, 5))].transpose(0, 3, 1, 2),
+            board=on_boards[random.integers(0, len(on_boards), (3, 5))],
+            windows=GAME.palette[random.integers(0, len(COLOURS), (2, 3, 5))].transpose(0, 3, 1, 2),
             row=np.array([0, step % 3], np.int32),
             col=np.array([step % 5, 4], np.int32),
             heading=np.array([step % 4, 1], np.int32),
@@ -71,7 +72,8 @@ def frames(count, *, first_step=1):
         )
         buffer.add(first_step + step, 7, frame)
         shown.append(frame)
-    return buffer.take(), shown
+    taken = buffer.take()
+    return {**taken, "windows": classes_seen(GAME, taken["windows"])}, shown
 
 
 def test_numbers_are_read_back_under_their_names_with_all_three_timelines(tmp_path):
@@ -175,13 +177,31 @@ def test_a_full_buffer_says_so():
     assert buffer.size == 0
 
 
-def test_mosaics_put_windows_side_by_side_and_mark_foreign_colours():
+def test_mosaics_put_windows_side_by_side():
+    windows = np.array([[[[SELF, BEAM]], [[GROUND, APPLE]]]], np.uint8)
+    assert mosaic(windows).tolist() == [[[SELF, BEAM, UNSEEN, GROUND, APPLE]]]
+
+
+def test_classes_are_known_from_colours_and_foreign_colours_are_marked():
     windows = np.zeros((1, 2, 3, 1, 2), np.uint8)
     windows[0, 0, :, 0, 0] = COLOURS[SELF]
     windows[0, 0, :, 0, 1] = COLOURS[BEAM]
     windows[0, 1, :, 0, 0] = (1, 2, 3)
     windows[0, 1, :, 0, 1] = COLOURS[APPLE]
-    assert mosaic(windows).tolist() == [[[SELF, BEAM, UNSEEN, UNSEEN, APPLE]]]
+    assert classes_seen(GAME, windows).tolist() == [[[[SELF, BEAM]], [[UNSEEN, APPLE]]]]
+
+
+@pytest.mark.parametrize("encoding", ["rgb", "one_hot"])
+@pytest.mark.parametrize("agents_apart", [False, True])
+def test_classes_are_known_in_every_form_of_observation(encoding, agents_apart):
+    game = replace(GAME, observation=Observation(encoding=encoding, agents_apart=agents_apart))
+    env = CommonsEnv(game)
+    env.reset()
+    classes = classes_seen(game, env.told.observation)
+    other = FIRST_AGENT + 1 if agents_apart else OTHER
+    assert (classes[0, 0] == SELF).sum() == 1
+    assert (classes[0, 0] == other).sum() == 1
+    assert set(np.unique(classes)) <= {*range(FIRST_AGENT), FIRST_AGENT, FIRST_AGENT + 1}
 
 
 def test_the_rim_is_wall_and_agents_are_left_to_their_own_colours():
@@ -234,7 +254,7 @@ def trained(run, *, watched):
     """The weights after a short training, and what torch's generator stands at."""
     torch.manual_seed(1)
     settings = DQNSettings(buffer_size=200, learning_rate=1e-3)
-    learner = DQNLearner(GAME.window_shape, 8, settings=settings, seed=1)
+    learner = DQNLearner(GAME.observation_shape, 8, settings=settings, seed=1)
     env = CommonsEnv(GAME, seed=1)
     observers = [Watch(run, env, title="run", episodes=4)] if watched else []
     train(env, {0: learner}, others={1: RandomActor(8)}, episodes=4, observers=observers)

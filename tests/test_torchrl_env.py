@@ -103,7 +103,7 @@ def test_a_mask_resets_only_the_marked_worlds():
         if key != keys.STATE:
             assert torch.equal(begun[key][[0, 2]], played[key][[0, 2]]), key
     assert begun[keys.STOCK][1] == len(SHORT.map.sites)
-    assert env.batch.worlds.step[:, 0].tolist() == [5, 0, 5]
+    assert env.worlds.now.step[:, 0].tolist() == [5, 0, 5]
 
 
 @pytest.mark.parametrize("bad", [-1, 8])
@@ -117,7 +117,7 @@ def test_unknown_actions_raise_and_change_nothing(bad):
             ValueError, match=f"action {bad} of agent 1 in world 1 is unknown; allowed: 0 to 7"
         ):
             step(moment.clone())
-    assert env.batch.worlds.step.sum() == 0
+    assert env.worlds.now.step.sum() == 0
     assert_close(moment.exclude(keys.ACTION), kept)
 
 

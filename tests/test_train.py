@@ -30,7 +30,7 @@ class Witness:
 
 
 def learner(seed=0):
-    return DQNLearner(GAME.window_shape, 8, settings=DQNSettings(buffer_size=200), seed=seed)
+    return DQNLearner(GAME.observation_shape, 8, settings=DQNSettings(buffer_size=200), seed=seed)
 
 
 def test_observers_see_every_turn_and_every_episode_and_the_learner_learns_once_a_turn():

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from boards import Play, drawn
 
-from cprl.commons.game import APPLE, GROUND, MARK, OTHER, WALL
+from cprl.commons.colours import APPLE, GROUND, MARK, OTHER, WALL
 
 
 def windows(play, *agents):

@@ -12,9 +12,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from cprl import Game, Map, Rules, presets
-from cprl.commons import compiled, drivers
+from cprl.commons import compiled, loops
 from cprl.commons.batch import Batch
-from cprl.commons.game import neighbours
+from cprl.commons.tables import neighbours
 from cprl.commons.world import empty_scratch
 
 STAY = 7
@@ -65,10 +65,10 @@ def played(game, actions, *, seed=0, first_world=0, threads=1):
     """The worlds and what was told, before the first turn and after each."""
     batch = Batch(game, actions.shape[1], seed=seed, first_world=first_world, threads=threads)
     told = batch.begin(batch.new_told())
-    moments = [(copied(batch.worlds), copied(told))]
+    moments = [(copied(batch.now), copied(told))]
     for turn in actions:
         batch.play(turn, told)
-        moments.append((copied(batch.worlds), copied(told)))
+        moments.append((copied(batch.now), copied(told)))
     return moments
 
 
@@ -188,11 +188,11 @@ def test_only_marked_worlds_begin_anew():
     told = batch.begin(batch.new_told())
     for turn in random_actions(30, 3, game):
         batch.play(turn, told)
-    before, told_before = copied(batch.worlds), copied(told)
+    before, told_before = copied(batch.now), copied(told)
     batch.begin(told, np.array([False, True, False]))
-    assert batch.worlds.step[:, 0].tolist() == [30, 0, 30]
-    assert batch.worlds.episode[:, 0].tolist() == [0, 1, 0]
-    assert_same(batch.worlds, before, rows=[0, 2], other_rows=[0, 2])
+    assert batch.now.step[:, 0].tolist() == [30, 0, 30]
+    assert batch.now.episode[:, 0].tolist() == [0, 1, 0]
+    assert_same(batch.now, before, rows=[0, 2], other_rows=[0, 2])
     assert_same(told, told_before, rows=[0, 2], other_rows=[0, 2])
 
 
@@ -222,10 +222,10 @@ def test_a_batch_that_cannot_be_is_refused(arguments, message):
 def test_unknown_actions_raise_and_change_nothing(actions, message):
     batch = Batch(presets.game("commons"), 2)
     told = batch.begin(batch.new_told())
-    before, told_before = copied(batch.worlds), copied(told)
+    before, told_before = copied(batch.now), copied(told)
     with pytest.raises(ValueError, match=message):
         batch.play(actions, told)
-    assert_same(batch.worlds, before)
+    assert_same(batch.now, before)
     assert_same(told, told_before)
 
 
@@ -249,18 +249,18 @@ def test_a_changed_rule_is_another_folder_of_compiled_rules(tmp_path, monkeypatc
 def test_the_rules_are_plain_python_and_uncompiled_play_the_same_game(variant):
     # This is what Numba's CUDA simulator does with them.
     game = presets.game("two_complex", variant=variant)
-    plain = compiled.compiled(drivers.FUNCTIONS, lambda function: function)
+    plain = compiled.compiled(loops.FUNCTIONS, lambda function: function)
     actions = random_actions(25, 2, game, seed=1)
     batch = Batch(game, 2, seed=1)
     scratch = empty_scratch(
         agents=2, sites=45, cells=game.tables.background.size, window=game.tables.window_cells.shape[1]
     )
     told = batch.new_told()
-    plain["begin_worlds"](batch.worlds, game.tables, np.ones(2, np.bool_), told, scratch, 0, 2)
+    plain["begin_worlds"](batch.now, game.tables, np.ones(2, np.bool_), told, scratch, 0, 2)
     for turn, (worlds, expected) in zip([None, *actions], played(game, actions, seed=1), strict=True):
         if turn is not None:
-            plain["play_worlds"](batch.worlds, game.tables, turn, told, scratch, 0, 2)
-        assert_same(batch.worlds, worlds)
+            plain["play_worlds"](batch.now, game.tables, turn, told, scratch, 0, 2)
+        assert_same(batch.now, worlds)
         assert_same(told, expected)
 
 
@@ -274,4 +274,4 @@ def test_a_batch_goes_on_as_it_was_after_pickling():
     other, other_told = pickle.loads(pickle.dumps(batch)), copied(told)
     for turn in actions[10:]:
         assert_same(batch.play(turn, told), other.play(turn, other_told))
-    assert_same(batch.worlds, other.worlds)
+    assert_same(batch.now, other.now)

@@ -16,8 +16,9 @@ from cprl import presets
 from cprl.commons import maps
 from cprl.commons.game import Game
 from cprl.commons.maps import Map
+from cprl.commons.observation import Observation
 from cprl.commons.rules import Rules
 from cprl.envs import CommonsEnv
 from cprl.train import train
 
-__all__ = ["CommonsEnv", "Game", "Map", "Rules", "maps", "presets", "train"]
+__all__ = ["CommonsEnv", "Game", "Map", "Observation", "Rules", "maps", "presets", "train"]

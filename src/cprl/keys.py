@@ -1,7 +1,7 @@
 """Every TensorDict entry that the rooms of cprl hand on: its name, shape, type and meaning.
 
 Axes, the same letters everywhere: B worlds, N agents, H x W the board, K sites, T time, A actions,
-R replicas, X rows and Y columns of an agent's window (its own row included, farthest row first).
+R replicas, C channels, X rows and Y columns of an agent's window (its own row included, farthest row first).
 """
 
 from typing import Final
@@ -10,7 +10,8 @@ AGENTS: Final = "agents"
 """The group of agents, a nested TensorDict of batch size [B, N]."""
 
 OBSERVATION: Final = (AGENTS, "observation")
-"""uint8 [B, N, 3, X, Y]: the RGB window that an agent sees, 0..255."""
+"""uint8 [B, N, C, X, Y]: what an agent sees, in the form that `Game.observation` says; as a rule its RGB
+window, C = 3 channels, 0..255."""
 
 ACTION: Final = (AGENTS, "action")
 """int64 [B, N]: what an agent does, an index into `cprl.commons.rules.ACTIONS`."""
@@ -32,6 +33,14 @@ HIT_BY: Final = (AGENTS, "hit_by")
 
 TAGGED_BY: Final = (AGENTS, "tagged_by")
 """bool [B, N, N]: row, who was tagged out this turn; column, by whom."""
+
+SCOREBOARD: Final = (AGENTS, "scoreboard")
+"""float32 [B, N, N]: apples bitten so far in this episode, a row per observer: its own first, then those of
+the next numbers, round and round. Only where `Observation.scoreboard` asks for it."""
+
+STOCK_GAUGE: Final = (AGENTS, "stock_gauge")
+"""float32 [B, N, 1]: the share of all sites that hold an apple, 0..1. Only where
+`Observation.stock_gauge` asks for it."""
 
 STOCK: Final = "stock"
 """int64 [B, 1]: apples on the board."""

@@ -1,4 +1,4 @@
-"""Networks that read a window."""
+"""Networks that read observations."""
 
 from collections.abc import Sequence
 from math import prod
@@ -7,34 +7,34 @@ import torch
 from torch import Tensor, nn
 from torchrl.modules import MLP
 
-BRIGHTEST = 255.0
-"""Windows are uint8; networks see them divided by this, in 0..1."""
-
 
 class QNetwork(nn.Module):
-    """The value of each action, from an RGB window, by fully connected layers with ReLU.
+    """The value of each action, from what an agent sees, by fully connected layers with ReLU.
 
     Args:
-        window_shape: (3, X, Y) of a window.
+        observation_shape: (C, X, Y) of an observation, `Game.observation_shape`.
         actions: how many actions A there are.
         hidden_cells: units of each hidden layer.
+        highest: the largest value of an observation, `Observation.highest`; layers see 0..1.
         relu_on_outputs: ReLU on the values too, as in the study as run.
         glorot_uniform: Glorot-uniform weights and zero biases, as in the study as run; else torch's default.
     """
 
     def __init__(
         self,
-        window_shape: Sequence[int],
+        observation_shape: Sequence[int],
         actions: int,
         *,
         hidden_cells: Sequence[int] = (32, 32),
+        highest: float = 255.0,
         relu_on_outputs: bool = False,
         glorot_uniform: bool = False,
     ) -> None:
         super().__init__()
-        self.window_dims = len(window_shape)
+        self.highest = highest
+        self.observation_dims = len(observation_shape)
         self.layers = MLP(
-            in_features=prod(window_shape),
+            in_features=prod(observation_shape),
             out_features=actions,
             num_cells=list(hidden_cells),
             activation_class=nn.ReLU,
@@ -43,9 +43,9 @@ class QNetwork(nn.Module):
         if glorot_uniform:
             self.apply(_glorot_uniform)
 
-    def forward(self, window: Tensor) -> Tensor:
-        """uint8 [..., 3, X, Y] to float32 [..., A]."""
-        seen = window.flatten(-self.window_dims).to(torch.float32) / BRIGHTEST
+    def forward(self, observation: Tensor) -> Tensor:
+        """uint8 [..., C, X, Y] to float32 [..., A]."""
+        seen = observation.flatten(-self.observation_dims).to(torch.float32) / self.highest
         return self.layers(seen)  # type: ignore[no-any-return]
 
 

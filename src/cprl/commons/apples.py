@@ -14,8 +14,8 @@ from cprl.commons.chance import (
     WORD_BITS,
     philox4x32,
 )
-from cprl.commons.game import Tables
 from cprl.commons.moves import cell_of
+from cprl.commons.tables import Tables
 from cprl.commons.world import Scratch, Worlds
 
 
@@ -43,6 +43,16 @@ def pick(world: Worlds, tables: Tables, k: int) -> None:
     world.stock_left[0] -= 1
     for n in range(tables.near_first[k], tables.near_first[k + 1]):
         world.near[tables.near_sites[n]] -= 1
+
+
+def recount(world: Worlds, tables: Tables) -> None:
+    """What follows from the stock: how many apples are left, and how many near each site."""
+    world.stock_left[0] = 0
+    for k in range(world.stock.shape[0]):
+        world.near[k] = 0
+        world.stock_left[0] += world.stock[k]
+        for n in range(tables.near_first[k], tables.near_first[k + 1]):
+            world.near[k] += world.stock[tables.near_sites[n]]
 
 
 def draw(world: Worlds, number: int) -> tuple[np.uint64, np.uint64, np.uint64, np.uint64]:
@@ -115,7 +125,8 @@ def bite(world: Worlds, tables: Tables, harvest: NDArray[np.float32]) -> None:
             if k >= 0 and world.stock[k] == 1 and tables.may_bite[i, k]:
                 pick(world, tables, k)
                 harvest[i] = 1.0
+                world.harvested[i] += 1
 
 
-FUNCTIONS = (fill, hang, pick, draw, draw_first_bytes, has_sprouted, find_sprouts, grow, bite)
-"""In the order in which they call each other, as `batch.py` compiles them."""
+FUNCTIONS = (fill, hang, pick, recount, draw, draw_first_bytes, has_sprouted, find_sprouts, grow, bite)
+"""In the order in which they call each other, as `compiled.py` compiles them."""

@@ -1,30 +1,50 @@
-"""B worlds at once: the compiled rules, driven by CPU threads over worlds."""
+"""B worlds of a game at once, on whatever driver plays them."""
 
-import os
-from collections.abc import Callable
-from concurrent.futures import ThreadPoolExecutor
-from functools import cache, partial
-from typing import Any
+from collections.abc import Mapping
+from typing import Any, NamedTuple, Protocol
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import DTypeLike, NDArray
 
-from cprl.commons.compiled import rules_for_cpu
-from cprl.commons.game import Game
-from cprl.commons.world import Actions, Bools, Bytes, Told, empty_scratch, empty_worlds
+from cprl.commons import state as states
+from cprl.commons.game import Game, told_shapes
+from cprl.commons.loops import Loop
+from cprl.commons.threads import CpuThreads
+from cprl.commons.world import Actions, Bools, Bytes, Ints, Told, Worlds, empty_worlds
 
-WORLDS_PER_THREAD = 512
-"""Fewer are not worth handing to another thread, which takes a tenth of a millisecond."""
+
+class Driver(Protocol):
+    """What runs the rules: `CpuThreads`, or `cprl.commons.cuda.CudaThreads`."""
+
+    threads: int
+
+    def place(self, worlds: Worlds) -> Worlds: ...
+    def empty(self, shape: tuple[int, ...], dtype: DTypeLike) -> NDArray[Any]: ...
+    def read(self, array: NDArray[Any]) -> NDArray[Any]: ...
+    def write(self, array: NDArray[Any], values: NDArray[Any]) -> None: ...
+    def first_unknown(self, actions: Actions, known: int) -> int: ...
+    def run(self, loop: Loop, worlds: Worlds, what: NDArray[Any], told: Told) -> None: ...
 
 
-@cache
-def _pool(process: int, threads: int) -> ThreadPoolExecutor:
-    """Threads of this very process; a fork makes its own."""
-    return ThreadPoolExecutor(threads, thread_name_prefix=f"cprl-{process}")
+class Shown(NamedTuple):
+    """One world as people look at it: numpy arrays, copies."""
+
+    board: Bytes
+    """uint8 [H, W], classes of `cprl.commons.colours`."""
+    stock: Bytes
+    """uint8 [K], 1 where an apple hangs."""
+    row: Ints
+    """int32 [N]."""
+    col: Ints
+    """int32 [N]."""
+    heading: Ints
+    """int32 [N], 0 up, 1 right, 2 down, 3 left."""
+    in_play: Bools
+    """bool [N]."""
 
 
 class Batch:
-    """B worlds of a game, played a turn at a time on the CPU.
+    """B worlds of a game, played a turn at a time.
 
     Args:
         game: what is played.
@@ -32,67 +52,58 @@ class Batch:
         seed: 0 .. 2**64 - 1; with it, the world's number, the episode and the step all chance is settled.
         first_world: the number of the first world, so that world b can be played alone.
         threads: how many CPU threads share the worlds; None for all cores where it pays.
+        driver: what plays them; by default CPU threads.
     """
 
     def __init__(
-        self, game: Game, worlds: int, *, seed: int = 0, first_world: int = 0, threads: int | None = None
+        self,
+        game: Game,
+        worlds: int,
+        *,
+        seed: int = 0,
+        first_world: int = 0,
+        threads: int | None = None,
+        driver: Driver | None = None,
     ) -> None:
         if worlds < 1:
             raise ValueError(f"worlds is {worlds}; at least 1 is wanted")
         if first_world < 0 or first_world + worlds > 2**32:
             raise ValueError(f"worlds {first_world} to {first_world + worlds - 1}; allowed: 0 to 2**32 - 1")
-        if threads is not None and threads < 1:
-            raise ValueError(f"threads is {threads}; at least 1 is wanted, or None for all cores")
         self.game = game
         self.size = worlds
-        most = threads or os.cpu_count() or 1
-        self.threads = min(most, worlds if threads else -(-worlds // WORLDS_PER_THREAD))
-        self.worlds = empty_worlds(worlds=worlds, agents=game.agents, sites=len(game.map.sites))
-        self.worlds.number[:, 0] = np.arange(first_world, first_world + worlds, dtype=np.uint64)
-        self._tables = game.tables
-        self._sheets = [
-            empty_scratch(
-                agents=game.agents,
-                sites=len(game.map.sites),
-                cells=self._tables.background.size,
-                window=self._tables.window_cells.shape[1],
-            )
-            for _ in range(self.threads)
-        ]
+        self.driver: Driver = driver or CpuThreads(game, worlds, threads=threads)
+        host = empty_worlds(worlds=worlds, agents=game.agents, sites=len(game.map.sites))
+        host.number[:, 0] = np.arange(first_world, first_world + worlds, dtype=np.uint64)
+        self.now: Worlds = self.driver.place(host)
+        """How the worlds stand, in the driver's arrays."""
+        self._everyone = self._marked(np.ones(worlds, np.bool_))
         self.set_seed(seed)
+
+    def _marked(self, which: Bools) -> Bools:
+        marks = self.driver.empty((self.size,), np.bool_)
+        self.driver.write(marks, which)
+        return marks
 
     def set_seed(self, seed: int) -> None:
         """Starts all over: the next episode of each world is the first of this seed."""
         if not 0 <= seed < 2**64:
             raise ValueError(f"seed is {seed}; allowed: 0 to 2**64 - 1")
-        self.worlds.seed[:] = seed
-        self.worlds.episode[:] = -1
+        self.driver.write(self.now.seed, np.full((self.size, 1), seed, np.uint64))
+        self.driver.write(self.now.episode, np.full((self.size, 1), -1, np.int32))
 
     def new_told(self) -> Told:
         """Fresh arrays for what a turn tells."""
-        shape = self.size, self.game.agents
-        return Told(
-            observation=np.empty((*shape, *self.game.window_shape), np.uint8),
-            harvest=np.empty(shape, np.float32),
-            in_play=np.empty(shape, np.bool_),
-            fired=np.empty(shape, np.bool_),
-            hit_by=np.empty((*shape, self.game.agents), np.bool_),
-            tagged_by=np.empty((*shape, self.game.agents), np.bool_),
-            stock=np.empty((self.size, 1), np.int64),
-            regrown=np.empty((self.size, 1), np.int64),
-            terminated=np.empty((self.size, 1), np.bool_),
-            truncated=np.empty((self.size, 1), np.bool_),
-            done=np.empty((self.size, 1), np.bool_),
-        )
+        shapes = told_shapes(self.game, self.size)
+        return Told(**{name: self.driver.empty(*form) for name, form in shapes.items()})
 
     def begin(self, told: Told, which: Bools | None = None) -> Told:
         """Begins the next episode of the marked worlds, all if None; only their rows of `told` are written.
 
         Args:
+            told: as `new_told` makes it.
             which: bool [B].
         """
-        which = np.ones(self.size, np.bool_) if which is None else which
-        self._share(rules_for_cpu()["begin_worlds"], which, told)
+        self.driver.run("begin_worlds", self.now, self._everyone if which is None else which, told)
         return told
 
     def play(self, actions: Actions, told: Told) -> Told:
@@ -100,6 +111,7 @@ class Batch:
 
         Args:
             actions: int64 [B, N], contiguous.
+            told: as `new_told` makes it.
 
         Raises:
             ValueError: for an action that the game does not know; then nothing has changed.
@@ -109,14 +121,48 @@ class Batch:
 
     def play_checked(self, actions: Actions, told: Told) -> Told:
         """`play` for actions that `check` has seen."""
-        self._share(rules_for_cpu()["play_worlds"], actions, told)
+        self.driver.run("play_worlds", self.now, actions, told)
         return told
 
     def boards(self, told: Told) -> Bytes:
-        """The whole boards as they stand, uint8 [B, H, W], colour classes of `cprl.commons.game`."""
-        boards = np.empty((self.size, self.game.map.height, self.game.map.width), np.uint8)
-        self._share(rules_for_cpu()["show_worlds"], boards, told)
+        """The whole boards as they stand, uint8 [B, H, W], classes of `cprl.commons.colours`."""
+        boards = self.driver.empty((self.size, self.game.map.height, self.game.map.width), np.uint8)
+        self.driver.run("show_worlds", self.now, boards, told)
         return boards
+
+    def show(self, told: Told, *, world: int = 0) -> Shown:
+        """One world for people to look at."""
+        read, now = self.driver.read, self.now
+        return Shown(
+            board=read(self.boards(told))[world],
+            stock=read(now.stock)[world],
+            row=read(now.row)[world],
+            col=read(now.col)[world],
+            heading=read(now.heading)[world],
+            in_play=read(now.in_play)[world],
+        )
+
+    def state(self) -> states.State:
+        """How all worlds stand, as plain arrays by the names of `Worlds`: copies, [B, ...] each.
+
+        With the game it says all that the future depends on, chance included.
+        """
+        return {name: self.driver.read(getattr(self.now, name)) for name in states.NAMES}
+
+    def load(self, state: Mapping[str, NDArray[Any]], told: Told) -> Told:
+        """Puts the worlds where a state says; `told` shows them so, and says that nothing happened.
+
+        Args:
+            state: as `state` gives it, of as many worlds of the same game.
+            told: as `new_told` makes it.
+
+        Raises:
+            ValueError: for a state that cannot be; then nothing has changed.
+        """
+        for name, values in states.checked(state, worlds=self.size, game=self.game).items():
+            self.driver.write(getattr(self.now, name), values)
+        self.driver.run("look_at_worlds", self.now, self._everyone, told)
+        return told
 
     def check(self, actions: Actions) -> None:
         """Raises ValueError unless all actions are known; see `play`."""
@@ -124,24 +170,10 @@ class Batch:
         if actions.shape != wanted or actions.dtype != np.int64:
             raise ValueError(f"actions are {actions.dtype} {actions.shape}; wanted: int64 {wanted}")
         known = len(self.game.actions)
-        at = rules_for_cpu()["first_unknown"](actions.reshape(-1), known)
+        at = self.driver.first_unknown(actions, known)
         if at >= 0:
             world, agent = divmod(at, self.game.agents)
             raise ValueError(
-                f"action {actions[world, agent]} of agent {agent} in world {world} is unknown; "
-                f"allowed: 0 to {known - 1} ({', '.join(self.game.actions)})"
+                f"action {self.driver.read(actions)[world, agent]} of agent {agent} in world {world} is "
+                f"unknown; allowed: 0 to {known - 1} ({', '.join(self.game.actions)})"
             )
-
-    def _share(self, rule: Callable[..., None], what: NDArray[Any], told: Told) -> None:
-        """Runs a rule on all worlds, each thread on its share of them; this thread takes the last share."""
-        play = partial(rule, self.worlds, self._tables, what, told)
-        if self.threads == 1:
-            play(self._sheets[0], 0, self.size)
-            return
-        bounds = [self.size * t // self.threads for t in range(self.threads + 1)]
-        *others, own = zip(self._sheets, bounds, bounds[1:], strict=False)
-        pool = _pool(os.getpid(), self.threads - 1)
-        shares = [pool.submit(play, *share) for share in others]
-        play(*own)
-        for share in shares:
-            share.result()

@@ -1,7 +1,8 @@
 """The beam: what it covers, whom it hits, and who is out of play for it. All on ONE world."""
 
-from cprl.commons.game import WALL, Tables
+from cprl.commons.colours import WALL
 from cprl.commons.moves import cell_of
+from cprl.commons.tables import Tables
 from cprl.commons.world import COL_STEP, ROW_STEP, Bools, Worlds
 
 
@@ -78,4 +79,4 @@ def put_out(world: Worlds, tables: Tables, i: int, freeze: int) -> None:
 
 
 FUNCTIONS = (beam_cell, beam_reach, is_hit, find_hits, put_out, tag)
-"""In the order in which they call each other, as `batch.py` compiles them."""
+"""In the order in which they call each other, as `compiled.py` compiles them."""

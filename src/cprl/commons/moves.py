@@ -1,6 +1,7 @@
 """Turning, walking, and what happens when several agents want one cell. All on ONE world."""
 
-from cprl.commons.game import WALL, Tables
+from cprl.commons.colours import WALL
+from cprl.commons.tables import Tables
 from cprl.commons.world import COL_STEP, ROW_STEP, Actions, Scratch, Worlds
 
 WALK_TURN = (0, 2, 3, 1)
@@ -150,9 +151,9 @@ def has_to_wait(world: Worlds, i: int) -> bool:
 def put_at_start(world: Worlds, tables: Tables) -> None:
     """Everybody in play, where and as the map says."""
     for i in range(world.row.shape[0]):
-        world.row[i] = tables.start_row[i]
-        world.col[i] = tables.start_col[i]
-        world.heading[i] = tables.start_heading[i]
+        world.row[i] = tables.start[i, 0]
+        world.col[i] = tables.start[i, 1]
+        world.heading[i] = tables.start[i, 2]
         world.out_steps[i] = 0
         world.in_play[i] = True
         world.on_board[i] = True
@@ -160,6 +161,7 @@ def put_at_start(world: Worlds, tables: Tables) -> None:
         world.hits[i] = 0
         world.tagged_step[i] = 0
         world.offences[i] = 0
+        world.harvested[i] = 0
 
 
 FUNCTIONS = (
@@ -180,4 +182,4 @@ FUNCTIONS = (
     return_to_play,
     put_at_start,
 )
-"""In the order in which they call each other, as `batch.py` compiles them."""
+"""In the order in which they call each other, as `compiled.py` compiles them."""

@@ -1,34 +1,16 @@
 """The board for people: apples, walls, and every agent in its own colour, with its heading."""
 
-from colorsys import hsv_to_rgb
 from typing import Final
 
 import numpy as np
 
-from cprl.commons.game import APPLE, GROUND, WALL, Game
+from cprl.commons.colours import APPLE, GROUND, WALL, agent_colour
+from cprl.commons.game import Game
 from cprl.commons.maps import Map
 from cprl.commons.world import COL_STEP, ROW_STEP, Bytes, Ints
 
 GRID_COLOUR: Final = (28, 30, 36)
 CELL_COLOURS: Final = {GROUND: (16, 18, 22), WALL: (125, 125, 125), APPLE: (46, 184, 76)}
-AGENT_COLOURS: Final = (
-    (86, 156, 255),
-    (255, 92, 92),
-    (255, 201, 60),
-    (186, 110, 255),
-    (64, 214, 200),
-    (255, 140, 40),
-    (255, 130, 200),
-    (200, 220, 90),
-)
-
-
-def agent_colour(agent: int) -> tuple[int, int, int]:
-    """An agent's identity colour, 0..255: eight that are easily told apart, then hues in between."""
-    if agent < len(AGENT_COLOURS):
-        return AGENT_COLOURS[agent]
-    red, green, blue = hsv_to_rgb(agent * 0.618034 % 1, 0.65, 1.0)
-    return round(255 * red), round(255 * green), round(255 * blue)
 
 
 def board_image(

@@ -62,6 +62,10 @@ class Rules:
     window_columns: int = 13
     """Columns that an agent sees, itself in the middle: odd, at least 1 [W]."""
 
+    walls_block_sight: bool = False
+    """Whether a window shows only cells in line of sight: the straight line between the two centres crosses
+    no wall (ours; both studies have no inner walls)."""
+
     episode_steps: int = 1000
     """Turns after which an episode is truncated [W]. At least 1."""
 
@@ -170,6 +174,7 @@ def _may_fire_fits(value: Any) -> bool:
 
 _Check = tuple[Callable[[Any], bool], str]
 _SWITCHES: Final = (
+    "walls_block_sight",
     "pairwise_clashes",
     "regrow_before_bites",
     "freeze_counts_tag_turn",

@@ -1,9 +1,8 @@
 """The order of a turn, on ONE world."""
 
 from cprl.commons import apples, beam, chance, moves, views
-from cprl.commons.apples import bite, fill, find_sprouts, grow
+from cprl.commons.apples import bite, fill, find_sprouts, grow, recount
 from cprl.commons.beam import find_hits, tag
-from cprl.commons.game import Tables
 from cprl.commons.moves import (
     act,
     count_down,
@@ -12,6 +11,7 @@ from cprl.commons.moves import (
     settle_clashes,
     settle_pairwise,
 )
+from cprl.commons.tables import Tables
 from cprl.commons.views import draw_windows
 from cprl.commons.world import PLAYING, TERMINATED, TRUNCATED, Actions, Scratch, Told, Worlds
 
@@ -60,6 +60,13 @@ def begin_episode(world: Worlds, tables: Tables, told: Told, scratch: Scratch) -
     tell_state(world, tables, told, scratch)
 
 
+def look_again(world: Worlds, tables: Tables, told: Told, scratch: Scratch) -> None:
+    """Tells of a state that was put in from outside; nothing is said to have happened."""
+    recount(world, tables)
+    tell_nothing_happened(told)
+    tell_state(world, tables, told, scratch)
+
+
 def keep_old_stock(world: Worlds, tables: Tables) -> None:
     """Remembers the stock as the turn begins, where the picture will show it."""
     if tables.picture_shows_old_stock:
@@ -92,6 +99,10 @@ def tell_state(world: Worlds, tables: Tables, told: Told, scratch: Scratch) -> N
     """How the world stands now, and what everybody sees of it."""
     for i in range(world.row.shape[0]):
         told.in_play[i] = world.in_play[i]
+        for j in range(told.scoreboard.shape[1]):
+            told.scoreboard[i, j] = world.harvested[(i + j) % world.row.shape[0]]
+        if told.stock_gauge.shape[1] > 0:
+            told.stock_gauge[i, 0] = world.stock_left[0] / world.stock.shape[0]
     told.stock[0] = world.stock_left[0]
     told.terminated[0] = world.ended[0] == TERMINATED
     told.truncated[0] = world.ended[0] == TRUNCATED
@@ -111,5 +122,6 @@ FUNCTIONS = (
     tell_state,
     play_turn,
     begin_episode,
+    look_again,
 )
-"""All rules in the order in which they call each other, as `batch.py` compiles them."""
+"""All rules in the order in which they call each other, as `compiled.py` compiles them."""

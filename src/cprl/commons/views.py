@@ -6,8 +6,9 @@ A picture is a function of the world's state alone, so it can be drawn again at 
 import numpy as np
 
 from cprl.commons.beam import beam_cell, beam_reach
-from cprl.commons.game import APPLE, BEAM, CLASS_SHIFT, GROUND, MARK, OTHER, SELF, WALL, Tables
+from cprl.commons.colours import APPLE, BEAM, FIRST_AGENT, GROUND, HIDDEN, MARK, OTHER, SELF, WALL
 from cprl.commons.moves import cell_of
+from cprl.commons.tables import CLASS_SHIFT, Tables
 from cprl.commons.world import COL_STEP, DOWN, ROW_STEP, UP, Bytes, Ints, Scratch, Worlds
 
 
@@ -53,8 +54,13 @@ def paint_beam(world: Worlds, tables: Tables, shooter: int, picture: Ints) -> No
                 picture[cell] = tables.paints[BEAM]
 
 
+def paint_of(tables: Tables, i: int) -> int:
+    """How others see agent i."""
+    return tables.paints[FIRST_AGENT + i if tables.agents_apart else OTHER]
+
+
 def paint_agents(world: Worlds, tables: Tables, picture: Ints) -> None:
-    """Marks, then beams, then everyone on the board as OTHER."""
+    """Marks, then beams, then everyone on the board as others see it."""
     agents = world.row.shape[0]
     for i in range(agents):
         if world.on_board[i]:
@@ -64,7 +70,7 @@ def paint_agents(world: Worlds, tables: Tables, picture: Ints) -> None:
             paint_beam(world, tables, i, picture)
     for i in range(agents):
         if world.on_board[i]:
-            picture[cell_of(world.row[i], world.col[i], tables)] = tables.paints[OTHER]
+            picture[cell_of(world.row[i], world.col[i], tables)] = paint_of(tables, i)
 
 
 def paint_agents_over(world: Worlds, tables: Tables, picture: Ints) -> None:
@@ -73,14 +79,14 @@ def paint_agents_over(world: Worlds, tables: Tables, picture: Ints) -> None:
     for i in range(agents):
         if world.on_board[i]:
             paint_mark(world, tables, i, picture)
-            picture[cell_of(world.row[i], world.col[i], tables)] = tables.paints[OTHER]
+            picture[cell_of(world.row[i], world.col[i], tables)] = paint_of(tables, i)
     for i in range(agents):
         if world.fired[i]:
             paint_beam(world, tables, i, picture)
 
 
 def paint(world: Worlds, tables: Tables, picture: Ints) -> None:
-    """The whole board as paints, everybody on it as OTHER."""
+    """The whole board as paints, everybody on it as others see it."""
     paint_apples(world, tables, picture)
     if tables.paint_over:
         paint_agents_over(world, tables, picture)
@@ -88,27 +94,51 @@ def paint(world: Worlds, tables: Tables, picture: Ints) -> None:
         paint_agents(world, tables, picture)
 
 
+def is_in_sight(tables: Tables, own: int, heading: int, n: int) -> bool:
+    """Whether no wall lies between an agent's own cell and cell n of its window."""
+    for at in range(tables.sight_first[n], tables.sight_first[n + 1]):
+        if tables.background[own + tables.sight_cells[heading, at]] == tables.paints[WALL]:
+            return False
+    return True
+
+
+def look(world: Worlds, tables: Tables, i: int, scratch: Scratch) -> None:
+    """The paints that agent i sees into `scratch.seen`, farthest row first, left column first."""
+    heading = world.heading[i]
+    own = 0 if tables.sees_all else cell_of(world.row[i], world.col[i], tables)
+    to_cell = tables.window_cells[heading]
+    for n in range(to_cell.shape[0]):
+        scratch.seen[n] = scratch.picture[np.uint64(own + to_cell[n])]
+    if tables.walls_block_sight:
+        for n in range(to_cell.shape[0]):
+            if not is_in_sight(tables, own, heading, n):
+                scratch.seen[n] = tables.paints[HIDDEN]
+
+
 def cut_window(world: Worlds, tables: Tables, i: int, scratch: Scratch, window: Bytes) -> None:
-    """What agent i sees: uint8 [3, X, Y], farthest row first, itself in the middle of the last row.
+    """What agent i sees: uint8 [C, X, Y], in a window itself in the middle of the last row.
 
     Two passes, since the second then writes straight runs; unsigned indices spare Numba's test for
     negative ones. Together they are three times as fast as one plain loop (`benchmarks/env_steps.py`).
     """
-    own = cell_of(world.row[i], world.col[i], tables)
-    to_cell = tables.window_cells[world.heading[i]]
-    cells = to_cell.shape[0]
-    for n in range(cells):
-        scratch.seen[n] = scratch.picture[np.uint64(own + to_cell[n])]
+    look(world, tables, i, scratch)
+    cells = tables.window_cells.shape[1]
     planes = window.reshape(-1)
-    for n in range(cells):
-        paint = scratch.seen[n]
-        planes[n] = paint & 255
-        planes[cells + n] = (paint >> 8) & 255
-        planes[2 * cells + n] = (paint >> 16) & 255
+    if tables.one_hot:
+        for at in range(planes.shape[0]):
+            planes[at] = 0
+        for n in range(cells):
+            planes[tables.channel_of[class_of(scratch.seen[n])] * cells + n] = 1
+    else:
+        for n in range(cells):
+            paint = scratch.seen[n]
+            planes[n] = paint & 255
+            planes[cells + n] = (paint >> 8) & 255
+            planes[2 * cells + n] = (paint >> 16) & 255
 
 
 def draw_windows(world: Worlds, tables: Tables, scratch: Scratch, observation: Bytes) -> None:
-    """Everybody's window, each seeing itself as SELF; `observation`: uint8 [N, 3, X, Y]."""
+    """Everybody's window, each seeing itself as SELF; `observation`: uint8 [N, C, X, Y]."""
     picture = scratch.picture
     paint(world, tables, picture)
     for i in range(world.row.shape[0]):
@@ -134,11 +164,14 @@ FUNCTIONS = (
     mark_cell,
     paint_mark,
     paint_beam,
+    paint_of,
     paint_agents,
     paint_agents_over,
     paint,
+    is_in_sight,
+    look,
     cut_window,
     draw_windows,
     draw_board,
 )
-"""In the order in which they call each other, as `batch.py` compiles them."""
+"""In the order in which they call each other, as `compiled.py` compiles them."""

@@ -64,6 +64,8 @@ class Worlds(NamedTuple):
     """[B, N], the step at which an agent was last tagged out, 0 for never."""
     offences: Ints
     """[B, N], how often an agent was tagged out in this episode."""
+    harvested: Ints
+    """[B, N], apples bitten in this episode."""
     step: Ints
     """[B, 1], turns played in this episode."""
     episode: Ints
@@ -76,7 +78,7 @@ class Told(NamedTuple):
     """What a turn tells, written into arrays that the caller hands in (torch memory, as a rule)."""
 
     observation: Bytes
-    """uint8 [B, N, 3, X, Y]."""
+    """uint8 [B, N, C, X, Y]."""
     harvest: NDArray[np.float32]
     """float32 [B, N]."""
     in_play: Bools
@@ -87,6 +89,11 @@ class Told(NamedTuple):
     """bool [B, N, N], row hit, column shooter."""
     tagged_by: Bools
     """bool [B, N, N], row tagged out, column shooter."""
+    scoreboard: NDArray[np.float32]
+    """float32 [B, N, N], a row per observer: apples that everybody has bitten in this episode, its own first,
+    then of the next numbers, round and round; [B, N, 0] where no scoreboard is observed."""
+    stock_gauge: NDArray[np.float32]
+    """float32 [B, N, 1], the share of all sites that hold an apple; [B, N, 0] where it is not observed."""
     stock: NDArray[np.int64]
     """int64 [B, 1]."""
     regrown: NDArray[np.int64]
@@ -147,6 +154,7 @@ def empty_worlds(*, worlds: int, agents: int, sites: int) -> Worlds:
         hits=ints(agents),
         tagged_step=ints(agents),
         offences=ints(agents),
+        harvested=ints(agents),
         step=ints(1),
         episode=np.full((worlds, 1), -1, np.int32),
         ended=ints(1),

@@ -1,8 +1,11 @@
 """CommonsEnv: B worlds of a commons as one TorchRL environment."""
 
+from collections.abc import Mapping
 from typing import Any
 
+import numpy as np
 import torch
+from numpy.typing import NDArray
 from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
 from torchrl.data import Binary, Bounded, Categorical, Composite, Unbounded
@@ -10,14 +13,20 @@ from torchrl.envs import EnvBase
 
 from cprl import keys
 from cprl.commons.batch import Batch
-from cprl.commons.game import COLOURS, Game
+from cprl.commons.game import Game, told_shapes
 from cprl.commons.world import Told
 
 _AGENT_ENTRIES = ("observation", "harvest", "in_play", "fired", "hit_by", "tagged_by")
+_TORCH_TYPES = {
+    np.uint8: torch.uint8,
+    np.float32: torch.float32,
+    np.bool_: torch.bool,
+    np.int64: torch.int64,
+}
 _WORLD_ENTRIES = ("stock", "regrown")
 _DONE_ENTRIES = ("done", "terminated", "truncated")
 _OWN_KEYS = frozenset((*_WORLD_ENTRIES, *_DONE_ENTRIES, keys.STATE, keys.AGENTS, "next", "_reset"))
-_OWN_AGENT_KEYS = frozenset((*_AGENT_ENTRIES, "reward"))
+_OWN_AGENT_KEYS = frozenset((*_AGENT_ENTRIES, "scoreboard", "stock_gauge", "reward"))
 
 
 class CommonsEnv(EnvBase):
@@ -57,17 +66,22 @@ class CommonsEnv(EnvBase):
             raise ValueError(f'device is "{device}"; so far the game runs on "cpu" only')
         super().__init__(device=torch.device("cpu"), batch_size=torch.Size([worlds]))
         self.game = game
-        self.batch = Batch(game, worlds, seed=seed, first_world=first_world, threads=threads)
+        self.worlds = Batch(game, worlds, seed=seed, first_world=first_world, threads=threads)
         self.group_map = {keys.AGENTS: list(game.agent_names)}
         self._agents_size = torch.Size([worlds, game.agents])
+        vectors = {"scoreboard": game.scoreboard_size, "stock_gauge": game.stock_gauge_size}
+        self._agent_entries = (*_AGENT_ENTRIES, *(name for name, size in vectors.items() if size))
         self._with_state = state
-        self._colours = torch.tensor(COLOURS, dtype=torch.uint8)
+        self._forms = {
+            name: (shape, _TORCH_TYPES[dtype]) for name, (shape, dtype) in told_shapes(game, worlds).items()
+        }
+        self._colours = torch.from_numpy(game.palette)
         self._tensors, self.told = self._fresh()
         self._make_specs()
 
     def _make_specs(self) -> None:
         (worlds,), per_agent = self.batch_size, tuple(self._agents_size)
-        agents = self.game.agents
+        game, agents = self.game, self.game.agents
 
         def flags(*shape: int) -> Binary:
             return Binary(shape[-1], shape=shape, dtype=torch.bool)
@@ -81,13 +95,22 @@ class CommonsEnv(EnvBase):
         self.reward_spec = group(reward=Unbounded(shape=(*per_agent, 1), dtype=torch.float32))
         sites = len(self.game.map.sites)
         observation_spec = group(
-            observation=Bounded(0, 255, shape=(*per_agent, *self.game.window_shape), dtype=torch.uint8),
+            observation=Bounded(
+                0, game.observation.highest, shape=(*per_agent, *game.observation_shape), dtype=torch.uint8
+            ),
             harvest=Bounded(0, 1, shape=per_agent, dtype=torch.float32),
             in_play=flags(*per_agent),
             fired=flags(*per_agent),
             hit_by=flags(*per_agent, agents),
             tagged_by=flags(*per_agent, agents),
         )
+        if game.observation.scoreboard:
+            most = float(game.rules.episode_steps)
+            observation_spec[keys.SCOREBOARD] = Bounded(
+                0, most, shape=(*per_agent, agents), dtype=torch.float32
+            )
+        if game.observation.stock_gauge:
+            observation_spec[keys.STOCK_GAUGE] = Bounded(0, 1, shape=(*per_agent, 1), dtype=torch.float32)
         for name in _WORLD_ENTRIES:
             observation_spec[name] = Bounded(0, sites, shape=(worlds, 1), dtype=torch.int64)
         if self._with_state:
@@ -98,30 +121,17 @@ class CommonsEnv(EnvBase):
 
     def _fresh(self) -> tuple[dict[str, Tensor], Told]:
         """New memory for what a turn tells: as tensors by name, and the same as arrays."""
-        worlds, agents = self._agents_size
-        tensors = {
-            "observation": torch.empty((worlds, agents, *self.game.window_shape), dtype=torch.uint8),
-            "harvest": torch.empty((worlds, agents), dtype=torch.float32),
-            "in_play": torch.empty((worlds, agents), dtype=torch.bool),
-            "fired": torch.empty((worlds, agents), dtype=torch.bool),
-            "hit_by": torch.empty((worlds, agents, agents), dtype=torch.bool),
-            "tagged_by": torch.empty((worlds, agents, agents), dtype=torch.bool),
-            "stock": torch.empty((worlds, 1), dtype=torch.int64),
-            "regrown": torch.empty((worlds, 1), dtype=torch.int64),
-            "terminated": torch.empty((worlds, 1), dtype=torch.bool),
-            "truncated": torch.empty((worlds, 1), dtype=torch.bool),
-            "done": torch.empty((worlds, 1), dtype=torch.bool),
-        }
+        tensors = {name: torch.empty(shape, dtype=dtype) for name, (shape, dtype) in self._forms.items()}
         return tensors, Told(**{name: tensor.numpy() for name, tensor in tensors.items()})
 
     def _as_tensordict(self, tensors: dict[str, Tensor], reward: Tensor | None = None) -> TensorDict:
         """The entries of one moment; without a reward as `reset` returns them."""
-        agents = {name: tensors[name] for name in _AGENT_ENTRIES}
+        agents = {name: tensors[name] for name in self._agent_entries}
         if reward is not None:
             agents["reward"] = reward
         entries: dict[str, Any] = {name: tensors[name] for name in (*_WORLD_ENTRIES, *_DONE_ENTRIES)}
         if self._with_state:
-            boards = torch.from_numpy(self.batch.boards(self.told))
+            boards = torch.from_numpy(self.worlds.boards(self.told))
             entries[keys.STATE] = self._colours[boards.long()].permute(0, 3, 1, 2)
         entries[keys.AGENTS] = TensorDict._new_unsafe(
             agents, batch_size=self._agents_size, device=self.device
@@ -131,7 +141,7 @@ class CommonsEnv(EnvBase):
     def _set_seed(self, seed: int | None) -> None:
         if seed is None:
             seed = int(torch.empty((), dtype=torch.int64).random_().item())
-        self.batch.set_seed(seed)
+        self.worlds.set_seed(seed)
 
     def _reset(self, tensordict: TensorDictBase | None = None, **kwargs: Any) -> TensorDict:
         which = None if tensordict is None else tensordict.get("_reset", None)
@@ -142,18 +152,32 @@ class CommonsEnv(EnvBase):
         before = self._tensors
         self._tensors, self.told = self._fresh()
         if which is None:
-            self.batch.begin(self.told)
+            self.worlds.begin(self.told)
         else:
             for name, tensor in self._tensors.items():
                 tensor.copy_(before[name])
-            self.batch.begin(self.told, which.reshape(-1).numpy())
+            self.worlds.begin(self.told, which.reshape(-1).numpy())
         return self._tensors
+
+    def load(self, state: Mapping[str, NDArray[Any]]) -> TensorDict:
+        """Puts all worlds where a state says, and returns that moment as `reset` does.
+
+        Args:
+            state: as `env.worlds.state()` gives it: plain arrays by name, of as many worlds of the same game.
+
+        Raises:
+            ValueError: for a state that cannot be; then nothing has changed.
+        """
+        tensors, told = self._fresh()
+        self.worlds.load(state, told)
+        self._tensors, self.told = tensors, told
+        return self._as_tensordict(tensors)
 
     def _step(self, tensordict: TensorDictBase) -> TensorDict:
         actions = tensordict.get(keys.AGENTS).get("action").contiguous().numpy()
-        self.batch.check(actions)
+        self.worlds.check(actions)
         self._tensors, self.told = self._fresh()
-        self.batch.play_checked(actions, self.told)
+        self.worlds.play_checked(actions, self.told)
         return self._as_tensordict(self._tensors, self._tensors["harvest"].unsqueeze(-1).clone())
 
     def _step_and_maybe_reset(self, tensordict: TensorDictBase) -> tuple[TensorDictBase, TensorDictBase]:

@@ -1,6 +1,7 @@
 """One independent DQN agent, out of TorchRL's parts."""
 
 from collections.abc import Sequence
+from functools import partial
 
 import torch
 from tensordict import TensorDictBase
@@ -16,18 +17,26 @@ class DQNLearner:
     """A network, its actor, a replay buffer, TorchRL's `DQNLoss` with a target network, and Adam.
 
     Args:
-        window_shape: (3, X, Y) of a window.
+        observation_shape: (C, X, Y) of what the agent sees, `Game.observation_shape`.
         actions: how many actions there are.
         settings: the hyper-parameters; see `presets.learner`.
+        highest: the largest value of an observation, `Observation.highest`.
         seed: of the replay buffer's sampling. Weights and exploration draw from torch's global generator,
             as TorchRL's modules do.
     """
 
     def __init__(
-        self, window_shape: Sequence[int], actions: int, *, settings: DQNSettings, seed: int = 0
+        self,
+        observation_shape: Sequence[int],
+        actions: int,
+        *,
+        settings: DQNSettings,
+        highest: float = 255.0,
+        seed: int = 0,
     ) -> None:
+        network = partial(_network, observation_shape, actions, settings, highest)
         self.settings = settings
-        self.network = _network(window_shape, actions, settings)
+        self.network = network()
         self.actor = QActor(self.network, actions)
         self.actor.epsilon = settings.epsilon(0)
         self.loss = DQNLoss(
@@ -37,7 +46,7 @@ class DQNLearner:
         # HardUpdate copies at every (interval + 1)-th step, and once when it is made.
         self._target = HardUpdate(self.loss, value_network_update_interval=settings.target_every_episodes - 1)
         if settings.own_target_weights:
-            self._give_target(_network(window_shape, actions, settings))
+            self._give_target(network())
         self._loss_share = 1 / actions if settings.mean_over_all_outputs else 1.0
         self._adam = torch.optim.Adam(
             self.loss.parameters(), lr=settings.learning_rate, eps=settings.adam_eps, fused=True
@@ -77,10 +86,13 @@ class DQNLearner:
         self._target.step()
 
 
-def _network(window_shape: Sequence[int], actions: int, settings: DQNSettings) -> QNetwork:
+def _network(
+    observation_shape: Sequence[int], actions: int, settings: DQNSettings, highest: float
+) -> QNetwork:
     return QNetwork(
-        window_shape,
+        observation_shape,
         actions,
+        highest=highest,
         hidden_cells=settings.hidden_cells,
         relu_on_outputs=settings.relu_on_outputs,
         glorot_uniform=settings.glorot_uniform,

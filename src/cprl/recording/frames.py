@@ -6,10 +6,12 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
-from cprl.commons.game import COLOURS, GROUND, OTHER, WALL
+from cprl.commons.colours import APPLE, BEAM, GROUND, MARK, WALL
+from cprl.commons.game import Game
+from cprl.commons.observation import classes_shown
 from cprl.commons.world import Bools, Bytes, Ints
 
-UNSEEN: Final = len(COLOURS)
+UNSEEN: Final = 255
 """The class of a pixel between windows, and of a colour that is none of the game's."""
 
 RIM_CELLS: Final = 1
@@ -25,7 +27,7 @@ class Frame:
     board: Bytes
     """uint8 [H, W], colour classes of `cprl.commons.game`."""
     windows: Bytes
-    """uint8 [N, 3, X, Y], RGB, what each agent sees."""
+    """uint8 [N, C, X, Y], what each agent observes."""
     row: Ints
     """int32 [N]."""
     col: Ints
@@ -42,7 +44,7 @@ class FrameBuffer:
     Args:
         capacity: frames it holds at most.
         board: (H, W).
-        windows: (N, 3, X, Y).
+        windows: (N, C, X, Y).
     """
 
     def __init__(self, capacity: int, *, board: tuple[int, int], windows: tuple[int, int, int, int]) -> None:
@@ -91,32 +93,43 @@ def board_with_rim(boards: Bytes) -> Bytes:
         uint8 [T, H + 2, W + 2].
     """
     rimmed = np.pad(boards, ((0, 0), (RIM_CELLS,) * 2, (RIM_CELLS,) * 2), constant_values=WALL)
-    return np.where(rimmed == OTHER, GROUND, rimmed).astype(np.uint8)
+    return np.where(np.isin(rimmed, (GROUND, WALL, APPLE, MARK, BEAM)), rimmed, GROUND).astype(np.uint8)
 
 
 def mosaic(windows: Bytes) -> Bytes:
-    """All agents' windows side by side, by colour class, a column of UNSEEN between two.
+    """All agents' windows side by side, a column of UNSEEN between two.
 
     Args:
-        windows: uint8 [T, N, 3, X, Y], RGB.
+        windows: uint8 [T, N, X, Y], classes as `classes_seen` gives them.
 
     Returns:
         uint8 [T, X, N * Y + N - 1].
     """
-    frames, agents, _, rows, columns = windows.shape
+    frames, agents, rows, columns = windows.shape
     wide = columns + _SEPARATOR_PIXELS
     joined = np.full((frames, rows, agents * wide - _SEPARATOR_PIXELS), UNSEEN, np.uint8)
-    classes = _classes(windows)
     for agent in range(agents):
-        joined[:, :, agent * wide : agent * wide + columns] = classes[:, agent]
+        joined[:, :, agent * wide : agent * wide + columns] = windows[:, agent]
     return joined
 
 
-def _classes(windows: Bytes) -> Bytes:
-    """uint8 [T, N, X, Y]: the class of each pixel, UNSEEN where the colour is none of the game's."""
+def classes_seen(game: Game, windows: Bytes) -> Bytes:
+    """The class of each cell that agents observe, UNSEEN where it is none of the game's.
+
+    Args:
+        game: which says what form the observations have.
+        windows: uint8 [T, N, C, X, Y], as observed.
+
+    Returns:
+        uint8 [T, N, X, Y].
+    """
+    if game.observation.encoding == "one_hot":
+        shown = classes_shown(game.observation, agents=game.agents, hides=game.rules.walls_block_sight)
+        classes: Bytes = np.take(np.array(shown, np.uint8), windows.argmax(2))
+        return classes
     packed = windows.astype(np.uint32)
     keys = packed[:, :, 0] | packed[:, :, 1] << 8 | packed[:, :, 2] << 16
     classes = np.full(keys.shape, UNSEEN, np.uint8)
-    for kind, (red, green, blue) in enumerate(COLOURS):
+    for kind, (red, green, blue) in enumerate(game.palette.astype(np.uint32)):
         classes[keys == (red | green << 8 | blue << 16)] = kind
     return classes

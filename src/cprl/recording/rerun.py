@@ -66,7 +66,7 @@ class RerunLogger(Logger):
             live, self.addresses = serve_live(recording_id, blueprint, period_s=_LIVE_PERIOD_S)
             self._streams.append(live)
         self._all(lambda recording: recording.send_recording_name(self.exp_name))
-        self._static("/", classes())
+        self._static("/", classes(self.scene))
         for entity, style in lines(self.scene).items():
             self._static(entity, style)
         if self.scene is not None:
@@ -106,7 +106,8 @@ class RerunLogger(Logger):
                 _send_waiting(each)
 
     def log_frames(self, frames: Mapping[str, NDArray[Any]]) -> None:
-        """Logs what `FrameBuffer.take` gave: the board, agents, headings and windows of each step."""
+        """Logs what `FrameBuffer.take` gave: the board, agents, headings and windows of each step,
+        windows as `classes_seen` gives them."""
         if self.scene is None:
             raise ValueError("the logger has no scene; give it one to log frames")
         count = len(frames["step"])

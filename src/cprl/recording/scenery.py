@@ -7,8 +7,7 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
-from cprl.commons.game import CLASS_NAMES, COLOURS
-from cprl.commons.picture import agent_colour
+from cprl.commons.colours import FIRST_AGENT, agent_colour, class_colour, class_name
 from cprl.recording.frames import RIM_CELLS, UNSEEN, board_with_rim, mosaic
 
 LINES: Final = {
@@ -38,13 +37,13 @@ class Scene:
     """(X, Y) of a window."""
 
 
-def classes() -> Any:
+def classes(scene: Scene | None) -> Any:
     """Names and colours of the classes on boards and in windows."""
     import rerun as rr
 
     known = [
-        rr.AnnotationInfo(id=kind, label=CLASS_NAMES[kind], color=COLOURS[kind])
-        for kind in range(len(COLOURS))
+        rr.AnnotationInfo(id=kind, label=class_name(kind), color=class_colour(kind))
+        for kind in range(FIRST_AGENT + (len(scene.agents) if scene else 0))
     ]
     return rr.AnnotationContext([*known, rr.AnnotationInfo(id=UNSEEN, label="", color=(0, 0, 0, 0))])
 

@@ -12,7 +12,7 @@ from tensordict import TensorDictBase
 
 from cprl.envs.torchrl_env import CommonsEnv
 from cprl.measuring.episodes import Episode
-from cprl.recording.frames import Frame, FrameBuffer
+from cprl.recording.frames import Frame, FrameBuffer, classes_seen
 from cprl.recording.rerun import RerunLogger
 from cprl.recording.scenery import Scene
 
@@ -53,14 +53,14 @@ class Watch:
     ) -> None:
         game = env.game
         self.env = env
-        _, rows, columns = game.window_shape
+        _, rows, columns = game.observation_shape
         board = game.map.height, game.map.width
         scene = Scene(height=board[0], width=board[1], agents=game.agent_names, window=(rows, columns))
         self.logger = RerunLogger(title, run, scene=scene, serve=serve)
         steps = game.rules.episode_steps
         self.every = max(1, ceil(episodes * steps * FRAME_BYTES / RECORDING_BYTES))
         self._buffer = FrameBuffer(
-            min(steps + 1, 5000), board=board, windows=(game.agents, *game.window_shape)
+            min(steps + 1, 5000), board=board, windows=(game.agents, *game.observation_shape)
         )
         self._step = self._episode = 0
         self._sent = self._episode_began = time.perf_counter()
@@ -100,20 +100,21 @@ class Watch:
             )
 
     def _frame(self) -> Frame:
-        batch, told = self.env.batch, self.env.told
-        worlds = batch.worlds
+        shown = self.env.worlds.show(self.env.told)
         return Frame(
-            board=batch.boards(told)[0],
-            windows=told.observation[0],
-            row=worlds.row[0],
-            col=worlds.col[0],
-            heading=worlds.heading[0],
-            in_play=worlds.in_play[0],
+            board=shown.board,
+            windows=self.env.told.observation[0],
+            row=shown.row,
+            col=shown.col,
+            heading=shown.heading,
+            in_play=shown.in_play,
         )
 
     def _send_frames(self) -> None:
         if self._buffer.size:
-            self.logger.log_frames(self._buffer.take())
+            frames = self._buffer.take()
+            frames["windows"] = classes_seen(self.env.game, frames["windows"])
+            self.logger.log_frames(frames)
         self._sent = time.perf_counter()
 
     def __enter__(self) -> Self:

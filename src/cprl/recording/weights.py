@@ -60,7 +60,7 @@ class BestWeights:
     ) -> None:
         self.run, self.networks, self.policy, self.env = run, networks, policy, env
         self.every, self.logger = every, logger
-        self.seed = int(env.batch.worlds.seed[0, 0])
+        self.seed = int(env.worlds.now.seed[0, 0])
         self.path: Path | None = None
         self.best_return, self.best_episode, self._episodes = float("-inf"), -1, 0
 

@@ -1,8 +1,10 @@
-"""The loops over worlds that a thread runs; the rules themselves know ONE world."""
+"""The loops over worlds that a thread runs, on the CPU or on the GPU; the rules themselves know ONE world."""
+
+from typing import Final, Literal, get_args
 
 from cprl.commons import turn
-from cprl.commons.game import Tables
-from cprl.commons.turn import begin_episode, play_turn
+from cprl.commons.tables import Tables
+from cprl.commons.turn import begin_episode, look_again, play_turn
 from cprl.commons.views import draw_board
 from cprl.commons.world import Actions, Bools, Bytes, Scratch, Told, Worlds
 
@@ -26,6 +28,7 @@ def one_world(w: Worlds, b: int) -> Worlds:
         w.hits[b],
         w.tagged_step[b],
         w.offences[b],
+        w.harvested[b],
         w.step[b],
         w.episode[b],
         w.ended[b],
@@ -41,11 +44,26 @@ def one_told(t: Told, b: int) -> Told:
         t.fired[b],
         t.hit_by[b],
         t.tagged_by[b],
+        t.scoreboard[b],
+        t.stock_gauge[b],
         t.stock[b],
         t.regrown[b],
         t.terminated[b],
         t.truncated[b],
         t.done[b],
+    )
+
+
+def one_scratch(s: Scratch, b: int) -> Scratch:
+    """World b's own sheet, where each world has one."""
+    return Scratch(
+        s.start_row[b],
+        s.start_col[b],
+        s.blocked[b],
+        s.words[b],
+        s.sprouts[b],
+        s.picture[b],
+        s.seen[b],
     )
 
 
@@ -92,6 +110,21 @@ def show_worlds(
         draw_board(one_world(worlds, b), tables, scratch, boards[b])
 
 
+def look_at_worlds(
+    worlds: Worlds,
+    tables: Tables,
+    which: Bools,
+    told: Told,
+    scratch: Scratch,
+    first: int,
+    last: int,
+) -> None:
+    """Tells of the marked worlds of first .. last - 1 as they were put in; `which`: bool [B]."""
+    for b in range(first, last):
+        if which[b]:
+            look_again(one_world(worlds, b), tables, one_told(told, b), scratch)
+
+
 def first_unknown(actions: Actions, known: int) -> int:
     """The index of the first action outside 0 .. known - 1, or -1; `actions`: int64 [count]."""
     for n in range(actions.shape[0]):
@@ -104,11 +137,15 @@ FUNCTIONS = (
     *turn.FUNCTIONS,
     one_world,
     one_told,
+    one_scratch,
     play_worlds,
     begin_worlds,
     show_worlds,
+    look_at_worlds,
     first_unknown,
 )
 """All rules and loops in the order in which they call each other."""
 
-CALLED_FROM_PYTHON = ("play_worlds", "begin_worlds", "show_worlds", "first_unknown")
+Loop = Literal["play_worlds", "begin_worlds", "show_worlds", "look_at_worlds"]
+LOOPS: Final[tuple[Loop, ...]] = get_args(Loop)
+"""The loops that drivers run, all with the same arguments."""

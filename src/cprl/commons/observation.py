@@ -1,0 +1,77 @@
+"""Observation: what agents are shown of the game, and in which form."""
+
+from dataclasses import dataclass, fields
+from typing import Any, Final, Literal, get_args
+
+from cprl.commons.colours import BEAM, FIRST_AGENT, GROUND, HIDDEN, OTHER, SELF, class_name
+
+Area = Literal["window", "full"]
+Encoding = Literal["rgb", "one_hot"]
+
+RGB_NAMES: Final = ("red", "green", "blue")
+
+
+@dataclass(frozen=True, kw_only=True)
+class Observation:
+    """The form of what every agent observes; defaults are those of both studies.
+
+    Raises:
+        ValueError: names the field, what came and what is allowed.
+    """
+
+    area: Area = "window"
+    """"window": the cells ahead, `Rules.window_rows` x `Rules.window_columns`, turned with the agent;
+    "full": the whole board as it lies, row 0 at the top, the observer as "self"."""
+
+    encoding: Encoding = "rgb"
+    """"rgb": red, green and blue, 0..255; "one_hot": a channel for each class of cell, 0 or 1."""
+
+    agents_apart: bool = False
+    """Whether every other agent has a colour or channel of its own, else all others look the same."""
+
+    scoreboard: bool = False
+    """Whether each agent also observes everybody's harvest of this episode: float32 [N], its own first."""
+
+    stock_gauge: bool = False
+    """Whether each agent also observes the share of all sites that hold an apple: float32 [1], 0..1."""
+
+    def __post_init__(self) -> None:
+        for field in fields(self):
+            value, allowed = getattr(self, field.name), _ALLOWED[field.name]
+            if value not in allowed or type(value) is not type(allowed[0]):
+                raise ValueError(f"Observation.{field.name} is {value!r}; allowed: {allowed}")
+
+    @property
+    def highest(self) -> int:
+        """The largest value of a cell: 255 for colours, 1 for channels of classes."""
+        return 255 if self.encoding == "rgb" else 1
+
+
+_SWITCH: Final = (False, True)
+_ALLOWED: Final[dict[str, tuple[Any, ...]]] = {
+    "area": get_args(Area),
+    "encoding": get_args(Encoding),
+    "agents_apart": _SWITCH,
+    "scoreboard": _SWITCH,
+    "stock_gauge": _SWITCH,
+}
+
+
+def classes_shown(observation: Observation, *, agents: int, hides: bool) -> tuple[int, ...]:
+    """The classes that can come up, in the order of the channels of "one_hot".
+
+    Args:
+        observation: its form.
+        agents: how many there are.
+        hides: whether walls block sight.
+    """
+    others = [FIRST_AGENT + i for i in range(agents)] if observation.agents_apart else [OTHER]
+    hidden = [HIDDEN] if hides else []
+    return (*range(GROUND, BEAM + 1), *sorted([*others, SELF, *hidden]))
+
+
+def channel_names(observation: Observation, *, agents: int, hides: bool) -> tuple[str, ...]:
+    """What each channel of an observation stands for; see `classes_shown`."""
+    if observation.encoding == "rgb":
+        return RGB_NAMES
+    return tuple(map(class_name, classes_shown(observation, agents=agents, hides=hides)))

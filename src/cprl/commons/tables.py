@@ -1,0 +1,236 @@
+"""A game written out as the tables that the compiled rules look things up in."""
+
+from math import hypot
+from typing import Final, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from cprl.commons.chance import REST_BITS, threshold
+from cprl.commons.colours import FIRST_AGENT, GROUND, WALL, class_colour
+from cprl.commons.maps import Map
+from cprl.commons.observation import Observation, classes_shown
+from cprl.commons.rules import Norm, Rules
+from cprl.commons.world import COL_STEP, DOWN, LEFT, RIGHT, ROW_STEP, UP, Bools, Indices, Ints
+
+CLASS_SHIFT: Final = 24
+"""A paint is a colour and, from this bit on, its class."""
+
+
+class Tables(NamedTuple):
+    """A game as arrays. A cell is an index into the board with its rim, row by row, `stride` cells a row."""
+
+    background: Ints
+    """[cells], the paint of ground or wall; the rim is wall."""
+    site_cell: Indices
+    """uint32 [K], the cell of each site."""
+    site_at: Ints
+    """[cells], the site on each cell, or -1."""
+    near_first: Ints
+    """[K + 1], where a site's neighbours begin in `near_sites`, and end."""
+    near_sites: Indices
+    """uint32 [pairs], the sites within reach of each site, itself left out."""
+    regrow_below: NDArray[np.int64]
+    """int64 [most neighbours + 1], an apple grows where a uniform 32-bit word falls below this."""
+    regrow_first_byte: Ints
+    """[most neighbours + 1], the largest first byte that such a word can have; -1 where none grows."""
+    start: Ints
+    """[N, 3], row, column and heading of each agent as an episode begins."""
+    beam_length: Ints
+    """[4], cells by heading."""
+    freeze: Ints
+    """[N, offences], turns missed by shooter and offence."""
+    may_fire: Bools
+    """bool [N]."""
+    may_bite: Bools
+    """bool [N, K]."""
+    paints: Ints
+    """[classes], what a picture's cell holds: red + 2**8 green + 2**16 blue + 2**24 class."""
+    channel_of: Ints
+    """[classes], the channel of each class under "one_hot"; -1 for those that never come up."""
+    window_cells: Ints
+    """[4, X * Y], from an agent's cell to each cell of its window, by heading; under "full" the cells of
+    the board themselves."""
+    sight_first: Ints
+    """[X * Y + 1], where the cells between an agent and each cell of its window begin in `sight_cells`."""
+    sight_cells: Ints
+    """[4, cells between], from an agent's cell to each cell in between, by heading."""
+    rim: int
+    """Cells of wall around the board, enough for any window and beam."""
+    stride: int
+    """Cells from one row to the next."""
+    beam_half_width: int
+    hits_to_tag: int
+    episode_steps: int
+    has_beam: bool
+    agents_apart: bool
+    one_hot: bool
+    sees_all: bool
+    """Whether an agent is shown the whole board."""
+    walls_block_sight: bool
+    never_from_nothing: bool
+    """Whether an empty board stays empty."""
+    pairwise_clashes: bool
+    regrow_before_bites: bool
+    freeze_counts_tag_turn: bool
+    ends_one_turn_late: bool
+    picture_shows_old_stock: bool
+    paint_over: bool
+    mark_behind_if_vertical: bool
+    self_paint_stays: bool
+
+
+def distance(norm: Norm, rows: int, cols: int) -> float:
+    """How far apart two cells are that lie so many rows and columns from each other."""
+    if norm == "euclidean":
+        return hypot(rows, cols)
+    if norm == "manhattan":
+        return abs(rows) + abs(cols)
+    return max(abs(rows), abs(cols))
+
+
+def neighbours(board: Map, rules: Rules) -> list[list[int]]:
+    """For each site the other sites within `regrow_radius_cells`, [K] lists of site indices."""
+    reach = int(rules.regrow_radius_cells)
+    site_on = {cell: site for site, cell in enumerate(board.sites)}
+    offsets = [
+        (rows, cols)
+        for rows in range(-min(reach, board.height), min(reach, board.height) + 1)
+        for cols in range(-min(reach, board.width), min(reach, board.width) + 1)
+        if (rows, cols) != (0, 0) and distance(rules.regrow_norm, rows, cols) <= rules.regrow_radius_cells
+    ]
+    return [
+        sorted(site_on[row + r, col + c] for r, c in offsets if (row + r, col + c) in site_on)
+        for row, col in board.sites
+    ]
+
+
+def _window_cells(rules: Rules, stride: int) -> Ints:
+    """[4, X * Y]: farthest row first, left column first, as seen by an agent with each heading."""
+    ahead = np.arange(rules.window_rows - 1, -1, -1)[:, None]
+    side = np.arange(rules.window_columns)[None, :] - rules.window_columns // 2
+    by_heading = [
+        ahead * (ROW_STEP[h] * stride + COL_STEP[h])
+        + side * (ROW_STEP[(h + 1) % 4] * stride + COL_STEP[(h + 1) % 4])
+        for h in (UP, RIGHT, DOWN, LEFT)
+    ]
+    return np.array(by_heading, np.int32).reshape(4, -1)
+
+
+def _paint(kind: int) -> int:
+    """A class and its colour as one number."""
+    red, green, blue = class_colour(kind)
+    return red | green << 8 | blue << 16 | kind << CLASS_SHIFT
+
+
+def _board_cells(board: Map, rim: int, stride: int) -> Ints:
+    """[4, H * W]: every cell of the board, row by row, whatever the heading."""
+    rows, cols = np.mgrid[rim : rim + board.height, rim : rim + board.width]
+    return np.tile((rows * stride + cols).reshape(1, -1), (4, 1)).astype(np.int32)
+
+
+def cells_between(rows: int, cols: int) -> list[tuple[int, int]]:
+    """The cells whose inside the straight line between two cell centres crosses, both ends left out.
+
+    A line that only touches a corner does not cross it: agents see through a gap between two diagonal
+    walls. The inside of the unit square around (r, c) is crossed where
+    abs(rows c - cols r) < (abs(rows) + abs(cols)) / 2.
+
+    Args:
+        rows: from the one to the other.
+        cols: likewise.
+    """
+    down, right = (1 if rows >= 0 else -1), (1 if cols >= 0 else -1)
+    return [
+        (r, c)
+        for r in range(0, rows + down, down)
+        for c in range(0, cols + right, right)
+        if (r, c) not in ((0, 0), (rows, cols)) and 2 * abs(rows * c - cols * r) < abs(rows) + abs(cols)
+    ]
+
+
+def _sight(rules: Rules, stride: int) -> tuple[Ints, Ints]:
+    """`sight_first` and `sight_cells`; nothing is in between where walls do not block sight."""
+    middle = rules.window_columns // 2
+    places = [
+        (ahead, side) for ahead in range(rules.window_rows - 1, -1, -1) for side in range(-middle, middle + 1)
+    ]
+    between = [cells_between(*place) if rules.walls_block_sight else [] for place in places]
+    first = np.cumsum([0, *map(len, between)], dtype=np.int32)
+    cells = np.array([cell for crossed in between for cell in crossed], np.int32).reshape(-1, 2)
+    by_heading = [
+        cells[:, 0] * (ROW_STEP[h] * stride + COL_STEP[h])
+        + cells[:, 1] * (ROW_STEP[(h + 1) % 4] * stride + COL_STEP[(h + 1) % 4])
+        for h in (UP, RIGHT, DOWN, LEFT)
+    ]
+    return first, np.array(by_heading, np.int32).reshape(4, -1)
+
+
+def build_tables(board: Map, rules: Rules, observation: Observation) -> Tables:
+    """Writes a game out."""
+    agents, half_width = board.agents, rules.beam_width_cells // 2
+    sees_all = observation.area == "full"
+    window_reach = (0,) if sees_all else (rules.window_rows - 1, rules.window_columns // 2)
+    rim = max(1, *window_reach, half_width)
+    stride = board.width + 2 * rim
+
+    def cells(places: tuple[tuple[int, ...], ...]) -> list[int]:
+        return [(place[0] + rim) * stride + place[1] + rim for place in places]
+
+    shown = classes_shown(observation, agents=agents, hides=rules.walls_block_sight)
+    classes = range(FIRST_AGENT + (agents if observation.agents_apart else 0))
+    paints = np.array(list(map(_paint, classes)), np.int32)
+    channel_of = np.full(len(classes), -1, np.int32)
+    channel_of[list(shown)] = range(len(shown))
+    first_between, between = _sight(rules, stride)
+    background = np.full((board.height + 2 * rim, stride), paints[WALL], np.int32)
+    background[rim:-rim, rim:-rim] = paints[GROUND]
+    background.reshape(-1)[cells(board.walls)] = paints[WALL]
+    site_at = np.full(background.size, -1, np.int32)
+    site_at[cells(board.sites)] = range(len(board.sites))
+    near = neighbours(board, rules)
+    most_near = max(map(len, near))
+    probs = [rules.regrow_prob[min(n, len(rules.regrow_prob) - 1)] for n in range(most_near + 1)]
+    below = np.array([threshold(p) for p in probs], np.int64)
+    freeze = rules.freeze_steps if isinstance(rules.freeze_steps, tuple) else ((rules.freeze_steps,),)
+    sites = len(board.sites)
+    return Tables(
+        background=background.reshape(-1),
+        site_cell=np.array(cells(board.sites), np.uint32),
+        site_at=site_at,
+        near_first=np.cumsum([0, *map(len, near)], dtype=np.int32),
+        near_sites=np.array([site for sites in near for site in sites], np.uint32),
+        regrow_below=below,
+        regrow_first_byte=((below - 1) >> REST_BITS).astype(np.int32),
+        start=np.array(board.starts, np.int32),
+        beam_length=np.array(rules.beam_lengths_cells, np.int32),
+        freeze=np.broadcast_to(np.array(freeze, np.int32), (agents, len(freeze[0]))).copy(),
+        may_fire=np.broadcast_to(np.array(rules.may_fire), (agents,)).copy(),
+        may_bite=np.broadcast_to(
+            np.array(True if rules.may_bite is None else rules.may_bite), (agents, sites)
+        ).copy(),
+        paints=paints,
+        channel_of=channel_of,
+        window_cells=_board_cells(board, rim, stride) if sees_all else _window_cells(rules, stride),
+        sight_first=first_between,
+        sight_cells=between,
+        rim=rim,
+        stride=stride,
+        beam_half_width=half_width,
+        hits_to_tag=int(rules.hits_to_tag),
+        episode_steps=int(rules.episode_steps),
+        has_beam=rules.has_beam,
+        agents_apart=observation.agents_apart,
+        one_hot=observation.encoding == "one_hot",
+        sees_all=sees_all,
+        walls_block_sight=rules.walls_block_sight,
+        never_from_nothing=rules.regrow_prob[0] == 0,
+        pairwise_clashes=rules.pairwise_clashes,
+        regrow_before_bites=rules.regrow_before_bites,
+        freeze_counts_tag_turn=rules.freeze_counts_tag_turn,
+        ends_one_turn_late=rules.ends_one_turn_late,
+        picture_shows_old_stock=rules.picture_shows_old_stock,
+        paint_over=rules.paint_over,
+        mark_behind_if_vertical=rules.mark_behind_if_vertical,
+        self_paint_stays=rules.self_paint_stays,
+    )

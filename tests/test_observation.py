@@ -1,0 +1,192 @@
+"""The forms of what agents observe, and walls that block sight."""
+
+import numpy as np
+import pytest
+from boards import Play, drawn, random_actions
+from torchrl.envs.utils import check_env_specs
+
+from cprl import CommonsEnv, Game, Observation, Rules, keys, maps, presets
+from cprl.commons.batch import Batch
+from cprl.commons.colours import COLOURS, MOST_AGENTS_APART, agent_colour
+from cprl.commons.tables import cells_between
+
+BOARD = """
+    A..#.A
+    .v....
+    ...<.^
+"""
+FORMS = [
+    Observation(area=area, encoding=encoding, agents_apart=apart, scoreboard=apart, stock_gauge=not apart)
+    for area in ("window", "full")
+    for encoding in ("rgb", "one_hot")
+    for apart in (False, True)
+]
+
+
+@pytest.mark.parametrize(
+    ("field", "value"),
+    [("area", "all"), ("encoding", "grey"), ("agents_apart", 1), ("scoreboard", None), ("stock_gauge", "no")],
+)
+def test_a_wrong_form_is_refused(field, value):
+    with pytest.raises(ValueError, match=rf"Observation\.{field} is .*; allowed: "):
+        Observation(**{field: value})
+
+
+@pytest.mark.parametrize("encoding", ["rgb", "one_hot"])
+def test_a_full_view_shows_the_whole_board_as_it_lies_with_oneself_in_it(encoding):
+    play = Play(BOARD, observation=Observation(area="full", encoding=encoding))
+    assert play.window(0) == drawn("A..#.A\n.S...m\n.mmo.o")
+    assert play.window(2) == drawn("A..#.A\n.o...m\n.mmo.S")
+
+
+@pytest.mark.parametrize("encoding", ["rgb", "one_hot"])
+def test_others_can_be_told_apart(encoding):
+    form = Observation(area="full", encoding=encoding, agents_apart=True)
+    play = Play(BOARD, observation=form)
+    assert play.window(0) == drawn("A..#.A\n.S...m\n.mm1.2")
+    assert play.window(1) == drawn("A..#.A\n.0...m\n.mmS.2")
+
+
+@pytest.mark.parametrize(("area", "sight"), [("window", False), ("window", True), ("full", False)])
+@pytest.mark.parametrize("apart", [False, True])
+def test_one_hot_channels_show_what_the_colours_show(area, apart, sight):
+    colours, channels = (
+        Play(
+            BOARD,
+            observation=Observation(area=area, encoding=encoding, agents_apart=apart),
+            window_rows=3,
+            window_columns=5,
+            walls_block_sight=sight,
+            regrow_prob=(0.1, 0.5),
+            freeze_steps=3,
+        )
+        for encoding in ("rgb", "one_hot")
+    )
+    for turn in random_actions(60, 1, colours.game, seed=1):
+        for play in (colours, channels):
+            play.turn(*(play.game.actions[action] for action in turn[0]))
+        for agent in range(3):
+            assert colours.window(agent) == channels.window(agent)
+
+
+def test_channels_have_names():
+    def names(**form):
+        rules = Rules(walls_block_sight=form.pop("sight", False))
+        return Game(map=maps.parse(BOARD), rules=rules, observation=Observation(**form)).channels
+
+    common = ("ground", "wall", "apple", "heading", "beam")
+    assert names() == ("red", "green", "blue")
+    assert names(encoding="one_hot") == (*common, "other", "self")
+    assert names(encoding="one_hot", sight=True) == (*common, "other", "self", "hidden")
+    apart = names(encoding="one_hot", agents_apart=True)
+    assert apart == (*common, "self", "agent_0", "agent_1", "agent_2")
+
+
+def test_identity_colours_are_all_different_and_none_of_the_games():
+    colours = [agent_colour(agent) for agent in range(MOST_AGENTS_APART)]
+    assert len({*colours, *COLOURS}) == MOST_AGENTS_APART + len(COLOURS)
+
+
+def test_too_many_agents_cannot_be_told_apart():
+    many = maps.parse(f"A{'>' * (MOST_AGENTS_APART + 1)}")
+    Game(map=many, rules=Rules())
+    with pytest.raises(ValueError, match="121 agents; at most 120 can be told apart"):
+        Game(map=many, rules=Rules(), observation=Observation(agents_apart=True))
+
+
+def test_a_scoreboard_shows_ones_own_harvest_first_then_those_of_the_next_numbers():
+    play = Play("A>A.A<.>A", observation=Observation(scoreboard=True, stock_gauge=True))
+    assert play.told.stock_gauge[0].tolist() == [[1.0]] * 3
+    play.turn("forward", "forward", "stay")
+    play.turn("backward", "stay", "stay")
+    play.turn("backward", "stay", "stay")
+    assert play.told.scoreboard[0].tolist() == [[2, 1, 0], [1, 0, 2], [0, 2, 1]]
+    assert play.told.stock_gauge[0].tolist() == [[0.25]] * 3
+    play.batch.begin(play.told)
+    assert not play.told.scoreboard.any()
+
+
+@pytest.mark.parametrize("form", FORMS, ids=str)
+def test_specs_follow_the_form(form):
+    game = presets.game("commons")
+    env = CommonsEnv(Game(map=game.map, rules=game.rules, observation=form), worlds=2, seed=1, state=True)
+    check_env_specs(env)
+    moment = env.reset()
+    channels, rows, columns = env.game.observation_shape
+    assert channels == len(env.game.channels)
+    assert moment[keys.OBSERVATION].shape == (2, 4, channels, rows, columns)
+    assert (rows, columns) == ((12, 24) if form.area == "full" else (7, 15))
+    assert (keys.SCOREBOARD in moment.keys(True)) == form.scoreboard
+    assert (keys.STOCK_GAUGE in moment.keys(True)) == form.stock_gauge
+    assert moment[keys.OBSERVATION].max() <= env.observation_spec[keys.OBSERVATION].space.high.max()
+
+
+def test_the_game_is_the_same_whatever_is_observed():
+    game = presets.game("commons", variant="as_run")
+    actions = random_actions(100, 2, game)
+    plain = Batch(game, 2)
+    others = [Batch(Game(map=game.map, rules=game.rules, observation=form), 2) for form in FORMS]
+    told = plain.begin(plain.new_told())
+    their_told = [other.begin(other.new_told()) for other in others]
+    for turn in actions:
+        plain.play(turn, told)
+        for other, other_told in zip(others, their_told, strict=True):
+            other.play(turn, other_told)
+            assert np.array_equal(other_told.harvest, told.harvest)
+            assert np.array_equal(other_told.stock, told.stock)
+            if other.game.observation == Observation(stock_gauge=True):
+                assert np.array_equal(other_told.observation, told.observation)
+
+
+WALLED = """
+    ..A.A..
+    .#.....
+    A..#..A
+    .......
+    ...^...
+"""
+
+
+def test_walls_hide_what_lies_behind_them():
+    play = Play(WALLED, window_rows=5, window_columns=7, walls_block_sight=True, may_fire=False)
+    assert play.window(0) == drawn(
+        """
+        ?????..
+        .#.?...
+        A..#..A
+        ...m...
+        ...S...
+        """
+    )
+    open_sight = Play(WALLED, window_rows=5, window_columns=7, may_fire=False)
+    assert open_sight.window(0) == drawn("..A.A..\n.#.....\nA..#..A\n...m...\n...S...")
+
+
+def test_what_is_behind_the_boards_edge_is_hidden_too():
+    play = Play("A>.", window_rows=4, window_columns=3, walls_block_sight=True, may_fire=False)
+    assert play.window(0) == drawn("???\n?#?\n#m#\n#S#")
+
+
+def test_the_cells_between_two_are_those_whose_inside_the_line_crosses():
+    assert cells_between(0, 0) == []
+    assert cells_between(0, 1) == []
+    assert cells_between(3, 0) == [(1, 0), (2, 0)]
+    assert cells_between(-2, 2) == [(-1, 1)], "corners do not count"
+    assert cells_between(1, 2) == [(0, 1), (1, 1)]
+    assert cells_between(-1, -3) == [(0, -1), (-1, -2)]
+
+
+@pytest.mark.parametrize("rows", range(-4, 5))
+@pytest.mark.parametrize("cols", range(-4, 5))
+def test_sight_is_mutual(rows, cols):
+    back = {(rows + r, cols + c) for r, c in cells_between(-rows, -cols)}
+    assert back == set(cells_between(rows, cols))
+
+
+def test_walls_that_block_sight_and_a_full_view_exclude_each_other():
+    with pytest.raises(ValueError, match="either an agent sees the whole board, or walls block its sight"):
+        Game(
+            map=maps.parse(BOARD),
+            rules=Rules(walls_block_sight=True),
+            observation=Observation(area="full"),
+        )

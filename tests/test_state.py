@@ -1,0 +1,147 @@
+"""The state of a batch is read and set as plain arrays; a bad one is refused."""
+
+import numpy as np
+import pytest
+import torch
+from boards import random_actions
+from test_worlds import assert_same, copied
+
+from cprl import CommonsEnv, Game, Observation, Rules, keys, maps, presets
+from cprl.commons.batch import Batch
+from cprl.commons.state import NAMES
+
+GAME = Game(
+    map=maps.parse("A>.A.\n.#.A.\n..<.A"),
+    rules=Rules(regrow_prob=(0.0, 0.2), freeze_steps=3, episode_steps=50, window_rows=3, window_columns=3),
+)
+
+
+def some_way_on(game, worlds=3, steps=40, **how):
+    batch = Batch(game, worlds, **how)
+    told = batch.begin(batch.new_told())
+    for turn in random_actions(steps, worlds, game):
+        batch.play(turn, told)
+    return batch, told
+
+
+@pytest.mark.parametrize("variant", presets.VARIANTS)
+@pytest.mark.parametrize("board", presets.BOARDS)
+def test_a_batch_that_loads_a_state_goes_on_as_the_one_it_was_read_from(board, variant):
+    game = presets.game(board, variant=variant)
+    game = Game(map=game.map, rules=game.rules, observation=Observation(scoreboard=True))
+    batch, told = some_way_on(game, seed=5)
+    other = Batch(game, 3, seed=77, first_world=9)
+    shown = other.load(batch.state(), other.new_told())
+    assert_same(other.now, batch.now)
+    for name in ("observation", "in_play", "scoreboard", "stock", "terminated", "truncated", "done"):
+        assert np.array_equal(getattr(shown, name), getattr(told, name)), name
+    assert not shown.harvest.any()
+    for turn in random_actions(60, 3, game, seed=2):
+        assert_same(batch.play(turn, told), other.play(turn, shown))
+    assert_same(other.now, batch.now)
+    assert_same(batch.begin(told), other.begin(shown))
+
+
+def test_a_state_is_a_copy_of_plain_arrays():
+    batch, _ = some_way_on(GAME)
+    state = batch.state()
+    assert sorted(state) == sorted(NAMES)
+    assert all(type(array) is np.ndarray for array in state.values())
+    before = copied(batch.now)
+    for array in state.values():
+        array[:] = 1
+    assert_same(batch.now, before)
+
+
+def test_an_environment_loads_a_state_and_shows_the_moment():
+    env, other = CommonsEnv(GAME, 2, seed=1), CommonsEnv(GAME, 2, seed=8)
+    moment = env.rollout(5, break_when_any_done=False)[:, -1]["next"]
+    shown = other.load(env.worlds.state())
+    assert torch.equal(shown[keys.OBSERVATION], moment[keys.OBSERVATION])
+    assert torch.equal(shown[keys.STOCK], moment[keys.STOCK])
+    actions = torch.tensor([[0, 1], [2, 3]])
+    after = [
+        one.step(entry.set(keys.ACTION, actions))["next"]
+        for one, entry in ((env, moment.exclude(keys.REWARD)), (other, shown))
+    ]
+    assert (after[0] == after[1]).all()
+
+
+def test_planning_ahead_and_back_changes_nothing():
+    env = CommonsEnv(GAME, 1, seed=3)
+    moment = env.reset()
+    kept = env.worlds.state()
+    env.rollout(20, auto_reset=False, tensordict=moment.clone())
+    assert env.worlds.now.step[0, 0] == 20
+    again = env.load(kept)
+    assert (again == moment).all()
+    assert all(np.array_equal(array, kept[name]) for name, array in env.worlds.state().items())
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"row": 3}, r"state\['row'\]\[0, 0\] is 3 .*; allowed: 0 to 2"),
+        ({"col": -1}, r"state\['col'\]\[0, 0\] is -1; allowed: 0 to 4"),
+        ({"heading": 4}, r"state\['heading'\]\[0, 0\] is 4; allowed: 0 to 3"),
+        ({"stock": 2}, r"state\['stock'\]\[0, 0\] is 2; allowed: 0 to 1"),
+        ({"out_steps": -1}, r"state\['out_steps'\]\[0, 0\] is -1; allowed: 0 to"),
+        ({"out_steps": 2}, r"state\['in_play'\]\[0, 0\] is True; allowed: False while there are turns"),
+        ({"hits": 1}, r"state\['hits'\]\[0, 0\] is 1; allowed: 0 to 0"),
+        ({"step": 51}, r"state\['step'\]\[0, 0\] is 51; allowed: 0 to 50"),
+        ({"ended": 3}, r"state\['ended'\]\[0, 0\] is 3; allowed: 0 to 2"),
+        ({"row": 1, "col": 1}, r"state\['row'\]\[0, 0\] is 1 \(column 1\); allowed: no cell of a wall"),
+        ({"row": 2, "col": 2}, r"state\['row'\]\[0, 0\] is 2 .*; allowed: no cell with another agent"),
+    ],
+)
+def test_a_state_that_cannot_be_is_refused_and_changes_nothing(change, message):
+    batch = Batch(GAME, 2)
+    told = batch.begin(batch.new_told())
+    state, before = batch.state(), copied(batch.now)
+    for name, value in change.items():
+        state[name][0, 0] = value
+    with pytest.raises(ValueError, match=message):
+        batch.load(state, told)
+    assert_same(batch.now, before)
+
+
+def test_other_names_shapes_and_types_are_refused():
+    batch = Batch(GAME, 2)
+    told, state = batch.begin(batch.new_told()), batch.state()
+    with pytest.raises(ValueError, match=r"lacks \['row'\] and has the unknown \['line'\]"):
+        batch.load({"line" if name == "row" else name: array for name, array in state.items()}, told)
+    with pytest.raises(ValueError, match=r"state\['row'\] is int64 \(2, 2\); wanted: int32 \(2, 2\)"):
+        batch.load({**state, "row": state["row"].astype(np.int64)}, told)
+    with pytest.raises(ValueError, match=r"is uint64 \(2, 1\); wanted: uint64 \(3, 1\)"):
+        Batch(GAME, 3).load(state, told)
+
+
+def test_two_agents_on_a_cell_are_a_state_as_run():
+    game = presets.game("two_complex", variant="as_run")
+    batch = Batch(game, 1)
+    told, state = batch.begin(batch.new_told()), batch.state()
+    state["row"][:], state["col"][:] = 3, 3
+    batch.load(state, told)
+    assert batch.now.row.tolist() == [[3, 3]]
+
+
+@pytest.mark.parametrize(
+    "told",
+    [
+        lambda told: told._replace(harvest=told.harvest.astype(np.float64)),
+        lambda told: told._replace(stock=told.stock[:1]),
+        lambda told: told._replace(observation=np.asfortranarray(told.observation)),
+    ],
+)
+def test_arrays_to_tell_into_that_do_not_fit_are_refused(told):
+    batch = Batch(GAME, 2)
+    with pytest.raises(ValueError, match=r"told\.\w+ is .*; wanted: .* contiguous and writeable"):
+        batch.begin(told(batch.new_told()))
+
+
+def test_actions_that_are_not_contiguous_are_refused():
+    batch = Batch(GAME, 2)
+    told = batch.begin(batch.new_told())
+    with pytest.raises(ValueError, match=r"int64 \(2, 2\) is not contiguous"):
+        batch.play(np.zeros((2, 4), np.int64)[:, ::2], told)
+    assert batch.now.step.sum() == 0
