@@ -210,8 +210,16 @@ def test_the_state_is_the_whole_board_in_colour():
     assert state[1] == [[10, 10, 10], [255, 0, 0], [50, 50, 50]]
 
 
-def test_other_devices_are_refused_for_now():
-    with pytest.raises(ValueError, match='device is "cuda"'):
+def test_devices_that_are_not_there_are_refused():
+    with pytest.raises(ValueError, match='device is "meta"; allowed: "cpu" and "cuda"'):
+        CommonsEnv(SHORT, device="meta")
+    with pytest.raises(ValueError, match="threads is 2; that is for the CPU"):
+        CommonsEnv(SHORT, device="cuda", threads=2)
+
+
+@pytest.mark.skipif(torch.cuda.is_available(), reason="there is a GPU")
+def test_without_a_gpu_the_device_cuda_is_refused():
+    with pytest.raises(RuntimeError, match='device is "cuda"; torch finds no GPU'):
         CommonsEnv(SHORT, device="cuda")
 
 

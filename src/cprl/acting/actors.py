@@ -17,15 +17,16 @@ class QActor(TensorDictSequential):
     Args:
         network: from "observation" to the value of each of A actions.
         actions: how many actions A there are.
+        device: where it chooses.
 
     It explores under `ExplorationType.RANDOM` alone, with chance `epsilon`.
     """
 
-    def __init__(self, network: nn.Module, actions: int) -> None:
-        spec = Categorical(actions, shape=(), dtype=torch.int64)
+    def __init__(self, network: nn.Module, actions: int, *, device: str | torch.device = "cpu") -> None:
+        spec = Categorical(actions, shape=(), dtype=torch.int64, device=torch.device(device))
         super().__init__(
             QValueActor(network, spec=spec, action_space="categorical"),
-            EGreedyModule(spec=spec, eps_init=1.0, eps_end=0.0),
+            EGreedyModule(spec=spec, eps_init=1.0, eps_end=0.0, device=torch.device(device)),
         )
 
     @property
@@ -48,18 +49,21 @@ class RandomActor(TensorDictModuleBase):
 
     Args:
         actions: how many actions A there are.
+        device: where it chooses.
         seed: of its own stream of random numbers.
     """
 
     in_keys = ("observation",)
     out_keys = ("action",)
 
-    def __init__(self, actions: int, *, seed: int = 0) -> None:
+    def __init__(self, actions: int, *, device: str | torch.device = "cpu", seed: int = 0) -> None:
         super().__init__()
         self.actions = actions
-        self.generator = torch.Generator().manual_seed(seed)
+        self.generator = torch.Generator(device).manual_seed(seed)
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Writes "action", int64 of the TensorDict's batch size."""
-        chosen = torch.randint(self.actions, tensordict.batch_size, generator=self.generator)
+        chosen = torch.randint(
+            self.actions, tensordict.batch_size, generator=self.generator, device=self.generator.device
+        )
         return tensordict.set("action", chosen)

@@ -29,6 +29,8 @@ class Driver(Protocol):
 class Shown(NamedTuple):
     """One world as people look at it: numpy arrays, copies."""
 
+    observation: Bytes
+    """uint8 [N, C, X, Y], what each agent observes."""
     board: Bytes
     """uint8 [H, W], classes of `cprl.commons.colours`."""
     stock: Bytes
@@ -134,6 +136,7 @@ class Batch:
         """One world for people to look at."""
         read, now = self.driver.read, self.now
         return Shown(
+            observation=read(told.observation[world]),
             board=read(self.boards(told))[world],
             stock=read(now.stock)[world],
             row=read(now.row)[world],

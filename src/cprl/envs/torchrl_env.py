@@ -1,6 +1,6 @@
 """CommonsEnv: B worlds of a commons as one TorchRL environment."""
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from typing import Any
 
 import numpy as np
@@ -12,8 +12,9 @@ from torchrl.data import Binary, Bounded, Categorical, Composite, Unbounded
 from torchrl.envs import EnvBase
 
 from cprl import keys
-from cprl.commons.batch import Batch
+from cprl.commons.batch import Batch, Driver
 from cprl.commons.game import Game, told_shapes
+from cprl.commons.threads import CpuThreads
 from cprl.commons.world import Told
 
 _AGENT_ENTRIES = ("observation", "harvest", "in_play", "fired", "hit_by", "tagged_by")
@@ -39,7 +40,8 @@ class CommonsEnv(EnvBase):
         game: what is played, a `Map` and its `Rules`; see `presets.game`.
         worlds: how many worlds B.
         seed: what all chance follows from; `set_seed` starts all over.
-        device: only "cpu" so far.
+        device: "cpu", or "cuda" where there is a GPU and the package numba-cuda: then worlds and everything
+            that is told stay there.
         threads: how many CPU threads share the worlds; None for all cores where it pays.
         first_world: the number of the first world: `CommonsEnv(game, 1, first_world=b)` plays what world b
             of a larger batch plays.
@@ -47,6 +49,7 @@ class CommonsEnv(EnvBase):
 
     Raises:
         ValueError: for numbers out of range, and, in `step`, for unknown actions; then nothing has changed.
+        RuntimeError: for the device "cuda" where Numba finds no GPU.
     """
 
     batch_locked = True
@@ -62,11 +65,11 @@ class CommonsEnv(EnvBase):
         first_world: int = 0,
         state: bool = False,
     ) -> None:
-        if torch.device(device).type != "cpu":
-            raise ValueError(f'device is "{device}"; so far the game runs on "cpu" only')
-        super().__init__(device=torch.device("cpu"), batch_size=torch.Size([worlds]))
-        self.game = game
-        self.worlds = Batch(game, worlds, seed=seed, first_world=first_world, threads=threads)
+        device = torch.device(device)
+        driver, as_array = _driver(game, worlds, device, threads)
+        super().__init__(device=device, batch_size=torch.Size([worlds]))
+        self.game, self._as_array = game, as_array
+        self.worlds = Batch(game, worlds, seed=seed, first_world=first_world, driver=driver)
         self.group_map = {keys.AGENTS: list(game.agent_names)}
         self._agents_size = torch.Size([worlds, game.agents])
         vectors = {"scoreboard": game.scoreboard_size, "stock_gauge": game.stock_gauge_size}
@@ -75,7 +78,7 @@ class CommonsEnv(EnvBase):
         self._forms = {
             name: (shape, _TORCH_TYPES[dtype]) for name, (shape, dtype) in told_shapes(game, worlds).items()
         }
-        self._colours = torch.from_numpy(game.palette)
+        self._colours = torch.from_numpy(game.palette).to(device)
         self._tensors, self.told = self._fresh()
         self._make_specs()
 
@@ -121,8 +124,12 @@ class CommonsEnv(EnvBase):
 
     def _fresh(self) -> tuple[dict[str, Tensor], Told]:
         """New memory for what a turn tells: as tensors by name, and the same as arrays."""
-        tensors = {name: torch.empty(shape, dtype=dtype) for name, (shape, dtype) in self._forms.items()}
-        return tensors, Told(**{name: tensor.numpy() for name, tensor in tensors.items()})
+        device, as_array = self.device, self._as_array
+        tensors = {
+            name: torch.empty(shape, dtype=dtype, device=device)
+            for name, (shape, dtype) in self._forms.items()
+        }
+        return tensors, Told(**{name: as_array(tensor) for name, tensor in tensors.items()})
 
     def _as_tensordict(self, tensors: dict[str, Tensor], reward: Tensor | None = None) -> TensorDict:
         """The entries of one moment; without a reward as `reset` returns them."""
@@ -131,7 +138,7 @@ class CommonsEnv(EnvBase):
             agents["reward"] = reward
         entries: dict[str, Any] = {name: tensors[name] for name in (*_WORLD_ENTRIES, *_DONE_ENTRIES)}
         if self._with_state:
-            boards = torch.from_numpy(self.worlds.boards(self.told))
+            boards = torch.as_tensor(self.worlds.boards(self.told), device=self.device)
             entries[keys.STATE] = self._colours[boards.long()].permute(0, 3, 1, 2)
         entries[keys.AGENTS] = TensorDict._new_unsafe(
             agents, batch_size=self._agents_size, device=self.device
@@ -156,7 +163,7 @@ class CommonsEnv(EnvBase):
         else:
             for name, tensor in self._tensors.items():
                 tensor.copy_(before[name])
-            self.worlds.begin(self.told, which.reshape(-1).numpy())
+            self.worlds.begin(self.told, self._as_array(which.reshape(-1)))
         return self._tensors
 
     def load(self, state: Mapping[str, NDArray[Any]]) -> TensorDict:
@@ -174,7 +181,7 @@ class CommonsEnv(EnvBase):
         return self._as_tensordict(tensors)
 
     def _step(self, tensordict: TensorDictBase) -> TensorDict:
-        actions = tensordict.get(keys.AGENTS).get("action").contiguous().numpy()
+        actions = self._as_array(tensordict.get(keys.AGENTS).get("action").contiguous())
         self.worlds.check(actions)
         self._tensors, self.told = self._fresh()
         self.worlds.play_checked(actions, self.told)
@@ -197,3 +204,21 @@ class CommonsEnv(EnvBase):
             if name not in _OWN_AGENT_KEYS:
                 carried._tensordict[keys.AGENTS]._tensordict[name] = value
         return tensordict, carried
+
+
+def _driver(
+    game: Game, worlds: int, device: torch.device, threads: int | None
+) -> tuple[Driver, Callable[[Tensor], Any]]:
+    """What plays the worlds on a device, and how it looks at a tensor's memory."""
+    if device.type == "cpu":
+        return CpuThreads(game, worlds, threads=threads), Tensor.numpy
+    if device.type != "cuda":
+        raise ValueError(f'device is "{device}"; allowed: "cpu" and "cuda"')
+    if threads is not None:
+        raise ValueError(f"threads is {threads}; that is for the CPU, on a GPU each world has its thread")
+    if not torch.cuda.is_available():
+        raise RuntimeError(f'device is "{device}"; torch finds no GPU, so "cpu" is what fits')
+    from cprl.commons.cuda import CudaThreads
+
+    driver = CudaThreads(game, worlds)
+    return driver, driver.wrap

@@ -21,6 +21,7 @@ class DQNLearner:
         actions: how many actions there are.
         settings: the hyper-parameters; see `presets.learner`.
         highest: the largest value of an observation, `Observation.highest`.
+        device: where the agent learns and keeps what it has seen; by default the CPU.
         seed: of the replay buffer's sampling. Weights and exploration draw from torch's global generator,
             as TorchRL's modules do.
     """
@@ -32,12 +33,14 @@ class DQNLearner:
         *,
         settings: DQNSettings,
         highest: float = 255.0,
+        device: str | torch.device = "cpu",
         seed: int = 0,
     ) -> None:
+        device = torch.device(device)
         network = partial(_network, observation_shape, actions, settings, highest)
         self.settings = settings
-        self.network = network()
-        self.actor = QActor(self.network, actions)
+        self.network = network().to(device)
+        self.actor = QActor(self.network, actions, device=device)
         self.actor.epsilon = settings.epsilon(0)
         self.loss = DQNLoss(
             self.actor.greedy, delay_value=True, loss_function="l2", action_space="categorical"
@@ -46,15 +49,15 @@ class DQNLearner:
         # HardUpdate copies at every (interval + 1)-th step, and once when it is made.
         self._target = HardUpdate(self.loss, value_network_update_interval=settings.target_every_episodes - 1)
         if settings.own_target_weights:
-            self._give_target(network())
+            self._give_target(network().to(device))
         self._loss_share = 1 / actions if settings.mean_over_all_outputs else 1.0
         self._adam = torch.optim.Adam(
             self.loss.parameters(), lr=settings.learning_rate, eps=settings.adam_eps, fused=True
         )
         self.buffer = TensorDictReplayBuffer(
-            storage=LazyTensorStorage(settings.buffer_size),
+            storage=LazyTensorStorage(settings.buffer_size, device=device),
             batch_size=settings.batch_size,
-            generator=torch.Generator().manual_seed(seed),
+            generator=torch.Generator(device).manual_seed(seed),
         )
         self.steps = 0
 

@@ -25,7 +25,7 @@ class Frame:
     """One world after one step."""
 
     board: Bytes
-    """uint8 [H, W], colour classes of `cprl.commons.game`."""
+    """uint8 [H, W], classes of `cprl.commons.colours`."""
     windows: Bytes
     """uint8 [N, C, X, Y], what each agent observes."""
     row: Ints

@@ -103,7 +103,7 @@ class Watch:
         shown = self.env.worlds.show(self.env.told)
         return Frame(
             board=shown.board,
-            windows=self.env.told.observation[0],
+            windows=shown.observation,
             row=shown.row,
             col=shown.col,
             heading=shown.heading,

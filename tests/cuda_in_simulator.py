@@ -1,0 +1,133 @@
+"""The CUDA driver in Numba's simulator beside the CPU driver; `test_cuda.py` starts it in another process.
+
+NUMBA_ENABLE_CUDASIM=1 python tests/cuda_in_simulator.py
+"""
+
+import sys
+from collections.abc import Callable
+
+import numpy as np
+import pytest
+from boards import random_actions
+from numba import cuda
+from numba.core import config
+
+from cprl import Game, Observation, Rules, maps, presets
+from cprl.commons.batch import Batch
+from cprl.commons.cuda import THREADS_PER_BLOCK, CudaThreads
+
+WALLS = maps.parse(
+    """
+    A>A#.<.
+    .A.#A.A
+    ..#..v.
+    """
+)
+
+
+def both(game: Game, worlds: int) -> tuple[Batch, Batch]:
+    """The same worlds on either driver."""
+    return Batch(game, worlds, seed=3), Batch(game, worlds, seed=3, driver=CudaThreads(game, worlds))
+
+
+def assert_same(cpu: Batch, gpu: Batch, told, told_by_gpu, when: object) -> None:
+    """Worlds and everything told are equal."""
+    for ours, theirs in ((told, told_by_gpu), (cpu.now, gpu.now)):
+        for name, array in ours._asdict().items():
+            other = gpu.driver.read(getattr(theirs, name))
+            if array.dtype != other.dtype or not np.array_equal(array, other):
+                raise AssertionError(f"{name} differs, {when}: {array} {other}")
+
+
+def play(game: Game, *, worlds: int = 2, turns: int = 50) -> None:
+    """Both drivers play the same turns; half-way some worlds begin anew."""
+    cpu, gpu = both(game, worlds)
+    told, told_by_gpu = cpu.begin(cpu.new_told()), gpu.begin(gpu.new_told())
+    assert_same(cpu, gpu, told, told_by_gpu, "at the start")
+    for number, turn in enumerate(random_actions(turns, worlds, game)):
+        cpu.play(turn, told)
+        gpu.play(cuda.to_device(turn), told_by_gpu)
+        assert_same(cpu, gpu, told, told_by_gpu, f"turn {number}")
+        if number == turns // 2:
+            which = np.arange(worlds) % 2 == 1
+            cpu.begin(told, which)
+            gpu.begin(told_by_gpu, cuda.to_device(which))
+            assert_same(cpu, gpu, told, told_by_gpu, "begun anew")
+    assert np.array_equal(cpu.boards(told), gpu.driver.read(gpu.boards(told_by_gpu)))
+
+
+def published(name: str) -> None:
+    """One of the four boards in one variant."""
+    board, variant = name.split(":")
+    play(presets.game(board, variant=variant))
+
+
+def forms() -> None:
+    """Every form of observation, and walls that block sight."""
+    rules = Rules(regrow_prob=(0.1, 0.5), freeze_steps=4, episode_steps=20, window_rows=3, window_columns=5)
+    for encoding in ("rgb", "one_hot"):
+        for area in ("window", "full"):
+            for others in (False, True):
+                form = Observation(
+                    area=area, encoding=encoding, agents_apart=others, scoreboard=others, stock_gauge=others
+                )
+                play(Game(map=WALLS, rules=rules, observation=form), turns=30)
+    hidden = Rules(regrow_prob=(0.1, 0.5), walls_block_sight=True, window_rows=3, window_columns=5)
+    play(Game(map=WALLS, rules=hidden), turns=30)
+
+
+def blocks() -> None:
+    """More worlds than a block has threads."""
+    play(Game(map=WALLS, rules=Rules(freeze_steps=2)), worlds=THREADS_PER_BLOCK + 3, turns=6)
+
+
+def state() -> None:
+    """A state goes from the one driver to the other and back, and seeds start all over."""
+    game = presets.game("two_complex")
+    cpu, gpu = both(game, 3)
+    told, told_by_gpu = cpu.begin(cpu.new_told()), gpu.begin(gpu.new_told())
+    for turn in random_actions(30, 3, game):
+        cpu.play(turn, told)
+    gpu.load(cpu.state(), told_by_gpu)
+    turn = random_actions(1, 3, game, seed=9)[0]
+    cpu.play(turn, told)
+    gpu.play(cuda.to_device(turn), told_by_gpu)
+    assert_same(cpu, gpu, told, told_by_gpu, "after loading")
+    assert all(np.array_equal(array, gpu.state()[name]) for name, array in cpu.state().items())
+    shown, shown_by_gpu = cpu.show(told, world=1), gpu.show(told_by_gpu, world=1)
+    assert all(map(np.array_equal, shown, shown_by_gpu))
+    for batch, tell in ((cpu, told), (gpu, told_by_gpu)):
+        batch.set_seed(11)
+        batch.begin(tell)
+    assert_same(cpu, gpu, told, told_by_gpu, "after set_seed")
+
+
+def unknown() -> None:
+    """Unknown actions are found, and change nothing."""
+    game = presets.game("commons")
+    _, gpu = both(game, 3)
+    told = gpu.begin(gpu.new_told())
+    before = gpu.state()
+    actions = np.zeros((3, 4), np.int64)
+    actions[1, 2], actions[2, 0] = 8, -1
+    with pytest.raises(ValueError, match="action 8 of agent 2 in world 1 is unknown; allowed: 0 to 7"):
+        gpu.play(cuda.to_device(actions), told)
+    assert all(np.array_equal(array, before[name]) for name, array in gpu.state().items())
+
+
+CHECKS: dict[str, Callable[[], None]] = {
+    **{
+        name: (lambda name=name: published(name))
+        for name in (f"{board}:{variant}" for board in presets.BOARDS for variant in presets.VARIANTS)
+    },
+    "forms": forms,
+    "blocks": blocks,
+    "state": state,
+    "unknown": unknown,
+}
+
+if __name__ == "__main__":
+    assert config.ENABLE_CUDASIM, "start with NUMBA_ENABLE_CUDASIM=1"
+    for name in sys.argv[1:] or CHECKS:
+        CHECKS[name]()
+        print(name, "equal", flush=True)

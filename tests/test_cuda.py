@@ -1,0 +1,76 @@
+"""The CUDA driver plays the game of the CPU driver: in Numba's simulator, and on a GPU if there is one."""
+
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from boards import random_actions
+
+from cprl import CommonsEnv, keys, presets
+from cprl.acting import RandomActor, Seats
+from cprl.learning import DQNLearner, DQNSettings
+from cprl.measuring.evaluate import evaluate
+from cprl.train import train
+
+SCRIPT = Path(__file__).with_name("cuda_in_simulator.py")
+GAMES = [f"{board}:{variant}" for board in presets.BOARDS for variant in presets.VARIANTS]
+
+
+@pytest.fixture(scope="module")
+def simulated():
+    """What the script printed and how it ended; the simulator has to be switched on before Numba is there."""
+    done = subprocess.run(
+        [sys.executable, SCRIPT],
+        env={**os.environ, "NUMBA_ENABLE_CUDASIM": "1"},
+        capture_output=True,
+        text=True,
+        timeout=300,
+    )
+    return done.stdout.splitlines(), done
+
+
+@pytest.mark.parametrize("check", [*GAMES, "forms", "blocks", "state", "unknown"])
+def test_the_simulated_gpu_plays_the_game_of_the_cpu(simulated, check):
+    lines, done = simulated
+    assert f"{check} equal" in lines, done.stderr
+
+
+def test_nothing_else_went_wrong_in_the_simulator(simulated):
+    assert simulated[1].returncode == 0, simulated[1].stderr
+
+
+@pytest.mark.gpu
+@pytest.mark.parametrize("variant", presets.VARIANTS)
+@pytest.mark.parametrize("board", presets.BOARDS)
+def test_the_gpu_plays_the_game_of_the_cpu(board, variant):
+    game = presets.game(board, variant=variant)
+    envs = [CommonsEnv(game, 300, seed=3, device=device, state=True) for device in ("cpu", "cuda")]
+    moments = [env.reset() for env in envs]
+    for turn in torch.as_tensor(random_actions(300, 300, game)):
+        steps = []
+        for i, env in enumerate(envs):
+            now, moments[i] = env.step_and_maybe_reset(moments[i].set(keys.ACTION, turn.to(env.device)))
+            steps.append(now["next"])
+        for key in steps[0].keys(True, True):
+            assert steps[1][key].is_cuda
+            assert torch.equal(steps[0][key], steps[1][key].cpu()), key
+    states = [env.worlds.state() for env in envs]
+    assert all(np.array_equal(array, states[1][name]) for name, array in states[0].items())
+
+
+@pytest.mark.gpu
+def test_an_agent_learns_on_the_gpu():
+    game = presets.game("two_complex")
+    env = CommonsEnv(game, device="cuda")
+    settings = DQNSettings(buffer_size=500, learning_starts=50)
+    learner = DQNLearner(game.observation_shape, 8, settings=settings, device="cuda")
+    before = [weights.clone() for weights in learner.network.parameters()]
+    random = RandomActor(8, device="cuda")
+    train(env, {0: learner}, others={1: random}, episodes=1)
+    assert learner.buffer[:10]["observation"].is_cuda
+    assert all(not torch.equal(*pair) for pair in zip(before, learner.network.parameters(), strict=True))
+    assert len(evaluate(CommonsEnv(game, 8, device="cuda"), Seats([learner.actor, random]))) == 8
