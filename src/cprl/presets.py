@@ -9,6 +9,7 @@ from typing import Any, Final, Literal, get_args
 from cprl.commons import maps
 from cprl.commons.game import Game
 from cprl.commons.rules import Rules
+from cprl.envs.gymnasium_env import CommonsGymnasiumEnv
 from cprl.learning.settings import DQNSettings
 
 Board = Literal["single_basic", "single_complex", "two_complex", "commons"]
@@ -55,6 +56,17 @@ def game(board: Board, *, variant: Variant = "published") -> Game:
     _check(board, variant)
     quirks = _AS_RUN if variant == "as_run" else {}
     return Game(map=maps.named(board), rules=Rules(**quirks, **_BOARD_RULES[board, variant]))
+
+
+def gymnasium_env(
+    board: Board, *, variant: Variant = "published", seed: int = 0, render_mode: str | None = None
+) -> CommonsGymnasiumEnv:
+    """A published board for one agent as a Gymnasium environment, as `gymnasium.make` builds it.
+
+    Raises:
+        ValueError: for an unknown board or variant, and for a board of several agents.
+    """
+    return CommonsGymnasiumEnv(game(board, variant=variant), seed=seed, render_mode=render_mode)
 
 
 def learner(board: Board, *, variant: Variant = "published") -> DQNSettings:

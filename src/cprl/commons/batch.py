@@ -1,7 +1,7 @@
 """B worlds of a game at once, on whatever driver plays them."""
 
 from collections.abc import Mapping
-from typing import Any, NamedTuple, Protocol
+from typing import Any, Protocol
 
 import numpy as np
 from numpy.typing import DTypeLike, NDArray
@@ -10,7 +10,7 @@ from cprl.commons import state as states
 from cprl.commons.game import Game, told_shapes
 from cprl.commons.loops import Loop
 from cprl.commons.threads import CpuThreads
-from cprl.commons.world import Actions, Bools, Bytes, Ints, Told, Worlds, empty_worlds
+from cprl.commons.world import Actions, Bools, Bytes, Shown, Told, Worlds, empty_worlds
 
 
 class Driver(Protocol):
@@ -24,25 +24,6 @@ class Driver(Protocol):
     def write(self, array: NDArray[Any], values: NDArray[Any]) -> None: ...
     def first_unknown(self, actions: Actions, known: int) -> int: ...
     def run(self, loop: Loop, worlds: Worlds, what: NDArray[Any], told: Told) -> None: ...
-
-
-class Shown(NamedTuple):
-    """One world as people look at it: numpy arrays, copies."""
-
-    observation: Bytes
-    """uint8 [N, C, X, Y], what each agent observes."""
-    board: Bytes
-    """uint8 [H, W], classes of `cprl.commons.colours`."""
-    stock: Bytes
-    """uint8 [K], 1 where an apple hangs."""
-    row: Ints
-    """int32 [N]."""
-    col: Ints
-    """int32 [N]."""
-    heading: Ints
-    """int32 [N], 0 up, 1 right, 2 down, 3 left."""
-    in_play: Bools
-    """bool [N]."""
 
 
 class Batch:

@@ -4,10 +4,10 @@ from typing import Final
 
 import numpy as np
 
-from cprl.commons.colours import APPLE, GROUND, WALL, agent_colour
+from cprl.commons.colours import APPLE, BEAM, COLOURS, GROUND, WALL, agent_colour
 from cprl.commons.game import Game
 from cprl.commons.maps import Map
-from cprl.commons.world import COL_STEP, ROW_STEP, Bytes, Ints
+from cprl.commons.world import COL_STEP, ROW_STEP, Bools, Bytes, Ints, Shown
 
 GRID_COLOUR: Final = (28, 30, 36)
 CELL_COLOURS: Final = {GROUND: (16, 18, 22), WALL: (125, 125, 125), APPLE: (46, 184, 76)}
@@ -20,6 +20,8 @@ def board_image(
     col: Ints,
     heading: Ints,
     *,
+    in_play: Bools | None = None,
+    beams: Bools | None = None,
     cell_pixels: int = 24,
 ) -> Bytes:
     """A picture of one world.
@@ -27,9 +29,11 @@ def board_image(
     Args:
         board: where walls and sites are.
         stock: uint8 [K], 1 where an apple hangs.
-        row: int [agents shown], and so are col and heading; agents out of play are left out by the caller.
+        row: int [N], and so are col and heading.
         col: see row.
         heading: 0 up, 1 right, 2 down, 3 left.
+        in_play: bool [N], who is drawn; None for everybody.
+        beams: bool [H, W], cells that a beam covers; None for no beam.
         cell_pixels: pixels across a cell, at least 8.
 
     Returns:
@@ -51,9 +55,26 @@ def board_image(
             inset = size // 6 if kind == APPLE else 0
             image[r * size + 1 : (r + 1) * size, c * size + 1 : (c + 1) * size] = CELL_COLOURS[GROUND]
             _fill(image, r, c, size, inset, CELL_COLOURS[kind])
+            if beams is not None and beams[r, c]:
+                _fill(image, r, c, size, 2 * size // 5, COLOURS[BEAM])
     for i, (r, c, h) in enumerate(zip(row, col, heading, strict=True)):
-        _draw_agent(image, int(r), int(c), int(h), size, agent_colour(i))
+        if in_play is None or in_play[i]:
+            _draw_agent(image, int(r), int(c), int(h), size, agent_colour(i))
     return image
+
+
+def world_image(board: Map, shown: Shown, *, cell_pixels: int = 24) -> Bytes:
+    """A picture of one world as it stands, agents out of play left out; see `board_image`."""
+    return board_image(
+        board,
+        shown.stock,
+        shown.row,
+        shown.col,
+        shown.heading,
+        in_play=shown.in_play,
+        beams=shown.board == BEAM,
+        cell_pixels=cell_pixels,
+    )
 
 
 def first_image(game: Game, *, cell_pixels: int = 24) -> Bytes:

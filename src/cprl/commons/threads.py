@@ -94,7 +94,8 @@ class CpuThreads:
             raise ValueError(f"an array {what.dtype} {what.shape} is not contiguous; one that is is wanted")
         if told is self._told:
             return
-        for name, array, (shape, dtype) in zip(Told._fields, told, self._wanted, strict=True):
+        arrays: dict[str, NDArray[Any]] = told._asdict()
+        for (name, array), (shape, dtype) in zip(arrays.items(), self._wanted, strict=True):
             if array.shape != shape or array.dtype != dtype or not array.flags.carray:
                 raise ValueError(
                     f"told.{name} is {array.dtype} {array.shape}; "

@@ -125,6 +125,25 @@ class Scratch(NamedTuple):
     """[X * Y], the paints of the window being cut."""
 
 
+class Shown(NamedTuple):
+    """One world as people look at it: numpy arrays, copies."""
+
+    observation: Bytes
+    """uint8 [N, C, X, Y], what each agent observes."""
+    board: Bytes
+    """uint8 [H, W], classes of `cprl.commons.colours`."""
+    stock: Bytes
+    """uint8 [K], 1 where an apple hangs."""
+    row: Ints
+    """int32 [N]."""
+    col: Ints
+    """int32 [N]."""
+    heading: Ints
+    """int32 [N], 0 up, 1 right, 2 down, 3 left."""
+    in_play: Bools
+    """bool [N]."""
+
+
 def empty_worlds(*, worlds: int, agents: int, sites: int) -> Worlds:
     """Room for B worlds, all zero; `begin` makes an episode of it."""
 

@@ -1,0 +1,109 @@
+"""The doors of PettingZoo: all agents at once (`parallel_env`), or one after the other (`env`)."""
+
+from typing import Any, ClassVar
+
+import numpy as np
+from gymnasium import spaces
+from pettingzoo import AECEnv, ParallelEnv
+from pettingzoo.utils import parallel_to_aec
+
+from cprl.commons.game import Game
+from cprl.commons.world import Bytes
+from cprl.envs.one_world import RENDER_FPS, RENDER_MODES, Observed, OneWorld
+
+Infos = dict[str, dict[str, Any]]
+
+
+class CommonsParallelEnv(ParallelEnv[str, Any, int]):
+    """One world of a game as a PettingZoo `ParallelEnv`; agents are agent_0, agent_1 and so on.
+
+    Every agent acts in every turn until the episode ends for all; what one chooses while it is out of play
+    does not count. `infos` tell each agent's harvest, whether it acts in the coming turn (in_play), whether
+    it fired and whether it was tagged.
+
+    Args:
+        game: what is played, see `presets.game`.
+        seed: what all chance follows from; `reset(seed=...)` starts all over with another.
+        render_mode: "rgb_array", "human" or None.
+
+    Raises:
+        ValueError: in `step`, for missing, superfluous or unknown actions; then nothing has changed.
+    """
+
+    metadata: ClassVar[dict[str, Any]] = {
+        "name": "commons_v0",
+        "render_modes": list(RENDER_MODES),
+        "render_fps": RENDER_FPS,
+        "is_parallelizable": True,
+    }
+
+    def __init__(self, game: Game, *, seed: int = 0, render_mode: str | None = None) -> None:
+        self.game, self.render_mode = game, render_mode
+        self.world = OneWorld(game, seed=seed, title="cprl commons", render_mode=render_mode)
+        self.possible_agents = list(game.agent_names)
+        self.agents: list[str] = []
+        self.observation_spaces = {name: self.world.observation_space() for name in self.possible_agents}
+        self.action_spaces = {name: spaces.Discrete(len(game.actions)) for name in self.possible_agents}
+        self.state_space = spaces.Box(0, 255, (3, game.map.height, game.map.width), np.uint8)
+
+    def observation_space(self, agent: str) -> spaces.Space[Any]:
+        """A Box of uint8 [C, X, Y], or a Dict with it as "observation"; always the same object."""
+        return self.observation_spaces[agent]
+
+    def action_space(self, agent: str) -> spaces.Space[Any]:
+        """Discrete, `Game.actions` by index; always the same object."""
+        return self.action_spaces[agent]
+
+    def reset(
+        self, seed: int | None = None, options: dict[str, Any] | None = None
+    ) -> tuple[dict[str, Observed], Infos]:
+        """Begins the next episode, or the first one of another seed."""
+        self.world.begin(seed)
+        self.agents = list(self.possible_agents)
+        return self._observations(), self._infos()
+
+    def step(
+        self, actions: dict[str, int]
+    ) -> tuple[dict[str, Observed], dict[str, float], dict[str, bool], dict[str, bool], Infos]:
+        """One turn; an action for every agent."""
+        if set(actions) != set(self.agents):
+            raise ValueError(
+                f"actions came for {sorted(actions)}; wanted: one for each of {self.agents}"
+                + ("" if self.agents else ", nobody: the episode is over, call reset()")
+            )
+        self.world.play([int(actions[name]) for name in self.agents])
+        rewards = {name: self.world.reward(i) for i, name in enumerate(self.agents)}
+        terminations = dict.fromkeys(self.agents, self.world.terminated)
+        truncations = dict.fromkeys(self.agents, self.world.truncated)
+        told = self._observations(), rewards, terminations, truncations, self._infos()
+        if self.world.terminated or self.world.truncated:
+            self.agents = []
+        return told
+
+    def state(self) -> Bytes:
+        """uint8 [3, H, W], the whole board as RGB."""
+        return self.world.state()
+
+    def render(self) -> Bytes | None:
+        """A picture, uint8 [rows, columns, 3]; None where it went to a window."""
+        return self.world.render()
+
+    def close(self) -> None:
+        """Closes the window, if there is one."""
+        self.world.close()
+
+    def _observations(self) -> dict[str, Observed]:
+        return {name: self.world.observation(i) for i, name in enumerate(self.agents)}
+
+    def _infos(self) -> Infos:
+        return {name: self.world.info(i) for i, name in enumerate(self.agents)}
+
+
+def parallel_env(game: Game, seed: int = 0, *, render_mode: str | None = None) -> CommonsParallelEnv:
+    """The game as a PettingZoo `ParallelEnv`; see `CommonsParallelEnv`."""
+    return CommonsParallelEnv(game, seed=seed, render_mode=render_mode)
+
+
+def env(game: Game, seed: int = 0, *, render_mode: str | None = None) -> AECEnv[str, Any, int]:
+    """The game as a PettingZoo `AECEnv`: agents choose in turn, and the last one's choice plays the turn."""
+    return parallel_to_aec(parallel_env(game, seed, render_mode=render_mode))

@@ -1,0 +1,285 @@
+"""The doors of PettingZoo and Gymnasium keep their contracts, and all doors play the same game."""
+
+import warnings
+from dataclasses import replace
+
+import gymnasium
+import matplotlib
+import numpy as np
+import pytest
+import torch
+from boards import random_actions
+from gymnasium.utils.env_checker import check_env
+from pettingzoo import ParallelEnv
+from pettingzoo.test import api_test, parallel_api_test, parallel_seed_test, render_test, seed_test
+from torchrl.envs import PettingZooWrapper
+from torchrl.envs.utils import check_env_specs
+
+from cprl import CommonsEnv, Game, Observation, Rules, keys, maps, presets
+from cprl.envs import CommonsGymnasiumEnv, env, parallel_env
+from cprl.envs.window import Window
+
+SHORT = Game(
+    map=maps.parse(".A>.A\n.A.A.\n..<.A"),
+    rules=Rules(regrow_prob=(0.0, 0.1), window_rows=3, window_columns=5, episode_steps=30, freeze_steps=3),
+)
+RICH = Observation(encoding="one_hot", agents_apart=True, scoreboard=True, stock_gauge=True)
+GAMES = [SHORT, replace(SHORT, observation=RICH), presets.game("commons", variant="as_run")]
+SINGLE = [presets.game("single_basic"), replace(presets.game("single_complex"), observation=RICH)]
+
+
+@pytest.fixture
+def no_screen(monkeypatch):
+    """Windows are drawn but not shown."""
+    monkeypatch.setenv("MPLBACKEND", "agg")
+    matplotlib.use("agg")
+
+
+@pytest.mark.parametrize("game", GAMES, ids=["short", "rich", "commons"])
+def test_pettingzoos_test_of_parallel_environments(game):
+    parallel_api_test(parallel_env(game), num_cycles=100)
+
+
+@pytest.mark.parametrize("game", [GAMES[0], GAMES[2]], ids=["short", "commons"])
+def test_pettingzoos_test_of_turn_by_turn_environments(game):
+    api_test(env(game), num_cycles=200)
+
+
+def test_pettingzoos_test_warns_only_that_vectors_beside_a_picture_are_no_box():
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always")
+        api_test(env(GAMES[1]), num_cycles=200)
+    told = {str(warning.message) for warning in caught}
+    assert all(
+        "Observation is not a NumPy array" in text or "probably should be gymnasium.spaces.box" in text
+        for text in told
+    )
+    assert told
+
+
+@pytest.mark.parametrize("game", GAMES, ids=["short", "rich", "commons"])
+def test_pettingzoos_tests_of_seeds(game):
+    parallel_seed_test(lambda: parallel_env(game), num_cycles=60)
+    seed_test(lambda: env(game), num_cycles=60)
+
+
+@pytest.mark.usefixtures("no_screen")
+def test_pettingzoos_test_of_rendering():
+    render_test(lambda **how: env(SHORT, **how))
+    matplotlib.pyplot.close("all")
+
+
+@pytest.mark.parametrize("game", SINGLE, ids=["single_basic", "rich"])
+@pytest.mark.usefixtures("no_screen")
+def test_gymnasiums_test_of_environments(game):
+    check_env(gymnasium.make("cprl/Commons-v0", game=game).unwrapped)
+    matplotlib.pyplot.close("all")
+
+
+@pytest.mark.parametrize("name", ["SingleBasic", "SingleComplex"])
+def test_single_boards_are_registered_in_both_variants(name):
+    for variant in presets.VARIANTS:
+        made = gymnasium.make(f"cprl/{name}-v0", variant=variant)
+        board = {"SingleBasic": "single_basic", "SingleComplex": "single_complex"}[name]
+        assert made.unwrapped.game == presets.game(board, variant=variant)
+
+
+@pytest.mark.filterwarnings("ignore:PettingZoo in TorchRL is tested using version:UserWarning")
+def test_torchrls_pettingzoo_wrapper_accepts_it():
+    wrapped = PettingZooWrapper(parallel_env(presets.game("commons")), use_mask=False)
+    check_env_specs(wrapped)
+    steps = wrapped.rollout(20)
+    assert steps["agent", "observation"].shape == (20, 4, 3, 7, 15)
+
+
+def played_by_torchrl(game, turns):
+    """Everything that the agents are told in each turn; a new episode begins where one has ended."""
+    door = CommonsEnv(game, seed=5)
+    moment = door.reset()
+    for turn in turns:
+        now, moment = door.step_and_maybe_reset(moment.set(keys.ACTION, torch.as_tensor(turn[None])))
+        after = now["next"]
+        agents = after["agents"][0]
+        flags = zip(agents["in_play"], agents["fired"], agents["tagged_by"].any(-1), strict=True)
+        yield {
+            **{
+                (name, entry): agents[i][entry].numpy()
+                for i, name in enumerate(game.agent_names)
+                for entry in ("observation", "scoreboard", "stock_gauge")
+                if entry in agents
+            },
+            "rewards": agents["reward"][:, 0].tolist(),
+            "infos": [tuple(map(bool, flag)) for flag in flags],
+            "end": (bool(after["terminated"]), bool(after["truncated"])),
+        }
+
+
+def told_of(names, observe, rewards, infos, end):
+    """The same from what PettingZoo's and Gymnasium's doors return."""
+    entries = {}
+    for name in names:
+        seen = observe(name)
+        for entry, array in (seen if isinstance(seen, dict) else {"observation": seen}).items():
+            entries[name, entry] = array
+    return {
+        **entries,
+        "rewards": [rewards[name] for name in names],
+        "infos": [(infos[name]["in_play"], infos[name]["fired"], infos[name]["tagged"]) for name in names],
+        "end": end,
+    }
+
+
+def played_in_parallel(game, turns):
+    door, names = parallel_env(game, 5), game.agent_names
+    door.reset()
+    for turn in turns:
+        seen, rewards, terminated, truncated, infos = door.step(dict(zip(names, turn.tolist(), strict=True)))
+        ends = set(zip(terminated.values(), truncated.values(), strict=True))
+        assert len(ends) == 1
+        yield told_of(names, seen.get, rewards, infos, end := ends.pop())
+        assert door.agents == ([] if any(end) else list(names))
+        if any(end):
+            door.reset()
+
+
+def played_turn_by_turn(game, turns):
+    door, names = env(game, 5), game.agent_names
+    door.reset()
+    for turn in turns:
+        for name, action in zip(names, turn.tolist(), strict=True):
+            assert door.agent_selection == name
+            door.step(action)
+        end = door.terminations[names[0]], door.truncations[names[0]]
+        yield told_of(names, door.observe, door.rewards, door.infos, end)
+        if any(end):
+            door.reset()
+
+
+def played_alone(game, turns):
+    door = CommonsGymnasiumEnv(game, seed=5)
+    door.reset()
+    for turn in turns:
+        seen, reward, *end, info = door.step(int(turn[0]))
+        one = {"agent_0": reward}
+        yield told_of(["agent_0"], {"agent_0": seen}.get, one, {"agent_0": info}, tuple(end))
+        if any(end):
+            door.reset()
+
+
+@pytest.mark.parametrize("board", presets.BOARDS)
+@pytest.mark.parametrize("form", [Observation(), RICH], ids=["rgb", "rich"])
+def test_all_doors_play_the_same_game_for_the_same_seed(board, form):
+    game = presets.game(board)
+    game = replace(game, rules=replace(game.rules, episode_steps=130), observation=form)
+    turns = random_actions(300, 1, game, seed=1)[:, 0]
+    doors = [played_in_parallel, played_turn_by_turn, *([played_alone] if game.agents == 1 else [])]
+    ends = 0
+    for number, told in enumerate(
+        zip(played_by_torchrl(game, turns), *(door(game, turns) for door in doors), strict=True)
+    ):
+        for other in told[1:]:
+            assert set(other) == set(told[0])
+            for entry, value in told[0].items():
+                assert np.array_equal(other[entry], value), (number, entry)
+        ends += any(told[0]["end"])
+    assert number == 299
+    assert ends >= 2
+
+
+@pytest.mark.parametrize("play", [played_in_parallel, played_turn_by_turn])
+def test_whole_seeded_episodes_are_the_same_again(play):
+    game = presets.game("commons")
+    turns = random_actions(300, 1, game, seed=3)[:, 0]
+    for one, other in zip(play(game, turns), play(game, turns), strict=True):
+        assert all(np.array_equal(other[entry], value) for entry, value in one.items())
+
+
+@pytest.mark.parametrize("door", [parallel_env, CommonsGymnasiumEnv])
+def test_reset_with_a_seed_starts_all_over_and_without_one_goes_on(door):
+    game = presets.game("single_complex")
+    turns = random_actions(200, 1, game, seed=4)[:, 0, 0].tolist()
+
+    def episode(world, **how):
+        world.reset(**how)
+        for turn in turns:
+            world.step({"agent_0": turn} if isinstance(world, ParallelEnv) else turn)
+        return world.world.state().tolist(), world.world.batch.now.harvested.tolist()
+
+    world = door(game)
+    first = episode(world, seed=7)
+    second = episode(world)
+    assert episode(world, seed=8) != first != second
+    assert episode(world, seed=7) == first
+    assert episode(world) == second
+    assert episode(door(game, seed=7)) == first
+
+
+def test_the_picture_shows_who_is_in_play_each_in_its_own_colour():
+    world = parallel_env(Game(map=maps.parse(">..<A"), rules=Rules(freeze_steps=3)), render_mode="rgb_array")
+    world.reset()
+    before = world.render()
+    world.step({"agent_0": 6, "agent_1": 7})
+    after = world.render()
+    assert before.shape == (25, 121, 3)
+    own = before[3, 3], before[3, 75]
+    assert own[0].tolist() != own[1].tolist()
+    assert after[3, 3].tolist() == own[0].tolist()
+    assert after[3, 75].tolist() != own[1].tolist(), "agent 1 is out of play"
+    assert (after == (255, 204, 51)).all(-1).any(), "the beam is drawn"
+
+
+@pytest.mark.parametrize(
+    ("actions", "message"),
+    [
+        ({"agent_0": 0}, r"actions came for \['agent_0'\]; wanted: one for each of \['agent_0', 'agent_1'\]"),
+        ({"agent_0": 0, "agent_1": 0, "agent_2": 0}, "wanted: one for each of"),
+        ({"agent_0": 0, "agent_1": 8}, "action 8 of agent 1 in world 0 is unknown; allowed: 0 to 7"),
+    ],
+)
+def test_wrong_actions_are_refused_and_change_nothing(actions, message):
+    world = parallel_env(SHORT)
+    world.reset()
+    before = world.state()
+    with pytest.raises(ValueError, match=message):
+        world.step(actions)
+    assert np.array_equal(world.state(), before)
+    assert world.world.batch.now.step[0, 0] == 0
+
+
+def test_stepping_an_episode_that_is_over_says_what_to_do():
+    world = parallel_env(replace(SHORT, rules=replace(SHORT.rules, episode_steps=1)))
+    world.reset()
+    world.step({"agent_0": 0, "agent_1": 0})
+    with pytest.raises(ValueError, match=r"the episode is over, call reset\(\)"):
+        world.step({"agent_0": 0, "agent_1": 0})
+
+
+def test_gymnasium_takes_one_agent():
+    with pytest.raises(ValueError, match="the game has 2 agents; Gymnasium takes one"):
+        CommonsGymnasiumEnv(SHORT)
+
+
+def test_render_modes_are_checked():
+    with pytest.raises(ValueError, match="render_mode is 'ansi'; allowed: None, rgb_array, human"):
+        parallel_env(SHORT, render_mode="ansi")
+    world = parallel_env(SHORT)
+    world.reset()
+    with pytest.raises(ValueError, match="nothing can be rendered"):
+        world.render()
+
+
+def test_where_no_window_can_be_opened_the_mode_human_says_so(monkeypatch):
+    monkeypatch.delenv("MPLBACKEND", raising=False)
+    matplotlib.use("agg")
+    with pytest.raises(RuntimeError, match=r'no window can be opened here .*"agg"'):
+        Window("title")
+
+
+@pytest.mark.usefixtures("no_screen")
+def test_a_window_shows_one_picture_after_the_other_and_closes():
+    window = Window("title")
+    for shade in (0, 200):
+        window.show(np.full((4, 6, 3), shade, np.uint8))
+    assert (window._image.get_array() == 200).all()
+    window.close()
+    assert not matplotlib.pyplot.get_fignums()
