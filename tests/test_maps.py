@@ -1,5 +1,7 @@
 """Drawings and maps: what is read, and what is refused."""
 
+import itertools
+
 import pytest
 
 from cprl import Game, Map, Rules, maps
@@ -97,3 +99,124 @@ def test_an_unknown_board_says_which_there_are():
 def test_rules_per_agent_must_fit_the_map(rules, message):
     with pytest.raises(ValueError, match=message):
         Game(map=maps.parse(">.A\n..<"), rules=Rules(**rules))
+
+
+WALLS_BY_ROW = {  # regions.md, after Perolat et al.: columns of wall, by row
+    **dict.fromkeys(range(5), (24, 28)),
+    5: [22, 24, 28, 29, 30],
+    6: [22, 24],
+    7: [*range(23), 24, *range(28, 53)],
+    11: [*range(25), 28, *range(30, 53)],
+    12: [28, 30],
+    13: [22, 23, 24, 28, 30],
+    **dict.fromkeys(range(14, 19), (24, 28)),
+}
+OPENINGS = [
+    *[(1, 24), (3, 28), (7, 1), (7, 8), (7, 40), (7, 48)],
+    *[(11, 4), (11, 12), (11, 44), (11, 51), (15, 24), (17, 28)],
+]
+
+
+def reached(board, start):
+    """The cells that can be walked to."""
+    walls, seen, waiting = set(board.walls), {start}, [start]
+    while waiting:
+        row, col = waiting.pop()
+        for cell in ((row + 1, col), (row - 1, col), (row, col + 1), (row, col - 1)):
+            inside = 0 <= cell[0] < board.height and 0 <= cell[1] < board.width
+            if inside and cell not in walls and cell not in seen:
+                seen.add(cell)
+                waiting.append(cell)
+    return seen
+
+
+def test_the_rooms_have_the_walls_of_the_paper():
+    single = {(row, col) for row, columns in WALLS_BY_ROW.items() for col in columns}
+    assert len(single) == 132
+    assert set(maps.rooms("single").walls) == set(maps.rooms("unequal").walls) == single
+    assert set(maps.rooms("multiple").walls) == single - set(OPENINGS)
+    assert len(maps.rooms("multiple").walls) == 120
+    assert maps.rooms("none").walls == ()
+
+
+@pytest.mark.parametrize("entrances", ["single", "multiple", "none", "unequal"])
+def test_every_room_has_its_apples_its_agents_and_a_way_out(entrances):
+    board = maps.rooms(entrances)
+    assert (board.height, board.width, board.agents, len(board.sites)) == (19, 53, 12, 180)
+    assert len(reached(board, (9, 26))) == 19 * 53 - len(board.walls)
+    for rows in (range(7), range(12, 19)):
+        for columns in (range(24), range(29, 53)):
+            assert sum(row in rows and col in columns for row, col in board.sites) == 45
+            assert sum(row in rows and col in columns for row, col, _ in board.starts) == 3
+    assert not {start[:2] for start in board.starts} & set(board.sites)
+    assert maps.parse(board.drawing()).sites == board.sites
+
+
+def test_rooms_are_the_same_after_half_a_turn_but_for_the_unequal_one():
+    for entrances in ("single", "multiple", "none"):
+        board = maps.rooms(entrances)
+        for cells in (board.sites, board.walls, [start[:2] for start in board.starts]):
+            assert {(18 - row, 52 - col) for row, col in cells} == set(cells)
+
+
+def test_fewer_agents_are_spread_over_the_rooms():
+    starts = maps.rooms(agents=4).starts
+    assert {(row > 9, col > 26) for row, col, _ in starts} == set(itertools.product((False, True), repeat=2))
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        ({"entrances": "two"}, "entrances is 'two'; allowed: single, multiple, none, unequal"),
+        ({"agents": 0}, "agents is 0; allowed: 1 to 12"),
+        ({"agents": 13}, "agents is 13; allowed: 1 to 12"),
+    ],
+)
+def test_other_rooms_are_refused(arguments, message):
+    with pytest.raises(ValueError, match=message):
+        maps.rooms(**arguments)
+
+
+def test_crosses_are_centres_with_their_four_neighbours():
+    board = maps.crosses(height=4, width=6, centres=[(1, 1), (2, 2)], starts=[(3, 5, 3)], walls=[(0, 5)])
+    assert board.drawing() == ".A...#\nAAA...\n.AAA..\n..A..<"
+    with pytest.raises(ValueError, match="the site at row -1, column 3 lies outside"):
+        maps.crosses(height=4, width=6, centres=[(0, 3)], starts=[(3, 5, 3)])
+
+
+def test_a_random_board_has_the_size_density_and_agents_asked_for():
+    board = maps.random(20, 40, agents=12, density=246 / 800, clustering=0.7, seed=4)
+    assert (board.height, board.width, board.agents, len(board.sites)) == (20, 40, 12, 246)
+    assert not {start[:2] for start in board.starts} & set(board.sites)
+    assert board == maps.random(20, 40, agents=12, density=246 / 800, clustering=0.7, seed=4)
+    assert board != maps.random(20, 40, agents=12, density=246 / 800, clustering=0.7, seed=5)
+
+
+def test_more_clustering_puts_sites_closer_together():
+    def mean_neighbours(clustering):
+        board = maps.random(15, 31, agents=1, density=0.2, clustering=clustering, seed=1)
+        sites = set(board.sites)
+        return sum((r + 1, c) in sites or (r, c + 1) in sites for r, c in sites) / len(sites)
+
+    loose, middle, tight = map(mean_neighbours, (0, 0.6, 1))
+    assert loose < middle < tight
+    patch = maps.random(15, 31, agents=1, density=0.2, clustering=1, seed=1)
+    ground = set(itertools.product(range(15), range(31))) - set(patch.sites)
+    alone = Map(height=15, width=31, sites=patch.sites, starts=((*patch.sites[0], 0),), walls=tuple(ground))
+    assert reached(alone, patch.sites[0]) == set(patch.sites), "one patch"
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        ({"height": 0}, "height is 0; at least 1"),
+        ({"agents": 0}, "agents is 0; at least 1"),
+        ({"density": 0}, "density is 0; allowed: above 0, up to 1"),
+        ({"density": 1.5}, "density is 1.5"),
+        ({"clustering": -0.1}, "clustering is -0.1; allowed: 0 to 1"),
+        ({"density": 1}, "12 sites and 2 agents find no room on 12 cells"),
+    ],
+)
+def test_random_boards_that_cannot_be_are_refused(arguments, message):
+    with pytest.raises(ValueError, match=message):
+        maps.random(**{"height": 3, "width": 4, "agents": 2, "density": 0.5, **arguments})

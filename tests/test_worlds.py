@@ -11,11 +11,11 @@ from boards import random_actions
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from cprl import Game, Map, Rules, presets
+from cprl import Game, Map, Rules, maps, presets
 from cprl.commons import compiled, loops
 from cprl.commons.batch import Batch
 from cprl.commons.tables import neighbours
-from cprl.commons.world import empty_scratch
+from cprl.commons.world import COL_STEP, ROW_STEP, empty_scratch
 
 STAY = 7
 
@@ -72,9 +72,8 @@ def played(game, actions, *, seed=0, first_world=0, threads=1):
     return moments
 
 
-@settings(max_examples=60, deadline=None)
-@given(games(), st.integers(0, 2**32))
-def test_no_two_agents_in_play_share_a_cell_and_nobody_stands_in_a_wall(game, seed):
+def check_places(game, seed):
+    """No two agents in play share a cell, and nobody stands in a wall."""
     for worlds, _ in played(game, random_actions(40, 3, game, seed=seed), seed=seed):
         for b in range(3):
             places = [
@@ -87,11 +86,8 @@ def test_no_two_agents_in_play_share_a_cell_and_nobody_stands_in_a_wall(game, se
             assert all(0 <= r < game.map.height and 0 <= c < game.map.width for r, c in places)
 
 
-@settings(max_examples=60, deadline=None)
-@given(games(), st.integers(0, 2**32), st.randoms(use_true_random=False))
-def test_agents_numbers_do_not_matter(game, seed, random):
-    order = list(range(game.agents))
-    random.shuffle(order)
+def check_numbers_do_not_matter(game, seed, order):
+    """The same agents under other numbers play the same game."""
     renumbered = replace(game, map=replace(game.map, starts=tuple(game.map.starts[i] for i in order)))
     actions = random_actions(40, 2, game, seed=seed)
     once = played(game, actions, seed=seed)
@@ -105,10 +101,8 @@ def test_agents_numbers_do_not_matter(game, seed, random):
         assert np.array_equal(told.tagged_by[:, order][:, :, order], other_told.tagged_by)
 
 
-@settings(max_examples=60, deadline=None)
-@given(games(), st.booleans(), st.integers(0, 2**32))
-def test_apples_are_conserved_and_counted(game, regrow_before_bites, seed):
-    game = replace(game, rules=replace(game.rules, regrow_before_bites=regrow_before_bites))
+def check_apples(game, seed):
+    """Apples hang only on sites, stock + harvest = first stock + regrown, and neighbours are counted."""
     moments = played(game, random_actions(40, 3, game, seed=seed), seed=seed)
     sites = len(game.map.sites)
     near = neighbours(game.map, game.rules)
@@ -119,14 +113,13 @@ def test_apples_are_conserved_and_counted(game, regrow_before_bites, seed):
         regrown += told.regrown[:, 0]
         assert np.array_equal(told.stock[:, 0] + harvest, sites + regrown)
         assert np.array_equal(worlds.stock.sum(1), told.stock[:, 0])
+        assert np.array_equal(worlds.harvested.sum(1), harvest)
         counted = [[int(stock[list(others)].sum()) for others in near] for stock in worlds.stock]
         assert np.array_equal(worlds.near, counted)
 
 
-@settings(max_examples=60, deadline=None)
-@given(games(freeze_steps=3), st.booleans(), st.integers(0, 2**32))
-def test_nobody_out_of_play_acts(game, as_run, seed):
-    game = replace(game, rules=replace(game.rules, pairwise_clashes=as_run, freeze_counts_tag_turn=as_run))
+def check_nobody_out_of_play_acts(game, seed):
+    """Who is out stays where it is, bites nothing, fires at nobody and is hit by nobody."""
     actions = random_actions(40, 3, game, seed=seed)
     moments = played(game, actions, seed=seed)
     for (before, _), (after, told) in itertools.pairwise(moments):
@@ -139,21 +132,92 @@ def test_nobody_out_of_play_acts(game, as_run, seed):
         assert not told.hit_by.transpose(0, 2, 1)[out].any()
 
 
-@pytest.mark.parametrize("variant", presets.VARIANTS)
-@pytest.mark.parametrize("board", presets.BOARDS)
-def test_a_world_does_not_notice_its_neighbours_nor_the_threads(board, variant):
-    game = presets.game(board, variant=variant)
+def check_worlds_do_not_notice_each_other(game, seed):
+    """Each world plays alone, in a batch, and on two threads alike."""
     actions = random_actions(60, 9, game, seed=3)
-    together = played(game, actions, seed=5)
-    threaded = played(game, actions, seed=5, threads=2)
+    together = played(game, actions, seed=seed)
+    threaded = played(game, actions, seed=seed, threads=2)
     for b in (0, 4, 8):
-        alone = played(game, actions[:, b : b + 1].copy(), seed=5, first_world=b)
+        alone = played(game, actions[:, b : b + 1].copy(), seed=seed, first_world=b)
         for (worlds, told), (many, told_many), (both, told_both) in zip(
             alone, together, threaded, strict=True
         ):
             for one, others in ((worlds, (many, both)), (told, (told_many, told_both))):
                 for other in others:
                     assert_same(one, other, rows=0, other_rows=b)
+
+
+def check_nobody_shoots_through_walls(game, seed):
+    """Between a shooter and whom it hits no wall stands in the beam's column."""
+    walls = set(game.map.walls)
+    hits = 0
+    for worlds, told in played(game, random_actions(200, 3, game, seed=seed), seed=seed):
+        for b, target, shooter in np.argwhere(told.hit_by):
+            hits += 1
+            heading = worlds.heading[b, shooter]
+            here, there = ((worlds.row[b, i], worlds.col[b, i]) for i in (shooter, target))
+            ahead = (there[0] - here[0]) * ROW_STEP[heading] + (there[1] - here[1]) * COL_STEP[heading]
+            for away in range(ahead):
+                cell = there[0] - away * ROW_STEP[heading], there[1] - away * COL_STEP[heading]
+                assert cell not in walls
+    return hits
+
+
+@settings(max_examples=60, deadline=None)
+@given(games(), st.integers(0, 2**32))
+def test_no_two_agents_in_play_share_a_cell_and_nobody_stands_in_a_wall(game, seed):
+    check_places(game, seed)
+
+
+@settings(max_examples=60, deadline=None)
+@given(games(), st.integers(0, 2**32), st.randoms(use_true_random=False))
+def test_agents_numbers_do_not_matter(game, seed, random):
+    order = list(range(game.agents))
+    random.shuffle(order)
+    check_numbers_do_not_matter(game, seed, order)
+
+
+@settings(max_examples=60, deadline=None)
+@given(games(), st.booleans(), st.integers(0, 2**32))
+def test_apples_are_conserved_and_counted(game, regrow_before_bites, seed):
+    check_apples(replace(game, rules=replace(game.rules, regrow_before_bites=regrow_before_bites)), seed)
+
+
+@settings(max_examples=60, deadline=None)
+@given(games(freeze_steps=3), st.booleans(), st.integers(0, 2**32))
+def test_nobody_out_of_play_acts(game, as_run, seed):
+    rules = replace(game.rules, pairwise_clashes=as_run, freeze_counts_tag_turn=as_run)
+    check_nobody_out_of_play_acts(replace(game, rules=rules), seed)
+
+
+@settings(max_examples=60, deadline=None)
+@given(games(beam_width_cells=3), st.integers(0, 2**32))
+def test_nobody_shoots_through_walls(game, seed):
+    check_nobody_shoots_through_walls(game, seed)
+
+
+CROWDED = "A>#A.\n.v.<A\n#A.^#"
+"""Walls amid agents that often meet."""
+
+
+@pytest.mark.parametrize("sight", [False, True], ids=["open", "walls block sight"])
+@pytest.mark.parametrize("board", ["single", "multiple", "none", "unequal", "crowded"])
+def test_the_same_holds_on_the_boards_with_walls(board, sight):
+    drawn = maps.parse(CROWDED) if board == "crowded" else maps.rooms(board)
+    game = Game(map=drawn, rules=Rules(walls_block_sight=sight, regrow_prob=(0, 0.1, 0.3), freeze_steps=4))
+    check_places(game, 1)
+    check_numbers_do_not_matter(game, 2, list(np.random.default_rng(0).permutation(game.agents)))
+    check_apples(game, 3)
+    check_nobody_out_of_play_acts(game, 4)
+    check_worlds_do_not_notice_each_other(game, 5)
+    assert check_nobody_shoots_through_walls(game, 6) > (50 if board == "crowded" else 0)
+
+
+@pytest.mark.parametrize("variant", presets.VARIANTS)
+@pytest.mark.parametrize("board", presets.BOARDS)
+def test_a_world_does_not_notice_its_neighbours_nor_the_threads(board, variant):
+    game = presets.game(board, variant=variant)
+    check_worlds_do_not_notice_each_other(game, 5)
 
 
 def test_another_seed_world_or_episode_is_another_game():

@@ -101,5 +101,5 @@ def _cache_folder() -> Path:
 
 def _fingerprint() -> str:
     """A name for this text of the rules."""
-    sources = sorted(path for path in Path(__file__).parent.glob("*.py"))
+    sources = sorted(path for path in Path(__file__).parent.rglob("*.py"))
     return hashlib.sha256(b"".join(path.read_bytes() for path in sources)).hexdigest()[:16]

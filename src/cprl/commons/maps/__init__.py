@@ -1,0 +1,19 @@
+"""Boards: drawn (`parse`), by name (`named`), or made by rule (`crosses`, `rooms`, `random`)."""
+
+from cprl.commons.maps.board import HEADING_OF_SIGN, SIGN_OF_HEADING, Cell, Map, Start
+from cprl.commons.maps.drawings import NAMES, named, parse
+from cprl.commons.maps.generators import crosses, random, rooms
+
+__all__ = [
+    "HEADING_OF_SIGN",
+    "NAMES",
+    "SIGN_OF_HEADING",
+    "Cell",
+    "Map",
+    "Start",
+    "crosses",
+    "named",
+    "parse",
+    "random",
+    "rooms",
+]
