@@ -5,7 +5,7 @@ TORCH_INDEX ?=
 BIN := .venv/bin
 INSTALLED := .venv/.installed
 
-.PHONY: run test test-slow check bench clean
+.PHONY: run test test-slow test-gpu check bench bench-gpu clean
 
 run: $(INSTALLED)
 	$(BIN)/python recipes/single_basic.py --schedule short --watch serve
@@ -24,6 +24,14 @@ check: $(INSTALLED)
 
 bench: $(INSTALLED)
 	$(BIN)/python benchmarks/env_steps.py
+	$(BIN)/python benchmarks/observation_forms.py
+
+# With a GPU: first `.venv/bin/pip install -c constraints.txt -e ".[cuda13]"`, or cuda12, as torch has it.
+test-gpu: $(INSTALLED)
+	$(BIN)/python -m pytest -m gpu
+
+bench-gpu: $(INSTALLED)
+	$(BIN)/python benchmarks/gpu_steps.py
 
 $(INSTALLED): pyproject.toml constraints.txt
 	$(PYTHON) -c "import sys; sys.version_info >= (3, 11) or sys.exit('cprl needs Python 3.11 or newer, this is ' + sys.version.split()[0] + '; try: make PYTHON=python3.12 ...')"

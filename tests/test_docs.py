@@ -44,5 +44,9 @@ def test_python_in_the_docs_runs(code, tmp_path, monkeypatch):
 
 def test_links_between_pages_lead_somewhere():
     for page in PAGES:
-        for target in re.findall(r"\]\(([^)#:]+)\)", page.read_text()):
-            assert (page.parent / target).exists(), f"{page.name} links to {target}"
+        for target, heading in re.findall(r"\]\(([^)#:]+)#?([^):]*)\)", page.read_text()):
+            path = page.parent / target
+            assert path.exists(), f"{page.name} links to {target}"
+            if heading:
+                headings = re.findall(r"^#+ (.*)$", path.read_text(), re.MULTILINE)
+                assert heading in [text.lower().replace(" ", "-") for text in headings], (page.name, heading)

@@ -11,7 +11,7 @@ from cprl.commons.colours import FIRST_AGENT, GROUND, WALL, class_colour
 from cprl.commons.maps import Map
 from cprl.commons.observation import Observation, classes_shown
 from cprl.commons.rules import Norm, Rules
-from cprl.commons.world import COL_STEP, DOWN, LEFT, RIGHT, ROW_STEP, UP, Bools, Indices, Ints
+from cprl.commons.world import COL_STEP, ROW_STEP, Bools, Indices, Ints
 
 CLASS_SHIFT: Final = 24
 """A paint is a colour and, from this bit on, its class."""
@@ -51,10 +51,9 @@ class Tables(NamedTuple):
     window_cells: Ints
     """[4, X * Y], from an agent's cell to each cell of its window, by heading; under "full" the cells of
     the board themselves."""
-    sight_first: Ints
-    """[X * Y + 1], where the cells between an agent and each cell of its window begin in `sight_cells`."""
-    sight_cells: Ints
-    """[4, cells between], from an agent's cell to each cell in between, by heading."""
+    in_sight: Bools
+    """bool [cells, 4, X * Y], whether no wall lies between a cell and each cell of the window of an agent
+    there, by heading; [1, 1, 1] where walls do not block sight."""
     rim: int
     """Cells of wall around the board, enough for any window and beam."""
     stride: int
@@ -105,16 +104,28 @@ def neighbours(board: Map, rules: Rules) -> list[list[int]]:
     ]
 
 
-def _window_cells(rules: Rules, stride: int) -> Ints:
-    """[4, X * Y]: farthest row first, left column first, as seen by an agent with each heading."""
-    ahead = np.arange(rules.window_rows - 1, -1, -1)[:, None]
-    side = np.arange(rules.window_columns)[None, :] - rules.window_columns // 2
-    by_heading = [
-        ahead * (ROW_STEP[h] * stride + COL_STEP[h])
-        + side * (ROW_STEP[(h + 1) % 4] * stride + COL_STEP[(h + 1) % 4])
-        for h in (UP, RIGHT, DOWN, LEFT)
+def _window_places(rules: Rules) -> list[tuple[int, int]]:
+    """(ahead, side) of each cell of a window: farthest row first, left column first."""
+    middle = rules.window_columns // 2
+    return [
+        (ahead, side) for ahead in range(rules.window_rows - 1, -1, -1) for side in range(-middle, middle + 1)
     ]
-    return np.array(by_heading, np.int32).reshape(4, -1)
+
+
+def _offset(ahead: int, side: int, heading: int, stride: int) -> int:
+    """From an agent's cell to the one so far ahead and so far to the right."""
+    right = (heading + 1) % 4
+    rows = ahead * ROW_STEP[heading] + side * ROW_STEP[right]
+    cols = ahead * COL_STEP[heading] + side * COL_STEP[right]
+    return rows * stride + cols
+
+
+def _window_cells(rules: Rules, stride: int) -> Ints:
+    """[4, X * Y], as seen by an agent with each heading."""
+    places = _window_places(rules)
+    return np.array(
+        [[_offset(*place, heading, stride) for place in places] for heading in range(4)], np.int32
+    )
 
 
 def _paint(kind: int) -> int:
@@ -149,21 +160,18 @@ def cells_between(rows: int, cols: int) -> list[tuple[int, int]]:
     ]
 
 
-def _sight(rules: Rules, stride: int) -> tuple[Ints, Ints]:
-    """`sight_first` and `sight_cells`; nothing is in between where walls do not block sight."""
-    middle = rules.window_columns // 2
-    places = [
-        (ahead, side) for ahead in range(rules.window_rows - 1, -1, -1) for side in range(-middle, middle + 1)
-    ]
-    between = [cells_between(*place) if rules.walls_block_sight else [] for place in places]
-    first = np.cumsum([0, *map(len, between)], dtype=np.int32)
-    cells = np.array([cell for crossed in between for cell in crossed], np.int32).reshape(-1, 2)
-    by_heading = [
-        cells[:, 0] * (ROW_STEP[h] * stride + COL_STEP[h])
-        + cells[:, 1] * (ROW_STEP[(h + 1) % 4] * stride + COL_STEP[(h + 1) % 4])
-        for h in (UP, RIGHT, DOWN, LEFT)
-    ]
-    return first, np.array(by_heading, np.int32).reshape(4, -1)
+def _in_sight(board: Map, rules: Rules, walls: Bools, rim: int, stride: int) -> Bools:
+    """`Tables.in_sight`; `walls`: bool [cells]."""
+    if not rules.walls_block_sight:
+        return np.ones((1, 1, 1), np.bool_)
+    places = _window_places(rules)
+    inside = _board_cells(board, rim, stride)[0]
+    seen = np.zeros((walls.size, 4, len(places)), np.bool_)
+    for heading in range(4):
+        for n, place in enumerate(places):
+            crossed = [_offset(*cell, heading, stride) for cell in cells_between(*place)]
+            seen[inside, heading, n] = ~walls[np.add.outer(inside, np.array(crossed, np.int64))].any(1)
+    return seen
 
 
 def build_tables(board: Map, rules: Rules, observation: Observation) -> Tables:
@@ -182,7 +190,6 @@ def build_tables(board: Map, rules: Rules, observation: Observation) -> Tables:
     paints = np.array(list(map(_paint, classes)), np.int32)
     channel_of = np.full(len(classes), -1, np.int32)
     channel_of[list(shown)] = range(len(shown))
-    first_between, between = _sight(rules, stride)
     background = np.full((board.height + 2 * rim, stride), paints[WALL], np.int32)
     background[rim:-rim, rim:-rim] = paints[GROUND]
     background.reshape(-1)[cells(board.walls)] = paints[WALL]
@@ -212,8 +219,7 @@ def build_tables(board: Map, rules: Rules, observation: Observation) -> Tables:
         paints=paints,
         channel_of=channel_of,
         window_cells=_board_cells(board, rim, stride) if sees_all else _window_cells(rules, stride),
-        sight_first=first_between,
-        sight_cells=between,
+        in_sight=_in_sight(board, rules, background.reshape(-1) == paints[WALL], rim, stride),
         rim=rim,
         stride=stride,
         beam_half_width=half_width,

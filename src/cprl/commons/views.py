@@ -94,14 +94,6 @@ def paint(world: Worlds, tables: Tables, picture: Ints) -> None:
         paint_agents(world, tables, picture)
 
 
-def is_in_sight(tables: Tables, own: int, heading: int, n: int) -> bool:
-    """Whether no wall lies between an agent's own cell and cell n of its window."""
-    for at in range(tables.sight_first[n], tables.sight_first[n + 1]):
-        if tables.background[own + tables.sight_cells[heading, at]] == tables.paints[WALL]:
-            return False
-    return True
-
-
 def look(world: Worlds, tables: Tables, i: int, scratch: Scratch) -> None:
     """The paints that agent i sees into `scratch.seen`, farthest row first, left column first."""
     heading = world.heading[i]
@@ -111,7 +103,7 @@ def look(world: Worlds, tables: Tables, i: int, scratch: Scratch) -> None:
         scratch.seen[n] = scratch.picture[np.uint64(own + to_cell[n])]
     if tables.walls_block_sight:
         for n in range(to_cell.shape[0]):
-            if not is_in_sight(tables, own, heading, n):
+            if not tables.in_sight[own, heading, n]:
                 scratch.seen[n] = tables.paints[HIDDEN]
 
 
@@ -125,10 +117,11 @@ def cut_window(world: Worlds, tables: Tables, i: int, scratch: Scratch, window: 
     cells = tables.window_cells.shape[1]
     planes = window.reshape(-1)
     if tables.one_hot:
-        for at in range(planes.shape[0]):
-            planes[at] = 0
         for n in range(cells):
-            planes[tables.channel_of[class_of(scratch.seen[n])] * cells + n] = 1
+            scratch.seen[n] = tables.channel_of[class_of(scratch.seen[n])]
+        for channel in range(window.shape[0]):
+            for n in range(cells):
+                planes[channel * cells + n] = scratch.seen[n] == channel
     else:
         for n in range(cells):
             paint = scratch.seen[n]
@@ -168,7 +161,6 @@ FUNCTIONS = (
     paint_agents,
     paint_agents_over,
     paint,
-    is_in_sight,
     look,
     cut_window,
     draw_windows,

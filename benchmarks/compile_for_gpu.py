@@ -1,0 +1,80 @@
+"""Compiles the rules for a GPU where there is none: to PTX by numba-cuda, and to machine code by ptxas.
+
+Proves that the kernels compile, not that they are right (`tests/test_cuda.py`) or fast (`gpu_steps.py`).
+
+    .venv/bin/pip install -c constraints.txt -e ".[cuda12]"
+    .venv/bin/python benchmarks/compile_for_gpu.py
+"""
+
+import re
+import subprocess
+import sys
+import tempfile
+from importlib.metadata import files
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import tyro
+from numba import typeof
+from numba.cuda import compile_ptx, dispatcher
+
+from cprl import Game, presets
+from cprl.commons.cuda import kernels
+from cprl.commons.game import told_shapes
+from cprl.commons.world import Scratch, Told, Worlds, empty_scratch, empty_worlds
+
+
+def arguments(game: Game, worlds: int = 4) -> dict[str, tuple[Any, ...]]:
+    """Arguments of each kernel with the types and layouts that `CudaThreads` gives them."""
+    agents, sites, tables = game.agents, len(game.map.sites), game.tables
+    state = empty_worlds(worlds=worlds, agents=agents, sites=sites)
+    window = tables.window_cells.shape[1]
+    sheet = empty_scratch(agents=agents, sites=sites, cells=tables.background.size, window=window)
+    scratch = Scratch(*(np.zeros((worlds, *each.shape), each.dtype, order="F") for each in sheet))
+    told = Told(**{name: np.zeros(*form) for name, form in told_shapes(game, worlds).items()})
+    actions, marks = np.zeros((worlds, agents), np.int64), np.zeros(worlds, np.bool_)
+    boards = np.zeros((worlds, game.map.height, game.map.width), np.uint8)
+    on_gpu = Worlds(*map(np.asfortranarray, state))
+    loops = {"play_worlds": actions, "begin_worlds": marks, "look_at_worlds": marks, "show_worlds": boards}
+    return {
+        **{name: (on_gpu, tables, what, told, scratch) for name, what in loops.items()},
+        "find_unknown": (actions, len(game.actions), np.zeros(1, np.int64)),
+    }
+
+
+def ptxas() -> Path | None:
+    """NVIDIA's assembler, as the extra `cuda12` brings it."""
+    found = [path for path in files("nvidia-cuda-nvcc-cu12") or () if path.name == "ptxas"]
+    return Path(str(found[0].locate())) if found else None
+
+
+def main(*, capability: tuple[int, int] = (9, 0)) -> None:
+    """Prints a line for each kernel.
+
+    Args:
+        capability: of the GPU to compile for, (9, 0) for an H100 or H200.
+    """
+    gpu = SimpleNamespace(compute_capability=capability)
+    dispatcher.get_current_device = lambda: gpu  # asks the driver otherwise, and there is none
+    assembler = ptxas()
+    for name, given in arguments(presets.game("commons")).items():
+        ptx, _ = compile_ptx(kernels()[name].py_func, tuple(map(typeof, given)), cc=capability)
+        line = f"{name}: {len(ptx):,} characters of PTX"
+        if assembler:
+            with tempfile.TemporaryDirectory() as folder:
+                source = Path(folder) / "kernel.ptx"
+                source.write_text(ptx)
+                command = [assembler, "-c", "-v", f"-arch=sm_{capability[0]}{capability[1]}", source]
+                done = subprocess.run([*command, "-o", f"{source}.o"], capture_output=True, text=True)
+            if done.returncode:
+                sys.exit(f"{name}: {done.stderr}")
+            line += ", " + ", ".join(
+                re.findall(r"Used \d+ registers|\d+ bytes (?:stack frame|spill \w+)", done.stderr)[-4:]
+            )
+        print(line)
+
+
+if __name__ == "__main__":
+    tyro.cli(main)
