@@ -3,7 +3,6 @@
 from collections.abc import Sequence
 from math import prod
 
-import torch
 from torch import Tensor, nn
 from torchrl.modules import MLP
 
@@ -31,7 +30,7 @@ class QNetwork(nn.Module):
         glorot_uniform: bool = False,
     ) -> None:
         super().__init__()
-        self.highest = highest
+        self.highest, self.relu_on_outputs = highest, relu_on_outputs
         self.observation_dims = len(observation_shape)
         self.layers = MLP(
             in_features=prod(observation_shape),
@@ -43,9 +42,14 @@ class QNetwork(nn.Module):
         if glorot_uniform:
             self.apply(_glorot_uniform)
 
+    @property
+    def linears(self) -> list[nn.Linear]:
+        """The layers with weights, first to last."""
+        return [layer for layer in self.layers if isinstance(layer, nn.Linear)]
+
     def forward(self, observation: Tensor) -> Tensor:
-        """uint8 [..., C, X, Y] to float32 [..., A]."""
-        seen = observation.flatten(-self.observation_dims).to(torch.float32) / self.highest
+        """uint8 [..., C, X, Y] to [..., A], in the parameters' type."""
+        seen = observation.flatten(-self.observation_dims).to(self.linears[0].weight.dtype) / self.highest
         return self.layers(seen)  # type: ignore[no-any-return]
 
 

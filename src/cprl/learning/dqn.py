@@ -5,7 +5,9 @@ from functools import partial
 
 import torch
 from tensordict import TensorDictBase
+from torch import nn
 from torchrl.data import LazyTensorStorage, TensorDictReplayBuffer
+from torchrl.modules import QValueActor
 from torchrl.objectives import DQNLoss, HardUpdate, ValueEstimators
 
 from cprl.acting.actors import QActor
@@ -87,6 +89,19 @@ class DQNLearner:
     def end_episode(self) -> None:
         """Counts an episode; the target network is replaced after every so many."""
         self._target.step()
+
+
+def dqn_loss(network: nn.Module, *, gamma: float) -> DQNLoss:
+    """TorchRL's `DQNLoss` of one agent with a target network, squared error and one-step targets.
+
+    Args:
+        network: from "observation" to the value of each action; a `LaneQNetwork` makes it that of many.
+        gamma: discount per step.
+    """
+    actor = QValueActor(network, spec=None, action_space="categorical")
+    loss = DQNLoss(actor, delay_value=True, loss_function="l2", action_space="categorical")
+    loss.make_value_estimator(ValueEstimators.TD0, gamma=gamma)
+    return loss
 
 
 def _network(

@@ -1,0 +1,108 @@
+"""One update of many independent DQN agents, in microseconds: gather, loss, backward, Adam.
+
+One thread, batch 8, window 7 x 15 x 3, two hidden layers of 32 and 8 actions; replay buffers of 4096
+transitions for each lane, filled beforehand. All ways in one run, the best of several repeats; each way
+compiles first, which takes a quarter of a minute where nothing is in torch's cache.
+
+    make bench
+"""
+
+import time
+from collections.abc import Callable, Sequence
+from functools import partial
+
+import torch
+import tyro
+from rich.console import Console
+from rich.table import Table
+from torchrl.data.replay_buffers import ReplayBuffer
+
+from cprl.acting import QNetwork
+from cprl.learning.dqn import dqn_loss
+from cprl.learning.replay import lane_buffer
+from cprl.learning.updates import FunctionalUpdate, ListUpdate, Update
+
+SHAPE, ACTIONS, BATCH, TRANSITIONS = (3, 7, 15), 8, 8, 4096
+
+WAYS: dict[str, Callable[..., Update]] = {
+    "list of TorchRL losses": ListUpdate,
+    "vmapped, compiled": partial(FunctionalUpdate, lane_axis=False),
+    "lane axis, not compiled": partial(FunctionalUpdate, lane_axis=True, compile=False),
+    "lane axis, compiled": partial(FunctionalUpdate, lane_axis=True),
+}
+MEASURED_BEFORE = {  # on such a machine, before this library was begun
+    "list of TorchRL losses": (1388, 5292, 21_811, 89_852),
+    "vmapped, compiled": (113, 285, 1008, 3361),
+    "lane axis, compiled": (86, 166, 459, 1471),
+    "a C++ kernel for this network alone": (21, 67, 316, 1246),
+}
+LANES = (1, 4, 16, 64)
+
+
+def filled(lanes: int) -> ReplayBuffer:
+    """A full buffer of noise."""
+    buffer = lane_buffer(
+        seeds=[(0, lane) for lane in range(lanes)],
+        transitions=TRANSITIONS,
+        batch_size=BATCH,
+        observation_shape=SHAPE,
+    )
+    state = buffer.storage.state_dict()
+    state["observation"].random_(0, 256)
+    state["action"] = torch.randint(ACTIONS, (TRANSITIONS, lanes))
+    state["reward"] = torch.rand(TRANSITIONS, lanes)
+    state["done"] = state["terminated"] = torch.rand(TRANSITIONS, lanes) < 0.001
+    state["row"] = torch.arange(TRANSITIONS)[:, None].repeat(1, lanes)
+    state["next_row"] = torch.full((lanes,), TRANSITIONS)
+    buffer.storage.load_state_dict({**state, "written": TRANSITIONS})
+    return buffer
+
+
+def update_us(make: Callable[..., Update], lanes: int, repeats: int) -> float:
+    """Microseconds of one update of all lanes, the best of several repeats."""
+    torch.manual_seed(0)
+    networks = [QNetwork(SHAPE, ACTIONS) for _ in range(lanes)]
+    update = make(networks, partial(dqn_loss, gamma=0.995), learning_rate=1e-5)
+    buffer, best = filled(lanes), float("inf")
+    for _ in range(20):
+        update.learn(buffer)
+    for _ in range(repeats):
+        turns, started = 0, time.perf_counter()
+        while time.perf_counter() - started < 0.3:
+            update.learn(buffer)
+            turns += 1
+        best = min(best, (time.perf_counter() - started) / turns)
+    return best * 1e6
+
+
+def add_rows(table: Table, rows: dict[str, Sequence[float]]) -> None:
+    """A row for each way: microseconds and, in brackets, how many times as fast as the list."""
+    reference = rows["list of TorchRL losses"]
+    for name, row in rows.items():
+        cells = (f"{us:,.0f} ({base / us:.0f}x)" for us, base in zip(row, reference, strict=True))
+        table.add_row(name, *cells)
+
+
+def main(*, lanes: tuple[int, ...] = LANES, repeats: int = 5) -> None:
+    """Prints the table.
+
+    Args:
+        lanes: how many agents learn at once.
+        repeats: of which the best counts.
+    """
+    rows = {name: [update_us(make, count, repeats) for count in lanes] for name, make in WAYS.items()}
+    table = Table("microseconds an update", title="one update of so many lanes, one thread")
+    for count in lanes:
+        table.add_column(f"{count}", justify="right", no_wrap=True)
+    add_rows(table, rows)
+    if lanes == LANES:
+        table.add_section()
+        table.add_row("measured before this library:")
+        add_rows(table, MEASURED_BEFORE)
+    Console().print(table)
+
+
+if __name__ == "__main__":
+    torch.set_num_threads(1)
+    torch.set_flush_denormal(True)
+    tyro.cli(main)

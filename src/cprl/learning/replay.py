@@ -1,0 +1,302 @@
+"""The replay buffer of many lanes: TorchRL's `ReplayBuffer` on a storage that keeps each window once.
+
+A lane is one agent of one replica. All lanes take a step together, so a transition is a row [L]; each lane
+draws its own sample. The window that follows a transition is the one with which the next begins, and is
+kept once; only where an episode ends it takes a place of its own.
+"""
+
+from collections.abc import Mapping, Sequence
+from math import prod
+from typing import Any, Final
+
+import numpy as np
+import torch
+from tensordict import TensorDict, TensorDictBase
+from torch import Tensor
+from torchrl.data.replay_buffers import ReplayBuffer, RoundRobinWriter, Sampler, Storage
+
+ENDS_PER_TRANSITION: Final = 0.02
+"""Room for the last windows of episodes, beside that for transitions: one in fifty. Where episodes are
+shorter than that, fewer transitions are kept; none is ever wrong."""
+
+DRAWS_AHEAD: Final = 1024
+"""Updates for which a lane draws its sample numbers at once."""
+
+Fields = dict[str, Tensor]
+
+
+def storage_bytes(
+    lanes: int, transitions: int, observation_shape: Sequence[int], *, item_bytes: int = 1
+) -> int:
+    """Bytes that `LaneStorage` allocates.
+
+    Args:
+        lanes: L.
+        transitions: kept for each lane, T.
+        observation_shape: (C, X, Y).
+        item_bytes: of one number of an observation.
+    """
+    windows = _rows(transitions) * prod(observation_shape) * item_bytes
+    return lanes * (windows + transitions * (8 + 4 + 8 + 1 + 1))
+
+
+def _rows(transitions: int) -> int:
+    return transitions + max(8, round(transitions * ENDS_PER_TRANSITION)) + 2
+
+
+class LaneStorage(Storage):
+    """Room for T transitions of each of L lanes.
+
+    Args:
+        lanes: L.
+        transitions: T.
+        observation_shape: (C, X, Y).
+        dtype: of observations.
+        device: where it lies.
+
+    What it is given and gives out are TensorDicts of the default keys: "observation", "action" and "next"
+    with "observation", "reward", "done" and "terminated"; [L] or [1, L] a step, [L, b] a sample.
+    """
+
+    def __init__(
+        self,
+        *,
+        lanes: int,
+        transitions: int,
+        observation_shape: Sequence[int],
+        dtype: torch.dtype = torch.uint8,
+        device: str | torch.device = "cpu",
+    ) -> None:
+        super().__init__(transitions)
+        self.lanes, self.rows, self.device = lanes, _rows(transitions), torch.device(device)
+        self.shape_of_observation = tuple(observation_shape)
+
+        def room(*shape: int, kind: torch.dtype) -> Tensor:
+            return torch.zeros(shape, dtype=kind, device=self.device)
+
+        self.fields: Fields = {
+            "observation": room(lanes * self.rows, *observation_shape, kind=dtype),
+            "action": room(transitions, lanes, kind=torch.int64),
+            "reward": room(transitions, lanes, kind=torch.float32),
+            "done": room(transitions, lanes, kind=torch.bool),
+            "terminated": room(transitions, lanes, kind=torch.bool),
+            "row": room(transitions, lanes, kind=torch.int64),
+        }
+        """Windows [L x rows, ...], the rest [T, L]; `row` counts the windows that a lane has written."""
+        self._lane = torch.arange(lanes, device=self.device)
+        self._next_row = room(lanes, kind=torch.int64)
+        self._begins = torch.ones(lanes, dtype=torch.bool, device=self.device)
+        self._oldest = room(lanes, kind=torch.int64)
+        self._written = 0
+
+    def __len__(self) -> int:
+        """Transitions of the lane that holds most."""
+        return min(self._written, int(self.max_size))
+
+    def valid(self) -> tuple[Tensor, int]:
+        """The number of each lane's oldest transition that is still whole, int64 [L], and of the next one."""
+        return self._oldest, self._written
+
+    def set(self, cursor: Any, data: TensorDictBase, *, set_cursor: bool = True) -> None:
+        """Writes the next transition of every lane; `cursor` is its place in the ring."""
+        place = int(cursor[0] if isinstance(cursor, Sequence | Tensor) else cursor)
+        if place != self._written % self.max_size:
+            raise ValueError(f"the cursor is {place}; the next place is {self._written % self.max_size}")
+        self.write(data.reshape(self.lanes))
+
+    def write(self, data: TensorDictBase) -> None:
+        """Writes the next transition of every lane, [L]."""
+        following, fields, place = data.get("next"), self.fields, self._written % self.max_size
+        windows = fields["observation"]
+        base = self._lane * self.rows
+        if self._begins.any():
+            first = self._begins.nonzero().flatten()
+            windows[base[first] + self._next_row[first] % self.rows] = data.get("observation")[first]
+        row = self._next_row
+        windows[base + (row + 1) % self.rows] = following.get("observation")
+        done = following.get("done").reshape(-1)
+        fields["action"][place] = data.get("action")
+        fields["reward"][place] = following.get("reward").reshape(-1)
+        fields["done"][place] = done
+        fields["terminated"][place] = following.get("terminated").reshape(-1)
+        fields["row"][place] = row
+        self._next_row = row + 1 + done
+        self._begins = done.clone()
+        self._written += 1
+        self._forget()
+
+    def _forget(self) -> None:
+        """Transitions whose windows or places have been written over are no longer drawn."""
+        self._oldest.clamp_(min=self._written - self.max_size)
+        for _ in range(2):  # a step takes two windows at most
+            place = self._oldest % self.max_size
+            lost = self.fields["row"][place, self._lane] <= self._next_row - self.rows
+            self._oldest += lost & (self._oldest < self._written)
+
+    def get(self, index: Tensor) -> TensorDict:
+        """The transitions at places [L, b] of the ring."""
+        return gather(self.fields, index, self.rows)
+
+    def state_dict(self) -> dict[str, Any]:
+        """Everything that it holds, as far as it was written."""
+        kept = len(self)
+        fields = {name: array[:kept].clone() for name, array in self.fields.items() if name != "observation"}
+        return {
+            "observation": self.fields["observation"].clone(),
+            **fields,
+            "next_row": self._next_row.clone(),
+            "begins": self._begins.clone(),
+            "oldest": self._oldest.clone(),
+            "written": self._written,
+        }
+
+    def load_state_dict(self, state_dict: Mapping[str, Any]) -> None:
+        """Goes on where the storage of that state was, which had the same sizes."""
+        wanted = self.fields["observation"].shape
+        if state_dict["observation"].shape != wanted:
+            raise ValueError(
+                f"the state's windows are {list(state_dict['observation'].shape)}; {list(wanted)} is wanted"
+            )
+        for name, array in self.fields.items():
+            array[: len(state_dict[name])] = state_dict[name]
+        self._next_row, self._begins = state_dict["next_row"].clone(), state_dict["begins"].clone()
+        self._oldest, self._written = state_dict["oldest"].clone(), int(state_dict["written"])
+
+    def _empty(self) -> None:
+        self._next_row.zero_()
+        self._begins.fill_(True)
+        self._oldest.zero_()
+        self._written = 0
+
+
+def gather(fields: Fields, index: Tensor, rows: int) -> TensorDict:
+    """Transitions at places [L, b] of a `LaneStorage`, as TorchRL's losses read them; changes nothing."""
+    lanes, size = index.shape
+    lane = torch.arange(lanes, device=index.device)[:, None]
+    row = fields["row"][index, lane]
+    windows = fields["observation"]
+    shape = lanes, size, *windows.shape[1:]
+
+    def seen(at: Tensor) -> Tensor:
+        return windows.index_select(0, (lane * rows + at % rows).reshape(-1)).reshape(shape)
+
+    def field(name: str) -> Tensor:
+        return fields[name][index, lane].unsqueeze(-1)
+
+    following = TensorDict(
+        {
+            "observation": seen(row + 1),
+            "reward": field("reward"),
+            "done": field("done"),
+            "terminated": field("terminated"),
+        },
+        [lanes, size],
+    )
+    return TensorDict(
+        {"observation": seen(row), "action": fields["action"][index, lane], "next": following}, [lanes, size]
+    )
+
+
+class LaneSampler(Sampler):
+    """Each lane draws uniformly among its own transitions, by random numbers of its own.
+
+    Args:
+        seeds: of each lane, e.g. (seed, replica, agent): what a lane draws follows from them alone.
+        batch_size: b.
+    """
+
+    def __init__(self, seeds: Sequence[Sequence[int]], batch_size: int) -> None:
+        self.batch_size = batch_size
+        self._chance = [np.random.Generator(np.random.Philox(np.random.SeedSequence(seed))) for seed in seeds]
+        self._numbers = torch.empty((0, len(seeds), batch_size), dtype=torch.float64)
+        self._used = 0
+
+    def sample(self, storage: LaneStorage, batch_size: int) -> tuple[Tensor, dict[str, Any]]:
+        """Places in the ring, int64 [L, b]."""
+        if batch_size != self.batch_size:
+            raise ValueError(f"batch_size is {batch_size}; this sampler draws {self.batch_size}")
+        return self.draw(storage), {}
+
+    def draw(self, storage: LaneStorage) -> Tensor:
+        """Places in the ring, int64 [L, b]."""
+        if self._used == len(self._numbers):
+            ahead = [chance.random((DRAWS_AHEAD, self.batch_size)) for chance in self._chance]
+            self._numbers, self._used = torch.from_numpy(np.stack(ahead, 1)), 0
+        numbers = self._numbers[self._used]
+        self._used += 1
+        oldest, written = storage.valid()
+        kept = (written - oldest)[:, None]
+        drawn = oldest[:, None] + (numbers.to(oldest.device) * kept).long()
+        return drawn % int(storage.max_size)
+
+    def state_dict(self) -> dict[str, Any]:
+        """Where each lane's random numbers stand."""
+        return {
+            "chance": [chance.bit_generator.state for chance in self._chance],
+            "numbers": self._numbers.clone(),
+            "used": self._used,
+        }
+
+    def load_state_dict(self, state_dict: Mapping[str, Any]) -> None:
+        """Goes on where the sampler of that state was."""
+        for chance, state in zip(self._chance, state_dict["chance"], strict=True):
+            chance.bit_generator.state = state
+        self._numbers, self._used = state_dict["numbers"].clone(), int(state_dict["used"])
+
+    def _empty(self) -> None:
+        """Nothing is kept of what was sampled."""
+
+    def dumps(self, path: Any) -> None:
+        """Writes `state_dict`."""
+        torch.save(self.state_dict(), path)
+
+    def loads(self, path: Any) -> None:
+        """Reads what `dumps` wrote."""
+        self.load_state_dict(torch.load(path, weights_only=True))
+
+
+def lane_buffer(
+    *,
+    seeds: Sequence[Sequence[int]],
+    transitions: int,
+    batch_size: int,
+    observation_shape: Sequence[int],
+    device: str | torch.device = "cpu",
+) -> ReplayBuffer:
+    """TorchRL's replay buffer over `LaneStorage` and `LaneSampler`.
+
+    Args:
+        seeds: of each lane's sampling; as many as there are lanes.
+        transitions: kept for each lane.
+        batch_size: drawn for each lane.
+        observation_shape: (C, X, Y).
+        device: where it lies.
+
+    Raises:
+        MemoryError: where the machine has less memory than it takes, before anything is allocated.
+    """
+    wanted = storage_bytes(len(seeds), transitions, observation_shape)
+    there = _free_bytes(torch.device(device))
+    if wanted > there:
+        raise MemoryError(
+            f"the replay buffers of {len(seeds)} lanes x {transitions:,} transitions take "
+            f"{wanted / 2**30:.2f} GiB; {there / 2**30:.2f} GiB are free: lower buffer_size or replicas"
+        )
+    storage = LaneStorage(
+        lanes=len(seeds), transitions=transitions, observation_shape=observation_shape, device=device
+    )
+    return ReplayBuffer(
+        storage=storage,
+        sampler=LaneSampler(seeds, batch_size),
+        writer=RoundRobinWriter(),
+        batch_size=batch_size,
+        collate_fn=lambda batch: batch,
+    )
+
+
+def _free_bytes(device: torch.device) -> int:
+    if device.type == "cuda":
+        return int(torch.cuda.mem_get_info(device)[0])
+    import psutil
+
+    return int(psutil.virtual_memory().available)
