@@ -1,15 +1,18 @@
 """One update of many independent DQN agents, in microseconds: gather, loss, backward, Adam.
 
 One thread, batch 8, window 7 x 15 x 3, two hidden layers of 32 and 8 actions; replay buffers of 4096
-transitions for each lane, filled beforehand. All ways in one run, the best of several repeats; each way
-compiles first, which takes a quarter of a minute where nothing is in torch's cache.
+transitions for each lane, filled beforehand. All ways in one run, each in a process of its own, as a
+training is, the best of several repeats; each way compiles first, a quarter of a minute where nothing is in
+torch's cache.
 
     make bench
 """
 
 import time
 from collections.abc import Callable, Sequence
+from concurrent.futures import ProcessPoolExecutor
 from functools import partial
+from multiprocessing import get_context
 
 import torch
 import tyro
@@ -58,11 +61,13 @@ def filled(lanes: int) -> ReplayBuffer:
     return buffer
 
 
-def update_us(make: Callable[..., Update], lanes: int, repeats: int) -> float:
+def update_us(way: str, lanes: int, repeats: int) -> float:
     """Microseconds of one update of all lanes, the best of several repeats."""
+    torch.set_num_threads(1)
+    torch.set_flush_denormal(True)
     torch.manual_seed(0)
     networks = [QNetwork(SHAPE, ACTIONS) for _ in range(lanes)]
-    update = make(networks, partial(dqn_loss, gamma=0.995), learning_rate=1e-5)
+    update = WAYS[way](networks, partial(dqn_loss, gamma=0.995), learning_rate=1e-5)
     buffer, best = filled(lanes), float("inf")
     for _ in range(20):
         update.learn(buffer)
@@ -90,7 +95,11 @@ def main(*, lanes: tuple[int, ...] = LANES, repeats: int = 5) -> None:
         lanes: how many agents learn at once.
         repeats: of which the best counts.
     """
-    rows = {name: [update_us(make, count, repeats) for count in lanes] for name, make in WAYS.items()}
+    rows: dict[str, list[float]] = {name: [] for name in WAYS}
+    with ProcessPoolExecutor(1, mp_context=get_context("spawn"), max_tasks_per_child=1) as process:
+        for count in lanes:
+            for name, row in rows.items():
+                row.append(process.submit(update_us, name, count, repeats).result())
     table = Table("microseconds an update", title="one update of so many lanes, one thread")
     for count in lanes:
         table.add_column(f"{count}", justify="right", no_wrap=True)
@@ -103,6 +112,4 @@ def main(*, lanes: tuple[int, ...] = LANES, repeats: int = 5) -> None:
 
 
 if __name__ == "__main__":
-    torch.set_num_threads(1)
-    torch.set_flush_denormal(True)
     tyro.cli(main)
