@@ -76,7 +76,7 @@ def test_what_cannot_be_trained_is_refused(arguments, message):
 
 
 def test_one_world_is_trained_at_a_time():
-    with pytest.raises(ValueError, match="has 2 worlds"):
+    with pytest.raises(ValueError, match="has 2 worlds; the learner at 0 has 1 replicas"):
         train(CommonsEnv(GAME, 2), {0: learner()}, others={1: RandomActor(8)}, episodes=1)
 
 

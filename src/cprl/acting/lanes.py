@@ -1,10 +1,14 @@
-"""LaneQNetwork: many independent networks of one shape as one, by batched matrix products."""
+"""Lanes: the agents at some seats of every replica, acting at once. A lane is one agent of one replica."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 
 import torch
+from tensordict import TensorDictBase
+from tensordict.nn import TensorDictModuleBase
 from torch import Tensor, nn
+from torchrl.envs.utils import ExplorationType, exploration_type
 
+from cprl.acting.draws import LaneDraws
 from cprl.acting.networks import QNetwork
 
 
@@ -56,3 +60,67 @@ class LaneQNetwork(nn.Module):
 
 def _shapes(network: QNetwork) -> tuple[tuple[int, ...], ...]:
     return tuple(tuple(layer.weight.shape) for layer in network.linears)
+
+
+class LaneActor(TensorDictModuleBase):
+    """Chooses for the agents at some seats of every replica: greedily, or with chance `epsilon` at random.
+
+    It explores under `ExplorationType.RANDOM` alone, by random numbers of each lane's own.
+
+    Args:
+        values: the value of each action, from observations [L, k, C, X, Y] to [L, k, A], lane = replica x
+            seats + seat; None for agents that choose at random always.
+        actions: how many actions A there are.
+        seeds: of each lane's exploration.
+        seats: how many seats S of a replica it takes.
+        worlds: how many worlds k of each replica are played at once, side by side in the batch.
+    """
+
+    in_keys = ("observation",)
+    out_keys = ("action",)
+
+    def __init__(
+        self,
+        values: Callable[[Tensor], Tensor] | None,
+        actions: int,
+        *,
+        seeds: Sequence[Sequence[int]],
+        seats: int,
+        worlds: int = 1,
+    ) -> None:
+        super().__init__()
+        self.values, self.actions = values, actions
+        self.seats, self.worlds, self.replicas = seats, worlds, len(seeds) // seats
+        self.epsilon = 1.0
+        self.draws = LaneDraws(seeds, 2 * worlds)
+
+    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
+        """Writes "action", int64 [replicas x k, S], for "observation" [replicas x k, S, C, X, Y]."""
+        observation = tensordict.get("observation")
+        explores = self.values is None or (
+            self.epsilon > 0 and exploration_type() in (ExplorationType.RANDOM, None)
+        )
+        best = self._best(observation) if self.values is not None else None
+        if explores:
+            chance, which = self.draws.next().view(-1, self.worlds, 2).unbind(-1)
+            random = (which * self.actions).long().to(observation.device)
+            if best is None:
+                best = random
+            else:
+                best = torch.where(chance.to(best.device) < self.epsilon, random, best)
+        assert best is not None
+        chosen = best.view(self.replicas, self.seats, self.worlds).transpose(1, 2)
+        return tensordict.set("action", chosen.reshape(-1, self.seats))
+
+    def _best(self, observation: Tensor) -> Tensor:
+        """The greedy actions of each lane, int64 [L, k]."""
+        assert self.values is not None
+        shape = observation.shape[-3:]
+        by_lane = observation.view(self.replicas, self.worlds, self.seats, *shape).transpose(1, 2)
+        with torch.no_grad():
+            return self.values(by_lane.reshape(-1, self.worlds, *shape)).argmax(-1)
+
+
+def random_lanes(actions: int, *, seeds: Sequence[Sequence[int]], seats: int, worlds: int = 1) -> LaneActor:
+    """Agents to whom every action is equally likely; see `LaneActor`."""
+    return LaneActor(None, actions, seeds=seeds, seats=seats, worlds=worlds)

@@ -1,45 +1,72 @@
 """Seats: one actor for each agent of a game, as one policy for the environment."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from typing import TypeAlias
 
 import torch
 from tensordict import TensorDict, TensorDictBase
 from tensordict.nn import TensorDictModuleBase
-from torch import nn
+from torch import Tensor, nn
 
 from cprl import keys
 
+Seat: TypeAlias = int | tuple[int, ...]
+"""Where an actor or learner sits: one agent's number, or several."""
+
+
+def agents_at(seat: Seat) -> tuple[int, ...]:
+    """The agents' numbers."""
+    return seat if isinstance(seat, tuple) else (seat,)
+
 
 class Seats(TensorDictModuleBase):
-    """Lets actor i see the window of agent i alone, and puts the actions together.
+    """Lets each actor see what the agents at its seats see, and puts the actions together.
 
     Args:
-        actors: one for each agent, agent 0 first; see `cprl.acting.actors`.
+        actors: one for each agent, agent 0 first, see `cprl.acting.actors`; or by the seats that each takes:
+            a number for an actor of one agent, a tuple of numbers for one of several, e.g. a `LaneActor`.
 
-    Reads ("agents", "observation"), uint8 [B, N, 3, X, Y]; writes ("agents", "action"), int64 [B, N].
+    Reads ("agents", "observation"), uint8 [B, N, C, X, Y]; writes ("agents", "action"), int64 [B, N].
+
+    Raises:
+        ValueError: for seats that are empty or taken twice.
     """
 
     in_keys = (keys.OBSERVATION,)
     out_keys = (keys.ACTION,)
 
-    def __init__(self, actors: Sequence[nn.Module]) -> None:
+    def __init__(self, actors: Sequence[nn.Module] | Mapping[Seat, nn.Module]) -> None:
         super().__init__()
-        self.actors = nn.ModuleList(actors)
+        of_seats = dict(actors) if isinstance(actors, Mapping) else dict(enumerate(actors))
+        taken = sorted(agent for seat in of_seats for agent in agents_at(seat))
+        if taken != list(range(len(taken))):
+            raise ValueError(f"actors sit at {taken}; wanted are 0, 1 and so on, each taken once")
+        self.agents = len(taken)
+        self.seats = list(of_seats)
+        self.actors = nn.ModuleList(of_seats.values())
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
-        """Each actor chooses for its agent, in all worlds at once."""
+        """Each actor chooses for its agents, in all worlds at once."""
         agents = tensordict.get(keys.AGENTS)
         observation = agents.get("observation")
-        if observation.shape[len(tensordict.batch_size)] != len(self.actors):
+        dim = len(tensordict.batch_size)
+        if observation.shape[dim] != self.agents:
             raise ValueError(
-                f"{len(self.actors)} actors for {observation.shape[len(tensordict.batch_size)]} agents; "
+                f"{self.agents} actors for {observation.shape[dim]} agents; "
                 "one actor for each agent is wanted"
             )
-        chosen = []
-        for i, actor in enumerate(self.actors):
-            view = TensorDict._new_unsafe(
-                {"observation": observation[..., i, :, :, :]}, batch_size=tensordict.batch_size
-            )
-            chosen.append(actor(view).get("action"))
-        agents.set("action", torch.stack(chosen, -1))
+        if self.seats == [tuple(range(self.agents))]:
+            agents.set("action", self._choose(self.actors[0], observation, tensordict.batch_size))
+            return tensordict
+        chosen = observation.new_empty(observation.shape[: dim + 1], dtype=torch.int64)
+        for seat, actor in zip(self.seats, self.actors, strict=True):
+            at = list(seat) if isinstance(seat, tuple) else seat
+            index = (*[slice(None)] * dim, at)
+            chosen[index] = self._choose(actor, observation[index], tensordict.batch_size)
+        agents.set("action", chosen)
         return tensordict
+
+    def _choose(self, actor: nn.Module, seen: Tensor, batch_size: torch.Size) -> Tensor:
+        view = TensorDict._new_unsafe({"observation": seen}, batch_size=batch_size)
+        action: Tensor = actor(view).get("action")
+        return action

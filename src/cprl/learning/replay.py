@@ -9,18 +9,19 @@ from collections.abc import Mapping, Sequence
 from math import prod
 from typing import Any, Final
 
-import numpy as np
 import torch
 from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
 from torchrl.data.replay_buffers import ReplayBuffer, RoundRobinWriter, Sampler, Storage
 
+from cprl.acting.draws import LaneDraws
+
 ENDS_PER_TRANSITION: Final = 0.02
 """Room for the last windows of episodes, beside that for transitions: one in fifty. Where episodes are
 shorter than that, fewer transitions are kept; none is ever wrong."""
 
-DRAWS_AHEAD: Final = 1024
-"""Updates for which a lane draws its sample numbers at once."""
+LOOKS_EVERY: Final = 32
+"""Steps after which a storage looks again what is about to be written over."""
 
 Fields = dict[str, Tensor]
 
@@ -41,7 +42,9 @@ def storage_bytes(
 
 
 def _rows(transitions: int) -> int:
-    return transitions + max(8, round(transitions * ENDS_PER_TRANSITION)) + 2
+    """Windows for which a lane has room: those of its transitions, of ends, and of the steps until it looks
+    again what has been written over, two a step at most."""
+    return transitions + max(8, round(transitions * ENDS_PER_TRANSITION)) + 2 * LOOKS_EVERY + 2
 
 
 class LaneStorage(Storage):
@@ -84,8 +87,10 @@ class LaneStorage(Storage):
         }
         """Windows [L x rows, ...], the rest [T, L]; `row` counts the windows that a lane has written."""
         self._lane = torch.arange(lanes, device=self.device)
+        self._base = self._lane * self.rows
         self._next_row = room(lanes, kind=torch.int64)
         self._begins = torch.ones(lanes, dtype=torch.bool, device=self.device)
+        self._any_begins = True
         self._oldest = room(lanes, kind=torch.int64)
         self._written = 0
 
@@ -95,7 +100,7 @@ class LaneStorage(Storage):
 
     def valid(self) -> tuple[Tensor, int]:
         """The number of each lane's oldest transition that is still whole, int64 [L], and of the next one."""
-        return self._oldest, self._written
+        return self._oldest.clamp(min=self._written - self.max_size), self._written
 
     def set(self, cursor: Any, data: TensorDictBase, *, set_cursor: bool = True) -> None:
         """Writes the next transition of every lane; `cursor` is its place in the ring."""
@@ -107,31 +112,35 @@ class LaneStorage(Storage):
     def write(self, data: TensorDictBase) -> None:
         """Writes the next transition of every lane, [L]."""
         following, fields, place = data.get("next"), self.fields, self._written % self.max_size
-        windows = fields["observation"]
-        base = self._lane * self.rows
-        if self._begins.any():
+        windows, row = fields["observation"], self._next_row
+        if self._any_begins:
             first = self._begins.nonzero().flatten()
-            windows[base[first] + self._next_row[first] % self.rows] = data.get("observation")[first]
-        row = self._next_row
-        windows[base + (row + 1) % self.rows] = following.get("observation")
+            windows[self._base[first] + row[first] % self.rows] = data.get("observation")[first]
+        windows[self._base + (row + 1) % self.rows] = following.get("observation")
         done = following.get("done").reshape(-1)
         fields["action"][place] = data.get("action")
         fields["reward"][place] = following.get("reward").reshape(-1)
         fields["done"][place] = done
         fields["terminated"][place] = following.get("terminated").reshape(-1)
         fields["row"][place] = row
-        self._next_row = row + 1 + done
-        self._begins = done.clone()
+        self._any_begins = bool(done.any())
+        self._begins = done
+        self._next_row = row + 1 + done if self._any_begins else row + 1
         self._written += 1
-        self._forget()
+        if self._written % LOOKS_EVERY == 0:
+            self._forget()
 
     def _forget(self) -> None:
-        """Transitions whose windows or places have been written over are no longer drawn."""
-        self._oldest.clamp_(min=self._written - self.max_size)
-        for _ in range(2):  # a step takes two windows at most
-            place = self._oldest % self.max_size
-            lost = self.fields["row"][place, self._lane] <= self._next_row - self.rows
-            self._oldest += lost & (self._oldest < self._written)
+        """Transitions whose windows are about to be written over are no longer drawn."""
+        oldest = self._oldest.clamp(min=self._written - self.max_size)
+        soon = self._next_row - self.rows + 2 * LOOKS_EVERY + 1
+        while True:
+            lost = self.fields["row"][oldest % self.max_size, self._lane] <= soon
+            lost &= oldest < self._written
+            if not lost.any():
+                break
+            oldest += lost
+        self._oldest = oldest
 
     def get(self, index: Tensor) -> TensorDict:
         """The transitions at places [L, b] of the ring."""
@@ -161,10 +170,12 @@ class LaneStorage(Storage):
             array[: len(state_dict[name])] = state_dict[name]
         self._next_row, self._begins = state_dict["next_row"].clone(), state_dict["begins"].clone()
         self._oldest, self._written = state_dict["oldest"].clone(), int(state_dict["written"])
+        self._any_begins = bool(self._begins.any())
 
     def _empty(self) -> None:
         self._next_row.zero_()
-        self._begins.fill_(True)
+        self._begins = torch.ones_like(self._begins)
+        self._any_begins = True
         self._oldest.zero_()
         self._written = 0
 
@@ -207,9 +218,7 @@ class LaneSampler(Sampler):
 
     def __init__(self, seeds: Sequence[Sequence[int]], batch_size: int) -> None:
         self.batch_size = batch_size
-        self._chance = [np.random.Generator(np.random.Philox(np.random.SeedSequence(seed))) for seed in seeds]
-        self._numbers = torch.empty((0, len(seeds), batch_size), dtype=torch.float64)
-        self._used = 0
+        self.draws = LaneDraws(seeds, batch_size)
 
     def sample(self, storage: LaneStorage, batch_size: int) -> tuple[Tensor, dict[str, Any]]:
         """Places in the ring, int64 [L, b]."""
@@ -219,29 +228,18 @@ class LaneSampler(Sampler):
 
     def draw(self, storage: LaneStorage) -> Tensor:
         """Places in the ring, int64 [L, b]."""
-        if self._used == len(self._numbers):
-            ahead = [chance.random((DRAWS_AHEAD, self.batch_size)) for chance in self._chance]
-            self._numbers, self._used = torch.from_numpy(np.stack(ahead, 1)), 0
-        numbers = self._numbers[self._used]
-        self._used += 1
         oldest, written = storage.valid()
         kept = (written - oldest)[:, None]
-        drawn = oldest[:, None] + (numbers.to(oldest.device) * kept).long()
+        drawn = oldest[:, None] + (self.draws.next().to(oldest.device) * kept).long()
         return drawn % int(storage.max_size)
 
     def state_dict(self) -> dict[str, Any]:
         """Where each lane's random numbers stand."""
-        return {
-            "chance": [chance.bit_generator.state for chance in self._chance],
-            "numbers": self._numbers.clone(),
-            "used": self._used,
-        }
+        return self.draws.state_dict()
 
     def load_state_dict(self, state_dict: Mapping[str, Any]) -> None:
         """Goes on where the sampler of that state was."""
-        for chance, state in zip(self._chance, state_dict["chance"], strict=True):
-            chance.bit_generator.state = state
-        self._numbers, self._used = state_dict["numbers"].clone(), int(state_dict["used"])
+        self.draws.load_state_dict(state_dict)
 
     def _empty(self) -> None:
         """Nothing is kept of what was sampled."""

@@ -8,6 +8,7 @@ a lane axis in the network where it is ours, else by `torch.vmap` over the loss 
 import gc
 import warnings
 from collections.abc import Callable, Sequence
+from copy import deepcopy
 from types import FunctionType
 from typing import Any, Protocol
 
@@ -46,6 +47,9 @@ class Update(Protocol):
     def copy_to_targets(self, which: Tensor) -> None:
         """Replaces the target weights of the marked lanes, bool [L], by their weights."""
 
+    def outputs(self, observation: Tensor) -> Tensor:
+        """What the networks give by their present weights: [L, k, ...] to [L, k, ...]."""
+
     def weights(self, lane: int) -> Weights:
         """Copies of all weights of one lane, targets too, by name."""
 
@@ -72,6 +76,7 @@ class ListUpdate:
         adam_eps: float = 1e-8,
         loss_share: float = 1.0,
     ) -> None:
+        self._networks = networks
         self.losses = [make_loss(network) for network in networks]
         for loss in self.losses:
             _promise_targets(loss)
@@ -95,6 +100,10 @@ class ListUpdate:
         loss.backward()  # type: ignore[no-untyped-call]
         self._adams[lane].step()
         return loss.detach()
+
+    def outputs(self, observation: Tensor) -> Tensor:
+        """See `Update`."""
+        return torch.stack([network(seen) for network, seen in zip(self._networks, observation, strict=True)])
 
     def copy_to_targets(self, which: Tensor) -> None:
         """See `Update`."""
@@ -142,6 +151,7 @@ class FunctionalUpdate:
             return _stacked(some, make_loss, lane_axis=lane_axis)
 
         self.lanes = len(networks)
+        self._network = LaneQNetwork(networks) if lane_axis else deepcopy(networks[0])  # type: ignore[arg-type]
         loss, groups = of(networks)
         own = {name: group for name, group in groups.items() if not name.startswith("target_")}
         targets = {name: group for name, group in groups.items() if name.startswith("target_")}
@@ -153,6 +163,10 @@ class FunctionalUpdate:
         self.targets = {
             f"{name}:{key}": value.clone() for name, group in targets.items() for key, value in group.items()
         }
+        self._shared = _weights_of(self._network, self.own)
+        if lane_axis:  # acts by the very tensors that learning changes
+            for name, parameter in self._network.named_parameters():
+                parameter.requires_grad_(False).data = self._shared[name]
         self._mean = {name: torch.zeros_like(value) for name, value in self.own.items()}
         self._square = {name: torch.zeros_like(value) for name, value in self.own.items()}
         self.steps = 0
@@ -226,6 +240,19 @@ class FunctionalUpdate:
         losses = self.loss(own, targets, batch).mean(-1) * self._share
         return losses.sum(), losses
 
+    def outputs(self, observation: Tensor) -> Tensor:
+        """See `Update`."""
+
+        if not self._vmapped:
+            given: Tensor = self._network(observation)
+            return given
+
+        def output(weights: Weights, seen: Tensor) -> Tensor:
+            one: Tensor = torch.func.functional_call(self._network, weights, (seen,))
+            return one
+
+        return torch.vmap(output)(self._shared, observation)
+
     def copy_to_targets(self, which: Tensor) -> None:
         """See `Update`."""
         for name, target in self.targets.items():
@@ -294,6 +321,17 @@ def _flat(groups: dict[str, TensorDictParams]) -> Weights:
         for name, group in groups.items()
         for key, value in group.flatten_keys(".").items()
     }
+
+
+def _weights_of(network: nn.Module, own: Weights) -> Weights:
+    """The network's weights by its own names, the same tensors as in the loss."""
+    found = {}
+    for name, _ in network.named_parameters():
+        matching = [value for key, value in own.items() if key.endswith(f".{name}")]
+        if len(matching) != 1:
+            raise ValueError(f"{len(matching)} weights of the loss are called {name}; one is wanted")
+        found[name] = matching[0]
+    return found
 
 
 def _stacked(

@@ -1,0 +1,165 @@
+"""LaneLearner: independent DQN agents at some seats of every replica, learning in one step."""
+
+from collections.abc import Callable, Sequence
+from functools import partial
+from typing import Final, Literal, get_args
+
+import numpy as np
+import torch
+from tensordict import TensorDictBase
+from torch import Tensor, nn
+
+from cprl.acting.lanes import LaneActor
+from cprl.acting.networks import QNetwork
+from cprl.commons.game import Game
+from cprl.learning.dqn import dqn_loss
+from cprl.learning.replay import lane_buffer
+from cprl.learning.settings import DQNSettings
+from cprl.learning.transitions import lane_transitions
+from cprl.learning.updates import FunctionalUpdate, ListUpdate, MakeLoss, Update
+
+Way = Literal["lane axis", "vmap", "list"]
+
+WEIGHTS, TARGET_WEIGHTS, EXPLORATION, SAMPLING, EVALUATION = range(5)
+"""What a lane's random numbers are for."""
+
+_LARGEST_SEED: Final = 2**63 - 1
+
+
+def lane_seeds(
+    seed: int, *, replicas: Sequence[int], seats: Sequence[int], purpose: int
+) -> list[tuple[int, int, int, int]]:
+    """A seed for each lane, replica by replica, of the run's seed, the replica, the agent and the purpose."""
+    return [(seed, replica, agent, purpose) for replica in replicas for agent in seats]
+
+
+class LaneLearner:
+    """R x S independent DQN agents: seats S of each of R replicas.
+
+    A lane has its own network, target, optimiser state, replay buffer, and randomness; its course is the
+    one it would take alone. Learns through TorchRL's loss and replay buffer, see `cprl.learning.updates`.
+
+    Args:
+        game: what is played.
+        seats: the numbers of the agents that learn.
+        replicas: how many replicas R, the worlds of the environment.
+        settings: the hyper-parameters.
+        seed: of the run.
+        first_replica: the number of the first replica, so that replica r can be trained alone.
+        make_network: a lane's network; by default `QNetwork` by the settings. It draws its weights from
+            torch's generator, which is seeded for each lane.
+        make_loss: a lane's loss out of its network; by default `dqn_loss`.
+        way: how lanes are updated; "lane axis" wants `QNetwork`s, "vmap" and "list" take any.
+        compile: whether the update is compiled, for the first two ways.
+        device: where they learn.
+    """
+
+    def __init__(
+        self,
+        game: Game,
+        *,
+        seats: Sequence[int],
+        replicas: int,
+        settings: DQNSettings,
+        seed: int = 0,
+        first_replica: int = 0,
+        make_network: Callable[[], nn.Module] | None = None,
+        make_loss: MakeLoss | None = None,
+        way: Way = "lane axis",
+        compile: bool = True,
+        device: str | torch.device = "cpu",
+    ) -> None:
+        if way not in get_args(Way):
+            raise ValueError(f"way is {way!r}; allowed: {', '.join(get_args(Way))}")
+        self.game, self.settings, self.seats = game, settings, tuple(seats)
+        self.replicas, self._numbers = replicas, range(first_replica, first_replica + replicas)
+        self.seed = seed
+        make_network = make_network or partial(_network, game, settings)
+        make_loss = make_loss or partial(dqn_loss, gamma=settings.gamma)
+        actions = len(game.actions)
+        networks = [_drawn(make_network, own).to(device) for own in self._seeds(WEIGHTS)]
+        targets = None
+        if settings.own_target_weights:
+            targets = [_drawn(make_network, own).to(device) for own in self._seeds(TARGET_WEIGHTS)]
+        how = {
+            "target_networks": targets,
+            "learning_rate": settings.learning_rate,
+            "adam_eps": settings.adam_eps,
+            "loss_share": 1 / actions if settings.mean_over_all_outputs else 1.0,
+        }
+        self.update: Update
+        if way == "list":
+            self.update = ListUpdate(networks, make_loss, **how)  # type: ignore[arg-type]
+        else:
+            self.update = FunctionalUpdate(
+                networks,
+                make_loss,
+                lane_axis=way == "lane axis",
+                compile=compile,
+                **how,  # type: ignore[arg-type]
+            )
+        self.buffer = lane_buffer(
+            seeds=self._seeds(SAMPLING),
+            transitions=settings.buffer_size,
+            batch_size=settings.batch_size,
+            observation_shape=game.observation_shape,
+            device=device,
+        )
+        self.actor = LaneActor(
+            self.update.outputs, actions, seeds=self._seeds(EXPLORATION), seats=len(self.seats)
+        )
+        self.steps = 0
+        self.actor.epsilon = settings.epsilon(0)
+        self._episodes = torch.zeros(replicas, dtype=torch.int64)
+
+    def _seeds(self, purpose: int) -> list[tuple[int, int, int, int]]:
+        return lane_seeds(self.seed, replicas=self._numbers, seats=self.seats, purpose=purpose)
+
+    def evaluation_actor(self, worlds: int) -> LaneActor:
+        """An actor by the present weights, with `epsilon_evaluation`, for so many worlds of each replica."""
+        actor = LaneActor(
+            self.update.outputs,
+            len(self.game.actions),
+            seeds=self._seeds(EVALUATION),
+            seats=len(self.seats),
+            worlds=worlds,
+        )
+        actor.epsilon = self.settings.epsilon_evaluation
+        return actor
+
+    def remember(self, batch: TensorDictBase) -> None:
+        """Stores a turn of every replica, as the collector yields it."""
+        self.buffer.storage.write(lane_transitions(self.seats, batch))
+        self.steps += 1
+        self.actor.epsilon = self.settings.epsilon(self.steps)
+
+    def learn(self) -> Tensor | None:
+        """One update of every lane; their losses [R, S], or None while too little is stored."""
+        if self.steps < self.settings.learning_starts:
+            return None
+        return self.update.learn(self.buffer).view(self.replicas, len(self.seats))
+
+    def end_episode(self, ended: Tensor) -> None:
+        """Counts an episode of the marked replicas, bool [R]; targets are replaced after every so many."""
+        self._episodes += ended
+        due = ended & (self._episodes % self.settings.target_every_episodes == 0)
+        if due.any():
+            self.update.copy_to_targets(due.repeat_interleave(len(self.seats)))
+
+
+def _network(game: Game, settings: DQNSettings) -> QNetwork:
+    return QNetwork(
+        game.observation_shape,
+        len(game.actions),
+        hidden_cells=settings.hidden_cells,
+        highest=game.observation.highest,
+        relu_on_outputs=settings.relu_on_outputs,
+        glorot_uniform=settings.glorot_uniform,
+    )
+
+
+def _drawn(make_network: Callable[[], nn.Module], seed: Sequence[int]) -> nn.Module:
+    """A network whose weights follow from a seed alone; torch's generator goes on as if nothing happened."""
+    with torch.random.fork_rng(devices=[]):
+        torch.manual_seed(int(np.random.SeedSequence(seed).generate_state(1, np.uint64)[0] & _LARGEST_SEED))
+        return make_network()

@@ -1,0 +1,234 @@
+"""Training many replicas at once: each plays and learns as it would alone."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+from tensordict import TensorDict, assert_close
+from test_torchrl_env import ByWindow
+from torchrl.collectors import Collector
+from torchrl.envs.utils import ExplorationType, set_exploration_type
+
+from cprl import CommonsEnv, Game, Rules, keys, maps
+from cprl.acting import LaneActor, RandomActor, Seats, random_lanes
+from cprl.acting.collect import StepCollector
+from cprl.learning import DQNSettings, LaneLearner, transitions_of
+from cprl.learning.transitions import lane_transitions
+from cprl.measuring.evaluate import evaluate
+from cprl.recording import EpisodeTable, read_episodes
+from cprl.train import train
+
+GAME = Game(
+    map=maps.parse(".A>.A\n.A.A.\n..<.A"),
+    rules=Rules(regrow_prob=(0.0, 0.2), window_rows=3, window_columns=5, episode_steps=12, freeze_steps=2),
+)
+SETTINGS = DQNSettings(
+    buffer_size=150,
+    batch_size=4,
+    learning_rate=1e-3,
+    hidden_cells=(8,),
+    epsilon_hold_steps=20,
+    epsilon_decay_steps=100,
+    target_every_episodes=2,
+)
+WAYS = ["list", "vmap", "lane axis"]
+
+
+class Witness:
+    def __init__(self):
+        self.episodes, self.learning = [], []
+
+    def see_turn(self, batch):
+        """Only whole episodes are of interest."""
+
+    def see_episode(self, episode, learning):
+        self.episodes.append(episode)
+        self.learning.append(learning)
+
+    def course(self, replica):
+        """Returns and losses of one replica, episode by episode."""
+        mine = [at for at, episode in enumerate(self.episodes) if episode.world == replica]
+        returns = [self.episodes[at].return_.tolist() for at in mine]
+        return returns, [
+            [value for name, value in self.learning[at].items() if "loss" in name] for at in mine
+        ]
+
+
+def learner(way="lane axis", *, game=GAME, seats=(0, 1), settings=SETTINGS, **how):
+    return LaneLearner(game, seats=seats, settings=settings, way=way, compile=False, **how)
+
+
+def trained(way, *, replicas, first=0, episodes=12, seats=(0, 1), settings=SETTINGS):
+    agents = learner(way, seats=seats, replicas=replicas, first_replica=first, seed=3, settings=settings)
+    witness = Witness()
+    others = {}
+    if len(seats) == 1:
+        seeds = [(3, first + replica, 1) for replica in range(replicas)]
+        others = {(1,): random_lanes(8, seeds=seeds, seats=1)}
+    env = CommonsEnv(GAME, replicas, seed=3, first_world=first)
+    train(env, {tuple(seats): agents}, others=others, episodes=episodes, observers=[witness])
+    return agents, witness
+
+
+@pytest.mark.parametrize("way", WAYS)
+@pytest.mark.parametrize("seats", [(0, 1), (0,)], ids=["two learn", "one learns beside a random one"])
+def test_each_replica_is_trained_as_it_would_be_alone(way, seats):
+    _, together = trained(way, replicas=3, seats=seats)
+    courses = [together.course(replica) for replica in range(3)]
+    assert courses[0] != courses[1] != courses[2]
+    for replica in (0, 2):
+        _, alone = trained(way, replicas=1, first=replica, seats=seats)
+        returns, losses = alone.course(0)
+        assert courses[replica][0] == returns
+        np.testing.assert_allclose(courses[replica][1], losses, rtol=1e-4, equal_nan=True)
+
+
+def test_all_ways_of_updating_take_the_same_course():
+    courses = [trained(way, replicas=2)[1].course(1) for way in WAYS]
+    for returns, losses in courses[1:]:
+        assert returns == courses[0][0]
+        np.testing.assert_allclose(losses, courses[0][1], rtol=1e-4, equal_nan=True)
+
+
+def test_as_run_targets_start_from_weights_of_their_own_and_the_loss_is_shared_over_outputs():
+    as_run = replace(SETTINGS, own_target_weights=True, mean_over_all_outputs=True)
+    plain, odd = (learner(replicas=2, settings=settings) for settings in (SETTINGS, as_run))
+    assert odd.update._share == plain.update._share / 8
+    for agents, same in ((plain, True), (odd, False)):
+        weights = agents.update.weights(0)
+        own = [value for name, value in weights.items() if not name.startswith("target_")]
+        target = [value for name, value in weights.items() if name.startswith("target_")]
+        assert torch.equal(own[0], target[0]) is same
+
+
+def test_every_replica_is_told_of_so_many_episodes_and_of_its_losses(tmp_path):
+    with EpisodeTable(tmp_path / "episodes.parquet") as table:
+        witness = Witness()
+        env = CommonsEnv(GAME, 3, seed=1)
+        train(env, {(0, 1): learner(replicas=3)}, episodes=5, observers=[table, witness])
+    rows = read_episodes(tmp_path).to_pydict()
+    for replica in range(3):
+        told = zip(rows["replica"], rows["agent"], rows["episode"], strict=True)
+        episodes = [episode for number, agent, episode in told if (number, agent) == (replica, 1)]
+        assert episodes == [0, 1, 2, 3, 4]
+        _, losses = witness.course(replica)
+        assert np.isfinite(losses[-1]).all()
+    assert set(witness.learning[0]) == {f"agent_{i}/{name}" for i in (0, 1) for name in ("loss", "epsilon")}
+
+
+def test_targets_follow_each_replicas_own_episodes():
+    agents = learner(replicas=2)
+    agents.remember(CommonsEnv(GAME, 2).rollout(1)[:, 0])
+    copied = []
+    agents.update.copy_to_targets = lambda which: copied.append(which.tolist())
+    for ended in ([True, False], [True, False], [True, True], [False, True]):
+        agents.end_episode(torch.tensor(ended))
+    assert copied == [[True, True, False, False], [False, False, True, True]]
+
+
+@pytest.mark.parametrize("worlds", [1, 4])
+def test_the_lean_collector_yields_what_torchrls_own_yields(worlds):
+    # By a policy that follows from the window alone: the stock collector calls it once to see its entries.
+    stock = Collector(
+        CommonsEnv(GAME, worlds, seed=2),
+        ByWindow(),
+        frames_per_batch=worlds,
+        total_frames=60 * worlds,
+        track_traj_ids=False,
+        auto_register_policy_transforms=False,
+    )
+    lean = StepCollector(CommonsEnv(GAME, worlds, seed=2), ByWindow())
+    ends = 0
+    for batch, own in zip(stock, lean, strict=False):
+        assert_close(own, batch[:, 0])
+        assert set(own.keys(True, True)) == set(batch.keys(True, True))
+        ends += int(own["next", "done"].sum())
+    assert ends >= 4 * worlds
+    stock.shutdown()
+    lean.shutdown()
+
+
+def test_transitions_of_lanes_are_those_of_the_agents():
+    batch = CommonsEnv(GAME, 3).rollout(1)[:, 0]
+    for seats in ((0, 1), (1,)):
+        lanes = lane_transitions(seats, batch)
+        assert lanes.batch_size == (3 * len(seats),)
+        for place, agent in enumerate(seats):
+            assert_close(lanes[place :: len(seats)], transitions_of(agent, batch))
+
+
+def test_a_lane_explores_by_its_own_numbers_and_only_where_asked():
+    def values(seen):
+        return torch.zeros(*seen.shape[:2], 8).index_fill(2, torch.tensor(5), 1.0)
+
+    def chosen(seeds, *, seats=1, worlds=1, epsilon=0.5, manner=ExplorationType.RANDOM, steps=400):
+        actor = LaneActor(values, 8, seeds=seeds, seats=seats, worlds=worlds)
+        actor.epsilon = epsilon
+        shape = len(seeds) // seats * worlds, seats, 3, 2, 2
+        seen = TensorDict({"observation": torch.zeros(shape, dtype=torch.uint8)}, shape[:1])
+        with set_exploration_type(manner):
+            return torch.stack([actor(seen.clone())["action"] for _ in range(steps)])
+
+    both = chosen([(1, 0), (1, 1)])
+    assert both.shape == (400, 2, 1)
+    assert torch.equal(both[:, 1], chosen([(1, 1)])[:, 0])
+    assert not torch.equal(both[:, 0], both[:, 1])
+    assert (both == 5).float().mean() == pytest.approx(0.5 + 0.5 / 8, abs=0.05)
+    assert (chosen([(1, 0)], epsilon=0.0) == 5).all()
+    assert (chosen([(1, 0)], manner=ExplorationType.DETERMINISTIC) == 5).all()
+    many = chosen([(1, 0), (1, 1)], seats=2, worlds=3)
+    assert many.shape == (400, 3, 2)
+    assert (many[:, 0] != many[:, 1]).any()
+
+
+def test_lanes_by_worlds_reach_the_right_network():
+    agents = learner(replicas=2)
+    actor = agents.evaluation_actor(3)
+    windows = torch.randint(0, 256, (6, 2, *GAME.observation_shape), dtype=torch.uint8)
+    with set_exploration_type(ExplorationType.DETERMINISTIC):
+        chosen = actor(TensorDict({"observation": windows}, [6]))["action"]
+    for world in range(6):
+        for agent in range(2):
+            lane = 2 * (world // 3) + agent
+            seen = windows[world, agent].expand(4, 1, *GAME.observation_shape)
+            assert chosen[world, agent] == agents.update.outputs(seen)[lane, 0].argmax()
+
+
+def test_trained_replicas_are_evaluated_side_by_side_on_fresh_worlds():
+    agents, _ = trained("lane axis", replicas=2)
+    env = CommonsEnv(GAME, 2 * 5, seed=9)
+    episodes = evaluate(env, Seats({(0, 1): agents.evaluation_actor(5)}), explore=True)
+    assert len(episodes) == 10
+    assert agents.evaluation_actor(5).epsilon == 0.05
+
+
+@pytest.mark.parametrize(
+    ("learners", "others", "message"),
+    [
+        ({(0, 1): {"replicas": 3}}, {}, r"has 2 worlds; the learner at \(0, 1\) has 3 replicas"),
+        ({(0,): {"replicas": 2}}, {}, r"made for the seats \(0, 1\) sits at \(0,\)"),
+        ({(0, 1): {"replicas": 2}}, {1: RandomActor(8)}, r"sit at \[0, 1, 1\]"),
+    ],
+)
+def test_learners_that_do_not_fit_are_refused(learners, others, message):
+    made = {seat: learner(**how) for seat, how in learners.items()}
+    if (0,) in made:
+        others = {1: RandomActor(8)}
+    with pytest.raises(ValueError, match=message):
+        train(CommonsEnv(GAME, 2), made, others=others, episodes=1)
+
+
+def test_an_unknown_way_is_refused():
+    with pytest.raises(ValueError, match="way is 'loop'; allowed: lane axis, vmap, list"):
+        learner("loop", replicas=1)
+
+
+def test_seats_take_every_agent_once():
+    with pytest.raises(ValueError, match=r"actors sit at \[0, 0\]"):
+        Seats({0: RandomActor(8), (0,): RandomActor(8)})
+    env = CommonsEnv(GAME, 2)
+    seats = Seats({1: RandomActor(8, seed=1), 0: RandomActor(8)})
+    with pytest.raises(ValueError, match="1 actors for 2 agents"):
+        Seats([RandomActor(8)])(env.reset())
+    assert seats(env.reset())[keys.ACTION].shape == (2, 2)
