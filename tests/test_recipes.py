@@ -6,12 +6,14 @@ from dataclasses import replace
 from pathlib import Path
 
 import pytest
+import torch
 
 from cprl import CommonsEnv, Map, Rules, presets
 from cprl.acting import RandomActor, Seats
-from cprl.learning import DQNLearner
+from cprl.learning import DQNLearner, LaneLearner
 from cprl.measuring.evaluate import evaluate, mean_return
-from cprl.recording import load_weights, read_episodes, restore_weights
+from cprl.recording import EpisodeTable, load_weights, read_episodes, restore_weights
+from cprl.train import train
 
 RECIPES = Path(__file__).parents[1] / "recipes"
 
@@ -89,3 +91,70 @@ def test_the_short_schedule_earns_three_times_what_chance_does(tmp_path):
     greedy, _ = mean_return(evaluate(fresh, Seats([learner.actor])))
     chance, _ = mean_return(evaluate(fresh, Seats([RandomActor(7)])))
     assert greedy >= 3 * chance
+
+
+LANES = {"single_complex": 1, "two_complex": 2, "two_against_random": 2, "commons": 4}
+
+
+@pytest.mark.parametrize("variant", presets.VARIANTS)
+@pytest.mark.parametrize("name", LANES)
+def test_recipes_of_replicas_leave_a_run_directory(name, variant, tmp_path, capsys):
+    how = {"replicas": 2, "episodes": 3, "evaluation_episodes": 2, "seed": 3, "compile": False}
+    run = recipe(name).main(variant=variant, out=tmp_path / "run", **how)
+    told = capsys.readouterr().out
+    kept = json.loads((run / "recipe.json").read_text())
+    assert kept["recipe"] == name
+    assert kept["arguments"]["replicas"] == 2
+    rows = read_episodes(run).to_pydict()
+    agents = LANES[name]
+    of_each = [(r, e, a) for r in range(2) for e in range(3) for a in range(agents)]
+    assert sorted(zip(rows["replica"], rows["episode"], rows["agent"], strict=True)) == of_each
+    weights = load_weights(run / "checkpoints" / "final.pt")
+    learning = 1 if name == "two_against_random" else agents
+    assert sorted(weights) == [f"replica_{r}/agent_{a}" for r in range(2) for a in range(learning)]
+    assert (run / "figures" / "training_curve.png").exists()
+    assert "trained, epsilon 0.05" in " ".join(told.split())
+    assert "run.rrd" not in told
+    game, settings = presets.game("commons"), presets.learner("commons", variant=variant)
+    if name == "commons":
+        network = LaneLearner(game, seats=[0], replicas=1, settings=settings, compile=False).networks()
+        restore_weights_of(network["replica_0/agent_0"], weights["replica_1/agent_2"])
+
+
+def restore_weights_of(network, state):
+    """Kept weights fit an ordinary network of one agent."""
+    before = next(network.parameters()).clone()
+    network.load_state_dict(state)
+    assert not torch.equal(before, next(network.parameters()))
+
+
+@pytest.mark.slow
+def test_fifty_episodes_of_commons_in_eight_replicas_are_those_of_each_alone(tmp_path):
+    how = {"episodes": 50, "evaluation_episodes": 1, "seed": 5}
+    run = recipe("commons").main(replicas=8, out=tmp_path / "all", **how)
+    rows = read_episodes(run).to_pydict()
+    returns = {}
+    for replica, agent, episode, value in zip(
+        rows["replica"], rows["agent"], rows["episode"], rows["return"], strict=True
+    ):
+        returns.setdefault((replica, agent), {})[episode] = value
+    courses = {lane: tuple(course[episode] for episode in range(50)) for lane, course in returns.items()}
+    assert len(courses) == 32
+    assert len(set(courses.values())) == 32, "all lanes differ"
+    weights = load_weights(run / "checkpoints" / "final.pt")
+    game, settings = presets.game("commons"), presets.learner("commons")
+    for replica in (0, 5):
+        alone = LaneLearner(
+            game, seats=range(4), replicas=1, first_replica=replica, settings=settings, seed=5
+        )
+        env = CommonsEnv(game, 1, seed=5, first_world=replica)
+        (tmp_path / f"alone_{replica}").mkdir()
+        with EpisodeTable(tmp_path / f"alone_{replica}" / "episodes.parquet") as table:
+            train(env, {(0, 1, 2, 3): alone}, episodes=50, observers=[table])
+        told = read_episodes(tmp_path / f"alone_{replica}").to_pydict()
+        for agent in range(4):
+            mine = [v for a, v in zip(told["agent"], told["return"], strict=True) if a == agent]
+            assert tuple(mine) == courses[replica, agent]
+            state = alone.networks()[f"replica_{replica}/agent_{agent}"].state_dict()
+            for name, value in weights[f"replica_{replica}/agent_{agent}"].items():
+                torch.testing.assert_close(state[name], value, rtol=1e-4, atol=1e-6)

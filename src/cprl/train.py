@@ -1,5 +1,6 @@
 """The loop: act, store, learn, measure, record."""
 
+import logging
 from collections.abc import Mapping, Sequence
 from typing import Any, Protocol
 
@@ -89,6 +90,18 @@ class _Losses:
         means = (self.total[replica] / self.updates[replica]).tolist()
         self.total[replica], self.updates[replica] = 0.0, 0
         return dict(zip(self.agents, means, strict=True))
+
+
+def prepare_process(seed: int) -> None:
+    """What a training wants of torch: one thread, no denormals, its generator seeded, TorchRL's log quiet.
+
+    These networks are so small that a second thread costs more than it gives, up to a hundredfold on a busy
+    machine; denormal numbers in Adam's moments of dead weights slow a long run by up to 1.9 times.
+    """
+    torch.manual_seed(seed)
+    torch.set_num_threads(1)
+    torch.set_flush_denormal(True)
+    logging.getLogger("torchrl").setLevel(logging.WARNING)
 
 
 def train(

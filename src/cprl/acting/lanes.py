@@ -33,6 +33,7 @@ class LaneQNetwork(nn.Module):
             raise ValueError(f"the networks of the lanes have {len(forms)} different forms; one is wanted")
         self.highest, self.relu_on_outputs = first.highest, first.relu_on_outputs
         self.observation_dims = first.observation_dims
+        self._names = [name for name, layer in first.named_modules() if isinstance(layer, nn.Linear)]
         layers = list(zip(*(network.linears for network in networks), strict=True))
         self.weights = nn.ParameterList(
             [torch.stack([layer.weight.detach().T for layer in lanes]).contiguous() for lanes in layers]
@@ -45,6 +46,14 @@ class LaneQNetwork(nn.Module):
     def lanes(self) -> int:
         """The number of lanes L."""
         return len(self.weights[0])
+
+    def lane_state(self, lane: int) -> dict[str, Tensor]:
+        """Copies of the weights of one lane, as the state dict of its `QNetwork`."""
+        state = {}
+        for name, weight, bias in zip(self._names, self.weights, self.biases, strict=True):
+            state[f"{name}.weight"] = weight[lane].detach().T.clone()
+            state[f"{name}.bias"] = bias[lane, 0].detach().clone()
+        return state
 
     def forward(self, observation: Tensor) -> Tensor:
         """uint8 [L, C, X, Y] or [L, b, C, X, Y] to [L, A] or [L, b, A], in the parameters' type."""

@@ -75,6 +75,7 @@ class LaneLearner:
         self.replicas, self._numbers = replicas, range(first_replica, first_replica + replicas)
         self.seed = seed
         make_network = make_network or partial(_network, game, settings)
+        self._make_network = make_network
         make_loss = make_loss or partial(dqn_loss, gamma=settings.gamma)
         actions = len(game.actions)
         networks = [_drawn(make_network, own).to(device) for own in self._seeds(WEIGHTS)]
@@ -126,6 +127,15 @@ class LaneLearner:
         )
         actor.epsilon = self.settings.epsilon_evaluation
         return actor
+
+    def networks(self) -> dict[str, nn.Module]:
+        """A copy of every lane's network with its present weights, by "replica_0/agent_0" and so on."""
+        made = {}
+        for lane, (_, replica, agent, _) in enumerate(self._seeds(WEIGHTS)):
+            network = self._make_network()
+            network.load_state_dict(self.update.network_state(lane))
+            made[f"replica_{replica}/agent_{agent}"] = network
+        return made
 
     def remember(self, batch: TensorDictBase) -> None:
         """Stores a turn of every replica, as the collector yields it."""

@@ -50,8 +50,11 @@ class Update(Protocol):
     def outputs(self, observation: Tensor) -> Tensor:
         """What the networks give by their present weights: [L, k, ...] to [L, k, ...]."""
 
+    def network_state(self, lane: int) -> Weights:
+        """Copies of the present weights of one lane, as the state dict of its network."""
+
     def weights(self, lane: int) -> Weights:
-        """Copies of all weights of one lane, targets too, by name."""
+        """Copies of all weights of one lane, targets too, by the names in the loss."""
 
 
 class ListUpdate:
@@ -111,6 +114,10 @@ class ListUpdate:
             loss = self.losses[lane]
             for name in _params(loss):
                 getattr(loss, f"target_{name}").data.copy_(getattr(loss, name).data)
+
+    def network_state(self, lane: int) -> Weights:
+        """See `Update`."""
+        return {name: value.detach().clone() for name, value in self._networks[lane].state_dict().items()}
 
     def weights(self, lane: int) -> Weights:
         """See `Update`."""
@@ -257,6 +264,12 @@ class FunctionalUpdate:
         """See `Update`."""
         for name, target in self.targets.items():
             target[which] = self.own[name.removeprefix("target_")][which]
+
+    def network_state(self, lane: int) -> Weights:
+        """See `Update`."""
+        if isinstance(self._network, LaneQNetwork):
+            return self._network.lane_state(lane)
+        return {name: value[lane].clone() for name, value in self._shared.items()}
 
     def weights(self, lane: int) -> Weights:
         """See `Update`."""

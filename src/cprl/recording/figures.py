@@ -25,7 +25,7 @@ def running_mean(values: NDArray[np.float64], window: int) -> NDArray[np.float64
 def training_curve(
     run: Path, *, title: str, random: list[Episode] | None = None, smoothed: int = SMOOTHED_EPISODES
 ) -> Path:
-    """Draws the collective return of every episode of a run, and its running mean.
+    """Draws the collective return of every episode of a run, the mean of its replicas, and its running mean.
 
     Args:
         run: the run's directory.
@@ -40,9 +40,11 @@ def training_curve(
     episodes = np.array(table["episode"])
     returns = np.zeros(int(episodes.max()) + 1)
     np.add.at(returns, episodes, table["return"])
+    returns /= len(set(table["replica"]))
     figure = Figure(figsize=(8, 4.5), layout="constrained")
     axes = figure.add_subplot()
-    axes.plot(returns, color="#9ecae1", linewidth=0.8, label="each episode")
+    each = "each episode, mean of the replicas" if max(table["replica"]) else "each episode"
+    axes.plot(returns, color="#9ecae1", linewidth=0.8, label=each)
     window = min(smoothed, max(1, len(returns) // 5))
     mean = running_mean(returns, window)
     axes.plot(mean, color="#08519c", linewidth=2, label=f"mean of {window} episodes from here")

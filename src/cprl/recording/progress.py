@@ -26,11 +26,18 @@ class ProgressBar:
         episodes: how many there will be.
         episode_steps: the length of an episode that its clock ends.
         title: what is going on.
+        replicas: how many replicas play them side by side.
         console: where to; by default standard output.
     """
 
     def __init__(
-        self, *, episodes: int, episode_steps: int, title: str, console: Console | None = None
+        self,
+        *,
+        episodes: int,
+        episode_steps: int,
+        title: str,
+        replicas: int = 1,
+        console: Console | None = None,
     ) -> None:
         self.console = console or Console()
         self._title, self._episode_steps = title, episode_steps
@@ -47,7 +54,7 @@ class ProgressBar:
         self._told = {"return": "-", "epsilon": "-"}
         self._steps = self._steps_then = self._steps_this_episode = self._episodes = 0
         self._started = self._then = time.perf_counter()
-        self._left_of = episodes
+        self._left_of, self._replicas = episodes, replicas
 
     def see_turn(self, batch: TensorDictBase) -> None:
         """Counts the turns of a batch and, now and then, moves the bar."""
@@ -72,13 +79,15 @@ class ProgressBar:
         rate = (self._steps - self._steps_then) / waited
         self._steps_then, self._then = self._steps, time.perf_counter()
         told = f"return {self._told['return']}  epsilon {self._told['epsilon']}  {rate:,.0f} steps/s"
-        done = self._episodes + min(1.0, self._steps_this_episode / self._episode_steps)
+        running = min(self._replicas, self._steps_this_episode / self._episode_steps)
+        done = (self._episodes + running) / self._replicas
         self._progress.update(self._task, completed=done, told=told)
         if not self.console.is_terminal and self._steps:
             spent_s = time.perf_counter() - self._started
             left_s = spent_s / done * (self._left_of - done)
+            episode = self._episodes // self._replicas
             self.console.print(
-                f"{self._title}: episode {self._episodes}/{self._left_of}  {told}  {left_s:,.0f} s left",
+                f"{self._title}: episode {episode}/{self._left_of}  {told}  {left_s:,.0f} s left",
                 soft_wrap=True,
             )
 
@@ -92,5 +101,5 @@ class ProgressBar:
         error: BaseException | None,
         traceback: TracebackType | None,
     ) -> None:
-        self._progress.update(self._task, completed=self._episodes)
+        self._progress.update(self._task, completed=self._episodes / self._replicas)
         self._progress.stop()

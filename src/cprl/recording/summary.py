@@ -12,6 +12,7 @@ from cprl.measuring.episodes import Episode
 from cprl.measuring.evaluate import mean_return
 from cprl.recording.streams import viewer
 
+KEPT = ("recipe.json", "episodes.parquet", "run.rrd", "checkpoints", "figures")
 METRICS = ("survival_steps", "sustainability", "equality", "peacefulness")
 
 
@@ -34,10 +35,12 @@ def summarise(
     """
     console = console or Console()
     console.print(_table(title, played))
-    console.print(f"Kept in {run}: recipe.json, episodes.parquet, run.rrd, checkpoints/", soft_wrap=True)
+    kept = [name for name in KEPT if (run / name).exists()]
+    console.print(f"Kept in {run}: {', '.join(kept)}", soft_wrap=True)
     if figure:
         console.print(f"Training curve: {figure}", soft_wrap=True)
-    console.print(f"Watch again: {viewer()} {run / 'run.rrd'}", soft_wrap=True)
+    if "run.rrd" in kept:
+        console.print(f"Watch again: {viewer()} {run / 'run.rrd'}", soft_wrap=True)
 
 
 def _table(title: str, played: Mapping[str, list[Episode]]) -> Table:

@@ -83,7 +83,9 @@ class Watch:
             self._send_frames()
 
     def see_episode(self, episode: Episode, learning: Mapping[str, float]) -> None:
-        """Logs the metrics of an episode, each agent's return, and how learning went."""
+        """Logs the metrics of an episode of the first replica, each agent's return, and how learning went."""
+        if episode.world:
+            return
         logger, now = self.logger, time.perf_counter()
         logger.at(step=self._step, episode=episode.episode)
         for name, value in episode.metrics.items():
