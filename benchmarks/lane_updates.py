@@ -22,8 +22,9 @@ from torchrl.data.replay_buffers import ReplayBuffer
 
 from cprl.acting import QNetwork
 from cprl.learning.dqn import dqn_loss
+from cprl.learning.fused import FunctionalUpdate
 from cprl.learning.replay import lane_buffer
-from cprl.learning.updates import FunctionalUpdate, ListUpdate, Update
+from cprl.learning.updates import ListUpdate, Update
 
 SHAPE, ACTIONS, BATCH, TRANSITIONS = (3, 7, 15), 8, 8, 4096
 
@@ -51,7 +52,7 @@ def filled(lanes: int) -> ReplayBuffer:
         observation_shape=SHAPE,
     )
     state = buffer.storage.state_dict()
-    state["observation"].random_(0, 256)
+    state["observation"] = torch.randint(256, (lanes, TRANSITIONS + 1, *SHAPE), dtype=torch.uint8)
     state["action"] = torch.randint(ACTIONS, (TRANSITIONS, lanes))
     state["reward"] = torch.rand(TRANSITIONS, lanes)
     state["done"] = state["terminated"] = torch.rand(TRANSITIONS, lanes) < 0.001

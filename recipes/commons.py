@@ -1,7 +1,6 @@
 """Experiment 5 of the study: four independent DQN agents on `commons`. Tragedy, or appropriation?
 
     python recipes/commons.py                          8 replicas of 4800 episodes
-    python recipes/commons.py --variant as_run         as its program played it
 
 Copy this file and change it: another map, rule, network or loss is one line.
 """
@@ -10,11 +9,10 @@ from pathlib import Path
 
 import tyro
 
-from cprl import CommonsEnv, presets
+from cprl import CommonsEnv, presets, recording
 from cprl.acting import Seats, random_lanes
 from cprl.learning import LaneLearner
 from cprl.measuring.evaluate import evaluate
-from cprl.recording import EpisodeTable, ProgressBar, save_weights, start_run, summarise, training_curve
 from cprl.train import prepare_process, train
 
 SEATS = (0, 1, 2, 3)
@@ -28,6 +26,7 @@ def main(
     evaluation_episodes: int = 20,
     seed: int = 0,
     out: Path | None = None,
+    go_on: bool = False,
     compile: bool = True,
 ) -> Path:
     """Trains the agents of all replicas, evaluates them on fresh worlds, and returns the run's directory.
@@ -39,6 +38,7 @@ def main(
         evaluation_episodes: fresh episodes for each replica, with epsilon 0.05, and for the random policy.
         seed: of chance, weights, exploration and replay.
         out: the run's directory; by default a new one under runs/.
+        go_on: with the run in `out`, which was stopped; bit for bit as if it had not been.
         compile: whether torch compiles the update; needs a C++ compiler, and is several times faster.
     """
     prepare_process(seed)
@@ -46,7 +46,8 @@ def main(
     settings = presets.learner("commons", variant=variant)
     title = f"commons, {variant} rules, {replicas} replicas, {episodes} episodes"
     arguments = {"replicas": replicas, "episodes": episodes, "variant": variant, "seed": seed}
-    run = start_run(out, "commons", {**arguments, "game": game, "learner": settings})
+    recipe = {**arguments, "game": game, "learner": settings}
+    run = recording.start_run(out, "commons", recipe, go_on=go_on)
     agents = LaneLearner(game, seats=SEATS, replicas=replicas, settings=settings, seed=seed, compile=compile)
 
     def random(seats: tuple[int, ...], worlds: int = 1) -> dict:
@@ -54,14 +55,13 @@ def main(
         return {seats: random_lanes(len(game.actions), seeds=seeds, seats=len(seats), worlds=worlds)}
 
     with (
-        EpisodeTable(run / "episodes.parquet") as table,
-        ProgressBar(
-            episodes=episodes, episode_steps=game.rules.episode_steps, replicas=replicas, title="training"
-        ) as bar,
+        recording.Checkpoints(run) as checkpoints,
+        recording.EpisodeTable(run / "episodes.parquet", go_on=go_on) as table,
+        recording.ProgressBar(game, episodes=episodes, replicas=replicas) as bar,
     ):
         env = CommonsEnv(game, replicas, seed=seed)
-        train(env, {SEATS: agents}, episodes=episodes, observers=[table, bar])
-    save_weights(run, agents.networks())
+        train(env, {SEATS: agents}, episodes=episodes, observers=[table, bar], checkpoints=checkpoints)
+        recording.save_weights(run, agents.networks())
 
     fresh = CommonsEnv(game, replicas * evaluation_episodes, seed=seed + 1)
     trained = Seats({SEATS: agents.evaluation_actor(evaluation_episodes)})
@@ -69,8 +69,8 @@ def main(
         "random": evaluate(fresh, Seats(random(SEATS, evaluation_episodes))),
         "trained, epsilon 0.05": evaluate(fresh, trained, explore=True),
     }
-    figure = training_curve(run, title=title, random=played["random"])
-    summarise(run, title=title, played=played, figure=figure)
+    figure = recording.training_curve(run, title=title, random=played["random"])
+    recording.summarise(run, title=title, played=played, figure=figure)
     return run
 
 

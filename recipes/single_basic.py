@@ -81,7 +81,7 @@ def main(
     with (
         Watch(run, env, title=title, episodes=episodes, recipe=arguments, serve=watch == "serve") as viewer,
         EpisodeTable(run / "episodes.parquet") as table,
-        ProgressBar(episodes=episodes, episode_steps=game.rules.episode_steps, title="training") as bar,
+        ProgressBar(game, episodes=episodes) as bar,
     ):
         best = BestWeights(run, networks, policy=policy, env=trial, logger=viewer.logger)
         train(env, {0: learner}, episodes=episodes, observers=[table, viewer, best, bar])

@@ -12,10 +12,12 @@ from torchrl.objectives import DQNLoss
 
 from cprl.acting import QNetwork
 from cprl.acting.lanes import LaneQNetwork
-from cprl.learning import updates
+from cprl.learning import fused
 from cprl.learning.dqn import dqn_loss
-from cprl.learning.replay import LaneSampler, lane_buffer, storage_bytes
-from cprl.learning.updates import FunctionalUpdate, ListUpdate
+from cprl.learning.fused import FunctionalUpdate
+from cprl.learning.replay import LaneSampler, lane_buffer
+from cprl.learning.storage import storage_bytes
+from cprl.learning.updates import ListUpdate
 
 SHAPE = (3, 4, 5)
 ACTIONS = 6
@@ -242,7 +244,7 @@ def test_a_failing_compile_falls_back_with_one_warning(monkeypatch):
 
         return run
 
-    monkeypatch.setattr(updates.torch, "compile", broken)
+    monkeypatch.setattr(fused.torch, "compile", broken)
     way = COMPILED["lane axis, compiled"]
     with pytest.warns(RuntimeWarning, match="torch.compile failed, updates run uncompiled.*no C") as caught:
         update, _ = trained(way, [0, 1], steps=20)

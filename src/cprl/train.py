@@ -4,7 +4,9 @@ import logging
 from collections.abc import Mapping, Sequence
 from typing import Any, Protocol
 
+import numpy as np
 import torch
+from numpy.typing import NDArray
 from tensordict import TensorDictBase
 from torch import Tensor
 
@@ -12,54 +14,18 @@ from cprl.acting.collect import StepCollector
 from cprl.acting.seats import Seat, Seats, agents_at
 from cprl.envs.torchrl_env import CommonsEnv
 from cprl.learning.dqn import DQNLearner
-from cprl.learning.transitions import transitions_of
+from cprl.learning.learner import LaneLosses, Learner, seated
 from cprl.measuring.episodes import Episode, EpisodeTracker
 
 
-class Learner(Protocol):
-    """Who learns at some seats of each replica, as `LaneLearner` does."""
+class Keeper(Protocol):
+    """Who keeps the state of a training, as `cprl.recording.Checkpoints` does."""
 
-    actor: Any
-    """Chooses at these seats; its `epsilon` is told to observers."""
-    seats: tuple[int, ...]
-    replicas: int
+    def restore(self, training: "Training") -> None:
+        """Puts a new training where the last one was."""
 
-    def remember(self, batch: TensorDictBase) -> None:
-        """Stores a turn of every replica."""
-
-    def learn(self) -> Tensor | None:
-        """One update; losses [R, S], or None while too little is stored."""
-
-    def end_episode(self, ended: Tensor) -> None:
-        """An episode of the marked replicas has ended, bool [R]."""
-
-
-class OneAgent:
-    """A plain `DQNLearner` as a `Learner`: one agent of one replica.
-
-    Args:
-        learner: the agent.
-        agent: its number.
-    """
-
-    replicas = 1
-
-    def __init__(self, learner: DQNLearner, agent: int) -> None:
-        self.learner, self.actor = learner, learner.actor
-        self.seats: tuple[int, ...] = (agent,)
-
-    def remember(self, batch: TensorDictBase) -> None:
-        """See `Learner`."""
-        self.learner.remember(transitions_of(self.seats[0], batch))
-
-    def learn(self) -> Tensor | None:
-        """See `Learner`."""
-        loss = self.learner.learn()
-        return None if loss is None else torch.tensor([[loss]])
-
-    def end_episode(self, ended: Tensor) -> None:
-        """See `Learner`."""
-        self.learner.end_episode()
+    def after_step(self, training: "Training") -> None:
+        """Keeps the state, if it is time to."""
 
 
 class Observer(Protocol):
@@ -70,26 +36,6 @@ class Observer(Protocol):
 
     def see_episode(self, episode: Episode, learning: Mapping[str, float]) -> None:
         """An episode that ended, and how learning went in it: `agent_0/loss`, `agent_0/epsilon`, ..."""
-
-
-class _Losses:
-    """The losses of the agents at some seats since each replica's last episode ended."""
-
-    def __init__(self, replicas: int, agents: tuple[int, ...]) -> None:
-        self.agents = agents
-        self.total = torch.zeros((replicas, len(agents)), dtype=torch.float64)
-        self.updates = torch.zeros(replicas, dtype=torch.int64)
-
-    def add(self, loss: Tensor | None) -> None:
-        if loss is not None:
-            self.total += loss.cpu()
-            self.updates += 1
-
-    def take(self, replica: int) -> dict[int, float]:
-        """The mean loss of each agent of a replica, NaN before its first update; starts it anew."""
-        means = (self.total[replica] / self.updates[replica]).tolist()
-        self.total[replica], self.updates[replica] = 0.0, 0
-        return dict(zip(self.agents, means, strict=True))
 
 
 def prepare_process(seed: int) -> None:
@@ -104,15 +50,8 @@ def prepare_process(seed: int) -> None:
     logging.getLogger("torchrl").setLevel(logging.WARNING)
 
 
-def train(
-    env: CommonsEnv,
-    learners: Mapping[Seat, Learner | DQNLearner],
-    *,
-    episodes: int,
-    others: Mapping[Seat, torch.nn.Module] | None = None,
-    observers: Sequence[Observer] = (),
-) -> None:
-    """Plays so many episodes of every replica; each learner stores every turn and then learns once.
+class Training:
+    """A training that takes one step after the other, and whose whole state can be read and set.
 
     All replicas take each step together. One whose episodes are short goes on until the last has played
     its last; what it plays beyond `episodes` is not told to observers.
@@ -129,49 +68,130 @@ def train(
         ValueError: for seats that are empty or taken twice, another number of worlds than the learners
             have replicas, or no episodes.
     """
-    others = others or {}
-    seated = {seat: _seated(learner, seat) for seat, learner in learners.items()}
-    _check(env, seated, others, episodes)
-    replicas = env.batch_size.numel()
-    actors = {seat: learner.actor for seat, learner in seated.items()}
-    collector = StepCollector(env, Seats({**actors, **others}))
-    tracker = EpisodeTracker(replicas, env.game.agents, env.game.rules.episode_steps)
-    losses = {seat: _Losses(replicas, agents_at(seat)) for seat in seated}
-    played = [0] * replicas
-    try:
-        for batch in collector:
-            for seat, learner in seated.items():
-                learner.remember(batch)
-                losses[seat].add(learner.learn())
-            for observer in observers:
-                observer.see_turn(batch)
-            ended = tracker.add(batch)
-            if not ended:
-                continue
-            worlds = torch.zeros(replicas, dtype=torch.bool)
-            worlds[[episode.world for episode in ended]] = True
-            learning = [_learning(episode.world, seated, losses) for episode in ended]
-            for learner in seated.values():
-                learner.end_episode(worlds)
-            for episode, of_agents in zip(ended, learning, strict=True):
-                played[episode.world] += 1
-                if played[episode.world] <= episodes:
-                    for observer in observers:
-                        observer.see_episode(episode, of_agents)
-            if min(played) >= episodes:
-                break
-    finally:
-        collector.shutdown(close_env=False)
+
+    def __init__(
+        self,
+        env: CommonsEnv,
+        learners: Mapping[Seat, Learner | DQNLearner],
+        *,
+        episodes: int,
+        others: Mapping[Seat, torch.nn.Module] | None = None,
+        observers: Sequence[Observer] = (),
+    ) -> None:
+        self.env, self.episodes, self.observers = env, episodes, observers
+        self.others = dict(others or {})
+        self.learners = {seat: seated(learner, seat) for seat, learner in learners.items()}
+        _check(env, self.learners, self.others, episodes)
+        replicas = env.batch_size.numel()
+        actors = {seat: learner.actor for seat, learner in self.learners.items()}
+        self._collector = StepCollector(env, Seats({**actors, **self.others}))
+        self._turns = iter(self._collector)
+        self._tracker = EpisodeTracker(replicas, env.game.agents, env.game.rules.episode_steps)
+        self._losses = {seat: LaneLosses(replicas, agents_at(seat)) for seat in self.learners}
+        self._played = [0] * replicas
+        self.steps = 0
+
+    @property
+    def is_over(self) -> bool:
+        """Whether every replica has played its episodes."""
+        return min(self._played) >= self.episodes
+
+    def step(self) -> None:
+        """One turn of every replica: act, store, learn, measure, record."""
+        batch = next(self._turns)
+        self.steps += 1
+        for seat, learner in self.learners.items():
+            learner.remember(batch)
+            self._losses[seat].add(learner.learn())
+        for observer in self.observers:
+            observer.see_turn(batch)
+        ended = self._tracker.add(batch)
+        if ended:
+            self._end(ended)
+
+    def _end(self, ended: Sequence[Episode]) -> None:
+        worlds = torch.zeros(len(self._played), dtype=torch.bool)
+        worlds[[episode.world for episode in ended]] = True
+        learning = [_learning(episode.world, self.learners, self._losses) for episode in ended]
+        for learner in self.learners.values():
+            learner.end_episode(worlds)
+        for episode, of_agents in zip(ended, learning, strict=True):
+            self._played[episode.world] += 1
+            if self._played[episode.world] <= self.episodes:
+                for observer in self.observers:
+                    observer.see_episode(episode, of_agents)
+
+    def state_dict(self) -> dict[str, Any]:
+        """Everything that the future depends on, in tensors, numbers, lists and dicts; not copies."""
+        return {
+            "steps": self.steps,
+            "played": list(self._played),
+            "worlds": {name: _tensor(array) for name, array in self.env.worlds.state().items()},
+            "learners": [learner.state_dict() for learner in self.learners.values()],
+            "others": [dict(other.state_dict()) for other in self.others.values()],
+            "losses": [losses.state_dict() for losses in self._losses.values()],
+            "tracker": self._tracker.state_dict(),
+            "observers": [observer.state_dict() for observer in self._keeping()],
+            "torch": torch.get_rng_state(),
+        }
+
+    def _keeping(self) -> list[Any]:
+        """The observers that go on from a state, as a table does; others may change from run to run."""
+        return [observer for observer in self.observers if hasattr(observer, "load_state_dict")]
+
+    def load_state_dict(self, state: Mapping[str, Any]) -> None:
+        """Goes on exactly where the training of that state was, which was made with the same arguments."""
+        self.steps, self._played = int(state["steps"]), list(state["played"])
+        kinds = {name: array.dtype for name, array in self.env.worlds.state().items()}
+        worlds = {name: tensor.numpy().view(kinds[name]) for name, tensor in state["worlds"].items()}
+        self._collector.go_on_from(self.env.load(worlds))
+        for learner, own in zip(self.learners.values(), state["learners"], strict=True):
+            learner.load_state_dict(own)
+        for other, own in zip(self.others.values(), state["others"], strict=True):
+            other.load_state_dict(own)
+        for losses, own in zip(self._losses.values(), state["losses"], strict=True):
+            losses.load_state_dict(own)
+        self._tracker.load_state_dict(state["tracker"])
+        for observer, own in zip(self._keeping(), state["observers"], strict=True):
+            observer.load_state_dict(own)
+        torch.set_rng_state(state["torch"])
 
 
-def _seated(learner: Learner | DQNLearner, seat: Seat) -> Learner:
-    if isinstance(learner, DQNLearner):
-        return OneAgent(learner, agents_at(seat)[0])
-    return learner
+def train(
+    env: CommonsEnv,
+    learners: Mapping[Seat, Learner | DQNLearner],
+    *,
+    episodes: int,
+    others: Mapping[Seat, torch.nn.Module] | None = None,
+    observers: Sequence[Observer] = (),
+    checkpoints: Keeper | None = None,
+) -> None:
+    """Plays so many episodes of every replica; each learner stores every turn and then learns once.
+
+    Args:
+        env: see `Training`, also for the others.
+        learners: by where they sit.
+        episodes: how many to play.
+        others: the actors of the agents that do not learn.
+        observers: told of each turn and each episode.
+        checkpoints: where the training goes on from, and keeps its state now and then.
+    """
+    training = Training(env, learners, episodes=episodes, others=others, observers=observers)
+    if checkpoints is not None:
+        checkpoints.restore(training)
+    while not training.is_over:
+        training.step()
+        if checkpoints is not None:
+            checkpoints.after_step(training)
+
+
+def _tensor(array: NDArray[Any]) -> Tensor:
+    """The same bytes as a tensor; torch keeps unsigned numbers as signed ones."""
+    return torch.from_numpy(array.view(np.int64) if array.dtype == np.uint64 else array)
 
 
 def _learning(
-    replica: int, learners: Mapping[Seat, Learner], losses: Mapping[Seat, _Losses]
+    replica: int, learners: Mapping[Seat, Learner], losses: Mapping[Seat, LaneLosses]
 ) -> dict[str, float]:
     """How learning went in the episode of a replica that has just ended."""
     learning = {}

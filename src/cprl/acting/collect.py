@@ -39,6 +39,10 @@ class StepCollector(BaseCollector):
                 now, self._carrier = self.env.step_and_maybe_reset(self.policy(self._carrier))
             yield now
 
+    def go_on_from(self, moment: TensorDictBase) -> None:
+        """Steps on from a moment that the environment was put in, e.g. by `CommonsEnv.load`."""
+        self._carrier = moment
+
     def set_seed(self, seed: int, static_seed: bool = False) -> int:
         """Seeds the environment; returns the next seed."""
         return int(self.env.set_seed(seed, static_seed=static_seed))

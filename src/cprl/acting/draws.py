@@ -36,13 +36,26 @@ class LaneDraws:
     def state_dict(self) -> dict[str, Any]:
         """Where each lane's numbers stand."""
         return {
-            "chance": [chance.bit_generator.state for chance in self._chance],
-            "numbers": self._numbers.clone(),
+            "chance": [_plain(chance.bit_generator.state) for chance in self._chance],
+            "numbers": self._numbers,
             "used": self._used,
         }
 
     def load_state_dict(self, state: Mapping[str, Any]) -> None:
         """Goes on where the draws of that state were."""
         for chance, own in zip(self._chance, state["chance"], strict=True):
-            chance.bit_generator.state = own
+            chance.bit_generator.state = _arrays(own)
         self._numbers, self._used = state["numbers"].clone(), int(state["used"])
+
+
+def _plain(state: Any) -> Any:
+    """A generator's state in dicts, lists and numbers, which can be read back without running code."""
+    if isinstance(state, Mapping):
+        return {name: _plain(value) for name, value in state.items()}
+    return state.tolist() if isinstance(state, np.ndarray) else state
+
+
+def _arrays(state: Any) -> Any:
+    if isinstance(state, Mapping):
+        return {name: _arrays(value) for name, value in state.items()}
+    return np.array(state, np.uint64) if isinstance(state, list) else state

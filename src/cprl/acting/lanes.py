@@ -1,6 +1,7 @@
 """Lanes: the agents at some seats of every replica, acting at once. A lane is one agent of one replica."""
 
 from collections.abc import Callable, Sequence
+from typing import Any
 
 import torch
 from tensordict import TensorDictBase
@@ -120,6 +121,14 @@ class LaneActor(TensorDictModuleBase):
         assert best is not None
         chosen = best.view(self.replicas, self.seats, self.worlds).transpose(1, 2)
         return tensordict.set("action", chosen.reshape(-1, self.seats))
+
+    def get_extra_state(self) -> dict[str, Any]:
+        """Where its random numbers stand; part of `state_dict`."""
+        return self.draws.state_dict()
+
+    def set_extra_state(self, state: dict[str, Any]) -> None:
+        """See `get_extra_state`."""
+        self.draws.load_state_dict(state)
 
     def _best(self, observation: Tensor) -> Tensor:
         """The greedy actions of each lane, int64 [L, k]."""

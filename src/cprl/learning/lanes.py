@@ -1,8 +1,8 @@
 """LaneLearner: independent DQN agents at some seats of every replica, learning in one step."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from functools import partial
-from typing import Final, Literal, get_args
+from typing import Any, Final, Literal, get_args
 
 import numpy as np
 import torch
@@ -13,10 +13,12 @@ from cprl.acting.lanes import LaneActor
 from cprl.acting.networks import QNetwork
 from cprl.commons.game import Game
 from cprl.learning.dqn import dqn_loss
+from cprl.learning.functional import MakeLoss
+from cprl.learning.fused import FunctionalUpdate
 from cprl.learning.replay import lane_buffer
 from cprl.learning.settings import DQNSettings
 from cprl.learning.transitions import lane_transitions
-from cprl.learning.updates import FunctionalUpdate, ListUpdate, MakeLoss, Update
+from cprl.learning.updates import ListUpdate, Update
 
 Way = Literal["lane axis", "vmap", "list"]
 
@@ -155,6 +157,27 @@ class LaneLearner:
         due = ended & (self._episodes % self.settings.target_every_episodes == 0)
         if due.any():
             self.update.copy_to_targets(due.repeat_interleave(len(self.seats)))
+
+    def state_dict(self) -> dict[str, Any]:
+        """Everything that the future of all lanes depends on; own tensors, not copies."""
+        return {
+            "update": self.update.state_dict(),
+            "storage": self.buffer.storage.state_dict(),
+            "sampler": self.buffer.sampler.state_dict(),
+            "exploration": self.actor.draws.state_dict(),
+            "steps": self.steps,
+            "episodes": self._episodes,
+        }
+
+    def load_state_dict(self, state: Mapping[str, Any]) -> None:
+        """Goes on where the learner of that state was, which was made with the same arguments."""
+        self.update.load_state_dict(state["update"])
+        self.buffer.storage.load_state_dict(state["storage"])
+        self.buffer.sampler.load_state_dict(state["sampler"])
+        self.actor.draws.load_state_dict(state["exploration"])
+        self.steps = int(state["steps"])
+        self.actor.epsilon = self.settings.epsilon(self.steps)
+        self._episodes = state["episodes"].clone()
 
 
 def _network(game: Game, settings: DQNSettings) -> QNetwork:

@@ -1,41 +1,26 @@
-"""One update of many independent learners, in three ways that are equally right.
+"""One update of many independent learners: what it is, and the plain way.
 
-Each lane has a loss module of TorchRL's that a recipe names. `FunctionalUpdate` runs the lanes as one: with
-a lane axis in the network where it is ours, else by `torch.vmap` over the loss of the user's own network.
+Each lane has a loss module of TorchRL's that a recipe names. `cprl.learning.fused` runs the lanes as one:
+with a lane axis in the network where it is ours, else by `torch.vmap` over the loss of the user's own.
 `ListUpdate` runs a plain list of loss modules, for losses with which neither works, and as the reference.
 """
 
-import gc
-import warnings
-from collections.abc import Callable, Sequence
-from copy import deepcopy
-from types import FunctionType
+from collections.abc import Mapping, Sequence
 from typing import Any, Protocol
 
 import torch
-from tensordict import TensorDict, TensorDictBase
-from tensordict.nn import TensorDictParams
+from tensordict import TensorDictBase
 from torch import Tensor, nn
 from torchrl.data.replay_buffers import ReplayBuffer
-from torchrl.objectives import LossModule
 
-from cprl.acting.lanes import LaneQNetwork
-from cprl.learning.replay import LaneStorage, gather
-
-MakeLoss = Callable[[nn.Module], LossModule]
-"""A per-agent loss out of a network; see `cprl.learning.dqn.dqn_loss`."""
-
-Weights = dict[str, Tensor]
-
-BETA_1, BETA_2 = 0.9, 0.999
-"""Adam's decay rates (Kingma and Ba 2015, the defaults of torch)."""
-
-
-OPTIONS: dict[str, Any] = {
-    "cpp_wrapper": True,
-    "guard_filter_fn": torch.compiler.skip_all_guards_unsafe,
-}
-"""Of torch.compile. Guards cost a quarter of the step at 16 lanes; `_forms` looks at all that may change."""
+from cprl.learning.functional import (
+    MakeLoss,
+    Weights,
+    flat,
+    params_of,
+    promise_targets,
+    total,
+)
 
 
 class Update(Protocol):
@@ -55,6 +40,12 @@ class Update(Protocol):
 
     def weights(self, lane: int) -> Weights:
         """Copies of all weights of one lane, targets too, by the names in the loss."""
+
+    def state_dict(self) -> dict[str, Any]:
+        """Everything that the next update depends on, but for the buffer; own tensors, not copies."""
+
+    def load_state_dict(self, state: Mapping[str, Any]) -> None:
+        """Goes on where the update of that state was."""
 
 
 class ListUpdate:
@@ -82,10 +73,10 @@ class ListUpdate:
         self._networks = networks
         self.losses = [make_loss(network) for network in networks]
         for loss in self.losses:
-            _promise_targets(loss)
+            promise_targets(loss)
         self._share = loss_share
         for loss, network in zip(self.losses, target_networks or (), strict=False):
-            for name, values in _params(make_loss(network)).items():
+            for name, values in params_of(make_loss(network)).items():
                 getattr(loss, f"target_{name}").data.copy_(values.data)
         self._adams = [
             torch.optim.Adam(loss.parameters(), lr=learning_rate, eps=adam_eps, fused=True)
@@ -98,7 +89,7 @@ class ListUpdate:
         return torch.stack([self._learn(lane, batch[lane]) for lane in range(len(self.losses))])
 
     def _learn(self, lane: int, batch: TensorDictBase) -> Tensor:
-        loss = _total(self.losses[lane](batch)) * self._share
+        loss = total(self.losses[lane](batch)) * self._share
         self._adams[lane].zero_grad()
         loss.backward()  # type: ignore[no-untyped-call]
         self._adams[lane].step()
@@ -112,7 +103,7 @@ class ListUpdate:
         """See `Update`."""
         for lane in which.nonzero().flatten().tolist():
             loss = self.losses[lane]
-            for name in _params(loss):
+            for name in params_of(loss):
                 getattr(loss, f"target_{name}").data.copy_(getattr(loss, name).data)
 
     def network_state(self, lane: int) -> Weights:
@@ -121,259 +112,18 @@ class ListUpdate:
 
     def weights(self, lane: int) -> Weights:
         """See `Update`."""
-        return _flat(_params(self.losses[lane], targets=True))
+        return flat(params_of(self.losses[lane], targets=True))
 
-
-class FunctionalUpdate:
-    """All lanes at once: gathering, TorchRL's loss, its gradient and Adam as one step, compiled if wanted.
-
-    Where a loss sees the lane axis it stays ordinary: it is asked for one loss for each transition, which
-    is averaged over the batch and summed over lanes, so that each lane's gradient is exactly its own.
-
-    Args:
-        networks: of the lanes, of one form; their weights are copied.
-        make_loss: a lane's loss out of its network.
-        target_networks: where targets start; by default as copies.
-        learning_rate: Adam's step size.
-        adam_eps: Adam's epsilon.
-        loss_share: by which each loss is multiplied.
-        lane_axis: whether the networks are stacked into a `LaneQNetwork`, else the loss is vmapped.
-        compile: whether the step is compiled by torch; where that fails a warning says so once, and the
-            step runs as it is.
-    """
-
-    def __init__(
-        self,
-        networks: Sequence[nn.Module],
-        make_loss: MakeLoss,
-        *,
-        target_networks: Sequence[nn.Module] | None = None,
-        learning_rate: float,
-        adam_eps: float = 1e-8,
-        loss_share: float = 1.0,
-        lane_axis: bool,
-        compile: bool = True,
-    ) -> None:
-        def of(some: Sequence[nn.Module]) -> tuple[LossModule, dict[str, Weights]]:
-            return _stacked(some, make_loss, lane_axis=lane_axis)
-
-        self.lanes = len(networks)
-        self._network = LaneQNetwork(networks) if lane_axis else deepcopy(networks[0])  # type: ignore[arg-type]
-        loss, groups = of(networks)
-        own = {name: group for name, group in groups.items() if not name.startswith("target_")}
-        targets = {name: group for name, group in groups.items() if name.startswith("target_")}
-        if target_networks is not None:
-            _, others = of(target_networks)
-            targets = {name: others[name.removeprefix("target_")] for name in targets}
-        self.loss = FunctionalLoss(loss)
-        self.own = {f"{name}:{key}": value for name, group in own.items() for key, value in group.items()}
-        self.targets = {
-            f"{name}:{key}": value.clone() for name, group in targets.items() for key, value in group.items()
+    def state_dict(self) -> dict[str, Any]:
+        """See `Update`."""
+        return {
+            "losses": [dict(loss.state_dict()) for loss in self.losses],
+            "adams": [adam.state_dict() for adam in self._adams],
         }
-        self._shared = _weights_of(self._network, self.own)
-        if lane_axis:  # acts by the very tensors that learning changes
-            for name, parameter in self._network.named_parameters():
-                parameter.requires_grad_(False).data = self._shared[name]
-        self._mean = {name: torch.zeros_like(value) for name, value in self.own.items()}
-        self._square = {name: torch.zeros_like(value) for name, value in self.own.items()}
-        self.steps = 0
-        self._learning_rate, self._adam_eps, self._share = learning_rate, adam_eps, loss_share
-        self._vmapped = not lane_axis
-        self._compiles = compile
-        self._compiled: Callable[..., Tensor] | None = None
-        self._compiled_for: tuple[object, ...] = ()
 
-    def learn(self, buffer: ReplayBuffer) -> Tensor:
+    def load_state_dict(self, state: Mapping[str, Any]) -> None:
         """See `Update`."""
-        storage: LaneStorage = buffer.storage
-        index = buffer.sampler.draw(storage)
-        self.steps += 1
-        arguments = storage.fields, storage.rows, index, *self._adam_scalars()
-        if not self._compiles:
-            return self._step(*arguments)
-        if self._compiled is not None and self._compiled_for == _forms(storage, index):
-            return self._compiled(self, *arguments)
-        self._compiled_for = _forms(storage, index)
-        return self._compile_and_step(*arguments)
-
-    def _compile_and_step(self, *arguments: Any) -> Tensor:
-        """The first step of these forms; where it cannot be compiled, nothing has been changed yet."""
-        self._compiled = torch.compile(_own_code(FunctionalUpdate._step), fullgraph=True, options=OPTIONS)
-        try:
-            with warnings.catch_warnings():
-                for kind in (DeprecationWarning, FutureWarning):  # torch's and TorchRL's own affairs
-                    warnings.simplefilter("ignore", kind)
-                losses = self._compiled(self, *arguments)
-        except Exception as error:
-            self._compiles = False
-            warnings.warn(
-                f"torch.compile failed, updates run uncompiled and several times slower: {error}",
-                RuntimeWarning,
-                stacklevel=3,
-            )
-            return self._step(*arguments)
-        # A compiler leaves millions of objects that stay; without this Python's garbage collector looks
-        # through them again and again, which takes up to a third of a training.
-        gc.collect()
-        gc.freeze()
-        return losses
-
-    def _adam_scalars(self) -> tuple[Tensor, Tensor]:
-        """Adam's two bias corrections, computed here once instead of for every weight in the graph."""
-        kind = next(iter(self.own.values()))
-        size = self._learning_rate / (1 - BETA_1**self.steps)
-        scale = (1 - BETA_2**self.steps) ** -0.5
-        return kind.new_tensor(size), kind.new_tensor(scale)
-
-    def _step(
-        self, fields: dict[str, Tensor], rows: int, index: Tensor, step_size: Tensor, scale: Tensor
-    ) -> Tensor:
-        batch = gather(fields, index, rows)
-        gradient = torch.func.grad(self._lane_losses, has_aux=True)
-        if self._vmapped:
-            gradient = torch.vmap(gradient)
-        gradients: Weights
-        losses: Tensor
-        gradients, losses = gradient(self.own, self.targets, batch)
-        for name, weight in self.own.items():
-            slope, mean, square = gradients[name], self._mean[name], self._square[name]
-            mean.mul_(BETA_1).add_(slope, alpha=1 - BETA_1)
-            square.mul_(BETA_2).addcmul_(slope, slope, value=1 - BETA_2)
-            weight.sub_(step_size * mean / (square.sqrt() * scale + self._adam_eps))
-        return losses
-
-    def _lane_losses(self, own: Weights, targets: Weights, batch: TensorDict) -> tuple[Tensor, Tensor]:
-        """The sum over lanes, for its gradient, and each lane's loss; under vmap there is one lane."""
-        losses = self.loss(own, targets, batch).mean(-1) * self._share
-        return losses.sum(), losses
-
-    def outputs(self, observation: Tensor) -> Tensor:
-        """See `Update`."""
-
-        if not self._vmapped:
-            given: Tensor = self._network(observation)
-            return given
-
-        def output(weights: Weights, seen: Tensor) -> Tensor:
-            one: Tensor = torch.func.functional_call(self._network, weights, (seen,))
-            return one
-
-        return torch.vmap(output)(self._shared, observation)
-
-    def copy_to_targets(self, which: Tensor) -> None:
-        """See `Update`."""
-        for name, target in self.targets.items():
-            target[which] = self.own[name.removeprefix("target_")][which]
-
-    def network_state(self, lane: int) -> Weights:
-        """See `Update`."""
-        if isinstance(self._network, LaneQNetwork):
-            return self._network.lane_state(lane)
-        return {name: value[lane].clone() for name, value in self._shared.items()}
-
-    def weights(self, lane: int) -> Weights:
-        """See `Update`."""
-        return {name: value[lane].clone() for name, value in {**self.own, **self.targets}.items()}
-
-
-class FunctionalLoss:
-    """A loss module of TorchRL's as a function of its weights, one loss for each transition.
-
-    TorchRL keeps a loss's weights in `TensorDictParams` of the module; here plain TensorDicts take their
-    place during a call, which both `torch.func` and `torch.compile` accept.
-
-    Args:
-        loss: the module; its own weights are taken out.
-    """
-
-    def __init__(self, loss: LossModule) -> None:
-        loss.reduction = "none"
-        loss.in_keys  # noqa: B018  (made when first asked for, which a compiler would see as a change)
-        loss.value_estimator  # noqa: B018
-        self._names = tuple(_params(loss, targets=True))
-        for name in self._names:
-            del loss._modules[name]
-            loss.__dict__[name] = None
-        self.module = loss
-
-    def __call__(self, own: Weights, targets: Weights, batch: TensorDict) -> Tensor:
-        """The loss of each transition, [L, b], or [b] under vmap."""
-        flat = {**own, **targets}
-        for name in self._names:
-            mine = f"{name}:"
-            group = {key.removeprefix(mine): flat[key] for key in flat if key.startswith(mine)}
-            setattr(self.module, name, TensorDict(group, []).unflatten_keys("."))
-        losses = _total(self.module(batch))
-        for name in self._names:
-            setattr(self.module, name, None)
-        return losses
-
-
-def _promise_targets(loss: LossModule) -> None:
-    """TorchRL warns of targets that no updater of its own replaces; here `copy_to_targets` does."""
-    for name in loss._has_update_associated:
-        loss._has_update_associated[name] = True
-
-
-def _total(out: TensorDictBase) -> Tensor:
-    """The sum of all entries that TorchRL calls a loss."""
-    losses = [value for key, value in out.items() if key.startswith("loss")]
-    total: Tensor = sum(losses[1:], losses[0])
-    return total
-
-
-def _params(loss: LossModule, *, targets: bool = False) -> dict[str, TensorDictParams]:
-    """The groups of weights of a loss by name, without those of targets unless asked for."""
-    groups = {name: child for name, child in loss._modules.items() if isinstance(child, TensorDictParams)}
-    return {name: group for name, group in groups.items() if targets or not name.startswith("target_")}
-
-
-def _flat(groups: dict[str, TensorDictParams]) -> Weights:
-    return {
-        f"{name}:{key}": value.detach().clone()
-        for name, group in groups.items()
-        for key, value in group.flatten_keys(".").items()
-    }
-
-
-def _weights_of(network: nn.Module, own: Weights) -> Weights:
-    """The network's weights by its own names, the same tensors as in the loss."""
-    found = {}
-    for name, _ in network.named_parameters():
-        matching = [value for key, value in own.items() if key.endswith(f".{name}")]
-        if len(matching) != 1:
-            raise ValueError(f"{len(matching)} weights of the loss are called {name}; one is wanted")
-        found[name] = matching[0]
-    return found
-
-
-def _stacked(
-    networks: Sequence[nn.Module], make_loss: MakeLoss, *, lane_axis: bool
-) -> tuple[LossModule, dict[str, Weights]]:
-    """A loss, and its groups of weights with the lanes' axis in front."""
-    if lane_axis:
-        losses = [make_loss(LaneQNetwork(networks))]  # type: ignore[arg-type]
-    else:
-        losses = [make_loss(network) for network in networks]
-    for loss in losses:
-        _promise_targets(loss)
-    groups: dict[str, Weights] = {}
-    for name in _params(losses[0], targets=True):
-        each = [dict(getattr(loss, name).flatten_keys(".").items()) for loss in losses]
-        groups[name] = {
-            key: (value if lane_axis else torch.stack([one[key].detach() for one in each])).detach().clone()
-            for key, value in each[0].items()
-        }
-    return losses[0], groups
-
-
-def _forms(storage: LaneStorage, index: Tensor) -> tuple[object, ...]:
-    """What the compiled step takes for granted of its arguments; its own tensors never change their form."""
-    return storage.rows, index.shape, *((field.shape, field.dtype) for field in storage.fields.values())
-
-
-def _own_code(function: Any) -> Callable[..., Tensor]:
-    """The same function with a code object of its own: torch keeps what it compiled by code object, and
-    would take learners of another size for a change of shapes."""
-    code = function.__code__.replace(co_name=f"{function.__name__}_of_one_learner")
-    return FunctionType(code, function.__globals__, code.co_name)
+        for loss, own in zip(self.losses, state["losses"], strict=True):
+            loss.load_state_dict(own)
+        for adam, own in zip(self._adams, state["adams"], strict=True):
+            adam.load_state_dict(own)

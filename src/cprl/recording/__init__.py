@@ -1,5 +1,6 @@
 """What is kept of a run: its recipe, its table of episodes, its recording, figures and weights."""
 
+from cprl.recording.checkpoints import Checkpoints
 from cprl.recording.figures import training_curve
 from cprl.recording.progress import ProgressBar
 from cprl.recording.rerun import RerunLogger
@@ -11,6 +12,7 @@ from cprl.recording.weights import BestWeights, load_weights, restore_weights, s
 
 __all__ = [
     "BestWeights",
+    "Checkpoints",
     "EpisodeTable",
     "ProgressBar",
     "RerunLogger",

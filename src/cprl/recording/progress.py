@@ -9,6 +9,7 @@ from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 from tensordict import TensorDictBase
 
+from cprl.commons.game import Game
 from cprl.measuring.episodes import Episode
 
 _BAR_PERIOD_S: Final = 0.25
@@ -23,8 +24,8 @@ class ProgressBar:
     context manager.
 
     Args:
+        game: what is played; its clock says how long an episode is.
         episodes: how many there will be.
-        episode_steps: the length of an episode that its clock ends.
         title: what is going on.
         replicas: how many replicas play them side by side.
         console: where to; by default standard output.
@@ -32,15 +33,15 @@ class ProgressBar:
 
     def __init__(
         self,
+        game: Game,
         *,
         episodes: int,
-        episode_steps: int,
-        title: str,
+        title: str = "training",
         replicas: int = 1,
         console: Console | None = None,
     ) -> None:
         self.console = console or Console()
-        self._title, self._episode_steps = title, episode_steps
+        self._title, self._episode_steps = title, game.rules.episode_steps
         self._progress = Progress(
             TextColumn("{task.description}"),
             BarColumn(),

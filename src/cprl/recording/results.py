@@ -52,20 +52,52 @@ class EpisodeTable:
 
     Args:
         path: the parquet file to be, `episodes.parquet` in a run's directory.
+        go_on: whether a journal that is there is gone on with, see `load_state_dict`; then an error in the
+            block leaves the journal as it is.
 
     Raises:
         FileExistsError: where there is a table already: nothing is ever written over.
     """
 
-    def __init__(self, path: str | os.PathLike[str]) -> None:
+    def __init__(self, path: str | os.PathLike[str], *, go_on: bool = False) -> None:
         self.path = Path(path)
         self.journal = _journal_of(self.path)
-        for table in (self.path, self.journal):
+        self._goes_on = go_on
+        for table in (self.path,) if go_on else (self.path, self.journal):
             if table.exists():
                 raise FileExistsError(f"{table} exists and is kept; give the table a directory of its own")
-        self._file = FileIO(self.journal, "x")  # not buffered: what is written has left this process
+        exists = self.journal.exists()
+        # Not buffered: what is written has left this process.
+        self._file = FileIO(self.journal, "r+" if exists else "x")
         self._schema: pa.Schema | None = None
         self._rows = 0
+        self._is_placed = not exists
+
+    def state_dict(self) -> dict[str, int]:
+        """How many rows it has."""
+        return {"rows": self._rows}
+
+    def load_state_dict(self, state: Mapping[str, int]) -> None:
+        """Goes on behind so many rows of its journal; what stands behind them is forgotten.
+
+        Raises:
+            ValueError: where the journal has fewer rows, or a batch of rows ends elsewhere.
+        """
+        rows, found, end = int(state["rows"]), 0, 0
+        schema = None
+        if rows:
+            with pa.OSFile(str(self.journal)) as source:
+                schema, batches = _read_journal(source)
+                for batch in batches:
+                    found += batch.num_rows
+                    end = source.tell()
+                    if found >= rows:
+                        break
+        if found != rows:
+            raise ValueError(f"{self.journal} holds {found} rows up to there; the checkpoint says {rows}")
+        self._file.truncate(end)
+        self._file.seek(end)
+        self._schema, self._rows, self._is_placed = schema, rows, True
 
     def add(self, *episodes: Episode, replica: int | None = None) -> None:
         """Appends episodes, whose metrics must have the same names in all of a table.
@@ -75,6 +107,8 @@ class EpisodeTable:
         """
         if not episodes:
             return
+        if not self._is_placed:  # nothing says how far the last run was kept: it begins anew
+            self.load_state_dict({"rows": 0})
         if self._schema is None:
             self._begin(episodes[0].metrics)
         rows = _rows(episodes, replica, self._schema)
@@ -116,7 +150,10 @@ class EpisodeTable:
         error: BaseException | None,
         traceback: TracebackType | None,
     ) -> None:
-        self.close()
+        if self._goes_on and error is not None:
+            self._file.close()
+        else:
+            self.close()
 
     def _begin(self, metrics: Iterable[str]) -> None:
         schema = _schema(metrics)

@@ -25,13 +25,14 @@ PACKAGES: Final = ("cprl", "torch", "torchrl", "tensordict", "numpy", "numba", "
 """The packages whose versions are kept."""
 
 
-def start_run(out: Path | None, name: str, recipe: Mapping[str, object]) -> Path:
+def start_run(out: Path | None, name: str, recipe: Mapping[str, object], *, go_on: bool = False) -> Path:
     """Makes the directory of a run and writes down what is about to happen.
 
     Args:
         out: the directory, new or empty; None for `runs/<name>-<YYYYmmdd-HHMMSS>` where we stand.
         name: the recipe's name.
         recipe: its arguments by name, of the types that `to_jsonable` takes.
+        go_on: whether the run in `out` is gone on with, which was stopped and has the same recipe.
 
     Returns:
         The directory. Its `recipe.json` holds the recipe's name, the arguments, versions, the git commit of
@@ -39,11 +40,14 @@ def start_run(out: Path | None, name: str, recipe: Mapping[str, object]) -> Path
         time and the command.
 
     Raises:
-        FileExistsError: where `out` is not empty.
-        ValueError: where the name cannot be that of a directory.
+        FileExistsError: where `out` is not empty, unless it is gone on with.
+        ValueError: where the name cannot be that of a directory; where there is nothing to go on with, or
+            the run was made with another recipe.
     """
     if Path(name).name != name:
         raise ValueError(f'"{name}" names a recipe; a name without slashes is wanted')
+    if go_on:
+        return _same_run(out, name, to_jsonable(recipe))
     started = datetime.now().astimezone()
     told = {
         "recipe": name,
@@ -56,6 +60,51 @@ def start_run(out: Path | None, name: str, recipe: Mapping[str, object]) -> Path
     directory = _new_directory(name, started) if out is None else _empty_directory(Path(out))
     write_atomically(directory / FILE_NAME, json.dumps(told, indent=2, allow_nan=False) + "\n")
     return directory
+
+
+def go_on_line(run: Path) -> str:
+    """The command line that goes on with a run which this process began, or went on with."""
+    given, left = list(sys.argv), []
+    while given:
+        word = given.pop(0)
+        if word == "--out" and given:
+            given.pop(0)
+        elif word not in ("--go-on", "--no-go-on") and not word.startswith("--out="):
+            left.append(word)
+    return shlex.join([sys.executable, *left, "--out", str(run), "--go-on"])
+
+
+def read_recipe(run: Path) -> dict[str, Any]:
+    """What `start_run` wrote.
+
+    Raises:
+        ValueError: where there is no run, or its recipe cannot be read; names file and reason.
+    """
+    path = Path(run) / FILE_NAME
+    try:
+        told: dict[str, Any] = json.loads(path.read_text(encoding="utf-8"))
+        if not isinstance(told["arguments"], dict):
+            raise TypeError('"arguments" is no table')
+    except (OSError, ValueError, KeyError, TypeError) as error:
+        raise ValueError(f"{path} is no recipe of a run: {error!r}") from error
+    return told
+
+
+def _same_run(out: Path | None, name: str, arguments: Any) -> Path:
+    """The directory of a stopped run, if it is of this recipe."""
+    if out is None:
+        raise ValueError("go_on wants the directory of the run as out")
+    told = read_recipe(Path(out))
+    if told.get("recipe") != name:
+        raise ValueError(f"{out} is a run of {told.get('recipe')!r}; this is {name!r}")
+    came, kept = json.loads(json.dumps(arguments)), told["arguments"]
+    changed = [key for key in {**kept, **came} if kept.get(key) != came.get(key)]
+    if changed:
+        raise ValueError(
+            f"{out} was begun with other arguments: "
+            + "; ".join(f"{key} {kept.get(key)} then, {came.get(key)} now" for key in changed)
+        )
+    return Path(out)
 
 
 def to_jsonable(value: object) -> Any:

@@ -1,0 +1,214 @@
+"""FunctionalUpdate: one update of many independent learners as one compiled step."""
+
+import gc
+import warnings
+from collections.abc import Callable, Mapping, Sequence
+from copy import deepcopy
+from types import FunctionType
+from typing import Any
+
+import torch
+from tensordict import TensorDict
+from torch import Tensor, nn
+from torchrl.data.replay_buffers import ReplayBuffer
+from torchrl.objectives import LossModule
+
+from cprl.acting.lanes import LaneQNetwork
+from cprl.learning.functional import FunctionalLoss, MakeLoss, Weights, stacked, weights_of
+from cprl.learning.storage import LaneStorage, gather
+
+BETA_1, BETA_2 = 0.9, 0.999
+"""Adam's decay rates (Kingma and Ba 2015, the defaults of torch)."""
+
+
+OPTIONS: dict[str, Any] = {
+    "cpp_wrapper": True,
+    "guard_filter_fn": torch.compiler.skip_all_guards_unsafe,
+}
+"""Of torch.compile. Guards cost a quarter of the step at 16 lanes; `_forms` looks at all that may change."""
+
+
+class FunctionalUpdate:
+    """All lanes at once: gathering, TorchRL's loss, its gradient and Adam as one step, compiled if wanted.
+
+    Where a loss sees the lane axis it stays ordinary: it is asked for one loss for each transition, which
+    is averaged over the batch and summed over lanes, so that each lane's gradient is exactly its own.
+
+    Args:
+        networks: of the lanes, of one form; their weights are copied.
+        make_loss: a lane's loss out of its network.
+        target_networks: where targets start; by default as copies.
+        learning_rate: Adam's step size.
+        adam_eps: Adam's epsilon.
+        loss_share: by which each loss is multiplied.
+        lane_axis: whether the networks are stacked into a `LaneQNetwork`, else the loss is vmapped.
+        compile: whether the step is compiled by torch; where that fails a warning says so once, and the
+            step runs as it is.
+    """
+
+    def __init__(
+        self,
+        networks: Sequence[nn.Module],
+        make_loss: MakeLoss,
+        *,
+        target_networks: Sequence[nn.Module] | None = None,
+        learning_rate: float,
+        adam_eps: float = 1e-8,
+        loss_share: float = 1.0,
+        lane_axis: bool,
+        compile: bool = True,
+    ) -> None:
+        def of(some: Sequence[nn.Module]) -> tuple[LossModule, dict[str, Weights]]:
+            return stacked(some, make_loss, lane_axis=lane_axis)
+
+        self.lanes = len(networks)
+        self._network = LaneQNetwork(networks) if lane_axis else deepcopy(networks[0])  # type: ignore[arg-type]
+        loss, groups = of(networks)
+        own = {name: group for name, group in groups.items() if not name.startswith("target_")}
+        targets = {name: group for name, group in groups.items() if name.startswith("target_")}
+        if target_networks is not None:
+            _, others = of(target_networks)
+            targets = {name: others[name.removeprefix("target_")] for name in targets}
+        self.loss = FunctionalLoss(loss)
+        self.own = {f"{name}:{key}": value for name, group in own.items() for key, value in group.items()}
+        self.targets = {
+            f"{name}:{key}": value.clone() for name, group in targets.items() for key, value in group.items()
+        }
+        self._shared = weights_of(self._network, self.own)
+        if lane_axis:  # acts by the very tensors that learning changes
+            for name, parameter in self._network.named_parameters():
+                parameter.requires_grad_(False).data = self._shared[name]
+        self._mean = {name: torch.zeros_like(value) for name, value in self.own.items()}
+        self._square = {name: torch.zeros_like(value) for name, value in self.own.items()}
+        self.steps = 0
+        self._learning_rate, self._adam_eps, self._share = learning_rate, adam_eps, loss_share
+        self._vmapped = not lane_axis
+        self._compiles = compile
+        self._compiled: Callable[..., Tensor] | None = None
+        self._compiled_for: tuple[object, ...] = ()
+
+    def learn(self, buffer: ReplayBuffer) -> Tensor:
+        """See `Update`."""
+        storage: LaneStorage = buffer.storage
+        index = buffer.sampler.draw(storage)
+        self.steps += 1
+        arguments = storage.fields, storage.rows, index, *self._adam_scalars()
+        if not self._compiles:
+            return self._step(*arguments)
+        if self._compiled is not None and self._compiled_for == _forms(storage, index):
+            return self._compiled(self, *arguments)
+        self._compiled_for = _forms(storage, index)
+        return self._compile_and_step(*arguments)
+
+    def _compile_and_step(self, *arguments: Any) -> Tensor:
+        """The first step of these forms; where it cannot be compiled, nothing has been changed yet."""
+        self._compiled = torch.compile(_own_code(FunctionalUpdate._step), fullgraph=True, options=OPTIONS)
+        try:
+            with warnings.catch_warnings():
+                for kind in (DeprecationWarning, FutureWarning):  # torch's and TorchRL's own affairs
+                    warnings.simplefilter("ignore", kind)
+                losses = self._compiled(self, *arguments)
+        except Exception as error:
+            self._compiles = False
+            warnings.warn(
+                f"torch.compile failed, updates run uncompiled and several times slower: {error}",
+                RuntimeWarning,
+                stacklevel=3,
+            )
+            return self._step(*arguments)
+        # A compiler leaves millions of objects that stay; without this Python's garbage collector looks
+        # through them again and again, which takes up to a third of a training.
+        gc.collect()
+        gc.freeze()
+        return losses
+
+    def _adam_scalars(self) -> tuple[Tensor, Tensor]:
+        """Adam's two bias corrections, computed here once instead of for every weight in the graph."""
+        kind = next(iter(self.own.values()))
+        size = self._learning_rate / (1 - BETA_1**self.steps)
+        scale = (1 - BETA_2**self.steps) ** -0.5
+        return kind.new_tensor(size), kind.new_tensor(scale)
+
+    def _step(
+        self, fields: dict[str, Tensor], rows: int, index: Tensor, step_size: Tensor, scale: Tensor
+    ) -> Tensor:
+        batch = gather(fields, index, rows)
+        gradient = torch.func.grad(self._lane_losses, has_aux=True)
+        if self._vmapped:
+            gradient = torch.vmap(gradient)
+        gradients: Weights
+        losses: Tensor
+        gradients, losses = gradient(self.own, self.targets, batch)
+        for name, weight in self.own.items():
+            slope, mean, square = gradients[name], self._mean[name], self._square[name]
+            mean.mul_(BETA_1).add_(slope, alpha=1 - BETA_1)
+            square.mul_(BETA_2).addcmul_(slope, slope, value=1 - BETA_2)
+            weight.sub_(step_size * mean / (square.sqrt() * scale + self._adam_eps))
+        return losses
+
+    def _lane_losses(self, own: Weights, targets: Weights, batch: TensorDict) -> tuple[Tensor, Tensor]:
+        """The sum over lanes, for its gradient, and each lane's loss; under vmap there is one lane."""
+        losses = self.loss(own, targets, batch).mean(-1) * self._share
+        return losses.sum(), losses
+
+    def outputs(self, observation: Tensor) -> Tensor:
+        """See `Update`."""
+
+        if not self._vmapped:
+            given: Tensor = self._network(observation)
+            return given
+
+        def output(weights: Weights, seen: Tensor) -> Tensor:
+            one: Tensor = torch.func.functional_call(self._network, weights, (seen,))
+            return one
+
+        return torch.vmap(output)(self._shared, observation)
+
+    def copy_to_targets(self, which: Tensor) -> None:
+        """See `Update`."""
+        for name, target in self.targets.items():
+            target[which] = self.own[name.removeprefix("target_")][which]
+
+    def network_state(self, lane: int) -> Weights:
+        """See `Update`."""
+        if isinstance(self._network, LaneQNetwork):
+            return self._network.lane_state(lane)
+        return {name: value[lane].clone() for name, value in self._shared.items()}
+
+    def weights(self, lane: int) -> Weights:
+        """See `Update`."""
+        return {name: value[lane].clone() for name, value in {**self.own, **self.targets}.items()}
+
+    def state_dict(self) -> dict[str, Any]:
+        """See `Update`."""
+        return {
+            "own": self.own,
+            "targets": self.targets,
+            "mean": self._mean,
+            "square": self._square,
+            "steps": self.steps,
+        }
+
+    def load_state_dict(self, state: Mapping[str, Any]) -> None:
+        """See `Update`; copies into the tensors that a compiled step knows."""
+        groups = {"own": self.own, "targets": self.targets, "mean": self._mean, "square": self._square}
+        for group, tensors in groups.items():
+            if set(state[group]) != set(tensors):
+                raise ValueError(
+                    f"the state has the weights {sorted(state[group])}; {sorted(tensors)} is wanted"
+                )
+            for name, tensor in tensors.items():
+                tensor.copy_(state[group][name])
+        self.steps = int(state["steps"])
+
+
+def _forms(storage: LaneStorage, index: Tensor) -> tuple[object, ...]:
+    """What the compiled step takes for granted of its arguments; its own tensors never change their form."""
+    return storage.rows, index.shape, *((field.shape, field.dtype) for field in storage.fields.values())
+
+
+def _own_code(function: Any) -> Callable[..., Tensor]:
+    """The same function with a code object of its own: torch keeps what it compiled by code object, and
+    would take learners of another size for a change of shapes."""
+    code = function.__code__.replace(co_name=f"{function.__name__}_of_one_learner")
+    return FunctionType(code, function.__globals__, code.co_name)

@@ -1,0 +1,113 @@
+"""Who learns: what the training loop wants of a learner, and a plain agent as one."""
+
+from collections.abc import Mapping
+from typing import Any, Protocol
+
+import torch
+from tensordict import TensorDictBase
+from torch import Tensor
+
+from cprl.acting.seats import Seat, agents_at
+from cprl.learning.dqn import DQNLearner
+from cprl.learning.transitions import transitions_of
+
+
+class Learner(Protocol):
+    """Who learns at some seats of each replica, as `LaneLearner` does."""
+
+    actor: Any
+    """Chooses at these seats; its `epsilon` is told to observers."""
+    seats: tuple[int, ...]
+    replicas: int
+
+    def remember(self, batch: TensorDictBase) -> None:
+        """Stores a turn of every replica."""
+
+    def learn(self) -> Tensor | None:
+        """One update; losses [R, S], or None while too little is stored."""
+
+    def end_episode(self, ended: Tensor) -> None:
+        """An episode of the marked replicas has ended, bool [R]."""
+
+    def state_dict(self) -> dict[str, Any]:
+        """Everything that its future depends on."""
+
+    def load_state_dict(self, state: Mapping[str, Any]) -> None:
+        """Goes on where the learner of that state was."""
+
+
+class OneAgent:
+    """A plain `DQNLearner` as a `Learner`: one agent of one replica.
+
+    Args:
+        learner: the agent.
+        agent: its number.
+    """
+
+    replicas = 1
+
+    def __init__(self, learner: DQNLearner, agent: int) -> None:
+        self.learner, self.actor = learner, learner.actor
+        self.seats: tuple[int, ...] = (agent,)
+
+    def remember(self, batch: TensorDictBase) -> None:
+        """See `Learner`."""
+        self.learner.remember(transitions_of(self.seats[0], batch))
+
+    def learn(self) -> Tensor | None:
+        """See `Learner`."""
+        loss = self.learner.learn()
+        return None if loss is None else torch.tensor([[loss]])
+
+    def end_episode(self, ended: Tensor) -> None:
+        """See `Learner`."""
+        self.learner.end_episode()
+
+    def state_dict(self) -> dict[str, Any]:
+        """A plain agent cannot go on from a checkpoint; `LaneLearner` can."""
+        raise NotImplementedError("a DQNLearner keeps no state to go on from; use a LaneLearner")
+
+    def load_state_dict(self, state: Mapping[str, Any]) -> None:
+        """See `state_dict`."""
+        raise NotImplementedError("a DQNLearner keeps no state to go on from; use a LaneLearner")
+
+
+def seated(learner: Learner | DQNLearner, seat: Seat) -> Learner:
+    """What sits there as a `Learner`."""
+    if isinstance(learner, DQNLearner):
+        return OneAgent(learner, agents_at(seat)[0])
+    return learner
+
+
+class LaneLosses:
+    """The losses of the agents at some seats since each replica's last episode ended.
+
+    Args:
+        replicas: how many replicas R.
+        agents: their numbers.
+    """
+
+    def __init__(self, replicas: int, agents: tuple[int, ...]) -> None:
+        self.agents = agents
+        self.total = torch.zeros((replicas, len(agents)), dtype=torch.float64)
+        self.updates = torch.zeros(replicas, dtype=torch.int64)
+
+    def add(self, loss: Tensor | None) -> None:
+        """Takes the losses of an update, [R, S]; None for no update."""
+        if loss is not None:
+            self.total += loss.cpu()
+            self.updates += 1
+
+    def take(self, replica: int) -> dict[int, float]:
+        """The mean loss of each agent of a replica, NaN before its first update; starts it anew."""
+        means = (self.total[replica] / self.updates[replica]).tolist()
+        self.total[replica], self.updates[replica] = 0.0, 0
+        return dict(zip(self.agents, means, strict=True))
+
+    def state_dict(self) -> dict[str, Tensor]:
+        """What was summed so far."""
+        return {"total": self.total, "updates": self.updates}
+
+    def load_state_dict(self, state: Mapping[str, Tensor]) -> None:
+        """Goes on with the sums of that state."""
+        self.total, self.updates = state["total"].clone(), state["updates"].clone()
