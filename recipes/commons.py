@@ -56,7 +56,7 @@ def main(
 
     with (
         recording.Checkpoints(run) as checkpoints,
-        recording.EpisodeTable(run / "episodes.parquet", go_on=go_on) as table,
+        recording.EpisodeTable(run / "episodes.parquet", resumable=True) as table,
         recording.ProgressBar(game, episodes=episodes, replicas=replicas) as bar,
     ):
         env = CommonsEnv(game, replicas, seed=seed)

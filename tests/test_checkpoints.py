@@ -220,7 +220,7 @@ def test_a_table_goes_on_behind_the_rows_of_a_checkpoint(tmp_path):
     path = tmp_path / "run" / "episodes.parquet"
 
     def go_on(behind):
-        with EpisodeTable(path, go_on=True) as table:
+        with EpisodeTable(path, resumable=True) as table:
             table.load_state_dict({"rows": behind})
             raise KeyboardInterrupt
 

@@ -37,7 +37,7 @@ def main(
     run.mkdir(exist_ok=True)
     with (
         Checkpoints(run, every_s=every_s, go_on=f"python {sys.argv[0]} {run}") as checkpoints,
-        EpisodeTable(run / "episodes.parquet", go_on=True) as table,
+        EpisodeTable(run / "episodes.parquet", resumable=True) as table,
     ):
         env = CommonsEnv(GAME, 3, seed=3)
         train(

@@ -145,13 +145,13 @@ class LaneStorage(Storage):
         return gather(self.fields, index, self.rows)
 
     def state_dict(self) -> dict[str, Any]:
-        """Everything that it holds, as far as it was written; the storage's own tensors, not copies."""
+        """Everything that it holds, as far as it was written; once full the own tensors, not copies."""
         kept = len(self)
         windows = self.fields["observation"].view(self.lanes, self.rows, *self.shape_of_observation)
         used = min(self.rows, int(self._next_row.max()) + 1)
         return {
-            **{name: array[:kept] for name, array in self.fields.items()},
-            "observation": windows[:, :used],
+            **{name: _part(array, array[:kept]) for name, array in self.fields.items()},
+            "observation": _part(windows, windows[:, :used]),
             "next_row": self._next_row,
             "begins": self._begins,
             "oldest": self._oldest,
@@ -179,6 +179,11 @@ class LaneStorage(Storage):
         self._any_begins = True
         self._oldest.zero_()
         self._written = 0
+
+
+def _part(whole: Tensor, part: Tensor) -> Tensor:
+    """The part by itself, since a view is written to a file with all that it is a view of."""
+    return whole if part.shape == whole.shape else part.clone()
 
 
 def gather(fields: Fields, index: Tensor, rows: int) -> TensorDict:

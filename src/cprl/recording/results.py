@@ -52,18 +52,18 @@ class EpisodeTable:
 
     Args:
         path: the parquet file to be, `episodes.parquet` in a run's directory.
-        go_on: whether a journal that is there is gone on with, see `load_state_dict`; then an error in the
-            block leaves the journal as it is.
+        resumable: whether a journal that is there is gone on with, see `load_state_dict`, and stays as it
+            is where the block ends with an error.
 
     Raises:
         FileExistsError: where there is a table already: nothing is ever written over.
     """
 
-    def __init__(self, path: str | os.PathLike[str], *, go_on: bool = False) -> None:
+    def __init__(self, path: str | os.PathLike[str], *, resumable: bool = False) -> None:
         self.path = Path(path)
         self.journal = _journal_of(self.path)
-        self._goes_on = go_on
-        for table in (self.path,) if go_on else (self.path, self.journal):
+        self._resumable = resumable
+        for table in (self.path,) if resumable else (self.path, self.journal):
             if table.exists():
                 raise FileExistsError(f"{table} exists and is kept; give the table a directory of its own")
         exists = self.journal.exists()
@@ -150,7 +150,7 @@ class EpisodeTable:
         error: BaseException | None,
         traceback: TracebackType | None,
     ) -> None:
-        if self._goes_on and error is not None:
+        if self._resumable and error is not None:
             self._file.close()
         else:
             self.close()
