@@ -8,6 +8,7 @@ from pathlib import Path
 import pytest
 import torch
 
+import cprl
 from cprl import CommonsEnv, Map, Rules, presets
 from cprl.acting import RandomActor, Seats
 from cprl.learning import DQNLearner, LaneLearner
@@ -158,3 +159,49 @@ def test_fifty_episodes_of_commons_in_eight_replicas_are_those_of_each_alone(tmp
             state = alone.networks()[f"replica_{replica}/agent_{agent}"].state_dict()
             for name, value in weights[f"replica_{replica}/agent_{agent}"].items():
                 torch.testing.assert_close(state[name], value, rtol=1e-4, atol=1e-6)
+
+
+def test_a_run_is_loaded_from_its_directory_alone(tmp_path):
+    how = {"replicas": 2, "episodes": 2, "evaluation_episodes": 1, "compile": False}
+    run = recipe("two_against_random").main(variant="as_run", out=tmp_path / "run", **how)
+    loaded = cprl.load(run)
+    assert loaded.game == presets.game("two_complex", variant="as_run")
+    assert loaded.settings == presets.learner("two_complex", variant="as_run")
+    assert loaded.replicas == [0, 1]
+    assert loaded.episodes().num_rows == 2 * 2 * 2
+    kept = load_weights(run / "checkpoints" / "final.pt")
+    for lane, network in loaded.networks.items():
+        for name, value in network.state_dict().items():
+            assert torch.equal(value, kept[lane][name])
+    with pytest.raises(ValueError, match=r"agents \[1\] of replica 1 have no network in .*; kept are"):
+        loaded.policy(1)
+    played = evaluate(loaded.env(3), loaded.policy(1, others={1: RandomActor(8)}), explore=True)
+    assert len(played) == 3
+
+
+def test_the_run_of_a_plain_agent_is_loaded_too(tmp_path, capsys):
+    run, _ = run_in_miniature(tmp_path, capsys)
+    for weights in ("final", "best"):
+        loaded = cprl.load(run, weights=weights)
+        assert list(loaded.networks) == ["replica_0/agent_0"]
+        assert len(evaluate(loaded.env(2), loaded.policy())) == 2
+
+
+def test_a_run_that_cannot_be_loaded_says_which_file_and_why(tmp_path, capsys):
+    run, _ = run_in_miniature(tmp_path, capsys)
+    weights = run / "checkpoints" / "final.pt"
+    content = weights.read_bytes()
+    for spoilt in (content[:-300], b"something else", b""):
+        weights.write_bytes(spoilt)
+        with pytest.raises(ValueError, match=r"final\.pt holds no weights of this run: "):
+            cprl.load(run)
+    weights.unlink()
+    with pytest.raises(ValueError, match=r"final\.pt holds no weights of this run: .*No such file"):
+        cprl.load(run)
+    told = json.loads((run / "recipe.json").read_text())
+    told["arguments"]["game"]["rules"]["hits_to_tag"] = 0
+    (run / "recipe.json").write_text(json.dumps(told))
+    with pytest.raises(ValueError, match=r"recipe\.json holds no game and learner .*hits_to_tag is 0"):
+        cprl.load(run)
+    with pytest.raises(ValueError, match=r"recipe\.json is no recipe of a run"):
+        cprl.load(tmp_path)

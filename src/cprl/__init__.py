@@ -12,6 +12,8 @@ The rooms, in the order in which the data flow:
     train       the loop: act, store, learn, measure, record
 """
 
+from typing import TYPE_CHECKING, Any
+
 from cprl import presets
 from cprl.commons import maps
 from cprl.commons.game import Game
@@ -21,4 +23,16 @@ from cprl.commons.rules import Rules
 from cprl.envs import CommonsEnv
 from cprl.train import train
 
-__all__ = ["CommonsEnv", "Game", "Map", "Observation", "Rules", "maps", "presets", "train"]
+if TYPE_CHECKING:
+    from cprl.recording.loaded import load
+
+__all__ = ["CommonsEnv", "Game", "Map", "Observation", "Rules", "load", "maps", "presets", "train"]
+
+
+def __getattr__(name: str) -> Any:
+    """`load` brings all of recording with it, half a second that only those pay who want it."""
+    if name == "load":
+        from cprl.recording.loaded import load
+
+        return load
+    raise AttributeError(f"module {__name__!r} has no attribute {name!r}")

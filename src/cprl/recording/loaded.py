@@ -1,0 +1,121 @@
+"""load: a finished run as its directory keeps it: game, settings, trained networks, episodes."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import pyarrow as pa
+from torch import nn
+
+from cprl.acting import QActor, QNetwork, Seats
+from cprl.commons.game import Game
+from cprl.commons.maps import Map
+from cprl.commons.observation import Observation
+from cprl.commons.rules import Rules
+from cprl.envs.torchrl_env import CommonsEnv
+from cprl.learning.settings import DQNSettings
+from cprl.recording.results import read_episodes
+from cprl.recording.run import read_recipe
+from cprl.recording.weights import load_weights
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class LoadedRun:
+    """A run, built again from its directory alone; see `load`."""
+
+    path: Path
+    game: Game
+    settings: DQNSettings
+    recipe: Mapping[str, Any]
+    """What `recipe.json` holds."""
+    networks: Mapping[str, QNetwork]
+    """The trained network of each lane, by "replica_0/agent_0" and so on."""
+
+    @property
+    def replicas(self) -> list[int]:
+        """The numbers of the replicas whose networks were kept."""
+        return sorted({int(lane.split("/")[0].removeprefix("replica_")) for lane in self.networks})
+
+    def env(self, worlds: int = 1, *, seed: int = 0) -> CommonsEnv:
+        """So many fresh worlds of the run's game."""
+        return CommonsEnv(self.game, worlds, seed=seed)
+
+    def policy(self, replica: int = 0, *, others: Mapping[int, nn.Module] | None = None) -> Seats:
+        """The trained agents of a replica, who explore with `epsilon_evaluation` where asked to.
+
+        Args:
+            replica: its number.
+            others: actors of the agents that did not learn, by number.
+
+        Raises:
+            ValueError: where a seat stays empty; says which.
+        """
+        actors: dict[int, nn.Module] = dict(others or {})
+        for agent in range(self.game.agents):
+            network = self.networks.get(f"replica_{replica}/agent_{agent}")
+            if network is not None:
+                actor = QActor(network, len(self.game.actions))
+                actor.epsilon = self.settings.epsilon_evaluation
+                actors.setdefault(agent, actor)
+        empty = sorted(set(range(self.game.agents)) - set(actors))
+        if empty:
+            raise ValueError(
+                f"agents {empty} of replica {replica} have no network in {self.path}; kept are "
+                f"{sorted(self.networks)}: give actors for them as others"
+            )
+        return Seats({agent: actors[agent] for agent in range(self.game.agents)})
+
+    def episodes(self) -> pa.Table:
+        """The table of episodes; see `cprl.recording.read_episodes`."""
+        return read_episodes(self.path)
+
+
+def load(run: str | Path, *, weights: str = "final") -> LoadedRun:
+    """Builds a run's game, settings and trained networks again; runs no code of its files.
+
+    Args:
+        run: its directory.
+        weights: which were kept: "final", or "best" where the recipe keeps them.
+
+    Raises:
+        ValueError: for a file that is missing, truncated, changed or foreign; names file and reason.
+    """
+    run = Path(run)
+    recipe = read_recipe(run)
+    try:
+        kept = recipe["arguments"]["game"]
+        game = Game(
+            map=Map(**kept["map"]),
+            rules=Rules(**kept["rules"]),
+            observation=Observation(**kept.get("observation", {})),
+        )
+        learner = recipe["arguments"]["learner"]
+        settings = DQNSettings(**{**learner, "hidden_cells": tuple(learner["hidden_cells"])})
+    except (KeyError, TypeError, ValueError) as error:
+        raise ValueError(f"{run / 'recipe.json'} holds no game and learner of cprl: {error!r}") from error
+    return LoadedRun(
+        path=run,
+        game=game,
+        settings=settings,
+        recipe=recipe,
+        networks=_networks(run / "checkpoints" / f"{weights}.pt", game, settings),
+    )
+
+
+def _networks(path: Path, game: Game, settings: DQNSettings) -> dict[str, QNetwork]:
+    networks = {}
+    try:
+        for lane, state in load_weights(path).items():
+            network = QNetwork(
+                game.observation_shape,
+                len(game.actions),
+                hidden_cells=settings.hidden_cells,
+                highest=game.observation.highest,
+                relu_on_outputs=settings.relu_on_outputs,
+            )
+            network.load_state_dict(state)
+            networks[lane if "/" in lane else f"replica_0/{lane}"] = network
+    except Exception as error:
+        raise ValueError(f"{path} holds no weights of this run: {error}") from error
+    return networks
