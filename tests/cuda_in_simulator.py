@@ -71,14 +71,14 @@ def forms() -> None:
                 form = Observation(
                     area=area, encoding=encoding, agents_apart=others, scoreboard=others, stock_gauge=others
                 )
-                play(Game(map=WALLS, rules=rules, observation=form), turns=30)
+                play(Game(map=WALLS, rules=rules, observation=form), turns=12)
     hidden = Rules(regrow_prob=(0.1, 0.5), walls_block_sight=True, window_rows=3, window_columns=5)
-    play(Game(map=WALLS, rules=hidden), turns=30)
+    play(Game(map=WALLS, rules=hidden), turns=12)
 
 
 def blocks() -> None:
     """More worlds than a block has threads."""
-    play(Game(map=WALLS, rules=Rules(freeze_steps=2)), worlds=THREADS_PER_BLOCK + 3, turns=6)
+    play(Game(map=WALLS, rules=Rules(freeze_steps=2)), worlds=THREADS_PER_BLOCK + 3, turns=3)
 
 
 def state() -> None:

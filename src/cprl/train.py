@@ -1,6 +1,7 @@
 """The loop: act, store, learn, measure, record."""
 
 import logging
+import sys
 from collections.abc import Mapping, Sequence
 from typing import Any, Protocol
 
@@ -39,7 +40,7 @@ class Observer(Protocol):
 
 
 def prepare_process(seed: int) -> None:
-    """What a training wants of torch: one thread, no denormals, its generator seeded, TorchRL's log quiet.
+    """What a training wants of torch: one thread, no denormals, a seeded generator; TorchRL quiet, ours told.
 
     These networks are so small that a second thread costs more than it gives, up to a hundredfold on a busy
     machine; denormal numbers in Adam's moments of dead weights slow a long run by up to 1.9 times.
@@ -48,6 +49,10 @@ def prepare_process(seed: int) -> None:
     torch.set_num_threads(1)
     torch.set_flush_denormal(True)
     logging.getLogger("torchrl").setLevel(logging.WARNING)
+    own = logging.getLogger("cprl")
+    own.setLevel(logging.INFO)
+    if not own.handlers:
+        own.addHandler(logging.StreamHandler(sys.stdout))
 
 
 class Training:
