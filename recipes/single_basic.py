@@ -1,7 +1,7 @@
 """Experiment 1 of the study: one DQN agent alone on `single_basic`. Does it learn not to strip the board?
 
     python recipes/single_basic.py --watch serve                     the published schedule, 6000 episodes
-    python recipes/single_basic.py --schedule short --watch serve    three to four minutes, live in the browser
+    python recipes/single_basic.py --schedule short --watch serve    some four minutes, live in the browser
 
 Copy this file and change it: another map, rule, network or loss is one line.
 """
