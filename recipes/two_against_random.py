@@ -5,12 +5,13 @@
 Copy this file and change it: another map, rule, network or loss is one line.
 """
 
+from functools import partial
 from pathlib import Path
 
 import tyro
 
 from cprl import CommonsEnv, presets, recording
-from cprl.acting import Seats, random_lanes
+from cprl.acting import Seats, random_seats
 from cprl.learning import LaneLearner
 from cprl.measuring.evaluate import evaluate
 from cprl.train import prepare_process, train
@@ -49,10 +50,7 @@ def main(
     recipe = {**arguments, "game": game, "learner": settings}
     run = recording.start_run(out, "two_against_random", recipe, go_on=go_on)
     agents = LaneLearner(game, seats=SEATS, replicas=replicas, settings=settings, seed=seed, compile=compile)
-
-    def random(seats: tuple[int, ...], worlds: int = 1) -> dict:
-        seeds = [(seed, replica, agent) for replica in range(replicas) for agent in seats]
-        return {seats: random_lanes(len(game.actions), seeds=seeds, seats=len(seats), worlds=worlds)}
+    random = partial(random_seats, game, replicas=replicas, seed=seed)
 
     with (
         recording.Checkpoints(run) as checkpoints,
@@ -66,9 +64,9 @@ def main(
 
     fresh = CommonsEnv(game, replicas * evaluation_episodes, seed=seed + 1)
     actors = {SEATS: agents.evaluation_actor(evaluation_episodes)}
-    trained = Seats({**actors, **random(WALKER, evaluation_episodes)})
+    trained = Seats({**actors, **random(WALKER, worlds=evaluation_episodes)})
     played = {
-        "random": evaluate(fresh, Seats(random((0, 1), evaluation_episodes))),
+        "random": evaluate(fresh, Seats(random((0, 1), worlds=evaluation_episodes))),
         "trained, epsilon 0.05": evaluate(fresh, trained, explore=True),
     }
     figure = recording.training_curve(run, title=title, random=played["random"])

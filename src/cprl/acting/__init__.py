@@ -1,8 +1,17 @@
 """From seeing to doing: networks, actors for one agent, and the seats that they take in a game."""
 
 from cprl.acting.actors import QActor, RandomActor
-from cprl.acting.lanes import LaneActor, LaneQNetwork, random_lanes
+from cprl.acting.lanes import LaneActor, LaneQNetwork, random_lanes, random_seats
 from cprl.acting.networks import QNetwork
 from cprl.acting.seats import Seats
 
-__all__ = ["LaneActor", "LaneQNetwork", "QActor", "QNetwork", "RandomActor", "Seats", "random_lanes"]
+__all__ = [
+    "LaneActor",
+    "LaneQNetwork",
+    "QActor",
+    "QNetwork",
+    "RandomActor",
+    "Seats",
+    "random_lanes",
+    "random_seats",
+]

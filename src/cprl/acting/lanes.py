@@ -11,6 +11,7 @@ from torchrl.envs.utils import ExplorationType, exploration_type
 
 from cprl.acting.draws import LaneDraws
 from cprl.acting.networks import QNetwork
+from cprl.commons.game import Game
 
 
 class LaneQNetwork(nn.Module):
@@ -137,6 +138,14 @@ class LaneActor(TensorDictModuleBase):
         by_lane = observation.view(self.replicas, self.worlds, self.seats, *shape).transpose(1, 2)
         with torch.no_grad():
             return self.values(by_lane.reshape(-1, self.worlds, *shape)).argmax(-1)
+
+
+def random_seats(
+    game: Game, seats: tuple[int, ...], *, replicas: int, seed: int, worlds: int = 1
+) -> dict[tuple[int, ...], LaneActor]:
+    """Agents at some seats of every replica to whom every action is equally likely, by where they sit."""
+    seeds = [(seed, replica, agent) for replica in range(replicas) for agent in seats]
+    return {seats: random_lanes(len(game.actions), seeds=seeds, seats=len(seats), worlds=worlds)}
 
 
 def random_lanes(actions: int, *, seeds: Sequence[Sequence[int]], seats: int, worlds: int = 1) -> LaneActor:

@@ -39,15 +39,12 @@ class DQNLearner:
         seed: int = 0,
     ) -> None:
         device = torch.device(device)
-        network = partial(_network, observation_shape, actions, settings, highest)
+        network = partial(q_network, observation_shape, actions, settings=settings, highest=highest)
         self.settings = settings
         self.network = network().to(device)
         self.actor = QActor(self.network, actions, device=device)
         self.actor.epsilon = settings.epsilon(0)
-        self.loss = DQNLoss(
-            self.actor.greedy, delay_value=True, loss_function="l2", action_space="categorical"
-        )
-        self.loss.make_value_estimator(ValueEstimators.TD0, gamma=settings.gamma)
+        self.loss = _loss_of(self.actor.greedy, settings.gamma)
         # HardUpdate copies at every (interval + 1)-th step, and once when it is made.
         self._target = HardUpdate(self.loss, value_network_update_interval=settings.target_every_episodes - 1)
         if settings.own_target_weights:
@@ -98,15 +95,19 @@ def dqn_loss(network: nn.Module, *, gamma: float) -> DQNLoss:
         network: from "observation" to the value of each action; a `LaneQNetwork` makes it that of many.
         gamma: discount per step.
     """
-    actor = QValueActor(network, spec=None, action_space="categorical")
+    return _loss_of(QValueActor(network, spec=None, action_space="categorical"), gamma)
+
+
+def _loss_of(actor: QValueActor, gamma: float) -> DQNLoss:
     loss = DQNLoss(actor, delay_value=True, loss_function="l2", action_space="categorical")
     loss.make_value_estimator(ValueEstimators.TD0, gamma=gamma)
     return loss
 
 
-def _network(
-    observation_shape: Sequence[int], actions: int, settings: DQNSettings, highest: float
+def q_network(
+    observation_shape: Sequence[int], actions: int, *, settings: DQNSettings, highest: float
 ) -> QNetwork:
+    """The network of the settings; see `QNetwork` for the other arguments."""
     return QNetwork(
         observation_shape,
         actions,

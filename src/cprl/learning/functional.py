@@ -90,19 +90,15 @@ def weights_of(network: nn.Module, own: Weights) -> Weights:
 
 def stacked(
     networks: Sequence[nn.Module], make_loss: MakeLoss, *, lane_axis: bool
-) -> tuple[LossModule, dict[str, Weights]]:
-    """A loss, and its groups of weights with the lanes' axis in front."""
+) -> tuple[LossModule, Weights]:
+    """A loss, and copies of its weights with the lanes' axis in front, by group:name."""
     if lane_axis:
         losses = [make_loss(LaneQNetwork(networks))]  # type: ignore[arg-type]
     else:
         losses = [make_loss(network) for network in networks]
     for loss in losses:
         promise_targets(loss)
-    groups: dict[str, Weights] = {}
-    for name in params_of(losses[0], targets=True):
-        each = [dict(getattr(loss, name).flatten_keys(".").items()) for loss in losses]
-        groups[name] = {
-            key: (value if lane_axis else torch.stack([one[key].detach() for one in each])).detach().clone()
-            for key, value in each[0].items()
-        }
-    return losses[0], groups
+    each = [flat(params_of(loss, targets=True)) for loss in losses]
+    if lane_axis:
+        return losses[0], each[0]
+    return losses[0], {name: torch.stack([one[name] for one in each]) for name in each[0]}

@@ -11,7 +11,6 @@ import torch
 from tensordict import TensorDict
 from torch import Tensor, nn
 from torchrl.data.replay_buffers import ReplayBuffer
-from torchrl.objectives import LossModule
 
 from cprl.acting.lanes import LaneQNetwork
 from cprl.learning.functional import FunctionalLoss, MakeLoss, Weights, stacked, weights_of
@@ -58,22 +57,14 @@ class FunctionalUpdate:
         lane_axis: bool,
         compile: bool = True,
     ) -> None:
-        def of(some: Sequence[nn.Module]) -> tuple[LossModule, dict[str, Weights]]:
-            return stacked(some, make_loss, lane_axis=lane_axis)
-
-        self.lanes = len(networks)
         self._network = LaneQNetwork(networks) if lane_axis else deepcopy(networks[0])  # type: ignore[arg-type]
-        loss, groups = of(networks)
-        own = {name: group for name, group in groups.items() if not name.startswith("target_")}
-        targets = {name: group for name, group in groups.items() if name.startswith("target_")}
+        loss, weights = stacked(networks, make_loss, lane_axis=lane_axis)
+        self.own = {name: value for name, value in weights.items() if not name.startswith("target_")}
+        self.targets = {name: value for name, value in weights.items() if name.startswith("target_")}
         if target_networks is not None:
-            _, others = of(target_networks)
-            targets = {name: others[name.removeprefix("target_")] for name in targets}
+            _, others = stacked(target_networks, make_loss, lane_axis=lane_axis)
+            self.targets = {name: others[name.removeprefix("target_")] for name in self.targets}
         self.loss = FunctionalLoss(loss)
-        self.own = {f"{name}:{key}": value for name, group in own.items() for key, value in group.items()}
-        self.targets = {
-            f"{name}:{key}": value.clone() for name, group in targets.items() for key, value in group.items()
-        }
         self._shared = weights_of(self._network, self.own)
         if lane_axis:  # acts by the very tensors that learning changes
             for name, parameter in self._network.named_parameters():

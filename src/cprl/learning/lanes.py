@@ -10,9 +10,8 @@ from tensordict import TensorDictBase
 from torch import Tensor, nn
 
 from cprl.acting.lanes import LaneActor
-from cprl.acting.networks import QNetwork
 from cprl.commons.game import Game
-from cprl.learning.dqn import dqn_loss
+from cprl.learning.dqn import dqn_loss, q_network
 from cprl.learning.functional import MakeLoss
 from cprl.learning.fused import FunctionalUpdate
 from cprl.learning.replay import lane_buffer
@@ -76,10 +75,16 @@ class LaneLearner:
         self.game, self.settings, self.seats = game, settings, tuple(seats)
         self.replicas, self._numbers = replicas, range(first_replica, first_replica + replicas)
         self.seed = seed
-        make_network = make_network or partial(_network, game, settings)
+        actions = len(game.actions)
+        make_network = make_network or partial(
+            q_network,
+            game.observation_shape,
+            actions,
+            settings=settings,
+            highest=game.observation.highest,
+        )
         self._make_network = make_network
         make_loss = make_loss or partial(dqn_loss, gamma=settings.gamma)
-        actions = len(game.actions)
         networks = [_drawn(make_network, own).to(device) for own in self._seeds(WEIGHTS)]
         targets = None
         if settings.own_target_weights:
@@ -178,17 +183,6 @@ class LaneLearner:
         self.steps = int(state["steps"])
         self.actor.epsilon = self.settings.epsilon(self.steps)
         self._episodes = state["episodes"].clone()
-
-
-def _network(game: Game, settings: DQNSettings) -> QNetwork:
-    return QNetwork(
-        game.observation_shape,
-        len(game.actions),
-        hidden_cells=settings.hidden_cells,
-        highest=game.observation.highest,
-        relu_on_outputs=settings.relu_on_outputs,
-        glorot_uniform=settings.glorot_uniform,
-    )
 
 
 def _drawn(make_network: Callable[[], nn.Module], seed: Sequence[int]) -> nn.Module:

@@ -14,6 +14,7 @@ from cprl.commons.maps import Map
 from cprl.commons.observation import Observation
 from cprl.commons.rules import Rules
 from cprl.envs.torchrl_env import CommonsEnv
+from cprl.learning.dqn import q_network
 from cprl.learning.settings import DQNSettings
 from cprl.recording.results import read_episodes
 from cprl.recording.run import read_recipe
@@ -107,12 +108,11 @@ def _networks(path: Path, game: Game, settings: DQNSettings) -> dict[str, QNetwo
     networks = {}
     try:
         for lane, state in load_weights(path).items():
-            network = QNetwork(
+            network = q_network(
                 game.observation_shape,
                 len(game.actions),
-                hidden_cells=settings.hidden_cells,
+                settings=settings,
                 highest=game.observation.highest,
-                relu_on_outputs=settings.relu_on_outputs,
             )
             network.load_state_dict(state)
             networks[lane if "/" in lane else f"replica_0/{lane}"] = network
