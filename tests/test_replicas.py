@@ -14,7 +14,7 @@ from cprl import CommonsEnv, Game, Rules, keys, maps
 from cprl.acting import LaneActor, RandomActor, Seats, random_lanes
 from cprl.acting.collect import StepCollector
 from cprl.learning import DQNSettings, LaneLearner, transitions_of
-from cprl.learning.transitions import lane_transitions
+from cprl.learning.transitions import lane_turn
 from cprl.measuring.evaluate import evaluate
 from cprl.recording import EpisodeTable, read_episodes
 from cprl.train import train
@@ -152,10 +152,15 @@ def test_the_lean_collector_yields_what_torchrls_own_yields(worlds):
 def test_transitions_of_lanes_are_those_of_the_agents():
     batch = CommonsEnv(GAME, 3).rollout(1)[:, 0]
     for seats in ((0, 1), (1,)):
-        lanes = lane_transitions(seats, batch)
-        assert lanes.batch_size == (3 * len(seats),)
+        lanes = lane_turn(seats, batch)
         for place, agent in enumerate(seats):
-            assert_close(lanes[place :: len(seats)], transitions_of(agent, batch))
+            alone = transitions_of(agent, batch)
+            own = lanes._make(entry[place :: len(seats)] for entry in lanes)
+            assert np.array_equal(own.observation, alone["observation"])
+            assert np.array_equal(own.action, alone["action"])
+            assert np.array_equal(own.next_observation, alone["next", "observation"])
+            for name in ("reward", "done", "terminated"):
+                assert np.array_equal(getattr(own, name), alone["next", name].squeeze(-1))
 
 
 def test_a_lane_explores_by_its_own_numbers_and_only_where_asked():

@@ -4,7 +4,10 @@ Axes, the same letters everywhere: B worlds, N agents, H x W the board, K sites,
 R replicas, C channels, X rows and Y columns of an agent's window (its own row included, farthest row first).
 """
 
-from typing import Final
+from typing import Any, Final
+
+from tensordict import TensorDictBase
+from tensordict.base import NO_DEFAULT
 
 AGENTS: Final = "agents"
 """The group of agents, a nested TensorDict of batch size [B, N]."""
@@ -59,3 +62,12 @@ TERMINATED: Final = "terminated"
 
 TRUNCATED: Final = "truncated"
 """bool [B, 1]: the clock ran out."""
+
+
+def entry(tensordict: TensorDictBase, name: str) -> Any:
+    """`tensordict.get(name)` without its search for nested keys: a tenth of the time, several times a step.
+
+    Raises:
+        KeyError: where there is no such entry.
+    """
+    return tensordict._get_str(name, NO_DEFAULT)

@@ -9,6 +9,7 @@ from tensordict.nn import TensorDictModuleBase
 from torch import Tensor, nn
 from torchrl.envs.utils import ExplorationType, exploration_type
 
+from cprl.acting.compiling import Compiled
 from cprl.acting.draws import LaneDraws
 from cprl.acting.networks import QNetwork
 from cprl.commons.game import Game
@@ -85,6 +86,7 @@ class LaneActor(TensorDictModuleBase):
         seeds: of each lane's exploration.
         seats: how many seats S of a replica it takes.
         worlds: how many worlds k of each replica are played at once, side by side in the batch.
+        compile: whether exploring is compiled by torch; where that fails a warning says so once.
     """
 
     in_keys = ("observation",)
@@ -98,30 +100,52 @@ class LaneActor(TensorDictModuleBase):
         seeds: Sequence[Sequence[int]],
         seats: int,
         worlds: int = 1,
+        compile: bool = False,
     ) -> None:
         super().__init__()
         self.values, self.actions = values, actions
         self.seats, self.worlds, self.replicas = seats, worlds, len(seeds) // seats
-        self.epsilon = 1.0
+        # As a compiled function takes it: as a tensor, since other numbers are taken for constant.
+        self._epsilon = torch.ones((), dtype=torch.float64)
         self.draws = LaneDraws(seeds, 2 * worlds)
+        self._explore = Compiled(LaneActor._explored, what="agents act", enabled=compile)
+
+    @property
+    def epsilon(self) -> float:
+        """The chance of a random action."""
+        return self._epsilon.item()
+
+    @epsilon.setter
+    def epsilon(self, chance: float) -> None:
+        self._epsilon.fill_(chance)
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Writes "action", int64 [replicas x k, S], for "observation" [replicas x k, S, C, X, Y]."""
-        observation = tensordict.get("observation")
-        explores = self.values is None or (
-            self.epsilon > 0 and exploration_type() in (ExplorationType.RANDOM, None)
-        )
-        best = self._best(observation) if self.values is not None else None
-        if explores:
-            chance, which = self.draws.next().view(-1, self.worlds, 2).unbind(-1)
-            random = (which * self.actions).long().to(observation.device)
-            if best is None:
-                best = random
-            else:
-                best = torch.where(chance.to(best.device) < self.epsilon, random, best)
-        assert best is not None
-        chosen = best.view(self.replicas, self.seats, self.worlds).transpose(1, 2)
-        return tensordict.set("action", chosen.reshape(-1, self.seats))
+        return tensordict.set("action", self._choose(tensordict.get("observation")))
+
+    def _choose(self, observation: Tensor) -> Tensor:
+        if self.values is None:
+            return self._by_replica(self._random(self.draws.next().to(observation.device)))
+        if exploration_type() not in (ExplorationType.RANDOM, None):
+            return self._by_replica(self._best(observation))
+        device = observation.device
+        arguments = observation, self.draws.next().to(device), self._epsilon.to(device)
+        chosen: Tensor = self._explore((observation.shape, observation.dtype), self, *arguments)
+        return chosen
+
+    def _explored(self, observation: Tensor, numbers: Tensor, epsilon: Tensor) -> Tensor:
+        """The greedy actions, or with chance epsilon random ones, int64 [replicas x k, S]."""
+        explores = numbers.view(-1, self.worlds, 2)[..., 0] < epsilon
+        return self._by_replica(torch.where(explores, self._random(numbers), self._best(observation)))
+
+    def _random(self, numbers: Tensor) -> Tensor:
+        """Random actions of each lane, int64 [L, k]."""
+        return (numbers.view(-1, self.worlds, 2)[..., 1] * self.actions).long()
+
+    def _by_replica(self, actions: Tensor) -> Tensor:
+        """From [L, k] to [replicas x k, S]."""
+        chosen = actions.view(self.replicas, self.seats, self.worlds).transpose(1, 2)
+        return chosen.reshape(-1, self.seats)
 
     def get_extra_state(self) -> dict[str, Any]:
         """Where its random numbers stand; part of `state_dict`."""

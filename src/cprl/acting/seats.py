@@ -47,8 +47,8 @@ class Seats(TensorDictModuleBase):
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Each actor chooses for its agents, in all worlds at once."""
-        agents = tensordict.get(keys.AGENTS)
-        observation = agents.get("observation")
+        agents = keys.entry(tensordict, keys.AGENTS)
+        observation = keys.entry(agents, "observation")
         dim = len(tensordict.batch_size)
         if observation.shape[dim] != self.agents:
             raise ValueError(

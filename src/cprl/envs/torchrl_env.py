@@ -1,6 +1,7 @@
 """CommonsEnv: B worlds of a commons as one TorchRL environment."""
 
 from collections.abc import Callable, Mapping
+from math import prod
 from typing import Any
 
 import numpy as np
@@ -26,6 +27,9 @@ _TORCH_TYPES = {
 }
 _WORLD_ENTRIES = ("stock", "regrown")
 _DONE_ENTRIES = ("done", "terminated", "truncated")
+_AHEAD_BYTES = 2**16
+"""Turns that tell less have their memory allocated sixteen at a time: alone each takes as long as a world."""
+_AHEAD_TURNS = 16
 _OWN_KEYS = frozenset((*_WORLD_ENTRIES, *_DONE_ENTRIES, keys.STATE, keys.AGENTS, "next", "_reset"))
 _OWN_AGENT_KEYS = frozenset((*_AGENT_ENTRIES, "scoreboard", "stock_gauge", "reward"))
 
@@ -79,6 +83,9 @@ class CommonsEnv(EnvBase):
             name: (shape, _TORCH_TYPES[dtype]) for name, (shape, dtype) in told_shapes(game, worlds).items()
         }
         self._colours = torch.from_numpy(game.palette).to(device)
+        told_bytes = sum(prod(shape) * dtype.itemsize for shape, dtype in self._forms.values())
+        self._turns_ahead = _AHEAD_TURNS if told_bytes < _AHEAD_BYTES else 1
+        self._ahead: list[tuple[dict[str, Tensor], Told]] = []
         self._tensors, self.told = self._fresh()
         self._make_specs()
 
@@ -124,12 +131,22 @@ class CommonsEnv(EnvBase):
 
     def _fresh(self) -> tuple[dict[str, Tensor], Told]:
         """New memory for what a turn tells: as tensors by name, and the same as arrays."""
-        device, as_array = self.device, self._as_array
-        tensors = {
-            name: torch.empty(shape, dtype=dtype, device=device)
-            for name, (shape, dtype) in self._forms.items()
-        }
-        return tensors, Told(**{name: as_array(tensor) for name, tensor in tensors.items()})
+        if not self._ahead:
+            names, blocks = list(self._forms), [self._block(*form) for form in self._forms.values()]
+            tensors = zip(*(block.unbind() for block in blocks), strict=True)
+            arrays = zip(*(self._turns_of(block) for block in blocks), strict=True)
+            for own, told in zip(tensors, arrays, strict=True):
+                self._ahead.append((dict(zip(names, own, strict=True)), Told(*told)))
+        return self._ahead.pop()
+
+    def _turns_of(self, block: Tensor) -> Any:
+        """The block's turns as arrays."""
+        on_cpu = block.device.type == "cpu"
+        return block.numpy() if on_cpu else [self._as_array(turn) for turn in block.unbind()]
+
+    def _block(self, shape: tuple[int, ...], dtype: torch.dtype) -> Tensor:
+        """Memory of several turns, [turns, ...]."""
+        return torch.empty((self._turns_ahead, *shape), dtype=dtype, device=self.device)
 
     def _as_tensordict(self, tensors: dict[str, Tensor], reward: Tensor | None = None) -> TensorDict:
         """The entries of one moment; without a reward as `reset` returns them."""

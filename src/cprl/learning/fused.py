@@ -1,10 +1,7 @@
 """FunctionalUpdate: one update of many independent learners as one compiled step."""
 
-import gc
-import warnings
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from copy import deepcopy
-from types import FunctionType
 from typing import Any
 
 import torch
@@ -12,19 +9,13 @@ from tensordict import TensorDict
 from torch import Tensor, nn
 from torchrl.data.replay_buffers import ReplayBuffer
 
+from cprl.acting.compiling import Compiled
 from cprl.acting.lanes import LaneQNetwork
 from cprl.learning.functional import FunctionalLoss, MakeLoss, Weights, stacked, weights_of
 from cprl.learning.storage import LaneStorage, gather
 
 BETA_1, BETA_2 = 0.9, 0.999
 """Adam's decay rates (Kingma and Ba 2015, the defaults of torch)."""
-
-
-OPTIONS: dict[str, Any] = {
-    "cpp_wrapper": True,
-    "guard_filter_fn": torch.compiler.skip_all_guards_unsafe,
-}
-"""Of torch.compile. Guards cost a quarter of the step at 16 lanes; `_forms` looks at all that may change."""
 
 
 class FunctionalUpdate:
@@ -74,9 +65,7 @@ class FunctionalUpdate:
         self.steps = 0
         self._learning_rate, self._adam_eps, self._share = learning_rate, adam_eps, loss_share
         self._vmapped = not lane_axis
-        self._compiles = compile
-        self._compiled: Callable[..., Tensor] | None = None
-        self._compiled_for: tuple[object, ...] = ()
+        self._compiled = Compiled(FunctionalUpdate._step, what="updates run", enabled=compile)
 
     def learn(self, buffer: ReplayBuffer) -> Tensor:
         """See `Update`."""
@@ -84,33 +73,7 @@ class FunctionalUpdate:
         index = buffer.sampler.draw(storage)
         self.steps += 1
         arguments = storage.fields, storage.rows, index, *self._adam_scalars()
-        if not self._compiles:
-            return self._step(*arguments)
-        if self._compiled is not None and self._compiled_for == _forms(storage, index):
-            return self._compiled(self, *arguments)
-        self._compiled_for = _forms(storage, index)
-        return self._compile_and_step(*arguments)
-
-    def _compile_and_step(self, *arguments: Any) -> Tensor:
-        """The first step of these forms; where it cannot be compiled, nothing has been changed yet."""
-        self._compiled = torch.compile(_own_code(FunctionalUpdate._step), fullgraph=True, options=OPTIONS)
-        try:
-            with warnings.catch_warnings():
-                for kind in (DeprecationWarning, FutureWarning):  # torch's and TorchRL's own affairs
-                    warnings.simplefilter("ignore", kind)
-                losses = self._compiled(self, *arguments)
-        except Exception as error:
-            self._compiles = False
-            warnings.warn(
-                f"torch.compile failed, updates run uncompiled and several times slower: {error}",
-                RuntimeWarning,
-                stacklevel=3,
-            )
-            return self._step(*arguments)
-        # A compiler leaves millions of objects that stay; without this Python's garbage collector looks
-        # through them again and again, which takes up to a third of a training.
-        gc.collect()
-        gc.freeze()
+        losses: Tensor = self._compiled(_form(storage, index), self, *arguments)
         return losses
 
     def _adam_scalars(self) -> tuple[Tensor, Tensor]:
@@ -193,13 +156,6 @@ class FunctionalUpdate:
         self.steps = int(state["steps"])
 
 
-def _forms(storage: LaneStorage, index: Tensor) -> tuple[object, ...]:
+def _form(storage: LaneStorage, index: Tensor) -> tuple[object, ...]:
     """What the compiled step takes for granted of its arguments; its own tensors never change their form."""
     return storage.rows, index.shape, *((field.shape, field.dtype) for field in storage.fields.values())
-
-
-def _own_code(function: Any) -> Callable[..., Tensor]:
-    """The same function with a code object of its own: torch keeps what it compiled by code object, and
-    would take learners of another size for a change of shapes."""
-    code = function.__code__.replace(co_name=f"{function.__name__}_of_one_learner")
-    return FunctionType(code, function.__globals__, code.co_name)

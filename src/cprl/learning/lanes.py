@@ -16,7 +16,7 @@ from cprl.learning.functional import MakeLoss
 from cprl.learning.fused import FunctionalUpdate
 from cprl.learning.replay import lane_buffer
 from cprl.learning.settings import DQNSettings
-from cprl.learning.transitions import lane_transitions
+from cprl.learning.transitions import lane_turn
 from cprl.learning.updates import ListUpdate, Update
 
 Way = Literal["lane axis", "vmap", "list"]
@@ -114,7 +114,11 @@ class LaneLearner:
             device=device,
         )
         self.actor = LaneActor(
-            self.update.outputs, actions, seeds=self._seeds(EXPLORATION), seats=len(self.seats)
+            self.update.outputs,
+            actions,
+            seeds=self._seeds(EXPLORATION),
+            seats=len(self.seats),
+            compile=compile and way != "list",
         )
         self.steps = 0
         self.actor.epsilon = settings.epsilon(0)
@@ -146,7 +150,7 @@ class LaneLearner:
 
     def remember(self, batch: TensorDictBase) -> None:
         """Stores a turn of every replica, as the collector yields it."""
-        self.buffer.storage.write(lane_transitions(self.seats, batch))
+        self.buffer.storage.write(lane_turn(self.seats, batch))
         self.steps += 1
         self.actor.epsilon = self.settings.epsilon(self.steps)
 

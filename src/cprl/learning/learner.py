@@ -1,8 +1,10 @@
 """Who learns: what the training loop wants of a learner, and a plain agent as one."""
 
 from collections.abc import Mapping
+from math import nan
 from typing import Any, Protocol
 
+import numpy as np
 import torch
 from tensordict import TensorDictBase
 from torch import Tensor
@@ -89,25 +91,26 @@ class LaneLosses:
 
     def __init__(self, replicas: int, agents: tuple[int, ...]) -> None:
         self.agents = agents
-        self.total = torch.zeros((replicas, len(agents)), dtype=torch.float64)
-        self.updates = torch.zeros(replicas, dtype=torch.int64)
+        self.total = np.zeros((replicas, len(agents)), np.float64)
+        self.updates = np.zeros(replicas, np.int64)
 
     def add(self, loss: Tensor | None) -> None:
         """Takes the losses of an update, [R, S]; None for no update."""
         if loss is not None:
-            self.total += loss.cpu()
+            self.total += loss.numpy(force=True)
             self.updates += 1
 
     def take(self, replica: int) -> dict[int, float]:
         """The mean loss of each agent of a replica, NaN before its first update; starts it anew."""
-        means = (self.total[replica] / self.updates[replica]).tolist()
+        updates = self.updates[replica]
+        means = (self.total[replica] / updates).tolist() if updates else [nan] * len(self.agents)
         self.total[replica], self.updates[replica] = 0.0, 0
         return dict(zip(self.agents, means, strict=True))
 
     def state_dict(self) -> dict[str, Tensor]:
         """What was summed so far."""
-        return {"total": self.total, "updates": self.updates}
+        return {"total": torch.tensor(self.total), "updates": torch.tensor(self.updates)}
 
     def load_state_dict(self, state: Mapping[str, Tensor]) -> None:
         """Goes on with the sums of that state."""
-        self.total, self.updates = state["total"].clone(), state["updates"].clone()
+        self.total[:], self.updates[:] = state["total"].numpy(), state["updates"].numpy()

@@ -14,6 +14,8 @@ from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
 from torchrl.data.replay_buffers import Storage
 
+from cprl.learning.transitions import LaneTurn, array_of
+
 ENDS_PER_TRANSITION: Final = 0.02
 """Room for the last windows of episodes, beside that for transitions: one in fifty. Where episodes are
 shorter than that, fewer transitions are kept; none is ever wrong."""
@@ -84,12 +86,17 @@ class LaneStorage(Storage):
             "row": room(transitions, lanes, kind=torch.int64),
         }
         """Windows [L x rows, ...], the rest [T, L]; `row` counts the windows that a lane has written."""
-        self._lane = torch.arange(lanes, device=self.device)
+        # Steps write through numpy where they can: on so few numbers torch takes five times as long.
+        self._arrays = {name: array_of(field) for name, field in self.fields.items()}
+        self._lane = array_of(torch.arange(lanes, device=self.device))
         self._base = self._lane * self.rows
-        self._next_row = room(lanes, kind=torch.int64)
-        self._begins = torch.ones(lanes, dtype=torch.bool, device=self.device)
-        self._any_begins = True
-        self._oldest = room(lanes, kind=torch.int64)
+        self._begin()
+
+    def _begin(self) -> None:
+        """Nothing has been written."""
+        zeros = torch.zeros(self.lanes, dtype=torch.int64, device=self.device)
+        self._next_row, self._oldest = array_of(zeros), array_of(zeros.clone())
+        self._begins, self._any_begins = array_of(zeros == 0), True
         self._written = 0
 
     def __len__(self) -> int:
@@ -98,42 +105,46 @@ class LaneStorage(Storage):
 
     def valid(self) -> tuple[Tensor, int]:
         """The number of each lane's oldest transition that is still whole, int64 [L], and of the next one."""
-        return self._oldest.clamp(min=self._written - self.max_size), self._written
+        oldest = torch.as_tensor(self._oldest)
+        return oldest.clamp(min=self._written - self.max_size), self._written
 
     def set(self, cursor: Any, data: TensorDictBase, *, set_cursor: bool = True) -> None:
         """Writes the next transition of every lane; `cursor` is its place in the ring."""
         place = int(cursor[0] if isinstance(cursor, Sequence | Tensor) else cursor)
         if place != self._written % self.max_size:
             raise ValueError(f"the cursor is {place}; the next place is {self._written % self.max_size}")
-        self.write(data.reshape(self.lanes))
+        data = data.reshape(self.lanes)
+        following = data.get("next")
+        flags = (following.get(name).reshape(-1) for name in ("reward", "done", "terminated"))
+        turn = data.get("observation"), data.get("action"), following.get("observation"), *flags
+        self.write(LaneTurn(*map(array_of, turn)))
 
-    def write(self, data: TensorDictBase) -> None:
-        """Writes the next transition of every lane, [L]."""
-        following, fields, place = data.get("next"), self.fields, self._written % self.max_size
-        windows, row = fields["observation"], self._next_row
+    def write(self, turn: LaneTurn) -> None:
+        """Writes the next transition of every lane; numpy arrays where this storage lies on the CPU."""
+        arrays, place, row = self._arrays, self._written % self.max_size, self._next_row
+        windows = arrays["observation"]
         if self._any_begins:
-            first = self._begins.nonzero().flatten()
-            windows[self._base[first] + row[first] % self.rows] = data.get("observation")[first]
-        windows[self._base + (row + 1) % self.rows] = following.get("observation")
-        done = following.get("done").reshape(-1)
-        fields["action"][place] = data.get("action")
-        fields["reward"][place] = following.get("reward").reshape(-1)
-        fields["done"][place] = done
-        fields["terminated"][place] = following.get("terminated").reshape(-1)
-        fields["row"][place] = row
-        self._any_begins = bool(done.any())
-        self._begins = done
-        self._next_row = row + 1 + done if self._any_begins else row + 1
+            first = self._begins
+            windows[(self._base + row % self.rows)[first]] = turn.observation[first]
+        windows[self._base + (row + 1) % self.rows] = turn.next_observation
+        arrays["action"][place] = turn.action
+        arrays["reward"][place] = turn.reward
+        arrays["done"][place] = turn.done
+        arrays["terminated"][place] = turn.terminated
+        arrays["row"][place] = row
+        self._begins = turn.done | turn.terminated
+        self._any_begins = bool(self._begins.any())
+        self._next_row = row + 1 + self._begins if self._any_begins else row + 1
         self._written += 1
         if self._written % LOOKS_EVERY == 0:
             self._forget()
 
     def _forget(self) -> None:
         """Transitions whose windows are about to be written over are no longer drawn."""
-        oldest = self._oldest.clamp(min=self._written - self.max_size)
+        oldest = self._oldest.clip(min=self._written - self.max_size)
         soon = self._next_row - self.rows + 2 * LOOKS_EVERY + 1
         while True:
-            lost = self.fields["row"][oldest % self.max_size, self._lane] <= soon
+            lost = self._arrays["row"][oldest % self.max_size, self._lane] <= soon
             lost &= oldest < self._written
             if not lost.any():
                 break
@@ -152,9 +163,9 @@ class LaneStorage(Storage):
         return {
             **{name: _part(array, array[:kept]) for name, array in self.fields.items()},
             "observation": _part(windows, windows[:, :used]),
-            "next_row": self._next_row,
-            "begins": self._begins,
-            "oldest": self._oldest,
+            "next_row": torch.as_tensor(self._next_row),
+            "begins": torch.as_tensor(self._begins),
+            "oldest": torch.as_tensor(self._oldest),
             "written": self._written,
         }
 
@@ -169,16 +180,13 @@ class LaneStorage(Storage):
         for name, array in self.fields.items():
             if name != "observation":
                 array[: len(state_dict[name])] = state_dict[name]
-        self._next_row, self._begins = state_dict["next_row"].clone(), state_dict["begins"].clone()
-        self._oldest, self._written = state_dict["oldest"].clone(), int(state_dict["written"])
+        own = {name: state_dict[name].to(self.device, copy=True) for name in ("next_row", "begins", "oldest")}
+        self._next_row, self._begins = array_of(own["next_row"]), array_of(own["begins"])
+        self._oldest, self._written = array_of(own["oldest"]), int(state_dict["written"])
         self._any_begins = bool(self._begins.any())
 
     def _empty(self) -> None:
-        self._next_row.zero_()
-        self._begins = torch.ones_like(self._begins)
-        self._any_begins = True
-        self._oldest.zero_()
-        self._written = 0
+        self._begin()
 
 
 def _part(whole: Tensor, part: Tensor) -> Tensor:

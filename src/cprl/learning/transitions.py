@@ -1,49 +1,68 @@
 """What one agent lived through, under TorchRL's default keys, so that any of its losses can read it."""
 
-import torch
+from typing import Any, NamedTuple
+
 from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
 
 from cprl import keys
 
 
-def lane_transitions(seats: tuple[int, ...], batch: TensorDictBase) -> TensorDict:
+class LaneTurn(NamedTuple):
+    """One transition of each of L lanes, as tensors or numpy arrays."""
+
+    observation: Any
+    """uint8 [L, C, X, Y]."""
+    action: Any
+    """int64 [L]."""
+    next_observation: Any
+    """uint8 [L, C, X, Y]."""
+    reward: Any
+    """float32 [L]."""
+    done: Any
+    """bool [L]."""
+    terminated: Any
+    """bool [L]."""
+
+
+def lane_turn(seats: tuple[int, ...], batch: TensorDictBase) -> LaneTurn:
     """The transitions of the agents at some seats of every replica, a turn of each.
 
     Args:
         seats: the agents' numbers, S.
-        batch: entries of `cprl.keys` at the root and under "next", of batch size [R] or [R, 1].
+        batch: entries of `cprl.keys` at the root and under "next", of batch size [R].
 
     Returns:
-        Like `transitions_of`, but [R x S], lane = replica x S + seat.
+        What `transitions_of` gives of each agent, lane = replica x S + seat; numpy views of what lies on the
+        CPU, as far as possible: on so few numbers torch takes several times as long.
     """
-    replicas = batch.batch_size[0]
-    lanes = replicas * len(seats)
-    before, after = batch.get(keys.AGENTS), batch.get("next")
-    agents_after = after.get(keys.AGENTS)
-    at = list(seats)
+    entry = keys.entry
+    before, after = entry(batch, keys.AGENTS), entry(batch, "next")
+    agents_after = entry(after, keys.AGENTS)
+    observation = array_of(entry(before, "observation"))
+    everyone = len(seats) == observation.shape[1]
+    lanes, windows, at = len(observation) * len(seats), observation.shape[2:], list(seats)
 
-    def of(entries: TensorDictBase, name: str) -> Tensor:
-        entry = entries.get(name)
-        entry = entry.reshape(replicas, *entry.shape[len(batch.batch_size) :])
-        chosen: Tensor = entry if len(at) == entry.shape[1] else entry[:, at]
-        return chosen.reshape(lanes, *entry.shape[2:])
+    def of(tensor: Tensor, *shape: int) -> Any:
+        array = array_of(tensor)
+        return (array if everyone else array[:, at]).reshape(lanes, *shape)
 
-    def of_world(name: str) -> Tensor:
-        flag: Tensor = after.get(name).reshape(replicas, 1, 1)
-        return flag.expand(replicas, len(at), 1).reshape(lanes, 1)
+    def of_world(flag: Tensor) -> Any:
+        return array_of(flag.expand(-1, len(at))).reshape(lanes)
 
-    new = TensorDict._new_unsafe
-    following = new(
-        {
-            "observation": of(agents_after, "observation"),
-            "reward": of(agents_after, "reward"),
-            **{name: of_world(name) for name in (keys.DONE, keys.TERMINATED, keys.TRUNCATED)},
-        },
-        batch_size=torch.Size([lanes]),
+    return LaneTurn(
+        of(entry(before, "observation"), *windows),
+        of(entry(before, "action")),
+        of(entry(agents_after, "observation"), *windows),
+        of(entry(agents_after, "reward")),
+        of_world(entry(after, keys.DONE)),
+        of_world(entry(after, keys.TERMINATED)),
     )
-    entries = {"observation": of(before, "observation"), "action": of(before, "action"), "next": following}
-    return new(entries, batch_size=torch.Size([lanes]))
+
+
+def array_of(tensor: Tensor) -> Any:
+    """The same memory as a numpy array; as it is where it lies on a GPU. Both are indexed alike."""
+    return tensor.numpy() if tensor.device.type == "cpu" else tensor
 
 
 def transitions_of(agent: int, batch: TensorDictBase) -> TensorDict:

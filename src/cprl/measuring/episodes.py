@@ -220,11 +220,11 @@ class EpisodeTracker:
 
 def _read(tensordict: TensorDictBase) -> Turns:
     """Every entry once, [B, ...] or [B, T', ...], without a copy where the batch lies on the CPU."""
-    following = tensordict.get("next")
-    agents = following.get(keys.AGENTS)
-    tensors = {name: agents.get(name) for _, name in _OF_AGENTS}
-    tensors |= {name: following.get(name) for name in _OF_WORLDS}
-    tensors["in_play"] = tensordict.get(keys.IN_PLAY)
+    following, entry = keys.entry(tensordict, "next"), keys.entry
+    agents, before = entry(following, keys.AGENTS), entry(tensordict, keys.AGENTS)
+    tensors = {name: entry(agents, name) for _, name in _OF_AGENTS}
+    tensors |= {name: entry(following, name) for name in _OF_WORLDS}
+    tensors["in_play"] = entry(before, keys.IN_PLAY[1])
     # In a world that had ended before and is stepped all the same nothing happens: it ends no second time.
-    tensors["had_ended"] = tensordict.get(keys.DONE)
+    tensors["had_ended"] = entry(tensordict, keys.DONE)
     return {name: tensor.numpy(force=True) for name, tensor in tensors.items()}

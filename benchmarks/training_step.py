@@ -1,0 +1,121 @@
+"""One whole training step of many independent DQN agents, in microseconds, and what each part takes of it.
+
+Lanes are 1 (one agent, one replica), 8 (one agent, 8 replicas, `single_complex`) and 32 (four agents, 8
+replicas, `commons`), with the published hyper-parameters, compiled, one thread, replay buffers of 20,000.
+Whole steps and updates alone take turns within one process, and the best of several repeats counts of each:
+inside a training an update finds its numbers, and everything its code, pushed out of the fast caches.
+
+    make bench
+"""
+
+import time
+from collections import Counter
+from collections.abc import Callable
+from concurrent.futures import ProcessPoolExecutor
+from contextlib import AbstractContextManager
+from dataclasses import replace
+from multiprocessing import get_context
+from typing import Any, Final
+from unittest.mock import patch
+
+import tyro
+from rich.console import Console
+from rich.table import Table
+
+from cprl import CommonsEnv, presets
+from cprl.acting import Seats
+from cprl.learning import LaneLearner
+from cprl.measuring.episodes import EpisodeTracker
+from cprl.train import Training, prepare_process
+
+CASES: Final[tuple[tuple[presets.Board, int, int], ...]] = (
+    ("single_complex", 1, 1),
+    ("single_complex", 1, 8),
+    ("commons", 4, 8),
+)
+"""Board, agents, replicas."""
+PARTS: Final[dict[str, tuple[type, str]]] = {
+    "policy": (Seats, "forward"),
+    "environment": (CommonsEnv, "_step_and_maybe_reset"),
+    "replay write": (LaneLearner, "remember"),
+    "update": (LaneLearner, "learn"),
+    "tracking": (EpisodeTracker, "add"),
+}
+STEPS: Final = 200
+
+
+def timed(part: str, spent: Counter[str]) -> AbstractContextManager[Any]:
+    """While it is open the time that a part takes is added up, in seconds."""
+    owner, name = PARTS[part]
+    plain: Callable[..., Any] = getattr(owner, name)
+
+    def with_clock(*arguments: Any, **named: Any) -> Any:
+        started = time.perf_counter()
+        result = plain(*arguments, **named)
+        spent[part] += time.perf_counter() - started  # type: ignore[assignment]
+        return result
+
+    return patch.object(owner, name, with_clock)
+
+
+def seconds(step: Callable[[], object]) -> float:
+    """Of STEPS steps."""
+    started = time.perf_counter()
+    for _ in range(STEPS):
+        step()
+    return time.perf_counter() - started
+
+
+def measure(board: presets.Board, agents: int, replicas: int, repeats: int) -> dict[str, float]:
+    """Microseconds of each part, of a whole step, and of an update alone."""
+    prepare_process(0)
+    game = presets.game(board)
+    settings = replace(presets.learner(board), buffer_size=20_000)
+    seats = tuple(range(agents))
+    learner = LaneLearner(game, seats=seats, replicas=replicas, settings=settings)
+    training = Training(CommonsEnv(game, replicas), {seats: learner}, episodes=10**9)
+    while training.steps < 500:
+        training.step()
+    best: dict[str, float] = {}
+
+    def keep(name: str, spent: float) -> None:
+        best[name] = min(best.get(name, float("inf")), spent / STEPS * 1e6)
+
+    for _ in range(repeats):
+        keep("whole step", seconds(training.step))
+        keep("update alone", seconds(learner.learn))
+    for _ in range(repeats):
+        for part in PARTS:
+            spent: Counter[str] = Counter()
+            with timed(part, spent):
+                seconds(training.step)
+            keep(part, spent[part])
+    return best
+
+
+def main(*, repeats: int = 15) -> None:
+    """Prints the table.
+
+    Args:
+        repeats: of which the best counts.
+    """
+    table = Table("microseconds a step", title="one whole training step, one thread, compiled")
+    columns = []
+    with ProcessPoolExecutor(1, mp_context=get_context("spawn"), max_tasks_per_child=1) as process:
+        for board, agents, replicas in CASES:
+            columns.append(process.submit(measure, board, agents, replicas, repeats).result())
+            table.add_column(f"{agents * replicas} lanes", justify="right")
+    for part in PARTS:
+        table.add_row(part, *(f"{best[part]:,.0f} ({best[part] / best['whole step']:.0%})" for best in columns))
+    rest = [best["whole step"] - sum(best[part] for part in PARTS) for best in columns]
+    table.add_row("the rest", *(f"{us:,.0f}" for us in rest))
+    table.add_section()
+    table.add_row("whole step", *(f"{best['whole step']:,.0f}" for best in columns))
+    table.add_row("update alone", *(f"{best['update alone']:,.0f}" for best in columns))
+    ratios = (best["whole step"] / best["update alone"] for best in columns)
+    table.add_row("whole step / update alone", *(f"{ratio:.2f}" for ratio in ratios))
+    Console().print(table)
+
+
+if __name__ == "__main__":
+    tyro.cli(main)
