@@ -8,7 +8,7 @@ INSTALLED := .venv/.installed
 .PHONY: run test test-slow test-gpu check bench bench-gpu clean
 
 run: $(INSTALLED)
-	$(BIN)/python recipes/single_basic.py --schedule short --watch serve
+	$(BIN)/python recipes/first_run.py --watch serve
 
 test: $(INSTALLED)
 	$(BIN)/python -m pytest

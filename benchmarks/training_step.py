@@ -106,7 +106,9 @@ def main(*, repeats: int = 15) -> None:
             columns.append(process.submit(measure, board, agents, replicas, repeats).result())
             table.add_column(f"{agents * replicas} lanes", justify="right")
     for part in PARTS:
-        table.add_row(part, *(f"{best[part]:,.0f} ({best[part] / best['whole step']:.0%})" for best in columns))
+        table.add_row(
+            part, *(f"{best[part]:,.0f} ({best[part] / best['whole step']:.0%})" for best in columns)
+        )
     rest = [best["whole step"] - sum(best[part] for part in PARTS) for best in columns]
     table.add_row("the rest", *(f"{us:,.0f}" for us in rest))
     table.add_section()

@@ -5,16 +5,14 @@
 Copy this file and change it: another map, rule, network or loss is one line.
 """
 
-from functools import partial
+from dataclasses import replace
 from pathlib import Path
 
 import tyro
 
-from cprl import CommonsEnv, presets, recording
-from cprl.acting import Seats, random_seats
+from cprl import presets, recording, study
 from cprl.learning import LaneLearner
-from cprl.measuring.evaluate import evaluate
-from cprl.train import prepare_process, train
+from cprl.train import prepare_process
 
 SEATS = (0, 1, 2, 3)
 
@@ -24,7 +22,9 @@ def main(
     replicas: int = 8,
     episodes: int = 4800,
     variant: presets.Variant = "published",
+    epsilon_decay_steps: int = 1_000_000,
     evaluation_episodes: int = 20,
+    learn_every: int = 1,
     seed: int = 0,
     out: Path | None = None,
     go_on: bool = False,
@@ -36,7 +36,9 @@ def main(
         replicas: independent repetitions of the whole training, side by side.
         episodes: how many each trains.
         variant: the rules and the learner as the study is written, or as it was run.
+        epsilon_decay_steps: of exploration; versions of the study's program have 500,000 too.
         evaluation_episodes: fresh episodes for each replica, with epsilon 0.05, and for the random policy.
+        learn_every: environment steps k after which agents learn, then k times.
         seed: of chance, weights, exploration and replay.
         out: the run's directory; by default a new one under runs/.
         go_on: with the run in `out`, which was stopped; bit for bit as if it had not been.
@@ -45,31 +47,27 @@ def main(
     prepare_process(seed)
     game = presets.game("commons", variant=variant)
     settings = presets.learner("commons", variant=variant)
-    title = f"commons, {variant} rules, {replicas} replicas, {episodes} episodes"
-    arguments = {"replicas": replicas, "episodes": episodes, "variant": variant, "seed": seed}
-    recipe = {**arguments, "game": game, "learner": settings}
+    settings = replace(settings, epsilon_decay_steps=epsilon_decay_steps)
+    recipe = {
+        "replicas": replicas,
+        "episodes": episodes,
+        "variant": variant,
+        "learn_every": learn_every,
+        "seed": seed,
+        "game": game,
+        "learner": settings,
+        "population": {"learning": SEATS, "random": ()},
+    }
     run = recording.start_run(out, "commons", recipe, go_on=go_on)
     agents = LaneLearner(game, seats=SEATS, replicas=replicas, settings=settings, seed=seed, compile=compile)
-    random = partial(random_seats, game, replicas=replicas, seed=seed)
-
-    with (
-        recording.Checkpoints(run) as checkpoints,
-        recording.EpisodeTable(run / "episodes.parquet", resumable=True) as table,
-        recording.ProgressBar(game, episodes=episodes, replicas=replicas) as bar,
-    ):
-        env = CommonsEnv(game, replicas, seed=seed)
-        train(env, {SEATS: agents}, episodes=episodes, observers=[table, bar], checkpoints=checkpoints)
-        recording.save_weights(run, agents.networks())
-
-    fresh = CommonsEnv(game, replicas * evaluation_episodes, seed=seed + 1)
-    trained = Seats({SEATS: agents.evaluation_actor(evaluation_episodes)})
-    played = {
-        "random": evaluate(fresh, Seats(random(SEATS, worlds=evaluation_episodes))),
-        "trained, epsilon 0.05": evaluate(fresh, trained, explore=True),
-    }
-    figure = recording.training_curve(run, title=title, random=played["random"])
-    recording.summarise(run, title=title, played=played, figure=figure)
-    return run
+    return study.conduct(
+        run,
+        agents,
+        episodes=episodes,
+        title=f"commons, {variant} rules, {replicas} replicas, {episodes} episodes",
+        evaluation_episodes=evaluation_episodes,
+        learn_every=learn_every,
+    )
 
 
 if __name__ == "__main__":

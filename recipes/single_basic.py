@@ -1,103 +1,69 @@
 """Experiment 1 of the study: one DQN agent alone on `single_basic`. Does it learn not to strip the board?
 
-    python recipes/single_basic.py --watch serve                     the published schedule, 6000 episodes
-    python recipes/single_basic.py --schedule short --watch serve    some four minutes, live in the browser
+    python recipes/single_basic.py                          8 replicas of 6000 episodes
 
 Copy this file and change it: another map, rule, network or loss is one line.
 """
 
-import logging
-from dataclasses import replace
 from pathlib import Path
-from typing import Literal
 
-import torch
 import tyro
 
-from cprl import CommonsEnv, presets
-from cprl.acting import RandomActor, Seats
-from cprl.learning import DQNLearner
-from cprl.measuring.evaluate import evaluate
-from cprl.recording import (
-    BestWeights,
-    EpisodeTable,
-    ProgressBar,
-    Watch,
-    restore_weights,
-    save_weights,
-    start_run,
-    summarise,
-    training_curve,
-)
-from cprl.train import train
+from cprl import presets, recording, study
+from cprl.learning import LaneLearner
+from cprl.train import prepare_process
 
-PUBLISHED_LINE = ".venv/bin/python recipes/single_basic.py --watch serve"
-SHORT = {"epsilon_decay_steps": 30_000, "batch_size": 64, "learning_rate": 3e-4, "target_every_episodes": 1}
-"""What the short schedule changes, besides the number of episodes: it has to learn from 1/50 of the steps."""
+SEATS = (0,)
 
 
 def main(
     *,
-    schedule: Literal["published", "short"] = "published",
+    replicas: int = 8,
+    episodes: int = 6000,
     variant: presets.Variant = "published",
-    episodes: int | None = None,
-    evaluation_episodes: int = 100,
+    evaluation_episodes: int = 20,
+    learn_every: int = 1,
     seed: int = 0,
     out: Path | None = None,
-    watch: Literal["file", "serve"] = "file",
+    go_on: bool = False,
+    compile: bool = True,
 ) -> Path:
-    """Trains the agent, evaluates it on fresh worlds, and returns the run's directory.
+    """Trains the agents of all replicas, evaluates them on fresh worlds, and returns the run's directory.
 
     Args:
-        schedule: the published one, or a short one with the numbers of `SHORT`.
+        replicas: independent repetitions of the whole training, side by side.
+        episodes: how many each trains.
         variant: the rules and the learner as the study is written, or as it was run.
-        episodes: how many to train; by default the schedule's, 6000 or 120.
-        evaluation_episodes: fresh episodes for the trained and for the random policy.
+        evaluation_episodes: fresh episodes for each replica, with epsilon 0.05, and for the random policy.
+        learn_every: environment steps k after which agents learn, then k times.
         seed: of chance, weights, exploration and replay.
         out: the run's directory; by default a new one under runs/.
-        watch: record to a file, or serve the recording live on 127.0.0.1 as well.
+        go_on: with the run in `out`, which was stopped; bit for bit as if it had not been.
+        compile: whether torch compiles the update; needs a C++ compiler, and is several times faster.
     """
+    prepare_process(seed)
     game = presets.game("single_basic", variant=variant)
     settings = presets.learner("single_basic", variant=variant)
-    if schedule == "short":
-        settings = replace(settings, **SHORT)
-    episodes = episodes or (120 if schedule == "short" else 6000)
-    title = f"single_basic, {variant} rules, {schedule} schedule, {episodes} episodes"
-    arguments = {"schedule": schedule, "variant": variant, "episodes": episodes, "seed": seed}
-
-    torch.manual_seed(seed)
-    torch.set_num_threads(1)
-    logging.getLogger("torchrl").setLevel(logging.WARNING)
-    run = start_run(out, "single_basic", {**arguments, "game": game, "learner": settings})
-    env, trial = CommonsEnv(game, seed=seed), CommonsEnv(game, 16, seed=seed + 1)
-    learner = DQNLearner(
-        game.observation_shape,
-        len(game.actions),
-        settings=settings,
-        highest=game.observation.highest,
-        seed=seed,
+    recipe = {
+        "replicas": replicas,
+        "episodes": episodes,
+        "variant": variant,
+        "learn_every": learn_every,
+        "seed": seed,
+        "game": game,
+        "learner": settings,
+        "population": {"learning": SEATS, "random": ()},
+    }
+    run = recording.start_run(out, "single_basic", recipe, go_on=go_on)
+    agents = LaneLearner(game, seats=SEATS, replicas=replicas, settings=settings, seed=seed, compile=compile)
+    return study.conduct(
+        run,
+        agents,
+        episodes=episodes,
+        title=f"single_basic, {variant} rules, {replicas} replicas, {episodes} episodes",
+        evaluation_episodes=evaluation_episodes,
+        learn_every=learn_every,
     )
-    policy, networks = Seats([learner.actor]), {"agent_0": learner.network}
-    with (
-        Watch(run, env, title=title, episodes=episodes, recipe=arguments, serve=watch == "serve") as viewer,
-        EpisodeTable(run / "episodes.parquet") as table,
-        ProgressBar(game, episodes=episodes) as bar,
-    ):
-        best = BestWeights(run, networks, policy=policy, env=trial, logger=viewer.logger)
-        train(env, {0: learner}, episodes=episodes, observers=[table, viewer, best, bar])
-    save_weights(run, networks)
-
-    fresh = CommonsEnv(game, evaluation_episodes, seed=seed + 2)
-    played = {"random": evaluate(fresh, Seats([RandomActor(len(game.actions), seed=seed)]))}
-    played["greedy, last"] = evaluate(fresh, policy)
-    if best.path:
-        restore_weights(best.path, networks)
-        played[f"greedy, best (episode {best.best_episode})"] = evaluate(fresh, policy)
-    figure = training_curve(run, title=title, random=played["random"])
-    summarise(run, title=title, played=played, figure=figure)
-    if schedule == "short":
-        print(f"This was a shortened schedule. The published one: {PUBLISHED_LINE}")
-    return run
 
 
 if __name__ == "__main__":

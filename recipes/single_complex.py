@@ -5,16 +5,13 @@
 Copy this file and change it: another map, rule, network or loss is one line.
 """
 
-from functools import partial
 from pathlib import Path
 
 import tyro
 
-from cprl import CommonsEnv, presets, recording
-from cprl.acting import Seats, random_seats
+from cprl import presets, recording, study
 from cprl.learning import LaneLearner
-from cprl.measuring.evaluate import evaluate
-from cprl.train import prepare_process, train
+from cprl.train import prepare_process
 
 SEATS = (0,)
 
@@ -25,6 +22,7 @@ def main(
     episodes: int = 6000,
     variant: presets.Variant = "published",
     evaluation_episodes: int = 20,
+    learn_every: int = 1,
     seed: int = 0,
     out: Path | None = None,
     go_on: bool = False,
@@ -37,6 +35,7 @@ def main(
         episodes: how many each trains.
         variant: the rules and the learner as the study is written, or as it was run.
         evaluation_episodes: fresh episodes for each replica, with epsilon 0.05, and for the random policy.
+        learn_every: environment steps k after which agents learn, then k times.
         seed: of chance, weights, exploration and replay.
         out: the run's directory; by default a new one under runs/.
         go_on: with the run in `out`, which was stopped; bit for bit as if it had not been.
@@ -45,31 +44,26 @@ def main(
     prepare_process(seed)
     game = presets.game("single_complex", variant=variant)
     settings = presets.learner("single_complex", variant=variant)
-    title = f"single_complex, {variant} rules, {replicas} replicas, {episodes} episodes"
-    arguments = {"replicas": replicas, "episodes": episodes, "variant": variant, "seed": seed}
-    recipe = {**arguments, "game": game, "learner": settings}
+    recipe = {
+        "replicas": replicas,
+        "episodes": episodes,
+        "variant": variant,
+        "learn_every": learn_every,
+        "seed": seed,
+        "game": game,
+        "learner": settings,
+        "population": {"learning": SEATS, "random": ()},
+    }
     run = recording.start_run(out, "single_complex", recipe, go_on=go_on)
     agents = LaneLearner(game, seats=SEATS, replicas=replicas, settings=settings, seed=seed, compile=compile)
-    random = partial(random_seats, game, replicas=replicas, seed=seed)
-
-    with (
-        recording.Checkpoints(run) as checkpoints,
-        recording.EpisodeTable(run / "episodes.parquet", resumable=True) as table,
-        recording.ProgressBar(game, episodes=episodes, replicas=replicas) as bar,
-    ):
-        env = CommonsEnv(game, replicas, seed=seed)
-        train(env, {SEATS: agents}, episodes=episodes, observers=[table, bar], checkpoints=checkpoints)
-        recording.save_weights(run, agents.networks())
-
-    fresh = CommonsEnv(game, replicas * evaluation_episodes, seed=seed + 1)
-    trained = Seats({SEATS: agents.evaluation_actor(evaluation_episodes)})
-    played = {
-        "random": evaluate(fresh, Seats(random(SEATS, worlds=evaluation_episodes))),
-        "trained, epsilon 0.05": evaluate(fresh, trained, explore=True),
-    }
-    figure = recording.training_curve(run, title=title, random=played["random"])
-    recording.summarise(run, title=title, played=played, figure=figure)
-    return run
+    return study.conduct(
+        run,
+        agents,
+        episodes=episodes,
+        title=f"single_complex, {variant} rules, {replicas} replicas, {episodes} episodes",
+        evaluation_episodes=evaluation_episodes,
+        learn_every=learn_every,
+    )
 
 
 if __name__ == "__main__":

@@ -18,6 +18,7 @@ ROOMS = (
     "theory",
     "presets",
     "train",
+    "study",
     "cli",
 )
 MODULES = sorted(path for path in SOURCE.rglob("*.py") if path.parent != SOURCE or path.name != "__init__.py")

@@ -5,15 +5,17 @@ import json
 from dataclasses import replace
 from pathlib import Path
 
+import pyarrow.parquet as pq
 import pytest
 import torch
 
 import cprl
-from cprl import CommonsEnv, Map, Rules, presets
+from cprl import CommonsEnv, Map, Rules, presets, recording
 from cprl.acting import RandomActor, Seats
 from cprl.learning import DQNLearner, LaneLearner
 from cprl.measuring.evaluate import evaluate, mean_return
 from cprl.recording import EpisodeTable, load_weights, read_episodes, restore_weights
+from cprl.recording.checkpoints import checkpoints_in, read_checkpoint
 from cprl.train import train
 
 RECIPES = Path(__file__).parents[1] / "recipes"
@@ -41,17 +43,17 @@ def shorter_episodes(monkeypatch, request):
 
 
 def run_in_miniature(tmp_path, capsys, **arguments):
-    run = recipe("single_basic").main(episodes=11, evaluation_episodes=3, out=tmp_path / "run", **arguments)
+    run = recipe("first_run").main(episodes=11, evaluation_episodes=3, out=tmp_path / "run", **arguments)
     return run, capsys.readouterr().out
 
 
 @pytest.mark.parametrize("variant", presets.VARIANTS)
-def test_single_basic_leaves_a_run_directory(variant, tmp_path, capsys):
+def test_the_first_run_leaves_a_run_directory(variant, tmp_path, capsys):
     run, told = run_in_miniature(tmp_path, capsys, variant=variant, seed=3)
     kept = json.loads((run / "recipe.json").read_text())
-    assert kept["recipe"] == "single_basic"
+    assert kept["recipe"] == "first_run"
     assert kept["arguments"]["seed"] == 3
-    assert kept["arguments"]["learner"]["learning_rate"] == 1e-5
+    assert kept["arguments"]["learner"]["learning_rate"] == 3e-4
     again = Rules(**kept["arguments"]["game"]["rules"]), Map(**kept["arguments"]["game"]["map"])
     assert again == (presets.game("single_basic", variant=variant).rules, presets.game("single_basic").map)
     assert read_episodes(run)["episode"].to_pylist() == list(range(11))
@@ -62,14 +64,13 @@ def test_single_basic_leaves_a_run_directory(variant, tmp_path, capsys):
     assert set(load_weights(run / "checkpoints" / "final.pt")) == {"agent_0"}
     assert "random" in told
     assert "greedy" in told
-    assert "shortened" not in told
 
 
-def test_the_short_schedule_says_so_and_names_the_published_one(tmp_path, capsys):
-    run, told = run_in_miniature(tmp_path, capsys, schedule="short", watch="serve")
+def test_the_first_run_says_that_it_is_short_and_names_the_published_schedule(tmp_path, capsys):
+    run, told = run_in_miniature(tmp_path, capsys, watch="serve")
     assert "Watch live (browser): http://127.0.0.1:" in told
     assert "short schedule, 11 episodes" in " ".join(told.split())
-    assert "The published one: .venv/bin/python recipes/single_basic.py --watch serve" in told
+    assert "The published one, with 8 replicas: .venv/bin/python recipes/single_basic.py" in told
     assert (
         json.loads((run / "recipe.json").read_text())["arguments"]["learner"]["epsilon_decay_steps"] == 30_000
     )
@@ -84,7 +85,7 @@ def test_a_directory_with_a_run_in_it_is_not_written_over(tmp_path, capsys):
 
 @pytest.mark.slow
 def test_the_short_schedule_earns_three_times_what_chance_does(tmp_path):
-    run = recipe("single_basic").main(schedule="short", out=tmp_path / "run")
+    run = recipe("first_run").main(out=tmp_path / "run")
     game = presets.game("single_basic")
     learner = DQNLearner(game.observation_shape, 7, settings=presets.learner("single_basic"))
     restore_weights(run / "checkpoints" / "best.pt", {"agent_0": learner.network})
@@ -94,7 +95,7 @@ def test_the_short_schedule_earns_three_times_what_chance_does(tmp_path):
     assert greedy >= 3 * chance
 
 
-LANES = {"single_complex": 1, "two_complex": 2, "two_against_random": 2, "commons": 4}
+LANES = {"single_basic": 1, "single_complex": 1, "two_complex": 2, "two_against_random": 2, "commons": 4}
 
 
 @pytest.mark.parametrize("variant", presets.VARIANTS)
@@ -115,7 +116,12 @@ def test_recipes_of_replicas_leave_a_run_directory(name, variant, tmp_path, caps
     assert sorted(weights) == [f"replica_{r}/agent_{a}" for r in range(2) for a in range(learning)]
     assert (run / "figures" / "training_curve.png").exists()
     assert "trained, epsilon 0.05" in " ".join(told.split())
-    assert "run.rrd" not in told
+    for policy in ("random", "trained"):
+        played = pq.read_table(run / "evaluation" / f"{policy}.parquet").to_pydict()
+        assert sorted(set(zip(played["replica"], played["episode"], strict=True))) == [
+            (r, e) for r in range(2) for e in range(2)
+        ]
+    assert json.loads((run / "report.json").read_text())["training_s"] > 0
     game, settings = presets.game("commons"), presets.learner("commons", variant=variant)
     if name == "commons":
         network = LaneLearner(game, seats=[0], replicas=1, settings=settings, compile=False).networks()
@@ -173,10 +179,43 @@ def test_a_run_is_loaded_from_its_directory_alone(tmp_path):
     for lane, network in loaded.networks.items():
         for name, value in network.state_dict().items():
             assert torch.equal(value, kept[lane][name])
-    with pytest.raises(ValueError, match=r"agents \[1\] of replica 1 have no network in .*; kept are"):
-        loaded.policy(1)
-    played = evaluate(loaded.env(3), loaded.policy(1, others={1: RandomActor(8)}), explore=True)
-    assert len(played) == 3
+    assert loaded.weights_from == run / "checkpoints" / "final.pt"
+    assert len(evaluate(loaded.env(3), loaded.policy(1), explore=True)) == 3
+    assert len(evaluate(loaded.env(3), loaded.policy(1, others={1: RandomActor(8)}), explore=True)) == 3
+    with pytest.raises(ValueError, match=r"agents \[0\] of replica 7 have no network in .*; kept are"):
+        loaded.policy(7)
+
+
+def test_a_run_that_was_stopped_is_loaded_from_its_newest_checkpoint(tmp_path, monkeypatch):
+    how = {"replicas": 2, "episodes": 3, "evaluation_episodes": 1, "compile": False}
+
+    class StopError(Exception):
+        pass
+
+    def after_step(checkpoints, training):
+        if training.steps in (20, 40):
+            checkpoints.save(training)
+        if training.steps == 50:
+            raise StopError
+
+    monkeypatch.setattr(recording.Checkpoints, "after_step", after_step)
+    with pytest.raises(StopError):
+        recipe("two_against_random").main(out=tmp_path / "run", **how)
+    loaded = cprl.load(tmp_path / "run")
+    older, newest = checkpoints_in(tmp_path / "run" / "checkpoints")
+    assert loaded.weights_from == newest
+    assert sorted(loaded.networks) == ["replica_0/agent_0", "replica_1/agent_0"]
+    (of_learner,) = read_checkpoint(newest)["learners"]
+    kept = of_learner["update"]["own"]["value_network_params:module.0.module.weights.0"]
+    for replica in (0, 1):
+        first = next(loaded.networks[f"replica_{replica}/agent_0"].parameters())
+        assert torch.equal(first, kept[replica].T)
+    assert len(evaluate(loaded.env(2), loaded.policy(1), explore=True)) == 2
+    newest.write_bytes(newest.read_bytes()[:-100])
+    assert cprl.load(tmp_path / "run").weights_from == older
+    older.unlink()
+    with pytest.raises(ValueError, match=r"nor a readable checkpoint: .*truncated or was changed"):
+        cprl.load(tmp_path / "run")
 
 
 def test_the_run_of_a_plain_agent_is_loaded_too(tmp_path, capsys):
@@ -196,8 +235,13 @@ def test_a_run_that_cannot_be_loaded_says_which_file_and_why(tmp_path, capsys):
         with pytest.raises(ValueError, match=r"final\.pt holds no weights of this run: "):
             cprl.load(run)
     weights.unlink()
-    with pytest.raises(ValueError, match=r"final\.pt holds no weights of this run: .*No such file"):
+    with pytest.raises(
+        ValueError, match=r"final\.pt is not there, nor a readable checkpoint: has .* been tr"
+    ):
         cprl.load(run)
+    (run / "checkpoints" / "best.pt").unlink()
+    with pytest.raises(ValueError, match=r"best\.pt holds no weights of this run: .*No such file"):
+        cprl.load(run, weights="best")
     told = json.loads((run / "recipe.json").read_text())
     told["arguments"]["game"]["rules"]["hits_to_tag"] = 0
     (run / "recipe.json").write_text(json.dumps(told))

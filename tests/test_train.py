@@ -1,20 +1,26 @@
 """The loop, and evaluation: whoever watches is told of every turn and every episode."""
 
+from dataclasses import replace
+from functools import partial
+
 import numpy as np
 import pytest
 import torch
 
 from cprl import CommonsEnv, Game, Rules, maps
 from cprl.acting import RandomActor, Seats
-from cprl.learning import DQNLearner, DQNSettings
+from cprl.acting.collect import stock_collector
+from cprl.learning import DQNLearner, DQNSettings, LaneLearner
 from cprl.measuring.evaluate import evaluate, mean_return
-from cprl.recording import EpisodeTable, read_episodes
+from cprl.recording import Checkpoints, EpisodeTable, read_episodes
 from cprl.train import train
 
 GAME = Game(
     map=maps.parse(".A>.A\n.A.A.\n..<.A"),
     rules=Rules(regrow_prob=(0.0, 0.1), window_rows=3, window_columns=5, episode_steps=9),
 )
+
+SETTINGS = DQNSettings(buffer_size=200, learning_rate=1e-3, hidden_cells=(8,), epsilon_hold_steps=5)
 
 
 class Witness:
@@ -78,6 +84,52 @@ def test_what_cannot_be_trained_is_refused(arguments, message):
 def test_one_world_is_trained_at_a_time():
     with pytest.raises(ValueError, match="has 2 worlds; the learner at 0 has 1 replicas"):
         train(CommonsEnv(GAME, 2), {0: learner()}, others={1: RandomActor(8)}, episodes=1)
+
+
+def test_learning_may_wait_for_several_steps_and_then_catches_up():
+    class Counting(LaneLearner):
+        def learn(self):
+            told.append(self.steps)
+            return super().learn()
+
+    told = []
+    settings = replace(SETTINGS, learning_starts=1)
+    agents = Counting(GAME, seats=(0, 1), replicas=2, settings=settings, compile=False)
+    training = train(CommonsEnv(GAME, 2), {(0, 1): agents}, episodes=2, learn_every=3)
+    bouts = training.steps // 3
+    assert told == [3 * (bout + 1) for bout in range(bouts) for _ in range(3)]
+
+
+def test_torchrls_own_collector_trains_the_same():
+    def course(**how):
+        witness = Witness()
+        agents = LaneLearner(GAME, seats=(0, 1), replicas=2, settings=SETTINGS, seed=3, compile=False)
+        train(CommonsEnv(GAME, 2, seed=3), {(0, 1): agents}, episodes=4, observers=[witness], **how)
+        losses = [learning["agent_1/loss"] for learning in witness.learning]
+        weights = agents.networks()["replica_1/agent_0"].state_dict().values()
+        return (
+            [episode.return_.tolist() for episode in witness.episodes],
+            losses,
+            [w.tolist() for w in weights],
+        )
+
+    assert repr(course(make_collector=stock_collector)) == repr(course())
+    returns, losses, _ = course(make_collector=partial(stock_collector, steps=4), learn_every=4)
+    assert len(returns) == 8
+    assert np.isfinite(losses[-2:]).all()
+
+
+def test_checkpoints_of_what_keeps_no_state_are_refused_before_anything_is_played(tmp_path):
+    env, witness = CommonsEnv(GAME), Witness()
+    how = {"episodes": 1, "checkpoints": Checkpoints(tmp_path), "observers": [witness]}
+    with pytest.raises(ValueError, match="a DQNLearner keeps no state to go on from; use a LaneLearner"):
+        train(env, {0: learner(), 1: learner()}, **how)
+    agents = LaneLearner(GAME, seats=(0, 1), replicas=1, settings=SETTINGS, compile=False)
+    with pytest.raises(
+        ValueError, match="a Collector keeps no state to go on from; train with a StepCollector"
+    ):
+        train(env, {(0, 1): agents}, make_collector=stock_collector, **how)
+    assert witness.turns == []
 
 
 def test_what_was_played_before_an_interruption_is_kept(tmp_path):

@@ -10,6 +10,7 @@ The rooms, in the order in which the data flow:
     recording   what is kept: runs, tables, the Rerun recording, figures
     presets     the published games and learners by name
     train       the loop: act, store, learn, measure, record
+    study       one study from its learners to its report
 """
 
 from typing import TYPE_CHECKING, Any

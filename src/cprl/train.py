@@ -2,7 +2,8 @@
 
 import logging
 import sys
-from collections.abc import Mapping, Sequence
+import time
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any, Protocol
 
 import numpy as np
@@ -10,6 +11,7 @@ import torch
 from numpy.typing import NDArray
 from tensordict import TensorDictBase
 from torch import Tensor
+from torchrl.collectors import BaseCollector
 
 from cprl.acting.collect import StepCollector
 from cprl.acting.seats import Seat, Seats, agents_at
@@ -27,6 +29,10 @@ class Keeper(Protocol):
 
     def after_step(self, training: "Training") -> None:
         """Keeps the state, if it is time to."""
+
+
+MakeCollector = Callable[[CommonsEnv, torch.nn.Module], BaseCollector]
+"""A collector out of an environment and a policy; it yields batches [R], or [R, T] of T turns."""
 
 
 class Observer(Protocol):
@@ -68,10 +74,12 @@ class Training:
         episodes: how many to play, at least 1.
         others: the actors of the agents that do not learn, likewise.
         observers: told of each turn and each episode, in this order.
+        learn_every: steps k after which each learner learns, then k times.
+        make_collector: `StepCollector`, or for TorchRL's own `cprl.acting.collect.stock_collector`.
 
     Raises:
         ValueError: for seats that are empty or taken twice, another number of worlds than the learners
-            have replicas, or no episodes.
+            have replicas, or numbers below 1.
     """
 
     def __init__(
@@ -82,32 +90,52 @@ class Training:
         episodes: int,
         others: Mapping[Seat, torch.nn.Module] | None = None,
         observers: Sequence[Observer] = (),
+        learn_every: int = 1,
+        make_collector: MakeCollector = StepCollector,
     ) -> None:
         self.env, self.episodes, self.observers = env, episodes, observers
+        self.learn_every = learn_every
         self.others = dict(others or {})
         self.learners = {seat: seated(learner, seat) for seat, learner in learners.items()}
-        _check(env, self.learners, self.others, episodes)
+        _check(env, self.learners, self.others)
+        for name, number in (("episodes", episodes), ("learn_every", learn_every)):
+            if number < 1:
+                raise ValueError(f"{name} is {number}; at least 1 is wanted")
         replicas = env.batch_size.numel()
         actors = {seat: learner.actor for seat, learner in self.learners.items()}
-        self._collector = StepCollector(env, Seats({**actors, **self.others}))
+        self._collector = make_collector(env, Seats({**actors, **self.others}))
         self._turns = iter(self._collector)
         self._tracker = EpisodeTracker(replicas, env.game.agents, env.game.rules.episode_steps)
         self._losses = {seat: LaneLosses(replicas, agents_at(seat)) for seat in self.learners}
         self._played = [0] * replicas
         self.steps = 0
+        self._began, self._spent_s = time.monotonic(), 0.0
 
     @property
     def is_over(self) -> bool:
         """Whether every replica has played its episodes."""
         return min(self._played) >= self.episodes
 
+    @property
+    def spent_s(self) -> float:
+        """Seconds that it has taken so far, those before it was stopped included."""
+        return self._spent_s + time.monotonic() - self._began
+
     def step(self) -> None:
-        """One turn of every replica: act, store, learn, measure, record."""
+        """The turns that the collector yields, one as a rule: act, store, learn, measure, record."""
         batch = next(self._turns)
+        for turn in [batch] if batch.batch_dims == 1 else batch.unbind(1):
+            self._take(turn)
+
+    def _take(self, batch: TensorDictBase) -> None:
+        """One turn of every replica."""
         self.steps += 1
-        for seat, learner in self.learners.items():
+        for learner in self.learners.values():
             learner.remember(batch)
-            self._losses[seat].add(learner.learn())
+        if self.steps % self.learn_every == 0:
+            for _ in range(self.learn_every):
+                for seat, learner in self.learners.items():
+                    self._losses[seat].add(learner.learn())
         for observer in self.observers:
             observer.see_turn(batch)
         ended = self._tracker.add(batch)
@@ -127,9 +155,15 @@ class Training:
                     observer.see_episode(episode, of_agents)
 
     def state_dict(self) -> dict[str, Any]:
-        """Everything that the future depends on, in tensors, numbers, lists and dicts; not copies."""
+        """Everything that the future depends on, in tensors, numbers, lists and dicts; not copies.
+
+        Raises:
+            ValueError: where a learner or the collector keeps no state to go on from.
+        """
+        self._step_collector()
         return {
             "steps": self.steps,
+            "spent_s": self.spent_s,
             "played": list(self._played),
             "worlds": {name: _tensor(array) for name, array in self.env.worlds.state().items()},
             "learners": [learner.state_dict() for learner in self.learners.values()],
@@ -144,12 +178,22 @@ class Training:
         """The observers that go on from a state, as a table does; others may change from run to run."""
         return [observer for observer in self.observers if hasattr(observer, "load_state_dict")]
 
+    def _step_collector(self) -> StepCollector:
+        """The collector, if a training can go on with it."""
+        if not isinstance(self._collector, StepCollector):
+            kind = type(self._collector).__name__
+            raise ValueError(
+                f"a {kind} keeps no state to go on from; train with a StepCollector, or without checkpoints"
+            )
+        return self._collector
+
     def load_state_dict(self, state: Mapping[str, Any]) -> None:
         """Goes on exactly where the training of that state was, which was made with the same arguments."""
+        self._began, self._spent_s = time.monotonic(), float(state["spent_s"])
         self.steps, self._played = int(state["steps"]), list(state["played"])
         kinds = {name: array.dtype for name, array in self.env.worlds.state().items()}
         worlds = {name: tensor.numpy().view(kinds[name]) for name, tensor in state["worlds"].items()}
-        self._collector.go_on_from(self.env.load(worlds))
+        self._step_collector().go_on_from(self.env.load(worlds))
         for learner, own in zip(self.learners.values(), state["learners"], strict=True):
             learner.load_state_dict(own)
         for other, own in zip(self.others.values(), state["others"], strict=True):
@@ -170,24 +214,44 @@ def train(
     others: Mapping[Seat, torch.nn.Module] | None = None,
     observers: Sequence[Observer] = (),
     checkpoints: Keeper | None = None,
-) -> None:
+    learn_every: int = 1,
+    make_collector: MakeCollector = StepCollector,
+) -> Training:
     """Plays so many episodes of every replica; each learner stores every turn and then learns once.
 
     Args:
-        env: see `Training`, also for the others.
+        env: see `Training`, also for all that is not said here.
         learners: by where they sit.
         episodes: how many to play.
         others: the actors of the agents that do not learn.
         observers: told of each turn and each episode.
         checkpoints: where the training goes on from, and keeps its state now and then.
+        learn_every: steps k after which each learner learns, then k times.
+        make_collector: what plays.
+
+    Returns:
+        The training, which is over.
+
+    Raises:
+        ValueError: see `Training`; with checkpoints also for what keeps no state to go on from.
     """
-    training = Training(env, learners, episodes=episodes, others=others, observers=observers)
+    training = Training(
+        env,
+        learners,
+        episodes=episodes,
+        others=others,
+        observers=observers,
+        learn_every=learn_every,
+        make_collector=make_collector,
+    )
     if checkpoints is not None:
+        training.state_dict()  # what cannot be kept is refused now, not when the first checkpoint is due
         checkpoints.restore(training)
     while not training.is_over:
         training.step()
         if checkpoints is not None:
             checkpoints.after_step(training)
+    return training
 
 
 def _tensor(array: NDArray[Any]) -> Tensor:
@@ -211,7 +275,6 @@ def _check(
     env: CommonsEnv,
     learners: Mapping[Seat, Learner],
     others: Mapping[Seat, torch.nn.Module],
-    episodes: int,
 ) -> None:
     taken = sorted(agent for seat in [*learners, *others] for agent in agents_at(seat))
     wanted = list(range(env.game.agents))
@@ -225,5 +288,3 @@ def _check(
             raise ValueError(
                 f"the environment has {worlds} worlds; the learner at {seat} has {learner.replicas} replicas"
             )
-    if episodes < 1:
-        raise ValueError(f"episodes is {episodes}; at least 1 is wanted")

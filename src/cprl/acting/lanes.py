@@ -166,7 +166,7 @@ class LaneActor(TensorDictModuleBase):
 
 def random_seats(
     game: Game, seats: tuple[int, ...], *, replicas: int, seed: int, worlds: int = 1
-) -> dict[tuple[int, ...], LaneActor]:
+) -> dict[int | tuple[int, ...], nn.Module]:
     """Agents at some seats of every replica to whom every action is equally likely, by where they sit."""
     seeds = [(seed, replica, agent) for replica in range(replicas) for agent in seats]
     return {seats: random_lanes(len(game.actions), seeds=seeds, seats=len(seats), worlds=worlds)}

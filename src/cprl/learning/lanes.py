@@ -2,7 +2,7 @@
 
 from collections.abc import Callable, Mapping, Sequence
 from functools import partial
-from typing import Any, Final, Literal, get_args
+from typing import Any, Final
 
 import numpy as np
 import torch
@@ -13,13 +13,11 @@ from cprl.acting.lanes import LaneActor
 from cprl.commons.game import Game
 from cprl.learning.dqn import dqn_loss, q_network
 from cprl.learning.functional import MakeLoss
-from cprl.learning.fused import FunctionalUpdate
 from cprl.learning.replay import lane_buffer
 from cprl.learning.settings import DQNSettings
 from cprl.learning.transitions import lane_turn
-from cprl.learning.updates import ListUpdate, Update
-
-Way = Literal["lane axis", "vmap", "list"]
+from cprl.learning.updates import ListUpdate
+from cprl.learning.ways import TRIAL_LANES, Way, make_update, trial_buffer
 
 WEIGHTS, TARGET_WEIGHTS, EXPLORATION, SAMPLING, EVALUATION = range(5)
 """What a lane's random numbers are for."""
@@ -50,8 +48,8 @@ class LaneLearner:
         make_network: a lane's network; by default `QNetwork` by the settings. It draws its weights from
             torch's generator, which is seeded for each lane.
         make_loss: a lane's loss out of its network; by default `dqn_loss`.
-        way: how lanes are updated; "lane axis" wants `QNetwork`s, "vmap" and "list" take any.
-        compile: whether the update is compiled, for the first two ways.
+        way: how lanes are updated; by default the fastest that fits, see `cprl.learning.ways`.
+        compile: whether acting and the update are compiled, for the first two ways.
         device: where they learn.
     """
 
@@ -66,51 +64,33 @@ class LaneLearner:
         first_replica: int = 0,
         make_network: Callable[[], nn.Module] | None = None,
         make_loss: MakeLoss | None = None,
-        way: Way = "lane axis",
+        way: Way | None = None,
         compile: bool = True,
         device: str | torch.device = "cpu",
     ) -> None:
-        if way not in get_args(Way):
-            raise ValueError(f"way is {way!r}; allowed: {', '.join(get_args(Way))}")
         self.game, self.settings, self.seats = game, settings, tuple(seats)
         self.replicas, self._numbers = replicas, range(first_replica, first_replica + replicas)
         self.seed = seed
-        actions = len(game.actions)
-        make_network = make_network or partial(
-            q_network,
-            game.observation_shape,
-            actions,
-            settings=settings,
-            highest=game.observation.highest,
+        actions, shape = len(game.actions), game.observation_shape
+        self._make_network = make_network or partial(
+            q_network, shape, actions, settings=settings, highest=game.observation.highest
         )
-        self._make_network = make_network
-        make_loss = make_loss or partial(dqn_loss, gamma=settings.gamma)
-        networks = [_drawn(make_network, own).to(device) for own in self._seeds(WEIGHTS)]
-        targets = None
-        if settings.own_target_weights:
-            targets = [_drawn(make_network, own).to(device) for own in self._seeds(TARGET_WEIGHTS)]
-        how = {
-            "target_networks": targets,
-            "learning_rate": settings.learning_rate,
-            "adam_eps": settings.adam_eps,
-            "loss_share": 1 / actions if settings.mean_over_all_outputs else 1.0,
-        }
-        self.update: Update
-        if way == "list":
-            self.update = ListUpdate(networks, make_loss, **how)  # type: ignore[arg-type]
-        else:
-            self.update = FunctionalUpdate(
-                networks,
-                make_loss,
-                lane_axis=way == "lane axis",
-                compile=compile,
-                **how,  # type: ignore[arg-type]
-            )
+        self.update = make_update(
+            way,
+            self._networks(WEIGHTS, device),
+            make_loss or partial(dqn_loss, gamma=settings.gamma),
+            target_networks=self._networks(TARGET_WEIGHTS, device) if settings.own_target_weights else None,
+            learning_rate=settings.learning_rate,
+            adam_eps=settings.adam_eps,
+            loss_share=1 / actions if settings.mean_over_all_outputs else 1.0,
+            compile=compile,
+            trial=trial_buffer(min(self.lanes, TRIAL_LANES), shape, actions, device=device),
+        )
         self.buffer = lane_buffer(
             seeds=self._seeds(SAMPLING),
             transitions=settings.buffer_size,
             batch_size=settings.batch_size,
-            observation_shape=game.observation_shape,
+            observation_shape=shape,
             device=device,
         )
         self.actor = LaneActor(
@@ -118,11 +98,20 @@ class LaneLearner:
             actions,
             seeds=self._seeds(EXPLORATION),
             seats=len(self.seats),
-            compile=compile and way != "list",
+            compile=compile and not isinstance(self.update, ListUpdate),
         )
         self.steps = 0
         self.actor.epsilon = settings.epsilon(0)
         self._episodes = torch.zeros(replicas, dtype=torch.int64)
+
+    @property
+    def lanes(self) -> int:
+        """The number of lanes, replicas x seats."""
+        return self.replicas * len(self.seats)
+
+    def _networks(self, purpose: int, device: str | torch.device) -> list[nn.Module]:
+        """A new network for each lane."""
+        return [_drawn(self._make_network, own).to(device) for own in self._seeds(purpose)]
 
     def _seeds(self, purpose: int) -> list[tuple[int, int, int, int]]:
         return lane_seeds(self.seed, replicas=self._numbers, seats=self.seats, purpose=purpose)
@@ -142,11 +131,15 @@ class LaneLearner:
     def networks(self) -> dict[str, nn.Module]:
         """A copy of every lane's network with its present weights, by "replica_0/agent_0" and so on."""
         made = {}
-        for lane, (_, replica, agent, _) in enumerate(self._seeds(WEIGHTS)):
-            network = self._make_network()
-            network.load_state_dict(self.update.network_state(lane))
-            made[f"replica_{replica}/agent_{agent}"] = network
+        for name, weights in self._weights().items():
+            made[name] = self._make_network()
+            made[name].load_state_dict(weights)
         return made
+
+    def _weights(self) -> dict[str, dict[str, Tensor]]:
+        """The state dict of each lane's network, by the name in `networks`."""
+        names = [f"replica_{replica}/agent_{agent}" for _, replica, agent, _ in self._seeds(WEIGHTS)]
+        return {name: self.update.network_state(lane) for lane, name in enumerate(names)}
 
     def remember(self, batch: TensorDictBase) -> None:
         """Stores a turn of every replica, as the collector yields it."""
@@ -168,8 +161,12 @@ class LaneLearner:
             self.update.copy_to_targets(due.repeat_interleave(len(self.seats)))
 
     def state_dict(self) -> dict[str, Any]:
-        """Everything that the future of all lanes depends on; own tensors, not copies."""
+        """Everything that the future of all lanes depends on; own tensors, not copies.
+
+        "networks" besides, which says the same as "update" in a form that `cprl.load` reads.
+        """
         return {
+            "networks": self._weights(),
             "update": self.update.state_dict(),
             "storage": self.buffer.storage.state_dict(),
             "sampler": self.buffer.sampler.state_dict(),

@@ -2,7 +2,7 @@
 
 from collections.abc import Mapping
 from math import nan
-from typing import Any, Protocol
+from typing import Any, Final, Protocol
 
 import numpy as np
 import torch
@@ -12,6 +12,10 @@ from torch import Tensor
 from cprl.acting.seats import Seat, agents_at
 from cprl.learning.dqn import DQNLearner
 from cprl.learning.transitions import transitions_of
+
+_NO_STATE: Final = (
+    "a DQNLearner keeps no state to go on from; use a LaneLearner, or train without checkpoints"
+)
 
 
 class Learner(Protocol):
@@ -67,11 +71,11 @@ class OneAgent:
 
     def state_dict(self) -> dict[str, Any]:
         """A plain agent cannot go on from a checkpoint; `LaneLearner` can."""
-        raise NotImplementedError("a DQNLearner keeps no state to go on from; use a LaneLearner")
+        raise ValueError(_NO_STATE)
 
     def load_state_dict(self, state: Mapping[str, Any]) -> None:
         """See `state_dict`."""
-        raise NotImplementedError("a DQNLearner keeps no state to go on from; use a LaneLearner")
+        raise ValueError(_NO_STATE)
 
 
 def seated(learner: Learner | DQNLearner, seat: Seat) -> Learner:

@@ -75,7 +75,7 @@ def lane_buffer(
         observation_shape: (C, X, Y).
         device: where it lies.
 
-    What they take is logged, as "cprl", before it is allocated.
+    What they take, if it is a mebibyte or more, is logged, as "cprl", before it is allocated.
 
     Raises:
         MemoryError: where the machine has less memory than it takes, before anything is allocated.
@@ -87,13 +87,14 @@ def lane_buffer(
             f"the replay buffers of {len(seeds)} lanes x {transitions:,} transitions take "
             f"{wanted / 2**30:.2f} GiB; {there / 2**30:.2f} GiB are free: lower buffer_size or replicas"
         )
-    logging.getLogger("cprl").info(
-        "Replay buffers of %d lanes x %s transitions: %.2f GiB of %.1f GiB free",
-        len(seeds),
-        f"{transitions:,}",
-        wanted / 2**30,
-        there / 2**30,
-    )
+    if wanted >= 2**20:
+        logging.getLogger("cprl").info(
+            "Replay buffers of %d lanes x %s transitions: %.2f GiB of %.1f GiB free",
+            len(seeds),
+            f"{transitions:,}",
+            wanted / 2**30,
+            there / 2**30,
+        )
     storage = LaneStorage(
         lanes=len(seeds), transitions=transitions, observation_shape=observation_shape, device=device
     )

@@ -4,7 +4,6 @@ import hashlib
 import os
 import re
 import signal
-import sys
 import time
 from collections.abc import Mapping
 from pathlib import Path
@@ -14,12 +13,16 @@ from typing import Any, Final, Protocol, Self
 import torch
 from rich.console import Console
 
+from cprl.recording.files import place_atomically
 from cprl.recording.run import go_on_line
 
 FOLDER: Final = "checkpoints"
 EVERY_S: Final = 300.0
 KEPT: Final = 2
 """Checkpoints that stay: the newest, and one more should it turn out unreadable."""
+
+PARTIAL: Final = "training.partial"
+"""A checkpoint that is being written, or whose writing was killed."""
 
 _NAME: Final = re.compile(r"training-(\d{12})-([0-9a-f]{32})\.pt")
 _SIGNALS: Final = (signal.SIGINT, signal.SIGTERM)
@@ -97,18 +100,11 @@ class Checkpoints:
     def save(self, training: HasState) -> Path:
         """Writes a checkpoint, all or nothing, and takes away those that are older than the newest two."""
         self.folder.mkdir(parents=True, exist_ok=True)
-        partial = self.folder / "training.partial"
-        try:
-            with open(partial, "wb") as file:
-                torch.save(training.state_dict(), file)
-                file.flush()
-                os.fsync(file.fileno())
-            path = self.folder / f"training-{training.steps:012d}-{_checksum(partial)}.pt"
-            os.replace(partial, path)
-            _sync_folder(self.folder)
-        except BaseException:
-            partial.unlink(missing_ok=True)
-            raise
+        path = place_atomically(
+            self.folder / PARTIAL,
+            lambda file: torch.save(training.state_dict(), file),
+            lambda partial: self.folder / f"training-{training.steps:012d}-{_checksum(partial)}.pt",
+        )
         for old in checkpoints_in(self.folder)[:-KEPT]:
             old.unlink()
         self._saved = time.monotonic()
@@ -118,6 +114,7 @@ class Checkpoints:
         """Takes the checkpoints away: the run is over, and its weights and episodes are kept elsewhere."""
         for path in checkpoints_in(self.folder):
             path.unlink()
+        (self.folder / PARTIAL).unlink(missing_ok=True)
 
     def __enter__(self) -> Self:
         for number in _SIGNALS:
@@ -179,14 +176,3 @@ def _checksum(path: Path) -> str:
         while block := file.read(1 << 24):
             digest.update(block)
     return digest.hexdigest()
-
-
-def _sync_folder(folder: Path) -> None:
-    """Makes a new name in a folder survive a loss of power, where the system can."""
-    if sys.platform == "win32":
-        return
-    number = os.open(folder, os.O_RDONLY)
-    try:
-        os.fsync(number)
-    finally:
-        os.close(number)

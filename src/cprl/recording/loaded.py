@@ -1,4 +1,4 @@
-"""load: a finished run as its directory keeps it: game, settings, trained networks, episodes."""
+"""load: a run as its directory keeps it: game, settings, population, trained networks, episodes."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -8,7 +8,7 @@ from typing import Any
 import pyarrow as pa
 from torch import nn
 
-from cprl.acting import QActor, QNetwork, Seats
+from cprl.acting import QActor, QNetwork, RandomActor, Seats
 from cprl.commons.game import Game
 from cprl.commons.maps import Map
 from cprl.commons.observation import Observation
@@ -16,6 +16,7 @@ from cprl.commons.rules import Rules
 from cprl.envs.torchrl_env import CommonsEnv
 from cprl.learning.dqn import q_network
 from cprl.learning.settings import DQNSettings
+from cprl.recording.checkpoints import FOLDER, checkpoints_in, read_checkpoint
 from cprl.recording.results import read_episodes
 from cprl.recording.run import read_recipe
 from cprl.recording.weights import load_weights
@@ -32,6 +33,8 @@ class LoadedRun:
     """What `recipe.json` holds."""
     networks: Mapping[str, QNetwork]
     """The trained network of each lane, by "replica_0/agent_0" and so on."""
+    weights_from: Path
+    """The file that held them: of a run that has not ended, its newest checkpoint."""
 
     @property
     def replicas(self) -> list[int]:
@@ -47,16 +50,20 @@ class LoadedRun:
 
         Args:
             replica: its number.
-            others: actors of the agents that did not learn, by number.
+            others: actors by the agent's number, instead of those of the run; where it says that an agent
+                acted at random, one that does so is there without being given.
 
         Raises:
             ValueError: where a seat stays empty; says which.
         """
-        actors: dict[int, nn.Module] = dict(others or {})
+        actions = len(self.game.actions)
+        at_random = self.recipe["arguments"].get("population", {}).get("random", ())
+        actors: dict[int, nn.Module] = {agent: RandomActor(actions, seed=agent) for agent in at_random}
+        actors |= others or {}
         for agent in range(self.game.agents):
             network = self.networks.get(f"replica_{replica}/agent_{agent}")
             if network is not None:
-                actor = QActor(network, len(self.game.actions))
+                actor = QActor(network, actions)
                 actor.epsilon = self.settings.epsilon_evaluation
                 actors.setdefault(agent, actor)
         empty = sorted(set(range(self.game.agents)) - set(actors))
@@ -72,12 +79,13 @@ class LoadedRun:
         return read_episodes(self.path)
 
 
-def load(run: str | Path, *, weights: str = "final") -> LoadedRun:
-    """Builds a run's game, settings and trained networks again; runs no code of its files.
+def load(run: str | Path, *, weights: str | None = None) -> LoadedRun:
+    """Builds a run's game, settings, population and networks again; runs no code of its files.
 
     Args:
         run: its directory.
-        weights: which were kept: "final", or "best" where the recipe keeps them.
+        weights: which were kept: "final", or "best" where the recipe keeps them; by default the final ones,
+            or those of the newest readable checkpoint where the run has not ended.
 
     Raises:
         ValueError: for a file that is missing, truncated, changed or foreign; names file and reason.
@@ -95,19 +103,44 @@ def load(run: str | Path, *, weights: str = "final") -> LoadedRun:
         settings = DQNSettings(**{**learner, "hidden_cells": tuple(learner["hidden_cells"])})
     except (KeyError, TypeError, ValueError) as error:
         raise ValueError(f"{run / 'recipe.json'} holds no game and learner of cprl: {error!r}") from error
+    path, kept_weights = _weights(run, weights)
     return LoadedRun(
         path=run,
         game=game,
         settings=settings,
         recipe=recipe,
-        networks=_networks(run / "checkpoints" / f"{weights}.pt", game, settings),
+        networks=_networks(path, kept_weights, game, settings),
+        weights_from=path,
     )
 
 
-def _networks(path: Path, game: Game, settings: DQNSettings) -> dict[str, QNetwork]:
+def _weights(run: Path, name: str | None) -> tuple[Path, Any]:
+    """A file with weights, and the state dict of each network in it."""
+    folder = run / FOLDER
+    path = folder / f"{name or 'final'}.pt"
+    if name is None and not path.exists():
+        reasons = []
+        for checkpoint in reversed(checkpoints_in(folder)):
+            try:
+                state = read_checkpoint(checkpoint)
+                of_learners = [learner["networks"] for learner in state["learners"]]
+            except (ValueError, KeyError) as error:
+                reasons.append(str(error))
+                continue
+            return checkpoint, {lane: own for networks in of_learners for lane, own in networks.items()}
+        raise ValueError(
+            "; ".join([f"{path} is not there, nor a readable checkpoint: has {run} been trained?", *reasons])
+        )
+    try:
+        return path, load_weights(path)
+    except Exception as error:
+        raise ValueError(f"{path} holds no weights of this run: {error}") from error
+
+
+def _networks(path: Path, weights: Any, game: Game, settings: DQNSettings) -> dict[str, QNetwork]:
     networks = {}
     try:
-        for lane, state in load_weights(path).items():
+        for lane, state in weights.items():
             network = q_network(
                 game.observation_shape,
                 len(game.actions),

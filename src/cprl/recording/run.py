@@ -1,7 +1,6 @@
 """A run is a directory; `recipe.json` in it says what was run, with what, when and from which commit."""
 
 import json
-import os
 import platform
 import shlex
 import subprocess
@@ -18,6 +17,8 @@ from typing import Any, Final
 
 import numpy as np
 import torch
+
+from cprl.recording.files import write_atomically
 
 FILE_NAME: Final = "recipe.json"
 
@@ -58,8 +59,14 @@ def start_run(out: Path | None, name: str, recipe: Mapping[str, object], *, go_o
         "command": shlex.join(sys.argv),
     }
     directory = _new_directory(name, started) if out is None else _empty_directory(Path(out))
-    write_atomically(directory / FILE_NAME, json.dumps(told, indent=2, allow_nan=False) + "\n")
+    write_json(directory / FILE_NAME, told)
     return directory
+
+
+def write_json(path: Path, told: object) -> None:
+    """Writes what `to_jsonable` gave, all or nothing."""
+    text = json.dumps(told, indent=2, allow_nan=False) + "\n"
+    write_atomically(path, lambda file: file.write(text.encode()))
 
 
 def go_on_line(run: Path) -> str:
@@ -159,20 +166,6 @@ def git_state() -> dict[str, str | bool] | None:
     if commit is None or changes is None:
         return None
     return {"commit": commit, "dirty": changes != ""}
-
-
-def write_atomically(path: Path, text: str) -> None:
-    """Writes a file that is never seen, nor left behind, half written."""
-    partial = path.with_name(path.name + ".partial")
-    try:
-        with open(partial, "w", encoding="utf-8") as file:
-            file.write(text)
-            file.flush()
-            os.fsync(file.fileno())
-        os.replace(partial, path)
-    except BaseException:
-        partial.unlink(missing_ok=True)
-        raise
 
 
 def _git(*arguments: str) -> str | None:

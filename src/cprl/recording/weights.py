@@ -1,6 +1,5 @@
 """The weights of networks, kept and read."""
 
-import os
 from collections.abc import Mapping
 from pathlib import Path
 
@@ -12,6 +11,7 @@ from torchrl.record.loggers import Logger
 from cprl.envs.torchrl_env import CommonsEnv
 from cprl.measuring.episodes import Episode
 from cprl.measuring.evaluate import evaluate, mean_return
+from cprl.recording.files import write_atomically
 
 
 def save_weights(run: Path, networks: Mapping[str, nn.Module], *, name: str = "final") -> Path:
@@ -27,9 +27,8 @@ def save_weights(run: Path, networks: Mapping[str, nn.Module], *, name: str = "f
     """
     path = run / "checkpoints" / f"{name}.pt"
     path.parent.mkdir(exist_ok=True)
-    partial = path.with_suffix(".partial")
-    torch.save({agent: network.state_dict() for agent, network in networks.items()}, partial)
-    os.replace(partial, path)
+    weights = {agent: network.state_dict() for agent, network in networks.items()}
+    write_atomically(path, lambda file: torch.save(weights, file))
     return path
 
 
