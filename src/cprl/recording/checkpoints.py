@@ -7,6 +7,7 @@ import signal
 import time
 from collections.abc import Mapping
 from pathlib import Path
+from threading import current_thread, main_thread
 from types import FrameType, TracebackType
 from typing import Any, Final, Protocol, Self
 
@@ -117,7 +118,8 @@ class Checkpoints:
         (self.folder / PARTIAL).unlink(missing_ok=True)
 
     def __enter__(self) -> Self:
-        for number in _SIGNALS:
+        # Python takes signals in the main thread alone; elsewhere they stay whose they are.
+        for number in _SIGNALS if current_thread() is main_thread() else ():
             self._usual[number] = signal.signal(number, self._stop)
         return self
 

@@ -4,22 +4,12 @@ from pathlib import Path
 
 import numpy as np
 from matplotlib.figure import Figure
-from numpy.typing import NDArray
 
 from cprl.measuring.episodes import Episode
 from cprl.measuring.evaluate import mean_return
+from cprl.measuring.published import SMOOTHED_EPISODES
+from cprl.recording.curves import running_mean
 from cprl.recording.results import read_episodes
-
-SMOOTHED_EPISODES = 100
-"""The study's curves are running means over about so many episodes, drawn at the first of them."""
-
-
-def running_mean(values: NDArray[np.float64], window: int) -> NDArray[np.float64]:
-    """Means over `window` values in a row, [len - window + 1]; over all of them if there are fewer."""
-    window = min(window, len(values))
-    sums = np.cumsum(np.concatenate([[0.0], values]))
-    means: NDArray[np.float64] = (sums[window:] - sums[:-window]) / window
-    return means
 
 
 def training_curve(

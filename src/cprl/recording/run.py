@@ -69,6 +69,22 @@ def write_json(path: Path, told: object) -> None:
     write_atomically(path, lambda file: file.write(text.encode()))
 
 
+def read_json(path: Path) -> dict[str, Any]:
+    """What `write_json` wrote.
+
+    Raises:
+        FileNotFoundError: where there is none.
+        ValueError: where it cannot be read.
+    """
+    try:
+        told = json.loads(path.read_text(encoding="utf-8"))
+    except ValueError as error:
+        raise ValueError(f"{path} holds no JSON: {error}") from error
+    if not isinstance(told, dict):
+        raise ValueError(f"{path} holds no table")
+    return told
+
+
 def go_on_line(run: Path) -> str:
     """The command line that goes on with a run which this process began, or went on with."""
     given, left = list(sys.argv), []

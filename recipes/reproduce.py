@@ -1,0 +1,85 @@
+"""The study's five experiments, run one after the other and reported beside the published figures.
+
+    python recipes/reproduce.py --runs ~/cprl-runs --results docs/results
+
+Every run is resumable: started again with the same --runs, this goes on where it was stopped, and what is
+finished is not run again. As soon as a run is finished its results are kept in --results; in the end the
+report is written there. About an hour for each single board and two for each `commons`, on one core.
+"""
+
+import os
+import subprocess
+import sys
+from collections.abc import Sequence
+from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
+
+import tyro
+
+from cprl.recording.bank import keep_results
+from cprl.recording.report import write_report
+
+AS_RUN = ("--variant", "as_run")
+EXPERIMENTS = {
+    "commons": ("commons", *AS_RUN),
+    "single_basic": ("single_basic", *AS_RUN),
+    "single_complex": ("single_complex", *AS_RUN),
+    "two_against_random": ("two_against_random", *AS_RUN),
+    "two_complex": ("two_complex", *AS_RUN),
+    "commons_decay_500k": ("commons", *AS_RUN, "--epsilon-decay-steps", "500000"),
+    "commons_published": ("commons", "--variant", "published"),
+    "commons_published_decay_500k": ("commons", "--variant", "published", "--epsilon-decay-steps", "500000"),
+}
+"""Recipe and arguments by the name of the run, the most telling first."""
+
+
+def main(
+    *,
+    runs: Path,
+    results: Path = Path("results"),
+    only: tuple[str, ...] = tuple(EXPERIMENTS),
+    replicas: int = 8,
+    episodes: int | None = None,
+    processes: int | None = None,
+    compile: bool = True,
+) -> Path:
+    """Runs experiments, keeps their results, and returns the report.
+
+    Args:
+        runs: where run directories are made, and gone on with; some gigabytes while they train.
+        results: where results and the report are kept.
+        only: which, by name.
+        replicas: of each.
+        episodes: of each; by default the recipe's, as the study shows.
+        processes: at once; by default one for each core.
+        compile: whether torch compiles; see the recipes.
+    """
+    for name in only:
+        if name not in EXPERIMENTS:
+            raise ValueError(f"there is no experiment {name!r}; allowed: {', '.join(EXPERIMENTS)}")
+    common = ["--replicas", str(replicas), *([] if compile else ["--no-compile"])]
+    common += [] if episodes is None else ["--episodes", str(episodes)]
+    with ThreadPoolExecutor(processes or os.cpu_count()) as pool:
+        for ended in [pool.submit(run, name, common, runs=runs, results=results) for name in only]:
+            ended.result()
+    return write_report([results / name for name in only], results)
+
+
+def run(name: str, common: Sequence[str], *, runs: Path, results: Path) -> None:
+    """Runs an experiment in a process of its own, or goes on with it, and keeps its results."""
+    recipe, *arguments = EXPERIMENTS[name]
+    directory, log = runs / name, runs / f"{name}.log"
+    if not (directory / "report.json").exists():
+        runs.mkdir(parents=True, exist_ok=True)
+        command = [sys.executable, str(Path(__file__).with_name(f"{recipe}.py")), *arguments, *common]
+        command += ["--out", str(directory), *(["--go-on"] if (directory / "recipe.json").exists() else [])]
+        print(f"{name}: see {log}", flush=True)
+        with open(log, "a") as told:
+            done = subprocess.run(command, stdout=told, stderr=subprocess.STDOUT, check=False)
+        if done.returncode or not (directory / "report.json").exists():
+            raise RuntimeError(f"{name} ended with {done.returncode} before it was finished; see {log}")
+    print(f"{name}: {keep_results(directory, results / name)}", flush=True)
+
+
+if __name__ == "__main__":
+    print(tyro.cli(main))

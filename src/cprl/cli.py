@@ -1,0 +1,39 @@
+"""The command `cprl`: what can be done with runs that are there."""
+
+import sys
+from pathlib import Path
+
+import tyro
+
+from cprl.recording.bank import keep_results
+from cprl.recording.report import write_report
+
+
+def report(runs: tuple[Path, ...], /, *, out: Path = Path("report")) -> None:
+    """Writes tables and figures of finished runs beside the published study.
+
+    Args:
+        runs: directories of runs, or of results.
+        out: where to: tables.md and figures/.
+    """
+    if not runs:
+        raise ValueError("cprl report wants at least one run: cprl report RUN...")
+    print(write_report(runs, out))
+
+
+def keep(run: Path, folder: Path, /) -> None:
+    """Copies what a report needs of a finished run, small enough to be committed.
+
+    Args:
+        run: the run's directory.
+        folder: where to.
+    """
+    print(keep_results(run, folder))
+
+
+def main() -> None:
+    """The command line; what cannot be done is said in a line, and ends with exit code 1."""
+    try:
+        tyro.extras.subcommand_cli_from_dict({"report": report, "keep": keep}, description=__doc__)
+    except (ValueError, OSError) as error:
+        sys.exit(f"cprl: {error}")

@@ -1,0 +1,137 @@
+"""Where agents go and when they fire: what the study claims of trained policies, as numbers.
+
+Arrays of a played episode, T steps, B worlds, N agents, each as the step began:
+    row, col    int [T, B, N]
+    in_play     bool [T, B, N]
+    fired       bool [T, B, N], whether the agent fired in this step
+    played      bool [T, B], True until the world's episode ended
+"""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from tensordict import TensorDictBase
+from torchrl.envs.utils import ExplorationType, set_exploration_type
+
+from cprl import keys
+from cprl.envs.torchrl_env import CommonsEnv
+
+Array = NDArray[Any]
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Trace:
+    """One episode of every world, step by step; see the module."""
+
+    row: Array
+    col: Array
+    in_play: Array
+    fired: Array
+    played: Array
+    board: tuple[int, int]
+    """Its height H and width W in cells."""
+
+
+def trace(
+    env: CommonsEnv, policy: Callable[[TensorDictBase], TensorDictBase], *, explore: bool = True
+) -> Trace:
+    """Plays the next episode of each world and keeps where everybody was.
+
+    Args:
+        env: B worlds; all are reset.
+        policy: writes the actions of all agents.
+        explore: whether actors explore with their epsilon.
+    """
+    steps: list[tuple[Array, ...]] = []
+    manner = ExplorationType.RANDOM if explore else ExplorationType.DETERMINISTIC
+    now, read = env.worlds.now, env.worlds.driver.read
+    with torch.no_grad(), set_exploration_type(manner):
+        moment = env.reset()
+        while not moment["done"].all():
+            places = read(now.row), read(now.col)
+            before = moment[keys.IN_PLAY].numpy(force=True), ~moment["done"][:, 0].numpy(force=True)
+            moment = env.step(policy(moment))["next"].exclude(keys.REWARD)
+            steps.append((*places, *before, moment[keys.FIRED].numpy(force=True)))
+    row, col, in_play, played, fired = (np.stack(entries) for entries in zip(*steps, strict=True))
+    board = env.game.map.height, env.game.map.width
+    return Trace(row=row, col=col, in_play=in_play, fired=fired, played=played, board=board)
+
+
+def visits(trace: Trace) -> Array:
+    """The share of its steps in play that each agent spent in each cell, float64 [B, N, H, W]."""
+    steps, worlds, agents = trace.row.shape
+    counts = np.zeros((worlds, agents, *trace.board))
+    here = trace.in_play & trace.played[..., None]
+    world, agent = np.broadcast_arrays(np.arange(worlds)[:, None], np.arange(agents))
+    for step in range(steps):
+        at = here[step]
+        place = world[at], agent[at], trace.row[step][at], trace.col[step][at]
+        counts[place] += 1  # an agent is in one cell at a time
+    shares: Array = counts / np.maximum(counts.sum((-2, -1), keepdims=True), 1)
+    return shares
+
+
+def overlap(trace: Trace) -> Array:
+    """How much the cells that two agents visit are the same, mean over pairs, float64 [B], 0..1.
+
+    The sum over cells of the smaller of the two shares: 1 for equal, 0 for disjoint visits. NaN alone.
+    """
+    shares = visits(trace)
+    agents = shares.shape[1]
+    pairs = [
+        np.minimum(shares[:, a], shares[:, b]).sum((-2, -1))
+        for a in range(agents)
+        for b in range(a + 1, agents)
+    ]
+    return np.mean(pairs, axis=0) if pairs else np.full(len(shares), np.nan)
+
+
+def rounds(trace: Trace) -> Array:
+    """How often each agent goes round the centre of the board, clockwise above 0, per 1000 steps, [B, N].
+
+    The angle under which the agent stands, seen from the centre, summed up from step to step.
+    """
+    height, width = trace.board
+    down, right = trace.row - (height - 1) / 2, trace.col - (width - 1) / 2
+    turned = np.diff(np.arctan2(down, right), axis=0)
+    turned = (turned + np.pi) % (2 * np.pi) - np.pi
+    here = trace.played[1:, :, None] & trace.in_play[1:] & trace.in_play[:-1]
+    steps = np.maximum(here.sum(0), 1)
+    gone: Array = (turned * here).sum(0) / (2 * np.pi) / steps * 1000
+    return gone
+
+
+def distance_to_nearest(trace: Trace) -> Array:
+    """From each agent to the nearest other one in play, in steps (row plus column), float64 [T, B, N].
+
+    NaN where the agent, or everybody else, is out of play.
+    """
+    apart = np.abs(trace.row[..., :, None] - trace.row[..., None, :]) + np.abs(
+        trace.col[..., :, None] - trace.col[..., None, :]
+    ).astype(np.float64)
+    both = trace.in_play[..., :, None] & trace.in_play[..., None, :]
+    both &= ~np.eye(trace.row.shape[-1], dtype=bool)
+    nearest: Array = np.where(both, apart, np.inf).min(-1)
+    nearest[~np.isfinite(nearest)] = np.nan
+    return nearest
+
+
+def shooting_distance(trace: Trace) -> tuple[Array, Array]:
+    """The mean distance to the nearest other agent when an agent fires, and in all its steps, [B] each.
+
+    NaN where nobody fired with another one in play.
+    """
+    nearest = distance_to_nearest(trace)
+    counted = np.isfinite(nearest) & trace.played[..., None]
+
+    def mean_of(which: Array) -> Array:
+        number = which.sum((0, 2))
+        with np.errstate(invalid="ignore"):
+            means: Array = np.where(which, nearest, 0.0).sum((0, 2)) / number
+        return means
+
+    return mean_of(counted & trace.fired), mean_of(counted)

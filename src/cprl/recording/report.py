@@ -1,0 +1,273 @@
+"""The report of finished runs beside the published study: tables in Markdown, figures as PNG.
+
+Made from results alone (`cprl.recording.bank`), so that anybody can make it again.
+"""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from datetime import timedelta
+from functools import cached_property
+from pathlib import Path
+from typing import Any, Final
+
+import numpy as np
+import pyarrow.parquet as pq
+from matplotlib.figure import Figure
+from numpy.typing import NDArray
+
+from cprl.measuring import phases
+from cprl.measuring.published import PHASES_BEGIN, SMOOTHED_EPISODES, Experiment, agreement, curve, experiment
+from cprl.measuring.statistics import curve_interval, estimate
+from cprl.recording.claims import measures
+from cprl.recording.curves import as_curves, curves_of, running_mean
+from cprl.recording.files import write_atomically
+from cprl.recording.run import read_json, read_recipe
+
+Values = NDArray[np.float64]
+
+TOO_FEW: Final = "too few episodes"
+TITLES: Final = {
+    "collective_return": "collective return, apples",
+    "equality": "equality (1 - Gini)",
+    "survival_steps": "survival, steps",
+    "peacefulness": "peacefulness, steps in play per agent",
+    "return_0": "return of the learner, apples",
+    "return_1": "return of the random walker, apples",
+}
+
+
+@dataclass(kw_only=True, eq=False)
+class Result:
+    """What a run left, as far as a report needs it."""
+
+    path: Path
+    recipe: Mapping[str, Any]
+    told: Mapping[str, Any]
+    """`report.json`."""
+    curves: Mapping[str, Values]
+    study: Experiment | None
+    """The study's experiment that its recipe repeats."""
+
+    @property
+    def name(self) -> str:
+        """That of its directory."""
+        return self.path.name
+
+    @property
+    def title(self) -> str:
+        """What was run, in a few words."""
+        arguments, (replicas, episodes) = self.recipe["arguments"], self.curves["collective_return"].shape
+        decay = arguments["learner"]["epsilon_decay_steps"]
+        return (
+            f"{self.recipe['recipe']}, {arguments['variant']} rules, epsilon decays in {decay:,} steps, "
+            f"{replicas} replicas of {episodes:,} episodes"
+        )
+
+    @cached_property
+    def phases(self) -> tuple[list[phases.ChangePoint], list[phases.Phase]] | None:
+        """As those of experiment 5 are told; None where there are too few episodes."""
+        smoothed = {name: running_mean(self.curves[name]) for name in phases.METRICS}
+        episodes = np.arange(smoothed["equality"].shape[1])
+        if len(episodes) <= 4 * phases.SHORTEST:
+            return None
+        changes = phases.change_points(episodes, smoothed)
+        return changes, phases.phases(episodes, smoothed, changes)
+
+
+def read_result(path: Path) -> Result:
+    """A run's directory, or its results.
+
+    Raises:
+        ValueError: where there is no run.
+        FileNotFoundError: where it has no episodes or did not end.
+    """
+    recipe = read_recipe(path)
+    return Result(
+        path=path,
+        recipe=recipe,
+        told=read_json(path / "report.json"),
+        curves=curves_of(path),
+        study=experiment(recipe["recipe"]),
+    )
+
+
+def write_report(runs: Sequence[Path], out: Path) -> Path:
+    """Writes `tables.md` and its figures.
+
+    Args:
+        runs: their directories, or results.
+        out: the folder of the report.
+
+    Returns:
+        `out/tables.md`.
+    """
+    results = [read_result(path) for path in runs]
+    (out / "figures").mkdir(parents=True, exist_ok=True)
+    lines = [
+        "# Tables and figures",
+        "",
+        "Made by `cprl report` from the results in this folder alone.",
+        "Intervals are 95 % bootstrap intervals over replicas; figures are running means over "
+        f"{SMOOTHED_EPISODES} episodes, drawn at the first of them, as in the study.",
+        "",
+        *_runs(results),
+        *_appendix(results),
+        *_agreements(results),
+        *_phases(results),
+        *_claims(results),
+        *_figures(results, out),
+    ]
+    path = out / "tables.md"
+    text = "\n".join(lines) + "\n"
+    write_atomically(path, lambda file: file.write(text.encode()))
+    return path
+
+
+def _runs(results: Sequence[Result]) -> list[str]:
+    rows = []
+    for result in results:
+        git, versions = result.recipe["git"] or {}, result.recipe["versions"]
+        took = timedelta(seconds=round(result.told["training_s"]))
+        rows.append(
+            [
+                result.name,
+                result.title,
+                f"{took}",
+                str(git.get("commit"))[:10],
+                f"torch {versions['torch']}, torchrl {versions['torchrl']}",
+                f"`python {result.recipe['command'].split('/')[-1]}`"
+                if "/" in result.recipe["command"]
+                else "",
+            ]
+        )
+    return ["## Runs", "", *_table(["run", "what", "training", "commit", "versions", "command"], rows)]
+
+
+def _appendix(results: Sequence[Result]) -> list[str]:
+    rows = []
+    for result in results:
+        study, returns = result.study, result.curves["collective_return"]
+        evaluated = {name: _evaluated(result.path, name) for name in ("random", "trained")}
+        rows.append(
+            [
+                result.name,
+                f"{study.number}" if study else "",
+                f"{study.random}" if study and study.random is not None else "",
+                _told(evaluated["random"]),
+                f"{study.trained}" if study else "",
+                _told(returns.mean(1)),
+                _told(evaluated["trained"]),
+            ]
+        )
+    head = ["run", "experiment", "random, published", "random, ours", "trained, published"]
+    head += ["mean over training, ours", "evaluation at epsilon 0.05, ours"]
+    return ["## Appendix A beside ours: collective return", "", *_table(head, rows)]
+
+
+def _agreements(results: Sequence[Result]) -> list[str]:
+    rows = []
+    for result in results:
+        for metric, name in (result.study.curves if result.study else {}).items():
+            rows.append(
+                [result.name, metric, *_agreement_cells(name, running_mean(result.curves[metric]).mean(0))]
+            )
+    head = ["run", "metric", "correlation", "mean absolute difference", "of the published curve's range"]
+    return ["## Published curves beside ours", "", *_table(head, rows)]
+
+
+def _agreement_cells(name: str, ours: Values) -> list[str]:
+    if len(ours) <= SMOOTHED_EPISODES:
+        return [TOO_FEW, "", ""]
+    correlation, difference = agreement(name, ours)
+    return [f"{correlation:.2f}", f"{difference:.3g}", f"{difference / np.ptp(curve(name)[1]):.0%}"]
+
+
+def _phases(results: Sequence[Result]) -> list[str]:
+    rows = [["published curves", *_phase_cells(*_published_phases())]]
+    for result in results:
+        if result.study and result.study.number == 5:
+            rows.append(
+                [result.name, *(_phase_cells(*result.phases) if result.phases else [TOO_FEW, "", "", ""])]
+            )
+    head = ["curves", "second phase from", "third", "fourth", "phases by their pattern"]
+    drawn = ", ".join(map(str, PHASES_BEGIN))
+    told = f"The study draws its phases from {drawn} on. See `cprl.measuring.phases` for how ours are found."
+    return ["## Phases of experiment 5", "", told, "", *_table(head, rows)]
+
+
+def _published_phases() -> tuple[list[phases.ChangePoint], list[phases.Phase]]:
+    study = experiment("commons")
+    assert study is not None
+    episodes = np.arange(10, 4745)
+    # The curve of survival begins at episode 512; before that nobody depletes the board.
+    metrics = {name: np.interp(episodes, *curve(study.curves[name])) for name in phases.METRICS}
+    changes = phases.change_points(episodes, metrics)
+    return changes, phases.phases(episodes, metrics, changes)
+
+
+def _phase_cells(changes: Sequence[phases.ChangePoint], found: Sequence[phases.Phase]) -> list[str]:
+    cells = [
+        f"{change.episode:.0f}"
+        + (f" [{change.low:.0f}, {change.high:.0f}]" if np.isfinite(change.low) else "")
+        for change in changes
+    ]
+    return [*cells, ", ".join(phase.label or "none of them" for phase in found)]
+
+
+def _claims(results: Sequence[Result]) -> list[str]:
+    lines = ["## What the claims are judged by", ""]
+    for result in results:
+        rows = [
+            [measure.name, str(measure.trained), "" if measure.random is None else f"{measure.random:.4g}"]
+            for measure in measures(result.path)
+        ]
+        lines += [f"### {result.name}", "", *_table(["measure", "trained", "random policy"], rows)]
+    return lines
+
+
+def _figures(results: Sequence[Result], out: Path) -> list[str]:
+    lines = ["## Figures", ""]
+    for result in results:
+        metrics = list(result.study.curves) if result.study else ["collective_return"]
+        for metric in metrics:
+            name = f"{result.name}_{metric}.png"
+            _draw(result, metric, out / "figures" / name)
+            lines += [f"![{result.name}, {TITLES.get(metric, metric)}](figures/{name})", ""]
+    return lines
+
+
+def _draw(result: Result, metric: str, path: Path) -> None:
+    """Mean and interval over replicas, single replicas, the published curve, and phases of experiment 5."""
+    smoothed = running_mean(result.curves[metric])
+    middle, low, high = curve_interval(smoothed, resamples=500)
+    figure = Figure(figsize=(8, 4.2), layout="constrained")
+    axes = figure.add_subplot()
+    axes.plot(smoothed.T, color="#9ecae1", linewidth=0.4)
+    axes.fill_between(np.arange(len(middle)), low, high, color="#6baed6", alpha=0.5, label="95 % interval")
+    axes.plot(middle, color="#08519c", linewidth=1.8, label=f"ours, mean of {len(smoothed)} replicas")
+    if result.study:
+        axes.plot(*curve(result.study.curves[metric]), color="#d94801", linewidth=1.2, label="published")
+    if result.study and result.study.number == 5:
+        for place in PHASES_BEGIN:
+            axes.axvline(place, color="#d94801", linestyle=":", linewidth=1)
+        for change in result.phases[0] if result.phases else ():
+            axes.axvline(change.episode, color="#08519c", linestyle="--", linewidth=1)
+    axes.set(title=result.title, xlabel="episode", ylabel=TITLES.get(metric, metric))
+    axes.title.set_fontsize(9)
+    axes.legend(loc="best", fontsize=8)
+    figure.savefig(path, dpi=90)
+
+
+def _evaluated(run: Path, policy: str) -> Values | None:
+    """The mean collective return of each replica in its evaluation, [R], where there is one."""
+    path = run / "evaluation" / f"{policy}.parquet"
+    return as_curves(pq.read_table(path))["collective_return"].mean(1) if path.exists() else None
+
+
+def _told(values: Values | None) -> str:
+    return "" if values is None else str(estimate(values))
+
+
+def _table(head: Sequence[str], rows: Sequence[Sequence[str]]) -> list[str]:
+    lines = [head, ["---"] * len(head), *rows]
+    return ["| " + " | ".join(cells) + " |" for cells in lines] + [""]

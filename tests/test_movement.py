@@ -1,0 +1,113 @@
+"""Where agents go and when they fire, on boards small enough to count."""
+
+import numpy as np
+import pytest
+import torch
+from tensordict.nn import TensorDictModuleBase
+
+from cprl import CommonsEnv, Game, Rules, keys, maps
+from cprl.measuring.movement import (
+    Trace,
+    distance_to_nearest,
+    overlap,
+    rounds,
+    shooting_distance,
+    trace,
+    visits,
+)
+
+FORWARD, LEFT, RIGHT, TURN_RIGHT, BEAM, STAY = 0, 2, 3, 5, 6, 7
+
+
+def drawn(cells, *, fired=(), in_play=None, board=(3, 4)):
+    """A trace of one world: `cells` [T][N] of (row, col), `fired` (step, agent) pairs."""
+    places = np.array(cells)[:, None]
+    shape = places.shape[:-1]
+    shots = np.zeros(shape, bool)
+    for step, agent in fired:
+        shots[step, 0, agent] = True
+    here = np.ones(shape, bool) if in_play is None else np.array(in_play, bool)[:, None]
+    return Trace(
+        row=places[..., 0],
+        col=places[..., 1],
+        in_play=here,
+        fired=shots,
+        played=np.ones(shape[:2], bool),
+        board=board,
+    )
+
+
+class Doing(TensorDictModuleBase):
+    """Plays actions [T, N] one after the other."""
+
+    in_keys = (keys.OBSERVATION,)
+    out_keys = (keys.ACTION,)
+
+    def __init__(self, actions):
+        super().__init__()
+        self.left = list(actions)
+
+    def forward(self, tensordict):
+        action = torch.tensor([self.left.pop(0)])
+        return tensordict.set(keys.ACTION, action)
+
+
+def test_a_trace_holds_where_everybody_was_as_each_step_began():
+    game = Game(
+        map=maps.parse("A...A\n>...<\n....."),
+        rules=Rules(regrow_prob=(0.0,), episode_steps=4, window_rows=3, window_columns=5, freeze_steps=9),
+    )
+    found = trace(CommonsEnv(game), Doing([(FORWARD, STAY), (BEAM, STAY), (STAY, STAY), (STAY, STAY)]))
+    assert found.row[:, 0].tolist() == [[1, 1]] * 4
+    assert found.col[:, 0, 0].tolist() == [0, 1, 1, 1]
+    assert found.fired[:, 0].tolist() == [[False, False], [True, False], [False, False], [False, False]]
+    assert found.in_play[:, 0, 1].tolist() == [True, True, False, False], "hit in the second step"
+    assert found.played.all()
+    assert found.board == (3, 5)
+
+
+def test_worlds_that_ended_earlier_are_not_counted_on():
+    game = Game(map=maps.parse("A>.\n..."), rules=Rules(regrow_prob=(0.0,), episode_steps=3))
+    actions = torch.tensor([[1], [7 - 1]])  # backward onto the only apple; stay
+    found = trace(CommonsEnv(game, 2), lambda moment: moment.set(keys.ACTION, actions))
+    assert found.played.sum(0).tolist() == [1, 3]
+
+
+def test_visits_are_shares_of_the_steps_in_play():
+    cells = [[(0, 0), (2, 3)], [(0, 1), (2, 3)], [(0, 1), (2, 3)], [(0, 1), (0, 0)]]
+    in_play = [[1, 1], [1, 1], [1, 0], [1, 1]]
+    shares = visits(drawn(cells, in_play=in_play))[0]
+    assert shares[0, 0, :2].tolist() == [0.25, 0.75]
+    assert shares[1, 2, 3] == pytest.approx(2 / 3)
+    assert shares.sum((-2, -1)).tolist() == pytest.approx([1.0, 1.0])
+
+
+def test_overlap_is_one_for_the_same_cells_and_none_for_halves():
+    assert overlap(drawn([[(0, 0), (0, 1)], [(0, 1), (0, 0)]])).tolist() == [1.0]
+    assert overlap(drawn([[(0, 0), (2, 3)], [(0, 1), (2, 2)]])).tolist() == [0.0]
+    # (0, 0): 1/2 and 1/2; (0, 1) and (0, 2) are one's own.
+    assert overlap(drawn([[(0, 0), (0, 0)], [(0, 1), (0, 2)]])).tolist() == [0.5]
+    assert np.isnan(overlap(drawn([[(0, 0)], [(0, 1)]]))).all()
+
+
+def test_rounds_count_turns_about_the_centre_and_their_sense():
+    clockwise = [(0, 1), (0, 2), (1, 3), (2, 2), (2, 1), (1, 0)]
+    there = [[cell] for cell in [*clockwise * 5, clockwise[0]]]
+    assert rounds(drawn(there))[0, 0] == pytest.approx(5 / 30 * 1000)
+    assert rounds(drawn(there[::-1]))[0, 0] == pytest.approx(-5 / 30 * 1000)
+    to_and_fro = [[cell] for cell in (clockwise + clockwise[::-1]) * 4]
+    assert rounds(drawn(to_and_fro))[0, 0] == pytest.approx(0.0)
+
+
+def test_shots_are_told_by_the_distance_to_the_nearest_other():
+    cells = [[(0, 0), (0, 1), (2, 3)], [(0, 0), (0, 3), (2, 3)]]
+    in_play = [[1, 1, 1], [1, 0, 1]]
+    drawing = drawn(cells, fired=[(0, 0), (1, 2)], in_play=in_play)
+    nearest = distance_to_nearest(drawing)[:, 0]
+    assert nearest[0].tolist() == [1.0, 1.0, 4.0]
+    assert nearest[1, [0, 2]].tolist() == [5.0, 5.0]
+    assert np.isnan(nearest[1, 1])
+    fired, always = shooting_distance(drawing)
+    assert fired.tolist() == [(1.0 + 5.0) / 2]
+    assert always.tolist() == [(1 + 1 + 4 + 5 + 5) / 5]
+    assert np.isnan(shooting_distance(drawn(cells))[0]).all(), "nobody fired"

@@ -1,0 +1,177 @@
+"""Results are kept small and whole, and a report is made of them alone."""
+
+import importlib.util
+from dataclasses import replace
+from pathlib import Path
+from types import SimpleNamespace
+
+import numpy as np
+import pyarrow as pa
+import pytest
+
+import cprl
+from cprl import presets
+from cprl.measuring.published import curve, experiment
+from cprl.recording import read_episodes
+from cprl.recording.bank import keep_results
+from cprl.recording.claims import dip_depth, of_training
+from cprl.recording.curves import as_curves, running_mean
+from cprl.recording.report import write_report
+
+RECIPES = Path(__file__).parents[1] / "recipes"
+
+
+def recipe(name):
+    spec = importlib.util.spec_from_file_location(name, RECIPES / f"{name}.py")
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    return module
+
+
+@pytest.fixture(scope="module")
+def run(tmp_path_factory):
+    """A miniature of experiment 4, with episodes of 40 steps."""
+    game = presets.game
+
+    def shorter(board, *, variant="published"):
+        whole = game(board, variant=variant)
+        return replace(whole, rules=replace(whole.rules, episode_steps=40))
+
+    with pytest.MonkeyPatch.context() as patched:
+        patched.setattr(presets, "game", shorter)
+        how = {"replicas": 2, "episodes": 12, "evaluation_episodes": 2, "compile": False}
+        out = tmp_path_factory.mktemp("runs") / "four"
+        return recipe("two_against_random").main(variant="as_run", out=out, **how)
+
+
+def test_what_is_kept_says_the_same_as_the_run(run, tmp_path):
+    folder = keep_results(run, tmp_path / "kept")
+    assert keep_results(run, folder) == folder, "again over the same"
+    kept, whole = read_episodes(folder).to_pydict(), read_episodes(run)
+    ordered = whole.sort_by([(name, "ascending") for name in ("replica", "episode", "agent")]).to_pydict()
+    assert set(kept) == set(ordered)
+    for name, column in ordered.items():
+        np.testing.assert_array_equal(np.float32(kept[name]), np.float32(column), err_msg=name)
+    mine, theirs = cprl.load(folder), cprl.load(run)
+    assert mine.game == theirs.game
+    assert sorted(mine.networks) == sorted(theirs.networks)
+    assert not list(folder.rglob("training-*"))
+    (run / "report.json").rename(tmp_path / "aside")
+    with pytest.raises(FileNotFoundError, match=r"report\.json is not there: has the run ended\?"):
+        keep_results(run, tmp_path / "other")
+    (tmp_path / "aside").rename(run / "report.json")
+    assert not (tmp_path / "other").exists()
+
+
+def test_a_report_tells_every_number_from_the_results_alone(run, tmp_path):
+    folder = keep_results(run, tmp_path / "two_against_random")
+    text = write_report([folder], tmp_path).read_text()
+    returns = as_curves(read_episodes(run))["collective_return"]
+    assert "| two_against_random | 4 |  | " in text, "the study gives no random score for experiment 4"
+    assert f"| 184.07 | {returns.mean():.4g} [" in text
+    assert "epsilon decays in 500,000 steps, 2 replicas of 12 episodes" in text
+    for metric in ("collective_return", "return_0", "return_1"):
+        figure = tmp_path / "figures" / f"two_against_random_{metric}.png"
+        assert figure.stat().st_size > 10_000
+        assert f"(figures/{figure.name})" in text
+    assert "| two_against_random | return_1 | too few episodes |" in text
+    assert "| shots per 1000 steps, all agents | " in text
+    assert "| published curves | 400 | 1250 | 1900 | exploration, tragedy, combat, cultivation |" in text
+    assert "nan" not in text
+
+
+def test_the_command_writes_a_report(run, tmp_path, capsys, monkeypatch):
+    from cprl import cli
+
+    monkeypatch.setattr("sys.argv", ["cprl", "keep", str(run), str(tmp_path / "kept")])
+    cli.main()
+    monkeypatch.setattr("sys.argv", ["cprl", "report", str(tmp_path / "kept"), "--out", str(tmp_path / "r")])
+    cli.main()
+    assert capsys.readouterr().out.splitlines()[-1] == str(tmp_path / "r" / "tables.md")
+    monkeypatch.setattr("sys.argv", ["cprl", "report"])
+    with pytest.raises(SystemExit, match="cprl: cprl report wants at least one run"):
+        cli.main()
+
+
+def test_reproduce_runs_what_is_missing_and_reports(tmp_path, monkeypatch, capsys):
+    reproduce = recipe("reproduce")
+    asked = []
+
+    def in_miniature(command, **how):
+        asked.append(command)
+        name = Path(command[1]).stem
+        at = Path(command[command.index("--out") + 1])
+        small = {"replicas": 2, "episodes": 5, "evaluation_episodes": 1, "compile": False}
+        if "--go-on" not in command and len(asked) == 1:
+            at.mkdir()
+            (at / "recipe.json").write_text("{}")  # it was stopped
+            return type("Done", (), {"returncode": 0})
+        (at / "recipe.json").unlink(missing_ok=True)
+        recipe(name).main(variant="as_run", out=at, **small)
+        return type("Done", (), {"returncode": 0})
+
+    game = presets.game
+    monkeypatch.setattr(
+        presets,
+        "game",
+        lambda board, *, variant="published": replace(
+            game(board, variant=variant), rules=replace(game(board, variant=variant).rules, episode_steps=20)
+        ),
+    )
+    monkeypatch.setattr(reproduce, "subprocess", SimpleNamespace(run=in_miniature, STDOUT=None))
+    how = {
+        "runs": tmp_path / "runs",
+        "results": tmp_path / "results",
+        "only": ("single_basic",),
+        "processes": 1,
+    }
+    with pytest.raises(RuntimeError, match=r"single_basic ended with 0 before it was finished; see .*log"):
+        reproduce.main(**how)
+    report = reproduce.main(**how)
+    assert "--go-on" in asked[1]
+    assert "| single_basic | 1 | 32.47 | " in report.read_text()
+    reproduce.main(**how)
+    assert len(asked) == 2, "what is finished is not run again"
+    with pytest.raises(ValueError, match="there is no experiment 'fishery'; allowed: commons, single_basic"):
+        reproduce.main(runs=tmp_path, only=("fishery",))
+
+
+def test_curves_are_those_of_each_replica_and_agent():
+    columns = {
+        "replica": [1, 1, 0, 0, 0, 0],
+        "episode": [0, 0, 0, 0, 1, 1],
+        "agent": [0, 1, 0, 1, 0, 1],
+        "return": [1.0, 2.0, 3.0, 4.0, 5.0, 6.0],
+        "equality": [0.5, 0.5, float("nan"), float("nan"), 0.7, 0.7],
+    }
+    curves = as_curves(pa.table(columns))
+    assert curves["return_1"].tolist() == [[4.0], [2.0]], "the episodes that all replicas have ended"
+    np.testing.assert_array_equal(curves["equality"], [[np.nan], [0.5]])
+
+
+def test_running_means_stand_at_their_first_episode_and_leave_out_what_is_undefined():
+    assert running_mean(np.array([1.0, 2.0, 6.0, 4.0]), 2).tolist() == [1.5, 4.0, 5.0]
+    assert running_mean(np.array([[1.0, np.nan, 3.0]]), 2).tolist() == [[1.0, 3.0]]
+    assert running_mean(np.array([1.0, 2.0]), 5).tolist() == [1.5]
+
+
+def test_a_dip_is_measured_from_the_peak_before_it():
+    assert dip_depth(np.array([[10.0, 20.0, 5.0, 30.0], [1.0, 2.0, 3.0, 4.0]])).tolist() == [0.75, 0.0]
+    published = np.interp(np.arange(600), *curve("exp1/return"))[None]
+    assert dip_depth(published)[0] == pytest.approx(1 - 104 / 146, abs=0.02)
+
+
+def test_measures_of_training_know_rich_and_poor():
+    flat = np.ones((3, 700))
+    curves = {"collective_return": 4 * flat, "return_0": 3 * flat, "return_1": flat}
+    found = of_training(curves)
+    assert (
+        found["return of the poorest agent over that of the richest, last 500 episodes"].tolist()
+        == [1 / 3] * 3
+    )
+    assert found["mean collective return over training"].tolist() == [4.0] * 3
+
+
+def test_every_published_experiment_is_reproduced():
+    named = {arguments[0] for arguments in recipe("reproduce").EXPERIMENTS.values()}
+    assert {experiment(name).number for name in named} == {1, 2, 3, 4, 5}
