@@ -19,6 +19,7 @@ ROOMS = (
     "presets",
     "train",
     "study",
+    "replay",
     "cli",
 )
 MODULES = sorted(path for path in SOURCE.rglob("*.py") if path.parent != SOURCE or path.name != "__init__.py")

@@ -1,6 +1,7 @@
 """Results are kept small and whole, and a report is made of them alone."""
 
 import importlib.util
+import sys
 from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
@@ -8,6 +9,7 @@ from types import SimpleNamespace
 import numpy as np
 import pyarrow as pa
 import pytest
+from test_rerun_logger import column
 
 import cprl
 from cprl import presets
@@ -17,6 +19,7 @@ from cprl.recording.bank import keep_results
 from cprl.recording.claims import dip_depth, of_training
 from cprl.recording.curves import as_curves, running_mean
 from cprl.recording.report import write_report
+from cprl.replay import replay
 
 RECIPES = Path(__file__).parents[1] / "recipes"
 
@@ -50,8 +53,8 @@ def test_what_is_kept_says_the_same_as_the_run(run, tmp_path):
     kept, whole = read_episodes(folder).to_pydict(), read_episodes(run)
     ordered = whole.sort_by([(name, "ascending") for name in ("replica", "episode", "agent")]).to_pydict()
     assert set(kept) == set(ordered)
-    for name, column in ordered.items():
-        np.testing.assert_array_equal(np.float32(kept[name]), np.float32(column), err_msg=name)
+    for name, values in ordered.items():
+        np.testing.assert_array_equal(np.float32(kept[name]), np.float32(values), err_msg=name)
     mine, theirs = cprl.load(folder), cprl.load(run)
     assert mine.game == theirs.game
     assert sorted(mine.networks) == sorted(theirs.networks)
@@ -91,6 +94,26 @@ def test_the_command_writes_a_report(run, tmp_path, capsys, monkeypatch):
     monkeypatch.setattr("sys.argv", ["cprl", "report"])
     with pytest.raises(SystemExit, match="cprl: cprl report wants at least one run"):
         cli.main()
+
+
+def test_a_stored_policy_plays_again_and_every_step_is_recorded(run, tmp_path, capsys, monkeypatch):
+    from cprl import cli
+
+    path, played = replay(run, tmp_path / "a.rrd", replica=1, episode=3)
+    steps, boards = column(path, "/world/board", "SegmentationImage:buffer", "step")
+    assert steps == list(range(1, played.steps + 1))
+    assert len(boards[0][0]) == (24 + 2) * (7 + 2)
+    _, again = replay(run, tmp_path / "b.rrd", replica=1, episode=3)
+    assert again.harvest.tolist() == played.harvest.tolist()
+    assert again.shots.tolist() == played.shots.tolist()
+    with pytest.raises(FileExistsError):
+        replay(run, tmp_path / "a.rrd")
+    with pytest.raises(ValueError, match="episode is -1"):
+        replay(run, episode=-1)
+    monkeypatch.setattr("sys.argv", ["cprl", "replay", str(run), "--out", str(tmp_path / "c.rrd")])
+    cli.main()
+    told = capsys.readouterr().out
+    assert f"Watch: {Path(sys.executable).with_name('rerun')} {tmp_path / 'c.rrd'}" in told
 
 
 def test_reproduce_runs_what_is_missing_and_reports(tmp_path, monkeypatch, capsys):

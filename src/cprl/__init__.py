@@ -11,6 +11,8 @@ The rooms, in the order in which the data flow:
     presets     the published games and learners by name
     train       the loop: act, store, learn, measure, record
     study       one study from its learners to its report
+    replay      a stored policy plays again, recorded
+    cli         the command cprl: report, replay, keep
 """
 
 from typing import TYPE_CHECKING, Any

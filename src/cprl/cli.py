@@ -7,6 +7,8 @@ import tyro
 
 from cprl.recording.bank import keep_results
 from cprl.recording.report import write_report
+from cprl.recording.streams import viewer
+from cprl.replay import replay as play_again
 
 
 def report(runs: tuple[Path, ...], /, *, out: Path = Path("report")) -> None:
@@ -19,6 +21,21 @@ def report(runs: tuple[Path, ...], /, *, out: Path = Path("report")) -> None:
     if not runs:
         raise ValueError("cprl report wants at least one run: cprl report RUN...")
     print(write_report(runs, out))
+
+
+def replay(run: Path, /, *, replica: int = 0, episode: int = 0, out: Path | None = None) -> None:
+    """Lets the agents of a run play a fresh episode, and records every step for the Rerun viewer.
+
+    Args:
+        run: the run's directory, or its results.
+        replica: whose agents.
+        episode: which of the fresh episodes; the same number plays the same again.
+        out: the recording; by default replay-<replica>-<episode>.rrd in the run's directory.
+    """
+    path, played = play_again(run, out, replica=replica, episode=episode)
+    harvests = ", ".join(f"{apples:.0f}" for apples in played.harvest)
+    print(f"{played.steps} steps, apples: {harvests}; {played.stock_left} left")
+    print(f"Watch: {viewer()} {path}")
 
 
 def keep(run: Path, folder: Path, /) -> None:
@@ -34,6 +51,8 @@ def keep(run: Path, folder: Path, /) -> None:
 def main() -> None:
     """The command line; what cannot be done is said in a line, and ends with exit code 1."""
     try:
-        tyro.extras.subcommand_cli_from_dict({"report": report, "keep": keep}, description=__doc__)
+        tyro.extras.subcommand_cli_from_dict(
+            {"report": report, "replay": replay, "keep": keep}, description=__doc__
+        )
     except (ValueError, OSError) as error:
         sys.exit(f"cprl: {error}")

@@ -33,20 +33,27 @@ class RerunLogger(Logger):
 
     Args:
         exp_name: the name that the viewer shows.
-        log_dir: the run's directory, where `run.rrd` is written.
+        log_dir: the run's directory, where the recording is written.
         scene: what is on the board; without it no frames can be logged.
         serve: whether to serve the recording live; `addresses` tells where. The recording is served on
             127.0.0.1 alone; the empty page of the web viewer, which Rerun serves, listens on all interfaces.
+        file_name: of the recording.
 
     Raises:
         FileExistsError: where there is a recording already.
     """
 
     def __init__(
-        self, exp_name: str, log_dir: str | Path, *, scene: Scene | None = None, serve: bool = False
+        self,
+        exp_name: str,
+        log_dir: str | Path,
+        *,
+        scene: Scene | None = None,
+        serve: bool = False,
+        file_name: str = FILE_NAME,
     ) -> None:
         self.scene = scene
-        self.path = Path(log_dir) / FILE_NAME
+        self.path = Path(log_dir) / file_name
         if self.path.exists():
             raise FileExistsError(
                 f"{self.path} exists and is kept; give the recording a directory of its own"

@@ -13,7 +13,7 @@ from tensordict import TensorDictBase
 from cprl.envs.torchrl_env import CommonsEnv
 from cprl.measuring.episodes import Episode
 from cprl.recording.frames import Frame, FrameBuffer, classes_seen
-from cprl.recording.rerun import RerunLogger
+from cprl.recording.rerun import FILE_NAME, RerunLogger
 from cprl.recording.scenery import Scene
 
 FRAME_BYTES: Final = 300
@@ -31,12 +31,13 @@ class Watch:
     An observer of `cprl.train`, and a context manager.
 
     Args:
-        run: the run's directory; the recording is `run.rrd` in it.
+        run: the run's directory, where the recording is written.
         env: whose first world is shown.
         title: what is going on; the viewer shows it.
         episodes: how many will be played, by which the frames are rationed.
         recipe: what the viewer shows as the recipe of the run.
         serve: whether to serve the recording live on 127.0.0.1; the addresses are printed at once.
+        file_name: of the recording.
         console: where to; by default standard output.
     """
 
@@ -49,6 +50,7 @@ class Watch:
         episodes: int,
         recipe: Mapping[str, object] | None = None,
         serve: bool = False,
+        file_name: str = FILE_NAME,
         console: Console | None = None,
     ) -> None:
         game = env.game
@@ -56,7 +58,7 @@ class Watch:
         _, rows, columns = game.observation_shape
         board = game.map.height, game.map.width
         scene = Scene(height=board[0], width=board[1], agents=game.agent_names, window=(rows, columns))
-        self.logger = RerunLogger(title, run, scene=scene, serve=serve)
+        self.logger = RerunLogger(title, run, scene=scene, serve=serve, file_name=file_name)
         steps = game.rules.episode_steps
         self.every = max(1, ceil(episodes * steps * FRAME_BYTES / RECORDING_BYTES))
         self._buffer = FrameBuffer(

@@ -1,0 +1,66 @@
+"""Replay: a stored policy plays again, and every step is recorded."""
+
+from collections.abc import Mapping
+from pathlib import Path
+
+import torch
+from tensordict import TensorDictBase
+from torch import nn
+
+from cprl.acting.seats import Seat
+from cprl.envs.torchrl_env import CommonsEnv
+from cprl.measuring.episodes import Episode
+from cprl.recording.loaded import load
+from cprl.recording.watch import Watch
+from cprl.train import Observer, train
+
+SEED = 20_011
+"""Of the fresh worlds; no training of ours uses it."""
+
+
+def replay(run: Path, out: Path | None = None, *, replica: int = 0, episode: int = 0) -> tuple[Path, Episode]:
+    """Lets the agents of a run play an episode in a fresh world, with `epsilon_evaluation`.
+
+    Args:
+        run: its directory, or its results.
+        out: the recording to be; by default `replay-<replica>-<episode>.rrd` in the run's directory.
+        replica: whose agents.
+        episode: which of the fresh episodes; the same number plays the same again.
+
+    Returns:
+        The recording, and how the episode went.
+
+    Raises:
+        ValueError: for a run that cannot be loaded; see `cprl.load`.
+        FileExistsError: where the recording is there already.
+    """
+    if episode < 0:
+        raise ValueError(f"episode is {episode}; at least 0 is wanted")
+    loaded = load(run)
+    target = out or run / f"replay-{replica}-{episode}.rrd"
+    env = CommonsEnv(loaded.game, 1, seed=SEED, first_world=episode)
+    torch.manual_seed(SEED + episode)  # TorchRL's exploration draws from torch's generator
+    actors: dict[Seat, nn.Module] = dict(enumerate(loaded.policy(replica).actors))
+    title = f"{run.name}, agents of replica {replica}, fresh episode {episode}"
+    target.parent.mkdir(parents=True, exist_ok=True)
+    with Watch(
+        target.parent, env, title=title, episodes=1, recipe=loaded.recipe, file_name=target.name
+    ) as watch:
+        last = _Last()
+        observers: list[Observer] = [watch, last]
+        train(env, {}, others=actors, episodes=1, observers=observers)
+    assert last.episode is not None
+    return target, last.episode
+
+
+class _Last:
+    """Keeps the episode."""
+
+    episode: Episode | None = None
+
+    def see_turn(self, batch: TensorDictBase) -> None:
+        """Nothing."""
+
+    def see_episode(self, episode: Episode, learning: Mapping[str, float]) -> None:
+        """Keeps it."""
+        self.episode = episode
