@@ -10,7 +10,6 @@ Copy this file and change it: another map, rule, network or loss is one line.
 import logging
 from dataclasses import replace
 from pathlib import Path
-from typing import Literal
 
 import torch
 import tyro
@@ -45,7 +44,7 @@ def main(
     evaluation_episodes: int = 100,
     seed: int = 0,
     out: Path | None = None,
-    watch: Literal["file", "serve"] = "file",
+    watch: str = "file",
 ) -> Path:
     """Trains the agent, evaluates it on fresh worlds, and returns the run's directory.
 
@@ -55,7 +54,7 @@ def main(
         evaluation_episodes: fresh episodes for the trained and for the random policy.
         seed: of chance, weights, exploration and replay.
         out: the run's directory; by default a new one under runs/.
-        watch: record to a file, or serve the recording live on 127.0.0.1 as well.
+        watch: "file", or live as well: "serve" on 127.0.0.1, "spawn" a viewer, "connect ADDRESS".
     """
     game = presets.game("single_basic", variant=variant)
     settings = replace(presets.learner("single_basic", variant=variant), **SHORT)
@@ -76,7 +75,14 @@ def main(
     )
     policy, networks = Seats([learner.actor]), {"agent_0": learner.network}
     with (
-        Watch(run, env, title=title, episodes=episodes, recipe=arguments, serve=watch == "serve") as viewer,
+        Watch(
+            run,
+            env,
+            title=title,
+            episodes=episodes,
+            recipe=arguments,
+            live=None if watch == "file" else watch,
+        ) as viewer,
         EpisodeTable(run / "episodes.parquet") as table,
         ProgressBar(game, episodes=episodes) as bar,
     ):

@@ -26,6 +26,7 @@ def main(
     seed: int = 0,
     out: Path | None = None,
     go_on: bool = False,
+    watch: str = "file",
     compile: bool = True,
 ) -> Path:
     """Trains the agents of all replicas, evaluates them on fresh worlds, and returns the run's directory.
@@ -39,6 +40,7 @@ def main(
         seed: of chance, weights, exploration and replay.
         out: the run's directory; by default a new one under runs/.
         go_on: with the run in `out`, which was stopped; bit for bit as if it had not been.
+        watch: "file", or live as well: "serve", "spawn", "connect ADDRESS"; "off" for no recording.
         compile: whether torch compiles the update; needs a C++ compiler, and is several times faster.
     """
     prepare_process(seed)
@@ -63,6 +65,7 @@ def main(
         title=f"single_complex, {variant} rules, {replicas} replicas, {episodes} episodes",
         evaluation_episodes=evaluation_episodes,
         learn_every=learn_every,
+        watch=watch,
     )
 
 

@@ -114,7 +114,9 @@ def test_every_replica_is_told_of_so_many_episodes_and_of_its_losses(tmp_path):
         assert episodes == [0, 1, 2, 3, 4]
         _, losses = witness.course(replica)
         assert np.isfinite(losses[-1]).all()
-    assert set(witness.learning[0]) == {f"agent_{i}/{name}" for i in (0, 1) for name in ("loss", "epsilon")}
+    assert set(witness.learning[0]) == {
+        f"agent_{i}/{name}" for i in (0, 1) for name in ("loss", "epsilon", "q")
+    }
 
 
 def test_targets_follow_each_replicas_own_episodes():

@@ -211,7 +211,7 @@ def test_the_rim_is_wall_and_agents_are_left_to_their_own_colours():
 
 
 def test_the_live_recording_is_served_on_this_machine(tmp_path):
-    with RerunLogger("run", tmp_path, scene=SCENE, serve=True) as logger:
+    with RerunLogger("run", tmp_path, scene=SCENE, live="serve") as logger:
         logger.log_scalar("social/equality", 1.0)
         logger.flush()
         address = logger.addresses["native"].split()[-1]
@@ -236,7 +236,7 @@ class Broken:
 
 
 def test_a_stream_that_fails_is_dropped_with_one_warning_and_the_other_goes_on(tmp_path):
-    with RerunLogger("run", tmp_path, scene=SCENE, serve=True) as logger:
+    with RerunLogger("run", tmp_path, scene=SCENE, live="serve") as logger:
         live = next(stream for stream in logger._streams if stream.name == "live view")
         live.recording = Broken()
         with pytest.warns(RuntimeWarning, match="live view is dropped.*no space left") as caught:

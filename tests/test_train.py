@@ -44,7 +44,7 @@ def test_observers_see_every_turn_and_every_episode_and_the_learner_learns_once_
     train(CommonsEnv(GAME), {0: agent}, others={1: RandomActor(8)}, episodes=5, observers=[witness])
     assert len(witness.turns) == agent.steps == sum(episode.steps for episode in witness.episodes)
     assert [episode.episode for episode in witness.episodes] == [0, 1, 2, 3, 4]
-    assert set(witness.learning[-1]) == {"agent_0/loss", "agent_0/epsilon"}
+    assert set(witness.learning[-1]) == {"agent_0/loss", "agent_0/epsilon", "agent_0/q"}
     assert np.isfinite(witness.learning[-1]["agent_0/loss"])
     harvest = sum(float(turn["next", "agents", "harvest"].sum()) for turn in witness.turns)
     assert harvest == sum(episode.harvest.sum() for episode in witness.episodes)

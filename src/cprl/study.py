@@ -1,5 +1,6 @@
 """One study from its learners to its report: train, keep, evaluate on fresh worlds, summarise."""
 
+from contextlib import AbstractContextManager, nullcontext
 from dataclasses import replace
 from datetime import datetime
 from functools import partial
@@ -14,8 +15,16 @@ from cprl.envs.torchrl_env import CommonsEnv
 from cprl.learning.lanes import LaneLearner
 from cprl.measuring.episodes import Episode
 from cprl.measuring.evaluate import evaluate
-from cprl.recording import Checkpoints, EpisodeTable, ProgressBar, save_weights, summarise, training_curve
-from cprl.recording.run import write_json
+from cprl.recording import (
+    Checkpoints,
+    EpisodeTable,
+    ProgressBar,
+    Watch,
+    save_weights,
+    summarise,
+    training_curve,
+)
+from cprl.recording.run import read_recipe, write_json
 from cprl.train import MakeCollector, train
 
 
@@ -29,6 +38,7 @@ def conduct(
     evaluation_episodes: int = 20,
     learn_every: int = 1,
     make_collector: MakeCollector = StepCollector,
+    watch: str = "file",
 ) -> Path:
     """Trains the agents of all replicas, evaluates them on fresh worlds, and writes and prints the outcome.
 
@@ -44,24 +54,28 @@ def conduct(
             policy at all seats.
         learn_every: steps k after which agents learn, then k times.
         make_collector: what plays; see `cprl.train.Training`.
+        watch: "file" for a recording to look at in the Rerun viewer; with "serve", "spawn" or "connect
+            ADDRESS" live as well, see `cprl.recording.streams.open_live`; "off" for none.
 
     Returns:
-        The run's directory, now with `episodes.parquet`, `checkpoints/final.pt`, `evaluation/`,
+        The run's directory, now with `episodes.parquet`, `run.rrd`, `checkpoints/final.pt`, `evaluation/`,
         `figures/` and `report.json`, which says how long it took.
     """
     game, replicas, seed = agents.game, agents.replicas, agents.seed
     at_random = partial(random_seats, game, replicas=replicas, seed=seed)
+    env = CommonsEnv(game, replicas, seed=seed)
     with (
-        Checkpoints(run) as checkpoints,
+        _watched(watch, run, env, title=title, episodes=episodes) as viewer,
+        Checkpoints(run, tell=viewer.tell if viewer else None) as checkpoints,
         EpisodeTable(run / "episodes.parquet", resumable=True) as table,
         ProgressBar(game, episodes=episodes, replicas=replicas) as bar,
     ):
         training = train(
-            CommonsEnv(game, replicas, seed=seed),
+            env,
             {agents.seats: agents},
             others=at_random(random) if random else {},
             episodes=episodes,
-            observers=[table, bar],
+            observers=[table, bar, *([viewer] if viewer else [])],
             checkpoints=checkpoints if make_collector is StepCollector else None,
             learn_every=learn_every,
             make_collector=make_collector,
@@ -90,6 +104,17 @@ def conduct(
     }
     summarise(run, title=title, played=told, figure=figure)
     return run
+
+
+def _watched(
+    watch: str, run: Path, env: CommonsEnv, *, title: str, episodes: int
+) -> AbstractContextManager[Watch | None]:
+    if watch == "off":
+        return nullcontext()
+    live = None if watch == "file" else watch
+    recipe = read_recipe(run)
+    told = {name: recipe.get(name) for name in ("command", "started", "git", "versions")}
+    return Watch(run, env, title=title, episodes=episodes, recipe={**told, **recipe["arguments"]}, live=live)
 
 
 def _keep(path: Path, played: list[Episode], of_replica: int) -> None:

@@ -140,12 +140,13 @@ class Training:
             observer.see_turn(batch)
         ended = self._tracker.add(batch)
         if ended:
-            self._end(ended)
+            self._end(ended, batch)
 
-    def _end(self, ended: Sequence[Episode]) -> None:
+    def _end(self, ended: Sequence[Episode], batch: TensorDictBase) -> None:
         worlds = torch.zeros(len(self._played), dtype=torch.bool)
         worlds[[episode.world for episode in ended]] = True
-        learning = [_learning(episode.world, self.learners, self._losses) for episode in ended]
+        values = {seat: learner.values(batch) for seat, learner in self.learners.items()}
+        learning = [_learning(episode.world, self.learners, self._losses, values) for episode in ended]
         for learner in self.learners.values():
             learner.end_episode(worlds)
         for episode, of_agents in zip(ended, learning, strict=True):
@@ -170,13 +171,13 @@ class Training:
             "others": [dict(other.state_dict()) for other in self.others.values()],
             "losses": [losses.state_dict() for losses in self._losses.values()],
             "tracker": self._tracker.state_dict(),
-            "observers": [observer.state_dict() for observer in self._keeping()],
+            "observers": {name: own.state_dict() for name, own in self._keeping().items()},
             "torch": torch.get_rng_state(),
         }
 
-    def _keeping(self) -> list[Any]:
-        """The observers that go on from a state, as a table does; others may change from run to run."""
-        return [observer for observer in self.observers if hasattr(observer, "load_state_dict")]
+    def _keeping(self) -> dict[str, Any]:
+        """The observers that go on from a state, as a table does, by the name of their class."""
+        return {type(own).__name__: own for own in self.observers if hasattr(own, "load_state_dict")}
 
     def _step_collector(self) -> StepCollector:
         """The collector, if a training can go on with it."""
@@ -201,8 +202,9 @@ class Training:
         for losses, own in zip(self._losses.values(), state["losses"], strict=True):
             losses.load_state_dict(own)
         self._tracker.load_state_dict(state["tracker"])
-        for observer, own in zip(self._keeping(), state["observers"], strict=True):
-            observer.load_state_dict(own)
+        for name, observer in self._keeping().items():
+            if name in state["observers"]:  # one may watch from now on, or no longer
+                observer.load_state_dict(state["observers"][name])
         torch.set_rng_state(state["torch"])
 
 
@@ -260,14 +262,18 @@ def _tensor(array: NDArray[Any]) -> Tensor:
 
 
 def _learning(
-    replica: int, learners: Mapping[Seat, Learner], losses: Mapping[Seat, LaneLosses]
+    replica: int,
+    learners: Mapping[Seat, Learner],
+    losses: Mapping[Seat, LaneLosses],
+    values: Mapping[Seat, Tensor],
 ) -> dict[str, float]:
     """How learning went in the episode of a replica that has just ended."""
     learning = {}
     for seat, learner in learners.items():
-        for agent, loss in losses[seat].take(replica).items():
+        for place, (agent, loss) in enumerate(losses[seat].take(replica).items()):
             learning[f"agent_{agent}/loss"] = loss
             learning[f"agent_{agent}/epsilon"] = learner.actor.epsilon
+            learning[f"agent_{agent}/q"] = float(values[seat][replica, place])
     return learning
 
 

@@ -12,7 +12,8 @@ OPTIONS: Final[dict[str, Any]] = {
     "cpp_wrapper": True,
     "guard_filter_fn": torch.compiler.skip_all_guards_unsafe,
 }
-"""Of torch.compile. Guards cost a quarter of an update of 16 lanes; whoever calls tells the form instead."""
+"""Of torch.compile, which takes some out of the dict it is given. Guards cost a quarter of an update of 16
+lanes; whoever calls tells the form instead."""
 
 
 class Compiled:
@@ -47,7 +48,7 @@ class Compiled:
 
     def _compile_and_call(self, *arguments: Any) -> Any:
         """The first call with this form; where it cannot be compiled, nothing has been changed yet."""
-        self._compiled = torch.compile(_own_code(self._plain), fullgraph=True, options=OPTIONS)
+        self._compiled = torch.compile(_own_code(self._plain), fullgraph=True, options=dict(OPTIONS))
         try:
             with warnings.catch_warnings():
                 for kind in (DeprecationWarning, FutureWarning):  # torch's and TorchRL's own affairs

@@ -106,24 +106,31 @@ class LaneActor(TensorDictModuleBase):
         self.values, self.actions = values, actions
         self.seats, self.worlds, self.replicas = seats, worlds, len(seeds) // seats
         # As a compiled function takes it: as a tensor, since other numbers are taken for constant.
-        self._epsilon = torch.ones((), dtype=torch.float64)
+        self._epsilon, self._chance = torch.ones((), dtype=torch.float64), 1.0
         self.draws = LaneDraws(seeds, 2 * worlds)
         self._explore = Compiled(LaneActor._explored, what="agents act", enabled=compile)
 
     @property
     def epsilon(self) -> float:
         """The chance of a random action."""
-        return self._epsilon.item()
+        return self._chance
 
     @epsilon.setter
     def epsilon(self, chance: float) -> None:
-        self._epsilon.fill_(chance)
+        self.explore_with(chance)
+
+    def explore_with(self, chance: float) -> None:
+        """Sets `epsilon`; quicker than through a module's attributes."""
+        if chance != self._chance:
+            self._epsilon.fill_(chance)
+            object.__setattr__(self, "_chance", chance)
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Writes "action", int64 [replicas x k, S], for "observation" [replicas x k, S, C, X, Y]."""
-        return tensordict.set("action", self._choose(tensordict.get("observation")))
+        return tensordict.set("action", self.choose(tensordict.get("observation")))
 
-    def _choose(self, observation: Tensor) -> Tensor:
+    def choose(self, observation: Tensor) -> Tensor:
+        """Actions, int64 [replicas x k, S], for what is seen, [replicas x k, S, C, X, Y]."""
         if self.values is None:
             return self._by_replica(self._random(self.draws.next().to(observation.device)))
         if exploration_type() not in (ExplorationType.RANDOM, None):

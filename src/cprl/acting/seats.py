@@ -9,6 +9,7 @@ from tensordict.nn import TensorDictModuleBase
 from torch import Tensor, nn
 
 from cprl import keys
+from cprl.acting.lanes import LaneActor
 
 Seat: TypeAlias = int | tuple[int, ...]
 """Where an actor or learner sits: one agent's number, or several."""
@@ -56,7 +57,7 @@ class Seats(TensorDictModuleBase):
                 "one actor for each agent is wanted"
             )
         if self.seats == [tuple(range(self.agents))]:
-            agents.set("action", self._choose(self.actors[0], observation, tensordict.batch_size))
+            keys.put(agents, "action", self._choose(self.actors[0], observation, tensordict.batch_size))
             return tensordict
         chosen = observation.new_empty(observation.shape[: dim + 1], dtype=torch.int64)
         for seat, actor in zip(self.seats, self.actors, strict=True):
@@ -67,6 +68,8 @@ class Seats(TensorDictModuleBase):
         return tensordict
 
     def _choose(self, actor: nn.Module, seen: Tensor, batch_size: torch.Size) -> Tensor:
+        if isinstance(actor, LaneActor):  # what its forward does, without a TensorDict to and fro
+            return actor.choose(seen)
         view = TensorDict._new_unsafe({"observation": seen}, batch_size=batch_size)
         action: Tensor = actor(view).get("action")
         return action

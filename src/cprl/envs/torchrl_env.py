@@ -212,7 +212,7 @@ class CommonsEnv(EnvBase):
         if "next" in tensordict or "_step" in tensordict:
             return super()._step_and_maybe_reset(tensordict)  # type: ignore[no-any-return]
         following = self._step(tensordict)
-        tensordict._set_str("next", following, validated=True, inplace=False, non_blocking=False)
+        keys.put(tensordict, "next", following)
         done = self._tensors["done"]
         carried = self._as_tensordict(self._begin(done) if done.any() else self._tensors)
         others = {name: value for name, value in tensordict.items() if name not in _OWN_KEYS}

@@ -12,7 +12,7 @@ from torchrl.data.replay_buffers import ReplayBuffer
 from cprl.acting.compiling import Compiled
 from cprl.acting.lanes import LaneQNetwork
 from cprl.learning.functional import FunctionalLoss, MakeLoss, Weights, stacked, weights_of
-from cprl.learning.storage import LaneStorage, gather
+from cprl.learning.storage import FIELDS, LaneStorage, gather
 
 BETA_1, BETA_2 = 0.9, 0.999
 """Adam's decay rates (Kingma and Ba 2015, the defaults of torch)."""
@@ -55,16 +55,20 @@ class FunctionalUpdate:
         if target_networks is not None:
             _, others = stacked(target_networks, make_loss, lane_axis=lane_axis)
             self.targets = {name: others[name.removeprefix("target_")] for name in self.targets}
+        self._mean = {name: torch.zeros_like(value) for name, value in self.own.items()}
+        self._square = {name: torch.zeros_like(value) for name, value in self.own.items()}
         self.loss = FunctionalLoss(loss)
         self._shared = weights_of(self._network, self.own)
         if lane_axis:  # acts by the very tensors that learning changes
             for name, parameter in self._network.named_parameters():
                 parameter.requires_grad_(False).data = self._shared[name]
-        self._mean = {name: torch.zeros_like(value) for name, value in self.own.items()}
-        self._square = {name: torch.zeros_like(value) for name, value in self.own.items()}
+        self._names, self._target_names = tuple(self.own), tuple(self.targets)
+        groups = self.own, self.targets, self._mean, self._square
+        self._tensors = [list(group.values()) for group in groups]
         self.steps = 0
         self._learning_rate, self._adam_eps, self._share = learning_rate, adam_eps, loss_share
         self._vmapped = not lane_axis
+        self._is_warm = not compile
         self._compiled = Compiled(FunctionalUpdate._step, what="updates run", enabled=compile)
 
     def learn(self, buffer: ReplayBuffer) -> Tensor:
@@ -72,8 +76,12 @@ class FunctionalUpdate:
         storage: LaneStorage = buffer.storage
         index = buffer.sampler.draw(storage)
         self.steps += 1
-        arguments = storage.fields, storage.rows, index, *self._adam_scalars()
-        losses: Tensor = self._compiled(_form(storage, index), self, *arguments)
+        if not self._is_warm:
+            # TensorDict fills a table of its own at first use; compiled code would fill it again each time.
+            self._gradients(self._tensors[0], self._tensors[1], gather(storage.fields, index, storage.rows))
+            self._is_warm = True
+        arguments = [*storage.fields.values()], storage.rows, index, *self._adam_scalars()
+        losses: Tensor = self._compiled(_form(storage, index), self, *arguments, self._tensors)
         return losses
 
     def _adam_scalars(self) -> tuple[Tensor, Tensor]:
@@ -84,25 +92,44 @@ class FunctionalUpdate:
         return kind.new_tensor(size), kind.new_tensor(scale)
 
     def _step(
-        self, fields: dict[str, Tensor], rows: int, index: Tensor, step_size: Tensor, scale: Tensor
+        self,
+        fields: list[Tensor],
+        rows: int,
+        index: Tensor,
+        step_size: Tensor,
+        scale: Tensor,
+        tensors: list[list[Tensor]],
     ) -> Tensor:
-        batch = gather(fields, index, rows)
-        gradient = torch.func.grad(self._lane_losses, has_aux=True)
-        if self._vmapped:
-            gradient = torch.vmap(gradient)
-        gradients: Weights
-        losses: Tensor
-        gradients, losses = gradient(self.own, self.targets, batch)
-        for name, weight in self.own.items():
-            slope, mean, square = gradients[name], self._mean[name], self._square[name]
+        """One step. Tensors come in lists: compiled code finds each of a dict by counting through its keys,
+        which takes longer than all that one lane has to compute."""
+        own, targets, means, squares = tensors
+        batch = gather(dict(zip(FIELDS, fields, strict=True)), index, rows)
+        gradients, losses = self._gradients(own, targets, batch)
+        for weight, slope, mean, square in zip(own, gradients, means, squares, strict=True):
             mean.mul_(BETA_1).add_(slope, alpha=1 - BETA_1)
             square.mul_(BETA_2).addcmul_(slope, slope, value=1 - BETA_2)
             weight.sub_(step_size * mean / (square.sqrt() * scale + self._adam_eps))
         return losses
 
-    def _lane_losses(self, own: Weights, targets: Weights, batch: TensorDict) -> tuple[Tensor, Tensor]:
+    def _gradients(
+        self, own: list[Tensor], targets: list[Tensor], batch: TensorDict
+    ) -> tuple[list[Tensor], Tensor]:
+        """By each of the own weights, and each lane's loss."""
+        gradient = torch.func.grad(self._lane_losses, has_aux=True)
+        if self._vmapped:
+            gradient = torch.vmap(gradient)
+        gradients, losses = gradient(own, targets, batch)
+        return gradients, losses
+
+    def _lane_losses(
+        self, own: list[Tensor], targets: list[Tensor], batch: TensorDict
+    ) -> tuple[Tensor, Tensor]:
         """The sum over lanes, for its gradient, and each lane's loss; under vmap there is one lane."""
-        losses = self.loss(own, targets, batch).mean(-1) * self._share
+        by_name = (
+            dict(zip(self._names, own, strict=True)),
+            dict(zip(self._target_names, targets, strict=True)),
+        )
+        losses = self.loss(*by_name, batch).mean(-1) * self._share
         return losses.sum(), losses
 
     def outputs(self, observation: Tensor) -> Tensor:

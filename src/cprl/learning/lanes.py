@@ -15,7 +15,7 @@ from cprl.learning.dqn import dqn_loss, q_network
 from cprl.learning.functional import MakeLoss
 from cprl.learning.replay import lane_buffer
 from cprl.learning.settings import DQNSettings
-from cprl.learning.transitions import lane_turn
+from cprl.learning.transitions import lane_turn, seen_next
 from cprl.learning.updates import ListUpdate
 from cprl.learning.ways import TRIAL_LANES, Way, make_update, trial_buffer
 
@@ -145,7 +145,7 @@ class LaneLearner:
         """Stores a turn of every replica, as the collector yields it."""
         self.buffer.storage.write(lane_turn(self.seats, batch))
         self.steps += 1
-        self.actor.epsilon = self.settings.epsilon(self.steps)
+        self.actor.explore_with(self.settings.epsilon(self.steps))
 
     def learn(self) -> Tensor | None:
         """One update of every lane; their losses [R, S], or None while too little is stored."""
@@ -159,6 +159,12 @@ class LaneLearner:
         due = ended & (self._episodes % self.settings.target_every_episodes == 0)
         if due.any():
             self.update.copy_to_targets(due.repeat_interleave(len(self.seats)))
+
+    def values(self, batch: TensorDictBase) -> Tensor:
+        """The highest value of each agent's actions at the end of a turn, [R, S]."""
+        seen = seen_next(batch)[:, list(self.seats)].flatten(0, 1).unsqueeze(1)
+        with torch.no_grad():
+            return self.update.outputs(seen).amax(-1).view(self.replicas, len(self.seats))
 
     def state_dict(self) -> dict[str, Any]:
         """Everything that the future of all lanes depends on; own tensors, not copies.

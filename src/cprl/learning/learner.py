@@ -11,7 +11,7 @@ from torch import Tensor
 
 from cprl.acting.seats import Seat, agents_at
 from cprl.learning.dqn import DQNLearner
-from cprl.learning.transitions import transitions_of
+from cprl.learning.transitions import seen_next, transitions_of
 
 _NO_STATE: Final = (
     "a DQNLearner keeps no state to go on from; use a LaneLearner, or train without checkpoints"
@@ -34,6 +34,9 @@ class Learner(Protocol):
 
     def end_episode(self, ended: Tensor) -> None:
         """An episode of the marked replicas has ended, bool [R]."""
+
+    def values(self, batch: TensorDictBase) -> Tensor:
+        """What each agent expects at best from the turn's end on, [R, S]; for people to look at."""
 
     def state_dict(self) -> dict[str, Any]:
         """Everything that its future depends on."""
@@ -68,6 +71,12 @@ class OneAgent:
     def end_episode(self, ended: Tensor) -> None:
         """See `Learner`."""
         self.learner.end_episode()
+
+    def values(self, batch: TensorDictBase) -> Tensor:
+        """See `Learner`."""
+        with torch.no_grad():
+            highest: Tensor = self.learner.network(seen_next(batch)[:, list(self.seats)]).amax(-1)
+        return highest
 
     def state_dict(self) -> dict[str, Any]:
         """A plain agent cannot go on from a checkpoint; `LaneLearner` can."""

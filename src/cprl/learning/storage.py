@@ -23,6 +23,9 @@ shorter than that, fewer transitions are kept; none is ever wrong."""
 LOOKS_EVERY: Final = 32
 """Steps after which a storage looks again what is about to be written over."""
 
+FIELDS: Final = ("observation", "action", "reward", "done", "terminated", "row")
+"""What a storage holds, in the order in which it holds it."""
+
 Fields = dict[str, Tensor]
 
 
@@ -105,8 +108,12 @@ class LaneStorage(Storage):
 
     def valid(self) -> tuple[Tensor, int]:
         """The number of each lane's oldest transition that is still whole, int64 [L], and of the next one."""
-        oldest = torch.as_tensor(self._oldest)
-        return oldest.clamp(min=self._written - self.max_size), self._written
+        oldest, written = self.oldest()
+        return torch.as_tensor(oldest), written
+
+    def oldest(self) -> tuple[Any, int]:
+        """`valid`, as a numpy array where it lies on the CPU."""
+        return self._oldest.clip(min=self._written - self.max_size), self._written
 
     def set(self, cursor: Any, data: TensorDictBase, *, set_cursor: bool = True) -> None:
         """Writes the next transition of every lane; `cursor` is its place in the ring."""

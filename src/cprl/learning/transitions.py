@@ -60,6 +60,12 @@ def lane_turn(seats: tuple[int, ...], batch: TensorDictBase) -> LaneTurn:
     )
 
 
+def seen_next(batch: TensorDictBase) -> Tensor:
+    """What all agents see at the end of a turn, uint8 [R, N, C, X, Y]."""
+    seen: Tensor = keys.entry(keys.entry(keys.entry(batch, "next"), keys.AGENTS), "observation")
+    return seen
+
+
 def array_of(tensor: Tensor) -> Any:
     """The same memory as a numpy array; as it is where it lies on a GPU. Both are indexed alike."""
     return tensor.numpy() if tensor.device.type == "cpu" else tensor

@@ -1,65 +1,102 @@
 """How the Rerun viewer is laid out when a recording is opened."""
 
-from collections.abc import Sequence
 from typing import Any
 
+from cprl.recording.scenery import Scene
 
-def layout(agents: Sequence[str]) -> Any:
-    """Board and windows left; returns, social metrics and learning right; events and recipe below.
+
+def layout(scene: Scene | None) -> Any:
+    """Board and windows left, what is measured right, events below, and tabs for the rest.
 
     Args:
-        agents: their names.
+        scene: what is on the board; None for a recording without one.
 
     Returns:
         A `rerun.blueprint.Blueprint`.
     """
-    import rerun as rr
     import rerun.blueprint as rrb
 
-    boundary = rrb.TimeRangeBoundary
-    whole = rrb.TimeAxis(view_range=rr.TimeRange(start=boundary.infinite(), end=boundary.infinite()))
+    agents = scene.agents if scene else ()
+    return rrb.Blueprint(
+        rrb.Horizontal(_board(agents), _numbers(agents), column_shares=[2, 3]),
+        rrb.BlueprintPanel(state="collapsed"),
+        rrb.SelectionPanel(state="collapsed"),
+        rrb.TimePanel(state="collapsed", timeline="step", play_state="following", fps=15),
+    )
 
-    def plot(name: str, *entities: str, share: bool = False) -> Any:
-        """A plot over the whole run; a share has the axis 0..1."""
-        return rrb.TimeSeriesView(
-            name=name,
-            contents=[f"+ /{entity}" for entity in entities],
-            axis_x=whole,
-            axis_y=rrb.ScalarAxis(range=(0.0, 1.05)) if share else None,
-            plot_legend=rrb.PlotLegend(rrb.Corner2D.LeftTop),
-        )
 
-    def of_agents(entity: str) -> list[str]:
-        return [f"{agent}/{entity}" for agent in agents]
+def _board(agents: tuple[str, ...]) -> Any:
+    """The board, what agents see, and what happened."""
+    import rerun.blueprint as rrb
 
     seen = "What the agent sees" if len(agents) == 1 else "What each agent sees, the first one left"
-    left = rrb.Vertical(
+    return rrb.Vertical(
         rrb.Spatial2DView(name="Board", origin="/world"),
         rrb.Spatial2DView(name=seen, origin="/windows"),
-        row_shares=[3, 2],
-    )
-    right = rrb.Vertical(
-        plot("Return of each episode, apples", *of_agents("return"), "evaluation/greedy_return"),
-        rrb.Horizontal(
-            plot("Survival, sustainability, steps", "social/survival_steps", "social/sustainability"),
-            plot("Equality", "social/equality", share=True),
-            plot("Peacefulness, steps in play", "social/peacefulness"),
-        ),
-        rrb.Horizontal(
-            plot("Loss", *of_agents("loss")),
-            plot("Epsilon", *of_agents("epsilon"), share=True),
-            plot("Steps per second", "time/env_steps_per_s"),
-        ),
         rrb.Tabs(
             rrb.TextLogView(name="Events", origin="/log"),
             rrb.TextDocumentView(name="Recipe", origin="/recipe"),
             active_tab="Events",
         ),
-        row_shares=[4, 3, 3, 2],
+        row_shares=[6, 3, 3],
     )
-    return rrb.Blueprint(
-        rrb.Horizontal(left, right, column_shares=[2, 3]),
-        rrb.BlueprintPanel(state="collapsed"),
-        rrb.SelectionPanel(state="collapsed"),
-        rrb.TimePanel(state="collapsed", timeline="step", play_state="following", fps=15),
+
+
+def _numbers(agents: tuple[str, ...]) -> Any:
+    """Returns and social metrics, the phase under them, and tabs for learning and for who tagged whom."""
+    import rerun.blueprint as rrb
+
+    learning = rrb.Horizontal(
+        _plot("Loss", *_of(agents, "loss")),
+        _plot("Q value of the greedy action", *_of(agents, "q")),
+        _plot("Epsilon", *_of(agents, "epsilon"), share=True),
+        _plot("Steps per second", "time/env_steps_per_s"),
+        name="Learning",
     )
+    more = rrb.Horizontal(
+        _plot("Apples per step", "social/efficiency"),
+        _plot("Mean time of harvest, steps", "social/sustainability"),
+        _plot("Apples left at the end", "social/stock_left"),
+        name="More metrics",
+    )
+    tags = rrb.TensorView(name="Who tagged whom", origin="/tags")
+    return rrb.Vertical(
+        rrb.Horizontal(
+            _plot("Return of each agent, apples", *_of(agents, "return"), "evaluation/greedy_return"),
+            _plot("Collective return, apples", "social/collective_return"),
+        ),
+        rrb.Horizontal(
+            _plot("Survival, steps", "social/survival_steps"),
+            _plot("Equality", "social/equality", share=True),
+            _plot("Peacefulness, steps in play", "social/peacefulness"),
+        ),
+        rrb.StateTimelineView(name="Phase", contents=["+ /phase/**"], time_view=_whole()),
+        rrb.Tabs(learning, more, *([tags] if len(agents) > 1 else []), active_tab=0),
+        row_shares=[4, 3, 1, 3],
+    )
+
+
+def _plot(name: str, *entities: str, share: bool = False) -> Any:
+    """A plot over the whole run; a share has the axis 0..1."""
+    import rerun.blueprint as rrb
+
+    return rrb.TimeSeriesView(
+        name=name,
+        contents=[f"+ /{entity}" for entity in entities],
+        axis_x=_whole(),
+        axis_y=rrb.ScalarAxis(range=(0.0, 1.05)) if share else None,
+        plot_legend=rrb.PlotLegend(rrb.Corner2D.LeftTop),
+    )
+
+
+def _whole() -> Any:
+    """A time axis that shows everything; by default it shows a thousand steps around the cursor."""
+    import rerun as rr
+    import rerun.blueprint as rrb
+
+    boundary = rrb.TimeRangeBoundary
+    return rrb.TimeAxis(view_range=rr.TimeRange(start=boundary.infinite(), end=boundary.infinite()))
+
+
+def _of(agents: tuple[str, ...], entity: str) -> list[str]:
+    return [f"{agent}/{entity}" for agent in agents]

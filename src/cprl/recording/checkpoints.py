@@ -5,7 +5,7 @@ import os
 import re
 import signal
 import time
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from threading import current_thread, main_thread
 from types import FrameType, TracebackType
@@ -51,16 +51,24 @@ class Checkpoints:
         run: the run's directory.
         every_s: seconds from one checkpoint to the next.
         go_on: the command line that goes on, told where the run is stopped; by default `go_on_line`.
+        tell: told of each checkpoint in words, e.g. `Watch.tell`.
         console: where to; by default standard output.
     """
 
     def __init__(
-        self, run: Path, *, every_s: float = EVERY_S, go_on: str | None = None, console: Console | None = None
+        self,
+        run: Path,
+        *,
+        every_s: float = EVERY_S,
+        go_on: str | None = None,
+        tell: Callable[[str], object] | None = None,
+        console: Console | None = None,
     ) -> None:
         if not every_s > 0:
             raise ValueError(f"every_s is {every_s}; a number above 0 is wanted")
         self.folder, self.every_s = run / FOLDER, every_s
         self.go_on = go_on_line(run) if go_on is None else go_on
+        self.tell = tell
         self.console = console or Console()
         self._saved = time.monotonic()
         self._asked_to_stop = False
@@ -109,6 +117,8 @@ class Checkpoints:
         for old in checkpoints_in(self.folder)[:-KEPT]:
             old.unlink()
         self._saved = time.monotonic()
+        if self.tell:
+            self.tell(f"checkpoint at step {training.steps:,}")
         return path
 
     def done(self) -> None:

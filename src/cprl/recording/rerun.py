@@ -8,14 +8,17 @@ from typing import Any, Final, TypeAlias
 import numpy as np
 import torch
 from numpy.typing import NDArray
+from rich.console import Console
 from torch import Tensor
 from torchrl.record.loggers import Logger
 
 from cprl.recording.blueprint import layout
-from cprl.recording.scenery import Scene, classes, frame_columns, image_forms, lines
-from cprl.recording.streams import FLUSH_TIMEOUT_S, Stream, open_file, serve_live
+from cprl.recording.scenery import Scene, classes, frame_columns, image_forms, lines, phase_states
+from cprl.recording.streams import FLUSH_TIMEOUT_S, Stream, open_file, open_live
 
 FILE_NAME: Final = "run.rrd"
+TIMELINES: Final = ("step", "episode", "frame")
+"""Of every row: environment steps of the run, episodes, and frames recorded so far."""
 
 Numbers: TypeAlias = "Sequence[int] | NDArray[np.integer[Any]]"
 
@@ -35,9 +38,12 @@ class RerunLogger(Logger):
         exp_name: the name that the viewer shows.
         log_dir: the run's directory, where the recording is written.
         scene: what is on the board; without it no frames can be logged.
-        serve: whether to serve the recording live; `addresses` tells where. The recording is served on
-            127.0.0.1 alone; the empty page of the web viewer, which Rerun serves, listens on all interfaces.
+        live: "serve", "spawn" or "connect ADDRESS", see `cprl.recording.streams.open_live`; None for the file
+            alone. A recording is served on 127.0.0.1 alone; the empty page of the web viewer, which Rerun
+            serves, listens on all interfaces.
         file_name: of the recording.
+        recording_id: the viewer shows files of one id as one recording; by default a new one.
+        console: where the addresses are told; by default standard output.
 
     Raises:
         FileExistsError: where there is a recording already.
@@ -49,38 +55,48 @@ class RerunLogger(Logger):
         log_dir: str | Path,
         *,
         scene: Scene | None = None,
-        serve: bool = False,
+        live: str | None = None,
         file_name: str = FILE_NAME,
+        recording_id: str | None = None,
+        console: Console | None = None,
     ) -> None:
         self.scene = scene
+        self.recording_id = recording_id or f"{exp_name}-{time.time_ns()}"
         self.path = Path(log_dir) / file_name
         if self.path.exists():
             raise FileExistsError(
                 f"{self.path} exists and is kept; give the recording a directory of its own"
             )
         self.addresses: dict[str, str] = {}
-        self._serve = serve
+        self._live, self._console = live, console or Console()
         self._streams: list[Stream] = []
-        self._frames = 0
+        self.frames = 0
+        """Frames recorded so far, in earlier files of the recording too."""
         self._now = (0, 0)
         super().__init__(exp_name, str(log_dir))
 
     def _create_experiment(self) -> list[Any]:
-        recording_id = f"{self.exp_name}-{time.time_ns()}"
-        blueprint = layout(self.scene.agents if self.scene else ())
+        recording_id, blueprint = self.recording_id, layout(self.scene)
         self._streams.append(open_file(recording_id, self.path, blueprint, period_s=_FILE_PERIOD_S))
-        if self._serve:
-            live, self.addresses = serve_live(recording_id, blueprint, period_s=_LIVE_PERIOD_S)
-            self._streams.append(live)
+        if self._live:
+            self._go_live(recording_id, blueprint)
         self._all(lambda recording: recording.send_recording_name(self.exp_name))
         self._static("/", classes(self.scene))
         for entity, style in lines(self.scene).items():
             self._static(entity, style)
+        for entity in ("phase/now", "phase/found"):
+            self._static(entity, phase_states())
         if self.scene is not None:
             for entity, form in image_forms(self.scene).items():
                 self._static(entity, form)
         self._all(lambda recording: recording.flush(timeout_sec=FLUSH_TIMEOUT_S))
         return [each.recording for each in self._streams]
+
+    def _go_live(self, recording_id: str, blueprint: Any) -> None:
+        live, self.addresses = open_live(self._live or "", recording_id, blueprint, period_s=_LIVE_PERIOD_S)
+        self._streams += [live] if live else []
+        for where, address in self.addresses.items():
+            self._console.print(f"Watch live ({where}): {address}", soft_wrap=True, highlight=False)
 
     def _all(self, what: Callable[[Any], object]) -> None:
         for each in self._streams:
@@ -105,12 +121,40 @@ class RerunLogger(Logger):
                     self.log_scalar(f"{name}/{index}", float(number), step)
                 return
             value = numbers[0]
-        when = self._now[0] if step is None else int(step)
-        row = when, self._now[1], self._frames, float(value)
+        self._wait(name, self._now[0] if step is None else int(step), [float(value)])
+
+    def log_lines(self, name: str, values: Sequence[float]) -> None:
+        """Logs several numbers that are drawn as lines of one plot, as many every time; NaN leaves a gap."""
+        self._wait(name, self._now[0], [float(value) for value in values])
+
+    def _wait(self, name: str, step: int, values: list[float]) -> None:
+        row = step, self._now[1], self.frames, values
         for each in self._streams:
             each.waiting.setdefault(name, []).append(row)
             if each.is_due:
                 _send_waiting(each)
+
+    def log_states(self, name: str, states: Mapping[int, str]) -> None:
+        """Logs in which state something is from which episode on; steps are those that `at` said."""
+        import rerun as rr
+
+        episodes = list(states)
+        times = _times([self._now[0]] * len(episodes), episodes, [self.frames] * len(episodes))
+        self._send(name, times, rr.StateChange.columns(state=list(states.values())))
+
+    def log_matrix(self, name: str, matrix: NDArray[Any], dims: Sequence[str]) -> None:
+        """Logs a matrix of numbers, float32 [rows, columns], with the names of its two axes."""
+        import rerun as rr
+
+        values = np.asarray(matrix, np.float32)
+
+        def log(recording: Any) -> None:
+            for timeline, number in zip(TIMELINES, (*self._now, self.frames), strict=True):
+                recording.set_time(timeline, sequence=number)
+            recording.log(name, rr.Tensor(values, dim_names=list(dims)))
+            recording.reset_time()
+
+        self._all(log)
 
     def log_frames(self, frames: Mapping[str, NDArray[Any]]) -> None:
         """Logs what `FrameBuffer.take` gave: the board, agents, headings and windows of each step,
@@ -120,8 +164,8 @@ class RerunLogger(Logger):
         count = len(frames["step"])
         if not count:
             return
-        numbers = np.arange(self._frames, self._frames + count)
-        self._frames += count
+        numbers = np.arange(self.frames, self.frames + count)
+        self.frames += count
         times = _times(frames["step"], frames["episode"], numbers)
         for entity, what in frame_columns(self.scene, frames).items():
             self._send(entity, times, what)
@@ -130,7 +174,7 @@ class RerunLogger(Logger):
         """Logs an event at the time that `at` said."""
         import rerun as rr
 
-        times = _times([self._now[0]], [self._now[1]], [self._frames])
+        times = _times([self._now[0]], [self._now[1]], [self.frames])
         what = rr.TextLog.columns(text=[text], level=[level])
         self._send("log", times, what)
 
@@ -163,7 +207,7 @@ class RerunLogger(Logger):
         )
         self._static(name, rr.Image.from_fields(format=form))
         count = len(images)
-        times = _times(range(first, first + count), [self._now[1]] * count, [self._frames] * count)
+        times = _times(range(first, first + count), [self._now[1]] * count, [self.frames] * count)
         what = rr.Image.columns(buffer=np.ascontiguousarray(images).reshape(count, -1))
         self._send(name, times, what)
 
@@ -178,7 +222,7 @@ class RerunLogger(Logger):
         when = self._now[0] if step is None else int(step)
 
         def log(recording: Any) -> None:
-            for timeline, number in (("step", when), ("episode", self._now[1]), ("frame", self._frames)):
+            for timeline, number in zip(TIMELINES, (when, self._now[1], self.frames), strict=True):
                 recording.set_time(timeline, sequence=number)
             recording.log(name, rr.BarChart(counts, abscissa=(edges[:-1] + edges[1:]) / 2))
             recording.reset_time()
@@ -212,8 +256,10 @@ def _times(steps: Numbers, episodes: Numbers, frames: Numbers) -> list[Any]:
     """The timelines that every row carries."""
     import rerun as rr
 
-    named = (("step", steps), ("episode", episodes), ("frame", frames))
-    return [rr.TimeColumn(name, sequence=np.asarray(numbers, np.int64)) for name, numbers in named]
+    return [
+        rr.TimeColumn(name, sequence=np.asarray(numbers, np.int64))
+        for name, numbers in zip(TIMELINES, (steps, episodes, frames), strict=True)
+    ]
 
 
 def _send_waiting(stream: Stream) -> None:
@@ -225,7 +271,8 @@ def _send_waiting(stream: Stream) -> None:
     def send(recording: Any) -> None:
         for name, rows in waiting.items():
             steps, episodes, frames, values = zip(*rows, strict=True)
-            recording.send_columns(name, _times(steps, episodes, frames), rr.Scalars.columns(scalars=values))
+            columns = rr.Scalars.columns(scalars=np.concatenate(values)).partition([len(v) for v in values])
+            recording.send_columns(name, _times(steps, episodes, frames), columns)
         recording.flush(timeout_sec=FLUSH_TIMEOUT_S)
 
     stream.do(send)

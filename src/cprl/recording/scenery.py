@@ -10,16 +10,31 @@ from numpy.typing import NDArray
 from cprl.commons.colours import FIRST_AGENT, agent_colour, class_colour, class_name
 from cprl.recording.frames import RIM_CELLS, UNSEEN, board_with_rim, mosaic
 
-LINES: Final = {
-    "social/survival_steps": ("survival_steps", (230, 160, 0)),
-    "social/sustainability": ("sustainability", (0, 158, 115)),
+SOCIAL: Final = {
+    "social/collective_return": ("collective return", (230, 160, 0)),
+    "social/efficiency": ("apples per step", (230, 160, 0)),
     "social/equality": ("equality", (86, 180, 233)),
+    "social/sustainability": ("sustainability", (0, 158, 115)),
+    "social/survival_steps": ("survival", (230, 120, 0)),
+    "social/peace": ("peace", (204, 121, 167)),
     "social/peacefulness": ("peacefulness", (204, 121, 167)),
+    "social/stock_left": ("apples left", (0, 200, 0)),
+}
+"""The name and colour of a line, since the viewers' own colours differ; agents have theirs."""
+OTHERS: Final = {
     "time/env_steps_per_s": ("steps per second", (150, 150, 150)),
     "evaluation/greedy_return": ("greedy, evaluated", (230, 160, 0)),
 }
-"""The name and colour of a line, since the viewers' own colours differ; agents have theirs."""
+OF_AGENTS: Final = ("return", "loss", "epsilon", "q")
+PHASE_COLOURS: Final = {
+    "exploration": (86, 180, 233),
+    "tragedy": (213, 94, 0),
+    "combat": (204, 121, 167),
+    "cultivation": (0, 158, 115),
+    "another": (120, 120, 120),
+}
 
+_MEAN_WIDTH, _SINGLE_WIDTH, _SINGLE_SHARE = 2.5, 0.7, 0.45
 AGENT_RADIUS_CELLS: Final = 0.48
 _ARROW_CELLS: Final = 0.9
 _OUT_OF_PLAY_ALPHA: Final = 60
@@ -35,6 +50,8 @@ class Scene:
     """Names of the agents, agent 0 first."""
     window: tuple[int, int]
     """(X, Y) of a window."""
+    replicas: int = 1
+    """How many replicas' metrics are drawn: their mean, and thinner each of them."""
 
 
 def classes(scene: Scene | None) -> Any:
@@ -49,16 +66,41 @@ def classes(scene: Scene | None) -> Any:
 
 
 def lines(scene: Scene | None) -> dict[str, Any]:
-    """The name and colour of each plotted line, by entity."""
+    """The names, colours and widths of each plot's lines, by entity."""
     import rerun as rr
 
-    styles = {
-        entity: rr.SeriesLines(names=[name], colors=[colour]) for entity, (name, colour) in LINES.items()
-    }
+    replicas = scene.replicas if scene else 1
+    styles = {entity: _mean_and_singles(name, colour, replicas) for entity, (name, colour) in SOCIAL.items()}
+    for entity, (name, colour) in OTHERS.items():
+        styles[entity] = rr.SeriesLines(names=[name], colors=[colour])
     for agent, name in enumerate(scene.agents if scene else ()):
-        for entity in ("return", "loss", "epsilon"):
+        for entity in OF_AGENTS:
             styles[f"{name}/{entity}"] = rr.SeriesLines(names=[name], colors=[agent_colour(agent)])
     return styles
+
+
+def _mean_and_singles(name: str, colour: tuple[int, int, int], replicas: int) -> Any:
+    """A thick line for the mean of several replicas, and a thin, darker one for each."""
+    import rerun as rr
+
+    if replicas == 1:
+        return rr.SeriesLines(names=[name], colors=[colour])
+    dark = tuple(round(_SINGLE_SHARE * part) for part in colour)
+    return rr.SeriesLines(
+        names=[f"{name}, mean", *(f"replica {replica}" for replica in range(replicas))],
+        colors=[colour, *[dark] * replicas],
+        widths=[_MEAN_WIDTH, *[_SINGLE_WIDTH] * replicas],
+    )
+
+
+def phase_states() -> Any:
+    """The colours of phases."""
+    import rerun as rr
+
+    packed = [red << 24 | green << 16 | blue << 8 | 255 for red, green, blue in PHASE_COLOURS.values()]
+    return rr.StateConfiguration(
+        values=list(PHASE_COLOURS), labels=list(PHASE_COLOURS), colors=np.array(packed, np.uint32)
+    )
 
 
 def image_forms(scene: Scene) -> dict[str, Any]:

@@ -1,19 +1,25 @@
 """Streams of one recording: to a file and, on request, served live on 127.0.0.1."""
 
+import os
 import socket
+import subprocess
 import sys
 import time
 import warnings
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any, Final
-from urllib.parse import quote
+from typing import Any, Final, TypeAlias
+from urllib.parse import quote, urlsplit
 
 LOCALHOST: Final = "127.0.0.1"
 SERVER_MEMORY: Final = "512MB"
 """What the served recording may hold; beyond it the oldest rows are dropped, for viewers alone."""
 
 FLUSH_TIMEOUT_S: Final = 5.0
+
+
+Waiting: TypeAlias = dict[str, list[tuple[int, int, int, list[float]]]]
+"""Numbers by entity: (step, episode, frame, a number for each line)."""
 
 
 class Stream:
@@ -27,8 +33,8 @@ class Stream:
 
     def __init__(self, name: str, recording: Any, *, period_s: float) -> None:
         self.name, self.recording, self.period_s = name, recording, period_s
-        self.waiting: dict[str, list[tuple[int, int, int, float]]] = {}
-        """Numbers by entity that have not been sent: (step, episode, frame, value)."""
+        self.waiting: Waiting = {}
+        """What has not been sent."""
         self._sent = time.perf_counter()
 
     @property
@@ -36,7 +42,7 @@ class Stream:
         """Whether what waits has waited long enough."""
         return time.perf_counter() - self._sent > self.period_s
 
-    def take(self) -> dict[str, list[tuple[int, int, int, float]]]:
+    def take(self) -> Waiting:
         """What waits, to be sent now."""
         taken, self.waiting = self.waiting, {}
         self._sent = time.perf_counter()
@@ -69,18 +75,81 @@ def open_file(recording_id: str, path: Path, blueprint: Any, *, period_s: float)
     return Stream("file", recording, period_s=period_s)
 
 
-def serve_live(recording_id: str, blueprint: Any, *, period_s: float) -> tuple[Stream, dict[str, str]]:
-    """A stream served on a free port of 127.0.0.1, and where to watch it: "browser" and "native"."""
+def open_live(
+    live: str, recording_id: str, blueprint: Any, *, period_s: float
+) -> tuple[Stream | None, dict[str, str]]:
+    """A stream that can be watched while it is written, and where: "browser" and "native".
+
+    Args:
+        live: "serve": served on free ports of 127.0.0.1, where viewers come and go and get the history;
+            "spawn": that, and Rerun's own viewer is started; "connect ADDRESS": sent to a viewer that
+            listens, such as rerun+http://127.0.0.1:9876/proxy.
+        recording_id: of the recording.
+        blueprint: its layout.
+        period_s: seconds between two sendings of waiting numbers.
+
+    Raises:
+        ValueError: for anything else.
+    """
+    how, _, address = live.partition(" ")
+    if how == "connect" and address.startswith("rerun+http"):
+        return _connect(address, recording_id, blueprint, period_s), {}
+    if live not in ("serve", "spawn"):
+        wanted = '"serve", "spawn" or "connect rerun+http://HOST:PORT/proxy"'
+        raise ValueError(f"live is {live!r}; wanted: {wanted}")
+    stream, grpc = _serve(recording_id, blueprint, period_s)
+    if live == "spawn":
+        _spawn(grpc)
+    return stream, _addresses(grpc)
+
+
+def _serve(recording_id: str, blueprint: Any, period_s: float) -> tuple[Stream, str]:
+    """A stream served on a free port of 127.0.0.1, and its address."""
     import rerun as rr
 
-    recording = _recording(recording_id)
-    port = _free_port()
+    recording, port = _recording(recording_id), _free_port()
     recording.set_sinks(
         rr.GrpcServerSink(LOCALHOST, port, server_memory_limit=SERVER_MEMORY), default_blueprint=blueprint
     )
-    return Stream("live view", recording, period_s=period_s), _addresses(
-        f"rerun+http://{LOCALHOST}:{port}/proxy"
-    )
+    return Stream("live view", recording, period_s=period_s), f"rerun+http://{LOCALHOST}:{port}/proxy"
+
+
+def _connect(address: str, recording_id: str, blueprint: Any, period_s: float) -> Stream | None:
+    """A stream to a viewer that listens there; None, with a warning, where nobody does.
+
+    Without this look Rerun would wait for the viewer, and at last hold up the training.
+    """
+    where = urlsplit(address.removeprefix("rerun+"))
+    try:
+        socket.create_connection((where.hostname or LOCALHOST, where.port or 9876), timeout=2).close()
+    except OSError as error:
+        _warn_of(f"viewer at {address}", error)
+        return None
+    recording = _recording(recording_id)
+    recording.connect_grpc(address, default_blueprint=blueprint)
+    return Stream(f"viewer at {address}", recording, period_s=period_s)
+
+
+def _spawn(grpc: str) -> None:
+    """Starts Rerun's own viewer beside the training; where it cannot open, a warning says so."""
+    if sys.platform.startswith("linux") and not (
+        os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY")
+    ):
+        _warn_of("viewer cannot open", "there is no display; open one of the addresses from elsewhere")
+        return
+    try:
+        subprocess.Popen(
+            [viewer(), "--connect", grpc],
+            stdout=subprocess.DEVNULL,
+            stderr=subprocess.DEVNULL,
+            start_new_session=True,
+        )
+    except OSError as error:
+        _warn_of("viewer cannot be started", error)
+
+
+def _warn_of(what: str, why: object) -> None:
+    warnings.warn(f"the Rerun {what}: {why}; the run goes on without it", RuntimeWarning, stacklevel=3)
 
 
 def _recording(recording_id: str) -> Any:

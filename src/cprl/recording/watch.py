@@ -1,24 +1,33 @@
 """Watch: shows a training in the Rerun viewer while it goes on, and keeps it."""
 
 import time
+import uuid
 from collections.abc import Mapping
+from itertools import count
 from math import ceil
 from pathlib import Path
 from types import TracebackType
-from typing import Final, Self
+from typing import Any, Final, Self
 
+import numpy as np
 from rich.console import Console
 from tensordict import TensorDictBase
 
+from cprl import keys
 from cprl.envs.torchrl_env import CommonsEnv
 from cprl.measuring.episodes import Episode
 from cprl.recording.frames import Frame, FrameBuffer, classes_seen
 from cprl.recording.rerun import FILE_NAME, RerunLogger
+from cprl.recording.run import FILE_NAME as RECIPE_FILE
 from cprl.recording.scenery import Scene
+from cprl.recording.series import Series, Values, mean_of
+from cprl.recording.story import ANOTHER, Story
 
 FRAME_BYTES: Final = 300
 RECORDING_BYTES: Final = 60_000_000
 """A frame takes about so much of a file, and the frames of a whole run are to take about so much."""
+TAGS_EVERY: Final = 50
+"""Episodes whose tags make one matrix of who tagged whom."""
 
 _PERIOD_S: Final = 1.0
 _FEWEST_FRAMES: Final = 50
@@ -26,19 +35,22 @@ _FEWEST_FRAMES: Final = 50
 
 
 class Watch:
-    """Logs each episode's metrics, and the frames of the first world in every so many episodes.
+    """Logs the metrics of every episode, and the frames of the first world in some.
 
-    An observer of `cprl.train`, and a context manager.
+    Frames are kept of every so many episodes, the first and the last among them, and of the one after each
+    new best. Of several replicas metrics are told as soon as all have ended an episode: their mean and each
+    of them; returns, losses and the like as means. An observer of `cprl.train`, and a context manager.
 
     Args:
-        run: the run's directory, where the recording is written.
-        env: whose first world is shown.
+        run: the run's directory, where the recording is written; beside one that is there, as `run-2.rrd`
+            and so on, which the viewer shows as one with it.
+        env: a world for each replica; the first is shown.
         title: what is going on; the viewer shows it.
         episodes: how many will be played, by which the frames are rationed.
         recipe: what the viewer shows as the recipe of the run.
-        serve: whether to serve the recording live on 127.0.0.1; the addresses are printed at once.
-        file_name: of the recording.
-        console: where to; by default standard output.
+        live: "serve", "spawn" or "connect ADDRESS", see `cprl.recording.streams`; None for the file alone.
+        file_name: of the recording, instead of `run.rrd`; then nothing of that name may be there.
+        console: where to tell how to watch; by default standard output.
     """
 
     def __init__(
@@ -49,35 +61,52 @@ class Watch:
         title: str,
         episodes: int,
         recipe: Mapping[str, object] | None = None,
-        serve: bool = False,
-        file_name: str = FILE_NAME,
+        live: str | None = None,
+        file_name: str | None = None,
         console: Console | None = None,
     ) -> None:
-        game = env.game
-        self.env = env
+        game, replicas = env.game, env.batch_size.numel()
+        self.env, self._episodes = env, episodes
         _, rows, columns = game.observation_shape
         board = game.map.height, game.map.width
-        scene = Scene(height=board[0], width=board[1], agents=game.agent_names, window=(rows, columns))
-        self.logger = RerunLogger(title, run, scene=scene, serve=serve, file_name=file_name)
+        scene = Scene(
+            height=board[0],
+            width=board[1],
+            agents=game.agent_names,
+            window=(rows, columns),
+            replicas=replicas,
+        )
+        self.logger = RerunLogger(
+            title,
+            run,
+            scene=scene,
+            live=live,
+            file_name=file_name or _free_name(run),
+            recording_id=_recording_id(run, title),
+            console=console,
+        )
         steps = game.rules.episode_steps
         self.every = max(1, ceil(episodes * steps * FRAME_BYTES / RECORDING_BYTES))
         self._buffer = FrameBuffer(
             min(steps + 1, 5000), board=board, windows=(game.agents, *game.observation_shape)
         )
+        self._series, self._story = Series(replicas), Story()
+        self._tags, self._tags_of = np.zeros((game.agents, game.agents)), 0
         self._step = self._episode = 0
-        self._sent = self._episode_began = time.perf_counter()
-        if serve:
-            _tell(self.logger, console or Console())
+        self._shows_next = False
+        self._sent = self._told_at = time.perf_counter()
+        self._told_step = 0
         self.logger.log_hparams({"run": str(run), **(recipe or {})})
         self.logger.log_text(f"{title} begins")
 
     def see_turn(self, batch: TensorDictBase) -> None:
         """Copies the first world as it stands after the turn, if this episode's frames are kept."""
         self._step += 1
-        if bool(batch.get(("next", "done")).reshape(-1)[0]):
+        if keys.entry(keys.entry(batch, "next"), keys.DONE)[0, 0]:
             self._send_frames()
             self._episode += 1
-        if self._episode % self.every:
+            self._shows_next = False
+        if not (self._episode % self.every == 0 or self._shows_next or self._episode == self._episodes - 1):
             return
         self._buffer.add(self._step, self._episode, self._frame())
         waited = time.perf_counter() - self._sent
@@ -85,23 +114,46 @@ class Watch:
             self._send_frames()
 
     def see_episode(self, episode: Episode, learning: Mapping[str, float]) -> None:
-        """Logs the metrics of an episode of the first replica, each agent's return, and how learning went."""
-        if episode.world:
-            return
-        logger, now = self.logger, time.perf_counter()
-        logger.at(step=self._step, episode=episode.episode)
-        for name, value in episode.metrics.items():
-            logger.log_scalar(f"social/{name}", value)
+        """Logs the numbers of an episode once all replicas have ended it, and what is new."""
+        numbers = {f"social/{name}": value for name, value in episode.metrics.items()}
+        numbers["social/stock_left"] = float(episode.stock_left)
         for agent, value in zip(self.env.game.agent_names, episode.return_, strict=True):
-            logger.log_scalar(f"{agent}/return", value)
-        for name, value in learning.items():
-            logger.log_scalar(name, value)
-        logger.log_scalar("time/env_steps_per_s", episode.steps / (now - self._episode_began))
-        self._episode_began = now
-        if episode.depletion_step > 0:
-            logger.log_text(
+            numbers[f"{agent}/return"] = float(value)
+        if episode.world == 0 and episode.depletion_step > 0:
+            self.logger.at(step=self._step, episode=episode.episode)
+            self.logger.log_text(
                 f"episode {episode.episode}: the last apple went in step {episode.depletion_step}"
             )
+        self._tags += episode.tagged_by
+        of_all = self._series.add(episode.episode, episode.world, {**numbers, **learning})
+        if of_all is not None:
+            self.logger.at(step=self._step, episode=episode.episode)
+            self._log(episode.episode, of_all)
+
+    def _log(self, episode: int, of_all: Mapping[str, Values]) -> None:
+        logger, now = self.logger, time.perf_counter()
+        for name, values in of_all.items():
+            singles = values.tolist() if name.startswith("social/") and len(values) > 1 else []
+            logger.log_lines(name, [mean_of(values), *singles])
+        steps = (self._step - self._told_step) * self._series.replicas
+        if steps:
+            logger.log_scalar("time/env_steps_per_s", steps / (now - self._told_at))
+            self._told_at, self._told_step = now, self._step
+        told = self._story.add(
+            {name.removeprefix("social/"): mean_of(values) for name, values in of_all.items()}
+        )
+        for event in told:
+            logger.log_text(f"episode {episode}: {event}")
+            self._shows_next |= event.startswith("new best")
+        if any(event.startswith("phase") for event in told):
+            logger.log_states("phase/now", {episode: self._story.phase or ANOTHER})
+        if (episode + 1) % TAGS_EVERY == 0 and self.env.game.agents > 1:
+            logger.log_matrix("tags", self._tags, ("tagged", "by whom"))
+            self._tags[:] = 0
+
+    def tell(self, event: str) -> None:
+        """Logs an event in words, a checkpoint for instance."""
+        self.logger.log_text(event)
 
     def _frame(self) -> Frame:
         shown = self.env.worlds.show(self.env.told)
@@ -121,6 +173,31 @@ class Watch:
             self.logger.log_frames(frames)
         self._sent = time.perf_counter()
 
+    def state_dict(self) -> dict[str, Any]:
+        """What it has seen and still waits for; frames are sent first."""
+        self._send_frames()
+        self.logger.flush()
+        return {
+            "step": self._step,
+            "episode": self._episode,
+            "shows_next": self._shows_next,
+            "frames": self.logger.frames,
+            "series": self._series.state_dict(),
+            "story": self._story.state_dict(),
+            "tags": self._tags.tolist(),
+        }
+
+    def load_state_dict(self, state: Mapping[str, Any]) -> None:
+        """Goes on where the watch of that state was."""
+        self._step = self._told_step = int(state["step"])
+        self._episode, self._shows_next = int(state["episode"]), bool(state["shows_next"])
+        self.logger.frames = int(state["frames"])
+        self._series.load_state_dict(state["series"])
+        self._story.load_state_dict(state["story"])
+        self._tags = np.array(state["tags"])
+        self.logger.at(step=self._step, episode=self._episode)
+        self.logger.log_text(f"gone on with from step {self._step:,}")
+
     def __enter__(self) -> Self:
         return self
 
@@ -131,9 +208,21 @@ class Watch:
         traceback: TracebackType | None,
     ) -> None:
         self._send_frames()
+        found = self._story.phases()
+        if found:
+            self.logger.log_states("phase/found", {round(one.first): one.label or ANOTHER for one in found})
         self.logger.shutdown()
 
 
-def _tell(logger: RerunLogger, console: Console) -> None:
-    for where, address in logger.addresses.items():
-        console.print(f"Watch live ({where}): {address}", soft_wrap=True, highlight=False)
+def _free_name(run: Path) -> str:
+    """run.rrd, or run-2.rrd and so on where the run was recorded before."""
+    names = (FILE_NAME if nth == 1 else f"run-{nth}.rrd" for nth in count(1))
+    return next(name for name in names if not (run / name).exists())
+
+
+def _recording_id(run: Path, title: str) -> str | None:
+    """The same for a run that is gone on with; None where the directory is no run's."""
+    recipe = run / RECIPE_FILE
+    if not recipe.exists():
+        return None
+    return str(uuid.uuid5(uuid.NAMESPACE_URL, title + recipe.read_text(encoding="utf-8")))

@@ -1,0 +1,254 @@
+"""A training is watched without being harmed: by no viewer, none there, one that dies, nor a full disk."""
+
+import os
+import socket
+import subprocess
+import sys
+import time
+import warnings
+from contextlib import contextmanager
+from pathlib import Path
+
+import numpy as np
+import pytest
+import rerun as rr
+import rerun_cli
+import torch
+from rerun.chunk import RrdReader
+from test_rerun_logger import column, static
+
+from cprl import CommonsEnv, Game, Rules, maps
+from cprl.learning import DQNSettings, LaneLearner
+from cprl.measuring import Episode, social
+from cprl.recording.streams import _free_port
+from cprl.recording.watch import Watch
+from cprl.train import train
+
+GAME = Game(
+    map=maps.parse(".A>.A\n.A.A.\n..<.A"),
+    rules=Rules(regrow_prob=(0.0, 0.1), window_rows=3, window_columns=5, episode_steps=20),
+)
+SETTINGS = DQNSettings(buffer_size=200, learning_rate=1e-3, hidden_cells=(8,), epsilon_hold_steps=5)
+VIEWER = Path(rerun_cli.__path__[0]) / "rerun"
+
+
+class Doing:
+    """Does something at a turn."""
+
+    def __init__(self, at, what):
+        self.left, self.what = at, what
+
+    def see_turn(self, batch):
+        self.left -= 1
+        if self.left == 0:
+            self.what()
+
+    def see_episode(self, episode, learning):
+        """Nothing."""
+
+
+def course(run=None, *, live=None, episodes=8, others=()):
+    """Weights, torch's generator and returns after a training of two replicas, watched if a run is given."""
+    torch.manual_seed(1)
+    agents = LaneLearner(GAME, seats=(0, 1), replicas=2, settings=SETTINGS, seed=1, compile=False)
+    env, returns = CommonsEnv(GAME, 2, seed=1), []
+
+    class Keeping(Doing):
+        def see_episode(self, episode, learning):
+            returns.append((episode.world, episode.return_.tolist(), learning["agent_0/loss"]))
+
+    observers = [Keeping(-1, None), *others]
+    if run is None:
+        train(env, {(0, 1): agents}, episodes=episodes, observers=observers)
+    else:
+        with Watch(run, env, title="run", episodes=episodes, live=live) as viewer:
+            train(env, {(0, 1): agents}, episodes=episodes, observers=[*observers, viewer])
+    weights = [value.tolist() for net in agents.networks().values() for value in net.state_dict().values()]
+    return repr((weights, torch.get_rng_state().tolist(), returns))
+
+
+@pytest.fixture(scope="module")
+def unwatched():
+    return course()
+
+
+@contextmanager
+def receiving():
+    """A process of Rerun's that listens as a viewer does, and its address."""
+    port = _free_port()
+    process = subprocess.Popen(
+        [VIEWER, "--serve-grpc", "--bind", "127.0.0.1", "--port", str(port)],
+        stdout=subprocess.DEVNULL,
+        stderr=subprocess.DEVNULL,
+    )
+    address = f"rerun+http://127.0.0.1:{port}/proxy"
+    try:
+        for _ in range(100):
+            with socket.socket() as probe:
+                if not probe.connect_ex(("127.0.0.1", port)):
+                    break
+            time.sleep(0.1)
+        yield process, address
+    finally:
+        process.kill()
+        process.wait()
+
+
+@pytest.mark.parametrize("live", [None, "serve"])
+def test_watching_changes_nothing_that_is_learned(live, tmp_path, unwatched):
+    assert course(tmp_path, live=live) == unwatched
+    assert column(tmp_path / "run.rrd", "social/equality", "Scalars:scalars", "episode")[0] == list(range(8))
+
+
+def test_a_viewer_that_is_killed_half_way_changes_nothing(tmp_path, unwatched):
+    with receiving() as (process, address):
+        killing = Doing(60, process.kill)
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore", RuntimeWarning)  # it is dropped when it is noticed, or at the end
+            assert course(tmp_path, live=f"connect {address}", others=[killing]) == unwatched
+        assert process.wait(10) != 0, "it really was killed"
+    episodes, _ = column(tmp_path / "run.rrd", "social/equality", "Scalars:scalars", "episode")
+    assert episodes == list(range(8)), "the file has it all"
+
+
+def test_an_address_where_nobody_listens_is_told_once_and_changes_nothing(tmp_path, unwatched):
+    address = f"rerun+http://127.0.0.1:{_free_port()}/proxy"
+    started = time.monotonic()
+    with pytest.warns(RuntimeWarning, match="viewer at rerun.*refused; the run goes on") as caught:
+        assert course(tmp_path, live=f"connect {address}") == unwatched
+    assert len(caught) == 1
+    assert time.monotonic() - started < 60
+
+
+@pytest.mark.skipif(os.geteuid() != 0, reason="only root may mount a disk that fills up")
+def test_a_full_disk_is_told_once_and_changes_nothing(tmp_path, unwatched):
+    disk = tmp_path / "disk"
+    disk.mkdir()
+    if subprocess.run(["mount", "-t", "tmpfs", "-o", "size=96k", "tmpfs", disk], check=False).returncode:
+        pytest.skip("no disk could be mounted here")
+    try:
+        with pytest.warns(
+            RuntimeWarning, match="the Rerun file is dropped, the run goes on without it"
+        ) as caught:
+            assert course(disk, live="serve") == unwatched
+        assert len(caught) == 1
+        assert (disk / "run.rrd").stat().st_size > 90_000, "the disk really was full"
+    finally:
+        subprocess.run(["umount", "-l", disk], check=True)
+
+
+def test_a_way_to_watch_that_is_none_is_refused_before_anything_begins(tmp_path):
+    with pytest.raises(
+        ValueError, match=r"live is 'telepathy'; wanted: \"serve\", \"spawn\" or \"connect rerun"
+    ):
+        course(tmp_path, live="telepathy")
+
+
+def test_without_a_display_no_viewer_is_spawned_and_the_addresses_stay(tmp_path, monkeypatch, capsys):
+    monkeypatch.delenv("DISPLAY", raising=False)
+    monkeypatch.delenv("WAYLAND_DISPLAY", raising=False)
+    with pytest.warns(RuntimeWarning, match="viewer cannot open: there is no display"):
+        course(tmp_path, live="spawn", episodes=1)
+    assert "Watch live (browser): http://127.0.0.1:" in capsys.readouterr().out
+
+
+def test_several_replicas_are_told_as_their_mean_and_each(tmp_path):
+    returns = {}
+
+    class Witness(Doing):
+        def see_episode(self, episode, learning):
+            returns[episode.world, episode.episode] = episode.metrics["collective_return"]
+
+    course(tmp_path, others=[Witness(-1, None)])
+    episodes, told = column(tmp_path / "run.rrd", "social/collective_return", "Scalars:scalars", "episode")
+    for episode, (mean, first, second) in zip(episodes, told, strict=True):
+        assert (first, second) == (returns[0, episode], returns[1, episode])
+        assert mean == pytest.approx((first + second) / 2)
+    names = static(tmp_path / "run.rrd", "social/collective_return", "SeriesLines:names")
+    assert names == ["collective return, mean", "replica 0", "replica 1"]
+    assert {len(own) for own in column(tmp_path / "run.rrd", "agent_1/q", "Scalars:scalars")[1]} == {1}
+
+
+def fake(number, world, *, returned, tagged):
+    """An episode of two agents with as many apples and tags as are said."""
+    values = dict.fromkeys(social.METRICS, 1.0) | {
+        "collective_return": returned,
+        "survival_steps": min(1000.0, 2 * returned),
+        "peacefulness": returned,
+    }
+    whole = np.array([returned / 2, returned / 2])
+    return Episode(
+        world=world,
+        episode=number,
+        steps=20,
+        terminated=number == 5,
+        return_=whole,
+        harvest=whole,
+        in_play_steps=np.array([20, 20]),
+        shots=np.array([1, 0]),
+        hits=np.array([1, 0]),
+        tagged=np.array([0, tagged]),
+        tagged_by=np.array([[0, 0], [tagged, 0]]),
+        stock_left=3,
+        depletion_step=7 if number == 5 else -1,
+        metrics=values,
+    )
+
+
+def test_a_society_that_rises_falls_and_recovers_is_told_as_a_story(tmp_path):
+    corners, apples = [0, 400, 800, 1200, 1600], [100, 500, 150, 400, 400]
+    with Watch(tmp_path, CommonsEnv(GAME, 2), title="run", episodes=1600) as viewer:
+        for number in range(1600):
+            for world in (0, 1):
+                returned = float(np.interp(number, corners, apples))
+                viewer.see_episode(fake(number, world, returned=returned, tagged=world), {})
+    path = tmp_path / "run.rrd"
+    _, events = column(path, "log", "TextLog:text")
+    told = "\n".join(text[0] for text in events)
+    assert "episode 5: the last apple went in step 7" in told
+    assert "episode 399: new best: 474.5 apples an episode, mean of the last 50" in told
+    assert told.index("phase: exploration") < told.index("phase: tragedy") < told.index("phase: combat")
+    episodes, states = column(path, "phase/found", "StateChange:state", "episode")
+    assert [state[0] for state in states] == ["exploration", "tragedy", "combat", "cultivation"]
+    assert np.abs(np.array(episodes) - [0, 350, 750, 1150]).max() <= 100, "drawn where the window begins"
+    assert column(path, "phase/now", "StateChange:state")[1]
+    episodes, tags = column(path, "tags", "Tensor:data", "episode")
+    assert episodes == list(range(49, 1600, 50))
+    assert tags[0][0]["buffer"] == [0.0, 0.0, 50.0, 0.0], "agent 1 was tagged by agent 0, in 50 episodes"
+
+
+def test_a_run_that_is_gone_on_with_adds_a_file_of_the_same_recording(tmp_path):
+    (tmp_path / "recipe.json").write_text("{}")
+    env = CommonsEnv(GAME, 2)
+    with Watch(tmp_path, env, title="run", episodes=9) as first:
+        for world in (0, 1):
+            first.see_episode(fake(0, world, returned=3.0, tagged=0), {})
+        first.see_episode(fake(1, 0, returned=4.0, tagged=0), {})
+        state = first.state_dict()
+    with Watch(tmp_path, env, title="run", episodes=9) as second:
+        second.load_state_dict(state)
+        second.see_episode(fake(1, 1, returned=6.0, tagged=0), {})
+    files = tmp_path / "run.rrd", tmp_path / "run-2.rrd"
+    ids = [RrdReader(file).recordings()[0].recording_id for file in files]
+    assert ids[0] == ids[1]
+    episodes, values = column(files[1], "social/collective_return", "Scalars:scalars", "episode")
+    assert (episodes, values) == ([1], [[5.0, 4.0, 6.0]])
+
+
+def test_a_killed_run_leaves_a_recording_up_to_its_last_flush(tmp_path):
+    script = f"""
+import sys; sys.path.insert(0, {str(Path(__file__).parent)!r})
+from pathlib import Path
+from test_watch import course, Doing
+course(Path({str(tmp_path)!r}), episodes=10**6, others=[Doing(150, lambda: print("going", flush=True))])
+"""
+    process = subprocess.Popen([sys.executable, "-c", script], stdout=subprocess.PIPE, text=True)
+    assert any(line == "going\n" for line in process.stdout)
+    process.kill()
+    process.communicate()
+    rr.set_strict_mode(False)
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", rr.error_utils.RerunWarning)  # a killed run's file has no footer
+        steps, _ = column(tmp_path / "run.rrd", "world/board", "SegmentationImage:buffer")
+    assert len(steps) >= 19, "the frames of the first episode were sent when it ended"
+    assert steps == sorted(steps)
