@@ -116,6 +116,20 @@ def test_a_stored_policy_plays_again_and_every_step_is_recorded(run, tmp_path, c
     assert f"Watch: {Path(sys.executable).with_name('rerun')} {tmp_path / 'c.rrd'}" in told
 
 
+def test_watch_opens_all_recordings_of_a_run_as_one(tmp_path, monkeypatch, capsys):
+    from cprl import cli
+
+    opened = []
+    monkeypatch.setattr(cli.os, "execvp", lambda program, command: opened.append(command))
+    monkeypatch.setattr("sys.argv", ["cprl", "watch", str(tmp_path)])
+    with pytest.raises(SystemExit, match=r"cprl: .* holds no recording"):
+        cli.main()
+    for name in ("run.rrd", "run-2.rrd"):
+        (tmp_path / name).touch()
+    cli.main()
+    assert opened[0][1:] == [str(tmp_path / "run-2.rrd"), str(tmp_path / "run.rrd")]
+
+
 def test_reproduce_runs_what_is_missing_and_reports(tmp_path, monkeypatch, capsys):
     reproduce = recipe("reproduce")
     asked = []

@@ -12,7 +12,7 @@ The rooms, in the order in which the data flow:
     train       the loop: act, store, learn, measure, record
     study       one study from its learners to its report
     replay      a stored policy plays again, recorded
-    cli         the command cprl: report, replay, keep
+    cli         the command cprl: watch, replay, report, keep
 """
 
 from typing import TYPE_CHECKING, Any

@@ -1,5 +1,6 @@
 """The command `cprl`: what can be done with runs that are there."""
 
+import os
 import sys
 from pathlib import Path
 
@@ -38,6 +39,19 @@ def replay(run: Path, /, *, replica: int = 0, episode: int = 0, out: Path | None
     print(f"Watch: {viewer()} {path}")
 
 
+def watch(run: Path, /) -> None:
+    """Opens the recording of a run in the Rerun viewer, all files of it as one.
+
+    Args:
+        run: the run's directory, or a single .rrd file.
+    """
+    files = [run] if run.is_file() else sorted(run.glob("*.rrd"))
+    if not files:
+        raise ValueError(f"{run} holds no recording (*.rrd); recipes write one unless watch is off")
+    command = [viewer(), *map(str, files)]
+    os.execvp(command[0], command)
+
+
 def keep(run: Path, folder: Path, /) -> None:
     """Copies what a report needs of a finished run, small enough to be committed.
 
@@ -52,7 +66,7 @@ def main() -> None:
     """The command line; what cannot be done is said in a line, and ends with exit code 1."""
     try:
         tyro.extras.subcommand_cli_from_dict(
-            {"report": report, "replay": replay, "keep": keep}, description=__doc__
+            {"watch": watch, "replay": replay, "report": report, "keep": keep}, description=__doc__
         )
     except (ValueError, OSError) as error:
         sys.exit(f"cprl: {error}")

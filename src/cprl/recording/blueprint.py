@@ -16,9 +16,9 @@ def layout(scene: Scene | None) -> Any:
     """
     import rerun.blueprint as rrb
 
-    agents = scene.agents if scene else ()
+    agents, replicas = (scene.agents, scene.replicas) if scene else ((), 1)
     return rrb.Blueprint(
-        rrb.Horizontal(_board(agents), _numbers(agents), column_shares=[2, 3]),
+        rrb.Horizontal(_board(agents), _numbers(agents, replicas), column_shares=[2, 3]),
         rrb.BlueprintPanel(state="collapsed"),
         rrb.SelectionPanel(state="collapsed"),
         rrb.TimePanel(state="collapsed", timeline="step", play_state="following", fps=15),
@@ -42,9 +42,13 @@ def _board(agents: tuple[str, ...]) -> Any:
     )
 
 
-def _numbers(agents: tuple[str, ...]) -> Any:
+def _numbers(agents: tuple[str, ...], replicas: int) -> Any:
     """Returns and social metrics, the phase under them, and tabs for learning and for who tagged whom."""
     import rerun.blueprint as rrb
+
+    def social(name: str, entity: str, *, share: bool = False) -> Any:
+        """A line for each of many replicas would make a legend that hides them all."""
+        return _plot(name, f"social/{entity}", share=share, legend=replicas == 1)
 
     learning = rrb.Horizontal(
         _plot("Loss", *_of(agents, "loss")),
@@ -54,21 +58,21 @@ def _numbers(agents: tuple[str, ...]) -> Any:
         name="Learning",
     )
     more = rrb.Horizontal(
-        _plot("Apples per step", "social/efficiency"),
-        _plot("Mean time of harvest, steps", "social/sustainability"),
-        _plot("Apples left at the end", "social/stock_left"),
+        social("Apples per step", "efficiency"),
+        social("Mean time of harvest, steps", "sustainability"),
+        social("Apples left at the end", "stock_left"),
         name="More metrics",
     )
     tags = rrb.TensorView(name="Who tagged whom", origin="/tags")
     return rrb.Vertical(
         rrb.Horizontal(
             _plot("Return of each agent, apples", *_of(agents, "return"), "evaluation/greedy_return"),
-            _plot("Collective return, apples", "social/collective_return"),
+            social("Collective return, apples", "collective_return"),
         ),
         rrb.Horizontal(
-            _plot("Survival, steps", "social/survival_steps"),
-            _plot("Equality", "social/equality", share=True),
-            _plot("Peacefulness, steps in play", "social/peacefulness"),
+            social("Survival, steps", "survival_steps"),
+            social("Equality", "equality", share=True),
+            social("Peacefulness, steps in play", "peacefulness"),
         ),
         rrb.StateTimelineView(name="Phase", contents=["+ /phase/**"], time_view=_whole()),
         rrb.Tabs(learning, more, *([tags] if len(agents) > 1 else []), active_tab=0),
@@ -76,7 +80,7 @@ def _numbers(agents: tuple[str, ...]) -> Any:
     )
 
 
-def _plot(name: str, *entities: str, share: bool = False) -> Any:
+def _plot(name: str, *entities: str, share: bool = False, legend: bool = True) -> Any:
     """A plot over the whole run; a share has the axis 0..1."""
     import rerun.blueprint as rrb
 
@@ -85,7 +89,7 @@ def _plot(name: str, *entities: str, share: bool = False) -> Any:
         contents=[f"+ /{entity}" for entity in entities],
         axis_x=_whole(),
         axis_y=rrb.ScalarAxis(range=(0.0, 1.05)) if share else None,
-        plot_legend=rrb.PlotLegend(rrb.Corner2D.LeftTop),
+        plot_legend=rrb.PlotLegend(rrb.Corner2D.LeftTop, visible=legend),
     )
 
 
