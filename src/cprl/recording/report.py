@@ -3,6 +3,7 @@
 Made from results alone (`cprl.recording.bank`), so that anybody can make it again.
 """
 
+import shlex
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from datetime import timedelta
@@ -135,12 +136,23 @@ def _runs(results: Sequence[Result]) -> list[str]:
                 f"{took}",
                 str(git.get("commit"))[:10],
                 f"torch {versions['torch']}, torchrl {versions['torchrl']}",
-                f"`python {result.recipe['command'].split('/')[-1]}`"
-                if "/" in result.recipe["command"]
-                else "",
+                f"`{_command(result.recipe['command'])}`",
             ]
         )
     return ["## Runs", "", *_table(["run", "what", "training", "commit", "versions", "command"], rows)]
+
+
+def _command(line: str) -> str:
+    """The command as anybody would give it: from the recipes' folder on, without a place of one's own."""
+    words = shlex.split(line)
+    if "--out" in words:
+        at = words.index("--out")
+        del words[at : at + 2]
+    kept = [word for word in words if word != "--go-on"]
+    script = kept[0]
+    return shlex.join(
+        ["python", script[script.find("recipes/") :] if "recipes/" in script else script, *kept[1:]]
+    )
 
 
 def _appendix(results: Sequence[Result]) -> list[str]:
