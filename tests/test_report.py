@@ -81,6 +81,7 @@ def test_a_report_tells_every_number_from_the_results_alone(run, tmp_path):
     assert "| shots per 1000 steps, all agents | " in text
     assert "| published curves | 400 | 1250 | 1900 | exploration, tragedy, combat, cultivation |" in text
     assert "nan" not in text
+    assert write_report([folder], tmp_path / "again").read_text() == text, "the same from the same"
 
 
 def test_the_command_writes_a_report(run, tmp_path, capsys, monkeypatch):

@@ -5,6 +5,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
+import torch
 from numpy.typing import NDArray
 
 from cprl.acting.actors import RandomActor
@@ -92,7 +93,9 @@ def of_play(loaded: LoadedRun, policy: Callable[..., object], *, worlds: int) ->
         policy: of all agents; they explore as they do in evaluation.
         worlds: how many.
     """
-    played = trace(loaded.env(worlds, seed=_FRESH_SEED), policy)
+    with torch.random.fork_rng(devices=[]):
+        torch.manual_seed(_FRESH_SEED)  # TorchRL's exploration draws from torch's generator
+        played = trace(loaded.env(worlds, seed=_FRESH_SEED), policy)
     around = np.abs(rounds(played)).mean(0)
     found = {
         f"rounds about the centre per 1000 steps, agent {agent}": float(around[agent])
