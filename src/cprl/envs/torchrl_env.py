@@ -204,6 +204,11 @@ class CommonsEnv(EnvBase):
         self.worlds.play_checked(actions, self.told)
         return self._as_tensordict(self._tensors, self._tensors["harvest"].unsqueeze(-1).clone())
 
+    def _any_done(self) -> bool:
+        """Whether any world has ended; numpy counts them in a tenth of the time that torch takes."""
+        done = self.told.done
+        return bool(np.count_nonzero(done) if isinstance(done, np.ndarray) else self._tensors["done"].any())
+
     def _step_and_maybe_reset(self, tensordict: TensorDictBase) -> tuple[TensorDictBase, TensorDictBase]:
         """What `EnvBase` does here, without its searching for keys: a seventh of its time for one world.
 
@@ -214,7 +219,7 @@ class CommonsEnv(EnvBase):
         following = self._step(tensordict)
         keys.put(tensordict, "next", following)
         done = self._tensors["done"]
-        carried = self._as_tensordict(self._begin(done) if done.any() else self._tensors)
+        carried = self._as_tensordict(self._begin(done) if self._any_done() else self._tensors)
         others = {name: value for name, value in tensordict.items() if name not in _OWN_KEYS}
         carried._tensordict.update(others)
         for name, value in tensordict.get(keys.AGENTS).items():

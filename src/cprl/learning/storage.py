@@ -9,6 +9,7 @@ from collections.abc import Mapping, Sequence
 from math import prod
 from typing import Any, Final
 
+import numpy as np
 import torch
 from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
@@ -140,7 +141,7 @@ class LaneStorage(Storage):
         arrays["terminated"][place] = turn.terminated
         arrays["row"][place] = row
         self._begins = turn.done | turn.terminated
-        self._any_begins = bool(self._begins.any())
+        self._any_begins = _any(self._begins)
         self._next_row = row + 1 + self._begins if self._any_begins else row + 1
         self._written += 1
         if self._written % LOOKS_EVERY == 0:
@@ -194,6 +195,10 @@ class LaneStorage(Storage):
 
     def _empty(self) -> None:
         self._begin()
+
+
+def _any(flags: Any) -> bool:
+    return bool(np.count_nonzero(flags) if isinstance(flags, np.ndarray) else flags.any())
 
 
 def _part(whole: Tensor, part: Tensor) -> Tensor:

@@ -153,7 +153,7 @@ class EpisodeTracker:
 
     def _add_turn(self, turn: Turns) -> list[Episode]:
         self._count(turn)
-        if not turn["done"].any():
+        if not np.count_nonzero(turn["done"]):  # a tenth of the time that `any` takes on so few
             return []
         done = turn["done"][:, 0]
         ended = np.flatnonzero(done & ~turn["had_ended"][:, 0])
@@ -179,10 +179,12 @@ class EpisodeTracker:
         steps += 1
         running["return"] += turn["reward"][..., 0]
         running["shots"] += turn["fired"]
-        running["tagged"] += turn["tagged_by"].any(-1)
-        running["hit_by"] += turn["hit_by"]
-        running["tagged_by"] += turn["tagged_by"]
-        if not turn["stock"].all():
+        if np.count_nonzero(turn["hit_by"]):
+            running["hit_by"] += turn["hit_by"]
+        if np.count_nonzero(turn["tagged_by"]):
+            running["tagged"] += turn["tagged_by"].any(-1)
+            running["tagged_by"] += turn["tagged_by"]
+        if np.count_nonzero(turn["stock"]) < turn["stock"].size:
             depletion_step = running["depletion_step"]
             just_now = (turn["stock"][:, 0] == 0) & (depletion_step == 0)
             depletion_step[just_now] = steps[just_now]
