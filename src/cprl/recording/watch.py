@@ -91,7 +91,7 @@ class Watch:
             min(steps + 1, 5000), board=board, windows=(game.agents, *game.observation_shape)
         )
         self._series, self._story = Series(replicas), Story()
-        self._tags, self._tags_of = np.zeros((game.agents, game.agents)), 0
+        self._tags = np.zeros((game.agents, game.agents))
         self._step = self._episode = 0
         self._shows_next = False
         self._sent = self._told_at = time.perf_counter()
