@@ -1,8 +1,9 @@
-"""From seeing to doing: networks, actors for one agent, and the seats that they take in a game."""
+"""From seeing to doing: networks, actors that learn or follow a script, and the seats that they take in a game."""
 
 from cprl.acting.actors import QActor, RandomActor
 from cprl.acting.lanes import LaneActor, LaneQNetwork, random_lanes, random_seats
 from cprl.acting.networks import QNetwork
+from cprl.acting.scripted import ScriptedActor
 from cprl.acting.seats import Seats
 
 __all__ = [
@@ -11,6 +12,7 @@ __all__ = [
     "QActor",
     "QNetwork",
     "RandomActor",
+    "ScriptedActor",
     "Seats",
     "random_lanes",
     "random_seats",

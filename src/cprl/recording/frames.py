@@ -7,12 +7,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cprl.commons.colours import APPLE, BEAM, GROUND, MARK, WALL
-from cprl.commons.game import Game
-from cprl.commons.observation import classes_shown
+from cprl.commons.seeing import UNSEEN, classes_seen
 from cprl.commons.world import Bools, Bytes, Ints
 
-UNSEEN: Final = 255
-"""The class of a pixel between windows, and of a colour that is none of the game's."""
+__all__ = ["UNSEEN", "Frame", "FrameBuffer", "board_with_rim", "classes_seen", "mosaic"]
 
 RIM_CELLS: Final = 1
 """Cells of wall that are shown around the board."""
@@ -111,25 +109,3 @@ def mosaic(windows: Bytes) -> Bytes:
     for agent in range(agents):
         joined[:, :, agent * wide : agent * wide + columns] = windows[:, agent]
     return joined
-
-
-def classes_seen(game: Game, windows: Bytes) -> Bytes:
-    """The class of each cell that agents observe, UNSEEN where it is none of the game's.
-
-    Args:
-        game: which says what form the observations have.
-        windows: uint8 [T, N, C, X, Y], as observed.
-
-    Returns:
-        uint8 [T, N, X, Y].
-    """
-    if game.observation.encoding == "one_hot":
-        shown = classes_shown(game.observation, agents=game.agents, hides=game.rules.walls_block_sight)
-        classes: Bytes = np.take(np.array(shown, np.uint8), windows.argmax(2))
-        return classes
-    packed = windows.astype(np.uint32)
-    keys = packed[:, :, 0] | packed[:, :, 1] << 8 | packed[:, :, 2] << 16
-    classes = np.full(keys.shape, UNSEEN, np.uint8)
-    for kind, (red, green, blue) in enumerate(game.palette.astype(np.uint32)):
-        classes[keys == (red | green << 8 | blue << 16)] = kind
-    return classes

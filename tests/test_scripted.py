@@ -1,0 +1,311 @@
+"""Scripted agents: each does what its sentence says, on what its window shows and on nothing else."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+from boards import Play, drawn
+from tensordict.nn import TensorDictModuleBase
+from torchrl.envs.utils import ExplorationType, set_exploration_type
+
+from cprl import CommonsEnv, Game, Observation, Rules, maps, presets
+from cprl.acting import Seats
+from cprl.acting.scripted import MANNERS, ScriptedActor
+from cprl.commons.rules import ACTIONS
+from cprl.learning import DQNSettings, LaneLearner
+from cprl.measuring.evaluate import evaluate
+from cprl.train import Training
+
+
+class Stays(TensorDictModuleBase):
+    """Never moves."""
+
+    in_keys = ("observation",)
+    out_keys = ("action",)
+
+    def __init__(self, actions):
+        super().__init__()
+        self.actions = actions
+
+    def forward(self, tensordict):
+        return tensordict.set("action", torch.full(tensordict.batch_size, self.actions - 1))
+
+
+class Scene(Play):
+    """A drawn board on which agent 0 is of a manner and all others stay; through CommonsEnv."""
+
+    def __init__(self, drawing, manner, *, worlds=1, seed=0, spare=3, **rules):
+        self.game = Game(map=maps.parse(drawing), rules=Rules(**{"regrow_prob": (0.0,), **rules}))
+        seeds = [(seed, world) for world in range(worlds)]
+        actors = [ScriptedActor(manner, self.game, seeds=seeds, seats=1, spare=spare)]
+        actors += [Stays(len(self.game.actions)) for _ in range(self.game.agents - 1)]
+        self.policy = Seats({(0,): actors[0], **dict(enumerate(actors[1:], 1))})
+        self.env = CommonsEnv(self.game, worlds, seed=seed)
+        self.batch, self.bitten = self.env.worlds, 0.0
+
+    def go(self, turns):
+        """The names of what agent 0 of the first world did; a world that has ended stays as it is."""
+        names, moment = [], self.env.reset()
+        for _ in range(turns):
+            batch = self.env.step(self.policy(moment))
+            names.append(self.game.actions[batch["agents", "action"][0, 0]])
+            moment = batch["next"].exclude(("agents", "reward"))
+            self.bitten += float(moment["agents", "harvest"][:, 0].sum())
+        return names
+
+
+def test_greedy_goes_the_shortest_way_around_walls_to_the_nearest_apple():
+    scene = Scene("..A.\nA##.\n..^A", "greedy", may_fire=False)
+    assert scene.go(4) == ["right", "forward", "forward", "left"]
+    assert (scene.board, scene.bitten) == (drawn("..^.\nA##.\n...."), 2)
+
+
+def test_an_apple_behind_a_closed_wall_is_none_in_reach():
+    scene = Scene("..#A\n.^#.", "greedy", worlds=64, may_fire=False)
+    scene.go(1)
+    first = scene.env.worlds.now.row[:, 0]
+    assert 0.75 < (first == 0).mean() < 1, "they wander: most go ahead, some turn"
+
+
+def test_greedy_finds_an_apple_that_it_did_not_see():
+    scene = Scene(".......\n<.....A\n.......", "greedy", worlds=20, may_fire=False, window_columns=5)
+    scene.go(150)
+    assert scene.bitten == 20
+
+
+CROSS = """
+    ..A..
+    .AAA.
+    ..A..
+    .....
+    ..^..
+"""
+
+
+@pytest.mark.parametrize(
+    ("manner", "spare", "left"), [("sustainable", 3, 3), ("sustainable", 1, 1), ("greedy", 3, 0)]
+)
+def test_sustainable_leaves_as_many_apples_of_a_patch_as_it_is_told(manner, spare, left):
+    scene = Scene(CROSS, manner, worlds=8, spare=spare, may_fire=False)
+    scene.go(200)
+    assert scene.env.told.stock[:, 0].tolist() == [left] * 8
+
+
+def test_sustainable_walks_over_no_apple_that_it_spares():
+    scene = Scene(">.A..", "sustainable", worlds=8, may_fire=False)
+    scene.go(100)
+    assert scene.bitten == 0
+    assert scene.env.worlds.now.col[:, 0].max() == 1
+
+
+@pytest.mark.parametrize(
+    ("drawing", "manner", "fires"),
+    [
+        (">..<A", "territorial", True),
+        (">..<.A", "territorial", True),
+        (">..<..A", "territorial", False),
+        (">.#<A", "territorial", False),
+        (">.....<A", "territorial", False),
+        (">..<A", "greedy", False),
+        (">..<A", "pacifist", False),
+        (">..<A", "sustainable", False),
+        (">..<..A", "aggressive", True),
+        (">....<A", "aggressive", True),
+        (">.....<A", "aggressive", False),
+        (">.#<..A", "aggressive", False),
+        (".>...\n...<A", "territorial", True),
+        (".>...\n.....\n...<A", "territorial", False),
+    ],
+)
+def test_who_fires_at_whom(drawing, manner, fires):
+    scene = Scene(drawing, manner, window_rows=8, window_columns=9)
+    assert (scene.go(1) == ["beam"]) == fires
+    assert scene.in_play[1] != fires, "and the beam hits"
+
+
+def test_aggressive_turns_to_one_at_its_side_goes_up_to_it_and_fires():
+    scene = Scene(".A......\n^......<", "aggressive", window_rows=8, window_columns=17)
+    assert scene.go(4) == ["turn_right", "forward", "forward", "beam"]
+    assert scene.in_play == [True, False]
+    assert scene.board == drawn(".A......\n..>.....")
+
+
+def test_aggressive_harvests_where_it_sees_nobody():
+    scene = Scene(".>.A.\n<....", "aggressive", window_columns=1)
+    assert scene.go(2) == ["forward", "forward"]
+    assert scene.bitten == 1
+
+
+@pytest.mark.parametrize(("manner", "goes"), [("greedy", 1.0), ("pacifist", 0.0)])
+def test_pacifist_leaves_an_apple_to_which_another_is_nearer(manner, goes):
+    scene = Scene("^..A.<\n......", manner, worlds=64)
+    steps = scene.env.rollout(1, scene.policy)
+    went = (steps["agents", "action"][:, 0, 0] == ACTIONS.index("right")).double().mean()
+    assert went == goes
+
+
+def test_two_who_want_one_cell_wait_for_each_other_until_one_gets_it():
+    game = Game(map=maps.parse(">A<\n#.#"), rules=Rules(regrow_prob=(0.0,)))
+    seeds = [(0, lane) for lane in range(20)]
+    actor = ScriptedActor("greedy", game, seeds=seeds, seats=2)
+    ends = evaluate(CommonsEnv(game, 10), Seats({(0, 1): actor}))
+    harvest = np.array([episode.harvest for episode in ends])
+    assert harvest.sum(1).tolist() == [1] * 10
+    assert 0 < harvest[:, 0].sum() < 10, "not always the same one"
+    assert max(episode.steps for episode in ends) > 1
+
+
+def population(manner, game, worlds, seed=0):
+    seeds = [(seed, agent) for agent in range(game.agents)]
+    actor = ScriptedActor(manner, game, seeds=seeds, seats=game.agents, worlds=worlds)
+    return evaluate(CommonsEnv(game, worlds, seed=seed), Seats({tuple(range(game.agents)): actor}))
+
+
+def mean(episodes, name):
+    return float(np.mean([np.sum(getattr(episode, name)) for episode in episodes]))
+
+
+def test_greedy_harvests_far_more_than_random_where_it_is_alone():
+    game = presets.game("single_basic")
+    returns = {manner: mean(population(manner, game, 8), "return_") for manner in ("random", "greedy")}
+    assert returns["greedy"] > 1.5 * returns["random"], returns
+
+
+def test_on_commons_the_greedy_drain_what_the_sustainable_live_on():
+    played = {name: population(name, presets.game("commons"), 3) for name in ("greedy", "sustainable")}
+    assert [episode.stock_left for episode in played["greedy"]] == [0, 0, 0]
+    assert max(episode.steps for episode in played["greedy"]) < 400
+    assert min(episode.stock_left for episode in played["sustainable"]) > 30
+    assert [episode.steps for episode in played["sustainable"]] == [1000] * 3
+    assert mean(played["sustainable"], "return_") > 3 * mean(played["greedy"], "return_")
+
+
+def test_the_aggressive_tag_the_territorial_less_and_the_pacifist_never_fire():
+    rules = replace(presets.game("commons").rules, episode_steps=200)
+    game = replace(presets.game("commons"), rules=rules)
+    played = {name: population(name, game, 4) for name in ("aggressive", "territorial", "pacifist")}
+    tagged = {name: mean(episodes, "tagged") for name, episodes in played.items()}
+    assert tagged["aggressive"] > tagged["territorial"] > tagged["pacifist"] == 0
+    assert mean(played["pacifist"], "shots") == 0
+
+
+FORMS = [
+    Observation(),
+    Observation(encoding="one_hot"),
+    Observation(agents_apart=True),
+    Observation(encoding="one_hot", agents_apart=True, stock_gauge=True),
+]
+
+
+@pytest.mark.parametrize("may_fire", [True, False])
+@pytest.mark.parametrize("manner", MANNERS)
+def test_the_form_of_what_is_seen_makes_no_difference(manner, may_fire):
+    walled = maps.parse("A.A.#.A\n.>A.#AA\nA..v.A.\n..#A.<.")
+    rules = Rules(walls_block_sight=True, may_fire=may_fire, window_rows=4, window_columns=7)
+    courses = []
+    for form in FORMS:
+        game = Game(map=walled, rules=rules, observation=form)
+        actor = ScriptedActor(manner, game, seeds=[(1, lane) for lane in range(9)], seats=3)
+        steps = CommonsEnv(game, 3).rollout(40, Seats({(0, 1, 2): actor}), break_when_any_done=False)
+        courses.append(steps["agents", "action"])
+    assert courses[0].max() < len(game.actions)
+    assert courses[0].unique().numel() > 3
+    for course in courses[1:]:
+        assert torch.equal(course, courses[0])
+
+
+def windows(game, worlds, turns=15):
+    """What is seen in so many worlds after some turns of random play, [worlds, N, C, X, Y]."""
+    return CommonsEnv(game, worlds).rollout(turns)["next", "agents", "observation"][:, -1].contiguous()
+
+
+@pytest.mark.parametrize("manner", MANNERS)
+def test_a_lanes_choices_do_not_depend_on_other_lanes(manner):
+    game = presets.game("commons")
+    seen = windows(game, 6)  # 2 replicas x 3 worlds, of which seats 1 and 3
+    seeds = [(5, replica, seat) for replica in range(2) for seat in (1, 3)]
+    everyone = ScriptedActor(manner, game, seeds=seeds, seats=2, worlds=3)
+    everyone.epsilon = 0.3
+    together = [everyone.choose(seen[:, [1, 3]]) for _ in range(30)]
+    for lane, seed in enumerate(seeds):
+        replica, seat = divmod(lane, 2)
+        alone = ScriptedActor(manner, game, seeds=[seed], seats=1, worlds=3)
+        alone.epsilon = 0.3
+        own = slice(3 * replica, 3 * replica + 3)
+        for chosen in together:
+            expected = alone.choose(seen[own, [[1], [3]][seat]])
+            assert torch.equal(chosen[own, seat], expected[:, 0])
+
+
+def test_epsilon_is_the_chance_of_a_random_action_where_actors_explore():
+    game = Game(map=maps.parse("A..\n...\n^.."), rules=Rules())
+    actor = ScriptedActor("greedy", game, seeds=[(lane,) for lane in range(4000)], seats=1)
+    seen = CommonsEnv(game, 4000).reset()["agents", "observation"]
+    actor.epsilon = 0.4
+    counts = torch.bincount(actor.choose(seen)[:, 0], minlength=8)
+    assert abs(int(counts[1:].sum()) - 4000 * 0.4 * 7 / 8) < 5 * (4000 * 0.35 * 0.65) ** 0.5
+    assert counts[1:].min() > 120
+    with set_exploration_type(ExplorationType.DETERMINISTIC):
+        assert torch.bincount(actor.choose(seen)[:, 0], minlength=8).tolist() == [4000, *[0] * 7]
+
+
+def test_it_goes_on_from_its_state():
+    game = presets.game("two_complex")
+    seen = windows(game, 2)
+
+    def made():
+        return ScriptedActor("random", game, seeds=[(0, lane) for lane in range(4)], seats=2)
+
+    one, other = made(), made()
+    for _ in range(7):
+        one.choose(seen)
+    other.load_state_dict(one.state_dict())
+    ahead = [[actor.choose(seen) for _ in range(2000)] for actor in (one, other)]
+    assert all(map(torch.equal, *ahead))
+
+
+def test_a_training_beside_a_scripted_agent_goes_on_from_a_state_read_back_from_disk(tmp_path):
+    game = Game(map=maps.parse(".A>.A\n.A.A.\n..<.A"), rules=Rules(window_rows=3, window_columns=5))
+    settings = DQNSettings(buffer_size=100, hidden_cells=(4,), epsilon_hold_steps=0, epsilon_decay_steps=10)
+
+    def training():
+        learner = LaneLearner(game, seats=[0], replicas=2, settings=settings, compile=False)
+        beside = ScriptedActor("territorial", game, seeds=[(1, r) for r in range(2)], seats=1)
+        return Training(CommonsEnv(game, 2), {(0,): learner}, others={(1,): beside}, episodes=9)
+
+    def played_on(one, turns):
+        for _ in range(turns):
+            one.step()
+        return {name: array.copy() for name, array in one.env.worlds.state().items()}
+
+    first, second = training(), training()
+    played_on(first, 40)
+    torch.save(first.state_dict(), tmp_path / "state.pt")
+    second.load_state_dict(torch.load(tmp_path / "state.pt", weights_only=True))
+    ends = played_on(first, 40), played_on(second, 40)
+    for name, array in ends[0].items():
+        assert np.array_equal(array, ends[1][name]), name
+
+
+@pytest.mark.parametrize(
+    ("manner", "how", "message"),
+    [
+        ("grim", {}, "manner is 'grim'; allowed: random, greedy"),
+        ("greedy", {"area": "full"}, "Observation.area is 'full'; .* area=\"window\" is what fits"),
+        ("greedy", {"seats": 2}, "3 seeds for 2 seats; a seed for each lane is wanted"),
+        ("greedy", {"worlds": 0}, "worlds is 0; at least 1"),
+        ("sustainable", {"spare": 0}, "spare is 0; at least 1"),
+    ],
+)
+def test_what_cannot_be_is_refused_before_anything_is_played(manner, how, message):
+    how = {"seats": 1, "area": "window", **how}
+    game = replace(presets.game("commons"), observation=Observation(area=how.pop("area")))
+    with pytest.raises(ValueError, match=message):
+        ScriptedActor(manner, game, seeds=[(lane,) for lane in range(3)], **how)
+
+
+def test_windows_of_another_game_are_refused():
+    actor = ScriptedActor("greedy", presets.game("commons"), seeds=[(0,)], seats=1)
+    with pytest.raises(ValueError, match=r"is \[1, 1, 3, 6, 13\]; \[1, 1, 3, 7, 15\] is wanted"):
+        actor.choose(windows(presets.game("single_basic"), 1))
