@@ -13,9 +13,7 @@ from cprl import CommonsEnv, Game, Observation, Rules, maps, presets
 from cprl.acting import Seats
 from cprl.acting.scripted import MANNERS, ScriptedActor
 from cprl.commons.rules import ACTIONS
-from cprl.learning import DQNSettings, LaneLearner
 from cprl.measuring.evaluate import evaluate
-from cprl.train import Training
 
 
 class Stays(TensorDictModuleBase):
@@ -263,29 +261,6 @@ def test_it_goes_on_from_its_state():
     other.load_state_dict(one.state_dict())
     ahead = [[actor.choose(seen) for _ in range(2000)] for actor in (one, other)]
     assert all(map(torch.equal, *ahead))
-
-
-def test_a_training_beside_a_scripted_agent_goes_on_from_a_state_read_back_from_disk(tmp_path):
-    game = Game(map=maps.parse(".A>.A\n.A.A.\n..<.A"), rules=Rules(window_rows=3, window_columns=5))
-    settings = DQNSettings(buffer_size=100, hidden_cells=(4,), epsilon_hold_steps=0, epsilon_decay_steps=10)
-
-    def training():
-        learner = LaneLearner(game, seats=[0], replicas=2, settings=settings, compile=False)
-        beside = ScriptedActor("territorial", game, seeds=[(1, r) for r in range(2)], seats=1)
-        return Training(CommonsEnv(game, 2), {(0,): learner}, others={(1,): beside}, episodes=9)
-
-    def played_on(one, turns):
-        for _ in range(turns):
-            one.step()
-        return {name: array.copy() for name, array in one.env.worlds.state().items()}
-
-    first, second = training(), training()
-    played_on(first, 40)
-    torch.save(first.state_dict(), tmp_path / "state.pt")
-    second.load_state_dict(torch.load(tmp_path / "state.pt", weights_only=True))
-    ends = played_on(first, 40), played_on(second, 40)
-    for name, array in ends[0].items():
-        assert np.array_equal(array, ends[1][name]), name
 
 
 @pytest.mark.parametrize(

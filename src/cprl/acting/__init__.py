@@ -1,4 +1,4 @@
-"""From seeing to doing: networks, actors that learn or follow a script, and the seats that they take in a game."""
+"""From seeing to doing: networks, actors that learn or that follow a script, and the seats that they take."""
 
 from cprl.acting.actors import QActor, RandomActor
 from cprl.acting.lanes import LaneActor, LaneQNetwork, random_lanes, random_seats

@@ -1,7 +1,7 @@
 """Seats: one actor for each agent of a game, as one policy for the environment."""
 
 from collections.abc import Mapping, Sequence
-from typing import TypeAlias
+from typing import Any, TypeAlias
 
 import torch
 from tensordict import TensorDict, TensorDictBase
@@ -27,7 +27,8 @@ class Seats(TensorDictModuleBase):
         actors: one for each agent, agent 0 first, see `cprl.acting.actors`; or by the seats that each takes:
             a number for an actor of one agent, a tuple of numbers for one of several, e.g. a `LaneActor`.
 
-    Reads ("agents", "observation"), uint8 [B, N, C, X, Y]; writes ("agents", "action"), int64 [B, N].
+    Reads ("agents", "observation"), uint8 [B, N, C, X, Y], and of the group "agents" whatever else an actor's
+    `in_keys` name, e.g. "stock_gauge"; writes ("agents", "action"), int64 [B, N].
 
     Raises:
         ValueError: for seats that are empty or taken twice.
@@ -57,19 +58,28 @@ class Seats(TensorDictModuleBase):
                 "one actor for each agent is wanted"
             )
         if self.seats == [tuple(range(self.agents))]:
-            keys.put(agents, "action", self._choose(self.actors[0], observation, tensordict.batch_size))
+            keys.put(agents, "action", self._choose(self.actors[0], agents, None, tensordict.batch_size))
             return tensordict
         chosen = observation.new_empty(observation.shape[: dim + 1], dtype=torch.int64)
         for seat, actor in zip(self.seats, self.actors, strict=True):
             at = list(seat) if isinstance(seat, tuple) else seat
             index = (*[slice(None)] * dim, at)
-            chosen[index] = self._choose(actor, observation[index], tensordict.batch_size)
+            chosen[index] = self._choose(actor, agents, index, tensordict.batch_size)
         agents.set("action", chosen)
         return tensordict
 
-    def _choose(self, actor: nn.Module, seen: Tensor, batch_size: torch.Size) -> Tensor:
+    def _choose(self, actor: nn.Module, agents: TensorDictBase, index: Any, batch_size: torch.Size) -> Tensor:
+        """What an actor chooses for the agents at an index, None for all, by the entries that it reads."""
         if isinstance(actor, LaneActor):  # what its forward does, without a TensorDict to and fro
-            return actor.choose(seen)
-        view = TensorDict._new_unsafe({"observation": seen}, batch_size=batch_size)
+            return actor.choose(_at(agents, "observation", index))
+        names = getattr(actor, "in_keys", ("observation",))
+        view = TensorDict._new_unsafe(
+            {name: _at(agents, name, index) for name in names}, batch_size=batch_size
+        )
         action: Tensor = actor(view).get("action")
         return action
+
+
+def _at(agents: TensorDictBase, name: str, index: Any) -> Tensor:
+    told: Tensor = keys.entry(agents, name)
+    return told if index is None else told[index]

@@ -1,0 +1,221 @@
+"""Tabular Q-learning, algorithm 1 of the study, for boards small enough to tabulate.
+
+Source: M. Wiatrak, "Governing the Commons with Multi-Agent Reinforcement Learning" (2019), after Watkins and
+Dayan, "Q-learning" (1992). With r paid for action a in state s, which led to s':
+
+    target = r where s' is terminal, else r + gamma max over a' of Q(s', a')
+    Q(s, a) <- (1 - alpha) Q(s, a) + alpha target
+
+An episode that the clock ends is not terminal: its last state counts as any other. A state is what the agent
+observes. Values are those of the game only where that tells all that matters; an agent that looks away from
+apples does not know which still hang, so windows on most boards do not (`tests/test_tabular.py` shows when).
+"""
+
+from collections import deque
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, fields
+from typing import Any, Literal
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from tensordict import TensorDictBase
+from torch import Tensor
+
+from cprl import keys
+from cprl.acting.tabular import NEVER_MET, QTables, TabularActor, observed_entries, states_of
+from cprl.commons.game import Game
+from cprl.learning.lanes import EVALUATION, EXPLORATION, lane_seeds
+
+
+@dataclass(frozen=True, kw_only=True)
+class TabularSettings:
+    """Hyper-parameters of one tabular agent; the study names none for it, so defaults are ours.
+
+    Raises:
+        ValueError: names the field, what came and what fits.
+    """
+
+    gamma: float = 0.995
+    """Discount per step, as `DQNSettings.gamma`."""
+    learning_rate: float | Literal["1/visits"] = 0.1
+    """alpha: a number in 0..1, or one divided by the visits of that action in that state."""
+    visits_power: float = 1.0
+    """With "1/visits" alpha is 1 / visits ** this. Below 1 early targets, learned from values that were wrong
+    themselves, are forgotten sooner: 0.5..1 takes far fewer steps (Even-Dar and Mansour 2003)."""
+    epsilon_start: float = 1.0
+    """Chance of a random action at first."""
+    epsilon_end: float = 0.1
+    """Chance of a random action after the decay."""
+    epsilon_hold_steps: int = 800
+    """Steps at `epsilon_start` before the decay."""
+    epsilon_decay_steps: int = 50_000
+    """Steps of the linear decay that follow."""
+    epsilon_evaluation: float = 0.05
+    """Chance of a random action in evaluation."""
+    max_states: int = 100_000
+    """States that an agent may meet; with one more it is refused to go on. Each takes its observation's bytes
+    and 16 per action, and some 150."""
+
+    def __post_init__(self) -> None:
+        if self.learning_rate != "1/visits":
+            _check_within("learning_rate", self.learning_rate, " or '1/visits'")
+        for field in fields(self):
+            value = getattr(self, field.name)
+            if field.name in ("gamma", "epsilon_start", "epsilon_end", "epsilon_evaluation"):
+                _check_within(field.name, value)
+            elif field.name in ("epsilon_decay_steps", "max_states") and value < 1:
+                raise ValueError(f"{field.name} is {value}; at least 1 is wanted")
+        _check_within("visits_power", self.visits_power)
+
+    def epsilon(self, step: int) -> float:
+        """The chance of a random action at a step, counted from 0; as `DQNSettings.epsilon`."""
+        done = min(1.0, max(0.0, (step - self.epsilon_hold_steps) / self.epsilon_decay_steps))
+        return self.epsilon_start + done * (self.epsilon_end - self.epsilon_start)
+
+    def rates(self, visits: NDArray[np.int64]) -> NDArray[np.float64]:
+        """alpha of values that have been learned so often, this time included."""
+        if self.learning_rate == "1/visits":
+            return 1.0 / visits.astype(np.float64) ** self.visits_power
+        return np.full(visits.shape, self.learning_rate)
+
+
+def _check_within(name: str, value: Any, other: str = "") -> None:
+    if isinstance(value, str) or not 0 <= value <= 1:
+        raise ValueError(f"{name} is {value!r}; a number in 0..1{other} is wanted")
+
+
+class TabularLearner:
+    """R x S independent tabular agents: seats S of each of R replicas, each with a table of its own.
+
+    A `cprl.learning.learner.Learner`; its tables lie in the CPU's memory.
+
+    Args:
+        game: what is played.
+        seats: the numbers of the agents that learn.
+        replicas: how many replicas R, the worlds of the environment.
+        settings: the hyper-parameters.
+        seed: of the run.
+        first_replica: the number of the first replica, so that replica r can be trained alone.
+
+    Raises:
+        MemoryError: in `remember`, where an agent meets more than `settings.max_states` states.
+    """
+
+    def __init__(
+        self,
+        game: Game,
+        *,
+        seats: Sequence[int],
+        replicas: int,
+        settings: TabularSettings,
+        seed: int = 0,
+        first_replica: int = 0,
+    ) -> None:
+        self.game, self.settings, self.seed, self.seats = game, settings, seed, tuple(seats)
+        self.replicas, self._numbers = replicas, range(first_replica, first_replica + replicas)
+        self.tables = QTables(self.lanes, len(game.actions), max_states=settings.max_states)
+        self.actor = self._actor(EXPLORATION, worlds=1)
+        self.actor.epsilon = settings.epsilon(0)
+        self.steps = 0
+        self._observed, self._every_lane = observed_entries(game), range(self.lanes)
+        self._turns: deque[dict[str, NDArray[Any]]] = deque()
+
+    @property
+    def lanes(self) -> int:
+        """The number of lanes, replicas x seats."""
+        return self.replicas * len(self.seats)
+
+    def _actor(self, purpose: int, *, worlds: int) -> TabularActor:
+        seeds = lane_seeds(self.seed, replicas=self._numbers, seats=self.seats, purpose=purpose)
+        return TabularActor(self.tables, self.game, seeds=seeds, seats=len(self.seats), worlds=worlds)
+
+    def evaluation_actor(self, worlds: int) -> TabularActor:
+        """An actor by the same tables, with `epsilon_evaluation`, for so many worlds of each replica."""
+        actor = self._actor(EVALUATION, worlds=worlds)
+        actor.epsilon = self.settings.epsilon_evaluation
+        return actor
+
+    def remember(self, batch: TensorDictBase) -> None:
+        """Notes a turn of every replica, to be learned by the next `learn`."""
+        agents, after = keys.entry(batch, keys.AGENTS), keys.entry(batch, "next")
+        terminated = (
+            keys.entry(after, keys.TERMINATED).expand(-1, len(self.seats)).numpy(force=True).reshape(-1)
+        )
+        seen, at = states_of(agents, self._observed, self.seats), list(self.seats)
+        rows = self.tables.find_or_add(seen, self._every_lane)
+        on = np.flatnonzero(~terminated)
+        next_seen = states_of(keys.entry(after, keys.AGENTS), self._observed, self.seats)
+        next_rows = np.full(self.lanes, NEVER_MET, np.int64)
+        next_rows[on] = self.tables.find_or_add([next_seen[lane] for lane in on], on.tolist())
+        reward = keys.entry(keys.entry(after, keys.AGENTS), "reward").numpy(force=True)
+        self._turns.append(
+            {
+                "row": rows,
+                "action": keys.entry(agents, "action").numpy(force=True)[:, at].reshape(-1).copy(),
+                "reward": reward[:, at].reshape(-1).astype(np.float64),
+                "next_row": next_rows,
+            }
+        )
+        self.steps += 1
+        self.actor.epsilon = self.settings.epsilon(self.steps)
+
+    def learn(self) -> Tensor | None:
+        """Learns the oldest turn not yet learned; squared errors [R, S], or None for no such turn."""
+        if not self._turns:
+            return None
+        turn, values = self._turns.popleft(), self.tables.values
+        place = turn["row"], turn["action"]
+        self.tables.visits[place] += 1  # no two lanes share a row
+        target = turn["reward"] + self.settings.gamma * values[turn["next_row"]].max(1)
+        error = target - values[place]
+        values[place] += self.settings.rates(self.tables.visits[place]) * error
+        return torch.from_numpy(error**2).view(self.replicas, len(self.seats))
+
+    def end_episode(self, ended: Tensor) -> None:
+        """Nothing is due at the end of an episode."""
+
+    def values(self, batch: TensorDictBase) -> Tensor:
+        """The highest value of each agent's actions at the end of a turn, [R, S]."""
+        after = keys.entry(keys.entry(batch, "next"), keys.AGENTS)
+        rows = self.tables.find(states_of(after, self._observed, self.seats), self._every_lane)
+        return torch.from_numpy(self.tables.values[rows].max(1)).view(self.replicas, len(self.seats))
+
+    def q_table(self, lane: int) -> dict[str, NDArray[Any]]:
+        """What a lane has learned, a row for each of n states that it has met; for people to look at.
+
+        Returns:
+            "observation" uint8 [n, C, X, Y], "stock_gauge" float32 [n, 1] and "scoreboard" float32 [n, N]
+            where the game has them, "values" float64 [n, A] and "visits" int64 [n, A].
+        """
+        states, rows = list(self.tables.rows[lane]), list(self.tables.rows[lane].values())
+        flat = np.frombuffer(b"".join(states), np.uint8).reshape(len(states), -1)
+        sizes = {"stock_gauge": self.game.stock_gauge_size, "scoreboard": self.game.scoreboard_size}
+        cells = int(np.prod(self.game.observation_shape))
+        table: dict[str, NDArray[Any]] = {
+            "observation": flat[:, :cells].reshape(len(states), *self.game.observation_shape)
+        }
+        vectors = np.ascontiguousarray(flat[:, cells:]).view(np.float32)
+        for name in self._observed[1:]:
+            table[name], vectors = vectors[:, : sizes[name]], vectors[:, sizes[name] :]
+        return {**table, "values": self.tables.values[rows], "visits": self.tables.visits[rows]}
+
+    def state_dict(self) -> dict[str, Any]:
+        """Everything that the future of all lanes depends on."""
+        turns = [{name: torch.from_numpy(array) for name, array in turn.items()} for turn in self._turns]
+        return {
+            "tables": self.tables.state_dict(),
+            "exploration": self.actor.draws.state_dict(),
+            "steps": self.steps,
+            "turns": turns,
+        }
+
+    def load_state_dict(self, state: Mapping[str, Any]) -> None:
+        """Goes on where the learner of that state was, which was made with the same arguments."""
+        self.tables.load_state_dict(state["tables"])
+        self.actor.draws.load_state_dict(state["exploration"])
+        self.steps = int(state["steps"])
+        self.actor.epsilon = self.settings.epsilon(self.steps)
+        self._turns = deque(
+            {name: own.numpy().copy() for name, own in turn.items()} for turn in state["turns"]
+        )
