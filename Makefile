@@ -27,6 +27,7 @@ bench: $(INSTALLED)
 	$(BIN)/python benchmarks/observation_forms.py
 	$(BIN)/python benchmarks/lane_updates.py
 	$(BIN)/python benchmarks/training_step.py
+	$(BIN)/python benchmarks/losses.py
 
 # With a GPU: first `.venv/bin/pip install -c constraints.txt -e ".[cuda13]"`, or cuda12, as torch has it.
 test-gpu: $(INSTALLED)

@@ -11,10 +11,9 @@ from pathlib import Path
 import tyro
 
 from cprl import presets, recording, study
-from cprl.learning import LaneLearner
+from cprl.learning import DQN
+from cprl.population import Learner, Population
 from cprl.train import prepare_process
-
-SEATS = (0, 1, 2, 3)
 
 
 def main(
@@ -50,6 +49,8 @@ def main(
     game = presets.game("commons", variant=variant)
     settings = presets.learner("commons", variant=variant)
     settings = replace(settings, epsilon_decay_steps=epsilon_decay_steps)
+    learner = Learner(DQN(settings=settings))
+    population = Population(game, [learner] * 4, replicas=replicas, seed=seed, compile=compile)
     recipe = {
         "replicas": replicas,
         "episodes": episodes,
@@ -58,13 +59,12 @@ def main(
         "seed": seed,
         "game": game,
         "learner": settings,
-        "population": {"learning": SEATS, "random": ()},
+        "population": population.told(),
     }
     run = recording.start_run(out, "commons", recipe, go_on=go_on)
-    agents = LaneLearner(game, seats=SEATS, replicas=replicas, settings=settings, seed=seed, compile=compile)
     return study.conduct(
         run,
-        agents,
+        population,
         episodes=episodes,
         title=f"commons, {variant} rules, {replicas} replicas, {episodes} episodes",
         evaluation_episodes=evaluation_episodes,

@@ -10,10 +10,9 @@ from pathlib import Path
 import tyro
 
 from cprl import presets, recording, study
-from cprl.learning import LaneLearner
+from cprl.learning import DQN
+from cprl.population import Learner, Population
 from cprl.train import prepare_process
-
-SEATS = (0,)
 
 
 def main(
@@ -46,6 +45,8 @@ def main(
     prepare_process(seed)
     game = presets.game("single_basic", variant=variant)
     settings = presets.learner("single_basic", variant=variant)
+    learner = Learner(DQN(settings=settings))
+    population = Population(game, [learner], replicas=replicas, seed=seed, compile=compile)
     recipe = {
         "replicas": replicas,
         "episodes": episodes,
@@ -54,13 +55,12 @@ def main(
         "seed": seed,
         "game": game,
         "learner": settings,
-        "population": {"learning": SEATS, "random": ()},
+        "population": population.told(),
     }
     run = recording.start_run(out, "single_basic", recipe, go_on=go_on)
-    agents = LaneLearner(game, seats=SEATS, replicas=replicas, settings=settings, seed=seed, compile=compile)
     return study.conduct(
         run,
-        agents,
+        population,
         episodes=episodes,
         title=f"single_basic, {variant} rules, {replicas} replicas, {episodes} episodes",
         evaluation_episodes=evaluation_episodes,

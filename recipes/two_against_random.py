@@ -10,10 +10,9 @@ from pathlib import Path
 import tyro
 
 from cprl import presets, recording, study
-from cprl.learning import LaneLearner
+from cprl.learning import DQN
+from cprl.population import Learner, Population, Scripted
 from cprl.train import prepare_process
-
-SEATS, WALKER = (0,), (1,)
 
 
 def main(
@@ -46,6 +45,10 @@ def main(
     prepare_process(seed)
     game = presets.game("two_complex", variant=variant)
     settings = presets.learner("two_complex", variant=variant)
+    learner = Learner(DQN(settings=settings))
+    population = Population(
+        game, [learner, Scripted("random")], replicas=replicas, seed=seed, compile=compile
+    )
     recipe = {
         "replicas": replicas,
         "episodes": episodes,
@@ -54,14 +57,12 @@ def main(
         "seed": seed,
         "game": game,
         "learner": settings,
-        "population": {"learning": SEATS, "random": WALKER},
+        "population": population.told(),
     }
     run = recording.start_run(out, "two_against_random", recipe, go_on=go_on)
-    agents = LaneLearner(game, seats=SEATS, replicas=replicas, settings=settings, seed=seed, compile=compile)
     return study.conduct(
         run,
-        agents,
-        random=WALKER,
+        population,
         episodes=episodes,
         title=f"two_against_random, {variant} rules, {replicas} replicas, {episodes} episodes",
         evaluation_episodes=evaluation_episodes,

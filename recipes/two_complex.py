@@ -10,10 +10,9 @@ from pathlib import Path
 import tyro
 
 from cprl import presets, recording, study
-from cprl.learning import LaneLearner
+from cprl.learning import DQN
+from cprl.population import Learner, Population
 from cprl.train import prepare_process
-
-SEATS = (0, 1)
 
 
 def main(
@@ -46,6 +45,8 @@ def main(
     prepare_process(seed)
     game = presets.game("two_complex", variant=variant)
     settings = presets.learner("two_complex", variant=variant)
+    learner = Learner(DQN(settings=settings))
+    population = Population(game, [learner] * 2, replicas=replicas, seed=seed, compile=compile)
     recipe = {
         "replicas": replicas,
         "episodes": episodes,
@@ -54,13 +55,12 @@ def main(
         "seed": seed,
         "game": game,
         "learner": settings,
-        "population": {"learning": SEATS, "random": ()},
+        "population": population.told(),
     }
     run = recording.start_run(out, "two_complex", recipe, go_on=go_on)
-    agents = LaneLearner(game, seats=SEATS, replicas=replicas, settings=settings, seed=seed, compile=compile)
     return study.conduct(
         run,
-        agents,
+        population,
         episodes=episodes,
         title=f"two_complex, {variant} rules, {replicas} replicas, {episodes} episodes",
         evaluation_episodes=evaluation_episodes,

@@ -17,6 +17,7 @@ ROOMS = (
     "recording",
     "theory",
     "presets",
+    "population",
     "train",
     "study",
     "replay",

@@ -172,7 +172,7 @@ def test_a_run_is_loaded_from_its_directory_alone(tmp_path):
     run = recipe("two_against_random").main(variant="as_run", out=tmp_path / "run", **how)
     loaded = cprl.load(run)
     assert loaded.game == presets.game("two_complex", variant="as_run")
-    assert loaded.settings == presets.learner("two_complex", variant="as_run")
+    assert loaded.algorithms[0].settings == presets.learner("two_complex", variant="as_run")
     assert loaded.replicas == [0, 1]
     assert loaded.episodes().num_rows == 2 * 2 * 2
     kept = load_weights(run / "checkpoints" / "final.pt")

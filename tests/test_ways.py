@@ -12,7 +12,7 @@ from cprl import Game, Rules, maps
 from cprl.acting import QNetwork
 from cprl.learning import DQNSettings, LaneLearner
 from cprl.learning.dqn import dqn_loss
-from cprl.learning.ways import fitting_way, trial_buffer
+from cprl.learning.ways import fitting_way, trial_batch
 
 SHAPE, ACTIONS = (3, 3, 5), 8
 
@@ -57,7 +57,7 @@ def loss_of(kind):
 
 
 def way_of(make_network, make_loss):
-    return fitting_way([make_network() for _ in range(2)], make_loss, trial_buffer(2, SHAPE, ACTIONS))
+    return fitting_way([make_network() for _ in range(2)], make_loss, trial_batch(2, SHAPE, ACTIONS))
 
 
 def q_network():
@@ -94,5 +94,5 @@ def test_a_learner_finds_its_way():
     for name, network in found.networks().items():
         for mine, theirs in zip(network.parameters(), named.networks()[name].parameters(), strict=True):
             assert torch.equal(mine, theirs), "a trial changes nothing"
-    with pytest.raises(ValueError, match="way is 'quick'; allowed: lane axis, vmap, list"):
+    with pytest.raises(ValueError, match="way is 'quick'; allowed: lane axis, lane axis, flat, vmap, list"):
         LaneLearner(game, replicas=2, way="quick", **how)

@@ -9,6 +9,7 @@ The rooms, in the order in which the data flow:
     measuring   from what happened to what it meant: social metrics, episodes
     recording   what is kept: runs, tables, the Rerun recording, figures
     presets     the published games and learners by name
+    population  who sits at each seat: learners, scripted and frozen agents
     train       the loop: act, store, learn, measure, record
     study       one study from its learners to its report
     replay      a stored policy plays again, recorded

@@ -3,18 +3,15 @@
 from contextlib import AbstractContextManager, nullcontext
 from dataclasses import replace
 from datetime import datetime
-from functools import partial
 from pathlib import Path
-
-from torch import nn
+from typing import Any
 
 from cprl.acting.collect import StepCollector
-from cprl.acting.lanes import random_seats
-from cprl.acting.seats import Seat, Seats
 from cprl.envs.torchrl_env import CommonsEnv
 from cprl.learning.lanes import LaneLearner
 from cprl.measuring.episodes import Episode
 from cprl.measuring.evaluate import evaluate
+from cprl.population import Population
 from cprl.recording import (
     Checkpoints,
     EpisodeTable,
@@ -25,16 +22,15 @@ from cprl.recording import (
     training_curve,
 )
 from cprl.recording.run import read_recipe, write_json
-from cprl.train import MakeCollector, train
+from cprl.train import MakeCollector, Training, train
 
 
 def conduct(
     run: Path,
-    agents: LaneLearner,
+    population: Population,
     *,
     episodes: int,
     title: str,
-    random: tuple[int, ...] = (),
     evaluation_episodes: int = 20,
     learn_every: int = 1,
     make_collector: MakeCollector = StepCollector,
@@ -46,12 +42,11 @@ def conduct(
 
     Args:
         run: the run's directory, see `cprl.recording.start_run`.
-        agents: who learns, at some seats of every replica.
+        population: who sits at the seats of every replica.
         episodes: how many each replica trains.
         title: what is run, for tables and figures.
-        random: the seats to whom every action is equally likely.
-        evaluation_episodes: fresh episodes for each replica with `epsilon_evaluation`, and for the random
-            policy at all seats.
+        evaluation_episodes: fresh episodes for each replica, in which learners of values explore with
+            `epsilon_evaluation`; and for the random policy at all seats.
         learn_every: steps k after which agents learn, then k times.
         make_collector: what plays; see `cprl.train.Training`.
         watch: "file" for a recording to look at in the Rerun viewer; with "serve", "spawn" or "connect
@@ -61,49 +56,69 @@ def conduct(
         The run's directory, now with `episodes.parquet`, `run.rrd`, `checkpoints/final.pt`, `evaluation/`,
         `figures/` and `report.json`, which says how long it took.
     """
-    game, replicas, seed = agents.game, agents.replicas, agents.seed
-    at_random = partial(random_seats, game, replicas=replicas, seed=seed)
-    env = CommonsEnv(game, replicas, seed=seed)
-    with (
-        _watched(watch, run, env, title=title, episodes=episodes) as viewer,
-        Checkpoints(run, tell=viewer.tell if viewer else None) as checkpoints,
-        EpisodeTable(run / "episodes.parquet", resumable=True) as table,
-        ProgressBar(game, episodes=episodes, replicas=replicas) as bar,
-    ):
-        training = train(
+    env = CommonsEnv(population.game, population.replicas, seed=population.seed)
+    with _watched(watch, run, env, title=title, episodes=episodes) as viewer:
+        training = _train(
+            run,
             env,
-            {agents.seats: agents},
-            others=at_random(random) if random else {},
+            population,
+            viewer,
             episodes=episodes,
-            observers=[table, bar, *([viewer] if viewer else [])],
-            checkpoints=checkpoints if make_collector is StepCollector else None,
             learn_every=learn_every,
             make_collector=make_collector,
         )
-        save_weights(run, agents.networks())
-
-    everyone, worlds = tuple(range(game.agents)), evaluation_episodes
-    trained: dict[Seat, nn.Module] = {agents.seats: agents.evaluation_actor(worlds)}
-    if random:
-        trained |= at_random(random, worlds=worlds)
-    fresh = CommonsEnv(game, replicas * worlds, seed=seed + 1)
-    played = {
-        "random": evaluate(fresh, Seats(at_random(everyone, worlds=worlds))),
-        "trained": evaluate(fresh, Seats(trained), explore=True),
-    }
+        save_weights(run, population.networks())
+    played = evaluate_population(population, worlds=evaluation_episodes)
     write_json(
         run / "report.json",
         {"training_s": round(training.spent_s, 1), "steps": training.steps, "finished": _now()},
     )
     for name, of_policy in played.items():
-        _keep(run / "evaluation" / f"{name}.parquet", of_policy, worlds)
+        _keep(run / "evaluation" / f"{name}.parquet", of_policy, evaluation_episodes)
     figure = training_curve(run, title=title, random=played["random"])
-    told = {
-        "random": played["random"],
-        f"trained, epsilon {agents.settings.epsilon_evaluation:g}": played["trained"],
-    }
+    told = {"random": played["random"], f"trained{_epsilon(population)}": played["trained"]}
     summarise(run, title=title, played=told, figure=figure)
     return run
+
+
+def _train(
+    run: Path, env: CommonsEnv, population: Population, viewer: Watch | None, *, episodes: int, **how: Any
+) -> Training:
+    """Trains and keeps what happens, from the newest checkpoint on if there is one."""
+    can_go_on = how["make_collector"] is StepCollector
+    with (
+        Checkpoints(run, tell=viewer.tell if viewer else None) as checkpoints,
+        EpisodeTable(run / "episodes.parquet", resumable=True) as table,
+        ProgressBar(population.game, episodes=episodes, replicas=population.replicas) as bar,
+    ):
+        return train(
+            env,
+            population.learners,
+            others=population.others,
+            episodes=episodes,
+            observers=[table, bar, *([viewer] if viewer else [])],
+            checkpoints=checkpoints if can_go_on else None,
+            **how,
+        )
+
+
+def evaluate_population(population: Population, *, worlds: int) -> dict[str, list[Episode]]:
+    """Fresh episodes, so many of each replica: of the "random" policy, and of everybody as "trained"."""
+    fresh = CommonsEnv(population.game, population.replicas * worlds, seed=population.seed + 1)
+    return {
+        "random": evaluate(fresh, population.random_policy(worlds)),
+        "trained": evaluate(fresh, population.policy(worlds), explore=True),
+    }
+
+
+def _epsilon(population: Population) -> str:
+    """With what chance the learners of values explore in evaluation, for people."""
+    chances = {
+        learner.settings.epsilon_evaluation
+        for learner in population.learners.values()
+        if isinstance(learner, LaneLearner)
+    }
+    return "".join(f", epsilon {chance:g}" for chance in sorted(chances))
 
 
 def _watched(

@@ -101,6 +101,10 @@ class Training:
         for name, number in (("episodes", episodes), ("learn_every", learn_every)):
             if number < 1:
                 raise ValueError(f"{name} is {number}; at least 1 is wanted")
+        for learner in self.learners.values():
+            steps = getattr(learner, "rollout_steps", learn_every)
+            if steps % learn_every:
+                raise ValueError(f"learn_every is {learn_every}; it must divide the rollouts' {steps} steps")
         replicas = env.batch_size.numel()
         actors = {seat: learner.actor for seat, learner in self.learners.items()}
         self._collector = make_collector(env, Seats({**actors, **self.others}))

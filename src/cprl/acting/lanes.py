@@ -1,6 +1,7 @@
 """Lanes: the agents at some seats of every replica, acting at once. A lane is one agent of one replica."""
 
 from collections.abc import Callable, Sequence
+from copy import deepcopy
 from typing import Any
 
 import torch
@@ -11,7 +12,7 @@ from torchrl.envs.utils import ExplorationType, exploration_type
 
 from cprl.acting.compiling import Compiled
 from cprl.acting.draws import LaneDraws
-from cprl.acting.networks import QNetwork
+from cprl.acting.networks import AgentNetworks, AtomNetwork, QNetwork
 from cprl.commons.game import Game
 
 
@@ -35,7 +36,7 @@ class LaneQNetwork(nn.Module):
         if len(forms) != 1:
             raise ValueError(f"the networks of the lanes have {len(forms)} different forms; one is wanted")
         self.highest, self.relu_on_outputs = first.highest, first.relu_on_outputs
-        self.observation_dims = first.observation_dims
+        self.observation_dims, self.outputs = first.observation_dims, first.outputs
         self._names = [name for name, layer in first.named_modules() if isinstance(layer, nn.Linear)]
         layers = list(zip(*(network.linears for network in networks), strict=True))
         self.weights = nn.ParameterList(
@@ -70,6 +71,34 @@ class LaneQNetwork(nn.Module):
         return values.reshape(*flat.shape[:-1], values.shape[-1])
 
 
+def stack_lanes(networks: Sequence[nn.Module]) -> nn.Module:
+    """The networks of all lanes as one whose parameters carry a lane axis; copies.
+
+    Raises:
+        ValueError: for other networks than `QNetwork`, alone, in an `AtomNetwork` or in `AgentNetworks`.
+    """
+    if all(isinstance(network, AtomNetwork) for network in networks):
+        stack = deepcopy(networks[0])
+        stack.network = stack_lanes([network.network for network in networks])  # type: ignore[misc]
+        return stack
+    if all(isinstance(network, AgentNetworks) for network in networks):
+        parts = zip(*(network.values() for network in networks), strict=True)  # type: ignore[operator]
+        return AgentNetworks(dict(zip(networks[0].keys(), map(stack_lanes, parts), strict=True)))  # type: ignore[operator]
+    if not all(isinstance(network, QNetwork) for network in networks):
+        raise ValueError(f"a {type(networks[0]).__name__} is no QNetwork")
+    return LaneQNetwork(networks)  # type: ignore[arg-type]
+
+
+def lane_state(stack: nn.Module, lane: int) -> dict[str, Tensor]:
+    """Copies of the weights of one lane of what `stack_lanes` gave for `QNetwork`s or `AtomNetwork`s, as the
+    state dict of such a network."""
+    if isinstance(stack, AtomNetwork):
+        own = lane_state(stack.network, lane)
+        return {"support": stack.support.clone(), **{f"network.{name}": value for name, value in own.items()}}
+    assert isinstance(stack, LaneQNetwork)
+    return stack.lane_state(lane)
+
+
 def _shapes(network: QNetwork) -> tuple[tuple[int, ...], ...]:
     return tuple(tuple(layer.weight.shape) for layer in network.linears)
 
@@ -82,6 +111,8 @@ class LaneActor(TensorDictModuleBase):
     Args:
         values: the value of each action, from observations [L, k, C, X, Y] to [L, k, A], lane = replica x
             seats + seat; None for agents that choose at random always.
+        samples: whether what `values` gives are the logits of a policy, from which agents that explore draw
+            their actions; `epsilon` is then none.
         actions: how many actions A there are.
         seeds: of each lane's exploration.
         seats: how many seats S of a replica it takes.
@@ -100,13 +131,15 @@ class LaneActor(TensorDictModuleBase):
         seeds: Sequence[Sequence[int]],
         seats: int,
         worlds: int = 1,
+        samples: bool = False,
         compile: bool = False,
     ) -> None:
         super().__init__()
-        self.values, self.actions = values, actions
+        self.values, self.actions, self.samples = values, actions, samples
         self.seats, self.worlds, self.replicas = seats, worlds, len(seeds) // seats
         # As a compiled function takes it: as a tensor, since other numbers are taken for constant.
-        self._epsilon, self._chance = torch.ones((), dtype=torch.float64), 1.0
+        self._chance = 0.0 if samples else 1.0
+        self._epsilon = torch.tensor(self._chance, dtype=torch.float64)
         self.draws = LaneDraws(seeds, 2 * worlds)
         self._explore = Compiled(LaneActor._explored, what="agents act", enabled=compile)
 
@@ -120,8 +153,8 @@ class LaneActor(TensorDictModuleBase):
         self.explore_with(chance)
 
     def explore_with(self, chance: float) -> None:
-        """Sets `epsilon`; quicker than through a module's attributes."""
-        if chance != self._chance:
+        """Sets `epsilon`, of agents that have one; quicker than through a module's attributes."""
+        if chance != self._chance and not self.samples:
             self._epsilon.fill_(chance)
             object.__setattr__(self, "_chance", chance)
 
@@ -141,7 +174,9 @@ class LaneActor(TensorDictModuleBase):
         return chosen
 
     def _explored(self, observation: Tensor, numbers: Tensor, epsilon: Tensor) -> Tensor:
-        """The greedy actions, or with chance epsilon random ones, int64 [replicas x k, S]."""
+        """Sampled actions; or the greedy ones, with chance epsilon random ones; int64 [replicas x k, S]."""
+        if self.samples:
+            return self._by_replica(self._sampled(observation, numbers))
         explores = numbers.view(-1, self.worlds, 2)[..., 0] < epsilon
         return self._by_replica(torch.where(explores, self._random(numbers), self._best(observation)))
 
@@ -164,11 +199,22 @@ class LaneActor(TensorDictModuleBase):
 
     def _best(self, observation: Tensor) -> Tensor:
         """The greedy actions of each lane, int64 [L, k]."""
+        return self._values(observation).argmax(-1)
+
+    def _sampled(self, observation: Tensor, numbers: Tensor) -> Tensor:
+        """Actions of each lane drawn from its policy, int64 [L, k]: the first beyond whose share of the
+        policy's whole a number in 0..1 does not lie."""
+        shares = self._values(observation).double().softmax(-1).cumsum(-1)
+        drawn = numbers.view(-1, self.worlds, 2)[..., 1:]
+        return (drawn >= shares[..., :-1]).sum(-1)
+
+    def _values(self, observation: Tensor) -> Tensor:
+        """What each lane's network gives, [L, k, A]."""
         assert self.values is not None
         shape = observation.shape[-3:]
         by_lane = observation.view(self.replicas, self.worlds, self.seats, *shape).transpose(1, 2)
         with torch.no_grad():
-            return self.values(by_lane.reshape(-1, self.worlds, *shape)).argmax(-1)
+            return self.values(by_lane.reshape(-1, self.worlds, *shape))
 
 
 def random_seats(

@@ -3,6 +3,7 @@
 from collections.abc import Sequence
 from math import prod
 
+import torch
 from torch import Tensor, nn
 from torchrl.modules import MLP
 
@@ -31,7 +32,7 @@ class QNetwork(nn.Module):
     ) -> None:
         super().__init__()
         self.highest, self.relu_on_outputs = highest, relu_on_outputs
-        self.observation_dims = len(observation_shape)
+        self.observation_dims, self.outputs = len(observation_shape), actions
         self.layers = MLP(
             in_features=prod(observation_shape),
             out_features=actions,
@@ -51,6 +52,54 @@ class QNetwork(nn.Module):
         """uint8 [..., C, X, Y] to [..., A], in the parameters' type."""
         seen = observation.flatten(-self.observation_dims).to(self.linears[0].weight.dtype) / self.highest
         return self.layers(seen)  # type: ignore[no-any-return]
+
+
+class AtomNetwork(nn.Module):
+    """The distribution of each action's return over so many fixed values, atoms, as in C51.
+
+    Source: Bellemare, Dabney and Munos, "A Distributional Perspective on Reinforcement Learning" (2017).
+
+    Args:
+        network: with A x atoms outputs.
+        actions: A.
+        lowest: the lowest return that it can tell.
+        highest: the highest.
+        atoms: how many there are.
+    """
+
+    support: Tensor
+
+    def __init__(self, network: QNetwork, *, actions: int, lowest: float, highest: float, atoms: int) -> None:
+        super().__init__()
+        self.network, self.actions, self.atoms = network, actions, atoms
+        self.register_buffer("support", torch.linspace(lowest, highest, atoms))
+
+    def atom_logits(self, observation: Tensor) -> Tensor:
+        """uint8 [..., C, X, Y] to [..., atoms, A], before the softmax over atoms."""
+        return self.network(observation).unflatten(-1, (self.atoms, self.actions))  # type: ignore[no-any-return]
+
+    def forward(self, observation: Tensor) -> Tensor:
+        """uint8 [..., C, X, Y] to the expected values [..., A]."""
+        return (self.atom_logits(observation).softmax(-2) * self.support[:, None]).sum(-2)
+
+
+class AgentNetworks(nn.ModuleDict):
+    """Networks of one agent that learn together, by name; the first is the one that acts."""
+
+    def forward(self, observation: Tensor) -> Tensor:
+        """What the acting network gives."""
+        given: Tensor = acting_part(self)(observation)
+        return given
+
+
+def parts_of(network: nn.Module) -> dict[str, nn.Module]:
+    """The networks of one agent by name, the acting one first; a single one has the name ""."""
+    return dict(network.items()) if isinstance(network, AgentNetworks) else {"": network}
+
+
+def acting_part(network: nn.Module) -> nn.Module:
+    """The network that acts."""
+    return next(iter(parts_of(network).values()))
 
 
 def _glorot_uniform(module: nn.Module) -> None:

@@ -1,9 +1,29 @@
-"""From what happened to better values: transitions, and the learners that use them."""
+"""From what happened to better values: algorithms, transitions, and the learners that use them."""
 
+from cprl.learning.algorithms import CQL, DQN, IQL, SAC, DistributionalDQN
 from cprl.learning.dqn import DQNLearner
 from cprl.learning.lanes import LaneLearner
-from cprl.learning.settings import DQNSettings
+from cprl.learning.on_policy import A2C, PPO, Reinforce
+from cprl.learning.rollouts import RolloutLearner
+from cprl.learning.settings import DQNSettings, RolloutSettings
 from cprl.learning.tabular import TabularLearner, TabularSettings
 from cprl.learning.transitions import transitions_of
 
-__all__ = ["DQNLearner", "DQNSettings", "LaneLearner", "TabularLearner", "TabularSettings", "transitions_of"]
+__all__ = [
+    "A2C",
+    "CQL",
+    "DQN",
+    "IQL",
+    "PPO",
+    "SAC",
+    "DQNLearner",
+    "DQNSettings",
+    "DistributionalDQN",
+    "LaneLearner",
+    "Reinforce",
+    "RolloutLearner",
+    "RolloutSettings",
+    "TabularLearner",
+    "TabularSettings",
+    "transitions_of",
+]

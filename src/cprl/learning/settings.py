@@ -51,3 +51,42 @@ class DQNSettings:
         """The chance of a random action at a step, counted from 0."""
         done = min(1.0, max(0.0, (step - self.epsilon_hold_steps) / self.epsilon_decay_steps))
         return self.epsilon_start + done * (self.epsilon_end - self.epsilon_start)
+
+
+@dataclass(frozen=True, kw_only=True)
+class RolloutSettings:
+    """Hyper-parameters of one independent agent that learns from rollouts; ours, the study has none.
+
+    Raises:
+        ValueError: names the field, what came and what fits.
+    """
+
+    rollout_steps: int = 250
+    """Steps T that are collected before the agent learns from them, each `epochs` times."""
+    epochs: int = 4
+    """Times that each step of a rollout is learned from."""
+    minibatch_size: int = 50
+    """Steps of an update; divides `rollout_steps`."""
+    gamma: float = 0.995
+    """Discount per step."""
+    gae_lambda: float = 0.95
+    """Of the generalised advantage estimate (Schulman et al. 2016)."""
+    normalize_advantage: bool = True
+    """Whether the advantages of a rollout get mean 0 and deviation 1, each agent's by themselves."""
+    learning_rate: float = 3e-4
+    """Adam's step size."""
+    adam_eps: float = 1e-5
+    """Added to Adam's denominator."""
+    max_grad_norm: float | None = 0.5
+    """To which an agent's gradient is shortened; None for never."""
+    hidden_cells: tuple[int, ...] = (32, 32)
+    """Units of each hidden layer, with ReLU, of the actor and of the critic."""
+
+    def __post_init__(self) -> None:
+        for name in ("rollout_steps", "epochs", "minibatch_size"):
+            if getattr(self, name) < 1:
+                raise ValueError(f"{name} is {getattr(self, name)}; at least 1 is wanted")
+        if self.rollout_steps % self.minibatch_size:
+            raise ValueError(
+                f"minibatch_size is {self.minibatch_size}; it must divide rollout_steps, {self.rollout_steps}"
+            )

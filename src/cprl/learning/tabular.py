@@ -25,7 +25,7 @@ from torch import Tensor
 from cprl import keys
 from cprl.acting.tabular import NEVER_MET, QTables, TabularActor, observed_entries, states_of
 from cprl.commons.game import Game
-from cprl.learning.lanes import EVALUATION, EXPLORATION, lane_seeds
+from cprl.learning.agents import EVALUATION, EXPLORATION, lane_seeds
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -1,11 +1,14 @@
 """What one agent lived through, under TorchRL's default keys, so that any of its losses can read it."""
 
-from typing import Any, NamedTuple
+from typing import Any, Literal, NamedTuple, TypeAlias
 
 from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
 
 from cprl import keys
+
+Paid: TypeAlias = Literal["own", "group"]
+"""What a learner is paid each turn: its own reward, or the sum of all agents' rewards."""
 
 
 class LaneTurn(NamedTuple):
@@ -25,12 +28,13 @@ class LaneTurn(NamedTuple):
     """bool [L]."""
 
 
-def lane_turn(seats: tuple[int, ...], batch: TensorDictBase) -> LaneTurn:
+def lane_turn(seats: tuple[int, ...], batch: TensorDictBase, *, paid: Paid = "own") -> LaneTurn:
     """The transitions of the agents at some seats of every replica, a turn of each.
 
     Args:
         seats: the agents' numbers, S.
         batch: entries of `cprl.keys` at the root and under "next", of batch size [R].
+        paid: which reward they get.
 
     Returns:
         What `transitions_of` gives of each agent, lane = replica x S + seat; numpy views of what lies on the
@@ -50,11 +54,12 @@ def lane_turn(seats: tuple[int, ...], batch: TensorDictBase) -> LaneTurn:
     def of_world(flag: Tensor) -> Any:
         return array_of(flag.expand(-1, len(at))).reshape(lanes)
 
+    reward = entry(agents_after, "reward")
     return LaneTurn(
         of(entry(before, "observation"), *windows),
         of(entry(before, "action")),
         of(entry(agents_after, "observation"), *windows),
-        of(entry(agents_after, "reward")),
+        of(reward) if paid == "own" else of_world(reward.sum(1)),
         of_world(entry(after, keys.DONE)),
         of_world(entry(after, keys.TERMINATED)),
     )

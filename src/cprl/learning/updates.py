@@ -9,34 +9,36 @@ from collections.abc import Mapping, Sequence
 from typing import Any, Protocol
 
 import torch
-from tensordict import TensorDictBase
+from tensordict import TensorDict
 from torch import Tensor, nn
 from torchrl.data.replay_buffers import ReplayBuffer
 
-from cprl.learning.functional import (
-    MakeLoss,
-    Weights,
-    flat,
-    params_of,
-    promise_targets,
-    total,
-)
+from cprl.acting.networks import parts_of
+from cprl.learning.functional import MakeLoss, Weights, promise_targets, targets_of, total, weights_of
 
 
 class Update(Protocol):
     """One update of L lanes."""
 
     def learn(self, buffer: ReplayBuffer) -> Tensor:
-        """Samples, updates every lane once, and returns the loss of each, float [L]."""
+        """Samples from a `LaneStorage`, updates every lane once, and returns the loss of each, float [L]."""
+
+    def learn_from(self, batch: TensorDict) -> Tensor:
+        """The same from a batch, [L, b]."""
 
     def copy_to_targets(self, which: Tensor) -> None:
         """Replaces the target weights of the marked lanes, bool [L], by their weights."""
 
-    def outputs(self, observation: Tensor) -> Tensor:
-        """What the networks give by their present weights: [L, k, ...] to [L, k, ...]."""
+    def outputs(self, observation: Tensor, *, part: int = 0) -> Tensor:
+        """What the networks give by their present weights: [L, k, ...] to [L, k, ...].
+
+        Args:
+            observation: of each lane.
+            part: which of an agent's networks, see `cprl.acting.networks.parts_of`; the first acts.
+        """
 
     def network_state(self, lane: int) -> Weights:
-        """Copies of the present weights of one lane, as the state dict of its network."""
+        """Copies of the present weights of one lane, as the state dict of its acting network."""
 
     def weights(self, lane: int) -> Weights:
         """Copies of all weights of one lane, targets too, by the names in the loss."""
@@ -58,6 +60,7 @@ class ListUpdate:
         learning_rate: Adam's step size.
         adam_eps: Adam's epsilon.
         loss_share: by which each loss is multiplied.
+        max_grad_norm: to which each lane's gradient is shortened, if it is longer; None for never.
     """
 
     def __init__(
@@ -69,14 +72,16 @@ class ListUpdate:
         learning_rate: float,
         adam_eps: float = 1e-8,
         loss_share: float = 1.0,
+        max_grad_norm: float | None = None,
     ) -> None:
-        self._networks = networks
+        self._parts = [list(parts_of(network).values()) for network in networks]
+        self._max_norm = max_grad_norm
         self.losses = [make_loss(network) for network in networks]
         for loss in self.losses:
             promise_targets(loss)
         self._share = loss_share
         for loss, network in zip(self.losses, target_networks or (), strict=False):
-            for name, values in params_of(make_loss(network)).items():
+            for name, values in targets_of(make_loss(network)).items():
                 getattr(loss, f"target_{name}").data.copy_(values.data)
         self._adams = [
             torch.optim.Adam(loss.parameters(), lr=learning_rate, eps=adam_eps, fused=True)
@@ -85,34 +90,39 @@ class ListUpdate:
 
     def learn(self, buffer: ReplayBuffer) -> Tensor:
         """See `Update`."""
-        batch = buffer.sample()
+        return self.learn_from(buffer.sample())
+
+    def learn_from(self, batch: TensorDict) -> Tensor:
+        """See `Update`."""
         return torch.stack([self._learn(lane, batch[lane]) for lane in range(len(self.losses))])
 
-    def _learn(self, lane: int, batch: TensorDictBase) -> Tensor:
+    def _learn(self, lane: int, batch: TensorDict) -> Tensor:
         loss = total(self.losses[lane](batch)) * self._share
         self._adams[lane].zero_grad()
         loss.backward()  # type: ignore[no-untyped-call]
+        if self._max_norm is not None:
+            torch.nn.utils.clip_grad_norm_(self.losses[lane].parameters(), self._max_norm)
         self._adams[lane].step()
         return loss.detach()
 
-    def outputs(self, observation: Tensor) -> Tensor:
+    def outputs(self, observation: Tensor, *, part: int = 0) -> Tensor:
         """See `Update`."""
-        return torch.stack([network(seen) for network, seen in zip(self._networks, observation, strict=True)])
+        return torch.stack([own[part](seen) for own, seen in zip(self._parts, observation, strict=True)])
 
     def copy_to_targets(self, which: Tensor) -> None:
         """See `Update`."""
         for lane in which.nonzero().flatten().tolist():
             loss = self.losses[lane]
-            for name in params_of(loss):
-                getattr(loss, f"target_{name}").data.copy_(getattr(loss, name).data)
+            for name, values in targets_of(loss).items():
+                getattr(loss, f"target_{name}").data.copy_(values.data)
 
     def network_state(self, lane: int) -> Weights:
         """See `Update`."""
-        return {name: value.detach().clone() for name, value in self._networks[lane].state_dict().items()}
+        return {name: value.detach().clone() for name, value in self._parts[lane][0].state_dict().items()}
 
     def weights(self, lane: int) -> Weights:
         """See `Update`."""
-        return flat(params_of(self.losses[lane], targets=True))
+        return weights_of(self.losses[lane])
 
     def state_dict(self) -> dict[str, Any]:
         """See `Update`."""

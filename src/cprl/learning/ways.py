@@ -1,6 +1,7 @@
 """Which way many lanes are updated: the fastest whose gradients are those of the plain list.
 
 "lane axis": the networks' parameters carry a lane axis, under one ordinary loss; wants `QNetwork`s.
+"lane axis, flat": the same, for losses that want transitions in a row.
 "vmap": the loss is vmapped over stacked parameters; takes any network.
 "list": a loss module for each lane, one after the other; takes any loss.
 """
@@ -11,23 +12,24 @@ from copy import deepcopy
 from typing import Any, Final, Literal, get_args
 
 import torch
+from tensordict import TensorDict
 from torch import Tensor, nn
-from torchrl.data.replay_buffers import ReplayBuffer
 
-from cprl.acting.networks import QNetwork
 from cprl.learning.functional import MakeLoss
 from cprl.learning.fused import FunctionalUpdate
 from cprl.learning.replay import lane_buffer
 from cprl.learning.transitions import LaneTurn, array_of
 from cprl.learning.updates import ListUpdate, Update
 
-Way = Literal["lane axis", "vmap", "list"]
+Way = Literal["lane axis", "lane axis, flat", "vmap", "list"]
 
 TRIAL_LANES: Final = 2
 """Lanes of a trial: enough to show what one lane would take from another."""
 TRIAL_TRANSITIONS: Final = 16
-TRIAL_STEP: Final = {"learning_rate": 1.0, "adam_eps": 1.0}
-"""By Adam's first step of this size a weight changes by g / (abs(g) + 1), g its gradient."""
+TRIAL_UPDATES: Final = 3
+"""Enough to show weights or targets that are not those of the last update."""
+TRIAL_STEP: Final = {"learning_rate": 0.1, "adam_eps": 1.0}
+"""By Adam's first step of this size a weight changes by 0.1 g / (abs(g) + 1), g its gradient."""
 TOLERANCE: Final = 1e-4
 """How far losses and changes of weights, in float32, may be from those of the list."""
 
@@ -38,17 +40,17 @@ def make_update(
     make_loss: MakeLoss,
     *,
     compile: bool,
-    trial: ReplayBuffer,
+    trial: TensorDict,
     **how: Any,
 ) -> Update:
     """An update of all lanes; see `FunctionalUpdate` for the arguments that are not said here.
 
     Args:
-        way: how; None for the first that passes a trial, of "lane axis", "vmap" and "list".
+        way: how; None for the first that passes a trial, in the order of `Way`.
         networks: of the lanes.
         make_loss: a lane's loss out of its network.
         compile: whether it is compiled, but for the list.
-        trial: made-up transitions for the first `TRIAL_LANES` lanes, see `trial_buffer`.
+        trial: a made-up batch for the first `TRIAL_LANES` lanes, see `trial_batch`.
 
     Raises:
         ValueError: for an unknown way.
@@ -60,13 +62,13 @@ def make_update(
     return _update(way, networks, make_loss, compile=compile, **how)
 
 
-def fitting_way(networks: Sequence[nn.Module], make_loss: MakeLoss, trial: ReplayBuffer) -> Way:
+def fitting_way(networks: Sequence[nn.Module], make_loss: MakeLoss, trial: TensorDict) -> Way:
     """The first way that does on a trial what the plain list does; warns where that is the list itself.
 
     Args:
         networks: of some lanes; copies of them are tried.
         make_loss: a lane's loss out of its network.
-        trial: made-up transitions of these lanes.
+        trial: a made-up batch of these lanes.
     """
     wanted = _tried("list", networks, make_loss, trial)
     reasons = []
@@ -74,7 +76,7 @@ def fitting_way(networks: Sequence[nn.Module], make_loss: MakeLoss, trial: Repla
         try:
             came = _tried(way, networks, make_loss, trial)
         except Exception as error:  # whatever a loss or network of the user's own does not bear
-            reasons.append(f"{way}: {str(error).splitlines()[0]}")
+            reasons.append(f"{way}: {(str(error) or repr(error)).splitlines()[0]}")
             continue
         if all(torch.allclose(*pair, TOLERANCE, TOLERANCE) for pair in zip(came, wanted, strict=True)):
             fitting: Way = way
@@ -88,10 +90,10 @@ def fitting_way(networks: Sequence[nn.Module], make_loss: MakeLoss, trial: Repla
     return "list"
 
 
-def trial_buffer(
+def trial_batch(
     lanes: int, observation_shape: Sequence[int], actions: int, *, device: str | torch.device = "cpu"
-) -> ReplayBuffer:
-    """Made-up transitions of a few lanes, the same every time; one in eight ends an episode."""
+) -> TensorDict:
+    """Made-up transitions [lanes, 8], the same every time; one in eight ends an episode."""
     buffer = lane_buffer(
         seeds=[(lane,) for lane in range(lanes)],
         transitions=TRIAL_TRANSITIONS,
@@ -106,7 +108,8 @@ def trial_buffer(
         ends = torch.full((lanes,), step % 8 == 7)
         turn = seen[0], action, seen[1], torch.rand(lanes, generator=chance), ends, ends
         buffer.storage.write(LaneTurn(*(array_of(entry.to(device)) for entry in turn)))
-    return buffer
+    batch: TensorDict = buffer.sample()
+    return batch
 
 
 def _update(
@@ -114,18 +117,20 @@ def _update(
 ) -> Update:
     if way == "list":
         return ListUpdate(networks, make_loss, **how)
-    if way == "lane axis" and not all(isinstance(network, QNetwork) for network in networks):
-        raise ValueError("networks are not QNetworks")
-    return FunctionalUpdate(networks, make_loss, lane_axis=way == "lane axis", compile=compile, **how)
+    axis, flat = way.startswith("lane axis"), way == "lane axis, flat"
+    return FunctionalUpdate(networks, make_loss, lane_axis=axis, flat=flat, compile=compile, **how)
 
 
-def _tried(way: Way, networks: Sequence[nn.Module], make_loss: MakeLoss, trial: ReplayBuffer) -> list[Tensor]:
-    """The losses of an update of copies of the networks, and their weights after it."""
-    sampling = deepcopy(trial.sampler.state_dict())
+def _tried(way: Way, networks: Sequence[nn.Module], make_loss: MakeLoss, trial: TensorDict) -> list[Tensor]:
+    """The losses of some updates of copies of the networks, targets replaced after all but the last, the
+    weights that act after them, and for each lane the sums of all its weights and of their squares."""
     update = _update(way, deepcopy(list(networks)), make_loss, compile=False, **TRIAL_STEP)
-    losses = update.learn(trial)
-    trial.sampler.load_state_dict(sampling)
-    return [
-        losses,
-        *(weight for lane in range(len(networks)) for weight in update.network_state(lane).values()),
-    ]
+    came = []
+    for _ in range(TRIAL_UPDATES):
+        came.append(update.learn_from(trial.clone()))
+        if len(came) < TRIAL_UPDATES:
+            update.copy_to_targets(torch.ones(len(networks), dtype=torch.bool))
+    for lane in range(len(networks)):
+        everything = torch.cat([weight.flatten() for weight in update.weights(lane).values()])
+        came += [*update.network_state(lane).values(), everything.sum(), everything.square().sum()]
+    return came

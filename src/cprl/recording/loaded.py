@@ -1,21 +1,26 @@
-"""load: a run as its directory keeps it: game, settings, population, trained networks, episodes."""
+"""load: a run as its directory keeps it: game, population, trained networks, episodes."""
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 import pyarrow as pa
+from tensordict import TensorDictBase
+from tensordict.nn import TensorDictModuleBase
 from torch import nn
 
-from cprl.acting import QActor, QNetwork, RandomActor, Seats
+from cprl.acting import QActor, RandomActor, Seats
+from cprl.acting.networks import acting_part
+from cprl.acting.scripted import ScriptedActor
 from cprl.commons.game import Game
 from cprl.commons.maps import Map
 from cprl.commons.observation import Observation
 from cprl.commons.rules import Rules
 from cprl.envs.torchrl_env import CommonsEnv
-from cprl.learning.dqn import q_network
-from cprl.learning.settings import DQNSettings
+from cprl.learning.algorithms import policy
+from cprl.learning.known import Algorithm, built
 from cprl.recording.checkpoints import FOLDER, checkpoints_in, read_checkpoint
 from cprl.recording.results import read_episodes
 from cprl.recording.run import read_recipe
@@ -28,11 +33,14 @@ class LoadedRun:
 
     path: Path
     game: Game
-    settings: DQNSettings
+    members: Sequence[Mapping[str, Any]]
+    """Who sat at each seat, as `cprl.population.Population.told` tells it."""
+    algorithms: Mapping[int, Algorithm]
+    """What the agents that learned were made of, by their number."""
     recipe: Mapping[str, Any]
     """What `recipe.json` holds."""
-    networks: Mapping[str, QNetwork]
-    """The trained network of each lane, by "replica_0/agent_0" and so on."""
+    networks: Mapping[str, nn.Module]
+    """The trained acting network of each lane, by "replica_0/agent_0" and so on."""
     weights_from: Path
     """The file that held them: of a run that has not ended, its newest checkpoint."""
 
@@ -45,28 +53,43 @@ class LoadedRun:
         """So many fresh worlds of the run's game."""
         return CommonsEnv(self.game, worlds, seed=seed)
 
+    def agent(self, agent: int, *, replica: int = 0) -> tuple[nn.Module, bool, float]:
+        """An agent that learned: its acting network, whether that gives the logits of a policy from which it
+        draws its actions, and else the chance of a random one with which it is evaluated.
+
+        Raises:
+            ValueError: where no such network was kept; says which were.
+        """
+        lane = f"replica_{replica}/agent_{agent}"
+        if lane not in self.networks:
+            raise ValueError(f"{self.path} keeps no network of {lane}; kept are {sorted(self.networks)}")
+        algorithm = self.algorithms[agent]
+        samples = bool(getattr(algorithm, "samples", True))
+        return self.networks[lane], samples, float(getattr(algorithm.settings, "epsilon_evaluation", 0.0))
+
     def policy(self, replica: int = 0, *, others: Mapping[int, nn.Module] | None = None) -> Seats:
-        """The trained agents of a replica, who explore with `epsilon_evaluation` where asked to.
+        """The agents of a replica; those that learned explore as in evaluation where asked to.
 
         Args:
             replica: its number.
-            others: actors by the agent's number, instead of those of the run; where it says that an agent
-                acted at random, one that does so is there without being given.
+            others: actors by the agent's number, instead of those of the run.
 
         Raises:
             ValueError: where a seat stays empty; says which.
         """
-        actions = len(self.game.actions)
-        at_random = self.recipe["arguments"].get("population", {}).get("random", ())
-        actors: dict[int, nn.Module] = {agent: RandomActor(actions, seed=agent) for agent in at_random}
-        actors |= others or {}
-        for agent in range(self.game.agents):
-            network = self.networks.get(f"replica_{replica}/agent_{agent}")
-            if network is not None:
-                actor = QActor(network, actions)
-                actor.epsilon = self.settings.epsilon_evaluation
-                actors.setdefault(agent, actor)
-        empty = sorted(set(range(self.game.agents)) - set(actors))
+        actors, empty = dict(others or {}), []
+        for seat, member in enumerate(self.members):
+            if seat in actors:
+                continue
+            if member["member"] == "Frozen":
+                earlier = load(member["run"])
+                actors[seat] = _actor(earlier, member["agent"], member["replica"])
+            elif member["member"] == "Scripted":
+                actors[seat] = self._scripted(member["manner"], seat)
+            elif f"replica_{replica}/agent_{seat}" in self.networks:
+                actors[seat] = _actor(self, seat, replica)
+            else:
+                empty.append(seat)
         if empty:
             raise ValueError(
                 f"agents {empty} of replica {replica} have no network in {self.path}; kept are "
@@ -74,18 +97,60 @@ class LoadedRun:
             )
         return Seats({agent: actors[agent] for agent in range(self.game.agents)})
 
+    def _scripted(self, manner: Any, seat: int) -> nn.Module:
+        if manner == "random":
+            return RandomActor(len(self.game.actions), seed=seat)
+        return _OneScripted(manner, self.game, seat)
+
     def episodes(self) -> pa.Table:
         """The table of episodes; see `cprl.recording.read_episodes`."""
         return read_episodes(self.path)
 
 
-def load(run: str | Path, *, weights: str | None = None) -> LoadedRun:
-    """Builds a run's game, settings, population and networks again; runs no code of its files.
+def _actor(run: LoadedRun, agent: int, replica: int) -> nn.Module:
+    """An agent that learned, as TorchRL's actor for one agent."""
+    network, samples, epsilon = run.agent(agent, replica=replica)
+    if samples:
+        drawing: nn.Module = policy(network)
+        return drawing
+    actor = QActor(network, len(run.game.actions))
+    actor.epsilon = epsilon
+    return actor
+
+
+class _OneScripted(TensorDictModuleBase):
+    """A scripted agent as TorchRL's actor for one agent, in however many worlds it is asked.
+
+    Args:
+        manner: see `ScriptedActor`.
+        game: what is played.
+        seat: where it sits; its random numbers follow from that.
+    """
+
+    in_keys = ("observation",)
+    out_keys = ("action",)
+
+    def __init__(self, manner: Any, game: Game, seat: int) -> None:
+        super().__init__()
+        self._make = partial(ScriptedActor, manner, game, seeds=[(seat,)], seats=1)
+        self._actor = self._make()
+
+    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
+        """Writes "action", int64 [B]."""
+        seen = tensordict.get("observation").unsqueeze(1)
+        if self._actor.worlds != len(seen):
+            self._actor = self._make(worlds=len(seen))
+        return tensordict.set("action", self._actor.choose(seen)[:, 0])
+
+
+def load(run: str | Path, *, weights: str | None = None, algorithms: Sequence[type[Any]] = ()) -> LoadedRun:
+    """Builds a run's game, population and networks again; runs no code of its files.
 
     Args:
         run: its directory.
         weights: which were kept: "final", or "best" where the recipe keeps them; by default the final ones,
             or those of the newest readable checkpoint where the run has not ended.
+        algorithms: classes of the user's own that the run's agents may be made of.
 
     Raises:
         ValueError: for a file that is missing, truncated, changed or foreign; names file and reason.
@@ -99,19 +164,38 @@ def load(run: str | Path, *, weights: str | None = None) -> LoadedRun:
             rules=Rules(**kept["rules"]),
             observation=Observation(**kept.get("observation", {})),
         )
-        learner = recipe["arguments"]["learner"]
-        settings = DQNSettings(**{**learner, "hidden_cells": tuple(learner["hidden_cells"])})
+        members = _members(recipe["arguments"], game)
+        made_of = {
+            seat: built(
+                {key: value for key, value in member.items() if key not in ("member", "paid")}, own=algorithms
+            )
+            for seat, member in enumerate(members)
+            if member["member"] == "Learner"
+        }
     except (KeyError, TypeError, ValueError) as error:
         raise ValueError(f"{run / 'recipe.json'} holds no game and learner of cprl: {error!r}") from error
     path, kept_weights = _weights(run, weights)
     return LoadedRun(
         path=run,
         game=game,
-        settings=settings,
+        members=members,
+        algorithms=made_of,
         recipe=recipe,
-        networks=_networks(path, kept_weights, game, settings),
+        networks=_networks(path, kept_weights, game, made_of),
         weights_from=path,
     )
+
+
+def _members(arguments: Mapping[str, Any], game: Game) -> list[dict[str, Any]]:
+    """Who sat where; runs of before there were populations had DQN agents and random ones."""
+    population = arguments.get("population", {})
+    if isinstance(population, list):
+        return population
+    settings = {"kind": "DQNSettings", **arguments["learner"]}
+    learner = {"member": "Learner", "algorithm": "DQN", "settings": settings}
+    scripted = {"member": "Scripted", "manner": "random"}
+    at_random = population.get("random", ())
+    return [scripted if seat in at_random else learner for seat in range(game.agents)]
 
 
 def _weights(run: Path, name: str | None) -> tuple[Path, Any]:
@@ -137,18 +221,15 @@ def _weights(run: Path, name: str | None) -> tuple[Path, Any]:
         raise ValueError(f"{path} holds no weights of this run: {error}") from error
 
 
-def _networks(path: Path, weights: Any, game: Game, settings: DQNSettings) -> dict[str, QNetwork]:
+def _networks(path: Path, weights: Any, game: Game, made_of: Mapping[int, Algorithm]) -> dict[str, nn.Module]:
     networks = {}
     try:
-        for lane, state in weights.items():
-            network = q_network(
-                game.observation_shape,
-                len(game.actions),
-                settings=settings,
-                highest=game.observation.highest,
-            )
+        for name, state in weights.items():
+            lane = name if "/" in name else f"replica_0/{name}"
+            seat = int(lane.rpartition("_")[2])
+            network = acting_part(made_of[seat].network(game))
             network.load_state_dict(state)
-            networks[lane if "/" in lane else f"replica_0/{lane}"] = network
+            networks[lane] = network
     except Exception as error:
         raise ValueError(f"{path} holds no weights of this run: {error}") from error
     return networks

@@ -1,0 +1,114 @@
+"""Lanes: who learns at some seats of every replica, their seeds, networks and actors."""
+
+from collections.abc import Callable, Sequence
+from typing import Final
+
+import numpy as np
+import torch
+from torch import Tensor, nn
+
+from cprl.acting.lanes import LaneActor
+from cprl.acting.networks import acting_part
+from cprl.commons.game import Game
+from cprl.learning.updates import ListUpdate, Update
+
+WEIGHTS, TARGET_WEIGHTS, EXPLORATION, SAMPLING, EVALUATION = range(5)
+"""What a lane's random numbers are for."""
+
+_LARGEST_SEED: Final = 2**63 - 1
+
+
+def lane_seeds(
+    seed: int, *, replicas: Sequence[int], seats: Sequence[int], purpose: int
+) -> list[tuple[int, int, int, int]]:
+    """A seed for each lane, replica by replica, of the run's seed, the replica, the agent and the purpose."""
+    return [(seed, replica, agent, purpose) for replica in replicas for agent in seats]
+
+
+class Lanes:
+    """R x S agents: seats S of each of R replicas; a lane is one of them, replica by replica.
+
+    Args:
+        game: what is played.
+        seats: the numbers of the agents.
+        replicas: how many replicas R.
+        seed: of the run.
+        first_replica: the number of the first replica.
+        make_network: the networks of an agent, which draw their weights from torch's generator; that is
+            seeded for each lane.
+        samples: whether they act by drawing from the policy whose logits the network gives.
+    """
+
+    def __init__(
+        self,
+        game: Game,
+        *,
+        seats: Sequence[int],
+        replicas: int,
+        seed: int,
+        first_replica: int,
+        make_network: Callable[[], nn.Module],
+        samples: bool,
+    ) -> None:
+        self.game, self.seats, self.replicas, self.seed = game, tuple(seats), replicas, seed
+        self._numbers = range(first_replica, first_replica + replicas)
+        self._make_network, self.samples = make_network, samples
+
+    def __len__(self) -> int:
+        return self.replicas * len(self.seats)
+
+    @property
+    def names(self) -> list[str]:
+        """Of each lane: "replica_0/agent_0" and so on."""
+        return [f"replica_{replica}/agent_{agent}" for replica in self._numbers for agent in self.seats]
+
+    def seeds(self, purpose: int) -> list[tuple[int, int, int, int]]:
+        """See `lane_seeds`."""
+        return lane_seeds(self.seed, replicas=self._numbers, seats=self.seats, purpose=purpose)
+
+    def new_networks(self, purpose: int, device: str | torch.device) -> list[nn.Module]:
+        """New networks for each lane."""
+        return [_drawn(self._make_network, own).to(device) for own in self.seeds(purpose)]
+
+    def actor(self, update: Update, *, compile: bool) -> LaneActor:
+        """Who acts by the present weights while they learn, each lane by random numbers of its own."""
+        return LaneActor(
+            update.outputs,
+            len(self.game.actions),
+            seeds=self.seeds(EXPLORATION),
+            seats=len(self.seats),
+            samples=self.samples,
+            compile=compile and not isinstance(update, ListUpdate),
+        )
+
+    def evaluation_actor(self, update: Update, worlds: int, *, epsilon: float) -> LaneActor:
+        """Who acts by the present weights in so many worlds of each replica."""
+        actor = LaneActor(
+            update.outputs,
+            len(self.game.actions),
+            seeds=self.seeds(EVALUATION),
+            seats=len(self.seats),
+            worlds=worlds,
+            samples=self.samples,
+        )
+        actor.epsilon = epsilon
+        return actor
+
+    def states(self, update: Update) -> dict[str, dict[str, Tensor]]:
+        """The state dict of each lane's acting network, by the lane's name."""
+        return {name: update.network_state(lane) for lane, name in enumerate(self.names)}
+
+    def networks(self, update: Update) -> dict[str, nn.Module]:
+        """A copy of each lane's acting network as it is now, by the lane's name."""
+        made = {}
+        for name, weights in self.states(update).items():
+            made[name] = acting_part(self._make_network())
+            made[name].load_state_dict(weights)
+        return made
+
+
+def _drawn(make_network: Callable[[], nn.Module], seed: Sequence[int]) -> nn.Module:
+    """A network whose weights follow from a seed alone; torch's generator goes on as if nothing happened."""
+    with torch.random.fork_rng(devices=[]):
+        torch.manual_seed(int(np.random.SeedSequence(seed).generate_state(1, np.uint64)[0] & _LARGEST_SEED))
+        return make_network()

@@ -1,0 +1,283 @@
+"""Off-policy algorithms: for each agent its networks and TorchRL's loss over them.
+
+Each is a plain value with three answers, which a loss of one's own gives as well (docs/algorithms.md has one
+of twenty lines): `settings`, `network(game)` and `loss(network)`, and `samples`, how it acts.
+"""
+
+from dataclasses import dataclass
+from typing import ClassVar, Protocol
+
+import torch
+from tensordict import TensorDictBase
+from tensordict.nn import ProbabilisticTensorDictSequential, TensorDictModule
+from torch import nn
+from torchrl.modules import DistributionalQValueActor, ProbabilisticActor, QValueActor
+from torchrl.objectives import (
+    DiscreteCQLLoss,
+    DiscreteIQLLoss,
+    DiscreteSACLoss,
+    DistributionalDQNLoss,
+    DQNLoss,
+    LossModule,
+    ValueEstimators,
+)
+from torchrl.objectives.value import ValueEstimatorBase
+
+from cprl.acting.networks import AgentNetworks, AtomNetwork, QNetwork
+from cprl.commons.game import Game
+from cprl.learning.settings import DQNSettings
+
+
+class OffPolicy(Protocol):
+    """What an agent that learns from a replay buffer is made of.
+
+    Equal ones learn as lanes of one step, so it should be a value: a frozen dataclass.
+    """
+
+    @property
+    def settings(self) -> DQNSettings:
+        """The hyper-parameters."""
+
+    @property
+    def samples(self) -> bool:
+        """Whether the network gives logits of a policy, from which actions are drawn; else values of actions,
+        of which the highest is taken but for chance epsilon."""
+
+    def network(self, game: Game) -> nn.Module:
+        """New networks of one agent, which draw their weights from torch's generator: from uint8
+        [..., C, X, Y] to [..., A]; several as `AgentNetworks`, the acting one first."""
+
+    def loss(self, network: nn.Module) -> LossModule:
+        """TorchRL's loss over them, for transitions of "observation", "action" and "next": "observation",
+        "reward" [.., 1], "done", "terminated"."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class DQN:
+    """Deep Q-learning with a target network by TorchRL's `DQNLoss`; the study's agents.
+
+    Source: Mnih et al., "Human-level control through deep reinforcement learning" (2015).
+    """
+
+    settings: DQNSettings
+    double: bool = False
+    """Whether the action whose value bootstraps is chosen by the network itself, not by its target (van
+    Hasselt, Guez and Silver, "Deep Reinforcement Learning with Double Q-learning", 2016)."""
+    loss_function: str = "l2"
+    """Of the temporal difference: "l2", "smooth_l1" (Huber) or "l1"."""
+    samples: ClassVar[bool] = False
+
+    def network(self, game: Game) -> nn.Module:
+        """See `OffPolicy`."""
+        return _network(game, self.settings, outputs=len(game.actions), relu=self.settings.relu_on_outputs)
+
+    def loss(self, network: nn.Module) -> LossModule:
+        """See `OffPolicy`."""
+        loss = DQNLoss(
+            _q_actor(network),
+            delay_value=True,
+            double_dqn=self.double,
+            loss_function=self.loss_function,
+            action_space="categorical",
+        )
+        loss.make_value_estimator(ValueEstimators.TD0, gamma=self.settings.gamma)
+        return loss
+
+
+@dataclass(frozen=True, kw_only=True)
+class DistributionalDQN:
+    """C51, the distribution of returns over fixed atoms, by TorchRL's `DistributionalDQNLoss`.
+
+    Source: Bellemare, Dabney and Munos, "A Distributional Perspective on Reinforcement Learning" (2017).
+    """
+
+    settings: DQNSettings
+    atoms: int = 51
+    lowest_return: float = 0.0
+    highest_return: float = 100.0
+    """Discounted returns that can be told: apples, by a discount of 0.995 at most 200 for one a step."""
+    samples: ClassVar[bool] = False
+
+    def network(self, game: Game) -> nn.Module:
+        """See `OffPolicy`."""
+        actions = len(game.actions)
+        return AtomNetwork(
+            _network(game, self.settings, outputs=actions * self.atoms),
+            actions=actions,
+            lowest=self.lowest_return,
+            highest=self.highest_return,
+            atoms=self.atoms,
+        )
+
+    def loss(self, network: nn.Module) -> LossModule:
+        """See `OffPolicy`."""
+        assert isinstance(network, AtomNetwork)
+        actor = DistributionalQValueActor(
+            AtomLogits(network), support=network.support, spec=None, action_space="categorical"
+        )
+        return DistributionalDQNLoss(actor, gamma=self.settings.gamma, delay_value=True)
+
+
+class AtomLogits(nn.Module):
+    """An `AtomNetwork` as TorchRL's distributional actor wants it: logits [..., atoms, A].
+
+    Args:
+        network: whose weights it has.
+    """
+
+    def __init__(self, network: AtomNetwork) -> None:
+        super().__init__()
+        self.of = network
+
+    def forward(self, observation: torch.Tensor) -> torch.Tensor:
+        """The logits."""
+        return self.of.atom_logits(observation)
+
+
+@dataclass(frozen=True, kw_only=True)
+class CQL:
+    """Conservative Q-learning by TorchRL's `DiscreteCQLLoss`, its two terms added.
+
+    Source: Kumar et al., "Conservative Q-Learning for Offline Reinforcement Learning" (2020).
+    """
+
+    settings: DQNSettings
+    loss_function: str = "l2"
+    samples: ClassVar[bool] = False
+
+    def network(self, game: Game) -> nn.Module:
+        """See `OffPolicy`."""
+        return _network(game, self.settings, outputs=len(game.actions), relu=self.settings.relu_on_outputs)
+
+    def loss(self, network: nn.Module) -> LossModule:
+        """See `OffPolicy`."""
+        loss = DiscreteCQLLoss(
+            _q_actor(network),
+            delay_value=True,
+            loss_function=self.loss_function,
+            action_space="categorical",
+        )
+        loss.make_value_estimator(ValueEstimators.TD0, gamma=self.settings.gamma)
+        _bootstrap_from_target(loss.value_estimator)
+        return loss
+
+
+def _bootstrap_from_target(estimator: ValueEstimatorBase) -> None:
+    """`DiscreteCQLLoss` of TorchRL 0.14.1 hands its target's weights on as `params`, of which its estimator
+    takes no notice: it would bootstrap from the network itself."""
+    estimate = estimator.value_estimate
+
+    def by_target(tensordict: TensorDictBase, *, params: TensorDictBase) -> torch.Tensor:
+        target: torch.Tensor = estimate(tensordict, target_params=params)
+        return target
+
+    estimator.value_estimate = by_target
+
+
+@dataclass(frozen=True, kw_only=True)
+class SAC:
+    """Soft actor-critic for discrete actions, twin critics, by TorchRL's `DiscreteSACLoss`.
+
+    Each agent has a temperature of its own. Source: Christodoulou, "Soft Actor-Critic for Discrete Action
+    Settings" (2019).
+    """
+
+    settings: DQNSettings
+    target_entropy_weight: float = 0.5
+    """The share of the highest entropy, log A, that the temperature holds the policy at."""
+    alpha_init: float = 0.1
+    """The temperature at first, in apples."""
+    loss_function: str = "l2"
+    samples: ClassVar[bool] = True
+
+    def network(self, game: Game) -> nn.Module:
+        """See `OffPolicy`."""
+        actions = len(game.actions)
+        names = "actor", "critic_0", "critic_1"
+        return AgentNetworks({name: _network(game, self.settings, outputs=actions) for name in names})
+
+    def loss(self, network: nn.Module) -> LossModule:
+        """See `OffPolicy`."""
+        assert isinstance(network, AgentNetworks)
+        loss = DiscreteSACLoss(
+            policy(network["actor"]),
+            [_module(network[name], "action_value") for name in ("critic_0", "critic_1")],
+            action_space="categorical",
+            num_actions=network["actor"].outputs,
+            num_qvalue_nets=2,
+            loss_function=self.loss_function,
+            alpha_init=self.alpha_init,
+            target_entropy_weight=self.target_entropy_weight,
+        )
+        loss.make_value_estimator(ValueEstimators.TD0, gamma=self.settings.gamma)
+        return loss
+
+
+@dataclass(frozen=True, kw_only=True)
+class IQL:
+    """Implicit (not: independent) Q-learning for discrete actions by TorchRL's `DiscreteIQLLoss`.
+
+    Source: Kostrikov, Nair and Levine, "Offline Reinforcement Learning with Implicit Q-Learning" (2021).
+    """
+
+    settings: DQNSettings
+    expectile: float = 0.7
+    """Which expectile of the actions' values the state's value is, 0.5 to 1."""
+    temperature: float = 3.0
+    """Of the weights of actions by their advantage, in 1/apples."""
+    loss_function: str = "l2"
+    samples: ClassVar[bool] = True
+
+    def network(self, game: Game) -> nn.Module:
+        """See `OffPolicy`."""
+        actions = len(game.actions)
+        sizes = {"actor": actions, "critic_0": actions, "critic_1": actions, "value": 1}
+        return AgentNetworks(
+            {name: _network(game, self.settings, outputs=size) for name, size in sizes.items()}
+        )
+
+    def loss(self, network: nn.Module) -> LossModule:
+        """See `OffPolicy`."""
+        assert isinstance(network, AgentNetworks)
+        loss = DiscreteIQLLoss(
+            policy(network["actor"]),
+            [_module(network[name], "state_action_value") for name in ("critic_0", "critic_1")],
+            _module(network["value"], "state_value"),
+            action_space="categorical",
+            num_qvalue_nets=2,
+            loss_function=self.loss_function,
+            temperature=self.temperature,
+            expectile=self.expectile,
+        )
+        loss.make_value_estimator(ValueEstimators.TD0, gamma=self.settings.gamma)
+        return loss
+
+
+def policy(network: nn.Module) -> ProbabilisticTensorDictSequential:
+    """A network's outputs as the logits of TorchRL's categorical policy."""
+    return ProbabilisticActor(
+        TensorDictModule(network, ["observation"], ["logits"]),
+        in_keys=["logits"],
+        out_keys=["action"],
+        distribution_class=torch.distributions.Categorical,
+        return_log_prob=True,
+    )
+
+
+def _network(game: Game, settings: DQNSettings, *, outputs: int, relu: bool = False) -> QNetwork:
+    return QNetwork(
+        game.observation_shape,
+        outputs,
+        highest=game.observation.highest,
+        hidden_cells=settings.hidden_cells,
+        relu_on_outputs=relu,
+        glorot_uniform=settings.glorot_uniform,
+    )
+
+
+def _q_actor(network: nn.Module) -> QValueActor:
+    return QValueActor(network, spec=None, action_space="categorical")
+
+
+def _module(network: nn.Module, name: str) -> TensorDictModule:
+    return TensorDictModule(network, ["observation"], [name])

@@ -1,0 +1,332 @@
+"""A population seats learners, scripted and frozen agents in any mix, and each learns as it would alone."""
+
+from dataclasses import dataclass, replace
+from typing import ClassVar
+
+import pytest
+import torch
+from torchrl.objectives import ClipPPOLoss
+
+import cprl
+from cprl import CommonsEnv, Game, Observation, Rules, maps, study
+from cprl.acting.networks import acting_part
+from cprl.learning import (
+    A2C,
+    CQL,
+    DQN,
+    IQL,
+    PPO,
+    SAC,
+    DistributionalDQN,
+    DQNSettings,
+    Reinforce,
+    RolloutSettings,
+)
+from cprl.learning.lanes import LaneLearner
+from cprl.learning.rollouts import RolloutLearner
+from cprl.learning.transitions import lane_turn
+from cprl.population import Frozen, Learner, Population, Scripted
+from cprl.recording import Checkpoints, start_run
+from cprl.recording.checkpoints import checkpoints_in
+from cprl.train import train
+
+GAME = Game(
+    map=maps.parse(
+        """
+        .A>.A.
+        A.A.v.
+        ..<.A^
+        """
+    ),
+    rules=Rules(regrow_prob=(0.0, 0.2), window_rows=3, window_columns=5, episode_steps=12, freeze_steps=2),
+)
+REPLAY = DQNSettings(
+    buffer_size=60,
+    batch_size=4,
+    learning_rate=1e-3,
+    hidden_cells=(8,),
+    epsilon_hold_steps=5,
+    epsilon_decay_steps=40,
+    target_every_episodes=2,
+)
+ROLLOUTS = RolloutSettings(rollout_steps=20, minibatch_size=10, epochs=2, hidden_cells=(8,))
+ALGORITHMS = {
+    "DQN": DQN(settings=REPLAY),
+    "double DQN": DQN(settings=REPLAY, double=True),
+    "Huber DQN": DQN(settings=REPLAY, loss_function="smooth_l1"),
+    "C51": DistributionalDQN(settings=REPLAY, atoms=7),
+    "CQL": CQL(settings=REPLAY),
+    "SAC": SAC(settings=REPLAY),
+    "IQL": IQL(settings=REPLAY),
+    "PPO": PPO(settings=ROLLOUTS),
+    "A2C": A2C(settings=replace(ROLLOUTS, epochs=1)),
+    "REINFORCE": Reinforce(settings=replace(ROLLOUTS, epochs=1)),
+}
+WAYS = {
+    "DQN": "lane axis",
+    "double DQN": "lane axis",
+    "Huber DQN": "lane axis",
+    "C51": "lane axis, flat",
+    "CQL": "lane axis",
+    "SAC": "vmap",
+    "IQL": "vmap",
+    "PPO": "lane axis",
+    "A2C": "lane axis",
+    "REINFORCE": "lane axis",
+}
+FOUR = tuple(range(4))
+
+
+def population(members, *, replicas=2, **how):
+    return Population(GAME, members, replicas=replicas, seed=3, compile=False, **how)
+
+
+class Returns:
+    """Keeps the returns of every episode, by replica."""
+
+    def __init__(self):
+        self.of = {}
+
+    def see_turn(self, batch):
+        """Only whole episodes are of interest."""
+
+    def see_episode(self, episode, learning):
+        self.of.setdefault(episode.world, []).append(episode.return_.tolist())
+
+
+def trained(agents, *, episodes=6, first=0, **how):
+    env = CommonsEnv(agents.game, agents.replicas, seed=agents.seed, first_world=first)
+    returns = Returns()
+    training = train(
+        env, agents.learners, others=agents.others, episodes=episodes, observers=[returns], **how
+    )
+    return training, returns.of
+
+
+def weights(agents):
+    return {
+        f"{lane}/{name}": value
+        for lane, network in agents.networks().items()
+        for name, value in network.state_dict().items()
+    }
+
+
+@pytest.mark.parametrize("name", ALGORITHMS)
+def test_each_loss_moves_every_agents_weights_and_no_replica_knows_of_the_others(name):
+    members = [Learner(ALGORITHMS[name])] * 4
+    together, alone = population(members, replicas=3), population(members, replicas=1, first_replica=2)
+    (learner,) = together.learners.values()
+    before = weights(together)
+    _, returns = trained(together)
+    _, returns_alone = trained(alone, first=2)
+    assert returns[2] == returns_alone[0]
+    after, after_alone = weights(together), weights(alone)
+    assert len(together.networks()) == 12
+    for key, value in after.items():
+        if not key.endswith("support"):
+            assert not torch.equal(value, before[key]), f"{key} has not moved"
+    for key, value in after_alone.items():
+        torch.testing.assert_close(value, after[key], rtol=1e-4, atol=1e-5)
+    made = [learner.update.network_state(lane) for lane in range(12)]
+    assert len({float(sum(value.sum() for value in state.values())) for state in made}) == 12, "lanes differ"
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", ALGORITHMS)
+def test_each_loss_takes_the_fastest_way_that_agrees_with_a_list_of_torchrls_losses(name):
+    algorithm = ALGORITHMS[name]
+    members = [Learner(algorithm)] * 4
+    found = population(members, replicas=1)
+    (learner,) = found.learners.values()
+    kind, common = type(learner), {"seats": FOUR, "replicas": 1, "settings": algorithm.settings, "seed": 3}
+    common |= {"make_network": lambda: algorithm.network(GAME), "make_loss": algorithm.loss, "compile": False}
+    if kind is LaneLearner:
+        common["samples"] = algorithm.samples
+    by_list, named = kind(GAME, way="list", **common), kind(GAME, way=WAYS[name], **common)
+    ends = []
+    for one in (learner, named, by_list):
+        env = CommonsEnv(GAME, 1, seed=3)
+        train(env, {FOUR: one}, episodes=5)
+        ends.append([one.update.network_state(lane) for lane in range(4)])
+    for mine, theirs, reference in zip(*ends, strict=True):
+        for key, value in reference.items():
+            assert torch.equal(mine[key], theirs[key]), "this is the way that is found"
+            torch.testing.assert_close(mine[key], value, rtol=1e-3, atol=1e-5)
+
+
+def test_unlike_agents_sit_side_by_side_in_one_training_and_like_ones_are_lanes():
+    dqn, ppo = Learner(ALGORITHMS["DQN"]), Learner(ALGORITHMS["PPO"])
+    mixed = population([dqn, ppo, dqn, Scripted("greedy")])
+    assert {seats: type(learner) for seats, learner in mixed.learners.items()} == {
+        (0, 2): LaneLearner,
+        (1,): RolloutLearner,
+    }
+    assert list(mixed.others) == [(3,)]
+    before = weights(mixed)
+    training, returns = trained(mixed)
+    assert training.steps == 72
+    assert len(returns[0]) == len(returns[1]) == 6
+    for key, value in weights(mixed).items():
+        assert not torch.equal(value, before[key])
+
+
+def test_equal_learners_are_lanes_even_if_they_were_written_down_twice():
+    twice = population([Learner(DQN(settings=REPLAY)) for _ in range(4)])
+    assert list(twice.learners) == [FOUR]
+    unequal = [Learner(DQN(settings=replace(REPLAY, gamma=gamma))) for gamma in (0.9, 0.9, 0.5, 0.5)]
+    assert list(population(unequal).learners) == [(0, 1), (2, 3)]
+
+
+def test_who_is_paid_for_the_group_gets_the_sum_of_all_rewards():
+    env = CommonsEnv(GAME, 2, seed=1)
+    policy = population([Scripted("greedy")] * 4).policy(1)
+    moment = env.step(policy(env.reset()))
+    rewards = moment["next", "agents", "reward"].squeeze(-1)
+    for _ in range(8):
+        moment = env.step(policy(moment["next"].exclude(("agents", "reward"))))
+        rewards = moment["next", "agents", "reward"].squeeze(-1)
+        if rewards.sum():
+            break
+    assert rewards.sum() > 0
+    own, group = (lane_turn((1, 3), moment, paid=paid).reward for paid in ("own", "group"))
+    assert own.tolist() == rewards[:, [1, 3]].flatten().tolist()
+    assert group.tolist() == rewards.sum(1).repeat_interleave(2).tolist()
+
+
+def test_paid_for_the_group_is_another_learner_than_paid_for_itself():
+    algorithm = ALGORITHMS["DQN"]
+    members = [Learner(algorithm), Learner(algorithm, paid="group"), *[Scripted()] * 2]
+    assert list(population(members).learners) == [(0,), (1,)]
+
+
+class AtSteps(Checkpoints):
+    def after_step(self, training):
+        if training.steps in (20, 45):
+            self.save(training)
+
+
+@pytest.mark.parametrize("kind", ["PPO", "SAC", "DQN"])
+def test_a_mixed_training_that_was_stopped_goes_on_bit_for_bit(kind, tmp_path):
+    members = [Learner(ALGORITHMS[kind]), Learner(ALGORITHMS["CQL"]), Scripted("greedy"), Scripted()]
+
+    def run(name, *, stop_at=None):
+        agents = population(members)
+
+        class StopError(Exception):
+            pass
+
+        class Witness(Returns):
+            turns = 0
+
+            def see_turn(self, batch):
+                self.turns += 1
+                if self.turns == stop_at:
+                    raise StopError
+
+        env = CommonsEnv(GAME, 2, seed=3)
+        (tmp_path / name).mkdir(exist_ok=True)
+        with AtSteps(tmp_path / name) as checkpoints:
+            try:
+                train(
+                    env,
+                    agents.learners,
+                    others=agents.others,
+                    episodes=7,
+                    observers=[Witness()],
+                    checkpoints=checkpoints,
+                )
+            except StopError:
+                assert checkpoints_in(tmp_path / name / "checkpoints")
+        return weights(agents)
+
+    whole = run("whole")
+    run("stopped", stop_at=47)
+    for key, value in run("stopped").items():
+        assert torch.equal(value, whole[key]), key
+
+
+def conducted(tmp_path, members, name="run"):
+    agents = population(members)
+    recipe = {"replicas": 2, "seed": 3, "game": GAME, "population": agents.told()}
+    run = start_run(tmp_path / name, "mixed", recipe)
+    study.conduct(run, agents, episodes=4, title="mixed", evaluation_episodes=2, watch="off")
+    return run, agents
+
+
+def test_a_mixed_run_is_kept_evaluated_and_built_again_from_its_directory(tmp_path, capsys):
+    members = [Learner(ALGORITHMS["C51"]), Learner(ALGORITHMS["PPO"]), Scripted("greedy"), Scripted()]
+    run, agents = conducted(tmp_path, members)
+    assert "trained, epsilon 0.05" in " ".join(capsys.readouterr().out.split())
+    loaded = cprl.load(run)
+    assert loaded.algorithms == {0: ALGORITHMS["C51"], 1: ALGORITHMS["PPO"]}
+    seen = torch.randint(256, (5, *GAME.observation_shape), dtype=torch.uint8)
+    for lane, network in agents.networks().items():
+        assert torch.equal(loaded.networks[lane](seen), network(seen))
+    env = loaded.env(2)
+    actions = loaded.policy(1)(env.reset())["agents", "action"]
+    assert actions.shape == (2, 4)
+
+
+def test_a_frozen_agent_plays_what_it_learned_and_changes_no_more(tmp_path, capsys):
+    run, earlier = conducted(tmp_path, [Learner(ALGORITHMS["DQN"])] * 4)
+    frozen = population([Frozen(run, 2, replica=1), *[Learner(ALGORITHMS["DQN"])] * 3])
+    (seats, actor), *rest = frozen.others.items()
+    assert (seats, rest) == ((0,), [])
+    actor.epsilon = 0.0
+    seen = CommonsEnv(GAME, 2, seed=9).reset()["agents", "observation"][:, :1]
+    network = earlier.networks()["replica_1/agent_2"]
+    assert torch.equal(actor.choose(seen), network(seen).argmax(-1))
+    before = frozen.others[0,].values(seen).clone()
+    trained(frozen)
+    assert torch.equal(frozen.others[0,].values(seen), before)
+    assert sorted({name.split("/")[1] for name in frozen.networks()}) == ["agent_1", "agent_2", "agent_3"]
+    again, _ = conducted(tmp_path, [Frozen(run, 2), *[Scripted()] * 3], name="again")
+    assert cprl.load(again).members[0] == {
+        "member": "Frozen",
+        "run": str(run),
+        "agent": 2,
+        "replica": 0,
+    }
+
+
+@dataclass(frozen=True, kw_only=True)
+class PPOFromReplay:
+    settings: DQNSettings
+    samples: ClassVar[bool] = True
+
+    def network(self, game):
+        return ALGORITHMS["PPO"].network(game)
+
+    def loss(self, network):
+        return ALGORITHMS["PPO"].loss(network)
+
+
+def test_what_does_not_fit_is_refused_before_training_and_says_what_fits(tmp_path, capsys):
+    dqn = Learner(ALGORITHMS["DQN"])
+    with pytest.raises(ValueError, match="3 members for a game of 4 seats; one for each is wanted"):
+        population([dqn] * 3)
+    assert isinstance(ALGORITHMS["PPO"].loss(ALGORITHMS["PPO"].network(GAME)), ClipPPOLoss)
+    with pytest.raises(
+        ValueError, match=r"ClipPPOLoss learns from what .* not from a replay buffer; what fits"
+    ):
+        population([Learner(PPOFromReplay(settings=REPLAY))] * 4)
+    with pytest.raises(ValueError, match=r'an agent has the networks .*; "actor" and "critic" are wanted'):
+        RolloutLearner(
+            GAME,
+            seats=[0],
+            replicas=1,
+            settings=ROLLOUTS,
+            make_network=lambda: acting_part(ALGORITHMS["PPO"].network(GAME)),
+            make_loss=ALGORITHMS["PPO"].loss,
+        )
+    with pytest.raises(ValueError, match=r"learn_every is 7; it must divide the rollouts' 20 steps"):
+        trained(population([Learner(ALGORITHMS["PPO"])] * 4), learn_every=7)
+    run, _ = conducted(tmp_path, [dqn] * 4)
+    larger = Game(map=GAME.map, rules=replace(GAME.rules, window_rows=4))
+    with pytest.raises(ValueError, match=r"have observations \(3, 3, 5\); this game has \(3, 4, 5\)"):
+        Population(larger, [Frozen(run, 0), dqn, dqn, dqn], compile=False)
+    other = Game(map=GAME.map, rules=GAME.rules, observation=Observation(agents_apart=True))
+    with pytest.raises(ValueError, match=r"have a form of observation .* this game has"):
+        Population(other, [Frozen(run, 0), dqn, dqn, dqn], compile=False)
+    with pytest.raises(ValueError, match=r"keeps no network of replica_9/agent_0; kept are"):
+        population([Frozen(run, 0, replica=9), dqn, dqn, dqn])
