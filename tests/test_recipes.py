@@ -14,6 +14,7 @@ from cprl import CommonsEnv, Map, Rules, presets, recording
 from cprl.acting import RandomActor, Seats
 from cprl.learning import DQNLearner, LaneLearner
 from cprl.measuring.evaluate import evaluate, mean_return
+from cprl.population import Learner, Population
 from cprl.recording import EpisodeTable, load_weights, read_episodes, restore_weights
 from cprl.recording.checkpoints import checkpoints_in, read_checkpoint
 from cprl.train import train
@@ -126,6 +127,20 @@ def test_recipes_of_replicas_leave_a_run_directory(name, variant, tmp_path, caps
     if name == "commons":
         network = LaneLearner(game, seats=[0], replicas=1, settings=settings, compile=False).networks()
         restore_weights_of(network["replica_0/agent_0"], weights["replica_1/agent_2"])
+
+
+@pytest.mark.parametrize("loss", ["dqn", "double_dqn", "cql", "sac", "iql", "ppo"])
+def test_swapping_the_loss_is_one_argument_and_each_leaves_a_run_that_plays_again(loss, tmp_path, capsys):
+    how = {"replicas": 2, "evaluation_episodes": 1, "compile": False, "watch": "off"}
+    episodes = 5 if loss == "ppo" else 1  # a rollout is longer than an episode is here
+    run = recipe("swap_the_loss").main(loss=loss, episodes=episodes, out=tmp_path / "run", **how)
+    loaded, algorithm = cprl.load(run), recipe("swap_the_loss").LOSSES[loss]
+    assert loaded.algorithms == {0: algorithm, 1: algorithm}
+    members = [Learner(algorithm)] * 2
+    for lane, network in Population(loaded.game, members, replicas=2, compile=False).networks().items():
+        trained = loaded.networks[lane].state_dict()
+        assert not any(torch.equal(value, trained[name]) for name, value in network.state_dict().items())
+    assert len(evaluate(loaded.env(1), loaded.policy(1), explore=True)) == 1
 
 
 def restore_weights_of(network, state):
