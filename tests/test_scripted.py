@@ -135,6 +135,12 @@ def test_aggressive_harvests_where_it_sees_nobody():
     assert scene.bitten == 1
 
 
+@pytest.mark.parametrize("manner", ["greedy", "territorial", "aggressive", "pacifist"])
+def test_cells_out_of_sight_are_neither_ground_nor_agents(manner):
+    scene = Scene("..#A\n.>#.\n...A", manner, walls_block_sight=True, window_columns=3)
+    assert scene.go(1)[0].startswith("turn_"), "the wall ahead hides what lies behind it"
+
+
 @pytest.mark.parametrize(("manner", "goes"), [("greedy", 1.0), ("pacifist", 0.0)])
 def test_pacifist_leaves_an_apple_to_which_another_is_nearer(manner, goes):
     scene = Scene("^..A.<\n......", manner, worlds=64)

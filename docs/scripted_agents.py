@@ -1,0 +1,35 @@
+"""The table of scripted agents in docs/algorithms.md: a whole population of each manner on a board.
+
+python docs/scripted_agents.py --board commons --episodes 20
+"""
+
+from statistics import fmean
+
+import tyro
+
+from cprl import CommonsEnv, presets
+from cprl.acting import ScriptedActor, Seats
+from cprl.acting.scripted import MANNERS
+from cprl.measuring.evaluate import evaluate, mean_return
+
+
+def main(*, board: presets.Board = "commons", episodes: int = 20, seed: int = 0) -> None:
+    """Prints, for each manner, means over episodes; the return with its standard error."""
+    game = presets.game(board)
+    everyone = tuple(range(game.agents))
+    print("| manner | return of all | steps | apples left | shots | tagged |\n|---|---:|---:|---:|---:|---:|")
+    for manner in MANNERS:
+        seeds = [(seed, agent) for agent in everyone]
+        actor = ScriptedActor(manner, game, seeds=seeds, seats=len(everyone), worlds=episodes)
+        played = evaluate(CommonsEnv(game, episodes, seed=seed), Seats({everyone: actor}))
+        return_, error = mean_return(played)
+        numbers = [
+            [float(episode.steps), float(episode.stock_left), episode.shots.sum(), episode.tagged.sum()]
+            for episode in played
+        ]
+        means = " | ".join(f"{fmean(column):.1f}" for column in zip(*numbers, strict=True))
+        print(f"| {manner} | {return_:.1f} ± {error:.1f} | {means} |", flush=True)
+
+
+if __name__ == "__main__":
+    tyro.cli(main)
