@@ -5,7 +5,7 @@ of twenty lines): `settings`, `network(game)` and `loss(network)`, and `samples`
 """
 
 from dataclasses import dataclass
-from typing import ClassVar, Protocol
+from typing import Any, ClassVar, Protocol
 
 import torch
 from tensordict import TensorDictBase
@@ -136,12 +136,16 @@ class AtomLogits(nn.Module):
 
 @dataclass(frozen=True, kw_only=True)
 class CQL:
-    """Conservative Q-learning by TorchRL's `DiscreteCQLLoss`, its two terms added.
+    """Conservative Q-learning by TorchRL's `DiscreteCQLLoss`: half the temporal difference's loss, and what
+    holds down the values of actions that were not taken.
 
     Source: Kumar et al., "Conservative Q-Learning for Offline Reinforcement Learning" (2020).
     """
 
     settings: DQNSettings
+    conservative_weight: float = 0.1
+    """Of the second term. TorchRL adds it whole, as for data that stay as they are; then agents who explore
+    imitate what they happened to do first (`tests/test_optimum.py`)."""
     loss_function: str = "l2"
     samples: ClassVar[bool] = False
 
@@ -151,8 +155,9 @@ class CQL:
 
     def loss(self, network: nn.Module) -> LossModule:
         """See `OffPolicy`."""
-        loss = DiscreteCQLLoss(
+        loss = _WeightedCQLLoss(
             _q_actor(network),
+            weight=self.conservative_weight,
             delay_value=True,
             loss_function=self.loss_function,
             action_space="categorical",
@@ -160,6 +165,19 @@ class CQL:
         loss.make_value_estimator(ValueEstimators.TD0, gamma=self.settings.gamma)
         _bootstrap_from_target(loss.value_estimator)
         return loss
+
+
+class _WeightedCQLLoss(DiscreteCQLLoss):
+    """The same with a weight of its conservative term."""
+
+    def __init__(self, actor: QValueActor, *, weight: float, **how: Any) -> None:
+        super().__init__(actor, **how)
+        self._weight = weight
+
+    def cql_loss(self, tensordict: TensorDictBase) -> tuple[torch.Tensor, dict[str, torch.Tensor]]:
+        """The term."""
+        loss, told = super().cql_loss(tensordict)
+        return self._weight * loss, told
 
 
 def _bootstrap_from_target(estimator: ValueEstimatorBase) -> None:
