@@ -1,6 +1,11 @@
 """Who goes where, and who gives way: boards before and after a turn."""
 
+from collections import Counter
+from dataclasses import replace
+
 from boards import Play, drawn
+
+from cprl.commons.batch import Batch
 
 
 def test_each_walk_goes_by_the_heading():
@@ -13,6 +18,31 @@ def test_each_walk_goes_by_the_heading():
     ends = {"forward": (2, 4), "backward": (2, 2), "left": (1, 3), "right": (3, 3), "stay": (2, 3)}
     for action, place in ends.items():
         assert Play(board).turn(action).places == [place], action
+
+
+def test_agents_start_where_the_map_says_or_change_places_every_episode_each_order_as_often():
+    board = "A>...\n.....\nv...<\n"
+    orders, fixed = Counter(), Play(board)
+    at = fixed.places
+    headings = dict(zip(at, fixed.batch.now.heading[0].tolist(), strict=True))
+    game = replace(fixed.game, rules=replace(fixed.game.rules, shuffle_starts=True))
+    batch = Batch(game, 100, seed=4)
+    told = batch.new_told()
+    for _ in range(12):
+        batch.begin(told)
+        places = [list(zip(*world, strict=True)) for world in zip(batch.now.row, batch.now.col, strict=True)]
+        orders.update(tuple(at.index(place) for place in world) for world in places)
+        for world, facing in zip(places, batch.now.heading.tolist(), strict=True):
+            assert [headings[place] for place in world] == facing, "a place keeps its heading"
+        fixed.batch.begin(fixed.told)
+        assert fixed.places == at
+    assert len(orders) == 6
+    assert all(140 < count < 260 for count in orders.values()), orders
+    alone = Batch(game, 1, seed=4, first_world=37)
+    for _ in range(12):
+        alone.begin(alone.new_told())
+    assert (alone.now.row[0] == batch.now.row[37]).all()
+    assert (alone.now.col[0] == batch.now.col[37]).all()
 
 
 def test_turning_left_and_right_turns_the_heading_by_a_quarter():

@@ -23,6 +23,7 @@ SITES_PER_DRAW = 16
 
 REGROWTH_FIRST_BYTE = 0 << 28
 REGROWTH_REST = 1 << 28
+STARTS = 2 << 28
 """What a draw is for stands in the upper four bits of the first counter word, the draw's number below."""
 
 

@@ -69,6 +69,9 @@ class Rules:
     episode_steps: int = 1000
     """Turns after which an episode is truncated [W]. At least 1."""
 
+    shuffle_starts: bool = False
+    """Whether agents change places at the start of every episode, each order equally likely (ours)."""
+
     pairwise_clashes: bool = False
     """[run] All move at once, then pairs of agents in the order of their numbers: two on one cell, or two
     that swapped, go back to where they began the turn, even if a third stands there. Agents out of play
@@ -175,6 +178,7 @@ def _may_fire_fits(value: Any) -> bool:
 _Check = tuple[Callable[[Any], bool], str]
 _SWITCHES: Final = (
     "walls_block_sight",
+    "shuffle_starts",
     "pairwise_clashes",
     "regrow_before_bites",
     "freeze_counts_tag_turn",

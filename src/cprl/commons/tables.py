@@ -67,6 +67,7 @@ class Tables(NamedTuple):
     sees_all: bool
     """Whether an agent is shown the whole board."""
     walls_block_sight: bool
+    shuffle_starts: bool
     never_from_nothing: bool
     """Whether an empty board stays empty."""
     pairwise_clashes: bool
@@ -230,6 +231,7 @@ def build_tables(board: Map, rules: Rules, observation: Observation) -> Tables:
         one_hot=observation.encoding == "one_hot",
         sees_all=sees_all,
         walls_block_sight=rules.walls_block_sight,
+        shuffle_starts=rules.shuffle_starts,
         never_from_nothing=rules.regrow_prob[0] == 0,
         pairwise_clashes=rules.pairwise_clashes,
         regrow_before_bites=rules.regrow_before_bites,

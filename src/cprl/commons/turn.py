@@ -1,8 +1,11 @@
 """The order of a turn, on ONE world."""
 
+import numpy as np
+
 from cprl.commons import apples, beam, chance, moves, views
-from cprl.commons.apples import bite, fill, find_sprouts, grow, recount
+from cprl.commons.apples import bite, draw, fill, find_sprouts, grow, recount
 from cprl.commons.beam import find_hits, tag
+from cprl.commons.chance import STARTS
 from cprl.commons.moves import (
     act,
     count_down,
@@ -49,6 +52,17 @@ def play_turn(world: Worlds, tables: Tables, actions: Actions, told: Told, scrat
     tell_state(world, tables, told, scratch)
 
 
+def shuffle_starts(world: Worlds) -> None:
+    """Agents change places, each order equally likely: from the last on, each with one of those up to it
+    (Durstenfeld, "Algorithm 235: Random permutation", 1964)."""
+    for i in range(world.row.shape[0] - 1, 0, -1):
+        word, _, _, _ = draw(world, STARTS | i)
+        j = int(word % np.uint64(i + 1))
+        world.row[i], world.row[j] = world.row[j], world.row[i]
+        world.col[i], world.col[j] = world.col[j], world.col[i]
+        world.heading[i], world.heading[j] = world.heading[j], world.heading[i]
+
+
 def begin_episode(world: Worlds, tables: Tables, told: Told, scratch: Scratch) -> None:
     """The next episode of a world: full stock, everybody at the start."""
     world.episode[0] += 1
@@ -56,6 +70,8 @@ def begin_episode(world: Worlds, tables: Tables, told: Told, scratch: Scratch) -
     world.ended[0] = PLAYING
     fill(world, tables)
     put_at_start(world, tables)
+    if tables.shuffle_starts:
+        shuffle_starts(world)
     tell_nothing_happened(told)
     tell_state(world, tables, told, scratch)
 
@@ -121,6 +137,7 @@ FUNCTIONS = (
     tell_nothing_happened,
     tell_state,
     play_turn,
+    shuffle_starts,
     begin_episode,
     look_again,
 )

@@ -1,6 +1,7 @@
 """Loss modules of TorchRL's as functions of their weights, and their weights by name."""
 
 from collections.abc import Callable, Mapping, Sequence
+from contextlib import suppress
 from typing import NamedTuple
 
 import torch
@@ -31,8 +32,10 @@ class FunctionalLoss:
         loss.reduction = "none"
         if hasattr(loss, "scalar_output_mode"):
             loss.scalar_output_mode = "exclude"  # numbers that are no loss, and of no transition
-        getattr(loss, "in_keys", None)  # made when first asked for, which a compiler would see as a change
-        getattr(loss, "value_estimator", None)
+        # Made when first asked for, which a compiler would see as a change; a loss may have neither.
+        getattr(loss, "in_keys", None)
+        with suppress(NotImplementedError):
+            getattr(loss, "value_estimator", None)
         self._groups = {name: group.batch_size for name, group in groups_of(loss).items()}
         self._singles = tuple(loss._parameters)
         for name in self._groups:

@@ -97,7 +97,7 @@ class ListUpdate:
         return torch.stack([self._learn(lane, batch[lane]) for lane in range(len(self.losses))])
 
     def _learn(self, lane: int, batch: TensorDict) -> Tensor:
-        loss = total(self.losses[lane](batch)) * self._share
+        loss = total(self.losses[lane](batch)).mean() * self._share
         self._adams[lane].zero_grad()
         loss.backward()  # type: ignore[no-untyped-call]
         if self._max_norm is not None:
