@@ -99,6 +99,14 @@ def change_points(
     ]
 
 
+def told_apart(
+    episodes: ArrayLike, metrics: Mapping[str, ArrayLike], *, number: int = 3
+) -> tuple[list[ChangePoint], list[Phase]]:
+    """So many change points and the phases between them; see `change_points` and `phases`."""
+    changes = change_points(episodes, metrics, number=number) if number else []
+    return changes, phases(episodes, metrics, changes)
+
+
 def phases(
     episodes: ArrayLike, metrics: Mapping[str, ArrayLike], changes: Sequence[ChangePoint]
 ) -> list[Phase]:

@@ -58,11 +58,12 @@ class Result:
     def title(self) -> str:
         """What was run, in a few words."""
         arguments, (replicas, episodes) = self.recipe["arguments"], self.curves["collective_return"].shape
-        decay = arguments["learner"]["epsilon_decay_steps"]
-        return (
-            f"{self.recipe['recipe']}, {arguments['variant']} rules, epsilon decays in {decay:,} steps, "
-            f"{replicas} replicas of {episodes:,} episodes"
-        )
+        told = [self.recipe["recipe"]]
+        if "variant" in arguments:
+            told.append(f"{arguments['variant']} rules")
+        if "learner" in arguments:
+            told.append(f"epsilon decays in {arguments['learner']['epsilon_decay_steps']:,} steps")
+        return ", ".join([*told, f"{replicas} replicas of {episodes:,} episodes"])
 
     @cached_property
     def phases(self) -> tuple[list[phases.ChangePoint], list[phases.Phase]] | None:
@@ -71,8 +72,7 @@ class Result:
         episodes = np.arange(smoothed["equality"].shape[1])
         if len(episodes) <= 4 * phases.SHORTEST:
             return None
-        changes = phases.change_points(episodes, smoothed)
-        return changes, phases.phases(episodes, smoothed, changes)
+        return phases.told_apart(episodes, smoothed)
 
 
 def read_result(path: Path) -> Result:
@@ -213,8 +213,7 @@ def _published_phases() -> tuple[list[phases.ChangePoint], list[phases.Phase]]:
     episodes = np.arange(10, 4745)
     # The curve of survival begins at episode 512; before that nobody depletes the board.
     metrics = {name: np.interp(episodes, *curve(study.curves[name])) for name in phases.METRICS}
-    changes = phases.change_points(episodes, metrics)
-    return changes, phases.phases(episodes, metrics, changes)
+    return phases.told_apart(episodes, metrics)
 
 
 def _phase_cells(changes: Sequence[phases.ChangePoint], found: Sequence[phases.Phase]) -> list[str]:

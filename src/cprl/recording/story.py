@@ -51,8 +51,7 @@ class Story:
         number = max(0, min(3, smoothed.shape[1] // phases.SHORTEST - 1))
         episodes = np.arange(smoothed.shape[1])
         metrics = dict(zip(phases.METRICS, smoothed, strict=True))
-        changes = phases.change_points(episodes, metrics, number=number) if number else []
-        return phases.phases(episodes, metrics, changes)
+        return phases.told_apart(episodes, metrics, number=number)[1]
 
     def _smoothed(self) -> NDArray[np.float64]:
         """Running means [M, E]; an undefined metric keeps its last value."""
