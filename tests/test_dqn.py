@@ -6,9 +6,10 @@ import pytest
 import torch
 from boards import random_actions
 from tensordict import TensorDict
+from torchrl.data.replay_buffers.samplers import PrioritizedSampler, SumSegmentTreeFp32
 
 from cprl import CommonsEnv, Game, Rules, keys, maps, presets
-from cprl.learning import DQNLearner, DQNSettings, transitions_of
+from cprl.learning import DQNLearner, DQNSettings, LaneLearner, transitions_of
 
 SHORT = Game(
     map=maps.parse(".A>.A\n.A.A.\n..<.A"),
@@ -92,6 +93,21 @@ def target_weights(agent):
 
 def own_weights(agent):
     return torch.cat([w.data.flatten() for w in agent.loss.value_network_params.values(True, True)])
+
+
+def test_prioritised_replay_prefers_large_errors_or_says_that_torchrls_extension_does_not_load():
+    settings = DQNSettings(buffer_size=50, priority_alpha=0.6, learning_starts=4, batch_size=4)
+    if SumSegmentTreeFp32 is None:
+        with pytest.raises(RuntimeError, match=r"priority_alpha is 0\.6, but TorchRL's compiled extension"):
+            DQNLearner((3, 3, 5), 8, settings=settings)
+        return
+    assert isinstance(DQNLearner((3, 3, 5), 8, settings=settings).buffer.sampler, PrioritizedSampler)
+
+
+def test_lanes_refuse_priorities():
+    game = Game(map=maps.parse(".A>\n..<"), rules=Rules(window_rows=3, window_columns=5))
+    with pytest.raises(ValueError, match=r"priority_alpha is 0\.5; lanes sample uniformly, 0 is what fits"):
+        LaneLearner(game, seats=(0, 1), replicas=1, settings=DQNSettings(priority_alpha=0.5))
 
 
 def test_the_target_network_starts_as_a_copy_and_as_run_with_weights_of_its_own():

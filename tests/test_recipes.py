@@ -8,6 +8,7 @@ from pathlib import Path
 import pyarrow.parquet as pq
 import pytest
 import torch
+from rerun.chunk import RrdReader
 
 import cprl
 from cprl import CommonsEnv, Map, Rules, presets, recording
@@ -141,6 +142,23 @@ def test_swapping_the_loss_is_one_argument_and_each_leaves_a_run_that_plays_agai
         trained = loaded.networks[lane].state_dict()
         assert not any(torch.equal(value, trained[name]) for name, value in network.state_dict().items())
     assert len(evaluate(loaded.env(1), loaded.policy(1), explore=True)) == 1
+
+
+def test_unlike_neighbours_train_in_one_loop_are_recorded_and_evaluated(tmp_path, capsys):
+    how = {"replicas": 2, "episodes": 5, "evaluation_episodes": 1, "compile": False}
+    run = recipe("mixed").main(neighbour="greedy", out=tmp_path / "run", **how)
+    kinds = [member.get("algorithm", member.get("manner")) for member in cprl.load(run).members]
+    assert kinds == ["DQN", "DQN", "PPO", "greedy"]
+    rows = pq.read_table(run / "evaluation" / "trained.parquet").to_pydict()
+    assert sorted(set(rows["agent"])) == [0, 1, 2, 3]
+    shots = dict.fromkeys(range(4), 0)
+    for agent, of_agent in zip(rows["agent"], rows["shots"], strict=True):
+        shots[agent] += of_agent
+    assert shots[3] == 0, "the greedy never fire"
+    assert max(shots.values()) > 0
+    told = {chunk.entity_path for chunk in RrdReader(run / "run.rrd").stream()}
+    assert {f"/agent_{agent}/return" for agent in range(4)} <= told
+    assert {f"/agent_{agent}/loss" for agent in range(3)} <= told
 
 
 def restore_weights_of(network, state):

@@ -2,17 +2,22 @@
 
 from collections.abc import Sequence
 from functools import partial
+from typing import Final
 
 import torch
 from tensordict import TensorDictBase
 from torch import nn
-from torchrl.data import LazyTensorStorage, TensorDictReplayBuffer
+from torchrl.data import LazyTensorStorage, PrioritizedSampler, TensorDictReplayBuffer
+from torchrl.data.replay_buffers import RandomSampler, Sampler
 from torchrl.modules import QValueActor
 from torchrl.objectives import DQNLoss, HardUpdate, ValueEstimators
 
 from cprl.acting.actors import QActor
 from cprl.acting.networks import QNetwork
 from cprl.learning.settings import DQNSettings
+
+PRIORITY_BETA: Final = 0.4
+"""How far the weights of a loss make up for preferred transitions, as in Schaul et al. at first."""
 
 
 class DQNLearner:
@@ -55,6 +60,7 @@ class DQNLearner:
         )
         self.buffer = TensorDictReplayBuffer(
             storage=LazyTensorStorage(settings.buffer_size, device=device),
+            sampler=_sampler(settings),
             batch_size=settings.batch_size,
             generator=torch.Generator(device).manual_seed(seed),
         )
@@ -77,7 +83,10 @@ class DQNLearner:
         """One update from a sample; the loss, or None while too little is stored."""
         if len(self.buffer) < self.settings.learning_starts:
             return None
-        loss = self.loss(self.buffer.sample())["loss"] * self._loss_share
+        sample = self.buffer.sample()
+        loss = self.loss(sample)["loss"] * self._loss_share
+        if self.settings.priority_alpha:
+            self.buffer.update_tensordict_priority(sample)
         self._adam.zero_grad()
         loss.backward()
         self._adam.step()
@@ -86,6 +95,19 @@ class DQNLearner:
     def end_episode(self) -> None:
         """Counts an episode; the target network is replaced after every so many."""
         self._target.step()
+
+
+def _sampler(settings: DQNSettings) -> Sampler:
+    if not settings.priority_alpha:
+        return RandomSampler()
+    try:
+        return PrioritizedSampler(settings.buffer_size, alpha=settings.priority_alpha, beta=PRIORITY_BETA)
+    except Exception as error:
+        raise RuntimeError(
+            f"priority_alpha is {settings.priority_alpha}, but TorchRL's compiled extension, wanted for that, "
+            f"does not load with torch {torch.__version__} ({error}); "
+            "0 is what fits, or a TorchRL that was built for this torch"
+        ) from error
 
 
 def dqn_loss(network: nn.Module, *, gamma: float) -> DQNLoss:

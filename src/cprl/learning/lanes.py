@@ -79,6 +79,11 @@ class LaneLearner:
             or partial(q_network, shape, actions, settings=settings, highest=game.observation.highest),
             samples=samples,
         )
+        if settings.priority_alpha:
+            raise ValueError(
+                f"priority_alpha is {settings.priority_alpha}; lanes sample uniformly, 0 is what fits, or a "
+                "plain DQNLearner for each agent"
+            )
         networks = self._lanes.new_networks(WEIGHTS, device)
         refuse_on_policy(make_loss(deepcopy(networks[0])))
         own_targets = settings.own_target_weights

@@ -35,6 +35,9 @@ class DQNSettings:
     """Steps of the linear decay that follow."""
     epsilon_evaluation: float = 0.05
     """Chance of a random action in evaluation."""
+    priority_alpha: float = 0.0
+    """How much transitions of a large error are preferred in sampling (Schaul et al., "Prioritized Experience
+    Replay", 2016); 0 for not at all. Above 0 wants TorchRL's compiled extension and a `DQNLearner`."""
     target_every_episodes: int = 3
     """Episodes between copies of the network to its target; experiment 5 was run with 3 or 10."""
     relu_on_outputs: bool = False

@@ -55,7 +55,7 @@ class ProgressBar:
         self._told = {"return": "-", "epsilon": "-"}
         self._steps = self._steps_then = self._steps_this_episode = self._episodes = 0
         self._started = self._then = time.perf_counter()
-        self._left_of, self._replicas = episodes, replicas
+        self._left_of, self._replicas, self._before = episodes, replicas, 0
 
     def see_turn(self, batch: TensorDictBase) -> None:
         """Counts the turns of a batch and, now and then, moves the bar."""
@@ -85,12 +85,21 @@ class ProgressBar:
         self._progress.update(self._task, completed=done, told=told)
         if not self.console.is_terminal and self._steps:
             spent_s = time.perf_counter() - self._started
-            left_s = spent_s / done * (self._left_of - done)
+            since = done - self._before / self._replicas
+            left_s = spent_s / since * (self._left_of - done) if since else float("nan")
             episode = self._episodes // self._replicas
             self.console.print(
                 f"{self._title}: episode {episode}/{self._left_of}  {told}  {left_s:,.0f} s left",
                 soft_wrap=True,
             )
+
+    def state_dict(self) -> dict[str, int]:
+        """How many episodes have ended."""
+        return {"episodes": self._episodes}
+
+    def load_state_dict(self, state: Mapping[str, int]) -> None:
+        """Counts on from there."""
+        self._episodes = self._before = int(state["episodes"])
 
     def __enter__(self) -> Self:
         self._progress.start()
