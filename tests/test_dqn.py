@@ -98,7 +98,7 @@ def own_weights(agent):
 def test_prioritised_replay_prefers_large_errors_or_says_that_torchrls_extension_does_not_load():
     settings = DQNSettings(buffer_size=50, priority_alpha=0.6, learning_starts=4, batch_size=4)
     if SumSegmentTreeFp32 is None:
-        with pytest.raises(RuntimeError, match=r"priority_alpha is 0\.6, but TorchRL's compiled extension"):
+        with pytest.raises(RuntimeError, match=r"priority_alpha is 0\.6: TorchRL's compiled extension"):
             DQNLearner((3, 3, 5), 8, settings=settings)
         return
     assert isinstance(DQNLearner((3, 3, 5), 8, settings=settings).buffer.sampler, PrioritizedSampler)

@@ -104,7 +104,7 @@ def _sampler(settings: DQNSettings) -> Sampler:
         return PrioritizedSampler(settings.buffer_size, alpha=settings.priority_alpha, beta=PRIORITY_BETA)
     except Exception as error:
         raise RuntimeError(
-            f"priority_alpha is {settings.priority_alpha}, but TorchRL's compiled extension, wanted for that, "
+            f"priority_alpha is {settings.priority_alpha}: TorchRL's compiled extension, which it wants, "
             f"does not load with torch {torch.__version__} ({error}); "
             "0 is what fits, or a TorchRL that was built for this torch"
         ) from error
