@@ -97,10 +97,10 @@ def _numbers(agents: tuple[str, ...], replicas: int) -> Any:
         return _plot(name, f"social/{entity}", share=share, legend=replicas == 1)
 
     learning = rrb.Horizontal(
-        _plot("Loss", *_of(agents, "loss")),
-        _plot("Q value of the greedy action", *_of(agents, "q")),
-        _plot("Epsilon", *_of(agents, "epsilon"), share=True),
-        _plot("Steps per second", "time/env_steps_per_s"),
+        _plot("Loss", *_of(agents, "loss"), legend=False),
+        _plot("Highest Q value", *_of(agents, "q"), legend=False),
+        _plot("Epsilon", *_of(agents, "epsilon"), share=True, legend=False),
+        _plot("Steps per second", "time/env_steps_per_s", legend=False),
         name="Learning",
     )
     more = rrb.Horizontal(

@@ -24,6 +24,7 @@ OTHERS: Final = {
     "evaluation/greedy_return": ("greedy, evaluated", (230, 160, 0)),
     "turn/stock": ("apples", (0, 200, 0)),
 }
+TOO_EARLY: Final = "too early to tell"
 OF_AGENTS: Final = ("return", "loss", "epsilon", "q", "harvested")
 PHASE_COLOURS: Final = {
     "exploration": (86, 180, 233),
@@ -31,6 +32,7 @@ PHASE_COLOURS: Final = {
     "combat": (204, 121, 167),
     "cultivation": (0, 158, 115),
     "another": (120, 120, 120),
+    TOO_EARLY: (60, 60, 60),
 }
 
 _MEAN_WIDTH, _SINGLE_WIDTH, _SINGLE_SHARE = 2.5, 0.7, 0.45
@@ -51,7 +53,7 @@ class Scene:
     window: tuple[int, int]
     """(X, Y) of a window."""
     replicas: int = 1
-    """How many replicas' metrics are drawn: their mean, and thinner each of them."""
+    """How many replicas' metrics are drawn: each of them thinly, and their mean."""
     is_replay: bool = False
     """Whether it is one episode of a stored policy: then harvest and stock are told turn by turn, and there
     are no curves over episodes."""
@@ -83,16 +85,16 @@ def lines(scene: Scene | None) -> dict[str, Any]:
 
 
 def _mean_and_singles(name: str, colour: tuple[int, int, int], replicas: int) -> Any:
-    """A thick line for the mean of several replicas, and a thin, darker one for each."""
+    """A thin, dark line for each of several replicas, and over them a thick one for their mean."""
     import rerun as rr
 
     if replicas == 1:
         return rr.SeriesLines(names=[name], colors=[colour])
     dark = tuple(round(_SINGLE_SHARE * part) for part in colour)
     return rr.SeriesLines(
-        names=[f"{name}, mean", *(f"replica {replica}" for replica in range(replicas))],
-        colors=[colour, *[dark] * replicas],
-        widths=[_MEAN_WIDTH, *[_SINGLE_WIDTH] * replicas],
+        names=[*(f"replica {replica}" for replica in range(replicas)), f"{name}, mean"],
+        colors=[*[dark] * replicas, colour],
+        widths=[*[_SINGLE_WIDTH] * replicas, _MEAN_WIDTH],
     )
 
 

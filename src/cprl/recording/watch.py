@@ -20,7 +20,7 @@ from cprl.measuring.episodes import Episode
 from cprl.recording.frames import Frame, FrameBuffer, classes_seen
 from cprl.recording.rerun import FILE_NAME, RerunLogger
 from cprl.recording.run import FILE_NAME as RECIPE_FILE
-from cprl.recording.scenery import Scene
+from cprl.recording.scenery import TOO_EARLY, Scene
 from cprl.recording.series import Series, Values, mean_of
 from cprl.recording.stage import frame_bytes
 from cprl.recording.story import ANOTHER, Story
@@ -108,6 +108,8 @@ class Watch:
         self._told_step = 0
         self.logger.log_hparams({"run": str(run), **(recipe or {})})
         self.logger.log_text(f"{title} begins")
+        if not is_replay:
+            self.logger.log_states("phase/now", {0: TOO_EARLY})
 
     def see_turn(self, batch: TensorDictBase) -> None:
         """Copies the first world as it stands after the turn, if this episode's frames are kept."""
@@ -145,7 +147,7 @@ class Watch:
         logger, now = self.logger, time.perf_counter()
         for name, values in of_all.items():
             singles = values.tolist() if name.startswith("social/") and len(values) > 1 else []
-            logger.log_lines(name, [mean_of(values), *singles])
+            logger.log_lines(name, [*singles, mean_of(values)])
         steps = (self._step - self._told_step) * self._series.replicas
         if steps:
             logger.log_scalar("time/env_steps_per_s", steps / (now - self._told_at))
