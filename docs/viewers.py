@@ -12,10 +12,10 @@ import subprocess
 import tempfile
 import time
 from collections.abc import Callable, Iterator, Mapping
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any
-from urllib.error import URLError
+from urllib.error import HTTPError, URLError
 from urllib.request import Request, urlopen
 
 import rerun_cli
@@ -24,7 +24,7 @@ from rerun.experimental import ViewerClient
 VIEWER = Path(rerun_cli.__path__[0]) / "rerun"
 """The viewer itself: the console script `rerun` would leave it running when it is ended."""
 
-START_S, STEADY_S = 30.0, 60.0
+START_S, STEADY_S, BUSY_S = 30.0, 60.0, 180.0
 
 CHROMIUM = (
     *("--headless", "--no-sandbox", "--disable-quic", "--no-first-run", "--disable-background-networking"),
@@ -120,11 +120,12 @@ def browser(page: str, *, size: tuple[int, int] = (1600, 1000)) -> Iterator[Call
                 f"{address}/session/{_asked(f'{address}/session', {'capabilities': wanted})['sessionId']}"
             )
             _asked(f"{session}/url", {"url": page})
-            yield lambda: base64.b64decode(_asked(f"{session}/screenshot"))
+            yield lambda: base64.b64decode(_patiently(f"{session}/screenshot"))
         finally:
             if session:
-                _asked(session, method="DELETE")
-            process.kill()
+                with suppress(RuntimeError, OSError):  # a busy page may not answer; it ends with the driver
+                    _asked(session, method="DELETE")
+            process.terminate()
             process.wait()
 
 
@@ -135,12 +136,27 @@ def _is_ready(address: str) -> bool:
         return False
 
 
+def _patiently(address: str) -> Any:
+    """What WebDriver answers at last: it waits ten seconds for a page, which may be busy drawing on a CPU."""
+    began = time.monotonic()
+    while True:
+        try:
+            return _asked(address)
+        except RuntimeError as error:
+            if "renderer" not in str(error) or time.monotonic() - began > BUSY_S:
+                raise
+            time.sleep(1)
+
+
 def _asked(address: str, body: Mapping[str, Any] | None = None, *, method: str | None = None) -> Any:
     """What WebDriver answers."""
     data = None if body is None else json.dumps(body).encode()
     request = Request(address, data, {"Content-Type": "application/json"}, method=method)
-    with urlopen(request, timeout=120) as answer:
-        return json.load(answer)["value"]
+    try:
+        with urlopen(request, timeout=120) as answer:
+            return json.load(answer)["value"]
+    except HTTPError as error:
+        raise RuntimeError(f"chromedriver says to {address}: {error.read().decode()[:300]}") from error
 
 
 def free_port() -> int:

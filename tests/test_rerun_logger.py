@@ -116,7 +116,7 @@ def test_frames_show_the_board_the_agents_and_what_each_sees(tmp_path):
     _, places = column(path, "world/agents", "Arrows2D:origins")
     assert places[1] == [[1 + 1.5, 0 + 1.5], [4 + 1.5, 1 + 1.5]]
     _, headings = column(path, "world/agents", "Arrows2D:vectors")
-    assert headings[2] == [pytest.approx([0, 0.9]), [0, 0]], (
+    assert headings[2] == [pytest.approx([0, 1.5]), [0, 0]], (
         "heading 2 points down; who is out points nowhere"
     )
     assert static(path, "world/agents", "Arrows2D:labels") == ["0", "1"]

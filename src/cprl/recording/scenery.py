@@ -35,7 +35,7 @@ PHASE_COLOURS: Final = {
     TOO_EARLY: (60, 60, 60),
 }
 
-_MEAN_WIDTH, _SINGLE_WIDTH, _SINGLE_SHARE = 2.5, 0.7, 0.45
+_MEAN_WIDTH, _AGENT_WIDTH, _SINGLE_WIDTH, _SINGLE_SHARE = 2.5, 1.5, 0.7, 0.45
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -80,7 +80,9 @@ def lines(scene: Scene | None) -> dict[str, Any]:
         styles[entity] = rr.SeriesLines(names=[name], colors=[colour])
     for agent, name in enumerate(scene.agents if scene else ()):
         for entity in OF_AGENTS:
-            styles[f"{name}/{entity}"] = rr.SeriesLines(names=[name], colors=[agent_colour(agent)])
+            styles[f"{name}/{entity}"] = rr.SeriesLines(
+                names=[name], colors=[agent_colour(agent)], widths=[_AGENT_WIDTH]
+            )
     return styles
 
 

@@ -15,7 +15,8 @@ RIM_CELLS: Final = 1
 """Cells of wall that are shown around the board."""
 
 _AHEAD: Final = np.array([(0, -1), (1, 0), (0, 1), (-1, 0)], np.float32)
-_ARROW_CELLS: Final = 0.9
+_ARROW_CELLS: Final = 1.5
+"""From an agent's centre into the next cell: the number stands at its middle, and hides less of the agent."""
 _OUT_HALF_CELLS: Final = 0.4
 _BEAM_OPACITY: Final = 0.5
 _STROKE_CELLS: Final = 0.07
