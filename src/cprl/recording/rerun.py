@@ -75,6 +75,7 @@ class RerunLogger(Logger):
         self.frames = 0
         """Frames recorded so far, in earlier files of the recording too."""
         self._now = (0, 0)
+        self._clips_end: dict[str, int] = {}
         super().__init__(exp_name, str(log_dir))
 
     def _create_experiment(self) -> list[Any]:
@@ -191,7 +192,10 @@ class RerunLogger(Logger):
         self._static("recipe", rr.TextDocument(text, media_type=rr.MediaType.MARKDOWN))
 
     def log_video(self, name: str, video: Tensor, step: int | None = None, **kwargs: Any) -> None:
-        """Logs uint8 [(1), T, C, H, W] as T images, one each `step` from the one given."""
+        """Logs uint8 [(1), T, C, H, W] as T images, one each `step` from the one given.
+
+        A clip of the same name that goes on until later is followed, since TorchRL's recorders count clips.
+        """
         import rerun as rr
 
         clip = torch.as_tensor(video).cpu()
@@ -199,7 +203,8 @@ class RerunLogger(Logger):
         if clip.ndim != 4:
             raise ValueError(f"the video is {list(video.shape)}; [T, C, H, W] or [1, T, C, H, W] is wanted")
         images = clip.permute(0, 2, 3, 1).to(torch.uint8).numpy()
-        first = self._now[0] if step is None else int(step)
+        first = max(self._now[0] if step is None else int(step), self._clips_end.get(name, 0))
+        self._clips_end[name] = first + len(images)
         form = rr.components.ImageFormat(
             width=images.shape[2],
             height=images.shape[1],
