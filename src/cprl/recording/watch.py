@@ -25,8 +25,8 @@ from cprl.recording.series import Series, Values, mean_of
 from cprl.recording.stage import frame_bytes
 from cprl.recording.story import ANOTHER, Story
 
-FRAMES_BYTES: Final = 60_000_000
-"""The frames of a whole run are to take about so much of a file."""
+FRAMES_BYTES: Final = 45_000_000
+"""The frames of every k-th episode are to take about so much of a file; those after new bests come on top."""
 TAGS_EVERY: Final = 50
 """Episodes whose tags make one matrix of who tagged whom."""
 
@@ -118,7 +118,7 @@ class Watch:
             self._send_frames()
             self._episode += 1
             self._shows_next = False
-        if not self._is_shown:
+        if not self.is_shown:
             return
         self._remember_tags(batch)
         self._buffer.add(self._step, self._episode, self._frame())
@@ -169,7 +169,7 @@ class Watch:
         self.logger.log_text(event)
 
     @property
-    def _is_shown(self) -> bool:
+    def is_shown(self) -> bool:
         """Whether frames are kept of the episode that goes on."""
         last = self._episodes - 1
         return self._episode <= last and (
