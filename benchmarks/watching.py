@@ -22,7 +22,6 @@ from tempfile import TemporaryDirectory
 from typing import Final
 
 import numpy as np
-import torch
 import tyro
 from rich.console import Console
 from rich.table import Table
@@ -107,15 +106,13 @@ def size(run: Path, episodes: int) -> tuple[int, int]:
     with Watch(run, env, title="size", episodes=episodes) as watch:
         witness = Witness(watch)
         training = Training(env, {}, others=at_random, episodes=10**9, observers=[witness])
-        nobody = torch.zeros(REPLICAS, len(SEATS), len(SEATS), dtype=torch.bool)
-        done = torch.ones(REPLICAS, 1, dtype=torch.bool)
-        ended = TensorDict({"next": {"done": done, "agents": {"tagged_by": nobody}}}, [REPLICAS])
+        unseen = TensorDict({}, [REPLICAS])
         for number in range(episodes):
             if watch.is_shown:
                 for _ in range(game.rules.episode_steps):
                     training.step()
             else:
-                witness.see_turn(ended)
+                witness.see_turn(unseen)
             better = 0.1 + 1.1 * number / episodes
             for replica, nth in enumerate(chance.integers(len(witness.played), size=REPLICAS)):
                 episode = witness.played[nth]

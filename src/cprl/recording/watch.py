@@ -112,13 +112,15 @@ class Watch:
             self.logger.log_states("phase/now", {0: TOO_EARLY})
 
     def see_turn(self, batch: TensorDictBase) -> None:
-        """Copies the first world as it stands after the turn, if this episode's frames are kept."""
+        """Copies the first world as it stands after the turn, if this episode's frames are kept.
+
+        Otherwise it does next to nothing: a look at a tensor each turn would cost a training some percent.
+        """
         self._step += 1
-        if keys.entry(keys.entry(batch, "next"), keys.DONE)[0, 0]:
-            self._send_frames()
-            self._episode += 1
-            self._shows_next = False
         if not self.is_shown:
+            return
+        if keys.entry(keys.entry(batch, "next"), keys.DONE)[0, 0]:  # the board is the next episode's already
+            self._send_frames()
             return
         self._remember_tags(batch)
         self._buffer.add(self._step, self._episode, self._frame())
@@ -132,6 +134,8 @@ class Watch:
         numbers["social/stock_left"] = float(episode.stock_left)
         for agent, value in zip(self.env.game.agent_names, episode.return_, strict=True):
             numbers[f"{agent}/return"] = float(value)
+        if episode.world == 0:
+            self._episode, self._shows_next = episode.episode + 1, False
         if episode.world == 0 and episode.depletion_step > 0:
             self.logger.at(step=self._step, episode=episode.episode)
             self.logger.log_text(
