@@ -1,8 +1,9 @@
 """What watching costs: training time with the default recording against without, and the size of the file.
 
-Time: the `commons` recipe (4 agents, 8 replicas, compiled) in one process, one thread. Whole episodes with
-the recording and without take turns, pair by pair, in either order; the median of the pairs' ratios counts,
-once for episodes whose frames are kept and once for the others, and both by how many of 5,000 there are.
+Time: the `commons` recipe (4 agents, 8 replicas, compiled) in one process, one thread. Blocks of 50 turns
+with the recording and without take turns, in either order; their ratio counts over an episode's length of
+each, the median of several, once for episodes whose frames are kept and once for the others, and both by how
+many of 5,000 there are.
 
 Size: 5,000 episodes of `commons` with 8 replicas are written. Those whose frames are kept are really played,
 by agents that act at random; the numbers of the others are drawn from what was played before, with returns
@@ -37,13 +38,15 @@ from cprl.train import Training, prepare_process
 SEATS: Final = (0, 1, 2, 3)
 REPLICAS: Final = 8
 EPISODES: Final = 5000
+BLOCK: Final = 50
+"""Turns; an episode's end falls on the last of an even number of pairs."""
 EPISODE_S: Final = 1.8
 FLUSHED_EVERY: Final = round(60 / EPISODE_S)
 MOST_TIME, MOST_BYTES = 0.02, 100e6
 """What is allowed."""
 
 
-def cost(run: Path, pairs: int) -> tuple[float, float, int]:
+def cost(run: Path, repeats: int) -> tuple[float, float, int]:
     """How many times as long an episode takes when it is recorded: with frames, and without; and of how many
     episodes one has its frames kept."""
     prepare_process(0)
@@ -54,25 +57,26 @@ def cost(run: Path, pairs: int) -> tuple[float, float, int]:
     training = Training(env, {SEATS: learner}, episodes=10**9)
     steps = game.rules.episode_steps
 
-    def episode_s(watch: Watch | None) -> float:
+    def seconds(watch: Watch | None) -> float:
         training.observers = [watch] if watch else []
         started = time.perf_counter()
-        for _ in range(steps):
+        for _ in range(BLOCK):
             training.step()
         return time.perf_counter() - started
 
     def ratio(watch: Watch) -> float:
+        """The last block of an episode is always one that is watched."""
         ratios = []
-        for pair in range(pairs):
-            if pair % 2:
-                without = episode_s(None)
-                ratios.append(episode_s(watch) / without)
-            else:
-                with_it = episode_s(watch)
-                ratios.append(with_it / episode_s(None))
+        for _ in range(repeats):
+            spent = {True: 0.0, False: 0.0}
+            for pair in range(steps // BLOCK):
+                for watched in (False, True) if pair % 2 else (True, False):
+                    spent[watched] += seconds(watch if watched else None)
+            ratios.append(spent[True] / spent[False])
         return median(ratios)
 
-    episode_s(None)
+    for _ in range(steps // BLOCK):
+        seconds(None)
     with Watch(run, env, title="cost", episodes=EPISODES) as watch:
         every, watch.every = watch.every, 1
         shown = ratio(watch)
@@ -128,15 +132,15 @@ def size(run: Path, episodes: int) -> tuple[int, int]:
     return watch.logger.path.stat().st_size, watch.logger.frames
 
 
-def main(*, pairs: int = 12, episodes: int = EPISODES) -> None:
+def main(*, repeats: int = 12, episodes: int = EPISODES) -> None:
     """Prints the table; ends with exit code 1 where more is taken than is allowed.
 
     Args:
-        pairs: of episodes, with and without the recording, for either kind.
+        repeats: of as many turns as an episode has with the recording, and as many without, for either kind.
         episodes: that are written.
     """
     with TemporaryDirectory() as folder:
-        shown, others, every = cost(Path(folder), pairs)
+        shown, others, every = cost(Path(folder), repeats)
     with TemporaryDirectory() as folder:
         size_bytes, frames = size(Path(folder), episodes)
     time_share = (shown + (every - 1) * others) / every - 1
