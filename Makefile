@@ -5,7 +5,9 @@ TORCH_INDEX ?=
 BIN := .venv/bin
 INSTALLED := .venv/.installed
 
-.PHONY: run test test-slow test-gpu check bench bench-gpu clean
+VIEWER_PACKAGES := mesa-vulkan-drivers libvulkan1 chromium chromium-driver
+
+.PHONY: run test test-slow test-gpu test-viewer viewer-packages check bench bench-gpu clean
 
 run: $(INSTALLED)
 	$(BIN)/python recipes/first_run.py --watch serve
@@ -15,6 +17,13 @@ test: $(INSTALLED)
 
 test-slow: $(INSTALLED)
 	$(BIN)/python -m pytest -m slow
+
+# Real viewers without a screen, pictures of which are looked at; see docs/watching.md.
+test-viewer: $(INSTALLED) viewer-packages
+	$(BIN)/python -m pytest -m viewer
+
+viewer-packages:
+	sh tests/install_viewers.sh $(VIEWER_PACKAGES)
 
 check: $(INSTALLED)
 	$(BIN)/ruff check .
@@ -28,6 +37,7 @@ bench: $(INSTALLED)
 	$(BIN)/python benchmarks/lane_updates.py
 	$(BIN)/python benchmarks/training_step.py
 	$(BIN)/python benchmarks/losses.py
+	$(BIN)/python benchmarks/watching.py
 
 # With a GPU: first `.venv/bin/pip install -c constraints.txt -e ".[cuda13]"`, or cuda12, as torch has it.
 test-gpu: $(INSTALLED)

@@ -45,6 +45,7 @@ def main(
         watch: "file", or live as well: "serve", "spawn", "connect ADDRESS"; "off" for no recording.
         compile: whether torch compiles the update; needs a C++ compiler, and is several times faster.
     """
+    recording.check_watch(watch)
     prepare_process(seed)
     game = presets.game("commons", variant=variant)
     settings = presets.learner("commons", variant=variant)

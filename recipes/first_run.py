@@ -23,6 +23,7 @@ from cprl.recording import (
     EpisodeTable,
     ProgressBar,
     Watch,
+    check_watch,
     restore_weights,
     save_weights,
     start_run,
@@ -56,6 +57,7 @@ def main(
         out: the run's directory; by default a new one under runs/.
         watch: "file", or live as well: "serve" on 127.0.0.1, "spawn" a viewer, "connect ADDRESS".
     """
+    check_watch(watch, can_be_off=False)
     game = presets.game("single_basic", variant=variant)
     settings = replace(presets.learner("single_basic", variant=variant), **SHORT)
     title = f"single_basic, {variant} rules, short schedule, {episodes} episodes"

@@ -43,6 +43,7 @@ def main(
         watch: "file", or live as well: "serve", "spawn", "connect ADDRESS"; "off" for no recording.
         compile: whether torch compiles the update; needs a C++ compiler, and is several times faster.
     """
+    recording.check_watch(watch)
     prepare_process(seed)
     game = presets.game("commons")
     settings = replace(presets.learner("commons"), learning_rate=1e-4, epsilon_decay_steps=100_000)

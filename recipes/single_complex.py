@@ -42,6 +42,7 @@ def main(
         watch: "file", or live as well: "serve", "spawn", "connect ADDRESS"; "off" for no recording.
         compile: whether torch compiles the update; needs a C++ compiler, and is several times faster.
     """
+    recording.check_watch(watch)
     prepare_process(seed)
     game = presets.game("single_complex", variant=variant)
     settings = presets.learner("single_complex", variant=variant)

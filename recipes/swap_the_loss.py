@@ -56,6 +56,7 @@ def main(
         watch: "file", or live as well: "serve", "spawn", "connect ADDRESS"; "off" for no recording.
         compile: whether torch compiles the update; needs a C++ compiler, and is several times faster.
     """
+    recording.check_watch(watch)
     prepare_process(seed)
     game, name = presets.game("two_complex"), f"swap_the_loss_{loss}"
     population = Population(game, [Learner(LOSSES[loss])] * 2, replicas=replicas, seed=seed, compile=compile)

@@ -2,6 +2,7 @@
 
 import importlib.util
 import json
+import re
 from dataclasses import replace
 from pathlib import Path
 
@@ -282,3 +283,13 @@ def test_a_run_that_cannot_be_loaded_says_which_file_and_why(tmp_path, capsys):
         cprl.load(run)
     with pytest.raises(ValueError, match=r"recipe\.json is no recipe of a run"):
         cprl.load(tmp_path)
+
+
+@pytest.mark.parametrize("watch", ["telepathy", "connect", "connect nobody", "connect rerun+http://:x/proxy"])
+@pytest.mark.parametrize(
+    "name", sorted(path.stem for path in RECIPES.glob("*.py") if path.stem != "reproduce")
+)
+def test_a_way_to_watch_that_is_none_is_refused_before_there_is_a_run(name, watch, tmp_path):
+    with pytest.raises(ValueError, match=re.escape(f"watch is {watch!r}") + '; wanted: "file",.* or "con'):
+        recipe(name).main(watch=watch, out=tmp_path / "run")
+    assert not (tmp_path / "run").exists()

@@ -9,6 +9,7 @@ from types import SimpleNamespace
 import numpy as np
 import pyarrow as pa
 import pytest
+from rerun.chunk import RrdReader
 from test_rerun_logger import column
 
 import cprl
@@ -97,13 +98,26 @@ def test_the_command_writes_a_report(run, tmp_path, capsys, monkeypatch):
         cli.main()
 
 
+def views_of(path):
+    """The names of the views that a recording opens with."""
+    reader, component = RrdReader(path), "ViewBlueprint:display_name"
+    (layout,) = reader.blueprints()
+    batches = [chunk.to_record_batch() for chunk in reader.stream(store=layout)]
+    return [batch.column(component)[0].as_py()[0] for batch in batches if component in batch.schema.names]
+
+
 def test_a_stored_policy_plays_again_and_every_step_is_recorded(run, tmp_path, capsys, monkeypatch):
     from cprl import cli
 
     path, played = replay(run, tmp_path / "a.rrd", replica=1, episode=3)
     steps, boards = column(path, "/world/board", "SegmentationImage:buffer", "step")
-    assert steps == list(range(1, played.steps + 1))
+    assert steps == list(range(1, played.steps)), "after the last turn the board is a new one already"
     assert len(boards[0][0]) == (24 + 2) * (7 + 2)
+    _, harvested = column(path, "/agent_0/harvested", "Scalars:scalars", "step")
+    assert 0 <= played.harvest[0] - harvested[-1][0] <= 1, "told turn by turn, all but the last turn"
+    views = ["Apples on the board", "Board", "Events", "Harvest so far, apples", "Recipe"]
+    assert sorted(views_of(path))[:5] == views, "no empty plots of a training"
+    assert len(views_of(path)) == 6, "and what the agents see"
     _, again = replay(run, tmp_path / "b.rrd", replica=1, episode=3)
     assert again.harvest.tolist() == played.harvest.tolist()
     assert again.shots.tolist() == played.shots.tolist()

@@ -13,11 +13,13 @@ from tensordict import TensorDict
 
 from cprl import CommonsEnv, Game, Observation, Rules, maps
 from cprl.acting import RandomActor
-from cprl.commons.colours import APPLE, BEAM, COLOURS, FIRST_AGENT, GROUND, MARK, OTHER, SELF, WALL
+from cprl.commons.colours import APPLE, BEAM, COLOURS, FIRST_AGENT, GROUND, OTHER, SELF, WALL
+from cprl.commons.seeing import UNSEEN, classes_seen
 from cprl.learning import DQNLearner, DQNSettings
-from cprl.recording.frames import UNSEEN, Frame, FrameBuffer, board_with_rim, classes_seen, mosaic
+from cprl.recording.frames import Frame, FrameBuffer, mosaic, window_corners
 from cprl.recording.rerun import RerunLogger
 from cprl.recording.scenery import Scene
+from cprl.recording.stage import boards
 from cprl.recording.watch import Watch
 from cprl.train import train
 
@@ -25,7 +27,7 @@ GAME = Game(
     map=maps.parse(".A>.A\n.A.A.\n..<.A"),
     rules=Rules(regrow_prob=(0.0, 0.1), window_rows=3, window_columns=5, episode_steps=20),
 )
-SCENE = Scene(height=3, width=5, agents=GAME.agent_names, window=(3, 5))
+SCENE = Scene(height=3, width=5, walls=(), sites=GAME.map.sites, agents=GAME.agent_names, window=(3, 5))
 
 
 @pytest.fixture(autouse=True)
@@ -58,17 +60,20 @@ def static(path, entity, component):
 def frames(count, *, first_step=1):
     """So many frames of two agents, each frame another."""
     random = np.random.default_rng(0)
-    buffer = FrameBuffer(count, board=(3, 5), windows=(2, 3, 3, 5))
-    on_boards = np.array([GROUND, WALL, APPLE, MARK, BEAM, OTHER], np.uint8)
+    sites = len(GAME.map.sites)
+    buffer = FrameBuffer(count, board=(3, 5), sites=sites, windows=(2, 3, 3, 5))
     shown = []
     for step in range(count):
         frame = Frame(
-            board=on_boards[random.integers(0, len(on_boards), (3, 5))],
+            beams=np.arange(15).reshape(3, 5) < step // 2,
+            stock=random.integers(0, 2, sites).astype(np.uint8),
             windows=GAME.palette[random.integers(0, len(COLOURS), (2, 3, 5))].transpose(0, 3, 1, 2),
             row=np.array([0, step % 3], np.int32),
             col=np.array([step % 5, 4], np.int32),
             heading=np.array([step % 4, 1], np.int32),
-            in_play=np.array([True, step % 2 == 0]),
+            in_play=np.array([True, step < 2]),
+            tagged_by=np.array([-1, 0 if step > 3 else -1], np.int32),
+            harvested=np.array([step, 0], np.int32),
         )
         buffer.add(first_step + step, 7, frame)
         shown.append(frame)
@@ -102,19 +107,45 @@ def test_frames_show_the_board_the_agents_and_what_each_sees(tmp_path):
     for frame, board in zip(shown, boards, strict=True):
         seen = np.array(board[0], np.uint8).reshape(5, 7)
         assert (seen[0] == WALL).all()
-        kept = frame.board != OTHER
-        assert np.array_equal(seen[1:-1, 1:-1][kept], frame.board[kept])
-        assert (seen[1:-1, 1:-1][~kept] == GROUND).all()
-    _, places = column(path, "world/agents", "Points2D:positions")
-    assert places[3] == [[3 + 1.5, 0 + 1.5], [4 + 1.5, 0 + 1.5]]
-    _, colours = column(path, "world/agents", "Points2D:colors")
-    assert [rgba & 255 for rgba in colours[3]] == [255, 60], "agent 1 is out of play in frame 3"
-    _, headings = column(path, "world/headings", "Arrows2D:vectors")
-    assert headings[2][0] == pytest.approx([0, 0.9]), "heading 2 points down"
+        inner, agents = seen[1:-1, 1:-1], {(int(frame.row[0]), int(frame.col[0])): FIRST_AGENT}
+        if frame.in_play[1]:
+            agents[int(frame.row[1]), int(frame.col[1])] = FIRST_AGENT + 1
+        for site, apple in zip(GAME.map.sites, frame.stock, strict=True):
+            assert site in agents or inner[site] == (APPLE if apple else GROUND)
+        assert {cell: inner[cell] for cell in agents} == agents
+        assert (inner >= FIRST_AGENT).sum() == len(agents), "who is out of play is not drawn as if it were in"
+    _, places = column(path, "world/agents", "Arrows2D:origins")
+    assert places[1] == [[1 + 1.5, 0 + 1.5], [4 + 1.5, 1 + 1.5]]
+    _, headings = column(path, "world/agents", "Arrows2D:vectors")
+    assert headings[2] == [pytest.approx([0, 1.5]), [0, 0]], (
+        "heading 2 points down; who is out points nowhere"
+    )
+    assert static(path, "world/agents", "Arrows2D:labels") == ["0", "1"]
     _, windows = column(path, "windows", "SegmentationImage:buffer")
-    first = np.array(windows[0][0], np.uint8).reshape(3, 11)
-    assert np.array_equal(np.array(COLOURS)[first[:, :5]].transpose(2, 0, 1), shown[0].windows[0])
-    assert (first[:, 5] == UNSEEN).all()
+    (_, _), (top, left) = window_corners(2, (3, 5))
+    first = np.array(windows[0][0], np.uint8).reshape(3 + top, 5 + left)
+    assert np.array_equal(np.array(COLOURS)[first[:3, :5]].transpose(2, 0, 1), shown[0].windows[0])
+    assert np.array_equal(np.array(COLOURS)[first[top:, left:]].transpose(2, 0, 1), shown[0].windows[1])
+    assert UNSEEN in first
+    frames_of_windows = static(path, "windows/frames", "Boxes2D:colors")
+    assert [colour >> 8 for colour in frames_of_windows] == [0x569CFF, 0xFF5C5C], "the agents' colours"
+
+
+def test_beams_and_those_out_of_play_have_marks_that_are_told_when_they_change(tmp_path):
+    with RerunLogger("run", tmp_path, scene=SCENE) as logger:
+        logger.log_frames(frames(6)[0])
+    path = tmp_path / "run.rrd"
+    steps, beams = column(path, "world/beams", "SegmentationImage:buffer")
+    assert steps == [1, 3, 5], "a beam over no cell, over one from frame 2 on, over two from frame 4 on"
+    covered = [np.argwhere(np.array(beam[0]).reshape(5, 7) == BEAM).tolist() for beam in beams]
+    assert covered == [[], [[1, 1]], [[1, 1], [1, 2]]]
+    steps, labels = column(path, "world/out", "Boxes2D:labels")
+    assert steps == [1, 3, 4, 5, 6]
+    assert labels == [[], ["out"], ["out"], ["by 0"], ["by 0"]]
+    _, centres = column(path, "world/out", "Boxes2D:centers")
+    assert centres[1] == [[4 + 1.5, 2 + 1.5]]
+    _, colours = column(path, "world/out", "Boxes2D:colors")
+    assert colours[1][0] >> 8 == 0xFF5C5C, "in agent 1's own colour"
 
 
 def test_colours_and_names_of_classes_are_in_the_recording(tmp_path):
@@ -168,7 +199,7 @@ def test_frames_without_a_scene_are_refused(tmp_path):
 
 
 def test_a_full_buffer_says_so():
-    buffer = FrameBuffer(1, board=(3, 5), windows=(2, 3, 3, 5))
+    buffer = FrameBuffer(1, board=(3, 5), sites=len(GAME.map.sites), windows=(2, 3, 3, 5))
     _, (frame,) = frames(1)
     buffer.add(0, 0, frame)
     with pytest.raises(ValueError, match="holds 1 frames"):
@@ -177,9 +208,16 @@ def test_a_full_buffer_says_so():
     assert buffer.size == 0
 
 
-def test_mosaics_put_windows_side_by_side():
-    windows = np.array([[[[SELF, BEAM]], [[GROUND, APPLE]]]], np.uint8)
-    assert mosaic(windows).tolist() == [[[SELF, BEAM, UNSEEN, GROUND, APPLE]]]
+def test_mosaics_put_low_windows_below_each_other_and_high_ones_side_by_side():
+    low = np.array([[[[SELF, BEAM, WALL]], [[GROUND, APPLE, OTHER]]]], np.uint8)
+    assert mosaic(low).tolist() == [[[SELF, BEAM, WALL], [UNSEEN] * 3, [GROUND, APPLE, OTHER]]]
+    high = np.array([[[[SELF], [BEAM], [WALL]], [[GROUND], [APPLE], [OTHER]]]], np.uint8)
+    assert mosaic(high).tolist() == [[[SELF, UNSEEN, GROUND], [BEAM, UNSEEN, APPLE], [WALL, UNSEEN, OTHER]]]
+
+
+def test_four_windows_make_two_rows_of_two():
+    assert window_corners(4, (7, 15)) == [(0, 0), (0, 16), (8, 0), (8, 16)]
+    assert window_corners(1, (7, 15)) == [(0, 0)]
 
 
 def test_classes_are_known_from_colours_and_foreign_colours_are_marked():
@@ -204,10 +242,11 @@ def test_classes_are_known_in_every_form_of_observation(encoding, agents_apart):
     assert set(np.unique(classes)) <= {*range(FIRST_AGENT), FIRST_AGENT, FIRST_AGENT + 1}
 
 
-def test_the_rim_is_wall_and_agents_are_left_to_their_own_colours():
-    assert board_with_rim(np.array([[[APPLE, OTHER]]], np.uint8)).tolist() == [
-        [[WALL] * 4, [WALL, APPLE, GROUND, WALL], [WALL] * 4]
-    ]
+def test_the_board_has_a_rim_of_wall_and_inner_walls():
+    scene = Scene(height=1, width=2, walls=((0, 1),), sites=(), agents=("agent_0",), window=(1, 1))
+    nowhere = np.array([[0]])
+    nobody = {"in_play": np.array([[False]]), "row": nowhere, "col": nowhere, "step": np.array([1])}
+    assert boards(scene, nobody).tolist() == [[[WALL] * 4, [WALL, GROUND, WALL, WALL], [WALL] * 4]]
 
 
 def test_the_live_recording_is_served_on_this_machine(tmp_path):
@@ -273,8 +312,9 @@ def test_a_watched_training_records_every_turn_and_learns_the_very_same(tmp_path
     path = tmp_path / "run.rrd"
     steps, _ = column(path, "world/board", "SegmentationImage:buffer")
     episodes, _ = column(path, "world/board", "SegmentationImage:buffer", "episode")
-    assert steps == list(range(1, len(steps) + 1))
-    assert sorted(set(episodes)) == [0, 1, 2, 3, 4], "the last frame is the first of the episode to come"
+    ends = np.cumsum(column(path, "social/survival_steps", "Scalars:scalars")[1])
+    assert sorted([*steps, *ends]) == list(range(1, int(ends[-1]) + 1)), "every turn but the last of each"
+    assert sorted(set(episodes)) == [0, 1, 2, 3]
     assert column(path, "agent_0/return", "Scalars:scalars", "episode")[0] == [0, 1, 2, 3]
     assert column(path, "agent_0/loss", "Scalars:scalars", "episode")[0] == [0, 1, 2, 3]
     assert len(column(path, "social/survival_steps", "Scalars:scalars")[0]) == 4

@@ -7,6 +7,7 @@ import torch
 from tensordict import TensorDictBase
 from torch import nn
 
+from cprl import keys
 from cprl.acting.seats import Seat
 from cprl.envs.torchrl_env import CommonsEnv
 from cprl.measuring.episodes import Episode
@@ -44,23 +45,41 @@ def replay(run: Path, out: Path | None = None, *, replica: int = 0, episode: int
     title = f"{run.name}, agents of replica {replica}, fresh episode {episode}"
     target.parent.mkdir(parents=True, exist_ok=True)
     with Watch(
-        target.parent, env, title=title, episodes=1, recipe=loaded.recipe, file_name=target.name
+        target.parent,
+        env,
+        title=title,
+        episodes=1,
+        recipe=loaded.recipe,
+        file_name=target.name,
+        is_replay=True,
     ) as watch:
-        last = _Last()
-        observers: list[Observer] = [watch, last]
+        teller = _Teller(watch)
+        observers: list[Observer] = [watch, teller]
         train(env, {}, others=actors, episodes=1, observers=observers)
-    assert last.episode is not None
-    return target, last.episode
+    assert teller.episode is not None
+    return target, teller.episode
 
 
-class _Last:
-    """Keeps the episode."""
+class _Teller:
+    """Tells every tag and how the episode ended, and keeps the episode."""
 
-    episode: Episode | None = None
+    def __init__(self, watch: Watch) -> None:
+        self.watch = watch
+        self.episode: Episode | None = None
+        self._step = 0
 
     def see_turn(self, batch: TensorDictBase) -> None:
-        """Nothing."""
+        """Tells who was tagged by whom."""
+        self._step += 1
+        for tagged, by in batch["next"][keys.TAGGED_BY][0].nonzero().tolist():
+            self._tell(f"agent {tagged} is tagged out by agent {by}")
 
     def see_episode(self, episode: Episode, learning: Mapping[str, float]) -> None:
-        """Keeps it."""
+        """Tells how it went."""
         self.episode = episode
+        apples = ", ".join(f"{own:.0f}" for own in episode.harvest)
+        self._tell(f"the end after {episode.steps} steps; apples: {apples}; {episode.stock_left} left")
+
+    def _tell(self, event: str) -> None:
+        self.watch.logger.at(step=self._step, episode=0)
+        self.watch.tell(event)

@@ -124,6 +124,7 @@ class Batch:
             col=read(now.col)[world],
             heading=read(now.heading)[world],
             in_play=read(now.in_play)[world],
+            harvested=read(now.harvested)[world],
         )
 
     def state(self) -> states.State:

@@ -142,6 +142,8 @@ class Shown(NamedTuple):
     """int32 [N], 0 up, 1 right, 2 down, 3 left."""
     in_play: Bools
     """bool [N]."""
+    harvested: Ints
+    """int32 [N], apples bitten in this episode."""
 
 
 def empty_worlds(*, worlds: int, agents: int, sites: int) -> Worlds:

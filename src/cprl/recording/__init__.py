@@ -6,6 +6,7 @@ from cprl.recording.progress import ProgressBar
 from cprl.recording.rerun import RerunLogger
 from cprl.recording.results import EpisodeTable, read_episodes
 from cprl.recording.run import start_run
+from cprl.recording.streams import check_watch
 from cprl.recording.summary import summarise
 from cprl.recording.watch import Watch
 from cprl.recording.weights import BestWeights, load_weights, restore_weights, save_weights
@@ -17,6 +18,7 @@ __all__ = [
     "ProgressBar",
     "RerunLogger",
     "Watch",
+    "check_watch",
     "load_weights",
     "read_episodes",
     "restore_weights",

@@ -1,12 +1,15 @@
 """How the Rerun viewer is laid out when a recording is opened."""
 
-from typing import Any
+from typing import Any, Final, Literal
 
 from cprl.recording.scenery import Scene
 
+_BACKGROUND: Final = (24, 26, 32)
+"""Behind boards and windows, so that their dark ground is told from the viewer's."""
+
 
 def layout(scene: Scene | None) -> Any:
-    """Board and windows left, what is measured right, events below, and tabs for the rest.
+    """Board and windows left, what is measured right, events below, and tabs for the rest; a replay has less.
 
     Args:
         scene: what is on the board; None for a recording without one.
@@ -16,12 +19,40 @@ def layout(scene: Scene | None) -> Any:
     """
     import rerun.blueprint as rrb
 
+    if scene and scene.is_replay:
+        return _laid_out(_replay(scene.agents), play_state="playing")
     agents, replicas = (scene.agents, scene.replicas) if scene else ((), 1)
-    return rrb.Blueprint(
+    return _laid_out(
         rrb.Horizontal(_board(agents), _numbers(agents, replicas), column_shares=[2, 3]),
+        play_state="following",
+    )
+
+
+def _laid_out(views: Any, *, play_state: Literal["playing", "following"]) -> Any:
+    """The views, and as little else as can be."""
+    import rerun.blueprint as rrb
+
+    return rrb.Blueprint(
+        views,
         rrb.BlueprintPanel(state="collapsed"),
         rrb.SelectionPanel(state="collapsed"),
-        rrb.TimePanel(state="collapsed", timeline="step", play_state="following", fps=15),
+        rrb.TimePanel(state="collapsed", timeline="step", play_state=play_state, fps=15),
+    )
+
+
+def _replay(agents: tuple[str, ...]) -> Any:
+    """A large board, what agents see, and the harvest and the stock of one episode, turn by turn."""
+    import rerun.blueprint as rrb
+
+    return rrb.Horizontal(
+        rrb.Vertical(_world(), _events(), row_shares=[7, 2]),
+        rrb.Vertical(
+            _windows(agents),
+            _plot("Harvest so far, apples", *_of(agents, "harvested")),
+            _plot("Apples on the board", "turn/stock"),
+            row_shares=[4, 3, 2],
+        ),
+        column_shares=[3, 2],
     )
 
 
@@ -29,16 +60,31 @@ def _board(agents: tuple[str, ...]) -> Any:
     """The board, what agents see, and what happened."""
     import rerun.blueprint as rrb
 
-    seen = "What the agent sees" if len(agents) == 1 else "What each agent sees, the first one left"
-    return rrb.Vertical(
-        rrb.Spatial2DView(name="Board", origin="/world"),
-        rrb.Spatial2DView(name=seen, origin="/windows"),
-        rrb.Tabs(
-            rrb.TextLogView(name="Events", origin="/log"),
-            rrb.TextDocumentView(name="Recipe", origin="/recipe"),
-            active_tab="Events",
-        ),
-        row_shares=[6, 3, 3],
+    return rrb.Vertical(_world(), _windows(agents), _events(), row_shares=[9, 9, 5])
+
+
+def _world() -> Any:
+    import rerun.blueprint as rrb
+
+    return rrb.Spatial2DView(name="Board", origin="/world", background=_BACKGROUND)
+
+
+def _windows(agents: tuple[str, ...]) -> Any:
+    import rerun.blueprint as rrb
+
+    seen = "What the agent sees" if len(agents) == 1 else "What each agent sees, in a frame of its colour"
+    return rrb.Spatial2DView(name=seen, origin="/windows", background=_BACKGROUND)
+
+
+def _events() -> Any:
+    """What happened, and what is run."""
+    import rerun.blueprint as rrb
+
+    columns = rrb.TextLogColumns(timeline_columns=["step"], text_log_columns=["Body"])
+    return rrb.Tabs(
+        rrb.TextLogView(name="Events", origin="/log", columns=columns),
+        rrb.TextDocumentView(name="Recipe", origin="/recipe"),
+        active_tab="Events",
     )
 
 
@@ -51,10 +97,10 @@ def _numbers(agents: tuple[str, ...], replicas: int) -> Any:
         return _plot(name, f"social/{entity}", share=share, legend=replicas == 1)
 
     learning = rrb.Horizontal(
-        _plot("Loss", *_of(agents, "loss")),
-        _plot("Q value of the greedy action", *_of(agents, "q")),
-        _plot("Epsilon", *_of(agents, "epsilon"), share=True),
-        _plot("Steps per second", "time/env_steps_per_s"),
+        _plot("Loss", *_of(agents, "loss"), legend=False),
+        _plot("Highest Q value", *_of(agents, "q"), legend=False),
+        _plot("Epsilon", *_of(agents, "epsilon"), share=True, legend=False),
+        _plot("Steps per second", "time/env_steps_per_s", legend=False),
         name="Learning",
     )
     more = rrb.Horizontal(

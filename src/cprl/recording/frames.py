@@ -1,29 +1,28 @@
 """Frames of one world, collected step by step in memory and handed on as columns."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
+from math import ceil
 from typing import Any, Final
 
 import numpy as np
 from numpy.typing import NDArray
 
-from cprl.commons.colours import APPLE, BEAM, GROUND, MARK, WALL
-from cprl.commons.seeing import UNSEEN, classes_seen
+from cprl.commons.seeing import UNSEEN
 from cprl.commons.world import Bools, Bytes, Ints
 
-__all__ = ["UNSEEN", "Frame", "FrameBuffer", "board_with_rim", "classes_seen", "mosaic"]
-
-RIM_CELLS: Final = 1
-"""Cells of wall that are shown around the board."""
-
-_SEPARATOR_PIXELS: Final = 1
+WINDOWS_APART_PIXELS: Final = 1
+_WINDOWS_WIDE: Final = 1.7
+"""The place for the windows in the viewer is about so many times as wide as high."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class Frame:
     """One world after one step."""
 
-    board: Bytes
-    """uint8 [H, W], classes of `cprl.commons.colours`."""
+    beams: Bools
+    """bool [H, W], the cells that a beam covers."""
+    stock: Bytes
+    """uint8 [K], 1 where an apple hangs."""
     windows: Bytes
     """uint8 [N, C, X, Y], what each agent observes."""
     row: Ints
@@ -34,6 +33,10 @@ class Frame:
     """int32 [N], 0 up, 1 right, 2 down, 3 left."""
     in_play: Bools
     """bool [N]."""
+    tagged_by: Ints
+    """int32 [N], who tagged an agent last; -1 for nobody known."""
+    harvested: Ints
+    """int32 [N], apples bitten in this episode."""
 
 
 class FrameBuffer:
@@ -42,21 +45,26 @@ class FrameBuffer:
     Args:
         capacity: frames it holds at most.
         board: (H, W).
+        sites: K.
         windows: (N, C, X, Y).
     """
 
-    def __init__(self, capacity: int, *, board: tuple[int, int], windows: tuple[int, int, int, int]) -> None:
+    def __init__(
+        self, capacity: int, *, board: tuple[int, int], sites: int, windows: tuple[int, int, int, int]
+    ) -> None:
         agents = windows[0]
         self.capacity, self.size = capacity, 0
         self._arrays: dict[str, NDArray[Any]] = {
             "step": np.zeros(capacity, np.int64),
             "episode": np.zeros(capacity, np.int64),
-            "board": np.zeros((capacity, *board), np.uint8),
+            "beams": np.zeros((capacity, *board), np.bool_),
+            "stock": np.zeros((capacity, sites), np.uint8),
             "windows": np.zeros((capacity, *windows), np.uint8),
-            "row": np.zeros((capacity, agents), np.int32),
-            "col": np.zeros((capacity, agents), np.int32),
-            "heading": np.zeros((capacity, agents), np.int32),
             "in_play": np.zeros((capacity, agents), np.bool_),
+            **{
+                name: np.zeros((capacity, agents), np.int32)
+                for name in ("row", "col", "heading", "tagged_by", "harvested")
+            },
         }
 
     @property
@@ -70,8 +78,8 @@ class FrameBuffer:
             raise ValueError(f"the buffer holds {self.capacity} frames; take them before adding another")
         arrays, at = self._arrays, self.size
         arrays["step"][at], arrays["episode"][at] = step, episode
-        for name in ("board", "windows", "row", "col", "heading", "in_play"):
-            arrays[name][at] = getattr(frame, name)
+        for field in fields(Frame):
+            arrays[field.name][at] = getattr(frame, field.name)
         self.size += 1
 
     def take(self) -> dict[str, NDArray[Any]]:
@@ -81,31 +89,39 @@ class FrameBuffer:
         return taken
 
 
-def board_with_rim(boards: Bytes) -> Bytes:
-    """Boards with a rim of wall, and without the agents, which are drawn in colours of their own.
+def window_corners(agents: int, window: tuple[int, int]) -> list[tuple[int, int]]:
+    """Where each agent's window begins in a mosaic of them all, (row, col), in rows of as many as show best.
 
     Args:
-        boards: uint8 [T, H, W], colour classes.
-
-    Returns:
-        uint8 [T, H + 2, W + 2].
+        agents: N.
+        window: (X, Y).
     """
-    rimmed = np.pad(boards, ((0, 0), (RIM_CELLS,) * 2, (RIM_CELLS,) * 2), constant_values=WALL)
-    return np.where(np.isin(rimmed, (GROUND, WALL, APPLE, MARK, BEAM)), rimmed, GROUND).astype(np.uint8)
+    high, wide = (length + WINDOWS_APART_PIXELS for length in window)
+
+    def cell_size(columns: int) -> float:
+        return min(_WINDOWS_WIDE / (columns * wide), 1 / (ceil(agents / columns) * high))
+
+    columns = max(range(1, agents + 1), key=cell_size)
+    return [(agent // columns * high, agent % columns * wide) for agent in range(agents)]
+
+
+def mosaic_size(agents: int, window: tuple[int, int]) -> tuple[int, int]:
+    """Rows and columns of pixels of the mosaic."""
+    corners = window_corners(agents, window)
+    return max(row for row, _ in corners) + window[0], max(col for _, col in corners) + window[1]
 
 
 def mosaic(windows: Bytes) -> Bytes:
-    """All agents' windows side by side, a column of UNSEEN between two.
+    """All agents' windows side by side and below each other, as `window_corners` says, UNSEEN between them.
 
     Args:
         windows: uint8 [T, N, X, Y], classes as `classes_seen` gives them.
 
     Returns:
-        uint8 [T, X, N * Y + N - 1].
+        uint8 [T, rows, columns], as `mosaic_size` says.
     """
     frames, agents, rows, columns = windows.shape
-    wide = columns + _SEPARATOR_PIXELS
-    joined = np.full((frames, rows, agents * wide - _SEPARATOR_PIXELS), UNSEEN, np.uint8)
-    for agent in range(agents):
-        joined[:, :, agent * wide : agent * wide + columns] = windows[:, agent]
+    joined = np.full((frames, *mosaic_size(agents, (rows, columns))), UNSEEN, np.uint8)
+    for agent, (top, left) in enumerate(window_corners(agents, (rows, columns))):
+        joined[:, top : top + rows, left : left + columns] = windows[:, agent]
     return joined

@@ -13,7 +13,8 @@ from torch import Tensor
 from torchrl.record.loggers import Logger
 
 from cprl.recording.blueprint import layout
-from cprl.recording.scenery import Scene, classes, frame_columns, image_forms, lines, phase_states
+from cprl.recording.scenery import Scene, classes, lines, phase_states
+from cprl.recording.stage import columns, fixed
 from cprl.recording.streams import FLUSH_TIMEOUT_S, Stream, open_file, open_live
 
 FILE_NAME: Final = "run.rrd"
@@ -23,14 +24,15 @@ TIMELINES: Final = ("step", "episode", "frame")
 Numbers: TypeAlias = "Sequence[int] | NDArray[np.integer[Any]]"
 
 _LIVE_PERIOD_S: Final = 1.0
-_FILE_PERIOD_S: Final = 10.0
+_FILE_PERIOD_S: Final = 60.0
+"""Each sending of numbers costs the file some forty kilobytes, however few they are."""
 
 
 class RerunLogger(Logger):
     """TorchRL's logger interface on a Rerun recording; names become entities, `social/equality` and so on.
 
     Numbers wait in memory and are sent as columns: to the viewer about every second, to the file about
-    every ten. Every row carries the timelines `step` (environment steps of the run), `episode` and `frame`
+    every minute. Every row carries the timelines `step` (environment steps of the run), `episode` and `frame`
     (frames recorded so far). The file and the live recording are two streams of one recording id, so that
     one may fail without the other; whatever fails is dropped with one warning.
 
@@ -73,6 +75,7 @@ class RerunLogger(Logger):
         self.frames = 0
         """Frames recorded so far, in earlier files of the recording too."""
         self._now = (0, 0)
+        self._clips_end: dict[str, int] = {}
         super().__init__(exp_name, str(log_dir))
 
     def _create_experiment(self) -> list[Any]:
@@ -87,8 +90,8 @@ class RerunLogger(Logger):
         for entity in ("phase/now", "phase/found"):
             self._static(entity, phase_states())
         if self.scene is not None:
-            for entity, form in image_forms(self.scene).items():
-                self._static(entity, form)
+            for entity, parts in fixed(self.scene).items():
+                self._static(entity, *parts)
         self._all(lambda recording: recording.flush(timeout_sec=FLUSH_TIMEOUT_S))
         return [each.recording for each in self._streams]
 
@@ -157,8 +160,7 @@ class RerunLogger(Logger):
         self._all(log)
 
     def log_frames(self, frames: Mapping[str, NDArray[Any]]) -> None:
-        """Logs what `FrameBuffer.take` gave: the board, agents, headings and windows of each step,
-        windows as `classes_seen` gives them."""
+        """Logs what `FrameBuffer.take` gave, windows as `classes_seen` gives them; see `stage.columns`."""
         if self.scene is None:
             raise ValueError("the logger has no scene; give it one to log frames")
         count = len(frames["step"])
@@ -166,8 +168,8 @@ class RerunLogger(Logger):
             return
         numbers = np.arange(self.frames, self.frames + count)
         self.frames += count
-        times = _times(frames["step"], frames["episode"], numbers)
-        for entity, what in frame_columns(self.scene, frames).items():
+        for entity, (rows, what) in columns(self.scene, frames).items():
+            times = _times(frames["step"][rows], frames["episode"][rows], numbers[rows])
             self._send(entity, times, what)
 
     def log_text(self, text: str, level: str = "INFO") -> None:
@@ -190,7 +192,10 @@ class RerunLogger(Logger):
         self._static("recipe", rr.TextDocument(text, media_type=rr.MediaType.MARKDOWN))
 
     def log_video(self, name: str, video: Tensor, step: int | None = None, **kwargs: Any) -> None:
-        """Logs uint8 [(1), T, C, H, W] as T images, one each `step` from the one given."""
+        """Logs uint8 [(1), T, C, H, W] as T images, one each `step` from the one given.
+
+        A clip of the same name that goes on until later is followed, since TorchRL's recorders count clips.
+        """
         import rerun as rr
 
         clip = torch.as_tensor(video).cpu()
@@ -198,7 +203,8 @@ class RerunLogger(Logger):
         if clip.ndim != 4:
             raise ValueError(f"the video is {list(video.shape)}; [T, C, H, W] or [1, T, C, H, W] is wanted")
         images = clip.permute(0, 2, 3, 1).to(torch.uint8).numpy()
-        first = self._now[0] if step is None else int(step)
+        first = max(self._now[0] if step is None else int(step), self._clips_end.get(name, 0))
+        self._clips_end[name] = first + len(images)
         form = rr.components.ImageFormat(
             width=images.shape[2],
             height=images.shape[1],

@@ -68,6 +68,36 @@ class Stream:
         self.recording = None
 
 
+_WAYS: Final = '"serve", "spawn" or "connect rerun+http://HOST:PORT/proxy"'
+
+
+def check_watch(watch: str, *, can_be_off: bool = True) -> None:
+    """Refuses a recipe's `watch` that is no way to watch, before a run is begun for it.
+
+    Args:
+        watch: "file", or live as well, see `open_live`; "off" for no recording.
+        can_be_off: whether the recipe can do without.
+
+    Raises:
+        ValueError: for anything else; says what came and what fits.
+    """
+    if watch != "file" and not (can_be_off and watch == "off"):
+        offs = '"off", ' if can_be_off else ""
+        _check(watch, f'"file", {offs}{_WAYS}', name="watch")
+
+
+def _check(live: str, wanted: str, *, name: str = "live") -> None:
+    how, _, address = live.partition(" ")
+    where = urlsplit(address.removeprefix("rerun+"))
+    try:
+        connects = how == "connect" and address.startswith("rerun+http") and bool(where.hostname)
+        connects = connects and where.port != 0
+    except ValueError:  # of a port that is no number
+        connects = False
+    if not connects and live not in ("serve", "spawn"):
+        raise ValueError(f"{name} is {live!r}; wanted: {wanted}")
+
+
 def open_file(recording_id: str, path: Path, blueprint: Any, *, period_s: float) -> Stream:
     """A stream into a new file."""
     recording = _recording(recording_id)
@@ -91,12 +121,9 @@ def open_live(
     Raises:
         ValueError: for anything else.
     """
-    how, _, address = live.partition(" ")
-    if how == "connect" and address.startswith("rerun+http"):
-        return _connect(address, recording_id, blueprint, period_s), {}
-    if live not in ("serve", "spawn"):
-        wanted = '"serve", "spawn" or "connect rerun+http://HOST:PORT/proxy"'
-        raise ValueError(f"live is {live!r}; wanted: {wanted}")
+    _check(live, _WAYS)
+    if live.startswith("connect "):
+        return _connect(live.partition(" ")[2], recording_id, blueprint, period_s), {}
     stream, grpc = _serve(recording_id, blueprint, period_s)
     if live == "spawn":
         _spawn(grpc)

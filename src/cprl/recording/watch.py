@@ -14,18 +14,20 @@ from rich.console import Console
 from tensordict import TensorDictBase
 
 from cprl import keys
+from cprl.commons.colours import BEAM
+from cprl.commons.seeing import classes_seen
 from cprl.envs.torchrl_env import CommonsEnv
 from cprl.measuring.episodes import Episode
-from cprl.recording.frames import Frame, FrameBuffer, classes_seen
+from cprl.recording.frames import Frame, FrameBuffer
 from cprl.recording.rerun import FILE_NAME, RerunLogger
 from cprl.recording.run import FILE_NAME as RECIPE_FILE
-from cprl.recording.scenery import Scene
+from cprl.recording.scenery import TOO_EARLY, Scene
 from cprl.recording.series import Series, Values, mean_of
+from cprl.recording.stage import frame_bytes
 from cprl.recording.story import ANOTHER, Story
 
-FRAME_BYTES: Final = 300
-RECORDING_BYTES: Final = 60_000_000
-"""A frame takes about so much of a file, and the frames of a whole run are to take about so much."""
+FRAMES_BYTES: Final = 45_000_000
+"""The frames of every k-th episode are to take about so much of a file; those after new bests come on top."""
 TAGS_EVERY: Final = 50
 """Episodes whose tags make one matrix of who tagged whom."""
 
@@ -50,6 +52,7 @@ class Watch:
         recipe: what the viewer shows as the recipe of the run.
         live: "serve", "spawn" or "connect ADDRESS", see `cprl.recording.streams`; None for the file alone.
         file_name: of the recording, instead of `run.rrd`; then nothing of that name may be there.
+        is_replay: whether a stored policy plays again, see `cprl.recording.scenery.Scene`.
         console: where to tell how to watch; by default standard output.
     """
 
@@ -63,6 +66,7 @@ class Watch:
         recipe: Mapping[str, object] | None = None,
         live: str | None = None,
         file_name: str | None = None,
+        is_replay: bool = False,
         console: Console | None = None,
     ) -> None:
         game, replicas = env.game, env.batch_size.numel()
@@ -72,9 +76,12 @@ class Watch:
         scene = Scene(
             height=board[0],
             width=board[1],
+            walls=game.map.walls,
+            sites=game.map.sites,
             agents=game.agent_names,
             window=(rows, columns),
             replicas=replicas,
+            is_replay=is_replay,
         )
         self.logger = RerunLogger(
             title,
@@ -86,28 +93,37 @@ class Watch:
             console=console,
         )
         steps = game.rules.episode_steps
-        self.every = max(1, ceil(episodes * steps * FRAME_BYTES / RECORDING_BYTES))
+        self.every = max(1, ceil(episodes * steps * frame_bytes(scene) / FRAMES_BYTES))
         self._buffer = FrameBuffer(
-            min(steps + 1, 5000), board=board, windows=(game.agents, *game.observation_shape)
+            min(steps + 1, 5000),
+            board=board,
+            sites=len(game.map.sites),
+            windows=(game.agents, *game.observation_shape),
         )
         self._series, self._story = Series(replicas), Story()
         self._tags = np.zeros((game.agents, game.agents))
+        self._tagged_by = np.full(game.agents, -1, np.int32)
         self._step = self._episode = 0
         self._shows_next = False
         self._sent = self._told_at = time.perf_counter()
         self._told_step = 0
         self.logger.log_hparams({"run": str(run), **(recipe or {})})
         self.logger.log_text(f"{title} begins")
+        if not is_replay:
+            self.logger.log_states("phase/now", {0: TOO_EARLY})
 
     def see_turn(self, batch: TensorDictBase) -> None:
-        """Copies the first world as it stands after the turn, if this episode's frames are kept."""
+        """Copies the first world as it stands after the turn, if this episode's frames are kept.
+
+        Otherwise it does next to nothing: a look at a tensor each turn would cost a training some percent.
+        """
         self._step += 1
-        if keys.entry(keys.entry(batch, "next"), keys.DONE)[0, 0]:
-            self._send_frames()
-            self._episode += 1
-            self._shows_next = False
-        if not (self._episode % self.every == 0 or self._shows_next or self._episode == self._episodes - 1):
+        if not self.is_shown:
             return
+        if keys.entry(keys.entry(batch, "next"), keys.DONE)[0, 0]:  # the board is the next episode's already
+            self._send_frames()
+            return
+        self._remember_tags(batch)
         self._buffer.add(self._step, self._episode, self._frame())
         waited = time.perf_counter() - self._sent
         if self._buffer.is_full or (waited > _PERIOD_S and self._buffer.size >= _FEWEST_FRAMES):
@@ -119,6 +135,8 @@ class Watch:
         numbers["social/stock_left"] = float(episode.stock_left)
         for agent, value in zip(self.env.game.agent_names, episode.return_, strict=True):
             numbers[f"{agent}/return"] = float(value)
+        if episode.world == 0:
+            self._episode, self._shows_next = episode.episode + 1, False
         if episode.world == 0 and episode.depletion_step > 0:
             self.logger.at(step=self._step, episode=episode.episode)
             self.logger.log_text(
@@ -134,7 +152,7 @@ class Watch:
         logger, now = self.logger, time.perf_counter()
         for name, values in of_all.items():
             singles = values.tolist() if name.startswith("social/") and len(values) > 1 else []
-            logger.log_lines(name, [mean_of(values), *singles])
+            logger.log_lines(name, [*singles, mean_of(values)])
         steps = (self._step - self._told_step) * self._series.replicas
         if steps:
             logger.log_scalar("time/env_steps_per_s", steps / (now - self._told_at))
@@ -155,15 +173,32 @@ class Watch:
         """Logs an event in words, a checkpoint for instance."""
         self.logger.log_text(event)
 
+    @property
+    def is_shown(self) -> bool:
+        """Whether frames are kept of the episode that goes on."""
+        last = self._episodes - 1
+        return self._episode <= last and (
+            self._episode % self.every == 0 or self._shows_next or self._episode == last
+        )
+
+    def _remember_tags(self, batch: TensorDictBase) -> None:
+        """Who was tagged in the first world this turn, and by whom; of several shooters the first."""
+        tagged_by = batch["next"][keys.TAGGED_BY][0].cpu().numpy()
+        tagged = tagged_by.any(1)
+        self._tagged_by[tagged] = tagged_by.argmax(1)[tagged]
+
     def _frame(self) -> Frame:
         shown = self.env.worlds.show(self.env.told)
         return Frame(
-            board=shown.board,
+            beams=shown.board == BEAM,
+            stock=shown.stock,
             windows=shown.observation,
             row=shown.row,
             col=shown.col,
             heading=shown.heading,
             in_play=shown.in_play,
+            tagged_by=self._tagged_by,
+            harvested=shown.harvested,
         )
 
     def _send_frames(self) -> None:

@@ -1,0 +1,175 @@
+"""Real viewers without a screen, and the pictures they show: Rerun's own, and its web viewer in Chromium.
+
+Rerun's own wants Vulkan drivers (Debian: mesa-vulkan-drivers, libvulkan1), the other chromium and
+chromium-driver; `make test-viewer` installs what is missing.
+"""
+
+import base64
+import json
+import shutil
+import socket
+import subprocess
+import tempfile
+import time
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager, suppress
+from pathlib import Path
+from typing import Any
+from urllib.error import HTTPError, URLError
+from urllib.request import Request, urlopen
+
+import rerun_cli
+from rerun.experimental import ViewerClient
+
+VIEWER = Path(rerun_cli.__path__[0]) / "rerun"
+"""The viewer itself: the console script `rerun` would leave it running when it is ended."""
+
+START_S, STEADY_S, BUSY_S = 30.0, 60.0, 180.0
+
+CHROMIUM = (
+    *("--headless", "--no-sandbox", "--disable-quic", "--no-first-run", "--disable-background-networking"),
+    *("--disable-component-update", "--disable-sync", "--force-color-profile=srgb"),
+    # WebGL by SwiftShader on the CPU; with WebGPU there the web viewer crashes.
+    *("--use-gl=angle", "--use-angle=swiftshader", "--enable-unsafe-swiftshader", "--ignore-gpu-blocklist"),
+    "--host-resolver-rules=MAP * ~NOTFOUND, EXCLUDE 127.0.0.1, EXCLUDE localhost",
+)
+
+
+@contextmanager
+def native_viewer(
+    *, connect_to: str | None = None, size: tuple[int, int] = (1600, 1000)
+) -> Iterator[ViewerClient]:
+    """Rerun's own viewer, headless, by its remote control.
+
+    Args:
+        connect_to: the address of a live recording; None for an empty viewer.
+        size: of the window, in pixels.
+    """
+    port = free_port()
+    command = [VIEWER, "--headless", "--hide-welcome-screen", "--window-size", f"{size[0]}x{size[1]}"]
+    command += ["--bind", "127.0.0.1", "--port", str(port)]
+    viewer = subprocess.Popen(
+        [*command, *(["--connect", connect_to] if connect_to else [])],
+        stdout=subprocess.DEVNULL,
+        stderr=subprocess.DEVNULL,
+    )
+    try:
+        yield _remote_control(port, viewer)
+    finally:
+        viewer.kill()
+        viewer.wait()
+
+
+def _remote_control(port: int, viewer: "subprocess.Popen[bytes]") -> ViewerClient:
+    """Of a viewer, once it answers."""
+    found: list[ViewerClient] = []
+
+    def answers() -> bool:
+        if viewer.poll() is not None:
+            raise RuntimeError(
+                f"the viewer ended at once, code {viewer.returncode}; are Vulkan drivers there?"
+            )
+        try:
+            client = ViewerClient.connect(f"rerun+http://127.0.0.1:{port}/proxy")
+            client.get_state()
+        except Exception:
+            return False
+        found.append(client)
+        return True
+
+    wait_until(answers, START_S, "the viewer did not answer")
+    return found[0]
+
+
+def steady_picture(client: ViewerClient) -> bytes:
+    """A screenshot that two looks in a row agree on, PNG."""
+    seen: list[bytes] = [b"", client.take_screenshot()]
+
+    def steady() -> bool:
+        seen[:] = [seen[-1], client.take_screenshot()]
+        return seen[0] == seen[1]
+
+    wait_until(steady, STEADY_S, "the picture did not come to rest", every_s=0.7)
+    return seen[-1]
+
+
+@contextmanager
+def browser(page: str, *, size: tuple[int, int] = (1600, 1000)) -> Iterator[Callable[[], bytes]]:
+    """Headless Chromium with a page open; what is handed out takes a picture of it, PNG.
+
+    Chromium is driven by chromium-driver, which speaks WebDriver: JSON over HTTP, no library is needed.
+
+    Raises:
+        FileNotFoundError: without chromium-driver.
+    """
+    driver = shutil.which("chromedriver")
+    if driver is None:
+        raise FileNotFoundError("there is no chromedriver; `make test-viewer` installs chromium-driver")
+    port = free_port()
+    process = subprocess.Popen(
+        [driver, f"--port={port}"], stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL
+    )
+    address = f"http://127.0.0.1:{port}"
+    session = ""
+    with tempfile.TemporaryDirectory() as profile:
+        flags = [*CHROMIUM, f"--user-data-dir={profile}", f"--window-size={size[0]},{size[1]}"]
+        wanted = {"alwaysMatch": {"goog:chromeOptions": {"args": flags}}}
+        try:
+            wait_until(lambda: _is_ready(address), START_S, "chromedriver did not answer")
+            session = (
+                f"{address}/session/{_asked(f'{address}/session', {'capabilities': wanted})['sessionId']}"
+            )
+            _asked(f"{session}/url", {"url": page})
+            yield lambda: base64.b64decode(_patiently(f"{session}/screenshot"))
+        finally:
+            if session:
+                with suppress(RuntimeError, OSError):  # a busy page may not answer; it ends with the driver
+                    _asked(session, method="DELETE")
+            process.terminate()
+            process.wait()
+
+
+def _is_ready(address: str) -> bool:
+    try:
+        return bool(_asked(f"{address}/status")["ready"])
+    except URLError:
+        return False
+
+
+def _patiently(address: str) -> Any:
+    """What WebDriver answers at last: it waits ten seconds for a page, which may be busy drawing on a CPU."""
+    began = time.monotonic()
+    while True:
+        try:
+            return _asked(address)
+        except RuntimeError as error:
+            if "renderer" not in str(error) or time.monotonic() - began > BUSY_S:
+                raise
+            time.sleep(1)
+
+
+def _asked(address: str, body: Mapping[str, Any] | None = None, *, method: str | None = None) -> Any:
+    """What WebDriver answers."""
+    data = None if body is None else json.dumps(body).encode()
+    request = Request(address, data, {"Content-Type": "application/json"}, method=method)
+    try:
+        with urlopen(request, timeout=120) as answer:
+            return json.load(answer)["value"]
+    except HTTPError as error:
+        raise RuntimeError(f"chromedriver says to {address}: {error.read().decode()[:300]}") from error
+
+
+def free_port() -> int:
+    """A port of 127.0.0.1 that nobody listens at."""
+    with socket.socket() as probe:
+        probe.bind(("127.0.0.1", 0))
+        return int(probe.getsockname()[1])
+
+
+def wait_until(condition: Callable[[], bool], limit_s: float, trouble: str, *, every_s: float = 0.2) -> None:
+    """Waits for a condition, at most so long."""
+    began = time.monotonic()
+    while not condition():
+        if time.monotonic() - began > limit_s:
+            raise TimeoutError(f"{trouble} within {limit_s:.0f} s")
+        time.sleep(every_s)
