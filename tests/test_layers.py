@@ -21,6 +21,7 @@ ROOMS = (
     "train",
     "study",
     "replay",
+    "evaluation",
     "cli",
 )
 MODULES = sorted(path for path in SOURCE.rglob("*.py") if path.parent != SOURCE or path.name != "__init__.py")

@@ -13,7 +13,8 @@ The rooms, in the order in which the data flow:
     train       the loop: act, store, learn, measure, record
     study       one study from its learners to its report
     replay      a stored policy plays again, recorded
-    cli         the command cprl: watch, replay, report, keep
+    evaluation  stored agents in fresh worlds, among themselves and among each other
+    cli         the command cprl: watch, replay, report, keep, evaluate, crossplay
 """
 
 from typing import TYPE_CHECKING, Any
@@ -28,15 +29,32 @@ from cprl.envs import CommonsEnv
 from cprl.train import train
 
 if TYPE_CHECKING:
+    from cprl.evaluation import crossplay, evaluate_run
     from cprl.recording.loaded import load
 
-__all__ = ["CommonsEnv", "Game", "Map", "Observation", "Rules", "load", "maps", "presets", "train"]
+__all__ = [
+    "CommonsEnv",
+    "Game",
+    "Map",
+    "Observation",
+    "Rules",
+    "crossplay",
+    "evaluate_run",
+    "load",
+    "maps",
+    "presets",
+    "train",
+]
 
 
 def __getattr__(name: str) -> Any:
-    """`load` brings all of recording with it, half a second that only those pay who want it."""
+    """What brings all of recording with it, half a second that only those pay who want it."""
     if name == "load":
         from cprl.recording.loaded import load
 
         return load
+    if name in ("crossplay", "evaluate_run"):
+        from cprl import evaluation
+
+        return getattr(evaluation, name)
     raise AttributeError(f"module {__name__!r} has no attribute {name!r}")

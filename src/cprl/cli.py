@@ -5,11 +5,19 @@ import sys
 from pathlib import Path
 
 import tyro
+from rich.console import Console
+from rich.table import Table
 
+from cprl.evaluation.runs import SEED, evaluate_run
+from cprl.evaluation.told import heading, matrices, run_table, seats_table
+from cprl.evaluation.visits import Diagonal
+from cprl.evaluation.visits import crossplay as play_each_other
 from cprl.recording.bank import keep_results
+from cprl.recording.labelled import refuse_to_write_over, write_table
 from cprl.recording.report import write_report
 from cprl.recording.streams import viewer
 from cprl.replay import replay as play_again
+from cprl.train import prepare_process
 
 
 def report(runs: tuple[Path, ...], /, *, out: Path = Path("report")) -> None:
@@ -62,11 +70,95 @@ def keep(run: Path, folder: Path, /) -> None:
     print(keep_results(run, folder))
 
 
+def evaluate(
+    run: Path,
+    /,
+    *,
+    episodes: int = 20,
+    greedy: bool = False,
+    seed: int = SEED,
+    replicas: tuple[int, ...] = (),
+    out: Path | None = None,
+) -> None:
+    """Lets all replicas of a run play fresh worlds, and tells the social metrics beside the random policy's.
+
+    Args:
+        run: the run's directory, or its results; of one that has not ended the newest checkpoint plays.
+        episodes: of each replica.
+        greedy: whether agents play what they hold best, without exploring or drawing.
+        seed: of the worlds and all chance; the same one gives the same numbers.
+        replicas: their numbers; by default all.
+        out: a parquet file to be, with every episode.
+    """
+    if out is not None:
+        refuse_to_write_over(out)
+    prepare_process(seed)
+    evaluation = evaluate_run(run, episodes=episodes, greedy=greedy, seed=seed, replicas=replicas)
+    _tell(run_table(evaluation))
+    print(f"Weights: {evaluation.run.weights_from}")
+    if out is not None:
+        write_table(out, evaluation.table())
+        print(f"Episodes: {out}")
+
+
+def crossplay(
+    runs: tuple[Path, ...],
+    /,
+    *,
+    episodes: int = 20,
+    greedy: bool = False,
+    seed: int = SEED,
+    replicas: tuple[int, ...] = (),
+    diagonal: Diagonal = "self",
+    out: Path | None = None,
+) -> None:
+    """Seats each run's agents among each other run's, one visitor at a time, and tells how all fare.
+
+    Args:
+        runs: directories of runs of the same game, or their results.
+        episodes: of each replica with the visitor at each seat.
+        greedy: whether agents play what they hold best, without exploring or drawing.
+        seed: of the worlds and all chance; the same one gives the same numbers.
+        replicas: their numbers; by default all that every run has.
+        diagonal: whom a run's agents meet there: "self", those they were trained with, or "strangers", those
+            of the run's next replica.
+        out: a parquet file to be, with every episode.
+    """
+    if out is not None:
+        refuse_to_write_over(out)
+    prepare_process(seed)
+    played = play_each_other(
+        runs, episodes=episodes, greedy=greedy, seed=seed, replicas=replicas, diagonal=diagonal
+    )
+    print(heading(played))
+    _tell(*matrices(played), seats_table(played))
+    if out is not None:
+        write_table(out, played.table())
+        print(f"Episodes: {out}")
+
+
+def _tell(*tables: Table) -> None:
+    """Prints tables; into a file or pipe as wide as they are."""
+    console = Console()
+    if not console.is_terminal:
+        console = Console(width=250)
+    for table in tables:
+        console.print(table)
+
+
 def main() -> None:
     """The command line; what cannot be done is said in a line, and ends with exit code 1."""
     try:
         tyro.extras.subcommand_cli_from_dict(
-            {"watch": watch, "replay": replay, "report": report, "keep": keep}, description=__doc__
+            {
+                "watch": watch,
+                "replay": replay,
+                "report": report,
+                "keep": keep,
+                "evaluate": evaluate,
+                "crossplay": crossplay,
+            },
+            description=__doc__,
         )
     except (ValueError, OSError) as error:
         sys.exit(f"cprl: {error}")

@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import Any
 
 import pyarrow as pa
+import torch
 from tensordict import TensorDictBase
 from tensordict.nn import TensorDictModuleBase
 from torch import nn
@@ -175,13 +176,15 @@ def load(run: str | Path, *, weights: str | None = None, algorithms: Sequence[ty
     except (KeyError, TypeError, ValueError) as error:
         raise ValueError(f"{run / 'recipe.json'} holds no game and learner of cprl: {error!r}") from error
     path, kept_weights = _weights(run, weights)
+    with torch.random.fork_rng(devices=[]):  # networks draw weights at first, which the kept ones replace
+        networks = _networks(path, kept_weights, game, made_of)
     return LoadedRun(
         path=run,
         game=game,
         members=members,
         algorithms=made_of,
         recipe=recipe,
-        networks=_networks(path, kept_weights, game, made_of),
+        networks=networks,
         weights_from=path,
     )
 

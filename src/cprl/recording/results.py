@@ -194,6 +194,11 @@ def read_episodes(run_directory: str | os.PathLike[str]) -> pa.Table:
     return pq.read_table(path)
 
 
+def as_table(episodes: Sequence[Episode], replica: int) -> pa.Table:
+    """Episodes of a replica, at least one, as such a table has them."""
+    return pa.Table.from_batches([_rows(episodes, replica, _schema(episodes[0].metrics))])
+
+
 def _journal_of(path: Path) -> Path:
     return path.with_suffix(".arrows")
 

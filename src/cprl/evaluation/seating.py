@@ -1,0 +1,152 @@
+"""Seating: agents of stored runs at the seats of fresh worlds, replicas side by side as lanes.
+
+What plays is what `LoadedRun.policy` gives, but as lanes: one step of all replicas takes as long as one of
+one, and chance is handed in: each lane's random numbers follow from (seed, replica, seat) alone.
+"""
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any, TypeAlias
+
+import torch
+from torch import Tensor, nn
+
+from cprl.acting.lanes import LaneActor, random_lanes, stack_lanes
+from cprl.acting.scripted import ScriptedActor
+from cprl.acting.seats import Seat, Seats
+from cprl.commons.game import Game
+from cprl.envs.torchrl_env import CommonsEnv
+from cprl.learning.agents import EVALUATION, lane_seeds
+from cprl.measuring.episodes import Episode
+from cprl.measuring.evaluate import evaluate
+from cprl.recording.loaded import LoadedRun, load
+
+Played: TypeAlias = dict[int, list[Episode]]
+"""Episodes by the number of the replica."""
+
+MakeSeats: TypeAlias = Callable[[Sequence[int]], Seats]
+"""Who plays, out of the numbers of the replicas that are side by side."""
+
+
+@dataclass(frozen=True)
+class Sitter:
+    """Who takes a seat in every replica: a run's agent for that seat.
+
+    Args:
+        run: whose.
+        replicas: by the number of a replica, that of the run's replica which the agent is of, if another.
+    """
+
+    run: LoadedRun
+    replicas: Mapping[int, int] | None = None
+
+    def replica(self, number: int) -> int:
+        """Of which of the run's replicas the agent in this one is."""
+        return number if self.replicas is None else self.replicas[number]
+
+
+def play(
+    game: Game, who: MakeSeats, replicas: Sequence[int], *, episodes: int, seed: int, explore: bool
+) -> Played:
+    """So many fresh episodes of each replica; number r plays the worlds r x episodes and on of the seed.
+
+    Args:
+        game: what is played.
+        who: see `MakeSeats`; its actors see so many worlds of each replica side by side.
+        replicas: their numbers, ascending.
+        episodes: of each.
+        seed: of the worlds.
+        explore: see `cprl.measuring.evaluate.evaluate`.
+    """
+    played: Played = {}
+    for group in _consecutive(replicas):
+        env = CommonsEnv(game, len(group) * episodes, seed=seed, first_world=group[0] * episodes)
+        found = evaluate(env, who(group), explore=explore)
+        for place, replica in enumerate(group):
+            played[replica] = found[place * episodes : (place + 1) * episodes]
+    return played
+
+
+def seated(sitters: Sequence[Sitter], replicas: Sequence[int], *, worlds: int, seed: int) -> Seats:
+    """Agents of stored runs at all seats of these replicas, so many worlds of each side by side.
+
+    Args:
+        sitters: who takes seat 0, 1 and so on.
+        replicas: their numbers.
+        worlds: of each.
+        seed: what their chance follows from, with the replica and the seat.
+
+    Raises:
+        ValueError: where a run keeps no network of an agent; says which are kept.
+    """
+    game = sitters[0].run.game
+    alike: dict[Any, list[int]] = {}
+    found = [[_agent(sitter, seat, replica) for replica in replicas] for seat, sitter in enumerate(sitters)]
+    for seat, agents in enumerate(found):
+        alike.setdefault(agents[0].kind, []).append(seat)
+    actors: dict[Seat, nn.Module] = {}
+    for kind, seats in alike.items():
+        seeds = lane_seeds(seed, replicas=replicas, seats=seats, purpose=EVALUATION)
+        networks = [found[seat][place].network for place in range(len(replicas)) for seat in seats]
+        actors[tuple(seats)] = _actor(kind, game, networks, seeds=seeds, seats=len(seats), worlds=worlds)
+    return Seats(actors)
+
+
+def random_seats(game: Game, replicas: Sequence[int], *, worlds: int, seed: int) -> Seats:
+    """Agents to whom every action is equally likely at all seats of these replicas; see `seated`."""
+    everyone = tuple(range(game.agents))
+    seeds = lane_seeds(seed, replicas=replicas, seats=everyone, purpose=EVALUATION)
+    return Seats({everyone: random_lanes(len(game.actions), seeds=seeds, seats=len(everyone), worlds=worlds)})
+
+
+@dataclass(frozen=True, eq=False)
+class _Agent:
+    """An agent, and what it has in common with those that can be lanes of one actor with it."""
+
+    kind: tuple[Any, ...]
+    """("scripted", manner), or ("trained", samples, epsilon, algorithm)."""
+    network: nn.Module | None = None
+
+
+def _agent(sitter: Sitter, seat: int, replica: int) -> _Agent:
+    """The agent at a seat of a replica."""
+    run, of_replica = sitter.run, sitter.replica(replica)
+    member = run.members[seat]
+    if member["member"] == "Scripted":
+        return _Agent(("scripted", member["manner"]))
+    if member["member"] == "Frozen":
+        run, seat, of_replica = load(member["run"]), member["agent"], member["replica"]
+    network, samples, epsilon = run.agent(seat, replica=of_replica)
+    return _Agent(("trained", samples, epsilon, repr(run.algorithms[seat])), network)
+
+
+def _actor(kind: tuple[Any, ...], game: Game, networks: Sequence[Any], **how: Any) -> nn.Module:
+    """One actor for agents of one kind."""
+    if kind == ("scripted", "random"):
+        return random_lanes(len(game.actions), **how)
+    if kind[0] == "scripted":
+        return ScriptedActor(kind[1], game, **how)
+    _, samples, epsilon, _ = kind
+    actor = LaneActor(_side_by_side(networks), len(game.actions), samples=samples, **how)
+    actor.epsilon = epsilon
+    return actor
+
+
+def _side_by_side(networks: Sequence[nn.Module]) -> Callable[[Tensor], Tensor]:
+    """What all networks give for what their lanes see, [L, k, C, X, Y] to [L, k, A]."""
+    try:
+        stack = stack_lanes(networks)
+    except ValueError:  # of a form that does not stack, e.g. an algorithm's of the user's own
+        return lambda seen: torch.stack([network(own) for network, own in zip(networks, seen, strict=True)])
+    return lambda seen: stack(seen)
+
+
+def _consecutive(numbers: Sequence[int]) -> list[list[int]]:
+    """Ascending numbers in groups without gaps."""
+    groups: list[list[int]] = []
+    for number in numbers:
+        if groups and groups[-1][-1] + 1 == number:
+            groups[-1].append(number)
+        else:
+            groups.append([number])
+    return groups

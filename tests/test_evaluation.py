@@ -1,0 +1,382 @@
+"""Stored runs play fresh worlds, alone and among each other, and the numbers are those of the episodes."""
+
+import json
+import shutil
+from dataclasses import replace
+from math import isnan
+
+import numpy as np
+import pyarrow.parquet as pq
+import pytest
+import torch
+from test_population import ALGORITHMS
+
+import cprl
+from cprl import CommonsEnv, Game, Observation, Rules, cli, maps, study
+from cprl.evaluation.games import differences
+from cprl.learning.agents import EVALUATION, lane_seeds
+from cprl.measuring.evaluate import evaluate
+from cprl.measuring.replicas import agents_without_harvest, over_replicas, social_measures
+from cprl.population import Frozen, Learner, Population, Scripted
+from cprl.recording import Checkpoints, start_run
+from cprl.train import train
+
+CORRIDORS = Game(
+    map=maps.parse(
+        """
+        >A.A.
+        #####
+        #AAA<
+        """
+    ),
+    rules=Rules(
+        regrow_prob=(0.0,), window_rows=4, window_columns=3, episode_steps=9, may_fire=False, freeze_steps=0
+    ),
+)
+"""A greedy agent 0 bites at steps 1 and 3, a greedy agent 1 at steps 1, 2 and 3; nothing grows again, so that
+then the episode is over. A sustainable agent leaves them all: near none of them hang three others."""
+
+MEADOW = Game(
+    map=maps.parse(
+        """
+        .A>.A.A
+        A.A...A
+        ..<.A.A
+        """
+    ),
+    rules=Rules(regrow_prob=(0.0, 0.2), window_rows=3, window_columns=5, episode_steps=15, freeze_steps=2),
+)
+DQN, PPO, SAC, C51 = (Learner(ALGORITHMS[name]) for name in ("DQN", "PPO", "SAC", "C51"))
+SEED = 77
+
+
+def recipe(agents):
+    return {"replicas": agents.replicas, "seed": 3, "game": agents.game, "population": agents.told()}
+
+
+def conducted(folder, game, members, *, replicas=3):
+    agents = Population(game, members, replicas=replicas, seed=3, compile=False)
+    run = start_run(folder, folder.name, recipe(agents))
+    study.conduct(run, agents, episodes=3, title=folder.name, evaluation_episodes=1, watch="off")
+    return run
+
+
+@pytest.fixture(scope="module")
+def scripted(tmp_path_factory):
+    """Runs on the corridors by the manner of both agents."""
+    folder = tmp_path_factory.mktemp("scripted")
+    return {
+        manner: conducted(folder / manner, CORRIDORS, [Scripted(manner)] * 2, replicas=2)
+        for manner in ("greedy", "sustainable")
+    }
+
+
+@pytest.fixture(scope="module")
+def learned(tmp_path_factory):
+    """Runs on the meadow: two DQN agents, and one that draws its actions beside a frozen one of them."""
+    folder = tmp_path_factory.mktemp("learned")
+    alike = conducted(folder / "alike", MEADOW, [DQN] * 2)
+    mixed = conducted(folder / "mixed", MEADOW, [PPO, Frozen(alike, 1, replica=2)])
+    return {"alike": alike, "mixed": mixed}
+
+
+def values(measures):
+    """Numbers by name; None where undefined in all episodes."""
+    return {name: one.estimate and one.estimate.value for name, one in measures.items()}
+
+
+def told(episodes):
+    """What tells episodes apart."""
+    return [(one.steps, one.return_.tolist(), one.shots.tolist(), one.stock_left) for one in episodes]
+
+
+def test_a_run_of_scripted_agents_gives_the_numbers_worked_by_hand(scripted):
+    found = cprl.evaluate_run(scripted["greedy"], episodes=4)
+    assert list(found.trained) == list(found.random) == [0, 1]
+    measures = found.measures()
+    assert values(measures) == pytest.approx(
+        {
+            "collective_return": 5,
+            "efficiency": 5 / 3,
+            "equality": 1 - 2 * 1 / (2 * 2 * 5),
+            "sustainability": ((1 + 3) / 2 + (1 + 2 + 3) / 3) / 2,
+            "survival_steps": 3,
+            "peace": 2,
+            "peacefulness": 3,
+            "stock_left": 0,
+            "agent_0/return": 2,
+            "agent_1/return": 3,
+        }
+    )
+    assert measures["equality"].estimate.low == measures["equality"].estimate.high == pytest.approx(0.9)
+    assert {one.episodes for one in measures.values()} == {8}
+
+
+def test_what_is_undefined_is_counted_apart_and_in_no_mean(scripted):
+    found = cprl.evaluate_run(scripted["sustainable"], episodes=3, replicas=[1])
+    measures = found.measures()
+    assert values(measures)["collective_return"] == 0
+    for name in ("equality", "sustainability"):
+        assert measures[name].estimate is None
+        assert str(measures[name]) == "undefined in all 3"
+    assert agents_without_harvest(found.trained) == (6, 6)
+    some = over_replicas({0: [1.0, float("nan")], 4: [float("nan")] * 2, 5: [2.0, 5.0]})
+    assert (some.undefined, some.episodes, some.estimate.replicas) == (3, 6, 2)
+    assert some.estimate.value == (1 + 3.5) / 2, "the mean of means of replicas, not 8 / 3 nor anything / 6"
+    assert str(some).endswith("], undefined in 3 of 6")
+    with pytest.raises(ValueError, match=r"episodes by replica are \{0: 1, 1: 0\}; at least one"):
+        over_replicas({0: [1.0], 1: []})
+
+
+@pytest.mark.parametrize("name", ["alike", "mixed"])
+def test_greedy_agents_play_what_the_policy_of_the_loaded_run_plays(name, learned):
+    found = cprl.evaluate_run(learned[name], episodes=4, greedy=True, seed=SEED)
+    loaded = cprl.load(learned[name])
+    means = []
+    for replica in loaded.replicas:
+        env = CommonsEnv(MEADOW, 4, seed=SEED, first_world=4 * replica)
+        alone = evaluate(env, loaded.policy(replica))
+        assert told(alone) == told(found.trained[replica])
+        means.append(np.mean([episode.harvest.sum() for episode in alone]))
+    assert values(found.measures())["collective_return"] == pytest.approx(np.mean(means))
+
+
+def test_agents_explore_with_the_runs_epsilon_for_evaluation(learned, tmp_path):
+    always = shutil.copytree(learned["alike"], tmp_path / "always")
+    text = json.loads((always / "recipe.json").read_text())
+    for member in text["arguments"]["population"]:
+        member["settings"]["epsilon_evaluation"] = 1.0
+    (always / "recipe.json").write_text(json.dumps(text))
+    by_chance = cprl.evaluate_run(always, episodes=2)
+    assert told(by_chance.trained[0]) == told(by_chance.random[0]), "with epsilon 1 every action is random"
+    assert told(by_chance.trained[0]) != told(cprl.evaluate_run(always, episodes=2, greedy=True).trained[0])
+
+
+def test_the_random_policy_is_that_of_the_populations(learned):
+    found = cprl.evaluate_run(learned["mixed"], episodes=2, seed=SEED, replicas=[1])
+    from cprl.acting.lanes import random_lanes
+    from cprl.acting.seats import Seats
+
+    seeds = lane_seeds(SEED, replicas=[1], seats=[0, 1], purpose=EVALUATION)
+    actor = random_lanes(len(MEADOW.actions), seeds=seeds, seats=2, worlds=2)
+    env = CommonsEnv(MEADOW, 2, seed=SEED, first_world=2)
+    assert told(evaluate(env, Seats({(0, 1): actor}), explore=True)) == told(found.random[1])
+
+
+@pytest.mark.parametrize("name", ["alike", "mixed"])
+def test_the_same_call_plays_the_same_whoever_drew_before_and_a_replica_the_same_alone(name, learned):
+    first = cprl.evaluate_run(learned[name], episodes=2)
+    torch.manual_seed(len(name))
+    state = torch.get_rng_state()
+    again = cprl.evaluate_run(learned[name], episodes=2, replicas=[2, 0])
+    assert torch.equal(torch.get_rng_state(), state), "nothing of ours draws from torch's generator"
+    assert list(again.trained) == [0, 2]
+    for replica in (0, 2):
+        assert told(again.trained[replica]) == told(first.trained[replica])
+        assert told(again.random[replica]) == told(first.random[replica])
+    other = cprl.evaluate_run(learned[name], episodes=2, seed=SEED)
+    assert told(other.trained[0]) != told(first.trained[0])
+    assert told(first.trained[0]) != told(first.trained[1]), "replicas play different worlds"
+
+
+def test_a_run_that_has_not_ended_plays_by_its_newest_checkpoint(tmp_path):
+    members = [C51, SAC]
+    agents = Population(MEADOW, members, replicas=2, seed=3, compile=False)
+    run = start_run(tmp_path / "stopped", "stopped", recipe(agents))
+    with pytest.raises(ValueError, match=r"has .* been trained"):
+        cprl.evaluate_run(run)
+
+    class Stopped(Exception):  # noqa: N818
+        pass
+
+    class Stops(Checkpoints):
+        def after_step(self, training):
+            if training.steps == 30:
+                self.save(training)
+                raise Stopped
+
+    env = CommonsEnv(MEADOW, 2, seed=3)
+    with pytest.raises(Stopped), Stops(run) as checkpoints:
+        train(env, agents.learners, others=agents.others, episodes=9, checkpoints=checkpoints)
+    found = cprl.evaluate_run(run, episodes=3, greedy=True)
+    assert found.run.weights_from.name.startswith("training-000000000030")
+    fresh = CommonsEnv(MEADOW, 6, seed=found.seed)
+    now = evaluate(fresh, agents.policy(3))
+    assert told(now) == told(found.trained[0] + found.trained[1])
+
+
+def test_a_matrix_of_scripted_agents_gives_the_numbers_worked_by_hand(scripted):
+    found = cprl.crossplay(list(scripted.values()), episodes=2)
+    wanted = {  # visitor, hosts, group: each the mean of seats 0 and 1
+        ("greedy", "greedy"): ((2 + 3) / 2, (3 + 2) / 2, 5),
+        ("greedy", "sustainable"): ((2 + 3) / 2, 0, (2 + 3) / 2),
+        ("sustainable", "greedy"): (0, (3 + 2) / 2, (3 + 2) / 2),
+        ("sustainable", "sustainable"): (0, 0, 0),
+    }
+    assert set(found.cells) == set(wanted)
+    for at, returns in wanted.items():
+        measures = found.cell(*at).measures()
+        assert [measures[f"{who}/return"].estimate.value for who in ("visitor", "hosts", "group")] == list(
+            returns
+        )
+    visit = found.cell("greedy", "sustainable")
+    assert [visit.measures(seat)["visitor/return"].estimate.value for seat in (0, 1)] == [2, 3]
+    assert [visit.measures(seat)["stock_left"].estimate.value for seat in (0, 1)] == [3, 2]
+    assert visit.measures()["equality"].estimate.value == 0.5, "one of two has everything"
+    assert visit.measures()["collective_return"].episodes == 2 * 2 * 2
+    at_home = found.cell("sustainable", "sustainable").measures()
+    assert (at_home["equality"].undefined, at_home["equality"].episodes) == (4, 4), "each episode once"
+    with pytest.raises(ValueError, match=r"there is no cell 'greedy' among 'DQN'; runs are \['greedy'"):
+        found.cell("greedy", "DQN")
+
+
+def test_each_cell_is_what_the_loaded_runs_policies_play_with_one_visitor(learned):
+    found = cprl.crossplay(learned.values(), episodes=3, seed=SEED, greedy=True)
+    loaded = {name: cprl.load(run) for name, run in learned.items()}
+    for visitor, hosts in (("alike", "mixed"), ("mixed", "alike")):
+        cell = found.cell(visitor, hosts)
+        by_replica = []
+        for replica in range(3):
+            mine, theirs, stock = [], [], []
+            for seat in range(2):
+                guest = loaded[visitor].policy(replica).actors[seat]
+                env = CommonsEnv(MEADOW, 3, seed=SEED, first_world=3 * replica)
+                alone = evaluate(env, loaded[hosts].policy(replica, others={seat: guest}))
+                assert told(alone) == told(cell.visits[seat][replica])
+                mine += [episode.return_[seat] for episode in alone]
+                theirs += [episode.return_[1 - seat] for episode in alone]
+                stock += [episode.stock_left for episode in alone]
+            by_replica.append((np.mean(mine), np.mean(theirs), np.mean(stock)))
+        measures = cell.measures()
+        for name, mean in zip(
+            ("visitor/return", "hosts/return", "stock_left"), np.mean(by_replica, 0), strict=True
+        ):
+            assert measures[name].estimate.value == pytest.approx(mean)
+            assert measures[name].estimate.replicas == 3
+    diagonal = found.cell("mixed", "mixed")
+    at_home = cprl.evaluate_run(learned["mixed"], episodes=3, seed=SEED, greedy=True)
+    assert diagonal.is_self_play
+    assert told(diagonal.visits[1][2]) == told(at_home.trained[2])
+
+
+def test_on_the_diagonal_strangers_are_of_the_next_replica(learned):
+    runs = list(learned.values())
+    how = {"episodes": 2, "seed": SEED, "greedy": True}
+    found = cprl.crossplay(runs, diagonal="strangers", replicas=[0, 2], **how)
+    loaded, cell = cprl.load(learned["alike"]), found.cell("alike", "alike")
+    for hosts, guests in ((0, 2), (2, 0)):
+        guest = loaded.policy(guests).actors[1]
+        env = CommonsEnv(MEADOW, 2, seed=SEED, first_world=2 * hosts)
+        alone = evaluate(env, loaded.policy(hosts, others={1: guest}))
+        assert told(alone) == told(cell.visits[1][hosts])
+    assert not cell.is_self_play
+    usual = cprl.crossplay(runs, replicas=[0, 2], **how)
+    for at in (("alike", "mixed"), ("mixed", "alike")):
+        assert values(usual.cell(*at).measures()) == values(found.cell(*at).measures())
+    with pytest.raises(ValueError, match=r"strangers are of another replica; there is only \[1\]"):
+        cprl.crossplay(runs, diagonal="strangers", replicas=[1])
+
+
+def test_what_does_not_fit_is_refused_and_says_what_fits(learned, scripted, tmp_path):
+    alike, mixed = learned.values()
+    with pytest.raises(ValueError, match="episodes is 0; at least 1 is wanted"):
+        cprl.evaluate_run(alike, episodes=0)
+    with pytest.raises(ValueError, match=r"seed is 3, by which .*alike was trained; with another"):
+        cprl.evaluate_run(alike, seed=3)
+    with pytest.raises(ValueError, match=r"alike has no replicas \[3, 9\]; it has \[0, 1, 2\]"):
+        cprl.evaluate_run(alike, replicas=[1, 9, 3])
+    with pytest.raises(ValueError, match="1 run came; at least two are wanted"):
+        cprl.crossplay([alike])
+    with pytest.raises(ValueError, match="alike is given twice"):
+        cprl.crossplay([alike, mixed, alike])
+    with pytest.raises(
+        ValueError, match=r"alike and greedy .* unlike games: Map\..* Rules.episode_steps 15 b"
+    ):
+        cprl.crossplay([alike, mixed, scripted["greedy"]])
+    lonely = Game(map=maps.parse(">A"), rules=CORRIDORS.rules)
+    runs = [conducted(tmp_path / n, lonely, [Scripted("greedy")], replicas=1) for n in ("a", "b")]
+    with pytest.raises(ValueError, match="the game has one seat, so nobody to visit; `cprl evaluate`"):
+        cprl.crossplay(runs)
+
+
+def test_games_differ_in_what_a_message_tells():
+    assert differences(MEADOW, MEADOW) == []
+    other = Game(
+        map=MEADOW.map,
+        rules=replace(MEADOW.rules, freeze_steps=7),
+        observation=Observation(agents_apart=True),
+    )
+    assert differences(MEADOW, other) == [
+        "Rules.freeze_steps 2 beside 7",
+        "Observation.agents_apart False beside True",
+    ]
+    assert "Map.sites differ" in differences(MEADOW, CORRIDORS), "forty cells would help nobody"
+
+
+def test_runs_of_the_same_name_are_told_apart_by_their_paths(scripted, tmp_path):
+    copy = shutil.copytree(scripted["greedy"], tmp_path / "greedy")
+    found = cprl.crossplay([scripted["greedy"], copy], episodes=1)
+    assert list(found.runs) == [str(scripted["greedy"]), str(copy)]
+
+
+def command(monkeypatch, capsys, *words):
+    monkeypatch.setattr("sys.argv", ["cprl", *map(str, words)])
+    cli.main()
+    return capsys.readouterr().out
+
+
+def test_the_command_evaluate_tells_every_metric_and_writes_the_episodes(
+    learned, tmp_path, monkeypatch, capsys
+):
+    out = tmp_path / "new" / "episodes.parquet"
+    text = command(monkeypatch, capsys, "evaluate", learned["alike"], "--episodes", 2, "--out", out)
+    found = cprl.evaluate_run(learned["alike"], episodes=2)
+    for name, random in found.measures("random").items():
+        line = f"│ {name} "
+        (row,) = [row for row in text.splitlines() if row.startswith(line)]
+        cells = [cell.strip() for cell in row.split("│")[2:4]]
+        assert cells == [str(found.measures()[name]), str(random)]
+    assert "run's agents, epsilon 0.05" in text
+    table = pq.read_table(out)
+    assert table.num_rows == 2 * 3 * 2 * 2, "policies, replicas, episodes, agents"
+    rows = table.to_pylist()
+    own = [
+        row["return"] for row in rows if (row["policy"], row["replica"], row["episode"]) == ("trained", 2, 1)
+    ]
+    assert own == found.trained[2][1].return_.tolist()
+    with pytest.raises(SystemExit, match=r"cprl: .*episodes\.parquet exists and is kept"):
+        command(monkeypatch, capsys, "evaluate", learned["alike"], "--out", out)
+    assert pq.read_table(out).equals(table)
+
+
+def test_the_command_crossplay_tells_a_matrix_for_each_number_and_writes_the_episodes(
+    scripted, tmp_path, monkeypatch, capsys
+):
+    out = tmp_path / "cross.parquet"
+    greedy, sustainable = scripted.values()
+    text = command(monkeypatch, capsys, "crossplay", greedy, sustainable, "--episodes", 1, "--out", out)
+    assert "2 replicas, 1 episodes each with the visitor at every seat, seed 30011, diagonal: self" in text
+    for name in ("visitor/return", "hosts/return", "group/return", "sustainability", "peacefulness"):
+        assert name in (line.strip() for line in text.splitlines())
+    rows = [[cell.strip() for cell in line.split("│")[1:-1]] for line in text.splitlines() if "│" in line]
+    assert ["greedy", "2.5 [2.5, 2.5]", "2.5 [2.5, 2.5]"] in rows
+    assert ["sustainable", "0 [0, 0]", "0 [0, 0]"] in rows
+    assert ["greedy", "sustainable", "1", "3 [3, 3]", "0 [0, 0]", "3 [3, 3]"] in rows
+    assert ["sustainable", "0.5 [0.5, 0.5]", "undefined in all 2"] in rows, "equality"
+    seats = pq.read_table(out, columns=["visitor", "hosts", "seat"]).to_pylist()
+    assert len(seats) == (1 + 2 + 2 + 1) * 2 * 2, "visits, replicas, agents"
+    assert {row["seat"] for row in seats if row["visitor"] == row["hosts"]} == {-1}
+    with pytest.raises(SystemExit, match=r"cprl: .*cross\.parquet exists and is kept"):
+        command(monkeypatch, capsys, "crossplay", greedy, sustainable, "--out", out)
+    with pytest.raises(SystemExit, match="cprl: 1 run came; at least two are wanted"):
+        command(monkeypatch, capsys, "crossplay", greedy)
+
+
+def test_social_measures_are_those_of_the_docs(scripted):
+    found = cprl.evaluate_run(scripted["greedy"], episodes=1)
+    text = (cli.Path(__file__).parents[1] / "docs" / "metrics.md").read_text()
+    documented = [line.split("`")[1] for line in text.splitlines() if line.startswith("| `social/")]
+    assert {f"social/{name}" for name in social_measures(found.trained)} == set(documented)
+    (single,) = [one for name, one in social_measures({0: found.trained[0]}).items() if name == "peace"]
+    assert str(single) == "2", "one replica alone has no interval"
+    assert isnan(single.estimate.low)
