@@ -141,6 +141,26 @@ def test_greedy_agents_play_what_the_policy_of_the_loaded_run_plays(name, learne
     assert values(found.measures())["collective_return"] == pytest.approx(np.mean(means))
 
 
+class Own(torch.nn.Module):
+    """A network of the user's own, which cannot be stacked with its like."""
+
+    def __init__(self, network):
+        super().__init__()
+        self.network = network
+
+    def forward(self, observation):
+        return self.network(observation)
+
+
+def test_networks_that_do_not_stack_play_the_same(learned):
+    loaded = cprl.load(learned["alike"])
+    own = replace(loaded, networks={lane: Own(network) for lane, network in loaded.networks.items()})
+    for greedy in (True, False):
+        one, other = (cprl.evaluate_run(run, episodes=2, greedy=greedy) for run in (loaded, own))
+        for replica in loaded.replicas:
+            assert told(one.trained[replica]) == told(other.trained[replica])
+
+
 def test_agents_explore_with_the_runs_epsilon_for_evaluation(learned, tmp_path):
     always = shutil.copytree(learned["alike"], tmp_path / "always")
     text = json.loads((always / "recipe.json").read_text())

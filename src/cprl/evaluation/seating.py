@@ -6,6 +6,7 @@ one, and chance is handed in: each lane's random numbers follow from (seed, repl
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+from functools import cache
 from typing import Any, TypeAlias
 
 import torch
@@ -81,7 +82,11 @@ def seated(sitters: Sequence[Sitter], replicas: Sequence[int], *, worlds: int, s
     """
     game = sitters[0].run.game
     alike: dict[Any, list[int]] = {}
-    found = [[_agent(sitter, seat, replica) for replica in replicas] for seat, sitter in enumerate(sitters)]
+    earlier = cache(load)  # a run whose agents are frozen in this one, once for all its seats and replicas
+    found = [
+        [_agent(sitter, seat, replica, earlier) for replica in replicas]
+        for seat, sitter in enumerate(sitters)
+    ]
     for seat, agents in enumerate(found):
         alike.setdefault(agents[0].kind, []).append(seat)
     actors: dict[Seat, nn.Module] = {}
@@ -108,14 +113,14 @@ class _Agent:
     network: nn.Module | None = None
 
 
-def _agent(sitter: Sitter, seat: int, replica: int) -> _Agent:
-    """The agent at a seat of a replica."""
+def _agent(sitter: Sitter, seat: int, replica: int, earlier: Callable[[str], LoadedRun]) -> _Agent:
+    """The agent at a seat of a replica; of a frozen one the run is what `earlier` gives for its path."""
     run, of_replica = sitter.run, sitter.replica(replica)
     member = run.members[seat]
     if member["member"] == "Scripted":
         return _Agent(("scripted", member["manner"]))
     if member["member"] == "Frozen":
-        run, seat, of_replica = load(member["run"]), member["agent"], member["replica"]
+        run, seat, of_replica = earlier(member["run"]), member["agent"], member["replica"]
     network, samples, epsilon = run.agent(seat, replica=of_replica)
     return _Agent(("trained", samples, epsilon, repr(run.algorithms[seat])), network)
 
