@@ -172,6 +172,28 @@ def test_agents_explore_with_the_runs_epsilon_for_evaluation(learned, tmp_path):
     assert told(by_chance.trained[0]) != told(cprl.evaluate_run(always, episodes=2, greedy=True).trained[0])
 
 
+class Undecided(torch.nn.Module):
+    """Gives every action the same logit."""
+
+    def forward(self, observation):
+        return torch.zeros(*observation.shape[:-3], len(MEADOW.actions))
+
+
+def test_agents_that_learned_a_policy_draw_from_it(learned):
+    loaded = cprl.load(learned["mixed"])
+    undecided = replace(
+        loaded,
+        members=[loaded.members[0]] * 2,
+        algorithms=dict.fromkeys((0, 1), PPO.algorithm),
+        networks={f"replica_{replica}/agent_{agent}": Undecided() for replica in (0, 1) for agent in (0, 1)},
+    )
+    found = cprl.evaluate_run(undecided, episodes=2)
+    for replica in (0, 1):
+        assert told(found.trained[replica]) == told(found.random[replica])
+    greedy = cprl.evaluate_run(undecided, episodes=2, greedy=True)
+    assert told(greedy.trained[0]) != told(greedy.random[0])
+
+
 def test_the_random_policy_is_that_of_the_populations(learned):
     found = cprl.evaluate_run(learned["mixed"], episodes=2, seed=SEED, replicas=[1])
     from cprl.acting.lanes import random_lanes
