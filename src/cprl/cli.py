@@ -94,10 +94,11 @@ def evaluate(
         refuse_to_write_over(out)
     prepare_process(seed)
     evaluation = evaluate_run(run, episodes=episodes, greedy=greedy, seed=seed, replicas=replicas)
+    if out is not None:
+        write_table(out, evaluation.table())
     _tell(run_table(evaluation))
     print(f"Weights: {evaluation.run.weights_from}")
     if out is not None:
-        write_table(out, evaluation.table())
         print(f"Episodes: {out}")
 
 
@@ -130,10 +131,11 @@ def crossplay(
     played = play_each_other(
         runs, episodes=episodes, greedy=greedy, seed=seed, replicas=replicas, diagonal=diagonal
     )
+    if out is not None:
+        write_table(out, played.table())
     print(heading(played))
     _tell(*matrices(played), seats_table(played))
     if out is not None:
-        write_table(out, played.table())
         print(f"Episodes: {out}")
 
 
