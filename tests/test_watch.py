@@ -1,5 +1,6 @@
 """A training is watched without being harmed: by no viewer, none there, one that dies, nor a full disk."""
 
+import contextlib
 import os
 import socket
 import subprocess
@@ -120,21 +121,47 @@ def test_an_address_where_nobody_listens_is_told_once_and_changes_nothing(tmp_pa
     assert time.monotonic() - started < 60
 
 
-@pytest.mark.skipif(os.geteuid() != 0, reason="only root may mount a disk that fills up")
-def test_a_full_disk_is_told_once_and_changes_nothing(tmp_path, unwatched):
-    disk = tmp_path / "disk"
-    disk.mkdir()
-    if subprocess.run(["mount", "-t", "tmpfs", "-o", "size=96k", "tmpfs", disk], check=False).returncode:
+@contextmanager
+def disk_of(size, folder):
+    """A disk of its own, of so many kilobytes."""
+    folder.mkdir()
+    mounted = ["mount", "-t", "tmpfs", "-o", f"size={size}k", "tmpfs", folder]
+    if subprocess.run(mounted, check=False).returncode:
         pytest.skip("no disk could be mounted here")
     try:
+        yield folder
+    finally:
+        subprocess.run(["umount", "-l", folder], check=True)
+
+
+only_root = pytest.mark.skipif(os.geteuid() != 0, reason="only root may mount a disk that fills up")
+
+
+@only_root
+def test_a_disk_that_fills_up_is_told_once_and_changes_nothing(tmp_path, unwatched):
+    with disk_of(3000, tmp_path / "disk") as disk:
+
+        def fill():
+            with contextlib.suppress(OSError), (disk / "others").open("wb", buffering=0) as file:
+                while file.write(bytes(1000)):
+                    pass
+
         with pytest.warns(
             RuntimeWarning, match="the Rerun file is dropped, the run goes on without it"
         ) as caught:
+            assert course(disk, live="serve", others=[Doing(30, fill)]) == unwatched
+        assert len(caught) == 1
+        assert os.statvfs(disk).f_bfree == 0, "the disk really was full"
+        assert (disk / "run.rrd").stat().st_size > 50_000, "and the recording had been begun"
+
+
+@only_root
+def test_a_disk_that_is_full_from_the_start_is_told_once_and_changes_nothing(tmp_path, unwatched):
+    with disk_of(96, tmp_path / "disk") as disk:
+        with pytest.warns(RuntimeWarning, match="bytes are free there, 2,000,000 are wanted") as caught:
             assert course(disk, live="serve") == unwatched
         assert len(caught) == 1
-        assert (disk / "run.rrd").stat().st_size > 90_000, "the disk really was full"
-    finally:
-        subprocess.run(["umount", "-l", disk], check=True)
+        assert not (disk / "run.rrd").exists()
 
 
 def test_a_way_to_watch_that_is_none_is_refused_before_anything_begins(tmp_path):

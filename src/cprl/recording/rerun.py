@@ -80,7 +80,9 @@ class RerunLogger(Logger):
 
     def _create_experiment(self) -> list[Any]:
         recording_id, blueprint = self.recording_id, layout(self.scene)
-        self._streams.append(open_file(recording_id, self.path, blueprint, period_s=_FILE_PERIOD_S))
+        Path(self.log_dir).mkdir(parents=True, exist_ok=True)
+        file = open_file(recording_id, self.path, blueprint, period_s=_FILE_PERIOD_S)
+        self._streams += [file] if file else []
         if self._live:
             self._go_live(recording_id, blueprint)
         self._all(lambda recording: recording.send_recording_name(self.exp_name))

@@ -1,6 +1,7 @@
 """Streams of one recording: to a file and, on request, served live on 127.0.0.1."""
 
 import os
+import shutil
 import socket
 import subprocess
 import sys
@@ -14,6 +15,9 @@ from urllib.parse import quote, urlsplit
 LOCALHOST: Final = "127.0.0.1"
 SERVER_MEMORY: Final = "512MB"
 """What the served recording may hold; beyond it the oldest rows are dropped, for viewers alone."""
+
+ROOM_BYTES: Final = 2_000_000
+"""Free on a disk, so that a recording is begun there; its layout and static parts take a tenth."""
 
 FLUSH_TIMEOUT_S: Final = 5.0
 
@@ -98,8 +102,15 @@ def _check(live: str, wanted: str, *, name: str = "live") -> None:
         raise ValueError(f"{name} is {live!r}; wanted: {wanted}")
 
 
-def open_file(recording_id: str, path: Path, blueprint: Any, *, period_s: float) -> Stream:
-    """A stream into a new file."""
+def open_file(recording_id: str, path: Path, blueprint: Any, *, period_s: float) -> Stream | None:
+    """A stream into a new file; None, with a warning, where the disk is as good as full.
+
+    Rerun would wait for ever, now and then, for a layout that finds no room.
+    """
+    free = shutil.disk_usage(path.parent).free
+    if free < ROOM_BYTES:
+        _warn_of(f"file {path}", f"{free:,} bytes are free there, {ROOM_BYTES:,} are wanted")
+        return None
     recording = _recording(recording_id)
     recording.save(path, default_blueprint=blueprint)
     return Stream("file", recording, period_s=period_s)
