@@ -227,7 +227,7 @@ def test_learners_that_do_not_fit_are_refused(learners, others, message):
 
 
 def test_an_unknown_way_is_refused():
-    with pytest.raises(ValueError, match="way is 'loop'; allowed: lane axis, vmap, list"):
+    with pytest.raises(ValueError, match="way is 'loop'; allowed: lane axis, lane axis, flat, vmap, list"):
         learner("loop", replicas=1)
 
 
