@@ -7,15 +7,20 @@ from cprl.learning.on_policy import A2C, PPO, Reinforce
 from cprl.learning.rollouts import RolloutLearner
 from cprl.learning.settings import DQNSettings, RolloutSettings
 from cprl.learning.tabular import TabularLearner, TabularSettings
+from cprl.learning.teams import IPPO, MAPPO, QMIX, VDN
 from cprl.learning.transitions import transitions_of
 
 __all__ = [
     "A2C",
     "CQL",
     "DQN",
+    "IPPO",
     "IQL",
+    "MAPPO",
     "PPO",
+    "QMIX",
     "SAC",
+    "VDN",
     "DQNLearner",
     "DQNSettings",
     "DistributionalDQN",

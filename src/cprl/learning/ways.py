@@ -91,7 +91,12 @@ def fitting_way(networks: Sequence[nn.Module], make_loss: MakeLoss, trial: Tenso
 
 
 def trial_batch(
-    lanes: int, observation_shape: Sequence[int], actions: int, *, device: str | torch.device = "cpu"
+    lanes: int,
+    observation_shape: Sequence[int],
+    actions: int,
+    *,
+    action_shape: Sequence[int] = (),
+    device: str | torch.device = "cpu",
 ) -> TensorDict:
     """Made-up transitions [lanes, 8], the same every time; one in eight ends an episode."""
     buffer = lane_buffer(
@@ -99,12 +104,13 @@ def trial_batch(
         transitions=TRIAL_TRANSITIONS,
         batch_size=8,
         observation_shape=observation_shape,
+        action_shape=action_shape,
         device=device,
     )
     chance = torch.Generator().manual_seed(0)
     for step in range(TRIAL_TRANSITIONS):
         seen = torch.randint(256, (2, lanes, *observation_shape), generator=chance).to(torch.uint8)
-        action = torch.randint(actions, (lanes,), generator=chance)
+        action = torch.randint(actions, (lanes, *action_shape), generator=chance)
         ends = torch.full((lanes,), step % 8 == 7)
         turn = seen[0], action, seen[1], torch.rand(lanes, generator=chance), ends, ends
         buffer.storage.write(LaneTurn(*(array_of(entry.to(device)) for entry in turn)))
