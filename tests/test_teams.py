@@ -1,19 +1,24 @@
 """Teams learn together: VDN and QMIX from replay, MAPPO and IPPO on-policy, one team in each replica."""
 
 from dataclasses import replace
+from statistics import fmean
 
 import pytest
+import test_optimum
 import torch
 from tensordict import TensorDict
 from test_population import GAME, REPLAY, ROLLOUTS, AtSteps, Returns, conducted, population, trained, weights
 
 import cprl
-from cprl import CommonsEnv
+from cprl import CommonsEnv, Game, Rules, maps, presets
 from cprl.acting.networks import acting_part
-from cprl.acting.teams import Mixing
-from cprl.learning import DQN, IPPO, MAPPO, QMIX, VDN
+from cprl.acting.teams import Mixing, TeamNetwork
+from cprl.learning import DQN, IPPO, MAPPO, QMIX, VDN, DQNSettings
+from cprl.learning.fused import FunctionalUpdate
+from cprl.learning.lanes import LaneLearner
 from cprl.learning.ways import trial_batch
-from cprl.population import Frozen, Learner, Scripted
+from cprl.measuring.evaluate import evaluate
+from cprl.population import Frozen, Learner, Population, Scripted
 from cprl.recording.checkpoints import checkpoints_in
 from cprl.train import train
 
@@ -38,8 +43,8 @@ def test_each_team_moves_every_members_weights_and_no_replica_knows_of_the_other
     together, learner = team_of(name, replicas=3)
     alone, _ = team_of(name, replicas=1, first_replica=2)
     before = weights(together)
-    _, returns = trained(together)
-    _, returns_alone = trained(alone, first=2)
+    _, returns = trained(together, episodes=4)
+    _, returns_alone = trained(alone, first=2, episodes=4)
     assert returns[2] == returns_alone[0]
     after, after_alone = weights(together), weights(alone)
     assert learner.lanes == 3, "a lane is a team"
@@ -70,6 +75,13 @@ def test_each_team_takes_the_way_that_agrees_with_a_list_of_torchrls_losses(name
         for key, value in by_list.items():
             assert torch.equal(mine[key], named[key]), "this is the way that is found"
             torch.testing.assert_close(mine[key], value, rtol=1e-3, atol=1e-5)
+
+
+def test_qmix_over_many_observations_is_not_slowed_by_what_the_trial_rounds():
+    game = presets.game("commons")  # 1260 inputs to its mixing
+    members = [Learner(QMIX(settings=DQNSettings(buffer_size=50)), paid="group")] * 4
+    (learner,) = Population(game, members, replicas=2, compile=False).learners.values()
+    assert isinstance(learner.update, FunctionalUpdate)
 
 
 def test_a_member_acts_by_its_own_network_and_what_it_sees_itself():
@@ -196,7 +208,7 @@ def test_a_team_that_was_stopped_goes_on_bit_for_bit(name, tmp_path):
                 train(
                     CommonsEnv(GAME, 2, seed=3),
                     agents.learners,
-                    episodes=6,
+                    episodes=4,
                     observers=[Witness()],
                     checkpoints=checkpoints,
                 )
@@ -246,8 +258,44 @@ def test_what_is_no_team_is_refused_and_what_needs_none_is_not():
     with pytest.raises(ValueError, match="QMIX wants a team of at least 2"):
         population([Learner(algorithm, paid="group") for algorithm in unequal])
     assert list(population([Learner(TEAMS["IPPO"])] * 4).learners) == [FOUR]
+    with pytest.raises(ValueError, match='paid is "own"; a team that learns from replay shares one reward'):
+        LaneLearner(GAME, seats=FOUR, replicas=2, settings=REPLAY, make_team=TeamNetwork)
     wrong = QMIX(settings=ROLLOUTS)
     with pytest.raises(
         ValueError, match="QMIX has settings of the type RolloutSettings; DQNSettings is wanted"
     ):
         population([Learner(wrong, paid="group")] * 4)
+
+
+ROWS = Game(
+    map=maps.parse(
+        """
+        >AA#
+        ####
+        #AA<
+        """
+    ),
+    rules=Rules(regrow_prob=(1.0,), may_fire=False, window_rows=2, window_columns=3, episode_steps=24),
+)
+"""Two boards of `test_optimum.py`, an agent on each: 24 apples an episode for each, and no more."""
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", TEAMS)
+def test_a_team_comes_close_to_the_optimum(name):
+    algorithm = replace(
+        TEAMS[name], settings=test_optimum.ROLLOUTS if name.endswith("PPO") else test_optimum.REPLAY
+    )
+    # Paid for the group, one of four replicas of IPPO ended at half of the apples.
+    members = [Learner(algorithm, paid="own" if name == "IPPO" else "group")] * 2
+    team = Population(ROWS, members, replicas=4, seed=1, compile=False)
+
+    def share():
+        played = evaluate(CommonsEnv(ROWS, 4, seed=99), team.policy(1))
+        return [float(episode.return_.sum()) / 48 for episode in played]
+
+    untrained = share()
+    train(CommonsEnv(ROWS, 4, seed=1), team.learners, episodes=400 if name.endswith("PPO") else 125)
+    assert fmean(untrained) < 0.5
+    shares = share()
+    assert fmean(shares) > 0.9, shares

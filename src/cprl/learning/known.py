@@ -6,8 +6,9 @@ from typing import Any, Final, TypeAlias
 
 from cprl.learning.algorithms import CQL, DQN, IQL, SAC, DistributionalDQN, OffPolicy
 from cprl.learning.on_policy import A2C, PPO, OnPolicy, Reinforce
+from cprl.learning.on_policy_teams import IPPO, MAPPO
 from cprl.learning.settings import DQNSettings, RolloutSettings
-from cprl.learning.teams import IPPO, MAPPO, QMIX, VDN, TeamAlgorithm
+from cprl.learning.teams import QMIX, VDN, TeamAlgorithm
 
 Algorithm: TypeAlias = OffPolicy | OnPolicy | TeamAlgorithm
 """What an agent that learns is made of."""

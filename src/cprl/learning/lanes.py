@@ -48,7 +48,7 @@ class LaneLearner:
 
     Raises:
         ValueError: for a loss that wants what the present policy has just done; see
-            `cprl.learning.rollouts`.
+            `cprl.learning.rollouts`; for a team that is not paid for the group.
     """
 
     def __init__(
@@ -71,7 +71,7 @@ class LaneLearner:
     ) -> None:
         self.game, self.settings, self.seats = game, settings, tuple(seats)
         self.replicas, self.seed, self.paid = replicas, seed, paid
-        actions = len(game.actions)
+        actions, shape = len(game.actions), game.observation_shape
         make_loss = make_loss or partial(dqn_loss, gamma=settings.gamma)
         agents = Lanes(
             game,
@@ -80,13 +80,7 @@ class LaneLearner:
             seed=seed,
             first_replica=first_replica,
             make_network=make_network
-            or partial(
-                q_network,
-                game.observation_shape,
-                actions,
-                settings=settings,
-                highest=game.observation.highest,
-            ),
+            or partial(q_network, shape, actions, settings=settings, highest=game.observation.highest),
             samples=samples,
         )
         if settings.priority_alpha:
@@ -94,6 +88,8 @@ class LaneLearner:
                 f"priority_alpha is {settings.priority_alpha}; lanes sample uniformly, 0 is what fits, or a "
                 "plain DQNLearner for each agent"
             )
+        if make_team and paid != "group":
+            raise ValueError(f'paid is "{paid}"; a team that learns from replay shares one reward, "group"')
         self._lanes: Lanes | Teams = Teams(agents, make_team) if make_team else agents
         networks = self._lanes.new_networks(WEIGHTS, device)
         refuse_on_policy(make_loss(deepcopy(networks[0])))
@@ -163,11 +159,8 @@ class LaneLearner:
         if self._lanes.samples:
             return torch.full((self.replicas, len(self.seats)), torch.nan)
         with torch.no_grad():
-            return (
-                self.update.outputs(self._lanes.seen_next(batch))
-                .amax(-1)
-                .view(self.replicas, len(self.seats))
-            )
+            highest = self.update.outputs(self._lanes.seen_next(batch)).amax(-1)
+        return highest.view(self.replicas, len(self.seats))
 
     def state_dict(self) -> dict[str, Any]:
         """Everything that the future of all lanes depends on; own tensors, not copies.

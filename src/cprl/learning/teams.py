@@ -1,23 +1,23 @@
-"""Algorithms of teams: agents that learn together, act each by its own observations and its own network.
+"""Algorithms of teams: agents that learn together, and act each by its own network and what it sees itself.
 
-A team is all the seats of a replica that share an equal algorithm; teams are lanes, one of each replica. VDN,
-QMIX and MAPPO change the question: their agents share one reward.
+A team is all the seats of a replica with equal learners; a lane is then a team. VDN, QMIX and MAPPO change
+the question: their agents share one reward. MAPPO and IPPO stand in `cprl.learning.on_policy_teams`.
 """
 
 from collections.abc import Sequence
 from dataclasses import dataclass, fields
-from typing import Any, ClassVar, Protocol, runtime_checkable
+from typing import ClassVar, Protocol, runtime_checkable
 
 from tensordict.nn import TensorDictModule
 from torch import nn
 from torchrl.modules import QValueActor, VDNMixer
 from torchrl.objectives import LossModule, ValueEstimators
-from torchrl.objectives.multiagent import IPPOLoss, MAPPOLoss, QMixerLoss
+from torchrl.objectives.multiagent import QMixerLoss
 
-from cprl.acting.networks import AgentNetworks, QNetwork
-from cprl.acting.teams import CentralCritic, Mixing, TeamNetwork
+from cprl.acting.networks import AgentNetworks
+from cprl.acting.teams import Mixing, TeamNetwork
 from cprl.commons.game import Game
-from cprl.learning.algorithms import policy, q_network_of
+from cprl.learning.algorithms import q_network_of
 from cprl.learning.settings import DQNSettings, RolloutSettings
 from cprl.learning.transitions import Paid
 
@@ -120,77 +120,6 @@ class QMIX:
         return _mixed(network, [_CHOSEN, "observation"], self.settings)
 
 
-@dataclass(frozen=True, kw_only=True)
-class MAPPO:
-    """PPO with actors of their own and one critic that sees what all members see, by TorchRL's `MAPPOLoss`.
-
-    Source: Yu et al., "The Surprising Effectiveness of PPO in Cooperative Multi-Agent Games" (2022); without
-    their normalisation of values, and with networks of each member's own.
-    """
-
-    settings: RolloutSettings
-    clip_epsilon: float = 0.2
-    """How far the chance of an action may move from what it was, as a ratio."""
-    entropy_coeff: float = 0.01
-    critic_coeff: float = 0.5
-    samples: ClassVar[bool] = True
-    shares_reward: ClassVar[bool] = True
-    fewest_members: ClassVar[int] = 1
-
-    def network(self, game: Game) -> nn.Module:
-        """See `TeamAlgorithm`."""
-        return _of_rollouts(game, self.settings, outputs=len(game.actions))
-
-    def team(self, members: Sequence[nn.Module], game: Game) -> nn.Module:
-        """See `TeamAlgorithm`."""
-        everything = len(members), *game.observation_shape
-        critic = QNetwork(
-            everything, 1, highest=game.observation.highest, hidden_cells=self.settings.hidden_cells
-        )
-        return AgentNetworks({"actor": TeamNetwork(members), "critic": CentralCritic(critic, len(members))})  # type: ignore[arg-type]
-
-    def loss(self, network: nn.Module) -> LossModule:
-        """See `TeamAlgorithm`."""
-        return _clipped(network, MAPPOLoss, self)
-
-
-@dataclass(frozen=True, kw_only=True)
-class IPPO:
-    """PPO with actors and critics of their own, by TorchRL's `IPPOLoss`.
-
-    Unlike agents that each learn by `PPO`, members share the length to which a gradient is shortened and the
-    mean and deviation of advantages. Source: de Witt et al., "Is Independent Learning All You Need in the
-    StarCraft Multi-Agent Challenge?" (2020).
-    """
-
-    settings: RolloutSettings
-    clip_epsilon: float = 0.2
-    """How far the chance of an action may move from what it was, as a ratio."""
-    entropy_coeff: float = 0.01
-    critic_coeff: float = 0.5
-    samples: ClassVar[bool] = True
-    shares_reward: ClassVar[bool] = False
-    fewest_members: ClassVar[int] = 1
-
-    def network(self, game: Game) -> nn.Module:
-        """See `TeamAlgorithm`."""
-        sizes = {"actor": len(game.actions), "critic": 1}
-        return AgentNetworks(
-            {name: _of_rollouts(game, self.settings, outputs=size) for name, size in sizes.items()}
-        )
-
-    def team(self, members: Sequence[nn.Module], game: Game) -> nn.Module:
-        """See `TeamAlgorithm`."""
-        of_each: Sequence[Any] = members
-        return AgentNetworks(
-            {name: TeamNetwork([networks[name] for networks in of_each]) for name in ("actor", "critic")}
-        )
-
-    def loss(self, network: nn.Module) -> LossModule:
-        """See `TeamAlgorithm`."""
-        return _clipped(network, IPPOLoss, self)
-
-
 def refuse_wrong_team(algorithm: TeamAlgorithm, *, paid: Paid, members: int) -> None:
     """Raises a ValueError for a team that is none: of members paid for themselves, too few, or with settings
     of the other kind."""
@@ -212,15 +141,6 @@ def refuse_wrong_team(algorithm: TeamAlgorithm, *, paid: Paid, members: int) -> 
         )
 
 
-def _of_rollouts(game: Game, settings: RolloutSettings, *, outputs: int) -> QNetwork:
-    return QNetwork(
-        game.observation_shape,
-        outputs,
-        highest=game.observation.highest,
-        hidden_cells=settings.hidden_cells,
-    )
-
-
 def _mixed(network: nn.Module, seen_by_mixer: Sequence[str], settings: DQNSettings) -> LossModule:
     """`QMixerLoss` over a team's "actor" and "mixer", its entries at the root."""
     assert isinstance(network, AgentNetworks)
@@ -233,16 +153,3 @@ def _mixed(network: nn.Module, seen_by_mixer: Sequence[str], settings: DQNSettin
     loss.set_keys(action="action", action_value="action_value", local_value=_CHOSEN, global_value=_OF_TEAM)
     loss.make_value_estimator(ValueEstimators.TD0, gamma=settings.gamma)
     return loss
-
-
-def _clipped(network: nn.Module, kind: type[MAPPOLoss], algorithm: MAPPO | IPPO) -> LossModule:
-    assert isinstance(network, AgentNetworks)
-    return kind(
-        policy(network["actor"]),
-        TensorDictModule(network["critic"], ["observation"], ["state_value"]),
-        clip_epsilon=algorithm.clip_epsilon,
-        entropy_coeff=algorithm.entropy_coeff,
-        critic_coeff=algorithm.critic_coeff,
-        loss_critic_type="l2",
-        normalize_advantage=False,  # `RolloutLearner` does, each team by itself
-    )
