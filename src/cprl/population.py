@@ -17,6 +17,7 @@ from cprl.learning.known import Algorithm, told
 from cprl.learning.lanes import LaneLearner
 from cprl.learning.rollouts import RolloutLearner
 from cprl.learning.settings import DQNSettings, RolloutSettings
+from cprl.learning.teams import TeamAlgorithm, refuse_wrong_team
 from cprl.learning.transitions import Paid
 from cprl.recording.loaded import load
 
@@ -172,6 +173,10 @@ def _learner(member: Learner, game: Game, *, seats: tuple[int, ...], **how: Any)
         "paid": member.paid,
         **how,
     }
+    if isinstance(algorithm, TeamAlgorithm):
+        team = algorithm
+        refuse_wrong_team(team, paid=member.paid, members=len(seats))
+        common["make_team"] = lambda networks: team.team(networks, game)
     settings = algorithm.settings
     if isinstance(settings, RolloutSettings):
         return RolloutLearner(game, settings=settings, **common)

@@ -1,6 +1,6 @@
 """Lanes: the agents at some seats of every replica, acting at once. A lane is one agent of one replica."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from copy import deepcopy
 from typing import Any
 
@@ -63,20 +63,32 @@ class LaneQNetwork(nn.Module):
         """uint8 [L, C, X, Y] or [L, b, C, X, Y] to [L, A] or [L, b, A], in the parameters' type."""
         flat = observation.flatten(-self.observation_dims)
         values = flat.reshape(self.lanes, -1, flat.shape[-1]).to(self.weights[0].dtype) / self.highest
-        last = len(self.weights) - 1
-        for layer, (weight, bias) in enumerate(zip(self.weights, self.biases, strict=True)):
-            values = torch.baddbmm(bias, values, weight)
-            if layer < last or self.relu_on_outputs:
-                values = values.relu()
+        values = through_layers(values, self.weights, self.biases, relu_on_outputs=self.relu_on_outputs)
         return values.reshape(*flat.shape[:-1], values.shape[-1])
+
+
+def through_layers(
+    values: Tensor, weights: Iterable[Tensor], biases: Iterable[Tensor], *, relu_on_outputs: bool
+) -> Tensor:
+    """[L, b, in] through layers of weights [L, in, out] and biases [L, 1, out] with ReLU between."""
+    first = True
+    for weight, bias in zip(weights, biases, strict=True):
+        values = torch.baddbmm(bias, values if first else values.relu(), weight)
+        first = False
+    return values.relu() if relu_on_outputs else values
 
 
 def stack_lanes(networks: Sequence[nn.Module]) -> nn.Module:
     """The networks of all lanes as one whose parameters carry a lane axis; copies.
 
     Raises:
-        ValueError: for other networks than `QNetwork`, alone, in an `AtomNetwork` or in `AgentNetworks`.
+        ValueError: for other networks than `QNetwork`, alone, in an `AtomNetwork` or in `AgentNetworks`, and
+            those that stack themselves, as a team's do.
     """
+    first: Any = networks[0]
+    if hasattr(first, "stacked"):
+        itself: nn.Module = first.stacked(networks)
+        return itself
     if all(isinstance(network, AtomNetwork) for network in networks):
         stack = deepcopy(networks[0])
         stack.network = stack_lanes([network.network for network in networks])  # type: ignore[misc]
@@ -90,13 +102,13 @@ def stack_lanes(networks: Sequence[nn.Module]) -> nn.Module:
 
 
 def lane_state(stack: nn.Module, lane: int) -> dict[str, Tensor]:
-    """Copies of the weights of one lane of what `stack_lanes` gave for `QNetwork`s or `AtomNetwork`s, as the
-    state dict of such a network."""
+    """Copies of the weights of one lane of what `stack_lanes` gave for acting networks, as the state dict of
+    such a network."""
     if isinstance(stack, AtomNetwork):
         own = lane_state(stack.network, lane)
         return {"support": stack.support.clone(), **{f"network.{name}": value for name, value in own.items()}}
-    assert isinstance(stack, LaneQNetwork)
-    return stack.lane_state(lane)
+    state: dict[str, Tensor] = stack.lane_state(lane)  # type: ignore[operator]
+    return state
 
 
 def _shapes(network: QNetwork) -> tuple[tuple[int, ...], ...]:

@@ -4,18 +4,24 @@ from cprl.learning.algorithms import CQL, DQN, IQL, SAC, DistributionalDQN
 from cprl.learning.dqn import DQNLearner
 from cprl.learning.lanes import LaneLearner
 from cprl.learning.on_policy import A2C, PPO, Reinforce
+from cprl.learning.on_policy_teams import IPPO, MAPPO
 from cprl.learning.rollouts import RolloutLearner
 from cprl.learning.settings import DQNSettings, RolloutSettings
 from cprl.learning.tabular import TabularLearner, TabularSettings
+from cprl.learning.teams import QMIX, VDN
 from cprl.learning.transitions import transitions_of
 
 __all__ = [
     "A2C",
     "CQL",
     "DQN",
+    "IPPO",
     "IQL",
+    "MAPPO",
     "PPO",
+    "QMIX",
     "SAC",
+    "VDN",
     "DQNLearner",
     "DQNSettings",
     "DistributionalDQN",

@@ -1,16 +1,18 @@
 """Lanes: who learns at some seats of every replica, their seeds, networks and actors."""
 
 from collections.abc import Callable, Sequence
-from typing import Final
+from typing import Final, Protocol
 
 import numpy as np
 import torch
+from tensordict import TensorDictBase
 from torch import Tensor, nn
 
 from cprl.acting.lanes import LaneActor
 from cprl.acting.networks import acting_part
 from cprl.commons.game import Game
-from cprl.learning.updates import ListUpdate, Update
+from cprl.learning.transitions import LaneTurn, Paid, lane_turn, seen_next
+from cprl.learning.updates import ListUpdate
 
 WEIGHTS, TARGET_WEIGHTS, EXPLORATION, SAMPLING, EVALUATION = range(5)
 """What a lane's random numbers are for."""
@@ -23,6 +25,16 @@ def lane_seeds(
 ) -> list[tuple[int, int, int, int]]:
     """A seed for each lane, replica by replica, of the run's seed, the replica, the agent and the purpose."""
     return [(seed, replica, agent, purpose) for replica in replicas for agent in seats]
+
+
+class Acts(Protocol):
+    """What acts by the present weights of many lanes; an `Update` does."""
+
+    def outputs(self, observation: Tensor, *, part: int = 0) -> Tensor:
+        """What the networks give: [L, k, ...] to [L, k, ...]."""
+
+    def network_state(self, lane: int) -> dict[str, Tensor]:
+        """Copies of the present weights of one lane, as the state dict of its acting network."""
 
 
 class Lanes:
@@ -52,7 +64,7 @@ class Lanes:
     ) -> None:
         self.game, self.seats, self.replicas, self.seed = game, tuple(seats), replicas, seed
         self._numbers = range(first_replica, first_replica + replicas)
-        self._make_network, self.samples = make_network, samples
+        self.make_network, self.samples = make_network, samples
 
     def __len__(self) -> int:
         return self.replicas * len(self.seats)
@@ -62,15 +74,46 @@ class Lanes:
         """Of each lane: "replica_0/agent_0" and so on."""
         return [f"replica_{replica}/agent_{agent}" for replica in self._numbers for agent in self.seats]
 
+    @property
+    def observation_shape(self) -> tuple[int, ...]:
+        """Of what a lane sees: (C, X, Y)."""
+        return self.game.observation_shape
+
+    @property
+    def action_shape(self) -> tuple[int, ...]:
+        """Of what a lane does, and of what it is paid in a rollout."""
+        return ()
+
+    @property
+    def of_replica(self) -> int:
+        """Lanes of a replica."""
+        return len(self.seats)
+
+    def turn(self, batch: TensorDictBase, paid: Paid) -> LaneTurn:
+        """A turn of every lane, as replay stores it."""
+        return lane_turn(self.seats, batch, paid=paid)
+
+    def rollout_turn(self, batch: TensorDictBase, paid: Paid) -> LaneTurn:
+        """A turn of every lane, as a rollout keeps it."""
+        return lane_turn(self.seats, batch, paid=paid)
+
+    def seen_next(self, batch: TensorDictBase) -> Tensor:
+        """What lanes see at the end of a turn, uint8 [L, 1, C, X, Y]."""
+        return seen_next(batch)[:, list(self.seats)].flatten(0, 1).unsqueeze(1)
+
+    def by_agent(self, losses: Tensor) -> Tensor:
+        """What was told of each lane, [L], of each agent of each replica, [R, S]."""
+        return losses.view(self.replicas, len(self.seats))
+
     def seeds(self, purpose: int) -> list[tuple[int, int, int, int]]:
         """See `lane_seeds`."""
         return lane_seeds(self.seed, replicas=self._numbers, seats=self.seats, purpose=purpose)
 
     def new_networks(self, purpose: int, device: str | torch.device) -> list[nn.Module]:
         """New networks for each lane."""
-        return [_drawn(self._make_network, own).to(device) for own in self.seeds(purpose)]
+        return [drawn(self.make_network, own).to(device) for own in self.seeds(purpose)]
 
-    def actor(self, update: Update, *, compile: bool) -> LaneActor:
+    def actor(self, update: Acts, *, compile: bool) -> LaneActor:
         """Who acts by the present weights while they learn, each lane by random numbers of its own."""
         return LaneActor(
             update.outputs,
@@ -81,7 +124,7 @@ class Lanes:
             compile=compile and not isinstance(update, ListUpdate),
         )
 
-    def evaluation_actor(self, update: Update, worlds: int, *, epsilon: float) -> LaneActor:
+    def evaluation_actor(self, update: Acts, worlds: int, *, epsilon: float) -> LaneActor:
         """Who acts by the present weights in so many worlds of each replica."""
         actor = LaneActor(
             update.outputs,
@@ -94,20 +137,20 @@ class Lanes:
         actor.epsilon = epsilon
         return actor
 
-    def states(self, update: Update) -> dict[str, dict[str, Tensor]]:
+    def states(self, update: Acts) -> dict[str, dict[str, Tensor]]:
         """The state dict of each lane's acting network, by the lane's name."""
         return {name: update.network_state(lane) for lane, name in enumerate(self.names)}
 
-    def networks(self, update: Update) -> dict[str, nn.Module]:
+    def networks(self, update: Acts) -> dict[str, nn.Module]:
         """A copy of each lane's acting network as it is now, by the lane's name."""
         made = {}
         for name, weights in self.states(update).items():
-            made[name] = acting_part(self._make_network())
+            made[name] = acting_part(self.make_network())
             made[name].load_state_dict(weights)
         return made
 
 
-def _drawn(make_network: Callable[[], nn.Module], seed: Sequence[int]) -> nn.Module:
+def drawn(make_network: Callable[[], nn.Module], seed: Sequence[int]) -> nn.Module:
     """A network whose weights follow from a seed alone; torch's generator goes on as if nothing happened."""
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(int(np.random.SeedSequence(seed).generate_state(1, np.uint64)[0] & _LARGEST_SEED))

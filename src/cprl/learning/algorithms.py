@@ -69,7 +69,7 @@ class DQN:
 
     def network(self, game: Game) -> nn.Module:
         """See `OffPolicy`."""
-        return _network(game, self.settings, outputs=len(game.actions), relu=self.settings.relu_on_outputs)
+        return q_network_of(game, self.settings)
 
     def loss(self, network: nn.Module) -> LossModule:
         """See `OffPolicy`."""
@@ -151,7 +151,7 @@ class CQL:
 
     def network(self, game: Game) -> nn.Module:
         """See `OffPolicy`."""
-        return _network(game, self.settings, outputs=len(game.actions), relu=self.settings.relu_on_outputs)
+        return q_network_of(game, self.settings)
 
     def loss(self, network: nn.Module) -> LossModule:
         """See `OffPolicy`."""
@@ -280,6 +280,11 @@ def policy(network: nn.Module) -> ProbabilisticTensorDictSequential:
         distribution_class=torch.distributions.Categorical,
         return_log_prob=True,
     )
+
+
+def q_network_of(game: Game, settings: DQNSettings) -> QNetwork:
+    """A new network of one agent: the value of each of its actions."""
+    return _network(game, settings, outputs=len(game.actions), relu=settings.relu_on_outputs)
 
 
 def _network(game: Game, settings: DQNSettings, *, outputs: int, relu: bool = False) -> QNetwork:

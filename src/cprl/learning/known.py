@@ -6,12 +6,18 @@ from typing import Any, Final, TypeAlias
 
 from cprl.learning.algorithms import CQL, DQN, IQL, SAC, DistributionalDQN, OffPolicy
 from cprl.learning.on_policy import A2C, PPO, OnPolicy, Reinforce
+from cprl.learning.on_policy_teams import IPPO, MAPPO
 from cprl.learning.settings import DQNSettings, RolloutSettings
+from cprl.learning.teams import QMIX, VDN, TeamAlgorithm
 
-Algorithm: TypeAlias = OffPolicy | OnPolicy
+Algorithm: TypeAlias = OffPolicy | OnPolicy | TeamAlgorithm
 """What an agent that learns is made of."""
 
-OF_CPRL: Final[tuple[type[Any], ...]] = (DQN, DistributionalDQN, CQL, SAC, IQL, PPO, A2C, Reinforce)
+OF_CPRL: Final[tuple[type[Any], ...]] = (
+    *(DQN, DistributionalDQN, CQL, SAC, IQL),
+    *(PPO, A2C, Reinforce),
+    *(VDN, QMIX, MAPPO, IPPO),
+)
 _SETTINGS: Final[dict[str, type[Any]]] = {kind.__name__: kind for kind in (DQNSettings, RolloutSettings)}
 
 

@@ -16,7 +16,8 @@ from cprl.learning.dqn import dqn_loss, q_network
 from cprl.learning.functional import MakeLoss, refuse_on_policy
 from cprl.learning.replay import lane_buffer
 from cprl.learning.settings import DQNSettings
-from cprl.learning.transitions import Paid, lane_turn, seen_next
+from cprl.learning.team_lanes import MakeTeam, Teams
+from cprl.learning.transitions import Paid
 from cprl.learning.ways import TRIAL_LANES, Way, make_update, trial_batch
 
 
@@ -36,6 +37,8 @@ class LaneLearner:
         make_network: a lane's network; by default `QNetwork` by the settings. It draws its weights from
             torch's generator, which is seeded for each lane.
         make_loss: a lane's loss out of its network; by default `dqn_loss`.
+        make_team: where agents learn as a team: its networks out of its members', see `cprl.learning.teams`;
+            a lane is then all seats of a replica.
         samples: whether networks give the logits of a policy, from which agents that explore draw their
             actions, else values; then `epsilon` of the settings is none.
         paid: what they are paid.
@@ -45,7 +48,7 @@ class LaneLearner:
 
     Raises:
         ValueError: for a loss that wants what the present policy has just done; see
-            `cprl.learning.rollouts`.
+            `cprl.learning.rollouts`; for a team that is not paid for the group.
     """
 
     def __init__(
@@ -59,6 +62,7 @@ class LaneLearner:
         first_replica: int = 0,
         make_network: Callable[[], nn.Module] | None = None,
         make_loss: MakeLoss | None = None,
+        make_team: MakeTeam | None = None,
         samples: bool = False,
         paid: Paid = "own",
         way: Way | None = None,
@@ -69,7 +73,7 @@ class LaneLearner:
         self.replicas, self.seed, self.paid = replicas, seed, paid
         actions, shape = len(game.actions), game.observation_shape
         make_loss = make_loss or partial(dqn_loss, gamma=settings.gamma)
-        self._lanes = Lanes(
+        agents = Lanes(
             game,
             seats=seats,
             replicas=replicas,
@@ -84,8 +88,15 @@ class LaneLearner:
                 f"priority_alpha is {settings.priority_alpha}; lanes sample uniformly, 0 is what fits, or a "
                 "plain DQNLearner for each agent"
             )
+        if make_team and paid != "group":
+            raise ValueError(f'paid is "{paid}"; a team that learns from replay shares one reward, "group"')
+        self._lanes: Lanes | Teams = Teams(agents, make_team) if make_team else agents
         networks = self._lanes.new_networks(WEIGHTS, device)
         refuse_on_policy(make_loss(deepcopy(networks[0])))
+        shapes = {
+            "observation_shape": self._lanes.observation_shape,
+            "action_shape": self._lanes.action_shape,
+        }
         own_targets = settings.own_target_weights
         self.update = make_update(
             way,
@@ -96,13 +107,13 @@ class LaneLearner:
             adam_eps=settings.adam_eps,
             loss_share=1 / actions if settings.mean_over_all_outputs else 1.0,
             compile=compile,
-            trial=trial_batch(min(self.lanes, TRIAL_LANES), shape, actions, device=device),
+            trial=trial_batch(min(self.lanes, TRIAL_LANES), actions=actions, **shapes, device=device),
         )
         self.buffer = lane_buffer(
             seeds=self._lanes.seeds(SAMPLING),
             transitions=settings.buffer_size,
             batch_size=settings.batch_size,
-            observation_shape=shape,
+            **shapes,
             device=device,
         )
         self.actor = self._lanes.actor(self.update, compile=compile)
@@ -112,7 +123,7 @@ class LaneLearner:
 
     @property
     def lanes(self) -> int:
-        """The number of lanes, replicas x seats."""
+        """The number of lanes, replicas x seats, or of teams."""
         return len(self._lanes)
 
     def evaluation_actor(self, worlds: int) -> LaneActor:
@@ -125,7 +136,7 @@ class LaneLearner:
 
     def remember(self, batch: TensorDictBase) -> None:
         """Stores a turn of every replica, as the collector yields it."""
-        self.buffer.storage.write(lane_turn(self.seats, batch, paid=self.paid))
+        self.buffer.storage.write(self._lanes.turn(batch, self.paid))
         self.steps += 1
         self.actor.explore_with(self.settings.epsilon(self.steps))
 
@@ -133,23 +144,23 @@ class LaneLearner:
         """One update of every lane; their losses [R, S], or None while too little is stored."""
         if self.steps < self.settings.learning_starts:
             return None
-        return self.update.learn(self.buffer).view(self.replicas, len(self.seats))
+        return self._lanes.by_agent(self.update.learn(self.buffer))
 
     def end_episode(self, ended: Tensor) -> None:
         """Counts an episode of the marked replicas, bool [R]; targets are replaced after every so many."""
         self._episodes += ended
         due = ended & (self._episodes % self.settings.target_every_episodes == 0)
         if due.any():
-            self.update.copy_to_targets(due.repeat_interleave(len(self.seats)))
+            self.update.copy_to_targets(due.repeat_interleave(self._lanes.of_replica))
 
     def values(self, batch: TensorDictBase) -> Tensor:
         """The highest value of each agent's actions at the end of a turn, [R, S]; NaN where its network gives
         a policy."""
         if self._lanes.samples:
             return torch.full((self.replicas, len(self.seats)), torch.nan)
-        seen = seen_next(batch)[:, list(self.seats)].flatten(0, 1).unsqueeze(1)
         with torch.no_grad():
-            return self.update.outputs(seen).amax(-1).view(self.replicas, len(self.seats))
+            highest = self.update.outputs(self._lanes.seen_next(batch)).amax(-1)
+        return highest.view(self.replicas, len(self.seats))
 
     def state_dict(self) -> dict[str, Any]:
         """Everything that the future of all lanes depends on; own tensors, not copies.

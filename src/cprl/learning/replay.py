@@ -67,6 +67,7 @@ def lane_buffer(
     transitions: int,
     batch_size: int,
     observation_shape: Sequence[int],
+    action_shape: Sequence[int] = (),
     device: str | torch.device = "cpu",
 ) -> ReplayBuffer:
     """TorchRL's replay buffer over `LaneStorage` and `LaneSampler`.
@@ -75,7 +76,8 @@ def lane_buffer(
         seeds: of each lane's sampling; as many as there are lanes.
         transitions: kept for each lane.
         batch_size: drawn for each lane.
-        observation_shape: (C, X, Y).
+        observation_shape: (C, X, Y); of a lane that is a team of S agents (S, C, X, Y).
+        action_shape: of a lane's action: () of one agent, (S,) of a team.
         device: where it lies.
 
     What they take, if it is a mebibyte or more, is logged, as "cprl", before it is allocated.
@@ -83,7 +85,7 @@ def lane_buffer(
     Raises:
         MemoryError: where the machine has less memory than it takes, before anything is allocated.
     """
-    wanted = storage_bytes(len(seeds), transitions, observation_shape)
+    wanted = storage_bytes(len(seeds), transitions, observation_shape, action_shape=action_shape)
     there = _free_bytes(torch.device(device))
     if wanted > there:
         raise MemoryError(
@@ -99,7 +101,11 @@ def lane_buffer(
             there / 2**30,
         )
     storage = LaneStorage(
-        lanes=len(seeds), transitions=transitions, observation_shape=observation_shape, device=device
+        lanes=len(seeds),
+        transitions=transitions,
+        observation_shape=observation_shape,
+        action_shape=action_shape,
+        device=device,
     )
     return ReplayBuffer(
         storage=storage,

@@ -15,7 +15,8 @@ from cprl.commons.game import Game
 from cprl.learning.agents import SAMPLING, WEIGHTS, Lanes
 from cprl.learning.functional import MakeLoss
 from cprl.learning.settings import RolloutSettings
-from cprl.learning.transitions import Paid, lane_turn, seen_next
+from cprl.learning.team_lanes import MakeTeam, Teams
+from cprl.learning.transitions import Paid
 from cprl.learning.ways import TRIAL_LANES, Way, make_update, trial_batch
 
 ACTOR, CRITIC = range(2)
@@ -38,6 +39,8 @@ class RolloutLearner:
         settings: the hyper-parameters.
         make_network: an agent's "actor" and "critic", see `cprl.learning.on_policy`.
         make_loss: an agent's loss out of them.
+        make_team: where agents learn as a team: its "actor" and "critic" out of its members' networks, see
+            `cprl.learning.teams`; a lane is then all seats of a replica.
         seed: of the run.
         first_replica: the number of the first replica, so that replica r can be trained alone.
         paid: what they are paid.
@@ -58,6 +61,7 @@ class RolloutLearner:
         settings: RolloutSettings,
         make_network: Callable[[], nn.Module],
         make_loss: MakeLoss,
+        make_team: MakeTeam | None = None,
         seed: int = 0,
         first_replica: int = 0,
         paid: Paid = "own",
@@ -67,7 +71,7 @@ class RolloutLearner:
     ) -> None:
         self.game, self.settings, self.seats = game, settings, tuple(seats)
         self.replicas, self.seed, self.paid = replicas, seed, paid
-        self._lanes = Lanes(
+        agents = Lanes(
             game,
             seats=seats,
             replicas=replicas,
@@ -76,9 +80,16 @@ class RolloutLearner:
             make_network=make_network,
             samples=True,
         )
+        self._lanes: Lanes | Teams = Teams(agents, make_team) if make_team else agents
         networks = self._lanes.new_networks(WEIGHTS, device)
         _refuse_other_parts(networks[0])
-        shape, actions = game.observation_shape, len(game.actions)
+        trial = trial_batch(
+            min(self.lanes, TRIAL_LANES),
+            self._lanes.observation_shape,
+            len(game.actions),
+            action_shape=self._lanes.action_shape,
+            device=device,
+        )
         self.update = make_update(
             way,
             networks,
@@ -87,7 +98,7 @@ class RolloutLearner:
             adam_eps=settings.adam_eps,
             max_grad_norm=settings.max_grad_norm,
             compile=compile,
-            trial=trial_rollout(trial_batch(min(self.lanes, TRIAL_LANES), shape, actions, device=device)),
+            trial=trial_rollout(trial),
         )
         self.actor = self._lanes.actor(self.update, compile=compile)
         self.draws = LaneDraws(self._lanes.seeds(SAMPLING), settings.rollout_steps)
@@ -97,7 +108,7 @@ class RolloutLearner:
 
     @property
     def lanes(self) -> int:
-        """The number of lanes, replicas x seats."""
+        """The number of lanes, replicas x seats, or of teams."""
         return len(self._lanes)
 
     @property
@@ -107,12 +118,12 @@ class RolloutLearner:
 
     def _room(self, device: torch.device) -> dict[str, Tensor]:
         """Memory for a rollout, [T, L, ...] each."""
-        size, shape = (self.rollout_steps, self.lanes), self.game.observation_shape
+        size, shape = (self.rollout_steps, self.lanes), self._lanes.observation_shape
         forms: dict[str, tuple[tuple[int, ...], torch.dtype]] = {
             "observation": (shape, torch.uint8),
-            "action": ((), torch.int64),
+            "action": (self._lanes.action_shape, torch.int64),
             "next_observation": (shape, torch.uint8),
-            "reward": ((), torch.float32),
+            "reward": (self._lanes.action_shape, torch.float32),
             "done": ((), torch.bool),
             "terminated": ((), torch.bool),
         }
@@ -138,7 +149,7 @@ class RolloutLearner:
         """
         if self._size == self.rollout_steps:
             raise ValueError(f"a rollout has {self.rollout_steps} steps; learn from it before the next")
-        turn = lane_turn(self.seats, batch, paid=self.paid)
+        turn = self._lanes.rollout_turn(batch, self.paid)
         for name, room in self._rollout.items():
             room[self._size] = torch.as_tensor(getattr(turn, name))
         self._size += 1
@@ -157,10 +168,10 @@ class RolloutLearner:
                 place = order[:, first : first + size]
                 losses.append(self.update.learn_from(batch[lane, place]))
         self._size = 0
-        return torch.stack(losses).mean(0).view(self.replicas, len(self.seats))
+        return self._lanes.by_agent(torch.stack(losses).mean(0))
 
     def _batch(self) -> TensorDict:
-        """The rollout with advantages, [L, T], as TorchRL's losses read it."""
+        """The rollout with advantages, [L, T], as TorchRL's losses read it; normalised within each lane."""
         columns = {name: room.transpose(0, 1) for name, room in self._rollout.items()}
         with torch.no_grad():
             chances = self.update.outputs(columns["observation"], part=ACTOR).log_softmax(-1)
@@ -170,11 +181,13 @@ class RolloutLearner:
                 self.settings.gae_lambda,
                 value,
                 self.update.outputs(columns["next_observation"], part=CRITIC),
-                *(columns[name].unsqueeze(-1) for name in ("reward", "done", "terminated")),
+                *(_like(columns[name], value) for name in ("reward", "done", "terminated")),
+                time_dim=1,
             )
         if self.settings.normalize_advantage:
-            spread = advantage.std(1, keepdim=True)
-            advantage = (advantage - advantage.mean(1, keepdim=True)) / (spread + _SMALL)
+            of_lane = tuple(range(1, advantage.ndim))
+            spread = advantage.std(of_lane, keepdim=True)
+            advantage = (advantage - advantage.mean(of_lane, keepdim=True)) / (spread + _SMALL)
         chosen = chances.gather(-1, columns["action"].unsqueeze(-1)).squeeze(-1)
         return TensorDict(
             {
@@ -193,9 +206,9 @@ class RolloutLearner:
 
     def values(self, batch: TensorDictBase) -> Tensor:
         """What each agent's critic expects from the end of a turn on, [R, S]."""
-        seen = seen_next(batch)[:, list(self.seats)].flatten(0, 1).unsqueeze(1)
         with torch.no_grad():
-            return self.update.outputs(seen, part=CRITIC).view(self.replicas, len(self.seats))
+            expected = self.update.outputs(self._lanes.seen_next(batch), part=CRITIC)
+        return expected.reshape(self.replicas, len(self.seats))
 
     def state_dict(self) -> dict[str, Any]:
         """Everything that the future of all lanes depends on; own tensors, not copies.
@@ -222,6 +235,13 @@ class RolloutLearner:
         self._size, self.steps = int(state["size"]), int(state["steps"])
 
 
+def _like(column: Tensor, value: Tensor) -> Tensor:
+    """What was told of lanes, [L, T], or of the members of teams, [L, T, S], in the form of values, which end
+    with an axis of 1."""
+    one_each = [1] * (value.ndim - column.ndim)
+    return column.reshape(*column.shape, *one_each).expand_as(value)
+
+
 def _refuse_other_parts(network: nn.Module) -> None:
     parts = list(parts_of(network))
     if not isinstance(network, AgentNetworks) or parts[:2] != ["actor", "critic"]:
@@ -233,6 +253,6 @@ def trial_rollout(transitions: TensorDict) -> TensorDict:
     chance = torch.Generator().manual_seed(1)
     batch = transitions.select("observation", "action")
     for name in ("advantage", "value_target", "state_value"):
-        batch[name] = torch.rand((*batch.batch_size, 1), generator=chance).to(batch["action"].device)
+        batch[name] = torch.rand((*batch["action"].shape, 1), generator=chance).to(batch["action"].device)
     batch["action_log_prob"] = batch["advantage"].squeeze(-1) - 2.5
     return batch

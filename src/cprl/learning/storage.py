@@ -31,7 +31,12 @@ Fields = dict[str, Tensor]
 
 
 def storage_bytes(
-    lanes: int, transitions: int, observation_shape: Sequence[int], *, item_bytes: int = 1
+    lanes: int,
+    transitions: int,
+    observation_shape: Sequence[int],
+    *,
+    action_shape: Sequence[int] = (),
+    item_bytes: int = 1,
 ) -> int:
     """Bytes that `LaneStorage` allocates.
 
@@ -39,10 +44,11 @@ def storage_bytes(
         lanes: L.
         transitions: kept for each lane, T.
         observation_shape: (C, X, Y).
+        action_shape: of a lane's action.
         item_bytes: of one number of an observation.
     """
     windows = _rows(transitions) * prod(observation_shape) * item_bytes
-    return lanes * (windows + transitions * (8 + 4 + 8 + 1 + 1))
+    return lanes * (windows + transitions * (8 * prod(action_shape) + 4 + 8 + 1 + 1))
 
 
 def _rows(transitions: int) -> int:
@@ -57,7 +63,8 @@ class LaneStorage(Storage):
     Args:
         lanes: L.
         transitions: T.
-        observation_shape: (C, X, Y).
+        observation_shape: (C, X, Y); of a lane that is a team of S agents (S, C, X, Y).
+        action_shape: of a lane's action: () of one agent, (S,) of a team.
         dtype: of observations.
         device: where it lies.
 
@@ -71,6 +78,7 @@ class LaneStorage(Storage):
         lanes: int,
         transitions: int,
         observation_shape: Sequence[int],
+        action_shape: Sequence[int] = (),
         dtype: torch.dtype = torch.uint8,
         device: str | torch.device = "cpu",
     ) -> None:
@@ -83,13 +91,14 @@ class LaneStorage(Storage):
 
         self.fields: Fields = {
             "observation": room(lanes * self.rows, *observation_shape, kind=dtype),
-            "action": room(transitions, lanes, kind=torch.int64),
+            "action": room(transitions, lanes, *action_shape, kind=torch.int64),
             "reward": room(transitions, lanes, kind=torch.float32),
             "done": room(transitions, lanes, kind=torch.bool),
             "terminated": room(transitions, lanes, kind=torch.bool),
             "row": room(transitions, lanes, kind=torch.int64),
         }
-        """Windows [L x rows, ...], the rest [T, L]; `row` counts the windows that a lane has written."""
+        """Windows [L x rows, ...], the rest [T, L], actions [T, L, ...]; `row` counts the windows that a lane
+        has written."""
         # Steps write through numpy where they can: on so few numbers torch takes five times as long.
         self._arrays = {name: array_of(field) for name, field in self.fields.items()}
         self._lane = array_of(torch.arange(lanes, device=self.device))

@@ -1,0 +1,301 @@
+"""Teams learn together: VDN and QMIX from replay, MAPPO and IPPO on-policy, one team in each replica."""
+
+from dataclasses import replace
+from statistics import fmean
+
+import pytest
+import test_optimum
+import torch
+from tensordict import TensorDict
+from test_population import GAME, REPLAY, ROLLOUTS, AtSteps, Returns, conducted, population, trained, weights
+
+import cprl
+from cprl import CommonsEnv, Game, Rules, maps, presets
+from cprl.acting.networks import acting_part
+from cprl.acting.teams import Mixing, TeamNetwork
+from cprl.learning import DQN, IPPO, MAPPO, QMIX, VDN, DQNSettings
+from cprl.learning.fused import FunctionalUpdate
+from cprl.learning.lanes import LaneLearner
+from cprl.learning.ways import trial_batch
+from cprl.measuring.evaluate import evaluate
+from cprl.population import Frozen, Learner, Population, Scripted
+from cprl.recording.checkpoints import checkpoints_in
+from cprl.train import train
+
+TEAMS = {
+    "VDN": VDN(settings=REPLAY),
+    "QMIX": QMIX(settings=REPLAY, mixing_cells=6),
+    "MAPPO": MAPPO(settings=ROLLOUTS),
+    "IPPO": IPPO(settings=ROLLOUTS),
+}
+WAYS = {"VDN": "vmap", "QMIX": "vmap", "MAPPO": "lane axis", "IPPO": "lane axis"}
+FOUR = tuple(range(4))
+
+
+def team_of(name, **how):
+    agents = population([Learner(TEAMS[name], paid="group")] * 4, **how)
+    (learner,) = agents.learners.values()
+    return agents, learner
+
+
+@pytest.mark.parametrize("name", TEAMS)
+def test_each_team_moves_every_members_weights_and_no_replica_knows_of_the_others(name):
+    together, learner = team_of(name, replicas=3)
+    alone, _ = team_of(name, replicas=1, first_replica=2)
+    before = weights(together)
+    _, returns = trained(together, episodes=4)
+    _, returns_alone = trained(alone, first=2, episodes=4)
+    assert returns[2] == returns_alone[0]
+    after, after_alone = weights(together), weights(alone)
+    assert learner.lanes == 3, "a lane is a team"
+    assert len(together.networks()) == 12
+    for key, value in after.items():
+        assert not torch.equal(value, before[key]), f"{key} has not moved"
+    for key, value in after_alone.items():
+        torch.testing.assert_close(value, after[key], rtol=1e-4, atol=1e-5)
+    made = [acting_part(network).linears[0].weight for network in together.networks().values()]
+    assert len({float(weight.detach().sum()) for weight in made}) == 12, (
+        "each member has a network of its own"
+    )
+
+
+@pytest.mark.parametrize("name", TEAMS)
+def test_each_team_takes_the_way_that_agrees_with_a_list_of_torchrls_losses(name):
+    algorithm = TEAMS[name]
+    _, found = team_of(name)
+    common = {"seats": FOUR, "replicas": 2, "settings": algorithm.settings, "seed": 3, "paid": "group"}
+    common |= {"make_network": lambda: algorithm.network(GAME), "make_loss": algorithm.loss, "compile": False}
+    common |= {"make_team": lambda members: algorithm.team(members, GAME)}
+    kind = type(found)
+    ends = []
+    for one in (found, kind(GAME, way=WAYS[name], **common), kind(GAME, way="list", **common)):
+        train(CommonsEnv(GAME, 2, seed=3), {FOUR: one}, episodes=3)
+        ends.append([network.state_dict() for network in one.networks().values()])
+    for mine, named, by_list in zip(*ends, strict=True):
+        for key, value in by_list.items():
+            assert torch.equal(mine[key], named[key]), "this is the way that is found"
+            torch.testing.assert_close(mine[key], value, rtol=1e-3, atol=1e-5)
+
+
+def test_qmix_over_many_observations_is_not_slowed_by_what_the_trial_rounds():
+    game = presets.game("commons")  # 1260 inputs to its mixing
+    members = [Learner(QMIX(settings=DQNSettings(buffer_size=50)), paid="group")] * 4
+    (learner,) = Population(game, members, replicas=2, compile=False).learners.values()
+    assert isinstance(learner.update, FunctionalUpdate)
+
+
+def test_a_member_acts_by_its_own_network_and_what_it_sees_itself():
+    agents, learner = team_of("QMIX")
+    seen = CommonsEnv(GAME, 2, seed=9).reset()["agents", "observation"]
+    actor = learner.evaluation_actor(1)
+    actor.epsilon = 0.0
+    chosen = actor.choose(seen)
+    for lane, network in agents.networks().items():
+        replica, agent = (int(part.rpartition("_")[2]) for part in lane.split("/"))
+        assert chosen[replica, agent] == network(seen[replica, agent]).argmax()
+
+
+def test_a_member_begins_with_the_weights_that_it_would_have_alone():
+    alone = population([Learner(DQN(settings=REPLAY))] * 4)
+    team, _ = team_of("VDN")
+    for key, value in weights(alone).items():
+        assert torch.equal(weights(team)[key], value)
+
+
+def test_the_loss_of_vdn_is_that_of_the_sum_of_its_members_values():
+    agents, learner = team_of("VDN", replicas=1)
+    networks = list(agents.networks().values())
+    batch = trial_batch(1, (4, *GAME.observation_shape), len(GAME.actions), action_shape=(4,))
+    (turn,) = batch
+    ends = turn["next", "terminated"].squeeze(-1)
+    assert 0 < ends.sum() < 8
+
+    def values(observation):
+        return torch.stack([own(observation[:, seat]) for seat, own in enumerate(networks)], 1)
+
+    with torch.no_grad():  # r + gamma sum of max Q', the targets are still copies
+        chosen = values(turn["observation"]).gather(-1, turn["action"].unsqueeze(-1)).sum((1, 2))
+        best = values(turn["next", "observation"]).amax(-1).sum(1)
+        target = turn["next", "reward"].squeeze(-1) + REPLAY.gamma * ~ends * best
+    torch.testing.assert_close(learner.update.learn_from(batch), (target - chosen).square().mean()[None])
+
+
+def first_turn(replicas=1):
+    """A turn in which agents see something, agent n does n and is paid n."""
+    chance = torch.Generator().manual_seed(5)
+    see = torch.randint(256, (2, replicas, 4, *GAME.observation_shape), generator=chance).to(torch.uint8)
+    no = torch.zeros(replicas, 1, dtype=torch.bool)
+    agents_then = {"observation": see[1], "reward": torch.arange(4.0).expand(replicas, 4).unsqueeze(-1)}
+    return TensorDict(
+        {
+            "agents": {"observation": see[0], "action": torch.arange(4).expand(replicas, 4)},
+            "next": {"agents": agents_then, "done": no, "terminated": no},
+        },
+        [replicas],
+    )
+
+
+def test_a_team_is_paid_for_all_agents_also_those_who_are_not_of_it():
+    agents = population([Scripted(), *[Learner(TEAMS["VDN"], paid="group")] * 2, Scripted()])
+    ((seats, learner),) = agents.learners.items()
+    assert seats == (1, 2)
+    learner.remember(first_turn(2))
+    fields = learner.buffer.storage.fields
+    assert fields["reward"][0].tolist() == [6.0, 6.0]
+    assert fields["action"][0].tolist() == [[1, 2], [1, 2]]
+
+
+@pytest.mark.parametrize(("name", "sees_all"), [("MAPPO", True), ("IPPO", False)])
+def test_the_critic_of_mappo_sees_what_all_see_that_of_ippo_what_one_sees(name, sees_all):
+    _, learner = team_of(name)
+    turn = first_turn(2)
+    before = learner.values(turn)
+    turn["next", "agents", "observation"][0, 3] = 255 - turn["next", "agents", "observation"][0, 3]
+    after = learner.values(turn)
+    changed = (before != after).tolist()
+    assert changed == [[sees_all, sees_all, sees_all, True], [False] * 4]
+    assert (len(set(before[0].tolist())) == 1) is sees_all
+
+
+@pytest.mark.parametrize("name", ["MAPPO", "IPPO"])
+def test_advantages_are_normalised_within_a_team(name):
+    _, learner = team_of(name)
+    env = CommonsEnv(GAME, 2, seed=3)
+    seen = []
+    learn_from = learner.update.learn_from
+    learner.update.learn_from = lambda batch: seen.append(batch) or learn_from(batch)
+    train(env, {FOUR: learner}, episodes=2)
+    advantage = torch.cat([batch["advantage"] for batch in seen[:2]], 1)
+    assert advantage.shape == (2, 20, 4, 1)
+    torch.testing.assert_close(advantage.flatten(1).mean(1), torch.zeros(2), atol=1e-5, rtol=0)
+    torch.testing.assert_close(advantage.flatten(1).std(1), torch.ones(2), atol=1e-4, rtol=0)
+
+
+def test_the_teams_value_grows_with_each_members_value():
+    mixing = Mixing(GAME.observation_shape, members=4, cells=6, highest=255.0)
+    state = torch.randint(256, (64, 4, *GAME.observation_shape), dtype=torch.uint8)
+    chosen = torch.randn(64, 4, 1, requires_grad=True)
+    (slope,) = torch.autograd.grad(mixing(chosen, state).sum(), chosen)
+    assert (slope >= 0).all()
+    assert (slope > 0).any()
+    raw = mixing.mixer.hyper_w_1(state.flatten(1).float() / 255)
+    assert (raw < 0).any(), "without the absolute value it would not"
+    doubled = mixing(chosen, (state // 2).to(torch.uint8))
+    assert not torch.equal(doubled, mixing(chosen, state)), "how it mixes depends on what is seen"
+
+
+@pytest.mark.parametrize("name", ["QMIX", "MAPPO"])
+def test_a_team_that_was_stopped_goes_on_bit_for_bit(name, tmp_path):
+    members = [*[Learner(TEAMS[name], paid="group")] * 3, Learner(DQN(settings=REPLAY))]
+
+    def run(folder, *, stop_at=None):
+        agents = population(members)
+
+        class StopError(Exception):
+            pass
+
+        class Witness(Returns):
+            turns = 0
+
+            def see_turn(self, batch):
+                self.turns += 1
+                if self.turns == stop_at:
+                    raise StopError
+
+        (tmp_path / folder).mkdir(exist_ok=True)
+        with AtSteps(tmp_path / folder) as checkpoints:
+            try:
+                train(
+                    CommonsEnv(GAME, 2, seed=3),
+                    agents.learners,
+                    episodes=4,
+                    observers=[Witness()],
+                    checkpoints=checkpoints,
+                )
+            except StopError:
+                assert checkpoints_in(tmp_path / folder / "checkpoints")
+        return agents
+
+    whole = weights(run("whole"))
+    run("stopped", stop_at=47)
+    again = run("stopped")
+    for key, value in weights(again).items():
+        assert torch.equal(value, whole[key]), key
+
+
+def test_a_teams_run_is_built_again_and_its_members_play_on_frozen(tmp_path, capsys):
+    members = [*[Learner(TEAMS["QMIX"], paid="group")] * 2, *[Learner(TEAMS["IPPO"])] * 2]
+    run, agents = conducted(tmp_path, members)
+    assert "trained, epsilon 0.05" in " ".join(capsys.readouterr().out.split())
+    loaded = cprl.load(run)
+    assert loaded.algorithms == {
+        **dict.fromkeys((0, 1), TEAMS["QMIX"]),
+        **dict.fromkeys((2, 3), TEAMS["IPPO"]),
+    }
+    seen = torch.randint(256, (5, *GAME.observation_shape), dtype=torch.uint8)
+    assert len(agents.networks()) == 8
+    for lane, network in agents.networks().items():
+        assert torch.equal(loaded.networks[lane](seen), network(seen))
+    assert loaded.policy(1)(loaded.env(2).reset())["agents", "action"].shape == (2, 4)
+    frozen = population([Frozen(run, 1, replica=1), Frozen(run, 3), *[Scripted()] * 2])
+    actor = frozen.others[0,]
+    actor.epsilon = 0.0
+    own = CommonsEnv(GAME, 2, seed=9).reset()["agents", "observation"][:, :1]
+    assert torch.equal(actor.choose(own), agents.networks()["replica_1/agent_1"](own).argmax(-1))
+
+
+@pytest.mark.parametrize("name", ["VDN", "QMIX", "MAPPO"])
+def test_who_shares_a_reward_but_is_paid_for_itself_is_refused(name):
+    with pytest.raises(ValueError, match=rf'{name} wants paid="group": .* paid="own", for which DQN, PPO'):
+        population([Learner(TEAMS[name])] * 4)
+
+
+def test_what_is_no_team_is_refused_and_what_needs_none_is_not():
+    alone = [Learner(TEAMS["QMIX"], paid="group"), *[Scripted()] * 3]
+    with pytest.raises(ValueError, match=r"QMIX wants a team of at least 2: .* came with 1, for which DQN"):
+        population(alone)
+    unequal = [replace(TEAMS["QMIX"], mixing_cells=cells) for cells in (4, 4, 5, 6)]
+    with pytest.raises(ValueError, match="QMIX wants a team of at least 2"):
+        population([Learner(algorithm, paid="group") for algorithm in unequal])
+    assert list(population([Learner(TEAMS["IPPO"])] * 4).learners) == [FOUR]
+    with pytest.raises(ValueError, match='paid is "own"; a team that learns from replay shares one reward'):
+        LaneLearner(GAME, seats=FOUR, replicas=2, settings=REPLAY, make_team=TeamNetwork)
+    wrong = QMIX(settings=ROLLOUTS)
+    with pytest.raises(
+        ValueError, match="QMIX has settings of the type RolloutSettings; DQNSettings is wanted"
+    ):
+        population([Learner(wrong, paid="group")] * 4)
+
+
+ROWS = Game(
+    map=maps.parse(
+        """
+        >AA#
+        ####
+        #AA<
+        """
+    ),
+    rules=Rules(regrow_prob=(1.0,), may_fire=False, window_rows=2, window_columns=3, episode_steps=24),
+)
+"""Two boards of `test_optimum.py`, an agent on each: 24 apples an episode for each, and no more."""
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", TEAMS)
+def test_a_team_comes_close_to_the_optimum(name):
+    algorithm = replace(
+        TEAMS[name], settings=test_optimum.ROLLOUTS if name.endswith("PPO") else test_optimum.REPLAY
+    )
+    # Paid for the group, one of four replicas of IPPO ended at half of the apples.
+    members = [Learner(algorithm, paid="own" if name == "IPPO" else "group")] * 2
+    team = Population(ROWS, members, replicas=4, seed=1, compile=False)
+
+    def share():
+        played = evaluate(CommonsEnv(ROWS, 4, seed=99), team.policy(1))
+        return [float(episode.return_.sum()) / 48 for episode in played]
+
+    untrained = share()
+    train(CommonsEnv(ROWS, 4, seed=1), team.learners, episodes=400 if name.endswith("PPO") else 125)
+    assert fmean(untrained) < 0.5
+    shares = share()
+    assert fmean(shares) > 0.9, shares
