@@ -303,6 +303,8 @@ class PPOFromReplay:
 
 def test_what_does_not_fit_is_refused_before_training_and_says_what_fits(tmp_path, capsys):
     dqn = Learner(ALGORITHMS["DQN"])
+    with pytest.raises(ValueError, match="paid is 'team'; allowed: own, group"):
+        Learner(ALGORITHMS["DQN"], paid="team")
     with pytest.raises(ValueError, match="3 members for a game of 4 seats; one for each is wanted"):
         population([dqn] * 3)
     assert isinstance(ALGORITHMS["PPO"].loss(ALGORITHMS["PPO"].network(GAME)), ClipPPOLoss)

@@ -3,7 +3,7 @@
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, TypeAlias
+from typing import Any, TypeAlias, get_args
 
 import torch
 from torch import Tensor, nn
@@ -35,6 +35,10 @@ class Learner:
 
     algorithm: Algorithm
     paid: Paid = "own"
+
+    def __post_init__(self) -> None:
+        if self.paid not in get_args(Paid):
+            raise ValueError(f"paid is {self.paid!r}; allowed: {', '.join(get_args(Paid))}")
 
 
 @dataclass(frozen=True)

@@ -1,8 +1,9 @@
 """From what happened to better values: algorithms, transitions, and the learners that use them."""
 
-from cprl.learning.algorithms import CQL, DQN, IQL, SAC, DistributionalDQN
+from cprl.learning.algorithms import CQL, DQN, DistributionalDQN
 from cprl.learning.dqn import DQNLearner
 from cprl.learning.lanes import LaneLearner
+from cprl.learning.off_policy_actors import IQL, SAC
 from cprl.learning.on_policy import A2C, PPO, Reinforce
 from cprl.learning.on_policy_teams import IPPO, MAPPO
 from cprl.learning.rollouts import RolloutLearner

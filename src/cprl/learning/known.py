@@ -4,7 +4,8 @@ from collections.abc import Iterable, Mapping
 from dataclasses import fields
 from typing import Any, Final, TypeAlias
 
-from cprl.learning.algorithms import CQL, DQN, IQL, SAC, DistributionalDQN, OffPolicy
+from cprl.learning.algorithms import CQL, DQN, DistributionalDQN, OffPolicy
+from cprl.learning.off_policy_actors import IQL, SAC
 from cprl.learning.on_policy import A2C, PPO, OnPolicy, Reinforce
 from cprl.learning.on_policy_teams import IPPO, MAPPO
 from cprl.learning.settings import DQNSettings, RolloutSettings

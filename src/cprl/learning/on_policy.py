@@ -10,7 +10,7 @@ from torchrl.objectives import A2CLoss, ClipPPOLoss, LossModule, ReinforceLoss
 
 from cprl.acting.networks import AgentNetworks, QNetwork
 from cprl.commons.game import Game
-from cprl.learning.algorithms import policy
+from cprl.learning.off_policy_actors import policy
 from cprl.learning.settings import RolloutSettings
 
 

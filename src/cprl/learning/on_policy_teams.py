@@ -12,7 +12,7 @@ from torchrl.objectives.multiagent import IPPOLoss, MAPPOLoss
 from cprl.acting.networks import AgentNetworks, QNetwork
 from cprl.acting.teams import CentralCritic, TeamNetwork
 from cprl.commons.game import Game
-from cprl.learning.algorithms import policy
+from cprl.learning.off_policy_actors import policy
 from cprl.learning.settings import RolloutSettings
 
 

@@ -1,6 +1,7 @@
 """The numbers of a DQN agent, with their units and sources."""
 
 from dataclasses import dataclass
+from typing import Protocol
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -52,8 +53,33 @@ class DQNSettings:
 
     def epsilon(self, step: int) -> float:
         """The chance of a random action at a step, counted from 0."""
-        done = min(1.0, max(0.0, (step - self.epsilon_hold_steps) / self.epsilon_decay_steps))
-        return self.epsilon_start + done * (self.epsilon_end - self.epsilon_start)
+        return epsilon_at(step, self)
+
+
+class Decay(Protocol):
+    """Settings whose chance of a random action stays for a while and then falls in a straight line."""
+
+    @property
+    def epsilon_start(self) -> float:
+        """At first."""
+
+    @property
+    def epsilon_end(self) -> float:
+        """After the decay."""
+
+    @property
+    def epsilon_hold_steps(self) -> int:
+        """Steps before the decay."""
+
+    @property
+    def epsilon_decay_steps(self) -> int:
+        """Steps of the decay."""
+
+
+def epsilon_at(step: int, settings: Decay) -> float:
+    """The chance of a random action at a step, counted from 0."""
+    done = min(1.0, max(0.0, (step - settings.epsilon_hold_steps) / settings.epsilon_decay_steps))
+    return settings.epsilon_start + done * (settings.epsilon_end - settings.epsilon_start)
 
 
 @dataclass(frozen=True, kw_only=True)

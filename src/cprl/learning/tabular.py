@@ -26,6 +26,7 @@ from cprl import keys
 from cprl.acting.tabular import NEVER_MET, QTables, TabularActor, observed_entries, states_of
 from cprl.commons.game import Game
 from cprl.learning.agents import EVALUATION, EXPLORATION, lane_seeds
+from cprl.learning.settings import epsilon_at
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -70,8 +71,7 @@ class TabularSettings:
 
     def epsilon(self, step: int) -> float:
         """The chance of a random action at a step, counted from 0; as `DQNSettings.epsilon`."""
-        done = min(1.0, max(0.0, (step - self.epsilon_hold_steps) / self.epsilon_decay_steps))
-        return self.epsilon_start + done * (self.epsilon_end - self.epsilon_start)
+        return epsilon_at(step, self)
 
     def rates(self, visits: NDArray[np.int64]) -> NDArray[np.float64]:
         """alpha of values that have been learned so often, this time included."""

@@ -20,8 +20,8 @@ from cprl.commons.maps import Map
 from cprl.commons.observation import Observation
 from cprl.commons.rules import Rules
 from cprl.envs.torchrl_env import CommonsEnv
-from cprl.learning.algorithms import policy
 from cprl.learning.known import Algorithm, built
+from cprl.learning.off_policy_actors import policy
 from cprl.recording.checkpoints import FOLDER, checkpoints_in, read_checkpoint
 from cprl.recording.results import read_episodes
 from cprl.recording.run import read_recipe
