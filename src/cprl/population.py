@@ -8,8 +8,8 @@ from typing import Any, TypeAlias, get_args
 import torch
 from torch import Tensor, nn
 
-from cprl.acting.lanes import LaneActor, random_lanes
-from cprl.acting.scripted import Manner, ScriptedActor
+from cprl.acting.lanes import LaneActor, random_seats
+from cprl.acting.scripted import Manner, scripted_lanes
 from cprl.acting.seats import Seat, Seats
 from cprl.commons.game import Game
 from cprl.learning.agents import EVALUATION, EXPLORATION, lane_seeds
@@ -147,9 +147,7 @@ class Population:
     def random_policy(self, worlds: int) -> Seats:
         """Everybody's seats taken by agents to whom every action is equally likely."""
         everyone = tuple(range(self.game.agents))
-        seeds = [(self.seed, replica, seat) for replica in range(self.replicas) for seat in everyone]
-        actor = random_lanes(len(self.game.actions), seeds=seeds, seats=len(everyone), worlds=worlds)
-        return Seats({everyone: actor})
+        return Seats(random_seats(self.game, everyone, replicas=self.replicas, seed=self.seed, worlds=worlds))
 
     def networks(self) -> dict[str, nn.Module]:
         """A copy of each learner's acting network as it is now, by "replica_0/agent_0" and so on."""
@@ -194,9 +192,7 @@ def _learner(member: Learner, game: Game, *, seats: tuple[int, ...], **how: Any)
 
 
 def _scripted(member: Scripted, game: Game, **how: Any) -> nn.Module:
-    if member.manner == "random":
-        return random_lanes(len(game.actions), **how)
-    return ScriptedActor(member.manner, game, **how)
+    return scripted_lanes(member.manner, game, **how)
 
 
 def _frozen(

@@ -38,11 +38,12 @@ import numpy as np
 import torch
 from tensordict import TensorDictBase
 from tensordict.nn import TensorDictModuleBase
-from torch import Tensor
+from torch import Tensor, nn
 from torchrl.envs.utils import ExplorationType, exploration_type
 
 from cprl.acting import manners, paths
 from cprl.acting.draws import LaneDraws
+from cprl.acting.lanes import random_lanes
 from cprl.acting.manners import NUMBERS, Terms
 from cprl.acting.paths import AGENT, APPLE, OPEN, UNKNOWN, WALL, Frame, Scratch
 from cprl.commons import colours
@@ -150,6 +151,16 @@ class ScriptedActor(TensorDictModuleBase):
     def set_extra_state(self, state: dict[str, Any]) -> None:
         """See `get_extra_state`."""
         self.draws.load_state_dict(state)
+
+
+def scripted_lanes(
+    manner: Manner, game: Game, *, seeds: Sequence[Sequence[int]], seats: int, worlds: int = 1
+) -> nn.Module:
+    """Agents of one manner at some seats of every replica, by the quickest actor that there is; see
+    `ScriptedActor`."""
+    if manner == "random":
+        return random_lanes(len(game.actions), seeds=seeds, seats=seats, worlds=worlds)
+    return ScriptedActor(manner, game, seeds=seeds, seats=seats, worlds=worlds)
 
 
 def _check(manner: str, game: Game, **numbers: int) -> None:

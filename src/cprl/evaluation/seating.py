@@ -13,7 +13,7 @@ import torch
 from torch import Tensor, nn
 
 from cprl.acting.lanes import LaneActor, random_lanes, stack_lanes
-from cprl.acting.scripted import ScriptedActor
+from cprl.acting.scripted import scripted_lanes
 from cprl.acting.seats import Seat, Seats
 from cprl.commons.game import Game
 from cprl.envs.torchrl_env import CommonsEnv
@@ -127,10 +127,8 @@ def _agent(sitter: Sitter, seat: int, replica: int, earlier: Callable[[str], Loa
 
 def _actor(kind: tuple[Any, ...], game: Game, networks: Sequence[Any], **how: Any) -> nn.Module:
     """One actor for agents of one kind."""
-    if kind == ("scripted", "random"):
-        return random_lanes(len(game.actions), **how)
     if kind[0] == "scripted":
-        return ScriptedActor(kind[1], game, **how)
+        return scripted_lanes(kind[1], game, **how)
     _, samples, epsilon, _ = kind
     actor = LaneActor(_side_by_side(networks), len(game.actions), samples=samples, **how)
     actor.epsilon = epsilon

@@ -69,6 +69,7 @@ class LaneLearner:
         compile: bool = True,
         device: str | torch.device = "cpu",
     ) -> None:
+        _refuse_what_does_not_fit(settings, is_team=make_team is not None, paid=paid)
         self.game, self.settings, self.seats = game, settings, tuple(seats)
         self.replicas, self.seed, self.paid = replicas, seed, paid
         actions, shape = len(game.actions), game.observation_shape
@@ -83,13 +84,6 @@ class LaneLearner:
             or partial(q_network, shape, actions, settings=settings, highest=game.observation.highest),
             samples=samples,
         )
-        if settings.priority_alpha:
-            raise ValueError(
-                f"priority_alpha is {settings.priority_alpha}; lanes sample uniformly, 0 is what fits, or a "
-                "plain DQNLearner for each agent"
-            )
-        if make_team and paid != "group":
-            raise ValueError(f'paid is "{paid}"; a team that learns from replay shares one reward, "group"')
         self._lanes: Lanes | Teams = Teams(agents, make_team) if make_team else agents
         networks = self._lanes.new_networks(WEIGHTS, device)
         refuse_on_policy(make_loss(deepcopy(networks[0])))
@@ -186,3 +180,13 @@ class LaneLearner:
         self.steps = int(state["steps"])
         self.actor.epsilon = self.settings.epsilon(self.steps)
         self._episodes = state["episodes"].clone()
+
+
+def _refuse_what_does_not_fit(settings: DQNSettings, *, is_team: bool, paid: Paid) -> None:
+    if settings.priority_alpha:
+        raise ValueError(
+            f"priority_alpha is {settings.priority_alpha}; lanes sample uniformly, 0 is what fits, or a "
+            "plain DQNLearner for each agent"
+        )
+    if is_team and paid != "group":
+        raise ValueError(f'paid is "{paid}"; a team that learns from replay shares one reward, "group"')
