@@ -23,7 +23,9 @@ class Driver(Protocol):
     def read(self, array: NDArray[Any]) -> NDArray[Any]: ...
     def write(self, array: NDArray[Any], values: NDArray[Any]) -> None: ...
     def first_unknown(self, actions: Actions, known: int) -> int: ...
-    def run(self, loop: Loop, worlds: Worlds, what: NDArray[Any], told: Told) -> None: ...
+    def run(
+        self, loop: Loop, worlds: Worlds, what: NDArray[Any], told: Told, *, vouched: bool = False
+    ) -> None: ...
 
 
 class Batch:
@@ -100,11 +102,13 @@ class Batch:
             ValueError: for an action that the game does not know; then nothing has changed.
         """
         self.check(actions)
-        return self.play_checked(actions, told)
+        self.driver.run("play_worlds", self.now, actions, told)
+        return told
 
     def play_checked(self, actions: Actions, told: Told) -> Told:
-        """`play` for actions that `check` has seen."""
-        self.driver.run("play_worlds", self.now, actions, told)
+        """`play` for contiguous actions that `check` has seen, into a `told` known to have its form: to look
+        at it again takes as long as a turn of one world."""
+        self.driver.run("play_worlds", self.now, actions, told, vouched=True)
         return told
 
     def boards(self, told: Told) -> Bytes:

@@ -86,7 +86,9 @@ class CudaThreads:
         at = int(self._unknown.copy_to_host()[0])
         return -1 if at == NONE_UNKNOWN else at
 
-    def run(self, loop: Loop, worlds: Worlds, what: NDArray[Any], told: Told) -> None:
+    def run(
+        self, loop: Loop, worlds: Worlds, what: NDArray[Any], told: Told, *, vouched: bool = False
+    ) -> None:
         """Runs a loop on all worlds, on the default stream; returns before it is done."""
         kernel = kernels()[loop][_blocks(len(what)), THREADS_PER_BLOCK]
         kernel(worlds, self.tables, what, told, self._scratch)

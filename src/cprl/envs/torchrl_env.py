@@ -86,7 +86,9 @@ class CommonsEnv(EnvBase):
         told_bytes = sum(prod(shape) * dtype.itemsize for shape, dtype in self._forms.values())
         self._turns_ahead = _AHEAD_TURNS if told_bytes < _AHEAD_BYTES else 1
         self._ahead: list[tuple[dict[str, Tensor], Told]] = []
-        self._tensors, self.told = self._fresh()
+        self._tensors: dict[str, Tensor]
+        self.told: Told
+        self._show_in(*self._fresh())
         self._make_specs()
 
     def _make_specs(self) -> None:
@@ -139,6 +141,11 @@ class CommonsEnv(EnvBase):
                 self._ahead.append((dict(zip(names, own, strict=True)), Told(*told)))
         return self._ahead.pop()
 
+    def _show_in(self, tensors: dict[str, Tensor], told: Told) -> None:
+        """Where the present moment is told; quicker than through a module's attributes."""
+        object.__setattr__(self, "_tensors", tensors)
+        object.__setattr__(self, "told", told)
+
     def _turns_of(self, block: Tensor) -> Any:
         """The block's turns as arrays."""
         on_cpu = block.device.type == "cpu"
@@ -174,7 +181,7 @@ class CommonsEnv(EnvBase):
     def _begin(self, which: Tensor | None) -> dict[str, Tensor]:
         """Begins the next episode of the marked worlds (bool [B, 1]; None for all), in fresh tensors."""
         before = self._tensors
-        self._tensors, self.told = self._fresh()
+        self._show_in(*self._fresh())
         if which is None:
             self.worlds.begin(self.told)
         else:
@@ -194,13 +201,13 @@ class CommonsEnv(EnvBase):
         """
         tensors, told = self._fresh()
         self.worlds.load(state, told)
-        self._tensors, self.told = tensors, told
+        self._show_in(tensors, told)
         return self._as_tensordict(tensors)
 
     def _step(self, tensordict: TensorDictBase) -> TensorDict:
         actions = self._as_array(tensordict.get(keys.AGENTS).get("action").contiguous())
         self.worlds.check(actions)
-        self._tensors, self.told = self._fresh()
+        self._show_in(*self._fresh())
         self.worlds.play_checked(actions, self.told)
         return self._as_tensordict(self._tensors, self._tensors["harvest"].unsqueeze(-1).clone())
 

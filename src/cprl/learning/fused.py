@@ -71,6 +71,8 @@ class FunctionalUpdate:
         groups = self.own, self.fixed, self._mean, self._square
         self._tensors = [list(group.values()) for group in groups]
         self.steps = 0
+        kind = next(iter(self.own.values()))
+        self._scalars = kind.new_zeros(()), kind.new_zeros(())
         self._learning_rate, self._adam_eps, self._share = learning_rate, adam_eps, loss_share
         self._max_norm = max_grad_norm
         self._vmapped, self._flat = not lane_axis, flat
@@ -108,10 +110,10 @@ class FunctionalUpdate:
 
     def _adam_scalars(self) -> tuple[Tensor, Tensor]:
         """Adam's two bias corrections, computed here once instead of for every weight in the graph."""
-        kind = next(iter(self.own.values()))
-        size = self._learning_rate / (1 - BETA_1**self.steps)
-        scale = (1 - BETA_2**self.steps) ** -0.5
-        return kind.new_tensor(size), kind.new_tensor(scale)
+        size, scale = self._scalars
+        size.fill_(self._learning_rate / (1 - BETA_1**self.steps))
+        scale.fill_((1 - BETA_2**self.steps) ** -0.5)
+        return size, scale
 
     def _step(
         self,

@@ -123,7 +123,7 @@ class LaneStorage(Storage):
 
     def oldest(self) -> tuple[Any, int]:
         """`valid`, as a numpy array where it lies on the CPU."""
-        return self._oldest.clip(min=self._written - self.max_size), self._written
+        return _at_least(self._oldest, self._written - int(self.max_size)), self._written
 
     def set(self, cursor: Any, data: TensorDictBase, *, set_cursor: bool = True) -> None:
         """Writes the next transition of every lane; `cursor` is its place in the ring."""
@@ -158,7 +158,7 @@ class LaneStorage(Storage):
 
     def _forget(self) -> None:
         """Transitions whose windows are about to be written over are no longer drawn."""
-        oldest = self._oldest.clip(min=self._written - self.max_size)
+        oldest = _at_least(self._oldest, self._written - int(self.max_size))
         soon = self._next_row - self.rows + 2 * LOOKS_EVERY + 1
         while True:
             lost = self._arrays["row"][oldest % self.max_size, self._lane] <= soon
@@ -204,6 +204,11 @@ class LaneStorage(Storage):
 
     def _empty(self) -> None:
         self._begin()
+
+
+def _at_least(numbers: Any, lowest: int) -> Any:
+    """Numpy's own `clip` looks up the limits of the type first, which takes five times as long."""
+    return np.maximum(numbers, lowest) if isinstance(numbers, np.ndarray) else numbers.clip(min=lowest)
 
 
 def _any(flags: Any) -> bool:
