@@ -1,7 +1,9 @@
 """One update of many agents for each of TorchRL's losses: the way that is found, and microseconds.
 
-One thread, batch 8, window 7 x 15 x 3, two hidden layers of 32 and 8 actions; each loss in a process of its
-own, the best of several repeats; what each compiles first takes up to a minute where torch has no cache.
+One thread, batch 8, window 7 x 15 x 3, two hidden layers of 32 and 8 actions. There are four learners in each
+replica of `commons`; those of VDN, QMIX, MAPPO and IPPO are a team of four. Each loss runs in a process of
+its own, and the best of several repeats counts; what each compiles first takes up to a minute where torch has
+no cache.
 
     make bench
 """
@@ -15,22 +17,31 @@ import torch
 import tyro
 from rich.console import Console
 from rich.table import Table
+from tensordict import TensorDict
 
 from cprl import presets
 from cprl.learning import (
     A2C,
     CQL,
     DQN,
+    IPPO,
     IQL,
+    MAPPO,
     PPO,
+    QMIX,
     SAC,
+    VDN,
     DistributionalDQN,
     DQNSettings,
     Reinforce,
     RolloutSettings,
 )
+from cprl.learning.agents import WEIGHTS, Lanes
+from cprl.learning.known import Algorithm
 from cprl.learning.rollouts import trial_rollout
-from cprl.learning.ways import fitting_way, make_update, trial_batch
+from cprl.learning.team_lanes import Teams
+from cprl.learning.teams import TeamAlgorithm
+from cprl.learning.ways import TRIAL_LANES, fitting_way, make_update, trial_batch
 
 REPLAY, ROLLOUTS = DQNSettings(), RolloutSettings()
 ALGORITHMS = {
@@ -44,27 +55,57 @@ ALGORITHMS = {
     "PPO": PPO(settings=ROLLOUTS),
     "A2C": A2C(settings=ROLLOUTS),
     "REINFORCE": Reinforce(settings=ROLLOUTS),
+    "VDN": VDN(settings=REPLAY),
+    "QMIX": QMIX(settings=REPLAY),
+    "MAPPO": MAPPO(settings=ROLLOUTS),
+    "IPPO": IPPO(settings=ROLLOUTS),
 }
 BATCH = 8
 
 
-def update_us(name: str, lanes: int, repeats: int) -> tuple[str, bool, float]:
-    """The way, whether it is compiled, and microseconds of one update of all lanes."""
+def lanes_of(algorithm: Algorithm, learners: int) -> Lanes | Teams:
+    """So many learners, four in each replica of `commons`, as lanes or teams."""
+    game = presets.game("commons")
+    agents = Lanes(
+        game,
+        seats=range(game.agents),
+        replicas=learners // game.agents,
+        seed=0,
+        first_replica=0,
+        make_network=lambda: algorithm.network(game),
+        samples=algorithm.samples,
+    )
+    if not isinstance(algorithm, TeamAlgorithm):
+        return agents
+    return Teams(agents, lambda members: algorithm.team(members, game))
+
+
+def update_us(name: str, learners: int, repeats: int) -> tuple[str, bool, float]:
+    """The way, whether it is compiled, and microseconds of one update of so many learners."""
     torch.set_num_threads(1)
     torch.set_flush_denormal(True)
     torch.manual_seed(0)
-    game, algorithm = presets.game("commons"), ALGORITHMS[name]
+    algorithm = ALGORITHMS[name]
+    lanes = lanes_of(algorithm, learners)
+    shapes = {"observation_shape": lanes.observation_shape, "action_shape": lanes.action_shape}
 
-    def batch_of(count: int) -> object:
-        batch = trial_batch(count, game.observation_shape, len(game.actions))
+    def batch_of(count: int) -> TensorDict:
+        batch = trial_batch(count, actions=len(presets.game("commons").actions), **shapes)
         return trial_rollout(batch) if isinstance(algorithm.settings, RolloutSettings) else batch
 
-    networks = [algorithm.network(game) for _ in range(lanes)]
-    way = fitting_way(networks[:2], algorithm.loss, batch_of(2))
+    networks = lanes_of(algorithm, max(learners, 2 * 4)).new_networks(WEIGHTS, "cpu")
+    trial = batch_of(TRIAL_LANES)
+    way = fitting_way(networks[:TRIAL_LANES], algorithm.loss, trial)
     update = make_update(
-        way, networks, algorithm.loss, compile=True, trial=batch_of(2), learning_rate=1e-5, adam_eps=1e-5
+        way,
+        networks[: len(lanes)],
+        algorithm.loss,
+        compile=True,
+        trial=trial,
+        learning_rate=1e-5,
+        adam_eps=1e-5,
     )
-    batch, best = batch_of(lanes), float("inf")
+    batch, best = batch_of(len(lanes)), float("inf")
     with warnings.catch_warnings(record=True) as told:
         warnings.simplefilter("always")
         for _ in range(10):
@@ -79,22 +120,22 @@ def update_us(name: str, lanes: int, repeats: int) -> tuple[str, bool, float]:
     return way, way != "list" and not failed, best * 1e6
 
 
-def main(*, lanes: tuple[int, ...] = (4, 32), repeats: int = 5, only: tuple[str, ...] = ()) -> None:
+def main(*, learners: tuple[int, ...] = (4, 32), repeats: int = 5, only: tuple[str, ...] = ()) -> None:
     """Prints the table.
 
     Args:
-        lanes: how many agents learn at once.
+        learners: how many agents learn at once, multiples of four.
         repeats: of which the best counts.
         only: which losses, by name; by default all.
     """
     table = Table(
-        "loss", "way", "compiled", title=f"us an update of so many lanes, batch {BATCH}, one thread"
+        "loss", "way", "compiled", title=f"us an update of so many learners, batch {BATCH}, one thread"
     )
-    for count in lanes:
+    for count in learners:
         table.add_column(f"{count}", justify="right", no_wrap=True)
     with ProcessPoolExecutor(1, mp_context=get_context("spawn"), max_tasks_per_child=1) as process:
         for name in only or ALGORITHMS:
-            measured = [process.submit(update_us, name, count, repeats).result() for count in lanes]
+            measured = [process.submit(update_us, name, count, repeats).result() for count in learners]
             way, compiled, _ = measured[0]
             cells = (f"{us:,.0f}" for _, _, us in measured)
             table.add_row(name, way, "yes" if compiled else "no", *cells)

@@ -10,6 +10,7 @@ from torchrl.objectives import ClipPPOLoss
 import cprl
 from cprl import CommonsEnv, Game, Observation, Rules, maps, study
 from cprl.acting.networks import acting_part
+from cprl.evaluation import evaluate_run
 from cprl.learning import (
     A2C,
     CQL,
@@ -21,6 +22,8 @@ from cprl.learning import (
     DQNSettings,
     Reinforce,
     RolloutSettings,
+    Tabular,
+    TabularSettings,
 )
 from cprl.learning.lanes import LaneLearner
 from cprl.learning.rollouts import RolloutLearner
@@ -287,6 +290,63 @@ def test_a_frozen_agent_plays_what_it_learned_and_changes_no_more(tmp_path, caps
         "agent": 2,
         "replica": 0,
     }
+
+
+def test_a_tabular_agent_is_a_member_like_any_other(tmp_path, capsys):
+    algorithm = Tabular(settings=TabularSettings(epsilon_hold_steps=5, epsilon_decay_steps=40))
+    members = [Learner(algorithm), Learner(ALGORITHMS["DQN"]), Learner(algorithm), Scripted("greedy")]
+    run, agents = conducted(tmp_path, members)
+    loaded = cprl.load(run)
+    assert loaded.algorithms[2] == algorithm
+    table = agents.learners[0, 2].q_table(3)
+    assert len(table["visits"]) > 10
+    seen, network = torch.from_numpy(table["observation"]), loaded.networks["replica_1/agent_2"]
+    assert torch.equal(network(seen.unsqueeze(0))[0], torch.from_numpy(table["values"]))
+    assert not network(torch.full_like(seen, 7)).any(), "of what was never met"
+    assert set(evaluate_run(run, episodes=2).trained) == {0, 1}
+
+    frozen = population([Frozen(run, 2, replica=1), *[Scripted()] * 3]).others[0,]
+    frozen.epsilon = 0.0
+    chosen = frozen.choose(seen[:2].unsqueeze(1))
+    assert chosen[:, 0].tolist() == table["values"][:2].argmax(1).tolist()
+
+    told = replace(GAME, observation=Observation(scoreboard=True))
+    with pytest.raises(ValueError, match=r"observe observation, scoreboard; .* see only"):
+        Population(told, members)
+
+
+@pytest.mark.parametrize("paid", ["own", "group"])
+def test_a_tabular_agent_is_paid_for_itself_or_for_the_group(paid):
+    class Witness:
+        """What was paid last for an action in a state, by replica."""
+
+        def __init__(self):
+            self.last = {}
+
+        def see_turn(self, batch):
+            rewards = batch["next", "agents", "reward"][..., 0]
+            paid_now = rewards.sum(1) if paid == "group" else rewards[:, 1]
+            for replica, reward in enumerate(paid_now.tolist()):
+                seen = batch["agents", "observation"][replica, 1].numpy().tobytes()
+                self.last[replica, seen, int(batch["agents", "action"][replica, 1])] = reward
+
+        def see_episode(self, episode, learning):
+            """Nothing."""
+
+    algorithm = Tabular(settings=TabularSettings(gamma=0.0, learning_rate=1.0))
+    agents = population([Scripted("greedy"), Learner(algorithm, paid=paid), *[Scripted("greedy")] * 2])
+    witness = Witness()
+    train(CommonsEnv(GAME, 2), agents.learners, others=agents.others, episodes=10, observers=[witness])
+    values = {}
+    for replica in range(2):
+        table = agents.learners[1,].q_table(replica)
+        for seen, of_actions, visits in zip(
+            table["observation"], table["values"], table["visits"], strict=True
+        ):
+            for action in visits.nonzero()[0].tolist():
+                values[replica, seen.tobytes(), action] = of_actions[action]
+    assert values == witness.last
+    assert (max(values.values()) > 1) == (paid == "group")
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -138,6 +138,8 @@ def test_swapping_the_loss_is_one_argument_and_each_leaves_a_run_that_plays_agai
     run = recipe("swap_the_loss").main(loss=loss, episodes=episodes, out=tmp_path / "run", **how)
     loaded, algorithm = cprl.load(run), recipe("swap_the_loss").LOSSES[loss]
     assert loaded.algorithms == {0: algorithm, 1: algorithm}
+    explores = "trained, epsilon 0.05" in " ".join(capsys.readouterr().out.split())
+    assert explores == (loss not in ("sac", "iql", "ppo")), "who draws from a policy has no epsilon"
     members = [Learner(algorithm)] * 2
     for lane, network in Population(loaded.game, members, replicas=2, compile=False).networks().items():
         trained = loaded.networks[lane].state_dict()

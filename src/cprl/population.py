@@ -17,11 +17,12 @@ from cprl.learning.known import Algorithm, told
 from cprl.learning.lanes import LaneLearner
 from cprl.learning.rollouts import RolloutLearner
 from cprl.learning.settings import DQNSettings, RolloutSettings
+from cprl.learning.tabular import Tabular, TabularLearner
 from cprl.learning.teams import TeamAlgorithm, refuse_wrong_team
 from cprl.learning.transitions import Paid
 from cprl.recording.loaded import load
 
-AnyLearner: TypeAlias = LaneLearner | RolloutLearner
+AnyLearner: TypeAlias = LaneLearner | RolloutLearner | TabularLearner
 
 
 @dataclass(frozen=True)
@@ -162,18 +163,30 @@ class Population:
         return [_told(member) for member in self.members]
 
 
-def _learner(member: Learner, game: Game, *, seats: tuple[int, ...], **how: Any) -> AnyLearner:
+def _learner(
+    member: Learner,
+    game: Game,
+    *,
+    seats: tuple[int, ...],
+    compile: bool,
+    device: str | torch.device,
+    **who: Any,
+) -> AnyLearner:
     algorithm = member.algorithm
+    who |= {"seats": seats, "paid": member.paid}
+    if isinstance(algorithm, Tabular):
+        algorithm.network(game)  # refuses a game of which it would not see all
+        return TabularLearner(game, settings=algorithm.settings, **who)
 
     def make_network() -> nn.Module:
         return algorithm.network(game)
 
     common: dict[str, Any] = {
-        "seats": seats,
         "make_network": make_network,
         "make_loss": algorithm.loss,
-        "paid": member.paid,
-        **how,
+        "compile": compile,
+        "device": device,
+        **who,
     }
     if isinstance(algorithm, TeamAlgorithm):
         team = algorithm

@@ -9,6 +9,7 @@ from typing import Any
 from cprl.acting.collect import StepCollector
 from cprl.envs.torchrl_env import CommonsEnv
 from cprl.learning.lanes import LaneLearner
+from cprl.learning.tabular import TabularLearner
 from cprl.measuring.episodes import Episode
 from cprl.measuring.evaluate import evaluate
 from cprl.population import Population
@@ -112,11 +113,11 @@ def evaluate_population(population: Population, *, worlds: int) -> dict[str, lis
 
 
 def _epsilon(population: Population) -> str:
-    """With what chance the learners of values explore in evaluation, for people."""
+    """With what chance learners of values explore in evaluation, for people; others draw from a policy."""
     chances = {
         learner.settings.epsilon_evaluation
         for learner in population.learners.values()
-        if isinstance(learner, LaneLearner)
+        if isinstance(learner, LaneLearner | TabularLearner) and not getattr(learner.actor, "samples", False)
     }
     return "".join(f", epsilon {chance:g}" for chance in sorted(chances))
 

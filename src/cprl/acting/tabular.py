@@ -1,6 +1,7 @@
 """Acting by tables: the value of each action in each state that an agent has met, and who reads it."""
 
 from collections.abc import Mapping, Sequence
+from math import prod
 from typing import Any
 
 import numpy as np
@@ -8,7 +9,7 @@ import torch
 from numpy.typing import NDArray
 from tensordict import TensorDictBase
 from tensordict.nn import TensorDictModuleBase
-from torch import Tensor
+from torch import Tensor, nn
 from torchrl.envs.utils import ExplorationType, exploration_type
 
 from cprl.acting.draws import LaneDraws
@@ -67,6 +68,12 @@ class QTables:
         own[state], self.size = self.size, self.size + 1
         return own[state]
 
+    def of_lane(self, lane: int) -> tuple[NDArray[np.uint8], NDArray[np.float64], NDArray[np.int64]]:
+        """The states that a lane has met, uint8 [n, bytes], their values and visits [n, A]; copies."""
+        states, rows = list(self.rows[lane]), list(self.rows[lane].values())
+        flat = np.frombuffer(b"".join(states), np.uint8).reshape(len(states), -1 if states else 0)
+        return flat.copy(), self.values[rows], self.visits[rows]
+
     def state_dict(self) -> dict[str, Tensor]:
         """All tables as tensors, a row for each state in the order in which they were met."""
         known = sorted((row, lane, state) for lane, own in enumerate(self.rows) for state, row in own.items())
@@ -113,6 +120,45 @@ def states_of(told: TensorDictBase, names: Sequence[str], seats: Sequence[int] |
     agents = arrays[0].shape[0] * arrays[0].shape[1]
     flat = [np.ascontiguousarray(array).reshape(agents, -1).view(np.uint8) for array in arrays]
     return [state.tobytes() for state in (flat[0] if len(flat) == 1 else np.concatenate(flat, 1))]
+
+
+class TableNetwork(nn.Module):
+    """What one agent has tabulated as an acting network, to be kept, loaded and frozen like any other.
+
+    Its state dict holds "states", uint8 [n, C X Y], and their "values", float64 [n, A]; it takes one with any
+    number of states. At first it knows none.
+
+    Args:
+        observation_shape: (C, X, Y) of an observation.
+        actions: how many actions A there are.
+    """
+
+    states: Tensor
+    values: Tensor
+
+    def __init__(self, observation_shape: Sequence[int], actions: int) -> None:
+        super().__init__()
+        self.observation_dims = len(observation_shape)
+        self.register_buffer("states", torch.zeros((0, prod(observation_shape)), dtype=torch.uint8))
+        self.register_buffer("values", torch.zeros((0, actions), dtype=torch.float64))
+        self._rows: dict[bytes, int] = {}
+
+    def forward(self, observation: Tensor) -> Tensor:
+        """uint8 [..., C, X, Y] to float64 [..., A]; 0 for what was never met."""
+        seen = observation.flatten(-self.observation_dims)
+        flat = seen.reshape(-1, seen.shape[-1]).numpy(force=True)
+        rows = [self._rows.get(state.tobytes(), len(self.values)) for state in flat]
+        values = torch.cat([self.values, self.values.new_zeros((1, self.values.shape[1]))])
+        return values[rows].reshape(*seen.shape[:-1], -1)
+
+    def _load_from_state_dict(self, state_dict: Any, prefix: str, *how: Any) -> None:
+        """As torch's, with as many states as come."""
+        for name in ("states", "values"):
+            own, came = getattr(self, name), state_dict.get(prefix + name)
+            if came is not None and came.shape[1:] == own.shape[1:]:
+                setattr(self, name, own.new_zeros(came.shape))
+        super()._load_from_state_dict(state_dict, prefix, *how)
+        self._rows = {state.tobytes(): row for row, state in enumerate(self.states.numpy(force=True))}
 
 
 class TabularActor(TensorDictModuleBase):

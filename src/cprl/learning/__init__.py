@@ -8,7 +8,7 @@ from cprl.learning.on_policy import A2C, PPO, Reinforce
 from cprl.learning.on_policy_teams import IPPO, MAPPO
 from cprl.learning.rollouts import RolloutLearner
 from cprl.learning.settings import DQNSettings, RolloutSettings
-from cprl.learning.tabular import TabularLearner, TabularSettings
+from cprl.learning.tabular import Tabular, TabularLearner, TabularSettings
 from cprl.learning.teams import QMIX, VDN
 from cprl.learning.transitions import transitions_of
 
@@ -30,6 +30,7 @@ __all__ = [
     "Reinforce",
     "RolloutLearner",
     "RolloutSettings",
+    "Tabular",
     "TabularLearner",
     "TabularSettings",
     "transitions_of",

@@ -9,17 +9,21 @@ from cprl.learning.off_policy_actors import IQL, SAC
 from cprl.learning.on_policy import A2C, PPO, OnPolicy, Reinforce
 from cprl.learning.on_policy_teams import IPPO, MAPPO
 from cprl.learning.settings import DQNSettings, RolloutSettings
+from cprl.learning.tabular import Tabular, TabularSettings
 from cprl.learning.teams import QMIX, VDN, TeamAlgorithm
 
-Algorithm: TypeAlias = OffPolicy | OnPolicy | TeamAlgorithm
+Algorithm: TypeAlias = OffPolicy | OnPolicy | TeamAlgorithm | Tabular
 """What an agent that learns is made of."""
 
 OF_CPRL: Final[tuple[type[Any], ...]] = (
     *(DQN, DistributionalDQN, CQL, SAC, IQL),
     *(PPO, A2C, Reinforce),
     *(VDN, QMIX, MAPPO, IPPO),
+    Tabular,
 )
-_SETTINGS: Final[dict[str, type[Any]]] = {kind.__name__: kind for kind in (DQNSettings, RolloutSettings)}
+_SETTINGS: Final[dict[str, type[Any]]] = {
+    kind.__name__: kind for kind in (DQNSettings, RolloutSettings, TabularSettings)
+}
 
 
 def told(algorithm: Algorithm) -> dict[str, Any]:

@@ -14,7 +14,7 @@ apples does not know which still hang, so windows on most boards do not (`tests/
 from collections import deque
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, fields
-from typing import Any, Literal
+from typing import Any, ClassVar, Literal
 
 import numpy as np
 import torch
@@ -23,10 +23,18 @@ from tensordict import TensorDictBase
 from torch import Tensor
 
 from cprl import keys
-from cprl.acting.tabular import NEVER_MET, QTables, TabularActor, observed_entries, states_of
+from cprl.acting.tabular import (
+    NEVER_MET,
+    QTables,
+    TableNetwork,
+    TabularActor,
+    observed_entries,
+    states_of,
+)
 from cprl.commons.game import Game
 from cprl.learning.agents import EVALUATION, EXPLORATION, lane_seeds
 from cprl.learning.settings import epsilon_at
+from cprl.learning.transitions import Paid
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -85,6 +93,28 @@ def _check_within(name: str, value: Any, other: str = "") -> None:
         raise ValueError(f"{name} is {value!r}; a number in 0..1{other} is wanted")
 
 
+@dataclass(frozen=True, kw_only=True)
+class Tabular:
+    """Tabular Q-learning as the algorithm of a population's member; see `TabularLearner`."""
+
+    settings: TabularSettings
+    samples: ClassVar[bool] = False
+
+    def network(self, game: Game) -> TableNetwork:
+        """What an agent has tabulated, nothing at first.
+
+        Raises:
+            ValueError: for a game that tells more than the board is seen to be.
+        """
+        names = observed_entries(game)
+        if names != ("observation",):
+            raise ValueError(
+                f"agents of this game observe {', '.join(names)}; as members of a population they see only "
+                "the observation: leave the others out of Observation, or hand a TabularLearner to train"
+            )
+        return TableNetwork(game.observation_shape, len(game.actions))
+
+
 class TabularLearner:
     """R x S independent tabular agents: seats S of each of R replicas, each with a table of its own.
 
@@ -97,6 +127,7 @@ class TabularLearner:
         settings: the hyper-parameters.
         seed: of the run.
         first_replica: the number of the first replica, so that replica r can be trained alone.
+        paid: what they are paid.
 
     Raises:
         MemoryError: in `remember`, where an agent meets more than `settings.max_states` states.
@@ -111,8 +142,10 @@ class TabularLearner:
         settings: TabularSettings,
         seed: int = 0,
         first_replica: int = 0,
+        paid: Paid = "own",
     ) -> None:
         self.game, self.settings, self.seed, self.seats = game, settings, seed, tuple(seats)
+        self.paid = paid
         self.replicas, self._numbers = replicas, range(first_replica, first_replica + replicas)
         self.tables = QTables(self.lanes, len(game.actions), max_states=settings.max_states)
         self.actor = self._actor(EXPLORATION, worlds=1)
@@ -139,9 +172,7 @@ class TabularLearner:
     def remember(self, batch: TensorDictBase) -> None:
         """Notes a turn of every replica, to be learned by the next `learn`."""
         agents, after = keys.entry(batch, keys.AGENTS), keys.entry(batch, "next")
-        terminated = (
-            keys.entry(after, keys.TERMINATED).expand(-1, len(self.seats)).numpy(force=True).reshape(-1)
-        )
+        terminated = keys.entry(after, keys.TERMINATED).numpy(force=True).repeat(len(self.seats))
         seen, at = states_of(agents, self._observed, self.seats), list(self.seats)
         rows = self.tables.find_or_add(seen, self._every_lane)
         on = np.flatnonzero(~terminated)
@@ -149,11 +180,12 @@ class TabularLearner:
         next_rows = np.full(self.lanes, NEVER_MET, np.int64)
         next_rows[on] = self.tables.find_or_add([next_seen[lane] for lane in on], on.tolist())
         reward = keys.entry(keys.entry(after, keys.AGENTS), "reward").numpy(force=True)
+        reward = reward[:, at] if self.paid == "own" else reward.sum(1).repeat(len(at))
         self._turns.append(
             {
                 "row": rows,
                 "action": keys.entry(agents, "action").numpy(force=True)[:, at].reshape(-1).copy(),
-                "reward": reward[:, at].reshape(-1).astype(np.float64),
+                "reward": reward.reshape(-1).astype(np.float64),
                 "next_row": next_rows,
             }
         )
@@ -188,23 +220,48 @@ class TabularLearner:
             "observation" uint8 [n, C, X, Y], "stock_gauge" float32 [n, 1] and "scoreboard" float32 [n, N]
             where the game has them, "values" float64 [n, A] and "visits" int64 [n, A].
         """
-        states, rows = list(self.tables.rows[lane]), list(self.tables.rows[lane].values())
-        flat = np.frombuffer(b"".join(states), np.uint8).reshape(len(states), -1)
+        flat, values, visits = self.tables.of_lane(lane)
         sizes = {"stock_gauge": self.game.stock_gauge_size, "scoreboard": self.game.scoreboard_size}
         cells = int(np.prod(self.game.observation_shape))
         table: dict[str, NDArray[Any]] = {
-            "observation": flat[:, :cells].reshape(len(states), *self.game.observation_shape)
+            "observation": flat[:, :cells].reshape(len(flat), *self.game.observation_shape)
         }
         vectors = np.ascontiguousarray(flat[:, cells:]).view(np.float32)
         for name in self._observed[1:]:
             table[name], vectors = vectors[:, : sizes[name]], vectors[:, sizes[name] :]
-        return {**table, "values": self.tables.values[rows], "visits": self.tables.visits[rows]}
+        return {**table, "values": values, "visits": visits}
+
+    def networks(self) -> dict[str, TableNetwork]:
+        """What every lane has tabulated up to now, by "replica_0/agent_0" and so on; copies.
+
+        Raises:
+            ValueError: see `Tabular.network`.
+        """
+        made = {}
+        for name, own in self._network_states().items():
+            made[name] = Tabular(settings=self.settings).network(self.game)
+            made[name].load_state_dict(own)
+        return made
+
+    def _network_states(self) -> dict[str, dict[str, Tensor]]:
+        """The state dict of each lane's `TableNetwork`."""
+        names = [f"replica_{replica}/agent_{agent}" for replica in self._numbers for agent in self.seats]
+        states = {}
+        for lane, name in enumerate(names):
+            seen, values, _ = self.tables.of_lane(lane)
+            states[name] = {"states": torch.from_numpy(seen), "values": torch.from_numpy(values)}
+        return states
 
     def state_dict(self) -> dict[str, Any]:
-        """Everything that the future of all lanes depends on."""
+        """Everything that the future of all lanes depends on.
+
+        "networks" besides, which says the same as "tables" in a form that `cprl.load` reads, where there is
+        one; see `Tabular.network`.
+        """
         turns = [{name: torch.from_numpy(array) for name, array in turn.items()} for turn in self._turns]
         return {
             "tables": self.tables.state_dict(),
+            "networks": self._network_states() if self._observed == ("observation",) else {},
             "exploration": self.actor.draws.state_dict(),
             "steps": self.steps,
             "turns": turns,
