@@ -12,7 +12,7 @@ from cprl import CommonsEnv, Game, Observation, Rules, maps
 from cprl.acting import Seats
 from cprl.acting.scripted import ScriptedActor
 from cprl.acting.tabular import NEVER_MET, QTables
-from cprl.learning.tabular import TabularLearner, TabularSettings
+from cprl.learning import TabularLearner, TabularSettings
 from cprl.measuring.evaluate import evaluate
 from cprl.recording import Checkpoints
 from cprl.recording.checkpoints import checkpoints_in, read_checkpoint

@@ -7,8 +7,8 @@ from cprl.learning.off_policy_actors import IQL, SAC
 from cprl.learning.on_policy import A2C, PPO, Reinforce
 from cprl.learning.on_policy_teams import IPPO, MAPPO
 from cprl.learning.rollouts import RolloutLearner
-from cprl.learning.settings import DQNSettings, RolloutSettings
-from cprl.learning.tabular import Tabular, TabularLearner, TabularSettings
+from cprl.learning.settings import DQNSettings, RolloutSettings, TabularSettings
+from cprl.learning.tabular import Tabular, TabularLearner
 from cprl.learning.teams import QMIX, VDN
 from cprl.learning.transitions import transitions_of
 

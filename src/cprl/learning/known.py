@@ -8,8 +8,8 @@ from cprl.learning.algorithms import CQL, DQN, DistributionalDQN, OffPolicy
 from cprl.learning.off_policy_actors import IQL, SAC
 from cprl.learning.on_policy import A2C, PPO, OnPolicy, Reinforce
 from cprl.learning.on_policy_teams import IPPO, MAPPO
-from cprl.learning.settings import DQNSettings, RolloutSettings
-from cprl.learning.tabular import Tabular, TabularSettings
+from cprl.learning.settings import DQNSettings, RolloutSettings, TabularSettings
+from cprl.learning.tabular import Tabular
 from cprl.learning.teams import QMIX, VDN, TeamAlgorithm
 
 Algorithm: TypeAlias = OffPolicy | OnPolicy | TeamAlgorithm | Tabular

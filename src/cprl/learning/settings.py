@@ -1,7 +1,10 @@
-"""The numbers of a DQN agent, with their units and sources."""
+"""The numbers of learning agents, with their units and sources."""
 
-from dataclasses import dataclass
-from typing import Protocol
+from dataclasses import dataclass, fields
+from typing import Any, Literal, Protocol
+
+import numpy as np
+from numpy.typing import NDArray
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -119,3 +122,59 @@ class RolloutSettings:
             raise ValueError(
                 f"minibatch_size is {self.minibatch_size}; it must divide rollout_steps, {self.rollout_steps}"
             )
+
+
+@dataclass(frozen=True, kw_only=True)
+class TabularSettings:
+    """Hyper-parameters of one tabular agent; the study names none for it, so defaults are ours.
+
+    Raises:
+        ValueError: names the field, what came and what fits.
+    """
+
+    gamma: float = 0.995
+    """Discount per step, as `DQNSettings.gamma`."""
+    learning_rate: float | Literal["1/visits"] = 0.1
+    """alpha: a number in 0..1, or one divided by the visits of that action in that state."""
+    visits_power: float = 1.0
+    """With "1/visits" alpha is 1 / visits ** this. Below 1 early targets, learned from values that were wrong
+    themselves, are forgotten sooner: 0.5..1 takes far fewer steps (Even-Dar and Mansour 2003)."""
+    epsilon_start: float = 1.0
+    """Chance of a random action at first."""
+    epsilon_end: float = 0.1
+    """Chance of a random action after the decay."""
+    epsilon_hold_steps: int = 800
+    """Steps at `epsilon_start` before the decay."""
+    epsilon_decay_steps: int = 50_000
+    """Steps of the linear decay that follow."""
+    epsilon_evaluation: float = 0.05
+    """Chance of a random action in evaluation."""
+    max_states: int = 100_000
+    """States that an agent may meet; with one more it is refused to go on. Each takes its observation's bytes
+    and 16 per action, and some 150."""
+
+    def __post_init__(self) -> None:
+        if self.learning_rate != "1/visits":
+            _check_within("learning_rate", self.learning_rate, " or '1/visits'")
+        for field in fields(self):
+            value = getattr(self, field.name)
+            if field.name in ("gamma", "epsilon_start", "epsilon_end", "epsilon_evaluation"):
+                _check_within(field.name, value)
+            elif field.name in ("epsilon_decay_steps", "max_states") and value < 1:
+                raise ValueError(f"{field.name} is {value}; at least 1 is wanted")
+        _check_within("visits_power", self.visits_power)
+
+    def epsilon(self, step: int) -> float:
+        """The chance of a random action at a step, counted from 0; as `DQNSettings.epsilon`."""
+        return epsilon_at(step, self)
+
+    def rates(self, visits: NDArray[np.int64]) -> NDArray[np.float64]:
+        """alpha of values that have been learned so often, this time included."""
+        if self.learning_rate == "1/visits":
+            return 1.0 / visits.astype(np.float64) ** self.visits_power
+        return np.full(visits.shape, self.learning_rate)
+
+
+def _check_within(name: str, value: Any, other: str = "") -> None:
+    if isinstance(value, str) or not 0 <= value <= 1:
+        raise ValueError(f"{name} is {value!r}; a number in 0..1{other} is wanted")
