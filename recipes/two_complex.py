@@ -5,6 +5,7 @@
 Copy this file and change it: another map, rule, network or loss is one line.
 """
 
+from dataclasses import replace
 from pathlib import Path
 
 import tyro
@@ -20,6 +21,7 @@ def main(
     replicas: int = 8,
     episodes: int = 6000,
     variant: presets.Variant = "published",
+    beam: bool = True,
     evaluation_episodes: int = 20,
     learn_every: int = 1,
     seed: int = 0,
@@ -34,6 +36,7 @@ def main(
         replicas: independent repetitions of the whole training, side by side.
         episodes: how many each trains.
         variant: the rules and the learner as the study is written, or as it was run.
+        beam: whether agents have the beam; without it nobody is tagged.
         evaluation_episodes: fresh episodes for each replica, with epsilon 0.05, and for the random policy.
         learn_every: environment steps k after which agents learn, then k times.
         seed: of chance, weights, exploration and replay.
@@ -45,6 +48,7 @@ def main(
     recording.check_watch(watch)
     prepare_process(seed)
     game = presets.game("two_complex", variant=variant)
+    game = replace(game, rules=replace(game.rules, may_fire=beam))
     settings = presets.learner("two_complex", variant=variant)
     learner = Learner(DQN(settings=settings))
     population = Population(game, [learner] * 2, replicas=replicas, seed=seed, compile=compile)
@@ -58,12 +62,13 @@ def main(
         "learner": settings,
         "population": population.told(),
     }
-    run = recording.start_run(out, "two_complex", recipe, go_on=go_on)
+    name = "two_complex" if beam else "two_complex_no_beam"
+    run = recording.start_run(out, name, recipe, go_on=go_on)
     return study.conduct(
         run,
         population,
         episodes=episodes,
-        title=f"two_complex, {variant} rules, {replicas} replicas, {episodes} episodes",
+        title=f"{name}, {variant} rules, {replicas} replicas, {episodes} episodes",
         evaluation_episodes=evaluation_episodes,
         learn_every=learn_every,
         watch=watch,

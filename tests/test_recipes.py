@@ -131,6 +131,13 @@ def test_recipes_of_replicas_leave_a_run_directory(name, variant, tmp_path, caps
         restore_weights_of(network["replica_0/agent_0"], weights["replica_1/agent_2"])
 
 
+def test_two_agents_without_the_beam_never_fire(tmp_path):
+    how = {"replicas": 2, "episodes": 1, "evaluation_episodes": 1, "compile": False, "watch": "off"}
+    run = recipe("two_complex").main(beam=False, out=tmp_path / "run", **how)
+    assert json.loads((run / "recipe.json").read_text())["recipe"] == "two_complex_no_beam"
+    assert set(read_episodes(run).to_pydict()["shots"]) == {0}
+
+
 @pytest.mark.parametrize("loss", ["dqn", "double_dqn", "cql", "sac", "iql", "ppo"])
 def test_swapping_the_loss_is_one_argument_and_each_leaves_a_run_that_plays_again(loss, tmp_path, capsys):
     how = {"replicas": 2, "evaluation_episodes": 1, "compile": False, "watch": "off"}
