@@ -93,7 +93,7 @@ def update_us(name: str, learners: int, repeats: int) -> tuple[str, bool, float]
         batch = trial_batch(count, actions=len(presets.game("commons").actions), **shapes)
         return trial_rollout(batch) if isinstance(algorithm.settings, RolloutSettings) else batch
 
-    networks = lanes_of(algorithm, max(learners, 2 * 4)).new_networks(WEIGHTS, "cpu")
+    networks = lanes_of(algorithm, max(learners, TRIAL_LANES * 4)).new_networks(WEIGHTS, "cpu")
     trial = batch_of(TRIAL_LANES)
     way = fitting_way(networks[:TRIAL_LANES], algorithm.loss, trial)
     update = make_update(

@@ -8,8 +8,7 @@ from typing import Any
 
 from cprl.acting.collect import StepCollector
 from cprl.envs.torchrl_env import CommonsEnv
-from cprl.learning.lanes import LaneLearner
-from cprl.learning.tabular import TabularLearner
+from cprl.learning.rollouts import RolloutLearner
 from cprl.measuring.episodes import Episode
 from cprl.measuring.evaluate import evaluate
 from cprl.population import Population
@@ -117,7 +116,7 @@ def _epsilon(population: Population) -> str:
     chances = {
         learner.settings.epsilon_evaluation
         for learner in population.learners.values()
-        if isinstance(learner, LaneLearner | TabularLearner) and not getattr(learner.actor, "samples", False)
+        if not isinstance(learner, RolloutLearner) and not learner.actor.samples
     }
     return "".join(f", epsilon {chance:g}" for chance in sorted(chances))
 

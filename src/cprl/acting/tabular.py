@@ -147,9 +147,10 @@ class TableNetwork(nn.Module):
         """uint8 [..., C, X, Y] to float64 [..., A]; 0 for what was never met."""
         seen = observation.flatten(-self.observation_dims)
         flat = seen.reshape(-1, seen.shape[-1]).numpy(force=True)
-        rows = [self._rows.get(state.tobytes(), len(self.values)) for state in flat]
-        values = torch.cat([self.values, self.values.new_zeros((1, self.values.shape[1]))])
-        return values[rows].reshape(*seen.shape[:-1], -1)
+        rows = torch.tensor([self._rows.get(state.tobytes(), -1) for state in flat])
+        values, known = self.values.new_zeros((len(rows), self.values.shape[1])), rows >= 0
+        values[known] = self.values[rows[known]]
+        return values.reshape(*seen.shape[:-1], -1)
 
     def _load_from_state_dict(self, state_dict: Any, prefix: str, *how: Any) -> None:
         """As torch's, with as many states as come."""
@@ -179,6 +180,7 @@ class TabularActor(TensorDictModuleBase):
     """
 
     out_keys = ("action",)
+    samples = False
 
     def __init__(
         self, tables: QTables, game: Game, *, seeds: Sequence[Sequence[int]], seats: int, worlds: int = 1

@@ -27,6 +27,16 @@ def lane_seeds(
     return [(seed, replica, agent, purpose) for replica in replicas for agent in seats]
 
 
+def lane_name(replica: int, agent: int) -> str:
+    """Under which a lane's networks are kept."""
+    return f"replica_{replica}/agent_{agent}"
+
+
+def lane_names(*, replicas: Sequence[int], seats: Sequence[int]) -> list[str]:
+    """Of each lane, replica by replica: "replica_0/agent_0" and so on."""
+    return [lane_name(replica, agent) for replica in replicas for agent in seats]
+
+
 class Acts(Protocol):
     """What acts by the present weights of many lanes; an `Update` does."""
 
@@ -71,8 +81,8 @@ class Lanes:
 
     @property
     def names(self) -> list[str]:
-        """Of each lane: "replica_0/agent_0" and so on."""
-        return [f"replica_{replica}/agent_{agent}" for replica in self._numbers for agent in self.seats]
+        """See `lane_names`."""
+        return lane_names(replicas=self._numbers, seats=self.seats)
 
     @property
     def observation_shape(self) -> tuple[int, ...]:

@@ -71,7 +71,7 @@ class DQN:
     def loss(self, network: nn.Module) -> LossModule:
         """See `OffPolicy`."""
         loss = DQNLoss(
-            _q_actor(network),
+            q_actor(network),
             delay_value=True,
             double_dqn=self.double,
             loss_function=self.loss_function,
@@ -153,7 +153,7 @@ class CQL:
     def loss(self, network: nn.Module) -> LossModule:
         """See `OffPolicy`."""
         loss = _WeightedCQLLoss(
-            _q_actor(network),
+            q_actor(network),
             weight=self.conservative_weight,
             delay_value=True,
             loss_function=self.loss_function,
@@ -205,5 +205,6 @@ def network_of(game: Game, settings: DQNSettings, *, outputs: int, relu: bool = 
     )
 
 
-def _q_actor(network: nn.Module) -> QValueActor:
+def q_actor(network: nn.Module) -> QValueActor:
+    """A network's outputs as the values of TorchRL's actor."""
     return QValueActor(network, spec=None, action_space="categorical")

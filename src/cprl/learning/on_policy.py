@@ -1,6 +1,6 @@
 """On-policy algorithms: for each agent an actor and a critic, and TorchRL's loss over them."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Protocol
 
@@ -51,15 +51,7 @@ class PPO:
 
     def loss(self, network: nn.Module) -> LossModule:
         """See `OnPolicy`."""
-        return _loss(
-            network,
-            ClipPPOLoss,
-            clip_epsilon=self.clip_epsilon,
-            entropy_coeff=self.entropy_coeff,
-            critic_coeff=self.critic_coeff,
-            loss_critic_type="l2",
-            normalize_advantage=False,  # `RolloutLearner` does, each lane by itself
-        )
+        return clipped_loss(network, ClipPPOLoss, self)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -112,9 +104,41 @@ class Reinforce:
 def actor_and_critic(game: Game, settings: RolloutSettings) -> AgentNetworks:
     """New networks of one agent, like those of the DQN agents: "actor" and "critic"."""
     sizes = {"actor": len(game.actions), "critic": 1}
-    how = {"highest": game.observation.highest, "hidden_cells": settings.hidden_cells}
-    return AgentNetworks(
-        {name: QNetwork(game.observation_shape, size, **how) for name, size in sizes.items()}  # type: ignore[arg-type]
+    shape = game.observation_shape
+    return AgentNetworks({name: rollout_network(game, settings, shape, size) for name, size in sizes.items()})
+
+
+def rollout_network(game: Game, settings: RolloutSettings, shape: Sequence[int], outputs: int) -> QNetwork:
+    """A new network from what is seen in a game, of such a shape, to so many outputs."""
+    return QNetwork(shape, outputs, highest=game.observation.highest, hidden_cells=settings.hidden_cells)
+
+
+class Clipped(Protocol):
+    """What PPO wants to know of an algorithm of its family."""
+
+    @property
+    def clip_epsilon(self) -> float:
+        """How far the chance of an action may move from what it was, as a ratio."""
+
+    @property
+    def entropy_coeff(self) -> float:
+        """Of the policy's entropy in the loss."""
+
+    @property
+    def critic_coeff(self) -> float:
+        """Of the critic's error in the loss."""
+
+
+def clipped_loss(network: nn.Module, kind: Callable[..., LossModule], algorithm: Clipped) -> LossModule:
+    """One of TorchRL's losses with a clipped ratio over "actor" and "critic"."""
+    return _loss(
+        network,
+        kind,
+        clip_epsilon=algorithm.clip_epsilon,
+        entropy_coeff=algorithm.entropy_coeff,
+        critic_coeff=algorithm.critic_coeff,
+        loss_critic_type="l2",
+        normalize_advantage=False,  # `RolloutLearner` does, each lane by itself
     )
 
 

@@ -4,15 +4,14 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any, ClassVar
 
-from tensordict.nn import TensorDictModule
 from torch import nn
 from torchrl.objectives import LossModule
 from torchrl.objectives.multiagent import IPPOLoss, MAPPOLoss
 
-from cprl.acting.networks import AgentNetworks, QNetwork
+from cprl.acting.networks import AgentNetworks
 from cprl.acting.teams import CentralCritic, TeamNetwork
 from cprl.commons.game import Game
-from cprl.learning.off_policy_actors import policy
+from cprl.learning.on_policy import actor_and_critic, clipped_loss, rollout_network
 from cprl.learning.settings import RolloutSettings
 
 
@@ -35,19 +34,17 @@ class MAPPO:
 
     def network(self, game: Game) -> nn.Module:
         """See `TeamAlgorithm`."""
-        return _of_rollouts(game, self.settings, outputs=len(game.actions))
+        return rollout_network(game, self.settings, game.observation_shape, len(game.actions))
 
     def team(self, members: Sequence[nn.Module], game: Game) -> nn.Module:
         """See `TeamAlgorithm`."""
         everything = len(members), *game.observation_shape
-        critic = QNetwork(
-            everything, 1, highest=game.observation.highest, hidden_cells=self.settings.hidden_cells
-        )
+        critic = rollout_network(game, self.settings, everything, 1)
         return AgentNetworks({"actor": TeamNetwork(members), "critic": CentralCritic(critic, len(members))})  # type: ignore[arg-type]
 
     def loss(self, network: nn.Module) -> LossModule:
         """See `TeamAlgorithm`."""
-        return _clipped(network, MAPPOLoss, self)
+        return clipped_loss(network, MAPPOLoss, self)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -70,10 +67,7 @@ class IPPO:
 
     def network(self, game: Game) -> nn.Module:
         """See `TeamAlgorithm`."""
-        sizes = {"actor": len(game.actions), "critic": 1}
-        return AgentNetworks(
-            {name: _of_rollouts(game, self.settings, outputs=size) for name, size in sizes.items()}
-        )
+        return actor_and_critic(game, self.settings)
 
     def team(self, members: Sequence[nn.Module], game: Game) -> nn.Module:
         """See `TeamAlgorithm`."""
@@ -84,26 +78,4 @@ class IPPO:
 
     def loss(self, network: nn.Module) -> LossModule:
         """See `TeamAlgorithm`."""
-        return _clipped(network, IPPOLoss, self)
-
-
-def _of_rollouts(game: Game, settings: RolloutSettings, *, outputs: int) -> QNetwork:
-    return QNetwork(
-        game.observation_shape,
-        outputs,
-        highest=game.observation.highest,
-        hidden_cells=settings.hidden_cells,
-    )
-
-
-def _clipped(network: nn.Module, kind: type[MAPPOLoss], algorithm: MAPPO | IPPO) -> LossModule:
-    assert isinstance(network, AgentNetworks)
-    return kind(
-        policy(network["actor"]),
-        TensorDictModule(network["critic"], ["observation"], ["state_value"]),
-        clip_epsilon=algorithm.clip_epsilon,
-        entropy_coeff=algorithm.entropy_coeff,
-        critic_coeff=algorithm.critic_coeff,
-        loss_critic_type="l2",
-        normalize_advantage=False,  # `RolloutLearner` does, each team by itself
-    )
+        return clipped_loss(network, IPPOLoss, self)

@@ -1,14 +1,35 @@
 """The numbers of learning agents, with their units and sources."""
 
 from dataclasses import dataclass, fields
-from typing import Any, Literal, Protocol
+from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
 
 
 @dataclass(frozen=True, kw_only=True)
-class DQNSettings:
+class Exploring:
+    """The chance of a random action: it stays for a while, and then falls in a straight line."""
+
+    epsilon_start: float = 1.0
+    """Chance of a random action at first."""
+    epsilon_end: float = 0.1
+    """Chance of a random action after the decay."""
+    epsilon_hold_steps: int = 800
+    """Steps at `epsilon_start` before the decay."""
+    epsilon_decay_steps: int = 500_000
+    """Steps of the linear decay that follow."""
+    epsilon_evaluation: float = 0.05
+    """Chance of a random action in evaluation."""
+
+    def epsilon(self, step: int) -> float:
+        """The chance of a random action at a step, counted from 0."""
+        done = min(1.0, max(0.0, (step - self.epsilon_hold_steps) / self.epsilon_decay_steps))
+        return self.epsilon_start + done * (self.epsilon_end - self.epsilon_start)
+
+
+@dataclass(frozen=True, kw_only=True)
+class DQNSettings(Exploring):
     """Hyper-parameters of one independent DQN agent; the defaults are the published ones.
 
     Source: M. Wiatrak, "Governing the Commons with Multi-Agent Reinforcement Learning" (2019), appendix A,
@@ -29,16 +50,6 @@ class DQNSettings:
     """Added to Adam's denominator; 1e-7 as run."""
     hidden_cells: tuple[int, ...] = (32, 32)
     """Units of each hidden layer, with ReLU."""
-    epsilon_start: float = 1.0
-    """Chance of a random action at first."""
-    epsilon_end: float = 0.1
-    """Chance of a random action after the decay."""
-    epsilon_hold_steps: int = 800
-    """Steps at `epsilon_start` before the decay."""
-    epsilon_decay_steps: int = 500_000
-    """Steps of the linear decay that follow."""
-    epsilon_evaluation: float = 0.05
-    """Chance of a random action in evaluation."""
     priority_alpha: float = 0.0
     """How much transitions of a large error are preferred in sampling (Schaul et al., "Prioritized Experience
     Replay", 2016); 0 for not at all. Above 0 wants TorchRL's compiled extension and a `DQNLearner`."""
@@ -53,36 +64,6 @@ class DQNSettings:
     mean_over_all_outputs: bool = False
     """[run] The squared error is averaged over all outputs, of which all but the chosen one count zero;
     else over the batch alone."""
-
-    def epsilon(self, step: int) -> float:
-        """The chance of a random action at a step, counted from 0."""
-        return epsilon_at(step, self)
-
-
-class Decay(Protocol):
-    """Settings whose chance of a random action stays for a while and then falls in a straight line."""
-
-    @property
-    def epsilon_start(self) -> float:
-        """At first."""
-
-    @property
-    def epsilon_end(self) -> float:
-        """After the decay."""
-
-    @property
-    def epsilon_hold_steps(self) -> int:
-        """Steps before the decay."""
-
-    @property
-    def epsilon_decay_steps(self) -> int:
-        """Steps of the decay."""
-
-
-def epsilon_at(step: int, settings: Decay) -> float:
-    """The chance of a random action at a step, counted from 0."""
-    done = min(1.0, max(0.0, (step - settings.epsilon_hold_steps) / settings.epsilon_decay_steps))
-    return settings.epsilon_start + done * (settings.epsilon_end - settings.epsilon_start)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -125,7 +106,7 @@ class RolloutSettings:
 
 
 @dataclass(frozen=True, kw_only=True)
-class TabularSettings:
+class TabularSettings(Exploring):
     """Hyper-parameters of one tabular agent; the study names none for it, so defaults are ours.
 
     Raises:
@@ -139,16 +120,8 @@ class TabularSettings:
     visits_power: float = 1.0
     """With "1/visits" alpha is 1 / visits ** this. Below 1 early targets, learned from values that were wrong
     themselves, are forgotten sooner: 0.5..1 takes far fewer steps (Even-Dar and Mansour 2003)."""
-    epsilon_start: float = 1.0
-    """Chance of a random action at first."""
-    epsilon_end: float = 0.1
-    """Chance of a random action after the decay."""
-    epsilon_hold_steps: int = 800
-    """Steps at `epsilon_start` before the decay."""
     epsilon_decay_steps: int = 50_000
     """Steps of the linear decay that follow."""
-    epsilon_evaluation: float = 0.05
-    """Chance of a random action in evaluation."""
     max_states: int = 100_000
     """States that an agent may meet; with one more it is refused to go on. Each takes its observation's bytes
     and 16 per action, and some 150."""
@@ -163,10 +136,6 @@ class TabularSettings:
             elif field.name in ("epsilon_decay_steps", "max_states") and value < 1:
                 raise ValueError(f"{field.name} is {value}; at least 1 is wanted")
         _check_within("visits_power", self.visits_power)
-
-    def epsilon(self, step: int) -> float:
-        """The chance of a random action at a step, counted from 0; as `DQNSettings.epsilon`."""
-        return epsilon_at(step, self)
 
     def rates(self, visits: NDArray[np.int64]) -> NDArray[np.float64]:
         """alpha of values that have been learned so often, this time included."""

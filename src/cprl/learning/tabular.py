@@ -32,9 +32,9 @@ from cprl.acting.tabular import (
     states_of,
 )
 from cprl.commons.game import Game
-from cprl.learning.agents import EVALUATION, EXPLORATION, lane_seeds
+from cprl.learning.agents import EVALUATION, EXPLORATION, lane_names, lane_seeds
 from cprl.learning.settings import TabularSettings
-from cprl.learning.transitions import Paid
+from cprl.learning.transitions import Paid, lane_turn
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -50,13 +50,7 @@ class Tabular:
         Raises:
             ValueError: for a game that tells more than the board is seen to be.
         """
-        names = observed_entries(game)
-        if names != ("observation",):
-            raise ValueError(
-                f"agents of this game observe {', '.join(names)}; as members of a population they see only "
-                "the observation: leave the others out of Observation, or hand a TabularLearner to train"
-            )
-        return TableNetwork(game.observation_shape, len(game.actions))
+        return _table_network(game)
 
 
 class TabularLearner:
@@ -115,21 +109,20 @@ class TabularLearner:
 
     def remember(self, batch: TensorDictBase) -> None:
         """Notes a turn of every replica, to be learned by the next `learn`."""
+        batch = batch.cpu()  # where the tables lie
+        turn = lane_turn(self.seats, batch, paid=self.paid)
         agents, after = keys.entry(batch, keys.AGENTS), keys.entry(batch, "next")
-        terminated = keys.entry(after, keys.TERMINATED).numpy(force=True).repeat(len(self.seats))
-        seen, at = states_of(agents, self._observed, self.seats), list(self.seats)
+        seen = states_of(agents, self._observed, self.seats)
         rows = self.tables.find_or_add(seen, self._every_lane)
-        on = np.flatnonzero(~terminated)
+        on = np.flatnonzero(~turn.terminated)
         next_seen = states_of(keys.entry(after, keys.AGENTS), self._observed, self.seats)
         next_rows = np.full(self.lanes, NEVER_MET, np.int64)
         next_rows[on] = self.tables.find_or_add([next_seen[lane] for lane in on], on.tolist())
-        reward = keys.entry(keys.entry(after, keys.AGENTS), "reward").numpy(force=True)
-        reward = reward[:, at] if self.paid == "own" else reward.sum(1).repeat(len(at))
         self._turns.append(
             {
                 "row": rows,
-                "action": keys.entry(agents, "action").numpy(force=True)[:, at].reshape(-1).copy(),
-                "reward": reward.reshape(-1).astype(np.float64),
+                "action": turn.action.copy(),
+                "reward": turn.reward.astype(np.float64),
                 "next_row": next_rows,
             }
         )
@@ -183,15 +176,14 @@ class TabularLearner:
         """
         made = {}
         for name, own in self._network_states().items():
-            made[name] = Tabular(settings=self.settings).network(self.game)
+            made[name] = _table_network(self.game)
             made[name].load_state_dict(own)
         return made
 
     def _network_states(self) -> dict[str, dict[str, Tensor]]:
         """The state dict of each lane's `TableNetwork`."""
-        names = [f"replica_{replica}/agent_{agent}" for replica in self._numbers for agent in self.seats]
         states = {}
-        for lane, name in enumerate(names):
+        for lane, name in enumerate(lane_names(replicas=self._numbers, seats=self.seats)):
             seen, values, _ = self.tables.of_lane(lane)
             states[name] = {"states": torch.from_numpy(seen), "values": torch.from_numpy(values)}
         return states
@@ -220,3 +212,14 @@ class TabularLearner:
         self._turns = deque(
             {name: own.numpy().copy() for name, own in turn.items()} for turn in state["turns"]
         )
+
+
+def _table_network(game: Game) -> TableNetwork:
+    """See `Tabular.network`."""
+    names = observed_entries(game)
+    if names != ("observation",):
+        raise ValueError(
+            f"agents of this game observe {', '.join(names)}; as members of a population they see only "
+            "the observation: leave the others out of Observation, or hand a TabularLearner to train"
+        )
+    return TableNetwork(game.observation_shape, len(game.actions))

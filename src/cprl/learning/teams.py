@@ -10,14 +10,14 @@ from typing import ClassVar, Protocol, runtime_checkable
 
 from tensordict.nn import TensorDictModule
 from torch import nn
-from torchrl.modules import QValueActor, VDNMixer
+from torchrl.modules import VDNMixer
 from torchrl.objectives import LossModule, ValueEstimators
 from torchrl.objectives.multiagent import QMixerLoss
 
 from cprl.acting.networks import AgentNetworks
 from cprl.acting.teams import Mixing, TeamNetwork
 from cprl.commons.game import Game
-from cprl.learning.algorithms import q_network_of
+from cprl.learning.algorithms import q_actor, q_network_of
 from cprl.learning.settings import DQNSettings, RolloutSettings
 from cprl.learning.transitions import Paid
 
@@ -145,7 +145,7 @@ def _mixed(network: nn.Module, seen_by_mixer: Sequence[str], settings: DQNSettin
     """`QMixerLoss` over a team's "actor" and "mixer", its entries at the root."""
     assert isinstance(network, AgentNetworks)
     loss = QMixerLoss(
-        QValueActor(network["actor"], spec=None, action_space="categorical"),
+        q_actor(network["actor"]),
         TensorDictModule(network["mixer"], list(seen_by_mixer), [_OF_TEAM]),
         delay_value=True,
         action_space="categorical",

@@ -2,7 +2,6 @@
 
 from typing import Any, Literal, NamedTuple, TypeAlias
 
-import numpy as np
 from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
 
@@ -53,12 +52,7 @@ def lane_turn(seats: tuple[int, ...], batch: TensorDictBase, *, paid: Paid = "ow
         return (array if everyone else array[:, at]).reshape(lanes, *shape)
 
     def of_world(flag: Tensor) -> Any:
-        array = array_of(flag)
-        return (
-            array.repeat(len(at))
-            if isinstance(array, np.ndarray)
-            else flag.expand(-1, len(at)).reshape(lanes)
-        )
+        return array_of(flag)[:, [0] * len(at)].reshape(lanes)
 
     reward = entry(agents_after, "reward")
     return LaneTurn(

@@ -20,6 +20,7 @@ from cprl.commons.maps import Map
 from cprl.commons.observation import Observation
 from cprl.commons.rules import Rules
 from cprl.envs.torchrl_env import CommonsEnv
+from cprl.learning.agents import lane_name
 from cprl.learning.known import Algorithm, built
 from cprl.learning.off_policy_actors import policy
 from cprl.recording.checkpoints import FOLDER, checkpoints_in, read_checkpoint
@@ -61,7 +62,7 @@ class LoadedRun:
         Raises:
             ValueError: where no such network was kept; says which were.
         """
-        lane = f"replica_{replica}/agent_{agent}"
+        lane = lane_name(replica, agent)
         if lane not in self.networks:
             raise ValueError(f"{self.path} keeps no network of {lane}; kept are {sorted(self.networks)}")
         algorithm = self.algorithms[agent]
@@ -87,7 +88,7 @@ class LoadedRun:
                 actors[seat] = _actor(earlier, member["agent"], member["replica"])
             elif member["member"] == "Scripted":
                 actors[seat] = self._scripted(member["manner"], seat)
-            elif f"replica_{replica}/agent_{seat}" in self.networks:
+            elif lane_name(replica, seat) in self.networks:
                 actors[seat] = _actor(self, seat, replica)
             else:
                 empty.append(seat)
