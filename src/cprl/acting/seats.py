@@ -45,6 +45,7 @@ class Seats(TensorDictModuleBase):
             raise ValueError(f"actors sit at {taken}; wanted are 0, 1 and so on, each taken once")
         self.agents = len(taken)
         self.seats = list(of_seats)
+        self._one_takes_all = self.seats == [tuple(taken)]
         self.actors = nn.ModuleList(of_seats.values())
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
@@ -57,8 +58,9 @@ class Seats(TensorDictModuleBase):
                 f"{self.agents} actors for {observation.shape[dim]} agents; "
                 "one actor for each agent is wanted"
             )
-        if self.seats == [tuple(range(self.agents))]:
-            keys.put(agents, "action", self._choose(self.actors[0], agents, None, tensordict.batch_size))
+        if self._one_takes_all:
+            (actor,) = self.actors
+            keys.put(agents, "action", self._choose(actor, agents, None, tensordict.batch_size))
             return tensordict
         chosen = observation.new_empty(observation.shape[: dim + 1], dtype=torch.int64)
         for seat, actor in zip(self.seats, self.actors, strict=True):

@@ -205,7 +205,7 @@ class CommonsEnv(EnvBase):
         return self._as_tensordict(tensors)
 
     def _step(self, tensordict: TensorDictBase) -> TensorDict:
-        actions = self._as_array(tensordict.get(keys.AGENTS).get("action").contiguous())
+        actions = self._as_array(keys.entry(keys.entry(tensordict, keys.AGENTS), "action").contiguous())
         self.worlds.check(actions)
         self._show_in(*self._fresh())
         self.worlds.play_checked(actions, self.told)

@@ -2,6 +2,7 @@
 
 from typing import Any, Literal, NamedTuple, TypeAlias
 
+import numpy as np
 from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
 
@@ -52,7 +53,9 @@ def lane_turn(seats: tuple[int, ...], batch: TensorDictBase, *, paid: Paid = "ow
         return (array if everyone else array[:, at]).reshape(lanes, *shape)
 
     def of_world(flag: Tensor) -> Any:
-        return array_of(flag)[:, [0] * len(at)].reshape(lanes)
+        array = array_of(flag)
+        repeat = array.repeat if isinstance(array, np.ndarray) else array.repeat_interleave
+        return repeat(len(at))
 
     reward = entry(agents_after, "reward")
     return LaneTurn(
@@ -73,7 +76,7 @@ def seen_next(batch: TensorDictBase) -> Tensor:
 
 def array_of(tensor: Tensor) -> Any:
     """The same memory as a numpy array; as it is where it lies on a GPU. Both are indexed alike."""
-    return tensor.numpy() if tensor.device.type == "cpu" else tensor
+    return tensor.numpy() if tensor.is_cpu else tensor
 
 
 def transitions_of(agent: int, batch: TensorDictBase) -> TensorDict:
