@@ -28,7 +28,8 @@ from cprl import CommonsEnv, presets
 from cprl.acting import Seats
 from cprl.learning import LaneLearner
 from cprl.measuring.episodes import EpisodeTracker
-from cprl.train import Training, prepare_process
+from cprl.process import prepare_process
+from cprl.train import Training
 
 CASES: Final[tuple[tuple[presets.Board, int, int], ...]] = (
     ("single_complex", 1, 1),

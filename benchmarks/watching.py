@@ -32,8 +32,9 @@ from cprl import CommonsEnv, presets
 from cprl.acting.lanes import random_seats
 from cprl.learning import LaneLearner
 from cprl.measuring import Episode
+from cprl.process import prepare_process
 from cprl.recording import Watch
-from cprl.train import Training, prepare_process
+from cprl.train import Training
 
 SEATS: Final = (0, 1, 2, 3)
 REPLICAS: Final = 8

@@ -13,7 +13,7 @@ import tyro
 from cprl import presets, recording, study
 from cprl.learning import DQN
 from cprl.population import Learner, Population
-from cprl.train import prepare_process
+from cprl.process import prepare_process
 
 
 def main(

@@ -15,7 +15,7 @@ from cprl import presets, recording, study
 from cprl.acting.scripted import Manner
 from cprl.learning import DQN, PPO, RolloutSettings
 from cprl.population import Learner, Population, Scripted
-from cprl.train import prepare_process
+from cprl.process import prepare_process
 
 
 def main(

@@ -15,7 +15,7 @@ import tyro
 from cprl import presets, recording, study
 from cprl.learning import CQL, DQN, IQL, PPO, SAC, RolloutSettings
 from cprl.population import Learner, Population
-from cprl.train import prepare_process
+from cprl.process import prepare_process
 
 REPLAY = replace(presets.learner("two_complex"), learning_rate=1e-4, epsilon_decay_steps=100_000)
 """The published settings, but for a schedule that fits 1000 episodes: ten times the step, a fifth of the

@@ -9,8 +9,9 @@ from pathlib import Path
 from cprl import CommonsEnv, Game, Rules, maps
 from cprl.acting import random_lanes
 from cprl.learning import DQNSettings, LaneLearner
+from cprl.process import prepare_process
 from cprl.recording import Checkpoints, EpisodeTable, save_weights
-from cprl.train import prepare_process, train
+from cprl.train import train
 
 GAME = Game(
     map=maps.parse(".A>.A\n.A.A.\n..<.A"),

@@ -11,8 +11,9 @@ from pathlib import Path
 
 from cprl import CommonsEnv, presets
 from cprl.learning import LaneLearner
+from cprl.process import prepare_process
 from cprl.recording import Watch
-from cprl.train import prepare_process, train
+from cprl.train import train
 
 SEATS = (0, 1, 2, 3)
 

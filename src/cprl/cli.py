@@ -12,12 +12,12 @@ from cprl.evaluation.runs import SEED, evaluate_run
 from cprl.evaluation.told import heading, matrices, run_table, seats_table
 from cprl.evaluation.visits import Diagonal
 from cprl.evaluation.visits import crossplay as play_each_other
+from cprl.process import prepare_process
 from cprl.recording.bank import keep_results
 from cprl.recording.labelled import refuse_to_write_over, write_table
 from cprl.recording.report import write_report
 from cprl.recording.streams import viewer
 from cprl.replay import replay as play_again
-from cprl.train import prepare_process
 
 
 def report(runs: tuple[Path, ...], /, *, out: Path = Path("report")) -> None:
