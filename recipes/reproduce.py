@@ -16,8 +16,9 @@ from pathlib import Path
 
 import tyro
 
+from cprl.process import prepare_process
 from cprl.recording.bank import keep_results
-from cprl.recording.report import write_report
+from cprl.reporting import write_report
 
 AS_RUN = ("--variant", "as_run")
 EXPERIMENTS = {
@@ -62,6 +63,7 @@ def main(
     with ThreadPoolExecutor(processes or os.cpu_count()) as pool:
         for ended in [pool.submit(run, name, common, runs=runs, results=results) for name in only]:
             ended.result()
+    prepare_process(0)
     return write_report([results / name for name in only], results)
 
 

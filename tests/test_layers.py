@@ -23,6 +23,7 @@ ROOMS = (
     "study",
     "replay",
     "evaluation",
+    "reporting",
     "cli",
 )
 MODULES = sorted(path for path in SOURCE.rglob("*.py") if path.parent != SOURCE or path.name != "__init__.py")

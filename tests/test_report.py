@@ -14,13 +14,14 @@ from test_rerun_logger import column
 
 import cprl
 from cprl import presets
+from cprl.measuring.movement import Trace
 from cprl.measuring.published import curve, experiment
 from cprl.recording import read_episodes
 from cprl.recording.bank import keep_results
-from cprl.recording.claims import dip_depth, of_training
 from cprl.recording.curves import as_curves, running_mean
-from cprl.recording.report import write_report
 from cprl.replay import replay
+from cprl.reporting import write_report
+from cprl.reporting.claims import dip_depth, measures, of_play, of_training
 
 RECIPES = Path(__file__).parents[1] / "recipes"
 
@@ -227,3 +228,32 @@ def test_measures_of_training_know_rich_and_poor():
 def test_every_published_experiment_is_reproduced():
     named = {arguments[0] for arguments in recipe("reproduce").EXPERIMENTS.values()}
     assert {experiment(name).number for name in named} == {1, 2, 3, 4, 5}
+
+
+def test_agents_at_play_are_measured_replica_by_replica():
+    shape = 2, 4, 2  # two steps, two worlds for each of two replicas, two agents
+    columns = np.array(
+        [[0, 4], [0, 4], [3, 3], [3, 3]]
+    )  # replica 0: four steps apart; replica 1: in one place
+    fired = np.zeros(shape, bool)
+    fired[0, 0, 0] = True
+    played = Trace(
+        row=np.zeros(shape, int),
+        col=np.broadcast_to(columns, shape),
+        in_play=np.ones(shape, bool),
+        fired=fired,
+        played=np.ones(shape[:2], bool),
+        board=(3, 9),
+    )
+    found = of_play(played, replicas=2)
+    assert found["shots per 1000 steps, all agents"].tolist() == [250.0, 0.0]
+    assert found["overlap of the cells that two agents visit"].tolist() == [0.0, 1.0]
+    nearness = found["steps to the nearest other when firing, over that in all steps"]
+    np.testing.assert_array_equal(nearness, [1.0, np.nan], "in replica 1 nobody fired")
+
+
+def test_the_random_walker_beside_a_learner_moves_as_the_random_policy_does(run):
+    """Chance of its own in every replica and world, whatever plays beside it."""
+    found = {measure.name: measure for measure in measures(run)}
+    walker = found["rounds about the centre per 1000 steps, agent 1"]
+    assert walker.trained.value == pytest.approx(walker.random, rel=0.2)

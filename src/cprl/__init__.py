@@ -2,6 +2,7 @@
 
 The rooms, in the order in which the data flow:
     keys        every TensorDict entry that is handed on
+    process     what a training wants of the process that it runs in
     commons     the game: maps, rules, turns; numpy and numba alone
     envs        doors into it: CommonsEnv for TorchRL
     acting      from seeing to doing: networks, policies, evaluation
@@ -14,6 +15,7 @@ The rooms, in the order in which the data flow:
     study       one study from its learners to its report
     replay      a stored policy plays again, recorded
     evaluation  stored agents in fresh worlds, among themselves and among each other
+    reporting   finished runs beside the published study
     cli         the command cprl: watch, replay, report, keep, evaluate, crossplay
 """
 

@@ -15,9 +15,9 @@ from cprl.evaluation.visits import crossplay as play_each_other
 from cprl.process import prepare_process
 from cprl.recording.bank import keep_results
 from cprl.recording.labelled import refuse_to_write_over, write_table
-from cprl.recording.report import write_report
 from cprl.recording.streams import viewer
 from cprl.replay import replay as play_again
+from cprl.reporting import write_report
 
 
 def report(runs: tuple[Path, ...], /, *, out: Path = Path("report")) -> None:
@@ -29,6 +29,7 @@ def report(runs: tuple[Path, ...], /, *, out: Path = Path("report")) -> None:
     """
     if not runs:
         raise ValueError("cprl report wants at least one run: cprl report RUN...")
+    prepare_process(SEED)
     print(write_report(runs, out))
 
 
@@ -41,6 +42,7 @@ def replay(run: Path, /, *, replica: int = 0, episode: int = 0, out: Path | None
         episode: which of the fresh episodes; the same number plays the same again.
         out: the recording; by default replay-<replica>-<episode>.rrd in the run's directory.
     """
+    prepare_process(SEED)
     path, played = play_again(run, out, replica=replica, episode=episode)
     harvests = ", ".join(f"{apples:.0f}" for apples in played.harvest)
     print(f"{played.steps} steps, apples: {harvests}; {played.stock_left} left")

@@ -4,7 +4,7 @@ What plays is what `LoadedRun.policy` gives, but as lanes: one step of all repli
 one, and chance is handed in: each lane's random numbers follow from (seed, replica, seat) alone.
 """
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cache
 from typing import Any, TypeAlias
@@ -60,12 +60,23 @@ def play(
         explore: see `cprl.measuring.evaluate.evaluate`.
     """
     played: Played = {}
-    for group in _consecutive(replicas):
-        env = CommonsEnv(game, len(group) * episodes, seed=seed, first_world=group[0] * episodes)
+    for group, env in fresh_worlds(game, replicas, worlds=episodes, seed=seed):
         found = evaluate(env, who(group), explore=explore)
         for place, replica in enumerate(group):
             played[replica] = found[place * episodes : (place + 1) * episodes]
     return played
+
+
+def fresh_worlds(
+    game: Game, replicas: Sequence[int], *, worlds: int, seed: int
+) -> Iterator[tuple[list[int], CommonsEnv]]:
+    """So many worlds of each replica, those of as many as can be side by side in one environment.
+
+    Yields:
+        The numbers of replicas, and their worlds in the same order; see `play` for which.
+    """
+    for group in _consecutive(replicas):
+        yield group, CommonsEnv(game, len(group) * worlds, seed=seed, first_world=group[0] * worlds)
 
 
 def seated(sitters: Sequence[Sitter], replicas: Sequence[int], *, worlds: int, seed: int) -> Seats:

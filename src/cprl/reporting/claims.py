@@ -2,23 +2,25 @@
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
+from typing import Final
 
 import numpy as np
-import torch
 from numpy.typing import NDArray
 
-from cprl.acting.actors import RandomActor
 from cprl.acting.seats import Seats
-from cprl.measuring.movement import overlap, rounds, shooting_distance, trace
+from cprl.evaluation.runs import SEED, kept_replicas
+from cprl.evaluation.seating import Sitter, fresh_worlds, random_seats, seated
+from cprl.measuring.movement import Trace, overlap, rounds, shooting_distance, trace
 from cprl.measuring.statistics import Estimate, estimate
 from cprl.recording.curves import curves_of, running_mean
 from cprl.recording.loaded import LoadedRun, load
 
 Values = NDArray[np.float64]
 
-WORLDS = 8
-"""Fresh worlds that the trained agents of each replica play, one episode in each, with epsilon 0.05."""
+WORLDS: Final = 64
+"""Fresh worlds that the trained agents of each replica play, one episode in each, as in evaluation."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -29,7 +31,7 @@ class Measure:
     trained: Estimate
     """Over replicas."""
     random: float | None
-    """Of the random policy at all seats, in 32 worlds; None for measures of training."""
+    """Of the random policy at all seats, in the same worlds; None for measures of training."""
 
 
 def measures(run: Path) -> list[Measure]:
@@ -44,14 +46,23 @@ def measures(run: Path) -> list[Measure]:
         for name, values in of_training(curves).items()
     ]
     loaded = load(run)
-    random = Seats([RandomActor(len(loaded.game.actions), seed=agent) for agent in range(loaded.game.agents)])
-    by_chance = of_play(loaded, random, worlds=32)
-    each = [of_play(loaded, loaded.policy(replica), worlds=WORLDS) for replica in loaded.replicas]
-    for name, chance in by_chance.items():
-        values = np.array([own[name] for own in each])
+    trained = _at_play(loaded, partial(seated, [Sitter(loaded)] * loaded.game.agents))
+    by_chance = _at_play(loaded, partial(random_seats, loaded.game))
+    for name, values in trained.items():
         if np.isfinite(values).all():
-            found.append(Measure(name=name, trained=estimate(values), random=chance))
+            found.append(Measure(name=name, trained=estimate(values), random=float(by_chance[name].mean())))
     return found
+
+
+def _at_play(loaded: LoadedRun, who: Callable[..., Seats]) -> dict[str, Values]:
+    """`of_play` of a run's game in the same fresh worlds, whoever plays."""
+    found: dict[str, list[Values]] = {}
+    replicas = kept_replicas(loaded)
+    for group, env in fresh_worlds(loaded.game, replicas, worlds=WORLDS, seed=SEED):
+        played = trace(env, who(group, worlds=WORLDS, seed=SEED))
+        for name, values in of_play(played, len(group)).items():
+            found.setdefault(name, []).append(values)
+    return {name: np.concatenate(values) for name, values in found.items()}
 
 
 def of_training(curves: dict[str, Values]) -> dict[str, Values]:
@@ -85,36 +96,41 @@ def dip_depth(curves: Values) -> Values:
     return deepest
 
 
-def of_play(loaded: LoadedRun, policy: Callable[..., object], *, worlds: int) -> dict[str, float]:
-    """Measures of one episode in each of so many fresh worlds.
+def of_play(played: Trace, replicas: int) -> dict[str, Values]:
+    """Measures of agents at play, [R] each; NaN where nobody fired with another one in play.
 
     Args:
-        loaded: the run whose game is played.
-        policy: of all agents; they explore as they do in evaluation.
-        worlds: how many.
+        played: an episode of each world, those of a replica side by side.
+        replicas: how many replicas R.
     """
-    with torch.random.fork_rng(devices=[]):
-        torch.manual_seed(_FRESH_SEED)  # TorchRL's exploration draws from torch's generator
-        played = trace(loaded.env(worlds, seed=_FRESH_SEED), policy)
-    around = np.abs(rounds(played)).mean(0)
+
+    def of_replica(of_worlds: Values) -> Values:
+        return of_worlds.reshape(replicas, -1)
+
+    def of_replicas(of_worlds: Values) -> Values:
+        """The mean over the worlds of each that have the number."""
+        values = of_replica(of_worlds)
+        with np.errstate(invalid="ignore"):
+            means: Values = np.nansum(values, 1) / np.isfinite(values).sum(1)
+        return means
+
+    around = np.abs(rounds(played))
+    agents = around.shape[1]
     found = {
-        f"rounds about the centre per 1000 steps, agent {agent}": float(around[agent])
-        for agent in range(len(around))
+        f"rounds about the centre per 1000 steps, agent {agent}": of_replicas(around[:, agent])
+        for agent in range(agents)
     }
-    if loaded.game.agents > 1:
+    if agents > 1:
         fired, always = shooting_distance(played)
-        found["overlap of the cells that two agents visit"] = float(np.mean(overlap(played)))
-        if np.isfinite(fired).any():
-            found["steps to the nearest other when firing, over that in all steps"] = float(
-                np.nanmean(fired) / np.nanmean(always)
-            )
-        shots = played.fired.sum() / played.played.sum() * 1000
-        found["shots per 1000 steps, all agents"] = float(shots)
+        found["overlap of the cells that two agents visit"] = of_replicas(overlap(played))
+        found["steps to the nearest other when firing, over that in all steps"] = of_replicas(
+            fired
+        ) / of_replicas(always)
+        shots = played.fired.sum((0, 2)), played.played.sum(0)
+        found["shots per 1000 steps, all agents"] = 1000 * np.divide(
+            *(of_replica(number).sum(1) for number in shots)
+        )
     return found
-
-
-_FRESH_SEED = 10_007
-"""No training of ours uses it."""
 
 
 def _agents(curves: dict[str, Values]) -> int:

@@ -19,10 +19,10 @@ from numpy.typing import NDArray
 from cprl.measuring import phases
 from cprl.measuring.published import PHASES_BEGIN, SMOOTHED_EPISODES, Experiment, agreement, curve, experiment
 from cprl.measuring.statistics import curve_interval, estimate
-from cprl.recording.claims import measures
 from cprl.recording.curves import as_curves, curves_of, running_mean
 from cprl.recording.files import write_atomically
 from cprl.recording.run import read_json, read_recipe
+from cprl.reporting.claims import measures
 
 Values = NDArray[np.float64]
 

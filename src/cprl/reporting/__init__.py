@@ -1,0 +1,5 @@
+"""Reporting: finished runs beside the published study."""
+
+from cprl.reporting.report import write_report
+
+__all__ = ["write_report"]
