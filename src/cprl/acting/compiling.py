@@ -2,8 +2,9 @@
 
 import gc
 import warnings
-from collections.abc import Callable, Hashable
-from types import FunctionType
+from collections.abc import Callable, Hashable, Iterator
+from contextlib import contextmanager
+from types import CodeType, FunctionType
 from typing import Any, Final
 
 import torch
@@ -48,9 +49,10 @@ class Compiled:
 
     def _compile_and_call(self, *arguments: Any) -> Any:
         """The first call with this form; where it cannot be compiled, nothing has been changed yet."""
-        self._compiled = torch.compile(_own_code(self._plain), fullgraph=True, options=dict(OPTIONS))
+        own = _own_code(self._plain)
+        self._compiled = torch.compile(own, fullgraph=True, options=dict(OPTIONS))
         try:
-            with warnings.catch_warnings():
+            with warnings.catch_warnings(), _rewritten(own) as codes:
                 for kind in (DeprecationWarning, FutureWarning):  # torch's and TorchRL's own affairs
                     warnings.simplefilter("ignore", kind)
                 result = self._compiled(*arguments)
@@ -62,6 +64,10 @@ class Compiled:
                 stacklevel=4,
             )
             return self._plain(*arguments)
+        if codes:
+            # What the function has become, called without looking for it at every call, which takes half of
+            # torch's time around the computation. With globals of its own: torch clears away its own names.
+            self._compiled = FunctionType(codes[-1], dict(own.__globals__), own.__name__)
         # A compiler leaves millions of objects that stay; without this Python's garbage collector looks
         # through them again and again, which takes up to a third of a training.
         gc.collect()
@@ -69,7 +75,25 @@ class Compiled:
         return result
 
 
-def _own_code(function: Any) -> Callable[..., Any]:
+@contextmanager
+def _rewritten(function: FunctionType) -> Iterator[list[CodeType]]:
+    """While it is open, the code that torch writes in place of a function's is put into the list."""
+    from torch._dynamo.convert_frame import register_bytecode_hook  # takes seconds
+
+    codes: list[CodeType] = []
+
+    def keep(code: CodeType, new_code: CodeType) -> None:
+        if code is function.__code__:
+            codes.append(new_code)
+
+    hook = register_bytecode_hook(keep)
+    try:
+        yield codes
+    finally:
+        hook.remove()
+
+
+def _own_code(function: Any) -> FunctionType:
     """The same function with a code object of its own: torch keeps what it compiled by code object, and
     would take learners of another size for a change of shapes."""
     code = function.__code__.replace(co_name=f"{function.__name__}_of_its_own")
