@@ -7,7 +7,16 @@ import pytest
 import test_optimum
 import torch
 from tensordict import TensorDict
-from test_population import GAME, REPLAY, ROLLOUTS, AtSteps, Returns, conducted, population, trained, weights
+from test_population import (
+    GAME,
+    REPLAY,
+    ROLLOUTS,
+    assert_goes_on_bit_for_bit,
+    conducted,
+    population,
+    trained,
+    weights,
+)
 
 import cprl
 from cprl import CommonsEnv, Game, Rules, maps, presets
@@ -19,7 +28,6 @@ from cprl.learning.lanes import LaneLearner
 from cprl.learning.ways import trial_batch
 from cprl.measuring.evaluate import evaluate
 from cprl.population import Frozen, Learner, Population, Scripted
-from cprl.recording.checkpoints import checkpoints_in
 from cprl.train import train
 
 TEAMS = {
@@ -187,40 +195,7 @@ def test_the_teams_value_grows_with_each_members_value():
 @pytest.mark.parametrize("name", ["QMIX", "MAPPO"])
 def test_a_team_that_was_stopped_goes_on_bit_for_bit(name, tmp_path):
     members = [*[Learner(TEAMS[name], paid="group")] * 3, Learner(DQN(settings=REPLAY))]
-
-    def run(folder, *, stop_at=None):
-        agents = population(members)
-
-        class StopError(Exception):
-            pass
-
-        class Witness(Returns):
-            turns = 0
-
-            def see_turn(self, batch):
-                self.turns += 1
-                if self.turns == stop_at:
-                    raise StopError
-
-        (tmp_path / folder).mkdir(exist_ok=True)
-        with AtSteps(tmp_path / folder) as checkpoints:
-            try:
-                train(
-                    CommonsEnv(GAME, 2, seed=3),
-                    agents.learners,
-                    episodes=4,
-                    observers=[Witness()],
-                    checkpoints=checkpoints,
-                )
-            except StopError:
-                assert checkpoints_in(tmp_path / folder / "checkpoints")
-        return agents
-
-    whole = weights(run("whole"))
-    run("stopped", stop_at=47)
-    again = run("stopped")
-    for key, value in weights(again).items():
-        assert torch.equal(value, whole[key]), key
+    assert_goes_on_bit_for_bit(members, tmp_path, episodes=4)
 
 
 def test_a_teams_run_is_built_again_and_its_members_play_on_frozen(tmp_path, capsys):
