@@ -104,12 +104,12 @@ def of_play(played: Trace, replicas: int) -> dict[str, Values]:
         replicas: how many replicas R.
     """
 
-    def of_replica(of_worlds: Values) -> Values:
+    def by_replica(of_worlds: Values) -> Values:
         return of_worlds.reshape(replicas, -1)
 
-    def of_replicas(of_worlds: Values) -> Values:
-        """The mean over the worlds of each that have the number."""
-        values = of_replica(of_worlds)
+    def mean(of_worlds: Values) -> Values:
+        """Of each replica, over those of its worlds that have the number."""
+        values = by_replica(of_worlds)
         with np.errstate(invalid="ignore"):
             means: Values = np.nansum(values, 1) / np.isfinite(values).sum(1)
         return means
@@ -117,19 +117,17 @@ def of_play(played: Trace, replicas: int) -> dict[str, Values]:
     around = np.abs(rounds(played))
     agents = around.shape[1]
     found = {
-        f"rounds about the centre per 1000 steps, agent {agent}": of_replicas(around[:, agent])
+        f"rounds about the centre per 1000 steps, agent {agent}": mean(around[:, agent])
         for agent in range(agents)
     }
     if agents > 1:
         fired, always = shooting_distance(played)
-        found["overlap of the cells that two agents visit"] = of_replicas(overlap(played))
-        found["steps to the nearest other when firing, over that in all steps"] = of_replicas(
-            fired
-        ) / of_replicas(always)
-        shots = played.fired.sum((0, 2)), played.played.sum(0)
-        found["shots per 1000 steps, all agents"] = 1000 * np.divide(
-            *(of_replica(number).sum(1) for number in shots)
-        )
+        shots, steps = played.fired.sum((0, 2)), played.played.sum(0)
+        found |= {
+            "overlap of the cells that two agents visit": mean(overlap(played)),
+            "steps to the nearest other when firing, over that in all steps": mean(fired) / mean(always),
+            "shots per 1000 steps, all agents": 1000 * by_replica(shots).sum(1) / by_replica(steps).sum(1),
+        }
     return found
 
 
