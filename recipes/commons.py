@@ -22,6 +22,7 @@ def main(
     episodes: int = 4800,
     variant: presets.Variant = "published",
     epsilon_decay_steps: int = 1_000_000,
+    target_every_episodes: int = 3,
     evaluation_episodes: int = 20,
     learn_every: int = 1,
     seed: int = 0,
@@ -37,6 +38,7 @@ def main(
         episodes: how many each trains.
         variant: the rules and the learner as the study is written, or as it was run.
         epsilon_decay_steps: of exploration; versions of the study's program have 500,000 too.
+        target_every_episodes: episodes between replacements of targets; the study's program has 3 or 10.
         evaluation_episodes: fresh episodes for each replica, with epsilon 0.05, and for the random policy.
         learn_every: environment steps k after which agents learn, then k times.
         seed: of chance, weights, exploration and replay.
@@ -49,7 +51,9 @@ def main(
     prepare_process(seed)
     game = presets.game("commons", variant=variant)
     settings = presets.learner("commons", variant=variant)
-    settings = replace(settings, epsilon_decay_steps=epsilon_decay_steps)
+    settings = replace(
+        settings, epsilon_decay_steps=epsilon_decay_steps, target_every_episodes=target_every_episodes
+    )
     learner = Learner(DQN(settings=settings))
     population = Population(game, [learner] * 4, replicas=replicas, seed=seed, compile=compile)
     recipe = {
