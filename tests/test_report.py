@@ -22,6 +22,8 @@ from cprl.recording.curves import as_curves, running_mean
 from cprl.replay import replay
 from cprl.reporting import write_report
 from cprl.reporting.claims import dip_depth, measures, of_play, of_training
+from cprl.reporting.result import Result
+from cprl.reporting.turning import turning_points_of
 
 RECIPES = Path(__file__).parents[1] / "recipes"
 
@@ -257,3 +259,30 @@ def test_the_random_walker_beside_a_learner_moves_as_the_random_policy_does(run)
     found = {measure.name: measure for measure in measures(run)}
     walker = found["rounds about the centre per 1000 steps, agent 1"]
     assert walker.trained.value == pytest.approx(walker.random, rel=0.2)
+
+
+def test_turning_points_are_those_of_the_mean_of_replicas(tmp_path):
+    """300 episodes, with a peak at 160 and a survival that gives way at 200."""
+    episodes = np.arange(300)
+    returns = np.where(episodes < 160, episodes * 1.0, 320.0 - episodes)
+    survival = np.where(episodes < 200, 1000.0, 600.0)
+    result = Result(
+        path=tmp_path / "five",
+        recipe={},
+        told={},
+        curves={
+            "collective_return": np.stack([returns, returns]),
+            "survival_steps": np.stack([survival, survival]),
+        },
+        study=experiment("commons"),
+    )
+    published, ours = turning_points_of([result])[-3:-1]
+    assert published == "| published curves | 572 | 364 | 339 | 1395 | 564 | 612 |  |"
+    smoothed = running_mean(returns)
+    top = int(smoothed.argmax())
+    first = int((running_mean(survival) < 990).argmax())
+    assert ours == (
+        f"| five | {smoothed[top]:.0f} | {top} | {smoothed[-1]:.0f} | 200 | {first} | 600 | 600 to 600 |"
+    )
+    assert first == 103, "the first mean of which three of a hundred episodes are short"
+    assert turning_points_of([]) == []

@@ -4,29 +4,24 @@ Made from results alone (`cprl.recording.bank`), so that anybody can make it aga
 """
 
 import shlex
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Sequence
 from datetime import timedelta
-from functools import cached_property
 from pathlib import Path
-from typing import Any, Final
+from typing import Final
 
 import numpy as np
 import pyarrow.parquet as pq
 from matplotlib.figure import Figure
-from numpy.typing import NDArray
 
-from cprl.measuring import phases
-from cprl.measuring.published import PHASES_BEGIN, SMOOTHED_EPISODES, Experiment, agreement, curve, experiment
+from cprl.measuring.published import PHASES_BEGIN, SMOOTHED_EPISODES, agreement, curve
 from cprl.measuring.statistics import curve_interval, estimate
-from cprl.recording.curves import as_curves, curves_of, running_mean
+from cprl.recording.curves import as_curves, running_mean
 from cprl.recording.files import write_atomically
-from cprl.recording.run import read_json, read_recipe
 from cprl.reporting.claims import measures
+from cprl.reporting.markdown import table
+from cprl.reporting.result import TOO_FEW, Result, Values, read_result
+from cprl.reporting.turning import phases_of, turning_points_of
 
-Values = NDArray[np.float64]
-
-TOO_FEW: Final = "too few episodes"
 TITLES: Final = {
     "collective_return": "collective return, apples",
     "equality": "equality (1 - Gini)",
@@ -35,61 +30,6 @@ TITLES: Final = {
     "return_0": "return of the learner, apples",
     "return_1": "return of the random walker, apples",
 }
-
-
-@dataclass(kw_only=True, eq=False)
-class Result:
-    """What a run left, as far as a report needs it."""
-
-    path: Path
-    recipe: Mapping[str, Any]
-    told: Mapping[str, Any]
-    """`report.json`."""
-    curves: Mapping[str, Values]
-    study: Experiment | None
-    """The study's experiment that its recipe repeats."""
-
-    @property
-    def name(self) -> str:
-        """That of its directory."""
-        return self.path.name
-
-    @property
-    def title(self) -> str:
-        """What was run, in a few words."""
-        arguments, (replicas, episodes) = self.recipe["arguments"], self.curves["collective_return"].shape
-        told = [self.recipe["recipe"]]
-        if "variant" in arguments:
-            told.append(f"{arguments['variant']} rules")
-        if "learner" in arguments:
-            told.append(f"epsilon decays in {arguments['learner']['epsilon_decay_steps']:,} steps")
-        return ", ".join([*told, f"{replicas} replicas of {episodes:,} episodes"])
-
-    @cached_property
-    def phases(self) -> tuple[list[phases.ChangePoint], list[phases.Phase]] | None:
-        """As those of experiment 5 are told; None where there are too few episodes."""
-        smoothed = {name: running_mean(self.curves[name]) for name in phases.METRICS}
-        episodes = np.arange(smoothed["equality"].shape[1])
-        if len(episodes) <= 4 * phases.SHORTEST:
-            return None
-        return phases.told_apart(episodes, smoothed)
-
-
-def read_result(path: Path) -> Result:
-    """A run's directory, or its results.
-
-    Raises:
-        ValueError: where there is no run.
-        FileNotFoundError: where it has no episodes or did not end.
-    """
-    recipe = read_recipe(path)
-    return Result(
-        path=path,
-        recipe=recipe,
-        told=read_json(path / "report.json"),
-        curves=curves_of(path),
-        study=experiment(recipe["recipe"]),
-    )
 
 
 def write_report(runs: Sequence[Path], out: Path) -> Path:
@@ -114,7 +54,8 @@ def write_report(runs: Sequence[Path], out: Path) -> Path:
         *_runs(results),
         *_appendix(results),
         *_agreements(results),
-        *_phases(results),
+        *phases_of(results),
+        *turning_points_of(results),
         *_claims(results),
         *_figures(results, out),
     ]
@@ -139,7 +80,7 @@ def _runs(results: Sequence[Result]) -> list[str]:
                 f"`{_command(result.recipe['command'])}`",
             ]
         )
-    return ["## Runs", "", *_table(["run", "what", "training", "commit", "versions", "command"], rows)]
+    return ["## Runs", "", *table(["run", "what", "training", "commit", "versions", "command"], rows)]
 
 
 def _command(line: str) -> str:
@@ -173,7 +114,7 @@ def _appendix(results: Sequence[Result]) -> list[str]:
         )
     head = ["run", "experiment", "random, published", "random, ours", "trained, published"]
     head += ["mean over training, ours", "evaluation at epsilon 0.05, ours"]
-    return ["## Appendix A beside ours: collective return", "", *_table(head, rows)]
+    return ["## Appendix A beside ours: collective return", "", *table(head, rows)]
 
 
 def _agreements(results: Sequence[Result]) -> list[str]:
@@ -184,7 +125,7 @@ def _agreements(results: Sequence[Result]) -> list[str]:
                 [result.name, metric, *_agreement_cells(name, running_mean(result.curves[metric]).mean(0))]
             )
     head = ["run", "metric", "correlation", "mean absolute difference", "of the published curve's range"]
-    return ["## Published curves beside ours", "", *_table(head, rows)]
+    return ["## Published curves beside ours", "", *table(head, rows)]
 
 
 def _agreement_cells(name: str, ours: Values) -> list[str]:
@@ -194,37 +135,6 @@ def _agreement_cells(name: str, ours: Values) -> list[str]:
     return [f"{correlation:.2f}", f"{difference:.3g}", f"{difference / np.ptp(curve(name)[1]):.0%}"]
 
 
-def _phases(results: Sequence[Result]) -> list[str]:
-    rows = [["published curves", *_phase_cells(*_published_phases())]]
-    for result in results:
-        if result.study and result.study.number == 5:
-            rows.append(
-                [result.name, *(_phase_cells(*result.phases) if result.phases else [TOO_FEW, "", "", ""])]
-            )
-    head = ["curves", "second phase from", "third", "fourth", "phases by their pattern"]
-    drawn = ", ".join(map(str, PHASES_BEGIN))
-    told = f"The study draws its phases from {drawn} on. See `cprl.measuring.phases` for how ours are found."
-    return ["## Phases of experiment 5", "", told, "", *_table(head, rows)]
-
-
-def _published_phases() -> tuple[list[phases.ChangePoint], list[phases.Phase]]:
-    study = experiment("commons")
-    assert study is not None
-    episodes = np.arange(10, 4745)
-    # The curve of survival begins at episode 512; before that nobody depletes the board.
-    metrics = {name: np.interp(episodes, *curve(study.curves[name])) for name in phases.METRICS}
-    return phases.told_apart(episodes, metrics)
-
-
-def _phase_cells(changes: Sequence[phases.ChangePoint], found: Sequence[phases.Phase]) -> list[str]:
-    cells = [
-        f"{change.episode:.0f}"
-        + (f" [{change.low:.0f}, {change.high:.0f}]" if np.isfinite(change.low) else "")
-        for change in changes
-    ]
-    return [*cells, ", ".join(phase.label or "none of them" for phase in found)]
-
-
 def _claims(results: Sequence[Result]) -> list[str]:
     lines = ["## What the claims are judged by", ""]
     for result in results:
@@ -232,7 +142,7 @@ def _claims(results: Sequence[Result]) -> list[str]:
             [measure.name, str(measure.trained), "" if measure.random is None else f"{measure.random:.4g}"]
             for measure in measures(result.path)
         ]
-        lines += [f"### {result.name}", "", *_table(["measure", "trained", "random policy"], rows)]
+        lines += [f"### {result.name}", "", *table(["measure", "trained", "random policy"], rows)]
     return lines
 
 
@@ -277,8 +187,3 @@ def _evaluated(run: Path, policy: str) -> Values | None:
 
 def _told(values: Values | None) -> str:
     return "" if values is None else str(estimate(values))
-
-
-def _table(head: Sequence[str], rows: Sequence[Sequence[str]]) -> list[str]:
-    lines = [head, ["---"] * len(head), *rows]
-    return ["| " + " | ".join(cells) + " |" for cells in lines] + [""]
