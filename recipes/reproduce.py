@@ -21,15 +21,19 @@ from cprl.recording.bank import keep_results
 from cprl.reporting import write_report
 
 AS_RUN = ("--variant", "as_run")
+DECAY_500K = ("--epsilon-decay-steps", "500000")
+TARGETS_10 = ("--target-every-episodes", "10")
 EXPERIMENTS = {
     "commons": ("commons", *AS_RUN),
     "single_basic": ("single_basic", *AS_RUN),
     "single_complex": ("single_complex", *AS_RUN),
     "two_against_random": ("two_against_random", *AS_RUN),
     "two_complex": ("two_complex", *AS_RUN),
-    "commons_decay_500k": ("commons", *AS_RUN, "--epsilon-decay-steps", "500000"),
+    "commons_decay_500k": ("commons", *AS_RUN, *DECAY_500K),
     "commons_published": ("commons", "--variant", "published"),
-    "commons_published_decay_500k": ("commons", "--variant", "published", "--epsilon-decay-steps", "500000"),
+    "commons_targets_10": ("commons", *AS_RUN, *TARGETS_10, "--episodes", "1600"),
+    "commons_targets_10_decay_500k": ("commons", *AS_RUN, *TARGETS_10, *DECAY_500K, "--episodes", "2000"),
+    "commons_published_decay_500k": ("commons", "--variant", "published", *DECAY_500K),
 }
 """Recipe and arguments by the name of the run, the most telling first."""
 

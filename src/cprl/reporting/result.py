@@ -44,6 +44,7 @@ class Result:
         if "variant" in arguments:
             told.append(f"{arguments['variant']} rules")
         if "learner" in arguments:
+            told.append(f"targets replaced every {arguments['learner']['target_every_episodes']} episodes")
             told.append(f"epsilon decays in {arguments['learner']['epsilon_decay_steps']:,} steps")
         return ", ".join([*told, f"{replicas} replicas of {episodes:,} episodes"])
 
