@@ -4,6 +4,7 @@ Made from results alone (`cprl.recording.bank`), so that anybody can make it aga
 """
 
 import shlex
+import textwrap
 from collections.abc import Sequence
 from datetime import timedelta
 from pathlib import Path
@@ -173,7 +174,7 @@ def _draw(result: Result, metric: str, path: Path) -> None:
             axes.axvline(place, color="#d94801", linestyle=":", linewidth=1)
         for change in result.phases[0] if result.phases else ():
             axes.axvline(change.episode, color="#08519c", linestyle="--", linewidth=1)
-    axes.set(title=result.title, xlabel="episode", ylabel=TITLES.get(metric, metric))
+    axes.set(title=textwrap.fill(result.title, 90), xlabel="episode", ylabel=TITLES.get(metric, metric))
     axes.title.set_fontsize(9)
     axes.legend(loc="best", fontsize=8)
     figure.savefig(path, dpi=90)
