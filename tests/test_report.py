@@ -234,9 +234,7 @@ def test_every_published_experiment_is_reproduced():
 
 def test_agents_at_play_are_measured_replica_by_replica():
     shape = 2, 4, 2  # two steps, two worlds for each of two replicas, two agents
-    columns = np.array(
-        [[0, 4], [0, 4], [3, 3], [3, 3]]
-    )  # replica 0: four steps apart; replica 1: in one place
+    columns = np.array([[0, 4], [0, 4], [3, 3], [3, 3]])  # four steps apart; in one place
     fired = np.zeros(shape, bool)
     fired[0, 0, 0] = True
     played = Trace(

@@ -1,8 +1,8 @@
 """The study's claims as measures of ours: of curves of episodes, and of trained agents at play."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from functools import partial
+from functools import cache, partial
 from pathlib import Path
 from typing import Final
 
@@ -10,12 +10,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cprl.acting.seats import Seats
+from cprl.commons.game import Game
 from cprl.evaluation.runs import SEED, kept_replicas
 from cprl.evaluation.seating import Sitter, fresh_worlds, random_seats, seated
 from cprl.measuring.movement import Trace, overlap, rounds, shooting_distance, trace
 from cprl.measuring.statistics import Estimate, estimate
 from cprl.recording.curves import curves_of, running_mean
-from cprl.recording.loaded import LoadedRun, load
+from cprl.recording.loaded import load
 
 Values = NDArray[np.float64]
 
@@ -46,19 +47,25 @@ def measures(run: Path) -> list[Measure]:
         for name, values in of_training(curves).items()
     ]
     loaded = load(run)
-    trained = _at_play(loaded, partial(seated, [Sitter(loaded)] * loaded.game.agents))
-    by_chance = _at_play(loaded, partial(random_seats, loaded.game))
+    game, replicas = loaded.game, tuple(kept_replicas(loaded))
+    trained = _at_play(game, replicas, partial(seated, [Sitter(loaded)] * game.agents))
+    by_chance = _by_chance(game, replicas)
     for name, values in trained.items():
         if np.isfinite(values).all():
             found.append(Measure(name=name, trained=estimate(values), random=float(by_chance[name].mean())))
     return found
 
 
-def _at_play(loaded: LoadedRun, who: Callable[..., Seats]) -> dict[str, Values]:
-    """`of_play` of a run's game in the same fresh worlds, whoever plays."""
+@cache
+def _by_chance(game: Game, replicas: tuple[int, ...]) -> dict[str, Values]:
+    """`of_play` of the random policy; the same for all runs of a game."""
+    return _at_play(game, replicas, partial(random_seats, game))
+
+
+def _at_play(game: Game, replicas: Sequence[int], who: Callable[..., Seats]) -> dict[str, Values]:
+    """`of_play` of a game in the same fresh worlds, whoever plays."""
     found: dict[str, list[Values]] = {}
-    replicas = kept_replicas(loaded)
-    for group, env in fresh_worlds(loaded.game, replicas, worlds=WORLDS, seed=SEED):
+    for group, env in fresh_worlds(game, replicas, worlds=WORLDS, seed=SEED):
         played = trace(env, who(group, worlds=WORLDS, seed=SEED))
         for name, values in of_play(played, len(group)).items():
             found.setdefault(name, []).append(values)
