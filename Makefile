@@ -7,7 +7,7 @@ INSTALLED := .venv/.installed
 
 VIEWER_PACKAGES := mesa-vulkan-drivers libvulkan1 chromium chromium-driver
 
-.PHONY: run test test-slow test-gpu test-viewer viewer-packages check bench bench-gpu clean
+.PHONY: run lint test test-slow test-gpu test-viewer viewer-packages check bench bench-gpu clean
 
 run: $(INSTALLED)
 	$(BIN)/python recipes/first_run.py --watch serve
@@ -25,11 +25,12 @@ test-viewer: $(INSTALLED) viewer-packages
 viewer-packages:
 	sh tests/install_viewers.sh $(VIEWER_PACKAGES)
 
-check: $(INSTALLED)
+lint: $(INSTALLED)
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
 	$(BIN)/mypy
-	$(BIN)/python -m pytest -n auto --dist worksteal
+
+check: lint test
 
 bench: $(INSTALLED)
 	$(BIN)/python benchmarks/env_steps.py

@@ -22,8 +22,8 @@ from numba.cuda import compile_ptx, dispatcher
 
 from cprl import Game, presets
 from cprl.commons.cuda import kernels
-from cprl.commons.game import told_shapes
-from cprl.commons.world import Scratch, Told, Worlds, empty_scratch, empty_worlds
+from cprl.commons.game import output_shapes
+from cprl.commons.world import Scratch, StepOutput, Worlds, empty_scratch, empty_worlds
 
 
 def arguments(game: Game, worlds: int = 4) -> dict[str, tuple[Any, ...]]:
@@ -33,7 +33,7 @@ def arguments(game: Game, worlds: int = 4) -> dict[str, tuple[Any, ...]]:
     window = tables.window_cells.shape[1]
     sheet = empty_scratch(agents=agents, sites=sites, cells=tables.background.size, window=window)
     scratch = Scratch(*(np.zeros((worlds, *each.shape), each.dtype, order="F") for each in sheet))
-    told = Told(**{name: np.zeros(*form) for name, form in told_shapes(game, worlds).items()})
+    told = StepOutput(**{name: np.zeros(*form) for name, form in output_shapes(game, worlds).items()})
     actions, marks = np.zeros((worlds, agents), np.int64), np.zeros(worlds, np.bool_)
     boards = np.zeros((worlds, game.map.height, game.map.width), np.uint8)
     on_gpu = Worlds(*map(np.asfortranarray, state))

@@ -69,7 +69,7 @@ def actions_for(game: Game, worlds: int, turns: int) -> np.ndarray:
 def kernel(game: Game, worlds: int, threads: int, turns: int, repeats: int) -> Rate:
     """The compiled rules alone, into the same arrays again and again."""
     batch = Batch(game, worlds, threads=threads)
-    told, actions = batch.new_told(), actions_for(game, worlds, turns)
+    told, actions = batch.new_output(), actions_for(game, worlds, turns)
     us = best_us(lambda turn: batch.play(actions[turn], told), lambda: batch.begin(told), turns, repeats)
     return Rate(worlds, batch.driver.threads, us)
 

@@ -40,7 +40,7 @@ def rates(size: int, turns: int, repeats: int) -> tuple[float, float]:
     actions = torch.randint(8, (turns, size, env.game.agents), device="cuda")
     arrays = [env.worlds.driver.wrap(turn) for turn in actions]  # type: ignore[attr-defined]
     moment = {"now": env.reset()}
-    told = env.told
+    told = env.output
 
     def step(turn: int) -> None:
         entry = moment["now"]

@@ -20,19 +20,19 @@ from rich.console import Console
 from rich.table import Table
 from torchrl.data.replay_buffers import ReplayBuffer
 
-from cprl.acting import QNetwork
-from cprl.learning.dqn import dqn_loss
-from cprl.learning.fused import FunctionalUpdate
-from cprl.learning.replay import lane_buffer
-from cprl.learning.updates import ListUpdate, Update
+from cprl.learners.buffer.sampler import lane_buffer
+from cprl.learners.engine.base import Engine, ListEngine
+from cprl.learners.engine.compiled import FunctionalEngine
+from cprl.learners.single import dqn_loss
+from cprl.networks.mlp import MLPNetwork
 
 SHAPE, ACTIONS, BATCH, TRANSITIONS = (3, 7, 15), 8, 8, 4096
 
-WAYS: dict[str, Callable[..., Update]] = {
-    "list of TorchRL losses": ListUpdate,
-    "vmapped, compiled": partial(FunctionalUpdate, lane_axis=False),
-    "lane axis, not compiled": partial(FunctionalUpdate, lane_axis=True, compile=False),
-    "lane axis, compiled": partial(FunctionalUpdate, lane_axis=True),
+WAYS: dict[str, Callable[..., Engine]] = {
+    "list of TorchRL losses": ListEngine,
+    "vmapped, compiled": partial(FunctionalEngine, lane_axis=False),
+    "lane axis, not compiled": partial(FunctionalEngine, lane_axis=True, compile=False),
+    "lane axis, compiled": partial(FunctionalEngine, lane_axis=True),
 }
 MEASURED_BEFORE = {  # on such a machine, before this library was begun
     "list of TorchRL losses": (1388, 5292, 21_811, 89_852),
@@ -62,20 +62,20 @@ def filled(lanes: int) -> ReplayBuffer:
     return buffer
 
 
-def update_us(way: str, lanes: int, repeats: int) -> float:
+def update_us(engine: str, lanes: int, repeats: int) -> float:
     """Microseconds of one update of all lanes, the best of several repeats."""
     torch.set_num_threads(1)
     torch.set_flush_denormal(True)
     torch.manual_seed(0)
-    networks = [QNetwork(SHAPE, ACTIONS) for _ in range(lanes)]
-    update = WAYS[way](networks, partial(dqn_loss, gamma=0.995), learning_rate=1e-5)
+    networks = [MLPNetwork(SHAPE, ACTIONS) for _ in range(lanes)]
+    update = WAYS[engine](networks, partial(dqn_loss, gamma=0.995), learning_rate=1e-5)
     buffer, best = filled(lanes), float("inf")
     for _ in range(20):
-        update.learn(buffer)
+        update.update(buffer)
     for _ in range(repeats):
         turns, started = 0, time.perf_counter()
         while time.perf_counter() - started < 0.3:
-            update.learn(buffer)
+            update.update(buffer)
             turns += 1
         best = min(best, (time.perf_counter() - started) / turns)
     return best * 1e6

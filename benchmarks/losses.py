@@ -20,28 +20,17 @@ from rich.table import Table
 from tensordict import TensorDict
 
 from cprl import presets
-from cprl.learning import (
-    A2C,
-    CQL,
-    DQN,
-    IPPO,
-    IQL,
-    MAPPO,
-    PPO,
-    QMIX,
-    SAC,
-    VDN,
-    DistributionalDQN,
-    DQNSettings,
-    Reinforce,
-    RolloutSettings,
-)
-from cprl.learning.agents import WEIGHTS, Lanes
-from cprl.learning.known import Algorithm
-from cprl.learning.rollouts import trial_rollout
-from cprl.learning.team_lanes import Teams
-from cprl.learning.teams import TeamAlgorithm
-from cprl.learning.ways import TRIAL_LANES, fitting_way, make_update, trial_batch
+from cprl.algorithms.actor_critic import IQL, SAC
+from cprl.algorithms.dqn import CQL, DQN, DistributionalDQN
+from cprl.algorithms.on_policy import A2C, PPO, Reinforce
+from cprl.algorithms.on_policy_teams import IPPO, MAPPO
+from cprl.algorithms.registry import Algorithm
+from cprl.algorithms.teams import QMIX, VDN, TeamAlgorithm
+from cprl.learners.engine.choice import TRIAL_LANES, fitting_engine, make_engine, trial_batch
+from cprl.learners.lanes import WEIGHTS, Lanes
+from cprl.learners.rollouts import trial_rollout
+from cprl.learners.settings import DQNSettings, RolloutSettings
+from cprl.learners.teams import Teams
 
 REPLAY, ROLLOUTS = DQNSettings(), RolloutSettings()
 ALGORITHMS = {
@@ -68,12 +57,12 @@ def lanes_of(algorithm: Algorithm, learners: int) -> Lanes | Teams:
     game = presets.game("commons")
     agents = Lanes(
         game,
-        seats=range(game.agents),
+        agents=range(game.agents),
         replicas=learners // game.agents,
         seed=0,
         first_replica=0,
         make_network=lambda: algorithm.network(game),
-        samples=algorithm.samples,
+        stochastic=algorithm.stochastic,
     )
     if not isinstance(algorithm, TeamAlgorithm):
         return agents
@@ -95,9 +84,9 @@ def update_us(name: str, learners: int, repeats: int) -> tuple[str, bool, float]
 
     networks = lanes_of(algorithm, max(learners, TRIAL_LANES * 4)).new_networks(WEIGHTS, "cpu")
     trial = batch_of(TRIAL_LANES)
-    way = fitting_way(networks[:TRIAL_LANES], algorithm.loss, trial)
-    update = make_update(
-        way,
+    engine = fitting_engine(networks[:TRIAL_LANES], algorithm.loss, trial)
+    update = make_engine(
+        engine,
         networks[: len(lanes)],
         algorithm.loss,
         compile=True,
@@ -109,15 +98,15 @@ def update_us(name: str, learners: int, repeats: int) -> tuple[str, bool, float]
     with warnings.catch_warnings(record=True) as told:
         warnings.simplefilter("always")
         for _ in range(10):
-            update.learn_from(batch.clone())
+            update.update_from(batch.clone())
     for _ in range(repeats):
         turns, started = 0, time.perf_counter()
         while time.perf_counter() - started < 0.3:
-            update.learn_from(batch.clone())
+            update.update_from(batch.clone())
             turns += 1
         best = min(best, (time.perf_counter() - started) / turns)
     failed = any("torch.compile failed" in str(one.message) for one in told)
-    return way, way != "list" and not failed, best * 1e6
+    return engine, engine != "list" and not failed, best * 1e6
 
 
 def main(*, learners: tuple[int, ...] = (4, 32), repeats: int = 5, only: tuple[str, ...] = ()) -> None:
@@ -136,9 +125,9 @@ def main(*, learners: tuple[int, ...] = (4, 32), repeats: int = 5, only: tuple[s
     with ProcessPoolExecutor(1, mp_context=get_context("spawn"), max_tasks_per_child=1) as process:
         for name in only or ALGORITHMS:
             measured = [process.submit(update_us, name, count, repeats).result() for count in learners]
-            way, compiled, _ = measured[0]
+            engine, compiled, _ = measured[0]
             cells = (f"{us:,.0f}" for _, _, us in measured)
-            table.add_row(name, way, "yes" if compiled else "no", *cells)
+            table.add_row(name, engine, "yes" if compiled else "no", *cells)
     Console().print(table)
 
 

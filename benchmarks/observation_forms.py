@@ -51,20 +51,20 @@ def main(*, worlds: int = 1024, turns: int = 100, rounds: int = 5) -> None:
     best: dict[tuple[str, str], Rate] = {}
     for _ in range(rounds):
         for form, game in games().items():
-            for way, measure in ways.items():
+            for engine, measure in ways.items():
                 rate = measure(game, worlds, 1, turns, 1)
-                if (form, way) not in best or rate.step_us < best[form, way].step_us:
-                    best[form, way] = rate
+                if (form, engine) not in best or rate.step_us < best[form, engine].step_us:
+                    best[form, engine] = rate
     table = Table(title=f"{worlds:,} worlds, one thread: steps per second")
     for column in ("observation", "shape"):
         table.add_column(column, no_wrap=True)
-    for way in ways:
-        table.add_column(way, justify="right", no_wrap=True)
+    for engine in ways:
+        table.add_column(engine, justify="right", no_wrap=True)
         table.add_column("x", justify="right", no_wrap=True)
     for form, game in games().items():
         row = [form, " x ".join(map(str, game.observation_shape))]
-        for way in ways:
-            rate, plain = best[form, way], best["window, rgb", way]
+        for engine in ways:
+            rate, plain = best[form, engine], best["window, rgb", engine]
             row += [f"{rate.steps_per_cpu_s:,.0f}", f"{plain.step_us / rate.step_us:.2f}"]
         table.add_row(*row)
     Console().print(table)

@@ -25,11 +25,11 @@ from rich.console import Console
 from rich.table import Table
 
 from cprl import CommonsEnv, presets
-from cprl.acting import Seats
-from cprl.learning import LaneLearner
+from cprl.learners.replay import ReplayLearner
 from cprl.measuring.episodes import EpisodeTracker
+from cprl.policies.assignment import AgentPolicies
 from cprl.process import prepare_process
-from cprl.train import Training
+from cprl.training import Training
 
 CASES: Final[tuple[tuple[presets.Board, int, int], ...]] = (
     ("single_complex", 1, 1),
@@ -38,10 +38,10 @@ CASES: Final[tuple[tuple[presets.Board, int, int], ...]] = (
 )
 """Board, agents, replicas."""
 PARTS: Final[dict[str, tuple[type, str]]] = {
-    "policy": (Seats, "forward"),
+    "policy": (AgentPolicies, "forward"),
     "environment": (CommonsEnv, "_step_and_maybe_reset"),
-    "replay write": (LaneLearner, "remember"),
-    "update": (LaneLearner, "learn"),
+    "replay write": (ReplayLearner, "store"),
+    "update": (ReplayLearner, "update"),
     "tracking": (EpisodeTracker, "add"),
 }
 STEPS: Final = 200
@@ -74,9 +74,9 @@ def measure(board: presets.Board, agents: int, replicas: int, repeats: int) -> d
     prepare_process(0)
     game = presets.game(board)
     settings = replace(presets.learner(board), buffer_size=20_000)
-    seats = tuple(range(agents))
-    learner = LaneLearner(game, seats=seats, replicas=replicas, settings=settings)
-    training = Training(CommonsEnv(game, replicas), {seats: learner}, episodes=10**9)
+    agents = tuple(range(agents))
+    learner = ReplayLearner(game, agents=agents, replicas=replicas, settings=settings)
+    training = Training(CommonsEnv(game, replicas), {agents: learner}, episodes=10**9)
     while training.steps < 500:
         training.step()
     best: dict[str, float] = {}
@@ -86,7 +86,7 @@ def measure(board: presets.Board, agents: int, replicas: int, repeats: int) -> d
 
     ratios = []
     for _ in range(repeats):
-        whole, alone = seconds(training.step), seconds(learner.learn)
+        whole, alone = seconds(training.step), seconds(learner.update)
         keep("whole step", whole)
         keep("update alone", alone)
         ratios.append(whole / alone)

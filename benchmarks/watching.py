@@ -29,12 +29,12 @@ from rich.table import Table
 from tensordict import TensorDict, TensorDictBase
 
 from cprl import CommonsEnv, presets
-from cprl.acting.lanes import random_seats
-from cprl.learning import LaneLearner
+from cprl.learners.replay import ReplayLearner
 from cprl.measuring import Episode
+from cprl.policies.lanes import random_agents
 from cprl.process import prepare_process
-from cprl.recording import Watch
-from cprl.train import Training
+from cprl.training import Training
+from cprl.viewer.callback import ViewerCallback
 
 SEATS: Final = (0, 1, 2, 3)
 REPLICAS: Final = 8
@@ -53,19 +53,19 @@ def cost(run: Path, repeats: int) -> tuple[float, float, int]:
     prepare_process(0)
     game = presets.game("commons")
     settings = replace(presets.learner("commons"), buffer_size=20_000)
-    learner = LaneLearner(game, seats=SEATS, replicas=REPLICAS, settings=settings)
+    learner = ReplayLearner(game, agents=SEATS, replicas=REPLICAS, settings=settings)
     env = CommonsEnv(game, REPLICAS)
     training = Training(env, {SEATS: learner}, episodes=10**9)
     steps = game.rules.episode_steps
 
-    def seconds(watch: Watch | None) -> float:
-        training.observers = [watch] if watch else []
+    def seconds(watch: ViewerCallback | None) -> float:
+        training.callbacks = [watch] if watch else []
         started = time.perf_counter()
         for _ in range(BLOCK):
             training.step()
         return time.perf_counter() - started
 
-    def ratio(watch: Watch) -> float:
+    def ratio(watch: ViewerCallback) -> float:
         """The last block of an episode is always one that is watched."""
         ratios = []
         for _ in range(repeats):
@@ -78,7 +78,7 @@ def cost(run: Path, repeats: int) -> tuple[float, float, int]:
 
     for _ in range(steps // BLOCK):
         seconds(None)
-    with Watch(run, env, title="cost", episodes=EPISODES) as watch:
+    with ViewerCallback(run, env, title="cost", episodes=EPISODES) as watch:
         every, watch.every = watch.every, 1
         shown = ratio(watch)
         watch.every = 10**9
@@ -88,15 +88,15 @@ def cost(run: Path, repeats: int) -> tuple[float, float, int]:
 class Witness:
     """Keeps the episodes that were played, and lets a watch see the turns."""
 
-    def __init__(self, watch: Watch) -> None:
+    def __init__(self, watch: ViewerCallback) -> None:
         self.watch = watch
         self.played: list[Episode] = []
 
-    def see_turn(self, batch: TensorDictBase) -> None:
+    def on_step(self, batch: TensorDictBase) -> None:
         """Lets the watch see it."""
-        self.watch.see_turn(batch)
+        self.watch.on_step(batch)
 
-    def see_episode(self, episode: Episode, learning: Mapping[str, float]) -> None:
+    def on_episode(self, episode: Episode, learning: Mapping[str, float]) -> None:
         """Keeps it."""
         self.played.append(episode)
 
@@ -107,17 +107,17 @@ def size(run: Path, episodes: int) -> tuple[int, int]:
     game = presets.game("commons")
     env = CommonsEnv(game, REPLICAS)
     chance = np.random.default_rng(0)
-    at_random = random_seats(game, SEATS, replicas=REPLICAS, seed=0)
-    with Watch(run, env, title="size", episodes=episodes) as watch:
+    at_random = random_agents(game, SEATS, replicas=REPLICAS, seed=0)
+    with ViewerCallback(run, env, title="size", episodes=episodes) as watch:
         witness = Witness(watch)
-        training = Training(env, {}, others=at_random, episodes=10**9, observers=[witness])
+        training = Training(env, {}, others=at_random, episodes=10**9, callbacks=[witness])
         unseen = TensorDict({}, [REPLICAS])
         for number in range(episodes):
             if watch.is_shown:
                 for _ in range(game.rules.episode_steps):
                     training.step()
             else:
-                witness.see_turn(unseen)
+                witness.on_step(unseen)
             better = 0.1 + 1.1 * number / episodes
             for replica, nth in enumerate(chance.integers(len(witness.played), size=REPLICAS)):
                 episode = witness.played[nth]
@@ -127,7 +127,7 @@ def size(run: Path, episodes: int) -> tuple[int, int]:
                 }
                 told = replace(episode, world=replica, episode=number, metrics=metrics)
                 names = [f"agent_{agent}/{name}" for agent in SEATS for name in ("loss", "epsilon", "q")]
-                watch.see_episode(told, dict(zip(names, chance.random(len(names)).tolist(), strict=True)))
+                watch.on_episode(told, dict(zip(names, chance.random(len(names)).tolist(), strict=True)))
             if number % FLUSHED_EVERY == 0:
                 watch.logger.flush()
     return watch.logger.path.stat().st_size, watch.logger.frames

@@ -8,8 +8,9 @@ from statistics import fmean, stdev
 import tyro
 
 from cprl import CommonsEnv, presets
-from cprl.acting import RandomActor, Seats
 from cprl.measuring.evaluate import evaluate
+from cprl.policies.assignment import AgentPolicies
+from cprl.policies.single import RandomActor
 
 APPENDIX_A = {
     "single_basic": (1, 32.47),
@@ -32,7 +33,7 @@ def main(*, episodes: int = 400, seed: int = 0) -> None:
         for variant in ("as_run", "published"):
             game = presets.game(board, variant=variant)
             actors = [RandomActor(len(game.actions), seed=seed + agent) for agent in range(game.agents)]
-            played = evaluate(CommonsEnv(game, episodes, seed=seed), Seats(actors))
+            played = evaluate(CommonsEnv(game, episodes, seed=seed), AgentPolicies(actors))
             returns = [float(episode.return_.sum()) for episode in played]
             peace = [episode.metrics["peacefulness"] for episode in played]
             ours, calm = (f"{fmean(x):.2f} ± {stdev(x) / episodes**0.5:.2f}" for x in (returns, peace))

@@ -8,9 +8,9 @@ from statistics import fmean
 import tyro
 
 from cprl import CommonsEnv, presets
-from cprl.acting import ScriptedActor, Seats
-from cprl.acting.scripted import MANNERS
 from cprl.measuring.evaluate import evaluate, mean_return
+from cprl.policies.assignment import AgentPolicies
+from cprl.policies.scripted import SCRIPTED_POLICIES, ScriptedActor
 
 
 def main(*, board: presets.Board = "commons", episodes: int = 20, seed: int = 0) -> None:
@@ -18,10 +18,10 @@ def main(*, board: presets.Board = "commons", episodes: int = 20, seed: int = 0)
     game = presets.game(board)
     everyone = tuple(range(game.agents))
     print("| manner | return of all | steps | apples left | shots | tagged |\n|---|---:|---:|---:|---:|---:|")
-    for manner in MANNERS:
+    for manner in SCRIPTED_POLICIES:
         seeds = [(seed, agent) for agent in everyone]
-        actor = ScriptedActor(manner, game, seeds=seeds, seats=len(everyone), worlds=episodes)
-        played = evaluate(CommonsEnv(game, episodes, seed=seed), Seats({everyone: actor}))
+        actor = ScriptedActor(manner, game, seeds=seeds, agents=len(everyone), worlds=episodes)
+        played = evaluate(CommonsEnv(game, episodes, seed=seed), AgentPolicies({everyone: actor}))
         return_, error = mean_return(played)
         numbers = [
             [float(episode.steps), float(episode.stock_left), episode.shots.sum(), episode.tagged.sum()]

@@ -15,22 +15,19 @@ import torch
 import tyro
 
 from cprl import CommonsEnv, presets
-from cprl.acting import RandomActor, Seats
-from cprl.learning import DQNLearner
+from cprl.learners.single import DQNLearner
 from cprl.measuring.evaluate import evaluate
-from cprl.recording import (
-    BestWeights,
-    EpisodeTable,
-    ProgressBar,
-    Watch,
-    check_watch,
-    restore_weights,
-    save_weights,
-    start_run,
-    summarise,
-    training_curve,
-)
-from cprl.train import train
+from cprl.policies.assignment import AgentPolicies
+from cprl.policies.single import RandomActor
+from cprl.runs.directory import start_run
+from cprl.runs.episodes import EpisodeTable
+from cprl.runs.weights import BestWeights, restore_weights, save_weights
+from cprl.terminal.figures import training_curve
+from cprl.terminal.progress import ProgressBar
+from cprl.terminal.summary import summarise
+from cprl.training import train
+from cprl.viewer.callback import ViewerCallback
+from cprl.viewer.streams import check_watch
 
 PUBLISHED_LINE = ".venv/bin/python recipes/single_basic.py"
 SHORT = {"epsilon_decay_steps": 30_000, "batch_size": 64, "learning_rate": 3e-4, "target_every_episodes": 1}
@@ -75,9 +72,9 @@ def main(
         highest=game.observation.highest,
         seed=seed,
     )
-    policy, networks = Seats([learner.actor]), {"agent_0": learner.network}
+    policy, networks = AgentPolicies([learner.actor]), {"agent_0": learner.network}
     with (
-        Watch(
+        ViewerCallback(
             run,
             env,
             title=title,
@@ -89,11 +86,11 @@ def main(
         ProgressBar(game, episodes=episodes) as bar,
     ):
         best = BestWeights(run, networks, policy=policy, env=trial, logger=viewer.logger)
-        train(env, {0: learner}, episodes=episodes, observers=[table, viewer, best, bar])
+        train(env, {0: learner}, episodes=episodes, callbacks=[table, viewer, best, bar])
     save_weights(run, networks)
 
     fresh = CommonsEnv(game, evaluation_episodes, seed=seed + 2)
-    played = {"random": evaluate(fresh, Seats([RandomActor(len(game.actions), seed=seed)]))}
+    played = {"random": evaluate(fresh, AgentPolicies([RandomActor(len(game.actions), seed=seed)]))}
     played["greedy, last"] = evaluate(fresh, policy)
     if best.path:
         restore_weights(best.path, networks)

@@ -11,22 +11,27 @@ from pathlib import Path
 
 import tyro
 
-from cprl import presets, recording, study
-from cprl.acting.scripted import Manner
-from cprl.learning import DQN, PPO, RolloutSettings
+from cprl import presets
+from cprl.algorithms.dqn import DQN
+from cprl.algorithms.on_policy import PPO
+from cprl.experiment import conduct
+from cprl.learners.settings import RolloutSettings
+from cprl.policies.scripted import ScriptedPolicy
 from cprl.population import Learner, Population, Scripted
 from cprl.process import prepare_process
+from cprl.runs.directory import start_run
+from cprl.viewer.streams import check_watch
 
 
 def main(
     *,
-    neighbour: Manner = "sustainable",
+    neighbour: ScriptedPolicy = "sustainable",
     replicas: int = 4,
     episodes: int = 500,
     evaluation_episodes: int = 20,
     seed: int = 0,
     out: Path | None = None,
-    go_on: bool = False,
+    resume: bool = False,
     watch: str = "file",
     compile: bool = True,
 ) -> Path:
@@ -39,11 +44,11 @@ def main(
         evaluation_episodes: fresh episodes for each replica, and for the random policy.
         seed: of chance, weights, exploration and replay.
         out: the run's directory; by default a new one under runs/.
-        go_on: with the run in `out`, which was stopped; bit for bit as if it had not been.
+        resume: with the run in `out`, which was stopped; bit for bit as if it had not been.
         watch: "file", or live as well: "serve", "spawn", "connect ADDRESS"; "off" for no recording.
         compile: whether torch compiles the update; needs a C++ compiler, and is several times faster.
     """
-    recording.check_watch(watch)
+    check_watch(watch)
     prepare_process(seed)
     game = presets.game("commons")
     settings = replace(presets.learner("commons"), learning_rate=1e-4, epsilon_decay_steps=100_000)
@@ -51,8 +56,8 @@ def main(
     members = [dqn, dqn, ppo, Scripted(neighbour)]
     population = Population(game, members, replicas=replicas, seed=seed, compile=compile)
     recipe = {"replicas": replicas, "episodes": episodes, "seed": seed, "game": game}
-    run = recording.start_run(out, "mixed", {**recipe, "population": population.told()}, go_on=go_on)
-    return study.conduct(
+    run = start_run(out, "mixed", {**recipe, "population": population.told()}, resume=resume)
+    return conduct(
         run,
         population,
         episodes=episodes,

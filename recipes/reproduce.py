@@ -17,8 +17,8 @@ from pathlib import Path
 import tyro
 
 from cprl.process import prepare_process
-from cprl.recording.bank import keep_results
 from cprl.reporting import write_report
+from cprl.runs.export import export_results
 
 AS_RUN = ("--variant", "as_run")
 DECAY_500K = ("--epsilon-decay-steps", "500000")
@@ -84,7 +84,7 @@ def run(name: str, common: Sequence[str], *, runs: Path, results: Path) -> None:
             done = subprocess.run(command, stdout=told, stderr=subprocess.STDOUT, check=False)
         if done.returncode or not (directory / "report.json").exists():
             raise RuntimeError(f"{name} ended with {done.returncode} before it was finished; see {log}")
-    print(f"{name}: {keep_results(directory, results / name)}", flush=True)
+    print(f"{name}: {export_results(directory, results / name)}", flush=True)
 
 
 if __name__ == "__main__":

@@ -9,10 +9,13 @@ from pathlib import Path
 
 import tyro
 
-from cprl import presets, recording, study
-from cprl.learning import DQN
+from cprl import presets
+from cprl.algorithms.dqn import DQN
+from cprl.experiment import conduct
 from cprl.population import Learner, Population
 from cprl.process import prepare_process
+from cprl.runs.directory import start_run
+from cprl.viewer.streams import check_watch
 
 
 def main(
@@ -21,10 +24,10 @@ def main(
     episodes: int = 6000,
     variant: presets.Variant = "published",
     evaluation_episodes: int = 20,
-    learn_every: int = 1,
+    update_every: int = 1,
     seed: int = 0,
     out: Path | None = None,
-    go_on: bool = False,
+    resume: bool = False,
     watch: str = "file",
     compile: bool = True,
 ) -> Path:
@@ -35,14 +38,14 @@ def main(
         episodes: how many each trains.
         variant: the rules and the learner as the study is written, or as it was run.
         evaluation_episodes: fresh episodes for each replica, with epsilon 0.05, and for the random policy.
-        learn_every: environment steps k after which agents learn, then k times.
+        update_every: environment steps k after which agents learn, then k times.
         seed: of chance, weights, exploration and replay.
         out: the run's directory; by default a new one under runs/.
-        go_on: with the run in `out`, which was stopped; bit for bit as if it had not been.
+        resume: with the run in `out`, which was stopped; bit for bit as if it had not been.
         watch: "file", or live as well: "serve", "spawn", "connect ADDRESS"; "off" for no recording.
         compile: whether torch compiles the update; needs a C++ compiler, and is several times faster.
     """
-    recording.check_watch(watch)
+    check_watch(watch)
     prepare_process(seed)
     game = presets.game("single_basic", variant=variant)
     settings = presets.learner("single_basic", variant=variant)
@@ -52,20 +55,20 @@ def main(
         "replicas": replicas,
         "episodes": episodes,
         "variant": variant,
-        "learn_every": learn_every,
+        "learn_every": update_every,
         "seed": seed,
         "game": game,
         "learner": settings,
         "population": population.told(),
     }
-    run = recording.start_run(out, "single_basic", recipe, go_on=go_on)
-    return study.conduct(
+    run = start_run(out, "single_basic", recipe, resume=resume)
+    return conduct(
         run,
         population,
         episodes=episodes,
         title=f"single_basic, {variant} rules, {replicas} replicas, {episodes} episodes",
         evaluation_episodes=evaluation_episodes,
-        learn_every=learn_every,
+        update_every=update_every,
         watch=watch,
     )
 

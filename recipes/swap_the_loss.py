@@ -12,10 +12,16 @@ from typing import Literal
 
 import tyro
 
-from cprl import presets, recording, study
-from cprl.learning import CQL, DQN, IQL, PPO, SAC, RolloutSettings
+from cprl import presets
+from cprl.algorithms.actor_critic import IQL, SAC
+from cprl.algorithms.dqn import CQL, DQN
+from cprl.algorithms.on_policy import PPO
+from cprl.experiment import conduct
+from cprl.learners.settings import RolloutSettings
 from cprl.population import Learner, Population
 from cprl.process import prepare_process
+from cprl.runs.directory import start_run
+from cprl.viewer.streams import check_watch
 
 REPLAY = replace(presets.learner("two_complex"), learning_rate=1e-4, epsilon_decay_steps=100_000)
 """The published settings, but for a schedule that fits 1000 episodes: ten times the step, a fifth of the
@@ -39,7 +45,7 @@ def main(
     evaluation_episodes: int = 20,
     seed: int = 0,
     out: Path | None = None,
-    go_on: bool = False,
+    resume: bool = False,
     watch: str = "file",
     compile: bool = True,
 ) -> Path:
@@ -52,17 +58,17 @@ def main(
         evaluation_episodes: fresh episodes for each replica, and for the random policy.
         seed: of chance, weights, exploration and replay.
         out: the run's directory; by default a new one under runs/.
-        go_on: with the run in `out`, which was stopped; bit for bit as if it had not been.
+        resume: with the run in `out`, which was stopped; bit for bit as if it had not been.
         watch: "file", or live as well: "serve", "spawn", "connect ADDRESS"; "off" for no recording.
         compile: whether torch compiles the update; needs a C++ compiler, and is several times faster.
     """
-    recording.check_watch(watch)
+    check_watch(watch)
     prepare_process(seed)
     game, name = presets.game("two_complex"), f"swap_the_loss_{loss}"
     population = Population(game, [Learner(LOSSES[loss])] * 2, replicas=replicas, seed=seed, compile=compile)
     recipe = {"replicas": replicas, "episodes": episodes, "seed": seed, "game": game}
-    run = recording.start_run(out, name, {**recipe, "population": population.told()}, go_on=go_on)
-    return study.conduct(
+    run = start_run(out, name, {**recipe, "population": population.told()}, resume=resume)
+    return conduct(
         run,
         population,
         episodes=episodes,

@@ -10,10 +10,13 @@ from pathlib import Path
 
 import tyro
 
-from cprl import presets, recording, study
-from cprl.learning import DQN
+from cprl import presets
+from cprl.algorithms.dqn import DQN
+from cprl.experiment import conduct
 from cprl.population import Learner, Population
 from cprl.process import prepare_process
+from cprl.runs.directory import start_run
+from cprl.viewer.streams import check_watch
 
 
 def main(
@@ -23,10 +26,10 @@ def main(
     variant: presets.Variant = "published",
     beam: bool = True,
     evaluation_episodes: int = 20,
-    learn_every: int = 1,
+    update_every: int = 1,
     seed: int = 0,
     out: Path | None = None,
-    go_on: bool = False,
+    resume: bool = False,
     watch: str = "file",
     compile: bool = True,
 ) -> Path:
@@ -38,14 +41,14 @@ def main(
         variant: the rules and the learner as the study is written, or as it was run.
         beam: whether agents have the beam; without it nobody is tagged.
         evaluation_episodes: fresh episodes for each replica, with epsilon 0.05, and for the random policy.
-        learn_every: environment steps k after which agents learn, then k times.
+        update_every: environment steps k after which agents learn, then k times.
         seed: of chance, weights, exploration and replay.
         out: the run's directory; by default a new one under runs/.
-        go_on: with the run in `out`, which was stopped; bit for bit as if it had not been.
+        resume: with the run in `out`, which was stopped; bit for bit as if it had not been.
         watch: "file", or live as well: "serve", "spawn", "connect ADDRESS"; "off" for no recording.
         compile: whether torch compiles the update; needs a C++ compiler, and is several times faster.
     """
-    recording.check_watch(watch)
+    check_watch(watch)
     prepare_process(seed)
     game = presets.game("two_complex", variant=variant)
     game = replace(game, rules=replace(game.rules, may_fire=beam))
@@ -56,21 +59,21 @@ def main(
         "replicas": replicas,
         "episodes": episodes,
         "variant": variant,
-        "learn_every": learn_every,
+        "learn_every": update_every,
         "seed": seed,
         "game": game,
         "learner": settings,
         "population": population.told(),
     }
     name = "two_complex" if beam else "two_complex_no_beam"
-    run = recording.start_run(out, name, recipe, go_on=go_on)
-    return study.conduct(
+    run = start_run(out, name, recipe, resume=resume)
+    return conduct(
         run,
         population,
         episodes=episodes,
         title=f"{name}, {variant} rules, {replicas} replicas, {episodes} episodes",
         evaluation_episodes=evaluation_episodes,
-        learn_every=learn_every,
+        update_every=update_every,
         watch=watch,
     )
 

@@ -9,7 +9,7 @@ from cprl import Game, Map, Observation, Rules, maps
 from cprl.commons.batch import Batch
 from cprl.commons.colours import CLASS_NAMES, agent_colour
 from cprl.commons.maps import SIGN_OF_HEADING
-from cprl.commons.world import Told
+from cprl.commons.world import StepOutput
 
 RGB_SIGN = {
     (10, 10, 10): ".",
@@ -45,14 +45,14 @@ class Play:
         rules = {"regrow_prob": (0.0,), **rules}
         self.game = Game(map=board, rules=Rules(**rules), observation=observation or Observation())
         self.batch = Batch(self.game, 1, seed=seed)
-        self.told: Told = self.batch.begin(self.batch.new_told())
+        self.output: StepOutput = self.batch.begin(self.batch.new_output())
 
     def turn(self, *names: str) -> "Play":
         """One turn; one action for each agent, the same for all if only one is given."""
         names = names * self.game.agents if len(names) == 1 else names
         known = list(self.game.actions)
         actions = np.array([[known.index(name) for name in names]], np.int64)
-        self.batch.play(actions, self.told)
+        self.batch.play(actions, self.output)
         return self
 
     @property
@@ -80,19 +80,19 @@ class Play:
 
     @property
     def harvest(self) -> list[float]:
-        return self.told.harvest[0].tolist()
+        return self.output.harvest[0].tolist()
 
     def window(self, agent: int) -> str:
         """What an agent sees, by the signs of `RGB_SIGN`, other agents by number if they are told apart."""
         if self.game.observation.encoding == "one_hot":
             return self._one_hot_window(agent)
-        pixels = self.told.observation[0, agent].transpose(1, 2, 0)
+        pixels = self.output.observation[0, agent].transpose(1, 2, 0)
         numbers = {agent_colour(i): str(i) for i in range(self.game.agents)}
         signs = {**RGB_SIGN, **(numbers if self.game.observation.agents_apart else {})}
         return "\n".join("".join(signs[tuple(map(int, cell))] for cell in row) for row in pixels)
 
     def _one_hot_window(self, agent: int) -> str:
-        planes = self.told.observation[0, agent]
+        planes = self.output.observation[0, agent]
         assert (planes.sum(0) == 1).all(), "each cell is of one class"
         signs = [SIGN_OF_NAME.get(name, name[-1]) for name in self.game.channels]
         return "\n".join("".join(signs[kind] for kind in row) for row in planes.argmax(0))

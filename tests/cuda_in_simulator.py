@@ -42,7 +42,7 @@ def assert_same(cpu: Batch, gpu: Batch, told, told_by_gpu, when: object) -> None
 def play(game: Game, *, worlds: int = 2, turns: int = 50) -> None:
     """Both drivers play the same turns; half-way some worlds begin anew."""
     cpu, gpu = both(game, worlds)
-    told, told_by_gpu = cpu.begin(cpu.new_told()), gpu.begin(gpu.new_told())
+    told, told_by_gpu = cpu.begin(cpu.new_output()), gpu.begin(gpu.new_output())
     assert_same(cpu, gpu, told, told_by_gpu, "at the start")
     for number, turn in enumerate(random_actions(turns, worlds, game)):
         cpu.play(turn, told)
@@ -85,7 +85,7 @@ def state() -> None:
     """A state goes from the one driver to the other and back, and seeds start all over."""
     game = presets.game("two_complex")
     cpu, gpu = both(game, 3)
-    told, told_by_gpu = cpu.begin(cpu.new_told()), gpu.begin(gpu.new_told())
+    told, told_by_gpu = cpu.begin(cpu.new_output()), gpu.begin(gpu.new_output())
     for turn in random_actions(30, 3, game):
         cpu.play(turn, told)
     gpu.load(cpu.state(), told_by_gpu)
@@ -96,9 +96,9 @@ def state() -> None:
     assert all(np.array_equal(array, gpu.state()[name]) for name, array in cpu.state().items())
     shown, shown_by_gpu = cpu.show(told, world=1), gpu.show(told_by_gpu, world=1)
     assert all(map(np.array_equal, shown, shown_by_gpu))
-    for batch, tell in ((cpu, told), (gpu, told_by_gpu)):
+    for batch, log_event in ((cpu, told), (gpu, told_by_gpu)):
         batch.set_seed(11)
-        batch.begin(tell)
+        batch.begin(log_event)
     assert_same(cpu, gpu, told, told_by_gpu, "after set_seed")
 
 
@@ -106,7 +106,7 @@ def unknown() -> None:
     """Unknown actions are found, and change nothing."""
     game = presets.game("commons")
     _, gpu = both(game, 3)
-    told = gpu.begin(gpu.new_told())
+    told = gpu.begin(gpu.new_output())
     before = gpu.state()
     actions = np.zeros((3, 4), np.int64)
     actions[1, 2], actions[2, 0] = 8, -1

@@ -6,7 +6,9 @@ from tensordict import TensorDict
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 
 from cprl import CommonsEnv, keys, presets
-from cprl.acting import QActor, QNetwork, RandomActor, Seats
+from cprl.networks.mlp import MLPNetwork
+from cprl.policies.assignment import AgentPolicies
+from cprl.policies.single import QActor, RandomActor
 
 
 def seen(*worlds):
@@ -14,7 +16,7 @@ def seen(*worlds):
 
 
 def test_a_network_reads_windows_as_brightness_in_0_to_1():
-    network = QNetwork((3, 4, 5), 7, hidden_cells=(6,))
+    network = MLPNetwork((3, 4, 5), 7, hidden_cells=(6,))
     window = torch.full((2, 3, 4, 5), 51, dtype=torch.uint8)
     by_hand = network.layers(torch.full((2, 60), 0.2))
     assert torch.allclose(network(window), by_hand)
@@ -22,7 +24,7 @@ def test_a_network_reads_windows_as_brightness_in_0_to_1():
 
 
 def test_the_study_as_run_has_relu_on_the_values_and_glorot_weights():
-    network = QNetwork((3, 4, 5), 7, relu_on_outputs=True, glorot_uniform=True)
+    network = MLPNetwork((3, 4, 5), 7, relu_on_outputs=True, glorot_uniform=True)
     windows = torch.randint(256, (500, 3, 4, 5), dtype=torch.uint8)
     assert (network(windows) >= 0).all()
     assert (network(windows) == 0).any()
@@ -34,7 +36,7 @@ def test_the_study_as_run_has_relu_on_the_values_and_glorot_weights():
 
 
 def test_a_greedy_actor_takes_the_action_of_the_highest_value():
-    actor = QActor(QNetwork((3, 4, 5), 7), 7)
+    actor = QActor(MLPNetwork((3, 4, 5), 7), 7)
     actor.epsilon = 1.0
     with set_exploration_type(ExplorationType.DETERMINISTIC):
         told = actor(seen(50))
@@ -42,7 +44,7 @@ def test_a_greedy_actor_takes_the_action_of_the_highest_value():
 
 
 def test_an_exploring_actor_takes_random_actions_as_often_as_epsilon_says():
-    actor = QActor(QNetwork((3, 4, 5), 7), 7)
+    actor = QActor(MLPNetwork((3, 4, 5), 7), 7)
     actor.epsilon = 0.4
     assert actor.epsilon == pytest.approx(0.4)
     with set_exploration_type(ExplorationType.RANDOM):
@@ -75,11 +77,11 @@ def test_each_seat_sees_the_window_of_its_own_agent():
     windows[:, 0, 0, 0, 0] = torch.tensor([1, 2, 3])
     windows[:, 1, 0, 0, 0] = torch.tensor([4, 5, 6])
     moment = TensorDict({"agents": TensorDict({"observation": windows}, (3, 2))}, (3,))
-    chosen = Seats([Brightest(), Brightest()])(moment)[keys.ACTION]
+    chosen = AgentPolicies([Brightest(), Brightest()])(moment)[keys.ACTION]
     assert chosen.tolist() == [[1, 4], [2, 5], [3, 6]]
 
 
 def test_seats_must_be_as_many_as_agents():
     env = CommonsEnv(presets.game("two_complex"), 3)
     with pytest.raises(ValueError, match="1 actors for 2 agents"):
-        Seats([RandomActor(8)])(env.reset())
+        AgentPolicies([RandomActor(8)])(env.reset())

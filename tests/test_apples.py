@@ -14,7 +14,7 @@ from cprl.commons.tables import distance, neighbours
 def test_an_agent_bites_the_apple_that_it_steps_on():
     play = Play(">A.\n...").turn("forward")
     assert play.harvest == [1]
-    assert play.told.stock[0, 0] == 0
+    assert play.output.stock[0, 0] == 0
 
 
 def test_an_empty_site_gives_nothing():
@@ -26,7 +26,7 @@ def test_who_may_not_bite_here_leaves_the_apple_to_others():
     may_bite = ((False, True), (True, True))
     play = Play(">A.<\n..A.", may_bite=may_bite).turn("forward", "stay")
     assert play.harvest == [0, 0]
-    assert play.told.stock[0, 0] == 2
+    assert play.output.stock[0, 0] == 2
 
 
 def test_as_run_the_lower_number_on_a_cell_gets_the_apple():
@@ -47,43 +47,43 @@ def test_regrowth_counts_the_stock_as_it_stood_at_the_start_of_the_turn():
     # The neighbour is bitten in the very turn in which it still counts.
     play = Play("^..\nA..\nA..", regrow_prob=(0.0, 1.0))
     play.turn("backward")
-    assert play.told.regrown[0, 0] == 0, "the site bitten was not empty as the turn began"
+    assert play.output.regrown[0, 0] == 0, "the site bitten was not empty as the turn began"
     play.turn("backward")
-    assert play.told.regrown[0, 0] == 1, "the first site grows from the apple bitten meanwhile"
-    assert play.told.stock[0, 0] == 1
+    assert play.output.regrown[0, 0] == 1, "the first site grows from the apple bitten meanwhile"
+    assert play.output.stock[0, 0] == 1
 
 
 def test_the_episode_ends_in_the_turn_that_takes_the_last_apple_and_as_run_one_later():
     for late in (False, True):
         play = Play(">A.\n...", ends_one_turn_late=late).turn("forward")
-        assert bool(play.told.terminated[0, 0]) is not late
-        assert bool(play.turn("stay").told.terminated[0, 0])
+        assert bool(play.output.terminated[0, 0]) is not late
+        assert bool(play.turn("stay").output.terminated[0, 0])
 
 
 def test_an_empty_board_on_which_apples_can_come_from_nothing_goes_on():
     play = Play(">A.\n...", regrow_prob=(0.001,), episode_steps=3).turn("forward")
-    assert not play.told.done[0, 0]
+    assert not play.output.done[0, 0]
     play.turn("stay").turn("stay")
-    assert play.told.truncated[0, 0]
-    assert not play.told.terminated[0, 0]
+    assert play.output.truncated[0, 0]
+    assert not play.output.terminated[0, 0]
 
 
 def test_a_clock_that_runs_out_with_the_last_apple_counts_as_depletion():
     play = Play(">A.\n...", episode_steps=1).turn("forward")
-    assert play.told.terminated[0, 0]
-    assert not play.told.truncated[0, 0]
+    assert play.output.terminated[0, 0]
+    assert not play.output.truncated[0, 0]
 
 
 def test_a_world_that_has_ended_stays_as_it_is_and_pays_nothing():
     play = Play(">AA\n..<", episode_steps=1, regrow_prob=(1.0,)).turn("forward", "beam")
     before = {name: array.copy() for name, array in play.batch.now._asdict().items()}
-    windows = play.told.observation.copy()
+    windows = play.output.observation.copy()
     play.turn("forward", "beam")
     assert play.harvest == [0, 0]
-    assert not play.told.fired.any()
-    assert play.told.done[0, 0]
-    assert play.told.truncated[0, 0]
-    assert np.array_equal(play.told.observation, windows)
+    assert not play.output.fired.any()
+    assert play.output.done[0, 0]
+    assert play.output.truncated[0, 0]
+    assert np.array_equal(play.output.observation, windows)
     for name, array in play.batch.now._asdict().items():
         assert np.array_equal(array, before[name]), name
 
@@ -107,7 +107,7 @@ def test_apples_grow_as_often_as_the_rules_say():
     board = maps.parse(">A......\n.AAA...A\n........")
     game = Game(map=board, rules=Rules(regrow_prob=prob, may_fire=False))
     batch = Batch(game, 40_000, seed=7)
-    told = batch.begin(batch.new_told())
+    told = batch.begin(batch.new_output())
     forward, stay = np.zeros((40_000, 1), np.int64), np.full((40_000, 1), 6)
     batch.play(forward, told)
     assert (told.harvest == 1).all()

@@ -50,16 +50,16 @@ def test_hits_are_judged_on_the_cells_after_the_moves():
 def test_with_two_hits_to_tag_a_turn_counts_one_hit_however_many_beams_cross():
     play = Play("A......\n>..^..<", hits_to_tag=2)
     play.turn("beam", "stay", "beam")
-    assert play.told.hit_by[0].tolist()[1] == [True, False, True]
-    assert not play.told.tagged_by.any()
+    assert play.output.hit_by[0].tolist()[1] == [True, False, True]
+    assert not play.output.tagged_by.any()
     play.turn("beam", "stay", "stay")
-    assert play.told.tagged_by[0].tolist()[1] == [True, False, False]
+    assert play.output.tagged_by[0].tolist()[1] == [True, False, False]
     assert play.in_play == [True, False, True]
 
 
 def test_who_may_not_fire_does_nothing_by_the_beam_action():
     play = Play("A...\n.>.^", may_fire=(False, True)).turn("beam", "stay")
-    assert not play.told.fired.any()
+    assert not play.output.fired.any()
     assert play.in_play == [True, True]
 
 

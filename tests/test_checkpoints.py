@@ -14,8 +14,9 @@ import torch
 import train_and_die
 from rich.console import Console
 
-from cprl.recording import Checkpoints, EpisodeTable, load_weights, read_episodes
-from cprl.recording.checkpoints import checkpoints_in, read_checkpoint
+from cprl.runs.checkpoints import Checkpointer, checkpoints_in, read_checkpoint
+from cprl.runs.episodes import EpisodeTable, read_episodes
+from cprl.runs.weights import load_weights
 
 SCRIPT = Path(train_and_die.__file__)
 EPISODES = 25
@@ -27,12 +28,12 @@ class Dying:
     def __init__(self, turns):
         self.left = turns
 
-    def see_turn(self, batch):
+    def on_step(self, batch):
         self.left -= 1
         if self.left == 0:
             raise ZeroDivisionError
 
-    def see_episode(self, episode, learning):
+    def on_episode(self, episode, learning):
         """Nothing."""
 
 
@@ -53,21 +54,21 @@ def in_one_go(tmp_path_factory):
     return run
 
 
-@pytest.mark.parametrize("way", ["lane axis", "vmap", "list"])
-def test_a_training_that_was_ended_goes_on_bit_for_bit(way, tmp_path):
+@pytest.mark.parametrize("engine", ["lane axis", "vmap", "list"])
+def test_a_training_that_was_ended_goes_on_bit_for_bit(engine, tmp_path):
     whole, parts = tmp_path / "whole", tmp_path / "parts"
-    train_and_die.main(whole, every_s=1000, episodes=12, way=way)
+    train_and_die.main(whole, every_s=1000, episodes=12, engine=engine)
     for turns in (7, 60, 130):  # before learning starts, amid an episode, and later
         with pytest.raises(ZeroDivisionError):
-            train_and_die.main(parts, every_s=1e-9, episodes=12, way=way, observers=[Dying(turns)])
+            train_and_die.main(parts, every_s=1e-9, episodes=12, engine=engine, callbacks=[Dying(turns)])
         assert (parts / "episodes.arrows").exists()
-    train_and_die.main(parts, every_s=1000, episodes=12, way=way)
+    train_and_die.main(parts, every_s=1000, episodes=12, engine=engine)
     assert_same_run(parts, whole)
 
 
 def test_a_training_that_was_ended_before_its_first_checkpoint_begins_anew(tmp_path, in_one_go):
     with pytest.raises(ZeroDivisionError):
-        train_and_die.main(tmp_path / "run", every_s=1000, episodes=EPISODES, observers=[Dying(80)])
+        train_and_die.main(tmp_path / "run", every_s=1000, episodes=EPISODES, callbacks=[Dying(80)])
     assert read_episodes(tmp_path / "run").num_rows > 0
     train_and_die.main(tmp_path / "run", every_s=1000, episodes=EPISODES)
     assert_same_run(tmp_path / "run", in_one_go)
@@ -140,7 +141,7 @@ class State:
 
 
 def quiet(run, **how):
-    return Checkpoints(run, console=Console(file=io.StringIO()), **how)
+    return Checkpointer(run, console=Console(file=io.StringIO()), **how)
 
 
 def test_the_newest_two_are_kept_and_the_newest_is_gone_on_from(tmp_path):
@@ -215,20 +216,20 @@ def test_a_full_disk_leaves_the_checkpoints_before(tmp_path, monkeypatch):
 
 def test_a_table_goes_on_behind_the_rows_of_a_checkpoint(tmp_path):
     with pytest.raises(ZeroDivisionError):
-        train_and_die.main(tmp_path / "run", every_s=1000, observers=[Dying(200)])
+        train_and_die.main(tmp_path / "run", every_s=1000, callbacks=[Dying(200)])
     rows = read_episodes(tmp_path / "run")
     path = tmp_path / "run" / "episodes.parquet"
 
-    def go_on(behind):
+    def resume(behind):
         with EpisodeTable(path, resumable=True) as table:
             table.load_state_dict({"rows": behind})
             raise KeyboardInterrupt
 
     with pytest.raises(ValueError, match=f"holds {rows.num_rows} rows up to there; the checkpoint says 1000"):
-        go_on(1000)
+        resume(1000)
     with pytest.raises(ValueError, match="holds 4 rows up to there; the checkpoint says 3"):
-        go_on(3)
+        resume(3)
     assert read_episodes(tmp_path / "run").equals(rows), "what cannot be gone on with is left as it is"
     with pytest.raises(KeyboardInterrupt):
-        go_on(6)
+        resume(6)
     assert read_episodes(tmp_path / "run").equals(rows.slice(0, 6))

@@ -2,7 +2,7 @@
 
 import torch
 
-from cprl.acting.compiling import Compiled
+from cprl.compiling import Compiled
 
 
 def scaled_in_place(owner, values, factor):

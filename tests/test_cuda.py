@@ -11,10 +11,12 @@ import torch
 from boards import random_actions
 
 from cprl import CommonsEnv, keys, presets
-from cprl.acting import RandomActor, Seats
-from cprl.learning import DQNLearner, DQNSettings
+from cprl.learners.settings import DQNSettings
+from cprl.learners.single import DQNLearner
 from cprl.measuring.evaluate import evaluate
-from cprl.train import train
+from cprl.policies.assignment import AgentPolicies
+from cprl.policies.single import RandomActor
+from cprl.training import train
 
 SCRIPT = Path(__file__).with_name("cuda_in_simulator.py")
 GAMES = [f"{board}:{variant}" for board in presets.BOARDS for variant in presets.VARIANTS]
@@ -73,4 +75,4 @@ def test_an_agent_learns_on_the_gpu():
     train(env, {0: learner}, others={1: random}, episodes=1)
     assert learner.buffer[:10]["observation"].is_cuda
     assert all(not torch.equal(*pair) for pair in zip(before, learner.network.parameters(), strict=True))
-    assert len(evaluate(CommonsEnv(game, 8, device="cuda"), Seats([learner.actor, random]))) == 8
+    assert len(evaluate(CommonsEnv(game, 8, device="cuda"), AgentPolicies([learner.actor, random]))) == 8

@@ -9,7 +9,10 @@ from tensordict import TensorDict
 from torchrl.data.replay_buffers.samplers import PrioritizedSampler, SumSegmentTreeFp32
 
 from cprl import CommonsEnv, Game, Rules, keys, maps, presets
-from cprl.learning import DQNLearner, DQNSettings, LaneLearner, transitions_of
+from cprl.learners.replay import ReplayLearner
+from cprl.learners.settings import DQNSettings
+from cprl.learners.single import DQNLearner
+from cprl.learners.transitions import transitions_of
 
 SHORT = Game(
     map=maps.parse(".A>.A\n.A.A.\n..<.A"),
@@ -71,10 +74,10 @@ def test_the_clock_running_out_is_no_end_for_the_target_but_depletion_is(ending,
 
 def test_learning_starts_at_the_stored_transitions_of_the_settings():
     agent = learner(learning_starts=16)
-    agent.remember(transitions(15))
-    assert agent.learn() is None
-    agent.remember(transitions(1))
-    assert agent.learn() > 0
+    agent.store(transitions(15))
+    assert agent.update() is None
+    agent.store(transitions(1))
+    assert agent.update() > 0
 
 
 def test_as_run_the_loss_is_averaged_over_all_outputs():
@@ -82,8 +85,8 @@ def test_as_run_the_loss_is_averaged_over_all_outputs():
     for over_all in (False, True):
         torch.manual_seed(1)
         agent = learner(mean_over_all_outputs=over_all)
-        agent.remember(transitions(16, reward=1.0))
-        losses.append(agent.learn())
+        agent.store(transitions(16, reward=1.0))
+        losses.append(agent.update())
     assert losses[1] == pytest.approx(losses[0] / 4)
 
 
@@ -107,7 +110,7 @@ def test_prioritised_replay_prefers_large_errors_or_says_that_torchrls_extension
 def test_lanes_refuse_priorities():
     game = Game(map=maps.parse(".A>\n..<"), rules=Rules(window_rows=3, window_columns=5))
     with pytest.raises(ValueError, match=r"priority_alpha is 0\.5; lanes sample uniformly, 0 is what fits"):
-        LaneLearner(game, seats=(0, 1), replicas=1, settings=DQNSettings(priority_alpha=0.5))
+        ReplayLearner(game, agents=(0, 1), replicas=1, settings=DQNSettings(priority_alpha=0.5))
 
 
 def test_the_target_network_starts_as_a_copy_and_as_run_with_weights_of_its_own():
@@ -120,10 +123,10 @@ def test_the_target_network_starts_as_a_copy_and_as_run_with_weights_of_its_own(
 @pytest.mark.parametrize("own_target_weights", [False, True])
 def test_the_target_network_is_replaced_after_every_third_episode(own_target_weights):
     agent = learner(target_every_episodes=3, own_target_weights=own_target_weights)
-    agent.remember(transitions(16, reward=1.0))
+    agent.store(transitions(16, reward=1.0))
     copied = []
     for _ in range(7):
-        agent.learn()
+        agent.update()
         agent.end_episode()
         copied.append(torch.equal(target_weights(agent), own_weights(agent)))
     assert copied == [False, False, True, False, False, True, False]
@@ -132,12 +135,12 @@ def test_the_target_network_is_replaced_after_every_third_episode(own_target_wei
 def test_the_actor_follows_the_learner_and_epsilon_its_steps():
     agent = learner(epsilon_hold_steps=10, epsilon_decay_steps=100)
     assert agent.actor.epsilon == 1.0
-    agent.remember(transitions(60))
+    agent.store(transitions(60))
     assert agent.actor.epsilon == pytest.approx(0.55)
     window = transitions(1)["observation"]
     before = agent.actor.greedy(TensorDict({"observation": window}, (1,)))["action_value"].clone()
     for _ in range(20):
-        agent.learn()
+        agent.update()
     after = agent.actor.greedy(TensorDict({"observation": window}, (1,)))["action_value"]
     assert not torch.equal(before, after)
 
@@ -150,8 +153,8 @@ def test_the_same_seed_learns_the_same():
         moment = env.reset()
         for turn in torch.as_tensor(random_actions(40, 1, SHORT)):
             now, moment = env.step_and_maybe_reset(moment.set(keys.ACTION, turn))
-            agent.remember(transitions_of(0, now[None]))
-            agent.learn()
+            agent.store(transitions_of(0, now[None]))
+            agent.update()
         return own_weights(agent)
 
     assert torch.equal(weights(0), weights(0))

@@ -12,14 +12,16 @@ import torch
 from test_population import ALGORITHMS
 
 import cprl
-from cprl import CommonsEnv, Game, Observation, Rules, cli, maps, study
-from cprl.evaluation.games import differences
-from cprl.learning.agents import EVALUATION, lane_seeds
+from cprl import CommonsEnv, Game, Observation, Rules, cli, maps
+from cprl import experiment as study
+from cprl.evaluation.same_game import differences
+from cprl.learners.lanes import EVALUATION, lane_seeds
 from cprl.measuring.evaluate import evaluate
 from cprl.measuring.replicas import agents_without_harvest, over_replicas, social_measures
 from cprl.population import Frozen, Learner, Population, Scripted
-from cprl.recording import Checkpoints, start_run
-from cprl.train import train
+from cprl.runs.checkpoints import Checkpointer
+from cprl.runs.directory import start_run
+from cprl.training import train
 
 CORRIDORS = Game(
     map=maps.parse(
@@ -196,13 +198,13 @@ def test_agents_that_learned_a_policy_draw_from_it(learned):
 
 def test_the_random_policy_is_that_of_the_populations(learned):
     found = cprl.evaluate_run(learned["mixed"], episodes=2, seed=SEED, replicas=[1])
-    from cprl.acting.lanes import random_lanes
-    from cprl.acting.seats import Seats
+    from cprl.policies.assignment import AgentPolicies
+    from cprl.policies.lanes import random_lanes
 
-    seeds = lane_seeds(SEED, replicas=[1], seats=[0, 1], purpose=EVALUATION)
-    actor = random_lanes(len(MEADOW.actions), seeds=seeds, seats=2, worlds=2)
+    seeds = lane_seeds(SEED, replicas=[1], agents=[0, 1], purpose=EVALUATION)
+    actor = random_lanes(len(MEADOW.actions), seeds=seeds, agents=2, worlds=2)
     env = CommonsEnv(MEADOW, 2, seed=SEED, first_world=2)
-    assert told(evaluate(env, Seats({(0, 1): actor}), explore=True)) == told(found.random[1])
+    assert told(evaluate(env, AgentPolicies({(0, 1): actor}), explore=True)) == told(found.random[1])
 
 
 @pytest.mark.parametrize("name", ["alike", "mixed"])
@@ -231,7 +233,7 @@ def test_a_run_that_has_not_ended_plays_by_its_newest_checkpoint(tmp_path):
     class Stopped(Exception):  # noqa: N818
         pass
 
-    class Stops(Checkpoints):
+    class Stops(Checkpointer):
         def after_step(self, training):
             if training.steps == 30:
                 self.save(training)
@@ -262,8 +264,8 @@ def test_a_matrix_of_scripted_agents_gives_the_numbers_worked_by_hand(scripted):
             returns
         )
     visit = found.cell("greedy", "sustainable")
-    assert [visit.measures(seat)["visitor/return"].estimate.value for seat in (0, 1)] == [2, 3]
-    assert [visit.measures(seat)["stock_left"].estimate.value for seat in (0, 1)] == [3, 2]
+    assert [visit.measures(agent)["visitor/return"].estimate.value for agent in (0, 1)] == [2, 3]
+    assert [visit.measures(agent)["stock_left"].estimate.value for agent in (0, 1)] == [3, 2]
     assert visit.measures()["equality"].estimate.value == 0.5, "one of two has everything"
     assert visit.measures()["collective_return"].episodes == 2 * 2 * 2
     at_home = found.cell("sustainable", "sustainable").measures()
@@ -280,13 +282,13 @@ def test_each_cell_is_what_the_loaded_runs_policies_play_with_one_visitor(learne
         by_replica = []
         for replica in range(3):
             mine, theirs, stock = [], [], []
-            for seat in range(2):
-                guest = loaded[visitor].policy(replica).actors[seat]
+            for agent in range(2):
+                guest = loaded[visitor].policy(replica).actors[agent]
                 env = CommonsEnv(MEADOW, 3, seed=SEED, first_world=3 * replica)
-                alone = evaluate(env, loaded[hosts].policy(replica, others={seat: guest}))
-                assert told(alone) == told(cell.visits[seat][replica])
-                mine += [episode.return_[seat] for episode in alone]
-                theirs += [episode.return_[1 - seat] for episode in alone]
+                alone = evaluate(env, loaded[hosts].policy(replica, others={agent: guest}))
+                assert told(alone) == told(cell.visits[agent][replica])
+                mine += [episode.return_[agent] for episode in alone]
+                theirs += [episode.return_[1 - agent] for episode in alone]
                 stock += [episode.stock_left for episode in alone]
             by_replica.append((np.mean(mine), np.mean(theirs), np.mean(stock)))
         measures = cell.measures()
@@ -405,9 +407,9 @@ def test_the_command_crossplay_tells_a_matrix_for_each_number_and_writes_the_epi
     assert ["sustainable", "0 [0, 0]", "0 [0, 0]"] in rows
     assert ["greedy", "sustainable", "1", "3 [3, 3]", "0 [0, 0]", "3 [3, 3]"] in rows
     assert ["sustainable", "0.5 [0.5, 0.5]", "undefined in all 2"] in rows, "equality"
-    seats = pq.read_table(out, columns=["visitor", "hosts", "seat"]).to_pylist()
-    assert len(seats) == (1 + 2 + 2 + 1) * 2 * 2, "visits, replicas, agents"
-    assert {row["seat"] for row in seats if row["visitor"] == row["hosts"]} == {-1}
+    agents = pq.read_table(out, columns=["visitor", "hosts", "seat"]).to_pylist()
+    assert len(agents) == (1 + 2 + 2 + 1) * 2 * 2, "visits, replicas, agents"
+    assert {row["seat"] for row in agents if row["visitor"] == row["hosts"]} == {-1}
     with pytest.raises(SystemExit, match=r"cprl: .*cross\.parquet exists and is kept"):
         command(monkeypatch, capsys, "crossplay", greedy, sustainable, "--out", out)
     with pytest.raises(SystemExit, match="cprl: 1 run came; at least two are wanted"):

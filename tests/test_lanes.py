@@ -10,25 +10,25 @@ from torch import nn
 from torchrl.data.replay_buffers import ReplayBuffer
 from torchrl.objectives import DQNLoss
 
-from cprl.acting import QNetwork
-from cprl.acting.lanes import LaneQNetwork
-from cprl.learning import fused
-from cprl.learning.dqn import dqn_loss
-from cprl.learning.fused import FunctionalUpdate
-from cprl.learning.replay import LaneSampler, lane_buffer
-from cprl.learning.storage import storage_bytes
-from cprl.learning.updates import ListUpdate
+from cprl.learners.buffer.sampler import LaneSampler, lane_buffer
+from cprl.learners.buffer.storage import storage_bytes
+from cprl.learners.engine import compiled as fused
+from cprl.learners.engine.base import ListEngine
+from cprl.learners.engine.compiled import FunctionalEngine
+from cprl.learners.single import dqn_loss
+from cprl.networks.mlp import MLPNetwork
+from cprl.networks.stacked import StackedMLP
 
 SHAPE = (3, 4, 5)
 ACTIONS = 6
 WAYS = {
-    "list": ListUpdate,
-    "vmap": partial(FunctionalUpdate, lane_axis=False, compile=False),
-    "lane axis": partial(FunctionalUpdate, lane_axis=True, compile=False),
+    "list": ListEngine,
+    "vmap": partial(FunctionalEngine, lane_axis=False, compile=False),
+    "lane axis": partial(FunctionalEngine, lane_axis=True, compile=False),
 }
 COMPILED = {
-    "vmap, compiled": partial(FunctionalUpdate, lane_axis=False, compile=True),
-    "lane axis, compiled": partial(FunctionalUpdate, lane_axis=True, compile=True),
+    "vmap, compiled": partial(FunctionalEngine, lane_axis=False, compile=True),
+    "lane axis, compiled": partial(FunctionalEngine, lane_axis=True, compile=True),
 }
 PRECISION = {torch.float32: 1e-5, torch.float64: 1e-10}
 
@@ -38,7 +38,7 @@ def networks(lanes, dtype=torch.float32, **how):
     made = []
     for lane in lanes:
         torch.manual_seed(lane)
-        made.append(QNetwork(SHAPE, ACTIONS, hidden_cells=(16, 16), **how).to(dtype))
+        made.append(MLPNetwork(SHAPE, ACTIONS, hidden_cells=(16, 16), **how).to(dtype))
     return made
 
 
@@ -77,12 +77,12 @@ def filled(lanes, *, steps=60, transitions=40):
     return buffer
 
 
-def trained(way, lanes, *, dtype=torch.float32, steps=200, lr=1e-3, **how):
+def trained(engine, lanes, *, dtype=torch.float32, steps=200, lr=1e-3, **how):
     """The update after so many steps, targets copied for lane after lane on the way, and the losses."""
-    update = way(networks(lanes, dtype), partial(dqn_loss, gamma=0.9), learning_rate=lr, **how)
+    update = engine(networks(lanes, dtype), partial(dqn_loss, gamma=0.9), learning_rate=lr, **how)
     buffer, losses = filled(lanes), []
     for step in range(steps):
-        losses.append(update.learn(buffer))
+        losses.append(update.update(buffer))
         update.copy_to_targets(torch.tensor([step % 20 == lane for lane in lanes]))
     return update, torch.stack(losses)
 
@@ -103,18 +103,18 @@ def in_order(update, lane):
         own = [(name, value) for name, value in named.items() if name.startswith(f"{group}:")]
         weights = [value for name, value in own if "weight" in name]
         biases = [value for name, value in own if "bias" in name]
-        stacked = isinstance(update, FunctionalUpdate) and not update._vmapped
+        stacked = isinstance(update, FunctionalEngine) and not update._vmapped
         parts += [value.T if stacked else value for value in weights]
         parts += [value.reshape(-1) for value in biases]
     return parts
 
 
 @pytest.mark.parametrize("dtype", PRECISION, ids=str)
-@pytest.mark.parametrize("way", ["vmap", "lane axis"])
-def test_both_fast_ways_end_where_a_list_of_torchrl_losses_ends(way, dtype):
+@pytest.mark.parametrize("engine", ["vmap", "lane axis"])
+def test_both_fast_ways_end_where_a_list_of_torchrl_losses_ends(engine, dtype):
     lanes = [0, 1, 2, 3, 4]
-    reference, losses = trained(ListUpdate, lanes, dtype=dtype)
-    update, their_losses = trained(WAYS[way], lanes, dtype=dtype)
+    reference, losses = trained(ListEngine, lanes, dtype=dtype)
+    update, their_losses = trained(WAYS[engine], lanes, dtype=dtype)
     assert_same_course(update, reference, range(5), range(5), PRECISION[dtype])
     torch.testing.assert_close(their_losses, losses, rtol=PRECISION[dtype] * 10, atol=1e-7)
     start = networks(lanes, dtype)[0]
@@ -123,7 +123,7 @@ def test_both_fast_ways_end_where_a_list_of_torchrl_losses_ends(way, dtype):
 
 def test_the_compiled_step_ends_there_too():
     lanes = [0, 1, 2]
-    reference, _ = trained(ListUpdate, lanes)
+    reference, _ = trained(ListEngine, lanes)
     update, _ = trained(COMPILED["lane axis, compiled"], lanes)
     assert update._compiled.enabled, "it really was compiled"
     assert_same_course(update, reference, range(3), range(3), 1e-5)
@@ -131,11 +131,11 @@ def test_the_compiled_step_ends_there_too():
 
 @pytest.mark.slow
 @pytest.mark.parametrize("dtype", PRECISION, ids=str)
-@pytest.mark.parametrize("way", COMPILED)
-def test_every_compiled_way_in_both_precisions(way, dtype):
+@pytest.mark.parametrize("engine", COMPILED)
+def test_every_compiled_way_in_both_precisions(engine, dtype):
     lanes = [0, 1, 2, 3]
-    reference, _ = trained(ListUpdate, lanes, dtype=dtype)
-    update, _ = trained(COMPILED[way], lanes, dtype=dtype)
+    reference, _ = trained(ListEngine, lanes, dtype=dtype)
+    update, _ = trained(COMPILED[engine], lanes, dtype=dtype)
     assert update._compiled.enabled
     assert_same_course(update, reference, range(4), range(4), PRECISION[dtype])
 
@@ -143,22 +143,22 @@ def test_every_compiled_way_in_both_precisions(way, dtype):
 @pytest.mark.parametrize(
     "dtype", [torch.float64, pytest.param(torch.float32, marks=pytest.mark.slow)], ids=str
 )
-@pytest.mark.parametrize("way", WAYS)
-def test_a_lanes_course_does_not_change_when_other_lanes_are_added(way, dtype):
-    many, losses = trained(WAYS[way], [3, 0, 1, 2, 5], dtype=dtype)
+@pytest.mark.parametrize("engine", WAYS)
+def test_a_lanes_course_does_not_change_when_other_lanes_are_added(engine, dtype):
+    many, losses = trained(WAYS[engine], [3, 0, 1, 2, 5], dtype=dtype)
     for place, lane in enumerate([3, 0]):
-        alone, own_losses = trained(WAYS[way], [lane], dtype=dtype)
+        alone, own_losses = trained(WAYS[engine], [lane], dtype=dtype)
         assert_same_course(many, alone, [place], [0], PRECISION[dtype])
         torch.testing.assert_close(losses[:, [place]], own_losses, rtol=PRECISION[dtype] * 10, atol=1e-7)
 
 
-@pytest.mark.parametrize("way", WAYS)
-def test_targets_change_for_the_marked_lanes_alone(way):
-    update, _ = trained(WAYS[way], [0, 1, 2], steps=15)
+@pytest.mark.parametrize("engine", WAYS)
+def test_targets_change_for_the_marked_lanes_alone(engine):
+    update, _ = trained(WAYS[engine], [0, 1, 2], steps=15)
     before = [in_order(update, lane) for lane in range(3)]
     half = len(before[0]) // 2
     for _ in range(3):
-        update.learn(filled([0, 1, 2]))
+        update.update(filled([0, 1, 2]))
     update.copy_to_targets(torch.tensor([False, True, False]))
     for lane in range(3):
         weights, targets = in_order(update, lane)[:half], in_order(update, lane)[half:]
@@ -168,10 +168,10 @@ def test_targets_change_for_the_marked_lanes_alone(way):
         assert all(kept) == (lane != 1)
 
 
-@pytest.mark.parametrize("way", WAYS)
-def test_targets_can_start_from_weights_of_their_own(way):
+@pytest.mark.parametrize("engine", WAYS)
+def test_targets_can_start_from_weights_of_their_own(engine):
     make_loss = partial(dqn_loss, gamma=0.9)
-    update = WAYS[way](networks([0, 1]), make_loss, target_networks=networks([10, 11]), learning_rate=1e-3)
+    update = WAYS[engine](networks([0, 1]), make_loss, target_networks=networks([10, 11]), learning_rate=1e-3)
     for lane in range(2):
         parts = in_order(update, lane)
         own, target = networks([lane])[0], networks([10 + lane])[0]
@@ -179,22 +179,22 @@ def test_targets_can_start_from_weights_of_their_own(way):
         assert torch.equal(parts[len(parts) // 2], target.linears[0].weight)
 
 
-@pytest.mark.parametrize("way", WAYS)
-def test_a_loss_can_be_weighed(way):
-    _, plain = trained(WAYS[way], [0, 1], steps=1)
-    _, weighed = trained(WAYS[way], [0, 1], steps=1, loss_share=0.25)
+@pytest.mark.parametrize("engine", WAYS)
+def test_a_loss_can_be_weighed(engine):
+    _, plain = trained(WAYS[engine], [0, 1], steps=1)
+    _, weighed = trained(WAYS[engine], [0, 1], steps=1, loss_share=0.25)
     torch.testing.assert_close(weighed, plain * 0.25)
 
 
 def test_the_stacked_networks_give_what_each_gives():
     each = networks([0, 1, 2], relu_on_outputs=True)
-    stacked = LaneQNetwork(each)
+    stacked = StackedMLP(each)
     windows = torch.randint(0, 256, (3, 7, *SHAPE), dtype=torch.uint8)
     expected = torch.stack([network(seen) for network, seen in zip(each, windows, strict=True)])
     torch.testing.assert_close(stacked(windows), expected)
     torch.testing.assert_close(stacked(windows[:, 0]), expected[:, 0])
     with pytest.raises(ValueError, match="2 different forms"):
-        LaneQNetwork([each[0], QNetwork(SHAPE, ACTIONS, hidden_cells=(8,))])
+        StackedMLP([each[0], MLPNetwork(SHAPE, ACTIONS, hidden_cells=(8,))])
 
 
 def test_a_users_own_network_is_vmapped():
@@ -217,12 +217,12 @@ def test_a_users_own_network_is_vmapped():
         return made
 
     make_loss = partial(dqn_loss, gamma=0.9)
-    fast = FunctionalUpdate(both(), make_loss, learning_rate=1e-3, lane_axis=False, compile=False)
-    plain = ListUpdate(both(), make_loss, learning_rate=1e-3)
+    fast = FunctionalEngine(both(), make_loss, learning_rate=1e-3, lane_axis=False, compile=False)
+    plain = ListEngine(both(), make_loss, learning_rate=1e-3)
     for update in (fast, plain):
         buffer = filled([0, 1, 2])
         for _ in range(50):
-            update.learn(buffer)
+            update.update(buffer)
     for lane in range(3):
         for mine, theirs in zip(fast.weights(lane).values(), plain.weights(lane).values(), strict=True):
             torch.testing.assert_close(mine, theirs, rtol=1e-4, atol=1e-6)
@@ -247,9 +247,9 @@ def test_a_failing_compile_falls_back_with_one_warning(monkeypatch):
         return run
 
     monkeypatch.setattr(fused.torch, "compile", broken)
-    way = COMPILED["lane axis, compiled"]
+    engine = COMPILED["lane axis, compiled"]
     with pytest.warns(RuntimeWarning, match="torch.compile failed, updates run uncompiled.*no C") as caught:
-        update, _ = trained(way, [0, 1], steps=20)
+        update, _ = trained(engine, [0, 1], steps=20)
     assert len(caught) == 1
     reference, _ = trained(WAYS["lane axis"], [0, 1], steps=20)
     assert_same_course(update, reference, range(2), range(2), 0)

@@ -1,4 +1,4 @@
-"""A room imports only from rooms above it (docs of `cprl`, DESIGN section 2)."""
+"""A package imports only from packages above it."""
 
 import ast
 from pathlib import Path
@@ -6,34 +6,42 @@ from pathlib import Path
 import pytest
 
 SOURCE = Path(__file__).parents[1] / "src" / "cprl"
-ROOMS = (
+PACKAGES = (
     "keys",
     "process",
-    "commons",
-    "envs",
+    "compat",
+    "compiling",
     "institutions",
-    "acting",
-    "learning",
-    "measuring",
-    "recording",
+    "commons",
     "theory",
+    "envs",
+    "networks",
+    "policies",
+    "collectors",
+    "learners",
+    "algorithms",
+    "measuring",
+    "runs",
+    "stored",
     "presets",
     "population",
-    "train",
-    "study",
-    "replay",
+    "viewer",
+    "terminal",
+    "training",
+    "experiment",
     "evaluation",
+    "studies",
     "reporting",
     "cli",
 )
 MODULES = sorted(path for path in SOURCE.rglob("*.py") if path.parent != SOURCE or path.name != "__init__.py")
 
 
-def room_of(path):
+def package_of(path):
     return path.relative_to(SOURCE).parts[0].removesuffix(".py")
 
 
-def rooms_imported(text):
+def packages_imported(text):
     for node in ast.walk(ast.parse(text)):
         if isinstance(node, ast.ImportFrom) and node.module and node.module.split(".")[0] == "cprl":
             parts = node.module.split(".")
@@ -43,18 +51,18 @@ def rooms_imported(text):
             yield from [parts[1] for parts in names if parts[0] == "cprl" and len(parts) > 1]
 
 
-def wrong_imports(room, text):
-    """What a module of this room imports from below it."""
-    return [other for other in rooms_imported(text) if ROOMS.index(other) > ROOMS.index(room)]
+def wrong_imports(package, text):
+    """What a module of this package imports from below it."""
+    return [other for other in packages_imported(text) if PACKAGES.index(other) > PACKAGES.index(package)]
 
 
 @pytest.mark.parametrize("path", MODULES, ids=lambda path: str(path.relative_to(SOURCE)))
-def test_a_room_imports_only_from_rooms_above_it(path):
-    assert wrong_imports(room_of(path), path.read_text()) == []
+def test_a_package_imports_only_from_packages_above_it(path):
+    assert wrong_imports(package_of(path), path.read_text()) == []
 
 
 @pytest.mark.parametrize(
-    "line", ["from cprl.train import train", "import cprl.recording.rerun", "from cprl import presets"]
+    "line", ["from cprl.training import train", "import cprl.viewer.logger", "from cprl import presets"]
 )
 def test_the_gate_closes(line):
     assert wrong_imports("commons", line)

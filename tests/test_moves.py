@@ -27,20 +27,20 @@ def test_agents_start_where_the_map_says_or_change_places_every_episode_each_ord
     headings = dict(zip(at, fixed.batch.now.heading[0].tolist(), strict=True))
     game = replace(fixed.game, rules=replace(fixed.game.rules, shuffle_starts=True))
     batch = Batch(game, 100, seed=4)
-    told = batch.new_told()
+    told = batch.new_output()
     for _ in range(12):
         batch.begin(told)
         places = [list(zip(*world, strict=True)) for world in zip(batch.now.row, batch.now.col, strict=True)]
         orders.update(tuple(at.index(place) for place in world) for world in places)
         for world, facing in zip(places, batch.now.heading.tolist(), strict=True):
             assert [headings[place] for place in world] == facing, "a place keeps its heading"
-        fixed.batch.begin(fixed.told)
+        fixed.batch.begin(fixed.output)
         assert fixed.places == at
     assert len(orders) == 6
     assert all(140 < count < 260 for count in orders.values()), orders
     alone = Batch(game, 1, seed=4, first_world=37)
     for _ in range(12):
-        alone.begin(alone.new_told())
+        alone.begin(alone.new_output())
     assert (alone.now.row[0] == batch.now.row[37]).all()
     assert (alone.now.col[0] == batch.now.col[37]).all()
 

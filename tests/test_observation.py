@@ -96,14 +96,14 @@ def test_too_many_agents_cannot_be_told_apart():
 
 def test_a_scoreboard_shows_ones_own_harvest_first_then_those_of_the_next_numbers():
     play = Play("A>A.A<.>A", observation=Observation(scoreboard=True, stock_gauge=True))
-    assert play.told.stock_gauge[0].tolist() == [[1.0]] * 3
+    assert play.output.stock_gauge[0].tolist() == [[1.0]] * 3
     play.turn("forward", "forward", "stay")
     play.turn("backward", "stay", "stay")
     play.turn("backward", "stay", "stay")
-    assert play.told.scoreboard[0].tolist() == [[2, 1, 0], [1, 0, 2], [0, 2, 1]]
-    assert play.told.stock_gauge[0].tolist() == [[0.25]] * 3
-    play.batch.begin(play.told)
-    assert not play.told.scoreboard.any()
+    assert play.output.scoreboard[0].tolist() == [[2, 1, 0], [1, 0, 2], [0, 2, 1]]
+    assert play.output.stock_gauge[0].tolist() == [[0.25]] * 3
+    play.batch.begin(play.output)
+    assert not play.output.scoreboard.any()
 
 
 @pytest.mark.parametrize("form", FORMS, ids=str)
@@ -126,8 +126,8 @@ def test_the_game_is_the_same_whatever_is_observed():
     actions = random_actions(100, 2, game)
     plain = Batch(game, 2)
     others = [Batch(Game(map=game.map, rules=game.rules, observation=form), 2) for form in FORMS]
-    told = plain.begin(plain.new_told())
-    their_told = [other.begin(other.new_told()) for other in others]
+    told = plain.begin(plain.new_output())
+    their_told = [other.begin(other.new_output()) for other in others]
     for turn in actions:
         plain.play(turn, told)
         for other, other_told in zip(others, their_told, strict=True):

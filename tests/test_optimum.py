@@ -5,21 +5,13 @@ from statistics import fmean
 import pytest
 
 from cprl import CommonsEnv, Game, Rules, maps
-from cprl.learning import (
-    A2C,
-    CQL,
-    DQN,
-    IQL,
-    PPO,
-    SAC,
-    DistributionalDQN,
-    DQNSettings,
-    Reinforce,
-    RolloutSettings,
-)
+from cprl.algorithms.actor_critic import IQL, SAC
+from cprl.algorithms.dqn import CQL, DQN, DistributionalDQN
+from cprl.algorithms.on_policy import A2C, PPO, Reinforce
+from cprl.learners.settings import DQNSettings, RolloutSettings
 from cprl.measuring.evaluate import evaluate
 from cprl.population import Learner, Population
-from cprl.train import train
+from cprl.training import train
 
 STEPS = 24
 GAME = Game(

@@ -8,30 +8,22 @@ import torch
 from torchrl.objectives import ClipPPOLoss
 
 import cprl
-from cprl import CommonsEnv, Game, Observation, Rules, maps, study
-from cprl.acting.networks import acting_part
+from cprl import CommonsEnv, Game, Observation, Rules, maps
+from cprl import experiment as study
+from cprl.algorithms.actor_critic import IQL, SAC
+from cprl.algorithms.dqn import CQL, DQN, DistributionalDQN
+from cprl.algorithms.on_policy import A2C, PPO, Reinforce
+from cprl.algorithms.tabular import Tabular
 from cprl.evaluation import evaluate_run
-from cprl.learning import (
-    A2C,
-    CQL,
-    DQN,
-    IQL,
-    PPO,
-    SAC,
-    DistributionalDQN,
-    DQNSettings,
-    Reinforce,
-    RolloutSettings,
-    Tabular,
-    TabularSettings,
-)
-from cprl.learning.lanes import LaneLearner
-from cprl.learning.rollouts import RolloutLearner
-from cprl.learning.transitions import lane_turn
+from cprl.learners.replay import ReplayLearner
+from cprl.learners.rollouts import RolloutLearner
+from cprl.learners.settings import DQNSettings, RolloutSettings, TabularSettings
+from cprl.learners.transitions import lane_turn
+from cprl.networks.agent import acting_part
 from cprl.population import Frozen, Learner, Population, Scripted
-from cprl.recording import Checkpoints, start_run
-from cprl.recording.checkpoints import checkpoints_in
-from cprl.train import train
+from cprl.runs.checkpoints import Checkpointer, checkpoints_in
+from cprl.runs.directory import start_run
+from cprl.training import train
 
 GAME = Game(
     map=maps.parse(
@@ -90,10 +82,10 @@ class Returns:
     def __init__(self):
         self.of = {}
 
-    def see_turn(self, batch):
+    def on_step(self, batch):
         """Only whole episodes are of interest."""
 
-    def see_episode(self, episode, learning):
+    def on_episode(self, episode, learning):
         self.of.setdefault(episode.world, []).append(episode.return_.tolist())
 
 
@@ -101,7 +93,7 @@ def trained(agents, *, episodes=6, first=0, **how):
     env = CommonsEnv(agents.game, agents.replicas, seed=agents.seed, first_world=first)
     returns = Returns()
     training = train(
-        env, agents.learners, others=agents.others, episodes=episodes, observers=[returns], **how
+        env, agents.learners, others=agents.others, episodes=episodes, callbacks=[returns], **how
     )
     return training, returns.of
 
@@ -130,7 +122,7 @@ def test_each_loss_moves_every_agents_weights_and_no_replica_knows_of_the_others
             assert not torch.equal(value, before[key]), f"{key} has not moved"
     for key, value in after_alone.items():
         torch.testing.assert_close(value, after[key], rtol=1e-4, atol=1e-5)
-    made = [learner.update.network_state(lane) for lane in range(12)]
+    made = [learner.engine.network_state(lane) for lane in range(12)]
     assert len({float(sum(value.sum() for value in state.values())) for state in made}) == 12, "lanes differ"
 
 
@@ -141,16 +133,16 @@ def test_each_loss_takes_the_fastest_way_that_agrees_with_a_list_of_torchrls_los
     members = [Learner(algorithm)] * 4
     found = population(members, replicas=1)
     (learner,) = found.learners.values()
-    kind, common = type(learner), {"seats": FOUR, "replicas": 1, "settings": algorithm.settings, "seed": 3}
+    kind, common = type(learner), {"agents": FOUR, "replicas": 1, "settings": algorithm.settings, "seed": 3}
     common |= {"make_network": lambda: algorithm.network(GAME), "make_loss": algorithm.loss, "compile": False}
-    if kind is LaneLearner:
-        common["samples"] = algorithm.samples
-    by_list, named = kind(GAME, way="list", **common), kind(GAME, way=WAYS[name], **common)
+    if kind is ReplayLearner:
+        common["stochastic"] = algorithm.stochastic
+    by_list, named = kind(GAME, engine="list", **common), kind(GAME, engine=WAYS[name], **common)
     ends = []
     for one in (learner, named, by_list):
         env = CommonsEnv(GAME, 1, seed=3)
         train(env, {FOUR: one}, episodes=5)
-        ends.append([one.update.network_state(lane) for lane in range(4)])
+        ends.append([one.engine.network_state(lane) for lane in range(4)])
     for mine, theirs, reference in zip(*ends, strict=True):
         for key, value in reference.items():
             assert torch.equal(mine[key], theirs[key]), "this is the way that is found"
@@ -160,8 +152,8 @@ def test_each_loss_takes_the_fastest_way_that_agrees_with_a_list_of_torchrls_los
 def test_unlike_agents_sit_side_by_side_in_one_training_and_like_ones_are_lanes():
     dqn, ppo = Learner(ALGORITHMS["DQN"]), Learner(ALGORITHMS["PPO"])
     mixed = population([dqn, ppo, dqn, Scripted("greedy")])
-    assert {seats: type(learner) for seats, learner in mixed.learners.items()} == {
-        (0, 2): LaneLearner,
+    assert {agents: type(learner) for agents, learner in mixed.learners.items()} == {
+        (0, 2): ReplayLearner,
         (1,): RolloutLearner,
     }
     assert list(mixed.others) == [(3,)]
@@ -191,18 +183,20 @@ def test_who_is_paid_for_the_group_gets_the_sum_of_all_rewards():
         if rewards.sum():
             break
     assert rewards.sum() > 0
-    own, group = (lane_turn((1, 3), moment, paid=paid).reward for paid in ("own", "group"))
+    own, group = (
+        lane_turn((1, 3), moment, reward_kind=reward_kind).reward for reward_kind in ("own", "group")
+    )
     assert own.tolist() == rewards[:, [1, 3]].flatten().tolist()
     assert group.tolist() == rewards.sum(1).repeat_interleave(2).tolist()
 
 
 def test_paid_for_the_group_is_another_learner_than_paid_for_itself():
     algorithm = ALGORITHMS["DQN"]
-    members = [Learner(algorithm), Learner(algorithm, paid="group"), *[Scripted()] * 2]
+    members = [Learner(algorithm), Learner(algorithm, reward_kind="group"), *[Scripted()] * 2]
     assert list(population(members).learners) == [(0,), (1,)]
 
 
-class AtSteps(Checkpoints):
+class AtSteps(Checkpointer):
     def after_step(self, training):
         if training.steps in (20, 45):
             self.save(training)
@@ -221,7 +215,7 @@ def assert_goes_on_bit_for_bit(members, tmp_path, *, episodes):
             super().__init__()
             self.at = at
 
-        def see_turn(self, batch):
+        def on_step(self, batch):
             self.turns += 1
             if self.turns == self.at:
                 raise StopError
@@ -236,7 +230,7 @@ def assert_goes_on_bit_for_bit(members, tmp_path, *, episodes):
                     agents.learners,
                     others=agents.others,
                     episodes=episodes,
-                    observers=[Stopping(stop_at)],
+                    callbacks=[Stopping(stop_at)],
                     checkpoints=checkpoints,
                 )
             except StopError:
@@ -280,8 +274,8 @@ def test_a_mixed_run_is_kept_evaluated_and_built_again_from_its_directory(tmp_pa
 def test_a_frozen_agent_plays_what_it_learned_and_changes_no_more(tmp_path, capsys):
     run, earlier = conducted(tmp_path, [Learner(ALGORITHMS["DQN"])] * 4)
     frozen = population([Frozen(run, 2, replica=1), *[Learner(ALGORITHMS["DQN"])] * 3])
-    (seats, actor), *rest = frozen.others.items()
-    assert (seats, rest) == ((0,), [])
+    (agents, actor), *rest = frozen.others.items()
+    assert (agents, rest) == ((0,), [])
     actor.epsilon = 0.0
     seen = CommonsEnv(GAME, 2, seed=9).reset()["agents", "observation"][:, :1]
     network = earlier.networks()["replica_1/agent_2"]
@@ -322,28 +316,30 @@ def test_a_tabular_agent_is_a_member_like_any_other(tmp_path, capsys):
         Population(told, members)
 
 
-@pytest.mark.parametrize("paid", ["own", "group"])
-def test_a_tabular_agent_is_paid_for_itself_or_for_the_group(paid):
+@pytest.mark.parametrize("reward_kind", ["own", "group"])
+def test_a_tabular_agent_is_paid_for_itself_or_for_the_group(reward_kind):
     class Witness:
         """What was paid last for an action in a state, by replica."""
 
         def __init__(self):
             self.last = {}
 
-        def see_turn(self, batch):
+        def on_step(self, batch):
             rewards = batch["next", "agents", "reward"][..., 0]
-            paid_now = rewards.sum(1) if paid == "group" else rewards[:, 1]
+            paid_now = rewards.sum(1) if reward_kind == "group" else rewards[:, 1]
             for replica, reward in enumerate(paid_now.tolist()):
                 seen = batch["agents", "observation"][replica, 1].numpy().tobytes()
                 self.last[replica, seen, int(batch["agents", "action"][replica, 1])] = reward
 
-        def see_episode(self, episode, learning):
+        def on_episode(self, episode, learning):
             """Nothing."""
 
     algorithm = Tabular(settings=TabularSettings(gamma=0.0, learning_rate=1.0))
-    agents = population([Scripted("greedy"), Learner(algorithm, paid=paid), *[Scripted("greedy")] * 2])
+    agents = population(
+        [Scripted("greedy"), Learner(algorithm, reward_kind=reward_kind), *[Scripted("greedy")] * 2]
+    )
     witness = Witness()
-    train(CommonsEnv(GAME, 2), agents.learners, others=agents.others, episodes=10, observers=[witness])
+    train(CommonsEnv(GAME, 2), agents.learners, others=agents.others, episodes=10, callbacks=[witness])
     values = {}
     for replica in range(2):
         table = agents.learners[1,].q_table(replica)
@@ -353,13 +349,13 @@ def test_a_tabular_agent_is_paid_for_itself_or_for_the_group(paid):
             for action in visits.nonzero()[0].tolist():
                 values[replica, seen.tobytes(), action] = of_actions[action]
     assert values == witness.last
-    assert (max(values.values()) > 1) == (paid == "group")
+    assert (max(values.values()) > 1) == (reward_kind == "group")
 
 
 @dataclass(frozen=True, kw_only=True)
 class PPOFromReplay:
     settings: DQNSettings
-    samples: ClassVar[bool] = True
+    stochastic: ClassVar[bool] = True
 
     def network(self, game):
         return ALGORITHMS["PPO"].network(game)
@@ -371,7 +367,7 @@ class PPOFromReplay:
 def test_what_does_not_fit_is_refused_before_training_and_says_what_fits(tmp_path, capsys):
     dqn = Learner(ALGORITHMS["DQN"])
     with pytest.raises(ValueError, match="paid is 'team'; allowed: own, group"):
-        Learner(ALGORITHMS["DQN"], paid="team")
+        Learner(ALGORITHMS["DQN"], reward_kind="team")
     with pytest.raises(ValueError, match="3 members for a game of 4 seats; one for each is wanted"):
         population([dqn] * 3)
     assert isinstance(ALGORITHMS["PPO"].loss(ALGORITHMS["PPO"].network(GAME)), ClipPPOLoss)
@@ -382,14 +378,14 @@ def test_what_does_not_fit_is_refused_before_training_and_says_what_fits(tmp_pat
     with pytest.raises(ValueError, match=r'an agent has the networks .*; "actor" and "critic" are wanted'):
         RolloutLearner(
             GAME,
-            seats=[0],
+            agents=[0],
             replicas=1,
             settings=ROLLOUTS,
             make_network=lambda: acting_part(ALGORITHMS["PPO"].network(GAME)),
             make_loss=ALGORITHMS["PPO"].loss,
         )
     with pytest.raises(ValueError, match=r"learn_every is 7; it must divide the rollouts' 20 steps"):
-        trained(population([Learner(ALGORITHMS["PPO"])] * 4), learn_every=7)
+        trained(population([Learner(ALGORITHMS["PPO"])] * 4), update_every=7)
     run, _ = conducted(tmp_path, [dqn] * 4)
     larger = Game(map=GAME.map, rules=replace(GAME.rules, window_rows=4))
     with pytest.raises(ValueError, match=r"have observations \(3, 3, 5\); this game has \(3, 4, 5\)"):

@@ -6,9 +6,10 @@ import re
 from rich.console import Console
 
 from cprl import CommonsEnv, Game, Rules, maps
-from cprl.acting import random_lanes
-from cprl.recording import ProgressBar, progress
-from cprl.train import train
+from cprl.policies.lanes import random_lanes
+from cprl.terminal import progress
+from cprl.terminal.progress import ProgressBar
+from cprl.training import train
 
 GAME = Game(map=maps.parse(".A>\n..A"), rules=Rules(window_rows=3, window_columns=3, episode_steps=5))
 
@@ -17,11 +18,11 @@ def lines(monkeypatch, *, before):
     """What is printed of a training of 6 episodes, as if so many episodes of 2 replicas had ended before."""
     monkeypatch.setattr(progress, "_LINE_PERIOD_S", 0.0)
     told = io.StringIO()
-    walker = random_lanes(8, seeds=[(0,), (1,)], seats=1)
+    walker = random_lanes(8, seeds=[(0,), (1,)], agents=1)
     with ProgressBar(GAME, episodes=9, replicas=2, console=Console(file=told, width=200)) as bar:
         if before:
             bar.load_state_dict({"episodes": before})
-        train(CommonsEnv(GAME, 2), {}, others={(0,): walker}, episodes=6, observers=[bar])
+        train(CommonsEnv(GAME, 2), {}, others={(0,): walker}, episodes=6, callbacks=[bar])
         assert bar.state_dict() == {"episodes": before + 12}
     return told.getvalue()
 

@@ -12,14 +12,17 @@ import torch
 from rerun.chunk import RrdReader
 
 import cprl
-from cprl import CommonsEnv, Map, Rules, presets, recording
-from cprl.acting import RandomActor, Seats
-from cprl.learning import DQNLearner, LaneLearner
+from cprl import CommonsEnv, Map, Rules, presets
+from cprl.learners.replay import ReplayLearner
+from cprl.learners.single import DQNLearner
 from cprl.measuring.evaluate import evaluate, mean_return
+from cprl.policies.assignment import AgentPolicies
+from cprl.policies.single import RandomActor
 from cprl.population import Learner, Population
-from cprl.recording import EpisodeTable, load_weights, read_episodes, restore_weights
-from cprl.recording.checkpoints import checkpoints_in, read_checkpoint
-from cprl.train import train
+from cprl.runs.checkpoints import Checkpointer, checkpoints_in, read_checkpoint
+from cprl.runs.episodes import EpisodeTable, read_episodes
+from cprl.runs.weights import load_weights, restore_weights
+from cprl.training import train
 
 RECIPES = Path(__file__).parents[1] / "recipes"
 
@@ -71,7 +74,7 @@ def test_the_first_run_leaves_a_run_directory(variant, tmp_path, capsys):
 
 def test_the_first_run_says_that_it_is_short_and_names_the_published_schedule(tmp_path, capsys):
     run, told = run_in_miniature(tmp_path, capsys, watch="serve")
-    assert "Watch live (browser): http://127.0.0.1:" in told
+    assert "ViewerCallback live (browser): http://127.0.0.1:" in told
     assert "short schedule, 11 episodes" in " ".join(told.split())
     assert "The published one, with 8 replicas: .venv/bin/python recipes/single_basic.py" in told
     assert (
@@ -93,8 +96,8 @@ def test_the_short_schedule_earns_three_times_what_chance_does(tmp_path):
     learner = DQNLearner(game.observation_shape, 7, settings=presets.learner("single_basic"))
     restore_weights(run / "checkpoints" / "best.pt", {"agent_0": learner.network})
     fresh = CommonsEnv(game, 100, seed=1234)
-    greedy, _ = mean_return(evaluate(fresh, Seats([learner.actor])))
-    chance, _ = mean_return(evaluate(fresh, Seats([RandomActor(7)])))
+    greedy, _ = mean_return(evaluate(fresh, AgentPolicies([learner.actor])))
+    chance, _ = mean_return(evaluate(fresh, AgentPolicies([RandomActor(7)])))
     assert greedy >= 3 * chance
 
 
@@ -127,7 +130,7 @@ def test_recipes_of_replicas_leave_a_run_directory(name, variant, tmp_path, caps
     assert json.loads((run / "report.json").read_text())["training_s"] > 0
     game, settings = presets.game("commons"), presets.learner("commons", variant=variant)
     if name == "commons":
-        network = LaneLearner(game, seats=[0], replicas=1, settings=settings, compile=False).networks()
+        network = ReplayLearner(game, agents=[0], replicas=1, settings=settings, compile=False).networks()
         restore_weights_of(network["replica_0/agent_0"], weights["replica_1/agent_2"])
 
 
@@ -194,13 +197,13 @@ def test_fifty_episodes_of_commons_in_eight_replicas_are_those_of_each_alone(tmp
     weights = load_weights(run / "checkpoints" / "final.pt")
     game, settings = presets.game("commons"), presets.learner("commons")
     for replica in (0, 5):
-        alone = LaneLearner(
-            game, seats=range(4), replicas=1, first_replica=replica, settings=settings, seed=5
+        alone = ReplayLearner(
+            game, agents=range(4), replicas=1, first_replica=replica, settings=settings, seed=5
         )
         env = CommonsEnv(game, 1, seed=5, first_world=replica)
         (tmp_path / f"alone_{replica}").mkdir()
         with EpisodeTable(tmp_path / f"alone_{replica}" / "episodes.parquet") as table:
-            train(env, {(0, 1, 2, 3): alone}, episodes=50, observers=[table])
+            train(env, {(0, 1, 2, 3): alone}, episodes=50, callbacks=[table])
         told = read_episodes(tmp_path / f"alone_{replica}").to_pydict()
         for agent in range(4):
             mine = [v for a, v in zip(told["agent"], told["return"], strict=True) if a == agent]
@@ -241,7 +244,7 @@ def test_a_run_that_was_stopped_is_loaded_from_its_newest_checkpoint(tmp_path, m
         if training.steps == 50:
             raise StopError
 
-    monkeypatch.setattr(recording.Checkpoints, "after_step", after_step)
+    monkeypatch.setattr(Checkpointer, "after_step", after_step)
     with pytest.raises(StopError):
         recipe("two_against_random").main(out=tmp_path / "run", **how)
     loaded = cprl.load(tmp_path / "run")

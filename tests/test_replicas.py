@@ -11,13 +11,16 @@ from torchrl.collectors import Collector
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 
 from cprl import CommonsEnv, Game, Rules, keys, maps
-from cprl.acting import LaneActor, RandomActor, Seats, random_lanes
-from cprl.acting.collect import StepCollector
-from cprl.learning import DQNSettings, LaneLearner, transitions_of
-from cprl.learning.transitions import lane_turn
+from cprl.collectors import StepCollector
+from cprl.learners.replay import ReplayLearner
+from cprl.learners.settings import DQNSettings
+from cprl.learners.transitions import lane_turn, transitions_of
 from cprl.measuring.evaluate import evaluate
-from cprl.recording import EpisodeTable, read_episodes
-from cprl.train import train
+from cprl.policies.assignment import AgentPolicies
+from cprl.policies.lanes import LaneActor, random_lanes
+from cprl.policies.single import RandomActor
+from cprl.runs.episodes import EpisodeTable, read_episodes
+from cprl.training import train
 
 GAME = Game(
     map=maps.parse(".A>.A\n.A.A.\n..<.A"),
@@ -39,10 +42,10 @@ class Witness:
     def __init__(self):
         self.episodes, self.learning = [], []
 
-    def see_turn(self, batch):
+    def on_step(self, batch):
         """Only whole episodes are of interest."""
 
-    def see_episode(self, episode, learning):
+    def on_episode(self, episode, learning):
         self.episodes.append(episode)
         self.learning.append(learning)
 
@@ -55,37 +58,37 @@ class Witness:
         ]
 
 
-def learner(way="lane axis", *, game=GAME, seats=(0, 1), settings=SETTINGS, **how):
-    return LaneLearner(game, seats=seats, settings=settings, way=way, compile=False, **how)
+def learner(engine="lane axis", *, game=GAME, agents=(0, 1), settings=SETTINGS, **how):
+    return ReplayLearner(game, agents=agents, settings=settings, engine=engine, compile=False, **how)
 
 
-def trained(way, *, replicas, first=0, episodes=12, seats=(0, 1), settings=SETTINGS):
-    agents = learner(way, seats=seats, replicas=replicas, first_replica=first, seed=3, settings=settings)
+def trained(engine, *, replicas, first=0, episodes=12, agents=(0, 1), settings=SETTINGS):
+    made = learner(engine, agents=agents, replicas=replicas, first_replica=first, seed=3, settings=settings)
     witness = Witness()
     others = {}
-    if len(seats) == 1:
+    if len(agents) == 1:
         seeds = [(3, first + replica, 1) for replica in range(replicas)]
-        others = {(1,): random_lanes(8, seeds=seeds, seats=1)}
+        others = {(1,): random_lanes(8, seeds=seeds, agents=1)}
     env = CommonsEnv(GAME, replicas, seed=3, first_world=first)
-    train(env, {tuple(seats): agents}, others=others, episodes=episodes, observers=[witness])
-    return agents, witness
+    train(env, {tuple(agents): made}, others=others, episodes=episodes, callbacks=[witness])
+    return made, witness
 
 
-@pytest.mark.parametrize("way", WAYS)
-@pytest.mark.parametrize("seats", [(0, 1), (0,)], ids=["two learn", "one learns beside a random one"])
-def test_each_replica_is_trained_as_it_would_be_alone(way, seats):
-    _, together = trained(way, replicas=3, seats=seats)
+@pytest.mark.parametrize("engine", WAYS)
+@pytest.mark.parametrize("agents", [(0, 1), (0,)], ids=["two learn", "one learns beside a random one"])
+def test_each_replica_is_trained_as_it_would_be_alone(engine, agents):
+    _, together = trained(engine, replicas=3, agents=agents)
     courses = [together.course(replica) for replica in range(3)]
     assert courses[0] != courses[1] != courses[2]
     for replica in (0, 2):
-        _, alone = trained(way, replicas=1, first=replica, seats=seats)
+        _, alone = trained(engine, replicas=1, first=replica, agents=agents)
         returns, losses = alone.course(0)
         assert courses[replica][0] == returns
         np.testing.assert_allclose(courses[replica][1], losses, rtol=1e-4, equal_nan=True)
 
 
 def test_all_ways_of_updating_take_the_same_course():
-    courses = [trained(way, replicas=2)[1].course(1) for way in WAYS]
+    courses = [trained(engine, replicas=2)[1].course(1) for engine in WAYS]
     for returns, losses in courses[1:]:
         assert returns == courses[0][0]
         np.testing.assert_allclose(losses, courses[0][1], rtol=1e-4, equal_nan=True)
@@ -94,9 +97,9 @@ def test_all_ways_of_updating_take_the_same_course():
 def test_as_run_targets_start_from_weights_of_their_own_and_the_loss_is_shared_over_outputs():
     as_run = replace(SETTINGS, own_target_weights=True, mean_over_all_outputs=True)
     plain, odd = (learner(replicas=2, settings=settings) for settings in (SETTINGS, as_run))
-    assert odd.update._share == plain.update._share / 8
+    assert odd.engine._share == plain.engine._share / 8
     for agents, same in ((plain, True), (odd, False)):
-        weights = agents.update.weights(0)
+        weights = agents.engine.weights(0)
         own = [value for name, value in weights.items() if not name.startswith("target_")]
         target = [value for name, value in weights.items() if name.startswith("target_")]
         assert torch.equal(own[0], target[0]) is same
@@ -106,7 +109,7 @@ def test_every_replica_is_told_of_so_many_episodes_and_of_its_losses(tmp_path):
     with EpisodeTable(tmp_path / "episodes.parquet") as table:
         witness = Witness()
         env = CommonsEnv(GAME, 3, seed=1)
-        train(env, {(0, 1): learner(replicas=3)}, episodes=5, observers=[table, witness])
+        train(env, {(0, 1): learner(replicas=3)}, episodes=5, callbacks=[table, witness])
     rows = read_episodes(tmp_path).to_pydict()
     for replica in range(3):
         told = zip(rows["replica"], rows["agent"], rows["episode"], strict=True)
@@ -121,9 +124,9 @@ def test_every_replica_is_told_of_so_many_episodes_and_of_its_losses(tmp_path):
 
 def test_targets_follow_each_replicas_own_episodes():
     agents = learner(replicas=2)
-    agents.remember(CommonsEnv(GAME, 2).rollout(1)[:, 0])
+    agents.store(CommonsEnv(GAME, 2).rollout(1)[:, 0])
     copied = []
-    agents.update.copy_to_targets = lambda which: copied.append(which.tolist())
+    agents.engine.copy_to_targets = lambda which: copied.append(which.tolist())
     for ended in ([True, False], [True, False], [True, True], [False, True]):
         agents.end_episode(torch.tensor(ended))
     assert copied == [[True, True, False, False], [False, False, True, True]]
@@ -153,11 +156,11 @@ def test_the_lean_collector_yields_what_torchrls_own_yields(worlds):
 
 def test_transitions_of_lanes_are_those_of_the_agents():
     batch = CommonsEnv(GAME, 3).rollout(1)[:, 0]
-    for seats in ((0, 1), (1,)):
-        lanes = lane_turn(seats, batch)
-        for place, agent in enumerate(seats):
+    for agents in ((0, 1), (1,)):
+        lanes = lane_turn(agents, batch)
+        for place, agent in enumerate(agents):
             alone = transitions_of(agent, batch)
-            own = lanes._make(entry[place :: len(seats)] for entry in lanes)
+            own = lanes._make(entry[place :: len(agents)] for entry in lanes)
             assert np.array_equal(own.observation, alone["observation"])
             assert np.array_equal(own.action, alone["action"])
             assert np.array_equal(own.next_observation, alone["next", "observation"])
@@ -169,10 +172,10 @@ def test_a_lane_explores_by_its_own_numbers_and_only_where_asked():
     def values(seen):
         return torch.zeros(*seen.shape[:2], 8).index_fill(2, torch.tensor(5), 1.0)
 
-    def chosen(seeds, *, seats=1, worlds=1, epsilon=0.5, manner=ExplorationType.RANDOM, steps=400):
-        actor = LaneActor(values, 8, seeds=seeds, seats=seats, worlds=worlds)
+    def chosen(seeds, *, agents=1, worlds=1, epsilon=0.5, manner=ExplorationType.RANDOM, steps=400):
+        actor = LaneActor(values, 8, seeds=seeds, agents=agents, worlds=worlds)
         actor.epsilon = epsilon
-        shape = len(seeds) // seats * worlds, seats, 3, 2, 2
+        shape = len(seeds) // agents * worlds, agents, 3, 2, 2
         seen = TensorDict({"observation": torch.zeros(shape, dtype=torch.uint8)}, shape[:1])
         with set_exploration_type(manner):
             return torch.stack([actor(seen.clone())["action"] for _ in range(steps)])
@@ -184,7 +187,7 @@ def test_a_lane_explores_by_its_own_numbers_and_only_where_asked():
     assert (both == 5).float().mean() == pytest.approx(0.5 + 0.5 / 8, abs=0.05)
     assert (chosen([(1, 0)], epsilon=0.0) == 5).all()
     assert (chosen([(1, 0)], manner=ExplorationType.DETERMINISTIC) == 5).all()
-    many = chosen([(1, 0), (1, 1)], seats=2, worlds=3)
+    many = chosen([(1, 0), (1, 1)], agents=2, worlds=3)
     assert many.shape == (400, 3, 2)
     assert (many[:, 0] != many[:, 1]).any()
 
@@ -199,13 +202,13 @@ def test_lanes_by_worlds_reach_the_right_network():
         for agent in range(2):
             lane = 2 * (world // 3) + agent
             seen = windows[world, agent].expand(4, 1, *GAME.observation_shape)
-            assert chosen[world, agent] == agents.update.outputs(seen)[lane, 0].argmax()
+            assert chosen[world, agent] == agents.engine.outputs(seen)[lane, 0].argmax()
 
 
 def test_trained_replicas_are_evaluated_side_by_side_on_fresh_worlds():
     agents, _ = trained("lane axis", replicas=2)
     env = CommonsEnv(GAME, 2 * 5, seed=9)
-    episodes = evaluate(env, Seats({(0, 1): agents.evaluation_actor(5)}), explore=True)
+    episodes = evaluate(env, AgentPolicies({(0, 1): agents.evaluation_actor(5)}), explore=True)
     assert len(episodes) == 10
     assert agents.evaluation_actor(5).epsilon == 0.05
 
@@ -219,7 +222,7 @@ def test_trained_replicas_are_evaluated_side_by_side_on_fresh_worlds():
     ],
 )
 def test_learners_that_do_not_fit_are_refused(learners, others, message):
-    made = {seat: learner(**how) for seat, how in learners.items()}
+    made = {agent: learner(**how) for agent, how in learners.items()}
     if (0,) in made:
         others = {1: RandomActor(8)}
     with pytest.raises(ValueError, match=message):
@@ -233,9 +236,9 @@ def test_an_unknown_way_is_refused():
 
 def test_seats_take_every_agent_once():
     with pytest.raises(ValueError, match=r"actors sit at \[0, 0\]"):
-        Seats({0: RandomActor(8), (0,): RandomActor(8)})
+        AgentPolicies({0: RandomActor(8), (0,): RandomActor(8)})
     env = CommonsEnv(GAME, 2)
-    seats = Seats({1: RandomActor(8, seed=1), 0: RandomActor(8)})
+    agents = AgentPolicies({1: RandomActor(8, seed=1), 0: RandomActor(8)})
     with pytest.raises(ValueError, match="1 actors for 2 agents"):
-        Seats([RandomActor(8)])(env.reset())
-    assert seats(env.reset())[keys.ACTION].shape == (2, 2)
+        AgentPolicies([RandomActor(8)])(env.reset())
+    assert agents(env.reset())[keys.ACTION].shape == (2, 2)

@@ -14,16 +14,16 @@ from test_rerun_logger import column
 
 import cprl
 from cprl import presets
+from cprl.evaluation.film import replay
 from cprl.measuring.movement import Trace
 from cprl.measuring.published import curve, experiment
-from cprl.recording import read_episodes
-from cprl.recording.bank import keep_results
-from cprl.recording.curves import as_curves, running_mean
-from cprl.replay import replay
 from cprl.reporting import write_report
 from cprl.reporting.claims import dip_depth, measures, of_play, of_training
 from cprl.reporting.result import Result
 from cprl.reporting.turning import turning_points_of
+from cprl.runs.curves import as_curves, running_mean
+from cprl.runs.episodes import read_episodes
+from cprl.runs.export import export_results
 
 RECIPES = Path(__file__).parents[1] / "recipes"
 
@@ -52,8 +52,8 @@ def run(tmp_path_factory):
 
 
 def test_what_is_kept_says_the_same_as_the_run(run, tmp_path):
-    folder = keep_results(run, tmp_path / "kept")
-    assert keep_results(run, folder) == folder, "again over the same"
+    folder = export_results(run, tmp_path / "kept")
+    assert export_results(run, folder) == folder, "again over the same"
     kept, whole = read_episodes(folder).to_pydict(), read_episodes(run)
     ordered = whole.sort_by([(name, "ascending") for name in ("replica", "episode", "agent")]).to_pydict()
     assert set(kept) == set(ordered)
@@ -65,13 +65,13 @@ def test_what_is_kept_says_the_same_as_the_run(run, tmp_path):
     assert not list(folder.rglob("training-*"))
     (run / "report.json").rename(tmp_path / "aside")
     with pytest.raises(FileNotFoundError, match=r"report\.json is not there: has the run ended\?"):
-        keep_results(run, tmp_path / "other")
+        export_results(run, tmp_path / "other")
     (tmp_path / "aside").rename(run / "report.json")
     assert not (tmp_path / "other").exists()
 
 
 def test_a_report_tells_every_number_from_the_results_alone(run, tmp_path):
-    folder = keep_results(run, tmp_path / "two_against_random")
+    folder = export_results(run, tmp_path / "two_against_random")
     text = write_report([folder], tmp_path).read_text()
     returns = as_curves(read_episodes(run))["collective_return"]
     assert "| two_against_random | 4 |  | " in text, "the study gives no random score for experiment 4"
@@ -131,7 +131,7 @@ def test_a_stored_policy_plays_again_and_every_step_is_recorded(run, tmp_path, c
     monkeypatch.setattr("sys.argv", ["cprl", "replay", str(run), "--out", str(tmp_path / "c.rrd")])
     cli.main()
     told = capsys.readouterr().out
-    assert f"Watch: {Path(sys.executable).with_name('rerun')} {tmp_path / 'c.rrd'}" in told
+    assert f"ViewerCallback: {Path(sys.executable).with_name('rerun')} {tmp_path / 'c.rrd'}" in told
 
 
 def test_watch_opens_all_recordings_of_a_run_as_one(tmp_path, monkeypatch, capsys):

@@ -12,16 +12,17 @@ from rerun.chunk import RrdReader
 from tensordict import TensorDict
 
 from cprl import CommonsEnv, Game, Observation, Rules, maps
-from cprl.acting import RandomActor
 from cprl.commons.colours import APPLE, BEAM, COLOURS, FIRST_AGENT, GROUND, OTHER, SELF, WALL
 from cprl.commons.seeing import UNSEEN, classes_seen
-from cprl.learning import DQNLearner, DQNSettings
-from cprl.recording.frames import Frame, FrameBuffer, mosaic, window_corners
-from cprl.recording.rerun import RerunLogger
-from cprl.recording.scenery import Scene
-from cprl.recording.stage import boards
-from cprl.recording.watch import Watch
-from cprl.train import train
+from cprl.learners.settings import DQNSettings
+from cprl.learners.single import DQNLearner
+from cprl.policies.single import RandomActor
+from cprl.training import train
+from cprl.viewer.callback import ViewerCallback
+from cprl.viewer.frames import Frame, FrameBuffer, mosaic, window_corners
+from cprl.viewer.logger import RerunLogger
+from cprl.viewer.scenery import Scene
+from cprl.viewer.stage import boards
 
 GAME = Game(
     map=maps.parse(".A>.A\n.A.A.\n..<.A"),
@@ -235,7 +236,7 @@ def test_classes_are_known_in_every_form_of_observation(encoding, agents_apart):
     game = replace(GAME, observation=Observation(encoding=encoding, agents_apart=agents_apart))
     env = CommonsEnv(game)
     env.reset()
-    classes = classes_seen(game, env.told.observation)
+    classes = classes_seen(game, env.output.observation)
     other = FIRST_AGENT + 1 if agents_apart else OTHER
     assert (classes[0, 0] == SELF).sum() == 1
     assert (classes[0, 0] == other).sum() == 1
@@ -295,10 +296,10 @@ def trained(run, *, watched):
     settings = DQNSettings(buffer_size=200, learning_rate=1e-3)
     learner = DQNLearner(GAME.observation_shape, 8, settings=settings, seed=1)
     env = CommonsEnv(GAME, seed=1)
-    observers = [Watch(run, env, title="run", episodes=4)] if watched else []
-    train(env, {0: learner}, others={1: RandomActor(8)}, episodes=4, observers=observers)
-    for observer in observers:
-        observer.__exit__(None, None, None)
+    callbacks = [ViewerCallback(run, env, title="run", episodes=4)] if watched else []
+    train(env, {0: learner}, others={1: RandomActor(8)}, episodes=4, callbacks=callbacks)
+    for callback in callbacks:
+        callback.__exit__(None, None, None)
     return torch.cat([weight.flatten() for weight in learner.network.parameters()]), torch.get_rng_state()
 
 

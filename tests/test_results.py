@@ -21,8 +21,8 @@ import torch
 
 from cprl import Map, Rules, presets
 from cprl.measuring import Episode, social
-from cprl.recording.results import COLUMNS, EpisodeTable, read_episodes
-from cprl.recording.run import start_run, to_jsonable
+from cprl.runs.directory import start_run, to_jsonable
+from cprl.runs.episodes import COLUMNS, EpisodeTable, read_episodes
 
 
 def an_episode(number: int = 0, *, world: int = 0, **metrics: float) -> Episode:

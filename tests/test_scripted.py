@@ -10,10 +10,10 @@ from tensordict.nn import TensorDictModuleBase
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 
 from cprl import CommonsEnv, Game, Observation, Rules, maps, presets
-from cprl.acting import Seats
-from cprl.acting.scripted import MANNERS, ScriptedActor
 from cprl.commons.rules import ACTIONS
 from cprl.measuring.evaluate import evaluate
+from cprl.policies.assignment import AgentPolicies
+from cprl.policies.scripted import SCRIPTED_POLICIES, ScriptedActor
 
 
 class Stays(TensorDictModuleBase):
@@ -31,14 +31,14 @@ class Stays(TensorDictModuleBase):
 
 
 class Scene(Play):
-    """A drawn board on which agent 0 is of a manner and all others stay; through CommonsEnv."""
+    """A drawn board on which agent 0 is of a policy and all others stay; through CommonsEnv."""
 
-    def __init__(self, drawing, manner, *, worlds=1, seed=0, spare=3, **rules):
+    def __init__(self, drawing, policy, *, worlds=1, seed=0, spare=3, **rules):
         self.game = Game(map=maps.parse(drawing), rules=Rules(**{"regrow_prob": (0.0,), **rules}))
         seeds = [(seed, world) for world in range(worlds)]
-        actors = [ScriptedActor(manner, self.game, seeds=seeds, seats=1, spare=spare)]
+        actors = [ScriptedActor(policy, self.game, seeds=seeds, agents=1, spare=spare)]
         actors += [Stays(len(self.game.actions)) for _ in range(self.game.agents - 1)]
-        self.policy = Seats({(0,): actors[0], **dict(enumerate(actors[1:], 1))})
+        self.policy = AgentPolicies({(0,): actors[0], **dict(enumerate(actors[1:], 1))})
         self.env = CommonsEnv(self.game, worlds, seed=seed)
         self.batch, self.bitten = self.env.worlds, 0.0
 
@@ -82,12 +82,12 @@ CROSS = """
 
 
 @pytest.mark.parametrize(
-    ("manner", "spare", "left"), [("sustainable", 3, 3), ("sustainable", 1, 1), ("greedy", 3, 0)]
+    ("policy", "spare", "left"), [("sustainable", 3, 3), ("sustainable", 1, 1), ("greedy", 3, 0)]
 )
-def test_sustainable_leaves_as_many_apples_of_a_patch_as_it_is_told(manner, spare, left):
-    scene = Scene(CROSS, manner, worlds=8, spare=spare, may_fire=False)
+def test_sustainable_leaves_as_many_apples_of_a_patch_as_it_is_told(policy, spare, left):
+    scene = Scene(CROSS, policy, worlds=8, spare=spare, may_fire=False)
     scene.go(200)
-    assert scene.env.told.stock[:, 0].tolist() == [left] * 8
+    assert scene.env.output.stock[:, 0].tolist() == [left] * 8
 
 
 def test_sustainable_walks_over_no_apple_that_it_spares():
@@ -98,7 +98,7 @@ def test_sustainable_walks_over_no_apple_that_it_spares():
 
 
 @pytest.mark.parametrize(
-    ("drawing", "manner", "fires"),
+    ("drawing", "policy", "fires"),
     [
         (">..<A", "territorial", True),
         (">..<.A", "territorial", True),
@@ -116,8 +116,8 @@ def test_sustainable_walks_over_no_apple_that_it_spares():
         (".>...\n.....\n...<A", "territorial", False),
     ],
 )
-def test_who_fires_at_whom(drawing, manner, fires):
-    scene = Scene(drawing, manner, window_rows=8, window_columns=9)
+def test_who_fires_at_whom(drawing, policy, fires):
+    scene = Scene(drawing, policy, window_rows=8, window_columns=9)
     assert (scene.go(1) == ["beam"]) == fires
     assert scene.in_play[1] != fires, "and the beam hits"
 
@@ -135,15 +135,15 @@ def test_aggressive_harvests_where_it_sees_nobody():
     assert scene.bitten == 1
 
 
-@pytest.mark.parametrize("manner", ["greedy", "territorial", "aggressive", "pacifist"])
-def test_cells_out_of_sight_are_neither_ground_nor_agents(manner):
-    scene = Scene("..#A\n.>#.\n...A", manner, walls_block_sight=True, window_columns=3)
+@pytest.mark.parametrize("policy", ["greedy", "territorial", "aggressive", "pacifist"])
+def test_cells_out_of_sight_are_neither_ground_nor_agents(policy):
+    scene = Scene("..#A\n.>#.\n...A", policy, walls_block_sight=True, window_columns=3)
     assert scene.go(1)[0].startswith("turn_"), "the wall ahead hides what lies behind it"
 
 
-@pytest.mark.parametrize(("manner", "goes"), [("greedy", 1.0), ("pacifist", 0.0)])
-def test_pacifist_leaves_an_apple_to_which_another_is_nearer(manner, goes):
-    scene = Scene("^..A.<\n......", manner, worlds=64)
+@pytest.mark.parametrize(("policy", "goes"), [("greedy", 1.0), ("pacifist", 0.0)])
+def test_pacifist_leaves_an_apple_to_which_another_is_nearer(policy, goes):
+    scene = Scene("^..A.<\n......", policy, worlds=64)
     steps = scene.env.rollout(1, scene.policy)
     went = (steps["agents", "action"][:, 0, 0] == ACTIONS.index("right")).double().mean()
     assert went == goes
@@ -152,18 +152,18 @@ def test_pacifist_leaves_an_apple_to_which_another_is_nearer(manner, goes):
 def test_two_who_want_one_cell_wait_for_each_other_until_one_gets_it():
     game = Game(map=maps.parse(">A<\n#.#"), rules=Rules(regrow_prob=(0.0,)))
     seeds = [(0, lane) for lane in range(20)]
-    actor = ScriptedActor("greedy", game, seeds=seeds, seats=2)
-    ends = evaluate(CommonsEnv(game, 10), Seats({(0, 1): actor}))
+    actor = ScriptedActor("greedy", game, seeds=seeds, agents=2)
+    ends = evaluate(CommonsEnv(game, 10), AgentPolicies({(0, 1): actor}))
     harvest = np.array([episode.harvest for episode in ends])
     assert harvest.sum(1).tolist() == [1] * 10
     assert 0 < harvest[:, 0].sum() < 10, "not always the same one"
     assert max(episode.steps for episode in ends) > 1
 
 
-def population(manner, game, worlds, seed=0):
+def population(policy, game, worlds, seed=0):
     seeds = [(seed, agent) for agent in range(game.agents)]
-    actor = ScriptedActor(manner, game, seeds=seeds, seats=game.agents, worlds=worlds)
-    return evaluate(CommonsEnv(game, worlds, seed=seed), Seats({tuple(range(game.agents)): actor}))
+    actor = ScriptedActor(policy, game, seeds=seeds, agents=game.agents, worlds=worlds)
+    return evaluate(CommonsEnv(game, worlds, seed=seed), AgentPolicies({tuple(range(game.agents)): actor}))
 
 
 def mean(episodes, name):
@@ -172,7 +172,7 @@ def mean(episodes, name):
 
 def test_greedy_harvests_far_more_than_random_where_it_is_alone():
     game = presets.game("single_basic")
-    returns = {manner: mean(population(manner, game, 8), "return_") for manner in ("random", "greedy")}
+    returns = {policy: mean(population(policy, game, 8), "return_") for policy in ("random", "greedy")}
     assert returns["greedy"] > 1.5 * returns["random"], returns
 
 
@@ -203,15 +203,15 @@ FORMS = [
 
 
 @pytest.mark.parametrize("may_fire", [True, False])
-@pytest.mark.parametrize("manner", MANNERS)
-def test_the_form_of_what_is_seen_makes_no_difference(manner, may_fire):
+@pytest.mark.parametrize("policy", SCRIPTED_POLICIES)
+def test_the_form_of_what_is_seen_makes_no_difference(policy, may_fire):
     walled = maps.parse("A.A.#.A\n.>A.#AA\nA..v.A.\n..#A.<.")
     rules = Rules(walls_block_sight=True, may_fire=may_fire, window_rows=4, window_columns=7)
     courses = []
     for form in FORMS:
         game = Game(map=walled, rules=rules, observation=form)
-        actor = ScriptedActor(manner, game, seeds=[(1, lane) for lane in range(9)], seats=3)
-        steps = CommonsEnv(game, 3).rollout(40, Seats({(0, 1, 2): actor}), break_when_any_done=False)
+        actor = ScriptedActor(policy, game, seeds=[(1, lane) for lane in range(9)], agents=3)
+        steps = CommonsEnv(game, 3).rollout(40, AgentPolicies({(0, 1, 2): actor}), break_when_any_done=False)
         courses.append(steps["agents", "action"])
     assert courses[0].max() < len(game.actions)
     assert courses[0].unique().numel() > 3
@@ -224,27 +224,27 @@ def windows(game, worlds, turns=15):
     return CommonsEnv(game, worlds).rollout(turns)["next", "agents", "observation"][:, -1].contiguous()
 
 
-@pytest.mark.parametrize("manner", MANNERS)
-def test_a_lanes_choices_do_not_depend_on_other_lanes(manner):
+@pytest.mark.parametrize("policy", SCRIPTED_POLICIES)
+def test_a_lanes_choices_do_not_depend_on_other_lanes(policy):
     game = presets.game("commons")
     seen = windows(game, 6)  # 2 replicas x 3 worlds, of which seats 1 and 3
-    seeds = [(5, replica, seat) for replica in range(2) for seat in (1, 3)]
-    everyone = ScriptedActor(manner, game, seeds=seeds, seats=2, worlds=3)
+    seeds = [(5, replica, agent) for replica in range(2) for agent in (1, 3)]
+    everyone = ScriptedActor(policy, game, seeds=seeds, agents=2, worlds=3)
     everyone.epsilon = 0.3
     together = [everyone.choose(seen[:, [1, 3]]) for _ in range(30)]
     for lane, seed in enumerate(seeds):
-        replica, seat = divmod(lane, 2)
-        alone = ScriptedActor(manner, game, seeds=[seed], seats=1, worlds=3)
+        replica, agent = divmod(lane, 2)
+        alone = ScriptedActor(policy, game, seeds=[seed], agents=1, worlds=3)
         alone.epsilon = 0.3
         own = slice(3 * replica, 3 * replica + 3)
         for chosen in together:
-            expected = alone.choose(seen[own, [[1], [3]][seat]])
-            assert torch.equal(chosen[own, seat], expected[:, 0])
+            expected = alone.choose(seen[own, [[1], [3]][agent]])
+            assert torch.equal(chosen[own, agent], expected[:, 0])
 
 
 def test_epsilon_is_the_chance_of_a_random_action_where_actors_explore():
     game = Game(map=maps.parse("A..\n...\n^.."), rules=Rules())
-    actor = ScriptedActor("greedy", game, seeds=[(lane,) for lane in range(4000)], seats=1)
+    actor = ScriptedActor("greedy", game, seeds=[(lane,) for lane in range(4000)], agents=1)
     seen = CommonsEnv(game, 4000).reset()["agents", "observation"]
     actor.epsilon = 0.4
     counts = torch.bincount(actor.choose(seen)[:, 0], minlength=8)
@@ -259,7 +259,7 @@ def test_it_goes_on_from_its_state():
     seen = windows(game, 2)
 
     def made():
-        return ScriptedActor("random", game, seeds=[(0, lane) for lane in range(4)], seats=2)
+        return ScriptedActor("random", game, seeds=[(0, lane) for lane in range(4)], agents=2)
 
     one, other = made(), made()
     for _ in range(7):
@@ -270,23 +270,23 @@ def test_it_goes_on_from_its_state():
 
 
 @pytest.mark.parametrize(
-    ("manner", "how", "message"),
+    ("policy", "how", "message"),
     [
-        ("grim", {}, "manner is 'grim'; allowed: random, greedy"),
+        ("grim", {}, "policy is 'grim'; allowed: random, greedy"),
         ("greedy", {"area": "full"}, "Observation.area is 'full'; .* area=\"window\" is what fits"),
-        ("greedy", {"seats": 2}, "3 seeds for 2 seats; a seed for each lane is wanted"),
+        ("greedy", {"agents": 2}, "3 seeds for 2 agents; a seed for each lane is wanted"),
         ("greedy", {"worlds": 0}, "worlds is 0; at least 1"),
         ("sustainable", {"spare": 0}, "spare is 0; at least 1"),
     ],
 )
-def test_what_cannot_be_is_refused_before_anything_is_played(manner, how, message):
-    how = {"seats": 1, "area": "window", **how}
+def test_what_cannot_be_is_refused_before_anything_is_played(policy, how, message):
+    how = {"agents": 1, "area": "window", **how}
     game = replace(presets.game("commons"), observation=Observation(area=how.pop("area")))
     with pytest.raises(ValueError, match=message):
-        ScriptedActor(manner, game, seeds=[(lane,) for lane in range(3)], **how)
+        ScriptedActor(policy, game, seeds=[(lane,) for lane in range(3)], **how)
 
 
 def test_windows_of_another_game_are_refused():
-    actor = ScriptedActor("greedy", presets.game("commons"), seeds=[(0,)], seats=1)
+    actor = ScriptedActor("greedy", presets.game("commons"), seeds=[(0,)], agents=1)
     with pytest.raises(ValueError, match=r"is \[1, 1, 3, 6, 13\]; \[1, 1, 3, 7, 15\] is wanted"):
         actor.choose(windows(presets.game("single_basic"), 1))

@@ -18,7 +18,7 @@ GAME = Game(
 
 def some_way_on(game, worlds=3, steps=40, **how):
     batch = Batch(game, worlds, **how)
-    told = batch.begin(batch.new_told())
+    told = batch.begin(batch.new_output())
     for turn in random_actions(steps, worlds, game):
         batch.play(turn, told)
     return batch, told
@@ -31,7 +31,7 @@ def test_a_batch_that_loads_a_state_goes_on_as_the_one_it_was_read_from(board, v
     game = Game(map=game.map, rules=game.rules, observation=Observation(scoreboard=True))
     batch, told = some_way_on(game, seed=5)
     other = Batch(game, 3, seed=77, first_world=9)
-    shown = other.load(batch.state(), other.new_told())
+    shown = other.load(batch.state(), other.new_output())
     assert_same(other.now, batch.now)
     for name in ("observation", "in_play", "scoreboard", "stock", "terminated", "truncated", "done"):
         assert np.array_equal(getattr(shown, name), getattr(told, name)), name
@@ -96,7 +96,7 @@ def test_planning_ahead_and_back_changes_nothing():
 )
 def test_a_state_that_cannot_be_is_refused_and_changes_nothing(change, message):
     batch = Batch(GAME, 2)
-    told = batch.begin(batch.new_told())
+    told = batch.begin(batch.new_output())
     state, before = batch.state(), copied(batch.now)
     for name, value in change.items():
         state[name][0, 0] = value
@@ -107,7 +107,7 @@ def test_a_state_that_cannot_be_is_refused_and_changes_nothing(change, message):
 
 def test_other_names_shapes_and_types_are_refused():
     batch = Batch(GAME, 2)
-    told, state = batch.begin(batch.new_told()), batch.state()
+    told, state = batch.begin(batch.new_output()), batch.state()
     with pytest.raises(ValueError, match=r"lacks \['row'\] and has the unknown \['line'\]"):
         batch.load({"line" if name == "row" else name: array for name, array in state.items()}, told)
     with pytest.raises(ValueError, match=r"state\['row'\] is int64 \(2, 2\); wanted: int32 \(2, 2\)"):
@@ -119,7 +119,7 @@ def test_other_names_shapes_and_types_are_refused():
 def test_two_agents_on_a_cell_are_a_state_as_run():
     game = presets.game("two_complex", variant="as_run")
     batch = Batch(game, 1)
-    told, state = batch.begin(batch.new_told()), batch.state()
+    told, state = batch.begin(batch.new_output()), batch.state()
     state["row"][:], state["col"][:] = 3, 3
     batch.load(state, told)
     assert batch.now.row.tolist() == [[3, 3]]
@@ -136,12 +136,12 @@ def test_two_agents_on_a_cell_are_a_state_as_run():
 def test_arrays_to_tell_into_that_do_not_fit_are_refused(told):
     batch = Batch(GAME, 2)
     with pytest.raises(ValueError, match=r"told\.\w+ is .*; wanted: .* contiguous and writeable"):
-        batch.begin(told(batch.new_told()))
+        batch.begin(told(batch.new_output()))
 
 
 def test_actions_that_are_not_contiguous_are_refused():
     batch = Batch(GAME, 2)
-    told = batch.begin(batch.new_told())
+    told = batch.begin(batch.new_output())
     with pytest.raises(ValueError, match=r"int64 \(2, 2\) is not contiguous"):
         batch.play(np.zeros((2, 4), np.int64)[:, ::2], told)
     assert batch.now.step.sum() == 0

@@ -9,14 +9,14 @@ import pytest
 import torch
 
 from cprl import CommonsEnv, Game, Observation, Rules, maps
-from cprl.acting import Seats
-from cprl.acting.scripted import ScriptedActor
-from cprl.acting.tabular import NEVER_MET, QTables
-from cprl.learning import TabularLearner, TabularSettings
+from cprl.learners.settings import TabularSettings
+from cprl.learners.tabular import TabularLearner
 from cprl.measuring.evaluate import evaluate
-from cprl.recording import Checkpoints
-from cprl.recording.checkpoints import checkpoints_in, read_checkpoint
-from cprl.train import Training, train
+from cprl.policies.assignment import AgentPolicies
+from cprl.policies.scripted import ScriptedActor
+from cprl.policies.tabular import NEVER_MET, QTables
+from cprl.runs.checkpoints import Checkpointer, checkpoints_in, read_checkpoint
+from cprl.training import Training, train
 
 SEES_ALL = {"window_rows": 4, "window_columns": 7, "may_fire": False}
 GAUGE = Observation(stock_gauge=True)
@@ -40,8 +40,8 @@ def outcomes(game, state, action):
     board, name = game.map, game.actions[action]
     row, col, heading, stock = state
     if name in QUARTER_TURNS:
-        way = (heading + QUARTER_TURNS[name]) % 4
-        cell = row + ROW[way], col + COL[way]
+        engine = (heading + QUARTER_TURNS[name]) % 4
+        cell = row + ROW[engine], col + COL[engine]
         is_inside = 0 <= cell[0] < board.height and 0 <= cell[1] < board.width
         row, col = cell if is_inside and cell not in board.walls else (row, col)
     else:
@@ -118,9 +118,11 @@ def played(game, *, worlds, turns):
         before, seen, had_ended = true_states(env), observed(moment["agents"]), moment["done"][:, 0].tolist()
         moment["agents", "action"] = actions
         moment = env.step(moment)["next"]
-        after, paid = true_states(env), moment["agents", "reward"].flatten().tolist()
+        after, reward_kind = true_states(env), moment["agents", "reward"].flatten().tolist()
         terminated = moment["terminated"][:, 0].tolist()
-        yield from zip(before, seen, actions[:, 0].tolist(), paid, after, had_ended, terminated, strict=True)
+        yield from zip(
+            before, seen, actions[:, 0].tolist(), reward_kind, after, had_ended, terminated, strict=True
+        )
         moment = moment.exclude(("agents", "reward"))
 
 
@@ -135,8 +137,8 @@ def known(request):
 def test_the_model_is_the_game_and_what_is_observed_tells_the_state(known):
     game, model, rows = known
     counts = {}
-    for before, _, action, paid, after, _, terminated in rows:
-        outcome = paid, None if terminated else after
+    for before, _, action, reward_kind, after, _, terminated in rows:
+        outcome = reward_kind, None if terminated else after
         counts.setdefault((before, action), {}).setdefault(outcome, 0)
         counts[before, action][outcome] += 1
     assert {state for state, _ in counts} == set(model.states)
@@ -153,7 +155,7 @@ def test_the_model_is_the_game_and_what_is_observed_tells_the_state(known):
 
 
 def learned(game, settings, *, episodes, replicas=2, seed=0):
-    learner = TabularLearner(game, seats=[0], replicas=replicas, settings=settings, seed=seed)
+    learner = TabularLearner(game, agents=[0], replicas=replicas, settings=settings, seed=seed)
     train(CommonsEnv(game, replicas, seed=seed), {(0,): learner}, episodes=episodes)
     return learner
 
@@ -218,8 +220,8 @@ def taught(learner, *names):
     for name in names:
         moment["agents", "action"] = torch.tensor([[learner.game.actions.index(name)]])
         batch = env.step(moment)
-        learner.remember(batch)
-        learner.learn()
+        learner.store(batch)
+        learner.update()
         moment = batch["next"].exclude(("agents", "reward"))
     return batch
 
@@ -232,14 +234,14 @@ def test_what_comes_after_the_clock_counts_and_nothing_after_the_last_apple():
     settings = TabularSettings(learning_rate=1.0, gamma=0.5)
     rules = {"window_rows": 3, "window_columns": 1, "may_fire": False}
     short = Game(map=maps.parse("A>A"), rules=Rules(episode_steps=1, **rules))
-    learner = TabularLearner(short, seats=[0], replicas=1, settings=settings)
+    learner = TabularLearner(short, agents=[0], replicas=1, settings=settings)
     taught(learner, "forward")  # Q(start, forward) = 1
     assert taught(learner, "stay")["next", "truncated"].item()
     assert value_at_the_start(learner, "stay") == 0.5
 
     # Who looks at the wall on the right sees the same whether the left apple hangs (X) or not (terminal).
     endless = Game(map=maps.parse("A>A"), rules=Rules(regrow_prob=(0.0,), **rules))
-    learner = TabularLearner(endless, seats=[0], replicas=1, settings=settings)
+    learner = TabularLearner(endless, agents=[0], replicas=1, settings=settings)
     for expected in (1.0, 1.0, 1.25):  # backward from X is worth 0, then 0.5 x 1, and so X itself
         taught(learner, "forward", "backward", "backward")
         assert value_at_the_start(learner, "forward") == expected
@@ -250,9 +252,9 @@ def test_what_comes_after_the_clock_counts_and_nothing_after_the_last_apple():
 
 def test_the_learned_policy_plays_through_its_evaluation_actor():
     learner = learned(ONCE, TabularSettings(learning_rate=1.0, **EXPLORES), episodes=40)
-    ends = evaluate(CommonsEnv(ONCE, 6, seed=1), Seats({(0,): learner.evaluation_actor(3)}))
+    ends = evaluate(CommonsEnv(ONCE, 6, seed=1), AgentPolicies({(0,): learner.evaluation_actor(3)}))
     assert [(episode.steps, episode.harvest.sum()) for episode in ends] == [(2, 2.0)] * 6
-    explored = evaluate(CommonsEnv(ONCE, 6), Seats({(0,): learner.evaluation_actor(3)}), explore=True)
+    explored = evaluate(CommonsEnv(ONCE, 6), AgentPolicies({(0,): learner.evaluation_actor(3)}), explore=True)
     assert len(explored) == 6
 
 
@@ -268,7 +270,7 @@ def test_an_agents_course_does_not_depend_on_other_replicas():
     tables = []
     for first, replicas in ((0, 3), (1, 1)):
         learner = TabularLearner(
-            PAIR, seats=[0, 1], replicas=replicas, settings=settings, first_replica=first
+            PAIR, agents=[0, 1], replicas=replicas, settings=settings, first_replica=first
         )
         env = CommonsEnv(PAIR, replicas, first_world=first)
         training = Training(env, {(0, 1): learner}, episodes=100)
@@ -286,31 +288,31 @@ class Dying:
     def __init__(self, turns):
         self.left = turns
 
-    def see_turn(self, batch):
+    def on_step(self, batch):
         self.left -= 1
         if self.left == 0:
             raise ZeroDivisionError
 
-    def see_episode(self, episode, learning):
+    def on_episode(self, episode, learning):
         """Nothing."""
 
 
-@pytest.mark.parametrize("learn_every", [1, 3])
-def test_a_training_beside_a_scripted_agent_goes_on_from_its_checkpoint(tmp_path, learn_every):
-    def trained(run, observers=()):
+@pytest.mark.parametrize("update_every", [1, 3])
+def test_a_training_beside_a_scripted_agent_goes_on_from_its_checkpoint(tmp_path, update_every):
+    def trained(run, callbacks=()):
         settings = TabularSettings(epsilon_hold_steps=10, epsilon_decay_steps=200)
-        learner = TabularLearner(PAIR, seats=[0], replicas=2, settings=settings)
-        other = ScriptedActor("territorial", PAIR, seeds=[(1, r) for r in range(2)], seats=1)
+        learner = TabularLearner(PAIR, agents=[0], replicas=2, settings=settings)
+        other = ScriptedActor("territorial", PAIR, seeds=[(1, r) for r in range(2)], agents=1)
         run.mkdir(exist_ok=True)
-        with Checkpoints(run, every_s=1e-9 if observers else 1000.0) as checkpoints:
+        with Checkpointer(run, every_s=1e-9 if callbacks else 1000.0) as checkpoints:
             train(
                 CommonsEnv(PAIR, 2),
                 {(0,): learner},
                 others={(1,): other},
                 episodes=5,
-                observers=observers,
+                callbacks=callbacks,
                 checkpoints=checkpoints,
-                learn_every=learn_every,
+                update_every=update_every,
             )
         return learner
 
@@ -318,10 +320,10 @@ def test_a_training_beside_a_scripted_agent_goes_on_from_its_checkpoint(tmp_path
     with pytest.raises(ZeroDivisionError):
         trained(tmp_path / "parts", [Dying(36)])
     kept = read_checkpoint(checkpoints_in(tmp_path / "parts" / "checkpoints")[-1])
-    assert (kept["steps"], len(kept["learners"][0]["turns"])) == (35, 35 % learn_every)
+    assert (kept["steps"], len(kept["learners"][0]["turns"])) == (35, 35 % update_every)
     parts = trained(tmp_path / "parts")
     assert whole.steps == parts.steps > 50
-    assert whole.tables.visits.sum() == 2 * (whole.steps - whole.steps % learn_every)
+    assert whole.tables.visits.sum() == 2 * (whole.steps - whole.steps % update_every)
     assert whole.tables.rows == parts.tables.rows
     size = whole.tables.size
     assert np.array_equal(whole.tables.values[:size], parts.tables.values[:size])
@@ -329,7 +331,7 @@ def test_a_training_beside_a_scripted_agent_goes_on_from_its_checkpoint(tmp_path
 
 
 def test_more_states_than_are_allowed_are_refused():
-    learner = TabularLearner(ONCE, seats=[0], replicas=1, settings=TabularSettings(max_states=3))
+    learner = TabularLearner(ONCE, agents=[0], replicas=1, settings=TabularSettings(max_states=3))
     with pytest.raises(MemoryError, match="lane 0 has met 3 states, as many as max_states allows"):
         taught(learner, "turn_left", "turn_left", "turn_left", "turn_left", "forward")
     assert len(learner.q_table(0)["values"]) == 3

@@ -20,15 +20,18 @@ from test_population import (
 
 import cprl
 from cprl import CommonsEnv, Game, Rules, maps, presets
-from cprl.acting.networks import acting_part
-from cprl.acting.teams import Mixing, TeamNetwork
-from cprl.learning import DQN, IPPO, MAPPO, QMIX, VDN, DQNSettings
-from cprl.learning.fused import FunctionalUpdate
-from cprl.learning.lanes import LaneLearner
-from cprl.learning.ways import trial_batch
+from cprl.algorithms.dqn import DQN
+from cprl.algorithms.on_policy_teams import IPPO, MAPPO
+from cprl.algorithms.teams import QMIX, VDN
+from cprl.learners.engine.choice import trial_batch
+from cprl.learners.engine.compiled import FunctionalEngine
+from cprl.learners.replay import ReplayLearner
+from cprl.learners.settings import DQNSettings
 from cprl.measuring.evaluate import evaluate
+from cprl.networks.agent import acting_part
+from cprl.networks.team import Mixing, TeamNetwork
 from cprl.population import Frozen, Learner, Population, Scripted
-from cprl.train import train
+from cprl.training import train
 
 TEAMS = {
     "VDN": VDN(settings=REPLAY),
@@ -41,7 +44,7 @@ FOUR = tuple(range(4))
 
 
 def team_of(name, **how):
-    agents = population([Learner(TEAMS[name], paid="group")] * 4, **how)
+    agents = population([Learner(TEAMS[name], reward_kind="group")] * 4, **how)
     (learner,) = agents.learners.values()
     return agents, learner
 
@@ -71,12 +74,13 @@ def test_each_team_moves_every_members_weights_and_no_replica_knows_of_the_other
 def test_each_team_takes_the_way_that_agrees_with_a_list_of_torchrls_losses(name):
     algorithm = TEAMS[name]
     _, found = team_of(name)
-    common = {"seats": FOUR, "replicas": 2, "settings": algorithm.settings, "seed": 3, "paid": "group"}
+    common = {"agents": FOUR, "replicas": 2, "settings": algorithm.settings, "seed": 3}
+    common |= {"reward_kind": "group"}
     common |= {"make_network": lambda: algorithm.network(GAME), "make_loss": algorithm.loss, "compile": False}
     common |= {"make_team": lambda members: algorithm.team(members, GAME)}
     kind = type(found)
     ends = []
-    for one in (found, kind(GAME, way=WAYS[name], **common), kind(GAME, way="list", **common)):
+    for one in (found, kind(GAME, engine=WAYS[name], **common), kind(GAME, engine="list", **common)):
         train(CommonsEnv(GAME, 2, seed=3), {FOUR: one}, episodes=3)
         ends.append([network.state_dict() for network in one.networks().values()])
     for mine, named, by_list in zip(*ends, strict=True):
@@ -87,9 +91,9 @@ def test_each_team_takes_the_way_that_agrees_with_a_list_of_torchrls_losses(name
 
 def test_qmix_over_many_observations_is_not_slowed_by_what_the_trial_rounds():
     game = presets.game("commons")  # 1260 inputs to its mixing
-    members = [Learner(QMIX(settings=DQNSettings(buffer_size=50)), paid="group")] * 4
+    members = [Learner(QMIX(settings=DQNSettings(buffer_size=50)), reward_kind="group")] * 4
     (learner,) = Population(game, members, replicas=2, compile=False).learners.values()
-    assert isinstance(learner.update, FunctionalUpdate)
+    assert isinstance(learner.engine, FunctionalEngine)
 
 
 def test_a_member_acts_by_its_own_network_and_what_it_sees_itself():
@@ -119,13 +123,13 @@ def test_the_loss_of_vdn_is_that_of_the_sum_of_its_members_values():
     assert 0 < ends.sum() < 8
 
     def values(observation):
-        return torch.stack([own(observation[:, seat]) for seat, own in enumerate(networks)], 1)
+        return torch.stack([own(observation[:, agent]) for agent, own in enumerate(networks)], 1)
 
     with torch.no_grad():  # r + gamma sum of max Q', the targets are still copies
         chosen = values(turn["observation"]).gather(-1, turn["action"].unsqueeze(-1)).sum((1, 2))
         best = values(turn["next", "observation"]).amax(-1).sum(1)
         target = turn["next", "reward"].squeeze(-1) + REPLAY.gamma * ~ends * best
-    torch.testing.assert_close(learner.update.learn_from(batch), (target - chosen).square().mean()[None])
+    torch.testing.assert_close(learner.engine.update_from(batch), (target - chosen).square().mean()[None])
 
 
 def first_turn(replicas=1):
@@ -144,10 +148,10 @@ def first_turn(replicas=1):
 
 
 def test_a_team_is_paid_for_all_agents_also_those_who_are_not_of_it():
-    agents = population([Scripted(), *[Learner(TEAMS["VDN"], paid="group")] * 2, Scripted()])
-    ((seats, learner),) = agents.learners.items()
-    assert seats == (1, 2)
-    learner.remember(first_turn(2))
+    agents = population([Scripted(), *[Learner(TEAMS["VDN"], reward_kind="group")] * 2, Scripted()])
+    ((agents, learner),) = agents.learners.items()
+    assert agents == (1, 2)
+    learner.store(first_turn(2))
     fields = learner.buffer.storage.fields
     assert fields["reward"][0].tolist() == [6.0, 6.0]
     assert fields["action"][0].tolist() == [[1, 2], [1, 2]]
@@ -170,8 +174,8 @@ def test_advantages_are_normalised_within_a_team(name):
     _, learner = team_of(name)
     env = CommonsEnv(GAME, 2, seed=3)
     seen = []
-    learn_from = learner.update.learn_from
-    learner.update.learn_from = lambda batch: seen.append(batch) or learn_from(batch)
+    update_from = learner.engine.update_from
+    learner.engine.update_from = lambda batch: seen.append(batch) or update_from(batch)
     train(env, {FOUR: learner}, episodes=2)
     advantage = torch.cat([batch["advantage"] for batch in seen[:2]], 1)
     assert advantage.shape == (2, 20, 4, 1)
@@ -194,12 +198,12 @@ def test_the_teams_value_grows_with_each_members_value():
 
 @pytest.mark.parametrize("name", ["QMIX", "MAPPO"])
 def test_a_team_that_was_stopped_goes_on_bit_for_bit(name, tmp_path):
-    members = [*[Learner(TEAMS[name], paid="group")] * 3, Learner(DQN(settings=REPLAY))]
+    members = [*[Learner(TEAMS[name], reward_kind="group")] * 3, Learner(DQN(settings=REPLAY))]
     assert_goes_on_bit_for_bit(members, tmp_path, episodes=4)
 
 
 def test_a_teams_run_is_built_again_and_its_members_play_on_frozen(tmp_path, capsys):
-    members = [*[Learner(TEAMS["QMIX"], paid="group")] * 2, *[Learner(TEAMS["IPPO"])] * 2]
+    members = [*[Learner(TEAMS["QMIX"], reward_kind="group")] * 2, *[Learner(TEAMS["IPPO"])] * 2]
     run, agents = conducted(tmp_path, members)
     assert "trained, epsilon 0.05" in " ".join(capsys.readouterr().out.split())
     loaded = cprl.load(run)
@@ -226,20 +230,20 @@ def test_who_shares_a_reward_but_is_paid_for_itself_is_refused(name):
 
 
 def test_what_is_no_team_is_refused_and_what_needs_none_is_not():
-    alone = [Learner(TEAMS["QMIX"], paid="group"), *[Scripted()] * 3]
+    alone = [Learner(TEAMS["QMIX"], reward_kind="group"), *[Scripted()] * 3]
     with pytest.raises(ValueError, match=r"QMIX wants a team of at least 2: .* came with 1, for which DQN"):
         population(alone)
     unequal = [replace(TEAMS["QMIX"], mixing_cells=cells) for cells in (4, 4, 5, 6)]
     with pytest.raises(ValueError, match="QMIX wants a team of at least 2"):
-        population([Learner(algorithm, paid="group") for algorithm in unequal])
+        population([Learner(algorithm, reward_kind="group") for algorithm in unequal])
     assert list(population([Learner(TEAMS["IPPO"])] * 4).learners) == [FOUR]
     with pytest.raises(ValueError, match='paid is "own"; a team that learns from replay shares one reward'):
-        LaneLearner(GAME, seats=FOUR, replicas=2, settings=REPLAY, make_team=TeamNetwork)
+        ReplayLearner(GAME, agents=FOUR, replicas=2, settings=REPLAY, make_team=TeamNetwork)
     wrong = QMIX(settings=ROLLOUTS)
     with pytest.raises(
         ValueError, match="QMIX has settings of the type RolloutSettings; DQNSettings is wanted"
     ):
-        population([Learner(wrong, paid="group")] * 4)
+        population([Learner(wrong, reward_kind="group")] * 4)
 
 
 ROWS = Game(
@@ -261,8 +265,8 @@ def test_a_team_comes_close_to_the_optimum(name):
     algorithm = replace(
         TEAMS[name], settings=test_optimum.ROLLOUTS if name.endswith("PPO") else test_optimum.REPLAY
     )
-    # Paid for the group, one of four replicas of IPPO ended at half of the apples.
-    members = [Learner(algorithm, paid="own" if name == "IPPO" else "group")] * 2
+    # RewardKind for the group, one of four replicas of IPPO ended at half of the apples.
+    members = [Learner(algorithm, reward_kind="own" if name == "IPPO" else "group")] * 2
     team = Population(ROWS, members, replicas=4, seed=1, compile=False)
 
     def share():

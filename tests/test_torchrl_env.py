@@ -83,7 +83,7 @@ def test_the_reward_is_the_harvest_and_changing_it_leaves_the_harvest_alone():
 def test_it_plays_the_game_of_the_batch():
     actions = random_actions(50, 6, SHORT)
     env, batch = CommonsEnv(SHORT, worlds=6, seed=4), Batch(SHORT, 6, seed=4)
-    moment, told = env.reset(), batch.begin(batch.new_told())
+    moment, told = env.reset(), batch.begin(batch.new_output())
     for turn in actions:
         moment[keys.ACTION] = torch.as_tensor(turn)
         moment = env.step(moment)["next"]

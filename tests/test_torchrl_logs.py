@@ -13,7 +13,7 @@ from torchrl.objectives import DQNLoss
 from torchrl.record import VideoRecorder
 from torchrl.trainers import LogScalar, LogValidationReward, Trainer
 
-from cprl.recording import RerunLogger
+from cprl.viewer.logger import RerunLogger
 
 FRAMES = 60
 

@@ -23,7 +23,7 @@ def traced_game(name: str):
 def test_windows_rewards_tags_and_ends_equal_the_published_program(path):
     trace, game = np.load(path), traced_game(path.stem)
     batch = Batch(game, 1)
-    told = batch.begin(batch.new_told())
+    told = batch.begin(batch.new_output())
     windows = trace["obs"].reshape(-1, game.agents, *game.observation_shape)
     assert np.array_equal(told.observation[0], windows[0]), "the first windows differ"
     for turn, actions in enumerate(trace["actions"]):

@@ -8,12 +8,16 @@ import pytest
 import torch
 
 from cprl import CommonsEnv, Game, Rules, maps
-from cprl.acting import RandomActor, Seats
-from cprl.acting.collect import stock_collector
-from cprl.learning import DQNLearner, DQNSettings, LaneLearner
+from cprl.collectors import stock_collector
+from cprl.learners.replay import ReplayLearner
+from cprl.learners.settings import DQNSettings
+from cprl.learners.single import DQNLearner
 from cprl.measuring.evaluate import evaluate, mean_return
-from cprl.recording import Checkpoints, EpisodeTable, read_episodes
-from cprl.train import train
+from cprl.policies.assignment import AgentPolicies
+from cprl.policies.single import RandomActor
+from cprl.runs.checkpoints import Checkpointer
+from cprl.runs.episodes import EpisodeTable, read_episodes
+from cprl.training import train
 
 GAME = Game(
     map=maps.parse(".A>.A\n.A.A.\n..<.A"),
@@ -27,10 +31,10 @@ class Witness:
     def __init__(self):
         self.turns, self.episodes, self.learning = [], [], []
 
-    def see_turn(self, batch):
+    def on_step(self, batch):
         self.turns.append(batch)
 
-    def see_episode(self, episode, learning):
+    def on_episode(self, episode, learning):
         self.episodes.append(episode)
         self.learning.append(dict(learning))
 
@@ -41,7 +45,7 @@ def learner(seed=0):
 
 def test_observers_see_every_turn_and_every_episode_and_the_learner_learns_once_a_turn():
     witness, agent = Witness(), learner()
-    train(CommonsEnv(GAME), {0: agent}, others={1: RandomActor(8)}, episodes=5, observers=[witness])
+    train(CommonsEnv(GAME), {0: agent}, others={1: RandomActor(8)}, episodes=5, callbacks=[witness])
     assert len(witness.turns) == agent.steps == sum(episode.steps for episode in witness.episodes)
     assert [episode.episode for episode in witness.episodes] == [0, 1, 2, 3, 4]
     assert set(witness.learning[-1]) == {"agent_0/loss", "agent_0/epsilon", "agent_0/q"}
@@ -62,7 +66,7 @@ def test_training_again_with_the_same_seeds_gives_the_same_episodes():
     def returns():
         torch.manual_seed(3)
         witness = Witness()
-        train(CommonsEnv(GAME, seed=3), {0: learner(3), 1: learner(4)}, episodes=4, observers=[witness])
+        train(CommonsEnv(GAME, seed=3), {0: learner(3), 1: learner(4)}, episodes=4, callbacks=[witness])
         return [episode.return_.tolist() for episode in witness.episodes]
 
     assert returns() == returns()
@@ -87,15 +91,15 @@ def test_one_world_is_trained_at_a_time():
 
 
 def test_learning_may_wait_for_several_steps_and_then_catches_up():
-    class Counting(LaneLearner):
-        def learn(self):
+    class Counting(ReplayLearner):
+        def update(self):
             told.append(self.steps)
-            return super().learn()
+            return super().update()
 
     told = []
     settings = replace(SETTINGS, learning_starts=1)
-    agents = Counting(GAME, seats=(0, 1), replicas=2, settings=settings, compile=False)
-    training = train(CommonsEnv(GAME, 2), {(0, 1): agents}, episodes=2, learn_every=3)
+    agents = Counting(GAME, agents=(0, 1), replicas=2, settings=settings, compile=False)
+    training = train(CommonsEnv(GAME, 2), {(0, 1): agents}, episodes=2, update_every=3)
     bouts = training.steps // 3
     assert told == [3 * (bout + 1) for bout in range(bouts) for _ in range(3)]
 
@@ -103,8 +107,8 @@ def test_learning_may_wait_for_several_steps_and_then_catches_up():
 def test_torchrls_own_collector_trains_the_same():
     def course(**how):
         witness = Witness()
-        agents = LaneLearner(GAME, seats=(0, 1), replicas=2, settings=SETTINGS, seed=3, compile=False)
-        train(CommonsEnv(GAME, 2, seed=3), {(0, 1): agents}, episodes=4, observers=[witness], **how)
+        agents = ReplayLearner(GAME, agents=(0, 1), replicas=2, settings=SETTINGS, seed=3, compile=False)
+        train(CommonsEnv(GAME, 2, seed=3), {(0, 1): agents}, episodes=4, callbacks=[witness], **how)
         losses = [learning["agent_1/loss"] for learning in witness.learning]
         weights = agents.networks()["replica_1/agent_0"].state_dict().values()
         return (
@@ -114,17 +118,17 @@ def test_torchrls_own_collector_trains_the_same():
         )
 
     assert repr(course(make_collector=stock_collector)) == repr(course())
-    returns, losses, _ = course(make_collector=partial(stock_collector, steps=4), learn_every=4)
+    returns, losses, _ = course(make_collector=partial(stock_collector, steps=4), update_every=4)
     assert len(returns) == 8
     assert np.isfinite(losses[-2:]).all()
 
 
 def test_checkpoints_of_what_keeps_no_state_are_refused_before_anything_is_played(tmp_path):
     env, witness = CommonsEnv(GAME), Witness()
-    how = {"episodes": 1, "checkpoints": Checkpoints(tmp_path), "observers": [witness]}
-    with pytest.raises(ValueError, match="a DQNLearner keeps no state to go on from; use a LaneLearner"):
+    how = {"episodes": 1, "checkpoints": Checkpointer(tmp_path), "callbacks": [witness]}
+    with pytest.raises(ValueError, match="a DQNLearner keeps no state to go on from; use a ReplayLearner"):
         train(env, {0: learner(), 1: learner()}, **how)
-    agents = LaneLearner(GAME, seats=(0, 1), replicas=1, settings=SETTINGS, compile=False)
+    agents = ReplayLearner(GAME, agents=(0, 1), replicas=1, settings=SETTINGS, compile=False)
     with pytest.raises(
         ValueError, match="a Collector keeps no state to go on from; train with a StepCollector"
     ):
@@ -134,21 +138,21 @@ def test_checkpoints_of_what_keeps_no_state_are_refused_before_anything_is_playe
 
 def test_what_was_played_before_an_interruption_is_kept(tmp_path):
     class Interrupting(Witness):
-        def see_episode(self, episode, learning):
-            super().see_episode(episode, learning)
+        def on_episode(self, episode, learning):
+            super().on_episode(episode, learning)
             if len(self.episodes) == 3:
                 raise KeyboardInterrupt
 
-    seats = {1: RandomActor(8)}
+    agents = {1: RandomActor(8)}
     table = EpisodeTable(tmp_path / "episodes.parquet")
     with pytest.raises(KeyboardInterrupt), table:
-        train(CommonsEnv(GAME), {0: learner()}, others=seats, episodes=9, observers=[table, Interrupting()])
+        train(CommonsEnv(GAME), {0: learner()}, others=agents, episodes=9, callbacks=[table, Interrupting()])
     assert read_episodes(tmp_path)["episode"].to_pylist() == [0, 0, 1, 1, 2, 2]
 
 
 def test_evaluation_plays_one_episode_in_every_world_and_changes_no_seed():
     state = torch.get_rng_state()
-    episodes = evaluate(CommonsEnv(GAME, 7, seed=1), Seats([RandomActor(8), RandomActor(8, seed=1)]))
+    episodes = evaluate(CommonsEnv(GAME, 7, seed=1), AgentPolicies([RandomActor(8), RandomActor(8, seed=1)]))
     assert [episode.world for episode in episodes] == list(range(7))
     assert {episode.steps for episode in episodes} <= set(range(1, 10))
     assert torch.equal(torch.get_rng_state(), state)
@@ -161,14 +165,14 @@ def test_evaluation_plays_one_episode_in_every_world_and_changes_no_seed():
 def test_evaluation_explores_only_if_asked():
     agent = learner()
     agent.actor.epsilon = 1.0
-    seats = Seats([agent.actor, RandomActor(8)])
+    agents = AgentPolicies([agent.actor, RandomActor(8)])
 
     def actions(explore):
         env = CommonsEnv(GAME, 1, seed=1)
         seen = []
         step = env.step
         env.step = lambda td: seen.append(int(td["agents", "action"][0, 0])) or step(td)
-        evaluate(env, seats, explore=explore)
+        evaluate(env, agents, explore=explore)
         return seen
 
     assert actions(explore=False) == actions(explore=False)

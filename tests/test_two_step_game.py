@@ -19,7 +19,9 @@ import torch
 from tensordict import TensorDict
 
 from cprl import Game, Rules, maps
-from cprl.learning import DQN, QMIX, VDN, DQNSettings
+from cprl.algorithms.dqn import DQN
+from cprl.algorithms.teams import QMIX, VDN
+from cprl.learners.settings import DQNSettings
 from cprl.population import Learner, Population
 
 START, SAFE, DARING, OVER = range(4)
@@ -55,9 +57,9 @@ def seen(state):
 def turn(state, action):
     """The next state [R], and the turn, for actions [R, 2]; of the commons, even and odd."""
     choice, ends = action % 2, state != START
-    paid = torch.where(ends, PAYOFFS[(state == DARING).long(), choice[:, 0], choice[:, 1]], 0.0)
+    reward_kind = torch.where(ends, PAYOFFS[(state == DARING).long(), choice[:, 0], choice[:, 1]], 0.0)
     then = torch.where(ends, OVER, SAFE + choice[:, 0])
-    rewards = torch.stack([paid, torch.zeros_like(paid)], 1).unsqueeze(-1)
+    rewards = torch.stack([reward_kind, torch.zeros_like(reward_kind)], 1).unsqueeze(-1)
     after = {"agents": {"observation": seen(then), "reward": rewards}, "done": ends[:, None]}
     before = {"observation": seen(state), "action": action}
     return then, TensorDict(
@@ -68,7 +70,7 @@ def turn(state, action):
 def taught(algorithm):
     """A learner of two agents, who are paid together, after it has learned from every pair of actions in both
     games, each met once; all actions are tried equally often at first, too."""
-    members = [Learner(algorithm, paid="group")] * 2
+    members = [Learner(algorithm, reward_kind="group")] * 2
     population = Population(game(), members, replicas=REPLICAS, seed=1, compile=False)
     (learner,) = population.learners.values()
     actions = range(len(population.game.actions))
@@ -76,10 +78,10 @@ def taught(algorithm):
         state, chooses = torch.full((REPLICAS,), START), 2 * ((mine + yours) % 4) + daring
         for pair in ((chooses, yours), (mine, yours)):
             state, batch = turn(state, torch.tensor([pair]).expand(REPLICAS, 2))
-            learner.remember(batch)
+            learner.store(batch)
     for _ in range(COPIES):
         for _ in range(UPDATES):
-            learner.learn()
+            learner.update()
         learner.end_episode(torch.ones(REPLICAS, dtype=torch.bool))
     return learner
 
@@ -104,7 +106,7 @@ def test_vdn_tells_the_nearest_sum_of_the_daring_game():
     learner = taught(VDN(settings=SETTINGS))
     daring = torch.full((REPLICAS,), DARING)
     with torch.no_grad():
-        values = learner.update.outputs(seen(daring).unsqueeze(1)).squeeze(1)
+        values = learner.engine.outputs(seen(daring).unsqueeze(1)).squeeze(1)
     by_choice = values.unflatten(-1, (4, 2)).mean(-2)
     told = by_choice[:, 0, :, None] + by_choice[:, 1, None, :]
     # row and column means 0.5 and 4.5, less the mean 2.5

@@ -13,8 +13,8 @@ from PIL import Image
 from viewers import browser, free_port, native_viewer, steady_picture
 
 from cprl.commons.colours import APPLE, COLOURS, agent_colour
-from cprl.recording.rerun import RerunLogger
-from cprl.recording.scenery import SOCIAL, Scene
+from cprl.viewer.logger import RerunLogger
+from cprl.viewer.scenery import SOCIAL, Scene
 
 pytestmark = pytest.mark.viewer
 
@@ -73,7 +73,7 @@ def training(tmp_path_factory):
     try:
         for line in process.stdout:
             heard.append(line)
-            if told := re.match(r"Watch live \((\w+)\): (.*)", line):
+            if told := re.match(r"ViewerCallback live \((\w+)\): (.*)", line):
                 addresses[told[1]] = told[2]
             if len(addresses) == 2:
                 break

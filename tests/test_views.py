@@ -85,7 +85,7 @@ def test_as_run_the_picture_shows_the_apples_as_they_hung_when_the_turn_began(ol
     rules = {"regrow_prob": (0.0, 1.0), "picture_shows_old_stock": old_stock}
     play = Play("A.A\n^..", window_rows=2, window_columns=3, **rules).turn("forward")
     play.turn("backward")
-    assert play.told.regrown[0, 0] == 1, "the apple bitten has grown again"
+    assert play.output.regrown[0, 0] == 1, "the apple bitten has grown again"
     assert windows(play, 0) == [[f"#{ahead}.", "#S."]]
     assert windows(play.turn("stay"), 0) == [["#A.", "#S."]]
 
@@ -107,6 +107,6 @@ def test_as_run_a_later_mark_covers_an_earlier_agent():
 
 def test_the_whole_board_shows_classes():
     play = Play("A.#\n.>.\n...")
-    shown = play.batch.boards(play.told)[0]
+    shown = play.batch.boards(play.output)[0]
     expected = [[APPLE, GROUND, WALL], [GROUND, OTHER, MARK], [GROUND, GROUND, GROUND]]
     assert np.array_equal(shown, expected)

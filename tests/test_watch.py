@@ -19,11 +19,12 @@ from rerun.chunk import RrdReader
 from test_rerun_logger import column, static
 
 from cprl import CommonsEnv, Game, Rules, maps
-from cprl.learning import DQNSettings, LaneLearner
+from cprl.learners.replay import ReplayLearner
+from cprl.learners.settings import DQNSettings
 from cprl.measuring import Episode, social
-from cprl.recording.streams import _free_port
-from cprl.recording.watch import Watch
-from cprl.train import train
+from cprl.training import train
+from cprl.viewer.callback import ViewerCallback
+from cprl.viewer.streams import _free_port
 
 GAME = Game(
     map=maps.parse(".A>.A\n.A.A.\n..<.A"),
@@ -39,31 +40,31 @@ class Doing:
     def __init__(self, at, what):
         self.left, self.what = at, what
 
-    def see_turn(self, batch):
+    def on_step(self, batch):
         self.left -= 1
         if self.left == 0:
             self.what()
 
-    def see_episode(self, episode, learning):
+    def on_episode(self, episode, learning):
         """Nothing."""
 
 
 def course(run=None, *, live=None, episodes=8, others=()):
     """Weights, torch's generator and returns after a training of two replicas, watched if a run is given."""
     torch.manual_seed(1)
-    agents = LaneLearner(GAME, seats=(0, 1), replicas=2, settings=SETTINGS, seed=1, compile=False)
+    agents = ReplayLearner(GAME, agents=(0, 1), replicas=2, settings=SETTINGS, seed=1, compile=False)
     env, returns = CommonsEnv(GAME, 2, seed=1), []
 
     class Keeping(Doing):
-        def see_episode(self, episode, learning):
+        def on_episode(self, episode, learning):
             returns.append((episode.world, episode.return_.tolist(), learning["agent_0/loss"]))
 
-    observers = [Keeping(-1, None), *others]
+    callbacks = [Keeping(-1, None), *others]
     if run is None:
-        train(env, {(0, 1): agents}, episodes=episodes, observers=observers)
+        train(env, {(0, 1): agents}, episodes=episodes, callbacks=callbacks)
     else:
-        with Watch(run, env, title="run", episodes=episodes, live=live) as viewer:
-            train(env, {(0, 1): agents}, episodes=episodes, observers=[*observers, viewer])
+        with ViewerCallback(run, env, title="run", episodes=episodes, live=live) as viewer:
+            train(env, {(0, 1): agents}, episodes=episodes, callbacks=[*callbacks, viewer])
     weights = [value.tolist() for net in agents.networks().values() for value in net.state_dict().values()]
     return repr((weights, torch.get_rng_state().tolist(), returns))
 
@@ -176,14 +177,14 @@ def test_without_a_display_no_viewer_is_spawned_and_the_addresses_stay(tmp_path,
     monkeypatch.delenv("WAYLAND_DISPLAY", raising=False)
     with pytest.warns(RuntimeWarning, match="viewer cannot open: there is no display"):
         course(tmp_path, live="spawn", episodes=1)
-    assert "Watch live (browser): http://127.0.0.1:" in capsys.readouterr().out
+    assert "ViewerCallback live (browser): http://127.0.0.1:" in capsys.readouterr().out
 
 
 def test_several_replicas_are_told_as_their_mean_and_each(tmp_path):
     returns = {}
 
     class Witness(Doing):
-        def see_episode(self, episode, learning):
+        def on_episode(self, episode, learning):
             returns[episode.world, episode.episode] = episode.metrics["collective_return"]
 
     course(tmp_path, others=[Witness(-1, None)])
@@ -224,11 +225,11 @@ def fake(number, world, *, returned, tagged):
 
 def test_a_society_that_rises_falls_and_recovers_is_told_as_a_story(tmp_path):
     corners, apples = [0, 400, 800, 1200, 1600], [100, 500, 150, 400, 400]
-    with Watch(tmp_path, CommonsEnv(GAME, 2), title="run", episodes=1600) as viewer:
+    with ViewerCallback(tmp_path, CommonsEnv(GAME, 2), title="run", episodes=1600) as viewer:
         for number in range(1600):
             for world in (0, 1):
                 returned = float(np.interp(number, corners, apples))
-                viewer.see_episode(fake(number, world, returned=returned, tagged=world), {})
+                viewer.on_episode(fake(number, world, returned=returned, tagged=world), {})
     path = tmp_path / "run.rrd"
     _, events = column(path, "log", "TextLog:text")
     told = "\n".join(text[0] for text in events)
@@ -248,14 +249,14 @@ def test_a_society_that_rises_falls_and_recovers_is_told_as_a_story(tmp_path):
 def test_a_run_that_is_gone_on_with_adds_a_file_of_the_same_recording(tmp_path):
     (tmp_path / "recipe.json").write_text("{}")
     env = CommonsEnv(GAME, 2)
-    with Watch(tmp_path, env, title="run", episodes=9) as first:
+    with ViewerCallback(tmp_path, env, title="run", episodes=9) as first:
         for world in (0, 1):
-            first.see_episode(fake(0, world, returned=3.0, tagged=0), {})
-        first.see_episode(fake(1, 0, returned=4.0, tagged=0), {})
+            first.on_episode(fake(0, world, returned=3.0, tagged=0), {})
+        first.on_episode(fake(1, 0, returned=4.0, tagged=0), {})
         state = first.state_dict()
-    with Watch(tmp_path, env, title="run", episodes=9) as second:
+    with ViewerCallback(tmp_path, env, title="run", episodes=9) as second:
         second.load_state_dict(state)
-        second.see_episode(fake(1, 1, returned=6.0, tagged=0), {})
+        second.on_episode(fake(1, 1, returned=6.0, tagged=0), {})
     files = tmp_path / "run.rrd", tmp_path / "run-2.rrd"
     ids = [RrdReader(file).recordings()[0].recording_id for file in files]
     assert ids[0] == ids[1]

@@ -9,10 +9,11 @@ from torchrl.modules import QValueActor
 from torchrl.objectives import DQNLoss, LossModule
 
 from cprl import Game, Rules, maps
-from cprl.acting import QNetwork
-from cprl.learning import DQNSettings, LaneLearner
-from cprl.learning.dqn import dqn_loss
-from cprl.learning.ways import fitting_way, trial_batch
+from cprl.learners.engine.choice import fitting_engine, trial_batch
+from cprl.learners.replay import ReplayLearner
+from cprl.learners.settings import DQNSettings
+from cprl.learners.single import dqn_loss
+from cprl.networks.mlp import MLPNetwork
 
 SHAPE, ACTIONS = (3, 3, 5), 8
 
@@ -57,15 +58,15 @@ def loss_of(kind):
 
 
 def way_of(make_network, make_loss):
-    return fitting_way([make_network() for _ in range(2)], make_loss, trial_batch(2, SHAPE, ACTIONS))
+    return fitting_engine([make_network() for _ in range(2)], make_loss, trial_batch(2, SHAPE, ACTIONS))
 
 
 def q_network():
-    return QNetwork(SHAPE, ACTIONS)
+    return MLPNetwork(SHAPE, ACTIONS)
 
 
 @pytest.mark.parametrize(
-    ("make_network", "make_loss", "way"),
+    ("make_network", "make_loss", "engine"),
     [
         (q_network, lambda network: dqn_loss(network, gamma=0.9), "lane axis"),
         (OwnNetwork, lambda network: dqn_loss(network, gamma=0.9), "vmap"),
@@ -73,10 +74,10 @@ def q_network():
     ],
     ids=["ours", "own network", "a loss that would mix lanes"],
 )
-def test_the_fastest_way_that_fits_is_taken_without_a_word(make_network, make_loss, way):
+def test_the_fastest_way_that_fits_is_taken_without_a_word(make_network, make_loss, engine):
     with warnings.catch_warnings():
         warnings.simplefilter("error")
-        assert way_of(make_network, make_loss) == way
+        assert way_of(make_network, make_loss) == engine
 
 
 def test_a_loss_that_cannot_be_vmapped_runs_as_a_list_and_a_warning_says_why():
@@ -86,13 +87,13 @@ def test_a_loss_that_cannot_be_vmapped_runs_as_a_list_and_a_warning_says_why():
 
 def test_a_learner_finds_its_way():
     game = Game(map=maps.parse(".A>\n..<"), rules=Rules(window_rows=3, window_columns=5))
-    how = {"seats": (0, 1), "settings": DQNSettings(buffer_size=50), "compile": False}
-    found = LaneLearner(game, replicas=2, **how)
-    named = LaneLearner(game, replicas=2, way="lane axis", **how)
-    assert type(found.update) is type(named.update)
+    how = {"agents": (0, 1), "settings": DQNSettings(buffer_size=50), "compile": False}
+    found = ReplayLearner(game, replicas=2, **how)
+    named = ReplayLearner(game, replicas=2, engine="lane axis", **how)
+    assert type(found.engine) is type(named.engine)
     assert found.networks().keys() == named.networks().keys()
     for name, network in found.networks().items():
         for mine, theirs in zip(network.parameters(), named.networks()[name].parameters(), strict=True):
             assert torch.equal(mine, theirs), "a trial changes nothing"
     with pytest.raises(ValueError, match="way is 'quick'; allowed: lane axis, lane axis, flat, vmap, list"):
-        LaneLearner(game, replicas=2, way="quick", **how)
+        ReplayLearner(game, replicas=2, engine="quick", **how)

@@ -64,7 +64,7 @@ def assert_same(record, other, *, rows=slice(None), other_rows=slice(None)):
 def played(game, actions, *, seed=0, first_world=0, threads=1):
     """The worlds and what was told, before the first turn and after each."""
     batch = Batch(game, actions.shape[1], seed=seed, first_world=first_world, threads=threads)
-    told = batch.begin(batch.new_told())
+    told = batch.begin(batch.new_output())
     moments = [(copied(batch.now), copied(told))]
     for turn in actions:
         batch.play(turn, told)
@@ -234,7 +234,7 @@ def test_another_seed_world_or_episode_is_another_game():
     assert not np.array_equal(base[:, 0], base[:, 1]), "two worlds of one seed"
     assert np.array_equal(base[:, 1], stocks(seed=1, first_world=1)[:, 0])
     batch = Batch(game, 2, seed=1)
-    told = batch.begin(batch.new_told())
+    told = batch.begin(batch.new_output())
     told = batch.begin(told)
     second_episode = []
     for turn in actions:
@@ -249,7 +249,7 @@ def test_another_seed_world_or_episode_is_another_game():
 def test_only_marked_worlds_begin_anew():
     game = presets.game("two_complex")
     batch = Batch(game, 3, seed=0)
-    told = batch.begin(batch.new_told())
+    told = batch.begin(batch.new_output())
     for turn in random_actions(30, 3, game):
         batch.play(turn, told)
     before, told_before = copied(batch.now), copied(told)
@@ -285,7 +285,7 @@ def test_a_batch_that_cannot_be_is_refused(arguments, message):
 )
 def test_unknown_actions_raise_and_change_nothing(actions, message):
     batch = Batch(presets.game("commons"), 2)
-    told = batch.begin(batch.new_told())
+    told = batch.begin(batch.new_output())
     before, told_before = copied(batch.now), copied(told)
     with pytest.raises(ValueError, match=message):
         batch.play(actions, told)
@@ -319,7 +319,7 @@ def test_the_rules_are_plain_python_and_uncompiled_play_the_same_game(variant):
     scratch = empty_scratch(
         agents=2, sites=45, cells=game.tables.background.size, window=game.tables.window_cells.shape[1]
     )
-    told = batch.new_told()
+    told = batch.new_output()
     plain["begin_worlds"](batch.now, game.tables, np.ones(2, np.bool_), told, scratch, 0, 2)
     for turn, (worlds, expected) in zip([None, *actions], played(game, actions, seed=1), strict=True):
         if turn is not None:
@@ -331,7 +331,7 @@ def test_the_rules_are_plain_python_and_uncompiled_play_the_same_game(variant):
 def test_a_batch_goes_on_as_it_was_after_pickling():
     game = presets.game("commons")
     batch = Batch(game, 2, seed=3)
-    told = batch.begin(batch.new_told())
+    told = batch.begin(batch.new_output())
     actions = random_actions(20, 2, game)
     for turn in actions[:10]:
         batch.play(turn, told)

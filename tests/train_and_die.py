@@ -7,11 +7,14 @@ import sys
 from pathlib import Path
 
 from cprl import CommonsEnv, Game, Rules, maps
-from cprl.acting import random_lanes
-from cprl.learning import DQNSettings, LaneLearner
+from cprl.learners.replay import ReplayLearner
+from cprl.learners.settings import DQNSettings
+from cprl.policies.lanes import random_lanes
 from cprl.process import prepare_process
-from cprl.recording import Checkpoints, EpisodeTable, save_weights
-from cprl.train import train
+from cprl.runs.checkpoints import Checkpointer
+from cprl.runs.episodes import EpisodeTable
+from cprl.runs.weights import save_weights
+from cprl.training import train
 
 GAME = Game(
     map=maps.parse(".A>.A\n.A.A.\n..<.A"),
@@ -29,15 +32,17 @@ SETTINGS = DQNSettings(
 
 
 def main(
-    run: Path, *, every_s: float = 0.05, episodes: int = 60, way: str = "lane axis", observers=()
+    run: Path, *, every_s: float = 0.05, episodes: int = 60, engine: str = "lane axis", callbacks=()
 ) -> None:
     """Trains agent 0 of three replicas beside a random one."""
     prepare_process(3)
-    learner = LaneLearner(GAME, seats=[0], replicas=3, settings=SETTINGS, seed=3, way=way, compile=False)
-    walker = random_lanes(8, seeds=[(3, replica, 1) for replica in range(3)], seats=1)
+    learner = ReplayLearner(
+        GAME, agents=[0], replicas=3, settings=SETTINGS, seed=3, engine=engine, compile=False
+    )
+    walker = random_lanes(8, seeds=[(3, replica, 1) for replica in range(3)], agents=1)
     run.mkdir(exist_ok=True)
     with (
-        Checkpoints(run, every_s=every_s, go_on=f"python {sys.argv[0]} {run}") as checkpoints,
+        Checkpointer(run, every_s=every_s, resume=f"python {sys.argv[0]} {run}") as checkpoints,
         EpisodeTable(run / "episodes.parquet", resumable=True) as table,
     ):
         env = CommonsEnv(GAME, 3, seed=3)
@@ -46,7 +51,7 @@ def main(
             {(0,): learner},
             others={(1,): walker},
             episodes=episodes,
-            observers=[table, *observers],
+            callbacks=[table, *callbacks],
             checkpoints=checkpoints,
         )
     save_weights(run, learner.networks())
@@ -57,17 +62,17 @@ class Telling:
 
     turns = 0
 
-    def see_turn(self, batch):
+    def on_step(self, batch):
         self.turns += 1
         if self.turns == 1:
             print("training", flush=True)
 
-    def see_episode(self, episode, learning):
+    def on_episode(self, episode, learning):
         """Nothing."""
 
 
 if __name__ == "__main__":
     every_s = float(sys.argv[2]) if len(sys.argv) > 2 else 0.05
     episodes = int(sys.argv[3]) if len(sys.argv) > 3 else 60
-    main(Path(sys.argv[1]), every_s=every_s, episodes=episodes, observers=[Telling()])
+    main(Path(sys.argv[1]), every_s=every_s, episodes=episodes, callbacks=[Telling()])
     print("done", flush=True)

@@ -10,10 +10,10 @@ from dataclasses import replace
 from pathlib import Path
 
 from cprl import CommonsEnv, presets
-from cprl.learning import LaneLearner
+from cprl.learners.replay import ReplayLearner
 from cprl.process import prepare_process
-from cprl.recording import Watch
-from cprl.train import train
+from cprl.training import train
+from cprl.viewer.callback import ViewerCallback
 
 SEATS = (0, 1, 2, 3)
 
@@ -21,10 +21,10 @@ SEATS = (0, 1, 2, 3)
 class Leisure:
     """Leaves the processor to viewers, which draw without a graphics card."""
 
-    def see_turn(self, batch):
+    def on_step(self, batch):
         time.sleep(0.01)
 
-    def see_episode(self, episode, learning):
+    def on_episode(self, episode, learning):
         """Nothing."""
 
 
@@ -35,10 +35,10 @@ def main(run: Path, *, episodes: int = 4000) -> None:
     game = presets.game("commons")
     game = replace(game, rules=replace(game.rules, episode_steps=100))
     settings = replace(presets.learner("commons"), buffer_size=2000, hidden_cells=(8,))
-    agents = LaneLearner(game, seats=SEATS, replicas=2, settings=settings, seed=5, compile=False)
+    agents = ReplayLearner(game, agents=SEATS, replicas=2, settings=settings, seed=5, compile=False)
     env = CommonsEnv(game, 2, seed=5)
-    with Watch(run, env, title="a live training", episodes=episodes, live="serve") as watch:
-        train(env, {SEATS: agents}, episodes=episodes, observers=[watch, Leisure()])
+    with ViewerCallback(run, env, title="a live training", episodes=episodes, live="serve") as watch:
+        train(env, {SEATS: agents}, episodes=episodes, callbacks=[watch, Leisure()])
 
 
 if __name__ == "__main__":

@@ -28,11 +28,11 @@ from cprl.commons.maps import Map
 from cprl.commons.observation import Observation
 from cprl.commons.rules import Rules
 from cprl.envs import CommonsEnv
-from cprl.train import train
+from cprl.training import train
 
 if TYPE_CHECKING:
     from cprl.evaluation import crossplay, evaluate_run
-    from cprl.recording.loaded import load
+    from cprl.stored import load
 
 __all__ = [
     "CommonsEnv",
@@ -52,7 +52,7 @@ __all__ = [
 def __getattr__(name: str) -> Any:
     """What brings all of recording with it, half a second that only those pay who want it."""
     if name == "load":
-        from cprl.recording.loaded import load
+        from cprl.stored import load
 
         return load
     if name in ("crossplay", "evaluate_run"):

@@ -8,16 +8,16 @@ import tyro
 from rich.console import Console
 from rich.table import Table
 
-from cprl.evaluation.runs import SEED, evaluate_run
-from cprl.evaluation.told import heading, matrices, run_table, seats_table
-from cprl.evaluation.visits import Diagonal
-from cprl.evaluation.visits import crossplay as play_each_other
+from cprl.evaluation.cross_play import Diagonal
+from cprl.evaluation.cross_play import crossplay as play_each_other
+from cprl.evaluation.evaluate import SEED, evaluate_run
+from cprl.evaluation.film import replay as play_again
+from cprl.evaluation.tables import heading, matrices, run_table, seats_table
 from cprl.process import prepare_process
-from cprl.recording.bank import keep_results
-from cprl.recording.labelled import refuse_to_write_over, write_table
-from cprl.recording.streams import viewer
-from cprl.replay import replay as play_again
 from cprl.reporting import write_report
+from cprl.runs.export import export_results
+from cprl.runs.labelled import refuse_to_write_over, write_table
+from cprl.viewer.streams import viewer
 
 
 def report(runs: tuple[Path, ...], /, *, out: Path = Path("report")) -> None:
@@ -46,7 +46,7 @@ def replay(run: Path, /, *, replica: int = 0, episode: int = 0, out: Path | None
     path, played = play_again(run, out, replica=replica, episode=episode)
     harvests = ", ".join(f"{apples:.0f}" for apples in played.harvest)
     print(f"{played.steps} steps, apples: {harvests}; {played.stock_left} left")
-    print(f"Watch: {viewer()} {path}")
+    print(f"ViewerCallback: {viewer()} {path}")
 
 
 def watch(run: Path, /) -> None:
@@ -69,7 +69,7 @@ def keep(run: Path, folder: Path, /) -> None:
         run: the run's directory.
         folder: where to.
     """
-    print(keep_results(run, folder))
+    print(export_results(run, folder))
 
 
 def evaluate(
@@ -115,7 +115,7 @@ def crossplay(
     diagonal: Diagonal = "self",
     out: Path | None = None,
 ) -> None:
-    """Seats each run's agents among each other run's, one visitor at a time, and tells how all fare.
+    """AgentPolicies each run's agents among each other run's, one visitor at a time, and tells how all fare.
 
     Args:
         runs: directories of runs of the same game, or their results.

@@ -8,21 +8,22 @@ from typing import Any, TypeAlias, get_args
 import torch
 from torch import Tensor, nn
 
-from cprl.acting.lanes import LaneActor, random_seats
-from cprl.acting.scripted import Manner, scripted_lanes
-from cprl.acting.seats import Seat, Seats
+from cprl.algorithms.registry import Algorithm, told
+from cprl.algorithms.tabular import Tabular
+from cprl.algorithms.teams import TeamAlgorithm, check_team
 from cprl.commons.game import Game
-from cprl.learning.agents import EVALUATION, EXPLORATION, lane_seeds
-from cprl.learning.known import Algorithm, told
-from cprl.learning.lanes import LaneLearner
-from cprl.learning.rollouts import RolloutLearner
-from cprl.learning.settings import DQNSettings, RolloutSettings
-from cprl.learning.tabular import Tabular, TabularLearner
-from cprl.learning.teams import TeamAlgorithm, refuse_wrong_team
-from cprl.learning.transitions import Paid
-from cprl.recording.loaded import load
+from cprl.learners.lanes import EVALUATION, EXPLORATION, lane_seeds
+from cprl.learners.replay import ReplayLearner
+from cprl.learners.rollouts import RolloutLearner
+from cprl.learners.settings import DQNSettings, RolloutSettings
+from cprl.learners.tabular import TabularLearner
+from cprl.learners.transitions import RewardKind
+from cprl.policies.assignment import AgentIndices, AgentPolicies
+from cprl.policies.lanes import LaneActor, random_agents
+from cprl.policies.scripted import ScriptedPolicy, scripted_lanes
+from cprl.stored import load
 
-AnyLearner: TypeAlias = LaneLearner | RolloutLearner | TabularLearner
+AnyLearner: TypeAlias = ReplayLearner | RolloutLearner | TabularLearner
 
 
 @dataclass(frozen=True)
@@ -31,26 +32,26 @@ class Learner:
 
     Args:
         algorithm: e.g. `cprl.learning.DQN(settings=...)`.
-        paid: "own", the agent's own reward, or "group", the sum of all agents' rewards.
+        reward_kind: "own", the agent's own reward, or "group", the sum of all agents' rewards.
     """
 
     algorithm: Algorithm
-    paid: Paid = "own"
+    reward_kind: RewardKind = "own"
 
     def __post_init__(self) -> None:
-        if self.paid not in get_args(Paid):
-            raise ValueError(f"paid is {self.paid!r}; allowed: {', '.join(get_args(Paid))}")
+        if self.reward_kind not in get_args(RewardKind):
+            raise ValueError(f"paid is {self.reward_kind!r}; allowed: {', '.join(get_args(RewardKind))}")
 
 
 @dataclass(frozen=True)
 class Scripted:
-    """A seat whose agent follows a rule; see `cprl.acting.scripted`.
+    """A seat whose agent follows a rule; see `cprl.policies.scripted`.
 
     Args:
-        manner: which.
+        policy: which.
     """
 
-    manner: Manner = "random"
+    policy: ScriptedPolicy = "random"
 
 
 @dataclass(frozen=True)
@@ -105,50 +106,52 @@ class Population:
             )
         self.game, self.members = game, tuple(members)
         self.replicas, self.seed, self._first = replicas, seed, first_replica
-        self.learners: dict[Seat, AnyLearner] = {
-            seats: _learner(
+        self.learners: dict[AgentIndices, AnyLearner] = {
+            agents: _learner(
                 member,
                 game,
-                seats=seats,
+                agents=agents,
                 replicas=replicas,
                 seed=seed,
                 first_replica=first_replica,
                 compile=compile,
                 device=device,
             )
-            for member, seats in self._seats_of(Learner)
+            for member, agents in self._seats_of(Learner)
         }
-        self.others: dict[Seat, nn.Module] = self._others(EXPLORATION)
+        self.others: dict[AgentIndices, nn.Module] = self._others(EXPLORATION)
 
     def _seats_of(self, kind: type[Any]) -> Iterable[tuple[Any, tuple[int, ...]]]:
         """Each different member of a kind, and where its like sit."""
         of_kind = [member for member in self.members if isinstance(member, kind)]
         for number, member in enumerate(of_kind):
             if member not in of_kind[:number]:
-                yield member, tuple(seat for seat, other in enumerate(self.members) if other == member)
+                yield member, tuple(agent for agent, other in enumerate(self.members) if other == member)
 
-    def _others(self, purpose: int, *, worlds: int = 1) -> dict[Seat, nn.Module]:
+    def _others(self, purpose: int, *, worlds: int = 1) -> dict[AgentIndices, nn.Module]:
         """The actors of the members that do not learn, with random numbers for a purpose."""
-        actors: dict[Seat, nn.Module] = {}
+        actors: dict[AgentIndices, nn.Module] = {}
         for kind, make in ((Scripted, _scripted), (Frozen, _frozen)):
-            for member, seats in self._seats_of(kind):
+            for member, agents in self._seats_of(kind):
                 replicas = range(self._first, self._first + self.replicas)
-                seeds = lane_seeds(self.seed, replicas=replicas, seats=seats, purpose=purpose)
-                actors[seats] = make(member, self.game, seeds=seeds, seats=len(seats), worlds=worlds)
+                seeds = lane_seeds(self.seed, replicas=replicas, agents=agents, purpose=purpose)
+                actors[agents] = make(member, self.game, seeds=seeds, agents=len(agents), worlds=worlds)
         return actors
 
-    def policy(self, worlds: int) -> Seats:
+    def policy(self, worlds: int) -> AgentPolicies:
         """Everybody as they are now, in so many worlds of each replica side by side; the learners of values
         with `epsilon_evaluation`."""
-        learned: dict[Seat, nn.Module] = {
-            seats: learner.evaluation_actor(worlds) for seats, learner in self.learners.items()
+        learned: dict[AgentIndices, nn.Module] = {
+            agents: learner.evaluation_actor(worlds) for agents, learner in self.learners.items()
         }
-        return Seats({**learned, **self._others(EVALUATION, worlds=worlds)})
+        return AgentPolicies({**learned, **self._others(EVALUATION, worlds=worlds)})
 
-    def random_policy(self, worlds: int) -> Seats:
+    def random_policy(self, worlds: int) -> AgentPolicies:
         """Everybody's seats taken by agents to whom every action is equally likely."""
         everyone = tuple(range(self.game.agents))
-        return Seats(random_seats(self.game, everyone, replicas=self.replicas, seed=self.seed, worlds=worlds))
+        return AgentPolicies(
+            random_agents(self.game, everyone, replicas=self.replicas, seed=self.seed, worlds=worlds)
+        )
 
     def networks(self) -> dict[str, nn.Module]:
         """A copy of each learner's acting network as it is now, by "replica_0/agent_0" and so on."""
@@ -167,13 +170,13 @@ def _learner(
     member: Learner,
     game: Game,
     *,
-    seats: tuple[int, ...],
+    agents: tuple[int, ...],
     compile: bool,
     device: str | torch.device,
     **who: Any,
 ) -> AnyLearner:
     algorithm = member.algorithm
-    who |= {"seats": seats, "paid": member.paid}
+    who |= {"agents": agents, "reward_kind": member.reward_kind}
     if isinstance(algorithm, Tabular):
         algorithm.network(game)  # refuses a game of which it would not see all
         return TabularLearner(game, settings=algorithm.settings, **who)
@@ -190,14 +193,14 @@ def _learner(
     }
     if isinstance(algorithm, TeamAlgorithm):
         team = algorithm
-        refuse_wrong_team(team, paid=member.paid, members=len(seats))
+        check_team(team, reward_kind=member.reward_kind, members=len(agents))
         common["make_team"] = lambda networks: team.team(networks, game)
     settings = algorithm.settings
     if isinstance(settings, RolloutSettings):
         return RolloutLearner(game, settings=settings, **common)
     if isinstance(settings, DQNSettings):
-        samples = algorithm.samples  # type: ignore[union-attr]
-        return LaneLearner(game, settings=settings, samples=samples, **common)
+        stochastic = algorithm.stochastic  # type: ignore[union-attr]
+        return ReplayLearner(game, settings=settings, stochastic=stochastic, **common)
     raise ValueError(
         f"{type(algorithm).__name__} has settings of the type {type(settings).__name__}; "
         "DQNSettings (learns from replay) or RolloutSettings (on-policy) is wanted"
@@ -205,11 +208,11 @@ def _learner(
 
 
 def _scripted(member: Scripted, game: Game, **how: Any) -> nn.Module:
-    return scripted_lanes(member.manner, game, **how)
+    return scripted_lanes(member.policy, game, **how)
 
 
 def _frozen(
-    member: Frozen, game: Game, *, seeds: Sequence[Sequence[int]], seats: int, worlds: int
+    member: Frozen, game: Game, *, seeds: Sequence[Sequence[int]], agents: int, worlds: int
 ) -> nn.Module:
     loaded = load(member.run)
     for name, theirs, ours in (
@@ -219,9 +222,14 @@ def _frozen(
     ):
         if theirs != ours:
             raise ValueError(f"the agents of {member.run} have {name} {theirs}; this game has {ours}")
-    network, samples, epsilon = loaded.agent(member.agent, replica=member.replica)
+    network, stochastic, epsilon = loaded.agent(member.agent, replica=member.replica)
     actor = LaneActor(
-        _for_all_lanes(network), len(game.actions), seeds=seeds, seats=seats, worlds=worlds, samples=samples
+        _for_all_lanes(network),
+        len(game.actions),
+        seeds=seeds,
+        agents=agents,
+        worlds=worlds,
+        stochastic=stochastic,
     )
     actor.epsilon = epsilon
     return actor
@@ -239,8 +247,8 @@ def _for_all_lanes(network: nn.Module) -> Callable[[Tensor], Tensor]:
 
 def _told(member: Member) -> dict[str, Any]:
     if isinstance(member, Learner):
-        return {"member": "Learner", "paid": member.paid, **told(member.algorithm)}
+        return {"member": "Learner", "paid": member.reward_kind, **told(member.algorithm)}
     if isinstance(member, Scripted):
-        return {"member": "Scripted", "manner": member.manner}
+        return {"member": "Scripted", "manner": member.policy}
     run = str(Path(member.run).resolve())
     return {"member": "Frozen", "run": run, "agent": member.agent, "replica": member.replica}

@@ -10,7 +10,7 @@ from cprl.commons import maps
 from cprl.commons.game import Game
 from cprl.commons.rules import Rules
 from cprl.envs.gymnasium_env import CommonsGymnasiumEnv
-from cprl.learning.settings import DQNSettings
+from cprl.learners.settings import DQNSettings
 
 Board = Literal["single_basic", "single_complex", "two_complex", "commons"]
 Variant = Literal["published", "as_run"]

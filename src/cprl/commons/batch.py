@@ -7,10 +7,10 @@ import numpy as np
 from numpy.typing import DTypeLike, NDArray
 
 from cprl.commons import state as states
-from cprl.commons.game import Game, told_shapes
+from cprl.commons.game import Game, output_shapes
 from cprl.commons.loops import Loop
 from cprl.commons.threads import CpuThreads
-from cprl.commons.world import Actions, Bools, Bytes, Shown, Told, Worlds, empty_worlds
+from cprl.commons.world import Actions, Bools, Bytes, Shown, StepOutput, Worlds, empty_worlds
 
 
 class Driver(Protocol):
@@ -24,7 +24,7 @@ class Driver(Protocol):
     def write(self, array: NDArray[Any], values: NDArray[Any]) -> None: ...
     def first_unknown(self, actions: Actions, known: int) -> int: ...
     def run(
-        self, loop: Loop, worlds: Worlds, what: NDArray[Any], told: Told, *, vouched: bool = False
+        self, loop: Loop, worlds: Worlds, what: NDArray[Any], output: StepOutput, *, vouched: bool = False
     ) -> None: ...
 
 
@@ -76,53 +76,53 @@ class Batch:
         self.driver.write(self.now.seed, np.full((self.size, 1), seed, np.uint64))
         self.driver.write(self.now.episode, np.full((self.size, 1), -1, np.int32))
 
-    def new_told(self) -> Told:
+    def new_output(self) -> StepOutput:
         """Fresh arrays for what a turn tells."""
-        shapes = told_shapes(self.game, self.size)
-        return Told(**{name: self.driver.empty(*form) for name, form in shapes.items()})
+        shapes = output_shapes(self.game, self.size)
+        return StepOutput(**{name: self.driver.empty(*form) for name, form in shapes.items()})
 
-    def begin(self, told: Told, which: Bools | None = None) -> Told:
-        """Begins the next episode of the marked worlds, all if None; only their rows of `told` are written.
+    def begin(self, output: StepOutput, which: Bools | None = None) -> StepOutput:
+        """Begins the next episode of the marked worlds, all if None; only their rows of `output` are written.
 
         Args:
-            told: as `new_told` makes it.
+            output: as `new_output` makes it.
             which: bool [B].
         """
-        self.driver.run("begin_worlds", self.now, self._everyone if which is None else which, told)
-        return told
+        self.driver.run("begin_worlds", self.now, self._everyone if which is None else which, output)
+        return output
 
-    def play(self, actions: Actions, told: Told) -> Told:
-        """One turn of every world, into `told`.
+    def play(self, actions: Actions, output: StepOutput) -> StepOutput:
+        """One turn of every world, into `output`.
 
         Args:
             actions: int64 [B, N], contiguous.
-            told: as `new_told` makes it.
+            output: as `new_output` makes it.
 
         Raises:
             ValueError: for an action that the game does not know; then nothing has changed.
         """
         self.check(actions)
-        self.driver.run("play_worlds", self.now, actions, told)
-        return told
+        self.driver.run("play_worlds", self.now, actions, output)
+        return output
 
-    def play_checked(self, actions: Actions, told: Told) -> Told:
-        """`play` for contiguous actions that `check` has seen, into a `told` known to have its form: to look
-        at it again takes as long as a turn of one world."""
-        self.driver.run("play_worlds", self.now, actions, told, vouched=True)
-        return told
+    def play_checked(self, actions: Actions, output: StepOutput) -> StepOutput:
+        """`play` for contiguous actions that `check` has seen, into an `output` known to have its form: to
+        look at it again takes as long as a turn of one world."""
+        self.driver.run("play_worlds", self.now, actions, output, vouched=True)
+        return output
 
-    def boards(self, told: Told) -> Bytes:
+    def boards(self, output: StepOutput) -> Bytes:
         """The whole boards as they stand, uint8 [B, H, W], classes of `cprl.commons.colours`."""
         boards = self.driver.empty((self.size, self.game.map.height, self.game.map.width), np.uint8)
-        self.driver.run("show_worlds", self.now, boards, told)
+        self.driver.run("show_worlds", self.now, boards, output)
         return boards
 
-    def show(self, told: Told, *, world: int = 0) -> Shown:
+    def show(self, output: StepOutput, *, world: int = 0) -> Shown:
         """One world for people to look at."""
         read, now = self.driver.read, self.now
         return Shown(
-            observation=read(told.observation[world]),
-            board=read(self.boards(told))[world],
+            observation=read(output.observation[world]),
+            board=read(self.boards(output))[world],
             stock=read(now.stock)[world],
             row=read(now.row)[world],
             col=read(now.col)[world],
@@ -138,20 +138,20 @@ class Batch:
         """
         return {name: self.driver.read(getattr(self.now, name)) for name in states.NAMES}
 
-    def load(self, state: Mapping[str, NDArray[Any]], told: Told) -> Told:
-        """Puts the worlds where a state says; `told` shows them so, and says that nothing happened.
+    def load(self, state: Mapping[str, NDArray[Any]], output: StepOutput) -> StepOutput:
+        """Puts the worlds where a state says; `output` shows them so, and says that nothing happened.
 
         Args:
             state: as `state` gives it, of as many worlds of the same game.
-            told: as `new_told` makes it.
+            output: as `new_output` makes it.
 
         Raises:
             ValueError: for a state that cannot be; then nothing has changed.
         """
         for name, values in states.checked(state, worlds=self.size, game=self.game).items():
             self.driver.write(getattr(self.now, name), values)
-        self.driver.run("look_at_worlds", self.now, self._everyone, told)
-        return told
+        self.driver.run("look_at_worlds", self.now, self._everyone, output)
+        return output
 
     def check(self, actions: Actions) -> None:
         """Raises ValueError unless all actions are known; see `play`."""

@@ -66,7 +66,7 @@ def entry_for_cpu(loop: str, *arguments: Any) -> Callable[..., None]:
 
     Numba's own call looks at the types of some sixty arrays each time, which takes seven of eight
     microseconds for one world; this one looks at none, so the caller must. The types are those of every
-    game: `Worlds`, `Tables`, `Told` and `Scratch` never change theirs.
+    game: `Worlds`, `Tables`, `StepOutput` and `Scratch` never change theirs.
     """
     if loop not in _entries:
         types = tuple(map(numba.typeof, arguments))

@@ -16,7 +16,7 @@ from cprl.commons.compiled import compiled
 from cprl.commons.game import Game
 from cprl.commons.loops import FUNCTIONS, LOOPS, Loop
 from cprl.commons.tables import Tables
-from cprl.commons.world import Actions, Scratch, Told, Worlds, empty_scratch
+from cprl.commons.world import Actions, Scratch, StepOutput, Worlds, empty_scratch
 
 cuda: Any = numba.cuda
 
@@ -87,11 +87,11 @@ class CudaThreads:
         return -1 if at == NONE_UNKNOWN else at
 
     def run(
-        self, loop: Loop, worlds: Worlds, what: NDArray[Any], told: Told, *, vouched: bool = False
+        self, loop: Loop, worlds: Worlds, what: NDArray[Any], output: StepOutput, *, vouched: bool = False
     ) -> None:
         """Runs a loop on all worlds, on the default stream; returns before it is done."""
         kernel = kernels()[loop][_blocks(len(what)), THREADS_PER_BLOCK]
-        kernel(worlds, self.tables, what, told, self._scratch)
+        kernel(worlds, self.tables, what, output, self._scratch)
 
 
 @cache
@@ -110,10 +110,10 @@ def _kernel(loop: Callable[..., None], one_scratch: Callable[..., Scratch]) -> C
     """Thread b runs the loop on world b alone."""
 
     @cuda.jit
-    def kernel(worlds, tables, what, told, scratch):  # type: ignore[no-untyped-def]
+    def kernel(worlds, tables, what, output, scratch):  # type: ignore[no-untyped-def]
         b = cuda.grid(1)
         if b < what.shape[0]:
-            loop(worlds, tables, what, told, one_scratch(scratch, b), b, b + 1)
+            loop(worlds, tables, what, output, one_scratch(scratch, b), b, b + 1)
 
     launched: Callable[..., Any] = kernel
     return launched

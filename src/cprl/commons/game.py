@@ -102,8 +102,8 @@ class Game:
         return {"map": self.map, "rules": self.rules, "observation": self.observation}
 
 
-def told_shapes(game: Game, worlds: int) -> dict[str, tuple[tuple[int, ...], type[np.generic]]]:
-    """Shape and type of each entry of `Told` for B worlds of a game."""
+def output_shapes(game: Game, worlds: int) -> dict[str, tuple[tuple[int, ...], type[np.generic]]]:
+    """Shape and type of each entry of `StepOutput` for B worlds of a game."""
     of_agent = worlds, game.agents
     return {
         "observation": ((*of_agent, *game.observation_shape), np.uint8),

@@ -6,7 +6,7 @@ from cprl.commons import turn
 from cprl.commons.tables import Tables
 from cprl.commons.turn import begin_episode, look_again, play_turn
 from cprl.commons.views import draw_board
-from cprl.commons.world import Actions, Bools, Bytes, Scratch, Told, Worlds
+from cprl.commons.world import Actions, Bools, Bytes, Scratch, StepOutput, Worlds
 
 
 def one_world(w: Worlds, b: int) -> Worlds:
@@ -35,9 +35,9 @@ def one_world(w: Worlds, b: int) -> Worlds:
     )
 
 
-def one_told(t: Told, b: int) -> Told:
+def one_told(t: StepOutput, b: int) -> StepOutput:
     """What is told of world b, without the axis B, sharing memory."""
-    return Told(
+    return StepOutput(
         t.observation[b],
         t.harvest[b],
         t.in_play[b],
@@ -71,21 +71,21 @@ def play_worlds(
     worlds: Worlds,
     tables: Tables,
     actions: Actions,
-    told: Told,
+    output: StepOutput,
     scratch: Scratch,
     first: int,
     last: int,
 ) -> None:
     """One turn of the worlds first .. last - 1; `actions`: int64 [B, N]."""
     for b in range(first, last):
-        play_turn(one_world(worlds, b), tables, actions[b], one_told(told, b), scratch)
+        play_turn(one_world(worlds, b), tables, actions[b], one_told(output, b), scratch)
 
 
 def begin_worlds(
     worlds: Worlds,
     tables: Tables,
     which: Bools,
-    told: Told,
+    output: StepOutput,
     scratch: Scratch,
     first: int,
     last: int,
@@ -93,14 +93,14 @@ def begin_worlds(
     """The next episode of those of the worlds first .. last - 1 that are marked; `which`: bool [B]."""
     for b in range(first, last):
         if which[b]:
-            begin_episode(one_world(worlds, b), tables, one_told(told, b), scratch)
+            begin_episode(one_world(worlds, b), tables, one_told(output, b), scratch)
 
 
 def show_worlds(
     worlds: Worlds,
     tables: Tables,
     boards: Bytes,
-    told: Told,
+    output: StepOutput,
     scratch: Scratch,
     first: int,
     last: int,
@@ -114,7 +114,7 @@ def look_at_worlds(
     worlds: Worlds,
     tables: Tables,
     which: Bools,
-    told: Told,
+    output: StepOutput,
     scratch: Scratch,
     first: int,
     last: int,
@@ -122,7 +122,7 @@ def look_at_worlds(
     """Tells of the marked worlds of first .. last - 1 as they were put in; `which`: bool [B]."""
     for b in range(first, last):
         if which[b]:
-            look_again(one_world(worlds, b), tables, one_told(told, b), scratch)
+            look_again(one_world(worlds, b), tables, one_told(output, b), scratch)
 
 
 def first_unknown(actions: Actions, known: int) -> int:

@@ -9,10 +9,10 @@ import numpy as np
 from numpy.typing import DTypeLike, NDArray
 
 from cprl.commons.compiled import entry_for_cpu, rules_for_cpu
-from cprl.commons.game import Game, told_shapes
+from cprl.commons.game import Game, output_shapes
 from cprl.commons.loops import Loop
 from cprl.commons.tables import Tables
-from cprl.commons.world import Actions, Told, Worlds, empty_scratch
+from cprl.commons.world import Actions, StepOutput, Worlds, empty_scratch
 
 WORLDS_PER_THREAD = 512
 """Fewer are not worth handing to another thread, which takes a tenth of a millisecond."""
@@ -39,8 +39,8 @@ class CpuThreads:
         most = threads or os.cpu_count() or 1
         self.threads = min(most, worlds if threads else -(-worlds // WORLDS_PER_THREAD))
         self.tables: Tables = game.tables
-        self._wanted = tuple(told_shapes(game, worlds).values())
-        self._told: Told | None = None
+        self._wanted = tuple(output_shapes(game, worlds).values())
+        self._output: StepOutput | None = None
         self._sheets = [
             empty_scratch(
                 agents=game.agents,
@@ -72,7 +72,7 @@ class CpuThreads:
         return int(rules_for_cpu()["first_unknown"](actions.reshape(-1), known))
 
     def run(
-        self, loop: Loop, worlds: Worlds, what: NDArray[Any], told: Told, *, vouched: bool = False
+        self, loop: Loop, worlds: Worlds, what: NDArray[Any], output: StepOutput, *, vouched: bool = False
     ) -> None:
         """Runs a loop on all worlds; this thread takes the last share.
 
@@ -80,13 +80,13 @@ class CpuThreads:
             loop: which.
             worlds: how they stand.
             what: the loop's own argument.
-            told: what it writes into.
+            output: what it writes into.
             vouched: whether the caller knows that both are of the right form; otherwise they are checked.
         """
         if not vouched:
-            self._check(what, told)
+            self._check(what, output)
         size = worlds.step.shape[0]
-        arguments = worlds, self.tables, what, told
+        arguments = worlds, self.tables, what, output
         entry = entry_for_cpu(loop, *arguments, self._sheets[0], 0, size)
         if self.threads == 1:
             entry(*arguments, self._sheets[0], 0, size)
@@ -99,17 +99,17 @@ class CpuThreads:
         for share in shares:
             share.result()
 
-    def _check(self, what: NDArray[Any], told: Told) -> None:
+    def _check(self, what: NDArray[Any], output: StepOutput) -> None:
         """The compiled loops do not look at what they are given, so this does; see `entry_for_cpu`."""
         if not what.flags.c_contiguous:
             raise ValueError(f"an array {what.dtype} {what.shape} is not contiguous; one that is is wanted")
-        if told is self._told:
+        if output is self._output:
             return
-        arrays: dict[str, NDArray[Any]] = told._asdict()
+        arrays: dict[str, NDArray[Any]] = output._asdict()
         for (name, array), (shape, dtype) in zip(arrays.items(), self._wanted, strict=True):
             if array.shape != shape or array.dtype != dtype or not array.flags.carray:
                 raise ValueError(
                     f"told.{name} is {array.dtype} {array.shape}; "
                     f"wanted: {np.dtype(dtype)} {shape}, contiguous and writeable"
                 )
-        self._told = told
+        self._output = output

@@ -6,24 +6,17 @@ from cprl.commons import apples, beam, chance, moves, views
 from cprl.commons.apples import bite, draw, fill, find_sprouts, grow, recount
 from cprl.commons.beam import find_hits, tag
 from cprl.commons.chance import STARTS
-from cprl.commons.moves import (
-    act,
-    count_down,
-    put_at_start,
-    return_to_play,
-    settle_clashes,
-    settle_pairwise,
-)
+from cprl.commons.moves import act, count_down, put_at_start, return_to_play, settle_clashes, settle_pairwise
 from cprl.commons.tables import Tables
 from cprl.commons.views import draw_windows
-from cprl.commons.world import PLAYING, TERMINATED, TRUNCATED, Actions, Scratch, Told, Worlds
+from cprl.commons.world import PLAYING, TERMINATED, TRUNCATED, Actions, Scratch, StepOutput, Worlds
 
 
-def play_turn(world: Worlds, tables: Tables, actions: Actions, told: Told, scratch: Scratch) -> None:
+def play_turn(world: Worlds, tables: Tables, actions: Actions, output: StepOutput, scratch: Scratch) -> None:
     """One turn; `actions`: int64 [N]. A world that has ended stays as it is and pays nothing."""
     if world.ended[0] != PLAYING:
-        tell_nothing_happened(told)
-        tell_state(world, tables, told, scratch)
+        write_nothing_happened(output)
+        write_state(world, tables, output, scratch)
         return
     began_empty = world.stock_left[0] == 0
     keep_old_stock(world, tables)
@@ -37,19 +30,19 @@ def play_turn(world: Worlds, tables: Tables, actions: Actions, told: Told, scrat
     sprouts = find_sprouts(world, tables, scratch)
     if tables.regrow_before_bites:
         grow(world, tables, scratch, sprouts)
-        bite(world, tables, told.harvest)
+        bite(world, tables, output.harvest)
     else:
-        bite(world, tables, told.harvest)
+        bite(world, tables, output.harvest)
         grow(world, tables, scratch, sprouts)
-    told.regrown[0] = sprouts
-    find_hits(world, tables, told.hit_by)
-    tag(world, tables, told.hit_by, told.tagged_by)
+    output.regrown[0] = sprouts
+    find_hits(world, tables, output.hit_by)
+    tag(world, tables, output.hit_by, output.tagged_by)
     judge_the_end(world, tables, began_empty)
     for i in range(world.row.shape[0]):
-        told.fired[i] = world.fired[i]
+        output.fired[i] = world.fired[i]
         world.on_board[i] = world.in_play[i]
     return_to_play(world, tables, scratch)
-    tell_state(world, tables, told, scratch)
+    write_state(world, tables, output, scratch)
 
 
 def shuffle_starts(world: Worlds) -> None:
@@ -63,7 +56,7 @@ def shuffle_starts(world: Worlds) -> None:
         world.heading[i], world.heading[j] = world.heading[j], world.heading[i]
 
 
-def begin_episode(world: Worlds, tables: Tables, told: Told, scratch: Scratch) -> None:
+def begin_episode(world: Worlds, tables: Tables, output: StepOutput, scratch: Scratch) -> None:
     """The next episode of a world: full stock, everybody at the start."""
     world.episode[0] += 1
     world.step[0] = 0
@@ -72,15 +65,15 @@ def begin_episode(world: Worlds, tables: Tables, told: Told, scratch: Scratch) -
     put_at_start(world, tables)
     if tables.shuffle_starts:
         shuffle_starts(world)
-    tell_nothing_happened(told)
-    tell_state(world, tables, told, scratch)
+    write_nothing_happened(output)
+    write_state(world, tables, output, scratch)
 
 
-def look_again(world: Worlds, tables: Tables, told: Told, scratch: Scratch) -> None:
+def look_again(world: Worlds, tables: Tables, output: StepOutput, scratch: Scratch) -> None:
     """Tells of a state that was put in from outside; nothing is said to have happened."""
     recount(world, tables)
-    tell_nothing_happened(told)
-    tell_state(world, tables, told, scratch)
+    write_nothing_happened(output)
+    write_state(world, tables, output, scratch)
 
 
 def keep_old_stock(world: Worlds, tables: Tables) -> None:
@@ -99,31 +92,31 @@ def judge_the_end(world: Worlds, tables: Tables, began_empty: bool) -> None:
         world.ended[0] = TRUNCATED
 
 
-def tell_nothing_happened(told: Told) -> None:
+def write_nothing_happened(output: StepOutput) -> None:
     """A turn without harvest, shots, hits and growth."""
-    agents = told.harvest.shape[0]
+    agents = output.harvest.shape[0]
     for i in range(agents):
-        told.harvest[i] = 0.0
-        told.fired[i] = False
+        output.harvest[i] = 0.0
+        output.fired[i] = False
         for j in range(agents):
-            told.hit_by[i, j] = False
-            told.tagged_by[i, j] = False
-    told.regrown[0] = 0
+            output.hit_by[i, j] = False
+            output.tagged_by[i, j] = False
+    output.regrown[0] = 0
 
 
-def tell_state(world: Worlds, tables: Tables, told: Told, scratch: Scratch) -> None:
+def write_state(world: Worlds, tables: Tables, output: StepOutput, scratch: Scratch) -> None:
     """How the world stands now, and what everybody sees of it."""
     for i in range(world.row.shape[0]):
-        told.in_play[i] = world.in_play[i]
-        for j in range(told.scoreboard.shape[1]):
-            told.scoreboard[i, j] = world.harvested[(i + j) % world.row.shape[0]]
-        if told.stock_gauge.shape[1] > 0:
-            told.stock_gauge[i, 0] = world.stock_left[0] / world.stock.shape[0]
-    told.stock[0] = world.stock_left[0]
-    told.terminated[0] = world.ended[0] == TERMINATED
-    told.truncated[0] = world.ended[0] == TRUNCATED
-    told.done[0] = world.ended[0] != PLAYING
-    draw_windows(world, tables, scratch, told.observation)
+        output.in_play[i] = world.in_play[i]
+        for j in range(output.scoreboard.shape[1]):
+            output.scoreboard[i, j] = world.harvested[(i + j) % world.row.shape[0]]
+        if output.stock_gauge.shape[1] > 0:
+            output.stock_gauge[i, 0] = world.stock_left[0] / world.stock.shape[0]
+    output.stock[0] = world.stock_left[0]
+    output.terminated[0] = world.ended[0] == TERMINATED
+    output.truncated[0] = world.ended[0] == TRUNCATED
+    output.done[0] = world.ended[0] != PLAYING
+    draw_windows(world, tables, scratch, output.observation)
 
 
 FUNCTIONS = (
@@ -134,8 +127,8 @@ FUNCTIONS = (
     *views.FUNCTIONS,
     keep_old_stock,
     judge_the_end,
-    tell_nothing_happened,
-    tell_state,
+    write_nothing_happened,
+    write_state,
     play_turn,
     shuffle_starts,
     begin_episode,

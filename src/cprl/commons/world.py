@@ -74,7 +74,7 @@ class Worlds(NamedTuple):
     """[B, 1], PLAYING, TERMINATED or TRUNCATED."""
 
 
-class Told(NamedTuple):
+class StepOutput(NamedTuple):
     """What a turn tells, written into arrays that the caller hands in (torch memory, as a rule)."""
 
     observation: Bytes

@@ -38,7 +38,7 @@ class OneWorld:
             raise ValueError(f"render_mode is {render_mode!r}; allowed: None, {', '.join(RENDER_MODES)}")
         self.game = game
         self.batch = Batch(game, 1, seed=seed)
-        self.told = self.batch.new_told()
+        self.output = self.batch.new_output()
         self.render_mode = render_mode
         self._window = Window(title) if render_mode == "human" else None
 
@@ -57,7 +57,7 @@ class OneWorld:
         """The next episode, or the first one of another seed."""
         if seed is not None:
             self.batch.set_seed(seed)
-        self.told = self.batch.begin(self.batch.new_told())
+        self.output = self.batch.begin(self.batch.new_output())
         if self._window:
             self.render()
 
@@ -69,48 +69,48 @@ class OneWorld:
         """
         row = np.array([actions], np.int64)
         self.batch.check(row)
-        self.told = self.batch.play_checked(row, self.batch.new_told())
+        self.output = self.batch.play_checked(row, self.batch.new_output())
         if self._window:
             self.render()
 
     def observation(self, agent: int) -> Observed:
         """What an agent observes, as `observation_space` says."""
-        told, form = self.told, self.game.observation
+        output, form = self.output, self.game.observation
         vectors: dict[str, NDArray[Any]] = {}
         if form.scoreboard:
-            vectors["scoreboard"] = told.scoreboard[0, agent]
+            vectors["scoreboard"] = output.scoreboard[0, agent]
         if form.stock_gauge:
-            vectors["stock_gauge"] = told.stock_gauge[0, agent]
-        seen = told.observation[0, agent]
+            vectors["stock_gauge"] = output.stock_gauge[0, agent]
+        seen = output.observation[0, agent]
         return {"observation": seen, **vectors} if vectors else seen
 
     def reward(self, agent: int) -> float:
         """What an agent is paid for the turn: its harvest."""
-        return float(self.told.harvest[0, agent])
+        return float(self.output.harvest[0, agent])
 
     def info(self, agent: int) -> dict[str, Any]:
         """What else happened to an agent in the turn, and whether it acts in the coming one."""
-        told = self.told
+        output = self.output
         return {
-            "harvest": float(told.harvest[0, agent]),
-            "in_play": bool(told.in_play[0, agent]),
-            "fired": bool(told.fired[0, agent]),
-            "tagged": bool(told.tagged_by[0, agent].any()),
+            "harvest": float(output.harvest[0, agent]),
+            "in_play": bool(output.in_play[0, agent]),
+            "fired": bool(output.fired[0, agent]),
+            "tagged": bool(output.tagged_by[0, agent].any()),
         }
 
     @property
     def terminated(self) -> bool:
         """Whether no apple is left and none can come."""
-        return bool(self.told.terminated[0, 0])
+        return bool(self.output.terminated[0, 0])
 
     @property
     def truncated(self) -> bool:
         """Whether the clock ran out."""
-        return bool(self.told.truncated[0, 0])
+        return bool(self.output.truncated[0, 0])
 
     def state(self) -> Bytes:
         """uint8 [3, H, W], the whole board as RGB."""
-        board = self.game.palette[self.batch.boards(self.told)[0]]
+        board = self.game.palette[self.batch.boards(self.output)[0]]
         return np.ascontiguousarray(board.transpose(2, 0, 1))
 
     def render(self) -> Bytes | None:
@@ -123,7 +123,7 @@ class OneWorld:
             raise ValueError(
                 'nothing can be rendered: make the environment with render_mode="rgb_array" or "human"'
             )
-        image = world_image(self.game.map, self.batch.show(self.told))
+        image = world_image(self.game.map, self.batch.show(self.output))
         if self._window is None:
             return image
         self._window.show(image)

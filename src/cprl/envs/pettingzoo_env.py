@@ -75,10 +75,10 @@ class CommonsParallelEnv(ParallelEnv[str, Any, int]):
         rewards = {name: self.world.reward(i) for i, name in enumerate(self.agents)}
         terminations = dict.fromkeys(self.agents, self.world.terminated)
         truncations = dict.fromkeys(self.agents, self.world.truncated)
-        told = self._observations(), rewards, terminations, truncations, self._infos()
+        output = self._observations(), rewards, terminations, truncations, self._infos()
         if self.world.terminated or self.world.truncated:
             self.agents = []
-        return told
+        return output
 
     def state(self) -> Bytes:
         """uint8 [3, H, W], the whole board as RGB."""

@@ -1,6 +1,6 @@
 """Evaluation: the agents of stored runs in fresh worlds, among themselves and among each other."""
 
-from cprl.evaluation.runs import Evaluation, evaluate_run
-from cprl.evaluation.visits import Cell, CrossPlay, crossplay
+from cprl.evaluation.cross_play import Cell, CrossPlay, crossplay
+from cprl.evaluation.evaluate import Evaluation, evaluate_run
 
 __all__ = ["Cell", "CrossPlay", "Evaluation", "crossplay", "evaluate_run"]

@@ -7,7 +7,7 @@ import torch
 from tensordict import TensorDictBase
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 
-from cprl.envs.torchrl_env import CommonsEnv
+from cprl.envs.commons_env import CommonsEnv
 from cprl.measuring.episodes import Episode, EpisodeTracker
 
 
@@ -18,7 +18,7 @@ def evaluate(
 
     Args:
         env: B worlds; all are reset.
-        policy: writes the actions of all agents, e.g. `cprl.acting.Seats`.
+        policy: writes the actions of all agents, e.g. `cprl.acting.AgentPolicies`.
         explore: whether actors explore with their epsilon, else they play greedily.
 
     Returns:
@@ -26,9 +26,9 @@ def evaluate(
     """
     worlds = env.batch_size.numel()
     tracker = EpisodeTracker(worlds, env.game.agents, env.game.rules.episode_steps)
-    manner = ExplorationType.RANDOM if explore else ExplorationType.DETERMINISTIC
+    exploration = ExplorationType.RANDOM if explore else ExplorationType.DETERMINISTIC
     episodes: dict[int, Episode] = {}
-    with torch.no_grad(), set_exploration_type(manner):
+    with torch.no_grad(), set_exploration_type(exploration):
         moment = env.reset()
         while len(episodes) < worlds:
             batch = env.step(policy(moment))

@@ -18,7 +18,7 @@ from tensordict import TensorDictBase
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 
 from cprl import keys
-from cprl.envs.torchrl_env import CommonsEnv
+from cprl.envs.commons_env import CommonsEnv
 
 Array = NDArray[Any]
 

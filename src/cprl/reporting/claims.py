@@ -9,14 +9,14 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from cprl.acting.seats import Seats
 from cprl.commons.game import Game
-from cprl.evaluation.runs import SEED, kept_replicas
-from cprl.evaluation.seating import Sitter, fresh_worlds, random_seats, seated
+from cprl.evaluation.evaluate import SEED, kept_replicas
+from cprl.evaluation.lanes import Sitter, fresh_worlds, random_agents, seated
 from cprl.measuring.movement import Trace, overlap, rounds, shooting_distance, trace
 from cprl.measuring.statistics import Estimate, estimate
-from cprl.recording.curves import curves_of, running_mean
-from cprl.recording.loaded import load
+from cprl.policies.assignment import AgentPolicies
+from cprl.runs.curves import curves_of, running_mean
+from cprl.stored import load
 
 Values = NDArray[np.float64]
 
@@ -59,10 +59,10 @@ def measures(run: Path) -> list[Measure]:
 @cache
 def _by_chance(game: Game, replicas: tuple[int, ...]) -> dict[str, Values]:
     """`of_play` of the random policy; the same for all runs of a game."""
-    return _at_play(game, replicas, partial(random_seats, game))
+    return _at_play(game, replicas, partial(random_agents, game))
 
 
-def _at_play(game: Game, replicas: Sequence[int], who: Callable[..., Seats]) -> dict[str, Values]:
+def _at_play(game: Game, replicas: Sequence[int], who: Callable[..., AgentPolicies]) -> dict[str, Values]:
     """`of_play` of a game in the same fresh worlds, whoever plays."""
     found: dict[str, list[Values]] = {}
     for group, env in fresh_worlds(game, replicas, worlds=WORLDS, seed=SEED):

@@ -1,6 +1,6 @@
 """The report of finished runs beside the published study: tables in Markdown, figures as PNG.
 
-Made from results alone (`cprl.recording.bank`), so that anybody can make it again.
+Made from results alone (`cprl.runs.export`), so that anybody can make it again.
 """
 
 import shlex
@@ -16,12 +16,12 @@ from matplotlib.figure import Figure
 
 from cprl.measuring.published import PHASES_BEGIN, SMOOTHED_EPISODES, agreement, curve
 from cprl.measuring.statistics import curve_interval, estimate
-from cprl.recording.curves import as_curves, running_mean
-from cprl.recording.files import write_atomically
 from cprl.reporting.claims import measures
 from cprl.reporting.markdown import table
 from cprl.reporting.result import TOO_FEW, Result, Values, read_result
 from cprl.reporting.turning import phases_of, turning_points_of
+from cprl.runs.curves import as_curves, running_mean
+from cprl.runs.files import write_atomically
 
 TITLES: Final = {
     "collective_return": "collective return, apples",

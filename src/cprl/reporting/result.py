@@ -11,8 +11,8 @@ from numpy.typing import NDArray
 
 from cprl.measuring import phases
 from cprl.measuring.published import Experiment, experiment
-from cprl.recording.curves import curves_of, running_mean
-from cprl.recording.run import read_json, read_recipe
+from cprl.runs.curves import curves_of, running_mean
+from cprl.runs.directory import read_json, read_recipe
 
 Values = NDArray[np.float64]
 

@@ -7,9 +7,9 @@ import numpy as np
 
 from cprl.measuring import phases
 from cprl.measuring.published import PHASES_BEGIN, curve, experiment
-from cprl.recording.curves import running_mean
 from cprl.reporting.markdown import table
 from cprl.reporting.result import TOO_FEW, Result, Values
+from cprl.runs.curves import running_mean
 
 SURVIVED: Final = 990
 """Steps, of an episode's 1000, below which the running mean of survival counts as falling."""

@@ -1,0 +1,1 @@
+"""What a replay buffer of many lanes is made of."""

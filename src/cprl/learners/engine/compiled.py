@@ -1,0 +1,263 @@
+"""FunctionalEngine: one update of many independent learners as one compiled step."""
+
+from collections.abc import Mapping, Sequence
+from copy import deepcopy
+from typing import Any
+
+import torch
+from tensordict import TensorDict
+from torch import Tensor, nn
+from torchrl.data.replay_buffers import ReplayBuffer
+
+from cprl.compiling import Compiled
+from cprl.learners.buffer.storage import FIELDS, LaneStorage, gather
+from cprl.learners.engine.functional import FunctionalLoss, MakeLoss, Weights, stacked
+from cprl.networks.agent import parts_of
+from cprl.networks.stacked import lane_state, stack_lanes
+
+BETA_1, BETA_2 = 0.9, 0.999
+"""Adam's decay rates (Kingma and Ba 2015, the defaults of torch)."""
+
+
+class FunctionalEngine:
+    """All lanes at once: gathering, TorchRL's loss, its gradient and Adam as one step, compiled if wanted.
+
+    Where a loss sees the lane axis it stays ordinary: it is asked for one loss for each transition, which
+    is averaged over the batch and summed over lanes, so that each lane's gradient is exactly its own.
+
+    Args:
+        networks: of the lanes, of one form; their weights are copied.
+        make_loss: a lane's loss out of its network.
+        target_networks: where targets start; by default as copies.
+        learning_rate: Adam's step size.
+        adam_eps: Adam's epsilon.
+        loss_share: by which each loss is multiplied.
+        max_grad_norm: to which each lane's gradient is shortened, if it is longer; None for never.
+        lane_axis: whether the networks are stacked into a `StackedMLP`, else the loss is vmapped.
+        flat: with a lane axis, whether the loss sees the transitions of all lanes in a row, [L x b].
+        compile: whether the step is compiled by torch; where that fails a warning says so once, and the
+            step runs as it is.
+    """
+
+    def __init__(
+        self,
+        networks: Sequence[nn.Module],
+        make_loss: MakeLoss,
+        *,
+        target_networks: Sequence[nn.Module] | None = None,
+        learning_rate: float,
+        adam_eps: float = 1e-8,
+        loss_share: float = 1.0,
+        max_grad_norm: float | None = None,
+        lane_axis: bool,
+        flat: bool = False,
+        compile: bool = True,
+    ) -> None:
+        loss, self.own, self.fixed, names = stacked(networks, make_loss, lane_axis=lane_axis)
+        if target_networks is not None:
+            others = stacked(target_networks, make_loss, lane_axis=lane_axis).own
+            self.fixed |= {name: others[_source(name)] for name in self.fixed if _source(name) in others}
+        self._mean = {name: torch.zeros_like(value) for name, value in self.own.items()}
+        self._square = {name: torch.zeros_like(value) for name, value in self.own.items()}
+        self.loss = FunctionalLoss(loss)
+        network = stack_lanes(networks) if lane_axis else deepcopy(networks[0])
+        self._parts = list(parts_of(network).items())
+        self._shared = {name: self.own[key] for name, key in names.items() if key in self.own}
+        if lane_axis:  # acts by the very tensors that learning changes
+            for name, parameter in network.named_parameters():
+                if name in self._shared:
+                    parameter.requires_grad_(False).data = self._shared[name]
+        self._names, self._fixed_names = tuple(self.own), tuple(self.fixed)
+        groups = self.own, self.fixed, self._mean, self._square
+        self._tensors = [list(group.values()) for group in groups]
+        self.steps = 0
+        kind = next(iter(self.own.values()))
+        self._scalars = kind.new_zeros(()), kind.new_zeros(())
+        self._learning_rate, self._adam_eps, self._share = learning_rate, adam_eps, loss_share
+        self._max_norm = max_grad_norm
+        self._vmapped, self._flat = not lane_axis, flat
+        self._is_warm = not compile
+        self._compiled = Compiled(FunctionalEngine._step, what="updates run", enabled=compile)
+        self._compiled_on = Compiled(FunctionalEngine._step_on, what="updates run", enabled=compile)
+
+    def update(self, buffer: ReplayBuffer) -> Tensor:
+        """See `Engine`."""
+        storage: LaneStorage = buffer.storage
+        index = buffer.sampler.draw(storage)
+        self.steps += 1
+        if not self._is_warm:
+            self._warm_up(gather(storage.fields, index, storage.rows))
+        arguments = [*storage.fields.values()], storage.rows, index, *self._adam_scalars()
+        losses: Tensor = self._compiled(_form(storage, index), self, *arguments, self._tensors)
+        return losses
+
+    def update_from(self, batch: TensorDict) -> Tensor:
+        """See `Engine`."""
+        self.steps += 1
+        if not self._is_warm:
+            self._warm_up(batch.clone())
+        entries = sorted(batch.items(True, True), key=lambda entry: str(entry[0]))
+        names, columns = tuple(name for name, _ in entries), [column for _, column in entries]
+        form = names, batch.batch_size, *((column.shape, column.dtype) for column in columns)
+        arguments = names, tuple(batch.batch_size), columns, *self._adam_scalars()
+        losses: Tensor = self._compiled_on(form, self, *arguments, self._tensors)
+        return losses
+
+    def _warm_up(self, batch: TensorDict) -> None:
+        """TensorDict fills a table of its own at first use; compiled code would fill it again each time."""
+        self._gradients(self._tensors[0], self._tensors[1], batch)
+        self._is_warm = True
+
+    def _adam_scalars(self) -> tuple[Tensor, Tensor]:
+        """Adam's two bias corrections, computed here once instead of for every weight in the graph."""
+        size, scale = self._scalars
+        size.fill_(self._learning_rate / (1 - BETA_1**self.steps))
+        scale.fill_((1 - BETA_2**self.steps) ** -0.5)
+        return size, scale
+
+    def _step(
+        self,
+        fields: list[Tensor],
+        rows: int,
+        index: Tensor,
+        step_size: Tensor,
+        scale: Tensor,
+        tensors: list[list[Tensor]],
+    ) -> Tensor:
+        """One step. Tensors come in lists: compiled code finds each of a dict by counting through its keys,
+        which takes longer than all that one lane has to compute."""
+        batch = gather(dict(zip(FIELDS, fields, strict=True)), index, rows)
+        return self._change(batch, step_size, scale, tensors)
+
+    def _step_on(
+        self,
+        names: tuple[Any, ...],
+        size: tuple[int, ...],
+        columns: list[Tensor],
+        step_size: Tensor,
+        scale: Tensor,
+        tensors: list[list[Tensor]],
+    ) -> Tensor:
+        """One step on a batch, whose entries come in the order of their names."""
+        batch = TensorDict({}, batch_size=size)
+        for name, column in zip(names, columns, strict=True):
+            batch.set(name, column)
+        return self._change(batch, step_size, scale, tensors)
+
+    def _change(
+        self, batch: TensorDict, step_size: Tensor, scale: Tensor, tensors: list[list[Tensor]]
+    ) -> Tensor:
+        """Gradients, then Adam, in place; each lane's loss."""
+        own, fixed, means, squares = tensors
+        gradients, losses = self._gradients(own, fixed, batch)
+        if self._max_norm is not None:
+            gradients = shortened(gradients, self._max_norm)
+        for weight, slope, mean, square in zip(own, gradients, means, squares, strict=True):
+            mean.mul_(BETA_1).add_(slope, alpha=1 - BETA_1)
+            square.mul_(BETA_2).addcmul_(slope, slope, value=1 - BETA_2)
+            weight.sub_(step_size * mean / (square.sqrt() * scale + self._adam_eps))
+        return losses
+
+    def _gradients(
+        self, own: list[Tensor], fixed: list[Tensor], batch: TensorDict
+    ) -> tuple[list[Tensor], Tensor]:
+        """By each of the own weights, and each lane's loss."""
+        gradient = torch.func.grad(self._lane_losses, has_aux=True)
+        if self._vmapped:
+            gradient = torch.vmap(gradient)
+        gradients, losses = gradient(own, fixed, batch)
+        return gradients, losses
+
+    def _lane_losses(
+        self, own: list[Tensor], fixed: list[Tensor], batch: TensorDict
+    ) -> tuple[Tensor, Tensor]:
+        """The sum over lanes, for its gradient, and each lane's loss; under vmap there is one lane."""
+        by_name = (
+            dict(zip(self._names, own, strict=True)),
+            dict(zip(self._fixed_names, fixed, strict=True)),
+        )
+        each = self.loss(*by_name, batch.reshape(-1) if self._flat else batch)
+        if self._flat:
+            each = each.reshape(batch.batch_size)
+        losses = (each.mean() if self._vmapped else each.flatten(1).mean(-1)) * self._share
+        return losses.sum(), losses
+
+    def outputs(self, observation: Tensor, *, part: int = 0) -> Tensor:
+        """See `Engine`."""
+        name, network = self._parts[part]
+        if not self._vmapped:
+            given: Tensor = network(observation)
+            return given
+
+        def output(weights: Weights, seen: Tensor) -> Tensor:
+            one: Tensor = torch.func.functional_call(network, weights, (seen,))
+            return one
+
+        return torch.vmap(output)(self._of_part(name), observation)
+
+    def _of_part(self, name: str) -> Weights:
+        """The weights of one of an agent's networks, by its own names."""
+        mine = f"{name}." if name else ""
+        return {key.removeprefix(mine): value for key, value in self._shared.items() if key.startswith(mine)}
+
+    def copy_to_targets(self, which: Tensor) -> None:
+        """See `Engine`."""
+        for name, fixed in self.fixed.items():
+            if _source(name) in self.own:
+                fixed[which] = self.own[_source(name)][which]
+
+    def network_state(self, lane: int) -> Weights:
+        """See `Engine`."""
+        name, network = self._parts[0]
+        if not self._vmapped:
+            return lane_state(network, lane)
+        buffers = {key: value.clone() for key, value in network.named_buffers()}
+        return {**{key: value[lane].clone() for key, value in self._of_part(name).items()}, **buffers}
+
+    def weights(self, lane: int) -> Weights:
+        """See `Engine`."""
+        everything = {**self.own, **self.fixed}
+        return {
+            name: (value[lane] if self._vmapped or _source(name) in self.own else value).clone()
+            for name, value in everything.items()
+        }
+
+    def state_dict(self) -> dict[str, Any]:
+        """See `Engine`."""
+        return {
+            "own": self.own,
+            "targets": self.fixed,
+            "mean": self._mean,
+            "square": self._square,
+            "steps": self.steps,
+        }
+
+    def load_state_dict(self, state: Mapping[str, Any]) -> None:
+        """See `Engine`; copies into the tensors that a compiled step knows."""
+        groups = {"own": self.own, "targets": self.fixed, "mean": self._mean, "square": self._square}
+        for group, tensors in groups.items():
+            if set(state[group]) != set(tensors):
+                raise ValueError(
+                    f"the state has the weights {sorted(state[group])}; {sorted(tensors)} is wanted"
+                )
+            for name, tensor in tensors.items():
+                tensor.copy_(state[group][name])
+        self.steps = int(state["steps"])
+
+
+def shortened(gradients: Sequence[Tensor], longest: float) -> list[Tensor]:
+    """Gradients [L, ...] of all weights, those of a lane scaled down where their norm is above `longest`."""
+    squares = [slope.reshape(len(slope), -1).square().sum(1) for slope in gradients]
+    norms = torch.stack(squares).sum(0).sqrt()
+    scales = (longest / (norms + 1e-6)).clamp(max=1.0)
+    return [slope * scales.reshape(-1, *[1] * (slope.ndim - 1)) for slope in gradients]
+
+
+def _source(name: str) -> str:
+    """The weight to whose value a target is set."""
+    return name.removeprefix("target_")
+
+
+def _form(storage: LaneStorage, index: Tensor) -> tuple[object, ...]:
+    """What the compiled step takes for granted of its arguments; its own tensors never change their form."""
+    return storage.rows, index.shape, *((field.shape, field.dtype) for field in storage.fields.values())

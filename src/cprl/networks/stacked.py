@@ -1,0 +1,111 @@
+"""The networks of many lanes as one, whose parameters carry a lane axis."""
+
+from collections.abc import Iterable, Sequence
+from copy import deepcopy
+from typing import Any
+
+import torch
+from torch import Tensor, nn
+
+from cprl.networks.agent import AgentNetworks
+from cprl.networks.distributional import AtomNetwork
+from cprl.networks.mlp import MLPNetwork
+
+
+class StackedMLP(nn.Module):
+    """L networks like `MLPNetwork` whose parameters carry a lane axis, [L, in, out] and [L, 1, out].
+
+    A lane is one agent of one replica; nothing crosses lanes: output l follows from input l and the
+    parameters l alone.
+
+    Args:
+        networks: the networks of the lanes, of one shape; their weights are copied.
+
+    Raises:
+        ValueError: where the networks differ in shape.
+    """
+
+    def __init__(self, networks: Sequence[MLPNetwork]) -> None:
+        super().__init__()
+        first = networks[0]
+        forms = {(network.highest, network.relu_on_outputs, *_shapes(network)) for network in networks}
+        if len(forms) != 1:
+            raise ValueError(f"the networks of the lanes have {len(forms)} different forms; one is wanted")
+        self.highest, self.relu_on_outputs = first.highest, first.relu_on_outputs
+        self.observation_dims, self.outputs = first.observation_dims, first.outputs
+        self._names = [name for name, layer in first.named_modules() if isinstance(layer, nn.Linear)]
+        layers = list(zip(*(network.linears for network in networks), strict=True))
+        self.weights = nn.ParameterList(
+            [torch.stack([layer.weight.detach().T for layer in lanes]).contiguous() for lanes in layers]
+        )
+        self.biases = nn.ParameterList(
+            [torch.stack([layer.bias.detach()[None] for layer in lanes]) for lanes in layers]
+        )
+
+    @property
+    def lanes(self) -> int:
+        """The number of lanes L."""
+        return len(self.weights[0])
+
+    def lane_state(self, lane: int) -> dict[str, Tensor]:
+        """Copies of the weights of one lane, as the state dict of its `MLPNetwork`."""
+        state = {}
+        for name, weight, bias in zip(self._names, self.weights, self.biases, strict=True):
+            state[f"{name}.weight"] = weight[lane].detach().T.clone()
+            state[f"{name}.bias"] = bias[lane, 0].detach().clone()
+        return state
+
+    def forward(self, observation: Tensor) -> Tensor:
+        """uint8 [L, C, X, Y] or [L, b, C, X, Y] to [L, A] or [L, b, A], in the parameters' type."""
+        flat = observation.flatten(-self.observation_dims)
+        values = flat.reshape(self.lanes, -1, flat.shape[-1]).to(self.weights[0].dtype) / self.highest
+        values = through_layers(values, self.weights, self.biases, relu_on_outputs=self.relu_on_outputs)
+        return values.reshape(*flat.shape[:-1], values.shape[-1])
+
+
+def through_layers(
+    values: Tensor, weights: Iterable[Tensor], biases: Iterable[Tensor], *, relu_on_outputs: bool
+) -> Tensor:
+    """[L, b, in] through layers of weights [L, in, out] and biases [L, 1, out] with ReLU between."""
+    first = True
+    for weight, bias in zip(weights, biases, strict=True):
+        values = torch.baddbmm(bias, values if first else values.relu(), weight)
+        first = False
+    return values.relu() if relu_on_outputs else values
+
+
+def stack_lanes(networks: Sequence[nn.Module]) -> nn.Module:
+    """The networks of all lanes as one whose parameters carry a lane axis; copies.
+
+    Raises:
+        ValueError: for other networks than `MLPNetwork`, alone, in an `AtomNetwork` or in `AgentNetworks`,
+            and those that stack themselves, as a team's do.
+    """
+    first: Any = networks[0]
+    if hasattr(first, "stacked"):
+        itself: nn.Module = first.stacked(networks)
+        return itself
+    if all(isinstance(network, AtomNetwork) for network in networks):
+        stack = deepcopy(networks[0])
+        stack.network = stack_lanes([network.network for network in networks])  # type: ignore[misc]
+        return stack
+    if all(isinstance(network, AgentNetworks) for network in networks):
+        parts = zip(*(network.values() for network in networks), strict=True)  # type: ignore[operator]
+        return AgentNetworks(dict(zip(networks[0].keys(), map(stack_lanes, parts), strict=True)))  # type: ignore[operator]
+    if not all(isinstance(network, MLPNetwork) for network in networks):
+        raise ValueError(f"a {type(networks[0]).__name__} is no MLPNetwork")
+    return StackedMLP(networks)  # type: ignore[arg-type]
+
+
+def lane_state(stack: nn.Module, lane: int) -> dict[str, Tensor]:
+    """Copies of the weights of one lane of what `stack_lanes` gave for acting networks, as the state dict of
+    such a network."""
+    if isinstance(stack, AtomNetwork):
+        own = lane_state(stack.network, lane)
+        return {"support": stack.support.clone(), **{f"network.{name}": value for name, value in own.items()}}
+    state: dict[str, Tensor] = stack.lane_state(lane)  # type: ignore[operator]
+    return state
+
+
+def _shapes(network: MLPNetwork) -> tuple[tuple[int, ...], ...]:
+    return tuple(tuple(layer.weight.shape) for layer in network.linears)

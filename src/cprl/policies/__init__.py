@@ -1,0 +1,1 @@
+"""From what agents observe to what they do."""

@@ -1,0 +1,61 @@
+"""Random numbers of lanes: each lane's follow from its own seed alone, whoever else draws."""
+
+from collections.abc import Mapping, Sequence
+from typing import Any, Final
+
+import numpy as np
+import torch
+from torch import Tensor
+
+DRAWN_AHEAD: Final = 1024
+"""Steps for which numbers are drawn at once."""
+
+
+class LaneRng:
+    """Uniform numbers in 0..1, so many for every lane and step.
+
+    Args:
+        seeds: of each lane, e.g. (seed, replica, agent, purpose).
+        count: numbers for each lane and step.
+    """
+
+    def __init__(self, seeds: Sequence[Sequence[int]], count: int) -> None:
+        self.lanes, self.count = len(seeds), count
+        self._chance = [np.random.Generator(np.random.Philox(np.random.SeedSequence(seed))) for seed in seeds]
+        self._numbers = torch.empty((0, self.lanes, count), dtype=torch.float64)
+        self._used = 0
+
+    def next(self) -> Tensor:
+        """The numbers of the next step, float64 [L, count]."""
+        if self._used == len(self._numbers):
+            ahead = [chance.random((DRAWN_AHEAD, self.count)) for chance in self._chance]
+            self._numbers, self._used = torch.from_numpy(np.stack(ahead, 1)), 0
+        self._used += 1
+        return self._numbers[self._used - 1]
+
+    def state_dict(self) -> dict[str, Any]:
+        """Where each lane's numbers stand."""
+        return {
+            "chance": [_plain(chance.bit_generator.state) for chance in self._chance],
+            "numbers": self._numbers,
+            "used": self._used,
+        }
+
+    def load_state_dict(self, state: Mapping[str, Any]) -> None:
+        """Goes on where the draws of that state were."""
+        for chance, own in zip(self._chance, state["chance"], strict=True):
+            chance.bit_generator.state = _arrays(own)
+        self._numbers, self._used = state["numbers"].clone(), int(state["used"])
+
+
+def _plain(state: Any) -> Any:
+    """A generator's state in dicts, lists and numbers, which can be read back without running code."""
+    if isinstance(state, Mapping):
+        return {name: _plain(value) for name, value in state.items()}
+    return state.tolist() if isinstance(state, np.ndarray) else state
+
+
+def _arrays(state: Any) -> Any:
+    if isinstance(state, Mapping):
+        return {name: _arrays(value) for name, value in state.items()}
+    return np.array(state, np.uint64) if isinstance(state, list) else state

@@ -1,0 +1,49 @@
+"""The results of a run, small enough to be committed: a run's directory without its recording and buffers."""
+
+import shutil
+from pathlib import Path
+
+import pyarrow as pa
+import pyarrow.parquet as pq
+
+from cprl.runs.episodes import FILE_NAME, read_episodes
+from cprl.runs.directory import read_recipe
+
+_WHOLE = ("recipe.json", "report.json", "checkpoints/final.pt")
+
+
+def export_results(run: Path, folder: Path) -> Path:
+    """Copies what a report needs of a finished run: recipe, episodes, evaluation, weights.
+
+    Args:
+        run: the run's directory.
+        folder: where to; what it holds of an earlier copy is replaced.
+
+    Returns:
+        The folder, which `cprl.load`, `read_episodes` and `cprl report` take like the run itself. Metrics
+        and returns are float32 there, and rows sorted by replica, episode and agent.
+
+    Raises:
+        ValueError: where there is no run.
+        FileNotFoundError: where the run has not ended.
+    """
+    read_recipe(run)
+    for name in _WHOLE:
+        if not (run / name).exists():
+            raise FileNotFoundError(f"{run / name} is not there: has the run ended?")
+    for name in _WHOLE:
+        (folder / name).parent.mkdir(parents=True, exist_ok=True)
+        shutil.copyfile(run / name, folder / name)
+    _write(read_episodes(run), folder / FILE_NAME)
+    for path in sorted((run / "evaluation").glob("*.parquet")):
+        _write(pq.read_table(path), folder / "evaluation" / path.name)
+    return folder
+
+
+def _write(table: pa.Table, path: Path) -> None:
+    path.parent.mkdir(parents=True, exist_ok=True)
+    ordered = table.sort_by([(name, "ascending") for name in ("replica", "episode", "agent")])
+    kinds = pa.schema(
+        [(own.name, pa.float32() if own.type == pa.float64() else own.type) for own in table.schema]
+    )
+    pq.write_table(ordered.cast(kinds), path, compression="zstd", compression_level=19)

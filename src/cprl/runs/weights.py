@@ -1,0 +1,94 @@
+"""The weights of networks, kept and read."""
+
+from collections.abc import Mapping
+from pathlib import Path
+
+import torch
+from tensordict import TensorDictBase
+from torch import Tensor, nn
+from torchrl.record.loggers import Logger
+
+from cprl.envs.commons_env import CommonsEnv
+from cprl.measuring.episodes import Episode
+from cprl.measuring.evaluate import evaluate, mean_return
+from cprl.runs.files import write_atomically
+
+
+def save_weights(run: Path, networks: Mapping[str, nn.Module], *, name: str = "final") -> Path:
+    """Writes the weights of each agent's network, all or nothing.
+
+    Args:
+        run: the run's directory.
+        networks: by the agent's name.
+        name: of the file.
+
+    Returns:
+        `checkpoints/<name>.pt` of the run, which `load_weights` reads.
+    """
+    path = run / "checkpoints" / f"{name}.pt"
+    path.parent.mkdir(exist_ok=True)
+    weights = {agent: network.state_dict() for agent, network in networks.items()}
+    write_atomically(path, lambda file: torch.save(weights, file))
+    return path
+
+
+class BestWeights:
+    """Evaluates the greedy policy every so many episodes, and keeps the best weights so far on disk.
+
+    An observer of `cprl.training`. The worlds of this evaluation are the same every time; what the kept
+    weights are worth must be measured on others.
+
+    Args:
+        run: the run's directory.
+        networks: by the agent's name.
+        policy: of all agents, e.g. `cprl.acting.AgentPolicies`.
+        env: worlds to evaluate in.
+        every: episodes from one evaluation to the next.
+        logger: told of each `evaluation/greedy_return`.
+    """
+
+    def __init__(
+        self,
+        run: Path,
+        networks: Mapping[str, nn.Module],
+        *,
+        policy: nn.Module,
+        env: CommonsEnv,
+        every: int = 10,
+        logger: Logger | None = None,
+    ) -> None:
+        self.run, self.networks, self.policy, self.env = run, networks, policy, env
+        self.every, self.logger = every, logger
+        self.seed = int(env.worlds.now.seed[0, 0])
+        self.path: Path | None = None
+        self.best_return, self.best_episode, self._episodes = float("-inf"), -1, 0
+
+    def on_step(self, batch: TensorDictBase) -> None:
+        """Nothing happens within an episode."""
+
+    def on_episode(self, episode: Episode, learning: Mapping[str, float]) -> None:
+        """Counts an episode; after every so many, evaluates and keeps the weights if they are better."""
+        self._episodes += 1
+        if self._episodes % self.every:
+            return
+        self.env.set_seed(self.seed)
+        reached, _ = mean_return(evaluate(self.env, self.policy))
+        if self.logger is not None:
+            self.logger.log_scalar("evaluation/greedy_return", reached)
+        if reached > self.best_return:
+            self.best_return, self.best_episode = reached, self._episodes
+            self.path = save_weights(self.run, self.networks, name="best")
+
+
+def restore_weights(path: Path, networks: Mapping[str, nn.Module]) -> None:
+    """Puts kept weights back into the networks of the same agents."""
+    kept = load_weights(path)
+    if set(kept) != set(networks):
+        raise ValueError(f"{path} holds the weights of {sorted(kept)}; wanted: {sorted(networks)}")
+    for agent, network in networks.items():
+        network.load_state_dict(kept[agent])
+
+
+def load_weights(path: Path) -> dict[str, dict[str, Tensor]]:
+    """The state dict of each agent's network; reads tensors only, runs no code of the file."""
+    return dict(torch.load(path, weights_only=True))

@@ -1,0 +1,49 @@
+"""Figures of a run, drawn from its table of episodes alone."""
+
+from pathlib import Path
+
+import numpy as np
+from matplotlib.figure import Figure
+
+from cprl.measuring.episodes import Episode
+from cprl.measuring.evaluate import mean_return
+from cprl.measuring.published import SMOOTHED_EPISODES
+from cprl.runs.curves import running_mean
+from cprl.runs.episodes import read_episodes
+
+
+def training_curve(
+    run: Path, *, title: str, random: list[Episode] | None = None, smoothed: int = SMOOTHED_EPISODES
+) -> Path:
+    """Draws the collective return of every episode of a run, the mean of its replicas, and its running mean.
+
+    Args:
+        run: the run's directory.
+        title: what was run, with its schedule.
+        random: episodes of the random policy, whose mean return becomes a dashed line.
+        smoothed: episodes that the running mean covers, drawn at the first of them as in the study.
+
+    Returns:
+        The PNG, `figures/training_curve.png` of the run.
+    """
+    table = read_episodes(run).select(["replica", "episode", "return"]).to_pydict()
+    episodes = np.array(table["episode"])
+    returns = np.zeros(int(episodes.max()) + 1)
+    np.add.at(returns, episodes, table["return"])
+    returns /= len(set(table["replica"]))
+    figure = Figure(figsize=(8, 4.5), layout="constrained")
+    axes = figure.add_subplot()
+    each = "each episode, mean of the replicas" if max(table["replica"]) else "each episode"
+    axes.plot(returns, color="#9ecae1", linewidth=0.8, label=each)
+    window = min(smoothed, max(1, len(returns) // 5))
+    mean = running_mean(returns, window)
+    axes.plot(mean, color="#08519c", linewidth=2, label=f"mean of {window} episodes from here")
+    if random:
+        level, _ = mean_return(random)
+        axes.axhline(level, color="#636363", linestyle="--", label=f"random policy, {level:.1f}")
+    axes.set(title=title, xlabel="episode", ylabel="collective return, apples", ylim=(0, None))
+    axes.legend(loc="lower right")
+    path = run / "figures" / "training_curve.png"
+    path.parent.mkdir(exist_ok=True)
+    figure.savefig(path, dpi=120)
+    return path

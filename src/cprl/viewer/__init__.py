@@ -1,0 +1,1 @@
+"""The Rerun recording of a training."""

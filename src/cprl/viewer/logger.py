@@ -1,0 +1,286 @@
+"""RerunLogger: a run as a Rerun recording, to a file and, on request, served live on 127.0.0.1."""
+
+import time
+from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
+from typing import Any, Final, TypeAlias
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from rich.console import Console
+from torch import Tensor
+from torchrl.record.loggers import Logger
+
+from cprl.viewer.blueprint import layout
+from cprl.viewer.scenery import Scene, classes, lines, phase_states
+from cprl.viewer.stage import columns, fixed
+from cprl.viewer.streams import FLUSH_TIMEOUT_S, Stream, open_file, open_live
+
+FILE_NAME: Final = "run.rrd"
+TIMELINES: Final = ("step", "episode", "frame")
+"""Of every row: environment steps of the run, episodes, and frames recorded so far."""
+
+Numbers: TypeAlias = "Sequence[int] | NDArray[np.integer[Any]]"
+
+_LIVE_PERIOD_S: Final = 1.0
+_FILE_PERIOD_S: Final = 60.0
+"""Each sending of numbers costs the file some forty kilobytes, however few they are."""
+
+
+class RerunLogger(Logger):
+    """TorchRL's logger interface on a Rerun recording; names become entities, `social/equality` and so on.
+
+    Numbers wait in memory and are sent as columns: to the viewer about every second, to the file about
+    every minute. Every row carries the timelines `step` (environment steps of the run), `episode` and `frame`
+    (frames recorded so far). The file and the live recording are two streams of one recording id, so that
+    one may fail without the other; whatever fails is dropped with one warning.
+
+    Args:
+        exp_name: the name that the viewer shows.
+        log_dir: the run's directory, where the recording is written.
+        scene: what is on the board; without it no frames can be logged.
+        live: "serve", "spawn" or "connect ADDRESS", see `cprl.viewer.streams.open_live`; None for the file
+            alone. A recording is served on 127.0.0.1 alone; the empty page of the web viewer, which Rerun
+            serves, listens on all interfaces.
+        file_name: of the recording.
+        recording_id: the viewer shows files of one id as one recording; by default a new one.
+        console: where the addresses are told; by default standard output.
+
+    Raises:
+        FileExistsError: where there is a recording already.
+    """
+
+    def __init__(
+        self,
+        exp_name: str,
+        log_dir: str | Path,
+        *,
+        scene: Scene | None = None,
+        live: str | None = None,
+        file_name: str = FILE_NAME,
+        recording_id: str | None = None,
+        console: Console | None = None,
+    ) -> None:
+        self.scene = scene
+        self.recording_id = recording_id or f"{exp_name}-{time.time_ns()}"
+        self.path = Path(log_dir) / file_name
+        if self.path.exists():
+            raise FileExistsError(
+                f"{self.path} exists and is kept; give the recording a directory of its own"
+            )
+        self.addresses: dict[str, str] = {}
+        self._live, self._console = live, console or Console()
+        self._streams: list[Stream] = []
+        self.frames = 0
+        """Frames recorded so far, in earlier files of the recording too."""
+        self._now = (0, 0)
+        self._clips_end: dict[str, int] = {}
+        super().__init__(exp_name, str(log_dir))
+
+    def _create_experiment(self) -> list[Any]:
+        recording_id, blueprint = self.recording_id, layout(self.scene)
+        Path(self.log_dir).mkdir(parents=True, exist_ok=True)
+        file = open_file(recording_id, self.path, blueprint, period_s=_FILE_PERIOD_S)
+        self._streams += [file] if file else []
+        if self._live:
+            self._go_live(recording_id, blueprint)
+        self._all(lambda recording: recording.send_recording_name(self.exp_name))
+        self._static("/", classes(self.scene))
+        for entity, style in lines(self.scene).items():
+            self._static(entity, style)
+        for entity in ("phase/now", "phase/found"):
+            self._static(entity, phase_states())
+        if self.scene is not None:
+            for entity, parts in fixed(self.scene).items():
+                self._static(entity, *parts)
+        self._all(lambda recording: recording.flush(timeout_sec=FLUSH_TIMEOUT_S))
+        return [each.recording for each in self._streams]
+
+    def _go_live(self, recording_id: str, blueprint: Any) -> None:
+        live, self.addresses = open_live(self._live or "", recording_id, blueprint, period_s=_LIVE_PERIOD_S)
+        self._streams += [live] if live else []
+        for where, address in self.addresses.items():
+            self._console.print(f"ViewerCallback live ({where}): {address}", soft_wrap=True, highlight=False)
+
+    def _all(self, what: Callable[[Any], object]) -> None:
+        for each in self._streams:
+            each.do(what)
+
+    def _static(self, entity: str, *what: Any) -> None:
+        self._all(lambda recording: recording.log(entity, *what, static=True))
+
+    def _send(self, entity: str, times: list[Any], columns: Any) -> None:
+        self._all(lambda recording: recording.send_columns(entity, times, columns))
+
+    def at(self, *, step: int, episode: int) -> None:
+        """Says when it is, for what is logged next without a step of its own."""
+        self._now = step, episode
+
+    def log_scalar(self, name: str, value: Any, step: int | None = None, **kwargs: Any) -> None:
+        """Logs a number, or a list, array or tensor of them as name/0, name/1 and so on."""
+        if isinstance(value, Tensor | np.ndarray | list | tuple):
+            numbers = np.asarray(value.detach().cpu() if isinstance(value, Tensor) else value).reshape(-1)
+            if numbers.size != 1:
+                for index, number in enumerate(numbers):
+                    self.log_scalar(f"{name}/{index}", float(number), step)
+                return
+            value = numbers[0]
+        self._wait(name, self._now[0] if step is None else int(step), [float(value)])
+
+    def log_lines(self, name: str, values: Sequence[float]) -> None:
+        """Logs several numbers that are drawn as lines of one plot, as many every time; NaN leaves a gap."""
+        self._wait(name, self._now[0], [float(value) for value in values])
+
+    def _wait(self, name: str, step: int, values: list[float]) -> None:
+        row = step, self._now[1], self.frames, values
+        for each in self._streams:
+            each.waiting.setdefault(name, []).append(row)
+            if each.is_due:
+                _send_waiting(each)
+
+    def log_states(self, name: str, states: Mapping[int, str]) -> None:
+        """Logs in which state something is from which episode on; steps are those that `at` said."""
+        import rerun as rr
+
+        episodes = list(states)
+        times = _times([self._now[0]] * len(episodes), episodes, [self.frames] * len(episodes))
+        self._send(name, times, rr.StateChange.columns(state=list(states.values())))
+
+    def log_matrix(self, name: str, matrix: NDArray[Any], dims: Sequence[str]) -> None:
+        """Logs a matrix of numbers, float32 [rows, columns], with the names of its two axes."""
+        import rerun as rr
+
+        values = np.asarray(matrix, np.float32)
+
+        def log(recording: Any) -> None:
+            for timeline, number in zip(TIMELINES, (*self._now, self.frames), strict=True):
+                recording.set_time(timeline, sequence=number)
+            recording.log(name, rr.Tensor(values, dim_names=list(dims)))
+            recording.reset_time()
+
+        self._all(log)
+
+    def log_frames(self, frames: Mapping[str, NDArray[Any]]) -> None:
+        """Logs what `FrameBuffer.take` gave, windows as `classes_seen` gives them; see `stage.columns`."""
+        if self.scene is None:
+            raise ValueError("the logger has no scene; give it one to log frames")
+        count = len(frames["step"])
+        if not count:
+            return
+        numbers = np.arange(self.frames, self.frames + count)
+        self.frames += count
+        for entity, (rows, what) in columns(self.scene, frames).items():
+            times = _times(frames["step"][rows], frames["episode"][rows], numbers[rows])
+            self._send(entity, times, what)
+
+    def log_text(self, text: str, level: str = "INFO") -> None:
+        """Logs an event at the time that `at` said."""
+        import rerun as rr
+
+        times = _times([self._now[0]], [self._now[1]], [self.frames])
+        what = rr.TextLog.columns(text=[text], level=[level])
+        self._send("log", times, what)
+
+    def log_hparams(self, cfg: Any) -> None:
+        """Shows a mapping, or a Markdown text, as the recipe of the run."""
+        import rerun as rr
+
+        text = (
+            cfg
+            if isinstance(cfg, str)
+            else "\n".join(f"- **{key}**: {value}" for key, value in dict(cfg).items())
+        )
+        self._static("recipe", rr.TextDocument(text, media_type=rr.MediaType.MARKDOWN))
+
+    def log_video(self, name: str, video: Tensor, step: int | None = None, **kwargs: Any) -> None:
+        """Logs uint8 [(1), T, C, H, W] as T images, one each `step` from the one given.
+
+        A clip of the same name that goes on until later is followed, since TorchRL's recorders count clips.
+        """
+        import rerun as rr
+
+        clip = torch.as_tensor(video).cpu()
+        clip = clip[0] if clip.ndim == 5 else clip
+        if clip.ndim != 4:
+            raise ValueError(f"the video is {list(video.shape)}; [T, C, H, W] or [1, T, C, H, W] is wanted")
+        images = clip.permute(0, 2, 3, 1).to(torch.uint8).numpy()
+        first = max(self._now[0] if step is None else int(step), self._clips_end.get(name, 0))
+        self._clips_end[name] = first + len(images)
+        form = rr.components.ImageFormat(
+            width=images.shape[2],
+            height=images.shape[1],
+            color_model="L" if images.shape[3] == 1 else "RGB",
+            channel_datatype=rr.ChannelDatatype.U8,
+        )
+        self._static(name, rr.Image.from_fields(format=form))
+        count = len(images)
+        times = _times(range(first, first + count), [self._now[1]] * count, [self.frames] * count)
+        what = rr.Image.columns(buffer=np.ascontiguousarray(images).reshape(count, -1))
+        self._send(name, times, what)
+
+    def log_histogram(
+        self, name: str, data: Any, *, bins: int = 30, step: int | None = None, **kwargs: Any
+    ) -> None:
+        """Logs how often values fall into so many equal bins, as bars."""
+        import rerun as rr
+
+        values = np.asarray(data.detach().cpu() if isinstance(data, Tensor) else data).reshape(-1)
+        counts, edges = np.histogram(values, bins=bins)
+        when = self._now[0] if step is None else int(step)
+
+        def log(recording: Any) -> None:
+            for timeline, number in zip(TIMELINES, (when, self._now[1], self.frames), strict=True):
+                recording.set_time(timeline, sequence=number)
+            recording.log(name, rr.BarChart(counts, abscissa=(edges[:-1] + edges[1:]) / 2))
+            recording.reset_time()
+
+        self._all(log)
+
+    def flush(self) -> None:
+        """Sends everything that waits, to the file and to the viewer."""
+        for each in self._streams:
+            _send_waiting(each)
+
+    def shutdown(self) -> None:
+        """Sends everything and closes the recording; the file gets its footer. A second call does nothing."""
+        self.flush()
+        for each in self._streams:
+            each.close()
+
+    close = shutdown
+
+    def __enter__(self) -> "RerunLogger":
+        return self
+
+    def __exit__(self, *error: object) -> None:
+        self.shutdown()
+
+    def __repr__(self) -> str:
+        return f"RerunLogger(exp_name={self.exp_name!r}, path={str(self.path)!r}, addresses={self.addresses})"
+
+
+def _times(steps: Numbers, episodes: Numbers, frames: Numbers) -> list[Any]:
+    """The timelines that every row carries."""
+    import rerun as rr
+
+    return [
+        rr.TimeColumn(name, sequence=np.asarray(numbers, np.int64))
+        for name, numbers in zip(TIMELINES, (steps, episodes, frames), strict=True)
+    ]
+
+
+def _send_waiting(stream: Stream) -> None:
+    """Sends what one stream still waits for, one chunk an entity."""
+    import rerun as rr
+
+    waiting = stream.take()
+
+    def send(recording: Any) -> None:
+        for name, rows in waiting.items():
+            steps, episodes, frames, values = zip(*rows, strict=True)
+            columns = rr.Scalars.columns(scalars=np.concatenate(values)).partition([len(v) for v in values])
+            recording.send_columns(name, _times(steps, episodes, frames), columns)
+        recording.flush(timeout_sec=FLUSH_TIMEOUT_S)
+
+    stream.do(send)

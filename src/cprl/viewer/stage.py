@@ -1,0 +1,164 @@
+"""The stage: frames of one world as Rerun's archetypes, the board with its agents and what they see."""
+
+from collections.abc import Mapping
+from typing import Any, Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from cprl.commons.colours import APPLE, BEAM, FIRST_AGENT, GROUND, WALL, agent_colour
+from cprl.commons.seeing import UNSEEN
+from cprl.commons.world import Bools, Bytes
+from cprl.viewer.frames import mosaic, mosaic_size, window_corners
+from cprl.viewer.scenery import Scene
+
+RIM_CELLS: Final = 1
+"""Cells of wall that are shown around the board."""
+
+_AHEAD: Final = np.array([(0, -1), (1, 0), (0, 1), (-1, 0)], np.float32)
+_ARROW_CELLS: Final = 1.5
+"""From an agent's centre into the next cell: the number stands at its middle, and hides less of the agent."""
+_OUT_HALF_CELLS: Final = 0.4
+_BEAM_OPACITY: Final = 0.5
+_STROKE_CELLS: Final = 0.07
+
+Frames = Mapping[str, NDArray[Any]]
+"""As `FrameBuffer.take` gives them, [T, ...] each, windows as `classes_seen` gives them."""
+
+
+def frame_bytes(scene: Scene) -> float:
+    """How much of a file one frame takes at most, about: a trained population's on `commons` takes 400."""
+    rows, columns = mosaic_size(len(scene.agents), scene.window)
+    return 80 + 20 * len(scene.agents) + 0.35 * (rows * columns + scene.height * scene.width)
+
+
+def fixed(scene: Scene) -> dict[str, list[Any]]:
+    """What is the same in every frame, by entity: sizes of pictures, agents' names, colours and frames."""
+    import rerun as rr
+
+    def form(size: tuple[int, int]) -> Any:
+        return rr.components.ImageFormat(
+            width=size[1], height=size[0], channel_datatype=rr.ChannelDatatype.U8
+        )
+
+    image = rr.SegmentationImage.from_fields
+    board = form((scene.height + 2 * RIM_CELLS, scene.width + 2 * RIM_CELLS))
+    agents, (rows, columns) = len(scene.agents), scene.window
+    colours = [agent_colour(agent) for agent in range(agents)]
+    corners = np.array(window_corners(agents, scene.window), np.float32)[:, ::-1]
+    return {
+        "world/board": [image(format=board, opacity=1.0, draw_order=-10.0)],
+        "world/beams": [image(format=board, opacity=_BEAM_OPACITY, draw_order=-5.0)],
+        "world/agents": [
+            rr.Arrows2D.from_fields(colors=[(255, 255, 255)], labels=[str(agent) for agent in range(agents)])
+        ],
+        "world/out": [rr.Boxes2D.from_fields(radii=[2 * _STROKE_CELLS])],
+        "windows": [image(format=form(mosaic_size(agents, scene.window)), opacity=1.0)],
+        "windows/frames": [
+            rr.Boxes2D(
+                mins=corners - 0.2,
+                sizes=np.full((agents, 2), (columns + 0.4, rows + 0.4)),
+                colors=colours,
+                radii=2 * _STROKE_CELLS,
+                labels=list(scene.agents),
+                show_labels=False,
+            )
+        ],
+    }
+
+
+def columns(scene: Scene, frames: Frames) -> dict[str, tuple[NDArray[np.intp], Any]]:
+    """What T frames show, by entity: which of the frames have a row there, and the columns of these rows.
+
+    Beams and marks of those out of play have a row only where they change, and in the first frame.
+    """
+    import rerun as rr
+
+    count = len(frames["step"])
+    everywhere = np.arange(count)
+
+    def pictures(images: Bytes) -> Any:
+        return rr.SegmentationImage.columns(buffer=images.reshape(len(images), -1))
+
+    beams = beam_pictures(frames["beams"])
+    changed = _changes(beams)
+    shown = {
+        "world/board": (everywhere, pictures(boards(scene, frames))),
+        "world/beams": (changed, pictures(beams[changed])),
+        "world/agents": (everywhere, _agents(frames)),
+        "world/out": _out(scene, frames),
+        "windows": (everywhere, pictures(mosaic(frames["windows"]))),
+    }
+    if scene.is_replay:
+        stock = frames["stock"].sum(1, dtype=np.float64)
+        shown["turn/stock"] = everywhere, rr.Scalars.columns(scalars=stock)
+        for agent, name in enumerate(scene.agents):
+            harvested = frames["harvested"][:, agent].astype(np.float64)
+            shown[f"{name}/harvested"] = everywhere, rr.Scalars.columns(scalars=harvested)
+    return shown
+
+
+def boards(scene: Scene, frames: Frames) -> Bytes:
+    """Boards with a rim of wall: apples that hang, and agents in play, each in a class of its own.
+
+    Returns:
+        uint8 [T, H + 2, W + 2].
+    """
+    count = len(frames["step"])
+    drawn = np.full((count, scene.height, scene.width), GROUND, np.uint8)
+    if scene.walls:
+        drawn[:, *np.array(scene.walls).T] = WALL
+    if scene.sites:
+        drawn[:, *np.array(scene.sites).T] = np.where(frames["stock"] > 0, APPLE, GROUND)
+    for agent in range(len(scene.agents)):
+        at = np.flatnonzero(frames["in_play"][:, agent])
+        drawn[at, frames["row"][at, agent], frames["col"][at, agent]] = FIRST_AGENT + agent
+    return _with_rim(drawn, WALL)
+
+
+def beam_pictures(beams: Bools) -> Bytes:
+    """The cells that beams cover, UNSEEN elsewhere: uint8 [T, H + 2, W + 2] of bool [T, H, W]."""
+    return _with_rim(np.where(beams, BEAM, UNSEEN).astype(np.uint8), UNSEEN)
+
+
+def _with_rim(pictures: Bytes, kind: int) -> Bytes:
+    return np.pad(pictures, ((0, 0), (RIM_CELLS,) * 2, (RIM_CELLS,) * 2), constant_values=kind)
+
+
+def _agents(frames: Frames) -> Any:
+    """Arrows that point where agents look; of those out of play no more than their numbers are left."""
+    import rerun as rr
+
+    count, agents = frames["in_play"].shape
+    ahead = _ARROW_CELLS * _AHEAD[frames["heading"]] * frames["in_play"][..., None]
+    return rr.Arrows2D.columns(
+        origins=_centres(frames).reshape(-1, 2), vectors=ahead.reshape(-1, 2)
+    ).partition([agents] * count)
+
+
+def _out(scene: Scene, frames: Frames) -> tuple[NDArray[np.intp], Any]:
+    """A hollow square in the colour of each agent that is out of play, and by whom it was tagged."""
+    import rerun as rr
+
+    out, by = ~frames["in_play"], frames["tagged_by"]
+    told = np.concatenate([out, np.where(out, by, 0), np.where(out, frames["row"], 0)], 1)
+    changed = _changes(np.concatenate([told, np.where(out, frames["col"], 0)], 1))
+    out, by, centres = out[changed], by[changed], _centres(frames)[changed]
+    rgb = np.array([agent_colour(agent) for agent in range(len(scene.agents))], np.uint8)
+    return changed, rr.Boxes2D.columns(
+        centers=centres[out],
+        half_sizes=np.full((int(out.sum()), 2), _OUT_HALF_CELLS),
+        colors=rgb[np.nonzero(out)[1]],
+        labels=["out" if tagger < 0 else f"by {tagger}" for tagger in by[out]],
+    ).partition(out.sum(1))
+
+
+def _centres(frames: Frames) -> NDArray[np.float32]:
+    """Where agents stand on the picture, (x, y): [T, N, 2]."""
+    return np.stack([frames["col"], frames["row"]], -1).astype(np.float32) + RIM_CELLS + 0.5
+
+
+def _changes(rows: NDArray[Any]) -> NDArray[np.intp]:
+    """The first row, and all that differ from the one before."""
+    flat = rows.reshape(len(rows), -1)
+    return np.flatnonzero(np.concatenate([[True], (flat[1:] != flat[:-1]).any(1)]))
