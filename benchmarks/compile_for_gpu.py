@@ -37,7 +37,7 @@ def arguments(game: Game, worlds: int = 4) -> dict[str, tuple[Any, ...]]:
     actions, marks = np.zeros((worlds, agents), np.int64), np.zeros(worlds, np.bool_)
     boards = np.zeros((worlds, game.map.height, game.map.width), np.uint8)
     on_gpu = Worlds(*map(np.asfortranarray, state))
-    loops = {"play_worlds": actions, "begin_worlds": marks, "look_at_worlds": marks, "show_worlds": boards}
+    loops = {"play_worlds": actions, "begin_worlds": marks, "refresh_worlds": marks, "show_worlds": boards}
     return {
         **{name: (on_gpu, tables, what, told, scratch) for name, what in loops.items()},
         "find_unknown": (actions, len(game.actions), np.zeros(1, np.int64)),

@@ -76,7 +76,7 @@ def kernel(game: Game, worlds: int, threads: int, turns: int, repeats: int) -> R
 
 def through_step(game: Game, worlds: int, threads: int, turns: int, repeats: int) -> Rate:
     """`CommonsEnv.step`: fresh tensors and TensorDicts every turn."""
-    env = CommonsEnv(game, worlds, threads=threads)
+    env = CommonsEnv(game, worlds, seed=0, threads=threads)
     actions = torch.as_tensor(actions_for(game, worlds, turns))
     moment = {"now": env.reset()}
 

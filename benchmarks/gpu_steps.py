@@ -36,7 +36,7 @@ def seconds(step: Callable[[int], object], turns: int, repeats: int) -> float:
 
 def rates(size: int, turns: int, repeats: int) -> tuple[float, float]:
     """Environment steps per second of the kernel alone and of `CommonsEnv.step`, `size` worlds."""
-    env = CommonsEnv(presets.game("commons"), size, device="cuda")
+    env = CommonsEnv(presets.game("commons"), size, seed=0, device="cuda")
     actions = torch.randint(8, (turns, size, env.game.agents), device="cuda")
     arrays = [env.worlds.driver.wrap(turn) for turn in actions]  # type: ignore[attr-defined]
     moment = {"now": env.reset()}

@@ -21,11 +21,10 @@ from tensordict import TensorDict
 
 from cprl import presets
 from cprl.algorithms.actor_critic import IQL, SAC
+from cprl.algorithms.base import Algorithm, TeamAlgorithm
 from cprl.algorithms.dqn import CQL, DQN, DistributionalDQN
 from cprl.algorithms.on_policy import A2C, PPO, Reinforce
-from cprl.algorithms.on_policy_teams import IPPO, MAPPO
-from cprl.algorithms.registry import Algorithm
-from cprl.algorithms.teams import QMIX, VDN, TeamAlgorithm
+from cprl.algorithms.teams import IPPO, MAPPO, QMIX, VDN
 from cprl.learners.engine.choice import TRIAL_LANES, fitting_engine, make_engine, trial_batch
 from cprl.learners.lanes import WEIGHTS, Lanes
 from cprl.learners.rollouts import trial_rollout
@@ -56,17 +55,17 @@ def lanes_of(algorithm: Algorithm, learners: int) -> Lanes | Teams:
     """So many learners, four in each replica of `commons`, as lanes or teams."""
     game = presets.game("commons")
     agents = Lanes(
-        game,
+        game.spaces,
         agents=range(game.agents),
         replicas=learners // game.agents,
         seed=0,
         first_replica=0,
-        make_network=lambda: algorithm.network(game),
+        make_network=lambda: algorithm.make_network(game.spaces),
         stochastic=algorithm.stochastic,
     )
     if not isinstance(algorithm, TeamAlgorithm):
         return agents
-    return Teams(agents, lambda members: algorithm.team(members, game))
+    return Teams(agents, lambda members: algorithm.make_team(members, game.spaces))
 
 
 def update_us(name: str, learners: int, repeats: int) -> tuple[str, bool, float]:
@@ -84,11 +83,11 @@ def update_us(name: str, learners: int, repeats: int) -> tuple[str, bool, float]
 
     networks = lanes_of(algorithm, max(learners, TRIAL_LANES * 4)).new_networks(WEIGHTS, "cpu")
     trial = batch_of(TRIAL_LANES)
-    engine = fitting_engine(networks[:TRIAL_LANES], algorithm.loss, trial)
+    engine = fitting_engine(networks[:TRIAL_LANES], algorithm.make_loss, trial)
     update = make_engine(
         engine,
         networks[: len(lanes)],
-        algorithm.loss,
+        algorithm.make_loss,
         compile=True,
         trial=trial,
         learning_rate=1e-5,

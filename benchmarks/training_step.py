@@ -73,10 +73,10 @@ def measure(board: presets.Board, agents: int, replicas: int, repeats: int) -> d
     """Microseconds of each part, of a whole step, and of an update alone; and the ratio of the last two."""
     prepare_process(0)
     game = presets.game(board)
-    settings = replace(presets.learner(board), buffer_size=20_000)
+    settings = replace(presets.dqn_settings(board), buffer_size=20_000)
     agents = tuple(range(agents))
-    learner = ReplayLearner(game, agents=agents, replicas=replicas, settings=settings)
-    training = Training(CommonsEnv(game, replicas), {agents: learner}, episodes=10**9)
+    learner = ReplayLearner(game.spaces, agents=agents, replicas=replicas, settings=settings)
+    training = Training(CommonsEnv(game, replicas, seed=0), {agents: learner}, episodes=10**9)
     while training.steps < 500:
         training.step()
     best: dict[str, float] = {}

@@ -36,7 +36,7 @@ from cprl.process import prepare_process
 from cprl.training import Training
 from cprl.viewer.callback import ViewerCallback
 
-SEATS: Final = (0, 1, 2, 3)
+AGENTS: Final = (0, 1, 2, 3)
 REPLICAS: Final = 8
 EPISODES: Final = 5000
 BLOCK: Final = 50
@@ -52,10 +52,10 @@ def cost(run: Path, repeats: int) -> tuple[float, float, int]:
     episodes one has its frames kept."""
     prepare_process(0)
     game = presets.game("commons")
-    settings = replace(presets.learner("commons"), buffer_size=20_000)
-    learner = ReplayLearner(game, agents=SEATS, replicas=REPLICAS, settings=settings)
-    env = CommonsEnv(game, REPLICAS)
-    training = Training(env, {SEATS: learner}, episodes=10**9)
+    settings = replace(presets.dqn_settings("commons"), buffer_size=20_000)
+    learner = ReplayLearner(game.spaces, agents=AGENTS, replicas=REPLICAS, settings=settings)
+    env = CommonsEnv(game, REPLICAS, seed=0)
+    training = Training(env, {AGENTS: learner}, episodes=10**9)
     steps = game.rules.episode_steps
 
     def seconds(watch: ViewerCallback | None) -> float:
@@ -105,9 +105,9 @@ def size(run: Path, episodes: int) -> tuple[int, int]:
     """Bytes of a recording of so many episodes, and the frames in it."""
     prepare_process(0)
     game = presets.game("commons")
-    env = CommonsEnv(game, REPLICAS)
+    env = CommonsEnv(game, REPLICAS, seed=0)
     chance = np.random.default_rng(0)
-    at_random = random_agents(game, SEATS, replicas=REPLICAS, seed=0)
+    at_random = random_agents(game, AGENTS, replicas=REPLICAS, seed=0)
     with ViewerCallback(run, env, title="size", episodes=episodes) as watch:
         witness = Witness(watch)
         training = Training(env, {}, others=at_random, episodes=10**9, callbacks=[witness])
@@ -126,7 +126,7 @@ def size(run: Path, episodes: int) -> tuple[int, int]:
                     "collective_return": better * episode.metrics["collective_return"],
                 }
                 told = replace(episode, world=replica, episode=number, metrics=metrics)
-                names = [f"agent_{agent}/{name}" for agent in SEATS for name in ("loss", "epsilon", "q")]
+                names = [f"agent_{agent}/{name}" for agent in AGENTS for name in ("loss", "epsilon", "q")]
                 watch.on_episode(told, dict(zip(names, chance.random(len(names)).tolist(), strict=True)))
             if number % FLUSHED_EVERY == 0:
                 watch.logger.flush()

@@ -1,4 +1,4 @@
-"""The table of scripted agents in docs/algorithms.md: a whole population of each manner on a board.
+"""The table of scripted agents in docs/algorithms.md: a whole population of each scripted policy on a board.
 
 python docs/scripted_agents.py --board commons --episodes 20
 """
@@ -14,13 +14,13 @@ from cprl.policies.scripted import SCRIPTED_POLICIES, ScriptedActor
 
 
 def main(*, board: presets.Board = "commons", episodes: int = 20, seed: int = 0) -> None:
-    """Prints, for each manner, means over episodes; the return with its standard error."""
+    """Prints, for each policy, means over episodes; the return with its standard error."""
     game = presets.game(board)
     everyone = tuple(range(game.agents))
-    print("| manner | return of all | steps | apples left | shots | tagged |\n|---|---:|---:|---:|---:|---:|")
-    for manner in SCRIPTED_POLICIES:
+    print("| policy | return of all | steps | apples left | shots | tagged |\n|---|---:|---:|---:|---:|---:|")
+    for policy in SCRIPTED_POLICIES:
         seeds = [(seed, agent) for agent in everyone]
-        actor = ScriptedActor(manner, game, seeds=seeds, agents=len(everyone), worlds=episodes)
+        actor = ScriptedActor(policy, game, seeds=seeds, agents=len(everyone), worlds=episodes)
         played = evaluate(CommonsEnv(game, episodes, seed=seed), AgentPolicies({everyone: actor}))
         return_, error = mean_return(played)
         numbers = [
@@ -28,7 +28,7 @@ def main(*, board: presets.Board = "commons", episodes: int = 20, seed: int = 0)
             for episode in played
         ]
         means = " | ".join(f"{fmean(column):.1f}" for column in zip(*numbers, strict=True))
-        print(f"| {manner} | {return_:.1f} ± {error:.1f} | {means} |", flush=True)
+        print(f"| {policy} | {return_:.1f} ± {error:.1f} | {means} |", flush=True)
 
 
 if __name__ == "__main__":

@@ -6,80 +6,39 @@ Copy this file and change it: another map, rule, network or loss is one line.
 """
 
 from dataclasses import replace
-from pathlib import Path
 
-import tyro
-
+import cprl
 from cprl import presets
-from cprl.algorithms.dqn import DQN
-from cprl.experiment import conduct
-from cprl.population import Learner, Population
-from cprl.process import prepare_process
-from cprl.runs.directory import start_run
-from cprl.viewer.streams import check_watch
+from cprl.algorithms import DQN
+from cprl.population import Learning
 
 
-def main(
+def experiment(
     *,
-    replicas: int = 8,
-    episodes: int = 4800,
     variant: presets.Variant = "published",
     epsilon_decay_steps: int = 1_000_000,
     target_every_episodes: int = 3,
-    evaluation_episodes: int = 20,
-    update_every: int = 1,
-    seed: int = 0,
-    out: Path | None = None,
-    resume: bool = False,
-    watch: str = "file",
-    compile: bool = True,
-) -> Path:
-    """Trains the agents of all replicas, evaluates them on fresh worlds, and returns the run's directory.
+) -> cprl.Experiment:
+    """Four independent DQN agents on `commons`.
 
     Args:
-        replicas: independent repetitions of the whole training, side by side.
-        episodes: how many each trains.
         variant: the rules and the learner as the study is written, or as it was run.
         epsilon_decay_steps: of exploration; versions of the study's program have 500,000 too.
         target_every_episodes: episodes between replacements of targets; the study's program has 3 or 10.
-        evaluation_episodes: fresh episodes for each replica, with epsilon 0.05, and for the random policy.
-        update_every: environment steps k after which agents learn, then k times.
-        seed: of chance, weights, exploration and replay.
-        out: the run's directory; by default a new one under runs/.
-        resume: with the run in `out`, which was stopped; bit for bit as if it had not been.
-        watch: "file", or live as well: "serve", "spawn", "connect ADDRESS"; "off" for no recording.
-        compile: whether torch compiles the update; needs a C++ compiler, and is several times faster.
     """
-    check_watch(watch)
-    prepare_process(seed)
-    game = presets.game("commons", variant=variant)
-    settings = presets.learner("commons", variant=variant)
     settings = replace(
-        settings, epsilon_decay_steps=epsilon_decay_steps, target_every_episodes=target_every_episodes
+        presets.dqn_settings("commons", variant=variant),
+        epsilon_decay_steps=epsilon_decay_steps,
+        target_every_episodes=target_every_episodes,
     )
-    learner = Learner(DQN(settings=settings))
-    population = Population(game, [learner] * 4, replicas=replicas, seed=seed, compile=compile)
-    recipe = {
-        "replicas": replicas,
-        "episodes": episodes,
-        "variant": variant,
-        "learn_every": update_every,
-        "seed": seed,
-        "game": game,
-        "learner": settings,
-        "population": population.told(),
-    }
-    run = start_run(out, "commons", recipe, resume=resume)
-    return conduct(
-        run,
-        population,
-        episodes=episodes,
-        title=f"commons, {variant} rules, {replicas} replicas, {episodes} episodes",
-        evaluation_episodes=evaluation_episodes,
-        update_every=update_every,
-        watch=watch,
+    return cprl.Experiment(
+        name="commons",
+        game=presets.game("commons", variant=variant),
+        agents=(Learning(DQN(settings=settings)),) * 4,
+        episodes=4800,
+        replicas=8,
     )
 
 
 if __name__ == "__main__":
-    tyro.cli(main)
+    cprl.recipe_main(experiment)

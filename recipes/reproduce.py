@@ -2,7 +2,7 @@
 
     python recipes/reproduce.py --runs ~/cprl-runs --results docs/results
 
-Every run is resumable: started again with the same --runs, this goes on where it was stopped, and what is
+Every run is resumable: started again with the same --runs, this resumes where it was stopped, and what is
 finished is not run again. As soon as a run is finished its results are kept in --results; in the end the
 report is written there. About an hour for each single board and two for each `commons`, on one core.
 """
@@ -13,6 +13,7 @@ import sys
 from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
+from typing import Literal
 
 import tyro
 
@@ -46,23 +47,23 @@ def main(
     replicas: int = 8,
     episodes: int | None = None,
     processes: int | None = None,
-    compile: bool = True,
+    engine: Literal["compiled", "eager"] = "compiled",
 ) -> Path:
     """Runs experiments, keeps their results, and returns the report.
 
     Args:
-        runs: where run directories are made, and gone on with; some gigabytes while they train.
+        runs: where run directories are made, and resumed; some gigabytes while they train.
         results: where results and the report are kept.
         only: which, by name.
         replicas: of each.
         episodes: of each; by default the recipe's, as the study shows.
         processes: at once; by default one for each core.
-        compile: whether torch compiles; see the recipes.
+        engine: how updates are computed; "compiled" requires a C++ compiler.
     """
     for name in only:
         if name not in EXPERIMENTS:
             raise ValueError(f"there is no experiment {name!r}; allowed: {', '.join(EXPERIMENTS)}")
-    common = ["--replicas", str(replicas), *([] if compile else ["--no-compile"])]
+    common = ["--replicas", str(replicas), "--engine", engine]
     common += [] if episodes is None else ["--episodes", str(episodes)]
     with ThreadPoolExecutor(processes or os.cpu_count()) as pool:
         for ended in [pool.submit(run, name, common, runs=runs, results=results) for name in only]:
@@ -72,13 +73,13 @@ def main(
 
 
 def run(name: str, common: Sequence[str], *, runs: Path, results: Path) -> None:
-    """Runs an experiment in a process of its own, or goes on with it, and keeps its results."""
+    """Runs an experiment in a process of its own, or resumes it, and keeps its results."""
     recipe, *arguments = EXPERIMENTS[name]
     directory, log = runs / name, runs / f"{name}.log"
     if not (directory / "report.json").exists():
         runs.mkdir(parents=True, exist_ok=True)
         command = [sys.executable, str(Path(__file__).with_name(f"{recipe}.py")), *arguments, *common]
-        command += ["--out", str(directory), *(["--go-on"] if (directory / "recipe.json").exists() else [])]
+        command += ["--out", str(directory), *(["--resume"] if (directory / "recipe.json").exists() else [])]
         print(f"{name}: see {log}", flush=True)
         with open(log, "a") as told:
             done = subprocess.run(command, stdout=told, stderr=subprocess.STDOUT, check=False)

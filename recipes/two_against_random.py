@@ -5,75 +5,27 @@
 Copy this file and change it: another map, rule, network or loss is one line.
 """
 
-from pathlib import Path
-
-import tyro
-
+import cprl
 from cprl import presets
-from cprl.algorithms.dqn import DQN
-from cprl.experiment import conduct
-from cprl.population import Learner, Population, Scripted
-from cprl.process import prepare_process
-from cprl.runs.directory import start_run
-from cprl.viewer.streams import check_watch
+from cprl.algorithms import DQN
+from cprl.population import Learning, Scripted
 
 
-def main(
-    *,
-    replicas: int = 8,
-    episodes: int = 6000,
-    variant: presets.Variant = "published",
-    evaluation_episodes: int = 20,
-    update_every: int = 1,
-    seed: int = 0,
-    out: Path | None = None,
-    resume: bool = False,
-    watch: str = "file",
-    compile: bool = True,
-) -> Path:
-    """Trains the agents of all replicas, evaluates them on fresh worlds, and returns the run's directory.
+def experiment(*, variant: presets.Variant = "published") -> cprl.Experiment:
+    """A DQN agent beside a random walker on `two_complex`.
 
     Args:
-        replicas: independent repetitions of the whole training, side by side.
-        episodes: how many each trains.
         variant: the rules and the learner as the study is written, or as it was run.
-        evaluation_episodes: fresh episodes for each replica, with epsilon 0.05, and for the random policy.
-        update_every: environment steps k after which agents learn, then k times.
-        seed: of chance, weights, exploration and replay.
-        out: the run's directory; by default a new one under runs/.
-        resume: with the run in `out`, which was stopped; bit for bit as if it had not been.
-        watch: "file", or live as well: "serve", "spawn", "connect ADDRESS"; "off" for no recording.
-        compile: whether torch compiles the update; needs a C++ compiler, and is several times faster.
     """
-    check_watch(watch)
-    prepare_process(seed)
-    game = presets.game("two_complex", variant=variant)
-    settings = presets.learner("two_complex", variant=variant)
-    learner = Learner(DQN(settings=settings))
-    population = Population(
-        game, [learner, Scripted("random")], replicas=replicas, seed=seed, compile=compile
-    )
-    recipe = {
-        "replicas": replicas,
-        "episodes": episodes,
-        "variant": variant,
-        "learn_every": update_every,
-        "seed": seed,
-        "game": game,
-        "learner": settings,
-        "population": population.told(),
-    }
-    run = start_run(out, "two_against_random", recipe, resume=resume)
-    return conduct(
-        run,
-        population,
-        episodes=episodes,
-        title=f"two_against_random, {variant} rules, {replicas} replicas, {episodes} episodes",
-        evaluation_episodes=evaluation_episodes,
-        update_every=update_every,
-        watch=watch,
+    settings = presets.dqn_settings("two_complex", variant=variant)
+    return cprl.Experiment(
+        name="two_against_random",
+        game=presets.game("two_complex", variant=variant),
+        agents=(Learning(DQN(settings=settings)), Scripted("random")),
+        episodes=6000,
+        replicas=8,
     )
 
 
 if __name__ == "__main__":
-    tyro.cli(main)
+    cprl.recipe_main(experiment)

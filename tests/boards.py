@@ -1,4 +1,4 @@
-"""Helpers of the tests: play a drawn board, and draw what came of it."""
+"""Helpers of the tests: play a drawn board and draw the result."""
 
 from collections.abc import Sequence
 from dataclasses import replace
@@ -25,9 +25,9 @@ SIGN_OF_NAME = dict(zip(CLASS_NAMES, ".#AmboS?", strict=True))
 
 
 class Play:
-    """One world of a board, played by the names of actions; nothing regrows unless the rules say so.
+    """One world of a board, played by the names of actions; apples regrow only if `rules` says so.
 
-    The agents of a drawing are numbered in reading order; `order` gives them other numbers.
+    The agents of a drawing are numbered in reading order; `order` gives them other indices.
     """
 
     def __init__(
@@ -48,10 +48,9 @@ class Play:
         self.output: StepOutput = self.batch.begin(self.batch.new_output())
 
     def turn(self, *names: str) -> "Play":
-        """One turn; one action for each agent, the same for all if only one is given."""
+        """Plays one turn: one action per agent, or one for all agents."""
         names = names * self.game.agents if len(names) == 1 else names
-        known = list(self.game.actions)
-        actions = np.array([[known.index(name) for name in names]], np.int64)
+        actions = np.array([[self.game.actions.index(name) for name in names]], np.int64)
         self.batch.play(actions, self.output)
         return self
 
@@ -83,7 +82,7 @@ class Play:
         return self.output.harvest[0].tolist()
 
     def window(self, agent: int) -> str:
-        """What an agent sees, by the signs of `RGB_SIGN`, other agents by number if they are told apart."""
+        """An agent's observation in the signs of `RGB_SIGN`; other agents by index under `agents_apart`."""
         if self.game.observation.encoding == "one_hot":
             return self._one_hot_window(agent)
         pixels = self.output.observation[0, agent].transpose(1, 2, 0)
@@ -99,7 +98,7 @@ class Play:
 
 
 def drawn(text: str) -> str:
-    """A drawing as it stands in a test, without its indentation."""
+    """A drawing without the indentation it has in a test."""
     return "\n".join(line.strip() for line in text.strip().splitlines())
 
 

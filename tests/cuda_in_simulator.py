@@ -1,4 +1,4 @@
-"""The CUDA driver in Numba's simulator beside the CPU driver; `test_cuda.py` starts it in another process.
+"""Compares the CUDA driver in Numba's simulator with the CPU driver; `test_cuda.py` runs it in a subprocess.
 
 NUMBA_ENABLE_CUDASIM=1 python tests/cuda_in_simulator.py
 """
@@ -26,34 +26,34 @@ WALLS = maps.parse(
 
 
 def both(game: Game, worlds: int) -> tuple[Batch, Batch]:
-    """The same worlds on either driver."""
+    """The same worlds on both drivers."""
     return Batch(game, worlds, seed=3), Batch(game, worlds, seed=3, driver=CudaThreads(game, worlds))
 
 
-def assert_same(cpu: Batch, gpu: Batch, told, told_by_gpu, when: object) -> None:
-    """Worlds and everything told are equal."""
-    for ours, theirs in ((told, told_by_gpu), (cpu.now, gpu.now)):
+def assert_same(cpu: Batch, gpu: Batch, output, gpu_output, when: object) -> None:
+    """Worlds and step outputs are equal."""
+    for ours, theirs in ((output, gpu_output), (cpu.now, gpu.now)):
         for name, array in ours._asdict().items():
             other = gpu.driver.read(getattr(theirs, name))
             if array.dtype != other.dtype or not np.array_equal(array, other):
                 raise AssertionError(f"{name} differs, {when}: {array} {other}")
 
 
-def play(game: Game, *, worlds: int = 2, turns: int = 50) -> None:
-    """Both drivers play the same turns; half-way some worlds begin anew."""
+def play(game: Game, *, worlds: int = 2, turns: int = 12) -> None:
+    """Both drivers play the same turns; halfway through, some worlds begin a new episode."""
     cpu, gpu = both(game, worlds)
-    told, told_by_gpu = cpu.begin(cpu.new_output()), gpu.begin(gpu.new_output())
-    assert_same(cpu, gpu, told, told_by_gpu, "at the start")
+    output, gpu_output = cpu.begin(cpu.new_output()), gpu.begin(gpu.new_output())
+    assert_same(cpu, gpu, output, gpu_output, "at the start")
     for number, turn in enumerate(random_actions(turns, worlds, game)):
-        cpu.play(turn, told)
-        gpu.play(cuda.to_device(turn), told_by_gpu)
-        assert_same(cpu, gpu, told, told_by_gpu, f"turn {number}")
+        cpu.play(turn, output)
+        gpu.play(cuda.to_device(turn), gpu_output)
+        assert_same(cpu, gpu, output, gpu_output, f"turn {number}")
         if number == turns // 2:
             which = np.arange(worlds) % 2 == 1
-            cpu.begin(told, which)
-            gpu.begin(told_by_gpu, cuda.to_device(which))
-            assert_same(cpu, gpu, told, told_by_gpu, "begun anew")
-    assert np.array_equal(cpu.boards(told), gpu.driver.read(gpu.boards(told_by_gpu)))
+            cpu.begin(output, which)
+            gpu.begin(gpu_output, cuda.to_device(which))
+            assert_same(cpu, gpu, output, gpu_output, "after a new episode began")
+    assert np.array_equal(cpu.boards(output), gpu.driver.read(gpu.boards(gpu_output)))
 
 
 def published(name: str) -> None:
@@ -82,36 +82,36 @@ def blocks() -> None:
 
 
 def state() -> None:
-    """A state goes from the one driver to the other and back, and seeds start all over."""
+    """A state is loaded from one driver into the other, and `set_seed` restarts both."""
     game = presets.game("two_complex")
     cpu, gpu = both(game, 3)
-    told, told_by_gpu = cpu.begin(cpu.new_output()), gpu.begin(gpu.new_output())
+    output, gpu_output = cpu.begin(cpu.new_output()), gpu.begin(gpu.new_output())
     for turn in random_actions(30, 3, game):
-        cpu.play(turn, told)
-    gpu.load(cpu.state(), told_by_gpu)
+        cpu.play(turn, output)
+    gpu.load(cpu.state(), gpu_output)
     turn = random_actions(1, 3, game, seed=9)[0]
-    cpu.play(turn, told)
-    gpu.play(cuda.to_device(turn), told_by_gpu)
-    assert_same(cpu, gpu, told, told_by_gpu, "after loading")
+    cpu.play(turn, output)
+    gpu.play(cuda.to_device(turn), gpu_output)
+    assert_same(cpu, gpu, output, gpu_output, "after loading")
     assert all(np.array_equal(array, gpu.state()[name]) for name, array in cpu.state().items())
-    shown, shown_by_gpu = cpu.show(told, world=1), gpu.show(told_by_gpu, world=1)
-    assert all(map(np.array_equal, shown, shown_by_gpu))
-    for batch, log_event in ((cpu, told), (gpu, told_by_gpu)):
+    shown, gpu_shown = cpu.show(output, world=1), gpu.show(gpu_output, world=1)
+    assert all(map(np.array_equal, shown, gpu_shown))
+    for batch, written in ((cpu, output), (gpu, gpu_output)):
         batch.set_seed(11)
-        batch.begin(log_event)
-    assert_same(cpu, gpu, told, told_by_gpu, "after set_seed")
+        batch.begin(written)
+    assert_same(cpu, gpu, output, gpu_output, "after set_seed")
 
 
 def unknown() -> None:
-    """Unknown actions are found, and change nothing."""
+    """Unknown actions are refused and change nothing."""
     game = presets.game("commons")
     _, gpu = both(game, 3)
-    told = gpu.begin(gpu.new_output())
+    output = gpu.begin(gpu.new_output())
     before = gpu.state()
     actions = np.zeros((3, 4), np.int64)
     actions[1, 2], actions[2, 0] = 8, -1
     with pytest.raises(ValueError, match="action 8 of agent 2 in world 1 is unknown; allowed: 0 to 7"):
-        gpu.play(cuda.to_device(actions), told)
+        gpu.play(cuda.to_device(actions), output)
     assert all(np.array_equal(array, before[name]) for name, array in gpu.state().items())
 
 

@@ -1,4 +1,4 @@
-"""Apples: who bites them and how they grow back."""
+"""Apples: harvest, regrowth and the end of an episode."""
 
 from collections import Counter
 
@@ -11,7 +11,7 @@ from cprl.commons.batch import Batch
 from cprl.commons.tables import distance, neighbours
 
 
-def test_an_agent_bites_the_apple_that_it_steps_on():
+def test_an_agent_harvests_the_apple_that_it_steps_on():
     play = Play(">A.\n...").turn("forward")
     assert play.harvest == [1]
     assert play.output.stock[0, 0] == 0
@@ -22,14 +22,14 @@ def test_an_empty_site_gives_nothing():
     assert play.harvest == [0]
 
 
-def test_who_may_not_bite_here_leaves_the_apple_to_others():
+def test_an_agent_that_may_not_harvest_a_site_leaves_its_apple():
     may_bite = ((False, True), (True, True))
     play = Play(">A.<\n..A.", may_bite=may_bite).turn("forward", "stay")
     assert play.harvest == [0, 0]
     assert play.output.stock[0, 0] == 2
 
 
-def test_as_run_the_lower_number_on_a_cell_gets_the_apple():
+def test_as_run_the_agent_of_lower_index_on_a_cell_gets_the_apple():
     # Pair (1, 2) goes back, 1 onto the cell that 0 has entered: a site.
     board = maps.Map(height=2, width=7, sites=((1, 2), (0, 6)), starts=((1, 1, 1), (1, 2, 1), (1, 4, 3)))
     play = Play(board, pairwise_clashes=True).turn("forward")
@@ -37,13 +37,13 @@ def test_as_run_the_lower_number_on_a_cell_gets_the_apple():
     assert play.harvest == [1, 0, 0]
 
 
-def test_an_apple_grown_this_turn_can_be_bitten_in_the_next_and_as_run_at_once():
+def test_an_apple_can_be_harvested_the_turn_after_it_grew_and_as_run_in_the_same_turn():
     for at_once, harvests in ((False, [1, 0, 1]), (True, [1, 1, 1])):
         play = Play(">A.\n.A.", regrow_prob=(0.0, 1.0), regrow_before_bites=at_once)
         assert [play.turn(name).harvest[0] for name in ("forward", "stay", "stay")] == harvests
 
 
-def test_regrowth_counts_the_stock_as_it_stood_at_the_start_of_the_turn():
+def test_regrowth_counts_the_stock_of_the_start_of_the_turn():
     # The neighbour is bitten in the very turn in which it still counts.
     play = Play("^..\nA..\nA..", regrow_prob=(0.0, 1.0))
     play.turn("backward")
@@ -60,7 +60,7 @@ def test_the_episode_ends_in_the_turn_that_takes_the_last_apple_and_as_run_one_l
         assert bool(play.turn("stay").output.terminated[0, 0])
 
 
-def test_an_empty_board_on_which_apples_can_come_from_nothing_goes_on():
+def test_the_episode_continues_on_an_empty_board_if_apples_can_grow_without_apples_near():
     play = Play(">A.\n...", regrow_prob=(0.001,), episode_steps=3).turn("forward")
     assert not play.output.done[0, 0]
     play.turn("stay").turn("stay")
@@ -68,13 +68,13 @@ def test_an_empty_board_on_which_apples_can_come_from_nothing_goes_on():
     assert not play.output.terminated[0, 0]
 
 
-def test_a_clock_that_runs_out_with_the_last_apple_counts_as_depletion():
+def test_an_episode_that_loses_its_last_apple_in_the_last_turn_is_terminated_not_truncated():
     play = Play(">A.\n...", episode_steps=1).turn("forward")
     assert play.output.terminated[0, 0]
     assert not play.output.truncated[0, 0]
 
 
-def test_a_world_that_has_ended_stays_as_it_is_and_pays_nothing():
+def test_a_world_that_has_ended_does_not_change_and_pays_nothing():
     play = Play(">AA\n..<", episode_steps=1, regrow_prob=(1.0,)).turn("forward", "beam")
     before = {name: array.copy() for name, array in play.batch.now._asdict().items()}
     windows = play.output.observation.copy()
@@ -95,7 +95,7 @@ def test_the_norm_decides_how_many_cells_are_near(norm, near):
     assert len(neighbours(full, Rules(regrow_norm=norm))[middle]) == near
 
 
-def test_distances_on_a_knight_move():
+def test_each_norm_measures_a_knights_move():
     assert distance("euclidean", 1, 2) == pytest.approx(5**0.5)
     assert distance("manhattan", -1, 2) == 3
     assert distance("chebyshev", 1, -2) == 2
@@ -107,12 +107,12 @@ def test_apples_grow_as_often_as_the_rules_say():
     board = maps.parse(">A......\n.AAA...A\n........")
     game = Game(map=board, rules=Rules(regrow_prob=prob, may_fire=False))
     batch = Batch(game, 40_000, seed=7)
-    told = batch.begin(batch.new_output())
+    output = batch.begin(batch.new_output())
     forward, stay = np.zeros((40_000, 1), np.int64), np.full((40_000, 1), 6)
-    batch.play(forward, told)
-    assert (told.harvest == 1).all()
-    batch.play(stay, told)
-    grown = Counter(told.regrown[:, 0].tolist())
+    batch.play(forward, output)
+    assert (output.harvest == 1).all()
+    batch.play(stay, output)
+    grown = Counter(output.regrown[:, 0].tolist())
     # 3 apples within distance 2 of (0, 1): (1, 1), (1, 2), (1, 3) is sqrt(5) away -> 2 count.
     share = grown[1] / 40_000
     assert share == pytest.approx(0.25, abs=4 * (0.25 * 0.75 / 40_000) ** 0.5)

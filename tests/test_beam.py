@@ -1,4 +1,4 @@
-"""Beams: whom they hit, what stops them, and what follows."""
+"""Beams: the agents they hit, the walls that stop them, and time-outs."""
 
 from boards import Play
 
@@ -8,7 +8,7 @@ def test_a_beam_reaches_its_length_and_no_further():
     assert Play(board, beam_length_cells=4).turn("beam", "stay", "stay").in_play == [True, False, True]
 
 
-def test_a_beam_is_three_wide_and_spares_who_stands_beside_the_shooter():
+def test_a_beam_is_three_cells_wide_and_misses_an_agent_beside_the_shooter():
     board = """
         A.v..
         .....
@@ -33,21 +33,21 @@ def test_a_wall_stops_each_column_of_a_beam_on_its_own():
     assert play.window(1).splitlines() == ["#####", "..b.#", ".obo#", "..b.#", ".#b##", "..S.#"]
 
 
-def test_two_who_shoot_each_other_are_both_out():
+def test_two_agents_that_shoot_each_other_are_both_tagged():
     assert Play("A....\n.>.<.").turn("beam").in_play == [False, False]
 
 
-def test_tags_take_effect_at_the_end_of_the_turn_so_the_apple_is_bitten_first():
+def test_an_agent_tagged_in_a_turn_still_harvests_in_that_turn():
     play = Play("..A..\n.>^..").turn("beam", "forward")
     assert play.harvest == [0, 1]
     assert play.in_play == [True, False]
 
 
-def test_hits_are_judged_on_the_cells_after_the_moves():
+def test_hits_are_found_on_the_cells_after_the_moves():
     assert Play("A....\n.....\n.>.^.", beam_width_cells=1).turn("beam", "forward").in_play == [True, True]
 
 
-def test_with_two_hits_to_tag_a_turn_counts_one_hit_however_many_beams_cross():
+def test_an_agent_in_two_beams_takes_one_hit_per_turn():
     play = Play("A......\n>..^..<", hits_to_tag=2)
     play.turn("beam", "stay", "beam")
     assert play.output.hit_by[0].tolist()[1] == [True, False, True]
@@ -57,7 +57,7 @@ def test_with_two_hits_to_tag_a_turn_counts_one_hit_however_many_beams_cross():
     assert play.in_play == [True, False, True]
 
 
-def test_who_may_not_fire_does_nothing_by_the_beam_action():
+def test_the_beam_action_of_an_agent_that_may_not_fire_does_nothing():
     play = Play("A...\n.>.^", may_fire=(False, True)).turn("beam", "stay")
     assert not play.output.fired.any()
     assert play.in_play == [True, True]

@@ -1,4 +1,4 @@
-"""Chance by counters: the published generator, and numbers that follow from seed and place alone."""
+"""Counter-based random numbers: the published test vectors, and thresholds."""
 
 import numpy as np
 import pytest
@@ -22,7 +22,7 @@ def test_philox_gives_the_known_answers(counter, key, answer):
 
 
 @pytest.mark.parametrize(("counter", "key", "answer"), KNOWN_ANSWERS)
-def test_the_compiled_philox_gives_them_too(counter, key, answer):
+def test_the_compiled_philox_gives_the_known_answers(counter, key, answer):
     import numba
 
     assert list(numba.njit(philox4x32)(*words(counter), *words(key))) == words(answer)

@@ -1,4 +1,4 @@
-"""The CUDA driver plays the game of the CPU driver: in Numba's simulator, and on a GPU if there is one."""
+"""The CUDA driver plays the same game as the CPU driver: in Numba's simulator, and on a GPU if any."""
 
 import os
 import subprocess
@@ -11,8 +11,8 @@ import torch
 from boards import random_actions
 
 from cprl import CommonsEnv, keys, presets
+from cprl.algorithms import DQN
 from cprl.learners.settings import DQNSettings
-from cprl.learners.single import DQNLearner
 from cprl.measuring.evaluate import evaluate
 from cprl.policies.assignment import AgentPolicies
 from cprl.policies.single import RandomActor
@@ -24,7 +24,7 @@ GAMES = [f"{board}:{variant}" for board in presets.BOARDS for variant in presets
 
 @pytest.fixture(scope="module")
 def simulated():
-    """What the script printed and how it ended; the simulator has to be switched on before Numba is there."""
+    """The lines the script printed, and its process; Numba must be imported with the simulator enabled."""
     done = subprocess.run(
         [sys.executable, SCRIPT],
         env={**os.environ, "NUMBA_ENABLE_CUDASIM": "1"},
@@ -36,19 +36,19 @@ def simulated():
 
 
 @pytest.mark.parametrize("check", [*GAMES, "forms", "blocks", "state", "unknown"])
-def test_the_simulated_gpu_plays_the_game_of_the_cpu(simulated, check):
+def test_the_simulated_gpu_plays_the_same_game_as_the_cpu(simulated, check):
     lines, done = simulated
     assert f"{check} equal" in lines, done.stderr
 
 
-def test_nothing_else_went_wrong_in_the_simulator(simulated):
+def test_the_simulator_exits_without_an_error(simulated):
     assert simulated[1].returncode == 0, simulated[1].stderr
 
 
 @pytest.mark.gpu
 @pytest.mark.parametrize("variant", presets.VARIANTS)
 @pytest.mark.parametrize("board", presets.BOARDS)
-def test_the_gpu_plays_the_game_of_the_cpu(board, variant):
+def test_the_gpu_plays_the_same_game_as_the_cpu(board, variant):
     game = presets.game(board, variant=variant)
     envs = [CommonsEnv(game, 300, seed=3, device=device, state=True) for device in ("cpu", "cuda")]
     moments = [env.reset() for env in envs]
@@ -69,10 +69,13 @@ def test_an_agent_learns_on_the_gpu():
     game = presets.game("two_complex")
     env = CommonsEnv(game, device="cuda")
     settings = DQNSettings(buffer_size=500, learning_starts=50)
-    learner = DQNLearner(game.observation_shape, 8, settings=settings, device="cuda")
-    before = [weights.clone() for weights in learner.network.parameters()]
+    how = {"agents": (0,), "replicas": 1, "engine": "torchrl", "device": "cuda"}
+    learner = DQN(settings=settings).make_learner(game.spaces, **how)
+    network = learner.stock.each[0].network
+    before = [weights.clone() for weights in network.parameters()]
     random = RandomActor(8, device="cuda")
-    train(env, {0: learner}, others={1: random}, episodes=1)
-    assert learner.buffer[:10]["observation"].is_cuda
-    assert all(not torch.equal(*pair) for pair in zip(before, learner.network.parameters(), strict=True))
-    assert len(evaluate(CommonsEnv(game, 8, device="cuda"), AgentPolicies([learner.actor, random]))) == 8
+    train(env, {(0,): learner}, others={1: random}, episodes=1)
+    assert learner.buffers[0][:10]["observation"].is_cuda
+    assert all(not torch.equal(*pair) for pair in zip(before, network.parameters(), strict=True))
+    policies = AgentPolicies({(0,): learner.evaluation_actor(8), 1: random})
+    assert len(evaluate(CommonsEnv(game, 8, device="cuda"), policies)) == 8

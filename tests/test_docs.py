@@ -1,6 +1,8 @@
 """What the docs say is so: names are compared, code is run."""
 
+import importlib
 import re
+import sys
 from pathlib import Path
 
 import pytest
@@ -35,15 +37,27 @@ def test_every_logged_name_has_its_line_in_the_docs_and_the_other_way_round(tmp_
 
 
 def blocks():
+    """Each block of Python, with the modules that its page has shown before: blocks that begin with the name
+    of their file, `# own.py`."""
     for page in PAGES:
+        modules = {}
         for number, code in enumerate(re.findall(r"```python\n(.*?)```", page.read_text(), re.DOTALL)):
-            yield pytest.param(code, id=f"{page.name}-{number}")
+            yield pytest.param(code, dict(modules), id=f"{page.name}-{number}")
+            if name := re.match(r"# (\w+)\.py\n", code):
+                modules[name[1]] = code
 
 
-@pytest.mark.parametrize("code", list(blocks()))
-def test_python_in_the_docs_runs(code, tmp_path, monkeypatch):
+@pytest.mark.parametrize(("code", "modules"), list(blocks()))
+def test_python_in_the_docs_runs(code, modules, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
+    monkeypatch.syspath_prepend(tmp_path)
+    for name, text in modules.items():
+        (tmp_path / f"{name}.py").write_text(text)
+        monkeypatch.delitem(sys.modules, name, raising=False)
+    importlib.invalidate_caches()
     exec(compile(code, "docs", "exec"), {"__name__": "docs"})
+    for name in modules:
+        sys.modules.pop(name, None)
 
 
 def test_links_between_pages_lead_somewhere():

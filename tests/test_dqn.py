@@ -1,4 +1,4 @@
-"""One DQN agent: what it stores, its target worked by hand, its clock and its target network."""
+"""One DQN agent of stock parts: what it stores, its target worked by hand, its clock and its targets."""
 
 from dataclasses import replace
 
@@ -6,13 +6,13 @@ import pytest
 import torch
 from boards import random_actions
 from tensordict import TensorDict
-from torchrl.data.replay_buffers.samplers import PrioritizedSampler, SumSegmentTreeFp32
+from torchrl.envs.utils import ExplorationType, set_exploration_type
 
 from cprl import CommonsEnv, Game, Rules, keys, maps, presets
-from cprl.learners.replay import ReplayLearner
+from cprl.algorithms import DQN
 from cprl.learners.settings import DQNSettings
-from cprl.learners.single import DQNLearner
 from cprl.learners.transitions import transitions_of
+from cprl.spaces import Spaces
 
 SHORT = Game(
     map=maps.parse(".A>.A\n.A.A.\n..<.A"),
@@ -20,9 +20,24 @@ SHORT = Game(
 )
 
 
-def learner(**changes):
+SPACES = Spaces(agents=1, observation_shape=(3, 2, 3), actions=4)
+
+
+def learner(spaces=SPACES, *, seed=0, **changes):
+    """The learner of agent 0 in one replica."""
     settings = replace(DQNSettings(buffer_size=100, learning_rate=1e-3), **changes)
-    return DQNLearner((3, 2, 3), 4, settings=settings, seed=0)
+    how = {"agents": (0,), "replicas": 1, "seed": seed, "engine": "torchrl"}
+    return DQN(settings=settings).make_learner(spaces, **how)
+
+
+def store(agent, count, *, reward=0.0):
+    """Stores so many made-up turns of a world in which nothing ends."""
+    for made_up in transitions(count, reward=reward).split(1):
+        following = made_up["next"]
+        after = {name: following[name][:, None] for name in ("observation", "reward")}
+        flags = {name: following[name] for name in ("done", "terminated", "truncated")}
+        before = {name: made_up[name][:, None] for name in ("observation", "action")}
+        agent.store(TensorDict({"agents": before, "next": {"agents": after, **flags}}, [1]))
 
 
 def transitions(count, *, reward=0.0, terminated=False, truncated=False):
@@ -64,19 +79,19 @@ def test_the_transitions_of_an_agent_are_its_own_under_torchrls_default_keys():
 def test_the_clock_running_out_is_no_end_for_the_target_but_depletion_is(ending, bootstraps):
     # target = r + gamma max_a Q'(s', a), without the second term behind a terminal state;
     # loss = mean (Q - target)^2
-    agent, batch = learner(), transitions(8, reward=1.0, **ending)
+    parts, batch = learner().stock.each[0], transitions(8, reward=1.0, **ending)
     with torch.no_grad():
-        value = agent.network(batch["observation"]).gather(-1, batch["action"][:, None])[:, 0]
-        best = agent.network(batch["next", "observation"]).amax(-1)
+        value = parts.network(batch["observation"]).gather(-1, batch["action"][:, None])[:, 0]
+        best = parts.network(batch["next", "observation"]).amax(-1)
         by_hand = ((value - (1.0 + bootstraps * 0.995 * best)) ** 2).mean()
-    assert agent.loss(batch)["loss"].item() == pytest.approx(by_hand.item(), rel=1e-5)
+    assert parts.loss(batch)["loss"].item() == pytest.approx(by_hand.item(), rel=1e-5)
 
 
 def test_learning_starts_at_the_stored_transitions_of_the_settings():
     agent = learner(learning_starts=16)
-    agent.store(transitions(15))
+    store(agent, 15)
     assert agent.update() is None
-    agent.store(transitions(1))
+    store(agent, 1)
     assert agent.update() > 0
 
 
@@ -85,32 +100,19 @@ def test_as_run_the_loss_is_averaged_over_all_outputs():
     for over_all in (False, True):
         torch.manual_seed(1)
         agent = learner(mean_over_all_outputs=over_all)
-        agent.store(transitions(16, reward=1.0))
-        losses.append(agent.update())
+        store(agent, 16, reward=1.0)
+        losses.append(agent.update().item())
     assert losses[1] == pytest.approx(losses[0] / 4)
 
 
 def target_weights(agent):
-    return torch.cat([w.data.flatten() for w in agent.loss.target_value_network_params.values(True, True)])
+    weights = agent.stock.each[0].loss.target_value_network_params
+    return torch.cat([weight.data.flatten() for weight in weights.values(True, True)])
 
 
 def own_weights(agent):
-    return torch.cat([w.data.flatten() for w in agent.loss.value_network_params.values(True, True)])
-
-
-def test_prioritised_replay_prefers_large_errors_or_says_that_torchrls_extension_does_not_load():
-    settings = DQNSettings(buffer_size=50, priority_alpha=0.6, learning_starts=4, batch_size=4)
-    if SumSegmentTreeFp32 is None:
-        with pytest.raises(RuntimeError, match=r"priority_alpha is 0\.6: TorchRL's compiled extension"):
-            DQNLearner((3, 3, 5), 8, settings=settings)
-        return
-    assert isinstance(DQNLearner((3, 3, 5), 8, settings=settings).buffer.sampler, PrioritizedSampler)
-
-
-def test_lanes_refuse_priorities():
-    game = Game(map=maps.parse(".A>\n..<"), rules=Rules(window_rows=3, window_columns=5))
-    with pytest.raises(ValueError, match=r"priority_alpha is 0\.5; lanes sample uniformly, 0 is what fits"):
-        ReplayLearner(game, agents=(0, 1), replicas=1, settings=DQNSettings(priority_alpha=0.5))
+    weights = agent.stock.each[0].loss.value_network_params
+    return torch.cat([weight.data.flatten() for weight in weights.values(True, True)])
 
 
 def test_the_target_network_starts_as_a_copy_and_as_run_with_weights_of_its_own():
@@ -123,11 +125,11 @@ def test_the_target_network_starts_as_a_copy_and_as_run_with_weights_of_its_own(
 @pytest.mark.parametrize("own_target_weights", [False, True])
 def test_the_target_network_is_replaced_after_every_third_episode(own_target_weights):
     agent = learner(target_every_episodes=3, own_target_weights=own_target_weights)
-    agent.store(transitions(16, reward=1.0))
+    store(agent, 16, reward=1.0)
     copied = []
     for _ in range(7):
         agent.update()
-        agent.end_episode()
+        agent.end_episode(torch.tensor([True]))
         copied.append(torch.equal(target_weights(agent), own_weights(agent)))
     assert copied == [False, False, True, False, False, True, False]
 
@@ -135,26 +137,33 @@ def test_the_target_network_is_replaced_after_every_third_episode(own_target_wei
 def test_the_actor_follows_the_learner_and_epsilon_its_steps():
     agent = learner(epsilon_hold_steps=10, epsilon_decay_steps=100)
     assert agent.actor.epsilon == 1.0
-    agent.store(transitions(60))
+    store(agent, 60)
     assert agent.actor.epsilon == pytest.approx(0.55)
-    window = transitions(1)["observation"]
-    before = agent.actor.greedy(TensorDict({"observation": window}, (1,)))["action_value"].clone()
-    for _ in range(20):
+    seen = transitions(200)["observation"][:, None]
+    greedy = agent.evaluation_actor(200)
+
+    def chosen():
+        with set_exploration_type(ExplorationType.DETERMINISTIC):
+            return greedy.choose(seen)
+
+    before = chosen()
+    for _ in range(50):
         agent.update()
-    after = agent.actor.greedy(TensorDict({"observation": window}, (1,)))["action_value"]
-    assert not torch.equal(before, after)
+    assert not torch.equal(before, chosen())
+    best = agent.stock.each[0].network(seen[:, 0]).argmax(-1)
+    assert torch.equal(chosen()[:, 0], best)
 
 
 def test_the_same_seed_learns_the_same():
     def weights(seed):
-        torch.manual_seed(seed)
-        agent = DQNLearner(SHORT.observation_shape, 8, settings=DQNSettings(buffer_size=100), seed=seed)
+        agent = learner(SHORT.spaces, seed=seed)
         env = CommonsEnv(SHORT, 1, seed=seed)
         moment = env.reset()
         for turn in torch.as_tensor(random_actions(40, 1, SHORT)):
             now, moment = env.step_and_maybe_reset(moment.set(keys.ACTION, turn))
-            agent.store(transitions_of(0, now[None]))
+            agent.store(now)
             agent.update()
+            torch.rand(1)  # whoever else draws from torch's generator
         return own_weights(agent)
 
     assert torch.equal(weights(0), weights(0))
@@ -163,6 +172,9 @@ def test_the_same_seed_learns_the_same():
 
 def test_the_published_learner_learns_from_presets():
     game = presets.game("single_basic", variant="as_run")
-    settings = presets.learner("single_basic", variant="as_run")
-    agent = DQNLearner(game.observation_shape, len(game.actions), settings=settings)
-    assert agent.network(torch.zeros(1, *game.observation_shape, dtype=torch.uint8)).shape == (1, 7)
+    settings = replace(presets.dqn_settings("single_basic", variant="as_run"), buffer_size=100)
+    how = {"agents": (0,), "replicas": 1, "engine": "torchrl"}
+    agent = DQN(settings=settings).make_learner(game.spaces, **how)
+    (network,) = agent.networks().values()
+    assert network(torch.zeros(1, *game.observation_shape, dtype=torch.uint8)).shape == (1, 7)
+    assert network.relu_on_outputs

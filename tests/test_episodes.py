@@ -240,9 +240,9 @@ def test_an_episode_longer_than_max_steps_is_refused():
 
 def test_what_does_not_fit_is_named():
     tracker = EpisodeTracker(2, 2, 3)
-    with pytest.raises(ValueError, match=r"the batch is \[1\]; \[2\] or \[2, T\] is wanted"):
+    with pytest.raises(ValueError, match=r"the batch is \[1\]; allowed: \[2\] or \[2, T\]"):
         tracker.add(turn(worlds=1))
-    with pytest.raises(ValueError, match=r'"reward" of the batch is \[2, 3, 1\]; \[2, 2, 1\] is wanted'):
+    with pytest.raises(ValueError, match=r'"reward" of the batch is \[2, 3, 1\]; allowed: \[2, 2, 1\]'):
         tracker.add(turn(worlds=2, agents=3))
     with pytest.raises(ValueError, match="max_steps is 0"):
         EpisodeTracker(1, 2, 0)
@@ -251,5 +251,5 @@ def test_what_does_not_fit_is_named():
     longer = EpisodeTracker(2, 2, 9)
     for _ in range(4):
         longer.add(turn(worlds=2))
-    with pytest.raises(ValueError, match="the state holds 4 steps; max_steps is 3"):
+    with pytest.raises(ValueError, match="the state has 4 steps; allowed: up to max_steps, 3"):
         tracker.load_state_dict(longer.state_dict())

@@ -1,6 +1,7 @@
 """Stored runs play fresh worlds, alone and among each other, and the numbers are those of the episodes."""
 
 import json
+import os
 import shutil
 from dataclasses import replace
 from math import isnan
@@ -12,13 +13,14 @@ import torch
 from test_population import ALGORITHMS
 
 import cprl
-from cprl import CommonsEnv, Game, Observation, Rules, cli, maps
-from cprl import experiment as study
+from cprl import CommonsEnv, Experiment, Game, Observation, Rules, cli, maps
+from cprl.agents import Population
+from cprl.evaluation.lanes import Source, policies_of
 from cprl.evaluation.same_game import differences
 from cprl.learners.lanes import EVALUATION, lane_seeds
 from cprl.measuring.evaluate import evaluate
 from cprl.measuring.replicas import agents_without_harvest, over_replicas, social_measures
-from cprl.population import Frozen, Learner, Population, Scripted
+from cprl.population import Frozen, Learning, Scripted
 from cprl.runs.checkpoints import Checkpointer
 from cprl.runs.directory import start_run
 from cprl.training import train
@@ -48,28 +50,34 @@ MEADOW = Game(
     ),
     rules=Rules(regrow_prob=(0.0, 0.2), window_rows=3, window_columns=5, episode_steps=15, freeze_steps=2),
 )
-DQN, PPO, SAC, C51 = (Learner(ALGORITHMS[name]) for name in ("DQN", "PPO", "SAC", "C51"))
+DQN, PPO, SAC, C51 = (Learning(ALGORITHMS[name]) for name in ("DQN", "PPO", "SAC", "C51"))
 SEED = 77
 
 
-def recipe(agents):
-    return {"replicas": agents.replicas, "seed": 3, "game": agents.game, "population": agents.told()}
+def an_experiment(name, game, members, *, replicas=3):
+    return Experiment(
+        name=name,
+        game=game,
+        agents=members,
+        replicas=replicas,
+        episodes=3,
+        seed=3,
+        evaluation_episodes=1,
+        engine="eager",
+    )
 
 
-def conducted(folder, game, members, *, replicas=3):
-    agents = Population(game, members, replicas=replicas, seed=3, compile=False)
-    run = start_run(folder, folder.name, recipe(agents))
-    study.conduct(run, agents, episodes=3, title=folder.name, evaluation_episodes=1, watch="off")
-    return run
+def ran(folder, game, members, **how):
+    return cprl.run(an_experiment(folder.name, game, members, **how), folder, watch="off")
 
 
 @pytest.fixture(scope="module")
 def scripted(tmp_path_factory):
-    """Runs on the corridors by the manner of both agents."""
+    """Runs on the corridors by the policy of both agents."""
     folder = tmp_path_factory.mktemp("scripted")
     return {
-        manner: conducted(folder / manner, CORRIDORS, [Scripted(manner)] * 2, replicas=2)
-        for manner in ("greedy", "sustainable")
+        policy: ran(folder / policy, CORRIDORS, [Scripted(policy)] * 2, replicas=2)
+        for policy in ("greedy", "sustainable")
     }
 
 
@@ -77,8 +85,8 @@ def scripted(tmp_path_factory):
 def learned(tmp_path_factory):
     """Runs on the meadow: two DQN agents, and one that draws its actions beside a frozen one of them."""
     folder = tmp_path_factory.mktemp("learned")
-    alike = conducted(folder / "alike", MEADOW, [DQN] * 2)
-    mixed = conducted(folder / "mixed", MEADOW, [PPO, Frozen(alike, 1, replica=2)])
+    alike = ran(folder / "alike", MEADOW, [DQN] * 2)
+    mixed = ran(folder / "mixed", MEADOW, [PPO, Frozen(os.path.relpath(alike), 1, replica=2)])
     return {"alike": alike, "mixed": mixed}
 
 
@@ -126,7 +134,7 @@ def test_what_is_undefined_is_counted_apart_and_in_no_mean(scripted):
     assert (some.undefined, some.episodes, some.estimate.replicas) == (3, 6, 2)
     assert some.estimate.value == (1 + 3.5) / 2, "the mean of means of replicas, not 8 / 3 nor anything / 6"
     assert str(some).endswith("], undefined in 3 of 6")
-    with pytest.raises(ValueError, match=r"episodes by replica are \{0: 1, 1: 0\}; at least one"):
+    with pytest.raises(ValueError, match=r"episodes by replica are \{0: 1, 1: 0\}; allowed: at least one"):
         over_replicas({0: [1.0], 1: []})
 
 
@@ -137,7 +145,7 @@ def test_greedy_agents_play_what_the_policy_of_the_loaded_run_plays(name, learne
     means = []
     for replica in loaded.replicas:
         env = CommonsEnv(MEADOW, 4, seed=SEED, first_world=4 * replica)
-        alone = evaluate(env, loaded.policy(replica))
+        alone = evaluate(env, loaded.policy(replica, worlds=4))
         assert told(alone) == told(found.trained[replica])
         means.append(np.mean([episode.harvest.sum() for episode in alone]))
     assert values(found.measures())["collective_return"] == pytest.approx(np.mean(means))
@@ -166,8 +174,8 @@ def test_networks_that_do_not_stack_play_the_same(learned):
 def test_agents_explore_with_the_runs_epsilon_for_evaluation(learned, tmp_path):
     always = shutil.copytree(learned["alike"], tmp_path / "always")
     text = json.loads((always / "recipe.json").read_text())
-    for member in text["arguments"]["population"]:
-        member["settings"]["epsilon_evaluation"] = 1.0
+    for agent in text["experiment"]["agents"]:
+        agent["algorithm"]["settings"]["epsilon_evaluation"] = 1.0
     (always / "recipe.json").write_text(json.dumps(text))
     by_chance = cprl.evaluate_run(always, episodes=2)
     assert told(by_chance.trained[0]) == told(by_chance.random[0]), "with epsilon 1 every action is random"
@@ -185,8 +193,7 @@ def test_agents_that_learned_a_policy_draw_from_it(learned):
     loaded = cprl.load(learned["mixed"])
     undecided = replace(
         loaded,
-        members=[loaded.members[0]] * 2,
-        algorithms=dict.fromkeys((0, 1), PPO.algorithm),
+        experiment=replace(loaded.experiment, agents=[PPO, PPO]),
         networks={f"replica_{replica}/agent_{agent}": Undecided() for replica in (0, 1) for agent in (0, 1)},
     )
     found = cprl.evaluate_run(undecided, episodes=2)
@@ -224,9 +231,10 @@ def test_the_same_call_plays_the_same_whoever_drew_before_and_a_replica_the_same
 
 
 def test_a_run_that_has_not_ended_plays_by_its_newest_checkpoint(tmp_path):
-    members = [C51, SAC]
-    agents = Population(MEADOW, members, replicas=2, seed=3, compile=False)
-    run = start_run(tmp_path / "stopped", "stopped", recipe(agents))
+    env, members = CommonsEnv(MEADOW, 2, seed=3), [C51, SAC]
+    agents = Population(env, members, seed=3, engine="eager")
+    experiment = an_experiment("stopped", MEADOW, members, replicas=2)
+    run = start_run(tmp_path / "stopped", "stopped", experiment.to_recipe)
     with pytest.raises(ValueError, match=r"has .* been trained"):
         cprl.evaluate_run(run)
 
@@ -239,9 +247,8 @@ def test_a_run_that_has_not_ended_plays_by_its_newest_checkpoint(tmp_path):
                 self.save(training)
                 raise Stopped
 
-    env = CommonsEnv(MEADOW, 2, seed=3)
     with pytest.raises(Stopped), Stops(run) as checkpoints:
-        train(env, agents.learners, others=agents.others, episodes=9, checkpoints=checkpoints)
+        train(env, agents.learners, others=agents.others, episodes=9, checkpointer=checkpoints)
     found = cprl.evaluate_run(run, episodes=3, greedy=True)
     assert found.run.weights_from.name.startswith("training-000000000030")
     fresh = CommonsEnv(MEADOW, 6, seed=found.seed)
@@ -251,7 +258,7 @@ def test_a_run_that_has_not_ended_plays_by_its_newest_checkpoint(tmp_path):
 
 def test_a_matrix_of_scripted_agents_gives_the_numbers_worked_by_hand(scripted):
     found = cprl.crossplay(list(scripted.values()), episodes=2)
-    wanted = {  # visitor, hosts, group: each the mean of seats 0 and 1
+    wanted = {  # focal, background, group: each the mean of focal agents 0 and 1
         ("greedy", "greedy"): ((2 + 3) / 2, (3 + 2) / 2, 5),
         ("greedy", "sustainable"): ((2 + 3) / 2, 0, (2 + 3) / 2),
         ("sustainable", "greedy"): (0, (3 + 2) / 2, (3 + 2) / 2),
@@ -260,86 +267,89 @@ def test_a_matrix_of_scripted_agents_gives_the_numbers_worked_by_hand(scripted):
     assert set(found.cells) == set(wanted)
     for at, returns in wanted.items():
         measures = found.cell(*at).measures()
-        assert [measures[f"{who}/return"].estimate.value for who in ("visitor", "hosts", "group")] == list(
+        assert [measures[f"{who}/return"].estimate.value for who in ("focal", "background", "group")] == list(
             returns
         )
     visit = found.cell("greedy", "sustainable")
-    assert [visit.measures(agent)["visitor/return"].estimate.value for agent in (0, 1)] == [2, 3]
+    assert [visit.measures(agent)["focal/return"].estimate.value for agent in (0, 1)] == [2, 3]
     assert [visit.measures(agent)["stock_left"].estimate.value for agent in (0, 1)] == [3, 2]
     assert visit.measures()["equality"].estimate.value == 0.5, "one of two has everything"
     assert visit.measures()["collective_return"].episodes == 2 * 2 * 2
     at_home = found.cell("sustainable", "sustainable").measures()
     assert (at_home["equality"].undefined, at_home["equality"].episodes) == (4, 4), "each episode once"
-    with pytest.raises(ValueError, match=r"there is no cell 'greedy' among 'DQN'; runs are \['greedy'"):
+    with pytest.raises(
+        ValueError, match=r"the cell is \('greedy', 'DQN'\); allowed: two of the runs \['greedy'"
+    ):
         found.cell("greedy", "DQN")
 
 
-def test_each_cell_is_what_the_loaded_runs_policies_play_with_one_visitor(learned):
+def test_each_cell_is_what_the_loaded_runs_policies_play_with_one_focal_agent(learned):
     found = cprl.crossplay(learned.values(), episodes=3, seed=SEED, greedy=True)
     loaded = {name: cprl.load(run) for name, run in learned.items()}
-    for visitor, hosts in (("alike", "mixed"), ("mixed", "alike")):
-        cell = found.cell(visitor, hosts)
+    for focal, background in (("alike", "mixed"), ("mixed", "alike")):
+        cell = found.cell(focal, background)
         by_replica = []
         for replica in range(3):
             mine, theirs, stock = [], [], []
             for agent in range(2):
-                guest = loaded[visitor].policy(replica).actors[agent]
+                sources = [Source(loaded[background])] * 2
+                sources[agent] = Source(loaded[focal])
                 env = CommonsEnv(MEADOW, 3, seed=SEED, first_world=3 * replica)
-                alone = evaluate(env, loaded[hosts].policy(replica, others={agent: guest}))
-                assert told(alone) == told(cell.visits[agent][replica])
+                alone = evaluate(env, policies_of(sources, [replica], worlds=3, seed=SEED))
+                assert told(alone) == told(cell.by_agent[agent][replica])
                 mine += [episode.return_[agent] for episode in alone]
                 theirs += [episode.return_[1 - agent] for episode in alone]
                 stock += [episode.stock_left for episode in alone]
             by_replica.append((np.mean(mine), np.mean(theirs), np.mean(stock)))
         measures = cell.measures()
         for name, mean in zip(
-            ("visitor/return", "hosts/return", "stock_left"), np.mean(by_replica, 0), strict=True
+            ("focal/return", "background/return", "stock_left"), np.mean(by_replica, 0), strict=True
         ):
             assert measures[name].estimate.value == pytest.approx(mean)
             assert measures[name].estimate.replicas == 3
     diagonal = found.cell("mixed", "mixed")
     at_home = cprl.evaluate_run(learned["mixed"], episodes=3, seed=SEED, greedy=True)
     assert diagonal.is_self_play
-    assert told(diagonal.visits[1][2]) == told(at_home.trained[2])
+    assert told(diagonal.by_agent[1][2]) == told(at_home.trained[2])
 
 
-def test_on_the_diagonal_strangers_are_of_the_next_replica(learned):
+def test_on_the_diagonal_a_cross_seed_agent_is_of_the_next_replica(learned):
     runs = list(learned.values())
     how = {"episodes": 2, "seed": SEED, "greedy": True}
-    found = cprl.crossplay(runs, diagonal="strangers", replicas=[0, 2], **how)
+    found = cprl.crossplay(runs, diagonal="cross_seed", replicas=[0, 2], **how)
     loaded, cell = cprl.load(learned["alike"]), found.cell("alike", "alike")
-    for hosts, guests in ((0, 2), (2, 0)):
-        guest = loaded.policy(guests).actors[1]
-        env = CommonsEnv(MEADOW, 2, seed=SEED, first_world=2 * hosts)
-        alone = evaluate(env, loaded.policy(hosts, others={1: guest}))
-        assert told(alone) == told(cell.visits[1][hosts])
+    for background, focal in ((0, 2), (2, 0)):
+        sources = [Source(loaded), Source(loaded, {background: focal})]
+        env = CommonsEnv(MEADOW, 2, seed=SEED, first_world=2 * background)
+        alone = evaluate(env, policies_of(sources, [background], worlds=2, seed=SEED))
+        assert told(alone) == told(cell.by_agent[1][background])
     assert not cell.is_self_play
     usual = cprl.crossplay(runs, replicas=[0, 2], **how)
     for at in (("alike", "mixed"), ("mixed", "alike")):
         assert values(usual.cell(*at).measures()) == values(found.cell(*at).measures())
-    with pytest.raises(ValueError, match=r"strangers are of another replica; there is only \[1\]"):
-        cprl.crossplay(runs, diagonal="strangers", replicas=[1])
+    with pytest.raises(ValueError, match=r"the replicas are \[1\]; allowed for cross_seed: at least 2"):
+        cprl.crossplay(runs, diagonal="cross_seed", replicas=[1])
 
 
 def test_what_does_not_fit_is_refused_and_says_what_fits(learned, scripted, tmp_path):
     alike, mixed = learned.values()
-    with pytest.raises(ValueError, match="episodes is 0; at least 1 is wanted"):
+    with pytest.raises(ValueError, match="episodes is 0; allowed: an integer >= 1"):
         cprl.evaluate_run(alike, episodes=0)
-    with pytest.raises(ValueError, match=r"seed is 3, by which .*alike was trained; with another"):
+    with pytest.raises(ValueError, match=r"seed is 3, the training seed of .*alike; allowed: any other"):
         cprl.evaluate_run(alike, seed=3)
-    with pytest.raises(ValueError, match=r"alike has no replicas \[3, 9\]; it has \[0, 1, 2\]"):
+    with pytest.raises(ValueError, match=r"alike has no replicas \[3, 9\]; allowed: \[0, 1, 2\]"):
         cprl.evaluate_run(alike, replicas=[1, 9, 3])
-    with pytest.raises(ValueError, match="1 run came; at least two are wanted"):
+    with pytest.raises(ValueError, match="1 run is given; allowed: at least two"):
         cprl.crossplay([alike])
     with pytest.raises(ValueError, match="alike is given twice"):
         cprl.crossplay([alike, mixed, alike])
     with pytest.raises(
-        ValueError, match=r"alike and greedy .* unlike games: Map\..* Rules.episode_steps 15 b"
+        ValueError, match=r"alike and greedy .* different games: Map\..* Rules.episode_steps 15 a"
     ):
         cprl.crossplay([alike, mixed, scripted["greedy"]])
     lonely = Game(map=maps.parse(">A"), rules=CORRIDORS.rules)
-    runs = [conducted(tmp_path / n, lonely, [Scripted("greedy")], replicas=1) for n in ("a", "b")]
-    with pytest.raises(ValueError, match="the game has one seat, so nobody to visit; `cprl evaluate`"):
+    runs = [ran(tmp_path / n, lonely, [Scripted("greedy")], replicas=1) for n in ("a", "b")]
+    with pytest.raises(ValueError, match=r"the game has 1 agent; .* use `cprl evaluate`"):
         cprl.crossplay(runs)
 
 
@@ -351,8 +361,8 @@ def test_games_differ_in_what_a_message_tells():
         observation=Observation(agents_apart=True),
     )
     assert differences(MEADOW, other) == [
-        "Rules.freeze_steps 2 beside 7",
-        "Observation.agents_apart False beside True",
+        "Rules.freeze_steps 2 and 7",
+        "Observation.agents_apart False and True",
     ]
     assert "Map.sites differ" in differences(MEADOW, CORRIDORS), "forty cells would help nobody"
 
@@ -388,7 +398,7 @@ def test_the_command_evaluate_tells_every_metric_and_writes_the_episodes(
         row["return"] for row in rows if (row["policy"], row["replica"], row["episode"]) == ("trained", 2, 1)
     ]
     assert own == found.trained[2][1].return_.tolist()
-    with pytest.raises(SystemExit, match=r"cprl: .*episodes\.parquet exists and is kept"):
+    with pytest.raises(SystemExit, match=r"cprl: .*episodes\.parquet exists and is not overwritten"):
         command(monkeypatch, capsys, "evaluate", learned["alike"], "--out", out)
     assert pq.read_table(out).equals(table)
 
@@ -399,20 +409,20 @@ def test_the_command_crossplay_tells_a_matrix_for_each_number_and_writes_the_epi
     out = tmp_path / "cross.parquet"
     greedy, sustainable = scripted.values()
     text = command(monkeypatch, capsys, "crossplay", greedy, sustainable, "--episodes", 1, "--out", out)
-    assert "2 replicas, 1 episodes each with the visitor at every seat, seed 30011, diagonal: self" in text
-    for name in ("visitor/return", "hosts/return", "group/return", "sustainability", "peacefulness"):
+    assert "2 replicas, 1 episodes each with focal agent at each index, seed 30011, diagonal: self" in text
+    for name in ("focal/return", "background/return", "group/return", "sustainability", "peacefulness"):
         assert name in (line.strip() for line in text.splitlines())
     rows = [[cell.strip() for cell in line.split("│")[1:-1]] for line in text.splitlines() if "│" in line]
     assert ["greedy", "2.5 [2.5, 2.5]", "2.5 [2.5, 2.5]"] in rows
     assert ["sustainable", "0 [0, 0]", "0 [0, 0]"] in rows
     assert ["greedy", "sustainable", "1", "3 [3, 3]", "0 [0, 0]", "3 [3, 3]"] in rows
     assert ["sustainable", "0.5 [0.5, 0.5]", "undefined in all 2"] in rows, "equality"
-    agents = pq.read_table(out, columns=["visitor", "hosts", "seat"]).to_pylist()
+    agents = pq.read_table(out, columns=["focal", "background", "focal_agent"]).to_pylist()
     assert len(agents) == (1 + 2 + 2 + 1) * 2 * 2, "visits, replicas, agents"
-    assert {row["seat"] for row in agents if row["visitor"] == row["hosts"]} == {-1}
-    with pytest.raises(SystemExit, match=r"cprl: .*cross\.parquet exists and is kept"):
+    assert {row["focal_agent"] for row in agents if row["focal"] == row["background"]} == {-1}
+    with pytest.raises(SystemExit, match=r"cprl: .*cross\.parquet exists and is not overwritten"):
         command(monkeypatch, capsys, "crossplay", greedy, sustainable, "--out", out)
-    with pytest.raises(SystemExit, match="cprl: 1 run came; at least two are wanted"):
+    with pytest.raises(SystemExit, match="cprl: 1 run is given; allowed: at least two"):
         command(monkeypatch, capsys, "crossplay", greedy)
 
 

@@ -1,4 +1,4 @@
-"""Drawings and maps: what is read, and what is refused."""
+"""Drawings, maps and generated boards."""
 
 import itertools
 
@@ -27,7 +27,7 @@ def test_agents_and_sites_are_numbered_in_reading_order():
     assert board.walls == ((1, 1),)
 
 
-def test_a_map_draws_itself_as_it_was_read():
+def test_a_map_draws_the_drawing_it_was_read_from():
     drawing = ".>A.\nv##.\nA..^"
     assert maps.parse(drawing).drawing() == drawing
 
@@ -58,7 +58,7 @@ def test_commons_numbers_its_agents_as_the_published_program_does():
         ("", "empty"),
     ],
 )
-def test_a_bad_drawing_names_row_and_column(drawing, message):
+def test_a_bad_drawing_is_refused_with_row_and_column(drawing, message):
     with pytest.raises(ValueError, match=message):
         maps.parse(drawing)
 
@@ -70,11 +70,11 @@ def test_a_bad_drawing_names_row_and_column(drawing, message):
         ({"starts": ((1, 2, 0),)}, "start at row 1, column 2 is on a wall"),
         ({"sites": ((1, 2),)}, "site at row 1, column 2 is on a wall"),
         ({"sites": ((0, 0), (0, 0))}, "two sites at row 0, column 0"),
-        ({"starts": ((0, 3, 0),)}, "start at row 0, column 3 lies outside a board of 2 rows and 3 columns"),
+        ({"starts": ((0, 3, 0),)}, "start at row 0, column 3 lies outside the board of 2 rows and 3 columns"),
         ({"starts": ((0, 0, 4),)}, "heading 4"),
         ({"starts": ()}, "starts is empty"),
         ({"sites": ()}, "sites is empty"),
-        ({"height": 0}, "0 rows"),
+        ({"height": 0}, "Map.height is 0 and Map.width is 3; allowed: integers >= 1"),
     ],
 )
 def test_a_map_that_cannot_be_played_is_refused(changes, message):
@@ -83,8 +83,8 @@ def test_a_map_that_cannot_be_played_is_refused(changes, message):
         Map(**{**fields, **changes})
 
 
-def test_an_unknown_board_says_which_there_are():
-    with pytest.raises(ValueError, match=r"'comons'.*single_basic, single_complex, two_complex, commons"):
+def test_an_unknown_board_is_refused_with_the_names_of_all_boards():
+    with pytest.raises(ValueError, match=r"'comons'; allowed: single_basic, .*, two_complex, commons"):
         maps.named("comons")
 
 
@@ -118,7 +118,7 @@ OPENINGS = [
 
 
 def reached(board, start):
-    """The cells that can be walked to."""
+    """The cells that an agent can reach on foot."""
     walls, seen, waiting = set(board.walls), {start}, [start]
     while waiting:
         row, col = waiting.pop()
@@ -140,7 +140,7 @@ def test_the_rooms_have_the_walls_of_the_paper():
 
 
 @pytest.mark.parametrize("entrances", ["single", "multiple", "none", "unequal"])
-def test_every_room_has_its_apples_its_agents_and_a_way_out(entrances):
+def test_every_room_has_45_sites_3_agents_and_a_way_out(entrances):
     board = maps.rooms(entrances)
     assert (board.height, board.width, board.agents, len(board.sites)) == (19, 53, 12, 180)
     assert len(reached(board, (9, 26))) == 19 * 53 - len(board.walls)
@@ -152,7 +152,7 @@ def test_every_room_has_its_apples_its_agents_and_a_way_out(entrances):
     assert maps.parse(board.drawing()).sites == board.sites
 
 
-def test_rooms_are_the_same_after_half_a_turn_but_for_the_unequal_one():
+def test_all_boards_of_rooms_but_unequal_are_symmetric_under_half_a_turn():
     for entrances in ("single", "multiple", "none"):
         board = maps.rooms(entrances)
         for cells in (board.sites, board.walls, [start[:2] for start in board.starts]):
@@ -172,7 +172,7 @@ def test_fewer_agents_are_spread_over_the_rooms():
         ({"agents": 13}, "agents is 13; allowed: 1 to 12"),
     ],
 )
-def test_other_rooms_are_refused(arguments, message):
+def test_rooms_refuse_other_entrances_and_numbers_of_agents(arguments, message):
     with pytest.raises(ValueError, match=message):
         maps.rooms(**arguments)
 
@@ -209,14 +209,14 @@ def test_more_clustering_puts_sites_closer_together():
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        ({"height": 0}, "height is 0; at least 1"),
-        ({"agents": 0}, "agents is 0; at least 1"),
-        ({"density": 0}, "density is 0; allowed: above 0, up to 1"),
+        ({"height": 0}, "height is 0; allowed: an integer >= 1"),
+        ({"agents": 0}, "agents is 0; allowed: an integer >= 1"),
+        ({"density": 0}, "density is 0; allowed: above 0, at most 1"),
         ({"density": 1.5}, "density is 1.5"),
-        ({"clustering": -0.1}, "clustering is -0.1; allowed: 0 to 1"),
-        ({"density": 1}, "12 sites and 2 agents find no room on 12 cells"),
+        ({"clustering": -0.1}, r"clustering is -0\.1; allowed: 0\.\.1"),
+        ({"density": 1}, "12 sites and 2 agents do not fit on 12 cells"),
     ],
 )
-def test_random_boards_that_cannot_be_are_refused(arguments, message):
+def test_random_boards_refuse_arguments_that_are_not_allowed(arguments, message):
     with pytest.raises(ValueError, match=message):
         maps.random(**{"height": 3, "width": 4, "agents": 2, "density": 0.5, **arguments})

@@ -1,4 +1,4 @@
-"""Where agents go and when they fire, on boards small enough to count."""
+"""Measures of where agents go and when they fire, on boards small enough to count by hand."""
 
 import numpy as np
 import pytest
@@ -38,7 +38,7 @@ def drawn(cells, *, fired=(), in_play=None, board=(3, 4)):
 
 
 class Doing(TensorDictModuleBase):
-    """Plays actions [T, N] one after the other."""
+    """Plays the given actions [T, N] in order."""
 
     in_keys = (keys.OBSERVATION,)
     out_keys = (keys.ACTION,)
@@ -52,7 +52,7 @@ class Doing(TensorDictModuleBase):
         return tensordict.set(keys.ACTION, action)
 
 
-def test_a_trace_holds_where_everybody_was_as_each_step_began():
+def test_a_trace_has_the_cells_of_all_agents_at_the_start_of_each_step():
     game = Game(
         map=maps.parse("A...A\n>...<\n....."),
         rules=Rules(regrow_prob=(0.0,), episode_steps=4, window_rows=3, window_columns=5, freeze_steps=9),
@@ -66,7 +66,7 @@ def test_a_trace_holds_where_everybody_was_as_each_step_began():
     assert found.board == (3, 5)
 
 
-def test_worlds_that_ended_earlier_are_not_counted_on():
+def test_a_trace_marks_the_steps_of_worlds_that_have_ended_as_not_played():
     game = Game(map=maps.parse("A>.\n..."), rules=Rules(regrow_prob=(0.0,), episode_steps=3))
     actions = torch.tensor([[1], [7 - 1]])  # backward onto the only apple; stay
     found = trace(CommonsEnv(game, 2), lambda moment: moment.set(keys.ACTION, actions))
@@ -82,15 +82,15 @@ def test_visits_are_shares_of_the_steps_in_play():
     assert shares.sum((-2, -1)).tolist() == pytest.approx([1.0, 1.0])
 
 
-def test_overlap_is_one_for_the_same_cells_and_none_for_halves():
+def test_overlap_is_one_for_the_same_cells_and_zero_for_different_ones():
     assert overlap(drawn([[(0, 0), (0, 1)], [(0, 1), (0, 0)]])).tolist() == [1.0]
     assert overlap(drawn([[(0, 0), (2, 3)], [(0, 1), (2, 2)]])).tolist() == [0.0]
-    # (0, 0): 1/2 and 1/2; (0, 1) and (0, 2) are one's own.
+    # (0, 0): 1/2 and 1/2; only one agent visits (0, 1), only the other (0, 2).
     assert overlap(drawn([[(0, 0), (0, 0)], [(0, 1), (0, 2)]])).tolist() == [0.5]
     assert np.isnan(overlap(drawn([[(0, 0)], [(0, 1)]]))).all()
 
 
-def test_rounds_count_turns_about_the_centre_and_their_sense():
+def test_rounds_count_signed_turns_about_the_centre():
     clockwise = [(0, 1), (0, 2), (1, 3), (2, 2), (2, 1), (1, 0)]
     there = [[cell] for cell in [*clockwise * 5, clockwise[0]]]
     assert rounds(drawn(there))[0, 0] == pytest.approx(5 / 30 * 1000)
@@ -99,7 +99,7 @@ def test_rounds_count_turns_about_the_centre_and_their_sense():
     assert rounds(drawn(to_and_fro))[0, 0] == pytest.approx(0.0)
 
 
-def test_shots_are_told_by_the_distance_to_the_nearest_other():
+def test_shooting_distance_compares_steps_with_a_shot_to_all_steps():
     cells = [[(0, 0), (0, 1), (2, 3)], [(0, 0), (0, 3), (2, 3)]]
     in_play = [[1, 1, 1], [1, 0, 1]]
     drawing = drawn(cells, fired=[(0, 0), (1, 2)], in_play=in_play)
@@ -110,4 +110,4 @@ def test_shots_are_told_by_the_distance_to_the_nearest_other():
     fired, always = shooting_distance(drawing)
     assert fired.tolist() == [(1.0 + 5.0) / 2]
     assert always.tolist() == [(1 + 1 + 4 + 5 + 5) / 5]
-    assert np.isnan(shooting_distance(drawn(cells))[0]).all(), "nobody fired"
+    assert np.isnan(shooting_distance(drawn(cells))[0]).all(), "no agent fired"

@@ -1,4 +1,4 @@
-"""Who goes where, and who gives way: boards before and after a turn."""
+"""Moves and clashes: boards before and after a turn."""
 
 from collections import Counter
 from dataclasses import replace
@@ -8,7 +8,7 @@ from boards import Play, drawn
 from cprl.commons.batch import Batch
 
 
-def test_each_walk_goes_by_the_heading():
+def test_each_walk_is_relative_to_the_heading():
     board = """
         A......
         .......
@@ -20,16 +20,16 @@ def test_each_walk_goes_by_the_heading():
         assert Play(board).turn(action).places == [place], action
 
 
-def test_agents_start_where_the_map_says_or_change_places_every_episode_each_order_as_often():
+def test_agents_begin_at_their_starts_or_at_a_random_permutation_of_them():
     board = "A>...\n.....\nv...<\n"
     orders, fixed = Counter(), Play(board)
     at = fixed.places
     headings = dict(zip(at, fixed.batch.now.heading[0].tolist(), strict=True))
     game = replace(fixed.game, rules=replace(fixed.game.rules, shuffle_starts=True))
     batch = Batch(game, 100, seed=4)
-    told = batch.new_output()
+    output = batch.new_output()
     for _ in range(12):
-        batch.begin(told)
+        batch.begin(output)
         places = [list(zip(*world, strict=True)) for world in zip(batch.now.row, batch.now.col, strict=True)]
         orders.update(tuple(at.index(place) for place in world) for world in places)
         for world, facing in zip(places, batch.now.heading.tolist(), strict=True):
@@ -73,15 +73,15 @@ def test_agents_who_want_the_same_cell_both_stay():
     )
 
 
-def test_nobody_enters_a_cell_that_someone_keeps():
+def test_no_agent_enters_a_cell_that_another_keeps():
     assert Play("A....\n.>>..").turn("forward", "stay").places == [(1, 1), (1, 2)]
 
 
-def test_one_follows_another_into_the_cell_it_leaves():
+def test_an_agent_enters_a_cell_that_another_leaves():
     assert Play("A....\n.>>..").turn("forward").places == [(1, 2), (1, 3)]
 
 
-def test_nobody_swaps():
+def test_two_agents_cannot_swap_cells():
     assert Play("A...\n.><.").turn("forward").places == [(1, 1), (1, 2)]
 
 
@@ -96,7 +96,7 @@ def test_a_cancelled_move_cancels_those_behind_it():
     assert play.turn("forward").places == [(1, 1), (1, 2), (1, 3), (1, 5)]
 
 
-def test_clashes_do_not_depend_on_the_numbers_of_the_agents():
+def test_clashes_do_not_depend_on_agent_indices():
     drawing = "A.......\n.>>>.<..\n...^...."
     straight = Play(drawing).turn("forward").places
     order = [4, 2, 0, 3, 1]
@@ -104,13 +104,13 @@ def test_clashes_do_not_depend_on_the_numbers_of_the_agents():
     assert shuffled == [straight[i] for i in order]
 
 
-def test_as_run_a_pair_goes_back_even_onto_a_third():
+def test_as_run_a_pair_goes_back_even_onto_a_third_agent():
     # 0 follows 1; 1 and 2 want one cell. Pair (0, 1): no clash. Pair (1, 2): both go back, 1 onto 0.
     play = Play("A......\n.>>.<..", pairwise_clashes=True)
     assert play.turn("forward").places == [(1, 2), (1, 2), (1, 4)]
 
 
-def test_a_tagged_agent_takes_up_no_room_and_waits_until_its_cell_is_free():
+def test_a_tagged_agent_occupies_no_cell_and_waits_until_its_cell_is_free():
     board = "A.....\n.>.^.."
     play = Play(board, freeze_steps=2).turn("beam", "stay")
     assert play.in_play == [True, False]
@@ -124,7 +124,7 @@ def test_a_tagged_agent_takes_up_no_room_and_waits_until_its_cell_is_free():
     assert play.turn("stay", "forward").places == [(1, 4), (0, 3)]
 
 
-def test_those_who_wait_for_one_cell_return_in_the_order_in_which_they_were_tagged():
+def test_agents_that_wait_for_one_cell_return_in_the_order_in_which_they_were_tagged():
     # 1 is tagged at (1, 3), then 2 comes there and is tagged too; the freeze of 1 is the longer wait.
     play = Play(
         "A......\n.>.^...\n...^...",

@@ -1,4 +1,4 @@
-"""The forms of what agents observe, and walls that block sight."""
+"""The forms of observations, and walls that block sight."""
 
 import numpy as np
 import pytest
@@ -7,7 +7,7 @@ from torchrl.envs.utils import check_env_specs
 
 from cprl import CommonsEnv, Game, Observation, Rules, keys, maps, presets
 from cprl.commons.batch import Batch
-from cprl.commons.colours import COLOURS, MOST_AGENTS_APART, agent_colour
+from cprl.commons.colours import COLOURS, MAX_AGENTS_APART, agent_colour
 from cprl.commons.tables import cells_between
 
 BOARD = """
@@ -27,20 +27,20 @@ FORMS = [
     ("field", "value"),
     [("area", "all"), ("encoding", "grey"), ("agents_apart", 1), ("scoreboard", None), ("stock_gauge", "no")],
 )
-def test_a_wrong_form_is_refused(field, value):
+def test_a_value_that_is_not_allowed_is_refused(field, value):
     with pytest.raises(ValueError, match=rf"Observation\.{field} is .*; allowed: "):
         Observation(**{field: value})
 
 
 @pytest.mark.parametrize("encoding", ["rgb", "one_hot"])
-def test_a_full_view_shows_the_whole_board_as_it_lies_with_oneself_in_it(encoding):
+def test_a_full_observation_shows_the_whole_board_with_the_observer_as_self(encoding):
     play = Play(BOARD, observation=Observation(area="full", encoding=encoding))
     assert play.window(0) == drawn("A..#.A\n.S...m\n.mmo.o")
     assert play.window(2) == drawn("A..#.A\n.o...m\n.mmo.S")
 
 
 @pytest.mark.parametrize("encoding", ["rgb", "one_hot"])
-def test_others_can_be_told_apart(encoding):
+def test_agents_apart_shows_each_other_agent_in_its_own_colour(encoding):
     form = Observation(area="full", encoding=encoding, agents_apart=True)
     play = Play(BOARD, observation=form)
     assert play.window(0) == drawn("A..#.A\n.S...m\n.mm1.2")
@@ -49,7 +49,7 @@ def test_others_can_be_told_apart(encoding):
 
 @pytest.mark.parametrize(("area", "sight"), [("window", False), ("window", True), ("full", False)])
 @pytest.mark.parametrize("apart", [False, True])
-def test_one_hot_channels_show_what_the_colours_show(area, apart, sight):
+def test_one_hot_and_rgb_observations_show_the_same_cells(area, apart, sight):
     colours, channels = (
         Play(
             BOARD,
@@ -69,7 +69,7 @@ def test_one_hot_channels_show_what_the_colours_show(area, apart, sight):
             assert colours.window(agent) == channels.window(agent)
 
 
-def test_channels_have_names():
+def test_channels_have_the_names_of_colours_or_classes():
     def names(**form):
         rules = Rules(walls_block_sight=form.pop("sight", False))
         return Game(map=maps.parse(BOARD), rules=rules, observation=Observation(**form)).channels
@@ -82,19 +82,19 @@ def test_channels_have_names():
     assert apart == (*common, "self", "agent_0", "agent_1", "agent_2")
 
 
-def test_identity_colours_are_all_different_and_none_of_the_games():
-    colours = [agent_colour(agent) for agent in range(MOST_AGENTS_APART)]
-    assert len({*colours, *COLOURS}) == MOST_AGENTS_APART + len(COLOURS)
+def test_identity_colours_differ_from_each_other_and_from_the_colours_of_classes():
+    colours = [agent_colour(agent) for agent in range(MAX_AGENTS_APART)]
+    assert len({*colours, *COLOURS}) == MAX_AGENTS_APART + len(COLOURS)
 
 
-def test_too_many_agents_cannot_be_told_apart():
-    many = maps.parse(f"A{'>' * (MOST_AGENTS_APART + 1)}")
+def test_agents_apart_refuses_too_many_agents():
+    many = maps.parse(f"A{'>' * (MAX_AGENTS_APART + 1)}")
     Game(map=many, rules=Rules())
-    with pytest.raises(ValueError, match="121 agents; at most 120 can be told apart"):
+    with pytest.raises(ValueError, match="121 agents; allowed: at most 120"):
         Game(map=many, rules=Rules(), observation=Observation(agents_apart=True))
 
 
-def test_a_scoreboard_shows_ones_own_harvest_first_then_those_of_the_next_numbers():
+def test_a_scoreboard_shows_the_observers_harvest_first_then_those_of_the_next_indices():
     play = Play("A>A.A<.>A", observation=Observation(scoreboard=True, stock_gauge=True))
     assert play.output.stock_gauge[0].tolist() == [[1.0]] * 3
     play.turn("forward", "forward", "stay")
@@ -107,7 +107,7 @@ def test_a_scoreboard_shows_ones_own_harvest_first_then_those_of_the_next_number
 
 
 @pytest.mark.parametrize("form", FORMS, ids=str)
-def test_specs_follow_the_form(form):
+def test_specs_match_the_form_of_the_observation(form):
     game = presets.game("commons")
     env = CommonsEnv(Game(map=game.map, rules=game.rules, observation=form), worlds=2, seed=1, state=True)
     check_env_specs(env)
@@ -121,21 +121,21 @@ def test_specs_follow_the_form(form):
     assert moment[keys.OBSERVATION].max() <= env.observation_spec[keys.OBSERVATION].space.high.max()
 
 
-def test_the_game_is_the_same_whatever_is_observed():
+def test_the_form_of_the_observation_does_not_change_the_game():
     game = presets.game("commons", variant="as_run")
     actions = random_actions(100, 2, game)
     plain = Batch(game, 2)
     others = [Batch(Game(map=game.map, rules=game.rules, observation=form), 2) for form in FORMS]
-    told = plain.begin(plain.new_output())
-    their_told = [other.begin(other.new_output()) for other in others]
+    output = plain.begin(plain.new_output())
+    outputs = [other.begin(other.new_output()) for other in others]
     for turn in actions:
-        plain.play(turn, told)
-        for other, other_told in zip(others, their_told, strict=True):
-            other.play(turn, other_told)
-            assert np.array_equal(other_told.harvest, told.harvest)
-            assert np.array_equal(other_told.stock, told.stock)
+        plain.play(turn, output)
+        for other, other_output in zip(others, outputs, strict=True):
+            other.play(turn, other_output)
+            assert np.array_equal(other_output.harvest, output.harvest)
+            assert np.array_equal(other_output.stock, output.stock)
             if other.game.observation == Observation(stock_gauge=True):
-                assert np.array_equal(other_told.observation, told.observation)
+                assert np.array_equal(other_output.observation, output.observation)
 
 
 WALLED = """
@@ -147,7 +147,7 @@ WALLED = """
 """
 
 
-def test_walls_hide_what_lies_behind_them():
+def test_walls_hide_the_cells_behind_them():
     play = Play(WALLED, window_rows=5, window_columns=7, walls_block_sight=True, may_fire=False)
     assert play.window(0) == drawn(
         """
@@ -162,12 +162,12 @@ def test_walls_hide_what_lies_behind_them():
     assert open_sight.window(0) == drawn("..A.A..\n.#.....\nA..#..A\n...m...\n...S...")
 
 
-def test_what_is_behind_the_boards_edge_is_hidden_too():
+def test_the_edge_of_the_board_hides_the_cells_behind_it():
     play = Play("A>.", window_rows=4, window_columns=3, walls_block_sight=True, may_fire=False)
     assert play.window(0) == drawn("???\n?#?\n#m#\n#S#")
 
 
-def test_the_cells_between_two_are_those_whose_inside_the_line_crosses():
+def test_the_cells_between_two_cells_are_those_whose_interior_the_line_crosses():
     assert cells_between(0, 0) == []
     assert cells_between(0, 1) == []
     assert cells_between(3, 0) == [(1, 0), (2, 0)]
@@ -183,8 +183,8 @@ def test_sight_is_mutual(rows, cols):
     assert back == set(cells_between(rows, cols))
 
 
-def test_walls_that_block_sight_and_a_full_view_exclude_each_other():
-    with pytest.raises(ValueError, match="either an agent sees the whole board, or walls block its sight"):
+def test_walls_that_block_sight_need_windows():
+    with pytest.raises(ValueError, match='use area="window" where walls block sight'):
         Game(
             map=maps.parse(BOARD),
             rules=Rules(walls_block_sight=True),

@@ -5,12 +5,13 @@ from statistics import fmean
 import pytest
 
 from cprl import CommonsEnv, Game, Rules, maps
+from cprl.agents import Population
 from cprl.algorithms.actor_critic import IQL, SAC
 from cprl.algorithms.dqn import CQL, DQN, DistributionalDQN
 from cprl.algorithms.on_policy import A2C, PPO, Reinforce
 from cprl.learners.settings import DQNSettings, RolloutSettings
 from cprl.measuring.evaluate import evaluate
-from cprl.population import Learner, Population
+from cprl.population import Learning
 from cprl.training import train
 
 STEPS = 24
@@ -67,7 +68,8 @@ def share_of_the_optimum(population):
 @pytest.mark.slow
 @pytest.mark.parametrize("name", ALGORITHMS)
 def test_a_lone_agent_comes_close_to_the_optimum(name):
-    population = Population(GAME, [Learner(ALGORITHMS[name])], replicas=REPLICAS, seed=1, compile=False)
+    env = CommonsEnv(GAME, REPLICAS)
+    population = Population(env, [Learning(ALGORITHMS[name])], seed=1, engine="eager")
     untrained = share_of_the_optimum(population)
     episodes = 125 if isinstance(ALGORITHMS[name].settings, DQNSettings) else 400
     train(CommonsEnv(GAME, REPLICAS, seed=1), population.learners, episodes=episodes)

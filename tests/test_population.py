@@ -8,9 +8,10 @@ import torch
 from torchrl.objectives import ClipPPOLoss
 
 import cprl
-from cprl import CommonsEnv, Game, Observation, Rules, maps
-from cprl import experiment as study
+from cprl import CommonsEnv, Experiment, Game, Observation, Rules, maps
+from cprl.agents import Population
 from cprl.algorithms.actor_critic import IQL, SAC
+from cprl.algorithms.base import OffPolicy
 from cprl.algorithms.dqn import CQL, DQN, DistributionalDQN
 from cprl.algorithms.on_policy import A2C, PPO, Reinforce
 from cprl.algorithms.tabular import Tabular
@@ -20,9 +21,8 @@ from cprl.learners.rollouts import RolloutLearner
 from cprl.learners.settings import DQNSettings, RolloutSettings, TabularSettings
 from cprl.learners.transitions import lane_turn
 from cprl.networks.agent import acting_part
-from cprl.population import Frozen, Learner, Population, Scripted
+from cprl.population import Frozen, Learning, Scripted
 from cprl.runs.checkpoints import Checkpointer, checkpoints_in
-from cprl.runs.directory import start_run
 from cprl.training import train
 
 GAME = Game(
@@ -58,22 +58,23 @@ ALGORITHMS = {
     "REINFORCE": Reinforce(settings=replace(ROLLOUTS, epochs=1)),
 }
 WAYS = {
-    "DQN": "lane axis",
-    "double DQN": "lane axis",
-    "Huber DQN": "lane axis",
-    "C51": "lane axis, flat",
-    "CQL": "lane axis",
-    "SAC": "vmap",
-    "IQL": "vmap",
-    "PPO": "lane axis",
-    "A2C": "lane axis",
-    "REINFORCE": "lane axis",
+    "DQN": "lane_axis",
+    "double DQN": "lane_axis",
+    "Huber DQN": "lane_axis",
+    "C51": "lane_axis_flat",
+    "CQL": "lane_axis",
+    "SAC": "vmapped",
+    "IQL": "vmapped",
+    "PPO": "lane_axis",
+    "A2C": "lane_axis",
+    "REINFORCE": "lane_axis",
 }
 FOUR = tuple(range(4))
 
 
-def population(members, *, replicas=2, **how):
-    return Population(GAME, members, replicas=replicas, seed=3, compile=False, **how)
+def population(members, *, replicas=2, first_replica=0, game=GAME):
+    env = CommonsEnv(game, replicas, seed=3)
+    return Population(env, members, seed=3, first_replica=first_replica, engine="eager")
 
 
 class Returns:
@@ -90,7 +91,7 @@ class Returns:
 
 
 def trained(agents, *, episodes=6, first=0, **how):
-    env = CommonsEnv(agents.game, agents.replicas, seed=agents.seed, first_world=first)
+    env = CommonsEnv(GAME, agents.replicas, seed=agents.seed, first_world=first)
     returns = Returns()
     training = train(
         env, agents.learners, others=agents.others, episodes=episodes, callbacks=[returns], **how
@@ -108,7 +109,7 @@ def weights(agents):
 
 @pytest.mark.parametrize("name", ALGORITHMS)
 def test_each_loss_moves_every_agents_weights_and_no_replica_knows_of_the_others(name):
-    members = [Learner(ALGORITHMS[name])] * 4
+    members = [Learning(ALGORITHMS[name])] * 4
     together, alone = population(members, replicas=3), population(members, replicas=1, first_replica=2)
     (learner,) = together.learners.values()
     before = weights(together)
@@ -130,14 +131,21 @@ def test_each_loss_moves_every_agents_weights_and_no_replica_knows_of_the_others
 @pytest.mark.parametrize("name", ALGORITHMS)
 def test_each_loss_takes_the_fastest_way_that_agrees_with_a_list_of_torchrls_losses(name):
     algorithm = ALGORITHMS[name]
-    members = [Learner(algorithm)] * 4
+    members = [Learning(algorithm)] * 4
     found = population(members, replicas=1)
     (learner,) = found.learners.values()
     kind, common = type(learner), {"agents": FOUR, "replicas": 1, "settings": algorithm.settings, "seed": 3}
-    common |= {"make_network": lambda: algorithm.network(GAME), "make_loss": algorithm.loss, "compile": False}
+    common |= {
+        "make_network": lambda: algorithm.make_network(GAME.spaces),
+        "make_loss": algorithm.make_loss,
+        "compile": False,
+    }
     if kind is ReplayLearner:
         common["stochastic"] = algorithm.stochastic
-    by_list, named = kind(GAME, engine="list", **common), kind(GAME, engine=WAYS[name], **common)
+    by_list, named = (
+        kind(GAME.spaces, engine="list", **common),
+        kind(GAME.spaces, engine=WAYS[name], **common),
+    )
     ends = []
     for one in (learner, named, by_list):
         env = CommonsEnv(GAME, 1, seed=3)
@@ -150,7 +158,7 @@ def test_each_loss_takes_the_fastest_way_that_agrees_with_a_list_of_torchrls_los
 
 
 def test_unlike_agents_sit_side_by_side_in_one_training_and_like_ones_are_lanes():
-    dqn, ppo = Learner(ALGORITHMS["DQN"]), Learner(ALGORITHMS["PPO"])
+    dqn, ppo = Learning(ALGORITHMS["DQN"]), Learning(ALGORITHMS["PPO"])
     mixed = population([dqn, ppo, dqn, Scripted("greedy")])
     assert {agents: type(learner) for agents, learner in mixed.learners.items()} == {
         (0, 2): ReplayLearner,
@@ -166,9 +174,9 @@ def test_unlike_agents_sit_side_by_side_in_one_training_and_like_ones_are_lanes(
 
 
 def test_equal_learners_are_lanes_even_if_they_were_written_down_twice():
-    twice = population([Learner(DQN(settings=REPLAY)) for _ in range(4)])
+    twice = population([Learning(DQN(settings=REPLAY)) for _ in range(4)])
     assert list(twice.learners) == [FOUR]
-    unequal = [Learner(DQN(settings=replace(REPLAY, gamma=gamma))) for gamma in (0.9, 0.9, 0.5, 0.5)]
+    unequal = [Learning(DQN(settings=replace(REPLAY, gamma=gamma))) for gamma in (0.9, 0.9, 0.5, 0.5)]
     assert list(population(unequal).learners) == [(0, 1), (2, 3)]
 
 
@@ -184,7 +192,7 @@ def test_who_is_paid_for_the_group_gets_the_sum_of_all_rewards():
             break
     assert rewards.sum() > 0
     own, group = (
-        lane_turn((1, 3), moment, reward_kind=reward_kind).reward for reward_kind in ("own", "group")
+        lane_turn((1, 3), moment, reward_kind=reward_kind).reward for reward_kind in ("individual", "team")
     )
     assert own.tolist() == rewards[:, [1, 3]].flatten().tolist()
     assert group.tolist() == rewards.sum(1).repeat_interleave(2).tolist()
@@ -192,7 +200,7 @@ def test_who_is_paid_for_the_group_gets_the_sum_of_all_rewards():
 
 def test_paid_for_the_group_is_another_learner_than_paid_for_itself():
     algorithm = ALGORITHMS["DQN"]
-    members = [Learner(algorithm), Learner(algorithm, reward_kind="group"), *[Scripted()] * 2]
+    members = [Learning(algorithm), Learning(algorithm, reward="team"), *[Scripted()] * 2]
     assert list(population(members).learners) == [(0,), (1,)]
 
 
@@ -231,7 +239,7 @@ def assert_goes_on_bit_for_bit(members, tmp_path, *, episodes):
                     others=agents.others,
                     episodes=episodes,
                     callbacks=[Stopping(stop_at)],
-                    checkpoints=checkpoints,
+                    checkpointer=checkpoints,
                 )
             except StopError:
                 assert checkpoints_in(tmp_path / name / "checkpoints")
@@ -243,62 +251,75 @@ def assert_goes_on_bit_for_bit(members, tmp_path, *, episodes):
         assert torch.equal(value, whole[key]), key
 
 
-@pytest.mark.parametrize("kind", ["PPO", "SAC", "DQN"])
+@pytest.mark.parametrize("kind", ["PPO", pytest.param("SAC", marks=pytest.mark.slow), "DQN"])
 def test_a_mixed_training_that_was_stopped_goes_on_bit_for_bit(kind, tmp_path):
-    members = [Learner(ALGORITHMS[kind]), Learner(ALGORITHMS["CQL"]), Scripted("greedy"), Scripted()]
+    members = [Learning(ALGORITHMS[kind]), Learning(ALGORITHMS["CQL"]), Scripted("greedy"), Scripted()]
     assert_goes_on_bit_for_bit(members, tmp_path, episodes=7)
 
 
-def conducted(tmp_path, members, name="run"):
-    agents = population(members)
-    recipe = {"replicas": 2, "seed": 3, "game": GAME, "population": agents.told()}
-    run = start_run(tmp_path / name, "mixed", recipe)
-    study.conduct(run, agents, episodes=4, title="mixed", evaluation_episodes=2, watch="off")
-    return run, agents
+def ran(tmp_path, members, name="run"):
+    """A whole run of these agents, and its networks."""
+    experiment = Experiment(
+        name="mixed",
+        game=GAME,
+        agents=members,
+        replicas=2,
+        episodes=4,
+        seed=3,
+        evaluation_episodes=2,
+        engine="eager",
+    )
+    run = cprl.run(experiment, tmp_path / name, watch="off")
+    return run, cprl.load(run).networks
 
 
 def test_a_mixed_run_is_kept_evaluated_and_built_again_from_its_directory(tmp_path, capsys):
-    members = [Learner(ALGORITHMS["C51"]), Learner(ALGORITHMS["PPO"]), Scripted("greedy"), Scripted()]
-    run, agents = conducted(tmp_path, members)
+    members = [Learning(ALGORITHMS["C51"]), Learning(ALGORITHMS["PPO"]), Scripted("greedy"), Scripted()]
+    run, _ = ran(tmp_path, members)
     assert "trained, epsilon 0.05" in " ".join(capsys.readouterr().out.split())
     loaded = cprl.load(run)
-    assert loaded.algorithms == {0: ALGORITHMS["C51"], 1: ALGORITHMS["PPO"]}
+    assert list(loaded.experiment.agents) == members
+    same = population(members)
+    trained(same, episodes=4)
     seen = torch.randint(256, (5, *GAME.observation_shape), dtype=torch.uint8)
-    for lane, network in agents.networks().items():
+    for lane, network in same.networks().items():
         assert torch.equal(loaded.networks[lane](seen), network(seen))
     env = loaded.env(2)
-    actions = loaded.policy(1)(env.reset())["agents", "action"]
+    actions = loaded.policy(1, worlds=2)(env.reset())["agents", "action"]
     assert actions.shape == (2, 4)
 
 
-def test_a_frozen_agent_plays_what_it_learned_and_changes_no_more(tmp_path, capsys):
-    run, earlier = conducted(tmp_path, [Learner(ALGORITHMS["DQN"])] * 4)
-    frozen = population([Frozen(run, 2, replica=1), *[Learner(ALGORITHMS["DQN"])] * 3])
+def test_a_frozen_agent_plays_what_it_learned_and_changes_no_more(tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    run, earlier = ran(tmp_path, [Learning(ALGORITHMS["DQN"])] * 4)
+    frozen = population([Frozen(run, 2, replica=1), *[Learning(ALGORITHMS["DQN"])] * 3])
     (agents, actor), *rest = frozen.others.items()
     assert (agents, rest) == ((0,), [])
     actor.epsilon = 0.0
     seen = CommonsEnv(GAME, 2, seed=9).reset()["agents", "observation"][:, :1]
-    network = earlier.networks()["replica_1/agent_2"]
+    network = earlier["replica_1/agent_2"]
     assert torch.equal(actor.choose(seen), network(seen).argmax(-1))
     before = frozen.others[0,].values(seen).clone()
     trained(frozen)
     assert torch.equal(frozen.others[0,].values(seen), before)
     assert sorted({name.split("/")[1] for name in frozen.networks()}) == ["agent_1", "agent_2", "agent_3"]
-    again, _ = conducted(tmp_path, [Frozen(run, 2), *[Scripted()] * 3], name="again")
-    assert cprl.load(again).members[0] == {
-        "member": "Frozen",
-        "run": str(run),
-        "agent": 2,
-        "replica": 0,
-    }
+    again, _ = ran(tmp_path, [Frozen("run", 2), *[Scripted()] * 3], name="again")
+    assert cprl.load(again).specs[0] == Frozen("run", 2)
+    assert str(tmp_path) not in (again / "recipe.json").read_text().split('"command"')[0]
+    monkeypatch.chdir(tmp_path.parent)
+    moved = cprl.load(again)
+    assert moved.specs[0] == Frozen(f"{tmp_path.name}/run", 2)
+    assert torch.equal(moved.agent(0).network(seen), earlier["replica_0/agent_2"](seen))
 
 
 def test_a_tabular_agent_is_a_member_like_any_other(tmp_path, capsys):
     algorithm = Tabular(settings=TabularSettings(epsilon_hold_steps=5, epsilon_decay_steps=40))
-    members = [Learner(algorithm), Learner(ALGORITHMS["DQN"]), Learner(algorithm), Scripted("greedy")]
-    run, agents = conducted(tmp_path, members)
+    members = [Learning(algorithm), Learning(ALGORITHMS["DQN"]), Learning(algorithm), Scripted("greedy")]
+    run, _ = ran(tmp_path, members)
     loaded = cprl.load(run)
-    assert loaded.algorithms[2] == algorithm
+    assert loaded.specs[2].algorithm == algorithm
+    agents = population(members)
+    trained(agents, episodes=4)
     table = agents.learners[0, 2].q_table(3)
     assert len(table["visits"]) > 10
     seen, network = torch.from_numpy(table["observation"]), loaded.networks["replica_1/agent_2"]
@@ -312,11 +333,11 @@ def test_a_tabular_agent_is_a_member_like_any_other(tmp_path, capsys):
     assert chosen[:, 0].tolist() == table["values"][:2].argmax(1).tolist()
 
     told = replace(GAME, observation=Observation(scoreboard=True))
-    with pytest.raises(ValueError, match=r"observe observation, scoreboard; .* see only"):
-        Population(told, members)
+    with pytest.raises(ValueError, match=r"observe observation, scoreboard; allowed .*: observation alone"):
+        population(members, game=told)
 
 
-@pytest.mark.parametrize("reward_kind", ["own", "group"])
+@pytest.mark.parametrize("reward_kind", ["individual", "team"])
 def test_a_tabular_agent_is_paid_for_itself_or_for_the_group(reward_kind):
     class Witness:
         """What was paid last for an action in a state, by replica."""
@@ -326,7 +347,7 @@ def test_a_tabular_agent_is_paid_for_itself_or_for_the_group(reward_kind):
 
         def on_step(self, batch):
             rewards = batch["next", "agents", "reward"][..., 0]
-            paid_now = rewards.sum(1) if reward_kind == "group" else rewards[:, 1]
+            paid_now = rewards.sum(1) if reward_kind == "team" else rewards[:, 1]
             for replica, reward in enumerate(paid_now.tolist()):
                 seen = batch["agents", "observation"][replica, 1].numpy().tobytes()
                 self.last[replica, seen, int(batch["agents", "action"][replica, 1])] = reward
@@ -336,7 +357,7 @@ def test_a_tabular_agent_is_paid_for_itself_or_for_the_group(reward_kind):
 
     algorithm = Tabular(settings=TabularSettings(gamma=0.0, learning_rate=1.0))
     agents = population(
-        [Scripted("greedy"), Learner(algorithm, reward_kind=reward_kind), *[Scripted("greedy")] * 2]
+        [Scripted("greedy"), Learning(algorithm, reward=reward_kind), *[Scripted("greedy")] * 2]
     )
     witness = Witness()
     train(CommonsEnv(GAME, 2), agents.learners, others=agents.others, episodes=10, callbacks=[witness])
@@ -349,49 +370,49 @@ def test_a_tabular_agent_is_paid_for_itself_or_for_the_group(reward_kind):
             for action in visits.nonzero()[0].tolist():
                 values[replica, seen.tobytes(), action] = of_actions[action]
     assert values == witness.last
-    assert (max(values.values()) > 1) == (reward_kind == "group")
+    assert (max(values.values()) > 1) == (reward_kind == "team")
 
 
 @dataclass(frozen=True, kw_only=True)
-class PPOFromReplay:
+class PPOFromReplay(OffPolicy):
     settings: DQNSettings
     stochastic: ClassVar[bool] = True
 
-    def network(self, game):
-        return ALGORITHMS["PPO"].network(game)
+    def make_network(self, spaces):
+        return ALGORITHMS["PPO"].make_network(spaces)
 
-    def loss(self, network):
-        return ALGORITHMS["PPO"].loss(network)
+    def make_loss(self, network):
+        return ALGORITHMS["PPO"].make_loss(network)
 
 
 def test_what_does_not_fit_is_refused_before_training_and_says_what_fits(tmp_path, capsys):
-    dqn = Learner(ALGORITHMS["DQN"])
-    with pytest.raises(ValueError, match="paid is 'team'; allowed: own, group"):
-        Learner(ALGORITHMS["DQN"], reward_kind="team")
-    with pytest.raises(ValueError, match="3 members for a game of 4 seats; one for each is wanted"):
+    dqn = Learning(ALGORITHMS["DQN"])
+    with pytest.raises(ValueError, match="reward is 'group'; allowed: individual, team"):
+        Learning(ALGORITHMS["DQN"], reward="group")
+    with pytest.raises(ValueError, match="3 agents are specified for a game of 4 agents; allowed: one"):
         population([dqn] * 3)
-    assert isinstance(ALGORITHMS["PPO"].loss(ALGORITHMS["PPO"].network(GAME)), ClipPPOLoss)
+    assert isinstance(ALGORITHMS["PPO"].make_loss(ALGORITHMS["PPO"].make_network(GAME.spaces)), ClipPPOLoss)
     with pytest.raises(
-        ValueError, match=r"ClipPPOLoss learns from what .* not from a replay buffer; what fits"
+        ValueError, match=r"ClipPPOLoss is on-policy and cannot learn from a replay buffer; use"
     ):
-        population([Learner(PPOFromReplay(settings=REPLAY))] * 4)
-    with pytest.raises(ValueError, match=r'an agent has the networks .*; "actor" and "critic" are wanted'):
+        population([Learning(PPOFromReplay(settings=REPLAY))] * 4)
+    with pytest.raises(ValueError, match=r'an agent has the networks .*; allowed: "actor" and "critic"'):
         RolloutLearner(
-            GAME,
+            GAME.spaces,
             agents=[0],
             replicas=1,
             settings=ROLLOUTS,
-            make_network=lambda: acting_part(ALGORITHMS["PPO"].network(GAME)),
-            make_loss=ALGORITHMS["PPO"].loss,
+            make_network=lambda: acting_part(ALGORITHMS["PPO"].make_network(GAME.spaces)),
+            make_loss=ALGORITHMS["PPO"].make_loss,
         )
-    with pytest.raises(ValueError, match=r"learn_every is 7; it must divide the rollouts' 20 steps"):
-        trained(population([Learner(ALGORITHMS["PPO"])] * 4), update_every=7)
-    run, _ = conducted(tmp_path, [dqn] * 4)
+    with pytest.raises(ValueError, match=r"update_every is 7; allowed: a divisor of rollout_steps 20"):
+        trained(population([Learning(ALGORITHMS["PPO"])] * 4), update_every=7)
+    run, _ = ran(tmp_path, [dqn] * 4)
     larger = Game(map=GAME.map, rules=replace(GAME.rules, window_rows=4))
     with pytest.raises(ValueError, match=r"have observations \(3, 3, 5\); this game has \(3, 4, 5\)"):
-        Population(larger, [Frozen(run, 0), dqn, dqn, dqn], compile=False)
+        population([Frozen(run, 0), dqn, dqn, dqn], game=larger)
     other = Game(map=GAME.map, rules=GAME.rules, observation=Observation(agents_apart=True))
     with pytest.raises(ValueError, match=r"have a form of observation .* this game has"):
-        Population(other, [Frozen(run, 0), dqn, dqn, dqn], compile=False)
+        population([Frozen(run, 0), dqn, dqn, dqn], game=other)
     with pytest.raises(ValueError, match=r"keeps no network of replica_9/agent_0; kept are"):
         population([Frozen(run, 0, replica=9), dqn, dqn, dqn])

@@ -1,4 +1,4 @@
-"""prepare_process: what a training wants of its process."""
+"""prepare_process: freed memory stays with the process."""
 
 import ctypes
 import platform
@@ -21,10 +21,10 @@ def faults_of_rounds():
 
 
 @pytest.mark.skipif(platform.libc_ver()[0] != "glibc", reason="mallopt is glibc's")
-def test_memory_freed_in_one_round_is_there_in_the_next():
+def test_memory_freed_in_one_round_is_reused_in_the_next():
     libc = ctypes.CDLL(None)
     for setting in (_M_MMAP_THRESHOLD, _M_TRIM_THRESHOLD):
-        libc.mallopt(setting, 2**17)  # glibc's own to begin with
+        libc.mallopt(setting, 2**17)  # glibc's initial value
     pages_of_a_round = 40 * 2**20 // 4096
     assert faults_of_rounds() > pages_of_a_round
     prepare_process(0)

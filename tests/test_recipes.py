@@ -4,6 +4,7 @@ import importlib.util
 import json
 import re
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 
 import pyarrow.parquet as pq
@@ -12,16 +13,15 @@ import torch
 from rerun.chunk import RrdReader
 
 import cprl
-from cprl import CommonsEnv, Map, Rules, presets
+from cprl import CommonsEnv, presets
+from cprl.agents import Population
+from cprl.algorithms import DQN, PPO
 from cprl.learners.replay import ReplayLearner
-from cprl.learners.single import DQNLearner
-from cprl.measuring.evaluate import evaluate, mean_return
-from cprl.policies.assignment import AgentPolicies
-from cprl.policies.single import RandomActor
-from cprl.population import Learner, Population
+from cprl.measuring.evaluate import evaluate
+from cprl.population import Learning, Scripted
 from cprl.runs.checkpoints import Checkpointer, checkpoints_in, read_checkpoint
 from cprl.runs.episodes import EpisodeTable, read_episodes
-from cprl.runs.weights import load_weights, restore_weights
+from cprl.runs.weights import load_weights
 from cprl.training import train
 
 RECIPES = Path(__file__).parents[1] / "recipes"
@@ -32,6 +32,13 @@ def recipe(name):
     module = importlib.util.module_from_spec(spec)
     spec.loader.exec_module(module)
     return module
+
+
+def run_recipe(name, out, *, own=None, watch="file", **changes):
+    """Runs the experiment of a recipe, in miniature."""
+    experiment = recipe(name).experiment(**(own or {}))
+    changes = {"engine": "eager", **changes}
+    return cprl.run(replace(experiment, **changes), out, watch=watch)
 
 
 @pytest.fixture(autouse=True)
@@ -53,66 +60,24 @@ def run_in_miniature(tmp_path, capsys, **arguments):
     return run, capsys.readouterr().out
 
 
-@pytest.mark.parametrize("variant", presets.VARIANTS)
-def test_the_first_run_leaves_a_run_directory(variant, tmp_path, capsys):
-    run, told = run_in_miniature(tmp_path, capsys, variant=variant, seed=3)
-    kept = json.loads((run / "recipe.json").read_text())
-    assert kept["recipe"] == "first_run"
-    assert kept["arguments"]["seed"] == 3
-    assert kept["arguments"]["learner"]["learning_rate"] == 3e-4
-    again = Rules(**kept["arguments"]["game"]["rules"]), Map(**kept["arguments"]["game"]["map"])
-    assert again == (presets.game("single_basic", variant=variant).rules, presets.game("single_basic").map)
-    assert read_episodes(run)["episode"].to_pylist() == list(range(11))
-    assert (run / "episodes.parquet").exists()
-    assert (run / "run.rrd").stat().st_size > 10_000
-    assert (run / "figures" / "training_curve.png").stat().st_size > 10_000
-    assert set(load_weights(run / "checkpoints" / "best.pt")) == {"agent_0"}
-    assert set(load_weights(run / "checkpoints" / "final.pt")) == {"agent_0"}
-    assert "random" in told
-    assert "greedy" in told
-
-
-def test_the_first_run_says_that_it_is_short_and_names_the_published_schedule(tmp_path, capsys):
-    run, told = run_in_miniature(tmp_path, capsys, watch="serve")
-    assert "ViewerCallback live (browser): http://127.0.0.1:" in told
-    assert "short schedule, 11 episodes" in " ".join(told.split())
-    assert "The published one, with 8 replicas: .venv/bin/python recipes/single_basic.py" in told
-    assert (
-        json.loads((run / "recipe.json").read_text())["arguments"]["learner"]["epsilon_decay_steps"] == 30_000
-    )
-
-
-def test_a_directory_with_a_run_in_it_is_not_written_over(tmp_path, capsys):
-    run, _ = run_in_miniature(tmp_path, capsys)
-    with pytest.raises(FileExistsError):
-        run_in_miniature(tmp_path, capsys)
-    assert read_episodes(run).num_rows == 11
-
-
-@pytest.mark.slow
-def test_the_short_schedule_earns_three_times_what_chance_does(tmp_path):
-    run = recipe("first_run").main(out=tmp_path / "run")
-    game = presets.game("single_basic")
-    learner = DQNLearner(game.observation_shape, 7, settings=presets.learner("single_basic"))
-    restore_weights(run / "checkpoints" / "best.pt", {"agent_0": learner.network})
-    fresh = CommonsEnv(game, 100, seed=1234)
-    greedy, _ = mean_return(evaluate(fresh, AgentPolicies([learner.actor])))
-    chance, _ = mean_return(evaluate(fresh, AgentPolicies([RandomActor(7)])))
-    assert greedy >= 3 * chance
-
-
 LANES = {"single_basic": 1, "single_complex": 1, "two_complex": 2, "two_against_random": 2, "commons": 4}
 
 
-@pytest.mark.parametrize("variant", presets.VARIANTS)
-@pytest.mark.parametrize("name", LANES)
+@pytest.mark.parametrize(
+    ("name", "variant"),
+    [
+        pytest.param(name, variant, marks=[pytest.mark.slow] * (variant == "as_run" and name != "commons"))
+        for name in LANES
+        for variant in presets.VARIANTS
+    ],
+)
 def test_recipes_of_replicas_leave_a_run_directory(name, variant, tmp_path, capsys):
-    how = {"replicas": 2, "episodes": 3, "evaluation_episodes": 2, "seed": 3, "compile": False}
-    run = recipe(name).main(variant=variant, out=tmp_path / "run", **how)
+    how = {"replicas": 2, "episodes": 3, "evaluation_episodes": 2, "seed": 3}
+    run = run_recipe(name, tmp_path / "run", own={"variant": variant}, **how)
     told = capsys.readouterr().out
     kept = json.loads((run / "recipe.json").read_text())
     assert kept["recipe"] == name
-    assert kept["arguments"]["replicas"] == 2
+    assert kept["experiment"]["replicas"] == 2
     rows = read_episodes(run).to_pydict()
     agents = LANES[name]
     of_each = [(r, e, a) for r in range(2) for e in range(3) for a in range(agents)]
@@ -128,40 +93,49 @@ def test_recipes_of_replicas_leave_a_run_directory(name, variant, tmp_path, caps
             (r, e) for r in range(2) for e in range(2)
         ]
     assert json.loads((run / "report.json").read_text())["training_s"] > 0
-    game, settings = presets.game("commons"), presets.learner("commons", variant=variant)
+    game, settings = presets.game("commons"), presets.dqn_settings("commons", variant=variant)
     if name == "commons":
-        network = ReplayLearner(game, agents=[0], replicas=1, settings=settings, compile=False).networks()
+        network = ReplayLearner(
+            game.spaces, agents=[0], replicas=1, settings=settings, compile=False
+        ).networks()
         restore_weights_of(network["replica_0/agent_0"], weights["replica_1/agent_2"])
 
 
 def test_two_agents_without_the_beam_never_fire(tmp_path):
-    how = {"replicas": 2, "episodes": 1, "evaluation_episodes": 1, "compile": False, "watch": "off"}
-    run = recipe("two_complex").main(beam=False, out=tmp_path / "run", **how)
+    how = {"replicas": 2, "episodes": 1, "evaluation_episodes": 1, "watch": "off"}
+    run = run_recipe("two_complex", tmp_path / "run", own={"beam": False}, **how)
     assert json.loads((run / "recipe.json").read_text())["recipe"] == "two_complex_no_beam"
     assert set(read_episodes(run).to_pydict()["shots"]) == {0}
 
 
-@pytest.mark.parametrize("loss", ["dqn", "double_dqn", "cql", "sac", "iql", "ppo"])
+@pytest.mark.parametrize(
+    "loss",
+    [
+        *["sac", "iql", "ppo"],
+        *(pytest.param(name, marks=pytest.mark.slow) for name in ("dqn", "double_dqn", "cql")),
+    ],
+)
 def test_swapping_the_loss_is_one_argument_and_each_leaves_a_run_that_plays_again(loss, tmp_path, capsys):
-    how = {"replicas": 2, "evaluation_episodes": 1, "compile": False, "watch": "off"}
+    how = {"replicas": 2, "evaluation_episodes": 1, "watch": "off"}
     episodes = 5 if loss == "ppo" else 1  # a rollout is longer than an episode is here
-    run = recipe("swap_the_loss").main(loss=loss, episodes=episodes, out=tmp_path / "run", **how)
+    run = run_recipe("swap_the_loss", tmp_path / "run", own={"loss": loss}, episodes=episodes, **how)
     loaded, algorithm = cprl.load(run), recipe("swap_the_loss").LOSSES[loss]
-    assert loaded.algorithms == {0: algorithm, 1: algorithm}
+    assert loaded.experiment.agents == (Learning(algorithm),) * 2
     explores = "trained, epsilon 0.05" in " ".join(capsys.readouterr().out.split())
     assert explores == (loss not in ("sac", "iql", "ppo")), "who draws from a policy has no epsilon"
-    members = [Learner(algorithm)] * 2
-    for lane, network in Population(loaded.game, members, replicas=2, compile=False).networks().items():
+    members = [Learning(algorithm)] * 2
+    for lane, network in Population(loaded.env(2), members, engine="eager").networks().items():
         trained = loaded.networks[lane].state_dict()
         assert not any(torch.equal(value, trained[name]) for name, value in network.state_dict().items())
     assert len(evaluate(loaded.env(1), loaded.policy(1), explore=True)) == 1
 
 
 def test_unlike_neighbours_train_in_one_loop_are_recorded_and_evaluated(tmp_path, capsys):
-    how = {"replicas": 2, "episodes": 5, "evaluation_episodes": 1, "compile": False}
-    run = recipe("mixed").main(neighbour="greedy", out=tmp_path / "run", **how)
-    kinds = [member.get("algorithm", member.get("manner")) for member in cprl.load(run).members]
-    assert kinds == ["DQN", "DQN", "PPO", "greedy"]
+    how = {"replicas": 2, "episodes": 5, "evaluation_episodes": 1}
+    run = run_recipe("mixed", tmp_path / "run", own={"neighbour": "greedy"}, **how)
+    first, second, third, last = cprl.load(run).experiment.agents
+    assert first == second
+    assert (type(first.algorithm), type(third.algorithm), last) == (DQN, PPO, Scripted("greedy"))
     rows = pq.read_table(run / "evaluation" / "trained.parquet").to_pydict()
     assert sorted(set(rows["agent"])) == [0, 1, 2, 3]
     shots = dict.fromkeys(range(4), 0)
@@ -184,7 +158,7 @@ def restore_weights_of(network, state):
 @pytest.mark.slow
 def test_fifty_episodes_of_commons_in_eight_replicas_are_those_of_each_alone(tmp_path):
     how = {"episodes": 50, "evaluation_episodes": 1, "seed": 5}
-    run = recipe("commons").main(replicas=8, out=tmp_path / "all", **how)
+    run = run_recipe("commons", tmp_path / "all", replicas=8, engine="compiled", **how)
     rows = read_episodes(run).to_pydict()
     returns = {}
     for replica, agent, episode, value in zip(
@@ -195,10 +169,10 @@ def test_fifty_episodes_of_commons_in_eight_replicas_are_those_of_each_alone(tmp
     assert len(courses) == 32
     assert len(set(courses.values())) == 32, "all lanes differ"
     weights = load_weights(run / "checkpoints" / "final.pt")
-    game, settings = presets.game("commons"), presets.learner("commons")
+    game, settings = presets.game("commons"), presets.dqn_settings("commons")
     for replica in (0, 5):
         alone = ReplayLearner(
-            game, agents=range(4), replicas=1, first_replica=replica, settings=settings, seed=5
+            game.spaces, agents=range(4), replicas=1, first_replica=replica, settings=settings, seed=5
         )
         env = CommonsEnv(game, 1, seed=5, first_world=replica)
         (tmp_path / f"alone_{replica}").mkdir()
@@ -214,11 +188,12 @@ def test_fifty_episodes_of_commons_in_eight_replicas_are_those_of_each_alone(tmp
 
 
 def test_a_run_is_loaded_from_its_directory_alone(tmp_path):
-    how = {"replicas": 2, "episodes": 2, "evaluation_episodes": 1, "compile": False}
-    run = recipe("two_against_random").main(variant="as_run", out=tmp_path / "run", **how)
+    how = {"replicas": 2, "episodes": 2, "evaluation_episodes": 1}
+    run = run_recipe("two_against_random", tmp_path / "run", own={"variant": "as_run"}, **how)
     loaded = cprl.load(run)
     assert loaded.game == presets.game("two_complex", variant="as_run")
-    assert loaded.algorithms[0].settings == presets.learner("two_complex", variant="as_run")
+    settings = presets.dqn_settings("two_complex", variant="as_run")
+    assert loaded.experiment.agents == (Learning(DQN(settings=settings)), Scripted("random"))
     assert loaded.replicas == [0, 1]
     assert loaded.episodes().num_rows == 2 * 2 * 2
     kept = load_weights(run / "checkpoints" / "final.pt")
@@ -226,14 +201,13 @@ def test_a_run_is_loaded_from_its_directory_alone(tmp_path):
         for name, value in network.state_dict().items():
             assert torch.equal(value, kept[lane][name])
     assert loaded.weights_from == run / "checkpoints" / "final.pt"
-    assert len(evaluate(loaded.env(3), loaded.policy(1), explore=True)) == 3
-    assert len(evaluate(loaded.env(3), loaded.policy(1, others={1: RandomActor(8)}), explore=True)) == 3
-    with pytest.raises(ValueError, match=r"agents \[0\] of replica 7 have no network in .*; kept are"):
+    assert len(evaluate(loaded.env(3), loaded.policy(1, worlds=3), explore=True)) == 3
+    with pytest.raises(ValueError, match=r"keeps no network of replica_7/agent_0; kept are"):
         loaded.policy(7)
 
 
 def test_a_run_that_was_stopped_is_loaded_from_its_newest_checkpoint(tmp_path, monkeypatch):
-    how = {"replicas": 2, "episodes": 3, "evaluation_episodes": 1, "compile": False}
+    how = {"replicas": 2, "episodes": 3, "evaluation_episodes": 1}
 
     class StopError(Exception):
         pass
@@ -246,7 +220,7 @@ def test_a_run_that_was_stopped_is_loaded_from_its_newest_checkpoint(tmp_path, m
 
     monkeypatch.setattr(Checkpointer, "after_step", after_step)
     with pytest.raises(StopError):
-        recipe("two_against_random").main(out=tmp_path / "run", **how)
+        run_recipe("two_against_random", tmp_path / "run", **how)
     loaded = cprl.load(tmp_path / "run")
     older, newest = checkpoints_in(tmp_path / "run" / "checkpoints")
     assert loaded.weights_from == newest
@@ -256,7 +230,7 @@ def test_a_run_that_was_stopped_is_loaded_from_its_newest_checkpoint(tmp_path, m
     for replica in (0, 1):
         first = next(loaded.networks[f"replica_{replica}/agent_0"].parameters())
         assert torch.equal(first, kept[replica].T)
-    assert len(evaluate(loaded.env(2), loaded.policy(1), explore=True)) == 2
+    assert len(evaluate(loaded.env(2), loaded.policy(1, worlds=2), explore=True)) == 2
     newest.write_bytes(newest.read_bytes()[:-100])
     assert cprl.load(tmp_path / "run").weights_from == older
     older.unlink()
@@ -269,7 +243,7 @@ def test_the_run_of_a_plain_agent_is_loaded_too(tmp_path, capsys):
     for weights in ("final", "best"):
         loaded = cprl.load(run, weights=weights)
         assert list(loaded.networks) == ["replica_0/agent_0"]
-        assert len(evaluate(loaded.env(2), loaded.policy())) == 2
+        assert len(evaluate(loaded.env(2), loaded.policy(worlds=2))) == 2
 
 
 def test_a_run_that_cannot_be_loaded_says_which_file_and_why(tmp_path, capsys):
@@ -289,11 +263,11 @@ def test_a_run_that_cannot_be_loaded_says_which_file_and_why(tmp_path, capsys):
     with pytest.raises(ValueError, match=r"best\.pt holds no weights of this run: .*No such file"):
         cprl.load(run, weights="best")
     told = json.loads((run / "recipe.json").read_text())
-    told["arguments"]["game"]["rules"]["hits_to_tag"] = 0
+    told["experiment"]["game"]["rules"]["hits_to_tag"] = 0
     (run / "recipe.json").write_text(json.dumps(told))
-    with pytest.raises(ValueError, match=r"recipe\.json holds no game and learner .*hits_to_tag is 0"):
+    with pytest.raises(ValueError, match=r"recipe\.json: experiment\.game\.rules: .*hits_to_tag is 0"):
         cprl.load(run)
-    with pytest.raises(ValueError, match=r"recipe\.json is no recipe of a run"):
+    with pytest.raises(ValueError, match=r"recipe\.json is not the recipe of a run"):
         cprl.load(tmp_path)
 
 
@@ -302,6 +276,7 @@ def test_a_run_that_cannot_be_loaded_says_which_file_and_why(tmp_path, capsys):
     "name", sorted(path.stem for path in RECIPES.glob("*.py") if path.stem != "reproduce")
 )
 def test_a_way_to_watch_that_is_none_is_refused_before_there_is_a_run(name, watch, tmp_path):
-    with pytest.raises(ValueError, match=re.escape(f"watch is {watch!r}") + '; wanted: "file",.* or "con'):
-        recipe(name).main(watch=watch, out=tmp_path / "run")
+    run = recipe(name).main if name == "first_run" else partial(run_recipe, name)
+    with pytest.raises(ValueError, match=re.escape(f"watch is {watch!r}") + '; allowed: "file",.* or "con'):
+        run(out=tmp_path / "run", watch=watch)
     assert not (tmp_path / "run").exists()

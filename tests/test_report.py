@@ -14,9 +14,9 @@ from test_rerun_logger import column
 
 import cprl
 from cprl import presets
-from cprl.evaluation.film import replay
+from cprl.evaluation.film import film
 from cprl.measuring.movement import Trace
-from cprl.measuring.published import curve, experiment
+from cprl.measuring.published import curve, published_experiment
 from cprl.reporting import write_report
 from cprl.reporting.claims import dip_depth, measures, of_play, of_training
 from cprl.reporting.result import Result
@@ -46,9 +46,9 @@ def run(tmp_path_factory):
 
     with pytest.MonkeyPatch.context() as patched:
         patched.setattr(presets, "game", shorter)
-        how = {"replicas": 2, "episodes": 12, "evaluation_episodes": 2, "compile": False}
-        out = tmp_path_factory.mktemp("runs") / "four"
-        return recipe("two_against_random").main(variant="as_run", out=out, **how)
+        how = {"replicas": 2, "episodes": 12, "evaluation_episodes": 2, "engine": "eager"}
+        experiment = recipe("two_against_random").experiment(variant="as_run")
+        return cprl.run(replace(experiment, **how), tmp_path_factory.mktemp("runs") / "four")
 
 
 def test_what_is_kept_says_the_same_as_the_run(run, tmp_path):
@@ -64,7 +64,7 @@ def test_what_is_kept_says_the_same_as_the_run(run, tmp_path):
     assert sorted(mine.networks) == sorted(theirs.networks)
     assert not list(folder.rglob("training-*"))
     (run / "report.json").rename(tmp_path / "aside")
-    with pytest.raises(FileNotFoundError, match=r"report\.json is not there: has the run ended\?"):
+    with pytest.raises(FileNotFoundError, match=r"report\.json does not exist: has the run ended\?"):
         export_results(run, tmp_path / "other")
     (tmp_path / "aside").rename(run / "report.json")
     assert not (tmp_path / "other").exists()
@@ -91,7 +91,7 @@ def test_a_report_tells_every_number_from_the_results_alone(run, tmp_path):
 def test_the_command_writes_a_report(run, tmp_path, capsys, monkeypatch):
     from cprl import cli
 
-    monkeypatch.setattr("sys.argv", ["cprl", "keep", str(run), str(tmp_path / "kept")])
+    monkeypatch.setattr("sys.argv", ["cprl", "export", str(run), str(tmp_path / "kept")])
     cli.main()
     monkeypatch.setattr("sys.argv", ["cprl", "report", str(tmp_path / "kept"), "--out", str(tmp_path / "r")])
     cli.main()
@@ -112,7 +112,7 @@ def views_of(path):
 def test_a_stored_policy_plays_again_and_every_step_is_recorded(run, tmp_path, capsys, monkeypatch):
     from cprl import cli
 
-    path, played = replay(run, tmp_path / "a.rrd", replica=1, episode=3)
+    path, played = film(run, tmp_path / "a.rrd", replica=1, episode=3)
     steps, boards = column(path, "/world/board", "SegmentationImage:buffer", "step")
     assert steps == list(range(1, played.steps)), "after the last turn the board is a new one already"
     assert len(boards[0][0]) == (24 + 2) * (7 + 2)
@@ -121,17 +121,17 @@ def test_a_stored_policy_plays_again_and_every_step_is_recorded(run, tmp_path, c
     views = ["Apples on the board", "Board", "Events", "Harvest so far, apples", "Recipe"]
     assert sorted(views_of(path))[:5] == views, "no empty plots of a training"
     assert len(views_of(path)) == 6, "and what the agents see"
-    _, again = replay(run, tmp_path / "b.rrd", replica=1, episode=3)
+    _, again = film(run, tmp_path / "b.rrd", replica=1, episode=3)
     assert again.harvest.tolist() == played.harvest.tolist()
     assert again.shots.tolist() == played.shots.tolist()
     with pytest.raises(FileExistsError):
-        replay(run, tmp_path / "a.rrd")
+        film(run, tmp_path / "a.rrd")
     with pytest.raises(ValueError, match="episode is -1"):
-        replay(run, episode=-1)
-    monkeypatch.setattr("sys.argv", ["cprl", "replay", str(run), "--out", str(tmp_path / "c.rrd")])
+        film(run, episode=-1)
+    monkeypatch.setattr("sys.argv", ["cprl", "film", str(run), "--out", str(tmp_path / "c.rrd")])
     cli.main()
     told = capsys.readouterr().out
-    assert f"ViewerCallback: {Path(sys.executable).with_name('rerun')} {tmp_path / 'c.rrd'}" in told
+    assert f"Watch: {Path(sys.executable).with_name('rerun')} {tmp_path / 'c.rrd'}" in told
 
 
 def test_watch_opens_all_recordings_of_a_run_as_one(tmp_path, monkeypatch, capsys):
@@ -156,13 +156,13 @@ def test_reproduce_runs_what_is_missing_and_reports(tmp_path, monkeypatch, capsy
         asked.append(command)
         name = Path(command[1]).stem
         at = Path(command[command.index("--out") + 1])
-        small = {"replicas": 2, "episodes": 5, "evaluation_episodes": 1, "compile": False}
-        if "--go-on" not in command and len(asked) == 1:
+        small = {"replicas": 2, "episodes": 5, "evaluation_episodes": 1, "engine": "eager"}
+        if "--resume" not in command and len(asked) == 1:
             at.mkdir()
             (at / "recipe.json").write_text("{}")  # it was stopped
             return type("Done", (), {"returncode": 0})
         (at / "recipe.json").unlink(missing_ok=True)
-        recipe(name).main(variant="as_run", out=at, **small)
+        cprl.run(replace(recipe(name).experiment(variant="as_run"), **small), at)
         return type("Done", (), {"returncode": 0})
 
     game = presets.game
@@ -183,7 +183,7 @@ def test_reproduce_runs_what_is_missing_and_reports(tmp_path, monkeypatch, capsy
     with pytest.raises(RuntimeError, match=r"single_basic ended with 0 before it was finished; see .*log"):
         reproduce.main(**how)
     report = reproduce.main(**how)
-    assert "--go-on" in asked[1]
+    assert "--resume" in asked[1]
     assert "| single_basic | 1 | 32.47 | " in report.read_text()
     reproduce.main(**how)
     assert len(asked) == 2, "what is finished is not run again"
@@ -229,7 +229,7 @@ def test_measures_of_training_know_rich_and_poor():
 
 def test_every_published_experiment_is_reproduced():
     named = {arguments[0] for arguments in recipe("reproduce").EXPERIMENTS.values()}
-    assert {experiment(name).number for name in named} == {1, 2, 3, 4, 5}
+    assert {published_experiment(name).number for name in named} == {1, 2, 3, 4, 5}
 
 
 def test_agents_at_play_are_measured_replica_by_replica():
@@ -267,12 +267,13 @@ def test_turning_points_are_those_of_the_mean_of_replicas(tmp_path):
     result = Result(
         path=tmp_path / "five",
         recipe={},
-        told={},
+        experiment=None,
+        report={},
         curves={
             "collective_return": np.stack([returns, returns]),
             "survival_steps": np.stack([survival, survival]),
         },
-        study=experiment("commons"),
+        study=published_experiment("commons"),
     )
     published, ours = turning_points_of([result])[-3:-1]
     assert published == "| published curves | 572 | 364 | 339 | 1395 | 564 | 612 |  |"

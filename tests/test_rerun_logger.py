@@ -12,10 +12,10 @@ from rerun.chunk import RrdReader
 from tensordict import TensorDict
 
 from cprl import CommonsEnv, Game, Observation, Rules, maps
+from cprl.algorithms import DQN
 from cprl.commons.colours import APPLE, BEAM, COLOURS, FIRST_AGENT, GROUND, OTHER, SELF, WALL
-from cprl.commons.seeing import UNSEEN, classes_seen
+from cprl.commons.decoding import UNSEEN, classes_seen
 from cprl.learners.settings import DQNSettings
-from cprl.learners.single import DQNLearner
 from cprl.policies.single import RandomActor
 from cprl.training import train
 from cprl.viewer.callback import ViewerCallback
@@ -189,7 +189,7 @@ def test_torchrls_logger_interface_is_there(tmp_path):
 def test_a_recording_is_never_written_over(tmp_path):
     RerunLogger("run", tmp_path).shutdown()
     before = (tmp_path / "run.rrd").read_bytes()
-    with pytest.raises(FileExistsError, match="exists and is kept"):
+    with pytest.raises(FileExistsError, match="exists and is not overwritten"):
         RerunLogger("run", tmp_path)
     assert (tmp_path / "run.rrd").read_bytes() == before
 
@@ -203,7 +203,7 @@ def test_a_full_buffer_says_so():
     buffer = FrameBuffer(1, board=(3, 5), sites=len(GAME.map.sites), windows=(2, 3, 3, 5))
     _, (frame,) = frames(1)
     buffer.add(0, 0, frame)
-    with pytest.raises(ValueError, match="holds 1 frames"):
+    with pytest.raises(ValueError, match="already has 1 frames"):
         buffer.add(1, 0, frame)
     assert buffer.take()["step"].tolist() == [0]
     assert buffer.size == 0
@@ -279,7 +279,7 @@ def test_a_stream_that_fails_is_dropped_with_one_warning_and_the_other_goes_on(t
     with RerunLogger("run", tmp_path, scene=SCENE, live="serve") as logger:
         live = next(stream for stream in logger._streams if stream.name == "live view")
         live.recording = Broken()
-        with pytest.warns(RuntimeWarning, match="live view is dropped.*no space left") as caught:
+        with pytest.warns(RuntimeWarning, match="live view failed.*no space left") as caught:
             logger.log_frames(frames(3)[0])
         assert len(caught) == 1
         with warnings.catch_warnings():
@@ -294,13 +294,15 @@ def trained(run, *, watched):
     """The weights after a short training, and what torch's generator stands at."""
     torch.manual_seed(1)
     settings = DQNSettings(buffer_size=200, learning_rate=1e-3)
-    learner = DQNLearner(GAME.observation_shape, 8, settings=settings, seed=1)
+    algorithm = DQN(settings=settings)
+    learner = algorithm.make_learner(GAME.spaces, agents=(0,), replicas=1, seed=1, engine="torchrl")
     env = CommonsEnv(GAME, seed=1)
     callbacks = [ViewerCallback(run, env, title="run", episodes=4)] if watched else []
-    train(env, {0: learner}, others={1: RandomActor(8)}, episodes=4, callbacks=callbacks)
+    train(env, {(0,): learner}, others={1: RandomActor(8)}, episodes=4, callbacks=callbacks)
     for callback in callbacks:
         callback.__exit__(None, None, None)
-    return torch.cat([weight.flatten() for weight in learner.network.parameters()]), torch.get_rng_state()
+    (network,) = learner.networks().values()
+    return torch.cat([weight.flatten() for weight in network.parameters()]), torch.get_rng_state()
 
 
 def test_a_watched_training_records_every_turn_and_learns_the_very_same(tmp_path):

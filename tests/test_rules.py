@@ -1,4 +1,4 @@
-"""Every field of Rules is checked on construction."""
+"""Rules and presets: every field is checked, and quirks, windows and learners match the study."""
 
 from dataclasses import fields, replace
 
@@ -34,7 +34,7 @@ WRONG = {
 }
 
 
-def test_every_field_has_a_check_and_a_wrong_value_here():
+def test_every_field_has_a_check_and_wrong_values_in_this_file():
     names = [field.name for field in fields(Rules)]
     assert sorted(_CHECKS) == sorted(names) == sorted(WRONG)
 
@@ -52,7 +52,7 @@ def test_lists_and_arrays_become_tuples_so_that_rules_compare_and_hash():
     assert hash(given) == hash(same)
 
 
-def test_replace_checks_again():
+def test_replace_checks_the_new_values():
     with pytest.raises(ValueError, match="window_columns is 4"):
         replace(Rules(), window_columns=4)
 
@@ -84,17 +84,17 @@ def test_without_a_beam_there_are_seven_actions_and_six_is_stay():
 
 
 @pytest.mark.parametrize(("board", "variant"), [("pond", "published"), ("commons", "as_writen")])
-def test_an_unknown_preset_says_what_there_is(board, variant):
+def test_an_unknown_preset_is_refused_with_what_is_allowed(board, variant):
     with pytest.raises(ValueError, match="allowed: "):
         presets.game(board, variant=variant)
     with pytest.raises(ValueError, match="allowed: "):
-        presets.learner(board, variant=variant)
+        presets.dqn_settings(board, variant=variant)
 
 
 def test_learners_differ_between_boards_and_variants_only_where_the_study_says():
-    assert presets.learner("commons").epsilon_decay_steps == 1_000_000
-    assert presets.learner("two_complex").epsilon_decay_steps == 500_000
-    as_run = presets.learner("single_basic", variant="as_run")
+    assert presets.dqn_settings("commons").epsilon_decay_steps == 1_000_000
+    assert presets.dqn_settings("two_complex").epsilon_decay_steps == 500_000
+    as_run = presets.dqn_settings("single_basic", variant="as_run")
     assert as_run.relu_on_outputs
     assert as_run.glorot_uniform
     assert as_run.own_target_weights
@@ -108,11 +108,11 @@ def test_learners_differ_between_boards_and_variants_only_where_the_study_says()
         mean_over_all_outputs=False,
         adam_eps=1e-8,
     )
-    assert written == presets.learner("single_basic")
+    assert written == presets.dqn_settings("single_basic")
 
 
-def test_epsilon_holds_then_falls_in_a_line_then_holds():
-    settings = presets.learner("single_basic")
+def test_epsilon_is_constant_then_falls_linearly_then_is_constant():
+    settings = presets.dqn_settings("single_basic")
     assert [settings.epsilon(step) for step in (0, 800)] == [1.0, 1.0]
     assert settings.epsilon(800 + 250_000) == pytest.approx(0.55)
     assert [settings.epsilon(step) for step in (500_800, 10**7)] == pytest.approx([0.1, 0.1])

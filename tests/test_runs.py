@@ -1,61 +1,106 @@
 """A run's directory: never written over, gone on with only by the same recipe."""
 
+import shlex
 import sys
+from dataclasses import replace
 
 import pytest
 
 from cprl import presets
+from cprl.algorithms import DQN
+from cprl.custom import Custom
+from cprl.experiment import Experiment
+from cprl.population import Frozen, Learning
 from cprl.runs.directory import read_recipe, resume_command, start_run
 
-RECIPE = {"replicas": 2, "seed": 1, "learner": presets.learner("commons")}
+AGENT = Learning(DQN(settings=presets.dqn_settings("commons")))
+EXPERIMENT = Experiment(
+    name="commons",
+    game=presets.game("commons"),
+    agents=[AGENT] * 3 + [Frozen("runs/earlier", 0)],
+    episodes=3,
+    replicas=2,
+    seed=1,
+)
 
 
-def test_a_stopped_run_is_gone_on_with_by_the_same_recipe(tmp_path):
-    run = start_run(tmp_path / "run", "commons", RECIPE)
+def begin(run, experiment=EXPERIMENT, **how):
+    return start_run(run, experiment.name, experiment.to_recipe, **how)
+
+
+def test_a_stopped_run_is_resumed_by_the_same_recipe(tmp_path):
+    run = begin(tmp_path / "run")
     written = (run / "recipe.json").read_text()
     (run / "episodes.arrows").touch()
-    assert start_run(run, "commons", RECIPE, resume=True) == run
+    assert begin(run, resume=True) == run
     assert (run / "recipe.json").read_text() == written
     with pytest.raises(FileExistsError, match="is not empty"):
-        start_run(run, "commons", RECIPE)
+        begin(run)
+
+
+def test_the_recipe_of_a_run_is_its_experiment(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    run = begin(None, command=["recipes/commons.py", "--episodes", "3"])
+    recipe = read_recipe(run)
+    assert recipe["command"] == "recipes/commons.py --episodes 3"
+    assert recipe["experiment"]["agents"][3]["run"] == "../earlier"
+    assert Experiment.from_recipe(recipe, directory=run) == EXPERIMENT
+    assert read_recipe(run / "recipe.json") == recipe
 
 
 @pytest.mark.parametrize(
-    ("name", "change", "message"),
+    ("change", "message"),
     [
-        ("commons", {"seed": 2}, "was begun with other arguments: seed 1 then, 2 now"),
-        ("commons", {"device": "cpu"}, "device None then, cpu now"),
-        ("two_complex", {}, "is a run of 'commons'; this is 'two_complex'"),
+        ({"seed": 2}, r"was started with another recipe: experiment\.seed was 1, is 2$"),
+        ({"name": "two_complex"}, "is a run of 'commons'; this is 'two_complex'"),
+        (
+            {"game": presets.game("commons", variant="as_run")},
+            r"experiment\.game\.rules\.hits_to_tag was 1, is 2; .*; and 4 more$",
+        ),
     ],
 )
-def test_another_recipe_is_refused(name, change, message, tmp_path):
-    run = start_run(tmp_path / "run", "commons", RECIPE)
+def test_another_recipe_is_refused_by_what_differs(change, message, tmp_path):
+    run = begin(tmp_path / "run")
     with pytest.raises(ValueError, match=message):
-        start_run(run, name, {**RECIPE, **change}, resume=True)
+        begin(run, replace(EXPERIMENT, **change), resume=True)
 
 
-def test_where_nothing_can_be_gone_on_with_that_is_said(tmp_path):
-    with pytest.raises(ValueError, match="go_on wants the directory of the run as out"):
-        start_run(None, "commons", RECIPE, resume=True)
-    with pytest.raises(ValueError, match=r"recipe\.json is no recipe of a run: FileNotFoundError"):
-        start_run(tmp_path / "nothing", "commons", RECIPE, resume=True)
-    for text in ("{", "[]", '{"arguments": 3}'):
+def test_a_run_of_an_older_cprl_is_not_resumed(tmp_path):
+    (tmp_path / "recipe.json").write_text('{"recipe": "commons", "arguments": {}}')
+    with pytest.raises(ValueError, match="was started by an older cprl, whose trainings this version cannot"):
+        begin(tmp_path, resume=True)
+
+
+def test_where_nothing_can_be_resumed_that_is_said(tmp_path):
+    with pytest.raises(ValueError, match="resume requires the directory of the run as out"):
+        begin(None, resume=True)
+    with pytest.raises(ValueError, match=r"recipe\.json is not the recipe of a run: FileNotFoundError"):
+        begin(tmp_path / "nothing", resume=True)
+    for text in ("{", "[]", '{"arguments": 3}', '{"experiment": []}'):
         (tmp_path / "recipe.json").write_text(text)
-        with pytest.raises(ValueError, match=r"recipe\.json is no recipe of a run: "):
+        with pytest.raises(ValueError, match=r"recipe\.json is not the recipe of a run: "):
             read_recipe(tmp_path)
 
 
 @pytest.mark.parametrize(
     ("given", "line"),
     [
-        ([], ""),
-        (["--seed", "3"], " --seed 3"),
-        (["--out", "elsewhere", "--seed", "3"], " --seed 3"),
-        (["--seed", "3", "--out=elsewhere", "--go-on"], " --seed 3"),
+        ("", ""),
+        ("--seed 3", " --seed 3"),
+        ("--out elsewhere --seed 3", " --seed 3"),
+        ("--seed 3 --out=elsewhere --resume", " --seed 3"),
+        ("--go-on --seed 3 --go_on", " --seed 3"),
+        ("--watch 'connect rerun+http://there'", " --watch 'connect rerun+http://there'"),
     ],
 )
-def test_the_line_that_goes_on_is_the_one_that_began_with_the_runs_directory(
-    given, line, monkeypatch, tmp_path
-):
-    monkeypatch.setattr(sys, "argv", ["recipes/commons.py", *given])
-    assert resume_command(tmp_path) == f"{sys.executable} recipes/commons.py{line} --out {tmp_path} --go-on"
+def test_the_line_that_resumes_is_the_one_that_began_with_the_runs_directory(given, line, tmp_path):
+    command = ["recipes/commons.py", *shlex.split(given)]
+    resumes = resume_command(tmp_path, command)
+    assert resumes == f"{sys.executable} recipes/commons.py{line} --out {tmp_path} --resume"
+
+
+def test_a_run_that_python_began_is_resumed_by_the_command_cprl(tmp_path):
+    experiment = replace(EXPERIMENT, callbacks=(Custom("my:Callback"), Custom("my:Other")))
+    run = begin(tmp_path / "run", experiment)
+    assert resume_command(run) == f"cprl run {run} --resume --allow my:Callback --allow my:Other"
+    assert resume_command(tmp_path) == f"cprl run {tmp_path} --resume"

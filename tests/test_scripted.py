@@ -1,4 +1,4 @@
-"""Scripted agents: each does what its sentence says, on what its window shows and on nothing else."""
+"""Scripted policies: each behaves as documented, given its window alone."""
 
 from dataclasses import replace
 
@@ -31,7 +31,7 @@ class Stays(TensorDictModuleBase):
 
 
 class Scene(Play):
-    """A drawn board on which agent 0 is of a policy and all others stay; through CommonsEnv."""
+    """A drawn board on which agent 0 follows a policy and all others stay; played through CommonsEnv."""
 
     def __init__(self, drawing, policy, *, worlds=1, seed=0, spare=3, **rules):
         self.game = Game(map=maps.parse(drawing), rules=Rules(**{"regrow_prob": (0.0,), **rules}))
@@ -43,7 +43,7 @@ class Scene(Play):
         self.batch, self.bitten = self.env.worlds, 0.0
 
     def go(self, turns):
-        """The names of what agent 0 of the first world did; a world that has ended stays as it is."""
+        """The names of the actions of agent 0 in the first world; a world that has ended does not change."""
         names, moment = [], self.env.reset()
         for _ in range(turns):
             batch = self.env.step(self.policy(moment))
@@ -53,20 +53,20 @@ class Scene(Play):
         return names
 
 
-def test_greedy_goes_the_shortest_way_around_walls_to_the_nearest_apple():
+def test_greedy_takes_the_shortest_path_around_walls_to_the_nearest_apple():
     scene = Scene("..A.\nA##.\n..^A", "greedy", may_fire=False)
     assert scene.go(4) == ["right", "forward", "forward", "left"]
     assert (scene.board, scene.bitten) == (drawn("..^.\nA##.\n...."), 2)
 
 
-def test_an_apple_behind_a_closed_wall_is_none_in_reach():
+def test_greedy_wanders_if_a_wall_closes_off_the_only_apple():
     scene = Scene("..#A\n.^#.", "greedy", worlds=64, may_fire=False)
     scene.go(1)
     first = scene.env.worlds.now.row[:, 0]
-    assert 0.75 < (first == 0).mean() < 1, "they wander: most go ahead, some turn"
+    assert 0.75 < (first == 0).mean() < 1, "they wander: most walk forward, some turn"
 
 
-def test_greedy_finds_an_apple_that_it_did_not_see():
+def test_greedy_finds_an_apple_outside_its_first_window():
     scene = Scene(".......\n<.....A\n.......", "greedy", worlds=20, may_fire=False, window_columns=5)
     scene.go(150)
     assert scene.bitten == 20
@@ -84,13 +84,13 @@ CROSS = """
 @pytest.mark.parametrize(
     ("policy", "spare", "left"), [("sustainable", 3, 3), ("sustainable", 1, 1), ("greedy", 3, 0)]
 )
-def test_sustainable_leaves_as_many_apples_of_a_patch_as_it_is_told(policy, spare, left):
+def test_sustainable_leaves_spare_apples_of_a_patch(policy, spare, left):
     scene = Scene(CROSS, policy, worlds=8, spare=spare, may_fire=False)
     scene.go(200)
     assert scene.env.output.stock[:, 0].tolist() == [left] * 8
 
 
-def test_sustainable_walks_over_no_apple_that_it_spares():
+def test_sustainable_does_not_walk_over_an_apple_that_it_spares():
     scene = Scene(">.A..", "sustainable", worlds=8, may_fire=False)
     scene.go(100)
     assert scene.bitten == 0
@@ -116,20 +116,20 @@ def test_sustainable_walks_over_no_apple_that_it_spares():
         (".>...\n.....\n...<A", "territorial", False),
     ],
 )
-def test_who_fires_at_whom(drawing, policy, fires):
+def test_which_policies_fire_at_which_agents(drawing, policy, fires):
     scene = Scene(drawing, policy, window_rows=8, window_columns=9)
     assert (scene.go(1) == ["beam"]) == fires
     assert scene.in_play[1] != fires, "and the beam hits"
 
 
-def test_aggressive_turns_to_one_at_its_side_goes_up_to_it_and_fires():
+def test_aggressive_turns_to_an_agent_at_its_side_walks_towards_it_and_fires():
     scene = Scene(".A......\n^......<", "aggressive", window_rows=8, window_columns=17)
     assert scene.go(4) == ["turn_right", "forward", "forward", "beam"]
     assert scene.in_play == [True, False]
     assert scene.board == drawn(".A......\n..>.....")
 
 
-def test_aggressive_harvests_where_it_sees_nobody():
+def test_aggressive_harvests_if_it_sees_no_agent():
     scene = Scene(".>.A.\n<....", "aggressive", window_columns=1)
     assert scene.go(2) == ["forward", "forward"]
     assert scene.bitten == 1
@@ -138,25 +138,25 @@ def test_aggressive_harvests_where_it_sees_nobody():
 @pytest.mark.parametrize("policy", ["greedy", "territorial", "aggressive", "pacifist"])
 def test_cells_out_of_sight_are_neither_ground_nor_agents(policy):
     scene = Scene("..#A\n.>#.\n...A", policy, walls_block_sight=True, window_columns=3)
-    assert scene.go(1)[0].startswith("turn_"), "the wall ahead hides what lies behind it"
+    assert scene.go(1)[0].startswith("turn_"), "the wall ahead hides the cells behind it"
 
 
 @pytest.mark.parametrize(("policy", "goes"), [("greedy", 1.0), ("pacifist", 0.0)])
-def test_pacifist_leaves_an_apple_to_which_another_is_nearer(policy, goes):
+def test_pacifist_leaves_an_apple_that_another_agent_is_nearer_to(policy, goes):
     scene = Scene("^..A.<\n......", policy, worlds=64)
     steps = scene.env.rollout(1, scene.policy)
     went = (steps["agents", "action"][:, 0, 0] == ACTIONS.index("right")).double().mean()
     assert went == goes
 
 
-def test_two_who_want_one_cell_wait_for_each_other_until_one_gets_it():
+def test_two_agents_that_want_one_cell_wait_at_random_until_one_gets_it():
     game = Game(map=maps.parse(">A<\n#.#"), rules=Rules(regrow_prob=(0.0,)))
     seeds = [(0, lane) for lane in range(20)]
     actor = ScriptedActor("greedy", game, seeds=seeds, agents=2)
-    ends = evaluate(CommonsEnv(game, 10), AgentPolicies({(0, 1): actor}))
+    ends = evaluate(CommonsEnv(game, 10, seed=0), AgentPolicies({(0, 1): actor}))
     harvest = np.array([episode.harvest for episode in ends])
     assert harvest.sum(1).tolist() == [1] * 10
-    assert 0 < harvest[:, 0].sum() < 10, "not always the same one"
+    assert 0 < harvest[:, 0].sum() < 10, "not always the same agent"
     assert max(episode.steps for episode in ends) > 1
 
 
@@ -170,13 +170,13 @@ def mean(episodes, name):
     return float(np.mean([np.sum(getattr(episode, name)) for episode in episodes]))
 
 
-def test_greedy_harvests_far_more_than_random_where_it_is_alone():
+def test_a_single_greedy_agent_harvests_far_more_than_a_random_one():
     game = presets.game("single_basic")
     returns = {policy: mean(population(policy, game, 8), "return_") for policy in ("random", "greedy")}
     assert returns["greedy"] > 1.5 * returns["random"], returns
 
 
-def test_on_commons_the_greedy_drain_what_the_sustainable_live_on():
+def test_on_commons_greedy_agents_deplete_the_stock_and_sustainable_agents_do_not():
     played = {name: population(name, presets.game("commons"), 3) for name in ("greedy", "sustainable")}
     assert [episode.stock_left for episode in played["greedy"]] == [0, 0, 0]
     assert max(episode.steps for episode in played["greedy"]) < 400
@@ -185,7 +185,7 @@ def test_on_commons_the_greedy_drain_what_the_sustainable_live_on():
     assert mean(played["sustainable"], "return_") > 3 * mean(played["greedy"], "return_")
 
 
-def test_the_aggressive_tag_the_territorial_less_and_the_pacifist_never_fire():
+def test_aggressive_agents_tag_more_than_territorial_ones_and_pacifists_never_fire():
     rules = replace(presets.game("commons").rules, episode_steps=200)
     game = replace(presets.game("commons"), rules=rules)
     played = {name: population(name, game, 4) for name in ("aggressive", "territorial", "pacifist")}
@@ -204,14 +204,16 @@ FORMS = [
 
 @pytest.mark.parametrize("may_fire", [True, False])
 @pytest.mark.parametrize("policy", SCRIPTED_POLICIES)
-def test_the_form_of_what_is_seen_makes_no_difference(policy, may_fire):
+def test_actions_do_not_depend_on_the_form_of_the_observation(policy, may_fire):
     walled = maps.parse("A.A.#.A\n.>A.#AA\nA..v.A.\n..#A.<.")
     rules = Rules(walls_block_sight=True, may_fire=may_fire, window_rows=4, window_columns=7)
     courses = []
     for form in FORMS:
         game = Game(map=walled, rules=rules, observation=form)
         actor = ScriptedActor(policy, game, seeds=[(1, lane) for lane in range(9)], agents=3)
-        steps = CommonsEnv(game, 3).rollout(40, AgentPolicies({(0, 1, 2): actor}), break_when_any_done=False)
+        steps = CommonsEnv(game, 3, seed=0).rollout(
+            40, AgentPolicies({(0, 1, 2): actor}), break_when_any_done=False
+        )
         courses.append(steps["agents", "action"])
     assert courses[0].max() < len(game.actions)
     assert courses[0].unique().numel() > 3
@@ -220,14 +222,16 @@ def test_the_form_of_what_is_seen_makes_no_difference(policy, may_fire):
 
 
 def windows(game, worlds, turns=15):
-    """What is seen in so many worlds after some turns of random play, [worlds, N, C, X, Y]."""
-    return CommonsEnv(game, worlds).rollout(turns)["next", "agents", "observation"][:, -1].contiguous()
+    """The observations of B worlds after some turns of random play, [B, N, C, X, Y]."""
+    return (
+        CommonsEnv(game, worlds, seed=0).rollout(turns)["next", "agents", "observation"][:, -1].contiguous()
+    )
 
 
 @pytest.mark.parametrize("policy", SCRIPTED_POLICIES)
-def test_a_lanes_choices_do_not_depend_on_other_lanes(policy):
+def test_the_actions_of_a_lane_do_not_depend_on_other_lanes(policy):
     game = presets.game("commons")
-    seen = windows(game, 6)  # 2 replicas x 3 worlds, of which seats 1 and 3
+    seen = windows(game, 6)  # 2 replicas x 3 worlds, of which agents 1 and 3
     seeds = [(5, replica, agent) for replica in range(2) for agent in (1, 3)]
     everyone = ScriptedActor(policy, game, seeds=seeds, agents=2, worlds=3)
     everyone.epsilon = 0.3
@@ -242,10 +246,10 @@ def test_a_lanes_choices_do_not_depend_on_other_lanes(policy):
             assert torch.equal(chosen[own, agent], expected[:, 0])
 
 
-def test_epsilon_is_the_chance_of_a_random_action_where_actors_explore():
+def test_epsilon_is_the_probability_of_a_random_action_while_exploring():
     game = Game(map=maps.parse("A..\n...\n^.."), rules=Rules())
     actor = ScriptedActor("greedy", game, seeds=[(lane,) for lane in range(4000)], agents=1)
-    seen = CommonsEnv(game, 4000).reset()["agents", "observation"]
+    seen = CommonsEnv(game, 4000, seed=0).reset()["agents", "observation"]
     actor.epsilon = 0.4
     counts = torch.bincount(actor.choose(seen)[:, 0], minlength=8)
     assert abs(int(counts[1:].sum()) - 4000 * 0.4 * 7 / 8) < 5 * (4000 * 0.35 * 0.65) ** 0.5
@@ -254,7 +258,7 @@ def test_epsilon_is_the_chance_of_a_random_action_where_actors_explore():
         assert torch.bincount(actor.choose(seen)[:, 0], minlength=8).tolist() == [4000, *[0] * 7]
 
 
-def test_it_goes_on_from_its_state():
+def test_an_actor_continues_from_the_state_of_another():
     game = presets.game("two_complex")
     seen = windows(game, 2)
 
@@ -273,20 +277,20 @@ def test_it_goes_on_from_its_state():
     ("policy", "how", "message"),
     [
         ("grim", {}, "policy is 'grim'; allowed: random, greedy"),
-        ("greedy", {"area": "full"}, "Observation.area is 'full'; .* area=\"window\" is what fits"),
-        ("greedy", {"agents": 2}, "3 seeds for 2 agents; a seed for each lane is wanted"),
-        ("greedy", {"worlds": 0}, "worlds is 0; at least 1"),
-        ("sustainable", {"spare": 0}, "spare is 0; at least 1"),
+        ("greedy", {"area": "full"}, "Observation.area is 'full'; allowed with scripted policies: 'window'"),
+        ("greedy", {"agents": 2}, "there are 3 seeds for 2 agents; allowed: one seed per lane"),
+        ("greedy", {"worlds": 0}, "worlds is 0; allowed: an integer >= 1"),
+        ("sustainable", {"spare": 0}, "spare is 0; allowed: an integer >= 1"),
     ],
 )
-def test_what_cannot_be_is_refused_before_anything_is_played(policy, how, message):
+def test_arguments_that_are_not_allowed_are_refused(policy, how, message):
     how = {"agents": 1, "area": "window", **how}
     game = replace(presets.game("commons"), observation=Observation(area=how.pop("area")))
     with pytest.raises(ValueError, match=message):
         ScriptedActor(policy, game, seeds=[(lane,) for lane in range(3)], **how)
 
 
-def test_windows_of_another_game_are_refused():
+def test_observations_of_another_game_are_refused():
     actor = ScriptedActor("greedy", presets.game("commons"), seeds=[(0,)], agents=1)
-    with pytest.raises(ValueError, match=r"is \[1, 1, 3, 6, 13\]; \[1, 1, 3, 7, 15\] is wanted"):
+    with pytest.raises(ValueError, match=r"is \[1, 1, 3, 6, 13\]; expected: \[1, 1, 3, 7, 15\]"):
         actor.choose(windows(presets.game("single_basic"), 1))

@@ -65,18 +65,15 @@ def test_a_yield_share_of_nothing_is_undefined():
     assert social.yield_share(HARVEST, sustainable_yield=0, first_stock=0).isnan()
 
 
-def test_without_a_harvest_equality_and_sustainability_are_undefined_and_counted():
+def test_without_a_harvest_equality_and_sustainability_are_undefined():
     harvest = torch.stack([HARVEST, EMPTY])
     assert social.equality(harvest).isnan().tolist() == [False, True]
     assert social.sustainability(harvest).isnan().tolist() == [False, True]
-    assert social.equality_undefined(harvest).tolist() == [False, True]
-    assert social.agents_without_harvest(harvest).tolist() == [0, 2]
 
 
 def test_an_agent_without_a_harvest_is_left_out_of_sustainability():
     harvest = HARVEST * torch.tensor([1, 0])
     assert social.sustainability(harvest).item() == pytest.approx(7 / 3)
-    assert social.agents_without_harvest(harvest).item() == 1
 
 
 def test_an_episode_without_steps_has_no_value_per_step():
@@ -122,7 +119,7 @@ def test_metrics_stay_in_their_ranges(episode):
     assert 0 <= metrics["peace"] <= agents
     assert 0 <= metrics["peacefulness"] <= steps
     assert metrics["efficiency"] * steps == pytest.approx(harvest.sum().item())
-    if social.equality_undefined(harvest):
+    if harvest.sum() == 0:
         assert math.isnan(metrics["equality"])
     else:
         assert 1 / agents - 1e-12 <= metrics["equality"] <= 1

@@ -1,4 +1,4 @@
-"""The state of a batch is read and set as plain arrays; a bad one is refused."""
+"""The state of a batch is read and set as plain arrays; an impossible state is refused."""
 
 import numpy as np
 import pytest
@@ -16,34 +16,34 @@ GAME = Game(
 )
 
 
-def some_way_on(game, worlds=3, steps=40, **how):
+def played_batch(game, worlds=3, steps=40, **how):
     batch = Batch(game, worlds, **how)
-    told = batch.begin(batch.new_output())
+    output = batch.begin(batch.new_output())
     for turn in random_actions(steps, worlds, game):
-        batch.play(turn, told)
-    return batch, told
+        batch.play(turn, output)
+    return batch, output
 
 
 @pytest.mark.parametrize("variant", presets.VARIANTS)
 @pytest.mark.parametrize("board", presets.BOARDS)
-def test_a_batch_that_loads_a_state_goes_on_as_the_one_it_was_read_from(board, variant):
+def test_a_batch_that_loads_a_state_continues_like_the_original(board, variant):
     game = presets.game(board, variant=variant)
     game = Game(map=game.map, rules=game.rules, observation=Observation(scoreboard=True))
-    batch, told = some_way_on(game, seed=5)
+    batch, output = played_batch(game, seed=5)
     other = Batch(game, 3, seed=77, first_world=9)
     shown = other.load(batch.state(), other.new_output())
     assert_same(other.now, batch.now)
     for name in ("observation", "in_play", "scoreboard", "stock", "terminated", "truncated", "done"):
-        assert np.array_equal(getattr(shown, name), getattr(told, name)), name
+        assert np.array_equal(getattr(shown, name), getattr(output, name)), name
     assert not shown.harvest.any()
     for turn in random_actions(60, 3, game, seed=2):
-        assert_same(batch.play(turn, told), other.play(turn, shown))
+        assert_same(batch.play(turn, output), other.play(turn, shown))
     assert_same(other.now, batch.now)
-    assert_same(batch.begin(told), other.begin(shown))
+    assert_same(batch.begin(output), other.begin(shown))
 
 
 def test_a_state_is_a_copy_of_plain_arrays():
-    batch, _ = some_way_on(GAME)
+    batch, _ = played_batch(GAME)
     state = batch.state()
     assert sorted(state) == sorted(NAMES)
     assert all(type(array) is np.ndarray for array in state.values())
@@ -53,7 +53,7 @@ def test_a_state_is_a_copy_of_plain_arrays():
     assert_same(batch.now, before)
 
 
-def test_an_environment_loads_a_state_and_shows_the_moment():
+def test_an_environment_loads_a_state_and_returns_its_observation():
     env, other = CommonsEnv(GAME, 2, seed=1), CommonsEnv(GAME, 2, seed=8)
     moment = env.rollout(5, break_when_any_done=False)[:, -1]["next"]
     shown = other.load(env.worlds.state())
@@ -67,7 +67,7 @@ def test_an_environment_loads_a_state_and_shows_the_moment():
     assert (after[0] == after[1]).all()
 
 
-def test_planning_ahead_and_back_changes_nothing():
+def test_loading_the_state_from_before_a_rollout_undoes_the_rollout():
     env = CommonsEnv(GAME, 1, seed=3)
     moment = env.reset()
     kept = env.worlds.state()
@@ -86,62 +86,62 @@ def test_planning_ahead_and_back_changes_nothing():
         ({"heading": 4}, r"state\['heading'\]\[0, 0\] is 4; allowed: 0 to 3"),
         ({"stock": 2}, r"state\['stock'\]\[0, 0\] is 2; allowed: 0 to 1"),
         ({"out_steps": -1}, r"state\['out_steps'\]\[0, 0\] is -1; allowed: 0 to"),
-        ({"out_steps": 2}, r"state\['in_play'\]\[0, 0\] is True; allowed: False while there are turns"),
+        ({"out_steps": 2}, r"state\['in_play'\]\[0, 0\] is True; allowed: False while out_steps is above 0"),
         ({"hits": 1}, r"state\['hits'\]\[0, 0\] is 1; allowed: 0 to 0"),
         ({"step": 51}, r"state\['step'\]\[0, 0\] is 51; allowed: 0 to 50"),
         ({"ended": 3}, r"state\['ended'\]\[0, 0\] is 3; allowed: 0 to 2"),
-        ({"row": 1, "col": 1}, r"state\['row'\]\[0, 0\] is 1 \(column 1\); allowed: no cell of a wall"),
-        ({"row": 2, "col": 2}, r"state\['row'\]\[0, 0\] is 2 .*; allowed: no cell with another agent"),
+        ({"row": 1, "col": 1}, r"state\['row'\]\[0, 0\] is 1 \(column 1\); allowed: a cell without a wall"),
+        ({"row": 2, "col": 2}, r"state\['row'\]\[0, 0\] is 2 .*; allowed: a cell without another agent"),
     ],
 )
-def test_a_state_that_cannot_be_is_refused_and_changes_nothing(change, message):
+def test_an_impossible_state_is_refused_and_changes_nothing(change, message):
     batch = Batch(GAME, 2)
-    told = batch.begin(batch.new_output())
+    output = batch.begin(batch.new_output())
     state, before = batch.state(), copied(batch.now)
     for name, value in change.items():
         state[name][0, 0] = value
     with pytest.raises(ValueError, match=message):
-        batch.load(state, told)
+        batch.load(state, output)
     assert_same(batch.now, before)
 
 
-def test_other_names_shapes_and_types_are_refused():
+def test_a_state_with_other_names_shapes_or_dtypes_is_refused():
     batch = Batch(GAME, 2)
-    told, state = batch.begin(batch.new_output()), batch.state()
-    with pytest.raises(ValueError, match=r"lacks \['row'\] and has the unknown \['line'\]"):
-        batch.load({"line" if name == "row" else name: array for name, array in state.items()}, told)
-    with pytest.raises(ValueError, match=r"state\['row'\] is int64 \(2, 2\); wanted: int32 \(2, 2\)"):
-        batch.load({**state, "row": state["row"].astype(np.int64)}, told)
-    with pytest.raises(ValueError, match=r"is uint64 \(2, 1\); wanted: uint64 \(3, 1\)"):
-        Batch(GAME, 3).load(state, told)
+    output, state = batch.begin(batch.new_output()), batch.state()
+    with pytest.raises(ValueError, match=r"lacks \['row'\] and has the unknown entries \['line'\]"):
+        batch.load({"line" if name == "row" else name: array for name, array in state.items()}, output)
+    with pytest.raises(ValueError, match=r"state\['row'\] is int64 \(2, 2\); expected: int32 \(2, 2\)"):
+        batch.load({**state, "row": state["row"].astype(np.int64)}, output)
+    with pytest.raises(ValueError, match=r"is uint64 \(2, 1\); expected: uint64 \(3, 1\)"):
+        Batch(GAME, 3).load(state, output)
 
 
-def test_two_agents_on_a_cell_are_a_state_as_run():
+def test_as_run_a_state_may_have_two_agents_on_a_cell():
     game = presets.game("two_complex", variant="as_run")
     batch = Batch(game, 1)
-    told, state = batch.begin(batch.new_output()), batch.state()
+    output, state = batch.begin(batch.new_output()), batch.state()
     state["row"][:], state["col"][:] = 3, 3
-    batch.load(state, told)
+    batch.load(state, output)
     assert batch.now.row.tolist() == [[3, 3]]
 
 
 @pytest.mark.parametrize(
-    "told",
+    "spoil",
     [
-        lambda told: told._replace(harvest=told.harvest.astype(np.float64)),
-        lambda told: told._replace(stock=told.stock[:1]),
-        lambda told: told._replace(observation=np.asfortranarray(told.observation)),
+        lambda output: output._replace(harvest=output.harvest.astype(np.float64)),
+        lambda output: output._replace(stock=output.stock[:1]),
+        lambda output: output._replace(observation=np.asfortranarray(output.observation)),
     ],
 )
-def test_arrays_to_tell_into_that_do_not_fit_are_refused(told):
+def test_output_arrays_of_the_wrong_form_are_refused(spoil):
     batch = Batch(GAME, 2)
-    with pytest.raises(ValueError, match=r"told\.\w+ is .*; wanted: .* contiguous and writeable"):
-        batch.begin(told(batch.new_output()))
+    with pytest.raises(ValueError, match=r"output\.\w+ is .*; expected: .* contiguous and writeable"):
+        batch.begin(spoil(batch.new_output()))
 
 
 def test_actions_that_are_not_contiguous_are_refused():
     batch = Batch(GAME, 2)
-    told = batch.begin(batch.new_output())
+    output = batch.begin(batch.new_output())
     with pytest.raises(ValueError, match=r"int64 \(2, 2\) is not contiguous"):
-        batch.play(np.zeros((2, 4), np.int64)[:, ::2], told)
+        batch.play(np.zeros((2, 4), np.int64)[:, ::2], output)
     assert batch.now.step.sum() == 0

@@ -155,7 +155,7 @@ def test_the_model_is_the_game_and_what_is_observed_tells_the_state(known):
 
 
 def learned(game, settings, *, episodes, replicas=2, seed=0):
-    learner = TabularLearner(game, agents=[0], replicas=replicas, settings=settings, seed=seed)
+    learner = TabularLearner(game.spaces, agents=[0], replicas=replicas, settings=settings, seed=seed)
     train(CommonsEnv(game, replicas, seed=seed), {(0,): learner}, episodes=episodes)
     return learner
 
@@ -213,6 +213,12 @@ def test_with_regrowth_it_learns_the_values_too():
         assert shortfall(learner, lane, model, rows) < 0.02
 
 
+def learner_of(game, **how):
+    learner = TabularLearner(game.spaces, **how)
+    learner.game = game
+    return learner
+
+
 def taught(learner, *names):
     """Plays a turn of one world after the other by the names of actions, and has each learned."""
     env = CommonsEnv(learner.game, 1)
@@ -234,14 +240,14 @@ def test_what_comes_after_the_clock_counts_and_nothing_after_the_last_apple():
     settings = TabularSettings(learning_rate=1.0, gamma=0.5)
     rules = {"window_rows": 3, "window_columns": 1, "may_fire": False}
     short = Game(map=maps.parse("A>A"), rules=Rules(episode_steps=1, **rules))
-    learner = TabularLearner(short, agents=[0], replicas=1, settings=settings)
+    learner = learner_of(short, agents=[0], replicas=1, settings=settings)
     taught(learner, "forward")  # Q(start, forward) = 1
     assert taught(learner, "stay")["next", "truncated"].item()
     assert value_at_the_start(learner, "stay") == 0.5
 
     # Who looks at the wall on the right sees the same whether the left apple hangs (X) or not (terminal).
     endless = Game(map=maps.parse("A>A"), rules=Rules(regrow_prob=(0.0,), **rules))
-    learner = TabularLearner(endless, agents=[0], replicas=1, settings=settings)
+    learner = learner_of(endless, agents=[0], replicas=1, settings=settings)
     for expected in (1.0, 1.0, 1.25):  # backward from X is worth 0, then 0.5 x 1, and so X itself
         taught(learner, "forward", "backward", "backward")
         assert value_at_the_start(learner, "forward") == expected
@@ -270,9 +276,9 @@ def test_an_agents_course_does_not_depend_on_other_replicas():
     tables = []
     for first, replicas in ((0, 3), (1, 1)):
         learner = TabularLearner(
-            PAIR, agents=[0, 1], replicas=replicas, settings=settings, first_replica=first
+            PAIR.spaces, agents=[0, 1], replicas=replicas, settings=settings, first_replica=first
         )
-        env = CommonsEnv(PAIR, replicas, first_world=first)
+        env = CommonsEnv(PAIR, replicas, seed=0, first_world=first)
         training = Training(env, {(0, 1): learner}, episodes=100)
         for _ in range(300):
             training.step()
@@ -301,17 +307,17 @@ class Dying:
 def test_a_training_beside_a_scripted_agent_goes_on_from_its_checkpoint(tmp_path, update_every):
     def trained(run, callbacks=()):
         settings = TabularSettings(epsilon_hold_steps=10, epsilon_decay_steps=200)
-        learner = TabularLearner(PAIR, agents=[0], replicas=2, settings=settings)
+        learner = TabularLearner(PAIR.spaces, agents=[0], replicas=2, settings=settings)
         other = ScriptedActor("territorial", PAIR, seeds=[(1, r) for r in range(2)], agents=1)
         run.mkdir(exist_ok=True)
         with Checkpointer(run, every_s=1e-9 if callbacks else 1000.0) as checkpoints:
             train(
-                CommonsEnv(PAIR, 2),
+                CommonsEnv(PAIR, 2, seed=0),
                 {(0,): learner},
                 others={(1,): other},
                 episodes=5,
                 callbacks=callbacks,
-                checkpoints=checkpoints,
+                checkpointer=checkpoints,
                 update_every=update_every,
             )
         return learner
@@ -331,7 +337,7 @@ def test_a_training_beside_a_scripted_agent_goes_on_from_its_checkpoint(tmp_path
 
 
 def test_more_states_than_are_allowed_are_refused():
-    learner = TabularLearner(ONCE, agents=[0], replicas=1, settings=TabularSettings(max_states=3))
+    learner = learner_of(ONCE, agents=[0], replicas=1, settings=TabularSettings(max_states=3))
     with pytest.raises(MemoryError, match="lane 0 has met 3 states, as many as max_states allows"):
         taught(learner, "turn_left", "turn_left", "turn_left", "turn_left", "forward")
     assert len(learner.q_table(0)["values"]) == 3
@@ -350,10 +356,10 @@ def test_tables_grow_and_keep_what_they_hold():
 @pytest.mark.parametrize(
     ("how", "message"),
     [
-        ({"gamma": 1.5}, r"gamma is 1.5; a number in 0..1 is wanted"),
-        ({"learning_rate": "1/n"}, r"learning_rate is '1/n'; a number in 0..1 or '1/visits' is wanted"),
-        ({"max_states": 0}, "max_states is 0; at least 1"),
-        ({"epsilon_decay_steps": 0}, "epsilon_decay_steps is 0; at least 1"),
+        ({"gamma": 1.5}, r"gamma is 1.5; allowed: a number in 0..1"),
+        ({"learning_rate": "1/n"}, r"learning_rate is '1/n'; allowed: a number in 0..1 or '1/visits'"),
+        ({"max_states": 0}, "max_states is 0; allowed: an integer >= 1"),
+        ({"epsilon_decay_steps": 0}, "epsilon_decay_steps is 0; allowed: an integer >= 1"),
     ],
 )
 def test_settings_that_cannot_be_are_refused(how, message):

@@ -12,17 +12,17 @@ from test_population import (
     REPLAY,
     ROLLOUTS,
     assert_goes_on_bit_for_bit,
-    conducted,
     population,
+    ran,
     trained,
     weights,
 )
 
 import cprl
 from cprl import CommonsEnv, Game, Rules, maps, presets
+from cprl.agents import Population
 from cprl.algorithms.dqn import DQN
-from cprl.algorithms.on_policy_teams import IPPO, MAPPO
-from cprl.algorithms.teams import QMIX, VDN
+from cprl.algorithms.teams import IPPO, MAPPO, QMIX, VDN
 from cprl.learners.engine.choice import trial_batch
 from cprl.learners.engine.compiled import FunctionalEngine
 from cprl.learners.replay import ReplayLearner
@@ -30,7 +30,7 @@ from cprl.learners.settings import DQNSettings
 from cprl.measuring.evaluate import evaluate
 from cprl.networks.agent import acting_part
 from cprl.networks.team import Mixing, TeamNetwork
-from cprl.population import Frozen, Learner, Population, Scripted
+from cprl.population import Frozen, Learning, Scripted, Team
 from cprl.training import train
 
 TEAMS = {
@@ -39,12 +39,12 @@ TEAMS = {
     "MAPPO": MAPPO(settings=ROLLOUTS),
     "IPPO": IPPO(settings=ROLLOUTS),
 }
-WAYS = {"VDN": "vmap", "QMIX": "vmap", "MAPPO": "lane axis", "IPPO": "lane axis"}
+WAYS = {"VDN": "vmapped", "QMIX": "vmapped", "MAPPO": "lane_axis", "IPPO": "lane_axis"}
 FOUR = tuple(range(4))
 
 
 def team_of(name, **how):
-    agents = population([Learner(TEAMS[name], reward_kind="group")] * 4, **how)
+    agents = population([Team(TEAMS[name], FOUR)], **how)
     (learner,) = agents.learners.values()
     return agents, learner
 
@@ -75,12 +75,20 @@ def test_each_team_takes_the_way_that_agrees_with_a_list_of_torchrls_losses(name
     algorithm = TEAMS[name]
     _, found = team_of(name)
     common = {"agents": FOUR, "replicas": 2, "settings": algorithm.settings, "seed": 3}
-    common |= {"reward_kind": "group"}
-    common |= {"make_network": lambda: algorithm.network(GAME), "make_loss": algorithm.loss, "compile": False}
-    common |= {"make_team": lambda members: algorithm.team(members, GAME)}
+    common |= {"reward_kind": "team"}
+    common |= {
+        "make_network": lambda: algorithm.make_network(GAME.spaces),
+        "make_loss": algorithm.make_loss,
+        "compile": False,
+    }
+    common |= {"make_team": lambda members: algorithm.make_team(members, GAME.spaces)}
     kind = type(found)
     ends = []
-    for one in (found, kind(GAME, engine=WAYS[name], **common), kind(GAME, engine="list", **common)):
+    for one in (
+        found,
+        kind(GAME.spaces, engine=WAYS[name], **common),
+        kind(GAME.spaces, engine="list", **common),
+    ):
         train(CommonsEnv(GAME, 2, seed=3), {FOUR: one}, episodes=3)
         ends.append([network.state_dict() for network in one.networks().values()])
     for mine, named, by_list in zip(*ends, strict=True):
@@ -91,8 +99,8 @@ def test_each_team_takes_the_way_that_agrees_with_a_list_of_torchrls_losses(name
 
 def test_qmix_over_many_observations_is_not_slowed_by_what_the_trial_rounds():
     game = presets.game("commons")  # 1260 inputs to its mixing
-    members = [Learner(QMIX(settings=DQNSettings(buffer_size=50)), reward_kind="group")] * 4
-    (learner,) = Population(game, members, replicas=2, compile=False).learners.values()
+    team = Team(QMIX(settings=DQNSettings(buffer_size=50)), FOUR)
+    (learner,) = Population(CommonsEnv(game, 2), [team], engine="eager").learners.values()
     assert isinstance(learner.engine, FunctionalEngine)
 
 
@@ -108,7 +116,7 @@ def test_a_member_acts_by_its_own_network_and_what_it_sees_itself():
 
 
 def test_a_member_begins_with_the_weights_that_it_would_have_alone():
-    alone = population([Learner(DQN(settings=REPLAY))] * 4)
+    alone = population([Learning(DQN(settings=REPLAY))] * 4)
     team, _ = team_of("VDN")
     for key, value in weights(alone).items():
         assert torch.equal(weights(team)[key], value)
@@ -148,7 +156,7 @@ def first_turn(replicas=1):
 
 
 def test_a_team_is_paid_for_all_agents_also_those_who_are_not_of_it():
-    agents = population([Scripted(), *[Learner(TEAMS["VDN"], reward_kind="group")] * 2, Scripted()])
+    agents = population([Scripted(), Team(TEAMS["VDN"], (1, 2)), Scripted()])
     ((agents, learner),) = agents.learners.items()
     assert agents == (1, 2)
     learner.store(first_turn(2))
@@ -198,52 +206,59 @@ def test_the_teams_value_grows_with_each_members_value():
 
 @pytest.mark.parametrize("name", ["QMIX", "MAPPO"])
 def test_a_team_that_was_stopped_goes_on_bit_for_bit(name, tmp_path):
-    members = [*[Learner(TEAMS[name], reward_kind="group")] * 3, Learner(DQN(settings=REPLAY))]
+    members = [Team(TEAMS[name], (0, 1, 2)), Learning(DQN(settings=REPLAY))]
     assert_goes_on_bit_for_bit(members, tmp_path, episodes=4)
 
 
-def test_a_teams_run_is_built_again_and_its_members_play_on_frozen(tmp_path, capsys):
-    members = [*[Learner(TEAMS["QMIX"], reward_kind="group")] * 2, *[Learner(TEAMS["IPPO"])] * 2]
-    run, agents = conducted(tmp_path, members)
+def test_a_teams_run_is_built_again_and_its_members_play_on_frozen(tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    members = [Team(TEAMS["QMIX"], (0, 1)), Team(TEAMS["IPPO"], (2, 3), reward="individual")]
+    run, networks = ran(tmp_path, members)
     assert "trained, epsilon 0.05" in " ".join(capsys.readouterr().out.split())
     loaded = cprl.load(run)
-    assert loaded.algorithms == {
-        **dict.fromkeys((0, 1), TEAMS["QMIX"]),
-        **dict.fromkeys((2, 3), TEAMS["IPPO"]),
-    }
-    seen = torch.randint(256, (5, *GAME.observation_shape), dtype=torch.uint8)
-    assert len(agents.networks()) == 8
-    for lane, network in agents.networks().items():
-        assert torch.equal(loaded.networks[lane](seen), network(seen))
-    assert loaded.policy(1)(loaded.env(2).reset())["agents", "action"].shape == (2, 4)
+    assert [spec.algorithm for spec in loaded.specs] == [*[TEAMS["QMIX"]] * 2, *[TEAMS["IPPO"]] * 2]
+    assert len(networks) == 8
+    assert loaded.policy(1, worlds=2)(loaded.env(2).reset())["agents", "action"].shape == (2, 4)
     frozen = population([Frozen(run, 1, replica=1), Frozen(run, 3), *[Scripted()] * 2])
     actor = frozen.others[0,]
     actor.epsilon = 0.0
     own = CommonsEnv(GAME, 2, seed=9).reset()["agents", "observation"][:, :1]
-    assert torch.equal(actor.choose(own), agents.networks()["replica_1/agent_1"](own).argmax(-1))
+    assert torch.equal(actor.choose(own), networks["replica_1/agent_1"](own).argmax(-1))
 
 
 @pytest.mark.parametrize("name", ["VDN", "QMIX", "MAPPO"])
 def test_who_shares_a_reward_but_is_paid_for_itself_is_refused(name):
-    with pytest.raises(ValueError, match=rf'{name} wants paid="group": .* paid="own", for which DQN, PPO'):
-        population([Learner(TEAMS[name])] * 4)
+    with pytest.raises(ValueError, match=rf'reward is "individual"; allowed for {name}: "team"'):
+        population([Team(TEAMS[name], FOUR, reward="individual")])
 
 
-def test_what_is_no_team_is_refused_and_what_needs_none_is_not():
-    alone = [Learner(TEAMS["QMIX"], reward_kind="group"), *[Scripted()] * 3]
-    with pytest.raises(ValueError, match=r"QMIX wants a team of at least 2: .* came with 1, for which DQN"):
-        population(alone)
-    unequal = [replace(TEAMS["QMIX"], mixing_cells=cells) for cells in (4, 4, 5, 6)]
-    with pytest.raises(ValueError, match="QMIX wants a team of at least 2"):
-        population([Learner(algorithm, reward_kind="group") for algorithm in unequal])
-    assert list(population([Learner(TEAMS["IPPO"])] * 4).learners) == [FOUR]
-    with pytest.raises(ValueError, match='paid is "own"; a team that learns from replay shares one reward'):
-        ReplayLearner(GAME, agents=FOUR, replicas=2, settings=REPLAY, make_team=TeamNetwork)
-    wrong = QMIX(settings=ROLLOUTS)
+def test_what_is_no_team_is_refused_and_says_what_fits():
+    with pytest.raises(ValueError, match=r"the team has 1 agents; allowed for QMIX: at least 2; DQN"):
+        population([Team(TEAMS["QMIX"], (0,)), *[Scripted()] * 3])
+    with pytest.raises(ValueError, match=r"QMIX is learned by a team: Team\(QMIX\(...\), agents=\(0, 1\)\)"):
+        Learning(TEAMS["QMIX"])
     with pytest.raises(
-        ValueError, match="QMIX has settings of the type RolloutSettings; DQNSettings is wanted"
+        ValueError, match=r"the algorithm is a DQN; allowed: a TeamAlgorithm of cprl\.algorithms"
     ):
-        population([Learner(wrong, reward_kind="group")] * 4)
+        Team(DQN(settings=REPLAY), FOUR)
+    with pytest.raises(
+        ValueError, match='reward is "individual"; allowed for a team that learns from replay: "team"'
+    ):
+        ReplayLearner(GAME.spaces, agents=FOUR, replicas=2, settings=REPLAY, make_team=TeamNetwork)
+    with pytest.raises(ValueError, match=r"QMIX\.settings is a RolloutSettings; allowed: DQNSettings"):
+        population([Team(QMIX(settings=ROLLOUTS), FOUR)])
+    for agents, message in [((1, 0), "ascending agent indices"), ((), "at least one"), ((0, 0), "ascending")]:
+        with pytest.raises(ValueError, match=message):
+            Team(TEAMS["QMIX"], agents)
+
+
+def test_two_equal_teams_stay_two_teams():
+    pairs = [Team(TEAMS["QMIX"], (0, 2)), Team(TEAMS["QMIX"], (1, 3))]
+    assert list(population(pairs).learners) == [(0, 2), (1, 3)]
+    with pytest.raises(ValueError, match="agent 2 is in two teams"):
+        population([Team(TEAMS["QMIX"], (0, 2)), Team(TEAMS["QMIX"], (2, 3))])
+    with pytest.raises(ValueError, match="a team has agent 4; the game has the agents 0 to 3"):
+        population([Team(TEAMS["QMIX"], (0, 4)), *[Scripted()] * 3])
 
 
 ROWS = Game(
@@ -266,7 +281,7 @@ def test_a_team_comes_close_to_the_optimum(name):
         TEAMS[name], settings=test_optimum.ROLLOUTS if name.endswith("PPO") else test_optimum.REPLAY
     )
     # RewardKind for the group, one of four replicas of IPPO ended at half of the apples.
-    members = [Learner(algorithm, reward_kind="own" if name == "IPPO" else "group")] * 2
+    members = [Learning(algorithm, reward_kind="individual" if name == "IPPO" else "team")] * 2
     team = Population(ROWS, members, replicas=4, seed=1, compile=False)
 
     def share():

@@ -1,5 +1,7 @@
 """CommonsEnv keeps TorchRL's contracts, and plays the very game of `cprl.commons`."""
 
+from functools import partial
+
 import numpy as np
 import pytest
 import torch
@@ -7,7 +9,7 @@ from boards import random_actions
 from tensordict import TensorDict, assert_close
 from tensordict.nn import TensorDictModuleBase
 from torchrl.collectors import Collector
-from torchrl.envs import EnvBase, RewardSum, TransformedEnv
+from torchrl.envs import EnvBase, ParallelEnv, RewardSum, SerialEnv, TransformedEnv
 from torchrl.envs.utils import check_env_specs
 
 from cprl import CommonsEnv, Game, Rules, keys, maps, presets
@@ -54,6 +56,33 @@ def test_the_specs_are_kept(board, state):
     env = CommonsEnv(presets.game(board), worlds=3, state=state)
     check_env_specs(env)
     check_env_specs(env, seed=1)
+
+
+@pytest.mark.parametrize("worlds", [1, 3])
+def test_each_spec_is_there_for_a_single_world_too(worlds):
+    env = CommonsEnv(presets.game("commons"), worlds=worlds, state=True)
+    observation = env.observation_spec_unbatched
+    for key, (shape, dtype) in EVERYTHING.items():
+        if key in env.done_keys:
+            continue
+        assert observation[key].shape == shape, key
+        assert observation[key].dtype == dtype, key
+    for kind in ("action", "observation", "reward", "done"):
+        one, all_of_them = (getattr(env, f"full_{kind}_spec{end}") for end in ("_unbatched", ""))
+        assert set(one.keys(True, True)) == set(all_of_them.keys(True, True))
+        for key in one.keys(True, True):
+            assert one[key].shape == all_of_them[key].shape[1:], key
+        for values in (one.rand(), one.zero()):
+            assert one.is_in(values), kind
+            assert values.batch_size == ()
+    assert observation.expand(worlds, *observation.shape) == env.observation_spec
+
+
+def test_flags_are_drawn_as_both_values():
+    drawn = CommonsEnv(presets.game("commons"), worlds=50).observation_spec.rand()
+    for key in (keys.IN_PLAY, keys.FIRED, keys.HIT_BY, keys.TAGGED_BY):
+        assert drawn[key].dtype == torch.bool
+        assert 0.3 < drawn[key].float().mean() < 0.7, key
 
 
 def test_entries_have_the_shapes_and_types_of_the_house():
@@ -195,6 +224,48 @@ def test_set_seed_starts_the_same_game_again():
     assert not torch.equal(runs[0], runs[2])
 
 
+def regrown_by_worker(vec_env, seed=None, **how):
+    """What grew in each of two environments, int64 [2, 200], when both are played by the same actions."""
+    if seed is not None:
+        vec_env.set_seed(seed, **how)
+    try:
+        moment, grown = vec_env.reset(), []
+        for turn in torch.as_tensor(random_actions(200, 1, presets.game("commons"))):
+            action = turn.expand(2, -1, -1).clone()
+            _, moment = vec_env.step_and_maybe_reset(moment.set(keys.ACTION, action))
+            grown.append(moment["regrown"].flatten())
+        return torch.stack(grown, 1)
+    finally:
+        vec_env.close()
+
+
+# Forked, since the lambda of a test cannot be pickled; TorchRL warns that it makes one in this process too.
+@pytest.mark.filterwarnings("ignore:A lambda function was passed", "ignore:.*fork:DeprecationWarning")
+@pytest.mark.parametrize("kind", [partial(ParallelEnv, mp_start_method="fork"), SerialEnv])
+def test_workers_of_one_call_play_different_worlds(kind):
+    def grown(*how, **more):
+        return regrown_by_worker(kind(2, lambda: CommonsEnv(presets.game("commons"))), *how, **more)
+
+    unasked, seeded, again = grown(), grown(5), grown(5)
+    assert unasked.sum(1).min() > 0
+    assert not torch.equal(*unasked), "no seed was given, and both workers play the same worlds"
+    assert not torch.equal(*seeded), "set_seed gave both workers the same worlds"
+    assert torch.equal(seeded, again)
+    same = grown(5, static_seed=True)
+    assert torch.equal(*same), "asked for by static_seed"
+
+
+def test_without_a_seed_torchs_generator_decides():
+    def seed_of_a_new_one():
+        return int(CommonsEnv(SHORT).worlds.now.seed[0, 0])
+
+    torch.manual_seed(3)
+    first, second = seed_of_a_new_one(), seed_of_a_new_one()
+    torch.manual_seed(3)
+    assert first != second
+    assert seed_of_a_new_one() == first
+
+
 def test_one_world_plays_as_it_does_in_a_larger_batch():
     many = CommonsEnv(SHORT, worlds=5, seed=3)
     one = CommonsEnv(SHORT, worlds=1, seed=3, first_world=2)
@@ -213,13 +284,13 @@ def test_the_state_is_the_whole_board_in_colour():
 def test_devices_that_are_not_there_are_refused():
     with pytest.raises(ValueError, match='device is "meta"; allowed: "cpu" and "cuda"'):
         CommonsEnv(SHORT, device="meta")
-    with pytest.raises(ValueError, match="threads is 2; that is for the CPU"):
+    with pytest.raises(ValueError, match="threads is 2; allowed on a GPU: None"):
         CommonsEnv(SHORT, device="cuda", threads=2)
 
 
 @pytest.mark.skipif(torch.cuda.is_available(), reason="there is a GPU")
 def test_without_a_gpu_the_device_cuda_is_refused():
-    with pytest.raises(RuntimeError, match='device is "cuda"; torch finds no GPU'):
+    with pytest.raises(RuntimeError, match='device is "cuda"; allowed: "cpu", because torch finds no GPU'):
         CommonsEnv(SHORT, device="cuda")
 
 

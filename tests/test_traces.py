@@ -23,15 +23,15 @@ def traced_game(name: str):
 def test_windows_rewards_tags_and_ends_equal_the_published_program(path):
     trace, game = np.load(path), traced_game(path.stem)
     batch = Batch(game, 1)
-    told = batch.begin(batch.new_output())
+    output = batch.begin(batch.new_output())
     windows = trace["obs"].reshape(-1, game.agents, *game.observation_shape)
-    assert np.array_equal(told.observation[0], windows[0]), "the first windows differ"
+    assert np.array_equal(output.observation[0], windows[0]), "the first windows differ"
     for turn, actions in enumerate(trace["actions"]):
-        in_play = told.in_play[0].sum()
-        batch.play(actions.astype(np.int64).reshape(1, -1), told)
-        assert np.array_equal(told.observation[0], windows[turn + 1]), f"windows differ after turn {turn}"
-        assert np.array_equal(told.harvest[0], trace["reward"][turn]), f"rewards differ in turn {turn}"
-        assert told.terminated[0, 0] == trace["done"][turn], f"the end differs in turn {turn}"
+        in_play = output.in_play[0].sum()
+        batch.play(actions.astype(np.int64).reshape(1, -1), output)
+        assert np.array_equal(output.observation[0], windows[turn + 1]), f"windows differ after turn {turn}"
+        assert np.array_equal(output.harvest[0], trace["reward"][turn]), f"rewards differ in turn {turn}"
+        assert output.terminated[0, 0] == trace["done"][turn], f"the end differs in turn {turn}"
         if trace["untagged"][turn] >= 0:
             assert in_play == trace["untagged"][turn], f"agents in play differ in turn {turn}"
 

@@ -8,16 +8,16 @@ import pytest
 import torch
 
 from cprl import CommonsEnv, Game, Rules, maps
+from cprl.algorithms import DQN
 from cprl.collectors import stock_collector
 from cprl.learners.replay import ReplayLearner
 from cprl.learners.settings import DQNSettings
-from cprl.learners.single import DQNLearner
 from cprl.measuring.evaluate import evaluate, mean_return
 from cprl.policies.assignment import AgentPolicies
 from cprl.policies.single import RandomActor
 from cprl.runs.checkpoints import Checkpointer
 from cprl.runs.episodes import EpisodeTable, read_episodes
-from cprl.training import train
+from cprl.training import Training, train
 
 GAME = Game(
     map=maps.parse(".A>.A\n.A.A.\n..<.A"),
@@ -39,13 +39,14 @@ class Witness:
         self.learning.append(dict(learning))
 
 
-def learner(seed=0):
-    return DQNLearner(GAME.observation_shape, 8, settings=DQNSettings(buffer_size=200), seed=seed)
+def learner(agent=0, *, seed=0):
+    algorithm = DQN(settings=DQNSettings(buffer_size=200))
+    return algorithm.make_learner(GAME.spaces, agents=(agent,), replicas=1, seed=seed, engine="torchrl")
 
 
 def test_observers_see_every_turn_and_every_episode_and_the_learner_learns_once_a_turn():
     witness, agent = Witness(), learner()
-    train(CommonsEnv(GAME), {0: agent}, others={1: RandomActor(8)}, episodes=5, callbacks=[witness])
+    train(CommonsEnv(GAME), {(0,): agent}, others={1: RandomActor(8)}, episodes=5, callbacks=[witness])
     assert len(witness.turns) == agent.steps == sum(episode.steps for episode in witness.episodes)
     assert [episode.episode for episode in witness.episodes] == [0, 1, 2, 3, 4]
     assert set(witness.learning[-1]) == {"agent_0/loss", "agent_0/epsilon", "agent_0/q"}
@@ -55,10 +56,10 @@ def test_observers_see_every_turn_and_every_episode_and_the_learner_learns_once_
 
 
 def test_two_learners_sit_side_by_side_and_each_stores_its_own_turns():
-    learners = {0: learner(0), 1: learner(1)}
+    learners = {(0,): learner(0), (1,): learner(1)}
     train(CommonsEnv(GAME), learners, episodes=2)
-    first, second = (learners[agent].buffer[:]["observation"] for agent in (0, 1))
-    assert len(first) == len(second) == learners[0].steps
+    first, second = (own.buffers[0][:]["observation"] for own in learners.values())
+    assert len(first) == len(second) == learners[0,].steps
     assert not torch.equal(first, second)
 
 
@@ -66,7 +67,12 @@ def test_training_again_with_the_same_seeds_gives_the_same_episodes():
     def returns():
         torch.manual_seed(3)
         witness = Witness()
-        train(CommonsEnv(GAME, seed=3), {0: learner(3), 1: learner(4)}, episodes=4, callbacks=[witness])
+        train(
+            CommonsEnv(GAME, seed=3),
+            {(0,): learner(0, seed=3), (1,): learner(1, seed=3)},
+            episodes=4,
+            callbacks=[witness],
+        )
         return [episode.return_.tolist() for episode in witness.episodes]
 
     assert returns() == returns()
@@ -75,19 +81,19 @@ def test_training_again_with_the_same_seeds_gives_the_same_episodes():
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        ({"others": {}}, r"sit at \[0\]; the game has the seats \[0, 1\]"),
-        ({"others": {0: RandomActor(8), 1: RandomActor(8)}}, r"sit at \[0, 0, 1\]"),
+        ({"others": {}}, r"control the agents \[0\]; allowed: each of \[0, 1\] exactly once"),
+        ({"others": {0: RandomActor(8), 1: RandomActor(8)}}, r"control the agents \[0, 0, 1\]"),
         ({"others": {1: RandomActor(8)}, "episodes": 0}, "episodes is 0"),
     ],
 )
 def test_what_cannot_be_trained_is_refused(arguments, message):
     with pytest.raises(ValueError, match=message):
-        train(CommonsEnv(GAME), {0: learner()}, **{"episodes": 1, **arguments})
+        train(CommonsEnv(GAME), {(0,): learner()}, **{"episodes": 1, **arguments})
 
 
 def test_one_world_is_trained_at_a_time():
-    with pytest.raises(ValueError, match="has 2 worlds; the learner at 0 has 1 replicas"):
-        train(CommonsEnv(GAME, 2), {0: learner()}, others={1: RandomActor(8)}, episodes=1)
+    with pytest.raises(ValueError, match=r"has 2 worlds; the learner of \(0,\) has 1 replicas"):
+        train(CommonsEnv(GAME, 2), {(0,): learner()}, others={1: RandomActor(8)}, episodes=1)
 
 
 def test_learning_may_wait_for_several_steps_and_then_catches_up():
@@ -98,7 +104,7 @@ def test_learning_may_wait_for_several_steps_and_then_catches_up():
 
     told = []
     settings = replace(SETTINGS, learning_starts=1)
-    agents = Counting(GAME, agents=(0, 1), replicas=2, settings=settings, compile=False)
+    agents = Counting(GAME.spaces, agents=(0, 1), replicas=2, settings=settings, compile=False)
     training = train(CommonsEnv(GAME, 2), {(0, 1): agents}, episodes=2, update_every=3)
     bouts = training.steps // 3
     assert told == [3 * (bout + 1) for bout in range(bouts) for _ in range(3)]
@@ -107,7 +113,9 @@ def test_learning_may_wait_for_several_steps_and_then_catches_up():
 def test_torchrls_own_collector_trains_the_same():
     def course(**how):
         witness = Witness()
-        agents = ReplayLearner(GAME, agents=(0, 1), replicas=2, settings=SETTINGS, seed=3, compile=False)
+        agents = ReplayLearner(
+            GAME.spaces, agents=(0, 1), replicas=2, settings=SETTINGS, seed=3, compile=False
+        )
         train(CommonsEnv(GAME, 2, seed=3), {(0, 1): agents}, episodes=4, callbacks=[witness], **how)
         losses = [learning["agent_1/loss"] for learning in witness.learning]
         weights = agents.networks()["replica_1/agent_0"].state_dict().values()
@@ -125,12 +133,10 @@ def test_torchrls_own_collector_trains_the_same():
 
 def test_checkpoints_of_what_keeps_no_state_are_refused_before_anything_is_played(tmp_path):
     env, witness = CommonsEnv(GAME), Witness()
-    how = {"episodes": 1, "checkpoints": Checkpointer(tmp_path), "callbacks": [witness]}
-    with pytest.raises(ValueError, match="a DQNLearner keeps no state to go on from; use a ReplayLearner"):
-        train(env, {0: learner(), 1: learner()}, **how)
-    agents = ReplayLearner(GAME, agents=(0, 1), replicas=1, settings=SETTINGS, compile=False)
+    how = {"episodes": 1, "checkpointer": Checkpointer(tmp_path), "callbacks": [witness]}
+    agents = ReplayLearner(GAME.spaces, agents=(0, 1), replicas=1, settings=SETTINGS, compile=False)
     with pytest.raises(
-        ValueError, match="a Collector keeps no state to go on from; train with a StepCollector"
+        ValueError, match="a Collector has no state to resume from; train with a StepCollector"
     ):
         train(env, {(0, 1): agents}, make_collector=stock_collector, **how)
     assert witness.turns == []
@@ -146,7 +152,9 @@ def test_what_was_played_before_an_interruption_is_kept(tmp_path):
     agents = {1: RandomActor(8)}
     table = EpisodeTable(tmp_path / "episodes.parquet")
     with pytest.raises(KeyboardInterrupt), table:
-        train(CommonsEnv(GAME), {0: learner()}, others=agents, episodes=9, callbacks=[table, Interrupting()])
+        train(
+            CommonsEnv(GAME), {(0,): learner()}, others=agents, episodes=9, callbacks=[table, Interrupting()]
+        )
     assert read_episodes(tmp_path)["episode"].to_pylist() == [0, 0, 1, 1, 2, 2]
 
 
@@ -165,7 +173,7 @@ def test_evaluation_plays_one_episode_in_every_world_and_changes_no_seed():
 def test_evaluation_explores_only_if_asked():
     agent = learner()
     agent.actor.epsilon = 1.0
-    agents = AgentPolicies([agent.actor, RandomActor(8)])
+    agents = AgentPolicies({(0,): agent.actor, 1: RandomActor(8)})
 
     def actions(explore):
         env = CommonsEnv(GAME, 1, seed=1)
@@ -177,3 +185,39 @@ def test_evaluation_explores_only_if_asked():
 
     assert actions(explore=False) == actions(explore=False)
     assert len(set(actions(explore=True))) > 2
+
+
+def test_two_callbacks_of_one_class_each_have_their_own_state():
+    class Counts:
+        def __init__(self, first):
+            self.count = first
+
+        def on_step(self, batch):
+            self.count += 1
+
+        def state_dict(self):
+            return {"count": self.count}
+
+        def load_state_dict(self, state):
+            self.count = state["count"]
+
+    def training(*firsts):
+        agents = ReplayLearner(GAME.spaces, agents=(0, 1), replicas=1, settings=SETTINGS, compile=False)
+        counts = [Counts(first) for first in firsts]
+        return Training(CommonsEnv(GAME, seed=0), {(0, 1): agents}, episodes=1, callbacks=counts)
+
+    one, other = training(10, 20), training(0, 0)
+    one.step()
+    other.load_state_dict(one.state_dict())
+    assert [own.count for own in other.callbacks] == [11, 21]
+
+
+def test_a_callback_that_nothing_would_call_is_refused():
+    with pytest.raises(ValueError, match="has none of the methods on_start, on_step, on_episode"):
+        train(
+            CommonsEnv(GAME, seed=0),
+            {},
+            others={0: RandomActor(8), 1: RandomActor(8)},
+            episodes=1,
+            callbacks=[7],
+        )

@@ -18,11 +18,13 @@ import pytest
 import torch
 from tensordict import TensorDict
 
-from cprl import Game, Rules, maps
+from cprl import CommonsEnv, Game, Rules, maps
+from cprl.agents import Population
+from cprl.algorithms.base import TeamAlgorithm
 from cprl.algorithms.dqn import DQN
 from cprl.algorithms.teams import QMIX, VDN
 from cprl.learners.settings import DQNSettings
-from cprl.population import Learner, Population
+from cprl.population import Learning, Team
 
 START, SAFE, DARING, OVER = range(4)
 PAYOFFS = torch.tensor([[[7.0, 7.0], [7.0, 7.0]], [[0.0, 1.0], [1.0, 8.0]]])
@@ -57,9 +59,9 @@ def seen(state):
 def turn(state, action):
     """The next state [R], and the turn, for actions [R, 2]; of the commons, even and odd."""
     choice, ends = action % 2, state != START
-    reward_kind = torch.where(ends, PAYOFFS[(state == DARING).long(), choice[:, 0], choice[:, 1]], 0.0)
+    paid = torch.where(ends, PAYOFFS[(state == DARING).long(), choice[:, 0], choice[:, 1]], 0.0)
     then = torch.where(ends, OVER, SAFE + choice[:, 0])
-    rewards = torch.stack([reward_kind, torch.zeros_like(reward_kind)], 1).unsqueeze(-1)
+    rewards = torch.stack([paid, torch.zeros_like(paid)], 1).unsqueeze(-1)
     after = {"agents": {"observation": seen(then), "reward": rewards}, "done": ends[:, None]}
     before = {"observation": seen(state), "action": action}
     return then, TensorDict(
@@ -70,10 +72,11 @@ def turn(state, action):
 def taught(algorithm):
     """A learner of two agents, who are paid together, after it has learned from every pair of actions in both
     games, each met once; all actions are tried equally often at first, too."""
-    members = [Learner(algorithm, reward_kind="group")] * 2
-    population = Population(game(), members, replicas=REPLICAS, seed=1, compile=False)
+    is_team = isinstance(algorithm, TeamAlgorithm)
+    specs = [Team(algorithm, (0, 1))] if is_team else [Learning(algorithm, reward="team")] * 2
+    population = Population(CommonsEnv(game(), REPLICAS), specs, seed=1, engine="eager")
     (learner,) = population.learners.values()
-    actions = range(len(population.game.actions))
+    actions = range(population.spaces.actions)
     for daring, (mine, yours) in product((0, 1), product(actions, actions)):
         state, chooses = torch.full((REPLICAS,), START), 2 * ((mine + yours) % 4) + daring
         for pair in ((chooses, yours), (mine, yours)):

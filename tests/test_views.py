@@ -1,4 +1,4 @@
-"""What agents see: windows drawn as signs, `S` self, `o` others, `m` heading marks, `b` beams."""
+"""Windows, drawn as signs: `S` self, `o` other agents, `m` heading marks, `b` beams."""
 
 import numpy as np
 import pytest
@@ -38,7 +38,7 @@ def test_everything_outside_the_board_is_wall():
     assert windows(play, 0) == [["#####", "#####", "##m.#", "##S.#"]]
 
 
-def test_everybody_sees_itself_blue_and_others_red():
+def test_each_agent_sees_itself_blue_and_others_red():
     play = Play("A....\n.>.<.", window_rows=4, window_columns=3)
     assert windows(play, 0, 1) == [["..#", ".o#", ".m#", ".S#"], ["#.A", "#o.", "#m.", "#S."]]
 
@@ -65,7 +65,7 @@ def test_as_run_beams_are_painted_over_apples_and_agents():
     assert windows(play, 0) == [["bbb", "bbb", "bbb", "bbb", "bbb", "AS."]]
 
 
-def test_an_agent_out_of_play_is_not_seen_but_still_sees_itself():
+def test_an_agent_out_of_play_sees_itself_but_is_hidden_from_others():
     play = Play("A....\n.>.<.", window_rows=3, window_columns=3).turn("beam", "stay")
     assert windows(play, 0, 1) == [["bb#", "bb#", ".S#"], ["#o.", "#bb", "#Sb"]]
 
@@ -73,7 +73,7 @@ def test_an_agent_out_of_play_is_not_seen_but_still_sees_itself():
 FACING_DOWN = "....\n.v..\n...A\n>..."
 
 
-def test_the_mark_shows_the_heading_and_as_run_it_is_behind_who_faces_down():
+def test_the_mark_shows_the_heading_and_as_run_it_is_behind_an_agent_that_faces_down():
     ahead = Play(FACING_DOWN, window_rows=4, window_columns=3)
     behind = Play(FACING_DOWN, window_rows=4, window_columns=3, mark_behind_if_vertical=True)
     assert windows(ahead, 0, 1) == [["###", ".mo", ".m.", ".S."], ["A.#", "..#", "mm#", ".S#"]]
@@ -81,7 +81,7 @@ def test_the_mark_shows_the_heading_and_as_run_it_is_behind_who_faces_down():
 
 
 @pytest.mark.parametrize(("old_stock", "ahead"), [(False, "A"), (True, "m")])
-def test_as_run_the_picture_shows_the_apples_as_they_hung_when_the_turn_began(old_stock, ahead):
+def test_as_run_the_picture_shows_the_apples_of_the_start_of_the_turn(old_stock, ahead):
     rules = {"regrow_prob": (0.0, 1.0), "picture_shows_old_stock": old_stock}
     play = Play("A.A\n^..", window_rows=2, window_columns=3, **rules).turn("forward")
     play.turn("backward")
@@ -90,7 +90,7 @@ def test_as_run_the_picture_shows_the_apples_as_they_hung_when_the_turn_began(ol
     assert windows(play.turn("stay"), 0) == [["#A.", "#S."]]
 
 
-def test_as_run_own_cells_stay_painted_as_self_for_later_agents():
+def test_as_run_the_cells_of_earlier_agents_stay_painted_as_self():
     board = "A....\n.>.<."
     stays = Play(board, window_rows=3, window_columns=3, self_paint_stays=True)
     goes = Play(board, window_rows=3, window_columns=3)
@@ -98,14 +98,14 @@ def test_as_run_own_cells_stay_painted_as_self_for_later_agents():
     assert windows(stays, 0, 1) == [[".o#", ".m#", ".S#"], ["#S.", "#m.", "#S."]]
 
 
-def test_as_run_a_later_mark_covers_an_earlier_agent():
+def test_as_run_the_mark_of_a_later_agent_covers_an_earlier_agent():
     covered = Play("A....\n..<<.", window_rows=3, window_columns=3, paint_over=True)
     seen = Play("A....\n..<<.", window_rows=3, window_columns=3)
     assert windows(covered, 1) == [["#m.", "#m.", "#S."]]
     assert windows(seen, 1) == [["#m.", "#o.", "#S."]]
 
 
-def test_the_whole_board_shows_classes():
+def test_boards_show_the_classes_of_all_cells():
     play = Play("A.#\n.>.\n...")
     shown = play.batch.boards(play.output)[0]
     expected = [[APPLE, GROUND, WALL], [GROUND, OTHER, MARK], [GROUND, GROUND, GROUND]]

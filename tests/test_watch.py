@@ -52,7 +52,7 @@ class Doing:
 def course(run=None, *, live=None, episodes=8, others=()):
     """Weights, torch's generator and returns after a training of two replicas, watched if a run is given."""
     torch.manual_seed(1)
-    agents = ReplayLearner(GAME, agents=(0, 1), replicas=2, settings=SETTINGS, seed=1, compile=False)
+    agents = ReplayLearner(GAME.spaces, agents=(0, 1), replicas=2, settings=SETTINGS, seed=1, compile=False)
     env, returns = CommonsEnv(GAME, 2, seed=1), []
 
     class Keeping(Doing):
@@ -116,7 +116,7 @@ def test_a_viewer_that_is_killed_half_way_changes_nothing(tmp_path, unwatched):
 def test_an_address_where_nobody_listens_is_told_once_and_changes_nothing(tmp_path, unwatched):
     address = f"rerun+http://127.0.0.1:{_free_port()}/proxy"
     started = time.monotonic()
-    with pytest.warns(RuntimeWarning, match="viewer at rerun.*refused; the run goes on") as caught:
+    with pytest.warns(RuntimeWarning, match="viewer at rerun.*refused; the run continues") as caught:
         assert course(tmp_path, live=f"connect {address}") == unwatched
     assert len(caught) == 1
     assert time.monotonic() - started < 60
@@ -148,7 +148,7 @@ def test_a_disk_that_fills_up_is_told_once_and_changes_nothing(tmp_path, unwatch
                     pass
 
         with pytest.warns(
-            RuntimeWarning, match="the Rerun file is dropped, the run goes on without it"
+            RuntimeWarning, match="the Rerun file failed, the run continues without it"
         ) as caught:
             assert course(disk, live="serve", others=[Doing(30, fill)]) == unwatched
         assert len(caught) == 1
@@ -159,7 +159,7 @@ def test_a_disk_that_fills_up_is_told_once_and_changes_nothing(tmp_path, unwatch
 @only_root
 def test_a_disk_that_is_full_from_the_start_is_told_once_and_changes_nothing(tmp_path, unwatched):
     with disk_of(96, tmp_path / "disk") as disk:
-        with pytest.warns(RuntimeWarning, match="bytes are free there, 2,000,000 are wanted") as caught:
+        with pytest.warns(RuntimeWarning, match="bytes are free there, 2,000,000 are needed") as caught:
             assert course(disk, live="serve") == unwatched
         assert len(caught) == 1
         assert not (disk / "run.rrd").exists()
@@ -167,7 +167,7 @@ def test_a_disk_that_is_full_from_the_start_is_told_once_and_changes_nothing(tmp
 
 def test_a_way_to_watch_that_is_none_is_refused_before_anything_begins(tmp_path):
     with pytest.raises(
-        ValueError, match=r"live is 'telepathy'; wanted: \"serve\", \"spawn\" or \"connect rerun"
+        ValueError, match=r"live is 'telepathy'; allowed: \"serve\", \"spawn\" or \"connect rerun"
     ):
         course(tmp_path, live="telepathy")
 
@@ -177,7 +177,7 @@ def test_without_a_display_no_viewer_is_spawned_and_the_addresses_stay(tmp_path,
     monkeypatch.delenv("WAYLAND_DISPLAY", raising=False)
     with pytest.warns(RuntimeWarning, match="viewer cannot open: there is no display"):
         course(tmp_path, live="spawn", episodes=1)
-    assert "ViewerCallback live (browser): http://127.0.0.1:" in capsys.readouterr().out
+    assert "Watch live (browser): http://127.0.0.1:" in capsys.readouterr().out
 
 
 def test_several_replicas_are_told_as_their_mean_and_each(tmp_path):
@@ -233,8 +233,8 @@ def test_a_society_that_rises_falls_and_recovers_is_told_as_a_story(tmp_path):
     path = tmp_path / "run.rrd"
     _, events = column(path, "log", "TextLog:text")
     told = "\n".join(text[0] for text in events)
-    assert "episode 5: the last apple went in step 7" in told
-    assert "episode 399: new best: 474.5 apples an episode, mean of the last 50" in told
+    assert "episode 5: the last apple was taken in step 7" in told
+    assert "episode 399: new best: 474.5 apples per episode, mean of the last 50" in told
     assert told.index("phase: exploration") < told.index("phase: tragedy") < told.index("phase: combat")
     episodes, states = column(path, "phase/found", "StateChange:state", "episode")
     assert [state[0] for state in states] == ["exploration", "tragedy", "combat", "cultivation"]

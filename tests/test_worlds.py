@@ -1,4 +1,4 @@
-"""What holds in every game, whatever is played: checked on random boards, rules and actions."""
+"""Invariants of every game, checked on random boards, rules and actions."""
 
 import itertools
 import pickle
@@ -56,24 +56,24 @@ def copied(record):
 
 
 def assert_same(record, other, *, rows=slice(None), other_rows=slice(None)):
-    """Two records of the same kind hold the same, in the worlds named."""
+    """Two records of the same type are equal in the given worlds."""
     for name, array in record._asdict().items():
         assert np.array_equal(array[rows], getattr(other, name)[other_rows]), name
 
 
 def played(game, actions, *, seed=0, first_world=0, threads=1):
-    """The worlds and what was told, before the first turn and after each."""
+    """The worlds and the step output, before the first turn and after each."""
     batch = Batch(game, actions.shape[1], seed=seed, first_world=first_world, threads=threads)
-    told = batch.begin(batch.new_output())
-    moments = [(copied(batch.now), copied(told))]
+    output = batch.begin(batch.new_output())
+    moments = [(copied(batch.now), copied(output))]
     for turn in actions:
-        batch.play(turn, told)
-        moments.append((copied(batch.now), copied(told)))
+        batch.play(turn, output)
+        moments.append((copied(batch.now), copied(output)))
     return moments
 
 
 def check_places(game, seed):
-    """No two agents in play share a cell, and nobody stands in a wall."""
+    """No two agents in play share a cell, and no agent stands in a wall."""
     for worlds, _ in played(game, random_actions(40, 3, game, seed=seed), seed=seed):
         for b in range(3):
             places = [
@@ -86,73 +86,73 @@ def check_places(game, seed):
             assert all(0 <= r < game.map.height and 0 <= c < game.map.width for r, c in places)
 
 
-def check_numbers_do_not_matter(game, seed, order):
-    """The same agents under other numbers play the same game."""
+def check_agent_indices_do_not_matter(game, seed, order):
+    """The same agents under other indices play the same game."""
     renumbered = replace(game, map=replace(game.map, starts=tuple(game.map.starts[i] for i in order)))
     actions = random_actions(40, 2, game, seed=seed)
     once = played(game, actions, seed=seed)
     again = played(renumbered, actions[:, :, order].copy(), seed=seed)
-    for (worlds, told), (other_worlds, other_told) in zip(once, again, strict=True):
+    for (worlds, output), (other_worlds, other_output) in zip(once, again, strict=True):
         assert np.array_equal(worlds.stock, other_worlds.stock)
         for name in ("row", "col", "heading", "in_play", "out_steps", "hits"):
             assert np.array_equal(getattr(worlds, name)[:, order], getattr(other_worlds, name)), name
         for name in ("observation", "harvest", "fired"):
-            assert np.array_equal(getattr(told, name)[:, order], getattr(other_told, name)), name
-        assert np.array_equal(told.tagged_by[:, order][:, :, order], other_told.tagged_by)
+            assert np.array_equal(getattr(output, name)[:, order], getattr(other_output, name)), name
+        assert np.array_equal(output.tagged_by[:, order][:, :, order], other_output.tagged_by)
 
 
 def check_apples(game, seed):
-    """Apples hang only on sites, stock + harvest = first stock + regrown, and neighbours are counted."""
+    """stock + harvest = first stock + regrown, and the apples near each site are counted."""
     moments = played(game, random_actions(40, 3, game, seed=seed), seed=seed)
     sites = len(game.map.sites)
     near = neighbours(game.map, game.rules)
     harvest = np.zeros(3, np.int64)
     regrown = np.zeros(3, np.int64)
-    for worlds, told in moments:
-        harvest += told.harvest.sum(1).astype(np.int64)
-        regrown += told.regrown[:, 0]
-        assert np.array_equal(told.stock[:, 0] + harvest, sites + regrown)
-        assert np.array_equal(worlds.stock.sum(1), told.stock[:, 0])
+    for worlds, output in moments:
+        harvest += output.harvest.sum(1).astype(np.int64)
+        regrown += output.regrown[:, 0]
+        assert np.array_equal(output.stock[:, 0] + harvest, sites + regrown)
+        assert np.array_equal(worlds.stock.sum(1), output.stock[:, 0])
         assert np.array_equal(worlds.harvested.sum(1), harvest)
         counted = [[int(stock[list(others)].sum()) for others in near] for stock in worlds.stock]
         assert np.array_equal(worlds.near, counted)
 
 
-def check_nobody_out_of_play_acts(game, seed):
-    """Who is out stays where it is, bites nothing, fires at nobody and is hit by nobody."""
+def check_no_agent_out_of_play_acts(game, seed):
+    """An agent out of play does not move, harvest or fire, and is not hit."""
     actions = random_actions(40, 3, game, seed=seed)
     moments = played(game, actions, seed=seed)
-    for (before, _), (after, told) in itertools.pairwise(moments):
+    for (before, _), (after, output) in itertools.pairwise(moments):
         out = ~before.in_play
         for name in ("row", "col", "heading"):
             assert np.array_equal(getattr(before, name)[out], getattr(after, name)[out]), name
-        assert not told.harvest[out].any()
-        assert not told.fired[out].any()
-        assert not told.hit_by[out].any()
-        assert not told.hit_by.transpose(0, 2, 1)[out].any()
+        assert not output.harvest[out].any()
+        assert not output.fired[out].any()
+        assert not output.hit_by[out].any()
+        assert not output.hit_by.transpose(0, 2, 1)[out].any()
 
 
-def check_worlds_do_not_notice_each_other(game, seed):
-    """Each world plays alone, in a batch, and on two threads alike."""
+def check_worlds_are_independent(game, seed):
+    """Each world plays the same game alone, in a batch, and on two threads."""
     actions = random_actions(60, 9, game, seed=3)
     together = played(game, actions, seed=seed)
     threaded = played(game, actions, seed=seed, threads=2)
     for b in (0, 4, 8):
         alone = played(game, actions[:, b : b + 1].copy(), seed=seed, first_world=b)
-        for (worlds, told), (many, told_many), (both, told_both) in zip(
+        for (worlds, output), (many, output_many), (both, output_both) in zip(
             alone, together, threaded, strict=True
         ):
-            for one, others in ((worlds, (many, both)), (told, (told_many, told_both))):
+            for one, others in ((worlds, (many, both)), (output, (output_many, output_both))):
                 for other in others:
                     assert_same(one, other, rows=0, other_rows=b)
 
 
-def check_nobody_shoots_through_walls(game, seed):
-    """Between a shooter and whom it hits no wall stands in the beam's column."""
+def check_no_beam_passes_a_wall(game, seed):
+    """There is no wall in the beam's column between a shooter and the agent it hits."""
     walls = set(game.map.walls)
     hits = 0
-    for worlds, told in played(game, random_actions(200, 3, game, seed=seed), seed=seed):
-        for b, target, shooter in np.argwhere(told.hit_by):
+    for worlds, output in played(game, random_actions(200, 3, game, seed=seed), seed=seed):
+        for b, target, shooter in np.argwhere(output.hit_by):
             hits += 1
             heading = worlds.heading[b, shooter]
             here, there = ((worlds.row[b, i], worlds.col[b, i]) for i in (shooter, target))
@@ -165,16 +165,16 @@ def check_nobody_shoots_through_walls(game, seed):
 
 @settings(max_examples=60, deadline=None)
 @given(games(), st.integers(0, 2**32))
-def test_no_two_agents_in_play_share_a_cell_and_nobody_stands_in_a_wall(game, seed):
+def test_no_two_agents_in_play_share_a_cell_and_no_agent_stands_in_a_wall(game, seed):
     check_places(game, seed)
 
 
 @settings(max_examples=60, deadline=None)
 @given(games(), st.integers(0, 2**32), st.randoms(use_true_random=False))
-def test_agents_numbers_do_not_matter(game, seed, random):
+def test_the_game_does_not_depend_on_agent_indices(game, seed, random):
     order = list(range(game.agents))
     random.shuffle(order)
-    check_numbers_do_not_matter(game, seed, order)
+    check_agent_indices_do_not_matter(game, seed, order)
 
 
 @settings(max_examples=60, deadline=None)
@@ -185,48 +185,48 @@ def test_apples_are_conserved_and_counted(game, regrow_before_bites, seed):
 
 @settings(max_examples=60, deadline=None)
 @given(games(freeze_steps=3), st.booleans(), st.integers(0, 2**32))
-def test_nobody_out_of_play_acts(game, as_run, seed):
+def test_no_agent_out_of_play_acts(game, as_run, seed):
     rules = replace(game.rules, pairwise_clashes=as_run, freeze_counts_tag_turn=as_run)
-    check_nobody_out_of_play_acts(replace(game, rules=rules), seed)
+    check_no_agent_out_of_play_acts(replace(game, rules=rules), seed)
 
 
 @settings(max_examples=60, deadline=None)
 @given(games(beam_width_cells=3), st.integers(0, 2**32))
-def test_nobody_shoots_through_walls(game, seed):
-    check_nobody_shoots_through_walls(game, seed)
+def test_no_beam_passes_a_wall(game, seed):
+    check_no_beam_passes_a_wall(game, seed)
 
 
 CROWDED = "A>#A.\n.v.<A\n#A.^#"
-"""Walls amid agents that often meet."""
+"""Walls between agents that often meet."""
 
 
 @pytest.mark.parametrize("sight", [False, True], ids=["open", "walls block sight"])
 @pytest.mark.parametrize("board", ["single", "multiple", "none", "unequal", "crowded"])
-def test_the_same_holds_on_the_boards_with_walls(board, sight):
+def test_the_invariants_hold_on_the_boards_with_walls(board, sight):
     drawn = maps.parse(CROWDED) if board == "crowded" else maps.rooms(board)
     game = Game(map=drawn, rules=Rules(walls_block_sight=sight, regrow_prob=(0, 0.1, 0.3), freeze_steps=4))
     check_places(game, 1)
-    check_numbers_do_not_matter(game, 2, list(np.random.default_rng(0).permutation(game.agents)))
+    check_agent_indices_do_not_matter(game, 2, list(np.random.default_rng(0).permutation(game.agents)))
     check_apples(game, 3)
-    check_nobody_out_of_play_acts(game, 4)
-    check_worlds_do_not_notice_each_other(game, 5)
-    assert check_nobody_shoots_through_walls(game, 6) > (50 if board == "crowded" else 0)
+    check_no_agent_out_of_play_acts(game, 4)
+    check_worlds_are_independent(game, 5)
+    assert check_no_beam_passes_a_wall(game, 6) > (50 if board == "crowded" else 0)
 
 
 @pytest.mark.parametrize("variant", presets.VARIANTS)
 @pytest.mark.parametrize("board", presets.BOARDS)
-def test_a_world_does_not_notice_its_neighbours_nor_the_threads(board, variant):
+def test_a_world_does_not_depend_on_other_worlds_or_the_number_of_threads(board, variant):
     game = presets.game(board, variant=variant)
-    check_worlds_do_not_notice_each_other(game, 5)
+    check_worlds_are_independent(game, 5)
 
 
-def test_another_seed_world_or_episode_is_another_game():
+def test_another_seed_world_or_episode_gives_another_game():
     game = presets.game("commons")
     actions = random_actions(150, 2, game)
     actions[:, 1] = actions[:, 0]
 
     def stocks(**how):
-        return np.array([told.stock for _, told in played(game, actions, **how)])
+        return np.array([output.stock for _, output in played(game, actions, **how)])
 
     base = stocks(seed=1)
     assert np.array_equal(base, stocks(seed=1))
@@ -234,30 +234,30 @@ def test_another_seed_world_or_episode_is_another_game():
     assert not np.array_equal(base[:, 0], base[:, 1]), "two worlds of one seed"
     assert np.array_equal(base[:, 1], stocks(seed=1, first_world=1)[:, 0])
     batch = Batch(game, 2, seed=1)
-    told = batch.begin(batch.new_output())
-    told = batch.begin(told)
+    output = batch.begin(batch.new_output())
+    output = batch.begin(output)
     second_episode = []
     for turn in actions:
-        batch.play(turn, told)
-        second_episode.append(told.stock.copy())
+        batch.play(turn, output)
+        second_episode.append(output.stock.copy())
     assert not np.array_equal(base[1:], second_episode)
     batch.set_seed(1)
-    assert np.array_equal(batch.begin(told).stock, base[0])
-    assert np.array_equal(batch.play(actions[0], told).stock, base[1])
+    assert np.array_equal(batch.begin(output).stock, base[0])
+    assert np.array_equal(batch.play(actions[0], output).stock, base[1])
 
 
-def test_only_marked_worlds_begin_anew():
+def test_only_the_selected_worlds_begin_a_new_episode():
     game = presets.game("two_complex")
     batch = Batch(game, 3, seed=0)
-    told = batch.begin(batch.new_output())
+    output = batch.begin(batch.new_output())
     for turn in random_actions(30, 3, game):
-        batch.play(turn, told)
-    before, told_before = copied(batch.now), copied(told)
-    batch.begin(told, np.array([False, True, False]))
+        batch.play(turn, output)
+    before, output_before = copied(batch.now), copied(output)
+    batch.begin(output, np.array([False, True, False]))
     assert batch.now.step[:, 0].tolist() == [30, 0, 30]
     assert batch.now.episode[:, 0].tolist() == [0, 1, 0]
     assert_same(batch.now, before, rows=[0, 2], other_rows=[0, 2])
-    assert_same(told, told_before, rows=[0, 2], other_rows=[0, 2])
+    assert_same(output, output_before, rows=[0, 2], other_rows=[0, 2])
 
 
 @pytest.mark.parametrize(
@@ -265,11 +265,11 @@ def test_only_marked_worlds_begin_anew():
     [
         ({"worlds": 0}, "worlds is 0"),
         ({"worlds": 2, "seed": -1}, "seed is -1"),
-        ({"worlds": 2, "first_world": 2**32}, "allowed: 0 to"),
+        ({"worlds": 2, "first_world": 2**32}, "first_world is 4294967296 and worlds is 2; allowed: "),
         ({"worlds": 2, "threads": 0}, "threads is 0"),
     ],
 )
-def test_a_batch_that_cannot_be_is_refused(arguments, message):
+def test_a_batch_refuses_arguments_that_are_not_allowed(arguments, message):
     with pytest.raises(ValueError, match=message):
         Batch(presets.game("commons"), **arguments)
 
@@ -279,28 +279,28 @@ def test_a_batch_that_cannot_be_is_refused(arguments, message):
     [
         (np.full((2, 4), 8), r"action 8 of agent 0 in world 0 is unknown; allowed: 0 to 7"),
         (np.array([[0, 0, 0, 0], [0, 0, -1, 0]]), "action -1 of agent 2 in world 1"),
-        (np.zeros((2, 3), np.int64), r"wanted: int64 \(2, 4\)"),
+        (np.zeros((2, 3), np.int64), r"expected: int64 \(2, 4\)"),
         (np.zeros((2, 4), np.int32), "int32"),
     ],
 )
 def test_unknown_actions_raise_and_change_nothing(actions, message):
     batch = Batch(presets.game("commons"), 2)
-    told = batch.begin(batch.new_output())
-    before, told_before = copied(batch.now), copied(told)
+    output = batch.begin(batch.new_output())
+    before, output_before = copied(batch.now), copied(output)
     with pytest.raises(ValueError, match=message):
-        batch.play(actions, told)
+        batch.play(actions, output)
     assert_same(batch.now, before)
-    assert_same(told, told_before)
+    assert_same(output, output_before)
 
 
-def test_rules_that_cannot_be_kept_on_disk_bring_a_warning(tmp_path):
+def test_a_cache_folder_that_is_not_writable_brings_a_warning(tmp_path):
     blocked = tmp_path / "file"
     blocked.write_text("")
-    with pytest.warns(RuntimeWarning, match=r"cannot be kept in .*; set CPRL_CACHE"):
+    with pytest.warns(RuntimeWarning, match=r"cannot be cached in .*; set CPRL_CACHE"):
         assert not compiled._can_write(blocked / "folder")
 
 
-def test_a_changed_rule_is_another_folder_of_compiled_rules(tmp_path, monkeypatch):
+def test_a_changed_rule_changes_the_cache_folder(tmp_path, monkeypatch):
     for source in Path(compiled.__file__).parent.glob("*.py"):
         (tmp_path / source.name).write_bytes(source.read_bytes())
     monkeypatch.setattr(compiled, "__file__", str(tmp_path / "compiled.py"))
@@ -310,8 +310,8 @@ def test_a_changed_rule_is_another_folder_of_compiled_rules(tmp_path, monkeypatc
 
 
 @pytest.mark.parametrize("variant", presets.VARIANTS)
-def test_the_rules_are_plain_python_and_uncompiled_play_the_same_game(variant):
-    # This is what Numba's CUDA simulator does with them.
+def test_the_rules_play_the_same_game_without_compilation(variant):
+    # Numba's CUDA simulator runs them in this way.
     game = presets.game("two_complex", variant=variant)
     plain = compiled.compiled(loops.FUNCTIONS, lambda function: function)
     actions = random_actions(25, 2, game, seed=1)
@@ -319,23 +319,23 @@ def test_the_rules_are_plain_python_and_uncompiled_play_the_same_game(variant):
     scratch = empty_scratch(
         agents=2, sites=45, cells=game.tables.background.size, window=game.tables.window_cells.shape[1]
     )
-    told = batch.new_output()
-    plain["begin_worlds"](batch.now, game.tables, np.ones(2, np.bool_), told, scratch, 0, 2)
+    output = batch.new_output()
+    plain["begin_worlds"](batch.now, game.tables, np.ones(2, np.bool_), output, scratch, 0, 2)
     for turn, (worlds, expected) in zip([None, *actions], played(game, actions, seed=1), strict=True):
         if turn is not None:
-            plain["play_worlds"](batch.now, game.tables, turn, told, scratch, 0, 2)
+            plain["play_worlds"](batch.now, game.tables, turn, output, scratch, 0, 2)
         assert_same(batch.now, worlds)
-        assert_same(told, expected)
+        assert_same(output, expected)
 
 
-def test_a_batch_goes_on_as_it_was_after_pickling():
+def test_a_pickled_batch_continues_like_the_original():
     game = presets.game("commons")
     batch = Batch(game, 2, seed=3)
-    told = batch.begin(batch.new_output())
+    output = batch.begin(batch.new_output())
     actions = random_actions(20, 2, game)
     for turn in actions[:10]:
-        batch.play(turn, told)
-    other, other_told = pickle.loads(pickle.dumps(batch)), copied(told)
+        batch.play(turn, output)
+    other, other_output = pickle.loads(pickle.dumps(batch)), copied(output)
     for turn in actions[10:]:
-        assert_same(batch.play(turn, told), other.play(turn, other_told))
+        assert_same(batch.play(turn, output), other.play(turn, other_output))
     assert_same(batch.now, other.now)

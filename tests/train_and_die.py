@@ -32,17 +32,17 @@ SETTINGS = DQNSettings(
 
 
 def main(
-    run: Path, *, every_s: float = 0.05, episodes: int = 60, engine: str = "lane axis", callbacks=()
+    run: Path, *, every_s: float = 0.05, episodes: int = 60, engine: str = "lane_axis", callbacks=()
 ) -> None:
     """Trains agent 0 of three replicas beside a random one."""
     prepare_process(3)
     learner = ReplayLearner(
-        GAME, agents=[0], replicas=3, settings=SETTINGS, seed=3, engine=engine, compile=False
+        GAME.spaces, agents=[0], replicas=3, settings=SETTINGS, seed=3, engine=engine, compile=False
     )
     walker = random_lanes(8, seeds=[(3, replica, 1) for replica in range(3)], agents=1)
     run.mkdir(exist_ok=True)
     with (
-        Checkpointer(run, every_s=every_s, resume=f"python {sys.argv[0]} {run}") as checkpoints,
+        Checkpointer(run, every_s=every_s, resume_command=f"python {sys.argv[0]} {run}") as checkpoints,
         EpisodeTable(run / "episodes.parquet", resumable=True) as table,
     ):
         env = CommonsEnv(GAME, 3, seed=3)
@@ -52,7 +52,7 @@ def main(
             others={(1,): walker},
             episodes=episodes,
             callbacks=[table, *callbacks],
-            checkpoints=checkpoints,
+            checkpointer=checkpoints,
         )
     save_weights(run, learner.networks())
 

@@ -15,7 +15,7 @@ from cprl.process import prepare_process
 from cprl.training import train
 from cprl.viewer.callback import ViewerCallback
 
-SEATS = (0, 1, 2, 3)
+AGENTS = (0, 1, 2, 3)
 
 
 class Leisure:
@@ -34,11 +34,11 @@ def main(run: Path, *, episodes: int = 4000) -> None:
     prepare_process(5)
     game = presets.game("commons")
     game = replace(game, rules=replace(game.rules, episode_steps=100))
-    settings = replace(presets.learner("commons"), buffer_size=2000, hidden_cells=(8,))
-    agents = ReplayLearner(game, agents=SEATS, replicas=2, settings=settings, seed=5, compile=False)
+    settings = replace(presets.dqn_settings("commons"), buffer_size=2000, hidden_cells=(8,))
+    agents = ReplayLearner(game.spaces, agents=AGENTS, replicas=2, settings=settings, seed=5, compile=False)
     env = CommonsEnv(game, 2, seed=5)
     with ViewerCallback(run, env, title="a live training", episodes=episodes, live="serve") as watch:
-        train(env, {SEATS: agents}, episodes=episodes, callbacks=[watch, Leisure()])
+        train(env, {AGENTS: agents}, episodes=episodes, callbacks=[watch, Leisure()])
 
 
 if __name__ == "__main__":

@@ -1,27 +1,44 @@
-"""cprl: common-pool resources and multi-agent reinforcement learning, as a modular TorchRL pipeline.
+"""cprl: common-pool resources and multi-agent reinforcement learning on TorchRL.
 
-The rooms, in the order in which the data flow:
-    keys        every TensorDict entry that is handed on
-    process     what a training wants of the process that it runs in
-    commons     the game: maps, rules, turns; numpy and numba alone
-    envs        doors into it: CommonsEnv for TorchRL
-    acting      from seeing to doing: networks, policies, evaluation
-    learning    from what happened to better values: settings, losses, the learner
-    measuring   from what happened to what it meant: social metrics, episodes
-    recording   what is kept: runs, tables, the Rerun recording, figures
-    presets     the published games and learners by name
-    population  who sits at each seat: learners, scripted and frozen agents
-    train       the loop: act, store, learn, measure, record
-    study       one study from its learners to its report
-    replay      a stored policy plays again, recorded
-    evaluation  stored agents in fresh worlds, among themselves and among each other
-    reporting   finished runs beside the published study
-    cli         the command cprl: watch, replay, report, keep, evaluate, crossplay
+Each imports only from those above it:
+    compat       what relies on private parts of libraries
+    keys         the TensorDict entries, their shapes and types
+    spaces       what agents observe and may do
+    custom       the user's own code, as a text that a recipe can keep
+    process      settings of the process that trains
+    compiling    functions compiled by torch
+    commons      the game: maps, rules, turns; numpy and numba alone
+    envs         TorchRL, PettingZoo, Gymnasium; make_env, where environments are put together
+    networks     from observations to numbers
+    policies     from observations to actions: learned, tabular and scripted agents
+    collectors   one step of all worlds after the other
+    learners     replay and rollouts, updates of many agents at once
+    algorithms   what agents learn by: DQN, PPO, QMIX and so on, frozen values
+    population   how each agent is specified: Learning, Team, Scripted, Frozen
+    config       values as JSON tables, and back
+    presets      the published games and hyper-parameters by name
+    measuring    social metrics, episodes, phases, statistics
+    runs         what is kept of a run: recipe, table of episodes, checkpoints, weights
+    viewer       recordings for the Rerun viewer
+    terminal     progress, summary, figures
+    callbacks    what is called while a training runs
+    training     the loop: act, store, update, measure, record
+    experiment   Experiment: what is trained and how, a value
+    stored       load: a run built again from its directory
+    agents       the learners and policies of a population
+    running      run: an experiment from its learners to its report
+    evaluation   stored agents in fresh worlds, alone and among each other
+    reporting    finished runs beside the published study
+    flags        the fields of an experiment as flags
+    commandline  recipe_main: the command line of a recipe
+    cli          the command cprl
 """
 
-from typing import TYPE_CHECKING, Any
+from importlib import import_module
+from importlib.metadata import version
+from typing import TYPE_CHECKING, Any, Final
 
-from cprl import presets
+from cprl import keys, presets
 from cprl.commons import maps
 from cprl.commons.game import Game
 from cprl.commons.maps import Map
@@ -31,32 +48,54 @@ from cprl.envs import CommonsEnv
 from cprl.training import train
 
 if TYPE_CHECKING:
+    from cprl.commandline import recipe_main
+    from cprl.custom import Custom
     from cprl.evaluation import crossplay, evaluate_run
+    from cprl.experiment import Experiment
+    from cprl.running import run
     from cprl.stored import load
+
+    __version__: str
 
 __all__ = [
     "CommonsEnv",
+    "Custom",
+    "Experiment",
     "Game",
     "Map",
     "Observation",
     "Rules",
+    "__version__",
     "crossplay",
     "evaluate_run",
+    "keys",
     "load",
     "maps",
     "presets",
+    "recipe_main",
+    "run",
     "train",
 ]
 
+_IMPORTED_WHEN_USED: Final = {
+    "Custom": "cprl.custom",
+    "Experiment": "cprl.experiment",
+    "crossplay": "cprl.evaluation",
+    "evaluate_run": "cprl.evaluation",
+    "load": "cprl.stored",
+    "recipe_main": "cprl.commandline",
+    "run": "cprl.running",
+}
+"""Where these names stand; with them come the viewer and all that is recorded, half a second of import."""
+
 
 def __getattr__(name: str) -> Any:
-    """What brings all of recording with it, half a second that only those pay who want it."""
-    if name == "load":
-        from cprl.stored import load
-
-        return load
-    if name in ("crossplay", "evaluate_run"):
-        from cprl import evaluation
-
-        return getattr(evaluation, name)
+    if name == "__version__":
+        return version("cprl")
+    if name in _IMPORTED_WHEN_USED:
+        return getattr(import_module(_IMPORTED_WHEN_USED[name]), name)
     raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+
+
+def __dir__() -> list[str]:
+    return list(__all__)

@@ -1,7 +1,8 @@
-"""The command `cprl`: what can be done with runs that are there."""
+"""The command `cprl`: what can be done with runs that are there. `cprl --version` prints its version."""
 
 import os
 import sys
+from importlib.metadata import version
 from pathlib import Path
 
 import tyro
@@ -11,13 +12,45 @@ from rich.table import Table
 from cprl.evaluation.cross_play import Diagonal
 from cprl.evaluation.cross_play import crossplay as play_each_other
 from cprl.evaluation.evaluate import SEED, evaluate_run
-from cprl.evaluation.film import replay as play_again
-from cprl.evaluation.tables import heading, matrices, run_table, seats_table
+from cprl.evaluation.film import film as film_run
+from cprl.evaluation.tables import agents_table, heading, matrices, run_table
+from cprl.experiment import Experiment
 from cprl.process import prepare_process
 from cprl.reporting import write_report
+from cprl.running import run as run_experiment
+from cprl.runs.directory import read_recipe
 from cprl.runs.export import export_results
 from cprl.runs.labelled import refuse_to_write_over, write_table
 from cprl.viewer.streams import viewer
+
+Allow = tyro.conf.UseAppendAction[tuple[str, ...]]
+"""--allow A --allow B."""
+
+
+def run(
+    recipe: Path,
+    /,
+    *,
+    out: Path | None = None,
+    resume: bool = False,
+    watch: str = "file",
+    allow: Allow = (),
+) -> None:
+    """Trains the experiment of a recipe or of a run anew, or resumes a run that was stopped.
+
+    Args:
+        recipe: a recipe.json, or the directory of a run.
+        out: the new run's directory; by default a new one under runs/, and with --resume the run itself.
+        resume: resume the run, bit for bit as if it had not been stopped.
+        watch: "file", or live as well: "serve", "spawn", "connect ADDRESS"; "off" for no recording.
+        allow: code of your own, module:Class, that the recipe may import; may be repeated.
+    """
+    _make_importable(allow)
+    directory = recipe if recipe.is_dir() else recipe.parent
+    experiment = Experiment.from_recipe(read_recipe(recipe), allow=allow, directory=directory)
+    if resume and out is None:
+        out = directory
+    print(run_experiment(experiment, out, resume=resume, watch=watch, allow=allow, command=sys.argv))
 
 
 def report(runs: tuple[Path, ...], /, *, out: Path = Path("report")) -> None:
@@ -33,20 +66,29 @@ def report(runs: tuple[Path, ...], /, *, out: Path = Path("report")) -> None:
     print(write_report(runs, out))
 
 
-def replay(run: Path, /, *, replica: int = 0, episode: int = 0, out: Path | None = None) -> None:
+def film(
+    run: Path,
+    /,
+    *,
+    replica: int = 0,
+    episode: int = 0,
+    out: Path | None = None,
+    allow: Allow = (),
+) -> None:
     """Lets the agents of a run play a fresh episode, and records every step for the Rerun viewer.
 
     Args:
         run: the run's directory, or its results.
         replica: whose agents.
         episode: which of the fresh episodes; the same number plays the same again.
-        out: the recording; by default replay-<replica>-<episode>.rrd in the run's directory.
+        out: the recording; by default film-<replica>-<episode>.rrd in the run's directory.
+        allow: code of your own, module:Class, that the run may import; see docs/changing.md.
     """
+    _make_importable(allow)
     prepare_process(SEED)
-    path, played = play_again(run, out, replica=replica, episode=episode)
-    harvests = ", ".join(f"{apples:.0f}" for apples in played.harvest)
-    print(f"{played.steps} steps, apples: {harvests}; {played.stock_left} left")
-    print(f"ViewerCallback: {viewer()} {path}")
+    path, played = film_run(run, out, replica=replica, episode=episode, allow=allow)
+    print(f"{played.steps} steps, {played.outcome}")
+    print(f"Watch: {viewer()} {path}")
 
 
 def watch(run: Path, /) -> None:
@@ -62,7 +104,7 @@ def watch(run: Path, /) -> None:
     os.execvp(command[0], command)
 
 
-def keep(run: Path, folder: Path, /) -> None:
+def export(run: Path, folder: Path, /) -> None:
     """Copies what a report needs of a finished run, small enough to be committed.
 
     Args:
@@ -81,8 +123,9 @@ def evaluate(
     seed: int = SEED,
     replicas: tuple[int, ...] = (),
     out: Path | None = None,
+    allow: Allow = (),
 ) -> None:
-    """Lets all replicas of a run play fresh worlds, and tells the social metrics beside the random policy's.
+    """Lets all replicas of a run play fresh worlds, and prints the social metrics beside the random policy's.
 
     Args:
         run: the run's directory, or its results; of one that has not ended the newest checkpoint plays.
@@ -91,14 +134,18 @@ def evaluate(
         seed: of the worlds and all chance; the same one gives the same numbers.
         replicas: their numbers; by default all.
         out: a parquet file to be, with every episode.
+        allow: code of your own, module:Class, that the run may import; see docs/changing.md.
     """
+    _make_importable(allow)
     if out is not None:
         refuse_to_write_over(out)
     prepare_process(seed)
-    evaluation = evaluate_run(run, episodes=episodes, greedy=greedy, seed=seed, replicas=replicas)
+    evaluation = evaluate_run(
+        run, episodes=episodes, greedy=greedy, seed=seed, replicas=replicas, allow=allow
+    )
     if out is not None:
         write_table(out, evaluation.table())
-    _tell(run_table(evaluation))
+    _print(run_table(evaluation))
     print(f"Weights: {evaluation.run.weights_from}")
     if out is not None:
         print(f"Episodes: {out}")
@@ -114,34 +161,43 @@ def crossplay(
     replicas: tuple[int, ...] = (),
     diagonal: Diagonal = "self",
     out: Path | None = None,
+    allow: Allow = (),
 ) -> None:
-    """AgentPolicies each run's agents among each other run's, one visitor at a time, and tells how all fare.
+    """Lets agents of each run play among those of each other run, and prints how all fare.
 
     Args:
         runs: directories of runs of the same game, or their results.
-        episodes: of each replica with the visitor at each seat.
+        episodes: of each replica with each focal agent.
         greedy: whether agents play what they hold best, without exploring or drawing.
         seed: of the worlds and all chance; the same one gives the same numbers.
         replicas: their numbers; by default all that every run has.
-        diagonal: whom a run's agents meet there: "self", those they were trained with, or "strangers", those
+        diagonal: whom a run's agents meet there: "self", those they were trained with, or "cross_seed", those
             of the run's next replica.
         out: a parquet file to be, with every episode.
+        allow: code of your own, module:Class, that the run may import; see docs/changing.md.
     """
+    _make_importable(allow)
     if out is not None:
         refuse_to_write_over(out)
     prepare_process(seed)
     played = play_each_other(
-        runs, episodes=episodes, greedy=greedy, seed=seed, replicas=replicas, diagonal=diagonal
+        runs, episodes=episodes, greedy=greedy, seed=seed, replicas=replicas, diagonal=diagonal, allow=allow
     )
     if out is not None:
         write_table(out, played.table())
     print(heading(played))
-    _tell(*matrices(played), seats_table(played))
+    _print(*matrices(played), agents_table(played))
     if out is not None:
         print(f"Episodes: {out}")
 
 
-def _tell(*tables: Table) -> None:
+def _make_importable(allow: tuple[str, ...]) -> None:
+    """Lets modules in the working directory be imported, as they are for a recipe that stands there."""
+    if allow:
+        sys.path.insert(0, os.getcwd())
+
+
+def _print(*tables: Table) -> None:
     """Prints tables; into a file or pipe as wide as they are."""
     console = Console()
     if not console.is_terminal:
@@ -152,13 +208,17 @@ def _tell(*tables: Table) -> None:
 
 def main() -> None:
     """The command line; what cannot be done is said in a line, and ends with exit code 1."""
+    if sys.argv[1:] == ["--version"]:
+        print(f"cprl {version('cprl')}")
+        return
     try:
         tyro.extras.subcommand_cli_from_dict(
             {
+                "run": run,
                 "watch": watch,
-                "replay": replay,
+                "film": film,
                 "report": report,
-                "keep": keep,
+                "export": export,
                 "evaluate": evaluate,
                 "crossplay": crossplay,
             },

@@ -1,4 +1,4 @@
-"""StepCollector: TorchRL's collector interface for one step a batch, without what the stock one spends."""
+"""StepCollector: a TorchRL collector of one step per batch, without the overhead of the stock one."""
 
 from collections import OrderedDict
 from collections.abc import Iterator
@@ -14,13 +14,13 @@ from torchrl.envs.utils import ExplorationType, set_exploration_type
 
 
 class StepCollector(BaseCollector):
-    """Yields one step of all worlds after the other, batch size [B].
+    """Yields steps of all worlds one by one, batch size [B].
 
-    The same as `Collector(env, policy, frames_per_batch=B)` but for its axis of one time step, which a test
-    holds equal; it stacks, copies and tracks nothing, so what it yields are the environment's own tensors.
+    Equivalent to `Collector(env, policy, frames_per_batch=B)` without its time axis of length 1, as a test
+    checks. It does not stack, copy or track anything: batches contain the environment's own tensors.
 
     Args:
-        env: B worlds, whose steps return fresh tensors.
+        env: B worlds, whose steps return new tensors.
         policy: writes the actions.
     """
 
@@ -28,21 +28,21 @@ class StepCollector(BaseCollector):
         super().__init__()
         self.env, self.policy = env, policy
         self.frames_per_batch = env.batch_size.numel()
-        self._carrier: TensorDictBase | None = None
-        self._iterator: Iterator[TensorDictBase] | None = None
+        self.carried: TensorDictBase | None = None
+        """The input of the environment's next step; None before the first step."""
 
     def iterator(self) -> Iterator[TensorDictBase]:
-        """Endless; the environment is reset when it begins."""
-        if self._carrier is None:
-            self._carrier = self.env.reset()
+        """An endless iterator; resets the environment at its start."""
+        if self.carried is None:
+            self.carried = self.env.reset()
         while True:
             with torch.no_grad(), set_exploration_type(ExplorationType.RANDOM):
-                now, self._carrier = self.env.step_and_maybe_reset(self.policy(self._carrier))
+                now, self.carried = self.env.step_and_maybe_reset(self.policy(self.carried))
             yield now
 
-    def resume_from(self, moment: TensorDictBase) -> None:
-        """Steps on from a moment that the environment was put in, e.g. by `CommonsEnv.load`."""
-        self._carrier = moment
+    def resume_from(self, carried: TensorDictBase) -> None:
+        """Steps the environment with this TensorDict next."""
+        self.carried = carried
 
     def set_seed(self, seed: int, static_seed: bool = False) -> int:
         """Seeds the environment; returns the next seed."""
@@ -51,28 +51,25 @@ class StepCollector(BaseCollector):
     def shutdown(
         self, timeout: float | None = None, close_env: bool = True, raise_on_error: bool = True
     ) -> None:
-        """Closes the environment, if wanted."""
+        """Closes the environment, if `close_env`."""
         if close_env and not self.env.is_closed:
             self.env.close(raise_if_closed=raise_on_error)
 
     def state_dict(self) -> "OrderedDict[str, Any]":
-        """Nothing: environment and policy have states of their own."""
+        """Empty: environment and policy have their own states."""
         return OrderedDict()
 
     def load_state_dict(self, state_dict: "OrderedDict[str, Any]") -> None:
-        """Nothing; see `state_dict`."""
-
-    def __del__(self) -> None:
-        """Nothing is left behind."""
+        """Does nothing; see `state_dict`."""
 
 
 def stock_collector(env: EnvBase, policy: nn.Module, *, steps: int = 1) -> Collector:
-    """TorchRL's own `Collector`, which yields [B, steps]; several times as slow at one step a batch.
+    """TorchRL's own `Collector`, which yields [B, steps]; several times slower at one step per batch.
 
     Args:
         env: B worlds.
         policy: writes the actions.
-        steps: in a batch; agents explore in all of them with the epsilon of the first.
+        steps: steps per batch; agents explore in all of them with the epsilon of the first.
     """
     before = deepcopy(policy.state_dict())
     collector = Collector(
@@ -83,5 +80,5 @@ def stock_collector(env: EnvBase, policy: nn.Module, *, steps: int = 1) -> Colle
         track_traj_ids=False,
         auto_register_policy_transforms=False,
     )
-    policy.load_state_dict(before)  # it was tried once, which took random numbers
+    policy.load_state_dict(before)  # the collector called it once, which consumed random numbers
     return collector

@@ -1,44 +1,47 @@
-"""Compiled: a function that torch compiles, called without guards where its arguments keep their form."""
+"""Compiled: a function compiled by torch, called without guards while shapes and dtypes stay the same."""
 
 import gc
 import warnings
-from collections.abc import Callable, Hashable, Iterator
-from contextlib import contextmanager
-from types import CodeType, FunctionType
+from collections.abc import Callable, Hashable, Sequence
 from typing import Any, Final
 
 import torch
 
-OPTIONS: Final[dict[str, Any]] = {
-    "cpp_wrapper": True,
-    "guard_filter_fn": torch.compiler.skip_all_guards_unsafe,
-}
-"""Of torch.compile, which takes some out of the dict it is given. Guards cost a quarter of an update of 16
-lanes; whoever calls tells the form instead."""
+from cprl.compat import COMPILE_OPTIONS, code_written_for, with_own_code, without_lookup
+
+TOLERANCE: Final = 1e-4
+"""The tolerance between float32 results of the same operations in another order."""
 
 
 class Compiled:
     """A function of tensors, compiled at its first call and again when the form of its arguments changes.
 
-    Where it cannot be compiled a warning says so once, and it runs as it is.
+    The form comprises everything but the values of tensors. At the first call with a form the function also
+    runs uncompiled, on copies, and the results are compared. If compilation fails or the results differ, it
+    warns once and runs uncompiled from then on. Functions that draw random numbers are not compared, because
+    compiled code may draw different ones.
 
     Args:
-        function: a plain function; whatever it reads besides tensors is taken as it was at the first call.
-        what: what it does, for the warning.
-        enabled: whether it is compiled at all.
+        function: a plain function; values other than tensors are constants from the first call on.
+        what: who acts, for warnings, which continue with "uncompiled", e.g. "agents act".
+        changes: the positions of the arguments that it changes in place, tensors or lists of tensors.
+        enabled: whether it is compiled.
     """
 
-    def __init__(self, function: Callable[..., Any], *, what: str, enabled: bool = True) -> None:
+    def __init__(
+        self, function: Callable[..., Any], *, what: str, changes: Sequence[int] = (), enabled: bool = True
+    ) -> None:
         self._plain, self._what, self.enabled = function, what, enabled
+        self._changes = tuple(changes)
         self._compiled: Callable[..., Any] | None = None
         self._form: Hashable = None
 
     def __call__(self, form: Hashable, *arguments: Any) -> Any:
-        """What the function gives.
+        """Calls the function.
 
         Args:
-            form: all that may change of the arguments but their values: shapes, types, numbers.
-            arguments: of the function.
+            form: all that may change about the arguments except tensor values: shapes, dtypes, numbers.
+            arguments: the arguments of the function.
         """
         if not self.enabled:
             return self._plain(*arguments)
@@ -48,12 +51,15 @@ class Compiled:
         return self._compile_and_call(*arguments)
 
     def _compile_and_call(self, *arguments: Any) -> Any:
-        """The first call with this form; where it cannot be compiled, nothing has been changed yet."""
-        own = _own_code(self._plain)
-        self._compiled = torch.compile(own, fullgraph=True, options=dict(OPTIONS))
+        """The first call with a form; if compilation fails, no argument has been changed yet."""
+        before = self._copies(arguments)
+        reference = self._outcome(before)
+        own = with_own_code(self._plain)
+        options = dict(COMPILE_OPTIONS)  # a copy, because torch removes entries
+        self._compiled = torch.compile(own, fullgraph=True, options=options)
         try:
-            with warnings.catch_warnings(), _rewritten(own) as codes:
-                for kind in (DeprecationWarning, FutureWarning):  # torch's and TorchRL's own affairs
+            with warnings.catch_warnings(), code_written_for(own) as codes:
+                for kind in (DeprecationWarning, FutureWarning):  # raised inside torch and TorchRL
                     warnings.simplefilter("ignore", kind)
                 result = self._compiled(*arguments)
         except Exception as error:
@@ -65,36 +71,74 @@ class Compiled:
             )
             return self._plain(*arguments)
         if codes:
-            # What the function has become, called without looking for it at every call, which takes half of
-            # torch's time around the computation. With globals of its own: torch clears away its own names.
-            self._compiled = FunctionType(codes[-1], dict(own.__globals__), own.__name__)
-        # A compiler leaves millions of objects that stay; without this Python's garbage collector looks
-        # through them again and again, which takes up to a third of a training.
+            self._compiled = without_lookup(own, codes)
+        # Compilation leaves millions of permanent objects. Without freezing, Python's garbage collector scans
+        # them again and again, which takes up to a third of a training.
         gc.collect()
         gc.freeze()
-        return result
+        difference = largest_difference([result, *(arguments[place] for place in self._changes)], reference)
+        if difference is None or self._is_random(before):
+            return result
+        self.enabled = False
+        warnings.warn(
+            f"the results of compiled code differ by up to {difference:.3g} from uncompiled code, "
+            f"{self._what} uncompiled and several times slower",
+            RuntimeWarning,
+            stacklevel=4,
+        )
+        for place, right in zip(self._changes, reference[1:], strict=True):
+            for tensor, value in zip(tensors_in(arguments[place]), tensors_in(right), strict=True):
+                tensor.copy_(value)
+        return reference[0]
+
+    def _copies(self, arguments: Sequence[Any]) -> list[Any]:
+        """The arguments, with copies of those that the function changes."""
+        return [copied(own) if place in self._changes else own for place, own in enumerate(arguments)]
+
+    def _outcome(self, arguments: Sequence[Any], *, seed: int | None = None) -> list[Any]:
+        """The result of the plain function, and the changed arguments as copies; the arguments and torch's
+        generators are left unchanged."""
+        own = self._copies(arguments)
+        with torch.random.fork_rng(devices=range(torch.cuda.device_count())):
+            if seed is not None:
+                torch.manual_seed(seed)
+            result = self._plain(*own)
+        return [result, *(own[place] for place in self._changes)]
+
+    def _is_random(self, arguments: Sequence[Any]) -> bool:
+        """Whether the result of the plain function depends on torch's seed."""
+        first, second = (self._outcome(arguments, seed=seed) for seed in (1, 2))
+        return largest_difference(first, second) is not None
 
 
-@contextmanager
-def _rewritten(function: FunctionType) -> Iterator[list[CodeType]]:
-    """While it is open, the code that torch writes in place of a function's is put into the list."""
-    from torch._dynamo.convert_frame import register_bytecode_hook  # takes seconds
-
-    codes: list[CodeType] = []
-
-    def keep(code: CodeType, new_code: CodeType) -> None:
-        if code is function.__code__:
-            codes.append(new_code)
-
-    hook = register_bytecode_hook(keep)
-    try:
-        yield codes
-    finally:
-        hook.remove()
+def copied(value: Any) -> Any:
+    """A copy of a tensor, or of a list of tensors."""
+    return [copied(own) for own in value] if isinstance(value, list) else value.clone()
 
 
-def _own_code(function: Any) -> FunctionType:
-    """The same function with a code object of its own: torch keeps what it compiled by code object, and
-    would take learners of another size for a change of shapes."""
-    code = function.__code__.replace(co_name=f"{function.__name__}_of_its_own")
-    return FunctionType(code, function.__globals__, code.co_name)
+def tensors_in(value: Any) -> list[torch.Tensor]:
+    """The tensors of a tensor or of nested lists, in order."""
+    return [tensor for own in value for tensor in tensors_in(own)] if isinstance(value, list) else [value]
+
+
+def largest_difference(results: Sequence[Any], reference: Sequence[Any]) -> float | None:
+    """The largest difference between tensors that do not agree; None if all agree.
+
+    Numbers agree within `TOLERANCE`, or a thousandth of the largest number of their tensor if that is less.
+    One number in a hundred of a tensor, and at least one of more than ten, may differ more: the first updates
+    of Adam and RMSprop turn a gradient that is only rounding error into a full step.
+    """
+    pairs = list(zip(tensors_in(list(results)), tensors_in(list(reference)), strict=True))
+    if all(_agree(*pair) for pair in pairs):
+        return None
+    return max(float((one.double() - other.double()).abs().max()) for one, other in pairs if one.numel())
+
+
+def _agree(result: torch.Tensor, reference: torch.Tensor) -> bool:
+    size = reference.numel()
+    if not size:
+        return True
+    scale = float(reference.double().abs().max()) if reference.isfinite().all() else 1.0
+    near = min(TOLERANCE, 10 * TOLERANCE * scale) + 1e-8
+    off = ~torch.isclose(result.double(), reference.double(), TOLERANCE, near, equal_nan=True)
+    return int(off.sum()) <= (max(1, size // 100) if size > 10 else 0)

@@ -1,152 +1,279 @@
-"""One study from its learners to its report: train, keep, evaluate on fresh worlds, summarise."""
+"""Experiment: everything that decides a training, as a value that a run's recipe holds."""
 
-from contextlib import AbstractContextManager, nullcontext
-from dataclasses import replace
-from datetime import datetime
+import os
+from collections.abc import Callable, Iterable, Mapping
+from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, Final, Literal, get_args
 
-from cprl.collectors import StepCollector
-from cprl.envs.commons_env import CommonsEnv
-from cprl.learners.rollouts import RolloutLearner
-from cprl.measuring.episodes import Episode
-from cprl.measuring.evaluate import evaluate
-from cprl.population import Population
-from cprl.runs.checkpoints import Checkpointer
-from cprl.runs.directory import read_recipe, write_json
-from cprl.runs.episodes import EpisodeTable
-from cprl.runs.weights import save_weights
-from cprl.terminal.figures import training_curve
-from cprl.terminal.progress import ProgressBar
-from cprl.terminal.summary import summarise
-from cprl.training import MakeCollector, Training, train
-from cprl.viewer.callback import ViewerCallback
+import torch
+
+from cprl.algorithms import Tabular
+from cprl.algorithms.base import TeamAlgorithm, TrainingEngine
+from cprl.commons.game import Game
+from cprl.config import custom_targets, differences, fields_from_config, fields_to_config
+from cprl.custom import Custom
+from cprl.envs.make_env import PlayableGame
+from cprl.population import AgentSpec, Frozen, Learning, Team, specs_by_agent
+from cprl.runs.old_recipes import experiment_config
+
+LoggerName = Literal["csv", "tensorboard", "wandb"]
+LOGGERS: Final[tuple[LoggerName, ...]] = get_args(LoggerName)
+FORMAT: Final = 2
+"""Of `recipe.json`; those of before, which had "arguments", are read too."""
+MOST_SEED: Final = 2**64 - 2
+"""Evaluation plays worlds of the next seed."""
 
 
-def conduct(
-    run: Path,
-    population: Population,
-    *,
-    episodes: int,
-    title: str,
-    evaluation_episodes: int = 20,
-    update_every: int = 1,
-    make_collector: MakeCollector = StepCollector,
-    watch: str = "file",
-) -> Path:
-    """Trains the agents of all replicas, evaluates them on fresh worlds, and writes and prints the outcome.
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Experiment:
+    """What is trained and how; equals what `recipe.json` holds.
 
-    A run that was stopped is gone on with from its newest checkpoint.
+    Lists become tuples. Two are equal where their recipes are.
 
-    Args:
-        run: the run's directory, see `cprl.recording.start_run`.
-        population: who sits at the seats of every replica.
-        episodes: how many each replica trains.
-        title: what is run, for tables and figures.
-        evaluation_episodes: fresh episodes for each replica, in which learners of values explore with
-            `epsilon_evaluation`; and for the random policy at all seats.
-        update_every: steps k after which agents learn, then k times.
-        make_collector: what plays; see `cprl.training.Training`.
-        watch: "file" for a recording to look at in the Rerun viewer; with "serve", "spawn" or "connect
-            ADDRESS" live as well, see `cprl.viewer.streams.open_live`; "off" for none.
-
-    Returns:
-        The run's directory, now with `episodes.parquet`, `run.rrd`, `checkpoints/final.pt`, `evaluation/`,
-        `figures/` and `report.json`, which says how long it took.
+    Raises:
+        ValueError: names the field, what came and what is allowed.
     """
-    env = CommonsEnv(population.game, population.replicas, seed=population.seed)
-    with _watched(watch, run, env, title=title, episodes=episodes) as viewer:
-        training = _train(
-            run,
-            env,
-            population,
-            viewer,
-            episodes=episodes,
-            update_every=update_every,
-            make_collector=make_collector,
-        )
-        save_weights(run, population.networks())
-    played = evaluate_population(population, worlds=evaluation_episodes)
-    write_json(
-        run / "report.json",
-        {"training_s": round(training.spent_s, 1), "steps": training.steps, "finished": _now()},
+
+    name: str
+    """What it is called: of the recipe, and of the run's directory."""
+    game: Game | Custom | PlayableGame
+    """What is played."""
+    agents: tuple[AgentSpec, ...]
+    """How each agent is specified; see `cprl.population`."""
+    episodes: int
+    """Episodes that each replica trains, at least 1."""
+    replicas: int = 1
+    """Independent repetitions R of the whole training, side by side."""
+    seed: int = 0
+    """Of chance, weights, exploration and replay; 0 to 2**64 - 2."""
+    evaluation_episodes: int = 20
+    """Fresh episodes of each replica after training, and of the random policy."""
+    update_every: int = 1
+    """Environment steps k after which agents learn, then k times."""
+    transforms: tuple[Custom, ...] = ()
+    """TorchRL transforms of the environment, the first one nearest to it."""
+    callbacks: tuple[Custom, ...] = ()
+    """Callbacks of the training; see `cprl.training`."""
+    loggers: tuple[LoggerName | Custom, ...] = ()
+    """TorchRL's loggers that get every series: "csv", "tensorboard", "wandb", or one of your own."""
+    device: str = "cpu"
+    """Where agents learn, e.g. "cpu" or "cuda:0"."""
+    engine: TrainingEngine = "compiled"
+    """How updates are computed: "compiled" by torch, several times faster and in need of a C++ compiler;
+    "eager", the same uncompiled; "torchrl", stock TorchRL, one agent after the other."""
+
+    def __post_init__(self) -> None:
+        for name in ("agents", "transforms", "callbacks", "loggers"):
+            given = getattr(self, name)
+            if isinstance(given, list):
+                object.__setattr__(self, name, tuple(given))
+        _check_kinds(self)
+        self.to_config()
+        _check_numbers(self)
+        _check_agents(self)
+        _check_engine(self)
+
+    def to_config(self) -> dict[str, Any]:
+        """Its fields as JSON can hold them."""
+        return fields_to_config(self, "experiment", instead={"game": _stored_game(self.game)})
+
+    @classmethod
+    def from_config(cls, table: Mapping[str, Any], *, allow: Iterable[str] = ()) -> "Experiment":
+        """The experiment that `to_config` gave; of the modules that it names only a game's is imported.
+
+        Args:
+            table: its fields.
+            allow: the targets of `Custom` that it may hold, "module:Class" each.
+
+        Raises:
+            ValueError: for what is not known, does not fit or is not allowed; by the place where it stands.
+        """
+        read = fields_from_config(cls, table, "experiment", allow=allow)
+        return read if not isinstance(read.game, Custom) else replace(read, game=_game(read.game))
+
+    def to_recipe(self, directory: str | Path | None = None) -> dict[str, Any]:
+        """What `recipe.json` says of it; `cprl.runs.directory.start_run` adds when and from what it was run.
+
+        Args:
+            directory: where the recipe is kept: runs of `Frozen` are then given relative to it.
+        """
+        stored = self if directory is None else frozen_relative_to(self, directory)
+        return {"format": FORMAT, "recipe": self.name, "experiment": stored.to_config()}
+
+    @classmethod
+    def from_recipe(
+        cls,
+        recipe: Mapping[str, Any],
+        *,
+        allow: Iterable[str] = (),
+        directory: str | Path | None = None,
+    ) -> "Experiment":
+        """The experiment of a recipe, of today's format or of any before.
+
+        Args:
+            recipe: what `recipe.json` holds.
+            allow: the targets of `Custom` that it may hold, "module:Class" each.
+            directory: where the recipe is kept; runs of `Frozen` are then relative to where we stand.
+
+        Raises:
+            ValueError: see `from_config`; for another format.
+        """
+        experiment = cls.from_config(recipe_config(recipe), allow=allow)
+        return experiment if directory is None or _is_old(recipe) else frozen_from(experiment, directory)
+
+    def __eq__(self, other: object) -> bool:
+        return self.to_config() == other.to_config() if isinstance(other, Experiment) else NotImplemented
+
+    def __hash__(self) -> int:
+        return hash((self.name, self.episodes, self.replicas, self.seed))
+
+
+def recipe_config(recipe: Mapping[str, Any]) -> dict[str, Any]:
+    """The experiment of a recipe, of today's format or of any before, as `Experiment.to_config` gives it.
+
+    Raises:
+        ValueError: for another format, and for one of before that lacks what each had.
+    """
+    if not _is_old(recipe):
+        if recipe.get("format") != FORMAT or not isinstance(recipe.get("experiment"), Mapping):
+            raise ValueError(f"the recipe has the format {recipe.get('format')!r}; allowed: {FORMAT}")
+        return dict(recipe["experiment"])
+    try:
+        table = experiment_config(recipe)
+    except (KeyError, TypeError) as error:
+        raise ValueError(f"the recipe holds no game and agents of cprl: {error!r}") from error
+    for agent in table["agents"]:
+        if agent["kind"] == "Frozen":  # absolute at that time
+            agent["run"] = os.path.relpath(agent["run"])
+    return table
+
+
+def frozen_relative_to(experiment: Experiment, directory: str | Path) -> Experiment:
+    """The same with the runs of `Frozen`, relative to where we stand, relative to a directory."""
+    return _with_runs(experiment, lambda run: os.path.relpath(run, directory))
+
+
+def frozen_from(experiment: Experiment, directory: str | Path) -> Experiment:
+    """The same with the runs of `Frozen`, relative to a directory, relative to where we stand."""
+    return _with_runs(experiment, lambda run: os.path.relpath(Path(directory) / run))
+
+
+def changes(before: Experiment, now: Experiment) -> list[str]:
+    """How two experiments differ, a sentence for each place."""
+    return differences(before.to_config(), now.to_config(), "experiment")
+
+
+def _is_old(recipe: Mapping[str, Any]) -> bool:
+    return "arguments" in recipe and "format" not in recipe
+
+
+def _with_runs(experiment: Experiment, moved: Callable[[str], str]) -> Experiment:
+    agents = tuple(
+        replace(spec, run=moved(spec.run)) if isinstance(spec, Frozen) else spec for spec in experiment.agents
     )
-    for name, of_policy in played.items():
-        _keep(run / "evaluation" / f"{name}.parquet", of_policy, evaluation_episodes)
-    figure = training_curve(run, title=title, random=played["random"])
-    told = {"random": played["random"], f"trained{_epsilon(population)}": played["trained"]}
-    summarise(run, title=title, played=told, figure=figure)
-    return run
+    return experiment if agents == experiment.agents else replace(experiment, agents=agents)
 
 
-def _train(
-    run: Path,
-    env: CommonsEnv,
-    population: Population,
-    viewer: ViewerCallback | None,
-    *,
-    episodes: int,
-    **how: Any,
-) -> Training:
-    """Trains and keeps what happens, from the newest checkpoint on if there is one."""
-    can_go_on = how["make_collector"] is StepCollector
-    with (
-        Checkpointer(run, log_event=viewer.log_event if viewer else None) as checkpoints,
-        EpisodeTable(run / "episodes.parquet", resumable=True) as table,
-        ProgressBar(population.game, episodes=episodes, replicas=population.replicas) as bar,
-    ):
-        return train(
-            env,
-            population.learners,
-            others=population.others,
-            episodes=episodes,
-            callbacks=[table, bar, *([viewer] if viewer else [])],
-            checkpoints=checkpoints if can_go_on else None,
-            **how,
+def _stored_game(game: object) -> object:
+    """As a recipe holds it: a game of the user's by the name of its class."""
+    if isinstance(game, Game | Custom) or not isinstance(game, PlayableGame):
+        return game
+    kind = type(game)
+    if "<" in kind.__qualname__:
+        raise ValueError(
+            f"experiment.game is a {kind.__qualname__}, which no recipe can name; allowed: a class at the "
+            "top of a module"
         )
+    return Custom(f"{kind.__module__}:{kind.__qualname__}", arguments=game.to_config())
 
 
-def evaluate_population(population: Population, *, worlds: int) -> dict[str, list[Episode]]:
-    """Fresh episodes, so many of each replica: of the "random" policy, and of everybody as "trained"."""
-    fresh = CommonsEnv(population.game, population.replicas * worlds, seed=population.seed + 1)
-    return {
-        "random": evaluate(fresh, population.random_policy(worlds)),
-        "trained": evaluate(fresh, population.policy(worlds), explore=True),
-    }
+def _game(stored: Custom) -> Custom | PlayableGame:
+    """The game whose class and arguments these are; the same where they only make one."""
+    kind = stored.resolve()
+    if not (isinstance(kind, type) and hasattr(kind, "to_config") and hasattr(kind, "make")):
+        return stored
+    try:
+        game = kind(**{name: _tuples(value) for name, value in stored.arguments.items()})
+    except (TypeError, ValueError) as error:
+        raise ValueError(f"experiment.game: {stored.target} does not take its arguments: {error}") from error
+    return game if isinstance(game, PlayableGame) and _stored_game(game) == stored else stored
 
 
-def _epsilon(population: Population) -> str:
-    """With what chance learners of values explore in evaluation, for people; others draw from a policy."""
-    chances = {
-        learner.settings.epsilon_evaluation
-        for learner in population.learners.values()
-        if not isinstance(learner, RolloutLearner) and not learner.actor.stochastic
-    }
-    return "".join(f", epsilon {chance:g}" for chance in sorted(chances))
+def _tuples(value: Any) -> Any:
+    return tuple(map(_tuples, value)) if isinstance(value, list) else value
 
 
-def _watched(
-    watch: str, run: Path, env: CommonsEnv, *, title: str, episodes: int
-) -> AbstractContextManager[ViewerCallback | None]:
-    if watch == "off":
-        return nullcontext()
-    live = None if watch == "file" else watch
-    recipe = read_recipe(run)
-    told = {name: recipe.get(name) for name in ("command", "started", "git", "versions")}
-    return ViewerCallback(
-        run, env, title=title, episodes=episodes, recipe={**told, **recipe["arguments"]}, live=live
-    )
+def _check_kinds(experiment: Experiment) -> None:
+    if not isinstance(experiment.game, Game | Custom | PlayableGame):
+        raise ValueError(
+            f"experiment.game is a {type(experiment.game).__name__}; allowed: a Game, a Custom, or a value "
+            "with `agents`, `to_config` and `make`"
+        )
+    if not isinstance(experiment.agents, tuple):
+        kind = type(experiment.agents).__name__
+        raise ValueError(f"experiment.agents is a {kind}; allowed: a tuple of specifications")
+    for place, spec in enumerate(experiment.agents):
+        if not isinstance(spec, AgentSpec):
+            raise ValueError(
+                f"experiment.agents[{place}] is a {type(spec).__name__}; allowed: Learning, Team, Scripted, "
+                "Frozen of cprl.population"
+            )
 
 
-def _keep(path: Path, played: list[Episode], of_replica: int) -> None:
-    """Writes episodes on fresh worlds, so many of each replica, as a table; again where one is there."""
-    path.parent.mkdir(exist_ok=True)
-    path.unlink(missing_ok=True)
-    with EpisodeTable(path) as table:
-        for number, episode in enumerate(played):
-            replica, nth = divmod(number, of_replica)
-            table.add(replace(episode, world=replica, episode=nth))
+def _check_numbers(experiment: Experiment) -> None:
+    name = experiment.name
+    if name in ("", ".", "..") or Path(name).name != name or "\\" in name:
+        raise ValueError(f"experiment.name is {name!r}; allowed: the name of a directory, without slashes")
+    for field in ("episodes", "replicas", "evaluation_episodes", "update_every"):
+        if getattr(experiment, field) < 1:
+            raise ValueError(
+                f"experiment.{field} is {getattr(experiment, field)}; allowed: a whole number from 1"
+            )
+    if not 0 <= experiment.seed <= MOST_SEED:
+        raise ValueError(f"experiment.seed is {experiment.seed}; allowed: 0 to 2**64 - 2")
+    try:
+        torch.device(experiment.device)
+    except RuntimeError as error:
+        raise ValueError(f'experiment.device is {experiment.device!r}; allowed: "cpu", "cuda:0"') from error
+    for target in custom_targets(experiment.to_config()):
+        if target.startswith("__main__:"):
+            raise ValueError(
+                f"experiment has {target}, of the script that runs, which nothing else can import; allowed: "
+                "a module of its own, and its name"
+            )
 
 
-def _now() -> str:
-    return datetime.now().astimezone().isoformat(timespec="seconds")
+def _check_agents(experiment: Experiment) -> None:
+    if not isinstance(experiment.game, Custom):
+        try:
+            specs_by_agent(experiment.agents, experiment.game.agents)
+        except ValueError as error:
+            raise ValueError(f"experiment.agents: {error}") from error
+    for place, spec in enumerate(experiment.agents):
+        where = f"experiment.agents[{place}]"
+        if isinstance(spec, Frozen) and Path(spec.run).is_absolute():
+            raise ValueError(
+                f"{where}.run is {spec.run}, an absolute path, which is another one on another machine; "
+                "allowed: a path relative to where we stand"
+            )
+        if isinstance(spec, Team) and isinstance(spec.algorithm, TeamAlgorithm):
+            spec.algorithm._check_team(len(spec.agents), spec.reward)
+        steps = getattr(getattr(getattr(spec, "algorithm", None), "settings", None), "rollout_steps", None)
+        if steps is not None and steps % experiment.update_every:
+            raise ValueError(
+                f"experiment.update_every is {experiment.update_every}; it must divide "
+                f"{where}.algorithm.settings.rollout_steps, {steps}"
+            )
+
+
+def _check_engine(experiment: Experiment) -> None:
+    if experiment.engine != "torchrl":
+        return
+    for place, spec in enumerate(experiment.agents):
+        if isinstance(spec, Team) or (isinstance(spec, Learning) and isinstance(spec.algorithm, Tabular)):
+            what = "a Team" if isinstance(spec, Team) else "Tabular"
+            raise ValueError(
+                f'experiment.agents[{place}] is {what}, which engine="torchrl" cannot train; allowed: '
+                '"compiled", "eager"'
+            )

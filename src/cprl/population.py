@@ -1,254 +1,152 @@
-"""Population: who sits at each seat of a game, in every replica: learners, scripted and frozen agents."""
+"""How each agent of a population is specified: plain values.
 
-from collections.abc import Callable, Iterable, Sequence
+A population is a sequence of specifications. A `Team` stands once and names its agents; the others take the
+remaining agent indices in order.
+"""
+
+from collections.abc import Sequence
 from dataclasses import dataclass
-from pathlib import Path
-from typing import Any, TypeAlias, get_args
+from typing import TypeAlias, get_args
 
-import torch
-from torch import Tensor, nn
-
-from cprl.algorithms.registry import Algorithm, told
-from cprl.algorithms.tabular import Tabular
-from cprl.algorithms.teams import TeamAlgorithm, check_team
-from cprl.commons.game import Game
-from cprl.learners.lanes import EVALUATION, EXPLORATION, lane_seeds
-from cprl.learners.replay import ReplayLearner
-from cprl.learners.rollouts import RolloutLearner
-from cprl.learners.settings import DQNSettings, RolloutSettings
-from cprl.learners.tabular import TabularLearner
+from cprl.algorithms.base import Algorithm, TeamAlgorithm
+from cprl.custom import Custom
 from cprl.learners.transitions import RewardKind
-from cprl.policies.assignment import AgentIndices, AgentPolicies
-from cprl.policies.lanes import LaneActor, random_agents
-from cprl.policies.scripted import ScriptedPolicy, scripted_lanes
-from cprl.stored import load
-
-AnyLearner: TypeAlias = ReplayLearner | RolloutLearner | TabularLearner
+from cprl.policies.scripted import SCRIPTED_POLICIES, ScriptedPolicy
 
 
 @dataclass(frozen=True)
-class Learner:
-    """A seat whose agent learns. Equal ones are lanes of one step.
+class Learning:
+    """An agent that learns on its own. Equal ones are updated together, as lanes of one engine.
 
     Args:
-        algorithm: e.g. `cprl.learning.DQN(settings=...)`.
-        reward_kind: "own", the agent's own reward, or "group", the sum of all agents' rewards.
+        algorithm: e.g. `cprl.algorithms.DQN(settings=...)`.
+        reward: "individual", the agent's own reward, or "team", the sum of the rewards of all agents of the
+            game.
     """
 
-    algorithm: Algorithm
-    reward_kind: RewardKind = "own"
+    algorithm: Algorithm | Custom
+    reward: RewardKind = "individual"
 
     def __post_init__(self) -> None:
-        if self.reward_kind not in get_args(RewardKind):
-            raise ValueError(f"paid is {self.reward_kind!r}; allowed: {', '.join(get_args(RewardKind))}")
+        _check_reward(self.reward)
+        _check_algorithm(self.algorithm, Algorithm)
+        if isinstance(self.algorithm, TeamAlgorithm):
+            name = type(self.algorithm).__name__
+            raise ValueError(
+                f"{name} is learned by a team: Team({name}(...), agents=(0, 1)) says which agents it has"
+            )
+
+
+@dataclass(frozen=True)
+class Team:
+    """Agents that learn together; a team in every replica.
+
+    Args:
+        algorithm: e.g. `cprl.algorithms.QMIX(settings=...)`.
+        agents: their indices, ascending.
+        reward: "team", the sum of the rewards of all agents of the game; or "individual", for IPPO alone.
+    """
+
+    algorithm: TeamAlgorithm | Custom
+    agents: tuple[int, ...]
+    reward: RewardKind = "team"
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "agents", tuple(self.agents))
+        _check_reward(self.reward)
+        _check_algorithm(self.algorithm, TeamAlgorithm)
+        if not self.agents or list(self.agents) != sorted(set(self.agents)) or self.agents[0] < 0:
+            raise ValueError(f"Team.agents is {self.agents}; allowed: ascending agent indices, at least one")
 
 
 @dataclass(frozen=True)
 class Scripted:
-    """A seat whose agent follows a rule; see `cprl.policies.scripted`.
-
-    Args:
-        policy: which.
-    """
+    """An agent that follows a rule and does not learn; see `cprl.policies.scripted`."""
 
     policy: ScriptedPolicy = "random"
+
+    def __post_init__(self) -> None:
+        if self.policy not in SCRIPTED_POLICIES:
+            raise ValueError(f"policy is {self.policy!r}; allowed: {', '.join(SCRIPTED_POLICIES)}")
 
 
 @dataclass(frozen=True)
 class Frozen:
-    """A seat whose agent plays what an earlier run learned, and learns no more; the same in every replica.
+    """An agent that plays what an agent of an earlier run learned, the same in every replica.
 
     Args:
-        run: the run's directory, or its results.
-        agent: which of its agents.
-        replica: of which replica.
+        run: the directory of the run, or of its results.
+        agent: the index of the agent in that run.
+        replica: the replica of that run.
     """
 
-    run: str | Path
+    run: str
     agent: int
     replica: int = 0
 
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "run", str(self.run))
+        for name in ("agent", "replica"):
+            if getattr(self, name) < 0:
+                raise ValueError(f"Frozen.{name} is {getattr(self, name)}; allowed: an integer >= 0")
 
-Member: TypeAlias = Learner | Scripted | Frozen
+
+AgentSpec: TypeAlias = Learning | Team | Scripted | Frozen
 
 
-class Population:
-    """The agents of R replicas, one for each seat of the game, in any mix.
-
-    Args:
-        game: what is played.
-        members: who sits at seat 0, 1 and so on.
-        replicas: how many replicas R, the worlds of a training.
-        seed: of the run; each agent of each replica has random numbers of its own.
-        first_replica: the number of the first replica, so that replica r can be trained alone.
-        compile: whether acting and learning are compiled by torch.
-        device: where agents learn.
+def specs_by_agent(specs: Sequence[AgentSpec], agents: int) -> list[AgentSpec]:
+    """The specification of each of N agents; that of a team for each of its members.
 
     Raises:
-        ValueError: for more or fewer members than seats, and for members that do not fit the game or each
-            other; says what fits.
+        ValueError: where agents remain without a specification, or have two.
     """
-
-    def __init__(
-        self,
-        game: Game,
-        members: Sequence[Member],
-        *,
-        replicas: int = 1,
-        seed: int = 0,
-        first_replica: int = 0,
-        compile: bool = True,
-        device: str | torch.device = "cpu",
-    ) -> None:
-        if len(members) != game.agents:
-            raise ValueError(
-                f"{len(members)} members for a game of {game.agents} seats; one for each is wanted"
-            )
-        self.game, self.members = game, tuple(members)
-        self.replicas, self.seed, self._first = replicas, seed, first_replica
-        self.learners: dict[AgentIndices, AnyLearner] = {
-            agents: _learner(
-                member,
-                game,
-                agents=agents,
-                replicas=replicas,
-                seed=seed,
-                first_replica=first_replica,
-                compile=compile,
-                device=device,
-            )
-            for member, agents in self._seats_of(Learner)
-        }
-        self.others: dict[AgentIndices, nn.Module] = self._others(EXPLORATION)
-
-    def _seats_of(self, kind: type[Any]) -> Iterable[tuple[Any, tuple[int, ...]]]:
-        """Each different member of a kind, and where its like sit."""
-        of_kind = [member for member in self.members if isinstance(member, kind)]
-        for number, member in enumerate(of_kind):
-            if member not in of_kind[:number]:
-                yield member, tuple(agent for agent, other in enumerate(self.members) if other == member)
-
-    def _others(self, purpose: int, *, worlds: int = 1) -> dict[AgentIndices, nn.Module]:
-        """The actors of the members that do not learn, with random numbers for a purpose."""
-        actors: dict[AgentIndices, nn.Module] = {}
-        for kind, make in ((Scripted, _scripted), (Frozen, _frozen)):
-            for member, agents in self._seats_of(kind):
-                replicas = range(self._first, self._first + self.replicas)
-                seeds = lane_seeds(self.seed, replicas=replicas, agents=agents, purpose=purpose)
-                actors[agents] = make(member, self.game, seeds=seeds, agents=len(agents), worlds=worlds)
-        return actors
-
-    def policy(self, worlds: int) -> AgentPolicies:
-        """Everybody as they are now, in so many worlds of each replica side by side; the learners of values
-        with `epsilon_evaluation`."""
-        learned: dict[AgentIndices, nn.Module] = {
-            agents: learner.evaluation_actor(worlds) for agents, learner in self.learners.items()
-        }
-        return AgentPolicies({**learned, **self._others(EVALUATION, worlds=worlds)})
-
-    def random_policy(self, worlds: int) -> AgentPolicies:
-        """Everybody's seats taken by agents to whom every action is equally likely."""
-        everyone = tuple(range(self.game.agents))
-        return AgentPolicies(
-            random_agents(self.game, everyone, replicas=self.replicas, seed=self.seed, worlds=worlds)
+    by_agent: dict[int, AgentSpec] = {}
+    for spec in specs:
+        for agent in spec.agents if isinstance(spec, Team) else ():
+            if agent in by_agent:
+                raise ValueError(f"agent {agent} is in two teams; allowed: one specification for each agent")
+            if agent >= agents:
+                raise ValueError(f"a team has agent {agent}; the game has the agents 0 to {agents - 1}")
+            by_agent[agent] = spec
+    alone = [spec for spec in specs if not isinstance(spec, Team)]
+    left = [agent for agent in range(agents) if agent not in by_agent]
+    if len(alone) != len(left):
+        raise ValueError(
+            f"{len(alone) + len(by_agent)} agents are specified for a game of {agents} agents; "
+            "allowed: one specification for each"
         )
-
-    def networks(self) -> dict[str, nn.Module]:
-        """A copy of each learner's acting network as it is now, by "replica_0/agent_0" and so on."""
-        return {
-            name: network
-            for learner in self.learners.values()
-            for name, network in learner.networks().items()
-        }
-
-    def told(self) -> list[dict[str, Any]]:
-        """What `cprl.load` builds it from again; a recipe keeps it as "population"."""
-        return [_told(member) for member in self.members]
+    by_agent.update(zip(left, alone, strict=True))
+    return [by_agent[agent] for agent in range(agents)]
 
 
-def _learner(
-    member: Learner,
-    game: Game,
-    *,
-    agents: tuple[int, ...],
-    compile: bool,
-    device: str | torch.device,
-    **who: Any,
-) -> AnyLearner:
-    algorithm = member.algorithm
-    who |= {"agents": agents, "reward_kind": member.reward_kind}
-    if isinstance(algorithm, Tabular):
-        algorithm.network(game)  # refuses a game of which it would not see all
-        return TabularLearner(game, settings=algorithm.settings, **who)
+def grouped(specs: Sequence[AgentSpec], agents: int) -> list[tuple[AgentSpec, tuple[int, ...]]]:
+    """Each specification with the indices of its agents: equal ones together, each team by itself, in the
+    order of their first agents.
 
-    def make_network() -> nn.Module:
-        return algorithm.network(game)
-
-    common: dict[str, Any] = {
-        "make_network": make_network,
-        "make_loss": algorithm.loss,
-        "compile": compile,
-        "device": device,
-        **who,
-    }
-    if isinstance(algorithm, TeamAlgorithm):
-        team = algorithm
-        check_team(team, reward_kind=member.reward_kind, members=len(agents))
-        common["make_team"] = lambda networks: team.team(networks, game)
-    settings = algorithm.settings
-    if isinstance(settings, RolloutSettings):
-        return RolloutLearner(game, settings=settings, **common)
-    if isinstance(settings, DQNSettings):
-        stochastic = algorithm.stochastic  # type: ignore[union-attr]
-        return ReplayLearner(game, settings=settings, stochastic=stochastic, **common)
-    raise ValueError(
-        f"{type(algorithm).__name__} has settings of the type {type(settings).__name__}; "
-        "DQNSettings (learns from replay) or RolloutSettings (on-policy) is wanted"
-    )
+    Raises:
+        ValueError: see `specs_by_agent`.
+    """
+    by_agent = specs_by_agent(specs, agents)
+    groups: list[tuple[AgentSpec, tuple[int, ...]]] = []
+    for agent, spec in enumerate(by_agent):
+        if not any(agent in members for _, members in groups):
+            members = (
+                spec.agents
+                if isinstance(spec, Team)
+                else tuple(other for other, own in enumerate(by_agent) if own == spec)
+            )
+            groups.append((spec, members))
+    return groups
 
 
-def _scripted(member: Scripted, game: Game, **how: Any) -> nn.Module:
-    return scripted_lanes(member.policy, game, **how)
+def _check_reward(reward: str) -> None:
+    if reward not in get_args(RewardKind):
+        raise ValueError(f"reward is {reward!r}; allowed: {', '.join(get_args(RewardKind))}")
 
 
-def _frozen(
-    member: Frozen, game: Game, *, seeds: Sequence[Sequence[int]], agents: int, worlds: int
-) -> nn.Module:
-    loaded = load(member.run)
-    for name, theirs, ours in (
-        ("observations", loaded.game.observation_shape, game.observation_shape),
-        ("a form of observation", loaded.game.observation, game.observation),
-        ("actions", loaded.game.actions, game.actions),
-    ):
-        if theirs != ours:
-            raise ValueError(f"the agents of {member.run} have {name} {theirs}; this game has {ours}")
-    network, stochastic, epsilon = loaded.agent(member.agent, replica=member.replica)
-    actor = LaneActor(
-        _for_all_lanes(network),
-        len(game.actions),
-        seeds=seeds,
-        agents=agents,
-        worlds=worlds,
-        stochastic=stochastic,
-    )
-    actor.epsilon = epsilon
-    return actor
-
-
-def _for_all_lanes(network: nn.Module) -> Callable[[Tensor], Tensor]:
-    network.requires_grad_(False)
-
-    def values(observation: Tensor) -> Tensor:
-        given: Tensor = network(observation)
-        return given
-
-    return values
-
-
-def _told(member: Member) -> dict[str, Any]:
-    if isinstance(member, Learner):
-        return {"member": "Learner", "paid": member.reward_kind, **told(member.algorithm)}
-    if isinstance(member, Scripted):
-        return {"member": "Scripted", "manner": member.policy}
-    run = str(Path(member.run).resolve())
-    return {"member": "Frozen", "run": run, "agent": member.agent, "replica": member.replica}
+def _check_algorithm(algorithm: object, kind: type[Algorithm]) -> None:
+    if not isinstance(algorithm, kind | Custom):
+        raise ValueError(
+            f"the algorithm is a {type(algorithm).__name__}; allowed: a {kind.__name__} of "
+            'cprl.algorithms, or Custom("module:Class", arguments={...}) for one of your own'
+        )

@@ -1,9 +1,10 @@
-"""The published games and learners by name, as the study is written and as it was run.
+"""The published games and hyperparameters by name, as in the text of the study and as in its program.
 
 Every number is from [W] M. Wiatrak, "Governing the Commons with Multi-Agent Reinforcement Learning" (2019),
-its appendix A, and the parameters and behaviour of the program it was run with.
+its appendix A, and the parameters and behaviour of the study's program.
 """
 
+from dataclasses import replace
 from typing import Any, Final, Literal, get_args
 
 from cprl.commons import maps
@@ -48,10 +49,10 @@ _BOARD_RULES: Final[dict[tuple[str, str], dict[str, Any]]] = {
 
 
 def game(board: Board, *, variant: Variant = "published") -> Game:
-    """A published board with its rules: `published` as the study is written, `as_run` as its program plays.
+    """A published board with its rules: `published` as in the study's text, `as_run` as in its program.
 
     Raises:
-        ValueError: for an unknown board or variant.
+        ValueError: if the board or variant is unknown.
     """
     _check(board, variant)
     quirks = _AS_RUN if variant == "as_run" else {}
@@ -61,22 +62,22 @@ def game(board: Board, *, variant: Variant = "published") -> Game:
 def gymnasium_env(
     board: Board, *, variant: Variant = "published", seed: int = 0, render_mode: str | None = None
 ) -> CommonsGymnasiumEnv:
-    """A published board for one agent as a Gymnasium environment, as `gymnasium.make` builds it.
+    """A published board for one agent as a Gymnasium environment, for `gymnasium.make`.
 
     Raises:
-        ValueError: for an unknown board or variant, and for a board of several agents.
+        ValueError: if the board or variant is unknown, or the board has several agents.
     """
     return CommonsGymnasiumEnv(game(board, variant=variant), seed=seed, render_mode=render_mode)
 
 
-def learner(board: Board, *, variant: Variant = "published") -> DQNSettings:
-    """The hyper-parameters of the DQN agents on a board.
+def dqn_settings(board: Board, *, variant: Variant = "published") -> DQNSettings:
+    """The hyperparameters of the DQN agents on a board.
 
     The text gives the decay of epsilon on `commons` as 1,000,000 steps; versions of the program have
-    500,000, 1,000,000 and, the last one, 5,000,000. Both variants take the text's.
+    500,000, 1,000,000 and, the last one, 5,000,000. Both variants use the value of the text.
 
     Raises:
-        ValueError: for an unknown board or variant.
+        ValueError: if the board or variant is unknown.
     """
     _check(board, variant)
     as_run = variant == "as_run"
@@ -88,6 +89,27 @@ def learner(board: Board, *, variant: Variant = "published") -> DQNSettings:
         own_target_weights=as_run,
         mean_over_all_outputs=as_run,
     )
+
+
+def variant_of(game: object) -> Variant | None:
+    """The variant of a published game, whichever agents may fire; None for any other game."""
+    if not isinstance(game, Game):
+        return None
+    for board in BOARDS:
+        for variant in VARIANTS:
+            published = _published(board, variant)
+            rules = replace(game.rules, may_fire=published.rules.may_fire)
+            if (game.map, rules, game.observation) == (
+                published.map,
+                published.rules,
+                published.observation,
+            ):
+                return variant
+    return None
+
+
+def _published(board: Board, variant: Variant) -> Game:
+    return game(board, variant=variant)
 
 
 def _check(board: str, variant: str) -> None:

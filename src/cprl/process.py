@@ -1,4 +1,4 @@
-"""What a training wants of the process that it runs in."""
+"""Settings of the process in which a training runs."""
 
 import ctypes
 import logging
@@ -9,17 +9,19 @@ import torch
 
 _M_TRIM_THRESHOLD: Final = -1
 _M_MMAP_THRESHOLD: Final = -3
-"""Names of settings in glibc's malloc.h."""
-_MOST_KEPT: Final = 32 * 2**20
-"""Bytes: glibc's highest threshold for memory of its own for an allocation (mallopt(3))."""
+"""Parameters of mallopt, from glibc's malloc.h."""
+_MAX_THRESHOLD_BYTES: Final = 32 * 2**20
+"""glibc's highest value of M_MMAP_THRESHOLD, in bytes (mallopt(3))."""
 
 
 def prepare_process(seed: int) -> None:
-    """What a training wants of its process: one torch thread, no denormals, a seeded generator, memory that
-    is kept for the next step; TorchRL quiet, ours told.
+    """Prepares the process for a training.
 
-    These networks are so small that a second thread costs more than it gives, up to a hundredfold on a busy
-    machine; denormal numbers in Adam's moments of dead weights slow a long run by up to 1.9 times.
+    Seeds torch's global generator, limits torch to one thread, flushes denormal numbers to zero, makes glibc
+    reuse freed memory, and logs warnings of TorchRL and messages of cprl.
+
+    The networks are so small that a second thread slows them down, up to a hundredfold on a busy machine.
+    Denormal numbers in Adam's moments of dead weights slow a long run by a factor of up to 1.9.
     """
     torch.manual_seed(seed)
     torch.set_num_threads(1)
@@ -33,12 +35,12 @@ def prepare_process(seed: int) -> None:
 
 
 def _keep_freed_memory() -> None:
-    """Has glibc keep what a step frees for the next one, up to what its own adjustment would come to.
+    """Makes glibc keep the memory that a step frees, up to the limit of glibc's own dynamic adjustment.
 
-    Otherwise it depends on the layout of the heap whether its end is handed back to the system after a step
-    and fetched again in the next, page by page.
+    Otherwise, depending on the layout of the heap, glibc may return its end to the system after each step and
+    request it again in the next, page by page.
     """
     mallopt = getattr(ctypes.CDLL(None), "mallopt", None) if sys.platform == "linux" else None
     if mallopt is not None:
-        mallopt(_M_MMAP_THRESHOLD, _MOST_KEPT)
-        mallopt(_M_TRIM_THRESHOLD, 2 * _MOST_KEPT)
+        mallopt(_M_MMAP_THRESHOLD, _MAX_THRESHOLD_BYTES)
+        mallopt(_M_TRIM_THRESHOLD, 2 * _MAX_THRESHOLD_BYTES)

@@ -1,33 +1,43 @@
-"""load: a run as its directory keeps it: game, population, trained networks, episodes."""
+"""load: a run as its directory keeps it, and its agents as policies."""
 
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
-from functools import partial
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
+from functools import cached_property
 from pathlib import Path
 from typing import Any
 
 import pyarrow as pa
 import torch
-from tensordict import TensorDictBase
-from tensordict.nn import TensorDictModuleBase
-from torch import nn
+from torch import Tensor, nn
+from torchrl.envs import EnvBase
 
-from cprl.algorithms.actor_critic import policy
-from cprl.algorithms.registry import Algorithm, built
 from cprl.commons.game import Game
-from cprl.commons.maps import Map
-from cprl.commons.observation import Observation
-from cprl.commons.rules import Rules
-from cprl.envs.commons_env import CommonsEnv
-from cprl.learners.lanes import lane_name
+from cprl.custom import made
+from cprl.envs.make_env import make_env, spaces_of
+from cprl.envs.state import load_transforms_state
+from cprl.experiment import Experiment
+from cprl.learners.lanes import EVALUATION, lane_name, lane_seeds
 from cprl.networks.agent import acting_part
-from cprl.policies.assignment import AgentPolicies
-from cprl.policies.scripted import ScriptedActor
-from cprl.policies.single import QActor, RandomActor
+from cprl.networks.stacked import stack_lanes
+from cprl.policies.assignment import AgentIndices, AgentPolicies
+from cprl.policies.lanes import LaneActor
+from cprl.policies.scripted import scripted_lanes
+from cprl.population import AgentSpec, Frozen, Learning, Scripted, Team, specs_by_agent
 from cprl.runs.checkpoints import FOLDER, checkpoints_in, read_checkpoint
-from cprl.runs.directory import read_recipe
+from cprl.runs.directory import FILE_NAME, read_recipe
 from cprl.runs.episodes import read_episodes
-from cprl.runs.weights import load_weights
+from cprl.runs.weights import TRANSFORMS, load_weights
+from cprl.spaces import Spaces
+
+
+@dataclass(frozen=True, eq=False)
+class StoredAgent:
+    """An agent of a stored run: how it acts, and its network if it has one."""
+
+    kind: tuple[Any, ...]
+    """("scripted", policy), or ("trained", stochastic, epsilon, algorithm); agents of one kind can be lanes
+    of one actor."""
+    network: nn.Module | None = None
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -35,204 +45,238 @@ class LoadedRun:
     """A run, built again from its directory alone; see `load`."""
 
     path: Path
-    game: Game
-    members: Sequence[Mapping[str, Any]]
-    """Who sat at each seat, as `cprl.population.Population.told` tells it."""
-    algorithms: Mapping[int, Algorithm]
-    """What the agents that learned were made of, by their number."""
+    experiment: Experiment
     recipe: Mapping[str, Any]
     """What `recipe.json` holds."""
     networks: Mapping[str, nn.Module]
     """The trained acting network of each lane, by "replica_0/agent_0" and so on."""
     weights_from: Path
     """The file that held them: of a run that has not ended, its newest checkpoint."""
+    transforms_state: Mapping[str, Any]
+    """What the transforms of the environment had learned."""
+    allow: tuple[str, ...] = ()
+    _earlier: dict[str, "LoadedRun"] = field(default_factory=dict, repr=False)
+    """Runs whose agents are frozen in this one, read once."""
+
+    @cached_property
+    def game(self) -> Any:
+        """What was played."""
+        return made(self.experiment.game)
+
+    @property
+    def specs(self) -> list[AgentSpec]:
+        """The specification of each agent."""
+        return specs_by_agent(self.experiment.agents, self.game.agents)
+
+    @cached_property
+    def spaces(self) -> Spaces:
+        """What its agents observe and may do, transforms included."""
+        return spaces_of(self.env())
 
     @property
     def replicas(self) -> list[int]:
-        """The numbers of the replicas whose networks were kept."""
-        return sorted({int(lane.split("/")[0].removeprefix("replica_")) for lane in self.networks})
+        """The numbers of its replicas."""
+        kept = sorted({int(lane.split("/")[0].removeprefix("replica_")) for lane in self.networks})
+        return kept or list(range(self.experiment.replicas))
 
-    def env(self, worlds: int = 1, *, seed: int = 0) -> CommonsEnv:
-        """So many fresh worlds of the run's game."""
-        return CommonsEnv(self.game, worlds, seed=seed)
+    def env(self, worlds: int = 1, *, seed: int = 0, first_world: int = 0) -> EnvBase:
+        """So many fresh worlds of the run's game, with its transforms as they were at the end."""
+        env = make_env(
+            self.game,
+            worlds=worlds,
+            seed=seed,
+            first_world=first_world,
+            transforms=self.experiment.transforms,
+        )
+        load_transforms_state(env, self.transforms_state)
+        return env
 
-    def agent(self, agent: int, *, replica: int = 0) -> tuple[nn.Module, bool, float]:
-        """An agent that learned: its acting network, whether that gives the logits of a policy from which it
-        draws its actions, and else the chance of a random one with which it is evaluated.
+    def agent(self, agent: int, *, replica: int = 0) -> StoredAgent:
+        """An agent of a replica.
 
         Raises:
-            ValueError: where no such network was kept; says which were.
+            ValueError: where the run keeps no network of it; says which it keeps.
         """
+        if not 0 <= agent < self.game.agents:
+            raise ValueError(f"agent is {agent}; {self.path} has the agents 0 to {self.game.agents - 1}")
+        spec = self.specs[agent]
+        if isinstance(spec, Scripted):
+            return StoredAgent(("scripted", spec.policy))
+        if isinstance(spec, Frozen):
+            if spec.run not in self._earlier:
+                self._earlier[spec.run] = load(spec.run, allow=self.allow)
+            return self._earlier[spec.run].agent(spec.agent, replica=spec.replica)
         lane = lane_name(replica, agent)
         if lane not in self.networks:
             raise ValueError(f"{self.path} keeps no network of {lane}; kept are {sorted(self.networks)}")
-        algorithm = self.algorithms[agent]
-        stochastic = bool(getattr(algorithm, "stochastic", True))
-        return self.networks[lane], stochastic, float(getattr(algorithm.settings, "epsilon_evaluation", 0.0))
+        algorithm = made(spec.algorithm)
+        stochastic = bool(algorithm.stochastic)
+        epsilon = 0.0 if stochastic else float(getattr(algorithm.settings, "epsilon_evaluation", 0.0))
+        return StoredAgent(("trained", stochastic, epsilon, repr(spec.algorithm)), self.networks[lane])
 
-    def policy(self, replica: int = 0, *, others: Mapping[int, nn.Module] | None = None) -> AgentPolicies:
-        """The agents of a replica; those that learned explore as in evaluation where asked to.
-
-        Args:
-            replica: its number.
-            others: actors by the agent's number, instead of those of the run.
+    def policy(self, replica: int = 0, *, worlds: int = 1, seed: int = 0) -> AgentPolicies:
+        """The agents of a replica in so many worlds side by side; those that learned explore as in evaluation
+        where asked to, by random numbers that follow from the seed.
 
         Raises:
-            ValueError: where a seat stays empty; says which.
+            ValueError: where the run keeps no network of an agent; says which it keeps.
         """
-        actors, empty = dict(others or {}), []
-        for agent, member in enumerate(self.members):
-            if agent in actors:
-                continue
-            if member["member"] == "Frozen":
-                earlier = load(member["run"])
-                actors[agent] = _actor(earlier, member["agent"], member["replica"])
-            elif member["member"] == "Scripted":
-                actors[agent] = self._scripted(member["manner"], agent)
-            elif lane_name(replica, agent) in self.networks:
-                actors[agent] = _actor(self, agent, replica)
-            else:
-                empty.append(agent)
-        if empty:
-            raise ValueError(
-                f"agents {empty} of replica {replica} have no network in {self.path}; kept are "
-                f"{sorted(self.networks)}: give actors for them as others"
-            )
-        return AgentPolicies({agent: actors[agent] for agent in range(self.game.agents)})
+        found = [[self.agent(agent, replica=replica)] for agent in range(self.game.agents)]
+        return stored_policies(found, self._playing, replicas=[replica], worlds=worlds, seed=seed)
 
-    def _scripted(self, policy: Any, agent: int) -> nn.Module:
-        if policy == "random":
-            return RandomActor(len(self.game.actions), seed=agent)
-        return _OneScripted(policy, self.game, agent)
+    @property
+    def _playing(self) -> Game | Spaces:
+        return self.game if isinstance(self.game, Game) else self.spaces
 
     def episodes(self) -> pa.Table:
-        """The table of episodes; see `cprl.recording.read_episodes`."""
+        """The table of episodes; see `cprl.runs.read_episodes`."""
         return read_episodes(self.path)
 
 
-def _actor(run: LoadedRun, agent: int, replica: int) -> nn.Module:
-    """An agent that learned, as TorchRL's actor for one agent."""
-    network, stochastic, epsilon = run.agent(agent, replica=replica)
-    if stochastic:
-        drawing: nn.Module = policy(network)
-        return drawing
-    actor = QActor(network, len(run.game.actions))
+def stored_policies(
+    agents: Sequence[Sequence[StoredAgent]],
+    playing: Game | Spaces,
+    *,
+    replicas: Sequence[int],
+    worlds: int,
+    seed: int,
+) -> AgentPolicies:
+    """Stored agents as the policies of all agents of some replicas, agents of one kind as lanes of one actor.
+
+    Args:
+        agents: by agent and replica.
+        playing: the game; its spaces where it is not one of cprl's.
+        replicas: their numbers.
+        worlds: how many worlds of each replica are played side by side.
+        seed: what random numbers follow from, with the replica and the agent.
+    """
+    alike: dict[Any, list[int]] = {}
+    for agent, of_replicas in enumerate(agents):
+        alike.setdefault(of_replicas[0].kind, []).append(agent)
+    actors: dict[AgentIndices, nn.Module] = {}
+    for same in alike.values():
+        seeds = lane_seeds(seed, replicas=replicas, agents=same, purpose=EVALUATION)
+        lanes = [agents[agent][place] for place in range(len(replicas)) for agent in same]
+        actors[tuple(same)] = stored_actor(lanes, playing, seeds=seeds, agents=len(same), worlds=worlds)
+    return AgentPolicies(actors)
+
+
+def stored_actor(
+    lanes: Sequence[StoredAgent],
+    playing: Game | Spaces,
+    *,
+    seeds: Sequence[Sequence[int]],
+    agents: int,
+    worlds: int,
+) -> nn.Module:
+    """One actor for stored agents of one kind; the one place where an actor is made of a stored agent.
+
+    Args:
+        lanes: an agent for each lane, lane = replica x agents + agent.
+        playing: the game; its spaces where it is not one of cprl's.
+        seeds: of each lane's random numbers.
+        agents: how many agents of a replica it controls.
+        worlds: how many worlds of each replica are played side by side.
+    """
+    kind = lanes[0].kind
+    if kind[0] == "scripted":
+        return scripted_lanes(kind[1], playing, seeds=seeds, agents=agents, worlds=worlds)
+    _, stochastic, epsilon, _ = kind
+    actions = playing.spaces.actions if isinstance(playing, Game) else playing.actions
+    networks: list[Any] = [lane.network for lane in lanes]
+    actor = LaneActor(
+        _side_by_side(networks), actions, seeds=seeds, agents=agents, worlds=worlds, stochastic=stochastic
+    )
     actor.epsilon = epsilon
     return actor
 
 
-class _OneScripted(TensorDictModuleBase):
-    """A scripted agent as TorchRL's actor for one agent, in however many worlds it is asked.
-
-    Args:
-        policy: see `ScriptedActor`.
-        game: what is played.
-        agent: where it sits; its random numbers follow from that.
-    """
-
-    in_keys = ("observation",)
-    out_keys = ("action",)
-
-    def __init__(self, policy: Any, game: Game, agent: int) -> None:
-        super().__init__()
-        self._make = partial(ScriptedActor, policy, game, seeds=[(agent,)], agents=1)
-        self._actor = self._make()
-
-    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
-        """Writes "action", int64 [B]."""
-        seen = tensordict.get("observation").unsqueeze(1)
-        if self._actor.worlds != len(seen):
-            self._actor = self._make(worlds=len(seen))
-        return tensordict.set("action", self._actor.choose(seen)[:, 0])
+def _side_by_side(networks: Sequence[nn.Module]) -> Callable[[Tensor], Tensor]:
+    """What all networks give for what their lanes see, [L, k, ...] to [L, k, A]."""
+    first = networks[0]
+    if all(network is first for network in networks):
+        first.requires_grad_(False)
+        return lambda seen: first(seen)
+    try:
+        stack = stack_lanes(networks)
+    except ValueError:  # of a form that does not stack, e.g. a network of the user's own
+        return lambda seen: torch.stack([network(own) for network, own in zip(networks, seen, strict=True)])
+    return lambda seen: stack(seen)
 
 
-def load(run: str | Path, *, weights: str | None = None, algorithms: Sequence[type[Any]] = ()) -> LoadedRun:
-    """Builds a run's game, population and networks again; runs no code of its files.
+def load(run: str | Path, *, weights: str | None = None, allow: Sequence[str] = ()) -> LoadedRun:
+    """Builds a run again from its directory alone; runs no code that it holds.
 
     Args:
         run: its directory.
         weights: which were kept: "final", or "best" where the recipe keeps them; by default the final ones,
             or those of the newest readable checkpoint where the run has not ended.
-        algorithms: classes of the user's own that the run's agents may be made of.
+        allow: the targets, "module:Class", of the user's own code that the run may import.
 
     Raises:
-        ValueError: for a file that is missing, truncated, changed or foreign; names file and reason.
+        ValueError: for a file that is missing, truncated, changed or foreign, naming it and the reason; for
+            code of the user's own that is not allowed, naming it.
     """
     run = Path(run)
     recipe = read_recipe(run)
     try:
-        kept = recipe["arguments"]["game"]
-        game = Game(
-            map=Map(**kept["map"]),
-            rules=Rules(**kept["rules"]),
-            observation=Observation(**kept.get("observation", {})),
-        )
-        members = _members(recipe["arguments"], game)
-        made_of = {
-            agent: built(
-                {key: value for key, value in member.items() if key not in ("member", "paid")}, own=algorithms
-            )
-            for agent, member in enumerate(members)
-            if member["member"] == "Learner"
-        }
-    except (KeyError, TypeError, ValueError) as error:
-        raise ValueError(f"{run / 'recipe.json'} holds no game and learner of cprl: {error!r}") from error
-    path, kept_weights = _weights(run, weights)
-    with torch.random.fork_rng(devices=[]):  # networks draw weights at first, which the kept ones replace
-        networks = _networks(path, kept_weights, game, made_of)
-    return LoadedRun(
+        experiment = Experiment.from_recipe(recipe, directory=run, allow=allow)
+    except ValueError as error:
+        raise ValueError(f"{run / FILE_NAME}: {error}") from error
+    path, kept, transforms = _kept(run, weights)
+    loaded = LoadedRun(
         path=run,
-        game=game,
-        members=members,
-        algorithms=made_of,
+        experiment=experiment,
         recipe=recipe,
-        networks=networks,
+        networks={},
         weights_from=path,
+        transforms_state=transforms,
+        allow=tuple(allow),
     )
+    with torch.random.fork_rng(devices=[]):  # networks draw weights at first, which the kept ones replace
+        object.__setattr__(loaded, "networks", _networks(path, kept, loaded))
+    return loaded
 
 
-def _members(arguments: Mapping[str, Any], game: Game) -> list[dict[str, Any]]:
-    """Who sat where; runs of before there were populations had DQN agents and random ones."""
-    population = arguments.get("population", {})
-    if isinstance(population, list):
-        return population
-    settings = {"kind": "DQNSettings", **arguments["learner"]}
-    learner = {"member": "Learner", "algorithm": "DQN", "settings": settings}
-    scripted = {"member": "Scripted", "manner": "random"}
-    at_random = population.get("random", ())
-    return [scripted if agent in at_random else learner for agent in range(game.agents)]
-
-
-def _weights(run: Path, name: str | None) -> tuple[Path, Any]:
-    """A file with weights, and the state dict of each network in it."""
+def _kept(run: Path, name: str | None) -> tuple[Path, Any, Any]:
+    """A file with weights, the state dict of each network in it, and the state of transforms."""
     folder = run / FOLDER
     path = folder / f"{name or 'final'}.pt"
     if name is None and not path.exists():
-        reasons = []
-        for checkpoint in reversed(checkpoints_in(folder)):
-            try:
-                state = read_checkpoint(checkpoint)
-                of_learners = [learner["networks"] for learner in state["learners"]]
-            except (ValueError, KeyError) as error:
-                reasons.append(str(error))
-                continue
-            return checkpoint, {lane: own for networks in of_learners for lane, own in networks.items()}
-        raise ValueError(
-            "; ".join([f"{path} is not there, nor a readable checkpoint: has {run} been trained?", *reasons])
-        )
+        return _from_checkpoint(run, path)
+    transforms = folder / TRANSFORMS
     try:
-        return path, load_weights(path)
+        return path, load_weights(path), load_weights(transforms) if transforms.exists() else {}
     except Exception as error:
         raise ValueError(f"{path} holds no weights of this run: {error}") from error
 
 
-def _networks(path: Path, weights: Any, game: Game, made_of: Mapping[int, Algorithm]) -> dict[str, nn.Module]:
+def _from_checkpoint(run: Path, final: Path) -> tuple[Path, Any, Any]:
+    """The same from the newest readable checkpoint."""
+    reasons = []
+    for checkpoint in reversed(checkpoints_in(run / FOLDER)):
+        try:
+            state = read_checkpoint(checkpoint)
+            of_learners = [learner["networks"] for learner in state["learners"]]
+        except (ValueError, KeyError) as error:
+            reasons.append(str(error))
+            continue
+        networks = {lane: own for networks in of_learners for lane, own in networks.items()}
+        return checkpoint, networks, state.get("env", {}).get("transforms", {})
+    raise ValueError(
+        "; ".join([f"{final} is not there, nor a readable checkpoint: has {run} been trained?", *reasons])
+    )
+
+
+def _networks(path: Path, weights: Any, run: LoadedRun) -> dict[str, nn.Module]:
     networks = {}
     try:
         for name, state in weights.items():
             lane = name if "/" in name else f"replica_0/{name}"
-            agent = int(lane.rpartition("_")[2])
-            network = acting_part(made_of[agent].network(game))
+            spec = run.specs[int(lane.rpartition("_")[2])]
+            if not isinstance(spec, Learning | Team):
+                raise ValueError(f"{lane} is the network of an agent that does not learn")
+            network = acting_part(made(spec.algorithm).make_network(run.spaces))
             network.load_state_dict(state)
             networks[lane] = network
     except Exception as error:

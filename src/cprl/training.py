@@ -1,98 +1,80 @@
-"""The loop: act, store, learn, measure, record."""
+"""The loop: act, store, update, measure, record."""
 
 import time
 from collections.abc import Callable, Mapping, Sequence
-from typing import Any, Protocol
+from typing import Any, Final
 
-import numpy as np
 import torch
-from numpy.typing import NDArray
 from tensordict import TensorDictBase
-from torch import Tensor
+from torch import Tensor, nn
 from torchrl.collectors import BaseCollector
+from torchrl.envs import EnvBase
 
+from cprl.callbacks import SavesTraining, check_callbacks
 from cprl.collectors import StepCollector
-from cprl.envs.commons_env import CommonsEnv
-from cprl.learners.base import LaneLosses, Learner, seated
-from cprl.learners.single import DQNLearner
+from cprl.envs.make_env import check_env, spaces_of
+from cprl.envs.state import carried_state, env_state, load_carried, load_env_state
+from cprl.envs.unwrap import commons_of
+from cprl.learners.base import LaneLosses, Learner
 from cprl.measuring.episodes import Episode, EpisodeTracker
 from cprl.policies.assignment import AgentIndices, AgentPolicies, agent_indices
 
-
-class Keeper(Protocol):
-    """Who keeps the state of a training, as `cprl.recording.Checkpointer` does."""
-
-    def restore(self, training: "Training") -> None:
-        """Puts a new training where the last one was."""
-
-    def after_step(self, training: "Training") -> None:
-        """Keeps the state, if it is time to."""
-
-
-MakeCollector = Callable[[CommonsEnv, torch.nn.Module], BaseCollector]
+MakeCollector = Callable[[EnvBase, nn.Module], BaseCollector]
 """A collector out of an environment and a policy; it yields batches [R], or [R, T] of T turns."""
 
-
-class Callback(Protocol):
-    """Whoever wants to know what happens in a training: a table, a recording, a progress bar."""
-
-    def on_step(self, batch: TensorDictBase) -> None:
-        """One turn of every world, as the collector yields it, [B]."""
-
-    def on_episode(self, episode: Episode, learning: Mapping[str, float]) -> None:
-        """An episode that ended, and how learning went in it: `agent_0/loss`, `agent_0/epsilon`, ..."""
+STATE_FORMAT: Final = 2
+"""Of `Training.state_dict`; 1 was that of cprl up to November 2026."""
 
 
 class Training:
     """A training that takes one step after the other, and whose whole state can be read and set.
 
-    All replicas take each step together. One whose episodes are short goes on until the last has played
-    its last; what it plays beyond `episodes` is not told to observers.
+    All replicas take each step together. A replica whose episodes are short plays on until the last one has
+    played its last episode; callbacks get no episodes beyond `episodes`.
 
     Args:
-        env: a world for each replica.
-        learners: by where they sit: a `DQNLearner` at an agent's number, alone in one replica, or a
-            `ReplayLearner` at a tuple of numbers, in every replica.
+        env: a world for each replica R.
+        learners: by the indices of their agents, a tuple; each updates these agents in every replica.
         episodes: how many to play, at least 1.
-        others: the actors of the agents that do not learn, likewise.
-        callbacks: told of each turn and each episode, in this order.
-        update_every: steps k after which each learner learns, then k times.
+        others: the actors of the agents that do not learn, likewise; an actor of one agent by its index.
+        callbacks: called after each turn and each episode, in this order; see `Callback`.
+        update_every: steps k after which each learner updates, then k times.
         make_collector: `StepCollector`, or for TorchRL's own `cprl.collectors.stock_collector`.
 
     Raises:
-        ValueError: for seats that are empty or taken twice, another number of worlds than the learners
-            have replicas, or numbers below 1.
+        ValueError: for agents without a learner or actor, or with two; another number of worlds than the
+            learners have replicas; numbers below 1; a callback without any of the methods of `Callback`.
     """
 
     def __init__(
         self,
-        env: CommonsEnv,
-        learners: Mapping[AgentIndices, Learner | DQNLearner],
+        env: EnvBase,
+        learners: Mapping[tuple[int, ...], Learner],
         *,
         episodes: int,
-        others: Mapping[AgentIndices, torch.nn.Module] | None = None,
-        callbacks: Sequence[Callback] = (),
+        others: Mapping[AgentIndices, nn.Module] | None = None,
+        callbacks: Sequence[Any] = (),
         update_every: int = 1,
         make_collector: MakeCollector = StepCollector,
     ) -> None:
-        self.env, self.episodes, self.callbacks = env, episodes, callbacks
+        replicas, spaces = env.batch_size.numel(), spaces_of(env)
+        check_env(env, replicas)
+        self.env, self.episodes, self.callbacks = env, episodes, list(callbacks)
         self.update_every = update_every
-        self.others = dict(others or {})
-        self.learners = {agents: seated(learner, agents) for agents, learner in learners.items()}
-        _check(env, self.learners, self.others)
-        for name, number in (("episodes", episodes), ("update_every", update_every)):
-            if number < 1:
-                raise ValueError(f"{name} is {number}; at least 1 is wanted")
-        for learner in self.learners.values():
-            steps = getattr(learner, "rollout_steps", update_every)
-            if steps % update_every:
-                raise ValueError(f"learn_every is {update_every}; it must divide the rollouts' {steps} steps")
-        replicas = env.batch_size.numel()
-        actors = {agents: learner.actor for agents, learner in self.learners.items()}
+        self.learners, self.others = dict(learners), dict(others or {})
+        _check_agents(spaces.agents, replicas, self.learners, self.others)
+        _check_numbers(episodes, update_every, self.learners)
+        check_callbacks(callbacks)
+        actors: dict[AgentIndices, nn.Module] = {
+            agents: learner.actor for agents, learner in self.learners.items()
+        }
         self._collector = make_collector(env, AgentPolicies({**actors, **self.others}))
         self._turns = iter(self._collector)
-        self._tracker = EpisodeTracker(replicas, env.game.agents, env.game.rules.episode_steps)
-        self._losses = {agents: LaneLosses(replicas, agent_indices(agents)) for agents in self.learners}
+        commons = commons_of(env)
+        longest = None if commons is None else commons.game.rules.episode_steps
+        self._tracker = EpisodeTracker(replicas, spaces.agents, longest)
+        self._losses = {agents: LaneLosses(replicas, agents) for agents in self.learners}
+        self._on_step = [own.on_step for own in self.callbacks if hasattr(own, "on_step")]
         self._played = [0] * replicas
         self.steps = 0
         self._began, self._spent_s = time.monotonic(), 0.0
@@ -107,8 +89,14 @@ class Training:
         """Seconds that it has taken so far, those before it was stopped included."""
         return self._spent_s + time.monotonic() - self._began
 
+    def start(self) -> None:
+        """Calls `on_start` of the callbacks; `train` does before the first step."""
+        for callback in self.callbacks:
+            if hasattr(callback, "on_start"):
+                callback.on_start(self)
+
     def step(self) -> None:
-        """The turns that the collector yields, one as a rule: act, store, learn, measure, record."""
+        """The turns that the collector yields, one as a rule: act, store, update, measure, record."""
         batch = next(self._turns)
         for turn in [batch] if batch.batch_dims == 1 else batch.unbind(1):
             self._take(turn)
@@ -122,8 +110,8 @@ class Training:
             for _ in range(self.update_every):
                 for agents, learner in self.learners.items():
                     self._losses[agents].add(learner.update())
-        for callback in self.callbacks:
-            callback.on_step(batch)
+        for on_step in self._on_step:
+            on_step(batch)
         ended = self._tracker.add(batch)
         if ended:
             self._end(ended, batch)
@@ -139,89 +127,110 @@ class Training:
             self._played[episode.world] += 1
             if self._played[episode.world] <= self.episodes:
                 for callback in self.callbacks:
-                    callback.on_episode(episode, of_agents)
+                    if hasattr(callback, "on_episode"):
+                        callback.on_episode(episode, of_agents)
 
     def state_dict(self) -> dict[str, Any]:
         """Everything that the future depends on, in tensors, numbers, lists and dicts; not copies.
 
         Raises:
-            ValueError: where a learner or the collector keeps no state to go on from.
+            ValueError: where the collector has no state to resume from.
         """
-        self._step_collector()
+        carried = self._step_collector().carried
         return {
+            "format": STATE_FORMAT,
             "steps": self.steps,
             "spent_s": self.spent_s,
             "played": list(self._played),
-            "worlds": {name: _tensor(array) for name, array in self.env.worlds.state().items()},
+            "env": env_state(self.env),
+            "carried": None if carried is None else carried_state(carried),
             "learners": [learner.state_dict() for learner in self.learners.values()],
             "others": [dict(other.state_dict()) for other in self.others.values()],
             "losses": [losses.state_dict() for losses in self._losses.values()],
             "tracker": self._tracker.state_dict(),
-            "observers": {name: own.state_dict() for name, own in self._keeping().items()},
+            "callbacks": {name: own.state_dict() for name, own in self._with_state().items()},
             "torch": torch.get_rng_state(),
         }
 
-    def _keeping(self) -> dict[str, Any]:
-        """The observers that go on from a state, as a table does, by the name of their class."""
-        return {type(own).__name__: own for own in self.callbacks if hasattr(own, "load_state_dict")}
+    def _with_state(self) -> dict[str, Any]:
+        """The callbacks that have a state, by the name of their class; a second one of a class gets a 2."""
+        named: dict[str, Any] = {}
+        for own in self.callbacks:
+            if hasattr(own, "state_dict") and hasattr(own, "load_state_dict"):
+                kind, nth = type(own).__name__, 1
+                while (name := kind if nth == 1 else f"{kind} {nth}") in named:
+                    nth += 1
+                named[name] = own
+        return named
 
     def _step_collector(self) -> StepCollector:
-        """The collector, if a training can go on with it."""
+        """The collector, if a training can resume with it."""
         if not isinstance(self._collector, StepCollector):
             kind = type(self._collector).__name__
             raise ValueError(
-                f"a {kind} keeps no state to go on from; train with a StepCollector, or without checkpoints"
+                f"a {kind} has no state to resume from; train with a StepCollector, or without a checkpointer"
             )
         return self._collector
 
     def load_state_dict(self, state: Mapping[str, Any]) -> None:
-        """Goes on exactly where the training of that state was, which was made with the same arguments."""
+        """Resumes exactly where the training of that state was, which was made with the same arguments.
+
+        Raises:
+            ValueError: for the state of a training of another version of cprl.
+        """
+        if state.get("format", 1) != STATE_FORMAT:
+            raise ValueError(
+                f"the state has the format {state.get('format', 1)}, this version resumes {STATE_FORMAT}; "
+                "finish the run with the version that began it (its recipe.json has the commit)"
+            )
         self._began, self._spent_s = time.monotonic(), float(state["spent_s"])
         self.steps, self._played = int(state["steps"]), list(state["played"])
-        kinds = {name: array.dtype for name, array in self.env.worlds.state().items()}
-        worlds = {name: tensor.numpy().view(kinds[name]) for name, tensor in state["worlds"].items()}
-        self._step_collector().resume_from(self.env.load(worlds))
-        for learner, own in zip(self.learners.values(), state["learners"], strict=True):
-            learner.load_state_dict(own)
-        for other, own in zip(self.others.values(), state["others"], strict=True):
-            other.load_state_dict(own)
-        for losses, own in zip(self._losses.values(), state["losses"], strict=True):
-            losses.load_state_dict(own)
+        self._load_env(state)
+        parts: dict[str, Any] = {"learners": self.learners, "others": self.others, "losses": self._losses}
+        for name, of_agents in parts.items():
+            for part, own in zip(of_agents.values(), state[name], strict=True):
+                part.load_state_dict(own)
         self._tracker.load_state_dict(state["tracker"])
-        for name, callback in self._keeping().items():
-            if name in state["observers"]:  # one may watch from now on, or no longer
-                callback.load_state_dict(state["observers"][name])
+        for name, callback in self._with_state().items():
+            if name in state["callbacks"]:  # a viewer may be added or left out from now on
+                callback.load_state_dict(state["callbacks"][name])
         torch.set_rng_state(state["torch"])
+
+    def _load_env(self, state: Mapping[str, Any]) -> None:
+        fresh = self.env.reset()  # the form of what is carried; the state then says where the worlds are
+        load_env_state(self.env, state["env"])
+        if state["carried"] is not None:
+            self._step_collector().resume_from(load_carried(fresh, state["carried"]))
 
 
 def train(
-    env: CommonsEnv,
-    learners: Mapping[AgentIndices, Learner | DQNLearner],
+    env: EnvBase,
+    learners: Mapping[tuple[int, ...], Learner],
     *,
     episodes: int,
-    others: Mapping[AgentIndices, torch.nn.Module] | None = None,
-    callbacks: Sequence[Callback] = (),
-    checkpoints: Keeper | None = None,
+    others: Mapping[AgentIndices, nn.Module] | None = None,
+    callbacks: Sequence[Any] = (),
+    checkpointer: SavesTraining | None = None,
     update_every: int = 1,
     make_collector: MakeCollector = StepCollector,
 ) -> Training:
-    """Plays so many episodes of every replica; each learner stores every turn and then learns once.
+    """Plays so many episodes of every replica; each learner stores every turn and then updates.
 
     Args:
         env: see `Training`, also for all that is not said here.
-        learners: by where they sit.
+        learners: by the indices of their agents.
         episodes: how many to play.
         others: the actors of the agents that do not learn.
-        callbacks: told of each turn and each episode.
-        checkpoints: where the training goes on from, and keeps its state now and then.
-        update_every: steps k after which each learner learns, then k times.
+        callbacks: called after each turn and each episode.
+        checkpointer: where the training resumes from, and saves its state now and then.
+        update_every: steps k after which each learner updates, then k times.
         make_collector: what plays.
 
     Returns:
         The training, which is over.
 
     Raises:
-        ValueError: see `Training`; with checkpoints also for what keeps no state to go on from.
+        ValueError: see `Training`; with a checkpointer also for what has no state to resume from.
     """
     training = Training(
         env,
@@ -232,28 +241,24 @@ def train(
         update_every=update_every,
         make_collector=make_collector,
     )
-    if checkpoints is not None:
-        training.state_dict()  # what cannot be kept is refused now, not when the first checkpoint is due
-        checkpoints.restore(training)
+    if checkpointer is not None:
+        training.state_dict()  # what cannot be saved is refused now, not when the first checkpoint is due
+        checkpointer.restore(training)
+    training.start()
     while not training.is_over:
         training.step()
-        if checkpoints is not None:
-            checkpoints.after_step(training)
+        if checkpointer is not None:
+            checkpointer.after_step(training)
     return training
-
-
-def _tensor(array: NDArray[Any]) -> Tensor:
-    """The same bytes as a tensor; torch keeps unsigned numbers as signed ones."""
-    return torch.from_numpy(array.view(np.int64) if array.dtype == np.uint64 else array)
 
 
 def _learning(
     replica: int,
-    learners: Mapping[AgentIndices, Learner],
-    losses: Mapping[AgentIndices, LaneLosses],
-    values: Mapping[AgentIndices, Tensor],
+    learners: Mapping[tuple[int, ...], Learner],
+    losses: Mapping[tuple[int, ...], LaneLosses],
+    values: Mapping[tuple[int, ...], Tensor],
 ) -> dict[str, float]:
-    """How learning went in the episode of a replica that has just ended."""
+    """What was learned in the episode of a replica that has just ended."""
     learning = {}
     for agents, learner in learners.items():
         for place, (agent, loss) in enumerate(losses[agents].take(replica).items()):
@@ -263,21 +268,32 @@ def _learning(
     return learning
 
 
-def _check(
-    env: CommonsEnv,
-    learners: Mapping[AgentIndices, Learner],
-    others: Mapping[AgentIndices, torch.nn.Module],
+def _check_agents(
+    agents: int,
+    replicas: int,
+    learners: Mapping[tuple[int, ...], Learner],
+    others: Mapping[AgentIndices, nn.Module],
 ) -> None:
-    taken = sorted(agent for agents in [*learners, *others] for agent in agent_indices(agents))
-    wanted = list(range(env.game.agents))
-    if taken != wanted:
-        raise ValueError(f"learners and others sit at {taken}; the game has the seats {wanted}, each for one")
-    worlds = env.batch_size.numel()
-    for agents, learner in learners.items():
-        if learner.agents != agent_indices(agents):
-            raise ValueError(f"a learner made for the seats {learner.agents} sits at {agent_indices(agents)}")
-        if learner.replicas != worlds:
+    taken = sorted(agent for indices in [*learners, *others] for agent in agent_indices(indices))
+    if taken != (wanted := list(range(agents))):
+        raise ValueError(
+            f"learners and others control the agents {taken}; allowed: each of {wanted} exactly once"
+        )
+    for indices, learner in learners.items():
+        if learner.agents != agent_indices(indices):
+            raise ValueError(f"a learner made for the agents {learner.agents} is given for {indices}")
+        if learner.replicas != replicas:
             raise ValueError(
-                f"the environment has {worlds} worlds; the learner at {agents} has "
-                f"{learner.replicas} replicas"
+                f"the environment has {replicas} worlds; the learner of {indices} has {learner.replicas} "
+                "replicas; allowed: a world for each replica"
             )
+
+
+def _check_numbers(episodes: int, update_every: int, learners: Mapping[tuple[int, ...], Learner]) -> None:
+    for name, number in (("episodes", episodes), ("update_every", update_every)):
+        if number < 1:
+            raise ValueError(f"{name} is {number}; allowed: an integer >= 1")
+    for learner in learners.values():
+        steps = getattr(learner, "rollout_steps", update_every)
+        if steps % update_every:
+            raise ValueError(f"update_every is {update_every}; allowed: a divisor of rollout_steps {steps}")

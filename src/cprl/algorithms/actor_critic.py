@@ -1,4 +1,4 @@
-"""Off-policy algorithms whose agents draw their actions from a policy that they learn: SAC and IQL."""
+"""Off-policy actor-critic algorithms, whose agents sample actions from a learned policy: SAC and IQL."""
 
 from dataclasses import dataclass
 from typing import ClassVar
@@ -9,36 +9,43 @@ from torch import nn
 from torchrl.modules import ProbabilisticActor
 from torchrl.objectives import DiscreteIQLLoss, DiscreteSACLoss, LossModule, ValueEstimators
 
+from cprl.algorithms.base import OffPolicy
 from cprl.algorithms.dqn import network_of
-from cprl.commons.game import Game
+from cprl.custom import Custom
 from cprl.learners.settings import DQNSettings
 from cprl.networks.agent import AgentNetworks
+from cprl.networks.specification import Network
+from cprl.spaces import Spaces
 
 
 @dataclass(frozen=True, kw_only=True)
-class SAC:
-    """Soft actor-critic for discrete actions, twin critics, by TorchRL's `DiscreteSACLoss`.
+class SAC(OffPolicy):
+    """Soft actor-critic for discrete actions with twin critics, TorchRL's `DiscreteSACLoss`.
 
-    Each agent has a temperature of its own. Source: Christodoulou, "Soft Actor-Critic for Discrete Action
+    Each agent learns its own temperature. Source: Christodoulou, "Soft Actor-Critic for Discrete Action
     Settings" (2019).
     """
 
     settings: DQNSettings
     target_entropy_weight: float = 0.5
-    """The share of the highest entropy, log A, that the temperature holds the policy at."""
+    """The target entropy of the temperature, as a fraction of the maximum entropy log A."""
     alpha_init: float = 0.1
-    """The temperature at first, in apples."""
+    """The initial temperature, in units of reward (apples)."""
     loss_function: str = "l2"
+    network: Network | Custom | None = None
+    """The architecture of the networks; None for fully connected layers of `settings.hidden_cells`."""
     stochastic: ClassVar[bool] = True
 
-    def network(self, game: Game) -> nn.Module:
-        """See `OffPolicy`."""
-        actions = len(game.actions)
+    def make_network(self, spaces: Spaces) -> nn.Module:
+        """See `Algorithm`."""
+        actions = spaces.actions
         names = "actor", "critic_0", "critic_1"
-        return AgentNetworks({name: network_of(game, self.settings, outputs=actions) for name in names})
+        return AgentNetworks(
+            {name: network_of(spaces, self.settings, self.network, outputs=actions) for name in names}
+        )
 
-    def loss(self, network: nn.Module) -> LossModule:
-        """See `OffPolicy`."""
+    def make_loss(self, network: nn.Module) -> LossModule:
+        """See `Algorithm`."""
         assert isinstance(network, AgentNetworks)
         loss = DiscreteSACLoss(
             policy(network["actor"]),
@@ -55,30 +62,35 @@ class SAC:
 
 
 @dataclass(frozen=True, kw_only=True)
-class IQL:
-    """Implicit (not: independent) Q-learning for discrete actions by TorchRL's `DiscreteIQLLoss`.
+class IQL(OffPolicy):
+    """Implicit (not independent) Q-learning for discrete actions, TorchRL's `DiscreteIQLLoss`.
 
     Source: Kostrikov, Nair and Levine, "Offline Reinforcement Learning with Implicit Q-Learning" (2021).
     """
 
     settings: DQNSettings
     expectile: float = 0.7
-    """Which expectile of the actions' values the state's value is, 0.5 to 1."""
+    """The expectile of the action values that the state value estimates, 0.5..1."""
     temperature: float = 3.0
-    """Of the weights of actions by their advantage, in 1/apples."""
+    """The inverse temperature of the advantage weights, in 1/reward (1/apples)."""
     loss_function: str = "l2"
+    network: Network | Custom | None = None
+    """The architecture of the networks; None for fully connected layers of `settings.hidden_cells`."""
     stochastic: ClassVar[bool] = True
 
-    def network(self, game: Game) -> nn.Module:
-        """See `OffPolicy`."""
-        actions = len(game.actions)
+    def make_network(self, spaces: Spaces) -> nn.Module:
+        """See `Algorithm`."""
+        actions = spaces.actions
         sizes = {"actor": actions, "critic_0": actions, "critic_1": actions, "value": 1}
         return AgentNetworks(
-            {name: network_of(game, self.settings, outputs=size) for name, size in sizes.items()}
+            {
+                name: network_of(spaces, self.settings, self.network, outputs=size)
+                for name, size in sizes.items()
+            }
         )
 
-    def loss(self, network: nn.Module) -> LossModule:
-        """See `OffPolicy`."""
+    def make_loss(self, network: nn.Module) -> LossModule:
+        """See `Algorithm`."""
         assert isinstance(network, AgentNetworks)
         loss = DiscreteIQLLoss(
             policy(network["actor"]),
@@ -95,7 +107,7 @@ class IQL:
 
 
 def policy(network: nn.Module) -> ProbabilisticTensorDictSequential:
-    """A network's outputs as the logits of TorchRL's categorical policy."""
+    """TorchRL's categorical policy with a network's outputs as logits."""
     return ProbabilisticActor(
         TensorDictModule(network, ["observation"], ["logits"]),
         in_keys=["logits"],

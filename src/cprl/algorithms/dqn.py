@@ -1,11 +1,7 @@
-"""Off-policy algorithms: for each agent its networks and TorchRL's loss over them.
-
-Each is a plain value with three answers, which a loss of one's own gives as well (docs/algorithms.md has one
-of twenty lines): `settings`, `network(game)` and `loss(network)`, and `stochastic`, how it acts.
-"""
+"""Algorithms that learn action values from replay: DQN and its variants, C51, CQL."""
 
 from dataclasses import dataclass
-from typing import Any, ClassVar, Protocol
+from typing import Any
 
 import torch
 from tensordict import TensorDictBase
@@ -18,59 +14,39 @@ from torchrl.objectives import (
     LossModule,
     ValueEstimators,
 )
-from torchrl.objectives.value import ValueEstimatorBase
 
-from cprl.commons.game import Game
-from cprl.learners.settings import DQNSettings
+from cprl.algorithms.base import OffPolicy
+from cprl.compat import bootstrap_from_target
+from cprl.custom import Custom
+from cprl.learners.settings import DEFAULT_HIDDEN_CELLS, DQNSettings, RolloutSettings
 from cprl.networks.distributional import AtomNetwork
-from cprl.networks.mlp import MLPNetwork
-
-
-class OffPolicy(Protocol):
-    """What an agent that learns from a replay buffer is made of.
-
-    Equal ones learn as lanes of one step, so it should be a value: a frozen dataclass.
-    """
-
-    @property
-    def settings(self) -> DQNSettings:
-        """The hyper-parameters."""
-
-    @property
-    def stochastic(self) -> bool:
-        """Whether the network gives logits of a policy, from which actions are drawn; else values of actions,
-        of which the highest is taken but for chance epsilon."""
-
-    def network(self, game: Game) -> nn.Module:
-        """New networks of one agent, which draw their weights from torch's generator: from uint8
-        [..., C, X, Y] to [..., A]; several as `AgentNetworks`, the acting one first."""
-
-    def loss(self, network: nn.Module) -> LossModule:
-        """TorchRL's loss over them, for transitions of "observation", "action" and "next": "observation",
-        "reward" [.., 1], "done", "terminated"."""
+from cprl.networks.mlp import MLP
+from cprl.networks.specification import Network, new_network
+from cprl.spaces import Spaces
 
 
 @dataclass(frozen=True, kw_only=True)
-class DQN:
-    """Deep Q-learning with a target network by TorchRL's `DQNLoss`; the study's agents.
+class DQN(OffPolicy):
+    """Deep Q-learning with a target network, TorchRL's `DQNLoss`; the algorithm of the study.
 
     Source: Mnih et al., "Human-level control through deep reinforcement learning" (2015).
     """
 
     settings: DQNSettings
     double: bool = False
-    """Whether the action whose value bootstraps is chosen by the network itself, not by its target (van
-    Hasselt, Guez and Silver, "Deep Reinforcement Learning with Double Q-learning", 2016)."""
+    """Whether the network itself, not its target, chooses the action whose value bootstraps (van Hasselt,
+    Guez and Silver, "Deep Reinforcement Learning with Double Q-learning", 2016)."""
     loss_function: str = "l2"
-    """Of the temporal difference: "l2", "smooth_l1" (Huber) or "l1"."""
-    stochastic: ClassVar[bool] = False
+    """The loss of the temporal-difference error: "l2", "smooth_l1" (Huber) or "l1"."""
+    network: Network | Custom | None = None
+    """The architecture of the networks; None for fully connected layers of `settings.hidden_cells`."""
 
-    def network(self, game: Game) -> nn.Module:
-        """See `OffPolicy`."""
-        return q_network_of(game, self.settings)
+    def make_network(self, spaces: Spaces) -> nn.Module:
+        """See `Algorithm`."""
+        return q_network_of(spaces, self.settings, self.network)
 
-    def loss(self, network: nn.Module) -> LossModule:
-        """See `OffPolicy`."""
+    def make_loss(self, network: nn.Module) -> LossModule:
+        """See `Algorithm`."""
         loss = DQNLoss(
             q_actor(network),
             delay_value=True,
@@ -83,8 +59,8 @@ class DQN:
 
 
 @dataclass(frozen=True, kw_only=True)
-class DistributionalDQN:
-    """C51, the distribution of returns over fixed atoms, by TorchRL's `DistributionalDQNLoss`.
+class DistributionalDQN(OffPolicy):
+    """C51: learns the distribution of returns over fixed atoms, TorchRL's `DistributionalDQNLoss`.
 
     Source: Bellemare, Dabney and Munos, "A Distributional Perspective on Reinforcement Learning" (2017).
     """
@@ -93,22 +69,24 @@ class DistributionalDQN:
     atoms: int = 51
     lowest_return: float = 0.0
     highest_return: float = 100.0
-    """Discounted returns that can be told: apples, by a discount of 0.995 at most 200 for one a step."""
-    stochastic: ClassVar[bool] = False
+    """The range of the atoms: discounted returns in apples. With a discount of 0.995 one apple per step
+    amounts to 200."""
+    network: Network | Custom | None = None
+    """The architecture of the networks; None for fully connected layers of `settings.hidden_cells`."""
 
-    def network(self, game: Game) -> nn.Module:
-        """See `OffPolicy`."""
-        actions = len(game.actions)
+    def make_network(self, spaces: Spaces) -> nn.Module:
+        """See `Algorithm`."""
+        actions = spaces.actions
         return AtomNetwork(
-            network_of(game, self.settings, outputs=actions * self.atoms),
+            network_of(spaces, self.settings, self.network, outputs=actions * self.atoms),
             actions=actions,
             lowest=self.lowest_return,
             highest=self.highest_return,
             atoms=self.atoms,
         )
 
-    def loss(self, network: nn.Module) -> LossModule:
-        """See `OffPolicy`."""
+    def make_loss(self, network: nn.Module) -> LossModule:
+        """See `Algorithm`."""
         assert isinstance(network, AtomNetwork)
         actor = DistributionalQValueActor(
             AtomLogits(network), support=network.support, spec=None, action_space="categorical"
@@ -117,10 +95,10 @@ class DistributionalDQN:
 
 
 class AtomLogits(nn.Module):
-    """An `AtomNetwork` as TorchRL's distributional actor wants it: logits [..., atoms, A].
+    """An `AtomNetwork` with the outputs that TorchRL's distributional actor expects: logits [..., atoms, A].
 
     Args:
-        network: whose weights it has.
+        network: the network, whose weights it shares.
     """
 
     def __init__(self, network: AtomNetwork) -> None:
@@ -133,26 +111,27 @@ class AtomLogits(nn.Module):
 
 
 @dataclass(frozen=True, kw_only=True)
-class CQL:
-    """Conservative Q-learning by TorchRL's `DiscreteCQLLoss`: half the temporal difference's loss, and what
-    holds down the values of actions that were not taken.
+class CQL(OffPolicy):
+    """Conservative Q-learning, TorchRL's `DiscreteCQLLoss`: half the temporal-difference loss, plus a
+    conservative term that lowers the values of actions that were not taken.
 
     Source: Kumar et al., "Conservative Q-Learning for Offline Reinforcement Learning" (2020).
     """
 
     settings: DQNSettings
     conservative_weight: float = 0.1
-    """Of the second term. TorchRL adds it whole, as for data that stay as they are; then agents who explore
-    imitate what they happened to do first (`tests/test_optimum.py`)."""
+    """The weight of the conservative term. TorchRL's weight is 1, for fixed data sets; with it, agents that
+    explore imitate their first random actions (`tests/test_optimum.py`)."""
     loss_function: str = "l2"
-    stochastic: ClassVar[bool] = False
+    network: Network | Custom | None = None
+    """The architecture of the networks; None for fully connected layers of `settings.hidden_cells`."""
 
-    def network(self, game: Game) -> nn.Module:
-        """See `OffPolicy`."""
-        return q_network_of(game, self.settings)
+    def make_network(self, spaces: Spaces) -> nn.Module:
+        """See `Algorithm`."""
+        return q_network_of(spaces, self.settings, self.network)
 
-    def loss(self, network: nn.Module) -> LossModule:
-        """See `OffPolicy`."""
+    def make_loss(self, network: nn.Module) -> LossModule:
+        """See `Algorithm`."""
         loss = _WeightedCQLLoss(
             q_actor(network),
             weight=self.conservative_weight,
@@ -161,51 +140,59 @@ class CQL:
             action_space="categorical",
         )
         loss.make_value_estimator(ValueEstimators.TD0, gamma=self.settings.gamma)
-        _bootstrap_from_target(loss.value_estimator)
+        bootstrap_from_target(loss.value_estimator)
         return loss
 
 
 class _WeightedCQLLoss(DiscreteCQLLoss):
-    """The same with a weight of its conservative term."""
+    """`DiscreteCQLLoss` with a weight for the conservative term."""
 
     def __init__(self, actor: QValueActor, *, weight: float, **how: Any) -> None:
         super().__init__(actor, **how)
         self._weight = weight
 
     def cql_loss(self, tensordict: TensorDictBase) -> tuple[torch.Tensor, dict[str, torch.Tensor]]:
-        """The term."""
-        loss, told = super().cql_loss(tensordict)
-        return self._weight * loss, told
+        """The weighted conservative term."""
+        loss, metadata = super().cql_loss(tensordict)
+        return self._weight * loss, metadata
 
 
-def _bootstrap_from_target(estimator: ValueEstimatorBase) -> None:
-    """`DiscreteCQLLoss` of TorchRL 0.14.1 hands its target's weights on as `params`, of which its estimator
-    takes no notice: it would bootstrap from the network itself."""
-    estimate = estimator.value_estimate
-
-    def by_target(tensordict: TensorDictBase, *, params: TensorDictBase) -> torch.Tensor:
-        target: torch.Tensor = estimate(tensordict, target_params=params)
-        return target
-
-    estimator.value_estimate = by_target
+def q_network_of(spaces: Spaces, settings: DQNSettings, network: Network | Custom | None) -> nn.Module:
+    """A new network of one agent, which outputs the value of each action."""
+    relu = settings.relu_on_outputs
+    return network_of(spaces, settings, network, outputs=spaces.actions, relu_on_outputs=relu)
 
 
-def q_network_of(game: Game, settings: DQNSettings) -> MLPNetwork:
-    """A new network of one agent: the value of each of its actions."""
-    return network_of(game, settings, outputs=len(game.actions), relu=settings.relu_on_outputs)
+def network_of(
+    spaces: Spaces,
+    settings: DQNSettings | RolloutSettings,
+    network: Network | Custom | None,
+    *,
+    outputs: int,
+    **how: Any,
+) -> nn.Module:
+    """A new network of one agent.
 
+    Args:
+        spaces: what agents observe.
+        settings: the hyperparameters.
+        network: the architecture; None for fully connected layers of `settings.hidden_cells`.
+        outputs: the number of outputs.
+        how: see `new_network`.
 
-def network_of(game: Game, settings: DQNSettings, *, outputs: int, relu: bool = False) -> MLPNetwork:
-    return MLPNetwork(
-        game.observation_shape,
-        outputs,
-        highest=game.observation.highest,
-        hidden_cells=settings.hidden_cells,
-        relu_on_outputs=relu,
-        glorot_uniform=settings.glorot_uniform,
-    )
+    Raises:
+        ValueError: see `new_network`; and if `settings.hidden_cells` is set together with a network.
+    """
+    if network is not None and settings.hidden_cells != DEFAULT_HIDDEN_CELLS:
+        raise ValueError(
+            f"settings.hidden_cells is {settings.hidden_cells}; allowed: the default, because the algorithm "
+            "has a network; set the layers in the network"
+        )
+    made = MLP(hidden_cells=settings.hidden_cells) if network is None else network
+    glorot_uniform = isinstance(settings, DQNSettings) and settings.glorot_uniform
+    return new_network(made, spaces, outputs, glorot_uniform=glorot_uniform, **how)
 
 
 def q_actor(network: nn.Module) -> QValueActor:
-    """A network's outputs as the values of TorchRL's actor."""
+    """TorchRL's `QValueActor` with a network's outputs as action values."""
     return QValueActor(network, spec=None, action_space="categorical")

@@ -1,6 +1,6 @@
-"""On-policy algorithms: for each agent an actor and a critic, and TorchRL's loss over them."""
+"""On-policy algorithms: each agent has an actor and a critic, and TorchRL's loss over them."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Protocol
 
@@ -9,69 +9,58 @@ from torch import nn
 from torchrl.objectives import A2CLoss, ClipPPOLoss, LossModule, ReinforceLoss
 
 from cprl.algorithms.actor_critic import policy
-from cprl.commons.game import Game
+from cprl.algorithms.base import OnPolicy
+from cprl.algorithms.dqn import network_of
+from cprl.custom import Custom
 from cprl.learners.settings import RolloutSettings
 from cprl.networks.agent import AgentNetworks
-from cprl.networks.mlp import MLPNetwork
-
-
-class OnPolicy(Protocol):
-    """What an agent is made of that learns from what its present policy has just done.
-
-    Equal ones learn as lanes of one step, so it should be a value: a frozen dataclass.
-    """
-
-    @property
-    def settings(self) -> RolloutSettings:
-        """The hyper-parameters."""
-
-    def network(self, game: Game) -> nn.Module:
-        """New `AgentNetworks` of one agent: "actor", to its policy's logits, and "critic", to one value."""
-
-    def loss(self, network: nn.Module) -> LossModule:
-        """TorchRL's loss over them, for "observation", "action", "action_log_prob", "advantage",
-        "value_target" and "state_value"."""
+from cprl.networks.specification import Network
+from cprl.spaces import Spaces
 
 
 @dataclass(frozen=True, kw_only=True)
-class PPO:
-    """Proximal policy optimisation with a clipped ratio by TorchRL's `ClipPPOLoss`.
+class PPO(OnPolicy):
+    """Proximal policy optimisation with a clipped ratio, TorchRL's `ClipPPOLoss`.
 
     Source: Schulman et al., "Proximal Policy Optimization Algorithms" (2017).
     """
 
     settings: RolloutSettings
     clip_epsilon: float = 0.2
-    """How far the chance of an action may move from what it was, as a ratio."""
+    """The largest change of an action's probability, as a ratio minus 1."""
     entropy_coeff: float = 0.01
     critic_coeff: float = 0.5
+    network: Network | Custom | None = None
+    """The architecture of the networks; None for fully connected layers of `settings.hidden_cells`."""
 
-    def network(self, game: Game) -> nn.Module:
-        """See `OnPolicy`."""
-        return actor_and_critic(game, self.settings)
+    def make_network(self, spaces: Spaces) -> nn.Module:
+        """See `Algorithm`."""
+        return actor_and_critic(spaces, self.settings, self.network)
 
-    def loss(self, network: nn.Module) -> LossModule:
-        """See `OnPolicy`."""
+    def make_loss(self, network: nn.Module) -> LossModule:
+        """See `Algorithm`."""
         return clipped_loss(network, ClipPPOLoss, self)
 
 
 @dataclass(frozen=True, kw_only=True)
-class A2C:
-    """Advantage actor-critic by TorchRL's `A2CLoss`; one epoch a rollout is meant.
+class A2C(OnPolicy):
+    """Advantage actor-critic, TorchRL's `A2CLoss`; meant for one epoch per rollout.
 
-    Source: Mnih et al., "Asynchronous Methods for Deep Reinforcement Learning" (2016), synchronous.
+    Source: Mnih et al., "Asynchronous Methods for Deep Reinforcement Learning" (2016), here synchronous.
     """
 
     settings: RolloutSettings
     entropy_coeff: float = 0.01
     critic_coeff: float = 0.5
+    network: Network | Custom | None = None
+    """The architecture of the networks; None for fully connected layers of `settings.hidden_cells`."""
 
-    def network(self, game: Game) -> nn.Module:
-        """See `OnPolicy`."""
-        return actor_and_critic(game, self.settings)
+    def make_network(self, spaces: Spaces) -> nn.Module:
+        """See `Algorithm`."""
+        return actor_and_critic(spaces, self.settings, self.network)
 
-    def loss(self, network: nn.Module) -> LossModule:
-        """See `OnPolicy`."""
+    def make_loss(self, network: nn.Module) -> LossModule:
+        """See `Algorithm`."""
         return _loss(
             network,
             A2CLoss,
@@ -82,56 +71,56 @@ class A2C:
 
 
 @dataclass(frozen=True, kw_only=True)
-class Reinforce:
-    """REINFORCE with a learned baseline by TorchRL's `ReinforceLoss`; one epoch a rollout is meant.
+class Reinforce(OnPolicy):
+    """REINFORCE with a learned baseline, TorchRL's `ReinforceLoss`; meant for one epoch per rollout.
 
     Source: Williams, "Simple statistical gradient-following algorithms for connectionist reinforcement
     learning" (1992).
     """
 
     settings: RolloutSettings
+    network: Network | Custom | None = None
+    """The architecture of the networks; None for fully connected layers of `settings.hidden_cells`."""
 
-    def network(self, game: Game) -> nn.Module:
-        """See `OnPolicy`."""
-        return actor_and_critic(game, self.settings)
+    def make_network(self, spaces: Spaces) -> nn.Module:
+        """See `Algorithm`."""
+        return actor_and_critic(spaces, self.settings, self.network)
 
-    def loss(self, network: nn.Module) -> LossModule:
-        """See `OnPolicy`."""
+    def make_loss(self, network: nn.Module) -> LossModule:
+        """See `Algorithm`."""
         loss = _loss(network, ReinforceLoss, loss_critic_type="l2")
         loss.set_keys(sample_log_prob="action_log_prob")
         return loss
 
 
-def actor_and_critic(game: Game, settings: RolloutSettings) -> AgentNetworks:
-    """New networks of one agent, like those of the DQN agents: "actor" and "critic"."""
-    sizes = {"actor": len(game.actions), "critic": 1}
-    shape = game.observation_shape
-    return AgentNetworks({name: rollout_network(game, settings, shape, size) for name, size in sizes.items()})
-
-
-def rollout_network(game: Game, settings: RolloutSettings, shape: Sequence[int], outputs: int) -> MLPNetwork:
-    """A new network from what is seen in a game, of such a shape, to so many outputs."""
-    return MLPNetwork(shape, outputs, highest=game.observation.highest, hidden_cells=settings.hidden_cells)
+def actor_and_critic(
+    spaces: Spaces, settings: RolloutSettings, network: Network | Custom | None
+) -> AgentNetworks:
+    """New networks of one agent: "actor" and "critic"."""
+    sizes = {"actor": spaces.actions, "critic": 1}
+    return AgentNetworks(
+        {name: network_of(spaces, settings, network, outputs=size) for name, size in sizes.items()}
+    )
 
 
 class Clipped(Protocol):
-    """What PPO wants to know of an algorithm of its family."""
+    """The fields of algorithms with a clipped loss."""
 
     @property
     def clip_epsilon(self) -> float:
-        """How far the chance of an action may move from what it was, as a ratio."""
+        """The largest change of an action's probability, as a ratio minus 1."""
 
     @property
     def entropy_coeff(self) -> float:
-        """Of the policy's entropy in the loss."""
+        """The weight of the policy's entropy in the loss."""
 
     @property
     def critic_coeff(self) -> float:
-        """Of the critic's error in the loss."""
+        """The weight of the critic's error in the loss."""
 
 
 def clipped_loss(network: nn.Module, kind: Callable[..., LossModule], algorithm: Clipped) -> LossModule:
-    """One of TorchRL's losses with a clipped ratio over "actor" and "critic"."""
+    """A TorchRL loss with a clipped ratio over "actor" and "critic"."""
     return _loss(
         network,
         kind,
@@ -139,7 +128,7 @@ def clipped_loss(network: nn.Module, kind: Callable[..., LossModule], algorithm:
         entropy_coeff=algorithm.entropy_coeff,
         critic_coeff=algorithm.critic_coeff,
         loss_critic_type="l2",
-        normalize_advantage=False,  # `RolloutLearner` does, each lane by itself
+        normalize_advantage=False,  # `RolloutLearner` normalises them per lane
     )
 
 

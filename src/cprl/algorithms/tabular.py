@@ -1,25 +1,37 @@
-"""Tabular Q-learning as an algorithm of a population."""
+"""Tabular Q-learning as an algorithm."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import ClassVar
+from typing import Any
 
-from cprl.commons.game import Game
+from cprl.algorithms.base import Algorithm, TrainingEngine
+from cprl.learners.base import Learner
 from cprl.learners.settings import TabularSettings
-from cprl.learners.tabular import table_network
+from cprl.learners.tabular import TabularLearner, table_network
 from cprl.policies.tabular import TableNetwork
+from cprl.spaces import Spaces
 
 
 @dataclass(frozen=True, kw_only=True)
-class Tabular:
-    """Tabular Q-learning as the algorithm of a population's member; see `TabularLearner`."""
+class Tabular(Algorithm):
+    """Tabular Q-learning; see `TabularLearner`."""
 
     settings: TabularSettings
-    stochastic: ClassVar[bool] = False
 
-    def network(self, game: Game) -> TableNetwork:
-        """What an agent has tabulated, nothing at first.
+    def make_network(self, spaces: Spaces) -> TableNetwork:
+        """The table of one agent, initially empty.
 
         Raises:
-            ValueError: for a game that tells more than the board is seen to be.
+            ValueError: if agents observe more than ("agents", "observation").
         """
-        return table_network(game)
+        return table_network(spaces)
+
+    def make_learner(
+        self, spaces: Spaces, *, agents: Sequence[int], engine: TrainingEngine = "compiled", **how: Any
+    ) -> Learner:
+        """See `Algorithm`; tables are neither compiled nor on a GPU."""
+        self._check_settings(TabularSettings)
+        self._refuse_torchrl(engine)
+        self.make_network(spaces)
+        how.pop("device", None)
+        return TabularLearner(spaces, agents=agents, settings=self.settings, **how)

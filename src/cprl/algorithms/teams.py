@@ -1,148 +1,162 @@
-"""Algorithms of teams: agents that learn together, and act each by its own network and what it sees itself.
+"""Algorithms of teams: agents that learn together and act independently, on their own observations.
 
-A team is all the seats of a replica with equal learners; a lane is then a team. VDN, QMIX and MAPPO change
-the question: their agents share one reward. MAPPO and IPPO stand in `cprl.algorithms.on_policy_teams`.
+A lane is then a team. VDN, QMIX and MAPPO change the social dilemma: their agents share one reward.
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass, fields
-from typing import ClassVar, Protocol, runtime_checkable
+from dataclasses import dataclass
+from typing import Any, ClassVar
 
 from tensordict.nn import TensorDictModule
 from torch import nn
 from torchrl.modules import VDNMixer
 from torchrl.objectives import LossModule, ValueEstimators
-from torchrl.objectives.multiagent import QMixerLoss
+from torchrl.objectives.multiagent import IPPOLoss, MAPPOLoss, QMixerLoss
 
-from cprl.algorithms.dqn import q_actor, q_network_of
-from cprl.commons.game import Game
+from cprl.algorithms.base import OffPolicy, OnPolicy, TeamAlgorithm
+from cprl.algorithms.dqn import network_of, q_actor, q_network_of
+from cprl.algorithms.on_policy import actor_and_critic, clipped_loss
+from cprl.custom import Custom
 from cprl.learners.settings import DQNSettings, RolloutSettings
-from cprl.learners.transitions import RewardKind
 from cprl.networks.agent import AgentNetworks
-from cprl.networks.team import Mixing, TeamNetwork
+from cprl.networks.specification import Network
+from cprl.networks.team import CentralCritic, Mixing, team_network
+from cprl.spaces import Spaces
 
 _CHOSEN, _OF_TEAM = "chosen_action_value", "team_value"
 
 
-@runtime_checkable
-class TeamAlgorithm(Protocol):
-    """What a team is made of; with `DQNSettings` it learns from replay, with `RolloutSettings` on-policy.
-
-    Equal ones learn as one team in each replica, so it should be a value: a frozen dataclass.
-    """
-
-    @property
-    def settings(self) -> DQNSettings | RolloutSettings:
-        """The hyper-parameters."""
-
-    @property
-    def stochastic(self) -> bool:
-        """See `cprl.algorithms.dqn.OffPolicy`."""
-
-    @property
-    def shares_reward(self) -> bool:
-        """Whether its members must be paid for the group."""
-
-    @property
-    def fewest_members(self) -> int:
-        """With how many the algorithm begins to be one."""
-
-    def network(self, game: Game) -> nn.Module:
-        """New networks of one member, which draw their weights from torch's generator; the one that acts
-        alone or first in `AgentNetworks`."""
-
-    def team(self, members: Sequence[nn.Module], game: Game) -> nn.Module:
-        """Those of all members as `AgentNetworks` of a team, a `TeamNetwork` that acts first; what it adds
-        draws its weights from torch's generator."""
-
-    def loss(self, network: nn.Module) -> LossModule:
-        """TorchRL's loss over a team's networks, for transitions of the default keys with observations
-        [.., S, C, X, Y] and actions [.., S]; rewards [.., 1] of replay, advantages [.., S, 1] of rollouts."""
-
-
 @dataclass(frozen=True, kw_only=True)
-class VDN:
-    """Value decomposition: the team's value is the sum of its members', by TorchRL's `QMixerLoss`.
+class VDN(TeamAlgorithm, OffPolicy):
+    """Value decomposition: the team's value is the sum of its members' values, TorchRL's `QMixerLoss`.
 
     Source: Sunehag et al., "Value-Decomposition Networks For Cooperative Multi-Agent Learning" (2017).
     """
 
     settings: DQNSettings
-    stochastic: ClassVar[bool] = False
-    shares_reward: ClassVar[bool] = True
-    fewest_members: ClassVar[int] = 1
+    network: Network | Custom | None = None
+    """The architecture of the networks; None for fully connected layers of `settings.hidden_cells`."""
 
-    def network(self, game: Game) -> nn.Module:
-        """See `TeamAlgorithm`."""
-        return q_network_of(game, self.settings)
+    def make_network(self, spaces: Spaces) -> nn.Module:
+        """See `Algorithm`."""
+        return q_network_of(spaces, self.settings, self.network)
 
-    def team(self, members: Sequence[nn.Module], game: Game) -> nn.Module:
-        """See `TeamAlgorithm`."""
+    def make_team(self, members: Sequence[nn.Module], spaces: Spaces) -> nn.Module:
+        """See `Algorithm`."""
         mixer = VDNMixer(len(members), device="cpu")
-        return AgentNetworks({"actor": TeamNetwork(members), "mixer": mixer})  # type: ignore[arg-type]
+        return AgentNetworks({"actor": _team(members, spaces), "mixer": mixer})
 
-    def loss(self, network: nn.Module) -> LossModule:
-        """See `TeamAlgorithm`."""
+    def make_loss(self, network: nn.Module) -> LossModule:
+        """See `Algorithm`."""
         return _mixed(network, [_CHOSEN], self.settings)
 
 
 @dataclass(frozen=True, kw_only=True)
-class QMIX:
-    """The team's value grows with each member's, mixed by what all of them see, by TorchRL's `QMixerLoss`.
+class QMIX(TeamAlgorithm, OffPolicy):
+    """Monotonic mixing: the team's value never falls as a member's value rises. TorchRL's `QMixerLoss`.
 
-    Source: Rashid et al., "QMIX: Monotonic Value Function Factorisation for Deep Multi-Agent Reinforcement
-    Learning" (2018). Members have networks of their own, of one observation, not recurrent ones.
+    The mixing network reads the observations of all members. Source: Rashid et al., "QMIX: Monotonic Value
+    Function Factorisation for Deep Multi-Agent Reinforcement Learning" (2018). Here members share no weights,
+    and their networks are not recurrent.
     """
 
     settings: DQNSettings
     mixing_cells: int = 32
     """Units of the mixing layer."""
-    stochastic: ClassVar[bool] = False
-    shares_reward: ClassVar[bool] = True
+    network: Network | Custom | None = None
+    """The architecture of the networks; None for fully connected layers of `settings.hidden_cells`."""
     fewest_members: ClassVar[int] = 2
 
-    def network(self, game: Game) -> nn.Module:
-        """See `TeamAlgorithm`."""
-        return q_network_of(game, self.settings)
+    def make_network(self, spaces: Spaces) -> nn.Module:
+        """See `Algorithm`."""
+        return q_network_of(spaces, self.settings, self.network)
 
-    def team(self, members: Sequence[nn.Module], game: Game) -> nn.Module:
-        """See `TeamAlgorithm`."""
+    def make_team(self, members: Sequence[nn.Module], spaces: Spaces) -> nn.Module:
+        """See `Algorithm`."""
         mixer = Mixing(
-            game.observation_shape,
+            spaces.observation_shape,
             members=len(members),
             cells=self.mixing_cells,
-            highest=game.observation.highest,
+            highest=spaces.observation_scale,
         )
-        return AgentNetworks({"actor": TeamNetwork(members), "mixer": mixer})  # type: ignore[arg-type]
+        return AgentNetworks({"actor": _team(members, spaces), "mixer": mixer})
 
-    def loss(self, network: nn.Module) -> LossModule:
-        """See `TeamAlgorithm`."""
+    def make_loss(self, network: nn.Module) -> LossModule:
+        """See `Algorithm`."""
         return _mixed(network, [_CHOSEN, "observation"], self.settings)
 
 
-def check_team(algorithm: TeamAlgorithm, *, reward_kind: RewardKind, members: int) -> None:
-    """Raises a ValueError for a team that is none: of members paid for themselves, too few, or with settings
-    of the other kind."""
-    name, fewest = type(algorithm).__name__, algorithm.fewest_members
-    came = algorithm.settings
-    wanted = [field.type for field in fields(algorithm) if field.name == "settings"]  # type: ignore[arg-type]
-    if not all(isinstance(came, kind) for kind in wanted if isinstance(kind, type)):
-        kinds = ", ".join(getattr(kind, "__name__", str(kind)) for kind in wanted)
-        raise ValueError(f"{name} has settings of the type {type(came).__name__}; {kinds} is wanted")
-    if algorithm.shares_reward and reward_kind != "group":
-        raise ValueError(
-            f'{name} wants paid="group": its agents share one reward, the sum of all; it came with '
-            f'paid="{reward_kind}", for which DQN, PPO or IPPO fit'
+@dataclass(frozen=True, kw_only=True)
+class MAPPO(TeamAlgorithm, OnPolicy):
+    """PPO with an actor per member and a central critic of all observations, TorchRL's `MAPPOLoss`.
+
+    Source: Yu et al., "The Surprising Effectiveness of PPO in Cooperative Multi-Agent Games" (2022); here
+    without value normalisation, and members share no weights.
+    """
+
+    settings: RolloutSettings
+    clip_epsilon: float = 0.2
+    """The largest change of an action's probability, as a ratio minus 1."""
+    entropy_coeff: float = 0.01
+    critic_coeff: float = 0.5
+    network: Network | Custom | None = None
+    """The architecture of the networks; None for fully connected layers of `settings.hidden_cells`."""
+
+    def make_network(self, spaces: Spaces) -> nn.Module:
+        """See `Algorithm`."""
+        return network_of(spaces, self.settings, self.network, outputs=spaces.actions)
+
+    def make_team(self, members: Sequence[nn.Module], spaces: Spaces) -> nn.Module:
+        """See `Algorithm`."""
+        everything = len(members), *spaces.observation_shape
+        critic = network_of(spaces, self.settings, self.network, outputs=1, shape=everything)
+        return AgentNetworks({"actor": _team(members, spaces), "critic": CentralCritic(critic, len(members))})
+
+    def make_loss(self, network: nn.Module) -> LossModule:
+        """See `Algorithm`."""
+        return clipped_loss(network, MAPPOLoss, self)
+
+
+@dataclass(frozen=True, kw_only=True)
+class IPPO(TeamAlgorithm, OnPolicy):
+    """PPO with an actor and a critic per member, TorchRL's `IPPOLoss`.
+
+    Unlike agents that each learn with `PPO`, members share gradient clipping and the normalisation of
+    advantages. Source: de Witt et al., "Is Independent Learning All You Need in the
+    StarCraft Multi-Agent Challenge?" (2020).
+    """
+
+    settings: RolloutSettings
+    clip_epsilon: float = 0.2
+    """The largest change of an action's probability, as a ratio minus 1."""
+    entropy_coeff: float = 0.01
+    critic_coeff: float = 0.5
+    network: Network | Custom | None = None
+    """The architecture of the networks; None for fully connected layers of `settings.hidden_cells`."""
+    shares_reward: ClassVar[bool] = False
+
+    def make_network(self, spaces: Spaces) -> nn.Module:
+        """See `Algorithm`."""
+        return actor_and_critic(spaces, self.settings, self.network)
+
+    def make_team(self, members: Sequence[nn.Module], spaces: Spaces) -> nn.Module:
+        """See `Algorithm`."""
+        of_each: Sequence[Any] = members
+        return AgentNetworks(
+            {name: _team([own[name] for own in of_each], spaces) for name in ("actor", "critic")}
         )
-    if members < fewest:
-        raise ValueError(
-            f"{name} wants a team of at least {fewest}: equal learners at so many seats; it came with "
-            f"{members}, for which DQN or VDN fits"
-        )
+
+    def make_loss(self, network: nn.Module) -> LossModule:
+        """See `Algorithm`."""
+        return clipped_loss(network, IPPOLoss, self)
+
+
+def _team(members: Sequence[nn.Module], spaces: Spaces) -> nn.Module:
+    return team_network(members, observation_dims=len(spaces.observation_shape))
 
 
 def _mixed(network: nn.Module, seen_by_mixer: Sequence[str], settings: DQNSettings) -> LossModule:
-    """`QMixerLoss` over a team's "actor" and "mixer", its entries at the root."""
+    """`QMixerLoss` over a team's "actor" and "mixer", with entries at the root of the TensorDict."""
     assert isinstance(network, AgentNetworks)
     loss = QMixerLoss(
         q_actor(network["actor"]),

@@ -1,1 +1,26 @@
-"""The game: numpy and numba; knows nothing of torch or of learning."""
+"""The game, in numpy and Numba. It knows nothing of torch or of learning.
+
+In reading order:
+
+    rules        every number of the game, with unit, range and source
+    maps         boards: drawn, named or generated
+    observation  what agents observe, and in which form
+    game         Game: a map, its rules and its observations
+    world        the arrays of B worlds: state, step output, scratch memory
+    colours      the classes of cells and their colours
+    tables       a game as lookup tables for the compiled rules
+    chance       counter-based random numbers
+    moves        turning, walking and clashes, on one world
+    beam         beams, hits and tags, on one world
+    apples       harvest and regrowth, on one world
+    views        the picture of the board and the agents' windows, on one world
+    turn         the order of a turn and of an episode, on one world
+    loops        the loops over worlds that a thread runs
+    compiled     compiles the rules for a target
+    threads      CpuThreads: runs the loops on CPU threads
+    cuda         CudaThreads: runs the loops on a GPU
+    state        reads, checks and restores the state of B worlds
+    batch        Batch: B worlds, played a turn at a time
+    decoding     observations back to classes of cells
+    picture      an image of the board for people
+"""

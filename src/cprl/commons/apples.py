@@ -1,4 +1,4 @@
-"""Apples: where they grow by chance, and who bites them. All on ONE world."""
+"""Apples: harvest and random regrowth, on one world."""
 
 import numpy as np
 from numpy.typing import NDArray
@@ -20,7 +20,7 @@ from cprl.commons.world import Scratch, Worlds
 
 
 def fill(world: Worlds, tables: Tables) -> None:
-    """An apple on every site."""
+    """Puts an apple on every site."""
     sites = world.stock.shape[0]
     for k in range(sites):
         world.stock[k] = 1
@@ -29,16 +29,16 @@ def fill(world: Worlds, tables: Tables) -> None:
     world.stock_left[0] = sites
 
 
-def hang(world: Worlds, tables: Tables, k: int) -> None:
-    """An apple appears on site k."""
+def add_apple(world: Worlds, tables: Tables, k: int) -> None:
+    """Adds an apple on site k."""
     world.stock[k] = 1
     world.stock_left[0] += 1
     for n in range(tables.near_first[k], tables.near_first[k + 1]):
         world.near[tables.near_sites[n]] += 1
 
 
-def pick(world: Worlds, tables: Tables, k: int) -> None:
-    """The apple on site k is gone."""
+def remove_apple(world: Worlds, tables: Tables, k: int) -> None:
+    """Removes the apple on site k."""
     world.stock[k] = 0
     world.stock_left[0] -= 1
     for n in range(tables.near_first[k], tables.near_first[k + 1]):
@@ -46,7 +46,7 @@ def pick(world: Worlds, tables: Tables, k: int) -> None:
 
 
 def recount(world: Worlds, tables: Tables) -> None:
-    """What follows from the stock: how many apples are left, and how many near each site."""
+    """Recomputes what follows from the stock: the apples left, and the apples near each site."""
     world.stock_left[0] = 0
     for k in range(world.stock.shape[0]):
         world.near[k] = 0
@@ -56,7 +56,7 @@ def recount(world: Worlds, tables: Tables) -> None:
 
 
 def draw(world: Worlds, number: int) -> tuple[np.uint64, np.uint64, np.uint64, np.uint64]:
-    """Four random words for this world, episode and step."""
+    """Draws four random 32-bit words; `number` identifies the draw within this world, episode and step."""
     return philox4x32(
         np.uint64(number),
         np.uint64(world.step[0]),
@@ -68,7 +68,7 @@ def draw(world: Worlds, number: int) -> tuple[np.uint64, np.uint64, np.uint64, n
 
 
 def draw_first_bytes(world: Worlds, scratch: Scratch) -> None:
-    """The first byte of every site's random word into `scratch.words`, four sites a word."""
+    """Draws the first byte of every site's random word into `scratch.words`, four sites per word."""
     sites = world.stock.shape[0]
     for number in range((sites + SITES_PER_DRAW - 1) // SITES_PER_DRAW):
         words = draw(world, REGROWTH_FIRST_BYTE + number)
@@ -79,11 +79,12 @@ def draw_first_bytes(world: Worlds, scratch: Scratch) -> None:
 
 
 def find_sprouts(world: Worlds, tables: Tables, scratch: Scratch) -> int:
-    """The sites that grow an apple this turn, by the stock as it stands; returns how many.
+    """Finds the sites that grow an apple in this turn, given the current stock; returns their number.
 
-    An empty site grows an apple if its random 32-bit word falls below what its neighbours allow. Sixteen
-    sites draw their first bytes together; only where that leaves it open are the other three drawn. The
-    first loop has no branch, since which sites are empty is nothing that a processor could guess.
+    An empty site grows an apple if its random 32-bit word is below a threshold that depends on the number of
+    apples near it. Sixteen sites share one draw for the first bytes of their words; the other three bytes are
+    drawn only where the first byte does not decide. The first loop has no branch, because a processor cannot
+    predict which sites are empty.
     """
     open_sites = 0
     draw_first_bytes(world, scratch)
@@ -101,32 +102,43 @@ def find_sprouts(world: Worlds, tables: Tables, scratch: Scratch) -> int:
 
 
 def has_sprouted(world: Worlds, tables: Tables, scratch: Scratch, k: int) -> bool:
-    """Whether the whole random word of site k falls below what its neighbours allow."""
+    """Whether the whole random word of site k is below its threshold."""
     first_byte = (scratch.words[k >> 2] >> (8 * (k & 3))) & LOW_BYTE
     rest = np.int64(draw(world, REGROWTH_REST + k)[0]) >> BYTE_BITS
     return ((first_byte << REST_BITS) | rest) < tables.regrow_below[world.near[k]]
 
 
 def grow(world: Worlds, tables: Tables, scratch: Scratch, sprouts: int) -> None:
-    """The apples found by `find_sprouts` appear."""
+    """Adds an apple on each site that `find_sprouts` found; `sprouts`: the number of these sites."""
     for s in range(sprouts):
-        hang(world, tables, scratch.sprouts[s])
+        add_apple(world, tables, scratch.sprouts[s])
 
 
 def bite(world: Worlds, tables: Tables, harvest: NDArray[np.float32]) -> None:
-    """Everyone in play bites the apple on its cell, if it may; `harvest`: float32 [N], apples bitten.
+    """Each agent in play harvests the apple on its cell, if it may; `harvest`: float32 [N], 0 or 1.
 
-    Two on one cell are met only under `pairwise_clashes`: the lower number gets the apple.
+    Two agents share a cell only under `pairwise_clashes`: the lower index gets the apple.
     """
     for i in range(world.row.shape[0]):
         harvest[i] = 0.0
         if world.in_play[i]:
             k = tables.site_at[cell_of(world.row[i], world.col[i], tables)]
             if k >= 0 and world.stock[k] == 1 and tables.may_bite[i, k]:
-                pick(world, tables, k)
+                remove_apple(world, tables, k)
                 harvest[i] = 1.0
                 world.harvested[i] += 1
 
 
-FUNCTIONS = (fill, hang, pick, recount, draw, draw_first_bytes, has_sprouted, find_sprouts, grow, bite)
-"""In the order in which they call each other, as `compiled.py` compiles them."""
+FUNCTIONS = (
+    fill,
+    add_apple,
+    remove_apple,
+    recount,
+    draw,
+    draw_first_bytes,
+    has_sprouted,
+    find_sprouts,
+    grow,
+    bite,
+)
+"""The rules of this module, each after those it calls; `compiled.py` compiles them in this order."""

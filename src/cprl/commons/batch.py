@@ -1,4 +1,4 @@
-"""B worlds of a game at once, on whatever driver plays them."""
+"""Batch: B worlds of a game, played a turn at a time by a driver (CPU threads or a GPU)."""
 
 from collections.abc import Mapping
 from typing import Any, Protocol
@@ -14,7 +14,7 @@ from cprl.commons.world import Actions, Bools, Bytes, Shown, StepOutput, Worlds,
 
 
 class Driver(Protocol):
-    """What runs the rules: `CpuThreads`, or `cprl.commons.cuda.CudaThreads`."""
+    """Runs the rules on B worlds: `CpuThreads` or `cprl.commons.cuda.CudaThreads`."""
 
     threads: int
 
@@ -24,7 +24,7 @@ class Driver(Protocol):
     def write(self, array: NDArray[Any], values: NDArray[Any]) -> None: ...
     def first_unknown(self, actions: Actions, known: int) -> int: ...
     def run(
-        self, loop: Loop, worlds: Worlds, what: NDArray[Any], output: StepOutput, *, vouched: bool = False
+        self, loop: Loop, worlds: Worlds, argument: NDArray[Any], output: StepOutput, *, checked: bool = False
     ) -> None: ...
 
 
@@ -32,12 +32,16 @@ class Batch:
     """B worlds of a game, played a turn at a time.
 
     Args:
-        game: what is played.
-        worlds: how many worlds B, at least 1.
-        seed: 0 .. 2**64 - 1; with it, the world's number, the episode and the step all chance is settled.
-        first_world: the number of the first world, so that world b can be played alone.
-        threads: how many CPU threads share the worlds; None for all cores where it pays.
-        driver: what plays them; by default CPU threads.
+        game: The game.
+        worlds: The number of worlds B, at least 1.
+        seed: 0 to 2**64 - 1. Random numbers are a function of the seed, the index of the world, the episode
+            and the step alone.
+        first_world: The index of the first world; with it, world b of a larger batch can be played alone.
+        threads: The number of CPU threads that share the worlds; None uses all cores where that is faster.
+        driver: The driver; CPU threads by default.
+
+    Raises:
+        ValueError: If `worlds`, `seed`, `first_world` or `threads` is out of range.
     """
 
     def __init__(
@@ -51,74 +55,77 @@ class Batch:
         driver: Driver | None = None,
     ) -> None:
         if worlds < 1:
-            raise ValueError(f"worlds is {worlds}; at least 1 is wanted")
+            raise ValueError(f"worlds is {worlds}; allowed: an integer >= 1")
         if first_world < 0 or first_world + worlds > 2**32:
-            raise ValueError(f"worlds {first_world} to {first_world + worlds - 1}; allowed: 0 to 2**32 - 1")
+            raise ValueError(
+                f"first_world is {first_world} and worlds is {worlds}; "
+                "allowed: worlds with indices from 0 to 2**32 - 1"
+            )
         self.game = game
         self.size = worlds
         self.driver: Driver = driver or CpuThreads(game, worlds, threads=threads)
         host = empty_worlds(worlds=worlds, agents=game.agents, sites=len(game.map.sites))
         host.number[:, 0] = np.arange(first_world, first_world + worlds, dtype=np.uint64)
         self.now: Worlds = self.driver.place(host)
-        """How the worlds stand, in the driver's arrays."""
-        self._everyone = self._marked(np.ones(worlds, np.bool_))
+        """The current state of the worlds, in the driver's arrays."""
+        self._all_worlds = self._selection(np.ones(worlds, np.bool_))
         self.set_seed(seed)
 
-    def _marked(self, which: Bools) -> Bools:
-        marks = self.driver.empty((self.size,), np.bool_)
-        self.driver.write(marks, which)
-        return marks
+    def _selection(self, which: Bools) -> Bools:
+        selection = self.driver.empty((self.size,), np.bool_)
+        self.driver.write(selection, which)
+        return selection
 
     def set_seed(self, seed: int) -> None:
-        """Starts all over: the next episode of each world is the first of this seed."""
+        """Restarts from a seed: the next episode of each world is the first episode of this seed."""
         if not 0 <= seed < 2**64:
             raise ValueError(f"seed is {seed}; allowed: 0 to 2**64 - 1")
         self.driver.write(self.now.seed, np.full((self.size, 1), seed, np.uint64))
         self.driver.write(self.now.episode, np.full((self.size, 1), -1, np.int32))
 
     def new_output(self) -> StepOutput:
-        """Fresh arrays for what a turn tells."""
+        """New arrays for the output of a turn."""
         shapes = output_shapes(self.game, self.size)
         return StepOutput(**{name: self.driver.empty(*form) for name, form in shapes.items()})
 
     def begin(self, output: StepOutput, which: Bools | None = None) -> StepOutput:
-        """Begins the next episode of the marked worlds, all if None; only their rows of `output` are written.
+        """Begins the next episode of some worlds and writes their rows of `output`.
 
         Args:
-            output: as `new_output` makes it.
-            which: bool [B].
+            output: Arrays made by `new_output`.
+            which: bool [B], the worlds that begin; None for all.
         """
-        self.driver.run("begin_worlds", self.now, self._everyone if which is None else which, output)
+        self.driver.run("begin_worlds", self.now, self._all_worlds if which is None else which, output)
         return output
 
     def play(self, actions: Actions, output: StepOutput) -> StepOutput:
-        """One turn of every world, into `output`.
+        """Plays one turn of every world and writes its output.
 
         Args:
             actions: int64 [B, N], contiguous.
-            output: as `new_output` makes it.
+            output: Arrays made by `new_output`.
 
         Raises:
-            ValueError: for an action that the game does not know; then nothing has changed.
+            ValueError: If an action is out of range or an array has the wrong form; no world has changed.
         """
         self.check(actions)
         self.driver.run("play_worlds", self.now, actions, output)
         return output
 
     def play_checked(self, actions: Actions, output: StepOutput) -> StepOutput:
-        """`play` for contiguous actions that `check` has seen, into an `output` known to have its form: to
-        look at it again takes as long as a turn of one world."""
-        self.driver.run("play_worlds", self.now, actions, output, vouched=True)
+        """`play` without checks, which take as long as a turn of one world: `actions` are contiguous and have
+        passed `check`, and `output` has the form of `new_output`."""
+        self.driver.run("play_worlds", self.now, actions, output, checked=True)
         return output
 
     def boards(self, output: StepOutput) -> Bytes:
-        """The whole boards as they stand, uint8 [B, H, W], classes of `cprl.commons.colours`."""
+        """The current boards: uint8 [B, H, W], classes of `cprl.commons.colours`."""
         boards = self.driver.empty((self.size, self.game.map.height, self.game.map.width), np.uint8)
         self.driver.run("show_worlds", self.now, boards, output)
         return boards
 
     def show(self, output: StepOutput, *, world: int = 0) -> Shown:
-        """One world for people to look at."""
+        """A copy of one world for display; `output` holds its latest observation."""
         read, now = self.driver.read, self.now
         return Shown(
             observation=read(output.observation[world]),
@@ -132,32 +139,36 @@ class Batch:
         )
 
     def state(self) -> states.State:
-        """How all worlds stand, as plain arrays by the names of `Worlds`: copies, [B, ...] each.
+        """The state of all worlds: copies of arrays [B, ...] by the names of `Worlds`.
 
-        With the game it says all that the future depends on, chance included.
+        The state and the game together determine the future, including all random numbers.
         """
         return {name: self.driver.read(getattr(self.now, name)) for name in states.NAMES}
 
     def load(self, state: Mapping[str, NDArray[Any]], output: StepOutput) -> StepOutput:
-        """Puts the worlds where a state says; `output` shows them so, and says that nothing happened.
+        """Sets the state of the worlds and writes it into `output`, with no harvest, shots, hits or growth.
 
         Args:
-            state: as `state` gives it, of as many worlds of the same game.
-            output: as `new_output` makes it.
+            state: Arrays as returned by `state`, for the same number of worlds of the same game.
+            output: Arrays made by `new_output`.
 
         Raises:
-            ValueError: for a state that cannot be; then nothing has changed.
+            ValueError: If the game cannot be in this state; no world has changed.
         """
         for name, values in states.checked(state, worlds=self.size, game=self.game).items():
             self.driver.write(getattr(self.now, name), values)
-        self.driver.run("look_at_worlds", self.now, self._everyone, output)
+        self.driver.run("refresh_worlds", self.now, self._all_worlds, output)
         return output
 
     def check(self, actions: Actions) -> None:
-        """Raises ValueError unless all actions are known; see `play`."""
-        wanted = self.size, self.game.agents
-        if actions.shape != wanted or actions.dtype != np.int64:
-            raise ValueError(f"actions are {actions.dtype} {actions.shape}; wanted: int64 {wanted}")
+        """Checks actions for `play`.
+
+        Raises:
+            ValueError: If `actions` is not int64 [B, N], or an action is out of range.
+        """
+        expected = self.size, self.game.agents
+        if actions.shape != expected or actions.dtype != np.int64:
+            raise ValueError(f"actions are {actions.dtype} {actions.shape}; expected: int64 {expected}")
         known = len(self.game.actions)
         at = self.driver.first_unknown(actions, known)
         if at >= 0:

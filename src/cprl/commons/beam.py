@@ -1,4 +1,4 @@
-"""The beam: what it covers, whom it hits, and who is out of play for it. All on ONE world."""
+"""The beam: the cells it covers, the agents it hits, and how they are tagged, on one world."""
 
 from cprl.commons.colours import WALL
 from cprl.commons.moves import cell_of
@@ -7,7 +7,7 @@ from cprl.commons.world import COL_STEP, ROW_STEP, Bools, Worlds
 
 
 def beam_cell(world: Worlds, tables: Tables, shooter: int, ahead: int, side: int) -> int:
-    """The cell so far ahead of a shooter and so far to its right."""
+    """The cell that lies `ahead` cells ahead of a shooter and `side` cells to its right."""
     heading = world.heading[shooter]
     right = (heading + 1) % 4
     row = world.row[shooter] + ahead * ROW_STEP[heading] + side * ROW_STEP[right]
@@ -16,7 +16,7 @@ def beam_cell(world: Worlds, tables: Tables, shooter: int, ahead: int, side: int
 
 
 def beam_reach(world: Worlds, tables: Tables, shooter: int, side: int) -> int:
-    """How many cells the beam's column at this side covers, each column up to its own wall."""
+    """The number of cells that the beam covers in its column at offset `side`, up to the first wall there."""
     reach = 0
     while (
         reach < tables.beam_length[world.heading[shooter]]
@@ -43,7 +43,7 @@ def is_hit(world: Worlds, tables: Tables, target: int, shooter: int) -> bool:
 
 
 def find_hits(world: Worlds, tables: Tables, hit_by: Bools) -> None:
-    """Who in play is hit by whom, on the cells after clashes; `hit_by`: bool [N, N], row hit."""
+    """Finds which agents in play are hit by whom, after all moves; `hit_by`: bool [N, N], row: agent hit."""
     agents = world.row.shape[0]
     for i in range(agents):
         for j in range(agents):
@@ -51,7 +51,7 @@ def find_hits(world: Worlds, tables: Tables, hit_by: Bools) -> None:
 
 
 def tag(world: Worlds, tables: Tables, hit_by: Bools, tagged_by: Bools) -> None:
-    """Hits are counted, one a turn; whoever has taken `hits_to_tag` goes out of play; [N, N] each."""
+    """Counts hits, at most one per agent and turn, and tags agents with `hits_to_tag` hits; [N, N] each."""
     agents = world.row.shape[0]
     for i in range(agents):
         freeze = -1
@@ -66,11 +66,11 @@ def tag(world: Worlds, tables: Tables, hit_by: Bools, tagged_by: Bools) -> None:
         if world.hits[i] >= tables.hits_to_tag:
             for j in range(agents):
                 tagged_by[i, j] = hit_by[i, j]
-            put_out(world, tables, i, freeze)
+            take_out_of_play(world, tables, i, freeze)
 
 
-def put_out(world: Worlds, tables: Tables, i: int, freeze: int) -> None:
-    """Agent i is out of play from now on, for so many turns."""
+def take_out_of_play(world: Worlds, tables: Tables, i: int, freeze: int) -> None:
+    """Takes agent i out of play for `freeze` turns."""
     world.in_play[i] = False
     world.hits[i] = 0
     world.offences[i] += 1
@@ -78,5 +78,5 @@ def put_out(world: Worlds, tables: Tables, i: int, freeze: int) -> None:
     world.out_steps[i] = max(0, freeze - 1) if tables.freeze_counts_tag_turn else freeze
 
 
-FUNCTIONS = (beam_cell, beam_reach, is_hit, find_hits, put_out, tag)
-"""In the order in which they call each other, as `compiled.py` compiles them."""
+FUNCTIONS = (beam_cell, beam_reach, is_hit, find_hits, take_out_of_play, tag)
+"""The rules of this module, each after those it calls; `compiled.py` compiles them in this order."""

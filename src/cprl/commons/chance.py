@@ -1,7 +1,7 @@
-"""Counter-based random numbers: what happens by chance is a function of where and when, nothing else.
+"""Counter-based random numbers: a function of seed, world, episode, step, site and purpose alone.
 
 Philox4x32-10 (Salmon, Moraes, Dror and Shaw, "Parallel random numbers: as easy as 1, 2, 3", SC 2011).
-The key is the seed, the counter says which number is wanted: purpose and site, step, episode, world.
+The seed is the key; the counter identifies the number: purpose and site, step, episode, world.
 So a world plays the same game in any batch, on any number of threads and on any device.
 """
 
@@ -24,15 +24,16 @@ SITES_PER_DRAW = 16
 REGROWTH_FIRST_BYTE = 0 << 28
 REGROWTH_REST = 1 << 28
 STARTS = 2 << 28
-"""What a draw is for stands in the upper four bits of the first counter word, the draw's number below."""
+"""The purpose of a draw: the upper four bits of the first counter word; its lower bits number the draw."""
 
 
 def philox4x32(
     c0: np.uint64, c1: np.uint64, c2: np.uint64, c3: np.uint64, k0: np.uint64, k1: np.uint64
 ) -> tuple[np.uint64, np.uint64, np.uint64, np.uint64]:
-    """Four uniform 32-bit words for a counter of four words and a key of two.
+    """Four uniform random 32-bit words, computed from a counter of four words and a key of two.
 
-    Words are held in uint64: no product overflows, so plain Python (the CUDA simulator) computes the same.
+    Words are held in uint64, so that no product overflows and plain Python (the CUDA simulator) gives the
+    same result.
     """
     for _ in range(ROUNDS):
         p0 = MULTIPLIER_0 * c0
@@ -45,5 +46,5 @@ def philox4x32(
 
 
 def threshold(probability: float) -> int:
-    """The number that a uniform 32-bit word falls below with this probability, to within 2**-33."""
+    """The threshold below which a uniform 32-bit word falls with this probability, to within 2**-33."""
     return round(probability * 2**32)

@@ -1,14 +1,14 @@
-"""Colour classes: what a cell of a picture shows, and in which colour."""
+"""The classes of cells and their colours."""
 
 from colorsys import hsv_to_rgb
 from typing import Final
 
 GROUND, WALL, APPLE, MARK, BEAM, OTHER, SELF, HIDDEN = range(8)
-"""The classes; from `FIRST_AGENT` on one for each agent, where agents are told apart."""
+"""The classes; MARK is a heading mark. Under `agents_apart`, each agent has a class from `FIRST_AGENT` on."""
 
 FIRST_AGENT: Final = 8
-MOST_AGENTS_APART: Final = 128 - FIRST_AGENT
-"""A class has seven bits of a paint."""
+MAX_AGENTS_APART: Final = 128 - FIRST_AGENT
+"""The largest number of agents under `agents_apart`: a class takes seven bits of a paint."""
 
 CLASS_NAMES: Final = ("ground", "wall", "apple", "heading", "beam", "other", "self", "hidden")
 
@@ -39,7 +39,7 @@ AGENT_COLOURS: Final[tuple[Colour, ...]] = (
 
 
 def agent_colour(agent: int) -> Colour:
-    """An agent's identity colour, 0..255: eight that are easily told apart, then hues in between."""
+    """An agent's identity colour (red, green, blue), 0..255: eight distinct colours, then hues in between."""
     if agent < len(AGENT_COLOURS):
         return AGENT_COLOURS[agent]
     red, green, blue = hsv_to_rgb(agent * 0.618034 % 1, 0.65, 1.0)
@@ -47,10 +47,10 @@ def agent_colour(agent: int) -> Colour:
 
 
 def class_name(kind: int) -> str:
-    """The name of a class; of an agent's class the agent's."""
+    """The name of a class; an agent's class has the agent's name."""
     return CLASS_NAMES[kind] if kind < FIRST_AGENT else f"agent_{kind - FIRST_AGENT}"
 
 
 def class_colour(kind: int) -> Colour:
-    """The colour of a class; of an agent's class the agent's identity colour."""
+    """The colour of a class; an agent's class has the agent's identity colour."""
     return COLOURS[kind] if kind < FIRST_AGENT else agent_colour(kind - FIRST_AGENT)

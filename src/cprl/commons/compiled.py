@@ -1,41 +1,74 @@
-"""The rules, compiled: one source, each function rebuilt for the target that is to run it."""
+"""Compiles the rules: every target is built from the same plain Python functions.
+
+What relies on private parts of Numba is here, each in a function or constant of its own: `CPU_OPTIONS`,
+`kept_in` and `machine_code`. `tests/test_compat.py` has a test for each.
+"""
 
 import hashlib
 import os
 import warnings
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from contextlib import contextmanager
 from functools import cache, partial
 from pathlib import Path
 from types import FunctionType
-from typing import Any
+from typing import Any, Final
 
 import numba
-from numba.core import config
 
 from cprl.commons.loops import FUNCTIONS, LOOPS
 
-numba_settings: Any = config
 Compiled = dict[str, Callable[..., Any]]
+
+CPU_OPTIONS: Final[Mapping[str, Any]] = {"nogil": True, "error_model": "numpy", "_nrt": False}
+"""Of `numba.njit`. `_nrt`, which is private, refuses any allocation inside a function, and spares the
+counting of references to the many arrays handed on, which would take fifty times as long as the game."""
+
+
+@contextmanager
+def kept_in(folder: Path) -> Iterator[None]:
+    """While it is open, functions that are decorated with `cache=True` are kept in that folder.
+
+    Numba documents its setting as an environment variable, read when Numba is imported.
+    """
+    settings: Any = numba.config
+    usual = settings.CACHE_DIR
+    settings.CACHE_DIR = str(folder)
+    try:
+        yield
+    finally:
+        settings.CACHE_DIR = usual
+
+
+def machine_code(function: Any, *arguments: Any) -> Callable[..., Any]:
+    """The machine code of a compiled function for arguments of the types of these, to be called directly.
+
+    Numba's own call looks at the types of all arguments each time; this one looks at none, so the caller
+    must. `Dispatcher.compile` returns it, which Numba does not document.
+    """
+    code: Callable[..., Any] = function.compile(tuple(map(numba.typeof, arguments)))
+    return code
 
 
 def compiled(functions: Iterable[Any], jit: Callable[[FunctionType], Callable[..., Any]]) -> Compiled:
-    """Each plain function rebuilt so that it calls the compiled ones before it, by name.
+    """Compiles plain functions by name; each calls the compiled versions of those before it.
 
-    One source of the rules for every target: `jit` says which.
+    Args:
+        functions: Plain functions, each after those it calls.
+        jit: Compiles one function for the target.
     """
-    ready: Compiled = {}
+    done: Compiled = {}
     for function in functions:
-        known = {**function.__globals__, **ready}
-        ready[function.__name__] = jit(FunctionType(function.__code__, known, function.__name__))
-    return ready
+        names = {**function.__globals__, **done}
+        done[function.__name__] = jit(FunctionType(function.__code__, names, function.__name__))
+    return done
 
 
-def _jit_for_cpu(function: FunctionType, *, keep: bool) -> Callable[..., Any]:
-    """Numba for a CPU thread. `_nrt=False` refuses any allocation inside a rule, and spares the counting
-    of references to the many arrays handed on, which would take fifty times as long as the game."""
-    options: dict[str, Any] = {"nogil": True, "error_model": "numpy", "_nrt": False}
+def _jit_for_cpu(function: FunctionType, *, on_disk: bool) -> Callable[..., Any]:
+    """Compiles a function for CPU threads."""
+    options = dict(CPU_OPTIONS)
     if function.__name__ in (*LOOPS, "first_unknown"):
-        options |= {"cache": keep}
+        options |= {"cache": on_disk}
     else:
         options |= {"forceinline": True, "no_cpython_wrapper": True, "no_cfunc_wrapper": True}
     return numba.njit(**options)(function)
@@ -43,39 +76,35 @@ def _jit_for_cpu(function: FunctionType, *, keep: bool) -> Callable[..., Any]:
 
 @cache
 def rules_for_cpu() -> Compiled:
-    """The rules compiled for CPU threads: ten seconds the first time, then kept on disk.
+    """The rules compiled for CPU threads: about ten seconds the first time, then cached on disk.
 
-    Numba's own cache looks only at the file of the function called, and would miss a change in a rule that
-    it calls; so the folder is named after the text of all rules.
+    Numba's own cache checks only the file of the called function and would miss a change in a rule that this
+    function calls; so the cache folder is named after the text of all rules.
     """
     folder = _cache_folder() / _fingerprint()
-    keep = _can_write(folder)
-    usual = numba_settings.CACHE_DIR
-    numba_settings.CACHE_DIR = str(folder)
-    try:
-        return compiled(FUNCTIONS, partial(_jit_for_cpu, keep=keep))
-    finally:
-        numba_settings.CACHE_DIR = usual
+    on_disk = _can_write(folder)
+    with kept_in(folder):
+        return compiled(FUNCTIONS, partial(_jit_for_cpu, on_disk=on_disk))
 
 
 _entries: dict[str, Callable[..., None]] = {}
 
 
 def entry_for_cpu(loop: str, *arguments: Any) -> Callable[..., None]:
-    """The machine code of a loop, to be called directly with arguments of the same types as these.
+    """The machine code of a loop, for direct calls with arguments of the same types as these.
 
-    Numba's own call looks at the types of some sixty arrays each time, which takes seven of eight
-    microseconds for one world; this one looks at none, so the caller must. The types are those of every
-    game: `Worlds`, `Tables`, `StepOutput` and `Scratch` never change theirs.
+    Numba's dispatcher inspects the types of about sixty arrays on every call, which takes seven of the eight
+    microseconds that one world needs. A direct call inspects nothing, so the caller must check the arguments.
+    The types are the same in every game: the fields of `Worlds`, `Tables`, `StepOutput` and `Scratch` have
+    fixed types.
     """
     if loop not in _entries:
-        types = tuple(map(numba.typeof, arguments))
-        _entries[loop] = rules_for_cpu()[loop].compile(types)  # type: ignore[attr-defined]
+        _entries[loop] = machine_code(rules_for_cpu()[loop], *arguments)
     return _entries[loop]
 
 
 def _can_write(folder: Path) -> bool:
-    """Whether compiled rules can be kept there; if not, a warning says what that costs."""
+    """Whether compiled rules can be cached in a folder; warns of the cost if not."""
     try:
         folder.mkdir(parents=True, exist_ok=True)
         if os.access(folder, os.W_OK):
@@ -84,8 +113,8 @@ def _can_write(folder: Path) -> bool:
     except OSError as error:
         reason = str(error)
     warnings.warn(
-        f"the compiled rules cannot be kept in {folder} ({reason}): every process compiles them anew, about "
-        "ten seconds; set CPRL_CACHE to a folder that can be written",
+        f"the compiled rules cannot be cached in {folder} ({reason}): every process compiles them again, "
+        "which takes about ten seconds; set CPRL_CACHE to a writable folder",
         RuntimeWarning,
         stacklevel=2,
     )
@@ -93,13 +122,13 @@ def _can_write(folder: Path) -> bool:
 
 
 def _cache_folder() -> Path:
-    """$CPRL_CACHE, or cprl in the user's cache folder."""
+    """$CPRL_CACHE, or the folder cprl in the user's cache folder."""
     if "CPRL_CACHE" in os.environ:
         return Path(os.environ["CPRL_CACHE"])
     return Path(os.environ.get("XDG_CACHE_HOME", Path.home() / ".cache")) / "cprl"
 
 
 def _fingerprint() -> str:
-    """A name for this text of the rules."""
+    """A hash of the source text of all rules."""
     sources = sorted(path for path in Path(__file__).parent.rglob("*.py"))
     return hashlib.sha256(b"".join(path.read_bytes() for path in sources)).hexdigest()[:16]

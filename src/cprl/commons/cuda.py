@@ -1,6 +1,6 @@
-"""CudaThreads: the same rules under numba-cuda, one GPU thread for each world.
+"""CudaThreads: runs the rules with numba-cuda, one GPU thread per world.
 
-With NUMBA_ENABLE_CUDASIM=1 Numba runs all of this without a GPU, slowly, as a check.
+With NUMBA_ENABLE_CUDASIM=1 Numba simulates all of this without a GPU: slowly, as a check.
 """
 
 from collections.abc import Callable
@@ -23,51 +23,51 @@ cuda: Any = numba.cuda
 THREADS_PER_BLOCK: Final = 64
 
 NONE_UNKNOWN: Final = 2**62
-"""What the search for unknown actions starts from: larger than any index."""
+"""The initial result of the search for unknown actions: larger than any index."""
 
 
 class CudaThreads:
-    """A driver of B worlds whose arrays are Numba's, on the current GPU.
+    """A driver of B worlds in Numba arrays on the current GPU.
 
-    Arrays of worlds and scratch lie in memory with the axis B innermost, so that threads side by side read
-    words side by side. What is told lies as torch wants it.
+    Worlds and scratch memory are stored with the axis B innermost, so that neighbouring threads read
+    neighbouring words. Step outputs are stored row-major, as in torch.
 
     Args:
-        game: what is played.
-        worlds: how many worlds B.
+        game: The game.
+        worlds: The number of worlds B.
 
     Raises:
-        RuntimeError: where there is no GPU that Numba can use.
+        RuntimeError: If Numba finds no GPU.
     """
 
     def __init__(self, game: Game, worlds: int) -> None:
         if not cuda.is_available():
             raise RuntimeError(
-                "Numba finds no GPU; it wants NVIDIA's driver and the package numba-cuda, "
-                "which come with cprl[cuda12] or cprl[cuda13]"
+                "Numba finds no GPU; it needs NVIDIA's driver and the package numba-cuda "
+                "(install cprl[cuda12] or cprl[cuda13])"
             )
         self.threads = worlds
         self.tables = Tables(*(_constant(entry) for entry in game.tables))
-        sheet = empty_scratch(
+        scratch = empty_scratch(
             agents=game.agents,
             sites=len(game.map.sites),
             cells=game.tables.background.size,
             window=game.tables.window_cells.shape[1],
         )
-        self._scratch = Scratch(*(_worlds_innermost((worlds, *each.shape), each.dtype) for each in sheet))
+        self._scratch = Scratch(*(_worlds_innermost((worlds, *each.shape), each.dtype) for each in scratch))
         self._unknown = cuda.to_device(np.full(1, NONE_UNKNOWN, np.int64))
 
     def place(self, worlds: Worlds) -> Worlds:
-        """The same arrays on the GPU."""
+        """Copies the arrays to the GPU."""
         return Worlds(*(cuda.to_device(np.asfortranarray(array)) for array in worlds))
 
     def wrap(self, memory: Any) -> NDArray[Any]:
-        """An array on GPU memory that somebody else holds, a torch tensor say; nothing is copied."""
+        """A Numba array on GPU memory of another owner, such as a torch tensor; shares the memory."""
         array: NDArray[Any] = cuda.as_cuda_array(memory)
         return array
 
     def empty(self, shape: tuple[int, ...], dtype: DTypeLike) -> NDArray[Any]:
-        """A new array, its entries undefined."""
+        """A new array with undefined entries."""
         array: NDArray[Any] = cuda.device_array(shape, dtype)
         return array
 
@@ -76,27 +76,35 @@ class CudaThreads:
         return np.ascontiguousarray(array.copy_to_host())
 
     def write(self, array: Any, values: NDArray[Any]) -> None:
-        """Copies values of the same shape and type into an array."""
+        """Copies values of the same shape and dtype into an array."""
         array.copy_to_device(np.asfortranarray(values))
 
     def first_unknown(self, actions: Actions, known: int) -> int:
-        """The index of the first action outside 0 .. known - 1 among all, or -1."""
+        """The index, in row-major order, of the first action outside 0 .. known - 1; -1 if there is none."""
         self._unknown.copy_to_device(np.full(1, NONE_UNKNOWN, np.int64))
         kernels()["find_unknown"][_blocks(len(actions)), THREADS_PER_BLOCK](actions, known, self._unknown)
         at = int(self._unknown.copy_to_host()[0])
         return -1 if at == NONE_UNKNOWN else at
 
     def run(
-        self, loop: Loop, worlds: Worlds, what: NDArray[Any], output: StepOutput, *, vouched: bool = False
+        self, loop: Loop, worlds: Worlds, argument: NDArray[Any], output: StepOutput, *, checked: bool = False
     ) -> None:
-        """Runs a loop on all worlds, on the default stream; returns before it is done."""
-        kernel = kernels()[loop][_blocks(len(what)), THREADS_PER_BLOCK]
-        kernel(worlds, self.tables, what, output, self._scratch)
+        """Starts a loop over all worlds on the default stream and returns before it has finished.
+
+        Args:
+            loop: The loop.
+            worlds: The state of the worlds.
+            argument: The loop's own argument.
+            output: The arrays that the loop writes.
+            checked: Ignored; see `CpuThreads.run`.
+        """
+        kernel = kernels()[loop][_blocks(len(argument)), THREADS_PER_BLOCK]
+        kernel(worlds, self.tables, argument, output, self._scratch)
 
 
 @cache
 def kernels() -> dict[str, Any]:
-    """A kernel for each loop by its name, and `find_unknown`; compiled when first launched."""
+    """The kernels by name: one for each loop, and `find_unknown`; compiled at their first launch."""
     rules = compiled(FUNCTIONS, _jit_for_gpu)
     launched: dict[str, Any] = {loop: _kernel(rules[loop], rules["one_scratch"]) for loop in LOOPS}
     return {**launched, "find_unknown": _find_unknown(rules["first_unknown"])}
@@ -110,17 +118,17 @@ def _kernel(loop: Callable[..., None], one_scratch: Callable[..., Scratch]) -> C
     """Thread b runs the loop on world b alone."""
 
     @cuda.jit
-    def kernel(worlds, tables, what, output, scratch):  # type: ignore[no-untyped-def]
+    def kernel(worlds, tables, argument, output, scratch):  # type: ignore[no-untyped-def]
         b = cuda.grid(1)
-        if b < what.shape[0]:
-            loop(worlds, tables, what, output, one_scratch(scratch, b), b, b + 1)
+        if b < argument.shape[0]:
+            loop(worlds, tables, argument, output, one_scratch(scratch, b), b, b + 1)
 
     launched: Callable[..., Any] = kernel
     return launched
 
 
 def _find_unknown(first_unknown: Callable[..., int]) -> Callable[..., Any]:
-    """Thread b looks at the actions of world b."""
+    """Thread b checks the actions of world b."""
 
     @cuda.jit
     def kernel(actions, known, found):  # type: ignore[no-untyped-def]
@@ -135,7 +143,7 @@ def _find_unknown(first_unknown: Callable[..., int]) -> Callable[..., Any]:
 
 
 def _constant(entry: Any) -> Any:
-    """An array of the tables on the GPU; a number stays what it is."""
+    """Copies an array of the tables to the GPU; returns a number unchanged."""
     return cuda.to_device(entry) if isinstance(entry, np.ndarray) else entry
 
 

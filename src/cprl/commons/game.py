@@ -1,24 +1,27 @@
-"""Game = Map + Rules + what agents observe."""
+"""Game: a Map, its Rules and the agents' Observation."""
 
 from dataclasses import dataclass, field
 from functools import cached_property
+from importlib import import_module
+from typing import Any
 
 import numpy as np
 
-from cprl.commons.colours import FIRST_AGENT, MOST_AGENTS_APART, class_colour
+from cprl.commons.colours import FIRST_AGENT, MAX_AGENTS_APART, class_colour
 from cprl.commons.maps import Map
 from cprl.commons.observation import Observation, channel_names
 from cprl.commons.rules import Rules
 from cprl.commons.tables import Tables, build_tables
 from cprl.commons.world import Bytes
+from cprl.spaces import Spaces
 
 
 @dataclass(frozen=True, kw_only=True)
 class Game:
-    """A Map, the Rules it is played by, and what agents observe of it.
+    """A map, its rules and what agents observe.
 
     Raises:
-        ValueError: where a rule given per agent or per site does not fit the map, or the observation not
+        ValueError: If a rule per agent or per site does not fit the map, or the observation does not fit
             the rules.
     """
 
@@ -40,13 +43,13 @@ class Game:
             )
         if self.observation.area == "full" and self.rules.walls_block_sight:
             raise ValueError(
-                'Observation.area is "full" and Rules.walls_block_sight is True; either an agent sees the '
-                "whole board, or walls block its sight"
+                'Observation.area is "full" and Rules.walls_block_sight is True; use area="window" where '
+                "walls block sight"
             )
-        if self.observation.agents_apart and agents > MOST_AGENTS_APART:
+        if self.observation.agents_apart and agents > MAX_AGENTS_APART:
             raise ValueError(
-                f"Observation.agents_apart is True and the map has {agents} agents; at most "
-                f"{MOST_AGENTS_APART} can be told apart"
+                f"Observation.agents_apart is True and the map has {agents} agents; allowed: at most "
+                f"{MAX_AGENTS_APART}"
             )
 
     @property
@@ -56,46 +59,68 @@ class Game:
 
     @property
     def agent_names(self) -> tuple[str, ...]:
-        """agent_0, agent_1 and so on."""
+        """agent_0, agent_1, ..., one for each agent."""
         return tuple(f"agent_{i}" for i in range(self.agents))
 
     @property
     def actions(self) -> tuple[str, ...]:
-        """The names of the actions by index."""
+        """The names of the actions; an action is its index in this tuple."""
         return self.rules.actions
 
     @property
     def channels(self) -> tuple[str, ...]:
-        """What each channel of an observation stands for: "red" and so on, or the names of classes."""
+        """The name of each channel of an observation: "red", "green", "blue", or the classes of cells."""
         hides = self.rules.walls_block_sight
         return channel_names(self.observation, agents=self.agents, hides=hides)
 
     @property
     def observation_shape(self) -> tuple[int, int, int]:
-        """(C, X, Y) of what an agent sees: channels, rows, columns."""
+        """The shape (C, X, Y) of one agent's observation: channels, rows, columns."""
         if self.observation.area == "full":
             return len(self.channels), self.map.height, self.map.width
         return len(self.channels), self.rules.window_rows, self.rules.window_columns
 
     @property
     def scoreboard_size(self) -> int:
-        """Entries of each agent's scoreboard: N, or 0 where none is observed."""
+        """The number of entries in each agent's scoreboard: N, or 0 without a scoreboard."""
         return self.agents if self.observation.scoreboard else 0
 
     @property
     def stock_gauge_size(self) -> int:
-        """Entries of each agent's stock gauge: 1, or 0 where none is observed."""
+        """The number of entries in each agent's stock gauge: 1, or 0 without a stock gauge."""
         return 1 if self.observation.stock_gauge else 0
 
     @property
+    def spaces(self) -> Spaces:
+        """What each agent observes and may do."""
+        vectors = {"stock_gauge": self.stock_gauge_size, "scoreboard": self.scoreboard_size}
+        return Spaces(
+            agents=self.agents,
+            observation_shape=self.observation_shape,
+            observation_scale=float(self.observation.highest),
+            actions=len(self.actions),
+            vectors=tuple((name, size) for name, size in vectors.items() if size),
+        )
+
+    def make(self, worlds: int, seed: int, device: Any = "cpu") -> Any:
+        """A `CommonsEnv` of so many worlds, as every game that an experiment plays makes its environment."""
+        envs = import_module("cprl.envs.commons_env")  # the game itself knows nothing of torch
+        return envs.CommonsEnv(self, worlds, seed=seed, device=device)
+
+    def to_config(self) -> dict[str, Any]:
+        """Its map, rules and observation as JSON can hold them."""
+        config: dict[str, Any] = import_module("cprl.config").to_config(self)
+        return config
+
+    @property
     def palette(self) -> Bytes:
-        """uint8 [classes, 3], red, green and blue of each class of cell."""
+        """The colour of each class of cell: uint8 [classes, 3], red, green and blue."""
         classes = FIRST_AGENT + (self.agents if self.observation.agents_apart else 0)
         return np.array([class_colour(kind) for kind in range(classes)], np.uint8)
 
     @cached_property
     def tables(self) -> Tables:
-        """The game as the compiled rules read it; computed once."""
+        """The lookup tables that the compiled rules read; computed once and cached."""
         return build_tables(self.map, self.rules, self.observation)
 
     def __getstate__(self) -> dict[str, object]:
@@ -103,7 +128,7 @@ class Game:
 
 
 def output_shapes(game: Game, worlds: int) -> dict[str, tuple[tuple[int, ...], type[np.generic]]]:
-    """Shape and type of each entry of `StepOutput` for B worlds of a game."""
+    """The shape and dtype of each entry of `StepOutput`, for B worlds of a game."""
     of_agent = worlds, game.agents
     return {
         "observation": ((*of_agent, *game.observation_shape), np.uint8),

@@ -1,16 +1,16 @@
-"""The loops over worlds that a thread runs, on the CPU or on the GPU; the rules themselves know ONE world."""
+"""The loops over worlds that a thread runs, on the CPU or the GPU. Each rule works on one world."""
 
 from typing import Final, Literal, get_args
 
 from cprl.commons import turn
 from cprl.commons.tables import Tables
-from cprl.commons.turn import begin_episode, look_again, play_turn
+from cprl.commons.turn import begin_episode, play_turn, refresh_output
 from cprl.commons.views import draw_board
 from cprl.commons.world import Actions, Bools, Bytes, Scratch, StepOutput, Worlds
 
 
 def one_world(w: Worlds, b: int) -> Worlds:
-    """World b without the axis B, sharing memory."""
+    """World b without the axis B; shares memory."""
     return Worlds(
         w.seed[b],
         w.number[b],
@@ -35,27 +35,27 @@ def one_world(w: Worlds, b: int) -> Worlds:
     )
 
 
-def one_told(t: StepOutput, b: int) -> StepOutput:
-    """What is told of world b, without the axis B, sharing memory."""
+def one_output(o: StepOutput, b: int) -> StepOutput:
+    """The output of world b without the axis B; shares memory."""
     return StepOutput(
-        t.observation[b],
-        t.harvest[b],
-        t.in_play[b],
-        t.fired[b],
-        t.hit_by[b],
-        t.tagged_by[b],
-        t.scoreboard[b],
-        t.stock_gauge[b],
-        t.stock[b],
-        t.regrown[b],
-        t.terminated[b],
-        t.truncated[b],
-        t.done[b],
+        o.observation[b],
+        o.harvest[b],
+        o.in_play[b],
+        o.fired[b],
+        o.hit_by[b],
+        o.tagged_by[b],
+        o.scoreboard[b],
+        o.stock_gauge[b],
+        o.stock[b],
+        o.regrown[b],
+        o.terminated[b],
+        o.truncated[b],
+        o.done[b],
     )
 
 
 def one_scratch(s: Scratch, b: int) -> Scratch:
-    """World b's own sheet, where each world has one."""
+    """The scratch memory of world b, where each world has its own; shares memory."""
     return Scratch(
         s.start_row[b],
         s.start_col[b],
@@ -76,9 +76,9 @@ def play_worlds(
     first: int,
     last: int,
 ) -> None:
-    """One turn of the worlds first .. last - 1; `actions`: int64 [B, N]."""
+    """Plays one turn of the worlds first .. last - 1; `actions`: int64 [B, N]."""
     for b in range(first, last):
-        play_turn(one_world(worlds, b), tables, actions[b], one_told(output, b), scratch)
+        play_turn(one_world(worlds, b), tables, actions[b], one_output(output, b), scratch)
 
 
 def begin_worlds(
@@ -90,10 +90,10 @@ def begin_worlds(
     first: int,
     last: int,
 ) -> None:
-    """The next episode of those of the worlds first .. last - 1 that are marked; `which`: bool [B]."""
+    """Begins the next episode of the worlds among first .. last - 1 where `which`, bool [B], is true."""
     for b in range(first, last):
         if which[b]:
-            begin_episode(one_world(worlds, b), tables, one_told(output, b), scratch)
+            begin_episode(one_world(worlds, b), tables, one_output(output, b), scratch)
 
 
 def show_worlds(
@@ -105,12 +105,12 @@ def show_worlds(
     first: int,
     last: int,
 ) -> None:
-    """The whole boards of the worlds first .. last - 1; `boards`: uint8 [B, H, W], colour classes."""
+    """Draws the boards of the worlds first .. last - 1; `boards`: uint8 [B, H, W], classes of cells."""
     for b in range(first, last):
         draw_board(one_world(worlds, b), tables, scratch, boards[b])
 
 
-def look_at_worlds(
+def refresh_worlds(
     worlds: Worlds,
     tables: Tables,
     which: Bools,
@@ -119,14 +119,15 @@ def look_at_worlds(
     first: int,
     last: int,
 ) -> None:
-    """Tells of the marked worlds of first .. last - 1 as they were put in; `which`: bool [B]."""
+    """Writes the output for a state set from outside, for the worlds among first .. last - 1 where `which`,
+    bool [B], is true."""
     for b in range(first, last):
         if which[b]:
-            look_again(one_world(worlds, b), tables, one_told(output, b), scratch)
+            refresh_output(one_world(worlds, b), tables, one_output(output, b), scratch)
 
 
 def first_unknown(actions: Actions, known: int) -> int:
-    """The index of the first action outside 0 .. known - 1, or -1; `actions`: int64 [count]."""
+    """The index of the first action outside 0 .. known - 1, -1 if there is none; `actions`: int64 [count]."""
     for n in range(actions.shape[0]):
         if actions[n] < 0 or actions[n] >= known:
             return n
@@ -136,16 +137,16 @@ def first_unknown(actions: Actions, known: int) -> int:
 FUNCTIONS = (
     *turn.FUNCTIONS,
     one_world,
-    one_told,
+    one_output,
     one_scratch,
     play_worlds,
     begin_worlds,
     show_worlds,
-    look_at_worlds,
+    refresh_worlds,
     first_unknown,
 )
-"""All rules and loops in the order in which they call each other."""
+"""All rules and loops, each after those it calls."""
 
-Loop = Literal["play_worlds", "begin_worlds", "show_worlds", "look_at_worlds"]
+Loop = Literal["play_worlds", "begin_worlds", "show_worlds", "refresh_worlds"]
 LOOPS: Final[tuple[Loop, ...]] = get_args(Loop)
-"""The loops that drivers run, all with the same arguments."""
+"""The loops that drivers run; all have the same parameters except the third."""

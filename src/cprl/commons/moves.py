@@ -1,29 +1,29 @@
-"""Turning, walking, and what happens when several agents want one cell. All on ONE world."""
+"""Turning, walking, and clashes between agents that want the same cell, on one world."""
 
 from cprl.commons.colours import WALL
 from cprl.commons.tables import Tables
 from cprl.commons.world import COL_STEP, ROW_STEP, Actions, Scratch, Worlds
 
 WALK_TURN = (0, 2, 3, 1)
-"""Quarter turns from the heading to the walk: forward, backward, left, right."""
+"""Right turns by 90 degrees from the heading to the direction of a walk: forward, backward, left, right."""
 
 TURN_LEFT, TURN_RIGHT, FIRE = 4, 5, 6
 
 
 def cell_of(row: int, col: int, tables: Tables) -> int:
-    """The index of a cell in the tables and in the picture."""
+    """The index of a cell (row, col) in the tables and in the picture."""
     return (row + tables.rim) * tables.stride + col + tables.rim
 
 
 def is_wall(row: int, col: int, tables: Tables) -> bool:
-    """Whether a cell is a wall; everything outside the board is."""
+    """Whether a cell is a wall; every cell outside the board is one."""
     return tables.background[cell_of(row, col, tables)] == tables.paints[WALL]
 
 
 def act(world: Worlds, tables: Tables, actions: Actions, scratch: Scratch) -> None:
-    """Everyone in play turns, fires or steps onto the cell it wants; whose step clashes is settled later.
+    """Each agent in play turns, fires or moves; clashing moves are cancelled later. `actions`: int64 [N].
 
-    `actions`: int64 [N]. Nobody steps onto a wall or off the board.
+    No agent moves onto a wall or off the board.
     """
     for i in range(world.row.shape[0]):
         scratch.start_row[i] = world.row[i]
@@ -43,7 +43,7 @@ def act(world: Worlds, tables: Tables, actions: Actions, scratch: Scratch) -> No
 
 
 def walk(world: Worlds, tables: Tables, i: int, direction: int) -> None:
-    """Agent i goes one cell in a direction, unless there is a wall."""
+    """Moves agent i by one cell in a direction (a heading), unless a wall is there."""
     row = world.row[i] + ROW_STEP[direction]
     col = world.col[i] + COL_STEP[direction]
     if not is_wall(row, col, tables):
@@ -52,23 +52,23 @@ def walk(world: Worlds, tables: Tables, i: int, direction: int) -> None:
 
 
 def go_back(world: Worlds, scratch: Scratch, i: int) -> None:
-    """Agent i returns to where it began the turn."""
+    """Moves agent i back to the cell where it began the turn."""
     world.row[i] = scratch.start_row[i]
     world.col[i] = scratch.start_col[i]
 
 
 def has_moved(world: Worlds, scratch: Scratch, i: int) -> bool:
-    """Whether agent i stands elsewhere than where it began the turn."""
+    """Whether agent i is on another cell than at the start of the turn."""
     return world.row[i] != scratch.start_row[i] or world.col[i] != scratch.start_col[i]
 
 
 def share_a_cell(world: Worlds, i: int, j: int) -> bool:
-    """Whether two agents stand on one cell."""
+    """Whether two agents are on one cell."""
     return world.row[i] == world.row[j] and world.col[i] == world.col[j]
 
 
 def have_swapped(world: Worlds, scratch: Scratch, i: int, j: int) -> bool:
-    """Whether each of two agents stands where the other began the turn."""
+    """Whether each of two agents is on the cell where the other began the turn."""
     return (
         world.row[i] == scratch.start_row[j]
         and world.col[i] == scratch.start_col[j]
@@ -78,14 +78,15 @@ def have_swapped(world: Worlds, scratch: Scratch, i: int, j: int) -> bool:
 
 
 def clash(world: Worlds, scratch: Scratch, i: int, j: int) -> bool:
-    """Whether two agents in play got in each other's way."""
+    """Whether the moves of two agents in play clash: they share a cell or have swapped."""
     return share_a_cell(world, i, j) or have_swapped(world, scratch, i, j)
 
 
 def settle_clashes(world: Worlds, scratch: Scratch) -> None:
-    """All who moved into a clash go back, all at once, again and again until nobody clashes.
+    """Moves all agents back, at once, that moved into a clash, and repeats this until no agents clash.
 
-    Who went back keeps its cell, which may cancel the move of another: no number matters (DESIGN 3).
+    An agent that went back keeps its cell, which may cancel another move. The result does not depend on the
+    order of the agents.
     """
     unsettled = True
     while unsettled:
@@ -101,7 +102,7 @@ def settle_clashes(world: Worlds, scratch: Scratch) -> None:
 
 
 def is_in_a_clash(world: Worlds, scratch: Scratch, i: int) -> bool:
-    """Whether agent i clashes with anybody in play."""
+    """Whether agent i clashes with any agent in play."""
     for j in range(world.row.shape[0]):
         if j != i and world.in_play[j] and clash(world, scratch, i, j):
             return True
@@ -109,7 +110,7 @@ def is_in_a_clash(world: Worlds, scratch: Scratch, i: int) -> bool:
 
 
 def settle_pairwise(world: Worlds, scratch: Scratch) -> None:
-    """[run] Pair by pair in the order of numbers, both who clash go back, even onto a third."""
+    """[run] Pair by pair in the order of indices, moves both clashing agents back, even onto a third one."""
     for i in range(world.row.shape[0]):
         for j in range(i + 1, world.row.shape[0]):
             if world.in_play[i] and world.in_play[j] and clash(world, scratch, i, j):
@@ -118,28 +119,28 @@ def settle_pairwise(world: Worlds, scratch: Scratch) -> None:
 
 
 def count_down(world: Worlds) -> None:
-    """Everyone out of play misses this turn."""
+    """Counts this turn as missed for every agent out of play."""
     for i in range(world.row.shape[0]):
         if world.out_steps[i] > 0:
             world.out_steps[i] -= 1
 
 
 def return_to_play(world: Worlds, tables: Tables, scratch: Scratch) -> None:
-    """Those who have served their time act from the coming turn on, if their cell is free.
+    """Returns agents to play that have no more turns to miss, if their cell is free.
 
-    Several waiting for one cell return in the order in which they were tagged; under `pairwise_clashes`
-    nobody waits.
+    Agents that wait for the same cell return in the order in which they were tagged. Under `pairwise_clashes`
+    no agent waits.
     """
     for i in range(world.row.shape[0]):
-        waits = world.in_play[i] or world.out_steps[i] > 0
-        scratch.blocked[i] = waits or (not tables.pairwise_clashes and has_to_wait(world, i))
+        is_not_due = world.in_play[i] or world.out_steps[i] > 0
+        scratch.blocked[i] = is_not_due or (not tables.pairwise_clashes and has_to_wait(world, i))
     for i in range(world.row.shape[0]):
         if not scratch.blocked[i]:
             world.in_play[i] = True
 
 
 def has_to_wait(world: Worlds, i: int) -> bool:
-    """Whether agent i, out of play, finds its cell taken or another before it in the line."""
+    """Whether agent i, out of play, has to wait: its cell is occupied, or another agent is first in line."""
     for j in range(world.row.shape[0]):
         if j != i and share_a_cell(world, i, j):
             first_in_line = world.out_steps[j] == 0 and world.tagged_step[j] < world.tagged_step[i]
@@ -148,8 +149,8 @@ def has_to_wait(world: Worlds, i: int) -> bool:
     return False
 
 
-def put_at_start(world: Worlds, tables: Tables) -> None:
-    """Everybody in play, where and as the map says."""
+def place_at_starts(world: Worlds, tables: Tables) -> None:
+    """Puts every agent in play at its start, with the heading given by the map."""
     for i in range(world.row.shape[0]):
         world.row[i] = tables.start[i, 0]
         world.col[i] = tables.start[i, 1]
@@ -180,6 +181,6 @@ FUNCTIONS = (
     count_down,
     has_to_wait,
     return_to_play,
-    put_at_start,
+    place_at_starts,
 )
-"""In the order in which they call each other, as `compiled.py` compiles them."""
+"""The rules of this module, each after those it calls; `compiled.py` compiles them in this order."""

@@ -1,4 +1,4 @@
-"""Observation: what agents are shown of the game, and in which form."""
+"""Observation: what agents observe of the game, and in which form."""
 
 from dataclasses import dataclass, fields
 from typing import Any, Final, Literal, get_args
@@ -13,24 +13,24 @@ RGB_NAMES: Final = ("red", "green", "blue")
 
 @dataclass(frozen=True, kw_only=True)
 class Observation:
-    """The form of what every agent observes; defaults are those of both studies.
+    """The form of every agent's observation; defaults are those of both studies.
 
     Raises:
-        ValueError: names the field, what came and what is allowed.
+        ValueError: If a value is not allowed; the message names the field, the value and what is allowed.
     """
 
     area: Area = "window"
-    """"window": the cells ahead, `Rules.window_rows` x `Rules.window_columns`, turned with the agent;
-    "full": the whole board as it lies, row 0 at the top, the observer as "self"."""
+    """"window": the cells ahead, `Rules.window_rows` x `Rules.window_columns`, rotated with the agent;
+    "full": the whole board, not rotated, row 0 at the top, with the observer shown as "self"."""
 
     encoding: Encoding = "rgb"
     """"rgb": red, green and blue, 0..255; "one_hot": a channel for each class of cell, 0 or 1."""
 
     agents_apart: bool = False
-    """Whether every other agent has a colour or channel of its own, else all others look the same."""
+    """Whether each other agent has its own colour or channel; otherwise all other agents look the same."""
 
     scoreboard: bool = False
-    """Whether each agent also observes everybody's harvest of this episode: float32 [N], its own first."""
+    """Whether each agent also observes every agent's harvest in this episode: float32 [N], its own first."""
 
     stock_gauge: bool = False
     """Whether each agent also observes the share of all sites that hold an apple: float32 [1], 0..1."""
@@ -43,7 +43,7 @@ class Observation:
 
     @property
     def highest(self) -> int:
-        """The largest value of a cell: 255 for colours, 1 for channels of classes."""
+        """The largest value of an entry: 255 for "rgb", 1 for "one_hot"."""
         return 255 if self.encoding == "rgb" else 1
 
 
@@ -58,12 +58,12 @@ _ALLOWED: Final[dict[str, tuple[Any, ...]]] = {
 
 
 def classes_shown(observation: Observation, *, agents: int, hides: bool) -> tuple[int, ...]:
-    """The classes that can come up, in the order of the channels of "one_hot".
+    """The classes that can occur, in the order of the channels of "one_hot".
 
     Args:
-        observation: its form.
-        agents: how many there are.
-        hides: whether walls block sight.
+        observation: The form of the observations.
+        agents: The number of agents N.
+        hides: Whether walls block sight.
     """
     others = [FIRST_AGENT + i for i in range(agents)] if observation.agents_apart else [OTHER]
     hidden = [HIDDEN] if hides else []
@@ -71,7 +71,7 @@ def classes_shown(observation: Observation, *, agents: int, hides: bool) -> tupl
 
 
 def channel_names(observation: Observation, *, agents: int, hides: bool) -> tuple[str, ...]:
-    """What each channel of an observation stands for; see `classes_shown`."""
+    """The name of each channel of an observation; see `classes_shown`."""
     if observation.encoding == "rgb":
         return RGB_NAMES
     return tuple(map(class_name, classes_shown(observation, agents=agents, hides=hides)))

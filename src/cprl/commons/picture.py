@@ -1,4 +1,4 @@
-"""The board for people: apples, walls, and every agent in its own colour, with its heading."""
+"""An image of the board for people: apples, walls, and each agent in its own colour with its heading."""
 
 from typing import Final
 
@@ -24,23 +24,26 @@ def board_image(
     beams: Bools | None = None,
     cell_pixels: int = 24,
 ) -> Bytes:
-    """A picture of one world.
+    """An image of one world.
 
     Args:
-        board: where walls and sites are.
-        stock: uint8 [K], 1 where an apple hangs.
-        row: int [N], and so are col and heading.
-        col: see row.
-        heading: 0 up, 1 right, 2 down, 3 left.
-        in_play: bool [N], who is drawn; None for everybody.
+        board: The map, with walls and sites.
+        stock: uint8 [K], 1 where a site holds an apple.
+        row: int [N], the row of each agent.
+        col: int [N], the column of each agent.
+        heading: int [N], 0 up, 1 right, 2 down, 3 left.
+        in_play: bool [N], the agents to draw; None for all.
         beams: bool [H, W], cells that a beam covers; None for no beam.
-        cell_pixels: pixels across a cell, at least 8.
+        cell_pixels: The size of a cell in pixels, at least 8.
 
     Returns:
         uint8 [H * cell_pixels + 1, W * cell_pixels + 1, 3], RGB.
+
+    Raises:
+        ValueError: If `cell_pixels` is below 8.
     """
     if cell_pixels < 8:
-        raise ValueError(f"cell_pixels is {cell_pixels}; at least 8 is wanted")
+        raise ValueError(f"cell_pixels is {cell_pixels}; allowed: an integer >= 8")
     size = cell_pixels
     image = np.empty((board.height * size + 1, board.width * size + 1, 3), np.uint8)
     image[:] = GRID_COLOUR
@@ -64,7 +67,7 @@ def board_image(
 
 
 def world_image(board: Map, shown: Shown, *, cell_pixels: int = 24) -> Bytes:
-    """A picture of one world as it stands, agents out of play left out; see `board_image`."""
+    """An image of the current state of one world, without agents out of play; see `board_image`."""
     return board_image(
         board,
         shown.stock,
@@ -78,7 +81,7 @@ def world_image(board: Map, shown: Shown, *, cell_pixels: int = 24) -> Bytes:
 
 
 def first_image(game: Game, *, cell_pixels: int = 24) -> Bytes:
-    """The board of a game as an episode begins; see `board_image`."""
+    """An image of the board at the start of an episode; see `board_image`."""
     starts = np.array(game.map.starts, np.int32)
     full = np.ones(len(game.map.sites), np.uint8)
     return board_image(game.map, full, *starts.T, cell_pixels=cell_pixels)
@@ -90,7 +93,7 @@ def _fill(image: Bytes, r: int, c: int, size: int, inset: int, colour: tuple[int
 
 
 def _draw_agent(image: Bytes, r: int, c: int, heading: int, size: int, colour: tuple[int, int, int]) -> None:
-    """A square with a triangle of white that points where the agent looks."""
+    """Draws a square with a white triangle that points in the direction of the heading."""
     _fill(image, r, c, size, 1, colour)
     middle = size // 2
     for away in range(size // 2 - 2):

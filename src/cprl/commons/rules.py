@@ -1,8 +1,8 @@
-"""Rules: every number of the game, its unit, its range, its source and its switch.
+"""Rules: every number and switch of the game, with its unit, range and source.
 
 Sources: [W] M. Wiatrak, "Governing the Commons with Multi-Agent Reinforcement Learning" (2019);
-[P] Perolat et al. (2017); [run] the program that [W] was run with, where it differs from the text.
-`docs/game.md` tells the game in words.
+[P] Perolat et al. (2017); [run] the program that produced the results of [W], where it differs from the text.
+`docs/game.md` describes the game in words.
 """
 
 from collections.abc import Callable, Sequence
@@ -12,100 +12,103 @@ from numbers import Integral, Real
 from typing import Any, Final, Literal, get_args
 
 ACTIONS: Final = ("forward", "backward", "left", "right", "turn_left", "turn_right", "beam", "stay")
-"""What an agent may do, by index; where nobody may fire there is no "beam" and 6 is "stay"."""
+"""The actions by index. If no agent may fire, there is no "beam", and 6 is "stay"."""
 
 Norm = Literal["euclidean", "manhattan", "chebyshev"]
 
 
 @dataclass(frozen=True, kw_only=True)
 class Rules:
-    """The numbers of a game. Defaults are those of `published`; every quirk of the study as run is off.
+    """The numbers of a game.
 
-    Lists and arrays are kept as tuples, so that rules compare, hash and print.
+    Defaults are those of `published`: every quirk of the study as run is off. Lists and arrays are stored as
+    tuples, so that rules can be compared, hashed and printed.
 
     Raises:
-        ValueError: names the field, what came and what is allowed.
+        ValueError: If a value is not allowed; the message names the field, the value and what is allowed.
     """
 
     regrow_prob: tuple[float, ...] = (0.0, 0.01, 0.01, 0.05, 0.05, 0.1)
-    """Probability per turn that an empty site grows an apple, by the number of apples near it [W];
-    the last one also holds for every larger number. Each in 0..1."""
+    """Probability per turn that an empty site grows an apple, indexed by the number of apples near it [W];
+    the last entry also applies to every larger number. Each in 0..1."""
 
     regrow_radius_cells: float = 2.0
-    """How far apples count as near, in cells by `regrow_norm`, the rim included [W]. At least 0."""
+    """The distance up to which apples count as near, in cells, measured by `regrow_norm`, inclusive [W].
+    0..1000."""
 
     regrow_norm: Norm = "euclidean"
-    """How that distance is measured [W]."""
+    """The norm that measures this distance [W]."""
 
     beam_length_cells: int | tuple[int, int, int, int] = 5
-    """Cells that a beam reaches ahead, at least 1; one number, or four by heading: up, right, down, left."""
+    """The length of a beam in cells, at least 1: one number, or four by heading (up, right, down, left)."""
 
     beam_width_cells: int = 3
-    """Cells across a beam, odd, at least 1 [W]."""
+    """The width of a beam in cells: odd, at least 1 [W]."""
 
     hits_to_tag: int = 1
-    """Hits, at most one per turn, that put an agent out of play [W]; 2 in [run]. At least 1."""
+    """The hits, at most one per turn, after which an agent is tagged [W]; 2 in [run]. At least 1."""
 
     freeze_steps: int | tuple[tuple[int, ...], ...] = 25
-    """Turns that a tagged agent misses [W], at least 0. One number, or a table: a row per shooter, a column
-    per offence of the one tagged (the last column holds for every later one)."""
+    """The number of turns that a tagged agent misses [W], at least 0. One number, or a table: a row per
+    shooter, a column per offence of the tagged agent (the last column applies to every later offence)."""
 
     may_fire: bool | tuple[bool, ...] = True
-    """Who may fire; one answer for all, or one per agent. Where nobody may, there is no beam action."""
+    """Whether agents may fire: one value for all, or one per agent. If none may, there is no beam action."""
 
     may_bite: tuple[tuple[bool, ...], ...] | None = None
-    """Who may bite where: a row per agent, a column per site; None for everybody everywhere."""
+    """Which agent may harvest which site: a row per agent, a column per site. None allows every agent every
+    site."""
 
     window_rows: int = 6
-    """Rows that an agent sees ahead, its own included [W]. At least 1."""
+    """The rows of a window: the agent's own and those ahead of it [W]. At least 1."""
 
     window_columns: int = 13
-    """Columns that an agent sees, itself in the middle: odd, at least 1 [W]."""
+    """The columns of a window, the agent's own in the middle: odd, at least 1 [W]."""
 
     walls_block_sight: bool = False
-    """Whether a window shows only cells in line of sight: the straight line between the two centres crosses
-    no wall (ours; both studies have no inner walls)."""
+    """Whether a window shows only cells in line of sight, that is, the straight line between the two cell
+    centres crosses no wall (ours; the boards of both studies have no inner walls)."""
 
     episode_steps: int = 1000
-    """Turns after which an episode is truncated [W]. At least 1."""
+    """The number of turns after which an episode is truncated [W]. At least 1."""
 
     shuffle_starts: bool = False
-    """Whether agents change places at the start of every episode, each order equally likely (ours)."""
+    """Whether each episode permutes the agents' starts, all permutations equally likely (ours)."""
 
     pairwise_clashes: bool = False
-    """[run] All move at once, then pairs of agents in the order of their numbers: two on one cell, or two
-    that swapped, go back to where they began the turn, even if a third stands there. Agents out of play
-    return at once, onto a taken cell too."""
+    """[run] All agents move at once. Then, pair by pair in the order of agent indices, two agents on one
+    cell, or two that swapped, both go back to where they began the turn, even if a third agent stands there.
+    Agents out of play return at once, even onto an occupied cell."""
 
     regrow_before_bites: bool = False
-    """[run] An apple may grow and be bitten in one turn."""
+    """[run] Apples grow before agents harvest, so an apple can grow and be harvested in the same turn."""
 
     freeze_counts_tag_turn: bool = False
-    """[run] The turn of the tag counts as the first of `freeze_steps`, so one turn less is missed."""
+    """[run] The turn of the tag counts as the first of `freeze_steps`, so the agent misses one turn less."""
 
     ends_one_turn_late: bool = False
-    """[run] The episode ends when the stock was empty as the turn began."""
+    """[run] The episode terminates in the turn that begins with an empty stock, one turn later."""
 
     picture_shows_old_stock: bool = False
-    """[run] The picture shows the apples as they hung when the turn began."""
+    """[run] The picture shows the apples of the start of the turn."""
 
     paint_over: bool = False
-    """[run] Heading marks are painted over apples and agents of lower numbers, beams over everything."""
+    """[run] Heading marks cover apples and agents of lower indices; beams cover everything."""
 
     mark_behind_if_vertical: bool = False
-    """[run] The heading mark of an agent that faces up or down is painted behind it."""
+    """[run] The heading mark of an agent that faces up or down is painted behind the agent."""
 
     self_paint_stays: bool = False
-    """[run] Each agent's own cell is painted as "self" in the order of numbers and stays so for the windows
-    of later agents, whether it is in play or not."""
+    """[run] Windows are drawn in the order of agent indices; each agent's cell is painted as "self" and
+    stays so in the windows of later agents, whether the agent is in play or not."""
 
     def __post_init__(self) -> None:
         for field in fields(self):
             object.__setattr__(self, field.name, _as_tuples(getattr(self, field.name)))
-        for name, (fits, wanted) in _CHECKS.items():
+        for name, (is_allowed, allowed) in _CHECKS.items():
             value = getattr(self, name)
-            if not fits(value):
-                raise ValueError(f"Rules.{name} is {value!r}; allowed: {wanted}")
+            if not is_allowed(value):
+                raise ValueError(f"Rules.{name} is {value!r}; allowed: {allowed}")
 
     @property
     def beam_lengths_cells(self) -> tuple[int, int, int, int]:
@@ -115,17 +118,17 @@ class Rules:
 
     @property
     def has_beam(self) -> bool:
-        """Whether anybody may fire, and so whether there is a beam action."""
+        """Whether any agent may fire, and so whether there is a beam action."""
         return any(self.may_fire) if isinstance(self.may_fire, tuple) else self.may_fire
 
     @property
     def actions(self) -> tuple[str, ...]:
-        """The names of the actions by index: 8, or 7 without a beam."""
+        """The names of the actions, by index: 8 of them, or 7 without a beam."""
         return ACTIONS if self.has_beam else tuple(name for name in ACTIONS if name != "beam")
 
 
 def _as_tuples(value: Any) -> Any:
-    """Lists and arrays as tuples all the way down, numpy scalars as Python's own."""
+    """Converts lists and arrays to nested tuples, and numpy scalars to Python numbers."""
     if hasattr(value, "tolist"):
         value = value.tolist()
     if isinstance(value, Sequence) and not isinstance(value, str):
@@ -133,24 +136,25 @@ def _as_tuples(value: Any) -> Any:
     return value
 
 
-def _is_count(value: Any, least: int) -> bool:
-    return isinstance(value, Integral) and not isinstance(value, bool) and least <= int(value) < 2**31
+def _is_count(value: Any, low: int) -> bool:
+    """Whether a value is an integer of at least `low` that fits into int32."""
+    return isinstance(value, Integral) and not isinstance(value, bool) and low <= int(value) < 2**31
 
 
 def _is_odd(value: Any) -> bool:
     return _is_count(value, 1) and value % 2 == 1
 
 
-def _is_number(value: Any, least: float, most: float) -> bool:
+def _is_number(value: Any, low: float, high: float) -> bool:
     real = isinstance(value, Real) and not isinstance(value, bool)
-    return real and isfinite(value) and least <= value <= most
+    return real and isfinite(value) and low <= value <= high
 
 
-def _is_table(value: Any, fits: Callable[[Any], bool]) -> bool:
-    """A tuple of equally long, non-empty tuples whose entries all fit."""
+def _is_table(value: Any, is_allowed: Callable[[Any], bool]) -> bool:
+    """Whether a value is a tuple of equally long, non-empty tuples whose entries are all allowed."""
     if not isinstance(value, tuple) or not value or not all(isinstance(row, tuple) for row in value):
         return False
-    return len({len(row) for row in value}) == 1 and all(row and all(map(fits, row)) for row in value)
+    return len({len(row) for row in value}) == 1 and all(row and all(map(is_allowed, row)) for row in value)
 
 
 def _is_bool(value: Any) -> bool:
@@ -171,7 +175,7 @@ def _are_freezes(value: Any) -> bool:
     return _is_count(value, 0) or _is_table(value, lambda steps: _is_count(steps, 0))
 
 
-def _may_fire_fits(value: Any) -> bool:
+def _is_may_fire(value: Any) -> bool:
     return _is_bool(value) or (isinstance(value, tuple) and bool(value) and all(map(_is_bool, value)))
 
 
@@ -192,17 +196,20 @@ _CHECKS: Final[dict[str, _Check]] = {
     "regrow_prob": (_are_probabilities, "one or more numbers in 0..1"),
     "regrow_radius_cells": (lambda value: _is_number(value, 0, 1000), "a number in 0..1000"),
     "regrow_norm": (lambda value: value in get_args(Norm), f"one of {get_args(Norm)}"),
-    "beam_length_cells": (_are_beam_lengths, "a whole number from 1, or four by heading"),
-    "beam_width_cells": (_is_odd, "an odd whole number from 1"),
-    "hits_to_tag": (lambda value: _is_count(value, 1), "a whole number from 1"),
-    "freeze_steps": (_are_freezes, "a whole number from 0, or rows of equal length by shooter and offence"),
-    "may_fire": (_may_fire_fits, "True, False or one of them per agent"),
+    "beam_length_cells": (_are_beam_lengths, "an integer >= 1, or four of them by heading"),
+    "beam_width_cells": (_is_odd, "an odd integer >= 1"),
+    "hits_to_tag": (lambda value: _is_count(value, 1), "an integer >= 1"),
+    "freeze_steps": (
+        _are_freezes,
+        "an integer >= 0, or a table of them: equally long rows by shooter, columns by offence",
+    ),
+    "may_fire": (_is_may_fire, "True, False, or a tuple with one of them per agent"),
     "may_bite": (
         lambda value: value is None or _is_table(value, _is_bool),
-        "None, or a row of True and False per agent, a column per site",
+        "None, or a table of True and False: a row per agent, a column per site",
     ),
-    "window_rows": (lambda value: _is_count(value, 1), "a whole number from 1"),
-    "window_columns": (_is_odd, "an odd whole number from 1"),
-    "episode_steps": (lambda value: _is_count(value, 1), "a whole number from 1"),
+    "window_rows": (lambda value: _is_count(value, 1), "an integer >= 1"),
+    "window_columns": (_is_odd, "an odd integer >= 1"),
+    "episode_steps": (lambda value: _is_count(value, 1), "an integer >= 1"),
     **dict.fromkeys(_SWITCHES, (_is_bool, "True or False")),
 }

@@ -1,4 +1,4 @@
-"""The state of B worlds as plain arrays: read out, checked, put back."""
+"""The state of B worlds as plain arrays, and the check that a game can be in it."""
 
 from collections.abc import Mapping
 from typing import Any, Final
@@ -12,36 +12,39 @@ from cprl.commons.world import PLAYING, TRUNCATED, Worlds, empty_worlds
 State = dict[str, NDArray[Any]]
 
 DERIVED: Final = ("near", "stock_left")
-"""Entries of `Worlds` that follow from the others."""
+"""Entries of `Worlds` that are computed from the others."""
 
 NAMES: Final = tuple(name for name in Worlds._fields if name not in DERIVED)
-"""Entries of a state: it says all that the future depends on."""
+"""Entries of a state. With the game they determine the future completely."""
 
-_MOST: Final = 2**31 - 1
+_MAX_INT32: Final = 2**31 - 1
 
 
 def checked(state: Mapping[str, Any], *, worlds: int, game: Game) -> State:
-    """The state as arrays, if it is one that this game can be in.
+    """Returns a state as arrays, after checking that the game can be in it.
 
     Args:
-        state: arrays by `NAMES`, with the shapes and types of `Worlds`.
-        worlds: how many worlds B.
-        game: what is played.
+        state: Arrays by the names in `NAMES`, with the shapes and dtypes of `Worlds`.
+        worlds: The number of worlds B.
+        game: The game.
 
     Raises:
-        ValueError: names the entry, what came and what is allowed.
+        ValueError: If the game cannot be in this state; the message names the entry, its value and what is
+            allowed.
     """
-    room = empty_worlds(worlds=worlds, agents=game.agents, sites=len(game.map.sites))
-    wanted = {name: getattr(room, name) for name in NAMES}
-    if set(state) != set(wanted):
-        missing, unknown = sorted(set(wanted) - set(state)), sorted(set(state) - set(wanted))
-        raise ValueError(f"the state lacks {missing} and has the unknown {unknown}; wanted: {sorted(wanted)}")
-    arrays = {name: np.asarray(state[name]) for name in wanted}
+    empty = empty_worlds(worlds=worlds, agents=game.agents, sites=len(game.map.sites))
+    expected = {name: getattr(empty, name) for name in NAMES}
+    if set(state) != set(expected):
+        missing, unknown = sorted(set(expected) - set(state)), sorted(set(state) - set(expected))
+        raise ValueError(
+            f"the state lacks {missing} and has the unknown entries {unknown}; expected: {sorted(expected)}"
+        )
+    arrays = {name: np.asarray(state[name]) for name in expected}
     for name, array in arrays.items():
-        if array.shape != wanted[name].shape or array.dtype != wanted[name].dtype:
+        if array.shape != expected[name].shape or array.dtype != expected[name].dtype:
             raise ValueError(
                 f"state[{name!r}] is {array.dtype} {array.shape}; "
-                f"wanted: {wanted[name].dtype} {wanted[name].shape}"
+                f"expected: {expected[name].dtype} {expected[name].shape}"
             )
     _check_ranges(arrays, game)
     _check_places(arrays, game)
@@ -57,38 +60,38 @@ def _check_ranges(arrays: State, game: Game) -> None:
         "row": (0, board.height - 1),
         "col": (0, board.width - 1),
         "heading": (0, 3),
-        "out_steps": (0, _MOST),
+        "out_steps": (0, _MAX_INT32),
         "hits": (0, rules.hits_to_tag - 1),
         "tagged_step": (0, rules.episode_steps),
-        "offences": (0, _MOST),
+        "offences": (0, _MAX_INT32),
         "harvested": (0, rules.episode_steps),
         "step": (0, rules.episode_steps),
-        "episode": (-1, _MOST),
+        "episode": (-1, _MAX_INT32),
         "ended": (PLAYING, TRUNCATED),
     }
-    for name, (least, most) in ranges.items():
-        _refuse(arrays, name, (arrays[name] < least) | (arrays[name] > most), f"{least} to {most}")
+    for name, (low, high) in ranges.items():
+        _refuse(arrays, name, (arrays[name] < low) | (arrays[name] > high), f"{low} to {high}")
     out = arrays["out_steps"] > 0
-    _refuse(arrays, "in_play", arrays["in_play"] & out, "False while there are turns to miss (out_steps)")
+    _refuse(arrays, "in_play", arrays["in_play"] & out, "False while out_steps is above 0")
 
 
 def _check_places(arrays: State, game: Game) -> None:
-    """Nobody in a wall; no two in play on a cell, unless the rules allow it."""
+    """Checks that no agent is in a wall, and that agents in play share a cell only if the rules allow it."""
     row, col = arrays["row"], arrays["col"]
     walls = np.zeros((game.map.height, game.map.width), np.bool_)
     if game.map.walls:
         walls[tuple(np.array(game.map.walls).T)] = True
-    _refuse(arrays, "row", walls[row, col], "no cell of a wall")
+    _refuse(arrays, "row", walls[row, col], "a cell without a wall")
     if game.rules.pairwise_clashes:
         return
     shares = (row[:, :, None] == row[:, None]) & (col[:, :, None] == col[:, None])
     shares &= arrays["in_play"][:, :, None] & arrays["in_play"][:, None]
     shares &= ~np.eye(game.agents, dtype=np.bool_)
-    _refuse(arrays, "row", shares.any(2), "no cell with another agent in play")
+    _refuse(arrays, "row", shares.any(2), "a cell without another agent in play")
 
 
 def _refuse(arrays: State, name: str, wrong: NDArray[np.bool_], allowed: str) -> None:
     if wrong.any():
-        at = tuple(int(index) for index in np.argwhere(wrong)[0])
-        place = f" (column {arrays['col'][at]})" if name == "row" else ""
-        raise ValueError(f"state[{name!r}]{list(at)} is {arrays[name][at]}{place}; allowed: {allowed}")
+        index = tuple(int(entry) for entry in np.argwhere(wrong)[0])
+        column = f" (column {arrays['col'][index]})" if name == "row" else ""
+        raise ValueError(f"state[{name!r}]{list(index)} is {arrays[name][index]}{column}; allowed: {allowed}")

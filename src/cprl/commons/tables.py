@@ -1,4 +1,4 @@
-"""A game written out as the tables that the compiled rules look things up in."""
+"""A game as lookup tables for the compiled rules."""
 
 from math import hypot
 from typing import Final, NamedTuple
@@ -14,50 +14,55 @@ from cprl.commons.rules import Norm, Rules
 from cprl.commons.world import COL_STEP, ROW_STEP, Bools, Indices, Ints
 
 CLASS_SHIFT: Final = 24
-"""A paint is a colour and, from this bit on, its class."""
+"""A paint is a colour in 24 bits, and its class from this bit on."""
 
 
 class Tables(NamedTuple):
-    """A game as arrays. A cell is an index into the board with its rim, row by row, `stride` cells a row."""
+    """A game as arrays, int32 unless stated otherwise.
+
+    A cell is an index into the board with a rim of wall around it, row by row, `stride` cells per row.
+    """
 
     background: Ints
-    """[cells], the paint of ground or wall; the rim is wall."""
+    """[cells], the paint of each cell without agents and apples: ground or wall."""
     site_cell: Indices
     """uint32 [K], the cell of each site."""
     site_at: Ints
     """[cells], the site on each cell, or -1."""
     near_first: Ints
-    """[K + 1], where a site's neighbours begin in `near_sites`, and end."""
+    """[K + 1], the sites near site k are `near_sites[near_first[k]:near_first[k + 1]]`."""
     near_sites: Indices
-    """uint32 [pairs], the sites within reach of each site, itself left out."""
+    """uint32 [pairs], the sites near each site, without the site itself."""
     regrow_below: NDArray[np.int64]
-    """int64 [most neighbours + 1], an apple grows where a uniform 32-bit word falls below this."""
+    """int64 [largest number of near sites + 1]: with this many apples near it, an empty site grows an apple
+    if a uniform 32-bit word is below this threshold."""
     regrow_first_byte: Ints
-    """[most neighbours + 1], the largest first byte that such a word can have; -1 where none grows."""
+    """[largest number of near sites + 1], the largest first byte of a word below that threshold; -1 where no
+    apple can grow."""
     start: Ints
-    """[N, 3], row, column and heading of each agent as an episode begins."""
+    """[N, 3], row, column and heading of each agent at the start of an episode."""
     beam_length: Ints
-    """[4], cells by heading."""
+    """[4], in cells, by heading."""
     freeze: Ints
-    """[N, offences], turns missed by shooter and offence."""
+    """[N, offences], the number of turns missed, by shooter and offence."""
     may_fire: Bools
-    """bool [N]."""
+    """bool [N], whether each agent may fire."""
     may_bite: Bools
-    """bool [N, K]."""
+    """bool [N, K], whether each agent may harvest each site."""
     paints: Ints
-    """[classes], what a picture's cell holds: red + 2**8 green + 2**16 blue + 2**24 class."""
+    """[classes], the value of a picture's cell: red + 2**8 green + 2**16 blue + 2**24 class."""
     channel_of: Ints
-    """[classes], the channel of each class under "one_hot"; -1 for those that never come up."""
+    """[classes], the channel of each class under "one_hot"; -1 for classes that cannot occur."""
     window_cells: Ints
-    """[4, X * Y], from an agent's cell to each cell of its window, by heading; under "full" the cells of
-    the board themselves."""
+    """[4, X * Y], by heading: the offset from an agent's cell to each cell of its window; under "full", the
+    cells of the board."""
     in_sight: Bools
-    """bool [cells, 4, X * Y], whether no wall lies between a cell and each cell of the window of an agent
-    there, by heading; [1, 1, 1] where walls do not block sight."""
+    """bool [cells, 4, X * Y], by the agent's cell and heading: whether no wall lies between the agent and
+    each cell of its window; [1, 1, 1] if walls do not block sight."""
     rim: int
-    """Cells of wall around the board, enough for any window and beam."""
+    """The width of the rim in cells, enough for any window and beam."""
     stride: int
-    """Cells from one row to the next."""
+    """The number of cells per row, rim included."""
     beam_half_width: int
     hits_to_tag: int
     episode_steps: int
@@ -65,7 +70,7 @@ class Tables(NamedTuple):
     agents_apart: bool
     one_hot: bool
     sees_all: bool
-    """Whether an agent is shown the whole board."""
+    """Whether agents observe the whole board."""
     walls_block_sight: bool
     shuffle_starts: bool
     never_from_nothing: bool
@@ -81,7 +86,7 @@ class Tables(NamedTuple):
 
 
 def distance(norm: Norm, rows: int, cols: int) -> float:
-    """How far apart two cells are that lie so many rows and columns from each other."""
+    """The distance between two cells, in cells, from their difference in rows and columns."""
     if norm == "euclidean":
         return hypot(rows, cols)
     if norm == "manhattan":
@@ -90,7 +95,7 @@ def distance(norm: Norm, rows: int, cols: int) -> float:
 
 
 def neighbours(board: Map, rules: Rules) -> list[list[int]]:
-    """For each site the other sites within `regrow_radius_cells`, [K] lists of site indices."""
+    """The other sites within `regrow_radius_cells` of each site: K lists of site indices."""
     reach = int(rules.regrow_radius_cells)
     site_on = {cell: site for site, cell in enumerate(board.sites)}
     offsets = [
@@ -106,7 +111,7 @@ def neighbours(board: Map, rules: Rules) -> list[list[int]]:
 
 
 def _window_places(rules: Rules) -> list[tuple[int, int]]:
-    """(ahead, side) of each cell of a window: farthest row first, left column first."""
+    """The (ahead, side) of each cell of a window: farthest row first, leftmost column first."""
     middle = rules.window_columns // 2
     return [
         (ahead, side) for ahead in range(rules.window_rows - 1, -1, -1) for side in range(-middle, middle + 1)
@@ -114,7 +119,7 @@ def _window_places(rules: Rules) -> list[tuple[int, int]]:
 
 
 def _offset(ahead: int, side: int, heading: int, stride: int) -> int:
-    """From an agent's cell to the one so far ahead and so far to the right."""
+    """The offset from an agent's cell to the one `ahead` cells ahead and `side` cells to the right."""
     right = (heading + 1) % 4
     rows = ahead * ROW_STEP[heading] + side * ROW_STEP[right]
     cols = ahead * COL_STEP[heading] + side * COL_STEP[right]
@@ -122,7 +127,7 @@ def _offset(ahead: int, side: int, heading: int, stride: int) -> int:
 
 
 def _window_cells(rules: Rules, stride: int) -> Ints:
-    """[4, X * Y], as seen by an agent with each heading."""
+    """`Tables.window_cells` for windows: [4, X * Y]."""
     places = _window_places(rules)
     return np.array(
         [[_offset(*place, heading, stride) for place in places] for heading in range(4)], np.int32
@@ -130,27 +135,30 @@ def _window_cells(rules: Rules, stride: int) -> Ints:
 
 
 def _paint(kind: int) -> int:
-    """A class and its colour as one number."""
+    """A class and its colour as one number; see `Tables.paints`."""
     red, green, blue = class_colour(kind)
     return red | green << 8 | blue << 16 | kind << CLASS_SHIFT
 
 
 def _board_cells(board: Map, rim: int, stride: int) -> Ints:
-    """[4, H * W]: every cell of the board, row by row, whatever the heading."""
+    """Every cell of the board, row by row, repeated for each heading: [4, H * W]."""
     rows, cols = np.mgrid[rim : rim + board.height, rim : rim + board.width]
     return np.tile((rows * stride + cols).reshape(1, -1), (4, 1)).astype(np.int32)
 
 
 def cells_between(rows: int, cols: int) -> list[tuple[int, int]]:
-    """The cells whose inside the straight line between two cell centres crosses, both ends left out.
+    """The cells whose interior the straight line between two cell centres crosses, without the two ends.
 
-    A line that only touches a corner does not cross it: agents see through a gap between two diagonal
-    walls. The inside of the unit square around (r, c) is crossed where
+    A line that only touches a corner of a cell does not cross the cell: agents see through the gap between
+    two diagonal walls. The line crosses the interior of the unit square around (r, c) if
     abs(rows c - cols r) < (abs(rows) + abs(cols)) / 2.
 
     Args:
-        rows: from the one to the other.
-        cols: likewise.
+        rows: The rows from the first cell to the second.
+        cols: The columns from the first cell to the second.
+
+    Returns:
+        (row, col) of each cell, relative to the first.
     """
     down, right = (1 if rows >= 0 else -1), (1 if cols >= 0 else -1)
     return [
@@ -176,7 +184,7 @@ def _in_sight(board: Map, rules: Rules, walls: Bools, rim: int, stride: int) -> 
 
 
 def build_tables(board: Map, rules: Rules, observation: Observation) -> Tables:
-    """Writes a game out."""
+    """Builds the tables of a game."""
     agents, half_width = board.agents, rules.beam_width_cells // 2
     sees_all = observation.area == "full"
     window_reach = (0,) if sees_all else (rules.window_rows - 1, rules.window_columns // 2)
@@ -197,8 +205,8 @@ def build_tables(board: Map, rules: Rules, observation: Observation) -> Tables:
     site_at = np.full(background.size, -1, np.int32)
     site_at[cells(board.sites)] = range(len(board.sites))
     near = neighbours(board, rules)
-    most_near = max(map(len, near))
-    probs = [rules.regrow_prob[min(n, len(rules.regrow_prob) - 1)] for n in range(most_near + 1)]
+    max_near = max(map(len, near))
+    probs = [rules.regrow_prob[min(n, len(rules.regrow_prob) - 1)] for n in range(max_near + 1)]
     below = np.array([threshold(p) for p in probs], np.int64)
     freeze = rules.freeze_steps if isinstance(rules.freeze_steps, tuple) else ((rules.freeze_steps,),)
     sites = len(board.sites)

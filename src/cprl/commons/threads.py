@@ -1,4 +1,4 @@
-"""CpuThreads: runs the compiled loops on CPU threads, each on its share of the worlds."""
+"""CpuThreads: runs the compiled loops on CPU threads, each for its share of the worlds."""
 
 import os
 from concurrent.futures import ThreadPoolExecutor
@@ -15,33 +15,36 @@ from cprl.commons.tables import Tables
 from cprl.commons.world import Actions, StepOutput, Worlds, empty_scratch
 
 WORLDS_PER_THREAD = 512
-"""Fewer are not worth handing to another thread, which takes a tenth of a millisecond."""
+"""With fewer worlds another thread does not pay: starting its share takes about 0.1 ms."""
 
 
 @cache
 def _pool(process: int, threads: int) -> ThreadPoolExecutor:
-    """Threads of this very process; a fork makes its own."""
+    """A pool of threads; the process id in the key gives a forked process its own pool."""
     return ThreadPoolExecutor(threads, thread_name_prefix=f"cprl-{process}")
 
 
 class CpuThreads:
-    """A driver of B worlds whose arrays are numpy arrays.
+    """A driver of B worlds in numpy arrays.
 
     Args:
-        game: what is played.
-        worlds: how many worlds B.
-        threads: how many threads share them; None for all cores where it pays.
+        game: The game.
+        worlds: The number of worlds B.
+        threads: The number of threads that share the worlds; None uses all cores where that is faster.
+
+    Raises:
+        ValueError: If `threads` is below 1.
     """
 
     def __init__(self, game: Game, worlds: int, *, threads: int | None = None) -> None:
         if threads is not None and threads < 1:
-            raise ValueError(f"threads is {threads}; at least 1 is wanted, or None for all cores")
-        most = threads or os.cpu_count() or 1
-        self.threads = min(most, worlds if threads else -(-worlds // WORLDS_PER_THREAD))
+            raise ValueError(f"threads is {threads}; allowed: an integer >= 1, or None for all cores")
+        limit = threads or os.cpu_count() or 1
+        self.threads = min(limit, worlds if threads else -(-worlds // WORLDS_PER_THREAD))
         self.tables: Tables = game.tables
-        self._wanted = tuple(output_shapes(game, worlds).values())
+        self._expected = tuple(output_shapes(game, worlds).values())
         self._output: StepOutput | None = None
-        self._sheets = [
+        self._scratch = [
             empty_scratch(
                 agents=game.agents,
                 sites=len(game.map.sites),
@@ -52,11 +55,11 @@ class CpuThreads:
         ]
 
     def place(self, worlds: Worlds) -> Worlds:
-        """The same arrays where this driver plays them."""
+        """Returns the arrays unchanged: this driver uses numpy arrays."""
         return worlds
 
     def empty(self, shape: tuple[int, ...], dtype: DTypeLike) -> NDArray[Any]:
-        """A new array, its entries undefined."""
+        """A new array with undefined entries."""
         return np.empty(shape, dtype)
 
     def read(self, array: NDArray[Any]) -> NDArray[Any]:
@@ -64,52 +67,57 @@ class CpuThreads:
         return array.copy()
 
     def write(self, array: NDArray[Any], values: NDArray[Any]) -> None:
-        """Copies values of the same shape and type into an array."""
+        """Copies values of the same shape and dtype into an array."""
         array[...] = values
 
     def first_unknown(self, actions: Actions, known: int) -> int:
-        """The index of the first action outside 0 .. known - 1 among all, or -1."""
+        """The index, in row-major order, of the first action outside 0 .. known - 1; -1 if there is none."""
         return int(rules_for_cpu()["first_unknown"](actions.reshape(-1), known))
 
     def run(
-        self, loop: Loop, worlds: Worlds, what: NDArray[Any], output: StepOutput, *, vouched: bool = False
+        self, loop: Loop, worlds: Worlds, argument: NDArray[Any], output: StepOutput, *, checked: bool = False
     ) -> None:
-        """Runs a loop on all worlds; this thread takes the last share.
+        """Runs a loop over all worlds; the calling thread takes the last share.
 
         Args:
-            loop: which.
-            worlds: how they stand.
-            what: the loop's own argument.
-            output: what it writes into.
-            vouched: whether the caller knows that both are of the right form; otherwise they are checked.
+            loop: The loop.
+            worlds: The state of the worlds.
+            argument: The loop's own argument.
+            output: The arrays that the loop writes.
+            checked: Whether the caller has checked the form of `argument` and `output`.
+
+        Raises:
+            ValueError: If an array has the wrong form.
         """
-        if not vouched:
-            self._check(what, output)
+        if not checked:
+            self._check(argument, output)
         size = worlds.step.shape[0]
-        arguments = worlds, self.tables, what, output
-        entry = entry_for_cpu(loop, *arguments, self._sheets[0], 0, size)
+        arguments = worlds, self.tables, argument, output
+        entry = entry_for_cpu(loop, *arguments, self._scratch[0], 0, size)
         if self.threads == 1:
-            entry(*arguments, self._sheets[0], 0, size)
+            entry(*arguments, self._scratch[0], 0, size)
             return
         bounds = [size * t // self.threads for t in range(self.threads + 1)]
-        *others, own = zip(self._sheets, bounds, bounds[1:], strict=False)
+        *others, own = zip(self._scratch, bounds, bounds[1:], strict=False)
         pool = _pool(os.getpid(), self.threads - 1)
         shares = [pool.submit(entry, *arguments, *share) for share in others]
         entry(*arguments, *own)
         for share in shares:
             share.result()
 
-    def _check(self, what: NDArray[Any], output: StepOutput) -> None:
-        """The compiled loops do not look at what they are given, so this does; see `entry_for_cpu`."""
-        if not what.flags.c_contiguous:
-            raise ValueError(f"an array {what.dtype} {what.shape} is not contiguous; one that is is wanted")
+    def _check(self, argument: NDArray[Any], output: StepOutput) -> None:
+        """Checks the arrays, because the compiled loops do not; see `entry_for_cpu`."""
+        if not argument.flags.c_contiguous:
+            raise ValueError(
+                f"an array {argument.dtype} {argument.shape} is not contiguous; allowed: contiguous arrays"
+            )
         if output is self._output:
             return
         arrays: dict[str, NDArray[Any]] = output._asdict()
-        for (name, array), (shape, dtype) in zip(arrays.items(), self._wanted, strict=True):
+        for (name, array), (shape, dtype) in zip(arrays.items(), self._expected, strict=True):
             if array.shape != shape or array.dtype != dtype or not array.flags.carray:
                 raise ValueError(
-                    f"told.{name} is {array.dtype} {array.shape}; "
-                    f"wanted: {np.dtype(dtype)} {shape}, contiguous and writeable"
+                    f"output.{name} is {array.dtype} {array.shape}; "
+                    f"expected: {np.dtype(dtype)} {shape}, contiguous and writeable"
                 )
         self._output = output

@@ -1,4 +1,4 @@
-"""The order of a turn, on ONE world."""
+"""The order of a turn and of an episode, on one world."""
 
 import numpy as np
 
@@ -6,16 +6,23 @@ from cprl.commons import apples, beam, chance, moves, views
 from cprl.commons.apples import bite, draw, fill, find_sprouts, grow, recount
 from cprl.commons.beam import find_hits, tag
 from cprl.commons.chance import STARTS
-from cprl.commons.moves import act, count_down, put_at_start, return_to_play, settle_clashes, settle_pairwise
+from cprl.commons.moves import (
+    act,
+    count_down,
+    place_at_starts,
+    return_to_play,
+    settle_clashes,
+    settle_pairwise,
+)
 from cprl.commons.tables import Tables
 from cprl.commons.views import draw_windows
 from cprl.commons.world import PLAYING, TERMINATED, TRUNCATED, Actions, Scratch, StepOutput, Worlds
 
 
 def play_turn(world: Worlds, tables: Tables, actions: Actions, output: StepOutput, scratch: Scratch) -> None:
-    """One turn; `actions`: int64 [N]. A world that has ended stays as it is and pays nothing."""
+    """Plays one turn; `actions`: int64 [N]. A world that has ended does not change and pays nothing."""
     if world.ended[0] != PLAYING:
-        write_nothing_happened(output)
+        clear_events(output)
         write_state(world, tables, output, scratch)
         return
     began_empty = world.stock_left[0] == 0
@@ -37,7 +44,7 @@ def play_turn(world: Worlds, tables: Tables, actions: Actions, output: StepOutpu
     output.regrown[0] = sprouts
     find_hits(world, tables, output.hit_by)
     tag(world, tables, output.hit_by, output.tagged_by)
-    judge_the_end(world, tables, began_empty)
+    check_end(world, tables, began_empty)
     for i in range(world.row.shape[0]):
         output.fired[i] = world.fired[i]
         world.on_board[i] = world.in_play[i]
@@ -46,8 +53,8 @@ def play_turn(world: Worlds, tables: Tables, actions: Actions, output: StepOutpu
 
 
 def shuffle_starts(world: Worlds) -> None:
-    """Agents change places, each order equally likely: from the last on, each with one of those up to it
-    (Durstenfeld, "Algorithm 235: Random permutation", 1964)."""
+    """Permutes the agents' starts, all permutations equally likely (Durstenfeld, "Algorithm 235: Random
+    permutation", 1964)."""
     for i in range(world.row.shape[0] - 1, 0, -1):
         word, _, _, _ = draw(world, STARTS | i)
         j = int(word % np.uint64(i + 1))
@@ -57,34 +64,34 @@ def shuffle_starts(world: Worlds) -> None:
 
 
 def begin_episode(world: Worlds, tables: Tables, output: StepOutput, scratch: Scratch) -> None:
-    """The next episode of a world: full stock, everybody at the start."""
+    """Starts the next episode: all sites hold an apple, all agents are at their starts."""
     world.episode[0] += 1
     world.step[0] = 0
     world.ended[0] = PLAYING
     fill(world, tables)
-    put_at_start(world, tables)
+    place_at_starts(world, tables)
     if tables.shuffle_starts:
         shuffle_starts(world)
-    write_nothing_happened(output)
+    clear_events(output)
     write_state(world, tables, output, scratch)
 
 
-def look_again(world: Worlds, tables: Tables, output: StepOutput, scratch: Scratch) -> None:
-    """Tells of a state that was put in from outside; nothing is said to have happened."""
+def refresh_output(world: Worlds, tables: Tables, output: StepOutput, scratch: Scratch) -> None:
+    """Writes the output for a state that was set from outside, with no harvest, shots, hits or growth."""
     recount(world, tables)
-    write_nothing_happened(output)
+    clear_events(output)
     write_state(world, tables, output, scratch)
 
 
 def keep_old_stock(world: Worlds, tables: Tables) -> None:
-    """Remembers the stock as the turn begins, where the picture will show it."""
+    """Copies the stock at the start of the turn, for `picture_shows_old_stock`."""
     if tables.picture_shows_old_stock:
         for k in range(world.stock.shape[0]):
             world.stock_before[k] = world.stock[k]
 
 
-def judge_the_end(world: Worlds, tables: Tables, began_empty: bool) -> None:
-    """TERMINATED if no apple is left and none can come, else TRUNCATED if the clock ran out."""
+def check_end(world: Worlds, tables: Tables, began_empty: bool) -> None:
+    """Ends the episode: TERMINATED if no apple is left and none can grow, else TRUNCATED if out of time."""
     is_empty = began_empty if tables.ends_one_turn_late else world.stock_left[0] == 0
     if is_empty and tables.never_from_nothing:
         world.ended[0] = TERMINATED
@@ -92,8 +99,8 @@ def judge_the_end(world: Worlds, tables: Tables, began_empty: bool) -> None:
         world.ended[0] = TRUNCATED
 
 
-def write_nothing_happened(output: StepOutput) -> None:
-    """A turn without harvest, shots, hits and growth."""
+def clear_events(output: StepOutput) -> None:
+    """Writes an output without harvest, shots, hits and growth."""
     agents = output.harvest.shape[0]
     for i in range(agents):
         output.harvest[i] = 0.0
@@ -105,7 +112,7 @@ def write_nothing_happened(output: StepOutput) -> None:
 
 
 def write_state(world: Worlds, tables: Tables, output: StepOutput, scratch: Scratch) -> None:
-    """How the world stands now, and what everybody sees of it."""
+    """Writes the current state and every agent's observation into the output."""
     for i in range(world.row.shape[0]):
         output.in_play[i] = world.in_play[i]
         for j in range(output.scoreboard.shape[1]):
@@ -126,12 +133,12 @@ FUNCTIONS = (
     *apples.FUNCTIONS,
     *views.FUNCTIONS,
     keep_old_stock,
-    judge_the_end,
-    write_nothing_happened,
+    check_end,
+    clear_events,
     write_state,
     play_turn,
     shuffle_starts,
     begin_episode,
-    look_again,
+    refresh_output,
 )
-"""All rules in the order in which they call each other, as `compiled.py` compiles them."""
+"""All rules, each after those it calls; `compiled.py` compiles them in this order."""

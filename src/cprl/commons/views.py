@@ -1,6 +1,6 @@
-"""The picture of the board and the windows that the agents see of it. All on ONE world.
+"""The picture of the board, and the windows that agents observe of it, on one world.
 
-A picture is a function of the world's state alone, so it can be drawn again at any time.
+The picture is a function of the world's state alone, so it can be drawn again at any time.
 """
 
 import numpy as np
@@ -13,12 +13,12 @@ from cprl.commons.world import COL_STEP, DOWN, ROW_STEP, UP, Bytes, Ints, Scratc
 
 
 def class_of(paint: int) -> int:
-    """The colour class of a paint."""
+    """The class of a paint."""
     return paint >> CLASS_SHIFT
 
 
 def paint_apples(world: Worlds, tables: Tables, picture: Ints) -> None:
-    """Ground, walls and apples; `picture`: int32 [cells], paints."""
+    """Paints ground, walls and apples; `picture`: int32 [cells], paints."""
     for cell in range(picture.shape[0]):
         picture[cell] = tables.background[cell]
     stock = world.stock_before if tables.picture_shows_old_stock else world.stock
@@ -28,7 +28,7 @@ def paint_apples(world: Worlds, tables: Tables, picture: Ints) -> None:
 
 
 def mark_cell(world: Worlds, tables: Tables, i: int) -> int:
-    """The cell of agent i's heading mark: ahead of it, or behind it by `mark_behind_if_vertical`."""
+    """The cell of agent i's heading mark: ahead of it, or behind it under `mark_behind_if_vertical`."""
     heading = world.heading[i]
     away = -1 if tables.mark_behind_if_vertical and heading in (UP, DOWN) else 1
     row = world.row[i] + away * ROW_STEP[heading]
@@ -37,7 +37,7 @@ def mark_cell(world: Worlds, tables: Tables, i: int) -> int:
 
 
 def paint_mark(world: Worlds, tables: Tables, i: int, picture: Ints) -> None:
-    """The heading mark of agent i, never on a wall; on open ground only, but for `paint_over`."""
+    """Paints the heading mark of agent i: on ground only, under `paint_over` on anything but a wall."""
     cell = mark_cell(world, tables, i)
     shown = class_of(picture[cell])
     if shown == GROUND or (tables.paint_over and shown != WALL):
@@ -45,7 +45,7 @@ def paint_mark(world: Worlds, tables: Tables, i: int, picture: Ints) -> None:
 
 
 def paint_beam(world: Worlds, tables: Tables, shooter: int, picture: Ints) -> None:
-    """The beam of a shooter; over ground and marks only, but for `paint_over`."""
+    """Paints the beam of a shooter: over ground and marks only, under `paint_over` over everything."""
     for side in range(-tables.beam_half_width, tables.beam_half_width + 1):
         for ahead in range(1, beam_reach(world, tables, shooter, side) + 1):
             cell = beam_cell(world, tables, shooter, ahead, side)
@@ -55,12 +55,12 @@ def paint_beam(world: Worlds, tables: Tables, shooter: int, picture: Ints) -> No
 
 
 def paint_of(tables: Tables, i: int) -> int:
-    """How others see agent i."""
+    """The paint of agent i in the windows of other agents."""
     return tables.paints[FIRST_AGENT + i if tables.agents_apart else OTHER]
 
 
 def paint_agents(world: Worlds, tables: Tables, picture: Ints) -> None:
-    """Marks, then beams, then everyone on the board as others see it."""
+    """Paints heading marks, then beams, then agents."""
     agents = world.row.shape[0]
     for i in range(agents):
         if world.on_board[i]:
@@ -74,7 +74,7 @@ def paint_agents(world: Worlds, tables: Tables, picture: Ints) -> None:
 
 
 def paint_agents_over(world: Worlds, tables: Tables, picture: Ints) -> None:
-    """[run] Mark and body in the order of numbers, each over what was there; then the beams, over all."""
+    """[run] Paints mark and body of each agent in the order of indices, covering others; beams cover all."""
     agents = world.row.shape[0]
     for i in range(agents):
         if world.on_board[i]:
@@ -86,7 +86,7 @@ def paint_agents_over(world: Worlds, tables: Tables, picture: Ints) -> None:
 
 
 def paint(world: Worlds, tables: Tables, picture: Ints) -> None:
-    """The whole board as paints, everybody on it as others see it."""
+    """Paints the whole board, with every agent as other agents see it."""
     paint_apples(world, tables, picture)
     if tables.paint_over:
         paint_agents_over(world, tables, picture)
@@ -95,7 +95,7 @@ def paint(world: Worlds, tables: Tables, picture: Ints) -> None:
 
 
 def look(world: Worlds, tables: Tables, i: int, scratch: Scratch) -> None:
-    """The paints that agent i sees into `scratch.seen`, farthest row first, left column first."""
+    """Writes the paints that agent i sees into `scratch.seen`: farthest row first, leftmost column first."""
     heading = world.heading[i]
     own = 0 if tables.sees_all else cell_of(world.row[i], world.col[i], tables)
     to_cell = tables.window_cells[heading]
@@ -108,10 +108,10 @@ def look(world: Worlds, tables: Tables, i: int, scratch: Scratch) -> None:
 
 
 def cut_window(world: Worlds, tables: Tables, i: int, scratch: Scratch, window: Bytes) -> None:
-    """What agent i sees: uint8 [C, X, Y], in a window itself in the middle of the last row.
+    """Writes the observation of agent i: uint8 [C, X, Y]; in a window it is in the middle of the last row.
 
-    Two passes, since the second then writes straight runs; unsigned indices spare Numba's test for
-    negative ones. Together they are three times as fast as one plain loop (`benchmarks/env_steps.py`).
+    There are two passes, so that the second writes contiguous memory; unsigned indices avoid Numba's check
+    for negative ones. Together this is three times as fast as one plain loop (`benchmarks/env_steps.py`).
     """
     look(world, tables, i, scratch)
     cells = tables.window_cells.shape[1]
@@ -131,7 +131,7 @@ def cut_window(world: Worlds, tables: Tables, i: int, scratch: Scratch, window: 
 
 
 def draw_windows(world: Worlds, tables: Tables, scratch: Scratch, observation: Bytes) -> None:
-    """Everybody's window, each seeing itself as SELF; `observation`: uint8 [N, C, X, Y]."""
+    """Writes every agent's observation, itself shown as SELF; `observation`: uint8 [N, C, X, Y]."""
     picture = scratch.picture
     paint(world, tables, picture)
     for i in range(world.row.shape[0]):
@@ -144,7 +144,7 @@ def draw_windows(world: Worlds, tables: Tables, scratch: Scratch, observation: B
 
 
 def draw_board(world: Worlds, tables: Tables, scratch: Scratch, board: Bytes) -> None:
-    """The whole board without its rim, as colour classes; `board`: uint8 [H, W]."""
+    """Writes the classes of all cells of the board, without its rim; `board`: uint8 [H, W]."""
     paint(world, tables, scratch.picture)
     for row in range(board.shape[0]):
         for col in range(board.shape[1]):
@@ -166,4 +166,4 @@ FUNCTIONS = (
     draw_windows,
     draw_board,
 )
-"""In the order in which they call each other, as `compiled.py` compiles them."""
+"""The rules of this module, each after those it calls; `compiled.py` compiles them in this order."""

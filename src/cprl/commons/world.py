@@ -1,6 +1,6 @@
-"""What changes in an episode, B games at once, and what the rules hand out and borrow each turn.
+"""The arrays of B worlds: their state, the output of a step, and scratch memory.
 
-The rules are written for ONE world: they get these same tuples with the axis B taken off.
+The rules are written for one world: they receive these tuples without the axis B.
 """
 
 from typing import Any, NamedTuple, TypeAlias
@@ -14,126 +14,129 @@ Ints: TypeAlias = NDArray[np.int32]
 Bytes: TypeAlias = NDArray[np.uint8]
 Bools: TypeAlias = NDArray[np.bool_]
 Indices: TypeAlias = NDArray[np.uint32]
-"""Unsigned, which spares Numba's test for negative indices."""
+"""Unsigned: Numba then skips its check for negative indices."""
 Actions: TypeAlias = NDArray[np.int64]
 Words: TypeAlias = NDArray[np.uint64]
 
 PLAYING, TERMINATED, TRUNCATED = 0, 1, 2
-"""How a world stands: its episode goes on, no apple is left and none can come, the clock ran out."""
+"""The status of a world: still playing; no apple is left and none can grow; out of time."""
 
 UP, RIGHT, DOWN, LEFT = 0, 1, 2, 3
-"""Headings; one more is a quarter turn to the right."""
+"""Headings; adding one turns right by 90 degrees."""
 
 ROW_STEP = (-1, 0, 1, 0)
 COL_STEP = (0, 1, 0, -1)
-"""One cell ahead, by heading."""
+"""The step to the next cell ahead, indexed by heading."""
 
 
 class Worlds(NamedTuple):
-    """The state of B worlds; int32 where nothing else is said."""
+    """The state of B worlds; arrays are int32 unless stated otherwise."""
 
     seed: Words
-    """uint64 [B, 1], what all chance of a world follows from, together with its number, episode and step."""
+    """uint64 [B, 1]. All random numbers of a world follow from its seed, number, episode and step."""
     number: Words
-    """uint64 [B, 1], which world of that seed this is; below 2**32."""
+    """uint64 [B, 1], the index of this world among all worlds of its seed; below 2**32."""
     stock: Bytes
-    """uint8 [B, K], 1 where an apple hangs."""
+    """uint8 [B, K], 1 where a site holds an apple."""
     stock_before: Bytes
-    """uint8 [B, K], the stock as the turn began; kept only under `picture_shows_old_stock`."""
+    """uint8 [B, K], the stock at the start of the turn; updated only under `picture_shows_old_stock`."""
     near: Indices
-    """uint32 [B, K], apples within reach of each site; follows from `stock`."""
+    """uint32 [B, K], the number of apples near each site; derived from `stock`."""
     stock_left: Ints
-    """[B, 1], the sum of `stock`."""
+    """[B, 1], the sum of `stock`; derived from it."""
     row: Ints
-    """[B, N], 0 at the upper edge."""
+    """[B, N], 0 is the top row."""
     col: Ints
-    """[B, N], 0 at the left edge."""
+    """[B, N], 0 is the leftmost column."""
     heading: Ints
     """[B, N], 0 up, 1 right, 2 down, 3 left."""
     out_steps: Ints
-    """[B, N], turns still to miss."""
+    """[B, N], the number of turns that the agent still has to miss."""
     in_play: Bools
-    """[B, N], who acts in the coming turn."""
+    """bool [B, N], whether the agent acts in the coming turn."""
     on_board: Bools
-    """[B, N], who was in play when the last picture was taken."""
+    """bool [B, N], whether the agent was in play at the end of the last turn, before anyone returned."""
     fired: Bools
-    """[B, N], who fired in the last turn."""
+    """bool [B, N], whether the agent fired in the last turn."""
     hits: Ints
-    """[B, N], hits taken since the last tag."""
+    """[B, N], hits since the last tag."""
     tagged_step: Ints
-    """[B, N], the step at which an agent was last tagged out, 0 for never."""
+    """[B, N], the step at which the agent was last tagged; 0 for never."""
     offences: Ints
-    """[B, N], how often an agent was tagged out in this episode."""
+    """[B, N], how often the agent was tagged in this episode."""
     harvested: Ints
-    """[B, N], apples bitten in this episode."""
+    """[B, N], apples harvested in this episode."""
     step: Ints
     """[B, 1], turns played in this episode."""
     episode: Ints
-    """[B, 1], episodes begun since the seed was set, less one."""
+    """[B, 1], the index of the episode since the seed was set; -1 before the first."""
     ended: Ints
     """[B, 1], PLAYING, TERMINATED or TRUNCATED."""
 
 
 class StepOutput(NamedTuple):
-    """What a turn tells, written into arrays that the caller hands in (torch memory, as a rule)."""
+    """The output of a turn, written into arrays that the caller provides (usually torch memory)."""
 
     observation: Bytes
     """uint8 [B, N, C, X, Y]."""
     harvest: NDArray[np.float32]
-    """float32 [B, N]."""
+    """float32 [B, N], apples harvested in this turn."""
     in_play: Bools
-    """bool [B, N], who acts in the coming turn."""
+    """bool [B, N], whether the agent acts in the coming turn."""
     fired: Bools
-    """bool [B, N]."""
+    """bool [B, N], whether the agent fired in this turn."""
     hit_by: Bools
-    """bool [B, N, N], row hit, column shooter."""
+    """bool [B, N, N]; row: the agent hit, column: the shooter."""
     tagged_by: Bools
-    """bool [B, N, N], row tagged out, column shooter."""
+    """bool [B, N, N]; row: the agent tagged, column: the shooter."""
     scoreboard: NDArray[np.float32]
-    """float32 [B, N, N], a row per observer: apples that everybody has bitten in this episode, its own first,
-    then of the next numbers, round and round; [B, N, 0] where no scoreboard is observed."""
+    """float32 [B, N, N], one row per observer: the harvest of every agent in this episode, the observer's own
+    first, then of the following agent indices, cyclically; [B, N, 0] without a scoreboard."""
     stock_gauge: NDArray[np.float32]
-    """float32 [B, N, 1], the share of all sites that hold an apple; [B, N, 0] where it is not observed."""
+    """float32 [B, N, 1], the share of all sites that hold an apple; [B, N, 0] without a stock gauge."""
     stock: NDArray[np.int64]
-    """int64 [B, 1]."""
+    """int64 [B, 1], apples on the board."""
     regrown: NDArray[np.int64]
-    """int64 [B, 1]."""
+    """int64 [B, 1], apples that grew in this turn."""
     terminated: Bools
-    """bool [B, 1]."""
+    """bool [B, 1], no apple is left and none can grow."""
     truncated: Bools
-    """bool [B, 1]."""
+    """bool [B, 1], the episode ran out of time."""
     done: Bools
-    """bool [B, 1]."""
+    """bool [B, 1], terminated or truncated."""
 
 
 class Scratch(NamedTuple):
-    """Paper to write on during a turn, a sheet for each thread: the rules allocate nothing."""
+    """Working memory for one turn, one per thread: the rules allocate nothing.
+
+    Arrays are int32 unless stated otherwise.
+    """
 
     start_row: Ints
-    """[N], where each agent began the turn."""
+    """[N], the row in which each agent began the turn."""
     start_col: Ints
-    """[N]."""
+    """[N], the column in which each agent began the turn."""
     blocked: Bools
-    """[N], whose move is being cancelled."""
+    """bool [N], whether the agent's move is being cancelled, or its return to play."""
     words: NDArray[np.int64]
-    """int64 [K / 4, rounded up to draws of 4], random words, four sites a word."""
+    """int64 [K / 4, rounded up to a multiple of 4], random 32-bit words; one word serves four sites."""
     sprouts: Ints
-    """[K], the sites that grow an apple this turn."""
+    """[K], the sites that grow an apple in this turn come first."""
     picture: Ints
-    """[cells], the board and a rim of wall around it, as paints."""
+    """[cells], the board and a rim of wall around it, as paints (see `Tables.paints`)."""
     seen: Ints
-    """[X * Y], the paints of the window being cut."""
+    """[X * Y], the paints of the window being written."""
 
 
 class Shown(NamedTuple):
-    """One world as people look at it: numpy arrays, copies."""
+    """One world for display: copies, as numpy arrays."""
 
     observation: Bytes
     """uint8 [N, C, X, Y], what each agent observes."""
     board: Bytes
     """uint8 [H, W], classes of `cprl.commons.colours`."""
     stock: Bytes
-    """uint8 [K], 1 where an apple hangs."""
+    """uint8 [K], 1 where a site holds an apple."""
     row: Ints
     """int32 [N]."""
     col: Ints
@@ -143,11 +146,11 @@ class Shown(NamedTuple):
     in_play: Bools
     """bool [N]."""
     harvested: Ints
-    """int32 [N], apples bitten in this episode."""
+    """int32 [N], apples harvested in this episode."""
 
 
 def empty_worlds(*, worlds: int, agents: int, sites: int) -> Worlds:
-    """Room for B worlds, all zero; `begin` makes an episode of it."""
+    """Memory for B worlds, all zero except `episode`, which is -1; `Batch.begin` starts the first episode."""
 
     def ints(*shape: int) -> Ints:
         return np.zeros((worlds, *shape), np.int32)
@@ -183,21 +186,21 @@ def empty_worlds(*, worlds: int, agents: int, sites: int) -> Worlds:
 
 
 CACHE_LINE_BYTES = 128
-"""Room behind each array of a sheet: threads that write into one line of the cache hinder each other."""
+"""Padding after each array of a Scratch, in entries: threads that share a cache line slow each other down."""
 
 
 def empty_scratch(*, agents: int, sites: int, cells: int, window: int) -> Scratch:
-    """A sheet for one thread."""
+    """The working memory of one thread; `window`: cells X * Y of a window."""
 
-    def room(length: int, dtype: type[np.generic] = np.int32) -> NDArray[Any]:
+    def padded(length: int, dtype: type[np.generic] = np.int32) -> NDArray[Any]:
         return np.zeros(length + CACHE_LINE_BYTES, dtype)[:length]
 
     return Scratch(
-        start_row=room(agents),
-        start_col=room(agents),
-        blocked=room(agents, np.bool_),
-        words=room(4 * -(-sites // SITES_PER_DRAW), np.int64),
-        sprouts=room(sites),
-        picture=room(cells),
-        seen=room(window),
+        start_row=padded(agents),
+        start_col=padded(agents),
+        blocked=padded(agents, np.bool_),
+        words=padded(4 * -(-sites // SITES_PER_DRAW), np.int64),
+        sprouts=padded(sites),
+        picture=padded(cells),
+        seen=padded(window),
     )

@@ -1,9 +1,26 @@
-"""Doors into the same game: TorchRL, PettingZoo, Gymnasium."""
+"""Adapters of the same game: TorchRL, PettingZoo, Gymnasium.
+
+Modules, in the order in which one reads them:
+    make_env         make_env, the one place where an environment is assembled; spaces_of
+    commons_env      CommonsEnv, TorchRL: B worlds at once
+    state            the state of an environment and its transforms, for checkpoints
+    pettingzoo_env   parallel_env and env, one world
+    gymnasium_env    one world of one agent
+"""
 
 from cprl.envs.commons_env import CommonsEnv
 from cprl.envs.gymnasium_env import CommonsGymnasiumEnv, register
+from cprl.envs.make_env import make_env, spaces_of
 from cprl.envs.pettingzoo_env import CommonsParallelEnv, env, parallel_env
 
-__all__ = ["CommonsEnv", "CommonsGymnasiumEnv", "CommonsParallelEnv", "env", "parallel_env"]
+__all__ = [
+    "CommonsEnv",
+    "CommonsGymnasiumEnv",
+    "CommonsParallelEnv",
+    "env",
+    "make_env",
+    "parallel_env",
+    "spaces_of",
+]
 
 register()

@@ -1,6 +1,6 @@
-"""The door of Gymnasium: one agent alone.
+"""Adapter for Gymnasium: games of a single agent.
 
-Importing `cprl` registers `cprl/SingleBasic-v0`, `cprl/SingleComplex-v0` and, for any game of one agent,
+Importing `cprl` registers `cprl/SingleBasic-v0`, `cprl/SingleComplex-v0` and, for any game with one agent,
 `cprl/Commons-v0`.
 """
 
@@ -15,18 +15,19 @@ from cprl.envs.one_world import RENDER_FPS, RENDER_MODES, Observed, OneWorld
 
 
 class CommonsGymnasiumEnv(gymnasium.Env[Any, Any]):
-    """One world of a game for one agent as a Gymnasium `Env`.
+    """One world of a game with one agent as a Gymnasium `Env`.
 
     Args:
-        game: what is played, see `presets.game`; its map has one agent.
-        seed: what all chance follows from; `reset(seed=...)` starts all over with another.
+        game: The game, see `presets.game`; its map has one agent.
+        seed: The seed of all random numbers, 0 to 2**64 - 1; `reset(seed=...)` restarts with another seed.
         render_mode: "rgb_array", "human" or None.
 
     Raises:
-        ValueError: for a game of several agents; in `step`, for an unknown action.
+        ValueError: If the game has several agents, or the seed or the render mode is not allowed.
+        RuntimeError: If the render mode is "human" and no window can be opened.
     """
 
-    metadata = {  # noqa: RUF012  (Gymnasium's own way)
+    metadata = {  # noqa: RUF012  (as Gymnasium declares it)
         "render_modes": list(RENDER_MODES),
         "render_fps": RENDER_FPS,
     }
@@ -34,7 +35,7 @@ class CommonsGymnasiumEnv(gymnasium.Env[Any, Any]):
     def __init__(self, game: Game, *, seed: int = 0, render_mode: str | None = None) -> None:
         if game.agents != 1:
             raise ValueError(
-                f"the game has {game.agents} agents; Gymnasium takes one: for more, "
+                f"the game has {game.agents} agents; allowed with Gymnasium: 1; for more use "
                 "cprl.envs.parallel_env (PettingZoo) or CommonsEnv (TorchRL)"
             )
         self.game, self.render_mode = game, render_mode
@@ -45,28 +46,36 @@ class CommonsGymnasiumEnv(gymnasium.Env[Any, Any]):
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[Observed, dict[str, Any]]:
-        """Begins the next episode, or the first one of another seed."""
+        """Begins the next episode, or the first episode of a new seed."""
         super().reset(seed=seed)
         self.world.begin(seed)
         return self.world.observation(0), self.world.info(0)
 
     def step(self, action: int) -> tuple[Observed, float, bool, bool, dict[str, Any]]:
-        """One turn; `info` tells harvest, in_play, fired and tagged."""
+        """Plays one turn; `info` holds "harvest", "in_play", "fired" and "tagged".
+
+        Raises:
+            ValueError: If the action is out of range; the world is unchanged.
+        """
         world = self.world
         world.play([int(action)])
         return world.observation(0), world.reward(0), world.terminated, world.truncated, world.info(0)
 
     def render(self) -> Bytes | None:
-        """A picture, uint8 [rows, columns, 3]; None where it went to a window."""
+        """Returns an image, uint8 [rows, columns, 3], under "rgb_array"; shows it in a window under "human".
+
+        Raises:
+            ValueError: If there is no render mode.
+        """
         return self.world.render()
 
     def close(self) -> None:
-        """Closes the window, if there is one."""
+        """Closes the window, if it is open."""
         self.world.close()
 
 
 def register() -> None:
-    """Makes the boards known to `gymnasium.make`; once is enough."""
+    """Registers the boards with `gymnasium.make`; `cprl.envs` calls it on import."""
     gymnasium.register("cprl/Commons-v0", entry_point=f"{__name__}:{CommonsGymnasiumEnv.__name__}")
     for name, board in (("SingleBasic", "single_basic"), ("SingleComplex", "single_complex")):
         gymnasium.register(

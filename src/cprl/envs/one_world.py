@@ -1,4 +1,4 @@
-"""OneWorld: one world of a game in numpy, as the doors of PettingZoo and Gymnasium show it."""
+"""OneWorld: one world of a game in numpy, shared by the adapters for PettingZoo and Gymnasium."""
 
 from collections.abc import Sequence
 from typing import Any, Final
@@ -20,17 +20,17 @@ Observed = NDArray[Any] | dict[str, NDArray[Any]]
 
 
 class OneWorld:
-    """One world that begins, is played and is looked at.
+    """One world of a game.
 
     Args:
-        game: what is played.
-        seed: what all chance follows from.
-        title: of the window of `render_mode="human"`.
-        render_mode: one of `RENDER_MODES`, or None.
+        game: The game.
+        seed: The seed of all random numbers, 0 to 2**64 - 1.
+        title: The title of the window under `render_mode="human"`.
+        render_mode: One of `RENDER_MODES`, or None.
 
     Raises:
-        ValueError: for another render mode.
-        RuntimeError: for "human" where no window can be opened.
+        ValueError: If the seed or the render mode is not allowed.
+        RuntimeError: If the render mode is "human" and no window can be opened.
     """
 
     def __init__(self, game: Game, *, seed: int, title: str, render_mode: str | None) -> None:
@@ -43,7 +43,7 @@ class OneWorld:
         self._window = Window(title) if render_mode == "human" else None
 
     def observation_space(self) -> spaces.Space[Any]:
-        """A Box of uint8 [C, X, Y]; a Dict with it as "observation" where vectors are observed too."""
+        """A Box of uint8 [C, X, Y]; with a scoreboard or stock gauge, a Dict with it as "observation"."""
         game = self.game
         seen = spaces.Box(0, game.observation.highest, game.observation_shape, np.uint8)
         vectors: dict[str, spaces.Space[Any]] = {}
@@ -54,7 +54,7 @@ class OneWorld:
         return spaces.Dict({"observation": seen, **vectors}) if vectors else seen
 
     def begin(self, seed: int | None) -> None:
-        """The next episode, or the first one of another seed."""
+        """Begins the next episode, or the first episode of a new seed."""
         if seed is not None:
             self.batch.set_seed(seed)
         self.output = self.batch.begin(self.batch.new_output())
@@ -62,10 +62,10 @@ class OneWorld:
             self.render()
 
     def play(self, actions: Sequence[int]) -> None:
-        """One turn; an action for each agent.
+        """Plays one turn with one action per agent.
 
         Raises:
-            ValueError: for actions that the game does not know; then nothing has changed.
+            ValueError: If there is not one action per agent, or one is out of range; the world is unchanged.
         """
         row = np.array([actions], np.int64)
         self.batch.check(row)
@@ -74,7 +74,7 @@ class OneWorld:
             self.render()
 
     def observation(self, agent: int) -> Observed:
-        """What an agent observes, as `observation_space` says."""
+        """The observation of an agent, an element of `observation_space`."""
         output, form = self.output, self.game.observation
         vectors: dict[str, NDArray[Any]] = {}
         if form.scoreboard:
@@ -85,11 +85,11 @@ class OneWorld:
         return {"observation": seen, **vectors} if vectors else seen
 
     def reward(self, agent: int) -> float:
-        """What an agent is paid for the turn: its harvest."""
+        """The reward of an agent in the last turn: its harvest."""
         return float(self.output.harvest[0, agent])
 
     def info(self, agent: int) -> dict[str, Any]:
-        """What else happened to an agent in the turn, and whether it acts in the coming one."""
+        """An agent's harvest in the last turn, whether it fired and was tagged, and whether it acts next."""
         output = self.output
         return {
             "harvest": float(output.harvest[0, agent]),
@@ -100,28 +100,29 @@ class OneWorld:
 
     @property
     def terminated(self) -> bool:
-        """Whether no apple is left and none can come."""
+        """Whether no apple is left and none can grow."""
         return bool(self.output.terminated[0, 0])
 
     @property
     def truncated(self) -> bool:
-        """Whether the clock ran out."""
+        """Whether the episode ran out of time."""
         return bool(self.output.truncated[0, 0])
 
     def state(self) -> Bytes:
-        """uint8 [3, H, W], the whole board as RGB."""
+        """The whole board in RGB: uint8 [3, H, W]."""
         board = self.game.palette[self.batch.boards(self.output)[0]]
         return np.ascontiguousarray(board.transpose(2, 0, 1))
 
     def render(self) -> Bytes | None:
-        """A picture, uint8 [rows, columns, 3], under "rgb_array"; under "human" it goes to the window.
+        """Returns an image, uint8 [rows, columns, 3], under "rgb_array"; shows it in a window under "human".
 
         Raises:
-            ValueError: where no render mode was chosen.
+            ValueError: If there is no render mode.
         """
         if self.render_mode is None:
             raise ValueError(
-                'nothing can be rendered: make the environment with render_mode="rgb_array" or "human"'
+                'render_mode is None, so render() is unavailable; allowed: "rgb_array" or "human", chosen '
+                "when the environment is made"
             )
         image = world_image(self.game.map, self.batch.show(self.output))
         if self._window is None:
@@ -130,6 +131,6 @@ class OneWorld:
         return None
 
     def close(self) -> None:
-        """Closes the window, if there is one."""
+        """Closes the window, if it is open."""
         if self._window:
             self._window.close()

@@ -1,4 +1,4 @@
-"""The doors of PettingZoo: all agents at once (`parallel_env`), or one after the other (`env`)."""
+"""Adapters for PettingZoo: all agents at once (`parallel_env`), or one after the other (`env`)."""
 
 from typing import Any, ClassVar
 
@@ -15,19 +15,20 @@ Infos = dict[str, dict[str, Any]]
 
 
 class CommonsParallelEnv(ParallelEnv[str, Any, int]):
-    """One world of a game as a PettingZoo `ParallelEnv`; agents are agent_0, agent_1 and so on.
+    """One world of a game as a PettingZoo `ParallelEnv`; agents are agent_0, agent_1, ...
 
-    Every agent acts in every turn until the episode ends for all; what one chooses while it is out of play
-    does not count. `infos` tell each agent's harvest, whether it acts in the coming turn (in_play), whether
-    it fired and whether it was tagged.
+    Every agent acts in every turn until the episode ends for all; the action of an agent out of play has no
+    effect. `infos` holds each agent's "harvest", whether it acts in the coming turn ("in_play"), whether it
+    "fired" and whether it was "tagged".
 
     Args:
-        game: what is played, see `presets.game`.
-        seed: what all chance follows from; `reset(seed=...)` starts all over with another.
+        game: The game, see `presets.game`.
+        seed: The seed of all random numbers, 0 to 2**64 - 1; `reset(seed=...)` restarts with another seed.
         render_mode: "rgb_array", "human" or None.
 
     Raises:
-        ValueError: in `step`, for missing, superfluous or unknown actions; then nothing has changed.
+        ValueError: If the seed or the render mode is not allowed.
+        RuntimeError: If the render mode is "human" and no window can be opened.
     """
 
     metadata: ClassVar[dict[str, Any]] = {
@@ -47,17 +48,17 @@ class CommonsParallelEnv(ParallelEnv[str, Any, int]):
         self.state_space = spaces.Box(0, 255, (3, game.map.height, game.map.width), np.uint8)
 
     def observation_space(self, agent: str) -> spaces.Space[Any]:
-        """A Box of uint8 [C, X, Y], or a Dict with it as "observation"; always the same object."""
+        """A Box of uint8 [C, X, Y], or a Dict that holds it as "observation"; always the same object."""
         return self.observation_spaces[agent]
 
     def action_space(self, agent: str) -> spaces.Space[Any]:
-        """Discrete, `Game.actions` by index; always the same object."""
+        """A Discrete space, the indices of `Game.actions`; always the same object."""
         return self.action_spaces[agent]
 
     def reset(
         self, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[dict[str, Observed], Infos]:
-        """Begins the next episode, or the first one of another seed."""
+        """Begins the next episode, or the first episode of a new seed."""
         self.world.begin(seed)
         self.agents = list(self.possible_agents)
         return self._observations(), self._infos()
@@ -65,11 +66,15 @@ class CommonsParallelEnv(ParallelEnv[str, Any, int]):
     def step(
         self, actions: dict[str, int]
     ) -> tuple[dict[str, Observed], dict[str, float], dict[str, bool], dict[str, bool], Infos]:
-        """One turn; an action for every agent."""
+        """Plays one turn with one action per agent.
+
+        Raises:
+            ValueError: If an action is missing, superfluous or out of range; the world is unchanged.
+        """
         if set(actions) != set(self.agents):
             raise ValueError(
-                f"actions came for {sorted(actions)}; wanted: one for each of {self.agents}"
-                + ("" if self.agents else ", nobody: the episode is over, call reset()")
+                f"actions has the agents {sorted(actions)}; allowed: exactly {self.agents}"
+                + ("" if self.agents else ", because the episode has ended: call reset()")
             )
         self.world.play([int(actions[name]) for name in self.agents])
         rewards = {name: self.world.reward(i) for i, name in enumerate(self.agents)}
@@ -81,15 +86,19 @@ class CommonsParallelEnv(ParallelEnv[str, Any, int]):
         return output
 
     def state(self) -> Bytes:
-        """uint8 [3, H, W], the whole board as RGB."""
+        """The whole board in RGB: uint8 [3, H, W]."""
         return self.world.state()
 
     def render(self) -> Bytes | None:
-        """A picture, uint8 [rows, columns, 3]; None where it went to a window."""
+        """Returns an image, uint8 [rows, columns, 3], under "rgb_array"; shows it in a window under "human".
+
+        Raises:
+            ValueError: If there is no render mode.
+        """
         return self.world.render()
 
     def close(self) -> None:
-        """Closes the window, if there is one."""
+        """Closes the window, if it is open."""
         self.world.close()
 
     def _observations(self) -> dict[str, Observed]:
@@ -105,5 +114,5 @@ def parallel_env(game: Game, seed: int = 0, *, render_mode: str | None = None) -
 
 
 def env(game: Game, seed: int = 0, *, render_mode: str | None = None) -> AECEnv[str, Any, int]:
-    """The game as a PettingZoo `AECEnv`: agents choose in turn, and the last one's choice plays the turn."""
+    """The game as a PettingZoo `AECEnv`: agents act one by one; a turn is played after the last has acted."""
     return parallel_to_aec(parallel_env(game, seed, render_mode=render_mode))

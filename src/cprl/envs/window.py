@@ -1,4 +1,4 @@
-"""Window: pictures on a person's screen, by Matplotlib."""
+"""Window: shows images on screen, with Matplotlib."""
 
 import os
 from typing import Any
@@ -7,13 +7,13 @@ from cprl.commons.world import Bytes
 
 
 class Window:
-    """A window that shows one picture after the other; opened with the first.
+    """A window that shows one image at a time; the first image opens it.
 
     Args:
-        title: of the window.
+        title: The title of the window.
 
     Raises:
-        RuntimeError: where Matplotlib can open no window, and nobody chose its backend.
+        RuntimeError: If Matplotlib cannot open a window and MPLBACKEND is not set.
     """
 
     def __init__(self, title: str) -> None:
@@ -25,15 +25,15 @@ class Window:
         self._opens = backend.lower() in registry.list_builtin(BackendFilter.INTERACTIVE)
         if not self._opens and "MPLBACKEND" not in os.environ:
             raise RuntimeError(
-                f'render_mode is "human", but no window can be opened here (Matplotlib chose "{backend}"); '
-                'use render_mode="rgb_array", or name a backend in MPLBACKEND'
+                f'render_mode is "human", but Matplotlib\'s backend "{backend}" cannot open a window; '
+                'use render_mode="rgb_array", or choose a backend with MPLBACKEND'
             )
         self._title = title
         self._figure: Any = None
         self._image: Any = None
 
     def show(self, picture: Bytes) -> None:
-        """Shows uint8 [rows, columns, 3], RGB."""
+        """Shows an image, uint8 [rows, columns, 3], RGB."""
         from matplotlib import pyplot
 
         if self._figure is None:
@@ -49,7 +49,7 @@ class Window:
         self._figure.canvas.flush_events()
 
     def close(self) -> None:
-        """Closes the window; the next picture opens another."""
+        """Closes the window; the next image opens a new one."""
         if self._figure is not None:
             from matplotlib import pyplot
 

@@ -1,13 +1,14 @@
-"""crossplay: one agent of a stored run at a time among those of another, at every seat.
+"""crossplay: a focal agent of one stored run plays with background agents of another.
 
-Cell (i, j) of the matrix: at seat s sits run i's agent for seat s, the visitor; at all other seats run j's
-agents, its hosts. That is played for every seat s and every replica r, run i's r among run j's r, in the
-same worlds for all cells and seats. A number of a cell is the mean over seats, estimated over replicas,
-which alone are independent.
+In cell (i, j) of the matrix the focal agent, with index s, is from run i, and all others, the background
+agents, are from run j. Each cell is played for every index s and every replica r, with replica r of both
+runs, in the same worlds for all cells and indices. A number of a cell is the mean over focal agents,
+estimated over replicas, because only replicas are independent.
 
-On the diagonal stands self-play: the visitor is of the hosts' own replica, trained with them. Elsewhere it
-is a stranger besides being of another run. diagonal="strangers" tells the two apart: there the visitor is of
-the run's next replica, which learned the same way and never met its hosts.
+The diagonal is self-play: the focal agent was trained with the background agents, in the same replica. In all
+other cells it is from another run and was not trained with them. diagonal="cross_seed" separates the two
+effects: the focal agent of the diagonal is then from the run's next replica, trained in the same way but not
+with the background agents.
 """
 
 from collections.abc import Callable, Mapping, Sequence
@@ -15,62 +16,63 @@ from dataclasses import dataclass
 from functools import partial
 from itertools import product
 from pathlib import Path
-from typing import Literal, TypeAlias
+from typing import Final, Literal, TypeAlias
 
 import numpy as np
 import pyarrow as pa
 
 from cprl.evaluation.evaluate import SEED, check, chosen_replicas, opened
-from cprl.evaluation.lanes import Played, Sitter, play, seated
+from cprl.evaluation.lanes import Played, Source, play, policies_of
 from cprl.evaluation.same_game import check_same_game
 from cprl.measuring.episodes import Episode
 from cprl.measuring.replicas import Measured, over_replicas, social_measures
 from cprl.runs.labelled import labelled
 from cprl.stored import LoadedRun
 
-Diagonal: TypeAlias = Literal["self", "strangers"]
+Diagonal: TypeAlias = Literal["self", "cross_seed"]
 
-NOBODY_VISITS = -1
-"""The seat, in tables, of episodes of self-play, in which everybody is visitor and host."""
+SELF_PLAY: Final = -1
+"""The focal agent of self-play in tables: every agent is focal and background."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Cell:
-    """What happened where one run's agents visited another's."""
+    """The episodes of focal agents of one run with background agents of another."""
 
-    visitor: str
-    hosts: str
-    visits: Mapping[int, Played]
-    """By the seat of the visitor; in self-play the same episodes at each."""
+    focal: str
+    background: str
+    by_agent: Mapping[int, Played]
+    """The episodes by the index of the focal agent; in self-play the same episodes for each."""
     is_self_play: bool
 
     def measures(self, agent: int | None = None) -> dict[str, Measured]:
-        """visitor/return, hosts/return (of a host, their mean) and group/return, then the social metrics.
+        """focal/return, background/return (the mean of the background agents), group/return, and the social
+        metrics.
 
         Args:
-            agent: the visitor's; None for the mean over seats.
+            agent: the index of the focal agent; None for the mean over all indices.
         """
-        agents = list(self.visits) if agent is None else [agent]
-        told = {
-            "visitor/return": self._returns(agents, lambda returns, at: returns[at]),
-            "hosts/return": self._returns(agents, lambda returns, at: np.delete(returns, at).mean()),
+        agents = list(self.by_agent) if agent is None else [agent]
+        returns = {
+            "focal/return": self._returns(agents, lambda returns, at: returns[at]),
+            "background/return": self._returns(agents, lambda returns, at: np.delete(returns, at).mean()),
             "group/return": self._returns(agents, lambda returns, at: returns.sum()),
         }
-        return {**told, **social_measures(self._played(agents[:1] if self.is_self_play else agents))}
+        return {**returns, **social_measures(self._played(agents[:1] if self.is_self_play else agents))}
 
     def _played(self, agents: Sequence[int]) -> Played:
-        """The episodes with a visitor at these seats, by replica."""
+        """The episodes with these focal agents, by replica."""
         together: Played = {}
         for agent in agents:
-            for replica, episodes in self.visits[agent].items():
+            for replica, episodes in self.by_agent[agent].items():
                 together.setdefault(replica, []).extend(episodes)
         return together
 
     def _returns(self, agents: Sequence[int], of: Callable[..., float]) -> Measured:
-        """A number of the agents' returns [N] and the visitor's seat, over replicas."""
+        """A function of the agents' returns [N] and the focal agent's index, estimated over replicas."""
         values: dict[int, list[float]] = {}
         for agent in agents:
-            for replica, episodes in self.visits[agent].items():
+            for replica, episodes in self.by_agent[agent].items():
                 own: list[Episode] = episodes
                 values.setdefault(replica, []).extend(float(of(one.return_, agent)) for one in own)
         return over_replicas(values)
@@ -78,43 +80,43 @@ class Cell:
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class CrossPlay:
-    """The matrix; see the top of this module."""
+    """The matrix of cross-play; see the docstring of this module."""
 
     runs: Mapping[str, LoadedRun]
-    """By the names by which they are told apart."""
+    """The runs by name."""
     cells: Mapping[tuple[str, str], Cell]
-    """By the names of the visitor's run and the hosts'."""
+    """The cells by the names of the focal agent's run and of the background agents' run."""
     replicas: list[int]
     episodes: int
     seed: int
     greedy: bool
     diagonal: Diagonal
 
-    def cell(self, visitor: str, hosts: str) -> Cell:
-        """A cell, by the names of two runs.
+    def cell(self, focal: str, background: str) -> Cell:
+        """The cell of two runs, by their names.
 
         Raises:
-            ValueError: for a name that no run has.
+            ValueError: if a name is unknown.
         """
-        if (visitor, hosts) not in self.cells:
-            raise ValueError(f"there is no cell {visitor!r} among {hosts!r}; runs are {list(self.runs)}")
-        return self.cells[visitor, hosts]
+        if (focal, background) not in self.cells:
+            raise ValueError(f"the cell is {(focal, background)}; allowed: two of the runs {list(self.runs)}")
+        return self.cells[focal, background]
 
     def table(self) -> pa.Table:
-        """All episodes as `episodes.parquet` has them, behind "visitor", "hosts" and "seat", the visitor's;
-        -1 in self-play. "replica" is the hosts'."""
+        """All episodes with the columns of `episodes.parquet`, after "focal" and "background", the names of
+        runs, and "focal_agent", -1 in self-play. "replica" is that of the background agents."""
         return labelled(
             (
                 {
-                    "visitor": cell.visitor,
-                    "hosts": cell.hosts,
-                    "seat": NOBODY_VISITS if cell.is_self_play else agent,
+                    "focal": cell.focal,
+                    "background": cell.background,
+                    "focal_agent": SELF_PLAY if cell.is_self_play else agent,
                 },
                 replica,
                 episodes,
             )
             for cell in self.cells.values()
-            for agent, played in list(cell.visits.items())[: 1 if cell.is_self_play else None]
+            for agent, played in list(cell.by_agent.items())[: 1 if cell.is_self_play else None]
             for replica, episodes in played.items()
         )
 
@@ -127,40 +129,45 @@ def crossplay(
     seed: int = SEED,
     replicas: Sequence[int] = (),
     diagonal: Diagonal = "self",
+    allow: Sequence[str] = (),
 ) -> CrossPlay:
-    """AgentPolicies the agents of each run among those of each other, one visitor at a time.
+    """Plays agents of each run with agents of each other run, one focal agent at a time.
 
     Args:
-        runs: at least two of the same game: directories, results, or what `cprl.load` gave.
-        episodes: of each replica with the visitor at each seat, each in a world of its own.
+        runs: at least two runs of the same game: directories, exported results, or values of `cprl.load`.
+        episodes: episodes of each replica with each focal agent, each in its own world.
         greedy: see `cprl.evaluate_run`.
-        seed: of the worlds and of all chance.
-        replicas: the numbers of those that play; by default all that every run has.
-        diagonal: whom a run's agents meet there: "self", those they were trained with, or "strangers", those
-            of the run's next replica.
+        seed: the seed of the worlds and of all random numbers.
+        replicas: the indices of the replicas that play; by default all that every run has.
+        diagonal: the pairing of a run with itself: "self", agents that were trained together, or
+            "cross_seed", a focal agent of the run's next replica.
+        allow: see `cprl.load`.
 
     Raises:
-        ValueError: for runs of unlike games, saying what differs, of a game of one seat, or given twice; for
-            "strangers" of a single replica; and see `cprl.evaluate_run`.
+        ValueError: if the runs have different games (names the differences), the game has one agent, a run is
+            given twice, or "cross_seed" has a single replica; and see `cprl.evaluate_run`.
     """
-    named = _named([opened(run) for run in runs])
+    named = _named([opened(run, allow) for run in runs])
     first, *_ = named.values()
     check_same_game(named)
     if first.game.agents == 1:
-        raise ValueError("the game has one seat, so nobody to visit; `cprl evaluate` is what fits")
+        raise ValueError("the game has 1 agent; allowed for cross-play: at least 2; use `cprl evaluate`")
     check(episodes=episodes, seed=seed, runs=list(named.values()))
     numbers = chosen_replicas(named, replicas)
-    if diagonal == "strangers" and len(numbers) < 2:
-        raise ValueError(f"strangers are of another replica; there is only {numbers}")
+    if diagonal == "cross_seed" and len(numbers) < 2:
+        raise ValueError(f"the replicas are {numbers}; allowed for cross_seed: at least 2")
     following = dict(zip(numbers, [*numbers[1:], numbers[0]], strict=True))
-    among = partial(_visits, replicas=numbers, episodes=episodes, seed=seed, explore=not greedy)
+    among = partial(_played_among, replicas=numbers, episodes=episodes, seed=seed, explore=not greedy)
     cells = {}
-    for visitor, hosts in product(named, repeat=2):
-        is_self_play = visitor == hosts and diagonal == "self"
-        of_replicas = following if visitor == hosts and not is_self_play else None
-        guest = None if is_self_play else Sitter(named[visitor], of_replicas)
-        cells[visitor, hosts] = Cell(
-            visitor=visitor, hosts=hosts, visits=among(guest, named[hosts]), is_self_play=is_self_play
+    for focal, background in product(named, repeat=2):
+        is_self_play = focal == background and diagonal == "self"
+        of_replicas = following if focal == background and not is_self_play else None
+        focal_source = None if is_self_play else Source(named[focal], of_replicas)
+        cells[focal, background] = Cell(
+            focal=focal,
+            background=background,
+            by_agent=among(focal_source, named[background]),
+            is_self_play=is_self_play,
         )
     return CrossPlay(
         runs=named,
@@ -173,36 +180,36 @@ def crossplay(
     )
 
 
-def _visits(
-    guest: Sitter | None,
-    hosts: LoadedRun,
+def _played_among(
+    focal_source: Source | None,
+    background: LoadedRun,
     *,
     replicas: Sequence[int],
     episodes: int,
     seed: int,
     explore: bool,
 ) -> dict[int, Played]:
-    """By the seat that the guest takes; without one the hosts play once among themselves, for all seats."""
-    game = hosts.game
+    """The episodes by the focal agent's index; without focal agents, self-play runs once for all indices."""
 
-    def played(sitters: Sequence[Sitter]) -> Played:
-        who = partial(seated, sitters, worlds=episodes, seed=seed)
-        return play(game, who, replicas, episodes=episodes, seed=seed, explore=explore)
+    def played(sources: Sequence[Source]) -> Played:
+        who = partial(policies_of, sources, worlds=episodes, seed=seed)
+        return play(background, who, replicas, episodes=episodes, seed=seed, explore=explore)
 
-    at_home = [Sitter(hosts)] * game.agents
-    if guest is None:
-        return dict.fromkeys(range(game.agents), played(at_home))
-    return {agent: played([*at_home[:agent], guest, *at_home[agent + 1 :]]) for agent in range(game.agents)}
+    agents = range(background.game.agents)
+    own = [Source(background)] * len(agents)
+    if focal_source is None:
+        return dict.fromkeys(agents, played(own))
+    return {agent: played([*own[:agent], focal_source, *own[agent + 1 :]]) for agent in agents}
 
 
 def _named(runs: Sequence[LoadedRun]) -> dict[str, LoadedRun]:
-    """By the names of their directories, by their paths where those are not all different."""
+    """The runs by the names of their directories, or by their paths if names coincide."""
     if len(runs) < 2:
-        raise ValueError(f"{len(runs)} run came; at least two are wanted: cprl crossplay RUN RUN...")
+        raise ValueError(f"{len(runs)} run is given; allowed: at least two: cprl crossplay RUN RUN...")
     paths = [run.path.resolve() for run in runs]
     for place, path in enumerate(paths):
         if path in paths[:place]:
-            raise ValueError(f"{runs[place].path} is given twice")
+            raise ValueError(f"{runs[place].path} is given twice; allowed: different runs")
     names = [path.name for path in paths]
     if len(set(names)) < len(names):
         names = [str(path) for path in paths]

@@ -1,4 +1,4 @@
-"""evaluate_run: how well the agents of a stored run play fresh worlds, beside the random policy."""
+"""evaluate_run: compares the agents of a stored run with the random policy in fresh worlds."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -8,13 +8,14 @@ from typing import Final
 
 import pyarrow as pa
 
-from cprl.evaluation.lanes import Played, Sitter, play, random_agents, seated
+from cprl.envs.unwrap import agent_names
+from cprl.evaluation.lanes import Played, Source, play, policies_of, random_policies
 from cprl.measuring.replicas import Measured, over_replicas, social_measures
 from cprl.runs.labelled import labelled
 from cprl.stored import LoadedRun, load
 
 SEED: Final = 30_011
-"""Of the fresh worlds; no training of ours uses it."""
+"""The default seed of fresh worlds; no training of ours uses it."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -25,9 +26,9 @@ class Evaluation:
     seed: int
     greedy: bool
     trained: Played
-    """By replica; those of number r in the worlds r x episodes and on."""
+    """The episodes by replica; replica r plays the worlds from r x episodes on."""
     random: Played
-    """The same worlds, every action equally likely at every seat."""
+    """The episodes of uniformly random agents in the same worlds."""
 
     def measures(self, policy: str = "trained") -> dict[str, Measured]:
         """The social metrics over replicas by name, then the agents' returns as `agent_0/return` and so on.
@@ -43,12 +44,12 @@ class Evaluation:
                     for replica, own in played.items()
                 }
             )
-            for agent, name in enumerate(self.run.game.agent_names)
+            for agent, name in enumerate(agent_names(self.run.env()))
         }
         return {**social_measures(played), **returns}
 
     def table(self) -> pa.Table:
-        """The episodes as `episodes.parquet` has them, behind a column "policy": "trained" or "random"."""
+        """The episodes with the columns of `episodes.parquet`, after "policy": "trained" or "random"."""
         return labelled(
             ({"policy": name}, replica, episodes)
             for name, played in (("trained", self.trained), ("random", self.random))
@@ -63,80 +64,77 @@ def evaluate_run(
     greedy: bool = False,
     seed: int = SEED,
     replicas: Sequence[int] = (),
+    allow: Sequence[str] = (),
 ) -> Evaluation:
-    """Lets every replica of a stored run play fresh episodes, and the random policy in the same worlds.
+    """Plays fresh episodes with every replica of a stored run, and with the random policy in the same worlds.
 
     Args:
-        run: its directory, its results, or what `cprl.load` gave. Of a run that has not ended the newest
-            checkpoint plays.
-        episodes: of each replica, each in a world of its own.
-        greedy: whether agents take the action that they hold best or likeliest; else those that learned
-            values explore with the run's `epsilon_evaluation` and those that learned a policy draw from it.
-            Scripted agents do what they do.
-        seed: of the worlds and of all chance; the same worlds and the same episodes every time.
-        replicas: the numbers of those that play; by default all. One plays the same alone as among others.
+        run: its directory, its exported results, or a value of `cprl.load`. For a run that has not ended, the
+            newest checkpoint is used.
+        episodes: episodes of each replica, each in its own world.
+        greedy: whether agents take the action with the highest value or probability; else agents with values
+            explore with the run's `epsilon_evaluation`, and agents with a policy sample from it. Scripted
+            agents are not affected.
+        seed: the seed of the worlds and of all random numbers; equal seeds give equal episodes.
+        replicas: the indices of the replicas that play; by default all. A replica's episodes do not depend on
+            the others.
+        allow: see `cprl.load`.
 
     Raises:
-        ValueError: for numbers out of range, replicas that were not kept, the seed of the training, or a run
-            that cannot be loaded, see `cprl.load`.
+        ValueError: if a number is out of range, a replica does not exist, the seed is that of the training,
+            or the run cannot be loaded, see `cprl.load`.
     """
-    loaded = opened(run)
+    loaded = opened(run, allow)
     check(episodes=episodes, seed=seed, runs=[loaded])
     numbers = chosen_replicas({str(loaded.path): loaded}, replicas)
-    game, sitters = loaded.game, [Sitter(loaded)] * loaded.game.agents
-    common = {"episodes": episodes, "seed": seed}
-    agents = partial(seated, sitters, worlds=episodes, seed=seed)
-    by_chance = partial(random_agents, game, worlds=episodes, seed=seed)
+    sources, common = [Source(loaded)] * loaded.game.agents, {"episodes": episodes, "seed": seed}
+    agents = partial(policies_of, sources, worlds=episodes, seed=seed)
+    by_chance = partial(random_policies, loaded, worlds=episodes, seed=seed)
     return Evaluation(
         run=loaded,
         seed=seed,
         greedy=greedy,
-        trained=play(game, agents, numbers, explore=not greedy, **common),
-        random=play(game, by_chance, numbers, explore=True, **common),
+        trained=play(loaded, agents, numbers, explore=not greedy, **common),
+        random=play(loaded, by_chance, numbers, explore=True, **common),
     )
 
 
-def opened(run: str | Path | LoadedRun) -> LoadedRun:
-    """A run, loaded if it is not."""
-    return run if isinstance(run, LoadedRun) else load(run)
-
-
-def kept_replicas(run: LoadedRun) -> list[int]:
-    """The numbers of a run's replicas, also where no agent of it learned."""
-    return run.replicas or list(range(int(run.recipe["arguments"].get("replicas", 1))))
+def opened(run: str | Path | LoadedRun, allow: Sequence[str] = ()) -> LoadedRun:
+    """A run, loaded if it is a directory."""
+    return run if isinstance(run, LoadedRun) else load(run, allow=allow)
 
 
 def chosen_replicas(runs: Mapping[str, LoadedRun], wanted: Sequence[int]) -> list[int]:
-    """The replicas wanted, or all that every run has, ascending.
+    """The chosen replicas, or all that every run has, ascending.
 
     Args:
-        runs: by name.
-        wanted: numbers; none for all.
+        runs: the runs by name.
+        wanted: the indices of the chosen replicas; empty for all.
 
     Raises:
-        ValueError: where a run does not have them, or the runs have none in common.
+        ValueError: if a run does not have them, or the runs have none in common.
     """
-    common = sorted(set.intersection(*(set(kept_replicas(run)) for run in runs.values())))
+    common = sorted(set.intersection(*(set(run.replicas) for run in runs.values())))
     for name, run in runs.items():
-        missing = sorted(set(wanted) - set(kept_replicas(run)))
+        missing = sorted(set(wanted) - set(run.replicas))
         if missing:
-            raise ValueError(f"{name} has no replicas {missing}; it has {kept_replicas(run)}")
+            raise ValueError(f"{name} has no replicas {missing}; allowed: {run.replicas}")
     if not common:
-        has = {name: kept_replicas(run) for name, run in runs.items()}
+        has = {name: run.replicas for name, run in runs.items()}
         raise ValueError(f"the runs have no replica in common: {has}")
     return sorted(set(wanted)) or common
 
 
 def check(*, episodes: int, seed: int, runs: Sequence[LoadedRun]) -> None:
-    """That there are episodes, and that the worlds are fresh to all agents.
+    """Checks that there are episodes, and that no agent was trained in the worlds.
 
     Raises:
-        ValueError: says what is wanted.
+        ValueError: names the value and what is allowed.
     """
     if episodes < 1:
-        raise ValueError(f"episodes is {episodes}; at least 1 is wanted")
+        raise ValueError(f"episodes is {episodes}; allowed: an integer >= 1")
     for run in runs:
-        if run.recipe["arguments"].get("seed") == seed:
+        if run.experiment.seed == seed:
             raise ValueError(
-                f"seed is {seed}, by which {run.path} was trained; with another its worlds are fresh"
+                f"seed is {seed}, the training seed of {run.path}; allowed: any other seed, for fresh worlds"
             )

@@ -1,47 +1,51 @@
-"""Replay: a stored policy plays again, and every step is recorded."""
+"""film: records an episode of the agents of a stored run, step by step."""
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 
-import torch
 from tensordict import TensorDictBase
-from torch import nn
 
 from cprl import keys
-from cprl.envs.commons_env import CommonsEnv
 from cprl.measuring.episodes import Episode
-from cprl.policies.assignment import AgentIndices
 from cprl.stored import load
-from cprl.training import Callback, train
+from cprl.training import train
 from cprl.viewer.callback import ViewerCallback
 
 SEED = 20_011
-"""Of the fresh worlds; no training of ours uses it."""
+"""The seed of fresh worlds; no training of ours uses it."""
 
 
-def replay(run: Path, out: Path | None = None, *, replica: int = 0, episode: int = 0) -> tuple[Path, Episode]:
-    """Lets the agents of a run play an episode in a fresh world, with `epsilon_evaluation`.
+def film(
+    run: Path,
+    out: Path | None = None,
+    *,
+    replica: int = 0,
+    episode: int = 0,
+    allow: Sequence[str] = (),
+) -> tuple[Path, Episode]:
+    """Records an episode of a run's agents in a fresh world, with the exploration of evaluation.
 
     Args:
-        run: its directory, or its results.
-        out: the recording to be; by default `replay-<replica>-<episode>.rrd` in the run's directory.
-        replica: whose agents.
-        episode: which of the fresh episodes; the same number plays the same again.
+        run: its directory, or its exported results.
+        out: the recording; by default `film-<replica>-<episode>.rrd` in the run's directory.
+        replica: the index of the agents' replica.
+        episode: the index of the fresh episode; equal indices give equal episodes.
+        allow: see `cprl.load`.
 
     Returns:
-        The recording, and how the episode went.
+        The recording, and the episode.
 
     Raises:
-        ValueError: for a run that cannot be loaded; see `cprl.load`.
-        FileExistsError: where the recording is there already.
+        ValueError: if the run cannot be loaded, see `cprl.load`.
+        FileExistsError: if the recording exists.
     """
     if episode < 0:
-        raise ValueError(f"episode is {episode}; at least 0 is wanted")
-    loaded = load(run)
-    target = out or run / f"replay-{replica}-{episode}.rrd"
-    env = CommonsEnv(loaded.game, 1, seed=SEED, first_world=episode)
-    torch.manual_seed(SEED + episode)  # TorchRL's exploration draws from torch's generator
-    actors: dict[AgentIndices, nn.Module] = dict(enumerate(loaded.policy(replica).actors))
+        raise ValueError(f"episode is {episode}; allowed: an integer >= 0")
+    loaded = load(run, allow=allow)
+    target = out or run / f"film-{replica}-{episode}.rrd"
+    env = loaded.env(1, seed=SEED, first_world=episode)
+    policies = loaded.policy(replica, seed=SEED + episode)
+    others = dict(zip(policies.indices, policies.actors, strict=True))
     title = f"{run.name}, agents of replica {replica}, fresh episode {episode}"
     target.parent.mkdir(parents=True, exist_ok=True)
     with ViewerCallback(
@@ -52,34 +56,34 @@ def replay(run: Path, out: Path | None = None, *, replica: int = 0, episode: int
         recipe=loaded.recipe,
         file_name=target.name,
         is_replay=True,
-    ) as watch:
-        teller = _Teller(watch)
-        callbacks: list[Callback] = [watch, teller]
-        train(env, {}, others=actors, episodes=1, callbacks=callbacks)
-    assert teller.episode is not None
-    return target, teller.episode
+    ) as viewer:
+        events = _Events(viewer)
+        train(env, {}, others=others, episodes=1, callbacks=[viewer, events])
+    assert events.episode is not None
+    return target, events.episode
 
 
-class _Teller:
-    """Tells every tag and how the episode ended, and keeps the episode."""
+class _Events:
+    """Logs every tag and the outcome of the episode, and stores the episode."""
 
-    def __init__(self, watch: ViewerCallback) -> None:
-        self.watch = watch
+    def __init__(self, viewer: ViewerCallback) -> None:
+        self.viewer = viewer
         self.episode: Episode | None = None
         self._step = 0
 
     def on_step(self, batch: TensorDictBase) -> None:
-        """Tells who was tagged by whom."""
+        """Logs who was tagged by whom."""
         self._step += 1
-        for tagged, by in batch["next"][keys.TAGGED_BY][0].nonzero().tolist():
-            self._tell(f"agent {tagged} is tagged out by agent {by}")
+        tagged_by = batch.get(("next", *keys.TAGGED_BY), None)
+        if tagged_by is not None:
+            for tagged, by in tagged_by[0].nonzero().tolist():
+                self._log(f"agent {tagged} is tagged out by agent {by}")
 
     def on_episode(self, episode: Episode, learning: Mapping[str, float]) -> None:
-        """Tells how it went."""
+        """Logs the outcome."""
         self.episode = episode
-        apples = ", ".join(f"{own:.0f}" for own in episode.harvest)
-        self._tell(f"the end after {episode.steps} steps; apples: {apples}; {episode.stock_left} left")
+        self._log(f"the end after {episode.steps} steps; {episode.outcome}")
 
-    def _tell(self, event: str) -> None:
-        self.watch.logger.at(step=self._step, episode=0)
-        self.watch.log_event(event)
+    def _log(self, event: str) -> None:
+        self.viewer.logger.at(step=self._step, episode=0)
+        self.viewer.log_event(event)

@@ -1,34 +1,39 @@
-"""Whether runs play the same game, and what differs where they do not."""
+"""Checks that runs have the same game, and names the differences."""
 
 from collections.abc import Mapping
 from dataclasses import fields
-from typing import Final
+from typing import Any, Final
+
+import torch
 
 from cprl.commons.game import Game
 from cprl.stored import LoadedRun
 
 _LONGEST: Final = 40
-"""Characters of a value that a message still tells."""
+"""The largest number of characters of a value in a message."""
 
 
 def check_same_game(runs: Mapping[str, LoadedRun]) -> None:
-    """That all runs, by name, play the game of the first.
+    """Checks that all runs, by name, have the game of the first.
 
     Raises:
-        ValueError: says what differs.
+        ValueError: names the differences.
     """
     first, *others = runs
     for other in others:
         found = differences(runs[first].game, runs[other].game)
+        found += transform_differences(runs[first], runs[other])
         if found:
             raise ValueError(
-                f"{first} and {other} are runs of unlike games: {'; '.join(found)}; "
-                "agents can visit each other in the same game alone"
+                f"{first} and {other} have different games: {'; '.join(found)}; allowed: runs of the same "
+                "game"
             )
 
 
-def differences(game: Game, other: Game) -> list[str]:
-    """The fields of map, rules and observation in which games differ, with their values where short."""
+def differences(game: Any, other: Any) -> list[str]:
+    """The fields of map, rules and observation in which games differ, with their values if they are short."""
+    if not (isinstance(game, Game) and isinstance(other, Game)):
+        return [] if game == other else [f"{game!r} and {other!r}"]
     found = []
     for mine, theirs in (
         (game.map, other.map),
@@ -38,7 +43,18 @@ def differences(game: Game, other: Game) -> list[str]:
         for field in fields(mine):
             one, two = getattr(mine, field.name), getattr(theirs, field.name)
             if one != two:
-                told = f"{one!r} beside {two!r}"
-                short = len(told) <= 2 * _LONGEST
-                found.append(f"{type(mine).__name__}.{field.name} {told if short else 'differ'}")
+                values = f"{one!r} and {two!r}"
+                short = len(values) <= 2 * _LONGEST
+                found.append(f"{type(mine).__name__}.{field.name} {values if short else 'differ'}")
     return found
+
+
+def transform_differences(run: LoadedRun, other: LoadedRun) -> list[str]:
+    """The differences between the transforms of two runs: their specification and their learned state."""
+    if run.experiment.transforms != other.experiment.transforms:
+        return [f"transforms {run.experiment.transforms} and {other.experiment.transforms}"]
+    mine, theirs = run.transforms_state, other.transforms_state
+    unlike = [
+        name for name in mine if not torch.equal(torch.as_tensor(mine[name]), torch.as_tensor(theirs[name]))
+    ]
+    return [f"the learned state of the transforms differs: {', '.join(unlike)}"] if unlike else []

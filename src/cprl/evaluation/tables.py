@@ -7,13 +7,13 @@ from rich.table import Table
 
 from cprl.evaluation.cross_play import CrossPlay
 from cprl.evaluation.evaluate import Evaluation
-from cprl.evaluation.lanes import Played
 from cprl.measuring.replicas import agents_without_harvest
+from cprl.measuring.reported import left_out
 from cprl.stored import LoadedRun
 
 
 def run_table(evaluation: Evaluation) -> Table:
-    """A row for each metric: mean over replicas and 95 % interval, of the run's agents and at random."""
+    """A row for each metric: mean over replicas and 95 % interval, of the run's agents and random agents."""
     replicas = len(evaluation.trained)
     episodes = len(next(iter(evaluation.trained.values())))
     table = Table(
@@ -26,65 +26,62 @@ def run_table(evaluation: Evaluation) -> Table:
     trained, random = evaluation.measures("trained"), evaluation.measures("random")
     for name, measured in trained.items():
         table.add_row(name, str(measured), str(random[name]))
-    table.add_row(
-        "agents without a harvest, not in sustainability",
-        _without_harvest(evaluation.trained),
-        _without_harvest(evaluation.random),
-    )
+    without = [agents_without_harvest(played) for played in (evaluation.trained, evaluation.random)]
+    if None not in without:
+        table.add_row(
+            "agents without a harvest, not in sustainability",
+            *(f"{own[0]} of {own[1]}" for own in without if own),
+        )
+    table.caption = left_out(next(iter(evaluation.trained.values()))[0].reported) or None
     return table
 
 
 def heading(played: CrossPlay) -> str:
-    """What the matrices are of."""
+    """The heading of the matrices."""
     how = how_they_play(list(played.runs.values()), played.greedy)
     return (
-        f"Cross-play: {len(played.replicas)} replicas, {played.episodes} episodes each with the visitor at "
-        f"every seat, seed {played.seed}{how}, diagonal: {played.diagonal}\n{_INTERVALS}"
+        f"Cross-play: {len(played.replicas)} replicas, {played.episodes} episodes each with focal agent at "
+        f"each index, seed {played.seed}{how}, diagonal: {played.diagonal}\n{_INTERVALS}"
     )
 
 
 def matrices(played: CrossPlay) -> Iterator[Table]:
-    """A matrix for each measure of the cells: rows visit, columns are the hosts."""
+    """A matrix for each metric: rows are the focal agent's run, columns the background agents' run."""
     cells = {at: cell.measures() for at, cell in played.cells.items()}
     for name in next(iter(cells.values())):
         if name == "collective_return":  # a reward is an apple: group/return says the same
             continue
         table = Table(title=name, title_justify="left")
-        table.add_column("visitor \\ hosts")
-        for hosts in played.runs:
-            table.add_column(hosts, justify="right")
-        for visitor in played.runs:
-            table.add_row(visitor, *(str(cells[visitor, hosts][name]) for hosts in played.runs))
+        table.add_column("focal \\ background")
+        for background in played.runs:
+            table.add_column(background, justify="right")
+        for focal in played.runs:
+            table.add_row(focal, *(str(cells[focal, background][name]) for background in played.runs))
         yield table
 
 
-def seats_table(played: CrossPlay) -> Table:
-    """The returns of each cell with the visitor at each seat."""
-    table = Table(title="returns by the visitor's seat", title_justify="left")
-    for heading in ("visitor", "hosts", "seat"):
+def agents_table(played: CrossPlay) -> Table:
+    """The returns of each cell by the index of the focal agent."""
+    table = Table(title="returns by the focal agent's index", title_justify="left")
+    for heading in ("focal", "background", "focal agent"):
         table.add_column(heading)
-    names = ("visitor/return", "hosts/return", "group/return")
+    names = ("focal/return", "background/return", "group/return")
     for name in names:
         table.add_column(name, justify="right")
-    for (visitor, hosts), cell in played.cells.items():
-        for agent in cell.visits:
+    for (focal, background), cell in played.cells.items():
+        for agent in cell.by_agent:
             measured = cell.measures(agent)
-            table.add_row(visitor, hosts, str(agent), *(str(measured[name]) for name in names))
+            table.add_row(focal, background, str(agent), *(str(measured[name]) for name in names))
     return table
 
 
 def how_they_play(runs: list[LoadedRun], greedy: bool) -> str:
-    """With what chance the agents that learned values explore, for people."""
+    """The epsilon of the agents that learned values, as text."""
     if greedy:
         return ", greedy"
-    learned = [run.agent(agent, replica=run.replicas[0]) for run in runs for agent in run.algorithms]
-    chances = {epsilon for _, stochastic, epsilon in learned if not stochastic}
+    agents = [run.agent(agent, replica=run.replicas[0]) for run in runs for agent in range(run.game.agents)]
+    chances = {agent.kind[2] for agent in agents if agent.kind[0] == "trained" and not agent.kind[1]}
     return "".join(f", epsilon {chance:g}" for chance in sorted(chances))
-
-
-def _without_harvest(played: Played) -> str:
-    none, all_agents = agents_without_harvest(played)
-    return f"{none} of {all_agents}"
 
 
 _INTERVALS: Final = "mean over replicas [95 % bootstrap interval]"

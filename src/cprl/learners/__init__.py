@@ -1,1 +1,16 @@
-"""How agents learn, many at once."""
+"""How agents learn, many at once.
+
+Modules, in the order in which one reads them:
+    settings     the hyper-parameters, with their units and sources
+    base         what the training loop asks of a learner
+    transitions  the turns of some agents, as replay and rollouts store them
+    lanes        a lane is one agent of one replica: seeds, networks, actors
+    teams        the same where a lane is a team
+    replay       ReplayLearner: learns from a replay buffer
+    rollouts     RolloutLearner: learns from rollouts of the present policy
+    tabular      TabularLearner: Q-learning in tables
+    single       the network and the loss of one DQN agent
+    engine/      one update of all lanes: as a list of losses, vmapped, or with a lane axis; compiled
+    buffer/      the storage and the sampler of the replay buffer of all lanes
+    torchrl/     the same agents by stock TorchRL parts, one after the other
+"""

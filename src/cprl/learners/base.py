@@ -1,105 +1,59 @@
-"""Who learns: what the training loop wants of a learner, and a plain agent as one."""
+"""The interface between the training loop and a learner."""
 
 from collections.abc import Mapping
 from math import nan
-from typing import Any, Final, Protocol
+from typing import Any, Protocol
 
 import numpy as np
 import torch
 from tensordict import TensorDictBase
-from torch import Tensor
-
-from cprl.learners.single import DQNLearner
-from cprl.learners.transitions import seen_next, transitions_of
-from cprl.policies.assignment import AgentIndices, agent_indices
-
-_NO_STATE: Final = (
-    "a DQNLearner keeps no state to go on from; use a ReplayLearner, or train without checkpoints"
-)
+from torch import Tensor, nn
 
 
 class Learner(Protocol):
-    """Who learns at some seats of each replica, as `ReplayLearner` does."""
+    """Learns for S agents of each of R replicas; `ReplayLearner` is one."""
 
     actor: Any
-    """Chooses at these seats; its `epsilon` is told to observers."""
+    """Chooses the actions of these agents; callbacks get its `epsilon`."""
     agents: tuple[int, ...]
+    """The indices of the agents."""
     replicas: int
+    """The number of replicas R."""
+    settings: Any
+    """The hyperparameters."""
 
     def store(self, batch: TensorDictBase) -> None:
-        """Stores a turn of every replica."""
+        """Stores one step of every replica; the batch size is [R]."""
 
     def update(self) -> Tensor | None:
-        """One update; losses [R, S], or None while too little is stored."""
+        """Updates every agent once; returns the losses [R, S], or None if too little is stored."""
 
     def end_episode(self, ended: Tensor) -> None:
-        """An episode of the marked replicas has ended, bool [R]."""
+        """Called after an episode has ended in the marked replicas, bool [R]."""
 
     def values(self, batch: TensorDictBase) -> Tensor:
-        """What each agent expects at best from the turn's end on, [R, S]; for people to look at."""
+        """Each agent's estimate of the value of the state after the turn, [R, S]; for display only."""
+
+    def evaluation_actor(self, worlds: int) -> Any:
+        """An actor with the current weights and the exploration of evaluation, for `worlds` worlds of each
+        replica."""
+
+    def networks(self) -> dict[str, nn.Module]:
+        """A copy of each agent's current acting network, by "replica_0/agent_0" and so on."""
 
     def state_dict(self) -> dict[str, Any]:
-        """Everything that its future depends on."""
+        """The full state: training continues from it exactly."""
 
     def load_state_dict(self, state: Mapping[str, Any]) -> None:
-        """Goes on where the learner of that state was."""
-
-
-class OneAgent:
-    """A plain `DQNLearner` as a `Learner`: one agent of one replica.
-
-    Args:
-        learner: the agent.
-        agent: its number.
-    """
-
-    replicas = 1
-
-    def __init__(self, learner: DQNLearner, agent: int) -> None:
-        self.learner, self.actor = learner, learner.actor
-        self.agents: tuple[int, ...] = (agent,)
-
-    def store(self, batch: TensorDictBase) -> None:
-        """See `Learner`."""
-        self.learner.store(transitions_of(self.agents[0], batch))
-
-    def update(self) -> Tensor | None:
-        """See `Learner`."""
-        loss = self.learner.update()
-        return None if loss is None else torch.tensor([[loss]])
-
-    def end_episode(self, ended: Tensor) -> None:
-        """See `Learner`."""
-        self.learner.end_episode()
-
-    def values(self, batch: TensorDictBase) -> Tensor:
-        """See `Learner`."""
-        with torch.no_grad():
-            highest: Tensor = self.learner.network(seen_next(batch)[:, list(self.agents)]).amax(-1)
-        return highest
-
-    def state_dict(self) -> dict[str, Any]:
-        """A plain agent cannot go on from a checkpoint; `ReplayLearner` can."""
-        raise ValueError(_NO_STATE)
-
-    def load_state_dict(self, state: Mapping[str, Any]) -> None:
-        """See `state_dict`."""
-        raise ValueError(_NO_STATE)
-
-
-def seated(learner: Learner | DQNLearner, agent: AgentIndices) -> Learner:
-    """What sits there as a `Learner`."""
-    if isinstance(learner, DQNLearner):
-        return OneAgent(learner, agent_indices(agent)[0])
-    return learner
+        """Continues from a state that `state_dict` returned."""
 
 
 class LaneLosses:
-    """The losses of the agents at some seats since each replica's last episode ended.
+    """Mean losses of S agents since the end of each replica's last episode.
 
     Args:
-        replicas: how many replicas R.
-        agents: their numbers.
+        replicas: the number of replicas R.
+        agents: the indices of the agents.
     """
 
     def __init__(self, replicas: int, agents: tuple[int, ...]) -> None:
@@ -108,22 +62,22 @@ class LaneLosses:
         self.updates = np.zeros(replicas, np.int64)
 
     def add(self, loss: Tensor | None) -> None:
-        """Takes the losses of an update, [R, S]; None for no update."""
+        """Adds the losses of an update, [R, S]; None if there was no update."""
         if loss is not None:
             self.total += loss.numpy(force=True)
             self.updates += 1
 
     def take(self, replica: int) -> dict[int, float]:
-        """The mean loss of each agent of a replica, NaN before its first update; starts it anew."""
+        """Returns the mean loss of each agent of a replica, NaN without an update, and resets the replica."""
         updates = self.updates[replica]
         means = (self.total[replica] / updates).tolist() if updates else [nan] * len(self.agents)
         self.total[replica], self.updates[replica] = 0.0, 0
         return dict(zip(self.agents, means, strict=True))
 
     def state_dict(self) -> dict[str, Tensor]:
-        """What was summed so far."""
+        """The sums so far."""
         return {"total": torch.tensor(self.total), "updates": torch.tensor(self.updates)}
 
     def load_state_dict(self, state: Mapping[str, Tensor]) -> None:
-        """Goes on with the sums of that state."""
+        """Continues from the sums of a state."""
         self.total[:], self.updates[:] = state["total"].numpy(), state["updates"].numpy()

@@ -1,4 +1,4 @@
-"""ReplayLearner: independent agents at some seats of every replica, learning from replay in one step."""
+"""ReplayLearner: independent agents that learn from replay, all of them in one update."""
 
 from collections.abc import Callable, Mapping, Sequence
 from copy import deepcopy
@@ -9,51 +9,55 @@ import torch
 from tensordict import TensorDictBase
 from torch import Tensor, nn
 
-from cprl.commons.game import Game
-from cprl.learners.buffer.sampler import lane_buffer
+from cprl.learners.buffer.gather import Horizon
+from cprl.learners.buffer.sampler import lane_buffer, transformed
+from cprl.learners.engine.base import Engine
 from cprl.learners.engine.choice import TRIAL_LANES, EngineName, make_engine, trial_batch
-from cprl.learners.engine.functional import MakeLoss, refuse_on_policy
-from cprl.learners.lanes import SAMPLING, TARGET_WEIGHTS, WEIGHTS, Lanes
+from cprl.learners.engine.functional import MakeLoss
+from cprl.learners.engine.refusals import refuse_for_replay
+from cprl.learners.lanes import SAMPLING, TARGET_WEIGHTS, WEIGHTS
 from cprl.learners.settings import DQNSettings
 from cprl.learners.single import dqn_loss, q_network
-from cprl.learners.teams import MakeTeam, Teams
+from cprl.learners.teams import MakeTeam, lanes_of
 from cprl.learners.transitions import RewardKind
 from cprl.policies.lanes import LaneActor
+from cprl.spaces import Spaces
 
 
 class ReplayLearner:
-    """R x S independent agents, DQN by default: seats S of each of R replicas.
+    """R x S independent agents, DQN by default: S agents of each of R replicas.
 
-    A lane has its own network, target, optimiser state, replay buffer, and randomness; its course is the
-    one it would take alone. Learns through TorchRL's loss and replay buffer, see `cprl.learners.engine.base`.
+    Each lane has its own network, target network, optimiser state, replay buffer and random numbers, and
+    learns exactly as it would alone. The loss and the replay buffer are TorchRL's, see
+    `cprl.learners.engine.base`.
 
     Args:
-        game: what is played.
-        agents: the numbers of the agents that learn.
-        replicas: how many replicas R, the worlds of the environment.
-        settings: the hyper-parameters.
-        seed: of the run.
-        first_replica: the number of the first replica, so that replica r can be trained alone.
-        make_network: a lane's network; by default `MLPNetwork` by the settings. It draws its weights from
-            torch's generator, which is seeded for each lane.
-        make_loss: a lane's loss out of its network; by default `dqn_loss`.
-        make_team: where agents learn as a team: its networks out of its members', see
-            `cprl.algorithms.teams`; a lane is then all agents of a replica.
-        stochastic: whether networks give the logits of a policy, from which agents that explore draw their
-            actions, else values; then `epsilon` of the settings is none.
-        reward_kind: what they are paid.
-        engine: how lanes are updated; by default the fastest that fits, see `cprl.learners.engine.choice`.
-        compile: whether acting and the update are compiled, for the first two ways.
-        device: where they learn.
+        spaces: the shape and dtype of observations, and the number of actions A.
+        agents: the indices of the agents that learn.
+        replicas: the number of replicas R; each is one world of the environment.
+        settings: the hyperparameters.
+        seed: the seed of the run.
+        first_replica: the index of the first replica, so that replica r can be trained alone.
+        make_network: makes a lane's network; by default an `MLPNetwork` with the settings. It draws weights
+            from torch's generator, which is seeded for each lane.
+        make_loss: makes a lane's loss from its network; by default `dqn_loss`.
+        make_team: for agents that learn as a team: makes the team's networks from those of its members, see
+            `cprl.algorithms.teams`; a lane is then the team of a replica.
+        stochastic: whether networks output the logits of a policy from which actions are sampled, with no
+            epsilon; else action values, with `epsilon` of the settings.
+        reward_kind: which reward they get.
+        engine: how lanes are updated; None picks the fastest that works, see `cprl.learners.engine.choice`.
+        compile: whether torch compiles acting and the update; the engine "list" is never compiled.
+        device: the torch device of networks, buffers and updates.
 
     Raises:
-        ValueError: for a loss that wants what the present policy has just done; see
-            `cprl.learners.rollouts`; for a team that is not paid for the group.
+        ValueError: for a loss that needs the latest steps of the current policy (see
+            `cprl.learners.rollouts`), and for a team without the team reward.
     """
 
     def __init__(
         self,
-        game: Game,
+        spaces: Spaces,
         *,
         agents: Sequence[int],
         replicas: int,
@@ -64,92 +68,115 @@ class ReplayLearner:
         make_loss: MakeLoss | None = None,
         make_team: MakeTeam | None = None,
         stochastic: bool = False,
-        reward_kind: RewardKind = "own",
+        reward_kind: RewardKind = "individual",
         engine: EngineName | None = None,
         compile: bool = True,
         device: str | torch.device = "cpu",
     ) -> None:
-        _refuse_what_does_not_fit(settings, is_team=make_team is not None, reward_kind=reward_kind)
-        self.game, self.settings, self.agents = game, settings, tuple(agents)
+        _refuse_unshared_reward(is_team=make_team is not None, reward_kind=reward_kind)
+        self.spaces, self.settings, self.agents = spaces, settings, tuple(agents)
         self.replicas, self.seed, self.reward_kind = replicas, seed, reward_kind
-        actions, shape = len(game.actions), game.observation_shape
-        make_loss = make_loss or partial(dqn_loss, gamma=settings.gamma)
-        lanes = Lanes(
-            game,
+        self._lanes = lanes_of(
+            spaces,
             agents=agents,
             replicas=replicas,
             seed=seed,
             first_replica=first_replica,
-            make_network=make_network
-            or partial(q_network, shape, actions, settings=settings, highest=game.observation.highest),
+            make_network=make_network or partial(_default_network, spaces, settings),
+            make_team=make_team,
             stochastic=stochastic,
         )
-        self._lanes: Lanes | Teams = Teams(lanes, make_team) if make_team else lanes
-        networks = self._lanes.new_networks(WEIGHTS, device)
-        refuse_on_policy(make_loss(deepcopy(networks[0])))
-        shapes = {
+        make_loss = make_loss or partial(dqn_loss, gamma=settings.gamma)
+        self._shapes: dict[str, Any] = {
             "observation_shape": self._lanes.observation_shape,
             "action_shape": self._lanes.action_shape,
+            "observation_dtype": spaces.observation_dtype,
+            "horizon": Horizon(settings.n_steps, settings.gamma) if settings.n_steps > 1 else None,
+            "device": device,
         }
-        own_targets = settings.own_target_weights
-        self.engine = make_engine(
-            engine,
-            networks,
-            make_loss,
-            target_networks=self._lanes.new_networks(TARGET_WEIGHTS, device) if own_targets else None,
-            learning_rate=settings.learning_rate,
-            adam_eps=settings.adam_eps,
-            loss_share=1 / actions if settings.mean_over_all_outputs else 1.0,
-            compile=compile,
-            trial=trial_batch(min(self.lanes, TRIAL_LANES), actions=actions, **shapes, device=device),
-        )
+        self.engine = self._make_engine(engine, make_loss, compile=compile)
         self.buffer = lane_buffer(
             seeds=self._lanes.seeds(SAMPLING),
             transitions=settings.buffer_size,
             batch_size=settings.batch_size,
-            **shapes,
-            device=device,
+            **self._shapes,
         )
+        for transform in settings.replay_transforms:
+            self.buffer.append_transform(transform.make())
         self.actor = self._lanes.actor(self.engine, compile=compile)
         self.steps = 0
         self.actor.epsilon = settings.epsilon(0)
         self._episodes = torch.zeros(replicas, dtype=torch.int64)
 
+    def _make_engine(self, name: EngineName | None, make_loss: MakeLoss, *, compile: bool) -> Engine:
+        """The engine of all lanes, with new networks."""
+        settings, device = self.settings, self._shapes["device"]
+        actions, own_targets = self.spaces.actions, settings.own_target_weights
+        networks = self._lanes.new_networks(WEIGHTS, device)
+        trial = trial_batch(min(self.lanes, TRIAL_LANES), actions=actions, **self._shapes)
+        trial = transformed(trial, settings.replay_transforms)
+        refuse_for_replay(make_loss(deepcopy(networks[0])), settings, trial[0])
+        return make_engine(
+            name,
+            networks,
+            make_loss,
+            target_networks=self._lanes.new_networks(TARGET_WEIGHTS, device) if own_targets else None,
+            optimizer=settings.optimizer,
+            learning_rate=settings.learning_rate,
+            adam_eps=settings.adam_eps,
+            tau=settings.tau,
+            loss_share=1 / actions if settings.mean_over_all_outputs else 1.0,
+            compile=compile,
+            trial=trial,
+        )
+
     @property
     def lanes(self) -> int:
-        """The number of lanes, replicas x seats, or of teams."""
+        """The number of lanes L = R x S, or of teams, R."""
         return len(self._lanes)
 
     def evaluation_actor(self, worlds: int) -> LaneActor:
-        """An actor by the present weights, with `epsilon_evaluation`, for so many worlds of each replica."""
+        """An actor with the current weights and `epsilon_evaluation`, for `worlds` worlds of each replica."""
         return self._lanes.evaluation_actor(self.engine, worlds, epsilon=self.settings.epsilon_evaluation)
 
     def networks(self) -> dict[str, nn.Module]:
-        """A copy of every lane's acting network as it is now, by "replica_0/agent_0" and so on."""
+        """A copy of each lane's current acting network, by "replica_0/agent_0" and so on."""
         return self._lanes.networks(self.engine)
 
     def store(self, batch: TensorDictBase) -> None:
-        """Stores a turn of every replica, as the collector yields it."""
-        self.buffer.storage.write(self._lanes.turn(batch, self.reward_kind))
+        """Stores one step of every replica, as the collector yields it."""
+        self.buffer.write(self._lanes.turn(batch, self.reward_kind))
         self.steps += 1
         self.actor.explore_with(self.settings.epsilon(self.steps))
 
     def update(self) -> Tensor | None:
-        """One update of every lane; their losses [R, S], or None while too little is stored."""
+        """Updates every lane `updates_per_step` times; returns the mean losses [R, S], or None while fewer
+        than `learning_starts` transitions are stored."""
         if self.steps < self.settings.learning_starts:
             return None
-        return self._lanes.by_agent(self.engine.update(self.buffer))
+        losses = self.engine.update(self.buffer)
+        if self.settings.updates_per_step > 1:
+            others = [self.engine.update(self.buffer) for _ in range(self.settings.updates_per_step - 1)]
+            losses = torch.stack([losses, *others]).mean(0)
+        return self._lanes.by_agent(losses)
 
     def end_episode(self, ended: Tensor) -> None:
-        """Counts an episode of the marked replicas, bool [R]; targets are replaced after every so many."""
+        """Counts an episode of the marked replicas, bool [R].
+
+        Every `target_every_episodes` episodes the weights of a replica are copied to its targets.
+
+        With `tau` they move after every update instead.
+        """
         self._episodes += ended
+        if self.settings.tau is not None:
+            return
         due = ended & (self._episodes % self.settings.target_every_episodes == 0)
         if due.any():
             self.engine.copy_to_targets(due.repeat_interleave(self._lanes.of_replica))
 
     def values(self, batch: TensorDictBase) -> Tensor:
-        """The highest value of each agent's actions at the end of a turn, [R, S]; NaN where its network gives
-        a policy."""
+        """The highest action value of each agent at the end of a turn, [R, S]; NaN where its network
+        outputs a policy."""
         if self._lanes.stochastic:
             return torch.full((self.replicas, len(self.agents)), torch.nan)
         with torch.no_grad():
@@ -157,11 +184,13 @@ class ReplayLearner:
         return highest.view(self.replicas, len(self.agents))
 
     def state_dict(self) -> dict[str, Any]:
-        """Everything that the future of all lanes depends on; own tensors, not copies.
+        """The full state of all lanes; the tensors themselves, not copies.
 
-        "networks" besides, which says the same as "update" in a form that `cprl.load` reads.
+        The entry "networks" repeats the weights of "update" in the form that `cprl.load` reads.
         """
+        transforms = {"transforms": self.buffer.transform.state_dict()} if self.buffer.has_transforms else {}
         return {
+            **transforms,
             "networks": self._lanes.states(self.engine),
             "update": self.engine.state_dict(),
             "storage": self.buffer.storage.state_dict(),
@@ -172,23 +201,24 @@ class ReplayLearner:
         }
 
     def load_state_dict(self, state: Mapping[str, Any]) -> None:
-        """Goes on where the learner of that state was, which was made with the same arguments."""
+        """Continues from the state of a learner made with the same arguments."""
         self.engine.load_state_dict(state["update"])
         self.buffer.storage.load_state_dict(state["storage"])
         self.buffer.sampler.load_state_dict(state["sampler"])
+        if self.buffer.has_transforms:
+            self.buffer.transform.load_state_dict(state["transforms"])
         self.actor.rng.load_state_dict(state["exploration"])
         self.steps = int(state["steps"])
         self.actor.epsilon = self.settings.epsilon(self.steps)
         self._episodes = state["episodes"].clone()
 
 
-def _refuse_what_does_not_fit(settings: DQNSettings, *, is_team: bool, reward_kind: RewardKind) -> None:
-    if settings.priority_alpha:
-        raise ValueError(
-            f"priority_alpha is {settings.priority_alpha}; lanes sample uniformly, 0 is what fits, or a "
-            "plain DQNLearner for each agent"
-        )
-    if is_team and reward_kind != "group":
-        raise ValueError(
-            f'paid is "{reward_kind}"; a team that learns from replay shares one reward, "group"'
-        )
+def _refuse_unshared_reward(*, is_team: bool, reward_kind: RewardKind) -> None:
+    if is_team and reward_kind != "team":
+        raise ValueError(f'reward is "{reward_kind}"; allowed for a team that learns from replay: "team"')
+
+
+def _default_network(spaces: Spaces, settings: DQNSettings) -> nn.Module:
+    return q_network(
+        spaces.observation_shape, spaces.actions, settings=settings, highest=spaces.observation_scale
+    )

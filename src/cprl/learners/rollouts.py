@@ -1,60 +1,64 @@
-"""RolloutLearner: independent on-policy agents at some seats of every replica."""
+"""RolloutLearner: independent on-policy agents, all of them in one update."""
 
 from collections.abc import Callable, Mapping, Sequence
+from copy import deepcopy
 from typing import Any, Final
 
+import numpy as np
 import torch
 from tensordict import TensorDict, TensorDictBase
 from torch import Tensor, nn
 from torchrl.objectives.value.functional import generalized_advantage_estimate
 
-from cprl.commons.game import Game
+from cprl.learners.buffer.storage import torch_dtype
+from cprl.learners.engine.base import Engine
 from cprl.learners.engine.choice import TRIAL_LANES, EngineName, make_engine, trial_batch
 from cprl.learners.engine.functional import MakeLoss
-from cprl.learners.lanes import SAMPLING, WEIGHTS, Lanes
+from cprl.learners.engine.refusals import reads, refuse_other_advantages
+from cprl.learners.lanes import SAMPLING, WEIGHTS
 from cprl.learners.settings import RolloutSettings
-from cprl.learners.teams import MakeTeam, Teams
+from cprl.learners.teams import MakeTeam, lanes_of
 from cprl.learners.transitions import RewardKind
 from cprl.networks.agent import AgentNetworks, parts_of
 from cprl.policies.lanes import LaneActor
 from cprl.policies.rng import LaneRng
+from cprl.spaces import Spaces
 
 ACTOR, CRITIC = range(2)
-"""Which of an agent's networks is which."""
+"""Positions of the actor and the critic among an agent's networks."""
 
 _SMALL: Final = 1e-8
 
 
 class RolloutLearner:
-    """R x S independent agents that learn from what their present policies have just done.
+    """R x S independent agents that learn from the latest steps of their current policies.
 
-    Every `rollout_steps` steps TorchRL's generalised advantage estimate is made of them, and the loss is
-    taken `epochs` times over them in minibatches, drawn anew by each lane for itself. A lane's course is the
-    one it would take alone.
+    After every `rollout_steps` steps the learner estimates advantages with TorchRL's GAE and updates for
+    `epochs` epochs. Each lane shuffles its own minibatches, and learns exactly as it would alone.
 
     Args:
-        game: what is played.
-        agents: the numbers of the agents that learn.
-        replicas: how many replicas R, the worlds of the environment.
-        settings: the hyper-parameters.
-        make_network: an agent's "actor" and "critic", see `cprl.algorithms.on_policy`.
-        make_loss: an agent's loss out of them.
-        make_team: where agents learn as a team: its "actor" and "critic" out of its members' networks, see
-            `cprl.algorithms.teams`; a lane is then all seats of a replica.
-        seed: of the run.
-        first_replica: the number of the first replica, so that replica r can be trained alone.
-        reward_kind: what they are paid.
-        engine: how lanes are updated; by default the fastest that fits, see `cprl.learners.engine.choice`.
-        compile: whether acting and the update are compiled.
-        device: where they learn.
+        spaces: the shape and dtype of observations, and the number of actions A.
+        agents: the indices of the agents that learn.
+        replicas: the number of replicas R; each is one world of the environment.
+        settings: the hyperparameters.
+        make_network: makes an agent's "actor" and "critic", see `cprl.algorithms.on_policy`.
+        make_loss: makes an agent's loss from them.
+        make_team: for agents that learn as a team: makes its "actor" and "critic" from the networks of its
+            members, see `cprl.algorithms.teams`; a lane is then the team of a replica.
+        seed: the seed of the run.
+        first_replica: the index of the first replica, so that replica r can be trained alone.
+        reward_kind: which reward they get.
+        engine: how lanes are updated; None picks the fastest that works, see `cprl.learners.engine.choice`.
+        compile: whether torch compiles acting and the update; the engine "list" is never compiled.
+        device: the torch device of networks, buffers and updates.
 
     Raises:
-        ValueError: for networks that are not an actor and a critic.
+        ValueError: if the networks are not "actor" and "critic".
     """
 
     def __init__(
         self,
-        game: Game,
+        spaces: Spaces,
         *,
         agents: Sequence[int],
         replicas: int,
@@ -64,65 +68,80 @@ class RolloutLearner:
         make_team: MakeTeam | None = None,
         seed: int = 0,
         first_replica: int = 0,
-        reward_kind: RewardKind = "own",
+        reward_kind: RewardKind = "individual",
         engine: EngineName | None = None,
         compile: bool = True,
         device: str | torch.device = "cpu",
     ) -> None:
-        self.game, self.settings, self.agents = game, settings, tuple(agents)
+        self.spaces, self.settings, self.agents = spaces, settings, tuple(agents)
         self.replicas, self.seed, self.reward_kind = replicas, seed, reward_kind
-        lanes = Lanes(
-            game,
+        self._lanes = lanes_of(
+            spaces,
             agents=agents,
             replicas=replicas,
             seed=seed,
             first_replica=first_replica,
             make_network=make_network,
+            make_team=make_team,
             stochastic=True,
         )
-        self._lanes: Lanes | Teams = Teams(lanes, make_team) if make_team else lanes
+        self.engine = self._make_engine(engine, make_loss, compile=compile, device=device)
+        self.actor = self._lanes.actor(self.engine, compile=compile)
+        self.rng = LaneRng(self._lanes.seeds(SAMPLING), settings.rollout_steps)
+        self._rollout = self._allocate(torch.device(device))
+        name = spaces.observation_dtype
+        self._dtypes: tuple[Any, ...] = (np.dtype(name), torch_dtype(name))
+        self._size = 0
+        self.steps = 0
+
+    def _make_engine(
+        self, name: EngineName | None, make_loss: MakeLoss, *, compile: bool, device: str | torch.device
+    ) -> Engine:
+        """The engine of all lanes, with new networks."""
+        settings = self.settings
         networks = self._lanes.new_networks(WEIGHTS, device)
         _refuse_other_parts(networks[0])
+        loss = make_loss(deepcopy(networks[0]))
+        refuse_other_advantages(loss, settings)
+        self._reads_logits = reads(loss, "logits")
         trial = trial_batch(
             min(self.lanes, TRIAL_LANES),
             self._lanes.observation_shape,
-            len(game.actions),
+            self.spaces.actions,
             action_shape=self._lanes.action_shape,
+            observation_dtype=self.spaces.observation_dtype,
             device=device,
         )
-        self.engine = make_engine(
-            engine,
+        return make_engine(
+            name,
             networks,
             make_loss,
+            optimizer=settings.optimizer,
             learning_rate=settings.learning_rate,
             adam_eps=settings.adam_eps,
             max_grad_norm=settings.max_grad_norm,
             compile=compile,
-            trial=trial_rollout(trial),
+            trial=trial_rollout(trial, actions=self.spaces.actions if self._reads_logits else None),
         )
-        self.actor = self._lanes.actor(self.engine, compile=compile)
-        self.rng = LaneRng(self._lanes.seeds(SAMPLING), settings.rollout_steps)
-        self._rollout = self._room(torch.device(device))
-        self._size = 0
-        self.steps = 0
 
     @property
     def lanes(self) -> int:
-        """The number of lanes, replicas x seats, or of teams."""
+        """The number of lanes L = R x S, or of teams, R."""
         return len(self._lanes)
 
     @property
     def rollout_steps(self) -> int:
-        """Steps of a rollout."""
+        """The length of a rollout, in steps."""
         return self.settings.rollout_steps
 
-    def _room(self, device: torch.device) -> dict[str, Tensor]:
-        """Memory for a rollout, [T, L, ...] each."""
+    def _allocate(self, device: torch.device) -> dict[str, Tensor]:
+        """Tensors for a rollout, zeros [T, L, ...] each."""
         size, shape = (self.rollout_steps, self.lanes), self._lanes.observation_shape
+        dtype = torch_dtype(self.spaces.observation_dtype)
         forms: dict[str, tuple[tuple[int, ...], torch.dtype]] = {
-            "observation": (shape, torch.uint8),
+            "observation": (shape, dtype),
             "action": (self._lanes.action_shape, torch.int64),
-            "next_observation": (shape, torch.uint8),
+            "next_observation": (shape, dtype),
             "reward": (self._lanes.action_shape, torch.float32),
             "done": ((), torch.bool),
             "terminated": ((), torch.bool),
@@ -133,30 +152,39 @@ class RolloutLearner:
         }
 
     def evaluation_actor(self, worlds: int) -> LaneActor:
-        """An actor by the present weights, for so many worlds of each replica."""
+        """An actor with the current weights, for `worlds` worlds of each replica."""
         return self._lanes.evaluation_actor(self.engine, worlds, epsilon=0.0)
 
     def networks(self) -> dict[str, nn.Module]:
-        """A copy of every lane's acting network as it is now, by "replica_0/agent_0" and so on."""
+        """A copy of each lane's current acting network, by "replica_0/agent_0" and so on."""
         return self._lanes.networks(self.engine)
 
     def store(self, batch: TensorDictBase) -> None:
-        """Takes a turn of every replica, as the collector yields it.
+        """Stores one step of every replica, as the collector yields it.
 
         Raises:
-            ValueError: where the rollout is full: agents learn after each step, or a number of steps that
-                divides `rollout_steps`.
+            ValueError: if the rollout is full: call `update` after each step, or after a number of steps that
+                divides `rollout_steps`; and if the dtype of observations is not that of the spaces.
         """
         if self._size == self.rollout_steps:
-            raise ValueError(f"a rollout has {self.rollout_steps} steps; learn from it before the next")
+            raise ValueError(
+                f"the rollout already has {self.rollout_steps} steps; call update() before store()"
+            )
         turn = self._lanes.rollout_turn(batch, self.reward_kind)
-        for name, room in self._rollout.items():
-            room[self._size] = torch.as_tensor(getattr(turn, name))
+        for seen in (turn.observation, turn.next_observation):
+            if seen.dtype not in self._dtypes:
+                raise ValueError(
+                    f"observations are {seen.dtype}; allowed: {self.spaces.observation_dtype}, from "
+                    "Spaces.observation_dtype: make the learner with the Spaces of the transformed "
+                    "environment"
+                )
+        for name, field in self._rollout.items():
+            field[self._size] = torch.as_tensor(getattr(turn, name))
         self._size += 1
         self.steps += 1
 
     def update(self) -> Tensor | None:
-        """All epochs over a full rollout; the mean losses [R, S], or None while it is not full."""
+        """Runs all epochs over a full rollout; returns the mean losses [R, S], or None if it is not full."""
         if self._size < self.rollout_steps:
             return None
         batch, size = self._batch(), self.settings.minibatch_size
@@ -171,10 +199,12 @@ class RolloutLearner:
         return self._lanes.by_agent(torch.stack(losses).mean(0))
 
     def _batch(self) -> TensorDict:
-        """The rollout with advantages, [L, T], as TorchRL's losses read it; normalised within each lane."""
+        """The rollout with advantages, [L, T], under the keys of TorchRL's losses; advantages are normalised
+        within each lane if the settings say so."""
         columns = {name: room.transpose(0, 1) for name, room in self._rollout.items()}
         with torch.no_grad():
-            chances = self.engine.outputs(columns["observation"], part=ACTOR).log_softmax(-1)
+            logits = self.engine.outputs(columns["observation"], part=ACTOR)
+            chances = logits.log_softmax(-1)
             value = self.engine.outputs(columns["observation"], part=CRITIC)
             advantage, target = generalized_advantage_estimate(
                 self.settings.gamma,
@@ -197,23 +227,24 @@ class RolloutLearner:
                 "advantage": advantage,
                 "value_target": target,
                 "state_value": value,
+                **({"logits": logits} if self._reads_logits else {}),
             },
             [self.lanes, self.rollout_steps],
         )
 
     def end_episode(self, ended: Tensor) -> None:
-        """Nothing: rollouts go on over the ends of episodes, which cut them."""
+        """Does nothing: a rollout continues into the next episode; advantages do not cross the boundary."""
 
     def values(self, batch: TensorDictBase) -> Tensor:
-        """What each agent's critic expects from the end of a turn on, [R, S]."""
+        """The value that each agent's critic gives to the state after a turn, [R, S]."""
         with torch.no_grad():
             expected = self.engine.outputs(self._lanes.seen_next(batch), part=CRITIC)
         return expected.reshape(self.replicas, len(self.agents))
 
     def state_dict(self) -> dict[str, Any]:
-        """Everything that the future of all lanes depends on; own tensors, not copies.
+        """The full state of all lanes; the tensors themselves, not copies.
 
-        "networks" besides, which says the same as "update" in a form that `cprl.load` reads.
+        The entry "networks" repeats the weights of "update" in the form that `cprl.load` reads.
         """
         return {
             "networks": self._lanes.states(self.engine),
@@ -226,18 +257,18 @@ class RolloutLearner:
         }
 
     def load_state_dict(self, state: Mapping[str, Any]) -> None:
-        """Goes on where the learner of that state was, which was made with the same arguments."""
+        """Continues from the state of a learner made with the same arguments."""
         self.engine.load_state_dict(state["update"])
-        for name, room in self._rollout.items():
-            room.copy_(state["rollout"][name])
+        for name, field in self._rollout.items():
+            field.copy_(state["rollout"][name])
         self.rng.load_state_dict(state["draws"])
         self.actor.rng.load_state_dict(state["exploration"])
         self._size, self.steps = int(state["size"]), int(state["steps"])
 
 
 def _like(column: Tensor, value: Tensor) -> Tensor:
-    """What was told of lanes, [L, T], or of the members of teams, [L, T, S], in the form of values, which end
-    with an axis of 1."""
+    """A field of lanes [L, T], or of team members [L, T, S], expanded to the shape of values, whose last axis
+    has size 1."""
     one_each = [1] * (value.ndim - column.ndim)
     return column.reshape(*column.shape, *one_each).expand_as(value)
 
@@ -245,14 +276,18 @@ def _like(column: Tensor, value: Tensor) -> Tensor:
 def _refuse_other_parts(network: nn.Module) -> None:
     parts = list(parts_of(network))
     if not isinstance(network, AgentNetworks) or parts[:2] != ["actor", "critic"]:
-        raise ValueError(f'an agent has the networks {parts}; "actor" and "critic" are wanted')
+        raise ValueError(f'an agent has the networks {parts}; allowed: "actor" and "critic"')
 
 
-def trial_rollout(transitions: TensorDict) -> TensorDict:
-    """A made-up batch of a rollout, out of made-up transitions."""
+def trial_rollout(transitions: TensorDict, *, actions: int | None = None) -> TensorDict:
+    """A synthetic batch of a rollout, from synthetic transitions; with logits if a number of actions is
+    given."""
     chance = torch.Generator().manual_seed(1)
     batch = transitions.select("observation", "action")
+    device = batch["action"].device
     for name in ("advantage", "value_target", "state_value"):
-        batch[name] = torch.rand((*batch["action"].shape, 1), generator=chance).to(batch["action"].device)
+        batch[name] = torch.rand((*batch["action"].shape, 1), generator=chance).to(device)
     batch["action_log_prob"] = batch["advantage"].squeeze(-1) - 2.5
+    if actions is not None:
+        batch["logits"] = torch.rand((*batch["action"].shape, actions), generator=chance).to(device)
     return batch

@@ -1,14 +1,14 @@
 """Tabular Q-learning, algorithm 1 of the study, for boards small enough to tabulate.
 
 Source: M. Wiatrak, "Governing the Commons with Multi-Agent Reinforcement Learning" (2019), after Watkins and
-Dayan, "Q-learning" (1992). With r paid for action a in state s, which led to s':
+Dayan, "Q-learning" (1992). With reward r of action a in state s, and next state s':
 
     target = r where s' is terminal, else r + gamma max over a' of Q(s', a')
     Q(s, a) <- (1 - alpha) Q(s, a) + alpha target
 
-An episode that the clock ends is not terminal: its last state counts as any other. A state is what the agent
-observes. Values are those of the game only where that tells all that matters; an agent that looks away from
-apples does not know which still hang, so windows on most boards do not (`tests/test_tabular.py` shows when).
+An episode that is truncated at its time limit has no terminal state: its last state bootstraps like any
+other. A state is the agent's observation. The values are exact only if the observation is a Markov state. A
+window that does not show every apple is none, as on most boards (`tests/test_tabular.py` shows when it is).
 """
 
 from collections import deque
@@ -19,73 +19,73 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 from tensordict import TensorDictBase
-from torch import Tensor
+from torch import Tensor, nn
 
 from cprl import keys
-from cprl.commons.game import Game
 from cprl.learners.lanes import EVALUATION, EXPLORATION, lane_names, lane_seeds
 from cprl.learners.settings import TabularSettings
 from cprl.learners.transitions import RewardKind, lane_turn
 from cprl.policies.tabular import NEVER_MET, QTables, TableNetwork, TabularActor, observed_entries, states_of
+from cprl.spaces import Spaces
 
 
 class TabularLearner:
-    """R x S independent tabular agents: seats S of each of R replicas, each with a table of its own.
+    """R x S independent tabular agents: S agents of each of R replicas, each with its own table.
 
-    A `cprl.learners.base.Learner`; its tables lie in the CPU's memory.
+    A `cprl.learners.base.Learner`; its tables are in the CPU's memory.
 
     Args:
-        game: what is played.
-        agents: the numbers of the agents that learn.
-        replicas: how many replicas R, the worlds of the environment.
-        settings: the hyper-parameters.
-        seed: of the run.
-        first_replica: the number of the first replica, so that replica r can be trained alone.
-        reward_kind: what they are paid.
+        spaces: the shape and dtype of observations, and the number of actions A.
+        agents: the indices of the agents that learn.
+        replicas: the number of replicas R; each is one world of the environment.
+        settings: the hyperparameters.
+        seed: the seed of the run.
+        first_replica: the index of the first replica, so that replica r can be trained alone.
+        reward_kind: which reward they get.
 
     Raises:
-        MemoryError: in `store`, where an agent meets more than `settings.max_states` states.
+        MemoryError: from `store`, if an agent visits more than `settings.max_states` states.
     """
 
     def __init__(
         self,
-        game: Game,
+        spaces: Spaces,
         *,
         agents: Sequence[int],
         replicas: int,
         settings: TabularSettings,
         seed: int = 0,
         first_replica: int = 0,
-        reward_kind: RewardKind = "own",
+        reward_kind: RewardKind = "individual",
     ) -> None:
-        self.game, self.settings, self.seed, self.agents = game, settings, seed, tuple(agents)
+        self.spaces, self.settings, self.seed, self.agents = spaces, settings, seed, tuple(agents)
         self.reward_kind = reward_kind
         self.replicas, self._numbers = replicas, range(first_replica, first_replica + replicas)
-        self.tables = QTables(self.lanes, len(game.actions), max_states=settings.max_states)
+        self.tables = QTables(self.lanes, spaces.actions, max_states=settings.max_states)
         self.actor = self._actor(EXPLORATION, worlds=1)
         self.actor.epsilon = settings.epsilon(0)
         self.steps = 0
-        self._observed, self._every_lane = observed_entries(game), range(self.lanes)
+        self._observed, self._every_lane = observed_entries(spaces), range(self.lanes)
         self._turns: deque[dict[str, NDArray[Any]]] = deque()
 
     @property
     def lanes(self) -> int:
-        """The number of lanes, replicas x seats."""
+        """The number of lanes L = R x S."""
         return self.replicas * len(self.agents)
 
     def _actor(self, purpose: int, *, worlds: int) -> TabularActor:
         seeds = lane_seeds(self.seed, replicas=self._numbers, agents=self.agents, purpose=purpose)
-        return TabularActor(self.tables, self.game, seeds=seeds, agents=len(self.agents), worlds=worlds)
+        return TabularActor(self.tables, self.spaces, seeds=seeds, agents=len(self.agents), worlds=worlds)
 
     def evaluation_actor(self, worlds: int) -> TabularActor:
-        """An actor by the same tables, with `epsilon_evaluation`, for so many worlds of each replica."""
+        """An actor with the same tables and `epsilon_evaluation`, for `worlds` worlds of each replica."""
         actor = self._actor(EVALUATION, worlds=worlds)
         actor.epsilon = self.settings.epsilon_evaluation
         return actor
 
     def store(self, batch: TensorDictBase) -> None:
-        """Notes a turn of every replica, to be learned by the next `update`."""
-        batch = batch.cpu()  # where the tables lie
+        """Queues one step of every replica for `update`."""
+        batch = batch.cpu()  # where the tables are
         turn = lane_turn(self.agents, batch, reward_kind=self.reward_kind)
         before, after = keys.entry(batch, keys.AGENTS), keys.entry(batch, "next")
         seen = states_of(before, self._observed, self.agents)
@@ -106,7 +106,7 @@ class TabularLearner:
         self.actor.epsilon = self.settings.epsilon(self.steps)
 
     def update(self) -> Tensor | None:
-        """Learns the oldest turn not yet learned; squared errors [R, S], or None for no such turn."""
+        """Learns from the oldest queued turn; returns the squared errors [R, S], or None if there is none."""
         if not self._turns:
             return None
         turn, values = self._turns.popleft(), self.tables.values
@@ -118,41 +118,41 @@ class TabularLearner:
         return torch.from_numpy(error**2).view(self.replicas, len(self.agents))
 
     def end_episode(self, ended: Tensor) -> None:
-        """Nothing is due at the end of an episode."""
+        """Does nothing at the end of an episode."""
 
     def values(self, batch: TensorDictBase) -> Tensor:
-        """The highest value of each agent's actions at the end of a turn, [R, S]."""
+        """The highest action value of each agent at the end of a turn, [R, S]."""
         after = keys.entry(keys.entry(batch, "next"), keys.AGENTS)
         rows = self.tables.find(states_of(after, self._observed, self.agents), self._every_lane)
         return torch.from_numpy(self.tables.values[rows].max(1)).view(self.replicas, len(self.agents))
 
     def q_table(self, lane: int) -> dict[str, NDArray[Any]]:
-        """What a lane has learned, a row for each of n states that it has met; for people to look at.
+        """The table of a lane, with one row for each of the n states that it has visited; for display.
 
         Returns:
             "observation" uint8 [n, C, X, Y], "stock_gauge" float32 [n, 1] and "scoreboard" float32 [n, N]
-            where the game has them, "values" float64 [n, A] and "visits" int64 [n, A].
+            if the game has them, "values" float64 [n, A] and "visits" int64 [n, A].
         """
         flat, values, visits = self.tables.of_lane(lane)
-        sizes = {"stock_gauge": self.game.stock_gauge_size, "scoreboard": self.game.scoreboard_size}
-        cells = int(np.prod(self.game.observation_shape))
+        sizes = dict(self.spaces.vectors)
+        cells = int(np.prod(self.spaces.observation_shape))
         table: dict[str, NDArray[Any]] = {
-            "observation": flat[:, :cells].reshape(len(flat), *self.game.observation_shape)
+            "observation": flat[:, :cells].reshape(len(flat), *self.spaces.observation_shape)
         }
         vectors = np.ascontiguousarray(flat[:, cells:]).view(np.float32)
         for name in self._observed[1:]:
             table[name], vectors = vectors[:, : sizes[name]], vectors[:, sizes[name] :]
         return {**table, "values": values, "visits": visits}
 
-    def networks(self) -> dict[str, TableNetwork]:
-        """What every lane has tabulated up to now, by "replica_0/agent_0" and so on; copies.
+    def networks(self) -> dict[str, nn.Module]:
+        """A copy of each lane's current table as a network, by "replica_0/agent_0" and so on.
 
         Raises:
-            ValueError: see `Tabular.network`.
+            ValueError: see `Tabular.make_network`.
         """
-        made = {}
+        made: dict[str, nn.Module] = {}
         for name, own in self._network_states().items():
-            made[name] = table_network(self.game)
+            made[name] = table_network(self.spaces)
             made[name].load_state_dict(own)
         return made
 
@@ -165,10 +165,10 @@ class TabularLearner:
         return states
 
     def state_dict(self) -> dict[str, Any]:
-        """Everything that the future of all lanes depends on.
+        """The full state of all lanes.
 
-        "networks" besides, which says the same as "tables" in a form that `cprl.load` reads, where there is
-        one; see `Tabular.network`.
+        The entry "networks" repeats the values of "tables" in the form that `cprl.load` reads. It is empty if
+        there is no such form, see `Tabular.make_network`.
         """
         turns = [{name: torch.from_numpy(array) for name, array in turn.items()} for turn in self._turns]
         return {
@@ -180,7 +180,7 @@ class TabularLearner:
         }
 
     def load_state_dict(self, state: Mapping[str, Any]) -> None:
-        """Goes on where the learner of that state was, which was made with the same arguments."""
+        """Continues from the state of a learner made with the same arguments."""
         self.tables.load_state_dict(state["tables"])
         self.actor.rng.load_state_dict(state["exploration"])
         self.steps = int(state["steps"])
@@ -190,12 +190,12 @@ class TabularLearner:
         )
 
 
-def table_network(game: Game) -> TableNetwork:
-    """See `Tabular.network`."""
-    names = observed_entries(game)
+def table_network(spaces: Spaces) -> TableNetwork:
+    """See `Tabular.make_network`."""
+    names = observed_entries(spaces)
     if names != ("observation",):
         raise ValueError(
-            f"agents of this game observe {', '.join(names)}; as members of a population they see only "
-            "the observation: leave the others out of Observation, or hand a TabularLearner to train"
+            f"agents of this game observe {', '.join(names)}; allowed for agents of a population: "
+            "observation alone; leave the others out of Observation, or pass a TabularLearner to train"
         )
-    return TableNetwork(game.observation_shape, len(game.actions))
+    return TableNetwork(spaces.observation_shape, spaces.actions)

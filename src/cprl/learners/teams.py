@@ -1,7 +1,7 @@
-"""Teams: lanes that are not one agent each but all members of a team, one team a replica."""
+"""Teams: lanes that hold all members of a team instead of one agent, one team per replica."""
 
 from collections.abc import Callable, Sequence
-from typing import Final
+from typing import Any, Final
 
 import torch
 from tensordict import TensorDictBase
@@ -11,26 +11,27 @@ from cprl.learners.engine.base import ListEngine
 from cprl.learners.lanes import Acts, Lanes, init_network
 from cprl.learners.transitions import LaneTurn, RewardKind, lane_turn, seen_next
 from cprl.networks.agent import acting_part
-from cprl.networks.team import TeamNetwork
+from cprl.networks.team import ModuleTeam, TeamNetwork
 from cprl.policies.lanes import LaneActor
+from cprl.spaces import Spaces
 
 MakeTeam = Callable[[Sequence[nn.Module]], nn.Module]
-"""The networks of a team out of those of its members: `AgentNetworks`, a `TeamNetwork` first."""
+"""Makes the networks of a team from those of its members: `AgentNetworks`, that of `team_network` first."""
 
 _SHARED: Final = 1
-"""Ends the seed of what a team has beside its members' networks."""
+"""The last number of the seed of the parts that a team adds to its members' networks."""
 
 
 class Teams:
-    """As `Lanes`, but that lane r is the team of all S seats in replica r.
+    """Like `Lanes`, but lane r is the team of the S agents of replica r.
 
-    Each member draws its first weights and acts by the seeds that it would have as an agent by itself; what
-    the team does as one is seeded as its first member.
+    Each member has the seeds of initial weights and exploration that it would have as an independent agent.
+    The team itself has the seeds of its first member.
 
     Args:
         members: the members of all teams.
-        make_team: their networks as a team's; what it adds draws from torch's generator, which is seeded for
-            each team.
+        make_team: makes a team's networks from those of its members. Parts that it adds are initialised from
+            torch's generator, which is seeded for each team.
     """
 
     def __init__(self, members: Lanes, make_team: MakeTeam) -> None:
@@ -40,7 +41,7 @@ class Teams:
             lambda: make_team([members.make_network() for _ in members.agents]), self.seeds(0)[0]
         )
         acting = acting_part(form)
-        assert isinstance(acting, TeamNetwork)
+        assert isinstance(acting, TeamNetwork | ModuleTeam)
         self._acting = acting
 
     def __len__(self) -> int:
@@ -48,17 +49,17 @@ class Teams:
 
     @property
     def observation_shape(self) -> tuple[int, ...]:
-        """Of what a team sees: (S, C, X, Y)."""
+        """The shape of a team's observation: (S, C, X, Y)."""
         return *self.action_shape, *self.members.observation_shape
 
     @property
     def action_shape(self) -> tuple[int, ...]:
-        """Of what a team does, and of what its members are paid in a rollout: (S,)."""
+        """The shape of a team's action, and of its rewards in a rollout: (S,)."""
         return (len(self.members.agents),)
 
     @property
     def of_replica(self) -> int:
-        """Lanes of a replica."""
+        """The number of lanes of a replica."""
         return 1
 
     def seeds(self, purpose: int) -> list[tuple[int, int, int, int]]:
@@ -75,18 +76,18 @@ class Teams:
         return made
 
     def turn(self, batch: TensorDictBase, reward_kind: RewardKind) -> LaneTurn:
-        """A turn of every team, as replay stores it: observations [R, S, C, X, Y], actions [R, S], and
-        rewards [R], of the group.
+        """One transition of every team, as a replay buffer stores it: observations [R, S, C, X, Y], actions
+        [R, S] and team rewards [R].
 
         Args:
             batch: see `lane_turn`.
-            reward_kind: "group".
+            reward_kind: "team".
         """
         turn = self.rollout_turn(batch, reward_kind)
         return turn._replace(reward=turn.reward[:, 0])
 
     def rollout_turn(self, batch: TensorDictBase, reward_kind: RewardKind) -> LaneTurn:
-        """A turn of every team, as a rollout keeps it: as `turn`, with rewards [R, S] of each member."""
+        """One transition of every team, as a rollout stores it: as `turn`, with rewards [R, S]."""
         agents = self.members.agents
         turn, size = lane_turn(agents, batch, reward_kind=reward_kind), (len(self), len(agents))
         of_members = {
@@ -97,11 +98,11 @@ class Teams:
         return turn._replace(**of_members, **flags)
 
     def seen_next(self, batch: TensorDictBase) -> Tensor:
-        """What teams see at the end of a turn, uint8 [R, 1, S, C, X, Y]."""
+        """The observations of teams after a turn, uint8 [R, 1, S, C, X, Y]."""
         return seen_next(batch)[:, list(self.members.agents)].unsqueeze(1)
 
     def by_agent(self, losses: Tensor) -> Tensor:
-        """What was told of each team, [R], of each of its members, [R, S]."""
+        """Values of teams, [R], repeated for each of their members, [R, S]."""
         return losses[:, None].expand(-1, len(self.members.agents))
 
     def actor(self, engine: Acts, *, compile: bool) -> LaneActor:
@@ -119,20 +120,26 @@ class Teams:
         return self.members.states(_Members(engine, self))
 
     def networks(self, engine: Acts) -> dict[str, nn.Module]:
-        """A copy of each member's acting network as it is now, by "replica_0/agent_0" and so on."""
+        """A copy of each member's current acting network, by "replica_0/agent_0" and so on."""
         return self.members.networks(_Members(engine, self))
 
     def member_state(self, team: dict[str, Tensor], member: int) -> dict[str, Tensor]:
-        """Of the state dict of a team's acting network, that of a member's own."""
+        """The state dict of one member's network, from that of a team's acting network."""
         return self._acting.member_state(team, member)
 
 
+def lanes_of(spaces: Spaces, *, make_team: MakeTeam | None, **how: Any) -> Lanes | Teams:
+    """The lanes of independent agents, or with `make_team` of a team; see `Lanes` for the arguments."""
+    members = Lanes(spaces, **how)
+    return Teams(members, make_team) if make_team else members
+
+
 class _Members:
-    """The update of teams as one of their members, lane = replica x S + member.
+    """Presents an engine of teams as one of their members, with lane = replica x S + member.
 
     Args:
-        engine: whose lanes are teams.
-        teams: which.
+        engine: the engine whose lanes are teams.
+        teams: the teams.
     """
 
     def __init__(self, engine: Acts, teams: Teams) -> None:
@@ -145,6 +152,6 @@ class _Members:
         return self._engine.outputs(by_team, part=part).transpose(1, 2).flatten(0, 1)
 
     def network_state(self, lane: int) -> dict[str, Tensor]:
-        """Of one member."""
+        """The weights of one member."""
         replica, member = divmod(lane, self._size[1])
         return self._teams.member_state(self._engine.network_state(replica), member)

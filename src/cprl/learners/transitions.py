@@ -1,15 +1,16 @@
-"""What one agent lived through, under TorchRL's default keys, so that any of its losses can read it."""
+"""Transitions of single agents, under TorchRL's default keys, which its losses read."""
 
 from typing import Any, Literal, NamedTuple, TypeAlias
 
 import numpy as np
+import torch
 from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
 
 from cprl import keys
 
-RewardKind: TypeAlias = Literal["own", "group"]
-"""What a learner is paid each turn: its own reward, or the sum of all agents' rewards."""
+RewardKind: TypeAlias = Literal["individual", "team"]
+"""The reward that a learner gets each turn: the agent's own, or the sum over all agents."""
 
 
 class LaneTurn(NamedTuple):
@@ -29,17 +30,19 @@ class LaneTurn(NamedTuple):
     """bool [L]."""
 
 
-def lane_turn(agents: tuple[int, ...], batch: TensorDictBase, *, reward_kind: RewardKind = "own") -> LaneTurn:
-    """The transitions of the agents at some seats of every replica, a turn of each.
+def lane_turn(
+    agents: tuple[int, ...], batch: TensorDictBase, *, reward_kind: RewardKind = "individual"
+) -> LaneTurn:
+    """One transition of each of some agents of every replica.
 
     Args:
-        agents: the agents' numbers, S.
-        batch: entries of `cprl.keys` at the root and under "next", of batch size [R].
+        agents: the indices of the S agents.
+        batch: entries of `cprl.keys` at the root and under "next", with batch size [R].
         reward_kind: which reward they get.
 
     Returns:
-        What `transitions_of` gives of each agent, lane = replica x S + seat; numpy views of what lies on the
-        CPU, as far as possible: on so few numbers torch takes several times as long.
+        The transitions of `transitions_of`, with lane = replica x S + position in `agents`. On the CPU they
+        are numpy arrays, views if possible: for so few numbers numpy is several times faster than torch.
     """
     entry = keys.entry
     before, after = entry(batch, keys.AGENTS), entry(batch, "next")
@@ -62,34 +65,34 @@ def lane_turn(agents: tuple[int, ...], batch: TensorDictBase, *, reward_kind: Re
         of(entry(before, "observation"), *windows),
         of(entry(before, "action")),
         of(entry(agents_after, "observation"), *windows),
-        of(reward) if reward_kind == "own" else of_world(reward.sum(1)),
+        of(reward) if reward_kind == "individual" else of_world(reward.sum(1)),
         of_world(entry(after, keys.DONE)),
         of_world(entry(after, keys.TERMINATED)),
     )
 
 
 def seen_next(batch: TensorDictBase) -> Tensor:
-    """What all agents see at the end of a turn, uint8 [R, N, C, X, Y]."""
+    """The observations of all agents after a turn, uint8 [R, N, C, X, Y]."""
     seen: Tensor = keys.entry(keys.entry(keys.entry(batch, "next"), keys.AGENTS), "observation")
     return seen
 
 
 def array_of(tensor: Tensor) -> Any:
-    """The same memory as a numpy array; as it is where it lies on a GPU. Both are indexed alike."""
+    """A numpy view of a tensor on the CPU; a tensor on a GPU unchanged. Both are indexed alike."""
     return tensor.numpy() if tensor.is_cpu else tensor
 
 
 def transitions_of(agent: int, batch: TensorDictBase) -> TensorDict:
-    """The transitions of one agent out of what a collector yields.
+    """The transitions of one agent from a collector's batch.
 
     Args:
-        agent: its number.
-        batch: entries of `cprl.keys` at the root and under "next", of any batch size.
+        agent: the index of the agent.
+        batch: entries of `cprl.keys` at the root and under "next", with any batch size.
 
     Returns:
         A flat TensorDict [transitions] of "observation" uint8 [.., 3, X, Y], "action" int64 [..] and "next":
         "observation", "reward" float32 [.., 1], "done", "terminated", "truncated" bool [.., 1].
-        Turns that the agent spends out of play are transitions too, with the action that it chose.
+        Turns that the agent spends out of play are included, with the action that it chose.
     """
     before, after = batch.get(keys.AGENTS), batch.get("next")
     agents_after = after.get(keys.AGENTS)
@@ -110,3 +113,20 @@ def transitions_of(agent: int, batch: TensorDictBase) -> TensorDict:
         },
         batch_size=batch.batch_size,
     ).reshape(-1)
+
+
+def turn_of(transitions: TensorDictBase) -> LaneTurn:
+    """The transitions of lanes, [L], under TorchRL's default keys, as a `LaneTurn`."""
+    following = transitions.get("next")
+    flags = (following.get(name).reshape(len(transitions)) for name in ("reward", "done", "terminated"))
+    turn = transitions.get("observation"), transitions.get("action"), following.get("observation"), *flags
+    return LaneTurn(*map(array_of, turn))
+
+
+def transitions_in(turn: LaneTurn) -> TensorDict:
+    """`turn_of`, the other way round."""
+    entries = {name: torch.as_tensor(value) for name, value in turn._asdict().items()}
+    lanes = [len(entries["done"])]
+    following = {name: entries.pop(name).unsqueeze(-1) for name in ("reward", "done", "terminated")}
+    following["observation"] = entries.pop("next_observation")
+    return TensorDict({**entries, "next": TensorDict(following, lanes)}, lanes)

@@ -1,7 +1,6 @@
-"""Whole episodes out of the batches that a collector yields."""
+"""Collects whole episodes from the batches of a collector."""
 
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass
 from typing import Any, Final
 
 import numpy as np
@@ -12,101 +11,89 @@ from torch import Tensor
 
 from cprl import keys
 from cprl.measuring import social
+from cprl.measuring.episode import Episode
+from cprl.measuring.reported import OPTIONAL, reported_in
+
+__all__ = ["Episode", "EpisodeTracker"]
 
 Array = NDArray[Any]
 Turns = dict[str, Array]
 
-_OF_AGENTS: Final = (keys.REWARD, keys.HARVEST, keys.FIRED, keys.HIT_BY, keys.TAGGED_BY)
-_OF_WORLDS: Final = (keys.STOCK, keys.TERMINATED, keys.DONE)
+_STATE: Final = {
+    "harvest": ("harvest",),
+    "in_play": ("in_play",),
+    "fired": ("shots",),
+    "hit_by": ("hit_by",),
+    "tagged_by": ("tagged", "tagged_by"),
+    "stock": ("depletion_step",),
+}
+"""The arrays that a tracker stores for each optional entry, by their names in its state."""
+_HISTORIES: Final = {"harvest": np.float32, "in_play": np.bool_}
+"""Entries that are stored for every step of an episode, with their dtypes."""
+_AS_COUNTED: Final = ("shots", "tagged", "tagged_by")
+"""Fields of an episode that are copied from the tracker's state unchanged."""
+_FIRST_CAPACITY_STEPS: Final = 128
+"""The initial capacity of histories, in steps, without max_steps."""
 _WORLDS_AT_ONCE: Final = 64
-"""Episodes measured together: the more, the faster, but each brings its whole history in float64."""
-
-
-@dataclass(frozen=True, kw_only=True, eq=False)
-class Episode:
-    """One episode of one world, from its first step to its end. Steps are counted from 1."""
-
-    world: int
-    """The index of the world in its batch."""
-    episode: int
-    """The episodes that this world had ended before."""
-    steps: int
-    """Steps played, at least 1."""
-    terminated: bool
-    """No apple was left and none could come; else the clock ran out."""
-    return_: NDArray[np.float64]
-    """[N], the sum of rewards: what the learner was paid, undiscounted."""
-    harvest: NDArray[np.float64]
-    """[N], apples bitten."""
-    in_play_steps: NDArray[np.int64]
-    """[N], steps whose action counted."""
-    shots: NDArray[np.int64]
-    """[N], beams fired."""
-    hits: NDArray[np.int64]
-    """[N], how many agents one's beams crossed, summed over the steps."""
-    tagged: NDArray[np.int64]
-    """[N], how many times one was tagged out; by two in one step is one time."""
-    tagged_by: NDArray[np.int64]
-    """[N, N], row: tagged, column: how many times by whom."""
-    stock_left: int
-    """Apples on the board at the end."""
-    depletion_step: int
-    """The first step that left no apple on the board, or -1."""
-    metrics: dict[str, float]
-    """`social.summary` of the episode; NaN where undefined."""
+"""Episodes measured together: more are faster, but the history of each is held in float64."""
 
 
 class EpisodeTracker:
-    """Keeps each world's running episode and hands it out when it ends.
+    """Tracks the running episode of each world and returns it when it ends.
+
+    The first batch determines which optional entries (`cprl.measuring.reported.OPTIONAL`) the game reports;
+    every later batch must have them. Fields and metrics that need other entries are left out of episodes.
 
     Args:
-        worlds: how many worlds B a batch holds.
-        agents: agents N of each world.
-        max_steps: no episode is longer, `Rules.episode_steps`.
-        sustainable_yield: apples per step that the map can bear; with first_stock, metrics hold yield_share.
-        first_stock: apples on the board as an episode begins.
+        worlds: the number of worlds B of a batch.
+        agents: the number of agents N of each world.
+        max_steps: the maximum length of an episode, e.g. `Rules.episode_steps`; None if it is unknown.
+        sustainable_yield: apples per step that the map can sustain; with first_stock, adds yield_share.
+        first_stock: apples on the board at the start of an episode.
 
     Raises:
-        ValueError: for numbers below 1; in `add`, for a batch that does not fit and for an episode that
-            is longer than max_steps.
+        ValueError: if a number is below 1; in `add`, if a batch has a wrong shape or lacks an entry, or an
+            episode is longer than max_steps.
     """
 
     def __init__(
         self,
         worlds: int,
         agents: int,
-        max_steps: int,
+        max_steps: int | None = None,
         *,
         sustainable_yield: float | None = None,
         first_stock: float | None = None,
     ) -> None:
         for name, number in (("worlds", worlds), ("agents", agents), ("max_steps", max_steps)):
-            if number < 1:
-                raise ValueError(f"{name} is {number}; at least 1 is wanted")
+            if number is not None and number < 1:
+                raise ValueError(f"{name} is {number}; allowed: an integer >= 1")
         self.worlds, self.agents, self.max_steps = worlds, agents, max_steps
+        self.reported: tuple[str, ...] | None = None
+        """The optional entries of this game; None before the first batch."""
         self._yield = {"sustainable_yield": sustainable_yield, "first_stock": first_stock}
         self._every_world = np.arange(worlds)
         self._checked: torch.Size | None = None
         self._episode = np.zeros(worlds, np.int64)
-        self._harvest = np.zeros((worlds, max_steps, agents), np.float32)
-        self._in_play = np.zeros((worlds, max_steps, agents), np.bool_)
-        self._running: dict[str, Array] = {
-            "steps": np.zeros(worlds, np.int64),
-            "depletion_step": np.zeros(worlds, np.int64),
-            "return": np.zeros((worlds, agents), np.float64),
-            "shots": np.zeros((worlds, agents), np.int64),
-            "tagged": np.zeros((worlds, agents), np.int64),
-            "hit_by": np.zeros((worlds, agents, agents), np.int64),
-            "tagged_by": np.zeros((worlds, agents, agents), np.int64),
-        }
+        self._of_agents: tuple[str, ...] = ()
+        self._of_worlds: tuple[str, ...] = ()
+        self._histories: dict[str, Array] = {}
+        self._running: dict[str, Array] = {}
 
     def add(self, tensordict: TensorDictBase) -> list[Episode]:
-        """Takes the next turns of all worlds, batch size [B] or [B, T'], with the entries of `cprl.keys`.
+        """Adds the next turns of all worlds, batch size [B] or [B, T], with the entries of `cprl.keys`.
 
         Returns:
-            The episodes that ended, in the order of turns, then of worlds.
+            The episodes that ended, ordered by turn, then by world.
         """
-        turns, size = _read(tensordict), tensordict.batch_size
+        if self.reported is None:
+            self._begin(reported_in(tensordict))
+            if tensordict.get(keys.DONE, None) is None:
+                raise self._missing(tensordict)
+        try:
+            turns, size = self._read(tensordict), tensordict.batch_size
+        except KeyError as error:
+            raise self._missing(tensordict) from error
         if size != self._checked:
             self._check(turns, size)
         if len(size) == 1:
@@ -117,45 +104,123 @@ class EpisodeTracker:
         return episodes
 
     def state_dict(self) -> dict[str, Tensor]:
-        """Copies of all that the running episodes are made of, as far as they have been played."""
-        longest = int(self._running["steps"].max())
+        """Copies of the arrays of the running episodes, up to the steps played."""
+        longest = int(self._running["steps"].max()) if self._running else 0
         return {name: torch.tensor(array) for name, array in self._arrays(longest).items()}
 
     def load_state_dict(self, state: Mapping[str, Tensor]) -> None:
-        """Goes on exactly where the tracker of that `state_dict` was."""
-        longest = state["harvest"].shape[1]
-        if longest > self.max_steps:
-            raise ValueError(f"the state holds {longest} steps; max_steps is {self.max_steps}")
-        arrays = self._arrays(longest)
+        """Continues exactly from a state that `state_dict` returned.
+
+        Raises:
+            ValueError: if the state has other shapes, or is from a game that reports other entries; the
+                tracker is then unchanged.
+        """
+        longest = next((state[name].shape[1] for name in _HISTORIES if name in state), 0)
+        if self.max_steps is not None and longest > self.max_steps:
+            raise ValueError(f"the state has {longest} steps; allowed: up to max_steps, {self.max_steps}")
+        reported = None  # the tracker had seen no batch
+        if "steps" in state:
+            reported = tuple(entry for entry in OPTIONAL if _STATE[entry][0] in state)
+            if self.reported not in (None, reported):
+                raise ValueError(
+                    f"the state is from a game that reports {list(reported)}; allowed: "
+                    f"{list(self.reported or ())}, as this game reports"
+                )
+        other = EpisodeTracker(self.worlds, self.agents, self.max_steps, **self._yield)
+        if reported is not None:
+            other._begin(reported, capacity=longest)
+        arrays = other._arrays(longest)
         for name, array in arrays.items():
             if state[name].shape != array.shape:
-                wanted = list(array.shape)
-                raise ValueError(f'"{name}" of the state is {list(state[name].shape)}; {wanted} is wanted')
+                allowed = list(array.shape)
+                raise ValueError(f'"{name}" of the state is {list(state[name].shape)}; allowed: {allowed}')
         for name, array in arrays.items():
             array[:] = state[name].numpy(force=True)
+        vars(self).update(vars(other))
 
     def _arrays(self, longest: int) -> dict[str, Array]:
-        histories = {"harvest": self._harvest[:, :longest], "in_play": self._in_play[:, :longest]}
+        histories = {name: array[:, :longest] for name, array in self._histories.items()}
         return {"episode": self._episode, **histories, **self._running}
 
+    def _begin(self, reported: tuple[str, ...], *, capacity: int = 0) -> None:
+        """Allocates the arrays for a game that reports these entries."""
+        if "harvest" not in reported and self._yield["sustainable_yield"] is not None:
+            raise ValueError(
+                "sustainable_yield is given; allowed: None, because yield_share needs a harvest, which the "
+                "game does not report"
+            )
+        self.reported = reported
+        worlds, agents = self.worlds, self.agents
+        steps = max(capacity, _FIRST_CAPACITY_STEPS) if self.max_steps is None else self.max_steps
+        self._histories = {
+            name: np.zeros((worlds, steps, agents), dtype)
+            for name, dtype in _HISTORIES.items()
+            if name in reported
+        }
+        shapes: dict[str, tuple[int, ...]] = {
+            "depletion_step": (worlds,),
+            "shots": (worlds, agents),
+            "tagged": (worlds, agents),
+            "hit_by": (worlds, agents, agents),
+            "tagged_by": (worlds, agents, agents),
+        }
+        kept = {name for entry in reported for name in _STATE[entry]}
+        self._running = {
+            "steps": np.zeros(worlds, np.int64),
+            "return": np.zeros((worlds, agents), np.float64),
+            **{name: np.zeros(shape, np.int64) for name, shape in shapes.items() if name in kept},
+        }
+        self._of_agents = ("reward", *(name for name in reported if name not in ("in_play", "stock")))
+        self._of_worlds = (*(name for name in reported if name == "stock"), keys.TERMINATED, keys.DONE)
+
+    def _read(self, tensordict: TensorDictBase) -> Turns:
+        """All entries as arrays, [B, ...] or [B, T, ...], without a copy if the batch is on the CPU.
+
+        "had_ended", the worlds that had ended before the turn, is included only if a world has ended now.
+        """
+        following, entry = keys.entry(tensordict, "next"), keys.entry
+        agents = entry(following, keys.AGENTS)
+        tensors = {name: entry(agents, name) for name in self._of_agents}
+        tensors |= {name: entry(following, name) for name in self._of_worlds}
+        if "in_play" in self._histories:
+            tensors["in_play"] = entry(entry(tensordict, keys.AGENTS), "in_play")
+        turns = {name: tensor.numpy(force=True) for name, tensor in tensors.items()}
+        if np.count_nonzero(turns["done"]):  # a tenth of the time that `any` takes on so few
+            turns["had_ended"] = entry(tensordict, keys.DONE).numpy(force=True)
+        return turns
+
+    def _missing(self, tensordict: TensorDictBase) -> ValueError:
+        """The error for a batch that lacks an entry."""
+        needed: dict[Any, str] = {keys.DONE: "done"}
+        needed |= {("next", name): f"next, {name}" for name in self._of_worlds}
+        needed |= {("next", keys.AGENTS, name): f"next, agents, {name}" for name in self._of_agents}
+        if "in_play" in self._histories:
+            needed[keys.IN_PLAY] = "agents, in_play"
+        missing = [f"({name})" for key, name in needed.items() if tensordict.get(key, None) is None]
+        return ValueError(
+            f"the batch lacks {', '.join(missing)}; every batch must have the rewards, done and terminated, "
+            f"and the optional entries of the first batch"
+        )
+
     def _check(self, turns: Turns, size: torch.Size) -> None:
-        """That a batch fits; once for every batch size, since checking takes longer than counting."""
+        """Checks the shapes of a batch, once per batch size, because checking takes longer than counting."""
         if len(size) not in (1, 2) or size[0] != self.worlds:
-            raise ValueError(f"the batch is {list(size)}; [{self.worlds}] or [{self.worlds}, T] is wanted")
+            raise ValueError(f"the batch is {list(size)}; allowed: [{self.worlds}] or [{self.worlds}, T]")
         one, agents = (1,), (self.agents,)
         own: dict[str, tuple[int, ...]] = dict.fromkeys(("harvest", "fired", "in_play"), agents)
         own |= {"reward": agents + one, "hit_by": agents * 2, "tagged_by": agents * 2}
         for name, array in turns.items():
-            wanted = (*size, *own.get(name, one))
-            if array.shape != wanted:
-                raise ValueError(f'"{name}" of the batch is {list(array.shape)}; {list(wanted)} is wanted')
+            allowed = (*size, *own.get(name, one))
+            if array.shape != allowed:
+                raise ValueError(f'"{name}" of the batch is {list(array.shape)}; allowed: {list(allowed)}')
         self._checked = size
 
     def _add_turn(self, turn: Turns) -> list[Episode]:
         self._count(turn)
-        if not np.count_nonzero(turn["done"]):  # a tenth of the time that `any` takes on so few
+        if "had_ended" not in turn:
             return []
         done = turn["done"][:, 0]
+        # A world that had ended before and is stepped again does not end a second time.
         ended = np.flatnonzero(done & ~turn["had_ended"][:, 0])
         episodes: list[Episode] = []
         for first in range(0, len(ended), _WORLDS_AT_ONCE):
@@ -169,64 +234,69 @@ class EpisodeTracker:
         running, steps = self._running, self._running["steps"]
         place = self._every_world, steps
         try:
-            self._harvest[place] = turn["harvest"]
+            for name, history in self._histories.items():
+                history[place] = turn[name]
         except IndexError:
-            raise ValueError(
-                f"the episode of world {int(steps.argmax())} has not ended after {self.max_steps} steps; "
-                f"give EpisodeTracker a max_steps that no episode exceeds"
-            ) from None
-        self._in_play[place] = turn["in_play"]
+            self._grow()
+            for name, history in self._histories.items():
+                history[place] = turn[name]
+        if not self._histories and self.max_steps is not None and steps.max() >= self.max_steps:
+            self._grow()
         steps += 1
         running["return"] += turn["reward"][..., 0]
-        running["shots"] += turn["fired"]
-        if np.count_nonzero(turn["hit_by"]):
+        if "fired" in turn:
+            running["shots"] += turn["fired"]
+        if "hit_by" in turn and np.count_nonzero(turn["hit_by"]):
             running["hit_by"] += turn["hit_by"]
-        if np.count_nonzero(turn["tagged_by"]):
+        if "tagged_by" in turn and np.count_nonzero(turn["tagged_by"]):
             running["tagged"] += turn["tagged_by"].any(-1)
             running["tagged_by"] += turn["tagged_by"]
-        if np.count_nonzero(turn["stock"]) < turn["stock"].size:
+        if "stock" in turn and np.count_nonzero(turn["stock"]) < turn["stock"].size:
             depletion_step = running["depletion_step"]
             just_now = (turn["stock"][:, 0] == 0) & (depletion_step == 0)
             depletion_step[just_now] = steps[just_now]
+
+    def _grow(self) -> None:
+        """Doubles the capacity of histories; raises a ValueError beyond max_steps."""
+        if self.max_steps is not None:
+            world = int(self._running["steps"].argmax())
+            raise ValueError(
+                f"the episode of world {world} has not ended after {self.max_steps} steps; "
+                f"allowed: up to max_steps of EpisodeTracker, which no episode may exceed"
+            ) from None
+        for name, history in self._histories.items():
+            self._histories[name] = np.concatenate([history, np.zeros_like(history)], axis=1)
 
     def _measure(self, worlds: Array, turn: Turns) -> Iterator[Episode]:
         """The episodes of the worlds, int64 [E], that end with this turn."""
         ended = {name: array[worlds] for name, array in self._running.items()}
         played = np.arange(ended["steps"].max()) < ended["steps"][:, None]
-        harvest = np.where(played[..., None], self._harvest[worlds, : played.shape[1]], 0)
-        in_play = played[..., None] & self._in_play[worlds, : played.shape[1]]
+        kept = {name: array[worlds, : played.shape[1]] for name, array in self._histories.items()}
+        if "harvest" in kept:
+            kept["harvest"] = np.where(played[..., None], kept["harvest"], 0)
+        if "in_play" in kept:
+            kept["in_play"] = played[..., None] & kept["in_play"]
+        steps = {name: torch.from_numpy(array) for name, array in kept.items()}
         metrics = social.summary(
-            torch.from_numpy(harvest),
-            torch.from_numpy(in_play),
-            played=torch.from_numpy(played),
-            **self._yield,
+            steps.get("harvest"), steps.get("in_play"), played=torch.from_numpy(played), **self._yield
         )
         for k, world in enumerate(worlds):
+            fields: dict[str, Any] = {name: ended[name][k] for name in _AS_COUNTED if name in ended}
+            if "harvest" in kept:
+                fields["harvest"] = kept["harvest"][k].sum(0, dtype=np.float64)
+            if "in_play" in kept:
+                fields["in_play_steps"] = kept["in_play"][k].sum(0)
+            if "hit_by" in ended:
+                fields["hits"] = ended["hit_by"][k].sum(0)
+            if "stock" in turn:
+                fields["stock_left"] = int(turn["stock"][world, 0])
+                fields["depletion_step"] = int(ended["depletion_step"][k]) or -1
             yield Episode(
                 world=int(world),
                 episode=int(self._episode[world]),
                 steps=int(ended["steps"][k]),
                 terminated=bool(turn["terminated"][world, 0]),
                 return_=ended["return"][k],
-                harvest=harvest[k].sum(0, dtype=np.float64),
-                in_play_steps=in_play[k].sum(0),
-                shots=ended["shots"][k],
-                hits=ended["hit_by"][k].sum(0),
-                tagged=ended["tagged"][k],
-                tagged_by=ended["tagged_by"][k],
-                stock_left=int(turn["stock"][world, 0]),
-                depletion_step=int(ended["depletion_step"][k]) or -1,
                 metrics={name: float(values[k]) for name, values in metrics.items()},
+                **fields,
             )
-
-
-def _read(tensordict: TensorDictBase) -> Turns:
-    """Every entry once, [B, ...] or [B, T', ...], without a copy where the batch lies on the CPU."""
-    following, entry = keys.entry(tensordict, "next"), keys.entry
-    agents, before = entry(following, keys.AGENTS), entry(tensordict, keys.AGENTS)
-    tensors = {name: entry(agents, name) for _, name in _OF_AGENTS}
-    tensors |= {name: entry(following, name) for name in _OF_WORLDS}
-    tensors["in_play"] = entry(before, keys.IN_PLAY[1])
-    # In a world that had ended before and is stepped all the same nothing happens: it ends no second time.
-    tensors["had_ended"] = entry(tensordict, keys.DONE)
-    return {name: tensor.numpy(force=True) for name, tensor in tensors.items()}

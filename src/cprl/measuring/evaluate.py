@@ -1,45 +1,69 @@
-"""How well a population plays, without learning: one fresh episode in every world of an environment."""
+"""Evaluates a policy without learning: one fresh episode in every world of an environment."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from statistics import fmean, stdev
 
 import torch
 from tensordict import TensorDictBase
+from torchrl.envs import EnvBase
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 
 from cprl.envs.commons_env import CommonsEnv
+from cprl.envs.unwrap import agent_count
 from cprl.measuring.episodes import Episode, EpisodeTracker
 
+Policy = Callable[[TensorDictBase], TensorDictBase]
 
-def evaluate(
-    env: CommonsEnv, policy: Callable[[TensorDictBase], TensorDictBase], *, explore: bool = False
-) -> list[Episode]:
+
+def evaluate(env: EnvBase, policy: Policy, *, explore: bool = False) -> list[Episode]:
     """Plays the next episode of each world to its end.
 
     Args:
-        env: B worlds; all are reset.
-        policy: writes the actions of all agents, e.g. `cprl.acting.AgentPolicies`.
-        explore: whether actors explore with their epsilon, else they play greedily.
+        env: B worlds, batch size [B]; all are reset. A world of a `CommonsEnv` that has ended does not change
+            until all have ended. In any other environment, including one with transforms, it is reset and
+            plays on, and only its first episode counts.
+        policy: writes the actions of all agents, e.g. `cprl.policies.assignment.AgentPolicies`.
+        explore: whether actors explore; else they act greedily.
 
     Returns:
-        B episodes, by the number of the world.
+        B episodes, in the order of worlds.
+
+    Raises:
+        ValueError: if the environment's batches lack entries or have wrong shapes, see `EpisodeTracker`.
     """
     worlds = env.batch_size.numel()
-    tracker = EpisodeTracker(worlds, env.game.agents, env.game.rules.episode_steps)
+    is_commons = isinstance(env, CommonsEnv)
+    tracker = EpisodeTracker(worlds, agent_count(env), env.game.rules.episode_steps if is_commons else None)
     exploration = ExplorationType.RANDOM if explore else ExplorationType.DETERMINISTIC
     episodes: dict[int, Episode] = {}
     with torch.no_grad(), set_exploration_type(exploration):
-        moment = env.reset()
-        while len(episodes) < worlds:
-            batch = env.step(policy(moment))
-            # A world that has ended stays as it is until all have.
-            episodes.update({episode.world: episode for episode in tracker.add(batch)})
-            moment = batch.get("next").exclude(("agents", "reward"))
+        for batch in (_until_ended if is_commons else _again_and_again)(env, policy):
+            for episode in tracker.add(batch):
+                episodes.setdefault(episode.world, episode)
+            if len(episodes) == worlds:
+                break
     return [episodes[world] for world in range(worlds)]
 
 
+def _until_ended(env: EnvBase, policy: Policy) -> Iterator[TensorDictBase]:
+    """Steps all worlds until all have ended; worlds that have ended do not change."""
+    moment = env.reset()
+    while True:
+        batch = env.step(policy(moment))
+        yield batch
+        moment = batch.get("next").exclude(("agents", "reward"))
+
+
+def _again_and_again(env: EnvBase, policy: Policy) -> Iterator[TensorDictBase]:
+    """Steps all worlds, and resets each world that has ended."""
+    moment = env.reset()
+    while True:
+        batch, moment = env.step_and_maybe_reset(policy(moment))
+        yield batch
+
+
 def mean_return(episodes: list[Episode]) -> tuple[float, float]:
-    """The mean over episodes of the return of all agents together, and its standard error."""
+    """The mean over episodes of the agents' summed return, and its standard error."""
     returns = [float(episode.return_.sum()) for episode in episodes]
     error = stdev(returns) / len(returns) ** 0.5 if len(returns) > 1 else float("nan")
     return fmean(returns), error

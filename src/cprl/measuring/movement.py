@@ -1,10 +1,10 @@
-"""Where agents go and when they fire: what the study claims of trained policies, as numbers.
+"""Where agents go and when they fire: measures for the study's claims about trained policies.
 
-Arrays of a played episode, T steps, B worlds, N agents, each as the step began:
-    row, col    int [T, B, N]
-    in_play     bool [T, B, N]
-    fired       bool [T, B, N], whether the agent fired in this step
-    played      bool [T, B], True until the world's episode ended
+Arrays of a played episode with T steps, B worlds and N agents, at the start of each step:
+    row, col    int [T, B, N], the cell of each agent
+    in_play     bool [T, B, N], whether the agent acts in this step
+    fired       bool [T, B, N], whether the agent fires in this step
+    played      bool [T, B], True until the world's episode has ended
 """
 
 from collections.abc import Callable
@@ -25,7 +25,7 @@ Array = NDArray[Any]
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Trace:
-    """One episode of every world, step by step; see the module."""
+    """One episode of every world; for its arrays see the module."""
 
     row: Array
     col: Array
@@ -33,23 +33,23 @@ class Trace:
     fired: Array
     played: Array
     board: tuple[int, int]
-    """Its height H and width W in cells."""
+    """The height H and width W of the board in cells."""
 
 
 def trace(
     env: CommonsEnv, policy: Callable[[TensorDictBase], TensorDictBase], *, explore: bool = True
 ) -> Trace:
-    """Plays the next episode of each world and keeps where everybody was.
+    """Plays the next episode of each world and records the positions of all agents.
 
     Args:
         env: B worlds; all are reset.
-        policy: writes the actions of all agents.
-        explore: whether actors explore with their epsilon.
+        policy: Writes the actions of all agents.
+        explore: Whether actors explore with their epsilon.
     """
     steps: list[tuple[Array, ...]] = []
-    manner = ExplorationType.RANDOM if explore else ExplorationType.DETERMINISTIC
+    exploration = ExplorationType.RANDOM if explore else ExplorationType.DETERMINISTIC
     now, read = env.worlds.now, env.worlds.driver.read
-    with torch.no_grad(), set_exploration_type(manner):
+    with torch.no_grad(), set_exploration_type(exploration):
         moment = env.reset()
         while not moment["done"].all():
             places = read(now.row), read(now.col)
@@ -76,9 +76,10 @@ def visits(trace: Trace) -> Array:
 
 
 def overlap(trace: Trace) -> Array:
-    """How much the cells that two agents visit are the same, mean over pairs, float64 [B], 0..1.
+    """The overlap of the cells that two agents visit, mean over all pairs, float64 [B], 0..1.
 
-    The sum over cells of the smaller of the two shares: 1 for equal, 0 for disjoint visits. NaN alone.
+    The overlap of two agents is the sum over cells of the smaller of their two shares: 1 for equal visits, 0
+    for disjoint ones. NaN for a single agent.
     """
     shares = visits(trace)
     agents = shares.shape[1]
@@ -91,9 +92,9 @@ def overlap(trace: Trace) -> Array:
 
 
 def rounds(trace: Trace) -> Array:
-    """How often each agent goes round the centre of the board, clockwise above 0, per 1000 steps, [B, N].
+    """Rounds of each agent about the centre of the board per 1000 steps, clockwise positive, float64 [B, N].
 
-    The angle under which the agent stands, seen from the centre, summed up from step to step.
+    They are the changes of the agent's angle, as seen from the centre, summed over its steps.
     """
     height, width = trace.board
     down, right = trace.row - (height - 1) / 2, trace.col - (width - 1) / 2
@@ -106,9 +107,10 @@ def rounds(trace: Trace) -> Array:
 
 
 def distance_to_nearest(trace: Trace) -> Array:
-    """From each agent to the nearest other one in play, in steps (row plus column), float64 [T, B, N].
+    """The distance from each agent to the nearest other agent in play, in steps: rows plus columns.
 
-    NaN where the agent, or everybody else, is out of play.
+    Returns:
+        float64 [T, B, N]; NaN where the agent, or every other agent, is out of play.
     """
     apart = np.abs(trace.row[..., :, None] - trace.row[..., None, :]) + np.abs(
         trace.col[..., :, None] - trace.col[..., None, :]
@@ -121,9 +123,9 @@ def distance_to_nearest(trace: Trace) -> Array:
 
 
 def shooting_distance(trace: Trace) -> tuple[Array, Array]:
-    """The mean distance to the nearest other agent when an agent fires, and in all its steps, [B] each.
+    """The mean distance to the nearest other agent when an agent fires, and in all steps, float64 [B] each.
 
-    NaN where nobody fired with another one in play.
+    NaN where no agent fired while another was in play.
     """
     nearest = distance_to_nearest(trace)
     counted = np.isfinite(nearest) & trace.played[..., None]

@@ -1,9 +1,9 @@
-"""Phases of a training: where the social metrics change their course, and what each stretch looks like.
+"""Phases of a training: the change points of the social metrics, and labels for the phases between them.
 
-A phase is a stretch of episodes in which every metric follows a straight line; lines of neighbouring phases
-need not meet. Change points are those that leave the least squared error over all metrics, each in units of
-its own standard deviation, found exactly by dynamic programming (C. Truong et al., "Selective review of
-offline change point detection methods" (2020), and their library ruptures).
+In a phase every metric follows a straight line over the episodes; the lines of adjacent phases need not meet.
+The change points minimise the squared error summed over all metrics, each in units of its own standard
+deviation. Dynamic programming finds the exact minimum (C. Truong et al., "Selective review of offline change
+point detection methods" (2020), and their library ruptures).
 """
 
 from collections.abc import Mapping, Sequence
@@ -19,15 +19,15 @@ from ruptures.base import BaseCost
 Values = NDArray[np.float64]
 
 PHASES: Final = ("exploration", "tragedy", "combat", "cultivation")
-"""The study's names, in its order."""
+"""The study's names of phases, in its order."""
 METRICS: Final = ("collective_return", "equality", "survival_steps", "peacefulness")
-"""What labels are told by."""
+"""The metrics that the labels of phases depend on."""
 GRID: Final = 50
-"""Episodes to which change points are told; a figure of running means over 100 has no finer ones."""
+"""The resolution of change points in episodes; running means over 100 episodes allow no finer one."""
 SHORTEST: Final = 200
-"""Episodes of the shortest phase."""
+"""The minimum length of a phase in episodes."""
 CHANGE: Final = 0.25
-"""How much of its whole range a metric's line must rise or fall by to count as rising or falling."""
+"""The share of its range by which a metric's line must rise or fall to count as rising or falling."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -37,20 +37,20 @@ class ChangePoint:
     episode: float
     low: float
     high: float
-    """low .. high holds 95 % of the change points of resampled replicas; NaN for one series alone."""
+    """low .. high contains 95 % of the change points of resampled replicas; NaN for a single replica."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class Phase:
-    """A stretch of episodes."""
+    """The episodes between two change points."""
 
     first: float
     last: float
     label: str | None
-    """One of `PHASES`, or None where the pattern is none of theirs."""
+    """One of `PHASES`, or None if the phase has the pattern of none of them."""
     change: Mapping[str, float]
-    """By how much the line of each metric rises from the phase's beginning to its end, in shares of the
-    metric's range over the whole training."""
+    """The rise of each metric's line from the beginning of the phase to its end, as a share of the metric's
+    range over the whole training; negative for a fall."""
 
 
 def change_points(
@@ -61,48 +61,51 @@ def change_points(
     resamples: int = 200,
     seed: int = 0,
 ) -> list[ChangePoint]:
-    """Where phases change.
+    """Finds the change points between phases.
 
     Args:
-        episodes: the number of each episode, [E], rising.
-        metrics: float [E] or [R, E] by name, the same R replicas for all; running means do well. NaN is
-            left out of means over replicas.
-        number: how many change points are looked for.
-        resamples: of the replicas, for the uncertainty.
-        seed: of the resampling.
+        episodes: The index of each episode, [E], increasing.
+        metrics: float [E] or [R, E] by name, the same R replicas for all; running means work well. Means
+            over replicas ignore NaN.
+        number: The number of change points.
+        resamples: The number of bootstrap resamples of the replicas.
+        seed: The seed of the resampling.
 
     Raises:
-        ValueError: for too few episodes for so many phases, metrics of other lengths, and undefined values.
+        ValueError: If there are too few episodes for this number of phases, a metric has another length, or
+            a metric is NaN in some episode of all replicas.
     """
     at = np.asarray(episodes, np.float64)
     curves = np.stack([np.atleast_2d(np.asarray(curve, np.float64)) for curve in metrics.values()])
     if curves.shape[-1] != len(at):
-        raise ValueError(f"metrics have {curves.shape[-1]} episodes, episodes {len(at)}; as many are wanted")
+        raise ValueError(
+            f"metrics have {curves.shape[-1]} episodes and episodes has {len(at)}; allowed: equal lengths"
+        )
     grid = np.arange(at[0], at[-1] + 1e-9, GRID / 5)
     if (grid[-1] - grid[0]) < (number + 1) * SHORTEST:
         raise ValueError(
-            f"episodes {at[0]:g} to {at[-1]:g} are too few for {number + 1} phases of {SHORTEST} or more"
+            f"episodes {at[0]:g} to {at[-1]:g} are too few for {number + 1} phases of at least {SHORTEST}"
         )
     found = _found(grid, at, _over_replicas(curves), number)
     replicas = curves.shape[1]
     low = high = np.full(number, np.nan)
     if replicas > 1:
-        chance = np.random.default_rng(seed)
-        drawn = [
-            _found(grid, at, _over_replicas(curves[:, chance.integers(replicas, size=replicas)]), number)
+        rng = np.random.default_rng(seed)
+        resampled = [
+            _found(grid, at, _over_replicas(curves[:, rng.integers(replicas, size=replicas)]), number)
             for _ in range(resamples)
         ]
-        low, high = np.quantile(drawn, [0.025, 0.975], axis=0)
+        low, high = np.quantile(resampled, [0.025, 0.975], axis=0)
     return [
-        ChangePoint(episode=float(middle), low=float(least), high=float(most))
-        for middle, least, most in zip(found, low, high, strict=True)
+        ChangePoint(episode=float(middle), low=float(lower), high=float(upper))
+        for middle, lower, upper in zip(found, low, high, strict=True)
     ]
 
 
-def told_apart(
+def find_phases(
     episodes: ArrayLike, metrics: Mapping[str, ArrayLike], *, number: int = 3
 ) -> tuple[list[ChangePoint], list[Phase]]:
-    """So many change points and the phases between them; see `change_points` and `phases`."""
+    """Finds `number` change points and the phases between them; see `change_points` and `phases`."""
     changes = change_points(episodes, metrics, number=number) if number else []
     return changes, phases(episodes, metrics, changes)
 
@@ -110,18 +113,18 @@ def told_apart(
 def phases(
     episodes: ArrayLike, metrics: Mapping[str, ArrayLike], changes: Sequence[ChangePoint]
 ) -> list[Phase]:
-    """The stretches between change points, labelled where the pattern of the study's claims is theirs.
+    """The phases between change points, labelled if they have a pattern that the study claims.
 
-    exploration: the first, and the collective return rises;
+    exploration: the first phase, if the collective return rises;
     tragedy: collective return, survival and peacefulness all fall;
-    combat: after a tragedy, and the collective return rises;
-    cultivation: after a tragedy, and none of the four metrics rises or falls.
-    To rise or fall is to do so by more than `CHANGE` of the metric's range.
+    combat: after a tragedy, if the collective return rises;
+    cultivation: after a tragedy, if none of the four metrics rises or falls.
+    A metric rises or falls if its line changes by more than `CHANGE` of the metric's range.
 
     Args:
-        episodes: [E].
-        metrics: float [E] or [R, E] by name, `METRICS` at least.
-        changes: see `change_points`.
+        episodes: The index of each episode, [E], increasing.
+        metrics: float [E] or [R, E] by name; at least `METRICS`.
+        changes: The change points, see `change_points`.
     """
     at = np.asarray(episodes, np.float64)
     means = {name: _over_replicas(np.atleast_2d(np.asarray(metrics[name], np.float64))) for name in METRICS}
@@ -154,7 +157,7 @@ def _label(change: Mapping[str, float], before: Sequence[str | None]) -> str | N
 
 
 def _over_replicas(curves: Values) -> Values:
-    """Means over R of what is defined, [..., R, E] to [..., E]; NaN where nothing is."""
+    """Means over replicas that ignore NaN, [..., R, E] to [..., E]; NaN if all replicas are NaN."""
     defined = ~np.isnan(curves)
     with np.errstate(invalid="ignore"):
         means: Values = np.where(defined, curves, 0.0).sum(-2) / defined.sum(-2)
@@ -162,7 +165,7 @@ def _over_replicas(curves: Values) -> Values:
 
 
 class _LineCost(BaseCost):
-    """The squared error that a straight line over a stretch leaves, summed over metrics."""
+    """The squared error of the best straight line over a segment, summed over metrics."""
 
     model = "line"
     min_size = int(SHORTEST // (GRID / 5))
@@ -183,10 +186,13 @@ class _LineCost(BaseCost):
 
 
 def _found(grid: Values, at: Values, means: Values, number: int) -> Any:
-    """The change points of one set of curves [M, E]."""
+    """The change points of one set of curves, [M, E] for M metrics."""
     on_grid = np.stack([np.interp(grid, at, curve) for curve in means], axis=1)
     if not np.isfinite(on_grid).all():
-        raise ValueError("a metric is undefined in some episode of all replicas; leave it out, or fill it")
+        raise ValueError(
+            "a metric is NaN in some episode of all replicas; allowed: finite means over replicas "
+            "(omit the metric or fill the gap)"
+        )
     spread = on_grid.std(0)
     signal = (on_grid - on_grid.mean(0)) / np.where(spread > 0, spread, 1.0)
     search = ruptures.Dynp(custom_cost=_LineCost(), min_size=_LineCost.min_size, jump=5).fit(signal)

@@ -1,7 +1,7 @@
-"""The published figures to compare with: appendix A's table and the training curves.
+"""The published results: the table of appendix A and the training curves.
 
 Source: M. Wiatrak, "Governing the Commons with Multi-Agent Reinforcement Learning" (2019), appendix A and the
-figures of its experiments, read off the figures at about 830 points each.
+figures of its experiments, digitised at about 830 points each.
 """
 
 import csv
@@ -17,31 +17,31 @@ from numpy.typing import NDArray
 Values = NDArray[np.float64]
 
 SMOOTHED_EPISODES: Final = 100
-"""The study's curves are means over several runs of running means over about so many episodes, drawn at the
-first of them."""
+"""The approximate window of the study's running means, in episodes. Its curves are means of these over
+several runs, drawn at the first episode of the window."""
 PHASES_BEGIN: Final = (450, 1500, 2400)
-"""Episodes of experiment 5 at which the study draws tragedy, combat and cultivation to begin."""
+"""The episodes at which tragedy, combat and cultivation begin in the study's figures of experiment 5."""
 
 
 @dataclass(frozen=True, kw_only=True)
-class Experiment:
+class PublishedExperiment:
     """An experiment of the study, a row of its appendix A."""
 
     number: int
     recipe: str
-    """Of ours, in recipes/."""
+    """The name of our recipe, in recipes/."""
     random: float | None
-    """The mean collective return of the random policy; the study gives none for experiment 4."""
+    """The mean collective return of the random policy; None for experiment 4, where the study gives none."""
     trained: float
     """The mean collective return over training."""
     episodes: int
-    """Shown in its figures."""
+    """The number of episodes in the study's figures."""
     curves: Mapping[str, str]
-    """Published curves by the metric of ours that they show; `return_0` is agent 0's return."""
+    """The names of published curves by our name of the metric; `return_0` is the return of agent 0."""
 
 
 EXPERIMENTS: Final = (
-    Experiment(
+    PublishedExperiment(
         number=1,
         recipe="single_basic",
         random=32.47,
@@ -49,7 +49,7 @@ EXPERIMENTS: Final = (
         episodes=6000,
         curves={"collective_return": "exp1/return"},
     ),
-    Experiment(
+    PublishedExperiment(
         number=2,
         recipe="single_complex",
         random=59.53,
@@ -57,7 +57,7 @@ EXPERIMENTS: Final = (
         episodes=6000,
         curves={"collective_return": "exp2/return"},
     ),
-    Experiment(
+    PublishedExperiment(
         number=3,
         recipe="two_complex",
         random=92.57,
@@ -65,7 +65,7 @@ EXPERIMENTS: Final = (
         episodes=6000,
         curves={"collective_return": "exp3/return"},
     ),
-    Experiment(
+    PublishedExperiment(
         number=4,
         recipe="two_against_random",
         random=None,
@@ -77,7 +77,7 @@ EXPERIMENTS: Final = (
             "return_1": "exp4_agents/return_random",
         },
     ),
-    Experiment(
+    PublishedExperiment(
         number=5,
         recipe="commons",
         random=264.53,
@@ -93,19 +93,19 @@ EXPERIMENTS: Final = (
 )
 
 
-def experiment(recipe: str) -> Experiment | None:
+def published_experiment(recipe: str) -> PublishedExperiment | None:
     """The study's experiment that a recipe repeats, or None."""
     return next((one for one in EXPERIMENTS if one.recipe == recipe), None)
 
 
 def curve(name: str) -> tuple[Values, Values]:
-    """A published curve: episodes and values, [points] each.
+    """A published curve: its episodes and its values, float64 [points] each.
 
     Args:
-        name: as in `Experiment.curves`.
+        name: as in `PublishedExperiment.curves`.
 
     Raises:
-        KeyError: for an unknown name.
+        KeyError: If there is no curve of this name.
     """
     return _curves()[name]
 
@@ -122,18 +122,19 @@ def _curves() -> dict[str, tuple[Values, Values]]:
 
 
 def agreement(name: str, values: Values) -> tuple[float, float]:
-    """How near a curve comes to a published one: Pearson's correlation, and the mean absolute difference.
+    """Pearson's correlation and the mean absolute difference between a curve of ours and a published one.
 
     Args:
-        name: of the published curve.
-        values: ours, [E] from episode 0 on, smoothed and drawn alike; compared where both are.
+        name: The name of the published curve.
+        values: Our curve, [E] from episode 0 on, smoothed in the same way. Only episodes that both curves
+            have are compared.
 
     Raises:
-        ValueError: where there are fewer than 10 points of both.
+        ValueError: If the published curve has fewer than 10 points in these episodes.
     """
     episodes, published = curve(name)
     both = episodes <= len(values) - 1
     if both.sum() < 10:
-        raise ValueError(f"{len(values)} episodes hold {both.sum()} points of {name}; 10 are wanted")
+        raise ValueError(f"{len(values)} episodes have {both.sum()} points of {name}; allowed: at least 10")
     ours = np.interp(episodes[both], np.arange(len(values)), values)
     return float(np.corrcoef(ours, published[both])[0, 1]), float(np.abs(ours - published[both]).mean())

@@ -1,4 +1,4 @@
-"""A number of many episodes of many replicas: estimated over replicas, what is undefined counted apart."""
+"""Metrics of episodes of several replicas: estimates over replicas, and counts of undefined values."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -11,32 +11,32 @@ from cprl.measuring.statistics import Estimate, estimate
 
 @dataclass(frozen=True, kw_only=True)
 class Measured:
-    """A number told once an episode, of so many episodes of each replica."""
+    """A metric with one value per episode, over the episodes of several replicas."""
 
     estimate: Estimate | None
-    """Of each replica's mean over the episodes in which it is defined, over the replicas that have such an
-    episode; None where none has."""
+    """The estimate over replicas of each replica's mean over the episodes in which the metric is defined.
+    Replicas without such an episode are left out; None if no replica has one."""
     undefined: int
-    """Episodes in which it is not defined, of all replicas; in no mean."""
+    """Episodes of all replicas in which the metric is undefined; they are not part of a mean."""
     episodes: int
-    """Of all replicas."""
+    """Episodes of all replicas."""
 
     def __str__(self) -> str:
         if self.estimate is None:
             return f"undefined in all {self.episodes}"
-        told = f"{self.estimate.value:.4g}" if isnan(self.estimate.low) else str(self.estimate)
-        return f"{told}, undefined in {self.undefined} of {self.episodes}" if self.undefined else told
+        value = f"{self.estimate.value:.4g}" if isnan(self.estimate.low) else str(self.estimate)
+        return f"{value}, undefined in {self.undefined} of {self.episodes}" if self.undefined else value
 
 
 def over_replicas(values: Mapping[int, Sequence[float]]) -> Measured:
-    """What values say, by replica one of each episode, NaN where undefined.
+    """Estimates a metric from its values by replica, one per episode, NaN where undefined.
 
     Raises:
-        ValueError: for no replicas, or a replica without episodes.
+        ValueError: if there are no replicas, or a replica has no episodes.
     """
     if not values or not all(map(len, values.values())):
         counts = {replica: len(own) for replica, own in values.items()}
-        raise ValueError(f"episodes by replica are {counts}; at least one of at least one replica is wanted")
+        raise ValueError(f"episodes by replica are {counts}; allowed: at least one replica, each at least 1")
     defined = [[value for value in own if not isnan(value)] for own in values.values()]
     means = [fmean(own) for own in defined if own]
     episodes = sum(map(len, values.values()))
@@ -48,7 +48,12 @@ def over_replicas(values: Mapping[int, Sequence[float]]) -> Measured:
 
 
 def social_metrics(episode: Episode) -> dict[str, float]:
-    """Each of "Social metrics" in docs/metrics.md by name, NaN where undefined."""
+    """Each of "Social metrics" in docs/metrics.md by name, NaN where undefined.
+
+    Metrics that need entries that the game does not report are left out.
+    """
+    if episode.stock_left is None:
+        return dict(episode.metrics)
     return {**episode.metrics, "stock_left": float(episode.stock_left)}
 
 
@@ -61,15 +66,26 @@ def social_measures(played: Mapping[int, Sequence[Episode]]) -> dict[str, Measur
     Raises:
         ValueError: see `over_replicas`.
     """
-    told = {replica: [social_metrics(episode) for episode in own] for replica, own in played.items()}
-    names = next((own[0] for own in told.values() if own), {})
+    metrics_by_replica = {
+        replica: [social_metrics(episode) for episode in own] for replica, own in played.items()
+    }
+    names = next((own[0] for own in metrics_by_replica.values() if own), {})
     return {
-        name: over_replicas({replica: [metrics[name] for metrics in own] for replica, own in told.items()})
-        for name in names or ("collective_return",)
+        name: over_replicas(
+            {replica: [metrics[name] for metrics in own] for replica, own in metrics_by_replica.items()}
+        )
+        for name in names or ("survival_steps",)  # every game has it; without episodes it raises the error
     }
 
 
-def agents_without_harvest(played: Mapping[int, Sequence[Episode]]) -> tuple[int, int]:
-    """How many agents of all episodes bit nothing, whom sustainability leaves out; and of how many."""
-    harvests = [apples for own in played.values() for episode in own for apples in episode.harvest]
+def agents_without_harvest(played: Mapping[int, Sequence[Episode]]) -> tuple[int, int] | None:
+    """Counts the agents of all episodes without a harvest, which sustainability leaves out, and all agents.
+
+    None if the game reports no harvest.
+    """
+    harvests: list[float] = []
+    for episode in (episode for own in played.values() for episode in own):
+        if episode.harvest is None:
+            return None
+        harvests += episode.harvest.tolist()
     return sum(apples == 0 for apples in harvests), len(harvests)

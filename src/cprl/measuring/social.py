@@ -1,63 +1,81 @@
 """The social metrics of whole episodes: pure functions on torch tensors.
 
-What they take, T steps counted from 1 and N agents (at least one), any batch axes in front:
-    harvest  float [..., T, N], apples bitten, at least 0; the raw harvest, never a shaped reward
-    in_play  bool [..., T, N], whether the action of this very step counted: the entry at the root of a step
-    played   bool [..., T], True for the steps of the episode, False for padding behind its end, so that
-             episodes of unlike length fit one batch; None when all were played. Padding is never read.
+Arguments, for T steps counted from 1 and N agents (at least one), with any leading batch axes:
+    harvest  float [..., T, N], apples harvested, at least 0; the raw harvest, never a shaped reward
+    in_play  bool [..., T, N], whether the action of this step had an effect: the entry at the root of a step
+    played   bool [..., T], True for the steps of the episode and False for the padding after its end, so that
+             episodes of different lengths fit one batch; None if all steps were played. Padding is not read.
 
-What they give: float64 [...], NaN where the metric is undefined, which a count beside it tells apart.
-TypeError for a wrong type, ValueError for a wrong shape or value.
+Results are float64 [...], NaN where the metric is undefined; separate functions count these cases.
+A wrong type raises TypeError, a wrong shape or value ValueError.
 
 Below, R_i is the sum of agent i's harvest over its episode. Sources:
 [P] Perolat et al., "A multi-agent reinforcement learning model of common-pool resource appropriation" (2017);
 [W] Wiatrak, "Governing the Commons with Multi-Agent Reinforcement Learning" (2019).
 """
 
+from collections.abc import Mapping
+from types import MappingProxyType
 from typing import Final
 
 import torch
 from torch import Tensor
 
-METRICS: Final = (
-    "collective_return",
-    "efficiency",
-    "equality",
-    "sustainability",
-    "survival_steps",
-    "peace",
-    "peacefulness",
+NEEDS: Final[Mapping[str, tuple[str, ...]]] = MappingProxyType(
+    {
+        "collective_return": ("harvest",),
+        "efficiency": ("harvest",),
+        "equality": ("harvest",),
+        "sustainability": ("harvest",),
+        "survival_steps": (),
+        "peace": ("in_play",),
+        "peacefulness": ("in_play",),
+        "yield_share": ("harvest",),
+    }
 )
-"""What `summary` always holds, in this order."""
+"""Which entries of a turn each metric is computed from; all need to know which steps were played."""
+
+METRICS: Final = tuple(name for name in NEEDS if name != "yield_share")
+"""What `summary` holds of a game that reports harvest and in_play, in this order."""
 
 
 def summary(
-    harvest: Tensor,
-    in_play: Tensor,
+    harvest: Tensor | None,
+    in_play: Tensor | None,
     *,
     played: Tensor | None = None,
     sustainable_yield: float | Tensor | None = None,
     first_stock: float | Tensor | None = None,
 ) -> dict[str, Tensor]:
-    """All metrics by name, each float64 [...]: `METRICS`, and yield_share where a yield is given."""
-    _check_steps("harvest", harvest, played)
-    _check_steps("in_play", in_play, played)
-    if harvest.shape != in_play.shape:
+    """All metrics by name, each float64 [...]: `METRICS`, and yield_share where a yield is given.
+
+    Without harvest or in_play, the metrics that need it (`NEEDS`) are left out; without both, `played` says
+    how many steps there were.
+    """
+    for name, steps in (("harvest", harvest), ("in_play", in_play)):
+        if steps is not None:
+            _check_steps(name, steps, played)
+    if played is not None:
+        _check_type("played", played, "bool")
+    if harvest is not None and in_play is not None and harvest.shape != in_play.shape:
         raise ValueError(
             f"harvest is {list(harvest.shape)} and in_play {list(in_play.shape)}; equal shapes are wanted"
         )
-    metrics = {
-        "collective_return": collective_return(harvest, played=played),
-        "efficiency": efficiency(harvest, played=played),
-        "equality": equality(harvest, played=played),
-        "sustainability": sustainability(harvest, played=played),
-        "survival_steps": survival_steps(harvest, played=played),
-        "peace": peace(in_play, played=played),
-        "peacefulness": peacefulness(in_play, played=played),
-    }
+    metrics: dict[str, Tensor] = {}
+    if harvest is not None:
+        metrics["collective_return"] = collective_return(harvest, played=played)
+        metrics["efficiency"] = efficiency(harvest, played=played)
+        metrics["equality"] = equality(harvest, played=played)
+        metrics["sustainability"] = sustainability(harvest, played=played)
+    metrics["survival_steps"] = _steps_played(in_play if harvest is None else harvest, played)
+    if in_play is not None:
+        metrics["peace"] = peace(in_play, played=played)
+        metrics["peacefulness"] = peacefulness(in_play, played=played)
     if (sustainable_yield is None) != (first_stock is None):
         raise ValueError("a yield_share takes both sustainable_yield and first_stock; only one was given")
     if sustainable_yield is not None and first_stock is not None:
+        if harvest is None:
+            raise ValueError("a yield_share takes a harvest; none was given")
         metrics["yield_share"] = yield_share(
             harvest, sustainable_yield=sustainable_yield, first_stock=first_stock, played=played
         )
@@ -81,14 +99,14 @@ def yield_share(
     first_stock: float | Tensor,
     played: Tensor | None = None,
 ) -> Tensor:
-    """sum_i R_i / (sustainable_yield x T + first_stock), a ratio: the harvest against what the map can bear.
+    """sum_i R_i / (sustainable_yield x T + first_stock), a ratio: the harvest relative to the map's yield.
 
-    At least 0, and above 1 where the true yield is above the lower bound given. Undefined where nothing
-    could be harvested.
+    At least 0, and above 1 where the true yield exceeds the given lower bound. Undefined where nothing could
+    be harvested.
 
     Args:
-        sustainable_yield: apples per step that can be taken for ever; a number, or a tensor [...].
-        first_stock: apples on the board as the episode begins; a number, or a tensor [...].
+        sustainable_yield: Apples per step that can be harvested forever; a number, or a tensor [...].
+        first_stock: Apples on the board at the start of the episode; a number, or a tensor [...].
     """
     total = collective_return(harvest, played=played)
     per_step, first = (torch.as_tensor(n).to(total) for n in (sustainable_yield, first_stock))
@@ -102,23 +120,18 @@ def yield_share(
 def equality(harvest: Tensor, *, played: Tensor | None = None) -> Tensor:
     """1 - Gini = 1 - sum_ij |R_i - R_j| / (2 N sum_i R_i), a ratio [P]; what [W] prints as "inequality".
 
-    From 1/N, one has everything, to 1, all have the same. Undefined where nobody harvested.
+    From 1/N (one agent has everything) to 1 (all have the same). Undefined where no agent harvested.
     """
     returns = _returns(harvest, played)
     gaps = (returns.unsqueeze(-1) - returns.unsqueeze(-2)).abs().sum((-2, -1))
     return 1 - gaps / (2 * returns.shape[-1] * returns.sum(-1))
 
 
-def equality_undefined(harvest: Tensor, *, played: Tensor | None = None) -> Tensor:
-    """bool [...]: nobody harvested, so there was nothing to share; sum it to count such episodes."""
-    return _returns(harvest, played).sum(-1) == 0
-
-
 def sustainability(harvest: Tensor, *, played: Tensor | None = None) -> Tensor:
     """The mean, over the agents with a harvest, of E[t given r_i,t > 0], in steps, 1..T [P].
 
-    High where apples are still there late. [P] leaves open what an agent without a harvest counts; here it
-    is left out, see `agents_without_harvest`. Undefined where nobody harvested.
+    High where apples are still available late. [P] does not define it for agents without a harvest; here they
+    are ignored, and `cprl.measuring.replicas` counts them. Undefined where no agent harvested.
     """
     took = (_harvest(harvest, played) > 0).to(torch.float64)
     steps = torch.arange(1, took.shape[-2] + 1, dtype=torch.float64, device=took.device)
@@ -126,17 +139,10 @@ def sustainability(harvest: Tensor, *, played: Tensor | None = None) -> Tensor:
     return mean_step.nanmean(-1)
 
 
-def agents_without_harvest(harvest: Tensor, *, played: Tensor | None = None) -> Tensor:
-    """int64 [...], 0..N: the agents that `sustainability` leaves out."""
-    return (_returns(harvest, played) == 0).sum(-1)
-
-
 def survival_steps(harvest: Tensor, *, played: Tensor | None = None) -> Tensor:
     """The step at which the episode ended, 0..T; what [W] calls "sustainability"."""
     _check_steps("harvest", harvest, played)
-    if played is None:
-        return torch.full(harvest.shape[:-2], harvest.shape[-2], dtype=torch.float64, device=harvest.device)
-    return played.sum(-1, dtype=torch.float64)
+    return _steps_played(harvest, played)
 
 
 def peace(in_play: Tensor, *, played: Tensor | None = None) -> Tensor:
@@ -150,17 +156,26 @@ def peace(in_play: Tensor, *, played: Tensor | None = None) -> Tensor:
 
 
 def peacefulness(in_play: Tensor, *, played: Tensor | None = None) -> Tensor:
-    """Agent-steps in play / N, in steps, 0..T, as [W] draws it; it also falls when episodes end early."""
+    """Agent-steps in play / N, in steps, 0..T, as in [W]; it also falls when episodes end early."""
     return _agent_steps_in_play(in_play, played) / in_play.shape[-1]
 
 
+def _steps_played(steps: Tensor | None, played: Tensor | None) -> Tensor:
+    """float64 [...]: the steps of each episode, of those in `played`, else of all in [..., T, N]."""
+    if played is not None:
+        return played.sum(-1, dtype=torch.float64)
+    if steps is None:
+        raise ValueError("neither harvest nor in_play nor played was given; at least one is wanted")
+    return torch.full(steps.shape[:-2], steps.shape[-2], dtype=torch.float64, device=steps.device)
+
+
 def _returns(harvest: Tensor, played: Tensor | None) -> Tensor:
-    """R_i, float64 [..., N]: a float32 sum would lose apples in a long episode."""
+    """R_i, float64 [..., N], because a float32 sum would lose apples in a long episode."""
     return _harvest(harvest, played).sum(-2, dtype=torch.float64)
 
 
 def _harvest(harvest: Tensor, played: Tensor | None) -> Tensor:
-    """The harvest, checked, with padding as 0."""
+    """The harvest, checked, with padding set to 0."""
     _check_steps("harvest", harvest, played)
     if played is not None:
         harvest = torch.where(played.unsqueeze(-1), harvest, 0)
@@ -170,14 +185,14 @@ def _harvest(harvest: Tensor, played: Tensor | None) -> Tensor:
 
 
 def _agent_steps_in_play(in_play: Tensor, played: Tensor | None) -> Tensor:
-    """float64 [...]: the sum of in_play over steps and agents, padding left out."""
+    """float64 [...]: the sum of in_play over steps and agents, without padding."""
     _check_steps("in_play", in_play, played)
     counted = in_play if played is None else in_play & played.unsqueeze(-1)
     return counted.sum((-2, -1), dtype=torch.float64)
 
 
 def _check_steps(name: str, steps: Tensor, played: Tensor | None) -> None:
-    """That `harvest` or `in_play` is of the wanted type and shape, and that `played` fits it."""
+    """Checks the type and shape of `harvest` or `in_play`, and that `played` fits it."""
     wanted = "float" if name == "harvest" else "bool"
     _check_type(name, steps, wanted)
     if steps.ndim < 2 or steps.shape[-1] == 0:

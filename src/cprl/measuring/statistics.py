@@ -1,9 +1,9 @@
-"""What a few replicas say about all that could have been run: means, intervals, differences.
+"""Statistics over replicas: means, bootstrap intervals and paired differences.
 
-A replica is one independent repetition of a whole training; within a replica episodes and agents depend on
-each other, so replicas are what is counted and resampled, never episodes. Values are float64 [R], a number
-for each of R replicas. The advice followed: R. Agarwal et al., "Deep Reinforcement Learning at the Edge of
-the Statistical Precipice" (2021): inter-quartile means and stratified bootstrap intervals.
+A replica is one independent repetition of a whole training. Episodes and agents within a replica depend on
+each other, so the bootstrap resamples replicas, never episodes. Values are float64 [R], one number per
+replica. Inter-quartile means and stratified bootstrap intervals follow R. Agarwal et al., "Deep Reinforcement
+Learning at the Edge of the Statistical Precipice" (2021).
 """
 
 from collections.abc import Callable, Sequence
@@ -28,7 +28,7 @@ class Estimate:
     value: float
     low: float
     high: float
-    """low .. high is the interval of the confidence asked for; NaN where one replica alone says nothing."""
+    """The bounds of the bootstrap interval; NaN for a single replica."""
     replicas: int
 
     def __str__(self) -> str:
@@ -41,7 +41,7 @@ def mean(values: ArrayLike, axis: int = -1) -> Any:
 
 
 def inter_quartile_mean(values: ArrayLike, axis: int = -1) -> Any:
-    """The mean of the middle half, float64 [...]: of R values floor(R / 4) are left out at each end."""
+    """The mean of the middle half, float64 [...]: of R values it ignores the floor(R / 4) at each end."""
     return stats.trim_mean(np.asarray(values, np.float64), 0.25, axis=axis)
 
 
@@ -55,26 +55,26 @@ def estimate(
     resamples: int = RESAMPLES,
     seed: int = 0,
 ) -> Estimate:
-    """A statistic over replicas with its bootstrap interval, stratified where there are several strata.
+    """A statistic over replicas with its bootstrap interval; stratified if there are several strata.
 
-    Each stratum (a board, an experiment) is resampled by itself and weighs the same, whatever its number of
-    replicas: the value is the mean over strata of the statistic of each.
+    Each stratum (a board, an experiment) is resampled separately and has the same weight, whatever its number
+    of replicas: the value is the mean of the statistics of all strata.
 
     Args:
         strata: float [R] each.
-        statistic: "mean" or "iqm", the inter-quartile mean.
-        confidence: of the interval, 0..1.
-        resamples: of the bootstrap.
-        seed: of the resampling.
+        statistic: "mean", or "iqm" for the inter-quartile mean.
+        confidence: The confidence of the interval, between 0 and 1, exclusive.
+        resamples: The number of bootstrap resamples.
+        seed: The seed of the resampling.
 
     Raises:
-        ValueError: for no replicas, for values that are not finite, and for numbers out of range.
+        ValueError: If there are no replicas, a value is not finite, or `confidence` is out of range.
     """
     samples = [_checked(stratum) for stratum in strata]
     if not samples:
-        raise ValueError("no values were given; at least one replica is wanted")
+        raise ValueError("there are no values; allowed: at least one stratum")
     if not 0 < confidence < 1:
-        raise ValueError(f"confidence is {confidence}; a number between 0 and 1 is wanted")
+        raise ValueError(f"confidence is {confidence}; allowed: above 0, below 1")
     of_one = _STATISTICS[statistic]
 
     def overall(*parts: Values, axis: int = -1) -> Any:
@@ -85,48 +85,31 @@ def estimate(
     return Estimate(value=float(overall(*samples)), low=low, high=high, replicas=replicas)
 
 
-def paired_difference(
-    values: ArrayLike,
-    others: ArrayLike,
-    *,
-    statistic: Statistic = "mean",
-    confidence: float = CONFIDENCE,
-    resamples: int = RESAMPLES,
-    seed: int = 0,
-) -> Estimate:
-    """How much higher values are than others, replica by replica, e.g. of conditions with the same seeds.
-
-    Args:
-        values: float [R].
-        others: float [R], of the same replicas in the same order.
-
-    Raises:
-        ValueError: for different numbers of replicas; see also `estimate`.
-    """
-    mine, theirs = _checked(values), _checked(others)
-    if mine.shape != theirs.shape:
-        raise ValueError(f"{len(mine)} replicas beside {len(theirs)}; the same replicas are wanted")
-    return estimate(mine - theirs, statistic=statistic, confidence=confidence, resamples=resamples, seed=seed)
-
-
 def curve_interval(
     curves: ArrayLike, *, confidence: float = CONFIDENCE, resamples: int = RESAMPLES, seed: int = 0
 ) -> tuple[Values, Values, Values]:
-    """The mean of several curves and its bootstrap interval at each point, by percentiles.
+    """The mean of several curves and its percentile bootstrap interval at each episode.
 
     Args:
-        curves: float [R, E], a curve of E episodes for each replica; NaN where undefined.
+        curves: float [R, E], a curve of E episodes per replica; NaN where undefined.
+        confidence: The confidence of the interval, between 0 and 1, exclusive.
+        resamples: The number of bootstrap resamples.
+        seed: The seed of the resampling.
 
     Returns:
-        mean, low and high, float64 [E]; NaN where no replica has a value, or, for low and high, only one.
+        Mean, low and high, float64 [E]; NaN where no replica has a value, for low and high also where only
+        one has.
+
+    Raises:
+        ValueError: If `curves` does not have two axes.
     """
     all_curves = np.asarray(curves, np.float64)
     if all_curves.ndim != 2:
-        raise ValueError(f"curves are {list(all_curves.shape)}; [R, E] is wanted")
+        raise ValueError(f"curves is {list(all_curves.shape)}; expected: [R, E]")
     defined = ~np.isnan(all_curves)
     filled, replicas = np.where(defined, all_curves, 0.0), len(all_curves)
     chosen = np.random.default_rng(seed).integers(replicas, size=(resamples, replicas))
-    times = (chosen[:, :, None] == np.arange(replicas)).sum(1)  # how often each resample has each replica
+    times = (chosen[:, :, None] == np.arange(replicas)).sum(1)  # count of each replica in each resample
     with np.errstate(invalid="ignore", divide="ignore"):
         middle = filled.sum(0) / defined.sum(0)
         resampled = (times @ filled) / (times @ defined)
@@ -141,7 +124,7 @@ def curve_interval(
 def _interval(
     samples: Sequence[Values], overall: Callable[..., Any], confidence: float, resamples: int, seed: int
 ) -> tuple[float, float]:
-    """Bias-corrected and accelerated where it is defined, else by percentiles."""
+    """The bias-corrected and accelerated (BCa) interval where it is defined, else the percentile interval."""
     if any(len(sample) < 2 for sample in samples):
         return float("nan"), float("nan")
     if all(np.ptp(sample) == 0 for sample in samples):
@@ -166,7 +149,7 @@ def _interval(
 def _checked(values: ArrayLike) -> Values:
     checked = np.asarray(values, np.float64)
     if checked.ndim != 1 or not len(checked):
-        raise ValueError(f"values are {list(checked.shape)}; [R], a number for each replica, is wanted")
+        raise ValueError(f"values is {list(checked.shape)}; expected: [R], one number per replica")
     if not np.isfinite(checked).all():
-        raise ValueError(f"values are {checked.tolist()}; finite numbers are wanted")
+        raise ValueError(f"values is {checked.tolist()}; allowed: finite numbers")
     return checked

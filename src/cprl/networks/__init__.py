@@ -1,1 +1,17 @@
-"""What turns an observation into numbers."""
+"""Neural networks of agents: they map observations to action values, logits or state values.
+
+Modules, in the order in which one reads them:
+    mlp            MLP: fully connected layers
+    convolutional  Conv: convolutions over rows and columns
+    specification  Network: which of them an algorithm has; networks of your own
+    agent          several networks of one agent that learn together
+    distributional distributions of returns
+    team           the networks of a team
+    stacked        the networks of many lanes as one
+"""
+
+from cprl.networks.convolutional import Conv, ConvNetwork
+from cprl.networks.mlp import MLP, MLPNetwork
+from cprl.networks.specification import Network
+
+__all__ = ["MLP", "Conv", "ConvNetwork", "MLPNetwork", "Network"]

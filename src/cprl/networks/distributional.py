@@ -1,28 +1,26 @@
-"""Networks that give a distribution of returns."""
+"""Networks that output a distribution of returns."""
 
 import torch
 from torch import Tensor, nn
 
-from cprl.networks.mlp import MLPNetwork
-
 
 class AtomNetwork(nn.Module):
-    """The distribution of each action's return over so many fixed values, atoms, as in C51.
+    """The distribution of each action's return over fixed values, called atoms, as in C51.
 
     Source: Bellemare, Dabney and Munos, "A Distributional Perspective on Reinforcement Learning" (2017).
 
     Args:
-        network: with A x atoms outputs.
-        actions: A.
-        lowest: the lowest return that it can tell.
-        highest: the highest.
-        atoms: how many there are.
+        network: a network with A x atoms outputs.
+        actions: the number of actions A.
+        lowest: the lowest atom, a return.
+        highest: the highest atom.
+        atoms: the number of atoms.
     """
 
     support: Tensor
 
     def __init__(
-        self, network: MLPNetwork, *, actions: int, lowest: float, highest: float, atoms: int
+        self, network: nn.Module, *, actions: int, lowest: float, highest: float, atoms: int
     ) -> None:
         super().__init__()
         self.network, self.actions, self.atoms = network, actions, atoms

@@ -1,22 +1,62 @@
-"""Networks that read observations."""
+"""Fully connected networks."""
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 from math import prod
 
 from torch import Tensor, nn
-from torchrl.modules import MLP
+from torchrl import modules
+
+from cprl.spaces import Spaces
+
+
+@dataclass(frozen=True, kw_only=True)
+class MLP:
+    """Fully connected layers with ReLU.
+
+    Raises:
+        ValueError: if a layer has fewer than 1 unit.
+    """
+
+    hidden_cells: tuple[int, ...] = (32, 32)
+    """Units of each hidden layer."""
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "hidden_cells", tuple(self.hidden_cells))
+        if any(size < 1 for size in self.hidden_cells):
+            raise ValueError(f"MLP.hidden_cells is {self.hidden_cells}; allowed: at least 1 in each layer")
+
+    def make(
+        self,
+        spaces: Spaces,
+        outputs: int,
+        *,
+        relu_on_outputs: bool = False,
+        glorot_uniform: bool = False,
+        shape: Sequence[int] | None = None,
+    ) -> "MLPNetwork":
+        """A new network; see `cprl.networks.specification.new_network`."""
+        return MLPNetwork(
+            spaces.observation_shape if shape is None else shape,
+            outputs,
+            hidden_cells=self.hidden_cells,
+            highest=spaces.observation_scale,
+            relu_on_outputs=relu_on_outputs,
+            glorot_uniform=glorot_uniform,
+        )
 
 
 class MLPNetwork(nn.Module):
-    """The value of each action, from what an agent sees, by fully connected layers with ReLU.
+    """Action values from an observation: fully connected layers with ReLU.
 
     Args:
         observation_shape: (C, X, Y) of an observation, `Game.observation_shape`.
-        actions: how many actions A there are.
+        actions: the number of actions A.
         hidden_cells: units of each hidden layer.
-        highest: the largest value of an observation, `Observation.highest`; layers see 0..1.
-        relu_on_outputs: ReLU on the values too, as in the study as run.
-        glorot_uniform: Glorot-uniform weights and zero biases, as in the study as run; else torch's default.
+        highest: the largest value of an observation, `Observation.highest`; inputs are divided by it.
+        relu_on_outputs: whether the values pass through ReLU too, as in the program of the study.
+        glorot_uniform: whether weights are initialised Glorot-uniform and biases to zero, as in the program
+            of the study; else torch's default.
     """
 
     def __init__(
@@ -32,7 +72,7 @@ class MLPNetwork(nn.Module):
         super().__init__()
         self.highest, self.relu_on_outputs = highest, relu_on_outputs
         self.observation_dims, self.outputs = len(observation_shape), actions
-        self.layers = MLP(
+        self.layers = modules.MLP(
             in_features=prod(observation_shape),
             out_features=actions,
             num_cells=list(hidden_cells),
@@ -40,7 +80,7 @@ class MLPNetwork(nn.Module):
             activate_last_layer=relu_on_outputs,
         )
         if glorot_uniform:
-            self.apply(_glorot_uniform)
+            self.apply(glorot_uniform_)
 
     @property
     def linears(self) -> list[nn.Linear]:
@@ -53,7 +93,9 @@ class MLPNetwork(nn.Module):
         return self.layers(seen)  # type: ignore[no-any-return]
 
 
-def _glorot_uniform(module: nn.Module) -> None:
-    if isinstance(module, nn.Linear):
+def glorot_uniform_(module: nn.Module) -> None:
+    """Initialises a layer's weights Glorot-uniform and its biases to zero."""
+    if isinstance(module, nn.Linear | nn.Conv2d):
         nn.init.xavier_uniform_(module.weight)
-        nn.init.zeros_(module.bias)
+        if module.bias is not None:
+            nn.init.zeros_(module.bias)

@@ -15,14 +15,14 @@ from cprl.networks.mlp import MLPNetwork
 class StackedMLP(nn.Module):
     """L networks like `MLPNetwork` whose parameters carry a lane axis, [L, in, out] and [L, 1, out].
 
-    A lane is one agent of one replica; nothing crosses lanes: output l follows from input l and the
+    A lane is one agent of one replica. Lanes do not influence each other: output l depends on input l and
     parameters l alone.
 
     Args:
-        networks: the networks of the lanes, of one shape; their weights are copied.
+        networks: the networks of the lanes, of one architecture; their weights are copied.
 
     Raises:
-        ValueError: where the networks differ in shape.
+        ValueError: if the networks differ in architecture.
     """
 
     def __init__(self, networks: Sequence[MLPNetwork]) -> None:
@@ -30,7 +30,7 @@ class StackedMLP(nn.Module):
         first = networks[0]
         forms = {(network.highest, network.relu_on_outputs, *_shapes(network)) for network in networks}
         if len(forms) != 1:
-            raise ValueError(f"the networks of the lanes have {len(forms)} different forms; one is wanted")
+            raise ValueError(f"the networks of the lanes have {len(forms)} architectures; allowed: 1")
         self.highest, self.relu_on_outputs = first.highest, first.relu_on_outputs
         self.observation_dims, self.outputs = first.observation_dims, first.outputs
         self._names = [name for name, layer in first.named_modules() if isinstance(layer, nn.Linear)]
@@ -63,10 +63,57 @@ class StackedMLP(nn.Module):
         return values.reshape(*flat.shape[:-1], values.shape[-1])
 
 
+class StackedModules(nn.Module):
+    """L networks of one architecture, vmapped over parameters with a lane axis, [L, ...].
+
+    Args:
+        networks: the networks of the lanes, with the attribute `observation_dims`; their weights are copied.
+
+    Raises:
+        ValueError: if the networks have buffers or differ in architecture.
+    """
+
+    def __init__(self, networks: Sequence[nn.Module]) -> None:
+        super().__init__()
+        first: Any = networks[0]
+        if next(first.buffers(), None) is not None:
+            raise ValueError(f"a {type(first).__name__} has buffers; allowed: parameters alone")
+        forms = {tuple((name, value.shape) for name, value in one.named_parameters()) for one in networks}
+        if len(forms) != 1:
+            raise ValueError(f"the networks of the lanes have {len(forms)} architectures; allowed: 1")
+        self.lanes, self.observation_dims = len(networks), int(first.observation_dims)
+        self.outputs = getattr(first, "outputs", None)
+        self._names = [name for name, _ in first.named_parameters()]
+        self.__dict__["form"] = deepcopy(first)  # not a submodule: this module's weights are the stacked ones
+        each = zip(*(network.parameters() for network in networks), strict=True)
+        self.weights = nn.ParameterList([torch.stack([one.detach() for one in lanes]) for lanes in each])
+
+    def lane_state(self, lane: int) -> dict[str, Tensor]:
+        """Copies of the weights of one lane, as the state dict of its network."""
+        return {
+            name: weight[lane].detach().clone()
+            for name, weight in zip(self._names, self.weights, strict=True)
+        }
+
+    def forward(self, observation: Tensor) -> Tensor:
+        """[L, ..., *shape], or flat [L x b, *shape], to the outputs of the networks."""
+        dims = self.observation_dims
+        leading, shape = observation.shape[:-dims], observation.shape[-dims:]
+
+        def output(weights: list[Tensor], seen: Tensor) -> Tensor:
+            named = dict(zip(self._names, weights, strict=True))
+            given: Tensor = torch.func.functional_call(self.__dict__["form"], named, (seen,))
+            return given
+
+        by_lane = observation.reshape(self.lanes, -1, *shape)
+        given = torch.vmap(output)(list(self.weights), by_lane)
+        return given.reshape(*leading, *given.shape[2:])
+
+
 def through_layers(
     values: Tensor, weights: Iterable[Tensor], biases: Iterable[Tensor], *, relu_on_outputs: bool
 ) -> Tensor:
-    """[L, b, in] through layers of weights [L, in, out] and biases [L, 1, out] with ReLU between."""
+    """Passes [L, b, in] through layers of weights [L, in, out] and biases [L, 1, out], with ReLU between."""
     first = True
     for weight, bias in zip(weights, biases, strict=True):
         values = torch.baddbmm(bias, values if first else values.relu(), weight)
@@ -75,11 +122,11 @@ def through_layers(
 
 
 def stack_lanes(networks: Sequence[nn.Module]) -> nn.Module:
-    """The networks of all lanes as one whose parameters carry a lane axis; copies.
+    """One network with the parameters of all lanes along a lane axis; copies.
 
     Raises:
-        ValueError: for other networks than `MLPNetwork`, alone, in an `AtomNetwork` or in `AgentNetworks`,
-            and those that stack themselves, as a team's do.
+        ValueError: if the networks cannot be stacked: a user's network without the attribute
+            `observation_dims`, the number of axes of an observation, or with buffers.
     """
     first: Any = networks[0]
     if hasattr(first, "stacked"):
@@ -92,14 +139,18 @@ def stack_lanes(networks: Sequence[nn.Module]) -> nn.Module:
     if all(isinstance(network, AgentNetworks) for network in networks):
         parts = zip(*(network.values() for network in networks), strict=True)  # type: ignore[operator]
         return AgentNetworks(dict(zip(networks[0].keys(), map(stack_lanes, parts), strict=True)))  # type: ignore[operator]
-    if not all(isinstance(network, MLPNetwork) for network in networks):
-        raise ValueError(f"a {type(networks[0]).__name__} is no MLPNetwork")
-    return StackedMLP(networks)  # type: ignore[arg-type]
+    if all(isinstance(network, MLPNetwork) for network in networks):
+        return StackedMLP(networks)  # type: ignore[arg-type]
+    if not all(hasattr(network, "observation_dims") for network in networks):
+        raise ValueError(
+            f"a {type(first).__name__} lacks the attribute observation_dims, the axes of an observation"
+        )
+    return StackedModules(networks)
 
 
 def lane_state(stack: nn.Module, lane: int) -> dict[str, Tensor]:
-    """Copies of the weights of one lane of what `stack_lanes` gave for acting networks, as the state dict of
-    such a network."""
+    """Copies of the weights of one lane of an acting network that `stack_lanes` made, as the state dict of
+    the lane's network."""
     if isinstance(stack, AtomNetwork):
         own = lane_state(stack.network, lane)
         return {"support": stack.support.clone(), **{f"network.{name}": value for name, value in own.items()}}

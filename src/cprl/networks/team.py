@@ -1,4 +1,4 @@
-"""Networks of teams: the members' own side by side, and what sees all that the members see."""
+"""Networks of teams: those of the members as one, and networks of the observations of all members."""
 
 from collections.abc import Sequence
 from copy import deepcopy
@@ -9,20 +9,20 @@ from torch import Tensor, nn
 from torchrl.modules import QMixer
 
 from cprl.networks.mlp import MLPNetwork
-from cprl.networks.stacked import StackedMLP, through_layers
+from cprl.networks.stacked import StackedMLP, stack_lanes, through_layers
 
 
 class TeamNetwork(nn.Module):
-    """The networks of the S members of a team, which share no weights, as one.
+    """The networks of the S members of a team as one network; members share no weights.
 
-    Parameters are [S, in, out] and [S, 1, out]; with the axis of R teams in front, as `stacked` gives them,
+    Parameters are [S, in, out] and [S, 1, out]. After `stacked` they have an axis of R teams first:
     [R, S, in, out] and [R, S, 1, out].
 
     Args:
-        networks: of the members, of one shape; their weights are copied.
+        networks: the members' networks, of one architecture; their weights are copied.
 
     Raises:
-        ValueError: where the networks differ in shape.
+        ValueError: if the networks differ in architecture.
     """
 
     def __init__(self, networks: Sequence[MLPNetwork]) -> None:
@@ -42,13 +42,13 @@ class TeamNetwork(nn.Module):
         return of_teams.reshape(*flat.shape[:-1], values.shape[-1])
 
     def member_state(self, state: dict[str, Tensor], member: int) -> dict[str, Tensor]:
-        """Of a state dict of one such team: the part of a member, as the state dict of its own network."""
+        """The state dict of a member's network, from the state dict of one team."""
         one = deepcopy(self)
         one.load_state_dict(state)
         return one.members.lane_state(member)
 
     def stacked(self, teams: Sequence["TeamNetwork"]) -> "TeamNetwork":
-        """The networks of R teams as one whose parameters carry an axis of them in front; copies."""
+        """One network with the parameters of R teams along a first axis; copies."""
         stack = deepcopy(self)
         for name in ("weights", "biases"):
             each = zip(*(getattr(team.members, name) for team in teams), strict=True)
@@ -57,16 +57,47 @@ class TeamNetwork(nn.Module):
         return stack
 
     def lane_state(self, lane: int) -> dict[str, Tensor]:
-        """Of a stack: copies of the weights of one team, as its state dict."""
+        """Copies of the weights of one team of a stack, as its state dict."""
         return {name: value[lane].clone() for name, value in self.state_dict().items()}
 
 
-class CentralCritic(nn.Module):
-    """What a team expects, from all that its members see, told to each of them.
+class ModuleTeam(nn.Module):
+    """Like `TeamNetwork` for members' networks of any architecture; evaluates them one after the other.
 
     Args:
-        network: one value out of the observations of all members, (S, C, X, Y).
-        members: S.
+        networks: the members' networks.
+        observation_dims: the number of axes of one member's observation.
+    """
+
+    def __init__(self, networks: Sequence[nn.Module], *, observation_dims: int) -> None:
+        super().__init__()
+        self.members, self._axis = nn.ModuleList(networks), -1 - observation_dims
+        self.observation_dims = 1 + observation_dims
+
+    def forward(self, observation: Tensor) -> Tensor:
+        """[..., S, *shape] to [..., S, A]."""
+        seen = observation.unbind(self._axis)
+        return torch.stack([member(own) for member, own in zip(self.members, seen, strict=True)], -2)
+
+    def member_state(self, state: dict[str, Tensor], member: int) -> dict[str, Tensor]:
+        """See `TeamNetwork`."""
+        mine = f"members.{member}."
+        return {name.removeprefix(mine): value for name, value in state.items() if name.startswith(mine)}
+
+
+def team_network(networks: Sequence[nn.Module], *, observation_dims: int) -> TeamNetwork | ModuleTeam:
+    """The networks of the members of a team as one; see `TeamNetwork` and `ModuleTeam`."""
+    if all(isinstance(network, MLPNetwork) for network in networks):
+        return TeamNetwork(networks)  # type: ignore[arg-type]
+    return ModuleTeam(networks, observation_dims=observation_dims)
+
+
+class CentralCritic(nn.Module):
+    """The value of a state for a team, from the observations of all members; the same for each member.
+
+    Args:
+        network: maps the observations of all members, (S, C, X, Y), to one value.
+        members: the number of members S.
     """
 
     def __init__(self, network: nn.Module, members: int) -> None:
@@ -79,22 +110,22 @@ class CentralCritic(nn.Module):
         return value.unsqueeze(-2).expand(*value.shape[:-1], self.members, 1)
 
     def stacked(self, critics: Sequence["CentralCritic"]) -> "CentralCritic":
-        """The critics of many teams as one; copies."""
-        return CentralCritic(StackedMLP([critic.network for critic in critics]), self.members)  # type: ignore[misc]
+        """One critic with the parameters of many teams; copies."""
+        return CentralCritic(stack_lanes([critic.network for critic in critics]), self.members)
 
 
 class Mixing(nn.Module):
-    """TorchRL's `QMixer` over what all members see, side by side, as the state.
+    """TorchRL's `QMixer` with the observations of all members as the state.
 
-    Its weights on the members' values are never negative, so that what is best for each is best for the team.
-    Source: Rashid et al., "QMIX: Monotonic Value Function Factorisation for Deep Multi-Agent Reinforcement
-    Learning" (2018).
+    Its weights on the members' values are never negative, so the best action of each member is the best for
+    the team. Source: Rashid et al., "QMIX: Monotonic Value Function Factorisation for Deep Multi-Agent
+    Reinforcement Learning" (2018).
 
     Args:
         observation_shape: (C, X, Y) of a member's observation.
-        members: S.
+        members: the number of members S.
         cells: units of the mixing layer.
-        highest: the largest value of an observation; layers see 0..1.
+        highest: the largest value of an observation; inputs are divided by it.
     """
 
     def __init__(self, observation_shape: Sequence[int], *, members: int, cells: int, highest: float) -> None:

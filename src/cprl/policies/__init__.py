@@ -1,1 +1,10 @@
-"""From what agents observe to what they do."""
+"""From observations to actions.
+
+Modules, in the order in which one reads them:
+    lanes           LaneActor: many agents at once, by the values or logits of their networks
+    single          one agent by TorchRL's modules
+    scripted        agents that follow a rule; scripted_rules and paths are compiled for them
+    tabular         agents that look actions up in tables
+    assignment      AgentPolicies: which policy controls which agents
+    rng             random numbers of each lane's own
+"""

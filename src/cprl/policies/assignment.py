@@ -4,35 +4,36 @@ from collections.abc import Mapping, Sequence
 from typing import Any, TypeAlias
 
 import torch
-from tensordict import TensorDict, TensorDictBase
+from tensordict import TensorDictBase
 from tensordict.nn import TensorDictModuleBase
 from torch import Tensor, nn
 
 from cprl import keys
+from cprl.compat import unchecked_tensordict
 from cprl.policies.lanes import LaneActor
 
 AgentIndices: TypeAlias = int | tuple[int, ...]
-"""Where an actor or learner sits: one agent's number, or several."""
+"""The agents that an actor or learner controls: one index, or several."""
 
 
 def agent_indices(indices: AgentIndices) -> tuple[int, ...]:
-    """The agents' numbers."""
+    """The indices of the agents as a tuple."""
     return indices if isinstance(indices, tuple) else (indices,)
 
 
 class AgentPolicies(TensorDictModuleBase):
-    """Lets each actor see what the agents at its seats see, and puts the actions together.
+    """Passes each actor the observations of its agents, and combines the actions.
 
     Args:
-        actors: one for each agent, agent 0 first, see `cprl.policies.single`; or by the agents
-            that each controls: an index for an actor of one agent, a tuple for one of several, e.g. a
+        actors: one for each agent, agent 0 first, see `cprl.policies.single`; or a mapping from the agents
+            that each controls: an index for an actor of one agent, a tuple for an actor of several, e.g. a
             `LaneActor`.
 
-    Reads ("agents", "observation"), uint8 [B, N, C, X, Y], and of the group "agents" whatever else an actor's
+    Reads ("agents", "observation"), uint8 [B, N, C, X, Y], and the other entries of "agents" that an actor's
     `in_keys` name, e.g. "stock_gauge"; writes ("agents", "action"), int64 [B, N].
 
     Raises:
-        ValueError: for seats that are empty or taken twice.
+        ValueError: if an agent has no actor or several.
     """
 
     in_keys = (keys.OBSERVATION,)
@@ -40,24 +41,24 @@ class AgentPolicies(TensorDictModuleBase):
 
     def __init__(self, actors: Sequence[nn.Module] | Mapping[AgentIndices, nn.Module]) -> None:
         super().__init__()
-        of_seats = dict(actors) if isinstance(actors, Mapping) else dict(enumerate(actors))
-        taken = sorted(agent for indices in of_seats for agent in agent_indices(indices))
+        by_agents = dict(actors) if isinstance(actors, Mapping) else dict(enumerate(actors))
+        taken = sorted(agent for indices in by_agents for agent in agent_indices(indices))
         if taken != list(range(len(taken))):
-            raise ValueError(f"actors sit at {taken}; wanted are 0, 1 and so on, each taken once")
+            raise ValueError(f"actors control the agents {taken}; allowed: 0, 1 and so on, each exactly once")
         self.agents = len(taken)
-        self.indices = list(of_seats)
+        self.indices = list(by_agents)
         self._one_takes_all = self.indices == [tuple(taken)]
-        self.actors = nn.ModuleList(of_seats.values())
+        self.actors = nn.ModuleList(by_agents.values())
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
-        """Each actor chooses for its agents, in all worlds at once."""
+        """Writes the action of every agent, in all worlds at once."""
         agents = keys.entry(tensordict, keys.AGENTS)
         observation = keys.entry(agents, "observation")
         dim = len(tensordict.batch_size)
         if observation.shape[dim] != self.agents:
             raise ValueError(
-                f"{self.agents} actors for {observation.shape[dim]} agents; "
-                "one actor for each agent is wanted"
+                f"there are {self.agents} actors for {observation.shape[dim]} agents; "
+                "allowed: one actor for each agent"
             )
         if self._one_takes_all:
             (actor,) = self.actors
@@ -72,17 +73,15 @@ class AgentPolicies(TensorDictModuleBase):
         return tensordict
 
     def _choose(self, actor: nn.Module, agents: TensorDictBase, index: Any, batch_size: torch.Size) -> Tensor:
-        """What an actor chooses for the agents at an index, None for all, by the entries that it reads."""
-        if isinstance(actor, LaneActor):  # what its forward does, without a TensorDict to and fro
+        """One actor's actions for the agents at an index, None for all; passes the entries it reads."""
+        if isinstance(actor, LaneActor):  # the same as its forward, without a TensorDict
             return actor.choose(_at(agents, "observation", index))
         names = getattr(actor, "in_keys", ("observation",))
-        view = TensorDict._new_unsafe(
-            {name: _at(agents, name, index) for name in names}, batch_size=batch_size
-        )
+        view = unchecked_tensordict({name: _at(agents, name, index) for name in names}, batch_size)
         action: Tensor = actor(view).get("action")
         return action
 
 
 def _at(agents: TensorDictBase, name: str, index: Any) -> Tensor:
-    told: Tensor = keys.entry(agents, name)
-    return told if index is None else told[index]
+    value: Tensor = keys.entry(agents, name)
+    return value if index is None else value[index]

@@ -1,9 +1,9 @@
-"""Ways through ONE window: what is seen where, how far it is, and the first step there.
+"""Shortest paths in one window: the cells an agent sees, their distance in steps, and the first step.
 
-A window X x Y lies in a frame of wall, flat: a cell is one number, and the cells beside it are
-`Frame.stride` and 1 away. The agent itself stands in the middle of the window's last row and looks up. What
-lies behind it is not in the window, so no way leads there. Plain functions, which
-`cprl.policies.scripted` compiles.
+A window of X x Y cells is surrounded by a frame of wall and stored flat: a cell is an index, and adjacent
+cells are `Frame.stride` or 1 apart. The agent is in the middle of the window's last row and faces up. The
+cells behind it are not in the window, so no path leads there. `cprl.policies.scripted` compiles these plain
+functions.
 """
 
 from typing import Any, Final, NamedTuple
@@ -13,51 +13,52 @@ import numpy as np
 from cprl.commons.world import Bools, Bytes, Ints
 
 OPEN, APPLE, AGENT, UNKNOWN, WALL = range(5)
-"""Roles of a cell; those up to AGENT can be walked up to. The agent's own cell is OPEN."""
+"""The roles of cells; paths can reach those up to AGENT. The agent's own cell is OPEN."""
 
 
 class Frame(NamedTuple):
-    """Where the cells of a framed window are."""
+    """The layout of a framed window."""
 
     stride: int
-    """Cells from one row to the next."""
+    """The number of cells per row, frame included."""
     own: int
-    """The agent's cell."""
+    """The index of the agent's cell."""
     cells: Ints
-    """int32 [X * Y], the window's cells in reading order."""
-    ways: Ints
-    """int32 [4]: to the cell ahead, to the left, to the right, behind."""
+    """int32 [X * Y], the indices of the window's cells in reading order."""
+    neighbours: Ints
+    """int32 [4], the offsets to the cell ahead, on the left, on the right and behind."""
     near: Ints
-    """int32 [n]: to each cell that counts as near; the frame is wide enough for all."""
+    """int32 [n], the offsets to all cells that count as near; the frame is wide enough for them."""
 
 
 class Scratch(NamedTuple):
-    """Borrowed memory, an entry for each cell of a framed window."""
+    """Working memory, [cells] each: one entry for each cell of a framed window."""
 
-    shut: Bools
-    """Cells that are not walked through."""
-    wanted: Bools
-    """Cells that are walked to."""
+    blocked: Bools
+    """bool, the cells that no path passes through."""
+    targets: Bools
+    """bool, the cells to walk to."""
     steps: Ints
-    """How many steps away a cell is, -1 where it cannot be reached."""
+    """int32, the distance of each cell from the agent in steps; -1 if it cannot be reached."""
     others_steps: Ints
-    """The same from the nearest other agent."""
+    """int32, the distance of each cell from the nearest other agent, likewise."""
     queue: Ints
+    """int32, the cells that the search has reached, in the order of their distance."""
 
 
-def spread(roles: Bytes, frame: Frame, shut: Bools, steps: Ints, queue: Ints, known: int) -> None:
-    """Fills in `steps` from the first `known` cells of the queue, at which it is 0; elsewhere it is -1.
+def spread(roles: Bytes, frame: Frame, blocked: Bools, steps: Ints, queue: Ints, known: int) -> None:
+    """Breadth-first search from the first `known` cells of the queue; fills in `steps`.
 
-    A cell that is shut is reached, but nobody goes on from there.
+    `steps` is 0 at these cells and -1 elsewhere. The search reaches blocked cells but does not pass them.
     """
     done = 0
     while done < known:
         cell = queue[done]
         done += 1
-        if shut[cell] and steps[cell] > 0:
+        if blocked[cell] and steps[cell] > 0:
             continue
-        for way in frame.ways:
-            beside = np.uint64(cell + way)
+        for offset in frame.neighbours:
+            beside = np.uint64(cell + offset)
             if steps[beside] < 0 and roles[beside] <= AGENT:
                 steps[beside] = steps[cell] + 1
                 queue[known] = beside
@@ -65,15 +66,15 @@ def spread(roles: Bytes, frame: Frame, shut: Bools, steps: Ints, queue: Ints, kn
 
 
 def count_own_steps(roles: Bytes, frame: Frame, scratch: Scratch) -> None:
-    """How far each cell is for the agent itself."""
+    """Computes the distance of each cell from the agent."""
     scratch.steps[:] = -1
     scratch.steps[frame.own] = 0
     scratch.queue[0] = frame.own
-    spread(roles, frame, scratch.shut, scratch.steps, scratch.queue, 1)
+    spread(roles, frame, scratch.blocked, scratch.steps, scratch.queue, 1)
 
 
 def count_others_steps(roles: Bytes, frame: Frame, scratch: Scratch) -> None:
-    """How far each cell is for the other agent that is nearest to it."""
+    """Computes the distance of each cell from the nearest other agent."""
     known = 0
     scratch.others_steps[:] = -1
     for cell in frame.cells:
@@ -81,39 +82,39 @@ def count_others_steps(roles: Bytes, frame: Frame, scratch: Scratch) -> None:
             scratch.others_steps[cell] = 0
             scratch.queue[known] = cell
             known += 1
-    spread(roles, frame, scratch.shut, scratch.others_steps, scratch.queue, known)
+    spread(roles, frame, scratch.blocked, scratch.others_steps, scratch.queue, known)
 
 
 def nearest(frame: Frame, scratch: Scratch) -> int:
-    """The wanted cell with the fewest steps, the first in reading order; -1 for none in reach."""
+    """The nearest target, the first of equally near ones in reading order; -1 if none can be reached."""
     best, fewest = -1, scratch.steps.size
     for cell in frame.cells:
-        if scratch.wanted[cell] and 0 <= scratch.steps[cell] < fewest:
+        if scratch.targets[cell] and 0 <= scratch.steps[cell] < fewest:
             best, fewest = cell, scratch.steps[cell]
     return best
 
 
 def step_to(frame: Frame, goal: int, scratch: Scratch) -> int:
-    """The first cell of a shortest way to a cell that can be reached."""
+    """The first cell on a shortest path to a reachable cell."""
     steps, cell = scratch.steps, goal
     while steps[cell] > 1:
-        for way in frame.ways:
-            if steps[cell + way] == steps[cell] - 1 and not scratch.shut[cell + way]:
-                cell += way
+        for offset in frame.neighbours:
+            if steps[cell + offset] == steps[cell] - 1 and not scratch.blocked[cell + offset]:
+                cell += offset
                 break
     return cell
 
 
 def is_beside_an_agent(roles: Bytes, frame: Frame, cell: int) -> bool:
-    """Whether another agent is seen right beside a cell."""
+    """Whether a visible other agent is adjacent to a cell."""
     agents = 0
-    for way in frame.ways:
-        agents += roles[cell + way] == AGENT
+    for offset in frame.neighbours:
+        agents += roles[cell + offset] == AGENT
     return agents > 0
 
 
 def apples_near(roles: Bytes, frame: Frame, cell: int) -> int:
-    """How many apples are seen near a cell, not counting one on it."""
+    """The number of visible apples near a cell, without one on the cell itself."""
     count = 0
     for away in frame.near:
         count += roles[cell + away] == APPLE
@@ -129,4 +130,4 @@ FUNCTIONS: Final[tuple[Any, ...]] = (
     is_beside_an_agent,
     apples_near,
 )
-"""In the order in which they call each other."""
+"""The functions of this module, each after those it calls."""

@@ -1,4 +1,4 @@
-"""Random numbers of lanes: each lane's follow from its own seed alone, whoever else draws."""
+"""Random numbers of lanes: those of a lane depend on its own seed alone, not on the other lanes."""
 
 from collections.abc import Mapping, Sequence
 from typing import Any, Final
@@ -8,15 +8,15 @@ import torch
 from torch import Tensor
 
 DRAWN_AHEAD: Final = 1024
-"""Steps for which numbers are drawn at once."""
+"""Steps whose numbers are generated at once."""
 
 
 class LaneRng:
-    """Uniform numbers in 0..1, so many for every lane and step.
+    """Uniform numbers in 0..1, `count` for each lane and step.
 
     Args:
-        seeds: of each lane, e.g. (seed, replica, agent, purpose).
-        count: numbers for each lane and step.
+        seeds: the seed of each lane, e.g. (seed, replica, agent, purpose).
+        count: numbers per lane and step.
     """
 
     def __init__(self, seeds: Sequence[Sequence[int]], count: int) -> None:
@@ -34,7 +34,7 @@ class LaneRng:
         return self._numbers[self._used - 1]
 
     def state_dict(self) -> dict[str, Any]:
-        """Where each lane's numbers stand."""
+        """The generators' states and the numbers generated ahead."""
         return {
             "chance": [_plain(chance.bit_generator.state) for chance in self._chance],
             "numbers": self._numbers,
@@ -42,14 +42,14 @@ class LaneRng:
         }
 
     def load_state_dict(self, state: Mapping[str, Any]) -> None:
-        """Goes on where the draws of that state were."""
+        """Continues from a state that `state_dict` returned."""
         for chance, own in zip(self._chance, state["chance"], strict=True):
             chance.bit_generator.state = _arrays(own)
         self._numbers, self._used = state["numbers"].clone(), int(state["used"])
 
 
 def _plain(state: Any) -> Any:
-    """A generator's state in dicts, lists and numbers, which can be read back without running code."""
+    """A generator's state as dicts, lists and numbers, which can be loaded without running code."""
     if isinstance(state, Mapping):
         return {name: _plain(value) for name, value in state.items()}
     return state.tolist() if isinstance(state, np.ndarray) else state

@@ -1,6 +1,6 @@
-"""How scripted agents choose, by what ONE window shows; `cprl.policies.scripted` says each manner in words.
+"""The scripted policies: an agent's action, given its window; `cprl.policies.scripted` describes them.
 
-Plain functions, which `cprl.policies.scripted` has compiled; cells and framed windows as in
+Plain functions that `cprl.policies.scripted` compiles; cells and framed windows are those of
 `cprl.policies.paths`.
 """
 
@@ -28,87 +28,92 @@ from cprl.policies.paths import (
 RANDOM, GREEDY, SUSTAINABLE, TERRITORIAL, AGGRESSIVE, PACIFIST = range(6)
 
 FORWARD, BACKWARD, LEFT, RIGHT, TURN_LEFT, TURN_RIGHT, BEAM = range(7)
-"""Indices into `cprl.commons.rules.ACTIONS`; the last action of a game is to stay."""
+"""Indices into `cprl.commons.rules.ACTIONS`; the last action of a game is "stay"."""
 
 EXPLORES, WHICH, WANDERS, WAITS, NUMBERS = range(5)
-"""What an agent's random numbers of a turn are for, and how many there are."""
+"""The uses of an agent's random numbers in a turn, and their count NUMBERS."""
 
-WALK_ON_CHANCE: Final = 0.9
-"""That one who wanders goes on ahead where it can."""
-WAIT_CHANCE: Final = 0.5
-"""That an agent waits where another may want the same cell, since then neither gets it (docs/game.md)."""
+WALK_ON_PROB: Final = 0.9
+"""The probability that a wandering agent walks forward if the cell ahead is free."""
+WAIT_PROB: Final = 0.5
+"""The probability that an agent waits where another agent may want the same cell: if both go, neither gets
+it (docs/game.md)."""
 
 Numbers: TypeAlias = NDArray[np.float64]
 
 
-class Terms(NamedTuple):
-    """What of the game an agent's choice depends on besides what it sees."""
+class Settings(NamedTuple):
+    """The properties of the game that an agent's choice depends on, besides its window."""
 
     actions: int
+    """The number of actions."""
     has_beam: bool
+    """Whether there is a beam action."""
     beam_length: int
-    """Cells ahead that a beam covers whatever the heading, which the agent does not know, as far as a window
-    shows them."""
+    """The cells ahead that a beam covers for every heading, since an agent does not know its heading; at most
+    those in the window."""
     beam_half_width: int
-    """Cells to each side that it covers, likewise."""
+    """The cells to each side that a beam covers; at most those in the window."""
     spare: int
-    """Apples that have to stay near an apple that "sustainable" bites."""
+    """The number of other apples near an apple that "sustainable" harvests."""
 
 
-def want_apples(roles: Bytes, frame: Frame, scratch: Scratch) -> None:
-    """All apples are wanted; nobody walks through another agent."""
+def target_apples(roles: Bytes, frame: Frame, scratch: Scratch) -> None:
+    """Makes all apples targets and blocks the cells of other agents."""
     for cell in frame.cells:
-        scratch.wanted[cell] = roles[cell] == APPLE
-        scratch.shut[cell] = roles[cell] == AGENT
+        scratch.targets[cell] = roles[cell] == APPLE
+        scratch.blocked[cell] = roles[cell] == AGENT
 
 
-def leave_hanging(scratch: Scratch, cell: int) -> None:
-    """An apple is neither wanted nor walked over."""
-    scratch.wanted[cell] = False
-    scratch.shut[cell] = True
+def exclude_apple(scratch: Scratch, cell: int) -> None:
+    """Makes an apple no target and blocks its cell."""
+    scratch.targets[cell] = False
+    scratch.blocked[cell] = True
 
 
-def spare_last_apples(roles: Bytes, frame: Frame, terms: Terms, scratch: Scratch) -> None:
-    """Leaves apples near which fewer others than `spare` would stay."""
+def exclude_sparse_apples(roles: Bytes, frame: Frame, settings: Settings, scratch: Scratch) -> None:
+    """Excludes the targets with fewer than `spare` other apples near them."""
     for cell in frame.cells:
-        if scratch.wanted[cell] and apples_near(roles, frame, cell) < terms.spare:
-            leave_hanging(scratch, cell)
+        if scratch.targets[cell] and apples_near(roles, frame, cell) < settings.spare:
+            exclude_apple(scratch, cell)
 
 
-def yield_to_the_nearer(roles: Bytes, frame: Frame, scratch: Scratch) -> None:
-    """Leaves apples to which another has fewer steps to go."""
+def exclude_apples_nearer_to_others(roles: Bytes, frame: Frame, scratch: Scratch) -> None:
+    """Excludes the targets that another agent reaches in fewer steps."""
     count_own_steps(roles, frame, scratch)
     count_others_steps(roles, frame, scratch)
     for cell in frame.cells:
-        if scratch.wanted[cell] and 0 <= scratch.others_steps[cell] < scratch.steps[cell]:
-            leave_hanging(scratch, cell)
+        if scratch.targets[cell] and 0 <= scratch.others_steps[cell] < scratch.steps[cell]:
+            exclude_apple(scratch, cell)
 
 
-def walk_to(roles: Bytes, frame: Frame, goal: int, number: float, terms: Terms, scratch: Scratch) -> int:
-    """The first step of a shortest way to a cell in reach; beside another agent it may wait."""
+def walk_to(
+    roles: Bytes, frame: Frame, goal: int, number: float, settings: Settings, scratch: Scratch
+) -> int:
+    """The action for the first step on a shortest path to a reachable cell; may wait for another agent."""
     cell = step_to(frame, goal, scratch)
-    if is_beside_an_agent(roles, frame, cell) and number < WAIT_CHANCE:
-        return terms.actions - 1
+    if is_beside_an_agent(roles, frame, cell) and number < WAIT_PROB:
+        return settings.actions - 1
     if cell == frame.own - 1:
         return LEFT
     return RIGHT if cell == frame.own + 1 else FORWARD
 
 
 def wander(roles: Bytes, frame: Frame, number: float, scratch: Scratch) -> int:
-    """Mostly straight on, where the cell ahead is free; else a turn to either side."""
+    """Walks forward with WALK_ON_PROB if the cell ahead is free; otherwise turns left or right."""
     ahead = frame.own - frame.stride
-    if roles[ahead] <= APPLE and not scratch.shut[ahead]:
-        if number < WALK_ON_CHANCE:
+    if roles[ahead] <= APPLE and not scratch.blocked[ahead]:
+        if number < WALK_ON_PROB:
             return FORWARD
-        number = (number - WALK_ON_CHANCE) / (1 - WALK_ON_CHANCE)
+        number = (number - WALK_ON_PROB) / (1 - WALK_ON_PROB)
     return TURN_LEFT if number < 0.5 else TURN_RIGHT
 
 
-def has_target(roles: Bytes, frame: Frame, terms: Terms, guards: bool) -> bool:
-    """Whether a beam would cover another agent that is seen; if it `guards`, one near an apple in sight."""
-    for side in range(-terms.beam_half_width, terms.beam_half_width + 1):
+def has_target(roles: Bytes, frame: Frame, settings: Settings, guards: bool) -> bool:
+    """Whether a beam would cover a visible agent; with `guards`, one that is near a visible apple."""
+    for side in range(-settings.beam_half_width, settings.beam_half_width + 1):
         cell = frame.own + side
-        for _ in range(terms.beam_length):
+        for _ in range(settings.beam_length):
             cell -= frame.stride
             if roles[cell] == WALL:
                 break
@@ -117,10 +122,10 @@ def has_target(roles: Bytes, frame: Frame, terms: Terms, guards: bool) -> bool:
     return False
 
 
-def pursue(roles: Bytes, frame: Frame, number: float, terms: Terms, scratch: Scratch) -> int:
-    """Turns to the nearest other agent in reach or walks up to it; -1 for none."""
+def pursue(roles: Bytes, frame: Frame, number: float, settings: Settings, scratch: Scratch) -> int:
+    """Turns towards the nearest reachable agent or walks towards it; -1 if there is none."""
     for cell in frame.cells:
-        scratch.wanted[cell] = roles[cell] == AGENT
+        scratch.targets[cell] = roles[cell] == AGENT
     goal = nearest(frame, scratch)
     if goal < 0:
         return -1
@@ -128,40 +133,42 @@ def pursue(roles: Bytes, frame: Frame, number: float, terms: Terms, scratch: Scr
     ahead, side = frame.own // frame.stride - goal // frame.stride, goal % frame.stride - middle
     if abs(side) > ahead:
         return TURN_RIGHT if side > 0 else TURN_LEFT
-    return walk_to(roles, frame, goal, number, terms, scratch)
+    return walk_to(roles, frame, goal, number, settings, scratch)
 
 
-def choose(policy: int, roles: Bytes, frame: Frame, numbers: Numbers, terms: Terms, scratch: Scratch) -> int:
-    """What an agent of this manner does.
+def choose(
+    policy: int, roles: Bytes, frame: Frame, numbers: Numbers, settings: Settings, scratch: Scratch
+) -> int:
+    """The action of one agent.
 
     Args:
-        policy: RANDOM and so on.
-        roles: uint8, of the cells of its window, framed.
-        frame: where they are.
-        numbers: float64 [NUMBERS], random in 0..1.
-        terms: of the game.
-        scratch: borrowed memory.
+        policy: RANDOM, GREEDY, ...
+        roles: uint8 [cells], the roles of the cells of its framed window.
+        frame: The layout of the framed window.
+        numbers: float64 [NUMBERS], uniform random numbers in [0, 1).
+        settings: The properties of the game.
+        scratch: Working memory.
     """
     if policy == RANDOM:
-        return int(numbers[WHICH] * terms.actions)
-    fires = policy in (TERRITORIAL, AGGRESSIVE) and terms.has_beam
-    if fires and has_target(roles, frame, terms, policy == TERRITORIAL):
+        return int(numbers[WHICH] * settings.actions)
+    fires = policy in (TERRITORIAL, AGGRESSIVE) and settings.has_beam
+    if fires and has_target(roles, frame, settings, policy == TERRITORIAL):
         return BEAM
-    want_apples(roles, frame, scratch)
+    target_apples(roles, frame, scratch)
     if policy == SUSTAINABLE:
-        spare_last_apples(roles, frame, terms, scratch)
+        exclude_sparse_apples(roles, frame, settings, scratch)
     elif policy == PACIFIST:
-        yield_to_the_nearer(roles, frame, scratch)
+        exclude_apples_nearer_to_others(roles, frame, scratch)
     count_own_steps(roles, frame, scratch)
     if policy == AGGRESSIVE:
-        action = pursue(roles, frame, numbers[WAITS], terms, scratch)
+        action = pursue(roles, frame, numbers[WAITS], settings, scratch)
         if action >= 0:
             return action
-        want_apples(roles, frame, scratch)
+        target_apples(roles, frame, scratch)
     goal = nearest(frame, scratch)
     if goal < 0:
         return wander(roles, frame, numbers[WANDERS], scratch)
-    return walk_to(roles, frame, goal, numbers[WAITS], terms, scratch)
+    return walk_to(roles, frame, goal, numbers[WAITS], settings, scratch)
 
 
 def choose_all(
@@ -170,33 +177,33 @@ def choose_all(
     roles: Bytes,
     frame: Frame,
     numbers: Numbers,
-    terms: Terms,
+    settings: Settings,
     scratch: Scratch,
     chosen: Actions,
 ) -> None:
-    """The choices of n agents, each with chance epsilon at random.
+    """The actions of n agents; each is random with probability `epsilon`.
 
     Args:
-        policy: RANDOM and so on.
-        epsilon: the chance.
-        roles: uint8 [n, cells], as in `choose`, and so on.
-        frame: of all.
-        numbers: float64 [n, NUMBERS].
-        terms: of the game.
-        scratch: borrowed memory.
-        chosen: int64 [n], written.
+        policy: RANDOM, GREEDY, ...
+        epsilon: The probability of a random action.
+        roles: uint8 [n, cells], the roles of the cells of each framed window.
+        frame: The layout of all framed windows.
+        numbers: float64 [n, NUMBERS], uniform random numbers in [0, 1).
+        settings: The properties of the game.
+        scratch: Working memory.
+        chosen: int64 [n], receives the actions.
     """
     for n in range(roles.shape[0]):
         explores = numbers[n, EXPLORES] < epsilon
-        chosen[n] = choose(RANDOM if explores else policy, roles[n], frame, numbers[n], terms, scratch)
+        chosen[n] = choose(RANDOM if explores else policy, roles[n], frame, numbers[n], settings, scratch)
 
 
 FUNCTIONS: Final[tuple[Any, ...]] = (
     *paths.FUNCTIONS,
-    want_apples,
-    leave_hanging,
-    spare_last_apples,
-    yield_to_the_nearer,
+    target_apples,
+    exclude_apple,
+    exclude_sparse_apples,
+    exclude_apples_nearer_to_others,
     walk_to,
     wander,
     has_target,
@@ -204,4 +211,4 @@ FUNCTIONS: Final[tuple[Any, ...]] = (
     choose,
     choose_all,
 )
-"""In the order in which they call each other."""
+"""All functions, each after those it calls."""

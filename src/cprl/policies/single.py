@@ -1,4 +1,4 @@
-"""Actors: TensorDict modules by which ONE agent chooses, under TorchRL's default keys.
+"""Actors of a single agent: TensorDict modules with TorchRL's default keys.
 
 They read "observation", uint8 [..., 3, X, Y], and write "action", int64 [...].
 """
@@ -15,11 +15,11 @@ class QActor(TensorDictSequential):
     """TorchRL's `QValueActor` followed by its `EGreedyModule`.
 
     Args:
-        network: from "observation" to the value of each of A actions.
-        actions: how many actions A there are.
-        device: where it chooses.
+        network: maps "observation" to the values of A actions.
+        actions: the number of actions A.
+        device: the device of its specs and of epsilon.
 
-    It explores under `ExplorationType.RANDOM` alone, with chance `epsilon`.
+    It explores only under `ExplorationType.RANDOM`, with probability `epsilon`.
     """
 
     def __init__(self, network: nn.Module, actions: int, *, device: str | torch.device = "cpu") -> None:
@@ -31,12 +31,12 @@ class QActor(TensorDictSequential):
 
     @property
     def greedy(self) -> QValueActor:
-        """The actor without exploration, as a loss wants it."""
+        """The actor without exploration, for losses."""
         return self.module[0]
 
     @property
     def epsilon(self) -> float:
-        """The chance of a random action."""
+        """The probability of a random action, 0..1."""
         return float(self.module[1].eps)
 
     @epsilon.setter
@@ -45,12 +45,12 @@ class QActor(TensorDictSequential):
 
 
 class RandomActor(TensorDictModuleBase):
-    """Every action is equally likely, whatever is seen.
+    """Chooses uniformly random actions.
 
     Args:
-        actions: how many actions A there are.
-        device: where it chooses.
-        seed: of its own stream of random numbers.
+        actions: the number of actions A.
+        device: the device of the actions.
+        seed: the seed of its own generator.
     """
 
     in_keys = ("observation",)
@@ -62,7 +62,7 @@ class RandomActor(TensorDictModuleBase):
         self.generator = torch.Generator(device).manual_seed(seed)
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
-        """Writes "action", int64 of the TensorDict's batch size."""
+        """Writes "action", int64 with the TensorDict's batch size."""
         chosen = torch.randint(
             self.actions, tensordict.batch_size, generator=self.generator, device=self.generator.device
         )

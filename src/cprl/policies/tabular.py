@@ -1,4 +1,4 @@
-"""Acting by tables: the value of each action in each state that an agent has met, and who reads it."""
+"""Tabular policies: tables of action values, and the actor and network that read them."""
 
 from collections.abc import Mapping, Sequence
 from math import prod
@@ -12,43 +12,43 @@ from tensordict.nn import TensorDictModuleBase
 from torch import Tensor, nn
 from torchrl.envs.utils import ExplorationType, exploration_type
 
-from cprl.commons.game import Game
 from cprl.policies.rng import LaneRng
+from cprl.spaces import Spaces
 
 NEVER_MET = 0
-"""The row of a state that is in no table; its values stay 0."""
+"""The row of states that are in no table; its values stay 0."""
 _FIRST_ROWS = 1024
 
 
 class QTables:
-    """A table for each lane, all in one array; a state is the bytes of what its agent observes.
+    """A table of action values per lane, all in one array; a state is the bytes of an agent's observation.
 
     Args:
-        lanes: how many tables L.
-        actions: how many actions A a row has.
-        max_states: rows of a lane at most.
+        lanes: The number of tables L.
+        actions: The number of actions A.
+        max_states: The largest number of states per lane.
     """
 
     def __init__(self, lanes: int, actions: int, *, max_states: int) -> None:
         self.max_states = max_states
         self.rows: list[dict[bytes, int]] = [{} for _ in range(lanes)]
-        """Of each lane, the row of each state that it has met."""
+        """For each lane, the row of each state it has met."""
         self.values = np.zeros((_FIRST_ROWS, actions), np.float64)
-        """float64 [rows, A], rows of all lanes as they were met; row 0 is of states never met."""
+        """float64 [rows, A], the values of all lanes in the order in which states were met; see NEVER_MET."""
         self.visits = np.zeros((_FIRST_ROWS, actions), np.int64)
-        """int64 [rows, A]: how often each value was learned."""
+        """int64 [rows, A], how often each value was updated."""
         self.size = 1
 
     def find(self, states: Sequence[bytes], lanes: Sequence[int]) -> NDArray[np.int64]:
-        """The row of each state in the table of its lane, int64 [n]; NEVER_MET where there is none."""
+        """The row of each state in the table of its lane, int64 [n]; NEVER_MET if it has none."""
         found = [self.rows[lane].get(state, NEVER_MET) for state, lane in zip(states, lanes, strict=True)]
         return np.array(found, np.int64)
 
     def find_or_add(self, states: Sequence[bytes], lanes: Sequence[int]) -> NDArray[np.int64]:
-        """The same, with a new row for a state never met.
+        """As `find`, but adds a row for each state that has none.
 
         Raises:
-            MemoryError: where a lane would have more than `max_states`.
+            MemoryError: If a lane would have more than `max_states` states.
         """
         rows = self.find(states, lanes)
         for n in np.flatnonzero(rows == NEVER_MET).tolist():
@@ -59,8 +59,8 @@ class QTables:
         own = self.rows[lane]
         if len(own) >= self.max_states:
             raise MemoryError(
-                f"lane {lane} has met {len(own):,} states, as many as max_states allows, and now another; "
-                "tabulate a smaller board, see less of it, or raise TabularSettings.max_states"
+                f"lane {lane} has met {len(own):,} states, as many as max_states allows, and meets another; "
+                "use a smaller board or a smaller observation, or raise TabularSettings.max_states"
             )
         if self.size == len(self.values):
             self.values = np.concatenate([self.values, np.zeros_like(self.values)])
@@ -69,13 +69,13 @@ class QTables:
         return own[state]
 
     def of_lane(self, lane: int) -> tuple[NDArray[np.uint8], NDArray[np.float64], NDArray[np.int64]]:
-        """The states that a lane has met, uint8 [n, bytes], their values and visits [n, A]; copies."""
+        """Copies of the n states that a lane has met, uint8 [n, bytes], their values and visits, [n, A]."""
         states, rows = list(self.rows[lane]), list(self.rows[lane].values())
         flat = np.frombuffer(b"".join(states), np.uint8).reshape(len(states), -1 if states else 0)
         return flat.copy(), self.values[rows], self.visits[rows]
 
     def state_dict(self) -> dict[str, Tensor]:
-        """All tables as tensors, a row for each state in the order in which they were met."""
+        """All tables as tensors, one row per state, in the order in which the states were met."""
         known = sorted((row, lane, state) for lane, own in enumerate(self.rows) for state, row in own.items())
         states = np.frombuffer(b"".join(state for _, _, state in known), np.uint8).copy()
         return {
@@ -86,7 +86,7 @@ class QTables:
         }
 
     def load_state_dict(self, state: Mapping[str, Tensor]) -> None:
-        """Goes on with the tables of that state."""
+        """Replaces the tables by those of a `state_dict`."""
         self.rows = [{} for _ in self.rows]
         for row, (seen, lane) in enumerate(
             zip(state["states"].numpy(), state["lanes"].tolist(), strict=True)
@@ -96,22 +96,20 @@ class QTables:
         self.size = len(self.values)
 
 
-def observed_entries(game: Game) -> tuple[str, ...]:
-    """The names of all that agents of a game observe."""
-    gauge = ("stock_gauge",) if game.observation.stock_gauge else ()
-    board = ("scoreboard",) if game.observation.scoreboard else ()
-    return ("observation", *gauge, *board)
+def observed_entries(spaces: Spaces) -> tuple[str, ...]:
+    """The names of all entries that agents observe."""
+    return ("observation", *(name for name, _ in spaces.vectors))
 
 
 def states_of(
     observed: TensorDictBase, names: Sequence[str], agents: Sequence[int] | None = None
 ) -> list[bytes]:
-    """The state of each agent: the bytes of all that it observes.
+    """The state of each agent: the bytes of everything it observes.
 
     Args:
-        observed: the entries of `observed_entries`, [B, S, ...] each.
-        names: which entries.
-        agents: the agents' numbers; None for all.
+        observed: Holds the entries of `observed_entries`, [B, S, ...] each.
+        names: The entries to use.
+        agents: The indices of the agents; None for all.
 
     Returns:
         B x S states, world by world.
@@ -125,14 +123,14 @@ def states_of(
 
 
 class TableNetwork(nn.Module):
-    """What one agent has tabulated as an acting network, to be kept, loaded and frozen like any other.
+    """The table of one agent as a network, so that it can be saved, loaded and frozen like any other.
 
-    Its state dict holds "states", uint8 [n, C X Y], and their "values", float64 [n, A]; it takes one with any
-    number of states. At first it knows none.
+    Its state dict holds "states", uint8 [n, C X Y], and their "values", float64 [n, A]. It loads a state dict
+    with any number of states n; initially n is 0.
 
     Args:
-        observation_shape: (C, X, Y) of an observation.
-        actions: how many actions A there are.
+        observation_shape: The shape (C, X, Y) of an observation.
+        actions: The number of actions A.
     """
 
     states: Tensor
@@ -144,9 +142,11 @@ class TableNetwork(nn.Module):
         self.register_buffer("states", torch.zeros((0, prod(observation_shape)), dtype=torch.uint8))
         self.register_buffer("values", torch.zeros((0, actions), dtype=torch.float64))
         self._rows: dict[bytes, int] = {}
+        self.register_load_state_dict_pre_hook(_take_as_many_states_as_come)  # type: ignore[no-untyped-call]
+        self.register_load_state_dict_post_hook(_find_them_again)  # type: ignore[no-untyped-call]
 
     def forward(self, observation: Tensor) -> Tensor:
-        """uint8 [..., C, X, Y] to float64 [..., A]; 0 for what was never met."""
+        """Maps observations, uint8 [..., C, X, Y], to values, float64 [..., A]; 0 for states never met."""
         seen = observation.flatten(-self.observation_dims)
         flat = seen.reshape(-1, seen.shape[-1]).numpy(force=True)
         rows = torch.tensor([self._rows.get(state.tobytes(), -1) for state in flat])
@@ -154,49 +154,53 @@ class TableNetwork(nn.Module):
         values[known] = self.values[rows[known]]
         return values.reshape(*seen.shape[:-1], -1)
 
-    def _load_from_state_dict(self, state_dict: Any, prefix: str, *how: Any) -> None:
-        """As torch's, with as many states as come."""
-        for name in ("states", "values"):
-            own, came = getattr(self, name), state_dict.get(prefix + name)
-            if came is not None and came.shape[1:] == own.shape[1:]:
-                setattr(self, name, own.new_zeros(came.shape))
-        super()._load_from_state_dict(state_dict, prefix, *how)
-        self._rows = {state.tobytes(): row for row, state in enumerate(self.states.numpy(force=True))}
+
+def _take_as_many_states_as_come(
+    network: TableNetwork, state_dict: Mapping[str, Tensor], prefix: str, *how: Any
+) -> None:
+    for name in ("states", "values"):
+        own, came = getattr(network, name), state_dict.get(prefix + name)
+        if came is not None and came.shape[1:] == own.shape[1:]:
+            setattr(network, name, own.new_zeros(came.shape))
+
+
+def _find_them_again(network: TableNetwork, *how: Any) -> None:
+    network._rows = {state.tobytes(): row for row, state in enumerate(network.states.numpy(force=True))}
 
 
 class TabularActor(TensorDictModuleBase):
-    """Chooses by the tables of its lanes: greedily, or with chance `epsilon` at random.
+    """Acts epsilon-greedily on the tables of its lanes.
 
-    It explores under `ExplorationType.RANDOM` alone, by random numbers of each lane's own. Of equal values
-    the first action's wins, so in a state never met it is the first action.
+    It explores only under `ExplorationType.RANDOM`, with separate random numbers for each lane. Of several
+    actions with the highest value it takes the first, so in a state never met it takes action 0.
 
     Args:
-        tables: of the lanes, lane = replica x seats + seat.
-        game: what is played.
+        tables: the tables of the lanes, with lane = replica x S + agent.
+        spaces: what agents observe and may do.
         seeds: of each lane's exploration.
-        agents: how many seats S of a replica it takes.
+        agents: the number of agents S of each replica.
         worlds: how many worlds k of each replica are played at once, side by side in the batch.
 
-    Reads "observation", [replicas x k, S, C, X, Y], and what else the game tells agents, "stock_gauge" and
-    "scoreboard"; writes "action", int64 [replicas x k, S].
+    Reads "observation", [replicas x k, S, C, X, Y], and "stock_gauge" and "scoreboard" if the game has them;
+    writes "action", int64 [replicas x k, S].
     """
 
     out_keys = ("action",)
     stochastic = False
 
     def __init__(
-        self, tables: QTables, game: Game, *, seeds: Sequence[Sequence[int]], agents: int, worlds: int = 1
+        self, tables: QTables, spaces: Spaces, *, seeds: Sequence[Sequence[int]], agents: int, worlds: int = 1
     ) -> None:
         super().__init__()
-        self.in_keys = observed_entries(game)
-        self.tables, self.actions, self.epsilon = tables, len(game.actions), 1.0
+        self.in_keys = observed_entries(spaces)
+        self.tables, self.actions, self.epsilon = tables, spaces.actions, 1.0
         self.agents, self.worlds, self.replicas = agents, worlds, len(seeds) // agents
         self.rng = LaneRng(seeds, 2 * worlds)
         lanes = np.arange(len(seeds)).reshape(self.replicas, 1, agents)
         self._lanes = np.broadcast_to(lanes, (self.replicas, worlds, agents)).reshape(-1).tolist()
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
-        """See the class."""
+        """Writes "action"; see the class."""
         rows = self.tables.find(states_of(tensordict, self.in_keys), self._lanes)
         chosen = self.tables.values[rows].argmax(1)
         if exploration_type() in (ExplorationType.RANDOM, None):
@@ -207,9 +211,9 @@ class TabularActor(TensorDictModuleBase):
         return tensordict.set("action", action)
 
     def get_extra_state(self) -> dict[str, Any]:
-        """Where its random numbers stand; part of `state_dict`."""
+        """The state of the random numbers; part of `state_dict`."""
         return self.rng.state_dict()
 
     def set_extra_state(self, state: dict[str, Any]) -> None:
-        """See `get_extra_state`."""
+        """Restores the state of the random numbers; see `get_extra_state`."""
         self.rng.load_state_dict(state)

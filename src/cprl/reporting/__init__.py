@@ -1,4 +1,4 @@
-"""Reporting: finished runs beside the published study."""
+"""Reports that compare finished runs with the published study."""
 
 from cprl.reporting.report import write_report
 

@@ -1,45 +1,44 @@
-"""The study's claims as measures of ours: of curves of episodes, and of trained agents at play."""
+"""Measures for the study's claims: of training curves, and of trained agents in new worlds."""
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from functools import cache, partial
+from functools import partial
 from pathlib import Path
-from typing import Final
+from typing import Any, Final
 
 import numpy as np
 from numpy.typing import NDArray
 
-from cprl.commons.game import Game
-from cprl.evaluation.evaluate import SEED, kept_replicas
-from cprl.evaluation.lanes import Sitter, fresh_worlds, random_agents, seated
+from cprl.evaluation.evaluate import SEED
+from cprl.evaluation.lanes import Source, fresh_worlds, policies_of, random_policies
 from cprl.measuring.movement import Trace, overlap, rounds, shooting_distance, trace
 from cprl.measuring.statistics import Estimate, estimate
 from cprl.policies.assignment import AgentPolicies
 from cprl.runs.curves import curves_of, running_mean
-from cprl.stored import load
+from cprl.stored import LoadedRun, load
 
 Values = NDArray[np.float64]
 
 WORLDS: Final = 64
-"""Fresh worlds that the trained agents of each replica play, one episode in each, as in evaluation."""
+"""The number of new worlds per replica in which trained agents play one episode each, as in evaluation."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class Measure:
-    """A number that says something about a claim."""
+    """A measure for a claim of the study."""
 
     name: str
     trained: Estimate
-    """Over replicas."""
+    """The value of the run, over its replicas."""
     random: float | None
-    """Of the random policy at all seats, in the same worlds; None for measures of training."""
+    """The mean if all agents follow the random policy, in the same worlds; None for measures of training."""
 
 
 def measures(run: Path) -> list[Measure]:
-    """What can be measured of a run's claims: of its training, and of its trained agents at play.
+    """All measures of a run: of its training curves, and of its trained agents in new worlds.
 
     Args:
-        run: its directory, or its results.
+        run: The directory of the run, or of its exported results.
     """
     curves = curves_of(run)
     found = [
@@ -47,25 +46,30 @@ def measures(run: Path) -> list[Measure]:
         for name, values in of_training(curves).items()
     ]
     loaded = load(run)
-    game, replicas = loaded.game, tuple(kept_replicas(loaded))
-    trained = _at_play(game, replicas, partial(seated, [Sitter(loaded)] * game.agents))
-    by_chance = _by_chance(game, replicas)
+    replicas = tuple(loaded.replicas)
+    trained = _at_play(loaded, replicas, partial(policies_of, [Source(loaded)] * loaded.game.agents))
+    by_chance = _by_chance(loaded, replicas)
     for name, values in trained.items():
         if np.isfinite(values).all():
             found.append(Measure(name=name, trained=estimate(values), random=float(by_chance[name].mean())))
     return found
 
 
-@cache
-def _by_chance(game: Game, replicas: tuple[int, ...]) -> dict[str, Values]:
-    """`of_play` of the random policy; the same for all runs of a game."""
-    return _at_play(game, replicas, partial(random_agents, game))
+_PLAYED_BY_CHANCE: Final[dict[Any, dict[str, Values]]] = {}
 
 
-def _at_play(game: Game, replicas: Sequence[int], who: Callable[..., AgentPolicies]) -> dict[str, Values]:
+def _by_chance(run: LoadedRun, replicas: tuple[int, ...]) -> dict[str, Values]:
+    """`of_play` of the random policy; the same for all runs of a game, so played once."""
+    key = run.game, run.experiment.transforms, replicas
+    if key not in _PLAYED_BY_CHANCE:
+        _PLAYED_BY_CHANCE[key] = _at_play(run, replicas, partial(random_policies, run))
+    return _PLAYED_BY_CHANCE[key]
+
+
+def _at_play(run: LoadedRun, replicas: Sequence[int], who: Callable[..., AgentPolicies]) -> dict[str, Values]:
     """`of_play` of a game in the same fresh worlds, whoever plays."""
     found: dict[str, list[Values]] = {}
-    for group, env in fresh_worlds(game, replicas, worlds=WORLDS, seed=SEED):
+    for group, env in fresh_worlds(run, replicas, worlds=WORLDS, seed=SEED):
         played = trace(env, who(group, worlds=WORLDS, seed=SEED))
         for name, values in of_play(played, len(group)).items():
             found.setdefault(name, []).append(values)
@@ -73,10 +77,10 @@ def _at_play(game: Game, replicas: Sequence[int], who: Callable[..., AgentPolici
 
 
 def of_training(curves: dict[str, Values]) -> dict[str, Values]:
-    """Measures of the course of training, [R] each.
+    """Measures of training curves, float64 [R] each.
 
     Args:
-        curves: as `curves_of` gives them.
+        curves: The curves of a run, as `curves_of` returns them.
     """
     returns = running_mean(curves["collective_return"])
     early = returns[:, : min(600, returns.shape[1])]
@@ -96,7 +100,7 @@ def of_training(curves: dict[str, Values]) -> dict[str, Values]:
 
 
 def dip_depth(curves: Values) -> Values:
-    """How far each curve falls below its highest point so far, at most, as a share of it, [R, E] to [R]."""
+    """The largest fall of each curve below its highest value so far, as a share of it, [R, E] to [R]."""
     peaks = np.maximum.accumulate(curves, axis=1)
     falls = np.divide(peaks - curves, peaks, out=np.zeros_like(peaks), where=peaks > 0)
     deepest: Values = falls.max(1)
@@ -104,18 +108,18 @@ def dip_depth(curves: Values) -> Values:
 
 
 def of_play(played: Trace, replicas: int) -> dict[str, Values]:
-    """Measures of agents at play, [R] each; NaN where nobody fired with another one in play.
+    """Measures of played episodes, float64 [R] each; NaN where no agent fired while another was in play.
 
     Args:
-        played: an episode of each world, those of a replica side by side.
-        replicas: how many replicas R.
+        played: One episode of each world; the worlds of a replica are adjacent.
+        replicas: The number of replicas R.
     """
 
     def by_replica(of_worlds: Values) -> Values:
         return of_worlds.reshape(replicas, -1)
 
     def mean(of_worlds: Values) -> Values:
-        """Of each replica, over those of its worlds that have the number."""
+        """The mean of each replica over those of its worlds in which the value is finite."""
         values = by_replica(of_worlds)
         with np.errstate(invalid="ignore"):
             means: Values = np.nansum(values, 1) / np.isfinite(values).sum(1)

@@ -1,6 +1,6 @@
-"""The report of finished runs beside the published study: tables in Markdown, figures as PNG.
+"""The report that compares finished runs with the published study: tables in Markdown, figures as PNG.
 
-Made from results alone (`cprl.runs.export`), so that anybody can make it again.
+It needs only exported results (`cprl.runs.export`), so that anyone can reproduce it.
 """
 
 import shlex
@@ -37,11 +37,15 @@ def write_report(runs: Sequence[Path], out: Path) -> Path:
     """Writes `tables.md` and its figures.
 
     Args:
-        runs: their directories, or results.
-        out: the folder of the report.
+        runs: The directories of runs, or of exported results.
+        out: The folder of the report; created if missing.
 
     Returns:
-        `out/tables.md`.
+        The path `out/tables.md`.
+
+    Raises:
+        ValueError: If a path has no run.
+        FileNotFoundError: If a run has no episodes or has not ended.
     """
     results = [read_result(path) for path in runs]
     (out / "figures").mkdir(parents=True, exist_ok=True)
@@ -70,7 +74,7 @@ def _runs(results: Sequence[Result]) -> list[str]:
     rows = []
     for result in results:
         git, versions = result.recipe["git"] or {}, result.recipe["versions"]
-        took = timedelta(seconds=round(result.told["training_s"]))
+        took = timedelta(seconds=round(result.report["training_s"]))
         rows.append(
             [
                 result.name,
@@ -85,12 +89,12 @@ def _runs(results: Sequence[Result]) -> list[str]:
 
 
 def _command(line: str) -> str:
-    """The command as anybody would give it: from the recipes' folder on, without a place of one's own."""
+    """The command line from `recipes/` on, without the output directory and without `--go-on`."""
     words = shlex.split(line)
     if "--out" in words:
         at = words.index("--out")
         del words[at : at + 2]
-    kept = [word for word in words if word != "--go-on"]
+    kept = [word for word in words if word not in ("--resume", "--go-on")]
     script = kept[0]
     return shlex.join(
         ["python", script[script.find("recipes/") :] if "recipes/" in script else script, *kept[1:]]
@@ -107,10 +111,10 @@ def _appendix(results: Sequence[Result]) -> list[str]:
                 result.name,
                 f"{study.number}" if study else "",
                 f"{study.random}" if study and study.random is not None else "",
-                _told(evaluated["random"]),
+                _estimate_cell(evaluated["random"]),
                 f"{study.trained}" if study else "",
-                _told(returns.mean(1)),
-                _told(evaluated["trained"]),
+                _estimate_cell(returns.mean(1)),
+                _estimate_cell(evaluated["trained"]),
             ]
         )
     head = ["run", "experiment", "random, published", "random, ours", "trained, published"]
@@ -159,7 +163,7 @@ def _figures(results: Sequence[Result], out: Path) -> list[str]:
 
 
 def _draw(result: Result, metric: str, path: Path) -> None:
-    """Mean and interval over replicas, single replicas, the published curve, and phases of experiment 5."""
+    """Draws replicas, their mean and its interval, the published curve, and the phases of experiment 5."""
     smoothed = running_mean(result.curves[metric])
     middle, low, high = curve_interval(smoothed, resamples=500)
     figure = Figure(figsize=(8, 4.2), layout="constrained")
@@ -181,10 +185,10 @@ def _draw(result: Result, metric: str, path: Path) -> None:
 
 
 def _evaluated(run: Path, policy: str) -> Values | None:
-    """The mean collective return of each replica in its evaluation, [R], where there is one."""
+    """The mean collective return of each replica in its evaluation, [R]; None if there is no evaluation."""
     path = run / "evaluation" / f"{policy}.parquet"
     return as_curves(pq.read_table(path))["collective_return"].mean(1) if path.exists() else None
 
 
-def _told(values: Values | None) -> str:
+def _estimate_cell(values: Values | None) -> str:
     return "" if values is None else str(estimate(values))

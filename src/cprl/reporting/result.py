@@ -1,4 +1,4 @@
-"""What a finished run left, as far as a report needs it."""
+"""Result: the files of a finished run that a report needs."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -9,8 +9,12 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
+from cprl import presets
+from cprl.algorithms import DQN
+from cprl.experiment import Experiment
 from cprl.measuring import phases
-from cprl.measuring.published import Experiment, experiment
+from cprl.measuring.published import PublishedExperiment, published_experiment
+from cprl.population import Learning
 from cprl.runs.curves import curves_of, running_mean
 from cprl.runs.directory import read_json, read_recipe
 
@@ -21,55 +25,59 @@ TOO_FEW: Final = "too few episodes"
 
 @dataclass(kw_only=True, eq=False)
 class Result:
-    """What a run left, as far as a report needs it."""
+    """The files of a finished run that a report needs, as read."""
 
     path: Path
     recipe: Mapping[str, Any]
-    told: Mapping[str, Any]
+    experiment: Experiment
+    report: Mapping[str, Any]
     """`report.json`."""
     curves: Mapping[str, Values]
-    study: Experiment | None
+    study: PublishedExperiment | None
     """The study's experiment that its recipe repeats."""
 
     @property
     def name(self) -> str:
-        """That of its directory."""
+        """The name of the run's directory."""
         return self.path.name
 
     @property
     def title(self) -> str:
         """What was run, in a few words."""
-        arguments, (replicas, episodes) = self.recipe["arguments"], self.curves["collective_return"].shape
-        told = [self.recipe["recipe"]]
-        if "variant" in arguments:
-            told.append(f"{arguments['variant']} rules")
-        if "learner" in arguments:
-            told.append(f"targets replaced every {arguments['learner']['target_every_episodes']} episodes")
-            told.append(f"epsilon decays in {arguments['learner']['epsilon_decay_steps']:,} steps")
-        return ", ".join([*told, f"{replicas} replicas of {episodes:,} episodes"])
+        replicas, episodes = self.curves["collective_return"].shape
+        parts, variant = [self.recipe["recipe"]], presets.variant_of(self.experiment.game)
+        if variant is not None:
+            parts.append(f"{variant} rules")
+        specs = [spec for spec in self.experiment.agents if isinstance(spec, Learning)]
+        settings = specs[0].algorithm.settings if specs and isinstance(specs[0].algorithm, DQN) else None
+        if settings is not None:
+            parts.append(f"targets replaced every {settings.target_every_episodes} episodes")
+            parts.append(f"epsilon decays in {settings.epsilon_decay_steps:,} steps")
+        return ", ".join([*parts, f"{replicas} replicas of {episodes:,} episodes"])
 
     @cached_property
     def phases(self) -> tuple[list[phases.ChangePoint], list[phases.Phase]] | None:
-        """As those of experiment 5 are told; None where there are too few episodes."""
+        """Change points and phases of the running means; None if there are too few episodes."""
         smoothed = {name: running_mean(self.curves[name]) for name in phases.METRICS}
         episodes = np.arange(smoothed["equality"].shape[1])
         if len(episodes) <= 4 * phases.SHORTEST:
             return None
-        return phases.told_apart(episodes, smoothed)
+        return phases.find_phases(episodes, smoothed)
 
 
 def read_result(path: Path) -> Result:
-    """A run's directory, or its results.
+    """Reads a run's directory, or its exported results.
 
     Raises:
-        ValueError: where there is no run.
-        FileNotFoundError: where it has no episodes or did not end.
+        ValueError: If the path has no run.
+        FileNotFoundError: If the run has no episodes or has not ended.
     """
     recipe = read_recipe(path)
     return Result(
         path=path,
         recipe=recipe,
-        told=read_json(path / "report.json"),
+        experiment=Experiment.from_recipe(recipe, directory=path),
+        report=read_json(path / "report.json"),
         curves=curves_of(path),
-        study=experiment(recipe["recipe"]),
+        study=published_experiment(recipe["recipe"]),
     )

@@ -1,4 +1,4 @@
-"""Phases and turning points of experiment 5, beside those of the published curves."""
+"""Phases and turning points of experiment 5, compared with those of the published curves."""
 
 from collections.abc import Sequence
 from typing import Final
@@ -6,29 +6,29 @@ from typing import Final
 import numpy as np
 
 from cprl.measuring import phases
-from cprl.measuring.published import PHASES_BEGIN, curve, experiment
+from cprl.measuring.published import PHASES_BEGIN, curve, published_experiment
 from cprl.reporting.markdown import table
 from cprl.reporting.result import TOO_FEW, Result, Values
 from cprl.runs.curves import running_mean
 
 SURVIVED: Final = 990
-"""Steps, of an episode's 1000, below which the running mean of survival counts as falling."""
+"""The running mean of survival, in steps of an episode's 1000, below which survival counts as falling."""
 
 
 def phases_of(results: Sequence[Result]) -> list[str]:
-    """A section of the phases, those of the published curves first."""
+    """The section on phases, those of the published curves first."""
     rows = [["published curves", *_phase_cells(*_published_phases())]]
     for result in _of_experiment_5(results):
         cells = _phase_cells(*result.phases) if result.phases else [TOO_FEW, "", "", ""]
         rows.append([result.name, *cells])
     head = ["curves", "second phase from", "third", "fourth", "phases by their pattern"]
     drawn = ", ".join(map(str, PHASES_BEGIN))
-    told = f"The study draws its phases from {drawn} on. See `cprl.measuring.phases` for how ours are found."
-    return ["## Phases of experiment 5", "", told, "", *table(head, rows)]
+    note = f"The study draws its phases from {drawn} on. See `cprl.measuring.phases` for how ours are found."
+    return ["## Phases of experiment 5", "", note, "", *table(head, rows)]
 
 
 def turning_points_of(results: Sequence[Result]) -> list[str]:
-    """A section of where the curves turn, of the mean of replicas; empty without a run of experiment 5."""
+    """The section on the turning points of the mean over replicas; empty without a run of experiment 5."""
     runs = _of_experiment_5(results)
     if not runs:
         return []
@@ -48,7 +48,7 @@ def turning_points_of(results: Sequence[Result]) -> list[str]:
 
 
 def _turning_cells(returns: tuple[Values, Values], survival: tuple[Values, Values]) -> list[str]:
-    """Of curves, each its episodes and its values."""
+    """The cells of one row; each curve consists of its episodes and its values."""
     at, values = returns
     top = int(values.argmax())
     bottom = top + int(values[top:].argmin())
@@ -63,12 +63,12 @@ def _of_experiment_5(results: Sequence[Result]) -> list[Result]:
 
 
 def _published_phases() -> tuple[list[phases.ChangePoint], list[phases.Phase]]:
-    study = experiment("commons")
+    study = published_experiment("commons")
     assert study is not None
     episodes = np.arange(10, 4745)
-    # The curve of survival begins at episode 512; before that nobody depletes the board.
+    # The curve of survival begins at episode 512; before that no agents deplete the board.
     metrics = {name: np.interp(episodes, *curve(study.curves[name])) for name in phases.METRICS}
-    return phases.told_apart(episodes, metrics)
+    return phases.find_phases(episodes, metrics)
 
 
 def _phase_cells(changes: Sequence[phases.ChangePoint], found: Sequence[phases.Phase]) -> list[str]:

@@ -1,4 +1,4 @@
-"""Checkpointer: the whole state of a training on disk, so that whatever stops it, it goes on bit for bit."""
+"""Checkpointer: saves the full state of a training, so that a stopped training resumes bit for bit."""
 
 import hashlib
 import os
@@ -14,23 +14,23 @@ from typing import Any, Final, Protocol, Self
 import torch
 from rich.console import Console
 
+from cprl.runs.directory import resume_command as command_to_resume
 from cprl.runs.files import place_atomically
-from cprl.runs.directory import resume_command
 
 FOLDER: Final = "checkpoints"
 EVERY_S: Final = 300.0
 KEPT: Final = 2
-"""Checkpointer that stay: the newest, and one more should it turn out unreadable."""
+"""Checkpoints that are kept: the newest, and one more in case it is unreadable."""
 
 PARTIAL: Final = "training.partial"
-"""A checkpoint that is being written, or whose writing was killed."""
+"""The suffix of a checkpoint that is being written, or whose writing was interrupted."""
 
 _NAME: Final = re.compile(r"training-(\d{12})-([0-9a-f]{32})\.pt")
 _SIGNALS: Final = (signal.SIGINT, signal.SIGTERM)
 
 
 class HasState(Protocol):
-    """What is kept: `cprl.training.Training`."""
+    """What a checkpoint saves: `cprl.training.Training`."""
 
     steps: int
 
@@ -39,20 +39,20 @@ class HasState(Protocol):
 
 
 class Checkpointer:
-    """Keeps the state of a training every so many seconds, and when it is told to stop; a context manager.
+    """Saves the state of a training every `every_s` seconds, and when it is stopped; a context manager.
 
-    A checkpoint is written beside the others, put safely on the disk and only then given its name, which
-    holds the checksum of its content. On the first SIGINT or SIGTERM the step in progress is finished, the
-    state kept, and the process ends with exit code 0 and the line that goes on; on the second it ends at
-    once. When the block ends without an error the checkpoints are taken away: keep what you want of the
-    training within it.
+    A checkpoint is written to a temporary file, synced to disk and then renamed; its name includes the
+    checksum of its content. On the first SIGINT or SIGTERM the checkpointer finishes the current step, saves
+    the state, prints the command that resumes and exits with code 0; the second signal ends the process at
+    once. When the block ends without an error the checkpoints are deleted, so save results within the block.
 
     Args:
         run: the run's directory.
-        every_s: seconds from one checkpoint to the next.
-        resume: the command line that goes on, told where the run is stopped; by default `resume_command`.
-        log_event: told of each checkpoint in words, e.g. `ViewerCallback.log_event`.
-        console: where to; by default standard output.
+        every_s: seconds between checkpoints, above 0.
+        resume_command: the command line that resumes, printed when the run is stopped; by default that of
+            this process.
+        log_event: called with a text at each checkpoint, e.g. `ViewerCallback.log_event`.
+        console: the console for messages; by default standard output.
     """
 
     def __init__(
@@ -60,14 +60,14 @@ class Checkpointer:
         run: Path,
         *,
         every_s: float = EVERY_S,
-        resume: str | None = None,
+        resume_command: str | None = None,
         log_event: Callable[[str], object] | None = None,
         console: Console | None = None,
     ) -> None:
         if not every_s > 0:
-            raise ValueError(f"every_s is {every_s}; a number above 0 is wanted")
+            raise ValueError(f"every_s is {every_s}; allowed: a number above 0")
         self.folder, self.every_s = run / FOLDER, every_s
-        self.resume = resume_command(run) if resume is None else resume
+        self.resume_command = command_to_resume(run) if resume_command is None else resume_command
         self.log_event = log_event
         self.console = console or Console()
         self._saved = time.monotonic()
@@ -75,10 +75,10 @@ class Checkpointer:
         self._usual: dict[int, Any] = {}
 
     def restore(self, training: HasState) -> None:
-        """Puts the training where the newest readable checkpoint was, if there is one.
+        """Restores the newest readable checkpoint, if there is one.
 
         Raises:
-            ValueError: where there are checkpoints, but none can be read; names each with its reason.
+            ValueError: if there are checkpoints but none can be read; names each with its reason.
         """
         reasons = []
         for path in reversed(checkpoints_in(self.folder)):
@@ -88,26 +88,26 @@ class Checkpointer:
                 reasons.append(str(error))
                 continue
             training.load_state_dict(state)
-            self.console.print(f"Going on from step {training.steps:,}: {path}", soft_wrap=True)
+            self.console.print(f"Resuming from step {training.steps:,}: {path}", soft_wrap=True)
             self._saved = time.monotonic()
             return
         if reasons:
             raise ValueError("no checkpoint can be read: " + "; ".join(reasons))
 
     def after_step(self, training: HasState) -> None:
-        """Keeps the state if it is time to, or if the process was asked to stop, which it then does."""
+        """Saves a checkpoint if one is due, or if the process was asked to stop; then stops it."""
         if self._asked_to_stop:
             path = self.save(training)
             self.console.print(
-                f"Stopped; everything up to step {training.steps:,} is in {path}", soft_wrap=True
+                f"Stopped; everything up to step {training.steps:,} is saved in {path}", soft_wrap=True
             )
-            self.console.print(f"To go on: {self.resume}", soft_wrap=True, highlight=False)
+            self.console.print(f"To resume: {self.resume_command}", soft_wrap=True, highlight=False)
             raise SystemExit(0)
         if time.monotonic() - self._saved >= self.every_s:
             self.save(training)
 
     def save(self, training: HasState) -> Path:
-        """Writes a checkpoint, all or nothing, and takes away those that are older than the newest two."""
+        """Writes a checkpoint atomically, and deletes all but the newest two."""
         self.folder.mkdir(parents=True, exist_ok=True)
         path = place_atomically(
             self.folder / PARTIAL,
@@ -122,13 +122,13 @@ class Checkpointer:
         return path
 
     def done(self) -> None:
-        """Takes the checkpoints away: the run is over, and its weights and episodes are kept elsewhere."""
+        """Deletes the checkpoints: the run has ended, and its weights and episodes are saved separately."""
         for path in checkpoints_in(self.folder):
             path.unlink()
         (self.folder / PARTIAL).unlink(missing_ok=True)
 
     def __enter__(self) -> Self:
-        # Python takes signals in the main thread alone; elsewhere they stay whose they are.
+        # Python handles signals in the main thread only; in other threads handlers stay as they are.
         for number in _SIGNALS if current_thread() is main_thread() else ():
             self._usual[number] = signal.signal(number, self._stop)
         return self
@@ -150,7 +150,7 @@ class Checkpointer:
             os.kill(os.getpid(), number)
             return
         self._asked_to_stop = True
-        self.console.print("Stopping after this step; once more to stop at once.")
+        self.console.print("Stopping after this step; signal again to stop at once.")
 
 
 def checkpoints_in(folder: Path) -> list[Path]:
@@ -163,11 +163,11 @@ def read_checkpoint(path: Path) -> dict[str, Any]:
     """The state in a checkpoint; runs no code of the file.
 
     Raises:
-        ValueError: for a file that is none, is truncated or was changed; names file and reason.
+        ValueError: if the file is not a checkpoint, is truncated or was changed; names file and reason.
     """
     name = _NAME.fullmatch(path.name)
     if name is None:
-        raise ValueError(f"{path} is no checkpoint: its name is not training-<steps>-<checksum>.pt")
+        raise ValueError(f"{path} is not a checkpoint; allowed: a name like training-<steps>-<checksum>.pt")
     try:
         checksum = _checksum(path)
     except OSError as error:
@@ -177,7 +177,7 @@ def read_checkpoint(path: Path) -> dict[str, Any]:
     try:
         state: dict[str, Any] = torch.load(path, weights_only=True)
     except Exception as error:
-        raise ValueError(f"{path} holds something else than the state of a training: {error}") from error
+        raise ValueError(f"{path} is not the state of a training: {error}") from error
     return state
 
 

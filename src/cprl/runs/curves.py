@@ -1,4 +1,4 @@
-"""The table of a run as curves: a number for each replica and episode, smoothed as the study smooths."""
+"""The episodes of a run as curves: a number for each replica and episode, smoothed as in the study."""
 
 from pathlib import Path
 from typing import Any
@@ -15,20 +15,20 @@ Values = NDArray[np.float64]
 
 
 def curves_of(run: Path) -> dict[str, Values]:
-    """Every metric of a run's episodes, and `return_0` and so on for each agent's return.
+    """Every metric that a run's game reports, and each agent's return as `return_0` and so on.
 
     Args:
         run: the run's directory.
 
     Returns:
-        float64 [R, E] by name, R replicas and the E episodes that all of them have ended; NaN where a metric
-        is undefined.
+        float64 [R, E] by name, for R replicas and the E episodes that all of them have ended; NaN where a
+        metric is undefined.
     """
     return as_curves(read_episodes(run))
 
 
 def as_curves(table: pa.Table) -> dict[str, Values]:
-    """See `curves_of`; of a table as `read_episodes` gives it."""
+    """Like `curves_of`, from a table of `read_episodes`."""
     replica, episode, agent = (table[name].to_numpy() for name in ("replica", "episode", "agent"))
     replicas, row = np.unique(replica, return_inverse=True)
     episodes = min(int(episode[row == nth].max()) for nth in range(len(replicas))) + 1
@@ -48,9 +48,9 @@ def as_curves(table: pa.Table) -> dict[str, Values]:
 
 
 def running_mean(values: Values, window: int = SMOOTHED_EPISODES) -> Values:
-    """Means over `window` values in a row, each at the place of the first, [..., len - window + 1].
+    """Means over `window` consecutive values, each at the position of the first, [..., len - window + 1].
 
-    Over all of them if there are fewer. What is undefined is left out; NaN where nothing is defined.
+    With fewer values, the mean of all. Undefined values are skipped; NaN where no value is defined.
     """
     window = min(window, values.shape[-1])
     defined = ~np.isnan(values)

@@ -1,171 +1,176 @@
-"""A run is a directory; `recipe.json` in it says what was run, with what, when and from which commit."""
+"""The directory of a run; its `recipe.json` holds the experiment, versions, start time and git commit."""
 
 import json
 import platform
 import shlex
 import subprocess
 import sys
-from collections.abc import Mapping, Set
-from dataclasses import fields, is_dataclass
+from collections.abc import Callable, Mapping, Sequence
 from datetime import datetime
-from enum import Enum
 from importlib.metadata import PackageNotFoundError, version
 from itertools import count
-from math import isfinite
 from pathlib import Path
 from typing import Any, Final
 
-import numpy as np
-import torch
-
+from cprl.config import custom_targets, differences
 from cprl.runs.files import write_atomically
 
 FILE_NAME: Final = "recipe.json"
 
+_RESUMES: Final = ("--resume", "--no-resume", "--go-on", "--no-go-on")
+_NAMED: Final = 5
+"""The largest number of differences between two recipes that an error names."""
+
 PACKAGES: Final = ("cprl", "torch", "torchrl", "tensordict", "numpy", "numba", "rerun-sdk")
-"""The packages whose versions are kept."""
+"""The packages whose versions are recorded."""
 
 
-def start_run(out: Path | None, name: str, recipe: Mapping[str, object], *, resume: bool = False) -> Path:
-    """Makes the directory of a run and writes down what is about to happen.
+def start_run(
+    out: Path | None,
+    name: str,
+    to_recipe: Callable[[Path], Mapping[str, Any]],
+    *,
+    resume: bool = False,
+    command: Sequence[str] | None = None,
+) -> Path:
+    """Makes the directory of a run and writes its recipe.
 
     Args:
-        out: the directory, new or empty; None for `runs/<name>-<YYYYmmdd-HHMMSS>` where we stand.
-        name: the recipe's name.
-        recipe: its arguments by name, of the types that `to_jsonable` takes.
-        resume: whether the run in `out` is gone on with, which was stopped and has the same recipe.
+        out: the directory, new or empty; None for `runs/<name>-<YYYYmmdd-HHMMSS>` in the working directory.
+        name: the name of the run.
+        to_recipe: makes the recipe for a directory, e.g. `cprl.Experiment.to_recipe`.
+        resume: whether to resume the stopped run in `out`, which must have the same recipe.
+        command: the command line, script first; by default that of this process.
 
     Returns:
-        The directory. Its `recipe.json` holds the recipe's name, the arguments, versions, the git commit of
-        the directory where we stand (None outside a checkout; dirty where a tracked file was changed), the
-        time and the command.
+        The directory. Its `recipe.json` holds the recipe, versions, the git commit of the working directory
+        (None outside a checkout; dirty if a tracked file was changed), the time, and the command without
+        `--out` and without the directory of the script.
 
     Raises:
-        FileExistsError: where `out` is not empty, unless it is gone on with.
-        ValueError: where the name cannot be that of a directory; where there is nothing to go on with, or
-            the run was made with another recipe.
+        FileExistsError: if `out` is not empty and not resumed.
+        ValueError: if the name cannot be that of a directory, there is nothing to resume, or the run was
+            started with another recipe; names the differences.
     """
     if Path(name).name != name:
-        raise ValueError(f'"{name}" names a recipe; a name without slashes is wanted')
+        raise ValueError(f'"{name}" names a run; allowed: a name without slashes')
     if resume:
-        return _same_run(out, name, to_jsonable(recipe))
+        return _same_run(out, to_recipe)
     started = datetime.now().astimezone()
-    told = {
-        "recipe": name,
-        "arguments": to_jsonable(recipe),
+    directory = _new_directory(name, started) if out is None else _empty_directory(Path(out))
+    recipe = {
+        **to_recipe(directory),
         "versions": versions(),
         "git": git_state(),
         "started": started.isoformat(timespec="seconds"),
-        "command": shlex.join(sys.argv),
+        "command": _command(sys.argv if command is None else command),
     }
-    directory = _new_directory(name, started) if out is None else _empty_directory(Path(out))
-    write_json(directory / FILE_NAME, told)
+    write_json(directory / FILE_NAME, recipe)
     return directory
 
 
-def write_json(path: Path, told: object) -> None:
-    """Writes what `to_jsonable` gave, all or nothing."""
-    text = json.dumps(told, indent=2, allow_nan=False) + "\n"
+def write_json(path: Path, value: object) -> None:
+    """Writes a JSON value atomically."""
+    text = json.dumps(value, indent=2, allow_nan=False) + "\n"
     write_atomically(path, lambda file: file.write(text.encode()))
 
 
 def read_json(path: Path) -> dict[str, Any]:
-    """What `write_json` wrote.
+    """Reads a JSON object that `write_json` wrote.
 
     Raises:
-        FileNotFoundError: where there is none.
-        ValueError: where it cannot be read.
+        FileNotFoundError: if there is no such file.
+        ValueError: if it cannot be read or is not an object.
     """
     try:
-        told = json.loads(path.read_text(encoding="utf-8"))
+        value = json.loads(path.read_text(encoding="utf-8"))
     except ValueError as error:
-        raise ValueError(f"{path} holds no JSON: {error}") from error
-    if not isinstance(told, dict):
-        raise ValueError(f"{path} holds no table")
-    return told
+        raise ValueError(f"{path} is not JSON: {error}") from error
+    if not isinstance(value, dict):
+        raise ValueError(f"{path} holds a {type(value).__name__}; allowed: a JSON object")
+    return value
 
 
-def resume_command(run: Path) -> str:
-    """The command line that goes on with a run which this process began, or went on with."""
-    given, left = list(sys.argv), []
+def resume_command(run: Path, command: Sequence[str] | None = None) -> str:
+    """The command line that resumes a run.
+
+    Args:
+        run: the run's directory.
+        command: the command line that started or resumed it, script first; None for a run that was started
+            from Python without one, which `cprl run` resumes.
+    """
+    if command is None:
+        path = run / FILE_NAME
+        targets = custom_targets(read_json(path).get("experiment")) if path.exists() else []
+        allow = [word for target in targets for word in ("--allow", target)]
+        return shlex.join(["cprl", "run", str(run), "--resume", *allow])
+    kept = [word for word in _without_out(command) if word.replace("_", "-") not in _RESUMES]
+    return shlex.join([sys.executable, *kept, "--out", str(run), "--resume"])
+
+
+def _command(words: Sequence[str]) -> str:
+    """A command line without local directories, because recipes are published: the script relative to the
+    working directory, or its name alone, and no `--out`."""
+    script, here = Path(words[0]), Path.cwd()
+    if script.is_absolute():
+        script = script.relative_to(here) if script.is_relative_to(here) else Path(script.name)
+    return shlex.join([str(script), *_without_out(words[1:])])
+
+
+def _without_out(words: Sequence[str]) -> list[str]:
+    """The words of a command line without `--out DIRECTORY`."""
+    given, left = list(words), []
     while given:
         word = given.pop(0)
         if word == "--out" and given:
             given.pop(0)
-        elif word not in ("--go-on", "--no-go-on") and not word.startswith("--out="):
+        elif not word.startswith("--out="):
             left.append(word)
-    return shlex.join([sys.executable, *left, "--out", str(run), "--go-on"])
+    return left
 
 
 def read_recipe(run: Path) -> dict[str, Any]:
-    """What `start_run` wrote.
+    """The recipe that `start_run` wrote; for runs older than `cprl.Experiment`, the recipe in its old format.
+
+    Args:
+        run: the run's directory, or the file itself.
 
     Raises:
-        ValueError: where there is no run, or its recipe cannot be read; names file and reason.
+        ValueError: if there is no run, or its recipe cannot be read; names file and reason.
     """
-    path = Path(run) / FILE_NAME
+    path = Path(run) if Path(run).suffix == ".json" else Path(run) / FILE_NAME
     try:
-        told: dict[str, Any] = json.loads(path.read_text(encoding="utf-8"))
-        if not isinstance(told["arguments"], dict):
-            raise TypeError('"arguments" is no table')
-    except (OSError, ValueError, KeyError, TypeError) as error:
-        raise ValueError(f"{path} is no recipe of a run: {error!r}") from error
-    return told
+        recipe: dict[str, Any] = json.loads(path.read_text(encoding="utf-8"))
+        if not isinstance(recipe, dict) or not any(
+            isinstance(recipe.get(name), dict) for name in ("experiment", "arguments")
+        ):
+            raise TypeError('no table "experiment"')
+    except (OSError, ValueError, TypeError) as error:
+        raise ValueError(f"{path} is not the recipe of a run: {error!r}") from error
+    return recipe
 
 
-def _same_run(out: Path | None, name: str, arguments: Any) -> Path:
-    """The directory of a stopped run, if it is of this recipe."""
+def _same_run(out: Path | None, to_recipe: Callable[[Path], Mapping[str, Any]]) -> Path:
+    """The directory of a stopped run, after a check that it has this recipe."""
     if out is None:
-        raise ValueError("go_on wants the directory of the run as out")
-    told = read_recipe(Path(out))
-    if told.get("recipe") != name:
-        raise ValueError(f"{out} is a run of {told.get('recipe')!r}; this is {name!r}")
-    came, kept = json.loads(json.dumps(arguments)), told["arguments"]
-    changed = [key for key in {**kept, **came} if kept.get(key) != came.get(key)]
-    if changed:
+        raise ValueError("resume requires the directory of the run as out")
+    kept, now = read_recipe(Path(out)), to_recipe(Path(out))
+    if kept.get("recipe") != now["recipe"]:
+        raise ValueError(f"{out} is a run of {kept.get('recipe')!r}; this is {now['recipe']!r}")
+    if kept.get("format") != now["format"]:
         raise ValueError(
-            f"{out} was begun with other arguments: "
-            + "; ".join(f"{key} {kept.get(key)} then, {came.get(key)} now" for key in changed)
+            f"{out} was started by an older cprl, whose trainings this version cannot resume; its agents can "
+            "still be loaded and evaluated"
         )
+    differ = differences(kept["experiment"], now["experiment"], "experiment")
+    if differ:
+        more = f"; and {len(differ) - _NAMED} more" if len(differ) > _NAMED else ""
+        raise ValueError(f"{out} was started with another recipe: {'; '.join(differ[:_NAMED])}{more}")
     return Path(out)
 
 
-def to_jsonable(value: object) -> Any:
-    """The same in dicts, lists, strings and numbers.
-
-    A dataclass becomes a dict of its fields; arrays and tensors nested lists; a path, device or dtype its
-    text; a function or class of a module `module:name`; a number that JSON lacks "nan", "inf" or "-inf".
-
-    Raises:
-        TypeError: for anything else, so that no recipe is kept that cannot be built again.
-    """
-    if isinstance(value, Enum):
-        return to_jsonable(value.value)
-    if value is None or isinstance(value, bool | int | str):
-        return value
-    if isinstance(value, float):
-        return float(value) if isfinite(value) else str(float(value))
-    if isinstance(value, np.ndarray | np.generic):
-        return to_jsonable(value.tolist())
-    if isinstance(value, torch.Tensor):
-        return to_jsonable(value.detach().cpu().tolist())
-    if isinstance(value, Path | torch.device | torch.dtype):
-        return str(value)
-    if "<" not in (name := getattr(value, "__qualname__", "<none>")):
-        return f"{getattr(value, '__module__', None)}:{name}"
-    if is_dataclass(value) and not isinstance(value, type):
-        return {field.name: to_jsonable(getattr(value, field.name)) for field in fields(value)}
-    if isinstance(value, Mapping):
-        return {str(to_jsonable(key)): to_jsonable(entry) for key, entry in value.items()}
-    if isinstance(value, Set):
-        return sorted((to_jsonable(entry) for entry in value), key=str)
-    if isinstance(value, list | tuple | range):
-        return [to_jsonable(entry) for entry in value]
-    raise TypeError(f"a {type(value).__name__} cannot be kept in {FILE_NAME}: {value!r}")
-
-
 def versions() -> dict[str, str | None]:
-    """The versions of Python and of `PACKAGES`; None for what is not installed."""
+    """The versions of Python and of `PACKAGES`; None for packages that are not installed."""
     found: dict[str, str | None] = {"python": platform.python_version()}
     for package in PACKAGES:
         try:
@@ -176,7 +181,7 @@ def versions() -> dict[str, str | None]:
 
 
 def git_state() -> dict[str, str | bool] | None:
-    """The commit of the directory where we stand, and whether a tracked file differs from it; or None."""
+    """The git commit of the working directory, and whether a tracked file differs from it; or None."""
     commit = _git("rev-parse", "HEAD")
     changes = _git("status", "--porcelain", "--untracked-files=no")
     if commit is None or changes is None:
@@ -185,7 +190,7 @@ def git_state() -> dict[str, str | bool] | None:
 
 
 def _git(*arguments: str) -> str | None:
-    """What git says; None where there is no git, no checkout or no commit."""
+    """The output of git; None if there is no git, no checkout or no commit."""
     try:
         done = subprocess.run(["git", *arguments], capture_output=True, text=True, check=True, timeout=10)
     except (OSError, subprocess.SubprocessError):
@@ -194,7 +199,7 @@ def _git(*arguments: str) -> str | None:
 
 
 def _new_directory(name: str, started: datetime) -> Path:
-    """runs/<name>-<time>, with -2, -3 and so on behind it when runs start in the same second."""
+    """runs/<name>-<time>, with the suffix -2, -3 and so on for runs that start in the same second."""
     stem = f"{name}-{started:%Y%m%d-%H%M%S}"
     for nth in count(1):
         directory = Path("runs") / (stem if nth == 1 else f"{stem}-{nth}")
@@ -209,5 +214,5 @@ def _new_directory(name: str, started: datetime) -> Path:
 def _empty_directory(directory: Path) -> Path:
     directory.mkdir(parents=True, exist_ok=True)
     if any(directory.iterdir()):
-        raise FileExistsError(f"{directory} is not empty; a run takes a new or empty directory")
+        raise FileExistsError(f"{directory} is not empty; allowed: a new or empty directory")
     return directory

@@ -1,8 +1,8 @@
-"""The table of a run: one row for each replica, episode and agent, kept from the moment an episode ends.
+"""The episodes of a run as a table: one row for each replica, episode and agent.
 
-While a run goes on, every episode is appended at once to a journal, `episodes.arrows`, an Arrow stream:
-whatever kills the process, all that was added stays readable, since a stream, unlike a parquet file, needs
-no footer. `EpisodeTable.close` turns the journal into `episodes.parquet`; `read_episodes` reads either.
+During a run every episode is appended at once to a journal, `episodes.arrows`, an Arrow stream. Unlike a
+parquet file a stream needs no footer, so it stays readable if the process is killed. `EpisodeTable.close`
+converts the journal to `episodes.parquet`; `read_episodes` reads either.
 """
 
 import os
@@ -19,6 +19,7 @@ import pyarrow.parquet as pq
 from tensordict import TensorDictBase
 
 from cprl.measuring import Episode, social
+from cprl.measuring.reported import FIELDS, left_out
 
 FILE_NAME: Final = "episodes.parquet"
 
@@ -37,8 +38,13 @@ COLUMNS: Final = {
     "depletion_step": pa.int32(),
     "terminated": pa.bool_(),
 }
-"""The columns of every table, as in `Episode`; behind them come the metrics, float64, NaN where undefined.
-What concerns the whole episode stands in the row of each of its agents."""
+"""The columns of a table, as in `Episode`; the metrics follow, float64, NaN where undefined.
+
+Values of the whole episode are repeated in the row of each agent. Values that the game does not report have
+no column."""
+
+LEFT_OUT: Final = b"left_out"
+"""The key of the schema's metadata whose value says which columns are left out, and why, if any are."""
 
 _ROWS_PER_GROUP: Final = 2**16
 
@@ -46,17 +52,17 @@ _ROWS_PER_GROUP: Final = 2**16
 class EpisodeTable:
     """Writes a table of episodes; a context manager.
 
-    What `add` has returned from survives the death of the process, SIGKILL included; when the machine
-    itself loses power, the last seconds may be lost. After an OSError (a full disk) all earlier episodes
-    are still there, and the same `add` or `close` can be tried again.
+    Episodes are safe once `add` has returned, even if the process is killed by SIGKILL; a power failure may
+    lose the last seconds. After an OSError (a full disk) all earlier episodes are intact, and the same `add`
+    or `close` can be repeated.
 
     Args:
-        path: the parquet file to be, `episodes.parquet` in a run's directory.
-        resumable: whether a journal that is there is gone on with, see `load_state_dict`, and stays as it
-            is where the block ends with an error.
+        path: the parquet file to write, `episodes.parquet` in a run's directory.
+        resumable: whether to continue an existing journal, see `load_state_dict`, and to leave the journal in
+            place if the block ends with an error.
 
     Raises:
-        FileExistsError: where there is a table already: nothing is ever written over.
+        FileExistsError: if the table exists; nothing is ever overwritten.
     """
 
     def __init__(self, path: str | os.PathLike[str], *, resumable: bool = False) -> None:
@@ -65,23 +71,23 @@ class EpisodeTable:
         self._resumable = resumable
         for table in (self.path,) if resumable else (self.path, self.journal):
             if table.exists():
-                raise FileExistsError(f"{table} exists and is kept; give the table a directory of its own")
+                raise FileExistsError(f"{table} exists and is not overwritten; use another directory")
         exists = self.journal.exists()
-        # Not buffered: what is written has left this process.
+        # Unbuffered, so that written data survives the process.
         self._file = FileIO(self.journal, "r+" if exists else "x")
         self._schema: pa.Schema | None = None
         self._rows = 0
         self._is_placed = not exists
 
     def state_dict(self) -> dict[str, int]:
-        """How many rows it has."""
+        """The number of rows."""
         return {"rows": self._rows}
 
     def load_state_dict(self, state: Mapping[str, int]) -> None:
-        """Goes on behind so many rows of its journal; what stands behind them is forgotten.
+        """Continues after the given number of rows of its journal; later rows are dropped.
 
         Raises:
-            ValueError: where the journal has fewer rows, or a batch of rows ends elsewhere.
+            ValueError: if the journal has fewer rows, or no batch of rows ends there.
         """
         rows, found, end = int(state["rows"]), 0, 0
         schema = None
@@ -94,40 +100,41 @@ class EpisodeTable:
                     if found >= rows:
                         break
         if found != rows:
-            raise ValueError(f"{self.journal} holds {found} rows up to there; the checkpoint says {rows}")
+            raise ValueError(f"{self.journal} holds {found} rows up to there; the checkpoint has {rows}")
         self._file.truncate(end)
         self._file.seek(end)
         self._schema, self._rows, self._is_placed = schema, rows, True
 
     def add(self, *episodes: Episode, replica: int | None = None) -> None:
-        """Appends episodes, whose metrics must have the same names in all of a table.
+        """Appends episodes; the first one of a table determines the columns and metrics of all.
 
         Args:
-            replica: the repetition of the training that they belong to; by default each episode's world.
+            episodes: the episodes.
+            replica: the index of their replica; by default each episode's world.
         """
         if not episodes:
             return
-        if not self._is_placed:  # nothing says how far the last run was kept: it begins anew
+        if not self._is_placed:  # there is no checkpoint of the last attempt: start over
             self.load_state_dict({"rows": 0})
         if self._schema is None:
-            self._begin(episodes[0].metrics)
+            self._begin(_schema_of(episodes[0]))
         rows = _rows(episodes, replica, self._schema)
         self._write(rows.serialize())
         self._rows += rows.num_rows
 
     def on_step(self, batch: TensorDictBase) -> None:
-        """Nothing: a table keeps whole episodes. An observer of `cprl.training`, as `on_episode` is."""
+        """Does nothing: a table stores whole episodes. With `on_episode` a callback of `cprl.training`."""
 
     def on_episode(self, episode: Episode, learning: Mapping[str, float]) -> None:
         """Adds an episode."""
         self.add(episode)
 
     def close(self) -> None:
-        """Turns the journal into the parquet file. A second call does nothing."""
+        """Converts the journal to the parquet file. A second call does nothing."""
         if not self.journal.exists():
             return
         if self._schema is None:
-            self._begin(social.METRICS)
+            self._begin(_schema(COLUMNS, social.METRICS))
         if not self._file.closed:
             self._file.close()
         partial = self.path.with_name(self.path.name + ".partial")
@@ -137,7 +144,7 @@ class EpisodeTable:
         except OSError as error:
             partial.unlink(missing_ok=True)
             raise OSError(
-                error.errno, f"{error}: could not write {self.path}; every episode stays in {self.journal}"
+                error.errno, f"{error}: could not write {self.path}; all episodes are in {self.journal}"
             ) from error
         self.journal.unlink()
 
@@ -155,13 +162,12 @@ class EpisodeTable:
         else:
             self.close()
 
-    def _begin(self, metrics: Iterable[str]) -> None:
-        schema = _schema(metrics)
+    def _begin(self, schema: pa.Schema) -> None:
         self._write(schema.serialize())
         self._schema = schema
 
     def _write(self, message: pa.Buffer) -> None:
-        """Appends all of a message or nothing: behind a torn one, the rest could not be read."""
+        """Appends all of a message or nothing: a partial message would make later ones unreadable."""
         end = self._file.tell()
         left = memoryview(message)
         try:
@@ -171,48 +177,61 @@ class EpisodeTable:
             self._file.seek(end)
             self._file.truncate()
             if isinstance(error, OSError):
-                kept = f"the {self._rows} rows before stay in {self.journal}"
+                kept = f"the {self._rows} earlier rows are in {self.journal}"
                 raise OSError(error.errno, f"{error}: could not add episodes; {kept}") from error
             raise
 
 
 def read_episodes(run_directory: str | os.PathLike[str]) -> pa.Table:
-    """The episodes of a run, finished, going on or killed, in the order in which they ended.
+    """The episodes of a finished, running or killed run, in the order in which they ended.
 
     Raises:
-        FileNotFoundError: where there are none.
+        FileNotFoundError: if there are none.
     """
     path = Path(run_directory) / FILE_NAME
     try:
-        # First the journal: as long as it is there it holds every row, and a merge does not disturb it.
+        # The journal first: while it exists it holds every row, and a merge does not change it.
         with pa.OSFile(str(_journal_of(path))) as journal:
             schema, batches = _read_journal(journal)
             return pa.Table.from_batches(list(batches), schema)
     except FileNotFoundError:
         if not path.exists():
-            raise FileNotFoundError(f"{path} is not there, nor is its journal: is this a run?") from None
+            raise FileNotFoundError(f"{path} and its journal do not exist: is this a run?") from None
     return pq.read_table(path)
 
 
 def as_table(episodes: Sequence[Episode], replica: int) -> pa.Table:
-    """Episodes of a replica, at least one, as such a table has them."""
-    return pa.Table.from_batches([_rows(episodes, replica, _schema(episodes[0].metrics))])
+    """At least one episode of a replica as a table with the columns of a run's table."""
+    return pa.Table.from_batches([_rows(episodes, replica, _schema_of(episodes[0]))])
 
 
 def _journal_of(path: Path) -> Path:
     return path.with_suffix(".arrows")
 
 
-def _schema(metrics: Iterable[str]) -> pa.Schema:
-    return pa.schema([*COLUMNS.items(), *((name, pa.float64()) for name in metrics)])
+def _schema(columns: Iterable[str], metrics: Iterable[str]) -> pa.Schema:
+    return pa.schema({name: COLUMNS[name] for name in columns} | dict.fromkeys(metrics, pa.float64()))
+
+
+def _schema_of(episode: Episode) -> pa.Schema:
+    """The columns that an episode has; the schema's metadata names those that it lacks."""
+    schema, missing = _schema(_columns_of(episode), episode.metrics), left_out(episode.reported)
+    return schema.with_metadata({LEFT_OUT: missing}) if missing else schema
+
+
+def _columns_of(episode: Episode) -> list[str]:
+    return [name for name in COLUMNS if name not in FIELDS or getattr(episode, name) is not None]
 
 
 def _rows(episodes: Sequence[Episode], replica: int | None, schema: pa.Schema) -> pa.RecordBatch:
     of_each = [_cells(episode, episode.world if replica is None else replica) for episode in episodes]
     for cells in of_each:
         if cells.keys() != set(schema.names):
-            came, wanted = list(cells)[len(COLUMNS) :], schema.names[len(COLUMNS) :]
-            raise ValueError(f"the episode has the metrics {came}; this table has {wanted}")
+            more, lacks = cells.keys() - set(schema.names), set(schema.names) - cells.keys()
+            raise ValueError(
+                f"the episode has the extra columns {sorted(more)} and lacks {sorted(lacks)}; allowed: the "
+                "columns of the table's first episode"
+            )
     return pa.record_batch(
         [
             pa.array(np.concatenate([cells[column.name] for cells in of_each]), column.type)
@@ -223,9 +242,9 @@ def _rows(episodes: Sequence[Episode], replica: int | None, schema: pa.Schema) -
 
 
 def _cells(episode: Episode, replica: int) -> dict[str, Any]:
-    """What stands in each column, [N]."""
-    own = {name: getattr(episode, name, None) for name in COLUMNS}
-    agents = np.arange(len(episode.harvest))
+    """The values of each column, [N]."""
+    own = {name: getattr(episode, name, None) for name in _columns_of(episode)}
+    agents = np.arange(len(episode.return_))
     cells: dict[str, Any] = {
         **own,
         "replica": replica,
@@ -237,11 +256,11 @@ def _cells(episode: Episode, replica: int) -> dict[str, Any]:
 
 
 def _read_journal(journal: pa.NativeFile) -> tuple[pa.Schema, Iterator[pa.RecordBatch]]:
-    """Everything that was written whole."""
+    """The schema and all batches that were written completely."""
     try:
         reader = pa.ipc.open_stream(journal)
-    except pa.ArrowInvalid:  # killed before even the names of the columns were written
-        return _schema(social.METRICS), iter(())
+    except pa.ArrowInvalid:  # the process was killed before it wrote the schema
+        return _schema(COLUMNS, social.METRICS), iter(())
     return reader.schema, _whole_batches(reader)
 
 
@@ -258,7 +277,7 @@ def _whole_batches(reader: pa.RecordBatchReader) -> Iterator[pa.RecordBatch]:
 
 
 def _merge(journal: Path, target: Path, *, rows: int) -> None:
-    """Writes the journal as a parquet file that lies safe on the disk."""
+    """Writes the journal as a parquet file, synced to disk."""
     merged = 0
     with pa.OSFile(str(journal)) as source:
         schema, batches = _read_journal(source)
@@ -273,7 +292,7 @@ def _merge(journal: Path, target: Path, *, rows: int) -> None:
 
 
 def _large_tables(batches: Iterable[pa.RecordBatch]) -> Iterator[pa.Table]:
-    """The batches in groups, since parquet is slow to read in groups of a few rows."""
+    """The batches in groups, because parquet files with row groups of a few rows are slow to read."""
     group, rows = list[pa.RecordBatch](), 0
     for batch in batches:
         group.append(batch)

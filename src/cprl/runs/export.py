@@ -1,4 +1,4 @@
-"""The results of a run, small enough to be committed: a run's directory without its recording and buffers."""
+"""Exports the results of a run, small enough to commit: its directory without recording and buffers."""
 
 import shutil
 from pathlib import Path
@@ -6,34 +6,38 @@ from pathlib import Path
 import pyarrow as pa
 import pyarrow.parquet as pq
 
-from cprl.runs.episodes import FILE_NAME, read_episodes
 from cprl.runs.directory import read_recipe
+from cprl.runs.episodes import FILE_NAME, read_episodes
+from cprl.runs.weights import TRANSFORMS
 
+_TRANSFORMS = f"checkpoints/{TRANSFORMS}"
 _WHOLE = ("recipe.json", "report.json", "checkpoints/final.pt")
 
 
 def export_results(run: Path, folder: Path) -> Path:
-    """Copies what a report needs of a finished run: recipe, episodes, evaluation, weights.
+    """Copies the files of a finished run that a report needs: recipe, episodes, evaluation, weights.
 
     Args:
         run: the run's directory.
-        folder: where to; what it holds of an earlier copy is replaced.
+        folder: the target; files of an earlier copy are replaced.
 
     Returns:
-        The folder, which `cprl.load`, `read_episodes` and `cprl report` take like the run itself. Metrics
-        and returns are float32 there, and rows sorted by replica, episode and agent.
+        The folder, which `cprl.load`, `read_episodes` and `cprl report` accept like the run itself. Metrics
+        and returns are float32, and rows are sorted by replica, episode and agent.
 
     Raises:
-        ValueError: where there is no run.
-        FileNotFoundError: where the run has not ended.
+        ValueError: if there is no run.
+        FileNotFoundError: if the run has not ended.
     """
     read_recipe(run)
     for name in _WHOLE:
         if not (run / name).exists():
-            raise FileNotFoundError(f"{run / name} is not there: has the run ended?")
+            raise FileNotFoundError(f"{run / name} does not exist: has the run ended?")
     for name in _WHOLE:
         (folder / name).parent.mkdir(parents=True, exist_ok=True)
         shutil.copyfile(run / name, folder / name)
+    if (run / _TRANSFORMS).exists():
+        shutil.copyfile(run / _TRANSFORMS, folder / _TRANSFORMS)
     _write(read_episodes(run), folder / FILE_NAME)
     for path in sorted((run / "evaluation").glob("*.parquet")):
         _write(pq.read_table(path), folder / "evaluation" / path.name)

@@ -1,4 +1,4 @@
-"""Files that are never seen, nor left behind, half written."""
+"""Atomic writes: files are complete or absent."""
 
 import os
 import sys
@@ -8,10 +8,10 @@ from typing import BinaryIO
 
 
 def write_atomically(path: Path, write: Callable[[BinaryIO], object]) -> None:
-    """Writes a file beside its place, puts it safely on the disk, and only then gives it its name.
+    """Writes a temporary file, syncs it to disk and renames it.
 
     Args:
-        path: the file to be; one of this name is replaced.
+        path: the file; an existing file is replaced.
         write: writes the content.
     """
     place_atomically(path.with_name(path.name + ".partial"), write, lambda partial: path)
@@ -20,12 +20,12 @@ def write_atomically(path: Path, write: Callable[[BinaryIO], object]) -> None:
 def place_atomically(
     partial: Path, write: Callable[[BinaryIO], object], name: Callable[[Path], Path]
 ) -> Path:
-    """The same, for a file whose name follows from its content.
+    """Like `write_atomically`, for a file whose name depends on its content.
 
     Args:
-        partial: the name until it is complete.
+        partial: the temporary name.
         write: writes the content.
-        name: the file to be, out of the complete one.
+        name: returns the final name, given the complete temporary file.
 
     Returns:
         The file.
@@ -45,7 +45,7 @@ def place_atomically(
 
 
 def _sync_folder(folder: Path) -> None:
-    """Makes a new name in a folder survive a loss of power, where the system can."""
+    """Syncs a folder, so that a new name in it survives a power failure, if the system supports it."""
     if sys.platform == "win32":
         return
     number = os.open(folder, os.O_RDONLY)

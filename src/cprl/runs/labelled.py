@@ -1,4 +1,4 @@
-"""Episodes of several players in one table, in columns of their own who played."""
+"""Episodes of several policies in one table, with columns that label them."""
 
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import replace
@@ -8,19 +8,18 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 
 from cprl.measuring import Episode
-from cprl.runs.files import write_atomically
 from cprl.runs.episodes import as_table
+from cprl.runs.files import write_atomically
 
 Label = Mapping[str, str | int]
-"""What stands in the first columns, by their names."""
+"""The values of the first columns, by name."""
 
 
 def labelled(parts: Iterable[tuple[Label, int, Sequence[Episode]]]) -> pa.Table:
-    """A table as `episodes.parquet`, behind columns that say who played.
+    """A table like `episodes.parquet`, with label columns first.
 
     Args:
-        parts: labels, all with the same names; the number of a replica; and its episodes, which are numbered
-            from 0.
+        parts: labels, all with the same names; the index of a replica; and its episodes, numbered from 0.
     """
     tables = []
     for label, replica, episodes in parts:
@@ -33,20 +32,20 @@ def labelled(parts: Iterable[tuple[Label, int, Sequence[Episode]]]) -> pa.Table:
 
 
 def refuse_to_write_over(path: Path) -> None:
-    """Asked before hours of work whose outcome goes there.
+    """Checks before hours of work that its output file does not exist.
 
     Raises:
-        FileExistsError: where there is a file.
+        FileExistsError: if the file exists.
     """
     if path.exists():
-        raise FileExistsError(f"{path} exists and is kept; name another file")
+        raise FileExistsError(f"{path} exists and is not overwritten; use another name")
 
 
 def write_table(path: Path, table: pa.Table) -> None:
-    """Writes a parquet file, all or nothing.
+    """Writes a parquet file atomically.
 
     Raises:
-        FileExistsError: where there is a file.
+        FileExistsError: if the file exists.
     """
     refuse_to_write_over(path)
     path.parent.mkdir(parents=True, exist_ok=True)

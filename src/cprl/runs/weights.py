@@ -1,7 +1,8 @@
-"""The weights of networks, kept and read."""
+"""Saves and loads the weights of networks."""
 
 from collections.abc import Mapping
 from pathlib import Path
+from typing import Any, Final
 
 import torch
 from tensordict import TensorDictBase
@@ -15,12 +16,12 @@ from cprl.runs.files import write_atomically
 
 
 def save_weights(run: Path, networks: Mapping[str, nn.Module], *, name: str = "final") -> Path:
-    """Writes the weights of each agent's network, all or nothing.
+    """Writes the weights of each agent's network atomically.
 
     Args:
         run: the run's directory.
-        networks: by the agent's name.
-        name: of the file.
+        networks: the networks by the agent's name.
+        name: the name of the file, without suffix.
 
     Returns:
         `checkpoints/<name>.pt` of the run, which `load_weights` reads.
@@ -32,19 +33,31 @@ def save_weights(run: Path, networks: Mapping[str, nn.Module], *, name: str = "f
     return path
 
 
-class BestWeights:
-    """Evaluates the greedy policy every so many episodes, and keeps the best weights so far on disk.
+TRANSFORMS: Final = "transforms.pt"
+"""The file in `checkpoints/` with the state of the environment's transforms."""
 
-    An observer of `cprl.training`. The worlds of this evaluation are the same every time; what the kept
-    weights are worth must be measured on others.
+
+def save_transforms(run: Path, state: Mapping[str, Any]) -> None:
+    """Writes the state of an environment's transforms atomically; writes no file if they have none."""
+    if state:
+        path = run / "checkpoints" / TRANSFORMS
+        path.parent.mkdir(exist_ok=True)
+        write_atomically(path, lambda file: torch.save(dict(state), file))
+
+
+class BestWeights:
+    """Evaluates the greedy policy every `every` episodes, and saves the best weights so far.
+
+    A callback of `cprl.training`. It evaluates in the same worlds every time, so measure the saved weights
+    in other worlds.
 
     Args:
         run: the run's directory.
-        networks: by the agent's name.
-        policy: of all agents, e.g. `cprl.acting.AgentPolicies`.
-        env: worlds to evaluate in.
-        every: episodes from one evaluation to the next.
-        logger: told of each `evaluation/greedy_return`.
+        networks: the networks by the agent's name.
+        policy: the policy of all agents, e.g. `cprl.policies.assignment.AgentPolicies`.
+        env: the worlds to evaluate in.
+        every: episodes between evaluations.
+        logger: gets each `evaluation/greedy_return`.
     """
 
     def __init__(
@@ -64,10 +77,10 @@ class BestWeights:
         self.best_return, self.best_episode, self._episodes = float("-inf"), -1, 0
 
     def on_step(self, batch: TensorDictBase) -> None:
-        """Nothing happens within an episode."""
+        """Does nothing within an episode."""
 
     def on_episode(self, episode: Episode, learning: Mapping[str, float]) -> None:
-        """Counts an episode; after every so many, evaluates and keeps the weights if they are better."""
+        """Counts an episode; every `every` episodes evaluates, and saves the weights if they are better."""
         self._episodes += 1
         if self._episodes % self.every:
             return
@@ -81,14 +94,14 @@ class BestWeights:
 
 
 def restore_weights(path: Path, networks: Mapping[str, nn.Module]) -> None:
-    """Puts kept weights back into the networks of the same agents."""
+    """Loads saved weights into the networks of the same agents."""
     kept = load_weights(path)
     if set(kept) != set(networks):
-        raise ValueError(f"{path} holds the weights of {sorted(kept)}; wanted: {sorted(networks)}")
+        raise ValueError(f"{path} holds the weights of {sorted(kept)}; allowed: {sorted(networks)}")
     for agent, network in networks.items():
         network.load_state_dict(kept[agent])
 
 
 def load_weights(path: Path) -> dict[str, dict[str, Tensor]]:
-    """The state dict of each agent's network; reads tensors only, runs no code of the file."""
+    """The state dict of each agent's network; loads tensors only, and runs no code of the file."""
     return dict(torch.load(path, weights_only=True))

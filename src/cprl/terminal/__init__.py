@@ -1,1 +1,7 @@
-"""What a person sees in the terminal."""
+"""Terminal output and figures of a run.
+
+Modules, in the order in which one reads them:
+    progress  a bar while a training runs
+    summary   what a run came to
+    figures   the training curve
+"""

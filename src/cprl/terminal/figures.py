@@ -1,4 +1,4 @@
-"""Figures of a run, drawn from its table of episodes alone."""
+"""Figures of a run, plotted from its table of episodes alone."""
 
 from pathlib import Path
 
@@ -15,18 +15,21 @@ from cprl.runs.episodes import read_episodes
 def training_curve(
     run: Path, *, title: str, random: list[Episode] | None = None, smoothed: int = SMOOTHED_EPISODES
 ) -> Path:
-    """Draws the collective return of every episode of a run, the mean of its replicas, and its running mean.
+    """Plots the summed return of all agents in each episode of a run, as the mean over replicas, and its
+    running mean.
 
     Args:
         run: the run's directory.
         title: what was run, with its schedule.
-        random: episodes of the random policy, whose mean return becomes a dashed line.
-        smoothed: episodes that the running mean covers, drawn at the first of them as in the study.
+        random: episodes of the random policy, whose mean return is a dashed line.
+        smoothed: the window of the running mean in episodes, plotted at its first episode as in the study.
 
     Returns:
         The PNG, `figures/training_curve.png` of the run.
     """
-    table = read_episodes(run).select(["replica", "episode", "return"]).to_pydict()
+    rows = read_episodes(run)
+    has_harvest = "harvest" in rows.column_names
+    table = rows.select(["replica", "episode", "return"]).to_pydict()
     episodes = np.array(table["episode"])
     returns = np.zeros(int(episodes.max()) + 1)
     np.add.at(returns, episodes, table["return"])
@@ -41,7 +44,10 @@ def training_curve(
     if random:
         level, _ = mean_return(random)
         axes.axhline(level, color="#636363", linestyle="--", label=f"random policy, {level:.1f}")
-    axes.set(title=title, xlabel="episode", ylabel="collective return, apples", ylim=(0, None))
+    axes.set(title=title, xlabel="episode")
+    axes.set_ylabel("collective return, apples" if has_harvest else "return of all agents together")
+    if has_harvest or returns.min() >= 0:
+        axes.set_ylim(0, None)
     axes.legend(loc="lower right")
     path = run / "figures" / "training_curve.png"
     path.parent.mkdir(exist_ok=True)

@@ -1,4 +1,4 @@
-"""What a person sees in the terminal while a training goes on."""
+"""The progress of a training in the terminal."""
 
 import time
 from collections.abc import Mapping
@@ -9,31 +9,31 @@ from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 from tensordict import TensorDictBase
 
-from cprl.commons.game import Game
 from cprl.measuring.episodes import Episode
 
 _BAR_PERIOD_S: Final = 0.25
 _LINE_PERIOD_S: Final = 10.0
-"""How often a bar moves, and a line is printed where the output is no terminal."""
+"""Seconds between updates of the bar, and between lines if the output is not a terminal."""
 
 
 class ProgressBar:
     """A bar with the return of the last episode, epsilon, steps per second and the time left.
 
-    Where the output is no terminal, a plain line every ten seconds. An observer of `cprl.training`, and a
-    context manager.
+    If the output is not a terminal, it prints a plain line every ten seconds. A callback of `cprl.training`,
+    and a context manager.
 
     Args:
-        game: what is played; its clock says how long an episode is.
-        episodes: how many there will be.
-        title: what is going on.
-        replicas: how many replicas play them side by side.
-        console: where to; by default standard output.
+        game: a game or its environment. The length of an episode is `episode_steps` of its `rules`, if it has
+            them; else that of the last episode.
+        episodes: the number of episodes of the run.
+        title: the title of the bar.
+        replicas: the number of replicas R.
+        console: the console; by default standard output.
     """
 
     def __init__(
         self,
-        game: Game,
+        game: object = None,
         *,
         episodes: int,
         title: str = "training",
@@ -41,25 +41,27 @@ class ProgressBar:
         console: Console | None = None,
     ) -> None:
         self.console = console or Console()
-        self._title, self._episode_steps = title, game.rules.episode_steps
+        rules = getattr(getattr(game, "game", game), "rules", None)
+        self._title, self._clock = title, getattr(rules, "episode_steps", None)
+        self._last_steps = 0
         self._progress = Progress(
             TextColumn("{task.description}"),
             BarColumn(),
             MofNCompleteColumn(),
-            TextColumn("{task.fields[told]}"),
+            TextColumn("{task.fields[values]}"),
             TimeRemainingColumn(),
             console=self.console,
             disable=not self.console.is_terminal,
         )
-        self._task = self._progress.add_task(title, total=episodes, told="")
-        self._told = {"return": "-", "epsilon": "-"}
+        self._task = self._progress.add_task(title, total=episodes, values="")
+        self._latest = {"return": "-", "epsilon": "-"}
         self._steps = self._steps_then = self._steps_this_episode = self._episodes = 0
         self._started = self._then = time.perf_counter()
         self._left_of, self._replicas, self._before = episodes, replicas, 0
 
     def on_step(self, batch: TensorDictBase) -> None:
-        """Counts the turns of a batch and, now and then, moves the bar."""
-        if not self._steps:  # what came before was starting up
+        """Counts the turns of a batch and updates the bar if it is due."""
+        if not self._steps:  # do not count the time before the first step
             self._started = self._then = time.perf_counter()
         self._steps += batch.numel()
         self._steps_this_episode += batch.numel()
@@ -68,37 +70,39 @@ class ProgressBar:
             self._show(waited)
 
     def on_episode(self, episode: Episode, learning: Mapping[str, float]) -> None:
-        """Takes over the return and epsilon of an episode that ended."""
+        """Shows the return and epsilon of an episode that has ended."""
         self._episodes += 1
         self._steps_this_episode = 0
-        self._told["return"] = f"{episode.return_.sum():.0f}"
+        self._last_steps = episode.steps
+        self._latest["return"] = f"{episode.return_.sum():{'.0f' if episode.harvest is not None else '.4g'}}"
         epsilons = [value for name, value in learning.items() if name.endswith("/epsilon")]
         if epsilons:
-            self._told["epsilon"] = f"{max(epsilons):.2f}"
+            self._latest["epsilon"] = f"{max(epsilons):.2f}"
 
     def _show(self, waited: float) -> None:
         rate = (self._steps - self._steps_then) / waited
         self._steps_then, self._then = self._steps, time.perf_counter()
-        told = f"return {self._told['return']}  epsilon {self._told['epsilon']}  {rate:,.0f} steps/s"
-        running = min(self._replicas, self._steps_this_episode / self._episode_steps)
+        values = f"return {self._latest['return']}  epsilon {self._latest['epsilon']}  {rate:,.0f} steps/s"
+        episode_steps = self._clock or self._last_steps
+        running = min(self._replicas, self._steps_this_episode / episode_steps) if episode_steps else 0
         done = (self._episodes + running) / self._replicas
-        self._progress.update(self._task, completed=done, told=told)
+        self._progress.update(self._task, completed=done, values=values)
         if not self.console.is_terminal and self._steps:
             spent_s = time.perf_counter() - self._started
             since = done - self._before / self._replicas
             left_s = spent_s / since * (self._left_of - done) if since else float("nan")
             episode = self._episodes // self._replicas
             self.console.print(
-                f"{self._title}: episode {episode}/{self._left_of}  {told}  {left_s:,.0f} s left",
+                f"{self._title}: episode {episode}/{self._left_of}  {values}  {left_s:,.0f} s left",
                 soft_wrap=True,
             )
 
     def state_dict(self) -> dict[str, int]:
-        """How many episodes have ended."""
+        """The number of episodes that have ended."""
         return {"episodes": self._episodes}
 
     def load_state_dict(self, state: Mapping[str, int]) -> None:
-        """Counts on from there."""
+        """Continues counting from a state."""
         self._episodes = self._before = int(state["episodes"])
 
     def __enter__(self) -> Self:

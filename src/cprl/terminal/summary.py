@@ -1,19 +1,29 @@
-"""What a run came to, in the terminal."""
+"""The results of a run, printed in the terminal."""
 
 from collections.abc import Mapping
 from math import isnan
 from pathlib import Path
 from statistics import fmean
+from typing import Final
 
 from rich.console import Console
 from rich.table import Table
 
 from cprl.measuring.episodes import Episode
 from cprl.measuring.evaluate import mean_return
+from cprl.measuring.replicas import social_metrics
+from cprl.measuring.reported import left_out
 from cprl.viewer.streams import viewer
 
 KEPT = ("recipe.json", "episodes.parquet", "run.rrd", "checkpoints", "figures")
-METRICS = ("survival_steps", "sustainability", "equality", "peacefulness")
+METRICS: Final = {
+    "survival_steps": ("survival_steps", 2),
+    "sustainability": ("sustainability", 2),
+    "equality": ("equality", 2),
+    "peacefulness": ("peacefulness", 2),
+    "stock_left": ("apples left", 1),
+}
+"""The name and digits of each metric that is printed if the game reports it."""
 
 
 def summarise(
@@ -24,23 +34,26 @@ def summarise(
     figure: Path | None = None,
     console: Console | None = None,
 ) -> None:
-    """Prints policies beside each other, each by its episodes, and where everything is kept.
+    """Prints a table that compares policies, the metrics that are left out, and the files of the run.
 
     Args:
         run: the run's directory.
         title: what was run, with its schedule.
-        played: episodes on fresh worlds by the name of the policy; the others are compared with the first.
+        played: episodes in fresh worlds by the name of the policy; the first policy is the baseline.
         figure: the training curve.
-        console: where to; by default standard output.
+        console: the console; by default standard output.
     """
     console = console or Console()
     console.print(_table(title, played))
+    missing = left_out(next(iter(played.values()))[0].reported)
+    if missing:
+        console.print(missing, soft_wrap=True)
     kept = [name for name in KEPT if (run / name).exists()]
-    console.print(f"Kept in {run}: {', '.join(kept)}", soft_wrap=True)
+    console.print(f"Saved in {run}: {', '.join(kept)}", soft_wrap=True)
     if figure:
         console.print(f"Training curve: {figure}", soft_wrap=True)
     if "run.rrd" in kept:
-        console.print(f"ViewerCallback again: {viewer()} {run / 'run.rrd'}", soft_wrap=True)
+        console.print(f"Watch again: {viewer()} {run / 'run.rrd'}", soft_wrap=True)
 
 
 def _table(title: str, played: Mapping[str, list[Episode]]) -> Table:
@@ -52,17 +65,18 @@ def _table(title: str, played: Mapping[str, list[Episode]]) -> Table:
     means = [mean_return(episodes) for episodes in played.values()]
     table.add_row("mean return", *(f"{mean:.1f} ± {error:.1f}" for mean, error in means))
     base, _ = means[0]
-    if base:
-        table.add_row("beside the first", *(f"{mean / base:.1f} x" for mean, _ in means))
-    for metric in METRICS:
-        table.add_row(metric, *(f"{_mean(episodes, metric):.2f}" for episodes in played.values()))
-    left = (fmean(episode.stock_left for episode in episodes) for episodes in played.values())
-    table.add_row("apples left", *(f"{apples:.1f}" for apples in left))
+    if base > 0:
+        table.add_row("relative to the first", *(f"{mean / base:.1f} x" for mean, _ in means))
+    measured = {name: [social_metrics(episode) for episode in own] for name, own in played.items()}
+    known = next(iter(measured.values()))[0]
+    for metric, (name, digits) in METRICS.items():
+        if metric in known:
+            table.add_row(name, *(f"{_mean(own, metric):.{digits}f}" for own in measured.values()))
     table.add_row("episodes", *(str(len(episodes)) for episodes in played.values()))
     return table
 
 
-def _mean(episodes: list[Episode], name: str) -> float:
+def _mean(measured: list[dict[str, float]], name: str) -> float:
     """The mean of a metric over the episodes in which it is defined."""
-    defined = [value for episode in episodes if not isnan(value := episode.metrics[name])]
+    defined = [metrics[name] for metrics in measured if not isnan(metrics[name])]
     return fmean(defined) if defined else float("nan")

@@ -1,1 +1,13 @@
-"""The Rerun recording of a training."""
+"""The Rerun recording of a training.
+
+Modules, in the order in which one reads them:
+    callback   ViewerCallback: logs a training while it runs
+    recorder   which episodes are recorded frame by frame
+    frames     frames of one world, collected in memory
+    events     new bests and phases, in words
+    logger     RerunLogger: TorchRL's logger interface on a recording
+    streams    to a file, and served live
+    scenery    names and colours of what a recording shows
+    stage      frames as Rerun's columns
+    blueprint  the layout of the viewer
+"""

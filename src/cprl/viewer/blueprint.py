@@ -1,35 +1,35 @@
-"""How the Rerun viewer is laid out when a recording is opened."""
+"""The layout of the Rerun viewer for a recording."""
 
 from typing import Any, Final, Literal
 
-from cprl.viewer.scenery import Scene
+from cprl.viewer.scenery import Curves, Scene
 
 _BACKGROUND: Final = (24, 26, 32)
-"""Behind boards and windows, so that their dark ground is told from the viewer's."""
+"""The background of boards and windows, which sets their dark cells apart from the viewer's own colour."""
 
 
-def layout(scene: Scene | None) -> Any:
-    """Board and windows left, what is measured right, events below, and tabs for the rest; a replay has less.
+def layout(curves: Curves) -> Any:
+    """Board and windows left, plots right, events below, and tabs for the rest; a replay has fewer views.
 
     Args:
-        scene: what is on the board; None for a recording without one.
+        curves: the numbers that are plotted; a `Scene` if there is a board, else the left shows events only.
 
     Returns:
         A `rerun.blueprint.Blueprint`.
     """
     import rerun.blueprint as rrb
 
-    if scene and scene.is_replay:
-        return _laid_out(_replay(scene.agents), play_state="playing")
-    agents, replicas = (scene.agents, scene.replicas) if scene else ((), 1)
-    return _laid_out(
-        rrb.Horizontal(_board(agents), _numbers(agents, replicas), column_shares=[2, 3]),
-        play_state="following",
-    )
+    if not isinstance(curves, Scene):
+        views = rrb.Horizontal(_events(), _numbers(curves), column_shares=[1, 3])
+    elif curves.is_replay:
+        return _laid_out(_replay(curves.agents), play_state="playing")
+    else:
+        views = rrb.Horizontal(_board(curves.agents), _numbers(curves), column_shares=[2, 3])
+    return _laid_out(views, play_state="following")
 
 
 def _laid_out(views: Any, *, play_state: Literal["playing", "following"]) -> Any:
-    """The views, and as little else as can be."""
+    """The views in a blueprint with the viewer's other panels collapsed."""
     import rerun.blueprint as rrb
 
     return rrb.Blueprint(
@@ -41,7 +41,7 @@ def _laid_out(views: Any, *, play_state: Literal["playing", "following"]) -> Any
 
 
 def _replay(agents: tuple[str, ...]) -> Any:
-    """A large board, what agents see, and the harvest and the stock of one episode, turn by turn."""
+    """A large board, the agents' windows, and the harvest and stock of one episode, turn by turn."""
     import rerun.blueprint as rrb
 
     return rrb.Horizontal(
@@ -57,7 +57,7 @@ def _replay(agents: tuple[str, ...]) -> Any:
 
 
 def _board(agents: tuple[str, ...]) -> Any:
-    """The board, what agents see, and what happened."""
+    """The board, the agents' windows, and the events."""
     import rerun.blueprint as rrb
 
     return rrb.Vertical(_world(), _windows(agents), _events(), row_shares=[9, 9, 5])
@@ -77,7 +77,7 @@ def _windows(agents: tuple[str, ...]) -> Any:
 
 
 def _events() -> Any:
-    """What happened, and what is run."""
+    """The events and the recipe."""
     import rerun.blueprint as rrb
 
     columns = rrb.TextLogColumns(timeline_columns=["step"], text_log_columns=["Body"])
@@ -88,13 +88,22 @@ def _events() -> Any:
     )
 
 
-def _numbers(agents: tuple[str, ...], replicas: int) -> Any:
-    """Returns and social metrics, the phase under them, and tabs for learning and for who tagged whom."""
+def _numbers(curves: Curves) -> Any:
+    """Returns and social metrics, the phase below them, and tabs for learning and for who tagged whom.
+
+    Metrics that the game does not report are left out.
+    """
     import rerun.blueprint as rrb
 
-    def social(name: str, entity: str, *, share: bool = False) -> Any:
-        """A line for each of many replicas would make a legend that hides them all."""
-        return _plot(name, f"social/{entity}", share=share, legend=replicas == 1)
+    agents = curves.agents
+
+    def social(*plots: tuple[str, str]) -> list[Any]:
+        """Plots without a legend for several replicas, because it would hide their lines."""
+        return [
+            _plot(name, f"social/{metric}", share=metric == "equality", legend=curves.replicas == 1)
+            for name, metric in plots
+            if metric in curves.metrics
+        ]
 
     learning = rrb.Horizontal(
         _plot("Loss", *_of(agents, "loss"), legend=False),
@@ -103,31 +112,35 @@ def _numbers(agents: tuple[str, ...], replicas: int) -> Any:
         _plot("Steps per second", "time/env_steps_per_s", legend=False),
         name="Learning",
     )
-    more = rrb.Horizontal(
-        social("Apples per step", "efficiency"),
-        social("Mean time of harvest, steps", "sustainability"),
-        social("Apples left at the end", "stock_left"),
-        name="More metrics",
+    more = social(
+        ("Apples per step", "efficiency"),
+        ("Mean time of harvest, steps", "sustainability"),
+        ("Apples left at the end", "stock_left"),
     )
-    tags = rrb.TensorView(name="Who tagged whom", origin="/tags")
-    return rrb.Vertical(
-        rrb.Horizontal(
-            _plot("Return of each agent, apples", *_of(agents, "return"), "evaluation/greedy_return"),
-            social("Collective return, apples", "collective_return"),
-        ),
-        rrb.Horizontal(
-            social("Survival, steps", "survival_steps"),
-            social("Equality", "equality", share=True),
-            social("Peacefulness, steps in play", "peacefulness"),
-        ),
-        rrb.StateTimelineView(name="Phase", contents=["+ /phase/**"], time_view=_whole()),
-        rrb.Tabs(learning, more, *([tags] if len(agents) > 1 else []), active_tab=0),
-        row_shares=[4, 3, 1, 3],
+    tabs: list[Any] = [learning, *([rrb.Horizontal(*more, name="More metrics")] if more else [])]
+    if len(agents) > 1 and curves.has_tags:
+        tabs.append(rrb.TensorView(name="Who tagged whom", origin="/tags"))
+    unit = ", apples" if "collective_return" in curves.metrics else ""
+    returns = rrb.Horizontal(
+        _plot(f"Return of each agent{unit}", *_of(agents, "return"), "evaluation/greedy_return"),
+        *social(("Collective return, apples", "collective_return")),
     )
+    outcome = social(
+        ("Survival, steps", "survival_steps"),
+        ("Equality", "equality"),
+        ("Peacefulness, steps in play", "peacefulness"),
+    )
+    rows: list[tuple[Any, int]] = [(returns, 4), (rrb.Horizontal(*outcome), 3)]
+    if curves.has_phases:
+        phases = rrb.StateTimelineView(name="Phase", contents=["+ /phase/**"], time_view=_whole())
+        rows.append((phases, 1))
+    rows.append((rrb.Tabs(*tabs, active_tab=0), 3))
+    views, shares = zip(*rows, strict=True)
+    return rrb.Vertical(*views, row_shares=list(shares))
 
 
 def _plot(name: str, *entities: str, share: bool = False, legend: bool = True) -> Any:
-    """A plot over the whole run; a share has the axis 0..1."""
+    """A plot over the whole run; the axis of a share is 0..1."""
     import rerun.blueprint as rrb
 
     return rrb.TimeSeriesView(
@@ -140,7 +153,7 @@ def _plot(name: str, *entities: str, share: bool = False, legend: bool = True) -
 
 
 def _whole() -> Any:
-    """A time axis that shows everything; by default it shows a thousand steps around the cursor."""
+    """A time axis of the whole run; Rerun's default is a thousand steps around the cursor."""
     import rerun as rr
     import rerun.blueprint as rrb
 

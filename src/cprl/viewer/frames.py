@@ -1,4 +1,4 @@
-"""Frames of one world, collected step by step in memory and handed on as columns."""
+"""Frames of one world, collected in memory step by step and returned as columns."""
 
 from dataclasses import dataclass, fields
 from math import ceil
@@ -7,12 +7,12 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
-from cprl.commons.seeing import UNSEEN
+from cprl.commons.decoding import UNSEEN
 from cprl.commons.world import Bools, Bytes, Ints
 
 WINDOWS_APART_PIXELS: Final = 1
 _WINDOWS_WIDE: Final = 1.7
-"""The place for the windows in the viewer is about so many times as wide as high."""
+"""The width of the viewer's area for windows, divided by its height, approximately."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -22,7 +22,7 @@ class Frame:
     beams: Bools
     """bool [H, W], the cells that a beam covers."""
     stock: Bytes
-    """uint8 [K], 1 where an apple hangs."""
+    """uint8 [K], 1 for a site with an apple."""
     windows: Bytes
     """uint8 [N, C, X, Y], what each agent observes."""
     row: Ints
@@ -34,18 +34,18 @@ class Frame:
     in_play: Bools
     """bool [N]."""
     tagged_by: Ints
-    """int32 [N], who tagged an agent last; -1 for nobody known."""
+    """int32 [N], the agent that tagged this one last; -1 if unknown."""
     harvested: Ints
-    """int32 [N], apples bitten in this episode."""
+    """int32 [N], apples harvested in this episode."""
 
 
 class FrameBuffer:
-    """Room for so many frames, allocated once: `add` copies, `take` hands out what there is.
+    """A buffer of frames, allocated once: `add` copies a frame, `take` returns all frames.
 
     Args:
-        capacity: frames it holds at most.
+        capacity: the largest number of frames.
         board: (H, W).
-        sites: K.
+        sites: the number of sites K.
         windows: (N, C, X, Y).
     """
 
@@ -69,13 +69,13 @@ class FrameBuffer:
 
     @property
     def is_full(self) -> bool:
-        """Whether there is no room for another frame."""
+        """Whether the buffer is full."""
         return self.size == self.capacity
 
     def add(self, step: int, episode: int, frame: Frame) -> None:
         """Copies a frame; `step` counts environment steps of the whole run."""
         if self.is_full:
-            raise ValueError(f"the buffer holds {self.capacity} frames; take them before adding another")
+            raise ValueError(f"the buffer already has {self.capacity} frames; call take() before add()")
         arrays, at = self._arrays, self.size
         arrays["step"][at], arrays["episode"][at] = step, episode
         for field in fields(Frame):
@@ -90,10 +90,10 @@ class FrameBuffer:
 
 
 def window_corners(agents: int, window: tuple[int, int]) -> list[tuple[int, int]]:
-    """Where each agent's window begins in a mosaic of them all, (row, col), in rows of as many as show best.
+    """The top-left corner (row, col) of each agent's window in a mosaic with cells as large as possible.
 
     Args:
-        agents: N.
+        agents: the number of agents N.
         window: (X, Y).
     """
     high, wide = (length + WINDOWS_APART_PIXELS for length in window)
@@ -106,19 +106,19 @@ def window_corners(agents: int, window: tuple[int, int]) -> list[tuple[int, int]
 
 
 def mosaic_size(agents: int, window: tuple[int, int]) -> tuple[int, int]:
-    """Rows and columns of pixels of the mosaic."""
+    """The rows and columns of the mosaic, in pixels."""
     corners = window_corners(agents, window)
     return max(row for row, _ in corners) + window[0], max(col for _, col in corners) + window[1]
 
 
 def mosaic(windows: Bytes) -> Bytes:
-    """All agents' windows side by side and below each other, as `window_corners` says, UNSEEN between them.
+    """The windows of all agents in a mosaic at `window_corners`, with UNSEEN between them.
 
     Args:
-        windows: uint8 [T, N, X, Y], classes as `classes_seen` gives them.
+        windows: uint8 [T, N, X, Y], classes of `classes_seen`.
 
     Returns:
-        uint8 [T, rows, columns], as `mosaic_size` says.
+        uint8 [T, rows, columns], with the size of `mosaic_size`.
     """
     frames, agents, rows, columns = windows.shape
     joined = np.full((frames, *mosaic_size(agents, (rows, columns))), UNSEEN, np.uint8)

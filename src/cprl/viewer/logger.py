@@ -1,4 +1,4 @@
-"""RerunLogger: a run as a Rerun recording, to a file and, on request, served live on 127.0.0.1."""
+"""RerunLogger: records a run with Rerun, to a file and, on request, live on 127.0.0.1."""
 
 import time
 from collections.abc import Callable, Mapping, Sequence
@@ -13,42 +13,43 @@ from torch import Tensor
 from torchrl.record.loggers import Logger
 
 from cprl.viewer.blueprint import layout
-from cprl.viewer.scenery import Scene, classes, lines, phase_states
+from cprl.viewer.scenery import Curves, Scene, classes, lines, phase_states
 from cprl.viewer.stage import columns, fixed
 from cprl.viewer.streams import FLUSH_TIMEOUT_S, Stream, open_file, open_live
 
 FILE_NAME: Final = "run.rrd"
 TIMELINES: Final = ("step", "episode", "frame")
-"""Of every row: environment steps of the run, episodes, and frames recorded so far."""
+"""The timelines of every row: environment steps of the run, episodes, and frames recorded so far."""
 
 Numbers: TypeAlias = "Sequence[int] | NDArray[np.integer[Any]]"
 
 _LIVE_PERIOD_S: Final = 1.0
 _FILE_PERIOD_S: Final = 60.0
-"""Each sending of numbers costs the file some forty kilobytes, however few they are."""
+"""Each batch of numbers adds about forty kilobytes to the file, however few they are."""
 
 
 class RerunLogger(Logger):
-    """TorchRL's logger interface on a Rerun recording; names become entities, `social/equality` and so on.
+    """A TorchRL logger that writes a Rerun recording; names become entities, `social/equality` and so on.
 
-    Numbers wait in memory and are sent as columns: to the viewer about every second, to the file about
+    Numbers are buffered in memory and sent as columns: to the viewer about every second, to the file about
     every minute. Every row carries the timelines `step` (environment steps of the run), `episode` and `frame`
-    (frames recorded so far). The file and the live recording are two streams of one recording id, so that
-    one may fail without the other; whatever fails is dropped with one warning.
+    (frames recorded so far). The file and the live recording are two streams with the same recording id. If
+    one fails, the logger warns once, drops it and continues with the other.
 
     Args:
         exp_name: the name that the viewer shows.
         log_dir: the run's directory, where the recording is written.
-        scene: what is on the board; without it no frames can be logged.
+        scene: the contents of the board; needed to log frames.
+        curves: the numbers that are plotted, if there is no scene, which has them too.
         live: "serve", "spawn" or "connect ADDRESS", see `cprl.viewer.streams.open_live`; None for the file
-            alone. A recording is served on 127.0.0.1 alone; the empty page of the web viewer, which Rerun
-            serves, listens on all interfaces.
-        file_name: of the recording.
-        recording_id: the viewer shows files of one id as one recording; by default a new one.
-        console: where the addresses are told; by default standard output.
+            alone. The recording is served on 127.0.0.1 only; the web viewer's empty page, which Rerun serves,
+            listens on all interfaces.
+        file_name: the name of the recording.
+        recording_id: the viewer shows files with the same id as one recording; by default a new id.
+        console: the console for the addresses; by default standard output.
 
     Raises:
-        FileExistsError: where there is a recording already.
+        FileExistsError: if the recording exists.
     """
 
     def __init__(
@@ -57,39 +58,41 @@ class RerunLogger(Logger):
         log_dir: str | Path,
         *,
         scene: Scene | None = None,
+        curves: Curves | None = None,
         live: str | None = None,
         file_name: str = FILE_NAME,
         recording_id: str | None = None,
         console: Console | None = None,
     ) -> None:
         self.scene = scene
+        self.curves = scene or curves or Curves(agents=())
         self.recording_id = recording_id or f"{exp_name}-{time.time_ns()}"
         self.path = Path(log_dir) / file_name
         if self.path.exists():
             raise FileExistsError(
-                f"{self.path} exists and is kept; give the recording a directory of its own"
+                f"{self.path} exists and is not overwritten; use another directory or file_name"
             )
         self.addresses: dict[str, str] = {}
         self._live, self._console = live, console or Console()
         self._streams: list[Stream] = []
         self.frames = 0
-        """Frames recorded so far, in earlier files of the recording too."""
+        """Frames recorded so far, including those in earlier files of the recording."""
         self._now = (0, 0)
         self._clips_end: dict[str, int] = {}
         super().__init__(exp_name, str(log_dir))
 
     def _create_experiment(self) -> list[Any]:
-        recording_id, blueprint = self.recording_id, layout(self.scene)
+        recording_id, blueprint = self.recording_id, layout(self.curves)
         Path(self.log_dir).mkdir(parents=True, exist_ok=True)
         file = open_file(recording_id, self.path, blueprint, period_s=_FILE_PERIOD_S)
         self._streams += [file] if file else []
         if self._live:
             self._go_live(recording_id, blueprint)
         self._all(lambda recording: recording.send_recording_name(self.exp_name))
-        self._static("/", classes(self.scene))
-        for entity, style in lines(self.scene).items():
+        self._static("/", classes(self.curves))
+        for entity, style in lines(self.curves).items():
             self._static(entity, style)
-        for entity in ("phase/now", "phase/found"):
+        for entity in ("phase/now", "phase/found") if self.curves.has_phases else ():
             self._static(entity, phase_states())
         if self.scene is not None:
             for entity, parts in fixed(self.scene).items():
@@ -101,7 +104,7 @@ class RerunLogger(Logger):
         live, self.addresses = open_live(self._live or "", recording_id, blueprint, period_s=_LIVE_PERIOD_S)
         self._streams += [live] if live else []
         for where, address in self.addresses.items():
-            self._console.print(f"ViewerCallback live ({where}): {address}", soft_wrap=True, highlight=False)
+            self._console.print(f"Watch live ({where}): {address}", soft_wrap=True, highlight=False)
 
     def _all(self, what: Callable[[Any], object]) -> None:
         for each in self._streams:
@@ -114,11 +117,11 @@ class RerunLogger(Logger):
         self._all(lambda recording: recording.send_columns(entity, times, columns))
 
     def at(self, *, step: int, episode: int) -> None:
-        """Says when it is, for what is logged next without a step of its own."""
+        """Sets the time of subsequent logs that have no step of their own."""
         self._now = step, episode
 
     def log_scalar(self, name: str, value: Any, step: int | None = None, **kwargs: Any) -> None:
-        """Logs a number, or a list, array or tensor of them as name/0, name/1 and so on."""
+        """Logs a number, or a list, array or tensor of numbers as name/0, name/1 and so on."""
         if isinstance(value, Tensor | np.ndarray | list | tuple):
             numbers = np.asarray(value.detach().cpu() if isinstance(value, Tensor) else value).reshape(-1)
             if numbers.size != 1:
@@ -129,7 +132,7 @@ class RerunLogger(Logger):
         self._wait(name, self._now[0] if step is None else int(step), [float(value)])
 
     def log_lines(self, name: str, values: Sequence[float]) -> None:
-        """Logs several numbers that are drawn as lines of one plot, as many every time; NaN leaves a gap."""
+        """Logs the numbers of several lines of one plot, equally many each time; NaN leaves a gap."""
         self._wait(name, self._now[0], [float(value) for value in values])
 
     def _wait(self, name: str, step: int, values: list[float]) -> None:
@@ -140,7 +143,7 @@ class RerunLogger(Logger):
                 _send_waiting(each)
 
     def log_states(self, name: str, states: Mapping[int, str]) -> None:
-        """Logs in which state something is from which episode on; steps are those that `at` said."""
+        """Logs states by the episode from which they hold; their step is the one set by `at`."""
         import rerun as rr
 
         episodes = list(states)
@@ -162,9 +165,9 @@ class RerunLogger(Logger):
         self._all(log)
 
     def log_frames(self, frames: Mapping[str, NDArray[Any]]) -> None:
-        """Logs what `FrameBuffer.take` gave, windows as `classes_seen` gives them; see `stage.columns`."""
+        """Logs frames of `FrameBuffer.take`, with windows of `classes_seen`; see `stage.columns`."""
         if self.scene is None:
-            raise ValueError("the logger has no scene; give it one to log frames")
+            raise ValueError("the logger has no scene; pass scene to log frames")
         count = len(frames["step"])
         if not count:
             return
@@ -175,7 +178,7 @@ class RerunLogger(Logger):
             self._send(entity, times, what)
 
     def log_text(self, text: str, level: str = "INFO") -> None:
-        """Logs an event at the time that `at` said."""
+        """Logs an event at the time set by `at`."""
         import rerun as rr
 
         times = _times([self._now[0]], [self._now[1]], [self.frames])
@@ -183,7 +186,7 @@ class RerunLogger(Logger):
         self._send("log", times, what)
 
     def log_hparams(self, cfg: Any) -> None:
-        """Shows a mapping, or a Markdown text, as the recipe of the run."""
+        """Logs a mapping, or a Markdown text, as the recipe of the run."""
         import rerun as rr
 
         text = (
@@ -194,16 +197,17 @@ class RerunLogger(Logger):
         self._static("recipe", rr.TextDocument(text, media_type=rr.MediaType.MARKDOWN))
 
     def log_video(self, name: str, video: Tensor, step: int | None = None, **kwargs: Any) -> None:
-        """Logs uint8 [(1), T, C, H, W] as T images, one each `step` from the one given.
+        """Logs uint8 [(1), T, C, H, W] as T images at consecutive steps from `step` on.
 
-        A clip of the same name that goes on until later is followed, since TorchRL's recorders count clips.
+        Starts after the last image of an earlier clip with the same name, because TorchRL's recorders pass
+        the number of the clip as its step.
         """
         import rerun as rr
 
         clip = torch.as_tensor(video).cpu()
         clip = clip[0] if clip.ndim == 5 else clip
         if clip.ndim != 4:
-            raise ValueError(f"the video is {list(video.shape)}; [T, C, H, W] or [1, T, C, H, W] is wanted")
+            raise ValueError(f"the video is {list(video.shape)}; allowed: [T, C, H, W] or [1, T, C, H, W]")
         images = clip.permute(0, 2, 3, 1).to(torch.uint8).numpy()
         first = max(self._now[0] if step is None else int(step), self._clips_end.get(name, 0))
         self._clips_end[name] = first + len(images)
@@ -222,7 +226,7 @@ class RerunLogger(Logger):
     def log_histogram(
         self, name: str, data: Any, *, bins: int = 30, step: int | None = None, **kwargs: Any
     ) -> None:
-        """Logs how often values fall into so many equal bins, as bars."""
+        """Logs a histogram of values in equal bins, as bars."""
         import rerun as rr
 
         values = np.asarray(data.detach().cpu() if isinstance(data, Tensor) else data).reshape(-1)
@@ -238,12 +242,12 @@ class RerunLogger(Logger):
         self._all(log)
 
     def flush(self) -> None:
-        """Sends everything that waits, to the file and to the viewer."""
+        """Sends all buffered numbers to the file and to the viewer."""
         for each in self._streams:
             _send_waiting(each)
 
     def shutdown(self) -> None:
-        """Sends everything and closes the recording; the file gets its footer. A second call does nothing."""
+        """Flushes and closes the recording; the file gets its footer. A second call does nothing."""
         self.flush()
         for each in self._streams:
             each.close()
@@ -261,7 +265,7 @@ class RerunLogger(Logger):
 
 
 def _times(steps: Numbers, episodes: Numbers, frames: Numbers) -> list[Any]:
-    """The timelines that every row carries."""
+    """The timelines of each row."""
     import rerun as rr
 
     return [
@@ -271,7 +275,7 @@ def _times(steps: Numbers, episodes: Numbers, frames: Numbers) -> list[Any]:
 
 
 def _send_waiting(stream: Stream) -> None:
-    """Sends what one stream still waits for, one chunk an entity."""
+    """Sends the buffered numbers of one stream, one chunk per entity."""
     import rerun as rr
 
     waiting = stream.take()

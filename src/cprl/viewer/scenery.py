@@ -1,4 +1,4 @@
-"""Scenery: what a recording shows, and the names and colours of it."""
+"""The contents of a recording, with their names and colours."""
 
 from dataclasses import dataclass
 from typing import Any, Final
@@ -6,7 +6,7 @@ from typing import Any, Final
 import numpy as np
 
 from cprl.commons.colours import FIRST_AGENT, agent_colour, class_colour, class_name
-from cprl.commons.seeing import UNSEEN
+from cprl.commons.decoding import UNSEEN
 
 SOCIAL: Final = {
     "social/collective_return": ("collective return", (230, 160, 0)),
@@ -18,7 +18,7 @@ SOCIAL: Final = {
     "social/peacefulness": ("peacefulness", (204, 121, 167)),
     "social/stock_left": ("apples left", (0, 200, 0)),
 }
-"""The name and colour of a line, since the viewers' own colours differ; agents have theirs."""
+"""The name and colour of each line, because viewers assign different colours; agents have their own."""
 OTHERS: Final = {
     "time/env_steps_per_s": ("steps per second", (150, 150, 150)),
     "evaluation/greedy_return": ("greedy, evaluated", (230, 160, 0)),
@@ -39,46 +39,61 @@ _MEAN_WIDTH, _AGENT_WIDTH, _SINGLE_WIDTH, _SINGLE_SHARE = 2.5, 1.5, 0.7, 0.45
 
 
 @dataclass(frozen=True, kw_only=True)
-class Scene:
-    """What is on the board that a recording shows."""
+class Curves:
+    """The numbers that a recording plots; a game without a board has nothing else."""
+
+    agents: tuple[str, ...]
+    """The names of the agents, agent 0 first."""
+    replicas: int = 1
+    """The number of replicas: each is a thin line, and their mean a thick one."""
+    metrics: tuple[str, ...] = tuple(name.removeprefix("social/") for name in SOCIAL)
+    """The metrics that the game reports, without the prefix `social/`."""
+    has_phases: bool = True
+    """Whether phases can be detected from these metrics."""
+    has_tags: bool = True
+    """Whether the game reports who tagged whom."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Scene(Curves):
+    """The contents of the board that a recording shows."""
 
     height: int
     width: int
     walls: tuple[tuple[int, int], ...]
     """(row, col) of each cell of inner wall."""
     sites: tuple[tuple[int, int], ...]
-    """(row, col) of each cell where an apple can hang, K."""
-    agents: tuple[str, ...]
-    """Names of the agents, agent 0 first."""
+    """(row, col) of each of the K sites, the cells where apples grow."""
     window: tuple[int, int]
     """(X, Y) of a window."""
-    replicas: int = 1
-    """How many replicas' metrics are drawn: each of them thinly, and their mean."""
     is_replay: bool = False
-    """Whether it is one episode of a stored policy: then harvest and stock are told turn by turn, and there
-    are no curves over episodes."""
+    """Whether it is one episode of a stored policy; then harvest and stock are plotted turn by turn, and
+    there are no curves over episodes."""
 
 
-def classes(scene: Scene | None) -> Any:
+def classes(curves: Curves) -> Any:
     """Names and colours of the classes on boards and in windows."""
     import rerun as rr
 
     known = [
         rr.AnnotationInfo(id=kind, label=class_name(kind), color=class_colour(kind))
-        for kind in range(FIRST_AGENT + (len(scene.agents) if scene else 0))
+        for kind in range(FIRST_AGENT + len(curves.agents))
     ]
     return rr.AnnotationContext([*known, rr.AnnotationInfo(id=UNSEEN, label="", color=(0, 0, 0, 0))])
 
 
-def lines(scene: Scene | None) -> dict[str, Any]:
+def lines(curves: Curves) -> dict[str, Any]:
     """The names, colours and widths of each plot's lines, by entity."""
     import rerun as rr
 
-    replicas = scene.replicas if scene else 1
-    styles = {entity: _mean_and_singles(name, colour, replicas) for entity, (name, colour) in SOCIAL.items()}
+    styles = {
+        entity: _mean_and_singles(name, colour, curves.replicas)
+        for entity, (name, colour) in SOCIAL.items()
+        if entity.removeprefix("social/") in curves.metrics
+    }
     for entity, (name, colour) in OTHERS.items():
         styles[entity] = rr.SeriesLines(names=[name], colors=[colour])
-    for agent, name in enumerate(scene.agents if scene else ()):
+    for agent, name in enumerate(curves.agents):
         for entity in OF_AGENTS:
             styles[f"{name}/{entity}"] = rr.SeriesLines(
                 names=[name], colors=[agent_colour(agent)], widths=[_AGENT_WIDTH]
@@ -87,7 +102,7 @@ def lines(scene: Scene | None) -> dict[str, Any]:
 
 
 def _mean_and_singles(name: str, colour: tuple[int, int, int], replicas: int) -> Any:
-    """A thin, dark line for each of several replicas, and over them a thick one for their mean."""
+    """A thin, dark line for each of several replicas, and a thick one on top for their mean."""
     import rerun as rr
 
     if replicas == 1:

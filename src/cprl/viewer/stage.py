@@ -1,4 +1,4 @@
-"""The stage: frames of one world as Rerun's archetypes, the board with its agents and what they see."""
+"""Frames of one world as Rerun archetypes: the board with its agents, and their windows."""
 
 from collections.abc import Mapping
 from typing import Any, Final
@@ -7,33 +7,34 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cprl.commons.colours import APPLE, BEAM, FIRST_AGENT, GROUND, WALL, agent_colour
-from cprl.commons.seeing import UNSEEN
+from cprl.commons.decoding import UNSEEN
 from cprl.commons.world import Bools, Bytes
 from cprl.viewer.frames import mosaic, mosaic_size, window_corners
 from cprl.viewer.scenery import Scene
 
 RIM_CELLS: Final = 1
-"""Cells of wall that are shown around the board."""
+"""The width of the wall shown around the board, in cells."""
 
 _AHEAD: Final = np.array([(0, -1), (1, 0), (0, 1), (-1, 0)], np.float32)
 _ARROW_CELLS: Final = 1.5
-"""From an agent's centre into the next cell: the number stands at its middle, and hides less of the agent."""
+"""The length of an agent's arrow, in cells: it ends in the next cell, so that the number at its middle hides
+less of the agent."""
 _OUT_HALF_CELLS: Final = 0.4
 _BEAM_OPACITY: Final = 0.5
 _STROKE_CELLS: Final = 0.07
 
 Frames = Mapping[str, NDArray[Any]]
-"""As `FrameBuffer.take` gives them, [T, ...] each, windows as `classes_seen` gives them."""
+"""Columns of `FrameBuffer.take`, [T, ...] each, with windows as classes of `classes_seen`."""
 
 
 def frame_bytes(scene: Scene) -> float:
-    """How much of a file one frame takes at most, about: a trained population's on `commons` takes 400."""
+    """The largest size of one frame in a file, about; with a trained population on `commons` it is 400."""
     rows, columns = mosaic_size(len(scene.agents), scene.window)
     return 80 + 20 * len(scene.agents) + 0.35 * (rows * columns + scene.height * scene.width)
 
 
 def fixed(scene: Scene) -> dict[str, list[Any]]:
-    """What is the same in every frame, by entity: sizes of pictures, agents' names, colours and frames."""
+    """The static parts of a recording, by entity: sizes of images, agents' names, colours and frames."""
     import rerun as rr
 
     def form(size: tuple[int, int]) -> Any:
@@ -68,9 +69,9 @@ def fixed(scene: Scene) -> dict[str, list[Any]]:
 
 
 def columns(scene: Scene, frames: Frames) -> dict[str, tuple[NDArray[np.intp], Any]]:
-    """What T frames show, by entity: which of the frames have a row there, and the columns of these rows.
+    """The contents of T frames, by entity: the frames that have a row there, and the columns of these rows.
 
-    Beams and marks of those out of play have a row only where they change, and in the first frame.
+    Beams and the marks of agents out of play have rows only for the first frame and where they change.
     """
     import rerun as rr
 
@@ -99,7 +100,7 @@ def columns(scene: Scene, frames: Frames) -> dict[str, tuple[NDArray[np.intp], A
 
 
 def boards(scene: Scene, frames: Frames) -> Bytes:
-    """Boards with a rim of wall: apples that hang, and agents in play, each in a class of its own.
+    """Boards with a border of wall: apples, and agents in play, each in a class of its own.
 
     Returns:
         uint8 [T, H + 2, W + 2].
@@ -117,7 +118,7 @@ def boards(scene: Scene, frames: Frames) -> Bytes:
 
 
 def beam_pictures(beams: Bools) -> Bytes:
-    """The cells that beams cover, UNSEEN elsewhere: uint8 [T, H + 2, W + 2] of bool [T, H, W]."""
+    """The cells that beams cover, UNSEEN elsewhere: bool [T, H, W] to uint8 [T, H + 2, W + 2]."""
     return _with_rim(np.where(beams, BEAM, UNSEEN).astype(np.uint8), UNSEEN)
 
 
@@ -126,7 +127,7 @@ def _with_rim(pictures: Bytes, kind: int) -> Bytes:
 
 
 def _agents(frames: Frames) -> Any:
-    """Arrows that point where agents look; of those out of play no more than their numbers are left."""
+    """Arrows that point in the agents' headings; agents out of play have their number only."""
     import rerun as rr
 
     count, agents = frames["in_play"].shape
@@ -137,12 +138,12 @@ def _agents(frames: Frames) -> Any:
 
 
 def _out(scene: Scene, frames: Frames) -> tuple[NDArray[np.intp], Any]:
-    """A hollow square in the colour of each agent that is out of play, and by whom it was tagged."""
+    """A hollow square in the colour of each agent out of play, labelled with the agent that tagged it."""
     import rerun as rr
 
     out, by = ~frames["in_play"], frames["tagged_by"]
-    told = np.concatenate([out, np.where(out, by, 0), np.where(out, frames["row"], 0)], 1)
-    changed = _changes(np.concatenate([told, np.where(out, frames["col"], 0)], 1))
+    marks = np.concatenate([out, np.where(out, by, 0), np.where(out, frames["row"], 0)], 1)
+    changed = _changes(np.concatenate([marks, np.where(out, frames["col"], 0)], 1))
     out, by, centres = out[changed], by[changed], _centres(frames)[changed]
     rgb = np.array([agent_colour(agent) for agent in range(len(scene.agents))], np.uint8)
     return changed, rr.Boxes2D.columns(
@@ -154,11 +155,11 @@ def _out(scene: Scene, frames: Frames) -> tuple[NDArray[np.intp], Any]:
 
 
 def _centres(frames: Frames) -> NDArray[np.float32]:
-    """Where agents stand on the picture, (x, y): [T, N, 2]."""
+    """The positions of agents on the image, (x, y): [T, N, 2]."""
     return np.stack([frames["col"], frames["row"]], -1).astype(np.float32) + RIM_CELLS + 0.5
 
 
 def _changes(rows: NDArray[Any]) -> NDArray[np.intp]:
-    """The first row, and all that differ from the one before."""
+    """The indices of the first row, and of all rows that differ from the previous one."""
     flat = rows.reshape(len(rows), -1)
     return np.flatnonzero(np.concatenate([[True], (flat[1:] != flat[:-1]).any(1)]))

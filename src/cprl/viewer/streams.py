@@ -1,4 +1,4 @@
-"""Streams of one recording: to a file and, on request, served live on 127.0.0.1."""
+"""The streams of one recording: to a file and, on request, live on 127.0.0.1."""
 
 import os
 import shutil
@@ -14,10 +14,10 @@ from urllib.parse import quote, urlsplit
 
 LOCALHOST: Final = "127.0.0.1"
 SERVER_MEMORY: Final = "512MB"
-"""What the served recording may hold; beyond it the oldest rows are dropped, for viewers alone."""
+"""The memory limit of the served recording; beyond it viewers lose the oldest rows, the file does not."""
 
-ROOM_BYTES: Final = 2_000_000
-"""Free on a disk, so that a recording is begun there; its layout and static parts take a tenth."""
+NEEDED_BYTES: Final = 2_000_000
+"""The free disk space needed to start a recording; its layout and static parts take a tenth."""
 
 FLUSH_TIMEOUT_S: Final = 5.0
 
@@ -27,33 +27,33 @@ Waiting: TypeAlias = dict[str, list[tuple[int, int, int, list[float]]]]
 
 
 class Stream:
-    """One recording stream that may fail: then a warning says so once, and the run goes on without it.
+    """One recording stream. If it fails, it warns once, and the run continues without it.
 
     Args:
-        name: what a person calls it.
+        name: the name in warnings.
         recording: a `rerun.RecordingStream`.
-        period_s: seconds between two sendings of waiting numbers.
+        period_s: seconds between two batches of buffered numbers.
     """
 
     def __init__(self, name: str, recording: Any, *, period_s: float) -> None:
         self.name, self.recording, self.period_s = name, recording, period_s
         self.waiting: Waiting = {}
-        """What has not been sent."""
+        """Numbers that have not been sent."""
         self._sent = time.perf_counter()
 
     @property
     def is_due(self) -> bool:
-        """Whether what waits has waited long enough."""
+        """Whether the buffered numbers should be sent now."""
         return time.perf_counter() - self._sent > self.period_s
 
     def take(self) -> Waiting:
-        """What waits, to be sent now."""
+        """The buffered numbers; the buffer is empty afterwards."""
         taken, self.waiting = self.waiting, {}
         self._sent = time.perf_counter()
         return taken
 
     def do(self, what: Callable[[Any], object]) -> None:
-        """Does something with the stream, if it is still there."""
+        """Calls a function with the stream, unless the stream has failed."""
         if self.recording is None:
             return
         try:
@@ -61,7 +61,7 @@ class Stream:
         except Exception as error:
             self.recording = None
             warnings.warn(
-                f"the Rerun {self.name} is dropped, the run goes on without it: {error}",
+                f"the Rerun {self.name} failed, the run continues without it: {error}",
                 RuntimeWarning,
                 stacklevel=2,
             )
@@ -72,44 +72,44 @@ class Stream:
         self.recording = None
 
 
-_WAYS: Final = '"serve", "spawn" or "connect rerun+http://HOST:PORT/proxy"'
+_LIVE: Final = '"serve", "spawn" or "connect rerun+http://HOST:PORT/proxy"'
 
 
 def check_watch(watch: str, *, can_be_off: bool = True) -> None:
-    """Refuses a recipe's `watch` that is no way to watch, before a run is begun for it.
+    """Checks a recipe's `watch` before the run starts.
 
     Args:
         watch: "file", or live as well, see `open_live`; "off" for no recording.
-        can_be_off: whether the recipe can do without.
+        can_be_off: whether "off" is allowed.
 
     Raises:
-        ValueError: for anything else; says what came and what fits.
+        ValueError: if the value is not allowed; names it and the allowed values.
     """
     if watch != "file" and not (can_be_off and watch == "off"):
         offs = '"off", ' if can_be_off else ""
-        _check(watch, f'"file", {offs}{_WAYS}', name="watch")
+        _check(watch, f'"file", {offs}{_LIVE}', name="watch")
 
 
-def _check(live: str, wanted: str, *, name: str = "live") -> None:
+def _check(live: str, allowed: str, *, name: str = "live") -> None:
     how, _, address = live.partition(" ")
     where = urlsplit(address.removeprefix("rerun+"))
     try:
         connects = how == "connect" and address.startswith("rerun+http") and bool(where.hostname)
         connects = connects and where.port != 0
-    except ValueError:  # of a port that is no number
+    except ValueError:  # the port is not a number
         connects = False
     if not connects and live not in ("serve", "spawn"):
-        raise ValueError(f"{name} is {live!r}; wanted: {wanted}")
+        raise ValueError(f"{name} is {live!r}; allowed: {allowed}")
 
 
 def open_file(recording_id: str, path: Path, blueprint: Any, *, period_s: float) -> Stream | None:
-    """A stream into a new file; None, with a warning, where the disk is as good as full.
+    """A stream to a new file; None, with a warning, if the disk is almost full.
 
-    Rerun would wait for ever, now and then, for a layout that finds no room.
+    Otherwise Rerun may wait forever for the layout to be written.
     """
     free = shutil.disk_usage(path.parent).free
-    if free < ROOM_BYTES:
-        _warn_of(f"file {path}", f"{free:,} bytes are free there, {ROOM_BYTES:,} are wanted")
+    if free < NEEDED_BYTES:
+        _warn_of(f"file {path}", f"{free:,} bytes are free there, {NEEDED_BYTES:,} are needed")
         return None
     recording = _recording(recording_id)
     recording.save(path, default_blueprint=blueprint)
@@ -119,20 +119,20 @@ def open_file(recording_id: str, path: Path, blueprint: Any, *, period_s: float)
 def open_live(
     live: str, recording_id: str, blueprint: Any, *, period_s: float
 ) -> tuple[Stream | None, dict[str, str]]:
-    """A stream that can be watched while it is written, and where: "browser" and "native".
+    """A live stream, and how to watch it: "browser" and "native".
 
     Args:
-        live: "serve": served on free ports of 127.0.0.1, where viewers come and go and get the history;
-            "spawn": that, and Rerun's own viewer is started; "connect ADDRESS": sent to a viewer that
-            listens, such as rerun+http://127.0.0.1:9876/proxy.
-        recording_id: of the recording.
+        live: "serve": serves the recording on free ports of 127.0.0.1; viewers can connect at any time and
+            get the history. "spawn": the same, and starts Rerun's native viewer. "connect ADDRESS": sends to
+            a listening viewer, such as rerun+http://127.0.0.1:9876/proxy.
+        recording_id: the id of the recording.
         blueprint: its layout.
-        period_s: seconds between two sendings of waiting numbers.
+        period_s: seconds between two batches of buffered numbers.
 
     Raises:
-        ValueError: for anything else.
+        ValueError: if `live` is anything else.
     """
-    _check(live, _WAYS)
+    _check(live, _LIVE)
     if live.startswith("connect "):
         return _connect(live.partition(" ")[2], recording_id, blueprint, period_s), {}
     stream, grpc = _serve(recording_id, blueprint, period_s)
@@ -153,9 +153,9 @@ def _serve(recording_id: str, blueprint: Any, period_s: float) -> tuple[Stream, 
 
 
 def _connect(address: str, recording_id: str, blueprint: Any, period_s: float) -> Stream | None:
-    """A stream to a viewer that listens there; None, with a warning, where nobody does.
+    """A stream to a listening viewer; None, with a warning, if there is none.
 
-    Without this look Rerun would wait for the viewer, and at last hold up the training.
+    Without this check Rerun would wait for the viewer and eventually block the training.
     """
     where = urlsplit(address.removeprefix("rerun+"))
     try:
@@ -169,7 +169,7 @@ def _connect(address: str, recording_id: str, blueprint: Any, period_s: float) -
 
 
 def _spawn(grpc: str) -> None:
-    """Starts Rerun's own viewer beside the training; where it cannot open, a warning says so."""
+    """Starts Rerun's native viewer in its own process; warns if it cannot open."""
     if sys.platform.startswith("linux") and not (
         os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY")
     ):
@@ -187,7 +187,7 @@ def _spawn(grpc: str) -> None:
 
 
 def _warn_of(what: str, why: object) -> None:
-    warnings.warn(f"the Rerun {what}: {why}; the run goes on without it", RuntimeWarning, stacklevel=3)
+    warnings.warn(f"the Rerun {what}: {why}; the run continues without it", RuntimeWarning, stacklevel=3)
 
 
 def _recording(recording_id: str) -> Any:
@@ -199,20 +199,20 @@ def _recording(recording_id: str) -> Any:
 
 
 def _free_port() -> int:
-    """A port of 127.0.0.1 that nobody listens at."""
+    """A free port of 127.0.0.1."""
     with socket.socket() as probe:
         probe.bind((LOCALHOST, 0))
         return int(probe.getsockname()[1])
 
 
 def viewer() -> str:
-    """How to start Rerun's own viewer: the one beside this Python, if there is one."""
+    """The command of Rerun's native viewer: the one next to this Python, if there is one."""
     beside = Path(sys.executable).with_name("rerun")
     return str(beside) if beside.exists() else "rerun"
 
 
 def _addresses(grpc: str) -> dict[str, str]:
-    """Starts the web viewer's pages, and tells where to look."""
+    """Starts the web viewer's pages; returns the addresses."""
     import rerun as rr
 
     web = _free_port()

@@ -1,4 +1,4 @@
-"""Boards: drawn (`parse`), by name (`named`), or made by rule (`crosses`, `rooms`, `random`)."""
+"""Boards: drawn (`parse`), by name (`named`), or generated (`crosses`, `rooms`, `random`)."""
 
 from cprl.commons.maps.board import HEADING_OF_SIGN, SIGN_OF_HEADING, Cell, Map, Start
 from cprl.commons.maps.drawings import NAMES, named, parse

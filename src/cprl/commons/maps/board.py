@@ -1,4 +1,4 @@
-"""Map: a board, where walls and apple sites are, and where agents start."""
+"""Map: a board with its walls, its apple sites and the starts of the agents."""
 
 from collections.abc import Iterable
 from dataclasses import dataclass
@@ -16,18 +16,18 @@ SITE, GROUND, WALL = "A", ".", "#"
 
 @dataclass(frozen=True, kw_only=True)
 class Map:
-    """A board: where walls and apple sites are, and where agents start.
+    """A board with its walls, its apple sites and the starts of the agents. Every cell outside it is wall.
 
     Raises:
-        ValueError: names the row and column of what does not fit.
+        ValueError: If the board cannot be played; the message names the row and column.
     """
 
     height: int
-    """Rows H, at least 1."""
+    """The number of rows H, at least 1."""
     width: int
-    """Columns W, at least 1."""
+    """The number of columns W, at least 1."""
     sites: tuple[Cell, ...]
-    """(row, col) of each of the K cells where an apple can hang; full when an episode begins."""
+    """(row, col) of each of the K sites, the cells that can hold an apple; all do when an episode begins."""
     starts: tuple[Start, ...]
     """(row, col, heading) of each of the N agents, agent 0 first; heading 0 up, 1 right, 2 down, 3 left."""
     walls: tuple[Cell, ...] = ()
@@ -46,7 +46,7 @@ class Map:
         return len(self.starts)
 
     def drawing(self) -> str:
-        """The board as `parse` reads it; agents are shown before sites, their numbers are not shown."""
+        """The board as a drawing for `parse`. An agent hides a site on its cell; its index is not shown."""
         signs = [[GROUND] * self.width for _ in range(self.height)]
         for row, col in self.sites:
             signs[row][col] = SITE
@@ -59,10 +59,12 @@ class Map:
 
 def _check_size(board: Map) -> None:
     if board.height < 1 or board.width < 1:
-        raise ValueError(f"a Map of {board.height} rows and {board.width} columns; both must be at least 1")
+        raise ValueError(
+            f"Map.height is {board.height} and Map.width is {board.width}; allowed: integers >= 1"
+        )
     for name, cells in (("sites", board.sites), ("starts", board.starts)):
         if not cells:
-            raise ValueError(f"Map.{name} is empty; at least one is wanted")
+            raise ValueError(f"Map.{name} is empty; allowed: at least one entry")
     for row, col, heading in board.starts:
         if heading not in SIGN_OF_HEADING:
             raise ValueError(
@@ -76,17 +78,17 @@ def _check_cells(board: Map) -> None:
         for row, col in cells:
             if not (0 <= row < board.height and 0 <= col < board.width):
                 raise ValueError(
-                    f"the {name} at row {row}, column {col} lies outside a board of "
+                    f"the {name} at row {row}, column {col} lies outside the board of "
                     f"{board.height} rows and {board.width} columns"
                 )
-        for row, col in _twice(cells):
-            raise ValueError(f"two {name}s at row {row}, column {col}; a cell has room for one")
+        for row, col in _duplicates(cells):
+            raise ValueError(f"two {name}s at row {row}, column {col}; allowed: one per cell")
     for name, cells in (("site", board.sites), ("start", starts)):
         for row, col in sorted(set(cells) & set(board.walls)):
             raise ValueError(f"the {name} at row {row}, column {col} is on a wall")
 
 
-def _twice(cells: Iterable[Cell]) -> Iterable[Cell]:
+def _duplicates(cells: Iterable[Cell]) -> Iterable[Cell]:
     seen: set[Cell] = set()
     for cell in cells:
         if cell in seen:

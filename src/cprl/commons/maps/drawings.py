@@ -1,7 +1,7 @@
-"""Drawings -> Map; the named boards.
+"""Maps from drawings, and the named boards.
 
-A drawing is rows of signs: `A` an apple site, `.` open ground, `#` an inner wall, `> ^ < v` an agent and
-its heading. Everything outside the board is wall.
+A drawing is rows of signs: `A` an apple site, `.` open ground, `#` an inner wall, `> ^ < v` an agent with its
+heading. Everything outside the board is wall.
 """
 
 from inspect import cleandoc
@@ -13,16 +13,17 @@ from cprl.commons.world import DOWN, RIGHT
 
 
 def parse(drawing: str) -> Map:
-    """The Map of a drawing, of any size; agents are numbered in reading order, rows and columns from 0.
+    """Reads a drawing of any size; agents are numbered in reading order, rows and columns from 0.
 
-    Common indentation and empty lines around the drawing are left out.
+    Common indentation and empty lines around the drawing are ignored.
 
     Raises:
-        ValueError: names the row and column of a ragged row, an unknown sign, or what is missing.
+        ValueError: If rows differ in length, a sign is unknown, or there is no site or no agent; the message
+            names the row and column.
     """
     rows = [row.rstrip() for row in cleandoc(drawing).splitlines()]
     if not rows:
-        raise ValueError("the drawing is empty; at least one row of signs is wanted")
+        raise ValueError("the drawing is empty; allowed: at least one row of signs")
     _check_drawing(rows)
     cells = [(r, c, sign) for r, row in enumerate(rows) for c, sign in enumerate(row)]
     return Map(
@@ -40,11 +41,11 @@ def _check_drawing(rows: list[str]) -> None:
     for r, row in enumerate(rows):
         for c, sign in enumerate(row):
             if sign not in known or sign == " ":
-                raise ValueError(f"unknown sign {sign!r} at row {r}, column {c}; known: {known}")
+                raise ValueError(f"unknown sign {sign!r} at row {r}, column {c}; allowed: {known}")
         if len(row) != width:
             raise ValueError(
                 f"row {r} ends after column {len(row) - 1}, row 0 after column {width - 1}; "
-                "all rows of a drawing must be equally long"
+                "all rows of a drawing must have the same length"
             )
     last = f"searched up to row {len(rows) - 1}, column {width - 1}"
     signs = set(chain.from_iterable(rows))
@@ -101,16 +102,20 @@ _DRAWINGS: Final = {
 _NUMBERED_STARTS: Final[dict[str, tuple[Start, ...]]] = {
     "commons": ((0, 1, RIGHT), (2, 2, DOWN), (1, 3, DOWN), (0, 2, RIGHT)),
 }
-"""Where the published program numbers its agents in another than the reading order."""
+"""Starts of boards on which the published program does not number its agents in reading order."""
 
 NAMES: Final = tuple(_DRAWINGS)
 """The four published boards, after [W]."""
 
 
 def named(name: str) -> Map:
-    """One of the published boards, by its name in `NAMES`."""
+    """A published board, by its name in `NAMES`.
+
+    Raises:
+        ValueError: If there is no board of this name.
+    """
     if name not in _DRAWINGS:
-        raise ValueError(f"no board is called {name!r}; there are {', '.join(NAMES)}")
+        raise ValueError(f"name is {name!r}; allowed: {', '.join(NAMES)}")
     board = parse(_DRAWINGS[name])
     starts = _NUMBERED_STARTS.get(name, board.starts)
     return Map(height=board.height, width=board.width, sites=board.sites, starts=starts, walls=board.walls)

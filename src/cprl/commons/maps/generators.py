@@ -1,4 +1,4 @@
-"""Boards made by rule: crosses of sites, rooms with walls, and random ones."""
+"""Generated boards: crosses of sites, rooms with walls, and random boards."""
 
 from collections.abc import Iterable, Sequence
 from typing import Final, Literal, get_args
@@ -20,7 +20,7 @@ _CENTRES: Final = (
     *((row, col) for row in (5, 13) for col in _NEAR_CENTRES),
 )
 _CLOSE_CENTRES: Final = (*((1, col) for col in (2, 6, 10, 14, 18)), *((3, col) for col in (4, 8, 12, 16)))
-"""The north-west room's crosses on the unequal board."""
+"""Centres of the crosses in the north-west room of the unequal board."""
 
 _NORTH_WALLS: Final[dict[Sequence[int], tuple[Sequence[int], ...]]] = {
     range(5): ((24, 28),),
@@ -28,10 +28,10 @@ _NORTH_WALLS: Final[dict[Sequence[int], tuple[Sequence[int], ...]]] = {
     (6,): ((22, 24),),
     (7,): (range(23), (24,), range(28, 53)),
 }
-"""Columns of wall by rows of the upper half; the lower half is the upper one turned by half a turn."""
+"""Columns of wall by rows of the upper half; the lower half is the upper one rotated by 180 degrees."""
 
 _OPENINGS: Final = ((1, 24), (3, 28), (7, 1), (7, 8), (7, 40), (7, 48))
-"""Of the upper half, likewise."""
+"""Openings in the walls of the upper half under "multiple"; the lower half likewise."""
 
 _NORTH_STARTS: Final = ((3, 6), (3, 46), (3, 10), (3, 42), (3, 14), (3, 38))
 
@@ -44,17 +44,17 @@ def crosses(
     starts: Iterable[Start],
     walls: Iterable[Cell] = (),
 ) -> Map:
-    """A board whose sites are crosses: each centre and its four neighbours.
+    """A board whose sites form crosses: each centre and its four neighbours.
 
     Args:
-        height: rows H.
-        width: columns W.
-        centres: (row, col) of each cross; cells of two crosses are one site.
+        height: The number of rows H.
+        width: The number of columns W.
+        centres: (row, col) of the centre of each cross; a cell in two crosses is one site.
         starts: (row, col, heading) of each agent.
         walls: (row, col) of each inner wall.
 
     Raises:
-        ValueError: names the row and column of a site or start that lies outside or on a wall.
+        ValueError: If a site or start lies outside the board or on a wall; the message names row and column.
     """
     sites = {
         (row + down, col + right)
@@ -69,17 +69,18 @@ def crosses(
 def rooms(entrances: Entrances = "single", *, agents: int = 12) -> Map:
     """Four rooms around a plus-shaped corridor, 19 x 53, after Perolat et al. (2017).
 
-    36 crosses, 180 sites; "single" gives each room one entrance with a bend, "multiple" several, "none"
-    takes all walls away, "unequal" is "single" with the crosses of the north-west room closer together.
-    The agents' places are ours: up to three in each room, in turn north-west, north-east, south-east,
-    south-west.
+    There are 36 crosses with 180 sites. "single" gives each room one entrance with a bend, "multiple"
+    several; "none" removes all walls; "unequal" is "single" with the crosses of the north-west room closer
+    together.
+    The starts are ours: up to three agents per room, assigned in turn to the north-west, north-east,
+    south-east and south-west room.
 
     Args:
-        entrances: which of the four boards.
-        agents: how many agents N, 1 to 12.
+        entrances: The board: "single", "multiple", "none" or "unequal".
+        agents: The number of agents N, 1 to 12.
 
     Raises:
-        ValueError: for another name or number.
+        ValueError: If `entrances` or `agents` is not allowed.
     """
     if entrances not in get_args(Entrances):
         raise ValueError(f"entrances is {entrances!r}; allowed: {', '.join(get_args(Entrances))}")
@@ -99,7 +100,7 @@ def rooms(entrances: Entrances = "single", *, agents: int = 12) -> Map:
 
 
 def _turned(cell: Cell) -> Cell:
-    """Where a cell of the rooms comes to lie after half a turn."""
+    """The position of a cell after the board is rotated by 180 degrees."""
     return ROOMS_HEIGHT - 1 - cell[0], ROOMS_WIDTH - 1 - cell[1]
 
 
@@ -119,7 +120,7 @@ def _room_walls(entrances: Entrances) -> list[Cell]:
 
 
 def _room_starts() -> list[Start]:
-    """Everybody looks towards the corridor."""
+    """The starts of all 12 agents, facing the corridor."""
     starts: list[Start] = []
     for west, east in zip(_NORTH_STARTS[::2], _NORTH_STARTS[1::2], strict=True):
         north = [(*cell, DOWN) for cell in (west, east)]
@@ -130,50 +131,51 @@ def _room_starts() -> list[Start]:
 def random(
     height: int, width: int, *, agents: int, density: float, clustering: float = 0.0, seed: int = 0
 ) -> Map:
-    """A board of random sites, without walls; agents start on random cells that are no sites.
+    """A board with random sites and no walls; agents start on random cells without a site.
 
-    Sites are placed one after the other: with the chance `clustering` on a free cell beside a site that is
-    already there, else on any free cell. At 0 they lie independently, near 1 they grow as one patch.
+    Sites are placed one by one: with probability `clustering` on a free cell next to an existing site,
+    otherwise on any free cell. At 0 they are independent; near 1 they form a single patch.
 
     Args:
-        height: rows H.
-        width: columns W.
-        agents: how many agents N, at least 1.
-        density: sites per cell, above 0; their number is density x H x W, rounded, at least 1.
-        clustering: 0..1.
-        seed: of all that is random here.
+        height: The number of rows H, at least 1.
+        width: The number of columns W, at least 1.
+        agents: The number of agents N, at least 1.
+        density: Sites per cell, above 0, at most 1. The number of sites is density x H x W, rounded, at
+            least 1.
+        clustering: A probability, 0..1.
+        seed: The seed of the random numbers.
 
     Raises:
-        ValueError: names what is out of range, or what finds no room.
+        ValueError: If an argument is out of range, or sites and agents do not fit on the board.
     """
     _check_random(height, width, agents, density, clustering)
-    chance = np.random.default_rng(seed)
+    rng = np.random.default_rng(seed)
     cells = [(row, col) for row in range(height) for col in range(width)]
-    wanted = max(1, round(density * len(cells)))
-    if wanted + agents > len(cells):
+    count = max(1, round(density * len(cells)))
+    if count + agents > len(cells):
         raise ValueError(
-            f"{wanted} sites and {agents} agents find no room on {len(cells)} cells; lower density or agents"
+            f"{count} sites and {agents} agents do not fit on {len(cells)} cells; lower density or agents"
         )
     free, beside, sites = set(cells), set[Cell](), set[Cell]()
-    while len(sites) < wanted:
-        near = beside and chance.random() < clustering
+    while len(sites) < count:
+        near = beside and rng.random() < clustering
         choices = sorted(beside if near else free)
-        row, col = choices[chance.integers(len(choices))]
+        row, col = choices[rng.integers(len(choices))]
         sites.add((row, col))
         free.discard((row, col))
         beside |= {(row - 1, col), (row + 1, col), (row, col - 1), (row, col + 1)}
         beside &= free
     places = sorted(free)
-    chosen = chance.choice(len(places), agents, replace=False)
-    starts = [(*places[at], int(chance.integers(4))) for at in chosen]
+    chosen = rng.choice(len(places), agents, replace=False)
+    starts = [(*places[at], int(rng.integers(4))) for at in chosen]
     return Map(height=height, width=width, sites=tuple(sorted(sites)), starts=tuple(starts))
 
 
 def _check_random(height: int, width: int, agents: int, density: float, clustering: float) -> None:
     for name, number in (("height", height), ("width", width), ("agents", agents)):
         if number < 1:
-            raise ValueError(f"{name} is {number}; at least 1 is wanted")
+            raise ValueError(f"{name} is {number}; allowed: an integer >= 1")
     if not 0 < density <= 1:
-        raise ValueError(f"density is {density}; allowed: above 0, up to 1")
+        raise ValueError(f"density is {density}; allowed: above 0, at most 1")
     if not 0 <= clustering <= 1:
-        raise ValueError(f"clustering is {clustering}; allowed: 0 to 1")
+        raise ValueError(f"clustering is {clustering}; allowed: 0..1")

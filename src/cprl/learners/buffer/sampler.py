@@ -1,4 +1,4 @@
-"""The replay buffer of many lanes: TorchRL's, over `LaneStorage`; each lane draws for itself."""
+"""The replay buffer of many lanes: TorchRL's buffer over `LaneStorage`; each lane samples for itself."""
 
 import logging
 from collections.abc import Mapping, Sequence
@@ -7,20 +7,23 @@ from typing import Any
 import numpy as np
 import psutil
 import torch
+from tensordict import TensorDict
 from torch import Tensor
 from torchrl.data.replay_buffers import ReplayBuffer, RoundRobinWriter, Sampler
 
-from cprl.learners.buffer.storage import LaneStorage, storage_bytes
-from cprl.learners.transitions import array_of
+from cprl.custom import Custom
+from cprl.learners.buffer.gather import Horizon
+from cprl.learners.buffer.storage import LaneStorage, storage_bytes, torch_dtype
+from cprl.learners.transitions import LaneTurn, array_of, transitions_in, turn_of
 from cprl.policies.rng import LaneRng
 
 
 class LaneSampler(Sampler):
-    """Each lane draws uniformly among its own transitions, by random numbers of its own.
+    """Samples uniformly from each lane's transitions, with a random number generator for each lane.
 
     Args:
-        seeds: of each lane, e.g. (seed, replica, agent): what a lane draws follows from them alone.
-        batch_size: b.
+        seeds: the seed of each lane, e.g. (seed, replica, agent); a lane's samples depend on it alone.
+        batch_size: transitions b sampled for each lane.
     """
 
     def __init__(self, seeds: Sequence[Sequence[int]], batch_size: int) -> None:
@@ -28,29 +31,31 @@ class LaneSampler(Sampler):
         self.rng = LaneRng(seeds, batch_size)
 
     def sample(self, storage: LaneStorage, batch_size: int) -> tuple[Tensor, dict[str, Any]]:
-        """Places in the ring, int64 [L, b]."""
+        """Positions in the ring, int64 [L, b]."""
         if batch_size != self.batch_size:
-            raise ValueError(f"batch_size is {batch_size}; this sampler draws {self.batch_size}")
+            raise ValueError(f"batch_size is {batch_size}; allowed: that of the sampler, {self.batch_size}")
         return self.draw(storage), {}
 
     def draw(self, storage: LaneStorage) -> Tensor:
-        """Places in the ring, int64 [L, b]."""
+        """Positions in the ring, int64 [L, b]."""
         oldest, written = storage.oldest()
+        if storage.horizon is not None:  # the newest transitions have no full return yet
+            written -= storage.horizon.steps - 1
         shares = array_of(self.rng.next().to(storage.device)) * (written - oldest)[:, None]
-        # Through numpy where it can be: on so few numbers torch takes three times as long.
+        # numpy on the CPU: for so few numbers torch takes three times as long.
         numbers = shares.astype(np.int64) if isinstance(shares, np.ndarray) else shares.long()
         return torch.as_tensor((oldest[:, None] + numbers) % int(storage.max_size))
 
     def state_dict(self) -> dict[str, Any]:
-        """Where each lane's random numbers stand."""
+        """The states of the lanes' random number generators."""
         return self.rng.state_dict()
 
     def load_state_dict(self, state_dict: Mapping[str, Any]) -> None:
-        """Goes on where the sampler of that state was."""
+        """Continues from a state that `state_dict` returned."""
         self.rng.load_state_dict(state_dict)
 
     def _empty(self) -> None:
-        """Nothing is kept of what was sampled."""
+        """Does nothing: the sampler stores nothing about past samples."""
 
     def dumps(self, path: Any) -> None:
         """Writes `state_dict`."""
@@ -61,6 +66,30 @@ class LaneSampler(Sampler):
         self.load_state_dict(torch.load(path, weights_only=True))
 
 
+class LaneBuffer(ReplayBuffer):
+    """TorchRL's replay buffer, which knows whether it has transforms: to ask takes it some microseconds."""
+
+    has_transforms = False
+
+    def append_transform(self, transform: Any, *, invert: bool = False) -> "LaneBuffer":
+        """See `ReplayBuffer`."""
+        super().append_transform(transform, invert=invert)
+        self.has_transforms = True
+        return self
+
+    def insert_transform(self, index: int, transform: Any, *, invert: bool = False) -> "LaneBuffer":
+        """See `ReplayBuffer`."""
+        super().insert_transform(index, transform, invert=invert)
+        self.has_transforms = True
+        return self
+
+    def write(self, turn: LaneTurn) -> None:
+        """Writes the next transition of every lane; as `extend`, through the inverse of the transforms."""
+        if self.has_transforms:
+            turn = turn_of(self.transform.inv(transitions_in(turn)))
+        self.storage.write(turn)
+
+
 def lane_buffer(
     *,
     seeds: Sequence[Sequence[int]],
@@ -68,52 +97,84 @@ def lane_buffer(
     batch_size: int,
     observation_shape: Sequence[int],
     action_shape: Sequence[int] = (),
+    observation_dtype: str = "uint8",
+    horizon: Horizon | None = None,
     device: str | torch.device = "cpu",
-) -> ReplayBuffer:
+) -> LaneBuffer:
     """TorchRL's replay buffer over `LaneStorage` and `LaneSampler`.
 
     Args:
-        seeds: of each lane's sampling; as many as there are lanes.
-        transitions: kept for each lane.
-        batch_size: drawn for each lane.
-        observation_shape: (C, X, Y); of a lane that is a team of S agents (S, C, X, Y).
-        action_shape: of a lane's action: () of one agent, (S,) of a team.
-        device: where it lies.
+        seeds: the sampling seed of each of the L lanes.
+        transitions: capacity per lane.
+        batch_size: transitions sampled per lane.
+        observation_shape: (C, X, Y); (S, C, X, Y) if a lane is a team of S agents.
+        action_shape: the shape of a lane's action: () for one agent, (S,) for a team.
+        observation_dtype: see `Spaces.observation_dtype`.
+        horizon: steps and discount of n-step returns, sampled in place of rewards; None for single steps.
+        device: the device of the storage.
 
-    What they take, if it is a mebibyte or more, is logged, as "cprl", before it is allocated.
+    The size is logged before allocation, under "cprl", if it is a mebibyte or more.
 
     Raises:
-        MemoryError: where the machine has less memory than it takes, before anything is allocated.
+        MemoryError: if the device has less free memory than needed; raised before anything is allocated.
     """
-    wanted = storage_bytes(len(seeds), transitions, observation_shape, action_shape=action_shape)
-    there = _free_bytes(torch.device(device))
-    if wanted > there:
+    dtype = torch_dtype(observation_dtype)
+    needed = storage_bytes(
+        len(seeds), transitions, observation_shape, action_shape=action_shape, item_bytes=dtype.itemsize
+    )
+    free = _free_bytes(torch.device(device))
+    if needed > free:
         raise MemoryError(
             f"the replay buffers of {len(seeds)} lanes x {transitions:,} transitions take "
-            f"{wanted / 2**30:.2f} GiB; {there / 2**30:.2f} GiB are free: lower buffer_size or replicas"
+            f"{needed / 2**30:.2f} GiB; {free / 2**30:.2f} GiB are free: use a smaller buffer_size or fewer "
+            "replicas"
         )
-    if wanted >= 2**20:
+    if needed >= 2**20:
         logging.getLogger("cprl").info(
             "Replay buffers of %d lanes x %s transitions: %.2f GiB of %.1f GiB free",
             len(seeds),
             f"{transitions:,}",
-            wanted / 2**30,
-            there / 2**30,
+            needed / 2**30,
+            free / 2**30,
         )
     storage = LaneStorage(
         lanes=len(seeds),
         transitions=transitions,
         observation_shape=observation_shape,
         action_shape=action_shape,
+        dtype=dtype,
+        horizon=horizon,
         device=device,
     )
-    return ReplayBuffer(
+    return LaneBuffer(
         storage=storage,
         sampler=LaneSampler(seeds, batch_size),
         writer=RoundRobinWriter(),
         batch_size=batch_size,
         collate_fn=lambda batch: batch,
     )
+
+
+def transformed(batch: TensorDict, transforms: Sequence[Custom]) -> TensorDict:
+    """A copy of a batch after the transforms of a replay buffer.
+
+    Raises:
+        ValueError: if a transform cannot be constructed or applied; names it.
+    """
+    for custom in transforms:
+        transform = custom.make()
+        if not callable(transform):
+            raise ValueError(
+                f"replay_transforms: {custom.target} makes a {type(transform).__name__}; allowed: a "
+                "torchrl.envs.Transform"
+            )
+        try:
+            batch = transform(batch.clone())
+        except Exception as error:  # a user's transform may raise anything
+            raise ValueError(
+                f"replay_transforms: {custom.target} cannot transform a sampled batch: {error}"
+            ) from error
+    return batch
 
 
 def _free_bytes(device: torch.device) -> int:

@@ -1,8 +1,8 @@
-"""LaneStorage: room for the transitions of many lanes, in which each window is kept once.
+"""LaneStorage: a ring buffer for the transitions of many lanes that stores each observation once.
 
-A lane is one agent of one replica. All lanes take a step together, so a transition is a row [L]; each lane
-draws its own sample. The window that follows a transition is the one with which the next begins, and is
-kept once; only where an episode ends it takes a place of its own.
+A lane is one agent of one replica. All lanes step together, so a transition is a row [L]; each lane samples
+for itself. The observation after a transition is also the one before the next transition, and is stored once.
+Only at the end of an episode it takes an extra row.
 """
 
 from collections.abc import Mapping, Sequence
@@ -15,19 +15,27 @@ from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
 from torchrl.data.replay_buffers import Storage
 
-from cprl.learners.transitions import LaneTurn, array_of
+from cprl.learners.buffer.gather import Fields, Horizon, gather
+from cprl.learners.transitions import LaneTurn, array_of, turn_of
 
 ENDS_PER_TRANSITION: Final = 0.02
-"""Room for the last windows of episodes, beside that for transitions: one in fifty. Where episodes are
-shorter than that, fewer transitions are kept; none is ever wrong."""
+"""Extra rows for the last observations of episodes: one per fifty transitions. With episodes shorter than 50
+steps the buffer holds fewer transitions; those that it holds are always correct."""
 
 LOOKS_EVERY: Final = 32
-"""Steps after which a storage looks again what is about to be written over."""
+"""Steps between checks for transitions whose observations are about to be overwritten."""
 
-FIELDS: Final = ("observation", "action", "reward", "done", "terminated", "row")
-"""What a storage holds, in the order in which it holds it."""
 
-Fields = dict[str, Tensor]
+def torch_dtype(name: str) -> torch.dtype:
+    """The torch dtype of a name that numpy and torch share, e.g. "uint8".
+
+    Raises:
+        ValueError: if torch has no dtype of that name.
+    """
+    dtype = getattr(torch, name, None)
+    if not isinstance(dtype, torch.dtype):
+        raise ValueError(f"dtype is {name!r}; allowed: the name of a torch dtype, e.g. 'uint8' or 'float32'")
+    return dtype
 
 
 def storage_bytes(
@@ -41,35 +49,36 @@ def storage_bytes(
     """Bytes that `LaneStorage` allocates.
 
     Args:
-        lanes: L.
-        transitions: kept for each lane, T.
+        lanes: the number of lanes L.
+        transitions: the capacity per lane, T.
         observation_shape: (C, X, Y).
-        action_shape: of a lane's action.
-        item_bytes: of one number of an observation.
+        action_shape: the shape of a lane's action.
+        item_bytes: bytes of one number of an observation.
     """
     windows = _rows(transitions) * prod(observation_shape) * item_bytes
     return lanes * (windows + transitions * (8 * prod(action_shape) + 4 + 8 + 1 + 1))
 
 
 def _rows(transitions: int) -> int:
-    """Windows for which a lane has room: those of its transitions, of ends, and of the steps until it looks
-    again what has been written over, two a step at most."""
+    """Observation rows per lane: one per transition, those for the ends of episodes, and at most two per step
+    until the next check for overwritten rows."""
     return transitions + max(8, round(transitions * ENDS_PER_TRANSITION)) + 2 * LOOKS_EVERY + 2
 
 
 class LaneStorage(Storage):
-    """Room for T transitions of each of L lanes.
+    """Stores up to T transitions of each of L lanes.
 
     Args:
-        lanes: L.
-        transitions: T.
-        observation_shape: (C, X, Y); of a lane that is a team of S agents (S, C, X, Y).
-        action_shape: of a lane's action: () of one agent, (S,) of a team.
-        dtype: of observations.
-        device: where it lies.
+        lanes: the number of lanes L.
+        transitions: the capacity per lane, T.
+        observation_shape: (C, X, Y); (S, C, X, Y) if a lane is a team of S agents.
+        action_shape: the shape of a lane's action: () for one agent, (S,) for a team.
+        dtype: the dtype of observations.
+        horizon: steps and discount of the returns that `get` returns as rewards; None for single steps.
+        device: the device of the tensors.
 
-    What it is given and gives out are TensorDicts of the default keys: "observation", "action" and "next"
-    with "observation", "reward", "done" and "terminated"; [L] or [1, L] a step, [L, b] a sample.
+    Inputs and outputs are TensorDicts with TorchRL's default keys: "observation", "action" and "next" with
+    "observation", "reward", "done" and "terminated"; [L] or [1, L] for a step, [L, b] for a sample.
     """
 
     def __init__(
@@ -80,66 +89,72 @@ class LaneStorage(Storage):
         observation_shape: Sequence[int],
         action_shape: Sequence[int] = (),
         dtype: torch.dtype = torch.uint8,
+        horizon: Horizon | None = None,
         device: str | torch.device = "cpu",
     ) -> None:
         super().__init__(transitions)
+        self.horizon = horizon
         self.lanes, self.rows, self.device = lanes, _rows(transitions), torch.device(device)
         self.shape_of_observation = tuple(observation_shape)
 
-        def room(*shape: int, kind: torch.dtype) -> Tensor:
+        def allocate(*shape: int, kind: torch.dtype) -> Tensor:
             return torch.zeros(shape, dtype=kind, device=self.device)
 
         self.fields: Fields = {
-            "observation": room(lanes * self.rows, *observation_shape, kind=dtype),
-            "action": room(transitions, lanes, *action_shape, kind=torch.int64),
-            "reward": room(transitions, lanes, kind=torch.float32),
-            "done": room(transitions, lanes, kind=torch.bool),
-            "terminated": room(transitions, lanes, kind=torch.bool),
-            "row": room(transitions, lanes, kind=torch.int64),
+            "observation": allocate(lanes * self.rows, *observation_shape, kind=dtype),
+            "action": allocate(transitions, lanes, *action_shape, kind=torch.int64),
+            "reward": allocate(transitions, lanes, kind=torch.float32),
+            "done": allocate(transitions, lanes, kind=torch.bool),
+            "terminated": allocate(transitions, lanes, kind=torch.bool),
+            "row": allocate(transitions, lanes, kind=torch.int64),
         }
-        """Windows [L x rows, ...], the rest [T, L], actions [T, L, ...]; `row` counts the windows that a lane
-        has written."""
-        # Steps write through numpy where they can: on so few numbers torch takes five times as long.
+        """Observations [L x rows, ...], actions [T, L, ...], the rest [T, L]; `row` counts the observations
+        that a lane has written."""
+        # Steps are written with numpy on the CPU: for so few numbers torch takes five times as long.
         self._arrays = {name: array_of(field) for name, field in self.fields.items()}
         self._lane = array_of(torch.arange(lanes, device=self.device))
         self._base = self._lane * self.rows
         self._begin()
 
     def _begin(self) -> None:
-        """Nothing has been written."""
+        """Resets to an empty storage."""
         zeros = torch.zeros(self.lanes, dtype=torch.int64, device=self.device)
         self._next_row, self._oldest = array_of(zeros), array_of(zeros.clone())
         self._begins, self._any_begins = array_of(zeros == 0), True
         self._written = 0
 
     def __len__(self) -> int:
-        """Transitions of the lane that holds most."""
+        """Transitions stored in the fullest lane."""
         return min(self._written, int(self.max_size))
 
-    def valid(self) -> tuple[Tensor, int]:
-        """The number of each lane's oldest transition that is still whole, int64 [L], and of the next one."""
-        oldest, written = self.oldest()
-        return torch.as_tensor(oldest), written
-
     def oldest(self) -> tuple[Any, int]:
-        """`valid`, as a numpy array where it lies on the CPU."""
+        """The number of each lane's oldest complete transition, int64 [L], a numpy array if the storage is on
+        the CPU; and the number of the next transition to be written."""
         return _at_least(self._oldest, self._written - int(self.max_size)), self._written
 
     def set(self, cursor: Any, data: TensorDictBase, *, set_cursor: bool = True) -> None:
-        """Writes the next transition of every lane; `cursor` is its place in the ring."""
+        """Writes the next transition of every lane; `cursor` is its position in the ring."""
         place = int(cursor[0] if isinstance(cursor, Sequence | Tensor) else cursor)
         if place != self._written % self.max_size:
-            raise ValueError(f"the cursor is {place}; the next place is {self._written % self.max_size}")
-        data = data.reshape(self.lanes)
-        following = data.get("next")
-        flags = (following.get(name).reshape(-1) for name in ("reward", "done", "terminated"))
-        turn = data.get("observation"), data.get("action"), following.get("observation"), *flags
-        self.write(LaneTurn(*map(array_of, turn)))
+            raise ValueError(
+                f"cursor is {place}; allowed: the next position, {self._written % self.max_size}"
+            )
+        self.write(turn_of(data.reshape(self.lanes)))
 
     def write(self, turn: LaneTurn) -> None:
-        """Writes the next transition of every lane; numpy arrays where this storage lies on the CPU."""
+        """Writes the next transition of every lane, numpy arrays if the storage is on the CPU.
+
+        Raises:
+            ValueError: if observations have another dtype than the storage; they would be rounded.
+        """
         arrays, place, row = self._arrays, self._written % self.max_size, self._next_row
         windows = arrays["observation"]
+        if turn.observation.dtype != windows.dtype or turn.next_observation.dtype != windows.dtype:
+            raise ValueError(
+                f"observations are {turn.observation.dtype} and {turn.next_observation.dtype}; allowed: "
+                f"{windows.dtype}, from Spaces.observation_dtype: make the learner with the Spaces of the "
+                "transformed environment"
+            )
         if self._any_begins:
             first = self._begins
             windows[(self._base + row % self.rows)[first]] = turn.observation[first]
@@ -157,7 +172,7 @@ class LaneStorage(Storage):
             self._forget()
 
     def _forget(self) -> None:
-        """Transitions whose windows are about to be written over are no longer drawn."""
+        """Excludes transitions whose observations are about to be overwritten from sampling."""
         oldest = _at_least(self._oldest, self._written - int(self.max_size))
         soon = self._next_row - self.rows + 2 * LOOKS_EVERY + 1
         while True:
@@ -169,11 +184,11 @@ class LaneStorage(Storage):
         self._oldest = oldest
 
     def get(self, index: Tensor) -> TensorDict:
-        """The transitions at places [L, b] of the ring."""
-        return gather(self.fields, index, self.rows)
+        """The transitions at positions [L, b] of the ring."""
+        return gather(self.fields, index, self.rows, self.horizon)
 
     def state_dict(self) -> dict[str, Any]:
-        """Everything that it holds, as far as it was written; once full the own tensors, not copies."""
+        """The written part of all fields; once the storage is full, the tensors themselves, not copies."""
         kept = len(self)
         windows = self.fields["observation"].view(self.lanes, self.rows, *self.shape_of_observation)
         used = min(self.rows, int(self._next_row.max()) + 1)
@@ -187,13 +202,13 @@ class LaneStorage(Storage):
         }
 
     def load_state_dict(self, state_dict: Mapping[str, Any]) -> None:
-        """Goes on where the storage of that state was, which had the same sizes."""
+        """Continues from the state of a storage with the same sizes."""
         windows = self.fields["observation"].view(self.lanes, self.rows, *self.shape_of_observation)
-        came = state_dict["observation"]
-        if len(came) != self.lanes or came.shape[1] > self.rows or came.shape[2:] != windows.shape[2:]:
-            wanted = [self.lanes, f"up to {self.rows}", *self.shape_of_observation]
-            raise ValueError(f"the state's windows are {list(came.shape)}; {wanted} is wanted")
-        windows[:, : came.shape[1]] = came
+        stored = state_dict["observation"]
+        if len(stored) != self.lanes or stored.shape[1] > self.rows or stored.shape[2:] != windows.shape[2:]:
+            allowed = [self.lanes, f"up to {self.rows}", *self.shape_of_observation]
+            raise ValueError(f"the state's observations are {list(stored.shape)}; allowed: {allowed}")
+        windows[:, : stored.shape[1]] = stored
         for name, array in self.fields.items():
             if name != "observation":
                 array[: len(state_dict[name])] = state_dict[name]
@@ -207,7 +222,7 @@ class LaneStorage(Storage):
 
 
 def _at_least(numbers: Any, lowest: int) -> Any:
-    """Numpy's own `clip` looks up the limits of the type first, which takes five times as long."""
+    """`clip` from below; numpy's `clip` checks the limits of the dtype, which takes five times as long."""
     return np.maximum(numbers, lowest) if isinstance(numbers, np.ndarray) else numbers.clip(min=lowest)
 
 
@@ -216,33 +231,5 @@ def _any(flags: Any) -> bool:
 
 
 def _part(whole: Tensor, part: Tensor) -> Tensor:
-    """The part by itself, since a view is written to a file with all that it is a view of."""
+    """A copy of the part, because saving a view would write the whole tensor behind it."""
     return whole if part.shape == whole.shape else part.clone()
-
-
-def gather(fields: Fields, index: Tensor, rows: int) -> TensorDict:
-    """Transitions at places [L, b] of a `LaneStorage`, as TorchRL's losses read them; changes nothing."""
-    lanes, size = index.shape
-    lane = torch.arange(lanes, device=index.device)[:, None]
-    row = fields["row"][index, lane]
-    windows = fields["observation"]
-    shape = lanes, size, *windows.shape[1:]
-
-    def seen(at: Tensor) -> Tensor:
-        return windows.index_select(0, (lane * rows + at % rows).reshape(-1)).reshape(shape)
-
-    def field(name: str) -> Tensor:
-        return fields[name][index, lane].unsqueeze(-1)
-
-    following = TensorDict(
-        {
-            "observation": seen(row + 1),
-            "reward": field("reward"),
-            "done": field("done"),
-            "terminated": field("terminated"),
-        },
-        [lanes, size],
-    )
-    return TensorDict(
-        {"observation": seen(row), "action": fields["action"][index, lane], "next": following}, [lanes, size]
-    )

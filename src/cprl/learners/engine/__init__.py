@@ -1,1 +1,1 @@
-"""One update of many independent learners."""
+"""Engines: one update step for many independent learners."""

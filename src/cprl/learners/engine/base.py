@@ -1,8 +1,8 @@
-"""One update of many independent learners: what it is, and the plain way.
+"""The interface of engines, which update many independent learners at once, and the plain list of losses.
 
-Each lane has a loss module of TorchRL's that a recipe names. `cprl.learners.engine.compiled` runs the
-lanes as one: with a lane axis in the network where it is ours, else by `torch.vmap` over the user's loss.
-`ListEngine` runs a plain list of loss modules, for losses with which neither works, and as the reference.
+Each lane has a TorchRL loss module. `cprl.learners.engine.compiled` updates all lanes together: it stacks
+networks along a lane axis if it can, else it applies `torch.vmap` to the loss. `ListEngine` runs a plain list
+of loss modules. It is the reference, and the fallback for losses that work with neither.
 """
 
 from collections.abc import Mapping, Sequence
@@ -10,57 +10,64 @@ from typing import Any, Protocol
 
 import torch
 from tensordict import TensorDict
+from tensordict.nn import TensorDictParams
 from torch import Tensor, nn
-from torchrl.data.replay_buffers import ReplayBuffer
+from torchrl.objectives import LossModule
 
-from cprl.learners.engine.functional import MakeLoss, Weights, promise_targets, targets_of, total, weights_of
+from cprl.learners.buffer.sampler import LaneBuffer
+from cprl.learners.engine.functional import MakeLoss, Weights, own_targets, targets_of, total, weights_of
+from cprl.learners.engine.optimizers import torch_optimizer
+from cprl.learners.settings import Optimizer
 from cprl.networks.agent import parts_of
 
 
 class Engine(Protocol):
-    """One update of L lanes."""
+    """Updates L lanes at once."""
 
-    def update(self, buffer: ReplayBuffer) -> Tensor:
-        """Samples from a `LaneStorage`, updates every lane once, and returns the loss of each, float [L]."""
+    def update(self, buffer: LaneBuffer) -> Tensor:
+        """Samples from a buffer, updates every lane once and returns their losses, float [L]."""
 
     def update_from(self, batch: TensorDict) -> Tensor:
-        """The same from a batch, [L, b]."""
+        """Updates every lane once from a batch, [L, b], and returns their losses, float [L]."""
 
     def copy_to_targets(self, which: Tensor) -> None:
-        """Replaces the target weights of the marked lanes, bool [L], by their weights."""
+        """Copies the weights of the marked lanes, bool [L], to their targets."""
 
     def outputs(self, observation: Tensor, *, part: int = 0) -> Tensor:
-        """What the networks give by their present weights: [L, k, ...] to [L, k, ...].
+        """The outputs of the networks with their current weights: [L, k, ...] to [L, k, ...].
 
         Args:
-            observation: of each lane.
-            part: which of an agent's networks, see `cprl.networks.mlp.parts_of`; the first acts.
+            observation: k observations of each lane.
+            part: which of an agent's networks, see `cprl.networks.agent.parts_of`; the first one acts.
         """
 
     def network_state(self, lane: int) -> Weights:
-        """Copies of the present weights of one lane, as the state dict of its acting network."""
+        """Copies of the current weights of one lane, as the state dict of its acting network."""
 
     def weights(self, lane: int) -> Weights:
-        """Copies of all weights of one lane, targets too, by the names in the loss."""
+        """Copies of all weights of one lane, including targets, by their names in the loss."""
 
     def state_dict(self) -> dict[str, Any]:
-        """Everything that the next update depends on, but for the buffer; own tensors, not copies."""
+        """The full state except the buffer; the tensors themselves, not copies."""
 
     def load_state_dict(self, state: Mapping[str, Any]) -> None:
-        """Goes on where the update of that state was."""
+        """Continues from a state that `state_dict` returned."""
 
 
 class ListEngine:
-    """A loss module of TorchRL's and a `torch.optim.Adam` for each lane, one after the other.
+    """A TorchRL loss module and a `torch.optim` optimiser for each lane; lanes are updated one by one.
 
     Args:
-        networks: of the lanes; they are trained in place.
-        make_loss: a lane's loss out of its network.
-        target_networks: where targets start; by default as copies.
-        learning_rate: Adam's step size.
-        adam_eps: Adam's epsilon.
-        loss_share: by which each loss is multiplied.
-        max_grad_norm: to which each lane's gradient is shortened, if it is longer; None for never.
+        networks: the lanes' networks; they are trained in place.
+        make_loss: makes a lane's loss from its network.
+        target_networks: networks with the initial target weights; by default targets start as copies.
+        optimizer: the name of the optimiser of `torch.optim`.
+        learning_rate: its step size.
+        adam_eps: its epsilon, if it has one.
+        tau: the fraction by which targets move towards the weights after each update; None for hard updates
+            by `copy_to_targets` alone.
+        loss_share: a factor of each loss.
+        max_grad_norm: the norm to which each lane's gradient is clipped; None for no clipping.
     """
 
     def __init__(
@@ -69,26 +76,29 @@ class ListEngine:
         make_loss: MakeLoss,
         *,
         target_networks: Sequence[nn.Module] | None = None,
+        optimizer: Optimizer = "adam",
         learning_rate: float,
         adam_eps: float = 1e-8,
         loss_share: float = 1.0,
         max_grad_norm: float | None = None,
+        tau: float | None = None,
     ) -> None:
+        self._tau = tau
         self._parts = [list(parts_of(network).values()) for network in networks]
         self._max_norm = max_grad_norm
         self.losses = [make_loss(network) for network in networks]
         for loss in self.losses:
-            promise_targets(loss)
+            own_targets(loss)
         self._share = loss_share
         for loss, network in zip(self.losses, target_networks or (), strict=False):
             for name, values in targets_of(make_loss(network)).items():
                 getattr(loss, f"target_{name}").data.copy_(values.data)
-        self._adams = [
-            torch.optim.Adam(loss.parameters(), lr=learning_rate, eps=adam_eps, fused=True)
+        self._optimizers = [
+            torch_optimizer(optimizer, loss.parameters(), learning_rate=learning_rate, eps=adam_eps)
             for loss in self.losses
         ]
 
-    def update(self, buffer: ReplayBuffer) -> Tensor:
+    def update(self, buffer: LaneBuffer) -> Tensor:
         """See `Engine`."""
         return self.update_from(buffer.sample())
 
@@ -98,11 +108,14 @@ class ListEngine:
 
     def _learn(self, lane: int, batch: TensorDict) -> Tensor:
         loss = total(self.losses[lane](batch)).mean() * self._share
-        self._adams[lane].zero_grad()
+        self._optimizers[lane].zero_grad()
         loss.backward()  # type: ignore[no-untyped-call]
         if self._max_norm is not None:
             torch.nn.utils.clip_grad_norm_(self.losses[lane].parameters(), self._max_norm)
-        self._adams[lane].step()
+        self._optimizers[lane].step()
+        if self._tau is not None:
+            for weight, target in _with_targets(self.losses[lane]):
+                target.data.lerp_(weight.data, self._tau)
         return loss.detach()
 
     def outputs(self, observation: Tensor, *, part: int = 0) -> Tensor:
@@ -112,9 +125,8 @@ class ListEngine:
     def copy_to_targets(self, which: Tensor) -> None:
         """See `Engine`."""
         for lane in which.nonzero().flatten().tolist():
-            loss = self.losses[lane]
-            for name, values in targets_of(loss).items():
-                getattr(loss, f"target_{name}").data.copy_(values.data)
+            for weight, target in _with_targets(self.losses[lane]):
+                target.data.copy_(weight.data)
 
     def network_state(self, lane: int) -> Weights:
         """See `Engine`."""
@@ -128,12 +140,17 @@ class ListEngine:
         """See `Engine`."""
         return {
             "losses": [dict(loss.state_dict()) for loss in self.losses],
-            "adams": [adam.state_dict() for adam in self._adams],
+            "adams": [optimizer.state_dict() for optimizer in self._optimizers],
         }
 
     def load_state_dict(self, state: Mapping[str, Any]) -> None:
         """See `Engine`."""
         for loss, own in zip(self.losses, state["losses"], strict=True):
             loss.load_state_dict(own)
-        for adam, own in zip(self._adams, state["adams"], strict=True):
-            adam.load_state_dict(own)
+        for optimizer, own in zip(self._optimizers, state["adams"], strict=True):
+            optimizer.load_state_dict(own)
+
+
+def _with_targets(loss: LossModule) -> list[tuple[TensorDictParams, TensorDictParams]]:
+    """The groups of weights of a loss that have targets, each paired with its targets."""
+    return [(values, getattr(loss, f"target_{name}")) for name, values in targets_of(loss).items()]

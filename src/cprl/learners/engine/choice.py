@@ -1,9 +1,10 @@
-"""Which way many lanes are updated: the fastest whose gradients are those of the plain list.
+"""Chooses the engine that updates many lanes: the fastest one with the gradients of the plain list.
 
-"lane axis": the networks' parameters carry a lane axis, under one ordinary loss; wants `MLPNetwork`s.
-"lane axis, flat": the same, for losses that want transitions in a row.
-"vmap": the loss is vmapped over stacked parameters; takes any network.
-"list": a loss module for each lane, one after the other; takes any loss.
+"lane_axis": the networks' parameters have a lane axis, under one ordinary loss; needs networks that stack,
+    see `cprl.networks.stacked.stack_lanes`.
+"lane_axis_flat": the same, for losses that need a flat batch of transitions, [L x b].
+"vmapped": `torch.vmap` of the loss over stacked parameters; works with any network.
+"list": a loss module for each lane, one after the other; works with any loss.
 """
 
 import warnings
@@ -15,23 +16,24 @@ import torch
 from tensordict import TensorDict
 from torch import Tensor, nn
 
+from cprl.compiling import TOLERANCE
+from cprl.learners.buffer.gather import Horizon
 from cprl.learners.buffer.sampler import lane_buffer
+from cprl.learners.buffer.storage import torch_dtype
 from cprl.learners.engine.base import Engine, ListEngine
 from cprl.learners.engine.compiled import FunctionalEngine
-from cprl.learners.engine.functional import MakeLoss
+from cprl.learners.engine.functional import MakeLoss, groups_of, own_targets
 from cprl.learners.transitions import LaneTurn, array_of
 
-EngineName = Literal["lane axis", "lane axis, flat", "vmap", "list"]
+EngineName = Literal["lane_axis", "lane_axis_flat", "vmapped", "list"]
 
 TRIAL_LANES: Final = 2
-"""Lanes of a trial: enough to show what one lane would take from another."""
+"""Lanes of a trial: enough to show whether lanes influence each other."""
 TRIAL_TRANSITIONS: Final = 16
 TRIAL_UPDATES: Final = 3
-"""Enough to show weights or targets that are not those of the last update."""
+"""Enough to show stale weights or targets."""
 TRIAL_STEP: Final = {"learning_rate": 0.1, "adam_eps": 1.0}
-"""By Adam's first step of this size a weight changes by 0.1 g / (abs(g) + 1), g its gradient."""
-TOLERANCE: Final = 1e-4
-"""How far losses and changes of weights, in float32, may be from those of the list."""
+"""With these values Adam's first step changes a weight by 0.1 g / (abs(g) + 1), where g is its gradient."""
 
 
 def make_engine(
@@ -43,69 +45,98 @@ def make_engine(
     trial: TensorDict,
     **how: Any,
 ) -> Engine:
-    """An update of all lanes; see `FunctionalEngine` for the arguments that are not said here.
+    """The engine of all lanes.
 
     Args:
-        name: how; None for the first that passes a trial, in the order of `EngineName`.
-        networks: of the lanes.
-        make_loss: a lane's loss out of its network.
-        compile: whether it is compiled, but for the list.
-        trial: a made-up batch for the first `TRIAL_LANES` lanes, see `trial_batch`.
+        name: which engine; None for the first that passes a trial, in the order of `EngineName`.
+        networks: the lanes' networks.
+        make_loss: makes a lane's loss from its network.
+        compile: whether torch compiles the update; ignored for "list".
+        trial: a synthetic batch for the first `TRIAL_LANES` lanes, see `trial_batch`.
+        how: the other arguments of `FunctionalEngine`.
 
     Raises:
-        ValueError: for an unknown way.
+        ValueError: if the engine is unknown.
     """
     if name is None:
         name = fitting_engine(networks[:TRIAL_LANES], make_loss, trial)
     if name not in get_args(EngineName):
-        raise ValueError(f"way is {name!r}; allowed: {', '.join(get_args(EngineName))}")
+        raise ValueError(f"engine is {name!r}; allowed: {', '.join(get_args(EngineName))}")
     return _make(name, networks, make_loss, compile=compile, **how)
 
 
 def fitting_engine(networks: Sequence[nn.Module], make_loss: MakeLoss, trial: TensorDict) -> EngineName:
-    """The first way that does on a trial what the plain list does; warns where that is the list itself.
+    """The first engine that agrees with the plain list on a trial; warns if only the list itself is left.
 
     Args:
-        networks: of some lanes; copies of them are tried.
-        make_loss: a lane's loss out of its network.
-        trial: a made-up batch of these lanes.
+        networks: the networks of some lanes; the trial uses copies.
+        make_loss: makes a lane's loss from its network.
+        trial: a synthetic batch of these lanes.
+
+    Raises:
+        ValueError: if the loss reads an entry that batches do not have; names the entry.
     """
-    wanted = _tried("list", networks, make_loss, trial)
+    try:
+        reference = _tried("list", networks, make_loss, trial)
+    except KeyError as error:
+        entries = ", ".join(
+            sorted("/".join(key) if isinstance(key, tuple) else key for key in trial.keys(True, True))
+        )
+        raise ValueError(
+            f"the loss reads an entry that its batches do not have: {error}; they have {entries}"
+        ) from error
+    own_numbers = _changed_buffers(networks[0], make_loss, trial)
     reasons = []
     for name in get_args(EngineName)[:-1]:
         try:
-            came = _tried(name, networks, make_loss, trial)
-            if _agree(came, wanted) or _agree_in_double(name, networks, make_loss, trial):
+            if own_numbers:
+                raise ValueError(
+                    f"agents would share buffers that the loss changes: {', '.join(own_numbers)}"
+                )
+            results = _tried(name, networks, make_loss, trial)
+            if _agree(results, reference) or _agree_in_double(name, networks, make_loss, trial):
                 fitting: EngineName = name
                 return fitting
-        except Exception as error:  # whatever a loss or network of the user's own does not bear
+        except Exception as error:  # a user's loss or network may raise anything
             reasons.append(f"{name}: {(str(error) or repr(error)).splitlines()[0]}")
             continue
-        reasons.append(f"{name}: agents would not learn what each learns alone")
+        reasons.append(f"{name}: the updates differ from those of agents that learn alone")
     warnings.warn(
-        f"agents learn one after the other, many times slower; {'; '.join(reasons)}",
+        f"agents are updated one after the other, which is many times slower; {'; '.join(reasons)}",
         RuntimeWarning,
         stacklevel=4,
     )
     return "list"
 
 
-def _agree(came: Sequence[Tensor], wanted: Sequence[Tensor]) -> bool:
-    return all(torch.allclose(*pair, TOLERANCE, TOLERANCE) for pair in zip(came, wanted, strict=True))
+def _changed_buffers(network: nn.Module, make_loss: MakeLoss, trial: TensorDict) -> list[str]:
+    """The names of a loss's buffers, other than its weights, that change when it is called."""
+    loss = make_loss(deepcopy(network))
+    own_targets(loss)
+    weights = tuple(f"{name}." for name in groups_of(loss))
+    numbers = {name: own for name, own in loss.named_buffers() if not name.startswith(weights)}
+    before = {name: own.clone() for name, own in numbers.items()}
+    with torch.random.fork_rng():
+        loss(trial[0].clone())
+    return [name for name, own in numbers.items() if not torch.equal(own, before[name])]
+
+
+def _agree(results: Sequence[Tensor], reference: Sequence[Tensor]) -> bool:
+    return all(torch.allclose(*pair, TOLERANCE, TOLERANCE) for pair in zip(results, reference, strict=True))
 
 
 def _agree_in_double(
     name: EngineName, networks: Sequence[nn.Module], make_loss: MakeLoss, trial: TensorDict
 ) -> bool:
-    """Whether a way agrees with the list in double precision: the steps of a trial are so large that a loss
-    like that of QMIX, with many inputs, makes more of what single precision rounds than is tolerated."""
+    """Whether an engine agrees with the list in double precision. A trial takes large steps, so for losses
+    with many inputs, such as that of QMIX, rounding in single precision can exceed the tolerance."""
     doubles = [deepcopy(network).double() for network in networks]
     batch = trial.apply(lambda entry: entry.double() if entry.is_floating_point() else entry)
     try:
-        came, wanted = (_tried(each, doubles, make_loss, batch) for each in (name, "list"))
-    except Exception:  # a network of the user's own may not bear double precision
+        results, reference = (_tried(each, doubles, make_loss, batch) for each in (name, "list"))
+    except Exception:  # a user's network may not support double precision
         return False
-    return _agree(came, wanted)
+    return _agree(results, reference)
 
 
 def trial_batch(
@@ -114,20 +145,27 @@ def trial_batch(
     actions: int,
     *,
     action_shape: Sequence[int] = (),
+    observation_dtype: str = "uint8",
+    horizon: Horizon | None = None,
     device: str | torch.device = "cpu",
 ) -> TensorDict:
-    """Made-up transitions [lanes, 8], the same every time; one in eight ends an episode."""
+    """Synthetic transitions [lanes, 8], always the same; one in eight ends an episode."""
+    transitions = TRIAL_TRANSITIONS + (horizon.steps - 1 if horizon else 0)
     buffer = lane_buffer(
         seeds=[(lane,) for lane in range(lanes)],
-        transitions=TRIAL_TRANSITIONS,
+        transitions=transitions,
         batch_size=8,
         observation_shape=observation_shape,
         action_shape=action_shape,
+        observation_dtype=observation_dtype,
+        horizon=horizon,
         device=device,
     )
     chance = torch.Generator().manual_seed(0)
-    for step in range(TRIAL_TRANSITIONS):
+    for step in range(transitions):
         seen = torch.randint(256, (2, lanes, *observation_shape), generator=chance).to(torch.uint8)
+        if observation_dtype != "uint8":
+            seen = (seen > 127).to(torch_dtype(observation_dtype))
         action = torch.randint(actions, (lanes, *action_shape), generator=chance)
         ends = torch.full((lanes,), step % 8 == 7)
         turn = seen[0], action, seen[1], torch.rand(lanes, generator=chance), ends, ends
@@ -141,22 +179,27 @@ def _make(
 ) -> Engine:
     if name == "list":
         return ListEngine(networks, make_loss, **how)
-    axis, flat = name.startswith("lane axis"), name == "lane axis, flat"
+    axis, flat = name.startswith("lane_axis"), name == "lane_axis_flat"
     return FunctionalEngine(networks, make_loss, lane_axis=axis, flat=flat, compile=compile, **how)
 
 
 def _tried(
     name: EngineName, networks: Sequence[nn.Module], make_loss: MakeLoss, trial: TensorDict
 ) -> list[Tensor]:
-    """The losses of some updates of copies of the networks, targets replaced after all but the last, the
-    weights that act after them, and for each lane the sums of all its weights and of their squares."""
+    """Runs some updates of copies of the networks, with a copy to targets after all but the last.
+
+    Returns:
+        The losses of the updates; then for each lane its acting weights afterwards, the sum of all its
+        weights and the sum of their squares.
+    """
     engine = _make(name, deepcopy(list(networks)), make_loss, compile=False, **TRIAL_STEP)
-    came = []
+    results = []
     for _ in range(TRIAL_UPDATES):
-        came.append(engine.update_from(trial.clone()))
-        if len(came) < TRIAL_UPDATES:
+        results.append(engine.update_from(trial.clone()))
+        if len(results) < TRIAL_UPDATES:
             engine.copy_to_targets(torch.ones(len(networks), dtype=torch.bool))
     for lane in range(len(networks)):
         everything = torch.cat([weight.flatten() for weight in engine.weights(lane).values()])
-        came += [*engine.network_state(lane).values(), everything.sum(), everything.square().sum()]
-    return came
+        acting = [value for _, value in sorted(engine.network_state(lane).items())]
+        results += [*acting, everything.sum(), everything.square().sum()]
+    return results

@@ -1,4 +1,4 @@
-"""FunctionalEngine: one update of many independent learners as one compiled step."""
+"""FunctionalEngine: updates many independent learners in one compiled step."""
 
 from collections.abc import Mapping, Sequence
 from copy import deepcopy
@@ -7,36 +7,39 @@ from typing import Any
 import torch
 from tensordict import TensorDict
 from torch import Tensor, nn
-from torchrl.data.replay_buffers import ReplayBuffer
 
 from cprl.compiling import Compiled
-from cprl.learners.buffer.storage import FIELDS, LaneStorage, gather
+from cprl.learners.buffer.gather import FIELDS, Horizon, gather
+from cprl.learners.buffer.sampler import LaneBuffer
+from cprl.learners.buffer.storage import LaneStorage
 from cprl.learners.engine.functional import FunctionalLoss, MakeLoss, Weights, stacked
+from cprl.learners.engine.optimizers import BETA_1, BETA_2, WITH_MEAN, WITH_SQUARE, change_weights
+from cprl.learners.settings import Optimizer
 from cprl.networks.agent import parts_of
 from cprl.networks.stacked import lane_state, stack_lanes
 
-BETA_1, BETA_2 = 0.9, 0.999
-"""Adam's decay rates (Kingma and Ba 2015, the defaults of torch)."""
-
 
 class FunctionalEngine:
-    """All lanes at once: gathering, TorchRL's loss, its gradient and Adam as one step, compiled if wanted.
+    """Updates all lanes in one step: gathering a batch, TorchRL's loss, its gradient and the optimiser.
 
-    Where a loss sees the lane axis it stays ordinary: it is asked for one loss for each transition, which
-    is averaged over the batch and summed over lanes, so that each lane's gradient is exactly its own.
+    With a lane axis the loss returns one number per transition. These are averaged over the batch and summed
+    over lanes, so that each lane's gradient depends on its own loss alone.
 
     Args:
-        networks: of the lanes, of one form; their weights are copied.
-        make_loss: a lane's loss out of its network.
-        target_networks: where targets start; by default as copies.
-        learning_rate: Adam's step size.
-        adam_eps: Adam's epsilon.
-        loss_share: by which each loss is multiplied.
-        max_grad_norm: to which each lane's gradient is shortened, if it is longer; None for never.
-        lane_axis: whether the networks are stacked into a `StackedMLP`, else the loss is vmapped.
-        flat: with a lane axis, whether the loss sees the transitions of all lanes in a row, [L x b].
-        compile: whether the step is compiled by torch; where that fails a warning says so once, and the
-            step runs as it is.
+        networks: the lanes' networks, of one architecture; their weights are copied.
+        make_loss: makes a lane's loss from its network.
+        target_networks: networks with the initial target weights; by default targets start as copies.
+        optimizer: the name of the optimiser of `torch.optim`.
+        learning_rate: its step size.
+        adam_eps: its epsilon, if it has one.
+        loss_share: a factor of each loss.
+        max_grad_norm: the norm to which each lane's gradient is clipped; None for no clipping.
+        tau: the fraction by which targets move towards the weights after each update; None for hard updates
+            by `copy_to_targets` alone.
+        lane_axis: whether the networks are stacked along a lane axis; else the loss is vmapped.
+        flat: with a lane axis, whether the loss gets the transitions of all lanes flat, [L x b].
+        compile: whether torch compiles the step. If compilation fails, the engine warns once and runs the
+            step uncompiled.
     """
 
     def __init__(
@@ -45,10 +48,12 @@ class FunctionalEngine:
         make_loss: MakeLoss,
         *,
         target_networks: Sequence[nn.Module] | None = None,
+        optimizer: Optimizer = "adam",
         learning_rate: float,
         adam_eps: float = 1e-8,
         loss_share: float = 1.0,
         max_grad_norm: float | None = None,
+        tau: float | None = None,
         lane_axis: bool,
         flat: bool = False,
         compile: bool = True,
@@ -57,13 +62,15 @@ class FunctionalEngine:
         if target_networks is not None:
             others = stacked(target_networks, make_loss, lane_axis=lane_axis).own
             self.fixed |= {name: others[_source(name)] for name in self.fixed if _source(name) in others}
-        self._mean = {name: torch.zeros_like(value) for name, value in self.own.items()}
-        self._square = {name: torch.zeros_like(value) for name, value in self.own.items()}
+        self._mean, self._square = (
+            {name: torch.zeros_like(value) for name, value in self.own.items() if optimizer in kept_by}
+            for kept_by in (WITH_MEAN, WITH_SQUARE)
+        )
         self.loss = FunctionalLoss(loss)
         network = stack_lanes(networks) if lane_axis else deepcopy(networks[0])
         self._parts = list(parts_of(network).items())
         self._shared = {name: self.own[key] for name, key in names.items() if key in self.own}
-        if lane_axis:  # acts by the very tensors that learning changes
+        if lane_axis:  # acts with the same tensors that updates change
             for name, parameter in network.named_parameters():
                 if name in self._shared:
                     parameter.requires_grad_(False).data = self._shared[name]
@@ -73,22 +80,28 @@ class FunctionalEngine:
         self.steps = 0
         kind = next(iter(self.own.values()))
         self._scalars = kind.new_zeros(()), kind.new_zeros(())
+        self._optimizer, self._tau = optimizer, tau
         self._learning_rate, self._adam_eps, self._share = learning_rate, adam_eps, loss_share
         self._max_norm = max_grad_norm
         self._vmapped, self._flat = not lane_axis, flat
         self._is_warm = not compile
-        self._compiled = Compiled(FunctionalEngine._step, what="updates run", enabled=compile)
-        self._compiled_on = Compiled(FunctionalEngine._step_on, what="updates run", enabled=compile)
+        self._compiled = Compiled(FunctionalEngine._step, what="updates run", changes=(7,), enabled=compile)
+        self._compiled_on = Compiled(
+            FunctionalEngine._step_on, what="updates run", changes=(6,), enabled=compile
+        )
 
-    def update(self, buffer: ReplayBuffer) -> Tensor:
+    def update(self, buffer: LaneBuffer) -> Tensor:
         """See `Engine`."""
+        if buffer.has_transforms:
+            return self.update_from(buffer.sample())
         storage: LaneStorage = buffer.storage
         index = buffer.sampler.draw(storage)
         self.steps += 1
         if not self._is_warm:
-            self._warm_up(gather(storage.fields, index, storage.rows))
-        arguments = [*storage.fields.values()], storage.rows, index, *self._adam_scalars()
-        losses: Tensor = self._compiled(_form(storage, index), self, *arguments, self._tensors)
+            self._warm_up(gather(storage.fields, index, storage.rows, storage.horizon))
+        fields, form = [*storage.fields.values()], _form(storage, index)
+        arguments = fields, storage.rows, storage.horizon, index, *self._adam_scalars(), self._tensors
+        losses: Tensor = self._compiled(form, self, *arguments)
         return losses
 
     def update_from(self, batch: TensorDict) -> Tensor:
@@ -104,12 +117,13 @@ class FunctionalEngine:
         return losses
 
     def _warm_up(self, batch: TensorDict) -> None:
-        """TensorDict fills a table of its own at first use; compiled code would fill it again each time."""
+        """Calls TensorDict once before compilation: it fills a cache at first use, which compiled code would
+        refill at each call."""
         self._gradients(self._tensors[0], self._tensors[1], batch)
         self._is_warm = True
 
     def _adam_scalars(self) -> tuple[Tensor, Tensor]:
-        """Adam's two bias corrections, computed here once instead of for every weight in the graph."""
+        """Adam's two bias corrections, computed once here instead of once per weight in the graph."""
         size, scale = self._scalars
         size.fill_(self._learning_rate / (1 - BETA_1**self.steps))
         scale.fill_((1 - BETA_2**self.steps) ** -0.5)
@@ -119,14 +133,15 @@ class FunctionalEngine:
         self,
         fields: list[Tensor],
         rows: int,
+        horizon: Horizon | None,
         index: Tensor,
         step_size: Tensor,
         scale: Tensor,
         tensors: list[list[Tensor]],
     ) -> Tensor:
-        """One step. Tensors come in lists: compiled code finds each of a dict by counting through its keys,
-        which takes longer than all that one lane has to compute."""
-        batch = gather(dict(zip(FIELDS, fields, strict=True)), index, rows)
+        """One step. Tensors are passed in lists: the guards of compiled code find a dict's entry by counting
+        through its keys, which takes longer than all computation of one lane."""
+        batch = gather(dict(zip(FIELDS, fields, strict=True)), index, rows, horizon)
         return self._change(batch, step_size, scale, tensors)
 
     def _step_on(
@@ -138,7 +153,7 @@ class FunctionalEngine:
         scale: Tensor,
         tensors: list[list[Tensor]],
     ) -> Tensor:
-        """One step on a batch, whose entries come in the order of their names."""
+        """One step on a batch; its entries are in the order of their names."""
         batch = TensorDict({}, batch_size=size)
         for name, column in zip(names, columns, strict=True):
             batch.set(name, column)
@@ -147,21 +162,32 @@ class FunctionalEngine:
     def _change(
         self, batch: TensorDict, step_size: Tensor, scale: Tensor, tensors: list[list[Tensor]]
     ) -> Tensor:
-        """Gradients, then Adam, in place; each lane's loss."""
+        """Computes gradients, changes the weights in place and returns each lane's loss."""
         own, fixed, means, squares = tensors
         gradients, losses = self._gradients(own, fixed, batch)
         if self._max_norm is not None:
             gradients = shortened(gradients, self._max_norm)
-        for weight, slope, mean, square in zip(own, gradients, means, squares, strict=True):
-            mean.mul_(BETA_1).add_(slope, alpha=1 - BETA_1)
-            square.mul_(BETA_2).addcmul_(slope, slope, value=1 - BETA_2)
-            weight.sub_(step_size * mean / (square.sqrt() * scale + self._adam_eps))
+        change_weights(
+            self._optimizer,
+            own,
+            gradients,
+            means,
+            squares,
+            step_size=step_size,
+            scale=scale,
+            learning_rate=self._learning_rate,
+            eps=self._adam_eps,
+        )
+        if self._tau is not None:
+            for name, target in zip(self._fixed_names, fixed, strict=True):
+                if _source(name) in self._names:
+                    target.lerp_(own[self._names.index(_source(name))], self._tau)
         return losses
 
     def _gradients(
         self, own: list[Tensor], fixed: list[Tensor], batch: TensorDict
     ) -> tuple[list[Tensor], Tensor]:
-        """By each of the own weights, and each lane's loss."""
+        """The gradients of the trained weights, and each lane's loss."""
         gradient = torch.func.grad(self._lane_losses, has_aux=True)
         if self._vmapped:
             gradient = torch.vmap(gradient)
@@ -171,7 +197,8 @@ class FunctionalEngine:
     def _lane_losses(
         self, own: list[Tensor], fixed: list[Tensor], batch: TensorDict
     ) -> tuple[Tensor, Tensor]:
-        """The sum over lanes, for its gradient, and each lane's loss; under vmap there is one lane."""
+        """The sum of the losses of all lanes, to differentiate, and each lane's loss; under vmap there is one
+        lane."""
         by_name = (
             dict(zip(self._names, own, strict=True)),
             dict(zip(self._fixed_names, fixed, strict=True)),
@@ -196,7 +223,7 @@ class FunctionalEngine:
         return torch.vmap(output)(self._of_part(name), observation)
 
     def _of_part(self, name: str) -> Weights:
-        """The weights of one of an agent's networks, by its own names."""
+        """The weights of one of an agent's networks, by their names in that network."""
         mine = f"{name}." if name else ""
         return {key.removeprefix(mine): value for key, value in self._shared.items() if key.startswith(mine)}
 
@@ -233,12 +260,12 @@ class FunctionalEngine:
         }
 
     def load_state_dict(self, state: Mapping[str, Any]) -> None:
-        """See `Engine`; copies into the tensors that a compiled step knows."""
+        """See `Engine`; copies into the existing tensors, which the compiled step refers to."""
         groups = {"own": self.own, "targets": self.fixed, "mean": self._mean, "square": self._square}
         for group, tensors in groups.items():
             if set(state[group]) != set(tensors):
                 raise ValueError(
-                    f"the state has the weights {sorted(state[group])}; {sorted(tensors)} is wanted"
+                    f"the state has the weights {sorted(state[group])}; allowed: {sorted(tensors)}"
                 )
             for name, tensor in tensors.items():
                 tensor.copy_(state[group][name])
@@ -246,7 +273,7 @@ class FunctionalEngine:
 
 
 def shortened(gradients: Sequence[Tensor], longest: float) -> list[Tensor]:
-    """Gradients [L, ...] of all weights, those of a lane scaled down where their norm is above `longest`."""
+    """Gradients [L, ...] of all weights, scaled down for lanes whose gradient norm exceeds `longest`."""
     squares = [slope.reshape(len(slope), -1).square().sum(1) for slope in gradients]
     norms = torch.stack(squares).sum(0).sqrt()
     scales = (longest / (norms + 1e-6)).clamp(max=1.0)
@@ -254,10 +281,15 @@ def shortened(gradients: Sequence[Tensor], longest: float) -> list[Tensor]:
 
 
 def _source(name: str) -> str:
-    """The weight to whose value a target is set."""
+    """The name of the weight that a target copies."""
     return name.removeprefix("target_")
 
 
 def _form(storage: LaneStorage, index: Tensor) -> tuple[object, ...]:
-    """What the compiled step takes for granted of its arguments; its own tensors never change their form."""
-    return storage.rows, index.shape, *((field.shape, field.dtype) for field in storage.fields.values())
+    """The shapes and dtypes for which a step is compiled; the engine's own tensors never change theirs."""
+    return (
+        storage.rows,
+        storage.horizon,
+        index.shape,
+        *((field.shape, field.dtype) for field in storage.fields.values()),
+    )

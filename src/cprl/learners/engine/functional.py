@@ -1,53 +1,57 @@
-"""Loss modules of TorchRL's as functions of their weights, and their weights by name."""
+"""TorchRL's loss modules as functions of their weights, and their weights by name."""
 
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
-from typing import NamedTuple
+from typing import Final, NamedTuple
 
 import torch
 from tensordict import TensorDict, TensorDictBase
 from tensordict.nn import TensorDictParams
 from torch import Tensor, nn
-from torchrl.objectives import A2CLoss, LossModule, PPOLoss, ReinforceLoss
+from torchrl.objectives import LossModule
 
+from cprl.compat import forget_cached_weights, promise_targets, refuse_updaters, updated_weights
 from cprl.networks.stacked import stack_lanes
 
 MakeLoss = Callable[[nn.Module], LossModule]
-"""A per-agent loss out of a network; see `cprl.learners.single.dqn_loss`."""
+"""Makes one agent's loss from its network; see `cprl.learners.single.dqn_loss`."""
 
 Weights = dict[str, Tensor]
 
+_NO_UPDATER: Final = (
+    "a SoftUpdate or HardUpdate was built on the {}; the engine has weights of its own, which it would not "
+    "change: leave it out, and set tau or target_every_episodes"
+)
+
 
 class FunctionalLoss:
-    """A loss module of TorchRL's as a function of its weights, one loss for each transition.
+    """A TorchRL loss module as a function of its weights that returns one loss per transition.
 
-    TorchRL keeps a loss's weights in `TensorDictParams` of the module; here plain TensorDicts take their
-    place during a call, which both `torch.func` and `torch.compile` accept.
+    TorchRL stores the weights of a loss in `TensorDictParams` of the module. During a call plain TensorDicts
+    replace them, which both `torch.func` and `torch.compile` accept.
 
     Args:
-        loss: the module; its own weights are taken out.
+        loss: the module; its own weights are removed from it.
     """
 
     def __init__(self, loss: LossModule) -> None:
         loss.reduction = "none"
         if hasattr(loss, "scalar_output_mode"):
-            loss.scalar_output_mode = "exclude"  # numbers that are no loss, and of no transition
-        # Made when first asked for, which a compiler would see as a change; a loss may have neither.
+            loss.scalar_output_mode = "exclude"  # drops scalars that are not losses of transitions
+        # Created lazily at first access, which a compiler would see as a change; a loss may have neither.
         getattr(loss, "in_keys", None)
         with suppress(NotImplementedError):
             getattr(loss, "value_estimator", None)
         self._groups = {name: group.batch_size for name, group in groups_of(loss).items()}
-        self._singles = tuple(loss._parameters)
-        for name in self._groups:
-            del loss._modules[name]
-            loss.__dict__[name] = None
-        for name in self._singles:
-            del loss._parameters[name]
-            loss.__dict__[name] = None
+        self._singles = tuple(_single_weights(loss))
+        for name in (*self._groups, *self._singles):
+            delattr(loss, name)
+            setattr(loss, name, None)
+        refuse_updaters(loss, _NO_UPDATER.format(type(loss).__name__))
         self.module = loss
 
     def __call__(self, own: Weights, fixed: Weights, batch: TensorDict) -> Tensor:
-        """The loss of each transition, [L, b], or [b] under vmap; one alone where the loss gives no more."""
+        """The loss of each transition, [L, b], or [b] under vmap; a single number if the loss reduces it."""
         flat = {**own, **fixed}
         for name, size in self._groups.items():
             mine = f"{name}:"
@@ -56,26 +60,22 @@ class FunctionalLoss:
         for name in self._singles:
             setattr(self.module, name, own[name])
         if not torch.compiler.is_compiling():
-            self.module.__dict__.pop("_cache", None)  # of what some losses make of their weights
+            forget_cached_weights(self.module)
         losses = total(self.module(batch))
         for name in (*self._groups, *self._singles):
             setattr(self.module, name, None)
         return losses
 
 
-def refuse_on_policy(loss: LossModule) -> None:
-    """Raises a ValueError for a loss that is right only for what the present policy has just done."""
-    if isinstance(loss, A2CLoss | PPOLoss | ReinforceLoss):
-        raise ValueError(
-            f"{type(loss).__name__} learns from what the present policy has just done, not from a replay "
-            "buffer; what fits is RolloutLearner, or cprl.learning.PPO, A2C or Reinforce in a population"
-        )
+def own_targets(loss: LossModule) -> None:
+    """Marks the targets of a loss as updated, by the engine, so that TorchRL does not warn.
 
-
-def promise_targets(loss: LossModule) -> None:
-    """TorchRL warns of targets that no updater of its own replaces; here `copy_to_targets` does."""
-    for name in loss._has_update_associated:
-        loss._has_update_associated[name] = True
+    Raises:
+        ValueError: if the loss already has a `SoftUpdate` or `HardUpdate`, which would have no effect.
+    """
+    if any(f"target_{name}_params" in groups_of(loss) for name in updated_weights(loss)):
+        raise ValueError(_NO_UPDATER.format(type(loss).__name__))
+    promise_targets(loss)
 
 
 def total(out: TensorDictBase) -> Tensor:
@@ -86,8 +86,14 @@ def total(out: TensorDictBase) -> Tensor:
 
 
 def groups_of(loss: LossModule) -> dict[str, TensorDictParams]:
-    """The groups of weights of a loss by name, those of targets among them."""
-    return {name: child for name, child in loss._modules.items() if isinstance(child, TensorDictParams)}
+    """The groups of weights of a loss by name, including targets."""
+    named = loss.named_modules(remove_duplicate=False)
+    return {name: own for name, own in named if isinstance(own, TensorDictParams) and "." not in name}
+
+
+def _single_weights(loss: LossModule) -> dict[str, nn.Parameter]:
+    """The weights of a loss that are in no group, by name; `LossModule.named_parameters` omits some."""
+    return dict(nn.Module.named_parameters(loss, recurse=False, remove_duplicate=False))
 
 
 def targets_of(loss: LossModule) -> dict[str, TensorDictParams]:
@@ -97,47 +103,47 @@ def targets_of(loss: LossModule) -> dict[str, TensorDictParams]:
 
 
 def _named(loss: LossModule) -> Weights:
-    """All weights of a loss, the tensors themselves, by group:name; single ones by their name."""
+    """All weights of a loss, not copied, by "group:name"; weights in no group by their name."""
     grouped = {
         f"{group}:{key}": value
         for group, weights in groups_of(loss).items()
         for key, value in weights.flatten_keys(".").items()
     }
-    return {**grouped, **loss._parameters}
+    return {**grouped, **_single_weights(loss)}
 
 
 def weights_of(loss: LossModule) -> Weights:
-    """Copies of all weights of a loss, those of targets among them, by name."""
+    """Copies of all weights of a loss, including targets, by name."""
     return {name: value.detach().clone() for name, value in _named(loss).items()}
 
 
 class Stacked(NamedTuple):
-    """A loss of many lanes, and its weights with the lanes' axis in front, by name."""
+    """A loss of many lanes and its weights by name, with the lane axis first."""
 
     loss: LossModule
     own: Weights
-    """What learns."""
+    """The trained weights."""
     fixed: Weights
-    """What does not: the weights of targets, and buffers."""
+    """Tensors that gradients do not change: target weights and buffers."""
     names: Mapping[str, str]
-    """Of the network's parameters that are among the loss's weights: their names there."""
+    """The names in the loss of those parameters of the network that are among its weights."""
 
 
 def stacked(networks: Sequence[nn.Module], make_loss: MakeLoss, *, lane_axis: bool) -> Stacked:
-    """One loss for the networks of all lanes, whose weights are copied.
+    """One loss for the networks of all lanes; the weights are copied.
 
     Raises:
-        ValueError: with a lane axis, for networks that cannot have one, for a loss with weights of its own,
-            which all lanes would share, and for one that stacks networks itself, in front of the lanes.
+        ValueError: with a lane axis: if the networks cannot be stacked, if the loss has weights of its own,
+            which all lanes would share, or if the loss adds an axis of its own before the lane axis.
     """
     made = [stack_lanes(networks)] if lane_axis else list(networks)
     losses = [make_loss(network) for network in made]
-    if lane_axis and losses[0]._parameters:
-        raise ValueError(f"all agents would share the loss's {', '.join(losses[0]._parameters)}")
+    if lane_axis and (shared := _single_weights(losses[0])):
+        raise ValueError(f"all agents would share the weights {', '.join(shared)} of the loss")
     if lane_axis and any(group.batch_size for group in groups_of(losses[0]).values()):
-        raise ValueError("the loss stacks networks in front of the lanes' axis")
+        raise ValueError("the loss stacks networks along an axis before the lane axis")
     for loss in losses:
-        promise_targets(loss)
+        own_targets(loss)
     named = _named(losses[0])
     where = {value.data_ptr(): name for name, value in named.items()}
     names = {

@@ -1,4 +1,4 @@
-"""What a window shows: observations back to classes of cells, whatever form the game gives them."""
+"""Decodes observations back to classes of cells, whatever form the game gives them."""
 
 from typing import Final
 
@@ -9,15 +9,15 @@ from cprl.commons.observation import classes_shown
 from cprl.commons.world import Bytes
 
 UNSEEN: Final = 255
-"""The class of a colour that is none of the game's, and of a pixel that lies in no window."""
+"""The class of a colour that the game does not use, and of a pixel that lies in no window."""
 
 
 def classes_seen(game: Game, windows: Bytes) -> Bytes:
-    """The class of each cell that agents observe, UNSEEN where it is none of the game's.
+    """The class of each observed cell (`cprl.commons.colours`); UNSEEN for a colour the game does not use.
 
     Args:
-        game: which says what form the observations have.
-        windows: uint8 [T, N, C, X, Y], as observed.
+        game: The game, which defines the form of the observations.
+        windows: uint8 [T, N, C, X, Y], observations.
 
     Returns:
         uint8 [T, N, X, Y].

@@ -1,4 +1,4 @@
-"""The way lanes are updated is found by trial: the fastest that does what each agent would do alone."""
+"""The engine is found by trial: the fastest that does what each agent would do alone."""
 
 import warnings
 
@@ -57,7 +57,7 @@ def loss_of(kind):
     return make
 
 
-def way_of(make_network, make_loss):
+def engine_of(make_network, make_loss):
     return fitting_engine([make_network() for _ in range(2)], make_loss, trial_batch(2, SHAPE, ACTIONS))
 
 
@@ -68,32 +68,36 @@ def q_network():
 @pytest.mark.parametrize(
     ("make_network", "make_loss", "engine"),
     [
-        (q_network, lambda network: dqn_loss(network, gamma=0.9), "lane axis"),
-        (OwnNetwork, lambda network: dqn_loss(network, gamma=0.9), "vmap"),
-        (q_network, loss_of(OverAllLanes), "vmap"),
+        (q_network, lambda network: dqn_loss(network, gamma=0.9), "lane_axis"),
+        (OwnNetwork, lambda network: dqn_loss(network, gamma=0.9), "vmapped"),
+        (q_network, loss_of(OverAllLanes), "vmapped"),
     ],
     ids=["ours", "own network", "a loss that would mix lanes"],
 )
-def test_the_fastest_way_that_fits_is_taken_without_a_word(make_network, make_loss, engine):
+def test_the_fastest_engine_that_fits_is_taken_without_a_word(make_network, make_loss, engine):
     with warnings.catch_warnings():
         warnings.simplefilter("error")
-        assert way_of(make_network, make_loss) == engine
+        assert engine_of(make_network, make_loss) == engine
 
 
 def test_a_loss_that_cannot_be_vmapped_runs_as_a_list_and_a_warning_says_why():
-    with pytest.warns(RuntimeWarning, match=r"one after the other, many times slower; .*vmap: .*\.item\(\)"):
-        assert way_of(OwnNetwork, loss_of(LookingAtNumbers)) == "list"
+    with pytest.warns(
+        RuntimeWarning, match=r"one after the other, which is many times slower; .*vmapped: .*\.item\(\)"
+    ):
+        assert engine_of(OwnNetwork, loss_of(LookingAtNumbers)) == "list"
 
 
-def test_a_learner_finds_its_way():
+def test_a_learner_finds_its_engine():
     game = Game(map=maps.parse(".A>\n..<"), rules=Rules(window_rows=3, window_columns=5))
     how = {"agents": (0, 1), "settings": DQNSettings(buffer_size=50), "compile": False}
-    found = ReplayLearner(game, replicas=2, **how)
-    named = ReplayLearner(game, replicas=2, engine="lane axis", **how)
+    found = ReplayLearner(game.spaces, replicas=2, **how)
+    named = ReplayLearner(game.spaces, replicas=2, engine="lane_axis", **how)
     assert type(found.engine) is type(named.engine)
     assert found.networks().keys() == named.networks().keys()
     for name, network in found.networks().items():
         for mine, theirs in zip(network.parameters(), named.networks()[name].parameters(), strict=True):
             assert torch.equal(mine, theirs), "a trial changes nothing"
-    with pytest.raises(ValueError, match="way is 'quick'; allowed: lane axis, lane axis, flat, vmap, list"):
-        ReplayLearner(game, replicas=2, engine="quick", **how)
+    with pytest.raises(
+        ValueError, match="engine is 'quick'; allowed: lane_axis, lane_axis_flat, vmapped, list"
+    ):
+        ReplayLearner(game.spaces, replicas=2, engine="quick", **how)

@@ -1,4 +1,4 @@
-"""The doors of PettingZoo and Gymnasium keep their contracts, and all doors play the same game."""
+"""The adapters for PettingZoo and Gymnasium keep their contracts, and all adapters play the same game."""
 
 import warnings
 from dataclasses import replace
@@ -36,42 +36,42 @@ def no_screen(monkeypatch):
 
 
 @pytest.mark.parametrize("game", GAMES, ids=["short", "rich", "commons"])
-def test_pettingzoos_test_of_parallel_environments(game):
+def test_the_parallel_env_passes_pettingzoos_api_test(game):
     parallel_api_test(parallel_env(game), num_cycles=100)
 
 
 @pytest.mark.parametrize("game", [GAMES[0], GAMES[2]], ids=["short", "commons"])
-def test_pettingzoos_test_of_turn_by_turn_environments(game):
+def test_the_aec_env_passes_pettingzoos_api_test(game):
     api_test(env(game), num_cycles=200)
 
 
-def test_pettingzoos_test_warns_only_that_vectors_beside_a_picture_are_no_box():
+def test_with_vectors_pettingzoos_api_test_warns_only_that_observations_are_not_a_box():
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always")
         api_test(env(GAMES[1]), num_cycles=200)
-    told = {str(warning.message) for warning in caught}
+    messages = {str(warning.message) for warning in caught}
     assert all(
         "Observation is not a NumPy array" in text or "probably should be gymnasium.spaces.box" in text
-        for text in told
+        for text in messages
     )
-    assert told
+    assert messages
 
 
 @pytest.mark.parametrize("game", GAMES, ids=["short", "rich", "commons"])
-def test_pettingzoos_tests_of_seeds(game):
+def test_both_envs_pass_pettingzoos_seed_tests(game):
     parallel_seed_test(lambda: parallel_env(game), num_cycles=60)
     seed_test(lambda: env(game), num_cycles=60)
 
 
 @pytest.mark.usefixtures("no_screen")
-def test_pettingzoos_test_of_rendering():
+def test_the_aec_env_passes_pettingzoos_render_test():
     render_test(lambda **how: env(SHORT, **how))
     matplotlib.pyplot.close("all")
 
 
 @pytest.mark.parametrize("game", SINGLE, ids=["single_basic", "rich"])
 @pytest.mark.usefixtures("no_screen")
-def test_gymnasiums_test_of_environments(game):
+def test_the_gymnasium_env_passes_gymnasiums_check(game):
     check_env(gymnasium.make("cprl/Commons-v0", game=game).unwrapped)
     matplotlib.pyplot.close("all")
 
@@ -85,7 +85,7 @@ def test_single_boards_are_registered_in_both_variants(name):
 
 
 @pytest.mark.filterwarnings("ignore:PettingZoo in TorchRL is tested using version:UserWarning")
-def test_torchrls_pettingzoo_wrapper_accepts_it():
+def test_torchrls_pettingzoo_wrapper_accepts_the_parallel_env():
     wrapped = PettingZooWrapper(parallel_env(presets.game("commons")), use_mask=False)
     check_env_specs(wrapped)
     steps = wrapped.rollout(20)
@@ -93,11 +93,11 @@ def test_torchrls_pettingzoo_wrapper_accepts_it():
 
 
 def played_by_torchrl(game, turns):
-    """Everything that the agents are told in each turn; a new episode begins where one has ended."""
-    door = CommonsEnv(game, seed=5)
-    moment = door.reset()
+    """Everything that the agents receive in each turn; a new episode begins when one has ended."""
+    adapter = CommonsEnv(game, seed=5)
+    moment = adapter.reset()
     for turn in turns:
-        now, moment = door.step_and_maybe_reset(moment.set(keys.ACTION, torch.as_tensor(turn[None])))
+        now, moment = adapter.step_and_maybe_reset(moment.set(keys.ACTION, torch.as_tensor(turn[None])))
         after = now["next"]
         agents = after["agents"][0]
         flags = zip(agents["in_play"], agents["fired"], agents["tagged_by"].any(-1), strict=True)
@@ -114,8 +114,8 @@ def played_by_torchrl(game, turns):
         }
 
 
-def told_of(names, observe, rewards, infos, end):
-    """The same from what PettingZoo's and Gymnasium's doors return."""
+def step_output(names, observe, rewards, infos, end):
+    """The same, from what the adapters for PettingZoo and Gymnasium return."""
     entries = {}
     for name in names:
         seen = observe(name)
@@ -130,72 +130,74 @@ def told_of(names, observe, rewards, infos, end):
 
 
 def played_in_parallel(game, turns):
-    door, names = parallel_env(game, 5), game.agent_names
-    door.reset()
+    adapter, names = parallel_env(game, 5), game.agent_names
+    adapter.reset()
     for turn in turns:
-        seen, rewards, terminated, truncated, infos = door.step(dict(zip(names, turn.tolist(), strict=True)))
+        seen, rewards, terminated, truncated, infos = adapter.step(
+            dict(zip(names, turn.tolist(), strict=True))
+        )
         ends = set(zip(terminated.values(), truncated.values(), strict=True))
         assert len(ends) == 1
-        yield told_of(names, seen.get, rewards, infos, end := ends.pop())
-        assert door.agents == ([] if any(end) else list(names))
+        yield step_output(names, seen.get, rewards, infos, end := ends.pop())
+        assert adapter.agents == ([] if any(end) else list(names))
         if any(end):
-            door.reset()
+            adapter.reset()
 
 
 def played_turn_by_turn(game, turns):
-    door, names = env(game, 5), game.agent_names
-    door.reset()
+    adapter, names = env(game, 5), game.agent_names
+    adapter.reset()
     for turn in turns:
         for name, action in zip(names, turn.tolist(), strict=True):
-            assert door.agent_selection == name
-            door.step(action)
-        end = door.terminations[names[0]], door.truncations[names[0]]
-        yield told_of(names, door.observe, door.rewards, door.infos, end)
+            assert adapter.agent_selection == name
+            adapter.step(action)
+        end = adapter.terminations[names[0]], adapter.truncations[names[0]]
+        yield step_output(names, adapter.observe, adapter.rewards, adapter.infos, end)
         if any(end):
-            door.reset()
+            adapter.reset()
 
 
 def played_alone(game, turns):
-    door = CommonsGymnasiumEnv(game, seed=5)
-    door.reset()
+    adapter = CommonsGymnasiumEnv(game, seed=5)
+    adapter.reset()
     for turn in turns:
-        seen, reward, *end, info = door.step(int(turn[0]))
+        seen, reward, *end, info = adapter.step(int(turn[0]))
         one = {"agent_0": reward}
-        yield told_of(["agent_0"], {"agent_0": seen}.get, one, {"agent_0": info}, tuple(end))
+        yield step_output(["agent_0"], {"agent_0": seen}.get, one, {"agent_0": info}, tuple(end))
         if any(end):
-            door.reset()
+            adapter.reset()
 
 
 @pytest.mark.parametrize("board", presets.BOARDS)
 @pytest.mark.parametrize("form", [Observation(), RICH], ids=["rgb", "rich"])
-def test_all_doors_play_the_same_game_for_the_same_seed(board, form):
+def test_all_adapters_play_the_same_game_for_the_same_seed(board, form):
     game = presets.game(board)
     game = replace(game, rules=replace(game.rules, episode_steps=130), observation=form)
     turns = random_actions(300, 1, game, seed=1)[:, 0]
-    doors = [played_in_parallel, played_turn_by_turn, *([played_alone] if game.agents == 1 else [])]
+    adapters = [played_in_parallel, played_turn_by_turn, *([played_alone] if game.agents == 1 else [])]
     ends = 0
-    for number, told in enumerate(
-        zip(played_by_torchrl(game, turns), *(door(game, turns) for door in doors), strict=True)
+    for number, outputs in enumerate(
+        zip(played_by_torchrl(game, turns), *(adapter(game, turns) for adapter in adapters), strict=True)
     ):
-        for other in told[1:]:
-            assert set(other) == set(told[0])
-            for entry, value in told[0].items():
+        for other in outputs[1:]:
+            assert set(other) == set(outputs[0])
+            for entry, value in outputs[0].items():
                 assert np.array_equal(other[entry], value), (number, entry)
-        ends += any(told[0]["end"])
+        ends += any(outputs[0]["end"])
     assert number == 299
     assert ends >= 2
 
 
 @pytest.mark.parametrize("play", [played_in_parallel, played_turn_by_turn])
-def test_whole_seeded_episodes_are_the_same_again(play):
+def test_the_same_seed_repeats_whole_episodes(play):
     game = presets.game("commons")
     turns = random_actions(300, 1, game, seed=3)[:, 0]
     for one, other in zip(play(game, turns), play(game, turns), strict=True):
         assert all(np.array_equal(other[entry], value) for entry, value in one.items())
 
 
-@pytest.mark.parametrize("door", [parallel_env, CommonsGymnasiumEnv])
-def test_reset_with_a_seed_starts_all_over_and_without_one_goes_on(door):
+@pytest.mark.parametrize("adapter", [parallel_env, CommonsGymnasiumEnv])
+def test_reset_with_a_seed_restarts_and_without_one_begins_the_next_episode(adapter):
     game = presets.game("single_complex")
     turns = random_actions(200, 1, game, seed=4)[:, 0, 0].tolist()
 
@@ -205,16 +207,16 @@ def test_reset_with_a_seed_starts_all_over_and_without_one_goes_on(door):
             world.step({"agent_0": turn} if isinstance(world, ParallelEnv) else turn)
         return world.world.state().tolist(), world.world.batch.now.harvested.tolist()
 
-    world = door(game)
+    world = adapter(game)
     first = episode(world, seed=7)
     second = episode(world)
     assert episode(world, seed=8) != first != second
     assert episode(world, seed=7) == first
     assert episode(world) == second
-    assert episode(door(game, seed=7)) == first
+    assert episode(adapter(game, seed=7)) == first
 
 
-def test_the_picture_shows_who_is_in_play_each_in_its_own_colour():
+def test_the_image_shows_each_agent_in_play_in_its_own_colour():
     world = parallel_env(Game(map=maps.parse(">..<A"), rules=Rules(freeze_steps=3)), render_mode="rgb_array")
     world.reset()
     before = world.render()
@@ -231,8 +233,8 @@ def test_the_picture_shows_who_is_in_play_each_in_its_own_colour():
 @pytest.mark.parametrize(
     ("actions", "message"),
     [
-        ({"agent_0": 0}, r"actions came for \['agent_0'\]; wanted: one for each of \['agent_0', 'agent_1'\]"),
-        ({"agent_0": 0, "agent_1": 0, "agent_2": 0}, "wanted: one for each of"),
+        ({"agent_0": 0}, r"actions has the agents \['agent_0'\]; allowed: exactly \['agent_0', 'agent_1'\]"),
+        ({"agent_0": 0, "agent_1": 0, "agent_2": 0}, "allowed: exactly "),
         ({"agent_0": 0, "agent_1": 8}, "action 8 of agent 1 in world 0 is unknown; allowed: 0 to 7"),
     ],
 )
@@ -246,16 +248,16 @@ def test_wrong_actions_are_refused_and_change_nothing(actions, message):
     assert world.world.batch.now.step[0, 0] == 0
 
 
-def test_stepping_an_episode_that_is_over_says_what_to_do():
+def test_a_step_after_the_end_of_an_episode_asks_for_reset():
     world = parallel_env(replace(SHORT, rules=replace(SHORT.rules, episode_steps=1)))
     world.reset()
     world.step({"agent_0": 0, "agent_1": 0})
-    with pytest.raises(ValueError, match=r"the episode is over, call reset\(\)"):
+    with pytest.raises(ValueError, match=r"the episode has ended: call reset\(\)"):
         world.step({"agent_0": 0, "agent_1": 0})
 
 
-def test_gymnasium_takes_one_agent():
-    with pytest.raises(ValueError, match="the game has 2 agents; Gymnasium takes one"):
+def test_gymnasium_refuses_games_of_several_agents():
+    with pytest.raises(ValueError, match="the game has 2 agents; allowed with Gymnasium: 1"):
         CommonsGymnasiumEnv(SHORT)
 
 
@@ -264,19 +266,19 @@ def test_render_modes_are_checked():
         parallel_env(SHORT, render_mode="ansi")
     world = parallel_env(SHORT)
     world.reset()
-    with pytest.raises(ValueError, match="nothing can be rendered"):
+    with pytest.raises(ValueError, match=r"render_mode is None, so .*; allowed: "):
         world.render()
 
 
-def test_where_no_window_can_be_opened_the_mode_human_says_so(monkeypatch):
+def test_the_render_mode_human_is_refused_where_no_window_can_be_opened(monkeypatch):
     monkeypatch.delenv("MPLBACKEND", raising=False)
     matplotlib.use("agg")
-    with pytest.raises(RuntimeError, match=r'no window can be opened here .*"agg"'):
+    with pytest.raises(RuntimeError, match=r'backend "agg" cannot open a window'):
         Window("title")
 
 
 @pytest.mark.usefixtures("no_screen")
-def test_a_window_shows_one_picture_after_the_other_and_closes():
+def test_a_window_shows_one_image_after_the_other_and_closes():
     window = Window("title")
     for shade in (0, 200):
         window.show(np.full((4, 6, 3), shade, np.uint8))

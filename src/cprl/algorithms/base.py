@@ -1,0 +1,183 @@
+"""The base classes of algorithms: frozen dataclasses that make the networks, loss and learner of agents.
+
+To write an algorithm, subclass `OffPolicy` or `OnPolicy` as a frozen dataclass with a field `settings`, and
+define `make_network` and `make_loss`; docs/algorithms.md has an example of twenty lines.
+"""
+
+from collections.abc import Sequence
+from typing import Any, ClassVar, Literal, TypeAlias, get_args
+
+from torch import nn
+from torchrl.objectives import LossModule
+
+from cprl.learners.base import Learner
+from cprl.learners.replay import ReplayLearner
+from cprl.learners.rollouts import RolloutLearner
+from cprl.learners.settings import DQNSettings, RolloutSettings
+from cprl.learners.torchrl import TorchRLReplayLearner, TorchRLRolloutLearner
+from cprl.spaces import Spaces
+
+TrainingEngine: TypeAlias = Literal["compiled", "eager", "torchrl"]
+"""How agents are updated. "compiled": all together, in one update that torch compiles; "eager": the same
+update, uncompiled; "torchrl": by TorchRL's stock parts, one agent after the other, see
+`cprl.learners.torchrl`."""
+
+
+class Algorithm:
+    """How an agent learns: hyperparameters, networks, loss and learner.
+
+    Agents with equal algorithms learn as lanes of one stacked update, so an algorithm must be a frozen
+    dataclass.
+    """
+
+    settings: Any
+    """The hyperparameters."""
+    stochastic: ClassVar[bool] = False
+    """Whether the acting network outputs the logits of a policy, from which actions are sampled; else it
+    outputs action values, and actions are epsilon-greedy."""
+
+    def make_network(self, spaces: Spaces) -> nn.Module:
+        """New networks of one agent, initialised from torch's generator. They map observations [..., *shape]
+        to [..., A]; several networks are `AgentNetworks`, the acting one first."""
+        raise NotImplementedError(f"{type(self).__name__} must define make_network(spaces)")
+
+    def make_loss(self, network: nn.Module) -> LossModule:
+        """TorchRL's loss over networks of `make_network`."""
+        raise NotImplementedError(f"{type(self).__name__} must define make_loss(network)")
+
+    def make_learner(
+        self, spaces: Spaces, *, agents: Sequence[int], engine: TrainingEngine = "compiled", **how: Any
+    ) -> Learner:
+        """The learner of these agents in every replica.
+
+        Args:
+            spaces: the shape and dtype of observations, and the number of actions A.
+            agents: their indices.
+            engine: how they are updated.
+            how: `replicas`, `seed`, `first_replica`, `reward_kind` and `device`, see
+                `cprl.learners.replay.ReplayLearner`.
+
+        Raises:
+            ValueError: if the settings have the wrong class, the algorithm does not support these agents,
+                or the engine is unknown or does not support the algorithm.
+        """
+        raise NotImplementedError(f"{type(self).__name__} must define make_learner")
+
+    def _refuse_torchrl(self, engine: TrainingEngine) -> None:
+        _check_engine(engine)
+        if engine == "torchrl":
+            raise ValueError(
+                f'{type(self).__name__} does not support engine="torchrl", which trains independent agents '
+                'one after the other; allowed: engine="compiled" or "eager"'
+            )
+
+    def _check_settings(self, kind: type[Any]) -> None:
+        if not isinstance(self.settings, kind):
+            raise ValueError(
+                f"{type(self).__name__}.settings is a {type(self.settings).__name__}; "
+                f"allowed: {kind.__name__}"
+            )
+
+
+class OffPolicy(Algorithm):
+    """Learns from a replay buffer.
+
+    The loss reads transitions with "observation", "action" and "next": "observation", "reward" [.., 1],
+    "done", "terminated".
+    """
+
+    settings: DQNSettings
+
+    def make_learner(
+        self, spaces: Spaces, *, agents: Sequence[int], engine: TrainingEngine = "compiled", **how: Any
+    ) -> Learner:
+        """See `Algorithm`."""
+        self._check_settings(DQNSettings)
+        _check_engine(engine)
+        how |= {
+            "agents": agents,
+            "settings": self.settings,
+            "make_network": lambda: self.make_network(spaces),
+            "make_loss": self.make_loss,
+            "stochastic": self.stochastic,
+        }
+        if engine == "torchrl":
+            return TorchRLReplayLearner(spaces, **how)
+        return ReplayLearner(spaces, compile=engine == "compiled", **how)
+
+
+class OnPolicy(Algorithm):
+    """Learns from rollouts of the current policy.
+
+    `make_network` returns `AgentNetworks`: "actor" outputs the policy's logits, "critic" one value. The loss
+    reads "observation", "action", "action_log_prob", "advantage", "value_target" and "state_value".
+    """
+
+    settings: RolloutSettings
+    stochastic: ClassVar[bool] = True
+
+    def make_learner(
+        self, spaces: Spaces, *, agents: Sequence[int], engine: TrainingEngine = "compiled", **how: Any
+    ) -> Learner:
+        """See `Algorithm`."""
+        self._check_settings(RolloutSettings)
+        _check_engine(engine)
+        how |= {
+            "agents": agents,
+            "settings": self.settings,
+            "make_network": lambda: self.make_network(spaces),
+            "make_loss": self.make_loss,
+        }
+        if engine == "torchrl":
+            return TorchRLRolloutLearner(spaces, **how)
+        return RolloutLearner(spaces, compile=engine == "compiled", **how)
+
+
+class TeamAlgorithm(Algorithm):
+    """Trains a team: agents that learn together and act independently, on their own observations.
+
+    `make_network` returns the networks of one member. The loss reads observations [.., S, *shape] and actions
+    [.., S] of S members; rewards [.., 1] of replay, advantages [.., S, 1] of rollouts.
+    """
+
+    shares_reward: ClassVar[bool] = True
+    """Whether the members must get the team reward."""
+    fewest_members: ClassVar[int] = 1
+    """The smallest team that the algorithm supports."""
+
+    def make_team(self, members: Sequence[nn.Module], spaces: Spaces) -> nn.Module:
+        """Makes the networks of a team from those of its members: `AgentNetworks`, the acting `TeamNetwork`
+        first. Added networks are initialised from torch's generator."""
+        raise NotImplementedError(f"{type(self).__name__} must define make_team(members, spaces)")
+
+    def make_learner(
+        self, spaces: Spaces, *, agents: Sequence[int], engine: TrainingEngine = "compiled", **how: Any
+    ) -> Learner:
+        """See `Algorithm`."""
+        self._refuse_torchrl(engine)
+        self._check_team(len(agents), str(how.get("reward_kind", "individual")))
+        return super().make_learner(
+            spaces,
+            agents=agents,
+            engine=engine,
+            make_team=lambda members: self.make_team(members, spaces),
+            **how,
+        )
+
+    def _check_team(self, members: int, reward: str) -> None:
+        name = type(self).__name__
+        if self.shares_reward and reward != "team":
+            raise ValueError(
+                f'reward is "{reward}"; allowed for {name}: "team", the sum over all agents; '
+                f'DQN, PPO and IPPO support "{reward}"'
+            )
+        if members < self.fewest_members:
+            raise ValueError(
+                f"the team has {members} agents; allowed for {name}: at least {self.fewest_members}; DQN and "
+                "VDN support fewer"
+            )
+
+
+def _check_engine(engine: str) -> None:
+    if engine not in get_args(TrainingEngine):
+        raise ValueError(f"engine is {engine!r}; allowed: {', '.join(get_args(TrainingEngine))}")

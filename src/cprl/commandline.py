@@ -1,0 +1,130 @@
+"""recipe_main: the command line of a recipe, made of the experiment that it describes.
+
+Its own arguments stand first; every number of the experiment can be changed by its place, e.g.
+`--game.rules.freeze-steps 50 --agents.0.algorithm.settings.gamma 0.9`.
+"""
+
+import inspect
+import sys
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated, Any, Final
+
+import tyro
+
+from cprl.experiment import Experiment
+from cprl.flags import applied, flags_of
+
+_OLD_WORDS: Final = {
+    "--go-on": ("--resume",),
+    "--no-go-on": ("--no-resume",),
+    "--learn-every": ("--update-every",),
+    "--compile": ("--engine", "compiled"),
+    "--no-compile": ("--engine", "eager"),
+}
+"""Flags of earlier versions, and what they are now."""
+
+_NOTE: Final = (
+    "Every value of the experiment below can be changed by its place. Agents that equal one before are not "
+    "listed; they have the same arguments by their own number. What is not listed at all is changed in a "
+    "copy of the recipe: the kind of an agent or of its algorithm, transforms, callbacks, drawn boards."
+)
+
+
+@dataclass(frozen=True, kw_only=True)
+class RunOptions:
+    """How an experiment is run; nothing of it changes a number."""
+
+    out: Path | None = None
+    """The run's directory; by default a new one under runs/."""
+    resume: bool = False
+    """Resume the run in `out`, which was stopped; bit for bit as if it had not been."""
+    watch: str = "file"
+    """"file", or live as well: "serve", "spawn", "connect ADDRESS"; "off" for no recording."""
+    allow: tyro.conf.UseAppendAction[tuple[str, ...]] = ()
+    """A class of somebody's own that a frozen agent's run may import, "module:Class"; may be repeated."""
+
+
+def recipe_main(make_experiment: Callable[..., Experiment], argv: Sequence[str] | None = None) -> Path:
+    """Runs the experiment of a recipe as the command line asks for it.
+
+    Args:
+        make_experiment: gives the experiment; its arguments become flags, so each has a type and a default,
+            and a line under "Args:".
+        argv: the command line, script first; by default that of this process.
+
+    Returns:
+        The run's directory.
+
+    Raises:
+        SystemExit: where the command line or an experiment is refused, with the reason.
+    """
+    command = list(sys.argv if argv is None else argv)
+    try:
+        experiment, options = parse(make_experiment, command)
+    except ValueError as error:
+        sys.exit(f"{Path(command[0]).name}: {error}")
+    from cprl.running import run
+
+    allow = {"allow": options.allow} if options.allow else {}
+    return run(experiment, options.out, resume=options.resume, watch=options.watch, command=command, **allow)
+
+
+def parse(
+    make_experiment: Callable[..., Experiment], command: Sequence[str]
+) -> tuple[Experiment, RunOptions]:
+    """The experiment that a command line, script first, asks for, and how it is to be run.
+
+    Raises:
+        ValueError: where the experiment refuses a value, or an argument of the recipe's own has the name of
+            a field of the experiment.
+        SystemExit: for `--help`, and for an argument that is unknown or of another type.
+    """
+    script, given = Path(command[0]).name, _in_todays_words(command[1:])
+    _check_names(make_experiment)
+    made, _ = tyro.cli(
+        make_experiment, args=given, prog=script, return_unknown_args=True, add_help=False, config=_CONFIG
+    )
+    kind, default = flags_of(made, all_agents=not {"-h", "--help"} & set(given))
+
+    def read(
+        own: Annotated[Any, tyro.conf.arg(name="", constructor=make_experiment)],
+        options: Annotated[RunOptions, tyro.conf.arg(name="")] = _OPTIONS,
+        experiment: Annotated[kind, tyro.conf.arg(name="")] = default,  # type: ignore[valid-type]
+    ) -> tuple[Any, RunOptions]:
+        return experiment, options
+
+    flags, options = tyro.cli(
+        read, args=given, prog=script, description=_description(make_experiment), config=_CONFIG
+    )
+    experiment: Experiment = applied(made, flags)
+    return experiment, options
+
+
+_OPTIONS: Final = RunOptions()
+_CONFIG: Final = (tyro.conf.HelptextFromCommentsOff,)
+
+
+def _in_todays_words(given: Sequence[str]) -> list[str]:
+    words: list[str] = []
+    for word in given:
+        flag, equals, value = word.partition("=")
+        new = _OLD_WORDS.get(flag.replace("_", "-"))
+        words += [word] if new is None else [*new[:-1], new[-1] + equals + value]
+    return words
+
+
+def _check_names(make_experiment: Callable[..., Experiment]) -> None:
+    taken = {*Experiment.__dataclass_fields__, *RunOptions.__dataclass_fields__}
+    for name in inspect.signature(make_experiment).parameters:
+        if name in taken:
+            raise ValueError(
+                f"the recipe has an argument {name!r} of its own, which every experiment has on the command "
+                "line; allowed: another name"
+            )
+
+
+def _description(make_experiment: Callable[..., Experiment]) -> str:
+    text = (inspect.getdoc(make_experiment) or "").partition("\nArgs:")[0].strip()
+    return "\n\n".join(filter(None, [text, " ".join(_NOTE.split())]))

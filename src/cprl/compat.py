@@ -1,0 +1,182 @@
+"""Code that relies on private parts of torch, TorchRL or tensordict, or works around their bugs.
+
+There is one function, class or constant for each, with a test in `tests/test_compat.py` that shows what an
+upgrade has broken. The rest of cprl uses public interfaces. Three exceptions are elsewhere:
+
+- code that relies on Numba is in `cprl.commons.compiled`, because the game works without torch;
+- methods with an underscore that a library expects its subclasses to define (`EnvBase._reset`, `_step` and
+  `_set_seed`, `Storage._empty`, `Sampler._empty`, `Logger._create_experiment`) are its interface for that;
+- nothing private of Rerun is used.
+"""
+
+from abc import abstractmethod
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from types import CodeType, FunctionType
+from typing import Any, Final
+
+import torch
+from tensordict import TensorDict, TensorDictBase
+from tensordict.base import NO_DEFAULT
+from torchrl.data import Categorical
+from torchrl.envs import EnvBase
+from torchrl.objectives import HardUpdate, LossModule
+from torchrl.objectives.value import ValueEstimatorBase
+
+# ---- tensordict
+
+
+def entry(tensordict: TensorDictBase, name: str) -> Any:
+    """`tensordict.get(name)` without its handling of nested keys; takes a tenth of the time.
+
+    Raises:
+        KeyError: if there is no such entry.
+    """
+    return tensordict._get_str(name, NO_DEFAULT)
+
+
+def put(tensordict: TensorDictBase, name: str, value: Any) -> None:
+    """`tensordict.set(name, value)` without key handling or checks; the value must fit."""
+    tensordict._set_str(name, value, validated=True, inplace=False, non_blocking=False)
+
+
+def unchecked_tensordict(
+    entries: dict[str, Any], batch_size: torch.Size, device: torch.device | None = None
+) -> TensorDict:
+    """`TensorDict(entries, batch_size, device=device)` without checks; the entries must fit, uncopied."""
+    return TensorDict._new_unsafe(entries, batch_size=batch_size, device=device)
+
+
+def put_all(tensordict: TensorDict, entries: Mapping[str, Any]) -> None:
+    """`put` for several entries of a TensorDict of `unchecked_tensordict` at once."""
+    tensordict._tensordict.update(entries)
+
+
+# ---- TorchRL: environments and specs
+
+
+class LeanStepEnv(EnvBase):
+    """An `EnvBase` that steps and resets in its own method, `lean_step`.
+
+    `EnvBase.step_and_maybe_reset`, rollouts and collectors call the private `_step_and_maybe_reset`, whose
+    key handling takes seven times as long as a step of one world. This class overrides it.
+    """
+
+    @abstractmethod
+    def lean_step(self, tensordict: TensorDictBase) -> tuple[TensorDictBase, TensorDictBase]:
+        """Like `EnvBase.step_and_maybe_reset`, for all worlds."""
+
+    def _step_and_maybe_reset(self, tensordict: TensorDictBase) -> tuple[TensorDictBase, TensorDictBase]:
+        if "next" in tensordict or "_step" in tensordict:  # a step of some worlds, or into given tensors
+            return super()._step_and_maybe_reset(tensordict)  # type: ignore[no-any-return]
+        return self.lean_step(tensordict)
+
+
+def flag_spec(*shape: int) -> Categorical:
+    """The spec of bools with a shape [B, ...], or [B, N, ...] in a group of agents.
+
+    `Binary` describes the same values but treats its last axis as one vector: a spec [B, N] cannot be indexed
+    in a group of shape [B, N], so `EnvBase.observation_spec_unbatched` raises an IndexError.
+    """
+    return Categorical(2, shape=shape, dtype=torch.bool)
+
+
+# ---- TorchRL: losses
+
+
+def updated_weights(loss: LossModule) -> list[str]:
+    """The names of the weights whose targets a TorchRL target updater updates."""
+    return [name for name, is_updated in loss._has_update_associated.items() if is_updated]
+
+
+def refuse_updaters(loss: LossModule, message: str) -> None:
+    """Makes a loss refuse TorchRL's target updaters, which read the names of its targets first."""
+
+    class Refusing(dict[str, bool]):
+        def keys(self) -> Any:
+            raise ValueError(message)
+
+    loss._has_update_associated = Refusing(loss._has_update_associated)
+
+
+def promise_targets(loss: LossModule) -> None:
+    """Marks the targets of a loss as updated: it would warn that they have no TorchRL updater, while
+    `Engine.copy_to_targets` updates them."""
+    for name in loss._has_update_associated:
+        loss._has_update_associated[name] = True
+
+
+def forget_cached_weights(loss: LossModule) -> None:
+    """Clears the detached weights that some losses cache at a call, so that they can be replaced."""
+    loss.__dict__.pop("_cache", None)
+
+
+def hard_update(loss: LossModule, *, every: int) -> HardUpdate:
+    """A `HardUpdate` that copies to targets at every `every`-th call of `step`, at least 1.
+
+    TorchRL counts one call more: with an interval of 2 it copies at every third call.
+    """
+    return HardUpdate(loss, value_network_update_interval=every - 1)
+
+
+def bootstrap_from_target(estimator: ValueEstimatorBase) -> None:
+    """Makes the estimator of a `DiscreteCQLLoss` bootstrap from the target network.
+
+    The loss passes the target weights as `params`, but its estimator ignores them and would bootstrap from
+    the network itself.
+    """
+    estimate = estimator.value_estimate
+
+    def by_target(tensordict: TensorDictBase, *, params: TensorDictBase) -> torch.Tensor:
+        target: torch.Tensor = estimate(tensordict, target_params=params)
+        return target
+
+    estimator.value_estimate = by_target
+
+
+# ---- torch.compile
+
+COMPILE_OPTIONS: Final[Mapping[str, Any]] = {
+    "cpp_wrapper": True,
+    "guard_filter_fn": torch.compiler.skip_all_guards_unsafe,
+}
+"""Options of `torch.compile`. Guards, which check the shapes and dtypes of arguments, take a quarter of an
+update of 16 agents. Without them the caller must recompile when these change, as `cprl.compiling` does."""
+
+
+def with_own_code(function: Any) -> FunctionType:
+    """The same function with its own code object: torch caches compiled code by code object, and would
+    treat learners of another size as a change of shapes."""
+    code = function.__code__.replace(co_name=f"{function.__name__}_of_its_own")
+    return FunctionType(code, function.__globals__, code.co_name)
+
+
+@contextmanager
+def code_written_for(function: FunctionType) -> Iterator[list[CodeType]]:
+    """A context that yields a list, to which the code that torch generates for a function is appended."""
+    from torch._dynamo.convert_frame import register_bytecode_hook  # takes seconds
+
+    codes: list[CodeType] = []
+
+    def keep(code: CodeType, new_code: CodeType) -> None:
+        if code is function.__code__:
+            codes.append(new_code)
+
+    hook = register_bytecode_hook(keep)
+    try:
+        yield codes
+    finally:
+        hook.remove()
+
+
+def without_lookup(function: FunctionType, codes: Sequence[CodeType]) -> FunctionType:
+    """The code that torch compiled for a function, to be called directly.
+
+    Torch's lookup of it at every call takes half of the overhead of a call. The globals are a copy, because
+    torch stores names in them that it may delete.
+
+    Args:
+        function: from `with_own_code`.
+        codes: from `code_written_for`, not empty.
+    """
+    return FunctionType(codes[-1], dict(function.__globals__), function.__name__)

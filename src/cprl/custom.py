@@ -1,0 +1,87 @@
+"""Custom: something of the user's own, as a text that a run's recipe can keep."""
+
+import importlib
+import json
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import Any
+
+
+@dataclass(frozen=True)
+class Custom:
+    """A class or function of the user's own, by its name, with arguments that JSON can hold.
+
+    An `Experiment` holds values only, so that its recipe says all of it: a transform, callback, logger,
+    network, algorithm or game that is not one of cprl's is handed over like this. Nothing is imported before
+    `make` is called; whoever loads a stored run names what it may import (`allow`).
+
+    Args:
+        target: "module:Class" or "module:function".
+        arguments: its keyword arguments; strings, numbers, booleans, None, and lists and tables of them. A
+            list of strings within a list becomes a tuple, so that nested TensorDict keys can be said:
+            `{"in_keys": [["agents", "reward"]]}`.
+
+    Raises:
+        ValueError: for a target of another form, and for arguments that JSON cannot hold.
+    """
+
+    target: str
+    arguments: Mapping[str, Any] = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        module, colon, name = self.target.partition(":")
+        if not (colon and module and name):
+            raise ValueError(f'Custom.target is {self.target!r}; allowed: "module:Class"')
+        try:
+            text = json.dumps(dict(self.arguments), allow_nan=False)
+        except (TypeError, ValueError) as error:
+            raise ValueError(
+                f"the arguments of Custom({self.target!r}) cannot be kept as JSON: {error}"
+            ) from error
+        object.__setattr__(self, "arguments", json.loads(text))
+
+    def __hash__(self) -> int:
+        return hash((self.target, json.dumps(self.arguments, sort_keys=True)))
+
+    def resolve(self) -> Any:
+        """What the target names, imported.
+
+        Raises:
+            ValueError: where there is no such module or name.
+        """
+        module, _, name = self.target.partition(":")
+        try:
+            found: Any = importlib.import_module(module)
+            for part in name.split("."):
+                found = getattr(found, part)
+        except (ImportError, AttributeError) as error:
+            raise ValueError(f"Custom({self.target!r}) cannot be imported: {error}") from error
+        return found
+
+    def make(self, *positional: Any) -> Any:
+        """Calls the target with these arguments.
+
+        Raises:
+            ValueError: where it cannot be imported, or does not take the arguments.
+        """
+        target = self.resolve()
+        try:
+            return target(*positional, **{name: _with_keys(value) for name, value in self.arguments.items()})
+        except TypeError as error:
+            raise ValueError(f"Custom({self.target!r}) does not take its arguments: {error}") from error
+
+
+def made(value: Any, *positional: Any) -> Any:
+    """What a `Custom` makes; anything else as it is."""
+    return value.make(*positional) if isinstance(value, Custom) else value
+
+
+def _with_keys(value: Any) -> Any:
+    """The same with each list of strings within a list as a tuple, a nested TensorDict key."""
+    if not isinstance(value, list):
+        return value
+    return [tuple(own) if _is_key(own) else _with_keys(own) for own in value]
+
+
+def _is_key(value: Any) -> bool:
+    return isinstance(value, list) and all(isinstance(part, str) for part in value)

@@ -1,0 +1,146 @@
+"""make_env: the one place where an environment is put together, whatever it is for."""
+
+from collections.abc import Iterable, Mapping
+from copy import deepcopy
+from typing import Any, Protocol, runtime_checkable
+
+import torch
+from torch import Tensor
+from torchrl.data import Bounded, Categorical
+from torchrl.envs import Compose, EnvBase, TransformedEnv
+
+from cprl import keys
+from cprl.commons.game import Game
+from cprl.custom import Custom, made
+from cprl.envs.commons_env import CommonsEnv
+from cprl.envs.state import env_state, load_env_state
+from cprl.envs.unwrap import commons_of
+from cprl.spaces import Spaces
+
+
+@runtime_checkable
+class PlayableGame(Protocol):
+    """What an experiment can play: a frozen value; `cprl.Game` is one.
+
+    The environment that it makes has batch size [worlds], ("agents", "observation") [B, N, ...],
+    ("agents", "action") int64 [B, N], ("agents", "reward") float32 [B, N, 1], and done, terminated and
+    truncated bool [B, 1] at the root. Whatever its future depends on, besides the TensorDict that it is
+    stepped with, is in its `state_dict`.
+    """
+
+    @property
+    def agents(self) -> int:
+        """The number of agents N."""
+
+    def to_config(self) -> Mapping[str, Any]:
+        """The arguments that build it again, as JSON can hold them; lists are given back as tuples."""
+
+    def make(self, worlds: int, seed: int, device: Any) -> Any:
+        """An `EnvBase` of so many worlds side by side, whose chance follows from the seed."""
+
+
+def make_env(
+    game: PlayableGame | Custom,
+    *,
+    worlds: int = 1,
+    seed: int = 0,
+    device: str | torch.device = "cpu",
+    first_world: int = 0,
+    transforms: Iterable[Any] = (),
+) -> EnvBase:
+    """An environment of a game, with transforms.
+
+    Args:
+        game: what is played, or a `Custom` that makes it.
+        worlds: how many worlds B.
+        seed: of all chance.
+        device: where it runs.
+        first_world: the number of the first world, so that a world plays the same in batches of any size. A
+            game of the user's own is made with the seed `seed + first_world` instead.
+        transforms: TorchRL transforms, or a `Custom` for each.
+
+    Raises:
+        ValueError: where the environment or a transform does not fit; says what does.
+    """
+    playable: Any = made(game)
+    env: EnvBase
+    if isinstance(playable, Game):
+        env = CommonsEnv(playable, worlds, seed=seed, device=device, first_world=first_world)
+    else:
+        env = playable.make(worlds, seed + first_world, device)
+    listed = [made(transform) for transform in transforms]
+    if listed:
+        env = TransformedEnv(env, Compose(*listed))
+    check_env(env, worlds)
+    return env
+
+
+def spaces_of(env: EnvBase) -> Spaces:
+    """What each agent of an environment observes and may do, transforms included.
+
+    Raises:
+        ValueError: for specs that agents cannot read, e.g. actions that are not categorical.
+    """
+    observation, action = _spec(env, "observation"), _spec(env, "action")
+    if not isinstance(action, Categorical) or action.ndim != 2:
+        raise ValueError(
+            f'("agents", "action") has the spec {type(action).__name__} {list(action.shape)}; allowed: '
+            "Categorical [worlds, agents]"
+        )
+    worlds, agents = action.shape
+    if observation.shape[:2] != action.shape:
+        raise ValueError(
+            f'("agents", "observation") is {list(observation.shape)}; allowed: [{worlds}, {agents}, ...]'
+        )
+    shape, dtype = observation.shape, observation.dtype
+    if isinstance(env, TransformedEnv):  # some transforms change observations and not their spec
+        seen = _first_observation(env)
+        shape, dtype = seen.shape, seen.dtype
+    is_float = dtype.is_floating_point
+    highest = float(observation.high.max()) if isinstance(observation, Bounded) and not is_float else 1.0
+    commons = commons_of(env)
+    known = () if commons is None else commons.game.spaces.vectors
+    vectors = tuple(
+        (name, size) for name, size in known if (keys.AGENTS, name) in env.observation_spec.keys(True)
+    )
+    return Spaces(
+        agents=agents,
+        observation_shape=tuple(shape[2:]),
+        observation_dtype=str(dtype).removeprefix("torch."),
+        observation_scale=highest,
+        actions=int(action.n),
+        vectors=vectors,
+    )
+
+
+def _first_observation(env: EnvBase) -> Tensor:
+    """("agents", "observation") after a reset, of which the environment keeps nothing."""
+    with torch.random.fork_rng(devices=[]):
+        before = deepcopy(env_state(env))
+        seen: Tensor = env.reset().get(keys.OBSERVATION)
+        load_env_state(env, before)
+    return seen
+
+
+def check_env(env: EnvBase, worlds: int) -> None:
+    """Raises a ValueError, with what is allowed, for an environment that a training could not play."""
+    if tuple(env.batch_size) != (worlds,):
+        raise ValueError(f"the environment has batch size {list(env.batch_size)}; allowed: [{worlds}]")
+    spaces = spaces_of(env)
+    reward = env.full_reward_spec.get(keys.REWARD, None)
+    if reward is None or tuple(reward.shape) != (worlds, spaces.agents, 1):
+        came = None if reward is None else list(reward.shape)
+        raise ValueError(f'("agents", "reward") is {came}; allowed: [{worlds}, {spaces.agents}, 1]')
+    for name in (keys.DONE, keys.TERMINATED, keys.TRUNCATED):
+        done = env.full_done_spec.get(name, None)
+        if done is None or tuple(done.shape) != (worlds, 1):
+            came = None if done is None else list(done.shape)
+            raise ValueError(f'"{name}" at the root is {came}; allowed: [{worlds}, 1]')
+
+
+def _spec(env: EnvBase, name: str) -> Any:
+    group = env.full_action_spec if name == "action" else env.observation_spec
+    spec = group.get((keys.AGENTS, name), None)
+    if spec is None:
+        raise ValueError(f'the environment has no ("agents", "{name}"); every game must have it')
+    return spec

@@ -1,0 +1,125 @@
+"""The whole state of an environment and of its transforms, for checkpoints."""
+
+from collections.abc import Callable, Mapping
+from typing import Any, Final
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from tensordict import TensorDict, TensorDictBase
+from torch import Tensor
+from torchrl.envs import EnvBase, TransformedEnv
+
+from cprl.envs.unwrap import base_env, commons_of
+
+
+def env_state(env: EnvBase) -> dict[str, Any]:
+    """All that the future of an environment depends on, besides the TensorDict that it is stepped with:
+    tensors, numbers, lists and tables."""
+    commons = commons_of(env)
+    if commons is None:
+        own = dict(base_env(env).state_dict())
+    else:
+        own = {name: _tensor(array) for name, array in commons.worlds.state().items()}
+    return {"worlds": own, "transforms": transforms_state(env)}
+
+
+def load_env_state(env: EnvBase, state: Mapping[str, Any]) -> None:
+    """Puts an environment, made with the same arguments, where `env_state` found it."""
+    commons = commons_of(env)
+    if commons is None:
+        base_env(env).load_state_dict(state["worlds"])
+    else:
+        dtypes = {name: array.dtype for name, array in commons.worlds.state().items()}
+        commons.load({name: tensor.numpy().view(dtypes[name]) for name, tensor in state["worlds"].items()})
+    load_transforms_state(env, state["transforms"])
+
+
+STEPS_TRIED: Final = 40
+"""Steps before and after a trial of `check_restorable`."""
+
+
+def check_restorable(make: Callable[[], EnvBase]) -> None:
+    """That an environment, put where another one was, plays on as that one does.
+
+    Tried with random actions on two new environments, since a game of the user's own may keep something
+    beside its `state_dict`, and a training that was stopped would then resume wrongly, unnoticed.
+
+    Args:
+        make: makes the environment, always with the same arguments.
+
+    Raises:
+        ValueError: where it plays on differently.
+    """
+    with torch.random.fork_rng(devices=[]):
+        torch.manual_seed(0)
+        first, second = make(), make()
+        carried = _played(first, first.reset(), STEPS_TRIED)[-1]
+        fresh = second.reset()
+        load_env_state(second, env_state(first))
+        copied = load_carried(fresh, carried_state(carried))
+        torch.manual_seed(1)
+        wanted = _played(first, carried, STEPS_TRIED)
+        torch.manual_seed(1)
+        came = _played(second, copied, STEPS_TRIED)
+    if not all(_equal(one, other) for one, other in zip(came, wanted, strict=True)):
+        kind = type(base_env(first)).__name__
+        raise ValueError(
+            f"the state_dict of {kind} does not hold all of its state: put back where it was, it plays on "
+            "differently, so a run that is stopped could not be resumed; register what it keeps as buffers "
+            "(register_buffer), or define state_dict and load_state_dict"
+        )
+
+
+def _played(env: EnvBase, carried: TensorDictBase, steps: int) -> list[TensorDictBase]:
+    """What is carried after each of so many steps of random actions."""
+    found = []
+    for _ in range(steps):
+        carried = env.step_and_maybe_reset(env.rand_action(carried.clone()))[1]
+        found.append(carried.clone())
+    return found
+
+
+def _equal(one: TensorDictBase, other: TensorDictBase) -> bool:
+    mine, theirs = (dict(own.items(True, True)) for own in (one, other))
+    return mine.keys() == theirs.keys() and all(
+        torch.equal(torch.nan_to_num(mine[name]), torch.nan_to_num(theirs[name])) for name in mine
+    )
+
+
+def transforms_state(env: EnvBase) -> dict[str, Any]:
+    """What the transforms have learned or been told, e.g. the statistics of a normalisation."""
+    return dict(env.transform.state_dict()) if isinstance(env, TransformedEnv) else {}
+
+
+def load_transforms_state(env: EnvBase, state: Mapping[str, Any]) -> None:
+    """Gives the transforms of an environment what those of another had."""
+    if isinstance(env, TransformedEnv):
+        env.transform.load_state_dict(dict(state))
+
+
+def carried_state(carried: TensorDictBase) -> dict[str, Any]:
+    """The TensorDict that an environment is stepped with as nested tables of tensors."""
+    return {
+        name: carried_state(value) if isinstance(value, TensorDictBase) else value
+        for name, value in carried.items()
+    }
+
+
+def load_carried(fresh: TensorDictBase, state: Mapping[str, Any]) -> TensorDictBase:
+    """The TensorDict of `carried_state`, in the form of what `env.reset()` gives."""
+    carried = fresh.empty()
+    for name, value in state.items():
+        if isinstance(value, Tensor):
+            carried.set(name, value.to(carried.device) if carried.device else value)
+        else:
+            inner = fresh.get(name, None)
+            size = carried.batch_size if inner is None else inner.batch_size
+            empty = TensorDict({}, batch_size=size, device=carried.device)
+            carried.set(name, load_carried(empty if inner is None else inner, value))
+    return carried
+
+
+def _tensor(array: NDArray[Any]) -> Tensor:
+    """The same bytes as a tensor; torch keeps unsigned numbers as signed ones."""
+    return torch.from_numpy(array.view(np.int64) if array.dtype == np.uint64 else array)

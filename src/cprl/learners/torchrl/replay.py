@@ -1,0 +1,269 @@
+"""TorchRLReplayLearner: independent agents that learn from replay with TorchRL's stock parts."""
+
+from collections.abc import Callable, Mapping, Sequence
+from math import prod
+from typing import Any, Final
+
+import psutil
+import torch
+from tensordict import TensorDict, TensorDictBase
+from torch import Tensor, nn
+from torchrl.data import LazyTensorStorage, TensorDictReplayBuffer
+from torchrl.data.replay_buffers import RandomSampler
+from torchrl.envs.transforms import MultiStepTransform, UnsqueezeTransform
+from torchrl.objectives import HardUpdate, IQLLoss, LossModule, SoftUpdate
+from torchrl.objectives.utils import TargetNetUpdater
+
+from cprl.custom import made
+from cprl.learners.buffer.storage import torch_dtype
+from cprl.learners.engine.functional import MakeLoss, targets_of
+from cprl.learners.engine.refusals import refuse_on_policy
+from cprl.learners.lanes import TARGET_WEIGHTS, Lanes
+from cprl.learners.settings import DQNSettings
+from cprl.learners.torchrl.agents import MakeSampler, StockAgents
+from cprl.learners.torchrl.buffers import buffer_state, load_buffer, nested, plain
+from cprl.learners.transitions import RewardKind
+from cprl.policies.lanes import LaneActor
+from cprl.spaces import Spaces
+
+BYTES_BESIDE: Final = 8 + 4 + 1 + 1
+"""Bytes of a transition without its observations: action, reward, done, terminated."""
+
+
+class TorchRLReplayLearner:
+    """R x S independent agents made of TorchRL's stock parts: S agents of each of R replicas.
+
+    Each has a network, the loss of its algorithm, an optimiser of torch.optim, a `HardUpdate` or
+    `SoftUpdate`, and a `TensorDictReplayBuffer` of a `LazyTensorStorage` and a `RandomSampler`. They explore
+    through `LaneActor`, not `EGreedyModule`, which uses torch's global generator: a replica's actions would
+    depend on the replicas that train beside it. Initial weights, initial targets and exploration equal those
+    of `ReplayLearner`; the sampled batches do not, unless `make_sampler` replays them.
+
+    Args:
+        spaces: the shape and dtype of observations, and the number of actions A.
+        agents: the indices of the agents that learn.
+        replicas: the number of replicas R; each is one world of the environment.
+        settings: the hyperparameters.
+        make_network: makes new networks of one agent, initialised from torch's generator, which is seeded for
+            each agent.
+        make_loss: makes an agent's loss from its networks.
+        seed: the seed of the run.
+        first_replica: the index of the first replica, so that replica r can be trained alone.
+        stochastic: whether networks output the logits of a policy; else action values.
+        reward_kind: which reward they get.
+        make_sampler: makes an agent's sampler; by default a `RandomSampler`.
+        device: the torch device of networks, buffers and updates.
+
+    Raises:
+        ValueError: for a loss that needs the latest steps of the current policy, for settings below their
+            minimum, and for settings that the loss ignores: those of targets if it has none, and `n_steps`.
+        MemoryError: if the device has less memory than the buffers need; raised before allocation.
+    """
+
+    def __init__(
+        self,
+        spaces: Spaces,
+        *,
+        agents: Sequence[int],
+        replicas: int,
+        settings: DQNSettings,
+        make_network: Callable[[], nn.Module],
+        make_loss: MakeLoss,
+        seed: int = 0,
+        first_replica: int = 0,
+        stochastic: bool = False,
+        reward_kind: RewardKind = "individual",
+        make_sampler: MakeSampler | None = None,
+        device: str | torch.device = "cpu",
+    ) -> None:
+        self.spaces, self.settings, self.agents = spaces, settings, tuple(agents)
+        self.replicas, self.seed, self.reward_kind = replicas, seed, reward_kind
+        self._make_sampler: MakeSampler = make_sampler or (lambda lane: RandomSampler())
+        self._lanes = Lanes(
+            spaces,
+            agents=agents,
+            replicas=replicas,
+            seed=seed,
+            first_replica=first_replica,
+            make_network=make_network,
+            stochastic=stochastic,
+        )
+        self.stock = StockAgents(
+            self._lanes,
+            lambda network: _off_policy(make_loss, network),
+            optimizer=settings.optimizer,
+            learning_rate=settings.learning_rate,
+            eps=settings.adam_eps,
+            loss_share=1 / spaces.actions if settings.mean_over_all_outputs else 1.0,
+            device=device,
+        )
+        _check(settings, self.stock.each[0].loss)
+        self.updaters = [_target_updater(agent.loss, settings) for agent in self.stock.each]
+        if settings.own_target_weights:
+            self._init_targets(make_loss)
+        _check_memory(len(self._lanes), spaces, settings, self.stock.device)
+        self._make_buffers()
+        self.actor = self._lanes.actor(self.stock, compile=False)
+        self.steps = 0
+        self.actor.epsilon = settings.epsilon(0)
+
+    def _init_targets(self, make_loss: MakeLoss) -> None:
+        """Gives targets initial weights of their own; the updaters have made them copies."""
+        networks = self._lanes.new_networks(TARGET_WEIGHTS, self.stock.device)
+        for agent, network in zip(self.stock.each, networks, strict=True):
+            for name, values in targets_of(make_loss(network)).items():
+                getattr(agent.loss, f"target_{name}").data.copy_(values.data)
+
+    def _make_buffers(self) -> None:
+        """An empty replay buffer for each agent."""
+        self._generators = self.stock.generators()
+        self.buffers = [self._buffer(lane, own) for lane, own in enumerate(self._generators)]
+        self._last: list[TensorDict] = []  # turns that `MultiStepTransform` holds back
+
+    def _buffer(self, lane: int, generator: torch.Generator) -> TensorDictReplayBuffer:
+        settings = self.settings
+        buffer = TensorDictReplayBuffer(
+            storage=LazyTensorStorage(settings.buffer_size, device=self.stock.device),
+            sampler=self._make_sampler(lane),
+            batch_size=settings.batch_size,
+            generator=generator,
+        )
+        if settings.n_steps > 1:
+            # With its default `done_keys` a transition would keep the flags of its first step, and bootstrap
+            # from the end of an episode that terminated within its n steps.
+            buffer.append_transform(MultiStepTransform(settings.n_steps, settings.gamma, done_keys=[]))
+            # `DistributionalDQNLoss` would read [b] as one discount for each atom.
+            buffer.append_transform(UnsqueezeTransform(dim=-1, in_keys=["steps_to_next_obs"]))
+        for transform in settings.replay_transforms:
+            buffer.append_transform(made(transform))
+        return buffer
+
+    def evaluation_actor(self, worlds: int) -> LaneActor:
+        """An actor with the current weights and `epsilon_evaluation`, for `worlds` worlds of each replica."""
+        return self._lanes.evaluation_actor(self.stock, worlds, epsilon=self.settings.epsilon_evaluation)
+
+    def networks(self) -> dict[str, nn.Module]:
+        """A copy of each agent's current acting network, by "replica_0/agent_0" and so on."""
+        return self._lanes.networks(self.stock)
+
+    def store(self, batch: TensorDictBase) -> None:
+        """Stores one step of every replica, as the collector yields it."""
+        turn = self.stock.transitions(batch, self.reward_kind)
+        if self.settings.n_steps > 1:
+            self._last = [*self._last, turn.clone()][-self.settings.n_steps :]
+        for lane, buffer in enumerate(self.buffers):
+            buffer.extend(turn[lane : lane + 1])
+        self.steps += 1
+        self.actor.epsilon = self.settings.epsilon(self.steps)
+
+    def update(self) -> Tensor | None:
+        """Updates every agent `updates_per_step` times; returns the mean losses [R, S], or None while fewer
+        than `learning_starts` transitions are stored."""
+        if self.steps < self.settings.learning_starts or not len(self.buffers[0]):
+            return None
+        losses = [self._update(lane) for lane in range(len(self.stock))]
+        return self._lanes.by_agent(torch.stack(losses))
+
+    def _update(self, lane: int) -> Tensor:
+        losses = []
+        for _ in range(self.settings.updates_per_step):
+            losses.append(self.stock.each[lane].update(self.buffers[lane].sample()))
+            updater = self.updaters[lane]
+            if isinstance(updater, SoftUpdate):
+                updater.step()
+        return torch.stack(losses).mean()
+
+    def end_episode(self, ended: Tensor) -> None:
+        """Counts an episode of the marked replicas, bool [R]; every `target_every_episodes` episodes a hard
+        update of the targets follows."""
+        for lane in ended.repeat_interleave(self._lanes.of_replica).nonzero().flatten().tolist():
+            updater = self.updaters[lane]
+            if isinstance(updater, HardUpdate):
+                updater.step()
+
+    def values(self, batch: TensorDictBase) -> Tensor:
+        """The highest action value of each agent at the end of a turn, [R, S]; NaN where its network
+        outputs a policy."""
+        if self._lanes.stochastic:
+            return torch.full((self.replicas, len(self.agents)), torch.nan)
+        with torch.no_grad():
+            return self._lanes.by_agent(self.stock.outputs(self._lanes.seen_next(batch)).amax(-1))
+
+    def state_dict(self) -> dict[str, Any]:
+        """The full state of all agents; the tensors themselves where possible, not copies.
+
+        The entry "networks" repeats the weights of "agents" in the form that `cprl.load` reads.
+        """
+        return {
+            "networks": self._lanes.states(self.stock),
+            "agents": [agent.state_dict() for agent in self.stock.each],
+            "updaters": [updater.state_dict() if updater else {} for updater in self.updaters],
+            "buffers": [buffer_state(*own) for own in zip(self.buffers, self._generators, strict=True)],
+            "last": [plain(turn) for turn in self._last],
+            "exploration": self.actor.rng.state_dict(),
+            "steps": self.steps,
+        }
+
+    def load_state_dict(self, state: Mapping[str, Any]) -> None:
+        """Continues from the state of a learner made with the same arguments."""
+        for agent, own in zip(self.stock.each, state["agents"], strict=True):
+            agent.load_state_dict(own)
+        for updater, own in zip(self.updaters, state["updaters"], strict=True):
+            if updater is not None:
+                updater.load_state_dict(own)
+        self._make_buffers()
+        self._last = [nested(turn) for turn in state["last"]]
+        for lane, buffer in enumerate(self.buffers):
+            for turn in self._last:
+                buffer.transform.inv(turn[lane : lane + 1].clone())
+            load_buffer(buffer, self._generators[lane], state["buffers"][lane])
+        self.actor.rng.load_state_dict(state["exploration"])
+        self.steps = int(state["steps"])
+        self.actor.epsilon = self.settings.epsilon(self.steps)
+
+
+def _off_policy(make_loss: MakeLoss, network: nn.Module) -> LossModule:
+    """Makes the loss; refuses on-policy losses, which would learn wrongly from replay."""
+    loss = make_loss(network)
+    refuse_on_policy(loss)
+    return loss
+
+
+def _target_updater(loss: LossModule, settings: DQNSettings) -> TargetNetUpdater | None:
+    """The target updater of a loss; None if the loss has no targets."""
+    if not targets_of(loss):
+        return None
+    if settings.tau is not None:
+        return SoftUpdate(loss, tau=settings.tau)
+    # HardUpdate copies at every (interval + 1)-th step.
+    return HardUpdate(loss, value_network_update_interval=settings.target_every_episodes - 1)
+
+
+def _check(settings: DQNSettings, loss: LossModule) -> None:
+    for name in ("updates_per_step", "n_steps", "target_every_episodes"):
+        if getattr(settings, name) < 1:
+            raise ValueError(f"{name} is {getattr(settings, name)}; allowed: an integer >= 1")
+    for name, default in (("tau", None), ("own_target_weights", False)):
+        if getattr(settings, name) != default and not targets_of(loss):
+            raise ValueError(f"{name} is {getattr(settings, name)}, and the loss has no targets")
+    if settings.n_steps > 1 and isinstance(loss, IQLLoss):
+        # TorchRL 0.14.1 ignores "steps_to_next_obs" here.
+        raise ValueError(
+            f"n_steps is {settings.n_steps}; allowed: 1, because TorchRL's {type(loss).__name__} discounts "
+            "the bootstrap value by one step, however many rewards were summed"
+        )
+
+
+def _check_memory(lanes: int, spaces: Spaces, settings: DQNSettings, device: torch.device) -> None:
+    """Checks memory in advance: stock storage holds the observations before and after each transition, and
+    its pages are only committed as they fill, so a machine with too little would fail hours later."""
+    observation = prod(spaces.observation_shape) * torch_dtype(spaces.observation_dtype).itemsize
+    wanted = lanes * settings.buffer_size * (2 * observation + BYTES_BESIDE)
+    on_gpu = device.type == "cuda"
+    free = torch.cuda.mem_get_info(device)[0] if on_gpu else psutil.virtual_memory().available
+    if wanted > free:
+        raise MemoryError(
+            f"the replay buffers of {lanes} agents x {settings.buffer_size:,} transitions take "
+            f"{wanted / 2**30:.2f} GiB; {free / 2**30:.2f} GiB are free: use a smaller buffer_size, fewer "
+            'replicas, or engine="compiled", which needs half'
+        )

@@ -1,0 +1,211 @@
+"""TorchRLRolloutLearner: independent on-policy agents that learn by stock parts."""
+
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any
+
+import torch
+from tensordict import TensorDict, TensorDictBase
+from tensordict.nn import TensorDictModule
+from torch import Tensor, nn
+from torchrl.data import LazyTensorStorage, TensorDictReplayBuffer
+from torchrl.data.replay_buffers import SamplerWithoutReplacement
+from torchrl.objectives.value import GAE
+
+from cprl.learners.engine.functional import MakeLoss
+from cprl.learners.lanes import Lanes
+from cprl.learners.settings import RolloutSettings
+from cprl.learners.torchrl.agents import MakeSampler, StockAgent, StockAgents
+from cprl.learners.torchrl.buffers import nested, plain
+from cprl.learners.transitions import RewardKind
+from cprl.networks.agent import AgentNetworks, parts_of
+from cprl.policies.lanes import LaneActor
+from cprl.spaces import Spaces
+
+ACTOR, CRITIC = range(2)
+"""Positions of the actor and the critic among an agent's networks."""
+
+
+class TorchRLRolloutLearner:
+    """R x S independent agents that learn from the latest steps of their current policies, with TorchRL's
+    stock parts: S agents of each of R replicas.
+
+    Every `rollout_steps` steps TorchRL's `GAE` adds advantages, and the loss is taken `epochs` times over
+    minibatches from a `TensorDictReplayBuffer` with a `SamplerWithoutReplacement`. First weights and the
+    actions that are drawn are those of `RolloutLearner`; the order of minibatches is not, unless
+    `make_sampler` says so.
+
+    Args:
+        spaces: the shape and dtype of observations, and the number of actions A.
+        agents: the indices of the agents that learn.
+        replicas: the number of replicas R; each is one world of the environment.
+        settings: the hyperparameters.
+        make_network: makes an agent's `AgentNetworks`, "actor" and "critic", initialised from torch's
+            generator, which is seeded for each agent.
+        make_loss: makes an agent's loss from them.
+        seed: the seed of the run.
+        first_replica: the index of the first replica, so that replica r can be trained alone.
+        reward_kind: which reward they get.
+        make_sampler: an agent's sampler of minibatches; by default a `SamplerWithoutReplacement`.
+        device: the torch device of networks, buffers and updates.
+
+    Raises:
+        ValueError: if the networks are not "actor" and "critic".
+    """
+
+    def __init__(
+        self,
+        spaces: Spaces,
+        *,
+        agents: Sequence[int],
+        replicas: int,
+        settings: RolloutSettings,
+        make_network: Callable[[], nn.Module],
+        make_loss: MakeLoss,
+        seed: int = 0,
+        first_replica: int = 0,
+        reward_kind: RewardKind = "individual",
+        make_sampler: MakeSampler | None = None,
+        device: str | torch.device = "cpu",
+    ) -> None:
+        self.spaces, self.settings, self.agents = spaces, settings, tuple(agents)
+        self.replicas, self.seed, self.reward_kind = replicas, seed, reward_kind
+        self._lanes = Lanes(
+            spaces,
+            agents=agents,
+            replicas=replicas,
+            seed=seed,
+            first_replica=first_replica,
+            make_network=make_network,
+            stochastic=True,
+        )
+        self.stock = StockAgents(
+            self._lanes,
+            lambda network: make_loss(_actor_and_critic(network)),
+            optimizer=settings.optimizer,
+            learning_rate=settings.learning_rate,
+            eps=settings.adam_eps,
+            max_grad_norm=settings.max_grad_norm,
+            device=device,
+        )
+        self.estimators = [_gae(agent.parts[CRITIC], settings) for agent in self.stock.each]
+        self._generators = self.stock.generators()
+        self.buffers = [
+            TensorDictReplayBuffer(
+                storage=LazyTensorStorage(settings.rollout_steps, device=self.stock.device),
+                sampler=make_sampler(lane) if make_sampler else SamplerWithoutReplacement(),
+                batch_size=settings.minibatch_size,
+                generator=generator,
+            )
+            for lane, generator in enumerate(self._generators)
+        ]
+        self.actor = self._lanes.actor(self.stock, compile=False)
+        self._rollout: list[TensorDict] = []
+        self.steps = 0
+
+    @property
+    def rollout_steps(self) -> int:
+        """The length of a rollout, in steps."""
+        return self.settings.rollout_steps
+
+    def evaluation_actor(self, worlds: int) -> LaneActor:
+        """An actor with the current weights, for `worlds` worlds of each replica."""
+        return self._lanes.evaluation_actor(self.stock, worlds, epsilon=0.0)
+
+    def networks(self) -> dict[str, nn.Module]:
+        """A copy of each agent's current acting network, by "replica_0/agent_0" and so on."""
+        return self._lanes.networks(self.stock)
+
+    def store(self, batch: TensorDictBase) -> None:
+        """Stores one step of every replica, as the collector yields it.
+
+        Raises:
+            ValueError: if the rollout is full: call `update` after each step, or after a number of steps that
+                divides `rollout_steps`.
+        """
+        if len(self._rollout) == self.rollout_steps:
+            raise ValueError(
+                f"the rollout already has {self.rollout_steps} steps; call update() before store()"
+            )
+        self._rollout.append(self.stock.transitions(batch, self.reward_kind).clone())
+        self.steps += 1
+
+    def update(self) -> Tensor | None:
+        """Runs all epochs over a full rollout; returns the mean losses [R, S], or None if it is not full."""
+        if len(self._rollout) < self.rollout_steps:
+            return None
+        rollout = torch.stack(self._rollout, 1)
+        self._rollout = []
+        return self._lanes.by_agent(
+            torch.stack([self._learn(lane, rollout[lane].clone()) for lane in range(len(self.stock))])
+        )
+
+    def _learn(self, lane: int, rollout: TensorDict) -> Tensor:
+        """Runs all epochs of one agent over its rollout, [T]; returns its mean loss."""
+        agent, buffer = self.stock.each[lane], self.buffers[lane]
+        self.estimators[lane](rollout)
+        _add_old_policy(rollout, agent)
+        buffer.empty()
+        buffer.extend(rollout)
+        minibatches = self.settings.epochs * (self.rollout_steps // self.settings.minibatch_size)
+        return torch.stack([agent.update(buffer.sample()) for _ in range(minibatches)]).mean()
+
+    def end_episode(self, ended: Tensor) -> None:
+        """Does nothing: a rollout continues into the next episode; advantages do not cross the boundary."""
+
+    def values(self, batch: TensorDictBase) -> Tensor:
+        """The value that each agent's critic gives to the state after a turn, [R, S]."""
+        with torch.no_grad():
+            expected = self.stock.outputs(self._lanes.seen_next(batch), part=CRITIC)
+        return self._lanes.by_agent(expected.flatten())
+
+    def state_dict(self) -> dict[str, Any]:
+        """The full state of all agents; the tensors themselves where possible, not copies.
+
+        The entry "networks" repeats the weights of "agents" in the form that `cprl.load` reads. The
+        buffers are refilled from each rollout, so only the states of their generators are stored.
+        """
+        return {
+            "networks": self._lanes.states(self.stock),
+            "agents": [agent.state_dict() for agent in self.stock.each],
+            "rollout": [plain(turn) for turn in self._rollout],
+            "generators": [generator.get_state() for generator in self._generators],
+            "exploration": self.actor.rng.state_dict(),
+            "steps": self.steps,
+        }
+
+    def load_state_dict(self, state: Mapping[str, Any]) -> None:
+        """Continues from the state of a learner made with the same arguments."""
+        for agent, own in zip(self.stock.each, state["agents"], strict=True):
+            agent.load_state_dict(own)
+        self._rollout = [nested(turn).to(self.stock.device) for turn in state["rollout"]]
+        for generator, own in zip(self._generators, state["generators"], strict=True):
+            generator.set_state(own.cpu())
+        self.actor.rng.load_state_dict(state["exploration"])
+        self.steps = int(state["steps"])
+
+
+def _gae(critic: nn.Module, settings: RolloutSettings) -> GAE:
+    """TorchRL's GAE with a critic's current weights."""
+    return GAE(
+        gamma=settings.gamma,
+        lmbda=settings.gae_lambda,
+        value_network=TensorDictModule(critic, ["observation"], ["state_value"]),
+        average_gae=settings.normalize_advantage,
+        deactivate_vmap=True,  # a user's network may not support it
+    )
+
+
+def _add_old_policy(rollout: TensorDict, agent: StockAgent) -> None:
+    """Adds the "logits" [T, A] of the policy that acted, and its "action_log_prob" [T]."""
+    with torch.no_grad():
+        logits = agent.parts[ACTOR](rollout["observation"])
+        policy = torch.distributions.Categorical(logits=logits)
+        chosen = policy.log_prob(rollout["action"])  # type: ignore[no-untyped-call]
+    rollout.update({"logits": logits, "action_log_prob": chosen})
+
+
+def _actor_and_critic(network: nn.Module) -> nn.Module:
+    parts = list(parts_of(network))
+    if not isinstance(network, AgentNetworks) or parts[:2] != ["actor", "critic"]:
+        raise ValueError(f'an agent has the networks {parts}; allowed: "actor" and "critic"')
+    return network

@@ -1,0 +1,73 @@
+"""Joins the numbers of each episode over all replicas, once every replica has ended it."""
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from cprl.measuring.episodes import Episode
+from cprl.measuring.replicas import social_metrics
+
+Values = NDArray[np.float64]
+
+
+def numbers_of(episode: Episode, learning: Mapping[str, float], agents: Sequence[str]) -> dict[str, float]:
+    """The numbers of an episode, by the names of docs/metrics.md; NaN where undefined.
+
+    Args:
+        episode: the episode.
+        learning: the numbers of learning in it, by agent index: `agent_0/loss` and so on.
+        agents: the agents' names, which replace `agent_0` and so on.
+    """
+    numbers = {f"social/{name}": value for name, value in social_metrics(episode).items()}
+    for agent, value in zip(agents, episode.return_, strict=True):
+        numbers[f"{agent}/return"] = float(value)
+    named = {f"agent_{index}": agent for index, agent in enumerate(agents)}
+    for name, value in learning.items():
+        of, slash, what = name.partition("/")
+        numbers[f"{named.get(of, of)}{slash}{what}"] = value
+    return numbers
+
+
+class Series:
+    """Collects the numbers of an episode until all replicas have ended it, so that replicas are comparable.
+
+    Args:
+        replicas: the number of replicas R.
+    """
+
+    def __init__(self, replicas: int) -> None:
+        self.replicas = replicas
+        self._waiting: dict[int, dict[int, dict[str, float]]] = {}
+
+    def add(self, episode: int, replica: int, numbers: Mapping[str, float]) -> dict[str, Values] | None:
+        """Adds the numbers of an episode of a replica.
+
+        Returns:
+            Its numbers, [R] by name, NaN where a replica has none, if all replicas have ended the episode;
+            else None.
+        """
+        of_episode = self._waiting.setdefault(episode, {})
+        of_episode[replica] = dict(numbers)
+        if len(of_episode) < self.replicas:
+            return None
+        del self._waiting[episode]
+        names = {name: None for own in of_episode.values() for name in own}
+        return {
+            name: np.array([of_episode[r].get(name, np.nan) for r in range(self.replicas)]) for name in names
+        }
+
+    def state_dict(self) -> dict[str, Any]:
+        """The incomplete episodes."""
+        return {"waiting": {episode: dict(own) for episode, own in self._waiting.items()}}
+
+    def load_state_dict(self, state: Mapping[str, Any]) -> None:
+        """Continues with the incomplete episodes of a state."""
+        self._waiting = {int(episode): dict(own) for episode, own in state["waiting"].items()}
+
+
+def mean_of(values: Values) -> float:
+    """The mean of the defined values; NaN if none is defined."""
+    defined = values[~np.isnan(values)]
+    return float(defined.mean()) if len(defined) else float("nan")

@@ -1,0 +1,126 @@
+"""Convolutional networks over the rows and columns of an observation."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from itertools import pairwise
+from math import prod
+from typing import Any
+
+from torch import Tensor, nn
+from torchrl import modules
+
+from cprl.networks.mlp import glorot_uniform_
+from cprl.spaces import Spaces
+
+
+@dataclass(frozen=True, kw_only=True)
+class Conv:
+    """Convolutions that keep the size of the window, then fully connected layers; ReLU after each.
+
+    Raises:
+        ValueError: if a size is below 1, there are no channels, or the kernel is even.
+    """
+
+    channels: tuple[int, ...] = (16, 16)
+    """Channels of each convolution."""
+    kernel_cells: int = 3
+    """Rows and columns of a kernel, odd."""
+    hidden_cells: tuple[int, ...] = (32,)
+    """Units of each fully connected layer after the convolutions."""
+
+    def __post_init__(self) -> None:
+        for name in ("channels", "hidden_cells"):
+            object.__setattr__(self, name, tuple(getattr(self, name)))
+            if any(size < 1 for size in getattr(self, name)):
+                raise ValueError(f"Conv.{name} is {getattr(self, name)}; allowed: at least 1 in each layer")
+        if not self.channels:
+            raise ValueError("Conv.channels is empty; allowed: at least one convolution; else use MLP")
+        if self.kernel_cells < 1 or self.kernel_cells % 2 == 0:
+            raise ValueError(f"Conv.kernel_cells is {self.kernel_cells}; allowed: 1, 3, 5 and so on")
+
+    def make(
+        self,
+        spaces: Spaces,
+        outputs: int,
+        *,
+        relu_on_outputs: bool = False,
+        glorot_uniform: bool = False,
+        shape: Sequence[int] | None = None,
+    ) -> "ConvNetwork":
+        """A new network; see `cprl.networks.specification.new_network`.
+
+        Raises:
+            ValueError: if observations have no rows and columns.
+        """
+        shape = tuple(spaces.observation_shape if shape is None else shape)
+        if len(shape) < 3:
+            raise ValueError(
+                f"observations have the shape {list(shape)}; allowed for Conv: channels, rows and columns; "
+                "use MLP"
+            )
+        return ConvNetwork(
+            shape,
+            outputs,
+            channels=self.channels,
+            kernel_cells=self.kernel_cells,
+            hidden_cells=self.hidden_cells,
+            highest=spaces.observation_scale,
+            relu_on_outputs=relu_on_outputs,
+            glorot_uniform=glorot_uniform,
+        )
+
+
+class ConvNetwork(nn.Module):
+    """The network of a `Conv`.
+
+    Args:
+        observation_shape: (C, X, Y), or (S, C, X, Y) for S observations, whose channels are concatenated.
+        outputs: the number of outputs A.
+        channels: channels of each convolution.
+        kernel_cells: rows and columns of a kernel, odd.
+        hidden_cells: units of each fully connected layer after the convolutions.
+        highest: the largest value of an observation; inputs are divided by it.
+        relu_on_outputs: whether the outputs pass through ReLU too.
+        glorot_uniform: whether weights are initialised Glorot-uniform and biases to zero; else torch's
+            default.
+    """
+
+    def __init__(
+        self,
+        observation_shape: Sequence[int],
+        outputs: int,
+        *,
+        channels: Sequence[int] = (16, 16),
+        kernel_cells: int = 3,
+        hidden_cells: Sequence[int] = (32,),
+        highest: float = 255.0,
+        relu_on_outputs: bool = False,
+        glorot_uniform: bool = False,
+    ) -> None:
+        super().__init__()
+        self.highest, self.outputs, self.observation_dims = highest, outputs, len(observation_shape)
+        *planes, rows, columns = observation_shape
+        self._window = prod(planes), rows, columns
+        self.convolutions = nn.ModuleList(
+            nn.Conv2d(before, after, kernel_cells, padding=kernel_cells // 2)
+            for before, after in pairwise((prod(planes), *channels))
+        )
+        self.layers = modules.MLP(
+            in_features=channels[-1] * rows * columns,
+            out_features=outputs,
+            num_cells=list(hidden_cells),
+            activation_class=nn.ReLU,
+            activate_last_layer=relu_on_outputs,
+        )
+        if glorot_uniform:
+            self.apply(glorot_uniform_)
+
+    def forward(self, observation: Tensor) -> Tensor:
+        """uint8 or float [..., C, X, Y] to [..., A], in the parameters' type."""
+        leading = observation.shape[: -self.observation_dims]
+        first: Any = self.convolutions[0]
+        values = observation.reshape(-1, *self._window).to(first.weight.dtype) / self.highest
+        for convolution in self.convolutions:
+            values = convolution(values).relu()
+        outputs: Tensor = self.layers(values.flatten(1))
+        return outputs.reshape(*leading, self.outputs)

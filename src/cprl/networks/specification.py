@@ -1,0 +1,93 @@
+"""The network architecture of an algorithm, and the networks made from it."""
+
+from collections.abc import Sequence
+from dataclasses import replace
+from typing import Any, TypeAlias
+
+import torch
+from torch import nn
+
+from cprl.custom import Custom
+from cprl.networks.convolutional import Conv
+from cprl.networks.mlp import MLP
+from cprl.spaces import Spaces
+
+Network: TypeAlias = MLP | Conv
+"""A network of cprl. A network of your own is a `Custom`, called with (spaces, outputs) and its arguments."""
+
+
+def new_network(
+    network: Network | Custom,
+    spaces: Spaces,
+    outputs: int,
+    *,
+    relu_on_outputs: bool = False,
+    glorot_uniform: bool = False,
+    shape: Sequence[int] | None = None,
+) -> nn.Module:
+    """A new network from observations [..., *shape] to [..., outputs], initialised from torch's generator.
+
+    Args:
+        network: the architecture.
+        spaces: the shape, dtype and largest value of observations.
+        outputs: the number of outputs. The network gets the attributes `outputs` and `observation_dims`.
+        relu_on_outputs: whether its outputs pass through ReLU.
+        glorot_uniform: whether its weights are initialised Glorot-uniform and its biases to zero.
+        shape: the shape of its input if that is not one observation: (S, *observation_shape) for the central
+            critic of S agents. A network of your own gets it as `spaces.observation_shape`.
+
+    Raises:
+        ValueError: if agents observe entries that networks do not read, if the network cannot read the
+            observation, or if it does not support `relu_on_outputs` or `glorot_uniform`.
+    """
+    refuse_unseen(spaces)
+    if not isinstance(network, Custom):
+        return network.make(
+            spaces, outputs, relu_on_outputs=relu_on_outputs, glorot_uniform=glorot_uniform, shape=shape
+        )
+    asked = {"relu_on_outputs": relu_on_outputs, "glorot_uniform": glorot_uniform}
+    for name, value in asked.items():
+        if value:
+            raise ValueError(
+                f"settings.{name} is True; allowed with a network of your own, {network.target}: False; "
+                "implement it in the network"
+            )
+    if shape is not None:
+        spaces = replace(spaces, observation_shape=tuple(shape))
+    return _checked(network.make(spaces, outputs), network.target, spaces, outputs)
+
+
+def refuse_unseen(spaces: Spaces) -> None:
+    """Raises a ValueError if agents observe entries other than "observation", which networks do not read."""
+    if spaces.vectors:
+        names = " and ".join(f'("agents", "{name}")' for name, _ in spaces.vectors)
+        raise ValueError(
+            f'agents observe {names}; allowed for networks: ("agents", "observation") alone: leave the entry '
+            "out of Observation, merge it into the observation with a transform that deletes it "
+            "(torchrl.envs.CatTensors), or use a TabularLearner, which reads it"
+        )
+
+
+def _checked(made: Any, target: str, spaces: Spaces, outputs: int) -> nn.Module:
+    """A user's network, after a check that it reads observations."""
+    if not isinstance(made, nn.Module):
+        raise ValueError(f"the network {target} is a {type(made).__name__}; allowed: a torch.nn.Module")
+    shape, dtype = spaces.observation_shape, spaces.observation_dtype
+    was_training = made.training
+    try:
+        with torch.no_grad():
+            given = made.eval()(torch.zeros(2, *shape, dtype=getattr(torch, dtype)))
+    except Exception as error:  # a user's network may raise anything
+        raise ValueError(
+            f"the network {target} cannot read observations [2, {', '.join(map(str, shape))}] of {dtype}: "
+            f"{error}"
+        ) from error
+    if tuple(given.shape) != (2, outputs):
+        raise ValueError(
+            f"the network {target} outputs {list(given.shape)} for two observations; allowed: [2, {outputs}]"
+        )
+    made.train(was_training)
+    for name, value in {"outputs": outputs, "observation_dims": len(shape)}.items():
+        if not hasattr(made, name):
+            setattr(made, name, value)
+    return made

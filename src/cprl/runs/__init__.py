@@ -1,0 +1,14 @@
+"""What is kept of a run: files alone.
+
+Modules, in the order in which one reads them:
+    directory    the run's directory and recipe.json
+    old_recipes  recipes of earlier formats
+    files        files that are never left half written
+    episodes     the table of episodes
+    labelled     several tables as one
+    curves       tables as curves over episodes
+    checkpoints  the state of a training, to resume from
+    weights      trained networks, and the state of transforms
+    loggers      TorchRL's loggers: CSV, TensorBoard, W&B
+    export       a finished run, small enough to commit
+"""

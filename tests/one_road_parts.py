@@ -1,0 +1,73 @@
+"""What the experiments of `test_one_road.py` name as `Custom`: a transform, a callback and a game."""
+
+import os
+import signal
+from dataclasses import asdict, dataclass
+from typing import Any
+
+import torch
+from matrix_game import MatrixGame
+from torchrl.envs import Transform
+
+from cprl import keys
+
+
+class Fatigue(Transform):
+    """Takes from every reward a share that grows with the steps that have been played in all worlds."""
+
+    def __init__(self, per_step: float) -> None:
+        super().__init__(in_keys=[keys.REWARD], out_keys=[keys.REWARD])
+        self.per_step = per_step
+        self.register_buffer("steps", torch.zeros(()))
+
+    def _step(self, tensordict, next_tensordict):
+        self.steps += 1
+        reward = next_tensordict.get(keys.REWARD)
+        next_tensordict.set(keys.REWARD, reward / (1 + self.per_step * self.steps))
+        return next_tensordict
+
+
+class Bored:
+    """Explores less from some episode on, and counts episodes; stops at the step in STOP_AT_STEP."""
+
+    def __init__(self, from_episode: int, epsilon: float) -> None:
+        self.from_episode, self.epsilon, self.episodes = from_episode, epsilon, 0
+        self.training: Any = None
+
+    def on_start(self, training) -> None:
+        self.training = training
+
+    def on_step(self, batch) -> None:
+        if self.training.steps == int(os.environ.get("STOP_AT_STEP", "-1")):
+            os.kill(os.getpid(), signal.SIGTERM)
+
+    def on_episode(self, episode, learning) -> None:
+        self.episodes += 1
+        if self.episodes >= self.from_episode:
+            for learner in self.training.learners.values():
+                learner.actor.epsilon = min(learner.actor.epsilon, self.epsilon)
+
+    def state_dict(self) -> dict[str, int]:
+        return {"episodes": self.episodes}
+
+    def load_state_dict(self, state) -> None:
+        self.episodes = state["episodes"]
+
+
+@dataclass(frozen=True)
+class Dilemma:
+    """A repeated prisoner's dilemma as a game of the user's own."""
+
+    steps: int = 5
+    agents: int = 2
+    hides_state: bool = False
+
+    def to_config(self) -> dict[str, Any]:
+        return asdict(self)
+
+    def make(self, worlds, seed, device):
+        env = MatrixGame(worlds, steps=self.steps)
+        if self.hides_state:
+            env.state_dict = dict
+            env.load_state_dict = lambda state: None
+        return env

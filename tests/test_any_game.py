@@ -1,0 +1,376 @@
+"""Any TorchRL game is measured, kept, watched and evaluated; what it does not report is left out by name."""
+
+import io
+import re
+from dataclasses import replace
+from itertools import chain, combinations
+from pathlib import Path
+
+import numpy as np
+import pyarrow as pa
+import pyarrow.parquet as pq
+import pytest
+import torch
+from matrix_game import MatrixGame, tit_for_tat
+from rerun.chunk import RrdReader
+from rich.console import Console
+from test_rerun_logger import column
+from test_torchrl_logs import Corridor
+from torchrl.envs import (
+    Compose,
+    GymWrapper,
+    ObservationNorm,
+    RenameTransform,
+    RewardSum,
+    StepCounter,
+    TransformedEnv,
+)
+from torchrl.envs.utils import check_env_specs
+
+from cprl import CommonsEnv, Game, Rules, maps
+from cprl.collectors import StepCollector
+from cprl.evaluation.tables import run_table
+from cprl.measuring import EpisodeTracker, social
+from cprl.measuring.evaluate import evaluate
+from cprl.measuring.replicas import agents_without_harvest, social_measures
+from cprl.measuring.reported import FIELDS, METRICS, OPTIONAL, available, left_out, reported_by
+from cprl.policies.assignment import AgentPolicies
+from cprl.policies.single import RandomActor
+from cprl.runs.curves import curves_of
+from cprl.runs.episodes import COLUMNS, LEFT_OUT, EpisodeTable, as_table, read_episodes
+from cprl.runs.labelled import labelled
+from cprl.terminal.figures import training_curve
+from cprl.terminal.progress import ProgressBar
+from cprl.terminal.summary import summarise
+from cprl.viewer.callback import ViewerCallback
+
+GAME = Game(
+    map=maps.parse(".A>.A\n.A.A.\n..<.A"),
+    rules=Rules(regrow_prob=(0.0, 0.1), window_rows=3, window_columns=5, episode_steps=20),
+)
+NO_HARVEST = "collective_return, efficiency, equality, sustainability, harvest (the game reports no harvest)"
+
+
+def play(env, policy, turns, *, callbacks=(), tracker=None):
+    """Steps an environment as a training does; returns the episodes that ended."""
+    tracker = tracker or EpisodeTracker(env.batch_size[0], 2)
+    ended = []
+    for turn, batch in enumerate(StepCollector(env, policy), start=1):
+        for callback in callbacks:
+            callback.on_step(batch)
+        for episode in tracker.add(batch):
+            ended.append(episode)
+            for callback in callbacks:
+                callback.on_episode(episode, {"agent_0/loss": 0.5})
+        if turn == turns:
+            return ended
+    raise AssertionError
+
+
+def at_random():
+    return AgentPolicies([RandomActor(8), RandomActor(8, seed=1)])
+
+
+def told(episodes):
+    return [repr({**vars(episode), "world": None, "episode": None}) for episode in episodes]
+
+
+def test_the_matrix_game_is_a_game_of_torchrl():
+    check_env_specs(MatrixGame(2, with_harvest=True))
+    assert reported_by(MatrixGame(2)) == ()
+    assert reported_by(MatrixGame(2, with_harvest=True)) == ("harvest",)
+    assert reported_by(TransformedEnv(CommonsEnv(GAME, 1), StepCounter())) == OPTIONAL
+
+
+def test_each_metric_needs_what_is_said_and_nothing_else():
+    entries = {"harvest": torch.rand(4, 9, 2), "in_play": torch.ones(4, 9, 2, dtype=torch.bool)}
+    played = torch.ones(4, 9, dtype=torch.bool)
+    whole = social.summary(entries["harvest"], entries["in_play"], played=played)
+    assert tuple(whole) == social.METRICS == tuple(METRICS)
+    for given in chain.from_iterable(combinations(entries, count) for count in range(3)):
+        part = social.summary(
+            *(entries[name] if name in given else None for name in ("harvest", "in_play")), played=played
+        )
+        assert tuple(part) == available(METRICS, given)
+        assert all(torch.equal(part[name], whole[name]) for name in part)
+    with pytest.raises(ValueError, match="neither harvest nor in_play nor played"):
+        social.summary(None, None)
+    with pytest.raises(ValueError, match="a yield_share takes a harvest"):
+        social.summary(None, None, played=played, sustainable_yield=1.0, first_stock=1.0)
+
+
+def test_what_the_docs_say_is_left_out_is_what_needs_the_entry():
+    text = (Path(__file__).parents[1] / "docs" / "metrics.md").read_text()
+    rows = dict(re.findall(r'^\| "(\w+)" \| (.*) \|$', text, re.MULTILINE))
+    needs = {**social.NEEDS, **FIELDS}
+    words = {name: set(re.findall(r"\w+", row)) for name, row in rows.items()}
+    assert {entry: words[entry] & set(needs) for entry in rows} == {
+        entry: {name for name, entries in needs.items() if entry in entries} - {"tagged_by"}
+        for entry in OPTIONAL
+    }, "tagged_by is told as who tagged whom"
+
+
+def test_a_game_that_reports_nothing_but_rewards_has_returns_and_steps():
+    # Agent 0 cooperates once, then both defect: 0 + 4 x 1, 4.5 + 4 x 1; the second world has one turn more.
+    first, second = play(MatrixGame(2), tit_for_tat, 6)
+    assert (first.return_.tolist(), first.steps, first.terminated) == ([4.0, 8.5], 5, False)
+    assert (second.return_.tolist(), second.steps, second.world) == ([5.0, 9.5], 6, 1)
+    assert first.metrics == {"survival_steps": 5.0}
+    assert [getattr(first, name) for name in FIELDS] == [None] * len(FIELDS)
+    assert first.reported == ()
+    assert first.outcome == "returns: 4, 8.5"
+    line = left_out(first.reported)
+    assert line.startswith(
+        f"left out: {NO_HARVEST}; peace, peacefulness, in_play_steps (the game reports no in_"
+    )
+    assert line.endswith("; stock_left, depletion_step (the game reports no stock)")
+
+
+def test_a_game_with_a_harvest_has_the_metrics_of_harvest():
+    (episode,) = play(MatrixGame(1, with_harvest=True), tit_for_tat, 5)
+    assert episode.harvest.tolist() == [4.0, 8.5]
+    assert tuple(episode.metrics) == available(METRICS, ["harvest"])
+    assert episode.metrics["collective_return"] == 12.5
+    assert episode.reported == ("harvest",)
+    assert left_out(OPTIONAL) == ""
+
+
+def test_the_longest_episode_need_not_be_known():
+    env = MatrixGame(2, steps=700, with_harvest=True)
+    known = EpisodeTracker(2, 2, 701)
+    expected = told(play(env, tit_for_tat, 701, tracker=known))
+    assert len(expected) == 2
+    assert told(play(MatrixGame(2, steps=700, with_harvest=True), tit_for_tat, 701)) == expected
+
+
+@pytest.mark.parametrize("with_harvest", [False, True])
+def test_a_tracker_goes_on_exactly_from_its_state(with_harvest, tmp_path):
+    batches, env = [], MatrixGame(2, steps=300, with_harvest=with_harvest)
+    for batch in StepCollector(env, tit_for_tat):
+        batches.append(batch)
+        if len(batches) == 301:
+            break
+    tracker = EpisodeTracker(2, 2)
+    assert list(tracker.state_dict()) == ["episode"], "before the first batch"
+    for batch in batches[:200]:
+        tracker.add(batch)
+    torch.save(tracker.state_dict(), tmp_path / "tracker.pt")
+    other = EpisodeTracker(2, 2)
+    other.load_state_dict(torch.load(tmp_path / "tracker.pt"))
+    ends = [[told(each.add(batch)) for batch in batches[200:]] for each in (tracker, other)]
+    assert ends[0] == ends[1]
+    assert sum(map(len, ends[0])) == 2
+    other.load_state_dict(EpisodeTracker(2, 2).state_dict())
+    assert other.reported is None
+
+
+def test_what_the_first_batch_reported_is_wanted_of_all():
+    whole, bare = (
+        next(iter(StepCollector(MatrixGame(1, with_harvest=has), tit_for_tat))) for has in (True, False)
+    )
+    tracker = EpisodeTracker(1, 2)
+    tracker.add(whole)
+    with pytest.raises(ValueError, match=r"the batch lacks \(next, agents, harvest\)"):
+        tracker.add(bare)
+    other = EpisodeTracker(1, 2)
+    other.add(bare)
+    with pytest.raises(ValueError, match=r"a game that reports \['harvest'\]; allowed: \[\]"):
+        other.load_state_dict(tracker.state_dict())
+    with pytest.raises(ValueError, match=r"lacks \(next, agents, reward\)"):
+        EpisodeTracker(1, 2).add(bare.exclude(("next", "agents", "reward")))
+    with pytest.raises(ValueError, match=r"lacks \(done\)"):
+        EpisodeTracker(1, 2).add(bare.exclude("done"))
+    with pytest.raises(ValueError, match="yield_share needs a harvest"):
+        EpisodeTracker(1, 2, sustainable_yield=1.0, first_stock=1.0).add(bare)
+    with pytest.raises(ValueError, match="world 0 has not ended after 3 steps"):
+        play(MatrixGame(1), tit_for_tat, 5, tracker=EpisodeTracker(1, 2, 3))
+
+
+def test_its_table_has_the_columns_that_there_are_and_says_what_is_left_out(tmp_path):
+    with EpisodeTable(tmp_path / "episodes.parquet") as table:
+        episodes = play(MatrixGame(2), tit_for_tat, 13, callbacks=[table])
+        (other,) = play(MatrixGame(1, with_harvest=True), tit_for_tat, 5)
+        with pytest.raises(
+            ValueError, match=r"has the extra columns \['collective_return', .*'harvest'.*\] and lacks \[\]"
+        ):
+            table.add(other)
+        going_on = read_episodes(tmp_path)
+    kept = read_episodes(tmp_path)
+    columns = ["replica", "episode", "agent", "return", "steps", "terminated", "survival_steps"]
+    assert kept.column_names == columns
+    assert kept.equals(going_on)
+    assert kept.schema.metadata[LEFT_OUT].decode() == left_out(())
+    assert kept["return"].to_pylist() == [4.0, 8.5, 5.0, 9.5, 4.0, 8.5, 5.0, 9.5]
+    curves = curves_of(tmp_path)
+    assert sorted(curves) == ["return_0", "return_1", "survival_steps"]
+    assert curves["return_1"].tolist() == [[8.5, 8.5], [9.5, 9.5]]
+    joined = labelled([({"policy": "a"}, 0, episodes[:2]), ({"policy": "b"}, 0, episodes[2:])])
+    assert joined.column_names == ["policy", *columns]
+
+
+def test_the_table_of_a_commons_is_as_it_was():
+    (episode,) = evaluate(CommonsEnv(GAME, 1), at_random())
+    table = as_table([episode], 0)
+    names = [*COLUMNS.items(), *((name, pa.float64()) for name in social.METRICS)]
+    assert table.schema.equals(pa.schema(names), check_metadata=True)
+
+
+def test_a_game_that_must_not_be_stepped_when_it_has_ended_is_evaluated():
+    episodes = evaluate(MatrixGame(3), tit_for_tat)
+    assert [(episode.world, episode.episode, episode.steps) for episode in episodes] == [
+        (0, 0, 5),
+        (1, 0, 6),
+        (2, 0, 7),
+    ]
+    measures = social_measures({0: episodes})
+    assert list(measures) == ["survival_steps"]
+    assert measures["survival_steps"].estimate.value == 6.0
+    assert agents_without_harvest({0: episodes}) is None
+
+
+def test_an_environment_whose_rewards_are_not_of_agents_in_worlds_is_refused():
+    with pytest.raises(ValueError, match=r"the environment has batch size \[\]; allowed: \[B\], B worlds"):
+        evaluate(GymWrapper(Corridor()), tit_for_tat)
+    env = TransformedEnv(MatrixGame(2), RenameTransform([("agents", "reward")], ["reward"]))
+    with pytest.raises(ValueError, match=r'\("agents", "reward"\) is None; allowed: \[2, N, 1\]'):
+        evaluate(env, tit_for_tat)
+
+
+def greedy_right(tensordict):
+    """A policy without chance: everyone walks by what it sees."""
+    seen = tensordict["agents", "observation"].to(torch.float32).flatten(2).sum(-1)
+    return tensordict.set(("agents", "action"), seen.round().long() % 7)
+
+
+def transformed(worlds):
+    """A CommonsEnv whose transforms keep something from step to step."""
+    paid = RewardSum(in_keys=[("agents", "reward")], out_keys=[("agents", "paid")], reset_keys=["_reset"])
+    return TransformedEnv(CommonsEnv(GAME, worlds, seed=3), Compose(paid, StepCounter()))
+
+
+def test_transforms_change_nothing_that_is_evaluated():
+    assert told(evaluate(transformed(5), greedy_right)) == told(
+        evaluate(CommonsEnv(GAME, 5, seed=3), greedy_right)
+    )
+    sums = []
+
+    def summing(tensordict):
+        sums.append(tensordict["agents", "paid"][:, :, 0].clone())
+        return greedy_right(tensordict)
+
+    env = transformed(1)
+    (episode,) = evaluate(env, summing)
+    assert torch.stack(sums).diff(dim=0).ge(0).all()
+    assert len(sums) == episode.steps
+    assert sums[-1].sum() > 0, "RewardSum goes on from step to step"
+
+
+def test_a_clock_of_a_transform_ends_episodes():
+    env = TransformedEnv(MatrixGame(2, steps=50), StepCounter(max_steps=7))
+    assert [episode.steps for episode in evaluate(env, tit_for_tat)] == [7, 7]
+
+
+def entities(path):
+    return {chunk.entity_path.strip("/") for chunk in RrdReader(path).stream()}
+
+
+def test_a_recording_of_it_has_metrics_and_returns_and_says_what_is_left_out(tmp_path):
+    env = MatrixGame(2)
+    with ViewerCallback(tmp_path, env, title="matrix", episodes=2) as viewer:
+        play(env, tit_for_tat, 5, callbacks=[viewer])
+        state = viewer.state_dict()
+    with ViewerCallback(tmp_path, env, title="matrix", episodes=2) as second:
+        second.load_state_dict(state)
+    path = tmp_path / "run.rrd"
+    events = [text[0] for text in column(path, "log", "TextLog:text")[1]]
+    assert events[0] == "matrix begins"
+    (line,) = [text for text in events if text.startswith("left out")]
+    assert NO_HARVEST in line
+    assert "phases and new bests (the game reports no harvest and no in_play)" in line
+    assert "who tagged whom" in line
+    assert line.endswith("the board and what agents see (the game reports no board)")
+    logged = entities(path)
+    assert not {name for name in logged if name.startswith(("world", "windows", "phase", "tags"))}
+    social_ones = {name for name in logged if name.startswith("social/")}
+    assert social_ones == {"social/survival_steps"}
+
+
+def test_a_recording_names_agents_as_the_environment_does(tmp_path):
+    env = MatrixGame(2)
+    env.group_map = {"agents": ["row", "column"]}
+    wrapped = TransformedEnv(env, StepCounter())
+    with ViewerCallback(tmp_path, wrapped, title="matrix", episodes=2) as viewer:
+        play(wrapped, tit_for_tat, 6, callbacks=[viewer])
+    path = tmp_path / "run.rrd"
+    assert column(path, "row/return", "Scalars:scalars", "episode") == ([0], [[4.5]])
+    assert column(path, "row/loss", "Scalars:scalars")[1] == [[0.5]]
+    _, survival = column(path, "social/survival_steps", "Scalars:scalars")
+    assert survival == [[5.0, 6.0, 5.5]]
+
+
+def test_under_transforms_windows_show_what_the_agents_of_the_game_observe(tmp_path):
+    torch.manual_seed(0)
+    shown = {}
+    for name in ("bare", "transformed"):
+        env = CommonsEnv(GAME, 1, seed=3)
+        norm = ObservationNorm(0.0, 255.0, in_keys=[("agents", "observation")], standard_normal=True)
+        played = env if name == "bare" else TransformedEnv(env, norm)
+        path = tmp_path / f"{name}.rrd"
+        with ViewerCallback(tmp_path, played, title="run", episodes=9, file_name=path.name) as viewer:
+            play(played, at_random(), 30, callbacks=[viewer])
+        shown[name] = {
+            entity: column(path, entity, "SegmentationImage:buffer") for entity in ("windows", "world/board")
+        }
+        assert not [text for text in column(path, "log", "TextLog:text")[1] if "left out" in text[0]]
+    assert len(shown["bare"]["windows"][0]) >= 19
+    assert str(shown["bare"]) == str(shown["transformed"])
+
+
+def test_the_terminal_shows_it_too(tmp_path, monkeypatch):
+    monkeypatch.setattr("cprl.terminal.progress._LINE_PERIOD_S", 0.0)
+    output = io.StringIO()
+    console = Console(file=output, width=200)
+    with (
+        EpisodeTable(tmp_path / "episodes.parquet") as table,
+        ProgressBar(episodes=9, replicas=2, console=console) as bar,
+    ):
+        episodes = play(MatrixGame(2), tit_for_tat, 12, callbacks=[table, bar])
+    assert "return 12.5" in output.getvalue()
+    figure = training_curve(tmp_path, title="matrix", random=episodes)
+    assert figure.stat().st_size > 10_000
+    summarise(tmp_path, title="matrix", played={"random": episodes, "trained": episodes}, console=console)
+    text = output.getvalue()
+    assert text.count("left out: collective_return") == 1
+    assert re.search(r"survival_steps\s*│\s*5\.\d+ │", text)
+    assert not re.search(r"│ (equality|apples left|sustainability)", text)
+
+
+def test_the_table_of_an_evaluation_says_what_is_left_out():
+    episodes = evaluate(MatrixGame(2), tit_for_tat)
+
+    class Evaluation:
+        run = type("Run", (), {"path": Path("run"), "algorithms": {}, "replicas": [0]})
+        trained, random, seed, greedy = {0: episodes}, {0: episodes}, 1, True
+
+        def measures(self, policy):
+            return social_measures({0: episodes})
+
+    table = run_table(Evaluation())
+    assert table.caption.startswith("left out: collective_return")
+    assert list(table.columns[0].cells) == ["survival_steps"]
+
+
+def test_bars_know_the_clock_of_a_game_or_of_its_environment():
+    clocks = [
+        ProgressBar(played, episodes=1)._clock
+        for played in (GAME, CommonsEnv(GAME, 1), transformed(1), MatrixGame(1), None)
+    ]
+    assert clocks == [20, 20, 20, None, None]
+
+
+def test_parquet_readers_of_others_read_the_table(tmp_path):
+    with EpisodeTable(tmp_path / "episodes.parquet") as table:
+        for episode in play(MatrixGame(1), tit_for_tat, 5):
+            table.add(replace(episode, episode=7), replica=3)
+    assert pq.read_table(tmp_path / "episodes.parquet")["replica"].to_pylist() == [3, 3]
+    assert np.array_equal(read_episodes(tmp_path)["episode"], [7, 7])

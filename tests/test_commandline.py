@@ -1,0 +1,293 @@
+"""A recipe's command line: its own arguments first, every number of its experiment by its place."""
+
+import importlib.util
+import json
+import shlex
+import sys
+from dataclasses import dataclass, replace
+from pathlib import Path
+from types import SimpleNamespace
+
+import pytest
+from my_game import Dilemma
+
+import cprl
+from cprl import Experiment, cli, presets
+from cprl.algorithms import DQN, PPO, QMIX, DQNSettings, RolloutSettings
+from cprl.commandline import RunOptions, parse, recipe_main
+from cprl.custom import Custom
+from cprl.flags import applied, docs, flags_of
+from cprl.population import Learning, Scripted, Team
+from cprl.runs.directory import start_run
+
+ROOT = Path(__file__).parents[1]
+RECIPES = sorted(
+    path.stem for path in (ROOT / "recipes").glob("*.py") if "recipe_main" in path.read_text(encoding="utf-8")
+)
+STORED = sorted((ROOT / "docs" / "results").rglob("recipe.json"))
+
+
+def experiment(*, variant: presets.Variant = "published", spare: int = 3) -> Experiment:
+    """Two agents that learn alike, one that does otherwise, one that does not.
+
+    Args:
+        variant: the rules.
+        spare: a number of its own.
+    """
+    dqn = Learning(DQN(settings=DQNSettings(target_every_episodes=spare)))
+    return Experiment(
+        name="mine",
+        game=presets.game("commons", variant=variant),
+        agents=[dqn, dqn, Learning(PPO(settings=RolloutSettings())), Scripted("greedy")],
+        episodes=10,
+        callbacks=[Custom("my_game:Callback")],
+    )
+
+
+def read(line, make=experiment):
+    return parse(make, ["recipes/mine.py", *shlex.split(line)])
+
+
+def recipe(name):
+    spec = importlib.util.spec_from_file_location(name, ROOT / "recipes" / f"{name}.py")
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    return module
+
+
+def test_without_arguments_the_recipe_is_as_it_stands():
+    assert read("") == (experiment(), RunOptions())
+
+
+def test_every_number_is_changed_by_its_place():
+    given, options = read(
+        "--replicas 2 --game.rules.freeze-steps 50 --agents.1.algorithm.settings.gamma 0.9 --variant as_run "
+        "--agents.3.policy pacifist --agents.2.algorithm.settings.max-grad-norm None --loggers csv wandb "
+        "--game.rules.regrow-prob 0 0.5 --game.rules.beam-length-cells 1 2 3 4 --game.rules.may-fire False "
+        "--agents.0.algorithm.double --agents.0.reward team --out here --watch 'connect rerun+http://there'"
+    )
+    first, second, third, _ = experiment().agents
+    base = experiment(variant="as_run")
+    rules = replace(
+        base.game.rules,
+        freeze_steps=50,
+        regrow_prob=(0.0, 0.5),
+        beam_length_cells=(1, 2, 3, 4),
+        may_fire=False,
+    )
+    settings = replace(second.algorithm.settings, gamma=0.9)
+    assert given == replace(
+        base,
+        replicas=2,
+        game=replace(base.game, rules=rules),
+        agents=(
+            Learning(replace(first.algorithm, double=True), reward="team"),
+            Learning(DQN(settings=settings)),
+            Learning(PPO(settings=replace(third.algorithm.settings, max_grad_norm=None))),
+            Scripted("pacifist"),
+        ),
+        loggers=("csv", "wandb"),
+    )
+    assert options == RunOptions(out=Path("here"), watch="connect rerun+http://there")
+
+
+def test_a_recipes_own_arguments_come_before_the_changes_to_what_they_make():
+    given, _ = read("--spare 7 --agents.1.algorithm.settings.target-every-episodes 9")
+    assert [spec.algorithm.settings.target_every_episodes for spec in given.agents[:2]] == [7, 9]
+
+
+@pytest.mark.parametrize(
+    ("old", "new"),
+    [
+        ("--learn_every 5 --no-compile --go-on --out x", "--update-every 5 --engine eager --resume --out x"),
+        ("--learn-every=5 --compile", "--update-every=5 --engine compiled"),
+        ("--game.rules.freeze_steps 3 --evaluation_episodes 2", "--game.rules.freeze-steps 3 --evaluation-ep"
+         "isodes 2"),
+    ],
+)  # fmt: skip
+def test_words_of_earlier_versions_and_underscores_are_still_read(old, new):
+    assert read(old) == read(new)
+    assert read(old) != read("")
+
+
+@pytest.mark.parametrize(
+    "line",
+    [
+        "--gama 0.9",
+        "--agents.0.algorithm.settings.gama 0.9",
+        "--agents.4.reward team",
+        "--agents.0 Scripted",
+        "--replicas two",
+        "--variant pirated",
+        "--callbacks my_game:Callback",
+        "--engine quick",
+        "stray",
+    ],
+)
+def test_an_argument_that_is_unknown_or_does_not_fit_is_refused(line, capsys):
+    with pytest.raises(SystemExit) as refused:
+        read(line)
+    assert refused.value.code == 2
+    assert line.split()[0].lstrip("-") in "".join(capsys.readouterr())
+
+
+@pytest.mark.parametrize(
+    ("line", "message"),
+    [
+        ("--replicas 0", r"^mine\.py: experiment\.replicas is 0; allowed: a whole number from 1"),
+        ("--game.map single_basic", r"^mine\.py: experiment\.agents: 4 agents are specified for a game of 1"),
+        ("--game.rules.hits-to-tag 0", r"^mine\.py: Rules\.hits_to_tag is 0"),
+        ("--update-every 3", r"update_every is 3; it must divide experiment\.agents\[2\]"),
+    ],
+)
+def test_what_the_experiment_refuses_is_said_in_a_line(line, message):
+    with pytest.raises(SystemExit, match=message):
+        recipe_main(experiment, ["recipes/mine.py", *line.split()])
+
+
+def test_an_argument_of_a_recipes_own_must_not_hide_one_of_the_experiment():
+    def hides(*, seed: int = 0) -> Experiment:
+        return replace(experiment(), seed=seed)
+
+    with pytest.raises(ValueError, match="argument 'seed' of its own, which every experiment has"):
+        read("", hides)
+
+
+def test_help_lists_the_recipes_own_arguments_first_and_equal_agents_once(capsys, monkeypatch):
+    monkeypatch.setenv("COLUMNS", "80")
+    with pytest.raises(SystemExit):
+        read("--help")
+    said = capsys.readouterr().out
+    words = " ".join(word for word in said.split() if word != "│")
+    assert "Two agents that learn alike, one that does otherwise" in words
+    assert "the kind of an agent or of its algorithm" in words
+    places = [
+        words.index(f"--{name} ") for name in ("spare", "out", "episodes", "game.map", "agents.0.reward")
+    ]
+    assert places == sorted(places)
+    assert "--agents.1.reward" not in words
+    assert "--agents.2.algorithm.clip-epsilon" in words
+    assert "--callbacks" not in words
+    assert "a number of its own. (default: 3)" in words
+    assert f"{docs(cprl.Rules)['episode_steps']} (default: 1000)" in words
+
+
+def test_a_board_is_given_by_its_name_and_a_drawing_stays():
+    drawn = cprl.maps.parse("A>.\n.vA")
+    alone = replace(experiment(), game=replace(experiment().game, map=drawn), agents=[Scripted()] * 2)
+    assert read("", lambda: alone)[0] == alone
+    given, _ = read("--game.map two_complex", lambda: alone)
+    assert given.game.map == cprl.maps.named("two_complex")
+
+
+def test_what_a_command_line_cannot_say_stays_as_it_is():
+    base = experiment()
+    table = tuple((True,) * len(base.game.map.sites) for _ in range(4))
+    rules = replace(base.game.rules, may_bite=table, freeze_steps=((1, 2),) * 4)
+    kept = replace(
+        base,
+        game=replace(base.game, rules=rules),
+        loggers=(Custom("my:Logger"),),
+        agents=(Learning(Custom("my:algorithm")), *base.agents[1:]),
+    )
+    given, _ = read("--agents.0.reward team --seed 4", lambda: kept)
+    assert given == replace(
+        kept, seed=4, agents=(Learning(Custom("my:algorithm"), reward="team"), *base.agents[1:])
+    )
+    for line in ("--game.rules.may-bite True", "--game.rules.freeze-steps 3", "--loggers csv"):
+        with pytest.raises(SystemExit):
+            read(line, lambda: kept)
+
+
+def test_a_game_of_somebodys_own_has_flags_too():
+    own = replace(experiment(), game=Gathering(), agents=[Scripted()] * 2)
+    given, _ = read("--game.yield-per-step 3 --seed 1", lambda: own)
+    assert given == replace(own, game=Gathering(yield_per_step=3.0), seed=1)
+
+
+@dataclass(frozen=True)
+class Gathering(Dilemma):
+    """A game of somebody's own.
+
+    Args:
+        yield_per_step: apples. Each step.
+    """
+
+    yield_per_step: float = 1.0
+
+
+def test_a_team_has_flags():
+    team = Team(QMIX(settings=DQNSettings()), agents=(0, 2))
+    given = flags_of(team)[1]
+    assert applied(team, given) == team
+    assert applied(team, replace(given, agents=(1, 2))) == replace(team, agents=(1, 2))
+
+
+def test_each_field_is_explained_in_a_sentence():
+    assert docs(Gathering) == {"yield_per_step": "apples"}
+    assert docs(RolloutSettings)["gae_lambda"] == (
+        "Lambda of generalised advantage estimation, 0..1 (Schulman et al. 2016)"
+    )
+    assert docs(DQNSettings)["epsilon_start"] == "Probability of a random action at the start, 0..1"
+    assert set(docs(Experiment)) == set(Experiment.__dataclass_fields__)
+
+
+@pytest.mark.parametrize("path", STORED, ids=lambda path: path.parent.name)
+def test_the_command_of_every_stored_result_still_gives_its_experiment(path):
+    stored = json.loads(path.read_text())
+    script, *given = shlex.split(stored["command"])
+    if Path(script).stem == "no_beam":  # a script of before two_complex.py had --no-beam
+        script, given = "recipes/two_complex.py", ["--no-beam", "--variant", "as_run", "--episodes", *given]
+    given, _ = parse(recipe(Path(script).stem).experiment, [script, *given])
+    assert given == Experiment.from_recipe(stored)
+
+
+@pytest.fixture
+def runs(monkeypatch):
+    """What `cprl.running.run` was asked for, which trains nothing."""
+    asked = []
+
+    def run(experiment, out=None, **how):
+        asked.append((experiment, out, how))
+        return Path("a run")
+
+    monkeypatch.setitem(sys.modules, "cprl.running", SimpleNamespace(run=run))
+    monkeypatch.setattr(cli, "run_experiment", run)
+    return asked
+
+
+def test_a_recipe_runs_its_experiment(runs):
+    line = ["recipes/mine.py", "--seed", "3", "--out", "here", "--resume", "--allow", "a:B", "--allow", "c:D"]
+    assert recipe_main(experiment, line) == Path("a run")
+    ((given, out, how),) = runs
+    assert given == replace(experiment(), seed=3)
+    assert out == Path("here")
+    assert how == {"resume": True, "watch": "file", "command": line, "allow": ("a:B", "c:D")}
+
+
+def test_cprl_run_trains_the_experiment_of_a_recipe_or_resumes_its_run(runs, tmp_path, monkeypatch):
+    run = start_run(tmp_path / "run", "mine", experiment().to_recipe, command=["recipes/mine.py"])
+    for words in (
+        f"{run}/recipe.json --out elsewhere --watch off --allow my_game:Callback",
+        f"{run} --allow my_game:Callback",
+        f"{run} --allow my_game:Callback --resume",
+    ):
+        monkeypatch.setattr(sys, "argv", ["cprl", "run", *words.split()])
+        cli.main()
+    assert all(given == experiment() for given, _, _ in runs)
+    assert [(out, how["resume"], how["watch"]) for _, out, how in runs] == [
+        (Path("elsewhere"), False, "off"),
+        (None, False, "file"),
+        (run, True, "file"),
+    ]
+    monkeypatch.setattr(sys, "argv", ["cprl", "run", str(run)])
+    with pytest.raises(SystemExit, match=r"^cprl: my_game:Callback would be imported.* --allow my_game:Call"):
+        cli.main()
+
+
+@pytest.mark.parametrize("name", RECIPES)
+def test_every_recipe_has_help(name, capsys):
+    with pytest.raises(SystemExit) as ended:
+        recipe_main(recipe(name).experiment, [f"recipes/{name}.py", "--help"])
+    assert ended.value.code == 0
+    assert f"usage: {name}.py [-h] [OPTIONS]" in capsys.readouterr().out

@@ -1,0 +1,296 @@
+"""Each private part of a library that cprl relies on is still there, and does what cprl wants of it.
+
+A failure here names the part that an upgrade has changed, and where cprl relies on it.
+"""
+
+import re
+import warnings
+from contextlib import contextmanager
+from pathlib import Path
+
+import numba
+import numpy as np
+import pytest
+import torch
+from tensordict import TensorDict
+from torch import nn
+from torchrl.data import Binary
+from torchrl.envs import EnvBase
+from torchrl.modules import QValueActor
+from torchrl.objectives import DiscreteCQLLoss, DQNLoss, ValueEstimators
+
+from cprl import CommonsEnv, Game, Rules, compat, keys, maps
+from cprl.commons import compiled
+from cprl.learners.engine.functional import FunctionalLoss, total, weights_of
+
+SOURCE = Path(compat.__file__).parent
+SHORT = Game(
+    map=maps.parse(".A>.A\n.A.A.\n..<.A"),
+    rules=Rules(window_rows=3, window_columns=5, episode_steps=9),
+)
+
+
+@contextmanager
+def relies_on(part, *, used_by):
+    """Says in the message of whatever goes wrong inside what an upgrade has changed, and who relies on it."""
+    try:
+        yield
+    except (Exception, pytest.fail.Exception) as error:
+        pytest.fail(f"{part} is not what it was, and {used_by} relies on it: {error!r}")
+
+
+def test_a_failure_says_what_broke():
+    with (
+        pytest.raises(
+            pytest.fail.Exception, match=r"TensorDict\._no_more is not what it was, and put relies"
+        ),
+        relies_on("TensorDict._no_more", used_by="put"),
+    ):
+        TensorDict({}, [])._no_more()
+
+
+def test_entries_are_read_and_written_past_the_checks_of_tensordict():
+    tensor, other = torch.arange(3), torch.ones(3)
+    moment = TensorDict({"a": tensor}, [3])
+    with relies_on("TensorDict._get_str", used_by="compat.entry"):
+        assert compat.entry(moment, "a") is tensor
+        with pytest.raises(KeyError):
+            compat.entry(moment, "b")
+    with relies_on("TensorDict._set_str", used_by="compat.put"):
+        compat.put(moment, "b", other)
+        assert moment["b"] is other
+        compat.put(moment, "b", tensor)
+        assert moment["b"] is tensor
+    assert (keys.entry, keys.put) == (compat.entry, compat.put)
+
+
+def test_tensordicts_are_made_and_filled_without_checks():
+    entries, size = {"a": torch.arange(3)}, torch.Size([3])
+    with relies_on("TensorDict._new_unsafe", used_by="compat.unchecked_tensordict"):
+        made = compat.unchecked_tensordict(entries, size, torch.device("cpu"))
+        assert made["a"] is entries["a"]
+        assert (made.batch_size, made.device) == (size, torch.device("cpu"))
+        assert compat.unchecked_tensordict({}, size).device is None
+        assert (made == TensorDict({"a": torch.arange(3)}, [3])).all()
+    with relies_on("TensorDict._tensordict, the dict of its entries", used_by="compat.put_all"):
+        compat.put_all(made, {"b": torch.ones(3), "c": torch.zeros(3)})
+        assert set(made.keys()) == {"a", "b", "c"}
+        assert made.clone()["b"].sum() == 3
+
+
+def test_torchrl_steps_and_resets_by_the_method_of_the_environment(monkeypatch):
+    env = CommonsEnv(SHORT, 2, seed=0)
+    lean, stock = [], []
+    of_env, of_torchrl = CommonsEnv.lean_step, EnvBase._step_and_maybe_reset
+    monkeypatch.setattr(CommonsEnv, "lean_step", lambda *how: lean.append(1) or of_env(*how))
+    monkeypatch.setattr(EnvBase, "_step_and_maybe_reset", lambda *how: stock.append(1) or of_torchrl(*how))
+    with relies_on("EnvBase._step_and_maybe_reset", used_by="compat.LeanStepEnv"):
+        env.step_and_maybe_reset(env.rand_action(env.reset()))
+        assert (len(lean), len(stock)) == (1, 0), "step_and_maybe_reset does not call it"
+        env.rollout(5, break_when_any_done=False)
+        assert (len(lean), len(stock)) == (5, 0), "rollout does not call it in all steps but the last"
+        moment = env.rand_action(env.reset())
+        moment["next"] = env.fake_tensordict()["next"]
+        env.step_and_maybe_reset(moment)
+        assert (len(lean), len(stock)) == (5, 1), "a step into given tensors is TorchRL's own"
+
+
+def test_specs_of_flags_can_be_indexed_by_a_group_of_agents_and_mean_what_binary_means():
+    with relies_on("Categorical(2, dtype=torch.bool)", used_by="compat.flag_spec"):
+        spec = compat.flag_spec(2, 3)
+        assert Binary(3, shape=(2, 3), dtype=torch.bool) == spec
+        assert spec[0, :].shape == (3,)
+        assert spec.rand().dtype == spec.zero().dtype == torch.bool
+        assert spec.is_in(torch.zeros(2, 3, dtype=torch.bool))
+
+
+def transitions(count):
+    following = {
+        "observation": torch.rand(count, 2),
+        "reward": torch.ones(count, 1),
+        "done": torch.zeros(count, 1, dtype=torch.bool),
+        "terminated": torch.zeros(count, 1, dtype=torch.bool),
+    }
+    return TensorDict(
+        {
+            "observation": torch.rand(count, 2),
+            "action": torch.randint(3, (count,)),
+            "next": TensorDict(following, (count,)),
+        },
+        (count,),
+    )
+
+
+def q_actor():
+    return QValueActor(nn.Linear(2, 3), spec=None, action_space="categorical")
+
+
+def q_loss():
+    """Of an agent with values of three actions for what it sees, two numbers."""
+    loss = DQNLoss(q_actor(), delay_value=True, action_space="categorical")
+    loss.make_value_estimator(ValueEstimators.TD0, gamma=0.5)
+    return loss
+
+
+def conservative_loss():
+    loss = DiscreteCQLLoss(q_actor(), delay_value=True, action_space="categorical")
+    loss.make_value_estimator(ValueEstimators.TD0, gamma=0.5)
+    compat.bootstrap_from_target(loss.value_estimator)
+    return loss
+
+
+def layer(weights):
+    """Weight and bias of the one layer among a loss's weights."""
+    flat = weights.flatten_keys(".")
+    return [flat[f"module.0.module.{name}"].data for name in ("weight", "bias")]
+
+
+def test_a_loss_does_not_warn_of_targets_that_are_promised():
+    with relies_on("LossModule._has_update_associated", used_by="compat.promise_targets"):
+        loss = q_loss()
+        with pytest.warns(UserWarning, match="No target network updater"):
+            loss(transitions(4))
+        compat.promise_targets(loss)
+        with warnings.catch_warnings():
+            warnings.simplefilter("error")
+            loss(transitions(4))
+
+
+@pytest.mark.parametrize("make_loss", [q_loss, conservative_loss])
+def test_a_loss_computes_with_whatever_weights_are_put_in_now(make_loss):
+    batch, losses, function = transitions(5), [make_loss(), make_loss()], make_loss()
+    for loss in (*losses, function):
+        compat.promise_targets(loss)
+        loss.reduction = "none"
+    wanted = [total(loss(batch.clone())) for loss in losses]
+    function, weights = FunctionalLoss(function), [weights_of(loss) for loss in losses]
+    with relies_on(
+        "LossModule, which reads weights from its attributes and keeps them in _cache,",
+        used_by="FunctionalLoss, by compat.forget_cached_weights,",
+    ):
+        for turn in (0, 1, 0):
+            torch.testing.assert_close(function(weights[turn], {}, batch.clone()), wanted[turn])
+
+
+@pytest.mark.parametrize(("every", "copied"), [(1, [1, 1, 1, 1]), (3, [0, 0, 1, 0, 0, 1])])
+def test_targets_are_replaced_at_every_so_many_steps(every, copied):
+    loss, came = q_loss(), []
+    compat.promise_targets(loss)
+    own, target = layer(loss.value_network_params)[0], layer(loss.target_value_network_params)[0]
+    with relies_on("HardUpdate, which counts one step more than its interval,", used_by="compat.hard_update"):
+        updater = compat.hard_update(loss, every=every)
+        for _ in copied:
+            own += 1
+            updater.step()
+            came.append(int(torch.equal(own, target)))
+        assert came == copied
+
+
+def test_conservative_q_learning_bootstraps_from_its_target():
+    # loss = half the mean of (Q - (r + gamma max_a Q'(s', a)))^2, with r = 1 and gamma = 0.5
+    loss, batch = conservative_loss(), transitions(6)
+    compat.promise_targets(loss)
+    target = layer(loss.target_value_network_params)
+    for weight in target:
+        weight.mul_(-3)
+    bootstrapped = nn.functional.linear(batch["next", "observation"], *target).amax(-1)
+    values = nn.functional.linear(batch["observation"], *layer(loss.value_network_params))
+    chosen = values.gather(-1, batch["action"][:, None]).squeeze(-1)
+    by_hand = 0.5 * (chosen - (1 + 0.5 * bootstrapped)).square().mean()
+    with relies_on("DiscreteCQLLoss's estimator", used_by="compat.bootstrap_from_target"):
+        torch.testing.assert_close(loss(batch)["loss_qvalue"].detach(), by_hand)
+
+
+def doubled(values):
+    return values * 2
+
+
+# Of torch itself, while it compiles.
+ignored = pytest.mark.filterwarnings("ignore::DeprecationWarning", "ignore::FutureWarning")
+
+
+@ignored
+def test_torch_hands_over_the_code_that_it_compiled():
+    own = compat.with_own_code(doubled)
+    assert own.__code__ is not doubled.__code__
+    with relies_on("torch.compiler.skip_all_guards_unsafe", used_by="compat.COMPILE_OPTIONS"):
+        function = torch.compile(own, fullgraph=True, options=dict(compat.COMPILE_OPTIONS))
+    with (
+        relies_on("torch._dynamo.convert_frame.register_bytecode_hook", used_by="compat.code_written_for"),
+        compat.code_written_for(own) as codes,
+    ):
+        assert function(torch.ones(3)).tolist() == [2.0] * 3
+        assert len(codes) == 1
+    with relies_on("the code that torch writes for a function", used_by="compat.without_lookup"):
+        direct = compat.without_lookup(own, codes)
+        torch._dynamo.reset()  # as somebody else in the process may
+        assert direct(torch.full((3,), 4.0)).tolist() == [8.0] * 3
+
+
+@ignored
+def test_torch_keeps_what_it_compiled_by_code_object():
+    with relies_on("torch's cache of compiled code", used_by="compat.with_own_code"):
+        for size in (2, 5):
+            own = compat.with_own_code(doubled)
+            with compat.code_written_for(own) as codes:
+                torch.compile(own, fullgraph=True, options=dict(compat.COMPILE_OPTIONS))(torch.ones(size))
+            assert len(codes) == 1, f"nothing was compiled for the size {size}"
+
+
+def summed(values):
+    total = 0.0
+    for value in values:
+        total += value
+    return total
+
+
+def test_numba_refuses_allocations():
+    def allocates(values):
+        return (values + 1).sum()
+
+    with relies_on("the option _nrt of numba.njit", used_by="cprl.commons.compiled.CPU_OPTIONS"):
+        assert numba.njit(**compiled.CPU_OPTIONS)(summed)(np.ones(3)) == 3
+        with pytest.raises(Exception, match="NRT"):
+            numba.njit(**compiled.CPU_OPTIONS)(allocates)(np.ones(3))
+
+
+def test_numba_gives_the_machine_code_of_a_function():
+    with relies_on("Dispatcher.compile of Numba", used_by="cprl.commons.compiled.machine_code"):
+        function = numba.njit(**compiled.CPU_OPTIONS)(summed)
+        code = compiled.machine_code(function, np.ones(3))
+        assert code is not function
+        assert code(np.arange(5.0)) == 10
+
+
+def test_numba_keeps_compiled_functions_where_it_is_told(tmp_path):
+    with relies_on("numba.config.CACHE_DIR", used_by="cprl.commons.compiled.kept_in"):
+        before = numba.config.CACHE_DIR
+        with compiled.kept_in(tmp_path):
+            function = numba.njit(cache=True)(summed)
+        assert before == numba.config.CACHE_DIR
+        assert function(np.ones(2)) == 2
+        assert list(tmp_path.rglob("*.nbi")), "nothing was kept"
+
+
+LIBRARY_PARTS = (
+    r"\b(?!self\b|cls\b|super\(\))[\w\])]+\._(?:get_str|set_str|new_unsafe|tensordict|modules|parameters|buffers)\b",
+    r"_has_update_associated",
+    r"_step_and_maybe_reset\(",
+    r"\btorch\._\w+",
+    r"\b(?:torchrl|tensordict|numba|rerun)(?:\.\w+)*\._\w+",
+    r"register_bytecode_hook",
+    r"skip_all_guards_unsafe",
+    r"\"_nrt\"",
+)
+
+
+def test_private_parts_of_libraries_are_used_in_their_home_alone():
+    homes = {SOURCE / "compat.py", SOURCE / "commons" / "compiled.py"}
+    found = [
+        f"{path.relative_to(SOURCE)}:{number}: {line.strip()}"
+        for path in sorted(SOURCE.rglob("*.py"))
+        if path not in homes
+        for number, line in enumerate(path.read_text().splitlines(), 1)
+        if any(re.search(part, line) for part in LIBRARY_PARTS)
+    ]
+    assert found == [], "move these into cprl.compat, with a test here"

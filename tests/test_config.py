@@ -1,0 +1,213 @@
+"""Values become tables and come back the same; what is not known is refused by the place where it stands."""
+
+import json
+from dataclasses import dataclass, fields
+
+import pytest
+import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from cprl import Game, Observation, Rules, maps, presets
+from cprl.algorithms import (
+    A2C,
+    CQL,
+    DQN,
+    IPPO,
+    IQL,
+    MAPPO,
+    PPO,
+    QMIX,
+    SAC,
+    VDN,
+    DistributionalDQN,
+    DQNSettings,
+    Reinforce,
+    RolloutSettings,
+    Tabular,
+    TabularSettings,
+)
+from cprl.config import KINDS, custom_targets, differences, from_config, to_config
+from cprl.custom import Custom
+from cprl.networks import MLP, Conv
+from cprl.population import Frozen, Learning, Scripted, Team
+
+SHARES = st.floats(1e-9, 1, allow_subnormal=False)
+POSITIVE = st.floats(1e-12, 1e6, allow_subnormal=False)
+CUSTOM = st.builds(
+    Custom,
+    st.sampled_from(["my.module:Transform", "mine:nested.Class"]),
+    arguments=st.dictionaries(
+        st.text(max_size=5),
+        st.recursive(
+            st.none()
+            | st.booleans()
+            | st.integers()
+            | st.floats(allow_nan=False, allow_infinity=False, allow_subnormal=False),
+            lambda inner: st.lists(inner, max_size=3) | st.dictionaries(st.just("kind"), inner, max_size=1),
+        ),
+        max_size=3,
+    ),
+)
+DQNS = st.builds(
+    DQNSettings,
+    gamma=SHARES,
+    learning_rate=POSITIVE,
+    hidden_cells=st.lists(st.integers(1, 64), min_size=1, max_size=3).map(tuple),
+    tau=st.none() | SHARES,
+    replay_transforms=st.lists(CUSTOM, max_size=2).map(tuple),
+    target_every_episodes=st.integers(1, 20),
+    relu_on_outputs=st.booleans(),
+)
+ROLLOUTS = st.builds(RolloutSettings, max_grad_norm=st.none() | POSITIVE, epochs=st.integers(1, 9))
+TABULARS = st.builds(TabularSettings, learning_rate=st.just("1/visits") | SHARES)
+NETWORKS = st.none() | st.builds(MLP) | st.builds(Conv, channels=st.just((4, 8))) | CUSTOM
+ALONE = st.one_of(
+    st.builds(DQN, settings=DQNS, double=st.booleans(), network=NETWORKS),
+    *[st.builds(kind, settings=DQNS) for kind in (DistributionalDQN, CQL, SAC, IQL)],
+    *[st.builds(kind, settings=ROLLOUTS) for kind in (PPO, A2C, Reinforce)],
+    st.builds(Tabular, settings=TABULARS),
+)
+TEAMS = st.one_of(
+    *[st.builds(kind, settings=DQNS) for kind in (VDN, QMIX)],
+    *[st.builds(kind, settings=ROLLOUTS) for kind in (MAPPO, IPPO)],
+)
+SPECS = st.one_of(
+    st.builds(Learning, ALONE | CUSTOM, reward=st.sampled_from(["individual", "team"])),
+    st.builds(Team, TEAMS | CUSTOM, agents=st.just((0, 2))),
+    st.builds(Scripted, st.sampled_from(["random", "greedy", "pacifist"])),
+    st.builds(Frozen, st.just("runs/earlier"), agent=st.integers(0, 3), replica=st.integers(0, 9)),
+)
+RULES = st.builds(
+    Rules,
+    regrow_prob=st.lists(st.just(0.0) | SHARES, min_size=1, max_size=6).map(tuple),
+    beam_length_cells=st.integers(1, 9) | st.tuples(*[st.integers(1, 9)] * 4),
+    freeze_steps=st.integers(0, 99) | st.just(((1, 2, 3), (4, 5, 6))),
+    may_fire=st.booleans() | st.just((True, False)),
+    may_bite=st.none() | st.just(((True, False, True, True), (False, True, True, False))),
+    shuffle_starts=st.booleans(),
+)
+BOARD = maps.parse("A>.#.\n.A.vA\n..A..")
+GAMES = st.builds(
+    Game,
+    map=st.just(BOARD),
+    rules=RULES,
+    observation=st.builds(Observation, encoding=st.sampled_from(["rgb", "one_hot"])),
+)
+
+
+@settings(max_examples=200, deadline=None)
+@given(value=SPECS | GAMES | CUSTOM | st.tuples(SPECS, GAMES))
+def test_a_value_comes_back_from_its_table_as_it_was(value):
+    text = json.dumps(to_config(value), allow_nan=False)
+    back = from_config(json.loads(text), allow=custom_targets(json.loads(text)))
+    assert back == value
+    assert hash(back) == hash(value)
+    assert to_config(back) == json.loads(text)
+
+
+def test_every_kind_comes_back():
+    made = {
+        "Game": presets.game("two_complex"),
+        "Map": BOARD,
+        "Learning": Learning(DQN(settings=DQNSettings())),
+        "Team": Team(QMIX(settings=DQNSettings()), agents=(0, 1)),
+        "Frozen": Frozen("runs/earlier", 1),
+        "Custom": Custom("a:b", arguments={"keys": [["agents", "reward"]]}),
+    }
+    of_settings = {"settings": DQNSettings}
+    of_settings |= dict.fromkeys(("PPO", "A2C", "Reinforce", "MAPPO", "IPPO"), RolloutSettings)
+    of_settings["Tabular"] = TabularSettings
+    for name, kind in KINDS.items():
+        if "settings" in [field.name for field in fields(kind)]:
+            made[name] = kind(settings=of_settings.get(name, DQNSettings)())
+        value = made.get(name) or kind()
+        table = json.loads(json.dumps(to_config(value)))
+        assert table["kind"] == name
+        assert from_config(table, allow=custom_targets(table)) == value
+
+
+def test_what_a_table_leaves_out_takes_its_default():
+    assert from_config({"kind": "DQNSettings", "gamma": 0.9}) == DQNSettings(gamma=0.9)
+
+
+TABLE = to_config([Learning(DQN(settings=DQNSettings()))], "agents")
+
+
+def changed(place, value):
+    """The table of one DQN agent with something else somewhere."""
+    table = json.loads(json.dumps(TABLE))
+    *way, last = place
+    inner = table
+    for step in way:
+        inner = inner[step]
+    inner[last] = value
+    return table
+
+
+@pytest.mark.parametrize(
+    ("place", "value", "message"),
+    [
+        ((0, "algorithm", "settings", "gama"), 0.9, r"settings\.gama is no field of .* mean 'gamma'\?"),
+        ((0, "algorithm", "settings", "gamma"), "0.9", r"settings\.gamma is '0\.9'; allowed: a number$"),
+        ((0, "algorithm", "settings", "batch_size"), 8.5, r"settings\.batch_size is 8\.5; allowed: a whole"),
+        ((0, "algorithm", "settings", "batch_size"), True, r"settings\.batch_size is True; allowed: a whole"),
+        ((0, "algorithm", "settings", "gamma"), float("inf"), r"settings\.gamma is inf; allowed: a finite"),
+        ((0, "algorithm", "settings", "kind"), "DQNSetting", r"settings\.kind is 'DQNSetting' \(did you mea"),
+        ((0, "algorithm", "settings"), {"gamma": 1}, r'settings is a table without "kind"; allowed: A2C'),
+        ((0, "algorithm", "settings", "hidden_cells"), [8, "x"], r"hidden_cells is \(8, 'x'\); allowed: \(a"),
+        ((0, "algorithm", "settings"), {"kind": "RolloutSettings"}, r"allowed: a DQNSettings"),
+        ((0, "algorithm"), {"kind": "DQN"}, r"\.algorithm lacks settings, which DQN requires"),
+        (
+            (0, "algorithm"),
+            {"kind": "QMIX", "settings": {"kind": "DQNSettings"}},
+            r": QMIX is learned by a team",
+        ),
+        ((0, "reward"), "own", r"\.reward is 'own'; allowed: 'individual', 'team'"),
+    ],
+)
+def test_what_is_not_known_is_refused_by_the_place_where_it_stands(place, value, message):
+    with pytest.raises(ValueError, match=r"^agents\[0\].*" + message):
+        from_config(changed(place, value), "agents")
+
+
+@dataclass(frozen=True, kw_only=True)
+class MyDQN(DQN):
+    """An algorithm of somebody's own, which is not in the registry."""
+
+
+@pytest.mark.parametrize(
+    ("value", "message"),
+    [
+        (torch.nn.Linear(1, 1), r'is a Linear, which .*Custom\("torch\.nn\.modules\.linear:Linear", arg'),
+        (torch.nn.Linear, r"is a class, which .*:Linear"),
+        (lambda: 0, r'is a function, .*Custom\("module:name", .*at the top of a module'),
+        (MyDQN(settings=DQNSettings()), r"is a MyDQN, which .*test_config:MyDQN"),
+        (float("nan"), r"is nan; allowed: a finite number"),
+        ({"a": 1}, r"is a dict, which a recipe cannot hold"),
+        (DQN(settings=DQNSettings(), double="yes"), r"\.double is 'yes'; allowed: True or False"),
+    ],
+)
+def test_a_live_object_is_refused_with_what_to_write_instead(value, message):
+    with pytest.raises(ValueError, match=r"^callbacks\[1\] ?" + message):
+        to_config((None, value), "callbacks")
+
+
+def test_what_would_be_imported_is_refused_unless_it_is_allowed():
+    table = to_config((Custom("a:B"), Custom("c:D", arguments={"kind": "Custom", "target": "not:one"})))
+    assert custom_targets(table) == ["a:B", "c:D"]
+    with pytest.raises(ValueError, match=r"^a:B, c:D would be imported.*--allow a:B --allow c:D"):
+        from_config(table)
+    with pytest.raises(ValueError, match=r"^c:D would be imported"):
+        from_config(table, allow=["a:B"])
+    assert from_config(table, allow=["a:B", "c:D"])[0] == Custom("a:B")
+
+
+def test_two_tables_are_told_apart_by_place():
+    before, now = TABLE, changed((0, "algorithm", "settings", "gamma"), 0.5)
+    assert differences(before, now, "agents") == [
+        "agents[0].algorithm.settings.gamma was 0.995, is 0.5",
+    ]
+    assert differences(before, before, "agents") == []
+    assert differences({"a": 1}, {}, "x") == ["x.a was 1, is not there"]
+    assert differences([1], [1, 2], "x") == ["x was [1], is [1, 2]"]

@@ -1,0 +1,229 @@
+"""An experiment is a value: its recipe says all of it, and gives it back."""
+
+import json
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+from my_game import Callback, Dilemma
+
+from cprl import presets
+from cprl.algorithms import DQN, IPPO, PPO, QMIX, DQNSettings, RolloutSettings, Tabular, TabularSettings
+from cprl.custom import Custom
+from cprl.experiment import Experiment, changes, frozen_from, frozen_relative_to
+from cprl.population import Frozen, Learning, Scripted, Team
+
+RESULTS = Path(__file__).parents[1] / "docs" / "results"
+RECIPES = sorted(RESULTS.rglob("recipe.json"))
+DQN_AGENT = Learning(DQN(settings=DQNSettings()))
+EXPERIMENT = Experiment(
+    name="mixed",
+    game=presets.game("commons"),
+    agents=[DQN_AGENT, Team(QMIX(settings=DQNSettings()), agents=(1, 3)), Scripted("greedy")],
+    episodes=10,
+    transforms=[Custom("torchrl.envs:RewardScaling", arguments={"loc": 0, "scale": 2})],
+    loggers=["csv", Custom("my.loggers:Mine")],
+)
+OWN = ("torchrl.envs:RewardScaling", "my.loggers:Mine")
+
+
+def as_stored(recipe):
+    return json.loads(json.dumps(recipe, allow_nan=False))
+
+
+@pytest.mark.parametrize("path", RECIPES, ids=lambda path: str(path.parent.relative_to(RESULTS)))
+def test_the_recipe_of_every_stored_result_is_an_experiment(path):
+    recipe = json.loads(path.read_text())
+    experiment = Experiment.from_recipe(recipe)
+    assert experiment.name == recipe["recipe"]
+    assert Experiment.from_recipe(as_stored(experiment.to_recipe())) == experiment
+    old = recipe["arguments"]
+    assert (experiment.episodes, experiment.replicas, experiment.seed) == (
+        old["episodes"],
+        old["replicas"],
+        old["seed"],
+    )
+    variant = presets.variant_of(experiment.game)
+    assert variant == old.get("variant", "published")
+    settings = experiment.agents[0].algorithm.settings
+    kept = old["learner"] if "learner" in old else old["population"][0]["settings"]
+    for name, value in kept.items():
+        if name not in ("kind", "priority_alpha"):
+            assert getattr(settings, name) == (tuple(value) if isinstance(value, list) else value)
+
+
+def test_there_are_results_of_all_three_generations():
+    kinds = {type(json.loads(path.read_text())["arguments"].get("population")) for path in RECIPES}
+    assert kinds == {type(None), dict, list}
+
+
+def test_an_experiment_equals_what_its_recipe_holds():
+    recipe = as_stored(EXPERIMENT.to_recipe())
+    assert (recipe["format"], recipe["recipe"]) == (2, "mixed")
+    again = Experiment.from_recipe(recipe, allow=OWN)
+    assert again == EXPERIMENT
+    assert hash(again) == hash(EXPERIMENT)
+    assert again.agents == EXPERIMENT.agents
+    assert again.to_recipe() == EXPERIMENT.to_recipe()
+    other = replace(EXPERIMENT, seed=1)
+    assert other != EXPERIMENT
+    assert changes(EXPERIMENT, other) == ["experiment.seed was 0, is 1"]
+
+
+def test_what_a_recipe_would_import_is_refused_by_name():
+    with pytest.raises(ValueError, match=r"RewardScaling would be imported.*--allow torchrl.*allow=\['tor"):
+        Experiment.from_recipe(EXPERIMENT.to_recipe(), allow=["my.loggers:Mine"])
+
+
+def test_a_recipe_of_another_format_is_refused():
+    with pytest.raises(ValueError, match=r"the format 3; allowed: 2"):
+        Experiment.from_recipe({**EXPERIMENT.to_recipe(), "format": 3})
+    with pytest.raises(ValueError, match=r"experiment\.replica is no field .* mean 'replicas'"):
+        Experiment.from_recipe({"format": 2, "experiment": {"replica": 3}})
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"episodes": 0}, r"experiment\.episodes is 0; allowed: a whole number from 1"),
+        ({"episodes": 1.5}, r"experiment\.episodes is 1\.5; allowed: a whole number"),
+        ({"replicas": True}, r"experiment\.replicas is True"),
+        ({"evaluation_episodes": 0}, r"experiment\.evaluation_episodes is 0"),
+        ({"update_every": -1}, r"experiment\.update_every is -1"),
+        ({"seed": 2**64 - 1}, r"experiment\.seed is 18446744073709551615; allowed: 0 to 2\*\*64 - 2"),
+        ({"seed": -1}, r"experiment\.seed is -1"),
+        ({"name": "a/b"}, r"experiment\.name is 'a/b'; allowed: the name of a directory"),
+        ({"name": ".."}, r"experiment\.name is '\.\.'"),
+        ({"device": "gpu"}, r"experiment\.device is 'gpu'; allowed: \"cpu\""),
+        ({"engine": "quick"}, r"experiment\.engine is 'quick'; allowed: 'compiled', 'eager', 'torchrl'"),
+        ({"engine": "torchrl"}, r"experiment\.agents\[1\] is a Team, which engine=\"torchrl\" cannot train"),
+        ({"game": 3}, r"experiment\.game is a int; allowed: a Game, a Custom, or a value with"),
+        ({"agents": [DQN_AGENT]}, r"experiment\.agents: 1 agents are specified for a game of 4 agents"),
+        ({"agents": DQN_AGENT}, r"experiment\.agents is a Learning; allowed: a tuple"),
+        ({"agents": [DQN(settings=DQNSettings())]}, r"agents\[0\] is a DQN; allowed: Learning, Team"),
+        (
+            {"agents": [DQN_AGENT] * 3 + [Frozen("/somewhere/run", 0)]},
+            r"experiment\.agents\[3\]\.run is /somewhere/run, an absolute path",
+        ),
+        (
+            {"agents": [DQN_AGENT] * 3 + [Learning(PPO(settings=RolloutSettings()))], "update_every": 3},
+            r"update_every is 3; it must divide experiment\.agents\[3\]\..*rollout_steps, 250",
+        ),
+        (
+            {"agents": [DQN_AGENT] * 3 + [Team(QMIX(settings=DQNSettings()), agents=(3,))]},
+            r"the team has 1 agents; allowed for QMIX: at least 2",
+        ),
+        (
+            {"agents": [Learning(Tabular(settings=TabularSettings()))] * 4, "engine": "torchrl"},
+            r"agents\[0\] is Tabular, which",
+        ),
+        (
+            {"agents": [Learning(DQN(settings=RolloutSettings()))] * 4},
+            r"settings is Roll.*; allowed: a DQNSe",
+        ),
+        ({"callbacks": [Callback()]}, r"callbacks\[0\] is a Callback, .*Custom\(\"my_game:Callback\", arg"),
+        ({"loggers": ["csw"]}, r"loggers\[0|loggers is \('csw',\); allowed: \('csv', 'tensorboard', 'wandb'"),
+        ({"transforms": [Custom("__main__:Mine")]}, r"__main__:Mine, of the script that runs"),
+    ],
+)
+def test_what_cannot_be_trained_is_refused_by_name(change, message):
+    with pytest.raises(ValueError, match=message):
+        replace(EXPERIMENT, **change)
+
+
+def test_a_game_of_somebodys_own_is_stored_by_the_name_of_its_class():
+    game = Dilemma(payoffs=((3.0, 0.5), (4.0, 1.0)))
+    experiment = Experiment(name="dilemma", game=game, agents=[DQN_AGENT] * 2, episodes=5)
+    recipe = as_stored(experiment.to_recipe())
+    assert recipe["experiment"]["game"] == {
+        "kind": "Custom",
+        "target": "my_game:Dilemma",
+        "arguments": {"payoffs": [[3.0, 0.5], [4.0, 1.0]], "agents": 2},
+    }
+    with pytest.raises(ValueError, match="--allow my_game:Dilemma"):
+        Experiment.from_recipe(recipe)
+    again = Experiment.from_recipe(recipe, allow=["my_game:Dilemma"])
+    assert again.game == game
+    assert again == experiment
+    with pytest.raises(ValueError, match="1 agents are specified for a game of 2 agents"):
+        replace(experiment, agents=[DQN_AGENT])
+    recipe["experiment"]["game"]["arguments"]["temptation"] = 1
+    with pytest.raises(ValueError, match=r"experiment\.game: my_game:Dilemma does not take its arguments"):
+        Experiment.from_recipe(recipe, allow=["my_game:Dilemma"])
+
+
+@pytest.mark.parametrize(
+    "stored",
+    [Custom("my_game:dilemma", arguments={"temptation": 9}), Custom("my_game:Dilemma", arguments={})],
+)
+def test_a_custom_that_makes_a_game_stays_the_same_text(stored):
+    experiment = Experiment(name="dilemma", game=stored, agents=[DQN_AGENT] * 2, episodes=5)
+    again = Experiment.from_recipe(as_stored(experiment.to_recipe()), allow=[stored.target])
+    assert again == experiment
+    assert again.game == stored
+
+
+def test_a_game_that_no_recipe_can_name_is_refused():
+    class Local(Dilemma):
+        pass
+
+    with pytest.raises(ValueError, match=r"experiment\.game is a .*Local, which no recipe can name"):
+        Experiment(name="local", game=Local(), agents=[DQN_AGENT] * 2, episodes=1)
+
+
+def test_a_run_of_frozen_agents_is_kept_relative_to_the_run_that_has_them(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    agents = [Frozen("runs/earlier", 0), *[DQN_AGENT] * 3]
+    experiment = Experiment(name="frozen", game=presets.game("commons"), agents=agents, episodes=1)
+    recipe = as_stored(experiment.to_recipe("runs/later"))
+    assert recipe["experiment"]["agents"][0]["run"] == "../earlier"
+    assert Experiment.from_recipe(recipe, directory="runs/later") == experiment
+    assert frozen_from(frozen_relative_to(experiment, "elsewhere/deep"), "elsewhere/deep") == experiment
+    (tmp_path / "runs").mkdir()
+    monkeypatch.chdir(tmp_path / "runs")
+    seen = Experiment.from_recipe(recipe, directory="later")
+    assert seen.agents[0] == Frozen("earlier", 0)
+
+
+def old_recipe(*members):
+    game = presets.game("two_complex")
+    table = Experiment(name="old", game=game, agents=[DQN_AGENT] * 2, episodes=1).to_config()["game"]
+    plain = {
+        name: {key: own for key, own in table[name].items() if key != "kind"}
+        for name in ("map", "rules", "observation")
+    }
+    return {"recipe": "old", "arguments": {"episodes": 7, "game": plain, "population": list(members)}}
+
+
+def test_equal_members_that_learned_as_a_team_are_one_team():
+    member = {
+        "member": "Learner",
+        "paid": "own",
+        "algorithm": "IPPO",
+        "clip_epsilon": 0.1,
+        "settings": {"kind": "RolloutSettings", "epochs": 2},
+    }
+    ippo = IPPO(settings=RolloutSettings(epochs=2), clip_epsilon=0.1)
+    assert Experiment.from_recipe(old_recipe(member, member)).agents == (
+        Team(ippo, agents=(0, 1), reward="individual"),
+    )
+    scripted = {"member": "Scripted", "manner": "greedy"}
+    assert Experiment.from_recipe(old_recipe(scripted, {**member, "paid": "group"})).agents == (
+        Scripted("greedy"),
+        Team(ippo, agents=(1,), reward="team"),
+    )
+
+
+def test_an_old_run_of_frozen_agents_is_found_from_where_we_stand(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    frozen = {"member": "Frozen", "run": str(tmp_path / "runs" / "a"), "agent": 1, "replica": 2}
+    old = Experiment.from_recipe(old_recipe(frozen, {"member": "Scripted", "manner": "random"}))
+    assert old.agents == (Frozen("runs/a", 1, 2), Scripted("random"))
+
+
+def test_an_old_recipe_that_cannot_be_read_says_why():
+    with pytest.raises(ValueError, match=r"the recipe holds no game and agents of cprl: KeyError\('game'\)"):
+        Experiment.from_recipe({"recipe": "old", "arguments": {}})
+    mine = {"member": "Learner", "paid": "own", "algorithm": "Mine", "settings": {"kind": "DQNSettings"}}
+    with pytest.raises(ValueError, match=r"experiment\.agents\[0\]\.algorithm\.kind is 'Mine'"):
+        Experiment.from_recipe(old_recipe(mine, mine))

@@ -1,0 +1,159 @@
+"""LoggerCallback: the numbers of episodes in any TorchRL logger; a CSV knows no number twice."""
+
+from pathlib import Path
+
+import pytest
+from matrix_game import MatrixGame, tit_for_tat
+from test_any_game import play
+from torchrl.record.loggers import CSVLogger
+
+from cprl.collectors import StepCollector
+from cprl.measuring import EpisodeTracker
+from cprl.runs import loggers
+from cprl.runs.loggers import LoggerCallback, check_logger, make_logger
+
+
+def files(folder):
+    """What stands in each file of scalars, but for the speed."""
+    scalars = folder / "logs" / "csv" / "scalars"
+    paths = {path.relative_to(scalars).with_suffix("").as_posix(): path for path in scalars.rglob("*.csv")}
+    return {name: path.read_text() for name, path in paths.items() if name != "time/env_steps_per_s"}
+
+
+def test_each_episode_is_written_as_the_mean_of_the_replicas_and_of_each(tmp_path):
+    with LoggerCallback(make_logger("csv", tmp_path), replicas=2, agents=("row", "column")) as callback:
+        play(MatrixGame(2), tit_for_tat, 12, callbacks=[callback])
+    # Worlds play 5 and 6 turns: the first two episodes of both have ended after turns 6 and 12.
+    assert files(tmp_path) == {
+        "social/survival_steps": "0,5.5\n1,5.5\n",
+        "replica_0/social/survival_steps": "0,5.0\n1,5.0\n",
+        "replica_1/social/survival_steps": "0,6.0\n1,6.0\n",
+        "row/return": "0,4.5\n1,4.5\n",
+        "replica_0/row/return": "0,4.0\n1,4.0\n",
+        "replica_1/row/return": "0,5.0\n1,5.0\n",
+        "column/return": "0,9.0\n1,9.0\n",
+        "replica_0/column/return": "0,8.5\n1,8.5\n",
+        "replica_1/column/return": "0,9.5\n1,9.5\n",
+        "row/loss": "0,0.5\n1,0.5\n",
+        "time/env_steps": "0,6.0\n1,12.0\n",
+    }
+    rates = (tmp_path / "logs/csv/scalars/time/env_steps_per_s.csv").read_text().split()
+    assert all(float(rate.split(",")[1]) > 0 for rate in rates)
+
+
+def course(run, batches, *, first=0, state=None):
+    """Logs batches; returns the states of tracker and callback after each."""
+    tracker, callback = EpisodeTracker(2, 2), LoggerCallback(make_logger("csv", run), replicas=2)
+    if state:
+        tracker.load_state_dict(state[0])
+        callback.load_state_dict(state[1])
+    states = []
+    for batch in batches[first:]:
+        callback.on_step(batch)
+        for episode in tracker.add(batch):
+            callback.on_episode(episode, {"agent_0/loss": float(episode.steps)})
+        states.append((tracker.state_dict(), callback.state_dict()))
+    return states
+
+
+@pytest.fixture(scope="module")
+def batches():
+    played = []
+    for batch in StepCollector(MatrixGame(2), tit_for_tat):
+        played.append(batch)
+        if len(played) == 40:
+            return played
+    raise AssertionError
+
+
+@pytest.mark.parametrize("checkpoint", [0, 4, 10, 11, 22, 35])
+def test_a_resumed_run_has_every_episode_once(checkpoint, tmp_path, batches):
+    states = course(tmp_path / "whole", batches)
+    course(tmp_path / "run", batches[:36])  # killed: nobody closed it
+    course(tmp_path / "run", batches, first=checkpoint + 1, state=states[checkpoint])
+    assert files(tmp_path / "run") == files(tmp_path / "whole")
+    assert files(tmp_path / "whole")["social/survival_steps"].count("\n") == 6
+
+
+def test_a_run_that_was_killed_before_its_first_checkpoint_begins_anew(tmp_path, batches):
+    course(tmp_path, batches)
+    course(tmp_path, batches[:12])
+    assert files(tmp_path)["time/env_steps"] == "0,6.0\n1,12.0\n"
+
+
+def test_a_logger_of_the_users_is_added_to_and_cut_after_a_resume(tmp_path, batches):
+    def logged():
+        return (tmp_path / "own" / "scalars" / "agent_0" / "return.csv").read_text()
+
+    for count in (1, 2):
+        with LoggerCallback(CSVLogger("own", str(tmp_path))) as callback:
+            play(MatrixGame(1), tit_for_tat, 5, callbacks=[callback])
+        assert logged() == "0,4.0\n" * count
+    state = callback.state_dict()
+    with LoggerCallback(CSVLogger("own", str(tmp_path))) as callback:
+        play(MatrixGame(1), tit_for_tat, 10, callbacks=[callback])
+        assert logged().count("\n") == 4
+        callback.load_state_dict(state)
+    assert logged() == "0,4.0\n" * 2
+
+
+def test_numbers_that_are_undefined_are_not_written(tmp_path):
+    class Undefined(LoggerCallback):
+        def on_episode(self, episode, learning):
+            super().on_episode(episode, {"agent_0/loss": float("nan"), "agent_0/epsilon": 0.25})
+
+    with Undefined(make_logger("csv", tmp_path)) as callback:
+        play(MatrixGame(1), tit_for_tat, 5, callbacks=[callback])
+    assert "agent_0/loss" not in files(tmp_path)
+    assert files(tmp_path)["agent_0/epsilon"] == "0,0.25\n"
+
+
+@pytest.mark.parametrize("error", [None, RuntimeError("stop")])
+def test_files_are_closed_at_the_end_and_by_an_error(error, tmp_path):
+    callback = LoggerCallback(make_logger("csv", tmp_path))
+
+    def course():
+        with callback:
+            play(MatrixGame(1), tit_for_tat, 5, callbacks=[callback])
+            opened.update(callback.logger.experiment.files)
+            if error:
+                raise error
+
+    opened = {}
+    if error:
+        with pytest.raises(RuntimeError, match="stop"):
+            course()
+    else:
+        course()
+    assert opened
+    assert all(file.closed for file in opened.values())
+
+
+def test_many_names_do_not_keep_many_files_open(tmp_path, monkeypatch):
+    monkeypatch.setattr(loggers, "_MOST_OPEN_FILES", 3)
+    with LoggerCallback(make_logger("csv", tmp_path)) as callback:
+        play(MatrixGame(1), tit_for_tat, 10, callbacks=[callback])
+        assert callback.logger.experiment.files == {}
+    assert files(tmp_path)["agent_0/return"] == "0,4.0\n1,4.0\n"
+
+
+def test_any_logger_that_is_made_already_is_taken(tmp_path):
+    class Own(CSVLogger):
+        """A logger of the user's."""
+
+    own = Own("own", str(tmp_path))
+    check_logger(own)
+    assert make_logger(own, tmp_path) is own
+    with pytest.raises(TypeError, match="logger is a dict without log_metrics"):
+        LoggerCallback({})
+
+
+def test_a_logger_that_cannot_be_made_is_refused_by_name_before_anything_is_written(tmp_path, monkeypatch):
+    with pytest.raises(ValueError, match='logger is \'mlflow\'; allowed: "csv", "tensorboard", "wandb", or'):
+        check_logger("mlflow")
+    monkeypatch.setattr(loggers, "find_spec", lambda name: None)
+    for name in ("tensorboard", "wandb"):
+        with pytest.raises(ModuleNotFoundError, match=f"needs the package {name}: pip install {name}"):
+            make_logger(name, tmp_path / "run")
+    assert not Path(tmp_path / "run").exists()
+    check_logger("csv")

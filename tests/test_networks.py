@@ -1,0 +1,282 @@
+"""Which network an agent has: fully connected, convolutional, or one of your own."""
+
+from dataclasses import replace
+from functools import partial
+
+import pytest
+import torch
+from torch import nn
+
+from cprl import CommonsEnv, Game, Rules, maps
+from cprl.algorithms import (
+    A2C,
+    CQL,
+    DQN,
+    IPPO,
+    IQL,
+    MAPPO,
+    PPO,
+    QMIX,
+    SAC,
+    VDN,
+    DistributionalDQN,
+    DQNSettings,
+    Reinforce,
+    RolloutSettings,
+    TeamAlgorithm,
+)
+from cprl.custom import Custom
+from cprl.learners.engine import choice
+from cprl.learners.engine.base import ListEngine
+from cprl.learners.engine.compiled import FunctionalEngine
+from cprl.learners.replay import ReplayLearner
+from cprl.networks import MLP, Conv, ConvNetwork, MLPNetwork
+from cprl.networks.specification import new_network
+from cprl.networks.stacked import stack_lanes
+from cprl.spaces import Spaces
+
+GAME = Game(
+    map=maps.parse(".A>.A\n.A.A.\n..<.A"),
+    rules=Rules(regrow_prob=(0.0, 0.2), window_rows=3, window_columns=5, episode_steps=12, freeze_steps=2),
+)
+SPACES = GAME.spaces
+VECTORS = Spaces(
+    agents=2, observation_shape=(6,), observation_dtype="float32", observation_scale=1.0, actions=3
+)
+REPLAY = DQNSettings(buffer_size=100, batch_size=4, learning_rate=1e-3)
+ROLLOUTS = RolloutSettings(rollout_steps=20, minibatch_size=10, epochs=1)
+OF_REPLAY, OF_ROLLOUTS = (
+    (DQN, DistributionalDQN, CQL, SAC, IQL, VDN, QMIX),
+    (PPO, A2C, Reinforce, IPPO, MAPPO),
+)
+CONV = Conv(channels=(4, 5), hidden_cells=(7,))
+
+
+class Own(nn.Module):
+    """A network of a user's: it reads one leading axis."""
+
+    def __init__(self, spaces, outputs, *, cells=6):
+        super().__init__()
+        self.layers = nn.Sequential(nn.Flatten(1), nn.LazyLinear(cells), nn.Tanh(), nn.Linear(cells, outputs))
+
+    def forward(self, observation):
+        return self.layers(observation.float() / 255)
+
+
+OWN = Custom("test_networks:Own", {"cells": 5})
+
+
+@pytest.mark.parametrize("leading", [(), (2,), (2, 3)])
+def test_a_convolutional_network_reads_any_leading_axes_of_bytes_and_of_floats(leading):
+    network = CONV.make(SPACES, 8)
+    seen = torch.randint(256, (*leading, *SPACES.observation_shape), dtype=torch.uint8)
+    given = network(seen)
+    assert given.shape == (*leading, 8)
+    torch.testing.assert_close(network(seen.float()), given)
+    one = seen.reshape(-1, *SPACES.observation_shape)[0]
+    torch.testing.assert_close(network(one), given.reshape(-1, 8)[0])
+    unscaled = replace(SPACES, observation_dtype="float32", observation_scale=1.0)
+    torch.manual_seed(0)
+    bytes_ = CONV.make(SPACES, 8)
+    torch.manual_seed(0)
+    floats = CONV.make(unscaled, 8)
+    torch.testing.assert_close(floats(seen.float() / 255), bytes_(seen))
+
+
+def test_a_convolutional_network_is_the_layers_that_one_would_write_down():
+    network = Conv(channels=(4,), kernel_cells=3, hidden_cells=(7,)).make(SPACES, 8, relu_on_outputs=True)
+    convolution, (first, last) = (
+        network.convolutions[0],
+        [layer for layer in network.layers if isinstance(layer, nn.Linear)],
+    )
+    seen = torch.randint(256, (6, *SPACES.observation_shape), dtype=torch.uint8)
+    hidden = nn.functional.conv2d(seen / 255.0, convolution.weight, convolution.bias, padding=1).relu()
+    wanted = last(first(hidden.flatten(1)).relu()).relu()
+    torch.testing.assert_close(network(seen), wanted)
+    assert (network(seen) >= 0).all()
+
+
+def test_glorot_uniform_weights_have_zero_biases():
+    network = CONV.make(SPACES, 8, glorot_uniform=True)
+    layers = [layer for layer in network.modules() if isinstance(layer, nn.Linear | nn.Conv2d)]
+    assert len(layers) == 4
+    for layer in layers:
+        assert not layer.bias.any()
+        fan_in, fan_out = nn.init._calculate_fan_in_and_fan_out(layer.weight)
+        limit = (6 / (fan_in + fan_out)) ** 0.5
+        assert 0.8 * limit < layer.weight.abs().max() <= limit
+
+
+def test_without_a_network_the_settings_say_the_hidden_layers():
+    for network, cells in ((None, (16, 9)), (MLP(hidden_cells=(16, 9)), (32, 32))):
+        made = DQN(settings=replace(REPLAY, hidden_cells=cells), network=network).make_network(SPACES)
+        assert isinstance(made, MLPNetwork)
+        assert [layer.out_features for layer in made.linears] == [16, 9, 8]
+    with pytest.raises(ValueError, match=r"settings.hidden_cells is \(16,\); allowed: the default"):
+        DQN(settings=replace(REPLAY, hidden_cells=(16,)), network=CONV).make_network(SPACES)
+
+
+def learner_of(kind, network, **how):
+    settings = REPLAY if kind in OF_REPLAY else ROLLOUTS
+    if issubclass(kind, TeamAlgorithm):
+        how |= {"reward_kind": "team"}
+    algorithm = kind(settings=settings, network=network)
+    how = {"agents": (0, 1), "replicas": 2, "engine": "eager", "seed": 4, **how}
+    return algorithm, algorithm.make_learner(SPACES, **how)
+
+
+def played(learner, steps=24):
+    env = CommonsEnv(GAME, learner.replicas, seed=3)
+    moment, losses = env.reset(), []
+    for _ in range(steps):
+        moment["agents", "action"] = learner.actor.choose(moment["agents", "observation"])
+        now, moment = env.step_and_maybe_reset(moment)
+        learner.store(now)
+        losses.append(learner.update())
+    return [loss for loss in losses if loss is not None]
+
+
+@pytest.mark.parametrize("network", [CONV, OWN], ids=["conv", "own"])
+@pytest.mark.parametrize("kind", [*OF_REPLAY, *OF_ROLLOUTS])
+def test_every_algorithm_learns_with_every_network(kind, network):
+    _, learner = learner_of(kind, network)
+    before = {lane: own.state_dict() for lane, own in learner.networks().items()}
+    assert isinstance(learner.engine, FunctionalEngine), "all lanes at once"
+    losses = played(learner)
+    assert torch.isfinite(torch.stack(losses)).all()
+    for lane, own in learner.networks().items():
+        for name, value in own.state_dict().items():
+            if name != "support":
+                assert not torch.equal(value, before[lane][name]), (lane, name)
+    seen = torch.randint(256, (5, *SPACES.observation_shape), dtype=torch.uint8)
+    assert own(seen).shape == (5, 8)
+
+
+@pytest.mark.parametrize("network", [CONV, OWN], ids=["conv", "own"])
+@pytest.mark.parametrize(
+    "kind",
+    [
+        DQN,
+        SAC,
+        MAPPO,
+        *(pytest.param(kind, marks=pytest.mark.slow) for kind in (DistributionalDQN, QMIX, PPO, IPPO)),
+    ],
+)
+def test_lanes_learn_with_any_network_what_each_would_alone(kind, network, monkeypatch):
+    ends = []
+    for engine in (FunctionalEngine, ListEngine):
+        if engine is ListEngine:
+            monkeypatch.setattr(choice, "fitting_engine", lambda *_: "list")
+        _, learner = learner_of(kind, network)
+        assert isinstance(learner.engine, engine)
+        played(learner, 30)
+        ends.append([own.state_dict() for own in learner.networks().values()])
+    for fast, plain in zip(*ends, strict=True):
+        for name, value in plain.items():
+            torch.testing.assert_close(fast[name], value, rtol=1e-3, atol=1e-5)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("kind", [DQN, PPO])
+def test_the_compiled_update_has_convolutions_too(kind):
+    _, compiled = learner_of(kind, CONV, engine="compiled")
+    _, plain = learner_of(kind, CONV)
+    losses, wanted = played(compiled), played(plain)
+    assert compiled.engine._compiled.enabled
+    assert compiled.engine._compiled_on.enabled
+    torch.testing.assert_close(torch.stack(losses), torch.stack(wanted), rtol=1e-3, atol=1e-5)
+
+
+def test_a_network_whose_buffers_do_not_stack_is_vmapped():
+    class Normalised(Own):
+        def __init__(self):
+            super().__init__(SPACES, 8)
+            self.observation_dims = 3
+            self.register_buffer("shift", torch.ones(()))
+            self(torch.zeros(1, *SPACES.observation_shape))
+
+        def forward(self, observation):
+            return super().forward(observation + self.shift)
+
+    with pytest.raises(ValueError, match="a Normalised has buffers; allowed: parameters alone"):
+        stack_lanes([Normalised(), Normalised()])
+    learner = ReplayLearner(
+        SPACES, agents=(0, 1), replicas=1, settings=REPLAY, make_network=Normalised, compile=False
+    )
+    assert learner.engine._vmapped
+    played(learner)
+
+
+@pytest.mark.parametrize("network", [MLP(), CONV, OWN])
+def test_the_central_critic_reads_the_observations_of_all_members(network):
+    algorithm = MAPPO(settings=ROLLOUTS, network=network)
+    team = algorithm.make_team([algorithm.make_network(SPACES) for _ in range(3)], SPACES)
+    seen = torch.randint(256, (4, 3, *SPACES.observation_shape), dtype=torch.uint8)
+    value = team["critic"](seen)
+    assert value.shape == (4, 3, 1)
+    other = seen.clone()
+    other[:, 2] = 255 - other[:, 2]
+    assert (team["critic"](other) != value).all()
+    assert torch.equal(team["actor"](other)[:, :2], team["actor"](seen)[:, :2])
+
+
+def test_a_learner_with_convolutions_continues_bit_for_bit():
+    (_, first), (_, second) = learner_of(DQN, CONV), learner_of(DQN, CONV)
+    played(first)
+    second.load_state_dict(first.state_dict())
+    for mine, theirs in zip(played(first), played(second), strict=True):
+        assert torch.equal(mine, theirs)
+
+
+class Narrow(nn.Module):
+    """Gives one output too few."""
+
+    def __init__(self, spaces, outputs):
+        super().__init__()
+        self.layer = nn.Linear(spaces.observation_shape[-1], outputs - 1)
+
+    def forward(self, observation):
+        return self.layer(observation.float().flatten(1)[:, : self.layer.in_features])
+
+
+def test_what_a_network_cannot_do_is_refused_by_name():
+    with pytest.raises(
+        ValueError, match=r"the shape \[6\]; allowed for Conv: channels, rows and columns; use MLP"
+    ):
+        DQN(settings=REPLAY, network=Conv()).make_network(VECTORS)
+    assert new_network(MLP(), VECTORS, 3)(torch.zeros(2, 6)).shape == (2, 3)
+    for name in ("relu_on_outputs", "glorot_uniform"):
+        settings = replace(REPLAY, **{name: True})
+        with pytest.raises(ValueError, match=rf"settings.{name} is True; .* test_networks:Own: False"):
+            DQN(settings=settings, network=OWN).make_network(SPACES)
+        DQN(settings=settings, network=CONV).make_network(SPACES)
+    with pytest.raises(
+        ValueError, match=r"test_networks:Narrow outputs \[2, 7\] for two .*allowed: \[2, 8\]"
+    ):
+        DQN(settings=REPLAY, network=Custom("test_networks:Narrow")).make_network(SPACES)
+    with pytest.raises(ValueError, match=r"math:hypot"):
+        DQN(settings=REPLAY, network=Custom("math:hypot")).make_network(SPACES)
+    flat = Custom("torch.nn:Linear")
+    with pytest.raises(ValueError, match=r"torch.nn:Linear"):
+        DQN(settings=REPLAY, network=flat).make_network(SPACES)
+
+
+@pytest.mark.parametrize(
+    ("make", "message"),
+    [
+        (partial(Conv, channels=()), "Conv.channels is empty"),
+        (partial(Conv, channels=(4, 0)), r"Conv.channels is \(4, 0\)"),
+        (partial(Conv, kernel_cells=2), "Conv.kernel_cells is 2; allowed: 1, 3, 5"),
+        (partial(Conv, hidden_cells=(0,)), r"Conv.hidden_cells is \(0,\)"),
+        (partial(MLP, hidden_cells=(0,)), r"MLP.hidden_cells is \(0,\)"),
+    ],
+)
+def test_sizes_out_of_range_are_refused(make, message):
+    with pytest.raises(ValueError, match=message):
+        make()
+
+
+def test_networks_are_made_without_hidden_layers_too():
+    for network in (MLP(hidden_cells=()), Conv(hidden_cells=())):
+        assert network.make(SPACES, 8)(torch.zeros(2, *SPACES.observation_shape)).shape == (2, 8)
+    assert isinstance(Conv().make(SPACES, 8), ConvNetwork)

@@ -1,0 +1,267 @@
+"""What an experiment names works everywhere: training, stop, resume, evaluation, film, from its recipe."""
+
+import subprocess
+import sys
+import time
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+from one_road_parts import Dilemma
+
+import cprl
+from cprl import Custom, Experiment, Game, Rules, cli, maps
+from cprl.algorithms import DQN, PPO, DQNSettings, RolloutSettings
+from cprl.evaluation.film import film
+from cprl.networks import Conv
+from cprl.population import Learning, Scripted
+from cprl.runs.checkpoints import checkpoints_in
+from cprl.runs.episodes import read_episodes
+from cprl.runs.weights import load_weights
+
+HERE = Path(__file__).parent
+REPLAY = DQNSettings(
+    buffer_size=300,
+    batch_size=4,
+    learning_rate=1e-3,
+    epsilon_hold_steps=10,
+    epsilon_decay_steps=400,
+    target_every_episodes=2,
+)
+MEADOW = Experiment(
+    name="own",
+    game=Game(
+        map=maps.parse(".A>.A.A\nA.A...A\n..<.A.A"),
+        rules=Rules(
+            regrow_prob=(0.0, 0.2), window_rows=3, window_columns=5, episode_steps=20, freeze_steps=2
+        ),
+    ),
+    agents=[Learning(DQN(settings=REPLAY, network=Conv(channels=(4,), hidden_cells=(8,))))] * 2,
+    replicas=2,
+    episodes=6,
+    seed=3,
+    evaluation_episodes=2,
+    transforms=[
+        Custom(
+            "torchrl.envs.transforms:RewardScaling",
+            arguments={"loc": 0.0, "scale": 0.5, "in_keys": [["agents", "reward"]]},
+        ),
+        Custom("one_road_parts:Fatigue", arguments={"per_step": 0.01}),
+    ],
+    callbacks=[Custom("one_road_parts:Bored", arguments={"from_episode": 7, "epsilon": 0.4})],
+    loggers=["csv"],
+    engine="eager",
+)
+ALLOW = ("one_road_parts:Bored", "one_road_parts:Fatigue", "torchrl.envs.transforms:RewardScaling")
+
+
+def files_of(run, folder):
+    return {str(path.relative_to(run)): path.read_text() for path in sorted((run / folder).rglob("*.csv"))}
+
+
+def assert_same_run(run, other):
+    """Episodes, weights, transforms, evaluation and the logger's files are the same bit for bit."""
+    assert read_episodes(run).equals(read_episodes(other))
+    for name in ("final", "transforms"):
+        mine, theirs = (load_weights(one / "checkpoints" / f"{name}.pt") for one in (run, other))
+        assert repr(mine) == repr(theirs), name
+    logged, wanted = files_of(run, "logs"), files_of(other, "logs")
+    assert logged.keys() == wanted.keys()
+    for name, text in wanted.items():
+        if "time/" not in name and "steps_per_s" not in name:
+            assert logged[name] == text, name
+    one, two = (cprl.evaluate_run(each, episodes=2, allow=ALLOW).table() for each in (run, other))
+    assert repr(one.to_pydict()) == repr(two.to_pydict())
+
+
+@pytest.fixture(scope="module")
+def in_one_go(tmp_path_factory):
+    return cprl.run(MEADOW, tmp_path_factory.mktemp("whole") / "run", watch="off")
+
+
+def test_an_experiment_with_parts_of_its_own_is_stopped_resumed_evaluated_and_filmed(
+    in_one_go, tmp_path, monkeypatch, capsys
+):
+    run = tmp_path / "run"
+    monkeypatch.setenv("STOP_AT_STEP", "71")
+    with pytest.raises(SystemExit) as stopped:
+        cprl.run(MEADOW, run, watch="off")
+    assert stopped.value.code == 0
+    told = capsys.readouterr().out
+    flags = " ".join(f"--allow {target}" for target in ALLOW)
+    assert f"To resume: cprl run {run} --resume {flags}" in told
+    assert len(checkpoints_in(run / "checkpoints")) == 1
+    monkeypatch.delenv("STOP_AT_STEP")
+    monkeypatch.setattr("sys.argv", ["cprl", "run", str(run), "--resume", *flags.split(), "--watch", "off"])
+    cli.main()
+    assert_same_run(run, in_one_go)
+    assert cprl.load(run, allow=ALLOW).experiment == MEADOW
+    _, episode = film(run, allow=ALLOW)
+    assert episode.steps <= 20
+    assert (run / "film-0-0.rrd").stat().st_size > 10_000
+
+
+def test_the_reward_is_what_the_transforms_make_of_it_and_the_harvest_is_not(in_one_go):
+    table = read_episodes(in_one_go).to_pydict()
+    bitten = [(own, paid) for own, paid in zip(table["harvest"], table["return"], strict=True) if own]
+    assert bitten
+    assert all(0 < paid < own / 2 for own, paid in bitten), "halved, and less with every step"
+    evaluated = cprl.evaluate_run(in_one_go, episodes=2, allow=ALLOW)
+    steps = load_weights(in_one_go / "checkpoints" / "transforms.pt")
+    (fatigue,) = [float(value) for name, value in steps.items() if name.endswith("steps")]
+    assert fatigue >= 6 * 20 - 20, "as many as were played"
+    for episode in evaluated.trained[0]:
+        assert episode.return_.sum() <= episode.harvest.sum() / 2 / (1 + 0.01 * fatigue)
+
+
+def test_no_command_imports_what_is_not_allowed(in_one_go, monkeypatch, capsys):
+    for words in (["evaluate"], ["film"], ["run"], ["crossplay", str(in_one_go)]):
+        monkeypatch.setattr("sys.argv", ["cprl", words[0], str(in_one_go), *words[1:]])
+        with pytest.raises(SystemExit, match=r"one_road_parts:Bored.*--allow one_road_parts:Bored"):
+            cli.main()
+    with pytest.raises(ValueError, match="one_road_parts:Fatigue"):
+        cprl.load(in_one_go, allow=ALLOW[:1])
+
+
+@pytest.mark.slow
+def test_it_survives_sigkill(in_one_go, tmp_path):
+    run = tmp_path / "run"
+    script = (
+        "import sys, functools, cprl.running as r, test_one_road as t\n"
+        "r.Checkpointer = functools.partial(r.Checkpointer, every_s=1e-9)\n"
+        f"r.run(t.MEADOW, {str(run)!r}, watch='off', resume='--resume' in sys.argv)\n"
+    )
+    for kill in range(4):
+        words = ["--resume"] if kill else []
+        process = subprocess.Popen([sys.executable, "-c", script, *words], cwd=HERE)
+        seen = {path.name for path in checkpoints_in(run / "checkpoints")}
+        deadline = time.monotonic() + 120
+        while process.poll() is None and time.monotonic() < deadline:
+            if {path.name for path in checkpoints_in(run / "checkpoints")} - seen:
+                time.sleep(0.02 * kill)
+                process.kill()
+                break
+            time.sleep(0.005)
+        process.wait()
+    if not (run / "report.json").exists():
+        subprocess.run([sys.executable, "-c", script, "--resume"], cwd=HERE, check=True)
+    assert_same_run(run, in_one_go)
+
+
+DILEMMA = Experiment(
+    name="dilemma",
+    game=Dilemma(steps=5),
+    agents=[
+        Learning(DQN(settings=replace(REPLAY, hidden_cells=(8,)))),
+        Learning(PPO(settings=RolloutSettings(rollout_steps=10, minibatch_size=5, hidden_cells=(8,)))),
+    ],
+    replicas=2,
+    episodes=8,
+    evaluation_episodes=3,
+    engine="eager",
+)
+DILEMMA_ALLOW = ("one_road_parts:Dilemma",)
+
+
+def test_a_matrix_game_is_trained_stopped_resumed_evaluated_and_cross_played(tmp_path, monkeypatch, capsys):
+    experiment = replace(DILEMMA, callbacks=MEADOW.callbacks)
+    whole = cprl.run(experiment, tmp_path / "whole")
+    assert "left out" in capsys.readouterr().out
+    monkeypatch.setenv("STOP_AT_STEP", "23")
+    with pytest.raises(SystemExit):
+        cprl.run(experiment, tmp_path / "parts")
+    monkeypatch.delenv("STOP_AT_STEP")
+    parts = cprl.run(experiment, tmp_path / "parts", resume=True)
+    allow = (*DILEMMA_ALLOW, "one_road_parts:Bored")
+    assert read_episodes(parts).equals(read_episodes(whole))
+    assert "harvest" not in read_episodes(whole).column_names
+    assert repr(load_weights(parts / "checkpoints" / "final.pt")) == repr(
+        load_weights(whole / "checkpoints" / "final.pt")
+    )
+    loaded = cprl.load(whole, allow=allow)
+    assert loaded.experiment == experiment
+    found = cprl.evaluate_run(loaded, episodes=4)
+    assert 5 <= found.measures()["agent_0/return"].estimate.value <= 4.5 * 9
+    other = cprl.run(replace(DILEMMA, seed=9), tmp_path / "other", watch="off")
+    played = cprl.crossplay([loaded, cprl.load(other, allow=allow)], episodes=2)
+    assert len(played.cells) == 4
+    assert played.cell("whole", "other").measures()["focal/return"].estimate is not None
+    film(whole, allow=allow)
+
+
+def test_scripted_policies_that_read_a_window_are_refused_where_there_is_none():
+    with pytest.raises(ValueError, match=r"Scripted\('greedy'\) reads the window of a cprl.Game"):
+        cprl.run(replace(DILEMMA, agents=[Scripted("greedy"), Scripted()]), "never")
+    flat = Custom(
+        "torchrl.envs.transforms:FlattenObservation",
+        arguments={"first_dim": -3, "last_dim": -1, "in_keys": [["agents", "observation"]]},
+    )
+    with pytest.raises(ValueError, match=r"reads the window of the game; transforms make it uint8 \[45\]"):
+        cprl.run(replace(MEADOW, agents=[Scripted("greedy"), Scripted()], transforms=[flat]), "never")
+    assert not Path("never").exists()
+
+
+def test_a_transform_that_changes_the_shape_of_observations_is_learned_from(tmp_path, capsys):
+    flat = Custom(
+        "torchrl.envs.transforms:FlattenObservation",
+        arguments={"first_dim": -3, "last_dim": -1, "in_keys": [["agents", "observation"]]},
+    )
+    agents = [Learning(DQN(settings=REPLAY))] * 2
+    experiment = replace(MEADOW, agents=agents, transforms=[flat], callbacks=(), loggers=(), episodes=2)
+    run = cprl.run(experiment, tmp_path / "run", watch="off")
+    loaded = cprl.load(run, allow=["torchrl.envs.transforms:FlattenObservation"])
+    assert loaded.spaces.observation_shape == (45,)
+    wrong = replace(experiment, agents=MEADOW.agents)
+    with pytest.raises(ValueError, match="Conv"):
+        cprl.run(wrong, tmp_path / "wrong", watch="off")
+    assert not (tmp_path / "wrong").exists()
+
+
+def test_normalised_observations_are_floats_from_the_environment_to_the_stored_policy(tmp_path, capsys):
+    norm = Custom(
+        "torchrl.envs.transforms:ObservationNorm",
+        arguments={
+            "loc": 100.0,
+            "scale": 50.0,
+            "standard_normal": True,
+            "in_keys": [["agents", "observation"]],
+        },
+    )
+    for agent in (MEADOW.agents[0], DILEMMA.agents[1]):
+        experiment = replace(
+            MEADOW, agents=[agent] * 2, transforms=[norm], callbacks=(), loggers=(), episodes=2
+        )
+        run = cprl.run(experiment, tmp_path / type(agent.algorithm).__name__, watch="off")
+        loaded = cprl.load(run, allow=["torchrl.envs.transforms:ObservationNorm"])
+        assert loaded.spaces.observation_dtype == "float32"
+        assert loaded.spaces.observation_scale == 1.0
+        assert cprl.evaluate_run(loaded, episodes=1).trained
+
+
+def test_a_game_that_hides_its_state_is_refused_before_anything_is_written(tmp_path):
+    with pytest.raises(ValueError, match="does not hold all of its state"):
+        cprl.run(replace(DILEMMA, game=Dilemma(hides_state=True)), tmp_path / "run", watch="off")
+    assert not (tmp_path / "run").exists()
+
+
+def test_an_experiment_with_torchrls_own_engine_is_stopped_loaded_and_resumed(tmp_path, monkeypatch, capsys):
+    experiment = replace(
+        MEADOW,
+        agents=[Learning(DQN(settings=replace(REPLAY, hidden_cells=(8,)))), Scripted("greedy")],
+        transforms=(),
+        loggers=(),
+        engine="torchrl",
+        episodes=3,
+    )
+    whole = cprl.run(experiment, tmp_path / "whole", watch="off")
+    monkeypatch.setenv("STOP_AT_STEP", "33")
+    with pytest.raises(SystemExit):
+        cprl.run(experiment, tmp_path / "parts", watch="off")
+    monkeypatch.delenv("STOP_AT_STEP")
+    stopped = cprl.load(tmp_path / "parts", allow=ALLOW)
+    assert stopped.weights_from.name.startswith("training-000000000033")
+    assert cprl.evaluate_run(stopped, episodes=1).trained.keys() == {0, 1}
+    parts = cprl.run(experiment, tmp_path / "parts", watch="off", resume=True)
+    assert read_episodes(parts).equals(read_episodes(whole))
+    mine, theirs = (load_weights(run / "checkpoints" / "final.pt") for run in (parts, whole))
+    assert repr(mine) == repr(theirs)

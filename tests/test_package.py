@@ -1,0 +1,48 @@
+"""What the package shows from outside: its names, version and types."""
+
+import subprocess
+import sys
+from importlib.metadata import version
+from importlib.resources import files
+
+import pytest
+
+import cprl
+from cprl import cli
+
+
+def test_dir_shows_all_and_only_the_public_names():
+    assert dir(cprl) == sorted(cprl.__all__)
+    assert len(set(cprl.__all__)) == len(cprl.__all__)
+    for name in cprl.__all__:
+        assert getattr(cprl, name) is not None, name
+
+
+def test_what_is_imported_when_used_is_public():
+    assert set(cprl._IMPORTED_WHEN_USED) <= set(cprl.__all__)
+
+
+def test_a_name_that_is_not_there_is_an_attribute_error():
+    with pytest.raises(AttributeError, match="module 'cprl' has no attribute 'lode'"):
+        _ = cprl.lode
+
+
+def test_importing_cprl_leaves_the_viewer_and_stored_runs_out():
+    code = (
+        "import sys, cprl\n"
+        "heavy = {'rerun', 'pyarrow', 'matplotlib', 'cprl.stored', 'cprl.evaluation'} & set(sys.modules)\n"
+        "sys.exit(str(sorted(heavy)) if heavy else 0)"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr
+
+
+def test_the_version_is_that_of_the_installed_package(capsys, monkeypatch):
+    assert cprl.__version__ == version("cprl")
+    monkeypatch.setattr(sys, "argv", ["cprl", "--version"])
+    cli.main()
+    assert capsys.readouterr().out == f"cprl {version('cprl')}\n"
+
+
+def test_type_checkers_find_the_types():
+    assert files("cprl").joinpath("py.typed").is_file()

@@ -1,0 +1,189 @@
+"""What a learner cannot do as it is asked is refused by name before training."""
+
+from dataclasses import replace
+from functools import partial
+
+import pytest
+import torch
+from tensordict import TensorDict
+from tensordict.nn import TensorDictModule
+from test_networks import GAME, REPLAY, ROLLOUTS, SPACES, played
+from torchrl.objectives import ClipPPOLoss, HardUpdate, KLPENPPOLoss, SoftUpdate, ValueEstimators
+
+from cprl import CommonsEnv, Observation
+from cprl.algorithms import A2C, DQN, PPO, QMIX
+from cprl.algorithms.actor_critic import policy
+from cprl.learners.buffer.sampler import lane_buffer
+from cprl.learners.engine.base import ListEngine
+from cprl.learners.replay import ReplayLearner
+from cprl.learners.rollouts import RolloutLearner
+from cprl.learners.settings import TabularSettings
+from cprl.learners.single import dqn_loss
+from cprl.learners.tabular import TabularLearner
+
+FLOATS = replace(SPACES, observation_dtype="float32", observation_scale=1.0)
+
+
+def float_turn():
+    """A turn of a world whose observations a transform has normalised."""
+    turn = CommonsEnv(GAME, 1).rollout(1)[:, 0]
+    for agents in (turn["agents"], turn["next", "agents"]):
+        agents["observation"] = agents["observation"] / 255.0 - 0.5
+    return turn
+
+
+@pytest.mark.parametrize("kind", ["replay", "rollouts"])
+def test_floats_are_not_rounded_into_bytes_and_are_learned_from_where_the_spaces_say_so(kind):
+    def new(spaces):
+        algorithm = DQN(settings=REPLAY) if kind == "replay" else PPO(settings=ROLLOUTS)
+        return algorithm.make_learner(spaces, agents=(0, 1), replicas=1, engine="eager")
+
+    with pytest.raises(ValueError, match=r"observations are float32.*Spaces.observation_dtype"):
+        new(SPACES).store(float_turn())
+    with pytest.raises(ValueError, match=r"observations are uint8"):
+        new(FLOATS).store(CommonsEnv(GAME, 1).rollout(1)[:, 0])
+    learner, turn = new(FLOATS), float_turn()
+    learner.store(turn)
+    if kind == "replay":
+        kept = learner.buffer.storage.get(torch.zeros(2, 1, dtype=torch.int64))["observation"][:, 0]
+    else:
+        kept = learner._rollout["observation"][0]
+    assert torch.equal(kept, turn["agents", "observation"][0])
+
+
+def test_a_buffer_refuses_floats_too():
+    buffer = lane_buffer(seeds=[(0,)], transitions=20, batch_size=2, observation_shape=(2,))
+    turn = {"observation": torch.zeros(1, 2), "action": torch.zeros(1, dtype=torch.int64)}
+
+    flags = {name: torch.zeros(1, 1, dtype=torch.bool) for name in ("done", "terminated")}
+    following = {"observation": torch.zeros(1, 2), "reward": torch.zeros(1, 1), **flags}
+    with pytest.raises(ValueError, match="observations are float32 and float32; allowed: uint8"):
+        buffer.extend(TensorDict({**turn, "next": TensorDict(following, [1])}, [1])[None])
+
+
+@pytest.mark.parametrize("updater", [partial(SoftUpdate, tau=0.1), HardUpdate], ids=["soft", "hard"])
+@pytest.mark.parametrize("engine", [None, "list", "vmapped", "lane_axis"])
+def test_a_target_updater_of_torchrls_that_would_have_no_effect_is_refused(updater, engine):
+    updaters = []
+
+    def make_loss(network):
+        loss = dqn_loss(network, gamma=0.9)
+        updaters.append(updater(loss))
+        return loss
+
+    with pytest.raises(
+        ValueError, match=r"a SoftUpdate or HardUpdate was built on the DQNLoss; .* set tau or"
+    ):
+        ReplayLearner(SPACES, agents=(0,), replicas=1, settings=REPLAY, make_loss=make_loss, engine=engine)
+
+
+def test_a_target_updater_on_the_loss_of_an_engine_is_refused():
+    learner = DQN(settings=REPLAY).make_learner(SPACES, agents=(0,), replicas=1, engine="eager")
+    with pytest.raises(ValueError, match=r"a SoftUpdate or HardUpdate .* DQNLoss; .* set tau or"):
+        SoftUpdate(learner.engine.loss.module, tau=0.1)
+
+
+def rollout_learner(make_loss, *, settings=ROLLOUTS, **how):
+    how = {"agents": (0, 1), "replicas": 1, "compile": False, **how}
+    network = partial(PPO(settings=settings).make_network, SPACES)
+    return RolloutLearner(SPACES, settings=settings, make_network=network, make_loss=make_loss, **how)
+
+
+@pytest.mark.parametrize("algorithm", [PPO, A2C])
+@pytest.mark.parametrize("estimator", [ValueEstimators.VTrace, ValueEstimators.TD0, ValueEstimators.TDLambda])
+def test_advantages_by_another_estimator_than_that_of_the_loss_are_refused(algorithm, estimator):
+    def make_loss(network):
+        loss = algorithm(settings=ROLLOUTS).make_loss(network)
+        how = {"actor_network": loss.actor_network} if estimator is ValueEstimators.VTrace else {}
+        loss.make_value_estimator(estimator, **how)
+        return loss
+
+    with pytest.raises(ValueError, match=rf"has the value estimator {estimator}; allowed: GAE, "):
+        rollout_learner(make_loss)
+
+
+def test_gae_by_other_numbers_than_those_of_the_settings_is_refused():
+    def make_loss(network, **how):
+        loss = PPO(settings=ROLLOUTS).make_loss(network)
+        loss.make_value_estimator(ValueEstimators.GAE, **how)
+        return loss
+
+    for wrong, message in (
+        ({"gamma": 0.5, "lmbda": 0.95}, r"gamma=0.5; .* gamma=0.995"),
+        ({"gamma": 0.995, "lmbda": 0.5}, r"lmbda=0.5; .* gae_lambda=0.95"),
+    ):
+        with pytest.raises(ValueError, match=message):
+            rollout_learner(partial(make_loss, **wrong))
+    rollout_learner(partial(make_loss, gamma=0.995, lmbda=0.95))
+
+
+def test_a_loss_that_reads_steps_in_a_row_is_refused_with_replay():
+    def make_loss(network):
+        loss = dqn_loss(network, gamma=0.9)
+        loss.make_value_estimator(ValueEstimators.TDLambda, gamma=0.9, lmbda=0.9)
+        return loss
+
+    with pytest.raises(ValueError, match=r"DQNLoss has the value estimator ValueEstimators.TDLambda"):
+        ReplayLearner(SPACES, agents=(0,), replicas=1, settings=REPLAY, make_loss=make_loss)
+
+
+def kl_loss(network):
+
+    critic = TensorDictModule(network["critic"], ["observation"], ["state_value"])
+    return KLPENPPOLoss(policy(network["actor"]), critic, loss_critic_type="l2", dtarg=0.0001)
+
+
+def test_ppo_with_a_kl_penalty_gets_the_old_logits_and_each_agent_a_penalty_of_its_own():
+    with pytest.warns(RuntimeWarning, match="agents would share buffers that the loss changes: beta"):
+        learner = rollout_learner(kl_loss, replicas=2)
+    assert isinstance(learner.engine, ListEngine)
+    seen = []
+    update_from = learner.engine.update_from
+    learner.engine.update_from = lambda batch: seen.append(batch) or update_from(batch)
+    losses = played(learner)
+    assert torch.isfinite(torch.stack(losses)).all()
+    first = seen[0]
+    chosen = first["logits"].log_softmax(-1).gather(-1, first["action"].unsqueeze(-1)).squeeze(-1)
+    torch.testing.assert_close(chosen, first["action_log_prob"])
+    penalties = [loss.beta for loss in learner.engine.losses]
+    assert all(float(beta) != 1.0 for beta in penalties), "it adapts"
+    assert len({beta.data_ptr() for beta in penalties}) == 4
+    assert any("beta" in own for own in learner.state_dict()["update"]["losses"])
+
+
+def test_others_do_not_carry_logits():
+    learner = rollout_learner(PPO(settings=ROLLOUTS).make_loss)
+    assert not learner._reads_logits
+
+
+class Demanding(ClipPPOLoss):
+    """Reads what no rollout has."""
+
+    def forward(self, tensordict):
+        tensordict["weather"]
+        return super().forward(tensordict)
+
+
+def test_a_loss_that_reads_what_batches_do_not_have_is_refused_by_the_name_of_the_entry():
+    def make_loss(network):
+        made = PPO(settings=ROLLOUTS).make_loss(network)
+        return Demanding(made.actor_network, made.critic_network)
+
+    with pytest.raises(
+        ValueError, match=r"the loss reads an entry that its batches do not have: .*weather.*advantage"
+    ):
+        rollout_learner(make_loss)
+
+
+@pytest.mark.parametrize("observed", [{"scoreboard": True}, {"stock_gauge": True}])
+def test_what_no_network_sees_is_refused_but_tables_read_it(observed):
+    spaces = replace(GAME, observation=Observation(**observed)).spaces
+    (name,) = observed
+    for algorithm in (DQN(settings=REPLAY), PPO(settings=ROLLOUTS)):
+        with pytest.raises(ValueError, match=rf'agents observe \("agents", "{name}"\); allowed for networks'):
+            algorithm.make_network(spaces)
+        with pytest.raises(ValueError, match=rf'agents observe \("agents", "{name}"\); allowed for networks'):
+            algorithm.make_learner(spaces, agents=(0,), replicas=1)
+    with pytest.raises(ValueError, match="allowed for networks"):
+        QMIX(settings=REPLAY).make_learner(spaces, agents=(0, 1), replicas=1, reward_kind="team")
+    TabularLearner(spaces, agents=(0,), replicas=1, settings=TabularSettings())

@@ -1,0 +1,573 @@
+"""engine="torchrl": stock parts learn what the fast engine learns, are stopped and continue, and refuse."""
+
+from collections import deque
+from dataclasses import replace
+from io import BytesIO
+
+import pytest
+import torch
+from torchrl.data import LazyTensorStorage, TensorDictReplayBuffer
+from torchrl.data.replay_buffers import RandomSampler, RoundRobinWriter, Sampler, SamplerWithoutReplacement
+from torchrl.envs.transforms import MultiStepTransform, RewardScaling
+from torchrl.envs.utils import ExplorationType, set_exploration_type
+from torchrl.objectives import (
+    A2CLoss,
+    ClipPPOLoss,
+    DiscreteCQLLoss,
+    DiscreteIQLLoss,
+    DiscreteSACLoss,
+    DistributionalDQNLoss,
+    DQNLoss,
+    HardUpdate,
+    ReinforceLoss,
+    SoftUpdate,
+)
+from torchrl.objectives.value import GAE
+
+from cprl import CommonsEnv, Game, Rules, keys, maps
+from cprl.algorithms import (
+    A2C,
+    CQL,
+    DQN,
+    IPPO,
+    IQL,
+    MAPPO,
+    PPO,
+    QMIX,
+    SAC,
+    VDN,
+    DistributionalDQN,
+    DQNSettings,
+    Reinforce,
+    RolloutSettings,
+    Tabular,
+    TabularSettings,
+)
+from cprl.custom import Custom
+from cprl.learners.engine.functional import total
+from cprl.learners.torchrl import TorchRLReplayLearner, TorchRLRolloutLearner
+from cprl.policies.lanes import LaneActor
+from cprl.training import Training
+
+GAME = Game(
+    map=maps.parse(".A>.A\n.A.A.\n..<.A"),
+    rules=Rules(regrow_prob=(0.0, 0.2), window_rows=3, window_columns=5, episode_steps=23),
+)
+SPACES = GAME.spaces
+REPLAY = DQNSettings(
+    buffer_size=90, learning_rate=1e-3, hidden_cells=(16,), epsilon_hold_steps=20, epsilon_decay_steps=100
+)
+AS_RUN = {
+    "own_target_weights": True,
+    "relu_on_outputs": True,
+    "mean_over_all_outputs": True,
+    "glorot_uniform": True,
+    "adam_eps": 1e-7,
+}
+ROLLOUT = RolloutSettings(
+    rollout_steps=40, minibatch_size=10, epochs=4, learning_rate=1e-3, hidden_cells=(16,)
+)
+ONE_EPOCH = RolloutSettings(rollout_steps=10, minibatch_size=10, epochs=1, hidden_cells=(16,))
+HOW = {"agents": (0, 1), "replicas": 2, "seed": 7}
+
+OFF_POLICY = {
+    "published DQN": DQN(settings=REPLAY),
+    "DQN as run": DQN(settings=REPLAY.__class__(**{**vars(REPLAY), **AS_RUN})),
+    "double DQN": DQN(settings=REPLAY, double=True),
+    "Huber": DQN(settings=REPLAY, loss_function="smooth_l1"),
+    "C51": DistributionalDQN(settings=REPLAY, atoms=11, highest_return=20.0),
+    "CQL": CQL(settings=REPLAY),
+    "SAC": SAC(settings=REPLAY),
+    "IQL": IQL(settings=REPLAY),
+}
+ON_POLICY = {
+    "PPO": PPO(settings=ROLLOUT),
+    "A2C": A2C(settings=ONE_EPOCH),
+    "REINFORCE": Reinforce(settings=ONE_EPOCH),
+}
+LOSSES = {
+    **dict.fromkeys(("published DQN", "DQN as run", "double DQN", "Huber"), DQNLoss),
+    "C51": DistributionalDQNLoss,
+    "CQL": DiscreteCQLLoss,
+    "SAC": DiscreteSACLoss,
+    "IQL": DiscreteIQLLoss,
+    "PPO": ClipPPOLoss,
+    "A2C": A2CLoss,
+    "REINFORCE": ReinforceLoss,
+}
+
+DEMANDED = ("published DQN", "DQN as run", "double DQN", "PPO", "A2C")
+UPDATES = {name: 200 if name in DEMANDED else 60 for name in LOSSES}
+"""Updates after which weights are compared; fewer where an update takes long."""
+
+
+def changed(settings, **changes):
+    return settings.__class__(**{**vars(settings), **changes})
+
+
+def turns(actor, *, seed=3):
+    """Endless turns of `GAME` in a world for each replica, played by an actor of both agents."""
+    env = CommonsEnv(GAME, 2, seed=seed)
+    moment = env.reset()
+    while True:
+        with torch.no_grad(), set_exploration_type(ExplorationType.RANDOM):
+            action = actor.choose(moment[keys.OBSERVATION])
+        now, moment = env.step_and_maybe_reset(moment.set(keys.ACTION, action))
+        yield now
+
+
+def take(learner, turn):
+    """What a training does with a turn; the losses."""
+    learner.store(turn)
+    losses = learner.update()
+    learner.end_episode(turn["next", "done"][:, 0])
+    return losses
+
+
+class Replayed(Sampler):
+    """Gives out the places that another sampler drew for an agent."""
+
+    def __init__(self):
+        self.places = deque()
+
+    def sample(self, storage, batch_size):
+        return self.places.popleft(), {}
+
+    def _empty(self):
+        pass
+
+    def state_dict(self):
+        return {}
+
+    def load_state_dict(self, state_dict):
+        pass
+
+    def dumps(self, path):
+        pass
+
+    def loads(self, path):
+        pass
+
+
+def both(algorithm):
+    """The fast engine's learner, and the stock one that is handed the places that the fast one draws."""
+    fast = algorithm.make_learner(SPACES, engine="eager", **HOW)
+    samplers = [Replayed() for _ in range(4)]
+    stock = algorithm.make_learner(SPACES, engine="torchrl", make_sampler=samplers.__getitem__, **HOW)
+    if isinstance(algorithm.settings, DQNSettings):
+        draw = fast.buffer.sampler.draw
+
+        def recorded(storage):
+            places = draw(storage)
+            for sampler, own in zip(samplers, places, strict=True):
+                sampler.places.append(own)
+            return places
+
+        fast.buffer.sampler.draw = recorded
+    else:
+        following, size = fast.rng.next, algorithm.settings.minibatch_size
+
+        def recorded():
+            numbers = following()
+            for sampler, own in zip(samplers, numbers.argsort(-1), strict=True):
+                sampler.places.extend(own.split(size))
+            return numbers
+
+        fast.rng.next = recorded
+    return fast, stock
+
+
+def assert_same_weights(fast, stock, tolerance):
+    ours, theirs = fast.networks(), stock.networks()
+    assert ours.keys() == theirs.keys()
+    for name, network in ours.items():
+        for mine, other in zip(
+            network.state_dict().values(), theirs[name].state_dict().values(), strict=True
+        ):
+            torch.testing.assert_close(mine, other, rtol=tolerance, atol=tolerance)
+
+
+def first_and_slow(names, *first):
+    """These names for the default tests, all others for `make test-slow`."""
+    return [pytest.param(name, marks=[] if name in first else pytest.mark.slow) for name in names]
+
+
+@pytest.mark.parametrize("name", first_and_slow(OFF_POLICY, "published DQN"))
+def test_from_the_same_draws_both_engines_have_the_same_weights_after_updates_from_replay(name):
+    fast, stock = both(OFF_POLICY[name])
+    assert_same_weights(fast, stock, 0.0)
+    first = [own.clone() for network in stock.networks().values() for own in network.parameters()]
+    played, updates = turns(fast.actor), 0
+    while updates < UPDATES[name]:
+        turn = next(played)
+        losses = take(fast, turn), take(stock, turn)
+        if losses[0] is None:
+            assert losses[1] is None
+            continue
+        torch.testing.assert_close(*losses, rtol=1e-4, atol=1e-5)
+        updates += 1
+    assert_same_weights(fast, stock, 1e-5)
+    torch.testing.assert_close(fast.values(turn), stock.values(turn), equal_nan=True, rtol=1e-4, atol=1e-5)
+    last = [own for network in stock.networks().values() for own in network.parameters()]
+    assert all((before - after).abs().max() > 1e-4 for before, after in zip(first, last, strict=True))
+
+
+@pytest.mark.parametrize("name", first_and_slow(ON_POLICY, "PPO"))
+def test_from_the_same_draws_both_engines_have_the_same_weights_after_updates_from_rollouts(name):
+    fast, stock = both(ON_POLICY[name])
+    settings = ON_POLICY[name].settings
+    assert_same_weights(fast, stock, 0.0)
+    played, updates = turns(fast.actor), 0
+    while updates < UPDATES[name]:
+        turn = next(played)
+        losses = take(fast, turn), take(stock, turn)
+        if losses[0] is not None:
+            torch.testing.assert_close(*losses, rtol=1e-4, atol=1e-5)
+            updates += settings.epochs * settings.rollout_steps // settings.minibatch_size
+    assert_same_weights(fast, stock, 1e-5)
+    torch.testing.assert_close(fast.values(turn), stock.values(turn), rtol=1e-4, atol=1e-5)
+
+
+@pytest.mark.parametrize("name", [*OFF_POLICY, *ON_POLICY])
+def test_every_part_is_torchrls_or_torchs_own(name):
+    algorithm = {**OFF_POLICY, **ON_POLICY}[name]
+    learner = algorithm.make_learner(SPACES, engine="torchrl", **HOW)
+    on_policy = name in ON_POLICY
+    assert type(learner) is (TorchRLRolloutLearner if on_policy else TorchRLReplayLearner)
+    assert len(learner.buffers) == len(learner.stock) == 4
+    for buffer in learner.buffers:
+        assert type(buffer) is TensorDictReplayBuffer
+        assert type(buffer.storage) is LazyTensorStorage
+        assert type(buffer.sampler) is (SamplerWithoutReplacement if on_policy else RandomSampler)
+        assert isinstance(buffer.writer, RoundRobinWriter)
+    for agent in learner.stock.each:
+        assert isinstance(agent.loss, LOSSES[name])
+        assert type(agent.optimizer) is torch.optim.Adam
+    if on_policy:
+        assert all(type(estimator) is GAE for estimator in learner.estimators)
+    else:
+        assert all(type(updater) is HardUpdate for updater in learner.updaters)
+
+
+def resumable(algorithm, **how):
+    return algorithm.make_learner(SPACES, engine="torchrl", **HOW, **how)
+
+
+RESUMED = {
+    **OFF_POLICY,
+    **ON_POLICY,
+    "everything of replay": DQN(
+        settings=changed(
+            REPLAY,
+            n_steps=3,
+            tau=0.05,
+            updates_per_step=2,
+            optimizer="rmsprop",
+            replay_transforms=(
+                Custom(
+                    "torchrl.envs.transforms:RewardScaling",
+                    {"loc": 0.0, "scale": 0.5, "in_keys": [["next", "reward"]]},
+                ),
+            ),
+        )
+    ),
+}
+
+
+def leaves(state):
+    """Every entry of a state, by where it stands."""
+    return dict(torch.utils._pytree.tree_flatten_with_path(state)[0])
+
+
+@pytest.mark.parametrize(
+    ("name", "steps"),
+    [
+        *(pytest.param(name, 95, marks=[] if name == "PPO" else pytest.mark.slow) for name in RESUMED),
+        ("published DQN", 1),
+        ("everything of replay", 41),
+        ("PPO", 41),
+    ],
+)
+def test_a_stopped_learner_continues_bit_for_bit(name, steps):
+    whole, stopped, again = (resumable(RESUMED[name]) for _ in range(3))
+    played = turns(LaneActor(None, SPACES.actions, seeds=[(r, a) for r in (0, 1) for a in (0, 1)], agents=2))
+    before = [next(played).clone() for _ in range(steps)]
+    after = [next(played).clone() for _ in range(35)]
+    for turn in before:
+        take(whole, turn)
+        take(stopped, turn)
+    kept = BytesIO()
+    torch.save(stopped.state_dict(), kept)
+    kept.seek(0)
+    again.load_state_dict(torch.load(kept, weights_only=True))
+    for turn in after:
+        ours, theirs = take(whole, turn), take(again, turn)
+        assert (ours is None) == (theirs is None)
+        assert ours is None or torch.equal(ours, theirs)
+        with set_exploration_type(ExplorationType.RANDOM):
+            seen = turn[keys.OBSERVATION]
+            assert torch.equal(whole.actor.choose(seen), again.actor.choose(seen))
+    ours, theirs = leaves(whole.state_dict()), leaves(again.state_dict())
+    assert ours.keys() == theirs.keys()
+    for where, own in ours.items():
+        other = theirs[where]
+        assert torch.equal(own, other) if isinstance(own, torch.Tensor) else own == other, where
+
+
+def test_a_stopped_training_continues_bit_for_bit_from_what_a_checkpoint_keeps():
+    def training():
+        groups = {(0,): (DQN, REPLAY), (1,): (PPO, ROLLOUT)}
+        learners = {
+            agents: kind(settings=settings).make_learner(
+                SPACES, agents=agents, replicas=2, seed=1, engine="torchrl"
+            )
+            for agents, (kind, settings) in groups.items()
+        }
+        return Training(CommonsEnv(GAME, 2, seed=1), learners, episodes=9)
+
+    whole, stopped, again = training(), training(), training()
+    for _ in range(57):
+        whole.step()
+        stopped.step()
+    kept = BytesIO()
+    torch.save(stopped.state_dict(), kept)
+    kept.seek(0)
+    again.load_state_dict(torch.load(kept, weights_only=True))
+    while not whole.is_over:
+        whole.step()
+        again.step()
+    assert again.is_over
+    for agents, learner in whole.learners.items():
+        other = again.learners[agents].networks()
+        for name, network in learner.networks().items():
+            for mine, theirs in zip(network.parameters(), other[name].parameters(), strict=True):
+                assert torch.equal(mine, theirs)
+
+
+@pytest.mark.parametrize("name", ["published DQN", "PPO"])
+def test_a_replica_learns_the_same_whichever_others_are_trained_with_it(name):
+    algorithm = {**OFF_POLICY, **ON_POLICY}[name]
+    together = algorithm.make_learner(SPACES, engine="torchrl", **HOW)
+    alone = algorithm.make_learner(
+        SPACES, engine="torchrl", agents=(0, 1), replicas=1, first_replica=1, seed=HOW["seed"]
+    )
+    played = turns(together.actor)
+    for _ in range(90):
+        turn = next(played)
+        take(together, turn)
+        torch.rand(1)  # whoever else draws
+        take(alone, turn[1:])
+    for name, network in alone.networks().items():
+        assert name.startswith("replica_1/")
+        for mine, theirs in zip(network.parameters(), together.networks()[name].parameters(), strict=True):
+            assert torch.equal(mine, theirs)
+
+
+def test_hard_targets_are_copied_after_every_third_episode_of_each_replica():
+    learner = resumable(DQN(settings=changed(REPLAY, own_target_weights=True)))
+    played = turns(learner.actor)
+    for _ in range(30):
+        learner.store(next(played))
+        learner.update()
+
+    def copied():
+        return [
+            all(
+                torch.equal(own, target)
+                for own, target in zip(
+                    agent.loss.value_network_params.values(True, True),
+                    agent.loss.target_value_network_params.values(True, True),
+                    strict=True,
+                )
+            )
+            for agent in learner.stock.each
+        ]
+
+    for episode in range(1, 4):
+        learner.end_episode(torch.tensor([True, False]))
+        assert copied() == [episode == 3] * 2 + [False] * 2
+    learner.end_episode(torch.tensor([False, True]))
+    assert copied() == [True, True, False, False]
+
+
+def test_soft_targets_move_by_tau_after_every_update_and_not_at_the_end_of_episodes():
+    learner = resumable(DQN(settings=changed(REPLAY, tau=0.25, target_every_episodes=1)))
+    played = turns(learner.actor)
+    for _ in range(16):
+        learner.store(next(played))
+    agent = learner.stock.each[0]
+
+    def weights(group):
+        return torch.cat([own.data.flatten() for own in getattr(agent.loss, group).values(True, True)])
+
+    assert type(learner.updaters[0]) is SoftUpdate
+    before = weights("target_value_network_params")
+    learner.update()
+    wanted = before + 0.25 * (weights("value_network_params") - before)
+    torch.testing.assert_close(weights("target_value_network_params"), wanted)
+    moved = weights("target_value_network_params")
+    learner.end_episode(torch.tensor([True, True]))
+    assert torch.equal(weights("target_value_network_params"), moved)
+
+
+def test_n_steps_sum_the_rewards_of_an_episode_and_keep_its_last_flags():
+    # Each stored transition holds r_t + gamma r_t+1 + gamma^2 r_t+2, cut where the episode ends, the
+    # observation after the last step that it sums, and the flags of that step.
+    settings = changed(REPLAY, n_steps=3, gamma=0.5, buffer_size=100)
+    learner = resumable(DQN(settings=settings))
+    assert isinstance(learner.buffers[0].transform[0], MultiStepTransform)
+    played = turns(learner.actor)
+    came = [next(played).clone() for _ in range(60)]
+    for turn in came:
+        learner.store(turn)
+    for replica, agent in ((0, 1), (1, 0)):
+        buffer = learner.buffers[2 * replica + agent]
+        kept = buffer.storage[:]
+        assert len(kept) == 60 - 3
+        for step in range(len(kept)):
+            reward, last = 0.0, step
+            for ahead in range(3):
+                last = step + ahead
+                reward += 0.5**ahead * came[last]["next", "agents", "reward"][replica, agent].item()
+                if came[last]["next", "done"][replica].item():
+                    break
+            assert kept["next", "reward"][step].item() == pytest.approx(reward)
+            assert kept["steps_to_next_obs"][step].item() == last - step + 1
+            seen = came[last]["next", "agents", "observation"][replica, agent]
+            assert torch.equal(kept["next", "observation"][step], seen)
+            assert torch.equal(kept["observation"][step], came[step][keys.OBSERVATION][replica, agent])
+            for flag in ("done", "terminated"):
+                assert torch.equal(kept["next", flag][step], came[last]["next", flag][replica])
+
+
+@pytest.mark.parametrize("name", [name for name in OFF_POLICY if name != "IQL"])
+def test_what_follows_n_steps_is_discounted_by_as_many(name):
+    algorithm = replace(
+        OFF_POLICY[name], settings=changed(OFF_POLICY[name].settings, n_steps=3, gamma=0.5, batch_size=16)
+    )
+    learner = resumable(algorithm)
+    played = turns(learner.actor)
+    for _ in range(30):
+        take(learner, next(played))
+    batch, loss = learner.buffers[0].sample(), learner.stock.each[0].loss
+
+    def with_steps(steps):
+        changed = batch.clone().set("steps_to_next_obs", torch.full_like(batch["steps_to_next_obs"], steps))
+        return total(loss(changed)).item()
+
+    assert with_steps(1) != with_steps(3)
+
+
+def test_n_steps_are_refused_for_a_loss_that_takes_no_notice_of_them():
+    with pytest.raises(ValueError, match=r"n_steps is 3; allowed: 1, because .*DiscreteIQLLoss discounts"):
+        resumable(IQL(settings=changed(REPLAY, n_steps=3)))
+
+
+def test_replay_transforms_change_what_is_sampled():
+    scale = Custom(
+        "torchrl.envs.transforms:RewardScaling", {"loc": 0.0, "scale": 10.0, "in_keys": [["next", "reward"]]}
+    )
+    learner = resumable(DQN(settings=changed(REPLAY, replay_transforms=(scale,), batch_size=200)))
+    played = turns(learner.actor)
+    for _ in range(40):
+        learner.store(next(played))
+    buffer = learner.buffers[0]
+    assert [type(own) for own in buffer.transform] == [RewardScaling]
+    sampled = buffer.sample()
+    assert sampled["next", "reward"].max() > 0
+    assert torch.equal(sampled["next", "reward"], 10 * buffer.storage[:]["next", "reward"][sampled["index"]])
+
+
+def test_updates_per_step_and_the_optimiser_are_those_of_the_settings():
+    kinds = {
+        "adam": torch.optim.Adam,
+        "adamw": torch.optim.AdamW,
+        "rmsprop": torch.optim.RMSprop,
+        "sgd": torch.optim.SGD,
+    }
+    for name, kind in kinds.items():
+        learner = resumable(DQN(settings=changed(REPLAY, optimizer=name, updates_per_step=3)))
+        optimizer = learner.stock.each[0].optimizer
+        assert type(optimizer) is kind
+        assert optimizer.param_groups[0]["lr"] == REPLAY.learning_rate
+        assert optimizer.param_groups[0].get("eps", REPLAY.adam_eps) == REPLAY.adam_eps
+        steps = []
+        optimizer.register_step_post_hook(lambda *_, steps=steps: steps.append(1))
+        played = turns(learner.actor)
+        for _ in range(18):
+            take(learner, next(played))
+        assert len(steps) == 3 * 3, "from the 16th turn on"
+
+
+@pytest.mark.parametrize(
+    "team",
+    [
+        VDN(settings=REPLAY),
+        QMIX(settings=REPLAY),
+        MAPPO(settings=ROLLOUT),
+        IPPO(settings=ROLLOUT),
+        Tabular(settings=TabularSettings()),
+    ],
+    ids=lambda team: type(team).__name__,
+)
+def test_teams_and_tables_are_refused_by_name(team):
+    match = f'{type(team).__name__} does not support engine="torchrl", .*"compiled" or "eager"'
+    with pytest.raises(ValueError, match=match):
+        team.make_learner(SPACES, engine="torchrl", reward_kind="team", **HOW)
+
+
+def test_other_engines_settings_and_networks_are_refused():
+    with pytest.raises(ValueError, match="engine is 'quick'; allowed: compiled, eager, torchrl"):
+        DQN(settings=REPLAY).make_learner(SPACES, engine="quick", **HOW)
+    with pytest.raises(ValueError, match="optimizer is 'lion'; allowed: adam, adamw, rmsprop, sgd"):
+        resumable(DQN(settings=changed(REPLAY, optimizer="lion")))
+    for name in ("updates_per_step", "n_steps", "target_every_episodes"):
+        with pytest.raises(ValueError, match=f"{name} is 0; allowed: an integer >= 1"):
+            resumable(DQN(settings=changed(REPLAY, **{name: 0})))
+    with pytest.raises(ValueError, match="ClipPPOLoss is on-policy and cannot learn from a replay buffer"):
+        TorchRLReplayLearner(
+            SPACES,
+            settings=REPLAY,
+            make_network=lambda: PPO(settings=ROLLOUT).make_network(SPACES),
+            make_loss=PPO(settings=ROLLOUT).make_loss,
+            **HOW,
+        )
+    with pytest.raises(ValueError, match=r'an agent has the networks .*; allowed: "actor" and "critic"'):
+        TorchRLRolloutLearner(
+            SPACES,
+            settings=ROLLOUT,
+            make_network=lambda: DQN(settings=REPLAY).make_network(SPACES),
+            make_loss=PPO(settings=ROLLOUT).make_loss,
+            **HOW,
+        )
+    with pytest.raises(
+        MemoryError, match=r"4 agents x 1,000,000,000,000 transitions take .* smaller buffer_size"
+    ):
+        resumable(DQN(settings=changed(REPLAY, buffer_size=10**12)))
+
+
+def test_targets_are_refused_for_a_loss_that_has_none():
+    def without_targets(network):
+        loss = DQNLoss(
+            DQN(settings=REPLAY).make_loss(network).value_network,
+            delay_value=False,
+            loss_function="l2",
+            action_space="categorical",
+        )
+        loss.make_value_estimator(gamma=0.9)
+        return loss
+
+    def make(**changes):
+        return TorchRLReplayLearner(
+            SPACES,
+            settings=changed(REPLAY, **changes),
+            make_network=lambda: DQN(settings=REPLAY).make_network(SPACES),
+            make_loss=without_targets,
+            **HOW,
+        )
+
+    assert make().updaters == [None] * 4
+    with pytest.raises(ValueError, match=r"tau is 0\.1, and the loss has no targets"):
+        make(tau=0.1)
+    with pytest.raises(ValueError, match="own_target_weights is True, and the loss has no targets"):
+        make(own_target_weights=True)
