@@ -20,6 +20,7 @@ from cprl.learners.rollouts import RolloutLearner
 from cprl.learners.settings import TabularSettings
 from cprl.learners.single import dqn_loss
 from cprl.learners.tabular import TabularLearner
+from cprl.learners.torchrl.rollouts import TorchRLRolloutLearner
 
 FLOATS = replace(SPACES, observation_dtype="float32", observation_scale=1.0)
 
@@ -100,6 +101,15 @@ def test_advantages_by_another_estimator_than_that_of_the_loss_are_refused(algor
 
     with pytest.raises(ValueError, match=rf"has the value estimator {estimator}; allowed: GAE, "):
         rollout_learner(make_loss)
+    with pytest.raises(ValueError, match=rf"has the value estimator {estimator}; allowed: GAE, "):
+        TorchRLRolloutLearner(
+            SPACES,
+            agents=(0, 1),
+            replicas=1,
+            settings=ROLLOUTS,
+            make_network=partial(PPO(settings=ROLLOUTS).make_network, SPACES),
+            make_loss=make_loss,
+        )
 
 
 def test_gae_by_other_numbers_than_those_of_the_settings_is_refused():

@@ -100,7 +100,7 @@ class RolloutLearner:
         """The engine of all lanes, with new networks."""
         settings = self.settings
         networks = self._lanes.new_networks(WEIGHTS, device)
-        _refuse_other_parts(networks[0])
+        refuse_other_parts(networks[0])
         loss = make_loss(deepcopy(networks[0]))
         refuse_other_advantages(loss, settings)
         self._reads_logits = reads(loss, "logits")
@@ -273,7 +273,8 @@ def _like(column: Tensor, value: Tensor) -> Tensor:
     return column.reshape(*column.shape, *one_each).expand_as(value)
 
 
-def _refuse_other_parts(network: nn.Module) -> None:
+def refuse_other_parts(network: nn.Module) -> None:
+    """Raises a ValueError if the networks of an agent are not "actor" and "critic"."""
     parts = list(parts_of(network))
     if not isinstance(network, AgentNetworks) or parts[:2] != ["actor", "critic"]:
         raise ValueError(f'an agent has the networks {parts}; allowed: "actor" and "critic"')

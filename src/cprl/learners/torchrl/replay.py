@@ -240,9 +240,6 @@ def _target_updater(loss: LossModule, settings: DQNSettings) -> TargetNetUpdater
 
 
 def _check(settings: DQNSettings, loss: LossModule) -> None:
-    for name in ("updates_per_step", "n_steps", "target_every_episodes"):
-        if getattr(settings, name) < 1:
-            raise ValueError(f"{name} is {getattr(settings, name)}; allowed: an integer >= 1")
     for name, default in (("tau", None), ("own_target_weights", False)):
         if getattr(settings, name) != default and not targets_of(loss):
             raise ValueError(f"{name} is {getattr(settings, name)}, and the loss has no targets")

@@ -9,20 +9,19 @@ from tensordict.nn import TensorDictModule
 from torch import Tensor, nn
 from torchrl.data import LazyTensorStorage, TensorDictReplayBuffer
 from torchrl.data.replay_buffers import SamplerWithoutReplacement
+from torchrl.objectives import LossModule
 from torchrl.objectives.value import GAE
 
 from cprl.learners.engine.functional import MakeLoss
+from cprl.learners.engine.refusals import refuse_other_advantages
 from cprl.learners.lanes import Lanes
+from cprl.learners.rollouts import ACTOR, CRITIC, refuse_other_parts
 from cprl.learners.settings import RolloutSettings
 from cprl.learners.torchrl.agents import MakeSampler, StockAgent, StockAgents
 from cprl.learners.torchrl.buffers import nested, plain
 from cprl.learners.transitions import RewardKind
-from cprl.networks.agent import AgentNetworks, parts_of
 from cprl.policies.lanes import LaneActor
 from cprl.spaces import Spaces
-
-ACTOR, CRITIC = range(2)
-"""Positions of the actor and the critic among an agent's networks."""
 
 
 class TorchRLRolloutLearner:
@@ -49,7 +48,8 @@ class TorchRLRolloutLearner:
         device: the torch device of networks, buffers and updates.
 
     Raises:
-        ValueError: if the networks are not "actor" and "critic".
+        ValueError: if the networks are not "actor" and "critic", and for a loss that needs other advantages
+            than GAE's with these settings.
     """
 
     def __init__(
@@ -80,7 +80,7 @@ class TorchRLRolloutLearner:
         )
         self.stock = StockAgents(
             self._lanes,
-            lambda network: make_loss(_actor_and_critic(network)),
+            lambda network: _on_policy(make_loss, network, settings),
             optimizer=settings.optimizer,
             learning_rate=settings.learning_rate,
             eps=settings.adam_eps,
@@ -204,8 +204,9 @@ def _add_old_policy(rollout: TensorDict, agent: StockAgent) -> None:
     rollout.update({"logits": logits, "action_log_prob": chosen})
 
 
-def _actor_and_critic(network: nn.Module) -> nn.Module:
-    parts = list(parts_of(network))
-    if not isinstance(network, AgentNetworks) or parts[:2] != ["actor", "critic"]:
-        raise ValueError(f'an agent has the networks {parts}; allowed: "actor" and "critic"')
-    return network
+def _on_policy(make_loss: MakeLoss, network: nn.Module, settings: RolloutSettings) -> LossModule:
+    """Makes the loss; refuses other networks than "actor" and "critic", and other advantages than GAE's."""
+    refuse_other_parts(network)
+    loss = make_loss(network)
+    refuse_other_advantages(loss, settings)
+    return loss
