@@ -1,0 +1,1 @@
+"""Faults: trainings that are killed, starved of space, locked out or spoilt; see `docs/reliability.md`."""
