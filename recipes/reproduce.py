@@ -79,7 +79,8 @@ def run(name: str, common: Sequence[str], *, runs: Path, results: Path) -> None:
     if not (directory / "report.json").exists():
         runs.mkdir(parents=True, exist_ok=True)
         command = [sys.executable, str(Path(__file__).with_name(f"{recipe}.py")), *arguments, *common]
-        command += ["--out", str(directory), *(["--resume"] if (directory / "recipe.json").exists() else [])]
+        command += ["--no-keep-checkpoint", "--out", str(directory)]
+        command += ["--resume"] if (directory / "recipe.json").exists() else []
         print(f"{name}: see {log}", flush=True)
         with open(log, "a") as told:
             done = subprocess.run(command, stdout=told, stderr=subprocess.STDOUT, check=False)

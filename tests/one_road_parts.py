@@ -1,6 +1,7 @@
 """What the experiments of `test_one_road.py` name as `Custom`: a transform, a callback and a game."""
 
 import os
+import shutil
 import signal
 from dataclasses import asdict, dataclass
 from typing import Any
@@ -52,6 +53,37 @@ class Bored:
 
     def load_state_dict(self, state) -> None:
         self.episodes = state["episodes"]
+
+
+class Stopping:
+    """Stops the process at the step in STOP_AT_STEP."""
+
+    def __init__(self) -> None:
+        self.steps = 0
+
+    def on_step(self, batch) -> None:
+        self.steps += 1
+        if self.steps == int(os.environ.get("STOP_AT_STEP", "-1")):
+            os.kill(os.getpid(), signal.SIGTERM)
+
+
+class Deleting:
+    """Deletes the directory in DELETE at step 30, and makes it again where a 1 follows."""
+
+    def __init__(self) -> None:
+        self.steps = 0
+
+    def on_step(self, batch) -> None:
+        self.steps += 1
+        run, again = os.environ["DELETE"].split()
+        if self.steps == 30:
+            shutil.rmtree(run)
+            if again == "1":
+                os.mkdir(run)
+
+
+class NoLogger:
+    """Lacks the methods of a logger."""
 
 
 @dataclass(frozen=True)

@@ -130,6 +130,8 @@ def test_it_survives_sigkill_at_twenty_random_moments(tmp_path):
 class State:
     """Stands for a training."""
 
+    is_ending = is_over = False
+
     def __init__(self, steps=0):
         self.steps, self.loaded = steps, None
 
@@ -159,6 +161,7 @@ def test_the_newest_two_are_kept_and_the_newest_is_gone_on_from(tmp_path):
 
 def test_it_saves_at_its_interval_and_not_before(tmp_path):
     often, seldom = quiet(tmp_path / "a", every_s=1e-9), quiet(tmp_path / "b", every_s=1000)
+    (tmp_path / "a").mkdir()
     for steps in (1, 2):
         often.after_step(State(steps))
         seldom.after_step(State(steps))

@@ -262,7 +262,14 @@ def test_a_recipe_runs_its_experiment(runs):
     ((given, out, how),) = runs
     assert given == replace(experiment(), seed=3)
     assert out == Path("here")
-    assert how == {"resume": True, "watch": "file", "command": line, "allow": ("a:B", "c:D")}
+    assert how == {
+        "resume": True,
+        "take_over": False,
+        "keep_checkpoint": True,
+        "watch": "file",
+        "command": line,
+        "allow": ("a:B", "c:D"),
+    }
 
 
 def test_cprl_run_trains_the_experiment_of_a_recipe_or_resumes_its_run(runs, tmp_path, monkeypatch):

@@ -252,15 +252,19 @@ def test_a_run_that_cannot_be_loaded_says_which_file_and_why(tmp_path, capsys):
     content = weights.read_bytes()
     for spoilt in (content[:-300], b"something else", b""):
         weights.write_bytes(spoilt)
-        with pytest.raises(ValueError, match=r"final\.pt holds no weights of this run: "):
+        with pytest.raises(ValueError, match=r"final\.pt is damaged or was changed: its checksum is"):
             cprl.load(run)
+        manifest = (run / "manifest.json").rename(run / "elsewhere")
+        with pytest.raises(ValueError, match=r"final\.pt holds no weights: "):
+            cprl.load(run)
+        manifest.rename(run / "manifest.json")
     weights.unlink()
     with pytest.raises(
         ValueError, match=r"final\.pt is not there, nor a readable checkpoint: has .* been tr"
     ):
         cprl.load(run)
     (run / "checkpoints" / "best.pt").unlink()
-    with pytest.raises(ValueError, match=r"best\.pt holds no weights of this run: .*No such file"):
+    with pytest.raises(ValueError, match=r"best\.pt holds no weights: .*No such file"):
         cprl.load(run, weights="best")
     told = json.loads((run / "recipe.json").read_text())
     told["experiment"]["game"]["rules"]["hits_to_tag"] = 0

@@ -95,7 +95,7 @@ def test_what_was_added_can_be_read_while_the_run_goes_on_and_when_it_is_over(tm
             table.add(an_episode(number))
             assert episode_numbers(read_episodes(tmp_path)) == list(range(number + 1))
         going_on = read_episodes(tmp_path)
-    assert [path.name for path in tmp_path.iterdir()] == ["episodes.parquet"]
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["episodes.parquet", "manifest.json"]
     assert str(read_episodes(tmp_path).to_pylist()) == str(going_on.to_pylist())
 
 
@@ -175,7 +175,7 @@ def test_a_disk_that_is_full_at_the_end_keeps_the_journal_and_closing_can_be_tri
     assert [path.name for path in tmp_path.iterdir()] == ["episodes.arrows"]
     assert episode_numbers(read_episodes(tmp_path)) == [0]
     table.close()
-    assert [path.name for path in tmp_path.iterdir()] == ["episodes.parquet"]
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["episodes.parquet", "manifest.json"]
 
 
 def test_a_journal_that_lost_rows_is_never_deleted(tmp_path):

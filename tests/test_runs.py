@@ -11,7 +11,7 @@ from cprl.algorithms import DQN
 from cprl.custom import Custom
 from cprl.experiment import Experiment
 from cprl.population import Frozen, Learning
-from cprl.runs.directory import read_recipe, resume_command, start_run
+from cprl.runs.directory import read_recipe, refuse_another_run, resume_command, start_run
 
 AGENT = Learning(DQN(settings=presets.dqn_settings("commons")))
 EXPERIMENT = Experiment(
@@ -28,11 +28,16 @@ def begin(run, experiment=EXPERIMENT, **how):
     return start_run(run, experiment.name, experiment.to_recipe, **how)
 
 
+def resume(run, experiment=EXPERIMENT):
+    return refuse_another_run(run, experiment.to_recipe)
+
+
 def test_a_stopped_run_is_resumed_by_the_same_recipe(tmp_path):
     run = begin(tmp_path / "run")
     written = (run / "recipe.json").read_text()
     (run / "episodes.arrows").touch()
-    assert begin(run, resume=True) == run
+    assert resume(run) == 3
+    assert resume(run, replace(EXPERIMENT, episodes=5)) == 3, "it can be extended"
     assert (run / "recipe.json").read_text() == written
     with pytest.raises(FileExistsError, match="is not empty"):
         begin(run)
@@ -52,6 +57,7 @@ def test_the_recipe_of_a_run_is_its_experiment(tmp_path, monkeypatch):
     ("change", "message"),
     [
         ({"seed": 2}, r"was started with another recipe: experiment\.seed was 1, is 2$"),
+        ({"episodes": 2}, "has 3 episodes, which cannot become 2; allowed: as many, or more to extend it"),
         ({"name": "two_complex"}, "is a run of 'commons'; this is 'two_complex'"),
         (
             {"game": presets.game("commons", variant="as_run")},
@@ -62,20 +68,20 @@ def test_the_recipe_of_a_run_is_its_experiment(tmp_path, monkeypatch):
 def test_another_recipe_is_refused_by_what_differs(change, message, tmp_path):
     run = begin(tmp_path / "run")
     with pytest.raises(ValueError, match=message):
-        begin(run, replace(EXPERIMENT, **change), resume=True)
+        resume(run, replace(EXPERIMENT, **change))
 
 
 def test_a_run_of_an_older_cprl_is_not_resumed(tmp_path):
     (tmp_path / "recipe.json").write_text('{"recipe": "commons", "arguments": {}}')
     with pytest.raises(ValueError, match="was started by an older cprl, whose trainings this version cannot"):
-        begin(tmp_path, resume=True)
+        resume(tmp_path)
 
 
 def test_where_nothing_can_be_resumed_that_is_said(tmp_path):
     with pytest.raises(ValueError, match="resume requires the directory of the run as out"):
-        begin(None, resume=True)
+        resume(None)
     with pytest.raises(ValueError, match=r"recipe\.json is not the recipe of a run: FileNotFoundError"):
-        begin(tmp_path / "nothing", resume=True)
+        resume(tmp_path / "nothing")
     for text in ("{", "[]", '{"arguments": 3}', '{"experiment": []}'):
         (tmp_path / "recipe.json").write_text(text)
         with pytest.raises(ValueError, match=r"recipe\.json is not the recipe of a run: "):

@@ -54,7 +54,8 @@ def main(
             callbacks=[table, *callbacks],
             checkpointer=checkpoints,
         )
-    save_weights(run, learner.networks())
+        save_weights(run, learner.networks())
+        checkpoints.done()
 
 
 class Telling:

@@ -2,6 +2,7 @@
 
 import os
 import sys
+from dataclasses import replace
 from importlib.metadata import version
 from pathlib import Path
 
@@ -9,6 +10,7 @@ import tyro
 from rich.console import Console
 from rich.table import Table
 
+from cprl.commandline import in_a_sentence
 from cprl.evaluation.cross_play import Diagonal
 from cprl.evaluation.cross_play import crossplay as play_each_other
 from cprl.evaluation.evaluate import SEED, evaluate_run
@@ -33,6 +35,9 @@ def run(
     *,
     out: Path | None = None,
     resume: bool = False,
+    episodes: int | None = None,
+    take_over: bool = False,
+    keep_checkpoint: bool = True,
     watch: str = "file",
     allow: Allow = (),
 ) -> None:
@@ -42,6 +47,9 @@ def run(
         recipe: a recipe.json, or the directory of a run.
         out: the new run's directory; by default a new one under runs/, and with --resume the run itself.
         resume: resume the run, bit for bit as if it had not been stopped.
+        episodes: instead of those of the recipe; with --resume more of them extend the run.
+        take_over: resume a run that a process on another host has locked.
+        keep_checkpoint: keep the state of the training of a finished run, so that it can be extended.
         watch: "file", or live as well: "serve", "spawn", "connect ADDRESS"; "off" for no recording.
         allow: code of your own, module:Class, that the recipe may import; may be repeated.
     """
@@ -50,7 +58,19 @@ def run(
     experiment = Experiment.from_recipe(read_recipe(recipe), allow=allow, directory=directory)
     if resume and out is None:
         out = directory
-    print(run_experiment(experiment, out, resume=resume, watch=watch, allow=allow, command=sys.argv))
+    if episodes is not None:
+        experiment = replace(experiment, episodes=episodes)
+    done = run_experiment(
+        experiment,
+        out,
+        resume=resume,
+        take_over=take_over,
+        keep_checkpoint=keep_checkpoint,
+        watch=watch,
+        allow=allow,
+        command=sys.argv,
+    )
+    print(done)
 
 
 def report(runs: tuple[Path, ...], /, *, out: Path = Path("report")) -> None:
@@ -211,7 +231,7 @@ def main() -> None:
     if sys.argv[1:] == ["--version"]:
         print(f"cprl {version('cprl')}")
         return
-    try:
+    with in_a_sentence("cprl"):
         tyro.extras.subcommand_cli_from_dict(
             {
                 "run": run,
@@ -224,5 +244,3 @@ def main() -> None:
             },
             description=__doc__,
         )
-    except (ValueError, OSError) as error:
-        sys.exit(f"cprl: {error}")

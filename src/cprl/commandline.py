@@ -6,7 +6,8 @@ Its own arguments stand first; every number of the experiment can be changed by 
 
 import inspect
 import sys
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any, Final
@@ -39,7 +40,12 @@ class RunOptions:
     out: Path | None = None
     """The run's directory; by default a new one under runs/."""
     resume: bool = False
-    """Resume the run in `out`, which was stopped; bit for bit as if it had not been."""
+    """Resume the run in `out`, which was stopped; bit for bit as if it had not been; with more episodes,
+    extend it."""
+    take_over: bool = False
+    """Resume a run that a process on another host has locked."""
+    keep_checkpoint: bool = True
+    """Keep the state of the training of a finished run, buffers included, so that it can be extended."""
     watch: str = "file"
     """"file", or live as well: "serve", "spawn", "connect ADDRESS"; "off" for no recording."""
     allow: tyro.conf.UseAppendAction[tuple[str, ...]] = ()
@@ -61,14 +67,25 @@ def recipe_main(make_experiment: Callable[..., Experiment], argv: Sequence[str] 
         SystemExit: where the command line or an experiment is refused, with the reason.
     """
     command = list(sys.argv if argv is None else argv)
-    try:
+    with in_a_sentence(Path(command[0]).name):
         experiment, options = parse(make_experiment, command)
-    except ValueError as error:
-        sys.exit(f"{Path(command[0]).name}: {error}")
     from cprl.running import run
 
-    allow = {"allow": options.allow} if options.allow else {}
-    return run(experiment, options.out, resume=options.resume, watch=options.watch, command=command, **allow)
+    with in_a_sentence(Path(command[0]).name):
+        return run(experiment, command=command, **vars(options))
+
+
+@contextmanager
+def in_a_sentence(program: str) -> Iterator[None]:
+    """Ends the process with a sentence and exit code 1 for what is refused, and for files that cannot be
+    written or read; any other error, and a ValueError of a training that has begun, keeps its traceback."""
+    try:
+        yield
+    except (ValueError, OSError, MemoryError) as error:
+        notes = getattr(error, "__notes__", [])
+        if notes and not isinstance(error, OSError | MemoryError):
+            raise
+        sys.exit("\n".join([f"{program}: {error}", *notes]))
 
 
 def parse(

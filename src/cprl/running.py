@@ -1,13 +1,16 @@
 """run: one experiment from its learners to its report: train, save, evaluate in fresh worlds, summarise."""
 
+import shutil
 from collections.abc import Sequence
-from contextlib import AbstractContextManager, ExitStack, nullcontext
+from contextlib import AbstractContextManager, ExitStack, nullcontext, suppress
 from dataclasses import dataclass, replace
 from datetime import datetime
 from functools import partial
 from pathlib import Path
 from typing import Any
 
+import torch
+from rich.console import Console
 from torchrl.envs import EnvBase
 
 from cprl.agents import Population
@@ -20,8 +23,17 @@ from cprl.measuring.episodes import Episode
 from cprl.measuring.evaluate import evaluate
 from cprl.process import prepare_process
 from cprl.runs.checkpoints import Checkpointer
-from cprl.runs.directory import read_recipe, resume_command, start_run, write_json
+from cprl.runs.directory import (
+    changed_circumstances,
+    read_recipe,
+    refuse_another_run,
+    resume_command,
+    start_run,
+)
 from cprl.runs.episodes import EpisodeTable
+from cprl.runs.extension import REPORT, extend, refuse_to_extend
+from cprl.runs.files import write_json
+from cprl.runs.lock import RunLockedError
 from cprl.runs.loggers import LoggerCallback, check_logger, make_logger
 from cprl.runs.weights import save_transforms, save_weights
 from cprl.terminal.figures import training_curve
@@ -41,21 +53,40 @@ class _Made:
     callbacks: list[Any]
 
 
+class _Began:
+    """A callback that notes that the training has begun."""
+
+    is_extendable = True
+    has_begun = False
+
+    def on_start(self, training: Training) -> None:
+        self.has_begun = True
+
+
 def run(
     experiment: Experiment,
     out: Path | str | None = None,
     *,
     resume: bool = False,
+    take_over: bool = False,
+    keep_checkpoint: bool = True,
     watch: str = "file",
     allow: Sequence[str] = (),
     command: Sequence[str] | None = None,
 ) -> Path:
     """Trains the agents of all replicas, evaluates them in fresh worlds, and writes and prints the outcome.
 
+    A run that ends before its training has begun leaves nothing behind; later, all that it produced.
+
     Args:
         experiment: what is run.
         out: the directory of the run, new or empty; by default `runs/<name>-<time>`.
-        resume: whether the run in `out`, which was stopped, is resumed from its newest checkpoint.
+        resume: whether the run in `out`, which was stopped, is resumed from its newest checkpoint, or a run
+            of fewer episodes, stopped or finished, is extended. Either equals a run that was not interrupted,
+            bit for bit. Of a finished run of as many episodes nothing is done.
+        take_over: whether to resume a run that a process on another host has locked.
+        keep_checkpoint: whether a finished run keeps the state of its training, buffers included, so that it
+            can be extended.
         watch: "file" for a recording for the Rerun viewer; "serve", "spawn" or "connect ADDRESS" to watch
             live as well, see `cprl.viewer.streams.open_live`; "off" for none.
         allow: the user's own code, "module:Class", that stored runs of `Frozen` agents may import.
@@ -64,40 +95,92 @@ def run(
 
     Returns:
         The directory, now with `recipe.json`, `episodes.parquet`, `run.rrd`, `checkpoints/final.pt`,
-        `evaluation/`, `figures/` and `report.json`.
+        `evaluation/`, `figures/`, `manifest.json` with their checksums, and `report.json`.
 
     Raises:
-        ValueError: for whatever does not fit, before anything is written.
+        ValueError: for whatever does not fit, before anything is written; `RunLockedError` where another
+            process writes the run.
         FileExistsError: where `out` is not empty and `resume` is not given.
+        OSError: for a full disk or a deleted directory; the message names it. What was written before is
+            intact, and the run can be resumed.
     """
     check_watch(watch)
     for logger in experiment.loggers:
         check_logger(logger.resolve() if isinstance(logger, Custom) else logger)
     prepare_process(experiment.seed)
     own = _make(experiment, allow)
-    directory = start_run(
-        None if out is None else Path(out),
-        experiment.name,
-        experiment.to_recipe,
-        resume=resume,
-        command=command,
+    out = None if out is None else Path(out)
+    is_there = False
+    episodes = refuse_another_run(out, experiment.to_recipe) if resume else experiment.episodes
+    if resume and out is not None:
+        if episodes < experiment.episodes:
+            refuse_to_extend(out, episodes, own.callbacks)
+        elif (out / REPORT).exists():
+            Console().print(f"{out} is finished; with more --episodes it is extended", soft_wrap=True)
+            return out
+        directory = out
+    else:
+        is_there = out is not None and out.exists()
+        directory = start_run(out, experiment.name, experiment.to_recipe, command=command)
+    checkpointer = Checkpointer(
+        directory,
+        keep_ending=keep_checkpoint,
+        take_over=take_over,
+        resume_command=resume_command(directory, command),
     )
-    resuming = resume_command(directory, command)
-    training = _train(directory, experiment, own, watch=watch, resuming=resuming)
-    played = evaluate_population(experiment, own)
-    write_json(
-        directory / "report.json",
-        {"training_s": round(training.spent_s, 1), "steps": training.steps, "finished": _now()},
-    )
-    for name, of_policy in played.items():
-        _write_episodes(
-            directory / "evaluation" / f"{name}.parquet", of_policy, experiment.evaluation_episodes
+    began = _Began()
+    try:
+        with checkpointer:
+            if resume:
+                _say_what_changed(directory)
+            if episodes < experiment.episodes:
+                extend(directory, episodes, experiment.episodes)
+            training = _train(directory, experiment, own, watch=watch, checkpointer=checkpointer, began=began)
+            _finish(directory, experiment, own, training)
+            checkpointer.done()
+    except BaseException as error:
+        if began.has_begun or resume:
+            error.add_note(f"To resume: {checkpointer.resume_command}")
+        elif not isinstance(error, RunLockedError):
+            _remove(directory, but_keep_empty=is_there)
+        raise
+    return directory
+
+
+def _remove(directory: Path, *, but_keep_empty: bool) -> None:
+    """Removes a run that never began; nobody else has written into its directory."""
+    with suppress(OSError):
+        for path in directory.iterdir():
+            if path.is_dir():
+                shutil.rmtree(path)
+            else:
+                path.unlink()
+        if not but_keep_empty:
+            directory.rmdir()
+
+
+def _say_what_changed(directory: Path) -> None:
+    changed = changed_circumstances(directory)
+    if changed:
+        Console(stderr=True).print(
+            f"Warning: {directory} was begun under other versions, so that numbers may differ from those of "
+            f"an undisturbed run: {'; '.join(changed)}",
+            soft_wrap=True,
+            markup=False,
         )
+
+
+def _finish(directory: Path, experiment: Experiment, own: _Made, training: Training) -> None:
+    """All that follows the training; `report.json`, the sign that a run is finished, comes last."""
+    played = evaluate_population(experiment, own)
+    for name, of_policy in played.items():
+        _write_episodes(directory, f"evaluation/{name}.parquet", of_policy, experiment.evaluation_episodes)
     title = _title(experiment)
     figure = training_curve(directory, title=title, random=played["random"])
+    report = {"training_s": round(training.spent_s, 1), "steps": training.steps, "finished": _now()}
+    write_json(directory / REPORT, {**report, "episodes": experiment.episodes})
     columns = {"random": played["random"], f"trained{_epsilon(own.population)}": played["trained"]}
     summarise(directory, title=title, played=columns, figure=figure)
-    return directory
 
 
 def _make(experiment: Experiment, allow: Sequence[str]) -> _Made:
@@ -115,17 +198,24 @@ def _make(experiment: Experiment, allow: Sequence[str]) -> _Made:
     population = Population(
         env, experiment.agents, seed=experiment.seed, engine=experiment.engine, allow=allow
     )
+    with torch.random.fork_rng(devices=[]):
+        _fresh_env(experiment)  # what the evaluation cannot have is refused now, not after hours
     return _Made(env=env, population=population, callbacks=[made(own) for own in experiment.callbacks])
 
 
-def _train(directory: Path, experiment: Experiment, own: _Made, *, watch: str, resuming: str) -> Training:
+def _train(
+    directory: Path,
+    experiment: Experiment,
+    own: _Made,
+    *,
+    watch: str,
+    checkpointer: Checkpointer,
+    began: _Began,
+) -> Training:
     """Trains and keeps what happens, from the newest checkpoint on if there is one."""
     with ExitStack() as stack:
         viewer = stack.enter_context(_viewer(watch, directory, own.env, experiment))
-        checkpointer = Checkpointer(
-            directory, resume_command=resuming, log_event=viewer.log_event if viewer else None
-        )
-        stack.enter_context(checkpointer)
+        checkpointer.log_event = viewer.log_event if viewer else None
         table = stack.enter_context(EpisodeTable(directory / "episodes.parquet", resumable=True))
         bar = ProgressBar(own.env, episodes=experiment.episodes, replicas=experiment.replicas)
         loggers = [stack.enter_context(_logger(logger, directory, own.env)) for logger in experiment.loggers]
@@ -135,7 +225,7 @@ def _train(directory: Path, experiment: Experiment, own: _Made, *, watch: str, r
             own.population.learners,
             others=own.population.others,
             episodes=experiment.episodes,
-            callbacks=[table, stack.enter_context(bar), *shown, *loggers, *own.callbacks],
+            callbacks=[began, table, stack.enter_context(bar), *shown, *loggers, *own.callbacks],
             checkpointer=checkpointer,
             update_every=experiment.update_every,
         )
@@ -152,19 +242,23 @@ def _logger(logger: str | Custom, directory: Path, env: EnvBase) -> LoggerCallba
 
 def evaluate_population(experiment: Experiment, own: _Made) -> dict[str, list[Episode]]:
     """Fresh episodes, so many of each replica: of the "random" policy, and of everybody as "trained"."""
-    worlds = experiment.evaluation_episodes
-    fresh = make_env(
-        experiment.game,
-        worlds=experiment.replicas * worlds,
-        seed=experiment.seed + 1,
-        device=experiment.device,
-        transforms=experiment.transforms,
-    )
+    fresh, worlds = _fresh_env(experiment), experiment.evaluation_episodes
     load_transforms_state(fresh, transforms_state(own.env))
     return {
         "random": evaluate(fresh, own.population.random_policy(worlds)),
         "trained": evaluate(fresh, own.population.policy(worlds), explore=True),
     }
+
+
+def _fresh_env(experiment: Experiment) -> EnvBase:
+    """The worlds of the evaluation."""
+    return make_env(
+        experiment.game,
+        worlds=experiment.replicas * experiment.evaluation_episodes,
+        seed=experiment.seed + 1,
+        device=experiment.device,
+        transforms=experiment.transforms,
+    )
 
 
 def _epsilon(population: Population) -> str:
@@ -200,11 +294,13 @@ def _title(experiment: Experiment) -> str:
     return f"{experiment.name}, {experiment.replicas} replicas, {experiment.episodes} episodes"
 
 
-def _write_episodes(path: Path, played: list[Episode], of_replica: int) -> None:
+def _write_episodes(directory: Path, name: str, played: list[Episode], of_replica: int) -> None:
     """Writes episodes in fresh worlds, so many of each replica, as a table; again where one is there."""
+    path = directory / name
     path.parent.mkdir(exist_ok=True)
-    path.unlink(missing_ok=True)
-    with EpisodeTable(path) as table:
+    for old in (path, path.with_suffix(".arrows")):
+        old.unlink(missing_ok=True)
+    with EpisodeTable(path, run=directory) as table:
         for number, episode in enumerate(played):
             replica, nth = divmod(number, of_replica)
             table.add(replace(episode, world=replica, episode=nth))

@@ -109,6 +109,10 @@ class LoadedRun:
         lane = lane_name(replica, agent)
         if lane not in self.networks:
             raise ValueError(f"{self.path} keeps no network of {lane}; kept are {sorted(self.networks)}")
+        if not _is_finite(self.networks[lane]):
+            raise ValueError(
+                f"{self.weights_from}: the weights of {lane} are NaN or infinite; leave that replica out"
+            )
         algorithm = made(spec.algorithm)
         stochastic = bool(algorithm.stochastic)
         epsilon = 0.0 if stochastic else float(getattr(algorithm.settings, "epsilon_evaluation", 0.0))
@@ -205,12 +209,16 @@ def _side_by_side(networks: Sequence[nn.Module]) -> Callable[[Tensor], Tensor]:
 
 
 def load(run: str | Path, *, weights: str | None = None, allow: Sequence[str] = ()) -> LoadedRun:
-    """Builds a run again from its directory alone; runs no code that it holds.
+    """Builds a run again from its directory; runs no code that it holds.
+
+    Files outside the directory are read for `Frozen` agents alone: the recipe names their runs by paths,
+    which may lead anywhere, e.g. "../other". They are read when such an agent is asked for, without code.
 
     Args:
         run: its directory.
-        weights: which were kept: "final", or "best" where the recipe keeps them; by default the final ones,
-            or those of the newest readable checkpoint where the run has not ended.
+        weights: which of those in its `checkpoints/`: "final", "best" where the recipe keeps them, or
+            "final-4800" of a run that was extended from so many episodes; by default the final ones, or those
+            of the newest readable checkpoint where the run has not ended.
         allow: the targets, "module:Class", of the user's own code that the run may import.
 
     Raises:
@@ -218,6 +226,8 @@ def load(run: str | Path, *, weights: str | None = None, allow: Sequence[str] = 
             code of the user's own that is not allowed, naming it.
     """
     run = Path(run)
+    if weights is not None and (Path(weights).name != weights or weights in ("", ".", "..")):
+        raise ValueError(f'weights is {weights!r}; allowed: a name in {run / FOLDER}, such as "final"')
     recipe = read_recipe(run)
     try:
         experiment = Experiment.from_recipe(recipe, directory=run, allow=allow)
@@ -244,11 +254,10 @@ def _kept(run: Path, name: str | None) -> tuple[Path, Any, Any]:
     path = folder / f"{name or 'final'}.pt"
     if name is None and not path.exists():
         return _from_checkpoint(run, path)
-    transforms = folder / TRANSFORMS
-    try:
-        return path, load_weights(path), load_weights(transforms) if transforms.exists() else {}
-    except Exception as error:
-        raise ValueError(f"{path} holds no weights of this run: {error}") from error
+    transforms = folder / (name.replace("final", "transforms") + ".pt" if name else TRANSFORMS)
+    if not transforms.exists():
+        transforms = folder / TRANSFORMS
+    return path, load_weights(path), load_weights(transforms) if transforms.exists() else {}
 
 
 def _from_checkpoint(run: Path, final: Path) -> tuple[Path, Any, Any]:
@@ -281,4 +290,12 @@ def _networks(path: Path, weights: Any, run: LoadedRun) -> dict[str, nn.Module]:
             networks[lane] = network
     except Exception as error:
         raise ValueError(f"{path} holds no weights of this run: {error}") from error
+    if not networks and any(isinstance(spec, Learning | Team) for spec in run.specs):
+        raise ValueError(f"{path} holds no weights of this run: it is empty")
+    if networks and not any(map(_is_finite, networks.values())):
+        raise ValueError(f"{path} holds no weights of this run: all are NaN or infinite")
     return networks
+
+
+def _is_finite(network: nn.Module) -> bool:
+    return all(bool(value.isfinite().all()) for value in network.state_dict().values())

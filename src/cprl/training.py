@@ -85,6 +85,11 @@ class Training:
         return min(self._played) >= self.episodes
 
     @property
+    def is_ending(self) -> bool:
+        """Whether a replica has played its last episode; episodes that it plays beyond are not recorded."""
+        return max(self._played) >= self.episodes
+
+    @property
     def spent_s(self) -> float:
         """Seconds that it has taken so far, those before it was stopped included."""
         return self._spent_s + time.monotonic() - self._began

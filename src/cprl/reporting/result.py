@@ -16,7 +16,8 @@ from cprl.measuring import phases
 from cprl.measuring.published import PublishedExperiment, published_experiment
 from cprl.population import Learning
 from cprl.runs.curves import curves_of, running_mean
-from cprl.runs.directory import read_json, read_recipe
+from cprl.runs.directory import read_recipe
+from cprl.runs.files import read_json
 
 Values = NDArray[np.float64]
 

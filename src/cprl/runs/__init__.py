@@ -4,10 +4,14 @@ Modules, in the order in which one reads them:
     directory    the run's directory and recipe.json
     old_recipes  recipes of earlier formats
     files        files that are never left half written
+    lock         at most one process writes a run
+    manifest     checksums of results
+    journal      rows that are safe as soon as they are written
     episodes     the table of episodes
     labelled     several tables as one
     curves       tables as curves over episodes
     checkpoints  the state of a training, to resume from
+    extension    more episodes for a run that is finished or stopped
     weights      trained networks, and the state of transforms
     loggers      TorchRL's loggers: CSV, TensorBoard, W&B
     export       a finished run, small enough to commit

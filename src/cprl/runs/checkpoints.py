@@ -1,6 +1,6 @@
 """Checkpointer: saves the full state of a training, so that a stopped training resumes bit for bit."""
 
-import hashlib
+import errno
 import os
 import re
 import signal
@@ -15,7 +15,8 @@ import torch
 from rich.console import Console
 
 from cprl.runs.directory import resume_command as command_to_resume
-from cprl.runs.files import place_atomically
+from cprl.runs.files import checksum, place_atomically, refuse_special
+from cprl.runs.lock import RunLock
 
 FOLDER: Final = "checkpoints"
 EVERY_S: Final = 300.0
@@ -25,7 +26,7 @@ KEPT: Final = 2
 PARTIAL: Final = "training.partial"
 """The suffix of a checkpoint that is being written, or whose writing was interrupted."""
 
-_NAME: Final = re.compile(r"training-(\d{12})-([0-9a-f]{32})\.pt")
+_NAME: Final = re.compile(r"(training|ending)-(\d{12})-([0-9a-f]{32})\.pt")
 _SIGNALS: Final = (signal.SIGINT, signal.SIGTERM)
 
 
@@ -34,6 +35,11 @@ class HasState(Protocol):
 
     steps: int
 
+    @property
+    def is_ending(self) -> bool: ...
+    @property
+    def is_over(self) -> bool: ...
+
     def state_dict(self) -> dict[str, Any]: ...
     def load_state_dict(self, state: Mapping[str, Any]) -> None: ...
 
@@ -41,80 +47,112 @@ class HasState(Protocol):
 class Checkpointer:
     """Saves the state of a training every `every_s` seconds, and when it is stopped; a context manager.
 
-    A checkpoint is written to a temporary file, synced to disk and then renamed; its name includes the
-    checksum of its content. On the first SIGINT or SIGTERM the checkpointer finishes the current step, saves
-    the state, prints the command that resumes and exits with code 0; the second signal ends the process at
-    once. When the block ends without an error the checkpoints are deleted, so save results within the block.
+    Within its block the run is locked, see `RunLock`. A checkpoint is written to a temporary file, synced to
+    disk and then renamed; its name includes the checksum of its content. On the first SIGINT or SIGTERM the
+    checkpointer finishes the current step, saves the state, prints the command that resumes and exits with
+    code 0; the second signal ends the process at once. Once the training is over, the first signal exits.
+
+    The checkpoints stay until `done` is called, when whatever follows the training is finished too.
 
     Args:
-        run: the run's directory.
+        run: the run's directory, which is made if it does not exist.
         every_s: seconds between checkpoints, above 0.
+        keep_ending: whether the state in which the first replica has played its last episode is kept even
+            after `done`: from there a training of more episodes continues bit for bit.
+        take_over: whether to take the lock that a process on another host left behind.
         resume_command: the command line that resumes, printed when the run is stopped; by default that of
             this process.
-        log_event: called with a text at each checkpoint, e.g. `ViewerCallback.log_event`.
         console: the console for messages; by default standard output.
+
+    Attributes:
+        log_event: called with a text at each checkpoint, e.g. `ViewerCallback.log_event`; None for nothing.
     """
+
+    log_event: Callable[[str], object] | None = None
 
     def __init__(
         self,
         run: Path,
         *,
         every_s: float = EVERY_S,
+        keep_ending: bool = True,
+        take_over: bool = False,
         resume_command: str | None = None,
-        log_event: Callable[[str], object] | None = None,
         console: Console | None = None,
     ) -> None:
         if not every_s > 0:
             raise ValueError(f"every_s is {every_s}; allowed: a number above 0")
-        self.folder, self.every_s = run / FOLDER, every_s
+        self.run, self.folder = run, run / FOLDER
+        self.every_s, self.keep_ending, self._take_over = every_s, keep_ending, take_over
         self.resume_command = command_to_resume(run) if resume_command is None else resume_command
-        self.log_event = log_event
         self.console = console or Console()
         self._saved = time.monotonic()
-        self._asked_to_stop = False
+        self._is_training, self._asked_to_stop = True, False
+        self._has_ending = not keep_ending
+        self._place: tuple[int, int] | None = None
+        self._lock: RunLock | None = None
         self._usual: dict[int, Any] = {}
 
     def restore(self, training: HasState) -> None:
         """Restores the newest readable checkpoint, if there is one.
 
         Raises:
-            ValueError: if there are checkpoints but none can be read; names each with its reason.
+            ValueError: if there are checkpoints but none can be restored; names each with its reason.
         """
-        reasons = []
+        reasons: list[str] = []
+        cause: Exception | None = None
         for path in reversed(checkpoints_in(self.folder)):
             try:
-                state = read_checkpoint(path)
+                training.load_state_dict(read_checkpoint(path))
             except ValueError as error:
                 reasons.append(str(error))
+                cause = error
                 continue
-            training.load_state_dict(state)
+            except (KeyError, TypeError, AttributeError, IndexError, RuntimeError) as error:
+                reasons.append(f"{path} does not hold the state of this training: {error!r}")
+                cause = error
+                continue
+            for reason in reasons:
+                self.console.print(f"Passed over: {reason}", soft_wrap=True)
             self.console.print(f"Resuming from step {training.steps:,}: {path}", soft_wrap=True)
             self._saved = time.monotonic()
+            self._has_ending |= training.is_ending
             return
         if reasons:
-            raise ValueError("no checkpoint can be read: " + "; ".join(reasons))
+            raise ValueError("no checkpoint can be read: " + "; ".join(reasons)) from cause
 
     def after_step(self, training: HasState) -> None:
         """Saves a checkpoint if one is due, or if the process was asked to stop; then stops it."""
+        ends = training.is_ending and not self._has_ending
         if self._asked_to_stop:
-            path = self.save(training)
+            path = self.save(training, kind="ending" if ends else "training")
             self.console.print(
                 f"Stopped; everything up to step {training.steps:,} is saved in {path}", soft_wrap=True
             )
-            self.console.print(f"To resume: {self.resume_command}", soft_wrap=True, highlight=False)
-            raise SystemExit(0)
-        if time.monotonic() - self._saved >= self.every_s:
+            self._stop_now()
+        self._is_training = not training.is_over
+        if ends:
+            self.save(training, kind="ending")
+            self._has_ending = True
+        elif time.monotonic() - self._saved >= self.every_s:
             self.save(training)
 
-    def save(self, training: HasState) -> Path:
-        """Writes a checkpoint atomically, and deletes all but the newest two."""
-        self.folder.mkdir(parents=True, exist_ok=True)
+    def save(self, training: HasState, *, kind: str = "training") -> Path:
+        """Writes a checkpoint atomically, and deletes all of its kind but the newest two, or the newest
+        "ending".
+
+        Raises:
+            OSError: if it cannot be written, or somebody deleted the run; those before it are intact.
+        """
+        self._refuse_deleted()
+        self.folder.mkdir(exist_ok=True)
         path = place_atomically(
             self.folder / PARTIAL,
             lambda file: torch.save(training.state_dict(), file),
-            lambda partial: self.folder / f"training-{training.steps:012d}-{_checksum(partial)}.pt",
+            lambda partial: self.folder / f"{kind}-{training.steps:012d}-{checksum(partial)}.pt",
         )
-        for old in checkpoints_in(self.folder)[:-KEPT]:
+        same = [old for old in checkpoints_in(self.folder) if is_ending(old) == (kind == "ending")]
+        for old in same[: -1 if kind == "ending" else -KEPT]:
             old.unlink()
         self._saved = time.monotonic()
         if self.log_event:
@@ -122,12 +160,28 @@ class Checkpointer:
         return path
 
     def done(self) -> None:
-        """Deletes the checkpoints: the run has ended, and its weights and episodes are saved separately."""
+        """Deletes the checkpoints, but for the one of `keep_ending`: weights and episodes are saved
+        separately, and whatever follows the training is finished."""
         for path in checkpoints_in(self.folder):
-            path.unlink()
+            if not (self.keep_ending and is_ending(path)):
+                path.unlink()
         (self.folder / PARTIAL).unlink(missing_ok=True)
 
+    def _refuse_deleted(self) -> None:
+        """Ends a run whose directory was deleted, or made again by somebody else; nothing is recreated."""
+        try:
+            found = self.run.stat()
+        except FileNotFoundError:
+            found = None
+        if self._place and (found is None or self._place != (found.st_dev, found.st_ino)):
+            what = "the directory was deleted while the run was written; the run ends"
+            raise FileNotFoundError(errno.ENOENT, what, str(self.run))
+
     def __enter__(self) -> Self:
+        self.run.mkdir(exist_ok=True)
+        self._lock = RunLock(self.run, take_over=self._take_over).__enter__()
+        found = self.run.stat()
+        self._place = (found.st_dev, found.st_ino)
         # Python handles signals in the main thread only; in other threads handlers stay as they are.
         for number in _SIGNALS if current_thread() is main_thread() else ():
             self._usual[number] = signal.signal(number, self._stop)
@@ -141,8 +195,8 @@ class Checkpointer:
     ) -> None:
         for number, usual in self._usual.items():
             signal.signal(number, usual)
-        if error is None:
-            self.done()
+        if self._lock is not None:
+            self._lock.__exit__(kind, error, traceback)
 
     def _stop(self, number: int, frame: FrameType | None) -> None:
         if self._asked_to_stop:
@@ -150,13 +204,31 @@ class Checkpointer:
             os.kill(os.getpid(), number)
             return
         self._asked_to_stop = True
-        self.console.print("Stopping after this step; signal again to stop at once.")
+        if self._is_training:
+            self.console.print("Stopping after this step; signal again to stop at once.")
+            return
+        self.console.print("Stopped after the training, which is saved.")
+        self._stop_now()
+
+    def _stop_now(self) -> None:
+        self.console.print(f"To resume: {self.resume_command}", soft_wrap=True, highlight=False)
+        raise SystemExit(0)
 
 
 def checkpoints_in(folder: Path) -> list[Path]:
     """The checkpoints of a run, oldest first."""
     found = folder.iterdir() if folder.is_dir() else iter(())
-    return sorted(path for path in found if _NAME.fullmatch(path.name))
+    return sorted((path for path in found if _NAME.fullmatch(path.name)), key=steps_of)
+
+
+def steps_of(path: Path) -> int:
+    """The step of a checkpoint, by its name."""
+    return int(path.name.split("-")[1])
+
+
+def is_ending(path: Path) -> bool:
+    """Whether a checkpoint is the one from which more episodes can be trained."""
+    return path.name.startswith("ending")
 
 
 def read_checkpoint(path: Path) -> dict[str, Any]:
@@ -168,23 +240,17 @@ def read_checkpoint(path: Path) -> dict[str, Any]:
     name = _NAME.fullmatch(path.name)
     if name is None:
         raise ValueError(f"{path} is not a checkpoint; allowed: a name like training-<steps>-<checksum>.pt")
+    refuse_special(path)
     try:
-        checksum = _checksum(path)
+        found = checksum(path)
     except OSError as error:
         raise ValueError(f"{path} cannot be read: {error}") from error
-    if checksum != name[2]:
-        raise ValueError(f"{path} is truncated or was changed: its checksum is {checksum}, not {name[2]}")
+    if found != name[3]:
+        raise ValueError(f"{path} is truncated or was changed: its checksum is {found}, not {name[3]}")
     try:
-        state: dict[str, Any] = torch.load(path, weights_only=True)
+        state = torch.load(path, weights_only=True)
     except Exception as error:
         raise ValueError(f"{path} is not the state of a training: {error}") from error
+    if not isinstance(state, dict):
+        raise ValueError(f"{path} is not the state of a training, but a {type(state).__name__}")
     return state
-
-
-def _checksum(path: Path) -> str:
-    """BLAKE2b of a file's content, 16 bytes in hexadecimal."""
-    digest = hashlib.blake2b(digest_size=16)
-    with open(path, "rb") as file:
-        while block := file.read(1 << 24):
-            digest.update(block)
-    return digest.hexdigest()

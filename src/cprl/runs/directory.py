@@ -1,6 +1,5 @@
 """The directory of a run; its `recipe.json` holds the experiment, versions, start time and git commit."""
 
-import json
 import platform
 import shlex
 import subprocess
@@ -13,11 +12,13 @@ from pathlib import Path
 from typing import Any, Final
 
 from cprl.config import custom_targets, differences
-from cprl.runs.files import write_atomically
+from cprl.runs.files import read_json, write_json
+from cprl.runs.lock import FILE_NAME as LOCK_NAME
+from cprl.runs.lock import RunLock
 
 FILE_NAME: Final = "recipe.json"
 
-_RESUMES: Final = ("--resume", "--no-resume", "--go-on", "--no-go-on")
+_RESUMES: Final = ("--resume", "--no-resume", "--go-on", "--no-go-on", "--take-over", "--no-take-over")
 _NAMED: Final = 5
 """The largest number of differences between two recipes that an error names."""
 
@@ -30,7 +31,6 @@ def start_run(
     name: str,
     to_recipe: Callable[[Path], Mapping[str, Any]],
     *,
-    resume: bool = False,
     command: Sequence[str] | None = None,
 ) -> Path:
     """Makes the directory of a run and writes its recipe.
@@ -39,7 +39,6 @@ def start_run(
         out: the directory, new or empty; None for `runs/<name>-<YYYYmmdd-HHMMSS>` in the working directory.
         name: the name of the run.
         to_recipe: makes the recipe for a directory, e.g. `cprl.Experiment.to_recipe`.
-        resume: whether to resume the stopped run in `out`, which must have the same recipe.
         command: the command line, script first; by default that of this process.
 
     Returns:
@@ -48,47 +47,89 @@ def start_run(
         `--out` and without the directory of the script.
 
     Raises:
-        FileExistsError: if `out` is not empty and not resumed.
-        ValueError: if the name cannot be that of a directory, there is nothing to resume, or the run was
-            started with another recipe; names the differences.
+        FileExistsError: if `out` is not empty.
+        RunLockedError: if another process is just starting a run there.
+        ValueError: if the name cannot be that of a directory.
     """
     if Path(name).name != name:
         raise ValueError(f'"{name}" names a run; allowed: a name without slashes')
-    if resume:
-        return _same_run(out, to_recipe)
     started = datetime.now().astimezone()
-    directory = _new_directory(name, started) if out is None else _empty_directory(Path(out))
-    recipe = {
-        **to_recipe(directory),
-        "versions": versions(),
-        "git": git_state(),
-        "started": started.isoformat(timespec="seconds"),
-        "command": _command(sys.argv if command is None else command),
-    }
-    write_json(directory / FILE_NAME, recipe)
+    directory = _new_directory(name, started) if out is None else _made_directory(Path(out))
+    with RunLock(directory):
+        _refuse_contents(directory)
+        recipe = {
+            **to_recipe(directory),
+            **_circumstances(),
+            "started": started.isoformat(timespec="seconds"),
+            "command": _command(sys.argv if command is None else command),
+        }
+        write_json(directory / FILE_NAME, recipe)
     return directory
 
 
-def write_json(path: Path, value: object) -> None:
-    """Writes a JSON value atomically."""
-    text = json.dumps(value, indent=2, allow_nan=False) + "\n"
-    write_atomically(path, lambda file: file.write(text.encode()))
+def refuse_another_run(out: Path | None, to_recipe: Callable[[Path], Mapping[str, Any]]) -> int:
+    """Refuses to resume what was not begun with the same recipe; only the number of episodes may grow.
 
+    Args:
+        out: the directory of the stopped run.
+        to_recipe: see `start_run`.
 
-def read_json(path: Path) -> dict[str, Any]:
-    """Reads a JSON object that `write_json` wrote.
+    Returns:
+        The number of episodes of the run so far, below that of the recipe if it is to be extended.
 
     Raises:
-        FileNotFoundError: if there is no such file.
-        ValueError: if it cannot be read or is not an object.
+        ValueError: if there is nothing to resume, or the run was started with another recipe; names the
+            differences.
     """
-    try:
-        value = json.loads(path.read_text(encoding="utf-8"))
-    except ValueError as error:
-        raise ValueError(f"{path} is not JSON: {error}") from error
-    if not isinstance(value, dict):
-        raise ValueError(f"{path} holds a {type(value).__name__}; allowed: a JSON object")
-    return value
+    if out is None:
+        raise ValueError("resume requires the directory of the run as out")
+    kept, now = read_recipe(out), to_recipe(out)
+    if kept.get("recipe") != now["recipe"]:
+        raise ValueError(f"{out} is a run of {kept.get('recipe')!r}; this is {now['recipe']!r}")
+    if kept.get("format") != now["format"]:
+        raise ValueError(
+            f"{out} was started by an older cprl, whose trainings this version cannot resume; its agents can "
+            "still be loaded and evaluated"
+        )
+    before, asked = kept["experiment"], now["experiment"]
+    differ = differences({**before, "episodes": 0}, {**asked, "episodes": 0}, "experiment")
+    if differ:
+        more = f"; and {len(differ) - _NAMED} more" if len(differ) > _NAMED else ""
+        raise ValueError(f"{out} was started with another recipe: {'; '.join(differ[:_NAMED])}{more}")
+    episodes = before.get("episodes")
+    if not isinstance(episodes, int) or episodes > asked["episodes"]:
+        raise ValueError(
+            f"{out} has {episodes} episodes, which cannot become {asked['episodes']}; allowed: as many, or "
+            "more to extend it"
+        )
+    return episodes
+
+
+def write_more_episodes(run: Path, episodes: int) -> None:
+    """Writes into a run's recipe that it is extended to so many episodes, and by which versions."""
+    recipe = read_recipe(run)
+    earlier = {"episodes": recipe["experiment"]["episodes"], **_circumstances()}
+    recipe["experiment"]["episodes"] = episodes
+    recipe["extended"] = [*recipe.get("extended", []), earlier]
+    write_json(run / FILE_NAME, recipe)
+
+
+def changed_circumstances(run: Path) -> list[str]:
+    """What differs now from when a run was started: versions and the git commit; a sentence for each.
+
+    Numbers may then differ from those of an undisturbed run.
+    """
+    recipe, now = read_recipe(run), _circumstances()
+    return [
+        line
+        for name in now
+        for line in differences(recipe.get(name), now[name], name)
+        if recipe.get(name) is not None
+    ]
+
+
+def _circumstances() -> dict[str, Any]:
+    return {"versions": versions(), "git": git_state()}
 
 
 def resume_command(run: Path, command: Sequence[str] | None = None) -> str:
@@ -140,33 +181,12 @@ def read_recipe(run: Path) -> dict[str, Any]:
     """
     path = Path(run) if Path(run).suffix == ".json" else Path(run) / FILE_NAME
     try:
-        recipe: dict[str, Any] = json.loads(path.read_text(encoding="utf-8"))
-        if not isinstance(recipe, dict) or not any(
-            isinstance(recipe.get(name), dict) for name in ("experiment", "arguments")
-        ):
+        recipe = read_json(path)
+        if not any(isinstance(recipe.get(name), dict) for name in ("experiment", "arguments")):
             raise TypeError('no table "experiment"')
     except (OSError, ValueError, TypeError) as error:
         raise ValueError(f"{path} is not the recipe of a run: {error!r}") from error
     return recipe
-
-
-def _same_run(out: Path | None, to_recipe: Callable[[Path], Mapping[str, Any]]) -> Path:
-    """The directory of a stopped run, after a check that it has this recipe."""
-    if out is None:
-        raise ValueError("resume requires the directory of the run as out")
-    kept, now = read_recipe(Path(out)), to_recipe(Path(out))
-    if kept.get("recipe") != now["recipe"]:
-        raise ValueError(f"{out} is a run of {kept.get('recipe')!r}; this is {now['recipe']!r}")
-    if kept.get("format") != now["format"]:
-        raise ValueError(
-            f"{out} was started by an older cprl, whose trainings this version cannot resume; its agents can "
-            "still be loaded and evaluated"
-        )
-    differ = differences(kept["experiment"], now["experiment"], "experiment")
-    if differ:
-        more = f"; and {len(differ) - _NAMED} more" if len(differ) > _NAMED else ""
-        raise ValueError(f"{out} was started with another recipe: {'; '.join(differ[:_NAMED])}{more}")
-    return Path(out)
 
 
 def versions() -> dict[str, str | None]:
@@ -211,8 +231,13 @@ def _new_directory(name: str, started: datetime) -> Path:
     raise AssertionError("count never ends")
 
 
-def _empty_directory(directory: Path) -> Path:
+def _made_directory(directory: Path) -> Path:
+    if directory.exists():
+        _refuse_contents(directory)
     directory.mkdir(parents=True, exist_ok=True)
-    if any(directory.iterdir()):
-        raise FileExistsError(f"{directory} is not empty; allowed: a new or empty directory")
     return directory
+
+
+def _refuse_contents(directory: Path) -> None:
+    if any(path.name != LOCK_NAME for path in directory.iterdir()):
+        raise FileExistsError(f"{directory} is not empty; allowed: a new or empty directory")

@@ -1,17 +1,15 @@
 """The episodes of a run as a table: one row for each replica, episode and agent.
 
-During a run every episode is appended at once to a journal, `episodes.arrows`, an Arrow stream. Unlike a
-parquet file a stream needs no footer, so it stays readable if the process is killed. `EpisodeTable.close`
-converts the journal to `episodes.parquet`; `read_episodes` reads either.
+During a run every episode is appended at once to a journal, `episodes.arrows`, see `cprl.runs.journal`.
+`EpisodeTable.close` converts the journal to `episodes.parquet`; `read_episodes` reads either.
 """
 
 import os
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from errno import EIO
-from io import FileIO
+from errno import EIO, ENOENT
 from pathlib import Path
 from types import TracebackType
-from typing import Any, Final, Self
+from typing import Any, BinaryIO, Final, Self
 
 import numpy as np
 import pyarrow as pa
@@ -20,6 +18,9 @@ from tensordict import TensorDictBase
 
 from cprl.measuring import Episode, social
 from cprl.measuring.reported import FIELDS, left_out
+from cprl.runs.files import refuse_special
+from cprl.runs.journal import Content, Journal, read_journal, write_journal
+from cprl.runs.manifest import verify, write_listed
 
 FILE_NAME: Final = "episodes.parquet"
 
@@ -47,63 +48,65 @@ LEFT_OUT: Final = b"left_out"
 """The key of the schema's metadata whose value says which columns are left out, and why, if any are."""
 
 _ROWS_PER_GROUP: Final = 2**16
+_EMPTY: Final = Content(None, [], [])
 
 
 class EpisodeTable:
     """Writes a table of episodes; a context manager.
 
-    Episodes are safe once `add` has returned, even if the process is killed by SIGKILL; a power failure may
-    lose the last seconds. After an OSError (a full disk) all earlier episodes are intact, and the same `add`
-    or `close` can be repeated.
+    Episodes are safe once `add` has returned, even if the process is killed by SIGKILL; after a power failure
+    those up to the last `state_dict` are, which syncs them to the disk. After an OSError (a full disk) all
+    earlier episodes are intact, and the same `add` or `close` can be repeated.
 
     Args:
         path: the parquet file to write, `episodes.parquet` in a run's directory.
-        resumable: whether to continue an existing journal, see `load_state_dict`, and to leave the journal in
-            place if the block ends with an error.
+        resumable: whether to continue an existing journal or table, see `load_state_dict`, and to leave the
+            journal in place if the block ends with an error.
+        run: the run whose manifest lists the table; by default the directory of the table.
 
     Raises:
-        FileExistsError: if the table exists; nothing is ever overwritten.
+        FileExistsError: if the table exists and is not to be resumed; nothing is ever overwritten.
+        ValueError: if the table to be resumed is damaged.
     """
 
-    def __init__(self, path: str | os.PathLike[str], *, resumable: bool = False) -> None:
+    def __init__(
+        self, path: str | os.PathLike[str], *, resumable: bool = False, run: Path | None = None
+    ) -> None:
         self.path = Path(path)
         self.journal = _journal_of(self.path)
+        self._run = self.path.parent if run is None else run
         self._resumable = resumable
-        for table in (self.path,) if resumable else (self.path, self.journal):
+        for table in () if resumable else (self.path, self.journal):
             if table.exists():
                 raise FileExistsError(f"{table} exists and is not overwritten; use another directory")
-        exists = self.journal.exists()
-        # Unbuffered, so that written data survives the process.
-        self._file = FileIO(self.journal, "r+" if exists else "x")
+        if self.path.exists() and not self.journal.exists():
+            _reopen(self.path, self.journal)
+        self._is_placed = not self.journal.exists()
+        self._file = Journal(self.journal)
         self._schema: pa.Schema | None = None
-        self._rows = 0
-        self._is_placed = not exists
+        self._rows, self._is_closed = 0, False
 
     def state_dict(self) -> dict[str, int]:
-        """The number of rows."""
+        """The number of rows, which are on the disk once it returns."""
+        self._file.sync()
         return {"rows": self._rows}
 
     def load_state_dict(self, state: Mapping[str, int]) -> None:
         """Continues after the given number of rows of its journal; later rows are dropped.
 
         Raises:
-            ValueError: if the journal has fewer rows, or no batch of rows ends there.
+            ValueError: if the journal is damaged, has fewer rows, or no episode ends there.
         """
-        rows, found, end = int(state["rows"]), 0, 0
-        schema = None
-        if rows:
-            with pa.OSFile(str(self.journal)) as source:
-                schema, batches = _read_journal(source)
-                for batch in batches:
-                    found += batch.num_rows
-                    end = source.tell()
-                    if found >= rows:
-                        break
+        rows, found, batches = int(state["rows"]), 0, 0
+        content = read_journal(self.journal) if rows else _EMPTY
+        for batch in content.batches:
+            if found >= rows:
+                break
+            found, batches = found + batch.num_rows, batches + 1
         if found != rows:
             raise ValueError(f"{self.journal} holds {found} rows up to there; the checkpoint has {rows}")
-        self._file.truncate(end)
-        self._file.seek(end)
-        self._schema, self._rows, self._is_placed = schema, rows, True
+        self._file.cut(content, batches)
+        self._schema, self._rows, self._is_placed = content.schema, rows, True
 
     def add(self, *episodes: Episode, replica: int | None = None) -> None:
         """Appends episodes; the first one of a table determines the columns and metrics of all.
@@ -116,10 +119,15 @@ class EpisodeTable:
             return
         if not self._is_placed:  # there is no checkpoint of the last attempt: start over
             self.load_state_dict({"rows": 0})
-        if self._schema is None:
-            self._begin(_schema_of(episodes[0]))
-        rows = _rows(episodes, replica, self._schema)
-        self._write(rows.serialize())
+        try:
+            if self._schema is None:
+                self._begin(_schema_of(episodes[0]))
+            assert self._schema is not None
+            rows = _rows(episodes, replica, self._schema)
+            self._file.append(rows)
+        except OSError as error:
+            kept = f"the {self._rows} earlier rows are in {self.journal}"
+            raise OSError(error.errno, f"{error}: could not add episodes; {kept}") from error
         self._rows += rows.num_rows
 
     def on_step(self, batch: TensorDictBase) -> None:
@@ -130,23 +138,27 @@ class EpisodeTable:
         self.add(episode)
 
     def close(self) -> None:
-        """Converts the journal to the parquet file. A second call does nothing."""
-        if not self.journal.exists():
+        """Converts the journal to the parquet file. A second call does nothing.
+
+        Raises:
+            OSError: if that fails; all episodes are in the journal, unless somebody deleted it.
+        """
+        if self._is_closed:
             return
         if self._schema is None:
             self._begin(_schema(COLUMNS, social.METRICS))
-        if not self._file.closed:
-            self._file.close()
-        partial = self.path.with_name(self.path.name + ".partial")
+        self._file.close()
         try:
-            _merge(self.journal, partial, rows=self._rows)
-            os.replace(partial, self.path)
+            name = self.path.relative_to(self._run).as_posix()
+            write_listed(self._run, name, lambda file: _merge(self.journal, file, rows=self._rows))
+        except FileNotFoundError as error:
+            raise FileNotFoundError(ENOENT, f"{error}: was {self.journal} deleted?") from error
         except OSError as error:
-            partial.unlink(missing_ok=True)
             raise OSError(
                 error.errno, f"{error}: could not write {self.path}; all episodes are in {self.journal}"
             ) from error
         self.journal.unlink()
+        self._is_closed = True
 
     def __enter__(self) -> Self:
         return self
@@ -163,23 +175,8 @@ class EpisodeTable:
             self.close()
 
     def _begin(self, schema: pa.Schema) -> None:
-        self._write(schema.serialize())
+        self._file.begin(schema)
         self._schema = schema
-
-    def _write(self, message: pa.Buffer) -> None:
-        """Appends all of a message or nothing: a partial message would make later ones unreadable."""
-        end = self._file.tell()
-        left = memoryview(message)
-        try:
-            while left:
-                left = left[self._file.write(left) :]
-        except BaseException as error:
-            self._file.seek(end)
-            self._file.truncate()
-            if isinstance(error, OSError):
-                kept = f"the {self._rows} earlier rows are in {self.journal}"
-                raise OSError(error.errno, f"{error}: could not add episodes; {kept}") from error
-            raise
 
 
 def read_episodes(run_directory: str | os.PathLike[str]) -> pa.Table:
@@ -187,17 +184,33 @@ def read_episodes(run_directory: str | os.PathLike[str]) -> pa.Table:
 
     Raises:
         FileNotFoundError: if there are none.
+        ValueError: if the file is damaged, see `cprl.runs.manifest`.
     """
     path = Path(run_directory) / FILE_NAME
     try:
         # The journal first: while it exists it holds every row, and a merge does not change it.
-        with pa.OSFile(str(_journal_of(path))) as journal:
-            schema, batches = _read_journal(journal)
-            return pa.Table.from_batches(list(batches), schema)
+        return _as_table(read_journal(_journal_of(path)))
     except FileNotFoundError:
         if not path.exists():
             raise FileNotFoundError(f"{path} and its journal do not exist: is this a run?") from None
-    return pq.read_table(path)
+    return read_table(path)
+
+
+def read_table(path: Path) -> pa.Table:
+    """A parquet file of a run, checked against its manifest.
+
+    Raises:
+        FileNotFoundError: if there is no such file.
+        ValueError: if it is damaged or no parquet file; names it.
+    """
+    refuse_special(path)
+    verify(path)
+    try:
+        return pq.read_table(path)
+    except FileNotFoundError:
+        raise
+    except (pa.ArrowException, OSError) as error:
+        raise ValueError(f"{path} is not a table: {error}") from error
 
 
 def as_table(episodes: Sequence[Episode], replica: int) -> pa.Table:
@@ -255,40 +268,33 @@ def _cells(episode: Episode, replica: int) -> dict[str, Any]:
     return {name: np.broadcast_to(cell, agents.shape) for name, cell in cells.items()}
 
 
-def _read_journal(journal: pa.NativeFile) -> tuple[pa.Schema, Iterator[pa.RecordBatch]]:
-    """The schema and all batches that were written completely."""
-    try:
-        reader = pa.ipc.open_stream(journal)
-    except pa.ArrowInvalid:  # the process was killed before it wrote the schema
-        return _schema(COLUMNS, social.METRICS), iter(())
-    return reader.schema, _whole_batches(reader)
+def _as_table(content: Content) -> pa.Table:
+    schema = _schema(COLUMNS, social.METRICS) if content.schema is None else content.schema
+    return pa.Table.from_batches(content.batches, schema)
 
 
-def _whole_batches(reader: pa.RecordBatchReader) -> Iterator[pa.RecordBatch]:
-    while True:
-        try:
-            yield reader.read_next_batch()
-        except StopIteration:
-            return
-        except (pa.ArrowInvalid, OSError) as error:
-            if getattr(error, "errno", None) is not None:
-                raise
-            return  # the process was killed while it wrote this one
+def _reopen(path: Path, journal: Path) -> None:
+    """Writes the journal of a finished table again, a batch for each episode."""
+    table = read_table(path).combine_chunks()
+    firsts = np.flatnonzero(table["agent"].to_numpy() == 0).tolist()
+    ends = [*firsts[1:], table.num_rows]
+    episodes = (
+        table.slice(first, end - first).combine_chunks().to_batches()[0]
+        for first, end in zip(firsts, ends, strict=True)
+    )
+    write_journal(journal, episodes, table.schema)
 
 
-def _merge(journal: Path, target: Path, *, rows: int) -> None:
-    """Writes the journal as a parquet file, synced to disk."""
-    merged = 0
-    with pa.OSFile(str(journal)) as source:
-        schema, batches = _read_journal(source)
-        with pq.ParquetWriter(target, schema) as writer:
-            for table in _large_tables(batches):
-                writer.write_table(table)
-                merged += table.num_rows
+def _merge(journal: Path, target: BinaryIO, *, rows: int) -> None:
+    """Writes the journal as a parquet file."""
+    content, merged = read_journal(journal), 0
+    schema = _as_table(content).schema
+    with pq.ParquetWriter(target, schema) as writer:
+        for table in _large_tables(content.batches):
+            writer.write_table(table)
+            merged += table.num_rows
     if merged != rows:
         raise OSError(EIO, f"{journal} holds {merged} rows of the {rows} that were added")
-    with open(target, "rb") as written:
-        os.fsync(written.fileno())
 
 
 def _large_tables(batches: Iterable[pa.RecordBatch]) -> Iterator[pa.Table]:

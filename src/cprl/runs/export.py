@@ -1,13 +1,13 @@
 """Exports the results of a run, small enough to commit: its directory without recording and buffers."""
 
-import shutil
 from pathlib import Path
 
 import pyarrow as pa
 import pyarrow.parquet as pq
 
 from cprl.runs.directory import read_recipe
-from cprl.runs.episodes import FILE_NAME, read_episodes
+from cprl.runs.episodes import FILE_NAME, read_episodes, read_table
+from cprl.runs.manifest import verify, write_listed
 from cprl.runs.weights import TRANSFORMS
 
 _TRANSFORMS = f"checkpoints/{TRANSFORMS}"
@@ -26,28 +26,36 @@ def export_results(run: Path, folder: Path) -> Path:
         and returns are float32, and rows are sorted by replica, episode and agent.
 
     Raises:
-        ValueError: if there is no run.
+        ValueError: if there is no run, or a file of it is damaged.
         FileNotFoundError: if the run has not ended.
     """
     read_recipe(run)
     for name in _WHOLE:
         if not (run / name).exists():
             raise FileNotFoundError(f"{run / name} does not exist: has the run ended?")
-    for name in _WHOLE:
-        (folder / name).parent.mkdir(parents=True, exist_ok=True)
-        shutil.copyfile(run / name, folder / name)
-    if (run / _TRANSFORMS).exists():
-        shutil.copyfile(run / _TRANSFORMS, folder / _TRANSFORMS)
-    _write(read_episodes(run), folder / FILE_NAME)
+    copied = [name for name in (*_WHOLE, _TRANSFORMS) if (run / name).exists()]
+    for name in copied:
+        verify(run / name)
+    folder.mkdir(parents=True, exist_ok=True)
+    for name in copied:
+        _copy(run / name, folder, name)
+    _write(read_episodes(run), folder, FILE_NAME)
     for path in sorted((run / "evaluation").glob("*.parquet")):
-        _write(pq.read_table(path), folder / "evaluation" / path.name)
+        _write(read_table(path), folder, f"evaluation/{path.name}")
     return folder
 
 
-def _write(table: pa.Table, path: Path) -> None:
-    path.parent.mkdir(parents=True, exist_ok=True)
+def _copy(path: Path, folder: Path, name: str) -> None:
+    content = path.read_bytes()
+    write_listed(folder, name, lambda file: file.write(content))
+
+
+def _write(table: pa.Table, folder: Path, name: str) -> None:
     ordered = table.sort_by([(name, "ascending") for name in ("replica", "episode", "agent")])
     kinds = pa.schema(
         [(own.name, pa.float32() if own.type == pa.float64() else own.type) for own in table.schema]
+    ).with_metadata(table.schema.metadata)
+    small = ordered.cast(kinds)
+    write_listed(
+        folder, name, lambda file: pq.write_table(small, file, compression="zstd", compression_level=19)
     )
-    pq.write_table(ordered.cast(kinds), path, compression="zstd", compression_level=19)

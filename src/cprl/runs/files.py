@@ -1,10 +1,12 @@
-"""Atomic writes: files are complete or absent."""
+"""Files of a run: complete or absent, JSON, and checksums."""
 
+import hashlib
+import json
 import os
 import sys
 from collections.abc import Callable
 from pathlib import Path
-from typing import BinaryIO
+from typing import Any, BinaryIO
 
 
 def write_atomically(path: Path, write: Callable[[BinaryIO], object]) -> None:
@@ -37,14 +39,52 @@ def place_atomically(
             os.fsync(file.fileno())
         path = name(partial)
         os.replace(partial, path)
-        _sync_folder(path.parent)
+        sync_folder(path.parent)
     except BaseException:
         partial.unlink(missing_ok=True)
         raise
     return path
 
 
-def _sync_folder(folder: Path) -> None:
+def write_json(path: Path, value: object) -> None:
+    """Writes a JSON value atomically."""
+    text = json.dumps(value, indent=2, allow_nan=False) + "\n"
+    write_atomically(path, lambda file: file.write(text.encode()))
+
+
+def read_json(path: Path) -> dict[str, Any]:
+    """Reads a JSON object.
+
+    Raises:
+        FileNotFoundError: if there is no such file.
+        ValueError: if it cannot be read, is nested too deeply or is not an object; names the file.
+    """
+    refuse_special(path)
+    try:
+        value = json.loads(path.read_text(encoding="utf-8"))
+    except (ValueError, RecursionError) as error:
+        raise ValueError(f"{path} is not JSON: {error}") from error
+    if not isinstance(value, dict):
+        raise ValueError(f"{path} holds a {type(value).__name__}; allowed: a JSON object")
+    return value
+
+
+def refuse_special(path: Path) -> None:
+    """Raises a ValueError for a directory, and for a pipe, which would wait for somebody to write into it."""
+    if path.exists() and not path.is_file():
+        raise ValueError(f"{path} is not a file")
+
+
+def checksum(path: Path) -> str:
+    """BLAKE2b of a file's content, 16 bytes in hexadecimal."""
+    digest = hashlib.blake2b(digest_size=16)
+    with open(path, "rb") as file:
+        while block := file.read(1 << 24):
+            digest.update(block)
+    return digest.hexdigest()
+
+
+def sync_folder(folder: Path) -> None:
     """Syncs a folder, so that a new name in it survives a power failure, if the system supports it."""
     if sys.platform == "win32":
         return

@@ -6,17 +6,18 @@ from typing import Any, Final
 
 import torch
 from tensordict import TensorDictBase
-from torch import Tensor, nn
+from torch import nn
 from torchrl.record.loggers import Logger
 
 from cprl.envs.commons_env import CommonsEnv
 from cprl.measuring.episodes import Episode
 from cprl.measuring.evaluate import evaluate, mean_return
-from cprl.runs.files import write_atomically
+from cprl.runs.files import refuse_special
+from cprl.runs.manifest import verify, write_listed
 
 
 def save_weights(run: Path, networks: Mapping[str, nn.Module], *, name: str = "final") -> Path:
-    """Writes the weights of each agent's network atomically.
+    """Writes the weights of each agent's network atomically, and lists them in the run's manifest.
 
     Args:
         run: the run's directory.
@@ -26,11 +27,8 @@ def save_weights(run: Path, networks: Mapping[str, nn.Module], *, name: str = "f
     Returns:
         `checkpoints/<name>.pt` of the run, which `load_weights` reads.
     """
-    path = run / "checkpoints" / f"{name}.pt"
-    path.parent.mkdir(exist_ok=True)
     weights = {agent: network.state_dict() for agent, network in networks.items()}
-    write_atomically(path, lambda file: torch.save(weights, file))
-    return path
+    return write_listed(run, f"checkpoints/{name}.pt", lambda file: torch.save(weights, file))
 
 
 TRANSFORMS: Final = "transforms.pt"
@@ -40,9 +38,7 @@ TRANSFORMS: Final = "transforms.pt"
 def save_transforms(run: Path, state: Mapping[str, Any]) -> None:
     """Writes the state of an environment's transforms atomically; writes no file if they have none."""
     if state:
-        path = run / "checkpoints" / TRANSFORMS
-        path.parent.mkdir(exist_ok=True)
-        write_atomically(path, lambda file: torch.save(dict(state), file))
+        write_listed(run, f"checkpoints/{TRANSFORMS}", lambda file: torch.save(dict(state), file))
 
 
 class BestWeights:
@@ -102,6 +98,20 @@ def restore_weights(path: Path, networks: Mapping[str, nn.Module]) -> None:
         network.load_state_dict(kept[agent])
 
 
-def load_weights(path: Path) -> dict[str, dict[str, Tensor]]:
-    """The state dict of each agent's network; loads tensors only, and runs no code of the file."""
-    return dict(torch.load(path, weights_only=True))
+def load_weights(path: Path) -> dict[str, Any]:
+    """The state dict of each agent's network, or the state of each transform; loads tensors only, and runs no
+    code of the file.
+
+    Raises:
+        ValueError: if the file is missing, damaged or foreign; names it and the reason.
+    """
+    refuse_special(path)
+    if path.exists():
+        verify(path)
+    try:
+        content = torch.load(path, weights_only=True)
+    except Exception as error:  # of whatever kind torch finds for what a file may hold
+        raise ValueError(f"{path} holds no weights: {error}") from error
+    if not isinstance(content, dict):
+        raise ValueError(f"{path} holds no weights, but a {type(content).__name__}")
+    return content

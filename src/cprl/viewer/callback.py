@@ -1,5 +1,6 @@
 """ViewerCallback: records a training for the Rerun viewer, and shows it live."""
 
+import json
 import time
 import uuid
 from collections.abc import Mapping, Sequence
@@ -20,6 +21,7 @@ from cprl.measuring.episodes import Episode
 from cprl.measuring.reported import FIELDS, METRICS, available, left_out, reported_by
 from cprl.measuring.series import Series, Values, mean_of, numbers_of
 from cprl.runs.directory import FILE_NAME as RECIPE_FILE
+from cprl.runs.files import read_json
 from cprl.viewer.events import ANOTHER, EventDetector
 from cprl.viewer.logger import FILE_NAME, RerunLogger
 from cprl.viewer.recorder import FrameRecorder, scene_of
@@ -84,7 +86,7 @@ class ViewerCallback:
             curves=curves,
             live=live,
             file_name=file_name or _free_name(run),
-            recording_id=_recording_id(run, title),
+            recording_id=_recording_id(run, file_name or FILE_NAME),
             console=console,
         )
         self._recorder = (
@@ -248,9 +250,10 @@ def _free_name(run: Path) -> str:
     return next(name for name in names if not (run / name).exists())
 
 
-def _recording_id(run: Path, title: str) -> str | None:
-    """The recording id, the same for a resumed run; None if the directory is not that of a run."""
-    recipe = run / RECIPE_FILE
-    if not recipe.exists():
+def _recording_id(run: Path, file_name: str) -> str | None:
+    """The recording id, the same when a run is resumed or extended; None where there is no run."""
+    if not (run / RECIPE_FILE).exists():
         return None
-    return str(uuid.uuid5(uuid.NAMESPACE_URL, title + recipe.read_text(encoding="utf-8")))
+    recipe = read_json(run / RECIPE_FILE)
+    same = {name: own for name, own in recipe.items() if name not in ("experiment", "extended")}
+    return str(uuid.uuid5(uuid.NAMESPACE_URL, file_name + json.dumps(same, sort_keys=True)))

@@ -1,0 +1,337 @@
+"""A run from its lock to its report: interrupted in any stage and resumed, it ends bit for bit the same."""
+
+import json
+import os
+import shutil
+import signal
+import socket
+from dataclasses import replace
+
+import pytest
+import torch
+from test_one_road import MEADOW, REPLAY
+
+import cprl
+from cprl import Custom, cli, maps, running
+from cprl.algorithms import DQN
+from cprl.population import Learning, Scripted
+from cprl.runs.checkpoints import Checkpointer, checkpoints_in, is_ending, read_checkpoint
+from cprl.runs.episodes import read_episodes, read_table
+from cprl.runs.files import checksum
+from cprl.runs.lock import RunLock, RunLockedError
+from cprl.runs.weights import load_weights
+
+LEARNING = Learning(DQN(settings=replace(REPLAY, hidden_cells=(8,))))
+FIELD = replace(
+    MEADOW,
+    game=replace(
+        MEADOW.game,
+        map=maps.parse(".A>A.\n..<A."),
+        rules=replace(MEADOW.game.rules, regrow_prob=(0.0,), episode_steps=40),
+    ),
+    agents=[LEARNING, Scripted("random")],
+    transforms=(),
+    callbacks=(),
+    episodes=5,
+)
+"""Its episodes have between ten and forty steps, so that one replica plays on while the other ends."""
+
+
+class InterruptionError(Exception):
+    """Stands for whatever ends a process."""
+
+
+def run(experiment, out, **how):
+    return cprl.run(experiment, out, watch="off", **how)
+
+
+def assert_same(run, other):
+    """Episodes, weights and evaluation are the same bit for bit."""
+    assert read_episodes(run).equals(read_episodes(other))
+    mine, theirs = (load_weights(one / "checkpoints" / "final.pt") for one in (run, other))
+    assert repr(mine) == repr(theirs)
+    for name in ("random", "trained"):
+        one, two = (read_table(each / "evaluation" / f"{name}.parquet") for each in (run, other))
+        assert one.equals(two)
+
+
+def contents(run):
+    return sorted(path.relative_to(run).as_posix() for path in run.rglob("*") if path.is_file())
+
+
+@pytest.fixture(scope="module")
+def whole(tmp_path_factory):
+    path = run(FIELD, tmp_path_factory.mktemp("whole") / "run")
+    table = read_episodes(path).to_pydict()
+    steps = [
+        sum(own for own, of in zip(table["steps"], table["replica"], strict=True) if of == r) for r in (0, 1)
+    ]
+    assert steps[0] != steps[1], "one replica plays on while the other ends"
+    return path
+
+
+def test_a_finished_run_has_results_their_checksums_and_the_state_to_extend_it_from(whole):
+    ending = next(path for path in contents(whole) if path.startswith("checkpoints/ending-"))
+    results = ["checkpoints/final.pt", "episodes.parquet"]
+    tables = ["evaluation/random.parquet", "evaluation/trained.parquet"]
+    listed = json.loads((whole / "manifest.json").read_text())["files"]
+    assert sorted(listed) == sorted(results + tables)
+    logs = [path for path in contents(whole) if path.startswith("logs/")]
+    others = ["figures/training_curve.png", "manifest.json", "recipe.json", "report.json"]
+    assert contents(whole) == sorted([ending, *results, *tables, *others, *logs])
+    assert json.loads((whole / "report.json").read_text())["episodes"] == FIELD.episodes
+
+
+SLOW = ("save_transforms", "training_curve", "write_json", "summarise")
+
+
+@pytest.mark.parametrize(
+    "stage",
+    ["save_weights", "evaluate_population", *(pytest.param(own, marks=pytest.mark.slow) for own in SLOW)],
+)
+def test_a_run_interrupted_in_any_stage_is_finished_by_resuming_it(stage, whole, tmp_path, monkeypatch):
+    def interrupted(*_, **__):
+        raise InterruptionError
+
+    with monkeypatch.context() as patched:
+        patched.setattr(running, stage, interrupted)
+        with pytest.raises(InterruptionError) as ended:
+            run(FIELD, tmp_path / "run")
+    assert ended.value.__notes__ == [f"To resume: cprl run {tmp_path / 'run'} --resume"]
+    assert checkpoints_in(tmp_path / "run" / "checkpoints")
+    assert run(FIELD, tmp_path / "run", resume=True) == tmp_path / "run"
+    assert_same(tmp_path / "run", whole)
+    assert (tmp_path / "run" / "report.json").exists()
+
+
+def test_a_finished_run_that_is_resumed_says_so_and_stays_as_it_is(whole, capsys):
+    before = {path: (whole / path).read_bytes() for path in contents(whole)}
+    run(FIELD, whole, resume=True)
+    assert f"{whole} is finished; with more --episodes it is extended" in capsys.readouterr().out
+    assert {path: (whole / path).read_bytes() for path in contents(whole)} == before
+
+
+@pytest.fixture(scope="module")
+def longer(tmp_path_factory):
+    return run(replace(FIELD, episodes=9), tmp_path_factory.mktemp("longer") / "run")
+
+
+def test_a_finished_run_is_extended_bit_for_bit_and_its_earlier_results_are_kept(
+    whole, longer, tmp_path, monkeypatch
+):
+    shorter, extended = tmp_path / "shorter", tmp_path / "extended"
+    shutil.copytree(whole, shorter)
+    shutil.copytree(whole, extended)
+    monkeypatch.setattr("sys.argv", f"cprl run {extended} --resume --episodes 9 --watch off".split())
+    cli.main()
+    assert_same(extended, longer)
+    assert cprl.load(extended).experiment == replace(FIELD, episodes=9)
+    assert repr(load_weights(extended / "checkpoints" / "final-5.pt")) == repr(
+        load_weights(shorter / "checkpoints" / "final.pt")
+    )
+    assert read_table(extended / "evaluation-5" / "trained.parquet").equals(
+        read_table(shorter / "evaluation" / "trained.parquet")
+    )
+    kept = cprl.load(extended, weights="final-5").networks
+    assert kept.keys() == cprl.load(extended).networks.keys()
+    recipe = json.loads((extended / "recipe.json").read_text())
+    assert [(own["episodes"], *own["versions"]) for own in recipe["extended"]] == [(5, *recipe["versions"])]
+
+
+@pytest.mark.slow
+def test_an_extension_that_is_interrupted_is_resumed(whole, longer, tmp_path, monkeypatch):
+    extended = shutil.copytree(whole, tmp_path / "extended")
+
+    def interrupted(*_, **__):
+        raise InterruptionError
+
+    more = replace(FIELD, episodes=9)
+    for stage in ("train", "save_weights", "evaluate_population"):
+        with monkeypatch.context() as patched:
+            patched.setattr(running, stage, interrupted)
+            with pytest.raises(InterruptionError):
+                run(more, extended, resume=True)
+    assert cprl.load(extended).weights_from.name == "final.pt"
+    run(more, extended, resume=True)
+    assert_same(extended, longer)
+
+
+@pytest.mark.slow
+def test_a_stopped_run_is_extended_too(longer, tmp_path, monkeypatch):
+    monkeypatch.setenv("STOP_AT_STEP", "41")
+    stopping = replace(FIELD, callbacks=[Custom("one_road_parts:Stopping")])
+    with pytest.raises(SystemExit):
+        run(stopping, tmp_path / "run")
+    monkeypatch.delenv("STOP_AT_STEP")
+    run(replace(stopping, episodes=9), tmp_path / "run", resume=True)
+    assert_same(tmp_path / "run", longer)
+
+
+def test_what_cannot_be_extended_bit_for_bit_is_refused_before_anything_is_written(whole, tmp_path):
+    bare = run(FIELD, tmp_path / "bare", keep_checkpoint=False)
+    assert checkpoints_in(bare / "checkpoints") == []
+    before = contents(bare)
+    with pytest.raises(ValueError, match=r"keeps no state of its training to extend it from"):
+        run(replace(FIELD, episodes=6), bare, resume=True)
+    assert contents(bare) == before
+    seeing = run(replace(MEADOW, episodes=2), tmp_path / "seeing")
+    with pytest.raises(
+        ValueError, match="has the callback Bored, whose on_start sees the number of episodes"
+    ):
+        run(replace(MEADOW, episodes=3), seeing, resume=True)
+    damaged = shutil.copytree(whole, tmp_path / "damaged")
+    (ending,) = filter(is_ending, checkpoints_in(damaged / "checkpoints"))
+    ending.write_bytes(ending.read_bytes()[:-1])
+    with pytest.raises(ValueError, match=f"{ending.name} is truncated or was changed"):
+        run(replace(FIELD, episodes=6), damaged, resume=True)
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"agents": [Learning(Custom("nowhere:Algorithm"))] * 2}, "nowhere"),
+        ({"transforms": [Custom("nowhere:Transform")]}, "nowhere"),
+        ({"loggers": [Custom("one_road_parts:NoLogger")]}, "NoLogger"),
+    ],
+)
+def test_a_refused_run_leaves_nothing_behind(change, message, tmp_path):
+    with pytest.raises((ValueError, TypeError), match=message):
+        run(replace(FIELD, **change), tmp_path / "run")
+    assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.filterwarnings("ignore:.*fork.*:DeprecationWarning")
+def test_a_run_that_is_written_is_locked_by_name_until_its_process_dies(tmp_path):
+    heard, say = os.pipe()
+    child = os.fork()
+    if child == 0:
+        with RunLock(tmp_path):
+            os.write(say, b"locked")
+            signal.pause()
+    os.read(heard, 6)
+    with pytest.raises(
+        RunLockedError, match=f"being written by process {child} on {socket.gethostname()} since"
+    ):
+        RunLock(tmp_path).__enter__()
+    with pytest.raises(RunLockedError), Checkpointer(tmp_path, take_over=True):
+        pass
+    os.kill(child, signal.SIGKILL)
+    os.waitpid(child, 0)
+    assert (tmp_path / "run.lock").exists()
+    with RunLock(tmp_path):
+        assert json.loads((tmp_path / "run.lock").read_text())["pid"] == os.getpid()
+    assert not (tmp_path / "run.lock").exists()
+
+
+def test_a_lock_of_another_host_is_refused_unless_it_is_taken_over(whole, tmp_path):
+    stopped = shutil.copytree(whole, tmp_path / "run")
+    (stopped / "report.json").unlink()
+    (stopped / "run.lock").write_text('{"host": "elsewhere", "pid": 7, "started": "2026-11-22T10:00:00"}\n')
+    with pytest.raises(RunLockedError, match=r"locked by process 7 on elsewhere since .*--take-over"):
+        run(FIELD, stopped, resume=True)
+    run(FIELD, stopped, resume=True, take_over=True)
+    assert_same(stopped, whole)
+
+
+def test_a_second_writer_is_refused_and_changes_nothing(whole, tmp_path):
+    live = shutil.copytree(whole, tmp_path / "run")
+    (live / "report.json").unlink()
+    with RunLock(live):
+        before = {path: (live / path).read_bytes() for path in contents(live)}
+        with pytest.raises(RunLockedError, match="is being written by process"):
+            run(FIELD, live, resume=True)
+        assert {path: (live / path).read_bytes() for path in contents(live)} == before
+
+
+@pytest.mark.parametrize("again", [False, True], ids=["deleted", "made again"])
+def test_a_deleted_run_ends_within_a_checkpoint_and_nothing_is_recreated(again, tmp_path, monkeypatch):
+    monkeypatch.setattr(running, "Checkpointer", _often)
+    monkeypatch.setenv("DELETE", f"{tmp_path / 'run'} {int(again)}")
+    deleting = replace(FIELD, callbacks=[Custom("one_road_parts:Deleting")], loggers=())
+    with pytest.raises(FileNotFoundError, match="the directory was deleted while the run was written"):
+        run(deleting, tmp_path / "run")
+    assert [path.name for path in tmp_path.rglob("*")] == (["run"] if again else [])
+
+
+def _often(*arguments, **how):
+    return Checkpointer(*arguments, every_s=1e-9, **how)
+
+
+def test_a_shorter_journal_falls_back_to_the_checkpoint_before(whole, tmp_path, monkeypatch, capsys):
+    monkeypatch.setenv("STOP_AT_STEP", "75")
+    monkeypatch.setattr(running, "Checkpointer", _often)
+    stopping = replace(FIELD, callbacks=[Custom("one_road_parts:Stopping")], loggers=())
+    path = tmp_path / "run"
+    with pytest.raises(SystemExit):
+        run(stopping, path)
+    monkeypatch.undo()
+    kept = checkpoints_in(path / "checkpoints")
+    rows = read_episodes(path).num_rows
+    _make_newest_have_one_episode_more(kept, path)
+    run(stopping, path, resume=True)
+    assert f"Passed over: {path / 'episodes.arrows'} holds {rows} rows up to there" in capsys.readouterr().out
+    assert read_episodes(path).equals(read_episodes(whole))
+
+
+def _make_newest_have_one_episode_more(kept, path):
+    state = read_checkpoint(kept[-1])
+    state["callbacks"]["EpisodeTable"]["rows"] += 2
+    torch.save(state, kept[-1])
+    kept[-1].rename(kept[-1].with_name(f"training-{state['steps']:012d}-{checksum(kept[-1])}.pt"))
+
+
+def test_going_on_under_other_versions_is_said(whole, tmp_path, capsys):
+    other = shutil.copytree(whole, tmp_path / "run")
+    (other / "report.json").unlink()
+    recipe = json.loads((other / "recipe.json").read_text())
+    recipe["versions"]["torch"] = "1.0"
+    (other / "recipe.json").write_text(json.dumps(recipe))
+    run(FIELD, other, resume=True)
+    assert "was begun under other versions" in (said := capsys.readouterr().err)
+    assert "versions.torch was '1.0', is" in said
+
+
+def test_empty_and_nan_weights_are_refused_by_name(whole, tmp_path):
+    path = shutil.copytree(whole, tmp_path / "run")
+    (path / "manifest.json").unlink()
+    final = path / "checkpoints" / "final.pt"
+    weights = load_weights(final)
+    for own in weights["replica_1/agent_0"].values():
+        own.fill_(torch.nan)
+    torch.save(weights, final)
+    loaded = cprl.load(path)
+    loaded.agent(0, replica=0)
+    with pytest.raises(ValueError, match=r"final\.pt: the weights of replica_1/agent_0 are NaN or infinite"):
+        loaded.agent(0, replica=1)
+    for own in weights["replica_0/agent_0"].values():
+        own.fill_(torch.inf)
+    torch.save(weights, final)
+    with pytest.raises(ValueError, match=r"final\.pt holds no weights of this run: all are NaN or infinite"):
+        cprl.load(path)
+    torch.save({}, final)
+    with pytest.raises(ValueError, match=r"final\.pt holds no weights of this run: it is empty"):
+        cprl.load(path)
+
+
+@pytest.mark.parametrize("name", ["../../other", "/etc/passwd", "..", ""])
+def test_weights_are_named_inside_the_run(whole, name):
+    with pytest.raises(ValueError, match=r"weights is .*; allowed: a name in"):
+        cprl.load(whole, weights=name)
+
+
+def test_a_pipe_in_place_of_weights_is_refused_at_once(whole, tmp_path):
+    path = shutil.copytree(whole, tmp_path / "run")
+    (path / "checkpoints" / "final.pt").unlink()
+    os.mkfifo(path / "checkpoints" / "final.pt")
+    with pytest.raises(ValueError, match=r"final\.pt is not a file"):
+        cprl.load(path)
+
+
+def test_files_are_written_as_the_umask_says(tmp_path):
+    before = os.umask(0o027)
+    try:
+        path = run(FIELD, tmp_path / "run")
+    finally:
+        os.umask(before)
+    modes = {name: (path / name).stat().st_mode & 0o777 for name in contents(path)}
+    assert modes == dict.fromkeys(modes, 0o640)
