@@ -24,7 +24,9 @@ def main() -> None:
             print(f"| {number} | {kill.row}", flush=True)
     stages = ", ".join(f"{stage} {number}" for stage, number in Counter(kill.stage for kill in done).items())
     wrong = sum(bool(kill.outcome) for kill in done)
-    print(f"\n{len(done)} kills ({stages}) in {time.monotonic() - began:.0f} s; {wrong} of a run that was not")
+    print(
+        f"\n{len(done)} kills ({stages}) in {time.monotonic() - began:.0f} s; {wrong} of a run that was not"
+    )
     print("bit-identical in the end.")
     sys.exit(bool(wrong))
 

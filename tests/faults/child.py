@@ -44,8 +44,8 @@ class Life:
     """A stage and n: before the n-th file operation of that stage, counted from 1, the process waits."""
     user: int | None = None
     """The number of the user that it becomes."""
-    reads_output: bool = True
-    """Whether somebody reads its standard output; else that is a pipe whose reader has gone."""
+    cache: Path | None = None
+    """A folder of that user for compiled rules."""
 
 
 class Reporter:
@@ -89,10 +89,6 @@ def live(life: Life, pipe: Connection) -> None:
     """The body of the process."""
     for number, path in ((1, life.output), (2, life.output.with_suffix(".err"))):
         os.dup2(os.open(path, os.O_WRONLY | os.O_CREAT | os.O_TRUNC, 0o666), number)
-    if not life.reads_output:
-        reader, writer = os.pipe()
-        os.close(reader)
-        os.dup2(writer, 1)
     multiprocessing.set_start_method(None, force=True)  # as where nothing was forked
     from cprl import cli, running
     from cprl.runs.checkpoints import Checkpointer
@@ -112,6 +108,7 @@ def live(life: Life, pipe: Connection) -> None:
     if life.user is not None:
         os.setgid(life.user)
         os.setuid(life.user)
+        os.environ["CPRL_CACHE"] = str(life.cache)
     sys.argv = list(life.argv)
     cli.main()
     reporter.begin("end")

@@ -1,4 +1,4 @@
-"""What tests of faults share: a small training, its undisturbed run, and a file system of a megabyte or two."""
+"""What tests of faults share: a small training, its undisturbed run, and a small file system."""
 
 import subprocess
 from dataclasses import replace

@@ -39,7 +39,7 @@ AGENTS: Final[dict[str, tuple[AgentSpec, ...]]] = {
 }
 """Who plays in each training."""
 
-EPISODES: Final = {"dqn": 60, "mixed": 40, "ppo": 120, "vdn": 60}
+EPISODES: Final = {"dqn": 40, "mixed": 30, "ppo": 80, "vdn": 40}
 ENGINES: Final = ("eager", "compiled")
 
 

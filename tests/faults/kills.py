@@ -77,7 +77,12 @@ class Victim:
             who = self.shop.experiment
             done.append(
                 Kill(
-                    experiment=who.name, engine=who.engine, stage=stage_then, moment=told, step=step, rows=rows
+                    experiment=who.name,
+                    engine=who.engine,
+                    stage=stage_then,
+                    moment=told,
+                    step=step,
+                    rows=rows,
                 )
             )
         outcome = self._outcome(run, ended or lived(self.shop.resumed(name)))

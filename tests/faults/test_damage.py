@@ -46,17 +46,12 @@ def test_a_bit_that_flipped_in_a_result_is_refused_by_name(name, read, tmp_path,
     run = tmp_path / "run"
     shutil.copytree(twin[0], run)
     read(run)
-    content, accepted = (run / name).read_bytes(), []
+    content = (run / name).read_bytes()
     for nth in range(BITS):
         (run / name).write_bytes(flipped(run / name, nth))
-        try:
+        with pytest.raises(ValueError, match=re.escape(str(run / name))):
             read(run)
-        except ValueError as error:
-            assert str(run / name) in str(error)
-        else:
-            accepted.append(nth)
         (run / name).write_bytes(content)
-    assert accepted == []
 
 
 @pytest.mark.parametrize("nth", range(BITS))
