@@ -134,7 +134,7 @@ def test_an_argument_that_is_unknown_or_does_not_fit_is_refused(line, capsys):
 @pytest.mark.parametrize(
     ("line", "message"),
     [
-        ("--replicas 0", r"^mine\.py: experiment\.replicas is 0; allowed: a whole number from 1"),
+        ("--replicas 0", r"^mine\.py: experiment\.replicas is 0; allowed: an integer in 1"),
         ("--game.map single_basic", r"^mine\.py: experiment\.agents: 4 agents are specified for a game of 1"),
         ("--game.rules.hits-to-tag 0", r"^mine\.py: Rules\.hits_to_tag is 0"),
         ("--update-every 3", r"update_every is 3; it must divide experiment\.agents\[2\]"),

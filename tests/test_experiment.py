@@ -85,19 +85,22 @@ def test_a_recipe_of_another_format_is_refused():
 @pytest.mark.parametrize(
     ("change", "message"),
     [
-        ({"episodes": 0}, r"experiment\.episodes is 0; allowed: a whole number from 1"),
-        ({"episodes": 1.5}, r"experiment\.episodes is 1\.5; allowed: a whole number"),
+        ({"episodes": 0}, r"experiment\.episodes is 0; allowed: an integer in 1"),
+        ({"episodes": 1.5}, r"experiment\.episodes is 1\.5; allowed: an integer"),
         ({"replicas": True}, r"experiment\.replicas is True"),
         ({"evaluation_episodes": 0}, r"experiment\.evaluation_episodes is 0"),
         ({"update_every": -1}, r"experiment\.update_every is -1"),
-        ({"seed": 2**64 - 1}, r"experiment\.seed is 18446744073709551615; allowed: 0 to 2\*\*64 - 2"),
+        (
+            {"seed": 2**64 - 1},
+            r"experiment\.seed is 18446744073709551615; allowed: an integer in 0\.\.2\*\*64 - 2",
+        ),
         ({"seed": -1}, r"experiment\.seed is -1"),
         ({"name": "a/b"}, r"experiment\.name is 'a/b'; allowed: the name of a directory"),
         ({"name": ".."}, r"experiment\.name is '\.\.'"),
         ({"device": "gpu"}, r"experiment\.device is 'gpu'; allowed: \"cpu\""),
         ({"engine": "quick"}, r"experiment\.engine is 'quick'; allowed: 'compiled', 'eager', 'torchrl'"),
         ({"engine": "torchrl"}, r"experiment\.agents\[1\] is a Team, which engine=\"torchrl\" cannot train"),
-        ({"game": 3}, r"experiment\.game is a int; allowed: a Game, a Custom, or a value with"),
+        ({"game": 3}, r"experiment\.game is 3; allowed: a Game, a Custom, or a value with"),
         ({"agents": [DQN_AGENT]}, r"experiment\.agents: 1 agents are specified for a game of 4 agents"),
         ({"agents": DQN_AGENT}, r"experiment\.agents is a Learning; allowed: a tuple"),
         ({"agents": [DQN(settings=DQNSettings())]}, r"agents\[0\] is a DQN; allowed: Learning, Team"),
@@ -116,10 +119,6 @@ def test_a_recipe_of_another_format_is_refused():
         (
             {"agents": [Learning(Tabular(settings=TabularSettings()))] * 4, "engine": "torchrl"},
             r"agents\[0\] is Tabular, which",
-        ),
-        (
-            {"agents": [Learning(DQN(settings=RolloutSettings()))] * 4},
-            r"settings is Roll.*; allowed: a DQNSe",
         ),
         ({"callbacks": [Callback()]}, r"callbacks\[0\] is a Callback, .*Custom\(\"my_game:Callback\", arg"),
         ({"loggers": ["csw"]}, r"loggers\[0|loggers is \('csw',\); allowed: \('csv', 'tensorboard', 'wandb'"),

@@ -10,11 +10,14 @@ import cprl
 SOURCE = Path(__file__).parents[1] / "src" / "cprl"
 PACKAGES = (
     "compat",
+    "checks",
     "keys",
     "spaces",
     "custom",
+    "output",
     "process",
     "compiling",
+    "memory",
     "institutions",
     "commons",
     "theory",

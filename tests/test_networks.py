@@ -264,7 +264,7 @@ def test_what_a_network_cannot_do_is_refused_by_name():
 @pytest.mark.parametrize(
     ("make", "message"),
     [
-        (partial(Conv, channels=()), "Conv.channels is empty"),
+        (partial(Conv, channels=()), r"Conv.channels is \(\); allowed: 1 to 64 layers"),
         (partial(Conv, channels=(4, 0)), r"Conv.channels is \(4, 0\)"),
         (partial(Conv, kernel_cells=2), "Conv.kernel_cells is 2; allowed: 1, 3, 5"),
         (partial(Conv, hidden_cells=(0,)), r"Conv.hidden_cells is \(0,\)"),

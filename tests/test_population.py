@@ -387,7 +387,7 @@ class PPOFromReplay(OffPolicy):
 
 def test_what_does_not_fit_is_refused_before_training_and_says_what_fits(tmp_path, capsys):
     dqn = Learning(ALGORITHMS["DQN"])
-    with pytest.raises(ValueError, match="reward is 'group'; allowed: individual, team"):
+    with pytest.raises(ValueError, match="reward is 'group'; allowed: 'individual', 'team'"):
         Learning(ALGORITHMS["DQN"], reward="group")
     with pytest.raises(ValueError, match="3 agents are specified for a game of 4 agents; allowed: one"):
         population([dqn] * 3)

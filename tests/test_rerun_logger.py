@@ -275,12 +275,18 @@ class Broken:
         return fail
 
 
+def fail(live, logger):
+    """Logs to a live stream, whose calls are made in another thread, and waits for them."""
+    logger.log_frames(frames(3)[0])
+    live.close()
+
+
 def test_a_stream_that_fails_is_dropped_with_one_warning_and_the_other_goes_on(tmp_path):
     with RerunLogger("run", tmp_path, scene=SCENE, live="serve") as logger:
         live = next(stream for stream in logger._streams if stream.name == "live view")
         live.recording = Broken()
         with pytest.warns(RuntimeWarning, match="live view failed.*no space left") as caught:
-            logger.log_frames(frames(3)[0])
+            fail(live, logger)
         assert len(caught) == 1
         with warnings.catch_warnings():
             warnings.simplefilter("error")

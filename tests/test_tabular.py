@@ -358,8 +358,8 @@ def test_tables_grow_and_keep_what_they_hold():
     [
         ({"gamma": 1.5}, r"gamma is 1.5; allowed: a number in 0..1"),
         ({"learning_rate": "1/n"}, r"learning_rate is '1/n'; allowed: a number in 0..1 or '1/visits'"),
-        ({"max_states": 0}, "max_states is 0; allowed: an integer >= 1"),
-        ({"epsilon_decay_steps": 0}, "epsilon_decay_steps is 0; allowed: an integer >= 1"),
+        ({"max_states": 0}, "max_states is 0; allowed: an integer in 1"),
+        ({"epsilon_decay_steps": 0}, "epsilon_decay_steps is 0; allowed: an integer in 1"),
     ],
 )
 def test_settings_that_cannot_be_are_refused(how, message):

@@ -238,14 +238,14 @@ def test_what_is_no_team_is_refused_and_says_what_fits():
     with pytest.raises(ValueError, match=r"QMIX is learned by a team: Team\(QMIX\(...\), agents=\(0, 1\)\)"):
         Learning(TEAMS["QMIX"])
     with pytest.raises(
-        ValueError, match=r"the algorithm is a DQN; allowed: a TeamAlgorithm of cprl\.algorithms"
+        ValueError, match=r"Team\.algorithm is a DQN; allowed: a TeamAlgorithm of cprl\.algorithms"
     ):
         Team(DQN(settings=REPLAY), FOUR)
     with pytest.raises(
         ValueError, match='reward is "individual"; allowed for a team that learns from replay: "team"'
     ):
         ReplayLearner(GAME.spaces, agents=FOUR, replicas=2, settings=REPLAY, make_team=TeamNetwork)
-    with pytest.raises(ValueError, match=r"QMIX\.settings is a RolloutSettings; allowed: DQNSettings"):
+    with pytest.raises(ValueError, match=r"QMIX\.settings is a RolloutSettings; allowed: a DQNSettings"):
         population([Team(QMIX(settings=ROLLOUTS), FOUR)])
     for agents, message in [((1, 0), "ascending agent indices"), ((), "at least one"), ((0, 0), "ascending")]:
         with pytest.raises(ValueError, match=message):

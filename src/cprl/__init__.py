@@ -2,11 +2,14 @@
 
 Each imports only from those above it:
     compat       what relies on private parts of libraries
+    checks       what users hand in: what fits, and how a refusal reads
     keys         the TensorDict entries, their shapes and types
     spaces       what agents observe and may do
     custom       the user's own code, as a text that a recipe can keep
+    output       text for the terminal, which may close
     process      settings of the process that trains
     compiling    functions compiled by torch
+    memory       devices, and what would not fit into their memory
     commons      the game: maps, rules, turns; numpy and numba alone
     envs         TorchRL, PettingZoo, Gymnasium; make_env, where environments are put together
     networks     from observations to numbers

@@ -7,7 +7,6 @@ from importlib.metadata import version
 from pathlib import Path
 
 import tyro
-from rich.console import Console
 from rich.table import Table
 
 from cprl.commandline import in_a_sentence
@@ -17,6 +16,7 @@ from cprl.evaluation.evaluate import SEED, evaluate_run
 from cprl.evaluation.film import film as film_run
 from cprl.evaluation.tables import agents_table, heading, matrices, run_table
 from cprl.experiment import Experiment
+from cprl.output import OUT, console, keep_output, say
 from cprl.process import prepare_process
 from cprl.reporting import write_report
 from cprl.running import run as run_experiment
@@ -70,7 +70,7 @@ def run(
         allow=allow,
         command=sys.argv,
     )
-    print(done)
+    say(done)
 
 
 def report(runs: tuple[Path, ...], /, *, out: Path = Path("report")) -> None:
@@ -83,7 +83,7 @@ def report(runs: tuple[Path, ...], /, *, out: Path = Path("report")) -> None:
     if not runs:
         raise ValueError("cprl report wants at least one run: cprl report RUN...")
     prepare_process(SEED)
-    print(write_report(runs, out))
+    say(write_report(runs, out))
 
 
 def film(
@@ -107,8 +107,8 @@ def film(
     _make_importable(allow)
     prepare_process(SEED)
     path, played = film_run(run, out, replica=replica, episode=episode, allow=allow)
-    print(f"{played.steps} steps, {played.outcome}")
-    print(f"Watch: {viewer()} {path}")
+    say(f"{played.steps} steps, {played.outcome}")
+    say(f"Watch: {viewer()} {path}")
 
 
 def watch(run: Path, /) -> None:
@@ -131,7 +131,7 @@ def export(run: Path, folder: Path, /) -> None:
         run: the run's directory.
         folder: where to.
     """
-    print(export_results(run, folder))
+    say(export_results(run, folder))
 
 
 def evaluate(
@@ -166,9 +166,9 @@ def evaluate(
     if out is not None:
         write_table(out, evaluation.table())
     _print(run_table(evaluation))
-    print(f"Weights: {evaluation.run.weights_from}")
+    say(f"Weights: {evaluation.run.weights_from}")
     if out is not None:
-        print(f"Episodes: {out}")
+        say(f"Episodes: {out}")
 
 
 def crossplay(
@@ -205,10 +205,10 @@ def crossplay(
     )
     if out is not None:
         write_table(out, played.table())
-    print(heading(played))
+    say(heading(played))
     _print(*matrices(played), agents_table(played))
     if out is not None:
-        print(f"Episodes: {out}")
+        say(f"Episodes: {out}")
 
 
 def _make_importable(allow: tuple[str, ...]) -> None:
@@ -219,17 +219,16 @@ def _make_importable(allow: tuple[str, ...]) -> None:
 
 def _print(*tables: Table) -> None:
     """Prints tables; into a file or pipe as wide as they are."""
-    console = Console()
-    if not console.is_terminal:
-        console = Console(width=250)
+    shown = console(width=None if OUT.isatty() else 250)
     for table in tables:
-        console.print(table)
+        shown.print(table)
 
 
 def main() -> None:
     """The command line; what cannot be done is said in a line, and ends with exit code 1."""
+    keep_output()
     if sys.argv[1:] == ["--version"]:
-        print(f"cprl {version('cprl')}")
+        say(f"cprl {version('cprl')}")
         return
     with in_a_sentence("cprl"):
         tyro.extras.subcommand_cli_from_dict(

@@ -12,6 +12,8 @@ from torchrl.collectors import BaseCollector, Collector
 from torchrl.envs import EnvBase
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 
+from cprl.checks import checked, count
+
 
 class StepCollector(BaseCollector):
     """Yields steps of all worlds one by one, batch size [B].
@@ -71,6 +73,7 @@ def stock_collector(env: EnvBase, policy: nn.Module, *, steps: int = 1) -> Colle
         policy: writes the actions.
         steps: steps per batch; agents explore in all of them with the epsilon of the first.
     """
+    steps = checked("steps", steps, count(1))
     before = deepcopy(policy.state_dict())
     collector = Collector(
         env,

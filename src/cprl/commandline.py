@@ -14,6 +14,7 @@ from typing import Annotated, Any, Final
 
 import tyro
 
+from cprl.checks import checked, instance
 from cprl.experiment import Experiment
 from cprl.flags import applied, flags_of
 
@@ -103,6 +104,7 @@ def parse(
     made, _ = tyro.cli(
         make_experiment, args=given, prog=script, return_unknown_args=True, add_help=False, config=_CONFIG
     )
+    checked("what the recipe makes", made, instance(Experiment, "an Experiment"))
     kind, default = flags_of(made, all_agents=not {"-h", "--help"} & set(given))
 
     def read(

@@ -4,7 +4,6 @@ A frozen dataclass becomes `{"kind": "DQN", ...its fields}`, a tuple a list. Rea
 known is refused by name, with the place where it stands, e.g. `experiment.agents[0].algorithm.settings.gama`.
 """
 
-import reprlib
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import MISSING, fields, is_dataclass
 from difflib import get_close_matches
@@ -30,6 +29,7 @@ from cprl.algorithms import (
     Tabular,
     TabularSettings,
 )
+from cprl.checks import check_nesting, shown
 from cprl.commons.game import Game
 from cprl.commons.maps import Map
 from cprl.commons.observation import Observation
@@ -60,6 +60,11 @@ def to_config(value: object, where: str = "value") -> Any:
     Raises:
         ValueError: for anything else, by the place where it stands; says what to write instead.
     """
+    check_nesting(value, where)
+    return _config(value, where)
+
+
+def _config(value: object, where: str) -> Any:
     if value is None or isinstance(value, bool):
         return value
     if isinstance(value, float):
@@ -71,7 +76,7 @@ def to_config(value: object, where: str = "value") -> Any:
     if isinstance(value, str):
         return str(value)
     if isinstance(value, tuple | list):
-        return [to_config(entry, f"{where}[{place}]") for place, entry in enumerate(value)]
+        return [_config(entry, f"{where}[{place}]") for place, entry in enumerate(value)]
     if isinstance(value, Custom):
         return {"kind": "Custom", "target": value.target, "arguments": dict(value.arguments)}
     if is_dataclass(value) and KINDS.get(type(value).__name__) is type(value):
@@ -112,6 +117,7 @@ def from_config(table: object, where: str = "value", *, allow: Iterable[str] = (
         ValueError: for a kind or field that is not known, a value that does not fit, and for a target that
             is not allowed; by the place where it stands.
     """
+    check_nesting(table, where)
     refuse_targets(table, allow)
     return _value(table, where)
 
@@ -122,12 +128,14 @@ def fields_from_config(kind: type[T], table: object, where: str, *, allow: Itera
     Raises:
         ValueError: see `from_config`.
     """
+    check_nesting(table, where)
     refuse_targets(table, allow)
     return _built(kind, table, where)
 
 
 def custom_targets(table: object) -> list[str]:
     """The targets of each `Custom` in a table that `to_config` gave, sorted, each once."""
+    check_nesting(table, "the table")
     return sorted(set(_targets(table)))
 
 
@@ -160,7 +168,7 @@ def differences(before: object, now: object, where: str) -> list[str]:
     elif isinstance(before, list) and isinstance(now, list) and len(before) == len(now):
         pairs = enumerate(zip(before, now, strict=True))
         return [line for place, (a, b) in pairs for line in differences(a, b, f"{where}[{place}]")]
-    return [] if before == now else [f"{where} was {_short(before)}, is {_short(now)}"]
+    return [] if before == now else [f"{where} was {_held(before)}, is {_held(now)}"]
 
 
 def _targets(table: object) -> Iterator[str]:
@@ -196,7 +204,7 @@ def _value(table: object, where: str) -> Any:
 
 def _built(kind: type[T], table: object, where: str) -> T:
     if not isinstance(table, Mapping):
-        raise ValueError(f"{where} is {_short(table)}; allowed: a table of the fields of {kind.__name__}")
+        raise ValueError(f"{where} is {shown(table)}; allowed: a table of the fields of {kind.__name__}")
     hints = _hints(kind)
     for name in table:
         if name not in hints:
@@ -232,7 +240,7 @@ def _hints(kind: Any) -> dict[str, Any]:
 
 def _check_type(value: object, hint: Any, where: str) -> None:
     if not fits(value, hint):
-        raise ValueError(f"{where} is {_short(value)}; allowed: {type_text(hint)}")
+        raise ValueError(f"{where} is {shown(value)}; allowed: {type_text(hint)}")
 
 
 def fits(value: object, hint: Any) -> bool:
@@ -288,13 +296,8 @@ def _meant(name: object, known: Iterable[str]) -> str:
     return f" (did you mean {close[0]!r}?)" if close else ""
 
 
-class _Absent:
-    def __repr__(self) -> str:
-        return "not there"
+def _held(value: object) -> str:
+    return "not there" if value is _ABSENT else shown(value)
 
 
-_ABSENT: Final = _Absent()
-
-
-def _short(value: object) -> str:
-    return reprlib.repr(value)
+_ABSENT: Final = object()

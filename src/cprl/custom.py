@@ -2,9 +2,18 @@
 
 import importlib
 import json
+import re
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-from typing import Any
+from typing import Any, Final
+
+from cprl.checks import Check, check_nesting, checked, instance
+
+_NAMES: Final = re.compile(r"[\w-]+(\.[\w-]+)*:\w+(\.\w+)*", re.ASCII)
+_TARGET: Final = Check(
+    lambda value: isinstance(value, str) and len(value) <= 1000 and bool(_NAMES.fullmatch(value)),
+    '"module:Class"',
+)
 
 
 @dataclass(frozen=True)
@@ -29,16 +38,17 @@ class Custom:
     arguments: Mapping[str, Any] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
-        module, colon, name = self.target.partition(":")
-        if not (colon and module and name):
-            raise ValueError(f'Custom.target is {self.target!r}; allowed: "module:Class"')
+        checked("Custom.target", self.target, _TARGET)
+        checked("Custom.arguments", self.arguments, instance(Mapping, "a table of keyword arguments"))
+        check_nesting(self.arguments, f"Custom.arguments of {self.target!r}")
         try:
+            _refuse_other_keys(self.arguments)
             text = json.dumps(dict(self.arguments), allow_nan=False)
+            object.__setattr__(self, "arguments", json.loads(text))
         except (TypeError, ValueError) as error:
             raise ValueError(
-                f"the arguments of Custom({self.target!r}) cannot be kept as JSON: {error}"
+                f"Custom.arguments of {self.target!r} cannot be kept as JSON: {error}"
             ) from error
-        object.__setattr__(self, "arguments", json.loads(text))
 
     def __hash__(self) -> int:
         return hash((self.target, json.dumps(self.arguments, sort_keys=True)))
@@ -74,6 +84,17 @@ class Custom:
 def made(value: Any, *positional: Any) -> Any:
     """What a `Custom` makes; anything else as it is."""
     return value.make(*positional) if isinstance(value, Custom) else value
+
+
+def _refuse_other_keys(value: Any) -> None:
+    """Raises a TypeError for tables by something else than text, which JSON would turn into text."""
+    if isinstance(value, Mapping):
+        for key in value:
+            if not isinstance(key, str):
+                raise TypeError(f"a table has the key {key!r}; allowed: text")
+    if isinstance(value, Mapping | list | tuple):
+        for own in value.values() if isinstance(value, Mapping) else value:
+            _refuse_other_keys(own)
 
 
 def _with_keys(value: Any) -> Any:

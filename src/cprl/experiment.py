@@ -6,15 +6,26 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Final, Literal, get_args
 
-import torch
-
 from cprl.algorithms import Tabular
 from cprl.algorithms.base import TeamAlgorithm, TrainingEngine
+from cprl.checks import (
+    DIRECTORY_NAME,
+    Check,
+    check_fields,
+    check_nesting,
+    checked,
+    count,
+    instance,
+    is_count,
+    one_of,
+    shown,
+)
 from cprl.commons.game import Game
 from cprl.config import custom_targets, differences, fields_from_config, fields_to_config
 from cprl.custom import Custom
 from cprl.envs.make_env import PlayableGame
-from cprl.population import AgentSpec, Frozen, Learning, Team, specs_by_agent
+from cprl.memory import DEVICE
+from cprl.population import SPEC, AgentSpec, Frozen, Learning, Team, specs_by_agent
 from cprl.runs.old_recipes import experiment_config
 
 LoggerName = Literal["csv", "tensorboard", "wandb"]
@@ -64,11 +75,9 @@ class Experiment:
     "eager", the same uncompiled; "torchrl", stock TorchRL, one agent after the other."""
 
     def __post_init__(self) -> None:
-        for name in ("agents", "transforms", "callbacks", "loggers"):
-            given = getattr(self, name)
-            if isinstance(given, list):
-                object.__setattr__(self, name, tuple(given))
-        _check_kinds(self)
+        check_fields(self, _CHECKS, "experiment")
+        _check_game(self.game)
+        _check_specs(self.agents)
         self.to_config()
         _check_numbers(self)
         _check_agents(self)
@@ -135,17 +144,22 @@ def recipe_config(recipe: Mapping[str, Any]) -> dict[str, Any]:
     Raises:
         ValueError: for another format, and for one of before that lacks what each had.
     """
+    checked("the recipe", recipe, instance(Mapping, "a table"))
+    check_nesting(recipe, "the recipe")
     if not _is_old(recipe):
         if recipe.get("format") != FORMAT or not isinstance(recipe.get("experiment"), Mapping):
-            raise ValueError(f"the recipe has the format {recipe.get('format')!r}; allowed: {FORMAT}")
+            raise ValueError(
+                f"the recipe has the format {shown(recipe.get('format'))}; allowed: {FORMAT}, with a table "
+                '"experiment"'
+            )
         return dict(recipe["experiment"])
     try:
         table = experiment_config(recipe)
-    except (KeyError, TypeError) as error:
+        for agent in table["agents"]:
+            if agent["kind"] == "Frozen":  # absolute at that time
+                agent["run"] = os.path.relpath(agent["run"])
+    except (KeyError, TypeError, AttributeError, ValueError) as error:
         raise ValueError(f"the recipe holds no game and agents of cprl: {error!r}") from error
-    for agent in table["agents"]:
-        if agent["kind"] == "Frozen":  # absolute at that time
-            agent["run"] = os.path.relpath(agent["run"])
     return table
 
 
@@ -204,38 +218,46 @@ def _tuples(value: Any) -> Any:
     return tuple(map(_tuples, value)) if isinstance(value, list) else value
 
 
-def _check_kinds(experiment: Experiment) -> None:
-    if not isinstance(experiment.game, Game | Custom | PlayableGame):
-        raise ValueError(
-            f"experiment.game is a {type(experiment.game).__name__}; allowed: a Game, a Custom, or a value "
-            "with `agents`, `to_config` and `make`"
-        )
-    if not isinstance(experiment.agents, tuple):
-        kind = type(experiment.agents).__name__
-        raise ValueError(f"experiment.agents is a {kind}; allowed: a tuple of specifications")
-    for place, spec in enumerate(experiment.agents):
-        if not isinstance(spec, AgentSpec):
-            raise ValueError(
-                f"experiment.agents[{place}] is a {type(spec).__name__}; allowed: Learning, Team, Scripted, "
-                "Frozen of cprl.population"
-            )
+def _is_playable(value: Any) -> bool:
+    return isinstance(value, Game | Custom | PlayableGame) and not isinstance(value, type)
+
+
+_MOST_WORLDS: Final = 2**22
+_TUPLE: Final = instance(tuple, "a tuple")
+_CHECKS: Final[dict[str, Check]] = {
+    "name": DIRECTORY_NAME,
+    "game": Check(_is_playable, "a Game, a Custom, or a value with `agents`, `to_config` and `make`"),
+    "agents": instance(tuple, "a tuple of specifications"),
+    "episodes": count(1),
+    "replicas": count(1, 2**20),
+    "seed": Check(lambda value: is_count(value, 0, MOST_SEED), "an integer in 0..2**64 - 2"),
+    "evaluation_episodes": count(1, 2**20),
+    "update_every": count(1),
+    **dict.fromkeys(("transforms", "callbacks", "loggers"), _TUPLE),
+    "device": DEVICE,
+    "engine": one_of(*get_args(TrainingEngine)),
+}
+
+
+def _check_game(game: object) -> None:
+    """What the rest of the checks read of a game of the user's own."""
+    if isinstance(game, PlayableGame):
+        checked("experiment.game.agents", game.agents, count(1))
+
+
+def _check_specs(agents: tuple[object, ...]) -> None:
+    for place, spec in enumerate(agents):
+        checked(f"experiment.agents[{place}]", spec, SPEC)
 
 
 def _check_numbers(experiment: Experiment) -> None:
-    name = experiment.name
-    if name in ("", ".", "..") or Path(name).name != name or "\\" in name:
-        raise ValueError(f"experiment.name is {name!r}; allowed: the name of a directory, without slashes")
-    for field in ("episodes", "replicas", "evaluation_episodes", "update_every"):
-        if getattr(experiment, field) < 1:
-            raise ValueError(
-                f"experiment.{field} is {getattr(experiment, field)}; allowed: a whole number from 1"
-            )
-    if not 0 <= experiment.seed <= MOST_SEED:
-        raise ValueError(f"experiment.seed is {experiment.seed}; allowed: 0 to 2**64 - 2")
-    try:
-        torch.device(experiment.device)
-    except RuntimeError as error:
-        raise ValueError(f'experiment.device is {experiment.device!r}; allowed: "cpu", "cuda:0"') from error
+    worlds = experiment.replicas * experiment.evaluation_episodes
+    if worlds > _MOST_WORLDS:
+        raise ValueError(
+            f"experiment.evaluation_episodes is {experiment.evaluation_episodes}; allowed for "
+            f"{experiment.replicas} replicas: up to {_MOST_WORLDS // experiment.replicas}, because all are "
+            "played at once"
+        )
     for target in custom_targets(experiment.to_config()):
         if target.startswith("__main__:"):
             raise ValueError(

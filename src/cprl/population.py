@@ -4,14 +4,49 @@ A population is a sequence of specifications. A `Team` stands once and names its
 remaining agent indices in order.
 """
 
+import os
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import TypeAlias, get_args
+from typing import Any, Final, TypeAlias, get_args
 
 from cprl.algorithms.base import Algorithm, TeamAlgorithm
+from cprl.checks import Check, check_fields, checked, count, instance, is_count, one_of
 from cprl.custom import Custom
 from cprl.learners.transitions import RewardKind
 from cprl.policies.scripted import SCRIPTED_POLICIES, ScriptedPolicy
+
+
+def _algorithm(kind: type[Algorithm]) -> Check:
+    return instance(
+        kind | Custom,
+        f'a {kind.__name__} of cprl.algorithms, or Custom("module:Class", arguments={{...}}) for one of '
+        "your own",
+    )
+
+
+def _is_path(value: Any) -> bool:
+    """Whether a value can be the path of a directory, on this machine or another."""
+    try:
+        return isinstance(value, str) and "\0" not in value and 0 < len(os.fsencode(value)) <= _MOST_PATH
+    except UnicodeEncodeError:
+        return False
+
+
+def _are_members(value: Any) -> bool:
+    return (
+        isinstance(value, tuple)
+        and len(value) > 0
+        and all(is_count(agent, 0) for agent in value)
+        and list(value) == sorted(set(value))
+    )
+
+
+_MOST_PATH: Final = 4095
+_PATH: Final = Check(_is_path, f"the path of a run's directory, up to {_MOST_PATH} bytes")
+_MEMBERS: Final = Check(_are_members, "ascending agent indices, at least one")
+_REWARD: Final = one_of(*get_args(RewardKind))
+_ALGORITHM: Final = _algorithm(Algorithm)
+_TEAM_ALGORITHM: Final = _algorithm(TeamAlgorithm)
 
 
 @dataclass(frozen=True)
@@ -28,8 +63,7 @@ class Learning:
     reward: RewardKind = "individual"
 
     def __post_init__(self) -> None:
-        _check_reward(self.reward)
-        _check_algorithm(self.algorithm, Algorithm)
+        check_fields(self, {"algorithm": _ALGORITHM, "reward": _REWARD})
         if isinstance(self.algorithm, TeamAlgorithm):
             name = type(self.algorithm).__name__
             raise ValueError(
@@ -52,11 +86,7 @@ class Team:
     reward: RewardKind = "team"
 
     def __post_init__(self) -> None:
-        object.__setattr__(self, "agents", tuple(self.agents))
-        _check_reward(self.reward)
-        _check_algorithm(self.algorithm, TeamAlgorithm)
-        if not self.agents or list(self.agents) != sorted(set(self.agents)) or self.agents[0] < 0:
-            raise ValueError(f"Team.agents is {self.agents}; allowed: ascending agent indices, at least one")
+        check_fields(self, {"algorithm": _TEAM_ALGORITHM, "agents": _MEMBERS, "reward": _REWARD})
 
 
 @dataclass(frozen=True)
@@ -66,8 +96,7 @@ class Scripted:
     policy: ScriptedPolicy = "random"
 
     def __post_init__(self) -> None:
-        if self.policy not in SCRIPTED_POLICIES:
-            raise ValueError(f"policy is {self.policy!r}; allowed: {', '.join(SCRIPTED_POLICIES)}")
+        check_fields(self, {"policy": one_of(*SCRIPTED_POLICIES)})
 
 
 @dataclass(frozen=True)
@@ -85,13 +114,13 @@ class Frozen:
     replica: int = 0
 
     def __post_init__(self) -> None:
-        object.__setattr__(self, "run", str(self.run))
-        for name in ("agent", "replica"):
-            if getattr(self, name) < 0:
-                raise ValueError(f"Frozen.{name} is {getattr(self, name)}; allowed: an integer >= 0")
+        if isinstance(self.run, os.PathLike):
+            object.__setattr__(self, "run", os.fspath(self.run))
+        check_fields(self, {"run": _PATH, "agent": count(0), "replica": count(0)})
 
 
 AgentSpec: TypeAlias = Learning | Team | Scripted | Frozen
+SPEC: Final = instance(AgentSpec, "Learning, Team, Scripted, Frozen of cprl.population")
 
 
 def specs_by_agent(specs: Sequence[AgentSpec], agents: int) -> list[AgentSpec]:
@@ -101,7 +130,9 @@ def specs_by_agent(specs: Sequence[AgentSpec], agents: int) -> list[AgentSpec]:
         ValueError: where agents remain without a specification, or have two.
     """
     by_agent: dict[int, AgentSpec] = {}
-    for spec in specs:
+    specs = checked("specs", specs, instance(tuple, "a tuple, one for each agent"))
+    for place, spec in enumerate(specs):
+        checked(f"agents[{place}]", spec, SPEC)
         for agent in spec.agents if isinstance(spec, Team) else ():
             if agent in by_agent:
                 raise ValueError(f"agent {agent} is in two teams; allowed: one specification for each agent")
@@ -137,16 +168,3 @@ def grouped(specs: Sequence[AgentSpec], agents: int) -> list[tuple[AgentSpec, tu
             )
             groups.append((spec, members))
     return groups
-
-
-def _check_reward(reward: str) -> None:
-    if reward not in get_args(RewardKind):
-        raise ValueError(f"reward is {reward!r}; allowed: {', '.join(get_args(RewardKind))}")
-
-
-def _check_algorithm(algorithm: object, kind: type[Algorithm]) -> None:
-    if not isinstance(algorithm, kind | Custom):
-        raise ValueError(
-            f"the algorithm is a {type(algorithm).__name__}; allowed: a {kind.__name__} of "
-            'cprl.algorithms, or Custom("module:Class", arguments={...}) for one of your own'
-        )

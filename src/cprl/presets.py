@@ -7,6 +7,7 @@ its appendix A, and the parameters and behaviour of the study's program.
 from dataclasses import replace
 from typing import Any, Final, Literal, get_args
 
+from cprl.checks import checked, one_of
 from cprl.commons import maps
 from cprl.commons.game import Game
 from cprl.commons.rules import Rules
@@ -113,7 +114,5 @@ def _published(board: Board, variant: Variant) -> Game:
 
 
 def _check(board: str, variant: str) -> None:
-    if board not in BOARDS:
-        raise ValueError(f"board is {board!r}; allowed: {', '.join(BOARDS)}")
-    if variant not in VARIANTS:
-        raise ValueError(f"variant is {variant!r}; allowed: {', '.join(VARIANTS)}")
+    checked("board", board, one_of(*BOARDS))
+    checked("variant", variant, one_of(*VARIANTS))

@@ -7,6 +7,8 @@ from typing import Final
 
 import torch
 
+from cprl.output import OUT, keep_output
+
 _M_TRIM_THRESHOLD: Final = -1
 _M_MMAP_THRESHOLD: Final = -3
 """Parameters of mallopt, from glibc's malloc.h."""
@@ -17,12 +19,14 @@ _MAX_THRESHOLD_BYTES: Final = 32 * 2**20
 def prepare_process(seed: int) -> None:
     """Prepares the process for a training.
 
-    Seeds torch's global generator, limits torch to one thread, flushes denormal numbers to zero, makes glibc
-    reuse freed memory, and logs warnings of TorchRL and messages of cprl.
+    Prepares the standard streams for being closed (`cprl.output`), seeds torch's global generator, limits
+    torch to one thread, flushes denormal numbers to zero, makes glibc reuse freed memory, and logs warnings
+    of TorchRL and messages of cprl.
 
     The networks are so small that a second thread slows them down, up to a hundredfold on a busy machine.
     Denormal numbers in Adam's moments of dead weights slow a long run by a factor of up to 1.9.
     """
+    keep_output()
     torch.manual_seed(seed)
     torch.set_num_threads(1)
     torch.set_flush_denormal(True)
@@ -31,7 +35,7 @@ def prepare_process(seed: int) -> None:
     own = logging.getLogger("cprl")
     own.setLevel(logging.INFO)
     if not own.handlers:
-        own.addHandler(logging.StreamHandler(sys.stdout))
+        own.addHandler(logging.StreamHandler(OUT))
 
 
 def _keep_freed_memory() -> None:

@@ -10,7 +10,6 @@ from pathlib import Path
 from typing import Any
 
 import torch
-from rich.console import Console
 from torchrl.envs import EnvBase
 
 from cprl.agents import Population
@@ -21,6 +20,7 @@ from cprl.envs.unwrap import agent_names, commons_of
 from cprl.experiment import Experiment
 from cprl.measuring.episodes import Episode
 from cprl.measuring.evaluate import evaluate
+from cprl.output import ERR, OUT, console
 from cprl.process import prepare_process
 from cprl.runs.checkpoints import Checkpointer
 from cprl.runs.directory import (
@@ -116,12 +116,13 @@ def run(
         if episodes < experiment.episodes:
             refuse_to_extend(out, episodes, own.callbacks)
         elif (out / REPORT).exists():
-            Console().print(f"{out} is finished; with more --episodes it is extended", soft_wrap=True)
+            console().print(f"{out} is finished; with more --episodes it is extended", soft_wrap=True)
             return out
         directory = out
     else:
         is_there = out is not None and out.exists()
         directory = start_run(out, experiment.name, experiment.to_recipe, command=command)
+    OUT.run = directory
     checkpointer = Checkpointer(
         directory,
         keep_ending=keep_checkpoint,
@@ -162,7 +163,7 @@ def _remove(directory: Path, *, but_keep_empty: bool) -> None:
 def _say_what_changed(directory: Path) -> None:
     changed = changed_circumstances(directory)
     if changed:
-        Console(stderr=True).print(
+        console(ERR).print(
             f"Warning: {directory} was begun under other versions, so that numbers may differ from those of "
             f"an undisturbed run: {'; '.join(changed)}",
             soft_wrap=True,
@@ -200,6 +201,8 @@ def _make(experiment: Experiment, allow: Sequence[str]) -> _Made:
     )
     with torch.random.fork_rng(devices=[]):
         _fresh_env(experiment)  # what the evaluation cannot have is refused now, not after hours
+        population.random_policy(experiment.evaluation_episodes)
+        population.policy(experiment.evaluation_episodes)
     return _Made(env=env, population=population, callbacks=[made(own) for own in experiment.callbacks])
 
 

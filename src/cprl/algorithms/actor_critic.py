@@ -28,7 +28,7 @@ class SAC(OffPolicy):
 
     settings: DQNSettings
     target_entropy_weight: float = 0.5
-    """The target entropy of the temperature, as a fraction of the maximum entropy log A."""
+    """The target entropy of the temperature, as a fraction of the maximum entropy log A, 0..1."""
     alpha_init: float = 0.1
     """The initial temperature, in units of reward (apples)."""
     loss_function: str = "l2"
@@ -70,7 +70,7 @@ class IQL(OffPolicy):
 
     settings: DQNSettings
     expectile: float = 0.7
-    """The expectile of the action values that the state value estimates, 0.5..1."""
+    """The expectile of the action values that the state value estimates, 0.5..0.999."""
     temperature: float = 3.0
     """The inverse temperature of the advantage weights, in 1/reward (1/apples)."""
     loss_function: str = "l2"

@@ -5,16 +5,21 @@ define `make_network` and `make_loss`; docs/algorithms.md has an example of twen
 """
 
 from collections.abc import Sequence
-from typing import Any, ClassVar, Literal, TypeAlias, get_args
+from inspect import get_annotations
+from typing import Any, ClassVar, Final, Literal, TypeAlias, get_args
 
 from torch import nn
 from torchrl.objectives import LossModule
 
+from cprl.checks import NONE, SWITCH, Check, check_fields, checked, count, either, instance, number, one_of
+from cprl.custom import Custom
 from cprl.learners.base import Learner
 from cprl.learners.replay import ReplayLearner
 from cprl.learners.rollouts import RolloutLearner
 from cprl.learners.settings import DQNSettings, RolloutSettings
 from cprl.learners.torchrl import TorchRLReplayLearner, TorchRLRolloutLearner
+from cprl.networks.mlp import MOST_CELLS
+from cprl.networks.specification import Network
 from cprl.spaces import Spaces
 
 TrainingEngine: TypeAlias = Literal["compiled", "eager", "torchrl"]
@@ -23,18 +28,54 @@ update, uncompiled; "torchrl": by TorchRL's stock parts, one agent after the oth
 `cprl.learners.torchrl`."""
 
 
+_WEIGHT: Final = number(0, 1e6)
+_CHECKS: Final[dict[str, Check]] = {
+    "network": either(instance(Network | Custom, 'MLP, Conv, Custom("module:Class")'), NONE),
+    "loss_function": one_of("l1", "l2", "smooth_l1"),
+    "double": SWITCH,
+    "atoms": count(2, MOST_CELLS),
+    "lowest_return": number(-1e9, 1e9),
+    "highest_return": number(-1e9, 1e9),
+    "conservative_weight": _WEIGHT,
+    "target_entropy_weight": number(0, 1),
+    "alpha_init": number(1e-12, 1e6),
+    "expectile": number(0.5, 0.999),
+    "temperature": _WEIGHT,
+    "clip_epsilon": number(1e-6, 0.999),
+    "entropy_coeff": _WEIGHT,
+    "critic_coeff": _WEIGHT,
+    "mixing_cells": count(1, MOST_CELLS),
+}
+"""Of the fields of cprl's algorithms; one of the same name means the same in each."""
+
+
 class Algorithm:
     """How an agent learns: hyperparameters, networks, loss and learner.
 
     Agents with equal algorithms learn as lanes of one stacked update, so an algorithm must be a frozen
     dataclass.
+
+    Raises:
+        ValueError: if a value is not allowed; the message names the field, the value and what is allowed.
     """
 
     settings: Any
     """The hyperparameters."""
+    settings_kind: ClassVar[type[Any]] = object
+    """The class of the settings."""
     stochastic: ClassVar[bool] = False
     """Whether the acting network outputs the logits of a policy, from which actions are sampled; else it
     outputs action values, and actions are epsilon-greedy."""
+
+    def __post_init__(self) -> None:
+        self._check_settings()
+        of_cprl = {
+            name
+            for kind in type(self).__mro__
+            if kind.__module__.startswith("cprl.algorithms.")
+            for name in get_annotations(kind)
+        }
+        check_fields(self, {name: own for name, own in _CHECKS.items() if name in of_cprl})
 
     def make_network(self, spaces: Spaces) -> nn.Module:
         """New networks of one agent, initialised from torch's generator. They map observations [..., *shape]
@@ -71,12 +112,9 @@ class Algorithm:
                 'one after the other; allowed: engine="compiled" or "eager"'
             )
 
-    def _check_settings(self, kind: type[Any]) -> None:
-        if not isinstance(self.settings, kind):
-            raise ValueError(
-                f"{type(self).__name__}.settings is a {type(self.settings).__name__}; "
-                f"allowed: {kind.__name__}"
-            )
+    def _check_settings(self) -> None:
+        kind = self.settings_kind
+        checked(f"{type(self).__name__}.settings", self.settings, instance(kind, f"a {kind.__name__}"))
 
 
 class OffPolicy(Algorithm):
@@ -87,12 +125,13 @@ class OffPolicy(Algorithm):
     """
 
     settings: DQNSettings
+    settings_kind: ClassVar[type[Any]] = DQNSettings
 
     def make_learner(
         self, spaces: Spaces, *, agents: Sequence[int], engine: TrainingEngine = "compiled", **how: Any
     ) -> Learner:
         """See `Algorithm`."""
-        self._check_settings(DQNSettings)
+        self._check_settings()
         _check_engine(engine)
         how |= {
             "agents": agents,
@@ -114,13 +153,14 @@ class OnPolicy(Algorithm):
     """
 
     settings: RolloutSettings
+    settings_kind: ClassVar[type[Any]] = RolloutSettings
     stochastic: ClassVar[bool] = True
 
     def make_learner(
         self, spaces: Spaces, *, agents: Sequence[int], engine: TrainingEngine = "compiled", **how: Any
     ) -> Learner:
         """See `Algorithm`."""
-        self._check_settings(RolloutSettings)
+        self._check_settings()
         _check_engine(engine)
         how |= {
             "agents": agents,
@@ -179,5 +219,4 @@ class TeamAlgorithm(Algorithm):
 
 
 def _check_engine(engine: str) -> None:
-    if engine not in get_args(TrainingEngine):
-        raise ValueError(f"engine is {engine!r}; allowed: {', '.join(get_args(TrainingEngine))}")
+    checked("engine", engine, one_of(*get_args(TrainingEngine)))

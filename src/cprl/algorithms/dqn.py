@@ -3,6 +3,7 @@
 from dataclasses import dataclass
 from typing import Any
 
+import numpy as np
 import torch
 from tensordict import TensorDictBase
 from torch import nn
@@ -73,6 +74,15 @@ class DistributionalDQN(OffPolicy):
     amounts to 200."""
     network: Network | Custom | None = None
     """The architecture of the networks; None for fully connected layers of `settings.hidden_cells`."""
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        atoms = np.linspace(self.lowest_return, self.highest_return, self.atoms, dtype=np.float32)
+        if not (np.diff(atoms) > 0).all():
+            raise ValueError(
+                f"DistributionalDQN.highest_return is {self.highest_return}; allowed: above lowest_return, "
+                f"{self.lowest_return}, and so far that float32 tells {self.atoms} atoms apart"
+            )
 
     def make_network(self, spaces: Spaces) -> nn.Module:
         """See `Algorithm`."""

@@ -27,7 +27,7 @@ class PPO(OnPolicy):
 
     settings: RolloutSettings
     clip_epsilon: float = 0.2
-    """The largest change of an action's probability, as a ratio minus 1."""
+    """The largest change of an action's probability, as a ratio minus 1; 1e-6..0.999."""
     entropy_coeff: float = 0.01
     critic_coeff: float = 0.5
     network: Network | Custom | None = None

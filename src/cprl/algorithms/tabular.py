@@ -2,7 +2,7 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, ClassVar
 
 from cprl.algorithms.base import Algorithm, TrainingEngine
 from cprl.learners.base import Learner
@@ -17,6 +17,7 @@ class Tabular(Algorithm):
     """Tabular Q-learning; see `TabularLearner`."""
 
     settings: TabularSettings
+    settings_kind: ClassVar[type[Any]] = TabularSettings
 
     def make_network(self, spaces: Spaces) -> TableNetwork:
         """The table of one agent, initially empty.
@@ -30,7 +31,7 @@ class Tabular(Algorithm):
         self, spaces: Spaces, *, agents: Sequence[int], engine: TrainingEngine = "compiled", **how: Any
     ) -> Learner:
         """See `Algorithm`; tables are neither compiled nor on a GPU."""
-        self._check_settings(TabularSettings)
+        self._check_settings()
         self._refuse_torchrl(engine)
         self.make_network(spaces)
         how.pop("device", None)

@@ -1,8 +1,9 @@
 """Observation: what agents observe of the game, and in which form."""
 
-from dataclasses import dataclass, fields
-from typing import Any, Final, Literal, get_args
+from dataclasses import dataclass
+from typing import Final, Literal, get_args
 
+from cprl.checks import SWITCH, Check, check_fields, one_of
 from cprl.commons.colours import BEAM, FIRST_AGENT, GROUND, HIDDEN, OTHER, SELF, class_name
 
 Area = Literal["window", "full"]
@@ -36,10 +37,7 @@ class Observation:
     """Whether each agent also observes the share of all sites that hold an apple: float32 [1], 0..1."""
 
     def __post_init__(self) -> None:
-        for field in fields(self):
-            value, allowed = getattr(self, field.name), _ALLOWED[field.name]
-            if value not in allowed or type(value) is not type(allowed[0]):
-                raise ValueError(f"Observation.{field.name} is {value!r}; allowed: {allowed}")
+        check_fields(self, _CHECKS)
 
     @property
     def highest(self) -> int:
@@ -47,13 +45,10 @@ class Observation:
         return 255 if self.encoding == "rgb" else 1
 
 
-_SWITCH: Final = (False, True)
-_ALLOWED: Final[dict[str, tuple[Any, ...]]] = {
-    "area": get_args(Area),
-    "encoding": get_args(Encoding),
-    "agents_apart": _SWITCH,
-    "scoreboard": _SWITCH,
-    "stock_gauge": _SWITCH,
+_CHECKS: Final[dict[str, Check]] = {
+    "area": one_of(*get_args(Area)),
+    "encoding": one_of(*get_args(Encoding)),
+    **dict.fromkeys(("agents_apart", "scoreboard", "stock_gauge"), SWITCH),
 }
 
 

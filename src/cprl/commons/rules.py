@@ -5,11 +5,10 @@ Sources: [W] M. Wiatrak, "Governing the Commons with Multi-Agent Reinforcement L
 `docs/game.md` describes the game in words.
 """
 
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass, fields
-from math import isfinite
-from numbers import Integral, Real
+from dataclasses import dataclass
 from typing import Any, Final, Literal, get_args
+
+from cprl.checks import SWITCH, Check, check_fields, is_bool, is_count, is_number, is_table, one_of
 
 ACTIONS: Final = ("forward", "backward", "left", "right", "turn_left", "turn_right", "beam", "stay")
 """The actions by index. If no agent may fire, there is no "beam", and 6 is "stay"."""
@@ -103,12 +102,7 @@ class Rules:
     stays so in the windows of later agents, whether the agent is in play or not."""
 
     def __post_init__(self) -> None:
-        for field in fields(self):
-            object.__setattr__(self, field.name, _as_tuples(getattr(self, field.name)))
-        for name, (is_allowed, allowed) in _CHECKS.items():
-            value = getattr(self, name)
-            if not is_allowed(value):
-                raise ValueError(f"Rules.{name} is {value!r}; allowed: {allowed}")
+        check_fields(self, _CHECKS)
 
     @property
     def beam_lengths_cells(self) -> tuple[int, int, int, int]:
@@ -127,59 +121,28 @@ class Rules:
         return ACTIONS if self.has_beam else tuple(name for name in ACTIONS if name != "beam")
 
 
-def _as_tuples(value: Any) -> Any:
-    """Converts lists and arrays to nested tuples, and numpy scalars to Python numbers."""
-    if hasattr(value, "tolist"):
-        value = value.tolist()
-    if isinstance(value, Sequence) and not isinstance(value, str):
-        return tuple(_as_tuples(item) for item in value)
-    return value
-
-
-def _is_count(value: Any, low: int) -> bool:
-    """Whether a value is an integer of at least `low` that fits into int32."""
-    return isinstance(value, Integral) and not isinstance(value, bool) and low <= int(value) < 2**31
-
-
 def _is_odd(value: Any) -> bool:
-    return _is_count(value, 1) and value % 2 == 1
-
-
-def _is_number(value: Any, low: float, high: float) -> bool:
-    real = isinstance(value, Real) and not isinstance(value, bool)
-    return real and isfinite(value) and low <= value <= high
-
-
-def _is_table(value: Any, is_allowed: Callable[[Any], bool]) -> bool:
-    """Whether a value is a tuple of equally long, non-empty tuples whose entries are all allowed."""
-    if not isinstance(value, tuple) or not value or not all(isinstance(row, tuple) for row in value):
-        return False
-    return len({len(row) for row in value}) == 1 and all(row and all(map(is_allowed, row)) for row in value)
-
-
-def _is_bool(value: Any) -> bool:
-    return isinstance(value, bool)
+    return is_count(value, 1) and value % 2 == 1
 
 
 def _are_probabilities(value: Any) -> bool:
-    return isinstance(value, tuple) and bool(value) and all(_is_number(p, 0, 1) for p in value)
+    return isinstance(value, tuple) and bool(value) and all(is_number(p, 0, 1) for p in value)
 
 
 def _are_beam_lengths(value: Any) -> bool:
     if isinstance(value, tuple):
-        return len(value) == 4 and all(_is_count(length, 1) for length in value)
-    return _is_count(value, 1)
+        return len(value) == 4 and all(is_count(length, 1) for length in value)
+    return is_count(value, 1)
 
 
 def _are_freezes(value: Any) -> bool:
-    return _is_count(value, 0) or _is_table(value, lambda steps: _is_count(steps, 0))
+    return is_count(value, 0) or is_table(value, lambda steps: is_count(steps, 0))
 
 
 def _is_may_fire(value: Any) -> bool:
-    return _is_bool(value) or (isinstance(value, tuple) and bool(value) and all(map(_is_bool, value)))
+    return is_bool(value) or (isinstance(value, tuple) and bool(value) and all(map(is_bool, value)))
 
 
-_Check = tuple[Callable[[Any], bool], str]
 _SWITCHES: Final = (
     "walls_block_sight",
     "shuffle_starts",
@@ -192,24 +155,24 @@ _SWITCHES: Final = (
     "mark_behind_if_vertical",
     "self_paint_stays",
 )
-_CHECKS: Final[dict[str, _Check]] = {
-    "regrow_prob": (_are_probabilities, "one or more numbers in 0..1"),
-    "regrow_radius_cells": (lambda value: _is_number(value, 0, 1000), "a number in 0..1000"),
-    "regrow_norm": (lambda value: value in get_args(Norm), f"one of {get_args(Norm)}"),
-    "beam_length_cells": (_are_beam_lengths, "an integer >= 1, or four of them by heading"),
-    "beam_width_cells": (_is_odd, "an odd integer >= 1"),
-    "hits_to_tag": (lambda value: _is_count(value, 1), "an integer >= 1"),
-    "freeze_steps": (
+_CHECKS: Final[dict[str, Check]] = {
+    "regrow_prob": Check(_are_probabilities, "one or more numbers in 0..1"),
+    "regrow_radius_cells": Check(lambda value: is_number(value, 0, 1000), "a number in 0..1000"),
+    "regrow_norm": one_of(*get_args(Norm)),
+    "beam_length_cells": Check(_are_beam_lengths, "an integer >= 1, or four of them by heading"),
+    "beam_width_cells": Check(_is_odd, "an odd integer >= 1"),
+    "hits_to_tag": Check(lambda value: is_count(value, 1), "an integer >= 1"),
+    "freeze_steps": Check(
         _are_freezes,
         "an integer >= 0, or a table of them: equally long rows by shooter, columns by offence",
     ),
-    "may_fire": (_is_may_fire, "True, False, or a tuple with one of them per agent"),
-    "may_bite": (
-        lambda value: value is None or _is_table(value, _is_bool),
+    "may_fire": Check(_is_may_fire, "True, False, or a tuple with one of them per agent"),
+    "may_bite": Check(
+        lambda value: value is None or is_table(value, is_bool),
         "None, or a table of True and False: a row per agent, a column per site",
     ),
-    "window_rows": (lambda value: _is_count(value, 1), "an integer >= 1"),
-    "window_columns": (_is_odd, "an odd integer >= 1"),
-    "episode_steps": (lambda value: _is_count(value, 1), "an integer >= 1"),
-    **dict.fromkeys(_SWITCHES, (_is_bool, "True or False")),
+    "window_rows": Check(lambda value: is_count(value, 1), "an integer >= 1"),
+    "window_columns": Check(_is_odd, "an odd integer >= 1"),
+    "episode_steps": Check(lambda value: is_count(value, 1), "an integer >= 1"),
+    **dict.fromkeys(_SWITCHES, SWITCH),
 }

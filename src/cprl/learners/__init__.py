@@ -3,6 +3,7 @@
 Modules, in the order in which one reads them:
     settings     the hyper-parameters, with their units and sources
     base         what the training loop asks of a learner
+    checks       what learners refuse before they allocate anything
     transitions  the turns of some agents, as replay and rollouts store them
     lanes        a lane is one agent of one replica: seeds, networks, actors
     teams        the same where a lane is a team

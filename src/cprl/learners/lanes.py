@@ -8,6 +8,7 @@ import torch
 from tensordict import TensorDictBase
 from torch import Tensor, nn
 
+from cprl.learners.checks import check_networks
 from cprl.learners.engine.base import ListEngine
 from cprl.learners.transitions import LaneTurn, RewardKind, lane_turn, seen_next
 from cprl.networks.agent import acting_part
@@ -125,8 +126,15 @@ class Lanes:
         return lane_seeds(self.seed, replicas=self._numbers, agents=self.agents, purpose=purpose)
 
     def new_networks(self, purpose: int, device: str | torch.device) -> list[nn.Module]:
-        """New networks for each lane."""
-        return [init_network(self.make_network, own).to(device) for own in self.seeds(purpose)]
+        """New networks for each lane.
+
+        Raises:
+            TooLargeError: if the device has less memory than training all of them takes.
+        """
+        first, *others = self.seeds(purpose)
+        made = [init_network(self.make_network, first).to(device)]
+        check_networks(made[0], len(self), device)
+        return made + [init_network(self.make_network, own).to(device) for own in others]
 
     def actor(self, engine: Acts, *, compile: bool) -> LaneActor:
         """The actor of training: the current weights, and random numbers of its own for each lane."""

@@ -11,6 +11,7 @@ from torch import Tensor, nn
 
 from cprl.learners.buffer.gather import Horizon
 from cprl.learners.buffer.sampler import lane_buffer, transformed
+from cprl.learners.checks import check_learner
 from cprl.learners.engine.base import Engine
 from cprl.learners.engine.choice import TRIAL_LANES, EngineName, make_engine, trial_batch
 from cprl.learners.engine.functional import MakeLoss
@@ -74,6 +75,7 @@ class ReplayLearner:
         device: str | torch.device = "cpu",
     ) -> None:
         _refuse_unshared_reward(is_team=make_team is not None, reward_kind=reward_kind)
+        check_learner(spaces, settings, DQNSettings, agents, replicas, first_replica, seed, reward_kind)
         self.spaces, self.settings, self.agents = spaces, settings, tuple(agents)
         self.replicas, self.seed, self.reward_kind = replicas, seed, reward_kind
         self._lanes = lanes_of(

@@ -11,6 +11,7 @@ from torch import Tensor, nn
 from torchrl.objectives.value.functional import generalized_advantage_estimate
 
 from cprl.learners.buffer.storage import torch_dtype
+from cprl.learners.checks import check_learner, check_rollouts
 from cprl.learners.engine.base import Engine
 from cprl.learners.engine.choice import TRIAL_LANES, EngineName, make_engine, trial_batch
 from cprl.learners.engine.functional import MakeLoss
@@ -54,6 +55,7 @@ class RolloutLearner:
 
     Raises:
         ValueError: if the networks are not "actor" and "critic".
+        TooLargeError: if the device has less memory than rollouts and networks take.
     """
 
     def __init__(
@@ -73,6 +75,7 @@ class RolloutLearner:
         compile: bool = True,
         device: str | torch.device = "cpu",
     ) -> None:
+        check_learner(spaces, settings, RolloutSettings, agents, replicas, first_replica, seed, reward_kind)
         self.spaces, self.settings, self.agents = spaces, settings, tuple(agents)
         self.replicas, self.seed, self.reward_kind = replicas, seed, reward_kind
         self._lanes = lanes_of(
@@ -138,6 +141,7 @@ class RolloutLearner:
         """Tensors for a rollout, zeros [T, L, ...] each."""
         size, shape = (self.rollout_steps, self.lanes), self._lanes.observation_shape
         dtype = torch_dtype(self.spaces.observation_dtype)
+        check_rollouts(size, shape, dtype, device)
         forms: dict[str, tuple[tuple[int, ...], torch.dtype]] = {
             "observation": (shape, dtype),
             "action": (self._lanes.action_shape, torch.int64),

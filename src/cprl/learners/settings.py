@@ -1,12 +1,26 @@
 """The hyperparameters of learning agents, with their units and sources."""
 
 from dataclasses import dataclass
-from typing import Any, Final, Literal, get_args
+from typing import Final, Literal, get_args
 
 import numpy as np
 from numpy.typing import NDArray
 
+from cprl.checks import (
+    MOST_INT64,
+    NONE,
+    SWITCH,
+    Check,
+    check_fields,
+    count,
+    either,
+    instance,
+    number,
+    one_of,
+    tuple_of,
+)
 from cprl.custom import Custom
+from cprl.networks.mlp import LAYERS
 
 Optimizer = Literal["adam", "adamw", "rmsprop", "sgd"]
 
@@ -28,6 +42,9 @@ class Exploring:
     """Steps of the linear decay after the hold."""
     epsilon_evaluation: float = 0.05
     """Probability of a random action in evaluation, 0..1."""
+
+    def __post_init__(self) -> None:
+        check_fields(self, _EXPLORING)
 
     def epsilon(self, step: int) -> float:
         """The probability of a random action at a step, counted from 0."""
@@ -56,9 +73,9 @@ class DQNSettings(Exploring):
     gamma: float = 0.995
     """Discount factor per step."""
     learning_rate: float = 1e-5
-    """The optimiser's step size."""
+    """The optimiser's step size, 1e-12..100."""
     adam_eps: float = 1e-8
-    """Added to the denominator of Adam, AdamW and RMSprop; [run] 1e-7."""
+    """Added to the denominator of Adam, AdamW and RMSprop, 1e-30..1; [run] 1e-7."""
     hidden_cells: tuple[int, ...] = DEFAULT_HIDDEN_CELLS
     """Units of each hidden layer, with ReLU; used if the algorithm has no `network`."""
     updates_per_step: int = 1
@@ -69,8 +86,8 @@ class DQNSettings(Exploring):
     optimizer: Optimizer = "adam"
     """The optimiser of `torch.optim`; its other options are torch's defaults."""
     tau: float | None = None
-    """Soft target updates: the fraction by which targets move towards the network after each update; None for
-    a copy every `target_every_episodes` episodes."""
+    """Soft target updates: the fraction by which targets move towards the network after each update, 1e-6..1;
+    None for a copy every `target_every_episodes` episodes."""
     replay_transforms: tuple[Custom, ...] = ()
     """TorchRL transforms of the replay buffer, in order: sampled batches pass through them, and stored
     transitions through their inverse. Random transforms use torch's global generator."""
@@ -87,32 +104,13 @@ class DQNSettings(Exploring):
     contribute zero; else over the batch alone."""
 
     def __post_init__(self) -> None:
-        object.__setattr__(self, "hidden_cells", tuple(self.hidden_cells))
-        object.__setattr__(self, "replay_transforms", tuple(self.replay_transforms))
-        _check_exploring(self)
-        _check_optimizer(self)
-        _check_at_least(
-            self,
-            1,
-            *("buffer_size", "batch_size", "learning_starts", "updates_per_step", "n_steps"),
-            "target_every_episodes",
-        )
-        _check_within("gamma", self.gamma)
-        if self.tau is not None and not 0 < self.tau <= 1:
-            raise ValueError(f"tau is {self.tau}; allowed: above 0 and up to 1, or None for hard updates")
+        check_fields(self, _DQN)
         longest = max(1, min(self.learning_starts, self.buffer_size // 2))
         if self.n_steps > longest:
             raise ValueError(
-                f"n_steps is {self.n_steps}; allowed: up to learning_starts, {self.learning_starts}, and "
-                f"half of buffer_size, {self.buffer_size}"
+                f"DQNSettings.n_steps is {self.n_steps}; allowed: up to learning_starts, "
+                f"{self.learning_starts}, and half of buffer_size, {self.buffer_size}"
             )
-        for transform in self.replay_transforms:
-            if not isinstance(transform, Custom):
-                raise ValueError(
-                    f"replay_transforms has a {type(transform).__name__}; allowed: "
-                    'Custom("torchrl.envs:RewardScaling", arguments={...}); for an instance call '
-                    "append_transform on the learner's buffer"
-                )
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -138,28 +136,26 @@ class RolloutSettings:
     normalize_advantage: bool = True
     """Whether each agent's advantages of a rollout are normalised to mean 0 and standard deviation 1."""
     learning_rate: float = 3e-4
-    """The optimiser's step size."""
+    """The optimiser's step size, 1e-12..100."""
     adam_eps: float = 1e-5
-    """Added to the denominator of Adam, AdamW and RMSprop."""
+    """Added to the denominator of Adam, AdamW and RMSprop, 1e-30..1."""
     max_grad_norm: float | None = 0.5
-    """The norm to which an agent's gradient is clipped; None for no clipping."""
+    """The norm to which an agent's gradient is clipped, 1e-6 or more; None for no clipping."""
     hidden_cells: tuple[int, ...] = DEFAULT_HIDDEN_CELLS
     """Units of each hidden layer, with ReLU, of the actor and of the critic; used if the algorithm has no
     `network`."""
 
     def __post_init__(self) -> None:
-        object.__setattr__(self, "hidden_cells", tuple(self.hidden_cells))
-        _check_optimizer(self)
-        _check_at_least(self, 1, "rollout_steps", "epochs", "minibatch_size")
-        for name in ("gamma", "gae_lambda"):
-            _check_within(name, getattr(self, name))
-        if self.max_grad_norm is not None and self.max_grad_norm <= 0:
-            raise ValueError(
-                f"max_grad_norm is {self.max_grad_norm}; allowed: above 0, or None for no clipping"
-            )
+        check_fields(self, _ROLLOUTS)
         if self.rollout_steps % self.minibatch_size:
             raise ValueError(
-                f"minibatch_size is {self.minibatch_size}; it must divide rollout_steps, {self.rollout_steps}"
+                f"RolloutSettings.minibatch_size is {self.minibatch_size}; it must divide rollout_steps, "
+                f"{self.rollout_steps}"
+            )
+        if self.normalize_advantage and self.rollout_steps == 1:
+            raise ValueError(
+                "RolloutSettings.rollout_steps is 1; allowed with normalize_advantage: 2 or more, because "
+                "one advantage has no standard deviation"
             )
 
 
@@ -185,12 +181,7 @@ class TabularSettings(Exploring):
     bytes of its observation, 16 per action and about 150 more."""
 
     def __post_init__(self) -> None:
-        _check_exploring(self)
-        if self.learning_rate != "1/visits":
-            _check_within("learning_rate", self.learning_rate, " or '1/visits'")
-        _check_within("gamma", self.gamma)
-        _check_at_least(self, 1, "max_states")
-        _check_within("visits_power", self.visits_power)
+        check_fields(self, _TABULAR)
 
     def rates(self, visits: NDArray[np.int64]) -> NDArray[np.float64]:
         """alpha of values with these numbers of visits, the current one included."""
@@ -199,30 +190,58 @@ class TabularSettings(Exploring):
         return np.full(visits.shape, self.learning_rate)
 
 
-def _check_within(name: str, value: Any, other: str = "") -> None:
-    if isinstance(value, str) or not 0 <= value <= 1:
-        raise ValueError(f"{name} is {value!r}; allowed: a number in 0..1{other}")
-
-
-def _check_at_least(settings: Any, lowest: int, *names: str) -> None:
-    for name in names:
-        if getattr(settings, name) < lowest:
-            raise ValueError(f"{name} is {getattr(settings, name)}; allowed: an integer >= {lowest}")
-
-
-def _check_exploring(settings: Exploring) -> None:
-    for name in ("epsilon_start", "epsilon_end", "epsilon_evaluation"):
-        _check_within(name, getattr(settings, name))
-    _check_at_least(settings, 0, "epsilon_hold_steps")
-    _check_at_least(settings, 1, "epsilon_decay_steps")
-
-
-def _check_optimizer(settings: DQNSettings | RolloutSettings) -> None:
-    if settings.optimizer not in get_args(Optimizer):
-        raise ValueError(f"optimizer is {settings.optimizer!r}; allowed: {', '.join(get_args(Optimizer))}")
-    if not settings.learning_rate > 0:
-        raise ValueError(f"learning_rate is {settings.learning_rate}; allowed: above 0")
-    if settings.adam_eps < 0:
-        raise ValueError(f"adam_eps is {settings.adam_eps}; allowed: at least 0")
-    if any(cells < 1 for cells in settings.hidden_cells):
-        raise ValueError(f"hidden_cells is {settings.hidden_cells}; allowed: at least 1 in each layer")
+_SHARE: Final = number(0, 1)
+_LEARNING_RATE: Final = number(1e-12, 100)
+_OPTIMISED: Final[dict[str, Check]] = {
+    "gamma": _SHARE,
+    "optimizer": one_of(*get_args(Optimizer)),
+    "learning_rate": _LEARNING_RATE,
+    # 0, and what float32 rounds to 0, would divide 0 by 0 wherever a gradient is 0.
+    "adam_eps": number(1e-30, 1),
+    "hidden_cells": LAYERS,
+}
+_EXPLORING: Final[dict[str, Check]] = {
+    "epsilon_start": _SHARE,
+    "epsilon_end": _SHARE,
+    "epsilon_hold_steps": count(0, MOST_INT64),
+    "epsilon_decay_steps": count(1, MOST_INT64),
+    "epsilon_evaluation": _SHARE,
+}
+_DQN: Final[dict[str, Check]] = {
+    **_EXPLORING,
+    **_OPTIMISED,
+    "buffer_size": count(1, 2**40 - 1),
+    "batch_size": count(1),
+    "learning_starts": count(1, MOST_INT64),
+    "updates_per_step": count(1),
+    "n_steps": count(1, 1000),
+    "tau": either(number(1e-6, 1), Check(NONE.fits, "None for copies every target_every_episodes episodes")),
+    "replay_transforms": tuple_of(
+        instance(
+            Custom,
+            'Custom("torchrl.envs:RewardScaling", arguments={...}); for an instance call append_transform on '
+            "the learner's buffer",
+        )
+    ),
+    "target_every_episodes": count(1, MOST_INT64),
+    "relu_on_outputs": SWITCH,
+    "glorot_uniform": SWITCH,
+    "own_target_weights": SWITCH,
+    "mean_over_all_outputs": SWITCH,
+}
+_ROLLOUTS: Final[dict[str, Check]] = {
+    **_OPTIMISED,
+    "rollout_steps": count(1),
+    "epochs": count(1),
+    "minibatch_size": count(1),
+    "gae_lambda": _SHARE,
+    "normalize_advantage": SWITCH,
+    "max_grad_norm": either(number(1e-6, 1e12), Check(NONE.fits, "None for no clipping")),
+}
+_TABULAR: Final[dict[str, Check]] = {
+    **_EXPLORING,
+    "gamma": _SHARE,
+    "learning_rate": either(_SHARE, one_of("1/visits")),
+    "visits_power": _SHARE,
+    "max_states": count(1),
+}

@@ -22,6 +22,7 @@ from tensordict import TensorDictBase
 from torch import Tensor, nn
 
 from cprl import keys
+from cprl.learners.checks import check_learner
 from cprl.learners.lanes import EVALUATION, EXPLORATION, lane_names, lane_seeds
 from cprl.learners.settings import TabularSettings
 from cprl.learners.transitions import RewardKind, lane_turn
@@ -44,6 +45,7 @@ class TabularLearner:
         reward_kind: which reward they get.
 
     Raises:
+        ValueError: for agents, replicas or a seed that there cannot be.
         MemoryError: from `store`, if an agent visits more than `settings.max_states` states.
     """
 
@@ -58,6 +60,7 @@ class TabularLearner:
         first_replica: int = 0,
         reward_kind: RewardKind = "individual",
     ) -> None:
+        check_learner(spaces, settings, TabularSettings, agents, replicas, first_replica, seed, reward_kind)
         self.spaces, self.settings, self.seed, self.agents = spaces, settings, seed, tuple(agents)
         self.reward_kind = reward_kind
         self.replicas, self._numbers = replicas, range(first_replica, first_replica + replicas)

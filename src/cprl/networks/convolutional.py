@@ -4,13 +4,20 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import pairwise
 from math import prod
-from typing import Any
+from typing import Any, Final
 
 from torch import Tensor, nn
 from torchrl import modules
 
-from cprl.networks.mlp import glorot_uniform_
+from cprl.checks import Check, check_arguments, check_fields, count, is_count, tuple_of
+from cprl.networks.mlp import LAYERS, NETWORK_CHECKS, check_size, glorot_uniform_, layers
 from cprl.spaces import Spaces
+
+_CHECKS: Final[dict[str, Check]] = {
+    "channels": layers(1),
+    "kernel_cells": Check(lambda value: is_count(value, 1, 999) and value % 2 == 1, "1, 3, 5 and so on"),
+    "hidden_cells": LAYERS,
+}
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -18,7 +25,7 @@ class Conv:
     """Convolutions that keep the size of the window, then fully connected layers; ReLU after each.
 
     Raises:
-        ValueError: if a size is below 1, there are no channels, or the kernel is even.
+        ValueError: if a value is not allowed; names it and says what is.
     """
 
     channels: tuple[int, ...] = (16, 16)
@@ -29,14 +36,7 @@ class Conv:
     """Units of each fully connected layer after the convolutions."""
 
     def __post_init__(self) -> None:
-        for name in ("channels", "hidden_cells"):
-            object.__setattr__(self, name, tuple(getattr(self, name)))
-            if any(size < 1 for size in getattr(self, name)):
-                raise ValueError(f"Conv.{name} is {getattr(self, name)}; allowed: at least 1 in each layer")
-        if not self.channels:
-            raise ValueError("Conv.channels is empty; allowed: at least one convolution; else use MLP")
-        if self.kernel_cells < 1 or self.kernel_cells % 2 == 0:
-            raise ValueError(f"Conv.kernel_cells is {self.kernel_cells}; allowed: 1, 3, 5 and so on")
+        check_fields(self, _CHECKS)
 
     def make(
         self,
@@ -83,6 +83,10 @@ class ConvNetwork(nn.Module):
         relu_on_outputs: whether the outputs pass through ReLU too.
         glorot_uniform: whether weights are initialised Glorot-uniform and biases to zero; else torch's
             default.
+
+    Raises:
+        ValueError: if an argument is not allowed; names it and says what is.
+        TooLargeError: if there is too little memory for the weights.
     """
 
     def __init__(
@@ -98,8 +102,23 @@ class ConvNetwork(nn.Module):
         glorot_uniform: bool = False,
     ) -> None:
         super().__init__()
+        check_arguments(
+            {**NETWORK_CHECKS, **_CHECKS, "observation_shape": tuple_of(count(1), at_least=3)},
+            observation_shape=observation_shape,
+            outputs=outputs,
+            channels=channels,
+            kernel_cells=kernel_cells,
+            hidden_cells=hidden_cells,
+            highest=highest,
+            relu_on_outputs=relu_on_outputs,
+            glorot_uniform=glorot_uniform,
+        )
         self.highest, self.outputs, self.observation_dims = highest, outputs, len(observation_shape)
         *planes, rows, columns = observation_shape
+        check_size(
+            (channels[-1] * rows * columns, *hidden_cells, outputs),
+            more=kernel_cells**2 * sum(a * b for a, b in pairwise((prod(planes), *channels))),
+        )
         self._window = prod(planes), rows, columns
         self.convolutions = nn.ModuleList(
             nn.Conv2d(before, after, kernel_cells, padding=kernel_cells // 2)

@@ -2,12 +2,57 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from itertools import pairwise
 from math import prod
+from typing import Final
 
 from torch import Tensor, nn
 from torchrl import modules
 
+from cprl.checks import SWITCH, Check, check_arguments, check_fields, count, is_count, number, tuple_of
+from cprl.memory import check_memory
 from cprl.spaces import Spaces
+
+MOST_LAYERS: Final = 64
+MOST_CELLS: Final = 2**16
+"""Of one layer."""
+
+
+def layers(at_least: int) -> Check:
+    """The sizes of so many layers or more."""
+    return Check(
+        lambda value: (
+            isinstance(value, tuple)
+            and at_least <= len(value) <= MOST_LAYERS
+            and all(is_count(cells, 1, MOST_CELLS) for cells in value)
+        ),
+        f"{at_least} to {MOST_LAYERS} layers, each an integer in 1..{MOST_CELLS}",
+    )
+
+
+def check_size(sizes: Sequence[int], more: int = 0) -> None:
+    """Raises a TooLargeError if there is too little memory for a network.
+
+    Args:
+        sizes: the number of inputs, of the units of each layer, and of outputs.
+        more: further weights.
+    """
+    weights = more + sum((before + 1) * after for before, after in pairwise(sizes))
+    check_memory(f"the {weights:,} weights of a network", 4 * weights, "smaller layers")
+
+
+NETWORK_CHECKS: Final[dict[str, Check]] = {
+    "observation_shape": tuple_of(count(1), at_least=1),
+    "outputs": count(1),
+    "highest": number(1e-30, 2**64),
+    "relu_on_outputs": SWITCH,
+    "glorot_uniform": SWITCH,
+}
+"""Of the arguments that every network has."""
+
+
+LAYERS: Final = layers(0)
+"""Units of each hidden layer; none is a linear network."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -15,16 +60,14 @@ class MLP:
     """Fully connected layers with ReLU.
 
     Raises:
-        ValueError: if a layer has fewer than 1 unit.
+        ValueError: if a value is not allowed; names it and says what is.
     """
 
     hidden_cells: tuple[int, ...] = (32, 32)
     """Units of each hidden layer."""
 
     def __post_init__(self) -> None:
-        object.__setattr__(self, "hidden_cells", tuple(self.hidden_cells))
-        if any(size < 1 for size in self.hidden_cells):
-            raise ValueError(f"MLP.hidden_cells is {self.hidden_cells}; allowed: at least 1 in each layer")
+        check_fields(self, {"hidden_cells": LAYERS})
 
     def make(
         self,
@@ -57,6 +100,10 @@ class MLPNetwork(nn.Module):
         relu_on_outputs: whether the values pass through ReLU too, as in the program of the study.
         glorot_uniform: whether weights are initialised Glorot-uniform and biases to zero, as in the program
             of the study; else torch's default.
+
+    Raises:
+        ValueError: if an argument is not allowed; names it and says what is.
+        TooLargeError: if there is too little memory for the weights.
     """
 
     def __init__(
@@ -70,6 +117,16 @@ class MLPNetwork(nn.Module):
         glorot_uniform: bool = False,
     ) -> None:
         super().__init__()
+        check_arguments(
+            {**NETWORK_CHECKS, "hidden_cells": LAYERS},
+            observation_shape=observation_shape,
+            outputs=actions,
+            hidden_cells=hidden_cells,
+            highest=highest,
+            relu_on_outputs=relu_on_outputs,
+            glorot_uniform=glorot_uniform,
+        )
+        check_size((prod(observation_shape), *hidden_cells, actions))
         self.highest, self.relu_on_outputs = highest, relu_on_outputs
         self.observation_dims, self.outputs = len(observation_shape), actions
         self.layers = modules.MLP(

@@ -7,6 +7,7 @@ from typing import Any, TypeAlias
 import torch
 from torch import nn
 
+from cprl.checks import checked, instance
 from cprl.custom import Custom
 from cprl.networks.convolutional import Conv
 from cprl.networks.mlp import MLP
@@ -40,6 +41,7 @@ def new_network(
         ValueError: if agents observe entries that networks do not read, if the network cannot read the
             observation, or if it does not support `relu_on_outputs` or `glorot_uniform`.
     """
+    checked("network", network, instance(Network | Custom, 'MLP, Conv, Custom("module:Class")'))
     refuse_unseen(spaces)
     if not isinstance(network, Custom):
         return network.make(
@@ -59,6 +61,7 @@ def new_network(
 
 def refuse_unseen(spaces: Spaces) -> None:
     """Raises a ValueError if agents observe entries other than "observation", which networks do not read."""
+    checked("spaces", spaces, instance(Spaces, "a Spaces, e.g. Game.spaces"))
     if spaces.vectors:
         names = " and ".join(f'("agents", "{name}")' for name, _ in spaces.vectors)
         raise ValueError(

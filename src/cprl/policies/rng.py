@@ -7,6 +7,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from cprl.memory import check_memory
+
 DRAWN_AHEAD: Final = 1024
 """Steps whose numbers are generated at once."""
 
@@ -17,9 +19,17 @@ class LaneRng:
     Args:
         seeds: the seed of each lane, e.g. (seed, replica, agent, purpose).
         count: numbers per lane and step.
+
+    Raises:
+        TooLargeError: if there is less memory than those take that are generated ahead.
     """
 
     def __init__(self, seeds: Sequence[Sequence[int]], count: int) -> None:
+        check_memory(
+            f"random numbers of {len(seeds)} lanes, {count:,} a step and {DRAWN_AHEAD} steps ahead,",
+            2 * 8 * len(seeds) * DRAWN_AHEAD * count,
+            "smaller batches or rollouts, fewer evaluation episodes or fewer replicas",
+        )
         self.lanes, self.count = len(seeds), count
         self._chance = [np.random.Generator(np.random.Philox(np.random.SeedSequence(seed))) for seed in seeds]
         self._numbers = torch.empty((0, self.lanes, count), dtype=torch.float64)

@@ -14,6 +14,7 @@ from typing import Any, Final, Protocol, Self
 import torch
 from rich.console import Console
 
+from cprl.output import console as safe_console
 from cprl.runs.directory import resume_command as command_to_resume
 from cprl.runs.files import checksum, place_atomically, refuse_special
 from cprl.runs.lock import RunLock
@@ -85,7 +86,7 @@ class Checkpointer:
         self.run, self.folder = run, run / FOLDER
         self.every_s, self.keep_ending, self._take_over = every_s, keep_ending, take_over
         self.resume_command = command_to_resume(run) if resume_command is None else resume_command
-        self.console = console or Console()
+        self.console = console or safe_console()
         self._saved = time.monotonic()
         self._is_training, self._asked_to_stop = True, False
         self._has_ending = not keep_ending

@@ -8,6 +8,8 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any, BinaryIO
 
+from cprl.checks import check_nesting
+
 
 def write_atomically(path: Path, write: Callable[[BinaryIO], object]) -> None:
     """Writes a temporary file, syncs it to disk and renames it.
@@ -62,6 +64,7 @@ def read_json(path: Path) -> dict[str, Any]:
     refuse_special(path)
     try:
         value = json.loads(path.read_text(encoding="utf-8"))
+        check_nesting(value, "it")
     except (ValueError, RecursionError) as error:
         raise ValueError(f"{path} is not JSON: {error}") from error
     if not isinstance(value, dict):

@@ -10,6 +10,7 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, T
 from tensordict import TensorDictBase
 
 from cprl.measuring.episodes import Episode
+from cprl.output import console as safe_console
 
 _BAR_PERIOD_S: Final = 0.25
 _LINE_PERIOD_S: Final = 10.0
@@ -40,7 +41,7 @@ class ProgressBar:
         replicas: int = 1,
         console: Console | None = None,
     ) -> None:
-        self.console = console or Console()
+        self.console = console or safe_console()
         rules = getattr(getattr(game, "game", game), "rules", None)
         self._title, self._clock = title, getattr(rules, "episode_steps", None)
         self._last_steps = 0

@@ -13,6 +13,7 @@ from cprl.measuring.episodes import Episode
 from cprl.measuring.evaluate import mean_return
 from cprl.measuring.replicas import social_metrics
 from cprl.measuring.reported import left_out
+from cprl.output import console as safe_console
 from cprl.viewer.streams import viewer
 
 KEPT = ("recipe.json", "episodes.parquet", "run.rrd", "checkpoints", "figures")
@@ -43,7 +44,7 @@ def summarise(
         figure: the training curve.
         console: the console; by default standard output.
     """
-    console = console or Console()
+    console = console or safe_console()
     console.print(_table(title, played))
     missing = left_out(next(iter(played.values()))[0].reported)
     if missing:

@@ -7,6 +7,7 @@ Modules, in the order in which one reads them:
     events     new bests and phases, in words
     logger     RerunLogger: TorchRL's logger interface on a recording
     streams    to a file, and served live
+    deadline   calls that may wait for a viewer, with deadlines
     scenery    names and colours of what a recording shows
     stage      frames as Rerun's columns
     blueprint  the layout of the viewer

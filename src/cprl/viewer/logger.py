@@ -12,6 +12,7 @@ from rich.console import Console
 from torch import Tensor
 from torchrl.record.loggers import Logger
 
+from cprl.output import console as safe_console
 from cprl.viewer.blueprint import layout
 from cprl.viewer.scenery import Curves, Scene, classes, lines, phase_states
 from cprl.viewer.stage import columns, fixed
@@ -73,7 +74,7 @@ class RerunLogger(Logger):
                 f"{self.path} exists and is not overwritten; use another directory or file_name"
             )
         self.addresses: dict[str, str] = {}
-        self._live, self._console = live, console or Console()
+        self._live, self._console = live, console or safe_console()
         self._streams: list[Stream] = []
         self.frames = 0
         """Frames recorded so far, including those in earlier files of the recording."""
@@ -154,10 +155,11 @@ class RerunLogger(Logger):
         """Logs a matrix of numbers, float32 [rows, columns], with the names of its two axes."""
         import rerun as rr
 
-        values = np.asarray(matrix, np.float32)
+        values = np.array(matrix, np.float32)  # a copy, because a viewer gets it later
+        now = (*self._now, self.frames)
 
         def log(recording: Any) -> None:
-            for timeline, number in zip(TIMELINES, (*self._now, self.frames), strict=True):
+            for timeline, number in zip(TIMELINES, now, strict=True):
                 recording.set_time(timeline, sequence=number)
             recording.log(name, rr.Tensor(values, dim_names=list(dims)))
             recording.reset_time()
@@ -220,7 +222,7 @@ class RerunLogger(Logger):
         self._static(name, rr.Image.from_fields(format=form))
         count = len(images)
         times = _times(range(first, first + count), [self._now[1]] * count, [self.frames] * count)
-        what = rr.Image.columns(buffer=np.ascontiguousarray(images).reshape(count, -1))
+        what = rr.Image.columns(buffer=images.reshape(count, -1).copy())
         self._send(name, times, what)
 
     def log_histogram(
@@ -231,10 +233,10 @@ class RerunLogger(Logger):
 
         values = np.asarray(data.detach().cpu() if isinstance(data, Tensor) else data).reshape(-1)
         counts, edges = np.histogram(values, bins=bins)
-        when = self._now[0] if step is None else int(step)
+        now = self._now[0] if step is None else int(step), self._now[1], self.frames
 
         def log(recording: Any) -> None:
-            for timeline, number in zip(TIMELINES, (when, self._now[1], self.frames), strict=True):
+            for timeline, number in zip(TIMELINES, now, strict=True):
                 recording.set_time(timeline, sequence=number)
             recording.log(name, rr.BarChart(counts, abscissa=(edges[:-1] + edges[1:]) / 2))
             recording.reset_time()

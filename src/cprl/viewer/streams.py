@@ -8,9 +8,13 @@ import sys
 import time
 import warnings
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 from typing import Any, Final, TypeAlias
 from urllib.parse import quote, urlsplit
+
+from cprl.viewer import deadline
+from cprl.viewer.deadline import Sender, abandon, exit_in_time, within
 
 LOCALHOST: Final = "127.0.0.1"
 SERVER_MEMORY: Final = "512MB"
@@ -57,19 +61,54 @@ class Stream:
         if self.recording is None:
             return
         try:
-            what(self.recording)
+            self._call(what)
         except Exception as error:
-            self.recording = None
-            warnings.warn(
-                f"the Rerun {self.name} failed, the run continues without it: {error}",
-                RuntimeWarning,
-                stacklevel=2,
-            )
+            self._fail(error)
 
     def close(self) -> None:
         """Disconnects; the file gets its footer. A second call does nothing."""
-        self.do(lambda recording: recording.disconnect())
+        if self.recording is None:
+            return
+        try:
+            self._disconnect()
+        except Exception as error:
+            self._fail(error)
         self.recording = None
+
+    def _call(self, what: Callable[[Any], object]) -> None:
+        what(self.recording)
+
+    def _disconnect(self) -> None:
+        self.recording.disconnect()
+
+    def _fail(self, error: Exception) -> None:
+        self.recording = None
+        warnings.warn(
+            f"the Rerun {self.name} failed, the run continues without it: {error}",
+            RuntimeWarning,
+            stacklevel=4,
+        )
+
+
+class LiveStream(Stream):
+    """A stream to viewers. Its calls are made in a thread of its own, because a viewer that stands still, or
+    accepts a connection and never reads, makes them wait forever; see `cprl.viewer.deadline`.
+    """
+
+    def __init__(self, name: str, recording: Any, *, period_s: float) -> None:
+        super().__init__(name, recording, period_s=period_s)
+        self._sender = Sender()
+
+    def _call(self, what: Callable[[Any], object]) -> None:
+        self._sender.put(partial(what, self.recording))
+
+    def _disconnect(self) -> None:
+        self._sender.put(self.recording.disconnect)
+        self._sender.close()
+
+    def _fail(self, error: Exception) -> None:
+        abandon(self.recording)
+        super()._fail(error)
 
 
 _LIVE: Final = '"serve", "spawn" or "connect rerun+http://HOST:PORT/proxy"'
@@ -145,11 +184,12 @@ def _serve(recording_id: str, blueprint: Any, period_s: float) -> tuple[Stream, 
     """A stream served on a free port of 127.0.0.1, and its address."""
     import rerun as rr
 
+    exit_in_time()
     recording, port = _recording(recording_id), _free_port()
     recording.set_sinks(
         rr.GrpcServerSink(LOCALHOST, port, server_memory_limit=SERVER_MEMORY), default_blueprint=blueprint
     )
-    return Stream("live view", recording, period_s=period_s), f"rerun+http://{LOCALHOST}:{port}/proxy"
+    return LiveStream("live view", recording, period_s=period_s), f"rerun+http://{LOCALHOST}:{port}/proxy"
 
 
 def _connect(address: str, recording_id: str, blueprint: Any, period_s: float) -> Stream | None:
@@ -158,14 +198,21 @@ def _connect(address: str, recording_id: str, blueprint: Any, period_s: float) -
     Without this check Rerun would wait for the viewer and eventually block the training.
     """
     where = urlsplit(address.removeprefix("rerun+"))
-    try:
+
+    def connect() -> Any:
         socket.create_connection((where.hostname or LOCALHOST, where.port or 9876), timeout=2).close()
+        recording = _recording(recording_id)
+        recording.connect_grpc(address, default_blueprint=blueprint)
+        return recording
+
+    exit_in_time()
+    try:
+        recording = within(deadline.CONNECT_S, connect)
     except OSError as error:
+        abandon(error)
         _warn_of(f"viewer at {address}", error)
         return None
-    recording = _recording(recording_id)
-    recording.connect_grpc(address, default_blueprint=blueprint)
-    return Stream(f"viewer at {address}", recording, period_s=period_s)
+    return LiveStream(f"viewer at {address}", recording, period_s=period_s)
 
 
 def _spawn(grpc: str) -> None:

@@ -2,10 +2,10 @@
 
 import logging
 from collections.abc import Mapping, Sequence
+from math import prod
 from typing import Any
 
 import numpy as np
-import psutil
 import torch
 from tensordict import TensorDict
 from torch import Tensor
@@ -15,6 +15,7 @@ from cprl.custom import Custom
 from cprl.learners.buffer.gather import Horizon
 from cprl.learners.buffer.storage import LaneStorage, storage_bytes, torch_dtype
 from cprl.learners.transitions import LaneTurn, array_of, transitions_in, turn_of
+from cprl.memory import check_memory, free_bytes
 from cprl.policies.rng import LaneRng
 
 
@@ -116,26 +117,26 @@ def lane_buffer(
     The size is logged before allocation, under "cprl", if it is a mebibyte or more.
 
     Raises:
-        MemoryError: if the device has less free memory than needed; raised before anything is allocated.
+        TooLargeError: if the device has less free memory than needed; raised before anything is allocated.
     """
     dtype = torch_dtype(observation_dtype)
     needed = storage_bytes(
         len(seeds), transitions, observation_shape, action_shape=action_shape, item_bytes=dtype.itemsize
     )
-    free = _free_bytes(torch.device(device))
-    if needed > free:
-        raise MemoryError(
-            f"the replay buffers of {len(seeds)} lanes x {transitions:,} transitions take "
-            f"{needed / 2**30:.2f} GiB; {free / 2**30:.2f} GiB are free: use a smaller buffer_size or fewer "
-            "replicas"
-        )
+    sampled = len(seeds) * batch_size * prod(observation_shape) * 2 * (dtype.itemsize + 4)  # and as float32
+    check_memory(
+        f"the replay buffers of {len(seeds)} lanes x {transitions:,} transitions",
+        needed + sampled,
+        "a smaller buffer_size or batch_size, or fewer replicas",
+        device=device,
+    )
     if needed >= 2**20:
         logging.getLogger("cprl").info(
             "Replay buffers of %d lanes x %s transitions: %.2f GiB of %.1f GiB free",
             len(seeds),
             f"{transitions:,}",
             needed / 2**30,
-            free / 2**30,
+            free_bytes(device) / 2**30,
         )
     storage = LaneStorage(
         lanes=len(seeds),
@@ -175,9 +176,3 @@ def transformed(batch: TensorDict, transforms: Sequence[Custom]) -> TensorDict:
                 f"replay_transforms: {custom.target} cannot transform a sampled batch: {error}"
             ) from error
     return batch
-
-
-def _free_bytes(device: torch.device) -> int:
-    if device.type == "cuda":
-        return int(torch.cuda.mem_get_info(device)[0])
-    return int(psutil.virtual_memory().available)

@@ -4,7 +4,6 @@ from collections.abc import Callable, Mapping, Sequence
 from math import prod
 from typing import Any, Final
 
-import psutil
 import torch
 from tensordict import TensorDict, TensorDictBase
 from torch import Tensor, nn
@@ -16,6 +15,7 @@ from torchrl.objectives.utils import TargetNetUpdater
 
 from cprl.custom import made
 from cprl.learners.buffer.storage import torch_dtype
+from cprl.learners.checks import check_learner
 from cprl.learners.engine.functional import MakeLoss, targets_of
 from cprl.learners.engine.refusals import refuse_on_policy
 from cprl.learners.lanes import TARGET_WEIGHTS, Lanes
@@ -23,6 +23,7 @@ from cprl.learners.settings import DQNSettings
 from cprl.learners.torchrl.agents import MakeSampler, StockAgents
 from cprl.learners.torchrl.buffers import buffer_state, load_buffer, nested, plain
 from cprl.learners.transitions import RewardKind
+from cprl.memory import check_memory
 from cprl.policies.lanes import LaneActor
 from cprl.spaces import Spaces
 
@@ -57,7 +58,7 @@ class TorchRLReplayLearner:
     Raises:
         ValueError: for a loss that needs the latest steps of the current policy, for settings below their
             minimum, and for settings that the loss ignores: those of targets if it has none, and `n_steps`.
-        MemoryError: if the device has less memory than the buffers need; raised before allocation.
+        TooLargeError: if the device has less memory than the buffers need; raised before allocation.
     """
 
     def __init__(
@@ -76,6 +77,7 @@ class TorchRLReplayLearner:
         make_sampler: MakeSampler | None = None,
         device: str | torch.device = "cpu",
     ) -> None:
+        check_learner(spaces, settings, DQNSettings, agents, replicas, first_replica, seed, reward_kind)
         self.spaces, self.settings, self.agents = spaces, settings, tuple(agents)
         self.replicas, self.seed, self.reward_kind = replicas, seed, reward_kind
         self._make_sampler: MakeSampler = make_sampler or (lambda lane: RandomSampler())
@@ -256,11 +258,10 @@ def _check_memory(lanes: int, spaces: Spaces, settings: DQNSettings, device: tor
     its pages are only committed as they fill, so a machine with too little would fail hours later."""
     observation = prod(spaces.observation_shape) * torch_dtype(spaces.observation_dtype).itemsize
     wanted = lanes * settings.buffer_size * (2 * observation + BYTES_BESIDE)
-    on_gpu = device.type == "cuda"
-    free = torch.cuda.mem_get_info(device)[0] if on_gpu else psutil.virtual_memory().available
-    if wanted > free:
-        raise MemoryError(
-            f"the replay buffers of {lanes} agents x {settings.buffer_size:,} transitions take "
-            f"{wanted / 2**30:.2f} GiB; {free / 2**30:.2f} GiB are free: use a smaller buffer_size, fewer "
-            'replicas, or engine="compiled", which needs half'
-        )
+    wanted += settings.batch_size * 2 * (observation + 4 * prod(spaces.observation_shape))
+    check_memory(
+        f"the replay buffers of {lanes} agents x {settings.buffer_size:,} transitions",
+        wanted,
+        'a smaller buffer_size or batch_size, fewer replicas, or engine="compiled", which needs half',
+        device=device,
+    )

@@ -12,6 +12,8 @@ from torchrl.data.replay_buffers import SamplerWithoutReplacement
 from torchrl.objectives import LossModule
 from torchrl.objectives.value import GAE
 
+from cprl.learners.buffer.storage import torch_dtype
+from cprl.learners.checks import check_learner, check_rollouts
 from cprl.learners.engine.functional import MakeLoss
 from cprl.learners.engine.refusals import refuse_other_advantages
 from cprl.learners.lanes import Lanes
@@ -67,6 +69,7 @@ class TorchRLRolloutLearner:
         make_sampler: MakeSampler | None = None,
         device: str | torch.device = "cpu",
     ) -> None:
+        check_learner(spaces, settings, RolloutSettings, agents, replicas, first_replica, seed, reward_kind)
         self.spaces, self.settings, self.agents = spaces, settings, tuple(agents)
         self.replicas, self.seed, self.reward_kind = replicas, seed, reward_kind
         self._lanes = Lanes(
@@ -88,6 +91,8 @@ class TorchRLRolloutLearner:
             device=device,
         )
         self.estimators = [_gae(agent.parts[CRITIC], settings) for agent in self.stock.each]
+        size, dtype = (settings.rollout_steps, len(self._lanes)), torch_dtype(spaces.observation_dtype)
+        check_rollouts(size, spaces.observation_shape, dtype, device)
         self._generators = self.stock.generators()
         self.buffers = [
             TensorDictReplayBuffer(

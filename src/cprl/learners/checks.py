@@ -1,0 +1,85 @@
+"""What learners refuse before they allocate anything."""
+
+from collections.abc import Sequence
+from math import prod
+from typing import Any, Final, get_args
+
+import torch
+from torch import nn
+
+from cprl.checks import Check, checked, count, instance, is_count, one_of
+from cprl.learners.transitions import RewardKind
+from cprl.memory import check_memory
+from cprl.spaces import Spaces
+
+_LEAST_BYTES: Final = 4096
+"""Of a lane, whatever it learns by: its name, seeds and random number generators."""
+_COPIES: Final = 6
+"""Of a lane's weights while it trains: as made, stacked, target, gradient and two of the optimiser."""
+
+
+def check_learner(
+    spaces: Spaces,
+    settings: object,
+    kind: type[Any],
+    agents: Sequence[int],
+    replicas: int,
+    first_replica: int,
+    seed: int,
+    reward_kind: RewardKind,
+) -> None:
+    """The arguments that every learner has.
+
+    Raises:
+        ValueError: for settings of another class, agents that the spaces do not have, replicas and a seed out
+            of range, and an unknown kind of reward.
+        TooLargeError: for more replicas than there is memory for, whatever they learn by.
+    """
+    checked("settings", settings, instance(kind, f"a {kind.__name__}"))
+    checked("spaces", spaces, instance(Spaces, "a Spaces, e.g. Game.spaces"))
+    checked("reward_kind", reward_kind, one_of(*get_args(RewardKind)))
+    most = spaces.agents - 1
+    allowed = Check(
+        lambda value: (
+            isinstance(value, tuple)
+            and 0 < len(value) == len(set(value))
+            and all(is_count(agent, 0, most) for agent in value)
+        ),
+        f"one or more of the agents 0 to {most}, each once",
+    )
+    checked("agents", agents, allowed)
+    checked("replicas", replicas, count(1, 2**20))
+    checked("first_replica", first_replica, count(0))
+    checked("seed", seed, count(0, 2**64 - 1))
+    lanes = len(agents) * replicas
+    check_memory(f"{replicas} replicas of {len(agents)} agents", lanes * _LEAST_BYTES, "fewer replicas")
+
+
+def check_networks(network: nn.Module, lanes: int, device: str | torch.device) -> None:
+    """Raises a TooLargeError if a device has too little memory to train a network like this for each lane."""
+    size = sum(value.numel() * value.element_size() for value in network.parameters())
+    check_memory(
+        f"the networks of {lanes} lanes, {size / 2**20:,.1f} MiB each, with targets and optimisers",
+        lanes * size * _COPIES,
+        "smaller networks or fewer replicas",
+        device=device,
+    )
+
+
+def check_rollouts(
+    size: tuple[int, int], shape: Sequence[int], dtype: torch.dtype, device: str | torch.device
+) -> None:
+    """Raises a TooLargeError if a device has too little memory for rollouts.
+
+    Args:
+        size: the number of steps T and of lanes L.
+        shape: the shape of an observation.
+        dtype: its dtype; updates read it as float32.
+        device: the device of rollouts and updates.
+    """
+    check_memory(
+        f"the rollouts of {size[1]} lanes x {size[0]:,} steps",
+        prod(size) * (2 * prod(shape) * (dtype.itemsize + 4) + 64),
+        "fewer rollout_steps or fewer replicas",
+        device=device,
+    )

@@ -1,0 +1,53 @@
+"""Devices and their free memory: what would not fit is refused before anything is allocated."""
+
+from typing import Any, Final
+
+import psutil
+import torch
+
+from cprl.checks import Check
+
+
+def _is_device(value: Any) -> bool:
+    try:
+        return isinstance(value, str) and str(torch.device(value)) == value != "meta"  # cuda:300 becomes 44
+    except (RuntimeError, ValueError):
+        return False
+
+
+DEVICE: Final = Check(_is_device, '"cpu", "cuda:0"')
+_SMALL: Final = 2**20
+"""Bytes that are not worth the question how many are free."""
+
+
+class TooLargeError(ValueError, MemoryError):
+    """What would take more memory than is free; nothing of it has been allocated."""
+
+
+def free_bytes(device: str | torch.device = "cpu") -> int:
+    """The bytes that can be allocated on a device."""
+    device = torch.device(device)
+    if device.type == "cuda":
+        return int(torch.cuda.mem_get_info(device)[0])
+    return int(psutil.virtual_memory().available)
+
+
+def check_memory(what: str, needed: int, instead: str, *, device: str | torch.device = "cpu") -> None:
+    """Refuses what would not fit.
+
+    Args:
+        what: takes the memory, in the plural, e.g. "the replay buffers of 4 lanes".
+        needed: bytes that it takes, estimated.
+        instead: what to use in its place.
+        device: where it would be allocated.
+
+    Raises:
+        TooLargeError: says how much it takes, how much is free, and what to use instead.
+    """
+    if needed > _SMALL and needed > (free := free_bytes(device)):
+        raise TooLargeError(f"{what} take {gib(needed)}; {gib(free)} are free: use {instead}")
+
+
+def gib(size: int) -> str:
+    """A number of bytes in GiB, for people."""
+    return f"{size / 2**30:,.2f} GiB" if size < 2**70 else f"more than {2**40:,} GiB"
