@@ -21,6 +21,7 @@ from torchrl.objectives import DiscreteCQLLoss, DQNLoss, ValueEstimators
 
 from cprl import CommonsEnv, Game, Rules, compat, keys, maps
 from cprl.commons import compiled
+from cprl.compat import LaneCategorical
 from cprl.learners.engine.functional import FunctionalLoss, total, weights_of
 
 SOURCE = Path(compat.__file__).parent
@@ -294,3 +295,24 @@ def test_private_parts_of_libraries_are_used_in_their_home_alone():
         if any(re.search(part, line) for part in LIBRARY_PARTS)
     ]
     assert found == [], "move these into cprl.compat, with a test here"
+
+
+def test_a_policy_that_is_nan_changes_nothing_of_the_others():
+    """Without it TorchRL samples all entropies where one is NaN, and torch refuses to sample from NaN."""
+    sound = torch.tensor([[0.5, -1.0, 2.0], [0.0, 0.1, 0.2]])
+    whole, usual = LaneCategorical(logits=sound), torch.distributions.Categorical(logits=sound)
+    broken = LaneCategorical(logits=torch.cat([sound, torch.full((1, 3), torch.nan)]))
+    assert torch.equal(whole.entropy(), usual.entropy())
+    assert torch.equal(broken.entropy()[:2], usual.entropy())
+    assert broken.entropy()[2] == 0
+    drawn = []
+    for own in (whole, usual):
+        torch.manual_seed(3)
+        drawn.append(own.sample((50,)))
+    assert torch.equal(*drawn)
+    assert broken.sample((50,)).shape == (50, 3)
+    action = torch.tensor([0, 1, 2])
+    assert torch.equal(broken.log_prob(action)[:2], usual.log_prob(action[:2]))
+    assert broken.log_prob(action)[2].isnan()
+    with pytest.raises(RuntimeError, match="contains either `inf`, `nan`"):
+        torch.distributions.Categorical(logits=torch.full((1, 3), torch.nan)).sample()

@@ -35,6 +35,7 @@ PACKAGES = (
     "viewer",
     "terminal",
     "callbacks",
+    "finite",
     "training",
     "experiment",
     "stored",

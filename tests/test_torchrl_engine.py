@@ -458,9 +458,44 @@ def test_what_follows_n_steps_is_discounted_by_as_many(name):
     assert with_steps(1) != with_steps(3)
 
 
+def replay_learner_of(make_loss, **changes):
+    return TorchRLReplayLearner(
+        SPACES,
+        settings=changed(REPLAY, **changes),
+        make_network=lambda: DQN(settings=REPLAY).make_network(SPACES),
+        make_loss=make_loss,
+        **HOW,
+    )
+
+
+class OneStepLoss(DQNLoss):
+    """Discounts the value behind a return by one step, however many rewards were summed."""
+
+    def forward(self, tensordict):
+        return super().forward(tensordict.exclude("steps_to_next_obs"))
+
+
 def test_n_steps_are_refused_for_a_loss_that_takes_no_notice_of_them():
-    with pytest.raises(ValueError, match=r"n_steps is 3; allowed: 1, because .*DiscreteIQLLoss discounts"):
+    with pytest.raises(ValueError, match=r"n_steps is 3; allowed: 1, because DiscreteIQLLoss does not read"):
         resumable(IQL(settings=changed(REPLAY, n_steps=3)))
+
+    def one_step(network):
+        actor = DQN(settings=REPLAY).make_loss(network).value_network
+        loss = OneStepLoss(actor, delay_value=True, loss_function="l2", action_space="categorical")
+        loss.make_value_estimator(gamma=REPLAY.gamma)
+        return loss
+
+    replay_learner_of(one_step)
+    with pytest.raises(ValueError, match=r"n_steps is 3; allowed: 1, because OneStepLoss does not read"):
+        replay_learner_of(one_step, n_steps=3)
+
+
+def test_returns_of_several_steps_need_the_gamma_that_the_loss_bootstraps_with():
+    make_loss = DQN(settings=changed(REPLAY, gamma=0.5)).make_loss
+    replay_learner_of(make_loss, n_steps=1)
+    replay_learner_of(make_loss, n_steps=3, gamma=0.5)
+    with pytest.raises(ValueError, match=r"DQNLoss has gamma 0\.5 and the settings have gamma 0\.995"):
+        replay_learner_of(make_loss, n_steps=3)
 
 
 def test_replay_transforms_change_what_is_sampled():

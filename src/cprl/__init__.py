@@ -25,6 +25,7 @@ Each imports only from those above it:
     viewer       recordings for the Rerun viewer
     terminal     progress, summary, figures
     callbacks    what is called while a training runs
+    finite       what is NaN or infinite in a training, found and named
     training     the loop: act, store, update, measure, record
     experiment   Experiment: what is trained and how, a value
     stored       load: a run built again from its directory

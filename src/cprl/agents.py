@@ -5,7 +5,7 @@ from dataclasses import replace
 from typing import Any
 
 import torch
-from torch import nn
+from torch import Tensor, nn
 from torchrl.envs import EnvBase
 
 from cprl.algorithms.base import Algorithm, TeamAlgorithm
@@ -14,13 +14,14 @@ from cprl.custom import Custom, made
 from cprl.envs.make_env import spaces_of
 from cprl.envs.unwrap import commons_of
 from cprl.learners.base import Learner
-from cprl.learners.lanes import EVALUATION, EXPLORATION, lane_seeds
+from cprl.learners.lanes import EVALUATION, EXPLORATION, lane_name, lane_seeds
+from cprl.networks.agent import acting_part
 from cprl.policies.assignment import AgentIndices, AgentPolicies
 from cprl.policies.lanes import random_agents
 from cprl.policies.scripted import scripted_lanes
 from cprl.population import AgentSpec, Frozen, Learning, Scripted, Team, grouped
 from cprl.spaces import Spaces
-from cprl.stored import StoredAgent, load, stored_actor
+from cprl.stored import LoadedRun, StoredAgent, load, stored_actor
 
 
 class Population:
@@ -33,6 +34,8 @@ class Population:
         first_replica: the number of the first replica, so that replica r can be trained alone.
         engine: "compiled", "eager" or "torchrl", see `Experiment.engine`.
         allow: what stored runs of `Frozen` agents may import, see `cprl.load`.
+        starts: whether agents that start from stored weights get them; False where a checkpoint follows,
+            which has later ones.
 
     Raises:
         ValueError: for specifications that do not fit the environment or each other; says what does.
@@ -47,6 +50,7 @@ class Population:
         first_replica: int = 0,
         engine: str = "compiled",
         allow: Sequence[str] = (),
+        starts: bool = True,
     ) -> None:
         self.spaces, self.specs = spaces_of(env), tuple(specs)
         self.replicas, self.seed, self._first = env.batch_size.numel(), seed, first_replica
@@ -54,8 +58,9 @@ class Population:
         self._game = None if commons is None else commons.game
         self._groups = grouped(specs, self.spaces.agents)
         _check_scripted(self._groups, self.spaces, self._game)
+        numbers = range(first_replica, first_replica + self.replicas)
         self._frozen = {
-            spec: _frozen(spec, self.spaces, self._game, allow)
+            spec: _frozen(spec, self.spaces, self._game, allow, numbers)
             for spec, _ in self._groups
             if isinstance(spec, Frozen)
         }
@@ -66,11 +71,13 @@ class Population:
             "engine": engine,
             "device": env.device or torch.device("cpu"),
         }
-        self.learners: dict[tuple[int, ...], Learner] = {
-            agents: _learner(spec, self.spaces, agents, who)
-            for spec, agents in self._groups
-            if isinstance(spec, Learning | Team)
-        }
+        self.learners: dict[tuple[int, ...], Learner] = {}
+        for spec, agents in self._groups:
+            if isinstance(spec, Learning | Team):
+                start = start_weights(spec, agents, self.spaces, self._game, numbers, allow) if starts else {}
+                self.learners[agents] = _learner(
+                    spec, self.spaces, agents, {**who, "start_from": start} if start else who
+                )
         self.others: dict[AgentIndices, nn.Module] = self._others(EXPLORATION, worlds=1)
 
     def _others(self, purpose: int, *, worlds: int) -> dict[AgentIndices, nn.Module]:
@@ -83,7 +90,7 @@ class Population:
             if isinstance(spec, Scripted):
                 actors[agents] = scripted_lanes(spec.policy, self._game or self.spaces, **how)
             elif isinstance(spec, Frozen):
-                stored = [self._frozen[spec]] * len(how["seeds"])
+                stored = [own for own in self._frozen[spec] for _ in agents]
                 actors[agents] = stored_actor(stored, self._game or self.spaces, **how)
         return actors
 
@@ -112,6 +119,10 @@ class Population:
 
 
 def _learner(spec: Learning | Team, spaces: Spaces, agents: tuple[int, ...], who: dict[str, Any]) -> Learner:
+    return _algorithm(spec).make_learner(spaces, agents=agents, reward_kind=spec.reward, **who)
+
+
+def _algorithm(spec: Learning | Team) -> Algorithm:
     wanted = TeamAlgorithm if isinstance(spec, Team) else Algorithm
     algorithm = made(spec.algorithm)
     if not isinstance(algorithm, wanted):
@@ -120,7 +131,7 @@ def _learner(spec: Learning | Team, spaces: Spaces, agents: tuple[int, ...], who
             f"the algorithm{named} is a {type(algorithm).__name__}; allowed: a subclass of "
             f"cprl.algorithms.{wanted.__name__}"
         )
-    return algorithm.make_learner(spaces, agents=agents, reward_kind=spec.reward, **who)
+    return algorithm
 
 
 def _check_scripted(groups: Sequence[tuple[AgentSpec, Any]], spaces: Spaces, game: Game | None) -> None:
@@ -139,9 +150,22 @@ def _check_scripted(groups: Sequence[tuple[AgentSpec, Any]], spaces: Spaces, gam
             )
 
 
-def _frozen(spec: Frozen, spaces: Spaces, game: Game | None, allow: Sequence[str]) -> StoredAgent:
-    """The stored agent, refused where it was trained for other observations or actions."""
-    run = load(spec.run, allow=allow)
+def _frozen(
+    spec: Frozen, spaces: Spaces, game: Game | None, allow: Sequence[str], replicas: Sequence[int]
+) -> list[StoredAgent]:
+    """The stored agent of each replica."""
+    run = _fitting_run(spec.run, spaces, game, allow)
+    return [run.agent(spec.agent, replica=_theirs(spec, replica)) for replica in replicas]
+
+
+def _theirs(spec: Frozen, replica: int) -> int:
+    """The replica of the stored run."""
+    return replica if spec.replica is None else spec.replica
+
+
+def _fitting_run(path: str, spaces: Spaces, game: Game | None, allow: Sequence[str]) -> LoadedRun:
+    """The stored run, refused where it was trained for other observations or actions."""
+    run = load(path, allow=allow)
     theirs = run.spaces
     differences: list[tuple[str, Any, Any]] = [
         ("observations", theirs.observation_shape, spaces.observation_shape),
@@ -155,5 +179,82 @@ def _frozen(spec: Frozen, spaces: Spaces, game: Game | None, allow: Sequence[str
         ]
     for name, came, here in differences:
         if came != here:
-            raise ValueError(f"the agents of {spec.run} have {name} {came}; this game has {here}")
-    return run.agent(spec.agent, replica=spec.replica)
+            raise ValueError(f"the agents of {path} have {name} {came}; this game has {here}")
+    return run
+
+
+def start_weights(
+    spec: Learning | Team,
+    agents: tuple[int, ...],
+    spaces: Spaces,
+    game: Game | None,
+    replicas: Sequence[int],
+    allow: Sequence[str] = (),
+) -> dict[str, dict[str, Tensor]]:
+    """The state dict of the acting network with which each agent of each replica starts, by the lane's name;
+    empty where they start anew.
+
+    Args:
+        spec: how the agents are specified.
+        agents: their indices.
+        spaces: what they observe and may do.
+        game: the game, if it is one of cprl's.
+        replicas: the numbers of the replicas.
+        allow: what the stored run may import.
+
+    Raises:
+        ValueError: where the stored run has no such agent, or its network is another one; says how.
+    """
+    source = spec.start_from
+    if source is None:
+        return {}
+    run, algorithm = _fitting_run(source.run, spaces, game, allow), _algorithm(spec)
+    theirs = _members(run, source, len(agents)) if isinstance(spec, Team) else (source.agent,) * len(agents)
+    weights = {}
+    for replica in replicas:
+        for agent, stored_agent in zip(agents, theirs, strict=True):
+            where = f"{lane_name(_theirs(source, replica), stored_agent)} of {source.run}"
+            stored = run.agent(stored_agent, replica=_theirs(source, replica))
+            weights[lane_name(replica, agent)] = _weights(stored, algorithm, spaces, where)
+    return weights
+
+
+def _members(run: LoadedRun, source: Frozen, size: int) -> tuple[int, ...]:
+    """The agents of the team that the stored agent is in."""
+    theirs = run.specs[source.agent] if source.agent < len(run.specs) else None
+    if not isinstance(theirs, Team) or len(theirs.agents) != size:
+        what = f"in a team of {len(theirs.agents)}" if isinstance(theirs, Team) else "in no team"
+        raise ValueError(
+            f"agent {source.agent} of {source.run} is {what}; allowed for a team of {size} to start from: a "
+            f"member of a team of {size}"
+        )
+    return theirs.agents
+
+
+def _weights(stored: StoredAgent, algorithm: Algorithm, spaces: Spaces, where: str) -> dict[str, Tensor]:
+    """The weights of a stored agent's network, if the algorithm's network computes the same with them."""
+    name = type(algorithm).__name__
+    if stored.network is None:
+        raise ValueError(f"{where} is scripted, without weights; allowed: an agent that learned")
+    if stored.kind[1] != algorithm.stochastic:
+        kinds = {True: "the logits of a policy", False: "action values"}
+        raise ValueError(
+            f"the network of {where} outputs {kinds[stored.kind[1]]}; {name} learns "
+            f"{kinds[algorithm.stochastic]}"
+        )
+    weights = stored.network.state_dict()
+    with torch.random.fork_rng(devices=[]), torch.no_grad():
+        network = acting_part(algorithm.make_network(spaces))
+        try:
+            network.load_state_dict(weights)
+        except RuntimeError as error:
+            reason = " ".join(str(error).split())
+            raise ValueError(f"{where} has another network than {name} here: {reason}") from error
+        torch.manual_seed(0)
+        seen = torch.rand(8, *spaces.observation_shape) * spaces.observation_scale
+        seen = seen.to(getattr(torch, spaces.observation_dtype))
+        if not torch.equal(network(seen), stored.network(seen)):
+            raise ValueError(
+                f"{where} has another network than {name} here: with the same weights the outputs differ"
+            )
+    return weights

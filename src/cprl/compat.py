@@ -84,6 +84,27 @@ def flag_spec(*shape: int) -> Categorical:
 # ---- TorchRL: losses
 
 
+class LaneCategorical(torch.distributions.Categorical):
+    """`Categorical` for the policies of several agents in one batch, of which one may be NaN.
+
+    TorchRL's PPO losses replace the entropies of the whole batch by samples if one of them is not finite, and
+    torch refuses to sample from NaN, on a GPU for the rest of the process. Here NaN has entropy 0 and is
+    sampled uniformly; the log-probabilities, and so that agent's loss, stay NaN. Nothing else differs.
+    """
+
+    def entropy(self) -> torch.Tensor:
+        """As of `Categorical`, and 0 for NaN."""
+        entropy: torch.Tensor = super().entropy()  # type: ignore[no-untyped-call]
+        # Compiled losses take a sample, made below, where the entropy is NaN.
+        return entropy if torch.compiler.is_compiling() else entropy.nan_to_num(nan=0.0)
+
+    def sample(self, sample_shape: Any = ()) -> torch.Tensor:
+        """As of `Categorical`, and uniform for NaN."""
+        size = torch.Size(sample_shape)
+        weights = self.probs.reshape(-1, self._num_events).nan_to_num(nan=1.0)
+        return torch.multinomial(weights, size.numel(), True).T.reshape(self._extended_shape(size))
+
+
 def updated_weights(loss: LossModule) -> list[str]:
     """The names of the weights whose targets a TorchRL target updater updates."""
     return [name for name, is_updated in loss._has_update_associated.items() if is_updated]

@@ -159,10 +159,10 @@ def differences(before: object, now: object, where: str) -> list[str]:
     """How two tables differ, a sentence for each place."""
     if isinstance(before, Mapping) and isinstance(now, Mapping):
         if before.get("kind") == now.get("kind"):
-            names = {**before, **now}
             return [
                 line
-                for name in names
+                for name in {**before, **now}
+                if not (before.get(name) is None and now.get(name) is None)  # fields of a later version
                 for line in differences(before.get(name, _ABSENT), now.get(name, _ABSENT), f"{where}.{name}")
             ]
     elif isinstance(before, list) and isinstance(now, list) and len(before) == len(now):

@@ -24,6 +24,7 @@ from cprl.commons.game import Game
 from cprl.config import custom_targets, differences, fields_from_config, fields_to_config
 from cprl.custom import Custom
 from cprl.envs.make_env import PlayableGame
+from cprl.finite import OnNan
 from cprl.memory import DEVICE
 from cprl.population import SPEC, AgentSpec, Frozen, Learning, Team, specs_by_agent
 from cprl.runs.old_recipes import experiment_config
@@ -73,6 +74,9 @@ class Experiment:
     engine: TrainingEngine = "compiled"
     """How updates are computed: "compiled" by torch, several times faster and in need of a C++ compiler;
     "eager", the same uncompiled; "torchrl", stock TorchRL, one agent after the other."""
+    on_nan: OnNan = "stop"
+    """What happens when a loss, weight, reward or observation is NaN or infinite: "stop" ends the training;
+    "continue" warns, and the others train on."""
 
     def __post_init__(self) -> None:
         check_fields(self, _CHECKS, "experiment")
@@ -183,9 +187,14 @@ def _is_old(recipe: Mapping[str, Any]) -> bool:
 
 
 def _with_runs(experiment: Experiment, moved: Callable[[str], str]) -> Experiment:
-    agents = tuple(
-        replace(spec, run=moved(spec.run)) if isinstance(spec, Frozen) else spec for spec in experiment.agents
-    )
+    def of_spec(spec: AgentSpec) -> AgentSpec:
+        if isinstance(spec, Frozen):
+            return replace(spec, run=moved(spec.run))
+        if isinstance(spec, Learning | Team) and spec.start_from is not None:
+            return replace(spec, start_from=replace(spec.start_from, run=moved(spec.start_from.run)))
+        return spec
+
+    agents = tuple(map(of_spec, experiment.agents))
     return experiment if agents == experiment.agents else replace(experiment, agents=agents)
 
 
@@ -236,6 +245,7 @@ _CHECKS: Final[dict[str, Check]] = {
     **dict.fromkeys(("transforms", "callbacks", "loggers"), _TUPLE),
     "device": DEVICE,
     "engine": one_of(*get_args(TrainingEngine)),
+    "on_nan": one_of(*get_args(OnNan)),
 }
 
 
@@ -274,9 +284,11 @@ def _check_agents(experiment: Experiment) -> None:
             raise ValueError(f"experiment.agents: {error}") from error
     for place, spec in enumerate(experiment.agents):
         where = f"experiment.agents[{place}]"
-        if isinstance(spec, Frozen) and Path(spec.run).is_absolute():
+        stored = spec if isinstance(spec, Frozen) else getattr(spec, "start_from", None)
+        if stored is not None and Path(stored.run).is_absolute():
+            name = f"{where}.run" if stored is spec else f"{where}.start_from.run"
             raise ValueError(
-                f"{where}.run is {spec.run}, an absolute path, which is another one on another machine; "
+                f"{name} is {stored.run}, an absolute path, which is another one on another machine; "
                 "allowed: a path relative to where we stand"
             )
         if isinstance(spec, Team) and isinstance(spec.algorithm, TeamAlgorithm):

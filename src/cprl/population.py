@@ -10,7 +10,7 @@ from dataclasses import dataclass
 from typing import Any, Final, TypeAlias, get_args
 
 from cprl.algorithms.base import Algorithm, TeamAlgorithm
-from cprl.checks import Check, check_fields, checked, count, instance, is_count, one_of
+from cprl.checks import NONE, Check, check_fields, checked, count, either, instance, is_count, one_of
 from cprl.custom import Custom
 from cprl.learners.transitions import RewardKind
 from cprl.policies.scripted import SCRIPTED_POLICIES, ScriptedPolicy
@@ -50,6 +50,29 @@ _TEAM_ALGORITHM: Final = _algorithm(TeamAlgorithm)
 
 
 @dataclass(frozen=True)
+class Frozen:
+    """What an agent of an earlier run learned: an agent that plays it, or what another one starts from.
+
+    Args:
+        run: the directory of the run, or of its results.
+        agent: the index of the agent in that run.
+        replica: the replica of that run; None for the replica of the same number in each replica.
+    """
+
+    run: str
+    agent: int
+    replica: int | None = 0
+
+    def __post_init__(self) -> None:
+        if isinstance(self.run, os.PathLike):
+            object.__setattr__(self, "run", os.fspath(self.run))
+        check_fields(self, {"run": _PATH, "agent": count(0), "replica": either(count(0), NONE)})
+
+
+_START: Final = either(instance(Frozen, "Frozen(run, agent, replica)"), NONE)
+
+
+@dataclass(frozen=True)
 class Learning:
     """An agent that learns on its own. Equal ones are updated together, as lanes of one engine.
 
@@ -57,13 +80,16 @@ class Learning:
         algorithm: e.g. `cprl.algorithms.DQN(settings=...)`.
         reward: "individual", the agent's own reward, or "team", the sum of the rewards of all agents of the
             game.
+        start_from: the agent whose weights its acting network, and the target of it, start with; None for
+            new ones. The optimiser, critics and exploration begin anew.
     """
 
     algorithm: Algorithm | Custom
     reward: RewardKind = "individual"
+    start_from: Frozen | None = None
 
     def __post_init__(self) -> None:
-        check_fields(self, {"algorithm": _ALGORITHM, "reward": _REWARD})
+        check_fields(self, {"algorithm": _ALGORITHM, "reward": _REWARD, "start_from": _START})
         if isinstance(self.algorithm, TeamAlgorithm):
             name = type(self.algorithm).__name__
             raise ValueError(
@@ -79,14 +105,20 @@ class Team:
         algorithm: e.g. `cprl.algorithms.QMIX(settings=...)`.
         agents: their indices, ascending.
         reward: "team", the sum of the rewards of all agents of the game; or "individual", for IPPO alone.
+        start_from: a member of a team of the same size; each member starts with the weights of the member
+            at the same place in that team, see `Learning`. Mixers and central critics begin anew.
     """
 
     algorithm: TeamAlgorithm | Custom
     agents: tuple[int, ...]
     reward: RewardKind = "team"
+    start_from: Frozen | None = None
 
     def __post_init__(self) -> None:
-        check_fields(self, {"algorithm": _TEAM_ALGORITHM, "agents": _MEMBERS, "reward": _REWARD})
+        check_fields(
+            self,
+            {"algorithm": _TEAM_ALGORITHM, "agents": _MEMBERS, "reward": _REWARD, "start_from": _START},
+        )
 
 
 @dataclass(frozen=True)
@@ -97,26 +129,6 @@ class Scripted:
 
     def __post_init__(self) -> None:
         check_fields(self, {"policy": one_of(*SCRIPTED_POLICIES)})
-
-
-@dataclass(frozen=True)
-class Frozen:
-    """An agent that plays what an agent of an earlier run learned, the same in every replica.
-
-    Args:
-        run: the directory of the run, or of its results.
-        agent: the index of the agent in that run.
-        replica: the replica of that run.
-    """
-
-    run: str
-    agent: int
-    replica: int = 0
-
-    def __post_init__(self) -> None:
-        if isinstance(self.run, os.PathLike):
-            object.__setattr__(self, "run", os.fspath(self.run))
-        check_fields(self, {"run": _PATH, "agent": count(0), "replica": count(0)})
 
 
 AgentSpec: TypeAlias = Learning | Team | Scripted | Frozen

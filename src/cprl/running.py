@@ -3,7 +3,7 @@
 import shutil
 from collections.abc import Sequence
 from contextlib import AbstractContextManager, ExitStack, nullcontext, suppress
-from dataclasses import dataclass, replace
+from dataclasses import asdict, dataclass, replace
 from datetime import datetime
 from functools import partial
 from pathlib import Path
@@ -18,17 +18,19 @@ from cprl.envs.make_env import make_env
 from cprl.envs.state import check_restorable, load_transforms_state, transforms_state
 from cprl.envs.unwrap import agent_names, commons_of
 from cprl.experiment import Experiment
+from cprl.finite import summary
 from cprl.measuring.episodes import Episode
 from cprl.measuring.evaluate import evaluate
 from cprl.output import ERR, OUT, console
 from cprl.process import prepare_process
-from cprl.runs.checkpoints import Checkpointer
+from cprl.runs.checkpoints import FOLDER, Checkpointer, checkpoints_in
 from cprl.runs.directory import (
     changed_circumstances,
     read_recipe,
     refuse_another_run,
     resume_command,
     start_run,
+    write_on_nan,
 )
 from cprl.runs.episodes import EpisodeTable
 from cprl.runs.extension import REPORT, extend, refuse_to_extend
@@ -108,8 +110,9 @@ def run(
     for logger in experiment.loggers:
         check_logger(logger.resolve() if isinstance(logger, Custom) else logger)
     prepare_process(experiment.seed)
-    own = _make(experiment, allow)
     out = None if out is None else Path(out)
+    is_begun = resume and out is not None and bool(checkpoints_in(out / FOLDER))
+    own = _make(experiment, allow, starts=not is_begun)
     is_there = False
     episodes = refuse_another_run(out, experiment.to_recipe) if resume else experiment.episodes
     if resume and out is not None:
@@ -134,6 +137,7 @@ def run(
         with checkpointer:
             if resume:
                 _say_what_changed(directory)
+                write_on_nan(directory, experiment.on_nan)
             if episodes < experiment.episodes:
                 extend(directory, episodes, experiment.episodes)
             training = _train(directory, experiment, own, watch=watch, checkpointer=checkpointer, began=began)
@@ -178,13 +182,15 @@ def _finish(directory: Path, experiment: Experiment, own: _Made, training: Train
         _write_episodes(directory, f"evaluation/{name}.parquet", of_policy, experiment.evaluation_episodes)
     title = _title(experiment)
     figure = training_curve(directory, title=title, random=played["random"])
+    broken = training.finite.found
     report = {"training_s": round(training.spent_s, 1), "steps": training.steps, "finished": _now()}
-    write_json(directory / REPORT, {**report, "episodes": experiment.episodes})
+    also = {"not_finite": [asdict(one) for one in broken]} if broken else {}
+    write_json(directory / REPORT, {**report, "episodes": experiment.episodes, **also})
     columns = {"random": played["random"], f"trained{_epsilon(own.population)}": played["trained"]}
-    summarise(directory, title=title, played=columns, figure=figure)
+    summarise(directory, title=title, played=columns, figure=figure, note=summary(broken))
 
 
-def _make(experiment: Experiment, allow: Sequence[str]) -> _Made:
+def _make(experiment: Experiment, allow: Sequence[str], *, starts: bool = True) -> _Made:
     make = partial(
         make_env,
         experiment.game,
@@ -197,7 +203,12 @@ def _make(experiment: Experiment, allow: Sequence[str]) -> _Made:
     if commons_of(env) is None or experiment.transforms:
         check_restorable(make)
     population = Population(
-        env, experiment.agents, seed=experiment.seed, engine=experiment.engine, allow=allow
+        env,
+        experiment.agents,
+        seed=experiment.seed,
+        engine=experiment.engine,
+        allow=allow,
+        starts=starts,
     )
     with torch.random.fork_rng(devices=[]):
         _fresh_env(experiment)  # what the evaluation cannot have is refused now, not after hours
@@ -231,6 +242,7 @@ def _train(
             callbacks=[began, table, stack.enter_context(bar), *shown, *loggers, *own.callbacks],
             checkpointer=checkpointer,
             update_every=experiment.update_every,
+            on_nan=experiment.on_nan,
         )
         save_weights(directory, own.population.networks())
         save_transforms(directory, transforms_state(own.env))

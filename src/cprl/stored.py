@@ -18,6 +18,7 @@ from cprl.envs.state import load_transforms_state
 from cprl.experiment import Experiment
 from cprl.learners.lanes import EVALUATION, lane_name, lane_seeds
 from cprl.networks.agent import acting_part
+from cprl.networks.finite import all_finite
 from cprl.networks.stacked import stack_lanes
 from cprl.policies.assignment import AgentIndices, AgentPolicies
 from cprl.policies.lanes import LaneActor
@@ -105,7 +106,8 @@ class LoadedRun:
         if isinstance(spec, Frozen):
             if spec.run not in self._earlier:
                 self._earlier[spec.run] = load(spec.run, allow=self.allow)
-            return self._earlier[spec.run].agent(spec.agent, replica=spec.replica)
+            theirs = replica if spec.replica is None else spec.replica
+            return self._earlier[spec.run].agent(spec.agent, replica=theirs)
         lane = lane_name(replica, agent)
         if lane not in self.networks:
             raise ValueError(f"{self.path} keeps no network of {lane}; kept are {sorted(self.networks)}")
@@ -298,4 +300,4 @@ def _networks(path: Path, weights: Any, run: LoadedRun) -> dict[str, nn.Module]:
 
 
 def _is_finite(network: nn.Module) -> bool:
-    return all(bool(value.isfinite().all()) for value in network.state_dict().values())
+    return all_finite(network.state_dict().values())

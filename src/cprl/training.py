@@ -15,9 +15,10 @@ from cprl.collectors import StepCollector
 from cprl.envs.make_env import check_env, spaces_of
 from cprl.envs.state import carried_state, env_state, load_carried, load_env_state
 from cprl.envs.unwrap import commons_of
-from cprl.learners.base import LaneLosses, Learner
+from cprl.finite import FiniteCheck, OnNan
+from cprl.learners.base import LaneLosses, Learner, check_agents, check_numbers, learned_in
 from cprl.measuring.episodes import Episode, EpisodeTracker
-from cprl.policies.assignment import AgentIndices, AgentPolicies, agent_indices
+from cprl.policies.assignment import AgentIndices, AgentPolicies
 
 MakeCollector = Callable[[EnvBase, nn.Module], BaseCollector]
 """A collector out of an environment and a policy; it yields batches [R], or [R, T] of T turns."""
@@ -40,6 +41,8 @@ class Training:
         callbacks: called after each turn and each episode, in this order; see `Callback`.
         update_every: steps k after which each learner updates, then k times.
         make_collector: `StepCollector`, or for TorchRL's own `cprl.collectors.stock_collector`.
+        on_nan: whether the training stops where a loss, weight, reward or observation is not finite, see
+            `cprl.finite`.
 
     Raises:
         ValueError: for agents without a learner or actor, or with two; another number of worlds than the
@@ -56,14 +59,15 @@ class Training:
         callbacks: Sequence[Any] = (),
         update_every: int = 1,
         make_collector: MakeCollector = StepCollector,
+        on_nan: OnNan = "stop",
     ) -> None:
         replicas, spaces = env.batch_size.numel(), spaces_of(env)
         check_env(env, replicas)
         self.env, self.episodes, self.callbacks = env, episodes, list(callbacks)
         self.update_every = update_every
         self.learners, self.others = dict(learners), dict(others or {})
-        _check_agents(spaces.agents, replicas, self.learners, self.others)
-        _check_numbers(episodes, update_every, self.learners)
+        check_agents(spaces.agents, replicas, self.learners, self.others)
+        check_numbers(episodes, update_every, self.learners)
         check_callbacks(callbacks)
         actors: dict[AgentIndices, nn.Module] = {
             agents: learner.actor for agents, learner in self.learners.items()
@@ -74,6 +78,7 @@ class Training:
         longest = None if commons is None else commons.game.rules.episode_steps
         self._tracker = EpisodeTracker(replicas, spaces.agents, longest)
         self._losses = {agents: LaneLosses(replicas, agents) for agents in self.learners}
+        self.finite = FiniteCheck(self.learners, spaces, on_nan=on_nan)
         self._on_step = [own.on_step for own in self.callbacks if hasattr(own, "on_step")]
         self._played = [0] * replicas
         self.steps = 0
@@ -83,6 +88,11 @@ class Training:
     def is_over(self) -> bool:
         """Whether every replica has played its episodes."""
         return min(self._played) >= self.episodes
+
+    @property
+    def is_sound(self) -> bool:
+        """Whether everything was finite so far; with `on_nan` "stop" a training that goes on always is."""
+        return not self.finite.found
 
     @property
     def is_ending(self) -> bool:
@@ -109,23 +119,33 @@ class Training:
     def _take(self, batch: TensorDictBase) -> None:
         """One turn of every replica."""
         self.steps += 1
+        self.finite.check_turn(batch, self.steps)
         for learner in self.learners.values():
             learner.store(batch)
         if self.steps % self.update_every == 0:
             for _ in range(self.update_every):
                 for agents, learner in self.learners.items():
-                    self._losses[agents].add(learner.update())
+                    self._losses[agents].add(self._update(learner))
+            self.finite.check_losses(self._losses, self.steps)
         for on_step in self._on_step:
             on_step(batch)
         ended = self._tracker.add(batch)
         if ended:
             self._end(ended, batch)
 
+    def _update(self, learner: Learner) -> Tensor | None:
+        try:
+            return learner.update()
+        except (RuntimeError, ValueError):  # some losses refuse NaN in words of their own
+            self.finite.check_weights(self.steps)
+            raise
+
     def _end(self, ended: Sequence[Episode], batch: TensorDictBase) -> None:
+        self.finite.check_weights(self.steps)
         worlds = torch.zeros(len(self._played), dtype=torch.bool)
         worlds[[episode.world for episode in ended]] = True
         values = {agents: learner.values(batch) for agents, learner in self.learners.items()}
-        learning = [_learning(episode.world, self.learners, self._losses, values) for episode in ended]
+        learning = [learned_in(episode.world, self.learners, self._losses, values) for episode in ended]
         for learner in self.learners.values():
             learner.end_episode(worlds)
         for episode, of_agents in zip(ended, learning, strict=True):
@@ -140,8 +160,11 @@ class Training:
 
         Raises:
             ValueError: where the collector has no state to resume from.
+            NotFiniteError: where weights are not finite, unless `on_nan` is "continue".
         """
         carried = self._step_collector().carried
+        self.finite.check_weights(self.steps)
+        self.finite.saved_step = self.steps
         return {
             "format": STATE_FORMAT,
             "steps": self.steps,
@@ -154,6 +177,7 @@ class Training:
             "losses": [losses.state_dict() for losses in self._losses.values()],
             "tracker": self._tracker.state_dict(),
             "callbacks": {name: own.state_dict() for name, own in self._with_state().items()},
+            "not_finite": self.finite.state_dict(),
             "torch": torch.get_rng_state(),
         }
 
@@ -196,6 +220,7 @@ class Training:
             for part, own in zip(of_agents.values(), state[name], strict=True):
                 part.load_state_dict(own)
         self._tracker.load_state_dict(state["tracker"])
+        self.finite.load_state_dict(state.get("not_finite", ()), step=self.steps)
         for name, callback in self._with_state().items():
             if name in state["callbacks"]:  # a viewer may be added or left out from now on
                 callback.load_state_dict(state["callbacks"][name])
@@ -218,6 +243,7 @@ def train(
     checkpointer: SavesTraining | None = None,
     update_every: int = 1,
     make_collector: MakeCollector = StepCollector,
+    on_nan: OnNan = "stop",
 ) -> Training:
     """Plays so many episodes of every replica; each learner stores every turn and then updates.
 
@@ -230,12 +256,14 @@ def train(
         checkpointer: where the training resumes from, and saves its state now and then.
         update_every: steps k after which each learner updates, then k times.
         make_collector: what plays.
+        on_nan: "stop" or "continue".
 
     Returns:
         The training, which is over.
 
     Raises:
         ValueError: see `Training`; with a checkpointer also for what has no state to resume from.
+        NotFiniteError: where a number is not finite, before a checkpoint holds it; see `cprl.finite`.
     """
     training = Training(
         env,
@@ -245,6 +273,7 @@ def train(
         callbacks=callbacks,
         update_every=update_every,
         make_collector=make_collector,
+        on_nan=on_nan,
     )
     if checkpointer is not None:
         training.state_dict()  # what cannot be saved is refused now, not when the first checkpoint is due
@@ -255,50 +284,3 @@ def train(
         if checkpointer is not None:
             checkpointer.after_step(training)
     return training
-
-
-def _learning(
-    replica: int,
-    learners: Mapping[tuple[int, ...], Learner],
-    losses: Mapping[tuple[int, ...], LaneLosses],
-    values: Mapping[tuple[int, ...], Tensor],
-) -> dict[str, float]:
-    """What was learned in the episode of a replica that has just ended."""
-    learning = {}
-    for agents, learner in learners.items():
-        for place, (agent, loss) in enumerate(losses[agents].take(replica).items()):
-            learning[f"agent_{agent}/loss"] = loss
-            learning[f"agent_{agent}/epsilon"] = learner.actor.epsilon
-            learning[f"agent_{agent}/q"] = float(values[agents][replica, place])
-    return learning
-
-
-def _check_agents(
-    agents: int,
-    replicas: int,
-    learners: Mapping[tuple[int, ...], Learner],
-    others: Mapping[AgentIndices, nn.Module],
-) -> None:
-    taken = sorted(agent for indices in [*learners, *others] for agent in agent_indices(indices))
-    if taken != (wanted := list(range(agents))):
-        raise ValueError(
-            f"learners and others control the agents {taken}; allowed: each of {wanted} exactly once"
-        )
-    for indices, learner in learners.items():
-        if learner.agents != agent_indices(indices):
-            raise ValueError(f"a learner made for the agents {learner.agents} is given for {indices}")
-        if learner.replicas != replicas:
-            raise ValueError(
-                f"the environment has {replicas} worlds; the learner of {indices} has {learner.replicas} "
-                "replicas; allowed: a world for each replica"
-            )
-
-
-def _check_numbers(episodes: int, update_every: int, learners: Mapping[tuple[int, ...], Learner]) -> None:
-    for name, number in (("episodes", episodes), ("update_every", update_every)):
-        if number < 1:
-            raise ValueError(f"{name} is {number}; allowed: an integer >= 1")
-    for learner in learners.values():
-        steps = getattr(learner, "rollout_steps", update_every)
-        if steps % update_every:
-            raise ValueError(f"update_every is {update_every}; allowed: a divisor of rollout_steps {steps}")

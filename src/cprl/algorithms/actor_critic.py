@@ -3,7 +3,6 @@
 from dataclasses import dataclass
 from typing import ClassVar
 
-import torch
 from tensordict.nn import ProbabilisticTensorDictSequential, TensorDictModule
 from torch import nn
 from torchrl.modules import ProbabilisticActor
@@ -11,6 +10,7 @@ from torchrl.objectives import DiscreteIQLLoss, DiscreteSACLoss, LossModule, Val
 
 from cprl.algorithms.base import OffPolicy
 from cprl.algorithms.dqn import network_of
+from cprl.compat import LaneCategorical
 from cprl.custom import Custom
 from cprl.learners.settings import DQNSettings
 from cprl.networks.agent import AgentNetworks
@@ -112,7 +112,7 @@ def policy(network: nn.Module) -> ProbabilisticTensorDictSequential:
         TensorDictModule(network, ["observation"], ["logits"]),
         in_keys=["logits"],
         out_keys=["action"],
-        distribution_class=torch.distributions.Categorical,
+        distribution_class=LaneCategorical,
         return_log_prob=True,
     )
 

@@ -9,6 +9,8 @@ import torch
 from tensordict import TensorDictBase
 from torch import Tensor, nn
 
+from cprl.policies.assignment import AgentIndices, agent_indices
+
 
 class Learner(Protocol):
     """Learns for S agents of each of R replicas; `ReplayLearner` is one."""
@@ -33,6 +35,10 @@ class Learner(Protocol):
 
     def values(self, batch: TensorDictBase) -> Tensor:
         """Each agent's estimate of the value of the state after the turn, [R, S]; for display only."""
+
+    def finite(self) -> Tensor:
+        """Whether everything that the learner keeps of each agent is finite, above all weights and targets,
+        bool [R, S]; called at the end of episodes and before the state is saved."""
 
     def evaluation_actor(self, worlds: int) -> Any:
         """An actor with the current weights and the exploration of evaluation, for `worlds` worlds of each
@@ -81,3 +87,52 @@ class LaneLosses:
     def load_state_dict(self, state: Mapping[str, Tensor]) -> None:
         """Continues from the sums of a state."""
         self.total[:], self.updates[:] = state["total"].numpy(), state["updates"].numpy()
+
+
+def learned_in(
+    replica: int,
+    learners: Mapping[tuple[int, ...], Learner],
+    losses: Mapping[tuple[int, ...], LaneLosses],
+    values: Mapping[tuple[int, ...], Tensor],
+) -> dict[str, float]:
+    """What was learned in the episode of a replica that has just ended."""
+    learning = {}
+    for agents, learner in learners.items():
+        for place, (agent, loss) in enumerate(losses[agents].take(replica).items()):
+            learning[f"agent_{agent}/loss"] = loss
+            learning[f"agent_{agent}/epsilon"] = learner.actor.epsilon
+            learning[f"agent_{agent}/q"] = float(values[agents][replica, place])
+    return learning
+
+
+def check_agents(
+    agents: int,
+    replicas: int,
+    learners: Mapping[tuple[int, ...], Learner],
+    others: Mapping[AgentIndices, nn.Module],
+) -> None:
+    """Raises a ValueError unless each of N agents has one learner or actor, with R replicas."""
+    taken = sorted(agent for indices in [*learners, *others] for agent in agent_indices(indices))
+    if taken != (wanted := list(range(agents))):
+        raise ValueError(
+            f"learners and others control the agents {taken}; allowed: each of {wanted} exactly once"
+        )
+    for indices, learner in learners.items():
+        if learner.agents != agent_indices(indices):
+            raise ValueError(f"a learner made for the agents {learner.agents} is given for {indices}")
+        if learner.replicas != replicas:
+            raise ValueError(
+                f"the environment has {replicas} worlds; the learner of {indices} has {learner.replicas} "
+                "replicas; allowed: a world for each replica"
+            )
+
+
+def check_numbers(episodes: int, update_every: int, learners: Mapping[tuple[int, ...], Learner]) -> None:
+    """Raises a ValueError for numbers below 1, and for rollouts that `update_every` does not divide."""
+    for name, number in (("episodes", episodes), ("update_every", update_every)):
+        if number < 1:
+            raise ValueError(f"{name} is {number}; allowed: an integer >= 1")
+    for learner in learners.values():
+        steps = getattr(learner, "rollout_steps", update_every)
+        if steps % update_every:
+            raise ValueError(f"update_every is {update_every}; allowed: a divisor of rollout_steps {steps}")

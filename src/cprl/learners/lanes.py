@@ -1,7 +1,7 @@
 """Lanes: the agents that a learner trains in every replica, with their seeds, networks and actors."""
 
-from collections.abc import Callable, Sequence
-from typing import Final, Protocol
+from collections.abc import Callable, Mapping, Sequence
+from typing import Final, Protocol, TypeAlias
 
 import numpy as np
 import torch
@@ -18,6 +18,9 @@ from cprl.spaces import Spaces
 
 WEIGHTS, TARGET_WEIGHTS, EXPLORATION, SAMPLING, EVALUATION = range(5)
 """The purposes of a lane's random numbers; each has its own seed."""
+
+StartFrom: TypeAlias = Mapping[str, Mapping[str, Tensor]]
+"""The state dict of the acting network with which each lane starts, by the lane's name."""
 
 _LARGEST_SEED: Final = 2**63 - 1
 
@@ -61,6 +64,7 @@ class Lanes:
         make_network: makes the networks of one agent. It draws weights from torch's generator, which is
             seeded for each lane.
         stochastic: whether the network outputs the logits of a policy from which actions are sampled.
+        start_from: the weights with which the acting networks of lanes start, see `StartFrom`.
 
     Raises:
         ValueError: if agents observe entries that networks do not read.
@@ -76,11 +80,13 @@ class Lanes:
         first_replica: int,
         make_network: Callable[[], nn.Module],
         stochastic: bool,
+        start_from: StartFrom | None = None,
     ) -> None:
         refuse_unseen(spaces)
         self.spaces, self.agents, self.replicas, self.seed = spaces, tuple(agents), replicas, seed
         self._numbers = range(first_replica, first_replica + replicas)
         self.make_network, self.stochastic = make_network, stochastic
+        self._start_from = start_from or {}
 
     def __len__(self) -> int:
         return self.replicas * len(self.agents)
@@ -126,15 +132,19 @@ class Lanes:
         return lane_seeds(self.seed, replicas=self._numbers, agents=self.agents, purpose=purpose)
 
     def new_networks(self, purpose: int, device: str | torch.device) -> list[nn.Module]:
-        """New networks for each lane.
+        """New networks for each lane; the acting ones with the weights to start from, if there are any.
 
         Raises:
             TooLargeError: if the device has less memory than training all of them takes.
         """
         first, *others = self.seeds(purpose)
-        made = [init_network(self.make_network, first).to(device)]
-        check_networks(made[0], len(self), device)
-        return made + [init_network(self.make_network, own).to(device) for own in others]
+        networks = [init_network(self.make_network, first)]
+        check_networks(networks[0], len(self), device)
+        networks += [init_network(self.make_network, own) for own in others]
+        for name, network in zip(self.names, networks, strict=True):
+            if name in self._start_from:
+                acting_part(network).load_state_dict(self._start_from[name])
+        return [network.to(device) for network in networks]
 
     def actor(self, engine: Acts, *, compile: bool) -> LaneActor:
         """The actor of training: the current weights, and random numbers of its own for each lane."""

@@ -16,7 +16,7 @@ from cprl.learners.engine.base import Engine
 from cprl.learners.engine.choice import TRIAL_LANES, EngineName, make_engine, trial_batch
 from cprl.learners.engine.functional import MakeLoss
 from cprl.learners.engine.refusals import refuse_for_replay
-from cprl.learners.lanes import SAMPLING, TARGET_WEIGHTS, WEIGHTS
+from cprl.learners.lanes import SAMPLING, TARGET_WEIGHTS, WEIGHTS, StartFrom
 from cprl.learners.settings import DQNSettings
 from cprl.learners.single import dqn_loss, q_network
 from cprl.learners.teams import MakeTeam, lanes_of
@@ -49,6 +49,8 @@ class ReplayLearner:
         reward_kind: which reward they get.
         engine: how lanes are updated; None picks the fastest that works, see `cprl.learners.engine.choice`.
         compile: whether torch compiles acting and the update; the engine "list" is never compiled.
+        start_from: the weights with which acting networks, and their targets, start, by the lane's name; the
+            others, such as critics, are new.
         device: the torch device of networks, buffers and updates.
 
     Raises:
@@ -72,6 +74,7 @@ class ReplayLearner:
         reward_kind: RewardKind = "individual",
         engine: EngineName | None = None,
         compile: bool = True,
+        start_from: StartFrom | None = None,
         device: str | torch.device = "cpu",
     ) -> None:
         _refuse_unshared_reward(is_team=make_team is not None, reward_kind=reward_kind)
@@ -87,6 +90,7 @@ class ReplayLearner:
             make_network=make_network or partial(_default_network, spaces, settings),
             make_team=make_team,
             stochastic=stochastic,
+            start_from=start_from,
         )
         make_loss = make_loss or partial(dqn_loss, gamma=settings.gamma)
         self._shapes: dict[str, Any] = {
@@ -175,6 +179,10 @@ class ReplayLearner:
         due = ended & (self._episodes % self.settings.target_every_episodes == 0)
         if due.any():
             self.engine.copy_to_targets(due.repeat_interleave(self._lanes.of_replica))
+
+    def finite(self) -> Tensor:
+        """Whether the weights, targets and optimiser state of each agent are finite, bool [R, S]."""
+        return self._lanes.by_agent(self.engine.finite())
 
     def values(self, batch: TensorDictBase) -> Tensor:
         """The highest action value of each agent at the end of a turn, [R, S]; NaN where its network

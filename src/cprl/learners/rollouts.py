@@ -13,10 +13,10 @@ from torchrl.objectives.value.functional import generalized_advantage_estimate
 from cprl.learners.buffer.storage import torch_dtype
 from cprl.learners.checks import check_learner, check_rollouts
 from cprl.learners.engine.base import Engine
-from cprl.learners.engine.choice import TRIAL_LANES, EngineName, make_engine, trial_batch
+from cprl.learners.engine.choice import TRIAL_LANES, EngineName, make_engine, trial_batch, trial_rollout
 from cprl.learners.engine.functional import MakeLoss
 from cprl.learners.engine.refusals import reads, refuse_other_advantages
-from cprl.learners.lanes import SAMPLING, WEIGHTS
+from cprl.learners.lanes import SAMPLING, WEIGHTS, StartFrom
 from cprl.learners.settings import RolloutSettings
 from cprl.learners.teams import MakeTeam, lanes_of
 from cprl.learners.transitions import RewardKind
@@ -51,6 +51,8 @@ class RolloutLearner:
         reward_kind: which reward they get.
         engine: how lanes are updated; None picks the fastest that works, see `cprl.learners.engine.choice`.
         compile: whether torch compiles acting and the update; the engine "list" is never compiled.
+        start_from: the weights with which acting networks, and their targets, start, by the lane's name; the
+            others, such as critics, are new.
         device: the torch device of networks, buffers and updates.
 
     Raises:
@@ -73,6 +75,7 @@ class RolloutLearner:
         reward_kind: RewardKind = "individual",
         engine: EngineName | None = None,
         compile: bool = True,
+        start_from: StartFrom | None = None,
         device: str | torch.device = "cpu",
     ) -> None:
         check_learner(spaces, settings, RolloutSettings, agents, replicas, first_replica, seed, reward_kind)
@@ -87,6 +90,7 @@ class RolloutLearner:
             make_network=make_network,
             make_team=make_team,
             stochastic=True,
+            start_from=start_from,
         )
         self.engine = self._make_engine(engine, make_loss, compile=compile, device=device)
         self.actor = self._lanes.actor(self.engine, compile=compile)
@@ -239,6 +243,10 @@ class RolloutLearner:
     def end_episode(self, ended: Tensor) -> None:
         """Does nothing: a rollout continues into the next episode; advantages do not cross the boundary."""
 
+    def finite(self) -> Tensor:
+        """Whether the weights, targets and optimiser state of each agent are finite, bool [R, S]."""
+        return self._lanes.by_agent(self.engine.finite())
+
     def values(self, batch: TensorDictBase) -> Tensor:
         """The value that each agent's critic gives to the state after a turn, [R, S]."""
         with torch.no_grad():
@@ -282,17 +290,3 @@ def refuse_other_parts(network: nn.Module) -> None:
     parts = list(parts_of(network))
     if not isinstance(network, AgentNetworks) or parts[:2] != ["actor", "critic"]:
         raise ValueError(f'an agent has the networks {parts}; allowed: "actor" and "critic"')
-
-
-def trial_rollout(transitions: TensorDict, *, actions: int | None = None) -> TensorDict:
-    """A synthetic batch of a rollout, from synthetic transitions; with logits if a number of actions is
-    given."""
-    chance = torch.Generator().manual_seed(1)
-    batch = transitions.select("observation", "action")
-    device = batch["action"].device
-    for name in ("advantage", "value_target", "state_value"):
-        batch[name] = torch.rand((*batch["action"].shape, 1), generator=chance).to(device)
-    batch["action_log_prob"] = batch["advantage"].squeeze(-1) - 2.5
-    if actions is not None:
-        batch["logits"] = torch.rand((*batch["action"].shape, actions), generator=chance).to(device)
-    return batch

@@ -23,7 +23,7 @@ from torch import Tensor, nn
 
 from cprl import keys
 from cprl.learners.checks import check_learner
-from cprl.learners.lanes import EVALUATION, EXPLORATION, lane_names, lane_seeds
+from cprl.learners.lanes import EVALUATION, EXPLORATION, StartFrom, lane_names, lane_seeds
 from cprl.learners.settings import TabularSettings
 from cprl.learners.transitions import RewardKind, lane_turn
 from cprl.policies.tabular import NEVER_MET, QTables, TableNetwork, TabularActor, observed_entries, states_of
@@ -43,6 +43,7 @@ class TabularLearner:
         seed: the seed of the run.
         first_replica: the index of the first replica, so that replica r can be trained alone.
         reward_kind: which reward they get.
+        start_from: the tables with which lanes start, by the lane's name; each value counts as never updated.
 
     Raises:
         ValueError: for agents, replicas or a seed that there cannot be.
@@ -59,12 +60,16 @@ class TabularLearner:
         seed: int = 0,
         first_replica: int = 0,
         reward_kind: RewardKind = "individual",
+        start_from: StartFrom | None = None,
     ) -> None:
         check_learner(spaces, settings, TabularSettings, agents, replicas, first_replica, seed, reward_kind)
         self.spaces, self.settings, self.seed, self.agents = spaces, settings, seed, tuple(agents)
         self.reward_kind = reward_kind
         self.replicas, self._numbers = replicas, range(first_replica, first_replica + replicas)
         self.tables = QTables(self.lanes, spaces.actions, max_states=settings.max_states)
+        for lane, name in enumerate(lane_names(replicas=self._numbers, agents=self.agents)):
+            if start_from and name in start_from:
+                self.tables.add_lane(lane, *(start_from[name][own].numpy() for own in ("states", "values")))
         self.actor = self._actor(EXPLORATION, worlds=1)
         self.actor.epsilon = settings.epsilon(0)
         self.steps = 0
@@ -122,6 +127,13 @@ class TabularLearner:
 
     def end_episode(self, ended: Tensor) -> None:
         """Does nothing at the end of an episode."""
+
+    def finite(self) -> Tensor:
+        """Whether the values of each agent's table are finite, bool [R, S]."""
+        sound = np.ones(self.lanes, np.bool_)
+        if not np.isfinite(self.tables.values[: self.tables.size].sum()):
+            sound = np.array([np.isfinite(self.tables.of_lane(lane)[1]).all() for lane in self._every_lane])
+        return torch.from_numpy(sound).view(self.replicas, len(self.agents))
 
     def values(self, batch: TensorDictBase) -> Tensor:
         """The highest action value of each agent at the end of a turn, [R, S]."""

@@ -68,6 +68,15 @@ class QTables:
         own[state], self.size = self.size, self.size + 1
         return own[state]
 
+    def add_lane(self, lane: int, states: NDArray[np.uint8], values: NDArray[np.float64]) -> None:
+        """Adds n states, uint8 [n, bytes], with their values [n, A] to the table of a lane.
+
+        Raises:
+            MemoryError: If the lane would have more than `max_states` states.
+        """
+        rows = self.find_or_add([state.tobytes() for state in states], [lane] * len(states))
+        self.values[rows] = values
+
     def of_lane(self, lane: int) -> tuple[NDArray[np.uint8], NDArray[np.float64], NDArray[np.int64]]:
         """Copies of the n states that a lane has met, uint8 [n, bytes], their values and visits, [n, A]."""
         states, rows = list(self.rows[lane]), list(self.rows[lane].values())

@@ -92,6 +92,7 @@ class Checkpointer:
         self._has_ending = not keep_ending
         self._place: tuple[int, int] | None = None
         self._lock: RunLock | None = None
+        self._sound: Path | None = None
         self._usual: dict[int, Any] = {}
 
     def restore(self, training: HasState) -> None:
@@ -117,6 +118,7 @@ class Checkpointer:
                 self.console.print(f"Passed over: {reason}", soft_wrap=True)
             self.console.print(f"Resuming from step {training.steps:,}: {path}", soft_wrap=True)
             self._saved = time.monotonic()
+            self._sound = path if _is_sound(training) else None
             self._has_ending |= training.is_ending
             return
         if reasons:
@@ -140,7 +142,8 @@ class Checkpointer:
 
     def save(self, training: HasState, *, kind: str = "training") -> Path:
         """Writes a checkpoint atomically, and deletes all of its kind but the newest two, or the newest
-        "ending".
+        "ending". Of a training that goes on with agents whose weights are not finite, the last
+        checkpoint before is kept as "sound-<its name>" too.
 
         Raises:
             OSError: if it cannot be written, or somebody deleted the run; those before it are intact.
@@ -152,6 +155,15 @@ class Checkpointer:
             lambda file: torch.save(training.state_dict(), file),
             lambda partial: self.folder / f"{kind}-{training.steps:012d}-{checksum(partial)}.pt",
         )
+        if _is_sound(training):
+            self._sound = path
+        elif self._sound is not None and self._sound.exists():
+            kept = self._sound.with_name(f"sound-{self._sound.name}")
+            try:
+                os.link(self._sound, kept)
+            except OSError:  # a file system without hard links
+                self._sound.replace(kept)
+            self._sound = None
         same = [old for old in checkpoints_in(self.folder) if is_ending(old) == (kind == "ending")]
         for old in same[: -1 if kind == "ending" else -KEPT]:
             old.unlink()
@@ -214,6 +226,10 @@ class Checkpointer:
     def _stop_now(self) -> None:
         self.console.print(f"To resume: {self.resume_command}", soft_wrap=True, highlight=False)
         raise SystemExit(0)
+
+
+def _is_sound(training: HasState) -> bool:
+    return bool(getattr(training, "is_sound", True))
 
 
 def checkpoints_in(folder: Path) -> list[Path]:

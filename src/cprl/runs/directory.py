@@ -68,7 +68,8 @@ def start_run(
 
 
 def refuse_another_run(out: Path | None, to_recipe: Callable[[Path], Mapping[str, Any]]) -> int:
-    """Refuses to resume what was not begun with the same recipe; only the number of episodes may grow.
+    """Refuses to resume what was not begun with the same recipe; only the number of episodes may grow,
+    and `on_nan` be another.
 
     Args:
         out: the directory of the stopped run.
@@ -92,7 +93,8 @@ def refuse_another_run(out: Path | None, to_recipe: Callable[[Path], Mapping[str
             "still be loaded and evaluated"
         )
     before, asked = kept["experiment"], now["experiment"]
-    differ = differences({**before, "episodes": 0}, {**asked, "episodes": 0}, "experiment")
+    free = {"episodes": 0, "on_nan": ""}
+    differ = differences({**before, **free}, {**asked, **free}, "experiment")
     if differ:
         more = f"; and {len(differ) - _NAMED} more" if len(differ) > _NAMED else ""
         raise ValueError(f"{out} was started with another recipe: {'; '.join(differ[:_NAMED])}{more}")
@@ -112,6 +114,14 @@ def write_more_episodes(run: Path, episodes: int) -> None:
     recipe["experiment"]["episodes"] = episodes
     recipe["extended"] = [*recipe.get("extended", []), earlier]
     write_json(run / FILE_NAME, recipe)
+
+
+def write_on_nan(run: Path, on_nan: str) -> None:
+    """Writes into a run's recipe what now happens where a number is not finite."""
+    recipe = read_recipe(run)
+    if recipe["experiment"].get("on_nan") != on_nan:
+        recipe["experiment"]["on_nan"] = on_nan
+        write_json(run / FILE_NAME, recipe)
 
 
 def changed_circumstances(run: Path) -> list[str]:

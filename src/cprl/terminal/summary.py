@@ -33,6 +33,7 @@ def summarise(
     title: str,
     played: Mapping[str, list[Episode]],
     figure: Path | None = None,
+    note: str | None = None,
     console: Console | None = None,
 ) -> None:
     """Prints a table that compares policies, the metrics that are left out, and the files of the run.
@@ -42,10 +43,13 @@ def summarise(
         title: what was run, with its schedule.
         played: episodes in fresh worlds by the name of the policy; the first policy is the baseline.
         figure: the training curve.
+        note: a sentence below the table.
         console: the console; by default standard output.
     """
     console = console or safe_console()
     console.print(_table(title, played))
+    if note:
+        console.print(note, soft_wrap=True, highlight=False)
     missing = left_out(next(iter(played.values()))[0].reported)
     if missing:
         console.print(missing, soft_wrap=True)

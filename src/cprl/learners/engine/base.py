@@ -19,6 +19,7 @@ from cprl.learners.engine.functional import MakeLoss, Weights, own_targets, targ
 from cprl.learners.engine.optimizers import torch_optimizer
 from cprl.learners.settings import Optimizer
 from cprl.networks.agent import parts_of
+from cprl.networks.finite import all_finite
 
 
 class Engine(Protocol):
@@ -46,6 +47,9 @@ class Engine(Protocol):
 
     def weights(self, lane: int) -> Weights:
         """Copies of all weights of one lane, including targets, by their names in the loss."""
+
+    def finite(self) -> Tensor:
+        """Whether the weights, targets and optimiser state of each lane are finite, bool [L] on the CPU."""
 
     def state_dict(self) -> dict[str, Any]:
         """The full state except the buffer; the tensors themselves, not copies."""
@@ -136,6 +140,11 @@ class ListEngine:
         """See `Engine`."""
         return weights_of(self.losses[lane])
 
+    def finite(self) -> Tensor:
+        """See `Engine`."""
+        pairs = zip(self.losses, self._optimizers, strict=True)
+        return torch.tensor([is_finite(loss, optimizer) for loss, optimizer in pairs])
+
     def state_dict(self) -> dict[str, Any]:
         """See `Engine`."""
         return {
@@ -149,6 +158,13 @@ class ListEngine:
             loss.load_state_dict(own)
         for optimizer, own in zip(self._optimizers, state["adams"], strict=True):
             optimizer.load_state_dict(own)
+
+
+def is_finite(loss: LossModule, optimizer: torch.optim.Optimizer) -> bool:
+    """Whether all weights of a loss, including targets, and its optimiser's state are finite."""
+    kept = [value for state in optimizer.state.values() for value in state.values()]
+    weights: list[Any] = list(loss.state_dict().values())
+    return all_finite(value for value in (*weights, *kept) if isinstance(value, Tensor))
 
 
 def _with_targets(loss: LossModule) -> list[tuple[TensorDictParams, TensorDictParams]]:

@@ -174,6 +174,20 @@ def trial_batch(
     return batch
 
 
+def trial_rollout(transitions: TensorDict, *, actions: int | None = None) -> TensorDict:
+    """A synthetic batch of a rollout, from synthetic transitions; with logits if a number of actions is
+    given."""
+    chance = torch.Generator().manual_seed(1)
+    batch = transitions.select("observation", "action")
+    device = batch["action"].device
+    for name in ("advantage", "value_target", "state_value"):
+        batch[name] = torch.rand((*batch["action"].shape, 1), generator=chance).to(device)
+    batch["action_log_prob"] = batch["advantage"].squeeze(-1) - 2.5
+    if actions is not None:
+        batch["logits"] = torch.rand((*batch["action"].shape, actions), generator=chance).to(device)
+    return batch
+
+
 def _make(
     name: EngineName, networks: Sequence[nn.Module], make_loss: MakeLoss, *, compile: bool, **how: Any
 ) -> Engine:

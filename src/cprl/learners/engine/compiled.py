@@ -13,9 +13,10 @@ from cprl.learners.buffer.gather import FIELDS, Horizon, gather
 from cprl.learners.buffer.sampler import LaneBuffer
 from cprl.learners.buffer.storage import LaneStorage
 from cprl.learners.engine.functional import FunctionalLoss, MakeLoss, Weights, stacked
-from cprl.learners.engine.optimizers import BETA_1, BETA_2, WITH_MEAN, WITH_SQUARE, change_weights
+from cprl.learners.engine.optimizers import BETA_1, BETA_2, WITH_MEAN, WITH_SQUARE, change_weights, shortened
 from cprl.learners.settings import Optimizer
 from cprl.networks.agent import parts_of
+from cprl.networks.finite import finite_lanes
 from cprl.networks.stacked import lane_state, stack_lanes
 
 
@@ -249,6 +250,11 @@ class FunctionalEngine:
             for name, value in everything.items()
         }
 
+    def finite(self) -> Tensor:
+        """See `Engine`."""
+        lanes, every = len(self._tensors[0][0]), [value for group in self._tensors for value in group]
+        return finite_lanes([value for value in every if value.ndim and len(value) == lanes])
+
     def state_dict(self) -> dict[str, Any]:
         """See `Engine`."""
         return {
@@ -270,14 +276,6 @@ class FunctionalEngine:
             for name, tensor in tensors.items():
                 tensor.copy_(state[group][name])
         self.steps = int(state["steps"])
-
-
-def shortened(gradients: Sequence[Tensor], longest: float) -> list[Tensor]:
-    """Gradients [L, ...] of all weights, scaled down for lanes whose gradient norm exceeds `longest`."""
-    squares = [slope.reshape(len(slope), -1).square().sum(1) for slope in gradients]
-    norms = torch.stack(squares).sum(0).sqrt()
-    scales = (longest / (norms + 1e-6)).clamp(max=1.0)
-    return [slope * scales.reshape(-1, *[1] * (slope.ndim - 1)) for slope in gradients]
 
 
 def _source(name: str) -> str:

@@ -73,3 +73,11 @@ def change_weights(
     else:
         for weight, slope in zip(weights, gradients, strict=True):
             weight.sub_(slope, alpha=learning_rate)
+
+
+def shortened(gradients: Sequence[Tensor], longest: float) -> list[Tensor]:
+    """Gradients [L, ...] of all weights, scaled down for lanes whose gradient norm exceeds `longest`."""
+    squares = [slope.reshape(len(slope), -1).square().sum(1) for slope in gradients]
+    norms = torch.stack(squares).sum(0).sqrt()
+    scales = (longest / (norms + 1e-6)).clamp(max=1.0)
+    return [slope * scales.reshape(-1, *[1] * (slope.ndim - 1)) for slope in gradients]

@@ -9,6 +9,7 @@ from tensordict import TensorDict, TensorDictBase
 from torch import Tensor, nn
 from torchrl.data.replay_buffers import Sampler
 
+from cprl.learners.engine.base import is_finite
 from cprl.learners.engine.functional import MakeLoss, own_targets, total
 from cprl.learners.lanes import SAMPLING, WEIGHTS, Lanes
 from cprl.learners.settings import Optimizer
@@ -134,6 +135,10 @@ class StockAgents:
         """The outputs of the current networks: [L, k, *shape] to [L, k, ...]; part 0 acts."""
         pairs = zip(self.each, observation, strict=True)
         return torch.stack([agent.parts[part](seen) for agent, seen in pairs])
+
+    def finite(self) -> Tensor:
+        """Whether the weights, targets and optimiser state of each agent are finite, bool [L]."""
+        return torch.tensor([is_finite(agent.loss, agent.optimizer) for agent in self.each])
 
     def network_state(self, lane: int) -> dict[str, Tensor]:
         """Copies of the current weights of one agent, as the state dict of its acting network."""

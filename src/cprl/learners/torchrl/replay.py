@@ -10,15 +10,18 @@ from torch import Tensor, nn
 from torchrl.data import LazyTensorStorage, TensorDictReplayBuffer
 from torchrl.data.replay_buffers import RandomSampler
 from torchrl.envs.transforms import MultiStepTransform, UnsqueezeTransform
-from torchrl.objectives import HardUpdate, IQLLoss, LossModule, SoftUpdate
+from torchrl.objectives import HardUpdate, LossModule, SoftUpdate
 from torchrl.objectives.utils import TargetNetUpdater
 
 from cprl.custom import made
+from cprl.learners.buffer.gather import Horizon
+from cprl.learners.buffer.sampler import transformed
 from cprl.learners.buffer.storage import torch_dtype
 from cprl.learners.checks import check_learner
+from cprl.learners.engine.choice import trial_batch
 from cprl.learners.engine.functional import MakeLoss, targets_of
-from cprl.learners.engine.refusals import refuse_on_policy
-from cprl.learners.lanes import TARGET_WEIGHTS, Lanes
+from cprl.learners.engine.refusals import refuse_for_replay
+from cprl.learners.lanes import TARGET_WEIGHTS, Lanes, StartFrom
 from cprl.learners.settings import DQNSettings
 from cprl.learners.torchrl.agents import MakeSampler, StockAgents
 from cprl.learners.torchrl.buffers import buffer_state, load_buffer, nested, plain
@@ -53,11 +56,14 @@ class TorchRLReplayLearner:
         stochastic: whether networks output the logits of a policy; else action values.
         reward_kind: which reward they get.
         make_sampler: makes an agent's sampler; by default a `RandomSampler`.
+        start_from: the weights with which acting networks, and their targets, start, by the lane's name; the
+            others, such as critics, are new.
         device: the torch device of networks, buffers and updates.
 
     Raises:
         ValueError: for a loss that needs the latest steps of the current policy, for settings below their
-            minimum, and for settings that the loss ignores: those of targets if it has none, and `n_steps`.
+            minimum, and for settings that the loss ignores or contradicts: those of targets if it has none,
+            `n_steps`, and with it another gamma.
         TooLargeError: if the device has less memory than the buffers need; raised before allocation.
     """
 
@@ -75,6 +81,7 @@ class TorchRLReplayLearner:
         stochastic: bool = False,
         reward_kind: RewardKind = "individual",
         make_sampler: MakeSampler | None = None,
+        start_from: StartFrom | None = None,
         device: str | torch.device = "cpu",
     ) -> None:
         check_learner(spaces, settings, DQNSettings, agents, replicas, first_replica, seed, reward_kind)
@@ -89,10 +96,12 @@ class TorchRLReplayLearner:
             first_replica=first_replica,
             make_network=make_network,
             stochastic=stochastic,
+            start_from=start_from,
         )
+        self._refuse_unfit(make_loss, device)
         self.stock = StockAgents(
             self._lanes,
-            lambda network: _off_policy(make_loss, network),
+            make_loss,
             optimizer=settings.optimizer,
             learning_rate=settings.learning_rate,
             eps=settings.adam_eps,
@@ -108,6 +117,21 @@ class TorchRLReplayLearner:
         self.actor = self._lanes.actor(self.stock, compile=False)
         self.steps = 0
         self.actor.epsilon = settings.epsilon(0)
+
+    def _refuse_unfit(self, make_loss: MakeLoss, device: str | torch.device) -> None:
+        """The checks of the fast engine, on a loss of its own and synthetic transitions of one agent."""
+        settings = self.settings
+        trial = trial_batch(
+            1,
+            self._lanes.observation_shape,
+            self.spaces.actions,
+            observation_dtype=self.spaces.observation_dtype,
+            horizon=Horizon(settings.n_steps, settings.gamma) if settings.n_steps > 1 else None,
+            device=device,
+        )
+        with torch.random.fork_rng(devices=[]):
+            loss = make_loss(self._lanes.make_network().to(device))
+        refuse_for_replay(loss, settings, transformed(trial, settings.replay_transforms)[0])
 
     def _init_targets(self, make_loss: MakeLoss) -> None:
         """Gives targets initial weights of their own; the updaters have made them copies."""
@@ -183,6 +207,10 @@ class TorchRLReplayLearner:
             if isinstance(updater, HardUpdate):
                 updater.step()
 
+    def finite(self) -> Tensor:
+        """Whether the weights, targets and optimiser state of each agent are finite, bool [R, S]."""
+        return self._lanes.by_agent(self.stock.finite())
+
     def values(self, batch: TensorDictBase) -> Tensor:
         """The highest action value of each agent at the end of a turn, [R, S]; NaN where its network
         outputs a policy."""
@@ -224,13 +252,6 @@ class TorchRLReplayLearner:
         self.actor.epsilon = self.settings.epsilon(self.steps)
 
 
-def _off_policy(make_loss: MakeLoss, network: nn.Module) -> LossModule:
-    """Makes the loss; refuses on-policy losses, which would learn wrongly from replay."""
-    loss = make_loss(network)
-    refuse_on_policy(loss)
-    return loss
-
-
 def _target_updater(loss: LossModule, settings: DQNSettings) -> TargetNetUpdater | None:
     """The target updater of a loss; None if the loss has no targets."""
     if not targets_of(loss):
@@ -245,12 +266,6 @@ def _check(settings: DQNSettings, loss: LossModule) -> None:
     for name, default in (("tau", None), ("own_target_weights", False)):
         if getattr(settings, name) != default and not targets_of(loss):
             raise ValueError(f"{name} is {getattr(settings, name)}, and the loss has no targets")
-    if settings.n_steps > 1 and isinstance(loss, IQLLoss):
-        # TorchRL 0.14.1 ignores "steps_to_next_obs" here.
-        raise ValueError(
-            f"n_steps is {settings.n_steps}; allowed: 1, because TorchRL's {type(loss).__name__} discounts "
-            "the bootstrap value by one step, however many rewards were summed"
-        )
 
 
 def _check_memory(lanes: int, spaces: Spaces, settings: DQNSettings, device: torch.device) -> None:

@@ -16,7 +16,7 @@ from cprl.learners.buffer.storage import torch_dtype
 from cprl.learners.checks import check_learner, check_rollouts
 from cprl.learners.engine.functional import MakeLoss
 from cprl.learners.engine.refusals import refuse_other_advantages
-from cprl.learners.lanes import Lanes
+from cprl.learners.lanes import Lanes, StartFrom
 from cprl.learners.rollouts import ACTOR, CRITIC, refuse_other_parts
 from cprl.learners.settings import RolloutSettings
 from cprl.learners.torchrl.agents import MakeSampler, StockAgent, StockAgents
@@ -47,6 +47,8 @@ class TorchRLRolloutLearner:
         first_replica: the index of the first replica, so that replica r can be trained alone.
         reward_kind: which reward they get.
         make_sampler: an agent's sampler of minibatches; by default a `SamplerWithoutReplacement`.
+        start_from: the weights with which acting networks, and their targets, start, by the lane's name; the
+            others, such as critics, are new.
         device: the torch device of networks, buffers and updates.
 
     Raises:
@@ -67,6 +69,7 @@ class TorchRLRolloutLearner:
         first_replica: int = 0,
         reward_kind: RewardKind = "individual",
         make_sampler: MakeSampler | None = None,
+        start_from: StartFrom | None = None,
         device: str | torch.device = "cpu",
     ) -> None:
         check_learner(spaces, settings, RolloutSettings, agents, replicas, first_replica, seed, reward_kind)
@@ -80,6 +83,7 @@ class TorchRLRolloutLearner:
             first_replica=first_replica,
             make_network=make_network,
             stochastic=True,
+            start_from=start_from,
         )
         self.stock = StockAgents(
             self._lanes,
@@ -156,6 +160,10 @@ class TorchRLRolloutLearner:
 
     def end_episode(self, ended: Tensor) -> None:
         """Does nothing: a rollout continues into the next episode; advantages do not cross the boundary."""
+
+    def finite(self) -> Tensor:
+        """Whether the weights, targets and optimiser state of each agent are finite, bool [R, S]."""
+        return self._lanes.by_agent(self.stock.finite())
 
     def values(self, batch: TensorDictBase) -> Tensor:
         """The value that each agent's critic gives to the state after a turn, [R, S]."""

@@ -1,0 +1,402 @@
+"""Numbers that are NaN or infinite are found and named, in every learner, before they are saved."""
+
+import json
+import warnings
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+from matrix_game import MatrixGame
+from torchrl.envs import Transform, TransformedEnv
+
+from cprl import CommonsEnv, Custom, Experiment, Game, Rules, load, maps, run
+from cprl.algorithms import (
+    DQN,
+    IPPO,
+    MAPPO,
+    PPO,
+    QMIX,
+    SAC,
+    VDN,
+    DistributionalDQN,
+    DQNSettings,
+    Reinforce,
+    RolloutSettings,
+    Tabular,
+    TabularSettings,
+)
+from cprl.commandline import parse
+from cprl.envs.make_env import spaces_of
+from cprl.finite import FiniteCheck, NotFinite, NotFiniteError, places, summary
+from cprl.learners.base import LaneLosses
+from cprl.learners.engine.base import ListEngine
+from cprl.learners.replay import ReplayLearner
+from cprl.networks.finite import all_finite, finite_lanes
+from cprl.population import Learning
+from cprl.runs.checkpoints import Checkpointer, checkpoints_in
+from cprl.training import Training, train
+
+GAME = Game(
+    map=maps.parse(".A>.A.A\nA.A...A\n..<.A.A"),
+    rules=Rules(regrow_prob=(0.0, 0.2), window_rows=3, window_columns=5, episode_steps=12),
+)
+REPLAY = DQNSettings(
+    buffer_size=60,
+    batch_size=4,
+    learning_starts=4,
+    hidden_cells=(8,),
+    learning_rate=1e-3,
+    epsilon_hold_steps=5,
+    epsilon_decay_steps=20,
+    target_every_episodes=1,
+)
+ROLLOUT = RolloutSettings(rollout_steps=6, minibatch_size=3, epochs=2, hidden_cells=(8,), learning_rate=1e-3)
+LEARNERS = {
+    "DQN": (DQN(settings=REPLAY), {}),
+    "DQN with soft updates": (DQN(settings=replace(REPLAY, tau=0.1)), {}),
+    "C51": (DistributionalDQN(settings=REPLAY, atoms=5), {}),
+    "SAC": (SAC(settings=REPLAY), {}),
+    "PPO": (PPO(settings=ROLLOUT), {}),
+    "DQN of TorchRL": (DQN(settings=REPLAY), {"engine": "torchrl"}),
+    "PPO of TorchRL": (PPO(settings=ROLLOUT), {"engine": "torchrl"}),
+    "Reinforce of TorchRL": (Reinforce(settings=ROLLOUT), {"engine": "torchrl"}),
+    "Tabular": (Tabular(settings=TabularSettings()), {}),
+    "VDN": (VDN(settings=REPLAY), {"reward_kind": "team"}),
+    "QMIX": (QMIX(settings=REPLAY), {"reward_kind": "team"}),
+    "IPPO": (IPPO(settings=ROLLOUT), {"reward_kind": "individual"}),
+    "MAPPO": (MAPPO(settings=ROLLOUT), {"reward_kind": "team"}),
+}
+REPLICAS, BROKEN = 3, (1, 0)
+"""The replica and the agent that break."""
+
+
+def make_learner(name, *, replicas=REPLICAS):
+    algorithm, how = LEARNERS[name]
+    how = {"engine": "eager", "reward_kind": "individual", **how}
+    return algorithm.make_learner(GAME.spaces, agents=(0, 1), replicas=replicas, seed=5, **how)
+
+
+def tensors_of(learner, replica, agent):
+    """The trained weights of a lane, as tensors to write into."""
+    if hasattr(learner, "tables"):
+        lane = replica * len(learner.agents) + agent
+        return [torch.from_numpy(learner.tables.values)[list(learner.tables.rows[lane].values())[-1]]]
+    lane = replica * learner._lanes.of_replica + (agent if learner._lanes.of_replica > 1 else 0)
+    if hasattr(learner, "stock"):
+        return [own.data for own in learner.stock.each[lane].loss.parameters()]
+    if isinstance(learner.engine, ListEngine):
+        return [own.data for own in learner.engine.losses[lane].parameters()]
+    return [own[lane] for own in learner.engine.own.values()]
+
+
+class Breaks:
+    """Makes the weights of a lane NaN, or whatever it is told to, at a step."""
+
+    def __init__(self, learner, *, step, value=torch.nan):
+        self.learner, self.step, self.value, self.steps = learner, step, value, 0
+
+    def on_step(self, batch):
+        self.steps += 1
+        if self.steps == self.step:
+            for tensor in tensors_of(self.learner, *BROKEN):
+                tensor.fill_(self.value)
+
+
+class Witness:
+    def __init__(self):
+        self.returns, self.actions = {}, []
+
+    def on_step(self, batch):
+        self.actions.append(batch["agents", "action"].clone())
+
+    def on_episode(self, episode, learning):
+        self.returns.setdefault(episode.world, []).append(episode.return_.tolist())
+
+
+def play(learner, *, breaks=None, episodes=3, seed=2, **how):
+    witness = Witness()
+    callbacks = [witness, *([breaks] if breaks else [])]
+    env = CommonsEnv(GAME, learner.replicas, seed=seed)
+    return train(env, {learner.agents: learner}, episodes=episodes, callbacks=callbacks, **how), witness
+
+
+@pytest.mark.parametrize("name", LEARNERS)
+def test_a_lane_that_breaks_stops_the_training_and_is_named(name):
+    learner = make_learner(name)
+    agents = r"agents 0, 1" if name in ("VDN", "QMIX", "IPPO", "MAPPO") else "agent 0"
+    with pytest.raises(NotFiniteError, match=rf"^at step \d+ .*the weights of {agents} in replica 1 are not"):
+        play(learner, breaks=Breaks(learner, step=14))
+    assert learner.finite()[[0, 2]].all()
+    assert not learner.finite()[BROKEN]
+
+
+FEW = ("PPO", "Tabular", "VDN")
+CONTINUING = [name if name in FEW else pytest.param(name, marks=pytest.mark.slow) for name in LEARNERS]
+
+
+@pytest.mark.parametrize("name", CONTINUING)
+def test_with_continue_a_broken_lane_is_named_once_and_other_replicas_learn_as_without_it(name):
+    whole, sound = make_learner(name), make_learner(name)
+    with pytest.warns(RuntimeWarning, match=r"replica 1 .*not finite.*; the others train on") as warned:
+        training, seen = play(whole, breaks=Breaks(whole, step=14), episodes=4, on_nan="continue")
+    named = [str(one.message) for one in warned if "not finite" in str(one.message)]
+    assert len(named) == 1
+    _, wanted = play(sound, episodes=4)
+    for replica in (0, 2):
+        assert seen.returns[replica] == wanted.returns[replica]
+        for agent in (0, 1):
+            lane = f"replica_{replica}/agent_{agent}"
+            mine, theirs = (own.networks()[lane].state_dict() for own in (whole, sound))
+            assert all(torch.equal(mine[key], theirs[key]) for key in theirs)
+    assert {one.replica for one in training.finite.found} == {1}
+    assert all(0 <= int(action) < GAME.spaces.actions for turn in seen.actions for action in turn.flatten())
+
+
+def losses_of(total, agents=(0, 1)):
+    losses = LaneLosses(len(total), agents)
+    losses.total[:] = total
+    return {agents: losses}
+
+
+def test_a_single_infinite_loss_is_named_with_its_step_and_whether_the_weights_are_sound():
+    learner = make_learner("DQN")
+    check = FiniteCheck({(0, 1): learner}, GAME.spaces)
+    check.check_losses(losses_of([[1.0, 2.0], [3.0, 4.0], [5.0, 6.0]]), 1)
+    with pytest.raises(
+        NotFiniteError, match=r"^at step 1,234 the loss of agent 1 in replica 2 is not finite;"
+    ):
+        check.check_losses(losses_of([[1.0, 2.0], [3.0, 4.0], [5.0, np.inf]]), 1234)
+    tensors_of(learner, 2, 1)[0].fill_(torch.inf)
+    check = FiniteCheck({(0, 1): learner}, GAME.spaces, on_nan="continue")
+    broken = losses_of([[np.nan, 2.0], [3.0, 4.0], [5.0, np.nan]])
+    with pytest.warns(RuntimeWarning) as warned:
+        check.check_losses(broken, 1234)
+    with warnings.catch_warnings():  # named once
+        warnings.simplefilter("error")
+        check.check_weights(1234)
+        check.check_losses(broken, 1235)
+    (message,) = [str(one.message) for one in warned]
+    assert message == (
+        "at step 1,234 the loss of agent 0 in replica 0, the loss of agent 1 in replica 2, and the weights "
+        "of agent 1 in replica 2 are not finite (weights were last checked at step 0); the others train on"
+    )
+    assert check.found[-1] == NotFinite("weights", 2, 1, 1234)
+
+
+def test_what_is_not_finite_is_named_by_agents_and_replicas_and_not_without_end():
+    many = [NotFinite("loss", replica, agent, 7) for replica in range(20) for agent in range(2)]
+    assert places(many[:1]) == "the loss of agent 0 in replica 0 is"
+    two = "the loss of agents 0, 1 in replica 0, and the loss of agents 0, 1 in replica 1 are"
+    assert places(many[:4]) == two
+    assert places(many).endswith("the loss of agents 0, 1 in replica 7, and 12 more are")
+    assert summary([]) is None
+    assert "From step 7 on the loss of agent 0 in replica 0 is not finite." in summary(many[:1])
+
+
+def test_large_numbers_are_finite():
+    large = torch.full((2, 3), 3e38)
+    assert finite_lanes([large, torch.zeros(2), torch.zeros(2, dtype=torch.int64)]).all()
+    assert all_finite([large, torch.zeros(0), torch.zeros(3, dtype=torch.uint8)])
+    assert not all_finite([torch.ones(3), torch.tensor(torch.nan)])
+    opposite = torch.tensor([[torch.inf, -torch.inf], [0.0, 1.0]])
+    assert finite_lanes([opposite]).tolist() == [False, True]
+
+
+class Poison(Transform):
+    """Makes an entry NaN, of one world and agent, from a step on."""
+
+    def __init__(self, name, *, world, agent, step, reset=False):
+        super().__init__()
+        self.name, self.place, self.step, self.steps, self.at_reset = name, (world, agent), step, 0, reset
+
+    def _step(self, tensordict, next_tensordict):
+        self.steps += 1
+        if self.steps >= self.step:
+            next_tensordict["agents", self.name][self.place] = torch.nan
+        return next_tensordict
+
+    def _reset(self, tensordict, tensordict_reset):
+        if self.at_reset:
+            tensordict_reset["agents", self.name][self.place] = torch.nan
+        return tensordict_reset
+
+
+@pytest.mark.parametrize(
+    ("poison", "message"),
+    [
+        ({"name": "reward", "step": 4}, "at step 4 the reward"),
+        ({"name": "observation", "step": 3}, "at step 3 the observation"),
+        ({"name": "observation", "step": 99, "reset": True}, "at step 1 the observation"),
+    ],
+)
+def test_rewards_and_observations_that_are_not_finite_are_blamed_on_the_environment(poison, message):
+    env = TransformedEnv(MatrixGame(3), Poison(world=2, agent=1, **poison))
+    learner = DQN(settings=REPLAY).make_learner(spaces_of(env), agents=(0, 1), replicas=3, engine="eager")
+    match = f"^{message} of agent 1 in replica 2 is not finite; it comes from the environment.* transforms"
+    with pytest.raises(NotFiniteError, match=match):
+        train(env, {(0, 1): learner}, episodes=3)
+
+
+def test_on_a_gpu_sums_are_looked_at_when_episodes_end():
+    class OnGpu(FiniteCheck):
+        is_on_cpu = staticmethod(lambda tensor: False)
+
+    env = TransformedEnv(MatrixGame(3), Poison("reward", world=2, agent=1, step=2))
+    algorithm = DQN(settings=replace(REPLAY, learning_starts=9))
+    learner = algorithm.make_learner(spaces_of(env), agents=(0, 1), replicas=3, engine="eager")
+    training = Training(env, {(0, 1): learner}, episodes=3)
+    training.finite = OnGpu(training.learners, spaces_of(env), on_nan="continue")
+    for _ in range(4):
+        training.step()
+    with pytest.warns(RuntimeWarning, match=r"at step 5 .*the reward of agent 1 in replica 2"):
+        training.step()
+    assert {one.place for one in training.finite.found} >= {("reward", 2, 1)}
+
+
+def test_no_checkpoint_holds_what_is_not_finite_and_the_last_one_is_kept(tmp_path):
+    learner = make_learner("DQN")
+    training = Training(CommonsEnv(GAME, REPLICAS, seed=2), {(0, 1): learner}, episodes=9)
+    with Checkpointer(tmp_path) as checkpointer:
+        for _ in range(9):
+            training.step()
+        checkpointer.save(training)
+        kept = checkpoints_in(tmp_path / "checkpoints")
+        tensors_of(learner, *BROKEN)[1].fill_(-torch.inf)
+        match = r"at step 9 the weights of agent 0 in replica 1 are .*; what was saved at step 9 is finite$"
+        with pytest.raises(NotFiniteError, match=match):
+            checkpointer.save(training)
+        assert checkpoints_in(tmp_path / "checkpoints") == kept
+        again = Training(CommonsEnv(GAME, REPLICAS, seed=2), {(0, 1): make_learner("DQN")}, episodes=9)
+        checkpointer.restore(again)
+        assert again.steps == 9
+        assert again.learners[0, 1].finite().all()
+
+
+def test_with_continue_the_last_sound_checkpoint_is_kept_beside_the_others(tmp_path):
+    learner = make_learner("DQN")
+    how = {"episodes": 9, "on_nan": "continue"}
+    training = Training(CommonsEnv(GAME, REPLICAS, seed=2), {(0, 1): learner}, **how)
+    with Checkpointer(tmp_path) as checkpointer:
+        for _ in range(3):
+            training.step()
+            checkpointer.save(training)
+        (sound,) = checkpoints_in(tmp_path / "checkpoints")[-1:]
+        tensors_of(learner, *BROKEN)[0].fill_(torch.nan)
+        with pytest.warns(RuntimeWarning, match="weights of agent 0 in replica 1"):
+            checkpointer.save(training)
+        for _ in range(4):
+            training.step()
+            checkpointer.save(training)
+        kept = tmp_path / "checkpoints" / f"sound-{sound.name}"
+        assert kept.exists()
+        assert sound not in checkpoints_in(tmp_path / "checkpoints")
+        again = Training(CommonsEnv(GAME, REPLICAS, seed=2), {(0, 1): make_learner("DQN")}, **how)
+        checkpointer.restore(again)
+        with warnings.catch_warnings():
+            warnings.simplefilter("error")
+            again.step()
+            checkpointer.save(again)
+        assert not again.is_sound
+        kept.rename(sound)
+        for path in checkpoints_in(tmp_path / "checkpoints"):
+            if path != sound:
+                path.unlink()
+        checkpointer.restore(again)
+        assert (again.steps, again.is_sound) == (3, True)
+
+
+def test_a_learner_of_somebodys_own_that_refuses_nan_is_explained():
+    class Refuses(ReplayLearner):
+        def update(self):
+            losses = super().update()
+            if not self.finite().all():
+                raise RuntimeError("probability tensor contains either `inf`, `nan` or element < 0")
+            return losses
+
+    learner = Refuses(GAME.spaces, agents=(0, 1), replicas=REPLICAS, settings=REPLAY, compile=False)
+    with pytest.raises(NotFiniteError, match="at step 6 the weights of agent 0 in replica 1 are") as caught:
+        play(learner, breaks=Breaks(learner, step=5))
+    assert "probability tensor" in str(caught.value.__context__)
+
+
+def test_on_nan_is_stop_or_continue():
+    with pytest.raises(ValueError, match="on_nan is 'go on'; allowed: 'stop', 'continue'"):
+        play(make_learner("DQN"), on_nan="go on")
+
+
+def experiment(**changes):
+    how = {"replicas": 2, "episodes": 2, "evaluation_episodes": 1, "engine": "eager", **changes}
+    return Experiment(name="breaks", game=GAME, agents=(Learning(DQN(settings=REPLAY)),) * 2, **how)
+
+
+def test_an_experiment_says_what_happens_and_its_summary_names_who_is_broken(tmp_path, capsys):
+    poison = Custom("test_finite:Breaking", arguments={"step": 5})
+    with pytest.raises(NotFiniteError, match=r"at step 6 .*agent 0 in replica 1"):
+        run(experiment(callbacks=(poison,)), tmp_path / "stops", watch="off")
+    continuing = experiment(callbacks=(poison,), on_nan="continue")
+    with pytest.warns(RuntimeWarning, match=r"at step 6 .*agent 0 in replica 1"):
+        directory = run(continuing, tmp_path / "continues", watch="off")
+    told = capsys.readouterr().out
+    assert "From step 6 on the loss of agent 0 in replica 1, and the weights of agent 0 in replica 1" in told
+    found = json.loads((directory / "report.json").read_text())["not_finite"]
+    assert found[0] == {"what": "loss", "replica": 1, "agent": 0, "step": 6}
+    assert Experiment.from_config(continuing.to_config(), allow=["test_finite:Breaking"]) == continuing
+    with pytest.raises(ValueError, match=r"experiment\.on_nan is 'no'; allowed: 'stop', 'continue'"):
+        experiment(on_nan="no")
+
+
+def test_the_command_line_says_it_too():
+    assert parse(experiment, ["recipe.py"])[0].on_nan == "stop"
+    assert parse(experiment, ["recipe.py", "--on-nan", "continue"])[0].on_nan == "continue"
+
+
+class Breaking:
+    """Makes the weights of the first lane's neighbour NaN at a step."""
+
+    def __init__(self, step):
+        self.step = step
+
+    def on_start(self, training):
+        (learner,) = training.learners.values()
+        self.breaks = Breaks(learner, step=self.step)
+
+    def on_step(self, batch):
+        self.breaks.on_step(batch)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", ["DQN", "PPO", "VDN", "MAPPO"])
+def test_compiled_lanes_learn_on_beside_a_broken_one(name):
+    algorithm, how = LEARNERS[name]
+    how = {"reward_kind": "individual", **how, "engine": "compiled"}
+    whole, sound = (
+        algorithm.make_learner(GAME.spaces, agents=(0, 1), replicas=REPLICAS, seed=5, **how) for _ in range(2)
+    )
+    with pytest.warns(RuntimeWarning, match=r"replica 1 .*not finite.*; the others train on"):
+        _, seen = play(whole, breaks=Breaks(whole, step=14), episodes=4, on_nan="continue")
+    _, wanted = play(sound, episodes=4)
+    for replica in (0, 2):
+        assert seen.returns[replica] == wanted.returns[replica]
+        for agent in (0, 1):
+            lane = f"replica_{replica}/agent_{agent}"
+            mine, theirs = (own.networks()[lane].state_dict() for own in (whole, sound))
+            assert all(torch.equal(mine[key], theirs[key]) for key in theirs)
+
+
+def test_a_training_that_stopped_is_resumed_with_continue(tmp_path):
+    with pytest.raises(NotFiniteError, match=r"at step 6 .*agent 0 in replica 1") as stopped:
+        run(
+            experiment(callbacks=(Custom("test_finite:Breaking", arguments={"step": 5}),)),
+            tmp_path / "run",
+            watch="off",
+        )
+    assert any("To resume:" in note for note in stopped.value.__notes__)
+    again = experiment(callbacks=(Custom("test_finite:Breaking", arguments={"step": 5}),), on_nan="continue")
+    with pytest.warns(RuntimeWarning, match=r"at step 6 .*; the others train on"):
+        run(again, tmp_path / "run", watch="off", resume=True)
+    loaded = load(tmp_path / "run", allow=["test_finite:Breaking"])
+    assert loaded.experiment == again
+    assert loaded.agent(0, replica=0).network is not None
+    with pytest.raises(ValueError, match="weights of replica_1/agent_0 are NaN or infinite"):
+        loaded.agent(0, replica=1)

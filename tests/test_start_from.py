@@ -1,0 +1,243 @@
+"""A training can start from the weights that an earlier run kept, with every kind of learner."""
+
+import os
+import shutil
+import signal
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+import torch
+from test_finite import GAME, REPLAY, ROLLOUT
+
+import cprl
+from cprl import CommonsEnv, Experiment, cli
+from cprl.agents import Population
+from cprl.algorithms import DQN, IPPO, MAPPO, PPO, QMIX, SAC, VDN, Tabular, TabularSettings
+from cprl.commandline import parse
+from cprl.learners.settings import DQNSettings
+from cprl.measuring.evaluate import evaluate
+from cprl.population import Frozen, Learning, Scripted, Team
+from cprl.runs.checkpoints import checkpoints_in
+from cprl.runs.weights import load_weights, save_weights
+
+FOUR = replace(GAME, map=cprl.maps.parse(".A>.A.A\nA<A.v.A\n..<.A.A"))
+ALONE = (
+    Learning(DQN(settings=REPLAY)),
+    Learning(PPO(settings=ROLLOUT)),
+    Learning(Tabular(settings=TabularSettings())),
+    Learning(SAC(settings=REPLAY)),
+)
+TEAMS = (
+    Team(VDN(settings=REPLAY), agents=(0, 2)),
+    Team(MAPPO(settings=ROLLOUT), agents=(1, 3)),
+)
+
+
+def experiment(agents, **changes):
+    how = {"replicas": 2, "episodes": 2, "evaluation_episodes": 1, "engine": "eager", "seed": 4, **changes}
+    return Experiment(name="start", game=FOUR, agents=agents, **how)
+
+
+@pytest.fixture(scope="module")
+def stored(tmp_path_factory):
+    """Two runs, of agents alone and of teams, and where they are from here."""
+    folder = tmp_path_factory.mktemp("stored")
+    for name, agents in (("alone", ALONE), ("teams", TEAMS)):
+        cprl.run(experiment(agents), folder / name, watch="off")
+    cprl.run(
+        experiment((Frozen(os.path.relpath(folder / "alone"), 0), *[Scripted()] * 3)),
+        folder / "frozen",
+        watch="off",
+    )
+    return os.path.relpath(folder)
+
+
+def population(agents, **how):
+    return Population(CommonsEnv(FOUR, 2, seed=4), agents, **{"engine": "eager", "seed": 8, **how})
+
+
+def same(network, state):
+    return all(torch.equal(own, state[name]) for name, own in network.state_dict().items())
+
+
+@pytest.mark.parametrize("engine", ["eager", "torchrl", pytest.param("compiled", marks=pytest.mark.slow)])
+@pytest.mark.parametrize("agent", [0, 1, 2, 3])
+def test_agents_start_with_the_weights_of_a_stored_one(stored, engine, agent):
+    if (engine, agent) == ("torchrl", 2):
+        pytest.skip("tables have no TorchRL engine")
+    kept = load_weights(Path(f"{stored}/alone/checkpoints/final.pt"))
+    spec = replace(ALONE[agent], start_from=Frozen(f"{stored}/alone", agent, replica=1))
+    begun = population([spec, spec, Scripted(), Scripted()], engine=engine)
+    assert len(begun.networks()) == 4
+    assert all(same(own, kept[f"replica_1/agent_{agent}"]) for own in begun.networks().values())
+    own = replace(spec, start_from=Frozen(f"{stored}/alone", agent, replica=None))
+    begun = population([own, Scripted(), Scripted(), Scripted()], engine=engine)
+    for replica in (0, 1):
+        name = f"replica_{replica}/agent_{agent}"
+        assert same(begun.networks()[f"replica_{replica}/agent_0"], kept[name])
+
+
+@pytest.mark.parametrize("algorithm", [VDN(settings=REPLAY), QMIX(settings=REPLAY)])
+def test_members_of_a_team_start_with_the_weights_of_the_members_of_a_stored_one(stored, algorithm):
+    kept = load_weights(Path(f"{stored}/teams/checkpoints/final.pt"))
+    spec = Team(algorithm, agents=(1, 3), start_from=Frozen(f"{stored}/teams", 2))
+    begun = population([spec, Scripted(), Scripted()]).networks()
+    for replica in (0, 1):
+        for agent, theirs in ((1, 0), (3, 2)):
+            assert same(begun[f"replica_{replica}/agent_{agent}"], kept[f"replica_0/agent_{theirs}"])
+
+
+@pytest.mark.parametrize("algorithm", [MAPPO(settings=ROLLOUT), IPPO(settings=ROLLOUT)])
+def test_teams_of_actors_start_likewise(stored, algorithm):
+    kept = load_weights(Path(f"{stored}/teams/checkpoints/final.pt"))
+    spec = Team(algorithm, agents=(0, 1), start_from=Frozen(f"{stored}/teams", 1, replica=None))
+    begun = population([spec, Scripted(), Scripted()]).networks()
+    assert same(begun["replica_1/agent_1"], kept["replica_1/agent_3"])
+
+
+@pytest.mark.parametrize("engine", ["eager", "torchrl"])
+@pytest.mark.parametrize("own_target_weights", [False, True])
+def test_targets_start_with_the_same_weights_and_the_optimiser_and_exploration_anew(
+    stored, engine, own_target_weights
+):
+    settings = replace(REPLAY, own_target_weights=own_target_weights)
+    spec = Learning(DQN(settings=settings), start_from=Frozen(f"{stored}/alone", 0))
+    (learner,) = population([spec, *[Scripted()] * 3], engine=engine).learners.values()
+    weights = (
+        dict(learner.stock.each[0].loss.state_dict()) if engine == "torchrl" else learner.engine.weights(0)
+    )
+    targets = [own for name, own in weights.items() if name.startswith("target_")]
+    trained = [own for name, own in weights.items() if not name.startswith("target_")]
+    trained = [own for own in trained if own.is_floating_point() and own.ndim]
+    assert targets
+    for target in targets:
+        assert any(own.shape == target.shape and torch.equal(own, target) for own in trained)
+    assert learner.steps == 0
+    assert learner.actor.epsilon == settings.epsilon(0) == 1.0
+
+
+def test_without_updates_it_plays_what_was_stored(stored):
+    never = DQNSettings(**{**vars(REPLAY), "learning_starts": 60, "learning_rate": 1e-30})
+    agents = [replace(ALONE[0], algorithm=DQN(settings=never), start_from=Frozen(f"{stored}/alone", 0))]
+    begun = population([*agents, *[Scripted("sustainable")] * 3])
+    frozen = population([Frozen(f"{stored}/alone", 0), *[Scripted("sustainable")] * 3])
+    played = [
+        [episode.return_.tolist() for episode in evaluate(CommonsEnv(FOUR, 2, seed=1), own.policy(1))]
+        for own in (begun, frozen)
+    ]
+    assert played[0] == played[1]
+
+
+def test_a_training_that_starts_from_another_is_run_stopped_and_resumed_without_it(
+    stored, tmp_path, monkeypatch
+):
+    shutil.copytree(f"{stored}/alone", tmp_path / "alone")
+    monkeypatch.chdir(tmp_path)
+    spec = replace(ALONE[0], start_from=Frozen("alone", 0))
+    begun = experiment((spec, Scripted(), Scripted(), Scripted()), episodes=4)
+    whole = cprl.run(begun, "runs/whole", watch="off")
+    assert cprl.load(whole).experiment == begun
+    recipe = cprl.runs.directory.read_recipe(whole)
+    assert recipe["experiment"]["agents"][0]["start_from"]["run"] == "../../alone"
+    monkeypatch.setenv("STOP_AT_STEP", "20")
+    stopping = replace(begun, callbacks=(cprl.Custom("test_start_from:Stops"),))
+    with pytest.raises(SystemExit):
+        cprl.run(stopping, "runs/stopped", watch="off")
+    assert checkpoints_in(tmp_path / "runs/stopped/checkpoints")
+    monkeypatch.delenv("STOP_AT_STEP")
+    shutil.rmtree(tmp_path / "alone")
+    words = ["cprl", "run", "runs/stopped", "--resume", "--watch", "off", "--allow", "test_start_from:Stops"]
+    monkeypatch.setattr("sys.argv", words)
+    cli.main()
+    mine, theirs = (
+        load_weights(tmp_path / f"runs/{name}/checkpoints/final.pt") for name in ("stopped", "whole")
+    )
+    assert repr(mine) == repr(theirs)
+
+
+class Stops:
+    """Asks for the end of the process at a step."""
+
+    def __init__(self):
+        self.steps = 0
+
+    def on_step(self, batch):
+        self.steps += 1
+        if self.steps == int(os.environ.get("STOP_AT_STEP", "-1")):
+            os.kill(os.getpid(), signal.SIGTERM)
+
+
+def refused(spec, match):
+    others = 4 - (len(spec.agents) if isinstance(spec, Team) else 1)
+    with pytest.raises(ValueError, match=match):
+        population([spec, *[Scripted()] * others])
+
+
+def test_what_cannot_be_started_from_is_refused_by_name(stored, tmp_path):
+    dqn, ppo, run = ALONE[0], ALONE[1], f"{stored}/alone"
+    refused(replace(dqn, start_from=Frozen(run, 4)), r"agent is 4; .*alone has the agents 0 to 3")
+    refused(replace(dqn, start_from=Frozen(run, 0, replica=2)), r"keeps no network of replica_2/agent_0")
+    refused(replace(dqn, start_from=Frozen(f"{stored}/frozen", 1)), r"agent_1 of .*frozen is scripted")
+    refused(replace(dqn, start_from=Frozen(f"{stored}/nowhere", 0)), "nowhere")
+    refused(
+        replace(dqn, start_from=Frozen(run, 1)),
+        r"agent_1 of .*alone outputs the logits of a policy; DQN learns action values",
+    )
+    refused(
+        replace(ppo, start_from=Frozen(run, 0)), r"outputs action values; PPO learns the logits of a policy"
+    )
+    wider = DQN(settings=replace(REPLAY, hidden_cells=(9,)))
+    refused(
+        Learning(wider, start_from=Frozen(run, 0)), r"agent_0 of .* has another network than DQN here: .*siz"
+    )
+    relu = DQN(settings=replace(REPLAY, relu_on_outputs=True))
+    refused(Learning(relu, start_from=Frozen(run, 0)), "with the same weights the outputs differ")
+    vdn = VDN(settings=REPLAY)
+    refused(
+        Team(vdn, (0, 1), start_from=Frozen(run, 0)), "agent 0 of .*alone is in no team; allowed for a te"
+    )
+    refused(
+        Team(vdn, (0, 1, 2), start_from=Frozen(f"{stored}/teams", 0)),
+        "is in a team of 2; allowed for a team of 3 to start from: a member of a team of 3",
+    )
+    spec = replace(dqn, start_from=Frozen(run, 0))
+    taller = replace(FOUR, rules=replace(FOUR.rules, window_rows=4))
+    with pytest.raises(ValueError, match=r"have observations .*; this game has"):
+        Population(CommonsEnv(taller, 2), [spec, *[Scripted()] * 3], engine="eager")
+    with pytest.raises(ValueError, match=r"experiment\.agents\[0\]\.start_from\.run is /x, an absolute path"):
+        experiment((replace(dqn, start_from=Frozen("/x", 0)), *[Scripted()] * 3))
+    broken = experiment((replace(dqn, start_from=Frozen(run, 7)), *[Scripted()] * 3))
+    with pytest.raises(ValueError, match="agent is 7"):
+        cprl.run(broken, tmp_path / "never", watch="off")
+    assert not (tmp_path / "never").exists()
+
+
+def test_weights_that_are_not_finite_are_no_start(stored, tmp_path):
+    shutil.copytree(f"{stored}/alone", tmp_path / "alone")
+    networks = population([ALONE[0], *[Scripted()] * 3]).networks()
+    for own in networks["replica_0/agent_0"].parameters():
+        own.data.fill_(torch.nan)
+    save_weights(tmp_path / "alone", networks)
+    refused(
+        replace(ALONE[0], start_from=Frozen(os.path.relpath(tmp_path / "alone"), 0)),
+        "the weights of replica_0/agent_0 are NaN or infinite; leave that replica out",
+    )
+
+
+def test_a_frozen_agent_can_be_that_of_its_own_replica(stored):
+    own = population([Frozen(f"{stored}/alone", 0, replica=None), *[Scripted()] * 3])
+    each = [population([Frozen(f"{stored}/alone", 0, replica), *[Scripted()] * 3]) for replica in (0, 1)]
+    seen = torch.randint(256, (2, 1, *FOUR.spaces.observation_shape), dtype=torch.uint8)
+    values = own.others[0,].values(seen)
+    torch.testing.assert_close(values[0], each[0].others[0,].values(seen)[0])
+    torch.testing.assert_close(values[1], each[1].others[0,].values(seen)[1])
+    assert not torch.allclose(values[1], each[0].others[0,].values(seen)[1])
+
+
+def test_where_to_start_is_a_flag(stored):
+    def made():
+        return experiment((replace(ALONE[0], start_from=Frozen("a", 0)), *[Scripted()] * 3))
+
+    words = ["recipe.py", "--agents.0.start-from.run", "b", "--agents.0.start-from.agent", "2"]
+    assert parse(made, words)[0].agents[0].start_from == Frozen("b", 2)
