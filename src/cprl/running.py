@@ -35,6 +35,7 @@ from cprl.runs.directory import (
 from cprl.runs.episodes import EpisodeTable
 from cprl.runs.extension import REPORT, extend, refuse_to_extend
 from cprl.runs.files import write_json
+from cprl.runs.lock import FILE_NAME as LOCK
 from cprl.runs.lock import RunLockedError
 from cprl.runs.loggers import LoggerCallback, check_logger, make_logger
 from cprl.runs.weights import save_transforms, save_weights
@@ -119,6 +120,9 @@ def run(
         if episodes < experiment.episodes:
             refuse_to_extend(out, episodes, own.callbacks)
         elif (out / REPORT).exists():
+            if (out / LOCK).exists():  # its process died before it had tidied up
+                with Checkpointer(out, keep_ending=keep_checkpoint, take_over=take_over) as left:
+                    left.done()
             console().print(f"{out} is finished; with more --episodes it is extended", soft_wrap=True)
             return out
         directory = out
@@ -144,9 +148,9 @@ def run(
             _finish(directory, experiment, own, training)
             checkpointer.done()
     except BaseException as error:
-        if began.has_begun or resume:
+        if began.has_begun or (resume and isinstance(error, OSError)):
             error.add_note(f"To resume: {checkpointer.resume_command}")
-        elif not isinstance(error, RunLockedError):
+        elif not resume and not isinstance(error, RunLockedError):
             _remove(directory, but_keep_empty=is_there)
         raise
     return directory

@@ -5,6 +5,7 @@ import shlex
 import subprocess
 import sys
 from collections.abc import Callable, Mapping, Sequence
+from contextlib import suppress
 from datetime import datetime
 from importlib.metadata import PackageNotFoundError, version
 from itertools import count
@@ -54,16 +55,23 @@ def start_run(
     if Path(name).name != name:
         raise ValueError(f'"{name}" names a run; allowed: a name without slashes')
     started = datetime.now().astimezone()
+    is_new = out is None or not Path(out).exists()
     directory = _new_directory(name, started) if out is None else _made_directory(Path(out))
-    with RunLock(directory):
-        _refuse_contents(directory)
-        recipe = {
-            **to_recipe(directory),
-            **_circumstances(),
-            "started": started.isoformat(timespec="seconds"),
-            "command": _command(sys.argv if command is None else command),
-        }
-        write_json(directory / FILE_NAME, recipe)
+    try:
+        with RunLock(directory):
+            _refuse_contents(directory)
+            recipe = {
+                **to_recipe(directory),
+                **_circumstances(),
+                "started": started.isoformat(timespec="seconds"),
+                "command": _command(sys.argv if command is None else command),
+            }
+            write_json(directory / FILE_NAME, recipe)
+    except BaseException:
+        if is_new:
+            with suppress(OSError):  # not where another process has begun a run there
+                directory.rmdir()
+        raise
     return directory
 
 

@@ -127,7 +127,9 @@ class EpisodeTable:
             self._file.append(rows)
         except OSError as error:
             kept = f"the {self._rows} earlier rows are in {self.journal}"
-            raise OSError(error.errno, f"{error}: could not add episodes; {kept}") from error
+            raise OSError(
+                error.errno, f"{error.strerror or error}: could not add episodes; {kept}"
+            ) from error
         self._rows += rows.num_rows
 
     def on_step(self, batch: TensorDictBase) -> None:
@@ -152,10 +154,11 @@ class EpisodeTable:
             name = self.path.relative_to(self._run).as_posix()
             write_listed(self._run, name, lambda file: _merge(self.journal, file, rows=self._rows))
         except FileNotFoundError as error:
-            raise FileNotFoundError(ENOENT, f"{error}: was {self.journal} deleted?") from error
+            raise FileNotFoundError(ENOENT, f"{error.strerror}: was {self.journal} deleted?") from error
         except OSError as error:
             raise OSError(
-                error.errno, f"{error}: could not write {self.path}; all episodes are in {self.journal}"
+                error.errno,
+                f"{error.strerror or error}: could not write {self.path}; all episodes are in {self.journal}",
             ) from error
         self.journal.unlink()
         self._is_closed = True

@@ -64,13 +64,21 @@ class RunLock:
                 os.close(file)
                 return False
             self._refuse_another_host(_holder(file))
-            _write(file, _this_process())
+            self._sign(file)
         except BaseException:
             with suppress(OSError):
                 os.close(file)
             raise
         self._file = file
         return True
+
+    def _sign(self, file: int) -> None:
+        """Writes who holds the lock; where the disk is full the file is removed."""
+        try:
+            _write(file, _this_process())
+        except OSError as error:
+            self.path.unlink(missing_ok=True)
+            raise OSError(error.errno, error.strerror, str(self.path)) from error
 
     def _is_still_there(self, file: int) -> bool:
         """Whether the locked file is the one in the directory: its holder removes it at the end."""

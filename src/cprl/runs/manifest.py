@@ -28,7 +28,8 @@ def write_listed(run: Path, name: str, write: Callable[[BinaryIO], object]) -> P
     """
     path = run / name
     unlist(run, name)
-    path.parent.mkdir(exist_ok=True)
+    if path.parent != run:  # a run that was deleted is not made again
+        path.parent.mkdir(exist_ok=True)
     write_atomically(path, write)
     enlist(run, name)
     return path
