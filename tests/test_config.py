@@ -72,11 +72,15 @@ TEAMS = st.one_of(
     *[st.builds(kind, settings=DQNS) for kind in (VDN, QMIX)],
     *[st.builds(kind, settings=ROLLOUTS) for kind in (MAPPO, IPPO)],
 )
+FROZEN = st.builds(
+    Frozen, st.just("runs/earlier"), agent=st.integers(0, 3), replica=st.none() | st.integers(0, 9)
+)
+STARTS = st.none() | FROZEN
 SPECS = st.one_of(
-    st.builds(Learning, ALONE | CUSTOM, reward=st.sampled_from(["individual", "team"])),
-    st.builds(Team, TEAMS | CUSTOM, agents=st.just((0, 2))),
+    st.builds(Learning, ALONE | CUSTOM, reward=st.sampled_from(["individual", "team"]), start_from=STARTS),
+    st.builds(Team, TEAMS | CUSTOM, agents=st.just((0, 2)), start_from=STARTS),
     st.builds(Scripted, st.sampled_from(["random", "greedy", "pacifist"])),
-    st.builds(Frozen, st.just("runs/earlier"), agent=st.integers(0, 3), replica=st.integers(0, 9)),
+    FROZEN,
 )
 RULES = st.builds(
     Rules,

@@ -15,6 +15,7 @@ from test_population import ALGORITHMS
 import cprl
 from cprl import CommonsEnv, Experiment, Game, Observation, Rules, cli, maps
 from cprl.agents import Population
+from cprl.evaluation.film import film
 from cprl.evaluation.lanes import Source, policies_of
 from cprl.evaluation.same_game import differences
 from cprl.learners.lanes import EVALUATION, lane_seeds
@@ -339,7 +340,11 @@ def test_what_does_not_fit_is_refused_and_says_what_fits(learned, scripted, tmp_
         cprl.evaluate_run(alike, seed=3)
     with pytest.raises(ValueError, match=r"alike has no replicas \[3, 9\]; allowed: \[0, 1, 2\]"):
         cprl.evaluate_run(alike, replicas=[1, 9, 3])
-    with pytest.raises(ValueError, match="1 run is given; allowed: at least two"):
+    with pytest.raises(ValueError, match=r"a replica is 1\.5; allowed: "):
+        cprl.evaluate_run(alike, replicas=[1.5])
+    with pytest.raises(ValueError, match=r"replica is 99; allowed: 0, 1, 2"):
+        film(alike, replica=99)
+    with pytest.raises(ValueError, match="the number of runs is 1; allowed: at least two"):
         cprl.crossplay([alike])
     with pytest.raises(ValueError, match="alike is given twice"):
         cprl.crossplay([alike, mixed, alike])
@@ -422,7 +427,7 @@ def test_the_command_crossplay_tells_a_matrix_for_each_number_and_writes_the_epi
     assert {row["focal_agent"] for row in agents if row["focal"] == row["background"]} == {-1}
     with pytest.raises(SystemExit, match=r"cprl: .*cross\.parquet exists and is not overwritten"):
         command(monkeypatch, capsys, "crossplay", greedy, sustainable, "--out", out)
-    with pytest.raises(SystemExit, match="cprl: 1 run is given; allowed: at least two"):
+    with pytest.raises(SystemExit, match="cprl: the number of runs is 1; allowed: at least two"):
         command(monkeypatch, capsys, "crossplay", greedy)
 
 

@@ -10,6 +10,7 @@ import torch
 from matrix_game import MatrixGame
 from torchrl.envs import Transform, TransformedEnv
 
+import cprl.training
 from cprl import CommonsEnv, Custom, Experiment, Game, Rules, load, maps, run
 from cprl.algorithms import (
     DQN,
@@ -159,23 +160,32 @@ def losses_of(total, agents=(0, 1)):
     return {agents: losses}
 
 
+NOTHING = np.zeros((3, 2))
+"""Returns of three replicas and two agents."""
+
+
+@pytest.fixture
+def looks_every_step(monkeypatch):
+    monkeypatch.setattr(cprl.training, "EVERY_STEPS", 1)
+
+
 def test_a_single_infinite_loss_is_named_with_its_step_and_whether_the_weights_are_sound():
     learner = make_learner("DQN")
     check = FiniteCheck({(0, 1): learner}, GAME.spaces)
-    check.check_losses(losses_of([[1.0, 2.0], [3.0, 4.0], [5.0, 6.0]]), 1)
+    check.check_sums(losses_of([[1.0, 2.0], [3.0, 4.0], [5.0, 6.0]]), NOTHING, 1)
     with pytest.raises(
         NotFiniteError, match=r"^at step 1,234 the loss of agent 1 in replica 2 is not finite;"
     ):
-        check.check_losses(losses_of([[1.0, 2.0], [3.0, 4.0], [5.0, np.inf]]), 1234)
+        check.check_sums(losses_of([[1.0, 2.0], [3.0, 4.0], [5.0, np.inf]]), NOTHING, 1234)
     tensors_of(learner, 2, 1)[0].fill_(torch.inf)
     check = FiniteCheck({(0, 1): learner}, GAME.spaces, on_nan="continue")
     broken = losses_of([[np.nan, 2.0], [3.0, 4.0], [5.0, np.nan]])
     with pytest.warns(RuntimeWarning) as warned:
-        check.check_losses(broken, 1234)
+        check.check_sums(broken, NOTHING, 1234)
     with warnings.catch_warnings():  # named once
         warnings.simplefilter("error")
         check.check_weights(1234)
-        check.check_losses(broken, 1235)
+        check.check_sums(broken, NOTHING, 1235)
     (message,) = [str(one.message) for one in warned]
     assert message == (
         "at step 1,234 the loss of agent 0 in replica 0, the loss of agent 1 in replica 2, and the weights "
@@ -225,33 +235,48 @@ class Poison(Transform):
 @pytest.mark.parametrize(
     ("poison", "message"),
     [
-        ({"name": "reward", "step": 4}, "at step 4 the reward"),
+        ({"name": "reward", "step": 4}, "at step 4 .*the reward"),
         ({"name": "observation", "step": 3}, "at step 3 the observation"),
         ({"name": "observation", "step": 99, "reset": True}, "at step 1 the observation"),
     ],
 )
-def test_rewards_and_observations_that_are_not_finite_are_blamed_on_the_environment(poison, message):
+def test_rewards_and_observations_that_are_not_finite_are_blamed_on_the_environment(
+    poison, message, looks_every_step
+):
     env = TransformedEnv(MatrixGame(3), Poison(world=2, agent=1, **poison))
     learner = DQN(settings=REPLAY).make_learner(spaces_of(env), agents=(0, 1), replicas=3, engine="eager")
-    match = f"^{message} of agent 1 in replica 2 is not finite; it comes from the environment.* transforms"
+    match = (
+        f"^{message} of agent 1 in replica 2(,| is).* not finite.*it comes from the environment.* transforms"
+    )
     with pytest.raises(NotFiniteError, match=match):
         train(env, {(0, 1): learner}, episodes=3)
 
 
-def test_on_a_gpu_sums_are_looked_at_when_episodes_end():
+def test_rewards_are_looked_at_every_sixteen_steps_and_when_episodes_end():
+    env = TransformedEnv(MatrixGame(3, steps=20), Poison("reward", world=2, agent=1, step=2))
+    algorithm = DQN(settings=replace(REPLAY, learning_starts=90))
+    learner = algorithm.make_learner(spaces_of(env), agents=(0, 1), replicas=3, engine="eager")
+    training = Training(env, {(0, 1): learner}, episodes=3)
+    for _ in range(15):
+        training.step()
+    with pytest.raises(NotFiniteError, match=r"^at step 16 the reward of agent 1 in replica 2 is not finite"):
+        training.step()
+
+
+def test_on_a_gpu_observations_are_looked_at_when_episodes_end():
     class OnGpu(FiniteCheck):
         is_on_cpu = staticmethod(lambda tensor: False)
 
-    env = TransformedEnv(MatrixGame(3), Poison("reward", world=2, agent=1, step=2))
+    env = TransformedEnv(MatrixGame(3), Poison("observation", world=2, agent=1, step=2))
     algorithm = DQN(settings=replace(REPLAY, learning_starts=9))
     learner = algorithm.make_learner(spaces_of(env), agents=(0, 1), replicas=3, engine="eager")
     training = Training(env, {(0, 1): learner}, episodes=3)
     training.finite = OnGpu(training.learners, spaces_of(env), on_nan="continue")
     for _ in range(4):
         training.step()
-    with pytest.warns(RuntimeWarning, match=r"at step 5 .*the reward of agent 1 in replica 2"):
+    with pytest.warns(RuntimeWarning, match=r"at step 5 .*the observation of agent 1 in replica 2"):
         training.step()
-    assert {one.place for one in training.finite.found} >= {("reward", 2, 1)}
+    assert {one.place for one in training.finite.found} >= {("observation", 2, 1)}
 
 
 def test_no_checkpoint_holds_what_is_not_finite_and_the_last_one_is_kept(tmp_path):
@@ -330,7 +355,9 @@ def experiment(**changes):
     return Experiment(name="breaks", game=GAME, agents=(Learning(DQN(settings=REPLAY)),) * 2, **how)
 
 
-def test_an_experiment_says_what_happens_and_its_summary_names_who_is_broken(tmp_path, capsys):
+def test_an_experiment_says_what_happens_and_its_summary_names_who_is_broken(
+    tmp_path, capsys, looks_every_step
+):
     poison = Custom("test_finite:Breaking", arguments={"step": 5})
     with pytest.raises(NotFiniteError, match=r"at step 6 .*agent 0 in replica 1"):
         run(experiment(callbacks=(poison,)), tmp_path / "stops", watch="off")
@@ -384,7 +411,7 @@ def test_compiled_lanes_learn_on_beside_a_broken_one(name):
             assert all(torch.equal(mine[key], theirs[key]) for key in theirs)
 
 
-def test_a_training_that_stopped_is_resumed_with_continue(tmp_path):
+def test_a_training_that_stopped_is_resumed_with_continue(tmp_path, looks_every_step):
     with pytest.raises(NotFiniteError, match=r"at step 6 .*agent 0 in replica 1") as stopped:
         run(
             experiment(callbacks=(Custom("test_finite:Breaking", arguments={"step": 5}),)),

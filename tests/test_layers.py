@@ -40,6 +40,7 @@ PACKAGES = (
     "experiment",
     "stored",
     "agents",
+    "outcome",
     "running",
     "evaluation",
     "studies",

@@ -74,7 +74,7 @@ def test_a_bad_drawing_is_refused_with_row_and_column(drawing, message):
         ({"starts": ((0, 0, 4),)}, "heading 4"),
         ({"starts": ()}, "starts is empty"),
         ({"sites": ()}, "sites is empty"),
-        ({"height": 0}, "Map.height is 0 and Map.width is 3; allowed: integers >= 1"),
+        ({"height": 0}, "Map.height is 0; allowed: an integer from 1 to 10,000"),
     ],
 )
 def test_a_map_that_cannot_be_played_is_refused(changes, message):
@@ -91,9 +91,9 @@ def test_an_unknown_board_is_refused_with_the_names_of_all_boards():
 @pytest.mark.parametrize(
     ("rules", "message"),
     [
-        ({"may_fire": (True,)}, "may_fire has 1 entries; the map has 2 agents"),
-        ({"freeze_steps": ((1,), (2,), (3,))}, "freeze_steps has 3 rows; the map has 2 agents"),
-        ({"may_bite": ((True, True), (True, True))}, "may_bite is 2 x 2; the map has 2 agents and 1 sites"),
+        ({"may_fire": (True,)}, "may_fire has 1 entries; allowed: 2, one per agent"),
+        ({"freeze_steps": ((1,), (2,), (3,))}, "freeze_steps has 3 rows; allowed: 2, one per agent"),
+        ({"may_bite": ((True, True), (True, True))}, "may_bite is 2 x 2; allowed: 2 x 1, agents x sites"),
     ],
 )
 def test_rules_per_agent_must_fit_the_map(rules, message):
@@ -168,8 +168,8 @@ def test_fewer_agents_are_spread_over_the_rooms():
     ("arguments", "message"),
     [
         ({"entrances": "two"}, "entrances is 'two'; allowed: single, multiple, none, unequal"),
-        ({"agents": 0}, "agents is 0; allowed: 1 to 12"),
-        ({"agents": 13}, "agents is 13; allowed: 1 to 12"),
+        ({"agents": 0}, "agents is 0; allowed: an integer from 1 to 12"),
+        ({"agents": 13}, "agents is 13; allowed: an integer from 1 to 12"),
     ],
 )
 def test_rooms_refuse_other_entrances_and_numbers_of_agents(arguments, message):
@@ -209,8 +209,8 @@ def test_more_clustering_puts_sites_closer_together():
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        ({"height": 0}, "height is 0; allowed: an integer >= 1"),
-        ({"agents": 0}, "agents is 0; allowed: an integer >= 1"),
+        ({"height": 0}, "height is 0; allowed: an integer from 1 to 10,000"),
+        ({"agents": 0}, "agents is 0; allowed: an integer from 1"),
         ({"density": 0}, "density is 0; allowed: above 0, at most 1"),
         ({"density": 1.5}, "density is 1.5"),
         ({"clustering": -0.1}, r"clustering is -0\.1; allowed: 0\.\.1"),

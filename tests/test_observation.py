@@ -184,7 +184,7 @@ def test_sight_is_mutual(rows, cols):
 
 
 def test_walls_that_block_sight_need_windows():
-    with pytest.raises(ValueError, match='use area="window" where walls block sight'):
+    with pytest.raises(ValueError, match='allowed: area="window" where walls block sight'):
         Game(
             map=maps.parse(BOARD),
             rules=Rules(walls_block_sight=True),

@@ -120,7 +120,7 @@ ALLOWED = {
     },
 }
 """What fits a field although it fits hardly any other."""
-OPTIONAL = {"tau", "max_grad_norm", "network", "may_bite"}
+OPTIONAL = {"tau", "max_grad_norm", "network", "may_bite", "start_from", "replica"}
 
 
 @pytest.mark.parametrize(("value", "field"), FIELDS)

@@ -61,6 +61,19 @@ def test_the_yield_share_takes_a_yield_for_each_episode():
     assert share.tolist() == [1.0, 0.5, 1.0]
 
 
+def test_a_yield_is_not_rounded_to_float32():
+    share = social.yield_share(HARVEST, sustainable_yield=0.1, first_stock=0)
+    assert share.item() == 4 / (0.1 * 4)
+
+
+@pytest.mark.parametrize(
+    "wrong", [-1, math.nan, math.inf, "3", None, [1, 2, 3], torch.zeros(2), True, 2**2000, {}]
+)
+def test_a_yield_that_is_no_number_is_refused(wrong):
+    with pytest.raises(ValueError, match=r"sustainable_yield is .*; allowed: a finite number >= 0"):
+        social.yield_share(HARVEST, sustainable_yield=wrong, first_stock=1)
+
+
 def test_a_yield_share_of_nothing_is_undefined():
     assert social.yield_share(HARVEST, sustainable_yield=0, first_stock=0).isnan()
 
@@ -143,13 +156,14 @@ def test_equality_is_one_when_all_have_the_same_and_one_nth_when_one_has_all():
 @pytest.mark.parametrize(
     ("harvest", "played", "error", "message"),
     [
-        (HARVEST.int(), None, TypeError, "harvest is a tensor of torch.int32; float is wanted"),
-        (HARVEST.numpy(), None, TypeError, "harvest is a ndarray; a torch tensor of float is wanted"),
-        (HARVEST[0], None, ValueError, r"harvest is \[2\]; \[..., T, N\]"),
+        (HARVEST.int(), None, TypeError, "harvest is a tensor of torch.int32; allowed: float"),
+        (HARVEST.numpy(), None, TypeError, "harvest is a ndarray; allowed: a torch tensor of float"),
+        (HARVEST[0], None, ValueError, r"harvest is \[2\]; allowed: \[..., T, N\]"),
         (HARVEST[:, :0], None, ValueError, "at least one agent"),
         (-HARVEST, None, ValueError, "below 0"),
-        (HARVEST, torch.ones(4), TypeError, "played is a tensor of torch.float32; bool is wanted"),
-        (HARVEST, torch.ones(5, dtype=torch.bool), ValueError, r"played is wanted as \[4\]"),
+        (HARVEST / 0, None, ValueError, "infinity; allowed: "),
+        (HARVEST, torch.ones(4), TypeError, "played is a tensor of torch.float32; allowed: bool"),
+        (HARVEST, torch.ones(5, dtype=torch.bool), ValueError, r"played is \[5\] .*; allowed: played \[4\]"),
         (HARVEST, torch.tensor([True, False, True, False]), ValueError, "turns True again"),
     ],
 )
@@ -159,11 +173,15 @@ def test_what_does_not_fit_is_named(harvest, played, error, message):
 
 
 def test_a_summary_names_what_does_not_fit_together():
-    with pytest.raises(TypeError, match=r"in_play is a tensor of .*; bool is wanted"):
+    with pytest.raises(TypeError, match=r"in_play is a tensor of .*; allowed: bool"):
         social.summary(HARVEST, HARVEST)
-    with pytest.raises(ValueError, match=r"harvest is \[4, 2\] and in_play \[3, 2\]"):
+    with pytest.raises(ValueError, match=r"harvest is \[4, 2\] and in_play is \[3, 2\]; allowed: equal"):
         social.summary(HARVEST, IN_PLAY[:3])
-    with pytest.raises(ValueError, match="both sustainable_yield and first_stock"):
+    with pytest.raises(ValueError, match="only first_stock is given; allowed: both sustainable_yield and"):
         social.summary(HARVEST, IN_PLAY, first_stock=3)
+    with pytest.raises(ValueError, match=r"played is \[\]; allowed: \[..., T\]"):
+        social.summary(None, None, played=torch.tensor(True))
+    with pytest.raises(ValueError, match="turns True again"):
+        social.summary(None, None, played=torch.tensor([False, True]))
     with pytest.raises(ValueError, match="first_stock is -1"):
         social.summary(HARVEST, IN_PLAY, sustainable_yield=1, first_stock=-1)

@@ -47,7 +47,7 @@ def test_one_replica_has_no_interval_and_values_that_are_not_finite_are_refused(
     assert np.isnan([alone.low, alone.high]).all()
     with pytest.raises(ValueError, match=r"values is \[1\.0, nan\]; allowed: finite numbers"):
         estimate([1.0, float("nan")])
-    with pytest.raises(ValueError, match=r"values is \[0\]; expected: \[R\]"):
+    with pytest.raises(ValueError, match=r"values is \[0\]; allowed: \[R\]"):
         estimate([])
     with pytest.raises(ValueError, match="there are no values"):
         estimate()
@@ -64,5 +64,5 @@ def test_a_curve_has_an_interval_at_each_episode():
     assert (low[1], high[1]) == (5.0, 5.0)
     assert 2.0 <= low[2] < 3.0 < high[2] <= 4.0
     assert np.isnan([middle[3], low[3], high[3]]).all()
-    with pytest.raises(ValueError, match=r"curves is \[4\]; expected: \[R, E\]"):
+    with pytest.raises(ValueError, match=r"curves is \[4\]; allowed: \[R, E\]"):
         curve_interval(curves[0])

@@ -284,7 +284,7 @@ def test_the_state_is_the_whole_board_in_colour():
 def test_devices_that_are_not_there_are_refused():
     with pytest.raises(ValueError, match='device is "meta"; allowed: "cpu" and "cuda"'):
         CommonsEnv(SHORT, device="meta")
-    with pytest.raises(ValueError, match="threads is 2; allowed on a GPU: None"):
+    with pytest.raises(ValueError, match="threads is 2; allowed: None on a GPU"):
         CommonsEnv(SHORT, device="cuda", threads=2)
 
 

@@ -30,6 +30,7 @@ Each imports only from those above it:
     experiment   Experiment: what is trained and how, a value
     stored       load: a run built again from its directory
     agents       the learners and policies of a population
+    outcome      trained agents in fresh worlds, beside the random policy
     running      run: an experiment from its learners to its report
     evaluation   stored agents in fresh worlds, alone and among each other
     reporting    finished runs beside the published study

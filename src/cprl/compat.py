@@ -67,6 +67,8 @@ class LeanStepEnv(EnvBase):
         """Like `EnvBase.step_and_maybe_reset`, for all worlds."""
 
     def _step_and_maybe_reset(self, tensordict: TensorDictBase) -> tuple[TensorDictBase, TensorDictBase]:
+        if not isinstance(tensordict, TensorDictBase):
+            raise ValueError(f"tensordict is a {type(tensordict).__name__}; allowed: a TensorDict")
         if "next" in tensordict or "_step" in tensordict:  # a step of some worlds, or into given tensors
             return super()._step_and_maybe_reset(tensordict)  # type: ignore[no-any-return]
         return self.lean_step(tensordict)

@@ -3,7 +3,7 @@
 import shutil
 from collections.abc import Sequence
 from contextlib import AbstractContextManager, ExitStack, nullcontext, suppress
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, dataclass
 from datetime import datetime
 from functools import partial
 from pathlib import Path
@@ -15,12 +15,11 @@ from torchrl.envs import EnvBase
 from cprl.agents import Population
 from cprl.custom import Custom, made
 from cprl.envs.make_env import make_env
-from cprl.envs.state import check_restorable, load_transforms_state, transforms_state
+from cprl.envs.state import check_restorable, transforms_state
 from cprl.envs.unwrap import agent_names, commons_of
 from cprl.experiment import Experiment
 from cprl.finite import summary
-from cprl.measuring.episodes import Episode
-from cprl.measuring.evaluate import evaluate
+from cprl.outcome import evaluate_population, exploration, fresh_env, write_evaluation
 from cprl.output import ERR, OUT, console
 from cprl.process import prepare_process
 from cprl.runs.checkpoints import FOLDER, Checkpointer, checkpoints_in
@@ -181,16 +180,15 @@ def _say_what_changed(directory: Path) -> None:
 
 def _finish(directory: Path, experiment: Experiment, own: _Made, training: Training) -> None:
     """All that follows the training; `report.json`, the sign that a run is finished, comes last."""
-    played = evaluate_population(experiment, own)
-    for name, of_policy in played.items():
-        _write_episodes(directory, f"evaluation/{name}.parquet", of_policy, experiment.evaluation_episodes)
+    played = evaluate_population(experiment, own.env, own.population)
+    write_evaluation(directory, played, of_replica=experiment.evaluation_episodes)
     title = _title(experiment)
     figure = training_curve(directory, title=title, random=played["random"])
     broken = training.finite.found
     report = {"training_s": round(training.spent_s, 1), "steps": training.steps, "finished": _now()}
     also = {"not_finite": [asdict(one) for one in broken]} if broken else {}
     write_json(directory / REPORT, {**report, "episodes": experiment.episodes, **also})
-    columns = {"random": played["random"], f"trained{_epsilon(own.population)}": played["trained"]}
+    columns = {"random": played["random"], f"trained{exploration(own.population)}": played["trained"]}
     summarise(directory, title=title, played=columns, figure=figure, note=summary(broken))
 
 
@@ -215,7 +213,7 @@ def _make(experiment: Experiment, allow: Sequence[str], *, starts: bool = True) 
         starts=starts,
     )
     with torch.random.fork_rng(devices=[]):
-        _fresh_env(experiment)  # what the evaluation cannot have is refused now, not after hours
+        fresh_env(experiment)  # what the evaluation cannot have is refused now, not after hours
         population.random_policy(experiment.evaluation_episodes)
         population.policy(experiment.evaluation_episodes)
     return _Made(env=env, population=population, callbacks=[made(own) for own in experiment.callbacks])
@@ -259,38 +257,6 @@ def _logger(logger: str | Custom, directory: Path, env: EnvBase) -> LoggerCallba
     )
 
 
-def evaluate_population(experiment: Experiment, own: _Made) -> dict[str, list[Episode]]:
-    """Fresh episodes, so many of each replica: of the "random" policy, and of everybody as "trained"."""
-    fresh, worlds = _fresh_env(experiment), experiment.evaluation_episodes
-    load_transforms_state(fresh, transforms_state(own.env))
-    return {
-        "random": evaluate(fresh, own.population.random_policy(worlds)),
-        "trained": evaluate(fresh, own.population.policy(worlds), explore=True),
-    }
-
-
-def _fresh_env(experiment: Experiment) -> EnvBase:
-    """The worlds of the evaluation."""
-    return make_env(
-        experiment.game,
-        worlds=experiment.replicas * experiment.evaluation_episodes,
-        seed=experiment.seed + 1,
-        device=experiment.device,
-        transforms=experiment.transforms,
-    )
-
-
-def _epsilon(population: Population) -> str:
-    """With which probability learners of values explore in evaluation, for people; others draw from a
-    policy."""
-    chances = {
-        learner.settings.epsilon_evaluation
-        for learner in population.learners.values()
-        if not learner.actor.stochastic
-    }
-    return "".join(f", epsilon {chance:g}" for chance in sorted(chances))
-
-
 def _viewer(
     watch: str, directory: Path, env: EnvBase, experiment: Experiment
 ) -> AbstractContextManager[ViewerCallback | None]:
@@ -311,18 +277,6 @@ def _viewer(
 def _title(experiment: Experiment) -> str:
     """For tables and figures."""
     return f"{experiment.name}, {experiment.replicas} replicas, {experiment.episodes} episodes"
-
-
-def _write_episodes(directory: Path, name: str, played: list[Episode], of_replica: int) -> None:
-    """Writes episodes in fresh worlds, so many of each replica, as a table; again where one is there."""
-    path = directory / name
-    path.parent.mkdir(exist_ok=True)
-    for old in (path, path.with_suffix(".arrows")):
-        old.unlink(missing_ok=True)
-    with EpisodeTable(path, run=directory) as table:
-        for number, episode in enumerate(played):
-            replica, nth = divmod(number, of_replica)
-            table.add(replace(episode, world=replica, episode=nth))
 
 
 def _now() -> str:

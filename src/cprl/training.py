@@ -15,7 +15,7 @@ from cprl.collectors import StepCollector
 from cprl.envs.make_env import check_env, spaces_of
 from cprl.envs.state import carried_state, env_state, load_carried, load_env_state
 from cprl.envs.unwrap import commons_of
-from cprl.finite import FiniteCheck, OnNan
+from cprl.finite import EVERY_STEPS, FiniteCheck, OnNan
 from cprl.learners.base import LaneLosses, Learner, check_agents, check_numbers, learned_in
 from cprl.measuring.episodes import Episode, EpisodeTracker
 from cprl.policies.assignment import AgentIndices, AgentPolicies
@@ -126,21 +126,30 @@ class Training:
             for _ in range(self.update_every):
                 for agents, learner in self.learners.items():
                     self._losses[agents].add(self._update(learner))
-            self.finite.check_losses(self._losses, self.steps)
         for on_step in self._on_step:
             on_step(batch)
         ended = self._tracker.add(batch)
         if ended:
             self._end(ended, batch)
+        elif self.steps % EVERY_STEPS == 0:
+            self._check_sums()
 
     def _update(self, learner: Learner) -> Tensor | None:
         try:
             return learner.update()
         except (RuntimeError, ValueError):  # some losses refuse NaN in words of their own
+            self._check_sums()
             self.finite.check_weights(self.steps)
             raise
 
+    def _check_sums(self, ended: Sequence[Episode] = ()) -> None:
+        returns = self._tracker.returns
+        for episode in ended:
+            returns[episode.world] = episode.return_
+        self.finite.check_sums(self._losses, returns, self.steps)
+
     def _end(self, ended: Sequence[Episode], batch: TensorDictBase) -> None:
+        self._check_sums(ended)
         self.finite.check_weights(self.steps)
         worlds = torch.zeros(len(self._played), dtype=torch.bool)
         worlds[[episode.world for episode in ended]] = True
@@ -163,6 +172,7 @@ class Training:
             NotFiniteError: where weights are not finite, unless `on_nan` is "continue".
         """
         carried = self._step_collector().carried
+        self._check_sums()
         self.finite.check_weights(self.steps)
         self.finite.saved_step = self.steps
         return {

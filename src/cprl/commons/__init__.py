@@ -2,12 +2,14 @@
 
 In reading order:
 
+    checks       checks of arguments, and their messages
     rules        every number of the game, with unit, range and source
     maps         boards: drawn, named or generated
     observation  what agents observe, and in which form
     game         Game: a map, its rules and its observations
     world        the arrays of B worlds: state, step output, scratch memory
     colours      the classes of cells and their colours
+    near         which sites are near each other
     tables       a game as lookup tables for the compiled rules
     chance       counter-based random numbers
     moves        turning, walking and clashes, on one world
@@ -19,6 +21,7 @@ In reading order:
     compiled     compiles the rules for a target
     threads      CpuThreads: runs the loops on CPU threads
     cuda         CudaThreads: runs the loops on a GPU
+    sizes        the memory that B worlds take
     state        reads, checks and restores the state of B worlds
     batch        Batch: B worlds, played a turn at a time
     decoding     observations back to classes of cells

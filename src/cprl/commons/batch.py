@@ -6,9 +6,11 @@ from typing import Any, Protocol
 import numpy as np
 from numpy.typing import DTypeLike, NDArray
 
+from cprl.commons import checks
 from cprl.commons import state as states
 from cprl.commons.game import Game, output_shapes
 from cprl.commons.loops import Loop
+from cprl.commons.sizes import check_memory
 from cprl.commons.threads import CpuThreads
 from cprl.commons.world import Actions, Bools, Bytes, Shown, StepOutput, Worlds, empty_worlds
 
@@ -42,6 +44,7 @@ class Batch:
 
     Raises:
         ValueError: If `worlds`, `seed`, `first_world` or `threads` is out of range.
+        MemoryError: If the worlds do not fit into memory.
     """
 
     def __init__(
@@ -54,16 +57,21 @@ class Batch:
         threads: int | None = None,
         driver: Driver | None = None,
     ) -> None:
-        if worlds < 1:
-            raise ValueError(f"worlds is {worlds}; allowed: an integer >= 1")
-        if first_world < 0 or first_world + worlds > 2**32:
+        checks.instance("game", game, Game, "a cprl.Game")
+        worlds = checks.integer("worlds", worlds, 1, 2**32)
+        first_world = checks.integer("first_world", first_world, 0, 2**32 - 1)
+        if first_world + worlds > 2**32:
             raise ValueError(
                 f"first_world is {first_world} and worlds is {worlds}; "
                 "allowed: worlds with indices from 0 to 2**32 - 1"
             )
+        checks.seed(seed)
+        if driver is None:
+            check_memory(game, worlds)
         self.game = game
         self.size = worlds
         self.driver: Driver = driver or CpuThreads(game, worlds, threads=threads)
+        self._has_begun = False
         host = empty_worlds(worlds=worlds, agents=game.agents, sites=len(game.map.sites))
         host.number[:, 0] = np.arange(first_world, first_world + worlds, dtype=np.uint64)
         self.now: Worlds = self.driver.place(host)
@@ -78,9 +86,7 @@ class Batch:
 
     def set_seed(self, seed: int) -> None:
         """Restarts from a seed: the next episode of each world is the first episode of this seed."""
-        if not 0 <= seed < 2**64:
-            raise ValueError(f"seed is {seed}; allowed: 0 to 2**64 - 1")
-        self.driver.write(self.now.seed, np.full((self.size, 1), seed, np.uint64))
+        self.driver.write(self.now.seed, np.full((self.size, 1), checks.seed(seed), np.uint64))
         self.driver.write(self.now.episode, np.full((self.size, 1), -1, np.int32))
 
     def new_output(self) -> StepOutput:
@@ -93,9 +99,19 @@ class Batch:
 
         Args:
             output: Arrays made by `new_output`.
-            which: bool [B], the worlds that begin; None for all.
+            which: bool [B], the worlds that begin; None for all. Of a new batch, all worlds begin.
+
+        Raises:
+            ValueError: If an array has the wrong form, or worlds of a new batch are left out.
         """
-        self.driver.run("begin_worlds", self.now, self._all_worlds if which is None else which, output)
+        if which is None:
+            which = self._all_worlds
+        else:
+            checks.array("which", which, (self.size,), np.bool_)
+            if not self._has_begun and not self.driver.read(which).all():
+                raise ValueError("which leaves worlds out; allowed at first: None, so that all worlds begin")
+        self.driver.run("begin_worlds", self.now, which, output)
+        self._has_begun = True
         return output
 
     def play(self, actions: Actions, output: StepOutput) -> StepOutput:
@@ -106,7 +122,8 @@ class Batch:
             output: Arrays made by `new_output`.
 
         Raises:
-            ValueError: If an action is out of range or an array has the wrong form; no world has changed.
+            ValueError: If an action is out of range, an array has the wrong form, or the worlds have not
+                begun; no world has changed.
         """
         self.check(actions)
         self.driver.run("play_worlds", self.now, actions, output)
@@ -126,6 +143,7 @@ class Batch:
 
     def show(self, output: StepOutput, *, world: int = 0) -> Shown:
         """A copy of one world for display; `output` holds its latest observation."""
+        world = checks.integer("world", world, 0, self.size - 1)
         read, now = self.driver.read, self.now
         return Shown(
             observation=read(output.observation[world]),
@@ -158,17 +176,19 @@ class Batch:
         for name, values in states.checked(state, worlds=self.size, game=self.game).items():
             self.driver.write(getattr(self.now, name), values)
         self.driver.run("refresh_worlds", self.now, self._all_worlds, output)
+        self._has_begun = True
         return output
 
     def check(self, actions: Actions) -> None:
         """Checks actions for `play`.
 
         Raises:
-            ValueError: If `actions` is not int64 [B, N], or an action is out of range.
+            ValueError: If `actions` is not int64 [B, N], an action is out of range, or the worlds have not
+                begun.
         """
-        expected = self.size, self.game.agents
-        if actions.shape != expected or actions.dtype != np.int64:
-            raise ValueError(f"actions are {actions.dtype} {actions.shape}; expected: int64 {expected}")
+        checks.array("actions", actions, (self.size, self.game.agents), np.int64)
+        if not self._has_begun:
+            raise ValueError("the worlds have not begun; allowed: begin() or load() first")
         known = len(self.game.actions)
         at = self.driver.first_unknown(actions, known)
         if at >= 0:

@@ -5,6 +5,7 @@ With NUMBA_ENABLE_CUDASIM=1 Numba simulates all of this without a GPU: slowly, a
 
 from collections.abc import Callable
 from functools import cache
+from math import isfinite
 from types import FunctionType
 from typing import Any, Final
 
@@ -15,6 +16,7 @@ from numpy.typing import DTypeLike, NDArray
 from cprl.commons.compiled import compiled
 from cprl.commons.game import Game
 from cprl.commons.loops import FUNCTIONS, LOOPS, Loop
+from cprl.commons.sizes import check_memory
 from cprl.commons.tables import Tables
 from cprl.commons.world import Actions, Scratch, StepOutput, Worlds, empty_scratch
 
@@ -38,6 +40,7 @@ class CudaThreads:
 
     Raises:
         RuntimeError: If Numba finds no GPU.
+        MemoryError: If the worlds do not fit into its memory.
     """
 
     def __init__(self, game: Game, worlds: int) -> None:
@@ -46,6 +49,7 @@ class CudaThreads:
                 "Numba finds no GPU; it needs NVIDIA's driver and the package numba-cuda "
                 "(install cprl[cuda12] or cprl[cuda13])"
             )
+        check_memory(game, worlds, free=_free_bytes())
         self.threads = worlds
         self.tables = Tables(*(_constant(entry) for entry in game.tables))
         scratch = empty_scratch(
@@ -149,6 +153,12 @@ def _constant(entry: Any) -> Any:
 
 def _worlds_innermost(shape: tuple[int, ...], dtype: DTypeLike) -> Any:
     return cuda.to_device(np.zeros(shape, dtype, order="F"))
+
+
+def _free_bytes() -> int | None:
+    """The free memory of the current GPU; None in Numba's simulator, which has the main memory."""
+    free = cuda.current_context().get_memory_info()[0]
+    return int(free) if isfinite(free) else None
 
 
 def _blocks(worlds: int) -> int:

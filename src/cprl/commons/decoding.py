@@ -4,6 +4,7 @@ from typing import Final
 
 import numpy as np
 
+from cprl.commons.checks import instance, refusal
 from cprl.commons.game import Game
 from cprl.commons.observation import classes_shown
 from cprl.commons.world import Bytes
@@ -21,7 +22,14 @@ def classes_seen(game: Game, windows: Bytes) -> Bytes:
 
     Returns:
         uint8 [T, N, X, Y].
+
+    Raises:
+        ValueError: If the observations are not of this game.
     """
+    instance("game", game, Game, "a cprl.Game")
+    shape = game.observation_shape
+    if getattr(windows, "ndim", 0) != 5 or windows.shape[2:] != shape or windows.dtype != np.uint8:
+        raise refusal("windows", getattr(windows, "shape", windows), f"uint8 [T, N, {shape}]")
     if game.observation.encoding == "one_hot":
         shown = classes_shown(game.observation, agents=game.agents, hides=game.rules.walls_block_sight)
         classes: Bytes = np.take(np.array(shown, np.uint8), windows.argmax(2))

@@ -7,11 +7,12 @@ from typing import Any
 
 import numpy as np
 
+from cprl.commons.checks import instance
 from cprl.commons.colours import FIRST_AGENT, MAX_AGENTS_APART, class_colour
 from cprl.commons.maps import Map
 from cprl.commons.observation import Observation, channel_names
 from cprl.commons.rules import Rules
-from cprl.commons.tables import Tables, build_tables
+from cprl.commons.tables import Tables, build_tables, check_sizes
 from cprl.commons.world import Bytes
 from cprl.spaces import Spaces
 
@@ -30,22 +31,25 @@ class Game:
     observation: Observation = field(default_factory=Observation)
 
     def __post_init__(self) -> None:
+        for name, kind in (("map", Map), ("rules", Rules), ("observation", Observation)):
+            instance(f"Game.{name}", getattr(self, name), kind, f"a cprl.{kind.__name__}")
         agents, sites = self.agents, len(self.map.sites)
         may_fire, may_bite, freeze = self.rules.may_fire, self.rules.may_bite, self.rules.freeze_steps
         if isinstance(may_fire, tuple) and len(may_fire) != agents:
-            raise ValueError(f"Rules.may_fire has {len(may_fire)} entries; the map has {agents} agents")
+            raise ValueError(f"Rules.may_fire has {len(may_fire)} entries; allowed: {agents}, one per agent")
         if isinstance(freeze, tuple) and len(freeze) != agents:
-            raise ValueError(f"Rules.freeze_steps has {len(freeze)} rows; the map has {agents} agents")
+            raise ValueError(f"Rules.freeze_steps has {len(freeze)} rows; allowed: {agents}, one per agent")
         if may_bite is not None and (len(may_bite), len(may_bite[0])) != (agents, sites):
             raise ValueError(
-                f"Rules.may_bite is {len(may_bite)} x {len(may_bite[0])}; "
-                f"the map has {agents} agents and {sites} sites"
+                f"Rules.may_bite is {len(may_bite)} x {len(may_bite[0])}; allowed: {agents} x {sites}, "
+                "agents x sites"
             )
         if self.observation.area == "full" and self.rules.walls_block_sight:
             raise ValueError(
-                'Observation.area is "full" and Rules.walls_block_sight is True; use area="window" where '
-                "walls block sight"
+                'Observation.area is "full" and Rules.walls_block_sight is True; allowed: area="window" '
+                "where walls block sight"
             )
+        check_sizes(self.map, self.rules)
         if self.observation.agents_apart and agents > MAX_AGENTS_APART:
             raise ValueError(
                 f"Observation.agents_apart is True and the map has {agents} agents; allowed: at most "

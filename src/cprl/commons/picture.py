@@ -1,14 +1,17 @@
 """An image of the board for people: apples, walls, and each agent in its own colour with its heading."""
 
-from typing import Final
+from typing import Any, Final
 
 import numpy as np
+from numpy.typing import NDArray
 
+from cprl.commons.checks import floats, instance, integer, memory, refusal
 from cprl.commons.colours import APPLE, BEAM, COLOURS, GROUND, WALL, agent_colour
 from cprl.commons.game import Game
 from cprl.commons.maps import Map
 from cprl.commons.world import COL_STEP, ROW_STEP, Bools, Bytes, Ints, Shown
 
+LARGEST_CELL_PIXELS: Final = 1000
 GRID_COLOUR: Final = (28, 30, 36)
 CELL_COLOURS: Final = {GROUND: (16, 18, 22), WALL: (125, 125, 125), APPLE: (46, 184, 76)}
 
@@ -34,17 +37,26 @@ def board_image(
         heading: int [N], 0 up, 1 right, 2 down, 3 left.
         in_play: bool [N], the agents to draw; None for all.
         beams: bool [H, W], cells that a beam covers; None for no beam.
-        cell_pixels: The size of a cell in pixels, at least 8.
+        cell_pixels: The size of a cell in pixels, 8..1000.
 
     Returns:
         uint8 [H * cell_pixels + 1, W * cell_pixels + 1, 3], RGB.
 
     Raises:
-        ValueError: If `cell_pixels` is below 8.
+        ValueError: If `cell_pixels` is no integer or below 8, or an array does not fit the map.
+        MemoryError: If the image does not fit into memory.
     """
-    if cell_pixels < 8:
-        raise ValueError(f"cell_pixels is {cell_pixels}; allowed: an integer >= 8")
-    size = cell_pixels
+    instance("board", board, Map, "a cprl.Map")
+    size = integer("cell_pixels", cell_pixels, 8, LARGEST_CELL_PIXELS)
+    stock = _numbers("stock", stock, (len(board.sites),), 1)
+    agents = floats("row", row).shape[:1]
+    row = _numbers("row", row, agents, board.height - 1)
+    col = _numbers("col", col, agents, board.width - 1)
+    heading = _numbers("heading", heading, agents, len(ROW_STEP) - 1)
+    in_play = None if in_play is None else _numbers("in_play", in_play, agents, 1)
+    beams = None if beams is None else _numbers("beams", beams, (board.height, board.width), 1)
+    pixels = (board.height * size + 1) * (board.width * size + 1)
+    memory(f"cell_pixels is {size}: the pixels", 3 * pixels, advice="fewer pixels")
     image = np.empty((board.height * size + 1, board.width * size + 1, 3), np.uint8)
     image[:] = GRID_COLOUR
     kinds = np.full((board.height, board.width), GROUND)
@@ -82,9 +94,22 @@ def world_image(board: Map, shown: Shown, *, cell_pixels: int = 24) -> Bytes:
 
 def first_image(game: Game, *, cell_pixels: int = 24) -> Bytes:
     """An image of the board at the start of an episode; see `board_image`."""
+    instance("game", game, Game, "a cprl.Game")
     starts = np.array(game.map.starts, np.int32)
     full = np.ones(len(game.map.sites), np.uint8)
     return board_image(game.map, full, *starts.T, cell_pixels=cell_pixels)
+
+
+def _numbers(name: str, values: Any, shape: tuple[int, ...], highest: int) -> NDArray[Any]:
+    """An array of integers or bools of a shape, 0 to `highest`; raises a ValueError for anything else."""
+    try:
+        found = np.asarray(values)
+    except (TypeError, ValueError, RuntimeError):
+        found = np.empty(0, object)
+    fits = found.dtype.kind in "biu" and found.shape == shape and found.ndim > 0
+    if not fits or (found.astype(np.int64) < 0).any() or (found > highest).any():
+        raise refusal(name, values, f"integers {list(shape)} from 0 to {highest}")
+    return found
 
 
 def _fill(image: Bytes, r: int, c: int, size: int, inset: int, colour: tuple[int, int, int]) -> None:

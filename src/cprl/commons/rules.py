@@ -15,6 +15,11 @@ ACTIONS: Final = ("forward", "backward", "left", "right", "turn_left", "turn_rig
 
 Norm = Literal["euclidean", "manhattan", "chebyshev"]
 
+LARGEST_WINDOW_CELLS: Final = 1000
+"""The largest number of rows or columns of a window."""
+SMALLEST_PROBABILITY: Final = 2**-32
+"""Chance is compared in 32 bits: a smaller probability could never come true, or would be rounded up."""
+
 
 @dataclass(frozen=True, kw_only=True)
 class Rules:
@@ -29,7 +34,7 @@ class Rules:
 
     regrow_prob: tuple[float, ...] = (0.0, 0.01, 0.01, 0.05, 0.05, 0.1)
     """Probability per turn that an empty site grows an apple, indexed by the number of apples near it [W];
-    the last entry also applies to every larger number. Each in 0..1."""
+    the last entry also applies to every larger number. Each 0, or 2**-32 (2.3e-10) to 1."""
 
     regrow_radius_cells: float = 2.0
     """The distance up to which apples count as near, in cells, measured by `regrow_norm`, inclusive [W].
@@ -121,12 +126,16 @@ class Rules:
         return ACTIONS if self.has_beam else tuple(name for name in ACTIONS if name != "beam")
 
 
-def _is_odd(value: Any) -> bool:
-    return is_count(value, 1) and value % 2 == 1
+def _is_odd(value: Any, high: int = 2**31 - 1) -> bool:
+    return is_count(value, 1, high) and value % 2 == 1
 
 
 def _are_probabilities(value: Any) -> bool:
-    return isinstance(value, tuple) and bool(value) and all(is_number(p, 0, 1) for p in value)
+    return isinstance(value, tuple) and bool(value) and all(map(_is_probability, value))
+
+
+def _is_probability(value: Any) -> bool:
+    return is_number(value, 0, 1) and (value == 0 or value >= SMALLEST_PROBABILITY)
 
 
 def _are_beam_lengths(value: Any) -> bool:
@@ -156,7 +165,7 @@ _SWITCHES: Final = (
     "self_paint_stays",
 )
 _CHECKS: Final[dict[str, Check]] = {
-    "regrow_prob": Check(_are_probabilities, "one or more numbers in 0..1"),
+    "regrow_prob": Check(_are_probabilities, "one or more numbers, each 0 or 2**-32 (2.3e-10) to 1"),
     "regrow_radius_cells": Check(lambda value: is_number(value, 0, 1000), "a number in 0..1000"),
     "regrow_norm": one_of(*get_args(Norm)),
     "beam_length_cells": Check(_are_beam_lengths, "an integer >= 1, or four of them by heading"),
@@ -171,8 +180,12 @@ _CHECKS: Final[dict[str, Check]] = {
         lambda value: value is None or is_table(value, is_bool),
         "None, or a table of True and False: a row per agent, a column per site",
     ),
-    "window_rows": Check(lambda value: is_count(value, 1), "an integer >= 1"),
-    "window_columns": Check(_is_odd, "an odd integer >= 1"),
+    "window_rows": Check(
+        lambda value: is_count(value, 1, LARGEST_WINDOW_CELLS), f"an integer from 1 to {LARGEST_WINDOW_CELLS}"
+    ),
+    "window_columns": Check(
+        lambda value: _is_odd(value, LARGEST_WINDOW_CELLS), f"an odd integer from 1 to {LARGEST_WINDOW_CELLS}"
+    ),
     "episode_steps": Check(lambda value: is_count(value, 1), "an integer >= 1"),
     **dict.fromkeys(_SWITCHES, SWITCH),
 }

@@ -6,6 +6,7 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
+from cprl.commons.checks import array, instance, shown
 from cprl.commons.game import Game
 from cprl.commons.world import PLAYING, TRUNCATED, Worlds, empty_worlds
 
@@ -34,21 +35,28 @@ def checked(state: Mapping[str, Any], *, worlds: int, game: Game) -> State:
     """
     empty = empty_worlds(worlds=worlds, agents=game.agents, sites=len(game.map.sites))
     expected = {name: getattr(empty, name) for name in NAMES}
+    instance("state", state, Mapping, f"a table of arrays by the names {sorted(expected)}")
     if set(state) != set(expected):
-        missing, unknown = sorted(set(expected) - set(state)), sorted(set(state) - set(expected))
+        missing = sorted(set(expected) - set(state))
+        unknown = sorted(map(str, set(state) - set(expected)))
         raise ValueError(
-            f"the state lacks {missing} and has the unknown entries {unknown}; expected: {sorted(expected)}"
+            f"the state lacks {missing} and has the unknown entries {shown(unknown)}; allowed: exactly "
+            f"{sorted(expected)}"
         )
-    arrays = {name: np.asarray(state[name]) for name in expected}
-    for name, array in arrays.items():
-        if array.shape != expected[name].shape or array.dtype != expected[name].dtype:
-            raise ValueError(
-                f"state[{name!r}] is {array.dtype} {array.shape}; "
-                f"expected: {expected[name].dtype} {expected[name].shape}"
-            )
+    arrays = {name: _as_array(name, state[name]) for name in expected}
+    for name, form in expected.items():
+        array(f"state[{name!r}]", arrays[name], form.shape, form.dtype)
     _check_ranges(arrays, game)
     _check_places(arrays, game)
     return arrays
+
+
+def _as_array(name: str, values: Any) -> NDArray[Any]:
+    """An entry as an array, e.g. of a list or a torch tensor."""
+    try:
+        return np.asarray(values)
+    except (ValueError, TypeError) as error:  # nested lists of unequal lengths, or memory of a GPU
+        raise ValueError(f"state[{name!r}] is {shown(values)}; allowed: an array on the CPU") from error
 
 
 def _check_ranges(arrays: State, game: Game) -> None:

@@ -1,6 +1,5 @@
 """A game as lookup tables for the compiled rules."""
 
-from math import hypot
 from typing import Final, NamedTuple
 
 import numpy as np
@@ -9,12 +8,16 @@ from numpy.typing import NDArray
 from cprl.commons.chance import REST_BITS, threshold
 from cprl.commons.colours import FIRST_AGENT, GROUND, WALL, class_colour
 from cprl.commons.maps import Map
+from cprl.commons.near import neighbours
 from cprl.commons.observation import Observation, classes_shown
-from cprl.commons.rules import Norm, Rules
+from cprl.commons.rules import Rules
 from cprl.commons.world import COL_STEP, ROW_STEP, Bools, Indices, Ints
 
 CLASS_SHIFT: Final = 24
 """A paint is a colour in 24 bits, and its class from this bit on."""
+
+LARGEST_TABLE: Final = 2**27
+"""The largest number of pairs of near sites, or of lines of sight; takes some seconds to build."""
 
 
 class Tables(NamedTuple):
@@ -85,29 +88,40 @@ class Tables(NamedTuple):
     self_paint_stays: bool
 
 
-def distance(norm: Norm, rows: int, cols: int) -> float:
-    """The distance between two cells, in cells, from their difference in rows and columns."""
-    if norm == "euclidean":
-        return hypot(rows, cols)
-    if norm == "manhattan":
-        return abs(rows) + abs(cols)
-    return max(abs(rows), abs(cols))
+def check_sizes(board: Map, rules: Rules) -> None:
+    """Checks the sizes of the two largest tables, before they are built.
+
+    Raises:
+        ValueError: If a table would be too large; the message says what to change.
+    """
+    reach, sites = int(rules.regrow_radius_cells), len(board.sites)
+    around = (2 * min(reach, board.height) + 1) * (2 * min(reach, board.width) + 1) - 1
+    pairs = sites * min(sites - 1, around)
+    if pairs > LARGEST_TABLE:
+        raise ValueError(
+            f"Rules.regrow_radius_cells is {rules.regrow_radius_cells} and the map has {sites:,} sites, up "
+            f"to {pairs:,} pairs of near sites; allowed: {LARGEST_TABLE:,} pairs, so a smaller radius or map"
+        )
+    rim = _rim(board, rules)
+    cells = (board.height + 2 * rim) * (board.width + 2 * rim)
+    entries = 4 * cells * rules.window_rows * rules.window_columns
+    if rules.walls_block_sight and entries > LARGEST_TABLE:
+        raise ValueError(
+            f"Rules.walls_block_sight is True with windows of {rules.window_rows} x {rules.window_columns} "
+            f"cells on a board of {board.height} x {board.width}, {entries:,} lines of sight; allowed: "
+            f"{LARGEST_TABLE:,}, so a smaller window or map"
+        )
 
 
-def neighbours(board: Map, rules: Rules) -> list[list[int]]:
-    """The other sites within `regrow_radius_cells` of each site: K lists of site indices."""
-    reach = int(rules.regrow_radius_cells)
-    site_on = {cell: site for site, cell in enumerate(board.sites)}
-    offsets = [
-        (rows, cols)
-        for rows in range(-min(reach, board.height), min(reach, board.height) + 1)
-        for cols in range(-min(reach, board.width), min(reach, board.width) + 1)
-        if (rows, cols) != (0, 0) and distance(rules.regrow_norm, rows, cols) <= rules.regrow_radius_cells
-    ]
-    return [
-        sorted(site_on[row + r, col + c] for r, c in offsets if (row + r, col + c) in site_on)
-        for row, col in board.sites
-    ]
+def _beam_half_width(board: Map, rules: Rules) -> int:
+    """Half the width of a beam, as far as the board extends."""
+    return min(rules.beam_width_cells // 2, max(board.height, board.width) - 1)
+
+
+def _rim(board: Map, rules: Rules, *, sees_all: bool = False) -> int:
+    """`Tables.rim`."""
+    window_reach = (0,) if sees_all else (rules.window_rows - 1, rules.window_columns // 2)
+    return max(1, *window_reach, _beam_half_width(board, rules))
 
 
 def _window_places(rules: Rules) -> list[tuple[int, int]]:
@@ -176,19 +190,19 @@ def _in_sight(board: Map, rules: Rules, walls: Bools, rim: int, stride: int) -> 
     places = _window_places(rules)
     inside = _board_cells(board, rim, stride)[0]
     seen = np.zeros((walls.size, 4, len(places)), np.bool_)
-    for heading in range(4):
-        for n, place in enumerate(places):
-            crossed = [_offset(*cell, heading, stride) for cell in cells_between(*place)]
+    for n, place in enumerate(places):
+        between = cells_between(*place)
+        for heading in range(4):
+            crossed = [_offset(*cell, heading, stride) for cell in between]
             seen[inside, heading, n] = ~walls[np.add.outer(inside, np.array(crossed, np.int64))].any(1)
     return seen
 
 
 def build_tables(board: Map, rules: Rules, observation: Observation) -> Tables:
     """Builds the tables of a game."""
-    agents, half_width = board.agents, rules.beam_width_cells // 2
+    agents, half_width = board.agents, _beam_half_width(board, rules)
     sees_all = observation.area == "full"
-    window_reach = (0,) if sees_all else (rules.window_rows - 1, rules.window_columns // 2)
-    rim = max(1, *window_reach, half_width)
+    rim = _rim(board, rules, sees_all=sees_all)
     stride = board.width + 2 * rim
 
     def cells(places: tuple[tuple[int, ...], ...]) -> list[int]:
@@ -204,8 +218,8 @@ def build_tables(board: Map, rules: Rules, observation: Observation) -> Tables:
     background.reshape(-1)[cells(board.walls)] = paints[WALL]
     site_at = np.full(background.size, -1, np.int32)
     site_at[cells(board.sites)] = range(len(board.sites))
-    near = neighbours(board, rules)
-    max_near = max(map(len, near))
+    near_first, near_sites = neighbours(board, rules)
+    max_near = int(np.diff(near_first).max())
     probs = [rules.regrow_prob[min(n, len(rules.regrow_prob) - 1)] for n in range(max_near + 1)]
     below = np.array([threshold(p) for p in probs], np.int64)
     freeze = rules.freeze_steps if isinstance(rules.freeze_steps, tuple) else ((rules.freeze_steps,),)
@@ -214,8 +228,8 @@ def build_tables(board: Map, rules: Rules, observation: Observation) -> Tables:
         background=background.reshape(-1),
         site_cell=np.array(cells(board.sites), np.uint32),
         site_at=site_at,
-        near_first=np.cumsum([0, *map(len, near)], dtype=np.int32),
-        near_sites=np.array([site for sites in near for site in sites], np.uint32),
+        near_first=near_first,
+        near_sites=near_sites,
         regrow_below=below,
         regrow_first_byte=((below - 1) >> REST_BITS).astype(np.int32),
         start=np.array(board.starts, np.int32),

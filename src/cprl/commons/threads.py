@@ -3,17 +3,20 @@
 import os
 from concurrent.futures import ThreadPoolExecutor
 from functools import cache
-from typing import Any
+from typing import Any, Final
 
 import numpy as np
 from numpy.typing import DTypeLike, NDArray
 
+from cprl.commons import checks
 from cprl.commons.compiled import entry_for_cpu, rules_for_cpu
 from cprl.commons.game import Game, output_shapes
 from cprl.commons.loops import Loop
 from cprl.commons.tables import Tables
 from cprl.commons.world import Actions, StepOutput, Worlds, empty_scratch
 
+MOST_THREADS: Final = 1024
+"""The largest number of threads; no machine has that many cores."""
 WORLDS_PER_THREAD = 512
 """With fewer worlds another thread does not pay: starting its share takes about 0.1 ms."""
 
@@ -33,12 +36,13 @@ class CpuThreads:
         threads: The number of threads that share the worlds; None uses all cores where that is faster.
 
     Raises:
-        ValueError: If `threads` is below 1.
+        ValueError: If `threads` is not allowed.
     """
 
     def __init__(self, game: Game, worlds: int, *, threads: int | None = None) -> None:
-        if threads is not None and threads < 1:
-            raise ValueError(f"threads is {threads}; allowed: an integer >= 1, or None for all cores")
+        if threads is not None:
+            allowed = f"an integer from 1 to {MOST_THREADS}, or None for all cores"
+            threads = checks.integer("threads", threads, 1, MOST_THREADS, allowed=allowed)
         limit = threads or os.cpu_count() or 1
         self.threads = min(limit, worlds if threads else -(-worlds // WORLDS_PER_THREAD))
         self.tables: Tables = game.tables
@@ -109,15 +113,17 @@ class CpuThreads:
         """Checks the arrays, because the compiled loops do not; see `entry_for_cpu`."""
         if not argument.flags.c_contiguous:
             raise ValueError(
-                f"an array {argument.dtype} {argument.shape} is not contiguous; allowed: contiguous arrays"
+                f"an array {argument.dtype} {list(argument.shape)} is not contiguous; allowed: contiguous "
+                "arrays"
             )
         if output is self._output:
             return
+        checks.instance("output", output, StepOutput, "a StepOutput, made by new_output()")
         arrays: dict[str, NDArray[Any]] = output._asdict()
         for (name, array), (shape, dtype) in zip(arrays.items(), self._expected, strict=True):
-            if array.shape != shape or array.dtype != dtype or not array.flags.carray:
+            checks.array(f"output.{name}", array, shape, dtype)
+            if not array.flags.carray:
                 raise ValueError(
-                    f"output.{name} is {array.dtype} {array.shape}; "
-                    f"expected: {np.dtype(dtype)} {shape}, contiguous and writeable"
+                    f"output.{name} is read-only or not contiguous; allowed: contiguous, writeable"
                 )
         self._output = output

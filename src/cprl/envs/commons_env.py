@@ -1,7 +1,6 @@
 """CommonsEnv: B worlds of a commons as one TorchRL environment."""
 
-import multiprocessing
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from math import prod
 from typing import Any
 
@@ -13,11 +12,12 @@ from torch import Tensor
 from torchrl.data import Bounded, Categorical, Composite, Unbounded
 
 from cprl import keys
-from cprl.commons.batch import Batch, Driver
+from cprl.commons import checks
+from cprl.commons.batch import Batch
 from cprl.commons.game import Game, output_shapes
-from cprl.commons.threads import CpuThreads
 from cprl.commons.world import StepOutput
 from cprl.compat import LeanStepEnv, flag_spec, put_all, unchecked_tensordict
+from cprl.envs.drivers import device_of, drawn_seed, driver_for
 
 _AGENT_ENTRIES = ("observation", "harvest", "in_play", "fired", "hit_by", "tagged_by")
 _TORCH_TYPES = {
@@ -26,6 +26,8 @@ _TORCH_TYPES = {
     np.bool_: torch.bool,
     np.int64: torch.int64,
 }
+_WHOLE_NUMBERS = (torch.int64, torch.int32, torch.int16, torch.int8, torch.uint8)
+"""The dtypes of actions that convert to int64 without a change of any number."""
 _WORLD_ENTRIES = ("stock", "regrown")
 _DONE_ENTRIES = ("done", "terminated", "truncated")
 _AHEAD_BYTES = 2**16
@@ -54,7 +56,9 @@ class CommonsEnv(LeanStepEnv):
         state: whether outputs include the whole board as "state", uint8 [B, 3, H, W].
 
     Raises:
-        ValueError: if a number is out of range, and, in `step`, for unknown actions; then nothing changes.
+        ValueError: if an argument is not allowed, and, in `step`, for actions that are missing, unknown or
+            of another form (int64 [B, N]; other integers are converted); then nothing changes.
+        MemoryError: if the worlds do not fit into memory.
         RuntimeError: for the device "cuda" if Numba finds no GPU.
     """
 
@@ -71,13 +75,19 @@ class CommonsEnv(LeanStepEnv):
         first_world: int = 0,
         state: bool = False,
     ) -> None:
-        device = torch.device(device)
-        driver, as_array = _driver(game, worlds, device, threads)
+        checks.instance("game", game, Game, "a cprl.Game; `cprl.envs.make_env` plays games of other kinds")
+        worlds = checks.integer("worlds", worlds, 1, 2**32)
+        checks.switch("state", state)
+        device = device_of(device)
+        if seed is not None:
+            checks.seed(seed)
+        driver, as_array = driver_for(game, worlds, device, threads)
         super().__init__(device=device, batch_size=torch.Size([worlds]))
         self.game, self._as_array = game, as_array
-        seed = _drawn_seed() if seed is None else seed
+        seed = drawn_seed() if seed is None else seed
         self.worlds = Batch(game, worlds, seed=seed, first_world=first_world, driver=driver)
         self.group_map = {keys.AGENTS: list(game.agent_names)}
+        self._size = worlds
         self._agents_size = torch.Size([worlds, game.agents])
         vectors = {"scoreboard": game.scoreboard_size, "stock_gauge": game.stock_gauge_size}
         self._agent_entries = (*_AGENT_ENTRIES, *(name for name, size in vectors.items() if size))
@@ -167,8 +177,29 @@ class CommonsEnv(LeanStepEnv):
         entries[keys.AGENTS] = unchecked_tensordict(agents, self._agents_size, self.device)
         return unchecked_tensordict(entries, self.batch_size, self.device)
 
+    def step(self, tensordict: TensorDictBase) -> TensorDictBase:
+        """Plays one turn of every world; see `EnvBase.step`."""
+        self._check_batch(tensordict)
+        return super().step(tensordict)
+
+    def reset(self, tensordict: TensorDictBase | None = None, **kwargs: Any) -> TensorDictBase:
+        """Begins the next episode of all worlds, or those in "_reset", bool [B, 1]; see `EnvBase.reset`."""
+        if tensordict is not None:
+            self._check_batch(tensordict)
+        return super().reset(tensordict, **kwargs)
+
+    def set_seed(self, seed: int | None = None, static_seed: bool = False) -> int | None:
+        """Restarts from a seed, 0 to 2**64 - 1; see `EnvBase.set_seed`."""
+        following: int | None = super().set_seed(None if seed is None else checks.seed(seed), static_seed)
+        return following
+
+    def _check_batch(self, tensordict: TensorDictBase) -> None:
+        if not isinstance(tensordict, TensorDictBase) or tensordict.batch_size != self.batch_size:
+            found = getattr(tensordict, "batch_size", tensordict)
+            raise checks.refusal("tensordict", found, f"a TensorDict of batch size {list(self.batch_size)}")
+
     def _set_seed(self, seed: int | None) -> None:
-        self.worlds.set_seed(_drawn_seed() if seed is None else seed)
+        self.worlds.set_seed(drawn_seed() if seed is None else seed)
 
     def _reset(self, tensordict: TensorDictBase | None = None, **kwargs: Any) -> TensorDict:
         which = None if tensordict is None else tensordict.get("_reset", None)
@@ -176,6 +207,11 @@ class CommonsEnv(LeanStepEnv):
 
     def _begin(self, which: Tensor | None) -> dict[str, Tensor]:
         """Starts the next episode of the marked worlds (bool [B, 1]; None for all), in new tensors."""
+        if which is not None and (
+            not isinstance(which, Tensor) or which.dtype != torch.bool or which.numel() != self._size
+        ):
+            kind = f"{which.dtype} {list(which.shape)}" if isinstance(which, Tensor) else checks.shown(which)
+            raise ValueError(f'"_reset" is {kind}; allowed: bool [{self._size}, 1]')
         before = self._tensors
         self._show_in(*self._fresh())
         if which is None:
@@ -201,11 +237,30 @@ class CommonsEnv(LeanStepEnv):
         return self._as_tensordict(tensors)
 
     def _step(self, tensordict: TensorDictBase) -> TensorDict:
-        actions = self._as_array(keys.entry(keys.entry(tensordict, keys.AGENTS), "action").contiguous())
+        actions = self._as_array(self._actions(tensordict).contiguous())
         self.worlds.check(actions)
         self._show_in(*self._fresh())
         self.worlds.play_checked(actions, self.output)
         return self._as_tensordict(self._tensors, self._tensors["harvest"].unsqueeze(-1).clone())
+
+    def _actions(self, tensordict: TensorDictBase) -> Tensor:
+        """("agents", "action"), int64 on the device of the worlds.
+
+        Raises:
+            ValueError: if it is missing or holds no integers.
+        """
+        try:
+            actions: Tensor = keys.entry(keys.entry(tensordict, keys.AGENTS), "action")
+        except (KeyError, AttributeError):
+            shape = list(self._agents_size)
+            raise ValueError(f'("agents", "action") is missing; allowed: int64 {shape}') from None
+        if actions.dtype is not torch.int64:
+            if actions.dtype not in _WHOLE_NUMBERS:
+                raise ValueError(
+                    f'("agents", "action") is {actions.dtype}; allowed: int64 {list(self._agents_size)}'
+                )
+            actions = actions.long()
+        return actions if actions.device == self.device else actions.to(self.device)
 
     def _any_done(self) -> bool:
         """Whether any world has ended; numpy counts in a tenth of the time that torch takes."""
@@ -226,34 +281,3 @@ class CommonsEnv(LeanStepEnv):
         others = {name: value for name, value in of_agents if name not in _OWN_AGENT_KEYS}
         put_all(keys.entry(carried, keys.AGENTS), others)
         return tensordict, carried
-
-
-def _drawn_seed() -> int:
-    """A seed from torch's generator, for an environment without one.
-
-    Forked workers start with equal generators, so in a worker process the seed also depends on the name of
-    the process, which `multiprocessing` makes unique among the children of a process.
-    """
-    drawn = int(torch.empty((), dtype=torch.int64).random_().item())
-    if multiprocessing.parent_process() is None:
-        return drawn
-    worker = multiprocessing.current_process().name.encode()
-    return int(np.random.SeedSequence((drawn, *worker)).generate_state(1, np.uint64)[0])
-
-
-def _driver(
-    game: Game, worlds: int, device: torch.device, threads: int | None
-) -> tuple[Driver, Callable[[Tensor], Any]]:
-    """The driver that runs the worlds on a device, and the function that views a tensor as an array."""
-    if device.type == "cpu":
-        return CpuThreads(game, worlds, threads=threads), Tensor.numpy
-    if device.type != "cuda":
-        raise ValueError(f'device is "{device}"; allowed: "cpu" and "cuda"')
-    if threads is not None:
-        raise ValueError(f"threads is {threads}; allowed on a GPU: None, each world has its own thread")
-    if not torch.cuda.is_available():
-        raise RuntimeError(f'device is "{device}"; allowed: "cpu", because torch finds no GPU')
-    from cprl.commons.cuda import CudaThreads
-
-    driver = CudaThreads(game, worlds)
-    return driver, driver.wrap

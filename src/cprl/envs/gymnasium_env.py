@@ -9,6 +9,7 @@ from typing import Any
 import gymnasium
 from gymnasium import spaces
 
+from cprl.commons import checks
 from cprl.commons.game import Game
 from cprl.commons.world import Bytes
 from cprl.envs.one_world import RENDER_FPS, RENDER_MODES, Observed, OneWorld
@@ -33,6 +34,7 @@ class CommonsGymnasiumEnv(gymnasium.Env[Any, Any]):
     }
 
     def __init__(self, game: Game, *, seed: int = 0, render_mode: str | None = None) -> None:
+        checks.instance("game", game, Game, "a cprl.Game")
         if game.agents != 1:
             raise ValueError(
                 f"the game has {game.agents} agents; allowed with Gymnasium: 1; for more use "
@@ -47,7 +49,7 @@ class CommonsGymnasiumEnv(gymnasium.Env[Any, Any]):
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[Observed, dict[str, Any]]:
         """Begins the next episode, or the first episode of a new seed."""
-        super().reset(seed=seed)
+        super().reset(seed=None if seed is None else checks.seed(seed))
         self.world.begin(seed)
         return self.world.observation(0), self.world.info(0)
 
@@ -55,10 +57,11 @@ class CommonsGymnasiumEnv(gymnasium.Env[Any, Any]):
         """Plays one turn; `info` holds "harvest", "in_play", "fired" and "tagged".
 
         Raises:
-            ValueError: If the action is out of range; the world is unchanged.
+            ValueError: If the action is no integer or out of range, or the episode has not begun; the world
+                is unchanged.
         """
         world = self.world
-        world.play([int(action)])
+        world.play([action])
         return world.observation(0), world.reward(0), world.terminated, world.truncated, world.info(0)
 
     def render(self) -> Bytes | None:

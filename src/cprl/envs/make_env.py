@@ -2,14 +2,15 @@
 
 from collections.abc import Iterable, Mapping
 from copy import deepcopy
-from typing import Any, Protocol, runtime_checkable
+from typing import Any, Final, Protocol, runtime_checkable
 
 import torch
 from torch import Tensor
 from torchrl.data import Bounded, Categorical
-from torchrl.envs import Compose, EnvBase, TransformedEnv
+from torchrl.envs import Compose, EnvBase, Transform, TransformedEnv
 
 from cprl import keys
+from cprl.commons import checks
 from cprl.commons.game import Game
 from cprl.custom import Custom, made
 from cprl.envs.commons_env import CommonsEnv
@@ -39,6 +40,9 @@ class PlayableGame(Protocol):
         """An `EnvBase` of so many worlds side by side, whose chance follows from the seed."""
 
 
+_TRANSFORMS: Final = "a sequence of TorchRL transforms"
+
+
 def make_env(
     game: PlayableGame | Custom,
     *,
@@ -63,12 +67,18 @@ def make_env(
         ValueError: where the environment or a transform does not fit; says what does.
     """
     playable: Any = made(game)
+    worlds = checks.integer("worlds", worlds, 1, 2**32)
+    seed, first_world = checks.seed(seed), checks.integer("first_world", first_world, 0, 2**32 - 1)
     env: EnvBase
     if isinstance(playable, Game):
         env = CommonsEnv(playable, worlds, seed=seed, device=device, first_world=first_world)
+    elif isinstance(playable, PlayableGame) and not isinstance(playable, type):
+        env = playable.make(worlds, checks.seed(seed + first_world, "seed + first_world"), device)
     else:
-        env = playable.make(worlds, seed + first_world, device)
-    listed = [made(transform) for transform in transforms]
+        raise checks.refusal("game", playable, "a cprl.Game, or a game with agents, to_config and make")
+    listed = [made(transform) for transform in checks.listed("transforms", transforms, _TRANSFORMS)]
+    for transform in listed:
+        checks.instance("a transform", transform, Transform, "a TorchRL transform")
     if listed:
         env = TransformedEnv(env, Compose(*listed))
     check_env(env, worlds)
@@ -81,6 +91,7 @@ def spaces_of(env: EnvBase) -> Spaces:
     Raises:
         ValueError: for specs that agents cannot read, e.g. actions that are not categorical.
     """
+    checks.instance("env", env, EnvBase, "a TorchRL environment")
     observation, action = _spec(env, "observation"), _spec(env, "action")
     if not isinstance(action, Categorical) or action.ndim != 2:
         raise ValueError(
@@ -129,18 +140,18 @@ def check_env(env: EnvBase, worlds: int) -> None:
     spaces = spaces_of(env)
     reward = env.full_reward_spec.get(keys.REWARD, None)
     if reward is None or tuple(reward.shape) != (worlds, spaces.agents, 1):
-        came = None if reward is None else list(reward.shape)
-        raise ValueError(f'("agents", "reward") is {came}; allowed: [{worlds}, {spaces.agents}, 1]')
+        found = None if reward is None else list(reward.shape)
+        raise ValueError(f'("agents", "reward") is {found}; allowed: [{worlds}, {spaces.agents}, 1]')
     for name in (keys.DONE, keys.TERMINATED, keys.TRUNCATED):
         done = env.full_done_spec.get(name, None)
         if done is None or tuple(done.shape) != (worlds, 1):
-            came = None if done is None else list(done.shape)
-            raise ValueError(f'"{name}" at the root is {came}; allowed: [{worlds}, 1]')
+            found = None if done is None else list(done.shape)
+            raise ValueError(f'"{name}" at the root is {found}; allowed: [{worlds}, 1]')
 
 
 def _spec(env: EnvBase, name: str) -> Any:
     group = env.full_action_spec if name == "action" else env.observation_spec
     spec = group.get((keys.AGENTS, name), None)
     if spec is None:
-        raise ValueError(f'the environment has no ("agents", "{name}"); every game must have it')
+        raise ValueError(f'("agents", "{name}") is missing in the environment; allowed: games that have it')
     return spec

@@ -7,6 +7,7 @@ import numpy as np
 from gymnasium import spaces
 from numpy.typing import NDArray
 
+from cprl.commons import checks
 from cprl.commons.batch import Batch
 from cprl.commons.game import Game
 from cprl.commons.picture import world_image
@@ -34,13 +35,15 @@ class OneWorld:
     """
 
     def __init__(self, game: Game, *, seed: int, title: str, render_mode: str | None) -> None:
-        if render_mode not in (None, *RENDER_MODES):
-            raise ValueError(f"render_mode is {render_mode!r}; allowed: None, {', '.join(RENDER_MODES)}")
+        if render_mode is not None and not (isinstance(render_mode, str) and render_mode in RENDER_MODES):
+            raise checks.refusal("render_mode", render_mode, f"None, {', '.join(RENDER_MODES)}")
         self.game = game
         self.batch = Batch(game, 1, seed=seed)
         self.output = self.batch.new_output()
         self.render_mode = render_mode
         self._window = Window(title) if render_mode == "human" else None
+        self._names = game.agent_names
+        self._has_begun = False
 
     def observation_space(self) -> spaces.Space[Any]:
         """A Box of uint8 [C, X, Y]; with a scoreboard or stock gauge, a Dict with it as "observation"."""
@@ -58,18 +61,25 @@ class OneWorld:
         if seed is not None:
             self.batch.set_seed(seed)
         self.output = self.batch.begin(self.batch.new_output())
+        self._has_begun = True
         if self._window:
             self.render()
 
-    def play(self, actions: Sequence[int]) -> None:
+    def play(self, actions: Sequence[Any]) -> None:
         """Plays one turn with one action per agent.
 
         Raises:
-            ValueError: If there is not one action per agent, or one is out of range; the world is unchanged.
+            ValueError: If there is not one action per agent, one is no integer or out of range, or the
+                episode has not begun; the world is unchanged.
         """
-        row = np.array([actions], np.int64)
-        self.batch.check(row)
-        self.output = self.batch.play_checked(row, self.batch.new_output())
+        if not self._has_begun:
+            raise ValueError("the episode has not begun; allowed: reset() before the first step")
+        last = len(self.game.actions) - 1
+        row = [
+            checks.integer(f"the action of {name}", action, 0, last)
+            for name, action in zip(self._names, actions, strict=True)
+        ]
+        self.output = self.batch.play_checked(np.array([row], np.int64), self.batch.new_output())
         if self._window:
             self.render()
 

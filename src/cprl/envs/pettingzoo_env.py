@@ -1,5 +1,6 @@
 """Adapters for PettingZoo: all agents at once (`parallel_env`), or one after the other (`env`)."""
 
+from collections.abc import Mapping
 from typing import Any, ClassVar
 
 import numpy as np
@@ -7,6 +8,7 @@ from gymnasium import spaces
 from pettingzoo import AECEnv, ParallelEnv
 from pettingzoo.utils import parallel_to_aec
 
+from cprl.commons import checks
 from cprl.commons.game import Game
 from cprl.commons.world import Bytes
 from cprl.envs.one_world import RENDER_FPS, RENDER_MODES, Observed, OneWorld
@@ -39,6 +41,7 @@ class CommonsParallelEnv(ParallelEnv[str, Any, int]):
     }
 
     def __init__(self, game: Game, *, seed: int = 0, render_mode: str | None = None) -> None:
+        checks.instance("game", game, Game, "a cprl.Game")
         self.game, self.render_mode = game, render_mode
         self.world = OneWorld(game, seed=seed, title="cprl commons", render_mode=render_mode)
         self.possible_agents = list(game.agent_names)
@@ -49,10 +52,12 @@ class CommonsParallelEnv(ParallelEnv[str, Any, int]):
 
     def observation_space(self, agent: str) -> spaces.Space[Any]:
         """A Box of uint8 [C, X, Y], or a Dict that holds it as "observation"; always the same object."""
+        checks.choice("agent", agent, self.possible_agents)
         return self.observation_spaces[agent]
 
     def action_space(self, agent: str) -> spaces.Space[Any]:
         """A Discrete space, the indices of `Game.actions`; always the same object."""
+        checks.choice("agent", agent, self.possible_agents)
         return self.action_spaces[agent]
 
     def reset(
@@ -69,14 +74,16 @@ class CommonsParallelEnv(ParallelEnv[str, Any, int]):
         """Plays one turn with one action per agent.
 
         Raises:
-            ValueError: If an action is missing, superfluous or out of range; the world is unchanged.
+            ValueError: If an action is missing, superfluous, no integer or out of range; the world is
+                unchanged.
         """
+        checks.instance("actions", actions, Mapping, "a dict with an action for each agent")
         if set(actions) != set(self.agents):
             raise ValueError(
-                f"actions has the agents {sorted(actions)}; allowed: exactly {self.agents}"
+                f"actions has the agents {checks.shown(list(actions))}; allowed: exactly {self.agents}"
                 + ("" if self.agents else ", because the episode has ended: call reset()")
             )
-        self.world.play([int(actions[name]) for name in self.agents])
+        self.world.play([actions[name] for name in self.agents])
         rewards = {name: self.world.reward(i) for i, name in enumerate(self.agents)}
         terminations = dict.fromkeys(self.agents, self.world.terminated)
         truncations = dict.fromkeys(self.agents, self.world.truncated)

@@ -10,6 +10,7 @@ from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
 from torchrl.envs import EnvBase, TransformedEnv
 
+from cprl.commons.checks import instance
 from cprl.envs.unwrap import base_env, commons_of
 
 
@@ -25,13 +26,19 @@ def env_state(env: EnvBase) -> dict[str, Any]:
 
 
 def load_env_state(env: EnvBase, state: Mapping[str, Any]) -> None:
-    """Puts an environment, made with the same arguments, where `env_state` found it."""
+    """Puts an environment, made with the same arguments, where `env_state` found it.
+
+    Raises:
+        ValueError: if the state is of another form, or a commons cannot be in it.
+    """
+    instance("state", state, Mapping, "a value of env_state")
+    for name in ("worlds", "transforms"):
+        instance(f"state[{name!r}]", state.get(name), Mapping, "a table")
     commons = commons_of(env)
     if commons is None:
         base_env(env).load_state_dict(state["worlds"])
     else:
-        dtypes = {name: array.dtype for name, array in commons.worlds.state().items()}
-        commons.load({name: tensor.numpy().view(dtypes[name]) for name, tensor in state["worlds"].items()})
+        commons.load({name: _array(name, tensor) for name, tensor in state["worlds"].items()})
     load_transforms_state(env, state["transforms"])
 
 
@@ -59,10 +66,10 @@ def check_restorable(make: Callable[[], EnvBase]) -> None:
         load_env_state(second, env_state(first))
         copied = load_carried(fresh, carried_state(carried))
         torch.manual_seed(1)
-        wanted = _played(first, carried, STEPS_TRIED)
+        expected = _played(first, carried, STEPS_TRIED)
         torch.manual_seed(1)
-        came = _played(second, copied, STEPS_TRIED)
-    if not all(_equal(one, other) for one, other in zip(came, wanted, strict=True)):
+        found = _played(second, copied, STEPS_TRIED)
+    if not all(_equal(one, other) for one, other in zip(found, expected, strict=True)):
         kind = type(base_env(first)).__name__
         raise ValueError(
             f"the state_dict of {kind} does not hold all of its state: put back where it was, it plays on "
@@ -118,6 +125,17 @@ def load_carried(fresh: TensorDictBase, state: Mapping[str, Any]) -> TensorDictB
             empty = TensorDict({}, batch_size=size, device=carried.device)
             carried.set(name, load_carried(empty if inner is None else inner, value))
     return carried
+
+
+def _array(name: str, tensor: Any) -> Any:
+    """The array of a tensor that `_tensor` made of an array of this name."""
+    if name in _UNSIGNED and isinstance(tensor, Tensor) and tensor.dtype == torch.int64:
+        return tensor.numpy(force=True).view(np.uint64)
+    return tensor
+
+
+_UNSIGNED: Final = ("seed", "number")
+"""The arrays of a state that are uint64."""
 
 
 def _tensor(array: NDArray[Any]) -> Tensor:

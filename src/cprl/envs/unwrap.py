@@ -3,11 +3,13 @@
 from torchrl.envs import EnvBase, TransformedEnv
 
 from cprl import keys
+from cprl.commons.checks import instance
 from cprl.envs.commons_env import CommonsEnv
 
 
 def base_env(env: EnvBase) -> EnvBase:
-    """The environment without its transforms."""
+    """The environment without its transforms; raises a ValueError if it is none."""
+    instance("env", env, EnvBase, "a TorchRL environment")
     while isinstance(env, TransformedEnv):
         env = env.base_env
     return env
@@ -25,14 +27,15 @@ def agent_count(env: EnvBase) -> int:
     Raises:
         ValueError: where the environment has another batch size, or no reward [B, N, 1] of the agents.
     """
+    base_env(env)
     size = tuple(env.batch_size)
     if len(size) != 1:
         raise ValueError(f"the environment has batch size {list(size)}; allowed: [B], B worlds")
     reward = env.full_reward_spec.get(keys.REWARD, None)
     shape = None if reward is None else tuple(reward.shape)
     if shape is None or len(shape) != 3 or shape[::2] != (*size, 1):
-        came = None if shape is None else list(shape)
-        raise ValueError(f'("agents", "reward") is {came}; allowed: [{size[0]}, N, 1]')
+        found = None if shape is None else list(shape)
+        raise ValueError(f'("agents", "reward") is {found}; allowed: [{size[0]}, N, 1]')
     return int(shape[1])
 
 

@@ -16,11 +16,12 @@ from dataclasses import dataclass
 from functools import partial
 from itertools import product
 from pathlib import Path
-from typing import Final, Literal, TypeAlias
+from typing import Final, Literal, TypeAlias, get_args
 
 import numpy as np
 import pyarrow as pa
 
+from cprl.commons import checks
 from cprl.evaluation.evaluate import SEED, check, chosen_replicas, opened
 from cprl.evaluation.lanes import Played, Source, play, policies_of
 from cprl.evaluation.same_game import check_same_game
@@ -51,8 +52,13 @@ class Cell:
 
         Args:
             agent: the index of the focal agent; None for the mean over all indices.
+
+        Raises:
+            ValueError: if there is no such agent.
         """
-        agents = list(self.by_agent) if agent is None else [agent]
+        agents = list(self.by_agent)
+        if agent is not None:
+            agents = [checks.integer("agent", agent, 0, len(agents) - 1)]
         returns = {
             "focal/return": self._returns(agents, lambda returns, at: returns[at]),
             "background/return": self._returns(agents, lambda returns, at: np.delete(returns, at).mean()),
@@ -145,14 +151,17 @@ def crossplay(
 
     Raises:
         ValueError: if the runs have different games (names the differences), the game has one agent, a run is
-            given twice, or "cross_seed" has a single replica; and see `cprl.evaluate_run`.
+            given twice, `diagonal` is another word, or "cross_seed" has a single replica; and see
+            `cprl.evaluate_run`.
     """
-    named = _named([opened(run, allow) for run in runs])
+    checks.choice("diagonal", diagonal, get_args(Diagonal))
+    listed = checks.listed("runs", runs, "a sequence of at least two runs")
+    named = _named([opened(run, allow) for run in listed])
     first, *_ = named.values()
     check_same_game(named)
     if first.game.agents == 1:
         raise ValueError("the game has 1 agent; allowed for cross-play: at least 2; use `cprl evaluate`")
-    check(episodes=episodes, seed=seed, runs=list(named.values()))
+    check(episodes=episodes, seed=seed, greedy=greedy, runs=list(named.values()))
     numbers = chosen_replicas(named, replicas)
     if diagonal == "cross_seed" and len(numbers) < 2:
         raise ValueError(f"the replicas are {numbers}; allowed for cross_seed: at least 2")
@@ -205,7 +214,9 @@ def _played_among(
 def _named(runs: Sequence[LoadedRun]) -> dict[str, LoadedRun]:
     """The runs by the names of their directories, or by their paths if names coincide."""
     if len(runs) < 2:
-        raise ValueError(f"{len(runs)} run is given; allowed: at least two: cprl crossplay RUN RUN...")
+        raise ValueError(
+            f"the number of runs is {len(runs)}; allowed: at least two: cprl crossplay RUN RUN..."
+        )
     paths = [run.path.resolve() for run in runs]
     for place, path in enumerate(paths):
         if path in paths[:place]:

@@ -8,6 +8,7 @@ from typing import Final
 
 import pyarrow as pa
 
+from cprl.commons import checks
 from cprl.envs.unwrap import agent_names
 from cprl.evaluation.lanes import Played, Source, play, policies_of, random_policies
 from cprl.measuring.replicas import Measured, over_replicas, social_measures
@@ -35,7 +36,11 @@ class Evaluation:
 
         Args:
             policy: "trained" or "random".
+
+        Raises:
+            ValueError: if it is anything else.
         """
+        checks.choice("policy", policy, ("trained", "random"))
         played = {"trained": self.trained, "random": self.random}[policy]
         returns = {
             f"{name}/return": over_replicas(
@@ -85,7 +90,7 @@ def evaluate_run(
             or the run cannot be loaded, see `cprl.load`.
     """
     loaded = opened(run, allow)
-    check(episodes=episodes, seed=seed, runs=[loaded])
+    check(episodes=episodes, seed=seed, greedy=greedy, runs=[loaded])
     numbers = chosen_replicas({str(loaded.path): loaded}, replicas)
     sources, common = [Source(loaded)] * loaded.game.agents, {"episodes": episodes, "seed": seed}
     agents = partial(policies_of, sources, worlds=episodes, seed=seed)
@@ -100,39 +105,50 @@ def evaluate_run(
 
 
 def opened(run: str | Path | LoadedRun, allow: Sequence[str] = ()) -> LoadedRun:
-    """A run, loaded if it is a directory."""
+    """A run, loaded if it is a directory.
+
+    Raises:
+        ValueError: if it is neither, or cannot be loaded, see `cprl.load`.
+    """
+    checks.instance("run", run, (str, Path, LoadedRun), "a directory, or a value of cprl.load")
     return run if isinstance(run, LoadedRun) else load(run, allow=allow)
 
 
-def chosen_replicas(runs: Mapping[str, LoadedRun], wanted: Sequence[int]) -> list[int]:
+def chosen_replicas(runs: Mapping[str, LoadedRun], replicas: Sequence[int]) -> list[int]:
     """The chosen replicas, or all that every run has, ascending.
 
     Args:
         runs: the runs by name.
-        wanted: the indices of the chosen replicas; empty for all.
+        replicas: the indices of the chosen replicas; empty for all.
 
     Raises:
         ValueError: if a run does not have them, or the runs have none in common.
     """
+    allowed = "the indices of replicas"
+    chosen = {
+        checks.integer("a replica", replica, 0, allowed="an integer >= 0")
+        for replica in checks.listed("replicas", replicas, allowed)
+    }
     common = sorted(set.intersection(*(set(run.replicas) for run in runs.values())))
     for name, run in runs.items():
-        missing = sorted(set(wanted) - set(run.replicas))
+        missing = sorted(chosen - set(run.replicas))
         if missing:
             raise ValueError(f"{name} has no replicas {missing}; allowed: {run.replicas}")
     if not common:
         has = {name: run.replicas for name, run in runs.items()}
-        raise ValueError(f"the runs have no replica in common: {has}")
-    return sorted(set(wanted)) or common
+        raise ValueError(f"the replicas of the runs are {has}; allowed: runs with a replica in common")
+    return sorted(chosen) or common
 
 
-def check(*, episodes: int, seed: int, runs: Sequence[LoadedRun]) -> None:
-    """Checks that there are episodes, and that no agent was trained in the worlds.
+def check(*, episodes: int, seed: int, greedy: bool, runs: Sequence[LoadedRun]) -> None:
+    """Checks the arguments of an evaluation, and that no agent was trained in the worlds.
 
     Raises:
         ValueError: names the value and what is allowed.
     """
-    if episodes < 1:
-        raise ValueError(f"episodes is {episodes}; allowed: an integer >= 1")
+    checks.integer("episodes", episodes, 1)
+    checks.seed(seed)
+    checks.switch("greedy", greedy)
     for run in runs:
         if run.experiment.seed == seed:
             raise ValueError(

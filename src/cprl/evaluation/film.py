@@ -6,6 +6,7 @@ from pathlib import Path
 from tensordict import TensorDictBase
 
 from cprl import keys
+from cprl.commons import checks
 from cprl.measuring.episodes import Episode
 from cprl.stored import load
 from cprl.training import train
@@ -16,8 +17,8 @@ SEED = 20_011
 
 
 def film(
-    run: Path,
-    out: Path | None = None,
+    run: str | Path,
+    out: str | Path | None = None,
     *,
     replica: int = 0,
     episode: int = 0,
@@ -36,17 +37,21 @@ def film(
         The recording, and the episode.
 
     Raises:
-        ValueError: if the run cannot be loaded, see `cprl.load`.
+        ValueError: if the run cannot be loaded, see `cprl.load`, or a number is out of range.
         FileExistsError: if the recording exists.
     """
-    if episode < 0:
-        raise ValueError(f"episode is {episode}; allowed: an integer >= 0")
+    episode = checks.integer("episode", episode, 0, 2**32 - 1)
+    replica = checks.integer("replica", replica, 0)
+    checks.instance("run", run, (str, Path), "a directory")
+    checks.instance("out", out, (str, Path, type(None)), "a path, or None")
     loaded = load(run, allow=allow)
-    target = out or run / f"film-{replica}-{episode}.rrd"
+    if replica not in loaded.replicas:
+        raise ValueError(f"replica is {replica}; allowed: {', '.join(map(str, loaded.replicas))}")
+    target = Path(run) / f"film-{replica}-{episode}.rrd" if out is None else Path(out)
     env = loaded.env(1, seed=SEED, first_world=episode)
     policies = loaded.policy(replica, seed=SEED + episode)
     others = dict(zip(policies.indices, policies.actors, strict=True))
-    title = f"{run.name}, agents of replica {replica}, fresh episode {episode}"
+    title = f"{Path(run).name}, agents of replica {replica}, fresh episode {episode}"
     target.parent.mkdir(parents=True, exist_ok=True)
     with ViewerCallback(
         target.parent,

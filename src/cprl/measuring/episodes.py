@@ -10,6 +10,7 @@ from tensordict import TensorDictBase
 from torch import Tensor
 
 from cprl import keys
+from cprl.commons import checks
 from cprl.measuring import social
 from cprl.measuring.episode import Episode
 from cprl.measuring.reported import OPTIONAL, reported_in
@@ -34,6 +35,8 @@ _AS_COUNTED: Final = ("shots", "tagged", "tagged_by")
 """Fields of an episode that are copied from the tracker's state unchanged."""
 _FIRST_CAPACITY_STEPS: Final = 128
 """The initial capacity of histories, in steps, without max_steps."""
+_LARGEST_FIRST_CAPACITY_STEPS: Final = 4096
+"""The largest initial capacity, however large max_steps is; histories grow with the episodes."""
 _WORLDS_AT_ONCE: Final = 64
 """Episodes measured together: more are faster, but the history of each is held in float64."""
 
@@ -52,8 +55,9 @@ class EpisodeTracker:
         first_stock: apples on the board at the start of an episode.
 
     Raises:
-        ValueError: if a number is below 1; in `add`, if a batch has a wrong shape or lacks an entry, or an
-            episode is longer than max_steps.
+        ValueError: if a number is no integer or below 1; in `add`, if a batch has a wrong shape or lacks an
+            entry, or an episode is longer than max_steps.
+        MemoryError: if there are too many worlds.
     """
 
     def __init__(
@@ -65,10 +69,12 @@ class EpisodeTracker:
         sustainable_yield: float | None = None,
         first_stock: float | None = None,
     ) -> None:
-        for name, number in (("worlds", worlds), ("agents", agents), ("max_steps", max_steps)):
-            if number is not None and number < 1:
-                raise ValueError(f"{name} is {number}; allowed: an integer >= 1")
+        worlds = checks.integer("worlds", worlds, 1, 2**32)
+        agents = checks.integer("agents", agents, 1, 2**20)
+        max_steps = None if max_steps is None else checks.integer("max_steps", max_steps, 1)
         self.worlds, self.agents, self.max_steps = worlds, agents, max_steps
+        needed = worlds * agents * (5 * self._capacity(0) + 16 * agents)
+        checks.memory(f"worlds is {worlds:,}: the histories of their episodes", needed, advice="fewer worlds")
         self.reported: tuple[str, ...] | None = None
         """The optional entries of this game; None before the first batch."""
         self._yield = {"sustainable_yield": sustainable_yield, "first_stock": first_stock}
@@ -87,6 +93,7 @@ class EpisodeTracker:
             The episodes that ended, ordered by turn, then by world.
         """
         if self.reported is None:
+            checks.instance("tensordict", tensordict, TensorDictBase, "a TensorDict with the next turns")
             self._begin(reported_in(tensordict))
             if tensordict.get(keys.DONE, None) is None:
                 raise self._missing(tensordict)
@@ -103,6 +110,12 @@ class EpisodeTracker:
             episodes += self._add_turn({name: array[:, turn] for name, array in turns.items()})
         return episodes
 
+    @property
+    def returns(self) -> NDArray[np.float64]:
+        """A copy of the returns so far of the running episodes, [B, N]; zeros before the first turn."""
+        kept = self._running.get("return")
+        return np.zeros((self.worlds, self.agents)) if kept is None else kept.copy()
+
     def state_dict(self) -> dict[str, Tensor]:
         """Copies of the arrays of the running episodes, up to the steps played."""
         longest = int(self._running["steps"].max()) if self._running else 0
@@ -115,6 +128,9 @@ class EpisodeTracker:
             ValueError: if the state has other shapes, or is from a game that reports other entries; the
                 tracker is then unchanged.
         """
+        checks.instance("state", state, Mapping, "a value of state_dict()")
+        for name, tensor in state.items():
+            checks.instance(f"state[{name!r}]", tensor, Tensor, "a tensor")
         longest = next((state[name].shape[1] for name in _HISTORIES if name in state), 0)
         if self.max_steps is not None and longest > self.max_steps:
             raise ValueError(f"the state has {longest} steps; allowed: up to max_steps, {self.max_steps}")
@@ -130,6 +146,8 @@ class EpisodeTracker:
         if reported is not None:
             other._begin(reported, capacity=longest)
         arrays = other._arrays(longest)
+        if not set(arrays) <= set(state):
+            raise ValueError(f"the state has {sorted(state)}; allowed: at least {sorted(arrays)}")
         for name, array in arrays.items():
             if state[name].shape != array.shape:
                 allowed = list(array.shape)
@@ -151,7 +169,7 @@ class EpisodeTracker:
             )
         self.reported = reported
         worlds, agents = self.worlds, self.agents
-        steps = max(capacity, _FIRST_CAPACITY_STEPS) if self.max_steps is None else self.max_steps
+        steps = self._capacity(capacity)
         self._histories = {
             name: np.zeros((worlds, steps, agents), dtype)
             for name, dtype in _HISTORIES.items()
@@ -172,6 +190,12 @@ class EpisodeTracker:
         }
         self._of_agents = ("reward", *(name for name in reported if name not in ("in_play", "stock")))
         self._of_worlds = (*(name for name in reported if name == "stock"), keys.TERMINATED, keys.DONE)
+
+    def _capacity(self, steps: int) -> int:
+        """The initial capacity of histories, in steps, at least `steps`."""
+        if self.max_steps is None:
+            return max(steps, _FIRST_CAPACITY_STEPS)
+        return max(steps, min(self.max_steps, _LARGEST_FIRST_CAPACITY_STEPS))
 
     def _read(self, tensordict: TensorDictBase) -> Turns:
         """All entries as arrays, [B, ...] or [B, T, ...], without a copy if the batch is on the CPU.
@@ -198,8 +222,8 @@ class EpisodeTracker:
             needed[keys.IN_PLAY] = "agents, in_play"
         missing = [f"({name})" for key, name in needed.items() if tensordict.get(key, None) is None]
         return ValueError(
-            f"the batch lacks {', '.join(missing)}; every batch must have the rewards, done and terminated, "
-            f"and the optional entries of the first batch"
+            f"the batch lacks {', '.join(missing)}; allowed: batches with rewards, done and terminated, "
+            "and the optional entries of the first batch"
         )
 
     def _check(self, turns: Turns, size: torch.Size) -> None:
@@ -257,15 +281,17 @@ class EpisodeTracker:
             depletion_step[just_now] = steps[just_now]
 
     def _grow(self) -> None:
-        """Doubles the capacity of histories; raises a ValueError beyond max_steps."""
-        if self.max_steps is not None:
+        """Doubles the capacity of histories, up to max_steps; raises a ValueError beyond it."""
+        most = self.max_steps
+        if most is not None and self._running["steps"].max() >= most:
             world = int(self._running["steps"].argmax())
             raise ValueError(
-                f"the episode of world {world} has not ended after {self.max_steps} steps; "
+                f"the episode of world {world} has not ended after {most} steps; "
                 f"allowed: up to max_steps of EpisodeTracker, which no episode may exceed"
             ) from None
         for name, history in self._histories.items():
-            self._histories[name] = np.concatenate([history, np.zeros_like(history)], axis=1)
+            more = np.zeros_like(history[:, : None if most is None else most - history.shape[1]])
+            self._histories[name] = np.concatenate([history, more], axis=1)
 
     def _measure(self, worlds: Array, turn: Turns) -> Iterator[Episode]:
         """The episodes of the worlds, int64 [E], that end with this turn."""

@@ -8,6 +8,7 @@ from tensordict import TensorDictBase
 from torchrl.envs import EnvBase
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 
+from cprl.commons import checks
 from cprl.envs.commons_env import CommonsEnv
 from cprl.envs.unwrap import agent_count
 from cprl.measuring.episodes import Episode, EpisodeTracker
@@ -31,9 +32,11 @@ def evaluate(env: EnvBase, policy: Policy, *, explore: bool = False) -> list[Epi
     Raises:
         ValueError: if the environment's batches lack entries or have wrong shapes, see `EpisodeTracker`.
     """
-    worlds = env.batch_size.numel()
+    agents, worlds = agent_count(env), env.batch_size.numel()
+    if not callable(policy):
+        raise checks.refusal("policy", policy, "a function that writes the actions of all agents")
     is_commons = isinstance(env, CommonsEnv)
-    tracker = EpisodeTracker(worlds, agent_count(env), env.game.rules.episode_steps if is_commons else None)
+    tracker = EpisodeTracker(worlds, agents, env.game.rules.episode_steps if is_commons else None)
     exploration = ExplorationType.RANDOM if explore else ExplorationType.DETERMINISTIC
     episodes: dict[int, Episode] = {}
     with torch.no_grad(), set_exploration_type(exploration):
@@ -63,7 +66,14 @@ def _again_and_again(env: EnvBase, policy: Policy) -> Iterator[TensorDictBase]:
 
 
 def mean_return(episodes: list[Episode]) -> tuple[float, float]:
-    """The mean over episodes of the agents' summed return, and its standard error."""
+    """The mean over episodes of the agents' summed return, and its standard error; NaN for one episode.
+
+    Raises:
+        ValueError: if there are no episodes.
+    """
+    episodes = list(checks.listed("episodes", episodes, "a list of episodes"))
+    if not episodes or not all(isinstance(episode, Episode) for episode in episodes):
+        raise checks.refusal("episodes", episodes, "at least one Episode")
     returns = [float(episode.return_.sum()) for episode in episodes]
     error = stdev(returns) / len(returns) ** 0.5 if len(returns) > 1 else float("nan")
     return fmean(returns), error

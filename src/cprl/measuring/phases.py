@@ -16,6 +16,8 @@ import ruptures
 from numpy.typing import ArrayLike, NDArray
 from ruptures.base import BaseCost
 
+from cprl.commons import checks
+
 Values = NDArray[np.float64]
 
 PHASES: Final = ("exploration", "tragedy", "combat", "cultivation")
@@ -24,6 +26,8 @@ METRICS: Final = ("collective_return", "equality", "survival_steps", "peacefulne
 """The metrics that the labels of phases depend on."""
 GRID: Final = 50
 """The resolution of change points in episodes; running means over 100 episodes allow no finer one."""
+LONGEST: Final = 100_000
+"""The largest number of episodes; the search takes time in proportion to its square."""
 SHORTEST: Final = 200
 """The minimum length of a phase in episodes."""
 CHANGE: Final = 0.25
@@ -72,15 +76,18 @@ def change_points(
         seed: The seed of the resampling.
 
     Raises:
-        ValueError: If there are too few episodes for this number of phases, a metric has another length, or
-            a metric is NaN in some episode of all replicas.
+        ValueError: If there are too few or too many episodes, a metric has another shape or is NaN in some
+            episode of all replicas, or an argument is out of range.
     """
-    at = np.asarray(episodes, np.float64)
-    curves = np.stack([np.atleast_2d(np.asarray(curve, np.float64)) for curve in metrics.values()])
-    if curves.shape[-1] != len(at):
-        raise ValueError(
-            f"metrics have {curves.shape[-1]} episodes and episodes has {len(at)}; allowed: equal lengths"
-        )
+    at, by_name = _checked(episodes, metrics)
+    number, resamples = checks.integer("number", number, 1), checks.integer("resamples", resamples, 1)
+    seed = checks.seed(seed)
+    shapes = {name: curve.shape for name, curve in by_name.items()}
+    if len(set(shapes.values())) > 1:
+        raise ValueError(f"metrics are {shapes}; allowed: the same shape for all")
+    curves = np.stack(list(by_name.values()))
+    if at[-1] - at[0] > LONGEST:
+        raise ValueError(f"episodes are {at[0]:g} to {at[-1]:g}; allowed: at most {LONGEST:,} episodes")
     grid = np.arange(at[0], at[-1] + 1e-9, GRID / 5)
     if (grid[-1] - grid[0]) < (number + 1) * SHORTEST:
         raise ValueError(
@@ -106,6 +113,7 @@ def find_phases(
     episodes: ArrayLike, metrics: Mapping[str, ArrayLike], *, number: int = 3
 ) -> tuple[list[ChangePoint], list[Phase]]:
     """Finds `number` change points and the phases between them; see `change_points` and `phases`."""
+    number = checks.integer("number", number, 0)
     changes = change_points(episodes, metrics, number=number) if number else []
     return changes, phases(episodes, metrics, changes)
 
@@ -125,13 +133,24 @@ def phases(
         episodes: The index of each episode, [E], increasing.
         metrics: float [E] or [R, E] by name; at least `METRICS`.
         changes: The change points, see `change_points`.
+
+    Raises:
+        ValueError: If a metric is missing or has another shape, or a phase has fewer than two episodes.
     """
-    at = np.asarray(episodes, np.float64)
-    means = {name: _over_replicas(np.atleast_2d(np.asarray(metrics[name], np.float64))) for name in METRICS}
+    at, by_name = _checked(episodes, metrics)
+    missing = [name for name in METRICS if name not in by_name]
+    if missing:
+        raise ValueError(f"metrics lack {missing}; allowed: at least {list(METRICS)}")
+    means = {name: _over_replicas(by_name[name]) for name in METRICS}
     bounds = [at[0], *(change.episode for change in changes), at[-1]]
     found: list[Phase] = []
     for first, last in pairwise(bounds):
         inside = (at >= first) & (at <= last)
+        if inside.sum() < 2:
+            raise ValueError(
+                f"the phase from episode {first:g} to {last:g} has {inside.sum()} episodes; allowed: at "
+                "least 2"
+            )
         change = {
             name: float(
                 np.polyfit(at[inside], curve[inside], 1)[0] * (last - first) / max(np.ptp(curve), 1e-12)
@@ -141,6 +160,26 @@ def phases(
         label = _label(change, [phase.label for phase in found])
         found.append(Phase(first=float(first), last=float(last), label=label, change=change))
     return found
+
+
+def _checked(episodes: ArrayLike, metrics: Mapping[str, ArrayLike]) -> tuple[Values, dict[str, Values]]:
+    """The episodes, [E], and each metric, [R, E], after checking their form."""
+    at = checks.floats("episodes", episodes)
+    if at.ndim != 1 or len(at) < 2 or not (np.diff(at) > 0).all() or not np.isfinite(at[[0, -1]]).all():
+        raise checks.refusal("episodes", episodes, "[E], at least two, finite and increasing")
+    checks.instance("metrics", metrics, Mapping, "a table of at least one metric, [E] or [R, E]")
+    curves = {name: np.atleast_2d(checks.floats(f"metrics[{name!r}]", own)) for name, own in metrics.items()}
+    if not curves:
+        raise ValueError("metrics is empty; allowed: at least one metric, [E] or [R, E]")
+    for name, curve in curves.items():
+        if curve.ndim != 2 or curve.shape[1] != len(at) or not len(curve):
+            raise ValueError(
+                f"metrics[{name!r}] is {list(curve.shape)}; allowed: [{len(at)}] or [R, {len(at)}], as there "
+                f"are {len(at)} episodes"
+            )
+        if np.isinf(curve).any():
+            raise ValueError(f"metrics[{name!r}] holds infinity; allowed: finite numbers, and NaN")
+    return at, curves
 
 
 def _label(change: Mapping[str, float], before: Sequence[str | None]) -> str | None:

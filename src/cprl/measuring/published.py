@@ -14,6 +14,8 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
+from cprl.commons import checks
+
 Values = NDArray[np.float64]
 
 SMOOTHED_EPISODES: Final = 100
@@ -95,6 +97,7 @@ EXPERIMENTS: Final = (
 
 def published_experiment(recipe: str) -> PublishedExperiment | None:
     """The study's experiment that a recipe repeats, or None."""
+    checks.instance("recipe", recipe, str, "the name of a recipe")
     return next((one for one in EXPERIMENTS if one.recipe == recipe), None)
 
 
@@ -105,8 +108,9 @@ def curve(name: str) -> tuple[Values, Values]:
         name: as in `PublishedExperiment.curves`.
 
     Raises:
-        KeyError: If there is no curve of this name.
+        ValueError: If there is no curve of this name.
     """
+    checks.choice("name", name, _curves())
     return _curves()[name]
 
 
@@ -130,9 +134,12 @@ def agreement(name: str, values: Values) -> tuple[float, float]:
             have are compared.
 
     Raises:
-        ValueError: If the published curve has fewer than 10 points in these episodes.
+        ValueError: If the published curve has fewer than 10 points in these episodes, or `values` is not [E].
     """
     episodes, published = curve(name)
+    values = checks.floats("values", values)
+    if values.ndim != 1:
+        raise ValueError(f"values is {list(values.shape)}; allowed: [E], one number per episode")
     both = episodes <= len(values) - 1
     if both.sum() < 10:
         raise ValueError(f"{len(values)} episodes have {both.sum()} points of {name}; allowed: at least 10")

@@ -3,8 +3,10 @@
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from math import isnan
+from numbers import Real
 from statistics import fmean
 
+from cprl.commons import checks
 from cprl.measuring.episodes import Episode
 from cprl.measuring.statistics import Estimate, estimate
 
@@ -34,6 +36,10 @@ def over_replicas(values: Mapping[int, Sequence[float]]) -> Measured:
     Raises:
         ValueError: if there are no replicas, or a replica has no episodes.
     """
+    checks.instance("values", values, Mapping, "a table of values by replica")
+    for replica, of_replica in values.items():
+        for value in checks.listed(f"values[{replica!r}]", of_replica, "one number per episode"):
+            checks.instance(f"values[{replica!r}]", value, Real, "one number per episode")
     if not values or not all(map(len, values.values())):
         counts = {replica: len(own) for replica, own in values.items()}
         raise ValueError(f"episodes by replica are {counts}; allowed: at least one replica, each at least 1")
@@ -52,6 +58,7 @@ def social_metrics(episode: Episode) -> dict[str, float]:
 
     Metrics that need entries that the game does not report are left out.
     """
+    checks.instance("episode", episode, Episode, "an Episode")
     if episode.stock_left is None:
         return dict(episode.metrics)
     return {**episode.metrics, "stock_left": float(episode.stock_left)}
@@ -67,7 +74,7 @@ def social_measures(played: Mapping[int, Sequence[Episode]]) -> dict[str, Measur
         ValueError: see `over_replicas`.
     """
     metrics_by_replica = {
-        replica: [social_metrics(episode) for episode in own] for replica, own in played.items()
+        replica: [social_metrics(episode) for episode in own] for replica, own in _checked(played).items()
     }
     names = next((own[0] for own in metrics_by_replica.values() if own), {})
     return {
@@ -78,13 +85,22 @@ def social_measures(played: Mapping[int, Sequence[Episode]]) -> dict[str, Measur
     }
 
 
+def _checked(played: Mapping[int, Sequence[Episode]]) -> Mapping[int, Sequence[Episode]]:
+    """Episodes by replica, after checking that they are."""
+    checks.instance("played", played, Mapping, "a table of episodes by replica")
+    for replica, own in played.items():
+        for episode in checks.listed(f"played[{replica!r}]", own, "a sequence of episodes"):
+            checks.instance(f"an entry of played[{replica!r}]", episode, Episode, "an Episode")
+    return played
+
+
 def agents_without_harvest(played: Mapping[int, Sequence[Episode]]) -> tuple[int, int] | None:
     """Counts the agents of all episodes without a harvest, which sustainability leaves out, and all agents.
 
     None if the game reports no harvest.
     """
     harvests: list[float] = []
-    for episode in (episode for own in played.values() for episode in own):
+    for episode in (episode for own in _checked(played).values() for episode in own):
         if episode.harvest is None:
             return None
         harvests += episode.harvest.tolist()

@@ -13,6 +13,7 @@ from tensordict import TensorDictBase
 from torchrl.envs import EnvBase
 
 from cprl import keys
+from cprl.commons.checks import instance, listed
 from cprl.measuring import social
 
 OPTIONAL: Final = ("harvest", "in_play", "fired", "hit_by", "tagged_by", "stock")
@@ -40,12 +41,14 @@ FIELDS: Final[Mapping[str, tuple[str, ...]]] = MappingProxyType(
 
 def reported_by(env: EnvBase) -> tuple[str, ...]:
     """The entries of `OPTIONAL` in the specs of an environment, transforms included."""
+    instance("env", env, EnvBase, "a TorchRL environment")
     found = set(env.observation_spec.keys(include_nested=True))
     return tuple(name for name in OPTIONAL if {name, (keys.AGENTS, name)} & found)
 
 
 def reported_in(tensordict: TensorDictBase) -> tuple[str, ...]:
     """The entries of `OPTIONAL` in a batch: in_play at the root, the others under "next"."""
+    instance("tensordict", tensordict, TensorDictBase, "a TensorDict")
     places: dict[str, Any] = {name: ("next", keys.AGENTS, name) for name in OPTIONAL}
     places |= {"in_play": keys.IN_PLAY, "stock": ("next", keys.STOCK)}
     return tuple(name for name in OPTIONAL if tensordict.get(places[name], None) is not None)
@@ -58,6 +61,8 @@ def available(needs: Mapping[str, tuple[str, ...]], reported: Collection[str]) -
         needs: the entries by name, e.g. `FIELDS`.
         reported: the entries of `OPTIONAL` that the game reports.
     """
+    instance("needs", needs, Mapping, "the entries by name, e.g. FIELDS")
+    reported = listed("reported", reported, "names of entries")
     return tuple(name for name, entries in needs.items() if set(entries) <= set(reported))
 
 
@@ -68,6 +73,7 @@ def left_out(reported: Collection[str], *, more: Mapping[str, tuple[str, ...]] |
         reported: the entries of `OPTIONAL` that the game reports.
         more: further names and the entries that they need; other words say what else the game lacks.
     """
+    reported = listed("reported", reported, "names of entries")
     lacking: dict[str, list[str]] = {}
     for name, entries in {**METRICS, **FIELDS, **(more or {})}.items():
         missing = " and no ".join(entry for entry in entries if entry not in reported)

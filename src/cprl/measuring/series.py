@@ -6,6 +6,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from cprl.commons import checks
 from cprl.measuring.episodes import Episode
 from cprl.measuring.replicas import social_metrics
 
@@ -35,10 +36,13 @@ class Series:
 
     Args:
         replicas: the number of replicas R.
+
+    Raises:
+        ValueError: if a number is out of range.
     """
 
     def __init__(self, replicas: int) -> None:
-        self.replicas = replicas
+        self.replicas = checks.integer("replicas", replicas, 1)
         self._waiting: dict[int, dict[int, dict[str, float]]] = {}
 
     def add(self, episode: int, replica: int, numbers: Mapping[str, float]) -> dict[str, Values] | None:
@@ -48,7 +52,10 @@ class Series:
             Its numbers, [R] by name, NaN where a replica has none, if all replicas have ended the episode;
             else None.
         """
+        episode = checks.integer("episode", episode, 0)
+        replica = checks.integer("replica", replica, 0, self.replicas - 1)
         of_episode = self._waiting.setdefault(episode, {})
+        checks.instance("numbers", numbers, Mapping, "numbers by name")
         of_episode[replica] = dict(numbers)
         if len(of_episode) < self.replicas:
             return None
@@ -69,5 +76,6 @@ class Series:
 
 def mean_of(values: Values) -> float:
     """The mean of the defined values; NaN if none is defined."""
+    values = checks.floats("values", values)
     defined = values[~np.isnan(values)]
     return float(defined.mean()) if len(defined) else float("nan")

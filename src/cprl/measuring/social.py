@@ -7,7 +7,7 @@ Arguments, for T steps counted from 1 and N agents (at least one), with any lead
              episodes of different lengths fit one batch; None if all steps were played. Padding is not read.
 
 Results are float64 [...], NaN where the metric is undefined; separate functions count these cases.
-A wrong type raises TypeError, a wrong shape or value ValueError.
+A wrong type raises TypeError, a wrong shape or value ValueError; the message says what is allowed.
 
 Below, R_i is the sum of agent i's harvest over its episode. Sources:
 [P] Perolat et al., "A multi-agent reinforcement learning model of common-pool resource appropriation" (2017);
@@ -20,6 +20,8 @@ from typing import Final
 
 import torch
 from torch import Tensor
+
+from cprl.commons.checks import refusal
 
 NEEDS: Final[Mapping[str, tuple[str, ...]]] = MappingProxyType(
     {
@@ -56,10 +58,10 @@ def summary(
         if steps is not None:
             _check_steps(name, steps, played)
     if played is not None:
-        _check_type("played", played, "bool")
+        _check_played(played)
     if harvest is not None and in_play is not None and harvest.shape != in_play.shape:
         raise ValueError(
-            f"harvest is {list(harvest.shape)} and in_play {list(in_play.shape)}; equal shapes are wanted"
+            f"harvest is {list(harvest.shape)} and in_play is {list(in_play.shape)}; allowed: equal shapes"
         )
     metrics: dict[str, Tensor] = {}
     if harvest is not None:
@@ -72,10 +74,13 @@ def summary(
         metrics["peace"] = peace(in_play, played=played)
         metrics["peacefulness"] = peacefulness(in_play, played=played)
     if (sustainable_yield is None) != (first_stock is None):
-        raise ValueError("a yield_share takes both sustainable_yield and first_stock; only one was given")
+        given = "sustainable_yield" if first_stock is None else "first_stock"
+        raise ValueError(
+            f"only {given} is given; allowed: both sustainable_yield and first_stock, or neither"
+        )
     if sustainable_yield is not None and first_stock is not None:
         if harvest is None:
-            raise ValueError("a yield_share takes a harvest; none was given")
+            raise ValueError("sustainable_yield is given and harvest is None; allowed: both, or neither")
         metrics["yield_share"] = yield_share(
             harvest, sustainable_yield=sustainable_yield, first_stock=first_stock, played=played
         )
@@ -109,10 +114,8 @@ def yield_share(
         first_stock: Apples on the board at the start of the episode; a number, or a tensor [...].
     """
     total = collective_return(harvest, played=played)
-    per_step, first = (torch.as_tensor(n).to(total) for n in (sustainable_yield, first_stock))
-    for name, number in (("sustainable_yield", per_step), ("first_stock", first)):
-        if not (number >= 0).all():
-            raise ValueError(f"{name} is {number.tolist()}; at least 0 is wanted")
+    per_step = _yield_number("sustainable_yield", sustainable_yield, total)
+    first = _yield_number("first_stock", first_stock, total)
     bearable = per_step * survival_steps(harvest, played=played) + first
     return torch.where(bearable > 0, total / bearable, torch.nan)
 
@@ -165,7 +168,7 @@ def _steps_played(steps: Tensor | None, played: Tensor | None) -> Tensor:
     if played is not None:
         return played.sum(-1, dtype=torch.float64)
     if steps is None:
-        raise ValueError("neither harvest nor in_play nor played was given; at least one is wanted")
+        raise ValueError("harvest, in_play and played are None; allowed: at least one of them")
     return torch.full(steps.shape[:-2], steps.shape[-2], dtype=torch.float64, device=steps.device)
 
 
@@ -179,8 +182,10 @@ def _harvest(harvest: Tensor, played: Tensor | None) -> Tensor:
     _check_steps("harvest", harvest, played)
     if played is not None:
         harvest = torch.where(played.unsqueeze(-1), harvest, 0)
-    if not (harvest >= 0).all():
-        raise ValueError("harvest holds a number below 0 or NaN; apples bitten are at least 0")
+    if not ((harvest >= 0) & (harvest < torch.inf)).all():
+        raise ValueError(
+            "harvest holds a number below 0, NaN or infinity; allowed: apples bitten, at least 0"
+        )
     return harvest
 
 
@@ -191,28 +196,51 @@ def _agent_steps_in_play(in_play: Tensor, played: Tensor | None) -> Tensor:
     return counted.sum((-2, -1), dtype=torch.float64)
 
 
+def _yield_number(name: str, values: float | Tensor, total: Tensor) -> Tensor:
+    """A number, or a tensor that fits the batch axes of `total`, in float64: float32 would round it.
+
+    Raises:
+        ValueError: If it is anything else, below 0 or not finite.
+    """
+    allowed = f"a finite number >= 0, or a tensor of them that fits {list(total.shape)}"
+    try:
+        numbers = torch.as_tensor(values, dtype=torch.float64, device=total.device)
+        fits = numbers.expand_as(total).shape == total.shape
+    except (TypeError, ValueError, RuntimeError, OverflowError):
+        raise refusal(name, values, allowed) from None
+    if not fits or isinstance(values, bool) or not ((numbers >= 0) & (numbers < torch.inf)).all():
+        raise refusal(name, values, allowed)
+    return numbers
+
+
 def _check_steps(name: str, steps: Tensor, played: Tensor | None) -> None:
     """Checks the type and shape of `harvest` or `in_play`, and that `played` fits it."""
-    wanted = "float" if name == "harvest" else "bool"
-    _check_type(name, steps, wanted)
+    _check_type(name, steps, "float" if name == "harvest" else "bool")
     if steps.ndim < 2 or steps.shape[-1] == 0:
-        raise ValueError(f"{name} is {list(steps.shape)}; [..., T, N] with at least one agent is wanted")
+        raise ValueError(f"{name} is {list(steps.shape)}; allowed: [..., T, N] with at least one agent")
     if played is None:
         return
-    _check_type("played", played, "bool")
+    _check_played(played)
     if played.shape != steps.shape[:-1]:
         raise ValueError(
-            f"played is {list(played.shape)} and {name} {list(steps.shape)}; "
-            f"played is wanted as {list(steps.shape[:-1])}"
+            f"played is {list(played.shape)} and {name} is {list(steps.shape)}; "
+            f"allowed: played {list(steps.shape[:-1])}"
         )
+
+
+def _check_played(played: Tensor) -> None:
+    """Checks that `played` is True up to the end of each episode, and False after it."""
+    _check_type("played", played, "bool")
+    if played.ndim < 1:
+        raise ValueError("played is []; allowed: [..., T]")
     if (played[..., 1:] & ~played[..., :-1]).any():
         raise ValueError(
-            "played turns True again; True up to the episode's end and False behind it is wanted"
+            "played turns True again; allowed: True up to the end of the episode, and False after it"
         )
 
 
-def _check_type(name: str, values: object, wanted: str) -> None:
+def _check_type(name: str, values: object, kind: str) -> None:
     if not isinstance(values, Tensor):
-        raise TypeError(f"{name} is a {type(values).__name__}; a torch tensor of {wanted} is wanted")
-    if not (values.is_floating_point() if wanted == "float" else values.dtype == torch.bool):
-        raise TypeError(f"{name} is a tensor of {values.dtype}; {wanted} is wanted")
+        raise TypeError(f"{name} is a {type(values).__name__}; allowed: a torch tensor of {kind}")
+    if not (values.is_floating_point() if kind == "float" else values.dtype == torch.bool):
+        raise TypeError(f"{name} is a tensor of {values.dtype}; allowed: {kind}")

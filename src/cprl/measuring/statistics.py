@@ -14,11 +14,14 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy import stats
 
+from cprl.commons import checks
+
 Values = NDArray[np.float64]
 Statistic = Literal["mean", "iqm"]
 
 CONFIDENCE: Final = 0.95
 RESAMPLES: Final = 2000
+_BELOW_ONE: Final = np.nextafter(1.0, 0.0).item()
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -37,12 +40,20 @@ class Estimate:
 
 def mean(values: ArrayLike, axis: int = -1) -> Any:
     """The mean, float64 [...]."""
-    return np.mean(np.asarray(values, np.float64), axis=axis)
+    return np.mean(_some(values, axis), axis=axis)
 
 
 def inter_quartile_mean(values: ArrayLike, axis: int = -1) -> Any:
     """The mean of the middle half, float64 [...]: of R values it ignores the floor(R / 4) at each end."""
-    return stats.trim_mean(np.asarray(values, np.float64), 0.25, axis=axis)
+    return stats.trim_mean(_some(values, axis), 0.25, axis=axis)
+
+
+def _some(values: ArrayLike, axis: int) -> Values:
+    """Values as float64, at least one along the axis."""
+    found = checks.floats("values", values)
+    if not found.ndim or not -found.ndim <= axis < found.ndim or not found.shape[axis]:
+        raise ValueError(f"values is {list(found.shape)} and axis is {axis}; allowed: at least one value")
+    return found
 
 
 _STATISTICS: Final[dict[Statistic, Callable[..., Any]]] = {"mean": mean, "iqm": inter_quartile_mean}
@@ -68,13 +79,14 @@ def estimate(
         seed: The seed of the resampling.
 
     Raises:
-        ValueError: If there are no replicas, a value is not finite, or `confidence` is out of range.
+        ValueError: If there are no replicas, a value is not finite, or an argument is out of range.
+        MemoryError: If there are too many resamples.
     """
     samples = [_checked(stratum) for stratum in strata]
     if not samples:
         raise ValueError("there are no values; allowed: at least one stratum")
-    if not 0 < confidence < 1:
-        raise ValueError(f"confidence is {confidence}; allowed: above 0, below 1")
+    checks.choice("statistic", statistic, _STATISTICS)
+    resamples, seed = _bootstrap(confidence, resamples, seed, max(map(len, samples)))
     of_one = _STATISTICS[statistic]
 
     def overall(*parts: Values, axis: int = -1) -> Any:
@@ -101,11 +113,17 @@ def curve_interval(
         one has.
 
     Raises:
-        ValueError: If `curves` does not have two axes.
+        ValueError: If `curves` is not [R, E] with at least one replica and without infinity, or an argument
+            is out of range.
+        MemoryError: If there are too many resamples.
     """
-    all_curves = np.asarray(curves, np.float64)
-    if all_curves.ndim != 2:
-        raise ValueError(f"curves is {list(all_curves.shape)}; expected: [R, E]")
+    all_curves = checks.floats("curves", curves)
+    if all_curves.ndim != 2 or not len(all_curves):
+        raise ValueError(f"curves is {list(all_curves.shape)}; allowed: [R, E], a curve per replica")
+    if np.isinf(all_curves).any():
+        raise ValueError("curves holds infinity; allowed: finite numbers, and NaN where undefined")
+    numbers = len(all_curves) ** 2 + all_curves.shape[1]
+    resamples, seed = _bootstrap(confidence, resamples, seed, numbers)
     defined = ~np.isnan(all_curves)
     filled, replicas = np.where(defined, all_curves, 0.0), len(all_curves)
     chosen = np.random.default_rng(seed).integers(replicas, size=(resamples, replicas))
@@ -146,10 +164,18 @@ def _interval(
     return float("nan"), float("nan")
 
 
+def _bootstrap(confidence: float, resamples: int, seed: int, numbers: int) -> tuple[int, int]:
+    """Resamples and seed, after checking them; `numbers`: those that each resample holds."""
+    checks.number("confidence", confidence, low=0, high=_BELOW_ONE, above=True, allowed="above 0, below 1")
+    resamples, seed = checks.integer("resamples", resamples, 1, 2**40), checks.seed(seed)
+    checks.memory(f"resamples is {resamples:,}: they", 8 * resamples * numbers, advice="fewer resamples")
+    return resamples, seed
+
+
 def _checked(values: ArrayLike) -> Values:
-    checked = np.asarray(values, np.float64)
+    checked = checks.floats("values", values)
     if checked.ndim != 1 or not len(checked):
-        raise ValueError(f"values is {list(checked.shape)}; expected: [R], one number per replica")
+        raise ValueError(f"values is {list(checked.shape)}; allowed: [R], one number per replica")
     if not np.isfinite(checked).all():
-        raise ValueError(f"values is {checked.tolist()}; allowed: finite numbers")
+        raise ValueError(f"values is {checks.shown(checked.tolist())}; allowed: finite numbers")
     return checked

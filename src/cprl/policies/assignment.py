@@ -9,6 +9,7 @@ from tensordict.nn import TensorDictModuleBase
 from torch import Tensor, nn
 
 from cprl import keys
+from cprl.commons import checks
 from cprl.compat import unchecked_tensordict
 from cprl.policies.lanes import LaneActor
 
@@ -41,9 +42,18 @@ class AgentPolicies(TensorDictModuleBase):
 
     def __init__(self, actors: Sequence[nn.Module] | Mapping[AgentIndices, nn.Module]) -> None:
         super().__init__()
-        by_agents = dict(actors) if isinstance(actors, Mapping) else dict(enumerate(actors))
+        allowed = "an actor for each agent, or a mapping from agents to actors"
+        by_agents: dict[AgentIndices, nn.Module] = (
+            dict(actors)
+            if isinstance(actors, Mapping)
+            else dict(enumerate(checks.listed("actors", actors, allowed)))
+        )
+        for indices, actor in by_agents.items():
+            checks.instance(f"the actor of {indices}", actor, nn.Module, "a torch module")
+            for agent in agent_indices(indices):
+                checks.integer("an agent", agent, 0)
         taken = sorted(agent for indices in by_agents for agent in agent_indices(indices))
-        if taken != list(range(len(taken))):
+        if not taken or taken != list(range(len(taken))):
             raise ValueError(f"actors control the agents {taken}; allowed: 0, 1 and so on, each exactly once")
         self.agents = len(taken)
         self.indices = list(by_agents)

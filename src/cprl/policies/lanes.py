@@ -9,8 +9,9 @@ from tensordict.nn import TensorDictModuleBase
 from torch import Tensor, nn
 from torchrl.envs.utils import ExplorationType, exploration_type
 
+from cprl.commons import checks
 from cprl.compiling import Compiled
-from cprl.policies.rng import LaneRng
+from cprl.policies.rng import MOST_LANES, LaneRng, check_lanes
 from cprl.spaces import Spaces
 
 
@@ -29,6 +30,10 @@ class LaneActor(TensorDictModuleBase):
         agents: the number of agents S of each replica.
         worlds: the number of worlds k of each replica that are played at once, consecutive in the batch.
         compile: whether torch compiles exploration; if that fails, the actor warns once and runs uncompiled.
+
+    Raises:
+        ValueError: if a number is no integer or below 1, or there is not one seed per lane; for an `epsilon`
+            outside 0..1.
     """
 
     in_keys = ("observation",)
@@ -46,12 +51,14 @@ class LaneActor(TensorDictModuleBase):
         compile: bool = False,
     ) -> None:
         super().__init__()
-        self.values, self.actions, self.stochastic = values, actions, stochastic
-        self.agents, self.worlds, self.replicas = agents, worlds, len(seeds) // agents
+        checks.switch("stochastic", stochastic)
+        self.values, self.stochastic = values, stochastic
+        self.actions = checks.integer("actions", actions, 1)
+        self.agents, self.worlds, self.replicas = check_lanes(seeds, agents=agents, worlds=worlds)
         # A tensor, because compiled code treats other numbers as constants.
         self._chance = 0.0 if stochastic else 1.0
         self._epsilon = torch.tensor(self._chance, dtype=torch.float64)
-        self.rng = LaneRng(seeds, 2 * worlds)
+        self.rng = LaneRng(seeds, 2 * self.worlds)
         self._explore = Compiled(LaneActor._explored, what="agents act", enabled=compile)
 
     @property
@@ -65,7 +72,10 @@ class LaneActor(TensorDictModuleBase):
 
     def explore_with(self, chance: float) -> None:
         """Sets `epsilon` of agents that have one; faster than through attributes of a module."""
+        if type(chance) is not float:
+            chance = checks.number("epsilon", chance, low=0, high=1, allowed="0..1")
         if chance != self._chance and not self.stochastic:
+            checks.number("epsilon", chance, low=0, high=1, allowed="0..1")
             self._epsilon.fill_(chance)
             object.__setattr__(self, "_chance", chance)
 
@@ -132,6 +142,9 @@ def random_agents(
     spaces: Spaces, agents: tuple[int, ...], *, replicas: int, seed: int, worlds: int = 1
 ) -> dict[int | tuple[int, ...], nn.Module]:
     """Uniformly random actors of some agents of every replica, by the indices of the agents."""
+    checks.instance("spaces", spaces, Spaces, "a cprl.spaces.Spaces")
+    agents = checks.listed("agents", agents, "the indices of agents")
+    replicas, seed = checks.integer("replicas", replicas, 1, MOST_LANES), checks.seed(seed)
     seeds = [(seed, replica, agent) for replica in range(replicas) for agent in agents]
     return {agents: random_lanes(spaces.actions, seeds=seeds, agents=len(agents), worlds=worlds)}
 

@@ -7,10 +7,36 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from cprl.commons import checks
 from cprl.memory import check_memory
 
 DRAWN_AHEAD: Final = 1024
 """Steps whose numbers are generated at once."""
+MOST_LANES: Final = 2**20
+"""The largest number of agents, of replicas and of lanes."""
+_SEEDS: Final = "a sequence of integers >= 0 for each lane"
+
+
+def check_lanes(seeds: Any, *, agents: int, worlds: int) -> tuple[int, int, int]:
+    """Checks the numbers of lanes, and returns agents S, worlds k and replicas R.
+
+    Args:
+        seeds: the seeds of each lane, lane = replica x S + agent.
+        agents: the number of agents S of each replica.
+        worlds: the number of worlds k of each replica.
+
+    Raises:
+        ValueError: if a number is no integer or below 1, or there is not one seed per lane.
+    """
+    agents = checks.integer("agents", agents, 1, MOST_LANES)
+    worlds = checks.integer("worlds", worlds, 1, 2**32)
+    lanes = len(checks.listed("seeds", seeds, _SEEDS))
+    if not lanes or lanes % agents:
+        raise ValueError(
+            f"there are {lanes} seeds for {agents} agents; allowed: one seed per lane, that is, a multiple "
+            "of the number of agents"
+        )
+    return agents, worlds, lanes // agents
 
 
 class LaneRng:
@@ -21,17 +47,20 @@ class LaneRng:
         count: numbers per lane and step.
 
     Raises:
+        ValueError: if a seed is no sequence of integers of at least 0.
         TooLargeError: if there is less memory than those take that are generated ahead.
     """
 
     def __init__(self, seeds: Sequence[Sequence[int]], count: int) -> None:
+        own = [_seed(lane, seed) for lane, seed in enumerate(checks.listed("seeds", seeds, _SEEDS))]
+        self.lanes, self.count = len(own), checks.integer("count", count, 1, 2**40)
+        ahead = 8 * 2 * DRAWN_AHEAD * self.lanes * self.count
         check_memory(
-            f"random numbers of {len(seeds)} lanes, {count:,} a step and {DRAWN_AHEAD} steps ahead,",
-            2 * 8 * len(seeds) * DRAWN_AHEAD * count,
+            f"random numbers of {self.lanes:,} lanes, {self.count:,} a step and {DRAWN_AHEAD} steps ahead,",
+            ahead,
             "smaller batches or rollouts, fewer evaluation episodes or fewer replicas",
         )
-        self.lanes, self.count = len(seeds), count
-        self._chance = [np.random.Generator(np.random.Philox(np.random.SeedSequence(seed))) for seed in seeds]
+        self._chance = [np.random.Generator(np.random.Philox(np.random.SeedSequence(seed))) for seed in own]
         self._numbers = torch.empty((0, self.lanes, count), dtype=torch.float64)
         self._used = 0
 
@@ -56,6 +85,12 @@ class LaneRng:
         for chance, own in zip(self._chance, state["chance"], strict=True):
             chance.bit_generator.state = _arrays(own)
         self._numbers, self._used = state["numbers"].clone(), int(state["used"])
+
+
+def _seed(lane: int, seed: Any) -> list[int]:
+    """The seed of a lane as ints."""
+    parts = checks.listed(f"seeds[{lane}]", seed, "a sequence of integers >= 0")
+    return [checks.integer(f"seeds[{lane}]", part, 0) for part in parts]
 
 
 def _plain(state: Any) -> Any:

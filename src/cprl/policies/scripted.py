@@ -44,16 +44,16 @@ from tensordict.nn import TensorDictModuleBase
 from torch import Tensor, nn
 from torchrl.envs.utils import ExplorationType, exploration_type
 
-from cprl.commons import colours
+from cprl.commons import checks, colours
 from cprl.commons.compiled import CPU_OPTIONS, compiled
 from cprl.commons.decoding import UNSEEN, classes_seen
 from cprl.commons.game import Game
-from cprl.commons.tables import distance
+from cprl.commons.near import distance
 from cprl.commons.world import Bytes
 from cprl.policies import paths, scripted_rules
 from cprl.policies.lanes import random_lanes
 from cprl.policies.paths import AGENT, APPLE, OPEN, UNKNOWN, WALL, Frame, Scratch
-from cprl.policies.rng import LaneRng
+from cprl.policies.rng import LaneRng, check_lanes
 from cprl.policies.scripted_rules import NUMBERS, Settings
 from cprl.spaces import Spaces
 
@@ -104,10 +104,11 @@ class ScriptedActor(TensorDictModuleBase):
         spare: int = SPARE,
     ) -> None:
         super().__init__()
-        _check(policy, game, seeds=len(seeds), agents=agents, worlds=worlds, spare=spare)
+        _check(policy, game)
         self.policy, self.game, self.epsilon = policy, game, 0.0
-        self.agents, self.worlds, self.replicas = agents, worlds, len(seeds) // agents
-        self.rng = LaneRng(seeds, NUMBERS * worlds)
+        self.agents, self.worlds, self.replicas = check_lanes(seeds, agents=agents, worlds=worlds)
+        self.rng = LaneRng(seeds, NUMBERS * self.worlds)
+        spare = checks.integer("spare", spare, 1, 2**31 - 1)
         self._settings, self._role_of_class = _settings(game, spare), _roles()
         self._rim, self._frame = _frame(game)
         size = self._frame.stride * (game.observation_shape[1] + 2 * self._rim)
@@ -124,8 +125,11 @@ class ScriptedActor(TensorDictModuleBase):
             ValueError: If the observations have another shape.
         """
         expected = (self.replicas * self.worlds, self.agents, *self.game.observation_shape)
+        if not isinstance(observation, Tensor) or observation.dtype != torch.uint8:
+            found = getattr(observation, "dtype", observation)
+            raise checks.refusal("observation", found, f"a uint8 tensor {list(expected)}")
         if observation.shape != expected:
-            raise ValueError(f"observation is {list(observation.shape)}; expected: {list(expected)}")
+            raise ValueError(f"observation is {list(observation.shape)}; allowed: {list(expected)}")
         explores = exploration_type() in (ExplorationType.RANDOM, None)
         chosen = np.empty(observation.shape[:2], np.int64)
         _choose_all()(
@@ -179,6 +183,8 @@ def scripted_lanes(
     Raises:
         ValueError: for another policy than "random" in a game that is not a `Game`.
     """
+    checks.choice("policy", policy, SCRIPTED_POLICIES)
+    checks.instance("playing", playing, (Game, Spaces), "a cprl.Game, or the Spaces of another game")
     if policy == "random":
         actions = playing.actions if isinstance(playing, Spaces) else playing.spaces.actions
         return random_lanes(actions, seeds=seeds, agents=agents, worlds=worlds)
@@ -190,21 +196,13 @@ def scripted_lanes(
     return ScriptedActor(policy, playing, seeds=seeds, agents=agents, worlds=worlds)
 
 
-def _check(policy: str, game: Game, **numbers: int) -> None:
-    if policy not in SCRIPTED_POLICIES:
-        raise ValueError(f"policy is {policy!r}; allowed: {', '.join(SCRIPTED_POLICIES)}")
+def _check(policy: str, game: Game) -> None:
+    checks.choice("policy", policy, SCRIPTED_POLICIES)
+    checks.instance("game", game, Game, "a cprl.Game")
     if game.observation.area != "window":
         raise ValueError(
             f"Observation.area is {game.observation.area!r}; allowed with scripted policies: 'window', "
             "because they rely on the agent's position in it"
-        )
-    for name, number in numbers.items():
-        if number < 1:
-            raise ValueError(f"{name} is {number}; allowed: an integer >= 1")
-    if numbers["seeds"] % numbers["agents"]:
-        raise ValueError(
-            f"there are {numbers['seeds']} seeds for {numbers['agents']} agents; allowed: one seed per lane, "
-            "that is, a multiple of the number of agents"
         )
 
 

@@ -10,6 +10,8 @@ from torch import nn
 from torchrl.data import Categorical
 from torchrl.modules import EGreedyModule, QValueActor
 
+from cprl.commons import checks
+
 
 class QActor(TensorDictSequential):
     """TorchRL's `QValueActor` followed by its `EGreedyModule`.
@@ -23,6 +25,7 @@ class QActor(TensorDictSequential):
     """
 
     def __init__(self, network: nn.Module, actions: int, *, device: str | torch.device = "cpu") -> None:
+        actions = checks.integer("actions", actions, 1)
         spec = Categorical(actions, shape=(), dtype=torch.int64, device=torch.device(device))
         super().__init__(
             QValueActor(network, spec=spec, action_space="categorical"),
@@ -41,7 +44,7 @@ class QActor(TensorDictSequential):
 
     @epsilon.setter
     def epsilon(self, chance: float) -> None:
-        self.module[1].eps.fill_(chance)
+        self.module[1].eps.fill_(checks.number("epsilon", chance, low=0, high=1, allowed="0..1"))
 
 
 class RandomActor(TensorDictModuleBase):
@@ -58,8 +61,8 @@ class RandomActor(TensorDictModuleBase):
 
     def __init__(self, actions: int, *, device: str | torch.device = "cpu", seed: int = 0) -> None:
         super().__init__()
-        self.actions = actions
-        self.generator = torch.Generator(device).manual_seed(seed)
+        self.actions = checks.integer("actions", actions, 1)
+        self.generator = torch.Generator(device).manual_seed(checks.seed(seed))
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Writes "action", int64 with the TensorDict's batch size."""

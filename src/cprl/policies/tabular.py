@@ -12,12 +12,15 @@ from tensordict.nn import TensorDictModuleBase
 from torch import Tensor, nn
 from torchrl.envs.utils import ExplorationType, exploration_type
 
-from cprl.policies.rng import LaneRng
+from cprl.commons import checks
+from cprl.policies.rng import MOST_LANES, LaneRng, check_lanes
 from cprl.spaces import Spaces
 
 NEVER_MET = 0
 """The row of states that are in no table; its values stay 0."""
 _FIRST_ROWS = 1024
+MOST_ACTIONS = 2**16
+"""The largest number of actions."""
 
 
 class QTables:
@@ -27,10 +30,15 @@ class QTables:
         lanes: The number of tables L.
         actions: The number of actions A.
         max_states: The largest number of states per lane.
+
+    Raises:
+        ValueError: If a number is no integer or below 1.
     """
 
     def __init__(self, lanes: int, actions: int, *, max_states: int) -> None:
-        self.max_states = max_states
+        lanes = checks.integer("lanes", lanes, 1, MOST_LANES)
+        actions = checks.integer("actions", actions, 1, MOST_ACTIONS)
+        self.max_states = checks.integer("max_states", max_states, 1)
         self.rows: list[dict[bytes, int]] = [{} for _ in range(lanes)]
         """For each lane, the row of each state it has met."""
         self.values = np.zeros((_FIRST_ROWS, actions), np.float64)
@@ -147,11 +155,16 @@ class TableNetwork(nn.Module):
 
     def __init__(self, observation_shape: Sequence[int], actions: int) -> None:
         super().__init__()
+        lengths = checks.listed(
+            "observation_shape", observation_shape, "the lengths of an observation's axes"
+        )
+        observation_shape = [checks.integer("observation_shape", own, 1, 2**31 - 1) for own in lengths]
+        actions = checks.integer("actions", actions, 1, MOST_ACTIONS)
         self.observation_dims = len(observation_shape)
         self.register_buffer("states", torch.zeros((0, prod(observation_shape)), dtype=torch.uint8))
         self.register_buffer("values", torch.zeros((0, actions), dtype=torch.float64))
         self._rows: dict[bytes, int] = {}
-        self.register_load_state_dict_pre_hook(_take_as_many_states_as_come)  # type: ignore[no-untyped-call]
+        self.register_load_state_dict_pre_hook(_resize_to_stored_states)  # type: ignore[no-untyped-call]
         self.register_load_state_dict_post_hook(_find_them_again)  # type: ignore[no-untyped-call]
 
     def forward(self, observation: Tensor) -> Tensor:
@@ -164,13 +177,13 @@ class TableNetwork(nn.Module):
         return values.reshape(*seen.shape[:-1], -1)
 
 
-def _take_as_many_states_as_come(
+def _resize_to_stored_states(
     network: TableNetwork, state_dict: Mapping[str, Tensor], prefix: str, *how: Any
 ) -> None:
     for name in ("states", "values"):
-        own, came = getattr(network, name), state_dict.get(prefix + name)
-        if came is not None and came.shape[1:] == own.shape[1:]:
-            setattr(network, name, own.new_zeros(came.shape))
+        own, stored = getattr(network, name), state_dict.get(prefix + name)
+        if stored is not None and stored.shape[1:] == own.shape[1:]:
+            setattr(network, name, own.new_zeros(stored.shape))
 
 
 def _find_them_again(network: TableNetwork, *how: Any) -> None:
@@ -201,11 +214,12 @@ class TabularActor(TensorDictModuleBase):
         self, tables: QTables, spaces: Spaces, *, seeds: Sequence[Sequence[int]], agents: int, worlds: int = 1
     ) -> None:
         super().__init__()
+        checks.instance("spaces", spaces, Spaces, "a cprl.spaces.Spaces")
         self.in_keys = observed_entries(spaces)
         self.tables, self.actions, self.epsilon = tables, spaces.actions, 1.0
-        self.agents, self.worlds, self.replicas = agents, worlds, len(seeds) // agents
+        self.agents, self.worlds, self.replicas = check_lanes(seeds, agents=agents, worlds=worlds)
         self.rng = LaneRng(seeds, 2 * worlds)
-        lanes = np.arange(len(seeds)).reshape(self.replicas, 1, agents)
+        lanes = np.arange(self.rng.lanes).reshape(self.replicas, 1, agents)
         self._lanes = np.broadcast_to(lanes, (self.replicas, worlds, agents)).reshape(-1).tolist()
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:

@@ -8,6 +8,7 @@ from inspect import cleandoc
 from itertools import chain
 from typing import Final
 
+from cprl.commons.checks import choice, instance
 from cprl.commons.maps.board import GROUND, HEADING_OF_SIGN, SITE, WALL, Map, Start
 from cprl.commons.world import DOWN, RIGHT
 
@@ -21,6 +22,7 @@ def parse(drawing: str) -> Map:
         ValueError: If rows differ in length, a sign is unknown, or there is no site or no agent; the message
             names the row and column.
     """
+    instance("drawing", drawing, str, "text, a row of signs per line")
     rows = [row.rstrip() for row in cleandoc(drawing).splitlines()]
     if not rows:
         raise ValueError("the drawing is empty; allowed: at least one row of signs")
@@ -114,8 +116,7 @@ def named(name: str) -> Map:
     Raises:
         ValueError: If there is no board of this name.
     """
-    if name not in _DRAWINGS:
-        raise ValueError(f"name is {name!r}; allowed: {', '.join(NAMES)}")
+    choice("name", name, NAMES)
     board = parse(_DRAWINGS[name])
     starts = _NUMBERED_STARTS.get(name, board.starts)
     return Map(height=board.height, width=board.width, sites=board.sites, starts=starts, walls=board.walls)

@@ -1,0 +1,65 @@
+"""Which sites are near each other, for regrowth."""
+
+from math import hypot
+from typing import Any, Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from cprl.commons.maps import Map
+from cprl.commons.rules import Norm, Rules
+from cprl.commons.world import Indices, Ints
+
+_PAIRS_AT_ONCE: Final = 2**20
+"""Pairs of a site and a cell or site around it that are compared at once."""
+
+
+def distance(norm: Norm, rows: int, cols: int) -> float:
+    """The distance between two cells, in cells, from their difference in rows and columns."""
+    if norm == "euclidean":
+        return hypot(rows, cols)
+    if norm == "manhattan":
+        return abs(rows) + abs(cols)
+    return max(abs(rows), abs(cols))
+
+
+def near_cells(board: Map, rules: Rules) -> list[tuple[int, int]]:
+    """The (rows, cols) from a cell to each other cell within `regrow_radius_cells`, as far as the board
+    extends."""
+    reach = int(rules.regrow_radius_cells)
+    rows, cols = min(reach, board.height - 1), min(reach, board.width - 1)
+    return [
+        (row, col)
+        for row in range(-rows, rows + 1)
+        for col in range(-cols, cols + 1)
+        if (row, col) != (0, 0) and distance(rules.regrow_norm, row, col) <= rules.regrow_radius_cells
+    ]
+
+
+def neighbours(board: Map, rules: Rules) -> tuple[Ints, Indices]:
+    """The other sites within `regrow_radius_cells` of each site: `Tables.near_first`, `Tables.near_sites`."""
+    sites, offsets = np.array(board.sites), np.array(near_cells(board, rules), np.int64).reshape(-1, 2)
+    on_cell = np.full((board.height, board.width), -1, np.int32)
+    on_cell[tuple(sites.T)] = np.arange(len(sites))
+    is_near = np.zeros((2 * board.height - 1, 2 * board.width - 1), np.bool_)
+    middle = board.height - 1, board.width - 1
+    is_near[tuple((offsets + middle).T)] = True
+    counts, found = [], []
+    near: NDArray[np.bool_]
+    others: NDArray[Any]
+    at_once = max(1, _PAIRS_AT_ONCE // max(1, min(len(sites), len(offsets))))
+    for first in range(0, len(sites), at_once):
+        some = sites[first : first + at_once, None]
+        if len(sites) <= len(offsets):
+            near = is_near[tuple(np.moveaxis(sites - some + middle, -1, 0))]
+            others = np.broadcast_to(np.arange(len(sites)), near.shape)
+        else:
+            cells = some + offsets
+            inside = np.asarray(((cells >= 0) & (cells < on_cell.shape)).all(-1))
+            others = on_cell[tuple(np.moveaxis(np.where(inside[..., None], cells, 0), -1, 0))]
+            others = np.sort(np.where(inside, others, -1), 1)
+            near = np.asarray(others >= 0)
+        counts.append(near.sum(1))
+        found.append(others[near].astype(np.uint32))
+    first_of = np.cumsum(np.concatenate([[0], *counts]), dtype=np.int32)
+    return first_of, np.concatenate(found)

@@ -1,0 +1,39 @@
+"""The memory that B worlds take, checked before it is allocated."""
+
+from math import prod
+from typing import Final
+
+import numpy as np
+
+from cprl.commons.checks import memory
+from cprl.commons.game import Game, output_shapes
+from cprl.commons.world import empty_worlds
+
+OUTPUTS_HELD: Final = 3
+"""The step outputs that an environment holds at once, at least: the current one, the next, and a copy."""
+
+
+def bytes_of_worlds(game: Game, worlds: int) -> int:
+    """The bytes that B worlds take at least: their state, and `OUTPUTS_HELD` step outputs."""
+    of_world = empty_worlds(worlds=1, agents=game.agents, sites=len(game.map.sites))
+    outputs = sum(prod(shape) * np.dtype(dtype).itemsize for shape, dtype in output_shapes(game, 1).values())
+    return worlds * (sum(array.nbytes for array in of_world) + OUTPUTS_HELD * outputs)
+
+
+def check_memory(game: Game, worlds: int, *, free: int | None = None) -> None:
+    """Checks that B worlds fit into memory, before it is allocated.
+
+    Args:
+        game: The game.
+        worlds: The number of worlds B.
+        free: Bytes of free memory; None for those of this machine's main memory.
+
+    Raises:
+        MemoryError: If they do not fit.
+    """
+    memory(
+        f"worlds is {worlds:,}: {'their arrays' if worlds > 1 else 'its arrays'}",
+        bytes_of_worlds(game, worlds),
+        free=free,
+        advice="fewer worlds, or a smaller map, window or number of agents",
+    )

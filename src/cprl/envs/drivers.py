@@ -1,0 +1,55 @@
+"""Where the worlds of an environment run, and the seed of one that is given none."""
+
+import multiprocessing
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from cprl.commons import checks
+from cprl.commons.batch import Driver
+from cprl.commons.game import Game
+from cprl.commons.sizes import check_memory
+from cprl.commons.threads import CpuThreads
+
+
+def drawn_seed() -> int:
+    """A seed from torch's generator, for an environment without one.
+
+    Forked workers start with equal generators, so in a worker process the seed also depends on the name of
+    the process, which `multiprocessing` makes unique among the children of a process.
+    """
+    drawn = int(torch.empty((), dtype=torch.int64).random_().item())
+    if multiprocessing.parent_process() is None:
+        return drawn
+    worker = multiprocessing.current_process().name.encode()
+    return int(np.random.SeedSequence((drawn, *worker)).generate_state(1, np.uint64)[0])
+
+
+def device_of(device: Any) -> torch.device:
+    """The device; raises a ValueError if torch knows none of this name."""
+    try:
+        return torch.device(device)
+    except (RuntimeError, TypeError, ValueError):
+        raise checks.refusal("device", device, '"cpu" and "cuda"') from None
+
+
+def driver_for(
+    game: Game, worlds: int, device: torch.device, threads: int | None
+) -> tuple[Driver, Callable[[Tensor], Any]]:
+    """The driver that runs the worlds on a device, and the function that views a tensor as an array."""
+    if device.type == "cpu":
+        check_memory(game, worlds)
+        return CpuThreads(game, worlds, threads=threads), Tensor.numpy
+    if device.type != "cuda":
+        raise ValueError(f'device is "{device}"; allowed: "cpu" and "cuda"')
+    if threads is not None:
+        raise checks.refusal("threads", threads, "None on a GPU, where each world has its own thread")
+    if not torch.cuda.is_available():
+        raise RuntimeError(f'device is "{device}"; allowed: "cpu", because torch finds no GPU')
+    from cprl.commons.cuda import CudaThreads
+
+    driver = CudaThreads(game, worlds)
+    return driver, driver.wrap

@@ -1,0 +1,260 @@
+"""What the game, its environments, policies and metrics cannot do as asked is refused by name."""
+
+import time
+from functools import partial
+
+import numpy as np
+import pytest
+import torch
+from tensordict import TensorDict
+
+from cprl import CommonsEnv, Game, Map, Observation, Rules, maps, presets
+from cprl.commons.batch import Batch
+from cprl.commons.near import neighbours
+from cprl.commons.picture import first_image
+from cprl.envs import CommonsGymnasiumEnv, make_env, parallel_env
+from cprl.envs.state import load_env_state
+from cprl.evaluation import crossplay, evaluate_run
+from cprl.evaluation.film import film
+from cprl.measuring import phases, published, statistics
+from cprl.measuring.episodes import EpisodeTracker
+from cprl.measuring.replicas import over_replicas
+from cprl.measuring.series import Series
+from cprl.policies.assignment import AgentPolicies
+from cprl.policies.lanes import random_lanes
+from cprl.policies.scripted import ScriptedActor, scripted_lanes
+from cprl.policies.single import RandomActor
+from cprl.policies.tabular import QTables
+
+GAME = Game(map=maps.parse(">A.\n.A."), rules=Rules(may_fire=False))
+BOARD = partial(Map, height=3, width=3, sites=((0, 0),), starts=((1, 1, 0),))
+INF, NAN = float("inf"), float("nan")
+
+
+def with_regrowth(*probabilities):
+    return Rules(regrow_prob=probabilities)
+
+
+@pytest.mark.parametrize(
+    ("call", "message"),
+    [
+        (lambda: BOARD(sites=((0, 1.7),)), r"Map.sites\[0\] is \(0, 1.7\); allowed: \(row, col\), integers"),
+        (lambda: BOARD(walls=((2, "1"),)), r"Map.walls\[0\] is"),
+        (lambda: BOARD(starts=((1, 1, 0.5),)), r"Map.starts\[0\] is .*; allowed: \(row, col, heading\)"),
+        (lambda: BOARD(starts=((1, 1),)), r"Map.starts\[0\] is \(1, 1\)"),
+        (lambda: BOARD(sites=3), "Map.sites is 3; allowed: "),
+        (lambda: BOARD(height=2.0), "Map.height is 2.0; allowed: an integer from 1"),
+        (lambda: BOARD(width=10**6), "Map.width is 1000000; allowed: an integer from 1 to 10,000"),
+        (lambda: BOARD(height=9999, width=9999), "Map has 9,999 x 9,999 = .*; allowed: at most 1,048,576"),
+        (lambda: maps.parse(3), "drawing is 3; allowed: text"),
+        (lambda: maps.named([]), r"name is \[\]; allowed: single_basic"),
+        (lambda: maps.random(9, 9, agents=1, density=0.5, seed=1.9), "seed is 1.9; allowed: "),
+        (lambda: maps.random(9, 9, agents=1, density=NAN), "density is nan; allowed: "),
+        (lambda: maps.rooms(agents=2.5), "agents is 2.5; allowed: "),
+        (lambda: Game(map=3, rules=Rules()), r"Game.map is 3; allowed: a cprl.Map"),
+        (lambda: Game(map=GAME.map, rules="x"), "Game.rules is 'x'; allowed: a cprl.Rules"),
+        (lambda: with_regrowth(1e-10), r"regrow_prob is \(1e-10,\); allowed: .* each 0 or 2\*\*-32"),
+        (lambda: Rules(window_rows=2**31 - 1), "window_rows is 2147483647; allowed: .* to 1000"),
+        (lambda: Rules(hits_to_tag=10**5000), r"hits_to_tag is .*; allowed: "),
+        (lambda: Observation(area=np.zeros(2)), "Observation.area is .*; allowed: "),
+        (lambda: presets.game(3), "board is 3; allowed: 'single_basic'"),
+        (lambda: presets.game("commons", variant=None), "variant is None; allowed: 'published'"),
+        (lambda: Batch(GAME, 2, threads=10**6), "threads is 1000000; allowed: an integer from 1 to 1024"),
+        (lambda: Batch(GAME, 2, first_world=-1), "first_world is -1; allowed: "),
+        (lambda: CommonsEnv(3), "game is 3; allowed: a cprl.Game"),
+        (lambda: CommonsEnv(GAME, seed=1.9), r"seed is 1.9; allowed: an integer from 0 to 2\*\*64 - 1"),
+        (lambda: CommonsEnv(GAME, seed=2**64), "seed is 18446744073709551616; allowed: "),
+        (lambda: CommonsEnv(GAME, 0), "worlds is 0; allowed: an integer from 1"),
+        (lambda: CommonsEnv(GAME, 1.5), "worlds is 1.5; allowed: an integer from 1"),
+        (lambda: CommonsEnv(GAME, device="x"), "device is 'x'; allowed: "),
+        (lambda: CommonsEnv(GAME, 2).load(3), "state is 3; allowed: "),
+        (lambda: load_env_state(CommonsEnv(GAME, 2), {}), r"state\['worlds'\] is None; allowed: a table"),
+        (lambda: make_env(3), "game is 3; allowed: a cprl.Game, or a game with"),
+        (lambda: make_env(GAME, transforms=[3]), "a transform is 3; allowed: a TorchRL transform"),
+        (lambda: parallel_env(3), "game is 3; allowed: a cprl.Game"),
+        (lambda: parallel_env(GAME).observation_space("x"), "agent is 'x'; allowed: agent_0"),
+        (lambda: CommonsGymnasiumEnv(GAME).step(0), r"has not begun; allowed: reset\(\) before"),
+        (lambda: first_image(GAME, cell_pixels=9.5), "cell_pixels is 9.5; allowed: an integer from 8"),
+        (lambda: scripted_lanes("gredy", GAME, seeds=[(0,)], agents=1), "policy is 'gredy'; allowed: random"),
+        (lambda: ScriptedActor("greedy", 3, seeds=[(0,)], agents=1), "game is 3; allowed: a cprl.Game"),
+        (lambda: random_lanes(7, seeds=[(0,)], agents=2), "1 seeds for 2 agents; allowed: "),
+        (lambda: random_lanes(7, seeds=[(0,)], agents=0), "agents is 0; allowed: "),
+        (lambda: setattr(random_lanes(7, seeds=[(0,)], agents=1), "epsilon", 2.0), "epsilon is 2.0"),
+        (lambda: RandomActor(3, seed=-1), "seed is -1; allowed: "),
+        (lambda: QTables(2.5, 3, max_states=9), "lanes is 2.5; allowed: "),
+        (lambda: AgentPolicies([3]), "the actor of 0 is 3; allowed: a torch module"),
+        (lambda: statistics.estimate([1, 2], statistic="median"), "'median'; allowed: mean, iqm"),
+        (lambda: statistics.estimate([1, 2], seed=-1), "seed is -1; allowed: "),
+        (lambda: statistics.estimate([1, 2], resamples=0), "resamples is 0; allowed: "),
+        (lambda: statistics.estimate("12"), "values is '12'; allowed: an array of numbers"),
+        (lambda: statistics.curve_interval([[1, INF]]), "curves holds infinity; allowed: "),
+        (lambda: statistics.curve_interval([[1.0]], confidence=2), "confidence is 2; allowed: "),
+        (lambda: phases.change_points([3, 2, 1], {"a": [1, 2, 3]}), "episodes is .*; allowed: .* increasing"),
+        (lambda: phases.phases([1, 2], {}, []), "metrics is empty; allowed: "),
+        (lambda: phases.find_phases([0, 1e9], {"a": [1, 2]}), "episodes are 0 to 1e.09; allowed: at most"),
+        (lambda: crossplay(["a", "b"], diagonal="selfplay"), "diagonal is 'selfplay'; allowed: self, cross_"),
+        (lambda: crossplay([]), "the number of runs is 0; allowed: at least two"),
+        (lambda: crossplay("ab"), "runs is 'ab'; allowed: a sequence of at least two runs"),
+        (lambda: evaluate_run(3), "run is 3; allowed: a directory"),
+        (lambda: film("run", replica=1.5), "replica is 1.5; allowed: an integer >= 0"),
+        (lambda: film("run", episode=2**32), "episode is 4294967296; allowed: an integer from 0"),
+        (lambda: published.curve("exp9"), "name is 'exp9'; allowed: exp1/return"),
+        (lambda: over_replicas({0: ["a"]}), r"values\[0\] is 'a'; allowed: "),
+        (lambda: Series(2).add(0, 2, {}), "replica is 2; allowed: an integer from 0 to 1"),
+        (lambda: EpisodeTracker(1, 1.5), "agents is 1.5; allowed: "),
+        (lambda: EpisodeTracker(1, 1).load_state_dict({}), "the state has .*; allowed: at least "),
+    ],
+)  # fmt: skip
+def test_it_is_refused_in_one_sentence(call, message):
+    with pytest.raises(ValueError, match=message):
+        call()
+
+
+def test_worlds_that_do_not_fit_into_memory_are_refused_before_they_are_allocated():
+    for make in (Batch, CommonsEnv):
+        with pytest.raises(MemoryError, match=r"worlds is 4,000,000,000: .* GiB are free; allowed: fewer"):
+            make(GAME, 4_000_000_000)
+    with pytest.raises(MemoryError, match="worlds is 4,000,000,000: the histories"):
+        EpisodeTracker(4_000_000_000, 4)
+
+
+def test_a_beam_wider_than_the_board_is_as_wide_as_the_board():
+    boards = maps.parse("..A..\n.>.<.\n....^")
+    widest, wide = (Game(map=boards, rules=Rules(beam_width_cells=n)) for n in (2**31 - 1, 11))
+    assert widest.tables.beam_half_width == 4
+    assert widest.tables.background.size < 1000
+    actions = np.random.default_rng(0).integers(0, 8, (60, 2, 3))
+    outputs = []
+    for game in (widest, wide):
+        batch = Batch(game, 2)
+        output = batch.begin(batch.new_output())
+        outputs.append([])
+        for action in actions:
+            batch.play(action, output)
+            outputs[-1].append((output.tagged_by.copy(), output.observation.copy(), batch.now.row.copy()))
+    assert any(tagged.any() for tagged, _, _ in outputs[0])
+    for one, other in zip(*outputs, strict=True):
+        assert all(map(np.array_equal, one, other))
+
+
+def test_a_large_random_board_takes_less_than_a_second():
+    started = time.process_time()
+    board = maps.random(300, 300, agents=12, density=0.3, clustering=0.8, seed=1)
+    assert time.process_time() - started < 1
+    assert (len(board.sites), board.agents) == (27_000, 12)
+
+
+def test_sites_far_apart_are_counted_without_walking_over_the_board():
+    board = Map(height=1000, width=1000, sites=((0, 0), (999, 999), (0, 5)), starts=((1, 1, 0),))
+    first, sites = neighbours(board, Rules(regrow_radius_cells=1000))
+    assert first.tolist() == [0, 1, 1, 2]
+    assert sites.tolist() == [2, 0]
+    crowded = maps.random(200, 200, agents=1, density=0.5)
+    with pytest.raises(ValueError, match=r"radius_cells is 1000 and the map has 20,000 sites.*allowed: "):
+        Game(map=crowded, rules=Rules(regrow_radius_cells=1000))
+    with pytest.raises(ValueError, match=r"walls_block_sight is True with windows of 1000 x 13.*allowed: "):
+        Game(map=GAME.map, rules=Rules(walls_block_sight=True, window_rows=1000))
+
+
+@pytest.mark.parametrize(
+    "which", [np.ones(1, bool), np.ones(3, bool), np.ones(2, np.int64), np.ones((2, 1), bool), [True] * 2]
+)
+def test_a_mask_of_another_form_is_refused_before_the_kernel_reads_it(which):
+    batch = Batch(GAME, 2)
+    output = batch.begin(batch.new_output())
+    with pytest.raises(ValueError, match=r"which is .*; allowed: bool \[2\]"):
+        batch.begin(output, which)
+    assert batch.now.episode.tolist() == [[0], [0]]
+
+
+def test_a_reset_mask_of_another_form_is_refused():
+    env = CommonsEnv(GAME, 2)
+    env.reset()
+    for mask in (torch.ones(2, 1, dtype=torch.int64), torch.ones(2, 3, dtype=torch.bool)):
+        with pytest.raises(ValueError, match=r'"_reset" is .*; allowed: bool \[2, 1\]'):
+            env._begin(mask)
+    assert env.worlds.now.episode.tolist() == [[0], [0]]
+
+
+def test_worlds_that_have_not_begun_are_not_played():
+    batch = Batch(GAME, 2)
+    with pytest.raises(ValueError, match="have not begun; allowed: "):
+        batch.play(np.zeros((2, 1), np.int64), batch.new_output())
+    with pytest.raises(ValueError, match="which leaves worlds out; allowed at first: None"):
+        batch.begin(batch.new_output(), np.array([True, False]))
+
+
+def stepped(env, action, how):
+    moment = env.reset()
+    if action is not None:
+        moment.set(("agents", "action"), action)
+    return getattr(env, how)(moment)
+
+
+@pytest.mark.parametrize("how", ["step", "step_and_maybe_reset"])
+@pytest.mark.parametrize(
+    ("action", "message"),
+    [
+        (None, r'\("agents", "action"\) is missing; allowed: int64 \[2, 1\]'),
+        (torch.zeros(2, 1), r'\("agents", "action"\) is torch.float32; allowed: int64'),
+        (torch.ones(2, 1, dtype=torch.bool), "is torch.bool; allowed: int64"),
+        (torch.zeros(2, 1, 1, dtype=torch.int64), r"actions is int64 \[2, 1, 1\]; allowed: int64 \[2, 1\]"),
+        (torch.full((2, 1), -1), "action -1 of agent 0 in world 0 is unknown; allowed: 0 to 6"),
+    ],
+)
+def test_wrong_actions_are_refused_and_no_world_changes(action, message, how):
+    env = CommonsEnv(GAME, 2)
+    with pytest.raises(ValueError, match=message):
+        stepped(env, action, how)
+    assert env.worlds.now.step.sum() == 0
+
+
+@pytest.mark.parametrize("dtype", [torch.int32, torch.int16, torch.int8, torch.uint8])
+def test_actions_of_other_integers_play_the_same(dtype):
+    action = torch.tensor([[3], [2]])
+    exact, other = (stepped(CommonsEnv(GAME, 2, seed=0), own, "step") for own in (action, action.to(dtype)))
+    assert torch.equal(exact["next", "agents", "observation"], other["next", "agents", "observation"])
+
+
+def test_batches_of_another_size_are_refused():
+    env = CommonsEnv(GAME, 2)
+    for wrong in (None, 3, TensorDict({}, [3])):
+        with pytest.raises(ValueError, match=r"tensordict is .*; allowed: a TensorDict"):
+            env.step(wrong)
+
+
+@pytest.mark.parametrize("action", [0.5, 1.0, "3", None, True, NAN, np.float32(1), np.ones(1, int), -1, 7])
+def test_one_world_takes_exact_actions_only(action):
+    world, parallel = CommonsGymnasiumEnv(GAME), parallel_env(GAME)
+    world.reset(), parallel.reset()
+    for step in (partial(world.step, action), partial(parallel.step, {"agent_0": action})):
+        with pytest.raises(ValueError, match=r"the action of agent_0 is .*; allowed: an integer from 0 to 6"):
+            step()
+    assert world.world.batch.now.step.sum() == 0
+    for seed in (-1, 1.5, 2**64, "3"):
+        with pytest.raises(ValueError, match=r"seed is .*; allowed: an integer from 0"):
+            world.reset(seed=seed)
+
+
+@pytest.mark.parametrize("action", [3, np.int8(3), np.uint64(3), np.array(3), torch.tensor(3)])
+def test_one_world_takes_integers_of_any_library(action):
+    world = CommonsGymnasiumEnv(GAME)
+    world.reset()
+    world.step(action)
+    assert world.world.batch.now.step.sum() == 1
+
+
+def test_the_histories_of_long_episodes_grow_with_them():
+    rules = Rules(may_fire=False, regrow_prob=(0.5,), episode_steps=5000)
+    env = CommonsEnv(Game(map=GAME.map, rules=rules), 1)
+    tracker = EpisodeTracker(1, 1, 2**31 - 1)
+    exact = EpisodeTracker(1, 1, 5000)
+    action = torch.zeros(1, 1, dtype=torch.int64)
+    moment, episodes = env.reset(), []
+    while not episodes:
+        batch, moment = env.step_and_maybe_reset(moment.set(("agents", "action"), action))
+        episodes, others = tracker.add(batch), exact.add(batch)
+    assert episodes[0].steps == 5000
+    assert tracker._histories["harvest"].shape == (1, 8192, 1)
+    assert exact._histories["harvest"].shape == (1, 5000, 1)
+    assert episodes[0].metrics == others[0].metrics
