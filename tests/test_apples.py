@@ -8,7 +8,7 @@ from boards import Play
 
 from cprl import Game, Rules, maps
 from cprl.commons.batch import Batch
-from cprl.commons.tables import distance, neighbours
+from cprl.commons.near import distance, neighbours
 
 
 def test_an_agent_harvests_the_apple_that_it_steps_on():

@@ -16,6 +16,7 @@ import tyro
 
 from cprl.checks import checked, instance
 from cprl.experiment import Experiment
+from cprl.finite import NotFiniteError
 from cprl.flags import applied, flags_of
 
 _OLD_WORDS: Final = {
@@ -84,7 +85,7 @@ def in_a_sentence(program: str) -> Iterator[None]:
         yield
     except (ValueError, OSError, MemoryError) as error:
         notes = getattr(error, "__notes__", [])
-        if notes and not isinstance(error, OSError | MemoryError):
+        if notes and not isinstance(error, OSError | MemoryError | NotFiniteError):
             raise
         sys.exit("\n".join([f"{program}: {error}", *notes]))
 
