@@ -7,7 +7,7 @@ INSTALLED := .venv/.installed
 
 VIEWER_PACKAGES := mesa-vulkan-drivers libvulkan1 chromium chromium-driver
 
-.PHONY: run lint test test-slow test-gpu test-viewer viewer-packages check bench bench-gpu clean
+.PHONY: run lint test fuzz test-slow test-gpu test-viewer viewer-packages check bench bench-gpu clean
 
 run: $(INSTALLED)
 	$(BIN)/python recipes/first_run.py --watch serve
@@ -17,6 +17,12 @@ test: $(INSTALLED)
 
 test-slow: $(INSTALLED)
 	$(BIN)/python -m pytest -m slow
+
+# Generated inputs for all that is public, 100,000 and more; the table is docs/fuzz.md. A part of it, and again
+# from another seed: `make fuzz FUZZ="--only Rules --seed 1"`, whose table is then left as it is.
+FUZZ ?= --out docs/fuzz.md
+fuzz: $(INSTALLED)
+	$(BIN)/python -W ignore -m tests.fuzz $(FUZZ)
 
 # Real viewers without a screen, pictures of which are looked at; see docs/watching.md.
 test-viewer: $(INSTALLED) viewer-packages

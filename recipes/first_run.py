@@ -27,6 +27,7 @@ from cprl import CommonsEnv, presets
 from cprl.algorithms import DQN
 from cprl.callbacks import Callback
 from cprl.collectors import StepCollector
+from cprl.commandline import in_a_sentence
 from cprl.learners.settings import DQNSettings
 from cprl.learners.transitions import transitions_of
 from cprl.measuring.episodes import EpisodeTracker
@@ -174,4 +175,5 @@ def learn(
 
 
 if __name__ == "__main__":
-    tyro.cli(main)
+    with in_a_sentence("first_run.py"):
+        tyro.cli(main)

@@ -17,6 +17,7 @@ from typing import Literal
 
 import tyro
 
+from cprl.commandline import in_a_sentence
 from cprl.process import prepare_process
 from cprl.reporting import write_report
 from cprl.runs.export import export_results
@@ -90,4 +91,5 @@ def run(name: str, common: Sequence[str], *, runs: Path, results: Path) -> None:
 
 
 if __name__ == "__main__":
-    print(tyro.cli(main))
+    with in_a_sentence("reproduce.py"):
+        print(tyro.cli(main))

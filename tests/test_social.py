@@ -156,13 +156,13 @@ def test_equality_is_one_when_all_have_the_same_and_one_nth_when_one_has_all():
 @pytest.mark.parametrize(
     ("harvest", "played", "error", "message"),
     [
-        (HARVEST.int(), None, TypeError, "harvest is a tensor of torch.int32; allowed: float"),
-        (HARVEST.numpy(), None, TypeError, "harvest is a ndarray; allowed: a torch tensor of float"),
+        (HARVEST.int(), None, ValueError, "harvest is a tensor of torch.int32; allowed: float"),
+        (HARVEST.numpy(), None, ValueError, "harvest is a ndarray; allowed: a torch tensor of float"),
         (HARVEST[0], None, ValueError, r"harvest is \[2\]; allowed: \[..., T, N\]"),
         (HARVEST[:, :0], None, ValueError, "at least one agent"),
         (-HARVEST, None, ValueError, "below 0"),
         (HARVEST / 0, None, ValueError, "infinity; allowed: "),
-        (HARVEST, torch.ones(4), TypeError, "played is a tensor of torch.float32; allowed: bool"),
+        (HARVEST, torch.ones(4), ValueError, "played is a tensor of torch.float32; allowed: bool"),
         (HARVEST, torch.ones(5, dtype=torch.bool), ValueError, r"played is \[5\] .*; allowed: played \[4\]"),
         (HARVEST, torch.tensor([True, False, True, False]), ValueError, "turns True again"),
     ],
@@ -173,7 +173,7 @@ def test_what_does_not_fit_is_named(harvest, played, error, message):
 
 
 def test_a_summary_names_what_does_not_fit_together():
-    with pytest.raises(TypeError, match=r"in_play is a tensor of .*; allowed: bool"):
+    with pytest.raises(ValueError, match=r"in_play is a tensor of .*; allowed: bool"):
         social.summary(HARVEST, HARVEST)
     with pytest.raises(ValueError, match=r"harvest is \[4, 2\] and in_play is \[3, 2\]; allowed: equal"):
         social.summary(HARVEST, IN_PLAY[:3])

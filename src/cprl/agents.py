@@ -9,6 +9,7 @@ from torch import Tensor, nn
 from torchrl.envs import EnvBase
 
 from cprl.algorithms.base import Algorithm, TeamAlgorithm
+from cprl.checks import MOST_SEED, checked, count, listed, texts
 from cprl.commons.game import Game
 from cprl.custom import Custom, made
 from cprl.envs.make_env import spaces_of
@@ -52,7 +53,11 @@ class Population:
         allow: Sequence[str] = (),
         starts: bool = True,
     ) -> None:
-        self.spaces, self.specs = spaces_of(env), tuple(specs)
+        specs = listed("specs", specs, AgentSpec, "Learning, Team, Scripted or Frozen")
+        checked("seed", seed, count(0, MOST_SEED))
+        checked("first_replica", first_replica, count(0))
+        texts("allow", allow)
+        self.spaces, self.specs = spaces_of(env), specs
         self.replicas, self.seed, self._first = env.batch_size.numel(), seed, first_replica
         commons = commons_of(env)
         self._game = None if commons is None else commons.game

@@ -1,13 +1,15 @@
 """What is called while a training runs."""
 
 from collections.abc import Mapping, Sequence
-from typing import Any, Final, Protocol
+from typing import Any, Final, Protocol, runtime_checkable
 
 from tensordict import TensorDictBase
 
+from cprl.checks import listed, shown
 from cprl.measuring.episodes import Episode
 
 
+@runtime_checkable
 class SavesTraining(Protocol):
     """What saves the state of a training, as `cprl.runs.Checkpointer` does."""
 
@@ -37,10 +39,13 @@ class Callback(Protocol):
 HOOKS: Final = ("on_start", "on_step", "on_episode")
 
 
-def check_callbacks(callbacks: Sequence[Any]) -> None:
-    """Refuses a callback that nothing would call."""
-    for callback in callbacks:
+def check_callbacks(callbacks: Sequence[Any]) -> tuple[Any, ...]:
+    """The callbacks; refuses one that nothing would call."""
+    found = listed("callbacks", callbacks, object, "callbacks")
+    for callback in found:
         if not any(hasattr(callback, hook) for hook in HOOKS):
             raise ValueError(
-                f"the callback {callback!r} has none of the methods {', '.join(HOOKS)}: nothing would call it"
+                f"the callback {shown(callback)} has none of the methods {', '.join(HOOKS)}: nothing would "
+                "call it"
             )
+    return found

@@ -5,13 +5,16 @@ argument. Whatever does not fit is a ValueError. A TypeError is left for a call 
 e.g. with an unknown keyword.
 """
 
+import os
 import reprlib
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import fields
+from pathlib import Path
 from typing import Any, Final, NamedTuple
 
 MOST_INT32: Final = 2**31 - 1
 MOST_INT64: Final = 2**63 - 1
+MOST_SEED: Final = 2**64 - 1
 MOST_NUMBER: Final = 1e30
 """The largest number that is allowed where nothing else bounds it; its products still fit into float32."""
 
@@ -87,7 +90,10 @@ def plain(value: Any, nested: int = 0) -> Any:
     """Lists, ranges and arrays as nested tuples, numpy scalars as Python's numbers, anything else as it is;
     what is nested deeper than any value of ours stays, so that no check lets it pass."""
     if not isinstance(value, type) and callable(getattr(value, "tolist", None)):
-        value = value.tolist()
+        try:
+            value = value.tolist()
+        except Exception:  # a tensor without values, sparse or on "meta"
+            return value
     if not isinstance(value, list | tuple | range) or nested > _MOST_NESTED_VALUE or value[_MOST_ENTRIES:]:
         return value
     return tuple(plain(entry, nested + 1) for entry in value)
@@ -199,6 +205,44 @@ def tuple_of(check: Check, at_least: int = 0) -> Check:
 def either(*checks: Check) -> Check:
     """What any of these checks allows."""
     return Check(lambda value: any(c.fits(value) for c in checks), " or ".join(c.allowed for c in checks))
+
+
+TEXT: Final = Check(lambda value: isinstance(value, str), "a text")
+
+
+def path(name: str, value: Any) -> Path:
+    """A text or another path as a `Path`; raises a ValueError for anything else, and for a text with NUL."""
+    if not isinstance(value, str | os.PathLike) or "\0" in os.fspath(value):
+        raise ValueError(f"{name} is {shown(value)}; allowed: a path, without NUL")
+    return Path(value)
+
+
+def texts(name: str, value: Any, at_least: int = 0) -> tuple[str, ...]:
+    """Texts, at least so many; raises a ValueError for anything else, a single text included."""
+    found: tuple[str, ...] = checked(name, value, tuple_of(TEXT, at_least))
+    return found
+
+
+def callable_of(name: str, value: Any, allowed: str) -> None:
+    """Raises a ValueError for what cannot be called."""
+    if not callable(value):
+        raise ValueError(f"{name} is {shown(value)}; allowed: {allowed}")
+
+
+def object_of(name: str, value: Any, kind: Any, allowed: str) -> None:
+    """Raises a ValueError for what is no instance of a class, nor of one of several; it is left as it is."""
+    if not isinstance(value, kind):
+        raise ValueError(f"{name} is {shown(value)}; allowed: {allowed}")
+
+
+def listed(name: str, value: Any, kind: Any, allowed: str) -> tuple[Any, ...]:
+    """The objects of a list or tuple, each an instance of a class; raises a ValueError for anything else."""
+    if not isinstance(value, Iterable) or isinstance(value, str | bytes | Mapping):
+        raise ValueError(f"{name} is {shown(value)}; allowed: a list of {allowed}")
+    found = tuple(value)
+    for place, own in enumerate(found):
+        object_of(f"{name}[{place}]", own, kind, allowed)
+    return found
 
 
 NONE: Final = Check(lambda value: value is None, "None")

@@ -12,7 +12,7 @@ from torchrl.collectors import BaseCollector, Collector
 from torchrl.envs import EnvBase
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 
-from cprl.checks import checked, count
+from cprl.checks import callable_of, checked, count, object_of
 
 
 class StepCollector(BaseCollector):
@@ -27,6 +27,8 @@ class StepCollector(BaseCollector):
     """
 
     def __init__(self, env: EnvBase, policy: nn.Module) -> None:
+        object_of("env", env, EnvBase, "an EnvBase of TorchRL")
+        callable_of("policy", policy, "a function that writes the actions")
         super().__init__()
         self.env, self.policy = env, policy
         self.frames_per_batch = env.batch_size.numel()

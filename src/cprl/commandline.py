@@ -14,7 +14,7 @@ from typing import Annotated, Any, Final
 
 import tyro
 
-from cprl.checks import checked, instance
+from cprl.checks import callable_of, checked, instance, texts
 from cprl.experiment import Experiment
 from cprl.finite import NotFiniteError
 from cprl.flags import applied, flags_of
@@ -66,9 +66,10 @@ def recipe_main(make_experiment: Callable[..., Experiment], argv: Sequence[str] 
         The run's directory.
 
     Raises:
+        ValueError: where `argv` is no list of texts.
         SystemExit: where the command line or an experiment is refused, with the reason.
     """
-    command = list(sys.argv if argv is None else argv)
+    command = list(texts("argv", sys.argv if argv is None else argv, 1))
     with in_a_sentence(Path(command[0]).name):
         experiment, options = parse(make_experiment, command)
     from cprl.running import run
@@ -100,6 +101,7 @@ def parse(
             a field of the experiment.
         SystemExit: for `--help`, and for an argument that is unknown or of another type.
     """
+    callable_of("make_experiment", make_experiment, "a function that gives an Experiment")
     script, given = Path(command[0]).name, _in_todays_words(command[1:])
     _check_names(make_experiment)
     made, _ = tyro.cli(

@@ -29,7 +29,7 @@ from cprl.algorithms import (
     Tabular,
     TabularSettings,
 )
-from cprl.checks import check_nesting, shown
+from cprl.checks import check_nesting, listed, shown
 from cprl.commons.game import Game
 from cprl.commons.maps import Map
 from cprl.commons.observation import Observation
@@ -145,7 +145,7 @@ def refuse_targets(table: object, allow: Iterable[str]) -> None:
     Raises:
         ValueError: names each target and says how it is allowed.
     """
-    allowed = set(allow)
+    allowed = set(listed("allow", allow, str, 'texts, "module:Class" each'))
     refused = [target for target in custom_targets(table) if target not in allowed]
     if refused:
         flags = " ".join(f"--allow {target}" for target in refused)

@@ -13,6 +13,7 @@ import torch
 from torchrl.envs import EnvBase
 
 from cprl.agents import Population
+from cprl.checks import SWITCH, checked, object_of, path, texts
 from cprl.custom import Custom, made
 from cprl.envs.make_env import make_env
 from cprl.envs.state import check_restorable, transforms_state
@@ -106,11 +107,16 @@ def run(
         OSError: for a full disk or a deleted directory; the message names it. What was written before is
             intact, and the run can be resumed.
     """
+    object_of("experiment", experiment, Experiment, "an Experiment")
+    out = None if out is None else path("out", out)
+    for name, switch in (("resume", resume), ("take_over", take_over), ("keep_checkpoint", keep_checkpoint)):
+        checked(name, switch, SWITCH)
+    texts("allow", allow)
+    command = None if command is None else texts("command", command, 1)
     check_watch(watch)
     for logger in experiment.loggers:
         check_logger(logger.resolve() if isinstance(logger, Custom) else logger)
     prepare_process(experiment.seed)
-    out = None if out is None else Path(out)
     is_begun = resume and out is not None and bool(checkpoints_in(out / FOLDER))
     own = _make(experiment, allow, starts=not is_begun)
     is_there = False

@@ -11,6 +11,8 @@ import torch
 from torch import Tensor, nn
 from torchrl.envs import EnvBase
 
+from cprl.checks import TEXT, checked, texts
+from cprl.checks import path as path_of
 from cprl.commons.game import Game
 from cprl.custom import made
 from cprl.envs.make_env import make_env, spaces_of
@@ -227,8 +229,13 @@ def load(run: str | Path, *, weights: str | None = None, allow: Sequence[str] = 
         ValueError: for a file that is missing, truncated, changed or foreign, naming it and the reason; for
             code of the user's own that is not allowed, naming it.
     """
-    run = Path(run)
-    if weights is not None and (Path(weights).name != weights or weights in ("", ".", "..")):
+    run = path_of("run", run)
+    texts("allow", allow)
+    if (
+        weights is not None
+        and checked("weights", weights, TEXT)
+        and (Path(weights).name != weights or weights in ("", ".", ".."))
+    ):
         raise ValueError(f'weights is {weights!r}; allowed: a name in {run / FOLDER}, such as "final"')
     recipe = read_recipe(run)
     try:

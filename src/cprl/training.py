@@ -11,6 +11,7 @@ from torchrl.collectors import BaseCollector
 from torchrl.envs import EnvBase
 
 from cprl.callbacks import SavesTraining, check_callbacks
+from cprl.checks import callable_of, object_of
 from cprl.collectors import StepCollector
 from cprl.envs.make_env import check_env, spaces_of
 from cprl.envs.state import carried_state, env_state, load_carried, load_env_state
@@ -61,14 +62,17 @@ class Training:
         make_collector: MakeCollector = StepCollector,
         on_nan: OnNan = "stop",
     ) -> None:
-        replicas, spaces = env.batch_size.numel(), spaces_of(env)
+        spaces = spaces_of(env)
+        replicas = env.batch_size.numel()
+        object_of("learners", learners, Mapping, "learners by the indices of their agents")
+        object_of("others", others, Mapping | None, "actors by the indices of their agents, or None")
+        callable_of("make_collector", make_collector, "a function that makes a collector")
         check_env(env, replicas)
-        self.env, self.episodes, self.callbacks = env, episodes, list(callbacks)
+        self.env, self.episodes, self.callbacks = env, episodes, list(check_callbacks(callbacks))
         self.update_every = update_every
         self.learners, self.others = dict(learners), dict(others or {})
         check_agents(spaces.agents, replicas, self.learners, self.others)
         check_numbers(episodes, update_every, self.learners)
-        check_callbacks(callbacks)
         actors: dict[AgentIndices, nn.Module] = {
             agents: learner.actor for agents, learner in self.learners.items()
         }
@@ -286,6 +290,7 @@ def train(
         on_nan=on_nan,
     )
     if checkpointer is not None:
+        object_of("checkpointer", checkpointer, SavesTraining, "None, or what has `restore` and `after_step`")
         training.state_dict()  # what cannot be saved is refused now, not when the first checkpoint is due
         checkpointer.restore(training)
     training.start()

@@ -9,6 +9,7 @@ import torch
 from tensordict import TensorDictBase
 from torch import Tensor, nn
 
+from cprl.checks import checked, count
 from cprl.policies.assignment import AgentIndices, agent_indices
 
 
@@ -130,8 +131,7 @@ def check_agents(
 def check_numbers(episodes: int, update_every: int, learners: Mapping[tuple[int, ...], Learner]) -> None:
     """Raises a ValueError for numbers below 1, and for rollouts that `update_every` does not divide."""
     for name, number in (("episodes", episodes), ("update_every", update_every)):
-        if number < 1:
-            raise ValueError(f"{name} is {number}; allowed: an integer >= 1")
+        checked(name, number, count(1))
     for learner in learners.values():
         steps = getattr(learner, "rollout_steps", update_every)
         if steps % update_every:

@@ -8,6 +8,7 @@ from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
 
 from cprl import keys
+from cprl.checks import checked, count, object_of
 
 RewardKind: TypeAlias = Literal["individual", "team"]
 """The reward that a learner gets each turn: the agent's own, or the sum over all agents."""
@@ -93,8 +94,17 @@ def transitions_of(agent: int, batch: TensorDictBase) -> TensorDict:
         A flat TensorDict [transitions] of "observation" uint8 [.., 3, X, Y], "action" int64 [..] and "next":
         "observation", "reward" float32 [.., 1], "done", "terminated", "truncated" bool [.., 1].
         Turns that the agent spends out of play are included, with the action that it chose.
+
+    Raises:
+        ValueError: for an agent that the batch does not have, and for anything but such a batch.
     """
-    before, after = batch.get(keys.AGENTS), batch.get("next")
+    object_of("batch", batch, TensorDictBase, "a TensorDict as a collector yields it")
+    before, after = batch.get(keys.AGENTS, None), batch.get("next", None)
+    if before is None or after is None or after.get(keys.AGENTS, None) is None:
+        raise ValueError(
+            'batch lacks "agents", at its root or under "next"; allowed: what a collector yields'
+        )
+    checked("agent", agent, count(0, before.get("action").shape[-1] - 1))
     agents_after = after.get(keys.AGENTS)
     dim = len(batch.batch_size)
     following = TensorDict(

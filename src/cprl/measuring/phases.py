@@ -16,6 +16,7 @@ import ruptures
 from numpy.typing import ArrayLike, NDArray
 from ruptures.base import BaseCost
 
+from cprl.checks import listed
 from cprl.commons import checks
 
 Values = NDArray[np.float64]
@@ -137,12 +138,13 @@ def phases(
     Raises:
         ValueError: If a metric is missing or has another shape, or a phase has fewer than two episodes.
     """
+    points = listed("changes", changes, ChangePoint, "change points")
     at, by_name = _checked(episodes, metrics)
     missing = [name for name in METRICS if name not in by_name]
     if missing:
         raise ValueError(f"metrics lack {missing}; allowed: at least {list(METRICS)}")
     means = {name: _over_replicas(by_name[name]) for name in METRICS}
-    bounds = [at[0], *(change.episode for change in changes), at[-1]]
+    bounds = [at[0], *(change.episode for change in points), at[-1]]
     found: list[Phase] = []
     for first, last in pairwise(bounds):
         inside = (at >= first) & (at <= last)

@@ -7,7 +7,7 @@ Arguments, for T steps counted from 1 and N agents (at least one), with any lead
              episodes of different lengths fit one batch; None if all steps were played. Padding is not read.
 
 Results are float64 [...], NaN where the metric is undefined; separate functions count these cases.
-A wrong type raises TypeError, a wrong shape or value ValueError; the message says what is allowed.
+A wrong type, shape or value raises ValueError; the message says what is allowed.
 
 Below, R_i is the sum of agent i's harvest over its episode. Sources:
 [P] Perolat et al., "A multi-agent reinforcement learning model of common-pool resource appropriation" (2017);
@@ -241,6 +241,6 @@ def _check_played(played: Tensor) -> None:
 
 def _check_type(name: str, values: object, kind: str) -> None:
     if not isinstance(values, Tensor):
-        raise TypeError(f"{name} is a {type(values).__name__}; allowed: a torch tensor of {kind}")
+        raise ValueError(f"{name} is a {type(values).__name__}; allowed: a torch tensor of {kind}")
     if not (values.is_floating_point() if kind == "float" else values.dtype == torch.bool):
-        raise TypeError(f"{name} is a tensor of {values.dtype}; allowed: {kind}")
+        raise ValueError(f"{name} is a tensor of {values.dtype}; allowed: {kind}")

@@ -6,6 +6,7 @@ replica. Inter-quartile means and stratified bootstrap intervals follow R. Agarw
 Learning at the Edge of the Statistical Precipice" (2021).
 """
 
+import warnings
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any, Final, Literal
@@ -51,6 +52,7 @@ def inter_quartile_mean(values: ArrayLike, axis: int = -1) -> Any:
 def _some(values: ArrayLike, axis: int) -> Values:
     """Values as float64, at least one along the axis."""
     found = checks.floats("values", values)
+    axis = checks.integer("axis", axis, -found.ndim)
     if not found.ndim or not -found.ndim <= axis < found.ndim or not found.shape[axis]:
         raise ValueError(f"values is {list(found.shape)} and axis is {axis}; allowed: at least one value")
     return found
@@ -150,15 +152,17 @@ def _interval(
         return same, same
     methods: tuple[Literal["BCa", "percentile"], ...] = ("BCa", "percentile")
     for method in methods if len(samples) == 1 else methods[1:]:
-        found = stats.bootstrap(
-            samples,
-            overall,
-            n_resamples=resamples,
-            confidence_level=confidence,
-            method=method,
-            rng=np.random.default_rng(seed),
-            vectorized=True,
-        ).confidence_interval
+        with warnings.catch_warnings():  # where it is undefined, which is seen from the outcome
+            warnings.simplefilter("ignore", RuntimeWarning)
+            found = stats.bootstrap(
+                samples,
+                overall,
+                n_resamples=resamples,
+                confidence_level=confidence,
+                method=method,
+                rng=np.random.default_rng(seed),
+                vectorized=True,
+            ).confidence_interval
         if np.isfinite([found.low, found.high]).all():
             return float(found.low), float(found.high)
     return float("nan"), float("nan")

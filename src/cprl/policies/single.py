@@ -11,6 +11,7 @@ from torchrl.data import Categorical
 from torchrl.modules import EGreedyModule, QValueActor
 
 from cprl.commons import checks
+from cprl.envs.drivers import device_of
 
 
 class QActor(TensorDictSequential):
@@ -62,7 +63,7 @@ class RandomActor(TensorDictModuleBase):
     def __init__(self, actions: int, *, device: str | torch.device = "cpu", seed: int = 0) -> None:
         super().__init__()
         self.actions = checks.integer("actions", actions, 1)
-        self.generator = torch.Generator(device).manual_seed(checks.seed(seed))
+        self.generator = torch.Generator(device_of(device)).manual_seed(checks.seed(seed))
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Writes "action", int64 with the TensorDict's batch size."""

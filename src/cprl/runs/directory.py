@@ -12,6 +12,8 @@ from itertools import count
 from pathlib import Path
 from typing import Any, Final
 
+from cprl.checks import TEXT, callable_of, checked, shown, texts
+from cprl.checks import path as path_of
 from cprl.config import custom_targets, differences
 from cprl.runs.files import read_json, write_json
 from cprl.runs.lock import FILE_NAME as LOCK_NAME
@@ -52,11 +54,15 @@ def start_run(
         RunLockedError: if another process is just starting a run there.
         ValueError: if the name cannot be that of a directory.
     """
-    if Path(name).name != name:
-        raise ValueError(f'"{name}" names a run; allowed: a name without slashes')
+    checked("name", name, TEXT)
+    if Path(name).name != name or "\0" in name:
+        raise ValueError(f"name is {shown(name)}; allowed: the name of a directory, without slashes")
+    callable_of("to_recipe", to_recipe, "a function that makes the recipe for a directory")
+    out = None if out is None else path_of("out", out)
+    command = None if command is None else texts("command", command, 1)
     started = datetime.now().astimezone()
-    is_new = out is None or not Path(out).exists()
-    directory = _new_directory(name, started) if out is None else _made_directory(Path(out))
+    is_new = out is None or not out.exists()
+    directory = _new_directory(name, started) if out is None else _made_directory(out)
     try:
         with RunLock(directory):
             _refuse_contents(directory)

@@ -16,6 +16,7 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 from tensordict import TensorDictBase
 
+from cprl.checks import path as path_of
 from cprl.measuring import Episode, social
 from cprl.measuring.reported import FIELDS, left_out
 from cprl.runs.files import refuse_special
@@ -72,9 +73,9 @@ class EpisodeTable:
     def __init__(
         self, path: str | os.PathLike[str], *, resumable: bool = False, run: Path | None = None
     ) -> None:
-        self.path = Path(path)
+        self.path = path_of("path", path)
         self.journal = _journal_of(self.path)
-        self._run = self.path.parent if run is None else run
+        self._run = self.path.parent if run is None else path_of("run", run)
         self._resumable = resumable
         for table in () if resumable else (self.path, self.journal):
             if table.exists():
@@ -189,7 +190,7 @@ def read_episodes(run_directory: str | os.PathLike[str]) -> pa.Table:
         FileNotFoundError: if there are none.
         ValueError: if the file is damaged, see `cprl.runs.manifest`.
     """
-    path = Path(run_directory) / FILE_NAME
+    path = path_of("run_directory", run_directory) / FILE_NAME
     try:
         # The journal first: while it exists it holds every row, and a merge does not change it.
         return _as_table(read_journal(_journal_of(path)))

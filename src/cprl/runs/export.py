@@ -5,6 +5,7 @@ from pathlib import Path
 import pyarrow as pa
 import pyarrow.parquet as pq
 
+from cprl.checks import path as path_of
 from cprl.runs.directory import read_recipe
 from cprl.runs.episodes import FILE_NAME, read_episodes, read_table
 from cprl.runs.manifest import verify, write_listed
@@ -29,6 +30,7 @@ def export_results(run: Path, folder: Path) -> Path:
         ValueError: if there is no run, or a file of it is damaged.
         FileNotFoundError: if the run has not ended.
     """
+    run, folder = path_of("run", run), path_of("folder", folder)
     read_recipe(run)
     for name in _WHOLE:
         if not (run / name).exists():

@@ -9,6 +9,8 @@ from tensordict import TensorDictBase
 from torch import nn
 from torchrl.record.loggers import Logger
 
+from cprl.checks import TEXT, callable_of, checked, count, object_of, shown
+from cprl.checks import path as path_of
 from cprl.envs.commons_env import CommonsEnv
 from cprl.measuring.episodes import Episode
 from cprl.measuring.evaluate import evaluate, mean_return
@@ -27,6 +29,10 @@ def save_weights(run: Path, networks: Mapping[str, nn.Module], *, name: str = "f
     Returns:
         `checkpoints/<name>.pt` of the run, which `load_weights` reads.
     """
+    _check_networks(networks)
+    if not isinstance(name, str) or not name or Path(name).name != name or "\0" in name:
+        raise ValueError(f"name is {shown(name)}; allowed: the name of a file, without slashes and suffix")
+    run = path_of("run", run)
     weights = {agent: network.state_dict() for agent, network in networks.items()}
     return write_listed(run, f"checkpoints/{name}.pt", lambda file: torch.save(weights, file))
 
@@ -66,7 +72,11 @@ class BestWeights:
         every: int = 10,
         logger: Logger | None = None,
     ) -> None:
-        self.run, self.networks, self.policy, self.env = run, networks, policy, env
+        _check_networks(networks)
+        callable_of("policy", policy, "a function that writes the actions of all agents")
+        object_of("env", env, CommonsEnv, "a CommonsEnv")
+        checked("every", every, count(1))
+        self.run, self.networks, self.policy, self.env = path_of("run", run), networks, policy, env
         self.every, self.logger = every, logger
         self.seed = int(env.worlds.now.seed[0, 0])
         self.path: Path | None = None
@@ -90,12 +100,27 @@ class BestWeights:
 
 
 def restore_weights(path: Path, networks: Mapping[str, nn.Module]) -> None:
-    """Loads saved weights into the networks of the same agents."""
-    kept = load_weights(path)
+    """Loads saved weights into the networks of the same agents.
+
+    Raises:
+        ValueError: if the file is missing, damaged or foreign, or holds the weights of other networks.
+    """
+    _check_networks(networks)
+    kept = load_weights(path_of("path", path))
     if set(kept) != set(networks):
         raise ValueError(f"{path} holds the weights of {sorted(kept)}; allowed: {sorted(networks)}")
     for agent, network in networks.items():
-        network.load_state_dict(kept[agent])
+        try:
+            network.load_state_dict(kept[agent])
+        except (RuntimeError, TypeError, AttributeError) as error:
+            raise ValueError(f"{path} holds no weights of this network of {agent}: {error}") from error
+
+
+def _check_networks(networks: Mapping[str, nn.Module]) -> None:
+    object_of("networks", networks, Mapping, "networks by the agent's name")
+    for name, network in networks.items():
+        checked("networks", name, TEXT)
+        object_of(f"networks[{name!r}]", network, nn.Module, "a network of torch")
 
 
 def load_weights(path: Path) -> dict[str, Any]:

@@ -5,6 +5,7 @@ from pathlib import Path
 import numpy as np
 from matplotlib.figure import Figure
 
+from cprl.checks import TEXT, checked, count, listed, path
 from cprl.measuring.episodes import Episode
 from cprl.measuring.evaluate import mean_return
 from cprl.measuring.published import SMOOTHED_EPISODES
@@ -27,6 +28,10 @@ def training_curve(
     Returns:
         The PNG, `figures/training_curve.png` of the run.
     """
+    run = path("run", run)
+    checked("title", title, TEXT)
+    checked("smoothed", smoothed, count(1))
+    random = None if random is None else list(listed("random", random, Episode, "an Episode"))
     rows = read_episodes(run)
     has_harvest = "harvest" in rows.column_names
     table = rows.select(["replica", "episode", "return"]).to_pydict()
@@ -49,7 +54,7 @@ def training_curve(
     if has_harvest or returns.min() >= 0:
         axes.set_ylim(0, None)
     axes.legend(loc="lower right")
-    path = run / "figures" / "training_curve.png"
-    path.parent.mkdir(exist_ok=True)
-    figure.savefig(path, dpi=120)
-    return path
+    picture = run / "figures" / "training_curve.png"
+    picture.parent.mkdir(exist_ok=True)
+    figure.savefig(picture, dpi=120)
+    return picture

@@ -9,12 +9,20 @@ from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 from tensordict import TensorDictBase
 
+from cprl.checks import checked, count, object_of
 from cprl.measuring.episodes import Episode
 from cprl.output import console as safe_console
 
 _BAR_PERIOD_S: Final = 0.25
 _LINE_PERIOD_S: Final = 10.0
 """Seconds between updates of the bar, and between lines if the output is not a terminal."""
+
+
+def console_of(console: Console | None) -> Console:
+    """The console, by default that of standard output; raises a ValueError for anything else."""
+    if console is not None:
+        object_of("console", console, Console, "a Console of rich, or None")
+    return console or safe_console()
 
 
 class ProgressBar:
@@ -41,7 +49,9 @@ class ProgressBar:
         replicas: int = 1,
         console: Console | None = None,
     ) -> None:
-        self.console = console or safe_console()
+        self.console = console_of(console)
+        checked("episodes", episodes, count(1))
+        checked("replicas", replicas, count(1))
         rules = getattr(getattr(game, "game", game), "rules", None)
         self._title, self._clock = title, getattr(rules, "episode_steps", None)
         self._last_steps = 0

@@ -9,11 +9,12 @@ from typing import Final
 from rich.console import Console
 from rich.table import Table
 
+from cprl.checks import TEXT, checked, listed, object_of, path
 from cprl.measuring.episodes import Episode
 from cprl.measuring.evaluate import mean_return
 from cprl.measuring.replicas import social_metrics
 from cprl.measuring.reported import left_out
-from cprl.output import console as safe_console
+from cprl.terminal.progress import console_of
 from cprl.viewer.streams import viewer
 
 KEPT = ("recipe.json", "episodes.parquet", "run.rrd", "checkpoints", "figures")
@@ -46,7 +47,14 @@ def summarise(
         note: a sentence below the table.
         console: the console; by default standard output.
     """
-    console = console or safe_console()
+    run, console = path("run", run), console_of(console)
+    checked("title", title, TEXT)
+    object_of("played", played, Mapping, "episodes by the name of the policy, at least one")
+    for name, episodes in played.items():
+        if not listed(f"played[{name!r}]", episodes, Episode, "an Episode"):
+            raise ValueError(f"played[{name!r}] is empty; allowed: at least one episode")
+    if not played:
+        raise ValueError("played is empty; allowed: the episodes of at least one policy")
     console.print(_table(title, played))
     if note:
         console.print(note, soft_wrap=True, highlight=False)

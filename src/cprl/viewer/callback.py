@@ -1,10 +1,10 @@
 """ViewerCallback: records a training for the Rerun viewer, and shows it live."""
 
+import itertools
 import json
 import time
 import uuid
 from collections.abc import Mapping, Sequence
-from itertools import count
 from pathlib import Path
 from types import TracebackType
 from typing import Any, Final, Self
@@ -15,6 +15,8 @@ from tensordict import TensorDictBase
 from torchrl.envs import EnvBase
 
 from cprl import keys
+from cprl.checks import TEXT, checked, count, object_of
+from cprl.checks import path as path_of
 from cprl.envs.unwrap import agent_names, commons_of
 from cprl.measuring import phases
 from cprl.measuring.episodes import Episode
@@ -75,6 +77,10 @@ class ViewerCallback:
         is_replay: bool = False,
         console: Console | None = None,
     ) -> None:
+        checked("title", title, TEXT)
+        object_of("recipe", recipe, Mapping | None, "a table, or None")
+        checked("episodes", episodes, count(1))
+        run = path_of("run", run)
         self.env, self._episodes = env, episodes
         self._agents, reported = agent_names(env), reported_by(env)
         curves, commons = _curves(env, self._agents, reported), commons_of(env)
@@ -246,7 +252,7 @@ def _curves(env: EnvBase, agents: tuple[str, ...], reported: Sequence[str]) -> C
 
 def _free_name(run: Path) -> str:
     """run.rrd, or run-2.rrd and so on if the run has a recording already."""
-    names = (FILE_NAME if nth == 1 else f"run-{nth}.rrd" for nth in count(1))
+    names = (FILE_NAME if nth == 1 else f"run-{nth}.rrd" for nth in itertools.count(1))
     return next(name for name in names if not (run / name).exists())
 
 

@@ -12,6 +12,8 @@ from rich.console import Console
 from torch import Tensor
 from torchrl.record.loggers import Logger
 
+from cprl.checks import NONE, TEXT, checked, either, object_of
+from cprl.checks import path as path_of
 from cprl.output import console as safe_console
 from cprl.viewer.blueprint import layout
 from cprl.viewer.scenery import Curves, Scene, classes, lines, phase_states
@@ -65,6 +67,14 @@ class RerunLogger(Logger):
         recording_id: str | None = None,
         console: Console | None = None,
     ) -> None:
+        checked("exp_name", exp_name, TEXT)
+        checked("file_name", file_name, TEXT)
+        checked("live", live, either(TEXT, NONE))
+        checked("recording_id", recording_id, either(TEXT, NONE))
+        object_of("scene", scene, Scene | None, "a Scene, or None")
+        object_of("curves", curves, Curves | None, "Curves, or None")
+        object_of("console", console, Console | None, "a Console of rich, or None")
+        log_dir = path_of("log_dir", log_dir)
         self.scene = scene
         self.curves = scene or curves or Curves(agents=())
         self.recording_id = recording_id or f"{exp_name}-{time.time_ns()}"

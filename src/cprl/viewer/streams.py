@@ -13,6 +13,7 @@ from pathlib import Path
 from typing import Any, Final, TypeAlias
 from urllib.parse import quote, urlsplit
 
+from cprl.checks import SWITCH, Check, checked, shown
 from cprl.viewer import deadline
 from cprl.viewer.deadline import Sender, abandon, exit_in_time, within
 
@@ -124,6 +125,8 @@ def check_watch(watch: str, *, can_be_off: bool = True) -> None:
     Raises:
         ValueError: if the value is not allowed; names it and the allowed values.
     """
+    checked("watch", watch, Check(lambda value: isinstance(value, str), f'"file", "off", {_LIVE}'))
+    checked("can_be_off", can_be_off, SWITCH)
     if watch != "file" and not (can_be_off and watch == "off"):
         offs = '"off", ' if can_be_off else ""
         _check(watch, f'"file", {offs}{_LIVE}', name="watch")
@@ -138,7 +141,7 @@ def _check(live: str, allowed: str, *, name: str = "live") -> None:
     except ValueError:  # the port is not a number
         connects = False
     if not connects and live not in ("serve", "spawn"):
-        raise ValueError(f"{name} is {live!r}; allowed: {allowed}")
+        raise ValueError(f"{name} is {shown(live)}; allowed: {allowed}")
 
 
 def open_file(recording_id: str, path: Path, blueprint: Any, *, period_s: float) -> Stream | None:

@@ -9,6 +9,7 @@ from tensordict import TensorDict, TensorDictBase
 from torch import Tensor, nn
 from torchrl.data.replay_buffers import Sampler
 
+from cprl.checks import callable_of, object_of
 from cprl.learners.engine.base import is_finite
 from cprl.learners.engine.functional import MakeLoss, own_targets, total
 from cprl.learners.lanes import SAMPLING, WEIGHTS, Lanes
@@ -27,6 +28,21 @@ _OPTIMIZERS: Final[dict[Optimizer, type[torch.optim.Optimizer]]] = {
     "sgd": torch.optim.SGD,
 }
 _LARGEST_SEED: Final = 2**63 - 1
+
+
+def check_makers(network: object, loss: object, sampler: object) -> None:
+    """Raises a ValueError for a maker that cannot be called."""
+    callable_of("make_network", network, "a function that makes a network")
+    callable_of("make_loss", loss, "a function that makes the loss of a network")
+    if sampler is not None:
+        callable_of("make_sampler", sampler, "None, or a function that makes the sampler of a lane")
+
+
+def sampler_of(make_sampler: MakeSampler, lane: int) -> Sampler:
+    """The sampler of a lane; raises a ValueError where something else is made."""
+    sampler = make_sampler(lane)
+    object_of(f"make_sampler({lane})", sampler, Sampler, "a Sampler of torchrl.data")
+    return sampler
 
 
 class StockAgent:

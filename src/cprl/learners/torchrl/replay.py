@@ -14,6 +14,7 @@ from torchrl.objectives import HardUpdate, LossModule, SoftUpdate
 from torchrl.objectives.utils import TargetNetUpdater
 
 from cprl.custom import made
+from cprl.envs.drivers import device_of
 from cprl.learners.buffer.gather import Horizon
 from cprl.learners.buffer.sampler import transformed
 from cprl.learners.buffer.storage import torch_dtype
@@ -23,7 +24,7 @@ from cprl.learners.engine.functional import MakeLoss, targets_of
 from cprl.learners.engine.refusals import refuse_for_replay
 from cprl.learners.lanes import TARGET_WEIGHTS, Lanes, StartFrom
 from cprl.learners.settings import DQNSettings
-from cprl.learners.torchrl.agents import MakeSampler, StockAgents
+from cprl.learners.torchrl.agents import MakeSampler, StockAgents, check_makers, sampler_of
 from cprl.learners.torchrl.buffers import buffer_state, load_buffer, nested, plain
 from cprl.learners.transitions import RewardKind
 from cprl.memory import check_memory
@@ -85,6 +86,8 @@ class TorchRLReplayLearner:
         device: str | torch.device = "cpu",
     ) -> None:
         check_learner(spaces, settings, DQNSettings, agents, replicas, first_replica, seed, reward_kind)
+        check_makers(make_network, make_loss, make_sampler)
+        device = device_of(device)
         self.spaces, self.settings, self.agents = spaces, settings, tuple(agents)
         self.replicas, self.seed, self.reward_kind = replicas, seed, reward_kind
         self._make_sampler: MakeSampler = make_sampler or (lambda lane: RandomSampler())
@@ -150,7 +153,7 @@ class TorchRLReplayLearner:
         settings = self.settings
         buffer = TensorDictReplayBuffer(
             storage=LazyTensorStorage(settings.buffer_size, device=self.stock.device),
-            sampler=self._make_sampler(lane),
+            sampler=sampler_of(self._make_sampler, lane),
             batch_size=settings.batch_size,
             generator=generator,
         )

@@ -12,6 +12,7 @@ from torchrl.data.replay_buffers import SamplerWithoutReplacement
 from torchrl.objectives import LossModule
 from torchrl.objectives.value import GAE
 
+from cprl.envs.drivers import device_of
 from cprl.learners.buffer.storage import torch_dtype
 from cprl.learners.checks import check_learner, check_rollouts
 from cprl.learners.engine.functional import MakeLoss
@@ -19,7 +20,7 @@ from cprl.learners.engine.refusals import refuse_other_advantages
 from cprl.learners.lanes import Lanes, StartFrom
 from cprl.learners.rollouts import ACTOR, CRITIC, refuse_other_parts
 from cprl.learners.settings import RolloutSettings
-from cprl.learners.torchrl.agents import MakeSampler, StockAgent, StockAgents
+from cprl.learners.torchrl.agents import MakeSampler, StockAgent, StockAgents, check_makers, sampler_of
 from cprl.learners.torchrl.buffers import nested, plain
 from cprl.learners.transitions import RewardKind
 from cprl.policies.lanes import LaneActor
@@ -73,6 +74,8 @@ class TorchRLRolloutLearner:
         device: str | torch.device = "cpu",
     ) -> None:
         check_learner(spaces, settings, RolloutSettings, agents, replicas, first_replica, seed, reward_kind)
+        check_makers(make_network, make_loss, make_sampler)
+        device = device_of(device)
         self.spaces, self.settings, self.agents = spaces, settings, tuple(agents)
         self.replicas, self.seed, self.reward_kind = replicas, seed, reward_kind
         self._lanes = Lanes(
@@ -101,7 +104,7 @@ class TorchRLRolloutLearner:
         self.buffers = [
             TensorDictReplayBuffer(
                 storage=LazyTensorStorage(settings.rollout_steps, device=self.stock.device),
-                sampler=make_sampler(lane) if make_sampler else SamplerWithoutReplacement(),
+                sampler=sampler_of(make_sampler, lane) if make_sampler else SamplerWithoutReplacement(),
                 batch_size=settings.minibatch_size,
                 generator=generator,
             )

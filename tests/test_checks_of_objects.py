@@ -1,0 +1,72 @@
+"""Checks of paths, texts and live objects, each with a message that says what came and what is allowed."""
+
+from pathlib import Path
+
+import pytest
+import torch
+
+import cprl
+from cprl.checks import callable_of, listed, object_of, path, plain, texts
+from cprl.collectors import StepCollector
+from cprl.measuring import statistics
+from cprl.runs.episodes import read_episodes
+from cprl.runs.export import export_results
+
+
+def test_texts_and_paths_are_paths():
+    assert path("run", "runs/a") == path("run", Path("runs/a")) == Path("runs/a")
+
+
+@pytest.mark.parametrize("given", [3, None, ("a",), "a\0b", Path("a\0b"), b"a"])
+def test_anything_else_is_no_path(given):
+    with pytest.raises(ValueError, match=r"^run is .*; allowed: a path, without NUL$"):
+        path("run", given)
+
+
+def test_a_single_text_is_no_list_of_texts():
+    assert texts("allow", ["a:b", "c:d"]) == ("a:b", "c:d")
+    for given in ("a:b", ["a", 3], 3, {"a": 1}):
+        with pytest.raises(ValueError, match=r"^allow is .*; allowed: a tuple of entries, each a text"):
+            texts("allow", given)
+    with pytest.raises(ValueError, match="argv is "):
+        texts("argv", [], 1)
+
+
+def test_objects_are_checked_by_their_class_and_left_as_they_are():
+    one = torch.zeros(2)
+    assert listed("values", iter([one]), torch.Tensor, "tensors") == (one,)
+    with pytest.raises(ValueError, match=r"values\[1\] is 3; allowed: tensors"):
+        listed("values", [one, 3], torch.Tensor, "tensors")
+    with pytest.raises(ValueError, match="values is 3; allowed: a list of tensors"):
+        listed("values", 3, torch.Tensor, "tensors")
+    with pytest.raises(ValueError, match="env is 'x'; allowed: an environment"):
+        object_of("env", "x", torch.Tensor, "an environment")
+    with pytest.raises(ValueError, match="make is 3; allowed: a function"):
+        callable_of("make", 3, "a function")
+
+
+@pytest.mark.parametrize("empty", [torch.zeros(3, device="meta"), torch.eye(3).to_sparse()])
+def test_a_tensor_without_values_stays_as_it_is(empty):
+    assert plain(empty) is empty
+
+
+@pytest.mark.parametrize(
+    ("call", "message"),
+    [
+        (lambda: read_episodes(3), "run_directory is 3"),
+        (lambda: export_results("a\0b", "x"), "run is "),
+        (lambda: cprl.load(3), "run is 3"),
+        (lambda: cprl.load("x", weights=[]), "weights is "),
+        (lambda: cprl.run(3), "experiment is 3"),
+        (lambda: StepCollector(3, print), "env is 3"),
+        (lambda: statistics.mean([1.0], axis="a"), "axis is 'a'"),
+    ],
+)
+def test_functions_refuse_what_is_of_another_kind_by_name(call, message):
+    with pytest.raises(ValueError, match=f"^{message}"):
+        call()
+
+
+def test_few_resamples_give_an_interval_without_a_warning():
+    found = statistics.estimate([1.0, 2.0, 4.0], resamples=1)
+    assert found.value == pytest.approx(7 / 3)
