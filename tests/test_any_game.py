@@ -93,9 +93,9 @@ def test_each_metric_needs_what_is_said_and_nothing_else():
         )
         assert tuple(part) == available(METRICS, given)
         assert all(torch.equal(part[name], whole[name]) for name in part)
-    with pytest.raises(ValueError, match="neither harvest nor in_play nor played"):
+    with pytest.raises(ValueError, match="harvest, in_play and played are None; allowed: at least one"):
         social.summary(None, None)
-    with pytest.raises(ValueError, match="a yield_share takes a harvest"):
+    with pytest.raises(ValueError, match="sustainable_yield is given and harvest is None"):
         social.summary(None, None, played=played, sustainable_yield=1.0, first_stock=1.0)
 
 

@@ -11,8 +11,8 @@ import torch
 from torch import Tensor, nn
 from torchrl.envs import EnvBase
 
-from cprl.checks import TEXT, checked, texts
 from cprl.checks import path as path_of
+from cprl.checks import texts
 from cprl.commons.game import Game
 from cprl.custom import made
 from cprl.envs.make_env import make_env, spaces_of
@@ -231,10 +231,8 @@ def load(run: str | Path, *, weights: str | None = None, allow: Sequence[str] = 
     """
     run = path_of("run", run)
     texts("allow", allow)
-    if (
-        weights is not None
-        and checked("weights", weights, TEXT)
-        and (Path(weights).name != weights or weights in ("", ".", ".."))
+    if weights is not None and (
+        not isinstance(weights, str) or Path(weights).name != weights or weights in ("", "..")
     ):
         raise ValueError(f'weights is {weights!r}; allowed: a name in {run / FOLDER}, such as "final"')
     recipe = read_recipe(run)

@@ -35,7 +35,7 @@ _HARVEST: Final = _SHAPES.map(lambda shape: (torch.rand(shape, generator=_chance
 _IN_PLAY: Final = _SHAPES.map(lambda shape: torch.rand(shape, generator=_chance()) < 0.8)
 _PLAYED: Final = _SHAPES.map(lambda shape: torch.ones(shape[:-1], dtype=torch.bool))
 _SOCIAL: Final = {"harvest": _HARVEST, "in_play": _IN_PLAY, "played": st.one_of(st.none(), _PLAYED)}
-_AMOUNTS: Final = st.one_of(st.floats(0, 100), st.just(3).map(torch.tensor))
+_AMOUNTS: Final = st.one_of(st.floats(0, 100, allow_subnormal=False), st.just(3).map(torch.tensor))
 _ARRAYS: Final = things.arrays()
 _LONG: Final = st.sampled_from((1200, 1200, 1200, 900)).map(lambda number: np.arange(float(number)))
 _CURVES: Final = st.integers(0, 9).map(
@@ -123,8 +123,8 @@ OWN: Final[dict[str, dict[str, st.SearchStrategy[Any]]]] = {
         "height": st.integers(2, 12),
         "width": st.integers(2, 12),
         "agents": _FEW,
-        "density": st.floats(0, 0.5),
-        "clustering": st.floats(0, 1),
+        "density": st.floats(0, 0.5, allow_subnormal=False),
+        "clustering": st.floats(0, 1, allow_subnormal=False),
         "seed": _SEEDS,
     },
     "cprl.config:from_config": {"table": st.one_of(st.sampled_from(runs.CONFIGS), hints.of_hint(Any))},

@@ -182,7 +182,10 @@ _MAKERS: Final = (
 def numbers() -> st.SearchStrategy[Any]:
     """Whole numbers and floating-point numbers, at limits and between."""
     return st.one_of(
-        st.sampled_from(LIMITS), st.sampled_from(FLOATS), st.integers(-(2**70), 2**70), st.floats()
+        st.sampled_from(LIMITS),
+        st.sampled_from(FLOATS),
+        st.integers(-(2**70), 2**70),
+        st.floats(allow_subnormal=False),
     )
 
 
