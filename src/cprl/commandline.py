@@ -80,11 +80,11 @@ def recipe_main(make_experiment: Callable[..., Experiment], argv: Sequence[str] 
 
 @contextmanager
 def in_a_sentence(program: str) -> Iterator[None]:
-    """Ends the process with a sentence and exit code 1 for what is refused, and for files that cannot be
-    written or read; any other error, and a ValueError of a training that has begun, keeps its traceback."""
+    """Ends the process with a sentence and exit code 1 for what is refused, for files that cannot be written
+    or read, and for a package that is not installed; any other error, and a ValueError of a training that has begun, keeps its traceback."""
     try:
         yield
-    except (ValueError, OSError, MemoryError) as error:
+    except (ValueError, OSError, MemoryError, ModuleNotFoundError) as error:
         notes = getattr(error, "__notes__", [])
         if notes and not isinstance(error, OSError | MemoryError | NotFiniteError):
             raise
