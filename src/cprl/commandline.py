@@ -81,7 +81,8 @@ def recipe_main(make_experiment: Callable[..., Experiment], argv: Sequence[str] 
 @contextmanager
 def in_a_sentence(program: str) -> Iterator[None]:
     """Ends the process with a sentence and exit code 1 for what is refused, for files that cannot be written
-    or read, and for a package that is not installed; any other error, and a ValueError of a training that has begun, keeps its traceback."""
+    or read, and for a package that is not installed. Any other error keeps its traceback, as a ValueError of
+    a training that has begun does."""
     try:
         yield
     except (ValueError, OSError, MemoryError, ModuleNotFoundError) as error:
