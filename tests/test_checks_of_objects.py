@@ -6,7 +6,8 @@ import pytest
 import torch
 
 import cprl
-from cprl.checks import callable_of, listed, object_of, path, plain, texts
+from cprl.arguments import callable_of, object_of, objects, path, texts
+from cprl.checks import plain
 from cprl.collectors import StepCollector
 from cprl.measuring import statistics
 from cprl.runs.episodes import read_episodes
@@ -34,11 +35,11 @@ def test_a_single_text_is_no_list_of_texts():
 
 def test_objects_are_checked_by_their_class_and_left_as_they_are():
     one = torch.zeros(2)
-    assert listed("values", iter([one]), torch.Tensor, "tensors") == (one,)
+    assert objects("values", iter([one]), torch.Tensor, "tensors") == (one,)
     with pytest.raises(ValueError, match=r"values\[1\] is 3; allowed: tensors"):
-        listed("values", [one, 3], torch.Tensor, "tensors")
+        objects("values", [one, 3], torch.Tensor, "tensors")
     with pytest.raises(ValueError, match="values is 3; allowed: a list of tensors"):
-        listed("values", 3, torch.Tensor, "tensors")
+        objects("values", 3, torch.Tensor, "tensors")
     with pytest.raises(ValueError, match="env is 'x'; allowed: an environment"):
         object_of("env", "x", torch.Tensor, "an environment")
     with pytest.raises(ValueError, match="make is 3; allowed: a function"):

@@ -11,6 +11,7 @@ SOURCE = Path(__file__).parents[1] / "src" / "cprl"
 PACKAGES = (
     "compat",
     "checks",
+    "arguments",
     "keys",
     "spaces",
     "custom",

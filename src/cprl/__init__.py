@@ -2,7 +2,8 @@
 
 Each imports only from those above it:
     compat       what relies on private parts of libraries
-    checks       what users hand in: what fits, and how a refusal reads
+    checks       what users hand in, as tables by field: what fits, and how a refusal reads
+    arguments    the same for the arguments of a function
     keys         the TensorDict entries, their shapes and types
     spaces       what agents observe and may do
     custom       the user's own code, as a text that a recipe can keep

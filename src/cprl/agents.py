@@ -9,7 +9,8 @@ from torch import Tensor, nn
 from torchrl.envs import EnvBase
 
 from cprl.algorithms.base import Algorithm, TeamAlgorithm
-from cprl.checks import MOST_SEED, checked, count, listed, texts
+from cprl.arguments import objects, texts
+from cprl.checks import MOST_SEED, checked, count
 from cprl.commons.game import Game
 from cprl.custom import Custom, made
 from cprl.envs.make_env import spaces_of
@@ -53,7 +54,7 @@ class Population:
         allow: Sequence[str] = (),
         starts: bool = True,
     ) -> None:
-        specs = listed("specs", specs, AgentSpec, "Learning, Team, Scripted or Frozen")
+        specs = objects("specs", specs, AgentSpec, "Learning, Team, Scripted or Frozen")
         checked("seed", seed, count(0, MOST_SEED))
         checked("first_replica", first_replica, count(0))
         texts("allow", allow)

@@ -5,7 +5,8 @@ from typing import Any, Final, Protocol, runtime_checkable
 
 from tensordict import TensorDictBase
 
-from cprl.checks import listed, shown
+from cprl.arguments import objects
+from cprl.checks import shown
 from cprl.measuring.episodes import Episode
 
 
@@ -41,7 +42,7 @@ HOOKS: Final = ("on_start", "on_step", "on_episode")
 
 def check_callbacks(callbacks: Sequence[Any]) -> tuple[Any, ...]:
     """The callbacks; refuses one that nothing would call."""
-    found = listed("callbacks", callbacks, object, "callbacks")
+    found = objects("callbacks", callbacks, object, "callbacks")
     for callback in found:
         if not any(hasattr(callback, hook) for hook in HOOKS):
             raise ValueError(

@@ -5,11 +5,9 @@ argument. Whatever does not fit is a ValueError. A TypeError is left for a call 
 e.g. with an unknown keyword.
 """
 
-import os
 import reprlib
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import fields
-from pathlib import Path
 from typing import Any, Final, NamedTuple
 
 MOST_INT32: Final = 2**31 - 1
@@ -208,41 +206,6 @@ def either(*checks: Check) -> Check:
 
 
 TEXT: Final = Check(lambda value: isinstance(value, str), "a text")
-
-
-def path(name: str, value: Any) -> Path:
-    """A text or another path as a `Path`; raises a ValueError for anything else, and for a text with NUL."""
-    if not isinstance(value, str | os.PathLike) or "\0" in os.fspath(value):
-        raise ValueError(f"{name} is {shown(value)}; allowed: a path, without NUL")
-    return Path(value)
-
-
-def texts(name: str, value: Any, at_least: int = 0) -> tuple[str, ...]:
-    """Texts, at least so many; raises a ValueError for anything else, a single text included."""
-    found: tuple[str, ...] = checked(name, value, tuple_of(TEXT, at_least))
-    return found
-
-
-def callable_of(name: str, value: Any, allowed: str) -> None:
-    """Raises a ValueError for what cannot be called."""
-    if not callable(value):
-        raise ValueError(f"{name} is {shown(value)}; allowed: {allowed}")
-
-
-def object_of(name: str, value: Any, kind: Any, allowed: str) -> None:
-    """Raises a ValueError for what is no instance of a class, nor of one of several; it is left as it is."""
-    if not isinstance(value, kind):
-        raise ValueError(f"{name} is {shown(value)}; allowed: {allowed}")
-
-
-def listed(name: str, value: Any, kind: Any, allowed: str) -> tuple[Any, ...]:
-    """The objects of a list or tuple, each an instance of a class; raises a ValueError for anything else."""
-    if not isinstance(value, Iterable) or isinstance(value, str | bytes | Mapping):
-        raise ValueError(f"{name} is {shown(value)}; allowed: a list of {allowed}")
-    found = tuple(value)
-    for place, own in enumerate(found):
-        object_of(f"{name}[{place}]", own, kind, allowed)
-    return found
 
 
 NONE: Final = Check(lambda value: value is None, "None")

@@ -12,7 +12,8 @@ from torchrl.collectors import BaseCollector, Collector
 from torchrl.envs import EnvBase
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 
-from cprl.checks import callable_of, checked, count, object_of
+from cprl.arguments import callable_of, object_of
+from cprl.checks import checked, count
 
 
 class StepCollector(BaseCollector):

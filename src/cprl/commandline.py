@@ -14,7 +14,8 @@ from typing import Annotated, Any, Final
 
 import tyro
 
-from cprl.checks import callable_of, checked, instance, texts
+from cprl.arguments import callable_of, texts
+from cprl.checks import checked, instance
 from cprl.experiment import Experiment
 from cprl.finite import NotFiniteError
 from cprl.flags import applied, flags_of

@@ -29,7 +29,8 @@ from cprl.algorithms import (
     Tabular,
     TabularSettings,
 )
-from cprl.checks import check_nesting, listed, shown
+from cprl.arguments import objects
+from cprl.checks import check_nesting, shown
 from cprl.commons.game import Game
 from cprl.commons.maps import Map
 from cprl.commons.observation import Observation
@@ -145,7 +146,7 @@ def refuse_targets(table: object, allow: Iterable[str]) -> None:
     Raises:
         ValueError: names each target and says how it is allowed.
     """
-    allowed = set(listed("allow", allow, str, 'texts, "module:Class" each'))
+    allowed = set(objects("allow", allow, str, 'texts, "module:Class" each'))
     refused = [target for target in custom_targets(table) if target not in allowed]
     if refused:
         flags = " ".join(f"--allow {target}" for target in refused)

@@ -1,14 +1,21 @@
-"""Devices and their free memory: what would not fit is refused before anything is allocated."""
+"""Devices and their free memory: what would not fit is refused before anything is allocated.
 
-from typing import Any, Final
+torch is imported where a device is asked for, so that the game, which does without, can use this too.
+"""
+
+from typing import TYPE_CHECKING, Any, Final
 
 import psutil
-import torch
 
 from cprl.checks import Check
 
+if TYPE_CHECKING:
+    import torch
+
 
 def _is_device(value: Any) -> bool:
+    import torch
+
     try:
         return isinstance(value, str) and str(torch.device(value)) == value != "meta"  # cuda:300 becomes 44
     except (RuntimeError, ValueError):
@@ -24,15 +31,23 @@ class TooLargeError(ValueError, MemoryError):
     """What would take more memory than is free; nothing of it has been allocated."""
 
 
-def free_bytes(device: str | torch.device = "cpu") -> int:
+def free_bytes(device: "str | torch.device" = "cpu") -> int:
     """The bytes that can be allocated on a device."""
-    device = torch.device(device)
-    if device.type == "cuda":
-        return int(torch.cuda.mem_get_info(device)[0])
+    if str(device).startswith("cuda"):
+        import torch
+
+        return int(torch.cuda.mem_get_info(torch.device(device))[0])
     return int(psutil.virtual_memory().available)
 
 
-def check_memory(what: str, needed: int, instead: str, *, device: str | torch.device = "cpu") -> None:
+def check_memory(
+    what: str,
+    needed: int,
+    instead: str,
+    *,
+    device: "str | torch.device" = "cpu",
+    free: int | None = None,
+) -> None:
     """Refuses what would not fit.
 
     Args:
@@ -40,11 +55,15 @@ def check_memory(what: str, needed: int, instead: str, *, device: str | torch.de
         needed: bytes that it takes, estimated.
         instead: what to use in its place.
         device: where it would be allocated.
+        free: how many bytes are free; None to ask the device.
 
     Raises:
         TooLargeError: says how much it takes, how much is free, and what to use instead.
     """
-    if needed > _SMALL and needed > (free := free_bytes(device)):
+    if needed <= _SMALL:
+        return
+    free = free_bytes(device) if free is None else free
+    if needed > free:
         raise TooLargeError(f"{what} take {gib(needed)}; {gib(free)} are free: use {instead}")
 
 

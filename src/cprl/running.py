@@ -13,7 +13,8 @@ import torch
 from torchrl.envs import EnvBase
 
 from cprl.agents import Population
-from cprl.checks import SWITCH, checked, object_of, path, texts
+from cprl.arguments import object_of, path, texts
+from cprl.checks import SWITCH, checked
 from cprl.custom import Custom, made
 from cprl.envs.make_env import make_env
 from cprl.envs.state import check_restorable, transforms_state

@@ -11,8 +11,8 @@ import torch
 from torch import Tensor, nn
 from torchrl.envs import EnvBase
 
-from cprl.checks import path as path_of
-from cprl.checks import texts
+from cprl.arguments import path as path_of
+from cprl.arguments import texts
 from cprl.commons.game import Game
 from cprl.custom import made
 from cprl.envs.make_env import make_env, spaces_of

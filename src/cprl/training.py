@@ -10,8 +10,8 @@ from torch import Tensor, nn
 from torchrl.collectors import BaseCollector
 from torchrl.envs import EnvBase
 
+from cprl.arguments import callable_of, object_of
 from cprl.callbacks import SavesTraining, check_callbacks
-from cprl.checks import callable_of, object_of
 from cprl.collectors import StepCollector
 from cprl.envs.make_env import check_env, spaces_of
 from cprl.envs.state import carried_state, env_state, load_carried, load_env_state

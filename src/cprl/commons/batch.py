@@ -6,11 +6,11 @@ from typing import Any, Protocol
 import numpy as np
 from numpy.typing import DTypeLike, NDArray
 
-from cprl.commons import checks
+from cprl import arguments
 from cprl.commons import state as states
 from cprl.commons.game import Game, output_shapes
 from cprl.commons.loops import Loop
-from cprl.commons.sizes import check_memory
+from cprl.commons.sizes import check_worlds_fit
 from cprl.commons.threads import CpuThreads
 from cprl.commons.world import Actions, Bools, Bytes, Shown, StepOutput, Worlds, empty_worlds
 
@@ -57,17 +57,17 @@ class Batch:
         threads: int | None = None,
         driver: Driver | None = None,
     ) -> None:
-        checks.instance("game", game, Game, "a cprl.Game")
-        worlds = checks.integer("worlds", worlds, 1, 2**32)
-        first_world = checks.integer("first_world", first_world, 0, 2**32 - 1)
+        arguments.object_of("game", game, Game, "a cprl.Game")
+        worlds = arguments.integer("worlds", worlds, 1, 2**32)
+        first_world = arguments.integer("first_world", first_world, 0, 2**32 - 1)
         if first_world + worlds > 2**32:
             raise ValueError(
                 f"first_world is {first_world} and worlds is {worlds}; "
                 "allowed: worlds with indices from 0 to 2**32 - 1"
             )
-        checks.seed(seed)
+        arguments.seed(seed)
         if driver is None:
-            check_memory(game, worlds)
+            check_worlds_fit(game, worlds)
         self.game = game
         self.size = worlds
         self.driver: Driver = driver or CpuThreads(game, worlds, threads=threads)
@@ -86,7 +86,7 @@ class Batch:
 
     def set_seed(self, seed: int) -> None:
         """Restarts from a seed: the next episode of each world is the first episode of this seed."""
-        self.driver.write(self.now.seed, np.full((self.size, 1), checks.seed(seed), np.uint64))
+        self.driver.write(self.now.seed, np.full((self.size, 1), arguments.seed(seed), np.uint64))
         self.driver.write(self.now.episode, np.full((self.size, 1), -1, np.int32))
 
     def new_output(self) -> StepOutput:
@@ -107,7 +107,7 @@ class Batch:
         if which is None:
             which = self._all_worlds
         else:
-            checks.array("which", which, (self.size,), np.bool_)
+            arguments.array("which", which, (self.size,), np.bool_)
             if not self._has_begun and not self.driver.read(which).all():
                 raise ValueError("which leaves worlds out; allowed at first: None, so that all worlds begin")
         self.driver.run("begin_worlds", self.now, which, output)
@@ -143,7 +143,7 @@ class Batch:
 
     def show(self, output: StepOutput, *, world: int = 0) -> Shown:
         """A copy of one world for display; `output` holds its latest observation."""
-        world = checks.integer("world", world, 0, self.size - 1)
+        world = arguments.integer("world", world, 0, self.size - 1)
         read, now = self.driver.read, self.now
         return Shown(
             observation=read(output.observation[world]),
@@ -186,7 +186,7 @@ class Batch:
             ValueError: If `actions` is not int64 [B, N], an action is out of range, or the worlds have not
                 begun.
         """
-        checks.array("actions", actions, (self.size, self.game.agents), np.int64)
+        arguments.array("actions", actions, (self.size, self.game.agents), np.int64)
         if not self._has_begun:
             raise ValueError("the worlds have not begun; allowed: begin() or load() first")
         known = len(self.game.actions)

@@ -16,7 +16,7 @@ from numpy.typing import DTypeLike, NDArray
 from cprl.commons.compiled import compiled
 from cprl.commons.game import Game
 from cprl.commons.loops import FUNCTIONS, LOOPS, Loop
-from cprl.commons.sizes import check_memory
+from cprl.commons.sizes import check_worlds_fit
 from cprl.commons.tables import Tables
 from cprl.commons.world import Actions, Scratch, StepOutput, Worlds, empty_scratch
 
@@ -49,7 +49,7 @@ class CudaThreads:
                 "Numba finds no GPU; it needs NVIDIA's driver and the package numba-cuda "
                 "(install cprl[cuda12] or cprl[cuda13])"
             )
-        check_memory(game, worlds, free=_free_bytes())
+        check_worlds_fit(game, worlds, free=_free_bytes())
         self.threads = worlds
         self.tables = Tables(*(_constant(entry) for entry in game.tables))
         scratch = empty_scratch(

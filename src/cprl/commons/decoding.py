@@ -4,7 +4,7 @@ from typing import Final
 
 import numpy as np
 
-from cprl.commons.checks import instance, refusal
+from cprl.arguments import object_of, refusal
 from cprl.commons.game import Game
 from cprl.commons.observation import classes_shown
 from cprl.commons.world import Bytes
@@ -26,7 +26,7 @@ def classes_seen(game: Game, windows: Bytes) -> Bytes:
     Raises:
         ValueError: If the observations are not of this game.
     """
-    instance("game", game, Game, "a cprl.Game")
+    object_of("game", game, Game, "a cprl.Game")
     shape = game.observation_shape
     if getattr(windows, "ndim", 0) != 5 or windows.shape[2:] != shape or windows.dtype != np.uint8:
         raise refusal("windows", getattr(windows, "shape", windows), f"uint8 [T, N, {shape}]")

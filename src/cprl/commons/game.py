@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from cprl.commons.checks import instance
+from cprl.arguments import object_of
 from cprl.commons.colours import FIRST_AGENT, MAX_AGENTS_APART, class_colour
 from cprl.commons.maps import Map
 from cprl.commons.observation import Observation, channel_names
@@ -32,7 +32,7 @@ class Game:
 
     def __post_init__(self) -> None:
         for name, kind in (("map", Map), ("rules", Rules), ("observation", Observation)):
-            instance(f"Game.{name}", getattr(self, name), kind, f"a cprl.{kind.__name__}")
+            object_of(f"Game.{name}", getattr(self, name), kind, f"a cprl.{kind.__name__}")
         agents, sites = self.agents, len(self.map.sites)
         may_fire, may_bite, freeze = self.rules.may_fire, self.rules.may_bite, self.rules.freeze_steps
         if isinstance(may_fire, tuple) and len(may_fire) != agents:

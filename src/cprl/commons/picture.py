@@ -5,11 +5,12 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
-from cprl.commons.checks import floats, instance, integer, memory, refusal
+from cprl.arguments import floats, integer, object_of, refusal
 from cprl.commons.colours import APPLE, BEAM, COLOURS, GROUND, WALL, agent_colour
 from cprl.commons.game import Game
 from cprl.commons.maps import Map
 from cprl.commons.world import COL_STEP, ROW_STEP, Bools, Bytes, Ints, Shown
+from cprl.memory import check_memory
 
 LARGEST_CELL_PIXELS: Final = 1000
 GRID_COLOUR: Final = (28, 30, 36)
@@ -46,7 +47,7 @@ def board_image(
         ValueError: If `cell_pixels` is no integer or below 8, or an array does not fit the map.
         MemoryError: If the image does not fit into memory.
     """
-    instance("board", board, Map, "a cprl.Map")
+    object_of("board", board, Map, "a cprl.Map")
     size = integer("cell_pixels", cell_pixels, 8, LARGEST_CELL_PIXELS)
     stock = _numbers("stock", stock, (len(board.sites),), 1)
     agents = floats("row", row).shape[:1]
@@ -56,7 +57,7 @@ def board_image(
     in_play = None if in_play is None else _numbers("in_play", in_play, agents, 1)
     beams = None if beams is None else _numbers("beams", beams, (board.height, board.width), 1)
     pixels = (board.height * size + 1) * (board.width * size + 1)
-    memory(f"cell_pixels is {size}: the pixels", 3 * pixels, advice="fewer pixels")
+    check_memory(f"cell_pixels is {size}: the pixels", 3 * pixels, "fewer pixels")
     image = np.empty((board.height * size + 1, board.width * size + 1, 3), np.uint8)
     image[:] = GRID_COLOUR
     kinds = np.full((board.height, board.width), GROUND)
@@ -94,7 +95,7 @@ def world_image(board: Map, shown: Shown, *, cell_pixels: int = 24) -> Bytes:
 
 def first_image(game: Game, *, cell_pixels: int = 24) -> Bytes:
     """An image of the board at the start of an episode; see `board_image`."""
-    instance("game", game, Game, "a cprl.Game")
+    object_of("game", game, Game, "a cprl.Game")
     starts = np.array(game.map.starts, np.int32)
     full = np.ones(len(game.map.sites), np.uint8)
     return board_image(game.map, full, *starts.T, cell_pixels=cell_pixels)

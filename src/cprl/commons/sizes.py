@@ -5,7 +5,7 @@ from typing import Final
 
 import numpy as np
 
-from cprl.commons.checks import memory
+from cprl import memory
 from cprl.commons.game import Game, output_shapes
 from cprl.commons.world import empty_worlds
 
@@ -20,7 +20,7 @@ def bytes_of_worlds(game: Game, worlds: int) -> int:
     return worlds * (sum(array.nbytes for array in of_world) + OUTPUTS_HELD * outputs)
 
 
-def check_memory(game: Game, worlds: int, *, free: int | None = None) -> None:
+def check_worlds_fit(game: Game, worlds: int, *, free: int | None = None) -> None:
     """Checks that B worlds fit into memory, before it is allocated.
 
     Args:
@@ -31,9 +31,9 @@ def check_memory(game: Game, worlds: int, *, free: int | None = None) -> None:
     Raises:
         MemoryError: If they do not fit.
     """
-    memory(
+    memory.check_memory(
         f"worlds is {worlds:,}: {'their arrays' if worlds > 1 else 'its arrays'}",
         bytes_of_worlds(game, worlds),
+        "fewer worlds, or a smaller map, window or number of agents",
         free=free,
-        advice="fewer worlds, or a smaller map, window or number of agents",
     )

@@ -6,7 +6,8 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
-from cprl.commons.checks import array, instance, shown
+from cprl.arguments import array, object_of
+from cprl.checks import shown
 from cprl.commons.game import Game
 from cprl.commons.world import PLAYING, TRUNCATED, Worlds, empty_worlds
 
@@ -35,7 +36,7 @@ def checked(state: Mapping[str, Any], *, worlds: int, game: Game) -> State:
     """
     empty = empty_worlds(worlds=worlds, agents=game.agents, sites=len(game.map.sites))
     expected = {name: getattr(empty, name) for name in NAMES}
-    instance("state", state, Mapping, f"a table of arrays by the names {sorted(expected)}")
+    object_of("state", state, Mapping, f"a table of arrays by the names {sorted(expected)}")
     if set(state) != set(expected):
         missing = sorted(set(expected) - set(state))
         unknown = sorted(map(str, set(state) - set(expected)))

@@ -8,7 +8,7 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import DTypeLike, NDArray
 
-from cprl.commons import checks
+from cprl import arguments
 from cprl.commons.compiled import entry_for_cpu, rules_for_cpu
 from cprl.commons.game import Game, output_shapes
 from cprl.commons.loops import Loop
@@ -42,7 +42,7 @@ class CpuThreads:
     def __init__(self, game: Game, worlds: int, *, threads: int | None = None) -> None:
         if threads is not None:
             allowed = f"an integer from 1 to {MOST_THREADS}, or None for all cores"
-            threads = checks.integer("threads", threads, 1, MOST_THREADS, allowed=allowed)
+            threads = arguments.integer("threads", threads, 1, MOST_THREADS, allowed=allowed)
         limit = threads or os.cpu_count() or 1
         self.threads = min(limit, worlds if threads else -(-worlds // WORLDS_PER_THREAD))
         self.tables: Tables = game.tables
@@ -118,10 +118,10 @@ class CpuThreads:
             )
         if output is self._output:
             return
-        checks.instance("output", output, StepOutput, "a StepOutput, made by new_output()")
+        arguments.object_of("output", output, StepOutput, "a StepOutput, made by new_output()")
         arrays: dict[str, NDArray[Any]] = output._asdict()
         for (name, array), (shape, dtype) in zip(arrays.items(), self._expected, strict=True):
-            checks.array(f"output.{name}", array, shape, dtype)
+            arguments.array(f"output.{name}", array, shape, dtype)
             if not array.flags.carray:
                 raise ValueError(
                     f"output.{name} is read-only or not contiguous; allowed: contiguous, writeable"

@@ -11,8 +11,8 @@ from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
 from torchrl.data import Bounded, Categorical, Composite, Unbounded
 
-from cprl import keys
-from cprl.commons import checks
+from cprl import arguments, keys
+from cprl.checks import shown
 from cprl.commons.batch import Batch
 from cprl.commons.game import Game, output_shapes
 from cprl.commons.world import StepOutput
@@ -75,12 +75,12 @@ class CommonsEnv(LeanStepEnv):
         first_world: int = 0,
         state: bool = False,
     ) -> None:
-        checks.instance("game", game, Game, "a cprl.Game; `cprl.envs.make_env` plays games of other kinds")
-        worlds = checks.integer("worlds", worlds, 1, 2**32)
-        checks.switch("state", state)
+        arguments.object_of("game", game, Game, "a cprl.Game; `cprl.envs.make_env` plays other games")
+        worlds = arguments.integer("worlds", worlds, 1, 2**32)
+        arguments.switch("state", state)
         device = device_of(device)
         if seed is not None:
-            checks.seed(seed)
+            arguments.seed(seed)
         driver, as_array = driver_for(game, worlds, device, threads)
         super().__init__(device=device, batch_size=torch.Size([worlds]))
         self.game, self._as_array = game, as_array
@@ -190,13 +190,15 @@ class CommonsEnv(LeanStepEnv):
 
     def set_seed(self, seed: int | None = None, static_seed: bool = False) -> int | None:
         """Restarts from a seed, 0 to 2**64 - 1; see `EnvBase.set_seed`."""
-        following: int | None = super().set_seed(None if seed is None else checks.seed(seed), static_seed)
+        following: int | None = super().set_seed(None if seed is None else arguments.seed(seed), static_seed)
         return following
 
     def _check_batch(self, tensordict: TensorDictBase) -> None:
         if not isinstance(tensordict, TensorDictBase) or tensordict.batch_size != self.batch_size:
             found = getattr(tensordict, "batch_size", tensordict)
-            raise checks.refusal("tensordict", found, f"a TensorDict of batch size {list(self.batch_size)}")
+            raise arguments.refusal(
+                "tensordict", found, f"a TensorDict of batch size {list(self.batch_size)}"
+            )
 
     def _set_seed(self, seed: int | None) -> None:
         self.worlds.set_seed(drawn_seed() if seed is None else seed)
@@ -210,7 +212,7 @@ class CommonsEnv(LeanStepEnv):
         if which is not None and (
             not isinstance(which, Tensor) or which.dtype != torch.bool or which.numel() != self._size
         ):
-            kind = f"{which.dtype} {list(which.shape)}" if isinstance(which, Tensor) else checks.shown(which)
+            kind = f"{which.dtype} {list(which.shape)}" if isinstance(which, Tensor) else shown(which)
             raise ValueError(f'"_reset" is {kind}; allowed: bool [{self._size}, 1]')
         before = self._tensors
         self._show_in(*self._fresh())

@@ -8,10 +8,10 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from cprl.commons import checks
+from cprl import arguments
 from cprl.commons.batch import Driver
 from cprl.commons.game import Game
-from cprl.commons.sizes import check_memory
+from cprl.commons.sizes import check_worlds_fit
 from cprl.commons.threads import CpuThreads
 
 
@@ -33,7 +33,7 @@ def device_of(device: Any) -> torch.device:
     try:
         return torch.device(device)
     except (RuntimeError, TypeError, ValueError):
-        raise checks.refusal("device", device, '"cpu" and "cuda"') from None
+        raise arguments.refusal("device", device, '"cpu" and "cuda"') from None
 
 
 def driver_for(
@@ -41,12 +41,12 @@ def driver_for(
 ) -> tuple[Driver, Callable[[Tensor], Any]]:
     """The driver that runs the worlds on a device, and the function that views a tensor as an array."""
     if device.type == "cpu":
-        check_memory(game, worlds)
+        check_worlds_fit(game, worlds)
         return CpuThreads(game, worlds, threads=threads), Tensor.numpy
     if device.type != "cuda":
         raise ValueError(f'device is "{device}"; allowed: "cpu" and "cuda"')
     if threads is not None:
-        raise checks.refusal("threads", threads, "None on a GPU, where each world has its own thread")
+        raise arguments.refusal("threads", threads, "None on a GPU, where each world has its own thread")
     if not torch.cuda.is_available():
         raise RuntimeError(f'device is "{device}"; allowed: "cpu", because torch finds no GPU')
     from cprl.commons.cuda import CudaThreads

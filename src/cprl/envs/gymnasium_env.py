@@ -9,7 +9,7 @@ from typing import Any
 import gymnasium
 from gymnasium import spaces
 
-from cprl.commons import checks
+from cprl import arguments
 from cprl.commons.game import Game
 from cprl.commons.world import Bytes
 from cprl.envs.one_world import RENDER_FPS, RENDER_MODES, Observed, OneWorld
@@ -34,7 +34,7 @@ class CommonsGymnasiumEnv(gymnasium.Env[Any, Any]):
     }
 
     def __init__(self, game: Game, *, seed: int = 0, render_mode: str | None = None) -> None:
-        checks.instance("game", game, Game, "a cprl.Game")
+        arguments.object_of("game", game, Game, "a cprl.Game")
         if game.agents != 1:
             raise ValueError(
                 f"the game has {game.agents} agents; allowed with Gymnasium: 1; for more use "
@@ -49,7 +49,7 @@ class CommonsGymnasiumEnv(gymnasium.Env[Any, Any]):
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[Observed, dict[str, Any]]:
         """Begins the next episode, or the first episode of a new seed."""
-        super().reset(seed=None if seed is None else checks.seed(seed))
+        super().reset(seed=None if seed is None else arguments.seed(seed))
         self.world.begin(seed)
         return self.world.observation(0), self.world.info(0)
 

@@ -9,8 +9,7 @@ from torch import Tensor
 from torchrl.data import Bounded, Categorical
 from torchrl.envs import Compose, EnvBase, Transform, TransformedEnv
 
-from cprl import keys
-from cprl.commons import checks
+from cprl import arguments, keys
 from cprl.commons.game import Game
 from cprl.custom import Custom, made
 from cprl.envs.commons_env import CommonsEnv
@@ -67,18 +66,18 @@ def make_env(
         ValueError: where the environment or a transform does not fit; says what does.
     """
     playable: Any = made(game)
-    worlds = checks.integer("worlds", worlds, 1, 2**32)
-    seed, first_world = checks.seed(seed), checks.integer("first_world", first_world, 0, 2**32 - 1)
+    worlds = arguments.integer("worlds", worlds, 1, 2**32)
+    seed, first_world = arguments.seed(seed), arguments.integer("first_world", first_world, 0, 2**32 - 1)
     env: EnvBase
     if isinstance(playable, Game):
         env = CommonsEnv(playable, worlds, seed=seed, device=device, first_world=first_world)
     elif isinstance(playable, PlayableGame) and not isinstance(playable, type):
-        env = playable.make(worlds, checks.seed(seed + first_world, "seed + first_world"), device)
+        env = playable.make(worlds, arguments.seed(seed + first_world, "seed + first_world"), device)
     else:
-        raise checks.refusal("game", playable, "a cprl.Game, or a game with agents, to_config and make")
-    listed = [made(transform) for transform in checks.listed("transforms", transforms, _TRANSFORMS)]
+        raise arguments.refusal("game", playable, "a cprl.Game, or a game with agents, to_config and make")
+    listed = [made(transform) for transform in arguments.listed("transforms", transforms, _TRANSFORMS)]
     for transform in listed:
-        checks.instance("a transform", transform, Transform, "a TorchRL transform")
+        arguments.object_of("a transform", transform, Transform, "a TorchRL transform")
     if listed:
         env = TransformedEnv(env, Compose(*listed))
     check_env(env, worlds)
@@ -91,7 +90,7 @@ def spaces_of(env: EnvBase) -> Spaces:
     Raises:
         ValueError: for specs that agents cannot read, e.g. actions that are not categorical.
     """
-    checks.instance("env", env, EnvBase, "a TorchRL environment")
+    arguments.object_of("env", env, EnvBase, "a TorchRL environment")
     observation, action = _spec(env, "observation"), _spec(env, "action")
     if not isinstance(action, Categorical) or action.ndim != 2:
         raise ValueError(

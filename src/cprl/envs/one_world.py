@@ -7,7 +7,7 @@ import numpy as np
 from gymnasium import spaces
 from numpy.typing import NDArray
 
-from cprl.commons import checks
+from cprl import arguments
 from cprl.commons.batch import Batch
 from cprl.commons.game import Game
 from cprl.commons.picture import world_image
@@ -36,7 +36,7 @@ class OneWorld:
 
     def __init__(self, game: Game, *, seed: int, title: str, render_mode: str | None) -> None:
         if render_mode is not None and not (isinstance(render_mode, str) and render_mode in RENDER_MODES):
-            raise checks.refusal("render_mode", render_mode, f"None, {', '.join(RENDER_MODES)}")
+            raise arguments.refusal("render_mode", render_mode, f"None, {', '.join(RENDER_MODES)}")
         self.game = game
         self.batch = Batch(game, 1, seed=seed)
         self.output = self.batch.new_output()
@@ -76,7 +76,7 @@ class OneWorld:
             raise ValueError("the episode has not begun; allowed: reset() before the first step")
         last = len(self.game.actions) - 1
         row = [
-            checks.integer(f"the action of {name}", action, 0, last)
+            arguments.integer(f"the action of {name}", action, 0, last)
             for name, action in zip(self._names, actions, strict=True)
         ]
         self.output = self.batch.play_checked(np.array([row], np.int64), self.batch.new_output())

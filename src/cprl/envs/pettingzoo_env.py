@@ -8,7 +8,8 @@ from gymnasium import spaces
 from pettingzoo import AECEnv, ParallelEnv
 from pettingzoo.utils import parallel_to_aec
 
-from cprl.commons import checks
+from cprl import arguments
+from cprl.checks import shown
 from cprl.commons.game import Game
 from cprl.commons.world import Bytes
 from cprl.envs.one_world import RENDER_FPS, RENDER_MODES, Observed, OneWorld
@@ -41,7 +42,7 @@ class CommonsParallelEnv(ParallelEnv[str, Any, int]):
     }
 
     def __init__(self, game: Game, *, seed: int = 0, render_mode: str | None = None) -> None:
-        checks.instance("game", game, Game, "a cprl.Game")
+        arguments.object_of("game", game, Game, "a cprl.Game")
         self.game, self.render_mode = game, render_mode
         self.world = OneWorld(game, seed=seed, title="cprl commons", render_mode=render_mode)
         self.possible_agents = list(game.agent_names)
@@ -52,12 +53,12 @@ class CommonsParallelEnv(ParallelEnv[str, Any, int]):
 
     def observation_space(self, agent: str) -> spaces.Space[Any]:
         """A Box of uint8 [C, X, Y], or a Dict that holds it as "observation"; always the same object."""
-        checks.choice("agent", agent, self.possible_agents)
+        arguments.choice("agent", agent, self.possible_agents)
         return self.observation_spaces[agent]
 
     def action_space(self, agent: str) -> spaces.Space[Any]:
         """A Discrete space, the indices of `Game.actions`; always the same object."""
-        checks.choice("agent", agent, self.possible_agents)
+        arguments.choice("agent", agent, self.possible_agents)
         return self.action_spaces[agent]
 
     def reset(
@@ -77,10 +78,10 @@ class CommonsParallelEnv(ParallelEnv[str, Any, int]):
             ValueError: If an action is missing, superfluous, no integer or out of range; the world is
                 unchanged.
         """
-        checks.instance("actions", actions, Mapping, "a dict with an action for each agent")
+        arguments.object_of("actions", actions, Mapping, "a dict with an action for each agent")
         if set(actions) != set(self.agents):
             raise ValueError(
-                f"actions has the agents {checks.shown(list(actions))}; allowed: exactly {self.agents}"
+                f"actions has the agents {shown(list(actions))}; allowed: exactly {self.agents}"
                 + ("" if self.agents else ", because the episode has ended: call reset()")
             )
         self.world.play([actions[name] for name in self.agents])

@@ -10,7 +10,7 @@ from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
 from torchrl.envs import EnvBase, TransformedEnv
 
-from cprl.commons.checks import instance
+from cprl.arguments import object_of
 from cprl.envs.unwrap import base_env, commons_of
 
 
@@ -31,9 +31,9 @@ def load_env_state(env: EnvBase, state: Mapping[str, Any]) -> None:
     Raises:
         ValueError: if the state is of another form, or a commons cannot be in it.
     """
-    instance("state", state, Mapping, "a value of env_state")
+    object_of("state", state, Mapping, "a value of env_state")
     for name in ("worlds", "transforms"):
-        instance(f"state[{name!r}]", state.get(name), Mapping, "a table")
+        object_of(f"state[{name!r}]", state.get(name), Mapping, "a table")
     commons = commons_of(env)
     if commons is None:
         base_env(env).load_state_dict(state["worlds"])

@@ -3,13 +3,13 @@
 from torchrl.envs import EnvBase, TransformedEnv
 
 from cprl import keys
-from cprl.commons.checks import instance
+from cprl.arguments import object_of
 from cprl.envs.commons_env import CommonsEnv
 
 
 def base_env(env: EnvBase) -> EnvBase:
     """The environment without its transforms; raises a ValueError if it is none."""
-    instance("env", env, EnvBase, "a TorchRL environment")
+    object_of("env", env, EnvBase, "a TorchRL environment")
     while isinstance(env, TransformedEnv):
         env = env.base_env
     return env

@@ -21,7 +21,7 @@ from typing import Final, Literal, TypeAlias, get_args
 import numpy as np
 import pyarrow as pa
 
-from cprl.commons import checks
+from cprl import arguments
 from cprl.evaluation.evaluate import SEED, check, chosen_replicas, opened
 from cprl.evaluation.lanes import Played, Source, play, policies_of
 from cprl.evaluation.same_game import check_same_game
@@ -58,7 +58,7 @@ class Cell:
         """
         agents = list(self.by_agent)
         if agent is not None:
-            agents = [checks.integer("agent", agent, 0, len(agents) - 1)]
+            agents = [arguments.integer("agent", agent, 0, len(agents) - 1)]
         returns = {
             "focal/return": self._returns(agents, lambda returns, at: returns[at]),
             "background/return": self._returns(agents, lambda returns, at: np.delete(returns, at).mean()),
@@ -154,8 +154,8 @@ def crossplay(
             given twice, `diagonal` is another word, or "cross_seed" has a single replica; and see
             `cprl.evaluate_run`.
     """
-    checks.choice("diagonal", diagonal, get_args(Diagonal))
-    listed = checks.listed("runs", runs, "a sequence of at least two runs")
+    arguments.choice("diagonal", diagonal, get_args(Diagonal))
+    listed = arguments.listed("runs", runs, "a sequence of at least two runs")
     named = _named([opened(run, allow) for run in listed])
     first, *_ = named.values()
     check_same_game(named)

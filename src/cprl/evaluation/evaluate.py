@@ -8,7 +8,7 @@ from typing import Final
 
 import pyarrow as pa
 
-from cprl.commons import checks
+from cprl import arguments
 from cprl.envs.unwrap import agent_names
 from cprl.evaluation.lanes import Played, Source, play, policies_of, random_policies
 from cprl.measuring.replicas import Measured, over_replicas, social_measures
@@ -40,7 +40,7 @@ class Evaluation:
         Raises:
             ValueError: if it is anything else.
         """
-        checks.choice("policy", policy, ("trained", "random"))
+        arguments.choice("policy", policy, ("trained", "random"))
         played = {"trained": self.trained, "random": self.random}[policy]
         returns = {
             f"{name}/return": over_replicas(
@@ -110,7 +110,7 @@ def opened(run: str | Path | LoadedRun, allow: Sequence[str] = ()) -> LoadedRun:
     Raises:
         ValueError: if it is neither, or cannot be loaded, see `cprl.load`.
     """
-    checks.instance("run", run, (str, Path, LoadedRun), "a directory, or a value of cprl.load")
+    arguments.object_of("run", run, (str, Path, LoadedRun), "a directory, or a value of cprl.load")
     return run if isinstance(run, LoadedRun) else load(run, allow=allow)
 
 
@@ -126,8 +126,8 @@ def chosen_replicas(runs: Mapping[str, LoadedRun], replicas: Sequence[int]) -> l
     """
     allowed = "the indices of replicas"
     chosen = {
-        checks.integer("a replica", replica, 0, allowed="an integer >= 0")
-        for replica in checks.listed("replicas", replicas, allowed)
+        arguments.integer("a replica", replica, 0, allowed="an integer >= 0")
+        for replica in arguments.listed("replicas", replicas, allowed)
     }
     common = sorted(set.intersection(*(set(run.replicas) for run in runs.values())))
     for name, run in runs.items():
@@ -146,9 +146,9 @@ def check(*, episodes: int, seed: int, greedy: bool, runs: Sequence[LoadedRun]) 
     Raises:
         ValueError: names the value and what is allowed.
     """
-    checks.integer("episodes", episodes, 1)
-    checks.seed(seed)
-    checks.switch("greedy", greedy)
+    arguments.integer("episodes", episodes, 1)
+    arguments.seed(seed)
+    arguments.switch("greedy", greedy)
     for run in runs:
         if run.experiment.seed == seed:
             raise ValueError(

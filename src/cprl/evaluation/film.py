@@ -5,8 +5,7 @@ from pathlib import Path
 
 from tensordict import TensorDictBase
 
-from cprl import keys
-from cprl.commons import checks
+from cprl import arguments, keys
 from cprl.measuring.episodes import Episode
 from cprl.stored import load
 from cprl.training import train
@@ -40,10 +39,10 @@ def film(
         ValueError: if the run cannot be loaded, see `cprl.load`, or a number is out of range.
         FileExistsError: if the recording exists.
     """
-    episode = checks.integer("episode", episode, 0, 2**32 - 1)
-    replica = checks.integer("replica", replica, 0)
-    checks.instance("run", run, (str, Path), "a directory")
-    checks.instance("out", out, (str, Path, type(None)), "a path, or None")
+    episode = arguments.integer("episode", episode, 0, 2**32 - 1)
+    replica = arguments.integer("replica", replica, 0)
+    arguments.object_of("run", run, (str, Path), "a directory")
+    arguments.object_of("out", out, (str, Path, type(None)), "a path, or None")
     loaded = load(run, allow=allow)
     if replica not in loaded.replicas:
         raise ValueError(f"replica is {replica}; allowed: {', '.join(map(str, loaded.replicas))}")

@@ -8,7 +8,8 @@ from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
 
 from cprl import keys
-from cprl.checks import checked, count, object_of
+from cprl.arguments import object_of
+from cprl.checks import checked, count
 
 RewardKind: TypeAlias = Literal["individual", "team"]
 """The reward that a learner gets each turn: the agent's own, or the sum over all agents."""

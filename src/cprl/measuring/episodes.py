@@ -9,11 +9,11 @@ from numpy.typing import NDArray
 from tensordict import TensorDictBase
 from torch import Tensor
 
-from cprl import keys
-from cprl.commons import checks
+from cprl import arguments, keys
 from cprl.measuring import social
 from cprl.measuring.episode import Episode
 from cprl.measuring.reported import OPTIONAL, reported_in
+from cprl.memory import check_memory
 
 __all__ = ["Episode", "EpisodeTracker"]
 
@@ -69,12 +69,12 @@ class EpisodeTracker:
         sustainable_yield: float | None = None,
         first_stock: float | None = None,
     ) -> None:
-        worlds = checks.integer("worlds", worlds, 1, 2**32)
-        agents = checks.integer("agents", agents, 1, 2**20)
-        max_steps = None if max_steps is None else checks.integer("max_steps", max_steps, 1)
+        worlds = arguments.integer("worlds", worlds, 1, 2**32)
+        agents = arguments.integer("agents", agents, 1, 2**20)
+        max_steps = None if max_steps is None else arguments.integer("max_steps", max_steps, 1)
         self.worlds, self.agents, self.max_steps = worlds, agents, max_steps
         needed = worlds * agents * (5 * self._capacity(0) + 16 * agents)
-        checks.memory(f"worlds is {worlds:,}: the histories of their episodes", needed, advice="fewer worlds")
+        check_memory(f"worlds is {worlds:,}: the histories of their episodes", needed, "fewer worlds")
         self.reported: tuple[str, ...] | None = None
         """The optional entries of this game; None before the first batch."""
         self._yield = {"sustainable_yield": sustainable_yield, "first_stock": first_stock}
@@ -93,7 +93,7 @@ class EpisodeTracker:
             The episodes that ended, ordered by turn, then by world.
         """
         if self.reported is None:
-            checks.instance("tensordict", tensordict, TensorDictBase, "a TensorDict with the next turns")
+            arguments.object_of("tensordict", tensordict, TensorDictBase, "a TensorDict with the next turns")
             self._begin(reported_in(tensordict))
             if tensordict.get(keys.DONE, None) is None:
                 raise self._missing(tensordict)
@@ -128,9 +128,9 @@ class EpisodeTracker:
             ValueError: if the state has other shapes, or is from a game that reports other entries; the
                 tracker is then unchanged.
         """
-        checks.instance("state", state, Mapping, "a value of state_dict()")
+        arguments.object_of("state", state, Mapping, "a value of state_dict()")
         for name, tensor in state.items():
-            checks.instance(f"state[{name!r}]", tensor, Tensor, "a tensor")
+            arguments.object_of(f"state[{name!r}]", tensor, Tensor, "a tensor")
         longest = next((state[name].shape[1] for name in _HISTORIES if name in state), 0)
         if self.max_steps is not None and longest > self.max_steps:
             raise ValueError(f"the state has {longest} steps; allowed: up to max_steps, {self.max_steps}")

@@ -8,7 +8,7 @@ from tensordict import TensorDictBase
 from torchrl.envs import EnvBase
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 
-from cprl.commons import checks
+from cprl import arguments
 from cprl.envs.commons_env import CommonsEnv
 from cprl.envs.unwrap import agent_count
 from cprl.measuring.episodes import Episode, EpisodeTracker
@@ -34,7 +34,7 @@ def evaluate(env: EnvBase, policy: Policy, *, explore: bool = False) -> list[Epi
     """
     agents, worlds = agent_count(env), env.batch_size.numel()
     if not callable(policy):
-        raise checks.refusal("policy", policy, "a function that writes the actions of all agents")
+        raise arguments.refusal("policy", policy, "a function that writes the actions of all agents")
     is_commons = isinstance(env, CommonsEnv)
     tracker = EpisodeTracker(worlds, agents, env.game.rules.episode_steps if is_commons else None)
     exploration = ExplorationType.RANDOM if explore else ExplorationType.DETERMINISTIC
@@ -71,9 +71,9 @@ def mean_return(episodes: list[Episode]) -> tuple[float, float]:
     Raises:
         ValueError: if there are no episodes.
     """
-    episodes = list(checks.listed("episodes", episodes, "a list of episodes"))
+    episodes = list(arguments.listed("episodes", episodes, "a list of episodes"))
     if not episodes or not all(isinstance(episode, Episode) for episode in episodes):
-        raise checks.refusal("episodes", episodes, "at least one Episode")
+        raise arguments.refusal("episodes", episodes, "at least one Episode")
     returns = [float(episode.return_.sum()) for episode in episodes]
     error = stdev(returns) / len(returns) ** 0.5 if len(returns) > 1 else float("nan")
     return fmean(returns), error

@@ -17,8 +17,7 @@ from numpy.typing import NDArray
 from tensordict import TensorDictBase
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 
-from cprl import keys
-from cprl.commons import checks
+from cprl import arguments, keys
 from cprl.envs.commons_env import CommonsEnv
 
 Array = NDArray[Any]
@@ -64,7 +63,7 @@ def trace(
 
 def visits(trace: Trace) -> Array:
     """The share of its steps in play that each agent spent in each cell, float64 [B, N, H, W]."""
-    checks.instance("trace", trace, Trace, "a value of trace()")
+    arguments.object_of("trace", trace, Trace, "a value of trace()")
     steps, worlds, agents = trace.row.shape
     counts = np.zeros((worlds, agents, *trace.board))
     here = trace.in_play & trace.played[..., None]

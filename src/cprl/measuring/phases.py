@@ -16,8 +16,8 @@ import ruptures
 from numpy.typing import ArrayLike, NDArray
 from ruptures.base import BaseCost
 
-from cprl.checks import listed
-from cprl.commons import checks
+from cprl import arguments
+from cprl.arguments import objects
 
 Values = NDArray[np.float64]
 
@@ -81,8 +81,8 @@ def change_points(
             episode of all replicas, or an argument is out of range.
     """
     at, by_name = _checked(episodes, metrics)
-    number, resamples = checks.integer("number", number, 1), checks.integer("resamples", resamples, 1)
-    seed = checks.seed(seed)
+    number, resamples = arguments.integer("number", number, 1), arguments.integer("resamples", resamples, 1)
+    seed = arguments.seed(seed)
     shapes = {name: curve.shape for name, curve in by_name.items()}
     if len(set(shapes.values())) > 1:
         raise ValueError(f"metrics are {shapes}; allowed: the same shape for all")
@@ -114,7 +114,7 @@ def find_phases(
     episodes: ArrayLike, metrics: Mapping[str, ArrayLike], *, number: int = 3
 ) -> tuple[list[ChangePoint], list[Phase]]:
     """Finds `number` change points and the phases between them; see `change_points` and `phases`."""
-    number = checks.integer("number", number, 0)
+    number = arguments.integer("number", number, 0)
     changes = change_points(episodes, metrics, number=number) if number else []
     return changes, phases(episodes, metrics, changes)
 
@@ -138,7 +138,7 @@ def phases(
     Raises:
         ValueError: If a metric is missing or has another shape, or a phase has fewer than two episodes.
     """
-    points = listed("changes", changes, ChangePoint, "change points")
+    points = objects("changes", changes, ChangePoint, "change points")
     at, by_name = _checked(episodes, metrics)
     missing = [name for name in METRICS if name not in by_name]
     if missing:
@@ -166,11 +166,13 @@ def phases(
 
 def _checked(episodes: ArrayLike, metrics: Mapping[str, ArrayLike]) -> tuple[Values, dict[str, Values]]:
     """The episodes, [E], and each metric, [R, E], after checking their form."""
-    at = checks.floats("episodes", episodes)
+    at = arguments.floats("episodes", episodes)
     if at.ndim != 1 or len(at) < 2 or not (np.diff(at) > 0).all() or not np.isfinite(at[[0, -1]]).all():
-        raise checks.refusal("episodes", episodes, "[E], at least two, finite and increasing")
-    checks.instance("metrics", metrics, Mapping, "a table of at least one metric, [E] or [R, E]")
-    curves = {name: np.atleast_2d(checks.floats(f"metrics[{name!r}]", own)) for name, own in metrics.items()}
+        raise arguments.refusal("episodes", episodes, "[E], at least two, finite and increasing")
+    arguments.object_of("metrics", metrics, Mapping, "a table of at least one metric, [E] or [R, E]")
+    curves = {
+        name: np.atleast_2d(arguments.floats(f"metrics[{name!r}]", own)) for name, own in metrics.items()
+    }
     if not curves:
         raise ValueError("metrics is empty; allowed: at least one metric, [E] or [R, E]")
     for name, curve in curves.items():

@@ -14,7 +14,7 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from cprl.commons import checks
+from cprl import arguments
 
 Values = NDArray[np.float64]
 
@@ -97,7 +97,7 @@ EXPERIMENTS: Final = (
 
 def published_experiment(recipe: str) -> PublishedExperiment | None:
     """The study's experiment that a recipe repeats, or None."""
-    checks.instance("recipe", recipe, str, "the name of a recipe")
+    arguments.object_of("recipe", recipe, str, "the name of a recipe")
     return next((one for one in EXPERIMENTS if one.recipe == recipe), None)
 
 
@@ -110,7 +110,7 @@ def curve(name: str) -> tuple[Values, Values]:
     Raises:
         ValueError: If there is no curve of this name.
     """
-    checks.choice("name", name, _curves())
+    arguments.choice("name", name, _curves())
     return _curves()[name]
 
 
@@ -137,7 +137,7 @@ def agreement(name: str, values: Values) -> tuple[float, float]:
         ValueError: If the published curve has fewer than 10 points in these episodes, or `values` is not [E].
     """
     episodes, published = curve(name)
-    values = checks.floats("values", values)
+    values = arguments.floats("values", values)
     if values.ndim != 1:
         raise ValueError(f"values is {list(values.shape)}; allowed: [E], one number per episode")
     both = episodes <= len(values) - 1

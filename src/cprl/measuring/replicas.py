@@ -6,7 +6,7 @@ from math import isnan
 from numbers import Real
 from statistics import fmean
 
-from cprl.commons import checks
+from cprl import arguments
 from cprl.measuring.episodes import Episode
 from cprl.measuring.statistics import Estimate, estimate
 
@@ -36,10 +36,10 @@ def over_replicas(values: Mapping[int, Sequence[float]]) -> Measured:
     Raises:
         ValueError: if there are no replicas, or a replica has no episodes.
     """
-    checks.instance("values", values, Mapping, "a table of values by replica")
+    arguments.object_of("values", values, Mapping, "a table of values by replica")
     for replica, of_replica in values.items():
-        for value in checks.listed(f"values[{replica!r}]", of_replica, "one number per episode"):
-            checks.instance(f"values[{replica!r}]", value, Real, "one number per episode")
+        for value in arguments.listed(f"values[{replica!r}]", of_replica, "one number per episode"):
+            arguments.object_of(f"values[{replica!r}]", value, Real, "one number per episode")
     if not values or not all(map(len, values.values())):
         counts = {replica: len(own) for replica, own in values.items()}
         raise ValueError(f"episodes by replica are {counts}; allowed: at least one replica, each at least 1")
@@ -58,7 +58,7 @@ def social_metrics(episode: Episode) -> dict[str, float]:
 
     Metrics that need entries that the game does not report are left out.
     """
-    checks.instance("episode", episode, Episode, "an Episode")
+    arguments.object_of("episode", episode, Episode, "an Episode")
     if episode.stock_left is None:
         return dict(episode.metrics)
     return {**episode.metrics, "stock_left": float(episode.stock_left)}
@@ -87,10 +87,10 @@ def social_measures(played: Mapping[int, Sequence[Episode]]) -> dict[str, Measur
 
 def _checked(played: Mapping[int, Sequence[Episode]]) -> Mapping[int, Sequence[Episode]]:
     """Episodes by replica, after checking that they are."""
-    checks.instance("played", played, Mapping, "a table of episodes by replica")
+    arguments.object_of("played", played, Mapping, "a table of episodes by replica")
     for replica, own in played.items():
-        for episode in checks.listed(f"played[{replica!r}]", own, "a sequence of episodes"):
-            checks.instance(f"an entry of played[{replica!r}]", episode, Episode, "an Episode")
+        for episode in arguments.listed(f"played[{replica!r}]", own, "a sequence of episodes"):
+            arguments.object_of(f"an entry of played[{replica!r}]", episode, Episode, "an Episode")
     return played
 
 

@@ -13,7 +13,7 @@ from tensordict import TensorDictBase
 from torchrl.envs import EnvBase
 
 from cprl import keys
-from cprl.commons.checks import instance, listed
+from cprl.arguments import listed, object_of
 from cprl.measuring import social
 
 OPTIONAL: Final = ("harvest", "in_play", "fired", "hit_by", "tagged_by", "stock")
@@ -41,14 +41,14 @@ FIELDS: Final[Mapping[str, tuple[str, ...]]] = MappingProxyType(
 
 def reported_by(env: EnvBase) -> tuple[str, ...]:
     """The entries of `OPTIONAL` in the specs of an environment, transforms included."""
-    instance("env", env, EnvBase, "a TorchRL environment")
+    object_of("env", env, EnvBase, "a TorchRL environment")
     found = set(env.observation_spec.keys(include_nested=True))
     return tuple(name for name in OPTIONAL if {name, (keys.AGENTS, name)} & found)
 
 
 def reported_in(tensordict: TensorDictBase) -> tuple[str, ...]:
     """The entries of `OPTIONAL` in a batch: in_play at the root, the others under "next"."""
-    instance("tensordict", tensordict, TensorDictBase, "a TensorDict")
+    object_of("tensordict", tensordict, TensorDictBase, "a TensorDict")
     places: dict[str, Any] = {name: ("next", keys.AGENTS, name) for name in OPTIONAL}
     places |= {"in_play": keys.IN_PLAY, "stock": ("next", keys.STOCK)}
     return tuple(name for name in OPTIONAL if tensordict.get(places[name], None) is not None)
@@ -61,7 +61,7 @@ def available(needs: Mapping[str, tuple[str, ...]], reported: Collection[str]) -
         needs: the entries by name, e.g. `FIELDS`.
         reported: the entries of `OPTIONAL` that the game reports.
     """
-    instance("needs", needs, Mapping, "the entries by name, e.g. FIELDS")
+    object_of("needs", needs, Mapping, "the entries by name, e.g. FIELDS")
     reported = listed("reported", reported, "names of entries")
     return tuple(name for name, entries in needs.items() if set(entries) <= set(reported))
 

@@ -6,7 +6,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from cprl.commons import checks
+from cprl import arguments
 from cprl.measuring.episodes import Episode
 from cprl.measuring.replicas import social_metrics
 
@@ -42,7 +42,7 @@ class Series:
     """
 
     def __init__(self, replicas: int) -> None:
-        self.replicas = checks.integer("replicas", replicas, 1)
+        self.replicas = arguments.integer("replicas", replicas, 1)
         self._waiting: dict[int, dict[int, dict[str, float]]] = {}
 
     def add(self, episode: int, replica: int, numbers: Mapping[str, float]) -> dict[str, Values] | None:
@@ -52,10 +52,10 @@ class Series:
             Its numbers, [R] by name, NaN where a replica has none, if all replicas have ended the episode;
             else None.
         """
-        episode = checks.integer("episode", episode, 0)
-        replica = checks.integer("replica", replica, 0, self.replicas - 1)
+        episode = arguments.integer("episode", episode, 0)
+        replica = arguments.integer("replica", replica, 0, self.replicas - 1)
         of_episode = self._waiting.setdefault(episode, {})
-        checks.instance("numbers", numbers, Mapping, "numbers by name")
+        arguments.object_of("numbers", numbers, Mapping, "numbers by name")
         of_episode[replica] = dict(numbers)
         if len(of_episode) < self.replicas:
             return None
@@ -76,6 +76,6 @@ class Series:
 
 def mean_of(values: Values) -> float:
     """The mean of the defined values; NaN if none is defined."""
-    values = checks.floats("values", values)
+    values = arguments.floats("values", values)
     defined = values[~np.isnan(values)]
     return float(defined.mean()) if len(defined) else float("nan")

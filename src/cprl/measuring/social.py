@@ -21,7 +21,7 @@ from typing import Final
 import torch
 from torch import Tensor
 
-from cprl.commons.checks import refusal
+from cprl.arguments import refusal
 
 NEEDS: Final[Mapping[str, tuple[str, ...]]] = MappingProxyType(
     {

@@ -15,7 +15,9 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy import stats
 
-from cprl.commons import checks
+from cprl import arguments
+from cprl.checks import shown
+from cprl.memory import check_memory
 
 Values = NDArray[np.float64]
 Statistic = Literal["mean", "iqm"]
@@ -51,8 +53,8 @@ def inter_quartile_mean(values: ArrayLike, axis: int = -1) -> Any:
 
 def _some(values: ArrayLike, axis: int) -> Values:
     """Values as float64, at least one along the axis."""
-    found = checks.floats("values", values)
-    axis = checks.integer("axis", axis, -found.ndim)
+    found = arguments.floats("values", values)
+    axis = arguments.integer("axis", axis, -found.ndim)
     if not found.ndim or not -found.ndim <= axis < found.ndim or not found.shape[axis]:
         raise ValueError(f"values is {list(found.shape)} and axis is {axis}; allowed: at least one value")
     return found
@@ -87,7 +89,7 @@ def estimate(
     samples = [_checked(stratum) for stratum in strata]
     if not samples:
         raise ValueError("there are no values; allowed: at least one stratum")
-    checks.choice("statistic", statistic, _STATISTICS)
+    arguments.choice("statistic", statistic, _STATISTICS)
     resamples, seed = _bootstrap(confidence, resamples, seed, max(map(len, samples)))
     of_one = _STATISTICS[statistic]
 
@@ -119,7 +121,7 @@ def curve_interval(
             is out of range.
         MemoryError: If there are too many resamples.
     """
-    all_curves = checks.floats("curves", curves)
+    all_curves = arguments.floats("curves", curves)
     if all_curves.ndim != 2 or not len(all_curves):
         raise ValueError(f"curves is {list(all_curves.shape)}; allowed: [R, E], a curve per replica")
     if np.isinf(all_curves).any():
@@ -170,16 +172,16 @@ def _interval(
 
 def _bootstrap(confidence: float, resamples: int, seed: int, numbers: int) -> tuple[int, int]:
     """Resamples and seed, after checking them; `numbers`: those that each resample holds."""
-    checks.number("confidence", confidence, low=0, high=_BELOW_ONE, above=True, allowed="above 0, below 1")
-    resamples, seed = checks.integer("resamples", resamples, 1, 2**40), checks.seed(seed)
-    checks.memory(f"resamples is {resamples:,}: they", 8 * resamples * numbers, advice="fewer resamples")
+    arguments.number("confidence", confidence, low=0, high=_BELOW_ONE, above=True, allowed="above 0, below 1")
+    resamples, seed = arguments.integer("resamples", resamples, 1, 2**40), arguments.seed(seed)
+    check_memory(f"resamples is {resamples:,}: they", 8 * resamples * numbers, "fewer resamples")
     return resamples, seed
 
 
 def _checked(values: ArrayLike) -> Values:
-    checked = checks.floats("values", values)
+    checked = arguments.floats("values", values)
     if checked.ndim != 1 or not len(checked):
         raise ValueError(f"values is {list(checked.shape)}; allowed: [R], one number per replica")
     if not np.isfinite(checked).all():
-        raise ValueError(f"values is {checks.shown(checked.tolist())}; allowed: finite numbers")
+        raise ValueError(f"values is {shown(checked.tolist())}; allowed: finite numbers")
     return checked

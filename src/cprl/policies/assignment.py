@@ -8,8 +8,7 @@ from tensordict import TensorDictBase
 from tensordict.nn import TensorDictModuleBase
 from torch import Tensor, nn
 
-from cprl import keys
-from cprl.commons import checks
+from cprl import arguments, keys
 from cprl.compat import unchecked_tensordict
 from cprl.policies.lanes import LaneActor
 
@@ -46,12 +45,12 @@ class AgentPolicies(TensorDictModuleBase):
         by_agents: dict[AgentIndices, nn.Module] = (
             dict(actors)
             if isinstance(actors, Mapping)
-            else dict(enumerate(checks.listed("actors", actors, allowed)))
+            else dict(enumerate(arguments.listed("actors", actors, allowed)))
         )
         for indices, actor in by_agents.items():
-            checks.instance(f"the actor of {indices}", actor, nn.Module, "a torch module")
+            arguments.object_of(f"the actor of {indices}", actor, nn.Module, "a torch module")
             for agent in agent_indices(indices):
-                checks.integer("an agent", agent, 0)
+                arguments.integer("an agent", agent, 0)
         taken = sorted(agent for indices in by_agents for agent in agent_indices(indices))
         if not taken or taken != list(range(len(taken))):
             raise ValueError(f"actors control the agents {taken}; allowed: 0, 1 and so on, each exactly once")

@@ -9,7 +9,7 @@ from tensordict.nn import TensorDictModuleBase
 from torch import Tensor, nn
 from torchrl.envs.utils import ExplorationType, exploration_type
 
-from cprl.commons import checks
+from cprl import arguments
 from cprl.compiling import Compiled
 from cprl.policies.rng import MOST_LANES, LaneRng, check_lanes
 from cprl.spaces import Spaces
@@ -51,9 +51,9 @@ class LaneActor(TensorDictModuleBase):
         compile: bool = False,
     ) -> None:
         super().__init__()
-        checks.switch("stochastic", stochastic)
+        arguments.switch("stochastic", stochastic)
         self.values, self.stochastic = values, stochastic
-        self.actions = checks.integer("actions", actions, 1)
+        self.actions = arguments.integer("actions", actions, 1)
         self.agents, self.worlds, self.replicas = check_lanes(seeds, agents=agents, worlds=worlds)
         # A tensor, because compiled code treats other numbers as constants.
         self._chance = 0.0 if stochastic else 1.0
@@ -73,9 +73,9 @@ class LaneActor(TensorDictModuleBase):
     def explore_with(self, chance: float) -> None:
         """Sets `epsilon` of agents that have one; faster than through attributes of a module."""
         if type(chance) is not float:
-            chance = checks.number("epsilon", chance, low=0, high=1, allowed="0..1")
+            chance = arguments.number("epsilon", chance, low=0, high=1, allowed="0..1")
         if chance != self._chance and not self.stochastic:
-            checks.number("epsilon", chance, low=0, high=1, allowed="0..1")
+            arguments.number("epsilon", chance, low=0, high=1, allowed="0..1")
             self._epsilon.fill_(chance)
             object.__setattr__(self, "_chance", chance)
 
@@ -142,9 +142,9 @@ def random_agents(
     spaces: Spaces, agents: tuple[int, ...], *, replicas: int, seed: int, worlds: int = 1
 ) -> dict[int | tuple[int, ...], nn.Module]:
     """Uniformly random actors of some agents of every replica, by the indices of the agents."""
-    checks.instance("spaces", spaces, Spaces, "a cprl.spaces.Spaces")
-    agents = checks.listed("agents", agents, "the indices of agents")
-    replicas, seed = checks.integer("replicas", replicas, 1, MOST_LANES), checks.seed(seed)
+    arguments.object_of("spaces", spaces, Spaces, "a cprl.spaces.Spaces")
+    agents = arguments.listed("agents", agents, "the indices of agents")
+    replicas, seed = arguments.integer("replicas", replicas, 1, MOST_LANES), arguments.seed(seed)
     seeds = [(seed, replica, agent) for replica in range(replicas) for agent in agents]
     return {agents: random_lanes(spaces.actions, seeds=seeds, agents=len(agents), worlds=worlds)}
 

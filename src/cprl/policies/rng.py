@@ -7,7 +7,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from cprl.commons import checks
+from cprl import arguments
 from cprl.memory import check_memory
 
 DRAWN_AHEAD: Final = 1024
@@ -28,9 +28,9 @@ def check_lanes(seeds: Any, *, agents: int, worlds: int) -> tuple[int, int, int]
     Raises:
         ValueError: if a number is no integer or below 1, or there is not one seed per lane.
     """
-    agents = checks.integer("agents", agents, 1, MOST_LANES)
-    worlds = checks.integer("worlds", worlds, 1, 2**32)
-    lanes = len(checks.listed("seeds", seeds, _SEEDS))
+    agents = arguments.integer("agents", agents, 1, MOST_LANES)
+    worlds = arguments.integer("worlds", worlds, 1, 2**32)
+    lanes = len(arguments.listed("seeds", seeds, _SEEDS))
     if not lanes or lanes % agents:
         raise ValueError(
             f"there are {lanes} seeds for {agents} agents; allowed: one seed per lane, that is, a multiple "
@@ -52,8 +52,8 @@ class LaneRng:
     """
 
     def __init__(self, seeds: Sequence[Sequence[int]], count: int) -> None:
-        own = [_seed(lane, seed) for lane, seed in enumerate(checks.listed("seeds", seeds, _SEEDS))]
-        self.lanes, self.count = len(own), checks.integer("count", count, 1, 2**40)
+        own = [_seed(lane, seed) for lane, seed in enumerate(arguments.listed("seeds", seeds, _SEEDS))]
+        self.lanes, self.count = len(own), arguments.integer("count", count, 1, 2**40)
         ahead = 8 * 2 * DRAWN_AHEAD * self.lanes * self.count
         check_memory(
             f"random numbers of {self.lanes:,} lanes, {self.count:,} a step and {DRAWN_AHEAD} steps ahead,",
@@ -89,8 +89,8 @@ class LaneRng:
 
 def _seed(lane: int, seed: Any) -> list[int]:
     """The seed of a lane as ints."""
-    parts = checks.listed(f"seeds[{lane}]", seed, "a sequence of integers >= 0")
-    return [checks.integer(f"seeds[{lane}]", part, 0) for part in parts]
+    parts = arguments.listed(f"seeds[{lane}]", seed, "a sequence of integers >= 0")
+    return [arguments.integer(f"seeds[{lane}]", part, 0) for part in parts]
 
 
 def _plain(state: Any) -> Any:

@@ -44,7 +44,8 @@ from tensordict.nn import TensorDictModuleBase
 from torch import Tensor, nn
 from torchrl.envs.utils import ExplorationType, exploration_type
 
-from cprl.commons import checks, colours
+from cprl import arguments
+from cprl.commons import colours
 from cprl.commons.compiled import CPU_OPTIONS, compiled
 from cprl.commons.decoding import UNSEEN, classes_seen
 from cprl.commons.game import Game
@@ -108,7 +109,7 @@ class ScriptedActor(TensorDictModuleBase):
         self.policy, self.game, self.epsilon = policy, game, 0.0
         self.agents, self.worlds, self.replicas = check_lanes(seeds, agents=agents, worlds=worlds)
         self.rng = LaneRng(seeds, NUMBERS * self.worlds)
-        spare = checks.integer("spare", spare, 1, 2**31 - 1)
+        spare = arguments.integer("spare", spare, 1, 2**31 - 1)
         self._settings, self._role_of_class = _settings(game, spare), _roles()
         self._rim, self._frame = _frame(game)
         size = self._frame.stride * (game.observation_shape[1] + 2 * self._rim)
@@ -127,7 +128,7 @@ class ScriptedActor(TensorDictModuleBase):
         expected = (self.replicas * self.worlds, self.agents, *self.game.observation_shape)
         if not isinstance(observation, Tensor) or observation.dtype != torch.uint8:
             found = getattr(observation, "dtype", observation)
-            raise checks.refusal("observation", found, f"a uint8 tensor {list(expected)}")
+            raise arguments.refusal("observation", found, f"a uint8 tensor {list(expected)}")
         if observation.shape != expected:
             raise ValueError(f"observation is {list(observation.shape)}; allowed: {list(expected)}")
         explores = exploration_type() in (ExplorationType.RANDOM, None)
@@ -183,8 +184,8 @@ def scripted_lanes(
     Raises:
         ValueError: for another policy than "random" in a game that is not a `Game`.
     """
-    checks.choice("policy", policy, SCRIPTED_POLICIES)
-    checks.instance("playing", playing, (Game, Spaces), "a cprl.Game, or the Spaces of another game")
+    arguments.choice("policy", policy, SCRIPTED_POLICIES)
+    arguments.object_of("playing", playing, (Game, Spaces), "a cprl.Game, or the Spaces of another game")
     if policy == "random":
         actions = playing.actions if isinstance(playing, Spaces) else playing.spaces.actions
         return random_lanes(actions, seeds=seeds, agents=agents, worlds=worlds)
@@ -197,8 +198,8 @@ def scripted_lanes(
 
 
 def _check(policy: str, game: Game) -> None:
-    checks.choice("policy", policy, SCRIPTED_POLICIES)
-    checks.instance("game", game, Game, "a cprl.Game")
+    arguments.choice("policy", policy, SCRIPTED_POLICIES)
+    arguments.object_of("game", game, Game, "a cprl.Game")
     if game.observation.area != "window":
         raise ValueError(
             f"Observation.area is {game.observation.area!r}; allowed with scripted policies: 'window', "

@@ -10,7 +10,7 @@ from torch import nn
 from torchrl.data import Categorical
 from torchrl.modules import EGreedyModule, QValueActor
 
-from cprl.commons import checks
+from cprl import arguments
 from cprl.envs.drivers import device_of
 
 
@@ -26,7 +26,7 @@ class QActor(TensorDictSequential):
     """
 
     def __init__(self, network: nn.Module, actions: int, *, device: str | torch.device = "cpu") -> None:
-        actions = checks.integer("actions", actions, 1)
+        actions = arguments.integer("actions", actions, 1)
         spec = Categorical(actions, shape=(), dtype=torch.int64, device=torch.device(device))
         super().__init__(
             QValueActor(network, spec=spec, action_space="categorical"),
@@ -45,7 +45,7 @@ class QActor(TensorDictSequential):
 
     @epsilon.setter
     def epsilon(self, chance: float) -> None:
-        self.module[1].eps.fill_(checks.number("epsilon", chance, low=0, high=1, allowed="0..1"))
+        self.module[1].eps.fill_(arguments.number("epsilon", chance, low=0, high=1, allowed="0..1"))
 
 
 class RandomActor(TensorDictModuleBase):
@@ -62,8 +62,8 @@ class RandomActor(TensorDictModuleBase):
 
     def __init__(self, actions: int, *, device: str | torch.device = "cpu", seed: int = 0) -> None:
         super().__init__()
-        self.actions = checks.integer("actions", actions, 1)
-        self.generator = torch.Generator(device_of(device)).manual_seed(checks.seed(seed))
+        self.actions = arguments.integer("actions", actions, 1)
+        self.generator = torch.Generator(device_of(device)).manual_seed(arguments.seed(seed))
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Writes "action", int64 with the TensorDict's batch size."""

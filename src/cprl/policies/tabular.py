@@ -12,7 +12,7 @@ from tensordict.nn import TensorDictModuleBase
 from torch import Tensor, nn
 from torchrl.envs.utils import ExplorationType, exploration_type
 
-from cprl.commons import checks
+from cprl import arguments
 from cprl.policies.rng import MOST_LANES, LaneRng, check_lanes
 from cprl.spaces import Spaces
 
@@ -36,9 +36,9 @@ class QTables:
     """
 
     def __init__(self, lanes: int, actions: int, *, max_states: int) -> None:
-        lanes = checks.integer("lanes", lanes, 1, MOST_LANES)
-        actions = checks.integer("actions", actions, 1, MOST_ACTIONS)
-        self.max_states = checks.integer("max_states", max_states, 1)
+        lanes = arguments.integer("lanes", lanes, 1, MOST_LANES)
+        actions = arguments.integer("actions", actions, 1, MOST_ACTIONS)
+        self.max_states = arguments.integer("max_states", max_states, 1)
         self.rows: list[dict[bytes, int]] = [{} for _ in range(lanes)]
         """For each lane, the row of each state it has met."""
         self.values = np.zeros((_FIRST_ROWS, actions), np.float64)
@@ -155,11 +155,11 @@ class TableNetwork(nn.Module):
 
     def __init__(self, observation_shape: Sequence[int], actions: int) -> None:
         super().__init__()
-        lengths = checks.listed(
+        lengths = arguments.listed(
             "observation_shape", observation_shape, "the lengths of an observation's axes"
         )
-        observation_shape = [checks.integer("observation_shape", own, 1, 2**31 - 1) for own in lengths]
-        actions = checks.integer("actions", actions, 1, MOST_ACTIONS)
+        observation_shape = [arguments.integer("observation_shape", own, 1, 2**31 - 1) for own in lengths]
+        actions = arguments.integer("actions", actions, 1, MOST_ACTIONS)
         self.observation_dims = len(observation_shape)
         self.register_buffer("states", torch.zeros((0, prod(observation_shape)), dtype=torch.uint8))
         self.register_buffer("values", torch.zeros((0, actions), dtype=torch.float64))
@@ -214,7 +214,7 @@ class TabularActor(TensorDictModuleBase):
         self, tables: QTables, spaces: Spaces, *, seeds: Sequence[Sequence[int]], agents: int, worlds: int = 1
     ) -> None:
         super().__init__()
-        checks.instance("spaces", spaces, Spaces, "a cprl.spaces.Spaces")
+        arguments.object_of("spaces", spaces, Spaces, "a cprl.spaces.Spaces")
         self.in_keys = observed_entries(spaces)
         self.tables, self.actions, self.epsilon = tables, spaces.actions, 1.0
         self.agents, self.worlds, self.replicas = check_lanes(seeds, agents=agents, worlds=worlds)

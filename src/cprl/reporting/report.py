@@ -15,8 +15,8 @@ import numpy as np
 import pyarrow.parquet as pq
 from matplotlib.figure import Figure
 
-from cprl import checks
-from cprl.checks import listed
+from cprl import arguments
+from cprl.arguments import objects
 from cprl.measuring.published import PHASES_BEGIN, SMOOTHED_EPISODES, agreement, curve
 from cprl.measuring.statistics import curve_interval, estimate
 from cprl.reporting.claims import measures
@@ -50,9 +50,9 @@ def write_report(runs: Sequence[Path], out: Path) -> Path:
         ValueError: If a path has no run.
         FileNotFoundError: If a run has no episodes or has not ended.
     """
-    folders = listed("runs", runs, (str, os.PathLike), "paths")
-    out = checks.path("out", out)
-    results = [read_result(checks.path("runs", path)) for path in folders]
+    folders = objects("runs", runs, (str, os.PathLike), "paths")
+    out = arguments.path("out", out)
+    results = [read_result(arguments.path("runs", path)) for path in folders]
     (out / "figures").mkdir(parents=True, exist_ok=True)
     lines = [
         "# Tables and figures",

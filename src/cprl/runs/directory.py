@@ -12,8 +12,9 @@ from itertools import count
 from pathlib import Path
 from typing import Any, Final
 
-from cprl.checks import TEXT, callable_of, checked, shown, texts
-from cprl.checks import path as path_of
+from cprl.arguments import callable_of, texts
+from cprl.arguments import path as path_of
+from cprl.checks import TEXT, checked, shown
 from cprl.config import custom_targets, differences
 from cprl.runs.files import read_json, write_json
 from cprl.runs.lock import FILE_NAME as LOCK_NAME

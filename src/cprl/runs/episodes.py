@@ -16,7 +16,7 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 from tensordict import TensorDictBase
 
-from cprl.checks import path as path_of
+from cprl.arguments import path as path_of
 from cprl.measuring import Episode, social
 from cprl.measuring.reported import FIELDS, left_out
 from cprl.runs.files import refuse_special

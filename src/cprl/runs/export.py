@@ -5,7 +5,7 @@ from pathlib import Path
 import pyarrow as pa
 import pyarrow.parquet as pq
 
-from cprl.checks import path as path_of
+from cprl.arguments import path as path_of
 from cprl.runs.directory import read_recipe
 from cprl.runs.episodes import FILE_NAME, read_episodes, read_table
 from cprl.runs.manifest import verify, write_listed

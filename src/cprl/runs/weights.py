@@ -9,8 +9,9 @@ from tensordict import TensorDictBase
 from torch import nn
 from torchrl.record.loggers import Logger
 
-from cprl.checks import TEXT, callable_of, checked, count, object_of, shown
-from cprl.checks import path as path_of
+from cprl.arguments import callable_of, object_of
+from cprl.arguments import path as path_of
+from cprl.checks import TEXT, checked, count, shown
 from cprl.envs.commons_env import CommonsEnv
 from cprl.measuring.episodes import Episode
 from cprl.measuring.evaluate import evaluate, mean_return

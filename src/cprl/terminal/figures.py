@@ -5,7 +5,8 @@ from pathlib import Path
 import numpy as np
 from matplotlib.figure import Figure
 
-from cprl.checks import TEXT, checked, count, listed, path
+from cprl.arguments import objects, path
+from cprl.checks import TEXT, checked, count
 from cprl.measuring.episodes import Episode
 from cprl.measuring.evaluate import mean_return
 from cprl.measuring.published import SMOOTHED_EPISODES
@@ -31,7 +32,7 @@ def training_curve(
     run = path("run", run)
     checked("title", title, TEXT)
     checked("smoothed", smoothed, count(1))
-    random = None if random is None else list(listed("random", random, Episode, "an Episode"))
+    random = None if random is None else list(objects("random", random, Episode, "an Episode"))
     rows = read_episodes(run)
     has_harvest = "harvest" in rows.column_names
     table = rows.select(["replica", "episode", "return"]).to_pydict()

@@ -9,7 +9,8 @@ from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 from tensordict import TensorDictBase
 
-from cprl.checks import checked, count, object_of
+from cprl.arguments import object_of
+from cprl.checks import checked, count
 from cprl.measuring.episodes import Episode
 from cprl.output import console as safe_console
 

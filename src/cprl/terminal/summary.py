@@ -9,7 +9,8 @@ from typing import Final
 from rich.console import Console
 from rich.table import Table
 
-from cprl.checks import TEXT, checked, listed, object_of, path
+from cprl.arguments import object_of, objects, path
+from cprl.checks import TEXT, checked
 from cprl.measuring.episodes import Episode
 from cprl.measuring.evaluate import mean_return
 from cprl.measuring.replicas import social_metrics
@@ -51,7 +52,7 @@ def summarise(
     checked("title", title, TEXT)
     object_of("played", played, Mapping, "episodes by the name of the policy, at least one")
     for name, episodes in played.items():
-        if not listed(f"played[{name!r}]", episodes, Episode, "an Episode"):
+        if not objects(f"played[{name!r}]", episodes, Episode, "an Episode"):
             raise ValueError(f"played[{name!r}] is empty; allowed: at least one episode")
     if not played:
         raise ValueError("played is empty; allowed: the episodes of at least one policy")

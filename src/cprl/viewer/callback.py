@@ -15,8 +15,9 @@ from tensordict import TensorDictBase
 from torchrl.envs import EnvBase
 
 from cprl import keys
-from cprl.checks import TEXT, checked, count, object_of
-from cprl.checks import path as path_of
+from cprl.arguments import object_of
+from cprl.arguments import path as path_of
+from cprl.checks import TEXT, checked, count
 from cprl.envs.unwrap import agent_names, commons_of
 from cprl.measuring import phases
 from cprl.measuring.episodes import Episode

@@ -12,8 +12,9 @@ from rich.console import Console
 from torch import Tensor
 from torchrl.record.loggers import Logger
 
-from cprl.checks import NONE, TEXT, checked, either, object_of
-from cprl.checks import path as path_of
+from cprl.arguments import object_of
+from cprl.arguments import path as path_of
+from cprl.checks import NONE, TEXT, checked, either
 from cprl.output import console as safe_console
 from cprl.viewer.blueprint import layout
 from cprl.viewer.scenery import Curves, Scene, classes, lines, phase_states

@@ -4,7 +4,7 @@ from collections.abc import Iterable
 from dataclasses import dataclass
 from typing import Any, Final
 
-from cprl.commons.checks import as_integer, integer, listed, refusal
+from cprl.arguments import as_integer, integer, listed, refusal
 from cprl.commons.world import DOWN, LEFT, RIGHT, UP
 
 Cell = tuple[int, int]

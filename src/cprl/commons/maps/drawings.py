@@ -8,7 +8,7 @@ from inspect import cleandoc
 from itertools import chain
 from typing import Final
 
-from cprl.commons.checks import choice, instance
+from cprl.arguments import choice, object_of
 from cprl.commons.maps.board import GROUND, HEADING_OF_SIGN, SITE, WALL, Map, Start
 from cprl.commons.world import DOWN, RIGHT
 
@@ -22,7 +22,7 @@ def parse(drawing: str) -> Map:
         ValueError: If rows differ in length, a sign is unknown, or there is no site or no agent; the message
             names the row and column.
     """
-    instance("drawing", drawing, str, "text, a row of signs per line")
+    object_of("drawing", drawing, str, "text, a row of signs per line")
     rows = [row.rstrip() for row in cleandoc(drawing).splitlines()]
     if not rows:
         raise ValueError("the drawing is empty; allowed: at least one row of signs")

@@ -8,7 +8,7 @@ from typing import Final, Literal, get_args
 
 import numpy as np
 
-from cprl.commons import checks
+from cprl import arguments
 from cprl.commons.maps.board import (
     LARGEST_BOARD_CELLS,
     LONGEST_SIDE_CELLS,
@@ -99,8 +99,8 @@ def rooms(entrances: Entrances = "single", *, agents: int = 12) -> Map:
     Raises:
         ValueError: If `entrances` or `agents` is not allowed.
     """
-    checks.choice("entrances", entrances, get_args(Entrances))
-    agents = checks.integer("agents", agents, 1, 2 * len(_NORTH_STARTS))
+    arguments.choice("entrances", entrances, get_args(Entrances))
+    agents = arguments.integer("agents", agents, 1, 2 * len(_NORTH_STARTS))
     centres: tuple[Cell, ...] = _CENTRES
     if entrances == "unequal":
         in_corner = {(row, col) for row, col in _CENTRES if row < 7 and col < 24}
@@ -163,13 +163,13 @@ def random(
     Raises:
         ValueError: If an argument is out of range, or sites and agents do not fit on the board.
     """
-    height = checks.integer("height", height, 1, LONGEST_SIDE_CELLS)
-    width = checks.integer("width", width, 1, LONGEST_SIDE_CELLS)
+    height = arguments.integer("height", height, 1, LONGEST_SIDE_CELLS)
+    width = arguments.integer("width", width, 1, LONGEST_SIDE_CELLS)
     check_cells("the board", height, width)
-    agents = checks.integer("agents", agents, 1, LARGEST_BOARD_CELLS)
-    density = checks.number("density", density, low=0, high=1, above=True, allowed="above 0, at most 1")
-    clustering = checks.number("clustering", clustering, low=0, high=1, allowed="0..1")
-    rng = np.random.default_rng(checks.seed(seed))
+    agents = arguments.integer("agents", agents, 1, LARGEST_BOARD_CELLS)
+    density = arguments.number("density", density, low=0, high=1, above=True, allowed="above 0, at most 1")
+    clustering = arguments.number("clustering", clustering, low=0, high=1, allowed="0..1")
+    rng = np.random.default_rng(arguments.seed(seed))
     cells = height * width
     count = max(1, round(density * cells))
     if count + agents > cells:

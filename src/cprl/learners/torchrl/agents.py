@@ -9,7 +9,7 @@ from tensordict import TensorDict, TensorDictBase
 from torch import Tensor, nn
 from torchrl.data.replay_buffers import Sampler
 
-from cprl.checks import callable_of, object_of
+from cprl.arguments import callable_of, object_of
 from cprl.learners.engine.base import is_finite
 from cprl.learners.engine.functional import MakeLoss, own_targets, total
 from cprl.learners.lanes import SAMPLING, WEIGHTS, Lanes

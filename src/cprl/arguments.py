@@ -1,27 +1,20 @@
-"""Checks of arguments, with messages of one form: "x is ...; allowed: ..."."""
+"""Checks of single arguments, with the messages of `cprl.checks`: "x is ...; allowed: ...".
 
-from collections.abc import Iterable, Sequence
-from math import isfinite
-from numbers import Real
+Each raises a ValueError for what does not fit; none rounds.
+"""
+
+import os
+from collections.abc import Iterable, Mapping, Sequence
 from operator import index
+from pathlib import Path
 from typing import Any, Final
 
 import numpy as np
-import psutil
 from numpy.typing import NDArray
 
+from cprl.checks import TEXT, checked, is_number, plain, shown, tuple_of
+
 HIGHEST_SEED: Final = 2**64 - 1
-_LONGEST: Final = 120
-"""The largest number of characters of a value in a message."""
-
-
-def shown(value: object) -> str:
-    """A value as text for a message, shortened where it is long."""
-    try:
-        text = repr(value)
-    except Exception:  # e.g. an integer of more digits than Python prints
-        return f"a {type(value).__name__}"
-    return text if len(text) <= _LONGEST else f"{text[:_LONGEST]}... ({type(value).__name__})"
 
 
 def refusal(name: str, value: object, allowed: str) -> ValueError:
@@ -61,21 +54,16 @@ def seed(value: Any, name: str = "seed") -> int:
     return integer(name, value, 0, HIGHEST_SEED, allowed="an integer from 0 to 2**64 - 1")
 
 
-def is_number(value: Any, low: float, high: float) -> bool:
-    """Whether a value is a finite real number from `low` to `high`."""
-    real = isinstance(value, Real) and not isinstance(value, bool)
-    return real and low <= value <= high and isfinite(value)
-
-
 def number(name: str, value: Any, *, low: float, high: float, above: bool = False, allowed: str) -> float:
     """A finite number from `low` to `high`; `above`: without `low` itself.
 
     Raises:
         ValueError: For anything else.
     """
-    if not is_number(value, low, high) or (above and value <= low):
+    found = plain(value)
+    if not is_number(found, low, high) or (above and found <= low):
         raise refusal(name, value, allowed)
-    return float(value)
+    return float(found)
 
 
 def choice(name: str, value: Any, allowed: Iterable[str]) -> None:
@@ -91,8 +79,8 @@ def switch(name: str, value: Any) -> None:
         raise refusal(name, value, "True or False")
 
 
-def instance(name: str, value: Any, kind: type | tuple[type, ...], allowed: str) -> None:
-    """Raises a ValueError unless a value has the type."""
+def object_of(name: str, value: Any, kind: Any, allowed: str) -> None:
+    """Raises a ValueError unless a value is an instance of a class, or of one of several."""
     if not isinstance(value, kind):
         raise refusal(name, value, allowed)
 
@@ -134,20 +122,30 @@ def floats(name: str, values: Any) -> NDArray[np.float64]:
     raise refusal(name, values, "an array of numbers")
 
 
-def memory(what: str, needed: int, *, free: int | None = None, advice: str) -> None:
-    """Checks memory before it is allocated.
+def path(name: str, value: Any) -> Path:
+    """A text or another path as a `Path`; raises a ValueError for anything else, and for a text with NUL."""
+    if not isinstance(value, str | os.PathLike) or "\0" in os.fspath(value):
+        raise refusal(name, value, "a path, without NUL")
+    return Path(value)
 
-    Args:
-        what: What takes the memory, e.g. "worlds is 1,000,000; their arrays".
-        needed: Bytes.
-        free: Bytes that are free; None for those of this machine's main memory.
-        advice: What to change.
 
-    Raises:
-        MemoryError: If there is too little.
-    """
-    free = psutil.virtual_memory().available if free is None else free
-    if needed > free:
-        raise MemoryError(
-            f"{what} take {needed / 2**30:.2f} GiB; {free / 2**30:.2f} GiB are free; allowed: {advice}"
-        )
+def texts(name: str, value: Any, at_least: int = 0) -> tuple[str, ...]:
+    """Texts, at least so many; raises a ValueError for anything else, a single text included."""
+    found: tuple[str, ...] = checked(name, value, tuple_of(TEXT, at_least))
+    return found
+
+
+def callable_of(name: str, value: Any, allowed: str) -> None:
+    """Raises a ValueError for what cannot be called."""
+    if not callable(value):
+        raise refusal(name, value, allowed)
+
+
+def objects(name: str, value: Any, kind: Any, allowed: str) -> tuple[Any, ...]:
+    """The objects of a list or tuple, each an instance of a class; raises a ValueError for anything else."""
+    if not isinstance(value, Iterable) or isinstance(value, str | bytes | Mapping):
+        raise refusal(name, value, f"a list of {allowed}")
+    found = tuple(value)
+    for place, own in enumerate(found):
+        object_of(f"{name}[{place}]", own, kind, allowed)
+    return found
