@@ -2,7 +2,8 @@
 
 Two processes train the same experiment, `commons` with four DQN agents and two replicas, without an end.
 They take turns: while one runs the other is stopped by SIGSTOP. Every few seconds of their running a row is
-added to a CSV: steps, CPU seconds, memory, file descriptors, threads, bytes of the recording.
+added to a CSV: steps, CPU seconds, memory, file descriptors, threads, bytes of the recording. The memory that
+is judged is the anonymous one: what of a library's file is in memory depends on other processes.
 
 What the served recording keeps for viewers that come later, up to `cprl.viewer.streams.SERVER_MEMORY`, is
 history and no leak. Here that limit is 4 MB instead of 512 MB, so that the history is full within the
@@ -201,10 +202,10 @@ def verdict(out: Path) -> Table:
 
     add("minutes of running", [f"{own['ran_s'][-1] / 60:.0f}" for own in of.values()])
     add("steps of each replica", [f"{own['steps'][-1]:,.0f}" for own in of.values()])
-    level = {who: own["uss"][late[who]][0] for who, own in of.items()}
-    add("memory after the warm-up, MB", [f"{level[who] / 1e6:.1f}" for who in of])
-    add("memory at the end, MB", [f"{own['uss'][-1] / 1e6:.1f}" for own in of.values()])
-    grown = {who: growth(own, "uss") for who, own in of.items()}
+    level = {who: own["anonymous"][late[who]][0] for who, own in of.items()}
+    add("anonymous memory after the warm-up, MB", [f"{level[who] / 1e6:.1f}" for who in of])
+    add("anonymous memory at the end, MB", [f"{own['anonymous'][-1] / 1e6:.1f}" for own in of.values()])
+    grown = {who: growth(own, "anonymous") for who, own in of.items()}
     add("growth per 100,000 steps, MB", [f"{grown[who] / 1e6:+.2f}" for who in of])
     add("growth per 100,000 steps", [f"{grown[who] / level[who]:+.2%}" for who in of], "< 1 %")
     add("recording, MB", [f"{own['recording'][-1] / 1e6:.1f}" for own in of.values()])
@@ -226,7 +227,7 @@ def draw(out: Path, figure: Path) -> None:
     memory, files, rate = drawn.subplots(3, sharex=True)
     for (who, own), colour in zip(of.items(), ("#08519c", "#e6550d"), strict=True):
         steps = own["steps"] / 1000
-        memory.plot(steps, own["uss"] / 1e6, color=colour, label=f"{who}: memory of its own")
+        memory.plot(steps, own["anonymous"] / 1e6, color=colour, label=f"{who}: anonymous memory")
         files.plot(steps, own["files"], color=colour, label=f"{who}: file descriptors")
         files.plot(steps, own["threads"], color=colour, linestyle="--", label=f"{who}: threads")
         near = np.arange(12, len(steps), 12)

@@ -33,6 +33,7 @@ from cprl.learners.transitions import transitions_of
 from cprl.measuring.episodes import EpisodeTracker
 from cprl.measuring.evaluate import evaluate
 from cprl.networks.mlp import MLPNetwork
+from cprl.output import say
 from cprl.policies.assignment import AgentPolicies
 from cprl.policies.single import RandomActor
 from cprl.population import Learning
@@ -125,7 +126,7 @@ def main(
         played[f"greedy, best (episode {best.best_episode})"] = evaluate(fresh, policy)
     figure = training_curve(run, title=title, random=played["random"])
     summarise(run, title=title, played=played, figure=figure)
-    print(f"This was a shortened schedule. The published one, with 8 replicas: {PUBLISHED_LINE}")
+    say(f"This was a shortened schedule. The published one, with 8 replicas: {PUBLISHED_LINE}")
     return run
 
 

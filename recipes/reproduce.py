@@ -18,6 +18,7 @@ from typing import Literal
 import tyro
 
 from cprl.commandline import in_a_sentence
+from cprl.output import say
 from cprl.process import prepare_process
 from cprl.reporting import write_report
 from cprl.runs.export import export_results
@@ -82,14 +83,14 @@ def run(name: str, common: Sequence[str], *, runs: Path, results: Path) -> None:
         command = [sys.executable, str(Path(__file__).with_name(f"{recipe}.py")), *arguments, *common]
         command += ["--no-keep-checkpoint", "--out", str(directory)]
         command += ["--resume"] if (directory / "recipe.json").exists() else []
-        print(f"{name}: see {log}", flush=True)
+        say(f"{name}: see {log}")
         with open(log, "a") as told:
             done = subprocess.run(command, stdout=told, stderr=subprocess.STDOUT, check=False)
         if done.returncode or not (directory / "report.json").exists():
             raise RuntimeError(f"{name} ended with {done.returncode} before it was finished; see {log}")
-    print(f"{name}: {export_results(directory, results / name)}", flush=True)
+    say(f"{name}: {export_results(directory, results / name)}")
 
 
 if __name__ == "__main__":
     with in_a_sentence("reproduce.py"):
-        print(tyro.cli(main))
+        say(tyro.cli(main))

@@ -265,6 +265,18 @@ def test_the_live_recording_is_served_on_this_machine(tmp_path):
     assert column(tmp_path / "run.rrd", "social/equality", "Scalars:scalars")[1] == [[1.0]]
 
 
+def test_rows_that_another_client_adds_to_the_live_view_do_not_reach_the_file(tmp_path):
+    with RerunLogger("run", tmp_path, live="serve", recording_id="one") as logger:
+        other = rr.RecordingStream("cprl", recording_id="one", send_properties=False)
+        other.connect_grpc(logger.addresses["native"].split()[-1])
+        times = [rr.TimeColumn("step", sequence=np.arange(3))]
+        other.send_columns("return", times, rr.Scalars.columns(scalars=np.zeros(3)))
+        other.flush(timeout_sec=5)
+        logger.log_scalar("return", 7.0)
+        other.disconnect()
+    assert column(tmp_path / "run.rrd", "return", "Scalars:scalars")[1] == [[7.0]]
+
+
 class Broken:
     """A stream whose disk is full."""
 

@@ -7,7 +7,10 @@ import sys
 import threading
 import time
 from pathlib import Path
+from urllib.parse import urlsplit
 
+import numpy as np
+import psutil
 import pytest
 from test_rerun_logger import column
 from test_watch import VIEWER, Doing, course, receiving
@@ -15,6 +18,7 @@ from test_watch import VIEWER, Doing, course, receiving
 from cprl.viewer import deadline
 from cprl.viewer.deadline import Sender, within
 from cprl.viewer.logger import RerunLogger
+from cprl.viewer.streams import _free_port
 
 HERE = Path(__file__).parent
 LISTENS = """
@@ -106,35 +110,39 @@ def test_a_viewer_that_never_answers_harms_neither_the_training_nor_the_file(
     assert episodes == list(range(8)), "the file has it all"
 
 
-def process_with(address, folder, *, closes, timeout):
-    """A process of its own that logs to a viewer and ends; its seconds, and what it says."""
+def process_with(address, folder, *, closes):
+    """A process of its own that logs to a viewer and ends; its seconds without imports, and what it says."""
     script = f"""
-import sys; sys.path.insert(0, {str(HERE)!r})
+import atexit, sys, time
+started = time.monotonic()
+atexit.register(lambda: print(time.monotonic() - started, flush=True))
 from pathlib import Path
 import numpy as np
 from cprl.viewer.logger import RerunLogger
+from cprl.viewer.streams import _free_port
+started = time.monotonic()
 logger = RerunLogger("run", Path({str(folder)!r}), live={address!r})
 for step in range(20):
     logger.at(step=step, episode=step)
     logger.log_matrix("m", np.zeros((300, 300)), ("a", "b"))
 if {closes}: logger.close()
-print("the end", flush=True)
 """
-    started = time.monotonic()
     ended = subprocess.run(
-        [sys.executable, "-c", script], capture_output=True, text=True, timeout=timeout, check=False
+        [sys.executable, "-c", script], capture_output=True, text=True, timeout=90, check=True
     )
-    assert ended.returncode == 0, ended.stderr
-    assert "the end" in ended.stdout
-    return time.monotonic() - started, ended.stderr
+    return float(ended.stdout.splitlines()[-1]), ended.stderr
+
+
+IN_ALL_S = deadline.CONNECT_S + deadline.CLOSE_S + deadline.STALL_S + 1
+"""The most that a viewer may cost a process."""
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("closes", [True, False])
 @pytest.mark.parametrize("reads", [0, 5_000, 1_000_000])
 def test_a_process_ends_in_time_though_its_viewer_never_answers(reads, closes, stalling, tmp_path):
-    spent, told = process_with(f"connect {stalling(reads)}", tmp_path, closes=closes, timeout=60)
-    assert spent < 20
+    spent, told = process_with(f"connect {stalling(reads)}", tmp_path, closes=closes)
+    assert spent < IN_ALL_S
     if closes:
         assert told.count("the run continues without it") == 1
 
@@ -144,9 +152,9 @@ def test_a_process_ends_in_time_though_its_viewer_never_answers(reads, closes, s
 def test_a_process_ends_in_time_though_its_viewer_was_stopped_before(closes, tmp_path):
     with receiving() as (process, address):
         os.kill(process.pid, signal.SIGSTOP)
-        spent, told = process_with(f"connect {address}", tmp_path, closes=closes, timeout=60)
+        spent, told = process_with(f"connect {address}", tmp_path, closes=closes)
         os.kill(process.pid, signal.SIGCONT)
-    assert spent < 20
+    assert spent < IN_ALL_S
     if closes:
         assert told.count("the run continues without it") == 1
 
@@ -167,19 +175,22 @@ def test_a_viewer_that_is_stopped_half_way_changes_nothing(tmp_path, recwarn):
 
 @pytest.mark.slow
 def test_a_served_recording_does_not_wait_for_a_viewer_that_stands_still(tmp_path):
-    """A relay of Rerun's own connects to the server as a viewer does, and is stopped."""
+    """Rerun's own receiver connects as a viewer does, and is stopped."""
     logger = RerunLogger("run", tmp_path, live="serve")
     address = logger.addresses["native"].split()[-1]
     viewer = subprocess.Popen(
-        [VIEWER, "--headless", "--bind", "127.0.0.1", "--port", "0", "--connect", address],
+        [VIEWER, address, "--save", tmp_path / "got.rrd", "--bind", "127.0.0.1", "--port", str(_free_port())],
         stdout=subprocess.DEVNULL,
         stderr=subprocess.DEVNULL,
     )
     try:
-        time.sleep(3)
+        ports = set()
+        while urlsplit(address).port not in ports:  # until it is connected
+            time.sleep(0.2)
+            connections = psutil.Process(viewer.pid).net_connections()
+            ports = {own.raddr.port for own in connections if own.status == psutil.CONN_ESTABLISHED}
+        time.sleep(1)
         os.kill(viewer.pid, signal.SIGSTOP)
-        import numpy as np
-
         slowest, random = 0.0, np.random.default_rng(0)
         for step in range(700):  # 700 MB: more than the server and its connections hold
             logger.at(step=step, episode=step)
@@ -187,7 +198,8 @@ def test_a_served_recording_does_not_wait_for_a_viewer_that_stands_still(tmp_pat
             logger.log_matrix("m", random.random((500, 500), np.float32), ("a", "b"))
             slowest = max(slowest, time.monotonic() - started)
         started = time.monotonic()
-        logger.close()
+        with pytest.warns(RuntimeWarning, match="live view failed, the run continues without it"):
+            logger.close()
         assert slowest < deadline.STALL_S + 1
         assert time.monotonic() - started < deadline.CLOSE_S + 1
     finally:
