@@ -112,7 +112,7 @@ def test_it_is_refused_in_one_sentence(call, message):
 
 def test_worlds_that_do_not_fit_into_memory_are_refused_before_they_are_allocated():
     for make in (Batch, CommonsEnv):
-        with pytest.raises(MemoryError, match=r"worlds is 4,000,000,000: .* GiB are free; allowed: fewer"):
+        with pytest.raises(MemoryError, match=r"worlds is 4,000,000,000: .* GiB are free: use fewer"):
             make(GAME, 4_000_000_000)
     with pytest.raises(MemoryError, match="worlds is 4,000,000,000: the histories"):
         EpisodeTracker(4_000_000_000, 4)
