@@ -34,7 +34,7 @@ from scipy.stats import theilslopes
 from cprl.output import console
 
 RECORDED, TWIN = "recorded", "twin"
-TURN_S: Final = {RECORDED: 90.0, TWIN: 30.0}
+TURN_S: Final = {RECORDED: 120.0, TWIN: 15.0}
 """Seconds for which each runs before the other does."""
 START_S: Final = 60.0
 """Seconds for each to begin."""

@@ -90,7 +90,14 @@ def in_a_sentence(program: str) -> Iterator[None]:
         notes = getattr(error, "__notes__", [])
         if notes and not isinstance(error, OSError | MemoryError | NotFiniteError):
             raise
-        sys.exit("\n".join([f"{program}: {error}", *notes]))
+        if isinstance(error, BrokenPipeError) and not notes:  # `--help | head`: its reader has seen enough
+            sys.exit(0)
+        sys.exit("\n".join([_shortened(f"{program}: {error}"), *notes]))
+
+
+def _shortened(text: str) -> str:
+    """A message without its middle where it is longer than a screen, e.g. because it names a file."""
+    return text if len(text) <= _LONGEST else f"{text[: _LONGEST // 2]} ... {text[-_LONGEST // 2 :]}"
 
 
 def parse(
@@ -126,6 +133,7 @@ def parse(
     return experiment, options
 
 
+_LONGEST: Final = 1500
 _OPTIONS: Final = RunOptions()
 _CONFIG: Final = (tyro.conf.HelptextFromCommentsOff,)
 
