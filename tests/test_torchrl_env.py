@@ -290,7 +290,7 @@ def test_devices_that_are_not_there_are_refused():
 
 @pytest.mark.skipif(torch.cuda.is_available(), reason="there is a GPU")
 def test_without_a_gpu_the_device_cuda_is_refused():
-    with pytest.raises(RuntimeError, match='device is "cuda"; allowed: "cpu", because torch finds no GPU'):
+    with pytest.raises(ValueError, match='device is "cuda"; allowed: "cpu", because torch finds no GPU'):
         CommonsEnv(SHORT, device="cuda")
 
 

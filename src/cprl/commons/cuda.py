@@ -39,13 +39,13 @@ class CudaThreads:
         worlds: The number of worlds B.
 
     Raises:
-        RuntimeError: If Numba finds no GPU.
+        ValueError: If Numba finds no GPU.
         MemoryError: If the worlds do not fit into its memory.
     """
 
     def __init__(self, game: Game, worlds: int) -> None:
         if not cuda.is_available():
-            raise RuntimeError(
+            raise ValueError(
                 "Numba finds no GPU; it needs NVIDIA's driver and the package numba-cuda "
                 "(install cprl[cuda12] or cprl[cuda13])"
             )

@@ -59,7 +59,7 @@ class CommonsEnv(LeanStepEnv):
         ValueError: if an argument is not allowed, and, in `step`, for actions that are missing, unknown or
             of another form (int64 [B, N]; other integers are converted); then nothing changes.
         MemoryError: if the worlds do not fit into memory.
-        RuntimeError: for the device "cuda" if Numba finds no GPU.
+        ValueError: for the device "cuda" if torch or Numba finds no GPU.
     """
 
     batch_locked = True

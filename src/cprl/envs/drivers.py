@@ -48,7 +48,7 @@ def driver_for(
     if threads is not None:
         raise arguments.refusal("threads", threads, "None on a GPU, where each world has its own thread")
     if not torch.cuda.is_available():
-        raise RuntimeError(f'device is "{device}"; allowed: "cpu", because torch finds no GPU')
+        raise ValueError(f'device is "{device}"; allowed: "cpu", because torch finds no GPU')
     from cprl.commons.cuda import CudaThreads
 
     driver = CudaThreads(game, worlds)
