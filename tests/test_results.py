@@ -273,7 +273,7 @@ def test_a_directory_that_holds_something_is_refused(tmp_path):
 
 
 def test_a_name_that_is_none_leaves_no_directory(tmp_path):
-    with pytest.raises(ValueError, match="a name without slashes"):
+    with pytest.raises(ValueError, match="the name of a directory, without slashes"):
         start_run(tmp_path / "run", "../tragedy", recipe)
     assert list(tmp_path.iterdir()) == []
 

@@ -12,6 +12,8 @@ from typing import Final, TextIO, cast
 
 from rich.console import Console
 
+from cprl.checks import shown
+
 PLAIN: Final = str.maketrans(
     {"±": "+-", "\u00d7": "x", "…": "...", "\u2013": "-", "\u2014": "-", "\u2212": "-"}
 )
@@ -109,9 +111,16 @@ def console(output: Output = OUT, *, width: int | None = None) -> Console:
 
 
 def say(*what: object) -> None:
-    """Prints a line, like `print`."""
-    OUT.write(" ".join(map(str, what)) + "\n")
+    """Prints a line, like `print`; what cannot be a text is shown by its class."""
+    OUT.write(" ".join(map(_text, what)) + "\n")
     OUT.flush()
+
+
+def _text(value: object) -> str:
+    try:
+        return str(value)
+    except Exception:  # of whatever kind a user's object raises; one that holds itself, a RecursionError
+        return shown(value)
 
 
 @cache
