@@ -54,7 +54,9 @@ def in_one_go(tmp_path_factory):
     return run
 
 
-@pytest.mark.parametrize("engine", ["lane_axis", "vmapped", pytest.param("list", marks=pytest.mark.slow)])
+@pytest.mark.parametrize(
+    "engine", ["lane_axis", *(pytest.param(name, marks=pytest.mark.slow) for name in ("vmapped", "list"))]
+)
 def test_a_training_that_was_ended_goes_on_bit_for_bit(engine, tmp_path):
     whole, parts = tmp_path / "whole", tmp_path / "parts"
     train_and_die.main(whole, every_s=1000, episodes=12, engine=engine)

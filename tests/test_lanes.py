@@ -112,7 +112,7 @@ def in_order(update, lane):
 @pytest.mark.parametrize(
     "dtype", [torch.float64, pytest.param(torch.float32, marks=pytest.mark.slow)], ids=str
 )
-@pytest.mark.parametrize("engine", ["vmapped", "lane_axis"])
+@pytest.mark.parametrize("engine", [pytest.param("vmapped", marks=pytest.mark.slow), "lane_axis"])
 def test_both_fast_engines_end_where_a_list_of_torchrl_losses_ends(engine, dtype):
     lanes = [0, 1, 2, 3, 4]
     reference, losses = trained(ListEngine, lanes, dtype=dtype)
@@ -146,7 +146,7 @@ def test_every_compiled_engine_in_both_precisions(engine, dtype):
     "dtype", [torch.float64, pytest.param(torch.float32, marks=pytest.mark.slow)], ids=str
 )
 @pytest.mark.parametrize(
-    "engine", [pytest.param(name, marks=[pytest.mark.slow] * (name == "list")) for name in ENGINES]
+    "engine", [pytest.param(name, marks=[pytest.mark.slow] * (name != "lane_axis")) for name in ENGINES]
 )
 def test_a_lanes_course_does_not_change_when_other_lanes_are_added(engine, dtype):
     many, losses = trained(ENGINES[engine], [3, 0, 1, 2, 5], dtype=dtype)

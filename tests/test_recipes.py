@@ -66,7 +66,7 @@ LANES = {"single_basic": 1, "single_complex": 1, "two_complex": 2, "two_against_
 @pytest.mark.parametrize(
     ("name", "variant"),
     [
-        pytest.param(name, variant, marks=[pytest.mark.slow] * (variant == "as_run" and name != "commons"))
+        pytest.param(name, variant, marks=[pytest.mark.slow] * (variant == "as_run"))
         for name in LANES
         for variant in presets.VARIANTS
     ],
@@ -111,8 +111,8 @@ def test_two_agents_without_the_beam_never_fire(tmp_path):
 @pytest.mark.parametrize(
     "loss",
     [
-        *["sac", "iql", "ppo"],
-        *(pytest.param(name, marks=pytest.mark.slow) for name in ("dqn", "double_dqn", "cql")),
+        "ppo",
+        *(pytest.param(name, marks=pytest.mark.slow) for name in ("dqn", "double_dqn", "cql", "sac", "iql")),
     ],
 )
 def test_swapping_the_loss_is_one_argument_and_each_leaves_a_run_that_plays_again(loss, tmp_path, capsys):

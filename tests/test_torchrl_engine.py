@@ -285,7 +285,7 @@ def leaves(state):
         *(pytest.param(name, 95, marks=[] if name == "PPO" else pytest.mark.slow) for name in RESUMED),
         ("published DQN", 1),
         ("everything of replay", 41),
-        ("PPO", 41),
+        pytest.param("PPO", 41, marks=pytest.mark.slow),
     ],
 )
 def test_a_stopped_learner_continues_bit_for_bit(name, steps):
@@ -344,7 +344,7 @@ def test_a_stopped_training_continues_bit_for_bit_from_what_a_checkpoint_keeps()
                 assert torch.equal(mine, theirs)
 
 
-@pytest.mark.parametrize("name", ["published DQN", "PPO"])
+@pytest.mark.parametrize("name", ["published DQN", pytest.param("PPO", marks=pytest.mark.slow)])
 def test_a_replica_learns_the_same_whichever_others_are_trained_with_it(name):
     algorithm = {**OFF_POLICY, **ON_POLICY}[name]
     together = algorithm.make_learner(SPACES, engine="torchrl", **HOW)
