@@ -6,7 +6,8 @@ process, and counts by its median difference:
 
 - the journal of episodes, with a CRC-32 for each episode, against the same rows without;
 - a checkpoint, which first syncs the journal, against the same without;
-- the search for NaN and infinity, at every episode's end and before every checkpoint, against none.
+- the search for NaN and infinity in all weights, at every episode's end and before every checkpoint, against
+  none.
 
 The sum is given as a share of the time in which they fall due: checkpoints every five minutes, and an episode
 of all replicas every so many seconds as the training itself takes. The checkpoint at the end of a run, from
@@ -137,7 +138,7 @@ def _measure(
 
 def seconds_of_search(training: Training, repeats: int) -> tuple[float, float]:
     """Of one search through the weights of all lanes; without it there is none."""
-    taken, _ = in_turns(training.check_finite, nullcontext, 20 * repeats)
+    taken, _ = in_turns(lambda: training.finite.check_weights(training.steps), nullcontext, 20 * repeats)
     return taken, taken
 
 
