@@ -36,8 +36,9 @@ from cprl.measuring.replicas import agents_without_harvest, social_measures
 from cprl.measuring.reported import FIELDS, METRICS, OPTIONAL, available, left_out, reported_by
 from cprl.policies.assignment import AgentPolicies
 from cprl.policies.single import RandomActor
+from cprl.runs.columns import COLUMNS, LEFT_OUT
 from cprl.runs.curves import curves_of
-from cprl.runs.episodes import COLUMNS, LEFT_OUT, EpisodeTable, as_table, read_episodes
+from cprl.runs.episodes import EpisodeTable, as_table, read_episodes
 from cprl.runs.labelled import labelled
 from cprl.terminal.figures import training_curve
 from cprl.terminal.progress import ProgressBar

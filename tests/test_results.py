@@ -18,8 +18,9 @@ import pytest
 import torch
 
 from cprl.measuring import Episode, social
+from cprl.runs.columns import COLUMNS
 from cprl.runs.directory import start_run
-from cprl.runs.episodes import COLUMNS, EpisodeTable, read_episodes
+from cprl.runs.episodes import EpisodeTable, read_episodes
 
 
 def an_episode(number: int = 0, *, world: int = 0, **metrics: float) -> Episode:

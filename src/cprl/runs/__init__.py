@@ -7,6 +7,7 @@ Modules, in the order in which one reads them:
     lock         at most one process writes a run
     manifest     checksums of results
     journal      rows that are safe as soon as they are written
+    columns      episodes as rows
     episodes     the table of episodes
     labelled     several tables as one
     curves       tables as curves over episodes

@@ -7,9 +7,10 @@ During a run every episode is appended at once to a journal, `episodes.arrows`, 
 import os
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from errno import EIO, ENOENT
+from itertools import pairwise
 from pathlib import Path
 from types import TracebackType
-from typing import Any, BinaryIO, Final, Self
+from typing import BinaryIO, Final, Self
 
 import numpy as np
 import pyarrow as pa
@@ -17,36 +18,13 @@ import pyarrow.parquet as pq
 from tensordict import TensorDictBase
 
 from cprl.arguments import path as path_of
-from cprl.measuring import Episode, social
-from cprl.measuring.reported import FIELDS, left_out
+from cprl.measuring import Episode
+from cprl.runs.columns import rows_of, schema_of, whole_schema
 from cprl.runs.files import refuse_special
 from cprl.runs.journal import Content, Journal, read_journal, write_journal
 from cprl.runs.manifest import verify, write_listed
 
 FILE_NAME: Final = "episodes.parquet"
-
-COLUMNS: Final = {
-    "replica": pa.int32(),
-    "episode": pa.int32(),
-    "agent": pa.int32(),
-    "return": pa.float32(),
-    "harvest": pa.float32(),
-    "steps": pa.int32(),
-    "in_play_steps": pa.int32(),
-    "shots": pa.int32(),
-    "hits": pa.int32(),
-    "tagged": pa.int32(),
-    "stock_left": pa.int32(),
-    "depletion_step": pa.int32(),
-    "terminated": pa.bool_(),
-}
-"""The columns of a table, as in `Episode`; the metrics follow, float64, NaN where undefined.
-
-Values of the whole episode are repeated in the row of each agent. Values that the game does not report have
-no column."""
-
-LEFT_OUT: Final = b"left_out"
-"""The key of the schema's metadata whose value says which columns are left out, and why, if any are."""
 
 _ROWS_PER_GROUP: Final = 2**16
 _EMPTY: Final = Content(None, [], [])
@@ -122,9 +100,9 @@ class EpisodeTable:
             self.load_state_dict({"rows": 0})
         try:
             if self._schema is None:
-                self._begin(_schema_of(episodes[0]))
+                self._begin(schema_of(episodes[0]))
             assert self._schema is not None
-            rows = _rows(episodes, replica, self._schema)
+            rows = rows_of(episodes, replica, self._schema)
             self._file.append(rows)
         except OSError as error:
             kept = f"the {self._rows} earlier rows are in {self.journal}"
@@ -149,7 +127,7 @@ class EpisodeTable:
         if self._is_closed:
             return
         if self._schema is None:
-            self._begin(_schema(COLUMNS, social.METRICS))
+            self._begin(whole_schema())
         self._file.close()
         try:
             name = self.path.relative_to(self._run).as_posix()
@@ -219,61 +197,15 @@ def read_table(path: Path) -> pa.Table:
 
 def as_table(episodes: Sequence[Episode], replica: int) -> pa.Table:
     """At least one episode of a replica as a table with the columns of a run's table."""
-    return pa.Table.from_batches([_rows(episodes, replica, _schema_of(episodes[0]))])
+    return pa.Table.from_batches([rows_of(episodes, replica, schema_of(episodes[0]))])
 
 
 def _journal_of(path: Path) -> Path:
     return path.with_suffix(".arrows")
 
 
-def _schema(columns: Iterable[str], metrics: Iterable[str]) -> pa.Schema:
-    return pa.schema({name: COLUMNS[name] for name in columns} | dict.fromkeys(metrics, pa.float64()))
-
-
-def _schema_of(episode: Episode) -> pa.Schema:
-    """The columns that an episode has; the schema's metadata names those that it lacks."""
-    schema, missing = _schema(_columns_of(episode), episode.metrics), left_out(episode.reported)
-    return schema.with_metadata({LEFT_OUT: missing}) if missing else schema
-
-
-def _columns_of(episode: Episode) -> list[str]:
-    return [name for name in COLUMNS if name not in FIELDS or getattr(episode, name) is not None]
-
-
-def _rows(episodes: Sequence[Episode], replica: int | None, schema: pa.Schema) -> pa.RecordBatch:
-    of_each = [_cells(episode, episode.world if replica is None else replica) for episode in episodes]
-    for cells in of_each:
-        if cells.keys() != set(schema.names):
-            more, lacks = cells.keys() - set(schema.names), set(schema.names) - cells.keys()
-            raise ValueError(
-                f"the episode has the extra columns {sorted(more)} and lacks {sorted(lacks)}; allowed: the "
-                "columns of the table's first episode"
-            )
-    return pa.record_batch(
-        [
-            pa.array(np.concatenate([cells[column.name] for cells in of_each]), column.type)
-            for column in schema
-        ],
-        schema=schema,
-    )
-
-
-def _cells(episode: Episode, replica: int) -> dict[str, Any]:
-    """The values of each column, [N]."""
-    own = {name: getattr(episode, name, None) for name in _columns_of(episode)}
-    agents = np.arange(len(episode.return_))
-    cells: dict[str, Any] = {
-        **own,
-        "replica": replica,
-        "agent": agents,
-        "return": episode.return_,
-        **episode.metrics,
-    }
-    return {name: np.broadcast_to(cell, agents.shape) for name, cell in cells.items()}
-
-
 def _as_table(content: Content) -> pa.Table:
-    schema = _schema(COLUMNS, social.METRICS) if content.schema is None else content.schema
+    schema = whole_schema() if content.schema is None else content.schema
     return pa.Table.from_batches(content.batches, schema)
 
 
@@ -281,10 +213,9 @@ def _reopen(path: Path, journal: Path) -> None:
     """Writes the journal of a finished table again, a batch for each episode."""
     table = read_table(path).combine_chunks()
     firsts = np.flatnonzero(table["agent"].to_numpy() == 0).tolist()
-    ends = [*firsts[1:], table.num_rows]
     episodes = (
         table.slice(first, end - first).combine_chunks().to_batches()[0]
-        for first, end in zip(firsts, ends, strict=True)
+        for first, end in pairwise([*firsts, table.num_rows])
     )
     write_journal(journal, episodes, table.schema)
 

@@ -1,0 +1,94 @@
+"""The columns of a table of episodes, and episodes as rows of it."""
+
+from collections.abc import Iterable, Sequence
+from typing import Any, Final
+
+import numpy as np
+import pyarrow as pa
+
+from cprl.measuring import Episode, social
+from cprl.measuring.reported import FIELDS, left_out
+
+COLUMNS: Final = {
+    "replica": pa.int32(),
+    "episode": pa.int32(),
+    "agent": pa.int32(),
+    "return": pa.float32(),
+    "harvest": pa.float32(),
+    "steps": pa.int32(),
+    "in_play_steps": pa.int32(),
+    "shots": pa.int32(),
+    "hits": pa.int32(),
+    "tagged": pa.int32(),
+    "stock_left": pa.int32(),
+    "depletion_step": pa.int32(),
+    "terminated": pa.bool_(),
+}
+"""The columns of a table, as in `Episode`; the metrics follow, float64, NaN where undefined.
+
+Values of the whole episode are repeated in the row of each agent. Values that the game does not report have
+no column."""
+
+LEFT_OUT: Final = b"left_out"
+"""The key of the schema's metadata whose value says which columns are left out, and why, if any are."""
+
+
+def whole_schema() -> pa.Schema:
+    """All columns and metrics, for a table without an episode."""
+    return _schema(COLUMNS, social.METRICS)
+
+
+def _schema(columns: Iterable[str], metrics: Iterable[str]) -> pa.Schema:
+    return pa.schema({name: COLUMNS[name] for name in columns} | dict.fromkeys(metrics, pa.float64()))
+
+
+def schema_of(episode: Episode) -> pa.Schema:
+    """The columns that an episode has; the schema's metadata names those that it lacks."""
+    schema, missing = _schema(_columns_of(episode), episode.metrics), left_out(episode.reported)
+    return schema.with_metadata({LEFT_OUT: missing}) if missing else schema
+
+
+def _columns_of(episode: Episode) -> list[str]:
+    return [name for name in COLUMNS if name not in FIELDS or getattr(episode, name) is not None]
+
+
+def rows_of(episodes: Sequence[Episode], replica: int | None, schema: pa.Schema) -> pa.RecordBatch:
+    """A row for each episode and agent.
+
+    Args:
+        episodes: at least one.
+        replica: the index of their replica; None for each episode's world.
+        schema: what `schema_of` gave for the first episode of the table.
+
+    Raises:
+        ValueError: if an episode has other columns.
+    """
+    of_each = [_cells(episode, episode.world if replica is None else replica) for episode in episodes]
+    for cells in of_each:
+        if cells.keys() != set(schema.names):
+            more, lacks = cells.keys() - set(schema.names), set(schema.names) - cells.keys()
+            raise ValueError(
+                f"the episode has the extra columns {sorted(more)} and lacks {sorted(lacks)}; allowed: the "
+                "columns of the table's first episode"
+            )
+    return pa.record_batch(
+        [
+            pa.array(np.concatenate([cells[column.name] for cells in of_each]), column.type)
+            for column in schema
+        ],
+        schema=schema,
+    )
+
+
+def _cells(episode: Episode, replica: int) -> dict[str, Any]:
+    """The values of each column, [N]."""
+    own = {name: getattr(episode, name, None) for name in _columns_of(episode)}
+    agents = np.arange(len(episode.return_))
+    cells: dict[str, Any] = {
+        **own,
+        "replica": replica,
+        "agent": agents,
+        "return": episode.return_,
+        **episode.metrics,
+    }
+    return {name: np.broadcast_to(cell, agents.shape) for name, cell in cells.items()}
