@@ -23,6 +23,7 @@ PACKAGES = (
     "commons",
     "theory",
     "envs",
+    "games",
     "networks",
     "policies",
     "collectors",

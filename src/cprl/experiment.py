@@ -25,6 +25,7 @@ from cprl.config import custom_targets, differences, fields_from_config, fields_
 from cprl.custom import Custom
 from cprl.envs.make_env import PlayableGame
 from cprl.finite import OnNan
+from cprl.games import game_of, is_playable, stored_game
 from cprl.memory import DEVICE
 from cprl.population import SPEC, AgentSpec, Frozen, Learning, Team, specs_by_agent
 from cprl.runs.old_recipes import experiment_config
@@ -89,7 +90,7 @@ class Experiment:
 
     def to_config(self) -> dict[str, Any]:
         """Its fields as JSON can hold them."""
-        return fields_to_config(self, "experiment", instead={"game": _stored_game(self.game)})
+        return fields_to_config(self, "experiment", instead={"game": stored_game(self.game)})
 
     @classmethod
     def from_config(cls, table: Mapping[str, Any], *, allow: Iterable[str] = ()) -> "Experiment":
@@ -103,7 +104,7 @@ class Experiment:
             ValueError: for what is not known, does not fit or is not allowed; by the place where it stands.
         """
         read = fields_from_config(cls, table, "experiment", allow=allow)
-        return read if not isinstance(read.game, Custom) else replace(read, game=_game(read.game))
+        return read if not isinstance(read.game, Custom) else replace(read, game=game_of(read.game))
 
     def to_recipe(self, directory: str | Path | None = None) -> dict[str, Any]:
         """What `recipe.json` says of it; `cprl.runs.directory.start_run` adds when and from what it was run.
@@ -198,44 +199,11 @@ def _with_runs(experiment: Experiment, moved: Callable[[str], str]) -> Experimen
     return experiment if agents == experiment.agents else replace(experiment, agents=agents)
 
 
-def _stored_game(game: object) -> object:
-    """As a recipe holds it: a game of the user's by the name of its class."""
-    if isinstance(game, Game | Custom) or not isinstance(game, PlayableGame):
-        return game
-    kind = type(game)
-    if "<" in kind.__qualname__:
-        raise ValueError(
-            f"experiment.game is a {kind.__qualname__}, which no recipe can name; allowed: a class at the "
-            "top of a module"
-        )
-    return Custom(f"{kind.__module__}:{kind.__qualname__}", arguments=game.to_config())
-
-
-def _game(stored: Custom) -> Custom | PlayableGame:
-    """The game whose class and arguments these are; the same where they only make one."""
-    kind = stored.resolve()
-    if not (isinstance(kind, type) and hasattr(kind, "to_config") and hasattr(kind, "make")):
-        return stored
-    try:
-        game = kind(**{name: _tuples(value) for name, value in stored.arguments.items()})
-    except (TypeError, ValueError) as error:
-        raise ValueError(f"experiment.game: {stored.target} does not take its arguments: {error}") from error
-    return game if isinstance(game, PlayableGame) and _stored_game(game) == stored else stored
-
-
-def _tuples(value: Any) -> Any:
-    return tuple(map(_tuples, value)) if isinstance(value, list) else value
-
-
-def _is_playable(value: Any) -> bool:
-    return isinstance(value, Game | Custom | PlayableGame) and not isinstance(value, type)
-
-
 _MOST_WORLDS: Final = 2**22
 _TUPLE: Final = instance(tuple, "a tuple")
 _CHECKS: Final[dict[str, Check]] = {
     "name": DIRECTORY_NAME,
-    "game": Check(_is_playable, "a Game, a Custom, or a value with `agents`, `to_config` and `make`"),
+    "game": Check(is_playable, "a Game, a Custom, or a value with `agents`, `to_config` and `make`"),
     "agents": instance(tuple, "a tuple of specifications"),
     "episodes": count(1),
     "replicas": count(1, 2**20),
