@@ -153,6 +153,7 @@ def run(
             training = _train(directory, experiment, own, watch=watch, checkpointer=checkpointer, began=began)
             _finish(directory, experiment, own, training)
             checkpointer.done()
+            _say_what_is_kept(directory)
     except BaseException as error:
         if began.has_begun or (resume and isinstance(error, OSError)):
             error.add_note(f"To resume: {checkpointer.resume_command}")
@@ -172,6 +173,15 @@ def _remove(directory: Path, *, but_keep_empty: bool) -> None:
                 path.unlink()
         if not but_keep_empty:
             directory.rmdir()
+
+
+def _say_what_is_kept(directory: Path) -> None:
+    for kept in checkpoints_in(directory / FOLDER):
+        console().print(
+            f"Kept so that it can be extended (--resume with more --episodes): {kept}, "
+            f"{kept.stat().st_size / 1e6:,.1f} MB",
+            soft_wrap=True,
+        )
 
 
 def _say_what_changed(directory: Path) -> None:
