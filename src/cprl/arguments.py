@@ -143,9 +143,9 @@ def callable_of(name: str, value: Any, allowed: str) -> None:
 
 def objects(name: str, value: Any, kind: Any, allowed: str) -> tuple[Any, ...]:
     """The objects of a list or tuple, each an instance of a class; raises a ValueError for anything else."""
-    if not isinstance(value, Iterable) or isinstance(value, str | bytes | Mapping):
+    if isinstance(value, Mapping):
         raise refusal(name, value, f"a list of {allowed}")
-    found = tuple(value)
+    found = listed(name, value, f"a list of {allowed}")
     for place, own in enumerate(found):
         object_of(f"{name}[{place}]", own, kind, allowed)
     return found
