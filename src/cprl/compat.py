@@ -1,12 +1,11 @@
-"""Code that relies on private parts of torch, TorchRL or tensordict, or works around their bugs.
+"""Code that relies on private parts of torch, TorchRL, tensordict or Rerun, or works around their bugs.
 
 There is one function, class or constant for each, with a test in `tests/test_compat.py` that shows what an
-upgrade has broken. The rest of cprl uses public interfaces. Three exceptions are elsewhere:
+upgrade has broken. The rest of cprl uses public interfaces. Two exceptions are elsewhere:
 
 - code that relies on Numba is in `cprl.commons.compiled`, because the game works without torch;
 - methods with an underscore that a library expects its subclasses to define (`EnvBase._reset`, `_step` and
-  `_set_seed`, `Storage._empty`, `Sampler._empty`, `Logger._create_experiment`) are its interface for that;
-- nothing private of Rerun is used.
+  `_set_seed`, `Storage._empty`, `Sampler._empty`, `Logger._create_experiment`) are its interface for that.
 """
 
 from abc import abstractmethod
@@ -203,3 +202,14 @@ def without_lookup(function: FunctionType, codes: Sequence[CodeType]) -> Functio
         codes: from `code_written_for`, not empty.
     """
     return FunctionType(codes[-1], dict(function.__globals__), function.__name__)
+
+
+# ---- Rerun
+
+
+def end_recordings() -> None:
+    """Flushes and ends recordings to which nothing refers any more: until then Rerun keeps two threads and
+    the buffers of each. `rerun.init` does the same, but makes another recording."""
+    from rerun_bindings import flush_and_cleanup_orphaned_recordings
+
+    flush_and_cleanup_orphaned_recordings()

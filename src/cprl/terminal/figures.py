@@ -30,7 +30,7 @@ def training_curve(
         The PNG, `figures/training_curve.png` of the run.
     """
     run = path("run", run)
-    checked("title", title, TEXT)
+    title = checked("title", title, TEXT).encode("utf-8", "replace").decode()
     checked("smoothed", smoothed, count(1))
     random = None if random is None else list(objects("random", random, Episode, "an Episode"))
     rows = read_episodes(run)

@@ -10,6 +10,8 @@ from queue import Full, Queue
 from threading import Thread
 from typing import Any, Final, TypeVar
 
+from cprl.compat import end_recordings
+
 T = TypeVar("T")
 
 CONNECT_S: Final = 4.0
@@ -99,6 +101,12 @@ class Sender:
             except Exception as error:
                 self._error = error
                 return
+
+
+def release() -> None:
+    """Ends the threads of recordings that are closed; a viewer that went away was reported when it did."""
+    with suppress(TimeoutError, RuntimeError):
+        within(CLOSE_S, end_recordings)
 
 
 def abandon(recording: object) -> None:

@@ -17,6 +17,7 @@ from cprl.arguments import path as path_of
 from cprl.checks import NONE, TEXT, checked, either
 from cprl.output import console as safe_console
 from cprl.viewer.blueprint import layout
+from cprl.viewer.deadline import release
 from cprl.viewer.scenery import Curves, Scene, classes, lines, phase_states
 from cprl.viewer.stage import columns, fixed
 from cprl.viewer.streams import FLUSH_TIMEOUT_S, Stream, open_file, open_live
@@ -264,6 +265,8 @@ class RerunLogger(Logger):
         self.flush()
         for each in self._streams:
             each.close()
+        self.experiment.clear()
+        release()
 
     close = shutdown
 
