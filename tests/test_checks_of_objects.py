@@ -6,12 +6,18 @@ import pytest
 import torch
 
 import cprl
+from cprl import CommonsEnv, presets
 from cprl.arguments import callable_of, object_of, objects, path, texts
 from cprl.checks import plain
 from cprl.collectors import StepCollector
+from cprl.learners.lanes import weights_to_start
 from cprl.measuring import statistics
+from cprl.measuring.evaluate import evaluate
+from cprl.output import say
 from cprl.runs.episodes import read_episodes
 from cprl.runs.export import export_results
+
+COMMONS = presets.game("commons")
 
 
 def test_texts_and_paths_are_paths():
@@ -61,11 +67,27 @@ def test_a_tensor_without_values_stays_as_it_is(empty):
         (lambda: cprl.run(3), "experiment is 3"),
         (lambda: StepCollector(3, print), "env is 3"),
         (lambda: statistics.mean([1.0], axis="a"), "axis is 'a'"),
+        (lambda: evaluate(CommonsEnv(COMMONS), print, explore=torch.zeros(0)), "explore is "),
+        (lambda: weights_to_start(True), "start_from is True"),
     ],
 )
 def test_functions_refuse_what_is_of_another_kind_by_name(call, message):
     with pytest.raises(ValueError, match=f"^{message}"):
         call()
+
+
+def test_a_tensor_without_a_dimension_is_no_list():
+    with pytest.raises(ValueError, match=r"^values is .*; allowed: a list of tensors"):
+        objects("values", torch.tensor(3), torch.Tensor, "tensors")
+
+
+def test_what_is_nested_too_deeply_for_python_is_printed_all_the_same(capsys):
+    nested = []
+    nested.append(nested)
+    for _ in range(10_000):
+        nested = [nested]
+    say(nested)
+    assert capsys.readouterr().out == "[[[[[...]]]]]\n"
 
 
 def test_few_resamples_give_an_interval_without_a_warning():

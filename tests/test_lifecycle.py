@@ -233,6 +233,12 @@ def test_a_lock_of_another_host_is_refused_unless_it_is_taken_over(whole, tmp_pa
     assert_same(stopped, whole)
 
 
+def test_a_lock_file_that_says_nothing_is_taken(tmp_path):
+    (tmp_path / "run.lock").write_text("[" * 4000)
+    with RunLock(tmp_path):
+        pass
+
+
 def test_a_second_writer_is_refused_and_changes_nothing(whole, tmp_path):
     live = shutil.copytree(whole, tmp_path / "run")
     (live / "report.json").unlink()

@@ -111,7 +111,7 @@ def console(output: Output = OUT, *, width: int | None = None) -> Console:
 
 
 def say(*what: object) -> None:
-    """Prints a line, like `print`; what cannot be a text is shown by its class."""
+    """Prints a line, like `print`; what cannot be a text is shortened."""
     OUT.write(" ".join(map(_text, what)) + "\n")
     OUT.flush()
 

@@ -8,6 +8,7 @@ import torch
 from tensordict import TensorDictBase
 from torch import Tensor, nn
 
+from cprl.arguments import object_of
 from cprl.learners.checks import check_networks
 from cprl.learners.engine.base import ListEngine
 from cprl.learners.transitions import LaneTurn, RewardKind, lane_turn, seen_next
@@ -52,6 +53,12 @@ class Acts(Protocol):
         """Copies of the current weights of one lane, as the state dict of its acting network."""
 
 
+def weights_to_start(start_from: StartFrom | None) -> StartFrom:
+    """The weights to start from, none as an empty table; refuses what is no table."""
+    object_of("start_from", start_from, Mapping | None, "weights by the name of the lane, or None")
+    return start_from or {}
+
+
 class Lanes:
     """R x S agents: S agents of each of R replicas. A lane is one of them, in order of replicas.
 
@@ -86,7 +93,7 @@ class Lanes:
         self.spaces, self.agents, self.replicas, self.seed = spaces, tuple(agents), replicas, seed
         self._numbers = range(first_replica, first_replica + replicas)
         self.make_network, self.stochastic = make_network, stochastic
-        self._start_from = start_from or {}
+        self._start_from = weights_to_start(start_from)
 
     def __len__(self) -> int:
         return self.replicas * len(self.agents)

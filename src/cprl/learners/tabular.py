@@ -23,7 +23,7 @@ from torch import Tensor, nn
 
 from cprl import keys
 from cprl.learners.checks import check_learner
-from cprl.learners.lanes import EVALUATION, EXPLORATION, StartFrom, lane_names, lane_seeds
+from cprl.learners.lanes import EVALUATION, EXPLORATION, StartFrom, lane_names, lane_seeds, weights_to_start
 from cprl.learners.settings import TabularSettings
 from cprl.learners.transitions import RewardKind, lane_turn
 from cprl.policies.tabular import NEVER_MET, QTables, TableNetwork, TabularActor, observed_entries, states_of
@@ -64,12 +64,12 @@ class TabularLearner:
     ) -> None:
         check_learner(spaces, settings, TabularSettings, agents, replicas, first_replica, seed, reward_kind)
         self.spaces, self.settings, self.seed, self.agents = spaces, settings, seed, tuple(agents)
-        self.reward_kind = reward_kind
+        self.reward_kind, start = reward_kind, weights_to_start(start_from)
         self.replicas, self._numbers = replicas, range(first_replica, first_replica + replicas)
         self.tables = QTables(self.lanes, spaces.actions, max_states=settings.max_states)
         for lane, name in enumerate(lane_names(replicas=self._numbers, agents=self.agents)):
-            if start_from and name in start_from:
-                self.tables.add_lane(lane, *(start_from[name][own].numpy() for own in ("states", "values")))
+            if name in start:
+                self.tables.add_lane(lane, *(start[name][own].numpy() for own in ("states", "values")))
         self.actor = self._actor(EXPLORATION, worlds=1)
         self.actor.epsilon = settings.epsilon(0)
         self.steps = 0

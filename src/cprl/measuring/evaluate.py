@@ -35,6 +35,7 @@ def evaluate(env: EnvBase, policy: Policy, *, explore: bool = False) -> list[Epi
     agents, worlds = agent_count(env), env.batch_size.numel()
     if not callable(policy):
         raise arguments.refusal("policy", policy, "a function that writes the actions of all agents")
+    arguments.switch("explore", explore)
     is_commons = isinstance(env, CommonsEnv)
     tracker = EpisodeTracker(worlds, agents, env.game.rules.episode_steps if is_commons else None)
     exploration = ExplorationType.RANDOM if explore else ExplorationType.DETERMINISTIC

@@ -125,7 +125,7 @@ def _holder(file: int) -> dict[str, Any]:
     """Who wrote the lock file; empty if it cannot be read, e.g. because its process is just starting."""
     try:
         holder = json.loads(os.pread(file, 4096, 0))
-    except ValueError:
+    except (ValueError, RecursionError):
         return {}
     return holder if isinstance(holder, dict) else {}
 
