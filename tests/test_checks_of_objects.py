@@ -16,6 +16,7 @@ from cprl.measuring.evaluate import evaluate
 from cprl.output import say
 from cprl.runs.episodes import read_episodes
 from cprl.runs.export import export_results
+from cprl.viewer.callback import ViewerCallback
 
 COMMONS = presets.game("commons")
 
@@ -93,3 +94,14 @@ def test_what_is_nested_too_deeply_for_python_is_printed_all_the_same(capsys):
 def test_few_resamples_give_an_interval_without_a_warning():
     found = statistics.estimate([1.0, 2.0, 4.0], resamples=1)
     assert found.value == pytest.approx(7 / 3)
+
+
+def test_a_recipe_that_is_nested_too_deeply_is_refused_before_a_recording_is_made(tmp_path):
+    recipe = {}
+    for _ in range(2000):
+        recipe = {"a": recipe}
+    with pytest.raises(ValueError, match="recipe is nested more than 64 deep"):
+        ViewerCallback(tmp_path, CommonsEnv(COMMONS), title="deep", episodes=1, recipe=recipe)
+    with pytest.raises(ValueError, match="file_name is "):
+        ViewerCallback(tmp_path, CommonsEnv(COMMONS), title="odd", episodes=1, file_name=torch.zeros(2))
+    assert list(tmp_path.iterdir()) == []

@@ -17,7 +17,7 @@ from torchrl.envs import EnvBase
 from cprl import keys
 from cprl.arguments import object_of
 from cprl.arguments import path as path_of
-from cprl.checks import TEXT, checked, count
+from cprl.checks import NONE, TEXT, check_nesting, checked, count, either
 from cprl.envs.unwrap import agent_names, commons_of
 from cprl.measuring import phases
 from cprl.measuring.episodes import Episode
@@ -81,6 +81,8 @@ class ViewerCallback:
         checked("title", title, TEXT)
         object_of("recipe", recipe, Mapping | None, "a table, or None")
         checked("episodes", episodes, count(1))
+        checked("file_name", file_name, either(TEXT, NONE))
+        check_nesting(recipe, "recipe")
         run = path_of("run", run)
         self.env, self._episodes = env, episodes
         self._agents, reported = agent_names(env), reported_by(env)

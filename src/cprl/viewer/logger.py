@@ -14,7 +14,7 @@ from torchrl.record.loggers import Logger
 
 from cprl.arguments import object_of
 from cprl.arguments import path as path_of
-from cprl.checks import NONE, TEXT, checked, either
+from cprl.checks import NONE, TEXT, check_nesting, checked, either
 from cprl.output import console as safe_console
 from cprl.viewer.blueprint import layout
 from cprl.viewer.deadline import release
@@ -203,6 +203,7 @@ class RerunLogger(Logger):
         """Logs a mapping, or a Markdown text, as the recipe of the run."""
         import rerun as rr
 
+        check_nesting(cfg, "cfg")
         text = (
             cfg
             if isinstance(cfg, str)
