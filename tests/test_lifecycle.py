@@ -17,6 +17,7 @@ from cprl.algorithms import DQN
 from cprl.population import Learning, Scripted
 from cprl.runs.checkpoints import Checkpointer, checkpoints_in, is_ending, read_checkpoint
 from cprl.runs.episodes import read_episodes, read_table
+from cprl.runs.export import export_results
 from cprl.runs.files import checksum
 from cprl.runs.lock import RunLock, RunLockedError
 from cprl.runs.weights import load_weights
@@ -341,3 +342,11 @@ def test_files_are_written_as_the_umask_says(tmp_path):
         os.umask(before)
     modes = {name: (path / name).stat().st_mode & 0o777 for name in contents(path)}
     assert modes == dict.fromkeys(modes, 0o640)
+
+
+def test_results_are_not_exported_without_a_file_that_the_run_had(whole, tmp_path):
+    lost = shutil.copytree(whole, tmp_path / "run")
+    (lost / "evaluation" / "trained.parquet").unlink()
+    with pytest.raises(FileNotFoundError, match=r"listed in the manifest.*evaluation/trained\.parquet"):
+        export_results(lost, tmp_path / "results")
+    assert not (tmp_path / "results").exists()

@@ -6,6 +6,8 @@ from dataclasses import replace
 import pytest
 from hypothesis import strategies as st
 
+import cprl
+
 from . import cases, public, register, runner, runs, table
 from .cases import Case, Target
 from .runner import ACCEPTED, REFUSED, Finding, Outcome
@@ -20,10 +22,18 @@ SLICES = {
 }
 
 
+@pytest.fixture(scope="module", autouse=True)
+def compiled():
+    """Rules are compiled before the clock of a case runs: the first case of a clean clone would wait."""
+    cprl.CommonsEnv(cprl.presets.game("single_basic"), 2, threads=1).rollout(2)
+    runs.root()
+
+
 @pytest.mark.filterwarnings("ignore::pytest.PytestUnraisableExceptionWarning")  # cases leave files open
 @pytest.mark.parametrize("which", SLICES)
 def test_generated_inputs_are_accepted_or_refused_as_documented(which, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(runner, "LONGEST_S", 60.0)  # scripted agents and pictures are compiled too
     found, answers = [], set()
 
     def each(number, case):

@@ -8,7 +8,7 @@ import pyarrow.parquet as pq
 from cprl.arguments import path as path_of
 from cprl.runs.directory import read_recipe
 from cprl.runs.episodes import FILE_NAME, read_episodes, read_table
-from cprl.runs.manifest import verify, write_listed
+from cprl.runs.manifest import refuse_missing, verify, write_listed
 from cprl.runs.weights import TRANSFORMS
 
 _TRANSFORMS = f"checkpoints/{TRANSFORMS}"
@@ -28,13 +28,14 @@ def export_results(run: Path, folder: Path) -> Path:
 
     Raises:
         ValueError: if there is no run, or a file of it is damaged.
-        FileNotFoundError: if the run has not ended.
+        FileNotFoundError: if the run has not ended, or lost a file since.
     """
     run, folder = path_of("run", run), path_of("folder", folder)
     read_recipe(run)
     for name in _WHOLE:
         if not (run / name).exists():
             raise FileNotFoundError(f"{run / name} does not exist: has the run ended?")
+    refuse_missing(run)
     copied = [name for name in (*_WHOLE, _TRANSFORMS) if (run / name).exists()]
     for name in copied:
         verify(run / name)

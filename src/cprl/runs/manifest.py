@@ -6,6 +6,7 @@ the journal of episodes one for each episode.
 """
 
 from collections.abc import Callable
+from errno import ENOENT
 from pathlib import Path
 from typing import BinaryIO, Final
 
@@ -86,6 +87,15 @@ def verify(path: Path) -> None:
                     f"{listed}"
                 )
             return
+
+
+def refuse_missing(run: Path) -> None:
+    """Raises a FileNotFoundError where a file that the manifest lists is not there; names each."""
+    missing = [name for name in _files(run) if not (run / name).exists()]
+    if missing:
+        raise FileNotFoundError(
+            ENOENT, "listed in the manifest, and not there", f"{run}: {', '.join(missing)}"
+        )
 
 
 def _files(run: Path) -> dict[str, str]:
