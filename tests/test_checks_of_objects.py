@@ -2,11 +2,12 @@
 
 from pathlib import Path
 
+import numpy as np
 import pytest
 import torch
 
 import cprl
-from cprl import CommonsEnv, presets
+from cprl import CommonsEnv, Map, presets
 from cprl.arguments import callable_of, object_of, objects, path, texts
 from cprl.checks import plain
 from cprl.collectors import StepCollector
@@ -70,6 +71,8 @@ def test_a_tensor_without_values_stays_as_it_is(empty):
         (lambda: statistics.mean([1.0], axis="a"), "axis is 'a'"),
         (lambda: evaluate(CommonsEnv(COMMONS), print, explore=torch.zeros(0)), "explore is "),
         (lambda: weights_to_start(True), "start_from is True"),
+        (lambda: Map(height=1, width=9, sites=np.float32, starts=()), "Map.sites is "),
+        (lambda: Map(height=np.float32, width=9, sites=(), starts=()), "Map.height is "),
     ],
 )
 def test_functions_refuse_what_is_of_another_kind_by_name(call, message):

@@ -54,6 +54,14 @@ def test_each_flipped_bit_is_refused_or_changes_nothing(journal):
     assert refused > len(data) / 2
 
 
+def test_a_stream_without_checksums_is_refused(tmp_path):
+    path = tmp_path / "episodes.arrows"
+    with pa.OSFile(str(path), "wb") as file, pa.ipc.new_stream(file, SCHEMA) as stream:
+        stream.write_batch(batch(0))
+    with pytest.raises(ValueError, match=r"episodes\.arrows has no checksum behind row 0"):
+        read_journal(path)
+
+
 def test_a_finished_table_that_is_resumed_goes_on_behind_any_episode(tmp_path):
     path = tmp_path / "episodes.parquet"
     with EpisodeTable(path) as table:

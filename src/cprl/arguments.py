@@ -26,7 +26,7 @@ def as_integer(value: Any) -> int | None:
     """An integer of Python, numpy or torch as an int; None for anything else, bools and floats included."""
     if type(value) is int:
         return value
-    if isinstance(value, bool) or "bool" in str(getattr(value, "dtype", "")):
+    if isinstance(value, bool | type) or "bool" in str(getattr(value, "dtype", "")):
         return None
     if len(getattr(value, "shape", ())) > 0:
         return None

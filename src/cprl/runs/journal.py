@@ -126,7 +126,12 @@ def read_journal(path: Path) -> Content:
             _refuse_damage(path, data, start, rows=rows)
             break
         checksum = None if metadata is None else metadata.get(_CHECKSUM)
-        if checksum is not None and checksum != _checksum(batch):
+        if checksum is None:
+            raise ValueError(
+                f"{path} has no checksum behind row {rows}: it was changed, or an earlier cprl wrote it; "
+                "finish that run with the version that began it (its recipe.json has the commit)"
+            )
+        if checksum != _checksum(batch):
             raise _damaged(path, rows)
         if _has_message(data, start + 8, source.tell()):  # a damaged length swallowed the next one
             raise _damaged(path, rows)

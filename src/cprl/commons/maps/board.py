@@ -95,7 +95,7 @@ def cells_of(name: str, entries: Any, form: tuple[str, ...] = CELL) -> tuple[Any
         ValueError: If they are anything else; the message names the entry.
     """
     allowed = f"({', '.join(form)}), integers"
-    if callable(getattr(entries, "tolist", None)):
+    if not isinstance(entries, type) and callable(getattr(entries, "tolist", None)):
         entries = entries.tolist()
     found = []
     for place, entry in enumerate(listed(name, entries, f"a sequence of {allowed} each")):
