@@ -15,6 +15,7 @@ from cprl.learners.lanes import weights_to_start
 from cprl.measuring import statistics
 from cprl.measuring.evaluate import evaluate
 from cprl.output import say
+from cprl.population import Scripted
 from cprl.runs.episodes import read_episodes
 from cprl.runs.export import export_results
 from cprl.viewer.callback import ViewerCallback
@@ -78,6 +79,13 @@ def test_a_tensor_without_values_stays_as_it_is(empty):
 def test_functions_refuse_what_is_of_another_kind_by_name(call, message):
     with pytest.raises(ValueError, match=f"^{message}"):
         call()
+
+
+def test_a_text_of_another_class_becomes_a_plain_one():
+    class Text(str):
+        pass
+
+    assert type(Scripted(Text("random")).policy) is str
 
 
 def test_a_tensor_without_a_dimension_is_no_list():

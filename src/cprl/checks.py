@@ -85,8 +85,10 @@ def check_fields(value: Any, checks: Mapping[str, Check], where: str = "") -> No
 
 
 def plain(value: Any, nested: int = 0) -> Any:
-    """Lists, ranges and arrays as nested tuples, numpy scalars as Python's numbers, anything else as it is;
+    """Lists, ranges and arrays as nested tuples, numpy scalars as Python's numbers, else the value as it is;
     what is nested deeper than any value of ours stays, so that no check lets it pass."""
+    if isinstance(value, str):
+        return str.__str__(value)  # a recipe holds no text of another class
     if not isinstance(value, type) and callable(getattr(value, "tolist", None)):
         try:
             value = value.tolist()
