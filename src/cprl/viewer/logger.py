@@ -95,12 +95,12 @@ class RerunLogger(Logger):
         super().__init__(exp_name, str(log_dir))
 
     def _create_experiment(self) -> list[Any]:
-        recording_id, blueprint = self.recording_id, layout(self.curves)
+        recording_id = self.recording_id
         Path(self.log_dir).mkdir(parents=True, exist_ok=True)
-        file = open_file(recording_id, self.path, blueprint, period_s=_FILE_PERIOD_S)
+        file = open_file(recording_id, self.path, layout(self.curves), period_s=_FILE_PERIOD_S)
         self._streams += [file] if file else []
         if self._live:
-            self._go_live(recording_id, blueprint)
+            self._go_live(recording_id, layout(self.curves, live=True))
         self._all(lambda recording: recording.send_recording_name(self.exp_name))
         self._static("/", classes(self.curves))
         for entity, style in lines(self.curves).items():
