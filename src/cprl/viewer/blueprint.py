@@ -15,6 +15,9 @@ from cprl.viewer.scenery import Curves, Scene
 
 _BACKGROUND: Final = (24, 26, 32)
 """The background of boards and windows, which sets their dark cells apart from the viewer's own colour."""
+_HEADER, _STRIP, _VIEW = 97, 40, 207
+"""Heights in a window of 1280 x 720, in pixels: the header, a strip, boards or plots. The rows share out any
+other height as they do this one."""
 
 
 def layout(curves: Curves, *, live: bool = False) -> Any:
@@ -32,12 +35,17 @@ def layout(curves: Curves, *, live: bool = False) -> Any:
 
     if isinstance(curves, Scene) and curves.is_replay:
         return _laid_out(_replay(curves.agents), timeline="frame", play_state="playing")
-    rows: list[tuple[Any, float]] = [(_header(), 2), (_top(curves, live=live), 7)]
-    if curves.has_phases:
-        rows.append((_strip(), 2))
-    views, shares = zip(*rows, (_plots(curves), 6), strict=True)
+    strips = 3 if curves.has_phases else 1
     return _laid_out(
-        rrb.Vertical(*views, row_shares=list(shares)), timeline="episode", play_state="following"
+        rrb.Vertical(
+            _header(),
+            _top(curves, live=live),
+            _strip(),
+            _plots(curves),
+            row_shares=[_HEADER, _VIEW, (0.5 + strips) * _STRIP, _VIEW],
+        ),
+        timeline="episode",
+        play_state="following",
     )
 
 
@@ -62,7 +70,7 @@ def _replay(agents: tuple[str, ...]) -> Any:
     import rerun.blueprint as rrb
 
     return rrb.Horizontal(
-        rrb.Vertical(_world(), _texts(), row_shares=[7, 2]),
+        rrb.Vertical(_world(), _texts("step"), row_shares=[7, 2]),
         rrb.Vertical(
             _windows(agents),
             _plot("Harvest so far, apples", *_of(agents, "harvested")),
@@ -76,7 +84,7 @@ def _replay(agents: tuple[str, ...]) -> Any:
 def _header() -> Any:
     import rerun.blueprint as rrb
 
-    return rrb.TextDocumentView(name="Now", origin="/header")
+    return rrb.TextDocumentView(name="Now", origin="/header", titlebar=False)
 
 
 def _top(curves: Curves, *, live: bool) -> Any:
@@ -112,11 +120,11 @@ def _windows(agents: tuple[str, ...]) -> Any:
     return rrb.Spatial2DView(name=seen, origin="/windows", background=_BACKGROUND)
 
 
-def _texts() -> Any:
-    """The events and the recipe."""
+def _texts(timeline: str = "episode") -> Any:
+    """The events, with their number on a timeline, and the recipe."""
     import rerun.blueprint as rrb
 
-    columns = rrb.TextLogColumns(timeline_columns=["episode"], text_log_columns=["Body"])
+    columns = rrb.TextLogColumns(timeline_columns=[timeline], text_log_columns=["Body"])
     return rrb.Tabs(
         rrb.TextLogView(name="Events", origin="/log", columns=columns),
         rrb.TextDocumentView(name="Recipe", origin="/recipe"),
@@ -128,7 +136,8 @@ def _strip() -> Any:
     """The live label, below it the phases found at the end and the published ones, as bands over episodes."""
     import rerun.blueprint as rrb
 
-    return rrb.StateTimelineView(name="Now, and phases", contents=["+ /phase/**"], time_view=_whole())
+    contents = ["+ /now", "+ /phase/**"]
+    return rrb.StateTimelineView(name="Phases", contents=contents, time_view=_whole(), titlebar=False)
 
 
 def _plots(curves: Curves) -> Any:
