@@ -20,13 +20,14 @@ _HEADER, _STRIP, _VIEW = 97, 40, 207
 other height as they do this one."""
 
 
-def layout(curves: Curves, *, live: bool = False) -> Any:
+def layout(curves: Curves, *, live: bool = False, ended: bool = False) -> Any:
     """The layout of a recording; a replay has fewer views, and a game without a board none of the board.
 
     Args:
         curves: the numbers that are plotted; a `Scene` if there is a board.
         live: whether it is the layout of the live view, which has the present policy's exhibition
-            (`/exhibition`, in the live stream alone).
+            (`/exhibition`, in the live stream alone), and no room for phases before they are there.
+        ended: whether the run has ended, for the live view.
 
     Returns:
         A `rerun.blueprint.Blueprint`.
@@ -35,7 +36,7 @@ def layout(curves: Curves, *, live: bool = False) -> Any:
 
     if isinstance(curves, Scene) and curves.is_replay:
         return _laid_out(_replay(curves.agents), timeline="frame", play_state="playing")
-    strips = 3 if curves.has_phases else 1
+    strips = 3 if curves.has_phases and (ended or not live) else 1
     return _laid_out(
         rrb.Vertical(
             _header(),
