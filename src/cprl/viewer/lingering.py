@@ -27,7 +27,8 @@ def check_linger(linger: bool, watch: str) -> None:
 
 
 def linger(logger: RerunLogger) -> None:
-    """Says where the recording stays served, and waits for Ctrl-C (SIGINT) or SIGTERM; returns then."""
+    """Says where the recording stays served, waits for Ctrl-C (SIGINT) or SIGTERM, and closes the recording;
+    a second signal in the meantime changes nothing."""
     if not logger.is_served:
         console().print("The recording is no longer served.")
         return
@@ -45,6 +46,7 @@ def linger(logger: RerunLogger) -> None:
         )
         while not asked.wait(1.0):
             pass
+        logger.shutdown()
     finally:
         for number, handler in usual.items():
             signal.signal(number, handler)
