@@ -35,7 +35,7 @@ def layout(curves: Curves, *, live: bool = False, ended: bool = False) -> Any:
     import rerun.blueprint as rrb
 
     if isinstance(curves, Scene) and curves.is_replay:
-        return _laid_out(_replay(curves.agents), timeline="frame", play_state="playing")
+        return _laid_out(_replay(curves.agents), timeline="step", play_state="playing")
     strips = 3 if curves.has_phases and (ended or not live) else 1
     return _laid_out(
         rrb.Vertical(
@@ -53,8 +53,8 @@ def layout(curves: Curves, *, live: bool = False, ended: bool = False) -> Any:
 def _laid_out(views: Any, *, timeline: str, play_state: Literal["playing", "following"]) -> Any:
     """The views in a blueprint with the viewer's other panels collapsed.
 
-    The timeline of the time panel is the axis of every plot: episodes, and in a replay frames, which are its
-    steps. Boards are played back on `frame`, which counts recorded frames alone.
+    The timeline of the time panel is the axis of every plot: episodes, and in a replay, which records all
+    its steps, steps. Boards of a run are played back on `frame`, which counts recorded frames alone.
     """
     import rerun.blueprint as rrb
 
@@ -71,7 +71,7 @@ def _replay(agents: tuple[str, ...]) -> Any:
     import rerun.blueprint as rrb
 
     return rrb.Horizontal(
-        rrb.Vertical(_world(), rrb.Tabs(_events("step"), _recipe(), active_tab=0), row_shares=[7, 2]),
+        rrb.Vertical(_world(), rrb.Tabs(_events(()), _recipe(), active_tab=0), row_shares=[7, 2]),
         rrb.Vertical(
             _windows(agents),
             _plot("Harvest so far, apples", *_of(agents, "harvested")),
@@ -121,11 +121,12 @@ def _windows(agents: tuple[str, ...]) -> Any:
     return rrb.Spatial2DView(name=seen, origin="/windows", background=_BACKGROUND)
 
 
-def _events(timeline: str = "episode") -> Any:
-    """The events, each with its number on a timeline."""
+def _events(timelines: tuple[str, ...] = ("episode",)) -> Any:
+    """The events, each with its number on these timelines; with none of them on the viewer's own, in a column
+    so wide that no number is cut."""
     import rerun.blueprint as rrb
 
-    columns = rrb.TextLogColumns(timeline_columns=[timeline], text_log_columns=["Body"])
+    columns = rrb.TextLogColumns(timeline_columns=list(timelines), text_log_columns=["Body"])
     return rrb.TextLogView(name="Events", origin="/log", columns=columns)
 
 
