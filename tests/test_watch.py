@@ -241,9 +241,13 @@ def test_a_society_that_rises_falls_and_recovers_is_told_as_a_story(tmp_path):
     path = tmp_path / "run.rrd"
     at, events = column(path, "log", "TextLog:text", "episode")
     told = dict(zip([text[0] for text in events], at, strict=True))
-    assert told["last apple taken in step 7"] == 5
-    assert told["new best: 474.5 apples per episode, mean of the last 50"] == 399
-    assert told["now tragedy"] < told["now recovery"]
+    assert told["episode 5: last apple taken in step 7"] == 5
+    assert told["episode 399: new best: 474.5 apples per episode, mean of the last 50"] == 399
+    tragedy, recovery = (
+        next(text for text in told if text.endswith(word)) for word in ("now tragedy", "now recovery")
+    )
+    assert told[tragedy] < told[recovery]
+    assert tragedy == f"episode {told[tragedy]}: now tragedy"
     episodes, states = column(path, "phase/found", "StateChange:state", "episode")
     assert [state[0] for state in states] == ["exploration", "tragedy", "combat", "cultivation"]
     assert np.abs(np.array(episodes) - [0, 350, 750, 1150]).max() <= 100, "drawn where the window begins"

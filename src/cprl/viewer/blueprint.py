@@ -71,7 +71,7 @@ def _replay(agents: tuple[str, ...]) -> Any:
     import rerun.blueprint as rrb
 
     return rrb.Horizontal(
-        rrb.Vertical(_world(), rrb.Tabs(_events(()), _recipe(), active_tab=0), row_shares=[7, 2]),
+        rrb.Vertical(_world(), rrb.Tabs(_events(), _recipe(), active_tab=0), row_shares=[7, 2]),
         rrb.Vertical(
             _windows(agents),
             _plot("Harvest so far, apples", *_of(agents, "harvested")),
@@ -121,12 +121,13 @@ def _windows(agents: tuple[str, ...]) -> Any:
     return rrb.Spatial2DView(name=seen, origin="/windows", background=_BACKGROUND)
 
 
-def _events(timelines: tuple[str, ...] = ("episode",)) -> Any:
-    """The events, each with its number on these timelines; with none of them on the viewer's own, in a column
-    so wide that no number is cut."""
+def _events() -> Any:
+    """The events, whose texts say when; the viewer's own column is so narrow that it cuts the numbers."""
     import rerun.blueprint as rrb
+    from rerun.blueprint.encodings import TimelineColumn
 
-    columns = rrb.TextLogColumns(timeline_columns=list(timelines), text_log_columns=["Body"])
+    hidden = [TimelineColumn("step", visible=False)]
+    columns = rrb.TextLogColumns(timeline_columns=hidden, text_log_columns=["Body"])
     return rrb.TextLogView(name="Events", origin="/log", columns=columns)
 
 
