@@ -1,7 +1,7 @@
 """run: one experiment from its learners to its report: train, save, evaluate in fresh worlds, summarise."""
 
 import shutil
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from contextlib import AbstractContextManager, ExitStack, nullcontext, suppress
 from dataclasses import asdict, dataclass
 from datetime import datetime
@@ -13,7 +13,7 @@ import torch
 from torchrl.envs import EnvBase
 
 from cprl.agents import Population
-from cprl.arguments import object_of, path, texts
+from cprl.arguments import callable_of, object_of, path, texts
 from cprl.checks import SWITCH, checked
 from cprl.custom import Custom, made
 from cprl.envs.make_env import make_env
@@ -77,6 +77,7 @@ def run(
     watch: str = "file",
     allow: Sequence[str] = (),
     command: Sequence[str] | None = None,
+    at_end: Callable[[Path], object] | None = None,
 ) -> Path:
     """Trains the agents of all replicas, evaluates them in fresh worlds, and writes and prints the outcome.
 
@@ -96,6 +97,7 @@ def run(
         allow: the user's own code, "module:Class", that stored runs of `Frozen` agents may import.
         command: the command line that began the run, script first, which the recipe keeps and the line that
             resumes is made of; by default the run is resumed by `cprl run`.
+        at_end: called with the directory of a run that has just finished, when all is written and said.
 
     Returns:
         The directory, now with `recipe.json`, `episodes.parquet`, `run.rrd`, `checkpoints/final.pt`,
@@ -115,6 +117,8 @@ def run(
     texts("allow", allow)
     command = None if command is None else texts("command", command, 1)
     check_watch(watch)
+    if at_end is not None:
+        callable_of("at_end", at_end, "a function of the run's directory, or None")
     for logger in experiment.loggers:
         check_logger(logger.resolve() if isinstance(logger, Custom) else logger)
     prepare_process(experiment.seed)
@@ -154,6 +158,8 @@ def run(
             _finish(directory, experiment, own, training)
             checkpointer.done()
             _say_what_is_kept(directory)
+        if at_end is not None:
+            at_end(directory)
     except BaseException as error:
         if began.has_begun or (resume and isinstance(error, OSError)):
             error.add_note(f"To resume: {checkpointer.resume_command}")
