@@ -34,6 +34,7 @@ PACKAGES = (
     "presets",
     "measuring",
     "runs",
+    "plotting",
     "viewer",
     "terminal",
     "callbacks",
