@@ -2,10 +2,11 @@
 
 from typing import Final
 
+SHARE: Final = "0 to 1"
 NAMES: Final = {
     "collective_return": ("collective return", "apples"),
     "efficiency": ("efficiency", "apples per step"),
-    "equality": ("equality (1 - Gini)", "0 to 1"),
+    "equality": ("equality (1 - Gini)", SHARE),
     "sustainability": ("sustainability (mean time of harvest)", "steps"),
     "survival_steps": ("survival", "steps"),
     "peace": ("peace (agents in play)", "agents"),
@@ -21,6 +22,13 @@ def title(name: str) -> str:
     return ", ".join(NAMES[name]) if name in NAMES else name
 
 
+def unit(name: str) -> str:
+    """The unit after a value, e.g. "steps"; "" where a range stands for one. A single agent's return is in
+    apples."""
+    found = "apples" if name.startswith("return_") else NAMES.get(name, ("", ""))[1]
+    return "" if found == SHARE else found
+
+
 def with_unit(name: str, *, rewards: str = "") -> str:
     """The name of a metric in code with its unit, e.g. "survival_steps (steps)".
 
@@ -28,5 +36,5 @@ def with_unit(name: str, *, rewards: str = "") -> str:
         name: of a metric, or of a return: ".../return".
         rewards: the unit of rewards; "" if the game does not say.
     """
-    unit = rewards if name.endswith("/return") else NAMES.get(name, ("", ""))[1]
-    return f"{name} ({unit})" if unit else name
+    own = rewards if name.endswith("/return") else NAMES.get(name, ("", ""))[1]
+    return f"{name} ({own})" if own else name

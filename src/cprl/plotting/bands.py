@@ -17,11 +17,12 @@ Bands = Sequence[tuple[float, float, str]]
 UNNAMED: Final = "none of the four patterns"
 COLOURS: Final = {
     "exploration": "#e4e4e4",
-    "tragedy": "#f9d3c7",
+    "tragedy": "#f9cdbf",
     "combat": "#faecb4",
-    "cultivation": "#d3e5f6",
+    "cultivation": "#e0d4f0",
     UNNAMED: "#ffffff",
 }
+"""Light enough for curves before them; the four are apart under deuteranopia too."""
 STRIP_IN: Final = 0.24
 """The height of a row of a strip in inches."""
 _CHARACTER_IN: Final = 0.075

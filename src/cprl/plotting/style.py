@@ -21,11 +21,14 @@ SMALL_PT: Final = 9
 
 MEAN: Final = "#08519c"
 REPLICA: Final = "#6baed6"
+INTERVAL: Final = "#4292c6"
 RAW: Final = "#b5b5b5"
 RANDOM_LINE: Final[dict[str, Any]] = {"color": "#555555", "linestyle": "--", "linewidth": 1.4, "zorder": 2.5}
 PUBLISHED: Final = "#000000"
 MARK: Final = "#a50f15"
 _EDGE: Final = "#303030"
+AGENTS_OF_A_DASH: Final = 4
+_DASHES: Final = ("-", (0, (6, 2)), (0, (4, 1, 1, 1)), (0, (1, 1)))
 
 
 def new_figure(heights_in: Sequence[float], *, title: str) -> tuple[Figure, list[Axes]]:
@@ -49,10 +52,14 @@ def new_figure(heights_in: Sequence[float], *, title: str) -> tuple[Figure, list
 
 
 def on_white(agent: int) -> dict[str, Any]:
-    """An agent's colour for a line on white, with a dark edge because some agents are as light as yellow."""
+    """An agent's colour for a line on white, with a dark edge because some agents are as light as yellow.
+
+    Agents 4 and on have dashes too, because their colours repeat.
+    """
     red, green, blue = agent_colour(agent)
     edge = [Stroke(linewidth=3.2, foreground=_EDGE), Normal()]
-    return {"color": (red / 255, green / 255, blue / 255), "path_effects": edge}
+    dashes = _DASHES[agent // AGENTS_OF_A_DASH % len(_DASHES)]
+    return {"color": (red / 255, green / 255, blue / 255), "path_effects": edge, "linestyle": dashes}
 
 
 def legend_below(figure: Figure, panels: Sequence[Axes], *, note: str = "", columns: int = 2) -> Legend:

@@ -7,7 +7,7 @@ from typing import Final
 import numpy as np
 from matplotlib.axes import Axes
 
-from cprl.measuring.names import title
+from cprl.measuring.names import title, unit
 from cprl.measuring.published import PHASED_RECIPE, SMOOTHED_EPISODES, curve
 from cprl.measuring.statistics import curve_interval
 from cprl.plotting import style
@@ -130,13 +130,15 @@ def _draw_curves(axes: Axes, smoothed: Values, metric: str) -> None:
     middle, low, high = curve_interval(smoothed, resamples=RESAMPLES)
     replicas = len(smoothed)
     agent = metric.removeprefix("return_")
-    bold = style.on_white(int(agent)) if agent.isdecimal() else {"color": style.MEAN}
+    of_agent = agent.isdecimal()
+    bold = style.on_white(int(agent)) if of_agent else {"color": style.MEAN}
+    faint, wide = (style.RAW, style.RAW) if of_agent else (style.REPLICA, style.INTERVAL)
     dot = "." if len(middle) < 3 else None  # a line needs two points
     if replicas > 1:
-        lines = axes.plot(smoothed.T, color=style.REPLICA, linewidth=0.6, alpha=0.8, zorder=2)
+        lines = axes.plot(smoothed.T, color=faint, linewidth=0.6, alpha=0.8, zorder=2)
         lines[0].set_label("ours, each replica")
         at, interval = np.arange(len(middle)), "ours, 95 % interval"
-        axes.fill_between(at, low, high, color=style.REPLICA, alpha=0.45, lw=0, label=interval, zorder=2.2)
+        axes.fill_between(at, low, high, color=wide, alpha=0.45, lw=0, label=interval, zorder=2.2)
     label = f"ours, mean of {replicas} replicas" if replicas > 1 else "ours, one replica"
     axes.plot(middle, linewidth=2.0, marker=dot, label=label, zorder=3, **bold)
 
@@ -148,7 +150,7 @@ def _draw_published(axes: Axes, result: Result, metric: str) -> None:
         axes.plot(*published, color=style.PUBLISHED, linewidth=1.1, label="published", zorder=2.8)
     random = _random(result, metric)
     if random is not None:
-        label = f"random play, ours, {random:,.4g} {axis_title(metric).rsplit(', ')[-1]}"
+        label = f"random play, ours, {random:,.4g} {unit(metric)}".strip()
         axes.axhline(random, **style.RANDOM_LINE, label=label)
 
 

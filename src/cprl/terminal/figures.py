@@ -13,6 +13,7 @@ from cprl.arguments import objects, path
 from cprl.checks import NONE, TEXT, checked, count, either
 from cprl.measuring.episodes import Episode
 from cprl.measuring.names import title as metric_title
+from cprl.measuring.names import unit
 from cprl.measuring.published import PHASED_RECIPE, SMOOTHED_EPISODES
 from cprl.plotting import style
 from cprl.plotting.bands import (
@@ -126,8 +127,7 @@ def _panel(name: str, values: Values, random: list[Episode] | None) -> _Panel:
     if random and name not in random[0].metrics:
         raise ValueError(f"random has episodes without {name}; allowed: episodes of the run's game")
     level = fmean(episode.metrics[name] for episode in random) if random else None
-    words = metric_title(name)
-    return _Panel(name=name, title=words, unit=words.rsplit(", ")[-1], values=values, random=level)
+    return _Panel(name=name, title=metric_title(name), unit=unit(name), values=values, random=level)
 
 
 def _draw(axes: Axes, panel: _Panel, window: int, dashed: str) -> None:
