@@ -36,6 +36,7 @@ PACKAGES = (
     "presets",
     "measuring",
     "runs",
+    "plotting",
     "viewer",
     "terminal",
     "callbacks",

@@ -20,7 +20,7 @@ from cprl.measuring.evaluate import evaluate
 from cprl.population import Learning, Scripted
 from cprl.runs.checkpoints import Checkpointer, checkpoints_in, read_checkpoint
 from cprl.runs.episodes import EpisodeTable, read_episodes
-from cprl.runs.weights import load_weights
+from cprl.runs.weights import load_weights, save_weights
 from cprl.training import train
 
 RECIPES = Path(__file__).parents[1] / "recipes"
@@ -240,7 +240,9 @@ def test_a_run_that_was_stopped_is_loaded_from_its_newest_checkpoint(tmp_path, m
 
 def test_the_run_of_a_plain_agent_is_loaded_too(tmp_path, capsys):
     run, _ = run_in_miniature(tmp_path, capsys)
-    for weights in ("final", "best"):
+    network = cprl.load(run).networks["replica_0/agent_0"]
+    save_weights(run, {"agent_0": network}, name="other")
+    for weights in ("final", "other"):
         loaded = cprl.load(run, weights=weights)
         assert list(loaded.networks) == ["replica_0/agent_0"]
         assert len(evaluate(loaded.env(2), loaded.policy(worlds=2))) == 2
@@ -263,7 +265,7 @@ def test_a_run_that_cannot_be_loaded_says_which_file_and_why(tmp_path, capsys):
         ValueError, match=r"final\.pt is not there, nor a readable checkpoint: has .* been tr"
     ):
         cprl.load(run)
-    (run / "checkpoints" / "best.pt").unlink()
+    (run / "checkpoints" / "best.pt").unlink(missing_ok=True)
     with pytest.raises(ValueError, match=r"best\.pt holds no weights: .*No such file"):
         cprl.load(run, weights="best")
     told = json.loads((run / "recipe.json").read_text())

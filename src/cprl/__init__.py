@@ -26,6 +26,7 @@ Each imports only from those above it:
     presets      the published games and hyper-parameters by name
     measuring    social metrics, episodes, phases, statistics
     runs         what is kept of a run: recipe, table of episodes, checkpoints, weights
+    plotting     what all figures share: sizes, colours, legends, bands of phases
     viewer       recordings for the Rerun viewer
     terminal     progress, summary, figures
     callbacks    what is called while a training runs

@@ -24,6 +24,7 @@ from cprl.finite import summary
 from cprl.measuring.episodes import Episode
 from cprl.outcome import evaluate_population, exploration, fresh_env, random_play, write_evaluation
 from cprl.output import ERR, OUT, console
+from cprl.population import exploration_steps
 from cprl.process import prepare_process
 from cprl.runs.checkpoints import FOLDER, Checkpointer, checkpoints_in
 from cprl.runs.directory import (
@@ -237,7 +238,8 @@ def _finish(
     if viewer is not None:
         viewer.finished(played)
     title = _title(experiment)
-    figure = training_curve(directory, title=title, random=played["random"])
+    ends = exploration_steps(experiment.agents)
+    figure = training_curve(directory, title=title, random=played["random"], exploration_steps=ends)
     broken = training.finite.found
     report = {"training_s": round(training.spent_s, 1), "steps": training.steps, "finished": _now()}
     also = {"not_finite": [asdict(one) for one in broken]} if broken else {}

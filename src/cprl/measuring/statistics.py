@@ -37,7 +37,9 @@ class Estimate:
     replicas: int
 
     def __str__(self) -> str:
-        return f"{self.value:.4g} [{self.low:.4g}, {self.high:.4g}]"
+        """The value with its interval, of a single replica the value alone."""
+        has_interval = np.isfinite([self.low, self.high]).all()
+        return f"{self.value:.4g} [{self.low:.4g}, {self.high:.4g}]" if has_interval else f"{self.value:.4g}"
 
 
 def mean(values: ArrayLike, axis: int = -1) -> Any:
