@@ -21,7 +21,7 @@ from cprl.envs.state import check_restorable, transforms_state
 from cprl.envs.unwrap import agent_names, commons_of
 from cprl.experiment import Experiment
 from cprl.finite import summary
-from cprl.outcome import evaluate_population, exploration, fresh_env, write_evaluation
+from cprl.outcome import evaluate_population, exhibited, exploration, fresh_env, write_evaluation
 from cprl.output import ERR, OUT, console
 from cprl.process import prepare_process
 from cprl.runs.checkpoints import FOLDER, Checkpointer, checkpoints_in
@@ -247,7 +247,7 @@ def _train(
 ) -> Training:
     """Trains and keeps what happens, from the newest checkpoint on if there is one."""
     with ExitStack() as stack:
-        viewer = stack.enter_context(_viewer(watch, directory, own.env, experiment))
+        viewer = stack.enter_context(_viewer(watch, directory, own, experiment))
         checkpointer.log_event = viewer.log_event if viewer else None
         table = stack.enter_context(EpisodeTable(directory / "episodes.parquet", resumable=True))
         bar = ProgressBar(own.env, episodes=experiment.episodes, replicas=experiment.replicas)
@@ -275,7 +275,7 @@ def _logger(logger: str | Custom, directory: Path, env: EnvBase) -> LoggerCallba
 
 
 def _viewer(
-    watch: str, directory: Path, env: EnvBase, experiment: Experiment
+    watch: str, directory: Path, own: _Made, experiment: Experiment
 ) -> AbstractContextManager[ViewerCallback | None]:
     if watch == "off":
         return nullcontext()
@@ -283,11 +283,12 @@ def _viewer(
     shown = {name: recipe.get(name) for name in ("command", "started", "git", "versions")}
     return ViewerCallback(
         directory,
-        env,
+        own.env,
         title=_title(experiment),
         episodes=experiment.episodes,
         recipe={**shown, **recipe["experiment"]},
         live=None if watch == "file" else watch,
+        exhibited=None if watch == "file" else exhibited(experiment, own.env, own.population),
     )
 
 

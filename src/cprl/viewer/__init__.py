@@ -6,7 +6,10 @@ Modules, in the order in which one reads them:
     frames     frames of one world, collected in memory
     events     new bests and phases, in words
     logger     RerunLogger: TorchRL's logger interface on a recording
+    exhibition a world that the present policy plays, for viewers alone
     streams    to a file, and served live
+    sending    one stream, which may fail without harm
+    page       the web viewer's page on 127.0.0.1, and recordings for it
     deadline   calls that may wait for a viewer, with deadlines
     scenery    names and colours of what a recording shows
     stage      frames as Rerun's columns
