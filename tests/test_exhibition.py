@@ -20,7 +20,8 @@ from cprl.outcome import exhibited, fresh_env
 from cprl.population import Learning, Scripted, Team
 from cprl.training import train
 from cprl.viewer import exhibition
-from cprl.viewer.callback import ViewerCallback, _curves
+from cprl.viewer.callback import ViewerCallback
+from cprl.viewer.contents import curves_of
 from cprl.viewer.exhibition import STEPS_PER_S, Exhibition, caption_of
 from cprl.viewer.recorder import scene_of
 from cprl.viewer.sending import Stream
@@ -81,7 +82,9 @@ class Kept:
         self.env, self.population = population_of(experiment)
         self.policy, self.world = exhibited(experiment, self.env, self.population)
         commons = self.env if not experiment.transforms else self.env.base_env
-        scene = scene_of(commons, _curves(commons, experiment.game.agent_names, []), is_replay=False)
+        scene = scene_of(
+            commons, curves_of(commons, experiment.game.agent_names, [], episodes=3), is_replay=False
+        )
         self.exhibition = Exhibition(
             self.policy,
             self.world,

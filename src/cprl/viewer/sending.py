@@ -14,8 +14,8 @@ _KEEPS_UP: Final = 8
 """The number of calls that may wait for viewers that keep up."""
 
 
-Waiting: TypeAlias = dict[str, list[tuple[int, int, int, list[float]]]]
-"""Numbers by entity: (step, episode, frame, a number for each line)."""
+Waiting: TypeAlias = dict[str, list[tuple[int, int, int, list[float] | str]]]
+"""Numbers and texts by entity: (step, episode, frame, a number for each line or a Markdown text)."""
 
 
 class Stream:
