@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cprl.arguments import floats, integer, object_of, refusal
-from cprl.commons.colours import APPLE, BEAM, COLOURS, GROUND, WALL, agent_colour
+from cprl.commons.colours import APPLE, BEAM, GROUND, PALETTE, WALL, agent_colour
 from cprl.commons.game import Game
 from cprl.commons.maps import Map
 from cprl.commons.world import COL_STEP, ROW_STEP, Bools, Bytes, Ints, Shown
@@ -14,7 +14,6 @@ from cprl.memory import check_memory
 
 LARGEST_CELL_PIXELS: Final = 1000
 GRID_COLOUR: Final = (28, 30, 36)
-CELL_COLOURS: Final = {GROUND: (16, 18, 22), WALL: (125, 125, 125), APPLE: (46, 184, 76)}
 
 
 def board_image(
@@ -69,10 +68,10 @@ def board_image(
         for c in range(board.width):
             kind = int(kinds[r, c])
             inset = size // 6 if kind == APPLE else 0
-            image[r * size + 1 : (r + 1) * size, c * size + 1 : (c + 1) * size] = CELL_COLOURS[GROUND]
-            _fill(image, r, c, size, inset, CELL_COLOURS[kind])
+            image[r * size + 1 : (r + 1) * size, c * size + 1 : (c + 1) * size] = PALETTE[GROUND]
+            _fill(image, r, c, size, inset, PALETTE[kind])
             if beams is not None and beams[r, c]:
-                _fill(image, r, c, size, 2 * size // 5, COLOURS[BEAM])
+                _fill(image, r, c, size, 2 * size // 5, PALETTE[BEAM])
     for i, (r, c, h) in enumerate(zip(row, col, heading, strict=True)):
         if in_play is None or in_play[i]:
             _draw_agent(image, int(r), int(c), int(h), size, agent_colour(i))

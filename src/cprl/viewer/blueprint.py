@@ -2,6 +2,7 @@
 
 from typing import Any, Final, Literal
 
+from cprl.commons.colours import WINDOW_CAPTION
 from cprl.viewer.scenery import Curves, Scene
 
 _BACKGROUND: Final = (24, 26, 32)
@@ -72,8 +73,8 @@ def _world() -> Any:
 def _windows(agents: tuple[str, ...]) -> Any:
     import rerun.blueprint as rrb
 
-    seen = "What the agent sees" if len(agents) == 1 else "What each agent sees, in a frame of its colour"
-    return rrb.Spatial2DView(name=seen, origin="/windows", background=_BACKGROUND)
+    seen = "What the agent sees" if len(agents) == 1 else "What each agent sees"
+    return rrb.Spatial2DView(name=f"{seen}, {WINDOW_CAPTION}", origin="/windows", background=_BACKGROUND)
 
 
 def _events() -> Any:

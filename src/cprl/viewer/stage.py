@@ -10,7 +10,7 @@ from cprl.commons.colours import APPLE, BEAM, FIRST_AGENT, GROUND, WALL, agent_c
 from cprl.commons.decoding import UNSEEN
 from cprl.commons.world import Bools, Bytes
 from cprl.viewer.frames import mosaic, mosaic_size, window_corners
-from cprl.viewer.scenery import Scene
+from cprl.viewer.scenery import Scene, window_classes
 
 RIM_CELLS: Final = 1
 """The width of the wall shown around the board, in cells."""
@@ -54,7 +54,10 @@ def fixed(scene: Scene) -> dict[str, list[Any]]:
             rr.Arrows2D.from_fields(colors=[(255, 255, 255)], labels=[str(agent) for agent in range(agents)])
         ],
         "world/out": [rr.Boxes2D.from_fields(radii=[2 * _STROKE_CELLS])],
-        "windows": [image(format=form(mosaic_size(agents, scene.window)), opacity=1.0)],
+        "windows": [
+            window_classes(scene),
+            image(format=form(mosaic_size(agents, scene.window)), opacity=1.0),
+        ],
         "windows/frames": [
             rr.Boxes2D(
                 mins=corners - 0.2,
