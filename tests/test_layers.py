@@ -16,6 +16,8 @@ PACKAGES = (
     "spaces",
     "custom",
     "output",
+    "caches",
+    "compile_clock",
     "process",
     "compiling",
     "memory",

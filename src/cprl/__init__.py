@@ -8,6 +8,8 @@ Each imports only from those above it:
     spaces       what agents observe and may do
     custom       the user's own code, as a text that a recipe can keep
     output       text for the terminal, which may close
+    caches       where compiled code is kept between runs
+    compile_clock  whether code is being compiled, and for how long
     process      settings of the process that trains
     compiling    functions compiled by torch
     memory       devices, and what would not fit into their memory

@@ -2,10 +2,17 @@
 
 Modules, in the order in which one reads them:
     callback   ViewerCallback: logs a training while it runs
+    story      header, live label, events, and the phases when it ends
+    header     the header's texts
+    events     new bests, and phases
+    plots      the lines of each episode, with running means and random play
+    tags       who tagged whom
     recorder   which episodes are recorded frame by frame
     frames     frames of one world, collected in memory
-    events     new bests and phases, in words
     logger     RerunLogger: TorchRL's logger interface on a recording
+    batches    numbers and texts as columns, in batches
+    recipe     the recipe as a table
+    names      files and ids of a run's recordings
     streams    to a file, and served live
     deadline   calls that may wait for a viewer, with deadlines
     scenery    names and colours of what a recording shows

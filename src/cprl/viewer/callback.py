@@ -1,9 +1,6 @@
 """ViewerCallback: records a training for the Rerun viewer, and shows it live."""
 
-import itertools
-import json
 import time
-import uuid
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from types import TracebackType
@@ -22,16 +19,16 @@ from cprl.envs.unwrap import agent_names, commons_of
 from cprl.measuring import phases
 from cprl.measuring.episodes import Episode
 from cprl.measuring.reported import FIELDS, METRICS, available, left_out, reported_by
-from cprl.measuring.series import Series, Values, mean_of, numbers_of
-from cprl.runs.directory import FILE_NAME as RECIPE_FILE
-from cprl.runs.files import read_json
-from cprl.viewer.events import ANOTHER, EventDetector
-from cprl.viewer.logger import FILE_NAME, RerunLogger
+from cprl.measuring.series import Series, Values, numbers_of
+from cprl.viewer.events import FEWEST_FOR_PHASES
+from cprl.viewer.header import has_died
+from cprl.viewer.logger import RerunLogger
+from cprl.viewer.names import FILE_NAME, free_name, recording_id
+from cprl.viewer.plots import Plots
 from cprl.viewer.recorder import FrameRecorder, scene_of
-from cprl.viewer.scenery import TOO_EARLY, Curves
-
-TAGS_EVERY: Final = 50
-"""Episodes whose tags are summed in one matrix of who tagged whom."""
+from cprl.viewer.scenery import Curves
+from cprl.viewer.story import Story
+from cprl.viewer.tags import Tags
 
 _SHOWN: Final[Mapping[str, tuple[str, ...]]] = {
     "phases and new bests": tuple(dict.fromkeys(entry for name in phases.METRICS for entry in METRICS[name])),
@@ -39,6 +36,8 @@ _SHOWN: Final[Mapping[str, tuple[str, ...]]] = {
     "the board and what agents see": ("board",),
 }
 """The views of a recording besides metrics, and the entries that each needs."""
+_DIED: Final = "died"
+"""Among an episode's numbers, whether the board died early."""
 
 
 class ViewerCallback:
@@ -86,7 +85,7 @@ class ViewerCallback:
         run = path_of("run", run)
         self.env, self._episodes = env, episodes
         self._agents, reported = agent_names(env), reported_by(env)
-        curves, commons = _curves(env, self._agents, reported), commons_of(env)
+        curves, commons = _curves(env, self._agents, reported, episodes), commons_of(env)
         scene = None if commons is None else scene_of(commons, curves, is_replay=is_replay)
         self.logger = RerunLogger(
             title,
@@ -94,8 +93,8 @@ class ViewerCallback:
             scene=scene,
             curves=curves,
             live=live,
-            file_name=file_name or _free_name(run),
-            recording_id=_recording_id(run, file_name or FILE_NAME),
+            file_name=file_name or free_name(run),
+            recording_id=recording_id(run, file_name or FILE_NAME),
             console=console,
         )
         self._recorder = (
@@ -106,10 +105,17 @@ class ViewerCallback:
         self.every = 0 if self._recorder is None else self._recorder.every
         """Episodes from one with frames to the next; 0 for no frames."""
         self._series = Series(curves.replicas)
-        self._events = EventDetector() if curves.has_phases else None
-        self._tags = np.zeros((len(self._agents),) * 2) if curves.has_tags else None
+        self.plots = Plots(self.logger, curves, episodes=episodes)
+        game = None if commons is None else commons.game
+        self.story = (
+            None
+            if is_replay
+            else Story(self.logger, curves, episodes=episodes, window=self.plots.window, game=game)
+        )
+        has_tags = curves.has_tags and len(self._agents) > 1
+        self._tags = Tags(self.logger, len(self._agents)) if has_tags else None
         self._step = self._episode = 0
-        self._shows_next = False
+        self._shows_next = self._has_died = False
         self._rate_at = time.perf_counter()
         self._rate_step = 0
         self.logger.log_hparams({"run": run.name, **(recipe or {})})
@@ -117,8 +123,7 @@ class ViewerCallback:
         missing = left_out([*reported, *(["board"] if scene else [])], more=_SHOWN)
         if missing:
             self.logger.log_text(missing)
-        if curves.has_phases and not is_replay:
-            self.logger.log_states("phase/now", {0: TOO_EARLY})
+        self.log_status("begins")
 
     def on_step(self, batch: TensorDictBase) -> None:
         """Copies the state of the first world after the turn, if this episode's frames are recorded.
@@ -140,47 +145,70 @@ class ViewerCallback:
     def on_episode(self, episode: Episode, learning: Mapping[str, float]) -> None:
         """Logs the numbers of an episode, and its events, once all replicas have ended it."""
         if episode.world == 0:
+            self._log_death(episode)
             self._episode, self._shows_next = episode.episode + 1, False
-        if episode.world == 0 and (episode.depletion_step or -1) > 0:
-            self.logger.at(step=self._step, episode=episode.episode)
-            self.logger.log_text(
-                f"episode {episode.episode}: the last apple was taken in step {episode.depletion_step}"
-            )
         if self._tags is not None and episode.tagged_by is not None:
-            self._tags += episode.tagged_by
+            self._tags.add(episode.tagged_by)
         numbers = numbers_of(episode, learning, self._agents)
-        of_all = self._series.add(episode.episode, episode.world, numbers)
+        died = has_died(episode)
+        of_all = self._series.add(
+            episode.episode, episode.world, numbers if died is None else {**numbers, _DIED: float(died)}
+        )
         if of_all is not None:
             self.logger.at(step=self._step, episode=episode.episode)
             self._log(episode.episode, of_all)
 
-    def _log(self, episode: int, of_all: Mapping[str, Values]) -> None:
-        logger, now = self.logger, time.perf_counter()
-        for name, values in of_all.items():
-            singles = values.tolist() if name.startswith("social/") and len(values) > 1 else []
-            logger.log_lines(name, [*singles, mean_of(values)])
+    def _log_death(self, episode: Episode) -> None:
+        """Logs the step of the last apple in the first replica, for the first time and where one sees it."""
+        step = episode.depletion_step or -1
+        if step > 0 and (self.is_shown or not self._has_died):
+            self.logger.at(step=self._step, episode=episode.episode)
+            self.logger.log_text(f"last apple taken in step {step}")
+            self._has_died = True
+
+    def _log(self, episode: int, of_all: dict[str, Values]) -> None:
+        now, died = time.perf_counter(), of_all.pop(_DIED, None)
+        self.plots.on_episode(of_all)
         steps = (self._step - self._rate_step) * self._series.replicas
         if steps:
-            logger.log_scalar("time/env_steps_per_s", steps / (now - self._rate_at))
+            self.logger.log_scalar("time/env_steps_per_s", steps / (now - self._rate_at))
             self._rate_at, self._rate_step = now, self._step
-        if self._events is not None:
-            self._log_events(self._events, episode, of_all)
-        if self._tags is not None and (episode + 1) % TAGS_EVERY == 0 and len(self._agents) > 1:
-            logger.log_matrix("tags", self._tags, ("tagged", "by whom"))
-            self._tags[:] = 0
+        if self.story is not None:
+            events = self.story.on_episode(episode, of_all, None if died is None else float(np.nansum(died)))
+            self._shows_next |= any(event.startswith("new best") for event in events)
+        if self._tags is not None:
+            self._tags.on_episode(episode)
 
-    def _log_events(self, detector: EventDetector, episode: int, of_all: Mapping[str, Values]) -> None:
-        events = detector.add(
-            {name.removeprefix("social/"): mean_of(values) for name, values in of_all.items()}
-        )
-        for event in events:
-            self.logger.log_text(f"episode {episode}: {event}")
-            self._shows_next |= event.startswith("new best")
-        if any(event.startswith("phase") for event in events):
-            self.logger.log_states("phase/now", {episode: detector.phase or ANOTHER})
+    def log_status(self, status: str) -> None:
+        """Says in the header what happens before the first episode has ended, e.g. "compiling, 12 s so far";
+        viewers get it at once."""
+        if self.story is not None:
+            self.story.begins(status)
+
+    def random_play(self, episodes: Sequence[Episode]) -> None:
+        """Compares the training with these episodes of random play: in header, label, plots and an event."""
+        self.plots.random_play(episodes)
+        if self.story is not None:
+            self.story.random_play(episodes)
+
+    @property
+    def baseline(self) -> float | None:
+        """The mean collective return of random play (or summed return, without a harvest), if it is known."""
+        return None if self.story is None else self.story.baseline
+
+    def finished(self, played: Mapping[str, Sequence[Episode]]) -> None:
+        """Shows that the run is finished, and closes the file; a live view stays open until the end.
+
+        Args:
+            played: the episodes of its evaluation, "trained" and "random".
+        """
+        self._send_frames()
+        if self.story is not None:
+            self.story.finished(played["trained"], played["random"])
+        self.logger.close_file()
 
     def log_event(self, event: str) -> None:
-        """Logs an event as text, for instance a checkpoint."""
+        """Logs an event as text."""
         self.logger.log_text(event)
 
     @property
@@ -208,8 +236,9 @@ class ViewerCallback:
             "shows_next": self._shows_next,
             "frames": self.logger.frames,
             "series": self._series.state_dict(),
-            "story": None if self._events is None else self._events.state_dict(),
-            "tags": None if self._tags is None else self._tags.tolist(),
+            "plots": self.plots.state_dict(),
+            "story": None if self.story is None else self.story.state_dict(),
+            "tags": None if self._tags is None else self._tags.state_dict(),
         }
 
     def load_state_dict(self, state: Mapping[str, Any]) -> None:
@@ -218,11 +247,12 @@ class ViewerCallback:
         self._episode, self._shows_next = int(state["episode"]), bool(state["shows_next"])
         self.logger.frames = int(state["frames"])
         self._series.load_state_dict(state["series"])
-        if self._events is not None:
-            self._events.load_state_dict(state["story"])
-        if self._tags is not None:
-            self._tags = np.array(state["tags"])
+        self.plots.load_state_dict(state.get("plots", {}))
         self.logger.at(step=self._step, episode=self._episode)
+        if self.story is not None:
+            self.story.load_state_dict(state["story"] or {})
+        if self._tags is not None:
+            self._tags.load_state_dict(state["tags"])
         self.logger.log_text(f"resumed from step {self._step:,}")
 
     def __enter__(self) -> Self:
@@ -235,34 +265,18 @@ class ViewerCallback:
         traceback: TracebackType | None,
     ) -> None:
         self._send_frames()
-        found = [] if self._events is None else self._events.phases()
-        if found:
-            self.logger.log_states("phase/found", {round(one.first): one.label or ANOTHER for one in found})
+        if self.story is not None:
+            self.story.close()
         self.logger.shutdown()
 
 
-def _curves(env: EnvBase, agents: tuple[str, ...], reported: Sequence[str]) -> Curves:
+def _curves(env: EnvBase, agents: tuple[str, ...], reported: Sequence[str], episodes: int) -> Curves:
     """The numbers of an environment that are plotted."""
     metrics = available({**METRICS, "stock_left": FIELDS["stock_left"]}, reported)
     return Curves(
         agents=agents,
         replicas=env.batch_size.numel(),
         metrics=metrics,
-        has_phases=set(phases.METRICS) <= set(metrics),
+        has_phases=episodes >= FEWEST_FOR_PHASES and set(phases.METRICS) <= set(metrics),
         has_tags="tagged_by" in reported,
     )
-
-
-def _free_name(run: Path) -> str:
-    """run.rrd, or run-2.rrd and so on if the run has a recording already."""
-    names = (FILE_NAME if nth == 1 else f"run-{nth}.rrd" for nth in itertools.count(1))
-    return next(name for name in names if not (run / name).exists())
-
-
-def _recording_id(run: Path, file_name: str) -> str | None:
-    """The recording id, the same when a run is resumed or extended; None where there is no run."""
-    if not (run / RECIPE_FILE).exists():
-        return None
-    recipe = read_json(run / RECIPE_FILE)
-    same = {name: own for name, own in recipe.items() if name not in ("experiment", "extended")}
-    return str(uuid.uuid5(uuid.NAMESPACE_URL, file_name + json.dumps(same, sort_keys=True)))

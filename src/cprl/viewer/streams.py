@@ -27,8 +27,8 @@ NEEDED_BYTES: Final = 2_000_000
 FLUSH_TIMEOUT_S: Final = 5.0
 
 
-Waiting: TypeAlias = dict[str, list[tuple[int, int, int, list[float]]]]
-"""Numbers by entity: (step, episode, frame, a number for each line)."""
+Waiting: TypeAlias = dict[str, list[tuple[int, int, int, list[float] | str]]]
+"""Numbers and texts by entity: (step, episode, frame, a number for each line or a Markdown text)."""
 
 
 class Stream:
