@@ -8,23 +8,25 @@ from functools import partial
 from threading import Event
 from typing import Any, Final, Protocol
 
+import numpy as np
 from numpy.typing import NDArray
 from tensordict import TensorDictBase
 from torchrl.envs import EnvBase, TransformedEnv
 
+from cprl.commons.game import Game
 from cprl.envs.state import load_transforms_state, transforms_state
 from cprl.envs.unwrap import commons_of
 from cprl.viewer.recorder import FrameRecorder
 from cprl.viewer.scenery import Scene
-from cprl.viewer.stage import RIM_CELLS, columns, fixed
+from cprl.viewer.stage import RIM_CELLS, board_columns, fixed
 from cprl.viewer.streams import Live
 
 STEPS_PER_S: Final = 11
 """Steps of the exhibited world in a second of wall time."""
 
-MOST_SHARE: Final = 0.01
+MOST_SHARE: Final = 0.012
 """The share of the training's wall time that its thread may spend on the exhibition: where a step of it takes
-longer than 0.9 ms, it plays more slowly."""
+longer than 1.1 ms, it plays more slowly."""
 
 EVERY_STEPS: Final = 11
 """Steps after which the caption is sent again, and the state of transforms is taken over."""
@@ -97,11 +99,15 @@ class Exhibition:
         self._carried: TensorDictBase | None = None
         self._due = clock()
         self._steps, self._caption = 0, ""
+        self._there = {"beams": False, "out": False}
         self.is_over = live.stream is None or live.exhibition is None
         """Whether it has ended, because it failed or has no viewers."""
         for entity, parts in fixed(scene).items():
             if live.stream is not None and entity.startswith(f"{_BOARD}/"):
                 live.stream.do(_log(_renamed(entity), *parts))
+        if live.exhibition is not None:  # before anything is compiled, which takes half a minute at first
+            live.exhibition.do(partial(_send, scene=scene, frames=_before_the_first_step(commons.game)))
+            self._send_caption(0)
 
     def on_step(self, *, episode: int) -> None:
         """Plays a step if one is due; `episode` is that of the training, for the caption."""
@@ -137,7 +143,7 @@ class Exhibition:
             return
         frames = self._recorder.take()
         if frames is not None:
-            live.do(partial(_send, scene=self._scene, frames=frames))
+            live.do(partial(_send, scene=self._scene, frames=frames, **self._changing(frames)))
         self._send_caption(episode)
 
     def _step(self) -> None:
@@ -151,6 +157,13 @@ class Exhibition:
             return
         batch, self._carried = self._env.step_and_maybe_reset(self._policy(self._carried))
         self._recorder.add(batch, step=0, episode=0)
+
+    def _changing(self, frames: Mapping[str, NDArray[Any]]) -> dict[str, bool]:
+        """Whether beams and agents out of play must be sent: with any, after any, and now and then."""
+        there = {"beams": bool(frames["beams"].any()), "out": not frames["in_play"].all()}
+        before, self._there = self._there, there
+        again = self._steps % EVERY_STEPS == 0
+        return {name: again or there[name] or before[name] for name in there}
 
     def _send_caption(self, episode: int) -> None:
         """Sends the caption where it has changed, and now and then for viewers that came later."""
@@ -175,6 +188,26 @@ def caption_of(policy: Exhibited, episode: int) -> str:
     return f"{'trained' if policy.is_trained else 'present'} policy, episode {episode:,}{chance}"
 
 
+def _before_the_first_step(game: Game) -> dict[str, NDArray[Any]]:
+    """The frame of the board as an episode begins, drawn from the map."""
+    board, agents = game.map, game.agents
+    row, col, heading = np.array(board.starts, np.int32).T
+    one = {
+        "step": np.zeros((), np.int64),
+        "episode": np.zeros((), np.int64),
+        "beams": np.zeros((board.height, board.width), np.bool_),
+        "stock": np.ones(len(board.sites), np.uint8),
+        "windows": np.zeros((agents, *game.observation_shape[1:]), np.uint8),
+        "row": row,
+        "col": col,
+        "heading": heading,
+        "in_play": np.ones(agents, np.bool_),
+        "tagged_by": np.full(agents, -1, np.int32),
+        "harvested": np.zeros(agents, np.int32),
+    }
+    return {name: array[None] for name, array in one.items()}
+
+
 def _renamed(entity: str) -> str:
     """The name in the exhibition of an entity of the recorded board."""
     return "exhibition" + entity.removeprefix(_BOARD)
@@ -184,8 +217,9 @@ def _log(entity: str, *what: Any) -> Callable[[Any], object]:
     return lambda recording: recording.log(entity, *what, static=True)
 
 
-def _send(recording: Any, scene: Scene, frames: Mapping[str, NDArray[Any]]) -> None:
+def _send(
+    recording: Any, *, scene: Scene, frames: Mapping[str, NDArray[Any]], beams: bool = True, out: bool = True
+) -> None:
     """Sends a frame without a time, so that viewers keep no other."""
-    for entity, (_, what) in columns(scene, frames).items():
-        if entity.startswith(f"{_BOARD}/"):
-            recording.send_columns(_renamed(entity), [], what)
+    for entity, (_, what) in board_columns(scene, frames, beams=beams, out=out).items():
+        recording.send_columns(_renamed(entity), [], what)
