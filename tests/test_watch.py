@@ -24,7 +24,7 @@ from cprl.learners.settings import DQNSettings
 from cprl.measuring import Episode, social
 from cprl.training import train
 from cprl.viewer.callback import ViewerCallback
-from cprl.viewer.streams import _free_port
+from cprl.viewer.page import free_port
 
 GAME = Game(
     map=maps.parse(".A>.A\n.A.A.\n..<.A"),
@@ -77,7 +77,7 @@ def unwatched():
 @contextmanager
 def receiving():
     """A process of Rerun's that listens as a viewer does, and its address."""
-    port = _free_port()
+    port = free_port()
     process = subprocess.Popen(
         [VIEWER, "--serve-grpc", "--bind", "127.0.0.1", "--port", str(port)],
         stdout=subprocess.DEVNULL,
@@ -114,7 +114,7 @@ def test_a_viewer_that_is_killed_half_way_changes_nothing(tmp_path, unwatched):
 
 
 def test_an_address_where_nobody_listens_is_told_once_and_changes_nothing(tmp_path, unwatched):
-    address = f"rerun+http://127.0.0.1:{_free_port()}/proxy"
+    address = f"rerun+http://127.0.0.1:{free_port()}/proxy"
     started = time.monotonic()
     with pytest.warns(RuntimeWarning, match="viewer at rerun.*refused; the run continues") as caught:
         assert course(tmp_path, live=f"connect {address}") == unwatched

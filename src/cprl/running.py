@@ -22,7 +22,14 @@ from cprl.envs.unwrap import agent_names, commons_of
 from cprl.experiment import Experiment
 from cprl.finite import summary
 from cprl.measuring.episodes import Episode
-from cprl.outcome import evaluate_population, exploration, fresh_env, random_play, write_evaluation
+from cprl.outcome import (
+    evaluate_population,
+    exhibited,
+    exploration,
+    fresh_env,
+    random_play,
+    write_evaluation,
+)
 from cprl.output import ERR, OUT, console
 from cprl.population import exploration_steps
 from cprl.process import prepare_process
@@ -168,7 +175,7 @@ def run(
                 write_on_nan(directory, experiment.on_nan)
             if episodes < experiment.episodes:
                 extend(directory, episodes, experiment.episodes)
-            viewer = closing.enter_context(_viewer(watch, directory, own.env, experiment))
+            viewer = closing.enter_context(_viewer(watch, directory, own, experiment))
             before = None if viewer is None else _random_play(experiment, own, viewer)
             training = _train(
                 directory, experiment, own, viewer=viewer, checkpointer=checkpointer, began=began
@@ -187,7 +194,7 @@ def run(
         if at_end is not None:
             at_end(directory)
         if linger and viewer is not None:
-            stay_served(viewer.logger)
+            stay_served(viewer.logger, viewer.play_on)
     return directory
 
 
@@ -321,7 +328,7 @@ def _logger(logger: str | Custom, directory: Path, env: EnvBase) -> LoggerCallba
 
 
 def _viewer(
-    watch: str, directory: Path, env: EnvBase, experiment: Experiment
+    watch: str, directory: Path, own: _Made, experiment: Experiment
 ) -> AbstractContextManager[ViewerCallback | None]:
     if watch == "off":
         return nullcontext()
@@ -329,11 +336,12 @@ def _viewer(
     shown = {name: recipe.get(name) for name in ("command", "started", "git", "versions")}
     return ViewerCallback(
         directory,
-        env,
+        own.env,
         title=_title(experiment),
         episodes=experiment.episodes,
         recipe={**shown, **recipe["experiment"]},
         live=None if watch == "file" else watch,
+        exhibited=None if watch == "file" else exhibited(experiment, own.env, own.population),
     )
 
 

@@ -11,6 +11,7 @@ A new tab is a function of `Curves` that returns a view or None, named in `_TABS
 from collections.abc import Callable
 from typing import Any, Final, Literal
 
+from cprl.commons.colours import WINDOW_CAPTION
 from cprl.viewer.scenery import Curves, Scene
 
 _BACKGROUND: Final = (24, 26, 32)
@@ -118,7 +119,7 @@ def _windows(agents: tuple[str, ...]) -> Any:
     import rerun.blueprint as rrb
 
     seen = "What the agent sees" if len(agents) == 1 else "What each agent sees"
-    return rrb.Spatial2DView(name=seen, origin="/windows", background=_BACKGROUND)
+    return rrb.Spatial2DView(name=f"{seen}, {WINDOW_CAPTION}", origin="/windows", background=_BACKGROUND)
 
 
 def _events(timeline: str = "episode") -> Any:
