@@ -29,6 +29,7 @@ from cprl.viewer.recorder import FrameRecorder, scene_of
 from cprl.viewer.scenery import Curves
 from cprl.viewer.story import Story
 from cprl.viewer.tags import Tags
+from cprl.viewer.views import Views
 
 _SHOWN: Final[Mapping[str, tuple[str, ...]]] = {
     "phases and new bests": tuple(dict.fromkeys(entry for name in phases.METRICS for entry in METRICS[name])),
@@ -112,6 +113,9 @@ class ViewerCallback:
             if is_replay
             else Story(self.logger, curves, episodes=episodes, window=self.plots.window, game=game)
         )
+        self._views = Views(
+            commons, self.logger, curves if scene is None else scene, episodes=episodes, every=self.every
+        )
         has_tags = curves.has_tags and len(self._agents) > 1
         self._tags = Tags(self.logger, len(self._agents)) if has_tags else None
         self._step = self._episode = 0
@@ -131,16 +135,22 @@ class ViewerCallback:
         Otherwise it only counts: reading a tensor each turn would cost a training some percent.
         """
         self._step += 1
+        self._views.on_step(self._step, self._episode, self._record(batch))
+
+    def _record(self, batch: TensorDictBase) -> int | None:
+        """Copies a frame if this episode's are recorded; returns its number, None if there is none."""
         if self._recorder is None or not self.is_shown:
-            return
+            return None
         if keys.entry(keys.entry(batch, "next"), keys.DONE)[
             0, 0
         ]:  # the board is already that of the next episode
             self._send_frames()
-            return
+            return None
         self._recorder.add(batch, step=self._step, episode=self._episode)
+        frame = self.logger.frames + self._recorder.pending - 1
         if self._recorder.is_due:
             self._send_frames()
+        return frame
 
     def on_episode(self, episode: Episode, learning: Mapping[str, float]) -> None:
         """Logs the numbers of an episode, and its events, once all replicas have ended it."""
@@ -149,6 +159,7 @@ class ViewerCallback:
             self._episode, self._shows_next = episode.episode + 1, False
         if self._tags is not None and episode.tagged_by is not None:
             self._tags.add(episode.tagged_by)
+        self._views.on_episode(episode)
         numbers = numbers_of(episode, learning, self._agents)
         died = has_died(episode)
         of_all = self._series.add(
@@ -169,6 +180,7 @@ class ViewerCallback:
     def _log(self, episode: int, of_all: dict[str, Values]) -> None:
         now, died = time.perf_counter(), of_all.pop(_DIED, None)
         self.plots.on_episode(of_all)
+        self._views.on_all(episode)
         steps = (self._step - self._rate_step) * self._series.replicas
         if steps:
             self.logger.log_scalar("time/env_steps_per_s", steps / (now - self._rate_at))
@@ -203,6 +215,7 @@ class ViewerCallback:
             played: the episodes of its evaluation, "trained" and "random".
         """
         self._send_frames()
+        self._views.close()
         if self.story is not None:
             self.story.finished(played["trained"], played["random"])
         self.logger.close_file()
@@ -237,6 +250,7 @@ class ViewerCallback:
             "frames": self.logger.frames,
             "series": self._series.state_dict(),
             "plots": self.plots.state_dict(),
+            "views": self._views.state_dict(),
             "story": None if self.story is None else self.story.state_dict(),
             "tags": None if self._tags is None else self._tags.state_dict(),
         }
@@ -248,6 +262,7 @@ class ViewerCallback:
         self.logger.frames = int(state["frames"])
         self._series.load_state_dict(state["series"])
         self.plots.load_state_dict(state.get("plots", {}))
+        self._views.load_state_dict(state.get("views", {}))
         self.logger.at(step=self._step, episode=self._episode)
         if self.story is not None:
             self.story.load_state_dict(state["story"] or {})
@@ -265,6 +280,7 @@ class ViewerCallback:
         traceback: TracebackType | None,
     ) -> None:
         self._send_frames()
+        self._views.close()
         if self.story is not None:
             self.story.close()
         self.logger.shutdown()
