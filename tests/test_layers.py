@@ -45,6 +45,7 @@ PACKAGES = (
     "outcome",
     "running",
     "evaluation",
+    "play",
     "studies",
     "reporting",
     "flags",

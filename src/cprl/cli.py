@@ -19,6 +19,12 @@ from cprl.evaluation.film_video import SUFFIXES, film_video
 from cprl.evaluation.tables import agents_table, heading, matrices, run_table
 from cprl.experiment import Experiment
 from cprl.output import OUT, console, keep_output, say
+from cprl.play.opening import SEED as PLAY_SEED
+from cprl.play.opening import open_session
+from cprl.play.terminal import play_in_terminal
+from cprl.play.window import NoWindowError, play_in_window
+from cprl.play.wording import ending, results_text, state
+from cprl.presets import Variant
 from cprl.process import prepare_process
 from cprl.reporting import write_report
 from cprl.running import run as run_experiment
@@ -130,6 +136,58 @@ def film(
         path, played = film_run(run, out, replica=replica, episode=episode, allow=allow)
     say(f"{played.steps} steps, {played.outcome}")
     say(f"{path}: {path.stat().st_size / 1000:.0f} kB" if is_video else f"Watch: {viewer()} {path}")
+
+
+def play(
+    board: str,
+    /,
+    *,
+    agent: int = 0,
+    others: str | None = None,
+    replica: int = 0,
+    variant: Variant = "published",
+    steps: int | None = None,
+    seed: int = PLAY_SEED,
+    terminal: bool = False,
+    allow: Allow = (),
+) -> None:
+    """Lets you play among trained or scripted agents, a turn for each key, and measures the episode.
+
+    Args:
+        board: commons, two_complex, single_complex or single_basic; or the directory of a run, whose game it
+            is then; or a file with a drawing.
+        agent: yours.
+        others: the directory of a run, whose agents play, or random, greedy, sustainable, territorial,
+            aggressive or pacifist; by default the agents of the run that is the board, else greedy.
+        replica: of the run whose agents play.
+        variant: of the boards with a name, published or as_run; see docs/game.md.
+        steps: turns of the episode at most; by default those of the game.
+        seed: of all chance; the same seed and the same keys play the same again.
+        terminal: play in the terminal, by lines of keys; also without pygame (extra "play") or a display.
+        allow: code of your own, module:Class, that a run may import; see docs/changing.md.
+    """
+    _make_importable(allow)
+    prepare_process(seed)
+    session = open_session(
+        board,
+        agent=agent,
+        others=others,
+        replica=replica,
+        variant=variant,
+        steps=steps,
+        seed=seed,
+        allow=allow,
+    )
+    if not terminal:
+        try:
+            play_in_window(session, f"cprl play {board}")
+        except NoWindowError as error:
+            say(f"{error}; you play in the terminal")
+            terminal = True
+        else:
+            say(f"{state(session)}; {ending(session)}\n{results_text(session)}")
+    if terminal:
+        play_in_terminal(session)
 
 
 def watch(run: Path, /) -> None:
@@ -257,6 +315,7 @@ def main() -> None:
                 "run": run,
                 "watch": watch,
                 "film": film,
+                "play": play,
                 "report": report,
                 "export": export,
                 "evaluate": evaluate,

@@ -62,13 +62,14 @@ class EpisodePicture:
         self.size: tuple[int, int] = width, height + height % 2
         """The width and height in pixels, both even."""
 
-    def draw(self, moments: Sequence[Shown], title: str, *, note: str = "") -> Bytes:
+    def draw(self, moments: Sequence[Shown], title: str, *, note: str = "", own: int | None = None) -> Bytes:
         """The picture of the last of these moments.
 
         Args:
             moments: the episode so far: the board as it began, then after each turn.
             title: what is shown, above the board on the left; shortened where the room ends.
             note: what is to be said of this moment, after the turn above the board on the right.
+            own: the index of the agent that gets a white frame; None for no frame.
 
         Returns:
             uint8 [height, width, 3], RGB.
@@ -81,9 +82,20 @@ class EpisodePicture:
         if drawn.size != self._board_size:
             drawn = drawn.resize(self._board_size, Image.Resampling.BOX)
         image.paste(drawn, ((self.size[0] - self._board_size[0]) // 2, self._caption_height))
+        if own is not None and moments[-1].in_play[own]:
+            at = self.cell_box(int(moments[-1].row[own]), int(moments[-1].col[own]))
+            draw.rectangle(at, outline=_TEXT, width=max(1, self._unit // 6))
         self._plot_stock(draw, np.array([moment.stock.sum(dtype=np.int64) for moment in moments]))
         self._plot_harvests(draw, np.array([moment.harvested for moment in moments]))
         return np.asarray(image)
+
+    def cell_box(self, row: int, col: int) -> tuple[float, float, float, float]:
+        """Where a cell is in the picture: left, top, right and bottom in pixels."""
+        wide, high = self._board_size
+        left = (self.size[0] - wide) // 2
+        across, down = wide / self.board.width, high / self.board.height
+        top = self._caption_height + row * down
+        return left + col * across, top, left + (col + 1) * across, top + down
 
     def _caption(self, draw: ImageDraw.ImageDraw, title: str, turn: str) -> None:
         edge = self._unit // 2
