@@ -31,9 +31,9 @@ def test_every_logged_name_has_its_line_in_the_docs_and_the_other_way_round(tmp_
     }
     elsewhere = {
         *("evaluation/greedy_return", "tags", "phase/found"),
-        *("agent_<i>/harvested", "turn/stock", "windows/frames"),
+        *("agent_<i>/harvested", "turn/stock", "windows/frames", "world/marks"),
     }
-    assert logged == told - elsewhere, "by BestWeights, of many episodes (test_watch), of replays, or static"
+    assert logged == told - elsewhere, "by BestWeights, of many episodes or agents, of replays, static"
 
 
 def blocks():

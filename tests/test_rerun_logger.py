@@ -115,13 +115,12 @@ def test_frames_show_the_board_the_agents_and_what_each_sees(tmp_path):
             assert site in agents or inner[site] == (APPLE if apple else GROUND)
         assert {cell: inner[cell] for cell in agents} == agents
         assert (inner >= FIRST_AGENT).sum() == len(agents), "who is out of play is not drawn as if it were in"
-    _, places = column(path, "world/agents", "Arrows2D:origins")
-    assert places[1] == [[1 + 1.5, 0 + 1.5], [4 + 1.5, 1 + 1.5]]
-    _, headings = column(path, "world/agents", "Arrows2D:vectors")
-    assert headings[2] == [pytest.approx([0, 1.5]), [0, 0]], (
-        "heading 2 points down; who is out points nowhere"
-    )
-    assert static(path, "world/agents", "Arrows2D:labels") == ["0", "1"]
+    _, lines = column(path, "world/agents", "LineStrips2D:strips")
+    assert [len(drawn) for drawn in lines] == [4, 4, 2, 2, 2, 2], "a triangle and a digit an agent in play"
+    (_, tip, *_), _, digit, _ = (np.array(line) for line in lines[1])
+    assert (tip - (2.5, 1.5)).tolist() == pytest.approx([0.44, 0], abs=1e-6), "heading 1 points right"
+    assert (np.abs(digit - (2.5, 1.5)) < 0.5).all(), "the number is inside the cell"
+    assert digit[:, 0].max() < tip[0] - 0.2, "and behind the triangle"
     _, windows = column(path, "windows", "SegmentationImage:buffer")
     (_, _), (top, left) = window_corners(2, (3, 5))
     first = np.array(windows[0][0], np.uint8).reshape(3 + top, 5 + left)
