@@ -48,6 +48,7 @@ PACKAGES = (
     "outcome",
     "running",
     "evaluation",
+    "play",
     "studies",
     "reporting",
     "flags",
