@@ -46,6 +46,7 @@ PACKAGES = (
     "stored",
     "agents",
     "outcome",
+    "parts",
     "running",
     "evaluation",
     "play",

@@ -36,6 +36,7 @@ Each imports only from those above it:
     stored       load: a run built again from its directory
     agents       the learners and policies of a population
     outcome      trained agents in fresh worlds, beside the random policy
+    parts        what is made of an experiment before anything is written
     running      run: an experiment from its learners to its report
     evaluation   stored agents in fresh worlds, alone and among each other
     play         a person among trained or scripted agents
