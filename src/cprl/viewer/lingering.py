@@ -28,7 +28,8 @@ def check_linger(linger: bool, watch: str) -> None:
 
 
 def linger(logger: RerunLogger, play_on: Callable[[Event], None] | None = None) -> None:
-    """Says where the recording stays served, and waits for Ctrl-C (SIGINT) or SIGTERM; returns then.
+    """Says where the recording stays served, waits for Ctrl-C (SIGINT) or SIGTERM, and closes the recording;
+    a second signal in the meantime changes nothing.
 
     Args:
         logger: whose recording is served.
@@ -53,6 +54,7 @@ def linger(logger: RerunLogger, play_on: Callable[[Event], None] | None = None) 
             play_on(asked)
         while not asked.wait(1.0):
             pass
+        logger.shutdown()
     finally:
         for number, handler in usual.items():
             signal.signal(number, handler)

@@ -280,6 +280,14 @@ class RerunLogger(Logger):
         for each in self._streams:
             send_waiting(each)
 
+    def show_end(self) -> None:
+        """Gives the live view the layout of a run that has ended, with its phases."""
+        if self.curves.has_phases:
+            ended = layout(self.curves, live=True, ended=True)
+            for each in self._streams:
+                if isinstance(each, LiveStream):
+                    each.do(lambda recording: recording.send_blueprint(ended))
+
     @property
     def is_served(self) -> bool:
         """Whether viewers can still connect: the live stream is open and served."""

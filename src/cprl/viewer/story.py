@@ -134,6 +134,7 @@ class Story:
         within = {first: label for first, label in published.items() if first < self._ended}
         if within:
             self._logger.log_states(_PUBLISHED, within)
+        self._logger.show_end()
 
     def _document(self, line: str, *, of_mean: int | None = None) -> None:
         self._logger.log_document("header", self._text(line, of_mean=of_mean))
