@@ -47,6 +47,7 @@ PACKAGES = (
     "outcome",
     "running",
     "evaluation",
+    "play",
     "studies",
     "reporting",
     "flags",

@@ -30,6 +30,7 @@ from cprl.viewer.plots import Plots
 from cprl.viewer.recorder import FrameRecorder, scene_of
 from cprl.viewer.story import Story
 from cprl.viewer.tags import Tags
+from cprl.viewer.views import Views
 
 _DIED: Final = "died"
 """Among an episode's numbers, whether the board died early."""
@@ -115,6 +116,9 @@ class ViewerCallback:
             if is_replay
             else Story(self.logger, curves, episodes=episodes, window=self.plots.window, game=game)
         )
+        self._views = Views(
+            commons, self.logger, curves if scene is None else scene, episodes=episodes, every=self.every
+        )
         has_tags = curves.has_tags and len(self._agents) > 1
         self._tags = Tags(self.logger, len(self._agents)) if has_tags else None
         self._step = self._episode = 0
@@ -139,16 +143,22 @@ class ViewerCallback:
         self._step += 1
         if self.exhibition is not None:
             self.exhibition.on_step(episode=self._episode)
+        self._views.on_step(self._step, self._episode, self._record(batch))
+
+    def _record(self, batch: TensorDictBase) -> int | None:
+        """Copies a frame if this episode's are recorded; returns its number, None if there is none."""
         if self._recorder is None or not self.is_shown:
-            return
+            return None
         if keys.entry(keys.entry(batch, "next"), keys.DONE)[
             0, 0
         ]:  # the board is already that of the next episode
             self._send_frames()
-            return
+            return None
         self._recorder.add(batch, step=self._step, episode=self._episode)
+        frame = self.logger.frames + self._recorder.pending - 1
         if self._recorder.is_due:
             self._send_frames()
+        return frame
 
     def on_episode(self, episode: Episode, learning: Mapping[str, float]) -> None:
         """Logs the numbers of an episode, and its events, once all replicas have ended it."""
@@ -157,6 +167,7 @@ class ViewerCallback:
             self._episode, self._shows_next = episode.episode + 1, False
         if self._tags is not None and episode.tagged_by is not None:
             self._tags.add(episode.tagged_by)
+        self._views.on_episode(episode)
         numbers = numbers_of(episode, learning, self._agents)
         died = has_died(episode)
         of_all = self._series.add(
@@ -183,6 +194,7 @@ class ViewerCallback:
     def _log(self, episode: int, of_all: dict[str, Values]) -> None:
         now, died = time.perf_counter(), of_all.pop(_DIED, None)
         self.plots.on_episode(of_all)
+        self._views.on_all(episode)
         steps = (self._step - self._rate_step) * self._series.replicas
         if steps:
             self.logger.log_scalar("time/env_steps_per_s", steps / (now - self._rate_at))
@@ -217,6 +229,7 @@ class ViewerCallback:
             played: the episodes of its evaluation, "trained" and "random".
         """
         self._send_frames()
+        self._views.close()
         if self.story is not None:
             self.story.finished(played["trained"], played["random"])
         self.logger.close_file()
@@ -260,6 +273,7 @@ class ViewerCallback:
             "frames": self.logger.frames,
             "series": self._series.state_dict(),
             "plots": self.plots.state_dict(),
+            "views": self._views.state_dict(),
             "story": None if self.story is None else self.story.state_dict(),
             "tags": None if self._tags is None else self._tags.state_dict(),
         }
@@ -271,6 +285,7 @@ class ViewerCallback:
         self.logger.frames = int(state["frames"])
         self._series.load_state_dict(state["series"])
         self.plots.load_state_dict(state.get("plots", {}))
+        self._views.load_state_dict(state.get("views", {}))
         self.logger.at(step=self._step, episode=self._episode)
         if self.story is not None:
             self.story.load_state_dict(state["story"] or {})
@@ -293,6 +308,7 @@ class ViewerCallback:
     ) -> None:
         self._stop_notice()
         self._send_frames()
+        self._views.close()
         if self.story is not None:
             self.story.close()
         self.logger.shutdown()

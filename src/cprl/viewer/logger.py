@@ -16,7 +16,7 @@ from cprl.arguments import object_of
 from cprl.arguments import path as path_of
 from cprl.checks import NONE, TEXT, check_nesting, checked, either
 from cprl.output import console as safe_console
-from cprl.viewer.batches import log_now, send_waiting, times
+from cprl.viewer.batches import Numbers, log_now, send_waiting, times
 from cprl.viewer.blueprint import layout
 from cprl.viewer.deadline import release
 from cprl.viewer.names import FILE_NAME
@@ -150,6 +150,28 @@ class RerunLogger(Logger):
 
     def _send(self, entity: str, at: list[Any], what: Any) -> None:
         self._all(lambda recording: recording.send_columns(entity, at, what))
+
+    @property
+    def is_live(self) -> bool:
+        """Whether there is a stream to viewers."""
+        return any(isinstance(each, LiveStream) for each in self._streams)
+
+    def log_static(self, name: str, *what: Any) -> None:
+        """Logs archetypes that hold at all times."""
+        self._static(name, *what)
+
+    def log_row(self, name: str, what: Any) -> None:
+        """Logs an archetype at the time set by `at`."""
+        now = (*self._now, self.frames)
+        self._all(lambda recording: log_now(recording, name, what, now))
+
+    def log_columns(
+        self, name: str, at: tuple[Numbers, Numbers, Numbers], what: Any, *, live_only: bool = False
+    ) -> None:
+        """Logs rows at steps, episodes and frames of their own; `live_only` for viewers alone."""
+        for each in self._streams:
+            if isinstance(each, LiveStream) or not live_only:
+                each.do(lambda recording: recording.send_columns(name, times(*at), what))
 
     def at(self, *, step: int, episode: int) -> None:
         """Sets the time of subsequent logs that have no step of their own."""

@@ -59,6 +59,11 @@ class FrameRecorder:
         waited = time.perf_counter() - self._sent
         return self._buffer.is_full or (waited > _PERIOD_S and self._buffer.size >= _FEWEST_FRAMES)
 
+    @property
+    def pending(self) -> int:
+        """Frames that wait to be sent."""
+        return self._buffer.size
+
     def add(self, batch: TensorDictBase, *, step: int, episode: int) -> None:
         """Copies a frame; `batch` is the latest step."""
         if self._has_tags:

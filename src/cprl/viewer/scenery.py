@@ -40,6 +40,8 @@ RANDOM_PLAY: Final = "random_play"
 """The folder of the lines of random play; each has the name of its metric."""
 ANOTHER: Final = "another"
 """The name of a phase that matches no pattern of the study."""
+BACKGROUND: Final = (24, 26, 32)
+"""The background of boards and windows, which sets their dark cells apart from the viewer's own colour."""
 STATES: Final = {
     "exploration": (86, 180, 233),
     "tragedy": (213, 94, 0),
@@ -93,6 +95,16 @@ class Scene(Curves):
     is_replay: bool = False
     """Whether it is one episode of a stored policy; then harvest and stock are plotted turn by turn, and
     there are no curves over episodes."""
+
+
+def has_lorenz(curves: Curves) -> bool:
+    """Whether there is a harvest, and somebody to share it with."""
+    return "equality" in curves.metrics and len(curves.agents) > 1
+
+
+def has_wall(curves: Curves) -> bool:
+    """Whether there are boards, and more than the one that is shown anyway."""
+    return isinstance(curves, Scene) and curves.replicas > 1
 
 
 def classes(curves: Curves) -> Any:

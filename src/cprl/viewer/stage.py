@@ -31,16 +31,18 @@ def frame_bytes(scene: Scene) -> float:
     return 80 + 45 * len(scene.agents) + 0.35 * (rows * columns + scene.height * scene.width)
 
 
+def image_form(size: tuple[int, int]) -> Any:
+    """The format of an image of classes with so many rows and columns."""
+    import rerun as rr
+
+    return rr.components.ImageFormat(width=size[1], height=size[0], channel_datatype=rr.ChannelDatatype.U8)
+
+
 def fixed(scene: Scene) -> dict[str, list[Any]]:
     """The static parts of a recording, by entity: sizes of images, agents' names, colours and frames."""
     import rerun as rr
 
-    def form(size: tuple[int, int]) -> Any:
-        return rr.components.ImageFormat(
-            width=size[1], height=size[0], channel_datatype=rr.ChannelDatatype.U8
-        )
-
-    image = rr.SegmentationImage.from_fields
+    form, image = image_form, rr.SegmentationImage.from_fields
     board = form((scene.height + 2 * RIM_CELLS, scene.width + 2 * RIM_CELLS))
     agents, (rows, columns) = len(scene.agents), scene.window
     colours = [agent_colour(agent) for agent in range(agents)]
