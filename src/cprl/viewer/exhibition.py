@@ -17,7 +17,7 @@ from cprl.commons.game import Game
 from cprl.envs.state import load_transforms_state, transforms_state
 from cprl.envs.unwrap import commons_of
 from cprl.viewer.recorder import FrameRecorder
-from cprl.viewer.scenery import Scene
+from cprl.viewer.scenery import BACKGROUND, Scene
 from cprl.viewer.stage import RIM_CELLS, board_columns, fixed
 from cprl.viewer.streams import Live
 
@@ -34,8 +34,9 @@ EVERY_STEPS: Final = 11
 _BOARD: Final = "world"
 """Where the entities of the recorded board are."""
 
-_CAPTION_CELLS: Final = 0.4
-"""The distance of the caption from the board, in cells."""
+_CAPTION_CELLS, _ROOM_CELLS = 0.4, 2.4
+"""The distances from the board to the caption and to the line that gives it room, in cells."""
+_THIN: Final = 0.01
 
 
 class Exhibited(Protocol):
@@ -105,6 +106,8 @@ class Exhibition:
         for entity, parts in fixed(scene).items():
             if live.stream is not None and entity.startswith(f"{_BOARD}/"):
                 live.stream.do(_log(_renamed(entity), *parts))
+        if live.stream is not None:
+            live.stream.do(_log("exhibition/room", _room(scene)))
         if live.exhibition is not None:  # before anything is compiled, which takes half a minute at first
             live.exhibition.do(partial(_send, scene=scene, frames=_before_the_first_step(commons.game)))
             self._send_caption(0)
@@ -174,7 +177,7 @@ class Exhibition:
 
         self._caption = caption
         place = (self._scene.width / 2 + RIM_CELLS, self._scene.height + 2 * RIM_CELLS + _CAPTION_CELLS)
-        what = rr.Points2D([place], labels=[caption], show_labels=True, radii=0, colors=[(255, 255, 255)])
+        what = rr.Points2D([place], labels=[caption], show_labels=True, radii=_THIN, colors=[(255, 255, 255)])
         if self._live.exhibition is not None:
             self._live.exhibition.do(_log("exhibition/caption", what))
 
@@ -186,6 +189,15 @@ def caption_of(policy: Exhibited, episode: int) -> str:
     shown = list(dict.fromkeys(f"{epsilon:.2f}" for epsilon in policy.epsilons))
     chance = f", epsilon {' to '.join(dict.fromkeys((shown[0], shown[-1])))}" if shown else ""
     return f"{'trained' if policy.is_trained else 'present'} policy, episode {episode:,}{chance}"
+
+
+def _room(scene: Scene) -> Any:
+    """A line below the board in the colour of the background: the view makes room for what it shows."""
+    import rerun as rr
+
+    low = scene.height + 2 * RIM_CELLS + _ROOM_CELLS
+    ends = [(0.0, low), (scene.width + 2 * RIM_CELLS, low)]
+    return rr.LineStrips2D([ends], radii=_THIN, colors=[BACKGROUND])
 
 
 def _before_the_first_step(game: Game) -> dict[str, NDArray[Any]]:
