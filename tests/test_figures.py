@@ -195,6 +195,7 @@ def test_a_game_without_a_harvest_has_one_panel_and_an_agents_colour_has_an_edge
     training_curve(table, title="matrix")
     assert [axes.get_ylabel() for axes in drawn[0].axes] == ["return of all agents together"]
     assert len(style.on_white(2)["path_effects"]) == 2
+    assert style.on_white(0)["linestyle"] != style.on_white(4)["linestyle"], "its colour may be the same"
 
 
 def test_a_figure_is_written_with_150_dots_an_inch_and_a_long_title_wraps(tmp_path):
@@ -250,4 +251,15 @@ def test_a_figure_beside_the_published_curve_says_how_both_are_smoothed(tmp_path
     assert told[:4] == ["ours, each replica", "ours, 95 % interval", "ours, mean of 3 replicas", "published"]
     assert "exploration ends, episode 101" in told
     assert "phase: tragedy" in told, "of the published strip; 300 episodes have no phases of their own"
+    see_that_the_legend_is_whole(drawn[0])
+
+
+def test_one_replica_has_no_interval_and_an_experiment_of_ones_own_no_published_curve(tmp_path, drawn):
+    result = a_result("a", "commons", 500.0)
+    result.study = None
+    result.curves = {name: values[:1] for name, values in result.curves.items()}
+    (path,) = [path for _, _, path in reported.draw_figures([result], tmp_path)]
+    assert path.name == "a_collective_return.png"
+    assert labels(drawn[0]) == ["ours, one replica", "exploration ends, episode 101"]
+    assert note(drawn[0]) == "Running means over the episodes that follow: ours over 100."
     see_that_the_legend_is_whole(drawn[0])

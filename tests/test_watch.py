@@ -2,6 +2,7 @@
 
 import contextlib
 import os
+import shutil
 import socket
 import subprocess
 import sys
@@ -276,6 +277,25 @@ def test_a_run_that_is_gone_on_with_adds_a_file_of_the_same_recording(tmp_path):
     assert (episodes, values) == ([1], [[4.0, 6.0, 5.0, 4.0]]), "the running mean goes on from 3"
 
 
+def see_the_first_episode(recording):
+    """Its frames are in a file that was not closed."""
+    rr.set_strict_mode(False)
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", rr.error_utils.RerunWarning)  # such a file has no footer
+        steps, _ = column(recording, "world/board", "SegmentationImage:buffer")
+    assert len(steps) >= 19, "the frames of the first episode were sent when it ended"
+    assert steps == sorted(steps)
+
+
+def test_the_file_of_a_run_that_goes_on_holds_all_up_to_its_last_flush(tmp_path):
+    """As it is left by a process that is killed."""
+    left = tmp_path / "left.rrd"
+    course(tmp_path, others=[Doing(150, lambda: shutil.copy(tmp_path / "run.rrd", left))])
+    see_the_first_episode(left)
+    assert left.stat().st_size < (tmp_path / "run.rrd").stat().st_size
+
+
+@pytest.mark.slow
 def test_a_killed_run_leaves_a_recording_up_to_its_last_flush(tmp_path):
     script = f"""
 import sys; sys.path.insert(0, {str(Path(__file__).parent)!r})
@@ -287,9 +307,4 @@ course(Path({str(tmp_path)!r}), episodes=10**6, others=[Doing(150, lambda: print
     assert any(line == "going\n" for line in process.stdout)
     process.kill()
     process.communicate()
-    rr.set_strict_mode(False)
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore", rr.error_utils.RerunWarning)  # a killed run's file has no footer
-        steps, _ = column(tmp_path / "run.rrd", "world/board", "SegmentationImage:buffer")
-    assert len(steps) >= 19, "the frames of the first episode were sent when it ended"
-    assert steps == sorted(steps)
+    see_the_first_episode(tmp_path / "run.rrd")

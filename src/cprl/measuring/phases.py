@@ -116,7 +116,7 @@ def find_phases(
     episodes: ArrayLike, metrics: Mapping[str, ArrayLike], *, number: int = 3, resamples: int = 200
 ) -> tuple[list[ChangePoint], list[Phase]]:
     """Finds `number` change points and the phases between them; see `change_points` and `phases`."""
-    number = arguments.integer("number", number, 0)
+    number, resamples = arguments.integer("number", number, 0), arguments.integer("resamples", resamples, 1)
     changes = change_points(episodes, metrics, number=number, resamples=resamples) if number else []
     return changes, phases(episodes, metrics, changes)
 
