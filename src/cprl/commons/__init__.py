@@ -2,7 +2,6 @@
 
 In reading order:
 
-    checks       checks of arguments, and their messages
     rules        every number of the game, with unit, range and source
     maps         boards: drawn, named or generated
     observation  what agents observe, and in which form
@@ -25,5 +24,6 @@ In reading order:
     state        reads, checks and restores the state of B worlds
     batch        Batch: B worlds, played a turn at a time
     decoding     observations back to classes of cells
+    sprites      agents as they are drawn: number, heading and second mark
     picture      an image of the board for people
 """

@@ -11,10 +11,11 @@ A new tab is a function of `Curves` that returns a view or None, named in `_TABS
 from collections.abc import Callable
 from typing import Any, Final, Literal
 
-from cprl.viewer.scenery import Curves, Scene
+from cprl.commons.colours import WINDOW_CAPTION
+from cprl.viewer.axes import BOUNDS
+from cprl.viewer.panels import Panels
+from cprl.viewer.scenery import BACKGROUND, Curves, Scene, has_lorenz, has_wall
 
-_BACKGROUND: Final = (24, 26, 32)
-"""The background of boards and windows, which sets their dark cells apart from the viewer's own colour."""
 _HEADER, _STRIP, _VIEW = 97, 40, 207
 """Heights in a window of 1280 x 720, in pixels: the header, a strip, boards or plots. The rows share out any
 other height as they do this one."""
@@ -73,7 +74,7 @@ def _replay(agents: tuple[str, ...]) -> Any:
     return rrb.Horizontal(
         rrb.Vertical(_world(), rrb.Tabs(_events(), _recipe(), active_tab=0), row_shares=[7, 2]),
         rrb.Vertical(
-            _windows(agents),
+            _windows(is_wide=True),
             _plot("Harvest so far, apples", *_of(agents, "harvested")),
             _plot("Apples on the board", "turn/stock"),
             row_shares=[4, 3, 2],
@@ -95,7 +96,7 @@ def _top(curves: Curves, *, live: bool) -> Any:
     if not isinstance(curves, Scene):
         return _events()
     boards = _boards(live=live)
-    return rrb.Horizontal(boards, _windows(curves.agents), _events(), column_shares=[5, 3, 3])
+    return rrb.Horizontal(boards, _windows(), _events(), column_shares=[5, 3, 3])
 
 
 def _boards(*, live: bool) -> Any:
@@ -104,21 +105,22 @@ def _boards(*, live: bool) -> Any:
 
     if not live:
         return _world()
-    present = rrb.Spatial2DView(name="Present policy", origin="/exhibition", background=_BACKGROUND)
+    present = rrb.Spatial2DView(name="Present policy", origin="/exhibition", background=BACKGROUND)
     return rrb.Tabs(present, _world("Recorded episodes"), active_tab=0)
 
 
 def _world(name: str = "Board") -> Any:
     import rerun.blueprint as rrb
 
-    return rrb.Spatial2DView(name=name, origin="/world", background=_BACKGROUND)
+    return rrb.Spatial2DView(name=name, origin="/world", background=BACKGROUND)
 
 
-def _windows(agents: tuple[str, ...]) -> Any:
+def _windows(*, is_wide: bool = False) -> Any:
+    """The windows, with the caption that fits."""
     import rerun.blueprint as rrb
 
-    seen = "What the agent sees" if len(agents) == 1 else "What each agent sees"
-    return rrb.Spatial2DView(name=seen, origin="/windows", background=_BACKGROUND)
+    name = f"What agents see, {WINDOW_CAPTION}" if is_wide else "Windows: self blue, others red"
+    return rrb.Spatial2DView(name=name, origin="/windows", background=BACKGROUND)
 
 
 def _events() -> Any:
@@ -198,9 +200,51 @@ def _recipe(curves: Curves | None = None) -> Any:
     return rrb.TextDocumentView(name="Recipe", origin="/recipe")
 
 
+def _fates(curves: Curves) -> Any:
+    """All boards at once, and how long each replica's apples lasted."""
+    if not isinstance(curves, Scene):
+        return None
+    wall = _panels("All replicas; framed: died in its last episode", "wall", curves, curves.replicas)
+    return _row(
+        "Replicas",
+        wall if has_wall(curves) else None,
+        _drawn("Apples on the board, over the turn", "turn"),
+    )
+
+
+def _places(curves: Curves) -> Any:
+    """Where agents go, and how evenly they share."""
+    name = "Where agents go, first replica; bright: long"
+    return _row(
+        "Places and shares",
+        _panels(name, "visits", curves, len(curves.agents)) if isinstance(curves, Scene) else None,
+        _drawn("Lorenz curve: harvest in %", "lorenz") if has_lorenz(curves) else None,
+    )
+
+
+def _panels(name: str, origin: str, scene: Scene, count: int) -> Any:
+    """A view of several boards."""
+    bounds = Panels(count, (scene.height + 2, scene.width + 2)).bounds
+    return _flat(name, origin, bounds)
+
+
+def _drawn(name: str, origin: str) -> Any:
+    """A view of a plot that is drawn with `Axes`."""
+    return _flat(name, origin, BOUNDS)
+
+
+def _flat(name: str, origin: str, bounds: tuple[tuple[float, float], tuple[float, float]]) -> Any:
+    import rerun.blueprint as rrb
+
+    visible = rrb.VisualBounds2D(x_range=bounds[0], y_range=bounds[1])
+    return rrb.Spatial2DView(name=name, origin=f"/{origin}", background=BACKGROUND, visual_bounds=visible)
+
+
 _TABS: Final[tuple[Callable[[Curves], Any], ...]] = (
     _outcome,
     _agents,
+    _fates,
+    _places,
     _learning,
     _more,
     _speed,

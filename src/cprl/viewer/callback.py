@@ -3,6 +3,7 @@
 import time
 from collections.abc import Mapping, Sequence
 from pathlib import Path
+from threading import Event
 from types import TracebackType
 from typing import Any, Final, Self
 
@@ -21,6 +22,7 @@ from cprl.measuring.reported import reported_by
 from cprl.measuring.series import Series, Values, numbers_of
 from cprl.viewer.compiling import CompilingNotice
 from cprl.viewer.contents import curves_of, missing_in
+from cprl.viewer.exhibition import Exhibited, Exhibition
 from cprl.viewer.header import has_died
 from cprl.viewer.logger import RerunLogger
 from cprl.viewer.names import FILE_NAME, free_name, recording_id
@@ -28,6 +30,7 @@ from cprl.viewer.plots import Plots
 from cprl.viewer.recorder import FrameRecorder, scene_of
 from cprl.viewer.story import Story
 from cprl.viewer.tags import Tags
+from cprl.viewer.views import Views
 
 _DIED: Final = "died"
 """Among an episode's numbers, whether the board died early."""
@@ -52,6 +55,8 @@ class ViewerCallback:
         episodes: the number of episodes of the run; determines how often frames are recorded.
         recipe: the recipe that the viewer shows.
         live: "serve", "spawn" or "connect ADDRESS", see `cprl.viewer.streams`; None for the file alone.
+        exhibited: what is exhibited live: the present policy and one world for it, see
+            `cprl.viewer.exhibition`.
         file_name: the name of the recording instead of `run.rrd`; there must be no such file.
         is_replay: whether a stored policy is replayed, see `cprl.viewer.scenery.Scene`.
         console: the console for the addresses; by default standard output.
@@ -66,6 +71,7 @@ class ViewerCallback:
         episodes: int,
         recipe: Mapping[str, object] | None = None,
         live: str | None = None,
+        exhibited: tuple[Exhibited, EnvBase] | None = None,
         file_name: str | None = None,
         is_replay: bool = False,
         console: Console | None = None,
@@ -86,6 +92,7 @@ class ViewerCallback:
             scene=scene,
             curves=curves,
             live=live,
+            exhibits=exhibited is not None and scene is not None,
             file_name=file_name or free_name(run),
             recording_id=recording_id(run, file_name or FILE_NAME),
             console=console,
@@ -95,6 +102,10 @@ class ViewerCallback:
             if commons is None or scene is None
             else FrameRecorder(commons, episodes=episodes, scene=scene)
         )
+        self.exhibition: Exhibition | None = None
+        """What the present policy plays for viewers; None where nothing is exhibited."""
+        if exhibited is not None and scene is not None:
+            self.exhibition = Exhibition(*exhibited, trained=env, scene=scene, live=self.logger.live)
         self.every = 0 if self._recorder is None else self._recorder.every
         """Episodes from one with frames to the next; 0 for no frames."""
         self._series = Series(curves.replicas)
@@ -104,6 +115,9 @@ class ViewerCallback:
             None
             if is_replay
             else Story(self.logger, curves, episodes=episodes, window=self.plots.window, game=game)
+        )
+        self._views = Views(
+            commons, self.logger, curves if scene is None else scene, episodes=episodes, every=self.every
         )
         has_tags = curves.has_tags and len(self._agents) > 1
         self._tags = Tags(self.logger, len(self._agents)) if has_tags else None
@@ -116,6 +130,8 @@ class ViewerCallback:
         missing = missing_in(reported, has_board=scene is not None)
         if missing:
             self.logger.log_text(missing)
+        if live and scene is None:
+            self.logger.log_text("no exhibition: the game has no board")
         self.log_status("begins")
         self._compiling = CompilingNotice(self._show_status) if live else None
 
@@ -125,16 +141,24 @@ class ViewerCallback:
         Otherwise it only counts: reading a tensor each turn would cost a training some percent.
         """
         self._step += 1
+        if self.exhibition is not None:
+            self.exhibition.on_step(episode=self._episode)
+        self._views.on_step(self._step, self._episode, self._record(batch))
+
+    def _record(self, batch: TensorDictBase) -> int | None:
+        """Copies a frame if this episode's are recorded; returns its number, None if there is none."""
         if self._recorder is None or not self.is_shown:
-            return
+            return None
         if keys.entry(keys.entry(batch, "next"), keys.DONE)[
             0, 0
         ]:  # the board is already that of the next episode
             self._send_frames()
-            return
+            return None
         self._recorder.add(batch, step=self._step, episode=self._episode)
+        frame = self.logger.frames + self._recorder.pending - 1
         if self._recorder.is_due:
             self._send_frames()
+        return frame
 
     def on_episode(self, episode: Episode, learning: Mapping[str, float]) -> None:
         """Logs the numbers of an episode, and its events, once all replicas have ended it."""
@@ -143,6 +167,7 @@ class ViewerCallback:
             self._episode, self._shows_next = episode.episode + 1, False
         if self._tags is not None and episode.tagged_by is not None:
             self._tags.add(episode.tagged_by)
+        self._views.on_episode(episode)
         numbers = numbers_of(episode, learning, self._agents)
         died = has_died(episode)
         of_all = self._series.add(
@@ -169,6 +194,7 @@ class ViewerCallback:
     def _log(self, episode: int, of_all: dict[str, Values]) -> None:
         now, died = time.perf_counter(), of_all.pop(_DIED, None)
         self.plots.on_episode(of_all)
+        self._views.on_all(episode)
         steps = (self._step - self._rate_step) * self._series.replicas
         if steps:
             self.logger.log_scalar("time/env_steps_per_s", steps / (now - self._rate_at))
@@ -203,6 +229,7 @@ class ViewerCallback:
             played: the episodes of its evaluation, "trained" and "random".
         """
         self._send_frames()
+        self._views.close()
         if self.story is not None:
             self.story.finished(played["trained"], played["random"])
         self.logger.close_file()
@@ -210,6 +237,11 @@ class ViewerCallback:
     def log_event(self, event: str) -> None:
         """Logs an event as text."""
         self.logger.log_text(event)
+
+    def play_on(self, stop: Event) -> None:
+        """Exhibits the trained policy until the event is set; returns at once where nothing is exhibited."""
+        if self.exhibition is not None:
+            self.exhibition.play_on(stop, episode=self._episode)
 
     @property
     def is_shown(self) -> bool:
@@ -241,6 +273,7 @@ class ViewerCallback:
             "frames": self.logger.frames,
             "series": self._series.state_dict(),
             "plots": self.plots.state_dict(),
+            "views": self._views.state_dict(),
             "story": None if self.story is None else self.story.state_dict(),
             "tags": None if self._tags is None else self._tags.state_dict(),
         }
@@ -252,6 +285,7 @@ class ViewerCallback:
         self.logger.frames = int(state["frames"])
         self._series.load_state_dict(state["series"])
         self.plots.load_state_dict(state.get("plots", {}))
+        self._views.load_state_dict(state.get("views", {}))
         self.logger.at(step=self._step, episode=self._episode)
         if self.story is not None:
             self.story.load_state_dict(state["story"] or {})
@@ -274,6 +308,7 @@ class ViewerCallback:
     ) -> None:
         self._stop_notice()
         self._send_frames()
+        self._views.close()
         if self.story is not None:
             self.story.close()
         self.logger.shutdown()

@@ -1,11 +1,21 @@
 """The contents of a recording, with their names and colours."""
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any, Final
 
 import numpy as np
 
-from cprl.commons.colours import FIRST_AGENT, agent_colour, class_colour, class_name
+from cprl.commons.colours import (
+    APPLE,
+    FIRST_AGENT,
+    PALETTE,
+    Colour,
+    agent_colour,
+    class_colour,
+    class_name,
+    picture_colour,
+)
 from cprl.commons.decoding import UNSEEN
 from cprl.measuring import now
 
@@ -17,19 +27,21 @@ SOCIAL: Final = {
     "social/survival_steps": ("survival", (230, 120, 0)),
     "social/peace": ("peace", (204, 121, 167)),
     "social/peacefulness": ("peacefulness", (204, 121, 167)),
-    "social/stock_left": ("apples left", (0, 200, 0)),
+    "social/stock_left": ("apples left", PALETTE[APPLE]),
 }
 """The name and colour of each line, because viewers assign different colours; agents have their own."""
 OTHERS: Final = {
     "time/env_steps_per_s": ("steps per second", (150, 150, 150)),
     "evaluation/greedy_return": ("greedy, evaluated", (230, 160, 0)),
-    "turn/stock": ("apples", (0, 200, 0)),
+    "turn/stock": ("apples", PALETTE[APPLE]),
 }
 OF_AGENTS: Final = ("return", "loss", "epsilon", "q", "harvested")
 RANDOM_PLAY: Final = "random_play"
 """The folder of the lines of random play; each has the name of its metric."""
 ANOTHER: Final = "another"
 """The name of a phase that matches no pattern of the study."""
+BACKGROUND: Final = (24, 26, 32)
+"""The background of boards and windows, which sets their dark cells apart from the viewer's own colour."""
 STATES: Final = {
     "exploration": (86, 180, 233),
     "tragedy": (213, 94, 0),
@@ -85,12 +97,31 @@ class Scene(Curves):
     there are no curves over episodes."""
 
 
+def has_lorenz(curves: Curves) -> bool:
+    """Whether there is a harvest, and somebody to share it with."""
+    return "equality" in curves.metrics and len(curves.agents) > 1
+
+
+def has_wall(curves: Curves) -> bool:
+    """Whether there are boards, and more than the one that is shown anyway."""
+    return isinstance(curves, Scene) and curves.replicas > 1
+
+
 def classes(curves: Curves) -> Any:
-    """Names and colours of the classes on boards and in windows."""
+    """Names and colours of the classes on boards."""
+    return _classes(curves, picture_colour)
+
+
+def window_classes(curves: Curves) -> Any:
+    """Names of the classes in windows, in the study's colours."""
+    return _classes(curves, class_colour)
+
+
+def _classes(curves: Curves, colour_of: Callable[[int], Colour]) -> Any:
     import rerun as rr
 
     known = [
-        rr.AnnotationInfo(id=kind, label=class_name(kind), color=class_colour(kind))
+        rr.AnnotationInfo(id=kind, label=class_name(kind), color=colour_of(kind))
         for kind in range(FIRST_AGENT + len(curves.agents))
     ]
     return rr.AnnotationContext([*known, rr.AnnotationInfo(id=UNSEEN, label="", color=(0, 0, 0, 0))])
