@@ -191,7 +191,7 @@ def _more(curves: Curves) -> Any:
 
 
 def _speed(curves: Curves) -> Any:
-    return _plot("Speed", "time/env_steps_per_s")
+    return _plot("Steps per second", "time/env_steps_per_s")
 
 
 def _recipe(curves: Curves | None = None) -> Any:
