@@ -7,6 +7,12 @@ Modules, in the order in which one reads them:
     events     new bests, and phases
     plots      the lines of each episode, with running means and random play
     tags       who tagged whom
+    views      the views below: which of them a training has, and when they are logged
+    wall       the boards of all replicas
+    visits     where agents go
+    turns      the stock over the turn
+    lorenz     Lorenz curve and Gini coefficient
+    decisions  in a replay: what each agent's policy says of its actions
     recorder   which episodes are recorded frame by frame
     frames     frames of one world, collected in memory
     logger     RerunLogger: TorchRL's logger interface on a recording
@@ -16,6 +22,9 @@ Modules, in the order in which one reads them:
     streams    to a file, and served live
     deadline   calls that may wait for a viewer, with deadlines
     scenery    names and colours of what a recording shows
+    panels     several boards in one image
+    axes       plots that are not over time
+    strokes    numbers, headings and marks of agents, as lines
     stage      frames as Rerun's columns
     blueprint  the layout of the viewer
 """

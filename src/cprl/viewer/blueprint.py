@@ -13,7 +13,7 @@ from typing import Any, Final, Literal
 
 from cprl.commons.colours import WINDOW_CAPTION
 from cprl.viewer.axes import BOUNDS
-from cprl.viewer.panels import Panels
+from cprl.viewer.panels import Panels, decision_panels
 from cprl.viewer.scenery import BACKGROUND, Curves, Scene, has_lorenz, has_wall
 
 _HEADER, _STRIP, _VIEW = 97, 40, 207
@@ -35,7 +35,7 @@ def layout(curves: Curves, *, live: bool = False) -> Any:
     import rerun.blueprint as rrb
 
     if isinstance(curves, Scene) and curves.is_replay:
-        return _laid_out(_replay(curves.agents), timeline="frame", play_state="playing")
+        return _laid_out(_replay(curves), timeline="frame", play_state="playing")
     strips = 3 if curves.has_phases else 1
     return _laid_out(
         rrb.Vertical(
@@ -66,7 +66,7 @@ def _laid_out(views: Any, *, timeline: str, play_state: Literal["playing", "foll
     )
 
 
-def _replay(agents: tuple[str, ...]) -> Any:
+def _replay(scene: Scene) -> Any:
     """A large board, the agents' windows, and the harvest and stock of one episode, turn by turn."""
     import rerun.blueprint as rrb
 
@@ -74,12 +74,19 @@ def _replay(agents: tuple[str, ...]) -> Any:
         rrb.Vertical(_world(), _texts("step"), row_shares=[7, 2]),
         rrb.Vertical(
             _windows(is_wide=True),
-            _plot("Harvest so far, apples", *_of(agents, "harvested")),
+            _decisions(scene),
+            _plot("Harvest so far, apples", *_of(scene.agents, "harvested")),
             _plot("Apples on the board", "turn/stock"),
-            row_shares=[4, 3, 2],
+            row_shares=[4, 3, 2, 2],
         ),
         column_shares=[3, 2],
     )
+
+
+def _decisions(scene: Scene) -> Any:
+    """What the agents choose by, arranged as their windows."""
+    bounds = decision_panels(len(scene.agents), scene.actions, scene.window).bounds
+    return _flat("What policies say (L, R turn, B beam, S stay), taken: white", "decisions", bounds)
 
 
 def _header() -> Any:
