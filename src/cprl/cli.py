@@ -47,6 +47,7 @@ def run(
     take_over: bool = False,
     keep_checkpoint: bool = True,
     watch: str = "file",
+    linger: bool = False,
     allow: Allow = (),
 ) -> None:
     """Trains the experiment of a recipe or of a run anew, or resumes a run that was stopped.
@@ -59,6 +60,7 @@ def run(
         take_over: resume a run that a process on another host has locked.
         keep_checkpoint: keep the state of the training of a finished run, so that it can be extended.
         watch: "file", or live as well: "serve", "spawn", "connect ADDRESS"; "off" for no recording.
+        linger: keep the recording served after the run, until Ctrl-C; with --watch serve or spawn.
         allow: code of your own, module:Class, that the recipe may import; may be repeated.
     """
     _make_importable(allow)
@@ -75,6 +77,7 @@ def run(
         take_over=take_over,
         keep_checkpoint=keep_checkpoint,
         watch=watch,
+        linger=linger,
         allow=allow,
         command=sys.argv,
     )

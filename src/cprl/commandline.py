@@ -51,6 +51,8 @@ class RunOptions:
     """Keep the state of the training of a finished run, buffers included, so that it can be extended."""
     watch: str = "file"
     """"file", or live as well: "serve", "spawn", "connect ADDRESS"; "off" for no recording."""
+    linger: bool = False
+    """Keep the recording served after the run is finished, until Ctrl-C; with watch "serve" or "spawn"."""
     allow: tyro.conf.UseAppendAction[tuple[str, ...]] = ()
     """A class of somebody's own that a frozen agent's run may import, "module:Class"; may be repeated."""
 

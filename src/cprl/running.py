@@ -21,7 +21,8 @@ from cprl.envs.state import check_restorable, transforms_state
 from cprl.envs.unwrap import agent_names, commons_of
 from cprl.experiment import Experiment
 from cprl.finite import summary
-from cprl.outcome import evaluate_population, exploration, fresh_env, write_evaluation
+from cprl.measuring.episodes import Episode
+from cprl.outcome import evaluate_population, exploration, fresh_env, random_play, write_evaluation
 from cprl.output import ERR, OUT, console
 from cprl.process import prepare_process
 from cprl.runs.checkpoints import FOLDER, Checkpointer, checkpoints_in
@@ -45,6 +46,8 @@ from cprl.terminal.progress import ProgressBar
 from cprl.terminal.summary import summarise
 from cprl.training import Training, train
 from cprl.viewer.callback import ViewerCallback
+from cprl.viewer.lingering import check_linger
+from cprl.viewer.lingering import linger as stay_served
 from cprl.viewer.streams import check_watch
 
 
@@ -75,6 +78,7 @@ def run(
     take_over: bool = False,
     keep_checkpoint: bool = True,
     watch: str = "file",
+    linger: bool = False,
     allow: Sequence[str] = (),
     command: Sequence[str] | None = None,
 ) -> Path:
@@ -93,6 +97,8 @@ def run(
             can be extended.
         watch: "file" for a recording for the Rerun viewer; "serve", "spawn" or "connect ADDRESS" to watch
             live as well, see `cprl.viewer.streams.open_live`; "off" for none.
+        linger: whether the recording stays served after the run, until Ctrl-C (SIGINT) or SIGTERM; only with
+            `watch` "serve" or "spawn".
         allow: the user's own code, "module:Class", that stored runs of `Frozen` agents may import.
         command: the command line that began the run, script first, which the recipe keeps and the line that
             resumes is made of; by default the run is resumed by `cprl run`.
@@ -110,11 +116,17 @@ def run(
     """
     object_of("experiment", experiment, Experiment, "an Experiment")
     out = None if out is None else path("out", out)
-    for name, switch in (("resume", resume), ("take_over", take_over), ("keep_checkpoint", keep_checkpoint)):
+    for name, switch in {
+        "resume": resume,
+        "take_over": take_over,
+        "keep_checkpoint": keep_checkpoint,
+        "linger": linger,
+    }.items():
         checked(name, switch, SWITCH)
     texts("allow", allow)
     command = None if command is None else texts("command", command, 1)
     check_watch(watch)
+    check_linger(linger, watch)
     for logger in experiment.loggers:
         check_logger(logger.resolve() if isinstance(logger, Custom) else logger)
     prepare_process(experiment.seed)
@@ -143,6 +155,7 @@ def run(
         resume_command=resume_command(directory, command),
     )
     began = _Began()
+    closing = ExitStack()  # of the viewer, which outlives the rest
     try:
         with checkpointer:
             if resume:
@@ -150,16 +163,24 @@ def run(
                 write_on_nan(directory, experiment.on_nan)
             if episodes < experiment.episodes:
                 extend(directory, episodes, experiment.episodes)
-            training = _train(directory, experiment, own, watch=watch, checkpointer=checkpointer, began=began)
-            _finish(directory, experiment, own, training)
+            viewer = closing.enter_context(_viewer(watch, directory, own.env, experiment))
+            before = None if viewer is None else _random_play(experiment, own, viewer)
+            training = _train(
+                directory, experiment, own, viewer=viewer, checkpointer=checkpointer, began=began
+            )
+            _finish(directory, experiment, own, training, viewer=viewer, before=before)
             checkpointer.done()
             _say_what_is_kept(directory)
     except BaseException as error:
+        closing.close()
         if began.has_begun or (resume and isinstance(error, OSError)):
             error.add_note(f"To resume: {checkpointer.resume_command}")
         elif not resume and not isinstance(error, RunLockedError):
             _remove(directory, but_keep_empty=is_there)
         raise
+    with closing:
+        if linger and viewer is not None:
+            stay_served(viewer.logger)
     return directory
 
 
@@ -195,10 +216,20 @@ def _say_what_changed(directory: Path) -> None:
         )
 
 
-def _finish(directory: Path, experiment: Experiment, own: _Made, training: Training) -> None:
+def _finish(
+    directory: Path,
+    experiment: Experiment,
+    own: _Made,
+    training: Training,
+    *,
+    viewer: ViewerCallback | None,
+    before: list[Episode] | None,
+) -> None:
     """All that follows the training; `report.json`, the sign that a run is finished, comes last."""
-    played = evaluate_population(experiment, own.env, own.population)
+    played = evaluate_population(experiment, own.env, own.population, random=before)
     write_evaluation(directory, played, of_replica=experiment.evaluation_episodes)
+    if viewer is not None:
+        viewer.finished(played)
     title = _title(experiment)
     figure = training_curve(directory, title=title, random=played["random"])
     broken = training.finite.found
@@ -241,14 +272,12 @@ def _train(
     experiment: Experiment,
     own: _Made,
     *,
-    watch: str,
+    viewer: ViewerCallback | None,
     checkpointer: Checkpointer,
     began: _Began,
 ) -> Training:
     """Trains and keeps what happens, from the newest checkpoint on if there is one."""
     with ExitStack() as stack:
-        viewer = stack.enter_context(_viewer(watch, directory, own.env, experiment))
-        checkpointer.log_event = viewer.log_event if viewer else None
         table = stack.enter_context(EpisodeTable(directory / "episodes.parquet", resumable=True))
         bar = ProgressBar(own.env, episodes=experiment.episodes, replicas=experiment.replicas)
         loggers = [stack.enter_context(_logger(logger, directory, own.env)) for logger in experiment.loggers]
@@ -265,7 +294,16 @@ def _train(
         )
         save_weights(directory, own.population.networks())
         save_transforms(directory, transforms_state(own.env))
+    if viewer is not None:
+        viewer.flush()
     return training
+
+
+def _random_play(experiment: Experiment, own: _Made, viewer: ViewerCallback) -> list[Episode]:
+    """Plays what the viewer compares the training with."""
+    episodes = random_play(experiment, own.population)
+    viewer.random_play(episodes)
+    return episodes
 
 
 def _logger(logger: str | Custom, directory: Path, env: EnvBase) -> LoggerCallback:

@@ -2,6 +2,7 @@
 
 Modules, in the order in which one reads them:
     callback   ViewerCallback: logs a training while it runs
+    contents   what of a game is plotted, and what is left out
     story      header, live label, events, and the phases when it ends
     header     the header's texts
     events     new bests, and phases
@@ -13,6 +14,7 @@ Modules, in the order in which one reads them:
     turns      the stock over the turn
     lorenz     Lorenz curve and Gini coefficient
     decisions  in a replay: what each agent's policy says of its actions
+    compiling  while code is compiled, the live header says so
     recorder   which episodes are recorded frame by frame
     frames     frames of one world, collected in memory
     logger     RerunLogger: TorchRL's logger interface on a recording
@@ -21,6 +23,7 @@ Modules, in the order in which one reads them:
     names      files and ids of a run's recordings
     streams    to a file, and served live
     deadline   calls that may wait for a viewer, with deadlines
+    lingering  a finished run stays served until Ctrl-C
     scenery    names and colours of what a recording shows
     panels     several boards in one image
     axes       plots that are not over time

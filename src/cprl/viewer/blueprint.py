@@ -21,13 +21,14 @@ _HEADER, _STRIP, _VIEW = 97, 40, 207
 other height as they do this one."""
 
 
-def layout(curves: Curves, *, live: bool = False) -> Any:
+def layout(curves: Curves, *, live: bool = False, ended: bool = False) -> Any:
     """The layout of a recording; a replay has fewer views, and a game without a board none of the board.
 
     Args:
         curves: the numbers that are plotted; a `Scene` if there is a board.
         live: whether it is the layout of the live view, which has the present policy's exhibition
-            (`/exhibition`, in the live stream alone).
+            (`/exhibition`, in the live stream alone), and no room for phases before they are there.
+        ended: whether the run has ended, for the live view.
 
     Returns:
         A `rerun.blueprint.Blueprint`.
@@ -36,7 +37,7 @@ def layout(curves: Curves, *, live: bool = False) -> Any:
 
     if isinstance(curves, Scene) and curves.is_replay:
         return _laid_out(_replay(curves), timeline="frame", play_state="playing")
-    strips = 3 if curves.has_phases else 1
+    strips = 3 if curves.has_phases and (ended or not live) else 1
     return _laid_out(
         rrb.Vertical(
             _header(),
@@ -71,7 +72,7 @@ def _replay(scene: Scene) -> Any:
     import rerun.blueprint as rrb
 
     return rrb.Horizontal(
-        rrb.Vertical(_world(), _texts("step"), row_shares=[7, 2]),
+        rrb.Vertical(_world(), rrb.Tabs(_events("step"), _recipe(), active_tab=0), row_shares=[7, 2]),
         rrb.Vertical(
             _windows(is_wide=True),
             _decisions(scene),
@@ -100,9 +101,9 @@ def _top(curves: Curves, *, live: bool) -> Any:
     import rerun.blueprint as rrb
 
     if not isinstance(curves, Scene):
-        return _texts()
+        return _events()
     boards = _boards(live=live)
-    return rrb.Horizontal(boards, _windows(), _texts(), column_shares=[5, 3, 3])
+    return rrb.Horizontal(boards, _windows(), _events(), column_shares=[5, 3, 3])
 
 
 def _boards(*, live: bool) -> Any:
@@ -129,16 +130,12 @@ def _windows(*, is_wide: bool = False) -> Any:
     return rrb.Spatial2DView(name=name, origin="/windows", background=BACKGROUND)
 
 
-def _texts(timeline: str = "episode") -> Any:
-    """The events, with their number on a timeline, and the recipe."""
+def _events(timeline: str = "episode") -> Any:
+    """The events, each with its number on a timeline."""
     import rerun.blueprint as rrb
 
     columns = rrb.TextLogColumns(timeline_columns=[timeline], text_log_columns=["Body"])
-    return rrb.Tabs(
-        rrb.TextLogView(name="Events", origin="/log", columns=columns),
-        rrb.TextDocumentView(name="Recipe", origin="/recipe"),
-        active_tab="Events",
-    )
+    return rrb.TextLogView(name="Events", origin="/log", columns=columns)
 
 
 def _strip() -> Any:
@@ -242,6 +239,12 @@ def _flat(name: str, origin: str, bounds: tuple[tuple[float, float], tuple[float
     return rrb.Spatial2DView(name=name, origin=f"/{origin}", background=BACKGROUND, visual_bounds=visible)
 
 
+def _recipe(curves: Curves | None = None) -> Any:
+    import rerun.blueprint as rrb
+
+    return rrb.TextDocumentView(name="Recipe", origin="/recipe")
+
+
 _TABS: Final[tuple[Callable[[Curves], Any], ...]] = (
     _outcome,
     _agents,
@@ -250,8 +253,9 @@ _TABS: Final[tuple[Callable[[Curves], Any], ...]] = (
     _learning,
     _more,
     _speed,
+    _recipe,
 )
-"""The tabs of plots, each a function of `Curves` that returns its view, or None if it has nothing to show."""
+"""The tabs, each a function of `Curves` that returns its view, or None if it has nothing to show."""
 
 
 def _row(name: str, *views: Any) -> Any:

@@ -16,27 +16,20 @@ from cprl.arguments import object_of
 from cprl.arguments import path as path_of
 from cprl.checks import NONE, TEXT, check_nesting, checked, count, either
 from cprl.envs.unwrap import agent_names, commons_of
-from cprl.measuring import phases
 from cprl.measuring.episodes import Episode
-from cprl.measuring.reported import FIELDS, METRICS, available, left_out, reported_by
+from cprl.measuring.reported import reported_by
 from cprl.measuring.series import Series, Values, numbers_of
-from cprl.viewer.events import FEWEST_FOR_PHASES
+from cprl.viewer.compiling import CompilingNotice
+from cprl.viewer.contents import curves_of, missing_in
 from cprl.viewer.header import has_died
 from cprl.viewer.logger import RerunLogger
 from cprl.viewer.names import FILE_NAME, free_name, recording_id
 from cprl.viewer.plots import Plots
 from cprl.viewer.recorder import FrameRecorder, scene_of
-from cprl.viewer.scenery import Curves
 from cprl.viewer.story import Story
 from cprl.viewer.tags import Tags
 from cprl.viewer.views import Views
 
-_SHOWN: Final[Mapping[str, tuple[str, ...]]] = {
-    "phases and new bests": tuple(dict.fromkeys(entry for name in phases.METRICS for entry in METRICS[name])),
-    "who tagged whom": ("tagged_by",),
-    "the board and what agents see": ("board",),
-}
-"""The views of a recording besides metrics, and the entries that each needs."""
 _DIED: Final = "died"
 """Among an episode's numbers, whether the board died early."""
 
@@ -86,7 +79,7 @@ class ViewerCallback:
         run = path_of("run", run)
         self.env, self._episodes = env, episodes
         self._agents, reported = agent_names(env), reported_by(env)
-        curves, commons = _curves(env, self._agents, reported, episodes), commons_of(env)
+        curves, commons = curves_of(env, self._agents, reported, episodes=episodes), commons_of(env)
         scene = None if commons is None else scene_of(commons, curves, is_replay=is_replay)
         self.logger = RerunLogger(
             title,
@@ -124,10 +117,11 @@ class ViewerCallback:
         self._rate_step = 0
         self.logger.log_hparams({"run": run.name, **(recipe or {})})
         self.logger.log_text(f"{title} begins")
-        missing = left_out([*reported, *(["board"] if scene else [])], more=_SHOWN)
+        missing = missing_in(reported, has_board=scene is not None)
         if missing:
             self.logger.log_text(missing)
         self.log_status("begins")
+        self._compiling = CompilingNotice(self._show_status) if live else None
 
     def on_step(self, batch: TensorDictBase) -> None:
         """Copies the state of the first world after the turn, if this episode's frames are recorded.
@@ -166,8 +160,14 @@ class ViewerCallback:
             episode.episode, episode.world, numbers if died is None else {**numbers, _DIED: float(died)}
         )
         if of_all is not None:
+            self._stop_notice()
             self.logger.at(step=self._step, episode=episode.episode)
             self._log(episode.episode, of_all)
+
+    def _show_status(self, status: str) -> None:
+        """Shows a status in the header of the live view; from any thread."""
+        if self.story is not None and self._episode == 0:
+            self.logger.show_live("header", self.story.beginning(status))
 
     def _log_death(self, episode: Episode) -> None:
         """Logs the step of the last apple in the first replica, for the first time and where one sees it."""
@@ -239,10 +239,14 @@ class ViewerCallback:
         if frames is not None:
             self.logger.log_frames(frames)
 
-    def state_dict(self) -> dict[str, Any]:
-        """The counters, events and pending numbers; frames are sent first."""
+    def flush(self) -> None:
+        """Sends all that waits, to the file and to viewers."""
         self._send_frames()
         self.logger.flush()
+
+    def state_dict(self) -> dict[str, Any]:
+        """The counters, events and pending numbers; frames are sent first."""
+        self.flush()
         return {
             "step": self._step,
             "episode": self._episode,
@@ -270,6 +274,10 @@ class ViewerCallback:
             self._tags.load_state_dict(state["tags"])
         self.logger.log_text(f"resumed from step {self._step:,}")
 
+    def _stop_notice(self) -> None:
+        if self._compiling is not None:
+            self._compiling.stop()
+
     def __enter__(self) -> Self:
         return self
 
@@ -279,20 +287,9 @@ class ViewerCallback:
         error: BaseException | None,
         traceback: TracebackType | None,
     ) -> None:
+        self._stop_notice()
         self._send_frames()
         self._views.close()
         if self.story is not None:
             self.story.close()
         self.logger.shutdown()
-
-
-def _curves(env: EnvBase, agents: tuple[str, ...], reported: Sequence[str], episodes: int) -> Curves:
-    """The numbers of an environment that are plotted."""
-    metrics = available({**METRICS, "stock_left": FIELDS["stock_left"]}, reported)
-    return Curves(
-        agents=agents,
-        replicas=env.batch_size.numel(),
-        metrics=metrics,
-        has_phases=episodes >= FEWEST_FOR_PHASES and set(phases.METRICS) <= set(metrics),
-        has_tags="tagged_by" in reported,
-    )

@@ -174,6 +174,16 @@ class RerunLogger(Logger):
         """Logs a Markdown text that takes the place of the one before, sent with the numbers."""
         self._wait(name, self._now[0], text)
 
+    def show_live(self, name: str, text: str) -> None:
+        """Shows a Markdown text in the live view at once, and not in the file; from any thread."""
+        import rerun as rr
+
+        at = times([self._now[0]], [self._now[1]], [self.frames])
+        what = rr.TextDocument.columns(text=[text])
+        for each in self._streams:
+            if isinstance(each, LiveStream):
+                each.do(lambda recording: recording.send_columns(name, at, what))
+
     def _wait(self, name: str, step: int, values: list[float] | str) -> None:
         row = step, self._now[1], self.frames, values
         for each in self._streams:
@@ -269,6 +279,21 @@ class RerunLogger(Logger):
         """Sends all buffered numbers to the file and to the viewer."""
         for each in self._streams:
             send_waiting(each)
+
+    def show_end(self) -> None:
+        """Gives the live view the layout of a run that has ended, with its phases."""
+        if self.curves.has_phases:
+            ended = layout(self.curves, live=True, ended=True)
+            for each in self._streams:
+                if isinstance(each, LiveStream):
+                    each.do(lambda recording: recording.send_blueprint(ended))
+
+    @property
+    def is_served(self) -> bool:
+        """Whether viewers can still connect: the live stream is open and served."""
+        return bool(self.addresses) and any(
+            isinstance(each, LiveStream) and each.recording is not None for each in self._streams
+        )
 
     def close_file(self) -> None:
         """Flushes and closes the file, which gets its footer; the live stream goes on."""

@@ -52,10 +52,14 @@ class Story:
         return None if self._random is None else self._random.mean
 
     def begins(self, status: str) -> None:
-        """Says in the header what happens before the first episode has ended, e.g. "compiling"."""
+        """Says in the header what happens before the first episode has ended, e.g. "begins"."""
         if self._ended == 0:
-            self._document(self._header.begins(status))
+            self._logger.log_document("header", self.beginning(status))
             self._logger.flush()
+
+    def beginning(self, status: str) -> str:
+        """The header before the first episode has ended."""
+        return self._text(self._header.begins(status))
 
     def random_play(self, episodes: Sequence[Episode]) -> None:
         """Sets what the group is compared with, and logs it as an event."""
@@ -130,10 +134,13 @@ class Story:
         within = {first: label for first, label in published.items() if first < self._ended}
         if within:
             self._logger.log_states(_PUBLISHED, within)
+        self._logger.show_end()
 
     def _document(self, line: str, *, of_mean: int | None = None) -> None:
-        notes = self._header.notes(window=self._window, of_mean=of_mean)
-        self._logger.log_document("header", f"{line}\n\n{notes}")
+        self._logger.log_document("header", self._text(line, of_mean=of_mean))
+
+    def _text(self, line: str, *, of_mean: int | None = None) -> str:
+        return f"{line}\n\n{self._header.notes(window=self._window, of_mean=of_mean)}"
 
     def _in_words(self, own: Played) -> str:
         error = f" ± {own.error:.2g}" if isfinite(own.error) else ""
