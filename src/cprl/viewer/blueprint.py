@@ -78,7 +78,7 @@ def _replay(scene: Scene) -> Any:
             _decisions(scene),
             _plot("Harvest so far, apples", *_of(scene.agents, "harvested")),
             _plot("Apples on the board", "turn/stock"),
-            row_shares=[4, 3, 2, 2],
+            row_shares=[4, 4, 2, 2],
         ),
         column_shares=[3, 2],
     )

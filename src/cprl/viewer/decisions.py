@@ -63,6 +63,8 @@ class Decisions:
         self._logger, self._names, self._actions = logger, tuple(names), tuple(actions)
         self._actors = list(zip(map(agent_indices, policies.indices), policies.actors, strict=True))
         self._panels = decision_panels(len(names), len(actions), window)
+        many = 2 * len(names) * len(actions) > np.iinfo(np.uint8).max
+        self._dtype = np.uint16 if many else np.uint8
         self._kinds = [""] * len(names)
         for agents, actor in self._actors:
             for agent in agents:
@@ -102,7 +104,9 @@ class Decisions:
         labels = rr.Points2D.columns(labels=texts).partition([len(self._names)] * count)
         self._logger.log_columns(f"{ENTITY}/labels", at, labels)
 
-    def _images(self, values: NDArray[np.float64], taken: NDArray[np.int64]) -> NDArray[np.uint16]:
+    def _images(
+        self, values: NDArray[np.float64], taken: NDArray[np.int64]
+    ) -> NDArray[np.unsignedinteger[Any]]:
         """Bars of T frames as classes: values [T, N, A] and actions [T, N] to [T, rows, columns]."""
         count, agents, actions = values.shape
         heights = self._heights(values)
@@ -113,7 +117,7 @@ class Decisions:
         bars = np.pad(bars.repeat(BAR, -1), ((0, 0),) * 4 + ((APART, 0),))
         panels = bars.transpose(0, 1, 3, 2, 4).reshape(count, agents, HIGH, -1)
         panels = np.pad(panels, ((0, 0),) * 3 + ((0, APART),))
-        whole = np.zeros((count, *self._panels.shape), np.uint16)
+        whole = np.zeros((count, *self._panels.shape), self._dtype)
         for agent, (top, left) in enumerate(self._panels.corners):
             whole[:, top : top + HIGH, left : left + panels.shape[-1]] = panels[:, agent]
         return whole
@@ -141,7 +145,8 @@ class Decisions:
         import rerun as rr
 
         rows, columns = self._panels.shape
-        form = rr.components.ImageFormat(width=columns, height=rows, channel_datatype=rr.ChannelDatatype.U16)
+        kind = rr.ChannelDatatype.U16 if self._dtype is np.uint16 else rr.ChannelDatatype.U8
+        form = rr.components.ImageFormat(width=columns, height=rows, channel_datatype=kind)
         classes = [rr.AnnotationInfo(id=0, label="", color=BACKGROUND)]
         for agent, name in enumerate(self._names):
             hue = tuple(round(_BAR_SHARE * part) for part in agent_colour(agent))
