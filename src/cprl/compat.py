@@ -8,8 +8,9 @@ upgrade has broken. The rest of cprl uses public interfaces. Two exceptions are 
   `_set_seed`, `Storage._empty`, `Sampler._empty`, `Logger._create_experiment`) are its interface for that.
 """
 
+import ctypes
 from abc import abstractmethod
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from functools import cache
 from hashlib import sha256
@@ -247,3 +248,14 @@ def end_recordings() -> None:
     from rerun_bindings import flush_and_cleanup_orphaned_recordings
 
     flush_and_cleanup_orphaned_recordings()
+
+
+def keep_native(recording: Any, keep: Callable[..., object] = ctypes.pythonapi.Py_IncRef) -> None:
+    """In place of a recording's end, which waits for a viewer: its native part, the private `inner`, stays
+    until the process ends.
+
+    Args:
+        recording: a `rerun.RecordingStream`, as its `__del__` gets it.
+        keep: bound here, because the interpreter clears modules before it deletes the last recordings.
+    """
+    keep(ctypes.py_object(recording.inner))

@@ -5,6 +5,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
+from typing import Final
 
 import numpy as np
 import torch
@@ -15,10 +16,15 @@ from cprl.arguments import object_of
 from cprl.commons.game import Game
 from cprl.envs.make_env import make_env
 from cprl.envs.state import load_transforms_state, transforms_state
+from cprl.envs.unwrap import commons_of
 from cprl.experiment import Experiment
 from cprl.measuring.episodes import Episode
 from cprl.measuring.evaluate import evaluate
+from cprl.policies.present import PresentPolicy
 from cprl.runs.episodes import EpisodeTable
+
+EXHIBITED_WORLD: Final = 2**31
+"""The number of the exhibited world; those of a training, of as many replicas, are smaller."""
 
 
 def fresh_env(experiment: Experiment) -> EnvBase:
@@ -30,6 +36,24 @@ def fresh_env(experiment: Experiment) -> EnvBase:
         device=experiment.device,
         transforms=experiment.transforms,
     )
+
+
+def exhibited(
+    experiment: Experiment, trained: EnvBase, population: Population
+) -> tuple[PresentPolicy, EnvBase] | None:
+    """The present policy, and one world for it that neither training nor evaluation plays; None where the
+    game has no board. Torch's generator is left as it was."""
+    if commons_of(trained) is None:
+        return None
+    with torch.random.fork_rng(devices=[]):
+        env = make_env(
+            experiment.game,
+            seed=experiment.seed,
+            first_world=EXHIBITED_WORLD,
+            device=experiment.device,
+            transforms=experiment.transforms,
+        )
+        return population.present_policy(), env
 
 
 def random_play(experiment: Experiment, population: Population) -> list[Episode]:

@@ -21,7 +21,10 @@ Modules, in the order in which one reads them:
     batches    numbers and texts as columns, in batches
     recipe     the recipe as a table
     names      files and ids of a run's recordings
+    exhibition a world that the present policy plays, for viewers alone
     streams    to a file, and served live
+    sending    one stream, which may fail without harm
+    page       the web viewer's page on 127.0.0.1, and recordings for it
     deadline   calls that may wait for a viewer, with deadlines
     lingering  a finished run stays served until Ctrl-C
     scenery    names and colours of what a recording shows

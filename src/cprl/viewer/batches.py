@@ -6,7 +6,7 @@ from typing import Any, Final, TypeAlias
 import numpy as np
 from numpy.typing import NDArray
 
-from cprl.viewer.streams import FLUSH_TIMEOUT_S, Stream
+from cprl.viewer.sending import FLUSH_TIMEOUT_S, Stream
 
 TIMELINES: Final = ("step", "episode", "frame")
 """The timelines of every row: environment steps of the run, episodes, and frames recorded so far."""

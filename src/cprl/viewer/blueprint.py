@@ -36,7 +36,7 @@ def layout(curves: Curves, *, live: bool = False, ended: bool = False) -> Any:
     import rerun.blueprint as rrb
 
     if isinstance(curves, Scene) and curves.is_replay:
-        return _laid_out(_replay(curves), timeline="frame", play_state="playing")
+        return _laid_out(_replay(curves), timeline="step", play_state="playing")
     strips = 3 if curves.has_phases and (ended or not live) else 1
     return _laid_out(
         rrb.Vertical(
@@ -54,8 +54,8 @@ def layout(curves: Curves, *, live: bool = False, ended: bool = False) -> Any:
 def _laid_out(views: Any, *, timeline: str, play_state: Literal["playing", "following"]) -> Any:
     """The views in a blueprint with the viewer's other panels collapsed.
 
-    The timeline of the time panel is the axis of every plot: episodes, and in a replay frames, which are its
-    steps. Boards are played back on `frame`, which counts recorded frames alone.
+    The timeline of the time panel is the axis of every plot: episodes, and in a replay, which records all
+    its steps, steps. Boards of a run are played back on `frame`, which counts recorded frames alone.
     """
     import rerun.blueprint as rrb
 
@@ -72,7 +72,7 @@ def _replay(scene: Scene) -> Any:
     import rerun.blueprint as rrb
 
     return rrb.Horizontal(
-        rrb.Vertical(_world(), rrb.Tabs(_events("step"), _recipe(), active_tab=0), row_shares=[7, 2]),
+        rrb.Vertical(_world(), rrb.Tabs(_events(), _recipe(), active_tab=0), row_shares=[7, 2]),
         rrb.Vertical(
             _windows(is_wide=True),
             _decisions(scene),
@@ -130,11 +130,13 @@ def _windows(*, is_wide: bool = False) -> Any:
     return rrb.Spatial2DView(name=name, origin="/windows", background=BACKGROUND)
 
 
-def _events(timeline: str = "episode") -> Any:
-    """The events, each with its number on a timeline."""
+def _events() -> Any:
+    """The events, whose texts say when; the viewer's own column is so narrow that it cuts the numbers."""
     import rerun.blueprint as rrb
+    from rerun.blueprint.encodings import TimelineColumn
 
-    columns = rrb.TextLogColumns(timeline_columns=[timeline], text_log_columns=["Body"])
+    hidden = [TimelineColumn("step", visible=False)]
+    columns = rrb.TextLogColumns(timeline_columns=hidden, text_log_columns=["Body"])
     return rrb.TextLogView(name="Events", origin="/log", columns=columns)
 
 
@@ -199,6 +201,12 @@ def _speed(curves: Curves) -> Any:
     return _plot("Speed", "time/env_steps_per_s")
 
 
+def _recipe(curves: Curves | None = None) -> Any:
+    import rerun.blueprint as rrb
+
+    return rrb.TextDocumentView(name="Recipe", origin="/recipe")
+
+
 def _fates(curves: Curves) -> Any:
     """All boards at once, and how long each replica's apples lasted."""
     if not isinstance(curves, Scene):
@@ -237,12 +245,6 @@ def _flat(name: str, origin: str, bounds: tuple[tuple[float, float], tuple[float
 
     visible = rrb.VisualBounds2D(x_range=bounds[0], y_range=bounds[1])
     return rrb.Spatial2DView(name=name, origin=f"/{origin}", background=BACKGROUND, visual_bounds=visible)
-
-
-def _recipe(curves: Curves | None = None) -> Any:
-    import rerun.blueprint as rrb
-
-    return rrb.TextDocumentView(name="Recipe", origin="/recipe")
 
 
 _TABS: Final[tuple[Callable[[Curves], Any], ...]] = (

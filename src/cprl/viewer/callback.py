@@ -3,6 +3,7 @@
 import time
 from collections.abc import Mapping, Sequence
 from pathlib import Path
+from threading import Event
 from types import TracebackType
 from typing import Any, Final, Self
 
@@ -21,6 +22,7 @@ from cprl.measuring.reported import reported_by
 from cprl.measuring.series import Series, Values, numbers_of
 from cprl.viewer.compiling import CompilingNotice
 from cprl.viewer.contents import curves_of, missing_in
+from cprl.viewer.exhibition import Exhibited, Exhibition
 from cprl.viewer.header import has_died
 from cprl.viewer.logger import RerunLogger
 from cprl.viewer.names import FILE_NAME, free_name, recording_id
@@ -53,6 +55,8 @@ class ViewerCallback:
         episodes: the number of episodes of the run; determines how often frames are recorded.
         recipe: the recipe that the viewer shows.
         live: "serve", "spawn" or "connect ADDRESS", see `cprl.viewer.streams`; None for the file alone.
+        exhibited: what is exhibited live: the present policy and one world for it, see
+            `cprl.viewer.exhibition`.
         file_name: the name of the recording instead of `run.rrd`; there must be no such file.
         is_replay: whether a stored policy is replayed, see `cprl.viewer.scenery.Scene`.
         console: the console for the addresses; by default standard output.
@@ -67,6 +71,7 @@ class ViewerCallback:
         episodes: int,
         recipe: Mapping[str, object] | None = None,
         live: str | None = None,
+        exhibited: tuple[Exhibited, EnvBase] | None = None,
         file_name: str | None = None,
         is_replay: bool = False,
         console: Console | None = None,
@@ -87,6 +92,7 @@ class ViewerCallback:
             scene=scene,
             curves=curves,
             live=live,
+            exhibits=exhibited is not None and scene is not None,
             file_name=file_name or free_name(run),
             recording_id=recording_id(run, file_name or FILE_NAME),
             console=console,
@@ -96,6 +102,10 @@ class ViewerCallback:
             if commons is None or scene is None
             else FrameRecorder(commons, episodes=episodes, scene=scene)
         )
+        self.exhibition: Exhibition | None = None
+        """What the present policy plays for viewers; None where nothing is exhibited."""
+        if exhibited is not None and scene is not None:
+            self.exhibition = Exhibition(*exhibited, trained=env, scene=scene, live=self.logger.live)
         self.every = 0 if self._recorder is None else self._recorder.every
         """Episodes from one with frames to the next; 0 for no frames."""
         self._series = Series(curves.replicas)
@@ -120,6 +130,8 @@ class ViewerCallback:
         missing = missing_in(reported, has_board=scene is not None)
         if missing:
             self.logger.log_text(missing)
+        if live and scene is None:
+            self.logger.log_text("no exhibition: the game has no board")
         self.log_status("begins")
         self._compiling = CompilingNotice(self._show_status) if live else None
 
@@ -129,6 +141,8 @@ class ViewerCallback:
         Otherwise it only counts: reading a tensor each turn would cost a training some percent.
         """
         self._step += 1
+        if self.exhibition is not None:
+            self.exhibition.on_step(episode=self._episode)
         self._views.on_step(self._step, self._episode, self._record(batch))
 
     def _record(self, batch: TensorDictBase) -> int | None:
@@ -174,7 +188,7 @@ class ViewerCallback:
         step = episode.depletion_step or -1
         if step > 0 and (self.is_shown or not self._has_died):
             self.logger.at(step=self._step, episode=episode.episode)
-            self.logger.log_text(f"last apple taken in step {step}")
+            self.logger.log_text(f"episode {episode.episode:,}: last apple taken in step {step}")
             self._has_died = True
 
     def _log(self, episode: int, of_all: dict[str, Values]) -> None:
@@ -223,6 +237,11 @@ class ViewerCallback:
     def log_event(self, event: str) -> None:
         """Logs an event as text."""
         self.logger.log_text(event)
+
+    def play_on(self, stop: Event) -> None:
+        """Exhibits the trained policy until the event is set; returns at once where nothing is exhibited."""
+        if self.exhibition is not None:
+            self.exhibition.play_on(stop, episode=self._episode)
 
     @property
     def is_shown(self) -> bool:

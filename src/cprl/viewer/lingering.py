@@ -1,6 +1,7 @@
 """Lingering: a finished run's recording stays served until the process is asked to end."""
 
 import signal
+from collections.abc import Callable
 from threading import Event, current_thread, main_thread
 from types import FrameType
 from typing import Final
@@ -26,9 +27,14 @@ def check_linger(linger: bool, watch: str) -> None:
         raise ValueError("linger is True in another thread than the main one, which alone gets signals")
 
 
-def linger(logger: RerunLogger) -> None:
+def linger(logger: RerunLogger, play_on: Callable[[Event], None] | None = None) -> None:
     """Says where the recording stays served, waits for Ctrl-C (SIGINT) or SIGTERM, and closes the recording;
-    a second signal in the meantime changes nothing."""
+    a second signal in the meantime changes nothing.
+
+    Args:
+        logger: whose recording is served.
+        play_on: called meanwhile; returns when the event is set, or when there is nothing to play.
+    """
     if not logger.is_served:
         console().print("The recording is no longer served.")
         return
@@ -44,6 +50,8 @@ def linger(logger: RerunLogger) -> None:
             soft_wrap=True,
             highlight=False,
         )
+        if play_on is not None:
+            play_on(asked)
         while not asked.wait(1.0):
             pass
         logger.shutdown()

@@ -22,8 +22,9 @@ from cprl.viewer.deadline import release
 from cprl.viewer.names import FILE_NAME
 from cprl.viewer.recipe import as_table
 from cprl.viewer.scenery import Curves, Scene, classes, lines, state_colours
+from cprl.viewer.sending import FLUSH_TIMEOUT_S, LiveStream, Stream
 from cprl.viewer.stage import columns, fixed
-from cprl.viewer.streams import FLUSH_TIMEOUT_S, LiveStream, Stream, open_file, open_live
+from cprl.viewer.streams import REPLAY, RUN, Live, open_file, open_live
 
 _LIVE_PERIOD_S: Final = 1.0
 _FILE_PERIOD_S: Final = 60.0
@@ -44,8 +45,8 @@ class RerunLogger(Logger):
         scene: the contents of the board; needed to log frames.
         curves: the numbers that are plotted, if there is no scene, which has them too.
         live: "serve", "spawn" or "connect ADDRESS", see `cprl.viewer.streams.open_live`; None for the file
-            alone. The recording is served on 127.0.0.1 only; the web viewer's empty page, which Rerun serves,
-            listens on all interfaces.
+            alone. The recording and the page of the web viewer are served on 127.0.0.1 only.
+        exhibits: whether viewers are sent an exhibition too, see `cprl.viewer.exhibition`.
         file_name: the name of the recording.
         recording_id: the viewer shows files with the same id as one recording; by default a new id.
         console: the console for the addresses; by default standard output.
@@ -62,6 +63,7 @@ class RerunLogger(Logger):
         scene: Scene | None = None,
         curves: Curves | None = None,
         live: str | None = None,
+        exhibits: bool = False,
         file_name: str = FILE_NAME,
         recording_id: str | None = None,
         console: Console | None = None,
@@ -82,8 +84,10 @@ class RerunLogger(Logger):
             raise FileExistsError(
                 f"{self.path} exists and is not overwritten; use another directory or file_name"
             )
-        self.addresses: dict[str, str] = {}
-        self._live, self._console = live, console or safe_console()
+        self.live = Live()
+        """What viewers are sent; nothing where the recording is written to a file alone."""
+        self._live, self._exhibits, self._console = live, exhibits, console or safe_console()
+        self._application = REPLAY if isinstance(self.curves, Scene) and self.curves.is_replay else RUN
         self._streams: list[Stream] = []
         self.frames = 0
         """Frames recorded so far, including those in earlier files of the recording."""
@@ -96,7 +100,13 @@ class RerunLogger(Logger):
 
         recording_id = self.recording_id
         Path(self.log_dir).mkdir(parents=True, exist_ok=True)
-        file = open_file(recording_id, self.path, layout(self.curves), period_s=_FILE_PERIOD_S)
+        file = open_file(
+            recording_id,
+            self.path,
+            layout(self.curves),
+            period_s=_FILE_PERIOD_S,
+            application=self._application,
+        )
         self._streams += [file] if file else []
         if self._live:
             self._go_live(recording_id, layout(self.curves, live=True))
@@ -114,10 +124,22 @@ class RerunLogger(Logger):
         return [each.recording for each in self._streams]
 
     def _go_live(self, recording_id: str, blueprint: Any) -> None:
-        live, self.addresses = open_live(self._live or "", recording_id, blueprint, period_s=_LIVE_PERIOD_S)
-        self._streams += [live] if live else []
+        self.live = open_live(
+            self._live or "",
+            recording_id,
+            blueprint,
+            period_s=_LIVE_PERIOD_S,
+            application=self._application,
+            exhibits=self._exhibits,
+        )
+        self._streams += [self.live.stream] if self.live.stream else []
         for where, address in self.addresses.items():
             self._console.print(f"Watch live ({where}): {address}", soft_wrap=True, highlight=False)
+
+    @property
+    def addresses(self) -> dict[str, str]:
+        """How to watch live: "browser" and "native"; empty where it is not served."""
+        return self.live.addresses
 
     def _all(self, what: Callable[[Any], object]) -> None:
         for each in self._streams:
@@ -303,6 +325,7 @@ class RerunLogger(Logger):
         self.flush()
         for each in self._streams:
             each.close()
+        self.live.close()
         self.experiment.clear()
         release()
 

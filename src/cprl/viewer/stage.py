@@ -78,23 +78,11 @@ def columns(scene: Scene, frames: Frames) -> dict[str, tuple[NDArray[np.intp], A
     """
     import rerun as rr
 
-    count, agents = frames["in_play"].shape
-    everywhere = np.arange(count)
-
-    def pictures(images: Bytes) -> Any:
-        return rr.SegmentationImage.columns(buffer=images.reshape(len(images), -1))
-
-    beams = beam_pictures(frames["beams"])
-    changed = _changes(beams)
+    everywhere = np.arange(len(frames["step"]))
     shown = {
-        "world/board": (everywhere, pictures(boards(scene, frames))),
-        "world/beams": (changed, pictures(beams[changed])),
-        "world/agents": (everywhere, _lines(numbers_and_headings(agents), frames)),
-        **_out(frames),
-        "windows": (everywhere, pictures(mosaic(frames["windows"]))),
+        **board_columns(scene, frames),
+        "windows": (everywhere, _pictures(mosaic(frames["windows"]))),
     }
-    if len(marks(agents).owner):
-        shown["world/marks"] = everywhere, _lines(marks(agents), frames)
     if scene.is_replay:
         stock = frames["stock"].sum(1, dtype=np.float64)
         shown["turn/stock"] = everywhere, rr.Scalars.columns(scalars=stock)
@@ -102,6 +90,32 @@ def columns(scene: Scene, frames: Frames) -> dict[str, tuple[NDArray[np.intp], A
             harvested = frames["harvested"][:, agent].astype(np.float64)
             shown[f"{name}/harvested"] = everywhere, rr.Scalars.columns(scalars=harvested)
     return shown
+
+
+def board_columns(
+    scene: Scene, frames: Frames, *, beams: bool = True, out: bool = True
+) -> dict[str, tuple[NDArray[np.intp], Any]]:
+    """`columns` of the board alone, on request without beams or agents out of play."""
+    count, agents = frames["in_play"].shape
+    everywhere = np.arange(count)
+    shown = {
+        "world/board": (everywhere, _pictures(boards(scene, frames))),
+        "world/agents": (everywhere, _lines(numbers_and_headings(agents), frames)),
+    }
+    if len(marks(agents).owner):
+        shown["world/marks"] = everywhere, _lines(marks(agents), frames)
+    if beams:
+        covered = beam_pictures(frames["beams"])
+        changed = _changes(covered)
+        shown["world/beams"] = changed, _pictures(covered[changed])
+    return shown | _out(frames) if out else shown
+
+
+def _pictures(images: Bytes) -> Any:
+    """Images of classes, uint8 [T, rows, columns], as columns."""
+    import rerun as rr
+
+    return rr.SegmentationImage.columns(buffer=images.reshape(len(images), -1))
 
 
 def boards(scene: Scene, frames: Frames) -> Bytes:

@@ -81,7 +81,7 @@ class Story:
         if self._detector is not None:
             events += self._detector.add({name.removeprefix("social/"): mean for name, mean in means.items()})
         for event in events:
-            self._logger.log_text(event)
+            self._logger.log_text(f"episode {episode:,}: {event}")
         if episode % -(-self._episodes // MOST_HEADERS) == 0 or self._ended == self._episodes:
             line = self._header.line(
                 episode=self._ended,
