@@ -32,5 +32,6 @@ Modules, in the order in which one reads them:
     axes       plots that are not over time
     strokes    numbers, headings and marks of agents, as lines
     stage      frames as Rerun's columns
+    tabs       the parts of the layout that show images and drawn plots
     blueprint  the layout of the viewer
 """
