@@ -127,9 +127,9 @@ def cost(run: Path, repeats: int) -> Cost:
     with ViewerCallback(run, env, **how) as watch:
         watch.every = 10**9
         watch.exhibition._clock, watch.exhibition._due = clock, clock()
-        before = watch.exhibition._steps, clock()
+        before = watch.exhibition.steps, clock()
         live = ratio(watch)
-        steps_per_s = (watch.exhibition._steps - before[0]) / (clock() - before[1])
+        steps_per_s = (watch.exhibition.steps - before[0]) / (clock() - before[1])
     return Cost(shown, others, live, every, steps_per_s)
 
 

@@ -11,7 +11,7 @@ import socket
 import subprocess
 import tempfile
 import time
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any
@@ -24,7 +24,8 @@ from rerun.experimental import ViewerClient
 VIEWER = Path(rerun_cli.__path__[0]) / "rerun"
 """The viewer itself: the console script `rerun` would leave it running when it is ended."""
 
-START_S, STEADY_S, BUSY_S = 30.0, 60.0, 180.0
+START_S, STEADY_S, BUSY_S = 120.0, 300.0, 600.0
+"""The longest waits, on a machine with much other work."""
 
 CHROMIUM = (
     *("--headless", "--no-sandbox", "--disable-quic", "--no-first-run", "--disable-background-networking"),
@@ -37,19 +38,19 @@ CHROMIUM = (
 
 @contextmanager
 def native_viewer(
-    *, connect_to: str | None = None, size: tuple[int, int] = (1600, 1000)
+    *, connect_to: Sequence[str] = (), size: tuple[int, int] = (1600, 1000)
 ) -> Iterator[ViewerClient]:
     """Rerun's own viewer, headless, by its remote control.
 
     Args:
-        connect_to: the address of a live recording; None for an empty viewer.
+        connect_to: the addresses of a live recording, see `RerunLogger.addresses`; none for an empty viewer.
         size: of the window, in pixels.
     """
     port = free_port()
     command = [VIEWER, "--headless", "--hide-welcome-screen", "--window-size", f"{size[0]}x{size[1]}"]
     command += ["--bind", "127.0.0.1", "--port", str(port)]
     viewer = subprocess.Popen(
-        [*command, *(["--connect", connect_to] if connect_to else [])],
+        [*command, *(["--connect", *connect_to] if connect_to else [])],
         stdout=subprocess.DEVNULL,
         stderr=subprocess.DEVNULL,
     )
@@ -142,8 +143,9 @@ def _patiently(address: str) -> Any:
     while True:
         try:
             return _asked(address)
-        except RuntimeError as error:
-            if "renderer" not in str(error) or time.monotonic() - began > BUSY_S:
+        except (RuntimeError, TimeoutError) as error:
+            is_busy = isinstance(error, TimeoutError) or "renderer" in str(error)
+            if not is_busy or time.monotonic() - began > BUSY_S:
                 raise
             time.sleep(1)
 

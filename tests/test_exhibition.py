@@ -73,7 +73,8 @@ class Kept:
     """An exhibition whose viewers are files, on a clock that the test moves."""
 
     def __init__(self, folder, experiment=ALONE):
-        self.now, self.paths = 0.0, (folder / "live.rrd", folder / "exhibition.rrd")
+        self.now, self.waits = 0.0, []
+        self.paths = (folder / "live.rrd", folder / "exhibition.rrd")
         self.streams = []
         for path in self.paths:
             recording = rr.RecordingStream("cprl", recording_id="one")
@@ -92,6 +93,7 @@ class Kept:
             scene=scene,
             live=Live(*self.streams),
             clock=lambda: self.now,
+            wait=lambda seconds: self.waits.append(seconds),
         )
 
     def rows(self, component, entity="board"):
@@ -119,8 +121,9 @@ FIRST, *OTHERS = EXPERIMENTS
 
 @pytest.mark.parametrize("name", [FIRST, *(pytest.param(name, marks=pytest.mark.slow) for name in OTHERS)])
 def test_an_exhibition_changes_nothing_that_is_learned(name, tmp_path, monkeypatch):
-    monkeypatch.setattr(exhibition, "STEPS_PER_S", 1e9)
+    monkeypatch.setattr(exhibition, "BATCH_S", 0.0)
     monkeypatch.setattr(exhibition, "MOST_SHARE", 1e9)
+    monkeypatch.setattr(Exhibition, "close", lambda self: None)
     experiment, played = EXPERIMENTS[name], []
 
     def course(watched):
@@ -145,7 +148,7 @@ def test_an_exhibition_changes_nothing_that_is_learned(name, tmp_path, monkeypat
             how = {"title": "run", "episodes": experiment.episodes, "live": "serve", "exhibited": shown}
             with ViewerCallback(tmp_path, env, **how) as viewer:
                 training(viewer)
-                played.append(viewer.exhibition._steps)
+                played.append(viewer.exhibition.steps)
         else:
             training()
         weights = [net.state_dict() for net in population.networks().values()]
@@ -168,23 +171,26 @@ def test_it_plays_eleven_steps_a_second_however_often_the_training_asks(tmp_path
     assert abs(len(boards) - 3 * STEPS_PER_S) <= 2
     assert timelines == set(), "rows without a time: viewers keep the newest alone, on every timeline"
     assert len({repr(board) for board in boards}) > len(boards) / 2, "the board moves"
+    assert kept.waits == [1 / STEPS_PER_S] * 3 * (STEPS_PER_S - 1), "they are sent one by one"
     captions, _ = kept.rows("Points2D:labels", "caption")
     assert captions[-1] == ["present policy, episode 7, epsilon 1.00"]
 
 
-def test_a_slow_exhibition_takes_little_of_the_time(tmp_path, monkeypatch):
-    kept = Kept(tmp_path)
+@pytest.mark.parametrize("seconds", [0.003, 0.05])
+def test_a_slow_exhibition_takes_one_percent_of_the_time(seconds, tmp_path, monkeypatch):
+    kept, played, step = Kept(tmp_path), [], Exhibition._step
 
-    def slowly(episode):
-        kept.now += 0.05
+    def slowly(self):
+        step(self)
+        kept.now += seconds
         played.append(kept.now)
 
-    played = []
-    monkeypatch.setattr(kept.exhibition, "_play", slowly)
-    while kept.now < 100:
+    monkeypatch.setattr(Exhibition, "_step", slowly)
+    while kept.now < 200:
         kept.now += 0.01
         kept.exhibition.on_step(episode=0)
-    assert len(played) * 0.05 <= 1.3
+    assert len(played) * seconds <= 0.011 * kept.now
+    assert len(played) * seconds >= 0.007 * kept.now
 
 
 def test_it_plays_the_weights_and_the_exploration_of_the_moment(tmp_path):
@@ -261,11 +267,11 @@ def test_viewers_that_do_not_keep_up_miss_frames_and_nothing_waits(tmp_path, mon
 
 
 def test_after_the_training_the_trained_policy_plays_on_until_it_is_stopped(tmp_path, monkeypatch):
-    monkeypatch.setattr(exhibition, "STEPS_PER_S", 1000)
+    monkeypatch.setattr(exhibition, "BATCH_S", 0.01)
     kept, stop = Kept(tmp_path), threading.Event()
     thread = threading.Thread(target=kept.exhibition.play_on, args=(stop,), kwargs={"episode": 4})
     thread.start()
-    while kept.exhibition._steps < 25:
+    while kept.exhibition.steps < 25:
         assert thread.is_alive()
     stop.set()
     thread.join(10)

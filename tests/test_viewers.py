@@ -1,45 +1,54 @@
 """Real viewers look at a live training, and their pictures show it; `make test-viewer` runs these tests."""
 
 import re
+import signal
 import subprocess
 import sys
-import time
+import threading
+from contextlib import contextmanager
 from io import BytesIO
 from pathlib import Path
 
 import numpy as np
 import pytest
 from PIL import Image
-from viewers import browser, free_port, native_viewer, steady_picture
+from test_rerun_logger import column
+from viewers import browser, free_port, native_viewer, steady_picture, wait_until
 
 from cprl.commons.colours import APPLE, PALETTE, agent_colour
 from cprl.viewer.logger import RerunLogger
+from cprl.viewer.page import Page
 from cprl.viewer.scenery import SOCIAL, Scene
 
 pytestmark = pytest.mark.viewer
 
 SCRIPT = Path(__file__).with_name("train_and_watch.py")
 AGENTS = 4
-BOARD = (0.0, 0.0, 0.4, 0.40)
+BOARD = (0.0, 0.2, 0.45, 0.46)
 """Where the layout puts what is looked for, as shares of the picture: left, top, right, bottom."""
-RETURNS, SOCIAL_PLOTS = (0.4, 0.0, 1.0, 0.42), (0.4, 0.36, 1.0, 0.66)
+HEADER = (0.0, 0.04, 1.0, 0.17)
 PLACES = {
-    "social/collective_return": RETURNS,
-    "social/survival_steps": SOCIAL_PLOTS,
-    "social/equality": SOCIAL_PLOTS,
-    "social/peacefulness": SOCIAL_PLOTS,
+    "social/collective_return": (0.0, 0.64, 0.333, 0.96),
+    "social/survival_steps": (0.34, 0.64, 0.666, 0.96),
+    "social/equality": (0.67, 0.64, 1.0, 0.96),
 }
 EVERYTHING = ["apples", *(f"agent_{n} on the board" for n in range(AGENTS))]
-EVERYTHING += [*(f"line of agent_{n}" for n in range(AGENTS)), *(f"line of {name}" for name in PLACES)]
+EVERYTHING += [f"line of {name}" for name in PLACES]
+LIMIT_S = 900.0
+"""The longest wait, on a machine with much other work; as a rule it takes seconds."""
 
 
 def spots(picture, place, colour, *, within=40):
     """The (row, col) of all pixels of that colour, nearly, in a part of a PNG."""
+    return np.argwhere(np.abs(part(picture, place) - colour).max(-1) <= within)
+
+
+def part(picture, place):
+    """The pixels of a part of a PNG, int32 [rows, columns, 3]."""
     pixels = np.asarray(Image.open(BytesIO(picture)).convert("RGB"), np.int32)
     high, wide = pixels.shape[:2]
     left, top, right, bottom = place
-    part = pixels[round(top * high) : round(bottom * high), round(left * wide) : round(right * wide)]
-    return np.argwhere(np.abs(part - colour).max(-1) <= within)
+    return pixels[round(top * high) : round(bottom * high), round(left * wide) : round(right * wide)]
 
 
 def missing(picture):
@@ -54,58 +63,87 @@ def missing(picture):
     for agent in range(AGENTS):
         if len(spots(picture, BOARD, agent_colour(agent), within=4)) < 60:
             lacking.append(f"agent_{agent} on the board")
-    lines = {f"agent_{agent}": (RETURNS, agent_colour(agent)) for agent in range(AGENTS)}
-    lines |= {name: (place, SOCIAL[name][1]) for name, place in PLACES.items()}
-    for name, (place, colour) in lines.items():
-        if len(np.unique(spots(picture, place, colour)[:, 1])) < 100:
+    for name, place in PLACES.items():
+        if len(np.unique(spots(picture, place, SOCIAL[name][1])[:, 1])) < 100:
             lacking.append(f"line of {name}")
     return lacking
 
 
-@pytest.fixture(scope="module")
-def training(tmp_path_factory):
-    """A training that goes on, and its two addresses."""
-    folder = tmp_path_factory.mktemp("live")
-    process = subprocess.Popen(
-        [sys.executable, "-u", SCRIPT, folder], stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True
-    )
+@contextmanager
+def training_of(episodes, folder):
+    """A training of so many episodes, its addresses, and its further output."""
+    command = [sys.executable, "-u", SCRIPT, folder / "run", str(episodes)]
+    process = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True)
     addresses, heard = {}, []
+    reader = threading.Thread(target=lambda: heard.extend(process.stdout))
     try:
         for line in process.stdout:
             heard.append(line)
-            if told := re.match(r"ViewerCallback live \((\w+)\): (.*)", line):
+            if told := re.match(r"Watch live \((\w+)\): (.*)", line):
                 addresses[told[1]] = told[2]
             if len(addresses) == 2:
                 break
         assert len(addresses) == 2, "".join(heard)
-        yield process, addresses
+        reader.start()
+        yield process, addresses, heard
     finally:
         process.kill()
-        process.communicate()
+        if reader.ident:
+            reader.join()
+        process.stdout.close()
+        process.wait()
 
 
-def look_until_all_is_there(take_picture, path, *, limit_s):
-    """Takes pictures until one shows everything; the last one is kept in `path`."""
-    began = time.monotonic()
-    while True:
-        picture = take_picture()
-        path.write_bytes(picture)
-        lacking = missing(picture)
-        if not lacking:
-            return
-        assert time.monotonic() - began < limit_s, f"{path} lacks {lacking}"
-        time.sleep(1)
+@pytest.fixture(scope="module")
+def training(tmp_path_factory):
+    """A training that goes on for hours."""
+    with training_of(100_000, tmp_path_factory.mktemp("live")) as (process, addresses, _):
+        yield process, addresses
+
+
+def sources(addresses):
+    """The addresses of the recording and of the exhibition."""
+    return addresses["native"].split("--connect ")[1].split()
+
+
+def look_until(is_there, take_picture, path):
+    """Takes pictures until one shows what it should; the last one is kept in `path`."""
+
+    def shows():
+        path.write_bytes(take_picture())
+        return is_there(path.read_bytes())
+
+    wait_until(shows, LIMIT_S, f"{path} does not show it", every_s=1.0)
+
+
+def shows_all(picture):
+    return not missing(picture)
+
+
+class Moves:
+    """Whether a part of the picture has changed so many times."""
+
+    def __init__(self, place, times):
+        self.place, self.left, self.last = place, times, None
+
+    def __call__(self, picture):
+        seen = part(picture, self.place).tobytes()
+        self.left -= self.last is not None and seen != self.last
+        self.last = seen
+        return self.left <= 0
 
 
 def test_reruns_viewer_shows_a_live_training(training, tmp_path):
     process, addresses = training
-    with native_viewer(connect_to=addresses["native"].split()[-1]) as client:
-        look_until_all_is_there(client.take_screenshot, tmp_path / "native.png", limit_s=120)
+    with native_viewer(connect_to=sources(addresses)) as client:
+        look_until(shows_all, client.take_screenshot, tmp_path / "native.png")
         first = client.get_state()
-        time.sleep(5)
-        later = client.get_state()
-    assert not [report for view in later.views for report in view.reports], "no view complains"
-    assert newest_step(later) > newest_step(first), "the viewer follows the training"
+        assert not [report for view in first.views for report in view.reports], "no view complains"
+        wait_until(
+            lambda: newest_step(client.get_state()) > newest_step(first),
+            LIMIT_S,
+            "the viewer does not follow the training",
+        )
     assert process.poll() is None, "the training goes on"
 
 
@@ -115,11 +153,55 @@ def newest_step(state):
     return next(timeline.end for timeline in recording.timelines if timeline.name == "step")
 
 
+def test_the_exhibition_moves_while_the_training_goes_on_and_keeps_to_one_recording(training, tmp_path):
+    process, addresses = training
+    with native_viewer(connect_to=sources(addresses)) as client:
+        look_until(Moves(BOARD, 3), client.take_screenshot, tmp_path / "moving.png")
+        assert len(client.get_state().recordings) == 1, "two servers, one recording"
+        client.set_time("episode", sequence=0, play_state="paused")
+        look_until(Moves(BOARD, 3), client.take_screenshot, tmp_path / "paused.png")
+    assert process.poll() is None
+
+
+def test_the_end_of_a_run_is_seen_and_the_trained_policy_plays_on(tmp_path):
+    with training_of(3, tmp_path) as (process, addresses, heard):
+        with native_viewer(connect_to=sources(addresses)) as client:
+            look_until(Moves(BOARD, 1), client.take_screenshot, tmp_path / "begins.png")
+            running = part((tmp_path / "begins.png").read_bytes(), HEADER).tobytes()
+            wait_until(
+                lambda: process.poll() is not None or any("stays served" in line for line in heard),
+                LIMIT_S,
+                "the run does not end",
+            )
+            assert process.poll() is None, "".join(heard)
+            changed = Moves(HEADER, 1)
+            changed.last = running
+            look_until(changed, client.take_screenshot, tmp_path / "ended.png")
+            look_until(Moves(BOARD, 3), client.take_screenshot, tmp_path / "plays_on.png")
+        texts = column(tmp_path / "run" / "run.rrd", "header", "TextDocument:text")[1]
+        assert "Finished" in texts[-1][0]
+        process.send_signal(signal.SIGINT)
+        assert process.wait(LIMIT_S) == 0
+
+
 def test_the_web_viewer_in_chromium_shows_a_live_training(training, tmp_path):
     process, addresses = training
     with browser(addresses["browser"]) as take_picture:
-        look_until_all_is_there(take_picture, tmp_path / "browser.png", limit_s=400)
+        look_until(shows_all, take_picture, tmp_path / "browser.png")
+        look_until(Moves(BOARD, 1), take_picture, tmp_path / "browser_moves.png")
     assert process.poll() is None, "the training goes on"
+
+
+def test_the_web_viewer_shows_a_recording_that_is_served_from_its_file(tmp_path):
+    run = Path(__file__).parents[1] / "docs" / "results" / "commons" / "replay-0-0.rrd"
+    page = Page([run])
+    with browser(page.address()) as take_picture:
+        look_until(
+            lambda picture: len(spots(picture, (0.0, 0.0, 0.6, 0.8), PALETTE[APPLE], within=4)) > 3000,
+            take_picture,
+            tmp_path / "replay.png",
+        )
+    page.close()
 
 
 def test_an_empty_viewer_lacks_everything():
@@ -132,17 +214,27 @@ def test_a_browser_without_a_recording_lacks_everything(training):
     page = addresses["browser"].split("?")[0]
     nobody = f"rerun%2Bhttp%3A%2F%2F127.0.0.1%3A{free_port()}%2Fproxy"
     with browser(f"{page}?url={nobody}&renderer=webgl&persist=0&theme=dark") as take_picture:
-        time.sleep(20)
+        wait_until(lambda: is_drawn(take_picture()), LIMIT_S, "the viewer is not drawn", every_s=1.0)
         assert missing(take_picture()) == EVERYTHING
+
+
+def is_drawn(picture):
+    """Whether the web viewer has loaded: before, there is a line of text on one colour."""
+    return len(np.unique(part(picture, (0.0, 0.0, 1.0, 1.0)).reshape(-1, 3), axis=0)) > 300
 
 
 def test_names_in_the_layout_without_any_data_are_no_lines(tmp_path):
     agents = tuple(f"agent_{agent}" for agent in range(AGENTS))
     scene = Scene(height=12, width=24, walls=(), sites=(), agents=agents, window=(6, 13))
     with RerunLogger("run", tmp_path, scene=scene) as logger:
-        for name in [*(f"{agent}/return" for agent in agents), *PLACES]:
+        for name in PLACES:
             logger.log_scalar(name, 1.0, step=7)
     with native_viewer() as client:
         client.open(str(tmp_path / "run.rrd"))
-        time.sleep(2)
+        wait_until(lambda: has_loaded(client), LIMIT_S, "the recording is not loaded")
         assert missing(steady_picture(client)) == EVERYTHING, "one value has a legend, and makes no line"
+
+
+def has_loaded(client):
+    state = client.get_state()
+    return not state.loading and len(state.recordings) == 1

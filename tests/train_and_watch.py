@@ -1,6 +1,6 @@
-"""A small training that is served live until it is ended; `test_viewers.py` looks at it with real viewers.
+"""A small training that is served live, and afterwards until it is ended; for `test_viewers.py`.
 
-python tests/train_and_watch.py RUN
+python tests/train_and_watch.py RUN EPISODES
 """
 
 import os
@@ -9,17 +9,16 @@ import time
 from dataclasses import replace
 from pathlib import Path
 
-from cprl import CommonsEnv, presets
-from cprl.learners.replay import ReplayLearner
-from cprl.process import prepare_process
-from cprl.training import train
-from cprl.viewer.callback import ViewerCallback
-
-AGENTS = (0, 1, 2, 3)
+import cprl
+from cprl import Custom, Experiment, presets
+from cprl.algorithms import DQN
+from cprl.population import Learning
 
 
 class Leisure:
     """Leaves the processor to viewers, which draw without a graphics card."""
+
+    is_extendable = True
 
     def on_step(self, batch):
         time.sleep(0.01)
@@ -28,18 +27,24 @@ class Leisure:
         """Nothing."""
 
 
-def main(run: Path, *, episodes: int = 4000) -> None:
-    """Trains the four agents of two replicas in short episodes of the commons."""
+def main(run: Path, episodes: int) -> None:
+    """Trains four agents in two replicas, in short episodes of the commons."""
     os.nice(15)
-    prepare_process(5)
     game = presets.game("commons")
-    game = replace(game, rules=replace(game.rules, episode_steps=100))
     settings = replace(presets.dqn_settings("commons"), buffer_size=2000, hidden_cells=(8,))
-    agents = ReplayLearner(game.spaces, agents=AGENTS, replicas=2, settings=settings, seed=5, compile=False)
-    env = CommonsEnv(game, 2, seed=5)
-    with ViewerCallback(run, env, title="a live training", episodes=episodes, live="serve") as watch:
-        train(env, {AGENTS: agents}, episodes=episodes, callbacks=[watch, Leisure()])
+    experiment = Experiment(
+        name="a live training",
+        game=replace(game, rules=replace(game.rules, episode_steps=100)),
+        agents=[Learning(DQN(settings=settings))] * 4,
+        replicas=2,
+        episodes=episodes,
+        seed=5,
+        evaluation_episodes=1,
+        engine="eager",
+        callbacks=[Custom("train_and_watch:Leisure")],
+    )
+    cprl.run(experiment, run, watch="serve", linger=True)
 
 
 if __name__ == "__main__":
-    main(Path(sys.argv[1]))
+    main(Path(sys.argv[1]), int(sys.argv[2]))

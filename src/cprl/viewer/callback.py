@@ -307,6 +307,8 @@ class ViewerCallback:
         traceback: TracebackType | None,
     ) -> None:
         self._stop_notice()
+        if self.exhibition is not None:
+            self.exhibition.close()
         self._send_frames()
         self._views.close()
         if self.story is not None:

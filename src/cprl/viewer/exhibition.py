@@ -24,12 +24,13 @@ from cprl.viewer.streams import Live
 STEPS_PER_S: Final = 11
 """Steps of the exhibited world in a second of wall time."""
 
-MOST_SHARE: Final = 0.012
-"""The share of the training's wall time that its thread may spend on the exhibition: where a step of it takes
-longer than 1.1 ms, it plays more slowly."""
+BATCH_S: Final = 1.0
+"""Seconds whose steps are played at once, because eleven steps in a row take a quarter of the time of eleven
+between steps of the training; they are sent one by one."""
 
-EVERY_STEPS: Final = 11
-"""Steps after which the caption is sent again, and the state of transforms is taken over."""
+MOST_SHARE: Final = 0.01
+"""The share of the training's wall time that its thread may spend on the exhibition: where a step of it takes
+longer than 0.9 ms, it plays fewer."""
 
 _BOARD: Final = "world"
 """Where the entities of the recorded board are."""
@@ -60,7 +61,7 @@ class Exhibited(Protocol):
 
 
 class Exhibition:
-    """Plays a step when one is due, and sends viewers the board as static entities: they have no time.
+    """Plays steps when they are due, and sends viewers the board as static entities: they have no time.
 
     So a viewer shows the newest board wherever its cursor is and on every timeline, and keeps that one alone,
     however long the training takes. Nothing of it is written to the file. If it fails, it warns once, and the
@@ -73,6 +74,8 @@ class Exhibition:
         scene: the contents of the board.
         live: what viewers are sent.
         clock: seconds of wall time.
+        wait: waits so many seconds between two frames, in the thread that sends them; returns whether to
+            leave out the rest. By default until `close`.
 
     Raises:
         ValueError: for another number of worlds than one, or a game without a board.
@@ -87,6 +90,7 @@ class Exhibition:
         scene: Scene,
         live: Live,
         clock: Callable[[], float] = time.perf_counter,
+        wait: Callable[[float], bool] | None = None,
     ) -> None:
         commons = commons_of(env)
         if commons is None or tuple(env.batch_size) != (1,):
@@ -95,47 +99,46 @@ class Exhibition:
                 "one world of a CommonsEnv, with transforms or without"
             )
         self._policy, self._env, self._trained, self._scene = policy, env, trained, scene
-        self._live, self._clock = live, clock
-        self._recorder = FrameRecorder(commons, episodes=1, scene=scene, capacity=1)
+        self._live, self._clock, self._closing = live, clock, Event()
+        self._wait = wait or self._closing.wait
+        self._recorder = FrameRecorder(commons, episodes=1, scene=scene, capacity=STEPS_PER_S)
         self._carried: TensorDictBase | None = None
-        self._due = clock()
-        self._steps, self._caption = 0, ""
-        self._there = {"beams": False, "out": False}
+        self._due, self._count = clock(), STEPS_PER_S
+        self.steps = 0
+        """Steps played so far."""
         self.is_over = live.stream is None or live.exhibition is None
         """Whether it has ended, because it failed or has no viewers."""
-        for entity, parts in fixed(scene).items():
-            if live.stream is not None and entity.startswith(f"{_BOARD}/"):
-                live.stream.do(_log(_renamed(entity), *parts))
         if live.stream is not None:
-            live.stream.do(_log("exhibition/room", _room(scene)))
-        if live.exhibition is not None:  # before anything is compiled, which takes half a minute at first
-            live.exhibition.do(partial(_send, scene=scene, frames=_before_the_first_step(commons.game)))
-            self._send_caption(0)
+            live.stream.do(partial(_send_fixed, scene=scene))
+        self._send(_before_the_first_step(commons.game), 0)  # compiling may take half a minute
 
     def on_step(self, *, episode: int) -> None:
-        """Plays a step if one is due; `episode` is that of the training, for the caption."""
+        """Plays the steps of a second if they are due; `episode` is the training's, for the caption."""
         now = self._clock()
-        if now < self._due or self.is_over:
-            return
-        self._play(episode)
-        spent = self._clock() - now
-        self._due = max(now + max(1 / STEPS_PER_S, spent / MOST_SHARE), self._due + 1 / STEPS_PER_S)
+        if now >= self._due and not self.is_over:
+            self._due = now + BATCH_S
+            self._play(episode)
 
     def play_on(self, stop: Event, *, episode: int) -> None:
         """Plays the trained policy until the event is set; returns at once where it has ended."""
         self._policy.is_trained = True
         while not (self.is_over or stop.is_set()):
-            began = self._clock()
             self._play(episode)
-            stop.wait(max(0.0, 1 / STEPS_PER_S - (self._clock() - began)))
+            stop.wait(BATCH_S)
+
+    def close(self) -> None:
+        """Leaves out frames that have not been sent."""
+        self._closing.set()
 
     def _play(self, episode: int) -> None:
-        live = self._live.exhibition
-        if live is None or live.is_behind:
+        """Plays some steps, and has them sent; fewer the next time if they took long."""
+        if self._live.exhibition is None or self._live.exhibition.is_behind:
             return
+        began = self._clock()
         try:
             with self._policy.apart():
-                self._step()
+                for _ in range(self._count):
+                    self._step()
         except Exception as error:
             self.is_over = True
             warnings.warn(
@@ -144,42 +147,32 @@ class Exhibition:
                 stacklevel=4,
             )
             return
+        spent = self._clock() - began
+        self._due = max(self._due, began + spent / MOST_SHARE)
+        affordable = int(MOST_SHARE * BATCH_S / max(spent / self._count, 1e-9))
+        self._count = max(1, min(STEPS_PER_S, affordable))
         frames = self._recorder.take()
         if frames is not None:
-            live.do(partial(_send, scene=self._scene, frames=frames, **self._changing(frames)))
-        self._send_caption(episode)
+            self._send(frames, episode)
 
     def _step(self) -> None:
         """One step of the world, of which the recorder then has a frame; the first only begins an episode."""
-        if self._steps % EVERY_STEPS == 0 and isinstance(self._env, TransformedEnv):
-            load_transforms_state(self._env, transforms_state(self._trained))
-        self._steps += 1
+        self.steps += 1
         if self._carried is None:
             self._carried = self._env.reset()
             self._recorder.add_board()
             return
         batch, self._carried = self._env.step_and_maybe_reset(self._policy(self._carried))
         self._recorder.add(batch, step=0, episode=0)
+        if isinstance(self._env, TransformedEnv) and self.steps % STEPS_PER_S == 0:
+            load_transforms_state(self._env, transforms_state(self._trained))
 
-    def _changing(self, frames: Mapping[str, NDArray[Any]]) -> dict[str, bool]:
-        """Whether beams and agents out of play must be sent: with any, after any, and now and then."""
-        there = {"beams": bool(frames["beams"].any()), "out": not frames["in_play"].all()}
-        before, self._there = self._there, there
-        again = self._steps % EVERY_STEPS == 0
-        return {name: again or there[name] or before[name] for name in there}
-
-    def _send_caption(self, episode: int) -> None:
-        """Sends the caption where it has changed, and now and then for viewers that came later."""
-        caption = caption_of(self._policy, episode)
-        if caption == self._caption and self._steps % EVERY_STEPS:
-            return
-        import rerun as rr
-
-        self._caption = caption
-        place = (self._scene.width / 2 + RIM_CELLS, self._scene.height + 2 * RIM_CELLS + _CAPTION_CELLS)
-        what = rr.Points2D([place], labels=[caption], show_labels=True, radii=_THIN, colors=[(255, 255, 255)])
+    def _send(self, frames: Mapping[str, NDArray[Any]], episode: int) -> None:
         if self._live.exhibition is not None:
-            self._live.exhibition.do(_log("exhibition/caption", what))
+            caption = caption_of(self._policy, episode)
+            self._live.exhibition.do(
+                partial(_send_frames, scene=self._scene, frames=frames, caption=caption, wait=self._wait)
+            )
 
 
 def caption_of(policy: Exhibited, episode: int) -> str:
@@ -189,15 +182,6 @@ def caption_of(policy: Exhibited, episode: int) -> str:
     shown = list(dict.fromkeys(f"{epsilon:.2f}" for epsilon in policy.epsilons))
     chance = f", epsilon {' to '.join(dict.fromkeys((shown[0], shown[-1])))}" if shown else ""
     return f"{'trained' if policy.is_trained else 'present'} policy, episode {episode:,}{chance}"
-
-
-def _room(scene: Scene) -> Any:
-    """A line below the board in the colour of the background: the view makes room for what it shows."""
-    import rerun as rr
-
-    low = scene.height + 2 * RIM_CELLS + _ROOM_CELLS
-    ends = [(0.0, low), (scene.width + 2 * RIM_CELLS, low)]
-    return rr.LineStrips2D([ends], radii=_THIN, colors=[BACKGROUND])
 
 
 def _before_the_first_step(game: Game) -> dict[str, NDArray[Any]]:
@@ -220,18 +204,48 @@ def _before_the_first_step(game: Game) -> dict[str, NDArray[Any]]:
     return {name: array[None] for name, array in one.items()}
 
 
+def _send_fixed(recording: Any, *, scene: Scene) -> None:
+    """Sends what never changes, to the server that keeps it for viewers that come later."""
+    import rerun as rr
+
+    for entity, parts in fixed(scene).items():
+        if entity.startswith(f"{_BOARD}/"):
+            recording.log(_renamed(entity), *parts, static=True)
+    low = scene.height + 2 * RIM_CELLS + _ROOM_CELLS
+    line = [(0.0, low), (scene.width + 2 * RIM_CELLS, low)]  # hidden; the view makes room for what it shows
+    room = rr.LineStrips2D([line], radii=_THIN, colors=[BACKGROUND])
+    recording.log("exhibition/room", room, static=True)
+
+
+def _send_frames(
+    recording: Any,
+    *,
+    scene: Scene,
+    frames: Mapping[str, NDArray[Any]],
+    caption: str,
+    wait: Callable[[float], bool],
+) -> None:
+    """Sends frames without a time, so that viewers keep the last alone, spread over `BATCH_S`."""
+    import rerun as rr
+
+    place = (scene.width / 2 + RIM_CELLS, scene.height + 2 * RIM_CELLS + _CAPTION_CELLS)
+    text = rr.Points2D([place], labels=[caption], show_labels=True, radii=_THIN, colors=[(255, 255, 255)])
+    recording.log("exhibition/caption", text, static=True)
+    count = len(frames["step"])
+    beams: list[bool] = np.any(frames["beams"], axis=(1, 2)).tolist()
+    out: list[bool] = np.any(np.logical_not(frames["in_play"]), axis=1).tolist()
+    for at in range(count):
+        frame = {name: column[at : at + 1] for name, column in frames.items()}
+        is_first, since = at == 0, slice(max(at - 1, 0), at + 1)
+        shown = board_columns(
+            scene, frame, beams=is_first or any(beams[since]), out=is_first or any(out[since])
+        )
+        for entity, (_, what) in shown.items():
+            recording.send_columns(_renamed(entity), [], what)
+        if at + 1 < count and wait(BATCH_S / count):
+            return
+
+
 def _renamed(entity: str) -> str:
     """The name in the exhibition of an entity of the recorded board."""
     return "exhibition" + entity.removeprefix(_BOARD)
-
-
-def _log(entity: str, *what: Any) -> Callable[[Any], object]:
-    return lambda recording: recording.log(entity, *what, static=True)
-
-
-def _send(
-    recording: Any, *, scene: Scene, frames: Mapping[str, NDArray[Any]], beams: bool = True, out: bool = True
-) -> None:
-    """Sends a frame without a time, so that viewers keep no other."""
-    for entity, (_, what) in board_columns(scene, frames, beams=beams, out=out).items():
-        recording.send_columns(_renamed(entity), [], what)

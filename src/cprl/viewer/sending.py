@@ -10,7 +10,7 @@ from cprl.viewer.deadline import Sender, abandon
 
 FLUSH_TIMEOUT_S: Final = 5.0
 
-_KEEPS_UP: Final = 8
+_KEEPS_UP: Final = 1
 """The number of calls that may wait for viewers that keep up."""
 
 

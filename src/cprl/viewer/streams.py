@@ -70,8 +70,8 @@ class Live:
     stream: Stream | None = None
     """The recording; None without a viewer."""
     exhibition: Stream | None = None
-    """Where the exhibition is sent: a server of its own, since a server that has used its memory drops the
-    oldest rows of all; in a viewer that listens, the stream above. None where nothing is exhibited."""
+    """Where the exhibition is sent, which waits between its frames; a server of its own, since a server that
+    has used its memory drops the oldest rows of all. None where nothing is exhibited."""
     addresses: dict[str, str] = field(default_factory=dict)
     """How to watch: "browser" and "native"."""
     page: Page | None = None
@@ -128,8 +128,11 @@ def open_live(
     _check(live, _LIVE)
     made = partial(_recording, application, recording_id)
     if live.startswith("connect "):
-        stream = _connect(live.partition(" ")[2], made, blueprint, period_s)
-        return Live(stream, stream if exhibits else None)
+        address, exhibition = live.partition(" ")[2], None
+        stream = _connect(address, made, blueprint, period_s)
+        if exhibits and stream is not None:
+            exhibition = _connect(address, partial(made, send_properties=False), blueprint, period_s)
+        return Live(stream, exhibition)
     stream, *grpc = _serve("live view", made(), blueprint, period_s, SERVER_MEMORY)
     exhibition = None
     if exhibits:  # with the layout as well: a viewer may hear of the recording here first
