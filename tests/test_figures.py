@@ -126,6 +126,7 @@ def test_a_centred_running_mean_stands_at_the_middle_of_its_episodes(tmp_path, d
     metrics["collective_return"] = np.arange(60.0)[None]
     training_curve(a_run(tmp_path / "run", metrics), title="a line")
     bold = next(line for line in curves_panels(drawn[0])[0].lines if line.get_color() == style.MEAN)
+    assert "highest and last mean of 3 episodes, 58 apples, episode 58" in labels(drawn[0])
     np.testing.assert_allclose(bold.get_xdata(), bold.get_ydata(), err_msg="a mean of a line lies on it")
     assert centres(np.zeros(5), 2).tolist() == [0.5, 1.5, 2.5, 3.5]
 
