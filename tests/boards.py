@@ -7,7 +7,7 @@ import numpy as np
 
 from cprl import Game, Map, Observation, Rules, maps
 from cprl.commons.batch import Batch
-from cprl.commons.colours import CLASS_NAMES, agent_colour
+from cprl.commons.colours import CLASS_NAMES, FIRST_AGENT, class_colour
 from cprl.commons.maps import SIGN_OF_HEADING
 from cprl.commons.world import StepOutput
 
@@ -86,7 +86,7 @@ class Play:
         if self.game.observation.encoding == "one_hot":
             return self._one_hot_window(agent)
         pixels = self.output.observation[0, agent].transpose(1, 2, 0)
-        numbers = {agent_colour(i): str(i) for i in range(self.game.agents)}
+        numbers = {class_colour(FIRST_AGENT + i): str(i) for i in range(self.game.agents)}
         signs = {**RGB_SIGN, **(numbers if self.game.observation.agents_apart else {})}
         return "\n".join("".join(signs[tuple(map(int, cell))] for cell in row) for row in pixels)
 

@@ -303,10 +303,10 @@ def test_a_recording_names_agents_as_the_environment_does(tmp_path):
     with ViewerCallback(tmp_path, wrapped, title="matrix", episodes=2) as viewer:
         play(wrapped, tit_for_tat, 6, callbacks=[viewer])
     path = tmp_path / "run.rrd"
-    assert column(path, "row/return", "Scalars:scalars", "episode") == ([0], [[4.5]])
+    assert column(path, "row/return", "Scalars:scalars", "episode") == ([0], [[4.5, 4.5]])
     assert column(path, "row/loss", "Scalars:scalars")[1] == [[0.5]]
     _, survival = column(path, "social/survival_steps", "Scalars:scalars")
-    assert survival == [[5.0, 6.0, 5.5]]
+    assert survival == [[5.0, 6.0, 5.5, 5.5]]
 
 
 def test_under_transforms_windows_show_what_the_agents_of_the_game_observe(tmp_path):

@@ -7,7 +7,7 @@ from torchrl.envs.utils import check_env_specs
 
 from cprl import CommonsEnv, Game, Observation, Rules, keys, maps, presets
 from cprl.commons.batch import Batch
-from cprl.commons.colours import COLOURS, MAX_AGENTS_APART, agent_colour
+from cprl.commons.colours import COLOURS, FIRST_AGENT, MAX_AGENTS_APART, class_colour
 from cprl.commons.tables import cells_between
 
 BOARD = """
@@ -83,7 +83,7 @@ def test_channels_have_the_names_of_colours_or_classes():
 
 
 def test_identity_colours_differ_from_each_other_and_from_the_colours_of_classes():
-    colours = [agent_colour(agent) for agent in range(MAX_AGENTS_APART)]
+    colours = [class_colour(FIRST_AGENT + agent) for agent in range(MAX_AGENTS_APART)]
     assert len({*colours, *COLOURS}) == MAX_AGENTS_APART + len(COLOURS)
 
 

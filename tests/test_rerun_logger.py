@@ -13,7 +13,7 @@ from tensordict import TensorDict
 
 from cprl import CommonsEnv, Game, Observation, Rules, maps
 from cprl.algorithms import DQN
-from cprl.commons.colours import APPLE, BEAM, COLOURS, FIRST_AGENT, GROUND, OTHER, SELF, WALL
+from cprl.commons.colours import APPLE, BEAM, COLOURS, FIRST_AGENT, GROUND, OTHER, PALETTE, SELF, WALL
 from cprl.commons.decoding import UNSEEN, classes_seen
 from cprl.learners.settings import DQNSettings
 from cprl.policies.single import RandomActor
@@ -115,13 +115,12 @@ def test_frames_show_the_board_the_agents_and_what_each_sees(tmp_path):
             assert site in agents or inner[site] == (APPLE if apple else GROUND)
         assert {cell: inner[cell] for cell in agents} == agents
         assert (inner >= FIRST_AGENT).sum() == len(agents), "who is out of play is not drawn as if it were in"
-    _, places = column(path, "world/agents", "Arrows2D:origins")
-    assert places[1] == [[1 + 1.5, 0 + 1.5], [4 + 1.5, 1 + 1.5]]
-    _, headings = column(path, "world/agents", "Arrows2D:vectors")
-    assert headings[2] == [pytest.approx([0, 1.5]), [0, 0]], (
-        "heading 2 points down; who is out points nowhere"
-    )
-    assert static(path, "world/agents", "Arrows2D:labels") == ["0", "1"]
+    _, lines = column(path, "world/agents", "LineStrips2D:strips")
+    assert [len(drawn) for drawn in lines] == [4, 4, 2, 2, 2, 2], "a triangle and a digit an agent in play"
+    (_, tip, *_), _, digit, _ = (np.array(line) for line in lines[1])
+    assert (tip - (2.5, 1.5)).tolist() == pytest.approx([0.44, 0], abs=1e-6), "heading 1 points right"
+    assert (np.abs(digit - (2.5, 1.5)) < 0.5).all(), "the number is inside the cell"
+    assert digit[:, 0].max() < tip[0] - 0.2, "and behind the triangle"
     _, windows = column(path, "windows", "SegmentationImage:buffer")
     (_, _), (top, left) = window_corners(2, (3, 5))
     first = np.array(windows[0][0], np.uint8).reshape(3 + top, 5 + left)
@@ -129,7 +128,7 @@ def test_frames_show_the_board_the_agents_and_what_each_sees(tmp_path):
     assert np.array_equal(np.array(COLOURS)[first[top:, left:]].transpose(2, 0, 1), shown[0].windows[1])
     assert UNSEEN in first
     frames_of_windows = static(path, "windows/frames", "Boxes2D:colors")
-    assert [colour >> 8 for colour in frames_of_windows] == [0x569CFF, 0xFF5C5C], "the agents' colours"
+    assert [colour >> 8 for colour in frames_of_windows] == [0x56B4E9, 0xE66100], "the agents' colours"
 
 
 def test_beams_and_those_out_of_play_have_marks_that_are_told_when_they_change(tmp_path):
@@ -146,21 +145,22 @@ def test_beams_and_those_out_of_play_have_marks_that_are_told_when_they_change(t
     _, centres = column(path, "world/out", "Boxes2D:centers")
     assert centres[1] == [[4 + 1.5, 2 + 1.5]]
     _, colours = column(path, "world/out", "Boxes2D:colors")
-    assert colours[1][0] >> 8 == 0xFF5C5C, "in agent 1's own colour"
+    assert colours[1][0] >> 8 == 0xE66100, "in agent 1's own colour"
 
 
 def test_colours_and_names_of_classes_are_in_the_recording(tmp_path):
     with RerunLogger("run", tmp_path, scene=SCENE):
         pass
-    (context,) = [
-        chunk.to_record_batch().column("AnnotationContext:context").to_pylist()[0]
-        for chunk in RrdReader(tmp_path / "run.rrd").stream()
-        if "AnnotationContext:context" in chunk.to_record_batch().schema.names
+    for entity, apple in (("", PALETTE[APPLE]), ("windows", COLOURS[APPLE])):
+        context = static(tmp_path / "run.rrd", entity, "AnnotationContext:context")
+        told = {entry["class_id"]: entry["class_description"]["info"] for entry in context[0]}
+        assert told[APPLE]["label"] == "apple"
+        red, green, blue = apple
+        assert told[APPLE]["color"] >> 8 == red << 16 | green << 8 | blue, "windows keep the study's colours"
+    assert static(tmp_path / "run.rrd", "agent_1/return", "SeriesLines:names") == [
+        "agent_1",
+        "agent_1, running mean",
     ]
-    told = {entry["class_id"]: entry["class_description"]["info"] for entry in context[0]}
-    assert told[APPLE]["label"] == "apple"
-    assert told[APPLE]["color"] >> 8 == 0x00FF00
-    assert static(tmp_path / "run.rrd", "agent_1/return", "SeriesLines:names") == ["agent_1"]
     assert RrdReader(tmp_path / "run.rrd").blueprints()
 
 
@@ -182,7 +182,7 @@ def test_torchrls_logger_interface_is_there(tmp_path):
     assert steps == [10, 11]
     assert np.array_equal(np.array(images[1][0]).reshape(4, 5, 3), clip[0, 1].permute(1, 2, 0))
     assert column(path, "weights", "BarChart:values")[0] == [6]
-    assert "gamma" in static(path, "recipe", "TextDocument:text")[0]
+    assert "| gamma | 0.995 |" in static(path, "recipe", "TextDocument:text")[0]
     assert column(path, "log", "TextLog:text")[1] == [["an apple fell"]]
 
 
@@ -333,7 +333,7 @@ def test_a_watched_training_records_every_turn_and_learns_the_very_same(tmp_path
     path = tmp_path / "run.rrd"
     steps, _ = column(path, "world/board", "SegmentationImage:buffer")
     episodes, _ = column(path, "world/board", "SegmentationImage:buffer", "episode")
-    ends = np.cumsum(column(path, "social/survival_steps", "Scalars:scalars")[1])
+    ends = np.cumsum([own[0] for own in column(path, "social/survival_steps", "Scalars:scalars")[1]])
     assert sorted([*steps, *ends]) == list(range(1, int(ends[-1]) + 1)), "every turn but the last of each"
     assert sorted(set(episodes)) == [0, 1, 2, 3]
     assert column(path, "agent_0/return", "Scalars:scalars", "episode")[0] == [0, 1, 2, 3]

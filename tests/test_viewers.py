@@ -12,7 +12,7 @@ import pytest
 from PIL import Image
 from viewers import browser, free_port, native_viewer, steady_picture
 
-from cprl.commons.colours import APPLE, COLOURS, agent_colour
+from cprl.commons.colours import APPLE, PALETTE, agent_colour
 from cprl.viewer.logger import RerunLogger
 from cprl.viewer.scenery import SOCIAL, Scene
 
@@ -49,7 +49,7 @@ def missing(picture):
     does.
     """
     lacking = []
-    if len(spots(picture, BOARD, COLOURS[APPLE], within=4)) < 5000:
+    if len(spots(picture, BOARD, PALETTE[APPLE], within=4)) < 5000:
         lacking.append("apples")
     for agent in range(AGENTS):
         if len(spots(picture, BOARD, agent_colour(agent), within=4)) < 60:

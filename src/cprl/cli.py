@@ -2,9 +2,13 @@
 
 import os
 import sys
+import time
+from collections.abc import Sequence
+from contextlib import suppress
 from dataclasses import replace
 from importlib.metadata import version
 from pathlib import Path
+from typing import Any
 
 import tyro
 from rich.table import Table
@@ -14,15 +18,23 @@ from cprl.evaluation.cross_play import Diagonal
 from cprl.evaluation.cross_play import crossplay as play_each_other
 from cprl.evaluation.evaluate import SEED, evaluate_run
 from cprl.evaluation.film import film as film_run
+from cprl.evaluation.film_video import SUFFIXES, film_video
 from cprl.evaluation.tables import agents_table, heading, matrices, run_table
 from cprl.experiment import Experiment
 from cprl.output import OUT, console, keep_output, say
+from cprl.play.opening import SEED as PLAY_SEED
+from cprl.play.opening import open_session
+from cprl.play.terminal import play_in_terminal
+from cprl.play.window import NoWindowError, play_in_window
+from cprl.play.wording import ending, results_text, state
+from cprl.presets import Variant
 from cprl.process import prepare_process
 from cprl.reporting import write_report
 from cprl.running import run as run_experiment
 from cprl.runs.directory import read_recipe
 from cprl.runs.export import export_results
 from cprl.runs.labelled import refuse_to_write_over, write_table
+from cprl.viewer.page import Page, has_display
 from cprl.viewer.streams import viewer
 
 Allow = tyro.conf.UseAppendAction[tuple[str, ...]]
@@ -39,6 +51,7 @@ def run(
     take_over: bool = False,
     keep_checkpoint: bool = True,
     watch: str = "file",
+    linger: bool = False,
     allow: Allow = (),
 ) -> None:
     """Trains the experiment of a recipe or of a run anew, or resumes a run that was stopped.
@@ -51,6 +64,7 @@ def run(
         take_over: resume a run that a process on another host has locked.
         keep_checkpoint: keep the state of the training of a finished run, so that it can be extended.
         watch: "file", or live as well: "serve", "spawn", "connect ADDRESS"; "off" for no recording.
+        linger: keep the recording served after the run, until Ctrl-C; with --watch serve or spawn.
         allow: code of your own, module:Class, that the recipe may import; may be repeated.
     """
     _make_importable(allow)
@@ -67,6 +81,7 @@ def run(
         take_over=take_over,
         keep_checkpoint=keep_checkpoint,
         watch=watch,
+        linger=linger,
         allow=allow,
         command=sys.argv,
     )
@@ -93,35 +108,121 @@ def film(
     replica: int = 0,
     episode: int = 0,
     out: Path | None = None,
+    every: int | None = None,
+    fps: float | None = None,
+    width: int | None = None,
     allow: Allow = (),
 ) -> None:
-    """Lets the agents of a run play a fresh episode, and records every step for the Rerun viewer.
+    """Lets the agents of a run play a fresh episode, recorded for the Rerun viewer or as a film.
 
     Args:
         run: the run's directory, or its results.
         replica: whose agents.
         episode: which of the fresh episodes; the same number plays the same again.
-        out: the recording; by default film-<replica>-<episode>.rrd in the run's directory.
+        out: what is written: a recording for the viewer (.rrd), or a film of the board, the stock and the
+            harvests (.gif, or .mp4, which wants the extra "film"); by default film-<replica>-<episode>.rrd in
+            the run's directory.
+        every: of a .gif or .mp4: turns from one picture to the next; by default 1 for an .mp4, and for a .gif
+            as many as it takes for 300 pictures.
+        fps: of a .gif or .mp4: pictures per second, at most 50; by default 15.
+        width: of a .gif or .mp4, in pixels, 240 to 1920; by default 640.
         allow: code of your own, module:Class, that the run may import; see docs/changing.md.
     """
+    flags: dict[str, Any] = {"every": every, "fps": fps, "width": width}
+    given = {name: value for name, value in flags.items() if value is not None}
+    if out is not None and out.suffix not in (".rrd", *SUFFIXES):
+        raise ValueError(f"--out is {out}; allowed: a name that ends in .rrd, {', '.join(SUFFIXES)}")
+    is_video = out is not None and out.suffix in SUFFIXES
+    if given and not is_video:
+        raise ValueError(f"--{next(iter(given))} is for films; allowed: with --out FILE.gif or FILE.mp4")
     _make_importable(allow)
     prepare_process(SEED)
-    path, played = film_run(run, out, replica=replica, episode=episode, allow=allow)
+    if out is not None and is_video:
+        path, played = film_video(run, out, replica=replica, episode=episode, allow=allow, **given)
+    else:
+        path, played = film_run(run, out, replica=replica, episode=episode, allow=allow)
     say(f"{played.steps} steps, {played.outcome}")
-    say(f"Watch: {viewer()} {path}")
+    say(f"{path}: {path.stat().st_size / 1000:.0f} kB" if is_video else f"Watch: {viewer()} {path}")
 
 
-def watch(run: Path, /) -> None:
+def play(
+    board: str,
+    /,
+    *,
+    agent: int = 0,
+    others: str | None = None,
+    replica: int = 0,
+    variant: Variant = "published",
+    steps: int | None = None,
+    seed: int = PLAY_SEED,
+    terminal: bool = False,
+    allow: Allow = (),
+) -> None:
+    """Lets you play among trained or scripted agents, a turn for each key, and measures the episode.
+
+    Args:
+        board: commons, two_complex, single_complex or single_basic; or the directory of a run, whose game it
+            is then; or a file with a drawing.
+        agent: yours.
+        others: the directory of a run, whose agents play, or random, greedy, sustainable, territorial,
+            aggressive or pacifist; by default the agents of the run that is the board, else greedy.
+        replica: of the run whose agents play.
+        variant: of the boards with a name, published or as_run; see docs/game.md.
+        steps: turns of the episode at most; by default those of the game.
+        seed: of all chance; the same seed and the same keys play the same again.
+        terminal: play in the terminal, by lines of keys; also without pygame (extra "play") or a display.
+        allow: code of your own, module:Class, that a run may import; see docs/changing.md.
+    """
+    _make_importable(allow)
+    prepare_process(seed)
+    session = open_session(
+        board,
+        agent=agent,
+        others=others,
+        replica=replica,
+        variant=variant,
+        steps=steps,
+        seed=seed,
+        allow=allow,
+    )
+    if not terminal:
+        try:
+            play_in_window(session, f"cprl play {board}")
+        except NoWindowError as error:
+            say(f"{error}; you play in the terminal")
+            terminal = True
+        else:
+            say(f"{state(session)}; {ending(session)}\n{results_text(session)}")
+    if terminal:
+        play_in_terminal(session)
+
+
+def watch(run: Path, /, *, serve: bool = False) -> None:
     """Opens the recording of a run in the Rerun viewer, all files of it as one.
 
     Args:
         run: the run's directory, or a single .rrd file.
+        serve: serve it for browsers on 127.0.0.1 instead, until Ctrl-C, as without a display.
     """
     files = [run] if run.is_file() else sorted(run.glob("*.rrd"))
     if not files:
         raise ValueError(f"{run} holds no recording (*.rrd); recipes write one unless watch is off")
+    if serve or not has_display():
+        _serve(files, why="" if serve else "There is no display: ")
+        return
     command = [viewer(), *map(str, files)]
     os.execvp(command[0], command)
+
+
+def _serve(files: Sequence[Path], *, why: str) -> None:
+    """Serves recordings and the web viewer until Ctrl-C."""
+    page = Page(files)
+    say(f"Watch (browser): {page.address()}")
+    say(f"Watch (native): {viewer()} {' '.join(page.recordings)}")
+    say(f"{why}served on 127.0.0.1 until Ctrl-C")
+    with suppress(KeyboardInterrupt):
+        while True:
+            time.sleep(1)
 
 
 def export(run: Path, folder: Path, /) -> None:
@@ -236,6 +337,7 @@ def main() -> None:
                 "run": run,
                 "watch": watch,
                 "film": film,
+                "play": play,
                 "report": report,
                 "export": export,
                 "evaluate": evaluate,

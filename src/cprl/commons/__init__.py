@@ -24,5 +24,6 @@ In reading order:
     state        reads, checks and restores the state of B worlds
     batch        Batch: B worlds, played a turn at a time
     decoding     observations back to classes of cells
+    sprites      agents as they are drawn: number, heading and second mark
     picture      an image of the board for people
 """

@@ -79,6 +79,11 @@ class Batch:
         self._all_worlds = self._selection(np.ones(worlds, np.bool_))
         self.set_seed(seed)
 
+    @property
+    def has_begun(self) -> bool:
+        """Whether the worlds have begun an episode, so that there is something to show."""
+        return self._has_begun
+
     def _selection(self, which: Bools) -> Bools:
         selection = self.driver.empty((self.size,), np.bool_)
         self.driver.write(selection, which)

@@ -1,4 +1,10 @@
-"""The classes of cells and their colours."""
+"""The classes of cells, their colours in windows, and the palette of all pictures for people.
+
+Windows keep the study's colours (`COLOURS`), because agents learn from them: there an agent sees itself in
+blue and others in red, whoever they are. All other pictures for people, the viewer's, boards, figures and
+films, have one palette, in which apples, agents, beams, walls and ground also differ under deuteranopia and
+protanopia. Only four hues are that far apart: agents 4 to 7 have those of agents 0 to 3, and a mark.
+"""
 
 from colorsys import hsv_to_rgb
 from typing import Final
@@ -24,9 +30,27 @@ COLOURS: Final[tuple[Colour, ...]] = (
     (0, 0, 255),
     (0, 0, 0),
 )
-"""Red, green and blue of each class [W, run]; HIDDEN is ours."""
+"""Red, green and blue of each class in windows [W, run]; HIDDEN is ours."""
 
-AGENT_COLOURS: Final[tuple[Colour, ...]] = (
+WINDOW_CAPTION: Final = "in the study's colours: self blue, others red"
+"""The caption of windows wherever they are shown."""
+
+PALETTE: Final[dict[int, Colour]] = {
+    GROUND: (16, 18, 22),
+    WALL: (70, 74, 84),
+    APPLE: (0, 110, 70),
+    BEAM: (200, 200, 200),
+}
+"""Red, green and blue of the classes in pictures for people; agents have `agent_colour`."""
+
+AGENT_COLOURS: Final[tuple[Colour, ...]] = ((86, 180, 233), (230, 97, 0), (240, 228, 66), (204, 121, 167))
+"""The hues of agents in pictures for people: blue, orange, yellow, pink."""
+
+MARKS: Final = ("plain", "ring", "stripe", "corners")
+"""The second marks: none for agents 0 to 3, a ring for 4 to 7, a stripe on either side for 8 to 11, the four
+corners for 12 to 15. From agent 16 on they repeat, and the number alone tells agents apart."""
+
+_APART_COLOURS: Final[tuple[Colour, ...]] = (
     (86, 156, 255),
     (255, 92, 92),
     (255, 201, 60),
@@ -36,14 +60,22 @@ AGENT_COLOURS: Final[tuple[Colour, ...]] = (
     (255, 130, 200),
     (200, 220, 90),
 )
+"""Other agents in windows under `agents_apart`; stored agents learned from them, so they stay as they are."""
 
 
 def agent_colour(agent: int) -> Colour:
-    """An agent's identity colour (red, green, blue), 0..255: eight distinct colours, then hues in between."""
-    if agent < len(AGENT_COLOURS):
-        return AGENT_COLOURS[agent]
-    red, green, blue = hsv_to_rgb(agent * 0.618034 % 1, 0.65, 1.0)
-    return round(255 * red), round(255 * green), round(255 * blue)
+    """An agent's hue (red, green, blue), 0..255, in pictures for people; agents 0 and 4 have the same."""
+    return AGENT_COLOURS[agent % len(AGENT_COLOURS)]
+
+
+def agent_mark(agent: int) -> str:
+    """An agent's second mark, one of `MARKS`; with the hue it tells sixteen agents apart."""
+    return MARKS[agent // len(AGENT_COLOURS) % len(MARKS)]
+
+
+def picture_colour(kind: int) -> Colour:
+    """The colour of a class in pictures for people; classes that only windows have keep the study's."""
+    return PALETTE.get(kind, COLOURS[kind]) if kind < FIRST_AGENT else agent_colour(kind - FIRST_AGENT)
 
 
 def class_name(kind: int) -> str:
@@ -52,5 +84,13 @@ def class_name(kind: int) -> str:
 
 
 def class_colour(kind: int) -> Colour:
-    """The colour of a class; an agent's class has the agent's identity colour."""
-    return COLOURS[kind] if kind < FIRST_AGENT else agent_colour(kind - FIRST_AGENT)
+    """The colour of a class in windows; under `agents_apart` each agent has one of its own."""
+    return COLOURS[kind] if kind < FIRST_AGENT else _apart_colour(kind - FIRST_AGENT)
+
+
+def _apart_colour(agent: int) -> Colour:
+    """Eight distinct colours, then hues in between."""
+    if agent < len(_APART_COLOURS):
+        return _APART_COLOURS[agent]
+    red, green, blue = hsv_to_rgb(agent * 0.618034 % 1, 0.65, 1.0)
+    return round(255 * red), round(255 * green), round(255 * blue)

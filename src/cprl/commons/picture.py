@@ -1,4 +1,4 @@
-"""An image of the board for people: apples, walls, and each agent in its own colour with its heading."""
+"""An image of the board for people: apples, walls, and agents in their hues with number and heading."""
 
 from typing import Any, Final
 
@@ -6,15 +6,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cprl.arguments import floats, integer, object_of, refusal
-from cprl.commons.colours import APPLE, BEAM, COLOURS, GROUND, WALL, agent_colour
+from cprl.commons.colours import APPLE, BEAM, GROUND, PALETTE, WALL, agent_colour
 from cprl.commons.game import Game
 from cprl.commons.maps import Map
-from cprl.commons.world import COL_STEP, ROW_STEP, Bools, Bytes, Ints, Shown
+from cprl.commons.sprites import BODY, INK, INK_COLOUR, MARK_COLOUR, MARKED, agent_sprite
+from cprl.commons.world import ROW_STEP, Bools, Bytes, Ints, Shown
 from cprl.memory import check_memory
 
 LARGEST_CELL_PIXELS: Final = 1000
 GRID_COLOUR: Final = (28, 30, 36)
-CELL_COLOURS: Final = {GROUND: (16, 18, 22), WALL: (125, 125, 125), APPLE: (46, 184, 76)}
 
 
 def board_image(
@@ -69,13 +69,13 @@ def board_image(
         for c in range(board.width):
             kind = int(kinds[r, c])
             inset = size // 6 if kind == APPLE else 0
-            image[r * size + 1 : (r + 1) * size, c * size + 1 : (c + 1) * size] = CELL_COLOURS[GROUND]
-            _fill(image, r, c, size, inset, CELL_COLOURS[kind])
+            image[r * size + 1 : (r + 1) * size, c * size + 1 : (c + 1) * size] = PALETTE[GROUND]
+            _fill(image, r, c, size, inset, PALETTE[kind])
             if beams is not None and beams[r, c]:
-                _fill(image, r, c, size, 2 * size // 5, COLOURS[BEAM])
+                _fill(image, r, c, size, 2 * size // 5, PALETTE[BEAM])
     for i, (r, c, h) in enumerate(zip(row, col, heading, strict=True)):
         if in_play is None or in_play[i]:
-            _draw_agent(image, int(r), int(c), int(h), size, agent_colour(i))
+            _draw_agent(image, int(r), int(c), int(h), size, i)
     return image
 
 
@@ -118,15 +118,9 @@ def _fill(image: Bytes, r: int, c: int, size: int, inset: int, colour: tuple[int
     image[top : (r + 1) * size - inset, left : (c + 1) * size - inset] = colour
 
 
-def _draw_agent(image: Bytes, r: int, c: int, heading: int, size: int, colour: tuple[int, int, int]) -> None:
-    """Draws a square with a white triangle that points in the direction of the heading."""
-    _fill(image, r, c, size, 1, colour)
-    middle = size // 2
-    for away in range(size // 2 - 2):
-        half = (size // 2 - 2 - away) // 2
-        row = r * size + middle + ROW_STEP[heading] * away
-        col = c * size + middle + COL_STEP[heading] * away
-        if ROW_STEP[heading]:
-            image[row, col - half : col + half + 1] = 255
-        else:
-            image[row - half : row + half + 1, col] = 255
+def _draw_agent(image: Bytes, r: int, c: int, heading: int, size: int, agent: int) -> None:
+    """Draws an agent's sprite in its hue."""
+    sprite = agent_sprite(agent, heading, size - 1)
+    cell = image[r * size + 1 : (r + 1) * size, c * size + 1 : (c + 1) * size]
+    for part, colour in ((BODY, agent_colour(agent)), (INK, INK_COLOUR), (MARKED, MARK_COLOUR)):
+        cell[sprite == part] = colour

@@ -15,9 +15,10 @@ from cprl import arguments, keys
 from cprl.checks import shown
 from cprl.commons.batch import Batch
 from cprl.commons.game import Game, output_shapes
-from cprl.commons.world import StepOutput
+from cprl.commons.world import Bytes, StepOutput
 from cprl.compat import LeanStepEnv, flag_spec, put_all, unchecked_tensordict
 from cprl.envs.drivers import device_of, drawn_seed, driver_for
+from cprl.envs.rendering import images
 
 _AGENT_ENTRIES = ("observation", "harvest", "in_play", "fired", "hit_by", "tagged_by")
 _TORCH_TYPES = {
@@ -237,6 +238,14 @@ class CommonsEnv(LeanStepEnv):
         self.worlds.load(state, output)
         self._show_in(tensors, output)
         return self._as_tensordict(tensors)
+
+    def render(self, *, world: int | None = None, cell_pixels: int = 24) -> Bytes:
+        """Images of the boards as they are now, e.g. for TorchRL's `PixelRenderTransform`.
+
+        Returns:
+            A numpy array, uint8 [B, rows, columns, 3] in RGB; of one `world` uint8 [rows, columns, 3].
+        """
+        return images(self.worlds, self.output, world=world, cell_pixels=cell_pixels)
 
     def _step(self, tensordict: TensorDictBase) -> TensorDict:
         actions = self._as_array(self._actions(tensordict).contiguous())

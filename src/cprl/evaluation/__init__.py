@@ -4,9 +4,13 @@ Modules, in the order in which one reads them:
     evaluate    evaluate_run: all replicas of a run, beside the random policy
     cross_play  crossplay: a focal agent of one run among background agents of another
     film        an episode, every step recorded
+    film_video  the same as a GIF or an MP4
     lanes       stored agents of all replicas side by side
     same_game   whether two runs can play together
     tables      tables for the terminal
+    turns            one episode of one world, turn by turn
+    episode_picture  the board with the stock and the harvests so far
+    video_files      GIF and MP4 out of pictures
 """
 
 from cprl.evaluation.cross_play import Cell, CrossPlay, crossplay

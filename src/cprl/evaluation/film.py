@@ -1,18 +1,54 @@
 """film: records an episode of the agents of a stored run, step by step."""
 
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 
 from tensordict import TensorDictBase
+from torchrl.envs import EnvBase
 
 from cprl import arguments, keys
 from cprl.measuring.episodes import Episode
-from cprl.stored import load
+from cprl.policies.assignment import AgentPolicies
+from cprl.stored import LoadedRun, load
 from cprl.training import train
 from cprl.viewer.callback import ViewerCallback
 
 SEED = 20_011
 """The seed of fresh worlds; no training of ours uses it."""
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class FreshEpisode:
+    """A fresh world of a run's game, and who plays in it."""
+
+    run: LoadedRun
+    env: EnvBase
+    """One world, with the run's transforms."""
+    policies: AgentPolicies
+    title: str
+
+
+def fresh_episode(
+    run: str | Path, *, replica: int = 0, episode: int = 0, allow: Sequence[str] = ()
+) -> FreshEpisode:
+    """The world and the agents of an episode that is filmed; equal numbers give equal episodes. See `film`.
+
+    Raises:
+        ValueError: if the run cannot be loaded, see `cprl.load`, or a number is out of range.
+    """
+    episode = arguments.integer("episode", episode, 0, 2**32 - 1)
+    replica = arguments.integer("replica", replica, 0)
+    arguments.object_of("run", run, (str, Path), "a directory")
+    loaded = load(run, allow=allow)
+    if replica not in loaded.replicas:
+        raise ValueError(f"replica is {replica}; allowed: {', '.join(map(str, loaded.replicas))}")
+    return FreshEpisode(
+        run=loaded,
+        env=loaded.env(1, seed=SEED, first_world=episode),
+        policies=loaded.policy(replica, seed=SEED + episode),
+        title=f"{Path(run).name}, agents of replica {replica}, fresh episode {episode}",
+    )
 
 
 def film(
@@ -27,7 +63,7 @@ def film(
 
     Args:
         run: its directory, or its exported results.
-        out: the recording; by default `film-<replica>-<episode>.rrd` in the run's directory.
+        out: the recording, a .rrd; by default `film-<replica>-<episode>.rrd` in the run's directory.
         replica: the index of the agents' replica.
         episode: the index of the fresh episode; equal indices give equal episodes.
         allow: see `cprl.load`.
@@ -36,33 +72,28 @@ def film(
         The recording, and the episode.
 
     Raises:
-        ValueError: if the run cannot be loaded, see `cprl.load`, or a number is out of range.
+        ValueError: if the run cannot be loaded, see `cprl.load`, a number is out of range, or the suffix is
+            another.
         FileExistsError: if the recording exists.
     """
-    episode = arguments.integer("episode", episode, 0, 2**32 - 1)
-    replica = arguments.integer("replica", replica, 0)
-    arguments.object_of("run", run, (str, Path), "a directory")
     arguments.object_of("out", out, (str, Path, type(None)), "a path, or None")
-    loaded = load(run, allow=allow)
-    if replica not in loaded.replicas:
-        raise ValueError(f"replica is {replica}; allowed: {', '.join(map(str, loaded.replicas))}")
+    if out is not None and Path(out).suffix != ".rrd":
+        raise arguments.refusal("out", str(out), "a .rrd; film_video makes a .gif or an .mp4")
+    fresh = fresh_episode(run, replica=replica, episode=episode, allow=allow)
     target = Path(run) / f"film-{replica}-{episode}.rrd" if out is None else Path(out)
-    env = loaded.env(1, seed=SEED, first_world=episode)
-    policies = loaded.policy(replica, seed=SEED + episode)
-    others = dict(zip(policies.indices, policies.actors, strict=True))
-    title = f"{Path(run).name}, agents of replica {replica}, fresh episode {episode}"
+    others = dict(zip(fresh.policies.indices, fresh.policies.actors, strict=True))
     target.parent.mkdir(parents=True, exist_ok=True)
     with ViewerCallback(
         target.parent,
-        env,
-        title=title,
+        fresh.env,
+        title=fresh.title,
         episodes=1,
-        recipe=loaded.recipe,
+        recipe=fresh.run.recipe,
         file_name=target.name,
         is_replay=True,
     ) as viewer:
         events = _Events(viewer)
-        train(env, {}, others=others, episodes=1, callbacks=[viewer, events])
+        train(fresh.env, {}, others=others, episodes=1, callbacks=[viewer, events])
     assert events.episode is not None
     return target, events.episode
 

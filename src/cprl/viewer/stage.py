@@ -8,19 +8,17 @@ from numpy.typing import NDArray
 
 from cprl.commons.colours import APPLE, BEAM, FIRST_AGENT, GROUND, WALL, agent_colour
 from cprl.commons.decoding import UNSEEN
+from cprl.commons.sprites import INK_COLOUR, MARK_COLOUR
 from cprl.commons.world import Bools, Bytes
 from cprl.viewer.frames import mosaic, mosaic_size, window_corners
-from cprl.viewer.scenery import Scene
+from cprl.viewer.scenery import Scene, window_classes
+from cprl.viewer.strokes import RADIUS_CELLS, Strokes, marks, numbers, numbers_and_headings
 
 RIM_CELLS: Final = 1
 """The width of the wall shown around the board, in cells."""
 
-_AHEAD: Final = np.array([(0, -1), (1, 0), (0, 1), (-1, 0)], np.float32)
-_ARROW_CELLS: Final = 1.5
-"""The length of an agent's arrow, in cells: it ends in the next cell, so that the number at its middle hides
-less of the agent."""
 _OUT_HALF_CELLS: Final = 0.4
-_BEAM_OPACITY: Final = 0.5
+_BEAM_OPACITY: Final = 0.7
 _STROKE_CELLS: Final = 0.07
 
 Frames = Mapping[str, NDArray[Any]]
@@ -28,21 +26,23 @@ Frames = Mapping[str, NDArray[Any]]
 
 
 def frame_bytes(scene: Scene) -> float:
-    """The largest size of one frame in a file, about; with a trained population on `commons` it is 400."""
+    """The largest size of one frame in a file, about; with a trained population on `commons` it is 500."""
     rows, columns = mosaic_size(len(scene.agents), scene.window)
-    return 80 + 20 * len(scene.agents) + 0.35 * (rows * columns + scene.height * scene.width)
+    return 80 + 45 * len(scene.agents) + 0.35 * (rows * columns + scene.height * scene.width)
+
+
+def image_form(size: tuple[int, int]) -> Any:
+    """The format of an image of classes with so many rows and columns."""
+    import rerun as rr
+
+    return rr.components.ImageFormat(width=size[1], height=size[0], channel_datatype=rr.ChannelDatatype.U8)
 
 
 def fixed(scene: Scene) -> dict[str, list[Any]]:
     """The static parts of a recording, by entity: sizes of images, agents' names, colours and frames."""
     import rerun as rr
 
-    def form(size: tuple[int, int]) -> Any:
-        return rr.components.ImageFormat(
-            width=size[1], height=size[0], channel_datatype=rr.ChannelDatatype.U8
-        )
-
-    image = rr.SegmentationImage.from_fields
+    form, image = image_form, rr.SegmentationImage.from_fields
     board = form((scene.height + 2 * RIM_CELLS, scene.width + 2 * RIM_CELLS))
     agents, (rows, columns) = len(scene.agents), scene.window
     colours = [agent_colour(agent) for agent in range(agents)]
@@ -50,11 +50,14 @@ def fixed(scene: Scene) -> dict[str, list[Any]]:
     return {
         "world/board": [image(format=board, opacity=1.0, draw_order=-10.0)],
         "world/beams": [image(format=board, opacity=_BEAM_OPACITY, draw_order=-5.0)],
-        "world/agents": [
-            rr.Arrows2D.from_fields(colors=[(255, 255, 255)], labels=[str(agent) for agent in range(agents)])
+        "world/agents": [rr.LineStrips2D.from_fields(colors=[INK_COLOUR], radii=[RADIUS_CELLS])],
+        "world/marks": [rr.LineStrips2D.from_fields(colors=[MARK_COLOUR], radii=[RADIUS_CELLS])],
+        "world/out": [rr.Boxes2D.from_fields(radii=[_STROKE_CELLS], show_labels=False)],
+        "world/out/numbers": [rr.LineStrips2D.from_fields(radii=[RADIUS_CELLS])],
+        "windows": [
+            window_classes(scene),
+            image(format=form(mosaic_size(agents, scene.window)), opacity=1.0),
         ],
-        "world/out": [rr.Boxes2D.from_fields(radii=[2 * _STROKE_CELLS])],
-        "windows": [image(format=form(mosaic_size(agents, scene.window)), opacity=1.0)],
         "windows/frames": [
             rr.Boxes2D(
                 mins=corners - 0.2,
@@ -75,20 +78,10 @@ def columns(scene: Scene, frames: Frames) -> dict[str, tuple[NDArray[np.intp], A
     """
     import rerun as rr
 
-    count = len(frames["step"])
-    everywhere = np.arange(count)
-
-    def pictures(images: Bytes) -> Any:
-        return rr.SegmentationImage.columns(buffer=images.reshape(len(images), -1))
-
-    beams = beam_pictures(frames["beams"])
-    changed = _changes(beams)
+    everywhere = np.arange(len(frames["step"]))
     shown = {
-        "world/board": (everywhere, pictures(boards(scene, frames))),
-        "world/beams": (changed, pictures(beams[changed])),
-        "world/agents": (everywhere, _agents(frames)),
-        "world/out": _out(scene, frames),
-        "windows": (everywhere, pictures(mosaic(frames["windows"]))),
+        **board_columns(scene, frames),
+        "windows": (everywhere, _pictures(mosaic(frames["windows"]))),
     }
     if scene.is_replay:
         stock = frames["stock"].sum(1, dtype=np.float64)
@@ -97,6 +90,32 @@ def columns(scene: Scene, frames: Frames) -> dict[str, tuple[NDArray[np.intp], A
             harvested = frames["harvested"][:, agent].astype(np.float64)
             shown[f"{name}/harvested"] = everywhere, rr.Scalars.columns(scalars=harvested)
     return shown
+
+
+def board_columns(
+    scene: Scene, frames: Frames, *, beams: bool = True, out: bool = True
+) -> dict[str, tuple[NDArray[np.intp], Any]]:
+    """`columns` of the board alone, on request without beams or agents out of play."""
+    count, agents = frames["in_play"].shape
+    everywhere = np.arange(count)
+    shown = {
+        "world/board": (everywhere, _pictures(boards(scene, frames))),
+        "world/agents": (everywhere, _lines(numbers_and_headings(agents), frames)),
+    }
+    if len(marks(agents).owner):
+        shown["world/marks"] = everywhere, _lines(marks(agents), frames)
+    if beams:
+        covered = beam_pictures(frames["beams"])
+        changed = _changes(covered)
+        shown["world/beams"] = changed, _pictures(covered[changed])
+    return shown | _out(frames) if out else shown
+
+
+def _pictures(images: Bytes) -> Any:
+    """Images of classes, uint8 [T, rows, columns], as columns."""
+    import rerun as rr
+
+    return rr.SegmentationImage.columns(buffer=images.reshape(len(images), -1))
 
 
 def boards(scene: Scene, frames: Frames) -> Bytes:
@@ -126,32 +145,46 @@ def _with_rim(pictures: Bytes, kind: int) -> Bytes:
     return np.pad(pictures, ((0, 0), (RIM_CELLS,) * 2, (RIM_CELLS,) * 2), constant_values=kind)
 
 
-def _agents(frames: Frames) -> Any:
-    """Arrows that point in the agents' headings; agents out of play have their number only."""
+def _lines(strokes: Strokes, frames: Frames) -> Any:
+    """Lines of the agents in play."""
     import rerun as rr
 
-    count, agents = frames["in_play"].shape
-    ahead = _ARROW_CELLS * _AHEAD[frames["heading"]] * frames["in_play"][..., None]
-    return rr.Arrows2D.columns(
-        origins=_centres(frames).reshape(-1, 2), vectors=ahead.reshape(-1, 2)
-    ).partition([agents] * count)
+    lines, counts = strokes.placed(_centres(frames), frames["heading"], frames["in_play"])
+    return rr.LineStrips2D.columns(strips=lines).partition(counts)
 
 
-def _out(scene: Scene, frames: Frames) -> tuple[NDArray[np.intp], Any]:
-    """A hollow square in the colour of each agent out of play, labelled with the agent that tagged it."""
+def _out(frames: Frames) -> dict[str, tuple[NDArray[np.intp], Any]]:
+    """A hollow square in the colour of each agent out of play, with its number where nobody else's stands.
+
+    The squares have labels that name who tagged the agent; the viewer shows them on request.
+    """
     import rerun as rr
 
-    out, by = ~frames["in_play"], frames["tagged_by"]
-    marks = np.concatenate([out, np.where(out, by, 0), np.where(out, frames["row"], 0)], 1)
-    changed = _changes(np.concatenate([marks, np.where(out, frames["col"], 0)], 1))
-    out, by, centres = out[changed], by[changed], _centres(frames)[changed]
-    rgb = np.array([agent_colour(agent) for agent in range(len(scene.agents))], np.uint8)
-    return changed, rr.Boxes2D.columns(
+    out, by, alone = ~frames["in_play"], frames["tagged_by"], _alone(frames)
+    places = [np.where(out, frames[name], 0) for name in ("row", "col")]
+    changed = _changes(np.concatenate([out, np.where(out, by, 0), alone, *places], 1))
+    out, by, alone, centres = out[changed], by[changed], alone[changed], _centres(frames)[changed]
+    rgb = np.array([agent_colour(agent) for agent in range(out.shape[1])], np.uint8)
+    squares = rr.Boxes2D.columns(
         centers=centres[out],
         half_sizes=np.full((int(out.sum()), 2), _OUT_HALF_CELLS),
         colors=rgb[np.nonzero(out)[1]],
         labels=["out" if tagger < 0 else f"by {tagger}" for tagger in by[out]],
     ).partition(out.sum(1))
+    strokes = numbers(out.shape[1])
+    lines, counts = strokes.placed(centres, frames["heading"][changed], alone)
+    owner = strokes.owner[np.nonzero(alone[:, strokes.owner])[1]]
+    digits = rr.LineStrips2D.columns(strips=lines, colors=rgb[owner]).partition(counts)
+    return {"world/out": (changed, squares), "world/out/numbers": (changed, digits)}
+
+
+def _alone(frames: Frames) -> Bools:
+    """The agents out of play in whose cell there is nobody in play, nor anyone out with a lower index."""
+    row, col, in_play = frames["row"], frames["col"], frames["in_play"]
+    same = (row[:, :, None] == row[:, None]) & (col[:, :, None] == col[:, None])
+    first = np.tri(row.shape[1], k=-1, dtype=np.bool_) | in_play[:, None]
+    alone: Bools = ~in_play & ~(same & first).any(2)
+    return alone
 
 
 def _centres(frames: Frames) -> NDArray[np.float32]:

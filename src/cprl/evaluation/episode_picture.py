@@ -1,0 +1,178 @@
+"""EpisodePicture: the board, with the stock and the harvests so far below it; for films and for play."""
+
+from collections.abc import Sequence
+from math import ceil
+from typing import Any, Final
+
+import numpy as np
+from numpy.typing import NDArray
+from PIL import Image, ImageDraw, ImageFont
+
+from cprl import arguments
+from cprl.commons.colours import APPLE, GROUND, PALETTE, Colour, agent_colour
+from cprl.commons.maps import Map
+from cprl.commons.picture import world_image
+from cprl.commons.world import Bytes, Shown
+
+SMALLEST_WIDTH, DEFAULT_WIDTH, LARGEST_WIDTH = 240, 640, 1920
+"""Pixels."""
+
+SMALLEST_CELL_PIXELS: Final = 8
+"""Boards with more cells than fit in this size are drawn with it, and then made smaller."""
+
+_TEXT: Final = (228, 231, 236)
+_FAINT: Final = (140, 146, 158)
+_LINE: Final = (52, 56, 66)
+
+
+class EpisodePicture:
+    """Draws any turn of an episode: a caption, the board, the apples on it and each agent's harvest so far.
+
+    Args:
+        board: the map.
+        steps: the length of the turn axis, in turns: the longest that an episode can be.
+        width: of the picture in pixels, 240 to 1920.
+        most_harvested: the top of the axis of harvests, in apples; None where it is not known before, so that
+            the axis grows with the episode.
+
+    Raises:
+        ValueError: for a width that is out of range.
+    """
+
+    def __init__(
+        self, board: Map, *, steps: int, width: int = DEFAULT_WIDTH, most_harvested: int | None = None
+    ) -> None:
+        width = arguments.integer("width", width, SMALLEST_WIDTH, LARGEST_WIDTH)
+        width -= width % 2  # which videos want
+        self.board, self.steps, self._most = board, steps, most_harvested
+        self._unit = max(10, width // 46)
+        self._font = ImageFont.load_default(self._unit)
+        self._cell = max(SMALLEST_CELL_PIXELS, (width - 1) // board.width)
+        wide, high = board.width * self._cell + 1, board.height * self._cell + 1
+        shrink = min(1.0, width / wide)
+        self._board_size = max(1, int(wide * shrink)), max(1, int(high * shrink))
+        self._half = (width - 3 * self._unit) // 2
+        self._legend = _Legend(len(board.starts), self._half, self._font)
+        self._line = line = self._unit + self._unit // 2
+        self._caption_height = line + self._unit // 2
+        self._plot_top = self._caption_height + self._board_size[1] + self._unit // 2
+        self._plot_height = 5 * self._unit
+        self._axes_top = self._plot_top + line * (1 + self._legend.rows)
+        height = self._axes_top + self._plot_height + 2 * line
+        self.size: tuple[int, int] = width, height + height % 2
+        """The width and height in pixels, both even."""
+
+    def draw(self, moments: Sequence[Shown], title: str, *, note: str = "", own: int | None = None) -> Bytes:
+        """The picture of the last of these moments.
+
+        Args:
+            moments: the episode so far: the board as it began, then after each turn.
+            title: what is shown, above the board on the left; shortened where the room ends.
+            note: what is to be said of this moment, after the turn above the board on the right.
+            own: the index of the agent that gets a white frame; None for no frame.
+
+        Returns:
+            uint8 [height, width, 3], RGB.
+        """
+        image = Image.new("RGB", self.size, PALETTE[GROUND])
+        draw = ImageDraw.Draw(image)
+        turn = f"turn {len(moments) - 1:,} of {self.steps:,}{f', {note}' if note else ''}"
+        self._caption(draw, title, turn)
+        drawn = Image.fromarray(world_image(self.board, moments[-1], cell_pixels=self._cell))
+        if drawn.size != self._board_size:
+            drawn = drawn.resize(self._board_size, Image.Resampling.BOX)
+        image.paste(drawn, ((self.size[0] - self._board_size[0]) // 2, self._caption_height))
+        if own is not None and moments[-1].in_play[own]:
+            at = self.cell_box(int(moments[-1].row[own]), int(moments[-1].col[own]))
+            draw.rectangle(at, outline=_TEXT, width=max(1, self._unit // 6))
+        self._plot_stock(draw, np.array([moment.stock.sum(dtype=np.int64) for moment in moments]))
+        self._plot_harvests(draw, np.array([moment.harvested for moment in moments]))
+        return np.asarray(image)
+
+    def cell_box(self, row: int, col: int) -> tuple[float, float, float, float]:
+        """Where a cell is in the picture: left, top, right and bottom in pixels."""
+        wide, high = self._board_size
+        left = (self.size[0] - wide) // 2
+        across, down = wide / self.board.width, high / self.board.height
+        top = self._caption_height + row * down
+        return left + col * across, top, left + (col + 1) * across, top + down
+
+    def _caption(self, draw: ImageDraw.ImageDraw, title: str, turn: str) -> None:
+        edge = self._unit // 2
+        right = self.size[0] - edge
+        draw.text((right, edge), turn, _TEXT, self._font, anchor="ra")
+        room = right - edge - self._unit - self._font.getlength(turn)
+        if self._font.getlength(title) > room:
+            while title and self._font.getlength(f"{title}...") > room:
+                title = title[:-1]
+            title = f"{title}..." if title else ""
+        draw.text((edge, edge), title, _TEXT, self._font)
+
+    def _plot_stock(self, draw: ImageDraw.ImageDraw, stock: NDArray[np.int64]) -> None:
+        """The apples on the board, [T], as an area."""
+        left, sites = self._unit, len(self.board.sites)
+        self._axes(draw, left, f"apples on the board: {stock[-1]} of {sites}")
+        path = self._points(left, stock, sites)
+        floor = self._axes_top + self._plot_height
+        draw.polygon([(path[0][0], floor), *path, (path[-1][0], floor)], PALETTE[APPLE], PALETTE[APPLE])
+
+    def _plot_harvests(self, draw: ImageDraw.ImageDraw, harvests: NDArray[np.int32]) -> None:
+        """Each agent's harvest so far, [T, N], as lines in their colours, which a legend repeats."""
+        left = 2 * self._unit + self._half
+        most = nice(int(harvests.max(initial=0)) if self._most is None else self._most)
+        self._axes(draw, left, f"apples harvested; the axis ends at {most:,}")
+        for agent in range(harvests.shape[1]):
+            path = self._points(left, harvests[:, agent], most)
+            draw.line(path, agent_colour(agent), max(1, self._unit // 6))
+        self._legend.draw(draw, (left, self._plot_top + self._line), harvests[-1])
+
+    def _axes(self, draw: ImageDraw.ImageDraw, left: int, title: str) -> None:
+        top, high, wide, below = self._axes_top, self._plot_height, self._half, self._unit // 4
+        draw.text((left, self._plot_top), title, _TEXT, self._font)
+        draw.rectangle((left, top, left + wide, top + high), outline=_LINE)
+        draw.text((left, top + high + below), "0", _FAINT, self._font)
+        draw.text((left + wide / 2, top + high + below), "turn", _FAINT, self._font, anchor="ma")
+        draw.text((left + wide, top + high + below), f"{self.steps:,}", _FAINT, self._font, anchor="ra")
+
+    def _points(self, left: int, values: NDArray[Any], most: int) -> list[tuple[float, float]]:
+        """Where values [T] of 0 to `most` are in a plot; at least two points."""
+        high = self._plot_height
+        columns = left + np.arange(len(values)) * (self._half / max(1, self.steps))
+        rows = self._axes_top + high - values * (high / max(1, most))
+        points = list(zip(columns.tolist(), rows.tolist(), strict=True))
+        return points if len(points) > 1 else points * 2
+
+
+class _Legend:
+    """The number of each agent in its colour, with its harvest, in as many rows as it takes.
+
+    Args:
+        agents: how many.
+        wide: the room in pixels.
+        font: of the text.
+    """
+
+    def __init__(self, agents: int, wide: int, font: ImageFont.ImageFont | ImageFont.FreeTypeFont) -> None:
+        self._font, self._agents = font, agents
+        self._item = int(font.getlength("00:0000  "))
+        self._in_a_row = max(1, wide // self._item)
+        self.rows = ceil(agents / self._in_a_row)
+        self._line = int(font.getbbox("0")[3] * 1.3) + 1
+
+    def draw(self, draw: ImageDraw.ImageDraw, at: tuple[int, int], harvested: NDArray[np.int32]) -> None:
+        """Draws it with its upper left corner there."""
+        for agent in range(self._agents):
+            row, place = divmod(agent, self._in_a_row)
+            where = at[0] + place * self._item, at[1] + row * self._line
+            colour: Colour = agent_colour(agent)
+            draw.text(where, f"{agent}:{harvested[agent]}", colour, self._font)
+
+
+def nice(number: int) -> int:
+    """The next larger of 10, 20, 50, 100, 200, 500 and so on."""
+    power = 10
+    while True:
+        for step in (1, 2, 5):
+            if number <= step * power:
+                return step * power
+        power *= 10

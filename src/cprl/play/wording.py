@@ -1,0 +1,67 @@
+"""What a person who plays is told, in words."""
+
+from collections.abc import Iterator
+from math import isnan
+from typing import Final
+
+from cprl.play.session import Session, TurnPlayed
+
+METRICS: Final = {
+    "collective_return": "apples of all agents",
+    "efficiency": "apples per turn",
+    "equality": "1 - Gini: 1 where all have the same",
+    "sustainability": "the mean turn of a harvest",
+    "survival_steps": "turns",
+    "peace": "agents in play per turn",
+    "peacefulness": "turns in play per agent",
+    "stock_left": "apples on the board",
+}
+"""What each social metric counts; docs/metrics.md defines them."""
+
+
+def state(session: Session) -> str:
+    """The turn, the apples on the board, and everybody's score."""
+    scores = [
+        f"{apples} by {'you' if agent == session.agent else f'agent {agent}'}{_out(session, agent)}"
+        for agent, apples in enumerate(session.harvested)
+    ]
+    of_steps = f"turn {session.turn:,} of {session.game.rules.episode_steps:,}"
+    return f"{of_steps}; {session.stock} apples on the board; harvested: {', '.join(scores)}"
+
+
+def _out(session: Session, agent: int) -> str:
+    return "" if session.moments[-1].in_play[agent] else " (out of play)"
+
+
+def happened(session: Session, turn: TurnPlayed) -> Iterator[str]:
+    """What a turn brought the person, and who tagged whom."""
+    me = session.agent
+    if turn.harvest[me]:
+        yield "you harvest an apple"
+    if turn.fired[me] and not turn.tagged_by[:, me].any():
+        yield "your beam tags nobody out"
+    for tagged, by in zip(*turn.tagged_by.nonzero(), strict=True):
+        whom = "you out" if tagged == me else f"agent {tagged} out"
+        yield f"you tag {whom}" if by == me else f"agent {by} tags {whom}"
+
+
+def ending(session: Session) -> str:
+    """Why it is over, if it is."""
+    if not session.has_ended:
+        return f"stopped after turn {session.turn:,}"
+    return "no apple is left" if session.stock == 0 else "time is over"
+
+
+def results(session: Session) -> list[tuple[str, str, str]]:
+    """Each social metric of the turns played: its name, value and what it counts; none before the first."""
+    return [(name, _number(value), METRICS.get(name, "")) for name, value in session.metrics().items()]
+
+
+def results_text(session: Session) -> str:
+    """The same as lines of text."""
+    lines = [f"{name:17s} {value:>9s}  {counts}" for name, value, counts in results(session)]
+    return "\n".join(lines) or "No turn was played, so there is nothing to measure."
+
+
+def _number(value: float) -> str:
+    return "undefined" if isnan(value) else f"{value:.4g}"

@@ -1,0 +1,168 @@
+"""An episode of stored agents as a GIF or an MP4."""
+
+import subprocess
+
+import numpy as np
+import pytest
+from imageio_ffmpeg import get_ffmpeg_exe
+from PIL import Image
+
+from cprl import Experiment, Game, Rules, cli, maps
+from cprl.commons.colours import APPLE, PALETTE, agent_colour
+from cprl.evaluation import video_files
+from cprl.evaluation.episode_picture import EpisodePicture, nice
+from cprl.evaluation.film import film
+from cprl.evaluation.film_video import film_video
+from cprl.population import Scripted
+from cprl.runs.directory import start_run
+from cprl.runs.weights import save_weights
+
+CORRIDORS = Game(
+    map=maps.parse(
+        """
+        >A.A.
+        #####
+        #AAA<
+        """
+    ),
+    rules=Rules(
+        regrow_prob=(0.0,), window_rows=4, window_columns=3, episode_steps=9, may_fire=False, freeze_steps=0
+    ),
+)
+"""Greedy agents bite in turns 1, 2 and 3, and nothing grows again: the board is dead after turn 3 of 9."""
+LEFT = [5, 3, 2, 0]
+"""Apples on the board at the start and after each turn."""
+
+
+@pytest.fixture(scope="module")
+def runs(tmp_path_factory):
+    """Runs on the corridors by the policy of both agents."""
+    folder = tmp_path_factory.mktemp("runs")
+    for policy in ("greedy", "random"):
+        agents = (Scripted(policy), Scripted(policy))
+        own = Experiment(name=policy, game=CORRIDORS, agents=agents, episodes=1)
+        save_weights(start_run(folder / policy, policy, own.to_recipe), {})
+    return folder
+
+
+def frames_of(path):
+    """The pictures of a GIF, [frames, height, width, 3], and their durations in ms."""
+    with Image.open(path) as film:
+        pictures, durations = [], []
+        for frame in range(film.n_frames):
+            film.seek(frame)
+            pictures.append(np.asarray(film.convert("RGB")))
+            durations.append(film.info["duration"])
+    return np.stack(pictures), durations
+
+
+def apples_in(picture, size):
+    """How many cells of the board look like an apple."""
+    cell = (size - 1) // CORRIDORS.map.width
+    top = next(row for row in range(len(picture)) if (picture[row] == (28, 30, 36)).all(-1).mean() > 0.9)
+    centres = [
+        picture[top + row * cell + cell // 2, (size - 1) % cell // 2 + col * cell + cell // 2]
+        for row, col in CORRIDORS.map.sites
+    ]
+    return sum((centre == PALETTE[APPLE]).all() for centre in centres)
+
+
+def test_a_gif_shows_the_board_die_and_the_last_picture_stays(runs, tmp_path):
+    path, played = film_video(runs / "greedy", tmp_path / "own.gif", width=300, fps=10)
+    assert (played.steps, played.harvest.tolist(), played.stock_left) == (3, [2, 3], 0)
+    pictures, durations = frames_of(path)
+    assert [apples_in(picture, 300) for picture in pictures] == LEFT
+    assert durations == [100, 100, 100, 2000]
+    for agent in range(2):
+        assert (pictures[0] == agent_colour(agent)).all(-1).sum() > 400, "a cell of its colour"
+    assert len(pictures[0]) < 600
+
+
+def test_every_nth_turn_is_shown_and_always_the_last(runs, tmp_path):
+    path, _ = film_video(runs / "greedy", tmp_path / "own.gif", every=2, width=300)
+    assert [apples_in(picture, 300) for picture in frames_of(path)[0]] == [LEFT[0], LEFT[2], LEFT[3]]
+
+
+def test_the_film_is_the_episode_that_the_recording_has(runs, tmp_path):
+    _, recorded = film(runs / "random", tmp_path / "own.rrd", episode=3)
+    _, filmed = film_video(runs / "random", tmp_path / "own.gif", episode=3, every=9, width=240)
+    assert filmed.harvest.tolist() == recorded.harvest.tolist()
+    assert filmed.metrics == pytest.approx(recorded.metrics, nan_ok=True)
+    _, other = film_video(runs / "random", tmp_path / "other.gif", episode=4, every=9, width=240)
+    assert other.metrics["sustainability"] != recorded.metrics["sustainability"]
+
+
+def test_an_mp4_has_a_picture_for_each_turn_and_holds_the_last(runs, tmp_path):
+    path, _ = film_video(runs / "greedy", tmp_path / "own.mp4", width=240, fps=5)
+    wide, high = EpisodePicture(CORRIDORS.map, steps=9, width=240).size
+    words = ["-loglevel", "error", "-i", path, "-f", "rawvideo", "-pix_fmt", "rgb24", "-"]
+    raw = subprocess.run([get_ffmpeg_exe(), *words], check=True, capture_output=True).stdout
+    pictures = np.frombuffer(raw, np.uint8).reshape(-1, high, wide, 3)
+    assert len(pictures) == len(LEFT) + 2 * 5, "two seconds"
+    greens = [(np.abs(picture.astype(int) - PALETTE[APPLE]) < 30).all(-1).sum() for picture in pictures]
+    assert greens[0] > 2 * greens[3] > 0, "the area of the plot is left"
+
+
+def test_an_mp4_without_imageio_ffmpeg_is_refused_in_a_sentence(runs, tmp_path, monkeypatch):
+    monkeypatch.setattr(video_files, "find_spec", lambda name: None)
+    monkeypatch.setattr("sys.argv", ["cprl", "film", str(runs / "greedy"), "--out", str(tmp_path / "a.mp4")])
+    with pytest.raises(SystemExit, match=r"a\.mp4: an \.mp4 needs imageio-ffmpeg, .* or name a \.gif"):
+        cli.main()
+
+
+@pytest.mark.parametrize("name", ["own.gif", "own.mp4"])
+def test_a_film_that_is_interrupted_leaves_no_file(runs, tmp_path, monkeypatch, name):
+    draw, drawn = EpisodePicture.draw, []
+
+    def interrupted(*arguments, **named):
+        drawn.append(arguments)
+        if len(drawn) == 6:
+            raise KeyboardInterrupt
+        return draw(*arguments, **named)
+
+    monkeypatch.setattr(EpisodePicture, "draw", interrupted)
+    with pytest.raises(KeyboardInterrupt):
+        film_video(runs / "random", tmp_path / name, width=240)
+    assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize(
+    ("words", "said"),
+    [
+        (["--out", "own.avi"], r"--out is own\.avi; allowed: a name that ends in \.rrd, \.gif, \.mp4"),
+        (["--fps", "3"], r"--fps is for films; allowed: with --out FILE\.gif or FILE\.mp4"),
+        (["--every", "3", "--out", "own.rrd"], r"--every is for films"),
+        (["--out", "own.gif", "--every", "0"], "every is 0; allowed: an integer >= 1"),
+        (["--out", "own.gif", "--fps", "51"], r"fps is 51\.0; allowed: a number above 0, at most 50"),
+        (["--out", "own.gif", "--width", "5000"], "width is 5000; allowed: an integer from 240 to 1,920"),
+        (["--out", "there.gif"], r"there\.gif exists and is not overwritten"),
+        (["--out", "own.gif", "--replica", "4"], "replica is 4; allowed: 0"),
+    ],
+)
+def test_what_cannot_be_filmed_is_refused_before_anything_is_played(runs, tmp_path, monkeypatch, words, said):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "there.gif").touch()
+    monkeypatch.setattr("cprl.stored.LoadedRun.env", lambda *_, **__: pytest.fail("played"))
+    monkeypatch.setattr("sys.argv", ["cprl", "film", str(runs / "random"), *words])
+    with pytest.raises(SystemExit, match=said):
+        cli.main()
+    assert [path.name for path in tmp_path.iterdir()] == ["there.gif"]
+
+
+def test_the_command_says_what_it_wrote(runs, tmp_path, monkeypatch, capsys):
+    words = ["--out", str(tmp_path / "own.gif"), "--width", "240"]
+    monkeypatch.setattr("sys.argv", ["cprl", "film", str(runs / "greedy"), *words])
+    cli.main()
+    assert capsys.readouterr().out.splitlines()[0] == "3 steps, apples: 2, 3; 0 left"
+
+
+def test_boards_wider_than_the_picture_are_drawn_smaller():
+    wide = maps.random(6, 300, agents=14, density=0.2, clustering=0.5, seed=1)
+    picture = EpisodePicture(wide, steps=10, width=240)
+    assert picture.size[0] == 240
+    assert picture._board_size[0] <= 240
+
+
+@pytest.mark.parametrize(("number", "top"), [(0, 10), (10, 10), (11, 20), (201, 500), (1001, 2000)])
+def test_axes_end_at_round_numbers(number, top):
+    assert nice(number) == top

@@ -1,0 +1,259 @@
+"""A person plays among others: the session, the terminal, the window."""
+
+import io
+import re
+from pathlib import Path
+
+import numpy as np
+import pytest
+from matrix_game import MatrixGame
+
+from cprl import Experiment, Game, Rules, cli, maps, presets
+from cprl.commons.colours import APPLE, PALETTE, agent_colour
+from cprl.measuring.episodes import EpisodeTracker
+from cprl.measuring.replicas import social_metrics
+from cprl.play.keys import help_of
+from cprl.play.opening import open_session
+from cprl.play.session import Session
+from cprl.play.terminal import board_text, play_in_terminal
+from cprl.play.window import NoWindowError, WindowPicture, play_in_window
+from cprl.population import Scripted
+from cprl.runs.directory import start_run
+from cprl.runs.weights import save_weights
+
+DRAWING = """
+.A>.A.
+#.....
+..AA<.
+"""
+RULES = Rules(regrow_prob=(0.0,), window_rows=3, window_columns=5, episode_steps=6, freeze_steps=2)
+MEADOW = Game(map=maps.parse(DRAWING), rules=RULES)
+
+
+@pytest.fixture(scope="module")
+def run(tmp_path_factory):
+    """A run on the meadow, in which everybody always leaves the apples that hang alone."""
+    folder = tmp_path_factory.mktemp("runs") / "meadow"
+    agents = (Scripted("sustainable"), Scripted("sustainable"))
+    own = Experiment(name="meadow", game=MEADOW, agents=agents, episodes=1)
+    save_weights(start_run(folder, "meadow", own.to_recipe), {})
+    return folder
+
+
+def text_of(session):
+    return board_text(session).plain.splitlines()
+
+
+def test_the_person_decides_for_one_agent_and_the_others_for_themselves(run):
+    session = open_session(str(run), agent=0, seed=1)
+    assert text_of(session) == [". A 0>. A .", "##. . . . .", ". . A A 1<."]
+    session.act("forward")
+    turned = session.act("forward")
+    assert turned.harvest.tolist() == [1, 0]
+    assert (session.harvested, session.stock, session.turn) == ([1, 0], 3, 2)
+    assert text_of(session)[0] == ". A . . 0>."
+    session.act("turn_left")
+    assert text_of(session)[0] == ". A . . 0^."
+
+
+def test_the_same_seed_and_keys_play_the_same_again(run):
+    def played(seed):
+        session = open_session(str(run), others="random", seed=seed)
+        while not session.has_ended:
+            session.act("stay")
+        return [moment.col[1] for moment in session.moments]
+
+    assert played(3) == played(3)
+    assert len({tuple(played(seed)) for seed in range(4)}) > 1
+
+
+def test_the_metrics_are_those_of_an_episode(run):
+    session, tracker, ended = open_session(str(run), others="greedy", seed=2), EpisodeTracker(1, 2, 6), []
+    play = session._turns.play
+
+    def watched():
+        batch = play()
+        ended.extend(tracker.add(batch))
+        return batch
+
+    session._turns.play = watched
+    assert session.metrics() == {}
+    for action in ("forward", "beam", "turn_right", "forward", "forward", "beam"):
+        if not session.has_ended:
+            session.act(action)
+    (episode,) = ended
+    assert session.metrics() == pytest.approx(social_metrics(episode), nan_ok=True)
+    with pytest.raises(ValueError, match="the episode has ended; allowed: turns up to its end"):
+        session.act("stay")
+
+
+def test_a_tagged_person_waits(tmp_path, capsys):
+    drawing = tmp_path / "lane.txt"
+    drawing.write_text(">..<A\n")
+    session = open_session(str(drawing), agent=0, others="aggressive", steps=9)
+    play_in_terminal(session, iter([".\n", ".\n", ""]).__next__)
+    told = capsys.readouterr().out
+    assert "turn 1: agent 1 tags you out" in told
+    assert "0 by you (out of play)" in told
+    assert not session.is_in_play
+
+
+def in_terminal(session, text, capsys):
+    play_in_terminal(session, io.StringIO(text).readline)
+    return capsys.readouterr().out.splitlines()
+
+
+def test_lines_of_keys_play_an_episode_to_its_end(run, capsys):
+    told = in_terminal(open_session(str(run), seed=1), "ww\n\nq..\n", capsys)
+    assert told[0].startswith("You are agent 0. Keys: w step forward, s step back")
+    assert told[2:6] == [
+        ". A 0>. A .",
+        "##. . . . .",
+        ". . A A 1<.",
+        "turn 0 of 6; 4 apples on the board; harvested: 0 by you, 0 by agent 1",
+    ]
+    assert told[6:8] == ["keys> ww", "turn 2: you harvest an apple"], "what is typed through a pipe is shown"
+    assert "The end: time is over." in told
+    assert told[-8] == "collective_return         1  apples of all agents"
+    assert len([line for line in told if line.startswith("turn")]) == 4 + 1
+
+
+def test_keys_that_are_unknown_play_nothing_and_are_named(run, capsys):
+    session = open_session(str(run), seed=1)
+    told = in_terminal(session, "wz\nquit\n", capsys)
+    assert session.turn == 0
+    assert any(line.startswith("key is 'z'; allowed: w step forward") for line in told)
+    assert told[-2:] == [
+        "The end: stopped after turn 0.",
+        "No turn was played, so there is nothing to measure.",
+    ]
+
+
+def test_the_session_in_the_docs_is_what_is_printed(tmp_path, monkeypatch, capsys):
+    page = (Path(__file__).parents[1] / "docs" / "play.md").read_text()
+    drawing, printed = re.findall(r"```text\n(.*?)```", page, re.DOTALL)
+    (line,) = re.findall(r"cprl (play meadow\.txt [^`]*)`", page)
+    (tmp_path / "meadow.txt").write_text(drawing)
+    typed = "".join(f"{keys}\n" for keys in re.findall(r"^keys> (.*)$", printed, re.MULTILINE))
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr("sys.stdin", io.StringIO(typed))
+    monkeypatch.setattr("sys.argv", ["cprl", *line.split()])
+    cli.main()
+    assert capsys.readouterr().out == printed
+
+
+def test_a_game_without_a_beam_has_no_key_for_it():
+    assert "f fire the beam" in help_of(MEADOW)
+    assert "beam" not in help_of(presets.game("single_basic"))
+
+
+@pytest.mark.parametrize(
+    ("words", "said"),
+    [
+        (["chess"], r"board is 'chess'; allowed: single_basic, .*, a run's directory, or a file with a draw"),
+        (["commons", "--others", "nobody"], "others is 'nobody'; allowed: random, greedy, .*directory"),
+        (["commons", "--agent", "4"], "agent is 4; allowed: an integer from 0 to 3"),
+        (["commons", "--steps", "0"], "steps is 0; allowed: an integer >= 1"),
+        (["odd.txt"], r"odd\.txt: unknown sign 'x' at row 0, column 1"),
+        (
+            ["odd.txt", "--variant", "as_run"],
+            r'variant is "as_run"; allowed with odd\.txt: "published"',
+        ),
+    ],
+)
+def test_what_cannot_be_played_is_refused(tmp_path, monkeypatch, words, said):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "odd.txt").write_text(".x>A\n")
+    monkeypatch.setattr("sys.argv", ["cprl", "play", "--terminal", *words])
+    with pytest.raises(SystemExit, match=said):
+        cli.main()
+
+
+def test_agents_of_another_game_are_refused(run, monkeypatch):
+    with pytest.raises(ValueError, match=r"the agents of .* have observations \(3, 3, 5\); this game has"):
+        open_session("two_complex", others=str(run))
+    with pytest.raises(ValueError, match="replica is -1"):
+        open_session(str(run), replica=-1)
+
+
+@pytest.fixture
+def dummy(monkeypatch):
+    """pygame with SDL's dummy driver, and a function that presses keys before the window opens."""
+    monkeypatch.setenv("SDL_VIDEODRIVER", "dummy")
+    monkeypatch.setenv("PYGAME_HIDE_SUPPORT_PROMPT", "1")
+    pygame = pytest.importorskip("pygame")
+    pygame.display.init()
+
+    def press(*names):
+        for name in names:
+            key = pygame.key.key_code(name)
+            text = name if len(name) == 1 else ""
+            pygame.event.post(pygame.event.Event(pygame.KEYDOWN, key=key, unicode=text, mod=0))
+
+    return press
+
+
+def test_keys_in_the_window_play_turns_until_escape(run, dummy):
+    session = open_session(str(run), seed=1)
+    dummy("w", "up", "left", "p", "escape")
+    play_in_window(session, "meadow")
+    assert session.turn == 3, "p is no key"
+    assert session.harvested == [1, 0]
+    assert text_of(session)[0] == ". A . . 0^."
+
+
+def test_the_window_passes_the_turns_of_a_person_who_is_out_of_play(tmp_path, dummy):
+    (tmp_path / "lane.txt").write_text(">..<A\n")
+    session = open_session(str(tmp_path / "lane.txt"), others="aggressive", steps=4)
+    dummy(".")
+    import pygame
+
+    post = pygame.event.wait
+
+    def wait(timeout):
+        event = post(1)
+        return pygame.event.Event(pygame.QUIT) if session.has_ended else event
+
+    with pytest.MonkeyPatch.context() as patched:
+        patched.setattr(pygame.event, "wait", wait)
+        play_in_window(session, "lane")
+    assert session.turn == 4
+
+
+def test_the_window_shows_the_board_the_person_and_the_keys(run):
+    session = open_session(str(run), seed=1)
+    picture = WindowPicture(session, "meadow")
+    first = picture.draw()
+    assert first.shape == (picture.size[1], picture.size[0], 3)
+    apple = first[round(np.mean(picture._episode.cell_box(0, 1)[1::2])), :]
+    assert (apple == PALETTE[APPLE]).all(-1).any()
+    mine = (first == agent_colour(0)).all(-1)
+    assert mine[picture._episode.size[1] :].sum() > 50, "its line is in the agent's colour"
+    session.act("forward")
+    assert (picture.draw() != first).any()
+    while not session.has_ended:
+        session.act("stay")
+    assert "time is over" in picture._first_line()
+
+
+def test_without_a_display_the_terminal_is_used_and_said(run, monkeypatch, capsys):
+    for name in ("DISPLAY", "WAYLAND_DISPLAY", "SDL_VIDEODRIVER"):
+        monkeypatch.delenv(name, raising=False)
+    monkeypatch.setattr(pytest.importorskip("pygame").display, "get_driver", lambda: "offscreen")
+    monkeypatch.setattr("sys.stdin", io.StringIO("quit\n"))
+    monkeypatch.setattr("sys.argv", ["cprl", "play", str(run)])
+    cli.main()
+    told = capsys.readouterr().out.splitlines()
+    assert told[0].startswith("there is no display")
+    assert told[0].endswith("you play in the terminal")
+
+
+def test_without_pygame_the_reason_is_said(run, monkeypatch):
+    monkeypatch.setitem(__import__("sys").modules, "pygame", None)
+    with pytest.raises(NoWindowError, match=r'pygame is not installed \(pip install .* -e "\.\[play\]"\)'):
+        play_in_window(open_session(str(run)), "meadow")
+
+
+def test_a_session_wants_a_board():
+    with pytest.raises(ValueError, match="env is a MatrixGame; allowed: a CommonsEnv, which has a board"):
+        Session(MatrixGame(), lambda moment: moment)
