@@ -13,7 +13,8 @@ from PIL import Image
 from test_phases import CORNERS, society
 from test_results import an_episode
 
-from cprl import presets
+import cprl
+from cprl import Game, Rules, maps, presets
 from cprl.algorithms import DQN, PPO
 from cprl.learners.settings import DQNSettings, RolloutSettings
 from cprl.measuring.phases import PHASES
@@ -264,3 +265,19 @@ def test_one_replica_has_no_interval_and_an_experiment_of_ones_own_no_published_
     assert labels(drawn[0]) == ["ours, one replica", "exploration ends, episode 101"]
     assert note(drawn[0]) == "Running means over the episodes that follow: ours over 100."
     see_that_the_legend_is_whole(drawn[0])
+
+
+def test_a_run_marks_where_the_exploration_of_its_agents_ends(tmp_path, drawn):
+    settings = DQNSettings(epsilon_hold_steps=3, epsilon_decay_steps=12, learning_starts=2, hidden_cells=(2,))
+    experiment = cprl.Experiment(
+        name="meadow",
+        game=Game(
+            map=maps.parse(".A>.A\n..<.A"), rules=Rules(episode_steps=5, window_rows=3, window_columns=3)
+        ),
+        agents=(Learning(DQN(settings=settings)), Scripted()),
+        episodes=5,
+        evaluation_episodes=1,
+        engine="eager",
+    )
+    cprl.run(experiment, tmp_path / "run", watch="off")
+    assert "exploration ends, episode 2" in labels(drawn[0])

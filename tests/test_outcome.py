@@ -14,8 +14,8 @@ from cprl.algorithms import DQN
 from cprl.custom import Custom
 from cprl.learners.settings import DQNSettings
 from cprl.outcome import evaluate_population, fresh_env, is_same_later, random_play
-from cprl.population import Learning, Scripted
 from cprl.parts import make_parts
+from cprl.population import Learning, Scripted
 from cprl.runs.episodes import read_table
 
 GAME = Game(
