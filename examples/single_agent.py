@@ -36,7 +36,7 @@ from cprl.networks.mlp import MLPNetwork
 from cprl.output import say
 from cprl.policies.assignment import AgentPolicies
 from cprl.policies.single import RandomActor
-from cprl.population import Learning
+from cprl.population import Learning, exploration_steps
 from cprl.runs.directory import start_run
 from cprl.runs.episodes import EpisodeTable
 from cprl.runs.weights import BestWeights, restore_weights, save_weights
@@ -124,8 +124,10 @@ def main(
     if best.path:
         restore_weights(best.path, networks)
         played[f"greedy, best (episode {best.best_episode})"] = evaluate(fresh, policy)
-    figure = training_curve(run, title=title, random=played["random"])
-    summarise(run, title=title, played=played, figure=figure)
+    ends = exploration_steps(experiment.agents)
+    figure = training_curve(run, title=title, random=played["random"], exploration_steps=ends)
+    note = None if best.path else "No best weights: greedy play harvested nothing whenever it was tried"
+    summarise(run, title=title, played=played, figure=figure, note=note)
     say(f"This was a shortened schedule. The published one, with 8 replicas: {PUBLISHED_LINE}")
     return run
 

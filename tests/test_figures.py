@@ -13,7 +13,8 @@ from PIL import Image
 from test_phases import CORNERS, society
 from test_results import an_episode
 
-from cprl import presets
+import cprl
+from cprl import Game, Rules, maps, presets
 from cprl.algorithms import DQN, PPO
 from cprl.learners.settings import DQNSettings, RolloutSettings
 from cprl.measuring.phases import PHASES
@@ -126,6 +127,7 @@ def test_a_centred_running_mean_stands_at_the_middle_of_its_episodes(tmp_path, d
     metrics["collective_return"] = np.arange(60.0)[None]
     training_curve(a_run(tmp_path / "run", metrics), title="a line")
     bold = next(line for line in curves_panels(drawn[0])[0].lines if line.get_color() == style.MEAN)
+    assert "highest and last mean of 3 episodes, 58 apples, episode 58" in labels(drawn[0])
     np.testing.assert_allclose(bold.get_xdata(), bold.get_ydata(), err_msg="a mean of a line lies on it")
     assert centres(np.zeros(5), 2).tolist() == [0.5, 1.5, 2.5, 3.5]
 
@@ -263,3 +265,19 @@ def test_one_replica_has_no_interval_and_an_experiment_of_ones_own_no_published_
     assert labels(drawn[0]) == ["ours, one replica", "exploration ends, episode 101"]
     assert note(drawn[0]) == "Running means over the episodes that follow: ours over 100."
     see_that_the_legend_is_whole(drawn[0])
+
+
+def test_a_run_marks_where_the_exploration_of_its_agents_ends(tmp_path, drawn):
+    settings = DQNSettings(epsilon_hold_steps=3, epsilon_decay_steps=12, learning_starts=2, hidden_cells=(2,))
+    experiment = cprl.Experiment(
+        name="meadow",
+        game=Game(
+            map=maps.parse(".A>.A\n..<.A"), rules=Rules(episode_steps=5, window_rows=3, window_columns=3)
+        ),
+        agents=(Learning(DQN(settings=settings)), Scripted()),
+        episodes=5,
+        evaluation_episodes=1,
+        engine="eager",
+    )
+    cprl.run(experiment, tmp_path / "run", watch="off")
+    assert "exploration ends, episode 2" in labels(drawn[0])

@@ -22,6 +22,7 @@ from cprl.outcome import (
 )
 from cprl.output import ERR, OUT, console
 from cprl.parts import Parts, make_logger_callback, make_parts, make_viewer, title_of
+from cprl.population import exploration_steps
 from cprl.process import prepare_process
 from cprl.runs.checkpoints import FOLDER, Checkpointer, checkpoints_in
 from cprl.runs.directory import (
@@ -235,7 +236,8 @@ def _train_and_evaluate(
     if viewer is not None:
         viewer.finished(played)
     title = title_of(experiment)
-    figure = training_curve(directory, title=title, random=played["random"])
+    ends = exploration_steps(experiment.agents)
+    figure = training_curve(directory, title=title, random=played["random"], exploration_steps=ends)
     broken = training.finite.found
     report = {"training_s": round(training.spent_s, 1), "steps": training.steps, "finished": _now()}
     also = {"not_finite": [asdict(one) for one in broken]} if broken else {}

@@ -159,11 +159,13 @@ def _random_label(panels: list[_Panel]) -> str:
 def _mark_peak(axes: Axes, panel: _Panel, window: int) -> None:
     """Marks the highest and the last running mean of the mean over replicas."""
     mean = running_mean(panel.values.mean(0), window)
-    at, top = centres(panel.values[0], window), int(mean.argmax())
-    over = f"of {window} episodes" if window > 1 else "episode"
-    for place, marker, name in ((top, "o", "highest"), (len(mean) - 1, "s", "last")):
-        label = f"{name} mean {over}, {mean[place]:,.4g} {panel.unit}".rstrip()
-        label += f", episode {at[place]:,.0f}" if place == top else ""
+    at, top, end = centres(panel.values[0], window), int(mean.argmax()), len(mean) - 1
+    over = f"mean of {window} episodes" if window > 1 else "episode"
+    marks = {"highest": (top, "o"), "last": (end, "s")}
+    if top == end:
+        marks = {"highest and last": (top, "o")}
+    for name, (place, marker) in marks.items():
+        when = f", episode {at[place]:,.0f}" if place == top else ""
         axes.plot(
             at[place],
             mean[place],
@@ -173,7 +175,7 @@ def _mark_peak(axes: Axes, panel: _Panel, window: int) -> None:
             markeredgecolor=style.MEAN,
             markeredgewidth=2,
             linestyle="none",
-            label=label,
+            label=f"{name} {over}, {mean[place]:,.4g} {panel.unit}".rstrip() + when,
             zorder=4,
         )
 

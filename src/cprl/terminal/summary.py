@@ -70,8 +70,8 @@ def summarise(
 
 def _table(title: str, played: Mapping[str, list[Episode]]) -> Table:
     """A column for each policy, a row for each number; the first policy is the baseline."""
-    table = Table(title=title)
-    table.add_column()
+    table = Table(title=title, caption="means over episodes ± their standard errors")
+    table.add_column(no_wrap=True)
     for nth, name in enumerate(played):
         table.add_column(name if nth or len(played) == 1 else f"{name} (baseline)", justify="right")
     has_harvest = all(episode.harvest is not None for own in played.values() for episode in own)
@@ -107,7 +107,7 @@ def _add_returns(
 ) -> None:
     """Adds the mean of a return with its standard error, and how many times the baseline's it is."""
     values = {policy: [of(episode) for episode in own] for policy, own in played.items()}
-    table.add_row(f"{name} (mean ± standard error)", *(_with_error(own) for own in values.values()))
+    table.add_row(name, *(_with_error(own) for own in values.values()))
     if len(played) == 1:
         return
     baseline, means = next(iter(played)), [fmean(own) for own in values.values()]

@@ -7,7 +7,6 @@ from torchrl.envs import EnvBase
 
 from cprl.measuring import phases
 from cprl.measuring.reported import FIELDS, METRICS, available, left_out
-from cprl.viewer.events import FEWEST_FOR_PHASES
 from cprl.viewer.scenery import Curves
 
 _SHOWN: Final[Mapping[str, tuple[str, ...]]] = {
@@ -36,7 +35,7 @@ def curves_of(env: EnvBase, agents: tuple[str, ...], reported: Sequence[str], *,
         agents=agents,
         replicas=env.batch_size.numel(),
         metrics=metrics,
-        has_phases=episodes >= FEWEST_FOR_PHASES and set(phases.METRICS) <= set(metrics),
+        has_phases=episodes >= phases.FEWEST_EPISODES and set(phases.METRICS) <= set(metrics),
         has_tags="tagged_by" in reported,
     )
 

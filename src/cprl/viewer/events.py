@@ -9,8 +9,6 @@ from numpy.typing import NDArray
 from cprl.measuring import phases
 from cprl.runs.curves import running_mean
 
-FEWEST_FOR_PHASES: Final = 1000
-"""Episodes of a run whose phases are found when it ends."""
 BEST_OVER: Final = 50
 """Episodes of the mean return that is compared with the best."""
 BETTER: Final = 1.05
