@@ -142,6 +142,16 @@ def test_the_session_in_the_docs_is_what_is_printed(tmp_path, monkeypatch, capsy
     assert capsys.readouterr().out == printed
 
 
+def test_ctrl_c_ends_an_episode_like_quit(run, capsys):
+    def interrupted():
+        raise KeyboardInterrupt
+
+    session = open_session(str(run), seed=1)
+    session.act("stay")
+    play_in_terminal(session, interrupted)
+    assert "The end: stopped after turn 1." in capsys.readouterr().out
+
+
 def test_a_game_without_a_beam_has_no_key_for_it():
     assert "f fire the beam" in help_of(MEADOW)
     assert "beam" not in help_of(presets.game("single_basic"))
