@@ -19,7 +19,7 @@ _PROMPT: Final = "keys> "
 
 
 def play_in_terminal(session: Session, read_line: Callable[[], str] | None = None) -> None:
-    """Plays the episode: each line of keys is played key by key; `quit`, Ctrl-C or the end of the input ends it.
+    """Plays the episode: a line of keys is played key by key; `quit`, Ctrl-C or the end of input ends it.
 
     Args:
         session: the episode.
