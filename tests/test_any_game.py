@@ -303,10 +303,10 @@ def test_a_recording_names_agents_as_the_environment_does(tmp_path):
     with ViewerCallback(tmp_path, wrapped, title="matrix", episodes=2) as viewer:
         play(wrapped, tit_for_tat, 6, callbacks=[viewer])
     path = tmp_path / "run.rrd"
-    assert column(path, "row/return", "Scalars:scalars", "episode") == ([0], [[4.5]])
+    assert column(path, "row/return", "Scalars:scalars", "episode") == ([0], [[4.5, 4.5]])
     assert column(path, "row/loss", "Scalars:scalars")[1] == [[0.5]]
     _, survival = column(path, "social/survival_steps", "Scalars:scalars")
-    assert survival == [[5.0, 6.0, 5.5]]
+    assert survival == [[5.0, 6.0, 5.5, 5.5]]
 
 
 def test_under_transforms_windows_show_what_the_agents_of_the_game_observe(tmp_path):
@@ -342,8 +342,8 @@ def test_the_terminal_shows_it_too(tmp_path, monkeypatch):
     summarise(tmp_path, title="matrix", played={"random": episodes, "trained": episodes}, console=console)
     text = output.getvalue()
     assert text.count("left out: collective_return") == 1
-    assert re.search(r"survival_steps\s*│\s*5\.\d+ │", text)
-    assert not re.search(r"│ (equality|apples left|sustainability)", text)
+    assert re.search(r"survival, steps\s*│\s*5\.\d+ │", text)
+    assert not re.search(r"│ (equality|stock left|sustainability|collective)", text)
 
 
 def test_the_table_of_an_evaluation_says_what_is_left_out():
@@ -358,7 +358,7 @@ def test_the_table_of_an_evaluation_says_what_is_left_out():
 
     table = run_table(Evaluation())
     assert table.caption.startswith("left out: collective_return")
-    assert list(table.columns[0].cells) == ["survival_steps"]
+    assert list(table.columns[0].cells) == ["survival_steps (steps)"]
 
 
 def test_bars_know_the_clock_of_a_game_or_of_its_environment():

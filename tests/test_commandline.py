@@ -267,6 +267,7 @@ def test_a_recipe_runs_its_experiment(runs):
         "take_over": False,
         "keep_checkpoint": True,
         "watch": "file",
+        "linger": False,
         "command": line,
         "allow": ("a:B", "c:D"),
     }

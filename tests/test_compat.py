@@ -358,3 +358,41 @@ def test_recordings_that_nothing_refers_to_end_and_a_closed_logger_leaves_its_la
     command = [sys.executable, "-c", _RECORDINGS, str(tmp_path)]
     done = subprocess.run(command, capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stderr
+
+
+def test_vector_instructions_are_looked_for_once_for_all_processes(tmp_path, monkeypatch):
+    with relies_on("torch._inductor.cpu_vec_isa", used_by="compat.remember_vector_instructions"):
+        from torch._inductor import cpu_vec_isa
+
+        usable = [kind for kind in cpu_vec_isa.supported_vec_isa_list if str(kind) == "avx2"]
+        assert usable
+        monkeypatch.setenv("TORCHINDUCTOR_CACHE_DIR", str(tmp_path))
+        monkeypatch.setattr(cpu_vec_isa, "x86_isa_checker", lambda: ["avx2"])
+        searches = []
+        for found in ([], usable, usable):  # at first the search fails, as it may on a busy machine
+            monkeypatch.setattr(
+                cpu_vec_isa, "valid_vec_isa_list", lambda found=found: searches.append(1) or found
+            )
+            compat.remember_vector_instructions.__wrapped__()  # as in a process of its own
+            assert cpu_vec_isa.valid_vec_isa_list() == cpu_vec_isa.valid_vec_isa_list() == found
+        assert len(searches) == 2, "the third process knows what the second one found"
+        monkeypatch.setattr(cpu_vec_isa, "x86_isa_checker", list)  # another CPU
+        monkeypatch.setattr(cpu_vec_isa, "valid_vec_isa_list", lambda: searches.append(1) or [])
+        compat.remember_vector_instructions.__wrapped__()
+        assert cpu_vec_isa.valid_vec_isa_list() == []
+        assert len(searches) == 3
+
+
+def test_what_ends_a_recording_waits_for_its_viewer_and_is_in_a_private_part():
+    """`RecordingStream.__del__` flushes; `keep_native` keeps `inner` alive in its place."""
+    import rerun as rr
+
+    with relies_on("RecordingStream.inner", used_by="compat.keep_native"):
+        recording = rr.RecordingStream("cprl", recording_id="kept")
+        native = recording.inner
+        before = sys.getrefcount(native)
+        compat.keep_native(recording)
+        assert sys.getrefcount(native) == before + 1
+    with relies_on("RecordingStream.__del__", used_by="deadline.exit_in_time"):
+        assert callable(vars(rr.RecordingStream)["__del__"])
+    recording.disconnect()

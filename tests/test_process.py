@@ -1,6 +1,7 @@
-"""prepare_process: freed memory stays with the process."""
+"""prepare_process: freed memory stays with the process, compiled code with the user."""
 
 import ctypes
+import os
 import platform
 
 import numpy as np
@@ -30,3 +31,14 @@ def test_memory_freed_in_one_round_is_reused_in_the_next():
     prepare_process(0)
     faults_of_rounds()
     assert faults_of_rounds() < pages_of_a_round / 10
+
+
+@pytest.mark.parametrize("own", [None, "elsewhere"])
+def test_compiled_code_is_kept_between_runs_unless_the_user_says_where(tmp_path, monkeypatch, own):
+    monkeypatch.setenv("CPRL_CACHE", str(tmp_path))
+    monkeypatch.delenv("TORCHINDUCTOR_CACHE_DIR", raising=False)
+    if own:
+        monkeypatch.setenv("TORCHINDUCTOR_CACHE_DIR", own)
+    prepare_process(0)
+    assert os.environ["TORCHINDUCTOR_CACHE_DIR"] == (own or str(tmp_path / "torch"))
+    assert (tmp_path / "torch").is_dir()

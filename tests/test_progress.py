@@ -2,10 +2,14 @@
 
 import io
 import re
+import time
 
+import pytest
 from rich.console import Console
+from tensordict import TensorDict
 
 from cprl import CommonsEnv, Game, Rules, maps
+from cprl.compile_clock import CLOCK
 from cprl.policies.lanes import random_lanes
 from cprl.terminal import progress
 from cprl.terminal.progress import ProgressBar
@@ -32,3 +36,45 @@ def test_lines_count_episodes_from_where_a_stopped_training_was(monkeypatch):
     assert (shown[0], shown[-1]) == (0, 5)
     shown = [int(number) for number in re.findall(r"episode (\d+)/9", lines(monkeypatch, before=6))]
     assert (shown[0], shown[-1]) == (3, 8)
+
+
+def printed(bar_of, *, steps, compile_s=0.0):
+    """What a bar prints of so many steps of one world, a millisecond each, the first with a compilation."""
+    told = io.StringIO()
+    batch = TensorDict(batch_size=[1])
+    with bar_of(Console(file=told, width=200)) as bar:
+        with CLOCK.running():
+            time.sleep(compile_s)
+        for _ in range(steps):
+            time.sleep(0.001)
+            bar.on_step(batch)
+    return told.getvalue()
+
+
+def long_bar(console):
+    return ProgressBar(GAME, episodes=1000, console=console)
+
+
+def test_no_time_left_is_shown_before_twenty_steps_were_timed(monkeypatch):
+    monkeypatch.setattr(progress, "_LINE_PERIOD_S", 0.0)
+    lines = printed(long_bar, steps=40).splitlines()
+    assert len(lines) == 40
+    assert all("left" not in line for line in lines[: progress.TIMED_STEPS - 1])
+    assert all(" left" in line for line in lines[progress.TIMED_STEPS - 1 :])
+
+
+def test_a_compilation_is_reported_while_it_lasts_and_slows_no_estimate(monkeypatch):
+    monkeypatch.setattr(progress, "_LINE_PERIOD_S", 0.02)
+    monkeypatch.setattr(progress, "COMPILING_PERIOD_S", 0.2)
+    told = printed(long_bar, steps=60, compile_s=1.0)
+    assert re.search(r"training: compiling, \d s so far", told)
+    rates = [int(rate.replace(",", "")) for rate in re.findall(r"([\d,]+) steps/s", told)]
+    assert min(rates) > 30, "a second of compiling for the first step would make it one step per second"
+
+
+@pytest.mark.parametrize(
+    ("seconds", "words"),
+    [(0.4, "0 s"), (99, "99 s"), (125, "2 min"), (6_050, "1 h 41 min"), (34_897, "9 h 42 min")],
+)
+def test_durations_are_told_in_units_that_fit(seconds, words):
+    assert progress.in_words(seconds) == words

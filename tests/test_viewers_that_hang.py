@@ -18,7 +18,7 @@ from test_watch import VIEWER, Doing, course, receiving
 from cprl.viewer import deadline
 from cprl.viewer.deadline import Sender, within
 from cprl.viewer.logger import RerunLogger
-from cprl.viewer.streams import _free_port
+from cprl.viewer.page import free_port
 
 HERE = Path(__file__).parent
 LISTENS = """
@@ -119,7 +119,7 @@ atexit.register(lambda: print(time.monotonic() - started, flush=True))
 from pathlib import Path
 import numpy as np
 from cprl.viewer.logger import RerunLogger
-from cprl.viewer.streams import _free_port
+from cprl.viewer.page import free_port
 started = time.monotonic()
 logger = RerunLogger("run", Path({str(folder)!r}), live={address!r})
 for step in range(20):
@@ -179,7 +179,7 @@ def test_a_served_recording_does_not_wait_for_a_viewer_that_stands_still(tmp_pat
     logger = RerunLogger("run", tmp_path, live="serve")
     address = logger.addresses["native"].split()[-1]
     viewer = subprocess.Popen(
-        [VIEWER, address, "--save", tmp_path / "got.rrd", "--bind", "127.0.0.1", "--port", str(_free_port())],
+        [VIEWER, address, "--save", tmp_path / "got.rrd", "--bind", "127.0.0.1", "--port", str(free_port())],
         stdout=subprocess.DEVNULL,
         stderr=subprocess.DEVNULL,
     )

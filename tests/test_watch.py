@@ -2,6 +2,7 @@
 
 import contextlib
 import os
+import shutil
 import socket
 import subprocess
 import sys
@@ -24,7 +25,7 @@ from cprl.learners.settings import DQNSettings
 from cprl.measuring import Episode, social
 from cprl.training import train
 from cprl.viewer.callback import ViewerCallback
-from cprl.viewer.streams import _free_port
+from cprl.viewer.page import free_port
 
 GAME = Game(
     map=maps.parse(".A>.A\n.A.A.\n..<.A"),
@@ -77,7 +78,7 @@ def unwatched():
 @contextmanager
 def receiving():
     """A process of Rerun's that listens as a viewer does, and its address."""
-    port = _free_port()
+    port = free_port()
     process = subprocess.Popen(
         [VIEWER, "--serve-grpc", "--bind", "127.0.0.1", "--port", str(port)],
         stdout=subprocess.DEVNULL,
@@ -114,7 +115,7 @@ def test_a_viewer_that_is_killed_half_way_changes_nothing(tmp_path, unwatched):
 
 
 def test_an_address_where_nobody_listens_is_told_once_and_changes_nothing(tmp_path, unwatched):
-    address = f"rerun+http://127.0.0.1:{_free_port()}/proxy"
+    address = f"rerun+http://127.0.0.1:{free_port()}/proxy"
     started = time.monotonic()
     with pytest.warns(RuntimeWarning, match="viewer at rerun.*refused; the run continues") as caught:
         assert course(tmp_path, live=f"connect {address}") == unwatched
@@ -189,11 +190,19 @@ def test_several_replicas_are_told_as_their_mean_and_each(tmp_path):
 
     course(tmp_path, others=[Witness(-1, None)])
     episodes, told = column(tmp_path / "run.rrd", "social/collective_return", "Scalars:scalars", "episode")
-    for episode, (first, second, mean) in zip(episodes, told, strict=True):
+    means = []
+    for episode, (first, second, mean, running) in zip(episodes, told, strict=True):
         assert (first, second) == (returns[0, episode], returns[1, episode])
         assert mean == pytest.approx((first + second) / 2)
+        means.append(mean)
+        assert running == pytest.approx(np.mean(means[-10:]))
     names = static(tmp_path / "run.rrd", "social/collective_return", "SeriesLines:names")
-    assert names == ["replica 0", "replica 1", "collective return, mean"]
+    assert names == [
+        "replica 0",
+        "replica 1",
+        "collective return, mean",
+        "collective return, running mean",
+    ]
     assert {len(own) for own in column(tmp_path / "run.rrd", "agent_1/q", "Scalars:scalars")[1]} == {1}
 
 
@@ -231,19 +240,23 @@ def test_a_society_that_rises_falls_and_recovers_is_told_as_a_story(tmp_path):
                 returned = float(np.interp(number, corners, apples))
                 viewer.on_episode(fake(number, world, returned=returned, tagged=world), {})
     path = tmp_path / "run.rrd"
-    _, events = column(path, "log", "TextLog:text")
-    told = "\n".join(text[0] for text in events)
-    assert "episode 5: the last apple was taken in step 7" in told
-    assert "episode 399: new best: 474.5 apples per episode, mean of the last 50" in told
-    assert told.index("phase: exploration") < told.index("phase: tragedy") < told.index("phase: combat")
+    at, events = column(path, "log", "TextLog:text", "episode")
+    told = dict(zip([text[0] for text in events], at, strict=True))
+    assert told["last apple taken in step 7"] == 5
+    assert told["new best: 474.5 apples per episode, mean of the last 50"] == 399
+    assert told["now tragedy"] < told["now recovery"]
     episodes, states = column(path, "phase/found", "StateChange:state", "episode")
     assert [state[0] for state in states] == ["exploration", "tragedy", "combat", "cultivation"]
     assert np.abs(np.array(episodes) - [0, 350, 750, 1150]).max() <= 100, "drawn where the window begins"
-    _, states = column(path, "phase/now", "StateChange:state")
-    assert [state[0] for state in states][:2] == ["too early to tell", "exploration"]
+    assert column(path, "phase/as_published", "StateChange:state") == ([], []), "it is not the published game"
+    episodes, states = column(path, "now", "StateChange:state", "episode")
+    assert [state[0] for state in states] == ["begins", "harvesting", "tragedy", "recovery"]
+    assert episodes[:2] == [0, 9]
+    assert 400 < episodes[2] < 800 < episodes[3] < 1200
     episodes, tags = column(path, "tags", "Tensor:data", "episode")
-    assert episodes == list(range(49, 1600, 50))
-    assert tags[0][0]["buffer"] == [0.0, 0.0, 50.0, 0.0], "agent 1 was tagged by agent 0, in 50 episodes"
+    assert episodes == list(range(9, 1600, 10))
+    assert tags[0][0]["buffer"] == [0.0, 0.0, 10.0, 0.0], "agent 1 was tagged by agent 0, in 10 episodes"
+    assert tags[-1][0]["buffer"] == [0.0, 0.0, 50.0, 0.0], "the last 50 episodes"
 
 
 def test_a_run_that_is_gone_on_with_adds_a_file_of_the_same_recording(tmp_path):
@@ -261,9 +274,28 @@ def test_a_run_that_is_gone_on_with_adds_a_file_of_the_same_recording(tmp_path):
     ids = [RrdReader(file).recordings()[0].recording_id for file in files]
     assert ids[0] == ids[1]
     episodes, values = column(files[1], "social/collective_return", "Scalars:scalars", "episode")
-    assert (episodes, values) == ([1], [[4.0, 6.0, 5.0]])
+    assert (episodes, values) == ([1], [[4.0, 6.0, 5.0, 4.0]]), "the running mean goes on from 3"
 
 
+def see_the_first_episode(recording):
+    """Its frames are in a file that was not closed."""
+    rr.set_strict_mode(False)
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", rr.error_utils.RerunWarning)  # such a file has no footer
+        steps, _ = column(recording, "world/board", "SegmentationImage:buffer")
+    assert len(steps) >= 19, "the frames of the first episode were sent when it ended"
+    assert steps == sorted(steps)
+
+
+def test_the_file_of_a_run_that_goes_on_holds_all_up_to_its_last_flush(tmp_path):
+    """As it is left by a process that is killed."""
+    left = tmp_path / "left.rrd"
+    course(tmp_path, others=[Doing(150, lambda: shutil.copy(tmp_path / "run.rrd", left))])
+    see_the_first_episode(left)
+    assert left.stat().st_size < (tmp_path / "run.rrd").stat().st_size
+
+
+@pytest.mark.slow
 def test_a_killed_run_leaves_a_recording_up_to_its_last_flush(tmp_path):
     script = f"""
 import sys; sys.path.insert(0, {str(Path(__file__).parent)!r})
@@ -275,9 +307,4 @@ course(Path({str(tmp_path)!r}), episodes=10**6, others=[Doing(150, lambda: print
     assert any(line == "going\n" for line in process.stdout)
     process.kill()
     process.communicate()
-    rr.set_strict_mode(False)
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore", rr.error_utils.RerunWarning)  # a killed run's file has no footer
-        steps, _ = column(tmp_path / "run.rrd", "world/board", "SegmentationImage:buffer")
-    assert len(steps) >= 19, "the frames of the first episode were sent when it ended"
-    assert steps == sorted(steps)
+    see_the_first_episode(tmp_path / "run.rrd")

@@ -16,10 +16,11 @@ from cprl.custom import Custom, made
 from cprl.envs.make_env import spaces_of
 from cprl.envs.unwrap import commons_of
 from cprl.learners.base import Learner
-from cprl.learners.lanes import EVALUATION, EXPLORATION, lane_name, lane_seeds
+from cprl.learners.lanes import EVALUATION, EXHIBITION, EXPLORATION, lane_name, lane_seeds
 from cprl.networks.agent import acting_part
 from cprl.policies.assignment import AgentIndices, AgentPolicies
 from cprl.policies.lanes import random_agents
+from cprl.policies.present import PresentPolicy
 from cprl.policies.scripted import scripted_lanes
 from cprl.population import AgentSpec, Frozen, Learning, Scripted, Team, grouped
 from cprl.spaces import Spaces
@@ -62,6 +63,7 @@ class Population:
         self.replicas, self.seed, self._first = env.batch_size.numel(), seed, first_replica
         commons = commons_of(env)
         self._game = None if commons is None else commons.game
+        self._device = env.device or torch.device("cpu")
         self._groups = grouped(specs, self.spaces.agents)
         _check_scripted(self._groups, self.spaces, self._game)
         numbers = range(first_replica, first_replica + self.replicas)
@@ -75,7 +77,7 @@ class Population:
             "seed": seed,
             "first_replica": first_replica,
             "engine": engine,
-            "device": env.device or torch.device("cpu"),
+            "device": self._device,
         }
         self.learners: dict[tuple[int, ...], Learner] = {}
         for spec, agents in self._groups:
@@ -86,17 +88,20 @@ class Population:
                 )
         self.others: dict[AgentIndices, nn.Module] = self._others(EXPLORATION, worlds=1)
 
-    def _others(self, purpose: int, *, worlds: int) -> dict[AgentIndices, nn.Module]:
-        """The actors of the agents that do not learn, with random numbers for a purpose."""
+    def _others(
+        self, purpose: int, *, worlds: int, replicas: int | None = None
+    ) -> dict[AgentIndices, nn.Module]:
+        """The actors of the agents that do not learn, with random numbers for a purpose; for so many
+        replicas, all by default."""
         actors: dict[AgentIndices, nn.Module] = {}
-        replicas = range(self._first, self._first + self.replicas)
+        numbers = range(self._first, self._first + (replicas or self.replicas))
         for spec, agents in self._groups:
             how: dict[str, Any] = {"agents": len(agents), "worlds": worlds}
-            how["seeds"] = lane_seeds(self.seed, replicas=replicas, agents=agents, purpose=purpose)
+            how["seeds"] = lane_seeds(self.seed, replicas=numbers, agents=agents, purpose=purpose)
             if isinstance(spec, Scripted):
                 actors[agents] = scripted_lanes(spec.policy, self._game or self.spaces, **how)
             elif isinstance(spec, Frozen):
-                stored = [own for own in self._frozen[spec] for _ in agents]
+                stored = [own for own in self._frozen[spec][: len(numbers)] for _ in agents]
                 actors[agents] = stored_actor(stored, self._game or self.spaces, **how)
         return actors
 
@@ -107,6 +112,16 @@ class Population:
             agents: learner.evaluation_actor(worlds) for agents, learner in self.learners.items()
         }
         return AgentPolicies({**learned, **self._others(EVALUATION, worlds=worlds)})
+
+    def present_policy(self) -> PresentPolicy:
+        """All agents of the first replica as they are now, whenever it is called, in one world."""
+        with torch.random.fork_rng(devices=[]):
+            actors: dict[AgentIndices, Any] = {
+                agents: (learner.evaluation_actor(1), learner.actor)
+                for agents, learner in self.learners.items()
+            }
+            others = self._others(EXHIBITION, worlds=1, replicas=1)
+        return PresentPolicy(actors, others, replicas=self.replicas, device=self._device)
 
     def random_policy(self, worlds: int) -> AgentPolicies:
         """Every agent takes every action with equal probability."""

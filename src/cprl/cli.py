@@ -2,6 +2,9 @@
 
 import os
 import sys
+import time
+from collections.abc import Sequence
+from contextlib import suppress
 from dataclasses import replace
 from importlib.metadata import version
 from pathlib import Path
@@ -31,6 +34,7 @@ from cprl.running import run as run_experiment
 from cprl.runs.directory import read_recipe
 from cprl.runs.export import export_results
 from cprl.runs.labelled import refuse_to_write_over, write_table
+from cprl.viewer.page import Page, has_display
 from cprl.viewer.streams import viewer
 
 Allow = tyro.conf.UseAppendAction[tuple[str, ...]]
@@ -47,6 +51,7 @@ def run(
     take_over: bool = False,
     keep_checkpoint: bool = True,
     watch: str = "file",
+    linger: bool = False,
     allow: Allow = (),
 ) -> None:
     """Trains the experiment of a recipe or of a run anew, or resumes a run that was stopped.
@@ -59,6 +64,7 @@ def run(
         take_over: resume a run that a process on another host has locked.
         keep_checkpoint: keep the state of the training of a finished run, so that it can be extended.
         watch: "file", or live as well: "serve", "spawn", "connect ADDRESS"; "off" for no recording.
+        linger: keep the recording served after the run, until Ctrl-C; with --watch serve or spawn.
         allow: code of your own, module:Class, that the recipe may import; may be repeated.
     """
     _make_importable(allow)
@@ -75,6 +81,7 @@ def run(
         take_over=take_over,
         keep_checkpoint=keep_checkpoint,
         watch=watch,
+        linger=linger,
         allow=allow,
         command=sys.argv,
     )
@@ -190,17 +197,32 @@ def play(
         play_in_terminal(session)
 
 
-def watch(run: Path, /) -> None:
+def watch(run: Path, /, *, serve: bool = False) -> None:
     """Opens the recording of a run in the Rerun viewer, all files of it as one.
 
     Args:
         run: the run's directory, or a single .rrd file.
+        serve: serve it for browsers on 127.0.0.1 instead, until Ctrl-C, as without a display.
     """
     files = [run] if run.is_file() else sorted(run.glob("*.rrd"))
     if not files:
         raise ValueError(f"{run} holds no recording (*.rrd); recipes write one unless watch is off")
+    if serve or not has_display():
+        _serve(files, why="" if serve else "There is no display: ")
+        return
     command = [viewer(), *map(str, files)]
     os.execvp(command[0], command)
+
+
+def _serve(files: Sequence[Path], *, why: str) -> None:
+    """Serves recordings and the web viewer until Ctrl-C."""
+    page = Page(files)
+    say(f"Watch (browser): {page.address()}")
+    say(f"Watch (native): {viewer()} {' '.join(page.recordings)}")
+    say(f"{why}served on 127.0.0.1 until Ctrl-C")
+    with suppress(KeyboardInterrupt):
+        while True:
+            time.sleep(1)
 
 
 def export(run: Path, folder: Path, /) -> None:

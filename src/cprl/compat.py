@@ -8,9 +8,13 @@ upgrade has broken. The rest of cprl uses public interfaces. Two exceptions are 
   `_set_seed`, `Storage._empty`, `Sampler._empty`, `Logger._create_experiment`) are its interface for that.
 """
 
+import ctypes
 from abc import abstractmethod
-from collections.abc import Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager, suppress
+from functools import cache
+from hashlib import sha256
+from pathlib import Path
 from types import CodeType, FunctionType
 from typing import Any, Final
 
@@ -204,6 +208,37 @@ def without_lookup(function: FunctionType, codes: Sequence[CodeType]) -> Functio
     return FunctionType(codes[-1], dict(function.__globals__), function.__name__)
 
 
+@cache
+def remember_vector_instructions() -> None:
+    """Makes torch find out only once, not in every process, which vector instructions its compiler can use.
+
+    It does so by loading a library in a new process for each set of instructions, which takes two seconds.
+    The answer is kept in torch's cache folder, for this version of torch, compiler and CPU, if every set
+    that the CPU has can be used.
+    """
+    from torch._inductor import cpu_vec_isa  # takes a second
+    from torch._inductor.cpp_builder import get_compiler_version_info, get_cpp_compiler
+    from torch._inductor.runtime.cache_dir_utils import cache_dir
+
+    find, every = cpu_vec_isa.valid_vec_isa_list, cpu_vec_isa.supported_vec_isa_list
+
+    @cache
+    def remembered() -> list[Any]:
+        has = cpu_vec_isa.x86_isa_checker()
+        usable = [kind for kind in every if has and all(flag in has for flag in str(kind).split())]
+        text = f"{torch.__version__} {get_compiler_version_info(get_cpp_compiler())} {has}"
+        mark = Path(cache_dir()) / f"usable_vectors_{sha256(text.encode()).hexdigest()[:16]}"
+        if usable and mark.exists():
+            return usable
+        found: list[Any] = find()
+        if usable and found == usable:
+            with suppress(OSError):
+                mark.touch()
+        return found
+
+    cpu_vec_isa.valid_vec_isa_list = remembered
+
+
 # ---- Rerun
 
 
@@ -213,3 +248,14 @@ def end_recordings() -> None:
     from rerun_bindings import flush_and_cleanup_orphaned_recordings
 
     flush_and_cleanup_orphaned_recordings()
+
+
+def keep_native(recording: Any, keep: Callable[..., object] = ctypes.pythonapi.Py_IncRef) -> None:
+    """In place of a recording's end, which waits for a viewer: its native part, the private `inner`, stays
+    until the process ends.
+
+    Args:
+        recording: a `rerun.RecordingStream`, as its `__del__` gets it.
+        keep: bound here, because the interpreter clears modules before it deletes the last recordings.
+    """
+    keep(ctypes.py_object(recording.inner))

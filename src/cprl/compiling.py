@@ -7,7 +7,14 @@ from typing import Any, Final
 
 import torch
 
-from cprl.compat import COMPILE_OPTIONS, code_written_for, with_own_code, without_lookup
+from cprl.compat import (
+    COMPILE_OPTIONS,
+    code_written_for,
+    remember_vector_instructions,
+    with_own_code,
+    without_lookup,
+)
+from cprl.compile_clock import CLOCK
 
 TOLERANCE: Final = 1e-4
 """The tolerance between float32 results of the same operations in another order."""
@@ -48,13 +55,15 @@ class Compiled:
         if self._compiled is not None and form == self._form:
             return self._compiled(*arguments)
         self._form = form
-        return self._compile_and_call(*arguments)
+        with CLOCK.running():
+            return self._compile_and_call(*arguments)
 
     def _compile_and_call(self, *arguments: Any) -> Any:
         """The first call with a form; if compilation fails, no argument has been changed yet."""
         before = self._copies(arguments)
         reference = self._outcome(before)
         own = with_own_code(self._plain)
+        remember_vector_instructions()
         options = dict(COMPILE_OPTIONS)  # a copy, because torch removes entries
         self._compiled = torch.compile(own, fullgraph=True, options=options)
         try:

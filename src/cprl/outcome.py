@@ -1,18 +1,30 @@
 """The outcome of a training: its agents in fresh worlds, beside the random policy."""
 
-from collections.abc import Mapping, Sequence
+import random as random_of_python
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
+from typing import Final
 
+import numpy as np
+import torch
 from torchrl.envs import EnvBase
 
 from cprl.agents import Population
+from cprl.arguments import object_of
+from cprl.commons.game import Game
 from cprl.envs.make_env import make_env
 from cprl.envs.state import load_transforms_state, transforms_state
+from cprl.envs.unwrap import commons_of
 from cprl.experiment import Experiment
 from cprl.measuring.episodes import Episode
 from cprl.measuring.evaluate import evaluate
+from cprl.policies.present import PresentPolicy
 from cprl.runs.episodes import EpisodeTable
+
+EXHIBITED_WORLD: Final = 2**31
+"""The number of the exhibited world; those of a training, of as many replicas, are smaller."""
 
 
 def fresh_env(experiment: Experiment) -> EnvBase:
@@ -26,8 +38,75 @@ def fresh_env(experiment: Experiment) -> EnvBase:
     )
 
 
-def evaluate_population(
+def exhibited(
     experiment: Experiment, trained: EnvBase, population: Population
+) -> tuple[PresentPolicy, EnvBase] | None:
+    """The present policy, and one world for it that neither training nor evaluation plays; None where the
+    game has no board. Torch's generator is left as it was."""
+    if commons_of(trained) is None:
+        return None
+    with torch.random.fork_rng(devices=[]):
+        env = make_env(
+            experiment.game,
+            seed=experiment.seed,
+            first_world=EXHIBITED_WORLD,
+            device=experiment.device,
+            transforms=experiment.transforms,
+        )
+        return population.present_policy(), env
+
+
+def random_play(experiment: Experiment, population: Population) -> list[Episode]:
+    """Lets agents who take every action with equal probability play the worlds of the evaluation, before the
+    training: what it is compared with while it runs. No generator moves.
+
+    Args:
+        experiment: what will be trained.
+        population: the agents.
+
+    Returns:
+        `evaluation_episodes` episodes for each replica.
+
+    Raises:
+        ValueError: for anything but an experiment and a population.
+    """
+    _check(experiment, population)
+    with _generators_kept(experiment.device):
+        return evaluate(fresh_env(experiment), population.random_policy(experiment.evaluation_episodes))
+
+
+def _check(experiment: object, population: object) -> None:
+    object_of("experiment", experiment, Experiment, "an Experiment")
+    object_of("population", population, Population, "a Population of the same experiment")
+
+
+@contextmanager
+def _generators_kept(device: str) -> Iterator[None]:
+    """Puts the global generators back where they were: games of somebody else's may draw from them."""
+    of_python = random_of_python.getstate()
+    of_numpy = np.random.get_state()  # noqa: NPY002  (the global generator is the point)
+    gpus = [torch.device(device)] if torch.device(device).type == "cuda" else []
+    try:
+        with torch.random.fork_rng(devices=gpus):
+            yield
+    finally:
+        random_of_python.setstate(of_python)
+        np.random.set_state(of_numpy)  # noqa: NPY002
+
+
+def is_same_later(experiment: Experiment) -> bool:
+    """Whether random play is the same before and after a training: the game is one of cprl's, whose chance
+    depends on seeds alone, and has no transforms, which may learn in between."""
+    object_of("experiment", experiment, Experiment, "an Experiment")
+    return isinstance(experiment.game, Game) and not experiment.transforms
+
+
+def evaluate_population(
+    experiment: Experiment,
+    trained: EnvBase,
+    population: Population,
+    *,
+    random: list[Episode] | None = None,
 ) -> dict[str, list[Episode]]:
     """Lets the agents play fresh episodes, so many of each replica.
 
@@ -35,16 +114,18 @@ def evaluate_population(
         experiment: what was trained.
         trained: the environment of the training; what its transforms have learned is used.
         population: the agents.
+        random: the episodes of `random_play`, which are not played again if they are the same now.
 
     Returns:
         The episodes by policy: "random", and "trained", everybody as they are now.
     """
     fresh, worlds = fresh_env(experiment), experiment.evaluation_episodes
     load_transforms_state(fresh, transforms_state(trained))
-    return {
-        "random": evaluate(fresh, population.random_policy(worlds)),
-        "trained": evaluate(fresh, population.policy(worlds), explore=True),
-    }
+    if random is None or not is_same_later(experiment):
+        random = evaluate(fresh, population.random_policy(worlds))
+    else:
+        fresh.reset()  # the trained agents play the second episode of each world
+    return {"random": random, "trained": evaluate(fresh, population.policy(worlds), explore=True)}
 
 
 def write_evaluation(run: Path, played: Mapping[str, Sequence[Episode]], *, of_replica: int) -> None:

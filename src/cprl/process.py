@@ -2,11 +2,14 @@
 
 import ctypes
 import logging
+import os
 import sys
+from contextlib import suppress
 from typing import Final
 
 import torch
 
+from cprl.caches import cache_folder
 from cprl.checks import MOST_SEED, checked, count
 from cprl.output import OUT, keep_output
 
@@ -21,8 +24,9 @@ def prepare_process(seed: int) -> None:
     """Prepares the process for a training.
 
     Prepares the standard streams for being closed (`cprl.output`), seeds torch's global generator, limits
-    torch to one thread, flushes denormal numbers to zero, makes glibc reuse freed memory, and logs warnings
-    of TorchRL and messages of cprl.
+    torch to one thread, flushes denormal numbers to zero, makes glibc reuse freed memory, keeps what torch
+    compiles in `cache_folder` unless $TORCHINDUCTOR_CACHE_DIR says where, and logs warnings of TorchRL and
+    messages of cprl.
 
     The networks are so small that a second thread slows them down, up to a hundredfold on a busy machine.
     Denormal numbers in Adam's moments of dead weights slow a long run by a factor of up to 1.9.
@@ -36,6 +40,7 @@ def prepare_process(seed: int) -> None:
     torch.set_num_threads(1)
     torch.set_flush_denormal(True)
     _keep_freed_memory()
+    _keep_compiled_code()
     logging.getLogger("torchrl").setLevel(logging.WARNING)
     own = logging.getLogger("cprl")
     own.setLevel(logging.INFO)
@@ -53,3 +58,13 @@ def _keep_freed_memory() -> None:
     if mallopt is not None:
         mallopt(_M_MMAP_THRESHOLD, _MAX_THRESHOLD_BYTES)
         mallopt(_M_TRIM_THRESHOLD, 2 * _MAX_THRESHOLD_BYTES)
+
+
+def _keep_compiled_code() -> None:
+    """Makes torch keep compiled code where the rules' is, and not in the folder for temporary files, which
+    many machines empty when they start."""
+    folder = cache_folder() / "torch"
+    with suppress(OSError):
+        folder.mkdir(parents=True, exist_ok=True)
+        if os.access(folder, os.W_OK):
+            os.environ.setdefault("TORCHINDUCTOR_CACHE_DIR", str(folder))

@@ -16,7 +16,9 @@ from typing import Any, Final
 
 import numba
 
+from cprl.caches import cache_folder
 from cprl.commons.loops import FUNCTIONS, LOOPS
+from cprl.compile_clock import CLOCK
 
 Compiled = dict[str, Callable[..., Any]]
 
@@ -81,7 +83,7 @@ def rules_for_cpu() -> Compiled:
     Numba's own cache checks only the file of the called function and would miss a change in a rule that this
     function calls; so the cache folder is named after the text of all rules.
     """
-    folder = _cache_folder() / _fingerprint()
+    folder = cache_folder() / _fingerprint()
     on_disk = _can_write(folder)
     with kept_in(folder):
         return compiled(FUNCTIONS, partial(_jit_for_cpu, on_disk=on_disk))
@@ -99,7 +101,8 @@ def entry_for_cpu(loop: str, *arguments: Any) -> Callable[..., None]:
     fixed types.
     """
     if loop not in _entries:
-        _entries[loop] = machine_code(rules_for_cpu()[loop], *arguments)
+        with CLOCK.running():
+            _entries[loop] = machine_code(rules_for_cpu()[loop], *arguments)
     return _entries[loop]
 
 
@@ -119,13 +122,6 @@ def _can_write(folder: Path) -> bool:
         stacklevel=2,
     )
     return False
-
-
-def _cache_folder() -> Path:
-    """$CPRL_CACHE, or the folder cprl in the user's cache folder."""
-    if "CPRL_CACHE" in os.environ:
-        return Path(os.environ["CPRL_CACHE"])
-    return Path(os.environ.get("XDG_CACHE_HOME", Path.home() / ".cache")) / "cprl"
 
 
 def _fingerprint() -> str:

@@ -17,7 +17,7 @@ from cprl.networks.specification import refuse_unseen
 from cprl.policies.lanes import LaneActor
 from cprl.spaces import Spaces
 
-WEIGHTS, TARGET_WEIGHTS, EXPLORATION, SAMPLING, EVALUATION = range(5)
+WEIGHTS, TARGET_WEIGHTS, EXPLORATION, SAMPLING, EVALUATION, EXHIBITION = range(6)
 """The purposes of a lane's random numbers; each has its own seed."""
 
 StartFrom: TypeAlias = Mapping[str, Mapping[str, Tensor]]

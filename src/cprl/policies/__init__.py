@@ -6,5 +6,6 @@ Modules, in the order in which one reads them:
     scripted        agents that follow a rule; scripted_rules and paths are compiled for them
     tabular         agents that look actions up in tables
     assignment      AgentPolicies: which policy controls which agents
+    present         PresentPolicy: the first replica's agents as they are now, beside the training
     rng             random numbers of each lane's own
 """

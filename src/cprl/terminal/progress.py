@@ -2,21 +2,28 @@
 
 import time
 from collections.abc import Mapping
+from threading import Event, Thread
 from types import TracebackType
 from typing import Final, Self
 
 from rich.console import Console
-from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
+from rich.progress import BarColumn, MofNCompleteColumn, Progress, ProgressColumn, Task
+from rich.text import Text
 from tensordict import TensorDictBase
 
 from cprl.arguments import object_of
 from cprl.checks import checked, count
+from cprl.compile_clock import CLOCK
 from cprl.measuring.episodes import Episode
 from cprl.output import console as safe_console
 
 _BAR_PERIOD_S: Final = 0.25
 _LINE_PERIOD_S: Final = 10.0
 """Seconds between updates of the bar, and between lines if the output is not a terminal."""
+COMPILING_PERIOD_S: Final = 2.0
+"""Seconds of compiling after which a line says so, and between such lines, which come ever more slowly."""
+TIMED_STEPS: Final = 20
+"""Steps that are timed before a remaining time is shown."""
 
 
 def console_of(console: Console | None) -> Console:
@@ -26,11 +33,20 @@ def console_of(console: Console | None) -> Console:
     return console or safe_console()
 
 
+def in_words(seconds: float) -> str:
+    """A duration: "47 s", "12 min", "3 h 05 min"."""
+    if seconds < 100:
+        return f"{seconds:.0f} s"
+    minutes = round(seconds / 60)
+    return f"{minutes} min" if minutes < 100 else f"{minutes // 60:,} h {minutes % 60:02} min"
+
+
 class ProgressBar:
     """A bar with the return of the last episode, epsilon, steps per second and the time left.
 
-    If the output is not a terminal, it prints a plain line every ten seconds. A callback of `cprl.training`,
-    and a context manager.
+    While code is compiled it says so, and for how long; that time does not count for the rest. If the output
+    is not a terminal, it prints a plain line every ten seconds. A callback of `cprl.training`, and a context
+    manager.
 
     Args:
         game: a game or its environment. The length of an episode is `episode_steps` of its `rules`, if it has
@@ -57,27 +73,29 @@ class ProgressBar:
         self._title, self._clock = title, getattr(rules, "episode_steps", None)
         self._last_steps = 0
         self._progress = Progress(
-            TextColumn("{task.description}"),
+            "{task.description}",
             BarColumn(),
             MofNCompleteColumn(),
-            TextColumn("{task.fields[values]}"),
-            TimeRemainingColumn(),
+            _Now(),
             console=self.console,
             disable=not self.console.is_terminal,
         )
         self._task = self._progress.add_task(title, total=episodes, values="")
         self._latest = {"return": "-", "epsilon": "-"}
-        self._steps = self._steps_then = self._steps_this_episode = self._episodes = 0
-        self._started = self._then = time.perf_counter()
+        self._turns = self._steps = self._steps_then = self._steps_this_episode = self._episodes = 0
+        self._started = self._then = _running_s()
         self._left_of, self._replicas, self._before = episodes, replicas, 0
+        self._compiled_before_s = CLOCK.total_s
+        self._is_over, self._lines = Event(), Thread(target=self._say_compiling, daemon=True)
 
     def on_step(self, batch: TensorDictBase) -> None:
         """Counts the turns of a batch and updates the bar if it is due."""
         if not self._steps:  # do not count the time before the first step
-            self._started = self._then = time.perf_counter()
+            self._started = self._then = _running_s()
+        self._turns += 1
         self._steps += batch.numel()
         self._steps_this_episode += batch.numel()
-        waited = time.perf_counter() - self._then
+        waited = _running_s() - self._then
         if waited > (_BAR_PERIOD_S if self.console.is_terminal else _LINE_PERIOD_S):
             self._show(waited)
 
@@ -93,21 +111,33 @@ class ProgressBar:
 
     def _show(self, waited: float) -> None:
         rate = (self._steps - self._steps_then) / waited
-        self._steps_then, self._then = self._steps, time.perf_counter()
+        self._steps_then, self._then = self._steps, _running_s()
         values = f"return {self._latest['return']}  epsilon {self._latest['epsilon']}  {rate:,.0f} steps/s"
         episode_steps = self._clock or self._last_steps
         running = min(self._replicas, self._steps_this_episode / episode_steps) if episode_steps else 0
         done = (self._episodes + running) / self._replicas
+        values += self._time_left(done)
         self._progress.update(self._task, completed=done, values=values)
-        if not self.console.is_terminal and self._steps:
-            spent_s = time.perf_counter() - self._started
-            since = done - self._before / self._replicas
-            left_s = spent_s / since * (self._left_of - done) if since else float("nan")
+        if not self.console.is_terminal:
             episode = self._episodes // self._replicas
-            self.console.print(
-                f"{self._title}: episode {episode}/{self._left_of}  {values}  {left_s:,.0f} s left",
-                soft_wrap=True,
-            )
+            self.console.print(f"{self._title}: episode {episode}/{self._left_of}  {values}", soft_wrap=True)
+
+    def _time_left(self, done: float) -> str:
+        """The time left after so many episodes, in words; empty before enough steps were timed."""
+        since = done - self._before / self._replicas
+        if self._turns < TIMED_STEPS or not since:
+            return ""
+        left_s = (_running_s() - self._started) / since * (self._left_of - done)
+        return f"  {in_words(max(0.0, left_s))} left"
+
+    def _say_compiling(self) -> None:
+        """Prints lines while code is compiled; in a terminal the bar shows it."""
+        period_s, said_s = COMPILING_PERIOD_S, 0.0
+        while not self._is_over.wait(0.2):
+            spent_s = CLOCK.total_s - self._compiled_before_s
+            if CLOCK.is_running and spent_s - said_s >= period_s:
+                said_s, period_s = spent_s, 1.5 * period_s
+                self.console.print(f"{self._title}: compiling, {spent_s:.0f} s so far", soft_wrap=True)
 
     def state_dict(self) -> dict[str, int]:
         """The number of episodes that have ended."""
@@ -118,7 +148,10 @@ class ProgressBar:
         self._episodes = self._before = int(state["episodes"])
 
     def __enter__(self) -> Self:
+        self._compiled_before_s = CLOCK.total_s
         self._progress.start()
+        if not self.console.is_terminal:
+            self._lines.start()
         return self
 
     def __exit__(
@@ -127,5 +160,23 @@ class ProgressBar:
         error: BaseException | None,
         traceback: TracebackType | None,
     ) -> None:
+        self._is_over.set()
+        if self._lines.is_alive():
+            self._lines.join()
         self._progress.update(self._task, completed=self._episodes / self._replicas)
         self._progress.stop()
+
+
+class _Now(ProgressColumn):
+    """What a task says of itself, or that code is being compiled."""
+
+    def render(self, task: Task) -> Text:
+        """Called some ten times a second by rich's own thread."""
+        if CLOCK.is_running:
+            return Text(f"compiling, {CLOCK.total_s:.0f} s so far")
+        return Text(str(task.fields["values"]))
+
+
+def _running_s() -> float:
+    """Seconds of a clock that stands still while code is compiled."""
+    return time.perf_counter() - CLOCK.total_s

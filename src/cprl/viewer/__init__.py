@@ -2,12 +2,25 @@
 
 Modules, in the order in which one reads them:
     callback   ViewerCallback: logs a training while it runs
+    contents   what of a game is plotted, and what is left out
+    story      header, live label, events, and the phases when it ends
+    header     the header's texts
+    events     new bests, and phases
+    plots      the lines of each episode, with running means and random play
+    tags       who tagged whom
+    compiling  while code is compiled, the live header says so
     recorder   which episodes are recorded frame by frame
     frames     frames of one world, collected in memory
-    events     new bests and phases, in words
     logger     RerunLogger: TorchRL's logger interface on a recording
+    batches    numbers and texts as columns, in batches
+    recipe     the recipe as a table
+    names      files and ids of a run's recordings
+    exhibition a world that the present policy plays, for viewers alone
     streams    to a file, and served live
+    sending    one stream, which may fail without harm
+    page       the web viewer's page on 127.0.0.1, and recordings for it
     deadline   calls that may wait for a viewer, with deadlines
+    lingering  a finished run stays served until Ctrl-C
     scenery    names and colours of what a recording shows
     stage      frames as Rerun's columns
     blueprint  the layout of the viewer

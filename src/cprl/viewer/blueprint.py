@@ -1,43 +1,69 @@
-"""The layout of the Rerun viewer for a recording."""
+"""The layout of the Rerun viewer for a recording: of the file, and of the live view.
 
+    header: one line in large type, and how to read the lines of plots
+    board (live: "Present policy" first) | windows of the agents | events
+    the live label and, at the end, the phases, as strips
+    plots in tabs, three to a tab
+
+A new tab is a function of `Curves` that returns a view or None, named in `_TABS`.
+"""
+
+from collections.abc import Callable
 from typing import Any, Final, Literal
 
 from cprl.commons.colours import WINDOW_CAPTION
-from cprl.viewer.scenery import Curves, Scene
+from cprl.viewer.axes import BOUNDS
+from cprl.viewer.panels import Panels
+from cprl.viewer.scenery import BACKGROUND, Curves, Scene, has_lorenz, has_wall
 
-_BACKGROUND: Final = (24, 26, 32)
-"""The background of boards and windows, which sets their dark cells apart from the viewer's own colour."""
+_HEADER, _STRIP, _VIEW = 97, 40, 207
+"""Heights in a window of 1280 x 720, in pixels: the header, a strip, boards or plots. The rows share out any
+other height as they do this one."""
 
 
-def layout(curves: Curves) -> Any:
-    """Board and windows left, plots right, events below, and tabs for the rest; a replay has fewer views.
+def layout(curves: Curves, *, live: bool = False, ended: bool = False) -> Any:
+    """The layout of a recording; a replay has fewer views, and a game without a board none of the board.
 
     Args:
-        curves: the numbers that are plotted; a `Scene` if there is a board, else the left shows events only.
+        curves: the numbers that are plotted; a `Scene` if there is a board.
+        live: whether it is the layout of the live view, which has the present policy's exhibition
+            (`/exhibition`, in the live stream alone), and no room for phases before they are there.
+        ended: whether the run has ended, for the live view.
 
     Returns:
         A `rerun.blueprint.Blueprint`.
     """
     import rerun.blueprint as rrb
 
-    if not isinstance(curves, Scene):
-        views = rrb.Horizontal(_events(), _numbers(curves), column_shares=[1, 3])
-    elif curves.is_replay:
-        return _laid_out(_replay(curves.agents), play_state="playing")
-    else:
-        views = rrb.Horizontal(_board(curves.agents), _numbers(curves), column_shares=[2, 3])
-    return _laid_out(views, play_state="following")
+    if isinstance(curves, Scene) and curves.is_replay:
+        return _laid_out(_replay(curves.agents), timeline="frame", play_state="playing")
+    strips = 3 if curves.has_phases and (ended or not live) else 1
+    return _laid_out(
+        rrb.Vertical(
+            _header(),
+            _top(curves, live=live),
+            _strip(),
+            _plots(curves),
+            row_shares=[_HEADER, _VIEW, (0.5 + strips) * _STRIP, _VIEW],
+        ),
+        timeline="episode",
+        play_state="following",
+    )
 
 
-def _laid_out(views: Any, *, play_state: Literal["playing", "following"]) -> Any:
-    """The views in a blueprint with the viewer's other panels collapsed."""
+def _laid_out(views: Any, *, timeline: str, play_state: Literal["playing", "following"]) -> Any:
+    """The views in a blueprint with the viewer's other panels collapsed.
+
+    The timeline of the time panel is the axis of every plot: episodes, and in a replay frames, which are its
+    steps. Boards are played back on `frame`, which counts recorded frames alone.
+    """
     import rerun.blueprint as rrb
 
     return rrb.Blueprint(
         views,
         rrb.BlueprintPanel(state="collapsed"),
         rrb.SelectionPanel(state="collapsed"),
-        rrb.TimePanel(state="collapsed", timeline="step", play_state=play_state, fps=15),
+        rrb.TimePanel(state="collapsed", timeline=timeline, play_state=play_state, fps=15),
     )
 
 
@@ -46,9 +72,9 @@ def _replay(agents: tuple[str, ...]) -> Any:
     import rerun.blueprint as rrb
 
     return rrb.Horizontal(
-        rrb.Vertical(_world(), _events(), row_shares=[7, 2]),
+        rrb.Vertical(_world(), rrb.Tabs(_events("step"), _recipe(), active_tab=0), row_shares=[7, 2]),
         rrb.Vertical(
-            _windows(agents),
+            _windows(is_wide=True),
             _plot("Harvest so far, apples", *_of(agents, "harvested")),
             _plot("Apples on the board", "turn/stock"),
             row_shares=[4, 3, 2],
@@ -57,91 +83,192 @@ def _replay(agents: tuple[str, ...]) -> Any:
     )
 
 
-def _board(agents: tuple[str, ...]) -> Any:
-    """The board, the agents' windows, and the events."""
+def _header() -> Any:
     import rerun.blueprint as rrb
 
-    return rrb.Vertical(_world(), _windows(agents), _events(), row_shares=[9, 9, 5])
+    return rrb.TextDocumentView(name="Now", origin="/header", titlebar=False)
 
 
-def _world() -> Any:
+def _top(curves: Curves, *, live: bool) -> Any:
+    """The board, the agents' windows and the events side by side; without a board the events alone."""
     import rerun.blueprint as rrb
 
-    return rrb.Spatial2DView(name="Board", origin="/world", background=_BACKGROUND)
+    if not isinstance(curves, Scene):
+        return _events()
+    boards = _boards(live=live)
+    return rrb.Horizontal(boards, _windows(), _events(), column_shares=[5, 3, 3])
 
 
-def _windows(agents: tuple[str, ...]) -> Any:
+def _boards(*, live: bool) -> Any:
+    """The boards, in tabs if there are several: live, the present policy's and that of recorded frames."""
     import rerun.blueprint as rrb
 
-    seen = "What the agent sees" if len(agents) == 1 else "What each agent sees"
-    return rrb.Spatial2DView(name=f"{seen}, {WINDOW_CAPTION}", origin="/windows", background=_BACKGROUND)
+    if not live:
+        return _world()
+    present = rrb.Spatial2DView(name="Present policy", origin="/exhibition", background=BACKGROUND)
+    return rrb.Tabs(present, _world("Recorded episodes"), active_tab=0)
 
 
-def _events() -> Any:
-    """The events and the recipe."""
+def _world(name: str = "Board") -> Any:
     import rerun.blueprint as rrb
 
-    columns = rrb.TextLogColumns(timeline_columns=["step"], text_log_columns=["Body"])
-    return rrb.Tabs(
-        rrb.TextLogView(name="Events", origin="/log", columns=columns),
-        rrb.TextDocumentView(name="Recipe", origin="/recipe"),
-        active_tab="Events",
+    return rrb.Spatial2DView(name=name, origin="/world", background=BACKGROUND)
+
+
+def _windows(*, is_wide: bool = False) -> Any:
+    """The windows, with the caption that fits."""
+    import rerun.blueprint as rrb
+
+    name = f"What agents see, {WINDOW_CAPTION}" if is_wide else "Windows: self blue, others red"
+    return rrb.Spatial2DView(name=name, origin="/windows", background=BACKGROUND)
+
+
+def _events(timeline: str = "episode") -> Any:
+    """The events, each with its number on a timeline."""
+    import rerun.blueprint as rrb
+
+    columns = rrb.TextLogColumns(timeline_columns=[timeline], text_log_columns=["Body"])
+    return rrb.TextLogView(name="Events", origin="/log", columns=columns)
+
+
+def _strip() -> Any:
+    """The live label, below it the phases found at the end and the published ones, as bands over episodes."""
+    import rerun.blueprint as rrb
+
+    contents = ["+ /now", "+ /phase/**"]
+    return rrb.StateTimelineView(name="Phases", contents=contents, time_view=_whole(), titlebar=False)
+
+
+def _plots(curves: Curves) -> Any:
+    import rerun.blueprint as rrb
+
+    tabs = [tab for make in _TABS if (tab := make(curves)) is not None]
+    return rrb.Tabs(*tabs, active_tab=0)
+
+
+def _outcome(curves: Curves) -> Any:
+    """What the group harvests, how long its board lives, and how evenly it shares."""
+    return _row(
+        "Outcome",
+        _social(curves, "Harvest of all, apples", "collective_return"),
+        _social(curves, "Survival, steps", "survival_steps"),
+        _social(curves, "Equality, 0 to 1", "equality", share=True),
     )
 
 
-def _numbers(curves: Curves) -> Any:
-    """Returns and social metrics, the phase below them, and tabs for learning and for who tagged whom.
-
-    Metrics that the game does not report are left out.
-    """
+def _agents(curves: Curves) -> Any:
+    """Each agent's return, time in play and who tagged whom."""
     import rerun.blueprint as rrb
 
-    agents = curves.agents
-
-    def social(*plots: tuple[str, str]) -> list[Any]:
-        """Plots without a legend for several replicas, because it would hide their lines."""
-        return [
-            _plot(name, f"social/{metric}", share=metric == "equality", legend=curves.replicas == 1)
-            for name, metric in plots
-            if metric in curves.metrics
-        ]
-
-    learning = rrb.Horizontal(
-        _plot("Loss", *_of(agents, "loss"), legend=False),
-        _plot("Highest Q value", *_of(agents, "q"), legend=False),
-        _plot("Epsilon", *_of(agents, "epsilon"), share=True, legend=False),
-        _plot("Steps per second", "time/env_steps_per_s", legend=False),
-        name="Learning",
+    unit = "apples" if "collective_return" in curves.metrics else "sum of rewards"
+    tags = rrb.TensorView(name="Who tagged whom", origin="/tags")
+    return _row(
+        "Agents",
+        _plot(f"Return of each, {unit}", *_of(curves.agents, "return"), "evaluation/greedy_return"),
+        _social(curves, "Peacefulness, steps in play", "peacefulness"),
+        tags if curves.has_tags and len(curves.agents) > 1 else None,
     )
-    more = social(
-        ("Apples per step", "efficiency"),
-        ("Mean time of harvest, steps", "sustainability"),
-        ("Apples left at the end", "stock_left"),
-    )
-    tabs: list[Any] = [learning, *([rrb.Horizontal(*more, name="More metrics")] if more else [])]
-    if len(agents) > 1 and curves.has_tags:
-        tabs.append(rrb.TensorView(name="Who tagged whom", origin="/tags"))
-    unit = ", apples" if "collective_return" in curves.metrics else ""
-    returns = rrb.Horizontal(
-        _plot(f"Return of each agent{unit}", *_of(agents, "return"), "evaluation/greedy_return"),
-        *social(("Collective return, apples", "collective_return")),
-    )
-    outcome = social(
-        ("Survival, steps", "survival_steps"),
-        ("Equality", "equality"),
-        ("Peacefulness, steps in play", "peacefulness"),
-    )
-    rows: list[tuple[Any, int]] = [(returns, 4), (rrb.Horizontal(*outcome), 3)]
-    if curves.has_phases:
-        phases = rrb.StateTimelineView(name="Phase", contents=["+ /phase/**"], time_view=_whole())
-        rows.append((phases, 1))
-    rows.append((rrb.Tabs(*tabs, active_tab=0), 3))
-    views, shares = zip(*rows, strict=True)
-    return rrb.Vertical(*views, row_shares=list(shares))
 
 
-def _plot(name: str, *entities: str, share: bool = False, legend: bool = True) -> Any:
-    """A plot over the whole run; the axis of a share is 0..1."""
+def _learning(curves: Curves) -> Any:
+    return _row(
+        "Learning",
+        _plot("Loss", *_of(curves.agents, "loss")),
+        _plot("Highest Q value, apples", *_of(curves.agents, "q")),
+        _plot("Epsilon, 0 to 1", *_of(curves.agents, "epsilon"), share=True),
+    )
+
+
+def _more(curves: Curves) -> Any:
+    return _row(
+        "More metrics",
+        _social(curves, "Apples per step", "efficiency"),
+        _social(curves, "Mean time of harvest, steps", "sustainability"),
+        _social(curves, "Apples left at the end", "stock_left"),
+    )
+
+
+def _speed(curves: Curves) -> Any:
+    return _plot("Speed", "time/env_steps_per_s")
+
+
+def _recipe(curves: Curves | None = None) -> Any:
+    import rerun.blueprint as rrb
+
+    return rrb.TextDocumentView(name="Recipe", origin="/recipe")
+
+
+def _fates(curves: Curves) -> Any:
+    """All boards at once, and how long each replica's apples lasted."""
+    if not isinstance(curves, Scene):
+        return None
+    wall = _panels("All replicas; framed: died in its last episode", "wall", curves, curves.replicas)
+    return _row(
+        "Replicas",
+        wall if has_wall(curves) else None,
+        _drawn("Apples on the board, over the turn", "turn"),
+    )
+
+
+def _places(curves: Curves) -> Any:
+    """Where agents go, and how evenly they share."""
+    name = "Where agents go, first replica; bright: long"
+    return _row(
+        "Places and shares",
+        _panels(name, "visits", curves, len(curves.agents)) if isinstance(curves, Scene) else None,
+        _drawn("Lorenz curve: harvest in %", "lorenz") if has_lorenz(curves) else None,
+    )
+
+
+def _panels(name: str, origin: str, scene: Scene, count: int) -> Any:
+    """A view of several boards."""
+    bounds = Panels(count, (scene.height + 2, scene.width + 2)).bounds
+    return _flat(name, origin, bounds)
+
+
+def _drawn(name: str, origin: str) -> Any:
+    """A view of a plot that is drawn with `Axes`."""
+    return _flat(name, origin, BOUNDS)
+
+
+def _flat(name: str, origin: str, bounds: tuple[tuple[float, float], tuple[float, float]]) -> Any:
+    import rerun.blueprint as rrb
+
+    visible = rrb.VisualBounds2D(x_range=bounds[0], y_range=bounds[1])
+    return rrb.Spatial2DView(name=name, origin=f"/{origin}", background=BACKGROUND, visual_bounds=visible)
+
+
+_TABS: Final[tuple[Callable[[Curves], Any], ...]] = (
+    _outcome,
+    _agents,
+    _fates,
+    _places,
+    _learning,
+    _more,
+    _speed,
+    _recipe,
+)
+"""The tabs, each a function of `Curves` that returns its view, or None if it has nothing to show."""
+
+
+def _row(name: str, *views: Any) -> Any:
+    """The views that are there side by side, as a tab; None if there is none."""
+    import rerun.blueprint as rrb
+
+    there = [view for view in views if view is not None]
+    return rrb.Horizontal(*there, name=name) if there else None
+
+
+def _social(curves: Curves, name: str, metric: str, *, share: bool = False) -> Any:
+    """The plot of a metric with random play's line; None if the game does not report it."""
+    if metric not in curves.metrics:
+        return None
+    return _plot(name, f"social/{metric}", f"random_play/{metric}", share=share)
+
+
+def _plot(name: str, *entities: str, share: bool = False) -> Any:
+    """A plot over the whole run, without a legend, which would hide its lines: they are named where the
+    pointer is, and `header` says which is which. The axis of a share is 0..1."""
     import rerun.blueprint as rrb
 
     return rrb.TimeSeriesView(
@@ -149,7 +276,7 @@ def _plot(name: str, *entities: str, share: bool = False, legend: bool = True) -
         contents=[f"+ /{entity}" for entity in entities],
         axis_x=_whole(),
         axis_y=rrb.ScalarAxis(range=(0.0, 1.05)) if share else None,
-        plot_legend=rrb.PlotLegend(rrb.Corner2D.LeftTop, visible=legend),
+        plot_legend=rrb.PlotLegend(visible=False),
     )
 
 

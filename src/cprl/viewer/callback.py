@@ -1,11 +1,9 @@
 """ViewerCallback: records a training for the Rerun viewer, and shows it live."""
 
-import itertools
-import json
 import time
-import uuid
 from collections.abc import Mapping, Sequence
 from pathlib import Path
+from threading import Event
 from types import TracebackType
 from typing import Any, Final, Self
 
@@ -19,26 +17,23 @@ from cprl.arguments import object_of
 from cprl.arguments import path as path_of
 from cprl.checks import NONE, TEXT, check_nesting, checked, count, either
 from cprl.envs.unwrap import agent_names, commons_of
-from cprl.measuring import phases
 from cprl.measuring.episodes import Episode
-from cprl.measuring.reported import FIELDS, METRICS, available, left_out, reported_by
-from cprl.measuring.series import Series, Values, mean_of, numbers_of
-from cprl.runs.directory import FILE_NAME as RECIPE_FILE
-from cprl.runs.files import read_json
-from cprl.viewer.events import ANOTHER, EventDetector
-from cprl.viewer.logger import FILE_NAME, RerunLogger
+from cprl.measuring.reported import reported_by
+from cprl.measuring.series import Series, Values, numbers_of
+from cprl.viewer.compiling import CompilingNotice
+from cprl.viewer.contents import curves_of, missing_in
+from cprl.viewer.exhibition import Exhibited, Exhibition
+from cprl.viewer.header import has_died
+from cprl.viewer.logger import RerunLogger
+from cprl.viewer.names import FILE_NAME, free_name, recording_id
+from cprl.viewer.plots import Plots
 from cprl.viewer.recorder import FrameRecorder, scene_of
-from cprl.viewer.scenery import TOO_EARLY, Curves
+from cprl.viewer.story import Story
+from cprl.viewer.tags import Tags
+from cprl.viewer.views import Views
 
-TAGS_EVERY: Final = 50
-"""Episodes whose tags are summed in one matrix of who tagged whom."""
-
-_SHOWN: Final[Mapping[str, tuple[str, ...]]] = {
-    "phases and new bests": tuple(dict.fromkeys(entry for name in phases.METRICS for entry in METRICS[name])),
-    "who tagged whom": ("tagged_by",),
-    "the board and what agents see": ("board",),
-}
-"""The views of a recording besides metrics, and the entries that each needs."""
+_DIED: Final = "died"
+"""Among an episode's numbers, whether the board died early."""
 
 
 class ViewerCallback:
@@ -60,6 +55,8 @@ class ViewerCallback:
         episodes: the number of episodes of the run; determines how often frames are recorded.
         recipe: the recipe that the viewer shows.
         live: "serve", "spawn" or "connect ADDRESS", see `cprl.viewer.streams`; None for the file alone.
+        exhibited: what is exhibited live: the present policy and one world for it, see
+            `cprl.viewer.exhibition`.
         file_name: the name of the recording instead of `run.rrd`; there must be no such file.
         is_replay: whether a stored policy is replayed, see `cprl.viewer.scenery.Scene`.
         console: the console for the addresses; by default standard output.
@@ -74,6 +71,7 @@ class ViewerCallback:
         episodes: int,
         recipe: Mapping[str, object] | None = None,
         live: str | None = None,
+        exhibited: tuple[Exhibited, EnvBase] | None = None,
         file_name: str | None = None,
         is_replay: bool = False,
         console: Console | None = None,
@@ -86,7 +84,7 @@ class ViewerCallback:
         run = path_of("run", run)
         self.env, self._episodes = env, episodes
         self._agents, reported = agent_names(env), reported_by(env)
-        curves, commons = _curves(env, self._agents, reported), commons_of(env)
+        curves, commons = curves_of(env, self._agents, reported, episodes=episodes), commons_of(env)
         scene = None if commons is None else scene_of(commons, curves, is_replay=is_replay)
         self.logger = RerunLogger(
             title,
@@ -94,8 +92,9 @@ class ViewerCallback:
             scene=scene,
             curves=curves,
             live=live,
-            file_name=file_name or _free_name(run),
-            recording_id=_recording_id(run, file_name or FILE_NAME),
+            exhibits=exhibited is not None and scene is not None,
+            file_name=file_name or free_name(run),
+            recording_id=recording_id(run, file_name or FILE_NAME),
             console=console,
         )
         self._recorder = (
@@ -103,22 +102,38 @@ class ViewerCallback:
             if commons is None or scene is None
             else FrameRecorder(commons, episodes=episodes, scene=scene)
         )
+        self.exhibition: Exhibition | None = None
+        """What the present policy plays for viewers; None where nothing is exhibited."""
+        if exhibited is not None and scene is not None:
+            self.exhibition = Exhibition(*exhibited, trained=env, scene=scene, live=self.logger.live)
         self.every = 0 if self._recorder is None else self._recorder.every
         """Episodes from one with frames to the next; 0 for no frames."""
         self._series = Series(curves.replicas)
-        self._events = EventDetector() if curves.has_phases else None
-        self._tags = np.zeros((len(self._agents),) * 2) if curves.has_tags else None
+        self.plots = Plots(self.logger, curves, episodes=episodes)
+        game = None if commons is None else commons.game
+        self.story = (
+            None
+            if is_replay
+            else Story(self.logger, curves, episodes=episodes, window=self.plots.window, game=game)
+        )
+        self._views = Views(
+            commons, self.logger, curves if scene is None else scene, episodes=episodes, every=self.every
+        )
+        has_tags = curves.has_tags and len(self._agents) > 1
+        self._tags = Tags(self.logger, len(self._agents)) if has_tags else None
         self._step = self._episode = 0
-        self._shows_next = False
+        self._shows_next = self._has_died = False
         self._rate_at = time.perf_counter()
         self._rate_step = 0
         self.logger.log_hparams({"run": run.name, **(recipe or {})})
         self.logger.log_text(f"{title} begins")
-        missing = left_out([*reported, *(["board"] if scene else [])], more=_SHOWN)
+        missing = missing_in(reported, has_board=scene is not None)
         if missing:
             self.logger.log_text(missing)
-        if curves.has_phases and not is_replay:
-            self.logger.log_states("phase/now", {0: TOO_EARLY})
+        if live and scene is None:
+            self.logger.log_text("no exhibition: the game has no board")
+        self.log_status("begins")
+        self._compiling = CompilingNotice(self._show_status) if live else None
 
     def on_step(self, batch: TensorDictBase) -> None:
         """Copies the state of the first world after the turn, if this episode's frames are recorded.
@@ -126,62 +141,107 @@ class ViewerCallback:
         Otherwise it only counts: reading a tensor each turn would cost a training some percent.
         """
         self._step += 1
+        if self.exhibition is not None:
+            self.exhibition.on_step(episode=self._episode)
+        self._views.on_step(self._step, self._episode, self._record(batch))
+
+    def _record(self, batch: TensorDictBase) -> int | None:
+        """Copies a frame if this episode's are recorded; returns its number, None if there is none."""
         if self._recorder is None or not self.is_shown:
-            return
+            return None
         if keys.entry(keys.entry(batch, "next"), keys.DONE)[
             0, 0
         ]:  # the board is already that of the next episode
             self._send_frames()
-            return
+            return None
         self._recorder.add(batch, step=self._step, episode=self._episode)
+        frame = self.logger.frames + self._recorder.pending - 1
         if self._recorder.is_due:
             self._send_frames()
+        return frame
 
     def on_episode(self, episode: Episode, learning: Mapping[str, float]) -> None:
         """Logs the numbers of an episode, and its events, once all replicas have ended it."""
         if episode.world == 0:
+            self._log_death(episode)
             self._episode, self._shows_next = episode.episode + 1, False
-        if episode.world == 0 and (episode.depletion_step or -1) > 0:
-            self.logger.at(step=self._step, episode=episode.episode)
-            self.logger.log_text(
-                f"episode {episode.episode}: the last apple was taken in step {episode.depletion_step}"
-            )
         if self._tags is not None and episode.tagged_by is not None:
-            self._tags += episode.tagged_by
+            self._tags.add(episode.tagged_by)
+        self._views.on_episode(episode)
         numbers = numbers_of(episode, learning, self._agents)
-        of_all = self._series.add(episode.episode, episode.world, numbers)
+        died = has_died(episode)
+        of_all = self._series.add(
+            episode.episode, episode.world, numbers if died is None else {**numbers, _DIED: float(died)}
+        )
         if of_all is not None:
+            self._stop_notice()
             self.logger.at(step=self._step, episode=episode.episode)
             self._log(episode.episode, of_all)
 
-    def _log(self, episode: int, of_all: Mapping[str, Values]) -> None:
-        logger, now = self.logger, time.perf_counter()
-        for name, values in of_all.items():
-            singles = values.tolist() if name.startswith("social/") and len(values) > 1 else []
-            logger.log_lines(name, [*singles, mean_of(values)])
+    def _show_status(self, status: str) -> None:
+        """Shows a status in the header of the live view; from any thread."""
+        if self.story is not None and self._episode == 0:
+            self.logger.show_live("header", self.story.beginning(status))
+
+    def _log_death(self, episode: Episode) -> None:
+        """Logs the step of the last apple in the first replica, for the first time and where one sees it."""
+        step = episode.depletion_step or -1
+        if step > 0 and (self.is_shown or not self._has_died):
+            self.logger.at(step=self._step, episode=episode.episode)
+            self.logger.log_text(f"last apple taken in step {step}")
+            self._has_died = True
+
+    def _log(self, episode: int, of_all: dict[str, Values]) -> None:
+        now, died = time.perf_counter(), of_all.pop(_DIED, None)
+        self.plots.on_episode(of_all)
+        self._views.on_all(episode)
         steps = (self._step - self._rate_step) * self._series.replicas
         if steps:
-            logger.log_scalar("time/env_steps_per_s", steps / (now - self._rate_at))
+            self.logger.log_scalar("time/env_steps_per_s", steps / (now - self._rate_at))
             self._rate_at, self._rate_step = now, self._step
-        if self._events is not None:
-            self._log_events(self._events, episode, of_all)
-        if self._tags is not None and (episode + 1) % TAGS_EVERY == 0 and len(self._agents) > 1:
-            logger.log_matrix("tags", self._tags, ("tagged", "by whom"))
-            self._tags[:] = 0
+        if self.story is not None:
+            events = self.story.on_episode(episode, of_all, None if died is None else float(np.nansum(died)))
+            self._shows_next |= any(event.startswith("new best") for event in events)
+        if self._tags is not None:
+            self._tags.on_episode(episode)
 
-    def _log_events(self, detector: EventDetector, episode: int, of_all: Mapping[str, Values]) -> None:
-        events = detector.add(
-            {name.removeprefix("social/"): mean_of(values) for name, values in of_all.items()}
-        )
-        for event in events:
-            self.logger.log_text(f"episode {episode}: {event}")
-            self._shows_next |= event.startswith("new best")
-        if any(event.startswith("phase") for event in events):
-            self.logger.log_states("phase/now", {episode: detector.phase or ANOTHER})
+    def log_status(self, status: str) -> None:
+        """Says in the header what happens before the first episode has ended, e.g. "compiling, 12 s so far";
+        viewers get it at once."""
+        if self.story is not None:
+            self.story.begins(status)
+
+    def random_play(self, episodes: Sequence[Episode]) -> None:
+        """Compares the training with these episodes of random play: in header, label, plots and an event."""
+        self.plots.random_play(episodes)
+        if self.story is not None:
+            self.story.random_play(episodes)
+
+    @property
+    def baseline(self) -> float | None:
+        """The mean collective return of random play (or summed return, without a harvest), if it is known."""
+        return None if self.story is None else self.story.baseline
+
+    def finished(self, played: Mapping[str, Sequence[Episode]]) -> None:
+        """Shows that the run is finished, and closes the file; a live view stays open until the end.
+
+        Args:
+            played: the episodes of its evaluation, "trained" and "random".
+        """
+        self._send_frames()
+        self._views.close()
+        if self.story is not None:
+            self.story.finished(played["trained"], played["random"])
+        self.logger.close_file()
 
     def log_event(self, event: str) -> None:
-        """Logs an event as text, for instance a checkpoint."""
+        """Logs an event as text."""
         self.logger.log_text(event)
+
+    def play_on(self, stop: Event) -> None:
+        """Exhibits the trained policy until the event is set; returns at once where nothing is exhibited."""
+        if self.exhibition is not None:
+            self.exhibition.play_on(stop, episode=self._episode)
 
     @property
     def is_shown(self) -> bool:
@@ -198,18 +258,24 @@ class ViewerCallback:
         if frames is not None:
             self.logger.log_frames(frames)
 
-    def state_dict(self) -> dict[str, Any]:
-        """The counters, events and pending numbers; frames are sent first."""
+    def flush(self) -> None:
+        """Sends all that waits, to the file and to viewers."""
         self._send_frames()
         self.logger.flush()
+
+    def state_dict(self) -> dict[str, Any]:
+        """The counters, events and pending numbers; frames are sent first."""
+        self.flush()
         return {
             "step": self._step,
             "episode": self._episode,
             "shows_next": self._shows_next,
             "frames": self.logger.frames,
             "series": self._series.state_dict(),
-            "story": None if self._events is None else self._events.state_dict(),
-            "tags": None if self._tags is None else self._tags.tolist(),
+            "plots": self.plots.state_dict(),
+            "views": self._views.state_dict(),
+            "story": None if self.story is None else self.story.state_dict(),
+            "tags": None if self._tags is None else self._tags.state_dict(),
         }
 
     def load_state_dict(self, state: Mapping[str, Any]) -> None:
@@ -218,12 +284,18 @@ class ViewerCallback:
         self._episode, self._shows_next = int(state["episode"]), bool(state["shows_next"])
         self.logger.frames = int(state["frames"])
         self._series.load_state_dict(state["series"])
-        if self._events is not None:
-            self._events.load_state_dict(state["story"])
-        if self._tags is not None:
-            self._tags = np.array(state["tags"])
+        self.plots.load_state_dict(state.get("plots", {}))
+        self._views.load_state_dict(state.get("views", {}))
         self.logger.at(step=self._step, episode=self._episode)
+        if self.story is not None:
+            self.story.load_state_dict(state["story"] or {})
+        if self._tags is not None:
+            self._tags.load_state_dict(state["tags"])
         self.logger.log_text(f"resumed from step {self._step:,}")
+
+    def _stop_notice(self) -> None:
+        if self._compiling is not None:
+            self._compiling.stop()
 
     def __enter__(self) -> Self:
         return self
@@ -234,35 +306,9 @@ class ViewerCallback:
         error: BaseException | None,
         traceback: TracebackType | None,
     ) -> None:
+        self._stop_notice()
         self._send_frames()
-        found = [] if self._events is None else self._events.phases()
-        if found:
-            self.logger.log_states("phase/found", {round(one.first): one.label or ANOTHER for one in found})
+        self._views.close()
+        if self.story is not None:
+            self.story.close()
         self.logger.shutdown()
-
-
-def _curves(env: EnvBase, agents: tuple[str, ...], reported: Sequence[str]) -> Curves:
-    """The numbers of an environment that are plotted."""
-    metrics = available({**METRICS, "stock_left": FIELDS["stock_left"]}, reported)
-    return Curves(
-        agents=agents,
-        replicas=env.batch_size.numel(),
-        metrics=metrics,
-        has_phases=set(phases.METRICS) <= set(metrics),
-        has_tags="tagged_by" in reported,
-    )
-
-
-def _free_name(run: Path) -> str:
-    """run.rrd, or run-2.rrd and so on if the run has a recording already."""
-    names = (FILE_NAME if nth == 1 else f"run-{nth}.rrd" for nth in itertools.count(1))
-    return next(name for name in names if not (run / name).exists())
-
-
-def _recording_id(run: Path, file_name: str) -> str | None:
-    """The recording id, the same when a run is resumed or extended; None where there is no run."""
-    if not (run / RECIPE_FILE).exists():
-        return None
-    recipe = read_json(run / RECIPE_FILE)
-    same = {name: own for name, own in recipe.items() if name not in ("experiment", "extended")}
-    return str(uuid.uuid5(uuid.NAMESPACE_URL, file_name + json.dumps(same, sort_keys=True)))

@@ -1,16 +1,15 @@
 """Calls of the Rerun SDK that may wait for a viewer, with deadlines."""
 
 import atexit
-import ctypes
 import time
 from collections.abc import Callable
 from contextlib import suppress
 from functools import cache
 from queue import Full, Queue
 from threading import Thread
-from typing import Any, Final, TypeVar
+from typing import Final, TypeVar
 
-from cprl.compat import end_recordings
+from cprl.compat import end_recordings, keep_native
 
 T = TypeVar("T")
 
@@ -65,6 +64,11 @@ class Sender:
         self._thread = Thread(target=self._work, daemon=True, name="cprl viewer")
         self._thread.start()
 
+    @property
+    def waiting(self) -> int:
+        """The number of calls that have not been begun, approximately."""
+        return self._queue.qsize()
+
     def put(self, what: Callable[[], object] | None) -> None:
         """Queues a call; waits at most `STALL_S`.
 
@@ -114,11 +118,6 @@ def abandon(recording: object) -> None:
     _ABANDONED.append(recording)
 
 
-def _keep_native(recording: Any, keep: Callable[..., object] = ctypes.pythonapi.Py_IncRef) -> None:
-    """In place of a recording's end, which waits for a viewer: its native part stays until the end."""
-    keep(ctypes.py_object(recording.inner))
-
-
 @cache
 def exit_in_time() -> None:
     """Gives Rerun's own last flush, when the interpreter exits, a deadline; it has none of itself."""
@@ -130,7 +129,7 @@ def exit_in_time() -> None:
             if not _ABANDONED:
                 return
         # A shutdown that waits holds a lock, for which the end of any other recording would wait.
-        rr.RecordingStream.__del__ = _keep_native  # type: ignore[method-assign]
+        rr.RecordingStream.__del__ = keep_native  # type: ignore[method-assign]
 
     rr.unregister_shutdown()
     atexit.register(shutdown)

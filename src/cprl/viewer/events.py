@@ -1,4 +1,4 @@
-"""Detects events of a training while it runs: new best returns, and new phases of the society."""
+"""Detects new best returns of a training while it runs, and its phases once it has ended."""
 
 from collections.abc import Mapping
 from typing import Any, Final
@@ -9,14 +9,12 @@ from numpy.typing import NDArray
 from cprl.measuring import phases
 from cprl.runs.curves import running_mean
 
-LOOKS_EVERY: Final = 100
-"""Episodes between checks of the phase."""
+FEWEST_FOR_PHASES: Final = 1000
+"""Episodes of a run whose phases are found when it ends."""
 BEST_OVER: Final = 50
 """Episodes of the mean return that is compared with the best."""
 BETTER: Final = 1.05
 """The factor by which a new best must exceed the last reported one."""
-ANOTHER: Final = "another"
-"""The name of a phase that matches no pattern of the study."""
 
 
 class EventDetector:
@@ -25,23 +23,22 @@ class EventDetector:
     def __init__(self) -> None:
         self._means: list[list[float]] = []
         self._best = 0.0
-        self.phase: str | None = None
+
+    @property
+    def returns(self) -> list[float]:
+        """The collective return of each episode so far."""
+        return [own[0] for own in self._means]
 
     def add(self, means: Mapping[str, float]) -> list[str]:
         """Adds the means of an episode; returns new events as text."""
         self._means.append([means[name] for name in phases.METRICS])
-        events, episode = [], len(self._means)
-        if episode % BEST_OVER == 0:
-            reached = float(np.mean([own[0] for own in self._means[-BEST_OVER:]]))
-            if reached > BETTER * self._best:
-                self._best = reached
-                events.append(f"new best: {reached:.1f} apples per episode, mean of the last {BEST_OVER}")
-        if episode % LOOKS_EVERY == 0:
-            found = self.phases()
-            if found and (found[-1].label or ANOTHER) != self.phase:
-                self.phase = found[-1].label or ANOTHER
-                events.append(f"phase: {self.phase}, since about episode {found[-1].first:.0f}")
-        return events
+        if len(self._means) % BEST_OVER:
+            return []
+        reached = float(np.mean(self.returns[-BEST_OVER:]))
+        if not reached > BETTER * self._best:
+            return []
+        self._best = reached
+        return [f"new best: {reached:.1f} apples per episode, mean of the last {BEST_OVER}"]
 
     def phases(self) -> list[phases.Phase]:
         """The phases so far, four at most; empty until there are enough episodes for one."""
@@ -62,10 +59,10 @@ class EventDetector:
         return smoothed
 
     def state_dict(self) -> dict[str, Any]:
-        """The means and events so far."""
-        return {"means": [list(own) for own in self._means], "best": self._best, "phase": self.phase}
+        """The means and the best so far."""
+        return {"means": [list(own) for own in self._means], "best": self._best}
 
     def load_state_dict(self, state: Mapping[str, Any]) -> None:
         """Continues from a state that `state_dict` returned."""
         self._means = [list(own) for own in state["means"]]
-        self._best, self.phase = float(state["best"]), state["phase"]
+        self._best = float(state["best"])

@@ -11,7 +11,7 @@ from cprl.commons.decoding import UNSEEN
 from cprl.commons.world import Bools, Bytes, Ints
 
 WINDOWS_APART_PIXELS: Final = 1
-_WINDOWS_WIDE: Final = 1.7
+WINDOWS_WIDE: Final = 1.7
 """The width of the viewer's area for windows, divided by its height, approximately."""
 
 
@@ -89,25 +89,28 @@ class FrameBuffer:
         return taken
 
 
-def window_corners(agents: int, window: tuple[int, int]) -> list[tuple[int, int]]:
+def window_corners(
+    agents: int, window: tuple[int, int], *, wide: float = WINDOWS_WIDE
+) -> list[tuple[int, int]]:
     """The top-left corner (row, col) of each agent's window in a mosaic with cells as large as possible.
 
     Args:
         agents: the number of agents N.
         window: (X, Y).
+        wide: the width of the viewer's area, divided by its height.
     """
-    high, wide = (length + WINDOWS_APART_PIXELS for length in window)
+    rows, cols = (length + WINDOWS_APART_PIXELS for length in window)
 
     def cell_size(columns: int) -> float:
-        return min(_WINDOWS_WIDE / (columns * wide), 1 / (ceil(agents / columns) * high))
+        return min(wide / (columns * cols), 1 / (ceil(agents / columns) * rows))
 
     columns = max(range(1, agents + 1), key=cell_size)
-    return [(agent // columns * high, agent % columns * wide) for agent in range(agents)]
+    return [(agent // columns * rows, agent % columns * cols) for agent in range(agents)]
 
 
-def mosaic_size(agents: int, window: tuple[int, int]) -> tuple[int, int]:
+def mosaic_size(agents: int, window: tuple[int, int], *, wide: float = WINDOWS_WIDE) -> tuple[int, int]:
     """The rows and columns of the mosaic, in pixels."""
-    corners = window_corners(agents, window)
+    corners = window_corners(agents, window, wide=wide)
     return max(row for row, _ in corners) + window[0], max(col for _, col in corners) + window[1]
 
 

@@ -3,7 +3,7 @@
 import time
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
-from typing import Any, Final, TypeAlias
+from typing import Any, Final
 
 import numpy as np
 import torch
@@ -16,17 +16,15 @@ from cprl.arguments import object_of
 from cprl.arguments import path as path_of
 from cprl.checks import NONE, TEXT, check_nesting, checked, either
 from cprl.output import console as safe_console
+from cprl.viewer.batches import Numbers, log_now, send_waiting, times
 from cprl.viewer.blueprint import layout
 from cprl.viewer.deadline import release
-from cprl.viewer.scenery import Curves, Scene, classes, lines, phase_states
+from cprl.viewer.names import FILE_NAME
+from cprl.viewer.recipe import as_table
+from cprl.viewer.scenery import Curves, Scene, classes, lines, state_colours
+from cprl.viewer.sending import FLUSH_TIMEOUT_S, LiveStream, Stream
 from cprl.viewer.stage import columns, fixed
-from cprl.viewer.streams import FLUSH_TIMEOUT_S, Stream, open_file, open_live
-
-FILE_NAME: Final = "run.rrd"
-TIMELINES: Final = ("step", "episode", "frame")
-"""The timelines of every row: environment steps of the run, episodes, and frames recorded so far."""
-
-Numbers: TypeAlias = "Sequence[int] | NDArray[np.integer[Any]]"
+from cprl.viewer.streams import REPLAY, RUN, Live, open_file, open_live
 
 _LIVE_PERIOD_S: Final = 1.0
 _FILE_PERIOD_S: Final = 60.0
@@ -47,8 +45,8 @@ class RerunLogger(Logger):
         scene: the contents of the board; needed to log frames.
         curves: the numbers that are plotted, if there is no scene, which has them too.
         live: "serve", "spawn" or "connect ADDRESS", see `cprl.viewer.streams.open_live`; None for the file
-            alone. The recording is served on 127.0.0.1 only; the web viewer's empty page, which Rerun serves,
-            listens on all interfaces.
+            alone. The recording and the page of the web viewer are served on 127.0.0.1 only.
+        exhibits: whether viewers are sent an exhibition too, see `cprl.viewer.exhibition`.
         file_name: the name of the recording.
         recording_id: the viewer shows files with the same id as one recording; by default a new id.
         console: the console for the addresses; by default standard output.
@@ -65,6 +63,7 @@ class RerunLogger(Logger):
         scene: Scene | None = None,
         curves: Curves | None = None,
         live: str | None = None,
+        exhibits: bool = False,
         file_name: str = FILE_NAME,
         recording_id: str | None = None,
         console: Console | None = None,
@@ -85,8 +84,10 @@ class RerunLogger(Logger):
             raise FileExistsError(
                 f"{self.path} exists and is not overwritten; use another directory or file_name"
             )
-        self.addresses: dict[str, str] = {}
-        self._live, self._console = live, console or safe_console()
+        self.live = Live()
+        """What viewers are sent; nothing where the recording is written to a file alone."""
+        self._live, self._exhibits, self._console = live, exhibits, console or safe_console()
+        self._application = REPLAY if isinstance(self.curves, Scene) and self.curves.is_replay else RUN
         self._streams: list[Stream] = []
         self.frames = 0
         """Frames recorded so far, including those in earlier files of the recording."""
@@ -95,18 +96,27 @@ class RerunLogger(Logger):
         super().__init__(exp_name, str(log_dir))
 
     def _create_experiment(self) -> list[Any]:
-        recording_id, blueprint = self.recording_id, layout(self.curves)
+        import rerun as rr
+
+        recording_id = self.recording_id
         Path(self.log_dir).mkdir(parents=True, exist_ok=True)
-        file = open_file(recording_id, self.path, blueprint, period_s=_FILE_PERIOD_S)
+        file = open_file(
+            recording_id,
+            self.path,
+            layout(self.curves),
+            period_s=_FILE_PERIOD_S,
+            application=self._application,
+        )
         self._streams += [file] if file else []
         if self._live:
-            self._go_live(recording_id, blueprint)
+            self._go_live(recording_id, layout(self.curves, live=True))
         self._all(lambda recording: recording.send_recording_name(self.exp_name))
         self._static("/", classes(self.curves))
         for entity, style in lines(self.curves).items():
             self._static(entity, style)
-        for entity in ("phase/now", "phase/found") if self.curves.has_phases else ():
-            self._static(entity, phase_states())
+        for entity, colours in state_colours(self.curves).items():
+            self._static(entity, colours)
+        self._static("header", rr.TextDocument.from_fields(media_type=rr.MediaType.MARKDOWN))
         if self.scene is not None:
             for entity, parts in fixed(self.scene).items():
                 self._static(entity, *parts)
@@ -114,10 +124,22 @@ class RerunLogger(Logger):
         return [each.recording for each in self._streams]
 
     def _go_live(self, recording_id: str, blueprint: Any) -> None:
-        live, self.addresses = open_live(self._live or "", recording_id, blueprint, period_s=_LIVE_PERIOD_S)
-        self._streams += [live] if live else []
+        self.live = open_live(
+            self._live or "",
+            recording_id,
+            blueprint,
+            period_s=_LIVE_PERIOD_S,
+            application=self._application,
+            exhibits=self._exhibits,
+        )
+        self._streams += [self.live.stream] if self.live.stream else []
         for where, address in self.addresses.items():
             self._console.print(f"Watch live ({where}): {address}", soft_wrap=True, highlight=False)
+
+    @property
+    def addresses(self) -> dict[str, str]:
+        """How to watch live: "browser" and "native"; empty where it is not served."""
+        return self.live.addresses
 
     def _all(self, what: Callable[[Any], object]) -> None:
         for each in self._streams:
@@ -126,8 +148,30 @@ class RerunLogger(Logger):
     def _static(self, entity: str, *what: Any) -> None:
         self._all(lambda recording: recording.log(entity, *what, static=True))
 
-    def _send(self, entity: str, times: list[Any], columns: Any) -> None:
-        self._all(lambda recording: recording.send_columns(entity, times, columns))
+    def _send(self, entity: str, at: list[Any], what: Any) -> None:
+        self._all(lambda recording: recording.send_columns(entity, at, what))
+
+    @property
+    def is_live(self) -> bool:
+        """Whether there is a stream to viewers."""
+        return any(isinstance(each, LiveStream) for each in self._streams)
+
+    def log_static(self, name: str, *what: Any) -> None:
+        """Logs archetypes that hold at all times."""
+        self._static(name, *what)
+
+    def log_row(self, name: str, what: Any) -> None:
+        """Logs an archetype at the time set by `at`."""
+        now = (*self._now, self.frames)
+        self._all(lambda recording: log_now(recording, name, what, now))
+
+    def log_columns(
+        self, name: str, at: tuple[Numbers, Numbers, Numbers], what: Any, *, live_only: bool = False
+    ) -> None:
+        """Logs rows at steps, episodes and frames of their own; `live_only` for viewers alone."""
+        for each in self._streams:
+            if isinstance(each, LiveStream) or not live_only:
+                each.do(lambda recording: recording.send_columns(name, times(*at), what))
 
     def at(self, *, step: int, episode: int) -> None:
         """Sets the time of subsequent logs that have no step of their own."""
@@ -148,20 +192,34 @@ class RerunLogger(Logger):
         """Logs the numbers of several lines of one plot, equally many each time; NaN leaves a gap."""
         self._wait(name, self._now[0], [float(value) for value in values])
 
-    def _wait(self, name: str, step: int, values: list[float]) -> None:
+    def log_document(self, name: str, text: str) -> None:
+        """Logs a Markdown text that takes the place of the one before, sent with the numbers."""
+        self._wait(name, self._now[0], text)
+
+    def show_live(self, name: str, text: str) -> None:
+        """Shows a Markdown text in the live view at once, and not in the file; from any thread."""
+        import rerun as rr
+
+        at = times([self._now[0]], [self._now[1]], [self.frames])
+        what = rr.TextDocument.columns(text=[text])
+        for each in self._streams:
+            if isinstance(each, LiveStream):
+                each.do(lambda recording: recording.send_columns(name, at, what))
+
+    def _wait(self, name: str, step: int, values: list[float] | str) -> None:
         row = step, self._now[1], self.frames, values
         for each in self._streams:
             each.waiting.setdefault(name, []).append(row)
             if each.is_due:
-                _send_waiting(each)
+                send_waiting(each)
 
     def log_states(self, name: str, states: Mapping[int, str]) -> None:
         """Logs states by the episode from which they hold; their step is the one set by `at`."""
         import rerun as rr
 
         episodes = list(states)
-        times = _times([self._now[0]] * len(episodes), episodes, [self.frames] * len(episodes))
-        self._send(name, times, rr.StateChange.columns(state=list(states.values())))
+        at = times([self._now[0]] * len(episodes), episodes, [self.frames] * len(episodes))
+        self._send(name, at, rr.StateChange.columns(state=list(states.values())))
 
     def log_matrix(self, name: str, matrix: NDArray[Any], dims: Sequence[str]) -> None:
         """Logs a matrix of numbers, float32 [rows, columns], with the names of its two axes."""
@@ -169,14 +227,7 @@ class RerunLogger(Logger):
 
         values = np.array(matrix, np.float32)  # a copy, because a viewer gets it later
         now = (*self._now, self.frames)
-
-        def log(recording: Any) -> None:
-            for timeline, number in zip(TIMELINES, now, strict=True):
-                recording.set_time(timeline, sequence=number)
-            recording.log(name, rr.Tensor(values, dim_names=list(dims)))
-            recording.reset_time()
-
-        self._all(log)
+        self._all(lambda recording: log_now(recording, name, rr.Tensor(values, dim_names=list(dims)), now))
 
     def log_frames(self, frames: Mapping[str, NDArray[Any]]) -> None:
         """Logs frames of `FrameBuffer.take`, with windows of `classes_seen`; see `stage.columns`."""
@@ -188,27 +239,23 @@ class RerunLogger(Logger):
         numbers = np.arange(self.frames, self.frames + count)
         self.frames += count
         for entity, (rows, what) in columns(self.scene, frames).items():
-            times = _times(frames["step"][rows], frames["episode"][rows], numbers[rows])
-            self._send(entity, times, what)
+            at = times(frames["step"][rows], frames["episode"][rows], numbers[rows])
+            self._send(entity, at, what)
 
     def log_text(self, text: str, level: str = "INFO") -> None:
         """Logs an event at the time set by `at`."""
         import rerun as rr
 
-        times = _times([self._now[0]], [self._now[1]], [self.frames])
+        at = times([self._now[0]], [self._now[1]], [self.frames])
         what = rr.TextLog.columns(text=[text], level=[level])
-        self._send("log", times, what)
+        self._send("log", at, what)
 
     def log_hparams(self, cfg: Any) -> None:
-        """Logs a mapping, or a Markdown text, as the recipe of the run."""
+        """Logs a mapping, as a table, or a Markdown text, as the recipe of the run."""
         import rerun as rr
 
         check_nesting(cfg, "cfg")
-        text = (
-            cfg
-            if isinstance(cfg, str)
-            else "\n".join(f"- **{key}**: {value}" for key, value in dict(cfg).items())
-        )
+        text = cfg if isinstance(cfg, str) else as_table(dict(cfg))
         self._static("recipe", rr.TextDocument(text, media_type=rr.MediaType.MARKDOWN))
 
     def log_video(self, name: str, video: Tensor, step: int | None = None, **kwargs: Any) -> None:
@@ -234,9 +281,9 @@ class RerunLogger(Logger):
         )
         self._static(name, rr.Image.from_fields(format=form))
         count = len(images)
-        times = _times(range(first, first + count), [self._now[1]] * count, [self.frames] * count)
+        at = times(range(first, first + count), [self._now[1]] * count, [self.frames] * count)
         what = rr.Image.columns(buffer=images.reshape(count, -1).copy())
-        self._send(name, times, what)
+        self._send(name, at, what)
 
     def log_histogram(
         self, name: str, data: Any, *, bins: int = 30, step: int | None = None, **kwargs: Any
@@ -247,25 +294,42 @@ class RerunLogger(Logger):
         values = np.asarray(data.detach().cpu() if isinstance(data, Tensor) else data).reshape(-1)
         counts, edges = np.histogram(values, bins=bins)
         now = self._now[0] if step is None else int(step), self._now[1], self.frames
-
-        def log(recording: Any) -> None:
-            for timeline, number in zip(TIMELINES, now, strict=True):
-                recording.set_time(timeline, sequence=number)
-            recording.log(name, rr.BarChart(counts, abscissa=(edges[:-1] + edges[1:]) / 2))
-            recording.reset_time()
-
-        self._all(log)
+        bars = rr.BarChart(counts, abscissa=(edges[:-1] + edges[1:]) / 2)
+        self._all(lambda recording: log_now(recording, name, bars, now))
 
     def flush(self) -> None:
         """Sends all buffered numbers to the file and to the viewer."""
         for each in self._streams:
-            _send_waiting(each)
+            send_waiting(each)
+
+    def show_end(self) -> None:
+        """Gives the live view the layout of a run that has ended, with its phases."""
+        if self.curves.has_phases:
+            ended = layout(self.curves, live=True, ended=True)
+            for each in self._streams:
+                if isinstance(each, LiveStream):
+                    each.do(lambda recording: recording.send_blueprint(ended))
+
+    @property
+    def is_served(self) -> bool:
+        """Whether viewers can still connect: the live stream is open and served."""
+        return bool(self.addresses) and any(
+            isinstance(each, LiveStream) and each.recording is not None for each in self._streams
+        )
+
+    def close_file(self) -> None:
+        """Flushes and closes the file, which gets its footer; the live stream goes on."""
+        self.flush()
+        for each in self._streams:
+            if not isinstance(each, LiveStream):
+                each.close()
 
     def shutdown(self) -> None:
         """Flushes and closes the recording; the file gets its footer. A second call does nothing."""
         self.flush()
         for each in self._streams:
             each.close()
+        self.live.close()
         self.experiment.clear()
         release()
 
@@ -279,29 +343,3 @@ class RerunLogger(Logger):
 
     def __repr__(self) -> str:
         return f"RerunLogger(exp_name={self.exp_name!r}, path={str(self.path)!r}, addresses={self.addresses})"
-
-
-def _times(steps: Numbers, episodes: Numbers, frames: Numbers) -> list[Any]:
-    """The timelines of each row."""
-    import rerun as rr
-
-    return [
-        rr.TimeColumn(name, sequence=np.asarray(numbers, np.int64))
-        for name, numbers in zip(TIMELINES, (steps, episodes, frames), strict=True)
-    ]
-
-
-def _send_waiting(stream: Stream) -> None:
-    """Sends the buffered numbers of one stream, one chunk per entity."""
-    import rerun as rr
-
-    waiting = stream.take()
-
-    def send(recording: Any) -> None:
-        for name, rows in waiting.items():
-            steps, episodes, frames, values = zip(*rows, strict=True)
-            columns = rr.Scalars.columns(scalars=np.concatenate(values)).partition([len(v) for v in values])
-            recording.send_columns(name, _times(steps, episodes, frames), columns)
-        recording.flush(timeout_sec=FLUSH_TIMEOUT_S)
-
-    stream.do(send)

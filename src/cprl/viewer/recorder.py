@@ -34,16 +34,17 @@ class FrameRecorder:
         env: the environment without its transforms.
         episodes: the number of episodes of the run; determines how often frames are recorded.
         scene: the contents of the board.
+        capacity: the largest number of frames to keep; by default an episode, at most 5,000.
     """
 
-    def __init__(self, env: CommonsEnv, *, episodes: int, scene: Scene) -> None:
+    def __init__(self, env: CommonsEnv, *, episodes: int, scene: Scene, capacity: int | None = None) -> None:
         game = env.game
         steps = game.rules.episode_steps
         self.env = env
         self.every = max(1, ceil(episodes * steps * frame_bytes(scene) / FRAMES_BYTES))
         """Episodes from one with frames to the next."""
         self._buffer = FrameBuffer(
-            min(steps + 1, 5000),
+            capacity or min(steps + 1, 5000),
             board=(game.map.height, game.map.width),
             sites=len(game.map.sites),
             windows=(game.agents, *game.observation_shape),
@@ -58,10 +59,19 @@ class FrameRecorder:
         waited = time.perf_counter() - self._sent
         return self._buffer.is_full or (waited > _PERIOD_S and self._buffer.size >= _FEWEST_FRAMES)
 
+    @property
+    def pending(self) -> int:
+        """Frames that wait to be sent."""
+        return self._buffer.size
+
     def add(self, batch: TensorDictBase, *, step: int, episode: int) -> None:
         """Copies a frame; `batch` is the latest step."""
         if self._has_tags:
             self._remember_tags(batch)
+        self._buffer.add(step, episode, self._frame())
+
+    def add_board(self, *, step: int = 0, episode: int = 0) -> None:
+        """Copies a frame of the board as it is, e.g. when an episode begins."""
         self._buffer.add(step, episode, self._frame())
 
     def take(self) -> Mapping[str, NDArray[Any]] | None:

@@ -17,6 +17,7 @@ from cprl.commons.colours import (
     picture_colour,
 )
 from cprl.commons.decoding import UNSEEN
+from cprl.measuring import now
 
 SOCIAL: Final = {
     "social/collective_return": ("collective return", (230, 160, 0)),
@@ -34,18 +35,33 @@ OTHERS: Final = {
     "evaluation/greedy_return": ("greedy, evaluated", (230, 160, 0)),
     "turn/stock": ("apples", PALETTE[APPLE]),
 }
-TOO_EARLY: Final = "too early to tell"
 OF_AGENTS: Final = ("return", "loss", "epsilon", "q", "harvested")
-PHASE_COLOURS: Final = {
+RANDOM_PLAY: Final = "random_play"
+"""The folder of the lines of random play; each has the name of its metric."""
+ANOTHER: Final = "another"
+"""The name of a phase that matches no pattern of the study."""
+BACKGROUND: Final = (24, 26, 32)
+"""The background of boards and windows, which sets their dark cells apart from the viewer's own colour."""
+STATES: Final = {
     "exploration": (86, 180, 233),
     "tragedy": (213, 94, 0),
     "combat": (204, 121, 167),
     "cultivation": (0, 158, 115),
-    "another": (120, 120, 120),
-    TOO_EARLY: (60, 60, 60),
+    ANOTHER: (120, 120, 120),
+    now.BEGINS: (80, 80, 80),
+    now.EXPLORING: (86, 180, 233),
+    now.HARVESTING: (150, 150, 150),
+    now.DECLINE: (213, 94, 0),
+    now.RECOVERY: (0, 158, 115),
 }
+"""The colours of phases and live labels, which share one where they mean the same."""
+STRIPS: Final = ("now", "phase/found", "phase/as_published")
+"""The entities of states: the live label, and the phases that are logged when a long run ends."""
 
-_MEAN_WIDTH, _AGENT_WIDTH, _SINGLE_WIDTH, _SINGLE_SHARE = 2.5, 1.5, 0.7, 0.45
+_RUNNING_WIDTH, _RAW_WIDTH, _SINGLE_WIDTH, _THIN_WIDTH = 2.5, 1.0, 0.7, 1.0
+_RAW_SHARE, _SINGLE_SHARE = 0.6, 0.35
+"""Of a line's colour, in that of its raw values, and of single replicas."""
+_GREY: Final = (150, 150, 150)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -59,7 +75,7 @@ class Curves:
     metrics: tuple[str, ...] = tuple(name.removeprefix("social/") for name in SOCIAL)
     """The metrics that the game reports, without the prefix `social/`."""
     has_phases: bool = True
-    """Whether phases can be detected from these metrics."""
+    """Whether phases are found when the run ends: it is long enough, and these metrics tell."""
     has_tags: bool = True
     """Whether the game reports who tagged whom."""
 
@@ -79,6 +95,16 @@ class Scene(Curves):
     is_replay: bool = False
     """Whether it is one episode of a stored policy; then harvest and stock are plotted turn by turn, and
     there are no curves over episodes."""
+
+
+def has_lorenz(curves: Curves) -> bool:
+    """Whether there is a harvest, and somebody to share it with."""
+    return "equality" in curves.metrics and len(curves.agents) > 1
+
+
+def has_wall(curves: Curves) -> bool:
+    """Whether there are boards, and more than the one that is shown anyway."""
+    return isinstance(curves, Scene) and curves.replicas > 1
 
 
 def classes(curves: Curves) -> Any:
@@ -106,39 +132,49 @@ def lines(curves: Curves) -> dict[str, Any]:
     import rerun as rr
 
     styles = {
-        entity: _mean_and_singles(name, colour, curves.replicas)
+        entity: _running(name, colour, curves.replicas)
         for entity, (name, colour) in SOCIAL.items()
         if entity.removeprefix("social/") in curves.metrics
     }
+    for metric in curves.metrics:
+        styles[f"{RANDOM_PLAY}/{metric}"] = rr.SeriesLines(
+            names=["random play"], colors=[_GREY], widths=[_THIN_WIDTH]
+        )
     for entity, (name, colour) in OTHERS.items():
         styles[entity] = rr.SeriesLines(names=[name], colors=[colour])
     for agent, name in enumerate(curves.agents):
         for entity in OF_AGENTS:
             styles[f"{name}/{entity}"] = rr.SeriesLines(
-                names=[name], colors=[agent_colour(agent)], widths=[_AGENT_WIDTH]
+                names=[name], colors=[agent_colour(agent)], widths=[_RAW_WIDTH]
             )
+        styles[f"{name}/return"] = _running(name, agent_colour(agent), replicas=1)
     return styles
 
 
-def _mean_and_singles(name: str, colour: tuple[int, int, int], replicas: int) -> Any:
-    """A thin, dark line for each of several replicas, and a thick one on top for their mean."""
+def _running(name: str, colour: tuple[int, int, int], replicas: int) -> Any:
+    """Thin, dark lines for each of several replicas, a faint one for their mean, and on top a bold one for
+    its running mean."""
     import rerun as rr
 
-    if replicas == 1:
-        return rr.SeriesLines(names=[name], colors=[colour])
-    dark = tuple(round(_SINGLE_SHARE * part) for part in colour)
+    singles = replicas if replicas > 1 else 0
+    raw = name if replicas == 1 else f"{name}, mean"
     return rr.SeriesLines(
-        names=[*(f"replica {replica}" for replica in range(replicas)), f"{name}, mean"],
-        colors=[*[dark] * replicas, colour],
-        widths=[*[_SINGLE_WIDTH] * replicas, _MEAN_WIDTH],
+        names=[*(f"replica {replica}" for replica in range(singles)), raw, f"{name}, running mean"],
+        colors=[*[_darker(colour, _SINGLE_SHARE)] * singles, _darker(colour, _RAW_SHARE), colour],
+        widths=[*[_SINGLE_WIDTH] * singles, _RAW_WIDTH, _RUNNING_WIDTH],
     )
 
 
-def phase_states() -> Any:
-    """The colours of phases."""
+def _darker(colour: tuple[int, int, int], share: float) -> tuple[int, ...]:
+    return tuple(round(share * part) for part in colour)
+
+
+def state_colours(curves: Curves) -> dict[str, Any]:
+    """The colours of live labels and phases, by entity."""
     import rerun as rr
 
-    packed = [red << 24 | green << 16 | blue << 8 | 255 for red, green, blue in PHASE_COLOURS.values()]
-    return rr.StateConfiguration(
-        values=list(PHASE_COLOURS), labels=list(PHASE_COLOURS), colors=np.array(packed, np.uint32)
-    )
+    packed = [red << 24 | green << 16 | blue << 8 | 255 for red, green, blue in STATES.values()]
+    names = list(STATES)
+    configuration = rr.StateConfiguration(values=names, labels=names, colors=np.array(packed, np.uint32))
+    strips = STRIPS if curves.has_phases else STRIPS[:1]
+    return dict.fromkeys(strips, configuration)

@@ -31,16 +31,18 @@ def frame_bytes(scene: Scene) -> float:
     return 80 + 45 * len(scene.agents) + 0.35 * (rows * columns + scene.height * scene.width)
 
 
+def image_form(size: tuple[int, int]) -> Any:
+    """The format of an image of classes with so many rows and columns."""
+    import rerun as rr
+
+    return rr.components.ImageFormat(width=size[1], height=size[0], channel_datatype=rr.ChannelDatatype.U8)
+
+
 def fixed(scene: Scene) -> dict[str, list[Any]]:
     """The static parts of a recording, by entity: sizes of images, agents' names, colours and frames."""
     import rerun as rr
 
-    def form(size: tuple[int, int]) -> Any:
-        return rr.components.ImageFormat(
-            width=size[1], height=size[0], channel_datatype=rr.ChannelDatatype.U8
-        )
-
-    image = rr.SegmentationImage.from_fields
+    form, image = image_form, rr.SegmentationImage.from_fields
     board = form((scene.height + 2 * RIM_CELLS, scene.width + 2 * RIM_CELLS))
     agents, (rows, columns) = len(scene.agents), scene.window
     colours = [agent_colour(agent) for agent in range(agents)]
@@ -76,23 +78,11 @@ def columns(scene: Scene, frames: Frames) -> dict[str, tuple[NDArray[np.intp], A
     """
     import rerun as rr
 
-    count, agents = frames["in_play"].shape
-    everywhere = np.arange(count)
-
-    def pictures(images: Bytes) -> Any:
-        return rr.SegmentationImage.columns(buffer=images.reshape(len(images), -1))
-
-    beams = beam_pictures(frames["beams"])
-    changed = _changes(beams)
+    everywhere = np.arange(len(frames["step"]))
     shown = {
-        "world/board": (everywhere, pictures(boards(scene, frames))),
-        "world/beams": (changed, pictures(beams[changed])),
-        "world/agents": (everywhere, _lines(numbers_and_headings(agents), frames)),
-        **_out(frames),
-        "windows": (everywhere, pictures(mosaic(frames["windows"]))),
+        **board_columns(scene, frames),
+        "windows": (everywhere, _pictures(mosaic(frames["windows"]))),
     }
-    if len(marks(agents).owner):
-        shown["world/marks"] = everywhere, _lines(marks(agents), frames)
     if scene.is_replay:
         stock = frames["stock"].sum(1, dtype=np.float64)
         shown["turn/stock"] = everywhere, rr.Scalars.columns(scalars=stock)
@@ -100,6 +90,32 @@ def columns(scene: Scene, frames: Frames) -> dict[str, tuple[NDArray[np.intp], A
             harvested = frames["harvested"][:, agent].astype(np.float64)
             shown[f"{name}/harvested"] = everywhere, rr.Scalars.columns(scalars=harvested)
     return shown
+
+
+def board_columns(
+    scene: Scene, frames: Frames, *, beams: bool = True, out: bool = True
+) -> dict[str, tuple[NDArray[np.intp], Any]]:
+    """`columns` of the board alone, on request without beams or agents out of play."""
+    count, agents = frames["in_play"].shape
+    everywhere = np.arange(count)
+    shown = {
+        "world/board": (everywhere, _pictures(boards(scene, frames))),
+        "world/agents": (everywhere, _lines(numbers_and_headings(agents), frames)),
+    }
+    if len(marks(agents).owner):
+        shown["world/marks"] = everywhere, _lines(marks(agents), frames)
+    if beams:
+        covered = beam_pictures(frames["beams"])
+        changed = _changes(covered)
+        shown["world/beams"] = changed, _pictures(covered[changed])
+    return shown | _out(frames) if out else shown
+
+
+def _pictures(images: Bytes) -> Any:
+    """Images of classes, uint8 [T, rows, columns], as columns."""
+    import rerun as rr
+
+    return rr.SegmentationImage.columns(buffer=images.reshape(len(images), -1))
 
 
 def boards(scene: Scene, frames: Frames) -> Bytes:

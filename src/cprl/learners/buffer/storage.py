@@ -98,7 +98,11 @@ class LaneStorage(Storage):
         self.shape_of_observation = tuple(observation_shape)
 
         def allocate(*shape: int, kind: torch.dtype) -> Tensor:
-            return torch.zeros(shape, dtype=kind, device=self.device)
+            if self.device.type != "cpu":
+                return torch.zeros(shape, dtype=kind, device=self.device)
+            # numpy leaves it to the system to clear pages when they are first written; torch writes them all
+            # at once, for a gigabyte in a second or more.
+            return torch.from_numpy(np.zeros(shape, array_of(torch.empty(0, dtype=kind)).dtype))
 
         self.fields: Fields = {
             "observation": allocate(lanes * self.rows, *observation_shape, kind=dtype),

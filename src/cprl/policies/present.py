@@ -1,0 +1,95 @@
+"""PresentPolicy: the agents of a training's first replica as they are now, in one world beside it."""
+
+from collections.abc import Mapping
+from typing import Any
+
+import torch
+from tensordict import TensorDictBase
+from tensordict.nn import TensorDictModuleBase
+from torch import nn
+from torchrl.envs.utils import ExplorationType, set_exploration_type
+
+from cprl.compat import unchecked_tensordict
+from cprl.policies.assignment import AgentIndices, AgentPolicies
+
+
+class FirstReplica(TensorDictModuleBase):
+    """What an actor of R replicas chooses in the first of them.
+
+    Args:
+        actor: chooses for S agents of every replica, one world each; has `in_keys`.
+        replicas: the number of replicas R.
+
+    Reads entries [1, S, ...], writes "action", int64 [1, S].
+    """
+
+    out_keys = ("action",)
+
+    def __init__(self, actor: nn.Module, replicas: int) -> None:
+        super().__init__()
+        self.actor, self.replicas = actor, replicas
+        self.in_keys = tuple(getattr(actor, "in_keys", ("observation",)))
+
+    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
+        """Writes the actions; the other replicas see the same, and what they choose is not used."""
+        seen = {}
+        for name in self.in_keys:
+            value = tensordict.get(name)
+            seen[name] = value.expand(self.replicas, *value.shape[1:]).contiguous()
+        chosen = self.actor(unchecked_tensordict(seen, torch.Size([self.replicas])))
+        return tensordict.set("action", chosen.get("action")[:1])
+
+
+class PresentPolicy:
+    """All agents of the first replica as they are now, exploring as they do now.
+
+    It has random numbers of its own, and leaves torch's generator as it was.
+
+    Args:
+        learned: for agents that learn two actors: one with the current weights and random numbers of its own,
+            for one world of each replica, with the exploration of evaluation at first; and that of the
+            training, whose exploration it takes over.
+        others: the actors of the other agents, for one world of the first replica.
+        replicas: the number of replicas R.
+        device: the device whose generator is left as it was, besides the CPU.
+    """
+
+    def __init__(
+        self,
+        learned: Mapping[AgentIndices, tuple[Any, Any]],
+        others: Mapping[AgentIndices, nn.Module],
+        *,
+        replicas: int,
+        device: torch.device | None = None,
+    ) -> None:
+        first = {agents: FirstReplica(own, replicas) for agents, (own, _) in learned.items()}
+        self._policy = AgentPolicies({**first, **others})
+        self._pairs = [pair for pair in learned.values() if _has_epsilon(pair[0])]
+        self._evaluation = [own.epsilon for own, _ in self._pairs]
+        self._devices = [device] if device is not None and device.type == "cuda" else []
+        self.is_trained = False
+        """Whether the training is over; agents then explore as in evaluation."""
+
+    @property
+    def epsilons(self) -> list[float]:
+        """The probabilities with which agents now act at random, ascending; empty for agents without any."""
+        return sorted({float(own.epsilon) for own, _ in self._pairs})
+
+    def explore_as_now(self) -> None:
+        """Sets each agent's exploration to what it is now."""
+        for (own, training), evaluation in zip(self._pairs, self._evaluation, strict=True):
+            own.epsilon = evaluation if self.is_trained else training.epsilon
+
+    def __call__(self, carried: TensorDictBase) -> TensorDictBase:
+        """Writes ("agents", "action"), int64 [1, N], for one world, batch size [1]."""
+        self.explore_as_now()
+        with torch.no_grad(), set_exploration_type(ExplorationType.RANDOM):
+            return self._policy(carried)
+
+    def apart(self) -> Any:
+        """A context in which nothing changes torch's generators for the rest of the process."""
+        return torch.random.fork_rng(devices=self._devices)
+
+
+def _has_epsilon(actor: Any) -> bool:
+    return hasattr(actor, "epsilon") and not getattr(actor, "stochastic", False)

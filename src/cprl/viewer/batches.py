@@ -1,0 +1,54 @@
+"""Rows as columns: numbers and texts that wait for their batch, and the timelines of each row."""
+
+from collections.abc import Sequence
+from typing import Any, Final, TypeAlias
+
+import numpy as np
+from numpy.typing import NDArray
+
+from cprl.viewer.sending import FLUSH_TIMEOUT_S, Stream
+
+TIMELINES: Final = ("step", "episode", "frame")
+"""The timelines of every row: environment steps of the run, episodes, and frames recorded so far."""
+
+Numbers: TypeAlias = "Sequence[int] | NDArray[np.integer[Any]]"
+
+
+def times(steps: Numbers, episodes: Numbers, frames: Numbers) -> list[Any]:
+    """The timelines of each row."""
+    import rerun as rr
+
+    return [
+        rr.TimeColumn(name, sequence=np.asarray(numbers, np.int64))
+        for name, numbers in zip(TIMELINES, (steps, episodes, frames), strict=True)
+    ]
+
+
+def log_now(recording: Any, name: str, what: Any, now: tuple[int, int, int]) -> None:
+    """Logs one row that has no columns, such as a tensor, at a (step, episode, frame)."""
+    for timeline, number in zip(TIMELINES, now, strict=True):
+        recording.set_time(timeline, sequence=number)
+    recording.log(name, what)
+    recording.reset_time()
+
+
+def send_waiting(stream: Stream) -> None:
+    """Sends the buffered numbers and texts of one stream, one chunk per entity."""
+    waiting = stream.take()
+
+    def send(recording: Any) -> None:
+        for name, rows in waiting.items():
+            steps, episodes, frames, values = zip(*rows, strict=True)
+            recording.send_columns(name, times(steps, episodes, frames), _columns(values))
+        recording.flush(timeout_sec=FLUSH_TIMEOUT_S)
+
+    stream.do(send)
+
+
+def _columns(values: Sequence[Any]) -> Any:
+    """Markdown texts, or equally many numbers in each row."""
+    import rerun as rr
+
+    if isinstance(values[0], str):
+        return rr.TextDocument.columns(text=list(values))
+    return rr.Scalars.columns(scalars=np.concatenate(values)).partition([len(own) for own in values])

@@ -1,0 +1,42 @@
+"""The contents of a recording: what is plotted of a game, and what its recording lacks."""
+
+from collections.abc import Mapping, Sequence
+from typing import Final
+
+from torchrl.envs import EnvBase
+
+from cprl.measuring import phases
+from cprl.measuring.reported import FIELDS, METRICS, available, left_out
+from cprl.viewer.events import FEWEST_FOR_PHASES
+from cprl.viewer.scenery import Curves
+
+_SHOWN: Final[Mapping[str, tuple[str, ...]]] = {
+    "phases and new bests": tuple(dict.fromkeys(entry for name in phases.METRICS for entry in METRICS[name])),
+    "who tagged whom": ("tagged_by",),
+    "the board and what agents see": ("board",),
+}
+"""The views of a recording besides metrics, and the entries that each needs."""
+
+
+def curves_of(env: EnvBase, agents: tuple[str, ...], reported: Sequence[str], *, episodes: int) -> Curves:
+    """The numbers of an environment that are plotted.
+
+    Args:
+        env: a world for each replica.
+        agents: their names.
+        reported: the optional entries that the game reports.
+        episodes: of the run.
+    """
+    metrics = available({**METRICS, "stock_left": FIELDS["stock_left"]}, reported)
+    return Curves(
+        agents=agents,
+        replicas=env.batch_size.numel(),
+        metrics=metrics,
+        has_phases=episodes >= FEWEST_FOR_PHASES and set(phases.METRICS) <= set(metrics),
+        has_tags="tagged_by" in reported,
+    )
+
+
+def missing_in(reported: Sequence[str], *, has_board: bool) -> str:
+    """One line that names what the recording lacks, and why; "" if it lacks nothing."""
+    return left_out([*reported, *(["board"] if has_board else [])], more=_SHOWN)

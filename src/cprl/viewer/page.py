@@ -1,0 +1,196 @@
+"""The page of Rerun's web viewer, and recordings for it to load, served on 127.0.0.1 alone."""
+
+import mmap
+import os
+import shutil
+import socket
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Mapping, Sequence
+from functools import cache
+from http.client import HTTPException
+from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
+from pathlib import Path
+from threading import Lock, Thread
+from typing import Any, Final
+from urllib.parse import quote, unquote, urlsplit
+from urllib.request import ProxyHandler, build_opener
+
+LOCALHOST: Final = "127.0.0.1"
+
+_FILES: Final[Mapping[str, str]] = {
+    "index.html": "text/html",
+    "re_viewer.js": "text/javascript",
+    "re_viewer_bg.wasm": "application/wasm",
+    "sw.js": "text/javascript",
+    "favicon.ico": "image/x-icon",
+}
+"""The files of the web viewer, and their types."""
+
+_START_S: Final = 30.0
+_POLL_S: Final = 0.1
+_QUERY: Final = "renderer=webgl&persist=0&hide_welcome_screen=1&theme=dark"
+
+
+class Page:
+    """Serves the web viewer of the installed Rerun, in threads that end with the process.
+
+    `rerun.serve_web_viewer` listens on all interfaces; this listens on 127.0.0.1, and answers only requests
+    that name it or localhost as their host. The viewer's files, 43 MB, are read when a browser first asks.
+
+    Args:
+        recordings: files that viewers may load; none where they connect to a served recording.
+    """
+
+    def __init__(self, recordings: Sequence[Path] = ()) -> None:
+        self._recordings = [Path(own) for own in recordings]
+        handler = type("Handler", (_Handler,), {"recordings": self._recordings})
+        self._server = _Server((LOCALHOST, 0), handler)
+        self.port = int(self._server.server_address[1])
+        """The port of 127.0.0.1."""
+        Thread(target=self._server.serve_forever, args=(_POLL_S,), daemon=True, name="cprl page").start()
+
+    @property
+    def recordings(self) -> list[str]:
+        """The addresses of the recordings."""
+        here = f"http://{LOCALHOST}:{self.port}/recordings"
+        return [f"{here}/{number}/{quote(own.name)}" for number, own in enumerate(self._recordings)]
+
+    def address(self, *sources: str) -> str:
+        """The address of the page that shows these sources in one viewer, by default the recordings."""
+        urls = [f"url={quote(source, safe='')}" for source in sources or self.recordings]
+        return f"http://{LOCALHOST}:{self.port}/?{'&'.join([*urls, _QUERY])}"
+
+    def close(self) -> None:
+        """Stops serving. A second call does nothing."""
+        self._server.shutdown()
+        self._server.server_close()
+
+
+class _Server(ThreadingHTTPServer):
+    daemon_threads = True
+
+    def handle_error(self, request: Any, client_address: Any) -> None:
+        """A browser that goes away is no error."""
+
+
+class _Handler(BaseHTTPRequestHandler):
+    recordings: Sequence[Path] = ()
+
+    def do_GET(self) -> None:
+        """Answers with a file of the web viewer, or a recording."""
+        host = urlsplit(f"//{self.headers.get('Host', '')}").hostname
+        if host not in (LOCALHOST, "localhost"):  # a page elsewhere whose name was made to lead here
+            self.send_error(403, f"allowed hosts: {LOCALHOST}, localhost")
+            return
+        path = urlsplit(self.path).path.lstrip("/") or "index.html"
+        recording = self._recording(path)
+        if recording is not None:
+            with recording.open("rb") as file:
+                self._begin("application/octet-stream", os.fstat(file.fileno()).st_size)
+                shutil.copyfileobj(file, self.wfile)
+        elif path in _FILES:
+            self._send_viewer(path)
+        else:
+            self.send_error(404)
+
+    def _recording(self, path: str) -> Path | None:
+        for number, own in enumerate(self.recordings):
+            if unquote(path) == f"recordings/{number}/{own.name}":
+                return own
+        return None
+
+    def _send_viewer(self, name: str) -> None:
+        try:
+            with _ONE_AT_A_TIME:
+                content = web_viewer()[name]
+        except (OSError, HTTPException, TimeoutError) as error:
+            self.send_error(503, "Rerun's web viewer cannot be read", str(error))
+            return
+        self._begin(_FILES[name], len(content))
+        self.wfile.write(content)
+
+    def _begin(self, kind: str, size: int) -> None:
+        self.send_response(200)
+        self.send_header("Content-Type", kind)
+        self.send_header("Content-Length", str(size))
+        self.send_header("rerun-final-length", str(size))  # of which the page shows how much it has loaded
+        self.end_headers()
+
+    def log_message(self, format: str, *args: Any) -> None:
+        """Nothing: the terminal is the training's."""
+
+
+_ONE_AT_A_TIME: Final = Lock()
+
+
+@cache
+def web_viewer() -> Mapping[str, mmap.mmap]:
+    """The files of the web viewer of the installed Rerun, by name, in a temporary file without a name.
+
+    Rerun's command has them built in, and only hands them out as a server, which is started for a second.
+
+    Raises:
+        OSError: if it cannot be started, or the disk is full.
+        TimeoutError: if it does not answer in time.
+    """
+    port = free_port()
+    command = [str(_binary()), "--serve-web", "--bind", LOCALHOST, "--port", str(free_port())]
+    process = subprocess.Popen(
+        [*command, "--web-viewer-port", str(port)],
+        stdin=subprocess.DEVNULL,
+        stdout=subprocess.DEVNULL,
+        stderr=subprocess.DEVNULL,
+        env={**os.environ, "CI": "1"},  # without usage data
+    )
+    try:
+        _wait_for(port, process)
+        return {name: _fetched(f"http://{LOCALHOST}:{port}/{name}") for name in _FILES}
+    finally:
+        process.kill()
+        process.wait()
+
+
+def _fetched(address: str) -> mmap.mmap:
+    opener = build_opener(ProxyHandler({}))
+    with tempfile.TemporaryFile() as file, opener.open(address, timeout=_START_S) as answer:
+        shutil.copyfileobj(answer, file, 2**20)
+        file.flush()
+        return mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ)
+
+
+def _wait_for(port: int, process: "subprocess.Popen[bytes]") -> None:
+    """Returns when the process listens at the port."""
+    ends = time.monotonic() + _START_S
+    while time.monotonic() < ends:
+        if process.poll() is not None:
+            raise OSError(f"{_binary()} ended with code {process.returncode}")
+        with socket.socket() as probe:
+            if probe.connect_ex((LOCALHOST, port)) == 0:
+                return
+        time.sleep(0.05)
+    raise TimeoutError(f"{_binary()} did not answer within {_START_S:g} s")
+
+
+def _binary() -> Path:
+    """Rerun's command itself; the script `rerun` beside Python leaves it running when it is ended."""
+    import rerun_cli
+
+    name = "rerun.exe" if sys.platform == "win32" else "rerun"
+    return Path(next(iter(rerun_cli.__path__))) / name
+
+
+def free_port() -> int:
+    """A free port of 127.0.0.1."""
+    with socket.socket() as probe:
+        probe.bind((LOCALHOST, 0))
+        return int(probe.getsockname()[1])
+
+
+def has_display() -> bool:
+    """Whether a window can open here."""
+    if not sys.platform.startswith("linux"):
+        return True
+    return bool(os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY"))

@@ -1,0 +1,310 @@
+"""The present policy plays a world of its own for viewers; the training and its file do not notice."""
+
+import threading
+import warnings
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import rerun as rr
+import torch
+from matrix_game import MatrixGame
+from rerun.chunk import RrdReader
+from torchrl.envs import Transform
+
+from cprl import Custom, Experiment, Game, Rules, maps
+from cprl.agents import Population
+from cprl.algorithms import DQN, MAPPO, PPO, DQNSettings, RolloutSettings
+from cprl.envs.make_env import make_env
+from cprl.outcome import exhibited, fresh_env
+from cprl.population import Learning, Scripted, Team
+from cprl.training import train
+from cprl.viewer import exhibition
+from cprl.viewer.callback import ViewerCallback
+from cprl.viewer.contents import curves_of
+from cprl.viewer.exhibition import STEPS_PER_S, Exhibition, caption_of
+from cprl.viewer.recorder import scene_of
+from cprl.viewer.sending import Stream
+from cprl.viewer.streams import Live
+
+REPLAY = DQNSettings(buffer_size=300, batch_size=4, hidden_cells=(8,), epsilon_hold_steps=10)
+ROLLOUT = RolloutSettings(rollout_steps=20, minibatch_size=10, hidden_cells=(8,))
+DQN_AGENT = Learning(DQN(settings=REPLAY))
+
+
+class Haze(Transform):
+    """Draws from torch's generator at every step, as a user's own code may."""
+
+    def _step(self, tensordict, next_tensordict):
+        torch.rand(3)
+        return next_tensordict
+
+
+ALONE = Experiment(
+    name="alone",
+    game=Game(
+        map=maps.parse(".A>.A.A\nA.A...A\n..<.A.A\n.>..A.<"),
+        rules=Rules(regrow_prob=(0.0, 0.2), window_rows=3, window_columns=5, episode_steps=20),
+    ),
+    agents=[DQN_AGENT, Learning(PPO(settings=ROLLOUT)), Scripted("greedy"), DQN_AGENT],
+    replicas=2,
+    episodes=3,
+    transforms=[Custom("test_exhibition:Haze")],
+    engine="eager",
+)
+EXPERIMENTS = {
+    "mixed, with a transform": ALONE,
+    "a team": replace(
+        ALONE,
+        agents=[Team(MAPPO(settings=ROLLOUT), agents=(0, 1, 2)), Scripted("random")],
+        transforms=[],
+    ),
+    "TorchRL's own engine": replace(ALONE, transforms=[], engine="torchrl"),
+}
+
+
+def population_of(experiment):
+    torch.manual_seed(experiment.seed)
+    env = make_env(experiment.game, worlds=experiment.replicas, seed=0, transforms=experiment.transforms)
+    return env, Population(env, experiment.agents, engine=experiment.engine)
+
+
+class Kept:
+    """An exhibition whose viewers are files, on a clock that the test moves."""
+
+    def __init__(self, folder, experiment=ALONE):
+        self.now, self.paths = 0.0, (folder / "live.rrd", folder / "exhibition.rrd")
+        self.streams = []
+        for path in self.paths:
+            recording = rr.RecordingStream("cprl", recording_id="one")
+            recording.save(path)
+            self.streams.append(Stream("live view", recording, period_s=1))
+        self.env, self.population = population_of(experiment)
+        self.policy, self.world = exhibited(experiment, self.env, self.population)
+        commons = self.env if not experiment.transforms else self.env.base_env
+        scene = scene_of(
+            commons, curves_of(commons, experiment.game.agent_names, [], episodes=3), is_replay=False
+        )
+        self.exhibition = Exhibition(
+            self.policy,
+            self.world,
+            trained=self.env,
+            scene=scene,
+            live=Live(*self.streams),
+            clock=lambda: self.now,
+        )
+
+    def rows(self, component, entity="board"):
+        """The values that viewers were sent, and whether any had a time."""
+        for stream in self.streams:
+            stream.close()
+        values, timelines = [], set()
+        for chunk in RrdReader(self.paths[1]).stream().filter(content=f"/exhibition/{entity}"):
+            batch = chunk.to_record_batch()
+            timelines |= set(batch.schema.names) & {"step", "episode", "frame", "log_time"}
+            if component in batch.schema.names:
+                values += batch.column(component).to_pylist()
+        return values, timelines
+
+
+def steps(kept, count):
+    """So many steps of the training, one a second."""
+    for _ in range(count):
+        kept.now += 1
+        kept.exhibition.on_step(episode=0)
+
+
+FIRST, *OTHERS = EXPERIMENTS
+
+
+@pytest.mark.parametrize("name", [FIRST, *(pytest.param(name, marks=pytest.mark.slow) for name in OTHERS)])
+def test_an_exhibition_changes_nothing_that_is_learned(name, tmp_path, monkeypatch):
+    monkeypatch.setattr(exhibition, "STEPS_PER_S", 1e9)
+    monkeypatch.setattr(exhibition, "MOST_SHARE", 1e9)
+    experiment, played = EXPERIMENTS[name], []
+
+    def course(watched):
+        env, population = population_of(experiment)
+        returns = []
+
+        class Keeping:
+            def on_episode(self, episode, learning):
+                returns.append((episode.world, episode.return_.tolist(), repr(learning)))
+
+        def training(*callbacks):
+            train(
+                env,
+                population.learners,
+                others=population.others,
+                episodes=experiment.episodes,
+                callbacks=[Keeping(), *callbacks],
+            )
+
+        if watched:
+            shown = exhibited(experiment, env, population)
+            how = {"title": "run", "episodes": experiment.episodes, "live": "serve", "exhibited": shown}
+            with ViewerCallback(tmp_path, env, **how) as viewer:
+                training(viewer)
+                played.append(viewer.exhibition._steps)
+        else:
+            training()
+        weights = [net.state_dict() for net in population.networks().values()]
+        return repr((weights, torch.get_rng_state().tolist(), returns))
+
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        assert course(True) == course(False)
+    assert played[0] > 20, "the exhibition was played"
+    entities = {chunk.entity_path for chunk in RrdReader(tmp_path / "run.rrd").stream()}
+    assert not [entity for entity in entities if "exhibition" in entity], "nothing of it is in the file"
+
+
+def test_it_plays_eleven_steps_a_second_however_often_the_training_asks(tmp_path):
+    kept = Kept(tmp_path)
+    for thousandth in range(3000):
+        kept.now = thousandth / 1000
+        kept.exhibition.on_step(episode=7)
+    boards, timelines = kept.rows("SegmentationImage:buffer")
+    assert abs(len(boards) - 3 * STEPS_PER_S) <= 2
+    assert timelines == set(), "rows without a time: viewers keep the newest alone, on every timeline"
+    assert len({repr(board) for board in boards}) > len(boards) / 2, "the board moves"
+    captions, _ = kept.rows("Points2D:labels", "caption")
+    assert captions[-1] == ["present policy, episode 7, epsilon 1.00"]
+
+
+def test_a_slow_exhibition_takes_little_of_the_time(tmp_path, monkeypatch):
+    kept = Kept(tmp_path)
+
+    def slowly(episode):
+        kept.now += 0.05
+        played.append(kept.now)
+
+    played = []
+    monkeypatch.setattr(kept.exhibition, "_play", slowly)
+    while kept.now < 100:
+        kept.now += 0.01
+        kept.exhibition.on_step(episode=0)
+    assert len(played) * 0.05 <= 1.3
+
+
+def test_it_plays_the_weights_and_the_exploration_of_the_moment(tmp_path):
+    experiment = replace(ALONE, agents=[DQN_AGENT] * 4, transforms=[])
+    env, population = population_of(experiment)
+    policy, world = exhibited(experiment, env, population)
+    (learner,) = population.learners.values()
+    learner.actor.epsilon = 0.0
+    seen = world.reset()
+    last = [own for own in learner.engine.own.values() if own.shape[0] == 8 and own.shape[-1] == 8][-1]
+    for best in (2, 5):
+        with torch.no_grad():
+            last.zero_()
+            last[:4, ..., best] = 1e6  # of the first replica; those of the second choose action 0
+        assert policy(seen)["agents", "action"].tolist() == [[best] * 4]
+    learner.actor.epsilon = 1.0
+    chosen = {action for _ in range(40) for action in policy(seen)["agents", "action"][0].tolist()}
+    assert len(chosen) == 8
+    assert policy.epsilons == [1.0]
+    policy.is_trained = True
+    policy.explore_as_now()
+    assert policy.epsilons == [REPLAY.epsilon_evaluation]
+
+
+def test_its_world_is_played_by_no_training_and_no_evaluation():
+    env, population = population_of(replace(ALONE, transforms=[]))
+    _, world = exhibited(replace(ALONE, transforms=[]), env, population)
+    courses = []
+    for each in (env, fresh_env(replace(ALONE, transforms=[])), world):
+        moment, stocks = each.reset(), []
+        for step in range(15):
+            moment["agents", "action"] = torch.full((*each.batch_size, 4), step % 4)
+            moment = each.step_and_maybe_reset(moment)[1]
+            stocks.append(each.worlds.state()["stock"])
+        courses += [repr(own.tolist()) for own in np.stack(stocks, 1)]
+    assert len(set(courses)) == len(courses)
+
+
+class Some:
+    """A policy, as far as the caption goes."""
+
+    is_trained = False
+
+    def __init__(self, *epsilons):
+        self.epsilons = epsilons
+
+    def explore_as_now(self):
+        pass
+
+
+def test_the_caption_names_the_episode_and_the_exploration():
+    assert caption_of(Some(0.314), 1234) == "present policy, episode 1,234, epsilon 0.31"
+    assert caption_of(Some(), 0) == "present policy, episode 0"
+    assert caption_of(Some(0.1, 0.5, 1.0), 3) == "present policy, episode 3, epsilon 0.10 to 1.00"
+    trained = Some(0.05)
+    trained.is_trained = True
+    assert caption_of(trained, 4800) == "trained policy, episode 4,800, epsilon 0.05"
+
+
+def test_an_exhibition_that_fails_warns_once_and_ends(tmp_path, monkeypatch):
+    kept = Kept(tmp_path)
+    kept.exhibition.on_step(episode=0)
+    monkeypatch.setattr(kept.world, "step_and_maybe_reset", lambda moment: 1 / 0)
+    with pytest.warns(RuntimeWarning, match="the exhibition failed, the run continues.*division") as caught:
+        steps(kept, 8)
+    assert len(caught) == 1
+
+
+def test_viewers_that_do_not_keep_up_miss_frames_and_nothing_waits(tmp_path, monkeypatch):
+    kept = Kept(tmp_path)
+    monkeypatch.setattr(Stream, "is_behind", True)
+    steps(kept, 5)
+    assert len(kept.rows("SegmentationImage:buffer")[0]) == 1, "the first, which the constructor sent"
+
+
+def test_after_the_training_the_trained_policy_plays_on_until_it_is_stopped(tmp_path, monkeypatch):
+    monkeypatch.setattr(exhibition, "STEPS_PER_S", 1000)
+    kept, stop = Kept(tmp_path), threading.Event()
+    thread = threading.Thread(target=kept.exhibition.play_on, args=(stop,), kwargs={"episode": 4})
+    thread.start()
+    while kept.exhibition._steps < 25:
+        assert thread.is_alive()
+    stop.set()
+    thread.join(10)
+    assert not thread.is_alive()
+    assert len(kept.rows("SegmentationImage:buffer")[0]) >= 24
+    captions, _ = kept.rows("Points2D:labels", "caption")
+    assert captions[-1] == ["trained policy, episode 4, epsilon 0.05"]
+
+
+def test_a_game_without_a_board_has_no_exhibition_and_one_event_says_so(tmp_path):
+    env = MatrixGame(1)
+    assert exhibited(ALONE, env, None) is None
+    with ViewerCallback(tmp_path, env, title="run", episodes=1, live="serve") as viewer:
+        assert viewer.exhibition is None
+        viewer.play_on(threading.Event())
+    texts = []
+    for chunk in RrdReader(tmp_path / "run.rrd").stream().filter(content="/log"):
+        batch = chunk.to_record_batch()
+        texts += batch.column("TextLog:text").to_pylist()
+    assert ["no exhibition: the game has no board"] in texts
+    with pytest.raises(ValueError, match=r"a MatrixGame of batch size \[1\]; allowed: one world of a C"):
+        Exhibition(Some(), env, trained=env, scene=None, live=Live())
+
+
+def test_parts_that_never_change_are_sent_once_to_the_server_that_keeps_them(tmp_path):
+    kept = Kept(tmp_path)
+    kept.exhibition.on_step(episode=0)
+    for stream in kept.streams:
+        stream.close()
+    sent = {}
+    for path in kept.paths:
+        chunks = RrdReader(path).stream()
+        sent[path.stem] = {
+            name
+            for chunk in chunks
+            if chunk.entity_path.startswith("/exhibition")
+            for name in chunk.to_record_batch().schema.names
+        }
+    assert "SegmentationImage:format" in sent["live"]
+    assert "SegmentationImage:format" not in sent["exhibition"]
+    assert "SegmentationImage:buffer" in sent["exhibition"]
+    assert np.all([not name.startswith("windows") for name in sent["exhibition"]])

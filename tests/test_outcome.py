@@ -1,0 +1,100 @@
+"""Random play before a training: what it is compared with while it runs, and what does not change by it."""
+
+import random
+from dataclasses import replace
+
+import numpy as np
+import torch
+from rerun.chunk import RrdReader
+from test_rerun_logger import column
+
+import cprl
+from cprl import Game, Rules, maps
+from cprl.algorithms import DQN
+from cprl.custom import Custom
+from cprl.learners.settings import DQNSettings
+from cprl.outcome import evaluate_population, fresh_env, is_same_later, random_play
+from cprl.parts import make_parts
+from cprl.population import Learning, Scripted
+from cprl.runs.episodes import read_table
+
+GAME = Game(
+    map=maps.parse(".A>.A\n.A.A.\n..<.A"),
+    rules=Rules(regrow_prob=(0.0, 0.1), window_rows=3, window_columns=5, episode_steps=20),
+)
+SETTINGS = DQNSettings(buffer_size=200, learning_rate=1e-3, hidden_cells=(8,))
+EXPERIMENT = cprl.Experiment(
+    name="small",
+    game=GAME,
+    agents=(Learning(DQN(settings=SETTINGS)), Scripted("random")),
+    episodes=3,
+    replicas=2,
+    evaluation_episodes=4,
+    engine="eager",
+)
+
+
+def numbers(episodes):
+    return [
+        (own.world, own.steps, own.return_.tolist(), own.harvest.tolist(), own.stock_left) for own in episodes
+    ]
+
+
+def test_random_play_before_is_the_one_after_and_the_trained_agents_meet_the_same_worlds():
+    made = make_parts(EXPERIMENT, ())
+    before = random_play(EXPERIMENT, made.population)
+    as_ever = evaluate_population(EXPERIMENT, made.env, make_parts(EXPERIMENT, ()).population)
+    reused = evaluate_population(EXPERIMENT, made.env, made.population, random=before)
+    assert len(before) == 8
+    assert reused["random"] is before
+    assert numbers(before) == numbers(as_ever["random"])
+    assert numbers(reused["trained"]) == numbers(as_ever["trained"])
+
+
+def test_random_play_moves_no_generator_even_of_a_game_that_draws_from_global_ones(monkeypatch):
+    made = make_parts(EXPERIMENT, ())
+
+    def states():
+        of_numpy = np.random.get_state()  # noqa: NPY002  (the global generator is the point)
+        return repr((torch.get_rng_state().tolist(), random.getstate(), of_numpy))
+
+    def drawing(experiment):
+        env = fresh_env(experiment)
+        torch.rand(1), random.random(), np.random.rand()  # noqa: NPY002
+        return env
+
+    monkeypatch.setattr("cprl.outcome.fresh_env", drawing)
+    before = states()
+    random_play(EXPERIMENT, made.population)
+    assert states() == before
+
+
+def test_random_play_of_a_game_with_transforms_or_of_somebody_elses_is_played_again():
+    assert is_same_later(EXPERIMENT)
+    counter = Custom("torchrl.envs:StepCounter", {})
+    assert not is_same_later(replace(EXPERIMENT, transforms=(counter,)))
+    somebodys = replace(EXPERIMENT, game=Custom("matrix_game:MatrixGame"), agents=(Scripted("random"),) * 2)
+    assert not is_same_later(somebodys)
+
+
+def test_a_run_has_the_same_outcome_watched_or_not_and_its_recording_shows_the_end(tmp_path):
+    off, watched = (cprl.run(EXPERIMENT, tmp_path / watch, watch=watch) for watch in ("off", "file"))
+    for policy in ("random", "trained"):
+        own, others = (read_table(run / "evaluation" / f"{policy}.parquet") for run in (off, watched))
+        assert own.equals(others)
+    headers = [text[0] for text in column(watched / "run.rrd", "header", "TextDocument:text")[1]]
+    random, trained = (
+        np.mean(np.array(read_table(watched / "evaluation" / f"{policy}.parquet")["collective_return"]))
+        for policy in ("random", "trained")
+    )
+    assert headers[0].startswith("# Episode 1 of 3 · begins")
+    assert headers[-2].startswith("# Episode 3 of 3 · exploring · ")
+    assert f"(random play {random:.3g})" in headers[-2]
+    assert f"# Finished, 3 episodes · trained {trained:.3g} apples, random play {random:.3g}" in headers[-1]
+    events = [text[0] for text in column(watched / "run.rrd", "log", "TextLog:text")[1]]
+    assert any(event.startswith(f"random play {random:.1f} ± ") for event in events)
+    assert any(event.startswith(f"finished: trained {trained:.1f}") for event in events)
+    assert not any("checkpoint" in event for event in events)
+    lines = column(watched / "run.rrd", "random_play/survival_steps", "Scalars:scalars", "episode")
+    assert lines[0] == [0, 1, 2]
+    RrdReader(watched / "run.rrd").store()  # which a file without its footer refuses
