@@ -114,7 +114,7 @@ def test_lines_of_keys_play_an_episode_to_its_end(run, capsys):
     ]
     assert told[6:8] == ["keys> ww", "turn 2: you harvest an apple"], "what is typed through a pipe is shown"
     assert "The end: time is over." in told
-    assert told[-8] == "collective_return         1  apples of all agents"
+    assert told[-8] == "collective_return         1  collective return, apples"
     assert len([line for line in told if line.startswith("turn")]) == 4 + 1
 
 
