@@ -16,6 +16,7 @@ from torchrl.envs import PettingZooWrapper
 from torchrl.envs.utils import check_env_specs
 
 from cprl import CommonsEnv, Game, Observation, Rules, keys, maps, presets
+from cprl.commons.colours import BEAM, PALETTE
 from cprl.envs import CommonsGymnasiumEnv, env, parallel_env
 from cprl.envs.window import Window
 
@@ -227,7 +228,7 @@ def test_the_image_shows_each_agent_in_play_in_its_own_colour():
     assert own[0].tolist() != own[1].tolist()
     assert after[3, 3].tolist() == own[0].tolist()
     assert after[3, 75].tolist() != own[1].tolist(), "agent 1 is out of play"
-    assert (after == (255, 204, 51)).all(-1).any(), "the beam is drawn"
+    assert (after == PALETTE[BEAM]).all(-1).any(), "the beam is drawn"
 
 
 @pytest.mark.parametrize(

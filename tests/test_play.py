@@ -114,7 +114,7 @@ def test_lines_of_keys_play_an_episode_to_its_end(run, capsys):
     ]
     assert told[6:8] == ["keys> ww", "turn 2: you harvest an apple"], "what is typed through a pipe is shown"
     assert "The end: time is over." in told
-    assert told[-8] == "collective_return         1  apples of all agents"
+    assert told[-8] == "collective_return         1  collective return, apples"
     assert len([line for line in told if line.startswith("turn")]) == 4 + 1
 
 
@@ -140,6 +140,16 @@ def test_the_session_in_the_docs_is_what_is_printed(tmp_path, monkeypatch, capsy
     monkeypatch.setattr("sys.argv", ["cprl", *line.split()])
     cli.main()
     assert capsys.readouterr().out == printed
+
+
+def test_ctrl_c_ends_an_episode_like_quit(run, capsys):
+    def interrupted():
+        raise KeyboardInterrupt
+
+    session = open_session(str(run), seed=1)
+    session.act("stay")
+    play_in_terminal(session, interrupted)
+    assert "The end: stopped after turn 1." in capsys.readouterr().out
 
 
 def test_a_game_without_a_beam_has_no_key_for_it():

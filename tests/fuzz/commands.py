@@ -1,6 +1,8 @@
-"""Command lines, called in this process: what they start stops after two steps and opens no viewer."""
+"""Command lines, called in this process: what they start stops after two steps and opens no viewer; whoever
+plays types a few keys in the terminal."""
 
 import contextlib
+import io
 import sys
 from collections.abc import Callable, Iterator
 from typing import Any, Final
@@ -8,7 +10,7 @@ from unittest import mock
 
 from hypothesis import strategies as st
 
-from cprl import cli
+from cprl import cli, presets
 
 from . import cases, hostile, public, runs
 from .cases import Case, Target
@@ -39,6 +41,14 @@ def _run(*names: str) -> st.SearchStrategy[list[str]]:
     return st.one_of(*[known] * 9, _WORDS.map(lambda word: [word]))
 
 
+def _alone(word: str) -> list[str]:
+    return [word]
+
+
+def _others(run: list[str]) -> list[str]:
+    return ["--others", *run]
+
+
 _COMMON: Final = (_flag("--allow", *runs.ALLOW, "os:getcwd"),)
 _ALLOWED: Final = st.just(["--allow", runs.ALLOW[0]])
 _PLAYED: Final = (
@@ -65,7 +75,21 @@ _SUBCOMMANDS: Final[dict[str, tuple[list[st.SearchStrategy[list[str]]], tuple[An
     "watch": ([_run(*runs.NAMES)], (_flag("--help"),)),
     "film": (
         [_run("plain", "finished", "results")],
-        (_flag("--replica", "0", "1"), _flag("--episode", "0", "3"), _flag("--out", "film.rrd"), *_COMMON),
+        (
+            *(_flag("--replica", "0", "1"), _flag("--episode", "0", "3")),
+            _flag("--out", "film.rrd", "film.gif", "a/film.gif", "film.avi"),
+            *(_flag("--every", "1", "5"), _flag("--fps", "5", "0.5"), _flag("--width", "240", "300")),
+            *_COMMON,
+        ),
+    ),
+    "play": (
+        [st.one_of(_run("plain", "finished", "results"), st.sampled_from(presets.BOARDS).map(_alone))],
+        (
+            *(_flag("--agent", "0", "1"), _flag("--replica", "0", "1"), _flag("--steps", "1", "3")),
+            *(_flag("--others", "greedy", "random"), _run("plain", "finished").map(_others)),
+            *(_flag("--variant", "published", "as_run"), _flag("--seed", "1", "0")),
+            *_COMMON,
+        ),
     ),
     "report": ([_run("plain")] * 2, (_flag("--out", "report", "a/b"),)),
     "export": ([_run("plain", "finished", "stopped"), st.just(["folder"])], (_flag("--watch", "off"),)),
@@ -149,12 +173,9 @@ def _lines(draw: Any, first: list[st.SearchStrategy[list[str]]], flags: Any, mor
 
 def targets() -> list[Target]:
     """A target for each subcommand, for `cprl` alone, and for each recipe."""
+    more = {"watch": [], "report": [], "export": [], "play": ["--allow", "--terminal"]}
     found = [
-        _target(
-            f"cprl {name}",
-            _subcommand(name),
-            _lines(first, flags, ["--allow"] if name not in ("watch", "report", "export") else []),
-        )
+        _target(f"cprl {name}", _subcommand(name), _lines(first, flags, more.get(name, ["--allow"])))
         for name, (first, flags) in _SUBCOMMANDS.items()
     ]
     alone = _lines([], [_flag(name) for name in ("--version", "--help", "run", "-h", "--", "evaluate")], [])
@@ -217,6 +238,7 @@ def _harmless() -> Iterator[None]:
         mock.patch("cprl.viewer.logger.open_live", return_value=(None, {})),
         mock.patch.object(subprocess, "run", _git_alone),
         mock.patch.object(sys, "path", list(sys.path)),
+        mock.patch.object(sys, "stdin", io.StringIO("w.\nf\nz\n\nquit\n")),
     ):
         yield
 

@@ -19,7 +19,7 @@ _PROMPT: Final = "keys> "
 
 
 def play_in_terminal(session: Session, read_line: Callable[[], str] | None = None) -> None:
-    """Plays the episode: each line of keys is played key by key; `quit` or the end of the input ends it.
+    """Plays the episode: a line of keys is played key by key; `quit`, Ctrl-C or the end of input ends it.
 
     Args:
         session: the episode.
@@ -49,10 +49,13 @@ def _ask_and_play(session: Session, read_line: Callable[[], str]) -> bool:
 
 
 def _ask(read_line: Callable[[], str]) -> str | None:
-    """The next line of the input, which is shown where no terminal does; None at its end."""
+    """The next line of the input, which is shown where no terminal does; None at its end and for Ctrl-C."""
     OUT.write(_PROMPT)
     OUT.flush()
-    line = read_line()
+    try:
+        line = read_line()
+    except KeyboardInterrupt:
+        line = ""
     if not sys.stdin.isatty() or not line:
         say(line.rstrip("\n"))
     return line or None

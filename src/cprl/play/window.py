@@ -36,7 +36,7 @@ class NoWindowError(Exception):
 
 
 def play_in_window(session: Session, title: str) -> None:
-    """Plays the episode in a window, a turn for each key; Escape or closing the window ends it.
+    """Plays the episode in a window, a turn for each key; Escape, Ctrl-C or closing the window ends it.
 
     Args:
         session: the episode.
@@ -52,6 +52,8 @@ def play_in_window(session: Session, title: str) -> None:
         pygame.display.set_caption(title)
         pygame.key.set_repeat(*_REPEAT_MS)
         _play(pygame, screen, session, picture)
+    except KeyboardInterrupt:  # in the terminal that the window was opened from
+        return
     finally:
         pygame.display.quit()
 

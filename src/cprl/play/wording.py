@@ -2,21 +2,9 @@
 
 from collections.abc import Iterator
 from math import isnan
-from typing import Final
 
+from cprl.measuring.names import title
 from cprl.play.session import Session, TurnPlayed
-
-METRICS: Final = {
-    "collective_return": "apples of all agents",
-    "efficiency": "apples per turn",
-    "equality": "1 - Gini: 1 where all have the same",
-    "sustainability": "the mean turn of a harvest",
-    "survival_steps": "turns",
-    "peace": "agents in play per turn",
-    "peacefulness": "turns in play per agent",
-    "stock_left": "apples on the board",
-}
-"""What each social metric counts; docs/metrics.md defines them."""
 
 
 def state(session: Session) -> str:
@@ -53,13 +41,13 @@ def ending(session: Session) -> str:
 
 
 def results(session: Session) -> list[tuple[str, str, str]]:
-    """Each social metric of the turns played: its name, value and what it counts; none before the first."""
-    return [(name, _number(value), METRICS.get(name, "")) for name, value in session.metrics().items()]
+    """Each social metric of the turns played: its name, value, words and unit; none before the first."""
+    return [(name, _number(value), title(name)) for name, value in session.metrics().items()]
 
 
 def results_text(session: Session) -> str:
     """The same as lines of text."""
-    lines = [f"{name:17s} {value:>9s}  {counts}" for name, value, counts in results(session)]
+    lines = [f"{name:17s} {value:>9s}  {words}" for name, value, words in results(session)]
     return "\n".join(lines) or "No turn was played, so there is nothing to measure."
 
 
