@@ -3,21 +3,17 @@
 python docs/replay_page.py
 """
 
-import subprocess
 import sys
-from collections.abc import Mapping
-from functools import cache
 from html import escape
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
 from threading import Lock
 from typing import Any, Final
-from urllib.error import URLError
 from urllib.parse import parse_qs, quote, urlsplit
-from urllib.request import ProxyHandler, build_opener
 
 import tyro
-from viewers import START_S, VIEWER, free_port, wait_until
+
+from cprl.viewer.page import web_viewer
 
 RESULTS: Final = Path(__file__).parent / "results"
 LOCALHOST: Final = "127.0.0.1"
@@ -71,37 +67,6 @@ def replays() -> dict[str, Path]:
     }
 
 
-@cache
-def viewer_files() -> Mapping[str, bytes]:
-    """The files of the web viewer, by name.
-
-    Rerun's command has them built in and hands them out as a server, which runs for a second on 127.0.0.1.
-    """
-    port = free_port()
-    words = ["--serve-web", "--bind", LOCALHOST, "--port", str(free_port()), "--web-viewer-port", str(port)]
-    server = subprocess.Popen([VIEWER, *words], stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
-    opener = build_opener(ProxyHandler({}))
-
-    def fetched(name: str) -> bytes:
-        with opener.open(f"http://{LOCALHOST}:{port}/{name}", timeout=START_S) as answer:
-            return bytes(answer.read())
-
-    def answers() -> bool:
-        if server.poll() is not None:
-            raise RuntimeError(f"{VIEWER} ended at once, code {server.returncode}")
-        try:
-            return bool(fetched("favicon.ico"))
-        except URLError:
-            return False
-
-    try:
-        wait_until(answers, START_S, "Rerun's web viewer did not answer")
-        return {name: fetched(name) for name in VIEWER_FILES}
-    finally:
-        server.kill()
-        server.wait()
-
-
 _ONE_AT_A_TIME: Final = Lock()
 
 
@@ -124,7 +89,7 @@ class Handler(BaseHTTPRequestHandler):
         elif folder == "viewer" and (name or "index.html") in VIEWER_FILES:
             name = name or "index.html"
             with _ONE_AT_A_TIME:
-                content = viewer_files()[name]
+                content = web_viewer()[name]
             self._send(VIEWER_FILES[name], content, VIEWER_MAY)
         elif folder == "replays" and name.removesuffix(".rrd") in known:
             self._send("application/octet-stream", known[name.removesuffix(".rrd")].read_bytes(), PAGE_MAY)

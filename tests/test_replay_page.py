@@ -28,7 +28,7 @@ ASSETS = {name: name.encode() for name in replay_page.VIEWER_FILES}
 @pytest.fixture
 def address(monkeypatch):
     """Where the page is served, with a viewer of a few bytes."""
-    monkeypatch.setattr(replay_page, "viewer_files", lambda: ASSETS)
+    monkeypatch.setattr(replay_page, "web_viewer", lambda: ASSETS)
     with replay_page.Server((replay_page.LOCALHOST, 0), replay_page.Handler) as server:
         thread = Thread(target=server.serve_forever, args=(0.01,))
         thread.start()
