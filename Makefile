@@ -7,10 +7,14 @@ INSTALLED := .venv/.installed
 
 VIEWER_PACKAGES := mesa-vulkan-drivers libvulkan1 chromium chromium-driver
 
-.PHONY: run lint test fuzz test-slow test-gpu test-viewer viewer-packages check bench bench-gpu clean
+.PHONY: run docs-live lint test fuzz test-slow test-gpu test-viewer viewer-packages check bench bench-gpu clean
 
 run: $(INSTALLED)
-	$(BIN)/python recipes/first_run.py --watch serve
+	$(BIN)/python recipes/tragedy.py --watch serve
+
+# Replays of the results in docs/results, in a browser; PORT takes another port than 8765.
+docs-live: $(INSTALLED)
+	@$(BIN)/python docs/replay_page.py $(if $(PORT),--port $(PORT))
 
 test: $(INSTALLED)
 	$(BIN)/python -m pytest -n auto --dist worksteal

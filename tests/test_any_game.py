@@ -342,8 +342,8 @@ def test_the_terminal_shows_it_too(tmp_path, monkeypatch):
     summarise(tmp_path, title="matrix", played={"random": episodes, "trained": episodes}, console=console)
     text = output.getvalue()
     assert text.count("left out: collective_return") == 1
-    assert re.search(r"survival_steps\s*│\s*5\.\d+ │", text)
-    assert not re.search(r"│ (equality|apples left|sustainability)", text)
+    assert re.search(r"survival, steps\s*│\s*5\.\d+ │", text)
+    assert not re.search(r"│ (equality|stock left|sustainability|collective)", text)
 
 
 def test_the_table_of_an_evaluation_says_what_is_left_out():
@@ -358,7 +358,7 @@ def test_the_table_of_an_evaluation_says_what_is_left_out():
 
     table = run_table(Evaluation())
     assert table.caption.startswith("left out: collective_return")
-    assert list(table.columns[0].cells) == ["survival_steps"]
+    assert list(table.columns[0].cells) == ["survival_steps (steps)"]
 
 
 def test_bars_know_the_clock_of_a_game_or_of_its_environment():

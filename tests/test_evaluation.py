@@ -20,6 +20,7 @@ from cprl.evaluation.lanes import Source, policies_of
 from cprl.evaluation.same_game import differences
 from cprl.learners.lanes import EVALUATION, lane_seeds
 from cprl.measuring.evaluate import evaluate
+from cprl.measuring.names import with_unit
 from cprl.measuring.replicas import agents_without_harvest, over_replicas, social_measures
 from cprl.population import Frozen, Learning, Scripted
 from cprl.runs.checkpoints import Checkpointer
@@ -391,7 +392,7 @@ def test_the_command_evaluate_tells_every_metric_and_writes_the_episodes(
     text = command(monkeypatch, capsys, "evaluate", learned["alike"], "--episodes", 2, "--out", out)
     found = cprl.evaluate_run(learned["alike"], episodes=2)
     for name, random in found.measures("random").items():
-        line = f"│ {name} "
+        line = f"│ {with_unit(name, rewards='apples')} "
         (row,) = [row for row in text.splitlines() if row.startswith(line)]
         cells = [cell.strip() for cell in row.split("│")[2:4]]
         assert cells == [str(found.measures()[name]), str(random)]
@@ -415,7 +416,7 @@ def test_the_command_crossplay_tells_a_matrix_for_each_number_and_writes_the_epi
     greedy, sustainable = scripted.values()
     text = command(monkeypatch, capsys, "crossplay", greedy, sustainable, "--episodes", 1, "--out", out)
     assert "2 replicas, 1 episodes each with focal agent at each index, seed 30011, diagonal: self" in text
-    for name in ("focal/return", "background/return", "group/return", "sustainability", "peacefulness"):
+    for name in ("focal/return (apples)", "group/return (apples)", "sustainability (steps)"):
         assert name in (line.strip() for line in text.splitlines())
     rows = [[cell.strip() for cell in line.split("│")[1:-1]] for line in text.splitlines() if "│" in line]
     assert ["greedy", "2.5 [2.5, 2.5]", "2.5 [2.5, 2.5]"] in rows

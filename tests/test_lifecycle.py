@@ -235,9 +235,11 @@ def test_a_lock_of_another_host_is_refused_unless_it_is_taken_over(whole, tmp_pa
 
 
 def test_a_lock_file_that_says_nothing_is_taken(tmp_path):
-    (tmp_path / "run.lock").write_text("[" * 4000)
+    lock = tmp_path / "run.lock"
+    lock.write_text("[" * 4000)
     with RunLock(tmp_path):
-        pass
+        assert json.loads(lock.read_text())["pid"] == os.getpid(), "and says whose it is now"
+    assert not lock.exists()
 
 
 def test_a_second_writer_is_refused_and_changes_nothing(whole, tmp_path):

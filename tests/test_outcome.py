@@ -14,8 +14,8 @@ from cprl.algorithms import DQN
 from cprl.custom import Custom
 from cprl.learners.settings import DQNSettings
 from cprl.outcome import evaluate_population, fresh_env, is_same_later, random_play
+from cprl.parts import make_parts
 from cprl.population import Learning, Scripted
-from cprl.running import _make
 from cprl.runs.episodes import read_table
 
 GAME = Game(
@@ -41,9 +41,9 @@ def numbers(episodes):
 
 
 def test_random_play_before_is_the_one_after_and_the_trained_agents_meet_the_same_worlds():
-    made = _make(EXPERIMENT, ())
+    made = make_parts(EXPERIMENT, ())
     before = random_play(EXPERIMENT, made.population)
-    as_ever = evaluate_population(EXPERIMENT, made.env, _make(EXPERIMENT, ()).population)
+    as_ever = evaluate_population(EXPERIMENT, made.env, make_parts(EXPERIMENT, ()).population)
     reused = evaluate_population(EXPERIMENT, made.env, made.population, random=before)
     assert len(before) == 8
     assert reused["random"] is before
@@ -52,7 +52,7 @@ def test_random_play_before_is_the_one_after_and_the_trained_agents_meet_the_sam
 
 
 def test_random_play_moves_no_generator_even_of_a_game_that_draws_from_global_ones(monkeypatch):
-    made = _make(EXPERIMENT, ())
+    made = make_parts(EXPERIMENT, ())
 
     def states():
         of_numpy = np.random.get_state()  # noqa: NPY002  (the global generator is the point)

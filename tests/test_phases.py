@@ -28,7 +28,7 @@ def society(replicas, noise, seed=0):
 
 @pytest.mark.parametrize("noise", [0.02, 0.3])
 def test_known_change_points_are_found_within_their_intervals(noise):
-    found = change_points(EPISODES, society(8, noise), number=3, resamples=40)
+    found = change_points(EPISODES, society(8, noise), number=3, resamples=12)
     for change, corner in zip(found, CORNERS[1:-1], strict=True):
         assert abs(change.episode - corner) <= 100
         assert change.low - 50 <= corner <= change.high + 50

@@ -1,6 +1,8 @@
 """A person plays among others: the session, the terminal, the window."""
 
 import io
+import re
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -44,14 +46,14 @@ def text_of(session):
 
 def test_the_person_decides_for_one_agent_and_the_others_for_themselves(run):
     session = open_session(str(run), agent=0, seed=1)
-    assert text_of(session) == [". A 0>. A . ", "##. . . . . ", ". . A A 1<. "]
+    assert text_of(session) == [". A 0>. A .", "##. . . . .", ". . A A 1<."]
     session.act("forward")
     turned = session.act("forward")
     assert turned.harvest.tolist() == [1, 0]
     assert (session.harvested, session.stock, session.turn) == ([1, 0], 3, 2)
-    assert text_of(session)[0] == ". A . . 0>. "
+    assert text_of(session)[0] == ". A . . 0>."
     session.act("turn_left")
-    assert text_of(session)[0] == ". A . . 0^. "
+    assert text_of(session)[0] == ". A . . 0^."
 
 
 def test_the_same_seed_and_keys_play_the_same_again(run):
@@ -92,7 +94,7 @@ def test_a_tagged_person_waits(tmp_path, capsys):
     play_in_terminal(session, iter([".\n", ".\n", ""]).__next__)
     told = capsys.readouterr().out
     assert "turn 1: agent 1 tags you out" in told
-    assert "you: 0 (out of play)" in told
+    assert "0 by you (out of play)" in told
     assert not session.is_in_play
 
 
@@ -105,10 +107,10 @@ def test_lines_of_keys_play_an_episode_to_its_end(run, capsys):
     told = in_terminal(open_session(str(run), seed=1), "ww\n\nq..\n", capsys)
     assert told[0].startswith("You are agent 0. Keys: w step forward, s step back")
     assert told[2:6] == [
-        ". A 0>. A . ",
-        "##. . . . . ",
-        ". . A A 1<. ",
-        "turn 0 of 6; 4 apples on the board; harvested: you: 0, agent 1: 0",
+        ". A 0>. A .",
+        "##. . . . .",
+        ". . A A 1<.",
+        "turn 0 of 6; 4 apples on the board; harvested: 0 by you, 0 by agent 1",
     ]
     assert told[6:8] == ["keys> ww", "turn 2: you harvest an apple"], "what is typed through a pipe is shown"
     assert "The end: time is over." in told
@@ -125,6 +127,19 @@ def test_keys_that_are_unknown_play_nothing_and_are_named(run, capsys):
         "The end: stopped after turn 0.",
         "No turn was played, so there is nothing to measure.",
     ]
+
+
+def test_the_session_in_the_docs_is_what_is_printed(tmp_path, monkeypatch, capsys):
+    page = (Path(__file__).parents[1] / "docs" / "play.md").read_text()
+    drawing, printed = re.findall(r"```text\n(.*?)```", page, re.DOTALL)
+    (line,) = re.findall(r"cprl (play meadow\.txt [^`]*)`", page)
+    (tmp_path / "meadow.txt").write_text(drawing)
+    typed = "".join(f"{keys}\n" for keys in re.findall(r"^keys> (.*)$", printed, re.MULTILINE))
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr("sys.stdin", io.StringIO(typed))
+    monkeypatch.setattr("sys.argv", ["cprl", *line.split()])
+    cli.main()
+    assert capsys.readouterr().out == printed
 
 
 def test_a_game_without_a_beam_has_no_key_for_it():
@@ -184,7 +199,7 @@ def test_keys_in_the_window_play_turns_until_escape(run, dummy):
     play_in_window(session, "meadow")
     assert session.turn == 3, "p is no key"
     assert session.harvested == [1, 0]
-    assert text_of(session)[0] == ". A . . 0^. "
+    assert text_of(session)[0] == ". A . . 0^."
 
 
 def test_the_window_passes_the_turns_of_a_person_who_is_out_of_play(tmp_path, dummy):

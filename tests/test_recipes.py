@@ -4,7 +4,6 @@ import importlib.util
 import json
 import re
 from dataclasses import replace
-from functools import partial
 from pathlib import Path
 
 import pyarrow.parquet as pq
@@ -21,14 +20,14 @@ from cprl.measuring.evaluate import evaluate
 from cprl.population import Learning, Scripted
 from cprl.runs.checkpoints import Checkpointer, checkpoints_in, read_checkpoint
 from cprl.runs.episodes import EpisodeTable, read_episodes
-from cprl.runs.weights import load_weights
+from cprl.runs.weights import load_weights, save_weights
 from cprl.training import train
 
 RECIPES = Path(__file__).parents[1] / "recipes"
 
 
-def recipe(name):
-    spec = importlib.util.spec_from_file_location(name, RECIPES / f"{name}.py")
+def recipe(name, folder=RECIPES):
+    spec = importlib.util.spec_from_file_location(name, folder / f"{name}.py")
     module = importlib.util.module_from_spec(spec)
     spec.loader.exec_module(module)
     return module
@@ -56,7 +55,8 @@ def shorter_episodes(monkeypatch, request):
 
 
 def run_in_miniature(tmp_path, capsys, **arguments):
-    run = recipe("first_run").main(episodes=11, evaluation_episodes=3, out=tmp_path / "run", **arguments)
+    main = recipe("single_agent", RECIPES.with_name("examples")).main
+    run = main(episodes=11, evaluation_episodes=3, out=tmp_path / "run", **arguments)
     return run, capsys.readouterr().out
 
 
@@ -240,7 +240,9 @@ def test_a_run_that_was_stopped_is_loaded_from_its_newest_checkpoint(tmp_path, m
 
 def test_the_run_of_a_plain_agent_is_loaded_too(tmp_path, capsys):
     run, _ = run_in_miniature(tmp_path, capsys)
-    for weights in ("final", "best"):
+    network = cprl.load(run).networks["replica_0/agent_0"]
+    save_weights(run, {"agent_0": network}, name="other")
+    for weights in ("final", "other"):
         loaded = cprl.load(run, weights=weights)
         assert list(loaded.networks) == ["replica_0/agent_0"]
         assert len(evaluate(loaded.env(2), loaded.policy(worlds=2))) == 2
@@ -263,7 +265,7 @@ def test_a_run_that_cannot_be_loaded_says_which_file_and_why(tmp_path, capsys):
         ValueError, match=r"final\.pt is not there, nor a readable checkpoint: has .* been tr"
     ):
         cprl.load(run)
-    (run / "checkpoints" / "best.pt").unlink()
+    (run / "checkpoints" / "best.pt").unlink(missing_ok=True)
     with pytest.raises(ValueError, match=r"best\.pt holds no weights: .*No such file"):
         cprl.load(run, weights="best")
     told = json.loads((run / "recipe.json").read_text())
@@ -275,12 +277,31 @@ def test_a_run_that_cannot_be_loaded_says_which_file_and_why(tmp_path, capsys):
         cprl.load(tmp_path)
 
 
+def test_the_tragedy_ends_with_what_happened_and_what_to_try_next(tmp_path, capsys, monkeypatch):
+    own = recipe("tragedy")
+    words = ["recipes/tragedy.py", "--out", str(tmp_path / "run"), "--engine", "eager", "--watch", "off"]
+    words += ["--episodes", "12", "--replicas", "2", "--evaluation-episodes", "2"]
+    run = cprl.recipe_main(own.experiment, words, at_end=own.tell)
+    told = capsys.readouterr().out
+    after = told[told.index("Training curve:") :]
+    assert "The agents began at" in after
+    assert "In the last 12 episodes they got" in after
+    assert "This was a short schedule. The published one" in after
+    assert after.count(str(run)) >= 4, "in the figure's path and in lines to be copied"
+
+
+def test_what_is_called_at_the_end_must_be_a_function(tmp_path):
+    experiment = recipe("tragedy").experiment()
+    with pytest.raises(ValueError, match=r"at_end is 'tell'; allowed: a function"):
+        cprl.run(experiment, tmp_path / "run", at_end="tell")
+    assert not (tmp_path / "run").exists()
+
+
 @pytest.mark.parametrize("watch", ["telepathy", "connect", "connect nobody", "connect rerun+http://:x/proxy"])
 @pytest.mark.parametrize(
     "name", sorted(path.stem for path in RECIPES.glob("*.py") if path.stem != "reproduce")
 )
 def test_a_way_to_watch_that_is_none_is_refused_before_there_is_a_run(name, watch, tmp_path):
-    run = recipe(name).main if name == "first_run" else partial(run_recipe, name)
     with pytest.raises(ValueError, match=re.escape(f"watch is {watch!r}") + '; allowed: "file",.* or "con'):
-        run(out=tmp_path / "run", watch=watch)
+        run_recipe(name, out=tmp_path / "run", watch=watch)
     assert not (tmp_path / "run").exists()

@@ -115,7 +115,7 @@ def test_where_exploration_ends_the_strip_changes_and_an_event_says_so(tmp_path)
             )
     at, events = column(tmp_path / "run.rrd", "log", "TextLog:text", "episode")
     told = dict(zip([text[0] for text in events], at, strict=True))
-    assert told["exploration ends: no epsilon falls any more; now harvesting"] == 19
+    assert told["episode 19: exploration ends: no epsilon falls any more; now harvesting"] == 19
     states = column(tmp_path / "run.rrd", "now", "StateChange:state", "episode")
     assert states == ([0, 19], [["exploring"], ["harvesting"]])
 

@@ -284,7 +284,7 @@ def leaves(state):
     [
         *(pytest.param(name, 95, marks=[] if name == "PPO" else pytest.mark.slow) for name in RESUMED),
         ("published DQN", 1),
-        ("everything of replay", 41),
+        pytest.param("everything of replay", 41, marks=pytest.mark.slow),
         pytest.param("PPO", 41, marks=pytest.mark.slow),
     ],
 )
@@ -323,10 +323,10 @@ def test_a_stopped_training_continues_bit_for_bit_from_what_a_checkpoint_keeps()
             )
             for agents, (kind, settings) in groups.items()
         }
-        return Training(CommonsEnv(GAME, 2, seed=1), learners, episodes=9)
+        return Training(CommonsEnv(GAME, 2, seed=1), learners, episodes=5)
 
     whole, stopped, again = training(), training(), training()
-    for _ in range(57):
+    for _ in range(47):
         whole.step()
         stopped.step()
     kept = BytesIO()

@@ -241,7 +241,11 @@ def regrown_by_worker(vec_env, seed=None, **how):
 
 # Forked, since the lambda of a test cannot be pickled; TorchRL warns that it makes one in this process too.
 @pytest.mark.filterwarnings("ignore:A lambda function was passed", "ignore:.*fork:DeprecationWarning")
-@pytest.mark.parametrize("kind", [partial(ParallelEnv, mp_start_method="fork"), SerialEnv])
+@pytest.mark.parametrize(
+    "kind",
+    [pytest.param(partial(ParallelEnv, mp_start_method="fork"), marks=pytest.mark.slow), SerialEnv],
+    ids=["ParallelEnv", "SerialEnv"],
+)
 def test_workers_of_one_call_play_different_worlds(kind):
     def grown(*how, **more):
         return regrown_by_worker(kind(2, lambda: CommonsEnv(presets.game("commons"))), *how, **more)

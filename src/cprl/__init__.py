@@ -26,6 +26,7 @@ Each imports only from those above it:
     presets      the published games and hyper-parameters by name
     measuring    social metrics, episodes, phases, statistics
     runs         what is kept of a run: recipe, table of episodes, checkpoints, weights
+    plotting     what all figures share: sizes, colours, legends, bands of phases
     viewer       recordings for the Rerun viewer
     terminal     progress, summary, figures
     callbacks    what is called while a training runs
@@ -35,6 +36,7 @@ Each imports only from those above it:
     stored       load: a run built again from its directory
     agents       the learners and policies of a population
     outcome      trained agents in fresh worlds, beside the random policy
+    parts        what is made of an experiment before anything is written
     running      run: an experiment from its learners to its report
     evaluation   stored agents in fresh worlds, alone and among each other
     play         a person among trained or scripted agents

@@ -19,6 +19,7 @@ from cprl.checks import checked, instance
 from cprl.experiment import Experiment
 from cprl.finite import NotFiniteError
 from cprl.flags import applied, flags_of
+from cprl.output import say
 
 _OLD_WORDS: Final = {
     "--go-on": ("--resume",),
@@ -57,13 +58,19 @@ class RunOptions:
     """A class of somebody's own that a frozen agent's run may import, "module:Class"; may be repeated."""
 
 
-def recipe_main(make_experiment: Callable[..., Experiment], argv: Sequence[str] | None = None) -> Path:
+def recipe_main(
+    make_experiment: Callable[..., Experiment],
+    argv: Sequence[str] | None = None,
+    *,
+    at_end: Callable[[Path], object] | None = None,
+) -> Path:
     """Runs the experiment of a recipe as the command line asks for it.
 
     Args:
         make_experiment: gives the experiment; its arguments become flags, so each has a type and a default,
             and a line under "Args:".
         argv: the command line, script first; by default that of this process.
+        at_end: called with the directory of a run that has just finished, see `cprl.run`.
 
     Returns:
         The run's directory.
@@ -78,16 +85,19 @@ def recipe_main(make_experiment: Callable[..., Experiment], argv: Sequence[str] 
     from cprl.running import run
 
     with in_a_sentence(Path(command[0]).name):
-        return run(experiment, command=command, **vars(options))
+        return run(experiment, command=command, at_end=at_end, **vars(options))
 
 
 @contextmanager
 def in_a_sentence(program: str) -> Iterator[None]:
     """Ends the process with a sentence and exit code 1 for what is refused, for files that cannot be written
-    or read, and for a package that is not installed. Any other error keeps its traceback, as a ValueError of
-    a training that has begun does."""
+    or read, and for a package that is not installed; with exit code 130 after Ctrl-C. Any other error keeps
+    its traceback, as a ValueError of a training that has begun does."""
     try:
         yield
+    except KeyboardInterrupt as error:
+        say("\n".join([f"{program}: interrupted", *getattr(error, "__notes__", [])]))
+        sys.exit(130)
     except (ValueError, OSError, MemoryError, ModuleNotFoundError) as error:
         notes = getattr(error, "__notes__", [])
         if notes and not isinstance(error, OSError | MemoryError | NotFiniteError):

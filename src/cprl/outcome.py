@@ -12,6 +12,7 @@ import torch
 from torchrl.envs import EnvBase
 
 from cprl.agents import Population
+from cprl.arguments import object_of
 from cprl.commons.game import Game
 from cprl.envs.make_env import make_env
 from cprl.envs.state import load_transforms_state, transforms_state
@@ -65,9 +66,18 @@ def random_play(experiment: Experiment, population: Population) -> list[Episode]
 
     Returns:
         `evaluation_episodes` episodes for each replica.
+
+    Raises:
+        ValueError: for anything but an experiment and a population.
     """
+    _check(experiment, population)
     with _generators_kept(experiment.device):
         return evaluate(fresh_env(experiment), population.random_policy(experiment.evaluation_episodes))
+
+
+def _check(experiment: object, population: object) -> None:
+    object_of("experiment", experiment, Experiment, "an Experiment")
+    object_of("population", population, Population, "a Population of the same experiment")
 
 
 @contextmanager
@@ -87,6 +97,7 @@ def _generators_kept(device: str) -> Iterator[None]:
 def is_same_later(experiment: Experiment) -> bool:
     """Whether random play is the same before and after a training: the game is one of cprl's, whose chance
     depends on seeds alone, and has no transforms, which may learn in between."""
+    object_of("experiment", experiment, Experiment, "an Experiment")
     return isinstance(experiment.game, Game) and not experiment.transforms
 
 

@@ -12,6 +12,7 @@ from typing import Any, Final, TypeAlias, get_args
 from cprl.algorithms.base import Algorithm, TeamAlgorithm
 from cprl.checks import NONE, Check, check_fields, checked, count, either, instance, is_count, one_of
 from cprl.custom import Custom
+from cprl.learners.settings import Exploring
 from cprl.learners.transitions import RewardKind
 from cprl.policies.scripted import SCRIPTED_POLICIES, ScriptedPolicy
 
@@ -180,3 +181,18 @@ def grouped(specs: Sequence[AgentSpec], agents: int) -> list[tuple[AgentSpec, tu
             )
             groups.append((spec, members))
     return groups
+
+
+def exploration_steps(specs: Sequence[AgentSpec]) -> int | None:
+    """The environment step of a replica at which the last agent's epsilon has reached its end.
+
+    None if no agent explores by epsilon, or only by an algorithm of the user's own.
+    """
+    algorithms = [spec.algorithm for spec in specs if isinstance(spec, Learning | Team)]
+    settings = [own.settings for own in algorithms if not isinstance(own, Custom)]
+    ends = [
+        own.epsilon_hold_steps + own.epsilon_decay_steps
+        for own in settings
+        if isinstance(own, Exploring) and own.epsilon_end < own.epsilon_start
+    ]
+    return max(ends, default=None)

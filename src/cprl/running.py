@@ -1,41 +1,31 @@
 """run: one experiment from its learners to its report: train, save, evaluate in fresh worlds, summarise."""
 
 import shutil
-from collections.abc import Sequence
-from contextlib import AbstractContextManager, ExitStack, nullcontext, suppress
-from dataclasses import asdict, dataclass
+from collections.abc import Callable, Mapping, Sequence
+from contextlib import ExitStack, suppress
+from dataclasses import asdict
 from datetime import datetime
-from functools import partial
 from pathlib import Path
-from typing import Any
 
-import torch
-from torchrl.envs import EnvBase
-
-from cprl.agents import Population
-from cprl.arguments import object_of, path, texts
+from cprl.arguments import callable_of, object_of, path, texts
 from cprl.checks import SWITCH, checked
-from cprl.custom import Custom, made
-from cprl.envs.make_env import make_env
-from cprl.envs.state import check_restorable, transforms_state
-from cprl.envs.unwrap import agent_names, commons_of
+from cprl.custom import Custom
+from cprl.envs.state import transforms_state
 from cprl.experiment import Experiment
 from cprl.finite import summary
 from cprl.measuring.episodes import Episode
 from cprl.outcome import (
     evaluate_population,
-    exhibited,
     exploration,
-    fresh_env,
     random_play,
     write_evaluation,
 )
 from cprl.output import ERR, OUT, console
+from cprl.parts import Parts, make_logger_callback, make_parts, make_viewer, title_of
 from cprl.process import prepare_process
 from cprl.runs.checkpoints import FOLDER, Checkpointer, checkpoints_in
 from cprl.runs.directory import (
     changed_circumstances,
-    read_recipe,
     refuse_another_run,
     resume_command,
     start_run,
@@ -46,7 +36,7 @@ from cprl.runs.extension import REPORT, extend, refuse_to_extend
 from cprl.runs.files import write_json
 from cprl.runs.lock import FILE_NAME as LOCK
 from cprl.runs.lock import RunLockedError
-from cprl.runs.loggers import LoggerCallback, check_logger, make_logger
+from cprl.runs.loggers import check_logger
 from cprl.runs.weights import save_transforms, save_weights
 from cprl.terminal.figures import training_curve
 from cprl.terminal.progress import ProgressBar
@@ -56,15 +46,6 @@ from cprl.viewer.callback import ViewerCallback
 from cprl.viewer.lingering import check_linger
 from cprl.viewer.lingering import linger as stay_served
 from cprl.viewer.streams import check_watch
-
-
-@dataclass(kw_only=True, eq=False)
-class _Made:
-    """What an experiment makes before anything is written, so that what does not fit is refused first."""
-
-    env: EnvBase
-    population: Population
-    callbacks: list[Any]
 
 
 class _Began:
@@ -88,6 +69,7 @@ def run(
     linger: bool = False,
     allow: Sequence[str] = (),
     command: Sequence[str] | None = None,
+    at_end: Callable[[Path], object] | None = None,
 ) -> Path:
     """Trains the agents of all replicas, evaluates them in fresh worlds, and writes and prints the outcome.
 
@@ -109,6 +91,7 @@ def run(
         allow: the user's own code, "module:Class", that stored runs of `Frozen` agents may import.
         command: the command line that began the run, script first, which the recipe keeps and the line that
             resumes is made of; by default the run is resumed by `cprl run`.
+        at_end: called with the directory of a run that has just finished, when all is written and said.
 
     Returns:
         The directory, now with `recipe.json`, `episodes.parquet`, `run.rrd`, `checkpoints/final.pt`,
@@ -121,38 +104,28 @@ def run(
         OSError: for a full disk or a deleted directory; the message names it. What was written before is
             intact, and the run can be resumed.
     """
-    object_of("experiment", experiment, Experiment, "an Experiment")
     out = None if out is None else path("out", out)
-    for name, switch in {
+    command = None if command is None else texts("command", command, 1)
+    switches = {
         "resume": resume,
         "take_over": take_over,
         "keep_checkpoint": keep_checkpoint,
         "linger": linger,
-    }.items():
-        checked(name, switch, SWITCH)
-    texts("allow", allow)
-    command = None if command is None else texts("command", command, 1)
-    check_watch(watch)
-    check_linger(linger, watch)
-    for logger in experiment.loggers:
-        check_logger(logger.resolve() if isinstance(logger, Custom) else logger)
+    }
+    _check(experiment, switches, allow=allow, watch=watch, at_end=at_end)
     prepare_process(experiment.seed)
     is_begun = resume and out is not None and bool(checkpoints_in(out / FOLDER))
-    own = _make(experiment, allow, starts=not is_begun)
-    is_there = False
+    own = make_parts(experiment, allow, starts=not is_begun)
     episodes = refuse_another_run(out, experiment.to_recipe) if resume else experiment.episodes
+    is_there = out is not None and out.exists()
     if resume and out is not None:
         if episodes < experiment.episodes:
             refuse_to_extend(out, episodes, own.callbacks)
         elif (out / REPORT).exists():
-            if (out / LOCK).exists():  # its process died before it had tidied up
-                with Checkpointer(out, keep_ending=keep_checkpoint, take_over=take_over) as left:
-                    left.done()
-            console().print(f"{out} is finished; with more --episodes it is extended", soft_wrap=True)
+            _tidy_up(out, keep_checkpoint=keep_checkpoint, take_over=take_over)
             return out
         directory = out
     else:
-        is_there = out is not None and out.exists()
         directory = start_run(out, experiment.name, experiment.to_recipe, command=command)
     OUT.run = directory
     checkpointer = Checkpointer(
@@ -170,12 +143,8 @@ def run(
                 write_on_nan(directory, experiment.on_nan)
             if episodes < experiment.episodes:
                 extend(directory, episodes, experiment.episodes)
-            viewer = closing.enter_context(_viewer(watch, directory, own, experiment))
-            before = None if viewer is None else _random_play(experiment, own, viewer)
-            training = _train(
-                directory, experiment, own, viewer=viewer, checkpointer=checkpointer, began=began
-            )
-            _finish(directory, experiment, own, training, viewer=viewer, before=before)
+            viewer = closing.enter_context(make_viewer(watch, directory, own, experiment))
+            _train_and_evaluate(directory, experiment, own, viewer, checkpointer, began)
             checkpointer.done()
             _say_what_is_kept(directory)
     except BaseException as error:
@@ -186,9 +155,35 @@ def run(
             _remove(directory, but_keep_empty=is_there)
         raise
     with closing:
+        if at_end is not None:
+            at_end(directory)
         if linger and viewer is not None:
             stay_served(viewer.logger, viewer.play_on)
     return directory
+
+
+def _check(
+    experiment: Experiment, switches: Mapping[str, bool], *, allow: Sequence[str], watch: str, at_end: object
+) -> None:
+    """Refuses arguments of `run` that do not fit."""
+    object_of("experiment", experiment, Experiment, "an Experiment")
+    for name, switch in switches.items():
+        checked(name, switch, SWITCH)
+    texts("allow", allow)
+    check_watch(watch)
+    check_linger(switches["linger"], watch)
+    if at_end is not None:
+        callable_of("at_end", at_end, "a function of the run's directory, or None")
+    for logger in experiment.loggers:
+        check_logger(logger.resolve() if isinstance(logger, Custom) else logger)
+
+
+def _tidy_up(finished: Path, *, keep_checkpoint: bool, take_over: bool) -> None:
+    """Says that a run is finished, and tidies up if its process died before it had."""
+    if (finished / LOCK).exists():
+        with Checkpointer(finished, keep_ending=keep_checkpoint, take_over=take_over) as left:
+            left.done()
+    console().print(f"{finished} is finished; with more --episodes it is extended", soft_wrap=True)
 
 
 def _remove(directory: Path, *, but_keep_empty: bool) -> None:
@@ -223,21 +218,23 @@ def _say_what_changed(directory: Path) -> None:
         )
 
 
-def _finish(
+def _train_and_evaluate(
     directory: Path,
     experiment: Experiment,
-    own: _Made,
-    training: Training,
-    *,
+    own: Parts,
     viewer: ViewerCallback | None,
-    before: list[Episode] | None,
+    checkpointer: Checkpointer,
+    began: _Began,
 ) -> None:
-    """All that follows the training; `report.json`, the sign that a run is finished, comes last."""
+    """All that follows the beginning; `report.json`, the sign that a run is finished, comes last."""
+    training, before = _train(
+        directory, experiment, own, viewer=viewer, checkpointer=checkpointer, began=began
+    )
     played = evaluate_population(experiment, own.env, own.population, random=before)
     write_evaluation(directory, played, of_replica=experiment.evaluation_episodes)
     if viewer is not None:
         viewer.finished(played)
-    title = _title(experiment)
+    title = title_of(experiment)
     figure = training_curve(directory, title=title, random=played["random"])
     broken = training.finite.found
     report = {"training_s": round(training.spent_s, 1), "steps": training.steps, "finished": _now()}
@@ -247,54 +244,40 @@ def _finish(
     summarise(directory, title=title, played=columns, figure=figure, note=summary(broken))
 
 
-def _make(experiment: Experiment, allow: Sequence[str], *, starts: bool = True) -> _Made:
-    make = partial(
-        make_env,
-        experiment.game,
-        worlds=experiment.replicas,
-        seed=experiment.seed,
-        device=experiment.device,
-        transforms=experiment.transforms,
-    )
-    env = make()
-    if commons_of(env) is None or experiment.transforms:
-        check_restorable(make)
-    population = Population(
-        env,
-        experiment.agents,
-        seed=experiment.seed,
-        engine=experiment.engine,
-        allow=allow,
-        starts=starts,
-    )
-    with torch.random.fork_rng(devices=[]):
-        fresh_env(experiment)  # what the evaluation cannot have is refused now, not after hours
-        population.random_policy(experiment.evaluation_episodes)
-        population.policy(experiment.evaluation_episodes)
-    return _Made(env=env, population=population, callbacks=[made(own) for own in experiment.callbacks])
-
-
 def _train(
     directory: Path,
     experiment: Experiment,
-    own: _Made,
+    own: Parts,
     *,
     viewer: ViewerCallback | None,
     checkpointer: Checkpointer,
     began: _Began,
-) -> Training:
-    """Trains and keeps what happens, from the newest checkpoint on if there is one."""
+) -> tuple[Training, list[Episode] | None]:
+    """Trains and keeps what happens, from the newest checkpoint on if there is one.
+
+    Returns:
+        The training, and what the viewer compares it with: random play, None without a viewer.
+    """
     with ExitStack() as stack:
         table = stack.enter_context(EpisodeTable(directory / "episodes.parquet", resumable=True))
-        bar = ProgressBar(own.env, episodes=experiment.episodes, replicas=experiment.replicas)
-        loggers = [stack.enter_context(_logger(logger, directory, own.env)) for logger in experiment.loggers]
+        bar = stack.enter_context(
+            ProgressBar(own.env, episodes=experiment.episodes, replicas=experiment.replicas)
+        )
+        loggers = [
+            stack.enter_context(make_logger_callback(logger, directory, own.env))
+            for logger in experiment.loggers
+        ]
+        before = None
+        if viewer is not None:
+            before = random_play(experiment, own.population)
+            viewer.random_play(before)
         shown = [viewer] if viewer else []
         training = train(
             own.env,
             own.population.learners,
             others=own.population.others,
             episodes=experiment.episodes,
-            callbacks=[began, table, stack.enter_context(bar), *shown, *loggers, *own.callbacks],
+            callbacks=[began, table, bar, *shown, *loggers, *own.callbacks],
             checkpointer=checkpointer,
             update_every=experiment.update_every,
             on_nan=experiment.on_nan,
@@ -303,43 +286,7 @@ def _train(
         save_transforms(directory, transforms_state(own.env))
     if viewer is not None:
         viewer.flush()
-    return training
-
-
-def _random_play(experiment: Experiment, own: _Made, viewer: ViewerCallback) -> list[Episode]:
-    """Plays what the viewer compares the training with."""
-    episodes = random_play(experiment, own.population)
-    viewer.random_play(episodes)
-    return episodes
-
-
-def _logger(logger: str | Custom, directory: Path, env: EnvBase) -> LoggerCallback:
-    return LoggerCallback(
-        make_logger(made(logger), directory), replicas=env.batch_size.numel(), agents=agent_names(env)
-    )
-
-
-def _viewer(
-    watch: str, directory: Path, own: _Made, experiment: Experiment
-) -> AbstractContextManager[ViewerCallback | None]:
-    if watch == "off":
-        return nullcontext()
-    recipe = read_recipe(directory)
-    shown = {name: recipe.get(name) for name in ("command", "started", "git", "versions")}
-    return ViewerCallback(
-        directory,
-        own.env,
-        title=_title(experiment),
-        episodes=experiment.episodes,
-        recipe={**shown, **recipe["experiment"]},
-        live=None if watch == "file" else watch,
-        exhibited=None if watch == "file" else exhibited(experiment, own.env, own.population),
-    )
-
-
-def _title(experiment: Experiment) -> str:
-    """For tables and figures."""
-    return f"{experiment.name}, {experiment.replicas} replicas, {experiment.episodes} episodes"
+    return training, before
 
 
 def _now() -> str:

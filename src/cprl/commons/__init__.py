@@ -2,7 +2,6 @@
 
 In reading order:
 
-    checks       checks of arguments, and their messages
     rules        every number of the game, with unit, range and source
     maps         boards: drawn, named or generated
     observation  what agents observe, and in which form

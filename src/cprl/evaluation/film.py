@@ -117,8 +117,8 @@ class _Events:
     def on_episode(self, episode: Episode, learning: Mapping[str, float]) -> None:
         """Logs the outcome."""
         self.episode = episode
-        self._log(f"the end after {episode.steps} steps; {episode.outcome}")
+        self._log(f"the end; {episode.outcome}")
 
     def _log(self, event: str) -> None:
         self.viewer.logger.at(step=self._step, episode=0)
-        self.viewer.log_event(event)
+        self.viewer.log_event(f"step {self._step:,}: {event}")

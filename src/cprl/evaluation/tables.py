@@ -7,6 +7,8 @@ from rich.table import Table
 
 from cprl.evaluation.cross_play import CrossPlay
 from cprl.evaluation.evaluate import Evaluation
+from cprl.evaluation.lanes import Played
+from cprl.measuring.names import with_unit
 from cprl.measuring.replicas import agents_without_harvest
 from cprl.measuring.reported import left_out
 from cprl.stored import LoadedRun
@@ -24,8 +26,9 @@ def run_table(evaluation: Evaluation) -> Table:
     table.add_column(f"run's agents{how_they_play([evaluation.run], evaluation.greedy)}", justify="right")
     table.add_column("random", justify="right")
     trained, random = evaluation.measures("trained"), evaluation.measures("random")
+    rewards = _unit_of_rewards(evaluation.trained)
     for name, measured in trained.items():
-        table.add_row(name, str(measured), str(random[name]))
+        table.add_row(with_unit(name, rewards=rewards), str(measured), str(random[name]))
     without = [agents_without_harvest(played) for played in (evaluation.trained, evaluation.random)]
     if None not in without:
         table.add_row(
@@ -48,10 +51,11 @@ def heading(played: CrossPlay) -> str:
 def matrices(played: CrossPlay) -> Iterator[Table]:
     """A matrix for each metric: rows are the focal agent's run, columns the background agents' run."""
     cells = {at: cell.measures() for at, cell in played.cells.items()}
+    rewards = _unit_of_cells(played)
     for name in next(iter(cells.values())):
         if name == "collective_return":  # a reward is an apple: group/return says the same
             continue
-        table = Table(title=name, title_justify="left")
+        table = Table(title=with_unit(name, rewards=rewards), title_justify="left")
         table.add_column("focal \\ background")
         for background in played.runs:
             table.add_column(background, justify="right")
@@ -65,14 +69,23 @@ def agents_table(played: CrossPlay) -> Table:
     table = Table(title="returns by the focal agent's index", title_justify="left")
     for heading in ("focal", "background", "focal agent"):
         table.add_column(heading)
-    names = ("focal/return", "background/return", "group/return")
+    names, rewards = ("focal/return", "background/return", "group/return"), _unit_of_cells(played)
     for name in names:
-        table.add_column(name, justify="right")
+        table.add_column(with_unit(name, rewards=rewards), justify="right")
     for (focal, background), cell in played.cells.items():
         for agent in cell.by_agent:
             measured = cell.measures(agent)
             table.add_row(focal, background, str(agent), *(str(measured[name]) for name in names))
     return table
+
+
+def _unit_of_cells(played: CrossPlay) -> str:
+    return _unit_of_rewards(next(iter(next(iter(played.cells.values())).by_agent.values())))
+
+
+def _unit_of_rewards(played: Played) -> str:
+    """Rewards are apples in a game that reports harvests; in another they have no unit."""
+    return "apples" if next(iter(played.values()))[0].harvest is not None else ""
 
 
 def how_they_play(runs: list[LoadedRun], greedy: bool) -> str:

@@ -31,6 +31,8 @@ LONGEST: Final = 100_000
 """The largest number of episodes; the search takes time in proportion to its square."""
 SHORTEST: Final = 200
 """The minimum length of a phase in episodes."""
+FEWEST_EPISODES: Final = 1_000
+"""Phases are found in trainings of at least so many episodes; in shorter ones they would be noise."""
 CHANGE: Final = 0.25
 """The share of its range by which a metric's line must rise or fall to count as rising or falling."""
 
@@ -111,11 +113,11 @@ def change_points(
 
 
 def find_phases(
-    episodes: ArrayLike, metrics: Mapping[str, ArrayLike], *, number: int = 3
+    episodes: ArrayLike, metrics: Mapping[str, ArrayLike], *, number: int = 3, resamples: int = 200
 ) -> tuple[list[ChangePoint], list[Phase]]:
     """Finds `number` change points and the phases between them; see `change_points` and `phases`."""
-    number = arguments.integer("number", number, 0)
-    changes = change_points(episodes, metrics, number=number) if number else []
+    number, resamples = arguments.integer("number", number, 0), arguments.integer("resamples", resamples, 1)
+    changes = change_points(episodes, metrics, number=number, resamples=resamples) if number else []
     return changes, phases(episodes, metrics, changes)
 
 

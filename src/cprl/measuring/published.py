@@ -19,8 +19,10 @@ from cprl import arguments
 Values = NDArray[np.float64]
 
 SMOOTHED_EPISODES: Final = 100
-"""The approximate window of the study's running means, in episodes. Its curves are means of these over
-several runs, drawn at the first episode of the window."""
+"""The window of our running means beside the published curves, in episodes. Both are drawn at the first
+episode of a window; those of the study are `PublishedExperiment.window_episodes`."""
+PHASED_RECIPE: Final = "commons"
+"""Our recipe of experiment 5, the only one whose phases the study draws."""
 PHASES_BEGIN: Final = (450, 1500, 2400)
 """The episodes at which tragedy, combat and cultivation begin in the study's figures of experiment 5."""
 
@@ -38,6 +40,9 @@ class PublishedExperiment:
     """The mean collective return over training."""
     episodes: int
     """The number of episodes in the study's figures."""
+    window_episodes: int
+    """The window of the study's running means. It gives none: this one has its nulls where the spectra of the
+    published curves have theirs, see tests/test_published.py."""
     curves: Mapping[str, str]
     """The names of published curves by our name of the metric; `return_0` is the return of agent 0."""
 
@@ -49,6 +54,7 @@ EXPERIMENTS: Final = (
         random=32.47,
         trained=174.65,
         episodes=6000,
+        window_episodes=150,
         curves={"collective_return": "exp1/return"},
     ),
     PublishedExperiment(
@@ -57,6 +63,7 @@ EXPERIMENTS: Final = (
         random=59.53,
         trained=177.45,
         episodes=6000,
+        window_episodes=50,
         curves={"collective_return": "exp2/return"},
     ),
     PublishedExperiment(
@@ -65,6 +72,7 @@ EXPERIMENTS: Final = (
         random=92.57,
         trained=191.72,
         episodes=6000,
+        window_episodes=150,
         curves={"collective_return": "exp3/return"},
     ),
     PublishedExperiment(
@@ -73,6 +81,7 @@ EXPERIMENTS: Final = (
         random=None,
         trained=184.07,
         episodes=6000,
+        window_episodes=50,
         curves={
             "collective_return": "exp4/return",
             "return_0": "exp4_agents/return_dqn",
@@ -85,6 +94,7 @@ EXPERIMENTS: Final = (
         random=264.53,
         trained=491.17,
         episodes=4800,
+        window_episodes=30,
         curves={
             "collective_return": "exp5/efficiency",
             "equality": "exp5/equality",

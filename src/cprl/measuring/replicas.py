@@ -26,7 +26,7 @@ class Measured:
     def __str__(self) -> str:
         if self.estimate is None:
             return f"undefined in all {self.episodes}"
-        value = f"{self.estimate.value:.4g}" if isnan(self.estimate.low) else str(self.estimate)
+        value = f"{self.estimate}"
         return f"{value}, undefined in {self.undefined} of {self.episodes}" if self.undefined else value
 
 

@@ -13,7 +13,6 @@ from typing import Any, Final, Literal
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-from scipy import stats
 
 from cprl import arguments
 from cprl.checks import shown
@@ -38,7 +37,9 @@ class Estimate:
     replicas: int
 
     def __str__(self) -> str:
-        return f"{self.value:.4g} [{self.low:.4g}, {self.high:.4g}]"
+        """The value with its interval, of a single replica the value alone."""
+        has_interval = np.isfinite([self.low, self.high]).all()
+        return f"{self.value:.4g} [{self.low:.4g}, {self.high:.4g}]" if has_interval else f"{self.value:.4g}"
 
 
 def mean(values: ArrayLike, axis: int = -1) -> Any:
@@ -48,6 +49,8 @@ def mean(values: ArrayLike, axis: int = -1) -> Any:
 
 def inter_quartile_mean(values: ArrayLike, axis: int = -1) -> Any:
     """The mean of the middle half, float64 [...]: of R values it ignores the floor(R / 4) at each end."""
+    from scipy import stats  # takes as long as torch
+
     return stats.trim_mean(_some(values, axis), 0.25, axis=axis)
 
 
@@ -147,6 +150,8 @@ def _interval(
     samples: Sequence[Values], overall: Callable[..., Any], confidence: float, resamples: int, seed: int
 ) -> tuple[float, float]:
     """The bias-corrected and accelerated (BCa) interval where it is defined, else the percentile interval."""
+    from scipy import stats
+
     if any(len(sample) < 2 for sample in samples):
         return float("nan"), float("nan")
     if all(np.ptp(sample) == 0 for sample in samples):

@@ -88,7 +88,8 @@ def board_text(session: Session) -> Text:
     text = Text()
     for row in range(board.height):
         for col in range(board.width):
-            sign, colour = cells.get((row, col), (".", PALETTE[WALL]))
-            text.append(sign.ljust(wide), f"rgb({colour[0]},{colour[1]},{colour[2]})")
+            sign, (red, green, blue) = cells.get((row, col), (".", PALETTE[WALL]))
+            is_last = col == board.width - 1
+            text.append(sign if is_last else sign.ljust(wide), f"rgb({red},{green},{blue})")
         text.append("\n" if row < board.height - 1 else "")
     return text

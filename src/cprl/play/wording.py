@@ -22,7 +22,7 @@ METRICS: Final = {
 def state(session: Session) -> str:
     """The turn, the apples on the board, and everybody's score."""
     scores = [
-        f"{'you' if agent == session.agent else f'agent {agent}'}: {apples}{_out(session, agent)}"
+        f"{apples} by {'you' if agent == session.agent else f'agent {agent}'}{_out(session, agent)}"
         for agent, apples in enumerate(session.harvested)
     ]
     of_steps = f"turn {session.turn:,} of {session.game.rules.episode_steps:,}"

@@ -5,35 +5,23 @@ It needs only exported results (`cprl.runs.export`), so that anyone can reproduc
 
 import os
 import shlex
-import textwrap
 from collections.abc import Sequence
 from datetime import timedelta
 from pathlib import Path
-from typing import Final
 
 import numpy as np
-import pyarrow.parquet as pq
-from matplotlib.figure import Figure
 
 from cprl import arguments
 from cprl.arguments import objects
-from cprl.measuring.published import PHASES_BEGIN, SMOOTHED_EPISODES, agreement, curve
-from cprl.measuring.statistics import curve_interval, estimate
+from cprl.measuring.published import EXPERIMENTS, SMOOTHED_EPISODES, agreement, curve
+from cprl.measuring.statistics import estimate
 from cprl.reporting.claims import measures
+from cprl.reporting.figures import axis_title, draw_figures
 from cprl.reporting.markdown import table
 from cprl.reporting.result import TOO_FEW, Result, Values, read_result
 from cprl.reporting.turning import phases_of, turning_points_of
-from cprl.runs.curves import as_curves, running_mean
+from cprl.runs.curves import running_mean
 from cprl.runs.files import write_atomically
-
-TITLES: Final = {
-    "collective_return": "collective return, apples",
-    "equality": "equality (1 - Gini)",
-    "survival_steps": "survival, steps",
-    "peacefulness": "peacefulness, steps in play per agent",
-    "return_0": "return of the learner, apples",
-    "return_1": "return of the random walker, apples",
-}
 
 
 def write_report(runs: Sequence[Path], out: Path) -> Path:
@@ -59,7 +47,8 @@ def write_report(runs: Sequence[Path], out: Path) -> Path:
         "",
         "Made by `cprl report` from the results in this folder alone.",
         "Intervals are 95 % bootstrap intervals over replicas; figures are running means over "
-        f"{SMOOTHED_EPISODES} episodes, drawn at the first of them, as in the study.",
+        f"{SMOOTHED_EPISODES} episodes, drawn at the first of them, as in the study. "
+        f"The published curves are means over other windows: {_windows()}.",
         "",
         *_runs(results),
         *_appendix(results),
@@ -73,6 +62,17 @@ def write_report(runs: Sequence[Path], out: Path) -> Path:
     text = "\n".join(lines) + "\n"
     write_atomically(path, lambda file: file.write(text.encode()))
     return path
+
+
+def _windows() -> str:
+    found: dict[int, list[str]] = {}
+    for study in EXPERIMENTS:
+        found.setdefault(study.window_episodes, []).append(f"{study.number}")
+    by_window = (
+        f"{window} episodes (experiment{'s' * (len(numbers) > 1)} {' and '.join(numbers)})"
+        for window, numbers in found.items()
+    )
+    return ", ".join(by_window)
 
 
 def _runs(results: Sequence[Result]) -> list[str]:
@@ -110,7 +110,7 @@ def _appendix(results: Sequence[Result]) -> list[str]:
     rows = []
     for result in results:
         study, returns = result.study, result.curves["collective_return"]
-        evaluated = {name: _evaluated(result.path, name) for name in ("random", "trained")}
+        evaluated = {name: _evaluated(result, name) for name in ("random", "trained")}
         rows.append(
             [
                 result.name,
@@ -158,41 +158,15 @@ def _claims(results: Sequence[Result]) -> list[str]:
 
 def _figures(results: Sequence[Result], out: Path) -> list[str]:
     lines = ["## Figures", ""]
-    for result in results:
-        metrics = list(result.study.curves) if result.study else ["collective_return"]
-        for metric in metrics:
-            name = f"{result.name}_{metric}.png"
-            _draw(result, metric, out / "figures" / name)
-            lines += [f"![{result.name}, {TITLES.get(metric, metric)}](figures/{name})", ""]
+    for result, metric, path in draw_figures(results, out / "figures"):
+        lines += [f"![{result.name}, {axis_title(metric)}](figures/{path.name})", ""]
     return lines
 
 
-def _draw(result: Result, metric: str, path: Path) -> None:
-    """Draws replicas, their mean and its interval, the published curve, and the phases of experiment 5."""
-    smoothed = running_mean(result.curves[metric])
-    middle, low, high = curve_interval(smoothed, resamples=500)
-    figure = Figure(figsize=(8, 4.2), layout="constrained")
-    axes = figure.add_subplot()
-    axes.plot(smoothed.T, color="#9ecae1", linewidth=0.4)
-    axes.fill_between(np.arange(len(middle)), low, high, color="#6baed6", alpha=0.5, label="95 % interval")
-    axes.plot(middle, color="#08519c", linewidth=1.8, label=f"ours, mean of {len(smoothed)} replicas")
-    if result.study:
-        axes.plot(*curve(result.study.curves[metric]), color="#d94801", linewidth=1.2, label="published")
-    if result.study and result.study.number == 5:
-        for place in PHASES_BEGIN:
-            axes.axvline(place, color="#d94801", linestyle=":", linewidth=1)
-        for change in result.phases[0] if result.phases else ():
-            axes.axvline(change.episode, color="#08519c", linestyle="--", linewidth=1)
-    axes.set(title=textwrap.fill(result.title, 90), xlabel="episode", ylabel=TITLES.get(metric, metric))
-    axes.title.set_fontsize(9)
-    axes.legend(loc="best", fontsize=8)
-    figure.savefig(path, dpi=90)
-
-
-def _evaluated(run: Path, policy: str) -> Values | None:
+def _evaluated(result: Result, policy: str) -> Values | None:
     """The mean collective return of each replica in its evaluation, [R]; None if there is no evaluation."""
-    path = run / "evaluation" / f"{policy}.parquet"
-    return as_curves(pq.read_table(path))["collective_return"].mean(1) if path.exists() else None
+    found = result.evaluated(policy)
+    return None if found is None else found["collective_return"]
 
 
 def _estimate_cell(values: Values | None) -> str:

@@ -7,15 +7,15 @@ from pathlib import Path
 from typing import Any, Final
 
 import numpy as np
+import pyarrow.parquet as pq
 from numpy.typing import NDArray
 
 from cprl import presets
 from cprl.algorithms import DQN
 from cprl.experiment import Experiment
-from cprl.measuring import phases
 from cprl.measuring.published import PublishedExperiment, published_experiment
 from cprl.population import Learning
-from cprl.runs.curves import curves_of, running_mean
+from cprl.runs.curves import Phases, as_curves, curves_of, phases_of, running_mean
 from cprl.runs.directory import read_recipe
 from cprl.runs.files import read_json
 
@@ -57,13 +57,21 @@ class Result:
         return ", ".join([*parts, f"{replicas} replicas of {episodes:,} episodes"])
 
     @cached_property
-    def phases(self) -> tuple[list[phases.ChangePoint], list[phases.Phase]] | None:
-        """Change points and phases of the running means; None if there are too few episodes."""
-        smoothed = {name: running_mean(self.curves[name]) for name in phases.METRICS}
-        episodes = np.arange(smoothed["equality"].shape[1])
-        if len(episodes) <= 4 * phases.SHORTEST:
+    def phases(self) -> Phases | None:
+        """Change points and phases; None if there are too few episodes, see `phases_of`."""
+        return phases_of(dict(self.curves))
+
+    def evaluated(self, policy: str) -> Mapping[str, Values] | None:
+        """The mean of each metric and replica in its evaluation, [R] by name; None if there is none.
+
+        Args:
+            policy: "random" or "trained".
+        """
+        path = self.path / "evaluation" / f"{policy}.parquet"
+        if not path.exists():
             return None
-        return phases.find_phases(episodes, smoothed)
+        curves = as_curves(pq.read_table(path))
+        return {name: running_mean(values, values.shape[1])[:, 0] for name, values in curves.items()}
 
 
 def read_result(path: Path) -> Result:

@@ -5,7 +5,7 @@ import os
 import re
 import signal
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from pathlib import Path
 from threading import current_thread, main_thread
 from types import FrameType, TracebackType
@@ -64,12 +64,7 @@ class Checkpointer:
         resume_command: the command line that resumes, printed when the run is stopped; by default that of
             this process.
         console: the console for messages; by default standard output.
-
-    Attributes:
-        log_event: called with a text at each checkpoint, e.g. `ViewerCallback.log_event`; None for nothing.
     """
-
-    log_event: Callable[[str], object] | None = None
 
     def __init__(
         self,
@@ -168,8 +163,6 @@ class Checkpointer:
         for old in same[: -1 if kind == "ending" else -KEPT]:
             old.unlink()
         self._saved = time.monotonic()
-        if self.log_event:
-            self.log_event(f"checkpoint at step {training.steps:,}")
         return path
 
     def done(self) -> None:

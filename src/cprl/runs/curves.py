@@ -7,11 +7,12 @@ import numpy as np
 import pyarrow as pa
 from numpy.typing import NDArray
 
-from cprl.measuring import social
+from cprl.measuring import phases, social
 from cprl.measuring.published import SMOOTHED_EPISODES
 from cprl.runs.episodes import read_episodes
 
 Values = NDArray[np.float64]
+Phases = tuple[list[phases.ChangePoint], list[phases.Phase]]
 
 
 def curves_of(run: Path) -> dict[str, Values]:
@@ -61,6 +62,44 @@ def running_mean(values: Values, window: int = SMOOTHED_EPISODES) -> Values:
             counts[..., window:] - counts[..., :-window]
         )
     return means
+
+
+def centres(values: Values, window: int) -> Values:
+    """The episode at the centre of each running mean over `window` of these values, [..., E] to [...]."""
+    window = min(window, values.shape[-1])
+    return np.arange(values.shape[-1] - window + 1) + (window - 1) / 2
+
+
+def phases_of(curves: dict[str, Values], *, centred: bool = False, resamples: int = 200) -> Phases | None:
+    """Change points and phases of a training, of running means over `SMOOTHED_EPISODES`.
+
+    Args:
+        curves: see `curves_of`.
+        centred: whether an episode is the centre of its running mean; else its first, as in the study.
+        resamples: of the replicas, for the intervals of the change points.
+
+    Returns:
+        None for fewer than `phases.FEWEST_EPISODES` episodes, a single agent, a game that does not report
+        the metrics, or a metric that is undefined in a whole window.
+    """
+    if not set(phases.METRICS) <= set(curves) or "return_1" not in curves:
+        return None
+    whole = curves["survival_steps"]
+    if whole.shape[1] < phases.FEWEST_EPISODES:
+        return None
+    smoothed = {name: running_mean(curves[name]) for name in phases.METRICS}
+    if any(np.isnan(means).all(0).any() for means in smoothed.values()):
+        return None
+    at = centres(whole, SMOOTHED_EPISODES)
+    return phases.find_phases(at if centred else at - at[0], smoothed, resamples=resamples)
+
+
+def episode_of_step(curves: dict[str, Values], step: int) -> float | None:
+    """The episode in which the replicas reach an environment step, their mean; None if one does not."""
+    played = curves["survival_steps"].cumsum(1)
+    if (played[:, -1] < step).any():
+        return None
+    return float((played >= step).argmax(1).mean())
 
 
 def _after_a_zero(values: Values) -> Values:

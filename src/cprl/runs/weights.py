@@ -52,7 +52,8 @@ class BestWeights:
     """Evaluates the greedy policy every `every` episodes, and saves the best weights so far.
 
     A callback of `cprl.training`. It evaluates in the same worlds every time, so measure the saved weights
-    in other worlds.
+    in other worlds. A policy that harvests nothing is never the best, where the game reports harvests; until
+    one harvests something `path` is None and `best_episode` is -1.
 
     Args:
         run: the run's directory.
@@ -92,9 +93,13 @@ class BestWeights:
         if self._episodes % self.every:
             return
         self.env.set_seed(self.seed)
-        reached, _ = mean_return(evaluate(self.env, self.policy))
+        played = evaluate(self.env, self.policy)
+        reached, _ = mean_return(played)
         if self.logger is not None:
             self.logger.log_scalar("evaluation/greedy_return", reached)
+        harvests = [episode.harvest for episode in played if episode.harvest is not None]
+        if harvests and not any(harvest.any() for harvest in harvests):
+            return
         if reached > self.best_return:
             self.best_return, self.best_episode = reached, self._episodes
             self.path = save_weights(self.run, self.networks, name="best")

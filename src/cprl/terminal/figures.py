@@ -1,30 +1,76 @@
 """Figures of a run, plotted from its table of episodes alone."""
 
+from dataclasses import dataclass
 from pathlib import Path
+from statistics import fmean
+from typing import Final
 
 import numpy as np
-from matplotlib.figure import Figure
+from matplotlib.axes import Axes
+from numpy.typing import NDArray
 
 from cprl.arguments import objects, path
-from cprl.checks import TEXT, checked, count
+from cprl.checks import NONE, TEXT, checked, count, either
 from cprl.measuring.episodes import Episode
-from cprl.measuring.evaluate import mean_return
-from cprl.measuring.published import SMOOTHED_EPISODES
-from cprl.runs.curves import running_mean
-from cprl.runs.episodes import read_episodes
+from cprl.measuring.names import title as metric_title
+from cprl.measuring.names import unit
+from cprl.measuring.published import PHASED_RECIPE, SMOOTHED_EPISODES
+from cprl.plotting import style
+from cprl.plotting.bands import (
+    STRIP_IN,
+    add_keys,
+    bands_of,
+    draw_bands,
+    draw_strip,
+    mark_exploration,
+    published_bands,
+)
+from cprl.runs.curves import centres, curves_of, episode_of_step, phases_of, running_mean
+from cprl.runs.directory import FILE_NAME as RECIPE
+from cprl.runs.directory import read_recipe
+
+Values = NDArray[np.float64]
+
+PARTS: Final = 20
+"""A running mean takes in at most one part in so many of a training, so that short ones keep their course."""
+HEIGHTS_IN: Final = (3.1, 1.7)
+
+
+@dataclass(frozen=True, kw_only=True)
+class _Panel:
+    """What is plotted in one panel."""
+
+    name: str
+    title: str
+    unit: str
+    values: Values
+    """[R, E]."""
+    random: float | None
+    """The mean of random play."""
 
 
 def training_curve(
-    run: Path, *, title: str, random: list[Episode] | None = None, smoothed: int = SMOOTHED_EPISODES
+    run: Path,
+    *,
+    title: str,
+    random: list[Episode] | None = None,
+    smoothed: int = SMOOTHED_EPISODES,
+    exploration_steps: int | None = None,
 ) -> Path:
-    """Plots the summed return of all agents in each episode of a run, as the mean over replicas, and its
-    running mean.
+    """Plots the collective return in each episode of a run, and survival below it.
+
+    Every episode and replica is faint, the mean over replicas and its highest point bold. Running means are
+    centred. Trainings of at least 1,000 episodes have their phases as bands behind the curves; those of the
+    published curves stand above if the run repeats their experiment. A game without a harvest has one panel,
+    the return of all its agents.
 
     Args:
         run: the run's directory.
         title: what was run, with its schedule.
-        random: episodes of the random policy, whose mean return is a dashed line.
-        smoothed: the window of the running mean in episodes, plotted at its first episode as in the study.
+        random: episodes of the random policy, whose means are dashed lines.
+        smoothed: the largest window of the running means, in episodes; they take in at most 1/20 of all.
+        exploration_steps: the environment step of a replica at which exploration ends, see
+            `cprl.population.exploration_steps`; a tick marks its episode.
 
     Returns:
         The PNG, `figures/training_curve.png` of the run.
@@ -32,30 +78,111 @@ def training_curve(
     run = path("run", run)
     title = checked("title", title, TEXT).encode("utf-8", "replace").decode()
     checked("smoothed", smoothed, count(1))
+    checked("exploration_steps", exploration_steps, either(count(0), NONE))
     random = None if random is None else list(objects("random", random, Episode, "an Episode"))
-    rows = read_episodes(run)
-    has_harvest = "harvest" in rows.column_names
-    table = rows.select(["replica", "episode", "return"]).to_pydict()
-    episodes = np.array(table["episode"])
-    returns = np.zeros(int(episodes.max()) + 1)
-    np.add.at(returns, episodes, table["return"])
-    returns /= len(set(table["replica"]))
-    figure = Figure(figsize=(8, 4.5), layout="constrained")
-    axes = figure.add_subplot()
-    each = "each episode, mean of the replicas" if max(table["replica"]) else "each episode"
-    axes.plot(returns, color="#9ecae1", linewidth=0.8, label=each)
-    window = min(smoothed, max(1, len(returns) // 5))
-    mean = running_mean(returns, window)
-    axes.plot(mean, color="#08519c", linewidth=2, label=f"mean of {window} episodes from here")
-    if random:
-        level, _ = mean_return(random)
-        axes.axhline(level, color="#636363", linestyle="--", label=f"random policy, {level:.1f}")
-    axes.set(title=title, xlabel="episode")
-    axes.set_ylabel("collective return, apples" if has_harvest else "return of all agents together")
-    if has_harvest or returns.min() >= 0:
-        axes.set_ylim(0, None)
-    axes.legend(loc="lower right")
+    curves = curves_of(run)
+    panels = _panels(curves, random)
+    episodes = panels[0].values.shape[1]
+    window = min(smoothed, max(1, episodes // PARTS))
+    found = phases_of(curves, centred=True, resamples=1)
+    ours = bands_of(found[1]) if found else []
+    strips = {"published": published_bands(episodes)} if ours and _is_published(run) else {}
+    strips |= {"this run": ours} if ours else {}
+
+    heights = [STRIP_IN * len(strips)] * bool(strips) + list(HEIGHTS_IN[: len(panels)])
+    figure, every = style.new_figure(heights, title=title)
+    strip, drawn = every[: len(strips) > 0], every[len(strips) > 0 :]
+    dashed = _random_label(panels)
+    for axes, panel in zip(drawn, panels, strict=True):
+        draw_bands(axes, ours)
+        _draw(axes, panel, window, dashed)
+        axes.set_xlim(-0.5, max(episodes - 0.5, 1))
+    add_keys(drawn[0], *strips.values())
+    _mark_peak(drawn[0], panels[0], window)
+    ends = None if exploration_steps is None else episode_of_step(curves, exploration_steps)
+    mark_exploration(drawn, ends)
+    for axes in strip:
+        draw_strip(axes, strips)
+    drawn[-1].set_xlabel("episode")
+    is_over = exploration_steps is None or ends is not None
+    style.legend_below(figure, drawn, note=_note(window, is_over=is_over))
     picture = run / "figures" / "training_curve.png"
     picture.parent.mkdir(exist_ok=True)
-    figure.savefig(picture, dpi=120)
-    return picture
+    return style.save(figure, picture)
+
+
+def _panels(curves: dict[str, Values], random: list[Episode] | None) -> list[_Panel]:
+    """Collective return and survival; of a game without a harvest the return of all agents."""
+    if "collective_return" in curves:
+        return [_panel(name, curves[name], random) for name in ("collective_return", "survival_steps")]
+    returns = sum(curve for name, curve in curves.items() if name.startswith("return_"))
+    level = fmean(float(episode.return_.sum()) for episode in random) if random else None
+    values = np.asarray(returns)
+    return [
+        _Panel(name="return", title="return of all agents together", unit="", values=values, random=level)
+    ]
+
+
+def _panel(name: str, values: Values, random: list[Episode] | None) -> _Panel:
+    if random and name not in random[0].metrics:
+        raise ValueError(f"random has episodes without {name}; allowed: episodes of the run's game")
+    level = fmean(episode.metrics[name] for episode in random) if random else None
+    return _Panel(name=name, title=metric_title(name), unit=unit(name), values=values, random=level)
+
+
+def _draw(axes: Axes, panel: _Panel, window: int, dashed: str) -> None:
+    """Draws every episode, the running means and random play."""
+    replicas, episodes = panel.values.shape
+    several = replicas > 1
+    dot = "." if episodes < 3 else None  # a line needs two points
+    raw = panel.values.mean(0)
+    label = "each episode, mean of the replicas" if several else "each episode"
+    axes.plot(raw, color=style.RAW, linewidth=0.7, marker=dot, label=label, zorder=1.5)
+    at, means = centres(raw, window), running_mean(panel.values, window)
+    if several:
+        lines = axes.plot(at, means.T, color=style.REPLICA, linewidth=0.9, alpha=0.75, zorder=2)
+        lines[0].set_label("each replica, running mean")
+    label = f"mean of the {replicas} replicas, running mean" if several else "running mean"
+    axes.plot(at, means.mean(0), color=style.MEAN, linewidth=2.4, marker=dot, label=label, zorder=3)
+    if panel.random is not None:
+        axes.axhline(panel.random, **style.RANDOM_LINE, label=dashed)
+    axes.set_ylabel(panel.title)
+    if panel.values.min() >= 0:
+        axes.set_ylim(0, None)
+
+
+def _random_label(panels: list[_Panel]) -> str:
+    levels = [f"{panel.random:,.4g} {panel.unit}".strip() for panel in panels if panel.random is not None]
+    return f"random play, {', '.join(levels)}"
+
+
+def _mark_peak(axes: Axes, panel: _Panel, window: int) -> None:
+    """Marks the highest and the last running mean of the mean over replicas."""
+    mean = running_mean(panel.values.mean(0), window)
+    at, top = centres(panel.values[0], window), int(mean.argmax())
+    over = f"of {window} episodes" if window > 1 else "episode"
+    for place, marker, name in ((top, "o", "highest"), (len(mean) - 1, "s", "last")):
+        label = f"{name} mean {over}, {mean[place]:,.4g} {panel.unit}".rstrip()
+        label += f", episode {at[place]:,.0f}" if place == top else ""
+        axes.plot(
+            at[place],
+            mean[place],
+            marker=marker,
+            markersize=8,
+            markerfacecolor="white",
+            markeredgecolor=style.MEAN,
+            markeredgewidth=2,
+            linestyle="none",
+            label=label,
+            zorder=4,
+        )
+
+
+def _note(window: int, *, is_over: bool) -> str:
+    note = f"Running means are over {window} episodes, centred." if window > 1 else "Nothing is smoothed."
+    return note if is_over else f"{note} Exploration was not over at the last episode."
+
+
+def _is_published(run: Path) -> bool:
+    """Whether a run repeats the experiment whose phases the study draws."""
+    return (run / RECIPE).exists() and read_recipe(run)["recipe"] == PHASED_RECIPE

@@ -1,9 +1,9 @@
 """The results of a run, printed in the terminal."""
 
-from collections.abc import Mapping
+from collections.abc import Callable, Iterator, Mapping
 from math import isnan
 from pathlib import Path
-from statistics import fmean
+from statistics import fmean, stdev
 from typing import Final
 
 from rich.console import Console
@@ -12,21 +12,17 @@ from rich.table import Table
 from cprl.arguments import object_of, objects, path
 from cprl.checks import TEXT, checked
 from cprl.measuring.episodes import Episode
-from cprl.measuring.evaluate import mean_return
+from cprl.measuring.names import title as metric_title
 from cprl.measuring.replicas import social_metrics
 from cprl.measuring.reported import left_out
 from cprl.terminal.progress import console_of
 from cprl.viewer.streams import viewer
 
 KEPT = ("recipe.json", "episodes.parquet", "run.rrd", "checkpoints", "figures")
-METRICS: Final = {
-    "survival_steps": ("survival_steps", 2),
-    "sustainability": ("sustainability", 2),
-    "equality": ("equality", 2),
-    "peacefulness": ("peacefulness", 2),
-    "stock_left": ("apples left", 1),
-}
-"""The name and digits of each metric that is printed if the game reports it."""
+METRICS: Final = {"survival_steps": 1, "sustainability": 1, "equality": 2, "peacefulness": 1, "stock_left": 1}
+"""The metrics that are printed if the game reports them, with their digits."""
+RETURN: Final = "return of all agents together"
+UNDEFINED: Final = "undefined"
 
 
 def summarise(
@@ -57,6 +53,8 @@ def summarise(
     if not played:
         raise ValueError("played is empty; allowed: the episodes of at least one policy")
     console.print(_table(title, played))
+    for line in _notes(played):
+        console.print(line, soft_wrap=True, highlight=False, markup=False)
     if note:
         console.print(note, soft_wrap=True, highlight=False)
     missing = left_out(next(iter(played.values()))[0].reported)
@@ -71,26 +69,80 @@ def summarise(
 
 
 def _table(title: str, played: Mapping[str, list[Episode]]) -> Table:
-    """A column for each policy, a row for each number."""
+    """A column for each policy, a row for each number; the first policy is the baseline."""
     table = Table(title=title)
     table.add_column()
-    for name in played:
-        table.add_column(name, justify="right")
-    means = [mean_return(episodes) for episodes in played.values()]
-    table.add_row("mean return", *(f"{mean:.1f} ± {error:.1f}" for mean, error in means))
-    base, _ = means[0]
-    if base > 0:
-        table.add_row("relative to the first", *(f"{mean / base:.1f} x" for mean, _ in means))
-    measured = {name: [social_metrics(episode) for episode in own] for name, own in played.items()}
+    for nth, name in enumerate(played):
+        table.add_column(name if nth or len(played) == 1 else f"{name} (baseline)", justify="right")
+    has_harvest = all(episode.harvest is not None for own in played.values() for episode in own)
+    name = "collective return, apples" if has_harvest else RETURN
+    _add_returns(table, name, played, _harvests if has_harvest else _returns)
+    if has_harvest and any(_differ(own) for own in played.values()):
+        _add_returns(table, f"{RETURN}, rewards", played, _returns)
+    measured = {policy: [social_metrics(episode) for episode in own] for policy, own in played.items()}
     known = next(iter(measured.values()))[0]
-    for metric, (name, digits) in METRICS.items():
+    for metric, digits in METRICS.items():
         if metric in known:
-            table.add_row(name, *(f"{_mean(own, metric):.{digits}f}" for own in measured.values()))
+            table.add_row(metric_title(metric), *(_mean(own, metric, digits) for own in measured.values()))
     table.add_row("episodes", *(str(len(episodes)) for episodes in played.values()))
     return table
 
 
-def _mean(measured: list[dict[str, float]], name: str) -> float:
+def _returns(episode: Episode) -> float:
+    return float(episode.return_.sum())
+
+
+def _harvests(episode: Episode) -> float:
+    assert episode.harvest is not None
+    return float(episode.harvest.sum())
+
+
+def _differ(episodes: list[Episode]) -> bool:
+    """Whether rewards are something else than apples, as under fines."""
+    return any(abs(_returns(episode) - _harvests(episode)) > 1e-3 for episode in episodes)
+
+
+def _add_returns(
+    table: Table, name: str, played: Mapping[str, list[Episode]], of: Callable[[Episode], float]
+) -> None:
+    """Adds the mean of a return with its standard error, and how many times the baseline's it is."""
+    values = {policy: [of(episode) for episode in own] for policy, own in played.items()}
+    table.add_row(f"{name} (mean ± standard error)", *(_with_error(own) for own in values.values()))
+    if len(played) == 1:
+        return
+    baseline, means = next(iter(played)), [fmean(own) for own in values.values()]
+    times = [f"{mean / means[0]:.1f}" if means[0] > 0 else UNDEFINED for mean in means]
+    table.add_row(f"  times that of {_who(baseline)}", *times)
+
+
+def _who(policy: str) -> str:
+    return "random play" if policy == "random" else policy
+
+
+def _with_error(values: list[float]) -> str:
+    """A single episode has no standard error."""
+    error = f" ± {stdev(values) / len(values) ** 0.5:.1f}" if len(values) > 1 else ""
+    return f"{fmean(values):.1f}{error}"
+
+
+def _mean(measured: list[dict[str, float]], name: str, digits: int) -> str:
     """The mean of a metric over the episodes in which it is defined."""
     defined = [metrics[name] for metrics in measured if not isnan(metrics[name])]
-    return fmean(defined) if defined else float("nan")
+    return f"{fmean(defined):.{digits}f}" if defined else UNDEFINED
+
+
+def _notes(played: Mapping[str, list[Episode]]) -> Iterator[str]:
+    """Why numbers are undefined, or means of fewer episodes."""
+    for policy, own in played.items():
+        empty = sum(episode.harvest is not None and not episode.harvest.any() for episode in own)
+        if empty == len(own):
+            yield f"{policy}: nobody harvested anything, so equality and sustainability are undefined"
+        elif empty:
+            yield (
+                f"{policy}: equality and sustainability leave out {empty} of {len(own)} episodes, in which "
+                "nobody harvested anything"
+            )
+    baseline = next(iter(played))
+    of = _returns if played[baseline][0].harvest is None else _harvests
+    if len(played) > 1 and fmean(map(of, played[baseline])) <= 0:
+        yield f"times that of {_who(baseline)}: undefined, because it is not above 0"

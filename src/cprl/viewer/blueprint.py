@@ -36,7 +36,7 @@ def layout(curves: Curves, *, live: bool = False, ended: bool = False) -> Any:
     import rerun.blueprint as rrb
 
     if isinstance(curves, Scene) and curves.is_replay:
-        return _laid_out(_replay(curves.agents), timeline="frame", play_state="playing")
+        return _laid_out(_replay(curves.agents), timeline="step", play_state="playing")
     strips = 3 if curves.has_phases and (ended or not live) else 1
     return _laid_out(
         rrb.Vertical(
@@ -54,8 +54,8 @@ def layout(curves: Curves, *, live: bool = False, ended: bool = False) -> Any:
 def _laid_out(views: Any, *, timeline: str, play_state: Literal["playing", "following"]) -> Any:
     """The views in a blueprint with the viewer's other panels collapsed.
 
-    The timeline of the time panel is the axis of every plot: episodes, and in a replay frames, which are its
-    steps. Boards are played back on `frame`, which counts recorded frames alone.
+    The timeline of the time panel is the axis of every plot: episodes, and in a replay, which records all
+    its steps, steps. Boards of a run are played back on `frame`, which counts recorded frames alone.
     """
     import rerun.blueprint as rrb
 
@@ -72,7 +72,7 @@ def _replay(agents: tuple[str, ...]) -> Any:
     import rerun.blueprint as rrb
 
     return rrb.Horizontal(
-        rrb.Vertical(_world(), rrb.Tabs(_events("step"), _recipe(), active_tab=0), row_shares=[7, 2]),
+        rrb.Vertical(_world(), rrb.Tabs(_events(), _recipe(), active_tab=0), row_shares=[7, 2]),
         rrb.Vertical(
             _windows(is_wide=True),
             _plot("Harvest so far, apples", *_of(agents, "harvested")),
@@ -123,11 +123,13 @@ def _windows(*, is_wide: bool = False) -> Any:
     return rrb.Spatial2DView(name=name, origin="/windows", background=BACKGROUND)
 
 
-def _events(timeline: str = "episode") -> Any:
-    """The events, each with its number on a timeline."""
+def _events() -> Any:
+    """The events, whose texts say when; the viewer's own column is so narrow that it cuts the numbers."""
     import rerun.blueprint as rrb
+    from rerun.blueprint.encodings import TimelineColumn
 
-    columns = rrb.TextLogColumns(timeline_columns=[timeline], text_log_columns=["Body"])
+    hidden = [TimelineColumn("step", visible=False)]
+    columns = rrb.TextLogColumns(timeline_columns=hidden, text_log_columns=["Body"])
     return rrb.TextLogView(name="Events", origin="/log", columns=columns)
 
 
@@ -189,7 +191,7 @@ def _more(curves: Curves) -> Any:
 
 
 def _speed(curves: Curves) -> Any:
-    return _plot("Speed", "time/env_steps_per_s")
+    return _plot("Steps per second", "time/env_steps_per_s")
 
 
 def _recipe(curves: Curves | None = None) -> Any:

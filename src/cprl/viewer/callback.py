@@ -188,7 +188,7 @@ class ViewerCallback:
         step = episode.depletion_step or -1
         if step > 0 and (self.is_shown or not self._has_died):
             self.logger.at(step=self._step, episode=episode.episode)
-            self.logger.log_text(f"last apple taken in step {step}")
+            self.logger.log_text(f"episode {episode.episode:,}: last apple taken in step {step}")
             self._has_died = True
 
     def _log(self, episode: int, of_all: dict[str, Values]) -> None:

@@ -201,10 +201,12 @@ class RerunLogger(Logger):
         import rerun as rr
 
         at = times([self._now[0]], [self._now[1]], [self.frames])
-        what = rr.TextDocument.columns(text=[text])
+        self._send_live(name, at, rr.TextDocument.columns(text=[text]))
+
+    def _send_live(self, entity: str, at: list[Any], what: Any) -> None:
         for each in self._streams:
             if isinstance(each, LiveStream):
-                each.do(lambda recording: recording.send_columns(name, at, what))
+                each.do(lambda recording: recording.send_columns(entity, at, what))
 
     def _wait(self, name: str, step: int, values: list[float] | str) -> None:
         row = step, self._now[1], self.frames, values
@@ -213,13 +215,17 @@ class RerunLogger(Logger):
             if each.is_due:
                 send_waiting(each)
 
-    def log_states(self, name: str, states: Mapping[int, str]) -> None:
+    def log_states(self, name: str, states: Mapping[int, str], *, live_only: bool = False) -> None:
         """Logs states by the episode from which they hold; their step is the one set by `at`."""
         import rerun as rr
 
         episodes = list(states)
         at = times([self._now[0]] * len(episodes), episodes, [self.frames] * len(episodes))
-        self._send(name, at, rr.StateChange.columns(state=list(states.values())))
+        what = rr.StateChange.columns(state=list(states.values()))
+        if live_only:
+            self._send_live(name, at, what)
+        else:
+            self._send(name, at, what)
 
     def log_matrix(self, name: str, matrix: NDArray[Any], dims: Sequence[str]) -> None:
         """Logs a matrix of numbers, float32 [rows, columns], with the names of its two axes."""

@@ -7,7 +7,7 @@ from typing import Any, Final
 from cprl import presets
 from cprl.commons.game import Game
 from cprl.measuring.episodes import Episode
-from cprl.measuring.now import EXPLORING, Now
+from cprl.measuring.now import BEGINS, EXPLORING, Now
 from cprl.measuring.phases import METRICS, PHASES
 from cprl.measuring.published import PHASES_BEGIN
 from cprl.measuring.series import Values, mean_of
@@ -45,6 +45,8 @@ class Story:
         self._random: Played | None = None
         self._ended = 0
         self._is_told = False
+        # A file of a resumed run must not say so: it is shown with those before it.
+        logger.log_states(_NOW, {0: BEGINS}, live_only=True)
 
     @property
     def baseline(self) -> float | None:
@@ -81,7 +83,7 @@ class Story:
         if self._detector is not None:
             events += self._detector.add({name.removeprefix("social/"): mean for name, mean in means.items()})
         for event in events:
-            self._logger.log_text(event)
+            self._logger.log_text(f"episode {episode:,}: {event}")
         if episode % -(-self._episodes // MOST_HEADERS) == 0 or self._ended == self._episodes:
             line = self._header.line(
                 episode=self._ended,
@@ -102,9 +104,11 @@ class Story:
             return []
         epsilons = {name: mean for name, mean in means.items() if name.endswith("/epsilon")}
         before, label = self._now.label, self._now.add(value, epsilons)
-        if label == before and episode:
+        if label == before and not (episode == 0 and label == BEGINS):
             return []
         self._logger.log_states(_NOW, {episode: label})
+        if label == BEGINS:
+            return []
         ended = "exploration ends: no epsilon falls any more; " if before == EXPLORING else ""
         return [f"{ended}now {label}"]
 

@@ -1,10 +1,10 @@
-"""A first run: one DQN agent alone on `single_basic` learns live in the viewer, in some four minutes.
+"""One DQN agent alone on `single_basic` out of TorchRL's own parts, a whole training on one page to copy.
 
-    python recipes/first_run.py --watch serve
+    python examples/single_agent.py --watch serve
 
-One agent, one world, out of TorchRL's own parts, to be read from top to bottom; the other recipes let cprl do
-all of it for many agents at once. Its schedule is its own: the published one (recipes/single_basic.py, with 8
-replicas) takes an hour.
+To be read from top to bottom: TorchRL's replay buffer, `QValueActor`, `EGreedyModule` and `DQNLoss`. It has
+no checkpoints, and is several times slower than recipes, in which cprl does all this for many agents at once.
+Its schedule is its own: the published one (recipes/single_basic.py, with 8 replicas) takes an hour.
 Copy this file and change it: another map, rule, network or loss is one line.
 """
 
@@ -74,7 +74,7 @@ def main(
     settings = replace(presets.dqn_settings("single_basic"), **SHORT)
     title = f"single_basic, published rules, short schedule, {episodes} episodes"
     experiment = cprl.Experiment(
-        name="first_run",
+        name="single_agent",
         game=game,
         agents=(Learning(DQN(settings=settings)),),
         episodes=episodes,
@@ -176,5 +176,5 @@ def learn(
 
 
 if __name__ == "__main__":
-    with in_a_sentence("first_run.py"):
+    with in_a_sentence("single_agent.py"):
         tyro.cli(main)

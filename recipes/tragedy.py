@@ -1,0 +1,55 @@
+"""The tragedy of the commons in four minutes: agents who learn end worse off than agents who do not.
+
+    python recipes/tragedy.py --watch serve --linger       4 replicas of 200 episodes
+
+Four independent DQN agents on `commons`, by the rules of the study as run and a schedule twenty times shorter
+than the published one, which recipes/commons.py has.
+Copy this file and change it: another map, rule, network or loss is one line.
+"""
+
+from dataclasses import replace
+from pathlib import Path
+
+import cprl
+from cprl import presets
+from cprl.algorithms import DQN
+from cprl.output import say
+from cprl.population import Learning
+from cprl.terminal.course import course_of, in_sentences
+
+SHORT = {"learning_rate": 1e-4, "epsilon_decay_steps": 100_000, "gamma": 0.95}
+"""What differs from the published schedule, besides the number of episodes."""
+
+NEXT = """\
+This was a short schedule. The published one, 8 replicas of 4,800 episodes, takes hours:
+    .venv/bin/python recipes/commons.py --variant as_run
+Three things to try next:
+    .venv/bin/cprl watch {run}
+        the recording again, from the first episode to the last
+    .venv/bin/python recipes/tragedy.py --game.rules.freeze-steps 100 --watch serve --linger
+        another rule: who is hit by a beam stays out four times as long
+    .venv/bin/cprl crossplay {run} {run} --diagonal cross_seed
+        agents of one replica among those of another"""
+
+
+def experiment() -> cprl.Experiment:
+    """Four independent DQN agents on `commons`, on a short schedule."""
+    settings = replace(presets.dqn_settings("commons", variant="as_run"), **SHORT)
+    return cprl.Experiment(
+        name="tragedy",
+        game=presets.game("commons", variant="as_run"),
+        agents=(Learning(DQN(settings=settings)),) * 4,
+        episodes=200,
+        replicas=4,
+        evaluation_episodes=50,
+    )
+
+
+def tell(run: Path) -> None:
+    """Says what happened, and what to try next."""
+    say(in_sentences(course_of(run)))
+    say(NEXT.format(run=run))
+
+
+if __name__ == "__main__":
+    cprl.recipe_main(experiment, at_end=tell)

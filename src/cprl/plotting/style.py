@@ -1,0 +1,93 @@
+"""Sizes and colours of figures on white, and legends that lie beside the data."""
+
+from collections.abc import Sequence
+from pathlib import Path
+from textwrap import fill
+from typing import Any, Final
+
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from matplotlib.legend import Legend
+from matplotlib.patheffects import Normal, Stroke
+
+from cprl.commons.colours import agent_colour
+
+DPI: Final = 150
+WIDTH_IN: Final = 8.0
+TITLE_CHARACTERS: Final = 84
+"""The largest number of characters on a line of a title; then it wraps."""
+SMALL_PT: Final = 9
+"""The size of the smallest text. A page shows a figure of 1,200 pixels at about 800."""
+
+MEAN: Final = "#08519c"
+REPLICA: Final = "#6baed6"
+INTERVAL: Final = "#4292c6"
+RAW: Final = "#b5b5b5"
+RANDOM_LINE: Final[dict[str, Any]] = {"color": "#555555", "linestyle": "--", "linewidth": 1.4, "zorder": 2.5}
+PUBLISHED: Final = "#000000"
+MARK: Final = "#a50f15"
+_EDGE: Final = "#303030"
+AGENTS_OF_A_DASH: Final = 4
+_DASHES: Final = ("-", (0, (6, 2)), (0, (4, 1, 1, 1)), (0, (1, 1)))
+
+
+def new_figure(heights_in: Sequence[float], *, title: str) -> tuple[Figure, list[Axes]]:
+    """An empty figure with one panel below the other, and the same episodes in all.
+
+    Args:
+        heights_in: the height of each panel in inches, at least one.
+        title: above the panels.
+    """
+    lines = fill(title, TITLE_CHARACTERS)
+    height = sum(heights_in) + 1.9 + 0.2 * lines.count("\n")
+    figure = Figure(figsize=(WIDTH_IN, height), layout="constrained")
+    grid = figure.add_gridspec(len(heights_in), 1, height_ratios=list(heights_in))
+    panels: list[Axes] = []
+    for row in range(len(heights_in)):
+        panels.append(figure.add_subplot(grid[row], sharex=panels[0] if panels else None))
+    for panel in panels[:-1]:
+        panel.tick_params(labelbottom=False)
+    figure.suptitle(lines, fontsize=11)
+    return figure, panels
+
+
+def on_white(agent: int) -> dict[str, Any]:
+    """An agent's colour for a line on white, with a dark edge because some agents are as light as yellow.
+
+    Agents 4 and on have dashes too, because their colours repeat.
+    """
+    red, green, blue = agent_colour(agent)
+    edge = [Stroke(linewidth=3.2, foreground=_EDGE), Normal()]
+    dashes = _DASHES[agent // AGENTS_OF_A_DASH % len(_DASHES)]
+    return {"color": (red / 255, green / 255, blue / 255), "path_effects": edge, "linestyle": dashes}
+
+
+def legend_below(figure: Figure, panels: Sequence[Axes], *, note: str = "", columns: int = 2) -> Legend:
+    """A legend of everything in the panels that has a label, each label once, below them all.
+
+    Args:
+        figure: the figure.
+        panels: its panels.
+        note: a sentence above the entries, e.g. how the curves are smoothed.
+        columns: of the entries.
+    """
+    entries: dict[str, Any] = {}
+    for panel in panels:
+        for handle, label in zip(*panel.get_legend_handles_labels(), strict=True):
+            entries.setdefault(label, handle)
+    return figure.legend(
+        list(entries.values()),
+        [fill(label, 58) for label in entries],
+        loc="outside lower center",
+        ncols=columns,
+        fontsize=SMALL_PT,
+        title=fill(note, 110) or None,
+        title_fontsize=SMALL_PT,
+        frameon=False,
+    )
+
+
+def save(figure: Figure, path: Path) -> Path:
+    """Writes a PNG."""
+    figure.savefig(path, dpi=DPI)
+    return path

@@ -1,0 +1,265 @@
+"""Figures: everything drawn is in the legend, which lies beside the data; phases only in long trainings."""
+
+from pathlib import Path
+from types import SimpleNamespace
+
+import numpy as np
+import pyarrow as pa
+import pyarrow.parquet as pq
+import pytest
+from matplotlib.collections import PolyCollection
+from matplotlib.image import imread
+from PIL import Image
+from test_phases import CORNERS, society
+from test_results import an_episode
+
+from cprl import presets
+from cprl.algorithms import DQN, PPO
+from cprl.learners.settings import DQNSettings, RolloutSettings
+from cprl.measuring.phases import PHASES
+from cprl.measuring.published import published_experiment
+from cprl.plotting import style
+from cprl.plotting.bands import UNNAMED, bands_of, published_bands
+from cprl.population import Learning, Scripted, exploration_steps
+from cprl.reporting import figures as reported
+from cprl.reporting.result import Result
+from cprl.runs.curves import centres, episode_of_step, phases_of
+from cprl.terminal.figures import training_curve
+
+
+def a_run(folder, metrics, *, recipe=None):
+    """A run of two agents who share what is harvested; metrics are [R, E] by name."""
+    replicas, episodes = next(iter(metrics.values())).shape
+    shape = replicas, episodes, 2
+    replica, episode, agent = (axis.ravel() for axis in np.indices(shape))
+    columns = {"replica": replica, "episode": episode, "agent": agent}
+    columns |= {name: np.repeat(values.ravel(), 2) for name, values in metrics.items()}
+    columns["return"] = np.repeat(metrics["collective_return"].ravel() / 2, 2)
+    folder.mkdir(parents=True, exist_ok=True)
+    pq.write_table(pa.table(columns), folder / "episodes.parquet")
+    if recipe:
+        (folder / "recipe.json").write_text(f'{{"recipe": "{recipe}", "experiment": {{}}}}')
+    return folder
+
+
+def the_tragedy(replicas, episodes):
+    """The course of `society`, in so many episodes."""
+    course = society(replicas, 0.05)
+    at = np.linspace(0, CORNERS[-1], episodes).astype(int)
+    return {name: curves[:, at] for name, curves in course.items()}
+
+
+@pytest.fixture
+def drawn(monkeypatch):
+    """The figures that are saved, in order; not rendered."""
+    figures = []
+
+    def keep(figure, path):
+        figures.append(figure)
+        return path
+
+    monkeypatch.setattr(style, "save", keep)
+    monkeypatch.setattr(reported, "RESAMPLES", 5)
+    return figures
+
+
+def labels(figure):
+    (legend,) = figure.legends
+    return [text.get_text().replace("\n", " ") for text in legend.get_texts()]
+
+
+def note(figure):
+    return figure.legends[0].get_title().get_text().replace("\n", " ")
+
+
+def curves_panels(figure):
+    return [axes for axes in figure.axes if axes.get_ylabel()]
+
+
+def see_that_the_legend_is_whole(figure):
+    """Each line and each interval has the look of an entry; no legend touches a panel."""
+    figure.draw_without_rendering()
+    (legend,) = figure.legends
+    looks = {handle.get_color() for handle in legend.legend_handles if hasattr(handle, "get_color")}
+    looks |= {tuple(np.round(handle.get_facecolor(), 3)) for handle in legend.get_patches()}
+    for axes in curves_panels(figure):
+        boundaries = [line for line in axes.lines if line.get_color() == "#999999"]  # of bands
+        for line in set(axes.lines) - set(boundaries):
+            assert line.get_color() in looks
+        for own in axes.collections:
+            if isinstance(own, PolyCollection):
+                assert tuple(np.round(own.get_facecolor()[0], 3)) in looks
+        for patch in axes.patches:
+            assert tuple(np.round(patch.get_facecolor(), 3)) in looks
+        assert not legend.get_window_extent().overlaps(axes.get_window_extent())
+        assert axes.get_legend() is None
+
+
+def test_a_short_training_shows_its_peak_its_end_random_play_and_where_exploration_ends(tmp_path, drawn):
+    run = a_run(tmp_path / "run", the_tragedy(4, 200))
+    random = [an_episode(0, collective_return=282.0, survival_steps=1000.0)]
+    training_curve(run, title="commons", random=random, exploration_steps=50_000)
+    (figure,) = drawn
+    above, below = curves_panels(figure)
+    assert (above.get_ylabel(), below.get_ylabel()) == ("collective return, apples", "survival, steps")
+    assert (above.get_ylim()[0], below.get_ylim()[0]) == (0, 0)
+    told = " / ".join(labels(figure))
+    for words in (
+        "each episode, mean of the replicas",
+        "each replica, running mean",
+        "mean of the 4 replicas, running mean",
+        "random play, 282 apples, 1,000 steps",
+        "highest mean of 10 episodes, 5",
+        "last mean of 10 episodes, 4",
+        "exploration ends, episode 5",
+    ):
+        assert words in told
+    assert "phase" not in told
+    assert note(figure) == "Running means are over 10 episodes, centred."
+    see_that_the_legend_is_whole(figure)
+    levels = [line for line in above.lines if line.get_color() == style.RANDOM_LINE["color"]]
+    assert [(line.get_linestyle(), line.get_ydata()[0]) for line in levels] == [("--", 282.0)]
+
+
+def test_a_centred_running_mean_stands_at_the_middle_of_its_episodes(tmp_path, drawn):
+    metrics = the_tragedy(1, 60)
+    metrics["collective_return"] = np.arange(60.0)[None]
+    training_curve(a_run(tmp_path / "run", metrics), title="a line")
+    bold = next(line for line in curves_panels(drawn[0])[0].lines if line.get_color() == style.MEAN)
+    np.testing.assert_allclose(bold.get_xdata(), bold.get_ydata(), err_msg="a mean of a line lies on it")
+    assert centres(np.zeros(5), 2).tolist() == [0.5, 1.5, 2.5, 3.5]
+
+
+def test_what_is_not_over_by_the_last_episode_is_said(tmp_path, drawn):
+    training_curve(a_run(tmp_path / "run", the_tragedy(2, 40)), title="short", exploration_steps=10**6)
+    assert "exploration ends" not in " ".join(labels(drawn[0]))
+    assert note(drawn[0]).endswith("Exploration was not over at the last episode.")
+
+
+@pytest.mark.parametrize(("episodes", "has_bands"), [(999, False), (1000, True)])
+def test_phases_are_drawn_from_a_thousand_episodes_on(episodes, has_bands, tmp_path, drawn):
+    run = a_run(tmp_path / "run", the_tragedy(2, episodes), recipe="commons")
+    training_curve(run, title="commons")
+    (figure,) = drawn
+    strips = [axes for axes in figure.axes if axes not in curves_panels(figure)]
+    assert bool(strips) == has_bands
+    assert ("phase: tragedy" in labels(figure)) == has_bands
+    see_that_the_legend_is_whole(figure)
+    if has_bands:
+        rows = [label.get_text() for label in strips[0].get_yticklabels()]
+        assert rows == ["published", "this run"]
+        assert "phase: exploration" in labels(figure)
+
+
+def test_a_run_of_another_experiment_has_no_published_phases(tmp_path, drawn):
+    training_curve(a_run(tmp_path / "run", the_tragedy(1, 1000), recipe="mixed"), title="mixed")
+    assert [label.get_text() for label in drawn[0].axes[0].get_yticklabels()] == ["this run"]
+
+
+def test_phases_need_a_group_and_numbers_in_every_window():
+    curves = {**the_tragedy(2, 1200), "return_0": np.ones((2, 1200)), "return_1": np.ones((2, 1200))}
+    changes, found = phases_of(curves, resamples=1)
+    assert bands_of(found)[0][2] == "exploration"
+    assert {name for _, _, name in bands_of(found)} <= {*PHASES, UNNAMED}
+    centred, _ = phases_of(curves, centred=True, resamples=1)
+    assert [one.episode for one in centred] == [one.episode + 49.5 for one in changes]
+    nobody = curves["equality"].copy()
+    nobody[:, 300:450] = np.nan
+    assert phases_of({**curves, "equality": nobody}) is None
+    alone = {name: values for name, values in curves.items() if name != "return_1"}
+    assert phases_of(alone) is None
+
+
+def test_the_published_phases_end_with_the_figure():
+    assert published_bands(1600) == [(0, 450, "exploration"), (450, 1500, "tragedy"), (1500, 1600, "combat")]
+
+
+def test_exploration_ends_with_the_last_agents_epsilon():
+    def dqn(hold, decay, **more):
+        settings = DQNSettings(epsilon_hold_steps=hold, epsilon_decay_steps=decay, **more)
+        return Learning(DQN(settings=settings))
+
+    assert exploration_steps([dqn(800, 1000), Scripted(), dqn(0, 2000)]) == 2000
+    assert exploration_steps([Learning(PPO(settings=RolloutSettings())), Scripted()]) is None
+    assert exploration_steps([dqn(0, 10, epsilon_start=0.1, epsilon_end=0.1)]) is None, "it never falls"
+    steps = {"survival_steps": np.array([[10.0, 10.0, 10.0], [5.0, 5.0, 20.0]])}
+    assert episode_of_step(steps, 20) == 1.5, "in the second and in the third episode"
+    assert episode_of_step(steps, 31) is None
+
+
+def test_a_game_without_a_harvest_has_one_panel_and_an_agents_colour_has_an_edge(tmp_path, drawn):
+    metrics = the_tragedy(1, 30)
+    table = a_run(tmp_path / "run", metrics)
+    rows = pq.read_table(table / "episodes.parquet").drop(["collective_return", "equality", "peacefulness"])
+    pq.write_table(rows, table / "episodes.parquet")
+    training_curve(table, title="matrix")
+    assert [axes.get_ylabel() for axes in drawn[0].axes] == ["return of all agents together"]
+    assert len(style.on_white(2)["path_effects"]) == 2
+    assert style.on_white(0)["linestyle"] != style.on_white(4)["linestyle"], "its colour may be the same"
+
+
+def test_a_figure_is_written_with_150_dots_an_inch_and_a_long_title_wraps(tmp_path):
+    figure, (axes,) = style.new_figure([2.0], title="a title of many words " * 8)
+    axes.plot([1, 2], label="a line")
+    style.legend_below(figure, [axes])
+    with Image.open(style.save(figure, tmp_path / "a.png")) as picture:
+        assert round(picture.info["dpi"][0]) == 150
+        assert picture.width == 1200
+    title = figure.get_suptitle()
+    assert max(map(len, title.splitlines())) <= style.TITLE_CHARACTERS
+    assert imread(tmp_path / "a.png")[:, 0].min() == 1, "nothing reaches over the edge"
+
+
+def a_result(name, recipe, level, *, agents=()):
+    study = published_experiment(recipe)
+    rng = np.random.default_rng(0)
+    curves = {metric: level + rng.normal(0, 5, (3, 300)) for metric in study.curves}
+    curves["survival_steps"] = np.full((3, 300), 500.0)
+    game = presets.game(recipe if recipe != "two_against_random" else "two_complex", variant="as_run")
+    specs = agents or (Learning(DQN(settings=DQNSettings(epsilon_decay_steps=50_000))),)
+    return Result(
+        path=Path(name),
+        recipe={"recipe": recipe},
+        experiment=SimpleNamespace(game=game, agents=specs),
+        report={},
+        curves=curves,
+        study=study,
+    )
+
+
+def test_figures_that_are_compared_have_the_same_vertical_range(tmp_path, drawn):
+    results = [
+        a_result("a", "single_basic", 100.0),
+        a_result("b", "single_complex", 900.0),
+        a_result("c", "commons", 500.0),
+    ]
+    told = list(reported.draw_figures(results, tmp_path))
+    limits = {
+        (result.name, metric): curves_panels(figure)[0].get_ylim()
+        for (result, metric, _), figure in zip(told, drawn, strict=True)
+    }
+    assert limits["a", "collective_return"] == limits["b", "collective_return"]
+    assert limits["a", "collective_return"][1] > 900, "as high as the highest"
+    assert limits["c", "collective_return"] != limits["a", "collective_return"], "of another board"
+
+
+def test_a_figure_beside_the_published_curve_says_how_both_are_smoothed(tmp_path, drawn):
+    _, _, path = next(reported.draw_figures([a_result("a", "commons", 500.0)], tmp_path))
+    assert path == tmp_path / "a_collective_return.png"
+    assert note(drawn[0]) == "Running means over the episodes that follow: ours over 100, published over 30."
+    told = labels(drawn[0])
+    assert told[:4] == ["ours, each replica", "ours, 95 % interval", "ours, mean of 3 replicas", "published"]
+    assert "exploration ends, episode 101" in told
+    assert "phase: tragedy" in told, "of the published strip; 300 episodes have no phases of their own"
+    see_that_the_legend_is_whole(drawn[0])
+
+
+def test_one_replica_has_no_interval_and_an_experiment_of_ones_own_no_published_curve(tmp_path, drawn):
+    result = a_result("a", "commons", 500.0)
+    result.study = None
+    result.curves = {name: values[:1] for name, values in result.curves.items()}
+    (path,) = [path for _, _, path in reported.draw_figures([result], tmp_path)]
+    assert path.name == "a_collective_return.png"
+    assert labels(drawn[0]) == ["ours, one replica", "exploration ends, episode 101"]
+    assert note(drawn[0]) == "Running means over the episodes that follow: ours over 100."
+    see_that_the_legend_is_whole(drawn[0])

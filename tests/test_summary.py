@@ -1,0 +1,121 @@
+"""What a run came to, in the terminal: each number has a unit, and none is missing without a word."""
+
+import io
+import re
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from rich.console import Console
+from test_results import an_episode
+from torch import nn
+
+from cprl import CommonsEnv, Game, Rules, maps
+from cprl.measuring.names import NAMES, title, with_unit
+from cprl.measuring.replicas import over_replicas
+from cprl.runs.weights import BestWeights
+from cprl.terminal.summary import summarise
+
+
+def episode(number, harvest, **metrics):
+    apples = np.array(harvest, dtype=float)
+    known = {"collective_return": apples.sum(), "survival_steps": 900.0, **metrics}
+    return replace(an_episode(number, **known), harvest=apples, return_=apples)
+
+
+def told_of(tmp_path, **played):
+    """The cells of each row by its name, and all that was printed."""
+    output = io.StringIO()
+    summarise(tmp_path, title="a run", played=played, console=Console(file=output, width=200))
+    text = output.getvalue()
+    cells = [[cell.strip() for cell in re.split("[│┃]", line)[1:-1]] for line in text.splitlines()]
+    return {row[0]: row[1:] for row in cells if row}, text
+
+
+def test_rows_have_units_and_say_whose_return_is_the_measure(tmp_path):
+    random = [episode(0, [3, 1], equality=0.75), episode(1, [1, 1], equality=1.0)]
+    trained = [episode(0, [9, 3], equality=0.75), episode(1, [5, 1], equality=0.5)]
+    rows, _ = told_of(tmp_path, random=random, trained=trained)
+    assert rows[""] == ["random (baseline)", "trained"]
+    assert rows["collective return, apples (mean ± standard error)"] == ["3.0 ± 1.0", "9.0 ± 3.0"]
+    assert rows["times that of random play"] == ["1.0", "3.0"]
+    assert rows["survival, steps"] == ["900.0", "900.0"]
+    assert rows["equality (1 - Gini), 0 to 1"] == ["0.88", "0.62"]
+    assert rows["stock left at the end, apples"] == ["11.0", "11.0"]
+    assert rows["episodes"] == ["2", "2"]
+
+
+def test_a_policy_that_harvests_nothing_has_words_instead_of_nan(tmp_path):
+    nan = float("nan")
+    idle = [episode(number, [0, 0], equality=nan, sustainability=nan) for number in range(2)]
+    busy = [episode(0, [2, 2], equality=1.0), episode(1, [0, 0], equality=nan, sustainability=nan)]
+    rows, text = told_of(tmp_path, random=idle, trained=busy)
+    assert rows["times that of random play"] == ["undefined", "undefined"]
+    assert rows["equality (1 - Gini), 0 to 1"] == ["undefined", "1.00"]
+    assert "nan" not in text
+    assert "random: nobody harvested anything, so equality and sustainability are undefined" in text
+    assert "trained: equality and sustainability leave out 1 of 2 episodes" in text
+    assert "times that of random play: undefined, because it is not above 0" in text
+
+
+def test_one_episode_has_no_error_and_one_policy_no_baseline(tmp_path):
+    rows, text = told_of(tmp_path, trained=[episode(0, [2, 1])])
+    assert rows["collective return, apples (mean ± standard error)"] == ["3.0"]
+    assert rows[""] == ["trained"]
+    assert not {"nan", "baseline", "times"} & set(re.findall(r"\w+", text))
+
+
+def test_rewards_that_are_no_apples_have_a_row_of_their_own(tmp_path):
+    fined = replace(episode(0, [3, 1]), return_=np.array([-1.0, 1.0]))
+    rows, _ = told_of(tmp_path, random=[fined])
+    assert rows["collective return, apples (mean ± standard error)"] == ["4.0"]
+    assert rows["return of all agents together, rewards (mean ± standard error)"] == ["0.0"]
+
+
+def test_weights_that_harvest_nothing_are_never_the_best(tmp_path):
+    env = CommonsEnv(Game(map=maps.parse("..>AA..\n......."), rules=Rules(episode_steps=3)), 2, seed=1)
+    stay, forward = 7, 0
+
+    def always(action):
+        return lambda batch: batch.set(("agents", "action"), torch.full((2, 1), action))
+
+    best = BestWeights(tmp_path, {"agent_0": nn.Linear(1, 1)}, policy=always(stay), env=env, every=1)
+    best.on_episode(episode(0, [0, 0]), {})
+    assert (best.path, best.best_episode) == (None, -1)
+    best.policy = always(forward)
+    best.on_episode(episode(1, [0, 0]), {})
+    assert best.best_episode == 2
+    assert best.path.exists()
+
+
+def test_an_estimate_of_one_replica_is_printed_without_an_interval():
+    assert str(over_replicas({0: [2.0, 4.0]})) == "3"
+    assert str(over_replicas({0: [2.0, float("nan")]})) == "2, undefined in 1 of 2"
+
+
+def test_units_are_those_of_the_docs():
+    lines = (Path(__file__).parents[1] / "docs" / "metrics.md").read_text().splitlines()
+    table = [line.split("|")[1:3] for line in lines if line.startswith("| `social/")]
+    units = {name.strip(" `").removeprefix("social/"): unit.strip() for name, unit in table}
+    assert set(units) == set(NAMES) - {"yield_share"}
+    for name, unit in units.items():
+        assert NAMES[name][1].startswith(unit.replace("0..1", "0 to 1"))
+
+
+@pytest.mark.parametrize(
+    ("name", "rewards", "told"),
+    [
+        ("survival_steps", "", "survival_steps (steps)"),
+        ("agent_0/return", "apples", "agent_0/return (apples)"),
+        ("agent_0/return", "", "agent_0/return"),
+        ("of_ones_own", "apples", "of_ones_own"),
+    ],
+)
+def test_a_name_in_code_has_its_unit_in_brackets(name, rewards, told):
+    assert with_unit(name, rewards=rewards) == told
+
+
+def test_a_metric_of_ones_own_is_called_by_its_name():
+    assert title("of_ones_own") == "of_ones_own"
