@@ -34,6 +34,7 @@ def test_every_logged_name_has_its_line_in_the_docs_and_the_other_way_round(tmp_
         *("evaluation/greedy_return", "tags", "phase/found", "phase/as_published"),
         "random_play/<metric>",
         *("agent_<i>/harvested", "turn/stock", "windows/frames", "world/marks"),
+        *("wall/boards", "wall/labels", "wall/died", "decisions", "decisions/labels"),
     }
     assert logged == told - elsewhere, "by BestWeights, of many episodes or agents, of replays, static"
 

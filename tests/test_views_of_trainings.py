@@ -14,6 +14,7 @@ from cprl.viewer.callback import ViewerCallback
 from cprl.viewer.lorenz import gini, lorenz_curve
 from cprl.viewer.panels import Panels
 from cprl.viewer.stage import boards
+from cprl.viewer.wall import Wall
 
 GAME = Game(
     map=maps.parse(".A>.A\n.A#A.\n..<.A"),
@@ -158,6 +159,33 @@ def test_the_wall_marks_a_board_that_has_died(run):
         rows = [row for step, row in zip(frames, colours, strict=True) if ended < step <= ended + own.steps]
         assert all((row[0] >> 8 == 0xD55E00) == died for row in rows)
         ended, died = ended + own.steps, own.terminated
+
+
+class Listener:
+    """Takes what is logged, as a logger with viewers does."""
+
+    is_live, frames = True, 12
+
+    def __init__(self):
+        self.rows = []
+
+    def log_static(self, name, *what):
+        """Nothing."""
+
+    def log_columns(self, name, at, what, *, live_only=False):
+        self.rows.append((name, at, live_only))
+
+
+def test_viewers_get_the_wall_twice_a_second_and_the_file_does_not(run, monkeypatch):
+    _, viewer, _ = run
+    clock, listener = iter(np.arange(10.0, 20.0, 0.2)), Listener()
+    monkeypatch.setattr("cprl.viewer.wall.time.perf_counter", lambda: next(clock))
+    wall = Wall(viewer.env, listener, scene=viewer.logger.scene, recorded_steps=100)
+    for step in range(1, 10):
+        wall.on_step(step, 3, None)
+    boards_at = [at for name, at, _ in listener.rows if name == "wall/boards"]
+    assert boards_at == [((step,), (3,), (12,)) for step in (1, 4, 7)]
+    assert all(live_only for *_, live_only in listener.rows)
 
 
 def test_boards_of_many_worlds_are_drawn_as_frames_of_one(run):

@@ -13,6 +13,7 @@ from cprl.policies.assignment import AgentPolicies
 from cprl.stored import LoadedRun, load
 from cprl.training import train
 from cprl.viewer.callback import ViewerCallback
+from cprl.viewer.decisions import Decisions
 
 SEED = 20_011
 """The seed of fresh worlds; no training of ours uses it."""
@@ -93,9 +94,22 @@ def film(
         is_replay=True,
     ) as viewer:
         events = _Events(viewer)
-        train(fresh.env, {}, others=others, episodes=1, callbacks=[viewer, events])
+        train(
+            fresh.env, {}, others=others, episodes=1, callbacks=[viewer, *_decisions(viewer, fresh), events]
+        )
     assert events.episode is not None
     return target, events.episode
+
+
+def _decisions(viewer: ViewerCallback, fresh: FreshEpisode) -> list[Decisions]:
+    """What agents choose by, of games whose boards are shown."""
+    scene, game = viewer.logger.scene, fresh.run.game
+    if scene is None:
+        return []
+    shown = Decisions(
+        viewer.logger, fresh.policies, actions=game.actions, names=scene.agents, window=scene.window
+    )
+    return [shown]
 
 
 class _Events:

@@ -110,6 +110,18 @@ class LaneActor(TensorDictModuleBase):
         chosen = actions.view(self.replicas, self.agents, self.worlds).transpose(1, 2)
         return chosen.reshape(-1, self.agents)
 
+    def preferences(self, observation: Tensor) -> Tensor | None:
+        """What it chooses by: the probabilities of a stochastic policy, else the action values, for
+        observations [R x k, S, C, X, Y]; float [R x k, S, A], None for agents that act at random.
+
+        It draws nothing, so the actions that follow stay the same.
+        """
+        if self.values is None:
+            return None
+        values = self._values(observation).view(self.replicas, self.agents, self.worlds, self.actions)
+        by_world = values.transpose(1, 2).reshape(-1, self.agents, self.actions)
+        return by_world.softmax(-1) if self.stochastic else by_world
+
     def get_extra_state(self) -> dict[str, Any]:
         """The state of its random numbers; part of `state_dict`."""
         return self.rng.state_dict()

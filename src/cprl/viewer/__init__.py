@@ -8,6 +8,12 @@ Modules, in the order in which one reads them:
     events     new bests, and phases
     plots      the lines of each episode, with running means and random play
     tags       who tagged whom
+    views      the views below: which of them a training has, and when they are logged
+    wall       the boards of all replicas
+    visits     where agents go
+    turns      the stock over the turn
+    lorenz     Lorenz curve and Gini coefficient
+    decisions  in a replay: what each agent's policy says of its actions
     compiling  while code is compiled, the live header says so
     recorder   which episodes are recorded frame by frame
     frames     frames of one world, collected in memory
@@ -22,6 +28,10 @@ Modules, in the order in which one reads them:
     deadline   calls that may wait for a viewer, with deadlines
     lingering  a finished run stays served until Ctrl-C
     scenery    names and colours of what a recording shows
+    panels     several boards in one image
+    axes       plots that are not over time
+    strokes    numbers, headings and marks of agents, as lines
     stage      frames as Rerun's columns
+    tabs       the parts of the layout that show images and drawn plots
     blueprint  the layout of the viewer
 """

@@ -12,9 +12,8 @@ from collections.abc import Callable
 from typing import Any, Final, Literal
 
 from cprl.commons.colours import WINDOW_CAPTION
-from cprl.viewer.axes import BOUNDS
-from cprl.viewer.panels import Panels
-from cprl.viewer.scenery import BACKGROUND, Curves, Scene, has_lorenz, has_wall
+from cprl.viewer.scenery import BACKGROUND, Curves, Scene
+from cprl.viewer.tabs import decisions, fates, places, row
 
 _HEADER, _STRIP, _VIEW = 97, 40, 207
 """Heights in a window of 1280 x 720, in pixels: the header, a strip, boards or plots. The rows share out any
@@ -36,7 +35,7 @@ def layout(curves: Curves, *, live: bool = False, ended: bool = False) -> Any:
     import rerun.blueprint as rrb
 
     if isinstance(curves, Scene) and curves.is_replay:
-        return _laid_out(_replay(curves.agents), timeline="step", play_state="playing")
+        return _laid_out(_replay(curves), timeline="step", play_state="playing")
     strips = 3 if curves.has_phases and (ended or not live) else 1
     return _laid_out(
         rrb.Vertical(
@@ -67,7 +66,7 @@ def _laid_out(views: Any, *, timeline: str, play_state: Literal["playing", "foll
     )
 
 
-def _replay(agents: tuple[str, ...]) -> Any:
+def _replay(scene: Scene) -> Any:
     """A large board, the agents' windows, and the harvest and stock of one episode, turn by turn."""
     import rerun.blueprint as rrb
 
@@ -75,9 +74,10 @@ def _replay(agents: tuple[str, ...]) -> Any:
         rrb.Vertical(_world(), rrb.Tabs(_events(), _recipe(), active_tab=0), row_shares=[7, 2]),
         rrb.Vertical(
             _windows(is_wide=True),
-            _plot("Harvest so far, apples", *_of(agents, "harvested")),
+            decisions(scene),
+            _plot("Harvest so far, apples", *_of(scene.agents, "harvested")),
             _plot("Apples on the board", "turn/stock"),
-            row_shares=[4, 3, 2],
+            row_shares=[4, 4, 2, 2],
         ),
         column_shares=[3, 2],
     )
@@ -150,7 +150,7 @@ def _plots(curves: Curves) -> Any:
 
 def _outcome(curves: Curves) -> Any:
     """What the group harvests, how long its board lives, and how evenly it shares."""
-    return _row(
+    return row(
         "Outcome",
         _social(curves, "Harvest of all, apples", "collective_return"),
         _social(curves, "Survival, steps", "survival_steps"),
@@ -164,7 +164,7 @@ def _agents(curves: Curves) -> Any:
 
     unit = "apples" if "collective_return" in curves.metrics else "sum of rewards"
     tags = rrb.TensorView(name="Who tagged whom", origin="/tags")
-    return _row(
+    return row(
         "Agents",
         _plot(f"Return of each, {unit}", *_of(curves.agents, "return"), "evaluation/greedy_return"),
         _social(curves, "Peacefulness, steps in play", "peacefulness"),
@@ -173,7 +173,7 @@ def _agents(curves: Curves) -> Any:
 
 
 def _learning(curves: Curves) -> Any:
-    return _row(
+    return row(
         "Learning",
         _plot("Loss", *_of(curves.agents, "loss")),
         _plot("Highest Q value, apples", *_of(curves.agents, "q")),
@@ -182,7 +182,7 @@ def _learning(curves: Curves) -> Any:
 
 
 def _more(curves: Curves) -> Any:
-    return _row(
+    return row(
         "More metrics",
         _social(curves, "Apples per step", "efficiency"),
         _social(curves, "Mean time of harvest, steps", "sustainability"),
@@ -200,65 +200,17 @@ def _recipe(curves: Curves | None = None) -> Any:
     return rrb.TextDocumentView(name="Recipe", origin="/recipe")
 
 
-def _fates(curves: Curves) -> Any:
-    """All boards at once, and how long each replica's apples lasted."""
-    if not isinstance(curves, Scene):
-        return None
-    wall = _panels("All replicas; framed: died in its last episode", "wall", curves, curves.replicas)
-    return _row(
-        "Replicas",
-        wall if has_wall(curves) else None,
-        _drawn("Apples on the board, over the turn", "turn"),
-    )
-
-
-def _places(curves: Curves) -> Any:
-    """Where agents go, and how evenly they share."""
-    name = "Where agents go, first replica; bright: long"
-    return _row(
-        "Places and shares",
-        _panels(name, "visits", curves, len(curves.agents)) if isinstance(curves, Scene) else None,
-        _drawn("Lorenz curve: harvest in %", "lorenz") if has_lorenz(curves) else None,
-    )
-
-
-def _panels(name: str, origin: str, scene: Scene, count: int) -> Any:
-    """A view of several boards."""
-    bounds = Panels(count, (scene.height + 2, scene.width + 2)).bounds
-    return _flat(name, origin, bounds)
-
-
-def _drawn(name: str, origin: str) -> Any:
-    """A view of a plot that is drawn with `Axes`."""
-    return _flat(name, origin, BOUNDS)
-
-
-def _flat(name: str, origin: str, bounds: tuple[tuple[float, float], tuple[float, float]]) -> Any:
-    import rerun.blueprint as rrb
-
-    visible = rrb.VisualBounds2D(x_range=bounds[0], y_range=bounds[1])
-    return rrb.Spatial2DView(name=name, origin=f"/{origin}", background=BACKGROUND, visual_bounds=visible)
-
-
 _TABS: Final[tuple[Callable[[Curves], Any], ...]] = (
     _outcome,
     _agents,
-    _fates,
-    _places,
+    fates,
+    places,
     _learning,
     _more,
     _speed,
     _recipe,
 )
 """The tabs, each a function of `Curves` that returns its view, or None if it has nothing to show."""
-
-
-def _row(name: str, *views: Any) -> Any:
-    """The views that are there side by side, as a tab; None if there is none."""
-    import rerun.blueprint as rrb
-
-    there = [view for view in views if view is not None]
-    return rrb.Horizontal(*there, name=name) if there else None
 
 
 def _social(curves: Curves, name: str, metric: str, *, share: bool = False) -> Any:

@@ -13,6 +13,10 @@ from cprl.viewer.scenery import Curves
 _SHOWN: Final[Mapping[str, tuple[str, ...]]] = {
     "phases and new bests": tuple(dict.fromkeys(entry for name in phases.METRICS for entry in METRICS[name])),
     "who tagged whom": ("tagged_by",),
+    "the Lorenz curve": ("harvest",),
+    "all boards side by side": ("board",),
+    "where agents go": ("board",),
+    "the stock over the turn": ("board",),
     "the board and what agents see": ("board",),
 }
 """The views of a recording besides metrics, and the entries that each needs."""

@@ -108,9 +108,9 @@ def window_corners(
     return [(agent // columns * rows, agent % columns * cols) for agent in range(agents)]
 
 
-def mosaic_size(agents: int, window: tuple[int, int], *, wide: float = WINDOWS_WIDE) -> tuple[int, int]:
+def mosaic_size(agents: int, window: tuple[int, int]) -> tuple[int, int]:
     """The rows and columns of the mosaic, in pixels."""
-    corners = window_corners(agents, window, wide=wide)
+    corners = window_corners(agents, window)
     return max(row for row, _ in corners) + window[0], max(col for _, col in corners) + window[1]
 
 

@@ -111,15 +111,15 @@ class RerunLogger(Logger):
         if self._live:
             self._go_live(recording_id, layout(self.curves, live=True))
         self._all(lambda recording: recording.send_recording_name(self.exp_name))
-        self._static("/", classes(self.curves))
+        self.log_static("/", classes(self.curves))
         for entity, style in lines(self.curves).items():
-            self._static(entity, style)
+            self.log_static(entity, style)
         for entity, colours in state_colours(self.curves).items():
-            self._static(entity, colours)
-        self._static("header", rr.TextDocument.from_fields(media_type=rr.MediaType.MARKDOWN))
+            self.log_static(entity, colours)
+        self.log_static("header", rr.TextDocument.from_fields(media_type=rr.MediaType.MARKDOWN))
         if self.scene is not None:
             for entity, parts in fixed(self.scene).items():
-                self._static(entity, *parts)
+                self.log_static(entity, *parts)
         self._all(lambda recording: recording.flush(timeout_sec=FLUSH_TIMEOUT_S))
         return [each.recording for each in self._streams]
 
@@ -145,7 +145,8 @@ class RerunLogger(Logger):
         for each in self._streams:
             each.do(what)
 
-    def _static(self, entity: str, *what: Any) -> None:
+    def log_static(self, entity: str, *what: Any) -> None:
+        """Logs archetypes that hold at all times."""
         self._all(lambda recording: recording.log(entity, *what, static=True))
 
     def _send(self, entity: str, at: list[Any], what: Any) -> None:
@@ -155,10 +156,6 @@ class RerunLogger(Logger):
     def is_live(self) -> bool:
         """Whether there is a stream to viewers."""
         return any(isinstance(each, LiveStream) for each in self._streams)
-
-    def log_static(self, name: str, *what: Any) -> None:
-        """Logs archetypes that hold at all times."""
-        self._static(name, *what)
 
     def log_row(self, name: str, what: Any) -> None:
         """Logs an archetype at the time set by `at`."""
@@ -232,8 +229,7 @@ class RerunLogger(Logger):
         import rerun as rr
 
         values = np.array(matrix, np.float32)  # a copy, because a viewer gets it later
-        now = (*self._now, self.frames)
-        self._all(lambda recording: log_now(recording, name, rr.Tensor(values, dim_names=list(dims)), now))
+        self.log_row(name, rr.Tensor(values, dim_names=list(dims)))
 
     def log_frames(self, frames: Mapping[str, NDArray[Any]]) -> None:
         """Logs frames of `FrameBuffer.take`, with windows of `classes_seen`; see `stage.columns`."""
@@ -262,7 +258,7 @@ class RerunLogger(Logger):
 
         check_nesting(cfg, "cfg")
         text = cfg if isinstance(cfg, str) else as_table(dict(cfg))
-        self._static("recipe", rr.TextDocument(text, media_type=rr.MediaType.MARKDOWN))
+        self.log_static("recipe", rr.TextDocument(text, media_type=rr.MediaType.MARKDOWN))
 
     def log_video(self, name: str, video: Tensor, step: int | None = None, **kwargs: Any) -> None:
         """Logs uint8 [(1), T, C, H, W] as T images at consecutive steps from `step` on.
@@ -285,7 +281,7 @@ class RerunLogger(Logger):
             color_model="L" if images.shape[3] == 1 else "RGB",
             channel_datatype=rr.ChannelDatatype.U8,
         )
-        self._static(name, rr.Image.from_fields(format=form))
+        self.log_static(name, rr.Image.from_fields(format=form))
         count = len(images)
         at = times(range(first, first + count), [self._now[1]] * count, [self.frames] * count)
         what = rr.Image.columns(buffer=images.reshape(count, -1).copy())

@@ -7,12 +7,19 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
-from cprl.viewer.frames import mosaic_size, window_corners
+from cprl.viewer.frames import window_corners
 
 _WIDE: Final = 3.0
 """The width of half a tab of the viewer, divided by its height, about."""
 _LABEL_SHARE: Final = 0.3
 """The height of a line of text, of that of a board: texts have a size of their own on the screen."""
+
+HIGH: Final = 12
+"""The height of a panel of bars, in pixels: the largest bar has one less."""
+BELOW: Final = 4
+"""The room below bars for the names of actions."""
+BAR, APART = 5, 1
+"""The width of a bar and of the gap, in pixels."""
 
 
 class Panels:
@@ -21,16 +28,23 @@ class Panels:
     Args:
         count: the number of boards.
         size: the rows and columns of a board, in pixels.
+        columns: how many stand side by side; by default so many that they are as large as possible.
     """
 
-    def __init__(self, count: int, size: tuple[int, int]) -> None:
+    def __init__(self, count: int, size: tuple[int, int], *, columns: int | None = None) -> None:
         label = max(2, ceil(_LABEL_SHARE * size[0]))
         padded = size[0] + label, size[1]
+        corners = np.array(window_corners(count, padded, wide=_WIDE))
+        if columns is not None:
+            places = np.arange(count)
+            cells = np.stack([places // columns, places % columns], 1)
+            corners = cells * (np.array(padded) + 1)
         self.size = size
-        self.shape = mosaic_size(count, padded, wide=_WIDE)
-        """The rows and columns of the image."""
-        self.corners = np.array(window_corners(count, padded, wide=_WIDE)) + np.array((label, 0))
+        self.corners = corners + np.array((label, 0))
         """int [count, 2], the top-left (row, col) of each board."""
+        rows, width = (self.corners.max(0) + size).tolist()
+        self.shape = rows, width
+        """The rows and columns of the image."""
         self._label = label
 
     def joined(self, boards: NDArray[Any], background: Any) -> NDArray[Any]:
@@ -67,3 +81,9 @@ class Panels:
             colors=list(colours) or None,
             show_labels=False,
         )
+
+
+def decision_panels(agents: int, actions: int, window: tuple[int, int]) -> Panels:
+    """The places of the agents' panels, arranged as their windows (X, Y) are."""
+    columns = sum(row == 0 for row, _ in window_corners(agents, window))
+    return Panels(agents, (HIGH + BELOW, actions * (BAR + APART) + APART), columns=columns)

@@ -114,5 +114,6 @@ def scene_of(env: CommonsEnv, curves: Curves, *, is_replay: bool) -> Scene:
         walls=board.walls,
         sites=board.sites,
         window=env.game.observation_shape[1:],
+        actions=len(env.game.actions),
         is_replay=is_replay,
     )

@@ -92,6 +92,8 @@ class Scene(Curves):
     """(row, col) of each of the K sites, the cells where apples grow."""
     window: tuple[int, int]
     """(X, Y) of a window."""
+    actions: int = 8
+    """The number of actions A."""
     is_replay: bool = False
     """Whether it is one episode of a stored policy; then harvest and stock are plotted turn by turn, and
     there are no curves over episodes."""

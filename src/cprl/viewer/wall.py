@@ -19,6 +19,8 @@ from cprl.viewer.stage import boards, image_form
 WALL_BYTES: Final = 4_000_000
 """The target size of the wall in a file, about."""
 _LIVE_PERIOD_S: Final = 0.5
+_LIVE_ROWS: Final = 10_000
+"""From then on rows for viewers get rarer, because a server's memory holds them: period = time / rows."""
 _FEWEST_STEPS: Final = 10
 """Steps from one row of the file to the next, at least."""
 _DIED: Final = STATES["tragedy"]
@@ -29,8 +31,9 @@ _Row = tuple[int, int, int, Any, list[str], Any]
 class Wall:
     """Logs the boards of all replicas: same rules, as many fates.
 
-    Viewers get them twice a second; the file gets every `stride`-th step of the episodes whose frames are
-    recorded. A board is outlined while the last episode of its replica has ended because no apple was left.
+    Viewers get them twice a second, after hours more rarely; the file gets every `stride`-th step of the
+    episodes whose frames are recorded. A board is outlined while the last episode of its replica has ended
+    because no apple was left.
 
     Args:
         env: the worlds, one for each replica R.
@@ -50,7 +53,7 @@ class Wall:
         """Steps from one row of the file to the next."""
         self._died = np.zeros(scene.replicas, np.bool_)
         self._rows: list[_Row] = []
-        self._sent = 0.0
+        self._began, self._sent = time.perf_counter(), 0.0
         form = rr.SegmentationImage.from_fields(format=image_form(self._panels.shape), opacity=1.0)
         logger.log_static("wall/boards", form)
         logger.log_static("wall/labels", self._panels.labels())
@@ -60,9 +63,11 @@ class Wall:
         """Logs the boards if they are due; `frame` is the number of the recorded one, if any."""
         if frame is not None and step % self.stride == 0:
             self._rows.append(self._row(step, episode, frame))
-        elif self._logger.is_live and time.perf_counter() - self._sent > _LIVE_PERIOD_S:
-            self._sent = time.perf_counter()
-            self._send([self._row(step, episode, self._logger.frames)], live_only=True)
+        elif self._logger.is_live:
+            now = time.perf_counter()
+            if now - self._sent > max(_LIVE_PERIOD_S, (now - self._began) / _LIVE_ROWS):
+                self._sent = now
+                self._send([self._row(step, episode, self._logger.frames)], live_only=True)
 
     def on_episode(self, episode: Episode) -> None:
         """Notes whether the replica's board has died, and sends the rows of the episode."""

@@ -1,0 +1,187 @@
+"""Decisions: what each agent's policy says of its actions in a replay, and which one it takes."""
+
+from collections.abc import Mapping, Sequence
+from typing import Any, Final
+
+import numpy as np
+from numpy.typing import NDArray
+from tensordict import TensorDictBase
+from torch import nn
+
+from cprl import keys
+from cprl.commons.colours import agent_colour
+from cprl.measuring.episodes import Episode
+from cprl.policies.assignment import AgentPolicies, agent_indices
+from cprl.policies.lanes import LaneActor
+from cprl.viewer.logger import RerunLogger
+from cprl.viewer.panels import APART, BAR, HIGH, decision_panels
+from cprl.viewer.scenery import BACKGROUND
+
+ENTITY: Final = "decisions"
+SIGNS: Final = {  # the viewer ends at a sign that its font lacks
+    "forward": "↑",
+    "backward": "↓",
+    "left": "←",
+    "right": "→",
+    "turn_left": "L",
+    "turn_right": "R",
+    "beam": "B",
+    "stay": "S",
+}
+_TAKEN: Final = (255, 255, 255)
+_BAR_SHARE: Final = 0.75
+"""Of an agent's hue, in the bars of actions that it does not take."""
+_MOST_LABELLED: Final = 4
+"""Agents whose bars have names; those of more are too narrow, and name their actions where the pointer is."""
+
+
+class Decisions:
+    """Logs a bar for each action of each agent, the taken one white; a callback of `cprl.training`.
+
+    A row has the number of the frame that shows what the agents see, so the bars stand beside their windows.
+    Bars of action values end at the best of the moment and begin as far below the median as that is above, so
+    that one poor action does not make all others look alike; bars of probabilities are from 0 to 1. Agents
+    that have neither, scripted ones and those at random, say so.
+
+    Args:
+        logger: of the replay, whose frames are all recorded.
+        policies: the agents.
+        actions: the names of the actions.
+        names: the names of the agents.
+        window: (X, Y) of a window.
+    """
+
+    def __init__(
+        self,
+        logger: RerunLogger,
+        policies: AgentPolicies,
+        *,
+        actions: Sequence[str],
+        names: Sequence[str],
+        window: tuple[int, int],
+    ) -> None:
+        self._logger, self._names, self._actions = logger, tuple(names), tuple(actions)
+        self._actors = list(zip(map(agent_indices, policies.indices), policies.actors, strict=True))
+        self._panels = decision_panels(len(names), len(actions), window)
+        many = 2 * len(names) * len(actions) > np.iinfo(np.uint8).max
+        self._dtype = np.uint16 if many else np.uint8
+        self._kinds = [""] * len(names)
+        for agents, actor in self._actors:
+            for agent in agents:
+                self._kinds[agent] = _kind(actor)
+        self._rows: list[tuple[NDArray[np.float64], NDArray[np.int64]]] = []
+        self._step = 0
+        for entity, parts in self._fixed().items():
+            logger.log_static(entity, *parts)
+
+    def on_step(self, batch: TensorDictBase) -> None:
+        """Notes what the agents' policies say of what they saw before this turn, and what they did."""
+        self._step += 1
+        if self._step == 1:
+            return  # the first board is shown in no frame
+        observation = batch[keys.OBSERVATION]
+        values = np.full((len(self._names), len(self._actions)), np.nan)
+        for agents, actor in self._actors:
+            if isinstance(actor, LaneActor):
+                found = actor.preferences(observation[:, list(agents)])
+                if found is not None:
+                    values[list(agents)] = found[0].double().numpy(force=True)
+        self._rows.append((values, batch[keys.ACTION][0].numpy(force=True).copy()))
+
+    def on_episode(self, episode: Episode, learning: Mapping[str, float]) -> None:
+        """Sends the rows of the episode."""
+        import rerun as rr
+
+        if not self._rows:
+            return
+        values, taken = (np.stack(part) for part in zip(*self._rows, strict=True))
+        count = len(values)
+        frames = np.arange(count)
+        at = frames + 1, np.zeros(count, np.int64), frames
+        images = self._images(values, taken).reshape(count, -1)
+        self._logger.log_columns(ENTITY, at, rr.SegmentationImage.columns(buffer=images.view(np.uint8)))
+        texts = [text for row in values for text in self._texts(row)]
+        labels = rr.Points2D.columns(labels=texts).partition([len(self._names)] * count)
+        self._logger.log_columns(f"{ENTITY}/labels", at, labels)
+
+    def _images(
+        self, values: NDArray[np.float64], taken: NDArray[np.int64]
+    ) -> NDArray[np.unsignedinteger[Any]]:
+        """Bars of T frames as classes: values [T, N, A] and actions [T, N] to [T, rows, columns]."""
+        count, agents, actions = values.shape
+        heights = self._heights(values)
+        level = np.arange(HIGH)[::-1, None]
+        classes = 1 + 2 * np.arange(agents * actions).reshape(agents, actions)
+        classes = classes + (np.arange(actions) == taken[..., None])
+        bars = np.where(level < heights[..., None, None], classes[..., None, None], 0)  # [T, N, A, HIGH, 1]
+        bars = np.pad(bars.repeat(BAR, -1), ((0, 0),) * 4 + ((APART, 0),))
+        panels = bars.transpose(0, 1, 3, 2, 4).reshape(count, agents, HIGH, -1)
+        panels = np.pad(panels, ((0, 0),) * 3 + ((0, APART),))
+        whole = np.zeros((count, *self._panels.shape), self._dtype)
+        for agent, (top, left) in enumerate(self._panels.corners):
+            whole[:, top : top + HIGH, left : left + panels.shape[-1]] = panels[:, agent]
+        return whole
+
+    def _heights(self, values: NDArray[np.float64]) -> NDArray[np.int64]:
+        """The heights of bars in pixels, at least 1; 0 where there are no values."""
+        low, best = _range(np.nan_to_num(values))
+        span = (best - low)[..., None]
+        share = np.clip((values - low[..., None]) / np.where(span > 0, span, 1.0), 0.0, 1.0)
+        is_share = np.array([kind == "probabilities" for kind in self._kinds])
+        share = np.where(is_share[:, None], values, share)
+        heights = 1 + (share * (HIGH - 2)).round()
+        pixels: NDArray[np.int64] = np.nan_to_num(heights).astype(np.int64)
+        return pixels
+
+    def _texts(self, values: NDArray[np.float64]) -> list[str]:
+        low, best = _range(np.nan_to_num(values))
+        return [
+            f"{name}: Q {low[agent]:.2f} to {best[agent]:.2f}" if kind == "Q" else f"{name}: {kind}"
+            for agent, (name, kind) in enumerate(zip(self._names, self._kinds, strict=True))
+        ]
+
+    def _fixed(self) -> dict[str, list[Any]]:
+        """The form of the image, the classes of its bars, and the names of actions."""
+        import rerun as rr
+
+        rows, columns = self._panels.shape
+        kind = rr.ChannelDatatype.U16 if self._dtype is np.uint16 else rr.ChannelDatatype.U8
+        form = rr.components.ImageFormat(width=columns, height=rows, channel_datatype=kind)
+        classes = [rr.AnnotationInfo(id=0, label="", color=BACKGROUND)]
+        for agent, name in enumerate(self._names):
+            hue = tuple(round(_BAR_SHARE * part) for part in agent_colour(agent))
+            for action, what in enumerate(self._actions):
+                first = 1 + 2 * (agent * len(self._actions) + action)
+                classes.append(rr.AnnotationInfo(id=first, label=f"{name}: {what}", color=hue))
+                label = f"{name} takes: {what}"
+                classes.append(rr.AnnotationInfo(id=first + 1, label=label, color=_TAKEN))
+        parts: dict[str, list[Any]] = {
+            ENTITY: [
+                rr.AnnotationContext(classes),
+                rr.SegmentationImage.from_fields(format=form, opacity=1.0),
+            ],
+            f"{ENTITY}/labels": [self._panels.labels()],
+        }
+        if len(self._names) <= _MOST_LABELLED:
+            bars = APART + BAR / 2 + (APART + BAR) * np.arange(len(self._actions))
+            places = [(left + bar, top + HIGH) for top, left in self._panels.corners.tolist() for bar in bars]
+            signs = [SIGNS.get(action, action) for action in self._actions] * len(self._names)
+            parts[f"{ENTITY}/actions"] = [
+                rr.Points2D(places, labels=signs, radii=0.0, colors=(170, 170, 170), show_labels=True)
+            ]
+        return parts
+
+
+def _range(values: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Where bars of action values [..., A] begin and end."""
+    best = values.max(-1)
+    return np.maximum(2 * np.median(values, -1) - best, values.min(-1)), best
+
+
+def _kind(actor: nn.Module) -> str:
+    """What an actor chooses by."""
+    if not isinstance(actor, LaneActor):
+        return "scripted, has no values"
+    if actor.values is None:
+        return "acts at random"
+    return "probabilities" if actor.stochastic else "Q"
