@@ -111,7 +111,7 @@ def test_maps_show_where_agents_were_in_their_hues(run):
     assert maps_of[1, 3, 5].argmax() == np.argmax(agent_colour(1))
     visits._counts[:] = 0
     _, labels = column(path, "visits/labels", "Points2D:labels", "episode")
-    assert labels[0] == ["agent_0, episode 1", "agent_1, episode 1"]
+    assert labels[0] == ["0: episode 1", "1: episode 1"]
 
 
 @pytest.mark.parametrize(("drawing", "replicas"), [(">A", 1), ("A" * 12 + "\n" + ">" * 12, 8)])

@@ -29,7 +29,7 @@ def fates(curves: Curves) -> Any:
 
 def places(curves: Curves) -> Any:
     """Where agents go, and how evenly they share."""
-    name = "Where agents go, first replica; bright: long"
+    name = "Where agents go in the first replica, by episodes"
     return row(
         "Places and shares",
         _panels(name, "visits", curves, len(curves.agents)) if isinstance(curves, Scene) else None,

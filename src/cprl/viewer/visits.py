@@ -41,7 +41,6 @@ class Visits:
         for row, col in scene.walls:
             self._walls[row + 1, col + 1] = True
         self._hues = np.array([agent_colour(agent) for agent in range(len(scene.agents))])
-        self._names = scene.agents
         self._ended = self._logged = 0
         logger.log_static("visits/labels", self._panels.labels())
 
@@ -65,8 +64,8 @@ class Visits:
         image = self._panels.joined(self.maps(), PALETTE[GROUND])
         self._logger.log_row("visits", rr.Image(image))
         first, last = self._logged + 1, max(self._ended, self._logged + 1)
-        episodes = f"episode {last}" if first == last else f"episodes {first} to {last}"
-        texts = [f"{name}, {episodes}" for name in self._names]
+        episodes = f"episode {last}" if first == last else f"{first} to {last}"
+        texts = [f"{agent}: {episodes}" for agent in range(len(self._agents))]
         self._logger.log_row("visits/labels", rr.Points2D.from_fields(labels=texts))
         self._counts[:] = 0
         self._logged = self._ended
