@@ -10,7 +10,7 @@ VIEWER_PACKAGES := mesa-vulkan-drivers libvulkan1 chromium chromium-driver
 .PHONY: run docs-live lint test fuzz test-slow test-gpu test-viewer viewer-packages check bench bench-gpu clean
 
 run: $(INSTALLED)
-	$(BIN)/python recipes/tragedy.py --watch serve
+	$(BIN)/python recipes/tragedy.py --watch serve --linger --no-keep-checkpoint
 
 # Replays of the results in docs/results, in a browser; PORT takes another port than 8765.
 docs-live: $(INSTALLED)

@@ -24,12 +24,12 @@ NEXT = """\
 This was a short schedule. The published one, 8 replicas of 4,800 episodes, takes hours:
     .venv/bin/python recipes/commons.py --variant as_run
 Three things to try next:
-    .venv/bin/cprl watch {run}
-        the recording again, from the first episode to the last
+    .venv/bin/cprl film {run} --out tragedy.gif
+        one episode of the trained agents as a film
+    .venv/bin/cprl play {run}
+        play among them yourself
     .venv/bin/python recipes/tragedy.py --game.rules.freeze-steps 100 --watch serve --linger
-        another rule: who is hit by a beam stays out four times as long
-    .venv/bin/cprl crossplay {run} {run} --diagonal cross_seed
-        agents of one replica among those of another"""
+        another rule: who is hit by the beam stays out four times as long"""
 
 
 def experiment() -> cprl.Experiment:
