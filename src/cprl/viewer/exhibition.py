@@ -150,10 +150,9 @@ class Exhibition:
                 stacklevel=4,
             )
             return
-        spent, is_first = self._clock() - began, self.steps == self._count
-        if is_first:  # much of it was compiling
-            spent = 0.0
-        self._due = max(self._due, began + min(spent / MOST_SHARE, LONGEST_S))
+        spent = self._clock() - began
+        is_first = self.steps == self._count  # much of it was compiling
+        self._due = max(self._due, began + (0.0 if is_first else min(spent / MOST_SHARE, LONGEST_S)))
         affordable = int(MOST_SHARE * BATCH_S / max(spent / self._count, 1e-9))
         self._count = max(1, min(STEPS_PER_S, affordable))
         frames = self._recorder.take()
