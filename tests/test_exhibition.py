@@ -189,8 +189,8 @@ def test_a_slow_exhibition_takes_one_percent_of_the_time(seconds, tmp_path, monk
     while kept.now < 200:
         kept.now += 0.01
         kept.exhibition.on_step(episode=0)
-    assert len(played) * seconds <= 0.011 * kept.now
-    assert len(played) * seconds >= 0.007 * kept.now
+    later = len(played) - STEPS_PER_S  # the first ones compile, which is not counted
+    assert 0.007 * kept.now <= later * seconds <= 0.011 * kept.now
 
 
 def test_it_plays_the_weights_and_the_exploration_of_the_moment(tmp_path):

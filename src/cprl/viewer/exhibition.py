@@ -32,6 +32,9 @@ MOST_SHARE: Final = 0.01
 """The share of the training's wall time that its thread may spend on the exhibition: where a step of it takes
 longer than 0.9 ms, it plays fewer."""
 
+LONGEST_S: Final = 10.0
+"""The longest time that a viewer sees the same board, if a step took exceptionally long."""
+
 _BOARD: Final = "world"
 """Where the entities of the recorded board are."""
 
@@ -148,7 +151,8 @@ class Exhibition:
             )
             return
         spent = self._clock() - began
-        self._due = max(self._due, began + spent / MOST_SHARE)
+        is_first = self.steps == self._count  # much of it was compiling
+        self._due = max(self._due, began + (0.0 if is_first else min(spent / MOST_SHARE, LONGEST_S)))
         affordable = int(MOST_SHARE * BATCH_S / max(spent / self._count, 1e-9))
         self._count = max(1, min(STEPS_PER_S, affordable))
         frames = self._recorder.take()
