@@ -138,6 +138,7 @@ def test_watch_opens_all_recordings_of_a_run_as_one(tmp_path, monkeypatch, capsy
     from cprl import cli
 
     opened = []
+    monkeypatch.setenv("DISPLAY", ":9")  # without one it is served until Ctrl-C
     monkeypatch.setattr(cli.os, "execvp", lambda program, command: opened.append(command))
     monkeypatch.setattr("sys.argv", ["cprl", "watch", str(tmp_path)])
     with pytest.raises(SystemExit, match=r"cprl: .* holds no recording"):
