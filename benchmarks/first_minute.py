@@ -16,6 +16,7 @@ import subprocess
 import sys
 import tempfile
 import time
+import warnings
 from collections.abc import Callable
 from pathlib import Path
 from threading import Thread
@@ -66,28 +67,32 @@ class Run:
     def _save(self, addresses: list[str]) -> None:
         for number, address in enumerate(addresses):
             target = self.folder / f"served-{number}.rrd"
-            command = [str(VIEWER), address, "--save", str(target)]
+            command = [str(VIEWER), address, "--port", "auto", "--save", str(target)]
             self._savers.append(
                 subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
             )
         self.addresses = addresses
 
     def look(self) -> None:
-        """Notes which entities have come."""
+        """Notes which columns have come, as "/entity Component:field"."""
         for path in self.folder.glob("served-*.rrd"):
             try:
-                chunks = RrdReader(path).stream()
-                found = {str(chunk.entity_path) for chunk in chunks}
+                with warnings.catch_warnings():
+                    warnings.simplefilter("ignore")  # the file has no footer yet
+                    batches = [
+                        (str(own.entity_path), own.to_record_batch()) for own in RrdReader(path).stream()
+                    ]
             except Exception:  # a file of which half a chunk is written
                 continue
-            for entity in found - set(self.entities):
-                self.entities[entity] = self.age_s
+            for entity, batch in batches:
+                for column in batch.schema.names:
+                    self.entities.setdefault(f"{entity} {column}", self.age_s)
 
     def line(self, what: str) -> float | None:
         return next((at for at, text in self.lines if what in text), None)
 
-    def entity(self, *starts: str) -> float | None:
-        return min((at for name, at in self.entities.items() if name.startswith(starts)), default=None)
+    def column(self, *names: str) -> float | None:
+        return min((at for name, at in self.entities.items() if name in names), default=None)
 
     def end(self) -> None:
         if self.process.poll() is None:
@@ -128,10 +133,13 @@ def main(*, cold: bool = False, pictures: Path | None = None, size: tuple[int, i
     for what, at in (
         ("imports alone, in a process of their own", imports_s),
         ("address", run.line("Watch live")),
-        ("first board", run.entity("/exhibition/board", "/world/board")),
+        (
+            "first board",
+            run.column(*(f"/{where}/board SegmentationImage:buffer" for where in ("exhibition", "world"))),
+        ),
         ("first line about compiling", run.line("compiling")),
-        ("first curve", run.entity("/social")),
-        ("end of training and evaluation: the table", run.line("mean return")),
+        ("first point of a curve", run.column("/social/collective_return Scalars:scalars")),
+        ("end of training and evaluation: the table", run.line("collective return")),
         ("all said, still served", run.line("stays served")),
     ):
         print(f"| {what} | {'never' if at is None else f'{at:.1f}'} |")

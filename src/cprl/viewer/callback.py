@@ -123,6 +123,7 @@ class ViewerCallback:
         self._tags = Tags(self.logger, len(self._agents)) if has_tags else None
         self._step = self._episode = 0
         self._shows_next = self._has_died = False
+        self._is_recording = self.is_shown
         self._rate_at = time.perf_counter()
         self._rate_step = 0
         self.logger.log_hparams({"run": run.name, **(recipe or {})})
@@ -141,13 +142,16 @@ class ViewerCallback:
         Otherwise it only counts: reading a tensor each turn would cost a training some percent.
         """
         self._step += 1
+        if not self._is_recording and self._step % self._views.sampled:
+            return  # nothing is due; whatever runs here displaces a training's data from the fast caches
+        self._is_recording = self.is_shown
         if self.exhibition is not None:
             self.exhibition.on_step(episode=self._episode)
         self._views.on_step(self._step, self._episode, self._record(batch))
 
     def _record(self, batch: TensorDictBase) -> int | None:
         """Copies a frame if this episode's are recorded; returns its number, None if there is none."""
-        if self._recorder is None or not self.is_shown:
+        if self._recorder is None or not self._is_recording:
             return None
         if keys.entry(keys.entry(batch, "next"), keys.DONE)[
             0, 0
@@ -177,6 +181,7 @@ class ViewerCallback:
             self._stop_notice()
             self.logger.at(step=self._step, episode=episode.episode)
             self._log(episode.episode, of_all)
+        self._is_recording = self.is_shown
 
     def _show_status(self, status: str) -> None:
         """Shows a status in the header of the live view; from any thread."""
@@ -282,6 +287,7 @@ class ViewerCallback:
         """Continues from a state that `state_dict` returned."""
         self._step = self._rate_step = int(state["step"])
         self._episode, self._shows_next = int(state["episode"]), bool(state["shows_next"])
+        self._is_recording = self.is_shown
         self.logger.frames = int(state["frames"])
         self._series.load_state_dict(state["series"])
         self.plots.load_state_dict(state.get("plots", {}))

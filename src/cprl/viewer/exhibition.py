@@ -4,6 +4,7 @@ import time
 import warnings
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import AbstractContextManager
+from dataclasses import dataclass
 from functools import partial
 from threading import Event
 from typing import Any, Final, Protocol
@@ -236,18 +237,40 @@ def _send_frames(
     text = rr.Points2D([place], labels=[caption], show_labels=True, radii=_THIN, colors=[(255, 255, 255)])
     recording.log("exhibition/caption", text, static=True)
     count = len(frames["step"])
-    beams: list[bool] = np.any(frames["beams"], axis=(1, 2)).tolist()
-    out: list[bool] = np.any(np.logical_not(frames["in_play"]), axis=1).tolist()
+    # Converted once for all frames: for each of them it would take most of the time of sending.
+    converted = [
+        (_renamed(entity), rows.tolist(), [_whole(column) for column in columns])
+        for entity, (rows, columns) in board_columns(scene, frames).items()
+    ]
     for at in range(count):
-        frame = {name: column[at : at + 1] for name, column in frames.items()}
-        is_first, since = at == 0, slice(max(at - 1, 0), at + 1)
-        shown = board_columns(
-            scene, frame, beams=is_first or any(beams[since]), out=is_first or any(out[since])
-        )
-        for entity, (_, what) in shown.items():
-            recording.send_columns(_renamed(entity), [], what)
+        for entity, rows, columns in converted:
+            if at in rows:
+                row = rows.index(at)
+                recording.send_columns(entity, [], [column.row(row) for column in columns])
         if at + 1 < count and wait(BATCH_S / count):
             return
+
+
+@dataclass(frozen=True)
+class _Column:
+    """A component of several frames, in place of `rerun.ComponentColumn`, from which it is."""
+
+    descriptor: Any
+    rows: Any
+    """A `pyarrow.ListArray` with a list for each frame."""
+
+    def row(self, number: int) -> "_Column":
+        return _Column(self.descriptor, self.rows.slice(number, 1))
+
+    def component_descriptor(self) -> Any:
+        return self.descriptor
+
+    def as_arrow_array(self) -> Any:
+        return self.rows
+
+
+def _whole(column: Any) -> _Column:
+    return _Column(column.component_descriptor(), column.as_arrow_array())
 
 
 def _renamed(entity: str) -> str:

@@ -26,7 +26,8 @@ from cprl.viewer.sending import FLUSH_TIMEOUT_S, LiveStream, Stream
 from cprl.viewer.stage import columns, fixed
 from cprl.viewer.streams import REPLAY, RUN, Live, open_file, open_live
 
-_LIVE_PERIOD_S: Final = 1.0
+_LIVE_PERIOD_S: Final = 4.0
+"""Sending a dozen numbers takes some ten milliseconds, in which a training waits for Python's lock."""
 _FILE_PERIOD_S: Final = 60.0
 """Each batch of numbers adds about forty kilobytes to the file, however few they are."""
 
@@ -34,7 +35,7 @@ _FILE_PERIOD_S: Final = 60.0
 class RerunLogger(Logger):
     """A TorchRL logger that writes a Rerun recording; names become entities, `social/equality` and so on.
 
-    Numbers are buffered in memory and sent as columns: to the viewer about every second, to the file about
+    Numbers are buffered in memory and sent as columns: to viewers about every four seconds, to the file about
     every minute. Every row carries the timelines `step` (environment steps of the run), `episode` and `frame`
     (frames recorded so far). The file and the live recording are two streams with the same recording id. If
     one fails, the logger warns once, drops it and continues with the other.

@@ -92,10 +92,8 @@ def columns(scene: Scene, frames: Frames) -> dict[str, tuple[NDArray[np.intp], A
     return shown
 
 
-def board_columns(
-    scene: Scene, frames: Frames, *, beams: bool = True, out: bool = True
-) -> dict[str, tuple[NDArray[np.intp], Any]]:
-    """`columns` of the board alone, on request without beams or agents out of play."""
+def board_columns(scene: Scene, frames: Frames) -> dict[str, tuple[NDArray[np.intp], Any]]:
+    """`columns` of the board alone."""
     count, agents = frames["in_play"].shape
     everywhere = np.arange(count)
     shown = {
@@ -104,11 +102,10 @@ def board_columns(
     }
     if len(marks(agents).owner):
         shown["world/marks"] = everywhere, _lines(marks(agents), frames)
-    if beams:
-        covered = beam_pictures(frames["beams"])
-        changed = _changes(covered)
-        shown["world/beams"] = changed, _pictures(covered[changed])
-    return shown | _out(frames) if out else shown
+    covered = beam_pictures(frames["beams"])
+    changed = _changes(covered)
+    shown["world/beams"] = changed, _pictures(covered[changed])
+    return shown | _out(frames)
 
 
 def _pictures(images: Bytes) -> Any:

@@ -1,6 +1,7 @@
 """Views: the wall of replicas, where agents go, the stock over the turn and the Lorenz curve."""
 
 from collections.abc import Mapping
+from math import gcd
 from typing import Any, Final
 
 from cprl.envs.commons_env import CommonsEnv
@@ -9,7 +10,7 @@ from cprl.viewer.logger import RerunLogger
 from cprl.viewer.lorenz import Lorenz
 from cprl.viewer.scenery import Curves, Scene, has_lorenz, has_wall
 from cprl.viewer.turns import Turns
-from cprl.viewer.visits import Visits
+from cprl.viewer.visits import SAMPLED_EVERY, Visits
 from cprl.viewer.wall import Wall
 
 LONGEST: Final = 50
@@ -46,11 +47,15 @@ class Views:
             self.turns = Turns(env, logger)
         replayed = isinstance(curves, Scene) and curves.is_replay
         self.lorenz = Lorenz(logger, len(curves.agents)) if has_lorenz(curves) and not replayed else None
+        self.sampled = 1 if self.turns is None else gcd(SAMPLED_EVERY, self.turns.stride)
+        """Steps from one look at the worlds to the next where no frame is recorded."""
         self._logged = 0
         self._ended = 0
 
     def on_step(self, step: int, episode: int, frame: int | None) -> None:
         """Looks at the worlds after a step, if a view is due; `frame` is the number of the recorded one."""
+        if frame is None and step % self.sampled:
+            return
         if self.wall is not None:
             self.wall.on_step(step, episode, frame)
         if self.visits is not None and self.turns is not None:
