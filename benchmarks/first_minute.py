@@ -18,6 +18,7 @@ import tempfile
 import time
 import warnings
 from collections.abc import Callable
+from contextlib import suppress
 from pathlib import Path
 from threading import Thread
 
@@ -76,17 +77,11 @@ class Run:
     def look(self) -> None:
         """Notes which columns have come, as "/entity Component:field"."""
         for path in self.folder.glob("served-*.rrd"):
-            try:
-                with warnings.catch_warnings():
-                    warnings.simplefilter("ignore")  # the file has no footer yet
-                    batches = [
-                        (str(own.entity_path), own.to_record_batch()) for own in RrdReader(path).stream()
-                    ]
-            except Exception:  # a file of which half a chunk is written
-                continue
-            for entity, batch in batches:
-                for column in batch.schema.names:
-                    self.entities.setdefault(f"{entity} {column}", self.age_s)
+            with warnings.catch_warnings(), suppress(Exception):  # of the last chunk, half of it may be there
+                warnings.simplefilter("ignore")  # the file has no footer yet
+                for chunk in RrdReader(path).stream():
+                    for column in chunk.to_record_batch().schema.names:
+                        self.entities.setdefault(f"{chunk.entity_path} {column}", self.age_s)
 
     def line(self, what: str) -> float | None:
         return next((at for at, text in self.lines if what in text), None)
