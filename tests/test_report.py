@@ -120,7 +120,7 @@ def test_a_stored_policy_plays_again_and_every_step_is_recorded(run, tmp_path, c
     assert 0 <= played.harvest[0] - harvested[-1][0] <= 1, "told turn by turn, all but the last turn"
     views = ["Apples on the board", "Board", "Events", "Harvest so far, apples", "Recipe"]
     assert sorted(views_of(path))[:5] == views, "no empty plots of a training"
-    assert len(views_of(path)) == 6, "and what the agents see"
+    assert len(views_of(path)) == 7, "and what the agents see, and what their policies say"
     _, again = film(run, tmp_path / "b.rrd", replica=1, episode=3)
     assert again.harvest.tolist() == played.harvest.tolist()
     assert again.shots.tolist() == played.shots.tolist()

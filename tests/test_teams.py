@@ -214,7 +214,9 @@ def test_a_teams_run_is_built_again_and_its_members_play_on_frozen(tmp_path, mon
     monkeypatch.chdir(tmp_path)
     members = [Team(TEAMS["QMIX"], (0, 1)), Team(TEAMS["IPPO"], (2, 3), reward="individual")]
     run, networks = ran(tmp_path, members)
-    assert "trained, epsilon 0.05" in " ".join(capsys.readouterr().out.split())
+    told = capsys.readouterr().out
+    assert "trained, epsilon" in told
+    assert " 0.05 ┃" in told
     loaded = cprl.load(run)
     assert [spec.algorithm for spec in loaded.specs] == [*[TEAMS["QMIX"]] * 2, *[TEAMS["IPPO"]] * 2]
     assert len(networks) == 8

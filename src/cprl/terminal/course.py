@@ -6,7 +6,7 @@ from math import nan, sqrt
 from pathlib import Path
 from typing import Final
 
-from cprl.arguments import path
+from cprl.arguments import object_of, path
 from cprl.runs.curves import as_curves, curves_of, running_mean
 from cprl.runs.episodes import read_table
 
@@ -82,7 +82,12 @@ def course_of(run: Path) -> Course:
 
 
 def in_sentences(course: Course) -> str:
-    """Four sentences: the peak, what came after it, how long boards last, and what that means."""
+    """Four sentences: the peak, what came after it, how long boards last, and what that means.
+
+    Raises:
+        ValueError: for anything else than a course.
+    """
+    object_of("course", course, Course, "a Course, see course_of")
     own = course
     over, change = own.peak_return / own.random_return, own.last_return / own.peak_return - 1
     last = min(LAST_EPISODES, own.episodes)
