@@ -149,9 +149,7 @@ def wait(run: Run, is_there: Callable[[], bool]) -> None:
 def take_pictures(run: Run, folder: Path, size: tuple[int, int]) -> None:
     """Pictures of the viewer at `LATER_S`, and when the run has ended."""
     folder.mkdir(parents=True, exist_ok=True)
-    with native_viewer(connect_to=run.addresses[0], size=size) as client:
-        for address in run.addresses[1:]:
-            client.open(address)
+    with native_viewer(connect_to=run.addresses, size=size) as client:
         for moment in LATER_S:
             wait(run, lambda moment=moment: run.age_s >= moment)
             (folder / f"{size[0]}-{moment:.0f}s.png").write_bytes(client.take_screenshot())

@@ -36,7 +36,7 @@ def main(
     live = source.startswith("rerun+")
     if not live and not Path(source).is_file():
         raise SystemExit(f"{source} is neither a recording nor an address (rerun+http://...)")
-    with native_viewer(connect_to=source if live else None, size=size) as client:
+    with native_viewer(connect_to=[source] if live else (), size=size) as client:
         if not live:
             client.open(str(Path(source).resolve()))
         time.sleep(1 + live_s)

@@ -96,7 +96,7 @@ def _top(curves: Curves, *, live: bool) -> Any:
     if not isinstance(curves, Scene):
         return _events()
     boards = _boards(live=live)
-    return rrb.Horizontal(boards, _windows(), _events(), column_shares=[5, 3, 3])
+    return rrb.Horizontal(boards, _windows(live=live), _events(), column_shares=[5, 3, 3])
 
 
 def _boards(*, live: bool) -> Any:
@@ -115,11 +115,13 @@ def _world(name: str = "Board") -> Any:
     return rrb.Spatial2DView(name=name, origin="/world", background=BACKGROUND)
 
 
-def _windows(*, is_wide: bool = False) -> Any:
-    """The windows, with the caption that fits."""
+def _windows(*, is_wide: bool = False, live: bool = False) -> Any:
+    """The windows, with the caption that fits; live they are those of the recorded episode."""
     import rerun.blueprint as rrb
 
     name = f"What agents see, {WINDOW_CAPTION}" if is_wide else "Windows: self blue, others red"
+    if live:
+        name = "Recorded windows: self blue, others red"
     return rrb.Spatial2DView(name=name, origin="/windows", background=BACKGROUND)
 
 
