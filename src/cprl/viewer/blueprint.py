@@ -121,7 +121,7 @@ def _windows(*, is_wide: bool = False, live: bool = False) -> Any:
 
     name = f"What agents see, {WINDOW_CAPTION}" if is_wide else "Windows: self blue, others red"
     if live:
-        name = "Recorded windows: self blue, others red"
+        name = "Recorded: self blue, others red"
     return rrb.Spatial2DView(name=name, origin="/windows", background=BACKGROUND)
 
 
