@@ -1,7 +1,11 @@
 """What the tests share: small boards that are never square, and a quiet, seeded torch."""
 
+from dataclasses import replace
+
 import pytest
 import torch
+
+from cprl import presets
 
 
 @pytest.fixture(autouse=True)
@@ -9,3 +13,17 @@ def seeded_torch() -> None:
     """TorchRL's modules draw from torch's global generator; every test starts it anew."""
     torch.manual_seed(0)
     torch.set_num_threads(1)
+
+
+@pytest.fixture
+def shorter_episodes(monkeypatch, request):
+    """Episodes of 60 steps in published games, but for slow tests."""
+    if "slow" in request.keywords:
+        return
+    game = presets.game
+
+    def shorter(board, *, variant="published"):
+        whole = game(board, variant=variant)
+        return replace(whole, rules=replace(whole.rules, episode_steps=60))
+
+    monkeypatch.setattr(presets, "game", shorter)

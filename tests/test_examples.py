@@ -2,7 +2,6 @@
 
 import importlib.util
 import json
-from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -22,19 +21,7 @@ _SPEC = importlib.util.spec_from_file_location(
 EXAMPLE = importlib.util.module_from_spec(_SPEC)
 _SPEC.loader.exec_module(EXAMPLE)
 
-
-@pytest.fixture(autouse=True)
-def shorter_episodes(monkeypatch, request):
-    """Episodes of 60 steps, but for slow tests."""
-    if "slow" in request.keywords:
-        return
-    game = presets.game
-
-    def shorter(board, *, variant="published"):
-        whole = game(board, variant=variant)
-        return replace(whole, rules=replace(whole.rules, episode_steps=60))
-
-    monkeypatch.setattr(presets, "game", shorter)
+pytestmark = pytest.mark.usefixtures("shorter_episodes")
 
 
 def run_in_miniature(tmp_path, capsys, **arguments):

@@ -25,6 +25,8 @@ from cprl.training import train
 
 RECIPES = Path(__file__).parents[1] / "recipes"
 
+pytestmark = pytest.mark.usefixtures("shorter_episodes")
+
 
 def recipe(name, folder=RECIPES):
     spec = importlib.util.spec_from_file_location(name, folder / f"{name}.py")
@@ -38,20 +40,6 @@ def run_recipe(name, out, *, own=None, watch="file", **changes):
     experiment = recipe(name).experiment(**(own or {}))
     changes = {"engine": "eager", **changes}
     return cprl.run(replace(experiment, **changes), out, watch=watch)
-
-
-@pytest.fixture(autouse=True)
-def shorter_episodes(monkeypatch, request):
-    """Episodes of 60 steps, but for slow tests."""
-    if "slow" in request.keywords:
-        return
-    game = presets.game
-
-    def shorter(board, *, variant="published"):
-        whole = game(board, variant=variant)
-        return replace(whole, rules=replace(whole.rules, episode_steps=60))
-
-    monkeypatch.setattr(presets, "game", shorter)
 
 
 def run_in_miniature(tmp_path, capsys, **arguments):

@@ -142,16 +142,18 @@ class RerunLogger(Logger):
         """How to watch live: "browser" and "native"; empty where it is not served."""
         return self.live.addresses
 
-    def _all(self, what: Callable[[Any], object]) -> None:
+    def _all(self, what: Callable[[Any], object], *, live_only: bool = False) -> None:
+        """Calls a function with each stream, or with that to viewers alone."""
         for each in self._streams:
-            each.do(what)
+            if isinstance(each, LiveStream) or not live_only:
+                each.do(what)
 
     def log_static(self, entity: str, *what: Any) -> None:
         """Logs archetypes that hold at all times."""
         self._all(lambda recording: recording.log(entity, *what, static=True))
 
-    def _send(self, entity: str, at: list[Any], what: Any) -> None:
-        self._all(lambda recording: recording.send_columns(entity, at, what))
+    def _send(self, entity: str, at: list[Any], what: Any, *, live_only: bool = False) -> None:
+        self._all(lambda recording: recording.send_columns(entity, at, what), live_only=live_only)
 
     @property
     def is_live(self) -> bool:
@@ -167,9 +169,7 @@ class RerunLogger(Logger):
         self, name: str, at: tuple[Numbers, Numbers, Numbers], what: Any, *, live_only: bool = False
     ) -> None:
         """Logs rows at steps, episodes and frames of their own; `live_only` for viewers alone."""
-        for each in self._streams:
-            if isinstance(each, LiveStream) or not live_only:
-                each.do(lambda recording: recording.send_columns(name, times(*at), what))
+        self._send(name, times(*at), what, live_only=live_only)
 
     def at(self, *, step: int, episode: int) -> None:
         """Sets the time of subsequent logs that have no step of their own."""
@@ -199,12 +199,7 @@ class RerunLogger(Logger):
         import rerun as rr
 
         at = times([self._now[0]], [self._now[1]], [self.frames])
-        self._send_live(name, at, rr.TextDocument.columns(text=[text]))
-
-    def _send_live(self, entity: str, at: list[Any], what: Any) -> None:
-        for each in self._streams:
-            if isinstance(each, LiveStream):
-                each.do(lambda recording: recording.send_columns(entity, at, what))
+        self._send(name, at, rr.TextDocument.columns(text=[text]), live_only=True)
 
     def _wait(self, name: str, step: int, values: list[float] | str) -> None:
         row = step, self._now[1], self.frames, values
@@ -219,11 +214,7 @@ class RerunLogger(Logger):
 
         episodes = list(states)
         at = times([self._now[0]] * len(episodes), episodes, [self.frames] * len(episodes))
-        what = rr.StateChange.columns(state=list(states.values()))
-        if live_only:
-            self._send_live(name, at, what)
-        else:
-            self._send(name, at, what)
+        self._send(name, at, rr.StateChange.columns(state=list(states.values())), live_only=live_only)
 
     def log_matrix(self, name: str, matrix: NDArray[Any], dims: Sequence[str]) -> None:
         """Logs a matrix of numbers, float32 [rows, columns], with the names of its two axes."""
@@ -309,9 +300,7 @@ class RerunLogger(Logger):
         """Gives the live view the layout of a run that has ended, with its phases."""
         if self.curves.has_phases:
             ended = layout(self.curves, live=True, ended=True)
-            for each in self._streams:
-                if isinstance(each, LiveStream):
-                    each.do(lambda recording: recording.send_blueprint(ended))
+            self._all(lambda recording: recording.send_blueprint(ended), live_only=True)
 
     @property
     def is_served(self) -> bool:
