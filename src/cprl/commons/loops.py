@@ -97,7 +97,6 @@ def one_payments(p: Payments, b: int) -> Payments:
         p.transfers[b],
         p.violated[b],
         p.counts[b],
-        p.institutions[b],
         p.in_force[b],
     )
 
