@@ -175,7 +175,7 @@ def test_an_appointed_sanctioner_holds_office_for_its_period():
     sanctioner = [Sanctioner(override_prob=1.0, period_episodes=2)]
     found = episodes(sanctioner, count=80, decisions=(0, 0, 0))
     assert found[::2] == found[1::2]
-    assert all(5 <= found[::2].count(agent) for agent in range(3))
+    assert all(found[::2].count(agent) >= 5 for agent in range(3))
 
 
 def test_an_elected_monitor_and_an_elected_sanctioner_are_two_elections():

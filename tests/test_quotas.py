@@ -1,7 +1,7 @@
 """Quotas, closed seasons and closed patches: what is allowed when, and what the rest costs.
 
-With `regrow_prob=(1.0,)` every site that begins a turn empty grows an apple in it: a site that is harvested at
-once bears an apple every second turn, a yield of 1/2.
+With `regrow_prob=(1.0,)` every site that begins a turn empty grows an apple in it: a site that is harvested
+at once bears an apple every second turn, a yield of 1/2.
 """
 
 import pytest
