@@ -1,8 +1,8 @@
 """What each institution costs: the time of a turn on the commons board, as a multiple of a turn without any.
 
 4 agents, 1024 worlds, one thread, RGB windows, random actions drawn beforehand; nothing is shown to agents
-(`observed=False`), since a further plane costs what any other costs. All games in one run, in turns; the median
-over rounds of the ratio to the game without institutions in the same round.
+(`observed=False`), since a further plane costs what any other costs. All games in one run, in turns; the
+median over rounds of the ratio to the game without institutions in the same round.
 
     make bench
 """
@@ -36,7 +36,8 @@ from cprl.institutions import (
 )
 
 TO_EXPLAIN, DEFECT = 1.1, 1.3
-"""Multiples of a turn through `CommonsEnv.step`: more than the first is explained, than the second a defect."""
+"""Multiples of a turn through `CommonsEnv.step`: what is above the first is explained, above the second a
+defect."""
 HIDDEN: Final = {"observed": False}
 EACH: Final[dict[str, tuple[Institution, ...]]] = {
     "Boundaries, stopped": (Boundaries.strips(height=12, width=24, agents=4, **HIDDEN),),
