@@ -38,9 +38,11 @@ from cprl.commons.rules import Rules
 from cprl.custom import Custom
 from cprl.networks import MLP, Conv
 from cprl.population import Frozen, Learning, Scripted, Team
+from cprl.preferences import Exchange, InequityAversion, SocialValueOrientation
 
 _OF_CPRL: Final[tuple[type[Any], ...]] = (
     *(Game, Map, Rules, Observation, Learning, Team, Scripted, Frozen),
+    *(InequityAversion, SocialValueOrientation, Exchange),
     *(DQN, DistributionalDQN, CQL, SAC, IQL, PPO, A2C, Reinforce, VDN, QMIX, MAPPO, IPPO, Tabular),
     *(DQNSettings, RolloutSettings, TabularSettings, MLP, Conv),
     Custom,
