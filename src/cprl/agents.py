@@ -144,9 +144,11 @@ def _learner(spec: Learning | Team, spaces: Spaces, agents: tuple[int, ...], who
     learner = _algorithm(spec).make_learner(spaces, agents=agents, reward_kind=spec.reward, **who)
     wants = getattr(learner, "wants", None)
     if not isinstance(spec.reward, str) and getattr(wants, "preferences", None) != spec.reward:
+        own = spec.algorithm
+        name = own.target if isinstance(own, Custom) else type(own).__name__
         raise ValueError(
-            f"reward is {named(spec.reward)}, which the learner of {spec.algorithm} does not have as its "
-            "`wants`; allowed for it: 'individual', 'team'"
+            f"reward is {named(spec.reward)}, which the learner of {name} does not have as its `wants`; "
+            "allowed for it: 'individual', 'team'"
         )
     return learner
 

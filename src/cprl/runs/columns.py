@@ -28,9 +28,9 @@ COLUMNS: Final = {
 """The columns of a table, as in `Episode`; the metrics follow, float64, NaN where undefined.
 
 Values of the whole episode are repeated in the row of each agent. Values that the game does not report have
-no column."""
+no column; nor has the wanted return outside of a training. It is null for agents that do not learn."""
 
-_LATER: Final = "wanted_return"
+_WANTED: Final = "wanted_return"
 
 LEFT_OUT: Final = b"left_out"
 """The key of the schema's metadata whose value says which columns are left out, and why, if any are."""
@@ -68,8 +68,8 @@ def rows_of(episodes: Sequence[Episode], replica: int | None, schema: pa.Schema)
     """
     of_each = [_cells(episode, episode.world if replica is None else replica) for episode in episodes]
     for cells in of_each:
-        if _LATER not in schema.names:  # a table that an earlier version of cprl began
-            cells.pop(_LATER, None)
+        if _WANTED not in schema.names:  # a table that an earlier cprl began goes on without it
+            cells.pop(_WANTED, None)
         if cells.keys() != set(schema.names):
             more, lacks = cells.keys() - set(schema.names), set(schema.names) - cells.keys()
             raise ValueError(
@@ -78,7 +78,11 @@ def rows_of(episodes: Sequence[Episode], replica: int | None, schema: pa.Schema)
             )
     return pa.record_batch(
         [
-            pa.array(np.concatenate([cells[column.name] for cells in of_each]), column.type)
+            pa.array(
+                np.concatenate([cells[column.name] for cells in of_each]),
+                column.type,
+                from_pandas=column.name == _WANTED,  # no number, of agents that do not learn, is null
+            )
             for column in schema
         ],
         schema=schema,
