@@ -24,13 +24,13 @@ class InequityAversion:
     first turn.
 
     Source: Hughes et al., "Inequity aversion improves cooperation in intertemporal social dilemmas" (2018),
-    equations 3 and 4, after Fehr and Schmidt (1999).
+    after Fehr and Schmidt (1999).
 
     Args:
-        alpha: the dislike of being behind (disadvantageous inequity), 0..1e6; 5 in the source.
-        beta: the dislike of being ahead (advantageous inequity), 0..1e6; 0.05 in the source.
+        alpha: the dislike of being behind (disadvantageous inequity), 0..1e6; 5 is usual.
+        beta: the dislike of being ahead (advantageous inequity), 0..1e6; 0.05 is usual.
         smoothing: the share of smoothed rewards that lasts into the next turn, 0..1; gamma x lambda of the
-            source, 0.99 x 0.975. With 0 only the rewards of the turn are compared, with 1 the returns so far.
+            source. With 0 only the rewards of the turn are compared, with 1 the returns so far.
 
     Raises:
         ValueError: for a number outside its range, in particular a negative dislike.
