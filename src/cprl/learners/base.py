@@ -107,16 +107,18 @@ class WantedReturns:
 
     def __init__(self, replicas: int, agents: int, learners: Mapping[tuple[int, ...], Learner]) -> None:
         found = {of: getattr(learner, "wants", None) for of, learner in learners.items()}
-        self._wants = {of: own for of, own in found.items() if isinstance(own, WantedRewards)}
+        self._wants: list[tuple[Any, WantedRewards]] = []
         self._first = np.full(agents, nan)
-        for of, wants in self._wants.items():
-            wants.clear()
-            self._first[list(of)] = 0
+        for of, wants in found.items():
+            if isinstance(wants, WantedRewards):
+                wants.clear()
+                self._wants.append((slice(None) if len(of) == agents else list(of), wants))
+                self._first[list(of)] = 0
         self.returns = np.tile(self._first, (replicas, 1))
 
     def add(self) -> None:
         """Adds the turn that the learners have just stored."""
-        for of, wants in self._wants.items():
+        for of, wants in self._wants:
             turn: Any = wants.now
             turn = turn.numpy(force=True) if isinstance(turn, Tensor) else turn
             self.returns[:, of] += turn[:, of]
