@@ -165,12 +165,12 @@ class Training:
         for learner in self.learners.values():
             learner.end_episode(worlds)
         for episode, of_agents in zip(ended, learning, strict=True):
-            wanted = self._wanted.take(episode.world)
+            episode = replace(episode, wanted_return=self._wanted.take(episode.world))
             self._played[episode.world] += 1
             if self._played[episode.world] <= self.episodes:
                 for callback in self.callbacks:
                     if hasattr(callback, "on_episode"):
-                        callback.on_episode(replace(episode, wanted_return=wanted), of_agents)
+                        callback.on_episode(episode, of_agents)
 
     def state_dict(self) -> dict[str, Any]:
         """Everything that the future depends on, in tensors, numbers, lists and dicts; not copies.
