@@ -1,49 +1,52 @@
-"""Game: a Map, its Rules and the agents' Observation."""
+"""Game: a Map, its Rules, the agents' Observation, and the institutions that they live under."""
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, fields
 from functools import cached_property
 from importlib import import_module
 from typing import Any
 
 import numpy as np
 
-from cprl.arguments import object_of
+from cprl.arguments import object_of, objects
 from cprl.commons.colours import FIRST_AGENT, MAX_AGENTS_APART, class_colour
+from cprl.commons.institution_tables import (
+    build_institution_tables,
+    check_institutions,
+    entries_shown,
+    shows_places,
+)
 from cprl.commons.maps import Map
 from cprl.commons.observation import Observation, channel_names
 from cprl.commons.rules import Rules
-from cprl.commons.tables import Tables, build_tables, check_sizes
+from cprl.commons.tables import GovernedTables, Tables, build_tables, check_sizes
 from cprl.commons.world import Bytes
+from cprl.institutions import COUNTS, Institution
+from cprl.institutions.choice import Ballot, ballots, decision_options
 from cprl.spaces import Spaces
 
 
 @dataclass(frozen=True, kw_only=True)
 class Game:
-    """A map, its rules and what agents observe.
+    """A map, its rules, what agents observe, and the rules that people make.
 
     Raises:
-        ValueError: If a rule per agent or per site does not fit the map, or the observation does not fit
-            the rules.
+        ValueError: If the observation does not fit the rules, or an institution does not fit the map, the
+            rules, the observation or another institution.
     """
 
     map: Map
     rules: Rules
     observation: Observation = field(default_factory=Observation)
+    institutions: tuple[Institution, ...] = ()
 
     def __post_init__(self) -> None:
         for name, kind in (("map", Map), ("rules", Rules), ("observation", Observation)):
             object_of(f"Game.{name}", getattr(self, name), kind, f"a cprl.{kind.__name__}")
-        agents, sites = self.agents, len(self.map.sites)
-        may_fire, may_bite, freeze = self.rules.may_fire, self.rules.may_bite, self.rules.freeze_steps
-        if isinstance(may_fire, tuple) and len(may_fire) != agents:
-            raise ValueError(f"Rules.may_fire has {len(may_fire)} entries; allowed: {agents}, one per agent")
-        if isinstance(freeze, tuple) and len(freeze) != agents:
-            raise ValueError(f"Rules.freeze_steps has {len(freeze)} rows; allowed: {agents}, one per agent")
-        if may_bite is not None and (len(may_bite), len(may_bite[0])) != (agents, sites):
-            raise ValueError(
-                f"Rules.may_bite is {len(may_bite)} x {len(may_bite[0])}; allowed: {agents} x {sites}, "
-                "agents x sites"
-            )
+        agents = self.agents
+        institutions = objects(
+            "Game.institutions", self.institutions, Institution, "a sequence of values of cprl.institutions"
+        )
+        object.__setattr__(self, "institutions", tuple(institutions))
         if self.observation.area == "full" and self.rules.walls_block_sight:
             raise ValueError(
                 'Observation.area is "full" and Rules.walls_block_sight is True; allowed: area="window" '
@@ -55,6 +58,7 @@ class Game:
                 f"Observation.agents_apart is True and the map has {agents} agents; allowed: at most "
                 f"{MAX_AGENTS_APART}"
             )
+        check_institutions(self.institutions, self.map, self.rules, self.observation)
 
     @property
     def agents(self) -> int:
@@ -73,16 +77,40 @@ class Game:
 
     @property
     def channels(self) -> tuple[str, ...]:
-        """The name of each channel of an observation: "red", "green", "blue", or the classes of cells."""
+        """The name of each channel of an observation: "red", "green", "blue", or the classes of cells, then
+        those of institutions, see `cprl.commons.institution_views`."""
+        return *self.cell_channels, *self._institution_channels
+
+    @property
+    def cell_channels(self) -> tuple[str, ...]:
+        """The channels that show the board: all but those of institutions."""
         hides = self.rules.walls_block_sight
         return channel_names(self.observation, agents=self.agents, hides=hides)
 
     @property
+    def _institution_channels(self) -> tuple[str, ...]:
+        rows, columns = self._seen
+        entries = len(entries_shown(self.institutions, self.agents))
+        places = ("forbidden",) if shows_places(self.institutions) else ()
+        return *places, *("institutions",) * -(-entries // (rows * columns))
+
+    @property
+    def _seen(self) -> tuple[int, int]:
+        """The rows and columns of an observation."""
+        if self.observation.area == "full":
+            return self.map.height, self.map.width
+        return self.rules.window_rows, self.rules.window_columns
+
+    @property
+    def observation_highest(self) -> int:
+        """The largest value of an entry of observations: 255, or 1 for "one_hot" without planes of
+        institutions."""
+        return 255 if self._institution_channels else self.observation.highest
+
+    @property
     def observation_shape(self) -> tuple[int, int, int]:
         """The shape (C, X, Y) of one agent's observation: channels, rows, columns."""
-        if self.observation.area == "full":
-            return len(self.channels), self.map.height, self.map.width
-        return len(self.channels), self.rules.window_rows, self.rules.window_columns
+        return len(self.channels), *self._seen
 
     @property
     def scoreboard_size(self) -> int:
@@ -95,13 +123,26 @@ class Game:
         return 1 if self.observation.stock_gauge else 0
 
     @property
+    def ballots(self) -> tuple[Ballot, ...]:
+        """What agents decide on at an episode's first turn."""
+        return ballots(self.institutions, self.agents)
+
+    @property
+    def decisions(self) -> int:
+        """The number of options of ("agents", "decision"); 0 where there is nothing to decide."""
+        return decision_options(self.institutions, self.agents)
+
+    @property
     def spaces(self) -> Spaces:
         """What each agent observes and may do."""
-        vectors = {"stock_gauge": self.stock_gauge_size, "scoreboard": self.scoreboard_size}
+        vectors = {
+            "stock_gauge": self.stock_gauge_size,
+            "scoreboard": self.scoreboard_size,
+        }
         return Spaces(
             agents=self.agents,
             observation_shape=self.observation_shape,
-            observation_scale=float(self.observation.highest),
+            observation_scale=float(self.observation_highest),
             actions=len(self.actions),
             vectors=tuple((name, size) for name, size in vectors.items() if size),
         )
@@ -112,7 +153,7 @@ class Game:
         return envs.CommonsEnv(self, worlds, seed=seed, device=device)
 
     def to_config(self) -> dict[str, Any]:
-        """Its map, rules and observation as JSON can hold them."""
+        """Its map, rules, observation and institutions as JSON can hold them."""
         config: dict[str, Any] = import_module("cprl.config").to_config(self)
         return config
 
@@ -125,14 +166,43 @@ class Game:
     @cached_property
     def tables(self) -> Tables:
         """The lookup tables that the compiled rules read; computed once and cached."""
-        return build_tables(self.map, self.rules, self.observation)
+        return build_tables(self.map, self.rules, self.observation, highest=self.observation_highest)
+
+    @cached_property
+    def governed_tables(self) -> GovernedTables:
+        """The lookup tables of the game and of its institutions; computed once and cached."""
+        planes = len(self.cell_channels)
+        own = build_institution_tables(
+            self.institutions, self.map, self.rules, self.tables, first_plane=planes
+        )
+        return GovernedTables(self.tables, own)
 
     def __getstate__(self) -> dict[str, object]:
-        return {"map": self.map, "rules": self.rules, "observation": self.observation}
+        return {own.name: getattr(self, own.name) for own in fields(self)}
 
 
-def output_shapes(game: Game, worlds: int) -> dict[str, tuple[tuple[int, ...], type[np.generic]]]:
-    """The shape and dtype of each entry of `StepOutput`, for B worlds of a game."""
+Shapes = dict[str, tuple[tuple[int, ...], type[np.generic]]]
+
+
+def output_shapes(game: Game, worlds: int) -> Shapes:
+    """The shape and dtype of each entry of `StepOutput`, for B worlds of a game, and then of `Payments` if it
+    has institutions."""
+    return _of_a_turn(game, worlds) | (_of_payments(game, worlds) if game.institutions else {})
+
+
+def _of_payments(game: Game, worlds: int) -> Shapes:
+    of_agent = worlds, game.agents
+    return {
+        "reward": (of_agent, np.float32),
+        "fines": (of_agent, np.float32),
+        "transfers": (of_agent, np.float32),
+        "violated": (of_agent, np.bool_),
+        "counts": ((*of_agent, len(COUNTS)), np.int32),
+        "in_force": ((worlds, len(game.ballots)), np.float32),
+    }
+
+
+def _of_a_turn(game: Game, worlds: int) -> Shapes:
     of_agent = worlds, game.agents
     return {
         "observation": ((*of_agent, *game.observation_shape), np.uint8),
