@@ -15,6 +15,7 @@ from cprl.agents import Population
 from cprl.algorithms import DQN, IPPO, PPO, QMIX, DQNSettings, RolloutSettings, Tabular, TabularSettings
 from cprl.commandline import parse
 from cprl.envs import spaces_of
+from cprl.institutions import Tax
 from cprl.measuring.episodes import EpisodeTracker
 from cprl.population import Frozen, Learning, Scripted, Team
 from cprl.preferences import Exchange, InequityAversion, SocialValueOrientation, WantedRewards
@@ -187,6 +188,21 @@ def test_the_wanted_return_is_the_sum_of_the_episode_and_the_return_stays_that_o
         assert episode.return_.tolist() == returns.tolist()
         assert episode.wanted_return.tolist()[:2] == [sums[0], returns[1]]
         assert np.isnan(episode.wanted_return[2]), "who does not learn wants nothing"
+
+
+def test_what_is_wanted_is_made_of_what_is_left_after_fines_and_transfers():
+    taxed = replace(BOARD, institutions=(Tax(rate=0.5),))
+    env, kept = CommonsEnv(taxed, 2, seed=3), Kept()
+    agents = population([Learning(DQN(settings=REPLAY), reward="team"), *[Scripted("greedy")] * 2], env)
+    train(env, agents.learners, others=agents.others, episodes=3, callbacks=[kept])
+    fines, transfers, harvest = (
+        sum(float(batch["next", "agents", name].sum()) for batch in kept.batches)
+        for name in ("fines", "transfers", "harvest")
+    )
+    assert fines > 1
+    wanted = sum(episode.wanted_return[0] for episode in kept.episodes)
+    assert wanted == pytest.approx(harvest - fines + transfers, abs=1e-4)
+    assert wanted == pytest.approx(sum(episode.return_.sum() for episode in kept.episodes), abs=1e-4)
 
 
 @pytest.mark.parametrize("update_every", [1, 2])
