@@ -24,7 +24,7 @@ from cprl.institutions import (
     Tax,
     Vote,
 )
-from cprl.institutions.memory import REMEMBERED, Memory, Payments
+from cprl.institutions.memory import DERIVED, REMEMBERED, Memory, Payments
 
 EVERYTHING = Game(
     map=maps.parse(
@@ -187,6 +187,6 @@ def assert_same_moments(one, other, *, rows=slice(None), other_rows=slice(None))
     for mine, theirs in zip(one, other, strict=True):
         names = mine._fields
         if isinstance(mine, Memory):
-            names = (*REMEMBERED, "may_fire", "closed")
+            names = (*REMEMBERED, *DERIVED)
         for name in names:
             assert np.array_equal(getattr(mine, name)[rows], getattr(theirs, name)[other_rows]), name

@@ -81,13 +81,15 @@ class Memory(NamedTuple):
     """float64 [B, N], apples taken in this turn; working memory."""
     transfers: Numbers
     """float64 [B, N], apples given in this turn; working memory."""
+    owed: Numbers
+    """float64 [B, N], the tax that each agent owes; working memory."""
     patch_stock: Ints
-    """int32 [B, P], apples on each patch; working memory."""
+    """int32 [B, P], apples on each patch; derived from the stock."""
 
 
-WORKING: Final = ("sanctioned", "broke", "unjust", "due", "fines", "transfers", "patch_stock")
+WORKING: Final = ("sanctioned", "broke", "unjust", "due", "fines", "transfers", "owed")
 """Entries of `Memory` that hold nothing between turns."""
-DERIVED: Final = ("may_fire", "closed")
+DERIVED: Final = ("may_fire", "closed", "patch_stock")
 """Entries of `Memory` that are computed from the others and from the stock."""
 REMEMBERED: Final = tuple(name for name in Memory._fields if name not in (*WORKING, *DERIVED))
 """Entries of `Memory` that are part of the state of a world."""
@@ -256,5 +258,6 @@ def empty_memory(tables: InstitutionTables, *, worlds: int) -> Memory:
         due=np.zeros((worlds, agents), np.float64),
         fines=np.zeros((worlds, agents), np.float64),
         transfers=np.zeros((worlds, agents), np.float64),
+        owed=np.zeros((worlds, agents), np.float64),
         patch_stock=np.zeros((worlds, patches), np.int32),
     )
