@@ -214,7 +214,7 @@ def test_a_reset_of_some_worlds_keeps_what_others_were_paid():
 
 def test_what_was_kept_is_restored_whole():
     check_restorable(lambda: CommonsEnv(EVERYTHING, 3, seed=4))
-    check_restorable(lambda: make_env(RICH, worlds=2, seed=4, transforms=[StepCounter]))
+    check_restorable(lambda: make_env(RICH, worlds=2, seed=4, transforms=[StepCounter()]))
 
 
 def of_workers(kind, turns, decisions):
