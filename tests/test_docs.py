@@ -40,7 +40,8 @@ def test_every_logged_name_has_its_line_in_the_docs_and_the_other_way_round(tmp_
         *("agent_<i>/harvested", "turn/stock", "windows/frames", "world/marks"),
         *("wall/boards", "wall/labels", "wall/died", "decisions", "decisions/labels"),
         *(name for name in told if name.startswith("institutions/")),
-        *(f"agent_<i>/{name}" for name in OF_AGENTS),
+        *(f"agent_<i>/{name}" for name in (*OF_AGENTS, "paid", "given")),
+        *("world/regions", "world/violators"),
     }
     because = "by BestWeights, of many episodes or agents, of replays, static, of games with institutions"
     assert logged == told - elsewhere, because

@@ -8,11 +8,13 @@ import torch
 from numpy.typing import NDArray
 from tensordict import TensorDictBase
 from torch import Tensor
+from torchrl.envs import EnvBase
 
 from cprl import keys
+from cprl.envs.unwrap import commons_of
 from cprl.measuring import institutions
 from cprl.measuring.institutions import COUNTS, Groups
-from cprl.measuring.reported import INSTITUTIONAL
+from cprl.measuring.reported import INSTITUTIONAL, OF_INSTITUTIONS
 
 Array = NDArray[Any]
 Widths = Mapping[str, int]
@@ -21,6 +23,31 @@ STATE: Final = {entry: (name,) for name, entry in INSTITUTIONAL.items()}
 """The arrays that a tracker stores for each entry, by their names in its state."""
 WIDE: Final = ("counts", "in_force")
 """The entries whose last axis is not that of agents: C counts, V decisions."""
+
+
+def groups_of(env: EnvBase) -> Groups | None:
+    """The groups of nested enterprises, those of the game's first `Levies`; None if it has none."""
+    commons = commons_of(env)
+    found = () if commons is None else getattr(commons.game, "institutions", ())
+    return next((own.groups for own in found if hasattr(own, "groups")), None)
+
+
+def metrics_of(env: EnvBase, reported: Collection[str]) -> tuple[str, ...]:
+    """The metrics of institutions in episodes of an environment that reports these entries."""
+    if set(reported).isdisjoint(OF_INSTITUTIONS):
+        return ()
+    has_groups = groups_of(env) is not None
+    return tuple(
+        name
+        for name, entries in institutions.NEEDS.items()
+        if set(entries) <= set(reported) and (has_groups or name not in institutions.OF_GROUPS)
+    )
+
+
+def decisions_of(env: EnvBase) -> tuple[str, ...]:
+    """What is decided in an episode, in words, in the order of "in_force"."""
+    (width,) = env.observation_spec["in_force"].shape[env.batch_dims :]
+    return tuple(f"decision {nth}" for nth in range(width))
 
 
 def widths_in(tensordict: TensorDictBase) -> dict[str, int]:

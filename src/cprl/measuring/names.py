@@ -16,13 +16,13 @@ NAMES: Final = {
 }
 """The words and the unit of each metric of an episode."""
 OF_INSTITUTIONS: Final = {
-    "fines": ("fines of all agents", "apples"),
-    "transfers": ("transfers to all agents", "apples"),
+    "fines": ("fines of all", "apples"),
+    "transfers": ("transfers to all", "apples"),
     "violations": ("violations", "turns"),
     "violations_per_step": ("violations per turn in play", SHARE),
     "trespasses": ("trespasses", "turns"),
-    "excess_bites": ("bites above a quota", "bites"),
-    "closed_bites": ("bites in closed seasons and patches", "bites"),
+    "excess_bites": ("taken above a quota", "bites"),
+    "closed_bites": ("taken in closed seasons and patches", "bites"),
     "own_share_of_bites": ("bites on one's own ground", SHARE),
     "detection_rate": ("violations detected", SHARE),
     "recidivism": ("violations after a sanction", SHARE),

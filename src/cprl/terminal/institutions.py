@@ -1,6 +1,7 @@
 """What came of institutions, as a table beside the summary of a run."""
 
 from collections.abc import Callable, Mapping, Sequence
+from math import isnan
 from statistics import fmean
 from typing import Final
 
@@ -20,7 +21,7 @@ def institutions_table(
     """A column for each policy; a row for each metric, then one for each agent: what it was fined and given,
     and its violations. None for a game without institutions.
 
-    Metrics that are undefined for all policies, since the game has other institutions, have no row.
+    Shares of something that never happened have no row.
 
     Args:
         played: episodes by the name of the policy, at least one of each.
@@ -32,19 +33,27 @@ def institutions_table(
     table = Table(title="institutions", caption="means over episodes")
     table.add_column(no_wrap=True)
     for name in played:
-        table.add_column(name, justify="right")
+        table.add_column(name, justify="right", no_wrap=True)
     measured = {policy: [institution_metrics(episode) for episode in own] for policy, own in played.items()}
     for metric in institution_metrics(first):
-        if any(metrics[metric] == metrics[metric] for own in measured.values() for metrics in own):
-            called = title(f"institutions/{metric}").replace("in_force_", "in force, decision ")
-            table.add_row(called, *(mean(own, metric, 2) for own in measured.values()))
+        values = [metrics[metric] for own in measured.values() for metrics in own]
+        if "equality" in metric or not all(map(isnan, values)):
+            table.add_row(_title(metric), *(mean(own, metric, 2) for own in measured.values()))
     fields = {name: word for name, word in _OF_AGENTS.items() if getattr(first, name) is not None}
     if fields:
         table.add_section()
+        table.add_row(f"of each agent: {' / '.join(fields.values())}")
     for agent in range(len(first.return_)) if fields else ():
         cells = [
             " / ".join(f"{fmean(getattr(one, name)[agent] for one in own):.1f}" for name in fields)
             for own in played.values()
         ]
-        table.add_row(f"agent {agent}: {' / '.join(fields.values())}", *cells)
+        table.add_row(f"  agent {agent}", *cells)
     return table
+
+
+def _title(metric: str) -> str:
+    prefix = "in_force_"
+    if metric.startswith(prefix):
+        return f"in force: decision {metric.removeprefix(prefix)}"
+    return title(f"institutions/{metric}")
