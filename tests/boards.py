@@ -6,10 +6,12 @@ from dataclasses import replace
 import numpy as np
 
 from cprl import Game, Map, Observation, Rules, maps
-from cprl.commons.batch import Batch
+from cprl.commons.batch import Batch, turn_of
 from cprl.commons.colours import CLASS_NAMES, FIRST_AGENT, class_colour
 from cprl.commons.maps import SIGN_OF_HEADING
 from cprl.commons.world import StepOutput
+from cprl.institutions import COUNTS, Institution
+from cprl.institutions.memory import Payments
 
 RGB_SIGN = {
     (10, 10, 10): ".",
@@ -37,22 +39,60 @@ class Play:
         seed: int = 0,
         order: Sequence[int] | None = None,
         observation: Observation | None = None,
+        institutions: Sequence[Institution] = (),
         **rules,
     ):
         board = maps.parse(board) if isinstance(board, str) else board
         if order is not None:
             board = replace(board, starts=tuple(board.starts[i] for i in order))
         rules = {"regrow_prob": (0.0,), **rules}
-        self.game = Game(map=board, rules=Rules(**rules), observation=observation or Observation())
+        self.game = Game(
+            map=board,
+            rules=Rules(**rules),
+            observation=observation or Observation(),
+            institutions=tuple(institutions),
+        )
         self.batch = Batch(self.game, 1, seed=seed)
-        self.output: StepOutput = self.batch.begin(self.batch.new_output())
+        self.whole = self.batch.begin(self.batch.new_output())
+        self.output: StepOutput = turn_of(self.whole)
 
-    def turn(self, *names: str) -> "Play":
+    def turn(self, *names: str, decisions: Sequence[int] | None = None) -> "Play":
         """Plays one turn: one action per agent, or one for all agents."""
         names = names * self.game.agents if len(names) == 1 else names
         actions = np.array([[self.game.actions.index(name) for name in names]], np.int64)
-        self.batch.play(actions, self.output)
+        decided = None if decisions is None else np.array([decisions], np.int64)
+        self.batch.play(actions, self.whole, decided)
         return self
+
+    def again(self) -> "Play":
+        """Begins the next episode."""
+        self.batch.begin(self.whole)
+        return self
+
+    @property
+    def payments(self) -> Payments:
+        """What institutions output in the last turn."""
+        return self.whole.payments
+
+    @property
+    def fines(self) -> list[float]:
+        return self.payments.fines[0].tolist()
+
+    @property
+    def transfers(self) -> list[float]:
+        return self.payments.transfers[0].tolist()
+
+    @property
+    def reward(self) -> list[float]:
+        return self.payments.reward[0].tolist()
+
+    @property
+    def violated(self) -> list[bool]:
+        return self.payments.violated[0].tolist()
+
+    def counts(self, name: str) -> list[int]:
+        """What was counted for each agent in this episode, by its name in `COUNTS`."""
+        return self.payments.counts[0, :, COUNTS.index(name)].tolist()
 
     @property
     def places(self) -> list[tuple[int, int]]:

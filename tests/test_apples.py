@@ -9,6 +9,7 @@ from boards import Play
 from cprl import Game, Rules, maps
 from cprl.commons.batch import Batch
 from cprl.commons.near import distance, neighbours
+from cprl.institutions import Boundaries
 
 
 def test_an_agent_harvests_the_apple_that_it_steps_on():
@@ -23,8 +24,8 @@ def test_an_empty_site_gives_nothing():
 
 
 def test_an_agent_that_may_not_harvest_a_site_leaves_its_apple():
-    may_bite = ((False, True), (True, True))
-    play = Play(">A.<\n..A.", may_bite=may_bite).turn("forward", "stay")
+    others = Boundaries.drawn(".1..\n....")
+    play = Play(">A.<\n..A.", institutions=[others]).turn("forward", "stay")
     assert play.harvest == [0, 0]
     assert play.output.stock[0, 0] == 2
 

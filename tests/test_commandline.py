@@ -17,6 +17,7 @@ from cprl.algorithms import DQN, PPO, QMIX, DQNSettings, RolloutSettings
 from cprl.commandline import RunOptions, parse, recipe_main
 from cprl.custom import Custom
 from cprl.flags import applied, docs, flags_of
+from cprl.institutions import GraduatedSanctions, Quota
 from cprl.population import Learning, Scripted, Team
 from cprl.runs.directory import start_run
 
@@ -63,7 +64,7 @@ def test_every_number_is_changed_by_its_place():
     given, options = read(
         "--replicas 2 --game.rules.freeze-steps 50 --agents.1.algorithm.settings.gamma 0.9 --variant as_run "
         "--agents.3.policy pacifist --agents.2.algorithm.settings.max-grad-norm None --loggers csv wandb "
-        "--game.rules.regrow-prob 0 0.5 --game.rules.beam-length-cells 1 2 3 4 --game.rules.may-fire False "
+        "--game.rules.regrow-prob 0 0.5 --game.rules.beam-length-cells 1 2 3 4 --game.rules.no-may-fire "
         "--agents.0.algorithm.double --agents.0.reward team --out here --watch 'connect rerun+http://there'"
     )
     first, second, third, _ = experiment().agents
@@ -182,11 +183,10 @@ def test_a_board_is_given_by_its_name_and_a_drawing_stays():
 
 def test_what_a_command_line_cannot_say_stays_as_it_is():
     base = experiment()
-    table = tuple((True,) * len(base.game.map.sites) for _ in range(4))
-    rules = replace(base.game.rules, may_bite=table, freeze_steps=((1, 2),) * 4)
+    sanctions = GraduatedSanctions(freeze_steps=((1, 2),) * 4, on="tags")
     kept = replace(
         base,
-        game=replace(base.game, rules=rules),
+        game=replace(base.game, institutions=(sanctions, Quota())),
         loggers=(Custom("my:Logger"),),
         agents=(Learning(Custom("my:algorithm")), *base.agents[1:]),
     )
@@ -194,7 +194,8 @@ def test_what_a_command_line_cannot_say_stays_as_it_is():
     assert given == replace(
         kept, seed=4, agents=(Learning(Custom("my:algorithm"), reward="team"), *base.agents[1:])
     )
-    for line in ("--game.rules.may-bite True", "--game.rules.freeze-steps 3", "--loggers csv"):
+    assert read("--game.institutions.1.share 0.5", lambda: kept)[0].game.institutions[1] == Quota(share=0.5)
+    for line in ("--game.institutions.0.freeze-steps 3", "--game.institutions.2.share 1", "--loggers csv"):
         with pytest.raises(SystemExit):
             read(line, lambda: kept)
 

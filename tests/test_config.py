@@ -29,6 +29,19 @@ from cprl.algorithms import (
 )
 from cprl.config import KINDS, custom_targets, differences, from_config, to_config
 from cprl.custom import Custom
+from cprl.institutions import (
+    Boundaries,
+    ClosedPatches,
+    ClosedSeason,
+    GraduatedSanctions,
+    Levies,
+    Mediation,
+    Monitoring,
+    Quota,
+    Sanctioner,
+    Tax,
+    Vote,
+)
 from cprl.networks import MLP, Conv
 from cprl.population import Frozen, Learning, Scripted, Team
 
@@ -86,22 +99,46 @@ RULES = st.builds(
     Rules,
     regrow_prob=st.lists(st.just(0.0) | SHARES, min_size=1, max_size=6).map(tuple),
     beam_length_cells=st.integers(1, 9) | st.tuples(*[st.integers(1, 9)] * 4),
-    freeze_steps=st.integers(0, 99) | st.just(((1, 2, 3), (4, 5, 6))),
-    may_fire=st.booleans() | st.just((True, False)),
-    may_bite=st.none() | st.just(((True, False, True, True), (False, True, True, False))),
+    freeze_steps=st.integers(0, 99),
+    may_fire=st.booleans(),
     shuffle_starts=st.booleans(),
 )
 BOARD = maps.parse("A>.#.\n.A.vA\n..A..")
+FINES = st.none() | st.sampled_from([0.0, 0.5, 9.0])
+INSTITUTIONS = st.one_of(
+    st.builds(Boundaries, regions=st.just((".01..", "aa...", "...1.")), owners=st.just(("0a", "1"))),
+    st.builds(Quota, share=SHARES, window_steps=st.integers(1, 99), by_stock=st.booleans(), fine=FINES),
+    st.builds(ClosedSeason, closed_steps=st.integers(0, 100), fine=FINES),
+    st.builds(Tax, rate=SHARES, brackets=st.sampled_from([(), ((0, 0.1), (3, 0.5))])),
+    st.builds(Levies, groups=st.just(((0,), (1,))), local_rate=st.sampled_from([0.0, 0.5])),
+    st.builds(Vote, on=st.builds(Tax) | st.builds(Quota), override_prob=SHARES),
+)
+ONE_OF_A_KIND = st.tuples(
+    st.builds(ClosedPatches, below=st.integers(0, 5), fine=FINES),
+    st.builds(Monitoring, prob=SHARES, monitor=st.sampled_from([None, 0, "elected"])),
+    st.builds(GraduatedSanctions, recovery_steps=st.none() | st.integers(1, 9), on=st.just("tags")),
+)
 GAMES = st.builds(
     Game,
     map=st.just(BOARD),
     rules=RULES,
     observation=st.builds(Observation, encoding=st.sampled_from(["rgb", "one_hot"])),
+    institutions=st.lists(INSTITUTIONS, max_size=3).map(tuple) | ONE_OF_A_KIND,
+)
+FIRING = Game(
+    map=BOARD,
+    rules=Rules(),
+    observation=Observation(agents_apart=True),
+    institutions=(
+        Mediation(turns=3),
+        Sanctioner(agents=(1,)),
+        GraduatedSanctions(freeze_steps=((1,), (2,)), on="tags"),
+    ),
 )
 
 
 @settings(max_examples=200, deadline=None)
-@given(value=SPECS | GAMES | CUSTOM | st.tuples(SPECS, GAMES))
+@given(value=SPECS | GAMES | CUSTOM | st.tuples(SPECS, GAMES) | st.just(FIRING))
 def test_a_value_comes_back_from_its_table_as_it_was(value):
     text = json.dumps(to_config(value), allow_nan=False)
     back = from_config(json.loads(text), allow=custom_targets(json.loads(text)))
@@ -117,6 +154,9 @@ def test_every_kind_comes_back():
         "Learning": Learning(DQN(settings=DQNSettings())),
         "Team": Team(QMIX(settings=DQNSettings()), agents=(0, 1)),
         "Frozen": Frozen("runs/earlier", 1),
+        "Boundaries": Boundaries(regions=("0.",)),
+        "Levies": Levies(groups=((0,),)),
+        "Vote": Vote(on=Quota()),
         "Custom": Custom("a:b", arguments={"keys": [["agents", "reward"]]}),
     }
     of_settings = {"settings": DQNSettings}

@@ -56,7 +56,7 @@ PACKAGES = (
     "commandline",
     "cli",
 )
-TO_COME = ("institutions", "theory", "studies")
+TO_COME = ("theory", "studies")
 """Their places are kept for them."""
 MODULES = sorted(path for path in SOURCE.rglob("*.py") if path.parent != SOURCE or path.name != "__init__.py")
 

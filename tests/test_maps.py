@@ -4,7 +4,7 @@ import itertools
 
 import pytest
 
-from cprl import Game, Map, Rules, maps
+from cprl import Map, maps
 
 BOARDS_OF_THE_STUDY = {  # name: (height, width, sites, agents), from shared/paper/maps.txt
     "single_basic": (7, 24, 13, 1),
@@ -86,19 +86,6 @@ def test_a_map_that_cannot_be_played_is_refused(changes, message):
 def test_an_unknown_board_is_refused_with_the_names_of_all_boards():
     with pytest.raises(ValueError, match=r"'comons'; allowed: single_basic, .*, two_complex, commons"):
         maps.named("comons")
-
-
-@pytest.mark.parametrize(
-    ("rules", "message"),
-    [
-        ({"may_fire": (True,)}, "may_fire has 1 entries; allowed: 2, one per agent"),
-        ({"freeze_steps": ((1,), (2,), (3,))}, "freeze_steps has 3 rows; allowed: 2, one per agent"),
-        ({"may_bite": ((True, True), (True, True))}, "may_bite is 2 x 2; allowed: 2 x 1, agents x sites"),
-    ],
-)
-def test_rules_per_agent_must_fit_the_map(rules, message):
-    with pytest.raises(ValueError, match=message):
-        Game(map=maps.parse(">.A\n..<"), rules=Rules(**rules))
 
 
 WALLS_BY_ROW = {  # regions.md, after Perolat et al.: columns of wall, by row

@@ -128,7 +128,7 @@ def test_agents_that_wait_for_one_cell_return_in_the_order_in_which_they_were_ta
     # 1 is tagged at (1, 3), then 2 comes there and is tagged too; the freeze of 1 is the longer wait.
     play = Play(
         "A......\n.>.^...\n...^...",
-        freeze_steps=((3,), (3,), (3,)),
+        freeze_steps=3,
         beam_length_cells=2,
         beam_width_cells=1,
     )

@@ -16,8 +16,7 @@ WRONG = {
     "beam_width_cells": [0, 2, 3.0],
     "hits_to_tag": [0, -1, 1.0],
     "freeze_steps": [-1, 2.5, ((1, 2), (3,)), (1, 2), ()],
-    "may_fire": [1, (), (True, 0)],
-    "may_bite": [True, ((True,), ()), ((1, 0),)],
+    "may_fire": [1, (), (True, 0), (True, False)],
     "window_rows": [0, 1.5, "6"],
     "window_columns": [0, 12, -3],
     "episode_steps": [0, 1e3, None],
@@ -46,8 +45,8 @@ def test_a_wrong_value_is_refused_with_field_value_and_what_is_allowed(name, val
 
 
 def test_lists_and_arrays_become_tuples_so_that_rules_compare_and_hash():
-    given = Rules(regrow_prob=[0, 0.5], freeze_steps=np.array([[25], [50]]), may_fire=np.array([True, False]))
-    same = Rules(regrow_prob=(0, 0.5), freeze_steps=((25,), (50,)), may_fire=(True, False))
+    given = Rules(regrow_prob=[0, 0.5], beam_length_cells=np.array([1, 2, 3, 4]), may_fire=np.bool_(False))
+    same = Rules(regrow_prob=(0, 0.5), beam_length_cells=(1, 2, 3, 4), may_fire=False)
     assert given == same
     assert hash(given) == hash(same)
 

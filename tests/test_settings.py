@@ -30,10 +30,23 @@ from cprl.algorithms import (
     Tabular,
     TabularSettings,
 )
-from cprl.checks import MOST_NESTED
+from cprl.checks import MOST_NESTED, plain
 from cprl.collectors import stock_collector
 from cprl.commandline import parse, recipe_main
 from cprl.config import KINDS, from_config, to_config
+from cprl.institutions import (
+    Boundaries,
+    ClosedPatches,
+    ClosedSeason,
+    GraduatedSanctions,
+    Levies,
+    Mediation,
+    Monitoring,
+    Quota,
+    Sanctioner,
+    Tax,
+    Vote,
+)
 from cprl.learners.replay import ReplayLearner
 from cprl.learners.rollouts import RolloutLearner
 from cprl.learners.settings import Exploring
@@ -51,6 +64,11 @@ GAME = presets.game("two_complex")
 REPLAY, ROLLOUTS, TABLES = DQNSettings(), RolloutSettings(), TabularSettings()
 SPACES = GAME.spaces
 EXPERIMENT = Experiment(name="mine", game=GAME, agents=[Scripted()] * 2, episodes=1)
+INSTITUTIONS = [
+    Boundaries(regions=("0.", ".1")),
+    *(Quota(), ClosedSeason(), ClosedPatches(), Tax(), Levies(groups=((0,), (1,))), Vote(on=Tax())),
+    *(Monitoring(), GraduatedSanctions(), Mediation(), Sanctioner()),
+]
 VALUES = [
     Rules(),
     Observation(),
@@ -65,6 +83,7 @@ VALUES = [
     Scripted(),
     Frozen("runs/earlier", 0),
     Custom("a:b"),
+    *INSTITUTIONS,
     EXPERIMENT,
 ]
 FIELDS = [
@@ -97,7 +116,6 @@ NEVER = (
     complex(1, 2),
 )
 ALLOWED = {
-    ("Rules", "may_bite"): (),
     ("Frozen", "run"): ("3", "yes"),
     ("Experiment", "name"): ("3", "yes"),
     **{("Experiment", name): ([], ()) for name in ("transforms", "callbacks", "loggers")},
@@ -107,6 +125,13 @@ ALLOWED = {
     ("DistributionalDQN", "lowest_return"): (-1, -0.5, 1.9),
     ("Spaces", "observation_scale"): (1.9,),
     ("Rules", "regrow_radius_cells"): (1.9,),
+    ("Boundaries", "regions"): (["x"], ["x", "y"]),
+    ("Boundaries", "owners"): (["x"], ["x", "y"]),
+    ("Tax", "brackets"): ([],),
+    **{(kind, "fine"): (1.9,) for kind in ("Quota", "ClosedSeason", "ClosedPatches")},
+    **{("Boundaries", name): (1.9,) for name in ("bite_fine", "step_fine")},
+    **dict.fromkeys((("Quota", "share"), ("Mediation", "refund")), (1.9,)),
+    ("Monitoring", "cost"): (1.9,),
     ("RolloutSettings", "max_grad_norm"): (1.9,),
     **{(kind, "learning_rate"): (1.9,) for kind in ("DQNSettings", "RolloutSettings")},
     **{("SAC", name): (1.9,) for name in ("alpha_init",)},
@@ -120,15 +145,18 @@ ALLOWED = {
     },
 }
 """What fits a field although it fits hardly any other."""
-OPTIONAL = {"tau", "max_grad_norm", "network", "may_bite", "start_from", "replica"}
+OPTIONAL = {"tau", "max_grad_norm", "network", "start_from", "replica"}
+OPTIONAL |= {"owners", "bite_fine", "step_fine", "fine", "monitor", "recovery_steps"}
+OPTIONAL_OF = {("Sanctioner", "agents")}
 
 
 @pytest.mark.parametrize(("value", "field"), FIELDS)
 def test_every_field_refuses_what_it_cannot_be_by_its_name(value, field):
     name = "experiment" if isinstance(value, Experiment) else type(value).__name__
     allowed = ALLOWED.get((type(value).__name__, field), ())
-    for wrong in (*NEVER, *([] if field in OPTIONAL else [None])):
-        if any(type(wrong) is type(own) and wrong == own for own in allowed):
+    is_optional = field in OPTIONAL or (type(value).__name__, field) in OPTIONAL_OF
+    for wrong in (*NEVER, *([] if is_optional else [None])):
+        if any(type(plain(wrong)) is type(plain(own)) and plain(wrong) == plain(own) for own in allowed):
             replace(value, **{field: wrong})
             continue
         with pytest.raises(ValueError, match=rf"^{name}\.{field}\b") as refused:
@@ -292,8 +320,8 @@ def test_what_is_nested_without_end_is_refused_in_a_sentence(deep):
     ):
         with pytest.raises(ValueError, match=rf"(nested more than {MOST_NESTED} deep|entries); allowed: "):
             refuses()
-    for refuses in (lambda: DQNSettings(hidden_cells=deep), lambda: Rules(may_bite=deep)):
-        with pytest.raises(ValueError, match=r"^(DQNSettings\.hidden_cells|Rules\.may_bite) is "):
+    for refuses in (lambda: DQNSettings(hidden_cells=deep), lambda: Rules(regrow_prob=deep)):
+        with pytest.raises(ValueError, match=r"^(DQNSettings\.hidden_cells|Rules\.regrow_prob) is "):
             refuses()
 
 

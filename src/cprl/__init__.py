@@ -13,6 +13,7 @@ Each imports only from those above it:
     process      settings of the process that trains
     compiling    functions compiled by torch
     memory       devices, and what would not fit into their memory
+    institutions  rules that people make: boundaries, quotas, taxes, sanctions, votes; numpy alone
     commons      the game: maps, rules, turns; numpy and numba alone
     envs         TorchRL, PettingZoo, Gymnasium; make_env, where environments are put together
     games        games of the user's own, as a recipe holds them

@@ -36,11 +36,26 @@ from cprl.commons.maps import Map
 from cprl.commons.observation import Observation
 from cprl.commons.rules import Rules
 from cprl.custom import Custom
+from cprl.institutions import (
+    Boundaries,
+    ClosedPatches,
+    ClosedSeason,
+    GraduatedSanctions,
+    Levies,
+    Mediation,
+    Monitoring,
+    Quota,
+    Sanctioner,
+    Tax,
+    Vote,
+)
 from cprl.networks import MLP, Conv
 from cprl.population import Frozen, Learning, Scripted, Team
 
 _OF_CPRL: Final[tuple[type[Any], ...]] = (
     *(Game, Map, Rules, Observation, Learning, Team, Scripted, Frozen),
+    *(Boundaries, ClosedPatches, ClosedSeason, GraduatedSanctions, Levies, Mediation),
+    *(Monitoring, Quota, Sanctioner, Tax, Vote),
     *(DQN, DistributionalDQN, CQL, SAC, IQL, PPO, A2C, Reinforce, VDN, QMIX, MAPPO, IPPO, Tabular),
     *(DQNSettings, RolloutSettings, TabularSettings, MLP, Conv),
     Custom,

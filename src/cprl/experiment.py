@@ -28,7 +28,7 @@ from cprl.finite import OnNan
 from cprl.games import game_of, is_playable, stored_game
 from cprl.memory import DEVICE
 from cprl.population import SPEC, AgentSpec, Frozen, Learning, Team, specs_by_agent
-from cprl.runs.old_recipes import experiment_config
+from cprl.runs.old_recipes import experiment_config, upgraded_game
 
 LoggerName = Literal["csv", "tensorboard", "wandb"]
 LOGGERS: Final[tuple[LoggerName, ...]] = get_args(LoggerName)
@@ -157,7 +157,10 @@ def recipe_config(recipe: Mapping[str, Any]) -> dict[str, Any]:
                 f"the recipe has the format {shown(recipe.get('format'))}; allowed: {FORMAT}, with a table "
                 '"experiment"'
             )
-        return dict(recipe["experiment"])
+        experiment = dict(recipe["experiment"])
+        if _has_old_rules(experiment.get("game")):
+            experiment["game"] = upgraded_game(experiment["game"])
+        return experiment
     try:
         table = experiment_config(recipe)
         for agent in table["agents"]:
@@ -181,6 +184,16 @@ def frozen_from(experiment: Experiment, directory: str | Path) -> Experiment:
 def changes(before: Experiment, now: Experiment) -> list[str]:
     """How two experiments differ, a sentence for each place."""
     return differences(before.to_config(), now.to_config(), "experiment")
+
+
+def _has_old_rules(game: object) -> bool:
+    """Whether the rules of a game have a field that is an institution now."""
+    if not isinstance(game, Mapping) or game.get("kind") != "Game":
+        return False
+    rules = game.get("rules")
+    if not isinstance(rules, Mapping) or not isinstance(game.get("map"), Mapping):
+        return False
+    return "may_bite" in rules or any(isinstance(rules.get(n), list) for n in ("may_fire", "freeze_steps"))
 
 
 def _is_old(recipe: Mapping[str, Any]) -> bool:

@@ -20,7 +20,7 @@ ACTION: Final = (AGENTS, "action")
 """int64 [B, N]: each agent's action, an index into `cprl.commons.rules.ACTIONS`."""
 
 REWARD: Final = (AGENTS, "reward")
-"""float32 [B, N, 1]: the reward of the turn."""
+"""float32 [B, N, 1]: the reward of the turn, harvest - fines + transfers."""
 
 HARVEST: Final = (AGENTS, "harvest")
 """float32 [B, N]: apples harvested this turn. An institution may change rewards, but never this entry."""
@@ -44,6 +44,30 @@ those of the following indices, cyclically. Only with `Observation.scoreboard`."
 
 STOCK_GAUGE: Final = (AGENTS, "stock_gauge")
 """float32 [B, N, 1]: the fraction of sites with an apple, 0..1. Only with `Observation.stock_gauge`."""
+
+FINES: Final = (AGENTS, "fines")
+"""float32 [B, N]: apples that institutions took from the agent this turn. This entry and all of institutions
+below are there only in games that have any."""
+
+TRANSFERS: Final = (AGENTS, "transfers")
+"""float32 [B, N]: apples that institutions gave the agent this turn."""
+
+VIOLATED: Final = (AGENTS, "violated")
+"""bool [B, N]: whether the agent broke a rule of an institution this turn, detected or not."""
+
+COUNTS: Final = (AGENTS, "counts")
+"""int32 [B, N, C]: what was counted for the agent in this episode so far, `cprl.institutions.COUNTS`."""
+
+INSTITUTIONS: Final = (AGENTS, "institutions")
+"""float32 [B, N, D]: what institutions show the agent, see `cprl.institutions.showing`; only if they show
+anything."""
+
+DECISION: Final = (AGENTS, "decision")
+"""int64 [B, N]: each agent's decision where `Game.decisions` is above 0: an option, 0 to `Game.decisions`
+- 1, read at an episode's first turn alone."""
+
+IN_FORCE: Final = "in_force"
+"""float32 [B, V]: what the agents' decisions put in force, one for each of `Game.ballots`."""
 
 STOCK: Final = "stock"
 """int64 [B, 1]: apples on the board."""

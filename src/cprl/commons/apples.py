@@ -115,7 +115,7 @@ def grow(world: Worlds, tables: Tables, scratch: Scratch, sprouts: int) -> None:
 
 
 def bite(world: Worlds, tables: Tables, harvest: NDArray[np.float32]) -> None:
-    """Each agent in play harvests the apple on its cell, if it may; `harvest`: float32 [N], 0 or 1.
+    """Each agent in play harvests the apple on its cell; `harvest`: float32 [N], 0 or 1.
 
     Two agents share a cell only under `pairwise_clashes`: the lower index gets the apple.
     """
@@ -123,7 +123,7 @@ def bite(world: Worlds, tables: Tables, harvest: NDArray[np.float32]) -> None:
         harvest[i] = 0.0
         if world.in_play[i]:
             k = tables.site_at[cell_of(world.row[i], world.col[i], tables)]
-            if k >= 0 and world.stock[k] == 1 and tables.may_bite[i, k]:
+            if k >= 0 and world.stock[k] == 1:
                 remove_apple(world, tables, k)
                 harvest[i] = 1.0
                 world.harvested[i] += 1

@@ -1,7 +1,7 @@
 """Batch: B worlds of a game, played a turn at a time by a driver (CPU threads or a GPU)."""
 
-from collections.abc import Mapping
-from typing import Any, Protocol
+from collections.abc import Iterable, Mapping
+from typing import Any, Final, Protocol, TypeAlias
 
 import numpy as np
 from numpy.typing import DTypeLike, NDArray
@@ -12,7 +12,28 @@ from cprl.commons.game import Game, output_shapes
 from cprl.commons.loops import Loop
 from cprl.commons.sizes import check_worlds_fit
 from cprl.commons.threads import CpuThreads
-from cprl.commons.world import Actions, Bools, Bytes, Shown, StepOutput, Worlds, empty_worlds
+from cprl.commons.world import (
+    Actions,
+    Arrays,
+    Bools,
+    Bytes,
+    Governed,
+    GovernedOutput,
+    Shown,
+    StepOutput,
+    Worlds,
+    empty_worlds,
+)
+from cprl.institutions.memory import REMEMBERED, Memory, Payments, empty_memory
+
+Output: TypeAlias = StepOutput | GovernedOutput
+"""`GovernedOutput` for a game with institutions."""
+
+_GOVERNED: Final[dict[Loop, Loop]] = {
+    "play_worlds": "play_governed_worlds",
+    "begin_worlds": "begin_governed_worlds",
+    "refresh_worlds": "refresh_governed_worlds",
+}
 
 
 class Driver(Protocol):
@@ -20,13 +41,19 @@ class Driver(Protocol):
 
     threads: int
 
-    def place(self, worlds: Worlds) -> Worlds: ...
+    def place(self, arrays: Arrays) -> Arrays: ...
     def empty(self, shape: tuple[int, ...], dtype: DTypeLike) -> NDArray[Any]: ...
     def read(self, array: NDArray[Any]) -> NDArray[Any]: ...
     def write(self, array: NDArray[Any], values: NDArray[Any]) -> None: ...
     def first_unknown(self, actions: Actions, known: int) -> int: ...
     def run(
-        self, loop: Loop, worlds: Worlds, argument: NDArray[Any], output: StepOutput, *, checked: bool = False
+        self,
+        loop: Loop,
+        worlds: Worlds | Governed,
+        argument: NDArray[Any],
+        output: Output,
+        *,
+        checked: bool = False,
     ) -> None: ...
 
 
@@ -76,6 +103,12 @@ class Batch:
         host.number[:, 0] = np.arange(first_world, first_world + worlds, dtype=np.uint64)
         self.now: Worlds = self.driver.place(host)
         """The current state of the worlds, in the driver's arrays."""
+        self.memory: Memory | None = None
+        """What institutions remember, likewise; None for a game without any."""
+        self._no_decisions = self.driver.empty((worlds, game.agents), np.int64)
+        if game.institutions:
+            self.driver.write(self._no_decisions, np.zeros((worlds, game.agents), np.int64))
+            self.memory = self.driver.place(empty_memory(game.governed_tables.institutions, worlds=worlds))
         self._all_worlds = self._selection(np.ones(worlds, np.bool_))
         self.set_seed(seed)
 
@@ -94,12 +127,29 @@ class Batch:
         self.driver.write(self.now.seed, np.full((self.size, 1), arguments.seed(seed), np.uint64))
         self.driver.write(self.now.episode, np.full((self.size, 1), -1, np.int32))
 
-    def new_output(self) -> StepOutput:
+    def new_output(self) -> Output:
         """New arrays for the output of a turn."""
         shapes = output_shapes(self.game, self.size)
-        return StepOutput(**{name: self.driver.empty(*form) for name, form in shapes.items()})
+        return output_of([self.driver.empty(*form) for form in shapes.values()])
 
-    def begin(self, output: StepOutput, which: Bools | None = None) -> StepOutput:
+    def _run(
+        self,
+        loop: Loop,
+        argument: NDArray[Any],
+        output: Output,
+        decisions: Actions | None = None,
+        *,
+        checked: bool = False,
+    ) -> None:
+        """Runs a loop of the game, with its institutions if it has any."""
+        if self.memory is None:
+            self.driver.run(loop, self.now, argument, output, checked=checked)
+        else:
+            decided = self._no_decisions if decisions is None else decisions
+            governed = Governed(self.now, self.memory, decided)
+            self.driver.run(_GOVERNED[loop], governed, argument, output, checked=checked)
+
+    def begin(self, output: Output, which: Bools | None = None) -> Output:
         """Begins the next episode of some worlds and writes their rows of `output`.
 
         Args:
@@ -115,39 +165,44 @@ class Batch:
             arguments.array("which", which, (self.size,), np.bool_)
             if not self._has_begun and not self.driver.read(which).all():
                 raise ValueError("which leaves worlds out; allowed at first: None, so that all worlds begin")
-        self.driver.run("begin_worlds", self.now, which, output)
+        self._run("begin_worlds", which, output)
         self._has_begun = True
         return output
 
-    def play(self, actions: Actions, output: StepOutput) -> StepOutput:
+    def play(self, actions: Actions, output: Output, decisions: Actions | None = None) -> Output:
         """Plays one turn of every world and writes its output.
 
         Args:
             actions: int64 [B, N], contiguous.
             output: Arrays made by `new_output`.
+            decisions: int64 [B, N], contiguous, where agents decide something, see `Game.decisions`; read of
+                worlds in the first turn of an episode alone. None for the first option of all agents.
 
         Raises:
-            ValueError: If an action is out of range, an array has the wrong form, or the worlds have not
-                begun; no world has changed.
+            ValueError: If an action or a decision is out of range, an array has the wrong form, or the worlds
+                have not begun; no world has changed.
         """
         self.check(actions)
-        self.driver.run("play_worlds", self.now, actions, output)
+        if decisions is not None:
+            self.check_decisions(decisions)
+        self._run("play_worlds", actions, output, decisions)
         return output
 
-    def play_checked(self, actions: Actions, output: StepOutput) -> StepOutput:
+    def play_checked(self, actions: Actions, output: Output, decisions: Actions | None = None) -> Output:
         """`play` without checks, which take as long as a turn of one world: `actions` are contiguous and have
-        passed `check`, and `output` has the form of `new_output`."""
-        self.driver.run("play_worlds", self.now, actions, output, checked=True)
+        passed `check`, decisions likewise, and `output` has the form of `new_output`."""
+        self._run("play_worlds", actions, output, decisions, checked=True)
         return output
 
-    def boards(self, output: StepOutput) -> Bytes:
+    def boards(self, output: Output) -> Bytes:
         """The current boards: uint8 [B, H, W], classes of `cprl.commons.colours`."""
         boards = self.driver.empty((self.size, self.game.map.height, self.game.map.width), np.uint8)
-        self.driver.run("show_worlds", self.now, boards, output)
+        self.driver.run("show_worlds", self.now, boards, turn_of(output), checked=True)
         return boards
 
-    def show(self, output: StepOutput, *, world: int = 0) -> Shown:
+    def show(self, output: Output, *, world: int = 0) -> Shown:
         """A copy of one world for display; `output` holds its latest observation."""
+        output = turn_of(output)
         world = arguments.integer("world", world, 0, self.size - 1)
         read, now = self.driver.read, self.now
         return Shown(
@@ -166,9 +221,16 @@ class Batch:
 
         The state and the game together determine the future, including all random numbers.
         """
-        return {name: self.driver.read(getattr(self.now, name)) for name in states.NAMES}
+        return {name: self.driver.read(array) for name, array in self._state_arrays().items()}
 
-    def load(self, state: Mapping[str, NDArray[Any]], output: StepOutput) -> StepOutput:
+    def _state_arrays(self) -> dict[str, NDArray[Any]]:
+        """The driver's arrays of a state by name."""
+        found = {name: getattr(self.now, name) for name in states.NAMES}
+        if self.memory is not None:
+            found |= {name: getattr(self.memory, name) for name in REMEMBERED}
+        return found
+
+    def load(self, state: Mapping[str, NDArray[Any]], output: Output) -> Output:
         """Sets the state of the worlds and writes it into `output`, with no harvest, shots, hits or growth.
 
         Args:
@@ -178,9 +240,10 @@ class Batch:
         Raises:
             ValueError: If the game cannot be in this state; no world has changed.
         """
-        for name, values in states.checked(state, worlds=self.size, game=self.game).items():
-            self.driver.write(getattr(self.now, name), values)
-        self.driver.run("refresh_worlds", self.now, self._all_worlds, output)
+        checked, arrays = states.checked(state, worlds=self.size, game=self.game), self._state_arrays()
+        for name, values in checked.items():
+            self.driver.write(arrays[name], values)
+        self._run("refresh_worlds", self._all_worlds, output)
         self._has_begun = True
         return output
 
@@ -202,3 +265,32 @@ class Batch:
                 f"action {self.driver.read(actions)[world, agent]} of agent {agent} in world {world} is "
                 f"unknown; allowed: 0 to {known - 1} ({', '.join(self.game.actions)})"
             )
+
+    def check_decisions(self, decisions: Actions) -> None:
+        """Checks decisions for `play`.
+
+        Raises:
+            ValueError: If they are not int64 [B, N], or one is out of range.
+        """
+        arguments.array("decisions", decisions, (self.size, self.game.agents), np.int64)
+        options = self.game.decisions
+        at = self.driver.first_unknown(decisions, max(1, options))
+        if at >= 0:
+            world, agent = divmod(at, self.game.agents)
+            raise ValueError(
+                f"decision {self.driver.read(decisions)[world, agent]} of agent {agent} in world {world} is "
+                f"unknown; allowed: 0 to {max(1, options) - 1}"
+            )
+
+
+def turn_of(output: Output) -> StepOutput:
+    """The part of an output that every game has."""
+    return output if isinstance(output, StepOutput) else output.turn
+
+
+def output_of(arrays: Iterable[Any]) -> Output:
+    """An output out of its arrays, in the order of `output_shapes`."""
+    found = list(arrays)
+    turn = StepOutput(*found[: len(StepOutput._fields)])
+    rest = found[len(StepOutput._fields) :]
+    return GovernedOutput(turn, Payments(*rest)) if rest else turn

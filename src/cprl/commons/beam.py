@@ -52,31 +52,41 @@ def find_hits(world: Worlds, tables: Tables, hit_by: Bools) -> None:
 
 def tag(world: Worlds, tables: Tables, hit_by: Bools, tagged_by: Bools) -> None:
     """Counts hits, at most one per agent and turn, and tags agents with `hits_to_tag` hits; [N, N] each."""
-    agents = world.row.shape[0]
-    for i in range(agents):
-        freeze = -1
-        for j in range(agents):
-            tagged_by[i, j] = False
-            if hit_by[i, j]:
-                offence = min(world.offences[i], tables.freeze.shape[1] - 1)
-                freeze = max(freeze, tables.freeze[j, offence])
-        if freeze < 0:
-            continue
-        world.hits[i] += 1
-        if world.hits[i] >= tables.hits_to_tag:
-            for j in range(agents):
-                tagged_by[i, j] = hit_by[i, j]
-            take_out_of_play(world, tables, i, freeze)
+    for i in range(world.row.shape[0]):
+        if count_hit(world, tables, hit_by, tagged_by, i):
+            take_out_of_play(world, tables, i, tables.freeze_steps)
+
+
+def count_hit(world: Worlds, tables: Tables, hit_by: Bools, tagged_by: Bools, i: int) -> bool:
+    """Counts at most one hit of agent i; the last of `hits_to_tag` tags it: writes by whom, returns True."""
+    is_hit_now = False
+    for j in range(world.row.shape[0]):
+        tagged_by[i, j] = False
+        is_hit_now = is_hit_now or hit_by[i, j]
+    if not is_hit_now:
+        return False
+    world.hits[i] += 1
+    if world.hits[i] < tables.hits_to_tag:
+        return False
+    for j in range(world.row.shape[0]):
+        tagged_by[i, j] = hit_by[i, j]
+    return True
 
 
 def take_out_of_play(world: Worlds, tables: Tables, i: int, freeze: int) -> None:
-    """Takes agent i out of play for `freeze` turns."""
-    world.in_play[i] = False
+    """Takes agent i, which was tagged, out of play for `freeze` turns."""
     world.hits[i] = 0
     world.offences[i] += 1
+    take_out(world, tables, i, freeze)
+
+
+def take_out(world: Worlds, tables: Tables, i: int, freeze: int) -> None:
+    """Takes agent i out of play for at least `freeze` turns."""
+    steps = max(0, freeze - 1) if tables.freeze_counts_tag_turn else freeze
+    world.in_play[i] = False
     world.tagged_step[i] = world.step[0]
-    world.out_steps[i] = max(0, freeze - 1) if tables.freeze_counts_tag_turn else freeze
+    world.out_steps[i] = max(world.out_steps[i], steps)
 
 
-FUNCTIONS = (beam_cell, beam_reach, is_hit, find_hits, take_out_of_play, tag)
+FUNCTIONS = (beam_cell, beam_reach, is_hit, find_hits, take_out, take_out_of_play, count_hit, tag)
 """The rules of this module, each after those it calls; `compiled.py` compiles them in this order."""

@@ -24,6 +24,8 @@ SITES_PER_DRAW = 16
 REGROWTH_FIRST_BYTE = 0 << 28
 REGROWTH_REST = 1 << 28
 STARTS = 2 << 28
+DETECTION = 3 << 28
+BALLOT = 4 << 28
 """The purpose of a draw: the upper four bits of the first counter word; its lower bits number the draw."""
 
 

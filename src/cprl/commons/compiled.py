@@ -126,5 +126,8 @@ def _can_write(folder: Path) -> bool:
 
 def _fingerprint() -> str:
     """A hash of the source text of all rules."""
-    sources = sorted(path for path in Path(__file__).parent.rglob("*.py"))
+    commons = Path(__file__).parent
+    sources = sorted(
+        path for folder in (commons, commons.parent / "institutions") for path in folder.rglob("*.py")
+    )
     return hashlib.sha256(b"".join(path.read_bytes() for path in sources)).hexdigest()[:16]

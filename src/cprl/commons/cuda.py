@@ -17,8 +17,18 @@ from cprl.commons.compiled import compiled
 from cprl.commons.game import Game
 from cprl.commons.loops import FUNCTIONS, LOOPS, Loop
 from cprl.commons.sizes import check_worlds_fit
-from cprl.commons.tables import Tables
-from cprl.commons.world import Actions, Scratch, StepOutput, Worlds, empty_scratch
+from cprl.commons.tables import GovernedTables, Tables
+from cprl.commons.world import (
+    Actions,
+    Arrays,
+    Governed,
+    GovernedOutput,
+    Scratch,
+    StepOutput,
+    Worlds,
+    empty_scratch,
+)
+from cprl.institutions.memory import InstitutionTables
 
 cuda: Any = numba.cuda
 
@@ -52,6 +62,12 @@ class CudaThreads:
         check_worlds_fit(game, worlds, free=_free_bytes())
         self.threads = worlds
         self.tables = Tables(*(_constant(entry) for entry in game.tables))
+        self.governed_tables: GovernedTables | None = None
+        if game.institutions:
+            own = game.governed_tables.institutions
+            self.governed_tables = GovernedTables(
+                self.tables, InstitutionTables(*(_constant(entry) for entry in own))
+            )
         scratch = empty_scratch(
             agents=game.agents,
             sites=len(game.map.sites),
@@ -61,9 +77,9 @@ class CudaThreads:
         self._scratch = Scratch(*(_worlds_innermost((worlds, *each.shape), each.dtype) for each in scratch))
         self._unknown = cuda.to_device(np.full(1, NONE_UNKNOWN, np.int64))
 
-    def place(self, worlds: Worlds) -> Worlds:
-        """Copies the arrays to the GPU."""
-        return Worlds(*(cuda.to_device(np.asfortranarray(array)) for array in worlds))
+    def place(self, arrays: Arrays) -> Arrays:
+        """Copies the arrays of `Worlds` or `Memory` to the GPU."""
+        return type(arrays)(*(cuda.to_device(np.asfortranarray(array)) for array in arrays))
 
     def wrap(self, memory: Any) -> NDArray[Any]:
         """A Numba array on GPU memory of another owner, such as a torch tensor; shares the memory."""
@@ -91,19 +107,26 @@ class CudaThreads:
         return -1 if at == NONE_UNKNOWN else at
 
     def run(
-        self, loop: Loop, worlds: Worlds, argument: NDArray[Any], output: StepOutput, *, checked: bool = False
+        self,
+        loop: Loop,
+        worlds: Worlds | Governed,
+        argument: NDArray[Any],
+        output: StepOutput | GovernedOutput,
+        *,
+        checked: bool = False,
     ) -> None:
         """Starts a loop over all worlds on the default stream and returns before it has finished.
 
         Args:
             loop: The loop.
-            worlds: The state of the worlds.
+            worlds: The state of the worlds; `Governed` for the loops of games with institutions.
             argument: The loop's own argument.
             output: The arrays that the loop writes.
             checked: Ignored; see `CpuThreads.run`.
         """
         kernel = kernels()[loop][_blocks(len(argument)), THREADS_PER_BLOCK]
-        kernel(worlds, self.tables, argument, output, self._scratch)
+        tables = self.governed_tables if isinstance(worlds, Governed) else self.tables
+        kernel(worlds, tables, argument, output, self._scratch)
 
 
 @cache

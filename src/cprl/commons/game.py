@@ -1,49 +1,47 @@
-"""Game: a Map, its Rules and the agents' Observation."""
+"""Game: a Map, its Rules, the agents' Observation, and the institutions that they live under."""
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, fields
 from functools import cached_property
 from importlib import import_module
 from typing import Any
 
 import numpy as np
 
-from cprl.arguments import object_of
+from cprl.arguments import object_of, objects
 from cprl.commons.colours import FIRST_AGENT, MAX_AGENTS_APART, class_colour
+from cprl.commons.institution_tables import build_institution_tables, check_institutions
 from cprl.commons.maps import Map
 from cprl.commons.observation import Observation, channel_names
 from cprl.commons.rules import Rules
-from cprl.commons.tables import Tables, build_tables, check_sizes
+from cprl.commons.tables import GovernedTables, Tables, build_tables, check_sizes
 from cprl.commons.world import Bytes
+from cprl.institutions import COUNTS, Institution
+from cprl.institutions.choice import Ballot, ballots, decision_options
 from cprl.spaces import Spaces
 
 
 @dataclass(frozen=True, kw_only=True)
 class Game:
-    """A map, its rules and what agents observe.
+    """A map, its rules, what agents observe, and the rules that people make.
 
     Raises:
-        ValueError: If a rule per agent or per site does not fit the map, or the observation does not fit
-            the rules.
+        ValueError: If the observation does not fit the rules, or an institution does not fit the map, the
+            rules, the observation or another institution.
     """
 
     map: Map
     rules: Rules
     observation: Observation = field(default_factory=Observation)
+    institutions: tuple[Institution, ...] = ()
 
     def __post_init__(self) -> None:
         for name, kind in (("map", Map), ("rules", Rules), ("observation", Observation)):
             object_of(f"Game.{name}", getattr(self, name), kind, f"a cprl.{kind.__name__}")
-        agents, sites = self.agents, len(self.map.sites)
-        may_fire, may_bite, freeze = self.rules.may_fire, self.rules.may_bite, self.rules.freeze_steps
-        if isinstance(may_fire, tuple) and len(may_fire) != agents:
-            raise ValueError(f"Rules.may_fire has {len(may_fire)} entries; allowed: {agents}, one per agent")
-        if isinstance(freeze, tuple) and len(freeze) != agents:
-            raise ValueError(f"Rules.freeze_steps has {len(freeze)} rows; allowed: {agents}, one per agent")
-        if may_bite is not None and (len(may_bite), len(may_bite[0])) != (agents, sites):
-            raise ValueError(
-                f"Rules.may_bite is {len(may_bite)} x {len(may_bite[0])}; allowed: {agents} x {sites}, "
-                "agents x sites"
-            )
+        agents = self.agents
+        institutions = objects(
+            "Game.institutions", self.institutions, Institution, "a sequence of values of cprl.institutions"
+        )
+        object.__setattr__(self, "institutions", tuple(institutions))
         if self.observation.area == "full" and self.rules.walls_block_sight:
             raise ValueError(
                 'Observation.area is "full" and Rules.walls_block_sight is True; allowed: area="window" '
@@ -55,6 +53,7 @@ class Game:
                 f"Observation.agents_apart is True and the map has {agents} agents; allowed: at most "
                 f"{MAX_AGENTS_APART}"
             )
+        check_institutions(self.institutions, self.map, self.rules, self.observation)
 
     @property
     def agents(self) -> int:
@@ -95,9 +94,28 @@ class Game:
         return 1 if self.observation.stock_gauge else 0
 
     @property
+    def institutions_size(self) -> int:
+        """The number D of entries that institutions show each agent: see `cprl.institutions.showing`."""
+        return len(self.governed_tables.institutions.shown_kind) if self.institutions else 0
+
+    @property
+    def ballots(self) -> tuple[Ballot, ...]:
+        """What agents decide on at an episode's first turn."""
+        return ballots(self.institutions, self.agents)
+
+    @property
+    def decisions(self) -> int:
+        """The number of options of ("agents", "decision"); 0 where there is nothing to decide."""
+        return decision_options(self.institutions, self.agents)
+
+    @property
     def spaces(self) -> Spaces:
         """What each agent observes and may do."""
-        vectors = {"stock_gauge": self.stock_gauge_size, "scoreboard": self.scoreboard_size}
+        vectors = {
+            "stock_gauge": self.stock_gauge_size,
+            "scoreboard": self.scoreboard_size,
+            "institutions": self.institutions_size,
+        }
         return Spaces(
             agents=self.agents,
             observation_shape=self.observation_shape,
@@ -112,7 +130,7 @@ class Game:
         return envs.CommonsEnv(self, worlds, seed=seed, device=device)
 
     def to_config(self) -> dict[str, Any]:
-        """Its map, rules and observation as JSON can hold them."""
+        """Its map, rules, observation and institutions as JSON can hold them."""
         config: dict[str, Any] = import_module("cprl.config").to_config(self)
         return config
 
@@ -127,12 +145,39 @@ class Game:
         """The lookup tables that the compiled rules read; computed once and cached."""
         return build_tables(self.map, self.rules, self.observation)
 
+    @cached_property
+    def governed_tables(self) -> GovernedTables:
+        """The lookup tables of the game and of its institutions; computed once and cached."""
+        own = build_institution_tables(self.institutions, self.map, self.rules, self.tables)
+        return GovernedTables(self.tables, own)
+
     def __getstate__(self) -> dict[str, object]:
-        return {"map": self.map, "rules": self.rules, "observation": self.observation}
+        return {own.name: getattr(self, own.name) for own in fields(self)}
 
 
-def output_shapes(game: Game, worlds: int) -> dict[str, tuple[tuple[int, ...], type[np.generic]]]:
-    """The shape and dtype of each entry of `StepOutput`, for B worlds of a game."""
+Shapes = dict[str, tuple[tuple[int, ...], type[np.generic]]]
+
+
+def output_shapes(game: Game, worlds: int) -> Shapes:
+    """The shape and dtype of each entry of `StepOutput`, for B worlds of a game, and then of `Payments` if it
+    has institutions."""
+    return _of_a_turn(game, worlds) | (_of_payments(game, worlds) if game.institutions else {})
+
+
+def _of_payments(game: Game, worlds: int) -> Shapes:
+    of_agent = worlds, game.agents
+    return {
+        "reward": (of_agent, np.float32),
+        "fines": (of_agent, np.float32),
+        "transfers": (of_agent, np.float32),
+        "violated": (of_agent, np.bool_),
+        "counts": ((*of_agent, len(COUNTS)), np.int32),
+        "institutions": ((*of_agent, game.institutions_size), np.float32),
+        "in_force": ((worlds, len(game.ballots)), np.float32),
+    }
+
+
+def _of_a_turn(game: Game, worlds: int) -> Shapes:
     of_agent = worlds, game.agents
     return {
         "observation": ((*of_agent, *game.observation_shape), np.uint8),

@@ -2,11 +2,22 @@
 
 from typing import Final, Literal, get_args
 
-from cprl.commons import turn
-from cprl.commons.tables import Tables
+from cprl.commons import institution_turn, turn
+from cprl.commons.institution_turn import begin_governed_episode, play_governed_turn, refresh_governed_output
+from cprl.commons.tables import GovernedTables, Tables
 from cprl.commons.turn import begin_episode, play_turn, refresh_output
 from cprl.commons.views import draw_board
-from cprl.commons.world import Actions, Bools, Bytes, Scratch, StepOutput, Worlds
+from cprl.commons.world import (
+    Actions,
+    Bools,
+    Bytes,
+    Governed,
+    GovernedOutput,
+    Scratch,
+    StepOutput,
+    Worlds,
+)
+from cprl.institutions.memory import Memory, Payments
 
 
 def one_world(w: Worlds, b: int) -> Worlds:
@@ -51,6 +62,43 @@ def one_output(o: StepOutput, b: int) -> StepOutput:
         o.terminated[b],
         o.truncated[b],
         o.done[b],
+    )
+
+
+def one_memory(m: Memory, b: int) -> Memory:
+    """What institutions remember of world b, without the axis B; shares memory."""
+    return Memory(
+        m.in_force[b],
+        m.allowed[b],
+        m.taken[b],
+        m.income[b],
+        m.level[b],
+        m.offence_step[b],
+        m.violation_step[b],
+        m.may_fire[b],
+        m.sanctioned[b],
+        m.detected[b],
+        m.closed[b],
+        m.counts[b],
+        m.broke[b],
+        m.unjust[b],
+        m.due[b],
+        m.fines[b],
+        m.transfers[b],
+        m.patch_stock[b],
+    )
+
+
+def one_payments(p: Payments, b: int) -> Payments:
+    """The payments of world b without the axis B; shares memory."""
+    return Payments(
+        p.reward[b],
+        p.fines[b],
+        p.transfers[b],
+        p.violated[b],
+        p.counts[b],
+        p.institutions[b],
+        p.in_force[b],
     )
 
 
@@ -126,6 +174,76 @@ def refresh_worlds(
             refresh_output(one_world(worlds, b), tables, one_output(output, b), scratch)
 
 
+def play_governed_worlds(
+    worlds: Governed,
+    tables: GovernedTables,
+    actions: Actions,
+    output: GovernedOutput,
+    scratch: Scratch,
+    first: int,
+    last: int,
+) -> None:
+    """`play_worlds` of a game with institutions."""
+    for b in range(first, last):
+        play_governed_turn(
+            one_world(worlds.worlds, b),
+            one_memory(worlds.memory, b),
+            tables.game,
+            tables.institutions,
+            actions[b],
+            worlds.decisions[b],
+            one_output(output.turn, b),
+            one_payments(output.payments, b),
+            scratch,
+        )
+
+
+def begin_governed_worlds(
+    worlds: Governed,
+    tables: GovernedTables,
+    which: Bools,
+    output: GovernedOutput,
+    scratch: Scratch,
+    first: int,
+    last: int,
+) -> None:
+    """`begin_worlds` of a game with institutions."""
+    for b in range(first, last):
+        if which[b]:
+            begin_governed_episode(
+                one_world(worlds.worlds, b),
+                one_memory(worlds.memory, b),
+                tables.game,
+                tables.institutions,
+                one_output(output.turn, b),
+                one_payments(output.payments, b),
+                scratch,
+            )
+
+
+def refresh_governed_worlds(
+    worlds: Governed,
+    tables: GovernedTables,
+    which: Bools,
+    output: GovernedOutput,
+    scratch: Scratch,
+    first: int,
+    last: int,
+) -> None:
+    """`refresh_worlds` of a game with institutions."""
+    for b in range(first, last):
+        if which[b]:
+            refresh_governed_output(
+                one_world(worlds.worlds, b),
+                one_memory(worlds.memory, b),
+                tables.game,
+                tables.institutions,
+                one_output(output.turn, b),
+                one_payments(output.payments, b),
+                scratch,
+            )
+
+
 def first_unknown(actions: Actions, known: int) -> int:
     """The index of the first action outside 0 .. known - 1, -1 if there is none; `actions`: int64 [count]."""
     for n in range(actions.shape[0]):
@@ -136,17 +254,31 @@ def first_unknown(actions: Actions, known: int) -> int:
 
 FUNCTIONS = (
     *turn.FUNCTIONS,
+    *institution_turn.FUNCTIONS,
     one_world,
     one_output,
+    one_memory,
+    one_payments,
     one_scratch,
     play_worlds,
     begin_worlds,
     show_worlds,
     refresh_worlds,
+    play_governed_worlds,
+    begin_governed_worlds,
+    refresh_governed_worlds,
     first_unknown,
 )
 """All rules and loops, each after those it calls."""
 
-Loop = Literal["play_worlds", "begin_worlds", "show_worlds", "refresh_worlds"]
+Loop = Literal[
+    "play_worlds",
+    "begin_worlds",
+    "show_worlds",
+    "refresh_worlds",
+    "play_governed_worlds",
+    "begin_governed_worlds",
+    "refresh_governed_worlds",
+]
 LOOPS: Final[tuple[Loop, ...]] = get_args(Loop)
 """The loops that drivers run; all have the same parameters except the third."""

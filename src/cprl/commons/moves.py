@@ -39,7 +39,7 @@ def act(world: Worlds, tables: Tables, actions: Actions, scratch: Scratch) -> No
         elif action == TURN_RIGHT:
             world.heading[i] = (world.heading[i] + 1) % 4
         elif action == FIRE and tables.has_beam:
-            world.fired[i] = tables.may_fire[i]
+            world.fired[i] = True
 
 
 def walk(world: Worlds, tables: Tables, i: int, direction: int) -> None:

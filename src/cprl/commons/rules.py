@@ -8,7 +8,7 @@ Sources: [W] M. Wiatrak, "Governing the Commons with Multi-Agent Reinforcement L
 from dataclasses import dataclass
 from typing import Any, Final, Literal, get_args
 
-from cprl.checks import SWITCH, Check, check_fields, is_bool, is_count, is_number, is_table, one_of
+from cprl.checks import SWITCH, Check, check_fields, is_bool, is_count, is_number, one_of
 
 ACTIONS: Final = ("forward", "backward", "left", "right", "turn_left", "turn_right", "beam", "stay")
 """The actions by index. If no agent may fire, there is no "beam", and 6 is "stay"."""
@@ -52,16 +52,13 @@ class Rules:
     hits_to_tag: int = 1
     """The hits, at most one per turn, after which an agent is tagged [W]; 2 in [run]. At least 1."""
 
-    freeze_steps: int | tuple[tuple[int, ...], ...] = 25
-    """The number of turns that a tagged agent misses [W], at least 0. One number, or a table: a row per
-    shooter, a column per offence of the tagged agent (the last column applies to every later offence)."""
+    freeze_steps: int = 25
+    """The number of turns that a tagged agent misses [W], at least 0; by shooter or by offence with
+    `cprl.institutions.GraduatedSanctions`."""
 
-    may_fire: bool | tuple[bool, ...] = True
-    """Whether agents may fire: one value for all, or one per agent. If none may, there is no beam action."""
-
-    may_bite: tuple[tuple[bool, ...], ...] | None = None
-    """Which agent may harvest which site: a row per agent, a column per site. None allows every agent every
-    site."""
+    may_fire: bool = True
+    """Whether agents may fire; if not, there is no beam action. For some agents alone:
+    `cprl.institutions.Sanctioner`."""
 
     window_rows: int = 6
     """The rows of a window: the agent's own and those ahead of it [W]. At least 1."""
@@ -116,14 +113,9 @@ class Rules:
         return length if isinstance(length, tuple) else (length,) * 4
 
     @property
-    def has_beam(self) -> bool:
-        """Whether any agent may fire, and so whether there is a beam action."""
-        return any(self.may_fire) if isinstance(self.may_fire, tuple) else self.may_fire
-
-    @property
     def actions(self) -> tuple[str, ...]:
         """The names of the actions, by index: 8 of them, or 7 without a beam."""
-        return ACTIONS if self.has_beam else tuple(name for name in ACTIONS if name != "beam")
+        return ACTIONS if self.may_fire else tuple(name for name in ACTIONS if name != "beam")
 
 
 def _is_odd(value: Any, high: int = 2**31 - 1) -> bool:
@@ -142,14 +134,6 @@ def _are_beam_lengths(value: Any) -> bool:
     if isinstance(value, tuple):
         return len(value) == 4 and all(is_count(length, 1) for length in value)
     return is_count(value, 1)
-
-
-def _are_freezes(value: Any) -> bool:
-    return is_count(value, 0) or is_table(value, lambda steps: is_count(steps, 0))
-
-
-def _is_may_fire(value: Any) -> bool:
-    return is_bool(value) or (isinstance(value, tuple) and bool(value) and all(map(is_bool, value)))
 
 
 _SWITCHES: Final = (
@@ -172,14 +156,10 @@ _CHECKS: Final[dict[str, Check]] = {
     "beam_width_cells": Check(_is_odd, "an odd integer >= 1"),
     "hits_to_tag": Check(lambda value: is_count(value, 1), "an integer >= 1"),
     "freeze_steps": Check(
-        _are_freezes,
-        "an integer >= 0, or a table of them: equally long rows by shooter, columns by offence",
+        lambda value: is_count(value, 0),
+        "an integer >= 0; by shooter or by offence with cprl.institutions.GraduatedSanctions",
     ),
-    "may_fire": Check(_is_may_fire, "True, False, or a tuple with one of them per agent"),
-    "may_bite": Check(
-        lambda value: value is None or is_table(value, is_bool),
-        "None, or a table of True and False: a row per agent, a column per site",
-    ),
+    "may_fire": Check(is_bool, "True or False; for some agents alone cprl.institutions.Sanctioner"),
     "window_rows": Check(
         lambda value: is_count(value, 1, LARGEST_WINDOW_CELLS), f"an integer from 1 to {LARGEST_WINDOW_CELLS}"
     ),

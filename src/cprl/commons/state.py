@@ -10,6 +10,7 @@ from cprl.arguments import array, object_of
 from cprl.checks import shown
 from cprl.commons.game import Game
 from cprl.commons.world import PLAYING, TRUNCATED, Worlds, empty_worlds
+from cprl.institutions.memory import REMEMBERED, empty_memory
 
 State = dict[str, NDArray[Any]]
 
@@ -36,6 +37,9 @@ def checked(state: Mapping[str, Any], *, worlds: int, game: Game) -> State:
     """
     empty = empty_worlds(worlds=worlds, agents=game.agents, sites=len(game.map.sites))
     expected = {name: getattr(empty, name) for name in NAMES}
+    if game.institutions:
+        memory = empty_memory(game.governed_tables.institutions, worlds=worlds)
+        expected |= {name: getattr(memory, name) for name in REMEMBERED}
     object_of("state", state, Mapping, f"a table of arrays by the names {sorted(expected)}")
     if set(state) != set(expected):
         missing = sorted(set(expected) - set(state))
@@ -49,6 +53,8 @@ def checked(state: Mapping[str, Any], *, worlds: int, game: Game) -> State:
         array(f"state[{name!r}]", arrays[name], form.shape, form.dtype)
     _check_ranges(arrays, game)
     _check_places(arrays, game)
+    if game.institutions:
+        _check_memory(arrays, game)
     return arrays
 
 
@@ -82,6 +88,22 @@ def _check_ranges(arrays: State, game: Game) -> None:
         _refuse(arrays, name, (arrays[name] < low) | (arrays[name] > high), f"{low} to {high}")
     out = arrays["out_steps"] > 0
     _refuse(arrays, "in_play", arrays["in_play"] & out, "False while out_steps is above 0")
+
+
+def _check_memory(arrays: State, game: Game) -> None:
+    """Checks what institutions remember."""
+    steps = game.rules.episode_steps
+    most = dict.fromkeys(("taken", "offence_step", "violation_step"), steps)
+    for name in ("taken", "level", "offence_step", "violation_step", "counts"):
+        high = most.get(name, _MAX_INT32)
+        _refuse(arrays, name, (arrays[name] < 0) | (arrays[name] > high), f"0 to {high}")
+    for name in ("allowed", "income"):
+        wrong = ~(np.isfinite(arrays[name]) & (arrays[name] >= 0))
+        _refuse(arrays, name, wrong, "a number of at least 0")
+    for nth, ballot in enumerate(game.ballots):
+        wrong = np.zeros(arrays["in_force"].shape, np.bool_)
+        wrong[:, nth] = ~np.isin(arrays["in_force"][:, nth], ballot.choices)
+        _refuse(arrays, "in_force", wrong, f"one of {list(ballot.choices)}")
 
 
 def _check_places(arrays: State, game: Game) -> None:

@@ -12,6 +12,7 @@ from cprl.commons.near import neighbours
 from cprl.commons.observation import Observation, classes_shown
 from cprl.commons.rules import Rules
 from cprl.commons.world import COL_STEP, ROW_STEP, Bools, Indices, Ints
+from cprl.institutions.memory import InstitutionTables
 
 CLASS_SHIFT: Final = 24
 """A paint is a colour in 24 bits, and its class from this bit on."""
@@ -46,12 +47,6 @@ class Tables(NamedTuple):
     """[N, 3], row, column and heading of each agent at the start of an episode."""
     beam_length: Ints
     """[4], in cells, by heading."""
-    freeze: Ints
-    """[N, offences], the number of turns missed, by shooter and offence."""
-    may_fire: Bools
-    """bool [N], whether each agent may fire."""
-    may_bite: Bools
-    """bool [N, K], whether each agent may harvest each site."""
     paints: Ints
     """[classes], the value of a picture's cell: red + 2**8 green + 2**16 blue + 2**24 class."""
     channel_of: Ints
@@ -68,6 +63,7 @@ class Tables(NamedTuple):
     """The number of cells per row, rim included."""
     beam_half_width: int
     hits_to_tag: int
+    freeze_steps: int
     episode_steps: int
     has_beam: bool
     agents_apart: bool
@@ -86,6 +82,13 @@ class Tables(NamedTuple):
     paint_over: bool
     mark_behind_if_vertical: bool
     self_paint_stays: bool
+
+
+class GovernedTables(NamedTuple):
+    """A game with institutions as arrays."""
+
+    game: Tables
+    institutions: InstitutionTables
 
 
 def check_sizes(board: Map, rules: Rules) -> None:
@@ -222,8 +225,6 @@ def build_tables(board: Map, rules: Rules, observation: Observation) -> Tables:
     max_near = int(np.diff(near_first).max())
     probs = [rules.regrow_prob[min(n, len(rules.regrow_prob) - 1)] for n in range(max_near + 1)]
     below = np.array([threshold(p) for p in probs], np.int64)
-    freeze = rules.freeze_steps if isinstance(rules.freeze_steps, tuple) else ((rules.freeze_steps,),)
-    sites = len(board.sites)
     return Tables(
         background=background.reshape(-1),
         site_cell=np.array(cells(board.sites), np.uint32),
@@ -234,11 +235,6 @@ def build_tables(board: Map, rules: Rules, observation: Observation) -> Tables:
         regrow_first_byte=((below - 1) >> REST_BITS).astype(np.int32),
         start=np.array(board.starts, np.int32),
         beam_length=np.array(rules.beam_lengths_cells, np.int32),
-        freeze=np.broadcast_to(np.array(freeze, np.int32), (agents, len(freeze[0]))).copy(),
-        may_fire=np.broadcast_to(np.array(rules.may_fire), (agents,)).copy(),
-        may_bite=np.broadcast_to(
-            np.array(True if rules.may_bite is None else rules.may_bite), (agents, sites)
-        ).copy(),
         paints=paints,
         channel_of=channel_of,
         window_cells=_board_cells(board, rim, stride) if sees_all else _window_cells(rules, stride),
@@ -247,8 +243,9 @@ def build_tables(board: Map, rules: Rules, observation: Observation) -> Tables:
         stride=stride,
         beam_half_width=half_width,
         hits_to_tag=int(rules.hits_to_tag),
+        freeze_steps=int(rules.freeze_steps),
         episode_steps=int(rules.episode_steps),
-        has_beam=rules.has_beam,
+        has_beam=rules.may_fire,
         agents_apart=observation.agents_apart,
         one_hot=observation.encoding == "one_hot",
         sees_all=sees_all,

@@ -12,8 +12,17 @@ from cprl import arguments
 from cprl.commons.compiled import entry_for_cpu, rules_for_cpu
 from cprl.commons.game import Game, output_shapes
 from cprl.commons.loops import Loop
-from cprl.commons.tables import Tables
-from cprl.commons.world import Actions, StepOutput, Worlds, empty_scratch
+from cprl.commons.tables import GovernedTables, Tables
+from cprl.commons.world import (
+    Actions,
+    Arrays,
+    Governed,
+    GovernedOutput,
+    StepOutput,
+    Worlds,
+    arrays_of,
+    empty_scratch,
+)
 
 MOST_THREADS: Final = 1024
 """The largest number of threads; no machine has that many cores."""
@@ -46,8 +55,9 @@ class CpuThreads:
         limit = threads or os.cpu_count() or 1
         self.threads = min(limit, worlds if threads else -(-worlds // WORLDS_PER_THREAD))
         self.tables: Tables = game.tables
+        self.governed_tables: GovernedTables | None = game.governed_tables if game.institutions else None
         self._expected = tuple(output_shapes(game, worlds).values())
-        self._output: StepOutput | None = None
+        self._output: StepOutput | GovernedOutput | None = None
         self._scratch = [
             empty_scratch(
                 agents=game.agents,
@@ -58,9 +68,9 @@ class CpuThreads:
             for _ in range(self.threads)
         ]
 
-    def place(self, worlds: Worlds) -> Worlds:
-        """Returns the arrays unchanged: this driver uses numpy arrays."""
-        return worlds
+    def place(self, arrays: Arrays) -> Arrays:
+        """Returns the arrays of `Worlds` or `Memory` unchanged: this driver uses numpy arrays."""
+        return arrays
 
     def empty(self, shape: tuple[int, ...], dtype: DTypeLike) -> NDArray[Any]:
         """A new array with undefined entries."""
@@ -79,13 +89,19 @@ class CpuThreads:
         return int(rules_for_cpu()["first_unknown"](actions.reshape(-1), known))
 
     def run(
-        self, loop: Loop, worlds: Worlds, argument: NDArray[Any], output: StepOutput, *, checked: bool = False
+        self,
+        loop: Loop,
+        worlds: Worlds | Governed,
+        argument: NDArray[Any],
+        output: StepOutput | GovernedOutput,
+        *,
+        checked: bool = False,
     ) -> None:
         """Runs a loop over all worlds; the calling thread takes the last share.
 
         Args:
             loop: The loop.
-            worlds: The state of the worlds.
+            worlds: The state of the worlds; `Governed` for the loops of games with institutions.
             argument: The loop's own argument.
             output: The arrays that the loop writes.
             checked: Whether the caller has checked the form of `argument` and `output`.
@@ -95,8 +111,9 @@ class CpuThreads:
         """
         if not checked:
             self._check(argument, output)
-        size = worlds.step.shape[0]
-        arguments = worlds, self.tables, argument, output
+        size = len(argument)
+        tables = self.governed_tables if isinstance(worlds, Governed) else self.tables
+        arguments = worlds, tables, argument, output
         entry = entry_for_cpu(loop, *arguments, self._scratch[0], 0, size)
         if self.threads == 1:
             entry(*arguments, self._scratch[0], 0, size)
@@ -109,7 +126,7 @@ class CpuThreads:
         for share in shares:
             share.result()
 
-    def _check(self, argument: NDArray[Any], output: StepOutput) -> None:
+    def _check(self, argument: NDArray[Any], output: StepOutput | GovernedOutput) -> None:
         """Checks the arrays, because the compiled loops do not; see `entry_for_cpu`."""
         if not argument.flags.c_contiguous:
             raise ValueError(
@@ -118,8 +135,9 @@ class CpuThreads:
             )
         if output is self._output:
             return
-        arguments.object_of("output", output, StepOutput, "a StepOutput, made by new_output()")
-        arrays: dict[str, NDArray[Any]] = output._asdict()
+        kind = GovernedOutput if self.governed_tables else StepOutput
+        arguments.object_of("output", output, kind, f"a {kind.__name__}, made by new_output()")
+        arrays: dict[str, NDArray[Any]] = arrays_of(output)
         for (name, array), (shape, dtype) in zip(arrays.items(), self._expected, strict=True):
             arguments.array(f"output.{name}", array, shape, dtype)
             if not array.flags.carray:

@@ -3,12 +3,13 @@
 The rules are written for one world: they receive these tuples without the axis B.
 """
 
-from typing import Any, NamedTuple, TypeAlias
+from typing import Any, NamedTuple, TypeAlias, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
 
 from cprl.commons.chance import SITES_PER_DRAW
+from cprl.institutions.memory import Memory, Payments
 
 Ints: TypeAlias = NDArray[np.int32]
 Bytes: TypeAlias = NDArray[np.uint8]
@@ -104,6 +105,32 @@ class StepOutput(NamedTuple):
     """bool [B, 1], the episode ran out of time."""
     done: Bools
     """bool [B, 1], terminated or truncated."""
+
+
+class GovernedOutput(NamedTuple):
+    """The output of a turn of a game with institutions."""
+
+    turn: StepOutput
+    payments: Payments
+
+
+def arrays_of(output: StepOutput | GovernedOutput) -> dict[str, NDArray[Any]]:
+    """All arrays of an output by name."""
+    if isinstance(output, StepOutput):
+        return output._asdict()
+    return output.turn._asdict() | output.payments._asdict()
+
+
+Arrays = TypeVar("Arrays", "Worlds", Memory)
+
+
+class Governed(NamedTuple):
+    """The state of B worlds with institutions, and what their agents decide."""
+
+    worlds: Worlds
+    memory: Memory
+    decisions: Actions
+    """int64 [B, N], read in the first turn of an episode."""
 
 
 class Scratch(NamedTuple):

@@ -13,12 +13,13 @@ from torchrl.data import Bounded, Categorical, Composite, Unbounded
 
 from cprl import arguments, keys
 from cprl.checks import shown
-from cprl.commons.batch import Batch
+from cprl.commons.batch import Batch, Output, output_of, turn_of
 from cprl.commons.game import Game, output_shapes
 from cprl.commons.world import Bytes, StepOutput
 from cprl.compat import LeanStepEnv, flag_spec, put_all, unchecked_tensordict
 from cprl.envs.drivers import device_of, drawn_seed, driver_for
 from cprl.envs.rendering import images
+from cprl.institutions import COUNTS
 
 _AGENT_ENTRIES = ("observation", "harvest", "in_play", "fired", "hit_by", "tagged_by")
 _TORCH_TYPES = {
@@ -26,6 +27,7 @@ _TORCH_TYPES = {
     np.float32: torch.float32,
     np.bool_: torch.bool,
     np.int64: torch.int64,
+    np.int32: torch.int32,
 }
 _WHOLE_NUMBERS = (torch.int64, torch.int32, torch.int16, torch.int8, torch.uint8)
 """The dtypes of actions that convert to int64 without a change of any number."""
@@ -34,8 +36,14 @@ _DONE_ENTRIES = ("done", "terminated", "truncated")
 _AHEAD_BYTES = 2**16
 """Below this size, memory is allocated for sixteen turns at once: an allocation takes as long as a world."""
 _AHEAD_TURNS = 16
-_OWN_KEYS = frozenset((*_WORLD_ENTRIES, *_DONE_ENTRIES, keys.STATE, keys.AGENTS, "next", "_reset"))
-_OWN_AGENT_KEYS = frozenset((*_AGENT_ENTRIES, "scoreboard", "stock_gauge", "reward"))
+_OWN_KEYS = frozenset(
+    (*_WORLD_ENTRIES, *_DONE_ENTRIES, keys.IN_FORCE, keys.STATE, keys.AGENTS, "next", "_reset")
+)
+_PAID_ENTRIES = ("fines", "transfers", "violated", "counts")
+"""Entries of agents in games with institutions."""
+_OWN_AGENT_KEYS = frozenset(
+    (*_AGENT_ENTRIES, *_PAID_ENTRIES, "scoreboard", "stock_gauge", "institutions", "reward")
+)
 
 
 class CommonsEnv(LeanStepEnv):
@@ -90,8 +98,10 @@ class CommonsEnv(LeanStepEnv):
         self.group_map = {keys.AGENTS: list(game.agent_names)}
         self._size = worlds
         self._agents_size = torch.Size([worlds, game.agents])
-        vectors = {"scoreboard": game.scoreboard_size, "stock_gauge": game.stock_gauge_size}
-        self._agent_entries = (*_AGENT_ENTRIES, *(name for name, size in vectors.items() if size))
+        paid = _PAID_ENTRIES if game.institutions else ()
+        self._agent_entries = (*_AGENT_ENTRIES, *paid, *(name for name, _ in game.spaces.vectors))
+        self._world_entries = (*_WORLD_ENTRIES, *((keys.IN_FORCE,) if game.ballots else ()))
+        self._decides, self._is_governed = game.decisions > 0, bool(game.institutions)
         self._with_state = state
         self._forms = {
             name: (shape, _TORCH_TYPES[dtype]) for name, (shape, dtype) in output_shapes(game, worlds).items()
@@ -99,9 +109,10 @@ class CommonsEnv(LeanStepEnv):
         self._colours = torch.from_numpy(game.palette).to(device)
         output_bytes = sum(prod(shape) * dtype.itemsize for shape, dtype in self._forms.values())
         self._turns_ahead = _AHEAD_TURNS if output_bytes < _AHEAD_BYTES else 1
-        self._ahead: list[tuple[dict[str, Tensor], StepOutput]] = []
+        self._ahead: list[tuple[dict[str, Tensor], Output]] = []
         self._tensors: dict[str, Tensor]
         self.output: StepOutput
+        self._whole: Output
         self._show_in(*self._fresh())
         self._make_specs()
 
@@ -112,8 +123,10 @@ class CommonsEnv(LeanStepEnv):
         def group(**specs: Any) -> Composite:
             return Composite(agents=Composite(**specs, shape=per_agent), shape=(worlds,))
 
+        decision = {"decision": Categorical(game.decisions, shape=per_agent, dtype=torch.int64)}
         self.action_spec = group(
-            action=Categorical(len(self.game.actions), shape=per_agent, dtype=torch.int64)
+            action=Categorical(len(self.game.actions), shape=per_agent, dtype=torch.int64),
+            **(decision if self._decides else {}),
         )
         self.reward_spec = group(reward=Unbounded(shape=(*per_agent, 1), dtype=torch.float32))
         sites = len(self.game.map.sites)
@@ -134,6 +147,8 @@ class CommonsEnv(LeanStepEnv):
             )
         if game.observation.stock_gauge:
             observation_spec[keys.STOCK_GAUGE] = Bounded(0, 1, shape=(*per_agent, 1), dtype=torch.float32)
+        if self._is_governed:
+            self._add_specs_of_institutions(observation_spec)
         for name in _WORLD_ENTRIES:
             observation_spec[name] = Bounded(0, sites, shape=(worlds, 1), dtype=torch.int64)
         if self._with_state:
@@ -142,20 +157,34 @@ class CommonsEnv(LeanStepEnv):
         self.observation_spec = observation_spec
         self.done_spec = Composite({name: flag_spec(worlds, 1) for name in _DONE_ENTRIES}, shape=(worlds,))
 
-    def _fresh(self) -> tuple[dict[str, Tensor], StepOutput]:
+    def _add_specs_of_institutions(self, specs: Composite) -> None:
+        game, per_agent = self.game, tuple(self._agents_size)
+        for key in (keys.FINES, keys.TRANSFERS):
+            specs[key] = Unbounded(shape=per_agent, dtype=torch.float32)
+        specs[keys.VIOLATED] = flag_spec(*per_agent)
+        specs[keys.COUNTS] = Unbounded(shape=(*per_agent, len(COUNTS)), dtype=torch.int32)
+        if game.institutions_size:
+            specs[keys.INSTITUTIONS] = Unbounded(
+                shape=(*per_agent, game.institutions_size), dtype=torch.float32
+            )
+        if game.ballots:
+            specs[keys.IN_FORCE] = Unbounded(shape=(self._size, len(game.ballots)), dtype=torch.float32)
+
+    def _fresh(self) -> tuple[dict[str, Tensor], Output]:
         """New memory for the output of a turn: as tensors by name, and the same memory as arrays."""
         if not self._ahead:
             names, blocks = list(self._forms), [self._block(*form) for form in self._forms.values()]
             tensors = zip(*(block.unbind() for block in blocks), strict=True)
             arrays = zip(*(self._turns_of(block) for block in blocks), strict=True)
             for own, output in zip(tensors, arrays, strict=True):
-                self._ahead.append((dict(zip(names, own, strict=True)), StepOutput(*output)))
+                self._ahead.append((dict(zip(names, own, strict=True)), output_of(output)))
         return self._ahead.pop()
 
-    def _show_in(self, tensors: dict[str, Tensor], output: StepOutput) -> None:
+    def _show_in(self, tensors: dict[str, Tensor], output: Output) -> None:
         """Sets the memory of the current output; faster than through attributes of a module."""
         object.__setattr__(self, "_tensors", tensors)
-        object.__setattr__(self, "output", output)
+        object.__setattr__(self, "_whole", output)
+        object.__setattr__(self, "output", turn_of(output))
 
     def _turns_of(self, block: Tensor) -> Any:
         """The turns of a block as arrays."""
@@ -171,7 +200,7 @@ class CommonsEnv(LeanStepEnv):
         agents = {name: tensors[name] for name in self._agent_entries}
         if reward is not None:
             agents["reward"] = reward
-        entries: dict[str, Any] = {name: tensors[name] for name in (*_WORLD_ENTRIES, *_DONE_ENTRIES)}
+        entries: dict[str, Any] = {name: tensors[name] for name in (*self._world_entries, *_DONE_ENTRIES)}
         if self._with_state:
             boards = torch.as_tensor(self.worlds.boards(self.output), device=self.device)
             entries[keys.STATE] = self._colours[boards.long()].permute(0, 3, 1, 2)
@@ -218,11 +247,11 @@ class CommonsEnv(LeanStepEnv):
         before = self._tensors
         self._show_in(*self._fresh())
         if which is None:
-            self.worlds.begin(self.output)
+            self.worlds.begin(self._whole)
         else:
             for name, tensor in self._tensors.items():
                 tensor.copy_(before[name])
-            self.worlds.begin(self.output, self._as_array(which.reshape(-1)))
+            self.worlds.begin(self._whole, self._as_array(which.reshape(-1)))
         return self._tensors
 
     def load(self, state: Mapping[str, NDArray[Any]]) -> TensorDict:
@@ -248,27 +277,32 @@ class CommonsEnv(LeanStepEnv):
         return images(self.worlds, self.output, world=world, cell_pixels=cell_pixels)
 
     def _step(self, tensordict: TensorDictBase) -> TensorDict:
-        actions = self._as_array(self._actions(tensordict).contiguous())
+        actions = self._as_array(self._chosen(tensordict, "action").contiguous())
         self.worlds.check(actions)
+        decisions = None
+        if self._decides:
+            decisions = self._as_array(self._chosen(tensordict, "decision").contiguous())
+            self.worlds.check_decisions(decisions)
         self._show_in(*self._fresh())
-        self.worlds.play_checked(actions, self.output)
-        return self._as_tensordict(self._tensors, self._tensors["harvest"].unsqueeze(-1).clone())
+        self.worlds.play_checked(actions, self._whole, decisions)
+        reward = self._tensors["reward"] if self._is_governed else self._tensors["harvest"].clone()
+        return self._as_tensordict(self._tensors, reward.unsqueeze(-1))
 
-    def _actions(self, tensordict: TensorDictBase) -> Tensor:
-        """("agents", "action"), int64 on the device of the worlds.
+    def _chosen(self, tensordict: TensorDictBase, name: str) -> Tensor:
+        """("agents", "action") or ("agents", "decision"), int64 on the device of the worlds.
 
         Raises:
             ValueError: if it is missing or holds no integers.
         """
         try:
-            actions: Tensor = keys.entry(keys.entry(tensordict, keys.AGENTS), "action")
+            actions: Tensor = keys.entry(keys.entry(tensordict, keys.AGENTS), name)
         except (KeyError, AttributeError):
             shape = list(self._agents_size)
-            raise ValueError(f'("agents", "action") is missing; allowed: int64 {shape}') from None
+            raise ValueError(f'("agents", "{name}") is missing; allowed: int64 {shape}') from None
         if actions.dtype is not torch.int64:
             if actions.dtype not in _WHOLE_NUMBERS:
                 raise ValueError(
-                    f'("agents", "action") is {actions.dtype}; allowed: int64 {list(self._agents_size)}'
+                    f'("agents", "{name}") is {actions.dtype}; allowed: int64 {list(self._agents_size)}'
                 )
             actions = actions.long()
         return actions if actions.device == self.device else actions.to(self.device)

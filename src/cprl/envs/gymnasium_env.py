@@ -50,7 +50,7 @@ class CommonsGymnasiumEnv(gymnasium.Env[Any, Any]):
     ) -> tuple[Observed, dict[str, Any]]:
         """Begins the next episode, or the first episode of a new seed."""
         super().reset(seed=None if seed is None else arguments.seed(seed))
-        self.world.begin(seed)
+        self.world.begin(seed, (options or {}).get("decisions"))
         return self.world.observation(0), self.world.info(0)
 
     def step(self, action: int) -> tuple[Observed, float, bool, bool, dict[str, Any]]:

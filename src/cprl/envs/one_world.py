@@ -1,6 +1,6 @@
 """OneWorld: one world of a game in numpy, shared by the adapters for PettingZoo and Gymnasium."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any, Final
 
 import numpy as np
@@ -8,11 +8,12 @@ from gymnasium import spaces
 from numpy.typing import NDArray
 
 from cprl import arguments
-from cprl.commons.batch import Batch
+from cprl.commons.batch import Batch, Output, turn_of
 from cprl.commons.game import Game
 from cprl.commons.picture import world_image
-from cprl.commons.world import Bytes
+from cprl.commons.world import Bytes, GovernedOutput
 from cprl.envs.window import Window
+from cprl.institutions.memory import Payments
 
 RENDER_MODES: Final = ("rgb_array", "human")
 RENDER_FPS: Final = 15
@@ -39,11 +40,21 @@ class OneWorld:
             raise arguments.refusal("render_mode", render_mode, f"None, {', '.join(RENDER_MODES)}")
         self.game = game
         self.batch = Batch(game, 1, seed=seed)
-        self.output = self.batch.new_output()
+        self._show_in(self.batch.new_output())
+        self._decisions = np.zeros((1, game.agents), np.int64)
         self.render_mode = render_mode
         self._window = Window(title) if render_mode == "human" else None
         self._names = game.agent_names
         self._has_begun = False
+
+    def _show_in(self, output: Output) -> None:
+        self._whole = output
+        self.output = turn_of(output)
+
+    @property
+    def payments(self) -> Payments | None:
+        """What institutions output in the last turn; None for a game without any."""
+        return self._whole.payments if isinstance(self._whole, GovernedOutput) else None
 
     def observation_space(self) -> spaces.Space[Any]:
         """A Box of uint8 [C, X, Y]; with a scoreboard or stock gauge, a Dict with it as "observation"."""
@@ -54,16 +65,41 @@ class OneWorld:
             vectors["scoreboard"] = spaces.Box(0, game.rules.episode_steps, (game.agents,), np.float32)
         if game.observation.stock_gauge:
             vectors["stock_gauge"] = spaces.Box(0, 1, (1,), np.float32)
+        if game.institutions_size:
+            vectors["institutions"] = spaces.Box(0, np.inf, (game.institutions_size,), np.float32)
         return spaces.Dict({"observation": seen, **vectors}) if vectors else seen
 
-    def begin(self, seed: int | None) -> None:
-        """Begins the next episode, or the first episode of a new seed."""
+    def begin(self, seed: int | None, decisions: Mapping[str, Any] | None = None) -> None:
+        """Begins the next episode, or the first episode of a new seed.
+
+        Args:
+            seed: The new seed, or None.
+            decisions: What agents decide in this episode, by name, see `Game.decisions`; an agent that is not
+                named takes the first option.
+
+        Raises:
+            ValueError: For decisions of agents or options that the game lacks; the world is unchanged.
+        """
+        decided = self._checked(decisions or {})
         if seed is not None:
             self.batch.set_seed(seed)
-        self.output = self.batch.begin(self.batch.new_output())
+        self._decisions = decided
+        self._show_in(self.batch.begin(self.batch.new_output()))
         self._has_begun = True
         if self._window:
             self.render()
+
+    def _checked(self, decisions: Any) -> NDArray[np.int64]:
+        """Decisions by name as int64 [1, N]."""
+        arguments.object_of("decisions", decisions, Mapping, "a dict of decisions by the names of agents")
+        options, decided = self.game.decisions, np.zeros((1, self.game.agents), np.int64)
+        if decisions and not options:
+            raise arguments.refusal("decisions", decisions, "None: agents decide nothing in this game")
+        for name, decision in decisions.items():
+            arguments.choice("the agent of a decision", name, self._names)
+            agent = self._names.index(name)
+            decided[0, agent] = arguments.integer(f"the decision of {name}", decision, 0, options - 1)
+        return decided
 
     def play(self, actions: Sequence[Any]) -> None:
         """Plays one turn with one action per agent.
@@ -79,7 +115,8 @@ class OneWorld:
             arguments.integer(f"the action of {name}", action, 0, last)
             for name, action in zip(self._names, actions, strict=True)
         ]
-        self.output = self.batch.play_checked(np.array([row], np.int64), self.batch.new_output())
+        output, decisions = self.batch.new_output(), self._decisions if self.game.decisions else None
+        self._show_in(self.batch.play_checked(np.array([row], np.int64), output, decisions))
         if self._window:
             self.render()
 
@@ -91,17 +128,23 @@ class OneWorld:
             vectors["scoreboard"] = output.scoreboard[0, agent]
         if form.stock_gauge:
             vectors["stock_gauge"] = output.stock_gauge[0, agent]
+        if self.payments is not None and self.game.institutions_size:
+            vectors["institutions"] = self.payments.institutions[0, agent]
         seen = output.observation[0, agent]
         return {"observation": seen, **vectors} if vectors else seen
 
     def reward(self, agent: int) -> float:
-        """The reward of an agent in the last turn: its harvest."""
-        return float(self.output.harvest[0, agent])
+        """The reward of an agent in the last turn: its harvest, less fines and plus transfers."""
+        payments = self.payments
+        return float((self.output.harvest if payments is None else payments.reward)[0, agent])
 
     def info(self, agent: int) -> dict[str, Any]:
-        """An agent's harvest in the last turn, whether it fired and was tagged, and whether it acts next."""
-        output = self.output
+        """An agent's harvest in the last turn, whether it fired and was tagged, and whether it acts next;
+        with institutions also its "fines" and "transfers" and whether it "violated" a rule."""
+        output, payments = self.output, self.payments
+        paid = {} if payments is None else _paid(payments, agent)
         return {
+            **paid,
             "harvest": float(output.harvest[0, agent]),
             "in_play": bool(output.in_play[0, agent]),
             "fired": bool(output.fired[0, agent]),
@@ -144,3 +187,12 @@ class OneWorld:
         """Closes the window, if it is open."""
         if self._window:
             self._window.close()
+
+
+def _paid(payments: Payments, agent: int) -> dict[str, Any]:
+    """What institutions did to an agent in the last turn."""
+    return {
+        "fines": float(payments.fines[0, agent]),
+        "transfers": float(payments.transfers[0, agent]),
+        "violated": bool(payments.violated[0, agent]),
+    }

@@ -22,7 +22,8 @@ class CommonsParallelEnv(ParallelEnv[str, Any, int]):
 
     Every agent acts in every turn until the episode ends for all; the action of an agent out of play has no
     effect. `infos` holds each agent's "harvest", whether it acts in the coming turn ("in_play"), whether it
-    "fired" and whether it was "tagged".
+    "fired" and whether it was "tagged"; with institutions also its "fines", "transfers" and whether it
+    "violated" a rule.
 
     Args:
         game: The game, see `presets.game`.
@@ -64,8 +65,14 @@ class CommonsParallelEnv(ParallelEnv[str, Any, int]):
     def reset(
         self, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[dict[str, Observed], Infos]:
-        """Begins the next episode, or the first episode of a new seed."""
-        self.world.begin(seed)
+        """Begins the next episode, or the first episode of a new seed.
+
+        Args:
+            seed: The new seed, or None for the next episode.
+            options: "decisions", a dict by agent, is what agents decide in this episode where institutions
+                ask them (`Game.decisions` options, the first one by default); others are ignored.
+        """
+        self.world.begin(seed, (options or {}).get("decisions"))
         self.agents = list(self.possible_agents)
         return self._observations(), self._infos()
 

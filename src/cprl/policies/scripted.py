@@ -211,7 +211,7 @@ def _settings(game: Game, spare: int) -> Settings:
     rules = game.rules
     return Settings(
         actions=len(game.actions),
-        has_beam=rules.has_beam,
+        has_beam=rules.may_fire,
         beam_length=min(*rules.beam_lengths_cells, rules.window_rows - 1),
         beam_half_width=min(rules.beam_width_cells, rules.window_columns) // 2,
         spare=spare,

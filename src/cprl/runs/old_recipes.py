@@ -19,7 +19,7 @@ def experiment_config(recipe: Mapping[str, Any]) -> dict[str, Any]:
         KeyError: if the recipe lacks a field that every old recipe had.
     """
     arguments = recipe["arguments"]
-    game = arguments["game"]
+    game = upgraded_game(arguments["game"])
     return {
         "name": recipe["recipe"],
         "game": {
@@ -27,6 +27,7 @@ def experiment_config(recipe: Mapping[str, Any]) -> dict[str, Any]:
             "map": {"kind": "Map", **game["map"]},
             "rules": {"kind": "Rules", **game["rules"]},
             "observation": {"kind": "Observation", **game.get("observation", {})},
+            "institutions": game.get("institutions", []),
         },
         "agents": _agents(arguments, agents=len(game["map"]["starts"])),
         "episodes": arguments["episodes"],
@@ -34,6 +35,48 @@ def experiment_config(recipe: Mapping[str, Any]) -> dict[str, Any]:
         "seed": arguments.get("seed", 0),
         "update_every": arguments.get("learn_every", 1),
     }
+
+
+def upgraded_game(game: Mapping[str, Any]) -> dict[str, Any]:
+    """The table of a game whose rules may have fields of before December 2026, which are institutions now:
+    `may_bite`, and `may_fire` and `freeze_steps` by agent.
+
+    Raises:
+        KeyError, TypeError, ValueError: if the table holds no game.
+    """
+    rules = dict(game["rules"])
+    may_bite, may_fire, freeze = rules.pop("may_bite", None), rules.get("may_fire"), rules.get("freeze_steps")
+    found: list[dict[str, Any]] = []
+    if may_bite is not None:
+        found.append({"kind": "Boundaries", **_regions(game["map"], may_bite), "observed": False})
+    if isinstance(may_fire, Sequence):
+        rules["may_fire"] = any(may_fire)
+        if rules["may_fire"] and not all(may_fire):
+            agents = [agent for agent, may in enumerate(may_fire) if may]
+            found.append({"kind": "Sanctioner", "agents": agents, "observed": False})
+    if isinstance(freeze, Sequence):
+        rules["freeze_steps"] = 25
+        sanctions = {"freeze_steps": freeze, "fines": [0.0], "recovery_steps": None, "on": "tags"}
+        found.append({"kind": "GraduatedSanctions", **sanctions, "observed": False})
+    kept = {**game, "rules": rules}
+    return {**kept, "institutions": [*found, *game.get("institutions", ())]} if found else kept
+
+
+_SIGNS: Final = "".join(chr(code) for code in range(ord("0"), 2**14) if chr(code).isprintable())
+
+
+def _regions(board: Mapping[str, Any], may_bite: Sequence[Sequence[bool]]) -> dict[str, Any]:
+    """The regions and owners of `Boundaries` that say the same as a table: a row per agent, a column per
+    site. Sites that the same agents may harvest are one region."""
+    columns = list(zip(*may_bite, strict=True))
+    signs = {column: _SIGNS[nth] for nth, column in enumerate(dict.fromkeys(columns)) if not all(column)}
+    rows = [["."] * board["width"] for _ in range(board["height"])]
+    for (row, col), column in zip(board["sites"], columns, strict=True):
+        rows[row][col] = signs.get(column, ".")
+    owners = [
+        "".join(sign for column, sign in signs.items() if column[agent]) for agent in range(len(may_bite))
+    ]
+    return {"regions": ["".join(row) for row in rows], "owners": owners}
 
 
 def _agents(arguments: Mapping[str, Any], *, agents: int) -> list[dict[str, Any]]:

@@ -1,0 +1,351 @@
+"""The institutions of a game as lookup tables for the compiled rules."""
+
+from collections.abc import Callable, Sequence
+from typing import Any, Final
+
+import numpy as np
+
+from cprl.commons.chance import threshold
+from cprl.commons.maps import Map
+from cprl.commons.near import neighbours
+from cprl.commons.observation import Observation
+from cprl.commons.rules import Rules
+from cprl.commons.tables import Tables
+from cprl.commons.world import Bools, Ints
+from cprl.commons.yields import sustainable_yield
+from cprl.institutions import (
+    Boundaries,
+    ClosedPatches,
+    ClosedSeason,
+    GraduatedSanctions,
+    Institution,
+    Levies,
+    Mediation,
+    Monitoring,
+    Quota,
+    Sanctioner,
+    Tax,
+    Vote,
+)
+from cprl.institutions import memory as shows
+from cprl.institutions.base import MOST_INSTITUTIONS
+from cprl.institutions.boundaries import OPEN
+from cprl.institutions.choice import MOST_DECISIONS, Ballot, ballots, decision_options
+from cprl.institutions.memory import InstitutionTables
+from cprl.institutions.monitoring import ELECTED
+
+_ABOUT_PLACES: Final = (Boundaries, ClosedPatches)
+
+
+def check_institutions(institutions: tuple[Any, ...], board: Map, rules: Rules, form: Observation) -> None:
+    """Checks that institutions fit each other, the map, the rules and the observation.
+
+    Raises:
+        ValueError: If not; names the institution and says what is allowed.
+    """
+    if len(institutions) > MOST_INSTITUTIONS:
+        raise ValueError(
+            f"Game.institutions has {len(institutions)} entries; allowed: at most {MOST_INSTITUTIONS}"
+        )
+    for own in institutions:
+        kind = type(own)
+        if kind not in _SHOWN_BY:
+            raise ValueError(
+                f"Game.institutions has a {kind.__name__}; allowed: "
+                f"{', '.join(known.__name__ for known in _SHOWN_BY)}; an institution of your own is a "
+                "TorchRL transform, see docs/institutions.md"
+            )
+        of_kind = sum(type(other) is kind for other in institutions)
+        if kind.at_most is not None and of_kind > kind.at_most:
+            raise ValueError(
+                f"Game.institutions has {of_kind} of {kind.__name__}; allowed: at most {kind.at_most}"
+            )
+        own.check_board(agents=board.agents, height=board.height, width=board.width)
+        _check_observation(own, form)
+        if isinstance(own, Sanctioner | Mediation) and not rules.may_fire:
+            raise ValueError(
+                f"Game.institutions has a {kind.__name__} and Rules.may_fire is False; allowed: a game in "
+                "which agents may fire"
+            )
+    options = decision_options(institutions, board.agents)
+    if options > MOST_DECISIONS:
+        raise ValueError(
+            f"Game.institutions lets agents choose from {options:,} options; allowed: at most "
+            f"{MOST_DECISIONS:,}"
+        )
+
+
+def _check_observation(own: Institution, form: Observation) -> None:
+    lacking = [name for name in type(own).needs if own.observed and not getattr(form, name)]
+    if lacking:
+        raise ValueError(
+            f"{type(own).__name__}.observed is True and Observation.{lacking[0]} is False; allowed: "
+            f"Observation({lacking[0]}=True), or {type(own).__name__}(observed=False)"
+        )
+
+
+def build_institution_tables(
+    institutions: Sequence[Institution], board: Map, rules: Rules, tables: Tables
+) -> InstitutionTables:
+    """Builds the tables of a game's institutions.
+
+    Args:
+        institutions: Those of the game.
+        board: Its map.
+        rules: Its rules.
+        tables: Those of the game itself.
+    """
+    voted = ballots(institutions, board.agents)
+    entries = _shown(institutions, board, tables)
+    return InstitutionTables(
+        **_boundary_tables(institutions, board, tables),
+        **_quota_tables(institutions, board, rules),
+        **_season_tables(institutions),
+        **_patch_tables(institutions, board, rules),
+        **_tax_tables(institutions, board.agents),
+        **_ballot_tables(voted),
+        **_monitoring_tables(institutions, voted),
+        **_sanction_tables(institutions, board.agents),
+        **_firing_tables(institutions, voted, board.agents),
+        shown_kind=np.array([kind for kind, _ in entries], np.int32),
+        shown_argument=np.array([argument for _, argument in entries], np.int32),
+    )
+
+
+def _of(kind: Any, institutions: Sequence[Institution]) -> list[Any]:
+    return [own for own in institutions if isinstance(own, kind)]
+
+
+def _floats(values: Sequence[float]) -> Any:
+    return np.array(values, np.float64)
+
+
+def _bools(values: Sequence[bool]) -> Bools:
+    return np.array(values, np.bool_)
+
+
+def _ints(values: Sequence[int]) -> Ints:
+    return np.array(values, np.int32)
+
+
+def _fine(value: float | None) -> float:
+    return 0.0 if value is None else float(value)
+
+
+def _voted(institutions: Sequence[Institution], kind: type[Any]) -> list[tuple[Any, int]]:
+    """Institutions of a kind, each with the index of the ballot that decides its value, or -1."""
+    found, ballot = [], 0
+    for own in institutions:
+        if isinstance(own, kind):
+            found.append((own, -1))
+        elif isinstance(own, Vote) and isinstance(own.on, kind):
+            found.append((own.on, ballot))
+        ballot += _is_decided(own)
+    return found
+
+
+def _is_decided(own: Institution) -> bool:
+    return (
+        isinstance(own, Vote)
+        or (isinstance(own, Sanctioner) and own.agents is None)
+        or (isinstance(own, Monitoring) and own.monitor == ELECTED)
+    )
+
+
+def _boundary_tables(institutions: Sequence[Institution], board: Map, tables: Tables) -> dict[str, Any]:
+    found = _of(Boundaries, institutions)
+    rows = tables.background.size // tables.stride
+    own = np.ones((len(found), board.agents, rows, tables.stride), np.bool_)
+    inside = slice(tables.rim, tables.rim + board.height), slice(tables.rim, tables.rim + board.width)
+    for nth, boundary in enumerate(found):
+        signs = np.array([list(row) for row in boundary.regions])
+        for agent in range(board.agents):
+            own[(nth, agent, *inside)] = np.isin(signs, [OPEN, *boundary.signs_of(agent)])
+    return {
+        "own": own.reshape(len(found), board.agents, tables.background.size),
+        "bite_stopped": _bools([boundary.bite_fine is None for boundary in found]),
+        "bite_fine": _floats([_fine(boundary.bite_fine) for boundary in found]),
+        "step_is_violation": _bools([boundary.step_fine is not None for boundary in found]),
+        "step_fine": _floats([_fine(boundary.step_fine) for boundary in found]),
+    }
+
+
+def _quota_tables(institutions: Sequence[Institution], board: Map, rules: Rules) -> dict[str, Any]:
+    found = _voted(institutions, Quota)
+    of_agent = sustainable_yield(board, rules) / board.agents if found else 0.0
+    return {
+        "quota_unit": _floats([of_agent * quota.window_steps for quota, _ in found]),
+        "quota_share": _floats([quota.share for quota, _ in found]),
+        "quota_ballot": _ints([ballot for _, ballot in found]),
+        "quota_steps": _ints([quota.window_steps for quota, _ in found]),
+        "quota_by_stock": _bools([quota.by_stock for quota, _ in found]),
+        "quota_stopped": _bools([quota.fine is None for quota, _ in found]),
+        "quota_fine": _floats([_fine(quota.fine) for quota, _ in found]),
+    }
+
+
+def _season_tables(institutions: Sequence[Institution]) -> dict[str, Any]:
+    found = _of(ClosedSeason, institutions)
+    return {
+        "season_steps": _ints([season.period_steps for season in found]),
+        "season_open": _ints([season.period_steps - season.closed_steps for season in found]),
+        "season_stopped": _bools([season.fine is None for season in found]),
+        "season_fine": _floats([_fine(season.fine) for season in found]),
+    }
+
+
+def patches_of(board: Map, rules: Rules) -> Ints:
+    """The patch of each site, int32 [K]: sites that are connected by being near each other."""
+    first, near = neighbours(board, rules)
+    patch = np.full(len(board.sites), -1, np.int32)
+    for start in range(len(patch)):
+        if patch[start] < 0:
+            number, waiting = patch.max() + 1, [start]
+            patch[start] = number
+            while waiting:
+                k = waiting.pop()
+                new = [int(other) for other in near[first[k] : first[k + 1]] if patch[other] < 0]
+                patch[new] = number
+                waiting += new
+    return patch
+
+
+def _patch_tables(institutions: Sequence[Institution], board: Map, rules: Rules) -> dict[str, Any]:
+    found = _of(ClosedPatches, institutions)
+    patch = patches_of(board, rules) if found else np.zeros(len(board.sites), np.int32)
+    return {
+        "patch_of": patch,
+        "patch_sites": np.bincount(patch).astype(np.int32) if found else _ints([]),
+        "patch_below": int(found[0].below) if found else 0,
+        "patch_stopped": bool(found and found[0].fine is None),
+        "patch_fine": _fine(found[0].fine) if found else 0.0,
+    }
+
+
+def _tax_tables(institutions: Sequence[Institution], agents: int) -> dict[str, Any]:
+    rows: list[tuple[int, int, tuple[int, ...], tuple[tuple[float, float], ...]]] = []
+    for tax, ballot in _voted(institutions, Tax):
+        group = (0 if tax.redistribution == "equal" else -1,) * agents
+        rows.append((ballot, tax.period_steps, group, tax.brackets or ((0.0, tax.rate),)))
+    for levies in _of(Levies, institutions):
+        rows.append((-1, 1, levies.group_of, ((0.0, levies.local_rate),)))
+        rows.append((-1, 1, (0,) * agents, ((0.0, levies.joint_rate),)))
+    most = max((len(brackets) for *_, brackets in rows), default=1)
+    from_, rate = np.full((len(rows), most), np.inf), np.zeros((len(rows), most))
+    for nth, (*_, brackets) in enumerate(rows):
+        from_[nth, : len(brackets)] = [start for start, _ in brackets]
+        rate[nth, : len(brackets)] = [own for _, own in brackets]
+    return {
+        "tax_from": from_,
+        "tax_rate": rate,
+        "tax_ballot": _ints([row[0] for row in rows]),
+        "tax_steps": _ints([row[1] for row in rows]),
+        "tax_group": np.array([row[2] for row in rows], np.int32).reshape(len(rows), agents),
+    }
+
+
+def _ballot_tables(voted: Sequence[Ballot]) -> dict[str, Any]:
+    choices = np.zeros((len(voted), max((len(ballot.choices) for ballot in voted), default=1)))
+    for nth, ballot in enumerate(voted):
+        choices[nth, : len(ballot.choices)] = ballot.choices
+    return {
+        "ballot_options": _ints([len(ballot.choices) for ballot in voted]),
+        "ballot_choice": choices,
+        "ballot_is_election": _bools([ballot.is_election for ballot in voted]),
+        "ballot_episodes": _ints([ballot.period_episodes for ballot in voted]),
+        "ballot_override": np.array([threshold(ballot.override_prob) for ballot in voted], np.int64),
+    }
+
+
+def _ballot_called(voted: Sequence[Ballot], title: str) -> int:
+    return next((nth for nth, ballot in enumerate(voted) if ballot.title == title), -1)
+
+
+def _monitoring_tables(institutions: Sequence[Institution], voted: Sequence[Ballot]) -> dict[str, Any]:
+    found = _of(Monitoring, institutions)
+    monitoring = found[0] if found else Monitoring(prob=1.0)
+    return {
+        "detected_below": threshold(monitoring.prob),
+        "monitor_cost": float(monitoring.cost),
+        "monitor": monitoring.monitor if isinstance(monitoring.monitor, int) else -1,
+        "monitor_ballot": _ballot_called(voted, "who monitors"),
+    }
+
+
+def _sanction_tables(institutions: Sequence[Institution], agents: int) -> dict[str, Any]:
+    found, mediated = _of(GraduatedSanctions, institutions), _of(Mediation, institutions)
+    steps = np.zeros((agents, 0), np.int32)
+    if found:
+        row = found[0].freeze_steps
+        steps = np.broadcast_to(np.array(row, np.int32), (agents, len(row[0] if found[0].is_table else row)))
+    on = found[0].on if found else ""
+    return {
+        "sanction_steps": np.ascontiguousarray(steps),
+        "sanction_fine": _floats(found[0].fines if found else ()),
+        "sanction_recovery": int(found[0].recovery_steps or 0) if found else 0,
+        "sanctions_tags": on in ("tags", "both"),
+        "sanctions_violations": on in ("violations", "both"),
+        "mediation_turns": int(mediated[0].turns) if mediated else 0,
+        "mediation_refund": float(mediated[0].refund) if mediated else 0.0,
+    }
+
+
+def _firing_tables(
+    institutions: Sequence[Institution], voted: Sequence[Ballot], agents: int
+) -> dict[str, Any]:
+    named = [own.agents for own in _of(Sanctioner, institutions) if own.agents is not None]
+    return {
+        "may_fire": _bools([not named or agent in named[0] for agent in range(agents)]),
+        "fire_ballot": _ballot_called(voted, "who may fire"),
+    }
+
+
+def _shown(institutions: Sequence[Institution], board: Map, tables: Tables) -> list[tuple[int, int]]:
+    """(what, which one) of each entry that institutions show agents; see `cprl.institutions.showing`."""
+    entries: list[tuple[int, int]] = []
+    seen = [own for own in institutions if own.observed]
+    if any(isinstance(own, _ABOUT_PLACES) for own in seen):
+        entries += [(shows.FORBIDDEN, cell) for cell in range(tables.window_cells.shape[1])]
+    quotas, seasons, ballot = 0, 0, 0
+    for own in institutions:
+        if own.observed:
+            entries += _SHOWN_BY[type(own)](own, quotas, seasons, ballot, board.agents)
+        quotas += isinstance(own, Quota) or (isinstance(own, Vote) and isinstance(own.on, Quota))
+        seasons += isinstance(own, ClosedSeason)
+        ballot += _is_decided(own)
+    return entries
+
+
+_Entries = list[tuple[int, int]]
+
+
+def _shown_by_quota(own: Any, quotas: int, seasons: int, ballot: int, agents: int) -> _Entries:
+    return [(shows.QUOTA_LEFT, quotas), (shows.QUOTA_TIME, quotas)]
+
+
+def _shown_by_season(own: Any, quotas: int, seasons: int, ballot: int, agents: int) -> _Entries:
+    return [(shows.CLOSED, seasons), (shows.SEASON_TIME, seasons)]
+
+
+def _shown_by_vote(own: Any, quotas: int, seasons: int, ballot: int, agents: int) -> _Entries:
+    also = _shown_by_quota(own.on, quotas, seasons, ballot, agents) if isinstance(own.on, Quota) else []
+    return [(shows.IN_FORCE, ballot), *(also if own.on.observed else [])]
+
+
+def _shown_by_monitoring(own: Any, quotas: int, seasons: int, ballot: int, agents: int) -> _Entries:
+    return [(shows.DETECTED, 0), *([(shows.IS_ELECTED, ballot)] if own.monitor == ELECTED else [])]
+
+
+_SHOWN_BY: Final[dict[type[Any], Callable[..., _Entries]]] = {
+    Boundaries: lambda *_: [],
+    ClosedPatches: lambda *_: [],
+    Quota: _shown_by_quota,
+    ClosedSeason: _shown_by_season,
+    Tax: lambda *_: [],
+    Levies: lambda *_: [],
+    Vote: _shown_by_vote,
+    Monitoring: _shown_by_monitoring,
+    GraduatedSanctions: lambda *_: [(shows.LEVEL, 0)],
+    Mediation: lambda *rest: [(shows.MARK, agent) for agent in range(rest[-1])],
+    Sanctioner: lambda *_: [(shows.MAY_FIRE, 0)],
+}

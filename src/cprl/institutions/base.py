@@ -1,0 +1,54 @@
+"""What all institutions share."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import ClassVar, Final
+
+from cprl.checks import NONE, SWITCH, Check, either, number
+
+MOST_INSTITUTIONS: Final = 64
+"""The largest number of institutions of a game."""
+
+MOST_APPLES: Final = 1e6
+"""The largest amount that an institution takes or gives at once."""
+
+FINE: Final = either(number(0, MOST_APPLES), NONE)
+AMOUNT: Final = number(0, MOST_APPLES)
+PROBABILITY: Final = number(0, 1)
+OBSERVED: Final[dict[str, Check]] = {"observed": SWITCH}
+
+
+@dataclass(frozen=True, kw_only=True)
+class Institution:
+    """A rule that people make, as a value that a game carries: `Game(..., institutions=(Quota(), Tax()))`.
+
+    Institutions act inside the turn, see `docs/institutions.md`. Amounts are in apples.
+    """
+
+    observed: bool = True
+    """Whether agents observe what this institution shows them, as part of ("agents", "institutions")."""
+
+    principle: ClassVar[str] = ""
+    """Of the eight design principles of Ostrom, "Governing the Commons" (1990), table 3.1."""
+    at_most: ClassVar[int | None] = None
+    """How many of this kind a game can have; None for any number."""
+    needs: ClassVar[tuple[str, ...]] = ()
+    """The switches of `Observation` without which agents cannot use what this institution shows them."""
+
+    def check_board(self, *, agents: int, height: int, width: int) -> None:
+        """Checks that it fits a board with N agents.
+
+        Raises:
+            ValueError: If not; says what is allowed.
+        """
+
+
+def check_agent_indices(name: str, indices: Sequence[int], agents: int) -> None:
+    """Checks that all indices are of agents of the game.
+
+    Raises:
+        ValueError: For the first that is not.
+    """
+    for agent in indices:
+        if agent >= agents:
+            raise ValueError(f"{name} has agent {agent}; allowed on this map: 0 to {agents - 1}")

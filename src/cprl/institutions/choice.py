@@ -1,0 +1,156 @@
+"""What agents decide themselves: votes on a tax or a quota, and elections."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from math import prod
+from typing import Any, ClassVar, Final, NamedTuple
+
+from cprl.checks import Check, check_fields, count, instance, is_count, is_number
+from cprl.institutions.base import OBSERVED, PROBABILITY, Institution, check_agent_indices
+from cprl.institutions.monitoring import ELECTED, Monitoring
+from cprl.institutions.quotas import Quota
+from cprl.institutions.taxes import Tax
+
+MOST_DECISIONS: Final = 2**20
+"""The largest number of options that an agent chooses from."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Vote(Institution):
+    """Agents vote on the rate of a tax or the share of a quota (Ostrom's principle 3, collective choice).
+
+    Each agent's decision is the index of a choice; the median of the N decisions counts, of two middle ones
+    the lower. Agents observe the value in force.
+
+    Raises:
+        ValueError: If a value is not allowed.
+    """
+
+    on: Tax | Quota
+    """The institution whose `rate` or `share` is voted on; its own value is not used."""
+
+    choices: tuple[float, ...] = (0.0, 0.25, 0.5, 0.75, 1.0)
+    """The values to choose from, ascending, at least two; of a tax 0..1."""
+
+    period_episodes: int = 1
+    """A vote is held in every such number of episodes, from the first one; its result stays in force until
+    the next."""
+
+    override_prob: float = 0.0
+    """The probability that an authority from outside puts a choice in force by chance, all equally likely, in
+    place of the result of a vote (the opposite of Ostrom's principle 7, the right to organise)."""
+
+    principle: ClassVar[str] = "3 collective choice"
+
+    def __post_init__(self) -> None:
+        check_fields(self, _VOTE)
+        if isinstance(self.on, Tax) and (self.on.brackets or self.choices[-1] > 1):
+            raise ValueError(
+                "Vote.on is a Tax with brackets; allowed: a Tax with one rate"
+                if self.on.brackets
+                else f"Vote.choices has {self.choices[-1]:g}; allowed for a Tax: 0..1"
+            )
+
+
+@dataclass(frozen=True, kw_only=True)
+class Sanctioner(Institution):
+    """Only some agents may fire: named ones, or the one that all elect (Ostrom's principle 7, the right to
+    organise).
+
+    In an election each agent's decision is the index of an agent; most votes win, ties are drawn by the
+    game's chance. Agents observe whether they may fire.
+
+    Raises:
+        ValueError: If a value is not allowed.
+    """
+
+    agents: tuple[int, ...] | None = None
+    """The agents that may fire; None for an election."""
+
+    period_episodes: int = 1
+    """An election is held in every such number of episodes, from the first one."""
+
+    override_prob: float = 0.0
+    """The probability that an authority from outside appoints an agent by chance, all equally likely, in
+    place of the elected one."""
+
+    principle: ClassVar[str] = "7 the right to organise"
+    at_most: ClassVar[int | None] = 1
+
+    def __post_init__(self) -> None:
+        check_fields(self, _SANCTIONER)
+
+    def check_board(self, *, agents: int, height: int, width: int) -> None:
+        """See `Institution.check_board`."""
+        check_agent_indices("Sanctioner.agents", self.agents or (), agents)
+
+
+class Ballot(NamedTuple):
+    """One thing that agents decide on."""
+
+    title: str
+    """What it is, in words."""
+    choices: tuple[float, ...]
+    """The values to choose from; agent indices in an election."""
+    is_election: bool
+    """Whether most votes count rather than the median."""
+    period_episodes: int
+    override_prob: float
+
+
+def ballots(institutions: Sequence[Institution], agents: int) -> tuple[Ballot, ...]:
+    """What N agents decide on, in the order of the institutions.
+
+    A decision is one number for all ballots: the choice of the first one plus its number of choices times the
+    choice of the second one, and so on.
+    """
+    found = []
+    everyone = tuple(float(agent) for agent in range(agents))
+    for own in institutions:
+        if isinstance(own, Vote):
+            title = "the tax rate" if isinstance(own.on, Tax) else "the quota's share"
+            found.append(Ballot(title, own.choices, False, own.period_episodes, own.override_prob))
+        elif isinstance(own, Sanctioner) and own.agents is None:
+            found.append(Ballot("who may fire", everyone, True, own.period_episodes, own.override_prob))
+        elif isinstance(own, Monitoring) and own.monitor == ELECTED:
+            found.append(Ballot("who monitors", everyone, True, own.period_episodes, 0.0))
+    return tuple(found)
+
+
+def decision_options(institutions: Sequence[Institution], agents: int) -> int:
+    """The number of options of ("agents", "decision"); 0 where there is nothing to decide."""
+    sizes = [len(ballot.choices) for ballot in ballots(institutions, agents)]
+    return prod(sizes) if sizes else 0
+
+
+def _are_choices(value: Any) -> bool:
+    return (
+        isinstance(value, tuple)
+        and len(value) >= 2
+        and all(is_number(own, 0, 1e6) for own in value)
+        and list(value) == sorted(set(value))
+    )
+
+
+def _are_agents(value: Any) -> bool:
+    return value is None or (
+        isinstance(value, tuple)
+        and bool(value)
+        and all(is_count(agent, 0) for agent in value)
+        and list(value) == sorted(set(value))
+    )
+
+
+_VOTE: Final[dict[str, Check]] = {
+    **OBSERVED,
+    "on": instance(Tax | Quota, "a Tax or a Quota"),
+    "choices": Check(_are_choices, "two or more numbers of at least 0, ascending"),
+    "period_episodes": count(1),
+    "override_prob": PROBABILITY,
+}
+_SANCTIONER: Final[dict[str, Check]] = {
+    **OBSERVED,
+    "agents": Check(_are_agents, "None for an election, or ascending agent indices, at least one"),
+    "period_episodes": count(1),
+    "override_prob": PROBABILITY,
+}

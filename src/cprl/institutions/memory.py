@@ -1,0 +1,248 @@
+"""The arrays of institutions: their memory in B worlds, what they output in a turn, and their parameters.
+
+Letters: B worlds, N agents, C counts, D entries shown, V ballots, Q quotas, T taxes, P patches.
+"""
+
+from typing import Final, NamedTuple, TypeAlias
+
+import numpy as np
+from numpy.typing import NDArray
+
+Ints: TypeAlias = NDArray[np.int32]
+Bytes: TypeAlias = NDArray[np.uint8]
+Bools: TypeAlias = NDArray[np.bool_]
+Floats: TypeAlias = NDArray[np.float32]
+Numbers: TypeAlias = NDArray[np.float64]
+Longs: TypeAlias = NDArray[np.int64]
+
+COUNTS: Final = (
+    "own_bites",
+    "foreign_bites",
+    "trespasses",
+    "excess_bites",
+    "closed_bites",
+    "unjust_tags",
+    "violations",
+    "detections",
+    "sanctions",
+    "returns_to_violation",
+)
+"""What is counted in an episode for each agent: bites in its own and in others' regions; turns in others'
+regions; bites above a quota, and in a closed season or patch; unjust tags of its own; turns with a violation;
+those that were detected; sanctions (of `GraduatedSanctions`); turns with a violation after a sanction."""
+(
+    OWN_BITES,
+    FOREIGN_BITES,
+    TRESPASSES,
+    EXCESS_BITES,
+    CLOSED_BITES,
+    UNJUST_TAGS,
+    VIOLATIONS,
+    DETECTIONS,
+    SANCTIONS,
+    RETURNS,
+) = range(len(COUNTS))
+
+
+class Memory(NamedTuple):
+    """What institutions remember of B worlds. All but `in_force` is cleared at an episode's begin."""
+
+    in_force: Numbers
+    """float64 [B, V], what each ballot decided: a tax rate, a quota's share or an agent index."""
+    allowed: Numbers
+    """float64 [B, Q], the apples that an agent may harvest in the current window."""
+    taken: Ints
+    """int32 [B, Q, N], apples harvested in the current window."""
+    income: Numbers
+    """float64 [B, T, N], apples harvested in the current period of each tax."""
+    level: Ints
+    """int32 [B, N], the level of the next sanction."""
+    offence_step: Ints
+    """int32 [B, N], the step of the last offence, or at which the level last fell."""
+    violation_step: Ints
+    """int32 [B, N], the step of the last violation; 0 for never."""
+    may_fire: Bools
+    """bool [B, N], whether the agent may fire."""
+    sanctioned: Bools
+    """bool [B, N], whether the agent was sanctioned in this episode."""
+    detected: Bools
+    """bool [B, N], whether a violation was detected in the last turn."""
+    closed: Bools
+    """bool [B, P], whether the patch is closed in the coming turn."""
+    counts: Ints
+    """int32 [B, N, C], the `COUNTS` of this episode."""
+    broke: Bools
+    """bool [B, N], whether the agent violated a rule in this turn; working memory."""
+    unjust: Bools
+    """bool [B, N], whether the agent tagged unjustly in this turn; working memory."""
+    due: Numbers
+    """float64 [B, N], the fines that follow if this turn's violations are detected; working memory."""
+    fines: Numbers
+    """float64 [B, N], apples taken in this turn; working memory."""
+    transfers: Numbers
+    """float64 [B, N], apples given in this turn; working memory."""
+    patch_stock: Ints
+    """int32 [B, P], apples on each patch; working memory."""
+
+
+WORKING: Final = ("broke", "unjust", "due", "fines", "transfers", "patch_stock")
+"""Entries of `Memory` that hold nothing between turns."""
+REMEMBERED: Final = tuple(name for name in Memory._fields if name not in WORKING)
+"""Entries of `Memory` that are part of the state of a world."""
+
+
+class Payments(NamedTuple):
+    """What institutions output in a turn, written into arrays that the caller provides."""
+
+    reward: Floats
+    """float32 [B, N], harvest - fines + transfers."""
+    fines: Floats
+    """float32 [B, N], apples taken."""
+    transfers: Floats
+    """float32 [B, N], apples given."""
+    violated: Bools
+    """bool [B, N], whether the agent broke a rule in this turn, detected or not."""
+    counts: Ints
+    """int32 [B, N, C], the `COUNTS` of this episode so far."""
+    institutions: Floats
+    """float32 [B, N, D], what institutions show each agent."""
+    in_force: Floats
+    """float32 [B, V], what each ballot decided."""
+
+
+(
+    FORBIDDEN,
+    QUOTA_LEFT,
+    QUOTA_TIME,
+    CLOSED,
+    SEASON_TIME,
+    LEVEL,
+    DETECTED,
+    MARK,
+    MAY_FIRE,
+    IN_FORCE,
+    IS_ELECTED,
+) = range(11)
+"""What an entry of `Payments.institutions` shows; see `cprl.institutions.showing`."""
+
+
+class InstitutionTables(NamedTuple):
+    """All institutions of a game as parameters; a kind that the game does not have has arrays of length 0."""
+
+    own: Bools
+    """bool [boundaries, N, cells], whether the agent may use the cell."""
+    bite_stopped: Bools
+    """bool [boundaries], whether bites in others' regions do not happen."""
+    bite_fine: Numbers
+    """float64 [boundaries]."""
+    step_is_violation: Bools
+    """bool [boundaries]."""
+    step_fine: Numbers
+    """float64 [boundaries]."""
+
+    quota_unit: Numbers
+    """float64 [Q], apples per agent and window at a share of 1."""
+    quota_share: Numbers
+    """float64 [Q]."""
+    quota_ballot: Ints
+    """[Q], the ballot that decides the share; -1 for none."""
+    quota_steps: Ints
+    """[Q], turns per window."""
+    quota_by_stock: Bools
+    quota_stopped: Bools
+    """bool [Q], whether bites above the quota do not happen."""
+    quota_fine: Numbers
+
+    season_steps: Ints
+    """[seasons], turns per period."""
+    season_open: Ints
+    """[seasons], the first turns of a period, in which it is open."""
+    season_stopped: Bools
+    season_fine: Numbers
+
+    patch_of: Ints
+    """[K], the patch of each site."""
+    patch_sites: Ints
+    """[P], sites per patch; [0] without `ClosedPatches`."""
+    patch_below: int
+    patch_stopped: bool
+    patch_fine: float
+
+    tax_from: Numbers
+    """float64 [T, brackets], where each bracket begins; infinite for those that a tax lacks."""
+    tax_rate: Numbers
+    """float64 [T, brackets]."""
+    tax_ballot: Ints
+    """[T], the ballot that decides the rate; -1 for none."""
+    tax_steps: Ints
+    """[T], turns per period."""
+    tax_group: Ints
+    """[T, N], the group within which it is paid out; -1 where it is lost."""
+
+    ballot_options: Ints
+    """[V], the number of choices."""
+    ballot_choice: Numbers
+    """float64 [V, choices]."""
+    ballot_is_election: Bools
+    ballot_episodes: Ints
+    """[V], held in every such number of episodes."""
+    ballot_override: Longs
+    """int64 [V], overridden if a uniform 32-bit word is below this threshold."""
+
+    detected_below: int
+    """A violation is detected if a uniform 32-bit word is below this threshold."""
+    monitor_cost: float
+    monitor: int
+    """Who pays it; -1 for all."""
+    monitor_ballot: int
+    """The ballot that elects who pays it; -1 for none."""
+
+    sanction_steps: Ints
+    """[N, levels], the time-out by shooter and level; [N, 0] without `GraduatedSanctions`."""
+    sanction_fine: Numbers
+    """float64 [levels]."""
+    sanction_recovery: int
+    """Turns; 0 for never."""
+    sanctions_tags: bool
+    sanctions_violations: bool
+
+    mediation_turns: int
+    """0 without `Mediation`."""
+    mediation_refund: float
+
+    may_fire: Bools
+    """bool [N], whether the agent may fire where none is elected."""
+    fire_ballot: int
+    """The ballot that elects who may fire; -1 for none."""
+
+    shown_kind: Ints
+    """[D], what each entry shows."""
+    shown_argument: Ints
+    """[D], which one of its kind."""
+
+
+def empty_memory(tables: InstitutionTables, *, worlds: int) -> Memory:
+    """Memory for B worlds, all zero; the first vote of a world sets `in_force`."""
+    agents, patches = tables.may_fire.shape[0], tables.patch_sites.shape[0]
+    quotas, taxes = tables.quota_unit.shape[0], tables.tax_steps.shape[0]
+    ballots = tables.ballot_options.shape[0]
+    return Memory(
+        in_force=np.zeros((worlds, ballots), np.float64),
+        allowed=np.zeros((worlds, quotas), np.float64),
+        taken=np.zeros((worlds, quotas, agents), np.int32),
+        income=np.zeros((worlds, taxes, agents), np.float64),
+        level=np.zeros((worlds, agents), np.int32),
+        offence_step=np.zeros((worlds, agents), np.int32),
+        violation_step=np.zeros((worlds, agents), np.int32),
+        may_fire=np.zeros((worlds, agents), np.bool_),
+        sanctioned=np.zeros((worlds, agents), np.bool_),
+        detected=np.zeros((worlds, agents), np.bool_),
+        closed=np.zeros((worlds, patches), np.bool_),
+        counts=np.zeros((worlds, agents, len(COUNTS)), np.int32),
+        broke=np.zeros((worlds, agents), np.bool_),
+        unjust=np.zeros((worlds, agents), np.bool_),
+        due=np.zeros((worlds, agents), np.float64),
+        fines=np.zeros((worlds, agents), np.float64),
+        transfers=np.zeros((worlds, agents), np.float64),
+        patch_stock=np.zeros((worlds, patches), np.int32),
+    )
