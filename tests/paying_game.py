@@ -4,7 +4,7 @@ import torch
 from torchrl.data import Bounded, Unbounded
 from torchrl.envs import Transform
 
-from cprl.measuring.institutions import COUNTS
+from cprl.institutions import COUNTS
 
 
 class Charges(Transform):

@@ -1,20 +1,42 @@
 """What is measured of institutions: metrics worked by hand, what a tracker keeps, the table, the series."""
 
+import dataclasses
+
 import numpy as np
 import pytest
 import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from test_episodes import all_written_out, turn, written_out
+from torchrl.envs import StepCounter, TransformedEnv
+from torchrl.envs.utils import RandomPolicy
 
+from cprl import CommonsEnv, Game, Observation, Rules, maps
+from cprl.institutions import (
+    COUNTS,
+    Boundaries,
+    ClosedSeason,
+    GraduatedSanctions,
+    Institution,
+    Levies,
+    Mediation,
+    Monitoring,
+    Quota,
+    Sanctioner,
+    Tax,
+    Vote,
+)
 from cprl.measuring import EpisodeTracker, institutions, social
-from cprl.measuring.institutions import COUNTS, NEEDS, OF_GROUPS
+from cprl.measuring.evaluate import evaluate
+from cprl.measuring.institutions import NEEDS, OF_GROUPS
 from cprl.measuring.replicas import institution_measures, social_measures
 from cprl.measuring.reported import OF_INSTITUTIONS, OPTIONAL, left_out
 from cprl.measuring.series import numbers_of
+from cprl.policies.lanes import random_agents
 from cprl.runs.columns import OF_INSTITUTIONS as COLUMNS
 from cprl.runs.curves import as_curves
 from cprl.runs.episodes import EpisodeTable, as_table, read_episodes
+from cprl.training import train
 
 NAN = float("nan")
 GROUPS = ((0, 1), (2, 3))
@@ -188,7 +210,11 @@ def test_one_group_of_all_is_as_unequal_as_all(apples, unit):
         (lambda: whole(groups=((0, 1), (2, 3), ())), "groups is .*; allowed: .*, each of 0 to 3 once"),
         (lambda: whole(groups=((0, 1), (2, 4))), "an agent of groups is 4; allowed: an integer from 0 to 3"),
         (lambda: whole(groups=3), "groups is 3; allowed: the agents of each group"),
-        (lambda: EpisodeTracker(1, 2, groups=((0,),)), r"groups is \(\(0,\),\); allowed: the agents of each"),
+        (
+            lambda: EpisodeTracker(1, 2, institutions=[Levies(groups=((0,),))]),
+            r"groups is \(\(0,\),\); allow",
+        ),
+        (lambda: EpisodeTracker(1, 2, institutions=["Tax"]), r"institutions\[0\] is 'Tax'; allowed: a value"),
         (lambda: institutions.harvest_over_yield(HARVEST, torch.tensor(4), -1), "sustainable_yield is -1; "),
         (lambda: institutions.harvest_over_yield(HARVEST, TAGS, 1), r"steps is \[4\]; allowed: \[\]"),
     ],
@@ -252,7 +278,7 @@ def test_an_episode_has_what_was_paid_broken_counted_and_decided():
 
 
 def test_with_groups_inequality_within_and_between_them_is_measured():
-    (episode,) = played(*an_episode(), groups=((0,), (1,)))
+    (episode,) = played(*an_episode(), institutions=[Levies(groups=((0,), (1,)))])
     assert episode.institutions["net_equality_within"] == 1.0
     assert episode.institutions["net_equality_between"] == pytest.approx(1 - 2 / 30)
 
@@ -276,12 +302,12 @@ def test_each_world_pays_for_itself_and_starts_anew():
 
 def test_a_tracker_goes_on_exactly_from_its_state(tmp_path):
     first, second, third = an_episode()
-    tracker = EpisodeTracker(1, 2, 10, groups=((0,), (1,)))
+    tracker = EpisodeTracker(1, 2, 10, institutions=[Levies(groups=((0,), (1,)))])
     tracker.add(first)
     torch.save(tracker.state_dict(), tmp_path / "tracker.pt")
     expected = all_written_out(tracker, [second, third, *an_episode()])
     for begun in (False, True):
-        other = EpisodeTracker(1, 2, 10, groups=((0,), (1,)))
+        other = EpisodeTracker(1, 2, 10, institutions=[Levies(groups=((0,), (1,)))])
         if begun:
             other.add(second)
         other.load_state_dict(torch.load(tmp_path / "tracker.pt"))
@@ -376,3 +402,104 @@ def test_an_episode_does_not_change_when_the_next_one_is_played():
     for batch in an_episode():
         tracker.add(batch)
     assert written_out(episode) == before
+
+
+MANY = (
+    Boundaries.drawn("00.11\n00.11\n22.22", bite_fine=1.0, step_fine=0.125),
+    Quota(share=2.0, window_steps=10, fine=0.5),
+    ClosedSeason(period_steps=12, closed_steps=4, fine=0.25),
+    Levies(groups=((0, 1), (2,)), local_rate=0.25, joint_rate=0.25),
+    Vote(on=Tax(period_steps=5), choices=(0.0, 0.5)),
+    Monitoring(prob=0.5, cost=0.125),
+    GraduatedSanctions(freeze_steps=(1, 2), fines=(0.5, 1.0)),
+    Mediation(turns=3, refund=2.0),
+)
+GAME = Game(
+    map=maps.parse(">A.A.\n.AAA<\nA.^.A"),
+    rules=Rules(regrow_prob=(0.05, 0.1), window_rows=3, window_columns=3, episode_steps=24),
+    institutions=MANY,
+    observation=Observation(agents_apart=True),
+)
+
+
+def play(game, *, worlds=3, episodes=2):
+    """Episodes of random agents, and the batches."""
+    env = CommonsEnv(game, worlds, seed=2)
+    tracker = EpisodeTracker(worlds, game.agents, 24, institutions=game.institutions)
+    torch.manual_seed(1)
+    found, batches, moment = [], [], env.reset()
+    while len(found) < worlds * episodes:
+        batch, moment = env.step_and_maybe_reset(env.rand_action(moment))
+        batches.append(batch)
+        found += tracker.add(batch)
+    return found, batches
+
+
+def test_what_a_game_pays_and_counts_is_what_an_episode_has():
+    found, batches = play(GAME)
+    names = ("fines", "transfers", "violated", "harvest", "counts", "reward")
+    every = {name: torch.stack([batch["next", "agents", name] for batch in batches], 1) for name in names}
+    for episode in found:
+        turns = slice(24 * episode.episode, 24 * episode.episode + 24)
+        own = {name: values[episode.world, turns] for name, values in every.items()}
+        for name in ("fines", "transfers", "harvest"):
+            assert getattr(episode, name).tolist() == own[name].double().sum(0).tolist()
+        assert episode.violations.tolist() == own["violated"].sum(0).tolist()
+        assert np.stack(list(episode.counts.values()), 1).tolist() == own["counts"][-1].tolist()
+        assert episode.counts["violations"].tolist() == episode.violations.tolist()
+        np.testing.assert_allclose(
+            episode.return_, episode.harvest - episode.fines + episode.transfers, atol=1e-4
+        )
+        assert set(episode.in_force) <= {0.0, 0.5}
+    total = {name: sum(own.counts[name].sum() for own in found) for name in COUNTS}
+    assert all(total.values()), f"each happened: {total}"
+    assert total["detections"] < total["violations"]
+
+
+def test_a_game_with_all_institutions_has_all_metrics_and_others_those_that_concern_them():
+    (episode, *_), _ = play(GAME, episodes=1)
+    assert list(episode.institutions) == list(NEEDS)
+    always = ["fines", "transfers", "violations", "violations_per_step", "net_equality"]
+    kinds = {
+        "Boundaries": ["trespasses", "own_share_of_bites"],
+        "Quota": ["excess_bites"],
+        "ClosedSeason": ["closed_bites"],
+        "Levies": list(OF_GROUPS),
+        "Vote": [],
+        "Monitoring": ["detection_rate"],
+        "GraduatedSanctions": ["recidivism", "sanctions_per_violation"],
+        "Mediation": ["unjust_share_of_tags"],
+    }
+    for own in MANY:
+        assert set(institutions.metrics_for([own])) == {*always, *kinds[type(own).__name__]}
+    assert "excess_bites" in institutions.metrics_for([Vote(on=Quota(), choices=(0.5, 1.0))])
+    (taxed, *_), _ = play(dataclasses.replace(GAME, institutions=(Tax(rate=0.5),)), episodes=1)
+    assert set(taxed.institutions) == set(always)
+    assert taxed.fines.sum() == pytest.approx(taxed.harvest.sum() / 2)
+    assert taxed.in_force is None
+
+
+def test_every_kind_of_institution_has_metrics_or_is_measured_by_those_of_all():
+    concerned = {kind for kinds in institutions.KINDS.values() for kind in kinds}
+    assert concerned | {Tax, Vote, Sanctioner} == set(Institution.__subclasses__())
+    assert set(institutions.KINDS) < set(NEEDS)
+    with pytest.raises(ValueError, match=r"institutions\[0\] is 3; allowed: a value of cprl.institutions"):
+        institutions.metrics_for([3])
+
+
+def test_trainings_and_evaluations_measure_what_concerns_the_game_behind_transforms():
+    names = {"institutions/net_equality_within", "institutions/own_share_of_bites", "agent_2/fines"}
+    undecided = tuple(own for own in MANY if not isinstance(own, Vote))
+    game = dataclasses.replace(GAME, institutions=undecided)
+    env = TransformedEnv(CommonsEnv(game, 2, seed=2), StepCounter())
+    seen = []
+
+    class Sees:
+        def on_episode(self, episode, learning):
+            seen.append(numbers_of(episode, learning, ["agent_0", "agent_1", "agent_2"]))
+
+    agents = random_agents(game.spaces, (0, 1, 2), replicas=2, seed=1)
+    train(env, {}, others=agents, episodes=1, callbacks=[Sees()])
+    assert names <= set(seen[0])
+    first, *_ = evaluate(env, RandomPolicy(env.action_spec))
+    assert "net_equality_between" in first.institutions

@@ -226,7 +226,7 @@ def test_a_mark_is_a_diamond_around_the_agent(tmp_path):
 def test_the_borders_of_regions_are_lines_in_their_owners_hue():
     # Agent 0 owns the left column of two rows, both own the cell on the top right:  a b
     #                                                                              a .
-    cells = {"a": ([0], np.array([[1, 0], [1, 0]], bool)), "b": ([0, 1], np.array([[0, 1], [0, 0]], bool))}
+    cells = [([0], np.array([[1, 0], [1, 0]], bool)), ([0, 1], np.array([[0, 1], [0, 0]], bool))]
     made = borders(cells)
     strips = [np.array(own) for own in made.strips.as_arrow_array().to_pylist()]
     assert len(strips) == 6 + 4, "around two cells, around one"
@@ -258,7 +258,7 @@ def test_the_summary_has_a_table_of_institutions(whole):
     assert f"{fined:.1f} / " in agent
     assert f" / {broke:.1f} " in agent
     assert "in force: decision 0" in text
-    assert "on one's own ground" not in text, "nothing was bitten in a region that has an owner"
+    assert "where one may bite" not in text, "nothing counted a bite"
     nothing = dict.fromkeys(("fines", "transfers", "violations", "counts", "in_force"))
     without = {"trained": [replace(one, **nothing) for one in found.trained[0]]}
     assert institutions_table(without, _mean) is None

@@ -21,7 +21,7 @@ from cprl.evaluation.film import fresh_episode
 from cprl.evaluation.turns import Turns
 from cprl.evaluation.video_files import check_can_write_mp4, write_gif, write_mp4
 from cprl.measuring.episodes import Episode, EpisodeTracker
-from cprl.measuring.institutional import groups_of
+from cprl.measuring.institutional import institutions_of
 from cprl.memory import check_memory
 from cprl.policies.assignment import AgentPolicies
 from cprl.runs.labelled import refuse_to_write_over
@@ -120,7 +120,7 @@ def _play(env: EnvBase, commons: CommonsEnv, policies: AgentPolicies) -> tuple[l
         return shown._replace(observation=shown.observation[:0])
 
     longest = commons.game.rules.episode_steps
-    tracker = EpisodeTracker(1, commons.game.agents, longest, groups=groups_of(env))
+    tracker = EpisodeTracker(1, commons.game.agents, longest, institutions=institutions_of(env))
     turns = Turns(env, policies)
     moments = [now()]
     while True:

@@ -1,15 +1,15 @@
 """Episodes that have ended, out of what an `EpisodeTracker` stored of them."""
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from typing import Any, Final
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
 
+from cprl.institutions import Institution
 from cprl.measuring import institutional, social
 from cprl.measuring.episode import Episode
-from cprl.measuring.institutions import Groups
 
 Array = NDArray[Any]
 Turns = dict[str, Array]
@@ -26,7 +26,7 @@ def episodes_of(
     histories: Mapping[str, Array],
     turn: Turns,
     of_yield: Mapping[str, float | None],
-    groups: Groups | None,
+    of_game: Sequence[Institution],
 ) -> Iterator[Episode]:
     """The E episodes that end with a turn.
 
@@ -37,7 +37,7 @@ def episodes_of(
         histories: harvest and in_play, [E, T, N], where the game reports them; their padding is not read.
         turn: the last turn of all worlds, [B, ...].
         of_yield: sustainable_yield and first_stock, see `cprl.measuring.social.summary`.
-        groups: see `cprl.measuring.institutions`.
+        of_game: the institutions of the game.
     """
     played = np.arange(ended["steps"].max()) < ended["steps"][:, None]
     kept = {name: array[:, : played.shape[1]] for name, array in histories.items()}
@@ -51,7 +51,7 @@ def episodes_of(
     )
     harvest = kept["harvest"].sum(1, dtype=np.float64) if "harvest" in kept else None
     in_play_steps = kept["in_play"].sum(1) if "in_play" in kept else None
-    came = institutional.measured(ended, harvest=harvest, in_play_steps=in_play_steps, groups=groups)
+    came = institutional.measured(ended, harvest=harvest, in_play_steps=in_play_steps, of_game=of_game)
     for k, world in enumerate(worlds):
         fields: dict[str, Any] = {name: ended[name][k] for name in _AS_COUNTED if name in ended}
         if harvest is not None:

@@ -52,7 +52,7 @@ class Episode:
     violations: NDArray[np.int64] | None = None
     """[N], steps in which the agent broke a rule of an institution."""
     counts: Mapping[str, NDArray[np.int64]] | None = None
-    """[N] by name, what institutions counted, see `cprl.measuring.institutions.COUNTS`."""
+    """[N] by name, what institutions counted, see `cprl.institutions.COUNTS`."""
     in_force: NDArray[np.float64] | None = None
     """[V], what was decided for this episode: tax rates, quotas, the agent elected."""
     institutions: Mapping[str, float] = field(default_factory=dict)

@@ -1,6 +1,6 @@
 """Collects whole episodes from the batches of a collector."""
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from typing import Any, Final
 
 import numpy as np
@@ -10,10 +10,11 @@ from tensordict import TensorDictBase
 from torch import Tensor
 
 from cprl import arguments, keys
+from cprl.institutions import Institution
 from cprl.measuring import institutional
 from cprl.measuring.ended import Array, Turns, episodes_of
 from cprl.measuring.episode import Episode
-from cprl.measuring.institutions import Groups, check_groups
+from cprl.measuring.institutions import check_groups, groups_of
 from cprl.measuring.reported import OF_INSTITUTIONS, OPTIONAL, reported_in
 from cprl.memory import check_memory
 
@@ -51,8 +52,8 @@ class EpisodeTracker:
         max_steps: the maximum length of an episode, e.g. `Rules.episode_steps`; None if it is unknown.
         sustainable_yield: apples per step that the map can sustain; with first_stock, adds yield_share.
         first_stock: apples on the board at the start of an episode.
-        groups: the agents that belong together, for games with institutions whose metrics tell groups apart,
-            see `cprl.measuring.institutions`; None for no groups.
+        institutions: those of the game, which tell what is measured of them, see
+            `cprl.measuring.institutions.metrics_for`.
 
     Raises:
         ValueError: if a number is no integer or below 1; in `add`, if a batch has a wrong shape or lacks an
@@ -68,7 +69,7 @@ class EpisodeTracker:
         *,
         sustainable_yield: float | None = None,
         first_stock: float | None = None,
-        groups: Groups | None = None,
+        institutions: Sequence[Institution] = (),
     ) -> None:
         worlds = arguments.integer("worlds", worlds, 1, 2**32)
         agents = arguments.integer("agents", agents, 1, 2**20)
@@ -79,7 +80,12 @@ class EpisodeTracker:
         self.reported: tuple[str, ...] | None = None
         """The optional entries of this game; None before the first batch."""
         self._yield = {"sustainable_yield": sustainable_yield, "first_stock": first_stock}
-        self._groups = None if groups is None else check_groups(groups, agents)
+        self._institutions: tuple[Institution, ...] = arguments.objects(
+            "institutions", institutions, Institution, "a value of cprl.institutions"
+        )
+        groups = groups_of(self._institutions)
+        if groups is not None:
+            check_groups(groups, agents)
         self._widths: institutional.Widths = {}
         self._every_world = np.arange(worlds)
         self._checked: torch.Size | None = None
@@ -146,7 +152,9 @@ class EpisodeTracker:
                     f"the state is from a game that reports {list(reported)}; allowed: "
                     f"{list(self.reported or ())}, as this game reports"
                 )
-        other = EpisodeTracker(self.worlds, self.agents, self.max_steps, **self._yield, groups=self._groups)
+        other = EpisodeTracker(
+            self.worlds, self.agents, self.max_steps, **self._yield, institutions=self._institutions
+        )
         if reported is not None:
             widths = institutional.widths_of(state) if self.reported is None else self._widths
             other._begin(reported, widths, capacity=longest)
@@ -314,5 +322,5 @@ class EpisodeTracker:
             histories={name: array[worlds, :longest] for name, array in self._histories.items()},
             turn=turn,
             of_yield=self._yield,
-            groups=self._groups,
+            of_game=self._institutions,
         )

@@ -1,6 +1,6 @@
 """What an `EpisodeTracker` keeps of the institutions of a game while episodes are running."""
 
-from collections.abc import Collection, Mapping
+from collections.abc import Collection, Mapping, Sequence
 from typing import Any, Final
 
 import numpy as np
@@ -12,8 +12,8 @@ from torchrl.envs import EnvBase
 
 from cprl import keys
 from cprl.envs.unwrap import commons_of
+from cprl.institutions import COUNTS, Institution
 from cprl.measuring import institutions
-from cprl.measuring.institutions import COUNTS, Groups
 from cprl.measuring.reported import INSTITUTIONAL, OF_INSTITUTIONS
 
 Array = NDArray[Any]
@@ -25,28 +25,29 @@ WIDE: Final = ("counts", "in_force")
 """The entries whose last axis is not that of agents: C counts, V decisions."""
 
 
-def groups_of(env: EnvBase) -> Groups | None:
-    """The groups of nested enterprises, those of the game's first `Levies`; None if it has none."""
+def institutions_of(env: EnvBase) -> tuple[Institution, ...]:
+    """The institutions of a game of cprl, transforms or not; () for another."""
     commons = commons_of(env)
-    found = () if commons is None else getattr(commons.game, "institutions", ())
-    return next((own.groups for own in found if hasattr(own, "groups")), None)
+    return () if commons is None else commons.game.institutions
 
 
 def metrics_of(env: EnvBase, reported: Collection[str]) -> tuple[str, ...]:
     """The metrics of institutions in episodes of an environment that reports these entries."""
     if set(reported).isdisjoint(OF_INSTITUTIONS):
         return ()
-    has_groups = groups_of(env) is not None
     return tuple(
         name
-        for name, entries in institutions.NEEDS.items()
-        if set(entries) <= set(reported) and (has_groups or name not in institutions.OF_GROUPS)
+        for name in institutions.metrics_for(institutions_of(env))
+        if set(institutions.NEEDS[name]) <= set(reported)
     )
 
 
 def decisions_of(env: EnvBase) -> tuple[str, ...]:
     """What is decided in an episode, in words, in the order of "in_force"."""
-    (width,) = env.observation_spec["in_force"].shape[env.batch_dims :]
+    commons = commons_of(env)
+    if commons is not None and commons.game.ballots:
+        return tuple(ballot.title for ballot in commons.game.ballots)
+    (width,) = env.observation_spec[keys.IN_FORCE].shape[env.batch_dims :]
     return tuple(f"decision {nth}" for nth in range(width))
 
 
@@ -54,9 +55,9 @@ def widths_in(tensordict: TensorDictBase) -> dict[str, int]:
     """C and V of a batch, by the names of `WIDE`.
 
     Raises:
-        ValueError: if it has other counts than `cprl.measuring.institutions.COUNTS`.
+        ValueError: if it has other counts than `cprl.institutions.COUNTS`.
     """
-    places: dict[str, Any] = {"counts": ("next", keys.AGENTS, "counts"), "in_force": ("next", "in_force")}
+    places: dict[str, Any] = {"counts": ("next", *keys.COUNTS), "in_force": ("next", keys.IN_FORCE)}
     found = {name: tensordict.get(place, None) for name, place in places.items()}
     widths = {name: values.shape[-1] for name, values in found.items() if values is not None}
     if widths.get("counts", len(COUNTS)) != len(COUNTS):
@@ -120,7 +121,7 @@ def measured(
     *,
     harvest: Array | None,
     in_play_steps: Array | None,
-    groups: Groups | None,
+    of_game: Sequence[Institution],
 ) -> dict[str, Tensor]:
     """The metrics of the E episodes that end, [E] by name; empty for a game without institutions.
 
@@ -128,7 +129,7 @@ def measured(
         ended: their arrays in the tracker's state.
         harvest: float64 [E, N]; None without the entry.
         in_play_steps: int64 [E, N], likewise.
-        groups: see `cprl.measuring.institutions`.
+        of_game: the institutions of the game, which tell what concerns it and which agents belong together.
     """
     if not any(name in ended for name in INSTITUTIONAL):
         return {}
@@ -143,4 +144,5 @@ def measured(
         if "counts" in ended
         else None
     )
-    return institutions.summary(**known, counts=counts, groups=groups)
+    found = institutions.summary(**known, counts=counts, groups=institutions.groups_of(of_game))
+    return {name: found[name] for name in institutions.metrics_for(of_game) if name in found}

@@ -2,7 +2,8 @@
 
 Arguments are totals of an episode, [..., N] for N agents (at least one) and any leading batch axes, integers
 or floats, at least 0; `harvest` in apples, `fines` and `transfers` in units of reward (an apple is 1), all
-others are counts, by the names of `COUNTS`; violations are turns in which the agent broke a rule.
+others are counts, by the names of `cprl.institutions.COUNTS`; violations are turns in which the agent broke a
+rule.
 
 Results are float64 [...], NaN where a metric is undefined; `cprl.measuring.replicas` counts these cases. None
 is computed from a shaped reward, and the social metrics stay those of the harvest. A wrong type, shape or
@@ -19,22 +20,20 @@ from typing import Final
 import torch
 from torch import Tensor
 
-from cprl.arguments import integer, listed, refusal
-from cprl.measuring import social
-
-COUNTS: Final = (
-    "own_bites",
-    "foreign_bites",
-    "trespasses",
-    "excess_bites",
-    "closed_bites",
-    "unjust_tags",
-    "violations",
-    "detections",
-    "sanctions",
-    "returns_to_violation",
+from cprl.arguments import integer, listed, objects, refusal
+from cprl.institutions import (
+    Boundaries,
+    ClosedPatches,
+    ClosedSeason,
+    GraduatedSanctions,
+    Institution,
+    Levies,
+    Mediation,
+    Monitoring,
+    Quota,
+    Vote,
 )
-"""The columns of ("agents", "counts"), counted for each agent over an episode."""
+from cprl.measuring import social
 
 NEEDS: Final[Mapping[str, tuple[str, ...]]] = MappingProxyType(
     {
@@ -62,11 +61,44 @@ NEEDS: Final[Mapping[str, tuple[str, ...]]] = MappingProxyType(
 OF_GROUPS: Final = tuple(name for name in NEEDS if name.endswith(("_within", "_between")))
 """The metrics that need to know which agents belong together."""
 
+KINDS: Final[Mapping[str, tuple[type[Institution], ...]]] = MappingProxyType(
+    {
+        "trespasses": (Boundaries,),
+        "own_share_of_bites": (Boundaries,),
+        "excess_bites": (Quota,),
+        "closed_bites": (ClosedSeason, ClosedPatches),
+        "detection_rate": (Monitoring,),
+        "recidivism": (GraduatedSanctions,),
+        "sanctions_per_violation": (GraduatedSanctions,),
+        "unjust_share_of_tags": (Mediation,),
+        **dict.fromkeys(OF_GROUPS, (Levies,)),
+    }
+)
+"""The institutions without which a metric says nothing; all others concern every institution."""
+
 Groups = Sequence[Sequence[int]]
 """The indices of the agents of each group; each agent belongs to one group."""
 
 _ROUNDING: Final = 1e-6
 """The share of all an agent got and gave below which its net income is 0: payments are float32."""
+
+
+def metrics_for(institutions: Sequence[Institution]) -> tuple[str, ...]:
+    """The metrics of `NEEDS` that say something of a game with these institutions; of a game with none, whose
+    entries are somebody's own, all but those of groups."""
+    found = objects("institutions", institutions, Institution, "a value of cprl.institutions")
+    if not found:
+        return tuple(name for name in NEEDS if name not in OF_GROUPS)
+    there = (*found, *(own.on for own in found if isinstance(own, Vote)))
+    return tuple(
+        name for name in NEEDS if name not in KINDS or any(isinstance(own, KINDS[name]) for own in there)
+    )
+
+
+def groups_of(institutions: Sequence[Institution]) -> Groups | None:
+    """The groups of nested enterprises, those of the first `Levies`; None without one."""
+    found = objects("institutions", institutions, Institution, "a value of cprl.institutions")
+    return next((own.groups for own in found if isinstance(own, Levies)), None)
 
 
 def summary(
@@ -87,7 +119,7 @@ def summary(
         fines: what institutions took from it.
         transfers: what they gave it.
         violations: turns in which it broke a rule.
-        counts: by the names of `COUNTS`, all of them.
+        counts: by the names of `cprl.institutions.COUNTS`, all of them.
         in_play_steps: turns in which it was in play.
         tags: how often it tagged somebody.
         groups: agents that belong together, for `OF_GROUPS`.
@@ -126,7 +158,7 @@ def total(name: str, values: Tensor) -> Tensor:
 def own_share_of_bites(own_bites: Tensor, foreign_bites: Tensor) -> Tensor:
     """sum own_bites / (sum own_bites + sum foreign_bites), 0..1: principle 1, boundaries.
 
-    Bites on one's own ground among all bites on ground that has owners. Undefined without such a bite.
+    The share of bites in places that the agent may use, those open to all included. Undefined without a bite.
     """
     own = total("own_bites", own_bites)
     return _ratio(own, own + total("foreign_bites", foreign_bites))

@@ -23,7 +23,7 @@ OF_INSTITUTIONS: Final = {
     "trespasses": ("trespasses", "turns"),
     "excess_bites": ("taken above a quota", "bites"),
     "closed_bites": ("taken in closed seasons and patches", "bites"),
-    "own_share_of_bites": ("bites on one's own ground", SHARE),
+    "own_share_of_bites": ("bites where one may bite", SHARE),
     "detection_rate": ("violations detected", SHARE),
     "recidivism": ("violations after a sanction", SHARE),
     "sanctions_per_violation": ("sanctions per violation", "ratio"),

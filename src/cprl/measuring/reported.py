@@ -66,7 +66,7 @@ def reported_in(tensordict: TensorDictBase) -> tuple[str, ...]:
     "next"."""
     object_of("tensordict", tensordict, TensorDictBase, "a TensorDict")
     places: dict[str, Any] = {name: ("next", keys.AGENTS, name) for name in (*OPTIONAL, *OF_INSTITUTIONS)}
-    places |= {"in_play": keys.IN_PLAY, "stock": ("next", keys.STOCK), "in_force": ("next", "in_force")}
+    places |= {"in_play": keys.IN_PLAY, "stock": ("next", keys.STOCK), "in_force": ("next", keys.IN_FORCE)}
     return tuple(name for name, place in places.items() if tensordict.get(place, None) is not None)
 
 

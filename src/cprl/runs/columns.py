@@ -6,8 +6,8 @@ from typing import Any, Final
 import numpy as np
 import pyarrow as pa
 
+from cprl.institutions import COUNTS
 from cprl.measuring import Episode, social
-from cprl.measuring.institutions import COUNTS
 from cprl.measuring.reported import FIELDS, left_out
 
 COLUMNS: Final = {

@@ -8,8 +8,9 @@ import pyarrow as pa
 import torch
 from numpy.typing import NDArray
 
+from cprl.institutions import COUNTS
 from cprl.measuring import phases, social
-from cprl.measuring.institutions import COUNTS, summary
+from cprl.measuring.institutions import summary
 from cprl.measuring.published import SMOOTHED_EPISODES
 from cprl.runs.columns import OF_INSTITUTIONS
 from cprl.runs.episodes import read_episodes

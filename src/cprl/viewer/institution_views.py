@@ -1,6 +1,5 @@
 """Institutions in a recording besides lines: the owners of regions on the board, and events of episodes."""
 
-from collections.abc import Mapping, Sequence
 from typing import Any, Final, TypeAlias
 
 import numpy as np
@@ -8,14 +7,15 @@ from numpy.typing import NDArray
 
 from cprl.commons.colours import agent_colour
 from cprl.envs.commons_env import CommonsEnv
+from cprl.institutions import Boundaries
 from cprl.measuring.episodes import Episode
 from cprl.viewer.institutions import has_institutions, lines
 from cprl.viewer.logger import RerunLogger
 from cprl.viewer.scenery import Curves, Scene
 from cprl.viewer.stage import RIM_CELLS
 
-Regions: TypeAlias = Mapping[str, tuple[Sequence[int], NDArray[np.bool_]]]
-"""By its sign the owners of a region, and its cells, bool [H, W]."""
+Regions: TypeAlias = list[tuple[list[int], NDArray[np.bool_]]]
+"""The owners of each region, and its cells, bool [H, W]."""
 
 _SHARED: Final = (150, 150, 150)
 """The colour of regions of several agents."""
@@ -27,7 +27,7 @@ def institution_views(logger: RerunLogger, env: CommonsEnv | None) -> "Instituti
     """What a recording shows of institutions; None for a game without them."""
     if not has_institutions(logger.curves):
         return None
-    return InstitutionViews(logger, logger.curves, regions=None if env is None else regions_of(env))
+    return InstitutionViews(logger, logger.curves, regions=[] if env is None else regions_of(env))
 
 
 class InstitutionViews:
@@ -39,11 +39,11 @@ class InstitutionViews:
         regions: of a game with `Boundaries`, see `regions_of`.
     """
 
-    def __init__(self, logger: RerunLogger, curves: Curves, *, regions: Regions | None = None) -> None:
+    def __init__(self, logger: RerunLogger, curves: Curves, *, regions: Regions) -> None:
         self._logger, self._curves = logger, curves
         for entity, style in lines(curves).items():
             logger.log_static(entity, style)
-        if regions is not None and isinstance(curves, Scene):
+        if regions and isinstance(curves, Scene):
             logger.log_static("world/regions", borders(regions))
 
     def on_episode(self, episode: Episode) -> None:
@@ -68,18 +68,17 @@ def in_words(episode: Episode, curves: Curves) -> str:
     return "; ".join(part for part in parts if part)
 
 
-def regions_of(env: CommonsEnv) -> Regions | None:
-    """The regions of the game's first `Boundaries`; None if it has none."""
-    for own in getattr(env.game, "institutions", ()):
-        if hasattr(own, "regions"):
+def regions_of(env: CommonsEnv) -> Regions:
+    """The regions of all `Boundaries` of a game; those that are open to all are none."""
+    found: Regions = []
+    for own in env.game.institutions:
+        if isinstance(own, Boundaries):
             signs = np.array([list(line) for line in own.regions])
             of_agents = [own.signs_of(agent) for agent in range(env.game.agents)]
-            return {
-                str(sign): ([agent for agent, ours in enumerate(of_agents) if sign in ours], signs == sign)
-                for sign in np.unique(signs)
-                if any(sign in ours for ours in of_agents)
-            }
-    return None
+            for sign in sorted(set("".join(of_agents))):
+                owners = [agent for agent, ours in enumerate(of_agents) if sign in ours]
+                found.append((owners, signs == sign))
+    return found
 
 
 def borders(regions: Regions) -> Any:
@@ -87,7 +86,7 @@ def borders(regions: Regions) -> Any:
     import rerun as rr
 
     strips, colours = [], []
-    for owners, cells in regions.values():
+    for owners, cells in regions:
         found = _borders(cells)
         strips += found
         hue = agent_colour(owners[0]) if len(owners) == 1 else _SHARED
