@@ -2,6 +2,7 @@
 
 from dataclasses import replace
 from io import StringIO
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -10,14 +11,19 @@ from paying_game import Charges
 from rerun.chunk import RrdReader
 from rich.console import Console
 from rich.table import Table
+from test_film import frames_of
 from test_rerun_logger import column, static
 from torchrl.envs import TransformedEnv
 
 import cprl
 from cprl import CommonsEnv, Custom, Experiment, Game, Rules, maps
 from cprl.evaluation import evaluate_run
+from cprl.evaluation.episode_picture import EpisodePicture
 from cprl.evaluation.film import film
+from cprl.evaluation.film_video import film_video
 from cprl.evaluation.tables import run_table
+from cprl.institutions import Boundaries, GraduatedSanctions, Monitoring, Sanctioner, Tax, Vote
+from cprl.measuring.reported import reported_by
 from cprl.policies.lanes import random_agents
 from cprl.population import Scripted
 from cprl.runs.episodes import read_episodes
@@ -27,7 +33,8 @@ from cprl.terminal.summary import _mean, summarise
 from cprl.training import train
 from cprl.viewer.blueprint import layout
 from cprl.viewer.callback import ViewerCallback
-from cprl.viewer.institution_views import borders, in_words
+from cprl.viewer.contents import curves_of
+from cprl.viewer.institution_views import borders, in_words, regions_of
 from cprl.viewer.institutions import has_institutions, lines, tabs
 from cprl.viewer.scenery import Curves
 
@@ -223,6 +230,31 @@ def test_a_mark_is_a_diamond_around_the_agent(tmp_path):
     assert found > 3
 
 
+def test_a_film_marks_who_broke_a_rule_since_its_last_picture(whole, tmp_path):
+    allow = ("paying_game:Charges",)
+    path, episode = film_video(whole, tmp_path / "film.gif", width=400, every=1, allow=allow)
+    assert episode.violations.sum() > 0
+    pictures, _ = frames_of(path)
+    picture = EpisodePicture(GAME.map, steps=30, width=400)
+    board = slice(*(round(picture.cell_box(row, 0)[1]) for row in (0, GAME.map.height)))
+    white = (pictures[:, board].astype(int).min(-1) > 215).sum((1, 2))
+    assert white[0] < white.max() / 2, "nobody has broken a rule when it begins"
+
+
+def test_a_picture_has_a_white_diamond_around_a_violator():
+    env = CommonsEnv(GAME, 1, seed=1)
+    env.reset()
+    now = env.worlds.show(env.output)
+    picture = EpisodePicture(GAME.map, steps=30, width=400)
+    plain, marked = (picture.draw([now], "own", violators=own) for own in ((), (2,)))
+    rows, cols = np.nonzero((plain != marked).any(-1))
+    left, _, right, bottom = picture.cell_box(int(now.row[2]), int(now.col[2]))
+    beyond = 0.22 * (right - left)
+    assert cols.min() == pytest.approx(left - beyond, abs=3)
+    assert rows.max() == pytest.approx(bottom + beyond, abs=3)
+    assert (marked[rows, cols].min(-1) > 100).mean() > 0.9
+
+
 def test_the_borders_of_regions_are_lines_in_their_owners_hue():
     # Agent 0 owns the left column of two rows, both own the cell on the top right:  a b
     #                                                                              a .
@@ -294,3 +326,60 @@ def test_the_run_keeps_them_and_the_training_curve_shows_them(whole):
     assert evaluation.exists()
     high, wide = imread(training_curve(whole, title="own")).shape[:2]
     assert high > wide, "four panels"
+
+
+GOVERNED = replace(
+    GAME,
+    institutions=(
+        Boundaries.drawn("0011..2\n0011..2\n00..333", bite_fine=1.0, step_fine=0.25),
+        Monitoring(prob=0.5),
+        GraduatedSanctions(),
+        Tax(rate=0.5, period_steps=4),
+    ),
+)
+
+
+@pytest.fixture(scope="module")
+def governed(tmp_path_factory):
+    """The recording of random agents in a game with cprl's own institutions."""
+    folder = tmp_path_factory.mktemp("governed")
+    env = CommonsEnv(GOVERNED, 2, seed=1)
+    others = random_agents(GOVERNED.spaces, tuple(range(AGENTS)), replicas=2, seed=1)
+    with ViewerCallback(folder, env, title="run", episodes=3) as viewer:
+        train(env, {}, others=others, episodes=3, callbacks=[viewer])
+    return folder / "run.rrd"
+
+
+def test_every_name_that_is_logged_of_institutions_is_in_the_docs(governed):
+    text = (Path(cprl.__file__).parents[2] / "docs" / "metrics.md").read_text()
+    logged = {name for name in entities(governed) if name.startswith("institutions/")}
+    assert {"institutions/own_share_of_bites", "institutions/recidivism"} <= logged
+    assert "institutions/unjust_share_of_tags" not in logged, "no Mediation"
+    assert all(f"`{name}`" in text for name in logged)
+
+
+def test_the_board_shows_whose_the_regions_are(governed):
+    env = CommonsEnv(GOVERNED, 1)
+    assert [(owners, cells.sum()) for owners, cells in regions_of(env)] == [
+        ([0], 6),
+        ([1], 4),
+        ([2], 2),
+        ([3], 3),
+    ]
+    strips = static(governed, "world/regions", "LineStrips2D:strips")
+    # the sides of 3 x 2, 2 x 2, 2 x 1 and 1 x 3 cells, one line for each
+    assert len(strips) == 10 + 8 + 6 + 8
+
+
+def test_regions_that_several_agents_share_are_drawn_once():
+    shared = Boundaries.drawn("aaaa...\naaaa...\nbbbb...", owners=("a", "a", "b", "ab"))
+    env = CommonsEnv(replace(GAME, institutions=(shared,)), 1)
+    assert [owners for owners, _ in regions_of(env)] == [[0, 1, 3], [2, 3]]
+
+
+def test_decisions_have_the_names_of_their_ballots(tmp_path):
+    game = replace(GAME, institutions=(Vote(on=Tax(), choices=(0.0, 0.5)), Sanctioner()))
+    curves = curves_of(
+        CommonsEnv(game, 1), ("a", "b", "c", "d"), reported_by(CommonsEnv(game, 1)), episodes=1
+    )
+    assert curves.in_force == ("the tax rate", "who may fire")
