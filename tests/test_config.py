@@ -44,6 +44,7 @@ from cprl.institutions import (
 )
 from cprl.networks import MLP, Conv
 from cprl.population import Frozen, Learning, Scripted, Team
+from cprl.preferences import Exchange, InequityAversion, SocialValueOrientation
 
 SHARES = st.floats(1e-9, 1, allow_subnormal=False)
 POSITIVE = st.floats(1e-6, 100)
@@ -89,9 +90,16 @@ FROZEN = st.builds(
     Frozen, st.just("runs/earlier"), agent=st.integers(0, 3), replica=st.none() | st.integers(0, 9)
 )
 STARTS = st.none() | FROZEN
+UNIT = st.floats(0, 1, allow_subnormal=False)
+PREFERENCES = st.one_of(
+    st.sampled_from(["individual", "team"]),
+    st.builds(InequityAversion, alpha=st.just(5) | UNIT, beta=UNIT, smoothing=UNIT),
+    st.builds(SocialValueOrientation, angle=st.floats(-3, 3, allow_subnormal=False), weight=UNIT),
+    st.builds(Exchange, UNIT),
+)
 SPECS = st.one_of(
-    st.builds(Learning, ALONE | CUSTOM, reward=st.sampled_from(["individual", "team"]), start_from=STARTS),
-    st.builds(Team, TEAMS | CUSTOM, agents=st.just((0, 2)), start_from=STARTS),
+    st.builds(Learning, ALONE | CUSTOM, reward=PREFERENCES, start_from=STARTS),
+    st.builds(Team, TEAMS | CUSTOM, agents=st.just((0, 2)), reward=PREFERENCES, start_from=STARTS),
     st.builds(Scripted, st.sampled_from(["random", "greedy", "pacifist"])),
     FROZEN,
 )
@@ -154,6 +162,9 @@ def test_every_kind_comes_back():
         "Learning": Learning(DQN(settings=DQNSettings())),
         "Team": Team(QMIX(settings=DQNSettings()), agents=(0, 1)),
         "Frozen": Frozen("runs/earlier", 1),
+        "InequityAversion": InequityAversion(alpha=5, beta=0.05, smoothing=0.9),
+        "SocialValueOrientation": SocialValueOrientation(angle=0.5, weight=1.0),
+        "Exchange": Exchange(0.5),
         "Boundaries": Boundaries(regions=("0.",)),
         "Levies": Levies(groups=((0,),)),
         "Vote": Vote(on=Quota()),

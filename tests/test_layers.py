@@ -26,6 +26,7 @@ PACKAGES = (
     "theory",
     "envs",
     "games",
+    "preferences",
     "networks",
     "policies",
     "collectors",

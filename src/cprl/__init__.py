@@ -17,6 +17,7 @@ Each imports only from those above it:
     commons      the game: maps, rules, turns; numpy and numba alone
     envs         TorchRL, PettingZoo, Gymnasium; make_env, where environments are put together
     games        games of the user's own, as a recipe holds them
+    preferences  what agents want: the reward that each learns from
     networks     from observations to numbers
     policies     from observations to actions: learned, tabular and scripted agents
     collectors   one step of all worlds after the other

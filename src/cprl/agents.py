@@ -23,6 +23,7 @@ from cprl.policies.lanes import random_agents
 from cprl.policies.present import PresentPolicy
 from cprl.policies.scripted import scripted_lanes
 from cprl.population import AgentSpec, Frozen, Learning, Scripted, Team, grouped
+from cprl.preferences.values import named
 from cprl.spaces import Spaces
 from cprl.stored import LoadedRun, StoredAgent, load, stored_actor
 
@@ -140,7 +141,16 @@ class Population:
 
 
 def _learner(spec: Learning | Team, spaces: Spaces, agents: tuple[int, ...], who: dict[str, Any]) -> Learner:
-    return _algorithm(spec).make_learner(spaces, agents=agents, reward_kind=spec.reward, **who)
+    learner = _algorithm(spec).make_learner(spaces, agents=agents, reward_kind=spec.reward, **who)
+    wants = getattr(learner, "wants", None)
+    if not isinstance(spec.reward, str) and getattr(wants, "preferences", None) != spec.reward:
+        own = spec.algorithm
+        name = own.target if isinstance(own, Custom) else type(own).__name__
+        raise ValueError(
+            f"reward is {named(spec.reward)}, which the learner of {name} does not have as its `wants`; "
+            "allowed for it: 'individual', 'team'"
+        )
+    return learner
 
 
 def _algorithm(spec: Learning | Team) -> Algorithm:

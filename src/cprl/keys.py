@@ -58,10 +58,6 @@ VIOLATED: Final = (AGENTS, "violated")
 COUNTS: Final = (AGENTS, "counts")
 """int32 [B, N, C]: what was counted for the agent in this episode so far, `cprl.institutions.COUNTS`."""
 
-INSTITUTIONS: Final = (AGENTS, "institutions")
-"""float32 [B, N, D]: what institutions show the agent, see `cprl.institutions.showing`; only if they show
-anything."""
-
 DECISION: Final = (AGENTS, "decision")
 """int64 [B, N]: each agent's decision where `Game.decisions` is above 0: an option, 0 to `Game.decisions`
 - 1, read at an episode's first turn alone."""

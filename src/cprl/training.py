@@ -2,6 +2,7 @@
 
 import time
 from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
 from typing import Any, Final
 
 import torch
@@ -17,7 +18,7 @@ from cprl.envs.make_env import check_env, spaces_of
 from cprl.envs.state import carried_state, env_state, load_carried, load_env_state
 from cprl.envs.unwrap import commons_of
 from cprl.finite import EVERY_STEPS, FiniteCheck, OnNan
-from cprl.learners.base import LaneLosses, Learner, check_agents, check_numbers, learned_in
+from cprl.learners.base import LaneLosses, Learner, WantedReturns, check_agents, check_numbers, learned_in
 from cprl.measuring.episodes import Episode, EpisodeTracker
 from cprl.measuring.institutional import institutions_of
 from cprl.policies.assignment import AgentIndices, AgentPolicies
@@ -83,6 +84,7 @@ class Training:
         longest = None if commons is None else commons.game.rules.episode_steps
         self._tracker = EpisodeTracker(replicas, spaces.agents, longest, institutions=institutions_of(env))
         self._losses = {agents: LaneLosses(replicas, agents) for agents in self.learners}
+        self._wanted = WantedReturns(replicas, spaces.agents, self.learners)
         self.finite = FiniteCheck(self.learners, spaces, on_nan=on_nan)
         self._on_step = [own.on_step for own in self.callbacks if hasattr(own, "on_step")]
         self._played = [0] * replicas
@@ -127,6 +129,7 @@ class Training:
         self.finite.check_turn(batch, self.steps)
         for learner in self.learners.values():
             learner.store(batch)
+        self._wanted.add()
         if self.steps % self.update_every == 0:
             for _ in range(self.update_every):
                 for agents, learner in self.learners.items():
@@ -163,6 +166,7 @@ class Training:
         for learner in self.learners.values():
             learner.end_episode(worlds)
         for episode, of_agents in zip(ended, learning, strict=True):
+            episode = replace(episode, wanted_return=self._wanted.take(episode.world))
             self._played[episode.world] += 1
             if self._played[episode.world] <= self.episodes:
                 for callback in self.callbacks:
@@ -190,6 +194,7 @@ class Training:
             "learners": [learner.state_dict() for learner in self.learners.values()],
             "others": [dict(other.state_dict()) for other in self.others.values()],
             "losses": [losses.state_dict() for losses in self._losses.values()],
+            "wanted": self._wanted.state_dict(),
             "tracker": self._tracker.state_dict(),
             "callbacks": {name: own.state_dict() for name, own in self._with_state().items()},
             "not_finite": self.finite.state_dict(),
@@ -234,6 +239,7 @@ class Training:
         for name, of_agents in parts.items():
             for part, own in zip(of_agents.values(), state[name], strict=True):
                 part.load_state_dict(own)
+        self._wanted.load_state_dict(state.get("wanted", {}))
         self._tracker.load_state_dict(state["tracker"])
         self.finite.load_state_dict(state.get("not_finite", ()), step=self.steps)
         for name, callback in self._with_state().items():

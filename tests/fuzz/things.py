@@ -44,6 +44,7 @@ from cprl.networks import MLP, Conv, MLPNetwork
 from cprl.policies.assignment import AgentPolicies
 from cprl.policies.lanes import random_agents
 from cprl.population import Frozen, Learning, Scripted, Team
+from cprl.preferences import Exchange, InequityAversion, SocialValueOrientation
 from cprl.spaces import Spaces
 
 MEADOW: Final = Game(
@@ -101,7 +102,14 @@ EXAMPLES: Final[dict[type, tuple[Any, ...]]] = {
     QMIX: (QMIX(settings=REPLAY, mixing_cells=3),),
     MAPPO: (MAPPO(settings=ROLLOUTS),),
     IPPO: (IPPO(settings=ROLLOUTS),),
-    Learning: (DQN_AGENT, Learning(PPO(settings=ROLLOUTS), reward="team")),
+    InequityAversion: (InequityAversion(alpha=5, beta=0.05, smoothing=0.9),),
+    SocialValueOrientation: (SocialValueOrientation(angle=0.5, weight=1.0),),
+    Exchange: (Exchange(0.5),),
+    Learning: (
+        DQN_AGENT,
+        Learning(PPO(settings=ROLLOUTS), reward="team"),
+        Learning(PPO(settings=ROLLOUTS), reward=Exchange(0.25)),
+    ),
     Team: (TEAM, Team(IPPO(settings=ROLLOUTS), agents=(0, 1), reward="individual")),
     Scripted: (Scripted(), Scripted("greedy")),
     Frozen: (Frozen("runs/none", agent=0),),

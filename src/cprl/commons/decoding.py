@@ -30,6 +30,7 @@ def classes_seen(game: Game, windows: Bytes) -> Bytes:
     shape = game.observation_shape
     if getattr(windows, "ndim", 0) != 5 or windows.shape[2:] != shape or windows.dtype != np.uint8:
         raise refusal("windows", getattr(windows, "shape", windows), f"uint8 [T, N, {shape}]")
+    windows = windows[:, :, : len(game.cell_channels)]
     if game.observation.encoding == "one_hot":
         shown = classes_shown(game.observation, agents=game.agents, hides=game.rules.walls_block_sight)
         classes: Bytes = np.take(np.array(shown, np.uint8), windows.argmax(2))

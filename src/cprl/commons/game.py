@@ -9,7 +9,12 @@ import numpy as np
 
 from cprl.arguments import object_of, objects
 from cprl.commons.colours import FIRST_AGENT, MAX_AGENTS_APART, class_colour
-from cprl.commons.institution_tables import build_institution_tables, check_institutions
+from cprl.commons.institution_tables import (
+    build_institution_tables,
+    check_institutions,
+    entries_shown,
+    shows_places,
+)
 from cprl.commons.maps import Map
 from cprl.commons.observation import Observation, channel_names
 from cprl.commons.rules import Rules
@@ -72,16 +77,40 @@ class Game:
 
     @property
     def channels(self) -> tuple[str, ...]:
-        """The name of each channel of an observation: "red", "green", "blue", or the classes of cells."""
+        """The name of each channel of an observation: "red", "green", "blue", or the classes of cells, then
+        those of institutions, see `cprl.commons.institution_views`."""
+        return *self.cell_channels, *self._institution_channels
+
+    @property
+    def cell_channels(self) -> tuple[str, ...]:
+        """The channels that show the board: all but those of institutions."""
         hides = self.rules.walls_block_sight
         return channel_names(self.observation, agents=self.agents, hides=hides)
 
     @property
+    def _institution_channels(self) -> tuple[str, ...]:
+        rows, columns = self._seen
+        entries = len(entries_shown(self.institutions, self.agents))
+        places = ("forbidden",) if shows_places(self.institutions) else ()
+        return *places, *("institutions",) * -(-entries // (rows * columns))
+
+    @property
+    def _seen(self) -> tuple[int, int]:
+        """The rows and columns of an observation."""
+        if self.observation.area == "full":
+            return self.map.height, self.map.width
+        return self.rules.window_rows, self.rules.window_columns
+
+    @property
+    def observation_highest(self) -> int:
+        """The largest value of an entry of observations: 255, or 1 for "one_hot" without planes of
+        institutions."""
+        return 255 if self._institution_channels else self.observation.highest
+
+    @property
     def observation_shape(self) -> tuple[int, int, int]:
         """The shape (C, X, Y) of one agent's observation: channels, rows, columns."""
-        if self.observation.area == "full":
-            return len(self.channels), self.map.height, self.map.width
-        return len(self.channels), self.rules.window_rows, self.rules.window_columns
+        return len(self.channels), *self._seen
 
     @property
     def scoreboard_size(self) -> int:
@@ -92,11 +121,6 @@ class Game:
     def stock_gauge_size(self) -> int:
         """The number of entries in each agent's stock gauge: 1, or 0 without a stock gauge."""
         return 1 if self.observation.stock_gauge else 0
-
-    @property
-    def institutions_size(self) -> int:
-        """The number D of entries that institutions show each agent: see `cprl.institutions.showing`."""
-        return len(self.governed_tables.institutions.shown_kind) if self.institutions else 0
 
     @property
     def ballots(self) -> tuple[Ballot, ...]:
@@ -114,12 +138,11 @@ class Game:
         vectors = {
             "stock_gauge": self.stock_gauge_size,
             "scoreboard": self.scoreboard_size,
-            "institutions": self.institutions_size,
         }
         return Spaces(
             agents=self.agents,
             observation_shape=self.observation_shape,
-            observation_scale=float(self.observation.highest),
+            observation_scale=float(self.observation_highest),
             actions=len(self.actions),
             vectors=tuple((name, size) for name, size in vectors.items() if size),
         )
@@ -143,12 +166,15 @@ class Game:
     @cached_property
     def tables(self) -> Tables:
         """The lookup tables that the compiled rules read; computed once and cached."""
-        return build_tables(self.map, self.rules, self.observation)
+        return build_tables(self.map, self.rules, self.observation, highest=self.observation_highest)
 
     @cached_property
     def governed_tables(self) -> GovernedTables:
         """The lookup tables of the game and of its institutions; computed once and cached."""
-        own = build_institution_tables(self.institutions, self.map, self.rules, self.tables)
+        planes = len(self.cell_channels)
+        own = build_institution_tables(
+            self.institutions, self.map, self.rules, self.tables, first_plane=planes
+        )
         return GovernedTables(self.tables, own)
 
     def __getstate__(self) -> dict[str, object]:
@@ -172,7 +198,6 @@ def _of_payments(game: Game, worlds: int) -> Shapes:
         "transfers": (of_agent, np.float32),
         "violated": (of_agent, np.bool_),
         "counts": ((*of_agent, len(COUNTS)), np.int32),
-        "institutions": ((*of_agent, game.institutions_size), np.float32),
         "in_force": ((worlds, len(game.ballots)), np.float32),
     }
 

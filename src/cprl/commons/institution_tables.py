@@ -85,7 +85,12 @@ def _check_observation(own: Institution, form: Observation) -> None:
 
 
 def build_institution_tables(
-    institutions: Sequence[Institution], board: Map, rules: Rules, tables: Tables
+    institutions: Sequence[Institution],
+    board: Map,
+    rules: Rules,
+    tables: Tables,
+    *,
+    first_plane: int,
 ) -> InstitutionTables:
     """Builds the tables of a game's institutions.
 
@@ -94,9 +99,10 @@ def build_institution_tables(
         board: Its map.
         rules: Its rules.
         tables: Those of the game itself.
+        first_plane: The number of channels of observations before those of institutions.
     """
     voted = ballots(institutions, board.agents)
-    entries = _shown(institutions, board, tables)
+    entries = entries_shown(institutions, board.agents)
     return InstitutionTables(
         **_boundary_tables(institutions, board, tables),
         **_quota_tables(institutions, board, rules),
@@ -109,6 +115,8 @@ def build_institution_tables(
         **_firing_tables(institutions, voted, board.agents),
         shown_kind=np.array([kind for kind, _ in entries], np.int32),
         shown_argument=np.array([argument for _, argument in entries], np.int32),
+        shows_places=shows_places(institutions),
+        first_plane=first_plane,
     )
 
 
@@ -170,11 +178,20 @@ def _boundary_tables(institutions: Sequence[Institution], board: Map, tables: Ta
     }
 
 
+def _most(quota: Quota, ballot: int, voted: Sequence[Ballot]) -> float:
+    """The largest share that a quota can have."""
+    return quota.share if ballot < 0 else voted[ballot].choices[-1]
+
+
 def _quota_tables(institutions: Sequence[Institution], board: Map, rules: Rules) -> dict[str, Any]:
+    voted = ballots(institutions, board.agents)
     found = _voted(institutions, Quota)
     of_agent = sustainable_yield(board, rules) / board.agents if found else 0.0
     return {
         "quota_unit": _floats([of_agent * quota.window_steps for quota, _ in found]),
+        "quota_full": _floats(
+            [of_agent * quota.window_steps * _most(quota, ballot, voted) for quota, ballot in found]
+        ),
         "quota_share": _floats([quota.share for quota, _ in found]),
         "quota_ballot": _ints([ballot for _, ballot in found]),
         "quota_steps": _ints([quota.window_steps for quota, _ in found]),
@@ -300,16 +317,18 @@ def _firing_tables(
     }
 
 
-def _shown(institutions: Sequence[Institution], board: Map, tables: Tables) -> list[tuple[int, int]]:
+def shows_places(institutions: Sequence[Institution]) -> bool:
+    """Whether agents see where bites are forbidden."""
+    return any(isinstance(own, _ABOUT_PLACES) and own.observed for own in institutions)
+
+
+def entries_shown(institutions: Sequence[Institution], agents: int) -> list[tuple[int, int]]:
     """(what, which one) of each entry that institutions show agents; see `cprl.institutions.showing`."""
     entries: list[tuple[int, int]] = []
-    seen = [own for own in institutions if own.observed]
-    if any(isinstance(own, _ABOUT_PLACES) for own in seen):
-        entries += [(shows.FORBIDDEN, cell) for cell in range(tables.window_cells.shape[1])]
     quotas, seasons, ballot = 0, 0, 0
     for own in institutions:
         if own.observed:
-            entries += _SHOWN_BY[type(own)](own, quotas, seasons, ballot, board.agents)
+            entries += _SHOWN_BY[type(own)](own, quotas, seasons, ballot, agents)
         quotas += isinstance(own, Quota) or (isinstance(own, Vote) and isinstance(own.on, Quota))
         seasons += isinstance(own, ClosedSeason)
         ballot += _is_decided(own)

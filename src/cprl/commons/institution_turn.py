@@ -5,9 +5,11 @@ The parts are those of `turn`; where institutions decide, this module asks their
 
 import numpy as np
 
+from cprl.commons import institution_views
 from cprl.commons.apples import draw, find_sprouts, grow, remove_apple
 from cprl.commons.beam import count_hit, find_hits, take_out, take_out_of_play
 from cprl.commons.chance import BALLOT, DETECTION
+from cprl.commons.institution_views import draw_institutions
 from cprl.commons.moves import act, cell_of, count_down, return_to_play, settle_clashes, settle_pairwise
 from cprl.commons.tables import Tables
 from cprl.commons.turn import (
@@ -22,14 +24,15 @@ from cprl.commons.world import PLAYING, Actions, Scratch, StepOutput, Worlds
 from cprl.institutions import deciding, limits, paying, showing
 from cprl.institutions.deciding import appoint, hold_ballot
 from cprl.institutions.limits import (
+    add_to_patch,
     close_patches,
-    is_forbidden,
+    count_patches,
     note_bite,
     note_step,
     open_windows,
     stops_bite,
 )
-from cprl.institutions.memory import FORBIDDEN, InstitutionTables, Memory, Payments
+from cprl.institutions.memory import InstitutionTables, Memory, Payments
 from cprl.institutions.paying import (
     charge,
     collect_taxes,
@@ -40,7 +43,6 @@ from cprl.institutions.paying import (
     recover,
     time_out,
 )
-from cprl.institutions.showing import shown_entry
 
 
 def play_governed_turn(
@@ -96,7 +98,9 @@ def play_governed_turn(
         world.on_board[i] = world.in_play[i]
     return_to_play(world, tables, scratch)
     write_state(world, tables, output, scratch)
-    close_patches(memory, rules, world.stock)
+    for s in range(sprouts):
+        add_to_patch(memory, rules, scratch.sprouts[s], 1)
+    close_patches(memory, rules)
     write_payments(world, memory, tables, rules, output, payments)
 
 
@@ -115,7 +119,8 @@ def begin_governed_episode(
     begin_ballots(world, memory, rules)
     appoint(memory, rules)
     open_windows(memory, rules, 1, 1.0)
-    close_patches(memory, rules, world.stock)
+    count_patches(memory, rules, world.stock)
+    close_patches(memory, rules)
     clear_turn(memory)
     write_payments(world, memory, tables, rules, output, payments)
 
@@ -131,6 +136,7 @@ def refresh_governed_output(
 ) -> None:
     """Writes the output for a state that was set from outside, with no events and no payments."""
     refresh_output(world, tables, output, scratch)
+    count_patches(memory, rules, world.stock)
     clear_turn(memory)
     write_payments(world, memory, tables, rules, output, payments)
 
@@ -238,6 +244,7 @@ def write_payments(
     payments: Payments,
 ) -> None:
     """Writes what institutions took, gave and counted in this turn, the reward, and what agents are shown."""
+    draw_institutions(world, memory, tables, rules, output.observation)
     for i in range(world.row.shape[0]):
         payments.fines[i] = memory.fines[i]
         payments.transfers[i] = memory.transfers[i]
@@ -245,28 +252,8 @@ def write_payments(
         payments.violated[i] = memory.broke[i]
         for count in range(memory.counts.shape[1]):
             payments.counts[i, count] = memory.counts[i, count]
-        for entry in range(payments.institutions.shape[1]):
-            if rules.shown_kind[entry] == FORBIDDEN:
-                window_cell = rules.shown_argument[entry]
-                payments.institutions[i, entry] = is_shown_forbidden(
-                    world, memory, tables, rules, i, window_cell
-                )
-            else:
-                payments.institutions[i, entry] = shown_entry(memory, rules, i, entry, world.step[0])
     for ballot in range(payments.in_force.shape[0]):
         payments.in_force[ballot] = memory.in_force[ballot]
-
-
-def is_shown_forbidden(
-    world: Worlds, memory: Memory, tables: Tables, rules: InstitutionTables, i: int, window_cell: int
-) -> bool:
-    """Whether agent i sees that a bite on a cell of its window would break a rule about places."""
-    own = 0 if tables.sees_all else cell_of(world.row[i], world.col[i], tables)
-    heading = world.heading[i]
-    if tables.walls_block_sight and not tables.in_sight[own, heading, window_cell]:
-        return False
-    cell = own + tables.window_cells[heading, window_cell]
-    return is_forbidden(memory, rules, i, cell, tables.site_at[cell])
 
 
 FUNCTIONS = (
@@ -274,6 +261,7 @@ FUNCTIONS = (
     *limits.FUNCTIONS,
     *paying.FUNCTIONS,
     *showing.FUNCTIONS,
+    *institution_views.FUNCTIONS,
     forget,
     begin_ballots,
     clear_turn,
@@ -281,7 +269,6 @@ FUNCTIONS = (
     bite_by_rules,
     tag_by_rules,
     pursue_violations,
-    is_shown_forbidden,
     write_payments,
     play_governed_turn,
     begin_governed_episode,

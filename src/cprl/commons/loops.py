@@ -85,6 +85,7 @@ def one_memory(m: Memory, b: int) -> Memory:
         m.due[b],
         m.fines[b],
         m.transfers[b],
+        m.owed[b],
         m.patch_stock[b],
     )
 
@@ -97,7 +98,6 @@ def one_payments(p: Payments, b: int) -> Payments:
         p.transfers[b],
         p.violated[b],
         p.counts[b],
-        p.institutions[b],
         p.in_force[b],
     )
 

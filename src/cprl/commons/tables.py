@@ -68,6 +68,9 @@ class Tables(NamedTuple):
     has_beam: bool
     agents_apart: bool
     one_hot: bool
+    one_hot_value: int
+    """The value of a cell in the channel of its class: 1, or 255 where institutions have planes of their
+    own."""
     sees_all: bool
     """Whether agents observe the whole board."""
     walls_block_sight: bool
@@ -201,8 +204,8 @@ def _in_sight(board: Map, rules: Rules, walls: Bools, rim: int, stride: int) -> 
     return seen
 
 
-def build_tables(board: Map, rules: Rules, observation: Observation) -> Tables:
-    """Builds the tables of a game."""
+def build_tables(board: Map, rules: Rules, observation: Observation, *, highest: int) -> Tables:
+    """Builds the tables of a game; `highest`: the largest value of an observation."""
     agents, half_width = board.agents, _beam_half_width(board, rules)
     sees_all = observation.area == "full"
     rim = _rim(board, rules, sees_all=sees_all)
@@ -248,6 +251,7 @@ def build_tables(board: Map, rules: Rules, observation: Observation) -> Tables:
         has_beam=rules.may_fire,
         agents_apart=observation.agents_apart,
         one_hot=observation.encoding == "one_hot",
+        one_hot_value=highest,
         sees_all=sees_all,
         walls_block_sight=rules.walls_block_sight,
         shuffle_starts=rules.shuffle_starts,

@@ -121,7 +121,7 @@ def cut_window(world: Worlds, tables: Tables, i: int, scratch: Scratch, window: 
             scratch.seen[n] = tables.channel_of[class_of(scratch.seen[n])]
         for channel in range(window.shape[0]):
             for n in range(cells):
-                planes[channel * cells + n] = scratch.seen[n] == channel
+                planes[channel * cells + n] = (scratch.seen[n] == channel) * tables.one_hot_value
     else:
         for n in range(cells):
             paint = scratch.seen[n]

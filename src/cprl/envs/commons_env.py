@@ -41,9 +41,7 @@ _OWN_KEYS = frozenset(
 )
 _PAID_ENTRIES = ("fines", "transfers", "violated", "counts")
 """Entries of agents in games with institutions."""
-_OWN_AGENT_KEYS = frozenset(
-    (*_AGENT_ENTRIES, *_PAID_ENTRIES, "scoreboard", "stock_gauge", "institutions", "reward")
-)
+_OWN_AGENT_KEYS = frozenset((*_AGENT_ENTRIES, *_PAID_ENTRIES, "scoreboard", "stock_gauge", "reward"))
 
 
 class CommonsEnv(LeanStepEnv):
@@ -132,7 +130,7 @@ class CommonsEnv(LeanStepEnv):
         sites = len(self.game.map.sites)
         observation_spec = group(
             observation=Bounded(
-                0, game.observation.highest, shape=(*per_agent, *game.observation_shape), dtype=torch.uint8
+                0, game.observation_highest, shape=(*per_agent, *game.observation_shape), dtype=torch.uint8
             ),
             harvest=Bounded(0, 1, shape=per_agent, dtype=torch.float32),
             in_play=flag_spec(*per_agent),
@@ -163,10 +161,6 @@ class CommonsEnv(LeanStepEnv):
             specs[key] = Unbounded(shape=per_agent, dtype=torch.float32)
         specs[keys.VIOLATED] = flag_spec(*per_agent)
         specs[keys.COUNTS] = Unbounded(shape=(*per_agent, len(COUNTS)), dtype=torch.int32)
-        if game.institutions_size:
-            specs[keys.INSTITUTIONS] = Unbounded(
-                shape=(*per_agent, game.institutions_size), dtype=torch.float32
-            )
         if game.ballots:
             specs[keys.IN_FORCE] = Unbounded(shape=(self._size, len(game.ballots)), dtype=torch.float32)
 

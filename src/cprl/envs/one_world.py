@@ -59,14 +59,12 @@ class OneWorld:
     def observation_space(self) -> spaces.Space[Any]:
         """A Box of uint8 [C, X, Y]; with a scoreboard or stock gauge, a Dict with it as "observation"."""
         game = self.game
-        seen = spaces.Box(0, game.observation.highest, game.observation_shape, np.uint8)
+        seen = spaces.Box(0, game.observation_highest, game.observation_shape, np.uint8)
         vectors: dict[str, spaces.Space[Any]] = {}
         if game.observation.scoreboard:
             vectors["scoreboard"] = spaces.Box(0, game.rules.episode_steps, (game.agents,), np.float32)
         if game.observation.stock_gauge:
             vectors["stock_gauge"] = spaces.Box(0, 1, (1,), np.float32)
-        if game.institutions_size:
-            vectors["institutions"] = spaces.Box(0, np.inf, (game.institutions_size,), np.float32)
         return spaces.Dict({"observation": seen, **vectors}) if vectors else seen
 
     def begin(self, seed: int | None, decisions: Mapping[str, Any] | None = None) -> None:
@@ -128,8 +126,6 @@ class OneWorld:
             vectors["scoreboard"] = output.scoreboard[0, agent]
         if form.stock_gauge:
             vectors["stock_gauge"] = output.stock_gauge[0, agent]
-        if self.payments is not None and self.game.institutions_size:
-            vectors["institutions"] = self.payments.institutions[0, agent]
         seen = output.observation[0, agent]
         return {"observation": seen, **vectors} if vectors else seen
 

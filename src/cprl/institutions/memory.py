@@ -1,6 +1,6 @@
 """The arrays of institutions: their memory in B worlds, what they output in a turn, and their parameters.
 
-Letters: B worlds, N agents, C counts, D entries shown, V ballots, Q quotas, T taxes, P patches.
+Letters: B worlds, N agents, C counts, S entries shown, V ballots, Q quotas, T taxes, P patches.
 """
 
 from typing import Final, NamedTuple, TypeAlias
@@ -81,12 +81,14 @@ class Memory(NamedTuple):
     """float64 [B, N], apples taken in this turn; working memory."""
     transfers: Numbers
     """float64 [B, N], apples given in this turn; working memory."""
+    owed: Numbers
+    """float64 [B, N], the tax that each agent owes; working memory."""
     patch_stock: Ints
-    """int32 [B, P], apples on each patch; working memory."""
+    """int32 [B, P], apples on each patch; derived from the stock."""
 
 
-WORKING: Final = ("broke", "unjust", "due", "fines", "transfers", "patch_stock")
-"""Entries of `Memory` that hold nothing between turns."""
+WORKING: Final = ("broke", "unjust", "due", "fines", "transfers", "owed", "patch_stock")
+"""Entries of `Memory` that hold nothing between turns, or nothing that does not follow from the rest."""
 REMEMBERED: Final = tuple(name for name in Memory._fields if name not in WORKING)
 """Entries of `Memory` that are part of the state of a world."""
 
@@ -104,14 +106,11 @@ class Payments(NamedTuple):
     """bool [B, N], whether the agent broke a rule in this turn, detected or not."""
     counts: Ints
     """int32 [B, N, C], the `COUNTS` of this episode so far."""
-    institutions: Floats
-    """float32 [B, N, D], what institutions show each agent."""
     in_force: Floats
     """float32 [B, V], what each ballot decided."""
 
 
 (
-    FORBIDDEN,
     QUOTA_LEFT,
     QUOTA_TIME,
     CLOSED,
@@ -122,8 +121,8 @@ class Payments(NamedTuple):
     MAY_FIRE,
     IN_FORCE,
     IS_ELECTED,
-) = range(11)
-"""What an entry of `Payments.institutions` shows; see `cprl.institutions.showing`."""
+) = range(10)
+"""What an entry shows agents; see `cprl.institutions.showing`."""
 
 
 class InstitutionTables(NamedTuple):
@@ -142,6 +141,8 @@ class InstitutionTables(NamedTuple):
 
     quota_unit: Numbers
     """float64 [Q], apples per agent and window at a share of 1."""
+    quota_full: Numbers
+    """float64 [Q], the most apples that an agent may harvest in a window, for what agents are shown."""
     quota_share: Numbers
     """float64 [Q]."""
     quota_ballot: Ints
@@ -216,9 +217,13 @@ class InstitutionTables(NamedTuple):
     """The ballot that elects who may fire; -1 for none."""
 
     shown_kind: Ints
-    """[D], what each entry shows."""
+    """[S], what each entry shows agents."""
     shown_argument: Ints
-    """[D], which one of its kind."""
+    """[S], which one of its kind."""
+    shows_places: bool
+    """Whether agents see where bites are forbidden."""
+    first_plane: int
+    """The channel of observations that is the first one of institutions."""
 
 
 def empty_memory(tables: InstitutionTables, *, worlds: int) -> Memory:
@@ -244,5 +249,6 @@ def empty_memory(tables: InstitutionTables, *, worlds: int) -> Memory:
         due=np.zeros((worlds, agents), np.float64),
         fines=np.zeros((worlds, agents), np.float64),
         transfers=np.zeros((worlds, agents), np.float64),
+        owed=np.zeros((worlds, agents), np.float64),
         patch_stock=np.zeros((worlds, patches), np.int32),
     )

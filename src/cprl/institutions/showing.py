@@ -1,16 +1,17 @@
-"""What institutions show agents in ("agents", "institutions"), on one world.
+"""What institutions show agents as part of their observations, on one world; each entry is in 0..1.
 
 `cprl.commons.institution_tables` lists the entries of a game in the order of its institutions:
-- the window's cells, 1 where a bite would break a rule about places (`Boundaries`, `ClosedPatches`; once);
-- `Quota`: apples left of the window's quota, relative to the quota at a share of 1; the part of the window
-  that is left;
+- `Quota`: apples left of the window's quota, relative to the most that it can be; the part of the window that
+  is left;
 - `ClosedSeason`: 1 if the coming turn is closed; the part of a period until that changes;
 - `GraduatedSanctions`: the agent's level, relative to the last one;
 - `Monitoring`: 1 if a violation of the agent was detected in the last turn; with an election, 1 if it
   monitors;
 - `Mediation`: for each agent, the own mark first, 1 if it violated a rule in the last turns;
 - `Sanctioner`: 1 if the agent may fire;
-- `Vote`: the value in force.
+- `Vote`: the value in force, relative to the highest choice.
+
+`Boundaries` and `ClosedPatches` show where bites are forbidden, see `cprl.commons.institution_views`.
 """
 
 from cprl.institutions.limits import is_season_closed
@@ -50,13 +51,13 @@ def has_mark(memory: Memory, tables: InstitutionTables, agent: int, turn: int) -
 
 
 def quota_left(memory: Memory, tables: InstitutionTables, q: int, i: int) -> float:
-    """The apples that agent i may still harvest in the window, relative to the quota at a share of 1."""
+    """The apples that agent i may still harvest in the window, relative to the most that it can be."""
     left = memory.allowed[q] - memory.taken[q, i]
-    return left / tables.quota_unit[q] if left > 0 and tables.quota_unit[q] > 0 else 0.0
+    return left / tables.quota_full[q] if left > 0 and tables.quota_full[q] > 0 else 0.0
 
 
 def shown_entry(memory: Memory, tables: InstitutionTables, i: int, entry: int, turn: int) -> float:
-    """One entry of what agent i is shown after a turn, other than those about cells."""
+    """One entry of what agent i is shown after a turn."""
     kind, argument = tables.shown_kind[entry], tables.shown_argument[entry]
     if kind == QUOTA_LEFT:
         return quota_left(memory, tables, argument, i)
@@ -77,7 +78,8 @@ def shown_entry(memory: Memory, tables: InstitutionTables, i: int, entry: int, t
     if kind == MAY_FIRE:
         return 1.0 if memory.may_fire[i] else 0.0
     if kind == IN_FORCE:
-        return memory.in_force[argument]
+        highest = tables.ballot_choice[argument, tables.ballot_options[argument] - 1]
+        return memory.in_force[argument] / highest
     if kind == IS_ELECTED:
         return 1.0 if memory.in_force[argument] == i else 0.0
     return 0.0
