@@ -97,17 +97,20 @@ class EpisodePicture:
             at = self.cell_box(int(moments[-1].row[own]), int(moments[-1].col[own]))
             draw.rectangle(at, outline=_TEXT, width=max(1, self._unit // 6))
         for agent in violators:
-            self._diamond(draw, int(moments[-1].row[agent]), int(moments[-1].col[agent]))
+            self._mark(draw, agent, moments[-1])
         self._plot_stock(draw, np.array([moment.stock.sum(dtype=np.int64) for moment in moments]))
         self._plot_harvests(draw, np.array([moment.harvested for moment in moments]))
         return np.asarray(image)
 
-    def _diamond(self, draw: ImageDraw.ImageDraw, row: int, col: int) -> None:
-        """The mark of who broke a rule, as `cprl.viewer.offences` has it, around a cell."""
-        left, top, right, bottom = self.cell_box(row, col)
+    def _mark(self, draw: ImageDraw.ImageDraw, agent: int, now: Shown) -> None:
+        """A diamond around who broke a rule, as `cprl.viewer.offences` has it; with its number where it is
+        out of play, as a sanction can put it at once."""
+        left, top, right, bottom = self.cell_box(int(now.row[agent]), int(now.col[agent]))
         across, down, more = (left + right) / 2, (top + bottom) / 2, (right - left) * _DIAMOND_BEYOND
         corners = [(across, top - more), (right + more, down), (across, bottom + more), (left - more, down)]
         draw.line([*corners, *corners[:2]], _TEXT, max(1, self._unit // 5), joint="curve")
+        if not now.in_play[agent]:
+            draw.text((across, down), str(agent), agent_colour(agent), self._font, anchor="mm")
 
     def cell_box(self, row: int, col: int) -> tuple[float, float, float, float]:
         """Where a cell is in the picture: left, top, right and bottom in pixels."""

@@ -28,7 +28,7 @@ OF_INSTITUTIONS: Final = {
     "recidivism": ("violations after a sanction", SHARE),
     "sanctions_per_violation": ("sanctions per violation", "ratio"),
     "unjust_share_of_tags": ("unjust tags", SHARE),
-    "net_equality": ("equality of net incomes (1 - Gini)", SHARE),
+    "net_equality": ("equality of net incomes", SHARE),
     "equality_within": ("equality within groups", SHARE),
     "equality_between": ("equality between groups", SHARE),
     "net_equality_within": ("equality of net incomes within groups", SHARE),

@@ -31,7 +31,7 @@ def institutions_table(
     if all(getattr(first, name) is None for name in INSTITUTIONAL):
         return None
     table = Table(title="institutions", caption="means over episodes")
-    table.add_column(no_wrap=True)
+    table.add_column()
     for name in played:
         table.add_column(name, justify="right", no_wrap=True)
     measured = {policy: [institution_metrics(episode) for episode in own] for policy, own in played.items()}
