@@ -13,6 +13,9 @@ Modules, in the order in which one reads them:
     visits     where agents go
     turns      the stock over the turn
     lorenz     Lorenz curve and Gini coefficient
+    institutions       lines and tabs of games with institutions
+    institution_views  their regions on the board, and events
+    offences   in a replay: who breaks a rule, and what is paid
     decisions  in a replay: what each agent's policy says of its actions
     compiling  while code is compiled, the live header says so
     recorder   which episodes are recorded frame by frame
