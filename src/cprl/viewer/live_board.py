@@ -46,8 +46,8 @@ def send_frames(
 ) -> None:
     """Sends frames one by one.
 
-    Whatever is done here in Python keeps the training from going on: columns are converted once for all
-    frames, and rows go to Rerun's native part as they are.
+    Whatever is done here in Python keeps the training from going on: columns are converted and cut once for
+    all frames, and rows go to Rerun's native part as they are.
 
     Args:
         recording: the stream.
@@ -62,15 +62,14 @@ def send_frames(
     text = rr.Points2D.columns(labels=np.array([caption]))
     send_chunk(recording, "exhibition/caption", {}, components(text))
     count = len(frames["step"])
-    converted = [
-        (_renamed(entity), rows.tolist(), components(columns))
-        for entity, (rows, columns) in board_columns(scene, frames).items()
-    ]
-    for at in range(count):
-        for entity, rows, columns in converted:
-            if at in rows:
-                row = rows.index(at)
-                send_chunk(recording, entity, {}, {kind: own.slice(row, 1) for kind, own in columns.items()})
+    shown: list[list[tuple[str, dict[Any, Any]]]] = [[] for _ in range(count)]
+    for entity, (rows, columns) in board_columns(scene, frames).items():
+        name, converted = _renamed(entity), components(columns)
+        for row, at in enumerate(rows.tolist()):
+            shown[at].append((name, {kind: own.slice(row, 1) for kind, own in converted.items()}))
+    for at, parts in enumerate(shown):
+        for name, own in parts:
+            send_chunk(recording, name, {}, own)
         if at + 1 < count and wait(lasting_s / count):
             return
 
