@@ -122,7 +122,7 @@ class Population:
                 for agents, learner in self.learners.items()
             }
             others = self._others(EXHIBITION, worlds=1, replicas=1)
-        return PresentPolicy(actors, others, replicas=self.replicas, device=self._device)
+            return PresentPolicy(actors, others, replicas=self.replicas, device=self._device)
 
     def random_policy(self, worlds: int) -> AgentPolicies:
         """Every agent takes every action with equal probability."""

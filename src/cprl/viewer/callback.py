@@ -122,6 +122,7 @@ class ViewerCallback:
         )
         self._institutions = institution_views(self.logger, commons)
         has_tags = curves.has_tags and len(self._agents) > 1
+        self._sampled = self._views.sampled
         self._tags = Tags(self.logger, len(self._agents)) if has_tags else None
         self._step = self._episode = 0
         self._shows_next = self._has_died = False
@@ -144,7 +145,7 @@ class ViewerCallback:
         Otherwise it only counts: reading a tensor each turn would cost a training some percent.
         """
         self._step += 1
-        if not self._is_recording and self._step % self._views.sampled:
+        if not self._is_recording and self._step % self._sampled:
             return  # nothing is due; whatever runs here displaces a training's data from the fast caches
         self._is_recording = self.is_shown
         if self.exhibition is not None:
