@@ -122,7 +122,7 @@ class Population:
                 for agents, learner in self.learners.items()
             }
             others = self._others(EXHIBITION, worlds=1, replicas=1)
-        return PresentPolicy(actors, others, replicas=self.replicas, device=self._device)
+            return PresentPolicy(actors, others, replicas=self.replicas, device=self._device)
 
     def random_policy(self, worlds: int) -> AgentPolicies:
         """Every agent takes every action with equal probability."""
@@ -207,6 +207,8 @@ def _fitting_run(path: str, spaces: Spaces, game: Game | None, allow: Sequence[s
         differences += [
             ("a form of observation", run.game.observation, game.observation),
             ("actions", run.game.actions, game.actions),
+            ("channels", run.game.channels, game.channels),
+            ("institutions that show", run.game.entries_shown, game.entries_shown),
         ]
     for name, came, here in differences:
         if came != here:

@@ -20,6 +20,7 @@ from cprl.envs.unwrap import commons_of
 from cprl.finite import EVERY_STEPS, FiniteCheck, OnNan
 from cprl.learners.base import LaneLosses, Learner, WantedReturns, check_agents, check_numbers, learned_in
 from cprl.measuring.episodes import Episode, EpisodeTracker
+from cprl.measuring.institutional import institutions_of
 from cprl.policies.assignment import AgentIndices, AgentPolicies
 
 MakeCollector = Callable[[EnvBase, nn.Module], BaseCollector]
@@ -81,7 +82,7 @@ class Training:
         self._turns = iter(self._collector)
         commons = commons_of(env)
         longest = None if commons is None else commons.game.rules.episode_steps
-        self._tracker = EpisodeTracker(replicas, spaces.agents, longest)
+        self._tracker = EpisodeTracker(replicas, spaces.agents, longest, institutions=institutions_of(env))
         self._losses = {agents: LaneLosses(replicas, agents) for agents in self.learners}
         self._wanted = WantedReturns(replicas, spaces.agents, self.learners)
         self.finite = FiniteCheck(self.learners, spaces, on_nan=on_nan)

@@ -31,7 +31,8 @@ def check_same_game(runs: Mapping[str, LoadedRun]) -> None:
 
 
 def differences(game: Any, other: Any) -> list[str]:
-    """The fields of map, rules and observation in which games differ, with their values if they are short."""
+    """The fields of map, rules and observation in which games differ, with their values if they are short,
+    and the institutions."""
     if not (isinstance(game, Game) and isinstance(other, Game)):
         return [] if game == other else [f"{game!r} and {other!r}"]
     found = []
@@ -46,6 +47,9 @@ def differences(game: Any, other: Any) -> list[str]:
                 values = f"{one!r} and {two!r}"
                 short = len(values) <= 2 * _LONGEST
                 found.append(f"{type(mine).__name__}.{field.name} {values if short else 'differ'}")
+    if game.institutions != other.institutions:
+        names = (", ".join(type(own).__name__ for own in of.institutions) or "none" for of in (game, other))
+        found.append(f"institutions {' and '.join(names)}, or their values")
     return found
 
 
