@@ -19,6 +19,7 @@ from cprl.institutions import (
     Levies,
     Mediation,
     Monitoring,
+    Quota,
     Sanctioner,
     Tax,
     Vote,
@@ -61,6 +62,15 @@ VOTES = tuple(Vote(on=Tax(), choices=tuple(n / 10 for n in range(11))) for _ in 
         ([Levies(groups=((0, 1), (1,)))], r"Levies\.groups has the agents \[0, 1, 1\]; allowed"),
         ([Levies(groups=((0, 1), (2,)))], r"Levies\.groups has agent 2; allowed on this map: 0 to 1"),
         ([Sanctioner(agents=(0, 2))], r"Sanctioner\.agents has agent 2; allowed on this map: 0 to 1"),
+        (
+            [Quota(), Monitoring()],
+            r"Monitoring has no violation to detect; allowed: a Boundaries, Quota or the like with a fine, .*, "
+            r"or a cost above 0",
+        ),
+        (
+            [Quota(), GraduatedSanctions(on="violations")],
+            r'GraduatedSanctions with on="violations" has no offence to sanction; allowed: a Boundaries',
+        ),
         ([Monitoring(monitor=2)], r"Monitoring\.monitor has agent 2; allowed on this map: 0 to 1"),
         (
             [GraduatedSanctions(freeze_steps=((1,),), on="tags")],

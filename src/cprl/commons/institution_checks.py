@@ -6,7 +6,18 @@ from cprl.commons.institution_entries import KINDS
 from cprl.commons.maps import Map
 from cprl.commons.observation import Observation
 from cprl.commons.rules import Rules
-from cprl.institutions import GraduatedSanctions, Institution, Mediation, Sanctioner
+from cprl.institutions import (
+    Boundaries,
+    ClosedPatches,
+    ClosedSeason,
+    GraduatedSanctions,
+    Institution,
+    Mediation,
+    Monitoring,
+    Quota,
+    Sanctioner,
+    Vote,
+)
 from cprl.institutions.base import MOST_INSTITUTIONS
 from cprl.institutions.choice import MOST_DECISIONS, decision_options
 
@@ -44,12 +55,37 @@ def check_institutions(institutions: tuple[Any, ...], board: Map, rules: Rules, 
                 f"Game.institutions has a {kind.__name__} and Rules.may_fire is False; allowed: a game in "
                 "which agents may fire"
             )
+        _check_effect(own, institutions, rules)
     options = decision_options(institutions, board.agents)
     if options > MOST_DECISIONS:
         raise ValueError(
             f"Game.institutions lets agents choose from {options:,} options; allowed: at most "
             f"{MOST_DECISIONS:,}"
         )
+
+
+def _check_effect(own: Institution, institutions: tuple[Any, ...], rules: Rules) -> None:
+    """Refuses what pursues violations of rules where there is no rule that can be broken."""
+    if any(_can_be_broken(other) for other in institutions):
+        return
+    name, allowed = (
+        type(own).__name__,
+        "a Boundaries, Quota or the like with a fine, or a Mediation, beside it",
+    )
+    if isinstance(own, Monitoring) and own.cost == 0:
+        raise ValueError(f"{name} has no violation to detect; allowed: {allowed}, or a cost above 0")
+    if isinstance(own, GraduatedSanctions) and (own.on == "violations" or not rules.may_fire):
+        raise ValueError(f'{name} with on="{own.on}" has no offence to sanction; allowed: {allowed}')
+
+
+def _can_be_broken(own: Any) -> bool:
+    """Whether an institution is a rule that agents can break."""
+    own = own.on if isinstance(own, Vote) else own
+    if isinstance(own, Boundaries):
+        return own.bite_fine is not None or own.step_fine is not None
+    if isinstance(own, Quota | ClosedSeason | ClosedPatches):
+        return own.fine is not None
+    return isinstance(own, Mediation)
 
 
 def _check_observation(own: Institution, form: Observation) -> None:
