@@ -16,13 +16,15 @@ from cprl.custom import Custom, made
 from cprl.envs.make_env import spaces_of
 from cprl.envs.unwrap import commons_of
 from cprl.learners.base import Learner
+from cprl.learners.decisions import Bandit, BanditDecider
 from cprl.learners.lanes import EVALUATION, EXHIBITION, EXPLORATION, lane_name, lane_seeds
 from cprl.networks.agent import acting_part
 from cprl.policies.assignment import AgentIndices, AgentPolicies
+from cprl.policies.decisions import ballot_sizes, decider_by_chance
 from cprl.policies.lanes import random_agents
 from cprl.policies.present import PresentPolicy
 from cprl.policies.scripted import scripted_lanes
-from cprl.population import AgentSpec, Frozen, Learning, Scripted, Team, grouped
+from cprl.population import AgentSpec, Frozen, Learning, Scripted, Team, grouped, refuse_undecided
 from cprl.spaces import Spaces
 from cprl.stored import LoadedRun, StoredAgent, load, stored_actor
 
@@ -87,6 +89,31 @@ class Population:
                     spec, self.spaces, agents, {**who, "start_from": start} if start else who
                 )
         self.others: dict[AgentIndices, nn.Module] = self._others(EXPLORATION, worlds=1)
+        self.decisions: BanditDecider | None = self._decisions()
+        """What the agents decide, and learn to, where the game asks them."""
+
+    def _decisions(self) -> BanditDecider | None:
+        sizes = () if self._game is None else ballot_sizes(self._game)
+        refuse_undecided(self.specs, len(sizes))
+        if not sizes:
+            return None
+        bandits: list[Bandit | None] = [None] * self.spaces.agents
+        stored: dict[int, list[Tensor]] = {}
+        for spec, agents in self._groups:
+            for agent in agents:
+                if isinstance(spec, Learning | Team):
+                    bandits[agent] = spec.decisions or Bandit()
+                elif isinstance(spec, Frozen):
+                    values = [own.decisions for own in self._frozen[spec] if own.decisions is not None]
+                    stored |= {agent: values} if values else {}  # a scripted agent of that run has none
+        return BanditDecider(
+            sizes,
+            bandits=bandits,
+            stored=stored,
+            replicas=self.replicas,
+            seed=self.seed,
+            first_replica=self._first,
+        )
 
     def _others(
         self, purpose: int, *, worlds: int, replicas: int | None = None
@@ -111,7 +138,8 @@ class Population:
         learned: dict[AgentIndices, nn.Module] = {
             agents: learner.evaluation_actor(worlds) for agents, learner in self.learners.items()
         }
-        return AgentPolicies({**learned, **self._others(EVALUATION, worlds=worlds)})
+        decisions = None if self.decisions is None else self.decisions.evaluation(worlds)
+        return AgentPolicies({**learned, **self._others(EVALUATION, worlds=worlds)}, decisions=decisions)
 
     def present_policy(self) -> PresentPolicy:
         """All agents of the first replica as they are now, whenever it is called, in one world."""
@@ -121,13 +149,17 @@ class Population:
                 for agents, learner in self.learners.items()
             }
             others = self._others(EXHIBITION, worlds=1, replicas=1)
-        return PresentPolicy(actors, others, replicas=self.replicas, device=self._device)
+        own = self.decisions
+        decisions = None if own is None else (own.first_replica(), own)
+        return PresentPolicy(actors, others, decisions=decisions, replicas=self.replicas, device=self._device)
 
     def random_policy(self, worlds: int) -> AgentPolicies:
-        """Every agent takes every action with equal probability."""
+        """Every agent takes every action with equal probability, and every choice where it decides."""
         everyone = tuple(range(self.spaces.agents))
+        seeds = [(self.seed, replica, agent) for replica in range(self.replicas) for agent in everyone]
         return AgentPolicies(
-            random_agents(self.spaces, everyone, replicas=self.replicas, seed=self.seed, worlds=worlds)
+            random_agents(self.spaces, everyone, replicas=self.replicas, seed=self.seed, worlds=worlds),
+            decisions=None if self._game is None else decider_by_chance(self._game, seeds, worlds=worlds),
         )
 
     def networks(self) -> dict[str, nn.Module]:
@@ -175,7 +207,7 @@ def _frozen(
     spec: Frozen, spaces: Spaces, game: Game | None, allow: Sequence[str], replicas: Sequence[int]
 ) -> list[StoredAgent]:
     """The stored agent of each replica."""
-    run = _fitting_run(spec.run, spaces, game, allow)
+    run = _fitting_run(spec.run, spaces, game, allow, is_to_decide=True)
     return [run.agent(spec.agent, replica=_theirs(spec, replica)) for replica in replicas]
 
 
@@ -184,8 +216,11 @@ def _theirs(spec: Frozen, replica: int) -> int:
     return replica if spec.replica is None else spec.replica
 
 
-def _fitting_run(path: str, spaces: Spaces, game: Game | None, allow: Sequence[str]) -> LoadedRun:
-    """The stored run, refused where it was trained for other observations or actions."""
+def _fitting_run(
+    path: str, spaces: Spaces, game: Game | None, allow: Sequence[str], *, is_to_decide: bool = False
+) -> LoadedRun:
+    """The stored run, refused where it was trained for other observations or actions, or other ballots if its
+    agents are to decide here."""
     run = load(path, allow=allow)
     theirs = run.spaces
     differences: list[tuple[str, Any, Any]] = [
@@ -194,6 +229,8 @@ def _fitting_run(path: str, spaces: Spaces, game: Game | None, allow: Sequence[s
         ("a number of actions of", theirs.actions, spaces.actions),
     ]
     if game is not None and isinstance(run.game, Game):
+        if is_to_decide and game.ballots:
+            differences.append(("ballots", _asked(run.game), _asked(game)))
         differences += [
             ("a form of observation", run.game.observation, game.observation),
             ("actions", run.game.actions, game.actions),
@@ -202,6 +239,11 @@ def _fitting_run(path: str, spaces: Spaces, game: Game | None, allow: Sequence[s
         if came != here:
             raise ValueError(f"the agents of {path} have {name} {came}; this game has {here}")
     return run
+
+
+def _asked(game: Game) -> list[tuple[str, tuple[float, ...]]]:
+    """What agents of a game decide on, and the choices."""
+    return [(ballot.title, ballot.choices) for ballot in game.ballots]
 
 
 def start_weights(

@@ -4,7 +4,9 @@ import time
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any, Final
 
+import numpy as np
 import torch
+from numpy.typing import NDArray
 from tensordict import TensorDictBase
 from torch import Tensor, nn
 from torchrl.collectors import BaseCollector
@@ -17,9 +19,17 @@ from cprl.envs.make_env import check_env, spaces_of
 from cprl.envs.state import carried_state, env_state, load_carried, load_env_state
 from cprl.envs.unwrap import commons_of
 from cprl.finite import EVERY_STEPS, FiniteCheck, OnNan
-from cprl.learners.base import LaneLosses, Learner, check_agents, check_numbers, learned_in
+from cprl.learners.base import (
+    LaneLosses,
+    Learner,
+    check_agents,
+    check_decisions,
+    check_numbers,
+    learned_in,
+)
 from cprl.measuring.episodes import Episode, EpisodeTracker
 from cprl.policies.assignment import AgentIndices, AgentPolicies
+from cprl.policies.decisions import Decider
 
 MakeCollector = Callable[[EnvBase, nn.Module], BaseCollector]
 """A collector out of an environment and a policy; it yields batches [R], or [R, T] of T turns."""
@@ -39,6 +49,7 @@ class Training:
         learners: by the indices of their agents, a tuple; each updates these agents in every replica.
         episodes: how many to play, at least 1.
         others: the actors of the agents that do not learn, likewise; an actor of one agent by its index.
+        decisions: what all agents decide, and learn to, where the game asks them; see `Game.decisions`.
         callbacks: called after each turn and each episode, in this order; see `Callback`.
         update_every: steps k after which each learner updates, then k times.
         make_collector: `StepCollector`, or for TorchRL's own `cprl.collectors.stock_collector`.
@@ -47,7 +58,8 @@ class Training:
 
     Raises:
         ValueError: for agents without a learner or actor, or with two; another number of worlds than the
-            learners have replicas; numbers below 1; a callback without any of the methods of `Callback`.
+            learners have replicas; numbers below 1; a callback without any of the methods of `Callback`;
+            decisions that are missing in a game that asks for them, or given in another.
     """
 
     def __init__(
@@ -57,6 +69,7 @@ class Training:
         *,
         episodes: int,
         others: Mapping[AgentIndices, nn.Module] | None = None,
+        decisions: Decider | None = None,
         callbacks: Sequence[Any] = (),
         update_every: int = 1,
         make_collector: MakeCollector = StepCollector,
@@ -76,9 +89,11 @@ class Training:
         actors: dict[AgentIndices, nn.Module] = {
             agents: learner.actor for agents, learner in self.learners.items()
         }
-        self._collector = make_collector(env, AgentPolicies({**actors, **self.others}))
-        self._turns = iter(self._collector)
         commons = commons_of(env)
+        check_decisions(decisions, 0 if commons is None else commons.game.decisions)
+        self.decisions = decisions
+        self._collector = make_collector(env, AgentPolicies({**actors, **self.others}, decisions=decisions))
+        self._turns = iter(self._collector)
         longest = None if commons is None else commons.game.rules.episode_steps
         self._tracker = EpisodeTracker(replicas, spaces.agents, longest)
         self._losses = {agents: LaneLosses(replicas, agents) for agents in self.learners}
@@ -162,6 +177,8 @@ class Training:
         for learner in self.learners.values():
             learner.end_episode(worlds)
         for episode, of_agents in zip(ended, learning, strict=True):
+            if self.decisions is not None and episode.decision is not None:
+                self.decisions.learn(episode.world, episode.decision, _return_to_decide_by(episode))
             self._played[episode.world] += 1
             if self._played[episode.world] <= self.episodes:
                 for callback in self.callbacks:
@@ -188,6 +205,7 @@ class Training:
             "carried": None if carried is None else carried_state(carried),
             "learners": [learner.state_dict() for learner in self.learners.values()],
             "others": [dict(other.state_dict()) for other in self.others.values()],
+            "decisions": {} if self.decisions is None else dict(self.decisions.state_dict()),
             "losses": [losses.state_dict() for losses in self._losses.values()],
             "tracker": self._tracker.state_dict(),
             "callbacks": {name: own.state_dict() for name, own in self._with_state().items()},
@@ -233,6 +251,8 @@ class Training:
         for name, of_agents in parts.items():
             for part, own in zip(of_agents.values(), state[name], strict=True):
                 part.load_state_dict(own)
+        if self.decisions is not None:
+            self.decisions.load_state_dict(state["decisions"])
         self._tracker.load_state_dict(state["tracker"])
         self.finite.load_state_dict(state.get("not_finite", ()), step=self.steps)
         for name, callback in self._with_state().items():
@@ -247,12 +267,18 @@ class Training:
             self._step_collector().resume_from(load_carried(fresh, state["carried"]))
 
 
+def _return_to_decide_by(episode: Episode) -> NDArray[np.float64]:
+    """What each agent's decisions are learned from, float64 [N]."""
+    return episode.return_
+
+
 def train(
     env: EnvBase,
     learners: Mapping[tuple[int, ...], Learner],
     *,
     episodes: int,
     others: Mapping[AgentIndices, nn.Module] | None = None,
+    decisions: Decider | None = None,
     callbacks: Sequence[Any] = (),
     checkpointer: SavesTraining | None = None,
     update_every: int = 1,
@@ -266,6 +292,7 @@ def train(
         learners: by the indices of their agents.
         episodes: how many to play.
         others: the actors of the agents that do not learn.
+        decisions: what all agents decide, where the game asks them.
         callbacks: called after each turn and each episode.
         checkpointer: where the training resumes from, and saves its state now and then.
         update_every: steps k after which each learner updates, then k times.
@@ -284,6 +311,7 @@ def train(
         learners,
         episodes=episodes,
         others=others,
+        decisions=decisions,
         callbacks=callbacks,
         update_every=update_every,
         make_collector=make_collector,

@@ -95,7 +95,12 @@ def film(
     ) as viewer:
         events = _Events(viewer)
         train(
-            fresh.env, {}, others=others, episodes=1, callbacks=[viewer, *_decisions(viewer, fresh), events]
+            fresh.env,
+            {},
+            others=others,
+            decisions=fresh.policies.decisions,
+            episodes=1,
+            callbacks=[viewer, *_decisions(viewer, fresh), events],
         )
     assert events.episode is not None
     return target, events.episode

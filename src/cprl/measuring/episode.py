@@ -39,6 +39,9 @@ class Episode:
     """[N], how often each agent was tagged out; by two agents in one step counts once."""
     tagged_by: NDArray[np.int64] | None = None
     """[N, N], how often the agent of the row was tagged by the agent of the column."""
+    decision: NDArray[np.int64] | None = None
+    """[N], what each agent had decided, see `cprl.institutions.choice.ballots`; None in games that ask
+    nothing."""
     stock_left: int | None = None
     """Apples on the board at the end."""
     depletion_step: int | None = None

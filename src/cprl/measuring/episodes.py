@@ -211,6 +211,8 @@ class EpisodeTracker:
         turns = {name: tensor.numpy(force=True) for name, tensor in tensors.items()}
         if np.count_nonzero(turns["done"]):  # a tenth of the time that `any` takes on so few
             turns["had_ended"] = entry(tensordict, keys.DONE).numpy(force=True)
+            if tensordict.get(keys.BALLOTS_DUE, None) is not None:
+                turns["decision"] = entry(entry(tensordict, keys.AGENTS), "decision").numpy(force=True)
         return turns
 
     def _missing(self, tensordict: TensorDictBase) -> ValueError:
@@ -231,7 +233,7 @@ class EpisodeTracker:
         if len(size) not in (1, 2) or size[0] != self.worlds:
             raise ValueError(f"the batch is {list(size)}; allowed: [{self.worlds}] or [{self.worlds}, T]")
         one, agents = (1,), (self.agents,)
-        own: dict[str, tuple[int, ...]] = dict.fromkeys(("harvest", "fired", "in_play"), agents)
+        own: dict[str, tuple[int, ...]] = dict.fromkeys(("harvest", "fired", "in_play", "decision"), agents)
         own |= {"reward": agents + one, "hit_by": agents * 2, "tagged_by": agents * 2}
         for name, array in turns.items():
             allowed = (*size, *own.get(name, one))
@@ -314,6 +316,8 @@ class EpisodeTracker:
                 fields["in_play_steps"] = kept["in_play"][k].sum(0)
             if "hit_by" in ended:
                 fields["hits"] = ended["hit_by"][k].sum(0)
+            if "decision" in turn:
+                fields["decision"] = turn["decision"][world].copy()
             if "stock" in turn:
                 fields["stock_left"] = int(turn["stock"][world, 0])
                 fields["depletion_step"] = int(ended["depletion_step"][k]) or -1

@@ -7,7 +7,7 @@ import numpy as np
 import pyarrow as pa
 
 from cprl.measuring import Episode, social
-from cprl.measuring.reported import FIELDS, left_out
+from cprl.measuring.reported import left_out
 
 COLUMNS: Final = {
     "replica": pa.int32(),
@@ -20,6 +20,7 @@ COLUMNS: Final = {
     "shots": pa.int32(),
     "hits": pa.int32(),
     "tagged": pa.int32(),
+    "decision": pa.int32(),
     "stock_left": pa.int32(),
     "depletion_step": pa.int32(),
     "terminated": pa.bool_(),
@@ -49,7 +50,7 @@ def schema_of(episode: Episode) -> pa.Schema:
 
 
 def _columns_of(episode: Episode) -> list[str]:
-    return [name for name in COLUMNS if name not in FIELDS or getattr(episode, name) is not None]
+    return [name for name in COLUMNS if getattr(episode, name, "") is not None]
 
 
 def rows_of(episodes: Sequence[Episode], replica: int | None, schema: pa.Schema) -> pa.RecordBatch:
