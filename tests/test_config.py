@@ -42,6 +42,7 @@ from cprl.institutions import (
     Tax,
     Vote,
 )
+from cprl.learners.decisions import Bandit
 from cprl.networks import MLP, Conv
 from cprl.population import Frozen, Learning, Scripted, Team
 
@@ -89,9 +90,16 @@ FROZEN = st.builds(
     Frozen, st.just("runs/earlier"), agent=st.integers(0, 3), replica=st.none() | st.integers(0, 9)
 )
 STARTS = st.none() | FROZEN
+BANDITS = st.none() | st.builds(Bandit, step_size=POSITIVE.filter(lambda step: step <= 1), epsilon_end=SHARES)
 SPECS = st.one_of(
-    st.builds(Learning, ALONE | CUSTOM, reward=st.sampled_from(["individual", "team"]), start_from=STARTS),
-    st.builds(Team, TEAMS | CUSTOM, agents=st.just((0, 2)), start_from=STARTS),
+    st.builds(
+        Learning,
+        ALONE | CUSTOM,
+        reward=st.sampled_from(["individual", "team"]),
+        start_from=STARTS,
+        decisions=BANDITS,
+    ),
+    st.builds(Team, TEAMS | CUSTOM, agents=st.just((0, 2)), start_from=STARTS, decisions=BANDITS),
     st.builds(Scripted, st.sampled_from(["random", "greedy", "pacifist"])),
     FROZEN,
 )

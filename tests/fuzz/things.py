@@ -38,6 +38,7 @@ from cprl.algorithms import (
 )
 from cprl.envs import make_env
 from cprl.learners.base import Learner
+from cprl.learners.decisions import Bandit
 from cprl.measuring import Episode
 from cprl.measuring.evaluate import evaluate
 from cprl.networks import MLP, Conv, MLPNetwork
@@ -101,6 +102,7 @@ EXAMPLES: Final[dict[type, tuple[Any, ...]]] = {
     QMIX: (QMIX(settings=REPLAY, mixing_cells=3),),
     MAPPO: (MAPPO(settings=ROLLOUTS),),
     IPPO: (IPPO(settings=ROLLOUTS),),
+    Bandit: (Bandit(), Bandit(step_size=0.5, epsilon_end=0.0)),
     Learning: (DQN_AGENT, Learning(PPO(settings=ROLLOUTS), reward="team")),
     Team: (TEAM, Team(IPPO(settings=ROLLOUTS), agents=(0, 1), reward="individual")),
     Scripted: (Scripted(), Scripted("greedy")),

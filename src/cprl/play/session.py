@@ -42,9 +42,7 @@ class Session:
         ValueError: if the environment is of another kind, or has no such agent or decision.
     """
 
-    def __init__(
-        self, env: EnvBase, others: Policy, *, agent: int = 0, decision: int | None = None
-    ) -> None:
+    def __init__(self, env: EnvBase, others: Policy, *, agent: int = 0, decision: int | None = None) -> None:
         commons = commons_of(env)
         if commons is None:
             raise ValueError(f"env is a {type(env).__name__}; allowed: a CommonsEnv, which has a board")

@@ -14,6 +14,7 @@ from torch import Tensor, nn
 from torchrl.envs.utils import ExplorationType, exploration_type
 
 from cprl import arguments
+from cprl.checks import shown
 from cprl.commons.game import Game
 from cprl.policies.rng import check_lanes
 
@@ -173,8 +174,9 @@ def _given(name: str, array: Doubles | None, shape: tuple[int, ...]) -> Doubles:
     if array is None:
         return np.zeros(shape)
     if not isinstance(array, np.ndarray) or array.shape != shape or array.dtype != np.float64:
-        found = f"{getattr(array, 'dtype', '')} {list(getattr(array, 'shape', []))}".strip()
-        raise arguments.refusal(name, found, f"None, or float64 {list(shape)}")
+        is_array = isinstance(array, np.ndarray)
+        found = f"{array.dtype} {list(array.shape)}" if is_array else shown(array)
+        raise ValueError(f"{name} is {found}; allowed: None, or float64 {list(shape)}")
     return array
 
 
