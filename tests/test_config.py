@@ -90,7 +90,7 @@ FROZEN = st.builds(
     Frozen, st.just("runs/earlier"), agent=st.integers(0, 3), replica=st.none() | st.integers(0, 9)
 )
 STARTS = st.none() | FROZEN
-BANDITS = st.none() | st.builds(Bandit, step_size=POSITIVE.filter(lambda step: step <= 1), epsilon_end=SHARES)
+BANDITS = st.none() | st.builds(Bandit, step_size=st.floats(1e-6, 1), epsilon_end=SHARES)
 SPECS = st.one_of(
     st.builds(
         Learning,
