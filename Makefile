@@ -45,6 +45,7 @@ check: lint test
 bench: $(INSTALLED)
 	$(BIN)/python benchmarks/env_steps.py
 	$(BIN)/python benchmarks/observation_forms.py
+	$(BIN)/python benchmarks/institutions.py
 	$(BIN)/python benchmarks/lane_updates.py
 	$(BIN)/python benchmarks/training_step.py
 	$(BIN)/python benchmarks/losses.py

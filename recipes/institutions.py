@@ -2,8 +2,8 @@
 
     python recipes/institutions.py --institution quota         16 replicas of 200 episodes
 
-Four independent DQN agents on `commons` with the schedule of recipes/tragedy.py, under one institution, or under
-none. docs/institutions.md compares them.
+Four independent DQN agents on `commons` with the schedule of recipes/tragedy.py, under one institution, or
+under none. docs/institutions.md compares them.
 Copy this file and change it: another institution, or several together, is one line.
 """
 
@@ -43,8 +43,8 @@ Choice = Literal[
 ]
 
 SHARE, WINDOW = 0.25, 50
-"""Of every quota here: a quarter of the map's proven yield, counted in windows of 50 turns: about 7 apples per
-agent and window."""
+"""Of every quota here: a quarter of the map's proven yield, counted in windows of 50 turns: about 7 apples
+per agent and window."""
 
 INSTITUTIONS: dict[Choice, tuple[Institution, ...]] = {
     "none": (),

@@ -45,6 +45,7 @@ from cprl.institutions import (
 from cprl.learners.decisions import Bandit
 from cprl.networks import MLP, Conv
 from cprl.population import Frozen, Learning, Scripted, Team
+from cprl.preferences import Exchange, InequityAversion, SocialValueOrientation
 
 SHARES = st.floats(1e-9, 1, allow_subnormal=False)
 POSITIVE = st.floats(1e-6, 100)
@@ -91,15 +92,23 @@ FROZEN = st.builds(
 )
 STARTS = st.none() | FROZEN
 BANDITS = st.none() | st.builds(Bandit, step_size=st.floats(1e-6, 1), epsilon_end=SHARES)
+UNIT = st.floats(0, 1, allow_subnormal=False)
+PREFERENCES = st.one_of(
+    st.sampled_from(["individual", "team"]),
+    st.builds(InequityAversion, alpha=st.just(5) | UNIT, beta=UNIT, smoothing=UNIT),
+    st.builds(SocialValueOrientation, angle=st.floats(-3, 3, allow_subnormal=False), weight=UNIT),
+    st.builds(Exchange, UNIT),
+)
 SPECS = st.one_of(
+    st.builds(Learning, ALONE | CUSTOM, reward=PREFERENCES, start_from=STARTS, decisions=BANDITS),
     st.builds(
-        Learning,
-        ALONE | CUSTOM,
-        reward=st.sampled_from(["individual", "team"]),
+        Team,
+        TEAMS | CUSTOM,
+        agents=st.just((0, 2)),
+        reward=PREFERENCES,
         start_from=STARTS,
         decisions=BANDITS,
     ),
-    st.builds(Team, TEAMS | CUSTOM, agents=st.just((0, 2)), start_from=STARTS, decisions=BANDITS),
     st.builds(Scripted, st.sampled_from(["random", "greedy", "pacifist"])),
     FROZEN,
 )
@@ -162,6 +171,9 @@ def test_every_kind_comes_back():
         "Learning": Learning(DQN(settings=DQNSettings())),
         "Team": Team(QMIX(settings=DQNSettings()), agents=(0, 1)),
         "Frozen": Frozen("runs/earlier", 1),
+        "InequityAversion": InequityAversion(alpha=5, beta=0.05, smoothing=0.9),
+        "SocialValueOrientation": SocialValueOrientation(angle=0.5, weight=1.0),
+        "Exchange": Exchange(0.5),
         "Boundaries": Boundaries(regions=("0.",)),
         "Levies": Levies(groups=((0,),)),
         "Vote": Vote(on=Quota()),

@@ -523,4 +523,4 @@ def test_a_bandit_is_a_flag_of_the_command_line(in_one_go, capsys, monkeypatch):
         "sys.argv", ["cprl", "evaluate", str(in_one_go), "--episodes", "1", "--allow", *ALLOW]
     )
     cli.main()
-    assert "social metrics" in capsys.readouterr().out
+    assert "Weights:" in capsys.readouterr().out

@@ -19,9 +19,10 @@ from cprl.evaluation import evaluate_run
 from cprl.learners.replay import ReplayLearner
 from cprl.learners.rollouts import RolloutLearner
 from cprl.learners.settings import DQNSettings, RolloutSettings, TabularSettings
-from cprl.learners.transitions import lane_turn
+from cprl.learners.transitions import lane_turn, wanted_in
 from cprl.networks.agent import acting_part
 from cprl.population import Frozen, Learning, Scripted
+from cprl.preferences import WantedRewards
 from cprl.runs.checkpoints import Checkpointer, checkpoints_in
 from cprl.training import train
 
@@ -192,7 +193,8 @@ def test_who_is_paid_for_the_group_gets_the_sum_of_all_rewards():
             break
     assert rewards.sum() > 0
     own, group = (
-        lane_turn((1, 3), moment, reward_kind=reward_kind).reward for reward_kind in ("individual", "team")
+        lane_turn((1, 3), moment, wanted_in(WantedRewards(preference), moment)).reward
+        for preference in ("individual", "team")
     )
     assert own.tolist() == rewards[:, [1, 3]].flatten().tolist()
     assert group.tolist() == rewards.sum(1).repeat_interleave(2).tolist()

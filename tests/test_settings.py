@@ -57,6 +57,7 @@ from cprl.networks import MLP, Conv, ConvNetwork, MLPNetwork
 from cprl.networks.specification import new_network
 from cprl.policies.rng import LaneRng
 from cprl.population import Frozen, Learning, Scripted, Team, specs_by_agent
+from cprl.preferences import Exchange, InequityAversion, SocialValueOrientation
 from cprl.running import run
 from cprl.runs.directory import read_recipe
 from cprl.runs.files import read_json
@@ -82,6 +83,9 @@ VALUES = [
     Bandit(),
     Learning(DQN(settings=REPLAY)),
     Team(QMIX(settings=REPLAY), agents=(0, 1)),
+    InequityAversion(alpha=5, beta=0.05, smoothing=0.9),
+    SocialValueOrientation(angle=0.5, weight=1.0),
+    Exchange(0.5),
     Scripted(),
     Frozen("runs/earlier", 0),
     Custom("a:b"),
@@ -138,6 +142,9 @@ ALLOWED = {
     **{(kind, "learning_rate"): (1.9,) for kind in ("DQNSettings", "RolloutSettings")},
     **{("SAC", name): (1.9,) for name in ("alpha_init",)},
     ("IQL", "temperature"): (1.9,),
+    **{("InequityAversion", name): (1.9,) for name in ("alpha", "beta")},
+    ("SocialValueOrientation", "angle"): (-1, -0.5, 1.9),
+    ("SocialValueOrientation", "weight"): (1.9,),
     ("DistributionalDQN", "highest_return"): (1.9,),
     ("CQL", "conservative_weight"): (1.9,),
     **{

@@ -17,6 +17,7 @@ Each imports only from those above it:
     commons      the game: maps, rules, turns; numpy and numba alone
     envs         TorchRL, PettingZoo, Gymnasium; make_env, where environments are put together
     games        games of the user's own, as a recipe holds them
+    preferences  what agents want: the reward that each learns from
     networks     from observations to numbers
     policies     from observations to actions: learned, tabular and scripted agents
     collectors   one step of all worlds after the other
@@ -35,6 +36,7 @@ Each imports only from those above it:
     training     the loop: act, store, update, measure, record
     experiment   Experiment: what is trained and how, a value
     stored       load: a run built again from its directory
+    earlier      agents of earlier runs: that play, and that others start from
     agents       the learners and policies of a population
     outcome      trained agents in fresh worlds, beside the random policy
     parts        what is made of an experiment before anything is written

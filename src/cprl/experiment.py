@@ -28,6 +28,7 @@ from cprl.finite import OnNan
 from cprl.games import game_of, is_playable, stored_game
 from cprl.memory import DEVICE
 from cprl.population import SPEC, AgentSpec, Frozen, Learning, Team, refuse_undecided, specs_by_agent
+from cprl.preferences.values import check_preference
 from cprl.runs.old_recipes import experiment_config, upgraded_game
 
 LoggerName = Literal["csv", "tensorboard", "wandb"]
@@ -273,6 +274,8 @@ def _check_agents(experiment: Experiment) -> None:
                 f"{name} is {stored.run}, an absolute path, which is another one on another machine; "
                 "allowed: a path relative to where we stand"
             )
+        if isinstance(spec, Learning | Team) and not isinstance(experiment.game, Custom):
+            check_preference(f"{where}.reward", spec.reward, experiment.game.agents)
         if isinstance(spec, Team) and isinstance(spec.algorithm, TeamAlgorithm):
             spec.algorithm._check_team(len(spec.agents), spec.reward)
         steps = getattr(getattr(getattr(spec, "algorithm", None), "settings", None), "rollout_steps", None)

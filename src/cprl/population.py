@@ -7,15 +7,15 @@ remaining agent indices in order.
 import os
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any, Final, TypeAlias, get_args
+from typing import Any, Final, TypeAlias
 
 from cprl.algorithms.base import Algorithm, TeamAlgorithm
 from cprl.checks import NONE, Check, check_fields, checked, count, either, instance, is_count, one_of
 from cprl.custom import Custom
 from cprl.learners.decisions import Bandit
 from cprl.learners.settings import Exploring
-from cprl.learners.transitions import RewardKind
 from cprl.policies.scripted import SCRIPTED_POLICIES, ScriptedPolicy
+from cprl.preferences.values import PREFERENCE, Preference
 
 
 def _algorithm(kind: type[Algorithm]) -> Check:
@@ -46,7 +46,6 @@ def _are_members(value: Any) -> bool:
 _MOST_PATH: Final = 4095
 _PATH: Final = Check(_is_path, f"the path of a run's directory, up to {_MOST_PATH} bytes")
 _MEMBERS: Final = Check(_are_members, "ascending agent indices, at least one")
-_REWARD: Final = one_of(*get_args(RewardKind))
 _ALGORITHM: Final = _algorithm(Algorithm)
 _TEAM_ALGORITHM: Final = _algorithm(TeamAlgorithm)
 
@@ -81,20 +80,20 @@ class Learning:
 
     Args:
         algorithm: e.g. `cprl.algorithms.DQN(settings=...)`.
-        reward: "individual", the agent's own reward, or "team", the sum of the rewards of all agents of the
-            game.
+        reward: what it wants: "individual", its own reward; "team", the sum of the rewards of all agents of
+            the game; or a value of `cprl.preferences`, e.g. `Exchange(0.5)`.
         start_from: the agent whose weights its acting network, and the target of it, start with; None for
             new ones. The optimiser, critics, exploration and decisions begin anew.
         decisions: how it learns what it decides, in a game with votes or elections; None for `Bandit()`.
     """
 
     algorithm: Algorithm | Custom
-    reward: RewardKind = "individual"
+    reward: Preference = "individual"
     start_from: Frozen | None = None
     decisions: Bandit | None = None
 
     def __post_init__(self) -> None:
-        check_fields(self, {"algorithm": _ALGORITHM, "reward": _REWARD, "start_from": _START})
+        check_fields(self, {"algorithm": _ALGORITHM, "reward": PREFERENCE, "start_from": _START})
         check_fields(self, _DECISIONS)
         if isinstance(self.algorithm, TeamAlgorithm):
             name = type(self.algorithm).__name__
@@ -110,7 +109,8 @@ class Team:
     Args:
         algorithm: e.g. `cprl.algorithms.QMIX(settings=...)`.
         agents: their indices, ascending.
-        reward: "team", the sum of the rewards of all agents of the game; or "individual", for IPPO alone.
+        reward: "team", the sum of the rewards of all agents of the game; for IPPO also what each member wants
+            by itself, see `Learning`.
         start_from: a member of a team of the same size; each member starts with the weights of the member
             at the same place in that team, see `Learning`. Mixers and central critics begin anew.
         decisions: how each member learns what it decides, by itself; see `Learning`.
@@ -118,14 +118,14 @@ class Team:
 
     algorithm: TeamAlgorithm | Custom
     agents: tuple[int, ...]
-    reward: RewardKind = "team"
+    reward: Preference = "team"
     start_from: Frozen | None = None
     decisions: Bandit | None = None
 
     def __post_init__(self) -> None:
         check_fields(
             self,
-            {"algorithm": _TEAM_ALGORITHM, "agents": _MEMBERS, "reward": _REWARD, "start_from": _START},
+            {"algorithm": _TEAM_ALGORITHM, "agents": _MEMBERS, "reward": PREFERENCE, "start_from": _START},
         )
         check_fields(self, _DECISIONS)
 

@@ -13,6 +13,7 @@ from torchrl.envs import EnvBase
 
 from cprl.arguments import path as path_of
 from cprl.arguments import texts
+from cprl.checks import shown
 from cprl.commons.game import Game
 from cprl.custom import made
 from cprl.envs.make_env import make_env, spaces_of
@@ -28,10 +29,10 @@ from cprl.policies.decisions import ballot_sizes
 from cprl.policies.lanes import LaneActor
 from cprl.policies.scripted import scripted_lanes
 from cprl.population import AgentSpec, Frozen, Learning, Scripted, Team, specs_by_agent
-from cprl.runs.checkpoints import FOLDER, checkpoints_in, read_checkpoint
+from cprl.runs.checkpoints import FOLDER
 from cprl.runs.directory import FILE_NAME, read_recipe
 from cprl.runs.episodes import read_episodes
-from cprl.runs.weights import DECISIONS, TRANSFORMS, load_weights
+from cprl.runs.kept import kept_of
 from cprl.spaces import Spaces
 
 
@@ -132,12 +133,13 @@ class LoadedRun:
     def _decisions_of(self, lane: str) -> Tensor | None:
         sizes = ballot_sizes(self.game) if isinstance(self.game, Game) else ()
         values = self.decisions.get(lane)
-        if sizes and (values is None or values.shape != (sum(sizes),)):
-            found = "nothing" if values is None else f"{list(values.shape)} values"
+        if not sizes:
+            return None
+        if not isinstance(values, Tensor) or values.shape != (sum(sizes),) or values.isnan().any():
             raise ValueError(
-                f"{self.path} keeps {found} of what {lane} decides; allowed: {sum(sizes)} values"
+                f"{self.path} keeps {shown(values)} of what {lane} decides; allowed: {sum(sizes)} values"
             )
-        return values if sizes else None
+        return values
 
     def policy(self, replica: int = 0, *, worlds: int = 1, seed: int = 0) -> AgentPolicies:
         """The agents of a replica in so many worlds side by side; those that learned explore as in evaluation
@@ -263,57 +265,20 @@ def load(run: str | Path, *, weights: str | None = None, allow: Sequence[str] = 
         experiment = Experiment.from_recipe(recipe, directory=run, allow=allow)
     except ValueError as error:
         raise ValueError(f"{run / FILE_NAME}: {error}") from error
-    path, kept, transforms, decisions = _kept(run, weights)
+    kept = kept_of(run, weights)
     loaded = LoadedRun(
         path=run,
         experiment=experiment,
         recipe=recipe,
         networks={},
-        weights_from=path,
-        transforms_state=transforms,
-        decisions=decisions,
+        weights_from=kept.path,
+        transforms_state=kept.transforms,
+        decisions=kept.decisions,
         allow=tuple(allow),
     )
     with torch.random.fork_rng(devices=[]):  # networks draw weights at first, which the kept ones replace
-        object.__setattr__(loaded, "networks", _networks(path, kept, loaded))
+        object.__setattr__(loaded, "networks", _networks(kept.path, kept.networks, loaded))
     return loaded
-
-
-def _kept(run: Path, name: str | None) -> tuple[Path, Any, Any, Any]:
-    """A file with weights, the state dict of each network in it, the state of transforms, and the values of
-    decisions."""
-    folder = run / FOLDER
-    path = folder / f"{name or 'final'}.pt"
-    if name is None and not path.exists():
-        return _from_checkpoint(run, path)
-    return path, load_weights(path), *(_beside(folder, own, name) for own in (TRANSFORMS, DECISIONS))
-
-
-def _beside(folder: Path, own: str, name: str | None) -> Any:
-    """What a file beside the weights holds, of a run that was extended that of these weights."""
-    path = folder / own
-    if name is not None and name.startswith("final"):
-        of_name = path.with_stem(name.replace("final", path.stem))
-        path = of_name if of_name.exists() else path
-    return load_weights(path) if path.exists() else {}
-
-
-def _from_checkpoint(run: Path, final: Path) -> tuple[Path, Any, Any, Any]:
-    """The same from the newest readable checkpoint."""
-    reasons = []
-    for checkpoint in reversed(checkpoints_in(run / FOLDER)):
-        try:
-            state = read_checkpoint(checkpoint)
-            of_learners = [learner["networks"] for learner in state["learners"]]
-        except (ValueError, KeyError) as error:
-            reasons.append(str(error))
-            continue
-        networks = {lane: own for networks in of_learners for lane, own in networks.items()}
-        decisions = state.get("decisions", {}).get("_extra_state", {}).get("learned", {})
-        return checkpoint, networks, state.get("env", {}).get("transforms", {}), decisions
-    raise ValueError(
-        "; ".join([f"{final} is not there, nor a readable checkpoint: has {run} been trained?", *reasons])
-    )
 
 
 def _networks(path: Path, weights: Any, run: LoadedRun) -> dict[str, nn.Module]:

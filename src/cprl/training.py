@@ -2,6 +2,7 @@
 
 import time
 from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
 from typing import Any, Final
 
 import numpy as np
@@ -22,6 +23,7 @@ from cprl.finite import EVERY_STEPS, FiniteCheck, OnNan
 from cprl.learners.base import (
     LaneLosses,
     Learner,
+    WantedReturns,
     check_agents,
     check_decisions,
     check_numbers,
@@ -97,6 +99,7 @@ class Training:
         longest = None if commons is None else commons.game.rules.episode_steps
         self._tracker = EpisodeTracker(replicas, spaces.agents, longest)
         self._losses = {agents: LaneLosses(replicas, agents) for agents in self.learners}
+        self._wanted = WantedReturns(replicas, spaces.agents, self.learners)
         self.finite = FiniteCheck(self.learners, spaces, on_nan=on_nan)
         self._on_step = [own.on_step for own in self.callbacks if hasattr(own, "on_step")]
         self._played = [0] * replicas
@@ -141,6 +144,7 @@ class Training:
         self.finite.check_turn(batch, self.steps)
         for learner in self.learners.values():
             learner.store(batch)
+        self._wanted.add()
         if self.steps % self.update_every == 0:
             for _ in range(self.update_every):
                 for agents, learner in self.learners.items():
@@ -177,6 +181,7 @@ class Training:
         for learner in self.learners.values():
             learner.end_episode(worlds)
         for episode, of_agents in zip(ended, learning, strict=True):
+            episode = replace(episode, wanted_return=self._wanted.take(episode.world))
             if self.decisions is not None and episode.decision is not None:
                 self.decisions.learn(episode.world, episode.decision, _return_to_decide_by(episode))
             self._played[episode.world] += 1
@@ -207,6 +212,7 @@ class Training:
             "others": [dict(other.state_dict()) for other in self.others.values()],
             "decisions": {} if self.decisions is None else dict(self.decisions.state_dict()),
             "losses": [losses.state_dict() for losses in self._losses.values()],
+            "wanted": self._wanted.state_dict(),
             "tracker": self._tracker.state_dict(),
             "callbacks": {name: own.state_dict() for name, own in self._with_state().items()},
             "not_finite": self.finite.state_dict(),
@@ -251,6 +257,7 @@ class Training:
         for name, of_agents in parts.items():
             for part, own in zip(of_agents.values(), state[name], strict=True):
                 part.load_state_dict(own)
+        self._wanted.load_state_dict(state.get("wanted", {}))
         if self.decisions is not None:
             self.decisions.load_state_dict(state["decisions"])
         self._tracker.load_state_dict(state["tracker"])
@@ -268,8 +275,9 @@ class Training:
 
 
 def _return_to_decide_by(episode: Episode) -> NDArray[np.float64]:
-    """What each agent's decisions are learned from, float64 [N]."""
-    return episode.return_
+    """What each agent's decisions are learned from, float64 [N]: its wanted return, else its return."""
+    wanted = episode.wanted_return
+    return episode.return_ if wanted is None else np.where(np.isnan(wanted), episode.return_, wanted)
 
 
 def train(

@@ -12,6 +12,7 @@ import cprl
 from cprl import CommonsEnv, maps, presets
 from cprl.algorithms import DQN
 from cprl.collectors import StepCollector
+from cprl.envs import parallel_env
 from cprl.measuring import phases
 from cprl.policies.lanes import random_agents
 from cprl.population import Scripted
@@ -213,6 +214,13 @@ OWN: Final[dict[str, dict[str, st.SearchStrategy[Any]]]] = {
     "cprl.reporting.report:write_report": {
         "runs": st.lists(_FINISHED, min_size=1, max_size=2),
         "out": hints.PATHS,
+    },
+    "cprl.preferences.wanted:wanted_rewards": {
+        "rewards": st.sampled_from((np.ones((2, 3), np.float32), torch.zeros(1, 2), np.ones((2, 1)))),
+        "smoothed": st.none() | st.just(0).map(lambda _: np.ones((2, 3))),
+    },
+    "cprl.preferences.wrapper:PreferenceWrapper": {
+        "env": st.just(0).map(lambda _: parallel_env(things.MEADOW)),
     },
     "cprl.running:run": {
         "experiment": st.sampled_from(things.EXAMPLES[cprl.Experiment]),

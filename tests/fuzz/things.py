@@ -37,6 +37,19 @@ from cprl.algorithms import (
     TeamAlgorithm,
 )
 from cprl.envs import make_env
+from cprl.institutions import (
+    Boundaries,
+    ClosedPatches,
+    ClosedSeason,
+    GraduatedSanctions,
+    Levies,
+    Mediation,
+    Monitoring,
+    Quota,
+    Sanctioner,
+    Tax,
+    Vote,
+)
 from cprl.learners.base import Learner
 from cprl.learners.decisions import Bandit
 from cprl.measuring import Episode
@@ -45,6 +58,7 @@ from cprl.networks import MLP, Conv, MLPNetwork
 from cprl.policies.assignment import AgentPolicies
 from cprl.policies.lanes import random_agents
 from cprl.population import Frozen, Learning, Scripted, Team
+from cprl.preferences import Exchange, InequityAversion, SocialValueOrientation
 from cprl.spaces import Spaces
 
 MEADOW: Final = Game(
@@ -52,6 +66,8 @@ MEADOW: Final = Game(
     rules=Rules(regrow_prob=(0.0, 0.2), window_rows=3, window_columns=5, episode_steps=6, freeze_steps=2),
 )
 """Small, never square; two agents, episodes of six turns."""
+GOVERNED: Final = replace(MEADOW, institutions=(Quota(fine=1.0), Monitoring(), Vote(on=Tax())))
+"""With rules that people make."""
 ALONE: Final = Game(
     map=maps.parse(".A>.\nA.A."),
     rules=Rules(may_fire=False, window_rows=3, window_columns=3, episode_steps=5),
@@ -82,7 +98,18 @@ EXAMPLES: Final[dict[type, tuple[Any, ...]]] = {
         Observation(area="full", encoding="one_hot"),
         Observation(agents_apart=True, scoreboard=True, stock_gauge=True),
     ),
-    Game: (MEADOW, ALONE, presets.game("single_basic")),
+    Game: (MEADOW, ALONE, GOVERNED, presets.game("single_basic")),
+    Boundaries: (Boundaries.strips(height=3, width=5, agents=2, step_fine=0.5),),
+    Quota: (Quota(), Quota(share=0.5, window_steps=3, by_stock=True, fine=1.0)),
+    ClosedSeason: (ClosedSeason(), ClosedSeason(period_steps=4, closed_steps=2, fine=0.0)),
+    ClosedPatches: (ClosedPatches(below=3),),
+    Tax: (Tax(), Tax(brackets=((0, 0.1), (2, 0.5)), period_steps=3, redistribution="none")),
+    Levies: (Levies(groups=((0,), (1,))),),
+    Vote: (Vote(on=Tax()), Vote(on=Quota(), override_prob=0.5)),
+    Monitoring: (Monitoring(), Monitoring(prob=0.2, cost=0.5, monitor="elected")),
+    GraduatedSanctions: (GraduatedSanctions(), GraduatedSanctions(freeze_steps=((1,), (2,)), on="tags")),
+    Mediation: (Mediation(observed=False),),
+    Sanctioner: (Sanctioner(), Sanctioner(agents=(1,))),
     DQNSettings: (DQNSettings(), REPLAY),
     RolloutSettings: (RolloutSettings(), ROLLOUTS),
     TabularSettings: (TabularSettings(), TABLES),
@@ -103,7 +130,14 @@ EXAMPLES: Final[dict[type, tuple[Any, ...]]] = {
     MAPPO: (MAPPO(settings=ROLLOUTS),),
     IPPO: (IPPO(settings=ROLLOUTS),),
     Bandit: (Bandit(), Bandit(step_size=0.5, epsilon_end=0.0)),
-    Learning: (DQN_AGENT, Learning(PPO(settings=ROLLOUTS), reward="team")),
+    InequityAversion: (InequityAversion(alpha=5, beta=0.05, smoothing=0.9),),
+    SocialValueOrientation: (SocialValueOrientation(angle=0.5, weight=1.0),),
+    Exchange: (Exchange(0.5),),
+    Learning: (
+        DQN_AGENT,
+        Learning(PPO(settings=ROLLOUTS), reward="team"),
+        Learning(PPO(settings=ROLLOUTS), reward=Exchange(0.25)),
+    ),
     Team: (TEAM, Team(IPPO(settings=ROLLOUTS), agents=(0, 1), reward="individual")),
     Scripted: (Scripted(), Scripted("greedy")),
     Frozen: (Frozen("runs/none", agent=0),),

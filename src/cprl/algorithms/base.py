@@ -20,6 +20,7 @@ from cprl.learners.settings import DQNSettings, RolloutSettings
 from cprl.learners.torchrl import TorchRLReplayLearner, TorchRLRolloutLearner
 from cprl.networks.mlp import MOST_CELLS
 from cprl.networks.specification import Network
+from cprl.preferences.values import Preference, named
 from cprl.spaces import Spaces
 
 TrainingEngine: TypeAlias = Literal["compiled", "eager", "torchrl"]
@@ -195,7 +196,7 @@ class TeamAlgorithm(Algorithm):
     ) -> Learner:
         """See `Algorithm`."""
         self._refuse_torchrl(engine)
-        self._check_team(len(agents), str(how.get("reward_kind", "individual")))
+        self._check_team(len(agents), how.get("reward_kind", "individual"))
         return super().make_learner(
             spaces,
             agents=agents,
@@ -204,12 +205,12 @@ class TeamAlgorithm(Algorithm):
             **how,
         )
 
-    def _check_team(self, members: int, reward: str) -> None:
+    def _check_team(self, members: int, reward: Preference) -> None:
         name = type(self).__name__
         if self.shares_reward and reward != "team":
             raise ValueError(
-                f'reward is "{reward}"; allowed for {name}: "team", the sum over all agents; '
-                f'DQN, PPO and IPPO support "{reward}"'
+                f'reward is {named(reward)}; allowed for {name}: "team", the sum over all agents; '
+                f"DQN, PPO and IPPO support {named(reward)}"
             )
         if members < self.fewest_members:
             raise ValueError(

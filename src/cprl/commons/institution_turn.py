@@ -24,7 +24,9 @@ from cprl.commons.world import PLAYING, Actions, Scratch, StepOutput, Worlds
 from cprl.institutions import deciding, limits, paying, showing
 from cprl.institutions.deciding import appoint, hold_ballot, is_due
 from cprl.institutions.limits import (
+    add_to_patch,
     close_patches,
+    count_patches,
     note_bite,
     note_step,
     open_windows,
@@ -96,7 +98,9 @@ def play_governed_turn(
         world.on_board[i] = world.in_play[i]
     return_to_play(world, tables, scratch)
     write_state(world, tables, output, scratch)
-    close_patches(memory, rules, world.stock)
+    for s in range(sprouts):
+        add_to_patch(memory, rules, scratch.sprouts[s], 1)
+    close_patches(memory, rules)
     write_payments(world, memory, tables, rules, output, payments)
 
 
@@ -115,7 +119,8 @@ def begin_governed_episode(
     begin_ballots(world, memory, rules)
     appoint(memory, rules)
     open_windows(memory, rules, 1, 1.0)
-    close_patches(memory, rules, world.stock)
+    count_patches(memory, rules, world.stock)
+    close_patches(memory, rules)
     clear_turn(memory)
     write_payments(world, memory, tables, rules, output, payments)
 
@@ -131,6 +136,7 @@ def refresh_governed_output(
 ) -> None:
     """Writes the output for a state that was set from outside, with no events and no payments."""
     refresh_output(world, tables, output, scratch)
+    count_patches(memory, rules, world.stock)
     clear_turn(memory)
     write_payments(world, memory, tables, rules, output, payments)
 

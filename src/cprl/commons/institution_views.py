@@ -1,9 +1,9 @@
 """What institutions add to agents' observations, on one world: further planes after the channels of cells.
 
 A plane "forbidden" is 255 on the cells of the window where a bite of the agent would break a rule about
-places. Planes "institutions" hold what `cprl.institutions.showing` lists, in 0..255: with S entries, cell n of
-the planes, row by row, shows entry n modulo S. So a single entry fills a plane evenly, as is usual for numbers
-that convolutions read beside a board.
+places. Planes "institutions" hold what `cprl.institutions.showing` lists, in 0..255: with S entries, cell n
+of the planes, row by row, shows entry n modulo S. So a single entry fills a plane evenly, as is usual for
+numbers that convolutions read beside a board.
 """
 
 from cprl.commons.moves import cell_of

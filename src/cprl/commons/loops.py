@@ -85,6 +85,7 @@ def one_memory(m: Memory, b: int) -> Memory:
         m.due[b],
         m.fines[b],
         m.transfers[b],
+        m.owed[b],
         m.patch_stock[b],
     )
 

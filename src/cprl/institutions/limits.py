@@ -69,8 +69,15 @@ def violate(memory: Memory, i: int, count: int, fine: float) -> None:
     memory.due[i] += fine
 
 
+def add_to_patch(memory: Memory, tables: InstitutionTables, site: int, apples: int) -> None:
+    """Counts apples that grew on a site, or with -1 the one that was bitten there."""
+    if tables.patch_sites.shape[0] > 0:
+        memory.patch_stock[tables.patch_of[site]] += apples
+
+
 def note_bite(memory: Memory, tables: InstitutionTables, i: int, cell: int, site: int, turn: int) -> None:
     """Counts a bite of agent i, and notes the rules that it breaks."""
+    add_to_patch(memory, tables, site, -1)
     for boundary in range(tables.own.shape[0]):
         if tables.own[boundary, i, cell]:
             memory.counts[i, OWN_BITES] += 1
@@ -99,16 +106,18 @@ def note_step(memory: Memory, tables: InstitutionTables, i: int, cell: int) -> N
                 memory.counts[i, TRESPASSES] += 1
 
 
-def close_patches(memory: Memory, tables: InstitutionTables, stock: Bytes) -> None:
-    """Writes which patches are closed in the coming turn; `stock`: uint8 [K], 1 for an apple."""
+def count_patches(memory: Memory, tables: InstitutionTables, stock: Bytes) -> None:
+    """Counts the apples of each patch; `stock`: uint8 [K], 1 for an apple."""
     patches = tables.patch_sites.shape[0]
-    if patches == 0:
-        return
     for p in range(patches):
         memory.patch_stock[p] = 0
     for site in range(stock.shape[0]):
-        memory.patch_stock[tables.patch_of[site]] += stock[site]
-    for p in range(patches):
+        add_to_patch(memory, tables, site, int(stock[site]))
+
+
+def close_patches(memory: Memory, tables: InstitutionTables) -> None:
+    """Writes which patches are closed in the coming turn."""
+    for p in range(tables.patch_sites.shape[0]):
         memory.closed[p] = memory.patch_stock[p] < tables.patch_below
 
 
@@ -127,8 +136,10 @@ FUNCTIONS = (
     is_above_quota,
     stops_bite,
     violate,
+    add_to_patch,
     note_bite,
     note_step,
+    count_patches,
     close_patches,
     is_forbidden,
 )

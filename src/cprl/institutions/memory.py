@@ -81,12 +81,14 @@ class Memory(NamedTuple):
     """float64 [B, N], apples taken in this turn; working memory."""
     transfers: Numbers
     """float64 [B, N], apples given in this turn; working memory."""
+    owed: Numbers
+    """float64 [B, N], the tax that each agent owes; working memory."""
     patch_stock: Ints
-    """int32 [B, P], apples on each patch; working memory."""
+    """int32 [B, P], apples on each patch; derived from the stock."""
 
 
-WORKING: Final = ("broke", "unjust", "due", "fines", "transfers", "patch_stock")
-"""Entries of `Memory` that hold nothing between turns."""
+WORKING: Final = ("broke", "unjust", "due", "fines", "transfers", "owed", "patch_stock")
+"""Entries of `Memory` that hold nothing between turns, or nothing that does not follow from the rest."""
 REMEMBERED: Final = tuple(name for name in Memory._fields if name not in WORKING)
 """Entries of `Memory` that are part of the state of a world."""
 
@@ -249,5 +251,6 @@ def empty_memory(tables: InstitutionTables, *, worlds: int) -> Memory:
         due=np.zeros((worlds, agents), np.float64),
         fines=np.zeros((worlds, agents), np.float64),
         transfers=np.zeros((worlds, agents), np.float64),
+        owed=np.zeros((worlds, agents), np.float64),
         patch_stock=np.zeros((worlds, patches), np.int32),
     )

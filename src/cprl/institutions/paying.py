@@ -99,11 +99,11 @@ def tax_of(memory: Memory, tables: InstitutionTables, tax: int, i: int) -> float
 
 
 def pay_out(memory: Memory, tables: InstitutionTables, tax: int, i: int) -> None:
-    """Gives agent i its equal part of what was collected in its group."""
+    """Gives agent i its equal part of what its group owed."""
     pool, members = 0.0, 0
     for j in range(memory.fines.shape[0]):
         if tables.tax_group[tax, j] == tables.tax_group[tax, i]:
-            pool += tax_of(memory, tables, tax, j)
+            pool += memory.owed[j]
             members += 1
     memory.transfers[i] += pool / members
 
@@ -122,11 +122,12 @@ def collect_taxes(memory: Memory, tables: InstitutionTables, turn: int, is_over:
     for tax in range(tables.tax_steps.shape[0]):
         if (is_over or turn % tables.tax_steps[tax] == 0) and has_income(memory, tax):
             for i in range(agents):
-                memory.fines[i] += tax_of(memory, tables, tax, i)
+                memory.owed[i] = tax_of(memory, tables, tax, i)
+                memory.fines[i] += memory.owed[i]
+                memory.income[tax, i] = 0.0
+            for i in range(agents):
                 if tables.tax_group[tax, i] >= 0:
                     pay_out(memory, tables, tax, i)
-            for i in range(agents):
-                memory.income[tax, i] = 0.0
 
 
 FUNCTIONS = (

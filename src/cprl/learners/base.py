@@ -6,6 +6,7 @@ from typing import Any, Protocol
 
 import numpy as np
 import torch
+from numpy.typing import NDArray
 from tensordict import TensorDictBase
 from torch import Tensor, nn
 
@@ -13,6 +14,7 @@ from cprl.arguments import object_of
 from cprl.checks import checked, count
 from cprl.policies.assignment import AgentIndices, agent_indices
 from cprl.policies.decisions import Decider
+from cprl.preferences.wanted import WantedRewards
 
 
 class Learner(Protocol):
@@ -25,7 +27,10 @@ class Learner(Protocol):
     replicas: int
     """The number of replicas R."""
     settings: Any
-    """The hyperparameters."""
+    """The hyperparameters.
+
+    A learner may also have `wants`, a `cprl.preferences.WantedRewards`: what its agents want.
+    """
 
     def store(self, batch: TensorDictBase) -> None:
         """Stores one step of every replica; the batch size is [R]."""
@@ -90,6 +95,50 @@ class LaneLosses:
     def load_state_dict(self, state: Mapping[str, Tensor]) -> None:
         """Continues from the sums of a state."""
         self.total[:], self.updates[:] = state["total"].numpy(), state["updates"].numpy()
+
+
+class WantedReturns:
+    """The sums of the rewards that agents want, over the running episode of each replica.
+
+    Args:
+        replicas: the number of replicas R.
+        agents: the number of agents N; those that do not learn, or whose learner does not say what they want,
+            have NaN.
+        learners: by the indices of their agents. What they remember of earlier episodes is cleared.
+    """
+
+    def __init__(self, replicas: int, agents: int, learners: Mapping[tuple[int, ...], Learner]) -> None:
+        found = {of: getattr(learner, "wants", None) for of, learner in learners.items()}
+        self._wants: list[tuple[Any, WantedRewards]] = []
+        self._first = np.full(agents, nan)
+        for of, wants in found.items():
+            if isinstance(wants, WantedRewards):
+                wants.clear()
+                self._wants.append((slice(None) if len(of) == agents else list(of), wants))
+                self._first[list(of)] = 0
+        self.returns = np.tile(self._first, (replicas, 1))
+
+    def add(self) -> None:
+        """Adds the turn that the learners have just stored."""
+        for of, wants in self._wants:
+            turn: Any = wants.now
+            turn = turn.numpy(force=True) if isinstance(turn, Tensor) else turn
+            self.returns[:, of] += turn[:, of]
+
+    def take(self, replica: int) -> NDArray[np.float64]:
+        """The wanted return of each agent of a replica, [N], whose next episode begins at 0."""
+        taken: NDArray[np.float64] = self.returns[replica].copy()
+        self.returns[replica] = self._first
+        return taken
+
+    def state_dict(self) -> dict[str, Tensor]:
+        """The sums so far."""
+        return {"returns": torch.tensor(self.returns)}
+
+    def load_state_dict(self, state: Mapping[str, Tensor]) -> None:
+        """Continues from the sums of a state; those of an earlier version, which had none, are 0."""
+        if state:
+            self.returns[:] = state["returns"].numpy()
 
 
 def learned_in(

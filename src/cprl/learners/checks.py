@@ -2,14 +2,14 @@
 
 from collections.abc import Sequence
 from math import prod
-from typing import Any, Final, get_args
+from typing import Any, Final
 
 import torch
 from torch import nn
 
-from cprl.checks import Check, checked, count, instance, is_count, one_of
-from cprl.learners.transitions import RewardKind
+from cprl.checks import Check, checked, count, instance, is_count
 from cprl.memory import check_memory
+from cprl.preferences.values import Preference, check_preference
 from cprl.spaces import Spaces
 
 _LEAST_BYTES: Final = 4096
@@ -26,18 +26,18 @@ def check_learner(
     replicas: int,
     first_replica: int,
     seed: int,
-    reward_kind: RewardKind,
+    reward_kind: Preference,
 ) -> None:
     """The arguments that every learner has.
 
     Raises:
         ValueError: for settings of another class, agents that the spaces do not have, replicas and a seed out
-            of range, and an unknown kind of reward.
+            of range, and what is no preference, or none for a game of one agent.
         TooLargeError: for more replicas than there is memory for, whatever they learn by.
     """
     checked("settings", settings, instance(kind, f"a {kind.__name__}"))
     checked("spaces", spaces, instance(Spaces, "a Spaces, e.g. Game.spaces"))
-    checked("reward_kind", reward_kind, one_of(*get_args(RewardKind)))
+    check_preference("reward_kind", reward_kind, spaces.agents)
     most = spaces.agents - 1
     allowed = Check(
         lambda value: (

@@ -1,7 +1,7 @@
 """Lanes: the agents that a learner trains in every replica, with their seeds, networks and actors."""
 
 from collections.abc import Callable, Mapping, Sequence
-from typing import Final, Protocol, TypeAlias
+from typing import Any, Final, Protocol, TypeAlias
 
 import numpy as np
 import torch
@@ -11,7 +11,7 @@ from torch import Tensor, nn
 from cprl.arguments import object_of
 from cprl.learners.checks import check_networks
 from cprl.learners.engine.base import ListEngine
-from cprl.learners.transitions import LaneTurn, RewardKind, lane_turn, seen_next
+from cprl.learners.transitions import LaneTurn, lane_turn, seen_next
 from cprl.networks.agent import acting_part
 from cprl.networks.specification import refuse_unseen
 from cprl.policies.lanes import LaneActor
@@ -118,13 +118,13 @@ class Lanes:
         """The number of lanes of a replica."""
         return len(self.agents)
 
-    def turn(self, batch: TensorDictBase, reward_kind: RewardKind) -> LaneTurn:
-        """One transition of every lane, as a replay buffer stores it."""
-        return lane_turn(self.agents, batch, reward_kind=reward_kind)
+    def turn(self, batch: TensorDictBase, rewards: Any) -> LaneTurn:
+        """One transition of every lane, as a replay buffer stores it; see `lane_turn`."""
+        return lane_turn(self.agents, batch, rewards)
 
-    def rollout_turn(self, batch: TensorDictBase, reward_kind: RewardKind) -> LaneTurn:
-        """One transition of every lane, as a rollout stores it."""
-        return lane_turn(self.agents, batch, reward_kind=reward_kind)
+    def rollout_turn(self, batch: TensorDictBase, rewards: Any) -> LaneTurn:
+        """One transition of every lane, as a rollout stores it; see `lane_turn`."""
+        return lane_turn(self.agents, batch, rewards)
 
     def seen_next(self, batch: TensorDictBase) -> Tensor:
         """The observations of lanes after a turn, uint8 [L, 1, C, X, Y]."""

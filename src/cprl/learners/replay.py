@@ -20,8 +20,10 @@ from cprl.learners.lanes import SAMPLING, TARGET_WEIGHTS, WEIGHTS, StartFrom
 from cprl.learners.settings import DQNSettings
 from cprl.learners.single import dqn_loss, q_network
 from cprl.learners.teams import MakeTeam, lanes_of
-from cprl.learners.transitions import RewardKind
+from cprl.learners.transitions import wanted_in
 from cprl.policies.lanes import LaneActor
+from cprl.preferences.values import Preference, named
+from cprl.preferences.wanted import WantedRewards
 from cprl.spaces import Spaces
 
 
@@ -46,7 +48,7 @@ class ReplayLearner:
             `cprl.algorithms.teams`; a lane is then the team of a replica.
         stochastic: whether networks output the logits of a policy from which actions are sampled, with no
             epsilon; else action values, with `epsilon` of the settings.
-        reward_kind: which reward they get.
+        reward_kind: what they want, see `cprl.preferences`.
         engine: how lanes are updated; None picks the fastest that works, see `cprl.learners.engine.choice`.
         compile: whether torch compiles acting and the update; the engine "list" is never compiled.
         start_from: the weights with which acting networks, and their targets, start, by the lane's name; the
@@ -71,7 +73,7 @@ class ReplayLearner:
         make_loss: MakeLoss | None = None,
         make_team: MakeTeam | None = None,
         stochastic: bool = False,
-        reward_kind: RewardKind = "individual",
+        reward_kind: Preference = "individual",
         engine: EngineName | None = None,
         compile: bool = True,
         start_from: StartFrom | None = None,
@@ -80,7 +82,7 @@ class ReplayLearner:
         _refuse_unshared_reward(is_team=make_team is not None, reward_kind=reward_kind)
         check_learner(spaces, settings, DQNSettings, agents, replicas, first_replica, seed, reward_kind)
         self.spaces, self.settings, self.agents = spaces, settings, tuple(agents)
-        self.replicas, self.seed, self.reward_kind = replicas, seed, reward_kind
+        self.replicas, self.seed, self.wants = replicas, seed, WantedRewards(reward_kind)
         self._lanes = lanes_of(
             spaces,
             agents=agents,
@@ -151,7 +153,7 @@ class ReplayLearner:
 
     def store(self, batch: TensorDictBase) -> None:
         """Stores one step of every replica, as the collector yields it."""
-        self.buffer.write(self._lanes.turn(batch, self.reward_kind))
+        self.buffer.write(self._lanes.turn(batch, wanted_in(self.wants, batch)))
         self.steps += 1
         self.actor.explore_with(self.settings.epsilon(self.steps))
 
@@ -208,6 +210,7 @@ class ReplayLearner:
             "exploration": self.actor.rng.state_dict(),
             "steps": self.steps,
             "episodes": self._episodes,
+            "wants": self.wants.state_dict(),
         }
 
     def load_state_dict(self, state: Mapping[str, Any]) -> None:
@@ -221,11 +224,14 @@ class ReplayLearner:
         self.steps = int(state["steps"])
         self.actor.epsilon = self.settings.epsilon(self.steps)
         self._episodes = state["episodes"].clone()
+        self.wants.load_state_dict(state.get("wants", {}))
 
 
-def _refuse_unshared_reward(*, is_team: bool, reward_kind: RewardKind) -> None:
+def _refuse_unshared_reward(*, is_team: bool, reward_kind: Preference) -> None:
     if is_team and reward_kind != "team":
-        raise ValueError(f'reward is "{reward_kind}"; allowed for a team that learns from replay: "team"')
+        raise ValueError(
+            f'reward is {named(reward_kind)}; allowed for a team that learns from replay: "team"'
+        )
 
 
 def _default_network(spaces: Spaces, settings: DQNSettings) -> nn.Module:

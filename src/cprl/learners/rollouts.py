@@ -19,10 +19,12 @@ from cprl.learners.engine.refusals import reads, refuse_other_advantages
 from cprl.learners.lanes import SAMPLING, WEIGHTS, StartFrom
 from cprl.learners.settings import RolloutSettings
 from cprl.learners.teams import MakeTeam, lanes_of
-from cprl.learners.transitions import RewardKind
+from cprl.learners.transitions import wanted_in
 from cprl.networks.agent import AgentNetworks, parts_of
 from cprl.policies.lanes import LaneActor
 from cprl.policies.rng import LaneRng
+from cprl.preferences.values import Preference
+from cprl.preferences.wanted import WantedRewards
 from cprl.spaces import Spaces
 
 ACTOR, CRITIC = range(2)
@@ -48,7 +50,7 @@ class RolloutLearner:
             members, see `cprl.algorithms.teams`; a lane is then the team of a replica.
         seed: the seed of the run.
         first_replica: the index of the first replica, so that replica r can be trained alone.
-        reward_kind: which reward they get.
+        reward_kind: what they want, see `cprl.preferences`.
         engine: how lanes are updated; None picks the fastest that works, see `cprl.learners.engine.choice`.
         compile: whether torch compiles acting and the update; the engine "list" is never compiled.
         start_from: the weights with which acting networks, and their targets, start, by the lane's name; the
@@ -72,7 +74,7 @@ class RolloutLearner:
         make_team: MakeTeam | None = None,
         seed: int = 0,
         first_replica: int = 0,
-        reward_kind: RewardKind = "individual",
+        reward_kind: Preference = "individual",
         engine: EngineName | None = None,
         compile: bool = True,
         start_from: StartFrom | None = None,
@@ -80,7 +82,7 @@ class RolloutLearner:
     ) -> None:
         check_learner(spaces, settings, RolloutSettings, agents, replicas, first_replica, seed, reward_kind)
         self.spaces, self.settings, self.agents = spaces, settings, tuple(agents)
-        self.replicas, self.seed, self.reward_kind = replicas, seed, reward_kind
+        self.replicas, self.seed, self.wants = replicas, seed, WantedRewards(reward_kind)
         self._lanes = lanes_of(
             spaces,
             agents=agents,
@@ -178,7 +180,7 @@ class RolloutLearner:
             raise ValueError(
                 f"the rollout already has {self.rollout_steps} steps; call update() before store()"
             )
-        turn = self._lanes.rollout_turn(batch, self.reward_kind)
+        turn = self._lanes.rollout_turn(batch, wanted_in(self.wants, batch))
         for seen in (turn.observation, turn.next_observation):
             if seen.dtype not in self._dtypes:
                 raise ValueError(
@@ -266,6 +268,7 @@ class RolloutLearner:
             "draws": self.rng.state_dict(),
             "exploration": self.actor.rng.state_dict(),
             "steps": self.steps,
+            "wants": self.wants.state_dict(),
         }
 
     def load_state_dict(self, state: Mapping[str, Any]) -> None:
@@ -276,6 +279,7 @@ class RolloutLearner:
         self.rng.load_state_dict(state["draws"])
         self.actor.rng.load_state_dict(state["exploration"])
         self._size, self.steps = int(state["size"]), int(state["steps"])
+        self.wants.load_state_dict(state.get("wants", {}))
 
 
 def _like(column: Tensor, value: Tensor) -> Tensor:

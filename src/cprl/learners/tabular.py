@@ -25,8 +25,10 @@ from cprl import keys
 from cprl.learners.checks import check_learner
 from cprl.learners.lanes import EVALUATION, EXPLORATION, StartFrom, lane_names, lane_seeds, weights_to_start
 from cprl.learners.settings import TabularSettings
-from cprl.learners.transitions import RewardKind, lane_turn
+from cprl.learners.transitions import lane_turn, wanted_in
 from cprl.policies.tabular import NEVER_MET, QTables, TableNetwork, TabularActor, observed_entries, states_of
+from cprl.preferences.values import Preference
+from cprl.preferences.wanted import WantedRewards
 from cprl.spaces import Spaces
 
 
@@ -42,7 +44,7 @@ class TabularLearner:
         settings: the hyperparameters.
         seed: the seed of the run.
         first_replica: the index of the first replica, so that replica r can be trained alone.
-        reward_kind: which reward they get.
+        reward_kind: what they want, see `cprl.preferences`.
         start_from: the tables with which lanes start, by the lane's name; each value counts as never updated.
 
     Raises:
@@ -59,12 +61,12 @@ class TabularLearner:
         settings: TabularSettings,
         seed: int = 0,
         first_replica: int = 0,
-        reward_kind: RewardKind = "individual",
+        reward_kind: Preference = "individual",
         start_from: StartFrom | None = None,
     ) -> None:
         check_learner(spaces, settings, TabularSettings, agents, replicas, first_replica, seed, reward_kind)
         self.spaces, self.settings, self.seed, self.agents = spaces, settings, seed, tuple(agents)
-        self.reward_kind, start = reward_kind, weights_to_start(start_from)
+        self.wants, start = WantedRewards(reward_kind), weights_to_start(start_from)
         self.replicas, self._numbers = replicas, range(first_replica, first_replica + replicas)
         self.tables = QTables(self.lanes, spaces.actions, max_states=settings.max_states)
         for lane, name in enumerate(lane_names(replicas=self._numbers, agents=self.agents)):
@@ -94,7 +96,7 @@ class TabularLearner:
     def store(self, batch: TensorDictBase) -> None:
         """Queues one step of every replica for `update`."""
         batch = batch.cpu()  # where the tables are
-        turn = lane_turn(self.agents, batch, reward_kind=self.reward_kind)
+        turn = lane_turn(self.agents, batch, wanted_in(self.wants, batch))
         before, after = keys.entry(batch, keys.AGENTS), keys.entry(batch, "next")
         seen = states_of(before, self._observed, self.agents)
         rows = self.tables.find_or_add(seen, self._every_lane)
@@ -192,6 +194,7 @@ class TabularLearner:
             "exploration": self.actor.rng.state_dict(),
             "steps": self.steps,
             "turns": turns,
+            "wants": self.wants.state_dict(),
         }
 
     def load_state_dict(self, state: Mapping[str, Any]) -> None:
@@ -203,6 +206,7 @@ class TabularLearner:
         self._turns = deque(
             {name: own.numpy().copy() for name, own in turn.items()} for turn in state["turns"]
         )
+        self.wants.load_state_dict(state.get("wants", {}))
 
 
 def table_network(spaces: Spaces) -> TableNetwork:

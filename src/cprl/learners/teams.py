@@ -9,7 +9,7 @@ from torch import Tensor, nn
 
 from cprl.learners.engine.base import ListEngine
 from cprl.learners.lanes import Acts, Lanes, init_network
-from cprl.learners.transitions import LaneTurn, RewardKind, lane_turn, seen_next
+from cprl.learners.transitions import LaneTurn, lane_turn, seen_next
 from cprl.networks.agent import acting_part
 from cprl.networks.team import ModuleTeam, TeamNetwork
 from cprl.policies.lanes import LaneActor
@@ -75,21 +75,21 @@ class Teams:
             made.append(init_network(lambda mine=of_team: self._make_team(mine), (*seed, _SHARED)).to(device))  # type: ignore[misc]
         return made
 
-    def turn(self, batch: TensorDictBase, reward_kind: RewardKind) -> LaneTurn:
+    def turn(self, batch: TensorDictBase, rewards: Any) -> LaneTurn:
         """One transition of every team, as a replay buffer stores it: observations [R, S, C, X, Y], actions
         [R, S] and team rewards [R].
 
         Args:
             batch: see `lane_turn`.
-            reward_kind: "team".
+            rewards: of all agents, [R, N], those of a team all the same.
         """
-        turn = self.rollout_turn(batch, reward_kind)
+        turn = self.rollout_turn(batch, rewards)
         return turn._replace(reward=turn.reward[:, 0])
 
-    def rollout_turn(self, batch: TensorDictBase, reward_kind: RewardKind) -> LaneTurn:
+    def rollout_turn(self, batch: TensorDictBase, rewards: Any) -> LaneTurn:
         """One transition of every team, as a rollout stores it: as `turn`, with rewards [R, S]."""
         agents = self.members.agents
-        turn, size = lane_turn(agents, batch, reward_kind=reward_kind), (len(self), len(agents))
+        turn, size = lane_turn(agents, batch, rewards), (len(self), len(agents))
         of_members = {
             name: getattr(turn, name).reshape(*size, *getattr(turn, name).shape[1:])
             for name in ("observation", "action", "next_observation", "reward")

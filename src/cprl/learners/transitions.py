@@ -1,6 +1,6 @@
 """Transitions of single agents, under TorchRL's default keys, which its losses read."""
 
-from typing import Any, Literal, NamedTuple, TypeAlias
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch
@@ -10,9 +10,7 @@ from torch import Tensor
 from cprl import keys
 from cprl.arguments import object_of
 from cprl.checks import checked, count
-
-RewardKind: TypeAlias = Literal["individual", "team"]
-"""The reward that a learner gets each turn: the agent's own, or the sum over all agents."""
+from cprl.preferences.wanted import WantedRewards
 
 
 class LaneTurn(NamedTuple):
@@ -32,15 +30,13 @@ class LaneTurn(NamedTuple):
     """bool [L]."""
 
 
-def lane_turn(
-    agents: tuple[int, ...], batch: TensorDictBase, *, reward_kind: RewardKind = "individual"
-) -> LaneTurn:
+def lane_turn(agents: tuple[int, ...], batch: TensorDictBase, rewards: Any = None) -> LaneTurn:
     """One transition of each of some agents of every replica.
 
     Args:
         agents: the indices of the S agents.
         batch: entries of `cprl.keys` at the root and under "next", with batch size [R].
-        reward_kind: which reward they get.
+        rewards: the rewards that all agents want, [R, N], see `wanted_in`; by default those of the batch.
 
     Returns:
         The transitions of `transitions_of`, with lane = replica x S + position in `agents`. On the CPU they
@@ -54,7 +50,9 @@ def lane_turn(
     lanes, windows, at = len(observation) * len(agents), observation.shape[2:], list(agents)
 
     def of(tensor: Tensor, *shape: int) -> Any:
-        array = array_of(tensor)
+        return picked(array_of(tensor), *shape)
+
+    def picked(array: Any, *shape: int) -> Any:
         return (array if everyone else array[:, at]).reshape(lanes, *shape)
 
     def of_world(flag: Tensor) -> Any:
@@ -62,15 +60,29 @@ def lane_turn(
         repeat = array.repeat if isinstance(array, np.ndarray) else array.repeat_interleave
         return repeat(len(at))
 
-    reward = entry(agents_after, "reward")
     return LaneTurn(
         of(entry(before, "observation"), *windows),
         of(entry(before, "action")),
         of(entry(agents_after, "observation"), *windows),
-        of(reward) if reward_kind == "individual" else of_world(reward.sum(1)),
+        of(entry(agents_after, "reward")) if rewards is None else picked(rewards),
         of_world(entry(after, keys.DONE)),
         of_world(entry(after, keys.TERMINATED)),
     )
+
+
+def wanted_in(wants: WantedRewards, batch: TensorDictBase) -> Any:
+    """The rewards that agents want in one turn of every replica; called once for each turn, in order.
+
+    Args:
+        wants: what they want, and remember.
+        batch: a turn of every replica, see `lane_turn`.
+
+    Returns:
+        [R, N], a numpy array on the CPU, else a tensor.
+    """
+    after = keys.entry(batch, "next")
+    rewards = keys.entry(keys.entry(after, keys.AGENTS), "reward")
+    return wants.add(array_of(rewards)[..., 0], array_of(keys.entry(after, keys.DONE))[..., 0])
 
 
 def seen_next(batch: TensorDictBase) -> Tensor:

@@ -42,6 +42,9 @@ class Episode:
     decision: NDArray[np.int64] | None = None
     """[N], what each agent had decided, see `cprl.institutions.choice.ballots`; None in games that ask
     nothing."""
+    wanted_return: NDArray[np.float64] | None = None
+    """[N], the sum of the rewards that each agent wanted in a training, see `cprl.preferences`; NaN for
+    agents that do not learn. None outside of a training."""
     stock_left: int | None = None
     """Apples on the board at the end."""
     depletion_step: int | None = None

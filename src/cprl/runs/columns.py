@@ -14,6 +14,7 @@ COLUMNS: Final = {
     "episode": pa.int32(),
     "agent": pa.int32(),
     "return": pa.float32(),
+    "wanted_return": pa.float32(),
     "harvest": pa.float32(),
     "steps": pa.int32(),
     "in_play_steps": pa.int32(),
@@ -28,7 +29,9 @@ COLUMNS: Final = {
 """The columns of a table, as in `Episode`; the metrics follow, float64, NaN where undefined.
 
 Values of the whole episode are repeated in the row of each agent. Values that the game does not report have
-no column."""
+no column; nor has the wanted return outside of a training. It is null for agents that do not learn."""
+
+_WANTED: Final = "wanted_return"
 
 LEFT_OUT: Final = b"left_out"
 """The key of the schema's metadata whose value says which columns are left out, and why, if any are."""
@@ -66,6 +69,8 @@ def rows_of(episodes: Sequence[Episode], replica: int | None, schema: pa.Schema)
     """
     of_each = [_cells(episode, episode.world if replica is None else replica) for episode in episodes]
     for cells in of_each:
+        if _WANTED not in schema.names:  # a table that an earlier cprl began goes on without it
+            cells.pop(_WANTED, None)
         if cells.keys() != set(schema.names):
             more, lacks = cells.keys() - set(schema.names), set(schema.names) - cells.keys()
             raise ValueError(
@@ -74,7 +79,11 @@ def rows_of(episodes: Sequence[Episode], replica: int | None, schema: pa.Schema)
             )
     return pa.record_batch(
         [
-            pa.array(np.concatenate([cells[column.name] for cells in of_each]), column.type)
+            pa.array(
+                np.concatenate([cells[column.name] for cells in of_each]),
+                column.type,
+                from_pandas=column.name == _WANTED,  # no number, of agents that do not learn, is null
+            )
             for column in schema
         ],
         schema=schema,

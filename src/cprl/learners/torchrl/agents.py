@@ -14,7 +14,6 @@ from cprl.learners.engine.base import is_finite
 from cprl.learners.engine.functional import MakeLoss, own_targets, total
 from cprl.learners.lanes import SAMPLING, WEIGHTS, Lanes
 from cprl.learners.settings import Optimizer
-from cprl.learners.transitions import RewardKind
 from cprl.networks.agent import parts_of
 
 MakeSampler = Callable[[int], Sampler]
@@ -126,14 +125,14 @@ class StockAgents:
             for seed in self._lanes.seeds(SAMPLING)
         ]
 
-    def transitions(self, batch: TensorDictBase, reward_kind: RewardKind) -> TensorDict:
+    def transitions(self, batch: TensorDictBase, rewards: Any) -> TensorDict:
         """A turn of every agent, [L], under TorchRL's default keys; rewards and flags are [L, 1].
 
         Args:
             batch: a turn of every replica, [R], as the collector yields it.
-            reward_kind: which reward they get.
+            rewards: the rewards that all agents want, [R, N], see `wanted_in`.
         """
-        turn = self._lanes.turn(batch, reward_kind)
+        turn = self._lanes.turn(batch, rewards)
         size = [len(self)]
         flags = {name: torch.as_tensor(getattr(turn, name)) for name in ("reward", "done", "terminated")}
         following = {

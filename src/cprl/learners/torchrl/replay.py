@@ -26,9 +26,11 @@ from cprl.learners.lanes import TARGET_WEIGHTS, Lanes, StartFrom
 from cprl.learners.settings import DQNSettings
 from cprl.learners.torchrl.agents import MakeSampler, StockAgents, check_makers, sampler_of
 from cprl.learners.torchrl.buffers import buffer_state, load_buffer, nested, plain
-from cprl.learners.transitions import RewardKind
+from cprl.learners.transitions import wanted_in
 from cprl.memory import check_memory
 from cprl.policies.lanes import LaneActor
+from cprl.preferences.values import Preference
+from cprl.preferences.wanted import WantedRewards
 from cprl.spaces import Spaces
 
 BYTES_BESIDE: Final = 8 + 4 + 1 + 1
@@ -55,7 +57,7 @@ class TorchRLReplayLearner:
         seed: the seed of the run.
         first_replica: the index of the first replica, so that replica r can be trained alone.
         stochastic: whether networks output the logits of a policy; else action values.
-        reward_kind: which reward they get.
+        reward_kind: what they want, see `cprl.preferences`.
         make_sampler: makes an agent's sampler; by default a `RandomSampler`.
         start_from: the weights with which acting networks, and their targets, start, by the lane's name; the
             others, such as critics, are new.
@@ -80,7 +82,7 @@ class TorchRLReplayLearner:
         seed: int = 0,
         first_replica: int = 0,
         stochastic: bool = False,
-        reward_kind: RewardKind = "individual",
+        reward_kind: Preference = "individual",
         make_sampler: MakeSampler | None = None,
         start_from: StartFrom | None = None,
         device: str | torch.device = "cpu",
@@ -89,7 +91,7 @@ class TorchRLReplayLearner:
         check_makers(make_network, make_loss, make_sampler)
         device = device_of(device)
         self.spaces, self.settings, self.agents = spaces, settings, tuple(agents)
-        self.replicas, self.seed, self.reward_kind = replicas, seed, reward_kind
+        self.replicas, self.seed, self.wants = replicas, seed, WantedRewards(reward_kind)
         self._make_sampler: MakeSampler = make_sampler or (lambda lane: RandomSampler())
         self._lanes = Lanes(
             spaces,
@@ -177,7 +179,7 @@ class TorchRLReplayLearner:
 
     def store(self, batch: TensorDictBase) -> None:
         """Stores one step of every replica, as the collector yields it."""
-        turn = self.stock.transitions(batch, self.reward_kind)
+        turn = self.stock.transitions(batch, wanted_in(self.wants, batch))
         if self.settings.n_steps > 1:
             self._last = [*self._last, turn.clone()][-self.settings.n_steps :]
         for lane, buffer in enumerate(self.buffers):
@@ -235,6 +237,7 @@ class TorchRLReplayLearner:
             "last": [plain(turn) for turn in self._last],
             "exploration": self.actor.rng.state_dict(),
             "steps": self.steps,
+            "wants": self.wants.state_dict(),
         }
 
     def load_state_dict(self, state: Mapping[str, Any]) -> None:
@@ -252,6 +255,7 @@ class TorchRLReplayLearner:
             load_buffer(buffer, self._generators[lane], state["buffers"][lane])
         self.actor.rng.load_state_dict(state["exploration"])
         self.steps = int(state["steps"])
+        self.wants.load_state_dict(state.get("wants", {}))
         self.actor.epsilon = self.settings.epsilon(self.steps)
 
 

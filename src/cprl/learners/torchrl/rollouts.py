@@ -22,8 +22,10 @@ from cprl.learners.rollouts import ACTOR, CRITIC, refuse_other_parts
 from cprl.learners.settings import RolloutSettings
 from cprl.learners.torchrl.agents import MakeSampler, StockAgent, StockAgents, check_makers, sampler_of
 from cprl.learners.torchrl.buffers import nested, plain
-from cprl.learners.transitions import RewardKind
+from cprl.learners.transitions import wanted_in
 from cprl.policies.lanes import LaneActor
+from cprl.preferences.values import Preference
+from cprl.preferences.wanted import WantedRewards
 from cprl.spaces import Spaces
 
 
@@ -46,7 +48,7 @@ class TorchRLRolloutLearner:
         make_loss: makes an agent's loss from them.
         seed: the seed of the run.
         first_replica: the index of the first replica, so that replica r can be trained alone.
-        reward_kind: which reward they get.
+        reward_kind: what they want, see `cprl.preferences`.
         make_sampler: an agent's sampler of minibatches; by default a `SamplerWithoutReplacement`.
         start_from: the weights with which acting networks, and their targets, start, by the lane's name; the
             others, such as critics, are new.
@@ -68,7 +70,7 @@ class TorchRLRolloutLearner:
         make_loss: MakeLoss,
         seed: int = 0,
         first_replica: int = 0,
-        reward_kind: RewardKind = "individual",
+        reward_kind: Preference = "individual",
         make_sampler: MakeSampler | None = None,
         start_from: StartFrom | None = None,
         device: str | torch.device = "cpu",
@@ -77,7 +79,7 @@ class TorchRLRolloutLearner:
         check_makers(make_network, make_loss, make_sampler)
         device = device_of(device)
         self.spaces, self.settings, self.agents = spaces, settings, tuple(agents)
-        self.replicas, self.seed, self.reward_kind = replicas, seed, reward_kind
+        self.replicas, self.seed, self.wants = replicas, seed, WantedRewards(reward_kind)
         self._lanes = Lanes(
             spaces,
             agents=agents,
@@ -138,7 +140,7 @@ class TorchRLRolloutLearner:
             raise ValueError(
                 f"the rollout already has {self.rollout_steps} steps; call update() before store()"
             )
-        self._rollout.append(self.stock.transitions(batch, self.reward_kind).clone())
+        self._rollout.append(self.stock.transitions(batch, wanted_in(self.wants, batch)).clone())
         self.steps += 1
 
     def update(self) -> Tensor | None:
@@ -187,6 +189,7 @@ class TorchRLRolloutLearner:
             "generators": [generator.get_state() for generator in self._generators],
             "exploration": self.actor.rng.state_dict(),
             "steps": self.steps,
+            "wants": self.wants.state_dict(),
         }
 
     def load_state_dict(self, state: Mapping[str, Any]) -> None:
@@ -198,6 +201,7 @@ class TorchRLRolloutLearner:
             generator.set_state(own.cpu())
         self.actor.rng.load_state_dict(state["exploration"])
         self.steps = int(state["steps"])
+        self.wants.load_state_dict(state.get("wants", {}))
 
 
 def _gae(critic: nn.Module, settings: RolloutSettings) -> GAE:

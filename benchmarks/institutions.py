@@ -1,0 +1,124 @@
+"""What each institution costs: the time of a turn on the commons board, as a multiple of a turn without any.
+
+4 agents, 1024 worlds, one thread, RGB windows, random actions drawn beforehand; nothing is shown to agents
+(`observed=False`), since a further plane costs what any other costs. All games in one run, in turns; the
+median over rounds of the ratio to the game without institutions in the same round.
+
+    make bench
+"""
+
+import sys
+from dataclasses import replace
+from statistics import median
+from typing import Final
+
+import torch
+import tyro
+from env_steps import actions_for, best_us
+from rich.console import Console
+from rich.table import Table
+
+from cprl import CommonsEnv, Game, keys, presets
+from cprl.commons.batch import Batch
+from cprl.institutions import (
+    Boundaries,
+    ClosedPatches,
+    ClosedSeason,
+    GraduatedSanctions,
+    Institution,
+    Levies,
+    Mediation,
+    Monitoring,
+    Quota,
+    Sanctioner,
+    Tax,
+    Vote,
+)
+
+TO_EXPLAIN, DEFECT = 1.1, 1.3
+"""Multiples of a turn through `CommonsEnv.step`: what is above the first is explained, above the second a
+defect."""
+HIDDEN: Final = {"observed": False}
+EACH: Final[dict[str, tuple[Institution, ...]]] = {
+    "Boundaries, stopped": (Boundaries.strips(height=12, width=24, agents=4, **HIDDEN),),
+    "Boundaries, fined": (
+        Boundaries.strips(height=12, width=24, agents=4, bite_fine=1.0, step_fine=0.1, **HIDDEN),
+    ),
+    "Quota": (Quota(**HIDDEN),),
+    "ClosedSeason": (ClosedSeason(**HIDDEN),),
+    "ClosedPatches": (ClosedPatches(**HIDDEN),),
+    "Tax": (Tax(**HIDDEN),),
+    "Tax, per 50 turns, 3 brackets": (
+        Tax(period_steps=50, brackets=((0, 0.1), (2, 0.3), (5, 0.5)), **HIDDEN),
+    ),
+    "Levies": (Levies(groups=((0, 1), (2, 3)), **HIDDEN),),
+    "Vote on a Tax": (Vote(on=Tax(**HIDDEN), **HIDDEN),),
+    "Monitoring": (Monitoring(cost=0.01, **HIDDEN),),
+    "GraduatedSanctions": (GraduatedSanctions(**HIDDEN),),
+    "Mediation": (Mediation(**HIDDEN),),
+    "Sanctioner, elected": (Sanctioner(**HIDDEN),),
+}
+"""Each kind, as cheap and as dear as it gets."""
+
+
+def of_kernel(game: Game, worlds: int, turns: int) -> float:
+    """Microseconds of a turn of the compiled rules alone."""
+    batch = Batch(game, worlds, threads=1)
+    output, actions = batch.new_output(), actions_for(game, worlds, turns)
+    return best_us(lambda turn: batch.play(actions[turn], output), lambda: batch.begin(output), turns, 1)
+
+
+def of_step(game: Game, worlds: int, turns: int) -> float:
+    """Microseconds of a turn through `CommonsEnv.step`."""
+    env = CommonsEnv(game, worlds, seed=0, threads=1)
+    actions = torch.as_tensor(actions_for(game, worlds, turns))
+    decisions = torch.zeros((worlds, game.agents), dtype=torch.int64)
+    now = {"entries": env.reset()}
+
+    def begin() -> None:
+        now["entries"] = env.reset()
+
+    def step(turn: int) -> None:
+        agents = now["entries"].get(keys.AGENTS)
+        agents.set("action", actions[turn])
+        if game.decisions:
+            agents.set("decision", decisions)
+        now["entries"] = env.step(now["entries"]).get("next")
+
+    return best_us(step, begin, turns, 1)
+
+
+def main(*, worlds: int = 1024, turns: int = 100, rounds: int = 15) -> None:
+    """Prints the table; ends with exit code 1 where an institution costs more than is allowed.
+
+    Args:
+        worlds: the batch size.
+        turns: turns timed at a time.
+        rounds: of which the median counts.
+    """
+    plain = presets.game("commons")
+    games = {name: replace(plain, institutions=own) for name, own in EACH.items()}
+    every = tuple(own for of_kind in EACH.values() for own in of_kind)
+    games["all at once"] = replace(plain, institutions=every)
+    ways = {"kernel": of_kernel, "CommonsEnv.step": of_step}
+    ratios: dict[tuple[str, str], list[float]] = {(name, way): [] for name in games for way in ways}
+    for _ in range(rounds):
+        for way, measure in ways.items():
+            for name, game in games.items():
+                without = measure(plain, worlds, turns)
+                ratios[name, way].append(measure(game, worlds, turns) / without)
+    table = Table(title=f"a turn of {worlds:,} worlds, as a multiple of one without institutions")
+    table.add_column("institution", no_wrap=True)
+    for way in ways:
+        table.add_column(way, justify="right", no_wrap=True)
+    for name in games:
+        table.add_row(name, *(f"{median(ratios[name, way]):.3f}" for way in ways))
+    Console().print(table)
+    dear = [name for name in EACH if median(ratios[name, "CommonsEnv.step"]) > DEFECT]
+    if dear:
+        sys.exit(f"more than {DEFECT} of a turn: {', '.join(dear)}")
+
+
+if __name__ == "__main__":
+    torch.set_num_threads(1)
+    tyro.cli(main)

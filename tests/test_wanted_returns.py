@@ -1,0 +1,384 @@
+"""Every learner stores the rewards that its agents want; a training that was stopped goes on with them."""
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+import pyarrow.parquet as pq
+import pytest
+import torch
+from matrix_game import MatrixGame
+from one_road_parts import Dilemma
+
+import cprl
+from cprl import CommonsEnv, Custom, Experiment, Game, Rules, maps
+from cprl.agents import Population
+from cprl.algorithms import DQN, IPPO, PPO, QMIX, DQNSettings, RolloutSettings, Tabular, TabularSettings
+from cprl.commandline import parse
+from cprl.envs import spaces_of
+from cprl.institutions import Tax
+from cprl.measuring.episodes import EpisodeTracker
+from cprl.population import Frozen, Learning, Scripted, Team
+from cprl.preferences import Exchange, InequityAversion, SocialValueOrientation, WantedRewards
+from cprl.runs.checkpoints import Checkpointer, checkpoints_in
+from cprl.runs.columns import rows_of, schema_of
+from cprl.runs.episodes import EpisodeTable, read_episodes
+from cprl.training import Training, train
+
+AVERSE = InequityAversion(alpha=5, beta=0.05, smoothing=0.9)
+PREFERENCES = {
+    "individual": "individual",
+    "team": "team",
+    "averse": AVERSE,
+    "angle": SocialValueOrientation(angle=0.5, weight=0.3),
+    "half": Exchange(0.5),
+}
+REPLAY = DQNSettings(
+    buffer_size=60, batch_size=4, hidden_cells=(8,), learning_rate=1e-3, epsilon_decay_steps=40
+)
+ROLLOUTS = RolloutSettings(rollout_steps=20, minibatch_size=10, epochs=2, hidden_cells=(8,))
+LEARNERS = {
+    "replay": (DQN(settings=REPLAY), "eager"),
+    "replay of torchrl": (DQN(settings=REPLAY), "torchrl"),
+    "rollouts": (PPO(settings=ROLLOUTS), "eager"),
+    "rollouts of torchrl": (PPO(settings=ROLLOUTS), "torchrl"),
+    "tables": (Tabular(settings=TabularSettings()), "eager"),
+    "team": (IPPO(settings=ROLLOUTS), "eager"),
+}
+BOARD = Game(
+    map=maps.parse(".A>.A.A\nA.A.v.A\n..<.A.A"),
+    rules=Rules(regrow_prob=(0.0, 0.2), window_rows=3, window_columns=5, episode_steps=12, freeze_steps=2),
+)
+
+
+def learner_of(name, preference, agents=(0, 1)):
+    algorithm, engine = LEARNERS[name]
+    return algorithm.make_learner(
+        spaces_of(MatrixGame(2)), agents=agents, replicas=2, seed=3, engine=engine, reward_kind=preference
+    )
+
+
+def batches(turns):
+    """Turns of a dilemma with actions by chance; its worlds end after 5 and 6 turns, again and again."""
+    env, found = MatrixGame(2), []
+    carried = env.reset()
+    for _ in range(turns):
+        batch, carried = env.step_and_maybe_reset(env.rand_action(carried))
+        found.append(batch.clone())
+    return found
+
+
+def on_paper(preference, found):
+    """The wanted rewards of turns, [T, R, N]."""
+    wants = WantedRewards(preference)
+    return np.stack(
+        [
+            wants.add(batch["next", "agents", "reward"][..., 0].numpy(), batch["next", "done"][:, 0].numpy())
+            for batch in found
+        ]
+    )
+
+
+def stored(name, learner, turns):
+    """The rewards that a learner holds, [T, L]."""
+    if name == "replay":
+        return learner.buffer.storage.fields["reward"][:turns].numpy()
+    if name == "replay of torchrl":
+        own = [buffer.storage.get(slice(0, turns))["next", "reward"][:, 0] for buffer in learner.buffers]
+        return torch.stack(own, 1).numpy()
+    if name == "rollouts of torchrl":
+        return torch.stack([turn["next", "reward"][:, 0] for turn in learner._rollout]).numpy()
+    if name == "tables":
+        return np.stack([turn["reward"] for turn in learner._turns])
+    return learner._rollout["reward"][:turns].reshape(turns, -1).numpy()
+
+
+@pytest.mark.parametrize("preference", PREFERENCES.values(), ids=PREFERENCES)
+@pytest.mark.parametrize("name", LEARNERS)
+def test_a_learner_stores_what_its_agents_want(name, preference):
+    found = batches(17)
+    expected = on_paper(preference, found)
+    assert expected.std() > 0
+    learner = learner_of(name, preference)
+    for batch in found:
+        given = batch["next", "agents", "reward"].clone()
+        learner.store(batch)
+        assert torch.equal(batch["next", "agents", "reward"], given), "the environment's reward stays"
+    assert np.array_equal(stored(name, learner, 17), expected.reshape(17, -1))
+
+
+@pytest.mark.parametrize("name", ["replay", "rollouts of torchrl", "tables"])
+def test_who_learns_alone_compares_itself_with_those_who_do_not_learn(name):
+    found = batches(17)
+    learner = learner_of(name, AVERSE, agents=(1,))
+    for batch in found:
+        learner.store(batch)
+    assert np.array_equal(stored(name, learner, 17), on_paper(AVERSE, found)[:, :, 1])
+
+
+@pytest.mark.parametrize("name", LEARNERS)
+def test_a_learner_remembers_where_its_state_was_taken(name):
+    found = batches(17)
+    whole, first, then = (learner_of(name, AVERSE) for _ in range(3))
+    for batch in found:
+        whole.store(batch)
+    for batch in found[:8]:  # within an episode of both replicas
+        first.store(batch)
+    state = first.state_dict()
+    assert state["wants"]["smoothed"].shape == (1, 2, 2)
+    then.load_state_dict(state)
+    for batch in found[8:]:
+        then.store(batch)
+    assert np.array_equal(stored(name, then, 17), stored(name, whole, 17))
+
+
+@pytest.mark.parametrize("name", LEARNERS)
+def test_a_state_of_before_there_were_preferences_is_still_read(name):
+    learner, other = learner_of(name, "team"), learner_of(name, "team")
+    for batch in batches(3):
+        learner.store(batch)
+    state = dict(learner.state_dict())
+    del state["wants"]
+    other.load_state_dict(state)
+    assert np.array_equal(stored(name, other, 3), stored(name, learner, 3))
+
+
+class Kept:
+    """Keeps batches and episodes; stops at a step."""
+
+    def __init__(self, stop_at=None):
+        self.batches, self.episodes, self.stop_at = [], [], stop_at
+
+    def on_step(self, batch):
+        self.batches.append(batch.clone())
+        if len(self.batches) == self.stop_at:
+            raise StoppedError
+
+    def on_episode(self, episode, learning):
+        self.episodes.append(episode)
+
+
+class StoppedError(Exception):
+    """A training is stopped."""
+
+
+class Early(Checkpointer):
+    def after_step(self, training):
+        if training.steps in (6, 16):
+            self.save(training)
+
+
+def population(specs, env, **how):
+    return Population(env, specs, seed=3, engine="eager", **how)
+
+
+def test_the_wanted_return_is_the_sum_of_the_episode_and_the_return_stays_that_of_the_game():
+    env, kept = CommonsEnv(BOARD, 2, seed=3), Kept()
+    dqn = DQN(settings=REPLAY)
+    agents = population([Learning(dqn, reward=AVERSE), Learning(dqn), Scripted("greedy")], env)
+    train(env, agents.learners, others=agents.others, episodes=3, callbacks=[kept])
+    tracker, wanted, total = EpisodeTracker(2, 3), np.zeros((2, 3)), []
+    for batch, rewards in zip(kept.batches, on_paper(AVERSE, kept.batches), strict=True):
+        wanted += rewards
+        for episode in tracker.add(batch):
+            total.append((episode.return_, wanted[episode.world].copy()))
+            wanted[episode.world] = 0
+    assert len(total) == len(kept.episodes) == 6
+    assert sum(abs(returns - sums).sum() for returns, sums in total) > 1
+    for episode, (returns, sums) in zip(kept.episodes, total, strict=True):
+        assert episode.return_.tolist() == returns.tolist()
+        assert episode.wanted_return.tolist()[:2] == [sums[0], returns[1]]
+        assert np.isnan(episode.wanted_return[2]), "who does not learn wants nothing"
+
+
+def test_what_is_wanted_is_made_of_what_is_left_after_fines_and_transfers():
+    taxed = replace(BOARD, institutions=(Tax(rate=0.5),))
+    env, kept = CommonsEnv(taxed, 2, seed=3), Kept()
+    agents = population([Learning(DQN(settings=REPLAY), reward="team"), *[Scripted("greedy")] * 2], env)
+    train(env, agents.learners, others=agents.others, episodes=3, callbacks=[kept])
+    fines, transfers, harvest = (
+        sum(float(batch["next", "agents", name].sum()) for batch in kept.batches)
+        for name in ("fines", "transfers", "harvest")
+    )
+    assert fines > 1
+    wanted = sum(episode.wanted_return[0] for episode in kept.episodes)
+    assert wanted == pytest.approx(harvest - fines + transfers, abs=1e-4)
+    assert wanted == pytest.approx(sum(episode.return_.sum() for episode in kept.episodes), abs=1e-4)
+
+
+@pytest.mark.parametrize("update_every", [1, 2])
+@pytest.mark.parametrize("name", ["replay", "rollouts", "replay of torchrl", "team"])
+def test_a_training_that_was_stopped_wants_on_bit_for_bit(name, update_every, tmp_path):
+    algorithm, engine = LEARNERS[name]
+    spec = (Team if name == "team" else Learning)(
+        algorithm, **({"agents": (0, 1)} if name == "team" else {}), reward=AVERSE
+    )
+
+    def run(folder, stop_at=None):
+        env = MatrixGame(2)
+        agents = Population(env, [spec] if name == "team" else [spec] * 2, seed=3, engine=engine)
+        kept = Kept(stop_at)
+        (tmp_path / folder).mkdir(exist_ok=True)
+        with (
+            Early(tmp_path / folder) as checkpoints,
+            EpisodeTable(tmp_path / folder / "episodes.parquet", resumable=True) as table,
+        ):
+            try:
+                train(
+                    env,
+                    agents.learners,
+                    episodes=7,
+                    callbacks=[table, kept],
+                    checkpointer=checkpoints,
+                    update_every=update_every,
+                )
+            except StoppedError:
+                assert checkpoints_in(tmp_path / folder / "checkpoints")
+                return None
+        return {key: value for own in agents.networks().values() for key, value in own.state_dict().items()}
+
+    whole = run("whole")
+    run("stopped", stop_at=19)
+    resumed = run("stopped")
+    for key, value in whole.items():
+        assert torch.equal(resumed[key], value), key
+    rows, theirs = read_episodes(tmp_path / "stopped"), read_episodes(tmp_path / "whole")
+    assert rows.equals(theirs)
+    assert rows["wanted_return"].to_pylist() != rows["return"].to_pylist()
+
+
+def test_a_second_training_begins_without_what_the_first_remembered():
+    learner = learner_of("replay", AVERSE)
+    for batch in batches(3):
+        learner.store(batch)
+    assert learner.wants.state_dict()
+    Training(MatrixGame(2), {(0, 1): learner}, episodes=1)
+    assert learner.wants.state_dict() == {}
+
+
+EXPERIMENT = Experiment(
+    name="wants",
+    game=BOARD,
+    agents=[Learning(DQN(settings=REPLAY), reward=AVERSE), Learning(DQN(settings=REPLAY)), Scripted()],
+    episodes=2,
+    replicas=2,
+    evaluation_episodes=1,
+    engine="eager",
+)
+
+
+def test_a_run_keeps_preferences_in_its_recipe_and_its_table(tmp_path):
+    run = cprl.run(EXPERIMENT, tmp_path / "run", watch="off")
+    loaded = cprl.load(run)
+    assert loaded.experiment == EXPERIMENT
+    assert loaded.specs[0].reward == AVERSE
+    table = pq.read_table(run / "episodes.parquet").to_pylist()
+    assert len(table) == 2 * 2 * 3
+    for row in table:
+        if row["agent"] == 1:
+            assert row["wanted_return"] == row["return"]
+        if row["agent"] == 2:
+            assert row["wanted_return"] is None
+    longer = cprl.run(EXPERIMENT, tmp_path / "other", watch="off")
+    assert read_episodes(longer).equals(read_episodes(run)), "null equals null, NaN does not"
+    with pytest.raises(ValueError, match=r"agents\[0\]\.reward\.alpha was 5, is 4"):
+        cprl.run(
+            replace(EXPERIMENT, agents=[Learning(DQN(settings=REPLAY), reward=replace(AVERSE, alpha=4)),
+                                        *EXPERIMENT.agents[1:]]),
+            run,
+            resume=True,
+            watch="off",
+        )  # fmt: skip
+
+
+def test_agents_that_start_from_stored_weights_want_what_they_are_told(tmp_path):
+    cprl.run(EXPERIMENT, tmp_path / "first", watch="off")
+    start = Frozen(str(tmp_path / "first"), agent=0, replica=None)
+    agents = population(
+        [Learning(DQN(settings=REPLAY), reward=Exchange(0.5), start_from=start)] * 3, CommonsEnv(BOARD, 2)
+    )
+    (learner,) = agents.learners.values()
+    assert learner.wants.preferences == Exchange(0.5)
+    train(CommonsEnv(BOARD, 2, seed=1), agents.learners, episodes=1)
+
+
+def test_preferences_are_flags_by_their_place():
+    given, _ = parse(
+        lambda: EXPERIMENT, ["mine.py", "--agents.0.reward.alpha", "2", "--agents.1.reward", "team"]
+    )
+    assert given.agents[0].reward == replace(AVERSE, alpha=2.0)
+    assert given.agents[1].reward == "team"
+
+
+def test_a_table_that_an_earlier_version_began_goes_on_without_the_column():
+    env, kept = MatrixGame(2), Kept()
+    agents = population([Learning(DQN(settings=REPLAY))] * 2, env)
+    train(env, agents.learners, episodes=1, callbacks=[kept])
+    schema = schema_of(kept.episodes[0])
+    assert "wanted_return" in schema.names
+    before = schema.remove(schema.get_field_index("wanted_return"))
+    assert rows_of(kept.episodes, None, before).schema.names == before.names
+
+
+@dataclass(frozen=True)
+class Deaf(DQN):
+    """An algorithm of somebody's own, whose learner knows two rewards."""
+
+    def make_learner(self, spaces, *, reward_kind, **how):
+        learner = super().make_learner(spaces, reward_kind="individual", **how)
+        return learner if reward_kind == "individual" else object()
+
+
+@pytest.mark.parametrize(
+    ("specs", "message"),
+    [
+        (
+            [Team(QMIX(settings=REPLAY), (0, 1), reward=AVERSE)],
+            'reward is InequityAversion; allowed for QMIX: "team"',
+        ),
+        (
+            [Learning(Deaf(settings=REPLAY), reward=AVERSE)] * 2,
+            "reward is InequityAversion, which the learner of Deaf does not have as its `wants`",
+        ),
+        (
+            [Learning(Custom("test_wanted_returns:deaf"), reward=AVERSE)] * 2,
+            "which the learner of test_wanted_returns:deaf does not have",
+        ),
+    ],
+)
+def test_where_it_cannot_be_wanted_it_is_refused_by_name(specs, message):
+    with pytest.raises(ValueError, match=message):
+        population(specs, MatrixGame(2))
+
+
+def deaf():
+    """As a recipe names it."""
+    return Deaf(settings=REPLAY)
+
+
+def test_agents_without_others_are_refused_before_anything_is_written(tmp_path):
+    alone = Game(map=maps.parse("A.>.A"), rules=Rules(may_fire=False))
+    with pytest.raises(ValueError, match=r"experiment\.agents\[0\]\.reward is Exchange.* a game of 1 agent"):
+        replace(EXPERIMENT, game=alone, agents=[Learning(DQN(settings=REPLAY), reward=Exchange(0.5))])
+    with pytest.raises(ValueError, match=r"reward_kind is Exchange, which compares an agent with others"):
+        DQN(settings=REPLAY).make_learner(alone.spaces, agents=(0,), replicas=1, reward_kind=Exchange(0.5))
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_a_game_of_ones_own_has_preferences_too(tmp_path):
+    agents = [
+        Learning(DQN(settings=REPLAY), reward=Exchange(0.25)),
+        Learning(PPO(settings=ROLLOUTS), reward=AVERSE),
+    ]
+    game = Custom("one_road_parts:Dilemma", arguments={"steps": 4})
+    run = cprl.run(
+        replace(EXPERIMENT, game=game, agents=agents),
+        tmp_path / "run",
+        watch="off",
+        allow=["one_road_parts:Dilemma"],
+    )
+    rows = read_episodes(run).to_pylist()
+    assert Dilemma(steps=4).agents == 2
+    # Exchange(0.25): 3 / 4 of the own return and 1 / 4 of the other's
+    pairs = [(rows[place], rows[place + 1]) for place in range(0, len(rows), 2)]
+    for own, other in pairs:
+        assert own["wanted_return"] == pytest.approx(0.75 * own["return"] + 0.25 * other["return"])
