@@ -10,6 +10,7 @@ import re
 import subprocess
 import sys
 import tempfile
+from dataclasses import replace
 from importlib.metadata import files
 from pathlib import Path
 from types import SimpleNamespace
@@ -21,9 +22,12 @@ from numba import typeof
 from numba.cuda import compile_ptx, dispatcher
 
 from cprl import Game, presets
+from cprl.commons.batch import output_of
 from cprl.commons.cuda import kernels
 from cprl.commons.game import output_shapes
-from cprl.commons.world import Scratch, StepOutput, Worlds, empty_scratch, empty_worlds
+from cprl.commons.world import Governed, Scratch, StepOutput, Worlds, empty_scratch, empty_worlds
+from cprl.institutions import Tax
+from cprl.institutions.memory import Memory, empty_memory
 
 
 def arguments(game: Game, worlds: int = 4) -> dict[str, tuple[Any, ...]]:
@@ -38,8 +42,18 @@ def arguments(game: Game, worlds: int = 4) -> dict[str, tuple[Any, ...]]:
     boards = np.zeros((worlds, game.map.height, game.map.width), np.uint8)
     on_gpu = Worlds(*map(np.asfortranarray, state))
     loops = {"play_worlds": actions, "begin_worlds": marks, "refresh_worlds": marks, "show_worlds": boards}
+    ruled = replace(game, institutions=(Tax(),))
+    memory = empty_memory(ruled.governed_tables.institutions, worlds=worlds)
+    governed = Governed(on_gpu, Memory(*map(np.asfortranarray, memory)), actions)
+    paid = output_of([np.zeros(*form) for form in output_shapes(ruled, worlds).values()])
+    of_governed = {
+        f"{name[:-6]}governed_worlds": what for name, what in loops.items() if name != "show_worlds"
+    }
     return {
         **{name: (on_gpu, tables, what, told, scratch) for name, what in loops.items()},
+        **{
+            name: (governed, ruled.governed_tables, what, paid, scratch) for name, what in of_governed.items()
+        },
         "find_unknown": (actions, len(game.actions), np.zeros(1, np.int64)),
     }
 

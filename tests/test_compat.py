@@ -383,6 +383,34 @@ def test_vector_instructions_are_looked_for_once_for_all_processes(tmp_path, mon
         assert len(searches) == 3
 
 
+def test_a_row_is_sent_as_rerun_itself_sends_columns(tmp_path):
+    import rerun as rr
+    from rerun.chunk import RrdReader
+
+    from cprl.viewer.batches import components, timelines, times
+
+    columns = rr.Points2D.columns(positions=np.ones((2, 2)), labels=["one", "two"])
+    at = times([3, 4], [0, 1], [5, 6])
+
+    def sent(name, send):
+        recording = rr.RecordingStream("cprl", recording_id="sent")
+        recording.save(tmp_path / name)
+        send(recording)
+        recording.disconnect()
+        chunks = [chunk.to_record_batch() for chunk in RrdReader(tmp_path / name).stream()]
+        return [
+            {column: batch.column(column).to_pylist() for column in batch.schema.names if ":" in column}
+            | {line: batch.column(line).to_pylist() for line in ("step", "episode", "frame")}
+            for batch in chunks
+            if "step" in batch.schema.names
+        ]
+
+    with relies_on("rerun_bindings.send_arrow_chunk", used_by="compat.send_chunk"):
+        own = sent("own", lambda to: compat.send_chunk(to, "a/b", timelines(at), components(columns)))
+        assert own
+        assert own == sent("its", lambda to: to.send_columns("a/b", at, columns))
+
+
 def test_what_ends_a_recording_waits_for_its_viewer_and_is_in_a_private_part():
     """`RecordingStream.__del__` flushes; `keep_native` keeps `inner` alive in its place."""
     import rerun as rr

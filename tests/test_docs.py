@@ -10,6 +10,10 @@ import pytest
 from rerun.chunk import RrdReader
 from test_rerun_logger import trained
 
+from cprl.measuring import institutions, names
+from cprl.measuring.series import OF_AGENTS
+from cprl.runs.columns import OF_INSTITUTIONS
+
 ROOT = Path(__file__).parents[1]
 PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md"))]
 
@@ -35,8 +39,30 @@ def test_every_logged_name_has_its_line_in_the_docs_and_the_other_way_round(tmp_
         "random_play/<metric>",
         *("agent_<i>/harvested", "turn/stock", "windows/frames", "world/marks"),
         *("wall/boards", "wall/labels", "wall/died", "decisions", "decisions/labels"),
+        *(name for name in told if name.startswith("institutions/")),
+        *(f"agent_<i>/{name}" for name in (*OF_AGENTS, "paid", "given")),
+        *("world/regions", "world/violators"),
     }
-    assert logged == told - elsewhere, "by BestWeights, of many episodes or agents, of replays, static"
+    because = "by BestWeights, of many episodes or agents, of replays, static, of games with institutions"
+    assert logged == told - elsewhere, because
+
+
+def rows_under(heading):
+    """The rows of the first table under a heading of docs/metrics.md, as cells."""
+    text = (ROOT / "docs" / "metrics.md").read_text().split(f"\n## {heading}\n")[1].split("\n## ")[0]
+    lines = [line for line in text.splitlines() if line.startswith("| ")]
+    return [[cell.strip() for cell in line.strip("|").split(" | ")] for line in lines[1:]]
+
+
+def test_the_docs_name_what_is_logged_and_kept_of_institutions():
+    rows = rows_under("Institutions, one value per episode")
+    units = {name: row[1] for row in rows for name in re.findall(r"`([^`]+)`", row[0])}
+    words = {f"institutions/{name}": unit for name, (_, unit) in names.OF_INSTITUTIONS.items()}
+    assert set(units) == {*words, "institutions/in_force_<v>", *(f"agent_<i>/{name}" for name in OF_AGENTS)}
+    assert tuple(names.OF_INSTITUTIONS) == tuple(institutions.NEEDS)
+    assert all(words[name] == units[name].replace("0..1", "0 to 1") for name in words)
+    columns = [row[0] for row in rows_under("The table of a run")]
+    assert columns == [*OF_INSTITUTIONS, "in_force_<v>"]
 
 
 def blocks():

@@ -11,6 +11,7 @@ import torch
 from matrix_game import MatrixGame
 from rerun.chunk import RrdReader
 from torchrl.envs import Transform
+from torchrl.envs.utils import ExplorationType, set_exploration_type
 
 from cprl import Custom, Experiment, Game, Rules, maps
 from cprl.agents import Population
@@ -160,6 +161,19 @@ def test_an_exhibition_changes_nothing_that_is_learned(name, tmp_path, monkeypat
     assert played[0] > 20, "the exhibition was played"
     entities = {chunk.entity_path for chunk in RrdReader(tmp_path / "run.rrd").stream()}
     assert not [entity for entity in entities if "exhibition" in entity], "nothing of it is in the file"
+
+
+@pytest.mark.parametrize("name", EXPERIMENTS)
+def test_the_present_policy_computes_its_own_replica_alone_and_acts_as_in_evaluation(name):
+    _, population = population_of(EXPERIMENTS[name])
+    for learner in population.learners.values():
+        of_all = learner.evaluation_actor(1)
+        alone = learner.evaluation_actor(1).of_first_replica()
+        shape = of_all.replicas, of_all.agents, *population.spaces.observation_shape
+        seen = torch.randint(0, 256, shape, dtype=torch.uint8)
+        with set_exploration_type(ExplorationType.RANDOM):
+            for _ in range(20):
+                assert torch.equal(alone.choose(seen[:1]), of_all.choose(seen)[:1])
 
 
 def test_it_plays_eleven_steps_a_second_however_often_the_training_asks(tmp_path):

@@ -11,6 +11,7 @@ from cprl import presets
 from cprl.algorithms import DQN, IPPO, PPO, QMIX, DQNSettings, RolloutSettings, Tabular, TabularSettings
 from cprl.custom import Custom
 from cprl.experiment import Experiment, changes, frozen_from, frozen_relative_to
+from cprl.institutions import Tax
 from cprl.population import Frozen, Learning, Scripted, Team
 
 RESULTS = Path(__file__).parents[1] / "docs" / "results"
@@ -226,3 +227,9 @@ def test_an_old_recipe_that_cannot_be_read_says_why():
     mine = {"member": "Learner", "paid": "own", "algorithm": "Mine", "settings": {"kind": "DQNSettings"}}
     with pytest.raises(ValueError, match=r"experiment\.agents\[0\]\.algorithm\.kind is 'Mine'"):
         Experiment.from_recipe(old_recipe(mine, mine))
+
+
+def test_a_published_game_with_institutions_is_no_published_game():
+    game = presets.game("commons", variant="as_run")
+    assert presets.variant_of(game) == "as_run"
+    assert presets.variant_of(replace(game, institutions=(Tax(),))) is None

@@ -207,6 +207,24 @@ def test_lanes_by_worlds_reach_the_right_network():
             assert chosen[world, agent] == agents.engine.outputs(seen)[lane, 0].argmax()
 
 
+@pytest.mark.parametrize("engine", ENGINES)
+def test_the_first_replica_alone_acts_with_the_weights_of_the_moment(engine):
+    agents = learner(engine, replicas=3)
+    alone = agents.evaluation_actor(1).of_first_replica()
+    env = CommonsEnv(GAME, 3, seed=3)
+    windows = torch.randint(0, 256, (3, 2, *GAME.observation_shape), dtype=torch.uint8)
+    before = alone.values(windows[0, :, None])
+    train(env, {(0, 1): agents}, episodes=3)
+    now = agents.engine.outputs(windows.flatten(0, 1)[:, None])[:2]
+    torch.testing.assert_close(alone.values(windows[0, :, None]), now)
+    assert (before - now).abs().max() > 1e-4, "it has learned since"
+    of_all = agents.evaluation_actor(1)
+    of_all.epsilon = alone.epsilon = 0.5
+    with set_exploration_type(ExplorationType.RANDOM):
+        for _ in range(20):
+            assert torch.equal(alone.choose(windows[:1]), of_all.choose(windows)[:1])
+
+
 def test_trained_replicas_are_evaluated_side_by_side_on_fresh_worlds():
     agents, _ = trained("lane_axis", replicas=2)
     env = CommonsEnv(GAME, 2 * 5, seed=9)

@@ -167,25 +167,30 @@ class Listener:
     is_live, frames = True, 12
 
     def __init__(self):
-        self.rows = []
+        self.rows, self.live_only = [], []
 
     def log_static(self, name, *what):
         """Nothing."""
 
-    def log_columns(self, name, at, what, *, live_only=False):
-        self.rows.append((name, at, live_only))
+    def do(self, what, *, live_only=False):
+        self.live_only.append(live_only)
+        what(self)
+
+    def take(self, entity, timelines, columns):
+        self.rows.append((entity, {name: own.to_pylist() for name, own in timelines.items()}))
 
 
 def test_viewers_get_the_wall_once_a_second_and_the_file_does_not(run, monkeypatch):
     _, viewer, _ = run
     clock, listener = iter(np.arange(10.0, 20.0, 0.4)), Listener()
     monkeypatch.setattr("cprl.viewer.wall.time.perf_counter", lambda: next(clock))
+    monkeypatch.setattr("cprl.viewer.wall.send_chunk", Listener.take)
     wall = Wall(viewer.env, listener, scene=viewer.logger.scene, recorded_steps=100)
     for step in range(1, 10):
         wall.on_step(step, 3, None)
-    boards_at = [at for name, at, _ in listener.rows if name == "wall/boards"]
-    assert boards_at == [((step,), (3,), (12,)) for step in (1, 4, 7)]
-    assert all(live_only for *_, live_only in listener.rows)
+    boards_at = [at for name, at in listener.rows if name == "wall/boards"]
+    assert boards_at == [{"step": [step], "episode": [3], "frame": [12]} for step in (1, 4, 7)]
+    assert listener.live_only == [True] * 3
 
 
 def test_boards_of_many_worlds_are_drawn_as_frames_of_one(run):

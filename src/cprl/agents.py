@@ -149,9 +149,11 @@ class Population:
                 for agents, learner in self.learners.items()
             }
             others = self._others(EXHIBITION, worlds=1, replicas=1)
-        own = self.decisions
-        decisions = None if own is None else (own.first_replica(), own)
-        return PresentPolicy(actors, others, decisions=decisions, replicas=self.replicas, device=self._device)
+            own = self.decisions
+            decisions = None if own is None else (own.first_replica(), own)
+            return PresentPolicy(
+                actors, others, decisions=decisions, replicas=self.replicas, device=self._device
+            )
 
     def random_policy(self, worlds: int) -> AgentPolicies:
         """Every agent takes every action with equal probability, and every choice where it decides."""

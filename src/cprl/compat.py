@@ -250,6 +250,19 @@ def end_recordings() -> None:
     flush_and_cleanup_orphaned_recordings()
 
 
+def send_chunk(
+    recording: Any, entity: str, timelines: Mapping[str, Any], components: Mapping[Any, Any]
+) -> None:
+    """`RecordingStream.send_columns` without its checks and conversions, which take most of its time where a
+    row is sent: `pyarrow` arrays of equal length by timeline and by component descriptor, without timelines a
+    static row."""
+    from rerun_bindings import send_arrow_chunk
+
+    send_arrow_chunk(
+        entity, timelines=dict(timelines), components=dict(components), recording=recording.to_native()
+    )
+
+
 def keep_native(recording: Any, keep: Callable[..., object] = ctypes.pythonapi.Py_IncRef) -> None:
     """In place of a recording's end, which waits for a viewer: its native part, the private `inner`, stays
     until the process ends.

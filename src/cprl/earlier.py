@@ -51,6 +51,8 @@ def _fitting_run(
         differences += [
             ("a form of observation", run.game.observation, game.observation),
             ("actions", run.game.actions, game.actions),
+            ("channels", run.game.channels, game.channels),
+            ("institutions that show", run.game.entries_shown, game.entries_shown),
         ]
     for name, came, here in differences:
         if came != here:

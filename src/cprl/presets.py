@@ -93,8 +93,8 @@ def dqn_settings(board: Board, *, variant: Variant = "published") -> DQNSettings
 
 
 def variant_of(game: object) -> Variant | None:
-    """The variant of a published game, whichever agents may fire; None for any other game."""
-    if not isinstance(game, Game):
+    """The variant of a published game, whether agents may fire or not; None for any other game."""
+    if not isinstance(game, Game) or game.institutions:
         return None
     for board in BOARDS:
         for variant in VARIANTS:

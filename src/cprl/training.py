@@ -30,6 +30,7 @@ from cprl.learners.base import (
     learned_in,
 )
 from cprl.measuring.episodes import Episode, EpisodeTracker
+from cprl.measuring.institutional import institutions_of
 from cprl.policies.assignment import AgentIndices, AgentPolicies
 from cprl.policies.decisions import Decider
 
@@ -97,7 +98,7 @@ class Training:
         self._collector = make_collector(env, AgentPolicies({**actors, **self.others}, decisions=decisions))
         self._turns = iter(self._collector)
         longest = None if commons is None else commons.game.rules.episode_steps
-        self._tracker = EpisodeTracker(replicas, spaces.agents, longest)
+        self._tracker = EpisodeTracker(replicas, spaces.agents, longest, institutions=institutions_of(env))
         self._losses = {agents: LaneLosses(replicas, agents) for agents in self.learners}
         self._wanted = WantedReturns(replicas, spaces.agents, self.learners)
         self.finite = FiniteCheck(self.learners, spaces, on_nan=on_nan)

@@ -22,6 +22,7 @@ from cprl.commons.tables import GovernedTables, Tables, build_tables, check_size
 from cprl.commons.world import Bytes
 from cprl.institutions import COUNTS, Institution
 from cprl.institutions.choice import Ballot, ballots, decision_options
+from cprl.institutions.memory import SHOWN
 from cprl.spaces import Spaces
 
 
@@ -90,9 +91,16 @@ class Game:
     @property
     def _institution_channels(self) -> tuple[str, ...]:
         rows, columns = self._seen
-        entries = len(entries_shown(self.institutions, self.agents))
+        entries = len(self.entries_shown)
         places = ("forbidden",) if shows_places(self.institutions) else ()
         return *places, *("institutions",) * -(-entries // (rows * columns))
+
+    @property
+    def entries_shown(self) -> tuple[str, ...]:
+        """What the entries of the channels "institutions" show, each with the number of its kind: "quota left
+        0"; see `cprl.institutions.showing`."""
+        entries = entries_shown(self.institutions, self.agents)
+        return tuple(f"{SHOWN[kind]} {argument}" for kind, argument in entries)
 
     @property
     def _seen(self) -> tuple[int, int]:

@@ -26,7 +26,7 @@ from cprl.evaluation.evaluate import SEED, check, chosen_replicas, opened
 from cprl.evaluation.lanes import Played, Source, play, policies_of
 from cprl.evaluation.same_game import check_same_game
 from cprl.measuring.episodes import Episode
-from cprl.measuring.replicas import Measured, over_replicas, social_measures
+from cprl.measuring.replicas import Measured, institution_measures, over_replicas, social_measures
 from cprl.runs.labelled import labelled
 from cprl.stored import LoadedRun
 
@@ -47,8 +47,8 @@ class Cell:
     is_self_play: bool
 
     def measures(self, agent: int | None = None) -> dict[str, Measured]:
-        """focal/return, background/return (the mean of the background agents), group/return, and the social
-        metrics.
+        """focal/return, background/return (the mean of the background agents), group/return, the social
+        metrics, and those of institutions as `institutions/fines` and so on.
 
         Args:
             agent: the index of the focal agent; None for the mean over all indices.
@@ -64,7 +64,8 @@ class Cell:
             "background/return": self._returns(agents, lambda returns, at: np.delete(returns, at).mean()),
             "group/return": self._returns(agents, lambda returns, at: returns.sum()),
         }
-        return {**returns, **social_measures(self._played(agents[:1] if self.is_self_play else agents))}
+        played = self._played(agents[:1] if self.is_self_play else agents)
+        return {**returns, **social_measures(played), **institution_measures(played)}
 
     def _played(self, agents: Sequence[int]) -> Played:
         """The episodes with these focal agents, by replica."""

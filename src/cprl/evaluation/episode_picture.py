@@ -20,6 +20,8 @@ SMALLEST_WIDTH, DEFAULT_WIDTH, LARGEST_WIDTH = 240, 640, 1920
 SMALLEST_CELL_PIXELS: Final = 8
 """Boards with more cells than fit in this size are drawn with it, and then made smaller."""
 
+_DIAMOND_BEYOND: Final = 0.22
+"""How far a violator's diamond goes beyond its cell, in cells."""
 _TEXT: Final = (228, 231, 236)
 _FAINT: Final = (140, 146, 158)
 _LINE: Final = (52, 56, 66)
@@ -62,7 +64,15 @@ class EpisodePicture:
         self.size: tuple[int, int] = width, height + height % 2
         """The width and height in pixels, both even."""
 
-    def draw(self, moments: Sequence[Shown], title: str, *, note: str = "", own: int | None = None) -> Bytes:
+    def draw(
+        self,
+        moments: Sequence[Shown],
+        title: str,
+        *,
+        note: str = "",
+        own: int | None = None,
+        violators: Sequence[int] = (),
+    ) -> Bytes:
         """The picture of the last of these moments.
 
         Args:
@@ -70,6 +80,7 @@ class EpisodePicture:
             title: what is shown, above the board on the left; shortened where the room ends.
             note: what is to be said of this moment, after the turn above the board on the right.
             own: the index of the agent that gets a white frame; None for no frame.
+            violators: the indices of agents that get a white diamond, since they broke a rule.
 
         Returns:
             uint8 [height, width, 3], RGB.
@@ -85,9 +96,21 @@ class EpisodePicture:
         if own is not None and moments[-1].in_play[own]:
             at = self.cell_box(int(moments[-1].row[own]), int(moments[-1].col[own]))
             draw.rectangle(at, outline=_TEXT, width=max(1, self._unit // 6))
+        for agent in violators:
+            self._mark(draw, agent, moments[-1])
         self._plot_stock(draw, np.array([moment.stock.sum(dtype=np.int64) for moment in moments]))
         self._plot_harvests(draw, np.array([moment.harvested for moment in moments]))
         return np.asarray(image)
+
+    def _mark(self, draw: ImageDraw.ImageDraw, agent: int, now: Shown) -> None:
+        """A diamond around who broke a rule, as `cprl.viewer.offences` has it; with its number where it is
+        out of play, as a sanction can put it at once."""
+        left, top, right, bottom = self.cell_box(int(now.row[agent]), int(now.col[agent]))
+        across, down, more = (left + right) / 2, (top + bottom) / 2, (right - left) * _DIAMOND_BEYOND
+        corners = [(across, top - more), (right + more, down), (across, bottom + more), (left - more, down)]
+        draw.line([*corners, *corners[:2]], _TEXT, max(1, self._unit // 5), joint="curve")
+        if not now.in_play[agent]:
+            draw.text((across, down), str(agent), agent_colour(agent), self._font, anchor="mm")
 
     def cell_box(self, row: int, col: int) -> tuple[float, float, float, float]:
         """Where a cell is in the picture: left, top, right and bottom in pixels."""

@@ -11,7 +11,8 @@ import pyarrow as pa
 from cprl import arguments
 from cprl.envs.unwrap import agent_names
 from cprl.evaluation.lanes import Played, Source, play, policies_of, random_policies
-from cprl.measuring.replicas import Measured, over_replicas, social_measures
+from cprl.measuring.replicas import Measured, institution_measures, over_replicas, social_measures
+from cprl.measuring.series import OF_AGENTS
 from cprl.runs.labelled import labelled
 from cprl.stored import LoadedRun, load
 
@@ -32,7 +33,8 @@ class Evaluation:
     """The episodes of uniformly random agents in the same worlds."""
 
     def measures(self, policy: str = "trained") -> dict[str, Measured]:
-        """The social metrics over replicas by name, then the agents' returns as `agent_0/return` and so on.
+        """The social metrics over replicas by name, those of institutions as `institutions/fines` and so on,
+        then the agents' returns, and what they paid, got and broke, as `agent_0/return` and so on.
 
         Args:
             policy: "trained" or "random".
@@ -42,16 +44,22 @@ class Evaluation:
         """
         arguments.choice("policy", policy, ("trained", "random"))
         played = {"trained": self.trained, "random": self.random}[policy]
-        returns = {
-            f"{name}/return": over_replicas(
+        names = agent_names(self.run.env())
+        first = next(iter(played.values()))[0]
+        fields = {"return_": "return"} | {
+            name: name for name in OF_AGENTS if getattr(first, name) is not None
+        }
+        of_agents = {
+            f"{name}/{called}": over_replicas(
                 {
-                    replica: [float(episode.return_[agent]) for episode in own]
+                    replica: [float(getattr(episode, field)[agent]) for episode in own]
                     for replica, own in played.items()
                 }
             )
-            for agent, name in enumerate(agent_names(self.run.env()))
+            for field, called in fields.items()
+            for agent, name in enumerate(names)
         }
-        return {**social_measures(played), **returns}
+        return {**social_measures(played), **institution_measures(played), **of_agents}
 
     def table(self) -> pa.Table:
         """The episodes with the columns of `episodes.parquet`, after "policy": "trained" or "random"."""

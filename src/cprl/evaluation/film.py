@@ -8,12 +8,15 @@ from tensordict import TensorDictBase
 from torchrl.envs import EnvBase
 
 from cprl import arguments, keys
+from cprl.envs.unwrap import commons_of
 from cprl.measuring.episodes import Episode
 from cprl.policies.assignment import AgentPolicies
 from cprl.stored import LoadedRun, load
 from cprl.training import train
 from cprl.viewer.callback import ViewerCallback
 from cprl.viewer.decisions import Decisions
+from cprl.viewer.institutions import has_institutions
+from cprl.viewer.offences import Offences, events
 
 SEED = 20_011
 """The seed of fresh worlds; no training of ours uses it."""
@@ -100,7 +103,7 @@ def film(
             others=others,
             decisions=fresh.policies.decisions,
             episodes=1,
-            callbacks=[viewer, *_decisions(viewer, fresh), events],
+            callbacks=[viewer, *_decisions(viewer, fresh), *_offences(viewer, fresh), events],
         )
     assert events.episode is not None
     return target, events.episode
@@ -117,8 +120,16 @@ def _decisions(viewer: ViewerCallback, fresh: FreshEpisode) -> list[Decisions]:
     return [shown]
 
 
+def _offences(viewer: ViewerCallback, fresh: FreshEpisode) -> list[Offences]:
+    """Who breaks rules and what is paid, of games with institutions whose boards are shown."""
+    scene, commons = viewer.logger.scene, commons_of(fresh.env)
+    if scene is None or commons is None or not has_institutions(scene):
+        return []
+    return [Offences(viewer.logger, commons, names=scene.agents)]
+
+
 class _Events:
-    """Logs every tag and the outcome of the episode, and stores the episode."""
+    """Logs every tag, violation and the outcome of the episode, and stores the episode."""
 
     def __init__(self, viewer: ViewerCallback) -> None:
         self.viewer = viewer
@@ -126,12 +137,14 @@ class _Events:
         self._step = 0
 
     def on_step(self, batch: TensorDictBase) -> None:
-        """Logs who was tagged by whom."""
+        """Logs who was tagged by whom, and who broke a rule."""
         self._step += 1
         tagged_by = batch.get(("next", *keys.TAGGED_BY), None)
         if tagged_by is not None:
             for tagged, by in tagged_by[0].nonzero().tolist():
                 self._log(f"agent {tagged} is tagged out by agent {by}")
+        for event in events(batch):
+            self._log(event)
 
     def on_episode(self, episode: Episode, learning: Mapping[str, float]) -> None:
         """Logs the outcome."""

@@ -7,7 +7,7 @@ from typing import Final
 
 from torchrl.envs import EnvBase
 
-from cprl import arguments
+from cprl import arguments, keys
 from cprl.commons.world import Bytes, Shown
 from cprl.envs.commons_env import CommonsEnv
 from cprl.envs.unwrap import commons_of
@@ -21,6 +21,7 @@ from cprl.evaluation.film import fresh_episode
 from cprl.evaluation.turns import Turns
 from cprl.evaluation.video_files import check_can_write_mp4, write_gif, write_mp4
 from cprl.measuring.episodes import Episode, EpisodeTracker
+from cprl.measuring.institutional import institutions_of
 from cprl.memory import check_memory
 from cprl.policies.assignment import AgentPolicies
 from cprl.runs.labelled import refuse_to_write_over
@@ -46,7 +47,8 @@ def film_video(
     width: int = DEFAULT_WIDTH,
     allow: Sequence[str] = (),
 ) -> tuple[Path, Episode]:
-    """Films an episode of a run's agents: the board, the apples on it and each agent's harvest so far.
+    """Films an episode of a run's agents: the board, the apples on it and each agent's harvest so far; under
+    institutions, agents that broke a rule since the last picture have a white diamond around them.
 
     It is the episode that `cprl.evaluation.film.film` records with the same numbers; the first and the last
     board are always in the film.
@@ -86,7 +88,7 @@ def film_video(
     commons = commons_of(fresh.env)
     if commons is None:
         raise ValueError(f"{run} plays a game without a board of cprl; allowed: a run of a cprl.Game")
-    moments, played = _play(fresh.env, commons, fresh.policies)
+    moments, violators, played = _play(fresh.env, commons, fresh.policies)
     board, steps = commons.game.map, commons.game.rules.episode_steps
     most = int(moments[-1].harvested.max())
     picture = EpisodePicture(board, steps=steps, width=width, most_harvested=most)
@@ -98,7 +100,9 @@ def film_video(
     def draw(turns: Sequence[int]) -> Iterator[Bytes]:
         for turn in turns:
             note = end if turn == len(moments) - 1 else ""
-            yield picture.draw(moments[: turn + 1], fresh.title, note=note)
+            first = max((other for other in chosen if other < turn), default=-1) + 1
+            broke = sorted(set().union(*violators[first : turn + 1]))
+            yield picture.draw(moments[: turn + 1], fresh.title, note=note, violators=broke)
 
     path.parent.mkdir(parents=True, exist_ok=True)
     if path.suffix == ".mp4":
@@ -111,18 +115,25 @@ def film_video(
     return path, played
 
 
-def _play(env: EnvBase, commons: CommonsEnv, policies: AgentPolicies) -> tuple[list[Shown], Episode]:
-    """All boards of the episode, that at its start first, without what agents observe; and the episode."""
+def _play(
+    env: EnvBase, commons: CommonsEnv, policies: AgentPolicies
+) -> tuple[list[Shown], list[set[int]], Episode]:
+    """All boards of the episode, that at its start first, without what agents observe; the agents that broke
+    a rule in the turn that led to each; and the episode."""
 
     def now() -> Shown:
         shown = commons.worlds.show(commons.output)
         return shown._replace(observation=shown.observation[:0])
 
-    tracker = EpisodeTracker(1, commons.game.agents, commons.game.rules.episode_steps)
+    longest = commons.game.rules.episode_steps
+    tracker = EpisodeTracker(1, commons.game.agents, longest, institutions=institutions_of(env))
     turns = Turns(env, policies)
-    moments = [now()]
+    moments, violators = [now()], [set[int]()]
     while True:
-        ended = tracker.add(turns.play())
+        batch = turns.play()
+        ended = tracker.add(batch)
         moments.append(now())
+        violated = batch.get(("next", *keys.VIOLATED), None)
+        violators.append(set() if violated is None else set(violated[0].nonzero()[:, 0].tolist()))
         if ended:
-            return moments, ended[0]
+            return moments, violators, ended[0]

@@ -6,7 +6,6 @@ from typing import Any, Final
 
 import torch
 
-from cprl.checks import shown
 from cprl.commons.game import Game
 from cprl.stored import LoadedRun
 
@@ -33,7 +32,7 @@ def check_same_game(runs: Mapping[str, LoadedRun]) -> None:
 
 def differences(game: Any, other: Any) -> list[str]:
     """The fields of map, rules and observation in which games differ, with their values if they are short,
-    and their institutions."""
+    and the institutions."""
     if not (isinstance(game, Game) and isinstance(other, Game)):
         return [] if game == other else [f"{game!r} and {other!r}"]
     found = []
@@ -49,7 +48,8 @@ def differences(game: Any, other: Any) -> list[str]:
                 short = len(values) <= 2 * _LONGEST
                 found.append(f"{type(mine).__name__}.{field.name} {values if short else 'differ'}")
     if game.institutions != other.institutions:
-        found.append(f"institutions {shown(game.institutions)} and {shown(other.institutions)}")
+        names = (", ".join(type(own).__name__ for own in of.institutions) or "none" for of in (game, other))
+        found.append(f"institutions {' and '.join(names)}, or their values")
     return found
 
 

@@ -1,6 +1,6 @@
 """Evaluations and cross-play as tables for the terminal."""
 
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator, Mapping
 from typing import Final
 
 from rich.table import Table
@@ -9,13 +9,16 @@ from cprl.evaluation.cross_play import CrossPlay
 from cprl.evaluation.evaluate import Evaluation
 from cprl.evaluation.lanes import Played
 from cprl.measuring.names import with_unit
-from cprl.measuring.replicas import agents_without_harvest
+from cprl.measuring.replicas import Measured, agents_without_harvest
 from cprl.measuring.reported import left_out
 from cprl.stored import LoadedRun
 
 
 def run_table(evaluation: Evaluation) -> Table:
-    """A row for each metric: mean over replicas and 95 % interval, of the run's agents and random agents."""
+    """A row for each metric: mean over replicas and 95 % interval, of the run's agents and random agents.
+
+    Metrics of institutions that are undefined everywhere, since the game has other institutions, have none.
+    """
     replicas = len(evaluation.trained)
     episodes = len(next(iter(evaluation.trained.values())))
     table = Table(
@@ -28,6 +31,8 @@ def run_table(evaluation: Evaluation) -> Table:
     trained, random = evaluation.measures("trained"), evaluation.measures("random")
     rewards = _unit_of_rewards(evaluation.trained)
     for name, measured in trained.items():
+        if _says_nothing(name, [measured, random[name]]):
+            continue
         table.add_row(with_unit(name, rewards=rewards), str(measured), str(random[name]))
     without = [agents_without_harvest(played) for played in (evaluation.trained, evaluation.random)]
     if None not in without:
@@ -53,7 +58,8 @@ def matrices(played: CrossPlay) -> Iterator[Table]:
     cells = {at: cell.measures() for at, cell in played.cells.items()}
     rewards = _unit_of_cells(played)
     for name in next(iter(cells.values())):
-        if name == "collective_return":  # a reward is an apple: group/return says the same
+        of_name = [measured[name] for measured in cells.values()]
+        if _says_nothing(name, of_name) or _repeats(name, cells.values()):
             continue
         table = Table(title=with_unit(name, rewards=rewards), title_justify="left")
         table.add_column("focal \\ background")
@@ -77,6 +83,16 @@ def agents_table(played: CrossPlay) -> Table:
             measured = cell.measures(agent)
             table.add_row(focal, background, str(agent), *(str(measured[name]) for name in names))
     return table
+
+
+def _says_nothing(name: str, measured: Iterable[Measured]) -> bool:
+    """Whether it is a metric of institutions that is undefined everywhere."""
+    return name.startswith("institutions/") and all(own.estimate is None for own in measured)
+
+
+def _repeats(name: str, cells: Iterable[Mapping[str, Measured]]) -> bool:
+    """Whether group/return says the same: a reward is an apple but for what institutions take and give."""
+    return name == "collective_return" and not any("institutions/fines" in own for own in cells)
 
 
 def _unit_of_cells(played: CrossPlay) -> str:

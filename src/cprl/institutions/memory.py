@@ -112,6 +112,19 @@ class Payments(NamedTuple):
     """bool [B, V], whether the ballot is held in the coming turn."""
 
 
+SHOWN: Final = (
+    "quota left",
+    "quota time",
+    "season closed",
+    "season time",
+    "sanction level",
+    "detected",
+    "violator",
+    "may fire",
+    "in force",
+    "elected",
+)
+"""What an entry shows agents; see `cprl.institutions.showing`."""
 (
     QUOTA_LEFT,
     QUOTA_TIME,
@@ -123,8 +136,7 @@ class Payments(NamedTuple):
     MAY_FIRE,
     IN_FORCE,
     IS_ELECTED,
-) = range(10)
-"""What an entry shows agents; see `cprl.institutions.showing`."""
+) = range(len(SHOWN))
 
 
 class InstitutionTables(NamedTuple):

@@ -1,6 +1,7 @@
 """Lanes: the agents that a learner trains in every replica, with their seeds, networks and actors."""
 
 from collections.abc import Callable, Mapping, Sequence
+from functools import partial
 from typing import Any, Final, Protocol, TypeAlias
 
 import numpy as np
@@ -43,11 +44,18 @@ def lane_names(*, replicas: Sequence[int], agents: Sequence[int]) -> list[str]:
     return [lane_name(replica, agent) for replica in replicas for agent in agents]
 
 
+Outputs = Callable[[Tensor], Tensor]
+"""The outputs of acting networks: [l, k, ...] to [l, k, ...] for l lanes."""
+
+
 class Acts(Protocol):
     """Evaluates the current networks of many lanes; an `Engine` does."""
 
     def outputs(self, observation: Tensor, *, part: int = 0) -> Tensor:
         """The outputs of the networks: [L, k, ...] to [L, k, ...]."""
+
+    def first(self, lanes: int) -> Outputs:
+        """`outputs` of the first l lanes alone, with their weights as they are at each call."""
 
     def network_state(self, lane: int) -> dict[str, Tensor]:
         """Copies of the current weights of one lane, as the state dict of its acting network."""
@@ -173,6 +181,7 @@ class Lanes:
             agents=len(self.agents),
             worlds=worlds,
             stochastic=self.stochastic,
+            first=partial(engine.first, len(self.agents)),
         )
         actor.epsilon = epsilon
         return actor

@@ -151,6 +151,17 @@ class _Members:
         by_team = observation.view(*self._size, *observation.shape[1:]).transpose(1, 2)
         return self._engine.outputs(by_team, part=part).transpose(1, 2).flatten(0, 1)
 
+    def first(self, lanes: int) -> Callable[[Tensor], Tensor]:
+        """`outputs` of the members of the first teams."""
+        members = self._size[1]
+        of_teams = self._engine.first(lanes // members)
+
+        def outputs(observation: Tensor) -> Tensor:
+            by_team = observation.view(-1, members, *observation.shape[1:]).transpose(1, 2)
+            return of_teams(by_team).transpose(1, 2).flatten(0, 1)
+
+        return outputs
+
     def network_state(self, lane: int) -> dict[str, Tensor]:
         """The weights of one member."""
         replica, member = divmod(lane, self._size[1])

@@ -1,11 +1,12 @@
 """Episode: the record of an episode that has ended."""
 
-from dataclasses import dataclass
+from collections.abc import Mapping
+from dataclasses import dataclass, field
 
 import numpy as np
 from numpy.typing import NDArray
 
-from cprl.measuring.reported import FIELDS, OPTIONAL
+from cprl.measuring.reported import FIELDS, INSTITUTIONAL, OPTIONAL
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -39,9 +40,6 @@ class Episode:
     """[N], how often each agent was tagged out; by two agents in one step counts once."""
     tagged_by: NDArray[np.int64] | None = None
     """[N, N], how often the agent of the row was tagged by the agent of the column."""
-    decision: NDArray[np.int64] | None = None
-    """[N], what each agent had decided, see `cprl.institutions.choice.ballots`; None in games that ask
-    nothing."""
     wanted_return: NDArray[np.float64] | None = None
     """[N], the sum of the rewards that each agent wanted in a training, see `cprl.preferences`; NaN for
     agents that do not learn. None outside of a training."""
@@ -49,6 +47,23 @@ class Episode:
     """Apples on the board at the end."""
     depletion_step: int | None = None
     """The first step that left no apple on the board, or -1."""
+    fines: NDArray[np.float64] | None = None
+    """[N], what institutions took from each agent, taxes included, in units of reward. This field and all
+    below are of games with institutions, see `cprl.measuring.reported.INSTITUTIONAL`."""
+    transfers: NDArray[np.float64] | None = None
+    """[N], what institutions gave each agent."""
+    violations: NDArray[np.int64] | None = None
+    """[N], steps in which the agent broke a rule of an institution."""
+    counts: Mapping[str, NDArray[np.int64]] | None = None
+    """[N] by name, what institutions counted, see `cprl.institutions.COUNTS`."""
+    decision: NDArray[np.int64] | None = None
+    """[N], what each agent had decided, see `cprl.institutions.choice.ballots`; None in games that ask
+    nothing."""
+    in_force: NDArray[np.float64] | None = None
+    """[V], what was decided for this episode: tax rates, quotas, the agent elected."""
+    institutions: Mapping[str, float] = field(default_factory=dict)
+    """`cprl.measuring.institutions.summary` of the episode; NaN where undefined, empty without
+    institutions."""
 
     @property
     def outcome(self) -> str:
@@ -60,6 +75,7 @@ class Episode:
 
     @property
     def reported(self) -> tuple[str, ...]:
-        """The entries of `cprl.measuring.reported.OPTIONAL` that the game reported."""
+        """The optional entries that the game reported, see `cprl.measuring.reported`."""
         missing = {entry for name, needs in FIELDS.items() if getattr(self, name) is None for entry in needs}
-        return tuple(entry for entry in OPTIONAL if entry not in missing)
+        more = (entry for name, entry in INSTITUTIONAL.items() if getattr(self, name) is not None)
+        return (*(entry for entry in OPTIONAL if entry not in missing), *more)

@@ -1,6 +1,6 @@
 """Collects whole episodes from the batches of a collector."""
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from typing import Any, Final
 
 import numpy as np
@@ -10,15 +10,15 @@ from tensordict import TensorDictBase
 from torch import Tensor
 
 from cprl import arguments, keys
-from cprl.measuring import social
+from cprl.institutions import Institution
+from cprl.measuring import institutional
+from cprl.measuring.ended import Array, Turns, episodes_of
 from cprl.measuring.episode import Episode
-from cprl.measuring.reported import OPTIONAL, reported_in
+from cprl.measuring.institutions import check_groups, groups_of
+from cprl.measuring.reported import OF_INSTITUTIONS, OPTIONAL, reported_in
 from cprl.memory import check_memory
 
 __all__ = ["Episode", "EpisodeTracker"]
-
-Array = NDArray[Any]
-Turns = dict[str, Array]
 
 _STATE: Final = {
     "harvest": ("harvest",),
@@ -27,12 +27,11 @@ _STATE: Final = {
     "hit_by": ("hit_by",),
     "tagged_by": ("tagged", "tagged_by"),
     "stock": ("depletion_step",),
+    **institutional.STATE,
 }
 """The arrays that a tracker stores for each optional entry, by their names in its state."""
 _HISTORIES: Final = {"harvest": np.float32, "in_play": np.bool_}
 """Entries that are stored for every step of an episode, with their dtypes."""
-_AS_COUNTED: Final = ("shots", "tagged", "tagged_by")
-"""Fields of an episode that are copied from the tracker's state unchanged."""
 _FIRST_CAPACITY_STEPS: Final = 128
 """The initial capacity of histories, in steps, without max_steps."""
 _LARGEST_FIRST_CAPACITY_STEPS: Final = 4096
@@ -44,8 +43,8 @@ _WORLDS_AT_ONCE: Final = 64
 class EpisodeTracker:
     """Tracks the running episode of each world and returns it when it ends.
 
-    The first batch determines which optional entries (`cprl.measuring.reported.OPTIONAL`) the game reports;
-    every later batch must have them. Fields and metrics that need other entries are left out of episodes.
+    The first batch determines which optional entries (`cprl.measuring.reported`) the game reports; every
+    later batch must have them. Fields and metrics that need other entries are left out of episodes.
 
     Args:
         worlds: the number of worlds B of a batch.
@@ -53,6 +52,8 @@ class EpisodeTracker:
         max_steps: the maximum length of an episode, e.g. `Rules.episode_steps`; None if it is unknown.
         sustainable_yield: apples per step that the map can sustain; with first_stock, adds yield_share.
         first_stock: apples on the board at the start of an episode.
+        institutions: those of the game, which tell what is measured of them, see
+            `cprl.measuring.institutions.metrics_for`.
 
     Raises:
         ValueError: if a number is no integer or below 1; in `add`, if a batch has a wrong shape or lacks an
@@ -68,6 +69,7 @@ class EpisodeTracker:
         *,
         sustainable_yield: float | None = None,
         first_stock: float | None = None,
+        institutions: Sequence[Institution] = (),
     ) -> None:
         worlds = arguments.integer("worlds", worlds, 1, 2**32)
         agents = arguments.integer("agents", agents, 1, 2**20)
@@ -78,9 +80,17 @@ class EpisodeTracker:
         self.reported: tuple[str, ...] | None = None
         """The optional entries of this game; None before the first batch."""
         self._yield = {"sustainable_yield": sustainable_yield, "first_stock": first_stock}
+        self._institutions: tuple[Institution, ...] = arguments.objects(
+            "institutions", institutions, Institution, "a value of cprl.institutions"
+        )
+        groups = groups_of(self._institutions)
+        if groups is not None:
+            check_groups(groups, agents)
+        self._widths: institutional.Widths = {}
         self._every_world = np.arange(worlds)
         self._checked: torch.Size | None = None
         self._episode = np.zeros(worlds, np.int64)
+        self._has_institutions = False
         self._of_agents: tuple[str, ...] = ()
         self._of_worlds: tuple[str, ...] = ()
         self._histories: dict[str, Array] = {}
@@ -94,7 +104,7 @@ class EpisodeTracker:
         """
         if self.reported is None:
             arguments.object_of("tensordict", tensordict, TensorDictBase, "a TensorDict with the next turns")
-            self._begin(reported_in(tensordict))
+            self._begin(reported_in(tensordict), institutional.widths_in(tensordict))
             if tensordict.get(keys.DONE, None) is None:
                 raise self._missing(tensordict)
         try:
@@ -136,15 +146,18 @@ class EpisodeTracker:
             raise ValueError(f"the state has {longest} steps; allowed: up to max_steps, {self.max_steps}")
         reported = None  # the tracker had seen no batch
         if "steps" in state:
-            reported = tuple(entry for entry in OPTIONAL if _STATE[entry][0] in state)
+            reported = tuple(entry for entry in (*OPTIONAL, *OF_INSTITUTIONS) if _STATE[entry][0] in state)
             if self.reported not in (None, reported):
                 raise ValueError(
                     f"the state is from a game that reports {list(reported)}; allowed: "
                     f"{list(self.reported or ())}, as this game reports"
                 )
-        other = EpisodeTracker(self.worlds, self.agents, self.max_steps, **self._yield)
+        other = EpisodeTracker(
+            self.worlds, self.agents, self.max_steps, **self._yield, institutions=self._institutions
+        )
         if reported is not None:
-            other._begin(reported, capacity=longest)
+            widths = institutional.widths_of(state) if self.reported is None else self._widths
+            other._begin(reported, widths, capacity=longest)
         arrays = other._arrays(longest)
         if not set(arrays) <= set(state):
             raise ValueError(f"the state has {sorted(state)}; allowed: at least {sorted(arrays)}")
@@ -160,14 +173,14 @@ class EpisodeTracker:
         histories = {name: array[:, :longest] for name, array in self._histories.items()}
         return {"episode": self._episode, **histories, **self._running}
 
-    def _begin(self, reported: tuple[str, ...], *, capacity: int = 0) -> None:
+    def _begin(self, reported: tuple[str, ...], widths: institutional.Widths, *, capacity: int = 0) -> None:
         """Allocates the arrays for a game that reports these entries."""
         if "harvest" not in reported and self._yield["sustainable_yield"] is not None:
             raise ValueError(
                 "sustainable_yield is given; allowed: None, because yield_share needs a harvest, which the "
                 "game does not report"
             )
-        self.reported = reported
+        self.reported, self._widths = reported, widths
         worlds, agents = self.worlds, self.agents
         steps = self._capacity(capacity)
         self._histories = {
@@ -187,9 +200,12 @@ class EpisodeTracker:
             "steps": np.zeros(worlds, np.int64),
             "return": np.zeros((worlds, agents), np.float64),
             **{name: np.zeros(shape, np.int64) for name, shape in shapes.items() if name in kept},
+            **institutional.arrays(reported, worlds, agents, widths),
         }
-        self._of_agents = ("reward", *(name for name in reported if name not in ("in_play", "stock")))
-        self._of_worlds = (*(name for name in reported if name == "stock"), keys.TERMINATED, keys.DONE)
+        self._has_institutions = not set(reported).isdisjoint(OF_INSTITUTIONS)
+        of_worlds = tuple(name for name in reported if name in ("stock", "in_force"))
+        self._of_agents = ("reward", *(name for name in reported if name not in ("in_play", *of_worlds)))
+        self._of_worlds = (*of_worlds, keys.TERMINATED, keys.DONE)
 
     def _capacity(self, steps: int) -> int:
         """The initial capacity of histories, in steps, at least `steps`."""
@@ -235,6 +251,7 @@ class EpisodeTracker:
         one, agents = (1,), (self.agents,)
         own: dict[str, tuple[int, ...]] = dict.fromkeys(("harvest", "fired", "in_play", "decision"), agents)
         own |= {"reward": agents + one, "hit_by": agents * 2, "tagged_by": agents * 2}
+        own |= institutional.shapes(self.agents, self._widths)
         for name, array in turns.items():
             allowed = (*size, *own.get(name, one))
             if array.shape != allowed:
@@ -281,6 +298,8 @@ class EpisodeTracker:
             depletion_step = running["depletion_step"]
             just_now = (turn["stock"][:, 0] == 0) & (depletion_step == 0)
             depletion_step[just_now] = steps[just_now]
+        if self._has_institutions:
+            institutional.count(running, turn)
 
     def _grow(self) -> None:
         """Doubles the capacity of histories, up to max_steps; raises a ValueError beyond it."""
@@ -297,36 +316,13 @@ class EpisodeTracker:
 
     def _measure(self, worlds: Array, turn: Turns) -> Iterator[Episode]:
         """The episodes of the worlds, int64 [E], that end with this turn."""
-        ended = {name: array[worlds] for name, array in self._running.items()}
-        played = np.arange(ended["steps"].max()) < ended["steps"][:, None]
-        kept = {name: array[worlds, : played.shape[1]] for name, array in self._histories.items()}
-        if "harvest" in kept:
-            kept["harvest"] = np.where(played[..., None], kept["harvest"], 0)
-        if "in_play" in kept:
-            kept["in_play"] = played[..., None] & kept["in_play"]
-        steps = {name: torch.from_numpy(array) for name, array in kept.items()}
-        metrics = social.summary(
-            steps.get("harvest"), steps.get("in_play"), played=torch.from_numpy(played), **self._yield
+        longest = self._running["steps"][worlds].max()
+        return episodes_of(
+            worlds,
+            numbers=self._episode[worlds],
+            ended={name: array[worlds] for name, array in self._running.items()},
+            histories={name: array[worlds, :longest] for name, array in self._histories.items()},
+            turn=turn,
+            of_yield=self._yield,
+            of_game=self._institutions,
         )
-        for k, world in enumerate(worlds):
-            fields: dict[str, Any] = {name: ended[name][k] for name in _AS_COUNTED if name in ended}
-            if "harvest" in kept:
-                fields["harvest"] = kept["harvest"][k].sum(0, dtype=np.float64)
-            if "in_play" in kept:
-                fields["in_play_steps"] = kept["in_play"][k].sum(0)
-            if "hit_by" in ended:
-                fields["hits"] = ended["hit_by"][k].sum(0)
-            if "decision" in turn:
-                fields["decision"] = turn["decision"][world].copy()
-            if "stock" in turn:
-                fields["stock_left"] = int(turn["stock"][world, 0])
-                fields["depletion_step"] = int(ended["depletion_step"][k]) or -1
-            yield Episode(
-                world=int(world),
-                episode=int(self._episode[world]),
-                steps=int(ended["steps"][k]),
-                terminated=bool(turn["terminated"][world, 0]),
-                return_=ended["return"][k],
-                metrics={name: float(values[k]) for name, values in metrics.items()},
-                **fields,
-            )

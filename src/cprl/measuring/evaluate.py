@@ -12,6 +12,7 @@ from cprl import arguments
 from cprl.envs.commons_env import CommonsEnv
 from cprl.envs.unwrap import agent_count
 from cprl.measuring.episodes import Episode, EpisodeTracker
+from cprl.measuring.institutional import institutions_of
 
 Policy = Callable[[TensorDictBase], TensorDictBase]
 
@@ -37,7 +38,8 @@ def evaluate(env: EnvBase, policy: Policy, *, explore: bool = False) -> list[Epi
         raise arguments.refusal("policy", policy, "a function that writes the actions of all agents")
     arguments.switch("explore", explore)
     is_commons = isinstance(env, CommonsEnv)
-    tracker = EpisodeTracker(worlds, agents, env.game.rules.episode_steps if is_commons else None)
+    longest = env.game.rules.episode_steps if is_commons else None
+    tracker = EpisodeTracker(worlds, agents, longest, institutions=institutions_of(env))
     exploration = ExplorationType.RANDOM if explore else ExplorationType.DETERMINISTIC
     episodes: dict[int, Episode] = {}
     with torch.no_grad(), set_exploration_type(exploration):

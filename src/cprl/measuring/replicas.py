@@ -64,6 +64,37 @@ def social_metrics(episode: Episode) -> dict[str, float]:
     return {**episode.metrics, "stock_left": float(episode.stock_left)}
 
 
+def institution_metrics(episode: Episode) -> dict[str, float]:
+    """Each of "Institutions" in docs/metrics.md by name, NaN where undefined: `Episode.institutions`, and
+    what was decided, `in_force_0` and so on. Empty for a game without institutions."""
+    arguments.object_of("episode", episode, Episode, "an Episode")
+    in_force: list[float] = [] if episode.in_force is None else episode.in_force.tolist()
+    return {**episode.institutions, **{f"in_force_{nth}": value for nth, value in enumerate(in_force)}}
+
+
+def institution_measures(played: Mapping[int, Sequence[Episode]]) -> dict[str, Measured]:
+    """`institution_metrics` over replicas, by name, as `institutions/fines` and so on; empty for a game
+    without institutions.
+
+    Args:
+        played: episodes by replica.
+
+    Raises:
+        ValueError: see `over_replicas`.
+    """
+    by_replica = {
+        replica: [institution_metrics(episode) for episode in own]
+        for replica, own in _checked(played).items()
+    }
+    names = next((own[0] for own in by_replica.values() if own), {})
+    return {
+        f"institutions/{name}": over_replicas(
+            {replica: [metrics[name] for metrics in own] for replica, own in by_replica.items()}
+        )
+        for name in names
+    }
+
+
 def social_measures(played: Mapping[int, Sequence[Episode]]) -> dict[str, Measured]:
     """`social_metrics` over replicas, by name.
 

@@ -19,6 +19,10 @@ from cprl.measuring import social
 OPTIONAL: Final = ("harvest", "in_play", "fired", "hit_by", "tagged_by", "stock")
 """The optional entries, by the last part of their keys in `cprl.keys`; all but "stock" are in "agents"."""
 
+OF_INSTITUTIONS: Final = ("fines", "transfers", "violated", "counts", "in_force")
+"""The entries of games with institutions, likewise; all but "in_force" are in "agents". A game without
+institutions has none of them and lacks nothing."""
+
 METRICS: Final[Mapping[str, tuple[str, ...]]] = MappingProxyType(
     {name: social.NEEDS[name] for name in social.METRICS}
 )
@@ -38,20 +42,32 @@ FIELDS: Final[Mapping[str, tuple[str, ...]]] = MappingProxyType(
 )
 """The entries that each field of `Episode` needs; other fields need none."""
 
+INSTITUTIONAL: Final[Mapping[str, str]] = MappingProxyType(
+    {
+        "fines": "fines",
+        "transfers": "transfers",
+        "violations": "violated",
+        "counts": "counts",
+        "in_force": "in_force",
+    }
+)
+"""The entry of `OF_INSTITUTIONS` that each field of `Episode` about institutions needs."""
+
 
 def reported_by(env: EnvBase) -> tuple[str, ...]:
-    """The entries of `OPTIONAL` in the specs of an environment, transforms included."""
+    """The entries of `OPTIONAL` and `OF_INSTITUTIONS` in the specs of an environment, transforms included."""
     object_of("env", env, EnvBase, "a TorchRL environment")
     found = set(env.observation_spec.keys(include_nested=True))
-    return tuple(name for name in OPTIONAL if {name, (keys.AGENTS, name)} & found)
+    return tuple(name for name in (*OPTIONAL, *OF_INSTITUTIONS) if {name, (keys.AGENTS, name)} & found)
 
 
 def reported_in(tensordict: TensorDictBase) -> tuple[str, ...]:
-    """The entries of `OPTIONAL` in a batch: in_play at the root, the others under "next"."""
+    """The entries of `OPTIONAL` and `OF_INSTITUTIONS` in a batch: in_play at the root, the others under
+    "next"."""
     object_of("tensordict", tensordict, TensorDictBase, "a TensorDict")
-    places: dict[str, Any] = {name: ("next", keys.AGENTS, name) for name in OPTIONAL}
-    places |= {"in_play": keys.IN_PLAY, "stock": ("next", keys.STOCK)}
-    return tuple(name for name in OPTIONAL if tensordict.get(places[name], None) is not None)
+    places: dict[str, Any] = {name: ("next", keys.AGENTS, name) for name in (*OPTIONAL, *OF_INSTITUTIONS)}
+    places |= {"in_play": keys.IN_PLAY, "stock": ("next", keys.STOCK), "in_force": ("next", keys.IN_FORCE)}
+    return tuple(name for name, place in places.items() if tensordict.get(place, None) is not None)
 
 
 def available(needs: Mapping[str, tuple[str, ...]], reported: Collection[str]) -> tuple[str, ...]:

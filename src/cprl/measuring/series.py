@@ -1,16 +1,19 @@
 """Joins the numbers of each episode over all replicas, once every replica has ended it."""
 
 from collections.abc import Mapping, Sequence
-from typing import Any
+from typing import Any, Final
 
 import numpy as np
 from numpy.typing import NDArray
 
 from cprl import arguments
 from cprl.measuring.episodes import Episode
-from cprl.measuring.replicas import social_metrics
+from cprl.measuring.replicas import institution_metrics, social_metrics
 
 Values = NDArray[np.float64]
+
+OF_AGENTS: Final = ("fines", "transfers", "violations")
+"""The fields of an episode that are numbers of each agent, where the game has institutions."""
 
 
 def numbers_of(episode: Episode, learning: Mapping[str, float], agents: Sequence[str]) -> dict[str, float]:
@@ -24,6 +27,10 @@ def numbers_of(episode: Episode, learning: Mapping[str, float], agents: Sequence
     numbers = {f"social/{name}": value for name, value in social_metrics(episode).items()}
     for agent, value in zip(agents, episode.return_, strict=True):
         numbers[f"{agent}/return"] = float(value)
+    numbers |= {f"institutions/{name}": value for name, value in institution_metrics(episode).items()}
+    for name in OF_AGENTS:
+        if (values := getattr(episode, name)) is not None:
+            numbers |= {f"{agent}/{name}": float(own) for agent, own in zip(agents, values, strict=True)}
     named = {f"agent_{index}": agent for index, agent in enumerate(agents)}
     for name, value in learning.items():
         of, slash, what = name.partition("/")

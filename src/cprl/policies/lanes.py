@@ -29,6 +29,7 @@ class LaneActor(TensorDictModuleBase):
         seeds: the exploration seed of each lane.
         agents: the number of agents S of each replica.
         worlds: the number of worlds k of each replica that are played at once, consecutive in the batch.
+        first: makes the function `values` of the first replica's lanes alone, [S, k, ...] to [S, k, A].
         compile: whether torch compiles exploration; if that fails, the actor warns once and runs uncompiled.
 
     Raises:
@@ -48,6 +49,7 @@ class LaneActor(TensorDictModuleBase):
         agents: int,
         worlds: int = 1,
         stochastic: bool = False,
+        first: Callable[[], Callable[[Tensor], Tensor]] | None = None,
         compile: bool = False,
     ) -> None:
         super().__init__()
@@ -58,6 +60,7 @@ class LaneActor(TensorDictModuleBase):
         # A tensor, because compiled code treats other numbers as constants.
         self._chance = 0.0 if stochastic else 1.0
         self._epsilon = torch.tensor(self._chance, dtype=torch.float64)
+        self._seeds, self._first = seeds, first
         self.rng = LaneRng(seeds, 2 * self.worlds)
         self._explore = Compiled(LaneActor._explored, what="agents act", enabled=compile)
 
@@ -78,6 +81,22 @@ class LaneActor(TensorDictModuleBase):
             arguments.number("epsilon", chance, low=0, high=1, allowed="0..1")
             self._epsilon.fill_(chance)
             object.__setattr__(self, "_chance", chance)
+
+    def of_first_replica(self) -> "LaneActor | None":
+        """An actor of the first replica's agents alone, with the same weights and exploration, and their own
+        random numbers from the start; None where `values` are not known for them alone."""
+        if self._first is None:
+            return None
+        actor = LaneActor(
+            self._first(),
+            self.actions,
+            seeds=self._seeds[: self.agents],
+            agents=self.agents,
+            worlds=self.worlds,
+            stochastic=self.stochastic,
+        )
+        actor.epsilon = self.epsilon
+        return actor
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Writes "action", int64 [R x k, S], for "observation" [R x k, S, C, X, Y]."""

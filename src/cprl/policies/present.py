@@ -12,6 +12,7 @@ from torchrl.envs.utils import ExplorationType, set_exploration_type
 from cprl.compat import unchecked_tensordict
 from cprl.policies.assignment import AgentIndices, AgentPolicies
 from cprl.policies.decisions import Decider
+from cprl.policies.lanes import LaneActor
 
 
 class FirstReplica(TensorDictModuleBase):
@@ -66,11 +67,16 @@ class PresentPolicy:
         replicas: int,
         device: torch.device | None = None,
     ) -> None:
-        first = {agents: FirstReplica(own, replicas) for agents, (own, _) in learned.items()}
         self._decisions = decisions
         own_decisions = None if decisions is None else decisions[0]
+        first: dict[AgentIndices, nn.Module] = {}
+        pairs: list[tuple[Any, Any]] = []
+        for agents, (own, training) in learned.items():
+            alone = own.of_first_replica() if isinstance(own, LaneActor) and own.worlds == 1 else None
+            first[agents] = FirstReplica(own, replicas) if alone is None else alone
+            pairs.append((own if alone is None else alone, training))
         self._policy = AgentPolicies({**first, **others}, decisions=own_decisions)
-        self._pairs = [pair for pair in learned.values() if _has_epsilon(pair[0])]
+        self._pairs = [pair for pair in pairs if _has_epsilon(pair[0])]
         self._evaluation = [own.epsilon for own, _ in self._pairs]
         self._devices = [device] if device is not None and device.type == "cuda" else []
         self.is_trained = False
@@ -94,7 +100,7 @@ class PresentPolicy:
         ("agents", "decision")."""
         self.explore_as_now()
         with torch.no_grad(), set_exploration_type(ExplorationType.RANDOM):
-            return self._policy(carried)
+            return self._policy.forward(carried)  # calling a module takes as long as a small network
 
     def apart(self) -> Any:
         """A context in which nothing changes torch's generators for the rest of the process."""

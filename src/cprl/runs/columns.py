@@ -6,6 +6,7 @@ from typing import Any, Final
 import numpy as np
 import pyarrow as pa
 
+from cprl.institutions import COUNTS
 from cprl.measuring import Episode, social
 from cprl.measuring.reported import left_out
 
@@ -21,7 +22,6 @@ COLUMNS: Final = {
     "shots": pa.int32(),
     "hits": pa.int32(),
     "tagged": pa.int32(),
-    "decision": pa.int32(),
     "stock_left": pa.int32(),
     "depletion_step": pa.int32(),
     "terminated": pa.bool_(),
@@ -33,27 +33,54 @@ no column; nor has the wanted return outside of a training. It is null for agent
 
 _WANTED: Final = "wanted_return"
 
+OF_INSTITUTIONS: Final = {
+    "decision": pa.int32(),
+    "fines": pa.float64(),
+    "transfers": pa.float64(),
+    "violations": pa.int32(),
+    **{name: pa.int32() for name in COUNTS if name != "violations"},
+}
+"""The columns of a game with institutions, between those of `COLUMNS` and the metrics; then one for each
+decision in force, `in_force_0` and so on, float64."""
+
 LEFT_OUT: Final = b"left_out"
 """The key of the schema's metadata whose value says which columns are left out, and why, if any are."""
 
 
 def whole_schema() -> pa.Schema:
     """All columns and metrics, for a table without an episode."""
-    return _schema(COLUMNS, social.METRICS)
+    return _schema(COLUMNS, (), social.METRICS)
 
 
-def _schema(columns: Iterable[str], metrics: Iterable[str]) -> pa.Schema:
-    return pa.schema({name: COLUMNS[name] for name in columns} | dict.fromkeys(metrics, pa.float64()))
+def _schema(columns: Iterable[str], more: Iterable[str], metrics: Iterable[str]) -> pa.Schema:
+    return pa.schema(
+        {name: COLUMNS[name] for name in columns}
+        | {name: OF_INSTITUTIONS.get(name, pa.float64()) for name in more}
+        | dict.fromkeys(metrics, pa.float64())
+    )
 
 
 def schema_of(episode: Episode) -> pa.Schema:
     """The columns that an episode has; the schema's metadata names those that it lacks."""
-    schema, missing = _schema(_columns_of(episode), episode.metrics), left_out(episode.reported)
+    schema = _schema(_columns_of(episode), _of_institutions(episode), episode.metrics)
+    missing = left_out(episode.reported)
     return schema.with_metadata({LEFT_OUT: missing}) if missing else schema
 
 
 def _columns_of(episode: Episode) -> list[str]:
     return [name for name in COLUMNS if getattr(episode, name, "") is not None]
+
+
+def _of_institutions(episode: Episode) -> dict[str, Any]:
+    """The values of the columns of institutions, [N] or a number; none for a game without them."""
+    payments = {"fines": episode.fines, "transfers": episode.transfers, "violations": episode.violations}
+    payments["decision"] = episode.decision
+    found = {**(episode.counts or {}), **{name: own for name, own in payments.items() if own is not None}}
+    in_force: list[float] = [] if episode.in_force is None else episode.in_force.tolist()
+    return {
+        **{name: found[name] for name in OF_INSTITUTIONS if name in found},
+        **{f"in_force_{nth}": value for nth, value in enumerate(in_force)},
+    }
 
 
 def rows_of(episodes: Sequence[Episode], replica: int | None, schema: pa.Schema) -> pa.RecordBatch:
@@ -99,6 +126,7 @@ def _cells(episode: Episode, replica: int) -> dict[str, Any]:
         "replica": replica,
         "agent": agents,
         "return": episode.return_,
+        **_of_institutions(episode),
         **episode.metrics,
     }
     return {name: np.broadcast_to(cell, agents.shape) for name, cell in cells.items()}

@@ -5,10 +5,14 @@ from typing import Any
 
 import numpy as np
 import pyarrow as pa
+import torch
 from numpy.typing import NDArray
 
+from cprl.institutions import COUNTS
 from cprl.measuring import phases, social
+from cprl.measuring.institutions import summary
 from cprl.measuring.published import SMOOTHED_EPISODES
+from cprl.runs.columns import OF_INSTITUTIONS
 from cprl.runs.episodes import read_episodes
 
 Values = NDArray[np.float64]
@@ -17,6 +21,9 @@ Phases = tuple[list[phases.ChangePoint], list[phases.Phase]]
 
 def curves_of(run: Path) -> dict[str, Values]:
     """Every metric that a run's game reports, and each agent's return as `return_0` and so on.
+
+    Those of institutions are there as `institutions/fines` and so on, but for the share of unjust tags, since
+    a table does not say who tagged, and for groups.
 
     Args:
         run: the run's directory.
@@ -45,7 +52,33 @@ def as_curves(table: pa.Table) -> dict[str, Values]:
         fill(name, name, everywhere & (agent == 0))
     for number in np.unique(agent):
         fill(f"return_{number}", "return", everywhere & (agent == number))
-    return curves
+    return curves | _of_institutions(table, (len(replicas), episodes), row, everywhere)
+
+
+def _of_institutions(
+    table: pa.Table, size: tuple[int, int], row: NDArray[Any], everywhere: NDArray[Any]
+) -> dict[str, Values]:
+    """The curves of institutions, [R, E] by name; none for a game without them."""
+    kept = [name for name in table.column_names if name in OF_INSTITUTIONS]
+    episode, agent = table["episode"].to_numpy(), table["agent"].to_numpy()
+    if not kept:
+        return {}
+
+    def values(name: str) -> torch.Tensor:
+        """A column as [R, E, N]."""
+        found = np.zeros((*size, int(agent.max()) + 1))
+        at = row[everywhere], episode[everywhere], agent[everywhere]
+        found[at] = table[name].to_numpy()[everywhere]
+        return torch.from_numpy(found)
+
+    others = ("harvest", "in_play_steps", "fines", "transfers", "violations")
+    given: dict[str, Any] = {name: values(name) for name in others if name in table.column_names}
+    if set(COUNTS) <= set(table.column_names):
+        given["counts"] = {name: values(name) for name in COUNTS}
+    curves = {name: found.numpy() for name, found in summary(**given).items()}
+    decided = [name for name in table.column_names if name.startswith("in_force_")]
+    curves |= {name: values(name)[..., 0].numpy() for name in decided}
+    return {f"institutions/{name}": curve for name, curve in curves.items()}
 
 
 def running_mean(values: Values, window: int = SMOOTHED_EPISODES) -> Values:

@@ -81,7 +81,7 @@ class LoggerCallback:
 
     A callback of `cprl.training`, and a context manager. The step of every number is the episode, counted
     from 0. An episode is written once all replicas have ended it: the mean over replicas as
-    `social/equality`, and with several replicas the social metrics and returns of each as
+    `social/equality`, and with several replicas the metrics and returns of each as
     `replica_0/social/equality`. Undefined values are not written, nor metrics that the game does not report,
     see `cprl.measuring.reported`.
 
@@ -126,7 +126,7 @@ class LoggerCallback:
         written = {name: mean_of(values) for name, values in of_all.items()}
         if self._series.replicas > 1:
             for name, values in of_all.items():
-                if name.startswith("social/") or name.endswith("/return"):
+                if name.startswith(("social/", "institutions/")) or name.endswith("/return"):
                     written |= {f"replica_{nth}/{name}": float(value) for nth, value in enumerate(values)}
         if self._steps:
             now, steps = time.perf_counter(), (self._steps - self._steps_then) * self._series.replicas

@@ -15,6 +15,7 @@ from cprl.measuring.episodes import Episode
 from cprl.measuring.names import title as metric_title
 from cprl.measuring.names import unit
 from cprl.measuring.published import PHASED_RECIPE, SMOOTHED_EPISODES
+from cprl.measuring.replicas import institution_metrics
 from cprl.plotting import style
 from cprl.plotting.bands import (
     STRIP_IN,
@@ -33,7 +34,9 @@ Values = NDArray[np.float64]
 
 PARTS: Final = 20
 """A running mean takes in at most one part in so many of a training, so that short ones keep their course."""
-HEIGHTS_IN: Final = (3.1, 1.7)
+HEIGHTS_IN: Final = (3.1, 1.7, 1.5, 1.5)
+OF_INSTITUTIONS: Final = ("institutions/violations", "institutions/fines")
+"""What has a panel in games with institutions."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -62,7 +65,7 @@ def training_curve(
     Every episode and replica is faint, the mean over replicas and its highest point bold. Running means are
     centred. Trainings of at least 1,000 episodes have their phases as bands behind the curves; those of the
     published curves stand above if the run repeats their experiment. A game without a harvest has one panel,
-    the return of all its agents.
+    the return of all its agents. Games with institutions have two more, violations and fines of all agents.
 
     Args:
         run: the run's directory.
@@ -112,22 +115,29 @@ def training_curve(
 
 
 def _panels(curves: dict[str, Values], random: list[Episode] | None) -> list[_Panel]:
-    """Collective return and survival; of a game without a harvest the return of all agents."""
+    """Collective return and survival, or the return of all agents of a game without a harvest; violations and
+    fines of a game with institutions."""
+    of_institutions = [_panel(name, curves[name], random) for name in OF_INSTITUTIONS if name in curves]
     if "collective_return" in curves:
-        return [_panel(name, curves[name], random) for name in ("collective_return", "survival_steps")]
+        shown = ("collective_return", "survival_steps")
+        return [*(_panel(name, curves[name], random) for name in shown), *of_institutions]
     returns = sum(curve for name, curve in curves.items() if name.startswith("return_"))
     level = fmean(float(episode.return_.sum()) for episode in random) if random else None
     values = np.asarray(returns)
-    return [
-        _Panel(name="return", title="return of all agents together", unit="", values=values, random=level)
-    ]
+    whole = _Panel(name="return", title="return of all agents together", unit="", values=values, random=level)
+    return [whole, *of_institutions]
 
 
 def _panel(name: str, values: Values, random: list[Episode] | None) -> _Panel:
-    if random and name not in random[0].metrics:
+    played = [{**one.metrics, **_of_institutions(one)} for one in random or ()]
+    if played and name not in played[0]:
         raise ValueError(f"random has episodes without {name}; allowed: episodes of the run's game")
-    level = fmean(episode.metrics[name] for episode in random) if random else None
+    level = fmean(metrics[name] for metrics in played) if played else None
     return _Panel(name=name, title=metric_title(name), unit=unit(name), values=values, random=level)
+
+
+def _of_institutions(episode: Episode) -> dict[str, float]:
+    return {f"institutions/{name}": value for name, value in institution_metrics(episode).items()}
 
 
 def _draw(axes: Axes, panel: _Panel, window: int, dashed: str) -> None:

@@ -15,6 +15,7 @@ from cprl.measuring.episodes import Episode
 from cprl.measuring.names import title as metric_title
 from cprl.measuring.replicas import social_metrics
 from cprl.measuring.reported import left_out
+from cprl.terminal.institutions import institutions_table
 from cprl.terminal.progress import console_of
 from cprl.viewer.streams import viewer
 
@@ -53,6 +54,9 @@ def summarise(
     if not played:
         raise ValueError("played is empty; allowed: the episodes of at least one policy")
     console.print(_table(title, played))
+    of_institutions = institutions_table(played, _mean)
+    if of_institutions is not None:
+        console.print(of_institutions)
     for line in _notes(played):
         console.print(line, soft_wrap=True, highlight=False, markup=False)
     if note:

@@ -12,7 +12,11 @@ Modules, in the order in which one reads them:
     wall       the boards of all replicas
     visits     where agents go
     turns      the stock over the turn
+    looks      the state of the worlds, noted now for the views to add up later
     lorenz     Lorenz curve and Gini coefficient
+    institutions       lines and tabs of games with institutions
+    institution_views  their regions on the board, and events
+    offences   in a replay: who breaks a rule, and what is paid
     decisions  in a replay: what each agent's policy says of its actions
     compiling  while code is compiled, the live header says so
     recorder   which episodes are recorded frame by frame
@@ -22,6 +26,7 @@ Modules, in the order in which one reads them:
     recipe     the recipe as a table
     names      files and ids of a run's recordings
     exhibition a world that the present policy plays, for viewers alone
+    live_board the exhibited board, as viewers get it
     streams    to a file, and served live
     sending    one stream, which may fail without harm
     page       the web viewer's page on 127.0.0.1, and recordings for it

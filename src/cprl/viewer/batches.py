@@ -1,11 +1,12 @@
 """Rows as columns: numbers and texts that wait for their batch, and the timelines of each row."""
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from typing import Any, Final, TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
 
+from cprl.compat import send_chunk
 from cprl.viewer.sending import FLUSH_TIMEOUT_S, Stream
 
 TIMELINES: Final = ("step", "episode", "frame")
@@ -24,6 +25,16 @@ def times(steps: Numbers, episodes: Numbers, frames: Numbers) -> list[Any]:
     ]
 
 
+def components(columns: Iterable[Any]) -> dict[Any, Any]:
+    """Columns of an archetype as `cprl.compat.send_chunk` takes them."""
+    return {own.component_descriptor(): own.as_arrow_array() for own in columns}
+
+
+def timelines(at: Iterable[Any]) -> dict[str, Any]:
+    """`times` as `cprl.compat.send_chunk` takes them."""
+    return {own.timeline_name(): own.as_arrow_array() for own in at}
+
+
 def log_now(recording: Any, name: str, what: Any, now: tuple[int, int, int]) -> None:
     """Logs one row that has no columns, such as a tensor, at a (step, episode, frame)."""
     for timeline, number in zip(TIMELINES, now, strict=True):
@@ -37,9 +48,12 @@ def send_waiting(stream: Stream) -> None:
     waiting = stream.take()
 
     def send(recording: Any) -> None:
+        known: dict[Any, dict[str, Any]] = {}  # most names have the same times
         for name, rows in waiting.items():
-            steps, episodes, frames, values = zip(*rows, strict=True)
-            recording.send_columns(name, times(steps, episodes, frames), _columns(values))
+            *at, values = zip(*rows, strict=True)
+            if tuple(at) not in known:
+                known[tuple(at)] = timelines(times(*at))
+            send_chunk(recording, name, known[tuple(at)], components(_columns(values)))
         recording.flush(timeout_sec=FLUSH_TIMEOUT_S)
 
     stream.do(send)

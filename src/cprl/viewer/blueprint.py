@@ -12,6 +12,7 @@ from collections.abc import Callable
 from typing import Any, Final, Literal
 
 from cprl.commons.colours import WINDOW_CAPTION
+from cprl.viewer import institutions
 from cprl.viewer.scenery import BACKGROUND, Curves, Scene
 from cprl.viewer.tabs import decisions, fates, places, row
 
@@ -67,8 +68,16 @@ def _laid_out(views: Any, *, timeline: str, play_state: Literal["playing", "foll
 
 
 def _replay(scene: Scene) -> Any:
-    """A large board, the agents' windows, and the harvest and stock of one episode, turn by turn."""
+    """A large board, the agents' windows, and the harvest and stock of one episode, turn by turn, and what
+    institutions take and give."""
     import rerun.blueprint as rrb
+
+    paid = [*_of(scene.agents, institutions.PAID), *_of(scene.agents, institutions.GIVEN)]
+    payments = (
+        [_plot("Fined (down) and given (up) in the turn, apples", *paid)]
+        if institutions.has_institutions(scene)
+        else []
+    )
 
     return rrb.Horizontal(
         rrb.Vertical(_world(), rrb.Tabs(_events(), _recipe(), active_tab=0), row_shares=[7, 2]),
@@ -77,7 +86,8 @@ def _replay(scene: Scene) -> Any:
             decisions(scene),
             _plot("Harvest so far, apples", *_of(scene.agents, "harvested")),
             _plot("Apples on the board", "turn/stock"),
-            row_shares=[4, 4, 2, 2],
+            *payments,
+            row_shares=[4, 4, 2, 2, *[2] * len(payments)],
         ),
         column_shares=[3, 2],
     )
@@ -147,6 +157,7 @@ def _plots(curves: Curves) -> Any:
     import rerun.blueprint as rrb
 
     tabs = [tab for make in _TABS if (tab := make(curves)) is not None]
+    tabs[2:2] = institutions.tabs(curves, _plot)
     return rrb.Tabs(*tabs, active_tab=0)
 
 

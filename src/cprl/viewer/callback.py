@@ -24,6 +24,7 @@ from cprl.viewer.compiling import CompilingNotice
 from cprl.viewer.contents import curves_of, missing_in
 from cprl.viewer.exhibition import Exhibited, Exhibition
 from cprl.viewer.header import has_died
+from cprl.viewer.institution_views import institution_views
 from cprl.viewer.logger import RerunLogger
 from cprl.viewer.names import FILE_NAME, free_name, recording_id
 from cprl.viewer.plots import Plots
@@ -119,7 +120,9 @@ class ViewerCallback:
         self._views = Views(
             commons, self.logger, curves if scene is None else scene, episodes=episodes, every=self.every
         )
+        self._institutions = institution_views(self.logger, commons)
         has_tags = curves.has_tags and len(self._agents) > 1
+        self._sampled = self._views.sampled
         self._tags = Tags(self.logger, len(self._agents)) if has_tags else None
         self._step = self._episode = 0
         self._shows_next = self._has_died = False
@@ -142,7 +145,7 @@ class ViewerCallback:
         Otherwise it only counts: reading a tensor each turn would cost a training some percent.
         """
         self._step += 1
-        if not self._is_recording and self._step % self._views.sampled:
+        if not self._is_recording and self._step % self._sampled:
             return  # nothing is due; whatever runs here displaces a training's data from the fast caches
         self._is_recording = self.is_shown
         if self.exhibition is not None:
@@ -168,6 +171,9 @@ class ViewerCallback:
         """Logs the numbers of an episode, and its events, once all replicas have ended it."""
         if episode.world == 0:
             self._log_death(episode)
+            if self._institutions is not None and episode.episode % self._views.every == 0:
+                self.logger.at(step=self._step, episode=episode.episode)
+                self._institutions.on_episode(episode)
             self._episode, self._shows_next = episode.episode + 1, False
         if self._tags is not None and episode.tagged_by is not None:
             self._tags.add(episode.tagged_by)

@@ -5,7 +5,7 @@ from typing import Final
 
 from torchrl.envs import EnvBase
 
-from cprl.measuring import phases
+from cprl.measuring import institutional, phases
 from cprl.measuring.reported import FIELDS, METRICS, available, left_out
 from cprl.viewer.scenery import Curves
 
@@ -37,6 +37,8 @@ def curves_of(env: EnvBase, agents: tuple[str, ...], reported: Sequence[str], *,
         metrics=metrics,
         has_phases=episodes >= phases.FEWEST_EPISODES and set(phases.METRICS) <= set(metrics),
         has_tags="tagged_by" in reported,
+        institutions=institutional.metrics_of(env, reported),
+        in_force=institutional.decisions_of(env) if "in_force" in reported else (),
     )
 
 

@@ -4,7 +4,6 @@ import time
 import warnings
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import AbstractContextManager
-from dataclasses import dataclass
 from functools import partial
 from threading import Event
 from typing import Any, Final, Protocol
@@ -17,9 +16,9 @@ from torchrl.envs import EnvBase, TransformedEnv
 from cprl.commons.game import Game
 from cprl.envs.state import load_transforms_state, transforms_state
 from cprl.envs.unwrap import commons_of
+from cprl.viewer.live_board import send_fixed, send_frames
 from cprl.viewer.recorder import FrameRecorder
-from cprl.viewer.scenery import BACKGROUND, Scene
-from cprl.viewer.stage import RIM_CELLS, board_columns, fixed
+from cprl.viewer.scenery import Scene
 from cprl.viewer.streams import Live
 
 STEPS_PER_S: Final = 11
@@ -35,13 +34,6 @@ longer than 0.9 ms, it plays fewer."""
 
 LONGEST_S: Final = 10.0
 """The longest time that a viewer sees the same board, if a step took exceptionally long."""
-
-_BOARD: Final = "world"
-"""Where the entities of the recorded board are."""
-
-_CAPTION_CELLS, _ROOM_CELLS = 0.4, 2.4
-"""The distances from the board to the caption and to the line that gives it room, in cells."""
-_THIN: Final = 0.01
 
 
 class Exhibited(Protocol):
@@ -105,7 +97,9 @@ class Exhibition:
         self._policy, self._env, self._trained, self._scene = policy, env, trained, scene
         self._live, self._clock, self._closing = live, clock, Event()
         self._wait = wait or self._closing.wait
-        self._recorder = FrameRecorder(commons, episodes=1, scene=scene, capacity=STEPS_PER_S)
+        self._recorder = FrameRecorder(
+            commons, episodes=1, scene=scene, capacity=STEPS_PER_S, has_windows=False
+        )
         self._carried: TensorDictBase | None = None
         self._due, self._count = clock(), STEPS_PER_S
         self.steps = 0
@@ -113,7 +107,7 @@ class Exhibition:
         self.is_over = live.stream is None or live.exhibition is None
         """Whether it has ended, because it failed or has no viewers."""
         if live.stream is not None:
-            live.stream.do(partial(_send_fixed, scene=scene))
+            live.stream.do(partial(send_fixed, scene=scene))
         self._send(_before_the_first_step(commons.game), 0)  # compiling may take half a minute
 
     def on_step(self, *, episode: int) -> None:
@@ -175,9 +169,8 @@ class Exhibition:
     def _send(self, frames: Mapping[str, NDArray[Any]], episode: int) -> None:
         if self._live.exhibition is not None:
             caption = caption_of(self._policy, episode)
-            self._live.exhibition.do(
-                partial(_send_frames, scene=self._scene, frames=frames, caption=caption, wait=self._wait)
-            )
+            shown = partial(send_frames, scene=self._scene, frames=frames, caption=caption)
+            self._live.exhibition.do(partial(shown, wait=self._wait, lasting_s=BATCH_S))
 
 
 def caption_of(policy: Exhibited, episode: int) -> str:
@@ -207,72 +200,3 @@ def _before_the_first_step(game: Game) -> dict[str, NDArray[Any]]:
         "harvested": np.zeros(agents, np.int32),
     }
     return {name: array[None] for name, array in one.items()}
-
-
-def _send_fixed(recording: Any, *, scene: Scene) -> None:
-    """Sends what never changes, to the server that keeps it for viewers that come later."""
-    import rerun as rr
-
-    for entity, parts in fixed(scene).items():
-        if entity.startswith(f"{_BOARD}/"):
-            recording.log(_renamed(entity), *parts, static=True)
-    low = scene.height + 2 * RIM_CELLS + _ROOM_CELLS
-    line = [(0.0, low), (scene.width + 2 * RIM_CELLS, low)]  # hidden; the view makes room for what it shows
-    room = rr.LineStrips2D([line], radii=_THIN, colors=[BACKGROUND])
-    recording.log("exhibition/room", room, static=True)
-
-
-def _send_frames(
-    recording: Any,
-    *,
-    scene: Scene,
-    frames: Mapping[str, NDArray[Any]],
-    caption: str,
-    wait: Callable[[float], bool],
-) -> None:
-    """Sends frames without a time, so that viewers keep the last alone, spread over `BATCH_S`."""
-    import rerun as rr
-
-    place = (scene.width / 2 + RIM_CELLS, scene.height + 2 * RIM_CELLS + _CAPTION_CELLS)
-    text = rr.Points2D([place], labels=[caption], show_labels=True, radii=_THIN, colors=[(255, 255, 255)])
-    recording.log("exhibition/caption", text, static=True)
-    count = len(frames["step"])
-    # Converted once for all frames: for each of them it would take most of the time of sending.
-    converted = [
-        (_renamed(entity), rows.tolist(), [_whole(column) for column in columns])
-        for entity, (rows, columns) in board_columns(scene, frames).items()
-    ]
-    for at in range(count):
-        for entity, rows, columns in converted:
-            if at in rows:
-                row = rows.index(at)
-                recording.send_columns(entity, [], [column.row(row) for column in columns])
-        if at + 1 < count and wait(BATCH_S / count):
-            return
-
-
-@dataclass(frozen=True)
-class _Column:
-    """A component of several frames, in place of `rerun.ComponentColumn`, from which it is."""
-
-    descriptor: Any
-    rows: Any
-    """A `pyarrow.ListArray` with a list for each frame."""
-
-    def row(self, number: int) -> "_Column":
-        return _Column(self.descriptor, self.rows.slice(number, 1))
-
-    def component_descriptor(self) -> Any:
-        return self.descriptor
-
-    def as_arrow_array(self) -> Any:
-        return self.rows
-
-
-def _whole(column: Any) -> _Column:
-    return _Column(column.component_descriptor(), column.as_arrow_array())
-
-
-def _renamed(entity: str) -> str:
-    """The name in the exhibition of an entity of the recorded board."""
-    return "exhibition" + entity.removeprefix(_BOARD)

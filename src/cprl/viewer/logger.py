@@ -111,7 +111,7 @@ class RerunLogger(Logger):
         self._streams += [file] if file else []
         if self._live:
             self._go_live(recording_id, layout(self.curves, live=True))
-        self._all(lambda recording: recording.send_recording_name(self.exp_name))
+        self.do(lambda recording: recording.send_recording_name(self.exp_name))
         self.log_static("/", classes(self.curves))
         for entity, style in lines(self.curves).items():
             self.log_static(entity, style)
@@ -121,7 +121,7 @@ class RerunLogger(Logger):
         if self.scene is not None:
             for entity, parts in fixed(self.scene).items():
                 self.log_static(entity, *parts)
-        self._all(lambda recording: recording.flush(timeout_sec=FLUSH_TIMEOUT_S))
+        self.do(lambda recording: recording.flush(timeout_sec=FLUSH_TIMEOUT_S))
         return [each.recording for each in self._streams]
 
     def _go_live(self, recording_id: str, blueprint: Any) -> None:
@@ -142,18 +142,18 @@ class RerunLogger(Logger):
         """How to watch live: "browser" and "native"; empty where it is not served."""
         return self.live.addresses
 
-    def _all(self, what: Callable[[Any], object], *, live_only: bool = False) -> None:
-        """Calls a function with each stream, or with that to viewers alone."""
+    def do(self, what: Callable[[Any], object], *, live_only: bool = False) -> None:
+        """Calls a function with each recording, or with that to viewers alone, in the thread that sends."""
         for each in self._streams:
             if isinstance(each, LiveStream) or not live_only:
                 each.do(what)
 
     def log_static(self, entity: str, *what: Any) -> None:
         """Logs archetypes that hold at all times."""
-        self._all(lambda recording: recording.log(entity, *what, static=True))
+        self.do(lambda recording: recording.log(entity, *what, static=True))
 
     def _send(self, entity: str, at: list[Any], what: Any, *, live_only: bool = False) -> None:
-        self._all(lambda recording: recording.send_columns(entity, at, what), live_only=live_only)
+        self.do(lambda recording: recording.send_columns(entity, at, what), live_only=live_only)
 
     @property
     def is_live(self) -> bool:
@@ -163,13 +163,11 @@ class RerunLogger(Logger):
     def log_row(self, name: str, what: Any) -> None:
         """Logs an archetype at the time set by `at`."""
         now = (*self._now, self.frames)
-        self._all(lambda recording: log_now(recording, name, what, now))
+        self.do(lambda recording: log_now(recording, name, what, now))
 
-    def log_columns(
-        self, name: str, at: tuple[Numbers, Numbers, Numbers], what: Any, *, live_only: bool = False
-    ) -> None:
-        """Logs rows at steps, episodes and frames of their own; `live_only` for viewers alone."""
-        self._send(name, times(*at), what, live_only=live_only)
+    def log_columns(self, name: str, at: tuple[Numbers, Numbers, Numbers], what: Any) -> None:
+        """Logs rows at steps, episodes and frames of their own."""
+        self._send(name, times(*at), what)
 
     def at(self, *, step: int, episode: int) -> None:
         """Sets the time of subsequent logs that have no step of their own."""
@@ -289,7 +287,7 @@ class RerunLogger(Logger):
         counts, edges = np.histogram(values, bins=bins)
         now = self._now[0] if step is None else int(step), self._now[1], self.frames
         bars = rr.BarChart(counts, abscissa=(edges[:-1] + edges[1:]) / 2)
-        self._all(lambda recording: log_now(recording, name, bars, now))
+        self.do(lambda recording: log_now(recording, name, bars, now))
 
     def flush(self) -> None:
         """Sends all buffered numbers to the file and to the viewer."""
@@ -300,7 +298,7 @@ class RerunLogger(Logger):
         """Gives the live view the layout of a run that has ended, with its phases."""
         if self.curves.has_phases:
             ended = layout(self.curves, live=True, ended=True)
-            self._all(lambda recording: recording.send_blueprint(ended), live_only=True)
+            self.do(lambda recording: recording.send_blueprint(ended), live_only=True)
 
     @property
     def is_served(self) -> bool:

@@ -7,7 +7,7 @@ from typing import Any, Final
 from cprl.measuring.episodes import Episode
 from cprl.measuring.recent import Recent
 from cprl.measuring.replicas import social_metrics
-from cprl.measuring.series import Values, mean_of
+from cprl.measuring.series import OF_AGENTS, Values, mean_of
 from cprl.viewer.logger import RerunLogger
 from cprl.viewer.scenery import RANDOM_PLAY, Curves
 
@@ -15,10 +15,16 @@ WINDOW: Final = 0.02
 """The share of the run's episodes whose mean is the bold line."""
 SHORTEST: Final = 10
 """Its episodes at least."""
+_WITH_MEAN: Final = tuple(f"/{name}" for name in ("return", *OF_AGENTS))
+
+
+def _of_institutions(episode: Episode) -> dict[str, float]:
+    return {f"institutions/{name}": value for name, value in episode.institutions.items()}
 
 
 class Plots:
-    """Logs the lines of each episode: social metrics and returns with a running mean, all else as it is.
+    """Logs the lines of each episode: social metrics, those of institutions and what agents get and pay
+    with a running mean, all else as it is.
 
     Args:
         logger: where they are logged.
@@ -35,8 +41,8 @@ class Plots:
 
     def random_play(self, episodes: Sequence[Episode]) -> None:
         """Sets the lines of random play: the mean of each metric in these episodes, where it is defined."""
-        metrics = [social_metrics(episode) for episode in episodes]
-        for name in self._curves.metrics:
+        metrics = [{**social_metrics(episode), **_of_institutions(episode)} for episode in episodes]
+        for name in (*self._curves.metrics, *(f"institutions/{own}" for own in self._curves.institutions)):
             defined = [own[name] for own in metrics if name in own and own[name] == own[name]]
             if defined:
                 self._random[name] = fmean(defined)
@@ -44,10 +50,10 @@ class Plots:
     def on_episode(self, of_all: Mapping[str, Values]) -> None:
         """Logs an episode at the logger's time: the numbers [R] of each name."""
         for name, values in of_all.items():
-            is_social = name.startswith("social/")
+            is_social = name.startswith(("social/", "institutions/"))
             singles = values.tolist() if is_social and len(values) > 1 else []
             line = [*singles, mean := mean_of(values)]
-            if is_social or name.endswith("/return"):
+            if is_social or name.endswith(_WITH_MEAN):
                 line.append(self._recent.setdefault(name, Recent(self.window)).add(mean))
             self._logger.log_lines(name, line)
         for name, mean in self._random.items():

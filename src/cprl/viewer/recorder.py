@@ -21,6 +21,7 @@ FRAMES_BYTES: Final = 45_000_000
 """The target size of a file's regular frames, about; the frames after new bests come on top."""
 
 _PERIOD_S: Final = 1.0
+_NO_WINDOWS: Final = np.zeros((0, 0, 0), np.uint8)
 _FEWEST_FRAMES: Final = 50
 """Frames are sent when an episode ends, or after a second if there are this many: each chunk has overhead."""
 
@@ -35,9 +36,18 @@ class FrameRecorder:
         episodes: the number of episodes of the run; determines how often frames are recorded.
         scene: the contents of the board.
         capacity: the largest number of frames to keep; by default an episode, at most 5,000.
+        has_windows: whether frames have the agents' windows; else these are empty.
     """
 
-    def __init__(self, env: CommonsEnv, *, episodes: int, scene: Scene, capacity: int | None = None) -> None:
+    def __init__(
+        self,
+        env: CommonsEnv,
+        *,
+        episodes: int,
+        scene: Scene,
+        capacity: int | None = None,
+        has_windows: bool = True,
+    ) -> None:
         game = env.game
         steps = game.rules.episode_steps
         self.env = env
@@ -47,8 +57,9 @@ class FrameRecorder:
             capacity or min(steps + 1, 5000),
             board=(game.map.height, game.map.width),
             sites=len(game.map.sites),
-            windows=(game.agents, *game.observation_shape),
+            windows=(game.agents, *(game.observation_shape if has_windows else (0, 0, 0))),
         )
+        self._has_windows = has_windows
         self._has_tags = scene.has_tags
         self._tagged_by = np.full(game.agents, -1, np.int32)
         self._sent = time.perf_counter()
@@ -80,7 +91,8 @@ class FrameRecorder:
         if not self._buffer.size:
             return None
         frames = self._buffer.take()
-        frames["windows"] = classes_seen(self.env.game, frames["windows"])
+        if self._has_windows:
+            frames["windows"] = classes_seen(self.env.game, frames["windows"])
         return frames
 
     def _remember_tags(self, batch: TensorDictBase) -> None:
@@ -94,7 +106,7 @@ class FrameRecorder:
         return Frame(
             beams=shown.board == BEAM,
             stock=shown.stock,
-            windows=shown.observation,
+            windows=shown.observation if self._has_windows else _NO_WINDOWS,
             row=shown.row,
             col=shown.col,
             heading=shown.heading,

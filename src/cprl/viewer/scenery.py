@@ -78,6 +78,10 @@ class Curves:
     """Whether phases are found when the run ends: it is long enough, and these metrics tell."""
     has_tags: bool = True
     """Whether the game reports who tagged whom."""
+    institutions: tuple[str, ...] = ()
+    """The metrics of institutions that the game reports, without the prefix `institutions/`."""
+    in_force: tuple[str, ...] = ()
+    """What is decided in an episode, in words, e.g. "the tax rate"."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -134,7 +138,7 @@ def lines(curves: Curves) -> dict[str, Any]:
     import rerun as rr
 
     styles = {
-        entity: _running(name, colour, curves.replicas)
+        entity: running(name, colour, curves.replicas)
         for entity, (name, colour) in SOCIAL.items()
         if entity.removeprefix("social/") in curves.metrics
     }
@@ -149,13 +153,13 @@ def lines(curves: Curves) -> dict[str, Any]:
             styles[f"{name}/{entity}"] = rr.SeriesLines(
                 names=[name], colors=[agent_colour(agent)], widths=[_RAW_WIDTH]
             )
-        styles[f"{name}/return"] = _running(name, agent_colour(agent), replicas=1)
+        styles[f"{name}/return"] = running(name, agent_colour(agent), replicas=1)
     return styles
 
 
-def _running(name: str, colour: tuple[int, int, int], replicas: int) -> Any:
+def running(name: str, colour: tuple[int, int, int], replicas: int, *, alone: bool = False) -> Any:
     """Thin, dark lines for each of several replicas, a faint one for their mean, and on top a bold one for
-    its running mean."""
+    its running mean; `alone` shows that one alone, where others share the plot."""
     import rerun as rr
 
     singles = replicas if replicas > 1 else 0
@@ -164,6 +168,7 @@ def _running(name: str, colour: tuple[int, int, int], replicas: int) -> Any:
         names=[*(f"replica {replica}" for replica in range(singles)), raw, f"{name}, running mean"],
         colors=[*[_darker(colour, _SINGLE_SHARE)] * singles, _darker(colour, _RAW_SHARE), colour],
         widths=[*[_SINGLE_WIDTH] * singles, _RAW_WIDTH, _RUNNING_WIDTH],
+        visible_series=[*[False] * (singles + 1), True] if alone else None,
     )
 
 

@@ -10,6 +10,7 @@ from cprl.measuring.episodes import Episode
 from cprl.viewer.axes import TITLE, Axes
 from cprl.viewer.header import has_died
 from cprl.viewer.logger import RerunLogger
+from cprl.viewer.looks import Looks
 from cprl.viewer.scenery import STATES
 
 POINTS: Final = 200
@@ -29,7 +30,7 @@ class Turns:
 
     def __init__(self, env: CommonsEnv, logger: RerunLogger) -> None:
         game, replicas = env.game, env.worlds.size
-        self._env, self._logger = env, logger
+        self._logger, self._looks = logger, Looks(env, ("step", "stock_left"))
         self.stride = ceil(game.rules.episode_steps / POINTS)
         """Turns from one point to the next."""
         self._every_replica = np.arange(replicas)
@@ -47,16 +48,22 @@ class Turns:
         logger.log_static("turn/axes/texts", texts)
 
     def on_step(self, step: int) -> None:
-        """Notes the stock of every replica, each at its own turn."""
+        """Notes the stock of every replica, each at its own turn, if it is time."""
         if step % self.stride:
             return
-        now, read = self._env.worlds.now, self._env.worlds.driver.read
-        turn = read(now.step)[:, 0]
+        self._looks.add()
+        if self._looks.is_full:
+            self._place()
+
+    def _place(self) -> None:
+        """Places the points that were noted, the latest last: it stays where two have the same place."""
+        turn, stock = (kept[..., 0] for kept in self._looks.take())
         point = self._every_replica, turn // self.stride
-        self._playing[(*point, 0)], self._playing[(*point, 1)] = turn, read(now.stock_left)[:, 0]
+        self._playing[(*point, 0)], self._playing[(*point, 1)] = turn, stock
 
     def on_episode(self, episode: Episode) -> None:
         """Ends the line of a replica."""
+        self._place()
         playing = self._playing[episode.world]
         points = playing[playing[:, 0] < episode.steps]
         end = [] if episode.stock_left is None else [(float(episode.steps), float(episode.stock_left))]
@@ -81,10 +88,12 @@ class Turns:
 
     def state_dict(self) -> dict[str, Any]:
         """The points of the running and of the last episodes."""
+        self._place()
         return {"playing": self._playing.tolist(), "ended": self._ended, "died": self._died}
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
         """Continues from a state that `state_dict` returned."""
+        self._looks.take()
         self._playing = np.array(state["playing"])
         self._ended = [[(turn, stock) for turn, stock in line] for line in state["ended"]]
         self._died = list(state["died"])

@@ -9,6 +9,7 @@ from cprl.commons.colours import GROUND, PALETTE, WALL, agent_colour
 from cprl.envs.commons_env import CommonsEnv
 from cprl.measuring.episodes import Episode
 from cprl.viewer.logger import RerunLogger
+from cprl.viewer.looks import Looks
 from cprl.viewer.panels import Panels
 from cprl.viewer.scenery import Scene
 
@@ -31,7 +32,7 @@ class Visits:
     """
 
     def __init__(self, env: CommonsEnv, logger: RerunLogger, *, scene: Scene) -> None:
-        self._env, self._logger = env, logger
+        self._logger, self._looks = logger, Looks(env, ("row", "col", "in_play"))
         self._size = scene.height, scene.width
         self._agents = np.arange(len(scene.agents)) * scene.height * scene.width
         self._counts = np.zeros(len(scene.agents) * scene.height * scene.width, np.int64)
@@ -45,12 +46,18 @@ class Visits:
         logger.log_static("visits/labels", self._panels.labels())
 
     def on_step(self, step: int) -> None:
-        """Counts where the agents in play are."""
+        """Notes where the agents are, if it is time."""
         if step % SAMPLED_EVERY:
             return
-        now, read = self._env.worlds.now, self._env.worlds.driver.read
-        cells = self._agents + read(now.row)[0] * self._size[1] + read(now.col)[0]
-        self._counts[cells] += read(now.in_play)[0]  # agents have cells of their own, so none is there twice
+        self._looks.add()
+        if self._looks.is_full:
+            self._count()
+
+    def _count(self) -> None:
+        """Counts where the agents in play were."""
+        row, col, in_play = (kept[:, 0] for kept in self._looks.take())
+        cells = self._agents + row * self._size[1] + col
+        self._counts += np.bincount(cells[in_play], minlength=len(self._counts))
 
     def on_episode(self, episode: Episode) -> None:
         """Notes how many episodes the first replica has ended."""
@@ -72,6 +79,7 @@ class Visits:
 
     def maps(self) -> Any:
         """The maps of the time since the last image: uint8 [N, H + 2, W + 2, 3], with a rim of wall."""
+        self._count()
         counts = self._counts.reshape(-1, *self._size)
         share = np.sqrt(counts / max(1, counts.max()))
         light = np.where(counts > 0, _DARKEST + (1 - _DARKEST) * share, 0.0)[..., None]
@@ -82,9 +90,11 @@ class Visits:
 
     def state_dict(self) -> dict[str, Any]:
         """The counts [N x H x W], and the episodes ended and logged."""
+        self._count()
         return {"counts": self._counts.tolist(), "ended": self._ended, "logged": self._logged}
 
     def load_state_dict(self, state: Mapping[str, Any]) -> None:
         """Continues from a state that `state_dict` returned."""
+        self._looks.take()
         self._counts[:] = state["counts"]
         self._ended, self._logged = int(state["ended"]), int(state["logged"])

@@ -1,6 +1,7 @@
 """Wall: the boards of all replicas side by side, at the same step of the training."""
 
 import time
+from functools import partial
 from itertools import chain
 from math import ceil
 from typing import Any, Final
@@ -8,8 +9,10 @@ from typing import Any, Final
 import numpy as np
 
 from cprl.commons.decoding import UNSEEN
+from cprl.compat import send_chunk
 from cprl.envs.commons_env import CommonsEnv
 from cprl.measuring.episodes import Episode
+from cprl.viewer.batches import components, timelines, times
 from cprl.viewer.header import has_died
 from cprl.viewer.logger import RerunLogger
 from cprl.viewer.panels import Panels
@@ -53,7 +56,7 @@ class Wall:
         """Steps from one row of the file to the next."""
         self._died = np.zeros(scene.replicas, np.bool_)
         self._rows: list[_Row] = []
-        self._began, self._sent = time.perf_counter(), 0.0
+        self._began = self._due = time.perf_counter()
         form = rr.SegmentationImage.from_fields(format=image_form(self._panels.shape), opacity=1.0)
         logger.log_static("wall/boards", form)
         logger.log_static("wall/labels", self._panels.labels())
@@ -63,10 +66,9 @@ class Wall:
         """Logs the boards if they are due; `frame` is the number of the recorded one, if any."""
         if frame is not None and step % self.stride == 0:
             self._rows.append(self._row(step, episode, frame))
-        elif self._logger.is_live:
-            now = time.perf_counter()
-            if now - self._sent > max(_LIVE_PERIOD_S, (now - self._began) / _LIVE_ROWS):
-                self._sent = now
+        elif (now := time.perf_counter()) > self._due:
+            self._due = now + max(_LIVE_PERIOD_S, (now - self._began) / _LIVE_ROWS)
+            if self._logger.is_live:
                 self._send([self._row(step, episode, self._logger.frames)], live_only=True)
 
     def on_episode(self, episode: Episode) -> None:
@@ -92,18 +94,7 @@ class Wall:
         return step, episode, frame, image, labels, outlines
 
     def _send(self, rows: list[_Row], *, live_only: bool = False) -> None:
-        import rerun as rr
-
-        steps, episodes, frames, images, labels, outlines = zip(*rows, strict=True)
-        at, replicas = (steps, episodes, frames), [self._scene.replicas] * len(rows)
-        flat = np.stack(images).reshape(len(rows), -1)
-        parts = {
-            "wall/boards": rr.SegmentationImage.columns(buffer=flat),
-            "wall/labels": rr.Points2D.columns(labels=list(chain(*labels))).partition(replicas),
-            "wall/died": rr.Boxes2D.columns(colors=np.concatenate(outlines)).partition(replicas),
-        }
-        for entity, columns in parts.items():
-            self._logger.log_columns(entity, at, columns, live_only=live_only)
+        self._logger.do(partial(_send_rows, rows=rows), live_only=live_only)
 
     def state_dict(self) -> list[bool]:
         """Whether each replica's last episode died; rows are sent first."""
@@ -114,3 +105,18 @@ class Wall:
     def load_state_dict(self, state: list[bool]) -> None:
         """Continues from a state that `state_dict` returned."""
         self._died = np.array(state, np.bool_)
+
+
+def _send_rows(recording: Any, *, rows: list[_Row]) -> None:
+    """Sends rows, for viewers in the thread that sends."""
+    import rerun as rr
+
+    steps, episodes, frames, images, labels, outlines = zip(*rows, strict=True)
+    at, replicas = timelines(times(steps, episodes, frames)), [len(labels[0])] * len(rows)
+    parts = {
+        "wall/boards": rr.SegmentationImage.columns(buffer=np.stack(images).reshape(len(rows), -1)),
+        "wall/labels": rr.Points2D.columns(labels=list(chain(*labels))).partition(replicas),
+        "wall/died": rr.Boxes2D.columns(colors=np.concatenate(outlines)).partition(replicas),
+    }
+    for entity, columns in parts.items():
+        send_chunk(recording, entity, at, components(columns))

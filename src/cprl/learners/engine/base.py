@@ -5,7 +5,8 @@ networks along a lane axis if it can, else it applies `torch.vmap` to the loss. 
 of loss modules. It is the reference, and the fallback for losses that work with neither.
 """
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
+from functools import partial
 from typing import Any, Protocol
 
 import torch
@@ -41,6 +42,10 @@ class Engine(Protocol):
             observation: k observations of each lane.
             part: which of an agent's networks, see `cprl.networks.agent.parts_of`; the first one acts.
         """
+
+    def first(self, lanes: int) -> Callable[[Tensor], Tensor]:
+        """`outputs` of the first l lanes alone: [l, k, ...] to [l, k, ...], with their weights as they are at
+        each call; takes the shorter the fewer they are."""
 
     def network_state(self, lane: int) -> Weights:
         """Copies of the current weights of one lane, as the state dict of its acting network."""
@@ -124,7 +129,11 @@ class ListEngine:
 
     def outputs(self, observation: Tensor, *, part: int = 0) -> Tensor:
         """See `Engine`."""
-        return torch.stack([own[part](seen) for own, seen in zip(self._parts, observation, strict=True)])
+        return stacked_outputs([own[part] for own in self._parts], observation)
+
+    def first(self, lanes: int) -> Callable[[Tensor], Tensor]:
+        """See `Engine`."""
+        return partial(stacked_outputs, [own[0] for own in self._parts[:lanes]])
 
     def copy_to_targets(self, which: Tensor) -> None:
         """See `Engine`."""
@@ -158,6 +167,11 @@ class ListEngine:
             loss.load_state_dict(own)
         for optimizer, own in zip(self._optimizers, state["adams"], strict=True):
             optimizer.load_state_dict(own)
+
+
+def stacked_outputs(networks: Sequence[nn.Module], observation: Tensor) -> Tensor:
+    """The outputs of several networks: [l, k, ...] to [l, k, ...]."""
+    return torch.stack([own(seen) for own, seen in zip(networks, observation, strict=True)])
 
 
 def is_finite(loss: LossModule, optimizer: torch.optim.Optimizer) -> bool:

@@ -1,7 +1,8 @@
 """FunctionalEngine: updates many independent learners in one compiled step."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from copy import deepcopy
+from functools import partial
 from typing import Any
 
 import torch
@@ -12,7 +13,7 @@ from cprl.compiling import Compiled
 from cprl.learners.buffer.gather import FIELDS, Horizon, gather
 from cprl.learners.buffer.sampler import LaneBuffer
 from cprl.learners.buffer.storage import LaneStorage
-from cprl.learners.engine.functional import FunctionalLoss, MakeLoss, Weights, stacked
+from cprl.learners.engine.functional import FunctionalLoss, MakeLoss, Weights, stacked, vmapped
 from cprl.learners.engine.optimizers import BETA_1, BETA_2, WITH_MEAN, WITH_SQUARE, change_weights, shortened
 from cprl.learners.settings import Optimizer
 from cprl.networks.agent import parts_of
@@ -68,7 +69,7 @@ class FunctionalEngine:
             for kept_by in (WITH_MEAN, WITH_SQUARE)
         )
         self.loss = FunctionalLoss(loss)
-        network = stack_lanes(networks) if lane_axis else deepcopy(networks[0])
+        self._one, network = networks[0], stack_lanes(networks) if lane_axis else deepcopy(networks[0])
         self._parts = list(parts_of(network).items())
         self._shared = {name: self.own[key] for name, key in names.items() if key in self.own}
         if lane_axis:  # acts with the same tensors that updates change
@@ -216,12 +217,18 @@ class FunctionalEngine:
         if not self._vmapped:
             given: Tensor = network(observation)
             return given
+        return vmapped(network, self._of_part(name), observation)
 
-        def output(weights: Weights, seen: Tensor) -> Tensor:
-            one: Tensor = torch.func.functional_call(network, weights, (seen,))
-            return one
-
-        return torch.vmap(output)(self._of_part(name), observation)
+    def first(self, lanes: int) -> Callable[[Tensor], Tensor]:
+        """See `Engine`."""
+        name, network = self._parts[0]
+        if self._vmapped:
+            weights = {key: value[:lanes] for key, value in self._of_part(name).items()}
+            return partial(vmapped, network, weights)
+        fewer, *_ = parts_of(stack_lanes([self._one] * lanes)).values()
+        for own, of_all in zip(fewer.parameters(), network.parameters(), strict=True):
+            own.requires_grad_(False).data = of_all.data[:lanes]  # the same memory, which updates change
+        return fewer
 
     def _of_part(self, name: str) -> Weights:
         """The weights of one of an agent's networks, by their names in that network."""

@@ -160,3 +160,13 @@ def stacked(networks: Sequence[nn.Module], make_loss: MakeLoss, *, lane_axis: bo
         {name: value for name, value in weights.items() if name not in learns},
         names,
     )
+
+
+def vmapped(network: nn.Module, weights: Weights, observation: Tensor) -> Tensor:
+    """The outputs of a network with the weights of each lane."""
+
+    def output(own: Weights, seen: Tensor) -> Tensor:
+        one: Tensor = torch.func.functional_call(network, own, (seen,))
+        return one
+
+    return torch.vmap(output)(weights, observation)

@@ -1,6 +1,7 @@
 """The agents of a learner as a plain list of stock parts of TorchRL and torch."""
 
 from collections.abc import Callable, Iterable, Mapping
+from functools import partial
 from typing import Any, Final
 
 import numpy as np
@@ -10,7 +11,7 @@ from torch import Tensor, nn
 from torchrl.data.replay_buffers import Sampler
 
 from cprl.arguments import callable_of, object_of
-from cprl.learners.engine.base import is_finite
+from cprl.learners.engine.base import is_finite, stacked_outputs
 from cprl.learners.engine.functional import MakeLoss, own_targets, total
 from cprl.learners.lanes import SAMPLING, WEIGHTS, Lanes
 from cprl.learners.settings import Optimizer
@@ -148,8 +149,11 @@ class StockAgents:
 
     def outputs(self, observation: Tensor, *, part: int = 0) -> Tensor:
         """The outputs of the current networks: [L, k, *shape] to [L, k, ...]; part 0 acts."""
-        pairs = zip(self.each, observation, strict=True)
-        return torch.stack([agent.parts[part](seen) for agent, seen in pairs])
+        return stacked_outputs([agent.parts[part] for agent in self.each], observation)
+
+    def first(self, lanes: int) -> Callable[[Tensor], Tensor]:
+        """`outputs` of the first agents alone."""
+        return partial(stacked_outputs, [agent.parts[0] for agent in self.each[:lanes]])
 
     def finite(self) -> Tensor:
         """Whether the weights, targets and optimiser state of each agent are finite, bool [L]."""

@@ -1,0 +1,505 @@
+"""What is measured of institutions: metrics worked by hand, what a tracker keeps, the table, the series."""
+
+import dataclasses
+
+import numpy as np
+import pytest
+import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from test_episodes import all_written_out, turn, written_out
+from torchrl.envs import StepCounter, TransformedEnv
+from torchrl.envs.utils import RandomPolicy
+
+from cprl import CommonsEnv, Game, Observation, Rules, maps
+from cprl.institutions import (
+    COUNTS,
+    Boundaries,
+    ClosedSeason,
+    GraduatedSanctions,
+    Institution,
+    Levies,
+    Mediation,
+    Monitoring,
+    Quota,
+    Sanctioner,
+    Tax,
+    Vote,
+)
+from cprl.measuring import EpisodeTracker, institutions, social
+from cprl.measuring.evaluate import evaluate
+from cprl.measuring.institutions import NEEDS, OF_GROUPS
+from cprl.measuring.replicas import institution_measures, social_measures
+from cprl.measuring.reported import OF_INSTITUTIONS, OPTIONAL, left_out
+from cprl.measuring.series import numbers_of
+from cprl.policies.lanes import random_agents
+from cprl.runs.columns import OF_INSTITUTIONS as COLUMNS
+from cprl.runs.curves import as_curves
+from cprl.runs.episodes import EpisodeTable, as_table, read_episodes
+from cprl.training import train
+
+NAN = float("nan")
+GROUPS = ((0, 1), (2, 3))
+# Four agents in one episode of 40 steps.
+HARVEST = torch.tensor([6.0, 2.0, 4.0, 0.0])
+FINES = torch.tensor([2.0, 0.0, 1.0, 0.0])
+TRANSFERS = torch.tensor([0.0, 1.0, 0.0, 2.0])
+IN_PLAY = torch.tensor([10, 10, 8, 4])
+TAGS = torch.tensor([2, 1, 1, 0])
+COUNTED = {
+    "own_bites": [5, 2, 3, 0],
+    "foreign_bites": [1, 0, 1, 0],
+    "trespasses": [2, 0, 3, 0],
+    "excess_bites": [1, 0, 0, 0],
+    "closed_bites": [0, 0, 2, 0],
+    "unjust_tags": [1, 0, 0, 0],
+    "violations": [3, 0, 5, 0],
+    "detections": [2, 0, 2, 0],
+    "sanctions": [2, 0, 1, 0],
+    "returns_to_violation": [1, 0, 3, 0],
+}
+BY_HAND = {
+    "fines": 3.0,
+    "transfers": 3.0,
+    "violations": 8.0,
+    "violations_per_step": 0.25,  # 8 / (10 + 10 + 8 + 4)
+    "trespasses": 5.0,
+    "excess_bites": 1.0,
+    "closed_bites": 2.0,
+    "own_share_of_bites": 10 / 12,
+    "detection_rate": 0.5,  # 4 of 8
+    "recidivism": 0.5,  # (1 + 3) of 8
+    "sanctions_per_violation": 0.375,  # 3 / 8
+    "unjust_share_of_tags": 0.25,  # 1 of 4
+    # net incomes 4, 3, 3, 2: gaps of pairs 1 + 1 + 2 + 0 + 1 + 1 = 6, twice; 1 - 12 / (2 * 4 agents * 12)
+    "net_equality": 0.875,
+    # (6, 2): 1 - 8 / (2 * 2 * 8) = 3/4; (4, 0): 1 - 8 / (2 * 2 * 4) = 1/2
+    "equality_within": 0.625,
+    "equality_between": 5 / 6,  # means 4 and 2: 1 - 4 / (2 * 2 * 6)
+    # (4, 3): 1 - 2 / (2 * 2 * 7) = 13/14; (3, 2): 1 - 2 / (2 * 2 * 5) = 9/10
+    "net_equality_within": (13 / 14 + 9 / 10) / 2,
+    "net_equality_between": 11 / 12,  # means 3.5 and 2.5: 1 - 2 / (2 * 2 * 6)
+}
+
+
+def counts(**own):
+    return {name: torch.tensor(own.get(name, COUNTED[name])) for name in COUNTS}
+
+
+def whole(**own):
+    given = {
+        "harvest": HARVEST,
+        "fines": FINES,
+        "transfers": TRANSFERS,
+        "violations": counts()["violations"],
+        "counts": counts(),
+        "in_play_steps": IN_PLAY,
+        "tags": TAGS,
+        "groups": GROUPS,
+    }
+    return institutions.summary(**{**given, **own})
+
+
+def values(metrics):
+    return {name: value.item() for name, value in metrics.items()}
+
+
+def test_each_metric_is_what_we_work_out_by_hand():
+    assert values(whole()) == pytest.approx(BY_HAND, rel=1e-15)
+    assert list(whole()) == list(NEEDS) == list(BY_HAND)
+    assert all(value.dtype == torch.float64 and value.shape == () for value in whole().values())
+
+
+def test_the_harvest_is_set_against_what_grows_back():
+    # 12 apples / (0.5 a step * 40 steps)
+    share = institutions.harvest_over_yield(HARVEST, torch.tensor(40), 0.5)
+    assert share.item() == pytest.approx(0.6)
+    assert institutions.harvest_over_yield(HARVEST, torch.tensor(40), 0).isnan()
+
+
+def test_batch_axes_come_through():
+    twice = {
+        "harvest": torch.stack([HARVEST, 2 * HARVEST]),
+        "fines": torch.stack([FINES, FINES]),
+        "transfers": torch.stack([TRANSFERS, TRANSFERS]),
+        "violations": None,
+        "in_play_steps": None,
+        "counts": None,
+        "tags": None,
+    }
+    found = whole(**twice)
+    assert {value.shape for value in found.values()} == {(2,)}
+    assert found["net_equality"][0].item() == BY_HAND["net_equality"]
+    assert found["equality_within"].tolist() == pytest.approx([0.625, 0.625]), "no matter in which unit"
+
+
+def test_where_nothing_happened_shares_are_undefined_and_totals_are_zero():
+    nothing = torch.zeros(4)
+    found = values(
+        whole(
+            harvest=nothing,
+            fines=nothing,
+            transfers=nothing,
+            violations=nothing,
+            in_play_steps=nothing,
+            tags=nothing,
+            counts=dict.fromkeys(COUNTS, nothing),
+        )
+    )
+    totals = {"fines", "transfers", "violations", "trespasses", "excess_bites", "closed_bites"}
+    assert {name for name, value in found.items() if value == 0} == totals
+    assert all(np.isnan(value) for name, value in found.items() if name not in totals)
+
+
+def test_a_group_without_income_is_left_out_of_the_mean_within():
+    found = whole(harvest=torch.tensor([6.0, 2.0, 0.0, 0.0]))
+    assert found["equality_within"].item() == 0.75
+    assert institutions.equality_within(torch.tensor([6.0, 2.0, 0.0, 0.0]), GROUPS)[1].isnan()
+    assert found["equality_between"].item() == 0.5, "means 4 and 0: one of two has everything"
+
+
+def test_the_equality_of_incomes_below_zero_is_undefined():
+    assert institutions.equality(torch.tensor([3.0, -1.0])).isnan()
+    assert institutions.equality(torch.tensor([3.0, 3.0])).item() == 1
+
+
+def test_a_tenth_paid_ten_times_in_float32_leaves_an_income_of_zero():
+    paid = torch.full((10,), 0.1).double().sum()  # 1.0000000149
+    net = institutions.net_income(torch.ones(1), paid[None], torch.zeros(1))
+    assert net.tolist() == [0.0]
+
+
+@settings(max_examples=50, deadline=None)
+@given(st.lists(st.integers(0, 50), min_size=1, max_size=6))
+def test_net_equality_without_payments_is_equality(apples):
+    harvest = torch.tensor(apples, dtype=torch.float64)
+    none = torch.zeros_like(harvest)
+    net = institutions.equality(institutions.net_income(harvest, none, none))
+    assert torch.equal(
+        net,
+        social.equality(harvest[None]),
+    ) or (net.isnan() and not harvest.any())
+
+
+@settings(max_examples=50, deadline=None)
+@given(st.lists(st.integers(0, 50), min_size=2, max_size=6), st.integers(1, 9))
+def test_one_group_of_all_is_as_unequal_as_all(apples, unit):
+    income = torch.tensor(apples, dtype=torch.float64) / unit
+    within = institutions.equality_within(income, [range(len(apples))])
+    assert torch.equal(within[0].nan_to_num(-1), institutions.equality(income).nan_to_num(-1))
+
+
+@pytest.mark.parametrize(
+    ("call", "message"),
+    [
+        (lambda: institutions.total("fines", [1.0]), "fines is a list; allowed: a torch tensor of numbers"),
+        (lambda: institutions.total("fines", FINES > 0), "fines is torch.bool; allowed: a torch tensor"),
+        (lambda: institutions.total("fines", torch.zeros(2, 0)), r"fines is \[2, 0\]; allowed: \[..., N\]"),
+        (lambda: institutions.total("fines", -FINES), "fines holds a number below 0, NaN or infinity"),
+        (lambda: institutions.equality(FINES / 0), "income holds NaN or infinity; allowed: finite"),
+        (lambda: institutions.detection_rate(TAGS, TAGS[None]), r"axes are \[\] and \[1\]; allowed: equal"),
+        (
+            lambda: institutions.net_income(HARVEST, FINES[:1], FINES),
+            r"\[4\], \[1\], \[4\]\]; allowed: equal",
+        ),
+        (
+            lambda: whole(groups=((0, 1), (2,))),
+            r"groups is \(\(0, 1\), \(2,\)\); allowed: the agents of each",
+        ),
+        (lambda: whole(groups=((0, 1), (1, 2, 3))), "groups is .*; allowed: .*, each of 0 to 3 once"),
+        (lambda: whole(groups=((0, 1), (2, 3), ())), "groups is .*; allowed: .*, each of 0 to 3 once"),
+        (lambda: whole(groups=((0, 1), (2, 4))), "an agent of groups is 4; allowed: an integer from 0 to 3"),
+        (lambda: whole(groups=3), "groups is 3; allowed: the agents of each group"),
+        (
+            lambda: EpisodeTracker(1, 2, institutions=[Levies(groups=((0,),))]),
+            r"groups is \(\(0,\),\); allow",
+        ),
+        (lambda: EpisodeTracker(1, 2, institutions=["Tax"]), r"institutions\[0\] is 'Tax'; allowed: a value"),
+        (lambda: institutions.harvest_over_yield(HARVEST, torch.tensor(4), -1), "sustainable_yield is -1; "),
+        (lambda: institutions.harvest_over_yield(HARVEST, TAGS, 1), r"steps is \[4\]; allowed: \[\]"),
+    ],
+)
+def test_what_does_not_fit_is_refused_in_one_sentence(call, message):
+    with pytest.raises(ValueError, match=message):
+        call()
+
+
+def paying(*, worlds=1, in_force=None, counted=None, **entries):
+    """A turn of `test_episodes.turn` with the entries of institutions, which nobody breaks or pays but for
+    what is said; counts are (name, agent): number of the first world."""
+    own = {name: entries.pop(name, [[0, 0]] * worlds) for name in ("fines", "transfers", "violated")}
+    batch = turn(worlds=worlds, **entries)
+    agents = batch["next", "agents"]
+    for name, value in own.items():
+        agents[name] = torch.tensor(value, dtype=torch.bool if name == "violated" else torch.float32)
+    agents["counts"] = torch.zeros(worlds, 2, len(COUNTS), dtype=torch.int32)
+    for (name, agent), number in (counted or {}).items():
+        agents["counts"][0, agent, COUNTS.index(name)] = number
+    if in_force is not None:
+        batch["next", "in_force"] = torch.tensor(in_force, dtype=torch.float32)
+    return batch
+
+
+def an_episode():
+    """Three turns: agent 1 breaks a rule in the first two, is detected and fined in the second."""
+    harvest = {"harvest": [[2, 2]]}
+    seen = {("violations", 1): 2, ("foreign_bites", 1): 2, ("own_bites", 0): 2, ("detections", 1): 1}
+    return (
+        paying(violated=[[0, 1]], **harvest, in_force=[[0.25]], counted={("violations", 1): 1}),
+        paying(violated=[[0, 1]], **harvest, fines=[[0, 1.5]], transfers=[[0.75, 0.75]], in_force=[[9]]),
+        paying(fines=[[0.5, 0]], counted=seen, in_force=[[9]], done=[[True]]),
+    )
+
+
+def played(*turns, **options):
+    tracker = EpisodeTracker(turns[0].batch_size[0], 2, 10, **options)
+    return [episode for batch in turns for episode in tracker.add(batch)]
+
+
+def test_an_episode_has_what_was_paid_broken_counted_and_decided():
+    (episode,) = played(*an_episode())
+    assert episode.fines.tolist() == [0.5, 1.5]
+    assert episode.transfers.tolist() == [0.75, 0.75]
+    assert episode.violations.tolist() == [0, 2]
+    assert list(episode.counts) == list(COUNTS)
+    assert episode.counts["foreign_bites"].tolist() == [0, 2], "those of the last turn"
+    assert episode.in_force.tolist() == [0.25], "that of the first turn"
+    assert episode.reported == (*OPTIONAL, *OF_INSTITUTIONS)
+    assert left_out(episode.reported) == ""
+    found = episode.institutions
+    assert set(NEEDS) - set(found) == set(OF_GROUPS)
+    assert (found["fines"], found["transfers"], found["violations"]) == (2.0, 1.5, 2.0)
+    assert found["violations_per_step"] == 2 / 6, "three turns of two agents"
+    assert (found["own_share_of_bites"], found["detection_rate"], found["recidivism"]) == (0.5, 0.5, 0.0)
+    assert np.isnan(found["unjust_share_of_tags"])
+    # net incomes 4 - 0.5 + 0.75 = 4.25 and 4 - 1.5 + 0.75 = 3.25: 1 - 2 / (2 * 2 * 7.5)
+    assert found["net_equality"] == pytest.approx(1 - 2 / 30)
+    assert episode.metrics["equality"] == 1.0, "of the harvest alone"
+
+
+def test_with_groups_inequality_within_and_between_them_is_measured():
+    (episode,) = played(*an_episode(), institutions=[Levies(groups=((0,), (1,)))])
+    assert episode.institutions["net_equality_within"] == 1.0
+    assert episode.institutions["net_equality_between"] == pytest.approx(1 - 2 / 30)
+
+
+def test_a_game_without_institutions_is_as_it_was():
+    (episode,) = played(turn(done=[[True]]))
+    assert (episode.fines, episode.counts, episode.in_force, episode.institutions) == (None, None, None, {})
+    assert not set(as_table([episode], 0).column_names) & set(COLUMNS)
+    assert not [name for name in numbers_of(episode, {}, ["a", "b"]) if "institutions" in name]
+    assert institution_measures({0: [episode]}) == {}
+    assert not {"fines", "counts"} & set(EpisodeTracker(1, 2).state_dict())
+
+
+def test_each_world_pays_for_itself_and_starts_anew():
+    first = paying(worlds=2, fines=[[1, 0], [0, 2]], done=[[True], [False]], in_force=[[1], [2]])
+    second = paying(worlds=2, fines=[[0, 4], [0, 8]], done=[[True], [True]], in_force=[[3], [4]])
+    episodes = played(first, second)
+    assert [episode.fines.tolist() for episode in episodes] == [[1, 0], [0, 4], [0, 10]]
+    assert [episode.in_force.tolist() for episode in episodes] == [[1], [3], [2]]
+
+
+def test_a_tracker_goes_on_exactly_from_its_state(tmp_path):
+    first, second, third = an_episode()
+    tracker = EpisodeTracker(1, 2, 10, institutions=[Levies(groups=((0,), (1,)))])
+    tracker.add(first)
+    torch.save(tracker.state_dict(), tmp_path / "tracker.pt")
+    expected = all_written_out(tracker, [second, third, *an_episode()])
+    for begun in (False, True):
+        other = EpisodeTracker(1, 2, 10, institutions=[Levies(groups=((0,), (1,)))])
+        if begun:
+            other.add(second)
+        other.load_state_dict(torch.load(tmp_path / "tracker.pt"))
+        assert all_written_out(other, [second, third, *an_episode()]) == expected
+
+
+def test_a_state_of_another_game_is_refused():
+    tracker = EpisodeTracker(1, 2, 10)
+    tracker.add(an_episode()[0])
+    without = EpisodeTracker(1, 2, 10)
+    without.add(turn())
+    with pytest.raises(ValueError, match="the state is from a game that reports"):
+        without.load_state_dict(tracker.state_dict())
+    two_votes = EpisodeTracker(1, 2, 10)
+    two_votes.add(paying(in_force=[[1, 2]]))
+    with pytest.raises(ValueError, match=r'"in_force" of the state is \[1, 1\]; allowed: \[1, 2\]'):
+        two_votes.load_state_dict(tracker.state_dict())
+
+
+def test_entries_that_do_not_fit_are_named():
+    wrong = paying()
+    wrong["next", "agents", "counts"] = torch.zeros(1, 2, 3, dtype=torch.int32)
+    with pytest.raises(ValueError, match='"counts" of the batch has 3 columns; allowed: 10, own_bites, '):
+        EpisodeTracker(1, 2, 10).add(wrong)
+    tracker = EpisodeTracker(1, 2, 10)
+    tracker.add(paying(in_force=[[1]]))
+    with pytest.raises(ValueError, match=r"the batch lacks \(next, in_force\)"):
+        tracker.add(paying())
+    lacks = paying(in_force=[[1]])
+    del lacks["next", "agents", "fines"]
+    with pytest.raises(ValueError, match=r"the batch lacks \(next, agents, fines\)"):
+        tracker.add(lacks)
+
+
+def test_a_game_that_pays_without_counting_has_the_metrics_of_payments():
+    batch = an_episode()[2]
+    del batch["next", "agents", "counts"]
+    del batch["next", "agents", "violated"]
+    (episode,) = played(batch)
+    assert (episode.violations, episode.counts) == (None, None)
+    assert list(episode.institutions) == ["fines", "transfers", "net_equality"]
+    assert [name for name in as_table([episode], 0).column_names if name in COLUMNS] == ["fines", "transfers"]
+
+
+def test_the_table_has_a_column_for_each_number_and_keeps_it(tmp_path):
+    (episode,) = played(*an_episode())
+    with EpisodeTable(tmp_path / "episodes.parquet") as table:
+        table.add(episode)
+    kept = read_episodes(tmp_path)
+    expected = ["terminated", *COLUMNS, "in_force_0", "collective_return"]
+    first = kept.column_names.index("terminated")
+    assert kept.column_names[first : first + len(expected)] == expected
+    assert kept["fines"].to_pylist() == [0.5, 1.5]
+    assert kept["violations"].to_pylist() == [0, 2]
+    assert kept["own_bites"].to_pylist() == [2, 0]
+    assert kept["in_force_0"].to_pylist() == [0.25, 0.25]
+    assert set(kept.column_names) - set(expected) <= set(
+        as_table(played(turn(done=[[True]])), 0).column_names
+    )
+
+
+def test_curves_have_the_metrics_of_the_table():
+    (episode,) = played(*an_episode())
+    curves = as_curves(as_table([episode], 0))
+    for name, value in episode.institutions.items():
+        if name != "unjust_share_of_tags":  # a table does not say who tagged
+            np.testing.assert_allclose(curves[f"institutions/{name}"], [[value]], err_msg=name)
+    assert curves["institutions/in_force_0"].tolist() == [[0.25]]
+    assert not any("inst" in name for name in as_curves(as_table(played(turn(done=[[True]])), 0)))
+
+
+def test_the_logged_numbers_are_those_of_the_episode():
+    (episode,) = played(*an_episode())
+    numbers = numbers_of(episode, {}, ["ann", "bob"])
+    assert numbers["institutions/detection_rate"] == 0.5
+    assert numbers["institutions/in_force_0"] == 0.25
+    assert (numbers["ann/fines"], numbers["bob/transfers"], numbers["bob/violations"]) == (0.5, 0.75, 2.0)
+
+
+def test_undefined_numbers_are_counted_apart():
+    first, second = (played(*an_episode())[0] for _ in range(2))
+    first.institutions["detection_rate"] = NAN
+    found = institution_measures({0: [first, second]})
+    assert str(found["institutions/detection_rate"]) == "0.5, undefined in 1 of 2"
+    assert not any(name.startswith("institutions") for name in social_measures({0: [first]}))
+
+
+def test_an_episode_does_not_change_when_the_next_one_is_played():
+    tracker = EpisodeTracker(1, 2, 10)
+    (episode,) = [own for batch in an_episode() for own in tracker.add(batch)]
+    before = written_out(episode)
+    for batch in an_episode():
+        tracker.add(batch)
+    assert written_out(episode) == before
+
+
+MANY = (
+    Boundaries.drawn("00.11\n00.11\n22.22", bite_fine=1.0, step_fine=0.125),
+    Quota(share=2.0, window_steps=10, fine=0.5),
+    ClosedSeason(period_steps=12, closed_steps=4, fine=0.25),
+    Levies(groups=((0, 1), (2,)), local_rate=0.25, joint_rate=0.25),
+    Vote(on=Tax(period_steps=5), choices=(0.0, 0.5)),
+    Monitoring(prob=0.5, cost=0.125),
+    GraduatedSanctions(freeze_steps=(1, 2), fines=(0.5, 1.0)),
+    Mediation(turns=3, refund=2.0),
+)
+GAME = Game(
+    map=maps.parse(">A.A.\n.AAA<\nA.^.A"),
+    rules=Rules(regrow_prob=(0.05, 0.1), window_rows=3, window_columns=3, episode_steps=24),
+    institutions=MANY,
+    observation=Observation(agents_apart=True),
+)
+
+
+def play(game, *, worlds=3, episodes=2):
+    """Episodes of random agents, and the batches."""
+    env = CommonsEnv(game, worlds, seed=2)
+    tracker = EpisodeTracker(worlds, game.agents, 24, institutions=game.institutions)
+    torch.manual_seed(1)
+    found, batches, moment = [], [], env.reset()
+    while len(found) < worlds * episodes:
+        batch, moment = env.step_and_maybe_reset(env.rand_action(moment))
+        batches.append(batch)
+        found += tracker.add(batch)
+    return found, batches
+
+
+def test_what_a_game_pays_and_counts_is_what_an_episode_has():
+    found, batches = play(GAME)
+    names = ("fines", "transfers", "violated", "harvest", "counts", "reward")
+    every = {name: torch.stack([batch["next", "agents", name] for batch in batches], 1) for name in names}
+    for episode in found:
+        turns = slice(24 * episode.episode, 24 * episode.episode + 24)
+        own = {name: values[episode.world, turns] for name, values in every.items()}
+        for name in ("fines", "transfers", "harvest"):
+            assert getattr(episode, name).tolist() == own[name].double().sum(0).tolist()
+        assert episode.violations.tolist() == own["violated"].sum(0).tolist()
+        assert np.stack(list(episode.counts.values()), 1).tolist() == own["counts"][-1].tolist()
+        assert episode.counts["violations"].tolist() == episode.violations.tolist()
+        np.testing.assert_allclose(
+            episode.return_, episode.harvest - episode.fines + episode.transfers, atol=1e-4
+        )
+        assert set(episode.in_force) <= {0.0, 0.5}
+    total = {name: sum(own.counts[name].sum() for own in found) for name in COUNTS}
+    assert all(total.values()), f"each happened: {total}"
+    assert total["detections"] < total["violations"]
+
+
+def test_a_game_with_all_institutions_has_all_metrics_and_others_those_that_concern_them():
+    (episode, *_), _ = play(GAME, episodes=1)
+    assert list(episode.institutions) == list(NEEDS)
+    always = ["fines", "transfers", "violations", "violations_per_step", "net_equality"]
+    kinds = {
+        "Boundaries": ["trespasses", "own_share_of_bites"],
+        "Quota": ["excess_bites"],
+        "ClosedSeason": ["closed_bites"],
+        "Levies": list(OF_GROUPS),
+        "Vote": [],
+        "Monitoring": ["detection_rate"],
+        "GraduatedSanctions": ["recidivism", "sanctions_per_violation"],
+        "Mediation": ["unjust_share_of_tags"],
+    }
+    for own in MANY:
+        assert set(institutions.metrics_for([own])) == {*always, *kinds[type(own).__name__]}
+    assert "excess_bites" in institutions.metrics_for([Vote(on=Quota(), choices=(0.5, 1.0))])
+    (taxed, *_), _ = play(dataclasses.replace(GAME, institutions=(Tax(rate=0.5),)), episodes=1)
+    assert set(taxed.institutions) == set(always)
+    assert taxed.fines.sum() == pytest.approx(taxed.harvest.sum() / 2)
+    assert taxed.in_force is None
+
+
+def test_every_kind_of_institution_has_metrics_or_is_measured_by_those_of_all():
+    concerned = {kind for kinds in institutions.KINDS.values() for kind in kinds}
+    assert concerned | {Tax, Vote, Sanctioner} == set(Institution.__subclasses__())
+    assert set(institutions.KINDS) < set(NEEDS)
+    with pytest.raises(ValueError, match=r"institutions\[0\] is 3; allowed: a value of cprl.institutions"):
+        institutions.metrics_for([3])
+
+
+def test_trainings_and_evaluations_measure_what_concerns_the_game_behind_transforms():
+    names = {"institutions/net_equality_within", "institutions/own_share_of_bites", "agent_2/fines"}
+    undecided = tuple(own for own in MANY if not isinstance(own, Vote))
+    game = dataclasses.replace(GAME, institutions=undecided)
+    env = TransformedEnv(CommonsEnv(game, 2, seed=2), StepCounter())
+    seen = []
+
+    class Sees:
+        def on_episode(self, episode, learning):
+            seen.append(numbers_of(episode, learning, ["agent_0", "agent_1", "agent_2"]))
+
+    agents = random_agents(game.spaces, (0, 1, 2), replicas=2, seed=1)
+    train(env, {}, others=agents, episodes=1, callbacks=[Sees()])
+    assert names <= set(seen[0])
+    first, *_ = evaluate(env, RandomPolicy(env.action_spec))
+    assert "net_equality_between" in first.institutions

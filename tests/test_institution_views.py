@@ -1,0 +1,385 @@
+"""Institutions in recordings, replays, tables and figures; games without them are shown as before."""
+
+from dataclasses import replace
+from io import StringIO
+from pathlib import Path
+
+import numpy as np
+import pytest
+from matplotlib.image import imread
+from paying_game import Charges
+from rerun.chunk import RrdReader
+from rich.console import Console
+from rich.table import Table
+from test_film import frames_of
+from test_rerun_logger import column, static
+from torchrl.envs import TransformedEnv
+
+import cprl
+from cprl import CommonsEnv, Custom, Experiment, Game, Rules, maps
+from cprl.evaluation import evaluate_run
+from cprl.evaluation.episode_picture import EpisodePicture
+from cprl.evaluation.film import film
+from cprl.evaluation.film_video import film_video
+from cprl.evaluation.tables import run_table
+from cprl.institutions import Boundaries, GraduatedSanctions, Monitoring, Sanctioner, Tax, Vote
+from cprl.measuring.reported import reported_by
+from cprl.policies.lanes import random_agents
+from cprl.population import Scripted
+from cprl.runs.episodes import read_episodes
+from cprl.terminal.figures import training_curve
+from cprl.terminal.institutions import institutions_table
+from cprl.terminal.summary import _mean, summarise
+from cprl.training import train
+from cprl.viewer.blueprint import layout
+from cprl.viewer.callback import ViewerCallback
+from cprl.viewer.contents import curves_of
+from cprl.viewer.institution_views import borders, in_words, regions_of
+from cprl.viewer.institutions import has_institutions, lines, tabs
+from cprl.viewer.scenery import Curves
+
+GAME = Game(
+    map=maps.parse(".A>.A.A\n.A#A.AA\nv.<.AA>"),
+    rules=Rules(regrow_prob=(0.02, 0.1), window_rows=5, window_columns=5, episode_steps=30),
+)
+AGENTS = 4
+
+
+class Remembers:
+    """The episodes, and who broke a rule in each turn of the first world."""
+
+    def __init__(self, env):
+        self.env, self.episodes, self.turns = env, [], []
+
+    def on_step(self, batch):
+        agents = batch["next", "agents"]
+        now = self.env.worlds.show(self.env.output)
+        self.turns.append(
+            {
+                "violated": np.flatnonzero(agents["violated"][0].numpy()).tolist(),
+                "fines": agents["fines"][0].tolist(),
+                "transfers": agents["transfers"][0].tolist(),
+                "at": [(int(row), int(col)) for row, col in zip(now.row, now.col, strict=True)],
+            }
+        )
+
+    def on_episode(self, episode, learning):
+        self.episodes.append(episode)
+
+
+def recorded(run, *, replicas=2, episodes=4):
+    env = TransformedEnv(CommonsEnv(GAME, replicas, seed=1), Charges())
+    seen = Remembers(env.base_env)
+    with ViewerCallback(run, env, title="run", episodes=episodes) as viewer:
+        others = random_agents(GAME.spaces, tuple(range(AGENTS)), replicas=replicas, seed=1)
+        train(env, {}, others=others, episodes=episodes, callbacks=[seen, viewer])
+    return viewer, seen
+
+
+@pytest.fixture(scope="module")
+def run(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("recorded")
+    return folder / "run.rrd", *recorded(folder)
+
+
+@pytest.fixture(scope="module")
+def whole(tmp_path_factory):
+    """A run of scripted agents under institutions, from its recipe."""
+    out = tmp_path_factory.mktemp("whole") / "run"
+    agents = tuple(Scripted(own) for own in ("greedy", "random", "random", "greedy"))
+    experiment = Experiment(
+        name="own",
+        game=GAME,
+        agents=agents,
+        episodes=6,
+        replicas=2,
+        transforms=(Custom("paying_game:Charges"),),
+        evaluation_episodes=2,
+    )
+    cprl.run(experiment, out=out, allow=("paying_game:Charges",))
+    return out
+
+
+def entities(path):
+    return {chunk.entity_path.strip("/") for chunk in RrdReader(path).stream()}
+
+
+def test_the_lines_of_institutions_are_each_replica_their_mean_and_its_running_mean(run):
+    path, _, seen = run
+    _, logged = column(path, "institutions/violations", "Scalars:scalars", "episode")
+    for number, line in enumerate(logged):
+        own = sorted((one for one in seen.episodes if one.episode == number), key=lambda one: one.world)
+        each = [one.institutions["violations"] for one in own]
+        assert line[:3] == [*each, np.mean(each)]
+    assert len(logged[0]) == 4
+    names = static(path, "institutions/violations", "SeriesLines:names")
+    assert list(names) == ["replica 0", "replica 1", "violations, mean", "violations, running mean"]
+
+
+def test_each_agent_has_lines_of_what_it_paid_got_and_broke(run):
+    path, _, seen = run
+    for name in ("fines", "transfers", "violations"):
+        for agent in range(AGENTS):
+            _, logged = column(path, f"agent_{agent}/{name}", "Scalars:scalars", "episode")
+            means = [
+                np.mean([getattr(one, name)[agent] for one in seen.episodes if one.episode == number])
+                for number in range(4)
+            ]
+            assert [line[0] for line in logged] == pytest.approx(means)
+
+
+def test_what_is_in_force_is_a_line(run):
+    path, _, _ = run
+    _, logged = column(path, "institutions/in_force_0", "Scalars:scalars", "episode")
+    assert [line[0] for line in logged] == [0.5] * 4
+
+
+def test_an_event_says_what_was_decided_broken_and_paid(run):
+    path, viewer, seen = run
+    _, texts = column(path, "log", "TextLog:text", "episode")
+    first = next(one for one in seen.episodes if (one.world, one.episode) == (0, 0))
+    text = next(text for (text,) in texts if text.startswith("episode 0: decision 0: 0.5; "))
+    assert text == f"episode 0: {in_words(first, viewer.logger.curves)}"
+    assert f"{first.violations.sum()} violations; agent 0 fined {first.fines[0]:.4g}, " in text
+
+
+def test_events_are_in_words():
+    curves = Curves(agents=("a", "b"), in_force=("the tax rate",))
+
+    class Episode:
+        violations, fines, in_force = np.array([0, 1]), np.array([0.0, 1.5]), np.array([0.25])
+
+    assert in_words(Episode(), curves) == "the tax rate: 0.25; 1 violation; agent 1 fined 1.5"
+    Episode.violations, Episode.fines, Episode.in_force = None, None, None
+    assert in_words(Episode(), curves) == ""
+
+
+def test_only_games_with_institutions_have_their_tabs(run):
+    _, viewer, _ = run
+    curves = viewer.logger.curves
+    made = [own.name for own in tabs(curves, lambda name, *entities, share=False: None)]
+    assert made == []
+    titles = []
+
+    def plot(name, *shown, share=False):
+        import rerun.blueprint as rrb
+
+        titles.append(name)
+        return rrb.TimeSeriesView(name=name, contents=[f"+ /{entity}" for entity in shown])
+
+    assert [own.name for own in tabs(curves, plot)] == ["Institutions", "Rules kept"]
+    assert titles == [
+        "Violations of each, turns",
+        "Fines of each, apples",
+        "Transfers to each, apples",
+        "Shares of violations, bites, tags",
+        "Equality of net incomes",
+        "In force: decision 0",
+    ]
+    without = Curves(agents=("a", "b"))
+    assert not has_institutions(without)
+    assert (tabs(without, plot), lines(without)) == ([], {})
+    assert layout(curves) is not None
+
+
+def test_a_recording_without_institutions_has_nothing_of_them(tmp_path):
+    env = CommonsEnv(GAME, 1, seed=1)
+    others = random_agents(GAME.spaces, tuple(range(AGENTS)), replicas=1, seed=1)
+    with ViewerCallback(tmp_path, env, title="run", episodes=2) as viewer:
+        train(env, {}, others=others, episodes=2, callbacks=[viewer])
+    words = ("institutions", "fines", "transfers", "violat", "regions", "paid", "given")
+    assert not [name for name in entities(tmp_path / "run.rrd") if any(word in name for word in words)]
+
+
+def test_a_replay_marks_who_breaks_a_rule_in_its_turn_and_shows_payments(whole, tmp_path):
+    path, episode = film(whole, tmp_path / "replay.rrd", allow=("paying_game:Charges",))
+    frames, marks = column(path, "world/violators", "LineStrips2D:strips", "frame")
+    assert frames == list(range(episode.steps - 1)), "the last turn has no frame"
+    _, texts = column(path, "log", "TextLog:text", "step")
+    broken = [text for (text,) in texts if "breaks a rule" in text]
+    assert len(broken) == episode.violations.sum() > 0
+    assert broken[0].split(": ")[1].endswith("fined 1.5") or "fined 1.75" in broken[0]
+    last = [text for text in broken if text.startswith(f"step {episode.steps}:")]
+    assert sum(len(own) for own in marks) == len(broken) - len(last)
+    for agent in range(AGENTS):
+        steps, paid = column(path, f"agent_{agent}/paid", "Scalars:scalars", "step")
+        _, given = column(path, f"agent_{agent}/given", "Scalars:scalars", "step")
+        assert steps == list(range(1, episode.steps + 1))
+        assert -np.sum(paid) == pytest.approx(episode.fines[agent])
+        assert np.sum(given) == pytest.approx(episode.transfers[agent])
+
+
+def test_a_mark_is_a_diamond_around_the_agent(tmp_path):
+    from cprl.viewer.offences import Offences
+
+    env = TransformedEnv(CommonsEnv(GAME, 1, seed=1), Charges())
+    seen = Remembers(env.base_env)
+    with ViewerCallback(tmp_path, env, title="replay", episodes=1, is_replay=True) as viewer:
+        marking = Offences(viewer.logger, env.base_env, names=viewer.logger.scene.agents)
+        others = random_agents(GAME.spaces, tuple(range(AGENTS)), replicas=1, seed=1)
+        train(env, {}, others=others, episodes=1, callbacks=[seen, viewer, marking])
+    _, marks = column(tmp_path / "run.rrd", "world/violators", "LineStrips2D:strips", "frame")
+    found = 0
+    for turn, own in zip(seen.turns, marks, strict=False):
+        assert len(own) == len(turn["violated"])
+        for agent, diamond in zip(turn["violated"], own, strict=True):
+            middle = np.mean(np.array(diamond)[:4], 0)
+            row, col = turn["at"][agent]
+            assert middle.tolist() == pytest.approx([col + 1.5, row + 1.5], abs=1e-5), "(x, y), with a rim"
+            found += 1
+    assert found > 3
+
+
+def test_a_film_marks_who_broke_a_rule_since_its_last_picture(whole, tmp_path):
+    allow = ("paying_game:Charges",)
+    path, episode = film_video(whole, tmp_path / "film.gif", width=400, every=1, allow=allow)
+    assert episode.violations.sum() > 0
+    pictures, _ = frames_of(path)
+    picture = EpisodePicture(GAME.map, steps=30, width=400)
+    board = slice(*(round(picture.cell_box(row, 0)[1]) for row in (0, GAME.map.height)))
+    white = (pictures[:, board].astype(int).min(-1) > 215).sum((1, 2))
+    assert white[0] < white.max() / 2, "nobody has broken a rule when it begins"
+
+
+def test_a_picture_has_a_white_diamond_around_a_violator():
+    env = CommonsEnv(GAME, 1, seed=1)
+    env.reset()
+    now = env.worlds.show(env.output)
+    picture = EpisodePicture(GAME.map, steps=30, width=400)
+    plain, marked = (picture.draw([now], "own", violators=own) for own in ((), (2,)))
+    rows, cols = np.nonzero((plain != marked).any(-1))
+    left, _, right, bottom = picture.cell_box(int(now.row[2]), int(now.col[2]))
+    beyond = 0.22 * (right - left)
+    assert cols.min() == pytest.approx(left - beyond, abs=3)
+    assert rows.max() == pytest.approx(bottom + beyond, abs=3)
+    assert (marked[rows, cols].min(-1) > 100).mean() > 0.9
+
+
+def test_the_borders_of_regions_are_lines_in_their_owners_hue():
+    # Agent 0 owns the left column of two rows, both own the cell on the top right:  a b
+    #                                                                              a .
+    cells = [([0], np.array([[1, 0], [1, 0]], bool)), ([0, 1], np.array([[0, 1], [0, 0]], bool))]
+    made = borders(cells)
+    strips = [np.array(own) for own in made.strips.as_arrow_array().to_pylist()]
+    assert len(strips) == 6 + 4, "around two cells, around one"
+    # the right side of the cell (1, 0): x from 1 to 2 and y from 2 to 3 with the rim, 0.08 inside
+    assert any(np.allclose(own, [(1.92, 2.0), (1.92, 3.0)], atol=1e-6) for own in strips[:6])
+    colours = made.colors.as_arrow_array().to_pylist()
+    assert len(set(colours[:6])) == len(set(colours[6:])) == 1
+    assert colours[0] != colours[6]
+
+
+def printed(what):
+    console = Console(width=110, record=True, file=StringIO())
+    console.print(what)
+    return console.export_text()
+
+
+def test_the_summary_has_a_table_of_institutions(whole):
+    found = evaluate_run(whole, episodes=2, allow=("paying_game:Charges",))
+    played = {"random": found.random[0], "trained": found.trained[0]}
+    table = institutions_table(played, _mean)
+    assert isinstance(table, Table)
+    text = printed(table)
+    paid = [np.mean([one.fines.sum() for one in own]) for own in played.values()]
+    row = next(line for line in text.splitlines() if "fines of all, apples" in line)
+    assert [float(cell) for cell in row.replace("│", " ").split()[-2:]] == pytest.approx(paid, abs=0.01)
+    agent = next(line for line in text.splitlines() if "agent 1" in line)
+    own = played["trained"]
+    fined, broke = (np.mean([getattr(one, name)[1] for one in own]) for name in ("fines", "violations"))
+    assert f"{fined:.1f} / " in agent
+    assert f" / {broke:.1f} " in agent
+    assert "in force: decision 0" in text
+    assert "where one may bite" not in text, "nothing counted a bite"
+    nothing = dict.fromkeys(("fines", "transfers", "violations", "counts", "in_force"))
+    without = {"trained": [replace(one, **nothing) for one in found.trained[0]]}
+    assert institutions_table(without, _mean) is None
+
+
+def test_what_is_printed_at_the_end_says_it_too(whole):
+    found = evaluate_run(whole, episodes=1, allow=("paying_game:Charges",))
+    console = Console(width=110, record=True, file=StringIO())
+    summarise(whole, title="own", played={"trained": found.trained[0]}, console=console)
+    text = console.export_text()
+    assert "violations per turn in play, 0 to 1" in text
+    assert "of each agent: fined / given / violations" in text
+
+
+def test_an_evaluation_reports_institutions(whole):
+    found = evaluate_run(whole, episodes=2, allow=("paying_game:Charges",))
+    measures = found.measures("random")
+    assert measures["institutions/detection_rate"].estimate.value == 1.0
+    paid = np.mean([one.fines[2] for own in found.random.values() for one in own])
+    assert measures["agent_2/fines"].estimate.value == pytest.approx(paid)
+    text = printed(run_table(found))
+    assert "institutions/net_equality" in text or measures["institutions/net_equality"].estimate is None
+    assert "agent_2/fines (apples)" in text
+    assert "institutions/own_share_of_bites" not in text, "undefined everywhere"
+    assert {"fines", "violations", "own_bites", "in_force_0"} <= set(found.table().column_names)
+
+
+def test_the_run_keeps_them_and_the_training_curve_shows_them(whole):
+    table = read_episodes(whole)
+    assert table["fines"].to_numpy().sum() > 0
+    assert table["violations"].to_numpy().max() > 0
+    evaluation = whole / "evaluation" / "trained.parquet"
+    assert evaluation.exists()
+    high, wide = imread(training_curve(whole, title="own")).shape[:2]
+    assert high > wide, "four panels"
+
+
+GOVERNED = replace(
+    GAME,
+    institutions=(
+        Boundaries.drawn("0011..2\n0011..2\n00..333", bite_fine=1.0, step_fine=0.25),
+        Monitoring(prob=0.5),
+        GraduatedSanctions(),
+        Tax(rate=0.5, period_steps=4),
+    ),
+)
+
+
+@pytest.fixture(scope="module")
+def governed(tmp_path_factory):
+    """The recording of random agents in a game with cprl's own institutions."""
+    folder = tmp_path_factory.mktemp("governed")
+    env = CommonsEnv(GOVERNED, 2, seed=1)
+    others = random_agents(GOVERNED.spaces, tuple(range(AGENTS)), replicas=2, seed=1)
+    with ViewerCallback(folder, env, title="run", episodes=3) as viewer:
+        train(env, {}, others=others, episodes=3, callbacks=[viewer])
+    return folder / "run.rrd"
+
+
+def test_every_name_that_is_logged_of_institutions_is_in_the_docs(governed):
+    text = (Path(cprl.__file__).parents[2] / "docs" / "metrics.md").read_text()
+    logged = {name for name in entities(governed) if name.startswith("institutions/")}
+    assert {"institutions/own_share_of_bites", "institutions/recidivism"} <= logged
+    assert "institutions/unjust_share_of_tags" not in logged, "no Mediation"
+    assert all(f"`{name}`" in text for name in logged)
+
+
+def test_the_board_shows_whose_the_regions_are(governed):
+    env = CommonsEnv(GOVERNED, 1)
+    assert [(owners, cells.sum()) for owners, cells in regions_of(env)] == [
+        ([0], 6),
+        ([1], 4),
+        ([2], 2),
+        ([3], 3),
+    ]
+    strips = static(governed, "world/regions", "LineStrips2D:strips")
+    # the sides of 3 x 2, 2 x 2, 2 x 1 and 1 x 3 cells, one line for each
+    assert len(strips) == 10 + 8 + 6 + 8
+
+
+def test_regions_that_several_agents_share_are_drawn_once():
+    shared = Boundaries.drawn("aaaa...\naaaa...\nbbbb...", owners=("a", "a", "b", "ab"))
+    env = CommonsEnv(replace(GAME, institutions=(shared,)), 1)
+    assert [owners for owners, _ in regions_of(env)] == [[0, 1, 3], [2, 3]]
+
+
+def test_decisions_have_the_names_of_their_ballots(tmp_path):
+    game = replace(GAME, institutions=(Vote(on=Tax(), choices=(0.0, 0.5)), Sanctioner()))
+    curves = curves_of(
+        CommonsEnv(game, 1), ("a", "b", "c", "d"), reported_by(CommonsEnv(game, 1)), episodes=1
+    )
+    assert curves.in_force == ("the tax rate", "who may fire")
