@@ -5,16 +5,26 @@ NUMBA_ENABLE_CUDASIM=1 python tests/cuda_in_simulator.py
 
 import sys
 from collections.abc import Callable
+from dataclasses import replace
 
 import numpy as np
 import pytest
 from boards import random_actions
+from governed import EVERYTHING, random_decisions
 from numba import cuda
 from numba.core import config
 
 from cprl import Game, Observation, Rules, maps, presets
-from cprl.commons.batch import Batch
+from cprl.commons.batch import Batch, turn_of
 from cprl.commons.cuda import THREADS_PER_BLOCK, CudaThreads
+from cprl.institutions import (
+    Boundaries,
+    ClosedPatches,
+    ClosedSeason,
+    GraduatedSanctions,
+    Quota,
+    Sanctioner,
+)
 
 WALLS = maps.parse(
     """
@@ -31,22 +41,29 @@ def both(game: Game, worlds: int) -> tuple[Batch, Batch]:
 
 
 def assert_same(cpu: Batch, gpu: Batch, output, gpu_output, when: object) -> None:
-    """Worlds and step outputs are equal."""
-    for ours, theirs in ((output, gpu_output), (cpu.now, gpu.now)):
+    """Worlds and step outputs are equal; with institutions also their memory and payments."""
+    records = [(turn_of(output), turn_of(gpu_output)), (cpu.now, gpu.now)]
+    if cpu.memory is not None:
+        records += [(cpu.memory, gpu.memory), (output.payments, gpu_output.payments)]
+    for ours, theirs in records:
         for name, array in ours._asdict().items():
             other = gpu.driver.read(getattr(theirs, name))
             if array.dtype != other.dtype or not np.array_equal(array, other):
                 raise AssertionError(f"{name} differs, {when}: {array} {other}")
 
 
-def play(game: Game, *, worlds: int = 2, turns: int = 12) -> None:
-    """Both drivers play the same turns; halfway through, some worlds begin a new episode."""
+def play(game: Game, *, worlds: int = 2, turns: int = 12) -> Batch:
+    """Both drivers play the same turns; halfway through, some worlds begin a new episode. Returns those of
+    the CPU."""
     cpu, gpu = both(game, worlds)
     output, gpu_output = cpu.begin(cpu.new_output()), gpu.begin(gpu.new_output())
     assert_same(cpu, gpu, output, gpu_output, "at the start")
-    for number, turn in enumerate(random_actions(turns, worlds, game)):
-        cpu.play(turn, output)
-        gpu.play(cuda.to_device(turn), gpu_output)
+    decisions = random_decisions(turns, worlds, game)
+    for number, (turn, decided) in enumerate(
+        zip(random_actions(turns, worlds, game), decisions, strict=True)
+    ):
+        cpu.play(turn, output, decided)
+        gpu.play(cuda.to_device(turn), gpu_output, cuda.to_device(decided))
         assert_same(cpu, gpu, output, gpu_output, f"turn {number}")
         if number == turns // 2:
             which = np.arange(worlds) % 2 == 1
@@ -54,6 +71,7 @@ def play(game: Game, *, worlds: int = 2, turns: int = 12) -> None:
             gpu.begin(gpu_output, cuda.to_device(which))
             assert_same(cpu, gpu, output, gpu_output, "after a new episode began")
     assert np.array_equal(cpu.boards(output), gpu.driver.read(gpu.boards(gpu_output)))
+    return cpu
 
 
 def published(name: str) -> None:
@@ -115,6 +133,39 @@ def unknown() -> None:
     assert all(np.array_equal(array, before[name]) for name, array in gpu.state().items())
 
 
+def institutions() -> None:
+    """Every kind of institution at once; what was played is loaded and goes on."""
+    state = play(EVERYTHING, turns=8).state()
+    cpu, gpu = both(EVERYTHING, 2)
+    output, gpu_output = cpu.load(state, cpu.new_output()), gpu.new_output()
+    gpu.load(state, gpu_output)
+    assert_same(cpu, gpu, output, gpu_output, "after loading")
+    (turn,) = random_actions(1, 2, EVERYTHING, seed=9)
+    cpu.play(turn, output)
+    gpu.play(cuda.to_device(turn), gpu_output)
+    assert_same(cpu, gpu, output, gpu_output, "without decisions")
+    before = gpu.state()
+    wrong = np.zeros((2, 3), np.int64)
+    wrong[1, 1] = EVERYTHING.decisions
+    with pytest.raises(ValueError, match=f"decision {EVERYTHING.decisions} of agent 1 in world 1 is unknown"):
+        gpu.play(cuda.to_device(turn), gpu_output, cuda.to_device(wrong))
+    assert all(np.array_equal(array, before[name]) for name, array in gpu.state().items())
+
+
+def stopped() -> None:
+    """Institutions that stop bites and shots, on a board as run; the tables of others are empty."""
+    own = (
+        Boundaries.drawn("001122-\n.......\n..3..22", owners=("01", "13", "2")),
+        *(Quota(share=0.5), ClosedSeason(period_steps=4, closed_steps=1), ClosedPatches()),
+        Sanctioner(agents=(1, 2)),
+        GraduatedSanctions(freeze_steps=((1,), (2,), (3,)), on="tags"),
+    )
+    rules = replace(
+        EVERYTHING.rules, pairwise_clashes=True, regrow_before_bites=True, freeze_counts_tag_turn=True
+    )
+    play(replace(EVERYTHING, rules=rules, institutions=own), turns=6)
+
+
 CHECKS: dict[str, Callable[[], None]] = {
     **{
         name: (lambda name=name: published(name))
@@ -124,6 +175,8 @@ CHECKS: dict[str, Callable[[], None]] = {
     "blocks": blocks,
     "state": state,
     "unknown": unknown,
+    "institutions": institutions,
+    "stopped": stopped,
 }
 
 if __name__ == "__main__":

@@ -3,12 +3,14 @@
 import os
 import subprocess
 import sys
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
 from boards import random_actions
+from governed import EVERYTHING, random_decisions
 
 from cprl import CommonsEnv, keys, presets
 from cprl.algorithms import DQN
@@ -20,6 +22,8 @@ from cprl.training import train
 
 SCRIPT = Path(__file__).with_name("cuda_in_simulator.py")
 GAMES = [f"{board}:{variant}" for board in presets.BOARDS for variant in presets.VARIANTS]
+
+GOVERNED = ["institutions", "stopped"]
 
 
 @pytest.fixture(scope="module")
@@ -35,7 +39,7 @@ def simulated():
     return done.stdout.splitlines(), done
 
 
-@pytest.mark.parametrize("check", [*GAMES, "forms", "blocks", "state", "unknown"])
+@pytest.mark.parametrize("check", [*GAMES, "forms", "blocks", "state", "unknown", *GOVERNED])
 def test_the_simulated_gpu_plays_the_same_game_as_the_cpu(simulated, check):
     lines, done = simulated
     assert f"{check} equal" in lines, done.stderr
@@ -49,13 +53,28 @@ def test_the_simulator_exits_without_an_error(simulated):
 @pytest.mark.parametrize("variant", presets.VARIANTS)
 @pytest.mark.parametrize("board", presets.BOARDS)
 def test_the_gpu_plays_the_same_game_as_the_cpu(board, variant):
-    game = presets.game(board, variant=variant)
+    check_gpu(presets.game(board, variant=variant))
+
+
+@pytest.mark.gpu
+def test_the_gpu_plays_the_same_game_as_the_cpu_under_every_kind_of_institution():
+    check_gpu(EVERYTHING)
+    for own in EVERYTHING.institutions:
+        check_gpu(replace(EVERYTHING, institutions=(own,)), turns=40)
+
+
+def check_gpu(game, turns=300):
+    """The same turns on the CPU and on the GPU: all entries and the whole state are equal."""
     envs = [CommonsEnv(game, 300, seed=3, device=device, state=True) for device in ("cpu", "cuda")]
     moments = [env.reset() for env in envs]
-    for turn in torch.as_tensor(random_actions(300, 300, game)):
+    decisions = torch.as_tensor(random_decisions(turns, 300, game))
+    for turn, decided in zip(torch.as_tensor(random_actions(turns, 300, game)), decisions, strict=True):
         steps = []
         for i, env in enumerate(envs):
-            now, moments[i] = env.step_and_maybe_reset(moments[i].set(keys.ACTION, turn.to(env.device)))
+            moments[i].set(keys.ACTION, turn.to(env.device))
+            if game.decisions:
+                moments[i].set(keys.DECISION, decided.to(env.device))
+            now, moments[i] = env.step_and_maybe_reset(moments[i])
             steps.append(now["next"])
         for key in steps[0].keys(True, True):
             assert steps[1][key].is_cuda

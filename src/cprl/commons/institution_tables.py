@@ -31,7 +31,7 @@ from cprl.institutions import memory as shows
 from cprl.institutions.base import MOST_INSTITUTIONS
 from cprl.institutions.boundaries import OPEN
 from cprl.institutions.choice import MOST_DECISIONS, Ballot, ballots, decision_options
-from cprl.institutions.memory import InstitutionTables
+from cprl.institutions.memory import FOREIGN, FREE, OWN, InstitutionTables
 from cprl.institutions.monitoring import ELECTED
 
 _ABOUT_PLACES: Final = (Boundaries, ClosedPatches)
@@ -62,7 +62,10 @@ def check_institutions(institutions: tuple[Any, ...], board: Map, rules: Rules, 
             )
         own.check_board(agents=board.agents, height=board.height, width=board.width)
         _check_observation(own, form)
-        if isinstance(own, Sanctioner | Mediation) and not rules.may_fire:
+        needs_tags = isinstance(own, Sanctioner | Mediation) or (
+            isinstance(own, GraduatedSanctions) and own.on == "tags"
+        )
+        if needs_tags and not rules.may_fire:
             raise ValueError(
                 f"Game.institutions has a {kind.__name__} and Rules.may_fire is False; allowed: a game in "
                 "which agents may fire"
@@ -163,18 +166,20 @@ def _is_decided(own: Institution) -> bool:
 def _boundary_tables(institutions: Sequence[Institution], board: Map, tables: Tables) -> dict[str, Any]:
     found = _of(Boundaries, institutions)
     rows = tables.background.size // tables.stride
-    own = np.ones((len(found), board.agents, rows, tables.stride), np.bool_)
+    use = np.full((len(found), board.agents, rows, tables.stride), FREE, np.uint8)
     inside = slice(tables.rim, tables.rim + board.height), slice(tables.rim, tables.rim + board.width)
     for nth, boundary in enumerate(found):
         signs = np.array([list(row) for row in boundary.regions])
         for agent in range(board.agents):
-            own[(nth, agent, *inside)] = np.isin(signs, [OPEN, *boundary.signs_of(agent)])
+            is_own = np.isin(signs, list(boundary.signs_of(agent)))
+            use[(nth, agent, *inside)] = np.where(signs == OPEN, FREE, np.where(is_own, OWN, FOREIGN))
     return {
-        "own": own.reshape(len(found), board.agents, tables.background.size),
+        "use": use.reshape(len(found), board.agents, tables.background.size),
         "bite_stopped": _bools([boundary.bite_fine is None for boundary in found]),
         "bite_fine": _floats([_fine(boundary.bite_fine) for boundary in found]),
         "step_is_violation": _bools([boundary.step_fine is not None for boundary in found]),
         "step_fine": _floats([_fine(boundary.step_fine) for boundary in found]),
+        "use_shown": _bools([boundary.observed for boundary in found]),
     }
 
 
@@ -236,6 +241,7 @@ def _patch_tables(institutions: Sequence[Institution], board: Map, rules: Rules)
         "patch_below": int(found[0].below) if found else 0,
         "patch_stopped": bool(found and found[0].fine is None),
         "patch_fine": _fine(found[0].fine) if found else 0.0,
+        "patch_shown": bool(found and found[0].observed),
     }
 
 

@@ -32,7 +32,7 @@ from cprl.institutions.limits import (
     open_windows,
     stops_bite,
 )
-from cprl.institutions.memory import InstitutionTables, Memory, Payments
+from cprl.institutions.memory import SANCTIONS, InstitutionTables, Memory, Payments
 from cprl.institutions.paying import (
     charge,
     collect_taxes,
@@ -69,8 +69,7 @@ def play_governed_turn(
     clear_turn(memory)
     if world.step[0] == 1:
         decide(world, memory, rules, decisions)
-    open_windows(memory, rules, world.step[0], world.stock_left[0] / world.stock.shape[0])
-    recover(memory, rules, world.step[0])
+        open_windows(memory, rules, 1, stock_share(world))
     count_down(world)
     act(world, tables, actions, scratch)
     for i in range(world.row.shape[0]):
@@ -90,6 +89,7 @@ def play_governed_turn(
     find_hits(world, tables, output.hit_by)
     tag_by_rules(world, memory, tables, rules, output)
     pursue_violations(world, memory, tables, rules)
+    recover(memory, rules, world.step[0])
     check_end(world, tables, began_empty)
     pay_monitor(memory, rules)
     collect_taxes(memory, rules, world.step[0], world.ended[0] != PLAYING)
@@ -98,6 +98,7 @@ def play_governed_turn(
         world.on_board[i] = world.in_play[i]
     return_to_play(world, tables, scratch)
     write_state(world, tables, output, scratch)
+    open_windows(memory, rules, world.step[0] + 1, stock_share(world))
     for s in range(sprouts):
         add_to_patch(memory, rules, scratch.sprouts[s], 1)
     close_patches(memory, rules)
@@ -118,7 +119,7 @@ def begin_governed_episode(
     forget(memory)
     begin_ballots(world, memory, rules)
     appoint(memory, rules)
-    open_windows(memory, rules, 1, 1.0)
+    open_windows(memory, rules, 1, stock_share(world))
     count_patches(memory, rules, world.stock)
     close_patches(memory, rules)
     clear_turn(memory)
@@ -136,9 +137,16 @@ def refresh_governed_output(
 ) -> None:
     """Writes the output for a state that was set from outside, with no events and no payments."""
     refresh_output(world, tables, output, scratch)
+    appoint(memory, rules)
     count_patches(memory, rules, world.stock)
+    close_patches(memory, rules)
     clear_turn(memory)
     write_payments(world, memory, tables, rules, output, payments)
+
+
+def stock_share(world: Worlds) -> float:
+    """The share of all sites that hold an apple, 0..1."""
+    return world.stock_left[0] / world.stock.shape[0]
 
 
 def forget(memory: Memory) -> None:
@@ -147,7 +155,6 @@ def forget(memory: Memory) -> None:
         memory.level[i] = 0
         memory.offence_step[i] = 0
         memory.violation_step[i] = 0
-        memory.sanctioned[i] = False
         memory.detected[i] = False
         for count in range(memory.counts.shape[1]):
             memory.counts[i, count] = 0
@@ -165,6 +172,7 @@ def begin_ballots(world: Worlds, memory: Memory, rules: InstitutionTables) -> No
 def clear_turn(memory: Memory) -> None:
     """Clears what institutions note within a turn."""
     for i in range(memory.broke.shape[0]):
+        memory.sanctioned[i] = memory.counts[i, SANCTIONS] > 0
         memory.broke[i] = False
         memory.unjust[i] = False
         memory.due[i] = 0.0
@@ -263,6 +271,7 @@ FUNCTIONS = (
     *paying.FUNCTIONS,
     *showing.FUNCTIONS,
     *institution_views.FUNCTIONS,
+    stock_share,
     forget,
     begin_ballots,
     clear_turn,

@@ -9,7 +9,7 @@ numbers that convolutions read beside a board.
 from cprl.commons.moves import cell_of
 from cprl.commons.tables import Tables
 from cprl.commons.world import Bytes, Worlds
-from cprl.institutions.limits import is_forbidden
+from cprl.institutions.limits import is_known_forbidden
 from cprl.institutions.memory import InstitutionTables, Memory
 from cprl.institutions.showing import shown_entry
 
@@ -25,7 +25,7 @@ def is_shown_forbidden(
     if tables.walls_block_sight and not tables.in_sight[own, heading, window_cell]:
         return False
     cell = own + tables.window_cells[heading, window_cell]
-    return is_forbidden(memory, rules, i, cell, tables.site_at[cell])
+    return is_known_forbidden(memory, rules, i, cell, tables.site_at[cell])
 
 
 def draw_forbidden(

@@ -110,7 +110,10 @@ class CpuThreads:
             ValueError: If an array has the wrong form.
         """
         if not checked:
-            self._check(argument, output)
+            _check_contiguous(argument)
+            if isinstance(worlds, Governed):
+                _check_contiguous(worlds.decisions)
+            self._check(output)
         size = len(argument)
         tables = self.governed_tables if isinstance(worlds, Governed) else self.tables
         arguments = worlds, tables, argument, output
@@ -126,13 +129,8 @@ class CpuThreads:
         for share in shares:
             share.result()
 
-    def _check(self, argument: NDArray[Any], output: StepOutput | GovernedOutput) -> None:
-        """Checks the arrays, because the compiled loops do not; see `entry_for_cpu`."""
-        if not argument.flags.c_contiguous:
-            raise ValueError(
-                f"an array {argument.dtype} {list(argument.shape)} is not contiguous; allowed: contiguous "
-                "arrays"
-            )
+    def _check(self, output: StepOutput | GovernedOutput) -> None:
+        """Checks the arrays of an output, because the compiled loops do not; see `entry_for_cpu`."""
         if output is self._output:
             return
         kind = GovernedOutput if self.governed_tables else StepOutput
@@ -145,3 +143,11 @@ class CpuThreads:
                     f"output.{name} is read-only or not contiguous; allowed: contiguous, writeable"
                 )
         self._output = output
+
+
+def _check_contiguous(array: NDArray[Any]) -> None:
+    """Checks that an array is contiguous, because the compiled loops do not."""
+    if not array.flags.c_contiguous:
+        raise ValueError(
+            f"an array {array.dtype} {list(array.shape)} is not contiguous; allowed: contiguous arrays"
+        )

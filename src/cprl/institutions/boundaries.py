@@ -9,6 +9,8 @@ from cprl.institutions.base import FINE, OBSERVED, Institution
 
 OPEN: Final = "."
 """The sign of a cell that everybody may use."""
+NOBODY: Final = "-"
+"""The sign of a cell that nobody may use: a reserve."""
 SIGNS: Final = digits + ascii_lowercase
 """The signs of the regions of agents 0, 1, ..., where `owners` is None."""
 _COUNT: Final = count(1)
@@ -26,7 +28,8 @@ class Boundaries(Institution):
     """
 
     regions: tuple[str, ...]
-    """The board, a text per row with one sign per cell: "." is open to all, any other sign names a region."""
+    """The board, a text per row with one sign per cell: "." is open to all, "-" to nobody, any other sign
+    names a region."""
 
     owners: tuple[str, ...] | None = None
     """For each agent the signs of the regions that it may use, e.g. ("a", "a", "ab"). None: agent i may use
@@ -85,10 +88,10 @@ class Boundaries(Institution):
         used = {sign for agent in range(agents) for sign in self.signs_of(agent)}
         for row, line in enumerate(self.regions):
             for col, sign in enumerate(line):
-                if sign != OPEN and sign not in used:
+                if sign not in (OPEN, NOBODY) and sign not in used:
                     raise ValueError(
                         f"Boundaries.regions has {shown(sign)} in row {row}, column {col}, which no agent "
-                        "may use; allowed: '.' and the signs of owners"
+                        "may use; allowed: '.', '-' and the signs of owners"
                     )
 
 
@@ -105,7 +108,7 @@ def _are_owners(value: Any) -> bool:
     return value is None or (
         isinstance(value, tuple)
         and bool(value)
-        and all(isinstance(own, str) and OPEN not in own and len(own) <= len(SIGNS) for own in value)
+        and all(isinstance(own, str) and OPEN not in own and NOBODY not in own for own in value)
     )
 
 

@@ -7,7 +7,9 @@ A violation adds its fine to `Memory.due`; whether it is paid depends on its det
 from cprl.institutions.memory import (
     CLOSED_BITES,
     EXCESS_BITES,
+    FOREIGN,
     FOREIGN_BITES,
+    OWN,
     OWN_BITES,
     TRESPASSES,
     Bytes,
@@ -50,8 +52,8 @@ def is_above_quota(memory: Memory, q: int, i: int, apples: int) -> bool:
 
 def stops_bite(memory: Memory, tables: InstitutionTables, i: int, cell: int, site: int, turn: int) -> bool:
     """Whether agent i cannot harvest this site in this turn."""
-    for boundary in range(tables.own.shape[0]):
-        if tables.bite_stopped[boundary] and not tables.own[boundary, i, cell]:
+    for boundary in range(tables.use.shape[0]):
+        if tables.bite_stopped[boundary] and tables.use[boundary, i, cell] == FOREIGN:
             return True
     for season in range(tables.season_steps.shape[0]):
         if tables.season_stopped[season] and is_season_closed(tables, season, turn):
@@ -78,10 +80,10 @@ def add_to_patch(memory: Memory, tables: InstitutionTables, site: int, apples: i
 def note_bite(memory: Memory, tables: InstitutionTables, i: int, cell: int, site: int, turn: int) -> None:
     """Counts a bite of agent i, and notes the rules that it breaks."""
     add_to_patch(memory, tables, site, -1)
-    for boundary in range(tables.own.shape[0]):
-        if tables.own[boundary, i, cell]:
+    for boundary in range(tables.use.shape[0]):
+        if tables.use[boundary, i, cell] == OWN:
             memory.counts[i, OWN_BITES] += 1
-        else:
+        elif tables.use[boundary, i, cell] == FOREIGN:
             violate(memory, i, FOREIGN_BITES, tables.bite_fine[boundary])
     for season in range(tables.season_steps.shape[0]):
         if is_season_closed(tables, season, turn):
@@ -98,8 +100,8 @@ def note_bite(memory: Memory, tables: InstitutionTables, i: int, cell: int, site
 
 def note_step(memory: Memory, tables: InstitutionTables, i: int, cell: int) -> None:
     """Notes that agent i, in play, ends its move on a cell."""
-    for boundary in range(tables.own.shape[0]):
-        if not tables.own[boundary, i, cell]:
+    for boundary in range(tables.use.shape[0]):
+        if tables.use[boundary, i, cell] == FOREIGN:
             if tables.step_is_violation[boundary]:
                 violate(memory, i, TRESPASSES, tables.step_fine[boundary])
             else:
@@ -121,12 +123,13 @@ def close_patches(memory: Memory, tables: InstitutionTables) -> None:
         memory.closed[p] = memory.patch_stock[p] < tables.patch_below
 
 
-def is_forbidden(memory: Memory, tables: InstitutionTables, i: int, cell: int, site: int) -> bool:
-    """Whether a bite of agent i on a cell would break a rule about places; `site`: -1 for none."""
-    for boundary in range(tables.own.shape[0]):
-        if not tables.own[boundary, i, cell]:
+def is_known_forbidden(memory: Memory, tables: InstitutionTables, i: int, cell: int, site: int) -> bool:
+    """Whether a bite of agent i on a cell would break a rule about places that it observes; `site`: -1 for
+    none."""
+    for boundary in range(tables.use.shape[0]):
+        if tables.use_shown[boundary] and tables.use[boundary, i, cell] == FOREIGN:
             return True
-    return site >= 0 and is_patch_closed(memory, tables, site)
+    return tables.patch_shown and site >= 0 and is_patch_closed(memory, tables, site)
 
 
 FUNCTIONS = (
@@ -141,6 +144,6 @@ FUNCTIONS = (
     note_step,
     count_patches,
     close_patches,
-    is_forbidden,
+    is_known_forbidden,
 )
 """The rules of this module, each after those it calls."""

@@ -62,15 +62,15 @@ class Memory(NamedTuple):
     violation_step: Ints
     """int32 [B, N], the step of the last violation; 0 for never."""
     may_fire: Bools
-    """bool [B, N], whether the agent may fire."""
-    sanctioned: Bools
-    """bool [B, N], whether the agent was sanctioned in this episode."""
+    """bool [B, N], whether the agent may fire; derived from `in_force`."""
     detected: Bools
     """bool [B, N], whether a violation was detected in the last turn."""
     closed: Bools
-    """bool [B, P], whether the patch is closed in the coming turn."""
+    """bool [B, P], whether the patch is closed in the coming turn; derived from the stock."""
     counts: Ints
     """int32 [B, N, C], the `COUNTS` of this episode."""
+    sanctioned: Bools
+    """bool [B, N], whether the agent was sanctioned in an earlier turn of this episode; working memory."""
     broke: Bools
     """bool [B, N], whether the agent violated a rule in this turn; working memory."""
     unjust: Bools
@@ -87,9 +87,11 @@ class Memory(NamedTuple):
     """int32 [B, P], apples on each patch; derived from the stock."""
 
 
-WORKING: Final = ("broke", "unjust", "due", "fines", "transfers", "owed", "patch_stock")
-"""Entries of `Memory` that hold nothing between turns, or nothing that does not follow from the rest."""
-REMEMBERED: Final = tuple(name for name in Memory._fields if name not in WORKING)
+WORKING: Final = ("sanctioned", "broke", "unjust", "due", "fines", "transfers", "owed")
+"""Entries of `Memory` that hold nothing between turns."""
+DERIVED: Final = ("may_fire", "closed", "patch_stock")
+"""Entries of `Memory` that are computed from the others and from the stock."""
+REMEMBERED: Final = tuple(name for name in Memory._fields if name not in (*WORKING, *DERIVED))
 """Entries of `Memory` that are part of the state of a world."""
 
 
@@ -139,11 +141,15 @@ SHOWN: Final = (
 ) = range(len(SHOWN))
 
 
+FOREIGN, OWN, FREE = 0, 1, 2
+"""What a cell is for an agent under `Boundaries`: in the region of others, in its own, or open to all."""
+
+
 class InstitutionTables(NamedTuple):
     """All institutions of a game as parameters; a kind that the game does not have has arrays of length 0."""
 
-    own: Bools
-    """bool [boundaries, N, cells], whether the agent may use the cell."""
+    use: Bytes
+    """uint8 [boundaries, N, cells]: `FOREIGN`, `OWN` or `FREE`."""
     bite_stopped: Bools
     """bool [boundaries], whether bites in others' regions do not happen."""
     bite_fine: Numbers
@@ -152,6 +158,8 @@ class InstitutionTables(NamedTuple):
     """bool [boundaries]."""
     step_fine: Numbers
     """float64 [boundaries]."""
+    use_shown: Bools
+    """bool [boundaries], whether agents are shown where it forbids bites."""
 
     quota_unit: Numbers
     """float64 [Q], apples per agent and window at a share of 1."""
@@ -182,6 +190,8 @@ class InstitutionTables(NamedTuple):
     patch_below: int
     patch_stopped: bool
     patch_fine: float
+    patch_shown: bool
+    """Whether agents are shown where patches are closed."""
 
     tax_from: Numbers
     """float64 [T, brackets], where each bracket begins; infinite for those that a tax lacks."""
@@ -241,12 +251,11 @@ class InstitutionTables(NamedTuple):
 
 
 def empty_memory(tables: InstitutionTables, *, worlds: int) -> Memory:
-    """Memory for B worlds, all zero; the first vote of a world sets `in_force`."""
+    """Memory for B worlds, all zero, except that the first choice of each ballot is in force."""
     agents, patches = tables.may_fire.shape[0], tables.patch_sites.shape[0]
     quotas, taxes = tables.quota_unit.shape[0], tables.tax_steps.shape[0]
-    ballots = tables.ballot_options.shape[0]
     return Memory(
-        in_force=np.zeros((worlds, ballots), np.float64),
+        in_force=np.tile(tables.ballot_choice[:, 0], (worlds, 1)),
         allowed=np.zeros((worlds, quotas), np.float64),
         taken=np.zeros((worlds, quotas, agents), np.int32),
         income=np.zeros((worlds, taxes, agents), np.float64),
@@ -254,10 +263,10 @@ def empty_memory(tables: InstitutionTables, *, worlds: int) -> Memory:
         offence_step=np.zeros((worlds, agents), np.int32),
         violation_step=np.zeros((worlds, agents), np.int32),
         may_fire=np.zeros((worlds, agents), np.bool_),
-        sanctioned=np.zeros((worlds, agents), np.bool_),
         detected=np.zeros((worlds, agents), np.bool_),
         closed=np.zeros((worlds, patches), np.bool_),
         counts=np.zeros((worlds, agents, len(COUNTS)), np.int32),
+        sanctioned=np.zeros((worlds, agents), np.bool_),
         broke=np.zeros((worlds, agents), np.bool_),
         unjust=np.zeros((worlds, agents), np.bool_),
         due=np.zeros((worlds, agents), np.float64),

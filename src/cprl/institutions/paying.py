@@ -13,7 +13,7 @@ from cprl.institutions.memory import (
 
 
 def recover(memory: Memory, tables: InstitutionTables, turn: int) -> None:
-    """Lowers the level of sanctions of agents without an offence for long enough."""
+    """Lowers the level of agents that have had no offence in the last turns, this one included."""
     if tables.sanction_recovery > 0:
         for i in range(memory.level.shape[0]):
             if memory.level[i] > 0 and turn - memory.offence_step[i] >= tables.sanction_recovery:
@@ -32,7 +32,6 @@ def offend(memory: Memory, tables: InstitutionTables, i: int, turn: int) -> None
     memory.fines[i] += tables.sanction_fine[min(memory.level[i], tables.sanction_fine.shape[0] - 1)]
     memory.level[i] += 1
     memory.offence_step[i] = turn
-    memory.sanctioned[i] = True
     memory.counts[i, SANCTIONS] += 1
 
 

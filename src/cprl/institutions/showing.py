@@ -68,7 +68,7 @@ def shown_entry(memory: Memory, tables: InstitutionTables, i: int, entry: int, t
     if kind == SEASON_TIME:
         return season_left(tables, argument, turn)
     if kind == LEVEL:
-        last = max(1, tables.sanction_fine.shape[0] - 1)
+        last = max(1, tables.sanction_fine.shape[0] - 1, tables.sanction_steps.shape[1] - 1)
         return min(memory.level[i], last) / last
     if kind == DETECTED:
         return 1.0 if memory.detected[i] else 0.0

@@ -7,6 +7,8 @@ agent indices of "learning" and "random"; and a population that lists a member f
 from collections.abc import Mapping, Sequence
 from typing import Any, Final
 
+from cprl.institutions.boundaries import NOBODY, OPEN
+
 _REWARDS: Final = {"own": "individual", "group": "team"}
 _OF_TEAMS: Final = ("VDN", "QMIX", "MAPPO", "IPPO")
 """Algorithms whose equal members formed a team."""
@@ -56,6 +58,7 @@ def upgraded_game(game: Mapping[str, Any]) -> dict[str, Any]:
             found.append({"kind": "Sanctioner", "agents": agents, "observed": False})
     if isinstance(freeze, Sequence):
         rules["freeze_steps"] = 25
+    if isinstance(freeze, Sequence) and rules.get("may_fire", True):
         sanctions = {"freeze_steps": freeze, "fines": [0.0], "recovery_steps": None, "on": "tags"}
         found.append({"kind": "GraduatedSanctions", **sanctions, "observed": False})
     kept = {**game, "rules": rules}
@@ -69,12 +72,14 @@ def _regions(board: Mapping[str, Any], may_bite: Sequence[Sequence[bool]]) -> di
     """The regions and owners of `Boundaries` that say the same as a table: a row per agent, a column per
     site. Sites that the same agents may harvest are one region."""
     columns = list(zip(*may_bite, strict=True))
-    signs = {column: _SIGNS[nth] for nth, column in enumerate(dict.fromkeys(columns)) if not all(column)}
-    rows = [["."] * board["width"] for _ in range(board["height"])]
+    signs = {column: _SIGNS[nth] for nth, column in enumerate(dict.fromkeys(columns)) if any(column)}
+    signs |= {column: OPEN if all(column) else NOBODY for column in columns if len(set(column)) == 1}
+    rows = [[OPEN] * board["width"] for _ in range(board["height"])]
     for (row, col), column in zip(board["sites"], columns, strict=True):
-        rows[row][col] = signs.get(column, ".")
+        rows[row][col] = signs[column]
     owners = [
-        "".join(sign for column, sign in signs.items() if column[agent]) for agent in range(len(may_bite))
+        "".join(sign for column, sign in signs.items() if column[agent] and sign != OPEN)
+        for agent in range(len(may_bite))
     ]
     return {"regions": ["".join(row) for row in rows], "owners": owners}
 

@@ -1,0 +1,192 @@
+"""Helpers of the tests of institutions: random games with institutions, and how they are played."""
+
+from dataclasses import replace
+from typing import NamedTuple
+
+import numpy as np
+from boards import random_actions
+from hypothesis import strategies as st
+from test_worlds import copied, games
+
+from cprl import Game, Observation, Rules, maps
+from cprl.commons.batch import Batch
+from cprl.commons.world import StepOutput, Worlds
+from cprl.institutions import (
+    Boundaries,
+    ClosedPatches,
+    ClosedSeason,
+    GraduatedSanctions,
+    Levies,
+    Mediation,
+    Monitoring,
+    Quota,
+    Sanctioner,
+    Tax,
+    Vote,
+)
+from cprl.institutions.memory import DERIVED, REMEMBERED, Memory, Payments
+
+EVERYTHING = Game(
+    map=maps.parse(
+        """
+        >AA.A.<
+        .A#A...
+        ..A.^.A
+        """
+    ),
+    rules=Rules(regrow_prob=(0.05, 0.5), freeze_steps=4, episode_steps=25, window_rows=3, window_columns=5),
+    observation=Observation(agents_apart=True),
+    institutions=(
+        Boundaries.drawn("001122-\n.......\n..3..22", owners=("01", "13", "2"), bite_fine=0.5),
+        Boundaries.drawn(".......\n..012..\n.......", step_fine=0.25, observed=False),
+        Quota(share=0.5, window_steps=4, fine=1),
+        Vote(on=Quota(window_steps=6, by_stock=True), choices=(0.5, 1, 2)),
+        ClosedSeason(period_steps=9, closed_steps=2, fine=0.75),
+        ClosedPatches(below=2, fine=0.1),
+        Vote(on=Tax(period_steps=3), choices=(0.0, 0.3), override_prob=0.5, period_episodes=2),
+        Tax(brackets=((0, 0.1), (2, 0.4)), redistribution="none", period_steps=5),
+        Levies(groups=((1,), (2, 0))),
+        Monitoring(prob=0.7, cost=0.2, monitor="elected"),
+        GraduatedSanctions(freeze_steps=(1, 2, 6), fines=(0, 0.5), recovery_steps=5),
+        Mediation(turns=2, refund=0.6),
+        Sanctioner(override_prob=0.3),
+    ),
+)
+"""A game with every kind of institution at once."""
+
+FINES = st.sampled_from([0.0, 0.5, 3.0])
+
+
+def boundaries(board, fine, step_fine):
+    """Boundaries with regions of agents, reserves and open ground."""
+    signs = ".-" + "".join(str(agent) for agent in range(board.agents))
+    row = st.text(signs, min_size=board.width, max_size=board.width)
+    rows = st.lists(row, min_size=board.height, max_size=board.height).map(tuple)
+    return st.builds(Boundaries, regions=rows, bite_fine=fine, step_fine=step_fine)
+
+
+def quotas(fine):
+    return st.builds(
+        Quota,
+        share=st.sampled_from([0.0, 0.5, 2.0]),
+        window_steps=st.integers(1, 9),
+        by_stock=st.booleans(),
+        fine=fine,
+        observed=st.booleans(),
+    )
+
+
+def taxes():
+    brackets = st.sampled_from([(), ((0, 0.2), (1, 0.5)), ((0, 0.0), (2.5, 1.0))])
+    kinds = st.sampled_from(["equal", "none"])
+    periods = st.integers(1, 7)
+    return st.builds(Tax, rate=st.floats(0, 1), redistribution=kinds, period_steps=periods, brackets=brackets)
+
+
+def levies(agents):
+    def grouped(order, cut):
+        groups = [group for group in (order[:cut], order[cut:]) if group]
+        return Levies(groups=tuple(map(tuple, groups)), local_rate=0.25, joint_rate=0.5)
+
+    return st.builds(grouped, st.permutations(range(agents)), st.integers(0, agents))
+
+
+def votes(on):
+    return st.builds(
+        Vote,
+        on=on,
+        choices=st.sampled_from([(0.0, 1.0), (0.1, 0.5, 0.9)]),
+        period_episodes=st.integers(1, 2),
+        override_prob=st.sampled_from([0.0, 0.5]),
+    )
+
+
+MONITORS = st.builds(
+    Monitoring,
+    prob=st.sampled_from([0.0, 0.5, 1.0]),
+    cost=st.sampled_from([0.0, 0.5]),
+    monitor=st.sampled_from([None, 0, "elected"]),
+)
+MEDIATIONS = st.builds(Mediation, turns=st.integers(1, 5), refund=FINES)
+SANCTIONS = st.builds(
+    GraduatedSanctions,
+    freeze_steps=st.sampled_from([(0,), (2, 5), (1, 2, 3)]),
+    fines=st.sampled_from([(0.0,), (1.0, 2.5)]),
+    recovery_steps=st.sampled_from([None, 1, 4]),
+    on=st.sampled_from(["tags", "violations", "both"]),
+)
+
+
+@st.composite
+def governed_games(draw, *, harmless=False, ballots=True, **fixed):
+    """Random games with up to seven institutions; `harmless`: only such as leave all but payments alone;
+    without `ballots`: none in which agents decide anything."""
+    game = draw(games(**fixed))
+    fine = FINES if harmless else FINES | st.none()
+    several = [
+        boundaries(game.map, fine, FINES | st.none()),
+        quotas(fine),
+        st.builds(ClosedSeason, period_steps=st.integers(5, 9), closed_steps=st.integers(0, 5), fine=fine),
+        taxes(),
+        levies(game.agents),
+    ]
+    plain = taxes().map(lambda tax: replace(tax, brackets=()))
+    if ballots:
+        several.append(votes(plain | quotas(fine)))
+    chosen = draw(st.lists(st.one_of(several), max_size=4))
+    monitors = MONITORS if ballots else MONITORS.map(lambda own: replace(own, monitor=None))
+    one_each = [monitors, st.builds(ClosedPatches, below=st.integers(0, 4), fine=fine), MEDIATIONS]
+    if not harmless:
+        sanctioners = st.just(Sanctioner(agents=(0,)))
+        one_each += [SANCTIONS, sanctioners | st.just(Sanctioner()) if ballots else sanctioners]
+    for kind in one_each:
+        chosen += draw(st.lists(kind, max_size=1))
+    order = draw(st.permutations(chosen or [Tax()]))
+    return replace(game, observation=Observation(agents_apart=True), institutions=tuple(order))
+
+
+class Moment(NamedTuple):
+    """Copies of all arrays after a turn."""
+
+    worlds: Worlds
+    memory: Memory
+    turn: StepOutput
+    payments: Payments
+
+
+def kept(batch, output):
+    return Moment(copied(batch.now), copied(batch.memory), copied(output.turn), copied(output.payments))
+
+
+def random_decisions(steps, worlds, game, *, seed=0):
+    """int64 [steps, worlds, N], every option equally likely."""
+    shape = steps, worlds, game.agents
+    return np.random.default_rng(seed + 1000).integers(0, max(1, game.decisions), shape)
+
+
+def play_on(batch, output, actions, decisions):
+    """The moments after each turn."""
+    found = []
+    for turn, decided in zip(actions, decisions, strict=True):
+        batch.play(turn, output, decided)
+        found.append(kept(batch, output))
+    return found
+
+
+def played(game, *, turns=40, worlds=2, seed=0, threads=1):
+    """The moments of random play, from the begin on."""
+    batch = Batch(game, worlds, seed=seed, threads=threads)
+    output = batch.begin(batch.new_output())
+    actions = random_actions(turns, worlds, game, seed=seed)
+    decisions = random_decisions(turns, worlds, game, seed=seed)
+    return [kept(batch, output), *play_on(batch, output, actions, decisions)]
+
+
+def assert_same_moments(one, other, *, rows=slice(None), other_rows=slice(None)):
+    """All that lasts, and all outputs, are equal in the given worlds."""
+    for mine, theirs in zip(one, other, strict=True):
+        names = mine._fields
+        if isinstance(mine, Memory):
+            names = (*REMEMBERED, *DERIVED)
+        for name in names:
+            assert np.array_equal(getattr(mine, name)[rows], getattr(theirs, name)[other_rows]), name

@@ -1,0 +1,169 @@
+"""Boundaries: who may harvest and stand where, and what it costs."""
+
+import pytest
+from boards import Play, drawn
+
+from cprl.institutions import Boundaries, ClosedPatches
+
+BOARD = """
+>AA..
+..AA<
+"""
+REGIONS = """
+.01..
+..01.
+"""
+
+
+def test_nobody_harvests_in_the_region_of_others_and_no_rule_is_broken():
+    play = Play(BOARD, institutions=[Boundaries.drawn(REGIONS)])
+    assert play.turn("forward").harvest == [1, 1], "each in its own region"
+    assert play.turn("forward").harvest == [0, 0], "each in that of the other"
+    assert play.board == drawn("""
+        ..>..
+        ..<..
+        """)
+    assert play.output.stock[0, 0] == 2
+    assert (play.fines, play.transfers, play.violated) == ([0, 0], [0, 0], [False, False])
+    assert play.reward == [0, 0]
+    assert play.counts("own_bites") == [1, 1]
+    assert play.counts("foreign_bites") == [0, 0]
+    assert play.counts("trespasses") == [1, 1], "standing there is counted, though it is allowed"
+
+
+def test_a_bite_with_a_fine_happens_and_is_paid():
+    play = Play(BOARD, institutions=[Boundaries.drawn(REGIONS, bite_fine=1.5)])
+    play.turn("forward").turn("forward", "stay")
+    # One apple for 1.5: 1 - 1.5 = -0.5.
+    assert (play.harvest, play.fines, play.reward) == ([1, 0], [1.5, 0], [-0.5, 0])
+    assert play.violated == [True, False]
+    assert play.counts("foreign_bites") == [1, 0]
+    assert play.counts("violations") == play.counts("detections") == [1, 0]
+    assert play.turn("stay").fines == [0, 0], "standing there without an apple costs nothing"
+    assert play.violated == [False, False]
+
+
+def test_a_fine_of_zero_is_a_violation_that_costs_nothing():
+    play = Play(BOARD, institutions=[Boundaries.drawn(REGIONS, bite_fine=0)])
+    play.turn("forward").turn("forward")
+    assert (play.harvest, play.fines, play.violated) == ([1, 1], [0, 0], [True, True])
+
+
+def test_each_turn_in_the_region_of_others_costs_the_step_fine_where_bites_are_stopped():
+    play = Play(BOARD, institutions=[Boundaries.drawn(REGIONS, step_fine=0.25)])
+    assert play.turn("forward").fines == [0, 0]
+    for _ in range(2):
+        play.turn("forward" if play.places[0] == (0, 1) else "stay")
+        assert play.places == [(0, 2), (1, 2)]
+        assert (play.harvest, play.fines, play.violated) == ([0, 0], [0.25, 0.25], [True, True])
+    play.turn("backward", "stay")
+    assert (play.fines, play.reward) == ([0, 0.25], [0, -0.25])
+    assert play.counts("trespasses") == play.counts("violations") == [2, 3]
+
+
+def test_step_and_bite_fines_of_one_turn_add_up_to_one_violation():
+    play = Play(BOARD, institutions=[Boundaries.drawn(REGIONS, bite_fine=2, step_fine=0.5)])
+    play.turn("forward").turn("forward", "stay")
+    # 1 - 2 - 0.5 = -1.5.
+    assert (play.fines, play.reward) == ([2.5, 0], [-1.5, 0])
+    assert play.counts("violations") == [1, 0]
+    assert play.counts("trespasses") == play.counts("foreign_bites") == [1, 0]
+
+
+def test_an_agent_that_is_out_of_play_is_not_fined_for_where_it_lies():
+    # Agent 1 stands in the region of agent 0, and is tagged there in the first turn.
+    play = Play(
+        "A....\n>..^.",
+        institutions=[Boundaries.drawn(".....\n...0.", step_fine=1)],
+        freeze_steps=2,
+    )
+    assert play.turn("beam", "stay").fines == [0, 1], "it was in play in this turn"
+    assert play.turn("stay").fines == [0, 0]
+    assert play.turn("stay").fines == [0, 0]
+    assert play.in_play == [True, True]
+    assert play.turn("stay").fines == [0, 1]
+
+
+def test_owners_are_named_by_the_signs_of_their_regions():
+    regions = ".ab..\n..ab."
+    play = Play(BOARD, institutions=[Boundaries.drawn(regions, owners=("b", "ab"))])
+    assert play.turn("forward").harvest == [0, 1]
+    assert play.turn("forward").harvest == [1, 1]
+    assert play.counts("own_bites") == [1, 2]
+
+
+def test_open_ground_belongs_to_nobody_and_counts_for_nobody():
+    play = Play(BOARD, institutions=[Boundaries.drawn(".....\n...1.", bite_fine=1)])
+    play.turn("forward")
+    assert play.harvest == [1, 1]
+    assert play.counts("own_bites") == [0, 1]
+    assert play.counts("foreign_bites") == [0, 0]
+
+
+def test_a_reserve_is_closed_to_all():
+    play = Play(BOARD, institutions=[Boundaries.drawn(".-...\n...-.", owners=("", ""))])
+    assert play.turn("forward").harvest == [0, 0]
+    assert play.turn("forward").harvest == [1, 1]
+
+
+def test_two_boundaries_both_count():
+    first, second = Boundaries.drawn(REGIONS, bite_fine=1), Boundaries.drawn(REGIONS, step_fine=0.5)
+    play = Play(BOARD, institutions=[first, second]).turn("forward").turn("forward")
+    assert play.harvest == [0, 0], "the second one stops the bite"
+    assert play.fines == [0.5, 0.5]
+    fined = Boundaries.drawn(REGIONS, bite_fine=0.25, step_fine=0.5)
+    play = Play(BOARD, institutions=[first, fined]).turn("forward").turn("forward")
+    # 1 + 0.25 + 0.5.
+    assert (play.harvest, play.fines) == ([1, 1], [1.75, 1.75])
+    assert play.counts("foreign_bites") == [2, 2], "once for each"
+    assert play.counts("violations") == [1, 1]
+
+
+def test_drawings_may_be_indented_and_strips_are_as_wide_as_can_be():
+    assert Boundaries.drawn(" .0\n 1. \n\n") == Boundaries(regions=(".0", "1."))
+    # Column 2 of 5 is left of the middle 2.5, so it is in the first of two strips.
+    assert Boundaries.strips(height=2, width=5, agents=2).regions == ("00011", "00011")
+    assert Boundaries.strips(height=1, width=4, agents=4, step_fine=1).regions == ("0123",)
+    with pytest.raises(ValueError, match=r"agents is 4; allowed: 1 to 3"):
+        Boundaries.strips(height=2, width=3, agents=4)
+
+
+def plane(play, agent):
+    """The plane of forbidden cells of an agent's window, # for forbidden."""
+    seen = play.output.observation[0, agent, play.game.channels.index("forbidden")]
+    assert set(seen.reshape(-1).tolist()) <= {0, 255}
+    return "\n".join("".join("#" if cell else "." for cell in row) for row in seen)
+
+
+WINDOW = {"window_rows": 3, "window_columns": 3}
+
+
+def test_agents_see_where_their_bites_are_forbidden():
+    play = Play(BOARD, institutions=[Boundaries.drawn(REGIONS)], **WINDOW)
+    # Agent 0 looks right from (0, 0): two rows ahead are (-1, 2) (0, 2) (1, 2), of which (0, 2) is of 1.
+    assert plane(play, 0) == ".#.\n...\n..."
+    # Agent 1 looks left from (1, 4): two ahead are (2, 2) (1, 2) (0, 2), of which (1, 2) is of 0.
+    assert plane(play, 1) == ".#.\n...\n..."
+    play.turn("turn_right", "stay")
+    # It looks down from (0, 0); (1, 0) is open.
+    assert plane(play, 0) == "...\n...\n..."
+
+
+def test_only_what_is_observed_is_shown():
+    # Site (0, 1) has no other apple near it, so its patch is closed with fewer than 2.
+    hidden = Boundaries.drawn("..1..\n.....", observed=False)
+    patches = ClosedPatches(below=2)
+    rules = {"regrow_radius_cells": 0, **WINDOW}
+    assert plane(Play(BOARD, institutions=[hidden, patches], **rules), 0) == ".##\n.#.\n..."
+    patches = ClosedPatches(below=2, observed=False)
+    shown = Boundaries.drawn("..1..\n.....")
+    assert plane(Play(BOARD, institutions=[shown, patches], **rules), 0) == ".#.\n...\n..."
+
+
+def test_walls_hide_what_is_forbidden_where_they_block_sight():
+    board, regions = ">.#A\n...<", "...1\n...."
+    rules = {"window_rows": 4, "window_columns": 3}
+    play = Play(board, institutions=[Boundaries.drawn(regions)], **rules)
+    assert plane(play, 0) == ".#.\n...\n...\n..."
+    play = Play(board, institutions=[Boundaries.drawn(regions)], walls_block_sight=True, **rules)
+    assert plane(play, 0) == "...\n...\n...\n..."

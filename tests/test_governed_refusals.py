@@ -1,0 +1,255 @@
+"""What institutions cannot be, and what does not fit together, is refused by name before anything is made."""
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+import pytest
+import torch
+from governed import EVERYTHING, kept
+
+from cprl import CommonsEnv, Game, Observation, Rules, keys, maps
+from cprl.commons.batch import Batch
+from cprl.envs import parallel_env
+from cprl.institutions import (
+    Boundaries,
+    ClosedPatches,
+    ClosedSeason,
+    GraduatedSanctions,
+    Institution,
+    Levies,
+    Mediation,
+    Monitoring,
+    Sanctioner,
+    Tax,
+    Vote,
+)
+
+PLAIN = Game(map=maps.parse(">A.\n.A<"), rules=Rules(regrow_prob=(0.0, 0.5)))
+
+
+@dataclass(frozen=True, kw_only=True)
+class Mine(Tax):
+    """A kind of the user's own."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Own(Institution):
+    """Another one."""
+
+
+VOTES = tuple(Vote(on=Tax(), choices=tuple(n / 10 for n in range(11))) for _ in range(6))
+
+
+@pytest.mark.parametrize(
+    ("institutions", "message"),
+    [
+        ([Boundaries(regions=("0..",))], r"Boundaries\.regions is 1 x 3; allowed: 2 x 3, as the map"),
+        ([Boundaries(regions=("0.", "0."))], r"Boundaries\.regions is 2 x 2; allowed: 2 x 3"),
+        (
+            [Boundaries(regions=("0..", "..2"))],
+            r"has '2' in row 1, column 2, which no agent may use; allowed: '\.', '-' and the signs of owners",
+        ),
+        (
+            [Boundaries(regions=("a..", "..b"), owners=("a", "a"))],
+            r"Boundaries\.regions has 'b' in row 1, column 2, which no agent may use",
+        ),
+        (
+            [Boundaries(regions=("a..", "..a"), owners=("a",))],
+            r"Boundaries\.owners has 1 entries; allowed: 2, one per agent",
+        ),
+        ([Levies(groups=((0,),))], r"Levies\.groups has the agents \[0\]; allowed: each of 0 to 1 exactly"),
+        ([Levies(groups=((0, 1), (1,)))], r"Levies\.groups has the agents \[0, 1, 1\]; allowed"),
+        ([Levies(groups=((0, 1), (2,)))], r"Levies\.groups has agent 2; allowed on this map: 0 to 1"),
+        ([Sanctioner(agents=(0, 2))], r"Sanctioner\.agents has agent 2; allowed on this map: 0 to 1"),
+        ([Monitoring(monitor=2)], r"Monitoring\.monitor has agent 2; allowed on this map: 0 to 1"),
+        (
+            [GraduatedSanctions(freeze_steps=((1,),), on="tags")],
+            r"GraduatedSanctions\.freeze_steps has 1 rows; allowed: 2, one per agent",
+        ),
+        ([Monitoring(), Tax(), Monitoring()], r"has 2 of Monitoring; allowed: at most 1"),
+        ([ClosedPatches(), ClosedPatches()], r"has 2 of ClosedPatches; allowed: at most 1"),
+        ([GraduatedSanctions()] * 2, r"has 2 of GraduatedSanctions; allowed: at most 1"),
+        ([Mediation(observed=False)] * 2, r"has 2 of Mediation; allowed: at most 1"),
+        ([Sanctioner()] * 3, r"has 3 of Sanctioner; allowed: at most 1"),
+        (
+            [Mediation()],
+            r"Mediation\.observed is True and Observation\.agents_apart is False; allowed: "
+            r"Observation\(agents_apart=True\), or Mediation\(observed=False\)",
+        ),
+        ([Mine()], r"Game\.institutions has a Mine; allowed: Boundaries, .*; an institution of your own"),
+        ([Own()], r"Game\.institutions has a Own; allowed: Boundaries, .* is a TorchRL transform"),
+        ([Tax()] * 65, r"Game\.institutions has 65 entries; allowed: at most 64"),
+        (VOTES, r"lets agents choose from 1,771,561 options; allowed: at most 1,048,576"),
+    ],
+)
+def test_what_does_not_fit_the_game_is_refused(institutions, message):
+    with pytest.raises(ValueError, match=message):
+        replace(PLAIN, institutions=tuple(institutions))
+
+
+@pytest.mark.parametrize("wrong", [(Tax,), ("Tax",), Tax(), {"tax": Tax()}, (None,), 3])
+def test_what_is_no_institution_is_refused(wrong):
+    with pytest.raises(ValueError, match=r"^Game\.institutions.*; allowed: "):
+        replace(PLAIN, institutions=wrong)
+
+
+@pytest.mark.parametrize(
+    "own", [Sanctioner(), Sanctioner(agents=(0,)), Mediation(observed=False), GraduatedSanctions(on="tags")]
+)
+def test_where_nobody_fires_what_follows_from_shots_is_refused(own):
+    with pytest.raises(ValueError, match=rf"a {type(own).__name__} and Rules\.may_fire is False; allowed: a"):
+        replace(PLAIN, rules=Rules(may_fire=False), institutions=(own,))
+    replace(PLAIN, rules=Rules(may_fire=False), institutions=(GraduatedSanctions(on="violations"),))
+
+
+@pytest.mark.parametrize(
+    ("make", "message"),
+    [
+        (lambda: Boundaries(regions=("0.", "0")), r"Boundaries\.regions is .*; allowed: equally long texts"),
+        (lambda: Boundaries(regions=()), r"Boundaries\.regions is "),
+        (lambda: Boundaries(regions=("0\t",)), r"Boundaries\.regions is "),
+        (lambda: Boundaries(regions=("a",), owners=("a.",)), r"Boundaries\.owners is .*; allowed: None, or"),
+        (lambda: Boundaries(regions=("a",), owners=("-",)), r"Boundaries\.owners is "),
+        (lambda: Boundaries(regions=("a",), bite_fine=-1), r"Boundaries\.bite_fine is -1"),
+        (lambda: Boundaries.strips(height=1, width=40, agents=37), r"agents is 37; allowed: 1 to 36"),
+        (lambda: ClosedSeason(period_steps=5, closed_steps=6), r"closed_steps is 6; allowed: up to .*, 5"),
+        (lambda: Tax(brackets=((1, 0.5),)), r"Tax\.brackets is .*; allowed: \(apples, rate\) pairs"),
+        (lambda: Tax(brackets=((0, 0.5), (0, 0.6))), r"Tax\.brackets is "),
+        (lambda: Tax(brackets=((0, 1.5),)), r"Tax\.brackets is "),
+        (lambda: Levies(groups=((0,), ())), r"Levies\.groups is .*; allowed: a tuple of agent indices"),
+        (
+            lambda: Levies(groups=((0,),), local_rate=0.6, joint_rate=0.5),
+            r"Levies\.joint_rate is 0\.5 and local_rate is 0\.6; allowed: at most 1 together",
+        ),
+        (lambda: Vote(on=Tax(brackets=((0, 0.1),))), r"Vote\.on is a Tax with brackets; allowed: a Tax with"),
+        (lambda: Vote(on=Tax(), choices=(0, 2)), r"Vote\.choices has 2; allowed for a Tax: 0\.\.1"),
+        (lambda: Vote(on=Tax(), choices=(0.5,)), r"Vote\.choices is .*; allowed: two or more numbers"),
+        (lambda: Vote(on=Tax(), choices=(0.5, 0.1)), r"Vote\.choices is .*ascending"),
+        (lambda: Vote(on=ClosedSeason()), r"Vote\.on is .*; allowed: a Tax or a Quota"),
+        (lambda: Sanctioner(agents=(1, 0)), r"Sanctioner\.agents is .*; allowed: None for an election"),
+        (lambda: Monitoring(monitor="chosen"), r"Monitoring\.monitor is .*; allowed: an agent index"),
+        (
+            lambda: GraduatedSanctions(freeze_steps=((1,), (2,)), on="both"),
+            r'GraduatedSanctions\.on is "both" and freeze_steps has a row per agent; allowed with .*"tags"',
+        ),
+        (lambda: GraduatedSanctions(recovery_steps=0), r"GraduatedSanctions\.recovery_steps is 0"),
+        (lambda: Mediation(turns=0), r"Mediation\.turns is 0"),
+    ],
+)
+def test_what_an_institution_cannot_be_is_refused(make, message):
+    with pytest.raises(ValueError, match=message):
+        make()
+
+
+def begun():
+    batch = Batch(EVERYTHING, 2)
+    return batch, batch.begin(batch.new_output())
+
+
+@pytest.mark.parametrize(
+    ("decisions", "message"),
+    [
+        (np.full((2, 3), EVERYTHING.decisions), rf"decision {EVERYTHING.decisions} of agent 0 in world 0 is"),
+        (np.array([[0, 0, 0], [0, -1, 0]]), r"decision -1 of agent 1 in world 1 is unknown; allowed: 0 to"),
+        (np.zeros((2, 2), np.int64), r"decisions is int64 \[2, 2\]; allowed: int64 \[2, 3\]"),
+        (np.zeros((2, 3)), r"decisions is float64 \[2, 3\]; allowed: int64 \[2, 3\]"),
+        (np.zeros((2, 6), np.int64)[:, ::2], r"int64 \[2, 3\] is not contiguous"),
+    ],
+)
+def test_wrong_decisions_are_refused_and_nothing_has_changed(decisions, message):
+    batch, output = begun()
+    before = kept(batch, output)
+    with pytest.raises(ValueError, match=message):
+        batch.play(np.zeros((2, 3), np.int64), output, decisions)
+    for one, other in zip(before, kept(batch, output), strict=True):
+        assert all(map(np.array_equal, one, other))
+
+
+def test_decisions_in_a_game_without_any_are_refused():
+    batch = Batch(replace(PLAIN, institutions=(Tax(),)), 1)
+    output = batch.begin(batch.new_output())
+    with pytest.raises(ValueError, match=r"decision 1 of agent 0 in world 0 is unknown; allowed: 0 to 0"):
+        batch.play(np.zeros((1, 2), np.int64), output, np.ones((1, 2), np.int64))
+
+
+def test_the_env_wants_a_decision_that_fits_in_every_turn():
+    env = CommonsEnv(EVERYTHING, 2)
+    moment = env.reset().set(keys.ACTION, torch.zeros(2, 3, dtype=torch.int64))
+    with pytest.raises(ValueError, match=r'\("agents", "decision"\) is missing; allowed: int64 \[2, 3\]'):
+        env.step(moment)
+    for wrong, message in (
+        (torch.full((2, 3), EVERYTHING.decisions), "decision .* of agent 0 in world 0 is unknown"),
+        (torch.zeros(2, 3), r'\("agents", "decision"\) is torch.float32; allowed: int64 \[2, 3\]'),
+    ):
+        with pytest.raises(ValueError, match=message):
+            env.step(moment.clone().set(keys.DECISION, wrong))
+    assert env.worlds.now.step.tolist() == [[0], [0]]
+    env.step(moment.set(keys.DECISION, torch.zeros(2, 3, dtype=torch.int32)))
+    assert env.worlds.now.step.tolist() == [[1], [1]]
+
+
+@pytest.mark.parametrize(
+    ("decisions", "message"),
+    [
+        ({"agent_3": 0}, r"the agent of a decision is .*agent_3"),
+        ({"agent_0": EVERYTHING.decisions}, r"the decision of agent_0 is .*; allowed: "),
+        ({"agent_0": 0.5}, r"the decision of agent_0 is 0\.5"),
+        ([0, 1, 2], r"decisions is .*; allowed: a dict of decisions"),
+    ],
+)
+def test_wrong_decisions_of_a_reset_are_refused_and_the_episode_goes_on(decisions, message):
+    adapter = parallel_env(EVERYTHING, 3)
+    adapter.reset()
+    adapter.step(dict.fromkeys(EVERYTHING.agent_names, 0))
+    before = adapter.world.batch.state()
+    with pytest.raises(ValueError, match=message):
+        adapter.reset(options={"decisions": decisions})
+    assert all(np.array_equal(before[name], array) for name, array in adapter.world.batch.state().items())
+
+
+def test_decisions_where_nothing_is_decided_are_refused():
+    with pytest.raises(
+        ValueError, match=r"decisions is .*; allowed: None: agents decide nothing in this game"
+    ):
+        parallel_env(PLAIN).reset(options={"decisions": {"agent_0": 0}})
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"taken": -1}, r"state\['taken'\]\[0, 0, 0\] is -1; allowed: 0 to 25"),
+        ({"taken": 26}, r"state\['taken'\]\[0, 0, 0\] is 26; allowed: 0 to 25"),
+        ({"level": -1}, r"state\['level'\]\[0, 0\] is -1"),
+        ({"offence_step": 26}, r"state\['offence_step'\]\[0, 0\] is 26; allowed: 0 to 25"),
+        ({"violation_step": -2}, r"state\['violation_step'\]\[0, 0\] is -2; allowed: 0 to 25"),
+        ({"counts": -1}, r"state\['counts'\]\[0, 0, 0\] is -1"),
+        ({"allowed": np.nan}, r"state\['allowed'\]\[0, 0\] is nan; allowed: a number of at least 0"),
+        ({"income": np.inf}, r"state\['income'\]\[0, 0, 0\] is inf; allowed: a number of at least 0"),
+        ({"in_force": 0.7}, r"state\['in_force'\]\[0, 0\] is 0\.7; allowed: one of \[0\.5, 1, 2\]"),
+    ],
+)
+def test_a_state_that_institutions_cannot_be_in_is_refused_and_changes_nothing(change, message):
+    batch, output = begun()
+    state, before = batch.state(), kept(batch, output)
+    for name, value in change.items():
+        state[name].reshape(-1)[0] = value
+    with pytest.raises(ValueError, match=message):
+        batch.load(state, output)
+    for one, other in zip(before, kept(batch, output), strict=True):
+        assert all(map(np.array_equal, one, other))
+
+
+def test_a_state_of_the_game_without_institutions_is_refused_and_the_other_way_round():
+    with_, without = begun()[0], Batch(replace(EVERYTHING, institutions=()), 2)
+    without.begin(without.new_output())
+    with pytest.raises(ValueError, match=r"the state lacks \['allowed', 'counts'"):
+        with_.load(without.state(), with_.new_output())
+    with pytest.raises(ValueError, match=r"has the unknown entries \['allowed', 'counts'"):
+        without.load(with_.state(), without.new_output())
+
+
+def test_a_state_from_before_the_first_episode_can_be_put_back():
+    batch = Batch(replace(EVERYTHING, observation=Observation(agents_apart=True)), 2)
+    other = Batch(batch.game, 2)
+    other.load(batch.state(), other.new_output())
+    assert all(np.array_equal(array, other.state()[name]) for name, array in batch.state().items())

@@ -1,0 +1,391 @@
+"""Invariants of games with institutions, on random boards, rules, institutions and actions."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from boards import random_actions
+from governed import (
+    EVERYTHING,
+    FINES,
+    MEDIATIONS,
+    assert_same_moments,
+    boundaries,
+    governed_games,
+    kept,
+    levies,
+    play_on,
+    played,
+    random_decisions,
+    taxes,
+)
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from test_worlds import games
+from test_worlds import played as played_without
+
+from cprl import Observation, presets
+from cprl.commons.batch import Batch
+from cprl.commons.world import PLAYING
+from cprl.institutions import (
+    COUNTS,
+    Boundaries,
+    ClosedPatches,
+    ClosedSeason,
+    GraduatedSanctions,
+    Monitoring,
+    Quota,
+    Sanctioner,
+)
+from cprl.institutions.memory import REMEMBERED
+
+SEEDS = st.integers(0, 2**32 - 1)
+AS_RUN = {
+    "pairwise_clashes": True,
+    "regrow_before_bites": True,
+    "freeze_counts_tag_turn": True,
+    "ends_one_turn_late": True,
+    "picture_shows_old_stock": True,
+}
+QUICK = settings(max_examples=60, deadline=None)
+
+
+def check_untouched(game, seed):
+    plain = replace(game, institutions=())
+    actions = random_actions(30, 2, game, seed=seed)
+    cells = len(game.cell_channels)
+    for moment, (worlds, turn) in zip(
+        played(game, turns=30, seed=seed), played_without(plain, actions, seed=seed), strict=True
+    ):
+        for name, array in worlds._asdict().items():
+            assert np.array_equal(array, getattr(moment.worlds, name)), name
+        for name, array in turn._asdict().items():
+            own = getattr(moment.turn, name)
+            assert np.array_equal(array, own[:, :, :cells] if name == "observation" else own), name
+
+
+@QUICK
+@given(game=governed_games(harmless=True), seed=SEEDS)
+def test_payments_alone_leave_the_game_as_it_is_bit_for_bit(game, seed):
+    check_untouched(game, seed)
+
+
+@settings(max_examples=30, deadline=None)
+@given(game=governed_games(harmless=True, **AS_RUN), seed=SEEDS)
+def test_payments_alone_leave_the_game_as_run_as_it_is(game, seed):
+    check_untouched(game, seed)
+
+
+@QUICK
+@given(game=governed_games(), seed=SEEDS)
+def test_the_reward_is_the_harvest_less_fines_plus_transfers_and_an_ended_world_pays_nothing(game, seed):
+    ended = np.zeros(2, bool)
+    for moment in played(game, seed=seed):
+        turn, paid = moment.turn, moment.payments
+        expected = turn.harvest.astype(np.float64) - paid.fines + paid.transfers
+        np.testing.assert_allclose(paid.reward, expected, rtol=1e-5, atol=1e-6)
+        assert (paid.fines >= 0).all()
+        assert (paid.transfers >= 0).all()
+        for flow in (paid.fines, paid.transfers, paid.reward, paid.violated):
+            assert not flow[ended].any()
+        ended = moment.worlds.ended[:, 0] != PLAYING
+
+
+@QUICK
+@given(game=governed_games(), seed=SEEDS)
+def test_counts_add_up(game, seed):
+    before = None
+    for moment in played(game, seed=seed):
+        counts = {name: moment.payments.counts[..., n] for n, name in enumerate(COUNTS)}
+        now = moment.payments.counts
+        assert (now >= (0 if before is None else before)).all()
+        if before is not None:
+            grown = now - before
+            assert np.array_equal(grown[..., COUNTS.index("violations")], moment.payments.violated)
+        assert (counts["detections"] <= counts["violations"]).all()
+        assert (counts["returns_to_violation"] <= counts["violations"]).all()
+        assert (counts["returns_to_violation"][counts["sanctions"] == 0] == 0).all()
+        before = now
+
+
+def with_one(strategy):
+    """Games with one institution of a strategy that is a function of the game."""
+    apart = Observation(agents_apart=True)
+    return games().flatmap(
+        lambda game: strategy(game).map(lambda own: replace(game, observation=apart, institutions=(own,)))
+    )
+
+
+def sums(game, seed):
+    """Of each turn: harvest, fines and transfers [T, B, N] of a whole episode, and the last counts."""
+    moments = played(game, turns=game.rules.episode_steps, seed=seed)[1:]
+    assert (moments[-1].worlds.ended != PLAYING).all()
+    harvest = np.array([moment.turn.harvest for moment in moments], np.float64)
+    fines, transfers = (
+        np.array([getattr(moment.payments, name) for moment in moments], np.float64)
+        for name in ("fines", "transfers")
+    )
+    counts = {name: moments[-1].payments.counts[..., n] for n, name in enumerate(COUNTS)}
+    return harvest, fines, transfers, counts
+
+
+def close(one, other):
+    np.testing.assert_allclose(one, other, rtol=1e-5, atol=1e-5)
+
+
+@QUICK
+@given(game=with_one(lambda _: taxes()), seed=SEEDS)
+def test_a_tax_takes_what_is_owed_by_the_end_and_gives_it_back_at_once_or_not_at_all(game, seed):
+    harvest, fines, transfers, _ = sums(game, seed)
+    (tax,) = game.institutions
+    if not tax.brackets:
+        close(fines.sum(0), tax.rate * harvest.sum(0))
+    if tax.redistribution == "none":
+        assert not transfers.any()
+    else:
+        close(transfers.sum(-1), fines.sum(-1))
+        close(transfers, transfers[..., :1].repeat(game.agents, -1))
+
+
+@QUICK
+@given(game=with_one(lambda game: levies(game.agents)), seed=SEEDS)
+def test_levies_take_their_rates_of_each_harvest_and_keep_nothing(game, seed):
+    harvest, fines, transfers, _ = sums(game, seed)
+    close(fines, 0.75 * harvest)
+    close(transfers.sum(-1), fines.sum(-1))
+    (own,) = game.institutions
+    for group in own.groups:
+        joint = 0.5 * harvest.sum(-1) * len(group) / game.agents
+        close(transfers[..., list(group)].sum(-1), 0.25 * harvest[..., list(group)].sum(-1) + joint)
+
+
+@QUICK
+@given(game=with_one(lambda _: MEDIATIONS), seed=SEEDS)
+def test_mediation_keeps_nothing(game, seed):
+    _, fines, transfers, counts = sums(game, seed)
+    close(fines.sum(-1), transfers.sum(-1))
+    if game.institutions[0].refund:
+        assert (fines.sum(0) > 0).sum() == (counts["unjust_tags"] > 0).sum()
+
+
+@QUICK
+@given(
+    game=with_one(lambda game: boundaries(game.map, FINES, FINES)),
+    seed=SEEDS,
+)
+def test_boundaries_charge_so_much_for_each_bite_and_step(game, seed):
+    harvest, fines, transfers, counts = sums(game, seed)
+    (own,) = game.institutions
+    close(fines.sum(0), own.bite_fine * counts["foreign_bites"] + own.step_fine * counts["trespasses"])
+    assert not transfers.any()
+    assert (counts["own_bites"] + counts["foreign_bites"] <= harvest.sum(0)).all()
+
+
+def fined_limits(_):
+    kinds = [
+        st.builds(Quota, share=st.sampled_from([0.0, 0.5]), window_steps=st.integers(1, 9), fine=FINES),
+        st.builds(ClosedSeason, period_steps=st.just(5), closed_steps=st.integers(0, 5), fine=FINES),
+        st.builds(ClosedPatches, below=st.integers(0, 4), fine=FINES),
+    ]
+    return st.one_of(kinds)
+
+
+@QUICK
+@given(game=with_one(fined_limits), seed=SEEDS)
+def test_limits_charge_so_much_for_each_bite_beyond_them(game, seed):
+    _, fines, transfers, counts = sums(game, seed)
+    (own,) = game.institutions
+    close(fines.sum(0), own.fine * (counts["excess_bites"] + counts["closed_bites"]))
+    assert not transfers.any()
+
+
+@QUICK
+@given(game=games(), seed=SEEDS, share=st.sampled_from([0.3, 1.0]), window=st.integers(1, 9))
+def test_nobody_harvests_more_than_a_quota_in_a_window(game, seed, share, window):
+    game = replace(game, institutions=(Quota(share=share, window_steps=window),))
+    most = share * game.governed_tables.institutions.quota_unit[0]
+    harvest, fines, _, counts = sums(game, seed)
+    for first in range(0, len(harvest), window):
+        assert (harvest[first : first + window].sum(0) <= most + 1e-6).all()
+    assert not fines.any()
+    assert not counts["excess_bites"].any()
+
+
+@QUICK
+@given(game=with_one(lambda game: boundaries(game.map, st.none(), st.none())), seed=SEEDS)
+def test_nobody_harvests_in_the_region_of_others(game, seed):
+    (own,) = game.institutions
+    for moment in played(game, seed=seed)[1:]:
+        for world, agent in np.argwhere(moment.turn.harvest > 0):
+            row, col = moment.worlds.row[world, agent], moment.worlds.col[world, agent]
+            assert own.regions[row][col] in ("." + own.signs_of(agent))
+
+
+@QUICK
+@given(game=games(), seed=SEEDS, cost=FINES, monitor=st.sampled_from([None, 0]))
+def test_inspection_costs_the_same_in_every_turn_until_the_end(game, seed, cost, monitor):
+    game = replace(game, institutions=(Monitoring(cost=cost, monitor=monitor),))
+    for before, moment in zip(*(played(game, seed=seed)[n:] for n in (0, 1)), strict=False):
+        is_playing = before.worlds.ended[:, 0] == PLAYING
+        close(moment.payments.fines.sum(-1), cost * is_playing)
+
+
+@QUICK
+@given(game=games(), seed=SEEDS)
+def test_fines_without_recovery_are_those_of_so_many_sanctions(game, seed):
+    levels = (0.5, 2.0, 7.0)
+    own = GraduatedSanctions(freeze_steps=(1, 2), fines=levels, recovery_steps=None)
+    game = replace(game, institutions=(own,))
+    _, fines, _, counts = sums(game, seed)
+    owed = np.cumsum([0, *levels, *[levels[-1]] * 99])
+    close(fines.sum(0), owed[counts["sanctions"]])
+
+
+@QUICK
+@given(game=games(), seed=SEEDS)
+def test_only_the_sanctioner_fires(game, seed):
+    game = replace(game, institutions=(Sanctioner(agents=(0,)),))
+    for moment in played(game, seed=seed):
+        assert not moment.turn.fired[:, 1:].any()
+
+
+@QUICK
+@given(game=governed_games(ballots=False), seed=SEEDS, order=st.randoms(use_true_random=False))
+def test_the_order_of_institutions_changes_no_move_and_no_payment(game, seed, order):
+    shuffled = list(game.institutions)
+    order.shuffle(shuffled)
+    other = replace(game, institutions=tuple(shuffled))
+    for one, two in zip(played(game, seed=seed), played(other, seed=seed), strict=True):
+        for name, array in one.worlds._asdict().items():
+            assert np.array_equal(array, getattr(two.worlds, name)), name
+        for name in ("fines", "transfers", "reward", "violated", "counts"):
+            mine, theirs = getattr(one.payments, name), getattr(two.payments, name)
+            np.testing.assert_allclose(mine, theirs, rtol=1e-5, atol=1e-6, err_msg=name)
+
+
+def test_the_order_of_institutions_is_that_of_ballots_and_of_what_is_shown():
+    ballots = [replace(EVERYTHING, institutions=EVERYTHING.institutions[::step]) for step in (1, -1)]
+    titles = [[ballot.title for ballot in game.ballots] for game in ballots]
+    assert (
+        titles[0] == titles[1][::-1] == ["the quota's share", "the tax rate", "who monitors", "who may fire"]
+    )
+    assert ballots[0].decisions == ballots[1].decisions == 3 * 2 * 3 * 3
+
+
+IDLE = 7
+
+
+@QUICK
+@given(game=governed_games(), seed=SEEDS)
+def test_an_episode_does_not_know_what_was_done_in_the_one_before(game, seed):
+    decisions = random_decisions(20, 2, game, seed=seed)
+    actions = random_actions(20, 2, game, seed=seed)
+    found = []
+    for first in (actions, np.full_like(actions, IDLE)):
+        batch = Batch(game, 2, seed=seed)
+        output = batch.begin(batch.new_output())
+        play_on(batch, output, first, decisions)
+        batch.begin(output)
+        found.append([kept(batch, output), *play_on(batch, output, actions, decisions)])
+    for one, other in zip(*found, strict=True):
+        assert_same_moments(one, other)
+
+
+@QUICK
+@given(game=governed_games(), seed=SEEDS)
+def test_at_an_episodes_begin_everything_but_what_is_in_force_is_as_in_a_new_world(game, seed):
+    batch = Batch(game, 2, seed=seed)
+    output = batch.begin(batch.new_output())
+    new = batch.state()
+    play_on(batch, output, random_actions(20, 2, game, seed=seed), random_decisions(20, 2, game, seed=seed))
+    batch.begin(output)
+    again = batch.state()
+    apart = [name for name in new if not np.array_equal(new[name], again[name])]
+    # A quota that is voted on begins with the share in force.
+    voted = {"in_force", "allowed"} if game.ballots else set()
+    assert set(apart) <= {"episode", *voted}
+
+
+@QUICK
+@given(game=governed_games(), seed=SEEDS, turns=st.integers(0, 25))
+def test_a_state_that_is_loaded_plays_on_bit_for_bit(game, seed, turns):
+    actions, decisions = random_actions(40, 2, game, seed=seed), random_decisions(40, 2, game, seed=seed)
+    batch = Batch(game, 2, seed=seed)
+    output = batch.begin(batch.new_output())
+    play_on(batch, output, actions[:turns], decisions[:turns])
+    other = Batch(game, 2, seed=5)
+    shown = other.load(batch.state(), other.new_output())
+    assert set(REMEMBERED) <= set(batch.state())
+    assert np.array_equal(shown.turn.observation, output.turn.observation), "planes of institutions, too"
+    for name in ("fines", "transfers", "reward", "violated"):
+        assert not getattr(shown.payments, name).any(), name
+    for name in ("counts", "in_force"):
+        assert np.array_equal(getattr(shown.payments, name), getattr(output.payments, name)), name
+    rest = actions[turns:], decisions[turns:]
+    for one, two in zip(play_on(batch, output, *rest), play_on(other, shown, *rest), strict=True):
+        assert_same_moments(one, two)
+
+
+@QUICK
+@given(game=governed_games(), seed=SEEDS)
+def test_a_world_of_a_batch_plays_as_it_would_alone(game, seed):
+    actions, decisions = random_actions(25, 3, game, seed=seed), random_decisions(25, 3, game, seed=seed)
+    batch, alone = Batch(game, 3, seed=seed), Batch(game, 1, seed=seed, first_world=2)
+    outputs = [own.begin(own.new_output()) for own in (batch, alone)]
+    whole = play_on(batch, outputs[0], actions, decisions)
+    single = play_on(alone, outputs[1], actions[:, 2:].copy(), decisions[:, 2:].copy())
+    for one, other in zip(whole, single, strict=True):
+        assert_same_moments(one, other, rows=slice(2, 3))
+
+
+@pytest.mark.parametrize("threads", [2, 3])
+def test_the_number_of_threads_changes_nothing(threads):
+    one = played(EVERYTHING, worlds=7, turns=60, seed=4)
+    other = played(EVERYTHING, worlds=7, turns=60, seed=4, threads=threads)
+    for mine, theirs in zip(one, other, strict=True):
+        assert_same_moments(mine, theirs)
+
+
+@QUICK
+@given(game=governed_games(), seed=SEEDS, turns=st.integers(1, 20))
+def test_a_new_episode_of_some_worlds_leaves_the_others_alone(game, seed, turns):
+    batch = Batch(game, 3, seed=seed)
+    output = batch.begin(batch.new_output())
+    actions, decisions = (
+        random_actions(turns, 3, game, seed=seed),
+        random_decisions(turns, 3, game, seed=seed),
+    )
+    before = play_on(batch, output, actions, decisions)[-1]
+    batch.begin(output, np.array([False, True, False]))
+    after = kept(batch, output)
+    assert_same_moments(before, after, rows=[0, 2], other_rows=[0, 2])
+    assert not after.payments.fines[1].any()
+    assert not after.payments.counts[1].any()
+
+
+def test_everything_at_once_happens_somewhere():
+    moments = played(EVERYTHING, worlds=20, turns=24, seed=1)
+    counts = np.max([moment.payments.counts for moment in moments], (0, 1, 2))
+    assert all(counts), dict(zip(COUNTS, counts.tolist(), strict=True))
+    assert any(moment.payments.transfers.any() for moment in moments)
+    assert len({tuple(row) for moment in moments for row in moment.payments.in_force.tolist()}) > 5
+
+
+@pytest.mark.parametrize("variant", presets.VARIANTS)
+def test_the_published_board_under_its_owners_plays_as_without_them_where_all_is_allowed(variant):
+    game = presets.game("commons", variant=variant)
+    free = Boundaries(regions=("." * game.map.width,) * game.map.height)
+    governed = replace(
+        game,
+        institutions=(
+            free,
+            Quota(share=1e6),
+            ClosedSeason(closed_steps=0),
+            ClosedPatches(below=0),
+            Sanctioner(agents=(0, 1, 2, 3)),
+            GraduatedSanctions(
+                freeze_steps=(game.rules.freeze_steps,), fines=(0,), recovery_steps=None, on="tags"
+            ),
+        ),
+    )
+    check_untouched(governed, seed=3)

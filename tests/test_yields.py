@@ -1,0 +1,149 @@
+"""The sustainable yield is a lower bound of what a map bears, which a harvest in a known way reaches."""
+
+from itertools import product
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from cprl import Game, Map, Rules, maps, presets
+from cprl.commons.batch import Batch
+from cprl.commons.near import neighbours
+from cprl.commons.yields import sustainable_yield
+
+CROSS = maps.parse(
+    """
+    >Av
+    AAA
+    .A.
+    """
+)
+AS_RUN = presets.game("commons", variant="as_run").rules
+PUBLISHED = presets.game("commons").rules
+
+
+def test_an_isolated_cross_bears_a_tenth_of_an_apple_a_turn_as_run():
+    # All five sites are near each other. Two are harvested and have three apples near: 2 x 0.05; with one it
+    # is 1 x 0.05 (four near), with three 3 x 0.01 (two near).
+    assert sustainable_yield(CROSS, AS_RUN) == pytest.approx(0.1)
+    # As published a harvested site also stands full for the turn in which it is bitten: 0.05 / 1.05 each.
+    assert sustainable_yield(CROSS, PUBLISHED) == pytest.approx(2 * 0.05 / 1.05)
+
+
+def test_crosses_far_from_each_other_add_up():
+    board = maps.crosses(height=7, width=30, centres=((3, 3), (3, 12), (3, 21)), starts=((0, 0, 0),))
+    assert sustainable_yield(board, AS_RUN) == pytest.approx(0.3)
+
+
+def test_where_nothing_grows_there_is_no_yield():
+    assert sustainable_yield(CROSS, Rules(regrow_prob=(0.0,))) == 0
+    lonely = maps.parse("A...>...A")
+    assert sustainable_yield(lonely, PUBLISHED) == 0, "no apple is near another"
+
+
+def test_where_apples_come_from_nothing_all_sites_are_harvested():
+    # Three sites, each 1/2 without regrowth in the same turn, and 1 with it.
+    board = maps.parse("AAA>")
+    assert sustainable_yield(board, Rules(regrow_prob=(1.0,))) == pytest.approx(1.5)
+    assert sustainable_yield(board, Rules(regrow_prob=(1.0,), regrow_before_bites=True)) == pytest.approx(3)
+
+
+def test_a_probability_that_falls_with_the_apples_near_counts_at_its_lowest():
+    # A pair. One harvested, its neighbour full: always one near, 0.2 / 1.2. Both harvested: none or one near,
+    # so at least 0.2 each, 2 x 0.2 / 1.2.
+    board = maps.parse("AA>")
+    assert sustainable_yield(board, Rules(regrow_prob=(0.9, 0.2))) == pytest.approx(2 * 0.2 / 1.2)
+
+
+@st.composite
+def boards(draw, sites):
+    cells = draw(st.permutations([(r, c) for r in range(4) for c in range(5)]))
+    most = draw(st.integers(1, sites))
+    return Map(height=4, width=5, sites=tuple(cells[1 : most + 1]), starts=((*cells[0], 0),))
+
+
+RULES = st.builds(
+    Rules,
+    regrow_prob=st.lists(st.sampled_from([0.0, 0.01, 0.05, 0.2, 0.5, 1.0]), min_size=1, max_size=5).map(
+        tuple
+    ),
+    regrow_radius_cells=st.sampled_from([1.0, 1.5, 2.0, 3.0]),
+    regrow_before_bites=st.booleans(),
+)
+
+
+def around(board, rules):
+    first, near = neighbours(board, rules)
+    return [near[first[k] : first[k + 1]].tolist() for k in range(len(board.sites))]
+
+
+def bound_of(harvested, near, rules):
+    """What these sites bear at least if they are harvested and no others are, worked out site by site."""
+    most, total = max(map(len, near)), 0.0
+    for k in np.flatnonzero(harvested):
+        kept = sum(not harvested[other] for other in near[k])
+        p = min(rules.regrow_prob[min(n, len(rules.regrow_prob) - 1)] for n in range(kept, most + 1))
+        total += p if rules.regrow_before_bites else p / (1 + p)
+    return total
+
+
+def best_set(board, rules):
+    """The best of all sets of harvested sites, and its bound."""
+    near = around(board, rules)
+    sets = [np.array(chosen, bool) for chosen in product((False, True), repeat=len(near))]
+    bounds = [bound_of(chosen, near, rules) for chosen in sets]
+    return sets[int(np.argmax(bounds))], max(bounds)
+
+
+@settings(max_examples=150, deadline=None)
+@given(board=boards(sites=7), rules=RULES)
+def test_no_set_of_harvested_sites_bears_less_than_is_claimed(board, rules):
+    claimed, (_, best) = sustainable_yield(board, rules), best_set(board, rules)
+    assert claimed <= best + 1e-9, "all sets were tried"
+    singles = [bound_of(np.arange(len(board.sites)) == k, around(board, rules), rules) for k in (0, -1)]
+    assert claimed >= max(0.0, singles[0]) - 1e-9, "one site alone is a set, too"
+
+
+def harvested_per_turn(board, rules, harvested, *, worlds=300, turns=300, rng):
+    """Apples a turn of a harvest of some sites as soon as they are full, played without the game's code."""
+    near = np.zeros((len(board.sites),) * 2)
+    for k, others in enumerate(around(board, rules)):
+        near[k, others] = 1
+    probs = np.array(rules.regrow_prob)
+    full, taken = np.ones((worlds, len(board.sites)), bool), 0
+    for turn in range(turns):
+        p = probs[np.minimum(full @ near.T, len(probs) - 1).astype(int)]
+        grows = ~full & (rng.random(full.shape) < p)
+        bitten = harvested & (full | grows if rules.regrow_before_bites else full)
+        full = (full | grows) & ~bitten
+        taken += bitten.sum() * (turn >= turns // 3)
+    return taken / (worlds * (turns - turns // 3))
+
+
+@pytest.mark.parametrize("seed", range(4))
+@pytest.mark.parametrize("before", [False, True])
+def test_a_harvest_of_the_best_set_bears_at_least_its_bound(seed, before):
+    rng = np.random.default_rng(seed)
+    cells = rng.permutation([(r, c) for r in range(4) for c in range(5)]).tolist()
+    board = Map(height=4, width=5, sites=tuple(map(tuple, cells[1:9])), starts=((*cells[0], 0),))
+    rules = Rules(regrow_prob=(0.0, 0.02, 0.05, 0.3), regrow_before_bites=before)
+    chosen, best = best_set(board, rules)
+    played = harvested_per_turn(board, rules, chosen, rng=rng)
+    # About 60,000 world-turns: the standard error is below 0.01 x the mean + 0.002.
+    assert played >= best * 0.97 - 0.004
+    assert sustainable_yield(board, rules) <= played / 0.97 + 0.004
+
+
+@pytest.mark.parametrize(("rules", "expected"), [(AS_RUN, 0.1), (PUBLISHED, 2 * 0.05 / 1.05)])
+def test_two_agents_that_stay_on_two_sites_of_a_cross_harvest_its_yield(rules, expected):
+    # Agent 0 steps right onto (0, 1), agent 1 down onto (1, 2); three sites stay full, so the chance is 0.05
+    # whatever the other harvested site holds.
+    batch = Batch(Game(map=CROSS, rules=rules), 64, seed=1)
+    output, actions = batch.begin(batch.new_output()), np.zeros((64, 2), np.int64)
+    batch.play(actions, output)
+    actions[:], taken = 7, 0.0
+    for _ in range(900):
+        taken += float(batch.play(actions, output).harvest.sum())
+    # About 5,600 apples, each by chance: a standard deviation of 75, 1.3 %.
+    assert taken / (64 * 900) == pytest.approx(expected, rel=0.05)
