@@ -53,7 +53,17 @@ DECISIONS: Final = "decisions.pt"
 
 
 def save_decisions(run: Path, values: Mapping[str, Tensor]) -> None:
-    """Writes the values of agents' decisions atomically; writes no file if they learn none."""
+    """Writes the values of agents' decisions atomically; writes no file if they learn none.
+
+    Args:
+        run: the run's directory.
+        values: float64 [C] by the agent's name, see `cprl.learners.decisions.BanditDecider.learned`.
+    """
+    run = path_of("run", run)
+    object_of("values", values, Mapping, "values by the agent's name")
+    for name, own in values.items():
+        checked("values", name, TEXT)
+        object_of(f"values[{name!r}]", own, Tensor, "a tensor")
     if values:
         write_listed(run, f"checkpoints/{DECISIONS}", lambda file: torch.save(dict(values), file))
 
