@@ -133,7 +133,7 @@ INSTITUTIONS = st.one_of(
 ONE_OF_A_KIND = st.tuples(
     st.builds(ClosedPatches, below=st.integers(0, 5), fine=FINES),
     st.builds(Monitoring, prob=SHARES, monitor=st.sampled_from([None, 0, "elected"])),
-    st.builds(GraduatedSanctions, recovery_steps=st.none() | st.integers(1, 9), on=st.just("tags")),
+    st.builds(GraduatedSanctions, recovery_steps=st.none() | st.integers(1, 9)),
 )
 GAMES = st.builds(
     Game,
