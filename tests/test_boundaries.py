@@ -92,12 +92,12 @@ def test_owners_are_named_by_the_signs_of_their_regions():
     assert play.counts("own_bites") == [1, 2]
 
 
-def test_open_ground_belongs_to_nobody_and_counts_for_nobody():
-    play = Play(BOARD, institutions=[Boundaries.drawn(".....\n...1.", bite_fine=1)])
+def test_where_it_may_bite_counts_as_its_own_open_ground_included():
+    play = Play(BOARD, institutions=[Boundaries.drawn(".....\n...0.", bite_fine=1)])
     play.turn("forward")
     assert play.harvest == [1, 1]
-    assert play.counts("own_bites") == [0, 1]
-    assert play.counts("foreign_bites") == [0, 0]
+    assert play.counts("own_bites") == [1, 0]
+    assert play.counts("foreign_bites") == [0, 1]
 
 
 def test_a_reserve_is_closed_to_all():

@@ -26,4 +26,13 @@ In reading order:
     decoding     observations back to classes of cells
     sprites      agents as they are drawn: number, heading and second mark
     picture      an image of the board for people
+
+Of games with institutions (`cprl.institutions`):
+
+    yields               what a map can bear
+    institution_checks   that they fit each other and the game
+    institution_entries  which entries they show agents
+    institution_tables   institutions as lookup tables for the compiled rules
+    institution_views    what they add to observations, on one world
+    institution_turn     the order of a turn with institutions, on one world
 """

@@ -62,7 +62,8 @@ def count_hit(world: Worlds, tables: Tables, hit_by: Bools, tagged_by: Bools, i:
     is_hit_now = False
     for j in range(world.row.shape[0]):
         tagged_by[i, j] = False
-        is_hit_now = is_hit_now or hit_by[i, j]
+        if hit_by[i, j]:
+            is_hit_now = True
     if not is_hit_now:
         return False
     world.hits[i] += 1

@@ -9,12 +9,9 @@ import numpy as np
 
 from cprl.arguments import object_of, objects
 from cprl.commons.colours import FIRST_AGENT, MAX_AGENTS_APART, class_colour
-from cprl.commons.institution_tables import (
-    build_institution_tables,
-    check_institutions,
-    entries_shown,
-    shows_places,
-)
+from cprl.commons.institution_checks import check_institutions
+from cprl.commons.institution_entries import entries_shown, shows_places
+from cprl.commons.institution_tables import build_institution_tables
 from cprl.commons.maps import Map
 from cprl.commons.observation import Observation, channel_names
 from cprl.commons.rules import Rules

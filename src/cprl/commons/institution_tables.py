@@ -1,14 +1,14 @@
 """The institutions of a game as lookup tables for the compiled rules."""
 
-from collections.abc import Callable, Sequence
-from typing import Any, Final
+from collections.abc import Sequence
+from typing import Any
 
 import numpy as np
 
 from cprl.commons.chance import threshold
+from cprl.commons.institution_entries import entries_shown, shows_places
 from cprl.commons.maps import Map
 from cprl.commons.near import neighbours
-from cprl.commons.observation import Observation
 from cprl.commons.rules import Rules
 from cprl.commons.tables import Tables
 from cprl.commons.world import Bools, Ints
@@ -27,64 +27,9 @@ from cprl.institutions import (
     Tax,
     Vote,
 )
-from cprl.institutions import memory as shows
-from cprl.institutions.base import MOST_INSTITUTIONS
 from cprl.institutions.boundaries import OPEN
-from cprl.institutions.choice import MOST_DECISIONS, Ballot, ballots, decision_options
-from cprl.institutions.memory import FOREIGN, FREE, OWN, InstitutionTables
-from cprl.institutions.monitoring import ELECTED
-
-_ABOUT_PLACES: Final = (Boundaries, ClosedPatches)
-
-
-def check_institutions(institutions: tuple[Any, ...], board: Map, rules: Rules, form: Observation) -> None:
-    """Checks that institutions fit each other, the map, the rules and the observation.
-
-    Raises:
-        ValueError: If not; names the institution and says what is allowed.
-    """
-    if len(institutions) > MOST_INSTITUTIONS:
-        raise ValueError(
-            f"Game.institutions has {len(institutions)} entries; allowed: at most {MOST_INSTITUTIONS}"
-        )
-    for own in institutions:
-        kind = type(own)
-        if kind not in _SHOWN_BY:
-            raise ValueError(
-                f"Game.institutions has a {kind.__name__}; allowed: "
-                f"{', '.join(known.__name__ for known in _SHOWN_BY)}; an institution of your own is a "
-                "TorchRL transform, see docs/institutions.md"
-            )
-        of_kind = sum(type(other) is kind for other in institutions)
-        if kind.at_most is not None and of_kind > kind.at_most:
-            raise ValueError(
-                f"Game.institutions has {of_kind} of {kind.__name__}; allowed: at most {kind.at_most}"
-            )
-        own.check_board(agents=board.agents, height=board.height, width=board.width)
-        _check_observation(own, form)
-        needs_tags = isinstance(own, Sanctioner | Mediation) or (
-            isinstance(own, GraduatedSanctions) and own.on == "tags"
-        )
-        if needs_tags and not rules.may_fire:
-            raise ValueError(
-                f"Game.institutions has a {kind.__name__} and Rules.may_fire is False; allowed: a game in "
-                "which agents may fire"
-            )
-    options = decision_options(institutions, board.agents)
-    if options > MOST_DECISIONS:
-        raise ValueError(
-            f"Game.institutions lets agents choose from {options:,} options; allowed: at most "
-            f"{MOST_DECISIONS:,}"
-        )
-
-
-def _check_observation(own: Institution, form: Observation) -> None:
-    lacking = [name for name in type(own).needs if own.observed and not getattr(form, name)]
-    if lacking:
-        raise ValueError(
-            f"{type(own).__name__}.observed is True and Observation.{lacking[0]} is False; allowed: "
-            f"Observation({lacking[0]}=True), or {type(own).__name__}(observed=False)"
-        )
+from cprl.institutions.choice import Ballot, ballots, is_decided
+from cprl.institutions.memory import InstitutionTables
 
 
 def build_institution_tables(
@@ -151,35 +96,26 @@ def _voted(institutions: Sequence[Institution], kind: type[Any]) -> list[tuple[A
             found.append((own, -1))
         elif isinstance(own, Vote) and isinstance(own.on, kind):
             found.append((own.on, ballot))
-        ballot += _is_decided(own)
+        ballot += is_decided(own)
     return found
-
-
-def _is_decided(own: Institution) -> bool:
-    return (
-        isinstance(own, Vote)
-        or (isinstance(own, Sanctioner) and own.agents is None)
-        or (isinstance(own, Monitoring) and own.monitor == ELECTED)
-    )
 
 
 def _boundary_tables(institutions: Sequence[Institution], board: Map, tables: Tables) -> dict[str, Any]:
     found = _of(Boundaries, institutions)
     rows = tables.background.size // tables.stride
-    use = np.full((len(found), board.agents, rows, tables.stride), FREE, np.uint8)
+    own = np.ones((len(found), board.agents, rows, tables.stride), np.bool_)
     inside = slice(tables.rim, tables.rim + board.height), slice(tables.rim, tables.rim + board.width)
     for nth, boundary in enumerate(found):
         signs = np.array([list(row) for row in boundary.regions])
         for agent in range(board.agents):
-            is_own = np.isin(signs, list(boundary.signs_of(agent)))
-            use[(nth, agent, *inside)] = np.where(signs == OPEN, FREE, np.where(is_own, OWN, FOREIGN))
+            own[(nth, agent, *inside)] = np.isin(signs, [OPEN, *boundary.signs_of(agent)])
     return {
-        "use": use.reshape(len(found), board.agents, tables.background.size),
+        "own": own.reshape(len(found), board.agents, tables.background.size),
         "bite_stopped": _bools([boundary.bite_fine is None for boundary in found]),
         "bite_fine": _floats([_fine(boundary.bite_fine) for boundary in found]),
         "step_is_violation": _bools([boundary.step_fine is not None for boundary in found]),
         "step_fine": _floats([_fine(boundary.step_fine) for boundary in found]),
-        "use_shown": _bools([boundary.observed for boundary in found]),
+        "own_shown": _bools([boundary.observed for boundary in found]),
     }
 
 
@@ -321,56 +257,3 @@ def _firing_tables(
         "may_fire": _bools([not named or agent in named[0] for agent in range(agents)]),
         "fire_ballot": _ballot_called(voted, "who may fire"),
     }
-
-
-def shows_places(institutions: Sequence[Institution]) -> bool:
-    """Whether agents see where bites are forbidden."""
-    return any(isinstance(own, _ABOUT_PLACES) and own.observed for own in institutions)
-
-
-def entries_shown(institutions: Sequence[Institution], agents: int) -> list[tuple[int, int]]:
-    """(what, which one) of each entry that institutions show agents; see `cprl.institutions.showing`."""
-    entries: list[tuple[int, int]] = []
-    quotas, seasons, ballot = 0, 0, 0
-    for own in institutions:
-        if own.observed:
-            entries += _SHOWN_BY[type(own)](own, quotas, seasons, ballot, agents)
-        quotas += isinstance(own, Quota) or (isinstance(own, Vote) and isinstance(own.on, Quota))
-        seasons += isinstance(own, ClosedSeason)
-        ballot += _is_decided(own)
-    return entries
-
-
-_Entries = list[tuple[int, int]]
-
-
-def _shown_by_quota(own: Any, quotas: int, seasons: int, ballot: int, agents: int) -> _Entries:
-    return [(shows.QUOTA_LEFT, quotas), (shows.QUOTA_TIME, quotas)]
-
-
-def _shown_by_season(own: Any, quotas: int, seasons: int, ballot: int, agents: int) -> _Entries:
-    return [(shows.CLOSED, seasons), (shows.SEASON_TIME, seasons)]
-
-
-def _shown_by_vote(own: Any, quotas: int, seasons: int, ballot: int, agents: int) -> _Entries:
-    also = _shown_by_quota(own.on, quotas, seasons, ballot, agents) if isinstance(own.on, Quota) else []
-    return [(shows.IN_FORCE, ballot), *(also if own.on.observed else [])]
-
-
-def _shown_by_monitoring(own: Any, quotas: int, seasons: int, ballot: int, agents: int) -> _Entries:
-    return [(shows.DETECTED, 0), *([(shows.IS_ELECTED, ballot)] if own.monitor == ELECTED else [])]
-
-
-_SHOWN_BY: Final[dict[type[Any], Callable[..., _Entries]]] = {
-    Boundaries: lambda *_: [],
-    ClosedPatches: lambda *_: [],
-    Quota: _shown_by_quota,
-    ClosedSeason: _shown_by_season,
-    Tax: lambda *_: [],
-    Levies: lambda *_: [],
-    Vote: _shown_by_vote,
-    Monitoring: _shown_by_monitoring,
-    GraduatedSanctions: lambda *_: [(shows.LEVEL, 0)],
-    Mediation: lambda *rest: [(shows.MARK, agent) for agent in range(rest[-1])],
-    Sanctioner: lambda *_: [(shows.MAY_FIRE, 0)],
-}

@@ -98,6 +98,15 @@ class Ballot(NamedTuple):
     override_prob: float
 
 
+def is_decided(own: Institution) -> bool:
+    """Whether agents decide something about this institution, so that it has a ballot."""
+    return (
+        isinstance(own, Vote)
+        or (isinstance(own, Sanctioner) and own.agents is None)
+        or (isinstance(own, Monitoring) and own.monitor == ELECTED)
+    )
+
+
 def ballots(institutions: Sequence[Institution], agents: int) -> tuple[Ballot, ...]:
     """What N agents decide on, in the order of the institutions.
 

@@ -27,9 +27,10 @@ COUNTS: Final = (
     "sanctions",
     "returns_to_violation",
 )
-"""What is counted in an episode for each agent: bites in its own and in others' regions; turns in others'
-regions; bites above a quota, and in a closed season or patch; unjust tags of its own; turns with a violation;
-those that were detected; sanctions (of `GraduatedSanctions`); turns with a violation after a sanction."""
+"""What is counted in an episode for each agent: bites where it may bite and in others' regions; turns in
+others' regions; bites above a quota, and in a closed season or patch; unjust tags of its own; turns with a
+violation; those that were detected; sanctions (of `GraduatedSanctions`); turns with a violation
+later than a sanction."""
 (
     OWN_BITES,
     FOREIGN_BITES,
@@ -141,15 +142,11 @@ SHOWN: Final = (
 ) = range(len(SHOWN))
 
 
-FOREIGN, OWN, FREE = 0, 1, 2
-"""What a cell is for an agent under `Boundaries`: in the region of others, in its own, or open to all."""
-
-
 class InstitutionTables(NamedTuple):
     """All institutions of a game as parameters; a kind that the game does not have has arrays of length 0."""
 
-    use: Bytes
-    """uint8 [boundaries, N, cells]: `FOREIGN`, `OWN` or `FREE`."""
+    own: Bools
+    """bool [boundaries, N, cells], whether the agent may use the cell."""
     bite_stopped: Bools
     """bool [boundaries], whether bites in others' regions do not happen."""
     bite_fine: Numbers
@@ -158,7 +155,7 @@ class InstitutionTables(NamedTuple):
     """bool [boundaries]."""
     step_fine: Numbers
     """float64 [boundaries]."""
-    use_shown: Bools
+    own_shown: Bools
     """bool [boundaries], whether agents are shown where it forbids bites."""
 
     quota_unit: Numbers
