@@ -42,6 +42,7 @@ from cprl.institutions import (
     Tax,
     Vote,
 )
+from cprl.learners.decisions import Bandit
 from cprl.networks import MLP, Conv
 from cprl.population import Frozen, Learning, Scripted, Team
 from cprl.preferences import Exchange, InequityAversion, SocialValueOrientation
@@ -90,6 +91,7 @@ FROZEN = st.builds(
     Frozen, st.just("runs/earlier"), agent=st.integers(0, 3), replica=st.none() | st.integers(0, 9)
 )
 STARTS = st.none() | FROZEN
+BANDITS = st.none() | st.builds(Bandit, step_size=st.floats(1e-6, 1), epsilon_end=SHARES)
 UNIT = st.floats(0, 1, allow_subnormal=False)
 PREFERENCES = st.one_of(
     st.sampled_from(["individual", "team"]),
@@ -98,8 +100,15 @@ PREFERENCES = st.one_of(
     st.builds(Exchange, UNIT),
 )
 SPECS = st.one_of(
-    st.builds(Learning, ALONE | CUSTOM, reward=PREFERENCES, start_from=STARTS),
-    st.builds(Team, TEAMS | CUSTOM, agents=st.just((0, 2)), reward=PREFERENCES, start_from=STARTS),
+    st.builds(Learning, ALONE | CUSTOM, reward=PREFERENCES, start_from=STARTS, decisions=BANDITS),
+    st.builds(
+        Team,
+        TEAMS | CUSTOM,
+        agents=st.just((0, 2)),
+        reward=PREFERENCES,
+        start_from=STARTS,
+        decisions=BANDITS,
+    ),
     st.builds(Scripted, st.sampled_from(["random", "greedy", "pacifist"])),
     FROZEN,
 )
@@ -124,7 +133,7 @@ INSTITUTIONS = st.one_of(
 ONE_OF_A_KIND = st.tuples(
     st.builds(ClosedPatches, below=st.integers(0, 5), fine=FINES),
     st.builds(Monitoring, prob=SHARES, monitor=st.sampled_from([None, 0, "elected"])),
-    st.builds(GraduatedSanctions, recovery_steps=st.none() | st.integers(1, 9), on=st.just("tags")),
+    st.builds(GraduatedSanctions, recovery_steps=st.none() | st.integers(1, 9)),
 )
 GAMES = st.builds(
     Game,

@@ -103,7 +103,8 @@ def test_an_episode_is_what_we_work_out_by_hand():
         "tagged_by": [[0, 0], [1, 0]],
         "stock_left": "0",
         "depletion_step": "2",
-        **dict.fromkeys(("fines", "transfers", "violations", "counts", "in_force", "wanted_return"), "None"),
+        **dict.fromkeys(("fines", "transfers", "violations", "counts", "decision", "in_force"), "None"),
+        "wanted_return": "None",
         "institutions": "{}",
     }
     # collective 3; equality 1 - 2 / (2 * 2 * 3); harvest at steps 1 and 3, and at 3; 5 agent-steps in play

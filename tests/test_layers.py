@@ -45,6 +45,7 @@ PACKAGES = (
     "training",
     "experiment",
     "stored",
+    "earlier",
     "agents",
     "outcome",
     "parts",

@@ -47,6 +47,7 @@ from cprl.institutions import (
     Tax,
     Vote,
 )
+from cprl.learners.decisions import Bandit
 from cprl.learners.replay import ReplayLearner
 from cprl.learners.rollouts import RolloutLearner
 from cprl.learners.settings import Exploring
@@ -79,6 +80,7 @@ VALUES = [
     *(kind(settings=REPLAY) for kind in (DQN, DistributionalDQN, CQL, SAC, IQL, VDN, QMIX)),
     *(kind(settings=ROLLOUTS) for kind in (PPO, A2C, Reinforce, MAPPO, IPPO)),
     Tabular(settings=TABLES),
+    Bandit(),
     Learning(DQN(settings=REPLAY)),
     Team(QMIX(settings=REPLAY), agents=(0, 1)),
     InequityAversion(alpha=5, beta=0.05, smoothing=0.9),
@@ -152,7 +154,7 @@ ALLOWED = {
     },
 }
 """What fits a field although it fits hardly any other."""
-OPTIONAL = {"tau", "max_grad_norm", "network", "start_from", "replica"}
+OPTIONAL = {"tau", "max_grad_norm", "network", "start_from", "replica", "decisions"}
 OPTIONAL |= {"owners", "bite_fine", "step_fine", "fine", "monitor", "recovery_steps"}
 OPTIONAL_OF = {("Sanctioner", "agents")}
 

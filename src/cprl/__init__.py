@@ -36,6 +36,7 @@ Each imports only from those above it:
     training     the loop: act, store, update, measure, record
     experiment   Experiment: what is trained and how, a value
     stored       load: a run built again from its directory
+    earlier      agents of earlier runs: that play, and that others start from
     agents       the learners and policies of a population
     outcome      trained agents in fresh worlds, beside the random policy
     parts        what is made of an experiment before anything is written

@@ -8,24 +8,25 @@ import torch
 from torch import Tensor, nn
 from torchrl.envs import EnvBase
 
-from cprl.algorithms.base import Algorithm, TeamAlgorithm
 from cprl.arguments import objects, texts
 from cprl.checks import MOST_SEED, checked, count
 from cprl.commons.game import Game
-from cprl.custom import Custom, made
+from cprl.custom import Custom
+from cprl.earlier import algorithm_of, frozen_agents, start_weights
 from cprl.envs.make_env import spaces_of
 from cprl.envs.unwrap import commons_of
 from cprl.learners.base import Learner
-from cprl.learners.lanes import EVALUATION, EXHIBITION, EXPLORATION, lane_name, lane_seeds
-from cprl.networks.agent import acting_part
+from cprl.learners.decisions import Bandit, BanditDecider
+from cprl.learners.lanes import EVALUATION, EXHIBITION, EXPLORATION, lane_seeds
 from cprl.policies.assignment import AgentIndices, AgentPolicies
+from cprl.policies.decisions import ballot_sizes, decider_by_chance
 from cprl.policies.lanes import random_agents
 from cprl.policies.present import PresentPolicy
 from cprl.policies.scripted import scripted_lanes
-from cprl.population import AgentSpec, Frozen, Learning, Scripted, Team, grouped
+from cprl.population import AgentSpec, Frozen, Learning, Scripted, Team, grouped, refuse_undecided
 from cprl.preferences.values import named
 from cprl.spaces import Spaces
-from cprl.stored import LoadedRun, StoredAgent, load, stored_actor
+from cprl.stored import stored_actor
 
 
 class Population:
@@ -69,7 +70,7 @@ class Population:
         _check_scripted(self._groups, self.spaces, self._game)
         numbers = range(first_replica, first_replica + self.replicas)
         self._frozen = {
-            spec: _frozen(spec, self.spaces, self._game, allow, numbers)
+            spec: frozen_agents(spec, self.spaces, self._game, allow, numbers)
             for spec, _ in self._groups
             if isinstance(spec, Frozen)
         }
@@ -88,6 +89,31 @@ class Population:
                     spec, self.spaces, agents, {**who, "start_from": start} if start else who
                 )
         self.others: dict[AgentIndices, nn.Module] = self._others(EXPLORATION, worlds=1)
+        self.decisions: BanditDecider | None = self._decisions()
+        """What the agents decide, and learn to, where the game asks them."""
+
+    def _decisions(self) -> BanditDecider | None:
+        sizes = () if self._game is None else ballot_sizes(self._game)
+        refuse_undecided(self.specs, len(sizes))
+        if not sizes:
+            return None
+        bandits: list[Bandit | None] = [None] * self.spaces.agents
+        stored: dict[int, list[Tensor]] = {}
+        for spec, agents in self._groups:
+            for agent in agents:
+                if isinstance(spec, Learning | Team):
+                    bandits[agent] = spec.decisions or Bandit()
+                elif isinstance(spec, Frozen):
+                    values = [own.decisions for own in self._frozen[spec] if own.decisions is not None]
+                    stored |= {agent: values} if values else {}  # a scripted agent of that run has none
+        return BanditDecider(
+            sizes,
+            bandits=bandits,
+            stored=stored,
+            replicas=self.replicas,
+            seed=self.seed,
+            first_replica=self._first,
+        )
 
     def _others(
         self, purpose: int, *, worlds: int, replicas: int | None = None
@@ -112,7 +138,8 @@ class Population:
         learned: dict[AgentIndices, nn.Module] = {
             agents: learner.evaluation_actor(worlds) for agents, learner in self.learners.items()
         }
-        return AgentPolicies({**learned, **self._others(EVALUATION, worlds=worlds)})
+        decisions = None if self.decisions is None else self.decisions.evaluation(worlds)
+        return AgentPolicies({**learned, **self._others(EVALUATION, worlds=worlds)}, decisions=decisions)
 
     def present_policy(self) -> PresentPolicy:
         """All agents of the first replica as they are now, whenever it is called, in one world."""
@@ -122,13 +149,19 @@ class Population:
                 for agents, learner in self.learners.items()
             }
             others = self._others(EXHIBITION, worlds=1, replicas=1)
-            return PresentPolicy(actors, others, replicas=self.replicas, device=self._device)
+            own = self.decisions
+            decisions = None if own is None else (own.first_replica(), own)
+            return PresentPolicy(
+                actors, others, decisions=decisions, replicas=self.replicas, device=self._device
+            )
 
     def random_policy(self, worlds: int) -> AgentPolicies:
-        """Every agent takes every action with equal probability."""
+        """Every agent takes every action with equal probability, and every choice where it decides."""
         everyone = tuple(range(self.spaces.agents))
+        seeds = [(self.seed, replica, agent) for replica in range(self.replicas) for agent in everyone]
         return AgentPolicies(
-            random_agents(self.spaces, everyone, replicas=self.replicas, seed=self.seed, worlds=worlds)
+            random_agents(self.spaces, everyone, replicas=self.replicas, seed=self.seed, worlds=worlds),
+            decisions=None if self._game is None else decider_by_chance(self._game, seeds, worlds=worlds),
         )
 
     def networks(self) -> dict[str, nn.Module]:
@@ -141,7 +174,7 @@ class Population:
 
 
 def _learner(spec: Learning | Team, spaces: Spaces, agents: tuple[int, ...], who: dict[str, Any]) -> Learner:
-    learner = _algorithm(spec).make_learner(spaces, agents=agents, reward_kind=spec.reward, **who)
+    learner = algorithm_of(spec).make_learner(spaces, agents=agents, reward_kind=spec.reward, **who)
     wants = getattr(learner, "wants", None)
     if not isinstance(spec.reward, str) and getattr(wants, "preferences", None) != spec.reward:
         own = spec.algorithm
@@ -151,18 +184,6 @@ def _learner(spec: Learning | Team, spaces: Spaces, agents: tuple[int, ...], who
             "allowed for it: 'individual', 'team'"
         )
     return learner
-
-
-def _algorithm(spec: Learning | Team) -> Algorithm:
-    wanted = TeamAlgorithm if isinstance(spec, Team) else Algorithm
-    algorithm = made(spec.algorithm)
-    if not isinstance(algorithm, wanted):
-        named = f" of {spec.algorithm.target}" if isinstance(spec.algorithm, Custom) else ""
-        raise ValueError(
-            f"the algorithm{named} is a {type(algorithm).__name__}; allowed: a subclass of "
-            f"cprl.algorithms.{wanted.__name__}"
-        )
-    return algorithm
 
 
 def _check_scripted(groups: Sequence[tuple[AgentSpec, Any]], spaces: Spaces, game: Game | None) -> None:
@@ -179,115 +200,3 @@ def _check_scripted(groups: Sequence[tuple[AgentSpec, Any]], spaces: Spaces, gam
                 f"it {spaces.observation_dtype} {list(spaces.observation_shape)}: leave those transforms "
                 'out, or use Scripted("random")'
             )
-
-
-def _frozen(
-    spec: Frozen, spaces: Spaces, game: Game | None, allow: Sequence[str], replicas: Sequence[int]
-) -> list[StoredAgent]:
-    """The stored agent of each replica."""
-    run = _fitting_run(spec.run, spaces, game, allow)
-    return [run.agent(spec.agent, replica=_theirs(spec, replica)) for replica in replicas]
-
-
-def _theirs(spec: Frozen, replica: int) -> int:
-    """The replica of the stored run."""
-    return replica if spec.replica is None else spec.replica
-
-
-def _fitting_run(path: str, spaces: Spaces, game: Game | None, allow: Sequence[str]) -> LoadedRun:
-    """The stored run, refused where it was trained for other observations or actions."""
-    run = load(path, allow=allow)
-    theirs = run.spaces
-    differences: list[tuple[str, Any, Any]] = [
-        ("observations", theirs.observation_shape, spaces.observation_shape),
-        ("observations of the dtype", theirs.observation_dtype, spaces.observation_dtype),
-        ("a number of actions of", theirs.actions, spaces.actions),
-    ]
-    if game is not None and isinstance(run.game, Game):
-        differences += [
-            ("a form of observation", run.game.observation, game.observation),
-            ("actions", run.game.actions, game.actions),
-            ("channels", run.game.channels, game.channels),
-            ("institutions that show", run.game.entries_shown, game.entries_shown),
-        ]
-    for name, came, here in differences:
-        if came != here:
-            raise ValueError(f"the agents of {path} have {name} {came}; this game has {here}")
-    return run
-
-
-def start_weights(
-    spec: Learning | Team,
-    agents: tuple[int, ...],
-    spaces: Spaces,
-    game: Game | None,
-    replicas: Sequence[int],
-    allow: Sequence[str] = (),
-) -> dict[str, dict[str, Tensor]]:
-    """The state dict of the acting network with which each agent of each replica starts, by the lane's name;
-    empty where they start anew.
-
-    Args:
-        spec: how the agents are specified.
-        agents: their indices.
-        spaces: what they observe and may do.
-        game: the game, if it is one of cprl's.
-        replicas: the numbers of the replicas.
-        allow: what the stored run may import.
-
-    Raises:
-        ValueError: where the stored run has no such agent, or its network is another one; says how.
-    """
-    source = spec.start_from
-    if source is None:
-        return {}
-    run, algorithm = _fitting_run(source.run, spaces, game, allow), _algorithm(spec)
-    theirs = _members(run, source, len(agents)) if isinstance(spec, Team) else (source.agent,) * len(agents)
-    weights = {}
-    for replica in replicas:
-        for agent, stored_agent in zip(agents, theirs, strict=True):
-            where = f"{lane_name(_theirs(source, replica), stored_agent)} of {source.run}"
-            stored = run.agent(stored_agent, replica=_theirs(source, replica))
-            weights[lane_name(replica, agent)] = _weights(stored, algorithm, spaces, where)
-    return weights
-
-
-def _members(run: LoadedRun, source: Frozen, size: int) -> tuple[int, ...]:
-    """The agents of the team that the stored agent is in."""
-    theirs = run.specs[source.agent] if source.agent < len(run.specs) else None
-    if not isinstance(theirs, Team) or len(theirs.agents) != size:
-        what = f"in a team of {len(theirs.agents)}" if isinstance(theirs, Team) else "in no team"
-        raise ValueError(
-            f"agent {source.agent} of {source.run} is {what}; allowed for a team of {size} to start from: a "
-            f"member of a team of {size}"
-        )
-    return theirs.agents
-
-
-def _weights(stored: StoredAgent, algorithm: Algorithm, spaces: Spaces, where: str) -> dict[str, Tensor]:
-    """The weights of a stored agent's network, if the algorithm's network computes the same with them."""
-    name = type(algorithm).__name__
-    if stored.network is None:
-        raise ValueError(f"{where} is scripted, without weights; allowed: an agent that learned")
-    if stored.kind[1] != algorithm.stochastic:
-        kinds = {True: "the logits of a policy", False: "action values"}
-        raise ValueError(
-            f"the network of {where} outputs {kinds[stored.kind[1]]}; {name} learns "
-            f"{kinds[algorithm.stochastic]}"
-        )
-    weights = stored.network.state_dict()
-    with torch.random.fork_rng(devices=[]), torch.no_grad():
-        network = acting_part(algorithm.make_network(spaces))
-        try:
-            network.load_state_dict(weights)
-        except RuntimeError as error:
-            reason = " ".join(str(error).split())
-            raise ValueError(f"{where} has another network than {name} here: {reason}") from error
-        torch.manual_seed(0)
-        seen = torch.rand(8, *spaces.observation_shape) * spaces.observation_scale
-        seen = seen.to(getattr(torch, spaces.observation_dtype))
-        if not torch.equal(network(seen), stored.network(seen)):
-            raise ValueError(
-                f"{where} has another network than {name} here: with the same weights the outputs differ"
-            )
-    return weights

@@ -155,6 +155,7 @@ def play(
     variant: Variant = "published",
     steps: int | None = None,
     seed: int = PLAY_SEED,
+    decision: int | None = None,
     terminal: bool = False,
     allow: Allow = (),
 ) -> None:
@@ -170,6 +171,7 @@ def play(
         variant: of the boards with a name, published or as_run; see docs/game.md.
         steps: turns of the episode at most; by default those of the game.
         seed: of all chance; the same seed and the same keys play the same again.
+        decision: what you vote for in a game with votes or elections, by its number; by default chance votes.
         terminal: play in the terminal, by lines of keys; also without pygame (extra "play") or a display.
         allow: code of your own, module:Class, that a run may import; see docs/changing.md.
     """
@@ -183,6 +185,7 @@ def play(
         variant=variant,
         steps=steps,
         seed=seed,
+        decision=decision,
         allow=allow,
     )
     if not terminal:

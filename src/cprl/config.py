@@ -49,6 +49,7 @@ from cprl.institutions import (
     Tax,
     Vote,
 )
+from cprl.learners.decisions import Bandit
 from cprl.networks import MLP, Conv
 from cprl.population import Frozen, Learning, Scripted, Team
 from cprl.preferences import Exchange, InequityAversion, SocialValueOrientation
@@ -59,7 +60,7 @@ _OF_CPRL: Final[tuple[type[Any], ...]] = (
     *(Boundaries, ClosedPatches, ClosedSeason, GraduatedSanctions, Levies, Mediation),
     *(Monitoring, Quota, Sanctioner, Tax, Vote),
     *(DQN, DistributionalDQN, CQL, SAC, IQL, PPO, A2C, Reinforce, VDN, QMIX, MAPPO, IPPO, Tabular),
-    *(DQNSettings, RolloutSettings, TabularSettings, MLP, Conv),
+    *(DQNSettings, RolloutSettings, TabularSettings, Bandit, MLP, Conv),
     Custom,
 )
 KINDS: Final[dict[str, type[Any]]] = {kind.__name__: kind for kind in _OF_CPRL}

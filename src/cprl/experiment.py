@@ -27,7 +27,7 @@ from cprl.envs.make_env import PlayableGame
 from cprl.finite import OnNan
 from cprl.games import game_of, is_playable, stored_game
 from cprl.memory import DEVICE
-from cprl.population import SPEC, AgentSpec, Frozen, Learning, Team, specs_by_agent
+from cprl.population import SPEC, AgentSpec, Frozen, Learning, Team, refuse_undecided, specs_by_agent
 from cprl.preferences.values import check_preference
 from cprl.runs.old_recipes import experiment_config, upgraded_game
 
@@ -262,6 +262,7 @@ def _check_agents(experiment: Experiment) -> None:
     if not isinstance(experiment.game, Custom):
         try:
             specs_by_agent(experiment.agents, experiment.game.agents)
+            refuse_undecided(experiment.agents, len(getattr(experiment.game, "ballots", ())))
         except ValueError as error:
             raise ValueError(f"experiment.agents: {error}") from error
     for place, spec in enumerate(experiment.agents):

@@ -65,6 +65,9 @@ DECISION: Final = (AGENTS, "decision")
 IN_FORCE: Final = "in_force"
 """float32 [B, V]: what the agents' decisions put in force, one for each of `Game.ballots`."""
 
+BALLOTS_DUE: Final = "ballots_due"
+"""bool [B, V]: which of `Game.ballots` are held in the coming turn, which reads the agents' decisions."""
+
 STOCK: Final = "stock"
 """int64 [B, 1]: apples on the board."""
 

@@ -101,6 +101,12 @@ def is_same_later(experiment: Experiment) -> bool:
     return isinstance(experiment.game, Game) and not experiment.transforms
 
 
+def _keeps_decisions(env: EnvBase) -> bool:
+    """Whether what agents decided stays in force for several episodes."""
+    commons = commons_of(env)
+    return commons is not None and any(ballot.period_episodes > 1 for ballot in commons.game.ballots)
+
+
 def evaluate_population(
     experiment: Experiment,
     trained: EnvBase,
@@ -123,8 +129,11 @@ def evaluate_population(
     load_transforms_state(fresh, transforms_state(trained))
     if random is None or not is_same_later(experiment):
         random = evaluate(fresh, population.random_policy(worlds))
-    else:
+    elif not _keeps_decisions(trained):
         fresh.reset()  # the trained agents play the second episode of each world
+    if _keeps_decisions(trained):
+        fresh = fresh_env(experiment)  # or its first one, where what others decided would stay in force
+        load_transforms_state(fresh, transforms_state(trained))
     return {"random": random, "trained": evaluate(fresh, population.policy(worlds), explore=True)}
 
 

@@ -12,6 +12,7 @@ from typing import Any, Final, TypeAlias
 from cprl.algorithms.base import Algorithm, TeamAlgorithm
 from cprl.checks import NONE, Check, check_fields, checked, count, either, instance, is_count, one_of
 from cprl.custom import Custom
+from cprl.learners.decisions import Bandit
 from cprl.learners.settings import Exploring
 from cprl.policies.scripted import SCRIPTED_POLICIES, ScriptedPolicy
 from cprl.preferences.values import PREFERENCE, Preference
@@ -70,6 +71,7 @@ class Frozen:
 
 
 _START: Final = either(instance(Frozen, "Frozen(run, agent, replica)"), NONE)
+_DECISIONS: Final = {"decisions": either(instance(Bandit, "Bandit(step_size=0.1, ...)"), NONE)}
 
 
 @dataclass(frozen=True)
@@ -81,15 +83,18 @@ class Learning:
         reward: what it wants: "individual", its own reward; "team", the sum of the rewards of all agents of
             the game; or a value of `cprl.preferences`, e.g. `Exchange(0.5)`.
         start_from: the agent whose weights its acting network, and the target of it, start with; None for
-            new ones. The optimiser, critics and exploration begin anew.
+            new ones. The optimiser, critics, exploration and decisions begin anew.
+        decisions: how it learns what it decides, in a game with votes or elections; None for `Bandit()`.
     """
 
     algorithm: Algorithm | Custom
     reward: Preference = "individual"
     start_from: Frozen | None = None
+    decisions: Bandit | None = None
 
     def __post_init__(self) -> None:
         check_fields(self, {"algorithm": _ALGORITHM, "reward": PREFERENCE, "start_from": _START})
+        check_fields(self, _DECISIONS)
         if isinstance(self.algorithm, TeamAlgorithm):
             name = type(self.algorithm).__name__
             raise ValueError(
@@ -108,18 +113,21 @@ class Team:
             by itself, see `Learning`.
         start_from: a member of a team of the same size; each member starts with the weights of the member
             at the same place in that team, see `Learning`. Mixers and central critics begin anew.
+        decisions: how each member learns what it decides, by itself; see `Learning`.
     """
 
     algorithm: TeamAlgorithm | Custom
     agents: tuple[int, ...]
     reward: Preference = "team"
     start_from: Frozen | None = None
+    decisions: Bandit | None = None
 
     def __post_init__(self) -> None:
         check_fields(
             self,
             {"algorithm": _TEAM_ALGORITHM, "agents": _MEMBERS, "reward": PREFERENCE, "start_from": _START},
         )
+        check_fields(self, _DECISIONS)
 
 
 @dataclass(frozen=True)
@@ -161,6 +169,16 @@ def specs_by_agent(specs: Sequence[AgentSpec], agents: int) -> list[AgentSpec]:
         )
     by_agent.update(zip(left, alone, strict=True))
     return [by_agent[agent] for agent in range(agents)]
+
+
+def refuse_undecided(specs: Sequence[AgentSpec], ballots: int) -> None:
+    """Raises a ValueError for agents that would learn decisions in a game without any."""
+    for place, spec in enumerate(specs):
+        if isinstance(spec, Learning | Team) and spec.decisions is not None and not ballots:
+            raise ValueError(
+                f"agents[{place}].decisions is {spec.decisions}; allowed in a game without votes and "
+                "elections: None"
+            )
 
 
 def grouped(specs: Sequence[AgentSpec], agents: int) -> list[tuple[AgentSpec, tuple[int, ...]]]:

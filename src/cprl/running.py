@@ -38,7 +38,7 @@ from cprl.runs.files import write_json
 from cprl.runs.lock import FILE_NAME as LOCK
 from cprl.runs.lock import RunLockedError
 from cprl.runs.loggers import check_logger
-from cprl.runs.weights import save_transforms, save_weights
+from cprl.runs.weights import save_decisions, save_transforms, save_weights
 from cprl.terminal.figures import training_curve
 from cprl.terminal.progress import ProgressBar
 from cprl.terminal.summary import summarise
@@ -278,6 +278,7 @@ def _train(
             own.env,
             own.population.learners,
             others=own.population.others,
+            decisions=own.population.decisions,
             episodes=experiment.episodes,
             callbacks=[began, table, bar, *shown, *loggers, *own.callbacks],
             checkpointer=checkpointer,
@@ -286,6 +287,8 @@ def _train(
         )
         save_weights(directory, own.population.networks())
         save_transforms(directory, transforms_state(own.env))
+        if own.population.decisions is not None:
+            save_decisions(directory, own.population.decisions.learned())
     if viewer is not None:
         viewer.flush()
     return training, before

@@ -13,23 +13,26 @@ from torchrl.envs import EnvBase
 
 from cprl.arguments import path as path_of
 from cprl.arguments import texts
+from cprl.checks import shown
 from cprl.commons.game import Game
 from cprl.custom import made
 from cprl.envs.make_env import make_env, spaces_of
 from cprl.envs.state import load_transforms_state
 from cprl.experiment import Experiment
+from cprl.learners.decisions import stored_decisions
 from cprl.learners.lanes import EVALUATION, lane_name, lane_seeds
 from cprl.networks.agent import acting_part
 from cprl.networks.finite import all_finite
 from cprl.networks.stacked import stack_lanes
 from cprl.policies.assignment import AgentIndices, AgentPolicies
+from cprl.policies.decisions import ballot_sizes
 from cprl.policies.lanes import LaneActor
 from cprl.policies.scripted import scripted_lanes
 from cprl.population import AgentSpec, Frozen, Learning, Scripted, Team, specs_by_agent
-from cprl.runs.checkpoints import FOLDER, checkpoints_in, read_checkpoint
+from cprl.runs.checkpoints import FOLDER
 from cprl.runs.directory import FILE_NAME, read_recipe
 from cprl.runs.episodes import read_episodes
-from cprl.runs.weights import TRANSFORMS, load_weights
+from cprl.runs.kept import kept_of
 from cprl.spaces import Spaces
 
 
@@ -41,6 +44,8 @@ class StoredAgent:
     """("scripted", policy), or ("trained", stochastic, epsilon, algorithm); agents of one kind can be lanes
     of one actor."""
     network: nn.Module | None = None
+    decisions: Tensor | None = None
+    """The values of its choices on all ballots, float64 [C]; None if it decides by chance, or nothing."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -57,6 +62,8 @@ class LoadedRun:
     """The file that held them: of a run that has not ended, its newest checkpoint."""
     transforms_state: Mapping[str, Any]
     """What the transforms of the environment had learned."""
+    decisions: Mapping[str, Tensor] = field(default_factory=dict)
+    """The values of what each lane decides, see `cprl.policies.decisions`; empty where it decides nothing."""
     allow: tuple[str, ...] = ()
     _earlier: dict[str, "LoadedRun"] = field(default_factory=dict, repr=False)
     """Runs whose agents are frozen in this one, read once."""
@@ -120,7 +127,19 @@ class LoadedRun:
         algorithm = made(spec.algorithm)
         stochastic = bool(algorithm.stochastic)
         epsilon = 0.0 if stochastic else float(getattr(algorithm.settings, "epsilon_evaluation", 0.0))
-        return StoredAgent(("trained", stochastic, epsilon, repr(spec.algorithm)), self.networks[lane])
+        kind = ("trained", stochastic, epsilon, repr(spec.algorithm))
+        return StoredAgent(kind, self.networks[lane], self._decisions_of(lane))
+
+    def _decisions_of(self, lane: str) -> Tensor | None:
+        sizes = ballot_sizes(self.game) if isinstance(self.game, Game) else ()
+        values = self.decisions.get(lane)
+        if not sizes:
+            return None
+        if not isinstance(values, Tensor) or values.shape != (sum(sizes),) or values.isnan().any():
+            raise ValueError(
+                f"{self.path} keeps {shown(values)} of what {lane} decides; allowed: {sum(sizes)} values"
+            )
+        return values
 
     def policy(self, replica: int = 0, *, worlds: int = 1, seed: int = 0) -> AgentPolicies:
         """The agents of a replica in so many worlds side by side; those that learned explore as in evaluation
@@ -166,7 +185,13 @@ def stored_policies(
         seeds = lane_seeds(seed, replicas=replicas, agents=same, purpose=EVALUATION)
         lanes = [agents[agent][place] for place in range(len(replicas)) for agent in same]
         actors[tuple(same)] = stored_actor(lanes, playing, seeds=seeds, agents=len(same), worlds=worlds)
-    return AgentPolicies(actors)
+    values = [[own.decisions for own in of_replicas] for of_replicas in agents]
+    decisions = (
+        stored_decisions(values, playing, replicas=replicas, worlds=worlds, seed=seed)
+        if isinstance(playing, Game)
+        else None
+    )
+    return AgentPolicies(actors, decisions=decisions)
 
 
 def stored_actor(
@@ -240,48 +265,20 @@ def load(run: str | Path, *, weights: str | None = None, allow: Sequence[str] = 
         experiment = Experiment.from_recipe(recipe, directory=run, allow=allow)
     except ValueError as error:
         raise ValueError(f"{run / FILE_NAME}: {error}") from error
-    path, kept, transforms = _kept(run, weights)
+    kept = kept_of(run, weights)
     loaded = LoadedRun(
         path=run,
         experiment=experiment,
         recipe=recipe,
         networks={},
-        weights_from=path,
-        transforms_state=transforms,
+        weights_from=kept.path,
+        transforms_state=kept.transforms,
+        decisions=kept.decisions,
         allow=tuple(allow),
     )
     with torch.random.fork_rng(devices=[]):  # networks draw weights at first, which the kept ones replace
-        object.__setattr__(loaded, "networks", _networks(path, kept, loaded))
+        object.__setattr__(loaded, "networks", _networks(kept.path, kept.networks, loaded))
     return loaded
-
-
-def _kept(run: Path, name: str | None) -> tuple[Path, Any, Any]:
-    """A file with weights, the state dict of each network in it, and the state of transforms."""
-    folder = run / FOLDER
-    path = folder / f"{name or 'final'}.pt"
-    if name is None and not path.exists():
-        return _from_checkpoint(run, path)
-    transforms = folder / (name.replace("final", "transforms") + ".pt" if name else TRANSFORMS)
-    if not transforms.exists():
-        transforms = folder / TRANSFORMS
-    return path, load_weights(path), load_weights(transforms) if transforms.exists() else {}
-
-
-def _from_checkpoint(run: Path, final: Path) -> tuple[Path, Any, Any]:
-    """The same from the newest readable checkpoint."""
-    reasons = []
-    for checkpoint in reversed(checkpoints_in(run / FOLDER)):
-        try:
-            state = read_checkpoint(checkpoint)
-            of_learners = [learner["networks"] for learner in state["learners"]]
-        except (ValueError, KeyError) as error:
-            reasons.append(str(error))
-            continue
-        networks = {lane: own for networks in of_learners for lane, own in networks.items()}
-        return checkpoint, networks, state.get("env", {}).get("transforms", {})
-    raise ValueError(
-        "; ".join([f"{final} is not there, nor a readable checkpoint: has {run} been trained?", *reasons])
-    )
 
 
 def _networks(path: Path, weights: Any, run: LoadedRun) -> dict[str, nn.Module]:

@@ -5,7 +5,9 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from typing import Any, Final
 
+import numpy as np
 import torch
+from numpy.typing import NDArray
 from tensordict import TensorDictBase
 from torch import Tensor, nn
 from torchrl.collectors import BaseCollector
@@ -18,10 +20,19 @@ from cprl.envs.make_env import check_env, spaces_of
 from cprl.envs.state import carried_state, env_state, load_carried, load_env_state
 from cprl.envs.unwrap import commons_of
 from cprl.finite import EVERY_STEPS, FiniteCheck, OnNan
-from cprl.learners.base import LaneLosses, Learner, WantedReturns, check_agents, check_numbers, learned_in
+from cprl.learners.base import (
+    LaneLosses,
+    Learner,
+    WantedReturns,
+    check_agents,
+    check_decisions,
+    check_numbers,
+    learned_in,
+)
 from cprl.measuring.episodes import Episode, EpisodeTracker
 from cprl.measuring.institutional import institutions_of
 from cprl.policies.assignment import AgentIndices, AgentPolicies
+from cprl.policies.decisions import Decider
 
 MakeCollector = Callable[[EnvBase, nn.Module], BaseCollector]
 """A collector out of an environment and a policy; it yields batches [R], or [R, T] of T turns."""
@@ -41,6 +52,7 @@ class Training:
         learners: by the indices of their agents, a tuple; each updates these agents in every replica.
         episodes: how many to play, at least 1.
         others: the actors of the agents that do not learn, likewise; an actor of one agent by its index.
+        decisions: what all agents decide, and learn to, where the game asks them; see `Game.decisions`.
         callbacks: called after each turn and each episode, in this order; see `Callback`.
         update_every: steps k after which each learner updates, then k times.
         make_collector: `StepCollector`, or for TorchRL's own `cprl.collectors.stock_collector`.
@@ -49,7 +61,8 @@ class Training:
 
     Raises:
         ValueError: for agents without a learner or actor, or with two; another number of worlds than the
-            learners have replicas; numbers below 1; a callback without any of the methods of `Callback`.
+            learners have replicas; numbers below 1; a callback without any of the methods of `Callback`;
+            decisions that are missing in a game that asks for them, or given in another.
     """
 
     def __init__(
@@ -59,6 +72,7 @@ class Training:
         *,
         episodes: int,
         others: Mapping[AgentIndices, nn.Module] | None = None,
+        decisions: Decider | None = None,
         callbacks: Sequence[Any] = (),
         update_every: int = 1,
         make_collector: MakeCollector = StepCollector,
@@ -78,9 +92,11 @@ class Training:
         actors: dict[AgentIndices, nn.Module] = {
             agents: learner.actor for agents, learner in self.learners.items()
         }
-        self._collector = make_collector(env, AgentPolicies({**actors, **self.others}))
-        self._turns = iter(self._collector)
         commons = commons_of(env)
+        check_decisions(decisions, 0 if commons is None else commons.game.decisions)
+        self.decisions = decisions
+        self._collector = make_collector(env, AgentPolicies({**actors, **self.others}, decisions=decisions))
+        self._turns = iter(self._collector)
         longest = None if commons is None else commons.game.rules.episode_steps
         self._tracker = EpisodeTracker(replicas, spaces.agents, longest, institutions=institutions_of(env))
         self._losses = {agents: LaneLosses(replicas, agents) for agents in self.learners}
@@ -167,6 +183,8 @@ class Training:
             learner.end_episode(worlds)
         for episode, of_agents in zip(ended, learning, strict=True):
             episode = replace(episode, wanted_return=self._wanted.take(episode.world))
+            if self.decisions is not None and episode.decision is not None:
+                self.decisions.learn(episode.world, episode.decision, _return_to_decide_by(episode))
             self._played[episode.world] += 1
             if self._played[episode.world] <= self.episodes:
                 for callback in self.callbacks:
@@ -193,6 +211,7 @@ class Training:
             "carried": None if carried is None else carried_state(carried),
             "learners": [learner.state_dict() for learner in self.learners.values()],
             "others": [dict(other.state_dict()) for other in self.others.values()],
+            "decisions": {} if self.decisions is None else dict(self.decisions.state_dict()),
             "losses": [losses.state_dict() for losses in self._losses.values()],
             "wanted": self._wanted.state_dict(),
             "tracker": self._tracker.state_dict(),
@@ -240,6 +259,8 @@ class Training:
             for part, own in zip(of_agents.values(), state[name], strict=True):
                 part.load_state_dict(own)
         self._wanted.load_state_dict(state.get("wanted", {}))
+        if self.decisions is not None:
+            self.decisions.load_state_dict(state["decisions"])
         self._tracker.load_state_dict(state["tracker"])
         self.finite.load_state_dict(state.get("not_finite", ()), step=self.steps)
         for name, callback in self._with_state().items():
@@ -254,12 +275,19 @@ class Training:
             self._step_collector().resume_from(load_carried(fresh, state["carried"]))
 
 
+def _return_to_decide_by(episode: Episode) -> NDArray[np.float64]:
+    """What each agent's decisions are learned from, float64 [N]: its wanted return, else its return."""
+    wanted = episode.wanted_return
+    return episode.return_ if wanted is None else np.where(np.isnan(wanted), episode.return_, wanted)
+
+
 def train(
     env: EnvBase,
     learners: Mapping[tuple[int, ...], Learner],
     *,
     episodes: int,
     others: Mapping[AgentIndices, nn.Module] | None = None,
+    decisions: Decider | None = None,
     callbacks: Sequence[Any] = (),
     checkpointer: SavesTraining | None = None,
     update_every: int = 1,
@@ -273,6 +301,7 @@ def train(
         learners: by the indices of their agents.
         episodes: how many to play.
         others: the actors of the agents that do not learn.
+        decisions: what all agents decide, where the game asks them.
         callbacks: called after each turn and each episode.
         checkpointer: where the training resumes from, and saves its state now and then.
         update_every: steps k after which each learner updates, then k times.
@@ -291,6 +320,7 @@ def train(
         learners,
         episodes=episodes,
         others=others,
+        decisions=decisions,
         callbacks=callbacks,
         update_every=update_every,
         make_collector=make_collector,

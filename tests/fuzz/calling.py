@@ -22,6 +22,7 @@ OF_FILES: Final = {
     "cprl.runs.loggers:LoggerCallback",
     "cprl.runs.weights:BestWeights",
     "cprl.runs.weights:restore_weights",
+    "cprl.runs.weights:save_decisions",
     "cprl.runs.weights:save_weights",
     "cprl.stored:load",
     "cprl.terminal.figures:training_curve",

@@ -255,6 +255,7 @@ OWN: Final[dict[str, dict[str, st.SearchStrategy[Any]]]] = {
             lambda number: {f"replica_{own}/agent_0": things.tiny_network() for own in range(number)}
         ),
     },
+    "cprl.runs.weights:save_decisions": {"run": st.just(Path("."))},
     "cprl.runs.weights:save_weights": {"run": st.just(Path(".")), "networks": _NETWORKS},
     "cprl.stored:load": {
         "run": _RUNS,

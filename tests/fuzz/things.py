@@ -51,6 +51,7 @@ from cprl.institutions import (
     Vote,
 )
 from cprl.learners.base import Learner
+from cprl.learners.decisions import Bandit
 from cprl.measuring import Episode
 from cprl.measuring.evaluate import evaluate
 from cprl.networks import MLP, Conv, MLPNetwork
@@ -128,6 +129,7 @@ EXAMPLES: Final[dict[type, tuple[Any, ...]]] = {
     QMIX: (QMIX(settings=REPLAY, mixing_cells=3),),
     MAPPO: (MAPPO(settings=ROLLOUTS),),
     IPPO: (IPPO(settings=ROLLOUTS),),
+    Bandit: (Bandit(), Bandit(step_size=0.5, epsilon_end=0.0)),
     InequityAversion: (InequityAversion(alpha=5, beta=0.05, smoothing=0.9),),
     SocialValueOrientation: (SocialValueOrientation(angle=0.5, weight=1.0),),
     Exchange: (Exchange(0.5),),

@@ -204,6 +204,7 @@ def _of_payments(game: Game, worlds: int) -> Shapes:
         "violated": (of_agent, np.bool_),
         "counts": ((*of_agent, len(COUNTS)), np.int32),
         "in_force": ((worlds, len(game.ballots)), np.float32),
+        "ballots_due": ((worlds, len(game.ballots)), np.bool_),
     }
 
 

@@ -22,7 +22,7 @@ from cprl.commons.turn import (
 )
 from cprl.commons.world import PLAYING, Actions, Scratch, StepOutput, Worlds
 from cprl.institutions import deciding, limits, paying, showing
-from cprl.institutions.deciding import appoint, hold_ballot
+from cprl.institutions.deciding import appoint, hold_ballot, is_due
 from cprl.institutions.limits import (
     add_to_patch,
     close_patches,
@@ -183,7 +183,7 @@ def clear_turn(memory: Memory) -> None:
 def decide(world: Worlds, memory: Memory, rules: InstitutionTables, decisions: Actions) -> None:
     """Holds the ballots that are due in this episode; `decisions`: int64 [N]."""
     for ballot in range(rules.ballot_options.shape[0]):
-        if world.episode[0] % rules.ballot_episodes[ballot] == 0:
+        if is_due(rules, ballot, world.episode[0]):
             hold_ballot(memory, rules, ballot, decisions, draw(world, BALLOT + ballot))
     appoint(memory, rules)
 
@@ -262,6 +262,7 @@ def write_payments(
             payments.counts[i, count] = memory.counts[i, count]
     for ballot in range(payments.in_force.shape[0]):
         payments.in_force[ballot] = memory.in_force[ballot]
+        payments.ballots_due[ballot] = world.step[0] == 0 and is_due(rules, ballot, world.episode[0])
 
 
 FUNCTIONS = (

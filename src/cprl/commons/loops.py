@@ -99,6 +99,7 @@ def one_payments(p: Payments, b: int) -> Payments:
         p.violated[b],
         p.counts[b],
         p.in_force[b],
+        p.ballots_due[b],
     )
 
 

@@ -36,8 +36,9 @@ _DONE_ENTRIES = ("done", "terminated", "truncated")
 _AHEAD_BYTES = 2**16
 """Below this size, memory is allocated for sixteen turns at once: an allocation takes as long as a world."""
 _AHEAD_TURNS = 16
+_BALLOT_ENTRIES = (keys.IN_FORCE, keys.BALLOTS_DUE)
 _OWN_KEYS = frozenset(
-    (*_WORLD_ENTRIES, *_DONE_ENTRIES, keys.IN_FORCE, keys.STATE, keys.AGENTS, "next", "_reset")
+    (*_WORLD_ENTRIES, *_DONE_ENTRIES, *_BALLOT_ENTRIES, keys.STATE, keys.AGENTS, "next", "_reset")
 )
 _PAID_ENTRIES = ("fines", "transfers", "violated", "counts")
 """Entries of agents in games with institutions."""
@@ -98,7 +99,7 @@ class CommonsEnv(LeanStepEnv):
         self._agents_size = torch.Size([worlds, game.agents])
         paid = _PAID_ENTRIES if game.institutions else ()
         self._agent_entries = (*_AGENT_ENTRIES, *paid, *(name for name, _ in game.spaces.vectors))
-        self._world_entries = (*_WORLD_ENTRIES, *((keys.IN_FORCE,) if game.ballots else ()))
+        self._world_entries = (*_WORLD_ENTRIES, *(_BALLOT_ENTRIES if game.ballots else ()))
         self._decides, self._is_governed = game.decisions > 0, bool(game.institutions)
         self._with_state = state
         self._forms = {
@@ -162,7 +163,9 @@ class CommonsEnv(LeanStepEnv):
         specs[keys.VIOLATED] = flag_spec(*per_agent)
         specs[keys.COUNTS] = Unbounded(shape=(*per_agent, len(COUNTS)), dtype=torch.int32)
         if game.ballots:
-            specs[keys.IN_FORCE] = Unbounded(shape=(self._size, len(game.ballots)), dtype=torch.float32)
+            of_ballots = (self._size, len(game.ballots))
+            specs[keys.IN_FORCE] = Unbounded(shape=of_ballots, dtype=torch.float32)
+            specs[keys.BALLOTS_DUE] = flag_spec(*of_ballots)
 
     def _fresh(self) -> tuple[dict[str, Tensor], Output]:
         """New memory for the output of a turn: as tensors by name, and the same memory as arrays."""

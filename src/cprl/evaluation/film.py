@@ -101,6 +101,7 @@ def film(
             fresh.env,
             {},
             others=others,
+            decisions=fresh.policies.decisions,
             episodes=1,
             callbacks=[viewer, *_decisions(viewer, fresh), *_offences(viewer, fresh), events],
         )

@@ -15,6 +15,7 @@ from cprl.learners.lanes import EVALUATION, lane_seeds
 from cprl.measuring.episodes import Episode
 from cprl.measuring.evaluate import evaluate
 from cprl.policies.assignment import AgentPolicies
+from cprl.policies.decisions import decider_by_chance
 from cprl.policies.lanes import random_lanes
 from cprl.stored import LoadedRun, stored_policies
 
@@ -109,7 +110,8 @@ def random_policies(run: LoadedRun, replicas: Sequence[int], *, worlds: int, see
     everyone = tuple(range(run.spaces.agents))
     seeds = lane_seeds(seed, replicas=replicas, agents=everyone, purpose=EVALUATION)
     return AgentPolicies(
-        {everyone: random_lanes(run.spaces.actions, seeds=seeds, agents=len(everyone), worlds=worlds)}
+        {everyone: random_lanes(run.spaces.actions, seeds=seeds, agents=len(everyone), worlds=worlds)},
+        decisions=decider_by_chance(run.game, seeds, worlds=worlds) if isinstance(run.game, Game) else None,
     )
 
 

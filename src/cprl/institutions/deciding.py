@@ -5,6 +5,11 @@ import numpy as np
 from cprl.institutions.memory import InstitutionTables, Longs, Memory
 
 
+def is_due(tables: InstitutionTables, ballot: int, episode: int) -> bool:
+    """Whether a ballot is held in an episode, counted from 0."""
+    return episode % tables.ballot_episodes[ballot] == 0
+
+
 def choice_of(tables: InstitutionTables, ballot: int, decision: int) -> int:
     """The choice that a decision makes on a ballot; see `cprl.institutions.choice.ballots`."""
     for before in range(ballot):
@@ -73,5 +78,5 @@ def appoint(memory: Memory, tables: InstitutionTables) -> None:
             memory.may_fire[i] = tables.may_fire[i]
 
 
-FUNCTIONS = (choice_of, votes_for, median_choice, elected_choice, hold_ballot, appoint)
+FUNCTIONS = (is_due, choice_of, votes_for, median_choice, elected_choice, hold_ballot, appoint)
 """The rules of this module, each after those it calls."""

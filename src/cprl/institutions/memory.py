@@ -111,6 +111,8 @@ class Payments(NamedTuple):
     """int32 [B, N, C], the `COUNTS` of this episode so far."""
     in_force: Floats
     """float32 [B, V], what each ballot decided."""
+    ballots_due: Bools
+    """bool [B, V], whether the ballot is held in the coming turn."""
 
 
 SHOWN: Final = (

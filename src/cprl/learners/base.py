@@ -10,8 +10,10 @@ from numpy.typing import NDArray
 from tensordict import TensorDictBase
 from torch import Tensor, nn
 
+from cprl.arguments import object_of
 from cprl.checks import checked, count
 from cprl.policies.assignment import AgentIndices, agent_indices
+from cprl.policies.decisions import Decider
 from cprl.preferences.wanted import WantedRewards
 
 
@@ -175,6 +177,18 @@ def check_agents(
                 f"the environment has {replicas} worlds; the learner of {indices} has {learner.replicas} "
                 "replicas; allowed: a world for each replica"
             )
+
+
+def check_decisions(decisions: object, options: int) -> None:
+    """Raises a ValueError unless there is a Decider where agents have so many options, and none for 0."""
+    object_of("decisions", decisions, Decider | None, "a cprl.policies.decisions.Decider, or None")
+    if options and decisions is None:
+        raise ValueError(
+            "decisions is None; allowed for a game whose agents vote or elect: a Decider, e.g. "
+            "Population(...).decisions"
+        )
+    if decisions is not None and not options:
+        raise ValueError("decisions is a Decider; allowed for a game whose agents decide nothing: None")
 
 
 def check_numbers(episodes: int, update_every: int, learners: Mapping[tuple[int, ...], Learner]) -> None:

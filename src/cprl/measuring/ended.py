@@ -60,6 +60,8 @@ def episodes_of(
             fields["in_play_steps"] = in_play_steps[k]
         if "hit_by" in ended:
             fields["hits"] = ended["hit_by"][k].sum(0)
+        if "decision" in turn:
+            fields["decision"] = turn["decision"][world].copy()
         if "stock" in turn:
             fields["stock_left"] = int(turn["stock"][world, 0])
             fields["depletion_step"] = int(ended["depletion_step"][k]) or -1

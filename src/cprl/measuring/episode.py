@@ -56,6 +56,9 @@ class Episode:
     """[N], steps in which the agent broke a rule of an institution."""
     counts: Mapping[str, NDArray[np.int64]] | None = None
     """[N] by name, what institutions counted, see `cprl.institutions.COUNTS`."""
+    decision: NDArray[np.int64] | None = None
+    """[N], what each agent had decided, see `cprl.institutions.choice.ballots`; None in games that ask
+    nothing."""
     in_force: NDArray[np.float64] | None = None
     """[V], what was decided for this episode: tax rates, quotas, the agent elected."""
     institutions: Mapping[str, float] = field(default_factory=dict)

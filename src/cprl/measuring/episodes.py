@@ -227,6 +227,8 @@ class EpisodeTracker:
         turns = {name: tensor.numpy(force=True) for name, tensor in tensors.items()}
         if np.count_nonzero(turns["done"]):  # a tenth of the time that `any` takes on so few
             turns["had_ended"] = entry(tensordict, keys.DONE).numpy(force=True)
+            if tensordict.get(keys.BALLOTS_DUE, None) is not None:
+                turns["decision"] = entry(entry(tensordict, keys.AGENTS), "decision").numpy(force=True)
         return turns
 
     def _missing(self, tensordict: TensorDictBase) -> ValueError:
@@ -247,7 +249,7 @@ class EpisodeTracker:
         if len(size) not in (1, 2) or size[0] != self.worlds:
             raise ValueError(f"the batch is {list(size)}; allowed: [{self.worlds}] or [{self.worlds}, T]")
         one, agents = (1,), (self.agents,)
-        own: dict[str, tuple[int, ...]] = dict.fromkeys(("harvest", "fired", "in_play"), agents)
+        own: dict[str, tuple[int, ...]] = dict.fromkeys(("harvest", "fired", "in_play", "decision"), agents)
         own |= {"reward": agents + one, "hit_by": agents * 2, "tagged_by": agents * 2}
         own |= institutional.shapes(self.agents, self._widths)
         for name, array in turns.items():

@@ -32,6 +32,7 @@ def open_session(
     variant: Variant = "published",
     steps: int | None = None,
     seed: int = SEED,
+    decision: int | None = None,
     allow: Sequence[str] = (),
 ) -> Session:
     """An episode for a person and others.
@@ -46,6 +47,8 @@ def open_session(
         variant: of a published board, see `presets.game`.
         steps: turns of the episode at most, in place of those of the game.
         seed: of all random numbers; equal seeds and equal actions give equal episodes.
+        decision: what the person decides in a game with votes or elections, 0 to `Game.decisions` - 1; None
+            for a choice by chance, as of a scripted agent.
         allow: see `cprl.load`.
 
     Raises:
@@ -67,7 +70,7 @@ def open_session(
     else:
         env = replace(run, experiment=replace(run.experiment, game=game)).env(seed=seed)
     population = Population(env, specs, seed=seed, allow=allow)
-    return Session(env, population.policy(1), agent=agent)
+    return Session(env, population.policy(1), agent=agent, decision=decision)
 
 
 def _board(board: str, variant: Variant, allow: Sequence[str]) -> tuple[Game, LoadedRun | None]:

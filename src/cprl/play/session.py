@@ -36,12 +36,13 @@ class Session:
         env: one world of a `CommonsEnv`, with or without transforms; it is reset.
         others: writes the actions of all agents; that of the person's agent is replaced.
         agent: the index of the person's agent.
+        decision: what it decides, see `Game.decisions`; None for what `others` write.
 
     Raises:
-        ValueError: if the environment is of another kind or has no such agent.
+        ValueError: if the environment is of another kind, or has no such agent or decision.
     """
 
-    def __init__(self, env: EnvBase, others: Policy, *, agent: int = 0) -> None:
+    def __init__(self, env: EnvBase, others: Policy, *, agent: int = 0, decision: int | None = None) -> None:
         commons = commons_of(env)
         if commons is None:
             raise ValueError(f"env is a {type(env).__name__}; allowed: a CommonsEnv, which has a board")
@@ -49,6 +50,7 @@ class Session:
         self.game: Game = commons.game
         self.agent = arguments.integer("agent", agent, 0, self.game.agents - 1)
         """The index of the person's agent."""
+        self._decision = None if decision is None else self._decided(decision)
         self._action = 0
         self._turns = Turns(env, self._choose)
         self._harvests: list[Tensor] = []
@@ -114,7 +116,17 @@ class Session:
         actions = chosen[keys.ACTION].clone()
         actions[0, self.agent] = self._action
         chosen[keys.ACTION] = actions
+        if self._decision is not None:
+            decisions = chosen[keys.DECISION].clone()
+            decisions[0, self.agent] = self._decision
+            chosen[keys.DECISION] = decisions
         return chosen
+
+    def _decided(self, decision: int) -> int:
+        options = self.game.decisions
+        if not options:
+            raise arguments.refusal("decision", decision, "None: agents decide nothing in this game")
+        return arguments.integer("decision", decision, 0, options - 1)
 
     def _now(self) -> Shown:
         """The board, without what agents observe."""

@@ -5,6 +5,7 @@ Modules, in the order in which one reads them:
     single          one agent by TorchRL's modules
     scripted        agents that follow a rule; scripted_rules and paths are compiled for them
     tabular         agents that look actions up in tables
+    decisions       Decider: what agents decide at an episode's begin, where a game asks them
     assignment      AgentPolicies: which policy controls which agents
     present         PresentPolicy: the first replica's agents as they are now, beside the training
     rng             random numbers of each lane's own

@@ -10,6 +10,7 @@ from torch import Tensor, nn
 
 from cprl import arguments, keys
 from cprl.compat import unchecked_tensordict
+from cprl.policies.decisions import Decider
 from cprl.policies.lanes import LaneActor
 
 AgentIndices: TypeAlias = int | tuple[int, ...]
@@ -28,19 +29,27 @@ class AgentPolicies(TensorDictModuleBase):
         actors: one for each agent, agent 0 first, see `cprl.policies.single`; or a mapping from the agents
             that each controls: an index for an actor of one agent, a tuple for an actor of several, e.g. a
             `LaneActor`.
+        decisions: what the agents decide, where a game asks them (`Game.decisions`); None in other games.
 
     Reads ("agents", "observation"), uint8 [B, N, C, X, Y], and the other entries of "agents" that an actor's
     `in_keys` name, e.g. "stock_gauge"; writes ("agents", "action"), int64 [B, N].
+    With decisions it also reads "ballots_due", and writes ("agents", "decision"), int64 [B, N].
 
     Raises:
         ValueError: if an agent has no actor or several.
     """
 
-    in_keys = (keys.OBSERVATION,)
-    out_keys = (keys.ACTION,)
+    in_keys: tuple[Any, ...] = (keys.OBSERVATION,)
+    out_keys: tuple[Any, ...] = (keys.ACTION,)
 
-    def __init__(self, actors: Sequence[nn.Module] | Mapping[AgentIndices, nn.Module]) -> None:
+    def __init__(
+        self,
+        actors: Sequence[nn.Module] | Mapping[AgentIndices, nn.Module],
+        *,
+        decisions: Decider | None = None,
+    ) -> None:
         super().__init__()
+        arguments.object_of("decisions", decisions, Decider | None, "a Decider, or None")
         allowed = "an actor for each agent, or a mapping from agents to actors"
         by_agents: dict[AgentIndices, nn.Module] = (
             dict(actors)
@@ -58,10 +67,22 @@ class AgentPolicies(TensorDictModuleBase):
         self.indices = list(by_agents)
         self._one_takes_all = self.indices == [tuple(taken)]
         self.actors = nn.ModuleList(by_agents.values())
+        self.decisions = decisions
+        if decisions is not None:
+            if decisions.agents != self.agents:
+                raise ValueError(
+                    f"there are {self.agents} actors, and decisions of {decisions.agents} agents; allowed: "
+                    "the same agents"
+                )
+            self.in_keys = (keys.OBSERVATION, keys.BALLOTS_DUE)
+            self.out_keys = (keys.ACTION, keys.DECISION)
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
-        """Writes the action of every agent, in all worlds at once."""
+        """Writes the action of every agent, and its decision, in all worlds at once."""
         agents = keys.entry(tensordict, keys.AGENTS)
+        if self.decisions is not None:
+            due = keys.entry(tensordict, keys.BALLOTS_DUE)
+            keys.put(agents, "decision", self.decisions.decide(due))
         observation = keys.entry(agents, "observation")
         dim = len(tensordict.batch_size)
         if observation.shape[dim] != self.agents:

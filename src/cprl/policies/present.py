@@ -11,6 +11,7 @@ from torchrl.envs.utils import ExplorationType, set_exploration_type
 
 from cprl.compat import unchecked_tensordict
 from cprl.policies.assignment import AgentIndices, AgentPolicies
+from cprl.policies.decisions import Decider
 from cprl.policies.lanes import LaneActor
 
 
@@ -51,6 +52,8 @@ class PresentPolicy:
             for one world of each replica, with the exploration of evaluation at first; and that of the
             training, whose exploration it takes over.
         others: the actors of the other agents, for one world of the first replica.
+        decisions: what agents decide, likewise two: without exploration and with numbers of its own, for one
+            world of the first replica; and that of the training. None where they decide nothing.
         replicas: the number of replicas R.
         device: the device whose generator is left as it was, besides the CPU.
     """
@@ -60,16 +63,19 @@ class PresentPolicy:
         learned: Mapping[AgentIndices, tuple[Any, Any]],
         others: Mapping[AgentIndices, nn.Module],
         *,
+        decisions: tuple[Decider, Decider] | None = None,
         replicas: int,
         device: torch.device | None = None,
     ) -> None:
+        self._decisions = decisions
+        own_decisions = None if decisions is None else decisions[0]
         first: dict[AgentIndices, nn.Module] = {}
         pairs: list[tuple[Any, Any]] = []
         for agents, (own, training) in learned.items():
             alone = own.of_first_replica() if isinstance(own, LaneActor) and own.worlds == 1 else None
             first[agents] = FirstReplica(own, replicas) if alone is None else alone
             pairs.append((own if alone is None else alone, training))
-        self._policy = AgentPolicies({**first, **others})
+        self._policy = AgentPolicies({**first, **others}, decisions=own_decisions)
         self._pairs = [pair for pair in pairs if _has_epsilon(pair[0])]
         self._evaluation = [own.epsilon for own, _ in self._pairs]
         self._devices = [device] if device is not None and device.type == "cuda" else []
@@ -85,9 +91,13 @@ class PresentPolicy:
         """Sets each agent's exploration to what it is now."""
         for (own, training), evaluation in zip(self._pairs, self._evaluation, strict=True):
             own.epsilon = evaluation if self.is_trained else training.epsilon
+        if self._decisions is not None:
+            present, trained = self._decisions
+            present.epsilon[:] = 0.0 if self.is_trained else trained.epsilon[:1]
 
     def __call__(self, carried: TensorDictBase) -> TensorDictBase:
-        """Writes ("agents", "action"), int64 [1, N], for one world, batch size [1]."""
+        """Writes ("agents", "action"), int64 [1, N], for one world, batch size [1]; where agents decide also
+        ("agents", "decision")."""
         self.explore_as_now()
         with torch.no_grad(), set_exploration_type(ExplorationType.RANDOM):
             return self._policy.forward(carried)  # calling a module takes as long as a small network

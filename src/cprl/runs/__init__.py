@@ -13,7 +13,8 @@ Modules, in the order in which one reads them:
     curves       tables as curves over episodes
     checkpoints  the state of a training, to resume from
     extension    more episodes for a run that is finished or stopped
-    weights      trained networks, and the state of transforms
+    weights      trained networks, the state of transforms, the values of decisions
+    kept         what a run keeps of its agents, ended or not
     loggers      TorchRL's loggers: CSV, TensorBoard, W&B
     export       a finished run, small enough to commit
 """

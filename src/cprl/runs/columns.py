@@ -34,6 +34,7 @@ no column; nor has the wanted return outside of a training. It is null for agent
 _WANTED: Final = "wanted_return"
 
 OF_INSTITUTIONS: Final = {
+    "decision": pa.int32(),
     "fines": pa.float64(),
     "transfers": pa.float64(),
     "violations": pa.int32(),
@@ -73,6 +74,7 @@ def _columns_of(episode: Episode) -> list[str]:
 def _of_institutions(episode: Episode) -> dict[str, Any]:
     """The values of the columns of institutions, [N] or a number; none for a game without them."""
     payments = {"fines": episode.fines, "transfers": episode.transfers, "violations": episode.violations}
+    payments["decision"] = episode.decision
     found = {**(episode.counts or {}), **{name: own for name, own in payments.items() if own is not None}}
     in_force: list[float] = [] if episode.in_force is None else episode.in_force.tolist()
     return {

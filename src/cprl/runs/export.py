@@ -9,9 +9,9 @@ from cprl.arguments import path as path_of
 from cprl.runs.directory import read_recipe
 from cprl.runs.episodes import FILE_NAME, read_episodes, read_table
 from cprl.runs.manifest import refuse_missing, verify, write_listed
-from cprl.runs.weights import TRANSFORMS
+from cprl.runs.weights import DECISIONS, TRANSFORMS
 
-_TRANSFORMS = f"checkpoints/{TRANSFORMS}"
+_IF_ANY = tuple(f"checkpoints/{name}" for name in (TRANSFORMS, DECISIONS))
 _WHOLE = ("recipe.json", "report.json", "checkpoints/final.pt")
 
 
@@ -36,7 +36,7 @@ def export_results(run: Path, folder: Path) -> Path:
         if not (run / name).exists():
             raise FileNotFoundError(f"{run / name} does not exist: has the run ended?")
     refuse_missing(run)
-    copied = [name for name in (*_WHOLE, _TRANSFORMS) if (run / name).exists()]
+    copied = [name for name in (*_WHOLE, *_IF_ANY) if (run / name).exists()]
     for name in copied:
         verify(run / name)
     folder.mkdir(parents=True, exist_ok=True)

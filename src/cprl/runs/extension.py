@@ -10,7 +10,11 @@ from cprl.runs.manifest import rename_listed
 
 REPORT: Final = "report.json"
 """Written when everything of a run is finished."""
-_RESULTS: Final = (REPORT, f"{FOLDER}/final.pt", f"{FOLDER}/transforms.pt", "evaluation")
+_RESULTS: Final = (
+    REPORT,
+    *(f"{FOLDER}/{name}.pt" for name in ("final", "transforms", "decisions")),
+    "evaluation",
+)
 
 
 def refuse_to_extend(run: Path, episodes: int, callbacks: Iterable[Any]) -> None:

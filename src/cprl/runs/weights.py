@@ -6,7 +6,7 @@ from typing import Any, Final
 
 import torch
 from tensordict import TensorDictBase
-from torch import nn
+from torch import Tensor, nn
 from torchrl.record.loggers import Logger
 
 from cprl.arguments import callable_of, object_of
@@ -46,6 +46,26 @@ def save_transforms(run: Path, state: Mapping[str, Any]) -> None:
     """Writes the state of an environment's transforms atomically; writes no file if they have none."""
     if state:
         write_listed(run, f"checkpoints/{TRANSFORMS}", lambda file: torch.save(dict(state), file))
+
+
+DECISIONS: Final = "decisions.pt"
+"""The file in `checkpoints/` with the values of what agents decide, by the agent's name."""
+
+
+def save_decisions(run: Path, values: Mapping[str, Tensor]) -> None:
+    """Writes the values of agents' decisions atomically; writes no file if they learn none.
+
+    Args:
+        run: the run's directory.
+        values: float64 [C] by the agent's name, see `cprl.learners.decisions.BanditDecider.learned`.
+    """
+    run = path_of("run", run)
+    object_of("values", values, Mapping, "values by the agent's name")
+    for name, own in values.items():
+        checked("values", name, TEXT)
+        object_of(f"values[{name!r}]", own, Tensor, "a tensor")
+    if values:
+        write_listed(run, f"checkpoints/{DECISIONS}", lambda file: torch.save(dict(values), file))
 
 
 class BestWeights:
