@@ -80,7 +80,13 @@ def taxes():
     brackets = st.sampled_from([(), ((0, 0.2), (1, 0.5)), ((0, 0.0), (2.5, 1.0))])
     kinds = st.sampled_from(["equal", "none"])
     periods = st.integers(1, 7)
-    return st.builds(Tax, rate=st.floats(0, 1), redistribution=kinds, period_steps=periods, brackets=brackets)
+    return st.builds(
+        Tax,
+        rate=st.floats(0, 1, allow_subnormal=False),
+        redistribution=kinds,
+        period_steps=periods,
+        brackets=brackets,
+    )
 
 
 def levies(agents):

@@ -48,7 +48,7 @@ from cprl.population import Frozen, Learning, Scripted, Team
 from cprl.preferences import Exchange, InequityAversion, SocialValueOrientation
 
 SHARES = st.floats(1e-9, 1, allow_subnormal=False)
-POSITIVE = st.floats(1e-6, 100)
+POSITIVE = st.floats(1e-6, 100, allow_subnormal=False)
 CUSTOM = st.builds(
     Custom,
     st.sampled_from(["my.module:Transform", "mine:nested.Class"]),
@@ -69,7 +69,7 @@ DQNS = st.builds(
     gamma=SHARES,
     learning_rate=POSITIVE,
     hidden_cells=st.lists(st.integers(1, 64), min_size=1, max_size=3).map(tuple),
-    tau=st.none() | st.floats(1e-6, 1),
+    tau=st.none() | st.floats(1e-6, 1, allow_subnormal=False),
     replay_transforms=st.lists(CUSTOM, max_size=2).map(tuple),
     target_every_episodes=st.integers(1, 20),
     relu_on_outputs=st.booleans(),
@@ -91,7 +91,9 @@ FROZEN = st.builds(
     Frozen, st.just("runs/earlier"), agent=st.integers(0, 3), replica=st.none() | st.integers(0, 9)
 )
 STARTS = st.none() | FROZEN
-BANDITS = st.none() | st.builds(Bandit, step_size=st.floats(1e-6, 1), epsilon_end=SHARES)
+BANDITS = st.none() | st.builds(
+    Bandit, step_size=st.floats(1e-6, 1, allow_subnormal=False), epsilon_end=SHARES
+)
 UNIT = st.floats(0, 1, allow_subnormal=False)
 PREFERENCES = st.one_of(
     st.sampled_from(["individual", "team"]),
@@ -131,7 +133,7 @@ INSTITUTIONS = st.one_of(
     st.builds(Vote, on=st.builds(Tax) | st.builds(Quota), override_prob=SHARES),
 )
 ONE_OF_A_KIND = st.tuples(
-    st.builds(ClosedPatches, below=st.integers(0, 5), fine=FINES),
+    st.builds(ClosedPatches, below=st.integers(0, 5), fine=st.sampled_from([0.0, 0.5])),
     st.builds(Monitoring, prob=SHARES, monitor=st.sampled_from([None, 0, "elected"])),
     st.builds(GraduatedSanctions, recovery_steps=st.none() | st.integers(1, 9)),
 )

@@ -64,7 +64,7 @@ VOTES = tuple(Vote(on=Tax(), choices=tuple(n / 10 for n in range(11))) for _ in 
         ([Sanctioner(agents=(0, 2))], r"Sanctioner\.agents has agent 2; allowed on this map: 0 to 1"),
         (
             [Quota(), Monitoring()],
-            r"Monitoring has no violation to detect; allowed: a Boundaries, Quota or the like with a fine, .*, "
+            r"Monitoring has no violation to detect; allowed: a Boundaries, Quota or the like with a fine.*, "
             r"or a cost above 0",
         ),
         (

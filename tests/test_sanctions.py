@@ -115,7 +115,7 @@ def test_violations_are_sanctioned_where_they_are_detected():
 
 def test_tags_keep_the_freeze_of_the_rules_where_violations_alone_are_offences():
     sanctions = GraduatedSanctions(freeze_steps=(0,), on="violations")
-    play = Play(BOARD, institutions=[sanctions], freeze_steps=4).turn("beam", "stay")
+    play = Play(BOARD, institutions=[Quota(fine=1), sanctions], freeze_steps=4).turn("beam", "stay")
     assert (missed(play), play.counts("sanctions")) == (4, [0, 0])
 
 
