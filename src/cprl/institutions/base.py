@@ -26,7 +26,7 @@ class Institution:
     """
 
     observed: bool = True
-    """Whether agents observe what this institution shows them, as part of ("agents", "institutions")."""
+    """Whether agents observe what this institution shows them, see `cprl.commons.institution_views`."""
 
     principle: ClassVar[str] = ""
     """Of the eight design principles of Ostrom, "Governing the Commons" (1990), table 3.1."""

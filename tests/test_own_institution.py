@@ -1,0 +1,103 @@
+"""The institution of a user's own in docs/institutions.md: what it charges, and how it is resumed."""
+
+import importlib
+import re
+import sys
+from pathlib import Path
+
+import pytest
+import torch
+
+import cprl
+from cprl import Custom, Experiment, Game, Rules, maps
+from cprl.algorithms import DQN, DQNSettings
+from cprl.envs import make_env
+from cprl.institutions import Tax
+from cprl.population import Learning
+from cprl.runs.checkpoints import checkpoints_in
+from cprl.runs.episodes import read_episodes
+from cprl.runs.weights import load_weights
+
+PAGE = Path(__file__).parents[1] / "docs" / "institutions.md"
+ALLOW = ("licence:Licence", "one_road_parts:Stopping")
+BOARD = maps.parse("A>..<.A\n.......\nA.....A")
+
+
+@pytest.fixture
+def licence(tmp_path_factory, monkeypatch):
+    """The module of the page, where a user would have it."""
+    (code,) = re.findall(r"```python\n(# licence\.py\n.*?)```", PAGE.read_text(), re.DOTALL)
+    folder = tmp_path_factory.mktemp("own")
+    (folder / "licence.py").write_text(code)
+    monkeypatch.syspath_prepend(folder)
+    importlib.invalidate_caches()
+    yield importlib.import_module("licence")
+    del sys.modules["licence"]
+
+
+def game(**rules):
+    return Game(
+        map=BOARD,
+        rules=Rules(**{"regrow_prob": (0.0, 0.2), "episode_steps": 20, "freeze_steps": 1, **rules}),
+        institutions=(Tax(rate=0.5, redistribution="none"),),
+    )
+
+
+def test_the_first_shot_of_each_episode_is_charged_and_the_price_rises_with_every_licence(licence):
+    env = make_env(game(episode_steps=3), worlds=2, transforms=[licence.Licence(fee=1.0, rise=0.25)])
+    beam, stay = 6, 7
+    plan = [[beam, stay], [beam, stay], [stay, beam]] * 2
+    now, steps = env.reset(), []
+    for mine in plan:
+        now["agents", "action"] = torch.tensor([mine, [stay, stay]])
+        step, now = env.step_and_maybe_reset(now)
+        steps.append(step["next", "agents"])
+    steps = torch.stack(steps, 1)
+    # Nobody harvests. Agent 0 of world 0 buys the first licence at 1; in its second shot it has one. It tags
+    # agent 1, which misses turn 2 and buys the second in turn 3, at 1 + 1 x 0.25. The next episode begins
+    # without licences: the third costs 1 + 2 x 0.25, the fourth 1 + 3 x 0.25.
+    fines = [[1.0, 0.0], [0.0, 0.0], [0.0, 1.25], [1.5, 0.0], [0.0, 0.0], [0.0, 1.75]]
+    assert steps["fines"][0].tolist() == fines
+    assert steps["fines"][1].tolist() == [[0.0, 0.0]] * 6, "world 1 is peaceful"
+    assert torch.equal(steps["reward"][..., 0], steps["harvest"] - steps["fines"] + steps["transfers"])
+
+
+def experiment():
+    settings = DQNSettings(
+        buffer_size=300, batch_size=4, hidden_cells=(8,), epsilon_hold_steps=10, epsilon_decay_steps=200
+    )
+    return Experiment(
+        name="licensed",
+        game=game(),
+        agents=[Learning(DQN(settings=settings))] * 2,
+        replicas=2,
+        episodes=6,
+        seed=3,
+        evaluation_episodes=2,
+        transforms=[Custom("licence:Licence", arguments={"fee": 1.0, "rise": 0.25})],
+        callbacks=[Custom("one_road_parts:Stopping")],
+        engine="eager",
+    )
+
+
+def test_a_run_that_is_stopped_and_resumed_equals_the_undisturbed_one_bit_for_bit(
+    licence, tmp_path, monkeypatch, capsys
+):
+    whole = cprl.run(experiment(), tmp_path / "whole", watch="off")
+    monkeypatch.setenv("STOP_AT_STEP", "51")  # between two turns of the third episode
+    with pytest.raises(SystemExit) as stopped:
+        cprl.run(experiment(), tmp_path / "parts", watch="off")
+    assert stopped.value.code == 0
+    (checkpoint,) = checkpoints_in(tmp_path / "parts" / "checkpoints")
+    kept = load_weights(checkpoint)
+    assert kept["carried"]["agents"]["licensed"].any(), "licences of the episode that was stopped"
+    assert kept["env"]["transforms"]["transforms.0.sold"] > 0, "and all that were sold before"
+    monkeypatch.delenv("STOP_AT_STEP")
+    parts = cprl.run(experiment(), tmp_path / "parts", watch="off", resume=True)
+    assert read_episodes(parts).equals(read_episodes(whole))
+    for name in ("final", "transforms"):
+        mine, theirs = (load_weights(run / "checkpoints" / f"{name}.pt") for run in (parts, whole))
+        assert repr(mine) == repr(theirs), name
+    one, two = (cprl.evaluate_run(run, episodes=2, allow=ALLOW).table() for run in (parts, whole))
+    assert repr(one.to_pydict()) == repr(two.to_pydict())
+    assert cprl.load(parts, allow=ALLOW).experiment == experiment()
