@@ -5,7 +5,7 @@ import pytest
 from boards import Play
 
 from cprl import Observation, presets
-from cprl.institutions import Boundaries, GraduatedSanctions, Mediation, Monitoring, Tax
+from cprl.institutions import Boundaries, GraduatedSanctions, Mediation, Monitoring, Quota, Tax
 
 OUTSIDE = Boundaries.drawn("........\n...0....", step_fine=1.0)
 BOARD = "A.......\n>..^...."
