@@ -43,6 +43,7 @@ Each imports only from those above it:
     running      run: an experiment from its learners to its report
     evaluation   stored agents in fresh worlds, alone and among each other
     play         a person among trained or scripted agents
+    studies      one experiment under many conditions: factors, trials, tables, figures
     reporting    finished runs beside the published study
     flags        the fields of an experiment as flags
     commandline  recipe_main: the command line of a recipe
