@@ -70,6 +70,7 @@ if TYPE_CHECKING:
     from cprl.experiment import Experiment
     from cprl.running import run
     from cprl.stored import load
+    from cprl.studies import Study, run_study
 
     __version__: str
 
@@ -81,6 +82,7 @@ __all__ = [
     "Map",
     "Observation",
     "Rules",
+    "Study",
     "__version__",
     "crossplay",
     "evaluate_run",
@@ -90,6 +92,7 @@ __all__ = [
     "presets",
     "recipe_main",
     "run",
+    "run_study",
     "train",
 ]
 
@@ -101,6 +104,8 @@ _IMPORTED_WHEN_USED: Final = {
     "load": "cprl.stored",
     "recipe_main": "cprl.commandline",
     "run": "cprl.running",
+    "run_study": "cprl.studies",
+    "Study": "cprl.studies",
 }
 """Where these names stand; with them come the viewer and all that is recorded, half a second of import."""
 
