@@ -2,6 +2,7 @@
 
 import json
 import os
+import pickle
 import shutil
 import signal
 import subprocess
@@ -13,7 +14,7 @@ from pathlib import Path
 import pytest
 from tiny_study import FREEZE, TINY
 
-from cprl import Study, run_study
+from cprl import Custom, Study, run_study
 from cprl.runs.checkpoints import FOLDER as CHECKPOINTS
 from cprl.runs.episodes import read_episodes
 from cprl.runs.lock import FILE_NAME as LOCK
@@ -216,3 +217,18 @@ def test_nothing_is_written_where_a_study_is_refused(tmp_path):
         with pytest.raises(ValueError, match="allowed: "):
             call()
     assert not (tmp_path / "x").exists()
+
+
+def test_a_study_varies_code_of_ones_own_and_a_process_that_knows_nothing_of_it_runs_it(tmp_path):
+    fatigue = Custom("one_road_parts:Fatigue", arguments={"per_step": 0.5})
+    study = Study(replace(TINY, transforms=(fatigue,)), {"transforms.0.arguments.per_step": [0.0, 0.5]})
+    code = (
+        "import pickle, sys; from cprl.studies.trials import run_task; "
+        "print(run_task(pickle.load(sys.stdin.buffer)))"
+    )
+    sent = pickle.dumps(task(tmp_path, study, 1))
+    command = [sys.executable, "-W", "ignore", "-c", code]
+    told = subprocess.run(command, input=sent, capture_output=True, cwd="/", check=True).stdout.decode()
+    assert "state='finished'" in told, told
+    recipe = json.loads(next((tmp_path / "runs").glob("*/recipe.json")).read_text())
+    assert recipe["experiment"]["transforms"][0]["arguments"] == {"per_step": 0.5}
