@@ -16,7 +16,7 @@ from torchrl.envs import EnvBase, TransformedEnv
 from cprl.commons.game import Game
 from cprl.envs.state import load_transforms_state, transforms_state
 from cprl.envs.unwrap import commons_of
-from cprl.viewer.live_board import send_fixed, send_frames
+from cprl.viewer.live_board import LiveBoard, send_fixed
 from cprl.viewer.recorder import FrameRecorder
 from cprl.viewer.scenery import Scene
 from cprl.viewer.streams import Live
@@ -94,9 +94,9 @@ class Exhibition:
                 f"the exhibition has a {type(env).__name__} of batch size {list(env.batch_size)}; allowed: "
                 "one world of a CommonsEnv, with transforms or without"
             )
-        self._policy, self._env, self._trained, self._scene = policy, env, trained, scene
+        self._policy, self._env, self._trained, self._board = policy, env, trained, LiveBoard(scene)
         self._live, self._clock, self._closing = live, clock, Event()
-        self._wait = wait or self._closing.wait
+        self._wait = wait or self._slept
         self._recorder = FrameRecorder(
             commons, episodes=1, scene=scene, capacity=STEPS_PER_S, has_windows=False
         )
@@ -127,6 +127,12 @@ class Exhibition:
     def close(self) -> None:
         """Leaves out frames that have not been sent."""
         self._closing.set()
+
+    def _slept(self, seconds: float) -> bool:
+        """Whether `close` was called by the end of so many seconds; an event's own `wait` takes
+        longer to end, and keeps the training from going on meanwhile."""
+        time.sleep(seconds)
+        return self._closing.is_set()
 
     def _play(self, episode: int) -> None:
         """Plays some steps, and has them sent; fewer the next time if they took long."""
@@ -169,7 +175,7 @@ class Exhibition:
     def _send(self, frames: Mapping[str, NDArray[Any]], episode: int) -> None:
         if self._live.exhibition is not None:
             caption = caption_of(self._policy, episode)
-            shown = partial(send_frames, scene=self._scene, frames=frames, caption=caption)
+            shown = partial(self._board.send, frames=frames, caption=caption)
             self._live.exhibition.do(partial(shown, wait=self._wait, lasting_s=BATCH_S))
 
 
