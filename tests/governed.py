@@ -147,7 +147,9 @@ def governed_games(draw, *, harmless=False, ballots=True, **fixed):
         one_each += [SANCTIONS, sanctioners | st.just(Sanctioner()) if ballots else sanctioners]
     for kind in one_each:
         chosen += draw(st.lists(kind, max_size=1))
-    order = draw(st.permutations(chosen or [Tax()]))
+    if not any(isinstance(own, Mediation) for own in chosen):
+        chosen.append(draw(quotas(FINES)))  # so that there is a rule to break
+    order = draw(st.permutations(chosen))
     return replace(game, observation=Observation(agents_apart=True), institutions=tuple(order))
 
 

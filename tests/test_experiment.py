@@ -16,6 +16,8 @@ from cprl.population import Frozen, Learning, Scripted, Team
 
 RESULTS = Path(__file__).parents[1] / "docs" / "results"
 RECIPES = sorted(RESULTS.rglob("recipe.json"))
+OLD = [path for path in RECIPES if "arguments" in json.loads(path.read_text())]
+"""Of before `Experiment`."""
 DQN_AGENT = Learning(DQN(settings=DQNSettings()))
 EXPERIMENT = Experiment(
     name="mixed",
@@ -38,7 +40,12 @@ def test_the_recipe_of_every_stored_result_is_an_experiment(path):
     experiment = Experiment.from_recipe(recipe)
     assert experiment.name == recipe["recipe"]
     assert Experiment.from_recipe(as_stored(experiment.to_recipe())) == experiment
-    old = recipe["arguments"]
+
+
+@pytest.mark.parametrize("path", OLD, ids=lambda path: str(path.parent.relative_to(RESULTS)))
+def test_an_old_recipe_says_the_same_as_it_did(path):
+    recipe = json.loads(path.read_text())
+    experiment, old = Experiment.from_recipe(recipe), recipe["arguments"]
     assert (experiment.episodes, experiment.replicas, experiment.seed) == (
         old["episodes"],
         old["replicas"],
@@ -54,7 +61,7 @@ def test_the_recipe_of_every_stored_result_is_an_experiment(path):
 
 
 def test_there_are_results_of_all_three_generations():
-    kinds = {type(json.loads(path.read_text())["arguments"].get("population")) for path in RECIPES}
+    kinds = {type(json.loads(path.read_text())["arguments"].get("population")) for path in OLD}
     assert kinds == {type(None), dict, list}
 
 

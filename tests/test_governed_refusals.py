@@ -109,7 +109,8 @@ def test_what_is_no_institution_is_refused(wrong):
 def test_where_nobody_fires_what_follows_from_shots_is_refused(own):
     with pytest.raises(ValueError, match=rf"a {type(own).__name__} and Rules\.may_fire is False; allowed: a"):
         replace(PLAIN, rules=Rules(may_fire=False), institutions=(own,))
-    replace(PLAIN, rules=Rules(may_fire=False), institutions=(GraduatedSanctions(on="violations"),))
+    of_violations = Quota(fine=1), GraduatedSanctions(on="violations")
+    replace(PLAIN, rules=Rules(may_fire=False), institutions=of_violations)
 
 
 @pytest.mark.parametrize(

@@ -224,7 +224,8 @@ def test_nobody_harvests_in_the_region_of_others(game, seed):
 @QUICK
 @given(game=games(), seed=SEEDS, cost=FINES, monitor=st.sampled_from([None, 0]))
 def test_inspection_costs_the_same_in_every_turn_until_the_end(game, seed, cost, monitor):
-    game = replace(game, institutions=(Monitoring(cost=cost, monitor=monitor),))
+    never_broken = Quota(share=1e6, fine=0)
+    game = replace(game, institutions=(Monitoring(cost=cost, monitor=monitor), never_broken))
     for before, moment in zip(*(played(game, seed=seed)[n:] for n in (0, 1)), strict=False):
         is_playing = before.worlds.ended[:, 0] == PLAYING
         close(moment.payments.fines.sum(-1), cost * is_playing)
