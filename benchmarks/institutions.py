@@ -35,9 +35,8 @@ from cprl.institutions import (
     Vote,
 )
 
-TO_EXPLAIN, DEFECT = 1.1, 1.3
-"""Multiples of a turn through `CommonsEnv.step`: what is above the first is explained, above the second a
-defect."""
+DEFECT = 1.3
+"""The multiple of a turn through `CommonsEnv.step` above which an institution costs more than is allowed."""
 HIDDEN: Final = {"observed": False}
 EACH: Final[dict[str, tuple[Institution, ...]]] = {
     "Boundaries, stopped": (Boundaries.strips(height=12, width=24, agents=4, **HIDDEN),),

@@ -59,8 +59,8 @@ iframe {{ flex: 1; border: 0; }}
 
 def replays() -> dict[str, Path]:
     """The committed replays by name: the run, and the file where a run has several."""
-    files = sorted(RESULTS.glob("*/replay*.rrd"))
-    runs = [path.parent.name for path in files]
+    files = sorted(RESULTS.rglob("replay*.rrd"))
+    runs = [path.parent.relative_to(RESULTS).as_posix() for path in files]
     return {
         run if runs.count(run) == 1 else f"{run}/{path.stem}": path
         for run, path in zip(runs, files, strict=True)

@@ -51,7 +51,8 @@ def refused(address, **headers):
 
 def test_the_page_names_every_committed_replay_and_embeds_one(address):
     text = got(address)[0].decode()
-    committed = sorted(path.parent.name for path in replay_page.RESULTS.glob("*/replay*.rrd"))
+    results = replay_page.RESULTS
+    committed = sorted(path.parent.relative_to(results).as_posix() for path in results.rglob("replay*.rrd"))
     assert re.findall(r'href="/\?replay=([^"]+)"', text) == committed
     assert "class=shown>commons</a>" in text
     assert "class=shown>two_complex</a>" in got(f"{address}/?replay=two_complex")[0].decode()
@@ -66,6 +67,8 @@ def test_the_viewer_that_is_embedded_loads_the_replay_from_here(address):
     assert query["url"][0].startswith(address)
     assert replay == (replay_page.RESULTS / "commons" / "replay-0-0.rrd").read_bytes()
     assert int(headers["Content-Length"]) == len(replay)
+    nested = replay_page.RESULTS / "institutions" / "monitoring" / "replay-0-0.rrd"
+    assert got(f"{address}/replays/institutions/monitoring.rrd")[0] == nested.read_bytes()
 
 
 def test_nothing_else_is_served_and_nothing_of_another_server_may_be_loaded(address):

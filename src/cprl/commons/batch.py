@@ -105,8 +105,8 @@ class Batch:
         """The current state of the worlds, in the driver's arrays."""
         self.memory: Memory | None = None
         """What institutions remember, likewise; None for a game without any."""
-        self._no_decisions = self.driver.empty((worlds, game.agents), np.int64)
         if game.institutions:
+            self._no_decisions: Actions = self.driver.empty((worlds, game.agents), np.int64)
             self.driver.write(self._no_decisions, np.zeros((worlds, game.agents), np.int64))
             self.memory = self.driver.place(empty_memory(game.governed_tables.institutions, worlds=worlds))
         self._all_worlds = self._selection(np.ones(worlds, np.bool_))

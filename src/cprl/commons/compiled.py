@@ -78,7 +78,8 @@ def _jit_for_cpu(function: FunctionType, *, on_disk: bool) -> Callable[..., Any]
 
 @cache
 def rules_for_cpu() -> Compiled:
-    """The rules compiled for CPU threads: about ten seconds the first time, then cached on disk.
+    """The rules compiled for CPU threads: about ten seconds the first time, for a game with institutions half
+    a minute; then cached on disk.
 
     Numba's own cache checks only the file of the called function and would miss a change in a rule that this
     function calls; so the cache folder is named after the text of all rules.

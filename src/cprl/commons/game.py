@@ -140,10 +140,7 @@ class Game:
     @property
     def spaces(self) -> Spaces:
         """What each agent observes and may do."""
-        vectors = {
-            "stock_gauge": self.stock_gauge_size,
-            "scoreboard": self.scoreboard_size,
-        }
+        vectors = {"stock_gauge": self.stock_gauge_size, "scoreboard": self.scoreboard_size}
         return Spaces(
             agents=self.agents,
             observation_shape=self.observation_shape,

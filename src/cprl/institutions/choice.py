@@ -100,11 +100,7 @@ class Ballot(NamedTuple):
 
 def is_decided(own: Institution) -> bool:
     """Whether agents decide something about this institution, so that it has a ballot."""
-    return (
-        isinstance(own, Vote)
-        or (isinstance(own, Sanctioner) and own.agents is None)
-        or (isinstance(own, Monitoring) and own.monitor == ELECTED)
-    )
+    return bool(ballots((own,), agents=1))
 
 
 def ballots(institutions: Sequence[Institution], agents: int) -> tuple[Ballot, ...]:

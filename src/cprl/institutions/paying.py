@@ -71,6 +71,8 @@ def charge(memory: Memory, i: int) -> None:
 
 def pay_monitor(memory: Memory, tables: InstitutionTables) -> None:
     """Charges the cost of inspection to who monitors, or to all in equal parts."""
+    if tables.monitor_cost == 0:
+        return
     agents = memory.fines.shape[0]
     for i in range(agents):
         if tables.monitor_ballot >= 0:
