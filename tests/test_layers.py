@@ -58,8 +58,8 @@ PACKAGES = (
     "commandline",
     "cli",
 )
-TO_COME = ("theory", "studies")
-"""Their places are kept for them."""
+TO_COME = ("theory",)
+"""Its place is kept for it."""
 MODULES = sorted(path for path in SOURCE.rglob("*.py") if path.parent != SOURCE or path.name != "__init__.py")
 
 

@@ -43,6 +43,7 @@ Each imports only from those above it:
     running      run: an experiment from its learners to its report
     evaluation   stored agents in fresh worlds, alone and among each other
     play         a person among trained or scripted agents
+    studies      one experiment under many conditions: factors, trials, tables, figures
     reporting    finished runs beside the published study
     flags        the fields of an experiment as flags
     commandline  recipe_main: the command line of a recipe
@@ -69,6 +70,7 @@ if TYPE_CHECKING:
     from cprl.experiment import Experiment
     from cprl.running import run
     from cprl.stored import load
+    from cprl.studies import Study, run_study
 
     __version__: str
 
@@ -80,6 +82,7 @@ __all__ = [
     "Map",
     "Observation",
     "Rules",
+    "Study",
     "__version__",
     "crossplay",
     "evaluate_run",
@@ -89,6 +92,7 @@ __all__ = [
     "presets",
     "recipe_main",
     "run",
+    "run_study",
     "train",
 ]
 
@@ -100,6 +104,8 @@ _IMPORTED_WHEN_USED: Final = {
     "load": "cprl.stored",
     "recipe_main": "cprl.commandline",
     "run": "cprl.running",
+    "run_study": "cprl.studies",
+    "Study": "cprl.studies",
 }
 """Where these names stand; with them come the viewer and all that is recorded, half a second of import."""
 

@@ -8,6 +8,7 @@ from datetime import datetime
 from pathlib import Path
 
 from cprl.arguments import callable_of, object_of, path, texts
+from cprl.callbacks import check_callbacks
 from cprl.checks import SWITCH, checked
 from cprl.custom import Custom
 from cprl.envs.state import transforms_state
@@ -70,6 +71,7 @@ def run(
     linger: bool = False,
     allow: Sequence[str] = (),
     command: Sequence[str] | None = None,
+    callbacks: Sequence[object] = (),
     at_end: Callable[[Path], object] | None = None,
 ) -> Path:
     """Trains the agents of all replicas, evaluates them in fresh worlds, and writes and prints the outcome.
@@ -92,6 +94,8 @@ def run(
         allow: the user's own code, "module:Class", that stored runs of `Frozen` agents may import.
         command: the command line that began the run, script first, which the recipe keeps and the line that
             resumes is made of; by default the run is resumed by `cprl run`.
+        callbacks: further callbacks of this process (see `cprl.callbacks`), which the recipe does not hold;
+            they may look, and change nothing.
         at_end: called with the directory of a run that has just finished, when all is written and said.
 
     Returns:
@@ -117,6 +121,7 @@ def run(
     prepare_process(experiment.seed)
     is_begun = resume and out is not None and bool(checkpoints_in(out / FOLDER))
     own = make_parts(experiment, allow, starts=not is_begun)
+    own.callbacks += check_callbacks(callbacks)
     episodes = refuse_another_run(out, experiment.to_recipe) if resume else experiment.episodes
     is_there = out is not None and out.exists()
     if resume and out is not None:

@@ -123,6 +123,11 @@ class Training:
         return max(self._played) >= self.episodes
 
     @property
+    def episodes_played(self) -> int:
+        """Episodes that all replicas together have ended so far, those beyond `episodes` left out."""
+        return sum(min(played, self.episodes) for played in self._played)
+
+    @property
     def spent_s(self) -> float:
         """Seconds that it has taken so far, those before it was stopped included."""
         return self._spent_s + time.monotonic() - self._began

@@ -1,0 +1,30 @@
+"""The experiment that every study of this folder varies: the tragedy of the commons on a short schedule.
+
+Four independent DQN agents on `commons`, by the rules of the study as run, 200 episodes of 8 replicas; the
+schedule of recipes/tragedy.py.
+"""
+
+from dataclasses import replace
+from typing import Final
+
+import cprl
+from cprl import presets
+from cprl.algorithms import DQN
+from cprl.population import Learning
+
+SETTINGS: Final = replace(
+    presets.dqn_settings("commons", variant="as_run"),
+    learning_rate=1e-4,
+    epsilon_decay_steps=100_000,
+    gamma=0.95,
+)
+AGENT: Final = Learning(DQN(settings=SETTINGS))
+
+EXPERIMENT: Final = cprl.Experiment(
+    name="short_commons",
+    game=presets.game("commons", variant="as_run"),
+    agents=(AGENT,) * 4,
+    episodes=200,
+    replicas=8,
+    evaluation_episodes=50,
+)

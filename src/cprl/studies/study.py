@@ -1,0 +1,279 @@
+"""Study: one experiment under several conditions, each repeated by the same replicas; a value."""
+
+import hashlib
+import os
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass, field
+from functools import cached_property, partial
+from pathlib import Path
+from typing import Any, Final
+
+from cprl.arguments import integer, object_of, refusal, switch
+from cprl.checks import DIRECTORY_NAME, check_nesting, checked, instance, shown
+from cprl.experiment import MOST_SEED, Experiment, frozen_from, frozen_relative_to
+from cprl.studies.conditions import Condition
+from cprl.studies.factors import (
+    MOST_CONDITIONS,
+    Factor,
+    Level,
+    changes_from_config,
+    changes_to_config,
+    checked_factors,
+    drawn,
+    factor_from_config,
+    factor_to_config,
+    grid,
+)
+from cprl.studies.naming import named, short_names
+from cprl.studies.paths import changed
+
+FORMAT: Final = 1
+"""Of `Study.to_config`."""
+BLOCK: Final = 8
+"""Replicas that one run trains side by side, if a study does not say."""
+SEEDS_APART: Final = 1000
+"""Between the seeds of two blocks of replicas; evaluation plays worlds of the next seed."""
+
+
+@dataclass(frozen=True, eq=False)
+class Study:
+    """One experiment under several conditions: a grid, random draws, or named conditions.
+
+    Args:
+        experiment: what every condition is, but for what it changes.
+        factors: by the path of a field (see `cprl.studies.paths`), its values; or by a name of your own, a
+            table of levels, each a table of values by path; or a distribution, with `draws`.
+        conditions: named ones instead of factors, each a table of values by path; `{}` changes nothing.
+        draws: so many random combinations of the factors' levels instead of their grid.
+        replicas: of each condition; by default those of the experiment.
+        block: replicas that one run trains side by side; fewer can be spread over more processes.
+        pairing: whether replica r has the same seeds and worlds in each condition.
+        reference: the name of the condition that others are compared with; by default the first one that
+            changes nothing, else the first.
+        name: by default that of the experiment.
+        question: what the study asks, for its report.
+        expectation: what was expected before it was run, for its report.
+
+    Raises:
+        ValueError: for a path that matches nothing, a value that does not fit, and two equal conditions; for
+            whatever else does not fit.
+    """
+
+    experiment: Experiment
+    factors: Mapping[str, Factor] = field(default_factory=dict)
+    conditions: Mapping[str, Mapping[str, Any]] = field(default_factory=dict, kw_only=True)
+    draws: int | None = field(default=None, kw_only=True)
+    replicas: int | None = field(default=None, kw_only=True)
+    block: int = field(default=BLOCK, kw_only=True)
+    pairing: bool = field(default=True, kw_only=True)
+    reference: str | None = field(default=None, kw_only=True)
+    name: str = field(default="", kw_only=True)
+    question: str = field(default="", kw_only=True)
+    expectation: str = field(default="", kw_only=True)
+
+    def __post_init__(self) -> None:
+        object_of("experiment", self.experiment, Experiment, "an Experiment")
+        keep = object.__setattr__
+        keep(self, "factors", checked_factors(self.factors))
+        keep(self, "conditions", _checked_conditions(self.conditions))
+        keep(self, "replicas", self.experiment.replicas if self.replicas is None else self.replicas)
+        keep(self, "name", self.name or self.experiment.name)
+        checked("name", self.name, DIRECTORY_NAME)
+        integer("replicas", self.replicas, 1, 2**20)
+        integer("block", self.block, 1, 2**20)
+        switch("pairing", self.pairing)
+        for own in ("question", "expectation"):
+            object_of(own, getattr(self, own), str, "a text")
+        if self.factors and self.conditions:
+            raise ValueError("a study has factors and conditions; allowed: one of them")
+        if self.draws is not None:
+            integer("draws", self.draws, 1, MOST_CONDITIONS)
+            if not self.factors:
+                raise ValueError("draws is given without factors; allowed: factors to draw from")
+        if self.blocks[-1].seed > MOST_SEED:
+            raise ValueError(f"the experiment's seed is {self.experiment.seed}; allowed: a lower one")
+        if self.reference_name not in [own.name for own in self.all_conditions]:
+            names = ", ".join(own.name for own in self.all_conditions[:10])
+            raise refusal("reference", self.reference, f"the name of a condition: {names}")
+
+    @cached_property
+    def all_conditions(self) -> tuple[Condition, ...]:
+        """Every condition, in order, each once."""
+        found = [
+            Condition(_of_level(self.experiment, levels), {own: at.value for own, at in levels.items()}, name)
+            for name, levels in self._levels()
+        ]
+        by_sum: dict[str, Condition] = {}
+        for own in found:
+            if (other := by_sum.setdefault(own.checksum, own)) is not own and self.draws is None:
+                raise ValueError(
+                    f"the conditions {other.name!r} and {own.name!r} are equal; allowed: each once"
+                )
+        return tuple(by_sum.values())
+
+    @cached_property
+    def blocks(self) -> tuple["Block", ...]:
+        """The blocks of replicas of each condition, in order."""
+        assert self.replicas is not None
+        firsts = range(0, self.replicas, self.block)
+        return tuple(
+            Block(
+                first=first,
+                replicas=min(self.block, self.replicas - first),
+                seed=self.experiment.seed + SEEDS_APART * nth,
+            )
+            for nth, first in enumerate(firsts)
+        )
+
+    @property
+    def reference_name(self) -> str:
+        """The name of the condition that others are compared with."""
+        if self.reference is not None:
+            return self.reference
+        same = Condition(self.experiment).checksum
+        unchanged = [own.name for own in self.all_conditions if own.checksum == same]
+        return unchanged[0] if unchanged else self.all_conditions[0].name
+
+    @property
+    def columns(self) -> tuple[str, ...]:
+        """The names of the factors; of named conditions "condition" alone."""
+        return tuple(self.factors) if self.factors else (CONDITION,)
+
+    def seed_of(self, condition: Condition, block: "Block") -> int:
+        """The seed of a block of replicas of a condition."""
+        if self.pairing:
+            return block.seed
+        digest = hashlib.blake2b(f"{condition.checksum} {block.seed}".encode(), digest_size=6)
+        return int.from_bytes(digest.digest())
+
+    def _levels(self) -> list[tuple[str, dict[str, Level]]]:
+        """The name and levels of each condition."""
+        if self.conditions:
+            return [(name, {CONDITION: Level(name, own)}) for name, own in self.conditions.items()]
+        if not self.factors:
+            return [(UNCHANGED, {CONDITION: Level(UNCHANGED, {})})]
+        if self.draws is not None:
+            seed = self.experiment.seed
+            every = [drawn(self.factors, seed=seed, nth=nth) for nth in range(self.draws)]
+        else:
+            every = list(grid(self.factors))
+        if len(every) > MOST_CONDITIONS:
+            raise ValueError(f"a study has {len(every):,} conditions; allowed: up to {MOST_CONDITIONS:,}")
+        short = short_names(self.factors)
+        return [(named({short[own]: at.value for own, at in levels.items()}), levels) for levels in every]
+
+    def to_config(self, directory: str | Path | None = None) -> dict[str, Any]:
+        """The study as JSON can hold it.
+
+        Args:
+            directory: where it is kept: runs of `Frozen` agents are then given relative to it.
+        """
+        place = _no_change if directory is None else partial(os.path.relpath, start=directory)
+        stored = self.experiment if directory is None else frozen_relative_to(self.experiment, directory)
+        return {
+            "format": FORMAT,
+            "experiment": stored.to_config(),
+            "factors": [[name, factor_to_config(name, own, place)] for name, own in self.factors.items()],
+            "conditions": [[name, changes_to_config(own, place)] for name, own in self.conditions.items()],
+            **{own: getattr(self, own) for own in _PLAIN},
+        }
+
+    @classmethod
+    def from_config(
+        cls,
+        table: Mapping[str, Any],
+        *,
+        allow: Iterable[str] = (),
+        directory: str | Path | None = None,
+    ) -> "Study":
+        """The study that `to_config` gave.
+
+        Args:
+            table: what JSON held.
+            allow: the targets of `Custom` that it may hold, "module:Class" each.
+            directory: where it is kept; runs of `Frozen` agents are then relative to where we stand.
+
+        Raises:
+            ValueError: for another format, and for what does not fit, see `Experiment.from_config`.
+        """
+        checked("the study", table, instance(Mapping, "a table"))
+        check_nesting(table, "the study")
+        lacks = [name for name in ("experiment", "factors", "conditions", *_PLAIN) if name not in table]
+        if table.get("format") != FORMAT or lacks:
+            raise ValueError(
+                f"the study has the format {shown(table.get('format'))}"
+                f"{' and lacks ' + ', '.join(lacks) if lacks else ''}; allowed: {FORMAT}, complete"
+            )
+        allow = tuple(allow)
+        place = _no_change if directory is None else partial(_joined, str(directory))
+        experiment = Experiment.from_config(table["experiment"], allow=allow)
+        try:
+            factors = {name: factor_from_config(own, allow, place) for name, own in table["factors"]}
+            named = {name: changes_from_config(own, allow, place) for name, own in table["conditions"]}
+        except (KeyError, TypeError, AttributeError) as error:
+            raise ValueError(
+                f"the study has no factors and conditions that it could have: {error!r}"
+            ) from error
+        return cls(
+            experiment if directory is None else frozen_from(experiment, directory),
+            factors,
+            conditions=named,
+            **{own: table[own] for own in _PLAIN},
+        )
+
+    def __eq__(self, other: object) -> bool:
+        return self.to_config() == other.to_config() if isinstance(other, Study) else NotImplemented
+
+    def __hash__(self) -> int:
+        return hash((self.name, self.replicas, self.block))
+
+
+@dataclass(frozen=True, kw_only=True)
+class Block:
+    """Replicas of a condition that one run trains side by side."""
+
+    first: int
+    """The number of the first one in the study."""
+    replicas: int
+    seed: int
+    """Of the run, where conditions are paired."""
+
+
+_PLAIN: Final = (
+    *("name", "question", "expectation"),
+    *("draws", "replicas", "block", "pairing", "reference"),
+)
+"""Fields that JSON can hold as they are."""
+CONDITION: Final = "condition"
+"""The column of named conditions."""
+UNCHANGED: Final = "unchanged"
+"""The one condition of a study without factors."""
+
+
+def _no_change(run: str) -> str:
+    return run
+
+
+def _joined(directory: str, run: str) -> str:
+    return os.path.relpath(os.path.join(directory, run))
+
+
+def _of_level(experiment: Experiment, levels: Mapping[str, Level]) -> Experiment:
+    changes = {path: value for own in levels.values() for path, value in own.changes.items()}
+    twice = sum(len(own.changes) for own in levels.values()) - len(changes)
+    if twice:
+        raise ValueError(f"two factors change the same field, of {', '.join(changes)}; allowed: one each")
+    refused = [path for path in changes if path in ("seed", "replicas", "name")]
+    if refused:
+        raise ValueError(f"a factor is {refused[0]}, which the study itself decides; allowed: other fields")
+    return changed(experiment, changes) if changes else experiment
+
+
+def _checked_conditions(conditions: object) -> dict[str, dict[str, Any]]:
+    allowed = "a table of conditions by name, each a table of values by path"
+    if not isinstance(conditions, Mapping):
+        raise refusal("conditions", conditions, allowed)
+    for name, own in conditions.items():
+        if not isinstance(name, str) or not name or not isinstance(own, Mapping):
+            raise refusal(f"conditions[{name!r}]", own, allowed)
+    return {name: dict(own) for name, own in conditions.items()}

@@ -1,0 +1,209 @@
+"""Trials: runs of a study, one for each condition and block of replicas, each in a directory of its own.
+
+The truth of a study lies in these directories. `run_task` makes of any of them a finished run, whatever was
+there: nothing, a run that was killed at any moment, or a finished one, of which it does nothing.
+"""
+
+import os
+import sys
+import time
+import traceback
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager, redirect_stderr, redirect_stdout
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any, Final, Literal, NamedTuple
+
+from cprl.config import custom_targets
+from cprl.experiment import Experiment
+from cprl.runs.directory import FILE_NAME as RECIPE
+from cprl.runs.directory import read_recipe
+from cprl.runs.extension import REPORT
+from cprl.runs.lock import FILE_NAME as LOCK
+from cprl.runs.lock import RunLock, RunLockedError
+from cprl.studies.conditions import Condition
+from cprl.studies.status import Status, StatusCallback, StatusFile, is_silent
+from cprl.studies.study import Block, Study
+
+State = Literal["missing", "unfinished", "finished"]
+PATIENCE_S: Final = 60.0
+"""Seconds without a sign of life after which a trial is taken over that another host has locked."""
+_POLL_S: Final = 1.0
+
+
+@dataclass(frozen=True, eq=False)
+class Trial:
+    """One run of a study: a block of replicas of a condition."""
+
+    condition: Condition
+    block: Block
+    experiment: Experiment
+    """What is run."""
+
+    @property
+    def name(self) -> str:
+        """The name of its directory: the condition's checksum, the seed and the number of replicas."""
+        return f"{self.condition.checksum}-s{self.experiment.seed}-r{self.experiment.replicas}"
+
+    def state(self, runs: Path) -> State:
+        """What its directory holds."""
+        return state_of(runs / self.name)
+
+
+def trials_of(study: Study) -> list[Trial]:
+    """Every trial of a study: the first blocks of all conditions, then their second ones, and so on."""
+    return [
+        Trial(
+            condition,
+            block,
+            replace(
+                condition.experiment,
+                seed=study.seed_of(condition, block),
+                replicas=block.replicas,
+            ),
+        )
+        for block in study.blocks
+        for condition in study.all_conditions
+    ]
+
+
+def state_of(run: Path) -> State:
+    """What the directory of a run holds; a finished run has a report."""
+    if (run / REPORT).exists():
+        return "finished"
+    return "unfinished" if (run / RECIPE).exists() else "missing"
+
+
+@dataclass(frozen=True, kw_only=True)
+class Task:
+    """What a process has to know to run a trial: plain values, which any executor can send."""
+
+    name: str
+    """Of the trial, and of its directory."""
+    runs: str
+    """The directory in which the trial's is."""
+    status: str
+    """The directory in which it says how far it is."""
+    recipe: Mapping[str, Any]
+    """What `Experiment.to_recipe` gave for the trial's directory."""
+    allow: tuple[str, ...] = ()
+    """Targets of `Custom` that may be imported."""
+    paths: tuple[str, ...] = ()
+    """Directories from which they are imported."""
+    command: tuple[str, ...] = ("cprl", "sweep")
+    """The command line of the study, which the recipe keeps."""
+
+    @property
+    def directory(self) -> Path:
+        """Of the trial."""
+        return Path(self.runs) / self.name
+
+
+class Outcome(NamedTuple):
+    """How a trial ended."""
+
+    name: str
+    state: Literal["finished", "failed"]
+    reason: str = ""
+    """Of a failure: the error in a line."""
+    worked: bool = False
+    """Whether anything had to be done."""
+
+
+def task_of(trial: Trial, *, runs: Path, status: Path, allow: Sequence[str] = ()) -> Task:
+    """The task of a trial.
+
+    Classes of the user's own that the experiment itself has are allowed: it was made with them.
+
+    Args:
+        trial: what is run.
+        runs: the directory in which its own is.
+        status: the directory in which it says how far it is.
+        allow: further targets of `Custom`, those of stored runs that agents come from.
+    """
+    recipe = trial.experiment.to_recipe(runs / trial.name)
+    targets = tuple(dict.fromkeys([*custom_targets(recipe["experiment"]), *allow]))
+    return Task(
+        name=trial.name,
+        runs=str(runs),
+        status=str(status),
+        recipe=recipe,
+        allow=targets,
+        paths=tuple(map(os.path.abspath, sys.path)) if targets else (),
+        command=tuple(sys.argv),
+    )
+
+
+def run_task(task: Task) -> Outcome:
+    """Makes a trial a finished one; may be called any number of times, anywhere.
+
+    What is there is kept: a finished trial is left as it is, an unfinished one is resumed. While another
+    process runs it, this one waits, and takes it over where that one has died.
+
+    What it prints is in `log.txt` beside its status, and why it failed in `failed.txt`.
+    """
+    run, status = task.directory, Status(Path(task.status), task.name)
+    if state_of(run) == "finished":
+        status.tidy_up()
+        return Outcome(task.name, "finished")
+    sys.path += [path for path in task.paths if path not in sys.path]
+    sys.argv = list(task.command)  # that of a worker process would name its machine's directories
+    status.folder.mkdir(parents=True, exist_ok=True)
+    try:
+        with _printing_into(status.log):
+            _run(task, run, status)
+    except Exception as error:
+        status.fail(f"{type(error).__name__}: {error}", traceback.format_exc())
+        return Outcome(task.name, "failed", f"{type(error).__name__}: {error}", True)
+    status.tidy_up()
+    return Outcome(task.name, "finished", worked=True)
+
+
+def _run(task: Task, run: Path, status: Status) -> None:
+    """Runs or resumes a trial as soon as nobody else does."""
+    from cprl.running import run as run_experiment
+
+    silent = is_silent(status, PATIENCE_S)
+    while state_of(run) != "finished":
+        is_begun, take_over = state_of(run) == "unfinished", next(silent)
+        experiment = Experiment.from_recipe(task.recipe, allow=task.allow, directory=run)
+        try:
+            if is_begun:  # another study may have begun it, under another name
+                experiment = replace(experiment, name=str(read_recipe(run)["experiment"]["name"]))
+            else:
+                _clear(run, take_over=take_over)
+            with StatusFile(status, experiment) as shown:
+                run_experiment(
+                    experiment,
+                    run,
+                    resume=is_begun,
+                    take_over=take_over,
+                    keep_checkpoint=False,
+                    watch="off",
+                    allow=task.allow,
+                    callbacks=(StatusCallback(shown),),
+                )
+        except (RunLockedError, FileExistsError):  # somebody else began it
+            if state_of(run) == "missing" and not (run / LOCK).exists():
+                raise
+            time.sleep(_POLL_S)
+
+
+def _clear(run: Path, *, take_over: bool) -> None:
+    """Removes what a process left that was killed before it had written a recipe."""
+    if not run.exists():
+        return
+    with RunLock(run, take_over=take_over):
+        for path in run.glob("*.partial") if state_of(run) == "missing" else ():
+            path.unlink(missing_ok=True)
+
+
+@contextmanager
+def _printing_into(log: Path) -> Iterator[None]:
+    """Appends what the block prints to a file."""
+    with (
+        open(log, "a", encoding="utf-8", errors="replace") as file,
+        redirect_stdout(file),
+        redirect_stderr(file),
+    ):
+        yield
