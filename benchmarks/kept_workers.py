@@ -1,11 +1,11 @@
 """What a small trial costs beside its training, in a worker that is kept for one trial after the other.
 
-Trials of one shape, 4 DQN agents on `commons` by the rules as run with 4 replicas and episodes of 250 steps,
-run one after the other in this process, as a study's worker does. Of each: its wall time; the seconds in which
-it acts, stores and updates, and those in which code is compiled or read from caches, both from its
-`report.json`; and the rest, which is everything else: making learners, measuring, evaluation, tables, weights,
-the figure, the summary. The first trial starts a worker and is told apart. With `--vary` trials differ in
-learning rate and discount, which are no constants of compiled code.
+Trials of one shape, 4 DQN agents on `commons` by the rules as run with 4 replicas of 2 episodes of 250 steps,
+run one after the other in this process, as a study's worker does. Of each: its wall time; the seconds in
+which it acts, stores and updates, and those in which code is compiled or read from caches, both from its
+`report.json`; and the rest, which is everything else: making learners, measuring, evaluation, tables,
+weights, the figure, the summary. The first trial starts a worker and is told apart. With `--vary` trials
+differ in learning rate and discount, which are no constants of compiled code.
 
     python benchmarks/kept_workers.py                        20 trials
     python benchmarks/kept_workers.py --trials 200 --vary
@@ -102,7 +102,7 @@ def small(number: int, *, vary: bool, episodes: int, episode_steps: int) -> cprl
         agents=(Learning(DQN(settings=settings)),) * 4,
         episodes=episodes,
         replicas=4,
-        evaluation_episodes=2,
+        evaluation_episodes=1,
         seed=number,
     )
 
@@ -135,7 +135,7 @@ def main(
     *,
     trials: int = 20,
     vary: bool = False,
-    episodes: int = 4,
+    episodes: int = 2,
     episode_steps: int = 250,
     clock: Literal["wall", "cpu"] = "wall",
 ) -> None:

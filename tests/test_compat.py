@@ -215,10 +215,14 @@ ignored = pytest.mark.filterwarnings("ignore::DeprecationWarning", "ignore::Futu
 
 def compiled_of_its_own(size):
     own = compat.with_own_code(doubled)
-    with compat.every_guard():
-        function = torch.compile(own, fullgraph=True, dynamic=False, options=dict(compat.COMPILE_OPTIONS))
-        assert function(torch.ones(size)).tolist() == [2.0] * size
+    assert called_first(own, torch.ones(size)).tolist() == [2.0] * size
     return own
+
+
+def called_first(own, *arguments):
+    with compat.every_guard():
+        options = dict(compat.COMPILE_OPTIONS)
+        return torch.compile(own, fullgraph=True, dynamic=False, options=options)(*arguments)
 
 
 @ignored
@@ -254,7 +258,7 @@ def test_torch_says_for_which_arguments_its_code_is_right():
 
 
 class Doubling:
-    """A class of its own for code that is to be thrown away."""
+    """What the class of an owner refers to."""
 
     factor = 2.0
 
@@ -264,37 +268,32 @@ def multiplied(owner, values):
 
 
 @ignored
-def test_code_that_depended_on_an_object_that_is_gone_fits_nothing():
+def test_code_that_depended_on_a_class_that_is_gone_fits_nothing():
     class Owner:
         @staticmethod
         def layer(values):
             return Doubling
 
     own = compat.with_own_code(multiplied)
-    with compat.every_guard():
-        torch.compile(own, fullgraph=True, dynamic=False, options=dict(compat.COMPILE_OPTIONS))(Owner(), torch.ones(2))
     arguments = Owner(), torch.ones(2)
+    called_first(own, *arguments)
     assert compat.fits(own, arguments)
-    del Owner
-    still = compat.fits(own, arguments)
-    assert still, "its class is there as long as one of its kind"
-    del arguments
+    del Owner, arguments
     gc.collect()
     assert not compat.fits(own, (Doubling(), torch.ones(2)))
 
 
 @ignored
-def test_torch_guards_hooks_and_tied_parameters_on_request():
+def test_torch_guards_hooks_on_request():
     def applied(module, values):
         return module(values)
 
     own = compat.with_own_code(applied)
-    plain, hooked = nn.Linear(2, 2), nn.Linear(2, 2)
+    plain, hooked = (nn.Linear(2, 2).requires_grad_(False) for _ in range(2))
     hooked.register_forward_hook(lambda module, seen, given: given + 1)
     with relies_on("settings of torch._dynamo", used_by="compat.every_guard"):
-        with compat.every_guard():
-            torch.compile(own, fullgraph=True, dynamic=False, options=dict(compat.COMPILE_OPTIONS))(plain, torch.ones(2))
-        assert compat.fits(own, (nn.Linear(2, 2), torch.ones(2)))
+        called_first(own, plain, torch.ones(2))
+        assert compat.fits(own, (nn.Linear(2, 2).requires_grad_(False), torch.ones(2)))
         assert not compat.fits(own, (hooked, torch.ones(2)))
 
 

@@ -36,9 +36,9 @@ class _Shared(NamedTuple):
     """What was compiled for some learner."""
 
     form: Hashable
-    guarded: FunctionType
+    guarded: Any
     """By whose code torch finds its guards."""
-    direct: FunctionType
+    direct: Any
     """The compiled code, called directly."""
 
 
@@ -125,7 +125,7 @@ class Compiled:
         return reference[0]
 
     def _first_call(self, own: FunctionType, arguments: Sequence[Any]) -> tuple[Any, bool]:
-        """Compiles and calls; the result, and whether torch can tell for which arguments the code is right."""
+        """Compiles and calls; the result, and whether torch can tell which arguments the code fits."""
         remember_vector_instructions()
         for further in ({}, NO_GUARDS):
             options = {**COMPILE_OPTIONS, **further}  # a copy, because torch removes entries

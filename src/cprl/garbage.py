@@ -1,8 +1,10 @@
-"""Garbage: what Python's collector of reference cycles need not look at, and what a training leaves behind."""
+"""Garbage: what Python's collector of cycles need not look at, and what a training leaves behind."""
 
 import gc
 from collections.abc import Iterator
 from contextlib import contextmanager
+
+from cprl.compile_clock import CLOCK
 
 _is_set_aside = False
 
@@ -19,20 +21,23 @@ def set_aside() -> None:
     _is_set_aside = True
 
 
-@contextmanager
-def cleared_up() -> Iterator[None]:
-    """Around a training: frees what this one and those before leave in reference cycles, such as replay
-    buffers, which a process that goes on would keep.
-
-    A training during which code was compiled has been set aside with everything else. It is freed when the
-    next one begins, because looking at all objects takes a second.
-    """
+def free_earlier() -> None:
+    """Before a training: frees an earlier one of this process during which code was compiled, and which was
+    set aside with everything else. It looks at all objects once more, which takes half a second."""
     global _is_set_aside
-    if _is_set_aside:
+    if not _is_set_aside:
+        return
+    with CLOCK.running():  # a late part of compiling
         gc.unfreeze()
         gc.collect()
         gc.freeze()
-        _is_set_aside = False
+    _is_set_aside = False
+
+
+@contextmanager
+def cleared_up() -> Iterator[None]:
+    """Around a training: frees what it leaves in reference cycles, such as replay buffers, which a process
+    that goes on would keep. One during which code was compiled stays until the next, see `free_earlier`."""
     try:
         yield
     finally:

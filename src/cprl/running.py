@@ -13,7 +13,7 @@ from cprl.custom import Custom
 from cprl.envs.state import transforms_state
 from cprl.experiment import Experiment
 from cprl.finite import summary
-from cprl.garbage import cleared_up
+from cprl.garbage import cleared_up, free_earlier
 from cprl.measuring.episodes import Episode
 from cprl.outcome import evaluate_population, exploration, random_play, write_evaluation
 from cprl.output import ERR, OUT, console
@@ -104,6 +104,7 @@ def run(
             intact, and the run can be resumed.
     """
     times = RunTimes()
+    free_earlier()
     out = None if out is None else path("out", out)
     command = None if command is None else texts("command", command, 1)
     switches = {

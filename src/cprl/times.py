@@ -40,7 +40,7 @@ class Times:
 
     def load_state_dict(self, state: Mapping[str, Any]) -> None:
         """Continues from a state of `state_dict`; one of cprl up to November 2026 has "spent_s" alone."""
-        self.__init__()  # type: ignore[misc]
+        self._began, self._compiled_s = time.monotonic(), CLOCK.total_s
         self._before = {name: float(state.get(name, 0.0)) for name in self._before}
         self.busy_s = float(state.get("busy_s", 0.0))
 
