@@ -11,7 +11,7 @@ from collections.abc import Iterator
 from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Final
+from typing import Any, Final
 
 import psutil
 import pyarrow.parquet as pq
@@ -19,14 +19,14 @@ import pyarrow.parquet as pq
 from cprl.studies.status import Status
 from cprl.studies.trials import state_of, trials_of
 
-from ..faults.driver import differences, progress
+from ..faults.driver import differences, progress, still_alive
 from .work import study
 
 ROOT: Final = Path(__file__).parents[2]
 NAMES: Final = tuple(trial.name for trial in trials_of(study()))
 HEAD: Final = (
-    "| kill | after the start or the one before | of | trials finished | trials that it hit | newest checkpoint, step "
-    "| rows | processes gone after |\n|---:|---:|---|---:|---|---:|---:|---:|"
+    "| kill | after the start or the last kill | of | trials finished | trials that it hit "
+    "| newest checkpoint, step | rows | workers gone after |\n|---:|---:|---|---:|---|---:|---:|---:|"
 )
 
 
@@ -43,7 +43,7 @@ class Kill:
     hit: tuple[tuple[str, int, int], ...]
     """Trials that were running, each with the step of its newest checkpoint and the rows of its table."""
     gone_s: float
-    """Until the processes that were to die with the victim had."""
+    """Until the workers that ran these trials had ended."""
 
     @property
     def row(self) -> str:
@@ -80,11 +80,29 @@ class Driver:
         return self.process.wait(deadline_s)
 
 
-def running(driver: Driver) -> dict[str, int]:
-    """The trials that workers of this driver run, each with the number of its process."""
+def running(driver: Driver) -> dict[str, dict[str, Any]]:
+    """The trials that workers of this driver run, each with its status."""
     pids = {own.pid for own in driver.family()}
-    found = {name: Status(driver.out / "status", name).read().get("pid") for name in NAMES}
-    return {name: pid for name, pid in found.items() if pid in pids and not is_finished(driver.out, name)}
+    found = {name: Status(driver.out / "status", name).read() for name in NAMES}
+    return {
+        name: own
+        for name, own in found.items()
+        if own.get("pid") in pids and not is_finished(driver.out, name)
+    }
+
+
+def is_training(driver: Driver, begun: dict[tuple[str, int], int]) -> bool:
+    """Whether a trial has made more than ten steps since its process was first seen; before that it compiles.
+
+    Args:
+        driver: runs the study.
+        begun: the steps with which each trial and process was first seen; changed.
+    """
+    own = running(driver)
+    return any(
+        said["steps"] > begun.setdefault((name, said["pid"]), said["steps"]) + 10
+        for name, said in own.items()
+    )
 
 
 def is_finished(out: Path, name: str) -> bool:
@@ -103,9 +121,9 @@ def killed(driver: Driver, victim: str, chance: random.Random, since: float) -> 
         driver.process.wait()
     else:
         hit = [chance.choice(hit)]
-        os.kill(workers[hit[0]], signal.SIGKILL)
-        family = [own for own in family if own.pid == workers[hit[0]]]
-    psutil.wait_procs(family, 60)
+        os.kill(workers[hit[0]]["pid"], signal.SIGKILL)
+    died = {workers[name]["pid"] for name in hit}
+    still_alive([own for own in family if own.pid in died], 60)
     return Kill(
         after_s=began - since,
         victim=victim,
@@ -118,12 +136,13 @@ def killed(driver: Driver, victim: str, chance: random.Random, since: float) -> 
 def all_kills(
     out: Path, on: str, kills: int, *, seed: int, wait_s: tuple[float, float], episodes: int
 ) -> Iterator[Kill]:
-    """Kills in turn the driver and a worker, and ends the study; each a random time of `wait_s` after the
-    first trial has begun that the driver, or whoever was started in place of the last victim, runs."""
+    """Kills in turn the driver and a worker, and ends the study; each a random time of `wait_s` after a trial
+    has begun that was not running before, and of two kills in three after its first steps."""
     chance = random.Random(seed)
     driver, since, done = Driver(out, on, episodes), time.monotonic(), 0
+    begun: dict[tuple[str, int], int] = {}
     while done < kills and driver.is_alive:
-        if not running(driver):
+        if not (running(driver) if done % 3 == 2 else is_training(driver, begun)):
             time.sleep(0.1)
             continue
         until = time.monotonic() + chance.uniform(*wait_s)
@@ -133,7 +152,7 @@ def all_kills(
         if (kill := killed(driver, victim, chance, since)) is None:
             continue
         yield kill
-        done, since = done + 1, time.monotonic()
+        done, since, begun = done + 1, time.monotonic(), {}
         if victim == "driver":
             driver = Driver(out, on, episodes)
     if (code := driver.end(3600)) != 0:

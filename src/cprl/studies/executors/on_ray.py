@@ -129,6 +129,7 @@ class Ray:
     def _connected(self) -> Iterator[Any]:
         """Ray, connected to; afterwards as it was before."""
         os.environ.setdefault("RAY_USAGE_STATS_ENABLED", "0")  # nothing is sent to Ray's makers
+        os.environ.setdefault("RAY_worker_niceness", "0")  # Ray's own is 15: a tenth of a busy machine
         ray: Any = import_module("ray")
         if ray.is_initialized():
             yield ray
