@@ -14,6 +14,7 @@ from multiprocessing.process import BaseProcess
 from pathlib import Path
 from typing import Any, Final
 
+import psutil
 import pyarrow.parquet as pq
 import torch
 
@@ -194,6 +195,24 @@ def lived(life: Life, *, deadline_s: float = DEADLINE_S) -> Ended:
     """Lives until the end."""
     with Process(life) as process:
         return process.end(deadline_s=deadline_s)
+
+
+def still_alive(processes: list[psutil.Process], within_s: float) -> list[psutil.Process]:
+    """Those that have not ended after so many seconds; what has ended, and whose parent has not noticed it
+    yet, is not alive."""
+    last, left = time.monotonic() + within_s, processes
+    while True:
+        left = [own for own in left if _is_alive(own)]
+        if not left or time.monotonic() >= last:
+            return left
+        time.sleep(0.01)
+
+
+def _is_alive(process: psutil.Process) -> bool:
+    try:
+        return process.is_running() and process.status() != psutil.STATUS_ZOMBIE
+    except psutil.NoSuchProcess:
+        return False
 
 
 _CHECKPOINT: Final = re.compile(r"(?:training|ending)-(\d{12})-[0-9a-f]{32}\.pt")

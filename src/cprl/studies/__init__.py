@@ -13,7 +13,19 @@ Modules, in the order in which one reads them:
 """
 
 from cprl.studies.execution import StudyResult, read_study, run_study
+from cprl.studies.executors import InProcess, Processes, Ray
 from cprl.studies.factors import Integers, LogUniform, Uniform
 from cprl.studies.study import Study
 
-__all__ = ["Integers", "LogUniform", "Study", "StudyResult", "Uniform", "read_study", "run_study"]
+__all__ = [
+    "InProcess",
+    "Integers",
+    "LogUniform",
+    "Processes",
+    "Ray",
+    "Study",
+    "StudyResult",
+    "Uniform",
+    "read_study",
+    "run_study",
+]

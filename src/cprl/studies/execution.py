@@ -5,7 +5,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Final
 
-from cprl.arguments import object_of, path, texts
+from cprl.arguments import object_of, path, refusal, texts
 from cprl.runs.files import read_json, write_json
 from cprl.studies.executors import Executor, InProcess
 from cprl.studies.study import Study
@@ -54,6 +54,8 @@ def run_study(
     out = Path("studies") / study.name if out is None else path("out", out)
     folder = out / RUNS if runs is None else path("runs", runs)
     texts("allow", allow)
+    if on is not None and (isinstance(on, type) or not isinstance(on, Executor)):
+        raise refusal("on", on, "InProcess(), Processes(jobs), Ray(), another Executor, or None")
     trials = trials_of(study)
     tasks = [task_of(trial, runs=folder, status=out / STATUS, allow=allow) for trial in trials]
     folder.mkdir(parents=True, exist_ok=True)

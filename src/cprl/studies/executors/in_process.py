@@ -1,16 +1,19 @@
-"""Executors: where the trials of a study are run. Each calls `cprl.studies.trials.run_task`."""
+"""Executor: what runs the trials of a study; and InProcess, one after the other in this process."""
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
-from typing import Protocol
+from typing import Protocol, runtime_checkable
 
 from cprl.studies.trials import Outcome, Task, run_task
 
 
+@runtime_checkable
 class Executor(Protocol):
     """Runs tasks; an outcome is yielded as soon as a task has ended, in whatever order.
 
-    It stops what it started when its iterator is closed.
+    It stops what it started when its iterator is closed. At the first SIGINT or SIGTERM of the process that
+    iterates, every running trial finishes its step and saves a checkpoint, and the process exits with code 0;
+    the same line again continues.
     """
 
     def run(self, tasks: Sequence[Task]) -> Iterator[Outcome]:

@@ -1,0 +1,1 @@
+"""SIGKILL while a study runs: of the process that runs it, and of its workers."""
