@@ -10,11 +10,12 @@ from study_runs import EXPERIMENT, TIME_OUT, write_run, write_study
 
 from cprl import Study, cli
 from cprl.measuring.statistics import difference, estimate
+from cprl.studies.by_condition import by_condition
+from cprl.studies.by_factor import _Axis, by_factor
 from cprl.studies.comparing import compare, metrics_of
 from cprl.studies.courses import courses
 from cprl.studies.diagrams import grids, heat_map, phase_diagram
 from cprl.studies.factors import Uniform
-from cprl.studies.figures import by_condition, by_factor
 from cprl.studies.outcomes import ending, endings
 from cprl.studies.panels import is_logarithmic, is_numeric
 from cprl.studies.results import write_results
@@ -244,6 +245,17 @@ def test_numbers_that_are_far_apart_stand_on_a_logarithmic_axis_and_names_on_non
     assert is_numeric([1, 2.5])
     assert not is_numeric([1, "two"])
     assert not is_numeric([True, False])
+
+
+def test_levels_that_are_too_close_for_their_names_stand_at_equal_distances():
+    def axis(levels):
+        study = Study(EXPERIMENT, {"agents.*.algorithm.settings.gamma": levels}, name="axis")
+        return _Axis.of("agents.*.algorithm.settings.gamma", study_table(study, Path("none")))
+
+    crowded = axis([0.5, 0.95, 0.99, 0.995])
+    assert crowded.places == {0.5: 0, 0.95: 1, 0.99: 2, 0.995: 3}
+    assert "equal distances" in crowded.title
+    assert axis([0.5, 0.7, 0.9]).places == {0.5: 0.5, 0.7: 0.7, 0.9: 0.9}
 
 
 def test_a_factor_with_names_is_refused_as_an_axis_of_numbers(tmp_path):

@@ -19,7 +19,8 @@ Modules, in the order in which one reads them:
     texts        comparisons in Markdown and in the terminal
     outcomes     in which phase each replica ends
     panels       what the figures share
-    figures      metrics by factor and by condition
+    by_factor    metrics against a factor
+    by_condition  conditions one below the other
     courses      the course of the training under each condition
     diagrams     heat maps and phase diagrams of two factors
     results      write_results: table, summary and figures of a study

@@ -131,6 +131,14 @@ def compare(
     integer("last", last, 1)
     if part == TRAINING and last < table.window:
         raise refusal("last", last, f"at least {table.window}, the episodes of a window of the table")
+    asked = metric, part, last, interval
+    if asked not in table.comparisons:
+        table.comparisons[asked] = _compared(table, *asked)
+    own: Comparison = table.comparisons[asked]
+    return own
+
+
+def _compared(table: StudyTable, metric: str, part: str, last: int, interval: Interval) -> Comparison:
     found = {name: _of_condition(table, name, metric, part, last) for name in table.design.conditions}
     lengths = [length for *_, length in found.values() if length]
     reference, is_paired = table.design.reference, table.design.is_paired

@@ -64,9 +64,10 @@ def courses(table: StudyTable, path: Path | str, *, metrics: Sequence[str] = ())
     if len(shown) > MOST_CONDITIONS:
         raise ValueError(f"the table has {len(shown)} conditions; allowed: up to {MOST_CONDITIONS}")
     curves = {(name, own): _course(table, name, own) for name in shown for own in chosen}
-    window = max((own[2] for own in curves.values()), default=1)
+    windows = sorted({own[2] for own in curves.values()}) or [1]
+    over = f"{windows[0]} to {windows[-1]}" if len(windows) > 1 else f"{windows[0]}"
     note = f"{replicas_text(table.replicas)}. "
-    note += f"Centred running means over {window} episodes" if window > 1 else "Nothing is smoothed"
+    note += f"Centred running means over {over} episodes" if windows[-1] > 1 else "Nothing is smoothed"
     note += ", then over replicas; bands: 95% intervals by bootstrap of the replicas."
     if len(shown) <= _MOST_TOGETHER:
         figure = _together(table, shown, chosen, names, curves)

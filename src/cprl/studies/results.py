@@ -9,10 +9,11 @@ from cprl.arguments import object_of
 from cprl.arguments import path as path_of
 from cprl.measuring.statistics import Interval
 from cprl.runs.files import write_atomically
+from cprl.studies.by_condition import by_condition
+from cprl.studies.by_factor import by_factor
 from cprl.studies.comparing import LAST, compare, metrics_of
 from cprl.studies.courses import courses
 from cprl.studies.diagrams import grids, heat_map, phase_diagram
-from cprl.studies.figures import by_condition, by_factor
 from cprl.studies.outcomes import Endings, endings
 from cprl.studies.panels import MOST_CONDITIONS, is_numeric
 from cprl.studies.sources import sources_of

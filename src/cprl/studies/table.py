@@ -77,6 +77,11 @@ class StudyTable:
         found = pairs["condition"].to_pylist()
         return {name: found.count(name) for name in self.design.conditions}
 
+    @cached_property
+    def comparisons(self) -> dict[Any, Any]:
+        """What `cprl.studies.comparing.compare` has computed of it, so that figures and texts share it."""
+        return {}
+
     def __str__(self) -> str:
         """What it holds, what it lacks and what is mixed, in sentences."""
         return "\n".join([self.summary, *self.design.notes, *self.mixed, *map(str, self.lacking)])
