@@ -3,6 +3,7 @@
 A failure here names the part that an upgrade has changed, and where cprl relies on it.
 """
 
+import gc
 import re
 import subprocess
 import sys
@@ -212,32 +213,88 @@ def doubled(values):
 ignored = pytest.mark.filterwarnings("ignore::DeprecationWarning", "ignore::FutureWarning")
 
 
+def compiled_of_its_own(size):
+    own = compat.with_own_code(doubled)
+    assert called_first(own, torch.ones(size)).tolist() == [2.0] * size
+    return own
+
+
+def called_first(own, *arguments):
+    with compat.every_guard():
+        options = dict(compat.COMPILE_OPTIONS)
+        return torch.compile(own, fullgraph=True, dynamic=False, options=options)(*arguments)
+
+
 @ignored
 def test_torch_hands_over_the_code_that_it_compiled():
-    own = compat.with_own_code(doubled)
+    own = compiled_of_its_own(3)
     assert own.__code__ is not doubled.__code__
-    with relies_on("torch.compiler.skip_all_guards_unsafe", used_by="compat.COMPILE_OPTIONS"):
-        function = torch.compile(own, fullgraph=True, options=dict(compat.COMPILE_OPTIONS))
-    with (
-        relies_on("torch._dynamo.convert_frame.register_bytecode_hook", used_by="compat.code_written_for"),
-        compat.code_written_for(own) as codes,
-    ):
-        assert function(torch.ones(3)).tolist() == [2.0] * 3
-        assert len(codes) == 1
+    with relies_on("torch's cache of compiled code", used_by="compat.compiled_code"):
+        code = compat.compiled_code(own)
+        assert code is not None
     with relies_on("the code that torch writes for a function", used_by="compat.without_lookup"):
-        direct = compat.without_lookup(own, codes)
+        direct = compat.without_lookup(own, code)
         torch._dynamo.reset()  # as somebody else in the process may
         assert direct(torch.full((3,), 4.0)).tolist() == [8.0] * 3
+    assert compat.compiled_code(own) is None, "it is gone from the cache"
 
 
 @ignored
 def test_torch_keeps_what_it_compiled_by_code_object():
     with relies_on("torch's cache of compiled code", used_by="compat.with_own_code"):
-        for size in (2, 5):
-            own = compat.with_own_code(doubled)
-            with compat.code_written_for(own) as codes:
-                torch.compile(own, fullgraph=True, options=dict(compat.COMPILE_OPTIONS))(torch.ones(size))
-            assert len(codes) == 1, f"nothing was compiled for the size {size}"
+        two, five = compiled_of_its_own(2), compiled_of_its_own(5)
+        assert compat.compiled_code(two) is not compat.compiled_code(five)
+
+
+@ignored
+def test_torch_says_for_which_arguments_its_code_is_right():
+    own = compiled_of_its_own(2)
+    with relies_on("the guards of compiled code", used_by="compat.fits"):
+        assert compat.fits(own, (torch.zeros(2),))
+        assert not compat.fits(own, (torch.zeros(3),))
+        assert not compat.fits(own, (torch.zeros(2, dtype=torch.int64),))
+        torch._dynamo.reset()
+        assert not compat.fits(own, (torch.zeros(2),)), "its guards are gone"
+
+
+class Doubling:
+    """What the class of an owner refers to."""
+
+    factor = 2.0
+
+
+def multiplied(owner, values):
+    return values * owner.layer(values).factor
+
+
+@ignored
+def test_code_that_depended_on_a_class_that_is_gone_fits_nothing():
+    class Owner:
+        @staticmethod
+        def layer(values):
+            return Doubling
+
+    own = compat.with_own_code(multiplied)
+    arguments = Owner(), torch.ones(2)
+    called_first(own, *arguments)
+    assert compat.fits(own, arguments)
+    del Owner, arguments
+    gc.collect()
+    assert not compat.fits(own, (Doubling(), torch.ones(2)))
+
+
+@ignored
+def test_torch_guards_hooks_on_request():
+    def applied(module, values):
+        return module(values)
+
+    own = compat.with_own_code(applied)
+    plain, hooked = (nn.Linear(2, 2).requires_grad_(False) for _ in range(2))
+    hooked.register_forward_hook(lambda module, seen, given: given + 1)
+    with relies_on("settings of torch._dynamo", used_by="compat.every_guard"):
+        called_first(own, plain, torch.ones(2))
+        assert compat.fits(own, (nn.Linear(2, 2).requires_grad_(False), torch.ones(2)))
+        assert not compat.fits(own, (hooked, torch.ones(2)))
 
 
 def summed(values):
@@ -281,7 +338,7 @@ LIBRARY_PARTS = (
     r"_step_and_maybe_reset\(",
     r"\btorch\._\w+",
     r"\b(?:torchrl|tensordict|numba|rerun)(?:\.\w+)*\._\w+",
-    r"register_bytecode_hook",
+    r"_debug_get_cache_entry_list",
     r"skip_all_guards_unsafe",
     r"\"_nrt\"",
 )

@@ -18,6 +18,8 @@ PACKAGES = (
     "output",
     "caches",
     "compile_clock",
+    "times",
+    "garbage",
     "process",
     "compiling",
     "memory",

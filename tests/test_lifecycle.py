@@ -80,7 +80,10 @@ def test_a_finished_run_has_results_their_checksums_and_the_state_to_extend_it_f
     logs = [path for path in contents(whole) if path.startswith("logs/")]
     others = ["figures/training_curve.png", "manifest.json", "recipe.json", "report.json"]
     assert contents(whole) == sorted([ending, *results, *tables, *others, *logs])
-    assert json.loads((whole / "report.json").read_text())["episodes"] == FIELD.episodes
+    report = json.loads((whole / "report.json").read_text())
+    assert report["episodes"] == FIELD.episodes
+    assert report["acting_storing_updating_s"] > 0
+    assert report["acting_storing_updating_s"] + report["compiling_s"] < report["wall_s"]
 
 
 SLOW = ("save_transforms", "training_curve", "write_json", "summarise")

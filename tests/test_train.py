@@ -178,8 +178,8 @@ def test_evaluation_explores_only_if_asked():
     def actions(explore):
         env = CommonsEnv(GAME, 1, seed=1)
         seen = []
-        step = env.step
-        env.step = lambda td: seen.append(int(td["agents", "action"][0, 0])) or step(td)
+        step = env.lean_step
+        env.lean_step = lambda td, **how: seen.append(int(td["agents", "action"][0, 0])) or step(td, **how)
         evaluate(env, agents, explore=explore)
         return seen
 

@@ -1,5 +1,7 @@
 """The wall of replicas, where agents go, the stock over the turn, and the Lorenz curve, as recorded."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 import torch
@@ -14,6 +16,7 @@ from cprl.viewer.callback import ViewerCallback
 from cprl.viewer.lorenz import gini, lorenz_curve
 from cprl.viewer.panels import Panels
 from cprl.viewer.stage import boards
+from cprl.viewer.turns import Turns
 from cprl.viewer.wall import Wall
 
 GAME = Game(
@@ -150,6 +153,22 @@ def test_a_resumed_recording_goes_on_counting(tmp_path):
     assert repr(other._views.state_dict()["visits"]) == repr(state["visits"]), "an older state has no views"
 
 
+def test_the_line_of_a_running_episode_goes_on_from_an_older_state_with_more_points():
+    game = replace(GAME, rules=replace(GAME.rules, episode_steps=1000))
+    turns = Turns(CommonsEnv(game, 2, seed=1), Listener())
+    older = np.full((2, 201, 2), np.nan)  # a point every five turns; replica 1 has just begun
+    older[0, :5] = [(0, 9), (5, 8), (10, 7), (15, 6), (20, 5)]
+    older[1, 0] = 0, 9
+    turns.load_state_dict({"playing": older.tolist(), "ended": [[], []], "died": [False, True]})
+    playing = np.array(turns.state_dict()["playing"])
+    assert playing.shape == (2, 101, 2)
+    # Now a place every ten turns, where the latest point stays.
+    assert playing[0, :3].tolist() == [[5, 8], [15, 6], [20, 5]]
+    assert playing[1, 0].tolist() == [0, 9]
+    assert np.isnan(playing[0, 3:]).all()
+    assert np.isnan(playing[1, 1:]).all()
+
+
 def test_the_wall_marks_a_board_that_has_died(run):
     path, _, seen = run
     frames, colours = column(path, "wall/died", "Boxes2D:colors", "step")
@@ -180,9 +199,9 @@ class Listener:
         self.rows.append((entity, {name: own.to_pylist() for name, own in timelines.items()}))
 
 
-def test_viewers_get_the_wall_once_a_second_and_the_file_does_not(run, monkeypatch):
+def test_viewers_get_the_wall_every_two_seconds_and_the_file_does_not(run, monkeypatch):
     _, viewer, _ = run
-    clock, listener = iter(np.arange(10.0, 20.0, 0.4)), Listener()
+    clock, listener = iter(np.arange(10.0, 20.0, 0.8)), Listener()
     monkeypatch.setattr("cprl.viewer.wall.time.perf_counter", lambda: next(clock))
     monkeypatch.setattr("cprl.viewer.wall.send_chunk", Listener.take)
     wall = Wall(viewer.env, listener, scene=viewer.logger.scene, recorded_steps=100)

@@ -10,6 +10,8 @@ Each imports only from those above it:
     output       text for the terminal, which may close
     caches       where compiled code is kept between runs
     compile_clock  whether code is being compiled, and for how long
+    times        where the time of a training and of a run goes
+    garbage      what a training leaves behind in memory
     process      settings of the process that trains
     compiling    functions compiled by torch
     memory       devices, and what would not fit into their memory

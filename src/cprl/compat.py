@@ -10,8 +10,8 @@ upgrade has broken. The rest of cprl uses public interfaces. Two exceptions are 
 
 import ctypes
 from abc import abstractmethod
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import contextmanager, suppress
+from collections.abc import Callable, Mapping, Sequence
+from contextlib import AbstractContextManager, suppress
 from functools import cache
 from hashlib import sha256
 from pathlib import Path
@@ -117,12 +117,18 @@ def updated_weights(loss: LossModule) -> list[str]:
 
 def refuse_updaters(loss: LossModule, message: str) -> None:
     """Makes a loss refuse TorchRL's target updaters, which read the names of its targets first."""
+    loss._has_update_associated = _Refusing(loss._has_update_associated, message)
 
-    class Refusing(dict[str, bool]):
-        def keys(self) -> Any:
-            raise ValueError(message)
 
-    loss._has_update_associated = Refusing(loss._has_update_associated)
+class _Refusing(dict[str, bool]):
+    """One class for all losses: compiled code is shared only between learners of the same classes."""
+
+    def __init__(self, names: Mapping[str, bool], message: str) -> None:
+        super().__init__(names)
+        self._message = message
+
+    def keys(self) -> Any:
+        raise ValueError(self._message)
 
 
 def promise_targets(loss: LossModule) -> None:
@@ -162,12 +168,22 @@ def bootstrap_from_target(estimator: ValueEstimatorBase) -> None:
 
 # ---- torch.compile
 
-COMPILE_OPTIONS: Final[Mapping[str, Any]] = {
-    "cpp_wrapper": True,
-    "guard_filter_fn": torch.compiler.skip_all_guards_unsafe,
-}
-"""Options of `torch.compile`. Guards, which check the shapes and dtypes of arguments, take a quarter of an
-update of 16 agents. Without them the caller must recompile when these change, as `cprl.compiling` does."""
+COMPILE_OPTIONS: Final[Mapping[str, Any]] = {"cpp_wrapper": True}
+"""Options of `torch.compile`."""
+
+NO_GUARDS: Final[Mapping[str, Any]] = {"guard_filter_fn": torch.compiler.skip_all_guards_unsafe}
+"""Further ones, for functions whose guards torch itself finds broken; `fits` must not be asked then."""
+
+
+def every_guard() -> AbstractContextManager[Any]:
+    """While it is open, torch guards what it compiles also against hooks of modules and shared parameters,
+    which it leaves out because they take time at each call; `fits` is asked once for each learner."""
+    import torch._dynamo  # takes a second
+
+    patched: AbstractContextManager[Any] = torch._dynamo.config.patch(
+        skip_nnmodule_hook_guards=False, skip_no_tensor_aliasing_guards_on_parameters=False
+    )
+    return patched
 
 
 def with_own_code(function: Any) -> FunctionType:
@@ -177,35 +193,44 @@ def with_own_code(function: Any) -> FunctionType:
     return FunctionType(code, function.__globals__, code.co_name)
 
 
-@contextmanager
-def code_written_for(function: FunctionType) -> Iterator[list[CodeType]]:
-    """A context that yields a list, to which the code that torch generates for a function is appended."""
-    from torch._dynamo.convert_frame import register_bytecode_hook  # takes seconds
+def compiled_code(function: FunctionType) -> CodeType | None:
+    """The code that torch compiled last for a function from `with_own_code`; None if there is none."""
+    from torch._C._dynamo.eval_frame import _debug_get_cache_entry_list
 
-    codes: list[CodeType] = []
-
-    def keep(code: CodeType, new_code: CodeType) -> None:
-        if code is function.__code__:
-            codes.append(new_code)
-
-    hook = register_bytecode_hook(keep)
-    try:
-        yield codes
-    finally:
-        hook.remove()
+    entries = _debug_get_cache_entry_list(function.__code__)
+    return entries[-1].code if entries else None
 
 
-def without_lookup(function: FunctionType, codes: Sequence[CodeType]) -> FunctionType:
+def fits(function: FunctionType, arguments: Sequence[Any]) -> bool:
+    """Whether all of torch's guards of `compiled_code` hold for arguments, which torch asks at each call.
+
+    Guards are everything about the arguments, and about what can be reached from them, that the code takes
+    for granted: types, functions, the numbers and texts that are constants in it, and the forms of tensors,
+    whose values never are.
+    """
+    from torch._C._dynamo.eval_frame import _debug_get_cache_entry_list
+    from torch._dynamo.guards import DeletedGuardManagerWrapper
+
+    entries = _debug_get_cache_entry_list(function.__code__)
+    guards = entries[-1].guard_manager if entries else None
+    # Those of code that depended on an object that is gone hold for everything.
+    if guards is None or isinstance(guards, DeletedGuardManagerWrapper):
+        return False
+    return bool(guards.check(dict(zip(function.__code__.co_varnames, arguments, strict=False))))
+
+
+def without_lookup(function: FunctionType, code: CodeType) -> FunctionType:
     """The code that torch compiled for a function, to be called directly.
 
-    Torch's lookup of it at every call takes half of the overhead of a call. The globals are a copy, because
-    torch stores names in them that it may delete.
+    Torch's lookup of it at every call takes half of the overhead of a call, and the guards a quarter of an
+    update of 16 agents. Without them the caller must compile again when the form of arguments changes, as
+    `cprl.compiling` does. The globals are a copy, because torch stores names in them that it may delete.
 
     Args:
         function: from `with_own_code`.
-        codes: from `code_written_for`, not empty.
+        code: from `compiled_code`.
     """
-    return FunctionType(codes[-1], dict(function.__globals__), function.__name__)
+    return FunctionType(code, dict(function.__globals__), function.__name__)
 
 
 @cache
@@ -261,6 +286,25 @@ def send_chunk(
     send_arrow_chunk(
         entity, timelines=dict(timelines), components=dict(components), recording=recording.to_native()
     )
+
+
+def rows_made(entity: str, components: Mapping[Any, Any]) -> list[Any]:
+    """The rows of `pyarrow` arrays of equal length, by component descriptor, as static chunks for
+    `send_made`."""
+    from rerun_bindings import ChunkInternal
+
+    count = len(next(iter(components.values())))
+    return [
+        ChunkInternal.from_columns(entity, {}, {kind: own.slice(row, 1) for kind, own in components.items()})
+        for row in range(count)
+    ]
+
+
+def send_made(recording: Any, made: Any) -> None:
+    """Sends a chunk that has been made before, in a fifth of the time of `send_chunk` on cold caches."""
+    from rerun_bindings import send_chunks
+
+    send_chunks(made, recording.to_native())
 
 
 def keep_native(recording: Any, keep: Callable[..., object] = ctypes.pythonapi.Py_IncRef) -> None:

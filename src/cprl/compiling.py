@@ -1,23 +1,49 @@
-"""Compiled: a function compiled by torch, called without guards while shapes and dtypes stay the same."""
+"""Compiled: a function compiled by torch, called without guards while shapes and dtypes stay the same.
 
-import gc
+Compiled code is kept for the process: another learner of the same form calls it too, if torch's guards hold
+for its arguments. Weights, moments, buffers and what a loss keeps in tensors are read from the arguments at
+each call; whatever else the code depends on is guarded, so a learner that differs in it gets code of its own.
+"""
+
 import warnings
-from collections.abc import Callable, Hashable, Sequence
-from typing import Any, Final
+from collections.abc import Callable, Hashable, Iterator, Sequence
+from types import CodeType, FunctionType
+from typing import Any, Final, NamedTuple
 
 import torch
 
 from cprl.compat import (
     COMPILE_OPTIONS,
-    code_written_for,
+    NO_GUARDS,
+    compiled_code,
+    every_guard,
+    fits,
     remember_vector_instructions,
     with_own_code,
     without_lookup,
 )
 from cprl.compile_clock import CLOCK
+from cprl.garbage import set_aside
 
 TOLERANCE: Final = 1e-4
 """The tolerance between float32 results of the same operations in another order."""
+
+MOST_SHARED: Final = 16
+"""Compiled forms of one function that are kept for other learners; of more, the oldest is dropped."""
+
+
+class _Shared(NamedTuple):
+    """What was compiled for some learner."""
+
+    form: Hashable
+    guarded: Any
+    """By whose code torch finds its guards."""
+    direct: Any
+    """The compiled code, called directly."""
+
+
+_shared: Final[dict[CodeType, list[_Shared]]] = {}
+"""By the code of the plain function; the oldest first."""
 
 
 class Compiled:
@@ -38,7 +64,8 @@ class Compiled:
     def __init__(
         self, function: Callable[..., Any], *, what: str, changes: Sequence[int] = (), enabled: bool = True
     ) -> None:
-        self._plain, self._what, self.enabled = function, what, enabled
+        self._plain: Any = function
+        self._what, self.enabled = what, enabled
         self._changes = tuple(changes)
         self._compiled: Callable[..., Any] | None = None
         self._form: Hashable = None
@@ -62,15 +89,15 @@ class Compiled:
         """The first call with a form; if compilation fails, no argument has been changed yet."""
         before = self._copies(arguments)
         reference = self._outcome(before)
+        for shared in _fitting(self._plain, self._form, arguments):
+            self._compiled = shared.direct
+            result = self._compiled(*arguments)
+            if self._difference(result, arguments, before, reference) is None:
+                return result
+            self._put_back(arguments, [before[place] for place in self._changes])
         own = with_own_code(self._plain)
-        remember_vector_instructions()
-        options = dict(COMPILE_OPTIONS)  # a copy, because torch removes entries
-        self._compiled = torch.compile(own, fullgraph=True, options=options)
         try:
-            with warnings.catch_warnings(), code_written_for(own) as codes:
-                for kind in (DeprecationWarning, FutureWarning):  # raised inside torch and TorchRL
-                    warnings.simplefilter("ignore", kind)
-                result = self._compiled(*arguments)
+            result, is_guarded = self._first_call(own, arguments)
         except Exception as error:
             self.enabled = False
             warnings.warn(
@@ -79,14 +106,13 @@ class Compiled:
                 stacklevel=4,
             )
             return self._plain(*arguments)
-        if codes:
-            self._compiled = without_lookup(own, codes)
-        # Compilation leaves millions of permanent objects. Without freezing, Python's garbage collector scans
-        # them again and again, which takes up to a third of a training.
-        gc.collect()
-        gc.freeze()
-        difference = largest_difference([result, *(arguments[place] for place in self._changes)], reference)
-        if difference is None or self._is_random(before):
+        set_aside()
+        difference = self._difference(result, arguments, before, reference)
+        if difference is None:
+            if (code := compiled_code(own)) is not None:
+                self._compiled = without_lookup(own, code)
+                if is_guarded:
+                    _share(self._plain, _Shared(self._form, own, self._compiled))
             return result
         self.enabled = False
         warnings.warn(
@@ -95,10 +121,40 @@ class Compiled:
             RuntimeWarning,
             stacklevel=4,
         )
-        for place, right in zip(self._changes, reference[1:], strict=True):
+        self._put_back(arguments, reference[1:])
+        return reference[0]
+
+    def _first_call(self, own: FunctionType, arguments: Sequence[Any]) -> tuple[Any, bool]:
+        """Compiles and calls; the result, and whether torch can tell which arguments the code fits."""
+        remember_vector_instructions()
+        for further in ({}, NO_GUARDS):
+            options = {**COMPILE_OPTIONS, **further}  # a copy, because torch removes entries
+            # Sizes and numbers of other learners, which torch remembers, must not make those of this one
+            # variables of its code: not dynamic.
+            self._compiled = torch.compile(own, fullgraph=True, dynamic=False, options=options)
+            try:
+                with warnings.catch_warnings(), every_guard():
+                    for kind in (DeprecationWarning, FutureWarning):  # raised inside torch and TorchRL
+                        warnings.simplefilter("ignore", kind)
+                    return self._compiled(*arguments), not further
+            except Exception as error:
+                if further or "Guard failed on the same frame" not in str(error):
+                    raise
+        raise AssertionError("unreachable")
+
+    def _difference(
+        self, result: Any, arguments: Sequence[Any], before: Sequence[Any], reference: Sequence[Any]
+    ) -> float | None:
+        """By how much a call differs from the plain function; None if they agree or it draws numbers."""
+        outcome = [result, *(arguments[place] for place in self._changes)]
+        difference = largest_difference(outcome, reference)
+        return None if difference is None or self._is_random(before) else difference
+
+    def _put_back(self, arguments: Sequence[Any], values: Sequence[Any]) -> None:
+        """Sets the arguments that the function changes."""
+        for place, right in zip(self._changes, values, strict=True):
             for tensor, value in zip(tensors_in(arguments[place]), tensors_in(right), strict=True):
                 tensor.copy_(value)
-        return reference[0]
 
     def _copies(self, arguments: Sequence[Any]) -> list[Any]:
         """The arguments, with copies of those that the function changes."""
@@ -118,6 +174,19 @@ class Compiled:
         """Whether the result of the plain function depends on torch's seed."""
         first, second = (self._outcome(arguments, seed=seed) for seed in (1, 2))
         return largest_difference(first, second) is not None
+
+
+def _fitting(plain: FunctionType, form: Hashable, arguments: Sequence[Any]) -> Iterator[_Shared]:
+    """What was compiled for other learners and fits these arguments too."""
+    for shared in list(_shared.get(plain.__code__, ())):
+        if shared.form == form and fits(shared.guarded, arguments):
+            yield shared
+
+
+def _share(plain: FunctionType, compiled: _Shared) -> None:
+    kept = _shared.setdefault(plain.__code__, [])
+    kept.append(compiled)
+    del kept[:-MOST_SHARED]
 
 
 def copied(value: Any) -> Any:

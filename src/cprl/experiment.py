@@ -201,15 +201,17 @@ def _is_old(recipe: Mapping[str, Any]) -> bool:
     return "arguments" in recipe and "format" not in recipe
 
 
-def _with_runs(experiment: Experiment, moved: Callable[[str], str]) -> Experiment:
-    def of_spec(spec: AgentSpec) -> AgentSpec:
-        if isinstance(spec, Frozen):
-            return replace(spec, run=moved(spec.run))
-        if isinstance(spec, Learning | Team) and spec.start_from is not None:
-            return replace(spec, start_from=replace(spec.start_from, run=moved(spec.start_from.run)))
-        return spec
+def with_run_moved(spec: Any, moved: Callable[[str], str]) -> Any:
+    """A specification of an agent whose stored run, if it has one, is in another directory."""
+    if isinstance(spec, Frozen):
+        return replace(spec, run=moved(spec.run))
+    if isinstance(spec, Learning | Team) and spec.start_from is not None:
+        return replace(spec, start_from=replace(spec.start_from, run=moved(spec.start_from.run)))
+    return spec
 
-    agents = tuple(map(of_spec, experiment.agents))
+
+def _with_runs(experiment: Experiment, moved: Callable[[str], str]) -> Experiment:
+    agents = tuple(with_run_moved(spec, moved) for spec in experiment.agents)
     return experiment if agents == experiment.agents else replace(experiment, agents=agents)
 
 

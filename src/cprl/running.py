@@ -14,13 +14,9 @@ from cprl.custom import Custom
 from cprl.envs.state import transforms_state
 from cprl.experiment import Experiment
 from cprl.finite import summary
+from cprl.garbage import cleared_up, free_earlier
 from cprl.measuring.episodes import Episode
-from cprl.outcome import (
-    evaluate_population,
-    exploration,
-    random_play,
-    write_evaluation,
-)
+from cprl.outcome import evaluate_population, exploration, random_play, write_evaluation
 from cprl.output import ERR, OUT, console
 from cprl.parts import Parts, make_logger_callback, make_parts, make_viewer, title_of
 from cprl.population import exploration_steps
@@ -44,6 +40,7 @@ from cprl.runs.weights import save_decisions, save_transforms, save_weights
 from cprl.terminal.figures import training_curve
 from cprl.terminal.progress import ProgressBar
 from cprl.terminal.summary import summarise
+from cprl.times import RunTimes
 from cprl.training import Training, train
 from cprl.viewer.callback import ViewerCallback
 from cprl.viewer.lingering import check_linger
@@ -61,6 +58,7 @@ class _Began:
         self.has_begun = True
 
 
+@cleared_up()
 def run(
     experiment: Experiment,
     out: Path | str | None = None,
@@ -110,6 +108,8 @@ def run(
         OSError: for a full disk or a deleted directory; the message names it. What was written before is
             intact, and the run can be resumed.
     """
+    times = RunTimes()
+    free_earlier()
     out = None if out is None else path("out", out)
     command = None if command is None else texts("command", command, 1)
     switches = {
@@ -151,7 +151,7 @@ def run(
             if episodes < experiment.episodes:
                 extend(directory, episodes, experiment.episodes)
             viewer = closing.enter_context(make_viewer(watch, directory, own, experiment))
-            _train_and_evaluate(directory, experiment, own, viewer, checkpointer, began)
+            _train_and_evaluate(directory, experiment, own, viewer, checkpointer, began, times)
             checkpointer.done()
             _say_what_is_kept(directory)
     except BaseException as error:
@@ -233,6 +233,7 @@ def _train_and_evaluate(
     viewer: ViewerCallback | None,
     checkpointer: Checkpointer,
     began: _Began,
+    times: RunTimes,
 ) -> None:
     """All that follows the beginning; `report.json`, the sign that a run is finished, comes last."""
     training, before = _train(
@@ -246,7 +247,7 @@ def _train_and_evaluate(
     ends = exploration_steps(experiment.agents)
     figure = training_curve(directory, title=title, random=played["random"], exploration_steps=ends)
     broken = training.finite.found
-    report = {"training_s": round(training.spent_s, 1), "steps": training.steps, "finished": _now()}
+    report = {**times.report(training.times), "steps": training.steps, "finished": _now()}
     also = {"not_finite": [asdict(one) for one in broken]} if broken else {}
     write_json(directory / REPORT, {**report, "episodes": experiment.episodes, **also})
     columns = {"random": played["random"], f"trained{exploration(own.population)}": played["trained"]}

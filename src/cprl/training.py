@@ -33,6 +33,7 @@ from cprl.measuring.episodes import Episode, EpisodeTracker
 from cprl.measuring.institutional import institutions_of
 from cprl.policies.assignment import AgentIndices, AgentPolicies
 from cprl.policies.decisions import Decider
+from cprl.times import Times
 
 MakeCollector = Callable[[EnvBase, nn.Module], BaseCollector]
 """A collector out of an environment and a policy; it yields batches [R], or [R, T] of T turns."""
@@ -105,7 +106,7 @@ class Training:
         self._on_step = [own.on_step for own in self.callbacks if hasattr(own, "on_step")]
         self._played = [0] * replicas
         self.steps = 0
-        self._began, self._spent_s = time.monotonic(), 0.0
+        self.times = Times()
 
     @property
     def is_over(self) -> bool:
@@ -129,8 +130,8 @@ class Training:
 
     @property
     def spent_s(self) -> float:
-        """Seconds that it has taken so far, those before it was stopped included."""
-        return self._spent_s + time.monotonic() - self._began
+        """Seconds that it has taken so far, those before it was stopped included; see also `times`."""
+        return self.times.spent_s
 
     def start(self) -> None:
         """Calls `on_start` of the callbacks; `train` does before the first step."""
@@ -140,7 +141,9 @@ class Training:
 
     def step(self) -> None:
         """The turns that the collector yields, one as a rule: act, store, update, measure, record."""
+        began = time.perf_counter()
         batch = next(self._turns)
+        self.times.busy_s += time.perf_counter() - began
         for turn in [batch] if batch.batch_dims == 1 else batch.unbind(1):
             self._take(turn)
 
@@ -148,6 +151,7 @@ class Training:
         """One turn of every replica."""
         self.steps += 1
         self.finite.check_turn(batch, self.steps)
+        began = time.perf_counter()
         for learner in self.learners.values():
             learner.store(batch)
         self._wanted.add()
@@ -155,6 +159,7 @@ class Training:
             for _ in range(self.update_every):
                 for agents, learner in self.learners.items():
                     self._losses[agents].add(self._update(learner))
+        self.times.busy_s += time.perf_counter() - began
         for on_step in self._on_step:
             on_step(batch)
         ended = self._tracker.add(batch)
@@ -210,7 +215,7 @@ class Training:
         return {
             "format": STATE_FORMAT,
             "steps": self.steps,
-            "spent_s": self.spent_s,
+            **self.times.state_dict(),
             "played": list(self._played),
             "env": env_state(self.env),
             "carried": None if carried is None else carried_state(carried),
@@ -256,7 +261,7 @@ class Training:
                 f"the state has the format {state.get('format', 1)}, this version resumes {STATE_FORMAT}; "
                 "finish the run with the version that began it (its recipe.json has the commit)"
             )
-        self._began, self._spent_s = time.monotonic(), float(state["spent_s"])
+        self.times.load_state_dict(state)
         self.steps, self._played = int(state["steps"]), list(state["played"])
         self._load_env(state)
         parts: dict[str, Any] = {"learners": self.learners, "others": self.others, "losses": self._losses}

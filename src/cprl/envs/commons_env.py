@@ -309,15 +309,18 @@ class CommonsEnv(LeanStepEnv):
         done = self.output.done
         return bool(np.count_nonzero(done) if isinstance(done, np.ndarray) else self._tensors["done"].any())
 
-    def lean_step(self, tensordict: TensorDictBase) -> tuple[TensorDictBase, TensorDictBase]:
+    def lean_step(
+        self, tensordict: TensorDictBase, *, resets: bool = True
+    ) -> tuple[TensorDictBase, TensorDictBase]:
         """Does the same as `EnvBase.step_and_maybe_reset`, without its handling of keys.
 
-        A test checks that they are equal, including the entries of policies.
+        A test checks that they are equal, including the entries of policies. Without `resets` worlds that
+        have ended stay as they are.
         """
         following = self._step(tensordict)
         keys.put(tensordict, "next", following)
         done = self._tensors["done"]
-        carried = self._as_tensordict(self._begin(done) if self._any_done() else self._tensors)
+        carried = self._as_tensordict(self._begin(done) if resets and self._any_done() else self._tensors)
         put_all(carried, {name: value for name, value in tensordict.items() if name not in _OWN_KEYS})
         of_agents = keys.entry(tensordict, keys.AGENTS).items()
         others = {name: value for name, value in of_agents if name not in _OWN_AGENT_KEYS}

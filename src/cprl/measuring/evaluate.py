@@ -43,7 +43,7 @@ def evaluate(env: EnvBase, policy: Policy, *, explore: bool = False) -> list[Epi
     exploration = ExplorationType.RANDOM if explore else ExplorationType.DETERMINISTIC
     episodes: dict[int, Episode] = {}
     with torch.no_grad(), set_exploration_type(exploration):
-        for batch in (_until_ended if is_commons else _again_and_again)(env, policy):
+        for batch in _until_ended(env, policy) if is_commons else _again_and_again(env, policy):
             for episode in tracker.add(batch):
                 episodes.setdefault(episode.world, episode)
             if len(episodes) == worlds:
@@ -51,13 +51,12 @@ def evaluate(env: EnvBase, policy: Policy, *, explore: bool = False) -> list[Epi
     return [episodes[world] for world in range(worlds)]
 
 
-def _until_ended(env: EnvBase, policy: Policy) -> Iterator[TensorDictBase]:
+def _until_ended(env: CommonsEnv, policy: Policy) -> Iterator[TensorDictBase]:
     """Steps all worlds until all have ended; worlds that have ended do not change."""
-    moment = env.reset()
+    moment: TensorDictBase = env.reset()
     while True:
-        batch = env.step(policy(moment))
+        batch, moment = env.lean_step(policy(moment), resets=False)
         yield batch
-        moment = batch.get("next").exclude(("agents", "reward"))
 
 
 def _again_and_again(env: EnvBase, policy: Policy) -> Iterator[TensorDictBase]:

@@ -1,6 +1,7 @@
 """PresentPolicy: the agents of a training's first replica as they are now, in one world beside it."""
 
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
 from typing import Any
 
 import torch
@@ -97,14 +98,17 @@ class PresentPolicy:
 
     def __call__(self, carried: TensorDictBase) -> TensorDictBase:
         """Writes ("agents", "action"), int64 [1, N], for one world, batch size [1]; where agents decide also
-        ("agents", "decision")."""
-        self.explore_as_now()
-        with torch.no_grad(), set_exploration_type(ExplorationType.RANDOM):
-            return self._policy.forward(carried)  # calling a module takes as long as a small network
+        ("agents", "decision"). To be called within `apart`."""
+        return self._policy.forward(carried)  # calling a module takes as long as a small network
 
-    def apart(self) -> Any:
-        """A context in which nothing changes torch's generators for the rest of the process."""
-        return torch.random.fork_rng(devices=self._devices)
+    @contextmanager
+    def apart(self) -> Iterator[None]:
+        """A context to play steps in: agents explore as they do when it begins, and nothing changes torch's
+        generators for the rest of the process."""
+        self.explore_as_now()
+        forked = torch.random.fork_rng(devices=self._devices)
+        with forked, torch.no_grad(), set_exploration_type(ExplorationType.RANDOM):
+            yield
 
 
 def _has_epsilon(actor: Any) -> bool:

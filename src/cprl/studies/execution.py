@@ -75,4 +75,4 @@ def read_study(out: Path, *, allow: Sequence[str] = ()) -> Study:
         table = read_json(out / FILE_NAME)
     except (OSError, ValueError) as error:
         raise ValueError(f"{out / FILE_NAME} is not the file of a study: {error!r}") from error
-    return Study.from_config(table, allow=allow)
+    return Study.from_config(table, allow=allow, directory=out)

@@ -1,6 +1,6 @@
 """What the conditions of a study differ in: factors with levels, and distributions of random draws."""
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import product
 from math import exp, log
@@ -10,6 +10,8 @@ import numpy as np
 
 from cprl.arguments import refusal
 from cprl.checks import MOST_NUMBER, is_count, is_number
+from cprl.config import from_config, to_config
+from cprl.experiment import with_run_moved
 from cprl.studies.paths import normalised
 
 _ALLOWED: Final = (
@@ -115,6 +117,45 @@ def levels_of(name: str, factor: Factor) -> list[Level]:
     if isinstance(factor, Mapping):
         return [Level(level, changes) for level, changes in factor.items()]
     return [Level(value, {name: value}) for value in factor]
+
+
+def factor_to_config(name: str, factor: Factor, place: Callable[[str], str]) -> dict[str, Any]:
+    """A factor as JSON can hold it; `place` gives where the runs of `Frozen` agents are said to be."""
+    if isinstance(factor, Distribution):
+        return {"distribution": type(factor).__name__, "low": factor.low, "high": factor.high}
+    if isinstance(factor, Mapping):
+        return {"levels": [[level, changes_to_config(own, place)] for level, own in factor.items()]}
+    return {"values": to_config(_moved(factor, place), f"factors[{name!r}]")}
+
+
+def factor_from_config(table: Mapping[str, Any], allow: Sequence[str], place: Callable[[str], str]) -> Factor:
+    """The factor that `factor_to_config` gave."""
+    if "distribution" in table:
+        made: Distribution = DISTRIBUTIONS[table["distribution"]](low=table["low"], high=table["high"])
+        return made
+    if "levels" in table:
+        return {level: changes_from_config(own, allow, place) for level, own in table["levels"]}
+    values: tuple[Any, ...] = _moved(from_config(table["values"], allow=allow), place)
+    return values
+
+
+def changes_to_config(changes: Mapping[str, Any], place: Callable[[str], str]) -> dict[str, Any]:
+    """Values by path as JSON can hold them."""
+    return {path: to_config(_moved(value, place), path) for path, value in changes.items()}
+
+
+def changes_from_config(
+    table: Mapping[str, Any], allow: Sequence[str], place: Callable[[str], str]
+) -> dict[str, Any]:
+    """The values by path that `changes_to_config` gave."""
+    return {path: _moved(from_config(value, path, allow=allow), place) for path, value in table.items()}
+
+
+def _moved(value: Any, place: Callable[[str], str]) -> Any:
+    """A value whose `Frozen` agents have their runs elsewhere."""
+    if isinstance(value, tuple | list):
+        return tuple(_moved(own, place) for own in value)
+    return with_run_moved(value, place)
 
 
 def _name(name: object, factor: object) -> str:

@@ -1,27 +1,30 @@
 """Study: one experiment under several conditions, each repeated by the same replicas; a value."""
 
 import hashlib
+import os
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
-from functools import cached_property
+from functools import cached_property, partial
 from pathlib import Path
 from typing import Any, Final
 
 from cprl.arguments import integer, object_of, refusal, switch
-from cprl.checks import DIRECTORY_NAME, checked, shown
-from cprl.config import from_config, to_config
-from cprl.experiment import MOST_SEED, Experiment, frozen_relative_to
+from cprl.checks import DIRECTORY_NAME, check_nesting, checked, instance, shown
+from cprl.experiment import MOST_SEED, Experiment, frozen_from, frozen_relative_to
 from cprl.studies.conditions import Condition
 from cprl.studies.factors import (
-    DISTRIBUTIONS,
     MOST_CONDITIONS,
-    Distribution,
     Factor,
     Level,
+    changes_from_config,
+    changes_to_config,
     checked_factors,
     drawn,
+    factor_from_config,
+    factor_to_config,
     grid,
 )
+from cprl.studies.naming import named, short_names
 from cprl.studies.paths import changed
 
 FORMAT: Final = 1
@@ -156,39 +159,66 @@ class Study:
             every = list(grid(self.factors))
         if len(every) > MOST_CONDITIONS:
             raise ValueError(f"a study has {len(every):,} conditions; allowed: up to {MOST_CONDITIONS:,}")
-        short = _short_names(self.factors)
+        short = short_names(self.factors)
         return [(named({short[own]: at.value for own, at in levels.items()}), levels) for levels in every]
 
     def to_config(self, directory: str | Path | None = None) -> dict[str, Any]:
-        """The study as JSON can hold it; runs of `Frozen` relative to a directory, if one is given."""
+        """The study as JSON can hold it.
+
+        Args:
+            directory: where it is kept: runs of `Frozen` agents are then given relative to it.
+        """
+        place = _no_change if directory is None else partial(os.path.relpath, start=directory)
         stored = self.experiment if directory is None else frozen_relative_to(self.experiment, directory)
         return {
             "format": FORMAT,
-            "name": self.name,
-            "question": self.question,
-            "expectation": self.expectation,
             "experiment": stored.to_config(),
-            "factors": [[name, _factor_config(name, own)] for name, own in self.factors.items()],
-            "conditions": [[name, _changes_config(own)] for name, own in self.conditions.items()],
-            **{own: getattr(self, own) for own in ("draws", "replicas", "block", "pairing", "reference")},
+            "factors": [[name, factor_to_config(name, own, place)] for name, own in self.factors.items()],
+            "conditions": [[name, changes_to_config(own, place)] for name, own in self.conditions.items()],
+            **{own: getattr(self, own) for own in _PLAIN},
         }
 
     @classmethod
-    def from_config(cls, table: Mapping[str, Any], *, allow: Iterable[str] = ()) -> "Study":
+    def from_config(
+        cls,
+        table: Mapping[str, Any],
+        *,
+        allow: Iterable[str] = (),
+        directory: str | Path | None = None,
+    ) -> "Study":
         """The study that `to_config` gave.
 
+        Args:
+            table: what JSON held.
+            allow: the targets of `Custom` that it may hold, "module:Class" each.
+            directory: where it is kept; runs of `Frozen` agents are then relative to where we stand.
+
         Raises:
-            ValueError: for another format and for what does not fit, see `Experiment.from_config`.
+            ValueError: for another format, and for what does not fit, see `Experiment.from_config`.
         """
-        if table.get("format") != FORMAT:
-            raise ValueError(f"the study has the format {shown(table.get('format'))}; allowed: {FORMAT}")
+        checked("the study", table, instance(Mapping, "a table"))
+        check_nesting(table, "the study")
+        lacks = [name for name in ("experiment", "factors", "conditions", *_PLAIN) if name not in table]
+        if table.get("format") != FORMAT or lacks:
+            raise ValueError(
+                f"the study has the format {shown(table.get('format'))}"
+                f"{' and lacks ' + ', '.join(lacks) if lacks else ''}; allowed: {FORMAT}, complete"
+            )
         allow = tuple(allow)
-        others = ("name", "question", "expectation", "draws", "replicas", "block", "pairing", "reference")
+        place = _no_change if directory is None else partial(_joined, str(directory))
+        experiment = Experiment.from_config(table["experiment"], allow=allow)
+        try:
+            factors = {name: factor_from_config(own, allow, place) for name, own in table["factors"]}
+            named = {name: changes_from_config(own, allow, place) for name, own in table["conditions"]}
+        except (KeyError, TypeError, AttributeError) as error:
+            raise ValueError(
+                f"the study has no factors and conditions that it could have: {error!r}"
+            ) from error
         return cls(
-            Experiment.from_config(table["experiment"], allow=allow),
-            {name: _factor_from(own, allow) for name, own in table["factors"]},
-            conditions={name: _changes_from(own, allow) for name, own in table["conditions"]},
-            **{own: table[own] for own in others},
+            experiment if directory is None else frozen_from(experiment, directory),
+            factors,
+            conditions=named,
+            **{own: table[own] for own in _PLAIN},
         )
 
     def __eq__(self, other: object) -> bool:
@@ -209,24 +239,23 @@ class Block:
     """Of the run, where conditions are paired."""
 
 
+_PLAIN: Final = (
+    *("name", "question", "expectation"),
+    *("draws", "replicas", "block", "pairing", "reference"),
+)
+"""Fields that JSON can hold as they are."""
 CONDITION: Final = "condition"
 """The column of named conditions."""
 UNCHANGED: Final = "unchanged"
 """The one condition of a study without factors."""
 
 
-def named(levels: Mapping[str, Any]) -> str:
-    """The name of a condition, e.g. "freeze_steps=5, gamma=0.9"."""
-    return ", ".join(f"{name}={level_text(value)}" for name, value in levels.items())
+def _no_change(run: str) -> str:
+    return run
 
 
-def level_text(value: Any) -> str:
-    """A level in a few words, for names and figures."""
-    if isinstance(value, float):
-        return f"{value:.6g}"
-    if isinstance(value, tuple) and all(isinstance(own, int | float) for own in value):
-        return f"({', '.join(map(level_text, value))})"
-    return value if isinstance(value, str) else shown(value)
+def _joined(directory: str, run: str) -> str:
+    return os.path.relpath(os.path.join(directory, run))
 
 
 def _of_level(experiment: Experiment, levels: Mapping[str, Level]) -> Experiment:
@@ -240,12 +269,6 @@ def _of_level(experiment: Experiment, levels: Mapping[str, Level]) -> Experiment
     return changed(experiment, changes) if changes else experiment
 
 
-def _short_names(factors: Iterable[str]) -> dict[str, str]:
-    """The last word of each path, where no other factor has it too."""
-    last = {own: own.rpartition(".")[2] for own in factors}
-    return {own: word if list(last.values()).count(word) == 1 else own for own, word in last.items()}
-
-
 def _checked_conditions(conditions: object) -> dict[str, dict[str, Any]]:
     allowed = "a table of conditions by name, each a table of values by path"
     if not isinstance(conditions, Mapping):
@@ -254,29 +277,3 @@ def _checked_conditions(conditions: object) -> dict[str, dict[str, Any]]:
         if not isinstance(name, str) or not name or not isinstance(own, Mapping):
             raise refusal(f"conditions[{name!r}]", own, allowed)
     return {name: dict(own) for name, own in conditions.items()}
-
-
-def _factor_config(name: str, factor: Factor) -> dict[str, Any]:
-    if isinstance(factor, Distribution):
-        return {"distribution": type(factor).__name__, "low": factor.low, "high": factor.high}
-    if isinstance(factor, Mapping):
-        return {"levels": [[level, _changes_config(own)] for level, own in factor.items()]}
-    return {"values": to_config(factor, f"factors[{name!r}]")}
-
-
-def _factor_from(table: Mapping[str, Any], allow: tuple[str, ...]) -> Factor:
-    if "distribution" in table:
-        made: Distribution = DISTRIBUTIONS[table["distribution"]](low=table["low"], high=table["high"])
-        return made
-    if "levels" in table:
-        return {level: _changes_from(own, allow) for level, own in table["levels"]}
-    values: tuple[Any, ...] = from_config(table["values"], allow=allow)
-    return values
-
-
-def _changes_config(changes: Mapping[str, Any]) -> dict[str, Any]:
-    return {path: to_config(value, path) for path, value in changes.items()}
-
-
-def _changes_from(table: Mapping[str, Any], allow: tuple[str, ...]) -> dict[str, Any]:
-    return {path: from_config(value, path, allow=allow) for path, value in table.items()}

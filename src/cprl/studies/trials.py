@@ -14,6 +14,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Final, Literal, NamedTuple
 
+from cprl.config import custom_targets
 from cprl.experiment import Experiment
 from cprl.runs.directory import FILE_NAME as RECIPE
 from cprl.runs.directory import read_recipe
@@ -110,14 +111,25 @@ class Outcome(NamedTuple):
 
 
 def task_of(trial: Trial, *, runs: Path, status: Path, allow: Sequence[str] = ()) -> Task:
-    """The task of a trial."""
+    """The task of a trial.
+
+    Classes of the user's own that the experiment itself has are allowed: it was made with them.
+
+    Args:
+        trial: what is run.
+        runs: the directory in which its own is.
+        status: the directory in which it says how far it is.
+        allow: further targets of `Custom`, those of stored runs that agents come from.
+    """
+    recipe = trial.experiment.to_recipe(runs / trial.name)
+    targets = tuple(dict.fromkeys([*custom_targets(recipe["experiment"]), *allow]))
     return Task(
         name=trial.name,
         runs=str(runs),
         status=str(status),
-        recipe=trial.experiment.to_recipe(runs / trial.name),
-        allow=tuple(allow),
-        paths=(os.getcwd(),) if allow else (),
+        recipe=recipe,
+        allow=targets,
+        paths=tuple(map(os.path.abspath, sys.path)) if targets else (),
         command=tuple(sys.argv),
     )
 
@@ -134,7 +146,7 @@ def run_task(task: Task) -> Outcome:
     if state_of(run) == "finished":
         status.tidy_up()
         return Outcome(task.name, "finished")
-    sys.path[:0] = [path for path in task.paths if path not in sys.path]
+    sys.path += [path for path in task.paths if path not in sys.path]
     sys.argv = list(task.command)  # that of a worker process would name its machine's directories
     status.folder.mkdir(parents=True, exist_ok=True)
     try:

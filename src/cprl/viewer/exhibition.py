@@ -16,21 +16,21 @@ from torchrl.envs import EnvBase, TransformedEnv
 from cprl.commons.game import Game
 from cprl.envs.state import load_transforms_state, transforms_state
 from cprl.envs.unwrap import commons_of
-from cprl.viewer.live_board import send_fixed, send_frames
+from cprl.viewer.live_board import LiveBoard, send_fixed
 from cprl.viewer.recorder import FrameRecorder
 from cprl.viewer.scenery import Scene
 from cprl.viewer.streams import Live
 
-STEPS_PER_S: Final = 11
-"""Steps of the exhibited world in a second of wall time."""
-
-BATCH_S: Final = 1.0
-"""Seconds whose steps are played at once, because eleven steps in a row take a quarter of the time of eleven
+BATCH_S: Final = 2.0
+"""Seconds whose steps are played at once, because many steps in a row take a quarter of the time of as many
 between steps of the training; they are sent one by one."""
+
+BATCH_STEPS: Final = 21
+"""Steps of the exhibited world in this time: 10.5 in a second of wall time."""
 
 MOST_SHARE: Final = 0.01
 """The share of the training's wall time that its thread may spend on the exhibition: where a step of it takes
-longer than 0.9 ms, it plays fewer."""
+longer than 0.95 ms, it plays fewer."""
 
 LONGEST_S: Final = 10.0
 """The longest time that a viewer sees the same board, if a step took exceptionally long."""
@@ -50,10 +50,11 @@ class Exhibited(Protocol):
         """Sets each agent's exploration to what it is now."""
 
     def apart(self) -> AbstractContextManager[Any]:
-        """A context in which nothing changes torch's generators for the rest of the process."""
+        """A context to play steps in: agents explore as they do when it begins, and nothing changes torch's
+        generators for the rest of the process."""
 
     def __call__(self, carried: TensorDictBase) -> TensorDictBase:
-        """Writes ("agents", "action"), int64 [1, N]."""
+        """Writes ("agents", "action"), int64 [1, N]; called within `apart`."""
 
 
 class Exhibition:
@@ -94,14 +95,14 @@ class Exhibition:
                 f"the exhibition has a {type(env).__name__} of batch size {list(env.batch_size)}; allowed: "
                 "one world of a CommonsEnv, with transforms or without"
             )
-        self._policy, self._env, self._trained, self._scene = policy, env, trained, scene
+        self._policy, self._env, self._trained, self._board = policy, env, trained, LiveBoard(scene)
         self._live, self._clock, self._closing = live, clock, Event()
-        self._wait = wait or self._closing.wait
+        self._wait = wait or self._slept
         self._recorder = FrameRecorder(
-            commons, episodes=1, scene=scene, capacity=STEPS_PER_S, has_windows=False
+            commons, episodes=1, scene=scene, capacity=BATCH_STEPS, has_windows=False
         )
         self._carried: TensorDictBase | None = None
-        self._due, self._count = clock(), STEPS_PER_S
+        self._due, self._count = clock(), BATCH_STEPS
         self.steps = 0
         """Steps played so far."""
         self.is_over = live.stream is None or live.exhibition is None
@@ -111,7 +112,7 @@ class Exhibition:
         self._send(_before_the_first_step(commons.game), 0)  # compiling may take half a minute
 
     def on_step(self, *, episode: int) -> None:
-        """Plays the steps of a second if they are due; `episode` is the training's, for the caption."""
+        """Plays the steps of two seconds if they are due; `episode` is the training's, for the caption."""
         now = self._clock()
         if now >= self._due and not self.is_over:
             self._due = now + BATCH_S
@@ -127,6 +128,12 @@ class Exhibition:
     def close(self) -> None:
         """Leaves out frames that have not been sent."""
         self._closing.set()
+
+    def _slept(self, seconds: float) -> bool:
+        """Whether `close` was called by the end of so many seconds; an event's own `wait` takes
+        longer to end, and keeps the training from going on meanwhile."""
+        time.sleep(seconds)
+        return self._closing.is_set()
 
     def _play(self, episode: int) -> None:
         """Plays some steps, and has them sent; fewer the next time if they took long."""
@@ -149,7 +156,7 @@ class Exhibition:
         is_first = self.steps == self._count  # much of it was compiling
         self._due = max(self._due, began + (0.0 if is_first else min(spent / MOST_SHARE, LONGEST_S)))
         affordable = int(MOST_SHARE * BATCH_S / max(spent / self._count, 1e-9))
-        self._count = max(1, min(STEPS_PER_S, affordable))
+        self._count = max(1, min(BATCH_STEPS, affordable))
         frames = self._recorder.take()
         if frames is not None:
             self._send(frames, episode)
@@ -163,13 +170,13 @@ class Exhibition:
             return
         batch, self._carried = self._env.step_and_maybe_reset(self._policy(self._carried))
         self._recorder.add(batch, step=0, episode=0)
-        if isinstance(self._env, TransformedEnv) and self.steps % STEPS_PER_S == 0:
+        if isinstance(self._env, TransformedEnv) and self.steps % BATCH_STEPS == 0:
             load_transforms_state(self._env, transforms_state(self._trained))
 
     def _send(self, frames: Mapping[str, NDArray[Any]], episode: int) -> None:
         if self._live.exhibition is not None:
             caption = caption_of(self._policy, episode)
-            shown = partial(send_frames, scene=self._scene, frames=frames, caption=caption)
+            shown = partial(self._board.send, frames=frames, caption=caption)
             self._live.exhibition.do(partial(shown, wait=self._wait, lasting_s=BATCH_S))
 
 

@@ -6,13 +6,38 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
-from cprl.compat import send_chunk
+from cprl.commons.colours import (
+    APPLE,
+    BEAM,
+    FIRST_AGENT,
+    GROUND,
+    MARK,
+    PALETTE,
+    Colour,
+    agent_colour,
+    class_name,
+    picture_colour,
+)
+from cprl.commons.sprites import INK_COLOUR, MARK_COLOUR
+from cprl.commons.world import Bytes
+from cprl.compat import rows_made, send_chunk, send_made
+from cprl.viewer.arrows import ragged
 from cprl.viewer.batches import components
 from cprl.viewer.scenery import BACKGROUND, Scene
-from cprl.viewer.stage import RIM_CELLS, board_columns, fixed
+from cprl.viewer.stage import BEAM_OPACITY, RIM_CELLS, Frames, alone_of, boards, centres_of, image_form
+from cprl.viewer.strokes import (
+    OUT_STROKE_CELLS,
+    RADIUS_CELLS,
+    Strokes,
+    marks,
+    numbers,
+    numbers_and_headings,
+    squares,
+)
 
-_BOARD: Final = "world"
-"""Where the entities of the recorded board are."""
+_BOARD: Final = "exhibition/board"
+_LIT_APPLE: Final = MARK
+"""The class of an apple under a beam; boards have no other use for it."""
 
 _CAPTION_CELLS, _ROOM_CELLS = 0.4, 2.4
 """The distances from the board to the caption and to the line that gives it room, in cells."""
@@ -23,9 +48,9 @@ def send_fixed(recording: Any, *, scene: Scene) -> None:
     """Sends what never changes, to the server that keeps it for viewers that come later."""
     import rerun as rr
 
-    for entity, parts in fixed(scene).items():
-        if entity.startswith(f"{_BOARD}/"):
-            recording.log(_renamed(entity), *parts, static=True)
+    form = image_form((scene.height + 2 * RIM_CELLS, scene.width + 2 * RIM_CELLS))
+    picture = rr.SegmentationImage.from_fields(format=form, opacity=1.0, draw_order=-10.0)
+    recording.log(_BOARD, _classes(len(scene.agents)), picture, static=True)
     low = scene.height + 2 * RIM_CELLS + _ROOM_CELLS
     line = [(0.0, low), (scene.width + 2 * RIM_CELLS, low)]  # hidden; the view makes room for what it shows
     room = rr.LineStrips2D([line], radii=_THIN, colors=[BACKGROUND])
@@ -35,45 +60,126 @@ def send_fixed(recording: Any, *, scene: Scene) -> None:
     recording.log("exhibition/caption", caption, static=True)
 
 
-def send_frames(
-    recording: Any,
-    *,
-    scene: Scene,
-    frames: Mapping[str, NDArray[Any]],
-    caption: str,
-    wait: Callable[[float], bool],
-    lasting_s: float,
-) -> None:
-    """Sends frames one by one.
-
-    Whatever is done here in Python keeps the training from going on: columns are converted and cut once for
-    all frames, and rows go to Rerun's native part as they are.
-
-    Args:
-        recording: the stream.
-        scene: the contents of the board.
-        frames: of `FrameRecorder.take`, [T, ...].
-        caption: the text below the board.
-        wait: waits so many seconds; returns whether to leave out the rest.
-        lasting_s: seconds over which they are spread.
-    """
+def _classes(agents: int) -> Any:
+    """Names and colours of the classes on the exhibited board."""
     import rerun as rr
 
-    text = rr.Points2D.columns(labels=np.array([caption]))
-    send_chunk(recording, "exhibition/caption", {}, components(text))
-    count = len(frames["step"])
-    shown: list[list[tuple[str, dict[Any, Any]]]] = [[] for _ in range(count)]
-    for entity, (rows, columns) in board_columns(scene, frames).items():
-        name, converted = _renamed(entity), components(columns)
-        for row, at in enumerate(rows.tolist()):
-            shown[at].append((name, {kind: own.slice(row, 1) for kind, own in converted.items()}))
-    for at, parts in enumerate(shown):
-        for name, own in parts:
-            send_chunk(recording, name, {}, own)
-        if at + 1 < count and wait(lasting_s / count):
-            return
+    known = {kind: (class_name(kind), picture_colour(kind)) for kind in range(FIRST_AGENT + agents)}
+    known[BEAM] = "beam", _lit(GROUND)
+    known[_LIT_APPLE] = "apple under a beam", _lit(APPLE)
+    return rr.AnnotationContext(
+        [rr.AnnotationInfo(id=kind, label=label, color=colour) for kind, (label, colour) in known.items()]
+    )
 
 
-def _renamed(entity: str) -> str:
-    """The name in the exhibition of an entity of the recorded board."""
-    return "exhibition" + entity.removeprefix(_BOARD)
+def _lit(kind: int) -> Colour:
+    """The colour of a class under a beam."""
+    pairs = zip(PALETTE[BEAM], PALETTE[kind], strict=True)
+    red, green, blue = (round(BEAM_OPACITY * over + (1 - BEAM_OPACITY) * under) for over, under in pairs)
+    return red, green, blue
+
+
+class LiveBoard:
+    """Sends the board with its agents as one entity, each frame as one row.
+
+    Whatever is done here in Python keeps the training from going on. So a frame is an image, with classes of
+    their own for cells under a beam, and lines in one column; rows are made once for all frames, and Rerun's
+    native part sends them. Squares of agents out of play have no labels, unlike in a recording.
+
+    Args:
+        scene: the contents of the board.
+    """
+
+    def __init__(self, scene: Scene) -> None:
+        import rerun as rr
+
+        self._scene, agents = scene, len(scene.agents)
+        hues = np.array([_packed(agent_colour(agent)) for agent in range(agents)], np.uint32)
+        ink, mark = (np.full(agents, _packed(colour), np.uint32) for colour in (INK_COLOUR, MARK_COLOUR))
+        kinds = (
+            (numbers_and_headings(agents), 0, ink, RADIUS_CELLS),
+            (marks(agents), 0, mark, RADIUS_CELLS),
+            (squares(agents), 1, hues, OUT_STROKE_CELLS),
+            (numbers(agents), 2, hues, RADIUS_CELLS),
+        )
+        self._strokes = Strokes(
+            np.concatenate([strokes.owner for strokes, *_ in kinds]),
+            np.concatenate([strokes.shape for strokes, *_ in kinds], 1),
+        )
+        lines = [len(strokes.owner) for strokes, *_ in kinds]
+        self._when = np.repeat([when for _, when, _, _ in kinds], lines)
+        """When each line is drawn: its agent is in play 0, out 1, or out with its cell to itself 2."""
+        self._colours = np.concatenate([colours[strokes.owner] for strokes, _, colours, _ in kinds])
+        self._radii = np.repeat(np.array([radius for *_, radius in kinds], np.float32), lines)
+        picture = rr.SegmentationImage.columns(buffer=np.zeros((1, 1), np.uint8))
+        drawn = rr.LineStrips2D.columns(strips=np.zeros((1, 2, 2), np.float32), colors=[0], radii=[0.0])
+        kept = {own.component_descriptor(): own.as_arrow_array().type for own in (*picture, *drawn)}
+        self._forms = {kind.component.partition(":")[2]: (kind, form) for kind, form in kept.items()}
+
+    def send(
+        self,
+        recording: Any,
+        *,
+        frames: Frames,
+        caption: str,
+        wait: Callable[[float], bool],
+        lasting_s: float,
+    ) -> None:
+        """Sends frames one by one.
+
+        Args:
+            recording: the stream.
+            frames: of `FrameRecorder.take`, [T, ...].
+            caption: the text below the board.
+            wait: waits so many seconds; returns whether to leave out the rest.
+            lasting_s: seconds over which they are spread.
+        """
+        import rerun as rr
+
+        text = rr.Points2D.columns(labels=np.array([caption]))
+        send_chunk(recording, "exhibition/caption", {}, components(text))
+        rows = rows_made(_BOARD, self.columns(frames))
+        for at, row in enumerate(rows, 1):
+            send_made(recording, row)
+            if at < len(rows) and wait(lasting_s / len(rows)):
+                return
+
+    def columns(self, frames: Frames) -> Mapping[Any, Any]:
+        """The rows of T frames as `pyarrow` arrays, by component descriptor."""
+        pictures, (lines, line, counts) = self._pictures(frames), self._lines(frames)
+        parts: dict[str, tuple[NDArray[Any], NDArray[Any]]] = {
+            "buffer": (np.ones(len(pictures), np.int32), pictures.reshape(len(pictures), -1)),
+            "strips": (counts, lines),
+            "colors": (counts, self._colours[line]),
+            "radii": (counts, self._radii[line]),
+        }
+        made = {}
+        for name, (of_row, values) in parts.items():
+            kind, form = self._forms[name]
+            made[kind] = ragged(form, of_row, values)
+        return made
+
+    def _pictures(self, frames: Frames) -> Bytes:
+        """Images of classes, uint8 [T, H + 2, W + 2]; a beam that covers an agent is behind it."""
+        pictures = boards(self._scene, frames)
+        inner = pictures[:, RIM_CELLS:-RIM_CELLS, RIM_CELLS:-RIM_CELLS]
+        covered = frames["beams"]
+        if covered.any():
+            inner[covered & (inner == GROUND)] = BEAM
+            inner[covered & (inner == APPLE)] = _LIT_APPLE
+        return pictures
+
+    def _lines(self, frames: Frames) -> tuple[NDArray[np.float32], NDArray[np.intp], NDArray[np.intp]]:
+        """The lines of all frames one after the other, float32 [lines, P, 2], which line each is, and how
+        many each frame has."""
+        in_play, owner = frames["in_play"], self._strokes.owner
+        alone = in_play if in_play.all() else alone_of(frames)  # nobody is out, so neither is read
+        drawn = np.stack([in_play, ~in_play, alone & ~in_play])[self._when, :, owner].T
+        lines, counts = self._strokes.placed_lines(centres_of(frames), frames["heading"], drawn)
+        return lines, np.nonzero(drawn)[1], counts
+
+
+def _packed(colour: Colour) -> int:
+    """An opaque colour as Rerun's 0xRRGGBBAA."""
+    red, green, blue = colour
+    return red << 24 | green << 16 | blue << 8 | 255

@@ -12,14 +12,19 @@ from cprl.commons.sprites import INK_COLOUR, MARK_COLOUR
 from cprl.commons.world import Bools, Bytes
 from cprl.viewer.frames import mosaic, mosaic_size, window_corners
 from cprl.viewer.scenery import Scene, window_classes
-from cprl.viewer.strokes import RADIUS_CELLS, Strokes, marks, numbers, numbers_and_headings
+from cprl.viewer.strokes import (
+    OUT_HALF_CELLS,
+    OUT_STROKE_CELLS,
+    RADIUS_CELLS,
+    Strokes,
+    marks,
+    numbers,
+    numbers_and_headings,
+)
 
 RIM_CELLS: Final = 1
 """The width of the wall shown around the board, in cells."""
-
-_OUT_HALF_CELLS: Final = 0.4
-_BEAM_OPACITY: Final = 0.7
-_STROKE_CELLS: Final = 0.07
+BEAM_OPACITY: Final = 0.7
 
 Frames = Mapping[str, NDArray[Any]]
 """Columns of `FrameBuffer.take`, [T, ...] each, with windows as classes of `classes_seen`."""
@@ -49,10 +54,10 @@ def fixed(scene: Scene) -> dict[str, list[Any]]:
     corners = np.array(window_corners(agents, scene.window), np.float32)[:, ::-1]
     return {
         "world/board": [image(format=board, opacity=1.0, draw_order=-10.0)],
-        "world/beams": [image(format=board, opacity=_BEAM_OPACITY, draw_order=-5.0)],
+        "world/beams": [image(format=board, opacity=BEAM_OPACITY, draw_order=-5.0)],
         "world/agents": [rr.LineStrips2D.from_fields(colors=[INK_COLOUR], radii=[RADIUS_CELLS])],
         "world/marks": [rr.LineStrips2D.from_fields(colors=[MARK_COLOUR], radii=[RADIUS_CELLS])],
-        "world/out": [rr.Boxes2D.from_fields(radii=[_STROKE_CELLS], show_labels=False)],
+        "world/out": [rr.Boxes2D.from_fields(radii=[OUT_STROKE_CELLS], show_labels=False)],
         "world/out/numbers": [rr.LineStrips2D.from_fields(radii=[RADIUS_CELLS])],
         "windows": [
             window_classes(scene),
@@ -63,7 +68,7 @@ def fixed(scene: Scene) -> dict[str, list[Any]]:
                 mins=corners - 0.2,
                 sizes=np.full((agents, 2), (columns + 0.4, rows + 0.4)),
                 colors=colours,
-                radii=2 * _STROKE_CELLS,
+                radii=2 * OUT_STROKE_CELLS,
                 labels=list(scene.agents),
                 show_labels=False,
             )
@@ -146,7 +151,7 @@ def _lines(strokes: Strokes, frames: Frames) -> Any:
     """Lines of the agents in play."""
     import rerun as rr
 
-    lines, counts = strokes.placed(_centres(frames), frames["heading"], frames["in_play"])
+    lines, counts = strokes.placed(centres_of(frames), frames["heading"], frames["in_play"])
     return rr.LineStrips2D.columns(strips=lines).partition(counts)
 
 
@@ -157,14 +162,14 @@ def _out(frames: Frames) -> dict[str, tuple[NDArray[np.intp], Any]]:
     """
     import rerun as rr
 
-    out, by, alone = ~frames["in_play"], frames["tagged_by"], _alone(frames)
+    out, by, alone = ~frames["in_play"], frames["tagged_by"], alone_of(frames)
     places = [np.where(out, frames[name], 0) for name in ("row", "col")]
     changed = _changes(np.concatenate([out, np.where(out, by, 0), alone, *places], 1))
-    out, by, alone, centres = out[changed], by[changed], alone[changed], _centres(frames)[changed]
+    out, by, alone, centres = out[changed], by[changed], alone[changed], centres_of(frames)[changed]
     rgb = np.array([agent_colour(agent) for agent in range(out.shape[1])], np.uint8)
     squares = rr.Boxes2D.columns(
         centers=centres[out],
-        half_sizes=np.full((int(out.sum()), 2), _OUT_HALF_CELLS),
+        half_sizes=np.full((int(out.sum()), 2), OUT_HALF_CELLS),
         colors=rgb[np.nonzero(out)[1]],
         labels=["out" if tagger < 0 else f"by {tagger}" for tagger in by[out]],
     ).partition(out.sum(1))
@@ -175,7 +180,7 @@ def _out(frames: Frames) -> dict[str, tuple[NDArray[np.intp], Any]]:
     return {"world/out": (changed, squares), "world/out/numbers": (changed, digits)}
 
 
-def _alone(frames: Frames) -> Bools:
+def alone_of(frames: Frames) -> Bools:
     """The agents out of play in whose cell there is nobody in play, nor anyone out with a lower index."""
     row, col, in_play = frames["row"], frames["col"], frames["in_play"]
     same = (row[:, :, None] == row[:, None]) & (col[:, :, None] == col[:, None])
@@ -184,7 +189,7 @@ def _alone(frames: Frames) -> Bools:
     return alone
 
 
-def _centres(frames: Frames) -> NDArray[np.float32]:
+def centres_of(frames: Frames) -> NDArray[np.float32]:
     """The positions of agents on the image, (x, y): [T, N, 2]."""
     return np.stack([frames["col"], frames["row"]], -1).astype(np.float32) + RIM_CELLS + 0.5
 

@@ -16,6 +16,10 @@ from cprl.commons.sprites import DIGIT_HIGH, POINTS, number_paths
 RADIUS_CELLS: Final = 0.045
 """Half the width of a line, in cells."""
 
+OUT_HALF_CELLS: Final = 0.4
+OUT_STROKE_CELLS: Final = 0.07
+"""Half the side of the square of an agent out of play, and half the width of its line, in cells."""
+
 _EDGE, _RIM, _DEEP, _HALF_WIDE, _GRID = 0.44, 0.09, 0.15, 0.16, 0.09
 """In cells: the distance of the triangle's tip from the middle; the width of a ring or stripe; the triangle's
 depth and half its width; the largest distance between points of a digit."""
@@ -47,10 +51,16 @@ class Strokes:
         Returns:
             The lines one after the other, float32 [lines, P, 2], and how many each frame has, [T].
         """
-        frame, line = np.nonzero(drawn[:, self.owner])
+        return self.placed_lines(centres, heading, drawn[:, self.owner])
+
+    def placed_lines(
+        self, centres: Floats, heading: NDArray[np.integer], drawn: NDArray[np.bool_]
+    ) -> tuple[Floats, NDArray[np.intp]]:
+        """`placed` for the lines that are drawn, bool [T, S], in place of agents."""
+        frame, line = np.nonzero(drawn)
         agent = self.owner[line]
         lines = self.shape[heading[frame, agent], line] + centres[frame, agent][:, None]
-        return lines, drawn[:, self.owner].sum(1)
+        return lines, drawn.sum(1)
 
 
 @cache
@@ -76,6 +86,14 @@ def numbers(agents: int) -> Strokes:
 def marks(agents: int) -> Strokes:
     """The second marks, from agent 4 on."""
     return _strokes([(agent, line) for agent in range(agents) for line in _mark(agent_mark(agent))])
+
+
+@cache
+def squares(agents: int) -> Strokes:
+    """A hollow square in the cell of each agent."""
+    far = OUT_HALF_CELLS
+    square = _turned((-far, -far), (far, -far), (far, far), (-far, far), (-far, -far))
+    return _strokes([(agent, square) for agent in range(agents)])
 
 
 def _strokes(lines: list[tuple[int, Floats]]) -> Strokes:

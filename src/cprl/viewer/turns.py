@@ -13,7 +13,7 @@ from cprl.viewer.logger import RerunLogger
 from cprl.viewer.looks import Looks
 from cprl.viewer.scenery import STATES
 
-POINTS: Final = 200
+POINTS: Final = 100
 """The points of a line, at most."""
 _LIVED: Final = (150, 150, 150)
 _TEXT: Final = (200, 200, 200)
@@ -94,6 +94,10 @@ class Turns:
     def load_state_dict(self, state: dict[str, Any]) -> None:
         """Continues from a state that `state_dict` returned."""
         self._looks.take()
-        self._playing = np.array(state["playing"])
+        playing = np.array(state["playing"])
+        self._playing[:] = np.nan
+        for replica, points in enumerate(playing):  # as many of an older state as there is room for
+            known = points[~np.isnan(points[:, 0])]
+            self._playing[replica, known[:, 0].astype(int) // self.stride] = known
         self._ended = [[(turn, stock) for turn, stock in line] for line in state["ended"]]
         self._died = list(state["died"])

@@ -13,7 +13,7 @@ from cprl.viewer.looks import Looks
 from cprl.viewer.panels import Panels
 from cprl.viewer.scenery import Scene
 
-SAMPLED_EVERY: Final = 5
+SAMPLED_EVERY: Final = 10
 """Steps from one look at the agents' cells to the next."""
 _DARKEST: Final = 0.35
 """The brightness of a cell that was visited once; 1 is the cell with the longest stay."""

@@ -21,7 +21,7 @@ from cprl.viewer.stage import boards, image_form
 
 WALL_BYTES: Final = 4_000_000
 """The target size of the wall in a file, about."""
-_LIVE_PERIOD_S: Final = 1.0
+_LIVE_PERIOD_S: Final = 2.0
 _LIVE_ROWS: Final = 10_000
 """From then on rows for viewers get rarer, because a server's memory holds them: period = time / rows."""
 _FEWEST_STEPS: Final = 10
@@ -34,7 +34,7 @@ _Row = tuple[int, int, int, Any, list[str], Any]
 class Wall:
     """Logs the boards of all replicas: same rules, as many fates.
 
-    Viewers get them once a second, after hours more rarely; the file gets every `stride`-th step of the
+    Viewers get them every two seconds, after hours more rarely; the file gets every `stride`-th step of the
     episodes whose frames are recorded. A board is outlined while the last episode of its replica has ended
     because no apple was left.
 

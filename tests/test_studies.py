@@ -1,0 +1,298 @@
+"""A study of parameters is a value: its conditions, their names, seeds and checksums; JSON and back."""
+
+import json
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from tiny_study import FREEZE, GAMMA, LEARNING, MIXED, SETTINGS, TINY
+
+from cprl import Study, maps, presets
+from cprl.algorithms import DQN, PPO
+from cprl.config import KINDS
+from cprl.experiment import MOST_SEED, Experiment
+from cprl.learners.settings import RolloutSettings
+from cprl.population import Frozen, Learning, Scripted, Team
+from cprl.studies import Integers, LogUniform, Uniform
+from cprl.studies.conditions import FORMAT, Condition, defaults_of
+from cprl.studies.factors import drawn
+from cprl.studies.paths import changed, values_at
+from cprl.studies.trials import trials_of
+
+
+def there_and_back(study, **how):
+    return Study.from_config(json.loads(json.dumps(study.to_config(**how))), **how)
+
+
+def test_a_path_changes_one_field_and_nothing_else():
+    new = changed(TINY, {FREEZE: 7})
+    assert new == replace(TINY, game=replace(TINY.game, rules=replace(TINY.game.rules, freeze_steps=7)))
+
+
+def test_a_star_in_agents_means_every_agent_that_learns_and_a_number_one_of_them():
+    both = changed(TINY, {GAMMA: 0.5})
+    assert values_at(both, GAMMA) == [0.5, 0.5]
+    one = changed(TINY, {GAMMA.replace("*", "1"): 0.5})
+    assert values_at(one, GAMMA) == [0.995, 0.5]
+    learning_alone = changed(MIXED, {GAMMA: 0.5})
+    assert values_at(learning_alone, GAMMA) == [0.5]
+    assert learning_alone.agents[1] == Scripted("greedy")
+
+
+def test_a_number_after_a_star_wins_in_whatever_order_they_are_given():
+    for paths in ((GAMMA, GAMMA.replace("*", "0")), (GAMMA.replace("*", "0"), GAMMA)):
+        given_in_order = {path: 0.5 if "*" in path else 0.25 for path in paths}
+        assert values_at(changed(TINY, given_in_order), GAMMA) == [0.25, 0.5]
+
+
+def test_a_path_into_a_value_that_is_changed_too_applies_to_the_new_value():
+    new = changed(TINY, {GAMMA: 0.5, "agents": [Scripted("random"), LEARNING]})
+    assert new.agents[0] == Scripted("random")
+    assert values_at(new, GAMMA) == [0.5]
+
+
+def test_board_and_agents_change_at_once_though_neither_would_fit_alone():
+    four = changed(TINY, {"agents": [LEARNING] * 4, "game.map": "commons"})
+    assert four.game.map == maps.named("commons")
+    assert len(four.agents) == 4
+
+
+def test_a_path_may_be_written_as_the_flag_is_and_a_list_becomes_a_tuple():
+    new = changed(TINY, {"game.rules.regrow-prob": [0, 0.5], "agents.*.algorithm.settings.hidden-cells": [2]})
+    assert new.game.rules.regrow_prob == (0, 0.5)
+    assert values_at(new, "agents.*.algorithm.settings.hidden_cells") == [(2,), (2,)]
+
+
+@pytest.mark.parametrize(
+    ("factors", "message"),
+    [
+        (
+            {"game.rules.freze_steps": [1]},
+            r"game.rules.freze_steps matches nothing \(did you mean 'freeze_steps'",
+        ),
+        ({"agents.2.algorithm": [3]}, "agents.2 matches nothing; agents has 0, 1"),
+        ({"agents.*.algorithm.settings.clip": [1]}, "settings.clip matches nothing"),
+        ({"agents.0.reward.by": [1]}, "reward.by matches nothing; agents.0.reward is 'individual'"),
+        ({FREEZE: [2.5]}, "freeze_steps is 2.5; allowed: a whole number"),
+        ({FREEZE: [True]}, "freeze_steps is True; allowed: a whole number"),
+        ({GAMMA: [2.0]}, r"gamma: DQNSettings.gamma is 2.0; allowed: a number in 0..1"),
+        ({"game.map": ["comons"]}, "at the path game.map: name is 'comons'; allowed: single_basic"),
+        ({"game.map": ["commons"]}, "with game.map: experiment.agents: 2 agents are specified"),
+        ({"replicas": [1]}, "a factor is replicas, which the study itself decides"),
+        ({FREEZE: 5}, r"factors\['game.rules.freeze_steps'\] is 5; allowed: the values"),
+        ({FREEZE: []}, r"is \[\]; allowed: the values"),
+        ({FREEZE: "12"}, "is '12'; allowed: the values"),
+        ({FREEZE: [5, 5]}, "conditions 'freeze_steps=5' and 'freeze_steps=5' are equal"),
+        ({"": [5]}, "path is ''; allowed: names with dots"),
+        ({FREEZE: Integers(1, 3)}, "allowed in a grid: levels, or with draws=N"),
+        ({"a": {"x": {FREEZE: 5}}, FREEZE: [6]}, "two factors change the same field"),
+        ([], r"factors is \[\]; allowed: a table of factors"),
+    ],
+)
+def test_what_does_not_fit_is_refused_by_its_path(factors, message):
+    with pytest.raises(ValueError, match=message):
+        Study(TINY, factors)
+
+
+@pytest.mark.parametrize(
+    ("how", "message"),
+    [
+        ({"replicas": 0}, "replicas is 0; allowed: an integer from 1"),
+        ({"block": 1.5}, "block is 1.5; allowed: an integer from 1"),
+        ({"pairing": 1}, "pairing is 1; allowed: True or False"),
+        ({"reference": "x"}, "reference is 'x'; allowed: the name of a condition: unchanged"),
+        ({"draws": 2}, "draws is given without factors"),
+        ({"conditions": {"a": 3}}, r"conditions\['a'\] is 3; allowed: a table"),
+        ({"conditions": {"a": {}, "b": {}}}, "conditions 'a' and 'b' are equal"),
+        ({"conditions": {"a": {}}, "factors": {FREEZE: [1]}}, "factors and conditions; allowed: one of them"),
+        ({"name": "a/b"}, "name is 'a/b'"),
+        ({"question": 3}, "question is 3; allowed: a text"),
+    ],
+)
+def test_a_study_refuses_what_is_no_study(how, message):
+    with pytest.raises(ValueError, match=message):
+        Study(TINY, **how)
+
+
+def test_a_population_without_learners_has_no_star():
+    scripted = replace(TINY, agents=(Scripted("greedy"),) * 2)
+    with pytest.raises(ValueError, match="has no agent that learns"):
+        Study(scripted, {GAMMA: [0.5]})
+
+
+def test_a_grid_has_every_combination_with_names_of_the_last_words():
+    study = Study(TINY, {FREEZE: [5, 25], GAMMA: [0.5, 0.995]})
+    names = ["freeze_steps=5, gamma=0.5", "freeze_steps=5, gamma=0.995"]
+    names += ["freeze_steps=25, gamma=0.5", "freeze_steps=25, gamma=0.995"]
+    assert [own.name for own in study.all_conditions] == names
+    assert study.all_conditions[1].levels == {FREEZE: 5, GAMMA: 0.995}
+    assert study.reference_name == "freeze_steps=25, gamma=0.995"  # the one that changes nothing
+    assert study.columns == (FREEZE, GAMMA)
+
+
+def test_paths_with_the_same_last_word_keep_their_whole_names():
+    study = Study(TINY, {GAMMA.replace("*", "0"): [0.5], GAMMA.replace("*", "1"): [0.25]})
+    (own,) = study.all_conditions
+    assert own.name == "agents.0.algorithm.settings.gamma=0.5, agents.1.algorithm.settings.gamma=0.25"
+
+
+def test_named_levels_change_several_fields_together():
+    levels = {"none": {}, "long": {FREEZE: 99, "game.rules.beam_length_cells": 9}}
+    study = Study(TINY, {"time-out": levels, GAMMA: [0.5, 0.9]})
+    assert [own.levels["time-out"] for own in study.all_conditions] == ["none", "none", "long", "long"]
+    assert study.all_conditions[3].experiment.game.rules.beam_length_cells == 9
+
+
+def test_a_condition_has_the_checksum_of_what_decides_its_numbers_and_of_nothing_else():
+    same = [
+        replace(TINY, seed=5),
+        replace(TINY, replicas=3),
+        replace(TINY, name="x"),
+        replace(TINY, on_nan="continue"),
+    ]
+    sums = {Condition(own).checksum for own in [TINY, *same]}
+    assert len(sums) == 1
+    others = [replace(TINY, episodes=3), replace(TINY, evaluation_episodes=2), changed(TINY, {GAMMA: 0.9})]
+    assert len({Condition(own).checksum for own in [TINY, *others]}) == 4
+
+
+def test_whole_numbers_are_numbers_to_the_checksum():
+    assert Condition(changed(TINY, {GAMMA: 1})).checksum == Condition(changed(TINY, {GAMMA: 1.0})).checksum
+
+
+def test_fields_that_have_their_default_do_not_count():
+    """A later version with further fields then gives the same checksum."""
+    table = TINY.to_config()
+    del table["game"]["rules"]["walls_block_sight"]
+    assert Condition(Experiment.from_config(table)).checksum == Condition(TINY).checksum
+
+
+def test_the_defaults_of_the_checksums_format_have_not_changed():
+    """Where a default has another value, count `conditions.FORMAT` up, and write its defaults anew."""
+    kept = json.loads((Path(__file__).parent / "condition_defaults.json").read_text())
+    found = {name: defaults_of(kind) for name, kind in {**KINDS, "Experiment": Experiment}.items()}
+    assert kept["format"] == FORMAT
+    for name, defaults in kept["defaults"].items():
+        assert {field: found[name].get(field, "gone") for field in defaults} == defaults, name
+    assert kept["defaults"].keys() == found.keys()  # of a new kind or field add its defaults
+    assert all(kept["defaults"][name].keys() == own.keys() for name, own in found.items())
+
+
+def test_the_checksum_of_the_published_commons_is_what_it_was():
+    experiment = Experiment(
+        name="commons",
+        game=presets.game("commons", variant="as_run"),
+        agents=(Learning(DQN(settings=presets.dqn_settings("commons", variant="as_run"))),) * 4,
+        episodes=4800,
+    )
+    assert Condition(experiment).checksum == "dab4a686bb41"
+
+
+def test_blocks_have_seeds_of_their_own_and_pairs_the_same_in_every_condition():
+    study = Study(TINY, {FREEZE: [5, 25]}, replicas=5, block=2)
+    found = [(own.condition.name, own.experiment.seed, own.experiment.replicas) for own in trials_of(study)]
+    pairs = [("freeze_steps=5", "freeze_steps=25"), (0, 1000, 2000), (2, 2, 1)]
+    assert found == [(name, seed, size) for seed, size in zip(*pairs[1:], strict=True) for name in pairs[0]]
+    unpaired = [own.experiment.seed for own in trials_of(replace(study, pairing=False))]
+    assert len(set(unpaired)) == 6
+
+
+def test_the_first_block_is_the_run_of_the_recipe_itself():
+    study = Study(replace(TINY, seed=3, replicas=2))
+    (trial,) = trials_of(study)
+    assert trial.experiment == replace(TINY, seed=3, replicas=2)
+
+
+def test_more_replicas_and_levels_keep_the_runs_that_are_there():
+    names = {own.name for own in trials_of(Study(TINY, {FREEZE: [5, 25]}, replicas=2, block=2))}
+    more = {own.name for own in trials_of(Study(TINY, {FREEZE: [5, 25, 50]}, replicas=4, block=2))}
+    assert names < more
+
+
+def test_a_seed_that_leaves_no_room_for_the_blocks_is_refused():
+    with pytest.raises(ValueError, match="seed is 18446744073709551614; allowed: a lower one"):
+        Study(replace(TINY, seed=MOST_SEED), replicas=2, block=1)
+
+
+def test_draws_are_the_same_again_and_more_of_them_keep_the_first():
+    factors = {GAMMA: Uniform(0.5, 0.9), FREEZE: Integers(1, 50), "a": {"x": {}, "y": {"episodes": 3}}}
+    few, more = (Study(TINY, factors, draws=count) for count in (3, 6))
+    assert [own.checksum for own in more.all_conditions][:3] == [own.checksum for own in few.all_conditions]
+    levels = [own.levels for own in more.all_conditions]
+    assert all(0.5 <= own[GAMMA] <= 0.9 and 1 <= own[FREEZE] <= 50 for own in levels)
+    assert len({own[GAMMA] for own in levels}) == 6
+
+
+@settings(deadline=None, max_examples=30)
+@given(seed=st.integers(0, 2**63), nth=st.integers(0, 10**6), low=st.floats(1e-6, 1), times=st.floats(1, 1e6))
+def test_draws_stay_in_their_range(seed, nth, low, times):
+    factors = {"a": LogUniform(low, low * times), "b": Uniform(-low, low), "c": Integers(-3, 3)}
+    found = {name: level.value for name, level in drawn(factors, seed=seed, nth=nth).items()}
+    assert low * (1 - 1e-12) <= found["a"] <= low * times * (1 + 1e-12)
+    assert -low <= found["b"] <= low
+    assert found["c"] in range(-3, 4)
+
+
+@pytest.mark.parametrize(
+    ("kind", "low", "high"),
+    [(Uniform, 2, 1), (LogUniform, 0, 1), (Integers, 0.5, 2), (Uniform, float("nan"), 1)],
+)
+def test_a_range_that_is_none_is_refused(kind, low, high):
+    with pytest.raises(ValueError, match=f"{kind.__name__}.low is "):
+        kind(low, high)
+
+
+ON_POLICY = Learning(PPO(settings=RolloutSettings()))
+STUDIES = {
+    "grid": Study(TINY, {FREEZE: [5, 25], "agents": [[LEARNING] * 2, [ON_POLICY, Scripted("random")]]}),
+    "levels": Study(TINY, {"b": {"x": {}, "y": {"game.rules.regrow_prob": (0, 0.5)}}}, pairing=False),
+    "draws": Study(TINY, {GAMMA: LogUniform(0.1, 0.9)}, draws=2, question="Why?", expectation="Thus."),
+    "named": Study(
+        TINY, conditions={"a": {}, "b": {FREEZE: 3}}, reference="b", replicas=9, block=4, name="n"
+    ),
+    "alone": Study(TINY),
+}
+
+
+@pytest.mark.parametrize("name", STUDIES)
+def test_a_study_becomes_json_and_comes_back_the_same(name):
+    study = STUDIES[name]
+    back = there_and_back(study)
+    assert back == study
+    assert [own.checksum for own in back.all_conditions] == [own.checksum for own in study.all_conditions]
+
+
+def test_the_runs_of_frozen_agents_are_kept_relative_to_the_study(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    study = Study(
+        replace(TINY, agents=(LEARNING, Frozen("runs/a", 0))),
+        {"agents.1": [Frozen("runs/b", 0), Scripted("greedy")]},
+    )
+    table = study.to_config("studies/x")
+    assert "../../runs/a" in json.dumps(table)
+    assert "../../runs/b" in json.dumps(table)
+    assert there_and_back(study, directory="studies/x") == study
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"format": 9}, "the study has the format 9; allowed: 1"),
+        ({"factors": None}, "has no factors and conditions that it could have"),
+        ({"factors": [["a", {"distribution": "Normal", "low": 0, "high": 1}]]}, "KeyError.*Normal"),
+        ({"experiment": {"name": "x"}}, "lacks game, agents, episodes"),
+    ],
+)
+def test_a_table_that_is_no_study_is_refused(change, message):
+    with pytest.raises(ValueError, match=message):
+        Study.from_config({**STUDIES["grid"].to_config(), **change})
+
+
+def test_a_team_is_an_agent_that_learns():
+    from cprl.algorithms import VDN
+
+    team = replace(TINY, agents=(Team(VDN(settings=SETTINGS), agents=(0, 1)),))
+    study = Study(team, {GAMMA: [0.5]})
+    assert values_at(study.all_conditions[0].experiment, GAMMA) == [0.5]

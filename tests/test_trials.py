@@ -1,0 +1,234 @@
+"""A trial becomes a finished run, whatever was there: nothing, half a run, a failure, another's lock."""
+
+import json
+import os
+import pickle
+import shutil
+import signal
+import subprocess
+import sys
+import time
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+from tiny_study import FREEZE, TINY
+
+from cprl import Custom, Study, run_study
+from cprl.runs.checkpoints import FOLDER as CHECKPOINTS
+from cprl.runs.episodes import read_episodes
+from cprl.runs.lock import FILE_NAME as LOCK
+from cprl.runs.lock import RunLock
+from cprl.studies import read_study, trials
+from cprl.studies.status import Status
+from cprl.studies.trials import run_task, state_of, task_of, trials_of
+
+STUDY = Study(TINY, {FREEZE: [5, 25]})
+
+
+def task(tmp_path, study=STUDY, nth=0):
+    return task_of(trials_of(study)[nth], runs=tmp_path / "runs", status=tmp_path / "status")
+
+
+@pytest.fixture(scope="module")
+def undisturbed(tmp_path_factory):
+    """The run of the first trial."""
+    own = task(tmp_path_factory.mktemp("undisturbed"))
+    assert run_task(own).worked
+    return own.directory
+
+
+def assert_same(run, other):
+    assert read_episodes(run).equals(read_episodes(other))
+    for name in ("trained", "random"):
+        path = f"evaluation/{name}.parquet"
+        assert (run / path).read_bytes() == (other / path).read_bytes()
+
+
+def test_a_missing_trial_is_run_and_a_finished_one_left_as_it_is(tmp_path):
+    own = task(tmp_path)
+    assert state_of(own.directory) == "missing"
+    done = run_task(own)
+    assert (done.name, done.state, done.worked) == (own.name, "finished", True)
+    before = {path: path.stat().st_mtime_ns for path in own.directory.rglob("*")}
+    again = run_task(own)
+    assert (again.state, again.worked) == ("finished", False)
+    assert {path: path.stat().st_mtime_ns for path in own.directory.rglob("*")} == before
+
+
+def test_a_trial_prints_into_its_log_and_says_how_far_it_is(tmp_path, capsys):
+    own = task(tmp_path)
+    run_task(own)
+    assert capsys.readouterr().out == ""
+    status = Status(Path(own.status), own.name)
+    assert "tiny, 1 replicas, 2 episodes" in status.log.read_text()
+    said = status.read()
+    assert (said["episodes"], said["of"], said["steps"], said["pid"]) == (2, 2, 40, os.getpid())
+    assert said["peak_bytes"] > 10**7
+    assert not list(tmp_path.rglob("*.partial"))
+
+
+def test_what_a_killed_process_left_before_its_recipe_is_no_obstacle(tmp_path, undisturbed):
+    own = task(tmp_path)
+    own.directory.mkdir(parents=True)
+    (own.directory / "recipe.json.partial").write_text("{")
+    (own.directory / LOCK).write_text("")
+    assert run_task(own).state == "finished"
+    assert_same(own.directory, undisturbed)
+
+
+def test_a_trial_that_was_killed_before_its_first_checkpoint_starts_over(tmp_path, undisturbed):
+    own = task(tmp_path)
+    shutil.copytree(undisturbed, own.directory)
+    for name in ("report.json", "manifest.json", "episodes.parquet", CHECKPOINTS, "evaluation", "figures"):
+        path = own.directory / name
+        shutil.rmtree(path) if path.is_dir() else path.unlink()
+    assert state_of(own.directory) == "unfinished"
+    assert run_task(own).state == "finished"
+    assert_same(own.directory, undisturbed)
+
+
+KILLED = """
+import sys
+sys.path.insert(0, {tests!r})
+from pathlib import Path
+from test_trials import task
+from cprl.runs.checkpoints import Checkpointer
+from cprl.studies.trials import run_task
+Checkpointer.__init__.__kwdefaults__["every_s"] = 1e-9
+run_task(task(Path({folder!r})))
+"""
+
+
+def test_a_trial_that_is_killed_in_its_training_is_resumed_bit_for_bit(tmp_path, undisturbed):
+    own = task(tmp_path)
+    code = KILLED.format(tests=str(Path(__file__).parent), folder=str(tmp_path))
+    process = subprocess.Popen([sys.executable, "-W", "ignore", "-c", code])
+    kept = own.directory / CHECKPOINTS
+    until = time.monotonic() + 60
+    while not (kept.exists() and any(kept.glob("training-*.pt"))) and time.monotonic() < until:
+        time.sleep(0.002)
+    process.send_signal(signal.SIGKILL)
+    process.wait()
+    assert state_of(own.directory) == "unfinished"
+    assert any(kept.glob("training-*.pt"))
+    assert run_task(own).worked
+    assert "Resuming from step" in Status(Path(own.status), own.name).log.read_text()
+    assert_same(own.directory, undisturbed)
+
+
+def test_a_failure_is_noted_with_its_reason_and_forgotten_when_it_is_mended(tmp_path, monkeypatch):
+    own = task(tmp_path)
+    status = Status(Path(own.status), own.name)
+    with monkeypatch.context() as patched:
+        patched.setattr("cprl.running.evaluate_population", lambda *_, **__: 1 / 0)
+        failed = run_task(own)
+    assert (failed.state, failed.reason) == ("failed", "ZeroDivisionError: division by zero")
+    assert status.failure() == "ZeroDivisionError: division by zero"
+    assert "evaluate_population" in status.failed.read_text()
+    assert run_task(own).state == "finished"
+    assert status.failure() is None
+
+
+def test_a_trial_waits_while_another_process_runs_it(tmp_path, undisturbed, monkeypatch):
+    own = task(tmp_path)
+    own.directory.mkdir(parents=True)
+    lock = RunLock(own.directory)
+    lock.__enter__()
+    waited = []
+
+    def finished_elsewhere(seconds):
+        waited.append(seconds)
+        lock.__exit__(None, None, None)
+        shutil.copytree(undisturbed, own.directory, dirs_exist_ok=True)
+
+    monkeypatch.setattr(trials.time, "sleep", finished_elsewhere)
+    assert run_task(own).state == "finished"
+    assert len(waited) == 1
+
+
+def test_the_lock_of_another_host_is_taken_over_once_its_trial_is_silent(tmp_path, undisturbed, monkeypatch):
+    own = task(tmp_path)
+    own.directory.mkdir(parents=True)
+    shutil.copy(undisturbed / "recipe.json", own.directory)
+    holder = {"host": "a-node-that-died", "pid": 1, "started": "2026-01-01T00:00:00+00:00"}
+    (own.directory / LOCK).write_text(json.dumps(holder))
+    monkeypatch.setattr(trials, "PATIENCE_S", 0.3)
+    monkeypatch.setattr(trials, "_POLL_S", 0.05)
+    began = time.monotonic()
+    assert run_task(own).state == "finished"
+    assert time.monotonic() - began > 0.3
+    assert_same(own.directory, undisturbed)
+
+
+def test_a_run_that_another_study_began_under_another_name_is_gone_on_with(tmp_path, undisturbed):
+    own = task(tmp_path, Study(replace(TINY, name="other"), {FREEZE: [5]}))
+    own.directory.mkdir(parents=True)
+    shutil.copy(undisturbed / "recipe.json", own.directory)
+    assert run_task(own).state == "finished"
+    assert json.loads((own.directory / "recipe.json").read_text())["recipe"] == "tiny"
+
+
+def written_at(run):
+    return (run / "report.json").stat().st_mtime_ns
+
+
+def test_a_study_runs_what_is_missing_and_an_edited_one_keeps_what_is_there(tmp_path):
+    first = run_study(STUDY, tmp_path)
+    assert first.failed == ()
+    assert read_study(tmp_path) == STUDY
+    kept = {
+        own.name: (tmp_path / "runs" / own.name / "report.json").stat().st_mtime_ns for own in first.trials
+    }
+    edited = Study(TINY, {FREEZE: [5, 25, 50]}, name="edited")
+    second = run_study(edited, tmp_path)
+    assert len(second.trials) == 3
+    for name, at in kept.items():
+        assert written_at(tmp_path / "runs" / name) == at
+    assert read_study(tmp_path) == edited
+
+
+def test_studies_may_share_their_runs(tmp_path):
+    run_study(STUDY, tmp_path / "a", runs=tmp_path / "pool")
+    shared = run_study(Study(TINY, {FREEZE: [25, 30]}), tmp_path / "b", runs=tmp_path / "pool")
+    assert shared.runs == tmp_path / "pool"
+    assert len(list((tmp_path / "pool").iterdir())) == 3
+    assert not (tmp_path / "b" / "runs").exists()
+
+
+def test_a_condition_that_fails_does_not_end_the_study(tmp_path, monkeypatch):
+    from cprl import running
+
+    usual = running.evaluate_population
+
+    def fails(experiment, *arguments, **how):
+        if experiment.game.rules.freeze_steps == 5:
+            raise RuntimeError("broken")
+        return usual(experiment, *arguments, **how)
+
+    monkeypatch.setattr(running, "evaluate_population", fails)
+    result = run_study(STUDY, tmp_path)
+    assert [(own.reason, own.state) for own in result.failed] == [("RuntimeError: broken", "failed")]
+    assert state_of(tmp_path / "runs" / result.trials[1].name) == "finished"
+
+
+def test_nothing_is_written_where_a_study_is_refused(tmp_path):
+    for call in (lambda: run_study(3, tmp_path / "x"), lambda: run_study(STUDY, tmp_path / "x", allow="a:B")):
+        with pytest.raises(ValueError, match="allowed: "):
+            call()
+    assert not (tmp_path / "x").exists()
+
+
+def test_a_study_varies_code_of_ones_own_and_a_process_that_knows_nothing_of_it_runs_it(tmp_path):
+    fatigue = Custom("one_road_parts:Fatigue", arguments={"per_step": 0.5})
+    study = Study(replace(TINY, transforms=(fatigue,)), {"transforms.0.arguments.per_step": [0.0, 0.5]})
+    code = (
+        "import pickle, sys; from cprl.studies.trials import run_task; "
+        "print(run_task(pickle.load(sys.stdin.buffer)))"
+    )
+    sent = pickle.dumps(task(tmp_path, study, 1))
+    command = [sys.executable, "-W", "ignore", "-c", code]
+    told = subprocess.run(command, input=sent, capture_output=True, cwd="/", check=True).stdout.decode()
+    assert "state='finished'" in told, told
+    recipe = json.loads(next((tmp_path / "runs").glob("*/recipe.json")).read_text())
+    assert recipe["experiment"]["transforms"][0]["arguments"] == {"per_step": 0.5}

@@ -1,0 +1,31 @@
+"""A study that takes a second: two agents, one replica, episodes of some turns, nothing compiled."""
+
+from dataclasses import replace
+
+from cprl import Experiment, Game, Rules, maps
+from cprl.algorithms import DQN
+from cprl.learners.settings import DQNSettings
+from cprl.population import Learning, Scripted
+
+BOARD = """
+.>A.A
+A.A..
+..A<A
+"""
+GAME = Game(map=maps.parse(BOARD), rules=Rules(episode_steps=20, window_rows=2, window_columns=3))
+SETTINGS = DQNSettings(buffer_size=100, hidden_cells=(4,), learning_starts=4, batch_size=2)
+LEARNING = Learning(DQN(settings=SETTINGS))
+
+TINY = Experiment(
+    name="tiny",
+    game=GAME,
+    agents=(LEARNING, LEARNING),
+    episodes=2,
+    replicas=1,
+    evaluation_episodes=1,
+    engine="eager",
+)
+MIXED = replace(TINY, agents=(LEARNING, Scripted("greedy")))
+
+FREEZE = "game.rules.freeze_steps"
+GAMMA = "agents.*.algorithm.settings.gamma"
