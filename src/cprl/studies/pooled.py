@@ -13,9 +13,9 @@ from cprl.experiment import Experiment
 from cprl.runs.directory import FILE_NAME as RECIPE
 from cprl.runs.directory import read_recipe
 from cprl.studies.conditions import UNNAMED, Condition
+from cprl.studies.naming import named, short_names
 from cprl.studies.paths import ALL, normalised, values_at
 from cprl.studies.sources import REASONS, Design, Lacking, Source, plain_level
-from cprl.studies.study import named
 from cprl.studies.table import WINDOW, StudyTable, table_of
 from cprl.studies.trials import state_of
 
@@ -129,8 +129,7 @@ def _groups(
         values = [_value_at(experiment, own, run) for own in fields]
         key = json.dumps([to_config(own, name) for own, name in zip(values, fields, strict=True)])
         found.setdefault(key, (values, []))[1].append(run)
-    words = [own.rpartition(".")[2] for own in fields]
-    short = {own: word if words.count(word) == 1 else own for own, word in zip(fields, words, strict=True)}
+    short = short_names(fields)
     groups: dict[str, tuple[dict[str, Any], list[Path]]] = {}
     for values, runs in sorted(found.values(), key=lambda own: [_rank(value) for value in own[0]]):
         levels = {name: plain_level(own) for name, own in zip(fields, values, strict=True)}

@@ -5,8 +5,9 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Final
 
+from cprl.studies.naming import level_text
 from cprl.studies.status import Status
-from cprl.studies.study import Study, level_text
+from cprl.studies.study import Study
 from cprl.studies.trials import State, trials_of
 
 REASONS: Final[dict[State, str]] = {
