@@ -1,10 +1,13 @@
-"""Settings of the process in which a training runs."""
+"""Settings of the process in which a training runs, and the type of processor that it runs on."""
 
 import ctypes
 import logging
 import os
+import platform
 import sys
 from contextlib import suppress
+from functools import cache
+from pathlib import Path
 from typing import Final
 
 import torch
@@ -46,6 +49,17 @@ def prepare_process(seed: int) -> None:
     own.setLevel(logging.INFO)
     if not own.handlers:
         own.addHandler(logging.StreamHandler(OUT))
+
+
+@cache
+def cpu() -> str:
+    """The type of this machine's processor; numbers may differ in the last bits on another."""
+    with suppress(OSError):
+        for line in Path("/proc/cpuinfo").read_text(encoding="utf-8", errors="replace").splitlines():
+            name, _, value = line.partition(":")
+            if name.strip() == "model name":
+                return value.strip()
+    return platform.processor() or platform.machine()
 
 
 def _keep_freed_memory() -> None:

@@ -27,6 +27,7 @@ from cprl.runs.directory import (
     refuse_another_run,
     resume_command,
     start_run,
+    write_changed_circumstances,
     write_on_nan,
 )
 from cprl.runs.episodes import EpisodeTable
@@ -222,6 +223,7 @@ def _say_what_changed(directory: Path) -> None:
             soft_wrap=True,
             markup=False,
         )
+        write_changed_circumstances(directory)
 
 
 def _train_and_evaluate(

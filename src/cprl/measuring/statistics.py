@@ -1,15 +1,17 @@
-"""Statistics over replicas: means, bootstrap intervals and paired differences.
+"""Statistics over replicas: means, differences, and their intervals by bootstrap or by Student's t.
 
 A replica is one independent repetition of a whole training. Episodes and agents within a replica depend on
 each other, so the bootstrap resamples replicas, never episodes. Values are float64 [R], one number per
 replica. Inter-quartile means and stratified bootstrap intervals follow R. Agarwal et al., "Deep Reinforcement
-Learning at the Edge of the Statistical Precipice" (2021).
+Learning at the Edge of the Statistical Precipice" (2021). Intervals by t of means over several samples have
+the degrees of freedom of B. L. Welch, "The generalization of 'Student's' problem when several different
+population variances are involved" (1947).
 """
 
 import warnings
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import Any, Final, Literal
+from typing import Any, Final, Literal, get_args
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -20,6 +22,10 @@ from cprl.memory import check_memory
 
 Values = NDArray[np.float64]
 Statistic = Literal["mean", "iqm"]
+Interval = Literal["bca", "t"]
+"""How an interval is computed: "bca", the bias-corrected and accelerated bootstrap, or by percentiles where
+there are several samples or that is undefined; "t", of means alone, by Student's t, which is wider and right
+for few replicas if their values are about normally distributed."""
 
 CONFIDENCE: Final = 0.95
 RESAMPLES: Final = 2000
@@ -28,13 +34,14 @@ _BELOW_ONE: Final = np.nextafter(1.0, 0.0).item()
 
 @dataclass(frozen=True, kw_only=True)
 class Estimate:
-    """A number with its bootstrap interval."""
+    """A number with its interval."""
 
     value: float
     low: float
     high: float
-    """The bounds of the bootstrap interval; NaN for a single replica."""
+    """The bounds of the interval; NaN for a single replica."""
     replicas: int
+    """Of all samples together; of paired differences, the pairs."""
 
     def __str__(self) -> str:
         """The value with its interval, of a single replica the value alone."""
@@ -69,11 +76,12 @@ _STATISTICS: Final[dict[Statistic, Callable[..., Any]]] = {"mean": mean, "iqm": 
 def estimate(
     *strata: ArrayLike,
     statistic: Statistic = "mean",
+    interval: Interval = "bca",
     confidence: float = CONFIDENCE,
     resamples: int = RESAMPLES,
     seed: int = 0,
 ) -> Estimate:
-    """A statistic over replicas with its bootstrap interval; stratified if there are several strata.
+    """A statistic over replicas with its interval; stratified if there are several strata.
 
     Each stratum (a board, an experiment) is resampled separately and has the same weight, whatever its number
     of replicas: the value is the mean of the statistics of all strata.
@@ -81,6 +89,7 @@ def estimate(
     Args:
         strata: float [R] each.
         statistic: "mean", or "iqm" for the inter-quartile mean.
+        interval: "bca", or "t" for means; see `Interval`.
         confidence: The confidence of the interval, between 0 and 1, exclusive.
         resamples: The number of bootstrap resamples.
         seed: The seed of the resampling.
@@ -93,15 +102,69 @@ def estimate(
     if not samples:
         raise ValueError("there are no values; allowed: at least one stratum")
     arguments.choice("statistic", statistic, _STATISTICS)
+    arguments.choice("interval", interval, get_args(Interval))
+    if interval == "t" and statistic != "mean":
+        raise ValueError(f'interval is "t" and statistic is {shown(statistic)}; allowed: "mean", or "bca"')
     resamples, seed = _bootstrap(confidence, resamples, seed, max(map(len, samples)))
     of_one = _STATISTICS[statistic]
 
     def overall(*parts: Values, axis: int = -1) -> Any:
         return sum(of_one(part, axis=axis) for part in parts) / len(parts)
 
-    low, high = _interval(samples, overall, confidence, resamples, seed)
+    if interval == "t":
+        low, high = _t_interval(samples, [1 / len(samples)] * len(samples), confidence)
+    else:
+        low, high = _interval(samples, overall, confidence, resamples, seed)
     replicas = sum(len(sample) for sample in samples)
     return Estimate(value=float(overall(*samples)), low=low, high=high, replicas=replicas)
+
+
+def difference(
+    values: ArrayLike,
+    reference: ArrayLike,
+    *,
+    paired: bool,
+    interval: Interval = "bca",
+    confidence: float = CONFIDENCE,
+    resamples: int = RESAMPLES,
+    seed: int = 0,
+) -> Estimate:
+    """The difference between two means over replicas, with its interval.
+
+    Args:
+        values: float [R].
+        reference: float [R] if paired, else of any number of replicas.
+        paired: Whether replica r of both had the same chance: then the interval is that of the mean of
+            differences; else both are resampled separately, or the interval is Welch's.
+        interval: See `Interval`.
+        confidence: The confidence of the interval, between 0 and 1, exclusive.
+        resamples: The number of bootstrap resamples.
+        seed: The seed of the resampling.
+
+    Raises:
+        ValueError: See `estimate`; for pairs of unequal numbers of replicas.
+    """
+    samples = [_checked(values), _checked(reference)]
+    how: dict[str, Any] = {"confidence": confidence, "resamples": resamples, "seed": seed}
+    if paired:
+        if len(samples[0]) != len(samples[1]):
+            raise ValueError(
+                f"values has {len(samples[0])} replicas and reference {len(samples[1])}; allowed in pairs: "
+                "as many"
+            )
+        return estimate(samples[0] - samples[1], interval=interval, **how)
+    arguments.choice("interval", interval, get_args(Interval))
+    resamples, seed = _bootstrap(confidence, resamples, seed, max(map(len, samples)))
+
+    def overall(own: Values, other: Values, axis: int = -1) -> Any:
+        return own.mean(axis) - other.mean(axis)
+
+    if interval == "t":
+        low, high = _t_interval(samples, [1.0, -1.0], confidence)
+    else:
+        low, high = _interval(samples, overall, confidence, resamples, seed)
+    value = float(overall(samples[0], samples[1]))
+    return Estimate(value=value, low=low, high=high, replicas=sum(map(len, samples)))
 
 
 def curve_interval(
@@ -173,6 +236,27 @@ def _interval(
         if np.isfinite([found.low, found.high]).all():
             return float(found.low), float(found.high)
     return float("nan"), float("nan")
+
+
+def _t_interval(
+    samples: Sequence[Values], weights: Sequence[float], confidence: float
+) -> tuple[float, float]:
+    """The interval of a weighted sum of means by Student's t, with the degrees of freedom of Welch."""
+    from scipy import stats
+
+    if any(len(sample) < 2 for sample in samples):
+        return float("nan"), float("nan")
+    middle = sum(weight * float(own.mean()) for weight, own in zip(weights, samples, strict=True))
+    parts = [
+        weight**2 * float(own.var(ddof=1)) / len(own) for weight, own in zip(weights, samples, strict=True)
+    ]
+    if sum(parts) == 0:
+        return middle, middle
+    freedom = sum(parts) ** 2 / sum(
+        part**2 / (len(own) - 1) for part, own in zip(parts, samples, strict=True)
+    )
+    reach = float(stats.t.ppf((1 + confidence) / 2, freedom)) * sum(parts) ** 0.5
+    return middle - reach, middle + reach
 
 
 def _bootstrap(confidence: float, resamples: int, seed: int, numbers: int) -> tuple[int, int]:

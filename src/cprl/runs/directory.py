@@ -1,4 +1,5 @@
-"""The directory of a run; its `recipe.json` holds the experiment, versions, start time and git commit."""
+"""The directory of a run; its `recipe.json` holds the experiment, versions, start time, git commit and
+the type of processor."""
 
 import platform
 import shlex
@@ -16,6 +17,7 @@ from cprl.arguments import callable_of, texts
 from cprl.arguments import path as path_of
 from cprl.checks import TEXT, checked, shown
 from cprl.config import custom_targets, differences
+from cprl.process import cpu
 from cprl.runs.files import read_json, write_json
 from cprl.runs.lock import FILE_NAME as LOCK_NAME
 from cprl.runs.lock import RunLock
@@ -47,8 +49,8 @@ def start_run(
 
     Returns:
         The directory. Its `recipe.json` holds the recipe, versions, the git commit of the working directory
-        (None outside a checkout; dirty if a tracked file was changed), the time, and the command without
-        `--out` and without the directory of the script.
+        (None outside a checkout; dirty if a tracked file was changed), the type of processor, the time, and
+        the command without `--out` and without the directory of the script.
 
     Raises:
         FileExistsError: if `out` is not empty.
@@ -140,7 +142,7 @@ def write_on_nan(run: Path, on_nan: str) -> None:
 
 
 def changed_circumstances(run: Path) -> list[str]:
-    """What differs now from when a run was started: versions and the git commit; a sentence for each.
+    """What differs now from when a run was started: versions, git commit, processor; a sentence for each.
 
     Numbers may then differ from those of an undisturbed run.
     """
@@ -153,8 +155,18 @@ def changed_circumstances(run: Path) -> list[str]:
     ]
 
 
+def write_changed_circumstances(run: Path) -> None:
+    """Writes into a run's recipe under which versions, git commit and processor it is resumed, if they are
+    not those of its last process."""
+    recipe, now = read_recipe(run), _circumstances()
+    before = recipe.get("resumed") or [recipe]
+    if any(before[-1].get(name) != now[name] for name in now):
+        recipe["resumed"] = [*recipe.get("resumed", []), now]
+        write_json(run / FILE_NAME, recipe)
+
+
 def _circumstances() -> dict[str, Any]:
-    return {"versions": versions(), "git": git_state()}
+    return {"versions": versions(), "git": git_state(), "cpu": cpu()}
 
 
 def resume_command(run: Path, command: Sequence[str] | None = None) -> str:

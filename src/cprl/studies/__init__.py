@@ -10,12 +10,29 @@ Modules, in the order in which one reads them:
     trials       one run of a study, run or resumed, whatever was there
     executors    where trials are run
     execution    run_study: every trial of a study
+    sources      which runs a table is made of, and which are lacking
+    circumstances  versions, commits and processors of runs, and which differ from the rest
+    windows      the episodes of a run as means over windows of them
+    rows         the rows of a table, sorted
+    table        StudyTable: what came out, as one tidy table
+    pooled       the same for any runs at hand, by fields of their experiments
+    comparing    means over replicas, and differences from the reference
+    texts        comparisons in Markdown and in the terminal
+    outcomes     in which phase each replica ends
+    panels       what the figures share
+    by_factor    metrics against a factor
+    by_condition  conditions one below the other
+    courses      the course of the training under each condition
+    diagrams     heat maps and phase diagrams of two factors
+    results      write_results: table, summary and figures of a study
+    table_command  the command cprl table
 """
 
 from cprl.studies.execution import StudyResult, read_study, run_study
 from cprl.studies.executors import InProcess, Processes, Ray
 from cprl.studies.factors import Integers, LogUniform, Uniform
 from cprl.studies.study import Study
+from cprl.studies.table import StudyTable, study_table
 
 __all__ = [
     "InProcess",
@@ -25,7 +42,9 @@ __all__ = [
     "Ray",
     "Study",
     "StudyResult",
+    "StudyTable",
     "Uniform",
     "read_study",
     "run_study",
+    "study_table",
 ]

@@ -6,14 +6,12 @@ Nothing here decides what a study holds. The files of a trial are `<name>.json`,
 
 import json
 import os
-import platform
 import resource
 import socket
 import sys
 import time
 from collections.abc import Iterator, Mapping
 from contextlib import suppress
-from functools import cache
 from pathlib import Path
 from threading import Event, Thread
 from types import TracebackType
@@ -24,6 +22,7 @@ from tensordict import TensorDictBase
 from cprl.compile_clock import CLOCK
 from cprl.experiment import Experiment
 from cprl.measuring.episodes import Episode
+from cprl.process import cpu
 from cprl.runs.files import write_json
 from cprl.training import Training
 
@@ -159,14 +158,3 @@ def peak_bytes() -> int:
     """The largest memory that this process has had, in bytes."""
     peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
     return peak if sys.platform == "darwin" else 1024 * peak
-
-
-@cache
-def cpu() -> str:
-    """The type of this machine's processor."""
-    with suppress(OSError):
-        for line in Path("/proc/cpuinfo").read_text().splitlines():
-            name, _, value = line.partition(":")
-            if name.strip() == "model name":
-                return value.strip()
-    return platform.processor() or platform.machine()

@@ -1,0 +1,214 @@
+"""Conditions compared: the mean of a metric over replicas, and its difference from the reference."""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Any, Final, get_args
+
+import numpy as np
+from numpy.typing import NDArray
+
+from cprl.arguments import choice, integer, object_of, refusal
+from cprl.measuring.statistics import CONFIDENCE, Estimate, Interval, difference, estimate
+from cprl.studies.table import StudyTable
+from cprl.studies.windows import NET, PARTS, TRAINING
+
+LAST: Final = 30
+"""Episodes at the end of a training that are compared, unless something else is asked for."""
+METRICS: Final = (
+    "collective_return",
+    NET,
+    "equality",
+    "sustainability",
+    "survival_steps",
+    "peacefulness",
+)
+"""Metrics that are compared, unless others are asked for, where a table has them."""
+
+Values = NDArray[np.float64]
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Compared:
+    """A metric under one condition."""
+
+    condition: str
+    levels: Mapping[str, Any]
+    values: Mapping[int, float]
+    """The mean over its episodes by the number of the replica; NaN where it is defined in none."""
+    episodes: int
+    """Episodes of all replicas together."""
+    undefined: int
+    """Episodes in which the metric is undefined, which are no part of a mean."""
+    estimate: Estimate | None
+    """Over the replicas in which it is defined; None if there are none."""
+    difference: Estimate | None
+    """From the reference; None of the reference itself, and where there are no replicas to compare."""
+
+    @property
+    def replicas(self) -> int:
+        """How many of its replicas are in the table."""
+        return len(self.values)
+
+    @property
+    def defined(self) -> Values:
+        """The values of the replicas in which it is defined, [R]."""
+        found = np.array(list(self.values.values()), dtype=np.float64)
+        return found[~np.isnan(found)]
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Comparison:
+    """A metric under every condition of a table, in order."""
+
+    metric: str
+    part: str
+    last: tuple[int, int]
+    """The smallest and the largest number of episodes of a replica that the values are means of: those at the
+    end of a training, or all of another part."""
+    interval: Interval
+    is_paired: bool
+    reference: str
+    conditions: tuple[Compared, ...]
+
+    @cached_property
+    def by_name(self) -> dict[str, Compared]:
+        """The conditions by name."""
+        return {own.condition: own for own in self.conditions}
+
+    @property
+    def episodes_text(self) -> str:
+        """Which episodes are compared, e.g. "the last 30 episodes of training"."""
+        low, high = self.last
+        number = f"{high}" if low == high else f"{low} to {high}"
+        if self.part == TRAINING:
+            return f"the last {number} episodes of training"
+        return (
+            f"{number} fresh episodes of {'random play' if self.part == 'random' else 'the trained agents'}"
+        )
+
+    @property
+    def differences_text(self) -> str:
+        """How differences are computed."""
+        how = "paired by replica" if self.is_paired else "not paired: each condition has chance of its own"
+        return f"differences from {self.reference}, {how}"
+
+    @property
+    def interval_text(self) -> str:
+        """How intervals are computed."""
+        if self.interval == "t":
+            return f"{CONFIDENCE:.0%} intervals over replicas by Student's t"
+        kind = "BCa" if self.is_paired else "BCa; of differences percentiles"
+        return f"{CONFIDENCE:.0%} intervals by bootstrap of the replicas ({kind})"
+
+
+def compare(
+    table: StudyTable,
+    metric: str,
+    *,
+    part: str = TRAINING,
+    last: int = LAST,
+    interval: Interval = "bca",
+) -> Comparison:
+    """A metric under every condition, with intervals over replicas.
+
+    Args:
+        table: the table.
+        metric: one of its metrics.
+        part: "training", "evaluation" or "random".
+        last: of training: episodes at its end; those of whole windows.
+        interval: "bca" or "t", see `cprl.measuring.statistics.Interval`.
+
+    Raises:
+        ValueError: for a metric that the table lacks, for fewer episodes than a window, and for what does not
+            fit.
+    """
+    object_of("table", table, StudyTable, "a StudyTable")
+    if metric not in table.metrics:
+        raise refusal("metric", metric, ", ".join(table.metrics) or "none, as the table has no finished run")
+    choice("part", part, PARTS)
+    choice("interval", interval, get_args(Interval))
+    integer("last", last, 1)
+    if part == TRAINING and last < table.window:
+        raise refusal("last", last, f"at least {table.window}, the episodes of a window of the table")
+    asked = metric, part, last, interval
+    if asked not in table.comparisons:
+        table.comparisons[asked] = _compared(table, *asked)
+    own: Comparison = table.comparisons[asked]
+    return own
+
+
+def _compared(table: StudyTable, metric: str, part: str, last: int, interval: Interval) -> Comparison:
+    found = {name: _of_condition(table, name, metric, part, last) for name in table.design.conditions}
+    lengths = [length for *_, length in found.values() if length]
+    reference, is_paired = table.design.reference, table.design.is_paired
+    compared = []
+    for name, (values, undefined, length) in found.items():
+        defined = [own for own in values.values() if not np.isnan(own)]
+        other = None
+        if name != reference:
+            other = _difference(values, found[reference][0], is_paired, interval)
+        compared.append(
+            Compared(
+                condition=name,
+                levels=table.design.conditions[name],
+                values=values,
+                episodes=length * len(values),
+                undefined=undefined,
+                estimate=estimate(defined, interval=interval) if defined else None,
+                difference=other,
+            )
+        )
+    return Comparison(
+        metric=metric,
+        part=part,
+        last=(min(lengths, default=0), max(lengths, default=0)),
+        interval=interval,
+        is_paired=is_paired,
+        reference=reference,
+        conditions=tuple(compared),
+    )
+
+
+def metrics_of(table: StudyTable, metrics: Sequence[str] = ()) -> tuple[str, ...]:
+    """The metrics asked for, by default those of `METRICS` that a table has.
+
+    Raises:
+        ValueError: for one that the table lacks.
+    """
+    for own in metrics:
+        if own not in table.metrics:
+            raise refusal("metric", own, ", ".join(table.metrics))
+    return tuple(metrics) or tuple(own for own in METRICS if own in table.metrics)
+
+
+def _of_condition(
+    table: StudyTable, condition: str, metric: str, part: str, last: int
+) -> tuple[dict[int, float], int, int]:
+    """The value of each replica, undefined episodes of all, and the episodes of each."""
+    rows = table.values(condition, metric, part)
+    if rows is None:
+        return {}, 0, 0
+    lengths = rows["window_episodes"]
+    ends = int((rows["episode"] + lengths).max())
+    kept = rows["episode"] >= ends - last if part == TRAINING else np.ones(len(lengths), bool)
+    counts = lengths[kept] - rows["undefined"][:, kept]
+    sums = np.where(counts > 0, rows["value"][:, kept], 0.0) * counts
+    with np.errstate(invalid="ignore"):
+        means = sums.sum(1) / counts.sum(1)
+    values = dict(zip(rows["replica"].tolist(), means.tolist(), strict=True))
+    return values, int(rows["undefined"][:, kept].sum()), int(lengths[kept].sum())
+
+
+def _difference(
+    values: Mapping[int, float], reference: Mapping[int, float], is_paired: bool, interval: Interval
+) -> Estimate | None:
+    if is_paired:
+        both = [own for own in values if own in reference]
+        pairs = np.array([(values[own], reference[own]) for own in both], dtype=np.float64).reshape(-1, 2)
+        pairs = pairs[~np.isnan(pairs).any(1)]
+        return difference(*pairs.T, paired=True, interval=interval) if len(pairs) else None
+    samples = [[x for x in own.values() if not np.isnan(x)] for own in (values, reference)]
+    if not all(samples):
+        return None
+    return difference(samples[0], samples[1], paired=False, interval=interval)

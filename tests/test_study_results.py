@@ -1,0 +1,353 @@
+"""What a study's table says: means, differences, phases, figures and the summary; numbers worked by hand."""
+
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+from PIL import Image
+from study_runs import EXPERIMENT, TIME_OUT, write_run, write_study
+
+from cprl import Study, cli
+from cprl.measuring.statistics import difference, estimate
+from cprl.studies.by_condition import by_condition
+from cprl.studies.by_factor import _Axis, by_factor
+from cprl.studies.comparing import compare, metrics_of
+from cprl.studies.courses import courses
+from cprl.studies.diagrams import grids, heat_map, phase_diagram
+from cprl.studies.factors import Uniform
+from cprl.studies.outcomes import ending, endings
+from cprl.studies.panels import is_logarithmic, is_numeric
+from cprl.studies.results import write_results
+from cprl.studies.sources import design_of, sources_of
+from cprl.studies.table import StudyTable, study_table
+from cprl.studies.texts import cells, markdown
+from cprl.studies.trials import trials_of
+
+SEES = "game.rules.window_rows"
+NAN = float("nan")
+PAIRED = Study(EXPERIMENT, {TIME_OUT: [5, 25]}, name="pairs", replicas=3)
+GRID = Study(EXPERIMENT, {TIME_OUT: [1, 5, 25], SEES: [3, 5]}, name="grid", question="Why?", replicas=3)
+
+
+def harvest(condition, replica, number):
+    """Replicas get 0, 100 and 200; with a time-out of 25, 3, 4 and 8 more."""
+    more = (3, 4, 8)[replica] if condition.levels[TIME_OUT] == 25 else 0
+    return 100 * replica + more + (number if number >= 0 else 0)
+
+
+@pytest.fixture(scope="module")
+def pairs(tmp_path_factory):
+    return study_table(PAIRED, write_study(PAIRED, tmp_path_factory.mktemp("pairs"), harvest))
+
+
+@pytest.fixture(scope="module")
+def grid_runs(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("grid")
+    return write_study(GRID, folder, harvest, but=("freeze_steps=5, window_rows=5",))
+
+
+# Statistics
+
+
+def test_an_interval_by_t_is_that_of_the_tables():
+    # 1, 2, 3, 4: mean 2.5, standard error sqrt(5/3) / 2 = 0.6455, t of 3 degrees of freedom 3.1824.
+    found = estimate([1, 2, 3, 4], interval="t")
+    assert (found.value, found.replicas) == (2.5, 4)
+    assert (found.low, found.high) == pytest.approx((2.5 - 2.0543, 2.5 + 2.0543), abs=1e-4)
+    assert np.isnan(estimate([3.0], interval="t").low)
+    same = estimate([2.0, 2.0], interval="t")
+    assert (same.low, same.high) == (2.0, 2.0)
+
+
+def test_a_paired_difference_is_far_narrower_than_one_of_two_samples():
+    values, reference = [3.0, 104.0, 208.0], [0.0, 100.0, 200.0]
+    pairs = difference(values, reference, paired=True, interval="t")
+    # The differences are 3, 4 and 8: mean 5, standard error sqrt(7 / 3) = 1.5275, t of 2 is 4.3027.
+    assert pairs.value == 5
+    assert (pairs.low, pairs.high) == pytest.approx((5 - 6.5724, 5 + 6.5724), abs=1e-3)
+    apart = difference(values, reference, paired=False, interval="t")
+    # Welch: variances 10508.3 and 10000 of 3 each, standard error 82.68; 3.9976 degrees of freedom, t 2.7770.
+    assert (apart.value, apart.replicas) == (5, 6)
+    assert apart.high - 5 == pytest.approx(229.6, abs=0.2)
+    wide, narrow = (difference(values, reference, paired=own) for own in (False, True))
+    assert wide.high - wide.low > 10 * (narrow.high - narrow.low)
+
+
+@pytest.mark.parametrize(
+    ("call", "message"),
+    [
+        (
+            lambda: difference([1, 2], [1], paired=True),
+            "values has 2 replicas and reference 1; allowed in pairs",
+        ),
+        (lambda: estimate([1, 2], interval="z"), "interval is 'z'; allowed: bca, t"),
+        (
+            lambda: estimate([1, 2], interval="t", statistic="iqm"),
+            r'interval is "t" and statistic is \'iqm\'',
+        ),
+    ],
+)
+def test_statistics_that_do_not_fit_are_refused(call, message):
+    with pytest.raises(ValueError, match=message):
+        call()
+
+
+# Comparisons
+
+
+def test_conditions_are_compared_by_the_last_episodes_and_pairs_of_replicas(pairs):
+    found = compare(pairs, "collective_return", interval="t")
+    reference, other = found.conditions
+    # Episodes 10 to 39 have the mean 24.5.
+    assert reference.values == {0: 24.5, 1: 124.5, 2: 224.5}
+    assert other.values == {0: 27.5, 1: 128.5, 2: 232.5}
+    assert (found.reference, reference.difference) == ("freeze_steps=5", None)
+    assert other.difference.value == 5
+    assert other.difference.low == pytest.approx(5 - 6.5724, abs=1e-3)
+    assert found.episodes_text == "the last 30 episodes of training"
+    assert found.differences_text == "differences from freeze_steps=5, paired by replica"
+    assert compare(pairs, "collective_return", last=10).conditions[0].values[0] == 34.5
+    evaluated = compare(pairs, "collective_return", part="evaluation")
+    assert evaluated.conditions[1].values == {0: 3, 1: 104, 2: 208}
+    assert evaluated.episodes_text == "3 fresh episodes of the trained agents"
+
+
+def test_without_pairing_the_difference_is_that_of_two_samples_and_says_so(tmp_path):
+    study = Study(EXPERIMENT, {TIME_OUT: [5, 25]}, name="apart", replicas=3, pairing=False)
+    table = study_table(study, write_study(study, tmp_path, harvest))
+    found = compare(table, "collective_return", interval="t")
+    assert found.conditions[1].difference.replicas == 6
+    assert found.conditions[1].difference.high > 200
+    assert "not paired" in cells([found], "differences").heading
+
+
+def test_replicas_without_a_value_are_counted_and_pairs_are_those_that_both_have(tmp_path):
+    def equality(replica, number):
+        return NAN if replica == 1 or number == 39 else 0.25
+
+    study = Study(EXPERIMENT, {TIME_OUT: [5, 25]}, name="gaps", replicas=3)
+    table = study_table(study, write_study(study, tmp_path, harvest, equality=equality))
+    found = compare(table, "equality")
+    own = found.conditions[1]
+    # Of the last 30 episodes replica 1 has no value in any, the others have none in the last one: 30 + 2.
+    assert (own.replicas, len(own.defined), own.episodes, own.undefined) == (3, 2, 90, 32)
+    assert (own.estimate.value, own.estimate.replicas, own.difference.replicas) == (0.25, 2, 2)
+    text = "\n".join(markdown(cells([found])))
+    assert "| freeze_steps=25 | 3 | 0.250 [0.250, 0.250], undefined in 32 of 90 episodes |" in text
+    assert "(of 2)" in "\n".join(markdown(cells([found], "differences")))
+
+
+def test_a_table_in_markdown_has_replicas_intervals_and_differences_that_exclude_zero_in_bold(pairs):
+    found = [compare(pairs, own, interval="t") for own in metrics_of(pairs, ["collective_return"])]
+    levels, differences = cells(found), cells(found, "differences")
+    assert levels.head == ["condition", "replicas", "collective return, apples"]
+    assert levels.heading == (
+        "The last 30 episodes of training; means over replicas; 95% intervals over replicas by Student's t."
+    )
+    assert [row[:2] for row in levels.rows] == [["freeze_steps=5", "3"], ["freeze_steps=25", "3"]]
+    assert differences.rows == [["freeze_steps=25", "3", "+5.0 [-1.6, +11.6]"]]
+    bca = cells([compare(pairs, "collective_return")], "differences").rows[0][2]
+    assert bca == "**+5.00 [+3.33, +8.00]**"  # of resampled means of 3, 4 and 8
+
+
+@pytest.mark.parametrize(
+    ("how", "message"),
+    [
+        ({"metric": "wealth"}, "metric is 'wealth'; allowed: collective_return, "),
+        ({"part": "sleep"}, "part is 'sleep'; allowed: training, evaluation, random"),
+        ({"interval": "z"}, "interval is 'z'; allowed: bca, t"),
+        ({"last": 5}, "last is 5; allowed: at least 10, the episodes of a window"),
+    ],
+)
+def test_comparisons_that_do_not_fit_are_refused(pairs, how, message):
+    with pytest.raises(ValueError, match=message):
+        compare(pairs, **{"metric": "collective_return", **how})
+
+
+# Phases
+
+
+@pytest.mark.parametrize(
+    ("course", "agents", "label"),
+    [
+        # Random play gets 100; the peak is 400, a third of its lead over random play is 100.
+        ([100] * 40, 4, "no better"),
+        ([100] * 20 + [400] * 60, 4, "harvesting"),
+        ([100] * 20 + [400] * 20 + [290] * 40, 4, "decline"),
+        ([100] * 20 + [400] * 20 + [310] * 40, 4, "harvesting"),
+        ([100] * 20 + [400] * 20 + [90] * 40, 4, "tragedy"),
+        ([100] * 20 + [400] * 20 + [90] * 40, 1, "decline"),
+        # From 80 a quarter of the way back to 400 is 160.
+        ([100] * 20 + [400] * 20 + [80] * 40 + [170] * 40, 4, "recovery"),
+        ([100] * 20 + [400] * 20 + [80] * 40 + [150] * 40, 4, "decline"),
+    ],
+)
+def test_a_short_training_ends_in_the_phase_that_its_last_episodes_say(course, agents, label):
+    assert ending(np.array(course, float), random=100.0, agents=agents) == label
+
+
+def test_the_most_frequent_phase_of_a_condition_is_counted_over_replicas(tmp_path):
+    def fall(condition, replica, number):
+        return 400 if number < 20 or replica == 0 else 10
+
+    how = {"factors": {TIME_OUT: [5, 25]}, "replicas": 3, "name": "falls"}
+    study = Study(EXPERIMENT, **how)
+    write_study(study, tmp_path, fall, random=100.0, but=("freeze_steps=25",))
+    # The last 30 of 40 episodes include 10 of the peak: their mean is 140, above 95.
+    found = endings(sources_of(study, tmp_path)[0])
+    assert found.most_frequent("freeze_steps=5") == ("decline", 2, 3)
+    assert dict(found.labels["freeze_steps=5"]) == {0: "harvesting", 1: "decline", 2: "decline"}
+    assert found.most_frequent("freeze_steps=25") is None
+
+
+# Figures
+
+
+def size(path):
+    with Image.open(path) as image:
+        assert len(set(image.convert("L").resize((64, 64)).tobytes())) > 8, "it is not empty"
+        return image.size
+
+
+def test_figures_of_a_grid_are_drawn_with_a_condition_that_has_no_run(grid_runs, tmp_path):
+    table = study_table(GRID, grid_runs)
+    found = endings(sources_of(GRID, grid_runs)[0])
+    (pair,) = grids(table.design)
+    assert pair == (TIME_OUT, SEES)
+    for name, draw in {
+        "factor": lambda path: by_factor(table, TIME_OUT, path),
+        "levels": lambda path: by_condition(table, path),
+        "differences": lambda path: by_condition(table, path, kind="differences"),
+        "courses": lambda path: courses(table, path),
+        "map": lambda path: heat_map(table, pair, path),
+        "bars": lambda path: phase_diagram(table, found, path),
+        "squares": lambda path: phase_diagram(table, found, path, factors=pair),
+    }.items():
+        width, height = size(draw(tmp_path / f"{name}.png"))
+        assert min(width, height) > 300
+
+
+def test_random_draws_are_drawn_as_points_and_have_no_heat_map(tmp_path):
+    factors = {"agents.*.algorithm.settings.gamma": Uniform(0.5, 0.9), TIME_OUT: [5, 25]}
+    study = Study(EXPERIMENT, factors, draws=4, name="draws", replicas=1)
+    table = study_table(study, write_study(study, tmp_path / "runs", harvest))
+    assert grids(table.design) == {}
+    size(by_factor(table, "agents.*.algorithm.settings.gamma", tmp_path / "gamma.png"))
+    with pytest.raises(ValueError, match="allowed: none, as the conditions are no grid of two factors"):
+        heat_map(table, (TIME_OUT, "agents.*.algorithm.settings.gamma"), tmp_path / "map.png")
+
+
+def test_numbers_that_are_far_apart_stand_on_a_logarithmic_axis_and_names_on_none():
+    assert is_logarithmic([1, 5, 31])
+    assert not is_logarithmic([1, 5, 30])
+    assert not is_logarithmic([0, 100])
+    assert is_numeric([1, 2.5])
+    assert not is_numeric([1, "two"])
+    assert not is_numeric([True, False])
+
+
+def test_levels_that_are_too_close_for_their_names_stand_at_equal_distances():
+    def axis(levels):
+        study = Study(EXPERIMENT, {"agents.*.algorithm.settings.gamma": levels}, name="axis")
+        return _Axis.of("agents.*.algorithm.settings.gamma", study_table(study, Path("none")))
+
+    crowded = axis([0.5, 0.95, 0.99, 0.995])
+    assert crowded.places == {0.5: 0, 0.95: 1, 0.99: 2, 0.995: 3}
+    assert "equal distances" in crowded.title
+    assert axis([0.5, 0.7, 0.9]).places == {0.5: 0.5, 0.7: 0.7, 0.9: 0.9}
+
+
+def test_a_factor_with_names_is_refused_as_an_axis_of_numbers(tmp_path):
+    study = Study(EXPERIMENT, {"word": {"a": {TIME_OUT: 5}, "b": {TIME_OUT: 25}}}, name="words")
+    table = study_table(study, write_study(study, tmp_path / "runs", lambda *_: 1))
+    with pytest.raises(ValueError, match="factor is 'word'; allowed: none, as no factor has levels"):
+        by_factor(table, "word", tmp_path / "word.png")
+
+
+def test_other_factors_are_held_at_the_levels_of_the_reference():
+    study = Study(EXPERIMENT, {TIME_OUT: [1, 5], SEES: [3, 5], "update_every": [1, 2]}, name="three")
+    found = grids(design_of(study))
+    assert list(found) == [(TIME_OUT, SEES), (TIME_OUT, "update_every"), (SEES, "update_every")]
+    assert all("update_every=1" in name for name in found[TIME_OUT, SEES].values())
+    assert len(found[TIME_OUT, SEES]) == 4
+
+
+# What is written
+
+
+def test_the_results_of_a_study_are_a_table_a_summary_and_figures(grid_runs, tmp_path):
+    table = write_results(GRID, tmp_path, grid_runs, again="cprl sweep grid.py")
+    figures = {path.name for path in (tmp_path / "figures").iterdir()}
+    pair = "game_rules_freeze_steps_game_rules_window_rows"
+    assert figures == {
+        "by_game_rules_freeze_steps.png", "by_game_rules_window_rows.png", "levels.png", "courses.png",
+        "phases.png", "differences.png", f"map_{pair}_collective_return.png", f"map_{pair}_equality.png",
+        f"phases_{pair}.png",
+    }  # fmt: skip
+    assert StudyTable.read(tmp_path / "table.parquet").summary == table.summary
+    text = (tmp_path / "summary.md").read_text()
+    assert "**Question.** Why?" in text
+    (lacking,) = table.lacking
+    assert f"- {lacking}" in text
+    assert "This line runs what is lacking: `cprl sweep grid.py`" in text
+    assert "| freeze_steps=25, window_rows=5 | 3 | 130" in text
+    assert all(f"(figures/{name})" in text for name in figures)
+    assert not list(tmp_path.rglob("*.partial"))
+
+
+def test_results_are_written_again_over_earlier_ones_and_none_of_those_is_left(grid_runs, tmp_path):
+    (tmp_path / "figures").mkdir()
+    (tmp_path / "figures" / "map_old.png").write_bytes(b"")
+    (tmp_path / "figures" / "mine.png").write_bytes(b"")
+    study = Study(EXPERIMENT, {TIME_OUT: [5]}, name="one", replicas=3)
+    write_study(study, tmp_path / "runs", harvest)
+    first = write_results(study, tmp_path, tmp_path / "runs")
+    before = (tmp_path / "summary.md").read_bytes(), (tmp_path / "table.parquet").read_bytes()
+    write_results(study, tmp_path, tmp_path / "runs")
+    assert before == ((tmp_path / "summary.md").read_bytes(), (tmp_path / "table.parquet").read_bytes())
+    assert {path.name for path in (tmp_path / "figures").iterdir()} == {
+        "levels.png", "courses.png", "phases.png", "mine.png",
+    }  # fmt: skip
+    assert first.lacking == ()
+
+
+def test_a_study_without_a_finished_run_has_a_summary_that_says_so(tmp_path):
+    write_results(GRID, tmp_path, tmp_path / "runs")
+    text = (tmp_path / "summary.md").read_text()
+    assert "grid: 0 replicas of 0 of 6 conditions, 0 rows; 6 runs are not in it." in text
+    assert text.count("was not begun") == 6
+    assert not (tmp_path / "figures").exists()
+
+
+def test_the_summary_of_runs_under_other_versions_says_so(tmp_path, monkeypatch):
+    monkeypatch.setattr("cprl.studies.results._draw", lambda *_: iter(()))
+    for nth, trial in enumerate(trials_of(PAIRED)):
+        write_run(tmp_path / "runs" / trial.name, trial.experiment, lambda *_: 1, cpu=("Xeon", "Epyc")[nth])
+    write_results(PAIRED, tmp_path, tmp_path / "runs")
+    text = (tmp_path / "summary.md").read_text()
+    assert "- The runs were made under more than one processor: Xeon in 1 run; Epyc in 1 run" in text
+
+
+# The command line
+
+
+def test_cprl_table_prints_any_runs_by_a_field_and_writes_them(tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    write_study(PAIRED, Path("runs"), harvest)
+    command = ["cprl", "table", "runs", "--by", "game.rules.freeze-steps", "--metric", "collective_return"]
+    for out in ("table.parquet", "table.md"):
+        monkeypatch.setattr(sys, "argv", [*command, "--out", out])
+        cli.main()
+    printed = capsys.readouterr().out
+    assert "+5.00 [+3.33, +8.00]" in printed
+    assert "2 runs by game.rules.freeze_steps: 6 replicas of 2 of 2 conditions" in printed
+    assert len(StudyTable.read("table.parquet").rows) > 0
+    assert "| freeze_steps=25 | 3 | **+5.00 [+3.33, +8.00]** |" in Path("table.md").read_text()
+    for out, message in (
+        ("table.md", "is not overwritten"),
+        ("a.csv", "a name that ends in .parquet or .md"),
+    ):
+        monkeypatch.setattr(sys, "argv", [*command, "--out", out])
+        with pytest.raises(SystemExit, match=message):
+            cli.main()
