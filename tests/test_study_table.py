@@ -228,6 +228,22 @@ def test_levels_that_are_no_numbers_are_texts_and_a_column_has_no_name_twice(tmp
     assert len(set(table.rows.column_names)) == len(table.rows.column_names)
 
 
+def test_conditions_that_words_do_not_tell_apart_are_numbered_and_not_merged(tmp_path):
+    agent = EXPERIMENT.agents[0]
+    settings = replace(agent.algorithm.settings, gamma=0.5)
+    other = replace(agent, algorithm=replace(agent.algorithm, settings=settings))
+    study = Study(EXPERIMENT, {"agents": [(agent, agent), (other, other)]}, name="alike")
+    gammas = {own.checksum: nth for nth, own in enumerate(study.all_conditions)}
+    write_study(study, tmp_path, lambda condition, *_: gammas[condition.checksum])
+    table = study_table(study, tmp_path)
+    first, second = table.design.conditions
+    assert second == f"{first} #2"
+    assert table.design.conditions[second]["agents"] == f"{table.design.conditions[first]['agents']} #2"
+    for nth, name in enumerate((first, second)):
+        rows = rows_of(table, condition=name, metric="collective_return", part="evaluation")
+        assert [own["value"] for own in rows] == [nth, nth]
+
+
 # Any runs at hand
 
 
