@@ -18,7 +18,9 @@ from cprl.commandline import RunOptions, parse, recipe_main
 from cprl.custom import Custom
 from cprl.flags import applied, docs, flags_of
 from cprl.institutions import GraduatedSanctions, Quota
+from cprl.networks import MLP
 from cprl.population import Learning, Scripted, Team
+from cprl.preferences import Exchange
 from cprl.runs.directory import start_run
 
 ROOT = Path(__file__).parents[1]
@@ -161,7 +163,12 @@ def test_help_lists_the_recipes_own_arguments_first_and_equal_agents_once(capsys
     said = capsys.readouterr().out
     words = " ".join(word for word in said.split() if word != "│")
     assert "Two agents that learn alike, one that does otherwise" in words
-    assert "the kind of an agent or of its algorithm" in words
+    assert (
+        "What is not listed cannot be changed on the command line, but in a copy of the recipe: the" in words
+    )
+    assert (
+        "the kind of an agent (Learning, Team, Scripted, Frozen), of its algorithm (DQN, PPO and so" in words
+    )
     places = [
         words.index(f"--{name} ") for name in ("spare", "out", "episodes", "game.map", "agents.0.reward")
     ]
@@ -171,6 +178,24 @@ def test_help_lists_the_recipes_own_arguments_first_and_equal_agents_once(capsys
     assert "--callbacks" not in words
     assert "a number of its own. (default: 3)" in words
     assert f"{docs(cprl.Rules)['episode_steps']} (default: 1000)" in words
+
+
+def test_a_value_of_several_kinds_has_the_fields_of_the_kind_that_it_is_and_no_subcommands(capsys):
+    first = Learning(DQN(network=MLP(hidden_cells=(8,))), reward=Exchange(0.5))
+    mixed = replace(experiment(), agents=[first, *experiment().agents[1:]])
+    given, _ = read(
+        "--agents.0.reward.share 0.1 --agents.0.algorithm.network.hidden-cells 4 4", lambda: mixed
+    )
+    changed = Learning(DQN(network=MLP(hidden_cells=(4, 4))), reward=Exchange(0.1))
+    assert given.agents == (changed, *mixed.agents[1:])
+    with pytest.raises(SystemExit):
+        read("--help", lambda: mixed)
+    said = capsys.readouterr().out
+    assert "subcommands" not in said
+    assert "--agents.1.reward {individual,team}" in said
+    with pytest.raises(SystemExit) as refused:
+        read("--agents.0.reward team", lambda: mixed)
+    assert refused.value.code == 2
 
 
 def test_a_board_is_given_by_its_name_and_a_drawing_stays():

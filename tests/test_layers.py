@@ -58,6 +58,8 @@ PACKAGES = (
     "reporting",
     "flags",
     "commandline",
+    "studies_options",
+    "studies_cli",
     "cli",
 )
 TO_COME = ("theory",)

@@ -49,6 +49,8 @@ Each imports only from those above it:
     reporting    finished runs beside the published study
     flags        the fields of an experiment as flags
     commandline  recipe_main: the command line of a recipe
+    studies_options  how a study is run, as options of a command line
+    studies_cli  cprl sweep, and study_main: the command line of a recipe of a study
     cli          the command cprl
 """
 
@@ -73,6 +75,7 @@ if TYPE_CHECKING:
     from cprl.running import run
     from cprl.stored import load
     from cprl.studies import Study, run_study
+    from cprl.studies_cli import study_main
 
     __version__: str
 
@@ -95,6 +98,7 @@ __all__ = [
     "recipe_main",
     "run",
     "run_study",
+    "study_main",
     "train",
 ]
 
@@ -108,6 +112,7 @@ _IMPORTED_WHEN_USED: Final = {
     "run": "cprl.running",
     "run_study": "cprl.studies",
     "Study": "cprl.studies",
+    "study_main": "cprl.studies_cli",
 }
 """Where these names stand; with them come the viewer and all that is recorded, half a second of import."""
 

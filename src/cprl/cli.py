@@ -35,6 +35,7 @@ from cprl.runs.directory import read_recipe
 from cprl.runs.export import export_results
 from cprl.runs.labelled import refuse_to_write_over, write_table
 from cprl.studies.table_command import runs_table
+from cprl.studies_cli import sweep
 from cprl.viewer.page import Page, has_display
 from cprl.viewer.streams import viewer
 
@@ -335,6 +336,10 @@ def main() -> None:
     if sys.argv[1:] == ["--version"]:
         say(f"cprl {version('cprl')}")
         return
+    if sys.argv[1:2] == ["sweep"]:
+        with in_a_sentence("cprl sweep"):
+            sweep(sys.argv[2:])
+        return
     with in_a_sentence("cprl"):
         tyro.extras.subcommand_cli_from_dict(
             {
@@ -346,6 +351,7 @@ def main() -> None:
                 "export": export,
                 "evaluate": evaluate,
                 "crossplay": crossplay,
+                "sweep": sweep,
                 "table": runs_table,
             },
             description=__doc__,

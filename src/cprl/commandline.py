@@ -10,7 +10,7 @@ from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Any, Final
+from typing import Annotated, Any, Final, TypeVar
 
 import tyro
 
@@ -20,6 +20,8 @@ from cprl.experiment import Experiment
 from cprl.finite import NotFiniteError
 from cprl.flags import applied, flags_of
 from cprl.output import say
+
+OptionsT = TypeVar("OptionsT")
 
 _OLD_WORDS: Final = {
     "--go-on": ("--resume",),
@@ -32,8 +34,10 @@ _OLD_WORDS: Final = {
 
 _NOTE: Final = (
     "Every value of the experiment below can be changed by its place. Agents that equal one before are not "
-    "listed; they have the same arguments by their own number. What is not listed at all is changed in a "
-    "copy of the recipe: the kind of an agent or of its algorithm, transforms, callbacks, drawn boards."
+    "listed; they have the same arguments by their own number. What is not listed cannot be changed on the "
+    "command line, but in a copy of the recipe: the kind of an agent (Learning, Team, Scripted, Frozen), of "
+    "its algorithm (DQN, PPO and so on), of its network and of what it wants; institutions that are not "
+    "there, transforms, callbacks, drawn boards."
 )
 
 
@@ -122,27 +126,48 @@ def parse(
             a field of the experiment.
         SystemExit: for `--help`, and for an argument that is unknown or of another type.
     """
+    return parse_with(make_experiment, command[1:], _OPTIONS, program=Path(command[0]).name)
+
+
+def parse_with(
+    make_experiment: Callable[..., Experiment],
+    words: Sequence[str],
+    options: OptionsT,
+    *,
+    program: str,
+    note: str = "",
+) -> tuple[Experiment, OptionsT]:
+    """Like `parse`, with options of another kind.
+
+    Args:
+        make_experiment: gives the experiment.
+        words: what stands after the program.
+        options: a dataclass whose fields become flags, with their values as defaults.
+        program: what stands before these words, for messages.
+        note: what `--help` says after the recipe's own text.
+    """
     callable_of("make_experiment", make_experiment, "a function that gives an Experiment")
-    script, given = Path(command[0]).name, _in_todays_words(command[1:])
-    _check_names(make_experiment)
+    given = _in_todays_words(words)
+    _check_names(make_experiment, options)
     made, _ = tyro.cli(
-        make_experiment, args=given, prog=script, return_unknown_args=True, add_help=False, config=_CONFIG
+        make_experiment, args=given, prog=program, return_unknown_args=True, add_help=False, config=_CONFIG
     )
     checked("what the recipe makes", made, instance(Experiment, "an Experiment"))
     kind, default = flags_of(made, all_agents=not {"-h", "--help"} & set(given))
+    options_kind: Any = type(options)
 
     def read(
         own: Annotated[Any, tyro.conf.arg(name="", constructor=make_experiment)],
-        options: Annotated[RunOptions, tyro.conf.arg(name="")] = _OPTIONS,
+        options: Annotated[options_kind, tyro.conf.arg(name="")] = options,
         experiment: Annotated[kind, tyro.conf.arg(name="")] = default,  # type: ignore[valid-type]
-    ) -> tuple[Any, RunOptions]:
+    ) -> tuple[Any, Any]:
         return experiment, options
 
-    flags, options = tyro.cli(
-        read, args=given, prog=script, description=_description(make_experiment), config=_CONFIG
+    flags, read_options = tyro.cli(
+        read, args=given, prog=program, description=_description(make_experiment, note), config=_CONFIG
     )
     experiment: Experiment = applied(made, flags)
-    return experiment, options
+    return experiment, read_options
 
 
 _LONGEST: Final = 1500
@@ -159,8 +184,12 @@ def _in_todays_words(given: Sequence[str]) -> list[str]:
     return words
 
 
-def _check_names(make_experiment: Callable[..., Experiment]) -> None:
-    taken = {*Experiment.__dataclass_fields__, *RunOptions.__dataclass_fields__}
+def _check_names(make_experiment: Callable[..., Experiment], options: Any) -> None:
+    taken = {
+        *Experiment.__dataclass_fields__,
+        *RunOptions.__dataclass_fields__,
+        *options.__dataclass_fields__,
+    }
     for name in inspect.signature(make_experiment).parameters:
         if name in taken:
             raise ValueError(
@@ -169,6 +198,6 @@ def _check_names(make_experiment: Callable[..., Experiment]) -> None:
             )
 
 
-def _description(make_experiment: Callable[..., Experiment]) -> str:
+def _description(make_experiment: Callable[..., Experiment], note: str) -> str:
     text = (inspect.getdoc(make_experiment) or "").partition("\nArgs:")[0].strip()
-    return "\n\n".join(filter(None, [text, " ".join(_NOTE.split())]))
+    return "\n\n".join(filter(None, [text, note, " ".join(_NOTE.split())]))

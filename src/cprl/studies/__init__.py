@@ -9,7 +9,13 @@ Modules, in the order in which one reads them:
     status       what a trial says of itself while it runs
     trials       one run of a study, run or resumed, whatever was there
     executors    where trials are run
+    overview     how far every trial is
+    progress     the same in the terminal
+    live         the same in the Rerun viewer
     execution    run_study: every trial of a study
+    points       Search: values of factors at which a metric is best
+    search       run_search: points that Optuna proposes, each run as a condition
+    words        factors as words of a command line
     sources      which runs a table is made of, and which are lacking
     circumstances  versions, commits and processors of runs, and which differ from the rest
     windows      the episodes of a run as means over windows of them
@@ -31,6 +37,8 @@ Modules, in the order in which one reads them:
 from cprl.studies.execution import StudyResult, read_study, run_study
 from cprl.studies.executors import InProcess, Processes, Ray
 from cprl.studies.factors import Integers, LogUniform, Uniform
+from cprl.studies.points import Search
+from cprl.studies.search import SearchResult, run_search
 from cprl.studies.study import Study
 from cprl.studies.table import StudyTable, study_table
 
@@ -40,11 +48,14 @@ __all__ = [
     "LogUniform",
     "Processes",
     "Ray",
+    "Search",
+    "SearchResult",
     "Study",
     "StudyResult",
     "StudyTable",
     "Uniform",
     "read_study",
+    "run_search",
     "run_study",
     "study_table",
 ]

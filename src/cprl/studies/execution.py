@@ -1,15 +1,21 @@
 """run_study: every trial of a study, wherever an executor runs it."""
 
-from collections.abc import Sequence
+import json
+from collections.abc import Iterator, Sequence
+from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Final
 
-from cprl.arguments import object_of, path, refusal, texts
+from cprl.arguments import object_of, path, refusal, switch, texts
 from cprl.runs.files import read_json, write_json
+from cprl.runs.lock import FILE_NAME as LOCK
+from cprl.runs.lock import RunLock, RunLockedError
 from cprl.studies.executors import Executor, InProcess
+from cprl.studies.live import LiveStudy, check_live
+from cprl.studies.progress import Progress
 from cprl.studies.study import Study
-from cprl.studies.trials import Outcome, Trial, task_of, trials_of
+from cprl.studies.trials import Outcome, Task, Trial, task_of, trials_of
 
 FILE_NAME: Final = "study.json"
 RUNS, STATUS = "runs", "status"
@@ -36,8 +42,12 @@ def run_study(
     on: Executor | None = None,
     runs: Path | str | None = None,
     allow: Sequence[str] = (),
+    progress: bool = True,
+    watch: str = "off",
 ) -> StudyResult:
     """Runs what a study lacks; may be stopped at any moment, and called again.
+
+    A trial that fails does not end the study. Two processes that run the same study share its trials.
 
     Args:
         study: what is run.
@@ -46,24 +56,131 @@ def run_study(
         on: where trials are run, see `cprl.studies.executors`; by default in this process.
         runs: the directory of the runs, which several studies may share; by default `runs` in `out`.
         allow: the user's own code, "module:Class", that stored runs of `Frozen` agents may import.
+        progress: whether a table of all trials is shown; lines where the output is not a terminal.
+        watch: "off", or "serve", "spawn", "connect ADDRESS" for the same table and the returns of finished
+            trials in the Rerun viewer, see `cprl.viewer.streams.open_live`.
 
     Raises:
         ValueError: for whatever does not fit, before anything is written.
     """
     object_of("study", study, Study, "a Study")
-    out = Path("studies") / study.name if out is None else path("out", out)
+    out = directory_of(study, out)
     folder = out / RUNS if runs is None else path("runs", runs)
-    texts("allow", allow)
+    trials = trials_of(study)
+    check_executor(on)
+    with as_driver(study, trials, out, folder, allow=allow, progress=progress, watch=watch) as driver:
+        failed = driver.run(trials, on or InProcess())
+    return StudyResult(study, out, folder, tuple(trials), failed)
+
+
+def directory_of(study: Study, out: Path | str | None) -> Path:
+    """The directory of a study, by default `studies/<name>`."""
+    return Path("studies") / study.name if out is None else path("out", out)
+
+
+def check_executor(on: object) -> None:
+    """Raises a ValueError for what runs no trials."""
     if on is not None and (isinstance(on, type) or not isinstance(on, Executor)):
         raise refusal("on", on, "InProcess(), Processes(jobs), Ray(), another Executor, or None")
-    trials = trials_of(study)
-    tasks = [task_of(trial, runs=folder, status=out / STATUS, allow=allow) for trial in trials]
-    folder.mkdir(parents=True, exist_ok=True)
+
+
+class Driver:
+    """What runs trials of a study whose directory is there; made by `as_driver`."""
+
+    def __init__(self, out: Path, runs: Path, *, allow: Sequence[str], progress: bool, title: str) -> None:
+        self._out, self._runs, self._allow = out, runs, allow
+        self._progress, self._title = progress, title
+        self.viewer: LiveStudy | None = None
+        self.others = ""
+        """Who runs the study too, in a sentence."""
+
+    def run(
+        self, trials: Sequence[Trial], executor: Executor, *, title: str | None = None
+    ) -> tuple[Outcome, ...]:
+        """Runs trials, shows how far they are, and returns those that failed."""
+        failed = []
+        shown = Progress(
+            trials,
+            runs=self._runs,
+            status=self._out / STATUS,
+            title=title or self._title,
+            is_shown=self._progress,
+            watchers=[] if self.viewer is None else [self.viewer.show],
+        )
+        if self.others:
+            shown.say(self.others)
+        tasks = tasks_of(trials, runs=self._runs, status=self._out / STATUS, allow=self._allow)
+        outcomes = executor.run(tasks)
+        with shown, ExitStack() as stack:
+            stack.callback(getattr(outcomes, "close", lambda: None))  # stops what it started
+            try:
+                for outcome in outcomes:
+                    shown.ended(outcome)
+                    if outcome.state == "failed":
+                        failed.append(outcome)
+            except BaseException as error:
+                error.add_note(_kept(trials, self._runs))
+                raise
+        return tuple(failed)
+
+
+@contextmanager
+def as_driver(
+    study: Study,
+    trials: Sequence[Trial],
+    out: Path,
+    runs: Path,
+    *,
+    allow: Sequence[str],
+    progress: bool,
+    watch: str,
+) -> Iterator[Driver]:
+    """Checks all that is asked for, then makes a study's directory.
+
+    Raises:
+        ValueError: for whatever does not fit, before anything is written.
+    """
+    switch("progress", progress)
+    texts("allow", allow)
+    check_live(watch)
+    tasks_of(trials, runs=runs, status=out / STATUS, allow=allow)
+    driver = Driver(out, runs, allow=allow, progress=progress, title=study.name)
+    runs.mkdir(parents=True, exist_ok=True)
     out.mkdir(parents=True, exist_ok=True)
     write_study(study, out)
-    outcomes = list((on or InProcess()).run(tasks))
-    failed = tuple(own for own in outcomes if own.state == "failed")
-    return StudyResult(study, out, folder, tuple(trials), failed)
+    with ExitStack() as stack:
+        try:
+            stack.enter_context(RunLock(out))
+        except RunLockedError:
+            driver.others = _others(out)
+        if watch != "off":
+            driver.viewer = stack.enter_context(LiveStudy(watch, runs=runs, title=study.name))
+        yield driver
+
+
+def tasks_of(trials: Sequence[Trial], *, runs: Path, status: Path, allow: Sequence[str]) -> list[Task]:
+    """The task of each trial."""
+    return [task_of(trial, runs=runs, status=status, allow=allow) for trial in trials]
+
+
+def _others(out: Path) -> str:
+    """Who runs a study too."""
+    holder = {}
+    with suppress(OSError, ValueError):
+        holder = json.loads((out / LOCK).read_bytes())
+    who = f", process {holder['pid']} on {holder.get('host')}" if "pid" in holder else ""
+    return (
+        f"{out} is run by somebody else too{who}, or was when its host went down: each trial is run by "
+        "whoever begins it first, the other waits for it"
+    )
+
+
+def _kept(trials: Sequence[Trial], runs: Path) -> str:
+    states = [trial.state(runs) for trial in trials]
+    return (
+        f"{states.count('finished')} of {len(trials)} trials are finished and {states.count('unfinished')} "
+        f"begun; all of it is kept in {runs}, and the same study continues from there"
+    )
 
 
 def write_study(study: Study, out: Path) -> None:

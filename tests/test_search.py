@@ -1,0 +1,226 @@
+"""A search finds good values of factors, goes on where it was stopped, and runs nothing twice."""
+
+import json
+import shutil
+import sys
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from tiny_study import FREEZE, GAMMA, TINY
+
+from cprl.runs.curves import as_curves, curves_of
+from cprl.runs.episodes import read_table
+from cprl.studies import Integers, LogUniform, Search, Uniform, read_study, run_search
+from cprl.studies.points import value_of
+from cprl.studies.search import FILE_NAME, JOURNAL
+from cprl.studies.trials import Outcome, trials_of
+from cprl.studies_cli import SweepOptions, wanted
+
+optuna = pytest.importorskip("optuna")
+
+ONE = replace(TINY, episodes=1)
+RATE = "agents.*.algorithm.settings.learning_rate"
+
+
+class Counting:
+    """Runs nothing: a finished run is whatever the test says it is worth."""
+
+    def __init__(self):
+        self.run_so_far = []
+
+    def run(self, tasks):
+        for task in tasks:
+            if not task.directory.exists():
+                task.directory.mkdir(parents=True)
+                (task.directory / "report.json").write_text(json.dumps(task.recipe["experiment"]))
+                self.run_so_far.append(task.name)
+            yield Outcome(task.name, "finished", worked=True)
+
+
+def rules_of(run):
+    return json.loads((run / "report.json").read_text())["game"]["rules"]
+
+
+@pytest.fixture
+def worth(monkeypatch):
+    """The best time-out is 40."""
+
+    def value(search, point, runs):
+        (trial,) = search_trials(search, point)
+        run = runs / trial.name
+        return -abs(rules_of(run)["freeze_steps"] - 40.0) if run.exists() else None
+
+    monkeypatch.setattr("cprl.studies.search.value_of", value)
+
+
+def search_trials(search, point):
+    return trials_of(search.study_of([replace(point, is_repeated=False)]))
+
+
+def a_search(points=12, **how):
+    return Search(ONE, {FREEZE: Integers(0, 1000), GAMMA: [0.5, 0.9]}, points=points, **how)
+
+
+def told(result):
+    return [(own.number, own.name, own.value, own.is_repeated) for own in result.points]
+
+
+def test_points_get_better_and_are_the_same_again(tmp_path, worth):
+    first = run_search(a_search(28), tmp_path / "a", on=Counting(), progress=False)
+    again = run_search(a_search(13), tmp_path / "b", on=Counting(), progress=False)
+    assert told(first)[:12] == told(again)[:12], "three whole batches"
+    by_chance = np.mean([own.value for own in first.points[:10]])
+    assert np.mean([own.value for own in first.points[-10:]]) > by_chance + 100
+    assert first.ranked[0].value == max(own.value for own in first.points)
+
+
+def test_a_search_that_was_stopped_anywhere_runs_the_rest_alone(tmp_path, worth):
+    class Killed(Counting):
+        def run(self, tasks):
+            for outcome in super().run(tasks):
+                yield outcome
+                if len(self.run_so_far) == self.most:
+                    raise KeyboardInterrupt
+
+    whole = Counting()
+    undisturbed = run_search(a_search(), tmp_path / "whole", on=whole, progress=False)
+    ran = []
+    for most in (1, 5, 3):
+        killed = Killed()
+        killed.most = most
+        with pytest.raises(KeyboardInterrupt):
+            run_search(a_search(), tmp_path / "killed", on=killed, progress=False)
+        ran += killed.run_so_far
+        for name in (FILE_NAME, JOURNAL, "study.json"):  # nothing but the runs is needed
+            (tmp_path / "killed" / name).unlink(missing_ok=True)
+    last = Counting()
+    done = run_search(a_search(), tmp_path / "killed", on=last, progress=False)
+    assert told(done) == told(undisturbed)
+    assert ran + last.run_so_far == whole.run_so_far, "each once, in the same order"
+
+
+def test_more_points_continue_a_search(tmp_path, worth):
+    run_search(a_search(8), tmp_path, on=Counting(), progress=False)
+    more = Counting()
+    longer = run_search(a_search(12), tmp_path, on=more, progress=False)
+    assert len(more.run_so_far) == 4
+    assert len(longer.points) == 12
+
+
+def test_points_that_come_twice_are_run_once(tmp_path, worth):
+    few = Search(ONE, {FREEZE: [30, 50, 80]}, points=12)
+    executor = Counting()
+    result = run_search(few, tmp_path, on=executor, progress=False)
+    assert len(executor.run_so_far) == len(set(executor.run_so_far)) <= 3
+    assert sum(own.is_repeated for own in result.points) == 12 - len(executor.run_so_far)
+    assert {own.value for own in result.points if own.name == "freeze_steps=30"} == {-10.0}
+    assert len(result.study.all_conditions) == len(executor.run_so_far)
+
+
+def test_named_levels_and_the_lowest_value(tmp_path, worth):
+    factors = {"stay out": {"briefly": {FREEZE: 1}, "long": {FREEZE: 500}}, GAMMA: Uniform(0.5, 0.9)}
+    result = run_search(
+        Search(ONE, factors, points=6, direction="minimise", sampler="random"),
+        tmp_path,
+        on=Counting(),
+        progress=False,
+    )
+    assert result.ranked[0].value == -460.0
+    assert result.ranked[0].name.startswith("stay out=long, gamma=0.")
+
+
+def test_what_has_failed_is_told_as_failed_and_tried_again_next_time(tmp_path, worth):
+    class Fails(Counting):
+        def run(self, tasks):
+            for task in tasks:
+                if task.recipe["experiment"]["game"]["rules"]["freeze_steps"] == 50:
+                    yield Outcome(task.name, "failed", "ValueError: no", True)
+                else:
+                    yield from super().run([task])
+
+    few = Search(ONE, {FREEZE: [30, 50]}, points=8, sampler="random")
+    result = run_search(few, tmp_path, on=Fails(), progress=False)
+    assert [own.reason for own in result.failed] == ["ValueError: no"]
+    assert {own.name: own.value for own in result.points} == {
+        "freeze_steps=30": -10.0,
+        "freeze_steps=50": None,
+    }
+    assert [own.name for own in result.ranked] == ["freeze_steps=30"]
+    mended = run_search(few, tmp_path, on=Counting(), progress=False)
+    assert not mended.failed
+    assert {own.value for own in mended.points} == {-10.0}
+
+
+def test_what_is_kept_is_read_by_optunas_own_tools_and_as_a_study(tmp_path, worth):
+    result = run_search(a_search(6), tmp_path, on=Counting(), progress=False)
+    backend = optuna.storages.journal.JournalFileBackend(str(tmp_path / JOURNAL))
+    kept = optuna.load_study(study_name="search", storage=optuna.storages.JournalStorage(backend))
+    assert [own.value for own in kept.trials] == [own.value for own in result.points]
+    assert read_study(tmp_path) == result.study
+    table = json.loads((tmp_path / FILE_NAME).read_text())
+    assert [own["value"] for own in table["points"]] == [own.value for own in result.points]
+    assert not list(tmp_path.glob(".optuna*"))
+
+
+def test_a_value_is_the_mean_over_replicas_of_the_episodes_asked_for(tmp_path):
+    experiment = replace(ONE, episodes=4, replicas=2, evaluation_episodes=3)
+    factors = {RATE: LogUniform(1e-4, 1e-3)}
+    search = Search(experiment, factors, points=1, block=1)
+    result = run_search(search, tmp_path, progress=False)
+    runs = [result.runs / trial.name for trial in result.trials]
+    assert len(runs) == 2
+    played = [as_curves(read_table(run / "evaluation" / "trained.parquet")) for run in runs]
+    harvests = [own["collective_return"] for own in played]  # [1, 3] each
+    assert result.points[0].value == pytest.approx(sum(own.sum() for own in harvests) / 6)
+    last = Search(experiment, factors, points=1, block=1, metric="return_1", over="training", last=2)
+    trained = [curves_of(run)["return_1"][0, 2:] for run in runs]
+    assert value_of(last, result.points[0], result.runs) == pytest.approx(np.mean(trained))
+    shutil.rmtree(runs[1])
+    assert value_of(search, result.points[0], result.runs) is None
+
+
+@pytest.mark.parametrize(
+    ("how", "message"),
+    [
+        ({"points": 0}, "points is 0"),
+        ({"metric": "luck"}, "metric is 'luck'; allowed: collective_return"),
+        ({"metric": "return_2"}, "metric is 'return_2'"),
+        ({"direction": "up"}, "direction is 'up'; allowed: 'maximise' or 'minimise'"),
+        ({"over": "all"}, "over is 'all'"),
+        ({"sampler": "magic"}, "sampler is 'magic'; allowed: tpe, random, gp"),
+        ({"at_once": 0}, "at_once is 0"),
+        ({"replicas": 0}, "replicas is 0"),
+        ({"factors": {"game.rules.freeze": [1]}}, "matches nothing"),
+        ({"factors": {FREEZE: Uniform(0.1, 0.2)}}, "allowed: a whole number"),
+        ({"factors": {}}, "allowed: factors to draw from"),
+    ],
+)
+def test_what_cannot_be_searched_is_refused(how, message):
+    with pytest.raises(ValueError) as refused:  # noqa: PT011  (the message is the point)
+        Search(ONE, **{"factors": {FREEZE: [1, 2]}, "points": 2, **how})
+    assert message in str(refused.value)
+
+
+def test_without_optuna_a_sentence_names_the_extra(tmp_path, monkeypatch):
+    monkeypatch.setitem(sys.modules, "optuna", None)
+    with pytest.raises(ModuleNotFoundError, match=r'pip install -c constraints\.txt -e "\.\[optuna\]"'):
+        run_search(a_search(), tmp_path / "out")
+    assert not (tmp_path / "out").exists()
+
+
+def test_a_sweep_can_be_a_search():
+    vary = (f"{FREEZE}=integers(1,9)", f"{GAMMA}=0.5,0.9")
+    search = wanted(ONE, SweepOptions(vary=vary, search=7, minimise="peace", at_once=2, block=3))
+    assert isinstance(search, Search)
+    assert (search.points, search.metric, search.direction, search.at_once) == (7, "peace", "minimise", 2)
+    assert search.factors == {FREEZE: Integers(1, 9), GAMMA: (0.5, 0.9)}
+
+
+@pytest.mark.parametrize("sampler", ["random", "gp", lambda seed: optuna.samplers.RandomSampler(seed=seed)])
+def test_other_samplers_propose_the_same_points_again_too(tmp_path, worth, sampler):
+    first, again = (
+        told(run_search(a_search(6, sampler=sampler), tmp_path / name, on=Counting(), progress=False))
+        for name in "ab"
+    )
+    assert first == again

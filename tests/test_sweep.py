@@ -1,0 +1,279 @@
+"""`cprl sweep` and `study_main`: studies from a command line."""
+
+import json
+import os
+import re
+import shlex
+import signal
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+from tiny_study import FREEZE, GAMMA, TINY
+
+import cprl
+from cprl import Study, cli, run_study
+from cprl.runs.directory import start_run
+from cprl.studies import InProcess, Processes, Ray, read_study
+from cprl.studies.trials import trials_of
+from cprl.studies_cli import recipe_of, study_main
+from cprl.studies_cli import sweep as sweep_words
+from cprl.studies_options import StudyOptions, executor_of
+
+ROOT = Path(__file__).parents[1]
+RECIPE = '''
+"""A recipe of two agents."""
+from dataclasses import replace
+from tiny_study import TINY
+import cprl
+
+def experiment(*, turns: int = 20) -> cprl.Experiment:
+    """Two agents on a tiny board.
+
+    Args:
+        turns: of an episode.
+    """
+    rules = replace(TINY.game.rules, episode_steps=turns)
+    return replace(TINY, game=replace(TINY.game, rules=rules))
+
+if __name__ == "__main__":
+    raise AssertionError("imported, not run")
+'''
+
+
+@pytest.fixture(autouse=True)
+def here(tmp_path, monkeypatch):
+    """A working directory with a recipe."""
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(sys, "path", [*sys.path])
+    Path("mine.py").write_text(RECIPE)
+    return tmp_path
+
+
+def sweep(line):
+    sweep_words(shlex.split(line))
+
+
+def test_a_recipe_is_run_under_every_combination_and_the_same_line_does_nothing_again(capsys):
+    line = (
+        f"mine.py --vary game.rules.freeze-steps=2,5 --vary {GAMMA}=0.5 --turns 7 --episodes 1 --replicas 2"
+    )
+    sweep(f"{line} --block 1 --out here")
+    study = read_study(Path("here"))
+    assert [own.name for own in study.all_conditions] == [
+        "freeze_steps=2, gamma=0.5",
+        "freeze_steps=5, gamma=0.5",
+    ]
+    assert study.experiment.game.rules.episode_steps == 7
+    assert (study.replicas, study.block, study.experiment.episodes) == (2, 1, 1)
+    assert all(trial.state(Path("here/runs")) == "finished" for trial in trials_of(study))
+    said = capsys.readouterr().out
+    assert "tiny: freeze_steps=2, gamma=0.5, replica 1 finished (3 of 4)" in said
+    before = {path: path.stat().st_mtime_ns for path in Path("here/runs").rglob("*")}
+    sweep(f"{line} --block 1 --out here")
+    assert before == {path: path.stat().st_mtime_ns for path in Path("here/runs").rglob("*")}
+    assert "tiny: 4 of 4 trials finished" in capsys.readouterr().out
+
+
+def test_a_dry_run_lists_all_trials_and_writes_nothing(here, capsys):
+    sweep(f"mine.py --vary {FREEZE}=2,5 --dry-run")
+    said = capsys.readouterr().out
+    assert "freeze_steps=5, replica 0  missing" in said
+    assert "2 conditions (game.rules.freeze_steps), 1 replicas each, in studies/tiny/runs" in said
+    assert sorted(path.name for path in here.iterdir()) == ["mine.py"]
+
+
+def test_a_failed_condition_does_not_end_the_study_and_is_listed_with_what_tries_it_again(
+    capsys, monkeypatch
+):
+    from cprl import running
+
+    def fails_at_5(experiment, *arguments, **how):
+        if experiment.game.rules.freeze_steps == 5:
+            raise RuntimeError("out of luck")
+        return run(experiment, *arguments, **how)
+
+    run = running.run
+    monkeypatch.setattr(running, "run", fails_at_5)
+    line = f"mine.py --vary {FREEZE}=5,2 --episodes 1"
+    with pytest.raises(SystemExit) as ended:
+        sweep(line)
+    assert ended.value.code == 1
+    said = capsys.readouterr().out
+    assert "1 of 2 trials failed; the others are kept:" in said
+    assert "  freeze_steps=5, replica 0: RuntimeError: out of luck\n    studies/tiny/status/" in said
+    assert f"To try them again: cprl sweep {line}" in said
+    sweep(f"{line} --dry-run")
+    assert re.search(r"replica 0  failed +0/1  RuntimeError: out of luck", capsys.readouterr().out)
+    monkeypatch.setattr(running, "run", run)
+    sweep(line)
+    assert "2 of 2 trials finished" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize(
+    ("line", "message"),
+    [
+        ("mine.py", "nothing is varied; allowed: --vary"),
+        ("--vary x=1", "the first word after cprl sweep is --vary; allowed: a recipe"),
+        ("nowhere.py --vary x=1", "the recipe is nowhere.py; allowed: a Python file"),
+        ("nowhere --vary x=1", "is not the recipe of a run"),
+        (f"mine.py --vary {FREEZE}=2,2", "are equal; allowed: each once"),
+        (f"mine.py --vary {FREEZE}=2,-1", "Rules.freeze_steps is -1"),
+        ("mine.py --vary seed=1,2", "which the study itself decides"),
+        ("mine.py --vary game.rules.freeze-step=1", "did you mean 'freeze_steps'"),
+        (f"mine.py --vary {FREEZE}=integers(1,9)", "has a range; allowed: values, or a range"),
+        (f"mine.py --vary {FREEZE}=2 --maximise peace", "--maximise is for a search"),
+        (f"mine.py --vary {FREEZE}=2 --at-once 2", "--at-once is for a search"),
+        (f"mine.py --vary {FREEZE}=2 --search 3 --draws 3", "--draws is not for a search"),
+        (f"mine.py --vary {FREEZE}=2 --search 3 --maximise peace --minimise peace", "allowed: one of them"),
+        (f"mine.py --vary {FREEZE}=2 --search 3 --maximise luck", "metric is 'luck'; allowed: "),
+        (f"mine.py --vary {FREEZE}=2 --reference best", "reference is 'best'; allowed: the name of"),
+        (f"mine.py --vary {FREEZE}=2 --jobs 0", "--jobs is 0; allowed"),
+        (f"mine.py --vary {FREEZE}=2 --jobs 2 --on here", "--jobs is 2 with --on here"),
+        (f"mine.py --vary {FREEZE}=2 --address auto", "--address is for --on ray"),
+        (f"mine.py --vary {FREEZE}=2 --watch file", "watch is 'file'; allowed: \"off\""),
+    ],
+)  # fmt: skip
+def test_what_cannot_be_is_refused_before_anything_is_written(here, line, message):
+    with pytest.raises(ValueError) as refused:  # noqa: PT011  (the message is the point)
+        sweep(line)
+    assert message in str(refused.value)
+    assert sorted(path.name for path in here.iterdir() if path.name != "__pycache__") == ["mine.py"]
+
+
+def test_flags_of_a_single_run_are_unknown(capsys):
+    with pytest.raises(SystemExit) as refused:
+        sweep(f"mine.py --vary {FREEZE}=2 --resume")
+    assert refused.value.code == 2
+    assert "--resume" in "".join(capsys.readouterr())
+
+
+@pytest.mark.parametrize("words", ["", "--help", "mine.py --help"])
+def test_help_says_how_values_are_written_and_what_a_command_line_cannot_change(words, capsys):
+    with pytest.raises(SystemExit) as ended:
+        sweep(words)
+    assert ended.value.code == 0
+    said = " ".join(capsys.readouterr().out.split())
+    assert "commas stand between values" in said
+    assert "loguniform(LOW,HIGH)" in said
+    if words.startswith("mine"):
+        assert "--turns INT" in said
+        assert "cannot be changed on the command line" in said
+        assert "the kind of an agent (Learning, Team, Scripted, Frozen), of its algorithm" in said
+
+
+def test_a_stored_recipe_is_varied_too(tmp_path, capsys):
+    run = start_run(tmp_path / "old", TINY.name, TINY.to_recipe)
+    for source in (run, run / "recipe.json"):
+        sweep(f"{source} --vary {FREEZE}=2,5 --dry-run")
+        assert "freeze_steps=5, replica 0  missing" in capsys.readouterr().out
+    assert recipe_of(run)() == TINY
+
+
+def test_a_recipe_of_a_study_is_not_swept():
+    Path("study.py").write_text("STUDY = 1")
+    with pytest.raises(ValueError, match=r"describes a study, which is run by itself: python study\.py"):
+        sweep(f"study.py --vary {FREEZE}=1")
+
+
+@pytest.mark.parametrize("name", ["commons", "tragedy", "mixed", "swap_the_loss", "two_complex"])
+def test_recipes_can_be_swept(name, capsys):
+    sweep(f"{ROOT / 'recipes' / name}.py --vary game.rules.freeze-steps=5,25 --replicas 4 --dry-run")
+    assert "freeze_steps=25, replicas 0-3" in capsys.readouterr().out
+
+
+def test_cprl_lists_sweep_among_its_commands(monkeypatch, capsys):
+    monkeypatch.setattr(sys, "argv", ["cprl", "--help"])
+    with pytest.raises(SystemExit):
+        cli.main()
+    assert "sweep" in capsys.readouterr().out
+    monkeypatch.setattr(sys, "argv", ["cprl", "sweep", "mine.py"])
+    with pytest.raises(SystemExit, match="cprl sweep: nothing is varied"):
+        cli.main()
+
+
+STUDY = Study(TINY, {FREEZE: [2, 5]}, name="tiny_study", question="What if?", expectation="Nothing.")
+
+
+def test_a_study_has_a_command_line(capsys):
+    line = ["recipes/mine.py", "--replicas", "2", "--block", "1", "--runs", "pool"]
+    out = study_main(STUDY, line)
+    assert out == Path("studies/tiny_study")
+    assert len(list(Path("pool").iterdir())) == 4
+    assert read_study(out).replicas == 2
+    assert study_main(STUDY, [*line, "--dry-run"]) == out
+    assert "4 of 4 trials finished" in capsys.readouterr().out.splitlines()[-2]
+    assert cprl.study_main is study_main
+
+
+def test_help_of_a_study_says_what_it_asks_and_expects(capsys):
+    with pytest.raises(SystemExit):
+        study_main(STUDY, ["recipes/mine.py", "--help"])
+    said = " ".join(capsys.readouterr().out.split())
+    assert (
+        "What if? Expected: Nothing. 2 conditions: freeze_steps=2, freeze_steps=5; 1 replicas of each."
+        in said
+    )
+
+
+def test_what_a_study_refuses_is_said_in_a_line():
+    with pytest.raises(SystemExit, match=r"^mine\.py: replicas is 0; allowed: an integer from 1"):
+        study_main(STUDY, ["recipes/mine.py", "--replicas", "0"])
+
+
+@pytest.mark.parametrize(
+    ("how", "expected"),
+    [
+        ({}, InProcess()),
+        ({"jobs": 1}, InProcess()),
+        ({"jobs": 2}, Processes(2)),
+        ({"jobs": 1, "on": "processes"}, Processes(1)),
+    ],
+)
+def test_where_trials_are_run_is_said_by_jobs_and_on(how, expected):
+    assert executor_of(StudyOptions(**how)) == expected
+
+
+def test_ray_is_asked_for_by_name():
+    pytest.importorskip("ray")
+    assert executor_of(StudyOptions(on="ray")) == Ray()
+    assert executor_of(StudyOptions(on="ray", address="auto", jobs=3)) == Ray("auto", jobs=3)
+
+
+def test_a_study_that_is_interrupted_says_what_is_kept_and_how_to_continue(capsys):
+    Path("study.py").write_text(
+        "import os, signal\n"
+        "from tiny_study import FREEZE, TINY\n"
+        "import cprl\n"
+        "from cprl import running\n"
+        "run = running.run\n"
+        "def stopped(experiment, *given, **how):\n"
+        "    if experiment.game.rules.freeze_steps == 5 and os.environ.get('STOP'):\n"
+        "        os.kill(os.getpid(), int(os.environ['STOP']))\n"
+        "    return run(experiment, *given, **how)\n"
+        "running.run = stopped\n"
+        "cprl.study_main(cprl.Study(TINY, {FREEZE: [2, 5]}, name='short'))\n"
+    )
+    paths = os.pathsep.join([str(ROOT / "src"), str(ROOT / "tests")])
+    environment = {**os.environ, "PYTHONPATH": paths, "STOP": str(int(signal.SIGTERM))}
+    command = [sys.executable, "study.py", "--out", "kept"]
+    stopped = subprocess.run(command, env=environment, capture_output=True, text=True, timeout=100)
+    assert stopped.returncode == 128 + signal.SIGTERM, stopped.stderr
+    assert "1 of 2 trials are finished and 0 begun; all of it is kept in kept/runs" in stopped.stdout
+    assert f"To continue: {shlex.join(command)}" in stopped.stdout
+    assert json.loads(Path("kept/study.json").read_text())["name"] == "short"
+    assert study_main(STUDY, ["study.py", "--out", "kept"]) == Path("kept")
+    assert "tiny_study: 1 of 2 trials finished" in capsys.readouterr().out
+
+
+def test_a_second_process_on_the_same_study_says_so(tmp_path, capsys):
+    from cprl.runs.lock import RunLock
+
+    (tmp_path / "out").mkdir()
+    with RunLock(tmp_path / "out"):
+        run_study(STUDY, tmp_path / "out")
+    said = capsys.readouterr().out
+    assert f"is run by somebody else too, process {os.getpid()} on" in said
+    assert "each trial is run by whoever begins it first" in said
+    assert "2 of 2 trials finished" in said
