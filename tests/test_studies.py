@@ -225,6 +225,19 @@ def test_draws_are_the_same_again_and_more_of_them_keep_the_first():
     assert len({own[GAMMA] for own in levels}) == 6
 
 
+def test_draws_that_are_equal_are_drawn_again_and_more_than_there_are_is_refused():
+    study = Study(TINY, {FREEZE: Integers(1, 3)}, draws=3)
+    assert sorted(own.levels[FREEZE] for own in study.all_conditions) == [1, 2, 3]
+    with pytest.raises(ValueError, match="draws is 4; the factors have no more than 3 combinations"):
+        Study(TINY, {FREEZE: Integers(1, 3)}, draws=4)
+
+
+def test_conditions_that_words_do_not_tell_apart_are_numbered():
+    others = [[LEARNING, Learning(DQN(settings=replace(SETTINGS, gamma=own)))] for own in (0.1, 0.2)]
+    names = [own.name for own in Study(TINY, {"agents": others}).all_conditions]
+    assert names[1] == f"{names[0]} #2"
+
+
 @settings(deadline=None, max_examples=30)
 @given(seed=st.integers(0, 2**63), nth=st.integers(0, 10**6), low=st.floats(1e-6, 1), times=st.floats(1, 1e6))
 def test_draws_stay_in_their_range(seed, nth, low, times):

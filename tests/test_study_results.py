@@ -10,18 +10,18 @@ from study_runs import EXPERIMENT, TIME_OUT, write_run, write_study
 
 from cprl import Study, cli
 from cprl.measuring.statistics import difference, estimate
-from cprl.studies.by_condition import by_condition
-from cprl.studies.by_factor import _Axis, by_factor
-from cprl.studies.comparing import compare, metrics_of
-from cprl.studies.courses import courses
-from cprl.studies.diagrams import grids, heat_map, phase_diagram
 from cprl.studies.factors import Uniform
-from cprl.studies.outcomes import ending, endings
-from cprl.studies.panels import is_logarithmic, is_numeric
+from cprl.studies.figures.by_condition import by_condition
+from cprl.studies.figures.by_factor import _Axis, by_factor
+from cprl.studies.figures.courses import courses
+from cprl.studies.figures.diagrams import grids, heat_map, phase_diagram
+from cprl.studies.figures.panels import is_logarithmic, is_numeric
 from cprl.studies.results import write_results
-from cprl.studies.sources import design_of, sources_of
-from cprl.studies.table import StudyTable, study_table
-from cprl.studies.texts import cells, markdown
+from cprl.studies.tables.comparing import compare, metrics_of
+from cprl.studies.tables.outcomes import ending, endings
+from cprl.studies.tables.sources import design_of, sources_of
+from cprl.studies.tables.table import StudyTable, study_table
+from cprl.studies.tables.texts import cells, markdown
 from cprl.studies.trials import trials_of
 
 SEES = "game.rules.window_rows"

@@ -12,10 +12,10 @@ from study_runs import EXPERIMENT, TIME_OUT, with_seed, write_run, write_study
 
 from cprl import Study
 from cprl.runs.directory import write_changed_circumstances
-from cprl.studies.circumstances import circumstances_of
-from cprl.studies.pooled import pooled_table, runs_in
 from cprl.studies.status import Status
-from cprl.studies.table import METADATA, StudyTable, study_table
+from cprl.studies.tables.circumstances import circumstances_of
+from cprl.studies.tables.pooled import pooled_table, runs_in
+from cprl.studies.tables.table import METADATA, StudyTable, study_table
 from cprl.studies.trials import trials_of
 
 STUDY = Study(EXPERIMENT, {TIME_OUT: [5, 25]}, name="small", replicas=3, block=2)
@@ -208,7 +208,7 @@ def test_pandas_is_named_where_it_is_not_installed(runs, monkeypatch):
     table = study_table(STUDY, runs)
     if find_spec("pandas") is not None:
         assert len(table.to_pandas()) == len(table.rows)
-    monkeypatch.setattr("cprl.studies.table.find_spec", lambda name: None)
+    monkeypatch.setattr("cprl.studies.tables.table.find_spec", lambda name: None)
     with pytest.raises(ImportError, match="to_pandas needs pandas, which is not installed; run: pip install"):
         table.to_pandas()
 

@@ -34,7 +34,7 @@ from cprl.running import run as run_experiment
 from cprl.runs.directory import read_recipe
 from cprl.runs.export import export_results
 from cprl.runs.labelled import refuse_to_write_over, write_table
-from cprl.studies.table_command import runs_table
+from cprl.studies.tables.table_command import runs_table
 from cprl.studies_cli import sweep
 from cprl.viewer.page import Page, has_display
 from cprl.viewer.streams import viewer

@@ -97,16 +97,16 @@ def carry_out(what: Study | Search, options: StudyOptions, command: Sequence[str
     executor, again = executor_of(options), shlex.join(command)
     if options.dry_run:
         return _list(what, options)
-    how: dict[str, Any] = {"on": executor, "runs": options.runs, "allow": options.allow}
+    names = ("runs", "allow", "watch")
+    how: dict[str, Any] = {"on": executor, **{own: getattr(options, own) for own in names}}
+    how |= {"results": options.figures, "again": again}
     with _interruptible(again):
         result: StudyResult | SearchResult
         if isinstance(what, Search):
-            result = run_search(what, options.out, watch=options.watch, **how)
+            result = run_search(what, options.out, **how)
             _say_best(result)
         else:
-            result = run_study(what, options.out, watch=options.watch, **how)
-        if options.figures:
-            _write_results(result, again)
+            result = run_study(what, options.out, **how)
     say(result.out)
     if result.failed:
         _say_failed(result, again)
@@ -173,12 +173,3 @@ def _interruptible(again: str) -> Iterator[None]:
         sys.exit(130 if isinstance(error, KeyboardInterrupt) else error.code)
     finally:
         signal.signal(signal.SIGTERM, usual)
-
-
-def _write_results(result: StudyResult | SearchResult, again: str) -> None:
-    """Writes table, summary and figures of what has finished into the study's directory."""
-    if all(trial.state(result.runs) != "finished" for trial in result.trials):
-        return
-    from cprl.studies.results import write_results
-
-    write_results(result.study, result.out, result.runs, again=again)

@@ -16,22 +16,9 @@ Modules, in the order in which one reads them:
     points       Search: values of factors at which a metric is best
     search       run_search: points that Optuna proposes, each run as a condition
     words        factors as words of a command line
-    sources      which runs a table is made of, and which are lacking
-    circumstances  versions, commits and processors of runs, and which differ from the rest
-    windows      the episodes of a run as means over windows of them
-    rows         the rows of a table, sorted
-    table        StudyTable: what came out, as one tidy table
-    pooled       the same for any runs at hand, by fields of their experiments
-    comparing    means over replicas, and differences from the reference
-    texts        comparisons in Markdown and in the terminal
-    outcomes     in which phase each replica ends
-    panels       what the figures share
-    by_factor    metrics against a factor
-    by_condition  conditions one below the other
-    courses      the course of the training under each condition
-    diagrams     heat maps and phase diagrams of two factors
+    tables       what came out, as one tidy table; means and differences; cprl table
+    figures      drawn of it
     results      write_results: table, summary and figures of a study
-    table_command  the command cprl table
 """
 
 from cprl.studies.execution import StudyResult, read_study, run_study
@@ -40,7 +27,7 @@ from cprl.studies.factors import Integers, LogUniform, Uniform
 from cprl.studies.points import Search
 from cprl.studies.search import SearchResult, run_search
 from cprl.studies.study import Study
-from cprl.studies.table import StudyTable, study_table
+from cprl.studies.tables.table import StudyTable, study_table
 
 __all__ = [
     "InProcess",

@@ -15,6 +15,7 @@ from cprl.studies.executors import Executor, InProcess
 from cprl.studies.live import LiveStudy, check_live
 from cprl.studies.progress import Progress
 from cprl.studies.study import Study
+from cprl.studies.tables.table import StudyTable
 from cprl.studies.trials import Outcome, Task, Trial, task_of, trials_of
 
 FILE_NAME: Final = "study.json"
@@ -33,6 +34,8 @@ class StudyResult:
     trials: tuple[Trial, ...]
     failed: tuple[Outcome, ...]
     """The trials that failed, with their reasons."""
+    table: StudyTable | None
+    """What came out; None if nothing has finished, and where no results were asked for."""
 
 
 def run_study(
@@ -44,6 +47,8 @@ def run_study(
     allow: Sequence[str] = (),
     progress: bool = True,
     watch: str = "off",
+    results: bool = True,
+    again: str = "",
 ) -> StudyResult:
     """Runs what a study lacks; may be stopped at any moment, and called again.
 
@@ -59,6 +64,9 @@ def run_study(
         progress: whether a table of all trials is shown; lines where the output is not a terminal.
         watch: "off", or "serve", "spawn", "connect ADDRESS" for the same table and the returns of finished
             trials in the Rerun viewer, see `cprl.viewer.streams.open_live`.
+        results: whether `table.parquet`, `summary.md` and `figures/` are written at the end, see
+            `cprl.studies.results`.
+        again: the command line that runs what is lacking, for the summary.
 
     Raises:
         ValueError: for whatever does not fit, before anything is written.
@@ -68,9 +76,22 @@ def run_study(
     folder = out / RUNS if runs is None else path("runs", runs)
     trials = trials_of(study)
     check_executor(on)
+    switch("results", results)
     with as_driver(study, trials, out, folder, allow=allow, progress=progress, watch=watch) as driver:
         failed = driver.run(trials, on or InProcess())
-    return StudyResult(study, out, folder, tuple(trials), failed)
+    table = results_of(study, trials, out, folder, again=again) if results else None
+    return StudyResult(study, out, folder, tuple(trials), failed, table)
+
+
+def results_of(
+    study: Study, trials: Sequence[Trial], out: Path, runs: Path, *, again: str
+) -> StudyTable | None:
+    """Writes table, summary and figures of what has finished; None if nothing has."""
+    if all(trial.state(runs) != "finished" for trial in trials):
+        return None
+    from cprl.studies.results import write_results  # with matplotlib
+
+    return write_results(study, out, runs, again=again)
 
 
 def directory_of(study: Study, out: Path | str | None) -> Path:

@@ -9,18 +9,18 @@ from cprl.arguments import object_of
 from cprl.arguments import path as path_of
 from cprl.measuring.statistics import Interval
 from cprl.runs.files import write_atomically
-from cprl.studies.by_condition import by_condition
-from cprl.studies.by_factor import by_factor
-from cprl.studies.comparing import LAST, compare, metrics_of
-from cprl.studies.courses import courses
-from cprl.studies.diagrams import grids, heat_map, phase_diagram
-from cprl.studies.outcomes import Endings, endings
-from cprl.studies.panels import MOST_CONDITIONS, is_numeric
-from cprl.studies.sources import sources_of
+from cprl.studies.figures.by_condition import by_condition
+from cprl.studies.figures.by_factor import by_factor
+from cprl.studies.figures.courses import courses
+from cprl.studies.figures.diagrams import grids, heat_map, phase_diagram
+from cprl.studies.figures.panels import MOST_CONDITIONS, is_numeric
 from cprl.studies.study import Study
-from cprl.studies.table import WINDOW, StudyTable, study_table
-from cprl.studies.texts import cells, markdown, metric_title
-from cprl.studies.windows import EVALUATION, RANDOM, TRAINING
+from cprl.studies.tables.comparing import LAST, compare, metrics_of
+from cprl.studies.tables.outcomes import Endings, endings
+from cprl.studies.tables.sources import sources_of
+from cprl.studies.tables.table import WINDOW, StudyTable, study_table
+from cprl.studies.tables.texts import cells, markdown, metric_title
+from cprl.studies.tables.windows import EVALUATION, RANDOM, TRAINING
 
 TABLE: Final = "table.parquet"
 SUMMARY: Final = "summary.md"
@@ -49,7 +49,7 @@ def write_results(
         study: the study, finished or not.
         out: its directory.
         runs: the directory of its runs.
-        window: see `cprl.studies.table.study_table`.
+        window: see `cprl.studies.tables.table.study_table`.
         last: episodes at the end of the training that are compared.
         interval: "bca" or "t", see `cprl.measuring.statistics.Interval`.
         again: the command line that runs what is lacking, for the summary.

@@ -13,14 +13,23 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Final
 
-from cprl.arguments import object_of
+from cprl.arguments import object_of, switch
 from cprl.arguments import path as path_of
 from cprl.runs.files import write_json
-from cprl.studies.execution import RUNS, Driver, as_driver, check_executor, directory_of, write_study
+from cprl.studies.execution import (
+    RUNS,
+    Driver,
+    as_driver,
+    check_executor,
+    directory_of,
+    results_of,
+    write_study,
+)
 from cprl.studies.executors import Executor, InProcess
 from cprl.studies.factors import Distribution, Integers, LogUniform
 from cprl.studies.points import Point, Search, labels, value_of
 from cprl.studies.study import Study
+from cprl.studies.tables.table import StudyTable
 from cprl.studies.trials import Outcome, Trial, trials_of
 
 FILE_NAME: Final = "search.json"
@@ -40,6 +49,8 @@ class SearchResult:
     points: tuple[Point, ...]
     trials: tuple[Trial, ...]
     failed: tuple[Outcome, ...]
+    table: StudyTable | None
+    """What came out; None if nothing has finished, and where no results were asked for."""
 
     @property
     def ranked(self) -> list[Point]:
@@ -58,6 +69,8 @@ def run_search(
     allow: Sequence[str] = (),
     progress: bool = True,
     watch: str = "off",
+    results: bool = True,
+    again: str = "",
 ) -> SearchResult:
     """Runs a search; may be stopped at any moment, and called again, with more points too.
 
@@ -71,6 +84,7 @@ def run_search(
     """
     object_of("search", search, Search, "a Search")
     check_executor(on)
+    switch("results", results)
     optuna = _optuna()
     asked = _Asked(search, optuna)
     batch = asked.next_batch()
@@ -89,9 +103,9 @@ def run_search(
             write_json(out / FILE_NAME, _as_table(search, asked.points))
             _write_journal(optuna, asked.study, out / JOURNAL)
             batch = asked.next_batch()
-    return SearchResult(
-        search, study, out, folder, tuple(asked.points), tuple(trials_of(study)), tuple(failed)
-    )
+    trials = trials_of(study)
+    table = results_of(study, trials, out, folder, again=again) if results else None
+    return SearchResult(search, study, out, folder, tuple(asked.points), tuple(trials), tuple(failed), table)
 
 
 class _Asked:

@@ -2,8 +2,9 @@
 
 import hashlib
 import os
-from collections.abc import Iterable, Mapping
-from dataclasses import dataclass, field
+from collections import Counter
+from collections.abc import Iterable, Iterator, Mapping
+from dataclasses import dataclass, field, replace
 from functools import cached_property, partial
 from pathlib import Path
 from typing import Any, Final
@@ -31,6 +32,8 @@ FORMAT: Final = 1
 """Of `Study.to_config`."""
 BLOCK: Final = 8
 """Replicas that one run trains side by side, if a study does not say."""
+_TRIES: Final = 20
+"""Draws for each one that is kept, at most."""
 SEEDS_APART: Final = 1000
 """Between the seeds of two blocks of replicas; evaluation plays worlds of the next seed."""
 
@@ -99,17 +102,19 @@ class Study:
     @cached_property
     def all_conditions(self) -> tuple[Condition, ...]:
         """Every condition, in order, each once."""
-        found = [
-            Condition(_of_level(self.experiment, levels), {own: at.value for own, at in levels.items()}, name)
-            for name, levels in self._levels()
-        ]
         by_sum: dict[str, Condition] = {}
-        for own in found:
+        for name, levels in self._levels():
+            changed_to = _of_level(self.experiment, levels)
+            own = Condition(changed_to, {factor: at.value for factor, at in levels.items()}, name)
             if (other := by_sum.setdefault(own.checksum, own)) is not own and self.draws is None:
-                raise ValueError(
-                    f"the conditions {other.name!r} and {own.name!r} are equal; allowed: each once"
-                )
-        return tuple(by_sum.values())
+                raise ValueError(f"conditions {other.name!r} and {name!r} are equal; allowed: each once")
+            if len(by_sum) == self.draws:
+                break
+        if self.draws is not None and len(by_sum) < self.draws:
+            raise ValueError(
+                f"draws is {self.draws}; the factors have no more than {len(by_sum)} combinations that differ"
+            )
+        return _apart(by_sum.values())
 
     @cached_property
     def blocks(self) -> tuple["Block", ...]:
@@ -146,21 +151,25 @@ class Study:
         digest = hashlib.blake2b(f"{condition.checksum} {block.seed}".encode(), digest_size=6)
         return int.from_bytes(digest.digest())
 
-    def _levels(self) -> list[tuple[str, dict[str, Level]]]:
-        """The name and levels of each condition."""
+    def _levels(self) -> Iterator[tuple[str, dict[str, Level]]]:
+        """The name and levels of each condition; of draws more than are asked for, as some may be equal."""
         if self.conditions:
-            return [(name, {CONDITION: Level(name, own)}) for name, own in self.conditions.items()]
-        if not self.factors:
-            return [(UNCHANGED, {CONDITION: Level(UNCHANGED, {})})]
+            yield from ((name, {CONDITION: Level(name, own)}) for name, own in self.conditions.items())
+        elif not self.factors:
+            yield UNCHANGED, {CONDITION: Level(UNCHANGED, {})}
+        else:
+            short = short_names(self.factors)
+            for levels in self._combinations():
+                yield named({short[own]: at.value for own, at in levels.items()}), levels
+
+    def _combinations(self) -> Iterable[dict[str, Level]]:
         if self.draws is not None:
             seed = self.experiment.seed
-            every = [drawn(self.factors, seed=seed, nth=nth) for nth in range(self.draws)]
-        else:
-            every = list(grid(self.factors))
+            return (drawn(self.factors, seed=seed, nth=nth) for nth in range(_TRIES * self.draws))
+        every = list(grid(self.factors))
         if len(every) > MOST_CONDITIONS:
             raise ValueError(f"a study has {len(every):,} conditions; allowed: up to {MOST_CONDITIONS:,}")
-        short = short_names(self.factors)
-        return [(named({short[own]: at.value for own, at in levels.items()}), levels) for levels in every]
+        return every
 
     def to_config(self, directory: str | Path | None = None) -> dict[str, Any]:
         """The study as JSON can hold it.
@@ -248,6 +257,17 @@ CONDITION: Final = "condition"
 """The column of named conditions."""
 UNCHANGED: Final = "unchanged"
 """The one condition of a study without factors."""
+
+
+def _apart(conditions: Iterable[Condition]) -> tuple[Condition, ...]:
+    """Conditions with a number after their name where others have the same, e.g. of unlike agents."""
+    times: Counter[str] = Counter()
+    found = []
+    for own in conditions:
+        times[own.name] += 1
+        is_first = times[own.name] == 1
+        found.append(own if is_first else replace(own, name=f"{own.name} #{times[own.name]}"))
+    return tuple(found)
 
 
 def _no_change(run: str) -> str:

@@ -35,11 +35,11 @@ from cprl.arguments import integer, object_of
 from cprl.arguments import path as path_of
 from cprl.runs.directory import versions
 from cprl.runs.files import write_atomically
-from cprl.studies.circumstances import Circumstances, circumstances_of, marks, sentences
-from cprl.studies.rows import rows_of
-from cprl.studies.sources import Design, Lacking, Source, design_of, sources_of
 from cprl.studies.study import Study
-from cprl.studies.windows import Windows, windows_of
+from cprl.studies.tables.circumstances import Circumstances, circumstances_of, marks, sentences
+from cprl.studies.tables.rows import rows_of
+from cprl.studies.tables.sources import Design, Lacking, Source, design_of, sources_of
+from cprl.studies.tables.windows import Windows, windows_of
 
 FORMAT: Final = 1
 WINDOW: Final = 10
@@ -79,7 +79,7 @@ class StudyTable:
 
     @cached_property
     def comparisons(self) -> dict[Any, Any]:
-        """What `cprl.studies.comparing.compare` has computed of it, so that figures and texts share it."""
+        """What `compare` in comparing.py has computed of it, so that figures and texts share it."""
         return {}
 
     def __str__(self) -> str:

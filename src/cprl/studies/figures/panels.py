@@ -12,8 +12,8 @@ from matplotlib.figure import Figure
 
 from cprl.plotting.style import DPI, SMALL_PT
 from cprl.runs.files import write_atomically
-from cprl.studies.comparing import Comparison
-from cprl.studies.sources import Design
+from cprl.studies.tables.comparing import Comparison
+from cprl.studies.tables.sources import Design
 
 MOST_CONDITIONS: Final = 60
 """A figure with a row for each condition has at most so many rows."""

@@ -10,11 +10,11 @@ from cprl.measuring.statistics import Interval
 from cprl.output import OUT, console, say
 from cprl.runs.files import write_atomically
 from cprl.runs.labelled import refuse_to_write_over
-from cprl.studies.comparing import LAST, compare, metrics_of
-from cprl.studies.pooled import pooled_table
-from cprl.studies.table import WINDOW, StudyTable
-from cprl.studies.texts import Cells, cells, markdown, rich_table
-from cprl.studies.windows import TRAINING
+from cprl.studies.tables.comparing import LAST, compare, metrics_of
+from cprl.studies.tables.pooled import pooled_table
+from cprl.studies.tables.table import WINDOW, StudyTable
+from cprl.studies.tables.texts import Cells, cells, markdown, rich_table
+from cprl.studies.tables.windows import TRAINING
 
 SUFFIXES: Final = (".parquet", ".md")
 Part = Literal["training", "evaluation", "random"]

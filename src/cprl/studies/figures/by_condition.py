@@ -11,8 +11,7 @@ from cprl.arguments import choice, refusal
 from cprl.arguments import path as path_of
 from cprl.measuring.statistics import Interval
 from cprl.plotting.style import MEAN, RANDOM_LINE, SMALL_PT
-from cprl.studies.comparing import LAST, Compared, Comparison, compare, metrics_of
-from cprl.studies.panels import (
+from cprl.studies.figures.panels import (
     FAINT,
     MOST_CONDITIONS,
     head,
@@ -24,9 +23,10 @@ from cprl.studies.panels import (
     wrapped,
     write_figure,
 )
-from cprl.studies.table import StudyTable
-from cprl.studies.texts import metric_title
-from cprl.studies.windows import RANDOM, TRAINING
+from cprl.studies.tables.comparing import LAST, Compared, Comparison, compare, metrics_of
+from cprl.studies.tables.table import StudyTable
+from cprl.studies.tables.texts import metric_title
+from cprl.studies.tables.windows import RANDOM, TRAINING
 
 Kind = Literal["levels", "differences"]
 
@@ -48,7 +48,7 @@ def by_condition(
         path: the PNG.
         kind: "levels", with random play as dashes; or "differences", with a dashed line at 0.
         metrics: see `by_factor`.
-        part: see `cprl.studies.comparing.compare`.
+        part: see `cprl.studies.tables.comparing.compare`.
         last: likewise.
         interval: likewise.
 

@@ -10,8 +10,8 @@ from numpy.typing import NDArray
 
 from cprl.arguments import choice, integer, object_of, refusal
 from cprl.measuring.statistics import CONFIDENCE, Estimate, Interval, difference, estimate
-from cprl.studies.table import StudyTable
-from cprl.studies.windows import NET, PARTS, TRAINING
+from cprl.studies.tables.table import StudyTable
+from cprl.studies.tables.windows import NET, PARTS, TRAINING
 
 LAST: Final = 30
 """Episodes at the end of a training that are compared, unless something else is asked for."""

@@ -29,7 +29,7 @@ from cprl.plotting.bands import COLOURS as PHASE_COLOURS
 from cprl.plotting.bands import UNNAMED
 from cprl.runs.curves import Values, as_curves, curves_of, phases_of, running_mean
 from cprl.runs.episodes import read_table
-from cprl.studies.sources import Source
+from cprl.studies.tables.sources import Source
 from cprl.terminal.course import BELOW_RANDOM, LAST_EPISODES, PEAK_EPISODES, PEAK_OVER_RANDOM
 
 NO_BETTER: Final = "no better"
@@ -42,7 +42,7 @@ COLOURS: Final = {
 }
 """Of labels, light enough for text before them."""
 BY_PHASES: Final = f"the last phase that cprl.measuring.phases finds, from {FEWEST_EPISODES:,} episodes on"
-BY_RETURNS: Final = "its last 30 episodes against its peak and random play, see cprl.studies.outcomes"
+BY_RETURNS: Final = "its last 30 episodes against its peak and random play, see cprl.studies.tables.outcomes"
 
 
 @dataclass(frozen=True, kw_only=True)

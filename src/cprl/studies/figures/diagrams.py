@@ -16,9 +16,7 @@ from cprl.arguments import object_of, refusal
 from cprl.arguments import path as path_of
 from cprl.measuring.statistics import Interval
 from cprl.plotting.style import SMALL_PT
-from cprl.studies.comparing import LAST, Comparison, compare
-from cprl.studies.outcomes import COLOURS, Endings
-from cprl.studies.panels import (
+from cprl.studies.figures.panels import (
     MOST_CONDITIONS,
     head,
     is_numeric,
@@ -31,10 +29,12 @@ from cprl.studies.panels import (
     wrapped,
     write_figure,
 )
-from cprl.studies.sources import Design
-from cprl.studies.table import StudyTable
-from cprl.studies.texts import digits_for, metric_title
-from cprl.studies.windows import TRAINING
+from cprl.studies.tables.comparing import LAST, Comparison, compare
+from cprl.studies.tables.outcomes import COLOURS, Endings
+from cprl.studies.tables.sources import Design
+from cprl.studies.tables.table import StudyTable
+from cprl.studies.tables.texts import digits_for, metric_title
+from cprl.studies.tables.windows import TRAINING
 
 _VALUES, _DIFFERENCES = "viridis", "RdBu"
 _CELL_IN: Final = (1.05, 0.55)
@@ -83,7 +83,7 @@ def heat_map(
         factors: two of its factors; any others are at the levels of the reference.
         path: the PNG.
         metric: one of its metrics.
-        part: see `cprl.studies.comparing.compare`.
+        part: see `cprl.studies.tables.comparing.compare`.
         last: likewise.
         interval: likewise.
 
@@ -127,7 +127,7 @@ def phase_diagram(
 
     Args:
         table: the table.
-        found: see `cprl.studies.outcomes.endings`.
+        found: see `cprl.studies.tables.outcomes.endings`.
         path: the PNG.
         factors: two factors; None for bars, of at most `MOST_CONDITIONS` conditions.
 

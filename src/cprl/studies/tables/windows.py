@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from cprl.measuring import social
 from cprl.runs.curves import as_curves
 from cprl.runs.episodes import read_episodes, read_table
-from cprl.studies.sources import Source
+from cprl.studies.tables.sources import Source
 
 TRAINING: Final = "training"
 EVALUATION: Final = "evaluation"

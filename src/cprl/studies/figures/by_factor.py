@@ -14,8 +14,7 @@ from cprl.arguments import path as path_of
 from cprl.arguments import refusal
 from cprl.measuring.statistics import Interval
 from cprl.plotting.style import RANDOM_LINE, SMALL_PT
-from cprl.studies.comparing import LAST, Compared, Comparison, compare, metrics_of
-from cprl.studies.panels import (
+from cprl.studies.figures.panels import (
     LEVEL,
     colours_of,
     head,
@@ -27,10 +26,11 @@ from cprl.studies.panels import (
     short,
     write_figure,
 )
-from cprl.studies.sources import Design
-from cprl.studies.table import StudyTable
-from cprl.studies.texts import metric_title
-from cprl.studies.windows import RANDOM, TRAINING
+from cprl.studies.tables.comparing import LAST, Compared, Comparison, compare, metrics_of
+from cprl.studies.tables.sources import Design
+from cprl.studies.tables.table import StudyTable
+from cprl.studies.tables.texts import metric_title
+from cprl.studies.tables.windows import RANDOM, TRAINING
 
 _COLUMNS: Final = 3
 _MOST_LINES: Final = 8
@@ -61,8 +61,8 @@ def by_factor(
         table: the table.
         factor: one of its factors.
         path: the PNG.
-        metrics: by default those of `cprl.studies.comparing.METRICS` that it has.
-        part: see `cprl.studies.comparing.compare`.
+        metrics: by default those of `cprl.studies.tables.comparing.METRICS` that it has.
+        part: see `cprl.studies.tables.comparing.compare`.
         last: likewise.
         interval: likewise.
 

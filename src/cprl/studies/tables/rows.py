@@ -7,8 +7,8 @@ import numpy as np
 import pyarrow as pa
 from numpy.typing import NDArray
 
-from cprl.studies.sources import Design, Source
-from cprl.studies.windows import NET, PARTS, Windows, ordered
+from cprl.studies.tables.sources import Design, Source
+from cprl.studies.tables.windows import NET, PARTS, Windows, ordered
 
 COLUMNS: Final = {
     "condition": pa.string(),
@@ -33,7 +33,7 @@ def column_of(factor: str) -> str:
 
 
 def rows_of(design: Design, found: list[tuple[Source, list[Windows]]], marked: Mapping[str, str]) -> pa.Table:
-    """The sorted rows of a table, with the columns that `cprl.studies.table` lists.
+    """The sorted rows of a table, with the columns that `cprl.studies.tables.table` lists.
 
     Args:
         design: the conditions.

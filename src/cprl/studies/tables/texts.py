@@ -10,8 +10,8 @@ from rich.text import Text
 from cprl.arguments import choice
 from cprl.measuring.names import title
 from cprl.measuring.statistics import Estimate
-from cprl.studies.comparing import Compared, Comparison
-from cprl.studies.windows import NET
+from cprl.studies.tables.comparing import Compared, Comparison
+from cprl.studies.tables.windows import NET
 
 Kind = Literal["levels", "differences"]
 NET_TITLE = "return of all agents together"

@@ -14,8 +14,7 @@ from cprl.measuring.published import SMOOTHED_EPISODES
 from cprl.measuring.statistics import curve_interval
 from cprl.plotting.style import RANDOM_LINE, SMALL_PT
 from cprl.runs.curves import running_mean
-from cprl.studies.comparing import compare, metrics_of
-from cprl.studies.panels import (
+from cprl.studies.figures.panels import (
     MOST_CONDITIONS,
     colours_of,
     head,
@@ -26,9 +25,10 @@ from cprl.studies.panels import (
     with_counts,
     write_figure,
 )
-from cprl.studies.table import StudyTable
-from cprl.studies.texts import metric_title
-from cprl.studies.windows import RANDOM, TRAINING
+from cprl.studies.tables.comparing import compare, metrics_of
+from cprl.studies.tables.table import StudyTable
+from cprl.studies.tables.texts import metric_title
+from cprl.studies.tables.windows import RANDOM, TRAINING
 
 METRICS: Final = ("collective_return", "survival_steps")
 """What is drawn unless something else is asked for."""
