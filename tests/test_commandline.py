@@ -181,12 +181,12 @@ def test_help_lists_the_recipes_own_arguments_first_and_equal_agents_once(capsys
 
 
 def test_a_value_of_several_kinds_has_the_fields_of_the_kind_that_it_is_and_no_subcommands(capsys):
-    first = Learning(DQN(network=MLP(hidden_cells=(8,))), reward=Exchange(0.5))
+    first = Learning(DQN(settings=DQNSettings(), network=MLP(hidden_cells=(8,))), reward=Exchange(0.5))
     mixed = replace(experiment(), agents=[first, *experiment().agents[1:]])
     given, _ = read(
         "--agents.0.reward.share 0.1 --agents.0.algorithm.network.hidden-cells 4 4", lambda: mixed
     )
-    changed = Learning(DQN(network=MLP(hidden_cells=(4, 4))), reward=Exchange(0.1))
+    changed = Learning(DQN(settings=DQNSettings(), network=MLP(hidden_cells=(4, 4))), reward=Exchange(0.1))
     assert given.agents == (changed, *mixed.agents[1:])
     with pytest.raises(SystemExit):
         read("--help", lambda: mixed)
