@@ -46,8 +46,8 @@ def main() -> None:
         found = wrong(folder / given.on, folder / "twin")
         runs = len(list((folder / "twin" / "runs").iterdir()))
     print(
-        f"\n{kills} kills in {time.monotonic() - began:.0f} s.\n{runs} runs were compared, file by file, with "
-        "those of one process that nobody killed: "
+        f"\n{kills} kills in {time.monotonic() - began:.0f} s.\n{runs} runs were compared, file by file, "
+        "with those of one process that nobody killed: "
         + ("; ".join(found) if found else "bit-identical, and no episode is there twice.")
     )
     sys.exit(bool(found) or kills < given.kills)
