@@ -159,7 +159,9 @@ def main(
         for number in range(trials):
             experiment = small(number, vary=vary, episodes=episodes, episode_steps=episode_steps)
             began = now()
-            run = cprl.run(experiment, folder / str(number), watch="off", keep_checkpoint=False)
+            run = cprl.run(
+                experiment, folder / str(number), watch="off", keep_checkpoint=False, figures=False
+            )
             done.append(trial_of(run, now() - began))
     later = done[1:]
     shown = Table(f"seconds ({clock})", title=f"{trials} trials in one process")

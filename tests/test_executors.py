@@ -101,7 +101,7 @@ class Broken(Processes):
 def undisturbed(tmp_path_factory):
     """The study of one process that nobody killed."""
     folder = tmp_path_factory.mktemp("undisturbed")
-    assert run_study(STUDY, folder, on=InProcess()).failed == ()
+    assert run_study(STUDY, folder, on=InProcess(), results=False).failed == ()
     return folder / "runs"
 
 
@@ -114,7 +114,7 @@ def assert_same_runs(folder, undisturbed):
 
 
 def test_a_worker_process_that_is_killed_is_replaced_and_its_trial_ends_the_same(tmp_path, undisturbed):
-    result = run_study(STUDY, tmp_path, on=Dying(2))
+    result = run_study(STUDY, tmp_path, on=Dying(1), results=False)
     assert result.failed == ()
     assert_same_runs(result.runs, undisturbed)
     killed, other = map(attempts_of, tasks_in(tmp_path))
@@ -128,7 +128,7 @@ def test_a_trial_whose_processes_always_die_fails_alone_and_its_neighbour_keeps_
 ):
     monkeypatch.setattr(processes, "ATTEMPTS", 3)
     study = Study(TINY, {FREEZE: [2, 5, 10]})
-    result = run_study(study, tmp_path, on=Hopeless(2))
+    result = run_study(study, tmp_path, on=Hopeless(2), results=False)
     dead, *others = tasks_in(tmp_path, study)
     (failed,) = result.failed
     assert failed.name == dead.name
@@ -140,7 +140,7 @@ def test_a_trial_whose_processes_always_die_fails_alone_and_its_neighbour_keeps_
 
 @pytest.mark.slow
 def test_what_a_worker_cannot_even_begin_is_the_trials_failure(tmp_path):
-    result = run_study(STUDY, tmp_path, on=Broken(1))
+    result = run_study(STUDY, tmp_path, on=Broken(1), results=False)
     assert [own.reason for own in result.failed] == ["OSError: no such disk"] * 2
 
 
@@ -152,7 +152,7 @@ from tiny_study import FREEZE, TINY
 from cprl.studies import Processes, Ray, Study, run_study
 {more}
 # No `if __name__ == "__main__"`, which a user may forget.
-run_study(Study(replace(TINY, episodes={episodes}), {{FREEZE: [2, 5]}}), {out!r}, on={on})
+run_study(Study(replace(TINY, episodes={episodes}), {{FREEZE: [2, 5]}}), {out!r}, on={on}, results=False)
 print("whole")
 """
 
@@ -225,12 +225,12 @@ def test_tasks_of_ray_whose_workers_are_killed_make_the_same_runs(tmp_path, undi
     monkeypatch.chdir(TESTS)  # Ray's workers import this module from there
     import ray
 
-    result = run_study(STUDY, tmp_path / "study", on=DyingOnRay(jobs=2))
+    result = run_study(STUDY, tmp_path / "study", on=DyingOnRay(jobs=2), results=False)
     assert result.failed == ()
     assert_same_runs(result.runs, undisturbed)
     assert not ray.is_initialized()
     monkeypatch.setattr(on_ray, "ATTEMPTS", 2)
-    result = run_study(STUDY, tmp_path / "hopeless", on=HopelessOnRay(jobs=2))
+    result = run_study(STUDY, tmp_path / "hopeless", on=HopelessOnRay(jobs=2), results=False)
     (failed,) = result.failed
     assert failed.name == tasks_in(tmp_path / "hopeless")[0].name
     assert "its worker or node died (WorkerCrashedError)" in failed.reason

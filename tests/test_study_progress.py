@@ -145,7 +145,7 @@ def test_in_a_terminal_one_table_is_drawn_again_and_again(tmp_path, monkeypatch)
     screen = Terminal()
     monkeypatch.setattr(sys, "stdout", screen)
     monkeypatch.setenv("TERM", "xterm")
-    run_study(Study(replace(TINY, episodes=1), {FREEZE: [2]}), tmp_path / "out")
+    run_study(Study(replace(TINY, episodes=1), {FREEZE: [2]}), tmp_path / "out", results=False)
     said = screen.getvalue()
     assert "\x1b[" in said
     assert "freeze_steps=2, replica 0" in said
@@ -153,7 +153,9 @@ def test_in_a_terminal_one_table_is_drawn_again_and_again(tmp_path, monkeypatch)
 
 
 def test_nothing_is_printed_where_no_progress_is_wanted(tmp_path, capsys):
-    run_study(Study(replace(TINY, episodes=1), {FREEZE: [2]}), tmp_path / "out", progress=False)
+    run_study(
+        Study(replace(TINY, episodes=1), {FREEZE: [2]}), tmp_path / "out", progress=False, results=False
+    )
     assert capsys.readouterr().out == ""
     with pytest.raises(ValueError, match="progress is 'no'; allowed: True or False"):
         run_study(STUDY, tmp_path / "other", progress="no")
@@ -177,7 +179,7 @@ def test_viewers_get_the_table_and_the_returns_of_finished_trials(tmp_path, caps
     addresses = {"browser": "http://there"}
     monkeypatch.setattr(live, "open_live", lambda *_, **__: live_of(Stream(), addresses))
     study = Study(replace(TINY, episodes=3, replicas=2), {FREEZE: [2]})
-    result = run_study(study, tmp_path / "out", watch="serve")
+    result = run_study(study, tmp_path / "out", watch="serve", results=False)
     assert "Watch live (browser): http://there" in capsys.readouterr().out
     tables = [what[1].text.as_arrow_array()[0].as_py() for name, what in sent if what[:1] == ("table",)]
     assert "| freeze_steps=2, replicas 0-1 | finished | 6 / 6 |  |" in tables[-1]

@@ -174,14 +174,14 @@ def written_at(run):
 
 
 def test_a_study_runs_what_is_missing_and_an_edited_one_keeps_what_is_there(tmp_path):
-    first = run_study(STUDY, tmp_path)
+    first = run_study(STUDY, tmp_path, results=False)
     assert first.failed == ()
     assert read_study(tmp_path) == STUDY
     kept = {
         own.name: (tmp_path / "runs" / own.name / "report.json").stat().st_mtime_ns for own in first.trials
     }
     edited = Study(TINY, {FREEZE: [5, 25, 50]}, name="edited")
-    second = run_study(edited, tmp_path)
+    second = run_study(edited, tmp_path, results=False)
     assert len(second.trials) == 3
     for name, at in kept.items():
         assert written_at(tmp_path / "runs" / name) == at
@@ -189,8 +189,8 @@ def test_a_study_runs_what_is_missing_and_an_edited_one_keeps_what_is_there(tmp_
 
 
 def test_studies_may_share_their_runs(tmp_path):
-    run_study(STUDY, tmp_path / "a", runs=tmp_path / "pool")
-    shared = run_study(Study(TINY, {FREEZE: [25, 30]}), tmp_path / "b", runs=tmp_path / "pool")
+    run_study(STUDY, tmp_path / "a", runs=tmp_path / "pool", results=False)
+    shared = run_study(Study(TINY, {FREEZE: [25, 30]}), tmp_path / "b", runs=tmp_path / "pool", results=False)
     assert shared.runs == tmp_path / "pool"
     assert len(list((tmp_path / "pool").iterdir())) == 3
     assert not (tmp_path / "b" / "runs").exists()
@@ -207,7 +207,7 @@ def test_a_condition_that_fails_does_not_end_the_study(tmp_path, monkeypatch):
         return usual(experiment, *arguments, **how)
 
     monkeypatch.setattr(running, "evaluate_population", fails)
-    result = run_study(STUDY, tmp_path)
+    result = run_study(STUDY, tmp_path, results=False)
     assert [(own.reason, own.state) for own in result.failed] == [("RuntimeError: broken", "failed")]
     assert state_of(tmp_path / "runs" / result.trials[1].name) == "finished"
 

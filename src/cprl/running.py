@@ -71,6 +71,7 @@ def run(
     allow: Sequence[str] = (),
     command: Sequence[str] | None = None,
     callbacks: Sequence[object] = (),
+    figures: bool = True,
     at_end: Callable[[Path], object] | None = None,
 ) -> Path:
     """Trains the agents of all replicas, evaluates them in fresh worlds, and writes and prints the outcome.
@@ -95,6 +96,7 @@ def run(
             resumes is made of; by default the run is resumed by `cprl run`.
         callbacks: further callbacks of this process (see `cprl.callbacks`), which the recipe does not hold;
             they may look, and change nothing.
+        figures: whether the training curve is drawn; a study draws its own.
         at_end: called with the directory of a run that has just finished, when all is written and said.
 
     Returns:
@@ -117,6 +119,7 @@ def run(
         "take_over": take_over,
         "keep_checkpoint": keep_checkpoint,
         "linger": linger,
+        "figures": figures,
     }
     _check(experiment, switches, allow=allow, watch=watch, at_end=at_end)
     prepare_process(experiment.seed)
@@ -151,7 +154,7 @@ def run(
             if episodes < experiment.episodes:
                 extend(directory, episodes, experiment.episodes)
             viewer = closing.enter_context(make_viewer(watch, directory, own, experiment))
-            _train_and_evaluate(directory, experiment, own, viewer, checkpointer, began, times)
+            _train_and_evaluate(directory, experiment, own, viewer, checkpointer, began, times, figures)
             checkpointer.done()
             _say_what_is_kept(directory)
     except BaseException as error:
@@ -234,6 +237,7 @@ def _train_and_evaluate(
     checkpointer: Checkpointer,
     began: _Began,
     times: RunTimes,
+    figures: bool,
 ) -> None:
     """All that follows the beginning; `report.json`, the sign that a run is finished, comes last."""
     training, before = _train(
@@ -243,9 +247,10 @@ def _train_and_evaluate(
     write_evaluation(directory, played, of_replica=experiment.evaluation_episodes)
     if viewer is not None:
         viewer.finished(played)
-    title = title_of(experiment)
-    ends = exploration_steps(experiment.agents)
-    figure = training_curve(directory, title=title, random=played["random"], exploration_steps=ends)
+    title, figure = title_of(experiment), None
+    if figures:
+        ends = exploration_steps(experiment.agents)
+        figure = training_curve(directory, title=title, random=played["random"], exploration_steps=ends)
     broken = training.finite.found
     report = {**times.report(training.times), "steps": training.steps, "finished": _now()}
     also = {"not_finite": [asdict(one) for one in broken]} if broken else {}

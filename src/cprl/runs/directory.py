@@ -25,6 +25,7 @@ from cprl.runs.lock import RunLock
 FILE_NAME: Final = "recipe.json"
 
 _RESUMES: Final = ("--resume", "--no-resume", "--go-on", "--no-go-on", "--take-over", "--no-take-over")
+_DIRECTORIES: Final = ("--out", "--runs")
 _NAMED: Final = 5
 """The largest number of differences between two recipes that an error names."""
 
@@ -188,7 +189,7 @@ def resume_command(run: Path, command: Sequence[str] | None = None) -> str:
 
 def _command(words: Sequence[str]) -> str:
     """A command line without local directories, because recipes are published: the script relative to the
-    working directory, or its name alone, and no `--out`."""
+    working directory, or its name alone, no `--out` and no `--runs`."""
     script, here = Path(words[0]), Path.cwd()
     if script.is_absolute():
         script = script.relative_to(here) if script.is_relative_to(here) else Path(script.name)
@@ -196,13 +197,13 @@ def _command(words: Sequence[str]) -> str:
 
 
 def _without_out(words: Sequence[str]) -> list[str]:
-    """The words of a command line without `--out DIRECTORY`."""
+    """The words of a command line without `--out DIRECTORY`, and `--runs DIRECTORY` of a study."""
     given, left = list(words), []
     while given:
         word = given.pop(0)
-        if word == "--out" and given:
+        if word in _DIRECTORIES and given:
             given.pop(0)
-        elif not word.startswith("--out="):
+        elif not word.startswith(tuple(f"{own}=" for own in _DIRECTORIES)):
             left.append(word)
     return left
 

@@ -6,7 +6,6 @@ Nothing here decides what a study holds. The files of a trial are `<name>.json`,
 
 import json
 import os
-import resource
 import socket
 import sys
 import time
@@ -17,6 +16,7 @@ from threading import Event, Thread
 from types import TracebackType
 from typing import Any, Final, Self
 
+import psutil
 from tensordict import TensorDictBase
 
 from cprl.compile_clock import CLOCK
@@ -156,5 +156,9 @@ def is_silent(status: Status, patience_s: float) -> Iterator[bool]:
 
 def peak_bytes() -> int:
     """The largest memory that this process has had, in bytes."""
+    if sys.platform == "win32":
+        return int(psutil.Process().memory_info().peak_wset)
+    import resource
+
     peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
     return peak if sys.platform == "darwin" else 1024 * peak

@@ -180,6 +180,7 @@ def _run(task: Task, run: Path, status: Status) -> None:
                     take_over=take_over,
                     keep_checkpoint=False,
                     watch="off",
+                    figures=False,
                     allow=task.allow,
                     callbacks=(StatusCallback(shown),),
                 )
