@@ -23,7 +23,6 @@ from ..faults.driver import differences, progress, still_alive
 from .work import study
 
 ROOT: Final = Path(__file__).parents[2]
-NAMES: Final = tuple(trial.name for trial in trials_of(study()))
 HEAD: Final = (
     "| kill | after the start or the last kill | of | trials finished | trials that it hit "
     "| newest checkpoint, step | rows | workers gone after |\n|---:|---:|---|---:|---|---:|---:|---:|"
@@ -61,6 +60,7 @@ class Driver:
         argv = [sys.executable, "-m", "tests.study_faults", "--drive", str(out), "--on", on]
         argv += ["--episodes", str(episodes)]
         self.out = out
+        self.names = [trial.name for trial in trials_of(study(episodes))]
         with open(out.with_suffix(".out"), "ab") as said:
             self.process = subprocess.Popen(argv, cwd=ROOT, env=where, stdout=said, stderr=said)
 
@@ -83,7 +83,7 @@ class Driver:
 def running(driver: Driver) -> dict[str, dict[str, Any]]:
     """The trials that workers of this driver run, each with its status."""
     pids = {own.pid for own in driver.family()}
-    found = {name: Status(driver.out / "status", name).read() for name in NAMES}
+    found = {name: Status(driver.out / "status", name).read() for name in driver.names}
     return {
         name: own
         for name, own in found.items()
@@ -127,7 +127,7 @@ def killed(driver: Driver, victim: str, chance: random.Random, since: float) -> 
     return Kill(
         after_s=began - since,
         victim=victim,
-        finished=sum(is_finished(driver.out, name) for name in NAMES),
+        finished=sum(is_finished(driver.out, name) for name in driver.names),
         hit=tuple((name, *progress(driver.out / "runs" / name)) for name in hit),
         gone_s=time.monotonic() - began,
     )
