@@ -80,7 +80,7 @@ def test_what_a_killed_process_left_before_its_recipe_is_no_obstacle(tmp_path, u
 def test_a_trial_that_was_killed_before_its_first_checkpoint_starts_over(tmp_path, undisturbed):
     own = task(tmp_path)
     shutil.copytree(undisturbed, own.directory)
-    for name in ("report.json", "manifest.json", "episodes.parquet", CHECKPOINTS, "evaluation", "figures"):
+    for name in ("report.json", "manifest.json", "episodes.parquet", CHECKPOINTS, "evaluation"):
         path = own.directory / name
         shutil.rmtree(path) if path.is_dir() else path.unlink()
     assert state_of(own.directory) == "unfinished"

@@ -29,6 +29,7 @@ NOT_CALLED: Final = {
     "cprl.algorithms.base:OnPolicy": "abstract; its subclasses have rows",
     "cprl.algorithms.base:TeamAlgorithm": "abstract; its subclasses have rows",
     "cprl.callbacks:Callback": "a Protocol, which nobody calls",
+    "cprl.studies.executors.in_process:Executor": "a Protocol, which nobody calls",
 }
 """Public names without a row, each with the reason."""
 

@@ -209,8 +209,18 @@ def write_study(study: Study, out: Path) -> None:
     write_json(out / FILE_NAME, study.to_config(out))
 
 
-def read_study(out: Path, *, allow: Sequence[str] = ()) -> Study:
-    """The study of a directory; raises a ValueError where there is none."""
+def read_study(out: Path | str, *, allow: Sequence[str] = ()) -> Study:
+    """The study of a directory.
+
+    Args:
+        out: the directory.
+        allow: the user's own code, "module:Class", that it may import.
+
+    Raises:
+        ValueError: where there is none, and for what is not allowed.
+    """
+    out = path("out", out)
+    texts("allow", allow)
     try:
         table = read_json(out / FILE_NAME)
     except (OSError, ValueError) as error:
