@@ -1,7 +1,9 @@
 """A study of parameters is a value: its conditions, their names, seeds and checksums; JSON and back."""
 
 import json
+import sys
 from dataclasses import replace
+from importlib import import_module
 from pathlib import Path
 
 import pytest
@@ -309,3 +311,19 @@ def test_a_team_is_an_agent_that_learns():
     team = replace(TINY, agents=(Team(VDN(settings=SETTINGS), agents=(0, 1)),))
     study = Study(team, {GAMMA: [0.5]})
     assert values_at(study.all_conditions[0].experiment, GAMMA) == [0.5]
+
+
+RECIPES = Path(__file__).parents[1] / "recipes" / "studies"
+
+
+@pytest.mark.parametrize("name", sorted(own.stem for own in RECIPES.glob("*.py") if own.stem != "base"))
+def test_a_shipped_study_asks_a_question_and_says_what_is_expected(name, monkeypatch):
+    monkeypatch.syspath_prepend(RECIPES)
+    study = import_module(name).STUDY
+    assert study.name == name
+    assert study.question.endswith("?")
+    assert len(study.expectation) > 100
+    assert len(study.all_conditions) >= 3
+    assert Condition(study.experiment).checksum in [own.checksum for own in study.all_conditions]
+    for module in (name, "base"):
+        sys.modules.pop(module)
