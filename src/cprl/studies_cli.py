@@ -100,7 +100,7 @@ def study_main(study: Study, argv: Sequence[str] | None = None) -> Path:
         given = {own: getattr(options, own) for own in ("replicas", "block")}
         changed = {own: value for own, value in given.items() if value is not None}
         wanted = replace(study, **changed) if changed else study
-        return carry_out(wanted, options, [_python(), *command])
+        return carry_out(wanted, options, [sys.executable, *command])
 
 
 def sweep(words: Sequence[str], /) -> None:
@@ -207,14 +207,6 @@ def recipe_of(source: Path, allow: Sequence[str] = ()) -> Callable[..., Experime
             raise ValueError(f"{source} describes a study, which is run by itself: python {source}")
         raise ValueError(f"{source} has no function `experiment`; allowed: one that gives an Experiment")
     return made
-
-
-def _python() -> str:
-    """This Python as one would type it here: summaries, which are published, have no local directories."""
-    executable = Path(sys.executable)
-    if executable.is_relative_to(Path.cwd()):
-        return str(executable.relative_to(Path.cwd()))
-    return executable.name
 
 
 def _about(study: Study) -> str:

@@ -98,7 +98,7 @@ def copied(name: str) -> Path:
 
 
 def _make(place: Path) -> None:
-    with contextlib.redirect_stdout(open(os.devnull, "w")):
+    with open(os.devnull, "w") as null, contextlib.redirect_stdout(null):
         cprl.run(WHOLE, place / "finished", watch="off")
         cprl.run(replace(WHOLE, transforms=(), loggers=()), place / "plain", watch="off")
         with stopped_after(STEPS), contextlib.suppress(Stopped), _saving_each(4):
