@@ -16,6 +16,7 @@ import tyro
 
 from cprl.arguments import integer
 from cprl.output import console, say
+from cprl.runs.directory import without_directories
 from cprl.studies.execution import RUNS, STATUS, StudyResult, directory_of, run_study
 from cprl.studies.executors import Executor, InProcess, Processes, Ray
 from cprl.studies.overview import Overview, label_of
@@ -99,7 +100,7 @@ def carry_out(what: Study | Search, options: StudyOptions, command: Sequence[str
         return _list(what, options)
     names = ("runs", "allow", "watch")
     how: dict[str, Any] = {"on": executor, **{own: getattr(options, own) for own in names}}
-    how |= {"results": options.figures, "again": shlex.join(_published(command))}
+    how |= {"results": options.figures, "again": shlex.join([without_directories(command[0]), *command[1:]])}
     with _interruptible(again):
         result: StudyResult | SearchResult
         if isinstance(what, Search):
@@ -135,15 +136,6 @@ def _list(what: Study | Search, options: StudyOptions) -> Path:
         "nothing was written"
     )
     return out
-
-
-def _published(command: Sequence[str]) -> list[str]:
-    """A command line as it stands in summaries, which have no local directories."""
-    program = Path(command[0])
-    if program.is_absolute():
-        here = Path.cwd()
-        program = program.relative_to(here) if program.is_relative_to(here) else Path(program.name)
-    return [str(program), *command[1:]]
 
 
 def _say_best(result: SearchResult) -> None:

@@ -190,10 +190,16 @@ def resume_command(run: Path, command: Sequence[str] | None = None) -> str:
 def _command(words: Sequence[str]) -> str:
     """A command line without local directories, because recipes are published: the script relative to the
     working directory, or its name alone, no `--out` and no `--runs`."""
-    script, here = Path(words[0]), Path.cwd()
-    if script.is_absolute():
-        script = script.relative_to(here) if script.is_relative_to(here) else Path(script.name)
-    return shlex.join([str(script), *_without_out(words[1:])])
+    return shlex.join([without_directories(words[0]), *_without_out(words[1:])])
+
+
+def without_directories(program: str) -> str:
+    """The first word of a command line as recipes and summaries have it, which are published: relative to the
+    working directory, or its name alone."""
+    path, here = Path(program), Path.cwd()
+    if path.is_absolute():
+        path = path.relative_to(here) if path.is_relative_to(here) else Path(path.name)
+    return str(path)
 
 
 def _without_out(words: Sequence[str]) -> list[str]:

@@ -3,11 +3,11 @@
 import hashlib
 import json
 from collections.abc import Mapping
-from dataclasses import MISSING, dataclass, field, fields, is_dataclass
+from dataclasses import MISSING, dataclass, field, fields
 from functools import cached_property
 from typing import Any, Final
 
-from cprl.config import KINDS
+from cprl.config import KINDS, to_config
 from cprl.experiment import Experiment
 
 FORMAT: Final = 1
@@ -53,7 +53,10 @@ def defaults_of(kind: Any) -> dict[str, Any]:
             found[own.name] = own.default
         elif own.init and own.default_factory is not MISSING:
             found[own.name] = own.default_factory()
-    return {name: _plain(value) for name, value in found.items()}
+    tables = {  # the arguments of a Custom are a table already
+        name: value if isinstance(value, Mapping) else to_config(value) for name, value in found.items()
+    }
+    return {name: _without_defaults(table) for name, table in tables.items()}
 
 
 def _without_defaults(table: Any, kind: Any = None) -> Any:
@@ -70,17 +73,3 @@ def _without_defaults(table: Any, kind: Any = None) -> Any:
     left_out = {} if kind is None else defaults_of(kind)
     plain = {name: _without_defaults(own) for name, own in table.items()}
     return {name: own for name, own in plain.items() if name not in left_out or own != left_out[name]}
-
-
-def _plain(value: Any) -> Any:
-    """A default as `_without_defaults` gives values."""
-    if isinstance(value, tuple | list):
-        return [_plain(own) for own in value]
-    if isinstance(value, float) and value.is_integer():
-        return int(value)
-    if is_dataclass(value) and not isinstance(value, type):
-        own = {entry.name: _plain(getattr(value, entry.name)) for entry in fields(value) if entry.init}
-        defaults = defaults_of(type(value))
-        kept = {name: held for name, held in own.items() if name not in defaults or held != defaults[name]}
-        return {"kind": type(value).__name__, **kept}
-    return value

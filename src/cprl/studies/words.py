@@ -15,14 +15,11 @@ from cprl.checks import shown
 from cprl.commons.maps import Map
 from cprl.config import fits, type_text
 from cprl.experiment import Experiment
-from cprl.studies.factors import Distribution, Factor, Integers, LogUniform, Uniform
+from cprl.studies import factors
+from cprl.studies.factors import Distribution, Factor, Integers
 from cprl.studies.paths import normalised, types_at
 
-DISTRIBUTIONS: Final[Mapping[str, Any]] = {
-    "uniform": Uniform,
-    "loguniform": LogUniform,
-    "integers": Integers,
-}
+DISTRIBUTIONS: Final[Mapping[str, Any]] = {name.lower(): kind for name, kind in factors.DISTRIBUTIONS.items()}
 """What draws values, by the word before its range: "loguniform(1e-5, 1e-3)"."""
 
 _DRAWN: Final = re.compile(r"\s*([a-z_]+)\((.*)\)\s*", re.IGNORECASE)
