@@ -109,8 +109,8 @@ class Team:
     Args:
         algorithm: e.g. `cprl.algorithms.QMIX(settings=...)`.
         agents: their indices, ascending.
-        reward: "team", the sum of the rewards of all agents of the game; for IPPO also what each member wants
-            by itself, see `Learning`.
+        reward: "team", the sum of the rewards of all agents of the game; for IPPO and MADDPG also what each
+            member wants by itself, see `Learning`.
         start_from: a member of a team of the same size; each member starts with the weights of the member
             at the same place in that team, see `Learning`. Mixers and central critics begin anew.
         decisions: how each member learns what it decides, by itself; see `Learning`.

@@ -6,12 +6,14 @@ Modules, in the order in which one reads them:
     actor_critic  SAC, IQL
     on_policy     PPO, A2C, REINFORCE
     teams         VDN, QMIX, MAPPO, IPPO
+    maddpg        MADDPG
     tabular       tabular Q-learning
 """
 
 from cprl.algorithms.actor_critic import IQL, SAC
 from cprl.algorithms.base import Algorithm, OffPolicy, OnPolicy, TeamAlgorithm
 from cprl.algorithms.dqn import CQL, DQN, DistributionalDQN
+from cprl.algorithms.maddpg import MADDPG
 from cprl.algorithms.on_policy import A2C, PPO, Reinforce
 from cprl.algorithms.tabular import Tabular
 from cprl.algorithms.teams import IPPO, MAPPO, QMIX, VDN
@@ -23,6 +25,7 @@ __all__ = [
     "DQN",
     "IPPO",
     "IQL",
+    "MADDPG",
     "MAPPO",
     "PPO",
     "QMIX",
