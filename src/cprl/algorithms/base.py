@@ -68,6 +68,8 @@ class Algorithm:
     stochastic: ClassVar[bool] = False
     """Whether the acting network outputs the logits of a policy, from which actions are sampled; else it
     outputs action values, and actions are epsilon-greedy."""
+    can_share_parameters: ClassVar[bool] = False
+    """Whether agents of a team can share one network, see `cprl.population.Team`."""
 
     def __post_init__(self) -> None:
         self._check_settings()
@@ -97,8 +99,8 @@ class Algorithm:
             spaces: the shape and dtype of observations, and the number of actions A.
             agents: their indices.
             engine: how they are updated.
-            how: `replicas`, `seed`, `first_replica`, `reward_kind` and `device`, see
-                `cprl.learners.replay.ReplayLearner`.
+            how: `replicas`, `seed`, `first_replica`, `reward_kind`, `device` and, if the algorithm
+                `can_share_parameters`, `share_parameters`; see `cprl.learners.replay.ReplayLearner`.
 
         Raises:
             ValueError: if the settings have the wrong class, the algorithm does not support these agents,
@@ -128,6 +130,7 @@ class OffPolicy(Algorithm):
 
     settings: DQNSettings
     settings_kind: ClassVar[type[Any]] = DQNSettings
+    can_share_parameters: ClassVar[bool] = True
     noise_numbers: ClassVar[int] = 0
     """How many uniform numbers in 0..1 the loss reads for each transition, of each member of a team, to
     sample by: the entry "noise", float32 [.., noise_numbers] or [.., S, noise_numbers]. A loss that samples
@@ -148,6 +151,7 @@ class OffPolicy(Algorithm):
             "noise_numbers": self.noise_numbers,
         }
         if engine == "torchrl":
+            _refuse_sharing(how)
             return TorchRLReplayLearner(spaces, **how)
         return ReplayLearner(spaces, compile=engine == "compiled", **how)
 
@@ -162,6 +166,7 @@ class OnPolicy(Algorithm):
     settings: RolloutSettings
     settings_kind: ClassVar[type[Any]] = RolloutSettings
     stochastic: ClassVar[bool] = True
+    can_share_parameters: ClassVar[bool] = True
 
     def make_learner(
         self, spaces: Spaces, *, agents: Sequence[int], engine: TrainingEngine = "compiled", **how: Any
@@ -176,6 +181,7 @@ class OnPolicy(Algorithm):
             "make_loss": self.make_loss,
         }
         if engine == "torchrl":
+            _refuse_sharing(how)
             return TorchRLRolloutLearner(spaces, **how)
         return RolloutLearner(spaces, compile=engine == "compiled", **how)
 
@@ -226,6 +232,13 @@ class TeamAlgorithm(Algorithm):
                 f"the team has {members} agents; allowed for {name}: at least {self.fewest_members}; DQN and "
                 "VDN support fewer"
             )
+
+
+def _refuse_sharing(how: dict[str, Any]) -> None:
+    if how.pop("share_parameters", False):
+        raise ValueError(
+            'share_parameters is True; allowed with engine="torchrl", which trains independent agents: False'
+        )
 
 
 def _check_engine(engine: str) -> None:
