@@ -174,7 +174,7 @@ class JointActionEnv(LeanStepEnv):
         own: Any = self._buffers
         seed: Any = np.int64(own["seed_bits"].item()).astype(np.uint64)
         episode: Any = own["episode"].numpy(force=True).astype(np.uint64)
-        world = (np.arange(len(episode)) + self._first_world).astype(np.uint64)[:, None]
+        world: Any = (np.arange(len(episode)) + self._first_world).astype(np.uint64)[:, None]
         zero = np.zeros_like(episode)
         word = philox4x32(_LENGTH + zero, zero, episode, world, seed & LOW_WORD, seed >> WORD_BITS)[0]
         unit = (word.astype(np.float64) + 0.5) / 2**32
