@@ -53,11 +53,12 @@ class ReplayLearner:
         compile: whether torch compiles acting and the update; the engine "list" is never compiled.
         start_from: the weights with which acting networks, and their targets, start, by the lane's name; the
             others, such as critics, are new.
+        sees_peers: whether transitions have the actions of all agents, see `transitions.joint_actions`.
         device: the torch device of networks, buffers and updates.
 
     Raises:
         ValueError: for a loss that needs the latest steps of the current policy (see
-            `cprl.learners.rollouts`), and for a team without the team reward.
+            `cprl.learners.rollouts`), for a team without the team reward, and for one that sees its peers.
     """
 
     def __init__(
@@ -77,6 +78,7 @@ class ReplayLearner:
         engine: EngineName | None = None,
         compile: bool = True,
         start_from: StartFrom | None = None,
+        sees_peers: bool = False,
         device: str | torch.device = "cpu",
     ) -> None:
         _refuse_unshared_reward(is_team=make_team is not None, reward_kind=reward_kind)
@@ -93,6 +95,7 @@ class ReplayLearner:
             make_team=make_team,
             stochastic=stochastic,
             start_from=start_from,
+            sees_peers=sees_peers,
         )
         make_loss = make_loss or partial(dqn_loss, gamma=settings.gamma)
         self._shapes: dict[str, Any] = {
