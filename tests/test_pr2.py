@@ -15,6 +15,8 @@ import cprl
 from cprl import CommonsEnv, Experiment, Game, Rules, keys, maps
 from cprl.agents import Population
 from cprl.algorithms import DQN, PR2, VDN, DQNSettings
+from cprl.envs import make_env
+from cprl.envs.matrix import MatrixGame, stag_hunt
 from cprl.evaluation import crossplay, evaluate_run
 from cprl.learners.engine.compiled import FunctionalEngine
 from cprl.learners.transitions import joint_actions
@@ -266,3 +268,34 @@ def test_a_team_does_not_see_peers_of_its_own():
     how = {"agents": (0, 1), "replicas": 2, "seed": 1, "reward_kind": "team"}
     with pytest.raises(ValueError, match=r"^sees_peers is True; allowed for a team: False"):
         Seeing(settings=SETTINGS).make_learner(GAME.spaces, engine="eager", **how)
+
+
+STAG = stag_hunt()
+"""4 for both who hunt the stag, 3 and 0 where one takes the hare, 1 for both who take it."""
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("game", "temperature", "first_action"),
+    [
+        # Wen et al. (2019) by exact values, see above: (0.676, 0.324) for both, not the equilibrium's 0.5.
+        pytest.param(MatrixGame((((0, 3), (3, 2)), ((1, 0), (2, 1)))), 1.0, 0.676, id="optimism"),
+        # Q(stag) = log(e^8 + 1) / 2 = 4.0002, Q(hare) = log(e^6 + e^2) / 2 = 3.0091, at T = 0.5 a probability
+        # of 1 / (1 + e^(-2 * 0.9911)) = 0.879 of the stag, though the hare is safer against uniform play.
+        pytest.param(STAG, 0.5, 0.879, id="stag hunt"),
+    ],
+)
+def test_ten_pairs_of_learners_end_at_the_policy_of_exact_values(game, temperature, first_action):
+    settings = DQNSettings(
+        buffer_size=1000, batch_size=16, learning_rate=3e-3, hidden_cells=(16,), learning_starts=50
+    )
+    learning = Learning(PR2(settings=settings, temperature=temperature))
+    env = make_env(game, worlds=10, seed=0)
+    agents = Population(env, (learning, learning), seed=0, engine="eager")
+    train(env, agents.learners, episodes=1000)
+    networks = agents.networks()
+    assert len(networks) == 20
+    for name, network in networks.items():
+        with torch.no_grad():
+            found = network(torch.ones(1)).softmax(-1)[0]
+        assert abs(found - first_action) < 0.02, name
