@@ -19,6 +19,7 @@ from cprl.algorithms import (
     IQL,
     MAPPO,
     PPO,
+    PR2,
     QMIX,
     SAC,
     VDN,
@@ -60,7 +61,7 @@ _OF_CPRL: Final[tuple[type[Any], ...]] = (
     *(InequityAversion, SocialValueOrientation, Exchange),
     *(Boundaries, ClosedPatches, ClosedSeason, GraduatedSanctions, Levies, Mediation),
     *(Monitoring, Quota, Sanctioner, Tax, Vote),
-    *(DQN, DistributionalDQN, CQL, SAC, IQL, PPO, A2C, Reinforce, VDN, QMIX, MAPPO, IPPO, Tabular),
+    *(DQN, DistributionalDQN, CQL, SAC, IQL, PR2, PPO, A2C, Reinforce, VDN, QMIX, MAPPO, IPPO, Tabular),
     *(DQNSettings, RolloutSettings, TabularSettings, Bandit, MLP, Conv),
     Custom,
 )

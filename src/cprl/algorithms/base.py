@@ -42,6 +42,7 @@ _CHECKS: Final[dict[str, Check]] = {
     "alpha_init": number(1e-12, 1e6),
     "expectile": number(0.5, 0.999),
     "temperature": _WEIGHT,
+    "entropy_bonus": SWITCH,
     "clip_epsilon": number(1e-6, 0.999),
     "entropy_coeff": _WEIGHT,
     "critic_coeff": _WEIGHT,
@@ -130,6 +131,9 @@ class OffPolicy(Algorithm):
     settings: DQNSettings
     settings_kind: ClassVar[type[Any]] = DQNSettings
     can_share_parameters: ClassVar[bool] = True
+    sees_peers_actions: ClassVar[bool] = False
+    """Whether "action" is [.., N] in place of [..]: first the agent's own action, then those of the others in
+    the order of their indices, whatever they learn by. Agents still act on their own observations alone."""
 
     def make_learner(
         self, spaces: Spaces, *, agents: Sequence[int], engine: TrainingEngine = "compiled", **how: Any
@@ -143,6 +147,7 @@ class OffPolicy(Algorithm):
             "make_network": lambda: self.make_network(spaces),
             "make_loss": self.make_loss,
             "stochastic": self.stochastic,
+            "sees_peers": self.sees_peers_actions,
         }
         if engine == "torchrl":
             _refuse_sharing(how)

@@ -12,7 +12,7 @@ from torch import Tensor, nn
 from cprl.arguments import object_of
 from cprl.learners.checks import check_networks
 from cprl.learners.engine.shared import is_list
-from cprl.learners.transitions import LaneTurn, lane_turn, seen_next
+from cprl.learners.transitions import LaneTurn, joint_actions, lane_turn, seen_next
 from cprl.networks.agent import acting_part
 from cprl.networks.specification import refuse_unseen
 from cprl.policies.lanes import LaneActor
@@ -81,6 +81,7 @@ class Lanes:
         stochastic: whether the network outputs the logits of a policy from which actions are sampled.
         start_from: the weights with which the acting networks of lanes start, see `StartFrom`.
         share_parameters: whether the agents of a replica share one network, initialised as that of the first.
+        sees_peers: whether a lane's stored action is that of all N agents, see `transitions.joint_actions`.
 
     Raises:
         ValueError: if agents observe entries that networks do not read.
@@ -98,12 +99,13 @@ class Lanes:
         stochastic: bool,
         start_from: StartFrom | None = None,
         share_parameters: bool = False,
+        sees_peers: bool = False,
     ) -> None:
         refuse_unseen(spaces)
         self.spaces, self.agents, self.replicas, self.seed = spaces, tuple(agents), replicas, seed
         self._numbers = range(first_replica, first_replica + replicas)
         self.make_network, self.stochastic = make_network, stochastic
-        self._start_from = weights_to_start(start_from)
+        self._start_from, self.sees_peers = weights_to_start(start_from), sees_peers
         self.sharing = len(self.agents) if share_parameters else 1
         """The number of agents that share a network."""
 
@@ -122,8 +124,9 @@ class Lanes:
 
     @property
     def action_shape(self) -> tuple[int, ...]:
-        """The shape of a lane's action, and of its reward in a rollout."""
-        return ()
+        """The shape of a lane's stored action: (N,) if it sees those of its peers, else (), the shape of its
+        reward in a rollout."""
+        return (self.spaces.agents,) if self.sees_peers else ()
 
     @property
     def of_replica(self) -> int:
@@ -132,7 +135,8 @@ class Lanes:
 
     def turn(self, batch: TensorDictBase, rewards: Any) -> LaneTurn:
         """One transition of every lane, as a replay buffer stores it; see `lane_turn`."""
-        return lane_turn(self.agents, batch, rewards)
+        turn = lane_turn(self.agents, batch, rewards)
+        return turn._replace(action=joint_actions(self.agents, batch)) if self.sees_peers else turn
 
     def rollout_turn(self, batch: TensorDictBase, rewards: Any) -> LaneTurn:
         """One transition of every lane, as a rollout stores it; see `lane_turn`."""

@@ -55,11 +55,12 @@ class ReplayLearner:
         start_from: the weights with which acting networks, and their targets, start, by the lane's name; the
             others, such as critics, are new.
         share_parameters: whether the agents of a replica share one network, which learns from all of them.
+        sees_peers: whether transitions have the actions of all agents, see `transitions.joint_actions`.
         device: the torch device of networks, buffers and updates.
 
     Raises:
         ValueError: for a loss that needs the latest steps of the current policy (see
-            `cprl.learners.rollouts`), and for a team without the team reward.
+            `cprl.learners.rollouts`), for a team without the team reward, and for one that sees its peers.
     """
 
     def __init__(
@@ -80,6 +81,7 @@ class ReplayLearner:
         compile: bool = True,
         start_from: StartFrom | None = None,
         share_parameters: bool = False,
+        sees_peers: bool = False,
         device: str | torch.device = "cpu",
     ) -> None:
         _refuse_unshared_reward(is_team=make_team is not None, reward_kind=reward_kind)
@@ -97,6 +99,7 @@ class ReplayLearner:
             stochastic=stochastic,
             start_from=start_from,
             share_parameters=share_parameters,
+            sees_peers=sees_peers,
         )
         make_loss = make_loss or partial(dqn_loss, gamma=settings.gamma)
         self._shapes: dict[str, Any] = {

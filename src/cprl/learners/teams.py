@@ -145,6 +145,10 @@ class Teams:
 def lanes_of(spaces: Spaces, *, make_team: MakeTeam | None, **how: Any) -> Lanes | Teams:
     """The lanes of independent agents, or with `make_team` of a team; see `Lanes` for the arguments."""
     members = Lanes(spaces, **how)
+    if make_team and members.sees_peers:
+        raise ValueError(
+            "sees_peers is True; allowed for a team: False; its members' actions are stored together"
+        )
     return Teams(members, make_team) if make_team else members
 
 

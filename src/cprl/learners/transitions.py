@@ -19,7 +19,7 @@ class LaneTurn(NamedTuple):
     observation: Any
     """uint8 [L, C, X, Y]."""
     action: Any
-    """int64 [L]."""
+    """int64 [L]; [L, N] for lanes that see the actions of their peers, see `joint_actions`."""
     next_observation: Any
     """uint8 [L, C, X, Y]."""
     reward: Any
@@ -68,6 +68,23 @@ def lane_turn(agents: tuple[int, ...], batch: TensorDictBase, rewards: Any = Non
         of_world(entry(after, keys.DONE)),
         of_world(entry(after, keys.TERMINATED)),
     )
+
+
+def joint_actions(agents: tuple[int, ...], batch: TensorDictBase) -> Any:
+    """The actions of all N agents in one turn, as each of some agents of every replica sees them.
+
+    Args:
+        agents: the indices of the S agents.
+        batch: a turn of every replica, see `lane_turn`.
+
+    Returns:
+        int64 [R x S, N]: first a lane's own action, then the others' in the order of their indices. They are
+        those that agents chose, also where an agent was out of play and its action did not count.
+    """
+    actions = array_of(keys.entry(keys.entry(batch, keys.AGENTS), "action"))
+    everyone = actions.shape[1]
+    order = [[own, *(other for other in range(everyone) if other != own)] for own in agents]
+    return actions[:, order].reshape(len(actions) * len(agents), everyone)
 
 
 def wanted_in(wants: WantedRewards, batch: TensorDictBase) -> Any:

@@ -33,8 +33,8 @@ from cprl.preferences.values import Preference
 from cprl.preferences.wanted import WantedRewards
 from cprl.spaces import Spaces
 
-BYTES_BESIDE: Final = 8 + 4 + 1 + 1
-"""Bytes of a transition without its observations: action, reward, done, terminated."""
+BYTES_BESIDE: Final = 4 + 1 + 1
+"""Bytes of a transition without its observations and actions: reward, done, terminated."""
 
 
 class TorchRLReplayLearner:
@@ -61,6 +61,7 @@ class TorchRLReplayLearner:
         make_sampler: makes an agent's sampler; by default a `RandomSampler`.
         start_from: the weights with which acting networks, and their targets, start, by the lane's name; the
             others, such as critics, are new.
+        sees_peers: whether transitions have the actions of all agents, see `transitions.joint_actions`.
         device: the torch device of networks, buffers and updates.
 
     Raises:
@@ -85,6 +86,7 @@ class TorchRLReplayLearner:
         reward_kind: Preference = "individual",
         make_sampler: MakeSampler | None = None,
         start_from: StartFrom | None = None,
+        sees_peers: bool = False,
         device: str | torch.device = "cpu",
     ) -> None:
         check_learner(spaces, settings, DQNSettings, agents, replicas, first_replica, seed, reward_kind)
@@ -102,6 +104,7 @@ class TorchRLReplayLearner:
             make_network=make_network,
             stochastic=stochastic,
             start_from=start_from,
+            sees_peers=sees_peers,
         )
         self._refuse_unfit(make_loss, device)
         self.stock = StockAgents(
@@ -117,7 +120,7 @@ class TorchRLReplayLearner:
         self.updaters = [_target_updater(agent.loss, settings) for agent in self.stock.each]
         if settings.own_target_weights:
             self._init_targets(make_loss)
-        _check_memory(len(self._lanes), spaces, settings, self.stock.device)
+        _check_memory(self._lanes, settings, self.stock.device)
         self._make_buffers()
         self.actor = self._lanes.actor(self.stock, compile=False)
         self.steps = 0
@@ -130,6 +133,7 @@ class TorchRLReplayLearner:
             1,
             self._lanes.observation_shape,
             self.spaces.actions,
+            action_shape=self._lanes.action_shape,
             observation_dtype=self.spaces.observation_dtype,
             horizon=Horizon(settings.n_steps, settings.gamma) if settings.n_steps > 1 else None,
             device=device,
@@ -275,14 +279,16 @@ def _check(settings: DQNSettings, loss: LossModule) -> None:
             raise ValueError(f"{name} is {getattr(settings, name)}, and the loss has no targets")
 
 
-def _check_memory(lanes: int, spaces: Spaces, settings: DQNSettings, device: torch.device) -> None:
+def _check_memory(lanes: Lanes, settings: DQNSettings, device: torch.device) -> None:
     """Checks memory in advance: stock storage holds the observations before and after each transition, and
     its pages are only committed as they fill, so a machine with too little would fail hours later."""
+    spaces = lanes.spaces
     observation = prod(spaces.observation_shape) * torch_dtype(spaces.observation_dtype).itemsize
-    wanted = lanes * settings.buffer_size * (2 * observation + BYTES_BESIDE)
+    beside = 8 * prod(lanes.action_shape) + BYTES_BESIDE
+    wanted = len(lanes) * settings.buffer_size * (2 * observation + beside)
     wanted += settings.batch_size * 2 * (observation + 4 * prod(spaces.observation_shape))
     check_memory(
-        f"the replay buffers of {lanes} agents x {settings.buffer_size:,} transitions",
+        f"the replay buffers of {len(lanes)} agents x {settings.buffer_size:,} transitions",
         wanted,
         'a smaller buffer_size or batch_size, fewer replicas, or engine="compiled", which needs half',
         device=device,
