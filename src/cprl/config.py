@@ -17,6 +17,7 @@ from cprl.algorithms import (
     DQN,
     IPPO,
     IQL,
+    MADDPG,
     MAPPO,
     PPO,
     PR2,
@@ -61,7 +62,8 @@ _OF_CPRL: Final[tuple[type[Any], ...]] = (
     *(InequityAversion, SocialValueOrientation, Exchange),
     *(Boundaries, ClosedPatches, ClosedSeason, GraduatedSanctions, Levies, Mediation),
     *(Monitoring, Quota, Sanctioner, Tax, Vote),
-    *(DQN, DistributionalDQN, CQL, SAC, IQL, PR2, PPO, A2C, Reinforce, VDN, QMIX, MAPPO, IPPO, Tabular),
+    *(DQN, DistributionalDQN, CQL, SAC, IQL, PPO, A2C, Reinforce, VDN, QMIX, MAPPO, IPPO, MADDPG, PR2),
+    Tabular,
     *(DQNSettings, RolloutSettings, TabularSettings, Bandit, MLP, Conv),
     Custom,
 )

@@ -46,6 +46,7 @@ _CHECKS: Final[dict[str, Check]] = {
     "clip_epsilon": number(1e-6, 0.999),
     "entropy_coeff": _WEIGHT,
     "critic_coeff": _WEIGHT,
+    "logit_penalty": _WEIGHT,
     "mixing_cells": count(1, MOST_CELLS),
 }
 """Of the fields of cprl's algorithms; one of the same name means the same in each."""
@@ -134,6 +135,10 @@ class OffPolicy(Algorithm):
     sees_peers_actions: ClassVar[bool] = False
     """Whether "action" is [.., N] in place of [..]: first the agent's own action, then those of the others in
     the order of their indices, whatever they learn by. Agents still act on their own observations alone."""
+    noise_numbers: ClassVar[int] = 0
+    """How many uniform numbers in 0..1 the loss reads for each transition, of each member of a team, to
+    sample by: the entry "noise", float32 [.., noise_numbers] or [.., S, noise_numbers]. A loss that samples
+    by torch's generator instead would make replicas depend on each other."""
 
     def make_learner(
         self, spaces: Spaces, *, agents: Sequence[int], engine: TrainingEngine = "compiled", **how: Any
@@ -148,6 +153,7 @@ class OffPolicy(Algorithm):
             "make_loss": self.make_loss,
             "stochastic": self.stochastic,
             "sees_peers": self.sees_peers_actions,
+            "noise_numbers": self.noise_numbers,
         }
         if engine == "torchrl":
             _refuse_sharing(how)
@@ -189,11 +195,12 @@ class TeamAlgorithm(Algorithm):
     """Trains a team: agents that learn together and act independently, on their own observations.
 
     `make_network` returns the networks of one member. The loss reads observations [.., S, *shape] and actions
-    [.., S] of S members; rewards [.., 1] of replay, advantages [.., S, 1] of rollouts.
+    [.., S] of S members. From replay, rewards are [.., 1], or [.., S, 1] where `shares_reward` is False; from
+    rollouts, advantages are [.., S, 1].
     """
 
     shares_reward: ClassVar[bool] = True
-    """Whether the members must get the team reward."""
+    """Whether the members must get the team reward; else each has its own."""
     fewest_members: ClassVar[int] = 1
     """The smallest team that the algorithm supports."""
 
@@ -208,6 +215,8 @@ class TeamAlgorithm(Algorithm):
         """See `Algorithm`."""
         self._refuse_torchrl(engine)
         self._check_team(len(agents), how.get("reward_kind", "individual"))
+        if isinstance(self, OffPolicy):
+            how["own_rewards"] = not self.shares_reward
         return super().make_learner(
             spaces,
             agents=agents,
@@ -221,7 +230,7 @@ class TeamAlgorithm(Algorithm):
         if self.shares_reward and reward != "team":
             raise ValueError(
                 f'reward is {named(reward)}; allowed for {name}: "team", the sum over all agents; '
-                f"DQN, PPO and IPPO support {named(reward)}"
+                f"DQN, PPO, IPPO and MADDPG support {named(reward)}"
             )
         if members < self.fewest_members:
             raise ValueError(

@@ -18,7 +18,7 @@ from cprl.networks.specification import refuse_unseen
 from cprl.policies.lanes import LaneActor
 from cprl.spaces import Spaces
 
-WEIGHTS, TARGET_WEIGHTS, EXPLORATION, SAMPLING, EVALUATION, EXHIBITION = range(6)
+WEIGHTS, TARGET_WEIGHTS, EXPLORATION, SAMPLING, EVALUATION, EXHIBITION, NOISE = range(7)
 """The purposes of a lane's random numbers; each has its own seed."""
 
 StartFrom: TypeAlias = Mapping[str, Mapping[str, Tensor]]
@@ -127,6 +127,11 @@ class Lanes:
         """The shape of a lane's stored action: (N,) if it sees those of its peers, else (), the shape of its
         reward in a rollout."""
         return (self.spaces.agents,) if self.sees_peers else ()
+
+    @property
+    def reward_shape(self) -> tuple[int, ...]:
+        """The shape of a lane's reward in a replay buffer."""
+        return ()
 
     @property
     def of_replica(self) -> int:

@@ -17,7 +17,7 @@ from cprl.learners.engine.choice import TRIAL_LANES, EngineName, make_engine, tr
 from cprl.learners.engine.functional import MakeLoss
 from cprl.learners.engine.refusals import refuse_for_replay
 from cprl.learners.engine.shared import SharedEngine
-from cprl.learners.lanes import SAMPLING, TARGET_WEIGHTS, WEIGHTS, StartFrom
+from cprl.learners.lanes import NOISE, SAMPLING, TARGET_WEIGHTS, WEIGHTS, StartFrom
 from cprl.learners.settings import DQNSettings
 from cprl.learners.single import dqn_loss, q_network
 from cprl.learners.teams import MakeTeam, lanes_of
@@ -47,6 +47,11 @@ class ReplayLearner:
         make_loss: makes a lane's loss from its network; by default `dqn_loss`.
         make_team: for agents that learn as a team: makes the team's networks from those of its members, see
             `cprl.algorithms.teams`; a lane is then the team of a replica.
+        own_rewards: whether each member of a team learns from what it wants itself, with rewards [.., S, 1];
+            else all have the team reward, [.., 1].
+        noise_numbers: how many uniform numbers the loss reads for each transition, of each member of a team:
+            the entry "noise", float32 [.., noise_numbers] or [.., S, noise_numbers], from random numbers of
+            each lane's own; 0 for a loss that samples nothing.
         stochastic: whether networks output the logits of a policy from which actions are sampled, with no
             epsilon; else action values, with `epsilon` of the settings.
         reward_kind: what they want, see `cprl.preferences`.
@@ -60,7 +65,8 @@ class ReplayLearner:
 
     Raises:
         ValueError: for a loss that needs the latest steps of the current policy (see
-            `cprl.learners.rollouts`), for a team without the team reward, and for one that sees its peers.
+            `cprl.learners.rollouts`), for a team without the team reward, unless it has `own_rewards`, and
+            for one that sees its peers.
     """
 
     def __init__(
@@ -75,6 +81,8 @@ class ReplayLearner:
         make_network: Callable[[], nn.Module] | None = None,
         make_loss: MakeLoss | None = None,
         make_team: MakeTeam | None = None,
+        own_rewards: bool = False,
+        noise_numbers: int = 0,
         stochastic: bool = False,
         reward_kind: Preference = "individual",
         engine: EngineName | None = None,
@@ -84,7 +92,7 @@ class ReplayLearner:
         sees_peers: bool = False,
         device: str | torch.device = "cpu",
     ) -> None:
-        _refuse_unshared_reward(is_team=make_team is not None, reward_kind=reward_kind)
+        _refuse_unshared_reward(is_sharing=bool(make_team) and not own_rewards, reward_kind=reward_kind)
         check_learner(spaces, settings, DQNSettings, agents, replicas, first_replica, seed, reward_kind)
         self.spaces, self.settings, self.agents = spaces, settings, tuple(agents)
         self.replicas, self.seed, self.wants = replicas, seed, WantedRewards(reward_kind)
@@ -96,6 +104,7 @@ class ReplayLearner:
             first_replica=first_replica,
             make_network=make_network or partial(_default_network, spaces, settings),
             make_team=make_team,
+            own_rewards=own_rewards,
             stochastic=stochastic,
             start_from=start_from,
             share_parameters=share_parameters,
@@ -105,6 +114,8 @@ class ReplayLearner:
         self._shapes: dict[str, Any] = {
             "observation_shape": self._lanes.observation_shape,
             "action_shape": self._lanes.action_shape,
+            "reward_shape": self._lanes.reward_shape,
+            "noise_numbers": noise_numbers,
             "observation_dtype": spaces.observation_dtype,
             "horizon": Horizon(settings.n_steps, settings.gamma) if settings.n_steps > 1 else None,
             "device": device,
@@ -112,6 +123,7 @@ class ReplayLearner:
         self.engine = self._make_engine(engine, make_loss, compile=compile)
         self.buffer = lane_buffer(
             seeds=self._lanes.seeds(SAMPLING),
+            noise_seeds=self._lanes.seeds(NOISE),
             transitions=settings.buffer_size,
             batch_size=settings.batch_size,
             **self._shapes,
@@ -209,8 +221,10 @@ class ReplayLearner:
         The entry "networks" repeats the weights of "update" in the form that `cprl.load` reads.
         """
         transforms = {"transforms": self.buffer.transform.state_dict()} if self.buffer.has_transforms else {}
+        noise = {"noise": self.buffer.noise.rng.state_dict()} if self.buffer.noise else {}
         return {
             **transforms,
+            **noise,
             "networks": self._lanes.states(self.engine),
             "update": self.engine.state_dict(),
             "storage": self.buffer.storage.state_dict(),
@@ -226,6 +240,8 @@ class ReplayLearner:
         self.engine.load_state_dict(state["update"])
         self.buffer.storage.load_state_dict(state["storage"])
         self.buffer.sampler.load_state_dict(state["sampler"])
+        if self.buffer.noise:
+            self.buffer.noise.rng.load_state_dict(state["noise"])
         if self.buffer.has_transforms:
             self.buffer.transform.load_state_dict(state["transforms"])
         self.actor.rng.load_state_dict(state["exploration"])
@@ -235,8 +251,8 @@ class ReplayLearner:
         self.wants.load_state_dict(state.get("wants", {}))
 
 
-def _refuse_unshared_reward(*, is_team: bool, reward_kind: Preference) -> None:
-    if is_team and reward_kind != "team":
+def _refuse_unshared_reward(*, is_sharing: bool, reward_kind: Preference) -> None:
+    if is_sharing and reward_kind != "team":
         raise ValueError(
             f'reward is {named(reward_kind)}; allowed for a team that learns from replay: "team"'
         )

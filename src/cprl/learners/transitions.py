@@ -23,7 +23,7 @@ class LaneTurn(NamedTuple):
     next_observation: Any
     """uint8 [L, C, X, Y]."""
     reward: Any
-    """float32 [L]."""
+    """float32 [L]; [L, S] where a lane is a team whose S members have rewards of their own."""
     done: Any
     """bool [L]."""
     terminated: Any
@@ -158,8 +158,10 @@ def transitions_of(agent: int, batch: TensorDictBase) -> TensorDict:
 def turn_of(transitions: TensorDictBase) -> LaneTurn:
     """The transitions of lanes, [L], under TorchRL's default keys, as a `LaneTurn`."""
     following = transitions.get("next")
-    flags = (following.get(name).reshape(len(transitions)) for name in ("reward", "done", "terminated"))
-    turn = transitions.get("observation"), transitions.get("action"), following.get("observation"), *flags
+    flags = (following.get(name).reshape(len(transitions)) for name in ("done", "terminated"))
+    reward = following.get("reward").squeeze(-1)
+    before = transitions.get("observation"), transitions.get("action")
+    turn = *before, following.get("observation"), reward, *flags
     return LaneTurn(*map(array_of, turn))
 
 
