@@ -36,6 +36,7 @@ from cprl.checks import MOST_NESTED, plain
 from cprl.collectors import stock_collector
 from cprl.commandline import parse, recipe_main
 from cprl.config import KINDS, from_config, to_config
+from cprl.envs.continuous import MaxOfTwoQuadratics
 from cprl.envs.matrix import prisoners_dilemma
 from cprl.institutions import (
     Boundaries,
@@ -81,6 +82,7 @@ VALUES = [
     *(REPLAY, ROLLOUTS, TABLES),
     *(MLP(), Conv(), SPACES),
     prisoners_dilemma(turns=9),
+    MaxOfTwoQuadratics(),
     *(kind(settings=REPLAY) for kind in (DQN, DistributionalDQN, CQL, SAC, IQL, PR2, VDN, QMIX, MADDPG)),
     *(kind(settings=ROLLOUTS) for kind in (PPO, A2C, Reinforce, MAPPO, IPPO)),
     Tabular(settings=TABLES),

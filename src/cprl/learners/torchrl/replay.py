@@ -18,7 +18,7 @@ from cprl.envs.drivers import device_of
 from cprl.learners.buffer.gather import Horizon
 from cprl.learners.buffer.sampler import Noise, transformed
 from cprl.learners.buffer.storage import torch_dtype
-from cprl.learners.checks import check_learner
+from cprl.learners.checks import check_learner, refuse_continuous
 from cprl.learners.engine.choice import trial_batch
 from cprl.learners.engine.functional import MakeLoss, targets_of
 from cprl.learners.engine.refusals import refuse_for_replay
@@ -63,6 +63,7 @@ class TorchRLReplayLearner:
         start_from: the weights with which acting networks, and their targets, start, by the lane's name; the
             others, such as critics, are new.
         sees_peers: whether transitions have the actions of all agents, see `transitions.joint_actions`.
+        action_noise: see `ReplayLearner`.
         device: the torch device of networks, buffers and updates.
 
     Raises:
@@ -89,9 +90,12 @@ class TorchRLReplayLearner:
         noise_numbers: int = 0,
         start_from: StartFrom | None = None,
         sees_peers: bool = False,
+        action_noise: float = 0.0,
         device: str | torch.device = "cpu",
     ) -> None:
         check_learner(spaces, settings, DQNSettings, agents, replicas, first_replica, seed, reward_kind)
+        if settings.mean_over_all_outputs:
+            refuse_continuous("settings.mean_over_all_outputs", spaces)
         check_makers(make_network, make_loss, make_sampler)
         device = device_of(device)
         self.spaces, self.settings, self.agents = spaces, settings, tuple(agents)
@@ -107,6 +111,7 @@ class TorchRLReplayLearner:
             stochastic=stochastic,
             start_from=start_from,
             sees_peers=sees_peers,
+            action_noise=action_noise,
         )
         self._refuse_unfit(make_loss, device, noise_numbers)
         self.stock = StockAgents(
@@ -138,9 +143,10 @@ class TorchRLReplayLearner:
             self._lanes.observation_shape,
             self.spaces.actions,
             action_shape=self._lanes.action_shape,
+            action_dtype=self.spaces.action_dtype,
             observation_dtype=self.spaces.observation_dtype,
             horizon=Horizon(settings.n_steps, settings.gamma) if settings.n_steps > 1 else None,
-            noise_numbers=noise_numbers,
+            noise_shape=(noise_numbers,) if noise_numbers else (),
             device=device,
         )
         with torch.random.fork_rng(devices=[]):
