@@ -17,14 +17,14 @@ from cprl.networks.mlp import MLPNetwork
 
 
 class Critic(nn.Module):
-    """The value of an action, [..., 1]."""
+    """The value of an action, [..., 1], in units that suit the game of two hills."""
 
     def __init__(self, network):
         super().__init__()
         self.of = network
 
     def forward(self, observation, action):
-        return self.of(torch.cat([observation, action / 10], -1))
+        return 30 * self.of(torch.cat([observation, action / 10], -1))
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -53,3 +53,25 @@ class DDPG(OffPolicy):
         )
         loss.make_value_estimator(ValueEstimators.TD0, gamma=self.settings.gamma)
         return loss
+
+
+def small_ddpg():
+    """With settings for a few steps."""
+    settings = DQNSettings(hidden_cells=(8,), learning_starts=8, buffer_size=40, batch_size=4, tau=0.05)
+    return DDPG(settings=settings, action_noise=0.5)
+
+
+def slow_ddpg():
+    """With settings for some thousand steps."""
+    settings = DQNSettings(
+        hidden_cells=(32, 32),
+        learning_starts=300,
+        buffer_size=3000,
+        batch_size=32,
+        tau=0.01,
+        learning_rate=1e-3,
+        epsilon_hold_steps=500,
+        epsilon_decay_steps=1000,
+        epsilon_end=0.0,
+    )
+    return DDPG(settings=settings, action_noise=0.5)

@@ -136,6 +136,14 @@ ALLOWED = {
     ("DQNSettings", "replay_transforms"): ([], ()),
     ("DistributionalDQN", "lowest_return"): (-1, -0.5, 1.9),
     ("Spaces", "observation_scale"): (1.9,),
+    **{("Spaces", name): (-1, -0.5, 1.9) for name in ("action_low", "action_high")},
+    **dict.fromkeys(
+        (("MaxOfTwoQuadratics", name) for name in ("wide_top", "steep_top", "steep_height")), (-1, -0.5, 1.9)
+    ),
+    **dict.fromkeys(
+        (("MaxOfTwoQuadratics", name) for name in ("bound", "wide_factor", "wide_width", "steep_width")),
+        (1.9,),
+    ),
     ("Rules", "regrow_radius_cells"): (1.9,),
     ("Boundaries", "regions"): (["x"], ["x", "y"]),
     ("Boundaries", "owners"): (["x"], ["x", "y"]),

@@ -79,8 +79,8 @@ def joint_actions(agents: tuple[int, ...], batch: TensorDictBase) -> Any:
         batch: a turn of every replica, see `lane_turn`.
 
     Returns:
-        int64 [R x S, N], or float32 [R x S, N, D]: first a lane's own action, then the others' in the order of
-        their indices. They are those that agents chose, also where an agent was out of play and its action
+        int64 [R x S, N], or float32 [R x S, N, D]: first a lane's own action, then the others' in the order
+        of their indices. They are those that agents chose, also where an agent was out of play and its action
         did not count.
     """
     actions = array_of(keys.entry(keys.entry(batch, keys.AGENTS), "action"))
