@@ -15,6 +15,7 @@ from torchrl.envs.utils import check_env_specs
 import cprl
 from cprl import Custom, Experiment, Study
 from cprl.algorithms import DQN, PPO, DQNSettings, RolloutSettings
+from cprl.commandline import parse
 from cprl.compat import LeanStepEnv
 from cprl.envs import make_env, spaces_of
 from cprl.envs.matrix import (
@@ -383,6 +384,12 @@ def test_a_study_varies_its_payoffs_and_turns():
     study = Study(EXPERIMENT, {"game.turns": [1, 5], "game.payoffs": [EXPERIMENT.game.payoffs, other]})
     found = {(own.experiment.game.turns, own.experiment.game.payoffs) for own in trials_of(study)}
     assert found == {(turns, table) for turns in (1, 5) for table in (EXPERIMENT.game.payoffs, other)}
+
+
+def test_its_numbers_are_flags_of_a_command_line():
+    words = ["mine", "--game.turns", "7", "--game.memory", "2", "--game.continue-prob", "0.5"]
+    experiment, _ = parse(lambda: EXPERIMENT, words)
+    assert experiment.game == replace(EXPERIMENT.game, turns=7, memory=2, continue_prob=0.5)
 
 
 def test_scripted_policies_that_read_a_window_are_refused():
