@@ -30,6 +30,7 @@ from cprl.envs.state import check_restorable
 from cprl.evaluation.same_game import differences
 from cprl.experiment import changes
 from cprl.population import Learning, Scripted
+from cprl.reporting import write_report
 from cprl.runs.episodes import read_episodes
 from cprl.runs.weights import load_weights
 from cprl.studies.trials import trials_of
@@ -370,6 +371,8 @@ def test_a_population_trains_stops_resumes_loads_and_meets_another(tmp_path, mon
     second = cprl.load(cprl.run(replace(EXPERIMENT, seed=9), tmp_path / "second", watch="off"))
     played = cprl.crossplay([loaded, second], episodes=2)
     assert played.cell("whole", "second").measures()["focal/return"].estimate is not None
+    with pytest.raises(ValueError, match=r"plays a game that reports no harvest; allowed in a report"):
+        write_report([whole], tmp_path / "report")
     third = cprl.load(cprl.run(replace(EXPERIMENT, game=chicken(turns=5)), tmp_path / "third", watch="off"))
     with pytest.raises(ValueError, match=r"have different games: MatrixGame.payoffs"):
         cprl.crossplay([loaded, third], episodes=2)
