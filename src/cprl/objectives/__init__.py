@@ -1,9 +1,12 @@
 """Losses that TorchRL lacks; each is a `torchrl.objectives.LossModule` and works without the rest of cprl.
 
 Modules, in the order in which one reads them:
-    pr2  probabilistic recursive reasoning: joint action values and the peers' expected answers
+    pr2               probabilistic recursive reasoning: joint action values, the peers' expected answers
+    stein             how particles, here samples of those answers, move towards a density
+    pr2_actor_critic  the same for continuous actions, with an actor, a critic and a sampler of answers
 """
 
 from cprl.objectives.pr2 import PR2Loss
+from cprl.objectives.pr2_actor_critic import PR2ActorCriticLoss
 
-__all__ = ["PR2Loss"]
+__all__ = ["PR2ActorCriticLoss", "PR2Loss"]
