@@ -15,6 +15,7 @@ from cprl.algorithms import (
     DQN,
     IPPO,
     IQL,
+    MADDPG,
     MAPPO,
     PPO,
     PR2,
@@ -86,7 +87,7 @@ ALONE = st.one_of(
     st.builds(Tabular, settings=TABULARS),
 )
 TEAMS = st.one_of(
-    *[st.builds(kind, settings=DQNS) for kind in (VDN, QMIX)],
+    *[st.builds(kind, settings=DQNS) for kind in (VDN, QMIX, MADDPG)],
     *[st.builds(kind, settings=ROLLOUTS) for kind in (MAPPO, IPPO)],
 )
 FROZEN = st.builds(

@@ -15,6 +15,7 @@ from cprl import CommonsEnv, Custom, Experiment, Game, Rules, load, maps, run
 from cprl.algorithms import (
     DQN,
     IPPO,
+    MADDPG,
     MAPPO,
     PPO,
     PR2,
@@ -69,6 +70,7 @@ LEARNERS = {
     "VDN": (VDN(settings=REPLAY), {"reward_kind": "team"}),
     "QMIX": (QMIX(settings=REPLAY), {"reward_kind": "team"}),
     "IPPO": (IPPO(settings=ROLLOUT), {"reward_kind": "individual"}),
+    "MADDPG": (MADDPG(settings=REPLAY), {"reward_kind": "individual"}),
     "MAPPO": (MAPPO(settings=ROLLOUT), {"reward_kind": "team"}),
 }
 REPLICAS, BROKEN = 3, (1, 0)
@@ -128,7 +130,7 @@ def play(learner, *, breaks=None, episodes=3, seed=2, **how):
 @pytest.mark.parametrize("name", LEARNERS)
 def test_a_lane_that_breaks_stops_the_training_and_is_named(name):
     learner = make_learner(name)
-    agents = r"agents 0, 1" if name in ("VDN", "QMIX", "IPPO", "MAPPO") else "agent 0"
+    agents = r"agents 0, 1" if name in ("VDN", "QMIX", "IPPO", "MAPPO", "MADDPG") else "agent 0"
     with pytest.raises(NotFiniteError, match=rf"^at step \d+ .*the weights of {agents} in replica 1 are not"):
         play(learner, breaks=Breaks(learner, step=14))
     assert learner.finite()[[0, 2]].all()

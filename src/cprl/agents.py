@@ -8,6 +8,7 @@ import torch
 from torch import Tensor, nn
 from torchrl.envs import EnvBase
 
+from cprl.algorithms.base import refuse_actions
 from cprl.arguments import objects, texts
 from cprl.checks import MOST_SEED, checked, count
 from cprl.commons.game import Game
@@ -174,7 +175,13 @@ class Population:
 
 
 def _learner(spec: Learning | Team, spaces: Spaces, agents: tuple[int, ...], who: dict[str, Any]) -> Learner:
-    learner = algorithm_of(spec).make_learner(spaces, agents=agents, reward_kind=spec.reward, **who)
+    sharing: dict[str, Any] = (
+        {"share_parameters": True} if isinstance(spec, Team) and spec.share_parameters else {}
+    )
+    refuse_actions(algorithm_of(spec), spaces)
+    learner = algorithm_of(spec).make_learner(
+        spaces, agents=agents, reward_kind=spec.reward, **sharing, **who
+    )
     wants = getattr(learner, "wants", None)
     if not isinstance(spec.reward, str) and getattr(wants, "preferences", None) != spec.reward:
         own = spec.algorithm

@@ -11,7 +11,7 @@ from cprl.commons.game import Game
 from cprl.custom import Custom, made
 from cprl.learners.lanes import lane_name
 from cprl.networks.agent import acting_part
-from cprl.population import Frozen, Learning, Team
+from cprl.population import Frozen, Learning, Team, refuse_sharing
 from cprl.spaces import Spaces
 from cprl.stored import LoadedRun, StoredAgent, load
 
@@ -44,6 +44,7 @@ def _fitting_run(
         ("observations", theirs.observation_shape, spaces.observation_shape),
         ("observations of the dtype", theirs.observation_dtype, spaces.observation_dtype),
         ("a number of actions of", theirs.actions, spaces.actions),
+        ("to choose", theirs.actions_text, spaces.actions_text),
     ]
     if game is not None and isinstance(run.game, Game):
         if is_to_decide and game.ballots:
@@ -144,7 +145,8 @@ def _weights(stored: StoredAgent, algorithm: Algorithm, spaces: Spaces, where: s
 
 def algorithm_of(spec: Learning | Team) -> Algorithm:
     """The algorithm of a specification; refuses code of the user's own that is none."""
-    wanted = TeamAlgorithm if isinstance(spec, Team) else Algorithm
+    is_sharing = isinstance(spec, Team) and spec.share_parameters
+    wanted = TeamAlgorithm if isinstance(spec, Team) and not is_sharing else Algorithm
     algorithm = made(spec.algorithm)
     if not isinstance(algorithm, wanted):
         named = f" of {spec.algorithm.target}" if isinstance(spec.algorithm, Custom) else ""
@@ -152,4 +154,5 @@ def algorithm_of(spec: Learning | Team) -> Algorithm:
             f"the algorithm{named} is a {type(algorithm).__name__}; allowed: a subclass of "
             f"cprl.algorithms.{wanted.__name__}"
         )
+    refuse_sharing(algorithm, is_sharing)
     return algorithm

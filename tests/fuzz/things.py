@@ -22,6 +22,7 @@ from cprl.algorithms import (
     DQN,
     IPPO,
     IQL,
+    MADDPG,
     MAPPO,
     PPO,
     PR2,
@@ -38,6 +39,7 @@ from cprl.algorithms import (
     TeamAlgorithm,
 )
 from cprl.envs import make_env
+from cprl.envs.continuous import MaxOfTwoQuadratics
 from cprl.envs.matrix import MatrixGame, matching_pennies, prisoners_dilemma
 from cprl.institutions import (
     Boundaries,
@@ -101,6 +103,7 @@ EXAMPLES: Final[dict[type, tuple[Any, ...]]] = {
         Observation(agents_apart=True, scoreboard=True, stock_gauge=True),
     ),
     Game: (MEADOW, ALONE, GOVERNED, presets.game("single_basic")),
+    MaxOfTwoQuadratics: (MaxOfTwoQuadratics(), MaxOfTwoQuadratics(bound=6.0, steep_width=0.5)),
     MatrixGame: (prisoners_dilemma(), matching_pennies(turns=4, continue_prob=0.5, memory=2)),
     Boundaries: (Boundaries.strips(height=3, width=5, agents=2, step_fine=0.5),),
     Quota: (Quota(), Quota(share=0.5, window_steps=3, by_stock=True, fine=1.0)),
@@ -131,6 +134,7 @@ EXAMPLES: Final[dict[type, tuple[Any, ...]]] = {
     Tabular: (Tabular(settings=TABLES),),
     VDN: (VDN(settings=REPLAY),),
     QMIX: (QMIX(settings=REPLAY, mixing_cells=3),),
+    MADDPG: (MADDPG(settings=REPLAY, logit_penalty=0.0),),
     MAPPO: (MAPPO(settings=ROLLOUTS),),
     IPPO: (IPPO(settings=ROLLOUTS),),
     Bandit: (Bandit(), Bandit(step_size=0.5, epsilon_end=0.0)),

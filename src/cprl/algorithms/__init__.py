@@ -7,12 +7,14 @@ Modules, in the order in which one reads them:
     pr2           PR2, which sees the actions of its peers
     on_policy     PPO, A2C, REINFORCE
     teams         VDN, QMIX, MAPPO, IPPO
+    maddpg        MADDPG
     tabular       tabular Q-learning
 """
 
 from cprl.algorithms.actor_critic import IQL, SAC
 from cprl.algorithms.base import Algorithm, OffPolicy, OnPolicy, TeamAlgorithm
 from cprl.algorithms.dqn import CQL, DQN, DistributionalDQN
+from cprl.algorithms.maddpg import MADDPG
 from cprl.algorithms.on_policy import A2C, PPO, Reinforce
 from cprl.algorithms.pr2 import PR2
 from cprl.algorithms.tabular import Tabular
@@ -25,6 +27,7 @@ __all__ = [
     "DQN",
     "IPPO",
     "IQL",
+    "MADDPG",
     "MAPPO",
     "PPO",
     "PR2",

@@ -11,11 +11,12 @@ from torch import Tensor, nn
 from torchrl.objectives.value.functional import generalized_advantage_estimate
 
 from cprl.learners.buffer.storage import torch_dtype
-from cprl.learners.checks import check_learner, check_rollouts
+from cprl.learners.checks import check_learner, check_rollouts, refuse_continuous
 from cprl.learners.engine.base import Engine
 from cprl.learners.engine.choice import TRIAL_LANES, EngineName, make_engine, trial_batch, trial_rollout
 from cprl.learners.engine.functional import MakeLoss
 from cprl.learners.engine.refusals import reads, refuse_other_advantages
+from cprl.learners.engine.shared import SharedEngine
 from cprl.learners.lanes import SAMPLING, WEIGHTS, StartFrom
 from cprl.learners.settings import RolloutSettings
 from cprl.learners.teams import MakeTeam, lanes_of
@@ -55,6 +56,7 @@ class RolloutLearner:
         compile: whether torch compiles acting and the update; the engine "list" is never compiled.
         start_from: the weights with which acting networks, and their targets, start, by the lane's name; the
             others, such as critics, are new.
+        share_parameters: whether the agents of a replica share one network, which learns from all of them.
         device: the torch device of networks, buffers and updates.
 
     Raises:
@@ -78,9 +80,11 @@ class RolloutLearner:
         engine: EngineName | None = None,
         compile: bool = True,
         start_from: StartFrom | None = None,
+        share_parameters: bool = False,
         device: str | torch.device = "cpu",
     ) -> None:
         check_learner(spaces, settings, RolloutSettings, agents, replicas, first_replica, seed, reward_kind)
+        refuse_continuous("a learner from rollouts", spaces)
         self.spaces, self.settings, self.agents = spaces, settings, tuple(agents)
         self.replicas, self.seed, self.wants = replicas, seed, WantedRewards(reward_kind)
         self._lanes = lanes_of(
@@ -93,6 +97,7 @@ class RolloutLearner:
             make_team=make_team,
             stochastic=True,
             start_from=start_from,
+            share_parameters=share_parameters,
         )
         self.engine = self._make_engine(engine, make_loss, compile=compile, device=device)
         self.actor = self._lanes.actor(self.engine, compile=compile)
@@ -114,14 +119,14 @@ class RolloutLearner:
         refuse_other_advantages(loss, settings)
         self._reads_logits = reads(loss, "logits")
         trial = trial_batch(
-            min(self.lanes, TRIAL_LANES),
+            min(len(networks), TRIAL_LANES),
             self._lanes.observation_shape,
             self.spaces.actions,
             action_shape=self._lanes.action_shape,
             observation_dtype=self.spaces.observation_dtype,
             device=device,
         )
-        return make_engine(
+        engine = make_engine(
             name,
             networks,
             make_loss,
@@ -132,6 +137,7 @@ class RolloutLearner:
             compile=compile,
             trial=trial_rollout(trial, actions=self.spaces.actions if self._reads_logits else None),
         )
+        return SharedEngine(engine, self._lanes.sharing) if self._lanes.sharing > 1 else engine
 
     @property
     def lanes(self) -> int:
@@ -152,7 +158,7 @@ class RolloutLearner:
             "observation": (shape, dtype),
             "action": (self._lanes.action_shape, torch.int64),
             "next_observation": (shape, dtype),
-            "reward": (self._lanes.action_shape, torch.float32),
+            "reward": (self._lanes.member_shape, torch.float32),
             "done": ((), torch.bool),
             "terminated": ((), torch.bool),
         }

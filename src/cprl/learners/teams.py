@@ -7,16 +7,17 @@ import torch
 from tensordict import TensorDictBase
 from torch import Tensor, nn
 
-from cprl.learners.engine.base import ListEngine
+from cprl.learners.engine.shared import is_list
 from cprl.learners.lanes import Acts, Lanes, init_network
 from cprl.learners.transitions import LaneTurn, lane_turn, seen_next
 from cprl.networks.agent import acting_part
-from cprl.networks.team import ModuleTeam, TeamNetwork
+from cprl.networks.team import ModuleTeam, SharedTeam, TeamNetwork
 from cprl.policies.lanes import LaneActor
 from cprl.spaces import Spaces
 
 MakeTeam = Callable[[Sequence[nn.Module]], nn.Module]
-"""Makes the networks of a team from those of its members: `AgentNetworks`, that of `team_network` first."""
+"""Makes the networks of a team from those of its members: `AgentNetworks`, that of `team_network` first.
+Members that share parameters are one and the same network."""
 
 _SHARED: Final = 1
 """The last number of the seed of the parts that a team adds to its members' networks."""
@@ -32,30 +33,56 @@ class Teams:
         members: the members of all teams.
         make_team: makes a team's networks from those of its members. Parts that it adds are initialised from
             torch's generator, which is seeded for each team.
+        own_rewards: whether a replay buffer stores what each member wants; else one reward of the team.
     """
 
-    def __init__(self, members: Lanes, make_team: MakeTeam) -> None:
-        self.members, self._make_team = members, make_team
+    def __init__(self, members: Lanes, make_team: MakeTeam, *, own_rewards: bool = False) -> None:
+        self.members, self._make_team, self._own_rewards = members, make_team, own_rewards
         self.stochastic = members.stochastic
         form = init_network(
-            lambda: make_team([members.make_network() for _ in members.agents]), self.seeds(0)[0]
+            lambda: make_team(self._shared([members.make_network() for _ in self._networks])),
+            self.seeds(0)[0],
         )
         acting = acting_part(form)
-        assert isinstance(acting, TeamNetwork | ModuleTeam)
+        assert isinstance(acting, TeamNetwork | SharedTeam | ModuleTeam)
         self._acting = acting
 
     def __len__(self) -> int:
         return self.members.replicas
 
     @property
+    def sharing(self) -> int:
+        """The number of lanes that share a network: a team has its own."""
+        return 1
+
+    @property
+    def _networks(self) -> range:
+        """The numbers of the networks of a team's members."""
+        return range(len(self.members.agents) // self.members.sharing)
+
+    def _shared(self, networks: Sequence[nn.Module]) -> list[nn.Module]:
+        """The network of each member, from the different ones."""
+        return [network for network in networks for _ in range(self.members.sharing)]
+
+    @property
     def observation_shape(self) -> tuple[int, ...]:
         """The shape of a team's observation: (S, C, X, Y)."""
-        return *self.action_shape, *self.members.observation_shape
+        return *self.member_shape, *self.members.observation_shape
 
     @property
     def action_shape(self) -> tuple[int, ...]:
-        """The shape of a team's action, and of its rewards in a rollout: (S,)."""
+        """The shape of a team's action, (S,)."""
+        return *self.member_shape, *self.members.action_shape
+
+    @property
+    def member_shape(self) -> tuple[int, ...]:
+        """The axis of a team's members, (S,), also the shape of its rewards in a rollout."""
         return (len(self.members.agents),)
+
+    @property
+    def reward_shape(self) -> tuple[int, ...]:
+        """The shape of a team's reward in a replay buffer: (S,) if each member has its own, else ()."""
+        return self.member_shape if self._own_rewards else ()
 
     @property
     def of_replica(self) -> int:
@@ -68,23 +95,23 @@ class Teams:
 
     def new_networks(self, purpose: int, device: str | torch.device) -> list[nn.Module]:
         """New networks for each team."""
-        members, size = self.members.new_networks(purpose, device), len(self.members.agents)
+        members, size = self.members.new_networks(purpose, device), len(self._networks)
         made = []
         for replica, seed in enumerate(self.seeds(purpose)):
-            of_team = members[replica * size : (replica + 1) * size]
+            of_team = self._shared(members[replica * size : (replica + 1) * size])
             made.append(init_network(lambda mine=of_team: self._make_team(mine), (*seed, _SHARED)).to(device))  # type: ignore[misc]
         return made
 
     def turn(self, batch: TensorDictBase, rewards: Any) -> LaneTurn:
         """One transition of every team, as a replay buffer stores it: observations [R, S, C, X, Y], actions
-        [R, S] and team rewards [R].
+        [R, S] and team rewards [R], or with `own_rewards` those of each member, [R, S].
 
         Args:
             batch: see `lane_turn`.
-            rewards: of all agents, [R, N], those of a team all the same.
+            rewards: of all agents, [R, N]; those of a team without `own_rewards` all the same.
         """
         turn = self.rollout_turn(batch, rewards)
-        return turn._replace(reward=turn.reward[:, 0])
+        return turn if self._own_rewards else turn._replace(reward=turn.reward[:, 0])
 
     def rollout_turn(self, batch: TensorDictBase, rewards: Any) -> LaneTurn:
         """One transition of every team, as a rollout stores it: as `turn`, with rewards [R, S]."""
@@ -107,9 +134,7 @@ class Teams:
 
     def actor(self, engine: Acts, *, compile: bool) -> LaneActor:
         """See `Lanes.actor`."""
-        return self.members.actor(
-            _Members(engine, self), compile=compile and not isinstance(engine, ListEngine)
-        )
+        return self.members.actor(_Members(engine, self), compile=compile and not is_list(engine))
 
     def evaluation_actor(self, engine: Acts, worlds: int, *, epsilon: float) -> LaneActor:
         """See `Lanes.evaluation_actor`."""
@@ -128,14 +153,17 @@ class Teams:
         return self._acting.member_state(team, member)
 
 
-def lanes_of(spaces: Spaces, *, make_team: MakeTeam | None, **how: Any) -> Lanes | Teams:
-    """The lanes of independent agents, or with `make_team` of a team; see `Lanes` for the arguments."""
+def lanes_of(
+    spaces: Spaces, *, make_team: MakeTeam | None, own_rewards: bool = False, **how: Any
+) -> Lanes | Teams:
+    """The lanes of independent agents, or with `make_team` of a team; see `Lanes` and `Teams` for the
+    arguments."""
     members = Lanes(spaces, **how)
     if make_team and members.sees_peers:
         raise ValueError(
             "sees_peers is True; allowed for a team: False; its members' actions are stored together"
         )
-    return Teams(members, make_team) if make_team else members
+    return Teams(members, make_team, own_rewards=own_rewards) if make_team else members
 
 
 class _Members:
