@@ -6,6 +6,7 @@ from math import log
 import pytest
 import torch
 from tensordict import TensorDict
+from tensordict.nn import TensorDictModule
 from torch import nn
 from torchrl.objectives import SoftUpdate, ValueEstimators
 
@@ -65,8 +66,23 @@ class Multiple(nn.Module):
         return self.factor * action + noise
 
 
-def loss_of(actor=3.0, value=2.0, answer=0.5, **how):
-    networks = Actor(actor), Product(value), Multiple(answer)
+class Gaussian(Actor):
+    """The same with a standard deviation."""
+
+    def __init__(self, action, scale):
+        super().__init__(action)
+        self.log_scale = nn.Parameter(torch.tensor([log(scale)]))
+
+    def forward(self, observation):
+        action = super().forward(observation)
+        return action, self.log_scale.exp().expand_as(action)
+
+
+def loss_of(actor=3.0, value=2.0, answer=0.5, *, scale=None, **how):
+    acting = Actor(actor)
+    if scale is not None:
+        acting = TensorDictModule(Gaussian(actor, scale), ["observation"], ["action", "scale"])
+    networks = acting, Product(value), Multiple(answer)
     loss = PR2ActorCriticLoss(*networks, **{"temperature": 1.0, "particles": 4, **how})
     SoftUpdate(loss, tau=0.1)  # copies the networks to their targets
     return loss.make_value_estimator(ValueEstimators.TD0, gamma=0.5)
@@ -110,9 +126,15 @@ def test_the_actor_takes_into_account_how_the_peers_answer_where_it_goes():
 
 
 def test_a_stochastic_actor_ascends_the_mean_over_what_it_may_do():
-    # a = 3 + 2 e; noise 0.841344746 is one standard deviation: e = 1, a = 5, the answer 2.5 + 1 = 3.5.
-    out = loss_of(exploration=2.0)(transition(noise=0.841344746))
-    torch.testing.assert_close(out["loss_actor"], torch.tensor(-2 * 5 * 3.5), rtol=1e-5, atol=1e-4)
+    # a = 3 + 2 e; noise 0.841344746 is one standard deviation: e = 1, a = 5, the answer 2.5 + 1 = 3.5. At
+    # T = 0.5 the entropy adds 0.5 log 2, whose slope for log 2 is 0.5; that of 2 a (a / 2 + e) is 2 (a + e) =
+    # 12 for a, and 12 * 2 e = 24 for the logarithm of the scale.
+    loss = loss_of(scale=2.0, temperature=0.5)
+    out = loss(transition(noise=0.841344746))["loss_actor"]
+    torch.testing.assert_close(out, torch.tensor(-35 - 0.5 * log(2)), rtol=1e-5, atol=1e-4)
+    out.backward()
+    slope = dict(loss.named_parameters())["actor_network_params.module.log_scale"].grad
+    torch.testing.assert_close(slope, torch.tensor([-24.5]), rtol=1e-4, atol=1e-4)
 
 
 def test_the_conditional_learns_the_answers_that_suit_the_agent_as_often_as_they_do():
@@ -157,7 +179,7 @@ def random_networks(seed):
 
 def test_lanes_have_the_losses_that_each_has_alone():
     made = [random_networks(seed) for seed in range(3)]
-    how = {"temperature": 0.5, "exploration": 0.3, "particles": 4, "noise_size": 2, "reduction": "none"}
+    how = {"temperature": 0.5, "particles": 4, "noise_size": 2, "reduction": "none"}
     generator = torch.Generator().manual_seed(0)
     batch = torch.stack([transition(numbers=12).expand(5).clone() for _ in range(3)])
     for name in ("action", "noise", "observation"):
@@ -184,15 +206,14 @@ def test_with_noise_in_the_batch_torchs_generator_is_left_alone():
     assert torch.equal(before, torch.get_rng_state())
     without = transition().exclude("noise")
     torch.manual_seed(3)
-    first = loss_of(exploration=1.0)(without)["loss_actor"]
-    assert not torch.equal(first, loss_of(exploration=1.0)(without)["loss_actor"])
+    first = loss_of(scale=1.0)(without)["loss_actor"]
+    assert not torch.equal(first, loss_of(scale=1.0)(without)["loss_actor"])
 
 
 @pytest.mark.parametrize(
     ("how", "message"),
     [
         ({"temperature": 0.0}, r"^temperature is 0\.0; allowed: a number in 1e-06\.\.1"),
-        ({"exploration": -1.0}, r"^exploration is -1\.0; allowed"),
         ({"particles": 1}, r"^particles is 1; allowed: an integer in 2"),
         ({"noise_size": 0}, r"^noise_size is 0; allowed: an integer in 1"),
         ({"reduction": "all"}, r"^reduction is 'all'; allowed: 'none', 'mean', 'sum'"),

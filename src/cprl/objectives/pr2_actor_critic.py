@@ -30,7 +30,9 @@ class PR2ActorCriticLoss(LossModule):
     - The actor ascends the mean of Q(s, a, g(s, a, noise)) over the noise, through the answers too: it takes
       into account how peers answer where it goes.
 
-    The actor may be deterministic, or with `exploration` Gaussian around what its network gives.
+    The actor is deterministic; where its network writes "scale" too, it is Gaussian with this standard
+    deviation. It then ascends the mean over its actions, plus T times the logarithm of the scale, its
+    entropy up to a constant: of all Gaussian policies it approaches that nearest to exp(Q(s, a) / T).
 
     Sources: Wen, Yang, Luo, Wang and Pan, "Probabilistic Recursive Reasoning for Multi-Agent Reinforcement
     Learning" (ICLR 2019), algorithm PR2-AC; the sampler: Feng, Wang and Liu, "Learning to Draw Samples with
@@ -38,13 +40,12 @@ class PR2ActorCriticLoss(LossModule):
 
     Args:
         actor_network: the agent's action float [..., D] of its observation: a `TensorDictModule` that writes
-            "action", or a module that reads "observation".
+            "action", and if it likes "scale", float [..., D], or a module that reads "observation".
         value_network: the joint value [..., 1] of "observation", "action" [..., D] and "peers_action"
             [..., (N - 1) x D]: likewise; it writes "state_action_value".
         conditional_network: the answer [..., (N - 1) x D] to "observation", "action" and "noise" [..., Z];
             likewise; it writes "peers_action".
         temperature: T, in units of reward; a buffer of that name, which may be changed.
-        exploration: the standard deviation of the actor, in units of actions; likewise a buffer.
         particles: samples M of the conditional, at least 2.
         noise_size: Z.
         reduction: "none" (one loss per transition), "mean" or "sum".
@@ -64,6 +65,7 @@ class PR2ActorCriticLoss(LossModule):
         """The entries by the names that `set_keys` takes."""
 
         action: NestedKey = "action"
+        scale: NestedKey = "scale"
         peers_action: NestedKey = "peers_action"
         state_action_value: NestedKey = "state_action_value"
         noise: NestedKey = "noise"
@@ -87,7 +89,6 @@ class PR2ActorCriticLoss(LossModule):
     conditional_network_params: TensorDictParams
     target_conditional_network_params: TensorDictParams
     temperature: Tensor
-    exploration: Tensor
 
     def __init__(
         self,
@@ -96,7 +97,6 @@ class PR2ActorCriticLoss(LossModule):
         conditional_network: TensorDictModule | nn.Module,
         *,
         temperature: float,
-        exploration: float = 0.0,
         particles: int = 16,
         noise_size: int = 1,
         reduction: str = "mean",
@@ -114,15 +114,10 @@ class PR2ActorCriticLoss(LossModule):
             if not isinstance(network, TensorDictModule):
                 network = TensorDictModule(network, reads, writes)
             self.convert_to_functional(network, name, create_target_params=True)
-        for name, value, allowed in (
-            ("temperature", temperature, number(1e-6, 1e6)),
-            ("exploration", exploration, number(0, 1e6)),
-        ):
-            self.register_buffer(name, torch.tensor(float(checked(name, value, allowed))))
-        self.particles, self.noise_size = (
-            checked("particles", particles, count(2)),
-            checked("noise_size", noise_size, count(1)),
-        )
+        checked("temperature", temperature, number(1e-6, 1e6))
+        self.register_buffer("temperature", torch.tensor(float(temperature)))
+        self.particles = checked("particles", particles, count(2))
+        self.noise_size = checked("noise_size", noise_size, count(1))
         self.reduction = checked("reduction", reduction, one_of("none", "mean", "sum"))
 
     @property
@@ -185,11 +180,18 @@ class PR2ActorCriticLoss(LossModule):
         return TensorDict(reduced)
 
     def _actor_loss(self, seen: TensorDictBase, noise: Tensor, around: Tensor) -> Tensor:
-        """The negative mean over samples of the values of the actor's actions and their answers, [...]."""
-        action = self._called("actor_network", self.actor_network_params, seen, self.tensor_keys.action)
-        actions, seen = action.unsqueeze(-2) + self.exploration * around, self._repeated(seen)
+        """The negative mean over samples of the values of the actor's actions and their answers, with the
+        entropy of a Gaussian actor, [...]."""
+        written = self._called("actor_network", self.actor_network_params, seen)
+        action, scale = (written.get(key, None) for key in (self.tensor_keys.action, self.tensor_keys.scale))
+        actions, entropy = action.unsqueeze(-2).expand_as(around), 0.0
+        if scale is not None:
+            actions = actions + scale.unsqueeze(-2) * around
+            entropy = self.temperature * scale.log().sum(-1)
+        seen = self._repeated(seen)
         answers = self._answers(self.conditional_network_params.detach(), seen, actions, noise)
-        return -self._value(self.value_network_params.detach(), seen, actions, answers).mean(-1)
+        values = self._value(self.value_network_params.detach(), seen, actions, answers)
+        return -(values.mean(-1) + entropy)
 
     def _conditional_loss(self, seen: TensorDictBase, own: Tensor, noise: Tensor) -> Tensor:
         """A sum whose gradient for the samples is the negative Stein direction, [...]."""
@@ -208,9 +210,8 @@ class PR2ActorCriticLoss(LossModule):
         """r + gamma Q'(s', a', b'), the mean over the answers b' of the target conditional, [...]."""
         with torch.no_grad():
             seen = tensordict.get("next").select(*self.actor_network.in_keys)
-            action = self._called(
-                "actor_network", self.target_actor_network_params, seen, self.tensor_keys.action
-            )
+            written = self._called("actor_network", self.target_actor_network_params, seen)
+            action = written.get(self.tensor_keys.action)
             seen, actions = self._repeated(seen), action.unsqueeze(-2)
             actions = actions.expand(*action.shape[:-1], self.particles, -1)
             answers = self._answers(self.target_conditional_network_params, seen, actions, noise)
@@ -238,25 +239,26 @@ class PR2ActorCriticLoss(LossModule):
     def _value(self, weights: Any, seen: TensorDictBase, own: Tensor, peers: Tensor) -> Tensor:
         keys = self.tensor_keys
         entries = {keys.action: own, keys.peers_action: peers}
-        return self._called("value_network", weights, seen, keys.state_action_value, entries).squeeze(-1)
+        value: Tensor = self._called("value_network", weights, seen, entries).get(keys.state_action_value)
+        return value.squeeze(-1)
 
     def _answers(self, weights: Any, seen: TensorDictBase, own: Tensor, noise: Tensor) -> Tensor:
         keys = self.tensor_keys
         entries = {keys.action: own, keys.noise: noise}
-        return self._called("conditional_network", weights, seen, keys.peers_action, entries)
+        answers: Tensor = self._called("conditional_network", weights, seen, entries).get(keys.peers_action)
+        return answers
 
     def _called(
         self,
         name: str,
         weights: Any,
         seen: TensorDictBase,
-        key: NestedKey,
         entries: Mapping[NestedKey, Tensor] | None = None,
-    ) -> Tensor:
-        """What a network writes for what is seen and further entries."""
+    ) -> TensorDictBase:
+        """What is seen, further entries, and what a network writes for them."""
         network, moment = getattr(self, name), seen.copy()
         for entry, value in (entries or {}).items():
             moment.set(entry, value)
         with weights.to_module(network, preserve_module_state=False):
-            written: Tensor = network(moment).get(key)
+            written: TensorDictBase = network(moment)
         return written
