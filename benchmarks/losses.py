@@ -25,6 +25,7 @@ from cprl.algorithms.base import Algorithm, OffPolicy, TeamAlgorithm
 from cprl.algorithms.dqn import CQL, DQN, DistributionalDQN
 from cprl.algorithms.maddpg import MADDPG
 from cprl.algorithms.on_policy import A2C, PPO, Reinforce
+from cprl.algorithms.pr2 import PR2
 from cprl.algorithms.teams import IPPO, MAPPO, QMIX, VDN
 from cprl.learners.engine.choice import TRIAL_LANES, fitting_engine, make_engine, trial_batch
 from cprl.learners.lanes import WEIGHTS, Lanes
@@ -41,6 +42,7 @@ ALGORITHMS = {
     "CQL": CQL(settings=REPLAY),
     "SAC": SAC(settings=REPLAY),
     "IQL": IQL(settings=REPLAY),
+    "PR2": PR2(settings=REPLAY),
     "PPO": PPO(settings=ROLLOUTS),
     "A2C": A2C(settings=ROLLOUTS),
     "REINFORCE": Reinforce(settings=ROLLOUTS),
@@ -64,6 +66,7 @@ def lanes_of(algorithm: Algorithm, learners: int) -> Lanes | Teams:
         first_replica=0,
         make_network=lambda: algorithm.make_network(game.spaces),
         stochastic=algorithm.stochastic,
+        sees_peers=getattr(algorithm, "sees_peers_actions", False),
     )
     if not isinstance(algorithm, TeamAlgorithm):
         return agents

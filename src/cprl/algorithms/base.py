@@ -42,6 +42,7 @@ _CHECKS: Final[dict[str, Check]] = {
     "alpha_init": number(1e-12, 1e6),
     "expectile": number(0.5, 0.999),
     "temperature": _WEIGHT,
+    "entropy_bonus": SWITCH,
     "clip_epsilon": number(1e-6, 0.999),
     "entropy_coeff": _WEIGHT,
     "critic_coeff": _WEIGHT,
@@ -68,6 +69,9 @@ class Algorithm:
     stochastic: ClassVar[bool] = False
     """Whether the acting network outputs the logits of a policy, from which actions are sampled; else it
     outputs action values, and actions are epsilon-greedy."""
+    has_continuous_actions: ClassVar[bool] = False
+    """Whether the acting network outputs an action of `Spaces.action_size` numbers, within their bounds; else
+    agents choose from `Spaces.actions`. A game of the other kind is refused."""
     can_share_parameters: ClassVar[bool] = False
     """Whether agents of a team can share one network, see `cprl.population.Team`."""
 
@@ -131,6 +135,13 @@ class OffPolicy(Algorithm):
     settings: DQNSettings
     settings_kind: ClassVar[type[Any]] = DQNSettings
     can_share_parameters: ClassVar[bool] = True
+    sees_peers_actions: ClassVar[bool] = False
+    """Whether "action" is [.., N] in place of [..], or [.., N, D] of continuous actions: first the agent's
+    own action, then those of the others in the order of their indices, whatever they learn by. Agents still
+    act on their own observations alone."""
+    action_noise: float = 0.0
+    """The standard deviation of the Gaussian noise that exploring agents add to continuous actions, in units
+    of actions; besides, they take a uniformly random one with the probability `epsilon` of the settings."""
     noise_numbers: ClassVar[int] = 0
     """How many uniform numbers in 0..1 the loss reads for each transition, of each member of a team, to
     sample by: the entry "noise", float32 [.., noise_numbers] or [.., S, noise_numbers]. A loss that samples
@@ -142,13 +153,16 @@ class OffPolicy(Algorithm):
         """See `Algorithm`."""
         self._check_settings()
         _check_engine(engine)
+        refuse_actions(self, spaces)
         how |= {
             "agents": agents,
             "settings": self.settings,
             "make_network": lambda: self.make_network(spaces),
             "make_loss": self.make_loss,
             "stochastic": self.stochastic,
+            "sees_peers": self.sees_peers_actions,
             "noise_numbers": self.noise_numbers,
+            "action_noise": self.action_noise,
         }
         if engine == "torchrl":
             _refuse_sharing(how)
@@ -174,6 +188,7 @@ class OnPolicy(Algorithm):
         """See `Algorithm`."""
         self._check_settings()
         _check_engine(engine)
+        refuse_actions(self, spaces)
         how |= {
             "agents": agents,
             "settings": self.settings,
@@ -238,6 +253,19 @@ def _refuse_sharing(how: dict[str, Any]) -> None:
     if how.pop("share_parameters", False):
         raise ValueError(
             'share_parameters is True; allowed with engine="torchrl", which trains independent agents: False'
+        )
+
+
+def refuse_actions(algorithm: Any, spaces: Spaces) -> None:
+    """Raises a ValueError if an algorithm is for continuous actions and the game has a number of them to
+    choose from, or the other way round."""
+    checked("spaces", spaces, instance(Spaces, "a Spaces, e.g. Game.spaces"))
+    is_continuous = bool(getattr(algorithm, "has_continuous_actions", False))
+    if is_continuous != bool(spaces.action_size):
+        kind = "actions of numbers within bounds" if is_continuous else "a number of actions to choose from"
+        raise ValueError(
+            f"agents that learn by {type(algorithm).__name__} would have {spaces.actions_text}; allowed for "
+            f"it: {kind}"
         )
 
 

@@ -67,17 +67,22 @@ class Teams:
     @property
     def observation_shape(self) -> tuple[int, ...]:
         """The shape of a team's observation: (S, C, X, Y)."""
-        return *self.action_shape, *self.members.observation_shape
+        return *self.member_shape, *self.members.observation_shape
 
     @property
     def action_shape(self) -> tuple[int, ...]:
-        """The shape of a team's action, and of its rewards in a rollout: (S,)."""
+        """The shape of a team's action, (S,)."""
+        return *self.member_shape, *self.members.action_shape
+
+    @property
+    def member_shape(self) -> tuple[int, ...]:
+        """The axis of a team's members, (S,), also the shape of its rewards in a rollout."""
         return (len(self.members.agents),)
 
     @property
     def reward_shape(self) -> tuple[int, ...]:
         """The shape of a team's reward in a replay buffer: (S,) if each member has its own, else ()."""
-        return self.action_shape if self._own_rewards else ()
+        return self.member_shape if self._own_rewards else ()
 
     @property
     def of_replica(self) -> int:
@@ -154,6 +159,10 @@ def lanes_of(
     """The lanes of independent agents, or with `make_team` of a team; see `Lanes` and `Teams` for the
     arguments."""
     members = Lanes(spaces, **how)
+    if make_team and members.sees_peers:
+        raise ValueError(
+            "sees_peers is True; allowed for a team: False; its members' actions are stored together"
+        )
     return Teams(members, make_team, own_rewards=own_rewards) if make_team else members
 
 

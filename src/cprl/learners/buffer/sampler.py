@@ -139,8 +139,9 @@ def lane_buffer(
     batch_size: int,
     observation_shape: Sequence[int],
     action_shape: Sequence[int] = (),
+    action_dtype: str = "int64",
     reward_shape: Sequence[int] = (),
-    noise_numbers: int = 0,
+    noise_shape: Sequence[int] = (),
     noise_seeds: Sequence[Sequence[int]] | None = None,
     observation_dtype: str = "uint8",
     horizon: Horizon | None = None,
@@ -153,10 +154,12 @@ def lane_buffer(
         transitions: capacity per lane.
         batch_size: transitions sampled per lane.
         observation_shape: (C, X, Y); (S, C, X, Y) if a lane is a team of S agents.
-        action_shape: the shape of a lane's action: () for one agent, (S,) for a team.
+        action_shape: the shape of a lane's action: () for one agent, (S,) for a team; with D last if actions
+            are continuous.
+        action_dtype: see `Spaces.action_dtype`.
         reward_shape: the shape of a lane's reward: (S,) for a team whose members have their own, else ().
-        noise_numbers: of uniform numbers that the loss reads with each transition, of each member of a team:
-            the entry "noise", float32 [L, b, *action_shape, noise_numbers]; 0 for none.
+        noise_shape: of the uniform numbers that the loss reads with each transition: the entry "noise",
+            float32 [L, b, *noise_shape]; () for none.
         noise_seeds: the seed of the numbers of each lane; by default `seeds`.
         observation_dtype: see `Spaces.observation_dtype`.
         horizon: steps and discount of n-step returns, sampled in place of rewards; None for single steps.
@@ -168,8 +171,16 @@ def lane_buffer(
         TooLargeError: if the device has less free memory than needed; raised before anything is allocated.
     """
     dtype = torch_dtype(observation_dtype)
-    shapes = {"action_shape": action_shape, "reward_shape": reward_shape}
-    needed = storage_bytes(len(seeds), transitions, observation_shape, item_bytes=dtype.itemsize, **shapes)
+    shapes: dict[str, Any] = {"action_shape": action_shape, "reward_shape": reward_shape}
+    kind = torch_dtype(action_dtype)
+    needed = storage_bytes(
+        len(seeds),
+        transitions,
+        observation_shape,
+        item_bytes=dtype.itemsize,
+        action_bytes=kind.itemsize,
+        **shapes,
+    )
     sampled = len(seeds) * batch_size * prod(observation_shape) * 2 * (dtype.itemsize + 4)  # and as float32
     check_memory(
         f"the replay buffers of {len(seeds)} lanes x {transitions:,} transitions",
@@ -189,6 +200,7 @@ def lane_buffer(
         lanes=len(seeds),
         transitions=transitions,
         observation_shape=observation_shape,
+        action_dtype=kind,
         dtype=dtype,
         horizon=horizon,
         device=device,
@@ -201,9 +213,8 @@ def lane_buffer(
         batch_size=batch_size,
         collate_fn=lambda batch: batch,
     )
-    if noise_numbers:
-        shape = *action_shape, noise_numbers
-        buffer.noise = Noise(noise_seeds or seeds, batch_size, shape, device)
+    if noise_shape:
+        buffer.noise = Noise(noise_seeds or seeds, batch_size, noise_shape, device)
     return buffer
 
 
