@@ -30,6 +30,7 @@ PACKAGES = (
     "games",
     "preferences",
     "networks",
+    "objectives",
     "policies",
     "collectors",
     "learners",
