@@ -282,9 +282,9 @@ def test_a_team_comes_close_to_the_optimum(name):
     algorithm = replace(
         TEAMS[name], settings=test_optimum.ROLLOUTS if name.endswith("PPO") else test_optimum.REPLAY
     )
-    # RewardKind for the group, one of four replicas of IPPO ended at half of the apples.
-    members = [Learning(algorithm, reward_kind="individual" if name == "IPPO" else "team")] * 2
-    team = Population(ROWS, members, replicas=4, seed=1, compile=False)
+    # With the reward of the group, one of four replicas of IPPO ended at half of the apples.
+    spec = Team(algorithm, (0, 1), reward="individual" if name == "IPPO" else "team")
+    team = Population(CommonsEnv(ROWS, 4, seed=1), [spec], seed=1, engine="eager")
 
     def share():
         played = evaluate(CommonsEnv(ROWS, 4, seed=99), team.policy(1))

@@ -174,7 +174,12 @@ class Population:
 
 
 def _learner(spec: Learning | Team, spaces: Spaces, agents: tuple[int, ...], who: dict[str, Any]) -> Learner:
-    learner = algorithm_of(spec).make_learner(spaces, agents=agents, reward_kind=spec.reward, **who)
+    sharing: dict[str, Any] = (
+        {"share_parameters": True} if isinstance(spec, Team) and spec.share_parameters else {}
+    )
+    learner = algorithm_of(spec).make_learner(
+        spaces, agents=agents, reward_kind=spec.reward, **sharing, **who
+    )
     wants = getattr(learner, "wants", None)
     if not isinstance(spec.reward, str) and getattr(wants, "preferences", None) != spec.reward:
         own = spec.algorithm

@@ -11,7 +11,7 @@ from cprl.commons.game import Game
 from cprl.custom import Custom, made
 from cprl.learners.lanes import lane_name
 from cprl.networks.agent import acting_part
-from cprl.population import Frozen, Learning, Team
+from cprl.population import Frozen, Learning, Team, refuse_sharing
 from cprl.spaces import Spaces
 from cprl.stored import LoadedRun, StoredAgent, load
 
@@ -144,7 +144,8 @@ def _weights(stored: StoredAgent, algorithm: Algorithm, spaces: Spaces, where: s
 
 def algorithm_of(spec: Learning | Team) -> Algorithm:
     """The algorithm of a specification; refuses code of the user's own that is none."""
-    wanted = TeamAlgorithm if isinstance(spec, Team) else Algorithm
+    is_sharing = isinstance(spec, Team) and spec.share_parameters
+    wanted = TeamAlgorithm if isinstance(spec, Team) and not is_sharing else Algorithm
     algorithm = made(spec.algorithm)
     if not isinstance(algorithm, wanted):
         named = f" of {spec.algorithm.target}" if isinstance(spec.algorithm, Custom) else ""
@@ -152,4 +153,5 @@ def algorithm_of(spec: Learning | Team) -> Algorithm:
             f"the algorithm{named} is a {type(algorithm).__name__}; allowed: a subclass of "
             f"cprl.algorithms.{wanted.__name__}"
         )
+    refuse_sharing(algorithm, is_sharing)
     return algorithm

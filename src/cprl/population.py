@@ -10,7 +10,7 @@ from dataclasses import dataclass
 from typing import Any, Final, TypeAlias
 
 from cprl.algorithms.base import Algorithm, TeamAlgorithm
-from cprl.checks import NONE, Check, check_fields, checked, count, either, instance, is_count, one_of
+from cprl.checks import NONE, SWITCH, Check, check_fields, checked, count, either, instance, is_count, one_of
 from cprl.custom import Custom
 from cprl.learners.decisions import Bandit
 from cprl.learners.settings import Exploring
@@ -107,27 +107,43 @@ class Team:
     """Agents that learn together; a team in every replica.
 
     Args:
-        algorithm: e.g. `cprl.algorithms.QMIX(settings=...)`.
+        algorithm: e.g. `cprl.algorithms.QMIX(settings=...)`; with `share_parameters` also one of independent
+            agents, e.g. `DQN(settings=...)`.
         agents: their indices, ascending.
-        reward: "team", the sum of the rewards of all agents of the game; for IPPO also what each member wants
-            by itself, see `Learning`.
+        reward: "team", the sum of the rewards of all agents of the game; for IPPO and algorithms of
+            independent agents also what each member wants by itself, see `Learning`.
         start_from: a member of a team of the same size; each member starts with the weights of the member
             at the same place in that team, see `Learning`. Mixers and central critics begin anew.
         decisions: how each member learns what it decides, by itself; see `Learning`.
+        share_parameters: whether the members share one network, of actions and, where the algorithm has
+            one for each member, of values; it learns from the transitions of all of them.
     """
 
-    algorithm: TeamAlgorithm | Custom
+    algorithm: Algorithm | Custom
     agents: tuple[int, ...]
     reward: Preference = "team"
     start_from: Frozen | None = None
     decisions: Bandit | None = None
+    share_parameters: bool = False
 
     def __post_init__(self) -> None:
+        checked("Team.share_parameters", self.share_parameters, SWITCH)
+        allowed = _ALGORITHM if self.share_parameters else _TEAM_ALGORITHM
         check_fields(
-            self,
-            {"algorithm": _TEAM_ALGORITHM, "agents": _MEMBERS, "reward": PREFERENCE, "start_from": _START},
+            self, {"algorithm": allowed, "agents": _MEMBERS, "reward": PREFERENCE, "start_from": _START}
         )
         check_fields(self, _DECISIONS)
+        if isinstance(self.algorithm, Algorithm):
+            refuse_sharing(self.algorithm, self.share_parameters)
+
+
+def refuse_sharing(algorithm: Algorithm, share_parameters: bool) -> None:
+    """Raises a ValueError for an algorithm whose agents cannot share parameters, but shall."""
+    if share_parameters and not algorithm.can_share_parameters:
+        raise ValueError(
+            f"Team.share_parameters is True; allowed for {type(algorithm).__name__}, whose agents each have "
+            "parameters of their own: False"
+        )
 
 
 @dataclass(frozen=True)

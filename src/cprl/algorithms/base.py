@@ -67,6 +67,8 @@ class Algorithm:
     stochastic: ClassVar[bool] = False
     """Whether the acting network outputs the logits of a policy, from which actions are sampled; else it
     outputs action values, and actions are epsilon-greedy."""
+    can_share_parameters: ClassVar[bool] = False
+    """Whether agents of a team can share one network, see `cprl.population.Team`."""
 
     def __post_init__(self) -> None:
         self._check_settings()
@@ -96,8 +98,8 @@ class Algorithm:
             spaces: the shape and dtype of observations, and the number of actions A.
             agents: their indices.
             engine: how they are updated.
-            how: `replicas`, `seed`, `first_replica`, `reward_kind` and `device`, see
-                `cprl.learners.replay.ReplayLearner`.
+            how: `replicas`, `seed`, `first_replica`, `reward_kind`, `device` and, if the algorithm
+                `can_share_parameters`, `share_parameters`; see `cprl.learners.replay.ReplayLearner`.
 
         Raises:
             ValueError: if the settings have the wrong class, the algorithm does not support these agents,
@@ -127,6 +129,7 @@ class OffPolicy(Algorithm):
 
     settings: DQNSettings
     settings_kind: ClassVar[type[Any]] = DQNSettings
+    can_share_parameters: ClassVar[bool] = True
 
     def make_learner(
         self, spaces: Spaces, *, agents: Sequence[int], engine: TrainingEngine = "compiled", **how: Any
@@ -142,6 +145,7 @@ class OffPolicy(Algorithm):
             "stochastic": self.stochastic,
         }
         if engine == "torchrl":
+            _refuse_sharing(how)
             return TorchRLReplayLearner(spaces, **how)
         return ReplayLearner(spaces, compile=engine == "compiled", **how)
 
@@ -156,6 +160,7 @@ class OnPolicy(Algorithm):
     settings: RolloutSettings
     settings_kind: ClassVar[type[Any]] = RolloutSettings
     stochastic: ClassVar[bool] = True
+    can_share_parameters: ClassVar[bool] = True
 
     def make_learner(
         self, spaces: Spaces, *, agents: Sequence[int], engine: TrainingEngine = "compiled", **how: Any
@@ -170,6 +175,7 @@ class OnPolicy(Algorithm):
             "make_loss": self.make_loss,
         }
         if engine == "torchrl":
+            _refuse_sharing(how)
             return TorchRLRolloutLearner(spaces, **how)
         return RolloutLearner(spaces, compile=engine == "compiled", **how)
 
@@ -217,6 +223,13 @@ class TeamAlgorithm(Algorithm):
                 f"the team has {members} agents; allowed for {name}: at least {self.fewest_members}; DQN and "
                 "VDN support fewer"
             )
+
+
+def _refuse_sharing(how: dict[str, Any]) -> None:
+    if how.pop("share_parameters", False):
+        raise ValueError(
+            'share_parameters is True; allowed with engine="torchrl", which trains independent agents: False'
+        )
 
 
 def _check_engine(engine: str) -> None:

@@ -11,7 +11,7 @@ from torch import Tensor, nn
 
 from cprl.arguments import object_of
 from cprl.learners.checks import check_networks
-from cprl.learners.engine.base import ListEngine
+from cprl.learners.engine.shared import is_list
 from cprl.learners.transitions import LaneTurn, lane_turn, seen_next
 from cprl.networks.agent import acting_part
 from cprl.networks.specification import refuse_unseen
@@ -80,6 +80,7 @@ class Lanes:
             seeded for each lane.
         stochastic: whether the network outputs the logits of a policy from which actions are sampled.
         start_from: the weights with which the acting networks of lanes start, see `StartFrom`.
+        share_parameters: whether the agents of a replica share one network, initialised as that of the first.
 
     Raises:
         ValueError: if agents observe entries that networks do not read.
@@ -96,12 +97,15 @@ class Lanes:
         make_network: Callable[[], nn.Module],
         stochastic: bool,
         start_from: StartFrom | None = None,
+        share_parameters: bool = False,
     ) -> None:
         refuse_unseen(spaces)
         self.spaces, self.agents, self.replicas, self.seed = spaces, tuple(agents), replicas, seed
         self._numbers = range(first_replica, first_replica + replicas)
         self.make_network, self.stochastic = make_network, stochastic
         self._start_from = weights_to_start(start_from)
+        self.sharing = len(self.agents) if share_parameters else 1
+        """The number of agents that share a network."""
 
     def __len__(self) -> int:
         return self.replicas * len(self.agents)
@@ -147,18 +151,29 @@ class Lanes:
         return lane_seeds(self.seed, replicas=self._numbers, agents=self.agents, purpose=purpose)
 
     def new_networks(self, purpose: int, device: str | torch.device) -> list[nn.Module]:
-        """New networks for each lane; the acting ones with the weights to start from, if there are any.
+        """New networks for each lane, or for each replica whose agents share one; the acting ones with the
+        weights to start from, if there are any.
 
         Raises:
             TooLargeError: if the device has less memory than training all of them takes.
+            ValueError: if agents that share a network would start from different weights.
         """
-        first, *others = self.seeds(purpose)
+        first, *others = self.seeds(purpose)[:: self.sharing]
         networks = [init_network(self.make_network, first)]
-        check_networks(networks[0], len(self), device)
+        check_networks(networks[0], 1 + len(others), device)
         networks += [init_network(self.make_network, own) for own in others]
-        for name, network in zip(self.names, networks, strict=True):
-            if name in self._start_from:
-                acting_part(network).load_state_dict(self._start_from[name])
+        for place, network in enumerate(networks):
+            start, *same = (
+                self._start_from.get(name, {})
+                for name in self.names[place * self.sharing : (place + 1) * self.sharing]
+            )
+            if any(not _equal(start, own) for own in same):
+                raise ValueError(
+                    f"the agents {list(self.agents)} would start from different weights; allowed for agents "
+                    "that share parameters: a run in which they shared them too"
+                )
+            if start:
+                acting_part(network).load_state_dict(start)
         return [network.to(device) for network in networks]
 
     def actor(self, engine: Acts, *, compile: bool) -> LaneActor:
@@ -169,7 +184,7 @@ class Lanes:
             seeds=self.seeds(EXPLORATION),
             agents=len(self.agents),
             stochastic=self.stochastic,
-            compile=compile and not isinstance(engine, ListEngine),
+            compile=compile and not is_list(engine),
         )
 
     def evaluation_actor(self, engine: Acts, worlds: int, *, epsilon: float) -> LaneActor:
@@ -197,6 +212,12 @@ class Lanes:
             made[name] = acting_part(self.make_network())
             made[name].load_state_dict(weights)
         return made
+
+
+def _equal(weights: Mapping[str, Tensor], others: Mapping[str, Tensor]) -> bool:
+    return weights.keys() == others.keys() and all(
+        torch.equal(value, others[name]) for name, value in weights.items()
+    )
 
 
 def init_network(make_network: Callable[[], nn.Module], seed: Sequence[int]) -> nn.Module:

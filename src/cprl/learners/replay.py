@@ -16,6 +16,7 @@ from cprl.learners.engine.base import Engine
 from cprl.learners.engine.choice import TRIAL_LANES, EngineName, make_engine, trial_batch
 from cprl.learners.engine.functional import MakeLoss
 from cprl.learners.engine.refusals import refuse_for_replay
+from cprl.learners.engine.shared import SharedEngine
 from cprl.learners.lanes import SAMPLING, TARGET_WEIGHTS, WEIGHTS, StartFrom
 from cprl.learners.settings import DQNSettings
 from cprl.learners.single import dqn_loss, q_network
@@ -53,6 +54,7 @@ class ReplayLearner:
         compile: whether torch compiles acting and the update; the engine "list" is never compiled.
         start_from: the weights with which acting networks, and their targets, start, by the lane's name; the
             others, such as critics, are new.
+        share_parameters: whether the agents of a replica share one network, which learns from all of them.
         device: the torch device of networks, buffers and updates.
 
     Raises:
@@ -77,6 +79,7 @@ class ReplayLearner:
         engine: EngineName | None = None,
         compile: bool = True,
         start_from: StartFrom | None = None,
+        share_parameters: bool = False,
         device: str | torch.device = "cpu",
     ) -> None:
         _refuse_unshared_reward(is_team=make_team is not None, reward_kind=reward_kind)
@@ -93,6 +96,7 @@ class ReplayLearner:
             make_team=make_team,
             stochastic=stochastic,
             start_from=start_from,
+            share_parameters=share_parameters,
         )
         make_loss = make_loss or partial(dqn_loss, gamma=settings.gamma)
         self._shapes: dict[str, Any] = {
@@ -121,10 +125,10 @@ class ReplayLearner:
         settings, device = self.settings, self._shapes["device"]
         actions, own_targets = self.spaces.actions, settings.own_target_weights
         networks = self._lanes.new_networks(WEIGHTS, device)
-        trial = trial_batch(min(self.lanes, TRIAL_LANES), actions=actions, **self._shapes)
+        trial = trial_batch(min(len(networks), TRIAL_LANES), actions=actions, **self._shapes)
         trial = transformed(trial, settings.replay_transforms)
         refuse_for_replay(make_loss(deepcopy(networks[0])), settings, trial[0])
-        return make_engine(
+        engine = make_engine(
             name,
             networks,
             make_loss,
@@ -137,6 +141,7 @@ class ReplayLearner:
             compile=compile,
             trial=trial,
         )
+        return SharedEngine(engine, self._lanes.sharing) if self._lanes.sharing > 1 else engine
 
     @property
     def lanes(self) -> int:

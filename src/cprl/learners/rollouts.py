@@ -16,6 +16,7 @@ from cprl.learners.engine.base import Engine
 from cprl.learners.engine.choice import TRIAL_LANES, EngineName, make_engine, trial_batch, trial_rollout
 from cprl.learners.engine.functional import MakeLoss
 from cprl.learners.engine.refusals import reads, refuse_other_advantages
+from cprl.learners.engine.shared import SharedEngine
 from cprl.learners.lanes import SAMPLING, WEIGHTS, StartFrom
 from cprl.learners.settings import RolloutSettings
 from cprl.learners.teams import MakeTeam, lanes_of
@@ -55,6 +56,7 @@ class RolloutLearner:
         compile: whether torch compiles acting and the update; the engine "list" is never compiled.
         start_from: the weights with which acting networks, and their targets, start, by the lane's name; the
             others, such as critics, are new.
+        share_parameters: whether the agents of a replica share one network, which learns from all of them.
         device: the torch device of networks, buffers and updates.
 
     Raises:
@@ -78,6 +80,7 @@ class RolloutLearner:
         engine: EngineName | None = None,
         compile: bool = True,
         start_from: StartFrom | None = None,
+        share_parameters: bool = False,
         device: str | torch.device = "cpu",
     ) -> None:
         check_learner(spaces, settings, RolloutSettings, agents, replicas, first_replica, seed, reward_kind)
@@ -93,6 +96,7 @@ class RolloutLearner:
             make_team=make_team,
             stochastic=True,
             start_from=start_from,
+            share_parameters=share_parameters,
         )
         self.engine = self._make_engine(engine, make_loss, compile=compile, device=device)
         self.actor = self._lanes.actor(self.engine, compile=compile)
@@ -114,14 +118,14 @@ class RolloutLearner:
         refuse_other_advantages(loss, settings)
         self._reads_logits = reads(loss, "logits")
         trial = trial_batch(
-            min(self.lanes, TRIAL_LANES),
+            min(len(networks), TRIAL_LANES),
             self._lanes.observation_shape,
             self.spaces.actions,
             action_shape=self._lanes.action_shape,
             observation_dtype=self.spaces.observation_dtype,
             device=device,
         )
-        return make_engine(
+        engine = make_engine(
             name,
             networks,
             make_loss,
@@ -132,6 +136,7 @@ class RolloutLearner:
             compile=compile,
             trial=trial_rollout(trial, actions=self.spaces.actions if self._reads_logits else None),
         )
+        return SharedEngine(engine, self._lanes.sharing) if self._lanes.sharing > 1 else engine
 
     @property
     def lanes(self) -> int:

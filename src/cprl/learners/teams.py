@@ -7,16 +7,17 @@ import torch
 from tensordict import TensorDictBase
 from torch import Tensor, nn
 
-from cprl.learners.engine.base import ListEngine
+from cprl.learners.engine.shared import is_list
 from cprl.learners.lanes import Acts, Lanes, init_network
 from cprl.learners.transitions import LaneTurn, lane_turn, seen_next
 from cprl.networks.agent import acting_part
-from cprl.networks.team import ModuleTeam, TeamNetwork
+from cprl.networks.team import ModuleTeam, SharedTeam, TeamNetwork
 from cprl.policies.lanes import LaneActor
 from cprl.spaces import Spaces
 
 MakeTeam = Callable[[Sequence[nn.Module]], nn.Module]
-"""Makes the networks of a team from those of its members: `AgentNetworks`, that of `team_network` first."""
+"""Makes the networks of a team from those of its members: `AgentNetworks`, that of `team_network` first.
+Members that share parameters are one and the same network."""
 
 _SHARED: Final = 1
 """The last number of the seed of the parts that a team adds to its members' networks."""
@@ -38,14 +39,29 @@ class Teams:
         self.members, self._make_team = members, make_team
         self.stochastic = members.stochastic
         form = init_network(
-            lambda: make_team([members.make_network() for _ in members.agents]), self.seeds(0)[0]
+            lambda: make_team(self._shared([members.make_network() for _ in self._networks])),
+            self.seeds(0)[0],
         )
         acting = acting_part(form)
-        assert isinstance(acting, TeamNetwork | ModuleTeam)
+        assert isinstance(acting, TeamNetwork | SharedTeam | ModuleTeam)
         self._acting = acting
 
     def __len__(self) -> int:
         return self.members.replicas
+
+    @property
+    def sharing(self) -> int:
+        """The number of lanes that share a network: a team has its own."""
+        return 1
+
+    @property
+    def _networks(self) -> range:
+        """The numbers of the networks of a team's members."""
+        return range(len(self.members.agents) // self.members.sharing)
+
+    def _shared(self, networks: Sequence[nn.Module]) -> list[nn.Module]:
+        """The network of each member, from the different ones."""
+        return [network for network in networks for _ in range(self.members.sharing)]
 
     @property
     def observation_shape(self) -> tuple[int, ...]:
@@ -68,10 +84,10 @@ class Teams:
 
     def new_networks(self, purpose: int, device: str | torch.device) -> list[nn.Module]:
         """New networks for each team."""
-        members, size = self.members.new_networks(purpose, device), len(self.members.agents)
+        members, size = self.members.new_networks(purpose, device), len(self._networks)
         made = []
         for replica, seed in enumerate(self.seeds(purpose)):
-            of_team = members[replica * size : (replica + 1) * size]
+            of_team = self._shared(members[replica * size : (replica + 1) * size])
             made.append(init_network(lambda mine=of_team: self._make_team(mine), (*seed, _SHARED)).to(device))  # type: ignore[misc]
         return made
 
@@ -107,9 +123,7 @@ class Teams:
 
     def actor(self, engine: Acts, *, compile: bool) -> LaneActor:
         """See `Lanes.actor`."""
-        return self.members.actor(
-            _Members(engine, self), compile=compile and not isinstance(engine, ListEngine)
-        )
+        return self.members.actor(_Members(engine, self), compile=compile and not is_list(engine))
 
     def evaluation_actor(self, engine: Acts, worlds: int, *, epsilon: float) -> LaneActor:
         """See `Lanes.evaluation_actor`."""

@@ -9,7 +9,7 @@ from torch import Tensor, nn
 from torchrl.modules import QMixer
 
 from cprl.networks.mlp import MLPNetwork
-from cprl.networks.stacked import StackedMLP, stack_lanes, through_layers
+from cprl.networks.stacked import StackedMLP, lane_state, stack_lanes, through_layers
 
 
 class TeamNetwork(nn.Module):
@@ -61,6 +61,37 @@ class TeamNetwork(nn.Module):
         return {name: value[lane].clone() for name, value in self.state_dict().items()}
 
 
+class SharedTeam(nn.Module):
+    """Like `TeamNetwork` for members that share one network, of any architecture.
+
+    Args:
+        network: the network of every member.
+        observation_dims: the number of axes of one member's observation.
+    """
+
+    def __init__(self, network: nn.Module, *, observation_dims: int) -> None:
+        super().__init__()
+        self.network, self.observation_dims = network, 1 + observation_dims
+
+    def forward(self, observation: Tensor) -> Tensor:
+        """[..., S, *shape] to [..., S, A]."""
+        given: Tensor = self.network(observation)
+        return given
+
+    def member_state(self, state: dict[str, Tensor], member: int) -> dict[str, Tensor]:
+        """See `TeamNetwork`."""
+        return {name.removeprefix("network."): value for name, value in state.items()}
+
+    def stacked(self, teams: Sequence["SharedTeam"]) -> "SharedTeam":
+        """One network with the parameters of R teams along a first axis; copies."""
+        together = stack_lanes([team.network for team in teams])
+        return SharedTeam(together, observation_dims=self.observation_dims - 1)
+
+    def lane_state(self, lane: int) -> dict[str, Tensor]:
+        """Copies of the weights of one team of a stack, as its state dict."""
+        return {f"network.{name}": value for name, value in lane_state(self.network, lane).items()}
+
+
 class ModuleTeam(nn.Module):
     """Like `TeamNetwork` for members' networks of any architecture; evaluates them one after the other.
 
@@ -85,8 +116,12 @@ class ModuleTeam(nn.Module):
         return {name.removeprefix(mine): value for name, value in state.items() if name.startswith(mine)}
 
 
-def team_network(networks: Sequence[nn.Module], *, observation_dims: int) -> TeamNetwork | ModuleTeam:
-    """The networks of the members of a team as one; see `TeamNetwork` and `ModuleTeam`."""
+def team_network(
+    networks: Sequence[nn.Module], *, observation_dims: int
+) -> TeamNetwork | SharedTeam | ModuleTeam:
+    """The networks of the members of a team as one; a `SharedTeam` if they are all the same object."""
+    if len(networks) > 1 and all(network is networks[0] for network in networks):
+        return SharedTeam(networks[0], observation_dims=observation_dims)
     if all(isinstance(network, MLPNetwork) for network in networks):
         return TeamNetwork(networks)  # type: ignore[arg-type]
     return ModuleTeam(networks, observation_dims=observation_dims)
