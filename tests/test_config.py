@@ -29,6 +29,7 @@ from cprl.algorithms import (
 )
 from cprl.config import KINDS, custom_targets, differences, from_config, to_config
 from cprl.custom import Custom
+from cprl.envs.matrix import MatrixGame, prisoners_dilemma
 from cprl.institutions import (
     Boundaries,
     ClosedPatches,
@@ -156,8 +157,17 @@ FIRING = Game(
 )
 
 
+MATRICES = st.builds(
+    MatrixGame,
+    st.sampled_from([(((1, 2.5), (0, 1)), ((2, 3), (0, 0))), ((((((1.0,) * 4,) * 2,) * 2,) * 2,) * 2)]),
+    turns=st.integers(2, 9),
+    memory=st.none() | st.integers(0, 3),
+    continue_prob=SHARES,
+)
+
+
 @settings(max_examples=200, deadline=None)
-@given(value=SPECS | GAMES | CUSTOM | st.tuples(SPECS, GAMES) | st.just(FIRING))
+@given(value=SPECS | GAMES | MATRICES | CUSTOM | st.tuples(SPECS, GAMES) | st.just(FIRING))
 def test_a_value_comes_back_from_its_table_as_it_was(value):
     text = json.dumps(to_config(value), allow_nan=False)
     back = from_config(json.loads(text), allow=custom_targets(json.loads(text)))
@@ -170,6 +180,7 @@ def test_every_kind_comes_back():
     made = {
         "Game": presets.game("two_complex"),
         "Map": BOARD,
+        "MatrixGame": prisoners_dilemma(),
         "Learning": Learning(DQN(settings=DQNSettings())),
         "Team": Team(QMIX(settings=DQNSettings()), agents=(0, 1)),
         "Frozen": Frozen("runs/earlier", 1),

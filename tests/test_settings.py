@@ -34,6 +34,7 @@ from cprl.checks import MOST_NESTED, plain
 from cprl.collectors import stock_collector
 from cprl.commandline import parse, recipe_main
 from cprl.config import KINDS, from_config, to_config
+from cprl.envs.matrix import prisoners_dilemma
 from cprl.institutions import (
     Boundaries,
     ClosedPatches,
@@ -77,6 +78,7 @@ VALUES = [
     Exploring(),
     *(REPLAY, ROLLOUTS, TABLES),
     *(MLP(), Conv(), SPACES),
+    prisoners_dilemma(turns=9),
     *(kind(settings=REPLAY) for kind in (DQN, DistributionalDQN, CQL, SAC, IQL, VDN, QMIX)),
     *(kind(settings=ROLLOUTS) for kind in (PPO, A2C, Reinforce, MAPPO, IPPO)),
     Tabular(settings=TABLES),
@@ -156,7 +158,7 @@ ALLOWED = {
 """What fits a field although it fits hardly any other."""
 OPTIONAL = {"tau", "max_grad_norm", "network", "start_from", "replica", "decisions"}
 OPTIONAL |= {"owners", "bite_fine", "step_fine", "fine", "monitor", "recovery_steps"}
-OPTIONAL_OF = {("Sanctioner", "agents")}
+OPTIONAL_OF = {("Sanctioner", "agents"), ("MatrixGame", "memory")}
 
 
 @pytest.mark.parametrize(("value", "field"), FIELDS)

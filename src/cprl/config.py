@@ -36,6 +36,7 @@ from cprl.commons.maps import Map
 from cprl.commons.observation import Observation
 from cprl.commons.rules import Rules
 from cprl.custom import Custom
+from cprl.envs.matrix import MatrixGame
 from cprl.institutions import (
     Boundaries,
     ClosedPatches,
@@ -55,7 +56,7 @@ from cprl.population import Frozen, Learning, Scripted, Team
 from cprl.preferences import Exchange, InequityAversion, SocialValueOrientation
 
 _OF_CPRL: Final[tuple[type[Any], ...]] = (
-    *(Game, Map, Rules, Observation, Learning, Team, Scripted, Frozen),
+    *(Game, Map, Rules, Observation, MatrixGame, Learning, Team, Scripted, Frozen),
     *(InequityAversion, SocialValueOrientation, Exchange),
     *(Boundaries, ClosedPatches, ClosedSeason, GraduatedSanctions, Levies, Mediation),
     *(Monitoring, Quota, Sanctioner, Tax, Vote),

@@ -1,15 +1,19 @@
-"""Games of the user's own, as a recipe holds them and back."""
+"""Games of the user's own, as a recipe holds them and back; and which games are cprl's."""
 
-from typing import Any
+from typing import Any, Final
 
 from cprl.commons.game import Game
 from cprl.custom import Custom
 from cprl.envs.make_env import PlayableGame
+from cprl.envs.matrix import MatrixGame
+
+OF_CPRL: Final[tuple[type[Any], ...]] = (Game, MatrixGame)
+"""Games that a recipe holds as values, and whose chance follows from the seed alone."""
 
 
 def stored_game(game: object) -> object:
     """As a recipe holds it: a game of the user's by the name of its class."""
-    if isinstance(game, Game | Custom) or not isinstance(game, PlayableGame):
+    if type(game) in OF_CPRL or isinstance(game, Game | Custom) or not isinstance(game, PlayableGame):
         return game
     kind = type(game)
     if "<" in kind.__qualname__:

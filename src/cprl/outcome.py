@@ -13,11 +13,11 @@ from torchrl.envs import EnvBase
 
 from cprl.agents import Population
 from cprl.arguments import object_of
-from cprl.commons.game import Game
 from cprl.envs.make_env import make_env
 from cprl.envs.state import load_transforms_state, transforms_state
 from cprl.envs.unwrap import commons_of
 from cprl.experiment import Experiment
+from cprl.games import OF_CPRL
 from cprl.measuring.episodes import Episode
 from cprl.measuring.evaluate import evaluate
 from cprl.policies.present import PresentPolicy
@@ -98,7 +98,7 @@ def is_same_later(experiment: Experiment) -> bool:
     """Whether random play is the same before and after a training: the game is one of cprl's, whose chance
     depends on seeds alone, and has no transforms, which may learn in between."""
     object_of("experiment", experiment, Experiment, "an Experiment")
-    return isinstance(experiment.game, Game) and not experiment.transforms
+    return isinstance(experiment.game, OF_CPRL) and not experiment.transforms
 
 
 def _keeps_decisions(env: EnvBase) -> bool:

@@ -37,6 +37,7 @@ from cprl.algorithms import (
     TeamAlgorithm,
 )
 from cprl.envs import make_env
+from cprl.envs.matrix import MatrixGame, matching_pennies, prisoners_dilemma
 from cprl.institutions import (
     Boundaries,
     ClosedPatches,
@@ -99,6 +100,7 @@ EXAMPLES: Final[dict[type, tuple[Any, ...]]] = {
         Observation(agents_apart=True, scoreboard=True, stock_gauge=True),
     ),
     Game: (MEADOW, ALONE, GOVERNED, presets.game("single_basic")),
+    MatrixGame: (prisoners_dilemma(), matching_pennies(turns=4, continue_prob=0.5, memory=2)),
     Boundaries: (Boundaries.strips(height=3, width=5, agents=2, step_fine=0.5),),
     Quota: (Quota(), Quota(share=0.5, window_steps=3, by_stock=True, fine=1.0)),
     ClosedSeason: (ClosedSeason(), ClosedSeason(period_steps=4, closed_steps=2, fine=0.0)),
