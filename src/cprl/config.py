@@ -17,6 +17,7 @@ from cprl.algorithms import (
     DQN,
     IPPO,
     IQL,
+    LOLA,
     MAPPO,
     PPO,
     QMIX,
@@ -24,6 +25,7 @@ from cprl.algorithms import (
     VDN,
     DistributionalDQN,
     DQNSettings,
+    LOLASettings,
     Reinforce,
     RolloutSettings,
     Tabular,
@@ -60,8 +62,8 @@ _OF_CPRL: Final[tuple[type[Any], ...]] = (
     *(InequityAversion, SocialValueOrientation, Exchange),
     *(Boundaries, ClosedPatches, ClosedSeason, GraduatedSanctions, Levies, Mediation),
     *(Monitoring, Quota, Sanctioner, Tax, Vote),
-    *(DQN, DistributionalDQN, CQL, SAC, IQL, PPO, A2C, Reinforce, VDN, QMIX, MAPPO, IPPO, Tabular),
-    *(DQNSettings, RolloutSettings, TabularSettings, Bandit, MLP, Conv),
+    *(DQN, DistributionalDQN, CQL, SAC, IQL, PPO, A2C, Reinforce, VDN, QMIX, MAPPO, IPPO, LOLA, Tabular),
+    *(DQNSettings, RolloutSettings, LOLASettings, TabularSettings, Bandit, MLP, Conv),
     Custom,
 )
 KINDS: Final[dict[str, type[Any]]] = {kind.__name__: kind for kind in _OF_CPRL}

@@ -6,15 +6,18 @@ Modules, in the order in which one reads them:
     actor_critic  SAC, IQL
     on_policy     PPO, A2C, REINFORCE
     teams         VDN, QMIX, MAPPO, IPPO
+    lola          LOLA, by policy gradients or DiCE
     tabular       tabular Q-learning
 """
 
 from cprl.algorithms.actor_critic import IQL, SAC
 from cprl.algorithms.base import Algorithm, OffPolicy, OnPolicy, TeamAlgorithm
 from cprl.algorithms.dqn import CQL, DQN, DistributionalDQN
+from cprl.algorithms.lola import LOLA
 from cprl.algorithms.on_policy import A2C, PPO, Reinforce
 from cprl.algorithms.tabular import Tabular
 from cprl.algorithms.teams import IPPO, MAPPO, QMIX, VDN
+from cprl.learners.lola.settings import LOLASettings
 from cprl.learners.settings import DQNSettings, RolloutSettings, TabularSettings
 
 __all__ = [
@@ -23,6 +26,7 @@ __all__ = [
     "DQN",
     "IPPO",
     "IQL",
+    "LOLA",
     "MAPPO",
     "PPO",
     "QMIX",
@@ -31,6 +35,7 @@ __all__ = [
     "Algorithm",
     "DQNSettings",
     "DistributionalDQN",
+    "LOLASettings",
     "OffPolicy",
     "OnPolicy",
     "Reinforce",

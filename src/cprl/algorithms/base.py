@@ -45,6 +45,7 @@ _CHECKS: Final[dict[str, Check]] = {
     "clip_epsilon": number(1e-6, 0.999),
     "entropy_coeff": _WEIGHT,
     "critic_coeff": _WEIGHT,
+    "estimator": one_of("policy_gradient", "dice"),
     "mixing_cells": count(1, MOST_CELLS),
 }
 """Of the fields of cprl's algorithms; one of the same name means the same in each."""
