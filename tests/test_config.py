@@ -16,8 +16,10 @@ from cprl.algorithms import (
     IPPO,
     IQL,
     LOLA,
+    MADDPG,
     MAPPO,
     PPO,
+    PR2,
     QMIX,
     SAC,
     VDN,
@@ -83,12 +85,12 @@ TABULARS = st.builds(TabularSettings, learning_rate=st.just("1/visits") | SHARES
 NETWORKS = st.none() | st.builds(MLP) | st.builds(Conv, channels=st.just((4, 8))) | CUSTOM
 ALONE = st.one_of(
     st.builds(DQN, settings=DQNS, double=st.booleans(), network=NETWORKS),
-    *[st.builds(kind, settings=DQNS) for kind in (DistributionalDQN, CQL, SAC, IQL)],
+    *[st.builds(kind, settings=DQNS) for kind in (DistributionalDQN, CQL, SAC, IQL, PR2)],
     *[st.builds(kind, settings=ROLLOUTS) for kind in (PPO, A2C, Reinforce)],
     st.builds(Tabular, settings=TABULARS),
 )
 TEAMS = st.one_of(
-    *[st.builds(kind, settings=DQNS) for kind in (VDN, QMIX)],
+    *[st.builds(kind, settings=DQNS) for kind in (VDN, QMIX, MADDPG)],
     *[st.builds(kind, settings=ROLLOUTS) for kind in (MAPPO, IPPO)],
     st.builds(LOLA, settings=LOOKS, estimator=st.sampled_from(["policy_gradient", "dice"])),
 )

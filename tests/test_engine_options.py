@@ -12,7 +12,7 @@ from torchrl.envs.transforms import MultiStepTransform, RewardScaling
 from torchrl.objectives import HardUpdate, SoftUpdate
 
 from cprl import CommonsEnv, Game, Rules, maps
-from cprl.algorithms import CQL, DQN, IQL, QMIX, SAC, VDN, DistributionalDQN
+from cprl.algorithms import CQL, DQN, IQL, MADDPG, PR2, QMIX, SAC, VDN, DistributionalDQN
 from cprl.custom import Custom
 from cprl.learners.buffer.gather import Horizon
 from cprl.learners.buffer.sampler import lane_buffer
@@ -263,7 +263,7 @@ def test_a_target_bootstraps_by_the_discount_of_its_steps():
         assert float(losses[lane]) == pytest.approx(float(wanted), rel=1e-5)
 
 
-@pytest.mark.parametrize("algorithm", [DQN, CQL, SAC, DistributionalDQN, VDN, QMIX])
+@pytest.mark.parametrize("algorithm", [DQN, CQL, SAC, PR2, DistributionalDQN, VDN, QMIX, MADDPG])
 def test_every_algorithm_of_replay_learns_from_returns_of_several_steps(algorithm):
     settings = replace(SETTINGS, n_steps=3, tau=0.05, updates_per_step=2)
     how = {"reward_kind": "team"} if algorithm in (VDN, QMIX) else {}

@@ -16,8 +16,10 @@ from cprl.algorithms import (
     DQN,
     IPPO,
     LOLA,
+    MADDPG,
     MAPPO,
     PPO,
+    PR2,
     QMIX,
     SAC,
     VDN,
@@ -62,6 +64,8 @@ LEARNERS = {
     "DQN with soft updates": (DQN(settings=replace(REPLAY, tau=0.1)), {}),
     "C51": (DistributionalDQN(settings=REPLAY, atoms=5), {}),
     "SAC": (SAC(settings=REPLAY), {}),
+    "PR2": (PR2(settings=REPLAY), {}),
+    "PR2 of TorchRL": (PR2(settings=REPLAY), {"engine": "torchrl"}),
     "PPO": (PPO(settings=ROLLOUT), {}),
     "DQN of TorchRL": (DQN(settings=REPLAY), {"engine": "torchrl"}),
     "PPO of TorchRL": (PPO(settings=ROLLOUT), {"engine": "torchrl"}),
@@ -70,6 +74,7 @@ LEARNERS = {
     "VDN": (VDN(settings=REPLAY), {"reward_kind": "team"}),
     "QMIX": (QMIX(settings=REPLAY), {"reward_kind": "team"}),
     "IPPO": (IPPO(settings=ROLLOUT), {"reward_kind": "individual"}),
+    "MADDPG": (MADDPG(settings=REPLAY), {"reward_kind": "individual"}),
     "MAPPO": (MAPPO(settings=ROLLOUT), {"reward_kind": "team"}),
     "LOLA": (LOLA(settings=LOOK), {}),
     "LOLA by DiCE": (LOLA(settings=LOOK, estimator="dice"), {}),
@@ -134,7 +139,7 @@ def play(learner, *, breaks=None, episodes=3, seed=2, **how):
 @pytest.mark.parametrize("name", LEARNERS)
 def test_a_lane_that_breaks_stops_the_training_and_is_named(name):
     learner = make_learner(name)
-    of_team = name in ("VDN", "QMIX", "IPPO", "MAPPO") or name.startswith("LOLA")
+    of_team = name in ("VDN", "QMIX", "IPPO", "MAPPO", "MADDPG") or name.startswith("LOLA")
     agents = r"agents 0, 1" if of_team else "agent 0"
     with pytest.raises(NotFiniteError, match=rf"^at step \d+ .*the weights of {agents} in replica 1 are not"):
         play(learner, breaks=Breaks(learner, step=14))

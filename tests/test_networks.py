@@ -14,8 +14,10 @@ from cprl.algorithms import (
     DQN,
     IPPO,
     IQL,
+    MADDPG,
     MAPPO,
     PPO,
+    PR2,
     QMIX,
     SAC,
     VDN,
@@ -46,7 +48,7 @@ VECTORS = Spaces(
 REPLAY = DQNSettings(buffer_size=100, batch_size=4, learning_rate=1e-3)
 ROLLOUTS = RolloutSettings(rollout_steps=20, minibatch_size=10, epochs=1)
 OF_REPLAY, OF_ROLLOUTS = (
-    (DQN, DistributionalDQN, CQL, SAC, IQL, VDN, QMIX),
+    (DQN, DistributionalDQN, CQL, SAC, IQL, PR2, VDN, QMIX, MADDPG),
     (PPO, A2C, Reinforce, IPPO, MAPPO),
 )
 CONV = Conv(channels=(4, 5), hidden_cells=(7,))

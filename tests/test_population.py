@@ -14,6 +14,7 @@ from cprl.algorithms.actor_critic import IQL, SAC
 from cprl.algorithms.base import OffPolicy
 from cprl.algorithms.dqn import CQL, DQN, DistributionalDQN
 from cprl.algorithms.on_policy import A2C, PPO, Reinforce
+from cprl.algorithms.pr2 import PR2
 from cprl.algorithms.tabular import Tabular
 from cprl.evaluation import evaluate_run
 from cprl.learners.replay import ReplayLearner
@@ -54,6 +55,7 @@ ALGORITHMS = {
     "CQL": CQL(settings=REPLAY),
     "SAC": SAC(settings=REPLAY),
     "IQL": IQL(settings=REPLAY),
+    "PR2": PR2(settings=REPLAY, temperature=1.0),
     "PPO": PPO(settings=ROLLOUTS),
     "A2C": A2C(settings=replace(ROLLOUTS, epochs=1)),
     "REINFORCE": Reinforce(settings=replace(ROLLOUTS, epochs=1)),
@@ -66,6 +68,7 @@ WAYS = {
     "CQL": "lane_axis",
     "SAC": "vmapped",
     "IQL": "vmapped",
+    "PR2": "lane_axis",
     "PPO": "lane_axis",
     "A2C": "lane_axis",
     "REINFORCE": "lane_axis",
@@ -142,7 +145,7 @@ def test_each_loss_takes_the_fastest_way_that_agrees_with_a_list_of_torchrls_los
         "compile": False,
     }
     if kind is ReplayLearner:
-        common["stochastic"] = algorithm.stochastic
+        common |= {"stochastic": algorithm.stochastic, "sees_peers": algorithm.sees_peers_actions}
     by_list, named = (
         kind(GAME.spaces, engine="list", **common),
         kind(GAME.spaces, engine=WAYS[name], **common),

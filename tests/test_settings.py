@@ -19,8 +19,10 @@ from cprl.algorithms import (
     IPPO,
     IQL,
     LOLA,
+    MADDPG,
     MAPPO,
     PPO,
+    PR2,
     QMIX,
     SAC,
     VDN,
@@ -36,6 +38,7 @@ from cprl.checks import MOST_NESTED, plain
 from cprl.collectors import stock_collector
 from cprl.commandline import parse, recipe_main
 from cprl.config import KINDS, from_config, to_config
+from cprl.envs.continuous import MaxOfTwoQuadratics
 from cprl.envs.matrix import prisoners_dilemma
 from cprl.institutions import (
     Boundaries,
@@ -81,7 +84,8 @@ VALUES = [
     *(REPLAY, ROLLOUTS, TABLES),
     *(MLP(), Conv(), SPACES),
     prisoners_dilemma(turns=9),
-    *(kind(settings=REPLAY) for kind in (DQN, DistributionalDQN, CQL, SAC, IQL, VDN, QMIX)),
+    MaxOfTwoQuadratics(),
+    *(kind(settings=REPLAY) for kind in (DQN, DistributionalDQN, CQL, SAC, IQL, PR2, VDN, QMIX, MADDPG)),
     *(kind(settings=ROLLOUTS) for kind in (PPO, A2C, Reinforce, MAPPO, IPPO)),
     LOOKS,
     LOLA(settings=LOOKS),
@@ -137,6 +141,14 @@ ALLOWED = {
     ("DQNSettings", "replay_transforms"): ([], ()),
     ("DistributionalDQN", "lowest_return"): (-1, -0.5, 1.9),
     ("Spaces", "observation_scale"): (1.9,),
+    **{("Spaces", name): (-1, -0.5, 1.9) for name in ("action_low", "action_high")},
+    **dict.fromkeys(
+        (("MaxOfTwoQuadratics", name) for name in ("wide_top", "steep_top", "steep_height")), (-1, -0.5, 1.9)
+    ),
+    **dict.fromkeys(
+        (("MaxOfTwoQuadratics", name) for name in ("bound", "wide_factor", "wide_width", "steep_width")),
+        (1.9,),
+    ),
     ("Rules", "regrow_radius_cells"): (1.9,),
     ("Boundaries", "regions"): (["x"], ["x", "y"]),
     ("Boundaries", "owners"): (["x"], ["x", "y"]),
@@ -153,7 +165,7 @@ ALLOWED = {
     },
     ("LOLA", "entropy_coeff"): (1.9,),
     **{("SAC", name): (1.9,) for name in ("alpha_init",)},
-    ("IQL", "temperature"): (1.9,),
+    **{(kind, "temperature"): (1.9,) for kind in ("IQL", "PR2")},
     **{("InequityAversion", name): (1.9,) for name in ("alpha", "beta")},
     ("SocialValueOrientation", "angle"): (-1, -0.5, 1.9),
     ("SocialValueOrientation", "weight"): (1.9,),

@@ -1,4 +1,4 @@
-"""Teams learn together: VDN and QMIX from replay, MAPPO and IPPO on-policy, one team in each replica."""
+"""Teams learn together: VDN, QMIX, MADDPG from replay, MAPPO, IPPO on-policy, one team in each replica."""
 
 from dataclasses import replace
 from statistics import fmean
@@ -22,6 +22,7 @@ import cprl
 from cprl import CommonsEnv, Game, Rules, maps, presets
 from cprl.agents import Population
 from cprl.algorithms.dqn import DQN
+from cprl.algorithms.maddpg import MADDPG
 from cprl.algorithms.teams import IPPO, MAPPO, QMIX, VDN
 from cprl.learners.engine.choice import trial_batch
 from cprl.learners.engine.compiled import FunctionalEngine
@@ -38,8 +39,9 @@ TEAMS = {
     "QMIX": QMIX(settings=REPLAY, mixing_cells=6),
     "MAPPO": MAPPO(settings=ROLLOUTS),
     "IPPO": IPPO(settings=ROLLOUTS),
+    "MADDPG": MADDPG(settings=REPLAY),
 }
-WAYS = {"VDN": "vmapped", "QMIX": "vmapped", "MAPPO": "lane_axis", "IPPO": "lane_axis"}
+WAYS = {"VDN": "vmapped", "QMIX": "vmapped", "MAPPO": "lane_axis", "IPPO": "lane_axis", "MADDPG": "lane_axis"}
 FOUR = tuple(range(4))
 
 
@@ -76,6 +78,8 @@ def test_each_team_takes_the_way_that_agrees_with_a_list_of_torchrls_losses(name
     _, found = team_of(name)
     common = {"agents": FOUR, "replicas": 2, "settings": algorithm.settings, "seed": 3}
     common |= {"reward_kind": "team"}
+    if name == "MADDPG":
+        common |= {"own_rewards": True, "noise_numbers": 2, "stochastic": True}
     common |= {
         "make_network": lambda: algorithm.make_network(GAME.spaces),
         "make_loss": algorithm.make_loss,

@@ -33,6 +33,7 @@ from cprl.algorithms import (
     IQL,
     MAPPO,
     PPO,
+    PR2,
     QMIX,
     SAC,
     VDN,
@@ -46,6 +47,7 @@ from cprl.algorithms import (
 from cprl.custom import Custom
 from cprl.learners.engine.functional import total
 from cprl.learners.torchrl import TorchRLReplayLearner, TorchRLRolloutLearner
+from cprl.objectives import PR2Loss
 from cprl.policies.lanes import LaneActor
 from cprl.training import Training
 
@@ -79,6 +81,7 @@ OFF_POLICY = {
     "CQL": CQL(settings=REPLAY),
     "SAC": SAC(settings=REPLAY),
     "IQL": IQL(settings=REPLAY),
+    "PR2": PR2(settings=REPLAY),
 }
 ON_POLICY = {
     "PPO": PPO(settings=ROLLOUT),
@@ -91,6 +94,7 @@ LOSSES = {
     "CQL": DiscreteCQLLoss,
     "SAC": DiscreteSACLoss,
     "IQL": DiscreteIQLLoss,
+    "PR2": PR2Loss,
     "PPO": ClipPPOLoss,
     "A2C": A2CLoss,
     "REINFORCE": ReinforceLoss,

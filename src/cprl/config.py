@@ -18,8 +18,10 @@ from cprl.algorithms import (
     IPPO,
     IQL,
     LOLA,
+    MADDPG,
     MAPPO,
     PPO,
+    PR2,
     QMIX,
     SAC,
     VDN,
@@ -38,6 +40,7 @@ from cprl.commons.maps import Map
 from cprl.commons.observation import Observation
 from cprl.commons.rules import Rules
 from cprl.custom import Custom
+from cprl.envs.continuous import MaxOfTwoQuadratics
 from cprl.envs.matrix import MatrixGame
 from cprl.institutions import (
     Boundaries,
@@ -58,11 +61,13 @@ from cprl.population import Frozen, Learning, Scripted, Team
 from cprl.preferences import Exchange, InequityAversion, SocialValueOrientation
 
 _OF_CPRL: Final[tuple[type[Any], ...]] = (
-    *(Game, Map, Rules, Observation, MatrixGame, Learning, Team, Scripted, Frozen),
+    *(Game, Map, Rules, Observation, Learning, Team, Scripted, Frozen),
+    *(MatrixGame, MaxOfTwoQuadratics),
     *(InequityAversion, SocialValueOrientation, Exchange),
     *(Boundaries, ClosedPatches, ClosedSeason, GraduatedSanctions, Levies, Mediation),
     *(Monitoring, Quota, Sanctioner, Tax, Vote),
-    *(DQN, DistributionalDQN, CQL, SAC, IQL, PPO, A2C, Reinforce, VDN, QMIX, MAPPO, IPPO, LOLA, Tabular),
+    *(DQN, DistributionalDQN, CQL, SAC, IQL, PPO, A2C, Reinforce, VDN, QMIX, MAPPO, IPPO, MADDPG, PR2),
+    *(LOLA, Tabular),
     *(DQNSettings, RolloutSettings, LOLASettings, TabularSettings, Bandit, MLP, Conv),
     Custom,
 )

@@ -4,10 +4,11 @@ from typing import Any, Final
 
 from cprl.commons.game import Game
 from cprl.custom import Custom
+from cprl.envs.continuous import MaxOfTwoQuadratics
 from cprl.envs.make_env import PlayableGame
 from cprl.envs.matrix import MatrixGame
 
-OF_CPRL: Final[tuple[type[Any], ...]] = (Game, MatrixGame)
+OF_CPRL: Final[tuple[type[Any], ...]] = (Game, MatrixGame, MaxOfTwoQuadratics)
 """Games that a recipe holds as values, and whose chance follows from the seed alone."""
 
 

@@ -26,7 +26,7 @@ from cprl.networks.finite import all_finite
 from cprl.networks.stacked import stack_lanes
 from cprl.policies.assignment import AgentIndices, AgentPolicies
 from cprl.policies.decisions import ballot_sizes
-from cprl.policies.lanes import LaneActor
+from cprl.policies.lanes import lane_actor
 from cprl.policies.scripted import scripted_lanes
 from cprl.population import AgentSpec, Frozen, Learning, Scripted, Team, specs_by_agent
 from cprl.runs.checkpoints import FOLDER
@@ -215,10 +215,10 @@ def stored_actor(
     if kind[0] == "scripted":
         return scripted_lanes(kind[1], playing, seeds=seeds, agents=agents, worlds=worlds)
     _, stochastic, epsilon, _ = kind
-    actions = playing.spaces.actions if isinstance(playing, Game) else playing.actions
+    spaces = playing.spaces if isinstance(playing, Game) else playing
     networks: list[Any] = [lane.network for lane in lanes]
-    actor = LaneActor(
-        _side_by_side(networks), actions, seeds=seeds, agents=agents, worlds=worlds, stochastic=stochastic
+    actor = lane_actor(
+        _side_by_side(networks), spaces, seeds=seeds, agents=agents, worlds=worlds, stochastic=stochastic
     )
     actor.epsilon = epsilon
     return actor

@@ -23,8 +23,10 @@ from cprl.algorithms import (
     IPPO,
     IQL,
     LOLA,
+    MADDPG,
     MAPPO,
     PPO,
+    PR2,
     QMIX,
     SAC,
     VDN,
@@ -39,6 +41,7 @@ from cprl.algorithms import (
     TeamAlgorithm,
 )
 from cprl.envs import make_env
+from cprl.envs.continuous import MaxOfTwoQuadratics
 from cprl.envs.matrix import MatrixGame, matching_pennies, prisoners_dilemma
 from cprl.institutions import (
     Boundaries,
@@ -103,6 +106,7 @@ EXAMPLES: Final[dict[type, tuple[Any, ...]]] = {
         Observation(agents_apart=True, scoreboard=True, stock_gauge=True),
     ),
     Game: (MEADOW, ALONE, GOVERNED, presets.game("single_basic")),
+    MaxOfTwoQuadratics: (MaxOfTwoQuadratics(), MaxOfTwoQuadratics(bound=6.0, steep_width=0.5)),
     MatrixGame: (prisoners_dilemma(), matching_pennies(turns=4, continue_prob=0.5, memory=2)),
     Boundaries: (Boundaries.strips(height=3, width=5, agents=2, step_fine=0.5),),
     Quota: (Quota(), Quota(share=0.5, window_steps=3, by_stock=True, fine=1.0)),
@@ -126,6 +130,7 @@ EXAMPLES: Final[dict[type, tuple[Any, ...]]] = {
     DistributionalDQN: (DistributionalDQN(settings=REPLAY, atoms=5),),
     CQL: (CQL(settings=REPLAY),),
     SAC: (SAC(settings=REPLAY),),
+    PR2: (PR2(settings=REPLAY, temperature=0.5, entropy_bonus=False),),
     IQL: (IQL(settings=REPLAY),),
     PPO: (PPO(settings=ROLLOUTS),),
     A2C: (A2C(settings=ROLLOUTS),),
@@ -133,6 +138,7 @@ EXAMPLES: Final[dict[type, tuple[Any, ...]]] = {
     Tabular: (Tabular(settings=TABLES),),
     VDN: (VDN(settings=REPLAY),),
     QMIX: (QMIX(settings=REPLAY, mixing_cells=3),),
+    MADDPG: (MADDPG(settings=REPLAY, logit_penalty=0.0),),
     MAPPO: (MAPPO(settings=ROLLOUTS),),
     IPPO: (IPPO(settings=ROLLOUTS),),
     LOLA: (LOLA(settings=LOOKS), LOLA(settings=LOOKS, estimator="dice")),

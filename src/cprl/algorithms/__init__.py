@@ -4,9 +4,11 @@ Modules, in the order in which one reads them:
     base          Algorithm, OffPolicy, OnPolicy, TeamAlgorithm: the base classes, also for your own
     dqn           DQN and its variants, C51, CQL
     actor_critic  SAC, IQL
+    pr2           PR2, which sees the actions of its peers
     on_policy     PPO, A2C, REINFORCE
     teams         VDN, QMIX, MAPPO, IPPO
     lola          LOLA, by policy gradients or DiCE
+    maddpg        MADDPG
     tabular       tabular Q-learning
 """
 
@@ -14,7 +16,9 @@ from cprl.algorithms.actor_critic import IQL, SAC
 from cprl.algorithms.base import Algorithm, OffPolicy, OnPolicy, TeamAlgorithm
 from cprl.algorithms.dqn import CQL, DQN, DistributionalDQN
 from cprl.algorithms.lola import LOLA
+from cprl.algorithms.maddpg import MADDPG
 from cprl.algorithms.on_policy import A2C, PPO, Reinforce
+from cprl.algorithms.pr2 import PR2
 from cprl.algorithms.tabular import Tabular
 from cprl.algorithms.teams import IPPO, MAPPO, QMIX, VDN
 from cprl.learners.lola.settings import LOLASettings
@@ -27,8 +31,10 @@ __all__ = [
     "IPPO",
     "IQL",
     "LOLA",
+    "MADDPG",
     "MAPPO",
     "PPO",
+    "PR2",
     "QMIX",
     "SAC",
     "VDN",

@@ -42,10 +42,12 @@ _CHECKS: Final[dict[str, Check]] = {
     "alpha_init": number(1e-12, 1e6),
     "expectile": number(0.5, 0.999),
     "temperature": _WEIGHT,
+    "entropy_bonus": SWITCH,
     "clip_epsilon": number(1e-6, 0.999),
     "entropy_coeff": _WEIGHT,
     "critic_coeff": _WEIGHT,
     "estimator": one_of("policy_gradient", "dice"),
+    "logit_penalty": _WEIGHT,
     "mixing_cells": count(1, MOST_CELLS),
 }
 """Of the fields of cprl's algorithms; one of the same name means the same in each."""
@@ -68,6 +70,9 @@ class Algorithm:
     stochastic: ClassVar[bool] = False
     """Whether the acting network outputs the logits of a policy, from which actions are sampled; else it
     outputs action values, and actions are epsilon-greedy."""
+    has_continuous_actions: ClassVar[bool] = False
+    """Whether the acting network outputs an action of `Spaces.action_size` numbers, within their bounds; else
+    agents choose from `Spaces.actions`. A game of the other kind is refused."""
     can_share_parameters: ClassVar[bool] = False
     """Whether agents of a team can share one network, see `cprl.population.Team`."""
 
@@ -131,6 +136,16 @@ class OffPolicy(Algorithm):
     settings: DQNSettings
     settings_kind: ClassVar[type[Any]] = DQNSettings
     can_share_parameters: ClassVar[bool] = True
+    sees_peers_actions: ClassVar[bool] = False
+    """Whether "action" is [.., N] in place of [..]: first the agent's own action, then those of the others in
+    the order of their indices, whatever they learn by. Agents still act on their own observations alone."""
+    action_noise: float = 0.0
+    """The standard deviation of the Gaussian noise that exploring agents add to continuous actions, in units
+    of actions; besides, they take a uniformly random one with the probability `epsilon` of the settings."""
+    noise_numbers: ClassVar[int] = 0
+    """How many uniform numbers in 0..1 the loss reads for each transition, of each member of a team, to
+    sample by: the entry "noise", float32 [.., noise_numbers] or [.., S, noise_numbers]. A loss that samples
+    by torch's generator instead would make replicas depend on each other."""
 
     def make_learner(
         self, spaces: Spaces, *, agents: Sequence[int], engine: TrainingEngine = "compiled", **how: Any
@@ -138,12 +153,16 @@ class OffPolicy(Algorithm):
         """See `Algorithm`."""
         self._check_settings()
         _check_engine(engine)
+        refuse_actions(self, spaces)
         how |= {
             "agents": agents,
             "settings": self.settings,
             "make_network": lambda: self.make_network(spaces),
             "make_loss": self.make_loss,
             "stochastic": self.stochastic,
+            "sees_peers": self.sees_peers_actions,
+            "noise_numbers": self.noise_numbers,
+            "action_noise": self.action_noise,
         }
         if engine == "torchrl":
             _refuse_sharing(how)
@@ -169,6 +188,7 @@ class OnPolicy(Algorithm):
         """See `Algorithm`."""
         self._check_settings()
         _check_engine(engine)
+        refuse_actions(self, spaces)
         how |= {
             "agents": agents,
             "settings": self.settings,
@@ -185,11 +205,12 @@ class TeamAlgorithm(Algorithm):
     """Trains a team: agents that learn together and act independently, on their own observations.
 
     `make_network` returns the networks of one member. The loss reads observations [.., S, *shape] and actions
-    [.., S] of S members; rewards [.., 1] of replay, advantages [.., S, 1] of rollouts.
+    [.., S] of S members. From replay, rewards are [.., 1], or [.., S, 1] where `shares_reward` is False; from
+    rollouts, advantages are [.., S, 1].
     """
 
     shares_reward: ClassVar[bool] = True
-    """Whether the members must get the team reward."""
+    """Whether the members must get the team reward; else each has its own."""
     fewest_members: ClassVar[int] = 1
     """The smallest team that the algorithm supports."""
 
@@ -204,6 +225,8 @@ class TeamAlgorithm(Algorithm):
         """See `Algorithm`."""
         self._refuse_torchrl(engine)
         self._check_team(len(agents), how.get("reward_kind", "individual"))
+        if isinstance(self, OffPolicy):
+            how["own_rewards"] = not self.shares_reward
         return super().make_learner(
             spaces,
             agents=agents,
@@ -217,7 +240,7 @@ class TeamAlgorithm(Algorithm):
         if self.shares_reward and reward != "team":
             raise ValueError(
                 f'reward is {named(reward)}; allowed for {name}: "team", the sum over all agents; '
-                f"DQN, PPO and IPPO support {named(reward)}"
+                f"DQN, PPO, IPPO, LOLA and MADDPG support {named(reward)}"
             )
         if members < self.fewest_members:
             raise ValueError(
@@ -230,6 +253,19 @@ def _refuse_sharing(how: dict[str, Any]) -> None:
     if how.pop("share_parameters", False):
         raise ValueError(
             'share_parameters is True; allowed with engine="torchrl", which trains independent agents: False'
+        )
+
+
+def refuse_actions(algorithm: Any, spaces: Spaces) -> None:
+    """Raises a ValueError if an algorithm is for continuous actions and the game has a number of them to
+    choose from, or the other way round."""
+    checked("spaces", spaces, instance(Spaces, "a Spaces, e.g. Game.spaces"))
+    is_continuous = bool(getattr(algorithm, "has_continuous_actions", False))
+    if is_continuous != bool(spaces.action_size):
+        kind = "actions of numbers within bounds" if is_continuous else "a number of actions to choose from"
+        raise ValueError(
+            f"agents that learn by {type(algorithm).__name__} would have {spaces.actions_text}; allowed for "
+            f"it: {kind}"
         )
 
 

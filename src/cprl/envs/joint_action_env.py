@@ -1,6 +1,7 @@
 """JointActionEnv: B worlds of a game in which all that happens is the agents' joint action."""
 
 from abc import abstractmethod
+from collections.abc import Callable
 from math import log1p
 from typing import Any, Final
 
@@ -31,7 +32,7 @@ class JointActionEnv(LeanStepEnv):
     Args:
         agents: N.
         observation_size: the length of an agent's observation, float32 [B, N, size], numbers in 0..1.
-        action: the spec of ("agents", "action"), of B worlds.
+        action: makes the spec of ("agents", "action") for a shape, [B, N].
         turns: the largest number of turns of an episode, which is truncated then; a game of one turn
             terminates, since nothing follows.
         continue_prob: the probability that a further turn follows; where none does, the episode terminates.
@@ -52,7 +53,7 @@ class JointActionEnv(LeanStepEnv):
         *,
         agents: int,
         observation_size: int,
-        action: TensorSpec,
+        action: Callable[[torch.Size], TensorSpec],
         turns: int,
         continue_prob: float,
         worlds: int,
@@ -61,6 +62,7 @@ class JointActionEnv(LeanStepEnv):
         first_world: int,
     ) -> None:
         worlds = arguments.integer("worlds", worlds, 1, 2**32)
+        first_world = arguments.integer("first_world", first_world, 0, 2**32 - 1)
         device = device_of(device)
         super().__init__(device=device, batch_size=torch.Size([worlds]))
         self.group_map = {keys.AGENTS: [f"agent_{agent}" for agent in range(agents)]}
@@ -71,7 +73,7 @@ class JointActionEnv(LeanStepEnv):
             self.register_buffer(name, torch.zeros(worlds, 1, dtype=dtype, device=device))
         self.register_buffer("seed_bits", torch.zeros((), dtype=torch.int64))
         self._set_seed(seed)
-        self._make_specs(observation_size, action)
+        self._make_specs(observation_size, action(self._agents_size))
 
     def _make_specs(self, observation_size: int, action: TensorSpec) -> None:
         size, of_agents = self.batch_size, self._agents_size
@@ -174,7 +176,7 @@ class JointActionEnv(LeanStepEnv):
         own: Any = self._buffers
         seed: Any = np.int64(own["seed_bits"].item()).astype(np.uint64)
         episode: Any = own["episode"].numpy(force=True).astype(np.uint64)
-        world = (np.arange(len(episode)) + self._first_world).astype(np.uint64)[:, None]
+        world: Any = (np.arange(len(episode)) + self._first_world).astype(np.uint64)[:, None]
         zero = np.zeros_like(episode)
         word = philox4x32(_LENGTH + zero, zero, episode, world, seed & LOW_WORD, seed >> WORD_BITS)[0]
         unit = (word.astype(np.float64) + 0.5) / 2**32

@@ -110,7 +110,7 @@ def random_policies(run: LoadedRun, replicas: Sequence[int], *, worlds: int, see
     everyone = tuple(range(run.spaces.agents))
     seeds = lane_seeds(seed, replicas=replicas, agents=everyone, purpose=EVALUATION)
     return AgentPolicies(
-        {everyone: random_lanes(run.spaces.actions, seeds=seeds, agents=len(everyone), worlds=worlds)},
+        {everyone: random_lanes(run.spaces, seeds=seeds, agents=len(everyone), worlds=worlds)},
         decisions=decider_by_chance(run.game, seeds, worlds=worlds) if isinstance(run.game, Game) else None,
     )
 

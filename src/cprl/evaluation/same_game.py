@@ -1,7 +1,7 @@
 """Checks that runs have the same game, and names the differences."""
 
 from collections.abc import Mapping
-from dataclasses import fields
+from dataclasses import fields, is_dataclass
 from typing import Any, Final
 
 import torch
@@ -31,25 +31,29 @@ def check_same_game(runs: Mapping[str, LoadedRun]) -> None:
 
 
 def differences(game: Any, other: Any) -> list[str]:
-    """The fields of map, rules and observation in which games differ, with their values if they are short,
-    and the institutions."""
+    """The fields in which games differ, of a commons those of map, rules and observation, with their values
+    if they are short, and the institutions."""
     if not (isinstance(game, Game) and isinstance(other, Game)):
-        return [] if game == other else [f"{game!r} and {other!r}"]
-    found = []
-    for mine, theirs in (
-        (game.map, other.map),
-        (game.rules, other.rules),
-        (game.observation, other.observation),
-    ):
-        for field in fields(mine):
-            one, two = getattr(mine, field.name), getattr(theirs, field.name)
-            if one != two:
-                values = f"{one!r} and {two!r}"
-                short = len(values) <= 2 * _LONGEST
-                found.append(f"{type(mine).__name__}.{field.name} {values if short else 'differ'}")
+        if game == other:
+            return []
+        alike = is_dataclass(game) and type(game) is type(other)
+        return (_field_differences(game, other) if alike else []) or [f"{game!r} and {other!r}"]
+    pairs = (game.map, other.map), (game.rules, other.rules), (game.observation, other.observation)
+    found = [line for mine, theirs in pairs for line in _field_differences(mine, theirs)]
     if game.institutions != other.institutions:
         names = (", ".join(type(own).__name__ for own in of.institutions) or "none" for of in (game, other))
         found.append(f"institutions {' and '.join(names)}, or their values")
+    return found
+
+
+def _field_differences(mine: Any, theirs: Any) -> list[str]:
+    found = []
+    for field in fields(mine):
+        one, two = getattr(mine, field.name), getattr(theirs, field.name)
+        if one != two:
+            values = f"{one!r} and {two!r}"
+            short = len(values) <= 2 * _LONGEST
+            found.append(f"{type(mine).__name__}.{field.name} {values if short else 'differ'}")
     return found
 
 

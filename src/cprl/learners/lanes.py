@@ -12,13 +12,13 @@ from torch import Tensor, nn
 from cprl.arguments import object_of
 from cprl.learners.checks import check_networks
 from cprl.learners.engine.shared import is_list
-from cprl.learners.transitions import LaneTurn, lane_turn, seen_next
+from cprl.learners.transitions import LaneTurn, joint_actions, lane_turn, seen_next
 from cprl.networks.agent import acting_part
 from cprl.networks.specification import refuse_unseen
-from cprl.policies.lanes import LaneActor
+from cprl.policies.lanes import LaneActor, lane_actor
 from cprl.spaces import Spaces
 
-WEIGHTS, TARGET_WEIGHTS, EXPLORATION, SAMPLING, EVALUATION, EXHIBITION = range(6)
+WEIGHTS, TARGET_WEIGHTS, EXPLORATION, SAMPLING, EVALUATION, EXHIBITION, NOISE = range(7)
 """The purposes of a lane's random numbers; each has its own seed."""
 
 StartFrom: TypeAlias = Mapping[str, Mapping[str, Tensor]]
@@ -81,6 +81,8 @@ class Lanes:
         stochastic: whether the network outputs the logits of a policy from which actions are sampled.
         start_from: the weights with which the acting networks of lanes start, see `StartFrom`.
         share_parameters: whether the agents of a replica share one network, initialised as that of the first.
+        sees_peers: whether a lane's stored action is that of all N agents, see `transitions.joint_actions`.
+        action_noise: of continuous actions, see `ContinuousLaneActor`.
 
     Raises:
         ValueError: if agents observe entries that networks do not read.
@@ -98,14 +100,17 @@ class Lanes:
         stochastic: bool,
         start_from: StartFrom | None = None,
         share_parameters: bool = False,
+        sees_peers: bool = False,
+        action_noise: float = 0.0,
     ) -> None:
         refuse_unseen(spaces)
         self.spaces, self.agents, self.replicas, self.seed = spaces, tuple(agents), replicas, seed
         self._numbers = range(first_replica, first_replica + replicas)
         self.make_network, self.stochastic = make_network, stochastic
-        self._start_from = weights_to_start(start_from)
+        self._start_from, self.sees_peers = weights_to_start(start_from), sees_peers
         self.sharing = len(self.agents) if share_parameters else 1
         """The number of agents that share a network."""
+        self._action_noise = action_noise
 
     def __len__(self) -> int:
         return self.replicas * len(self.agents)
@@ -122,7 +127,17 @@ class Lanes:
 
     @property
     def action_shape(self) -> tuple[int, ...]:
-        """The shape of a lane's action, and of its reward in a rollout."""
+        """The shape of a lane's stored action: () or (D,), with a first axis N if it sees those of peers."""
+        return *((self.spaces.agents,) if self.sees_peers else ()), *self.spaces.action_shape
+
+    @property
+    def member_shape(self) -> tuple[int, ...]:
+        """The axes of the members of a lane: none, since it is one agent."""
+        return ()
+
+    @property
+    def reward_shape(self) -> tuple[int, ...]:
+        """The shape of a lane's reward in a replay buffer."""
         return ()
 
     @property
@@ -132,7 +147,8 @@ class Lanes:
 
     def turn(self, batch: TensorDictBase, rewards: Any) -> LaneTurn:
         """One transition of every lane, as a replay buffer stores it; see `lane_turn`."""
-        return lane_turn(self.agents, batch, rewards)
+        turn = lane_turn(self.agents, batch, rewards)
+        return turn._replace(action=joint_actions(self.agents, batch)) if self.sees_peers else turn
 
     def rollout_turn(self, batch: TensorDictBase, rewards: Any) -> LaneTurn:
         """One transition of every lane, as a rollout stores it; see `lane_turn`."""
@@ -178,20 +194,21 @@ class Lanes:
 
     def actor(self, engine: Acts, *, compile: bool) -> LaneActor:
         """The actor of training: the current weights, and random numbers of its own for each lane."""
-        return LaneActor(
+        return lane_actor(
             engine.outputs,
-            self.spaces.actions,
+            self.spaces,
             seeds=self.seeds(EXPLORATION),
             agents=len(self.agents),
             stochastic=self.stochastic,
+            noise=self._action_noise,
             compile=compile and not is_list(engine),
         )
 
     def evaluation_actor(self, engine: Acts, worlds: int, *, epsilon: float) -> LaneActor:
         """The actor of evaluation: the current weights, for `worlds` worlds of each replica."""
-        actor = LaneActor(
+        actor = lane_actor(
             engine.outputs,
-            self.spaces.actions,
+            self.spaces,
             seeds=self.seeds(EVALUATION),
             agents=len(self.agents),
             worlds=worlds,

@@ -11,13 +11,13 @@ from torch import Tensor, nn
 
 from cprl.learners.buffer.gather import Horizon
 from cprl.learners.buffer.sampler import lane_buffer, transformed
-from cprl.learners.checks import check_learner
+from cprl.learners.checks import check_learner, refuse_continuous
 from cprl.learners.engine.base import Engine
 from cprl.learners.engine.choice import TRIAL_LANES, EngineName, make_engine, trial_batch
 from cprl.learners.engine.functional import MakeLoss
 from cprl.learners.engine.refusals import refuse_for_replay
 from cprl.learners.engine.shared import SharedEngine
-from cprl.learners.lanes import SAMPLING, TARGET_WEIGHTS, WEIGHTS, StartFrom
+from cprl.learners.lanes import NOISE, SAMPLING, TARGET_WEIGHTS, WEIGHTS, StartFrom
 from cprl.learners.settings import DQNSettings
 from cprl.learners.single import dqn_loss, q_network
 from cprl.learners.teams import MakeTeam, lanes_of
@@ -47,6 +47,11 @@ class ReplayLearner:
         make_loss: makes a lane's loss from its network; by default `dqn_loss`.
         make_team: for agents that learn as a team: makes the team's networks from those of its members, see
             `cprl.algorithms.teams`; a lane is then the team of a replica.
+        own_rewards: whether each member of a team learns from what it wants itself, with rewards [.., S, 1];
+            else all have the team reward, [.., 1].
+        noise_numbers: how many uniform numbers the loss reads for each transition, of each member of a team:
+            the entry "noise", float32 [.., noise_numbers] or [.., S, noise_numbers], from random numbers of
+            each lane's own; 0 for a loss that samples nothing.
         stochastic: whether networks output the logits of a policy from which actions are sampled, with no
             epsilon; else action values, with `epsilon` of the settings.
         reward_kind: what they want, see `cprl.preferences`.
@@ -55,11 +60,14 @@ class ReplayLearner:
         start_from: the weights with which acting networks, and their targets, start, by the lane's name; the
             others, such as critics, are new.
         share_parameters: whether the agents of a replica share one network, which learns from all of them.
+        sees_peers: whether transitions have the actions of all agents, see `transitions.joint_actions`.
+        action_noise: of continuous actions, see `cprl.policies.lanes.ContinuousLaneActor`.
         device: the torch device of networks, buffers and updates.
 
     Raises:
         ValueError: for a loss that needs the latest steps of the current policy (see
-            `cprl.learners.rollouts`), and for a team without the team reward.
+            `cprl.learners.rollouts`), for a team without the team reward, unless it has `own_rewards`, and
+            for one that sees its peers.
     """
 
     def __init__(
@@ -74,16 +82,22 @@ class ReplayLearner:
         make_network: Callable[[], nn.Module] | None = None,
         make_loss: MakeLoss | None = None,
         make_team: MakeTeam | None = None,
+        own_rewards: bool = False,
+        noise_numbers: int = 0,
         stochastic: bool = False,
         reward_kind: Preference = "individual",
         engine: EngineName | None = None,
         compile: bool = True,
         start_from: StartFrom | None = None,
         share_parameters: bool = False,
+        sees_peers: bool = False,
+        action_noise: float = 0.0,
         device: str | torch.device = "cpu",
     ) -> None:
-        _refuse_unshared_reward(is_team=make_team is not None, reward_kind=reward_kind)
+        _refuse_unshared_reward(is_sharing=bool(make_team) and not own_rewards, reward_kind=reward_kind)
         check_learner(spaces, settings, DQNSettings, agents, replicas, first_replica, seed, reward_kind)
+        if make_network is None or make_loss is None or settings.mean_over_all_outputs:
+            refuse_continuous("a learner of action values", spaces)
         self.spaces, self.settings, self.agents = spaces, settings, tuple(agents)
         self.replicas, self.seed, self.wants = replicas, seed, WantedRewards(reward_kind)
         self._lanes = lanes_of(
@@ -94,14 +108,20 @@ class ReplayLearner:
             first_replica=first_replica,
             make_network=make_network or partial(_default_network, spaces, settings),
             make_team=make_team,
+            own_rewards=own_rewards,
             stochastic=stochastic,
             start_from=start_from,
             share_parameters=share_parameters,
+            sees_peers=sees_peers,
+            action_noise=action_noise,
         )
         make_loss = make_loss or partial(dqn_loss, gamma=settings.gamma)
         self._shapes: dict[str, Any] = {
             "observation_shape": self._lanes.observation_shape,
             "action_shape": self._lanes.action_shape,
+            "reward_shape": self._lanes.reward_shape,
+            "action_dtype": spaces.action_dtype,
+            "noise_shape": (*self._lanes.member_shape, noise_numbers) if noise_numbers else (),
             "observation_dtype": spaces.observation_dtype,
             "horizon": Horizon(settings.n_steps, settings.gamma) if settings.n_steps > 1 else None,
             "device": device,
@@ -109,6 +129,7 @@ class ReplayLearner:
         self.engine = self._make_engine(engine, make_loss, compile=compile)
         self.buffer = lane_buffer(
             seeds=self._lanes.seeds(SAMPLING),
+            noise_seeds=self._lanes.seeds(NOISE),
             transitions=settings.buffer_size,
             batch_size=settings.batch_size,
             **self._shapes,
@@ -193,8 +214,8 @@ class ReplayLearner:
 
     def values(self, batch: TensorDictBase) -> Tensor:
         """The highest action value of each agent at the end of a turn, [R, S]; NaN where its network
-        outputs a policy."""
-        if self._lanes.stochastic:
+        outputs a policy, or a continuous action."""
+        if self._lanes.stochastic or self.spaces.action_size:
             return torch.full((self.replicas, len(self.agents)), torch.nan)
         with torch.no_grad():
             highest = self.engine.outputs(self._lanes.seen_next(batch)).amax(-1)
@@ -206,8 +227,10 @@ class ReplayLearner:
         The entry "networks" repeats the weights of "update" in the form that `cprl.load` reads.
         """
         transforms = {"transforms": self.buffer.transform.state_dict()} if self.buffer.has_transforms else {}
+        noise = {"noise": self.buffer.noise.rng.state_dict()} if self.buffer.noise else {}
         return {
             **transforms,
+            **noise,
             "networks": self._lanes.states(self.engine),
             "update": self.engine.state_dict(),
             "storage": self.buffer.storage.state_dict(),
@@ -223,6 +246,8 @@ class ReplayLearner:
         self.engine.load_state_dict(state["update"])
         self.buffer.storage.load_state_dict(state["storage"])
         self.buffer.sampler.load_state_dict(state["sampler"])
+        if self.buffer.noise:
+            self.buffer.noise.rng.load_state_dict(state["noise"])
         if self.buffer.has_transforms:
             self.buffer.transform.load_state_dict(state["transforms"])
         self.actor.rng.load_state_dict(state["exploration"])
@@ -232,8 +257,8 @@ class ReplayLearner:
         self.wants.load_state_dict(state.get("wants", {}))
 
 
-def _refuse_unshared_reward(*, is_team: bool, reward_kind: Preference) -> None:
-    if is_team and reward_kind != "team":
+def _refuse_unshared_reward(*, is_sharing: bool, reward_kind: Preference) -> None:
+    if is_sharing and reward_kind != "team":
         raise ValueError(
             f'reward is {named(reward_kind)}; allowed for a team that learns from replay: "team"'
         )

@@ -11,7 +11,7 @@ from torch import Tensor, nn
 from torchrl.objectives.value.functional import generalized_advantage_estimate
 
 from cprl.learners.buffer.storage import torch_dtype
-from cprl.learners.checks import check_learner, check_rollouts
+from cprl.learners.checks import check_learner, check_rollouts, refuse_continuous
 from cprl.learners.engine.base import Engine
 from cprl.learners.engine.choice import TRIAL_LANES, EngineName, make_engine, trial_batch, trial_rollout
 from cprl.learners.engine.functional import MakeLoss
@@ -84,6 +84,7 @@ class RolloutLearner:
         device: str | torch.device = "cpu",
     ) -> None:
         check_learner(spaces, settings, RolloutSettings, agents, replicas, first_replica, seed, reward_kind)
+        refuse_continuous("a learner from rollouts", spaces)
         self.spaces, self.settings, self.agents = spaces, settings, tuple(agents)
         self.replicas, self.seed, self.wants = replicas, seed, WantedRewards(reward_kind)
         self._lanes = lanes_of(
@@ -157,7 +158,7 @@ class RolloutLearner:
             "observation": (shape, dtype),
             "action": (self._lanes.action_shape, torch.int64),
             "next_observation": (shape, dtype),
-            "reward": (self._lanes.action_shape, torch.float32),
+            "reward": (self._lanes.member_shape, torch.float32),
             "done": ((), torch.bool),
             "terminated": ((), torch.bool),
         }

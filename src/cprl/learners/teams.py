@@ -33,10 +33,11 @@ class Teams:
         members: the members of all teams.
         make_team: makes a team's networks from those of its members. Parts that it adds are initialised from
             torch's generator, which is seeded for each team.
+        own_rewards: whether a replay buffer stores what each member wants; else one reward of the team.
     """
 
-    def __init__(self, members: Lanes, make_team: MakeTeam) -> None:
-        self.members, self._make_team = members, make_team
+    def __init__(self, members: Lanes, make_team: MakeTeam, *, own_rewards: bool = False) -> None:
+        self.members, self._make_team, self._own_rewards = members, make_team, own_rewards
         self.stochastic = members.stochastic
         form = init_network(
             lambda: make_team(self._shared([members.make_network() for _ in self._networks])),
@@ -66,12 +67,22 @@ class Teams:
     @property
     def observation_shape(self) -> tuple[int, ...]:
         """The shape of a team's observation: (S, C, X, Y)."""
-        return *self.action_shape, *self.members.observation_shape
+        return *self.member_shape, *self.members.observation_shape
 
     @property
     def action_shape(self) -> tuple[int, ...]:
-        """The shape of a team's action, and of its rewards in a rollout: (S,)."""
+        """The shape of a team's action, (S,)."""
+        return *self.member_shape, *self.members.action_shape
+
+    @property
+    def member_shape(self) -> tuple[int, ...]:
+        """The axis of a team's members, (S,), also the shape of its rewards in a rollout."""
         return (len(self.members.agents),)
+
+    @property
+    def reward_shape(self) -> tuple[int, ...]:
+        """The shape of a team's reward in a replay buffer: (S,) if each member has its own, else ()."""
+        return self.member_shape if self._own_rewards else ()
 
     @property
     def of_replica(self) -> int:
@@ -93,14 +104,14 @@ class Teams:
 
     def turn(self, batch: TensorDictBase, rewards: Any) -> LaneTurn:
         """One transition of every team, as a replay buffer stores it: observations [R, S, C, X, Y], actions
-        [R, S] and team rewards [R].
+        [R, S] and team rewards [R], or with `own_rewards` those of each member, [R, S].
 
         Args:
             batch: see `lane_turn`.
-            rewards: of all agents, [R, N], those of a team all the same.
+            rewards: of all agents, [R, N]; those of a team without `own_rewards` all the same.
         """
         turn = self.rollout_turn(batch, rewards)
-        return turn._replace(reward=turn.reward[:, 0])
+        return turn if self._own_rewards else turn._replace(reward=turn.reward[:, 0])
 
     def rollout_turn(self, batch: TensorDictBase, rewards: Any) -> LaneTurn:
         """One transition of every team, as a rollout stores it: as `turn`, with rewards [R, S]."""
@@ -142,10 +153,17 @@ class Teams:
         return self._acting.member_state(team, member)
 
 
-def lanes_of(spaces: Spaces, *, make_team: MakeTeam | None, **how: Any) -> Lanes | Teams:
-    """The lanes of independent agents, or with `make_team` of a team; see `Lanes` for the arguments."""
+def lanes_of(
+    spaces: Spaces, *, make_team: MakeTeam | None, own_rewards: bool = False, **how: Any
+) -> Lanes | Teams:
+    """The lanes of independent agents, or with `make_team` of a team; see `Lanes` and `Teams` for the
+    arguments."""
     members = Lanes(spaces, **how)
-    return Teams(members, make_team) if make_team else members
+    if make_team and members.sees_peers:
+        raise ValueError(
+            "sees_peers is True; allowed for a team: False; its members' actions are stored together"
+        )
+    return Teams(members, make_team, own_rewards=own_rewards) if make_team else members
 
 
 class _Members:

@@ -19,11 +19,12 @@ class LaneTurn(NamedTuple):
     observation: Any
     """uint8 [L, C, X, Y]."""
     action: Any
-    """int64 [L]."""
+    """int64 [L], or float32 [L, D]; with an axis N after L for lanes that see the actions of their peers, see
+    `joint_actions`."""
     next_observation: Any
     """uint8 [L, C, X, Y]."""
     reward: Any
-    """float32 [L]."""
+    """float32 [L]; [L, S] where a lane is a team whose S members have rewards of their own."""
     done: Any
     """bool [L]."""
     terminated: Any
@@ -45,7 +46,7 @@ def lane_turn(agents: tuple[int, ...], batch: TensorDictBase, rewards: Any = Non
     entry = keys.entry
     before, after = entry(batch, keys.AGENTS), entry(batch, "next")
     agents_after = entry(after, keys.AGENTS)
-    observation = array_of(entry(before, "observation"))
+    observation, action = array_of(entry(before, "observation")), entry(before, "action")
     everyone = len(agents) == observation.shape[1]
     lanes, windows, at = len(observation) * len(agents), observation.shape[2:], list(agents)
 
@@ -62,12 +63,30 @@ def lane_turn(agents: tuple[int, ...], batch: TensorDictBase, rewards: Any = Non
 
     return LaneTurn(
         of(entry(before, "observation"), *windows),
-        of(entry(before, "action")),
+        of(action, *action.shape[2:]),
         of(entry(agents_after, "observation"), *windows),
         of(entry(agents_after, "reward")) if rewards is None else picked(rewards),
         of_world(entry(after, keys.DONE)),
         of_world(entry(after, keys.TERMINATED)),
     )
+
+
+def joint_actions(agents: tuple[int, ...], batch: TensorDictBase) -> Any:
+    """The actions of all N agents in one turn, as each of some agents of every replica sees them.
+
+    Args:
+        agents: the indices of the S agents.
+        batch: a turn of every replica, see `lane_turn`.
+
+    Returns:
+        int64 [R x S, N], or float32 [R x S, N, D]: first a lane's own action, then the others' in the order
+        of their indices. They are those that agents chose, also where an agent was out of play and its action
+        did not count.
+    """
+    actions = array_of(keys.entry(keys.entry(batch, keys.AGENTS), "action"))
+    everyone = actions.shape[1]
+    order = [[own, *(other for other in range(everyone) if other != own)] for own in agents]
+    return actions[:, order].reshape(len(actions) * len(agents), everyone, *actions.shape[2:])
 
 
 def wanted_in(wants: WantedRewards, batch: TensorDictBase) -> Any:
@@ -141,8 +160,10 @@ def transitions_of(agent: int, batch: TensorDictBase) -> TensorDict:
 def turn_of(transitions: TensorDictBase) -> LaneTurn:
     """The transitions of lanes, [L], under TorchRL's default keys, as a `LaneTurn`."""
     following = transitions.get("next")
-    flags = (following.get(name).reshape(len(transitions)) for name in ("reward", "done", "terminated"))
-    turn = transitions.get("observation"), transitions.get("action"), following.get("observation"), *flags
+    flags = (following.get(name).reshape(len(transitions)) for name in ("done", "terminated"))
+    reward = following.get("reward").squeeze(-1)
+    before = transitions.get("observation"), transitions.get("action")
+    turn = *before, following.get("observation"), reward, *flags
     return LaneTurn(*map(array_of, turn))
 
 

@@ -6,6 +6,8 @@ Modules, in the order in which one reads them:
     specification  Network: which of them an algorithm has; networks of your own
     agent          several networks of one agent that learn together
     distributional distributions of returns
+    bounded        outputs within bounds: continuous actions
+    joint          values of the actions of several agents together
     team           the networks of a team
     stacked        the networks of many lanes as one
 """

@@ -2,14 +2,19 @@
 
 from collections.abc import Iterable, Sequence
 from copy import deepcopy
-from typing import Any
+from typing import Any, Final
 
 import torch
 from torch import Tensor, nn
 
 from cprl.networks.agent import AgentNetworks
+from cprl.networks.bounded import BoundedNetwork
 from cprl.networks.distributional import AtomNetwork
+from cprl.networks.joint import JointNetwork
 from cprl.networks.mlp import MLPNetwork
+
+_OVER_ANOTHER: Final = AtomNetwork, BoundedNetwork, JointNetwork
+"""Networks that compute with the outputs of another, their attribute `network`, which has all weights."""
 
 
 class StackedMLP(nn.Module):
@@ -132,10 +137,10 @@ def stack_lanes(networks: Sequence[nn.Module]) -> nn.Module:
     if hasattr(first, "stacked"):
         itself: nn.Module = first.stacked(networks)
         return itself
-    if all(isinstance(network, AtomNetwork) for network in networks):
-        stack = deepcopy(networks[0])
+    if isinstance(first, _OVER_ANOTHER) and all(type(network) is type(first) for network in networks):
+        stack: Any = deepcopy(networks[0])
         stack.network = stack_lanes([network.network for network in networks])  # type: ignore[misc]
-        return stack
+        return stack  # type: ignore[no-any-return]
     if all(isinstance(network, AgentNetworks) for network in networks):
         parts = zip(*(network.values() for network in networks), strict=True)  # type: ignore[operator]
         return AgentNetworks(dict(zip(networks[0].keys(), map(stack_lanes, parts), strict=True)))  # type: ignore[operator]
@@ -151,9 +156,9 @@ def stack_lanes(networks: Sequence[nn.Module]) -> nn.Module:
 def lane_state(stack: nn.Module, lane: int) -> dict[str, Tensor]:
     """Copies of the weights of one lane of an acting network that `stack_lanes` made, as the state dict of
     the lane's network."""
-    if isinstance(stack, AtomNetwork):
-        own = lane_state(stack.network, lane)
-        return {"support": stack.support.clone(), **{f"network.{name}": value for name, value in own.items()}}
+    if isinstance(stack, _OVER_ANOTHER):
+        own = {f"network.{name}": value for name, value in lane_state(stack.network, lane).items()}
+        return {**{name: value.clone() for name, value in stack.named_buffers(recurse=False)}, **own}
     state: dict[str, Tensor] = stack.lane_state(lane)  # type: ignore[operator]
     return state
 

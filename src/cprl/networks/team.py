@@ -149,6 +149,55 @@ class CentralCritic(nn.Module):
         return CentralCritic(stack_lanes([critic.network for critic in critics]), self.members)
 
 
+class JointCritics(nn.Module):
+    """The value of joint actions to each of S members, by a critic for each; critics share no weights.
+
+    Args:
+        heads: each member's network of a vector, to one value: the features of what all members observe, then
+            the actions of all members, one-hot.
+        encoders: each member's network of what all members observe, (S, *shape), to features, which pass
+            through ReLU; None for the observations themselves.
+        observation_dims: the number of axes of one member's observation.
+        highest: the largest value of an observation; without encoders, observations are divided by it.
+    """
+
+    def __init__(
+        self,
+        heads: nn.Module,
+        encoders: nn.Module | None,
+        *,
+        observation_dims: int,
+        highest: float,
+    ) -> None:
+        super().__init__()
+        self.heads, self.encoders = heads, encoders
+        self._dims, self.highest = 1 + observation_dims, highest
+
+    def forward(self, observation: Tensor, joint_action: Tensor) -> Tensor:
+        """Observations [..., S, *shape] and float one-hot actions [..., S, S, A], in row i those by which
+        member i's critic judges, to values [..., S, 1]."""
+        members = joint_action.shape[-2]
+        if self.encoders is None:
+            flat = observation.flatten(-self._dims).to(joint_action.dtype) / self.highest
+            features = flat.unsqueeze(-2).expand(*flat.shape[:-1], members, flat.shape[-1])
+        else:
+            everyone = observation.unsqueeze(-1 - self._dims)
+            leading, shape = observation.shape[: -self._dims], observation.shape[-self._dims :]
+            features = self.encoders(everyone.expand(*leading, members, *shape)).relu()
+        values: Tensor = self.heads(torch.cat([features, joint_action.flatten(-2)], -1))
+        return values
+
+    def stacked(self, critics: Sequence["JointCritics"]) -> "JointCritics":
+        """The critics of many teams, with their parameters along a first axis; copies."""
+        heads, encoders = ([getattr(own, name) for own in critics] for name in ("heads", "encoders"))
+        return JointCritics(
+            stack_lanes(heads),
+            None if self.encoders is None else stack_lanes(encoders),
+            observation_dims=self._dims - 1,
+            highest=self.highest,
+        )
+
+
 class Mixing(nn.Module):
     """TorchRL's `QMixer` with the observations of all members as the state.
 

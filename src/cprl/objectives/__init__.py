@@ -1,20 +1,26 @@
-"""Losses that TorchRL does not have, as `torchrl.objectives.LossModule` that work without the rest of cprl.
+"""Losses that TorchRL lacks: each a `torchrl.objectives.LossModule` that works without the rest of cprl.
 
 Modules, in the order in which one reads them:
-    lola            gradients and losses that look one learning step of the others ahead, of any objective
-    dice            what rollouts say of returns, differentiable any number of times
-    lola_losses     LOLALoss, LOLADiCELoss: the two put together for policies
-    iterated        the exact values of policies that remember one turn of a repeated matrix game
+    maddpg       MADDPGLoss: an actor and a centralised critic for each of several agents
+    pr2          probabilistic recursive reasoning: joint action values and the peers' expected answers
+    lola         gradients and losses that look one learning step of the others ahead, of any objective
+    dice         what rollouts say of returns, differentiable any number of times
+    lola_losses  LOLALoss, LOLADiCELoss: the two put together for policies
+    iterated     the exact values of policies that remember one turn of a repeated matrix game
 """
 
 from cprl.objectives.dice import dice_objective, loaded_dice, magic_box
 from cprl.objectives.iterated import iterated_value
 from cprl.objectives.lola import lola_gradients, look_ahead_losses, looked_ahead
 from cprl.objectives.lola_losses import LOLADiCELoss, LOLALoss
+from cprl.objectives.maddpg import MADDPGLoss
+from cprl.objectives.pr2 import PR2Loss
 
 __all__ = [
     "LOLADiCELoss",
     "LOLALoss",
+    "MADDPGLoss",
+    "PR2Loss",
     "dice_objective",
     "iterated_value",
     "loaded_dice",

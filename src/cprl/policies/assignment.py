@@ -32,7 +32,7 @@ class AgentPolicies(TensorDictModuleBase):
         decisions: what the agents decide, where a game asks them (`Game.decisions`); None in other games.
 
     Reads ("agents", "observation"), uint8 [B, N, C, X, Y], and the other entries of "agents" that an actor's
-    `in_keys` name, e.g. "stock_gauge"; writes ("agents", "action"), int64 [B, N].
+    `in_keys` name, e.g. "stock_gauge"; writes ("agents", "action"), int64 [B, N], or float32 [B, N, D].
     With decisions it also reads "ballots_due", and writes ("agents", "decision"), int64 [B, N].
 
     Raises:
@@ -94,11 +94,16 @@ class AgentPolicies(TensorDictModuleBase):
             (actor,) = self.actors
             keys.put(agents, "action", self._choose(actor, agents, None, tensordict.batch_size))
             return tensordict
-        chosen = observation.new_empty(observation.shape[: dim + 1], dtype=torch.int64)
+        chosen: Tensor | None = None
         for indices, actor in zip(self.indices, self.actors, strict=True):
             at = list(indices) if isinstance(indices, tuple) else indices
             index = (*[slice(None)] * dim, at)
-            chosen[index] = self._choose(actor, agents, index, tensordict.batch_size)
+            action = self._choose(actor, agents, index, tensordict.batch_size)
+            if chosen is None:
+                own = action.shape[dim + isinstance(indices, tuple) :]  # (D,) of continuous actions
+                kind = action.dtype if action.is_floating_point() else torch.int64
+                chosen = observation.new_empty((*observation.shape[: dim + 1], *own), dtype=kind)
+            chosen[index] = action
         agents.set("action", chosen)
         return tensordict
 

@@ -45,19 +45,20 @@ class LaneRng:
     Args:
         seeds: the seed of each lane, e.g. (seed, replica, agent, purpose).
         count: numbers per lane and step.
+        ahead: steps whose numbers are generated at once; it changes no number.
 
     Raises:
         ValueError: if a seed is no sequence of integers of at least 0.
         TooLargeError: if there is less memory than those take that are generated ahead.
     """
 
-    def __init__(self, seeds: Sequence[Sequence[int]], count: int) -> None:
+    def __init__(self, seeds: Sequence[Sequence[int]], count: int, *, ahead: int = DRAWN_AHEAD) -> None:
         own = [_seed(lane, seed) for lane, seed in enumerate(arguments.listed("seeds", seeds, _SEEDS))]
         self.lanes, self.count = len(own), arguments.integer("count", count, 1, 2**40)
-        ahead = 8 * 2 * DRAWN_AHEAD * self.lanes * self.count
+        self._ahead = arguments.integer("ahead", ahead, 1, DRAWN_AHEAD)
         check_memory(
-            f"random numbers of {self.lanes:,} lanes, {self.count:,} a step and {DRAWN_AHEAD} steps ahead,",
-            ahead,
+            f"random numbers of {self.lanes:,} lanes, {self.count:,} a step and {self._ahead} steps ahead,",
+            8 * 2 * self._ahead * self.lanes * self.count,
             "smaller batches or rollouts, fewer evaluation episodes or fewer replicas",
         )
         self._chance = [np.random.Generator(np.random.Philox(np.random.SeedSequence(seed))) for seed in own]
@@ -67,7 +68,7 @@ class LaneRng:
     def next(self) -> Tensor:
         """The numbers of the next step, float64 [L, count]."""
         if self._used == len(self._numbers):
-            ahead = [chance.random((DRAWN_AHEAD, self.count)) for chance in self._chance]
+            ahead = [chance.random((self._ahead, self.count)) for chance in self._chance]
             self._numbers, self._used = torch.from_numpy(np.stack(ahead, 1)), 0
         self._used += 1
         return self._numbers[self._used - 1]

@@ -187,8 +187,8 @@ def scripted_lanes(
     arguments.choice("policy", policy, SCRIPTED_POLICIES)
     arguments.object_of("playing", playing, (Game, Spaces), "a cprl.Game, or the Spaces of another game")
     if policy == "random":
-        actions = playing.actions if isinstance(playing, Spaces) else playing.spaces.actions
-        return random_lanes(actions, seeds=seeds, agents=agents, worlds=worlds)
+        spaces = playing if isinstance(playing, Spaces) else playing.spaces
+        return random_lanes(spaces, seeds=seeds, agents=agents, worlds=worlds)
     if isinstance(playing, Spaces):
         raise ValueError(
             f"Scripted({policy!r}) reads the window of a cprl.Game; in a game of another kind, allowed: "

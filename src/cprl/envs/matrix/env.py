@@ -1,15 +1,14 @@
 """MatrixEnv: B worlds of a matrix game as one TorchRL environment."""
 
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import torch
 from torch import Tensor
 from torchrl.data import Categorical
 
+from cprl import arguments
 from cprl.envs.joint_action_env import JointActionEnv
-
-if TYPE_CHECKING:
-    from cprl.envs.matrix.game import MatrixGame
+from cprl.envs.matrix.game import MatrixGame
 
 
 class MatrixEnv(JointActionEnv):
@@ -36,19 +35,20 @@ class MatrixEnv(JointActionEnv):
 
     def __init__(
         self,
-        game: "MatrixGame",
+        game: MatrixGame,
         worlds: int = 1,
         *,
         seed: int | None = None,
         device: str | torch.device = "cpu",
         first_world: int = 0,
     ) -> None:
+        arguments.object_of("game", game, MatrixGame, "a MatrixGame")
         agents, actions, remembered = game.agents, game.actions, game.remembered
         self._none = actions**agents
         super().__init__(
             agents=agents,
             observation_size=remembered * (self._none + 1) if remembered else 1,
-            action=Categorical(actions, shape=(worlds, agents), dtype=torch.int64),
+            action=lambda shape: Categorical(actions, shape=shape, dtype=torch.int64),
             turns=game.turns,
             continue_prob=game.continue_prob,
             worlds=worlds,
@@ -62,7 +62,7 @@ class MatrixEnv(JointActionEnv):
         """What agents are paid, [A**N, N], by the number of the joint action as agent 0 sees it."""
         self._places = _places(agents, actions).to(self.device)
         self._remembered = remembered
-        size = (worlds, agents, remembered)
+        size = (*self._agents_size, remembered)
         self.register_buffer("joint", torch.full(size, self._none, device=self.device))
 
     def checked_action(self, action: Any) -> Tensor:

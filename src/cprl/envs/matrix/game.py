@@ -1,13 +1,15 @@
 """MatrixGame: a payoff table as a value."""
 
 from dataclasses import KW_ONLY, asdict, dataclass
-from typing import Any, Final
+from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
 
 from cprl import arguments
 from cprl.checks import MOST_NUMBER, NONE, Check, check_fields, count, either, is_number, shown
-from cprl.envs.matrix.env import MatrixEnv
+
+if TYPE_CHECKING:
+    from cprl.envs.matrix.env import MatrixEnv
 
 _MOST_PAYOFFS: Final = 2**16
 
@@ -63,8 +65,10 @@ class MatrixGame:
         """Its fields."""
         return asdict(self)
 
-    def make(self, worlds: int, seed: int, device: Any, *, first_world: int = 0) -> MatrixEnv:
+    def make(self, worlds: int, seed: int, device: Any, *, first_world: int = 0) -> "MatrixEnv":
         """Its environment, so many worlds; see `MatrixEnv`."""
+        from cprl.envs.matrix.env import MatrixEnv
+
         return MatrixEnv(self, worlds, seed=seed, device=device, first_world=first_world)
 
 

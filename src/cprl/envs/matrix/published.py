@@ -24,7 +24,7 @@ def prisoners_dilemma(
 ) -> MatrixGame:
     """The prisoner's dilemma; action 0 cooperates, 1 defects.
 
-    By default the payoffs of Foerster et al. (2018), table 1. Leibo et al. (2017), table 1, have 3, 0, 4, 1.
+    By default the payoffs of Foerster et al. (2018), table 1. Leibo et al. (2017), figure 1, have 3, 0, 4, 1.
 
     Args:
         reward: of both where both cooperate.
@@ -53,7 +53,7 @@ def stag_hunt(
     memory: int | None = None,
     continue_prob: float = 1.0,
 ) -> MatrixGame:
-    """The stag hunt; action 0 hunts the stag, 1 the hare. Payoffs of Leibo et al. (2017), table 1.
+    """The stag hunt; action 0 hunts the stag, 1 the hare. Payoffs of Leibo et al. (2017), figure 1.
 
     Args:
         reward: of both where both hunt the stag.
@@ -65,7 +65,7 @@ def stag_hunt(
         continue_prob: see `MatrixGame`.
 
     Raises:
-        ValueError: unless reward > temptation >= punishment > sucker.
+        ValueError: unless reward > temptation > sucker and reward > punishment > sucker.
     """
     _check_order(reward=reward, temptation=temptation, sucker=sucker)
     _check_order(reward=reward, punishment=punishment, sucker=sucker)
@@ -83,7 +83,7 @@ def chicken(
     memory: int | None = None,
     continue_prob: float = 1.0,
 ) -> MatrixGame:
-    """Chicken; action 0 swerves, 1 goes straight on. Payoffs of Leibo et al. (2017), table 1.
+    """Chicken; action 0 swerves, 1 goes straight on. Payoffs of Leibo et al. (2017), figure 1.
 
     Args:
         reward: of both where both swerve.

@@ -60,8 +60,19 @@ def gather(fields: Fields, index: Tensor, rows: int, horizon: Horizon | None = N
     return TensorDict({**entries, **more}, [lanes, size])
 
 
+def sampled(
+    fields: Fields, index: Tensor, rows: int, horizon: Horizon | None, noise: Tensor | None
+) -> TensorDict:
+    """`gather`, with uniform numbers [L, b, ...] as the entry "noise" for losses that sample, or without."""
+    batch = gather(fields, index, rows, horizon)
+    if noise is not None:
+        batch.set("noise", noise)
+    return batch
+
+
 def _returns(fields: Fields, index: Tensor, lane: Tensor, horizon: Horizon) -> tuple[Tensor, Tensor, Tensor]:
-    """From each place: the last place of its return [L, b], the return [L, b, 1], and its steps [L, b]."""
+    """From each place: the last place of its return [L, b], the return [L, b, 1], or [L, b, S, 1] of the
+    members of a team, and its steps [L, b]."""
     places = len(fields["done"])
 
     def goes_on(place: Tensor) -> Tensor:
@@ -69,9 +80,10 @@ def _returns(fields: Fields, index: Tensor, lane: Tensor, horizon: Horizon) -> t
 
     last, steps, going = index, torch.ones_like(index), goes_on(index)
     total = fields["reward"][index, lane]
+    of_members = (...,) + (None,) * (total.ndim - index.ndim)  # a world ends for all members of a team
     for step in range(1, horizon.steps):
         place = (index + step) % places
-        total = total + going * horizon.gamma**step * fields["reward"][place, lane]
+        total = total + going[of_members] * horizon.gamma**step * fields["reward"][place, lane]
         last = torch.where(going, place, last)
         steps = steps + going
         going = going & goes_on(place)

@@ -3,7 +3,7 @@
 import logging
 from collections.abc import Mapping, Sequence
 from math import prod
-from typing import Any
+from typing import Any, Final
 
 import numpy as np
 import torch
@@ -16,7 +16,10 @@ from cprl.learners.buffer.gather import Horizon
 from cprl.learners.buffer.storage import LaneStorage, storage_bytes, torch_dtype
 from cprl.learners.transitions import LaneTurn, array_of, transitions_in, turn_of
 from cprl.memory import check_memory, free_bytes
-from cprl.policies.rng import LaneRng
+from cprl.policies.rng import DRAWN_AHEAD, LaneRng
+
+NUMBERS_AHEAD: Final = 2**14
+"""Numbers for losses that sample, which are generated at once for each lane."""
 
 
 class LaneSampler(Sampler):
@@ -67,10 +70,48 @@ class LaneSampler(Sampler):
         self.load_state_dict(torch.load(path, weights_only=True))
 
 
+class Noise:
+    """Uniform numbers in 0..1 for losses that sample: a batch of them for each update and lane.
+
+    Args:
+        seeds: the seed of each of the L lanes; a lane's numbers depend on it alone.
+        batch_size: transitions b of a lane's batch.
+        shape: of the numbers of a transition.
+        device: the device of the batches.
+    """
+
+    def __init__(
+        self,
+        seeds: Sequence[Sequence[int]],
+        batch_size: int,
+        shape: Sequence[int],
+        device: str | torch.device = "cpu",
+    ) -> None:
+        self._size, self._device = (len(seeds), batch_size, *shape), torch.device(device)
+        count = batch_size * prod(shape)
+        self.rng = LaneRng(seeds, count, ahead=min(DRAWN_AHEAD, max(1, NUMBERS_AHEAD // count)))
+
+    def next(self) -> Tensor:
+        """The numbers of the next batch, float32 [L, b, *shape]."""
+        return self.rng.next().view(self._size).to(self._device, torch.float32)
+
+
 class LaneBuffer(ReplayBuffer):
-    """TorchRL's replay buffer, which knows whether it has transforms: to ask takes it some microseconds."""
+    """TorchRL's replay buffer, which knows whether it has transforms: to ask takes it some microseconds.
+
+    Its samples have the entry "noise" if it has `noise`; transforms do not see it.
+    """
 
     has_transforms = False
+    noise: "Noise | None" = None
+
+    def sample(self, batch_size: int | None = None, return_info: bool = False) -> Any:
+        """See `ReplayBuffer`."""
+        sampled = super().sample(batch_size, return_info)
+        if self.noise is not None:
+            batch = sampled[0] if return_info else sampled
+            batch.set("noise", self.noise.next())
+        return sampled
 
     def append_transform(self, transform: Any, *, invert: bool = False) -> "LaneBuffer":
         """See `ReplayBuffer`."""
@@ -98,6 +139,10 @@ def lane_buffer(
     batch_size: int,
     observation_shape: Sequence[int],
     action_shape: Sequence[int] = (),
+    action_dtype: str = "int64",
+    reward_shape: Sequence[int] = (),
+    noise_shape: Sequence[int] = (),
+    noise_seeds: Sequence[Sequence[int]] | None = None,
     observation_dtype: str = "uint8",
     horizon: Horizon | None = None,
     device: str | torch.device = "cpu",
@@ -109,7 +154,13 @@ def lane_buffer(
         transitions: capacity per lane.
         batch_size: transitions sampled per lane.
         observation_shape: (C, X, Y); (S, C, X, Y) if a lane is a team of S agents.
-        action_shape: the shape of a lane's action: () for one agent, (S,) for a team.
+        action_shape: the shape of a lane's action: () for one agent, (S,) for a team; with D last if actions
+            are continuous.
+        action_dtype: see `Spaces.action_dtype`.
+        reward_shape: the shape of a lane's reward: (S,) for a team whose members have their own, else ().
+        noise_shape: of the uniform numbers that the loss reads with each transition: the entry "noise",
+            float32 [L, b, *noise_shape]; () for none.
+        noise_seeds: the seed of the numbers of each lane; by default `seeds`.
         observation_dtype: see `Spaces.observation_dtype`.
         horizon: steps and discount of n-step returns, sampled in place of rewards; None for single steps.
         device: the device of the storage.
@@ -120,8 +171,15 @@ def lane_buffer(
         TooLargeError: if the device has less free memory than needed; raised before anything is allocated.
     """
     dtype = torch_dtype(observation_dtype)
+    shapes: dict[str, Any] = {"action_shape": action_shape, "reward_shape": reward_shape}
+    kind = torch_dtype(action_dtype)
     needed = storage_bytes(
-        len(seeds), transitions, observation_shape, action_shape=action_shape, item_bytes=dtype.itemsize
+        len(seeds),
+        transitions,
+        observation_shape,
+        item_bytes=dtype.itemsize,
+        action_bytes=kind.itemsize,
+        **shapes,
     )
     sampled = len(seeds) * batch_size * prod(observation_shape) * 2 * (dtype.itemsize + 4)  # and as float32
     check_memory(
@@ -142,18 +200,22 @@ def lane_buffer(
         lanes=len(seeds),
         transitions=transitions,
         observation_shape=observation_shape,
-        action_shape=action_shape,
+        action_dtype=kind,
         dtype=dtype,
         horizon=horizon,
         device=device,
+        **shapes,
     )
-    return LaneBuffer(
+    buffer = LaneBuffer(
         storage=storage,
         sampler=LaneSampler(seeds, batch_size),
         writer=RoundRobinWriter(),
         batch_size=batch_size,
         collate_fn=lambda batch: batch,
     )
+    if noise_shape:
+        buffer.noise = Noise(noise_seeds or seeds, batch_size, noise_shape, device)
+    return buffer
 
 
 def transformed(batch: TensorDict, transforms: Sequence[Custom]) -> TensorDict:

@@ -145,11 +145,15 @@ def trial_batch(
     actions: int,
     *,
     action_shape: Sequence[int] = (),
+    action_dtype: str = "int64",
+    reward_shape: Sequence[int] = (),
+    noise_shape: Sequence[int] = (),
     observation_dtype: str = "uint8",
     horizon: Horizon | None = None,
     device: str | torch.device = "cpu",
 ) -> TensorDict:
-    """Synthetic transitions [lanes, 8], always the same; one in eight ends an episode."""
+    """Synthetic transitions [lanes, 8], always the same; one in eight ends an episode. For the arguments see
+    `lane_buffer`."""
     transitions = TRIAL_TRANSITIONS + (horizon.steps - 1 if horizon else 0)
     buffer = lane_buffer(
         seeds=[(lane,) for lane in range(lanes)],
@@ -157,6 +161,9 @@ def trial_batch(
         batch_size=8,
         observation_shape=observation_shape,
         action_shape=action_shape,
+        action_dtype=action_dtype,
+        reward_shape=reward_shape,
+        noise_shape=noise_shape,
         observation_dtype=observation_dtype,
         horizon=horizon,
         device=device,
@@ -166,9 +173,13 @@ def trial_batch(
         seen = torch.randint(256, (2, lanes, *observation_shape), generator=chance).to(torch.uint8)
         if observation_dtype != "uint8":
             seen = (seen > 127).to(torch_dtype(observation_dtype))
-        action = torch.randint(actions, (lanes, *action_shape), generator=chance)
+        if action_dtype == "int64":
+            action = torch.randint(actions, (lanes, *action_shape), generator=chance)
+        else:
+            action = torch.rand((lanes, *action_shape), generator=chance)
         ends = torch.full((lanes,), step % 8 == 7)
-        turn = seen[0], action, seen[1], torch.rand(lanes, generator=chance), ends, ends
+        reward = torch.rand((lanes, *reward_shape), generator=chance)
+        turn = seen[0], action, seen[1], reward, ends, ends
         buffer.storage.write(LaneTurn(*(array_of(entry.to(device)) for entry in turn)))
     batch: TensorDict = buffer.sample()
     return batch

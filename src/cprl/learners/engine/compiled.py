@@ -10,7 +10,7 @@ from tensordict import TensorDict
 from torch import Tensor, nn
 
 from cprl.compiling import Compiled
-from cprl.learners.buffer.gather import FIELDS, Horizon, gather
+from cprl.learners.buffer.gather import FIELDS, Horizon, sampled
 from cprl.learners.buffer.sampler import LaneBuffer
 from cprl.learners.buffer.storage import LaneStorage
 from cprl.learners.engine.functional import FunctionalLoss, MakeLoss, Weights, stacked, vmapped
@@ -99,10 +99,11 @@ class FunctionalEngine:
         storage: LaneStorage = buffer.storage
         index = buffer.sampler.draw(storage)
         self.steps += 1
+        noise = None if buffer.noise is None else buffer.noise.next()
         if not self._is_warm:
-            self._warm_up(gather(storage.fields, index, storage.rows, storage.horizon))
-        fields, form = [*storage.fields.values()], _form(storage, index)
-        arguments = fields, storage.rows, storage.horizon, index, *self._adam_scalars(), self._tensors
+            self._warm_up(sampled(storage.fields, index, storage.rows, storage.horizon, noise))
+        fields, form = [*storage.fields.values()], _form(storage, index, noise)
+        arguments = fields, storage.rows, storage.horizon, index, *self._adam_scalars(), self._tensors, noise
         losses: Tensor = self._compiled(form, self, *arguments)
         return losses
 
@@ -140,10 +141,11 @@ class FunctionalEngine:
         step_size: Tensor,
         scale: Tensor,
         tensors: list[list[Tensor]],
+        noise: Tensor | None,
     ) -> Tensor:
         """One step. Tensors are passed in lists: the guards of compiled code find a dict's entry by counting
         through its keys, which takes longer than all computation of one lane."""
-        batch = gather(dict(zip(FIELDS, fields, strict=True)), index, rows, horizon)
+        batch = sampled(dict(zip(FIELDS, fields, strict=True)), index, rows, horizon, noise)
         return self._change(batch, step_size, scale, tensors)
 
     def _step_on(
@@ -290,11 +292,7 @@ def _source(name: str) -> str:
     return name.removeprefix("target_")
 
 
-def _form(storage: LaneStorage, index: Tensor) -> tuple[object, ...]:
+def _form(storage: LaneStorage, index: Tensor, noise: Tensor | None) -> tuple[object, ...]:
     """The shapes and dtypes for which a step is compiled; the engine's own tensors never change theirs."""
-    return (
-        storage.rows,
-        storage.horizon,
-        index.shape,
-        *((field.shape, field.dtype) for field in storage.fields.values()),
-    )
+    sizes = storage.rows, storage.horizon, index.shape, None if noise is None else noise.shape
+    return (*sizes, *((field.shape, field.dtype) for field in storage.fields.values()))

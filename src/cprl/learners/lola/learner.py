@@ -11,7 +11,7 @@ from torchrl.objectives import LossModule
 from torchrl.objectives.value.functional import generalized_advantage_estimate
 
 from cprl.learners.buffer.storage import torch_dtype
-from cprl.learners.checks import check_learner, check_rollouts
+from cprl.learners.checks import check_learner, check_rollouts, refuse_continuous
 from cprl.learners.lanes import WEIGHTS, Lanes, StartFrom
 from cprl.learners.lola.networks import LOLANetworks
 from cprl.learners.lola.settings import LOLASettings
@@ -73,6 +73,7 @@ class LOLALearner:
         device: str | torch.device = "cpu",
     ) -> None:
         check_learner(spaces, settings, LOLASettings, agents, replicas, first_replica, seed, reward_kind)
+        refuse_continuous("LOLA", spaces)
         self.spaces, self.settings, self.agents = spaces, settings, tuple(agents)
         self.replicas, self.seed, self.wants = replicas, seed, WantedRewards(reward_kind)
         self._lanes = Lanes(

@@ -16,13 +16,13 @@ from torchrl.objectives.utils import TargetNetUpdater
 from cprl.custom import made
 from cprl.envs.drivers import device_of
 from cprl.learners.buffer.gather import Horizon
-from cprl.learners.buffer.sampler import transformed
+from cprl.learners.buffer.sampler import Noise, transformed
 from cprl.learners.buffer.storage import torch_dtype
-from cprl.learners.checks import check_learner
+from cprl.learners.checks import check_learner, refuse_continuous
 from cprl.learners.engine.choice import trial_batch
 from cprl.learners.engine.functional import MakeLoss, targets_of
 from cprl.learners.engine.refusals import refuse_for_replay
-from cprl.learners.lanes import TARGET_WEIGHTS, Lanes, StartFrom
+from cprl.learners.lanes import NOISE, TARGET_WEIGHTS, Lanes, StartFrom
 from cprl.learners.settings import DQNSettings
 from cprl.learners.torchrl.agents import MakeSampler, StockAgents, check_makers, sampler_of
 from cprl.learners.torchrl.buffers import buffer_state, load_buffer, nested, plain
@@ -33,8 +33,8 @@ from cprl.preferences.values import Preference
 from cprl.preferences.wanted import WantedRewards
 from cprl.spaces import Spaces
 
-BYTES_BESIDE: Final = 8 + 4 + 1 + 1
-"""Bytes of a transition without its observations: action, reward, done, terminated."""
+BYTES_BESIDE: Final = 4 + 1 + 1
+"""Bytes of a transition without its observations and actions: reward, done, terminated."""
 
 
 class TorchRLReplayLearner:
@@ -59,8 +59,11 @@ class TorchRLReplayLearner:
         stochastic: whether networks output the logits of a policy; else action values.
         reward_kind: what they want, see `cprl.preferences`.
         make_sampler: makes an agent's sampler; by default a `RandomSampler`.
+        noise_numbers: see `ReplayLearner`.
         start_from: the weights with which acting networks, and their targets, start, by the lane's name; the
             others, such as critics, are new.
+        sees_peers: whether transitions have the actions of all agents, see `transitions.joint_actions`.
+        action_noise: see `ReplayLearner`.
         device: the torch device of networks, buffers and updates.
 
     Raises:
@@ -84,10 +87,15 @@ class TorchRLReplayLearner:
         stochastic: bool = False,
         reward_kind: Preference = "individual",
         make_sampler: MakeSampler | None = None,
+        noise_numbers: int = 0,
         start_from: StartFrom | None = None,
+        sees_peers: bool = False,
+        action_noise: float = 0.0,
         device: str | torch.device = "cpu",
     ) -> None:
         check_learner(spaces, settings, DQNSettings, agents, replicas, first_replica, seed, reward_kind)
+        if settings.mean_over_all_outputs:
+            refuse_continuous("settings.mean_over_all_outputs", spaces)
         check_makers(make_network, make_loss, make_sampler)
         device = device_of(device)
         self.spaces, self.settings, self.agents = spaces, settings, tuple(agents)
@@ -102,8 +110,10 @@ class TorchRLReplayLearner:
             make_network=make_network,
             stochastic=stochastic,
             start_from=start_from,
+            sees_peers=sees_peers,
+            action_noise=action_noise,
         )
-        self._refuse_unfit(make_loss, device)
+        self._refuse_unfit(make_loss, device, noise_numbers)
         self.stock = StockAgents(
             self._lanes,
             make_loss,
@@ -117,21 +127,26 @@ class TorchRLReplayLearner:
         self.updaters = [_target_updater(agent.loss, settings) for agent in self.stock.each]
         if settings.own_target_weights:
             self._init_targets(make_loss)
-        _check_memory(len(self._lanes), spaces, settings, self.stock.device)
+        _check_memory(self._lanes, settings, self.stock.device)
         self._make_buffers()
+        of_batch = settings.batch_size, (noise_numbers,), self.stock.device
+        self._noise = [Noise([own], *of_batch) for own in self._lanes.seeds(NOISE) if noise_numbers]
         self.actor = self._lanes.actor(self.stock, compile=False)
         self.steps = 0
         self.actor.epsilon = settings.epsilon(0)
 
-    def _refuse_unfit(self, make_loss: MakeLoss, device: str | torch.device) -> None:
+    def _refuse_unfit(self, make_loss: MakeLoss, device: str | torch.device, noise_numbers: int) -> None:
         """The checks of the fast engine, on a loss of its own and synthetic transitions of one agent."""
         settings = self.settings
         trial = trial_batch(
             1,
             self._lanes.observation_shape,
             self.spaces.actions,
+            action_shape=self._lanes.action_shape,
+            action_dtype=self.spaces.action_dtype,
             observation_dtype=self.spaces.observation_dtype,
             horizon=Horizon(settings.n_steps, settings.gamma) if settings.n_steps > 1 else None,
+            noise_shape=(noise_numbers,) if noise_numbers else (),
             device=device,
         )
         with torch.random.fork_rng(devices=[]):
@@ -198,7 +213,10 @@ class TorchRLReplayLearner:
     def _update(self, lane: int) -> Tensor:
         losses = []
         for _ in range(self.settings.updates_per_step):
-            losses.append(self.stock.each[lane].update(self.buffers[lane].sample()))
+            batch = self.buffers[lane].sample()
+            if self._noise:
+                batch.set("noise", self._noise[lane].next()[0])
+            losses.append(self.stock.each[lane].update(batch))
             updater = self.updaters[lane]
             if isinstance(updater, SoftUpdate):
                 updater.step()
@@ -235,6 +253,7 @@ class TorchRLReplayLearner:
             "updaters": [updater.state_dict() if updater else {} for updater in self.updaters],
             "buffers": [buffer_state(*own) for own in zip(self.buffers, self._generators, strict=True)],
             "last": [plain(turn) for turn in self._last],
+            "noise": [own.rng.state_dict() for own in self._noise],
             "exploration": self.actor.rng.state_dict(),
             "steps": self.steps,
             "wants": self.wants.state_dict(),
@@ -253,6 +272,8 @@ class TorchRLReplayLearner:
             for turn in self._last:
                 buffer.transform.inv(turn[lane : lane + 1].clone())
             load_buffer(buffer, self._generators[lane], state["buffers"][lane])
+        for noise, own in zip(self._noise, state.get("noise", ()), strict=True):
+            noise.rng.load_state_dict(own)
         self.actor.rng.load_state_dict(state["exploration"])
         self.steps = int(state["steps"])
         self.wants.load_state_dict(state.get("wants", {}))
@@ -275,14 +296,16 @@ def _check(settings: DQNSettings, loss: LossModule) -> None:
             raise ValueError(f"{name} is {getattr(settings, name)}, and the loss has no targets")
 
 
-def _check_memory(lanes: int, spaces: Spaces, settings: DQNSettings, device: torch.device) -> None:
+def _check_memory(lanes: Lanes, settings: DQNSettings, device: torch.device) -> None:
     """Checks memory in advance: stock storage holds the observations before and after each transition, and
     its pages are only committed as they fill, so a machine with too little would fail hours later."""
+    spaces = lanes.spaces
     observation = prod(spaces.observation_shape) * torch_dtype(spaces.observation_dtype).itemsize
-    wanted = lanes * settings.buffer_size * (2 * observation + BYTES_BESIDE)
+    beside = 8 * prod(lanes.action_shape) + BYTES_BESIDE
+    wanted = len(lanes) * settings.buffer_size * (2 * observation + beside)
     wanted += settings.batch_size * 2 * (observation + 4 * prod(spaces.observation_shape))
     check_memory(
-        f"the replay buffers of {lanes} agents x {settings.buffer_size:,} transitions",
+        f"the replay buffers of {len(lanes)} agents x {settings.buffer_size:,} transitions",
         wanted,
         'a smaller buffer_size or batch_size, fewer replicas, or engine="compiled", which needs half',
         device=device,

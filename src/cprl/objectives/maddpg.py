@@ -1,0 +1,271 @@
+"""MADDPGLoss: actors with centralised critics, for discrete actions."""
+
+from dataclasses import dataclass
+from typing import Any, Final, Literal, TypeAlias, get_args
+
+import torch
+from tensordict import TensorDict, TensorDictBase, TensorDictParams
+from tensordict.nn import TensorDictModule, dispatch
+from tensordict.utils import NestedKey, unravel_key
+from torch import Tensor
+from torchrl.objectives import LossModule, ValueEstimators
+from torchrl.objectives.utils import dispatch_value_estimator, distance_loss
+
+from cprl.checks import checked, number, one_of
+
+ActionSpace: TypeAlias = Literal["categorical", "one-hot"]
+
+NUMBERS: Final = 2
+"""Uniform numbers that the loss takes for each transition and member: one samples the member's next action
+from its target policy, the other its action for the actor's loss."""
+
+
+class MADDPGLoss(LossModule):
+    """MADDPG for discrete actions: S agents, the members, each with a policy of its own observations and a
+    critic that also sees the observations and actions of all others; each learns from its own reward.
+
+    The critic of member i learns r_i + gamma Q'_i(o', a'_1 .. a'_S) by its squared error, where Q' is its
+    target and every a'_j, its own too, is sampled from the target policy of member j. The actor of member i
+    maximises Q_i(o, a_1 .. a_S), where a_i is sampled from its current policy and the others' actions are
+    those of the batch. Samples are one-hot; gradients pass through them as if they were the probabilities
+    (straight-through: one_hot + probs - probs.detach()), which is exact if Q_i is linear in a_i. TorchRL's
+    `OneHotCategorical(grad_method=ReparamGradientStrategy.PassThrough)` does the same.
+
+    Source: Lowe et al., "Multi-Agent Actor-Critic for Mixed Cooperative-Competitive Environments" (2017).
+
+    Args:
+        actor_network: writes "logits", float [.., S, A], of member i from what member i observes. It reads
+            entries that the batch has at its root and under "next".
+        critic_network: writes "state_action_value", float [.., S, 1], from such entries and "joint_action",
+            float one-hot [.., S, S, A]: row i holds the actions of all members by which the critic of member
+            i judges.
+        loss_function: of the critics' errors: "l2", "smooth_l1" or "l1".
+        logit_penalty: the weight of the mean squared logit of each member in the actors' loss, 0 or more;
+            1e-3 in the published program.
+        action_space: "categorical" for actions int64 [.., S], "one-hot" for actions [.., S, A].
+        reduction: "mean" or "sum" over transitions, or "none" for losses [..].
+
+    Call `make_value_estimator(ValueEstimators.TD0, gamma=0.95)` for the discount, 0.99 by default; it is
+    raised to "steps_to_next_obs" where the batch has that entry. Targets are moved by TorchRL's `SoftUpdate`
+    or `HardUpdate`.
+
+    `forward` reads the entries of the networks, "action", and under "next" "reward" float [.., S, 1], and
+    "done" and "terminated" bool [.., 1] or [.., S, 1]; other names are set by `set_keys`. "noise", float
+    [.., S, 2] of uniform numbers in 0..1, decides what is sampled; without it they come from torch's global
+    generator. It writes nothing into the batch, and returns, summed over members and then reduced,
+    "loss_actor" and "loss_value", and without gradients "entropy", in nats, "pred_value", "target_value" and
+    "td_error", float [.., S, 1], squared.
+
+    Raises:
+        ValueError: if an argument is not allowed; names it and says what is.
+    """
+
+    @dataclass
+    class _AcceptedKeys:
+        action: NestedKey = "action"
+        logits: NestedKey = "logits"
+        joint_action: NestedKey = "joint_action"
+        state_action_value: NestedKey = "state_action_value"
+        reward: NestedKey = "reward"
+        done: NestedKey = "done"
+        terminated: NestedKey = "terminated"
+        steps_to_next_obs: NestedKey = "steps_to_next_obs"
+        noise: NestedKey = "noise"
+
+    default_keys = _AcceptedKeys
+    default_value_estimator = ValueEstimators.TD0
+    out_keys = ("loss_actor", "loss_value", "entropy", "pred_value", "target_value", "td_error")
+
+    actor_network: TensorDictModule
+    actor_network_params: TensorDictParams
+    target_actor_network_params: TensorDictParams
+    critic_network: TensorDictModule
+    critic_network_params: TensorDictParams
+    target_critic_network_params: TensorDictParams
+
+    def __init__(
+        self,
+        actor_network: TensorDictModule,
+        critic_network: TensorDictModule,
+        *,
+        loss_function: str = "l2",
+        logit_penalty: float = 1e-3,
+        action_space: ActionSpace = "categorical",
+        reduction: str = "mean",
+    ) -> None:
+        checked("loss_function", loss_function, one_of("l1", "l2", "smooth_l1"))
+        checked("logit_penalty", logit_penalty, number(0, 1e6))
+        checked("action_space", action_space, one_of(*get_args(ActionSpace)))
+        checked("reduction", reduction, one_of("mean", "sum", "none"))
+        super().__init__()
+        self._in_keys: list[NestedKey] | None = None
+        self.convert_to_functional(actor_network, "actor_network", create_target_params=True)
+        self.convert_to_functional(
+            critic_network,
+            "critic_network",
+            create_target_params=True,
+            compare_against=list(actor_network.parameters()),
+        )
+        self.loss_function, self.logit_penalty = loss_function, logit_penalty
+        self.action_space, self.reduction = action_space, reduction
+
+    @property
+    def in_keys(self) -> list[NestedKey]:
+        """What `forward` must find in a batch."""
+        if self._in_keys is None:
+            keys = self.tensor_keys
+            seen = {*self.actor_network.in_keys, *self.critic_network.in_keys} - {keys.joint_action}
+            after = {keys.reward, keys.done, keys.terminated, *seen}
+            every = {keys.action, *seen, *(("next", key) for key in after)}
+            self._in_keys = sorted(map(unravel_key, every), key=str)
+        return self._in_keys
+
+    @in_keys.setter
+    def in_keys(self, keys: list[NestedKey]) -> None:
+        self._in_keys = keys
+
+    def _forward_value_estimator_keys(self, **_: Any) -> None:
+        if self._value_estimator is not None:
+            self._value_estimator.set_keys(**self._estimator_keys())
+        self._in_keys = None
+
+    def _estimator_keys(self) -> dict[str, NestedKey]:
+        keys = self.tensor_keys
+        names = ("reward", "done", "terminated", "steps_to_next_obs")
+        return {"value": keys.state_action_value, **{name: getattr(keys, name) for name in names}}
+
+    def make_value_estimator(self, value_type: Any = None, **hyperparams: Any) -> "MADDPGLoss":
+        """Chooses how targets bootstrap: `ValueEstimators.TD0` with `gamma`; see `LossModule`."""
+        value_type, given = self._prepare_value_estimator_kwargs(value_type, **hyperparams)
+        if value_type is not None:
+            dispatch_value_estimator(
+                self,
+                value_type,
+                supported=(ValueEstimators.TD0,),
+                tensor_keys=self._estimator_keys(),
+                value_network=None,
+                **given,
+            )
+        return self
+
+    @dispatch
+    def forward(self, tensordict: TensorDictBase) -> TensorDict:
+        """The losses of a batch of transitions."""
+        logits = self._logits(tensordict, self.actor_network_params)
+        taken = self._one_hot(tensordict.get(self.tensor_keys.action), logits)
+        next_noise, noise = self._noise(tensordict, logits).unbind(-1)
+        target = self._target_value(tensordict, next_noise)
+        value = self._values(
+            tensordict, taken.unsqueeze(-3).expand(*_joint(taken)), self.critic_network_params
+        )
+        errors = distance_loss(value, target, self.loss_function)
+        actor_losses = self._actor_losses(tensordict, logits, taken, noise)
+        with torch.no_grad():
+            entropy = -(logits.softmax(-1) * logits.log_softmax(-1)).sum((-2, -1))
+            known = {"pred_value": value.detach(), "target_value": target}
+            known["td_error"] = (value - target).square()
+        parts = {"loss_actor": actor_losses.sum(-1), "loss_value": errors.sum((-2, -1)), "entropy": entropy}
+        reduced = {name: self._reduce_loss(part, tensordict=tensordict) for name, part in parts.items()}
+        return TensorDict({**reduced, **known})
+
+    def _actor_losses(
+        self, tensordict: TensorDictBase, logits: Tensor, taken: Tensor, noise: Tensor
+    ) -> Tensor:
+        """Of each member, [.., S]: in row i of the joint actions member i takes an action of its current
+        policy, the others those of the batch."""
+        own = torch.eye(taken.shape[-2], dtype=taken.dtype, device=taken.device).unsqueeze(-1)
+        sampled = straight_through(logits, noise)
+        joint = own * sampled.unsqueeze(-3) + (1 - own) * taken.unsqueeze(-3)
+        values = self._values(tensordict, joint, self.critic_network_params.detach())
+        return self.logit_penalty * logits.square().mean(-1) - values.squeeze(-1)
+
+    def _target_value(self, tensordict: TensorDictBase, noise: Tensor) -> Tensor:
+        """What the critics learn, float [.., S, 1]."""
+        keys, after = self.tensor_keys, tensordict.get("next")
+        reward = after.get(keys.reward)
+        with torch.no_grad():
+            logits = self._logits(after, self.target_actor_network_params)
+            actions = sampled_one_hot(logits.softmax(-1), noise)
+            joint = actions.unsqueeze(-3).expand(*_joint(actions))
+            value = self._values(after, joint, self.target_critic_network_params)
+            entries = {
+                ("next", keys.reward): reward,
+                ("next", keys.done): _as(after.get(keys.done), reward),
+                ("next", keys.terminated): _as(after.get(keys.terminated), reward),
+            }
+            steps = tensordict.get(keys.steps_to_next_obs, None)
+            if steps is not None:
+                entries[keys.steps_to_next_obs] = _as(steps, reward)
+            transitions = TensorDict({}, tensordict.batch_size)
+            for name, entry in entries.items():
+                transitions.set(unravel_key(name), entry)
+            target: Tensor = self.value_estimator.value_estimate(transitions, next_value=value)
+        return target
+
+    def _logits(self, tensordict: TensorDictBase, weights: TensorDictBase) -> Tensor:
+        """Of the policy of each member, [.., S, A]."""
+        seen = tensordict.select(*self.actor_network.in_keys)
+        with weights.to_module(self.actor_network, preserve_module_state=False):
+            logits: Tensor = self.actor_network(seen).get(self.tensor_keys.logits)
+        return logits
+
+    def _values(self, tensordict: TensorDictBase, joint: Tensor, weights: TensorDictBase) -> Tensor:
+        """Of joint actions [.., S, S, A] by the critic of each member, [.., S, 1]."""
+        key = self.tensor_keys.joint_action
+        seen = tensordict.select(*(own for own in self.critic_network.in_keys if own != key))
+        seen.set(key, joint)
+        with weights.to_module(self.critic_network, preserve_module_state=False):
+            values: Tensor = self.critic_network(seen).get(self.tensor_keys.state_action_value)
+        return values
+
+    def _one_hot(self, action: Tensor, logits: Tensor) -> Tensor:
+        """Actions as one-hot, float [.., S, A]."""
+        if self.action_space == "one-hot":
+            return action.to(logits.dtype)
+        return _one_hot(action, logits)
+
+    def _noise(self, tensordict: TensorDictBase, logits: Tensor) -> Tensor:
+        """Uniform numbers, float [.., S, 2]: those of the batch, or new ones."""
+        noise: Tensor | None = tensordict.get(self.tensor_keys.noise, None)
+        if noise is None:
+            noise = torch.rand(*logits.shape[:-1], NUMBERS, dtype=logits.dtype, device=logits.device)
+        return noise
+
+
+def straight_through(logits: Tensor, noise: Tensor) -> Tensor:
+    """One-hot samples of a policy, [.., A], with the gradient of its probabilities.
+
+    Args:
+        logits: of the policy, float [.., A].
+        noise: uniform numbers in 0..1, [..].
+    """
+    probs = logits.softmax(-1)
+    return sampled_one_hot(probs.detach(), noise) + probs - probs.detach()
+
+
+def sampled_one_hot(probs: Tensor, noise: Tensor) -> Tensor:
+    """One-hot samples [.., A] by inverting the cumulative distribution at uniform numbers.
+
+    Args:
+        probs: float [.., A].
+        noise: uniform numbers in 0..1, [..].
+    """
+    below = noise.unsqueeze(-1) >= probs.cumsum(-1)[..., :-1]
+    return _one_hot(below.sum(-1), probs)
+
+
+def _one_hot(action: Tensor, like: Tensor) -> Tensor:
+    """Actions int64 [..] as one-hot in the type of a tensor [.., A]; unlike torch's, it can be vmapped and
+    compiled."""
+    return (action.unsqueeze(-1) == torch.arange(like.shape[-1], device=like.device)).to(like.dtype)
+
+
+def _joint(actions: Tensor) -> tuple[int, ...]:
+    """The shape of joint actions, [.., S, S, A], of actions [.., S, A]."""
+    members = actions.shape[-2]
+    return *actions.shape[:-2], members, members, actions.shape[-1]
+
+
+def _as(flag: Tensor, reward: Tensor) -> Tensor:
+    """An entry [.., 1] of a world, or [.., S, 1] of members, for each member."""
+    return (flag if flag.ndim == reward.ndim else flag.unsqueeze(-2)).expand_as(reward)

@@ -1,0 +1,172 @@
+"""PR2Loss: probabilistic recursive reasoning for discrete actions, an agent's values of joint actions."""
+
+from dataclasses import dataclass
+from math import log
+from typing import Any, Final
+
+import torch
+from tensordict import TensorDict, TensorDictBase
+from tensordict.nn import TensorDictModule, TensorDictParams
+from tensordict.utils import NestedKey
+from torch import Tensor, nn
+from torchrl.objectives import LossModule, ValueEstimators
+from torchrl.objectives.utils import dispatch_value_estimator, distance_loss
+
+from cprl.arguments import choice, number, object_of, switch
+from cprl.networks.joint import chosen, marginal, soft_value
+
+_VALUES: Final = "joint_action_value"
+_LOWEST_TEMPERATURE: Final = 1e-6
+
+
+class PR2Loss(LossModule):
+    """The loss of PR2-Q: an agent expects its peers to answer each of its actions, and learns what that pays.
+
+    The network values joint actions by pairs, q_j(s, a, b): the agent's own action and that of peer j; the
+    value of a joint action is their sum. With temperature T the peers' expected answer is
+    rho(b | s, a) ~ exp(q_j(s, a, b) / T), the value of an own action Q(s, a) = T log sum exp(Q(s, a, others)
+    / T) over the others' joint actions, and the policy pi(a | s) ~ exp(Q(s, a) / T); see
+    `cprl.networks.joint`. The loss is the squared difference between the value of the joint action taken and
+    r + gamma V(s'), where V is the soft value of the target network, T log sum exp(Q(s', a) / T).
+
+    The model of the peers is optimistic: they are expected to do what the agent values, whatever they value.
+    In the game of payoffs [[0, 3], [1, 2]] against [[3, 2], [0, 1]], at T = 1, the agent of the rows plays
+    (0.676, 0.324), not the equilibrium (0.5, 0.5).
+
+    Source: Wen, Yang, Luo, Wang and Pan, "Probabilistic Recursive Reasoning for Multi-Agent Reinforcement
+    Learning" (ICLR 2019), algorithm PR2-Q; departures are numbered in docs/algorithms.md.
+
+    Args:
+        value_network: maps observations to the values of pairs, float [..., N - 1, A, A]: a
+            `TensorDictModule` that writes "joint_action_value", or a module that reads "observation".
+        temperature: T, in units of reward, above 0.
+        entropy_bonus: whether soft values contain T times the entropy of the joint action, as in the paper:
+            up to T log A for each agent and step, which pays them for living on. Else the sums are means, by
+            which uniform play is worth what it is paid: lower by N T log A.
+        loss_function: of the temporal-difference error: "l2", "smooth_l1" (Huber) or "l1".
+        delay_value: whether soft values come from a target network.
+        reduction: "none" (one loss per transition), "mean" or "sum".
+
+    Reads the observation, "action" int64 [..., N], the agent's own first, and under "next" the observation,
+    "reward" [..., 1], "done" and "terminated"; writes "td_error", the squared error [..., 1].
+
+    Raises:
+        ValueError: if an argument is not allowed; names it and says what is.
+    """
+
+    @dataclass
+    class _AcceptedKeys:
+        """The entries by the names that `set_keys` takes."""
+
+        joint_action_value: NestedKey = _VALUES
+        action: NestedKey = "action"
+        value: NestedKey = "state_value"
+        value_target: NestedKey = "value_target"
+        reward: NestedKey = "reward"
+        done: NestedKey = "done"
+        terminated: NestedKey = "terminated"
+        priority: NestedKey = "td_error"
+
+    tensor_keys: _AcceptedKeys
+    default_keys = _AcceptedKeys
+    default_value_estimator = ValueEstimators.TD0
+    out_keys = ["loss"]  # noqa: RUF012
+
+    value_network: TensorDictModule
+    value_network_params: TensorDictParams
+    target_value_network_params: TensorDictParams
+
+    def __init__(
+        self,
+        value_network: TensorDictModule | nn.Module,
+        *,
+        temperature: float,
+        entropy_bonus: bool = True,
+        loss_function: str = "l2",
+        delay_value: bool = True,
+        reduction: str = "mean",
+    ) -> None:
+        super().__init__()
+        self._in_keys: list[NestedKey] | None = None
+        object_of("value_network", value_network, nn.Module, "a TensorDictModule or a torch.nn.Module")
+        switch("entropy_bonus", entropy_bonus)
+        switch("delay_value", delay_value)
+        choice("loss_function", loss_function, ("l1", "l2", "smooth_l1"))
+        choice("reduction", reduction, ("none", "mean", "sum"))
+        self.temperature = number(
+            "temperature", temperature, low=_LOWEST_TEMPERATURE, high=1e6, allowed="1e-6..1e6"
+        )
+        self.entropy_bonus, self.loss_function, self.reduction = entropy_bonus, loss_function, reduction
+        self.delay_value = delay_value
+        if not isinstance(value_network, TensorDictModule):
+            value_network = TensorDictModule(value_network, ["observation"], [_VALUES])
+        self.convert_to_functional(value_network, "value_network", create_target_params=delay_value)
+
+    @property
+    def in_keys(self) -> list[NestedKey]:
+        """The entries that the loss reads."""
+        if self._in_keys is None:
+            keys = self.tensor_keys
+            own = list(self.value_network.in_keys)
+            after = [*own, keys.reward, keys.done, keys.terminated]
+            self._in_keys = [keys.action, *own, *(("next", *_path(key)) for key in after)]
+        return self._in_keys
+
+    def _forward_value_estimator_keys(self, **kwargs: Any) -> None:
+        self._in_keys = None
+        if self._value_estimator is not None:
+            self._value_estimator.set_keys(**self._estimator_keys())
+
+    def _estimator_keys(self) -> dict[str, NestedKey]:
+        keys = self.tensor_keys
+        names = "value", "value_target", "reward", "done", "terminated"
+        return {name: getattr(keys, name) for name in names}
+
+    def make_value_estimator(self, value_type: Any = None, **hyperparams: Any) -> "PR2Loss":
+        """Sets the discount, e.g. `make_value_estimator(ValueEstimators.TD0, gamma=0.99)`.
+
+        Raises:
+            NotImplementedError: for another estimator than TD0.
+        """
+        dispatch_value_estimator(
+            self,
+            self.default_value_estimator if value_type is None else value_type,
+            supported=(ValueEstimators.TD0,),
+            tensor_keys=self._estimator_keys(),
+            value_network=None,
+            **hyperparams,
+        )
+        return self
+
+    def forward(self, tensordict: TensorDictBase) -> TensorDict:
+        """The loss of a batch, under "loss"."""
+        keys = self.tensor_keys
+        value = chosen(self._joint(tensordict, self.value_network_params), tensordict.get(keys.action))
+        target = self._target(tensordict)
+        tensordict.set(keys.priority, (value.detach() - target).square().unsqueeze(-1))
+        loss = distance_loss(value, target, self.loss_function)
+        return TensorDict({"loss": self._reduce_loss(loss, tensordict=tensordict)})
+
+    def _target(self, tensordict: TensorDictBase) -> Tensor:
+        """r + gamma V(s'), float [...]."""
+        with torch.no_grad():
+            joint = self._joint(tensordict.get("next"), self.target_value_network_params)
+            following = soft_value(marginal(joint, self.temperature), self.temperature)
+            if not self.entropy_bonus:
+                agents, actions = joint.shape[-3] + 1, joint.shape[-1]
+                following = following - self.temperature * agents * log(actions)
+            estimated: Tensor = self.value_estimator.value_estimate(
+                tensordict, next_value=following.unsqueeze(-1)
+            )
+        return estimated.squeeze(-1)
+
+    def _joint(self, moment: TensorDictBase, weights: TensorDictBase) -> Tensor:
+        """The values of pairs, [..., N - 1, A, A]."""
+        seen = moment.select(*self.value_network.in_keys)
+        with weights.to_module(self.value_network, preserve_module_state=False):
+            values: Tensor = self.value_network(seen).get(self.tensor_keys.joint_action_value)
+        return values
+
+
+def _path(key: NestedKey) -> tuple[str, ...]:
+    return key if isinstance(key, tuple) else (key,)

@@ -1,0 +1,416 @@
+"""MADDPG: critics that see the whole team, rewards of one's own, one-hot actions with straight-through gradients."""
+
+from dataclasses import dataclass, replace
+from typing import ClassVar
+
+import pytest
+import torch
+from tensordict import TensorDict
+from tensordict.nn import TensorDictModule
+from test_population import GAME, REPLAY, assert_goes_on_bit_for_bit, population, ran, trained, weights
+from test_teams import first_turn
+from torch import nn
+from torchrl.data import LazyTensorStorage, TensorDictReplayBuffer
+from torchrl.objectives import DQNLoss, SoftUpdate, ValueEstimators
+
+import cprl
+from cprl import CommonsEnv
+from cprl.algorithms import DQN, MADDPG
+from cprl.algorithms.dqn import q_actor
+from cprl.evaluation import evaluate_run
+from cprl.learners.buffer.gather import Horizon
+from cprl.learners.buffer.sampler import lane_buffer
+from cprl.learners.transitions import LaneTurn
+from cprl.networks import MLP
+from cprl.objectives import MADDPGLoss
+from cprl.objectives.maddpg import sampled_one_hot, straight_through
+from cprl.population import Frozen, Learning, Scripted, Team
+
+pytestmark = pytest.mark.filterwarnings("ignore:No target network updater:UserWarning")
+TEAM = MADDPG(settings=REPLAY)
+FOUR = tuple(range(4))
+
+
+class Linear(nn.Module):
+    """A linear map for each member, without a bias: [.., S, in] to [.., S, out]."""
+
+    def __init__(self, *weight):
+        super().__init__()
+        self.weight = nn.Parameter(torch.tensor(weight))
+
+    def forward(self, values):
+        return torch.einsum("...si,sio->...so", values, self.weight)
+
+
+class LinearCritics(Linear):
+    """Of the actions of all members alone: [.., S, S, A] to [.., S, 1]."""
+
+    def forward(self, joint_action):
+        return super().forward(joint_action.flatten(-2))
+
+
+def loss_of(actors, critics, *, sees=("joint_action",), gamma=0.5, **how):
+    actor = TensorDictModule(actors, ["observation"], ["logits"])
+    critic = TensorDictModule(critics, list(sees), ["state_action_value"])
+    loss = MADDPGLoss(actor, critic, logit_penalty=how.pop("logit_penalty", 0.0), **how)
+    return loss.make_value_estimator(ValueEstimators.TD0, gamma=gamma)
+
+
+# Member 0 takes action 1 where it sees 1, else action 0 where it sees -1; member 1 the other way round.
+SURE = [[[-50.0, 50.0]], [[50.0, -50.0]]]
+# The critic of member 0 values its own actions at 1 and 2, the other's at 3 and 4; that of member 1 values the
+# actions of member 0 at 10 and 20, its own at 30 and 40.
+VALUES = [[[1.0], [2.0], [3.0], [4.0]], [[10.0], [20.0], [30.0], [40.0]]]
+
+
+def two_transitions(**entries):
+    after = {
+        "observation": torch.tensor([[[1.0], [1.0]], [[1.0], [-1.0]]]),
+        "reward": torch.tensor([[[5.0], [6.0]], [[7.0], [8.0]]]),
+        "done": torch.tensor([[False], [True]]),
+        "terminated": torch.tensor([[False], [True]]),
+    }
+    before = {"observation": torch.ones(2, 2, 1), "action": torch.tensor([[0, 1], [1, 0]])}
+    return TensorDict({**before, "next": TensorDict(after, [2]), **entries}, [2])
+
+
+def test_targets_are_those_of_the_target_policies_and_target_critics():
+    loss = loss_of(Linear(*SURE), LinearCritics(*VALUES))
+    loss.actor_network_params.data.zero_()  # neither moves the targets
+    loss.critic_network_params.data.zero_()
+    out = loss(two_transitions())
+    # After the first transition both see 1: member 0 takes action 1, member 1 action 0, which is worth
+    # 2 + 3 = 5 to member 0 and 20 + 30 = 50 to member 1: 5 + 0.5 * 5 = 7.5, 6 + 0.5 * 50 = 31. The second ends.
+    assert out["target_value"].squeeze(-1).tolist() == [[7.5, 31.0], [7.0, 8.0]]
+    # The critics say 0: squares 56.25 + 961 and 49 + 64, summed over members, of which the mean is 565.125.
+    assert out["loss_value"].item() == 565.125
+
+
+def test_critics_judge_the_actions_that_were_taken_and_several_steps_are_discounted():
+    loss = loss_of(Linear(*SURE), LinearCritics(*VALUES), reduction="none")
+    batch = two_transitions(steps_to_next_obs=torch.tensor([[2], [1]]))
+    out = loss(batch)
+    # (0, 1) is worth 1 + 4 to member 0 and 10 + 40 to member 1; (1, 0) is worth 2 + 3 and 20 + 30.
+    assert out["pred_value"].squeeze(-1).tolist() == [[5.0, 50.0], [5.0, 50.0]]
+    # 5 + 0.25 * 5 = 6.25 and 6 + 0.25 * 50 = 18.5.
+    assert out["target_value"].squeeze(-1).tolist() == [[6.25, 18.5], [7.0, 8.0]]
+    assert out["loss_value"].tolist() == [1.25**2 + 31.5**2, 2.0**2 + 42.0**2]
+    assert set(batch.keys()) == set(two_transitions(steps_to_next_obs=torch.ones(2, 1)).keys()), (
+        "not written to"
+    )
+
+
+def test_an_actors_own_action_is_a_new_one_and_the_others_are_those_of_the_batch():
+    loss = loss_of(Linear(*SURE), LinearCritics(*VALUES), reduction="none", logit_penalty=0.1)
+    out = loss(two_transitions())
+    # Both see 1, so member 0 would take action 1, member 1 action 0. In the first transition (0, 1) was taken:
+    # member 0 is worth 2 + 4, member 1 10 + 30; in the second 2 + 3 and 20 + 30. All logits are 50 or -50:
+    # 0.1 * 2500 for each member.
+    assert out["loss_actor"].tolist() == [500.0 - 6.0 - 40.0, 500.0 - 5.0 - 50.0]
+    loss.zero_grad()
+    out["loss_actor"].sum().backward()
+    assert all(weight.grad is None for weight in loss.critic_network_params.values(True, True))
+
+
+def samples_of(probs):
+    """For each action a uniform number that samples it, [A]."""
+    return probs.cumsum(-1) - probs / 2
+
+
+def enumerated(loss, batch, probs):
+    """The actors' gradient, averaged over what the only two members sample, by the chance of each."""
+    total = 0.0
+    weight = loss.actor_network_params.get(("module", "weight"))
+    for first, noise in zip(probs[0], samples_of(probs[0]), strict=True):
+        for second, other in zip(probs[1], samples_of(probs[1]), strict=True):
+            batch["noise"] = torch.stack([torch.zeros(2), torch.stack([noise, other])], -1)[None]
+            (slope,) = torch.autograd.grad(loss(batch)["loss_actor"], weight)
+            total = total + first * second * slope
+    return total
+
+
+def test_where_a_critic_is_linear_in_the_action_the_gradient_is_that_of_the_expected_value():
+    chance = torch.Generator().manual_seed(4)
+    actors = Linear(*torch.randn(2, 3, 4, generator=chance).tolist())
+    critics = LinearCritics(*torch.randn(2, 8, 1, generator=chance).tolist())
+    loss = loss_of(actors, critics)
+    no = torch.zeros(1, 1, dtype=torch.bool)
+    seen = torch.randn(1, 2, 3, generator=chance)
+    after = TensorDict(
+        {"observation": seen, "reward": torch.zeros(1, 2, 1), "done": no, "terminated": no}, [1]
+    )
+    batch = TensorDict({"observation": seen, "action": torch.tensor([[2, 0]]), "next": after}, [1])
+    weight = loss.actor_network_params.get(("module", "weight"))
+    probs = torch.einsum("si,sio->so", seen[0], weight).softmax(-1)
+    # E Q of a member over its own actions; the other's value is a constant.
+    own = torch.stack(
+        [loss.critic_network_params.get(("module", "weight"))[i, 4 * i : 4 * i + 4, 0] for i in (0, 1)]
+    )
+    (wanted,) = torch.autograd.grad(-(probs * own.detach()).sum(), weight)
+    got = enumerated(loss, batch, probs.detach())
+    assert float((got - wanted).norm() / wanted.norm()) < 1e-5  # 0.02 was asked for
+    assert float(wanted.norm()) > 0.1
+
+
+def test_samples_invert_the_cumulative_distribution():
+    probs = torch.tensor([0.25, 0.5, 0.25])
+    noise = torch.tensor([0.0, 0.2499, 0.25, 0.7499, 0.75, 1.0])
+    assert sampled_one_hot(probs.expand(6, 3), noise).argmax(-1).tolist() == [0, 0, 1, 1, 2, 2]
+    logits = probs.log().requires_grad_()
+    sample = straight_through(logits, torch.tensor(0.6))
+    assert sample.tolist() == [0.0, 1.0, 0.0]
+    (slope,) = torch.autograd.grad(sample[1], logits)  # of the probability 0.5: 0.5 * (delta - probs)
+    assert slope.tolist() == [-0.125, 0.25, -0.125]
+
+
+def test_without_noise_samples_come_from_torchs_generator_and_with_it_not():
+    loss = loss_of(Linear([[0.0, 0.0]], [[0.0, 0.0]]), LinearCritics(*VALUES), reduction="none")
+    seen = []
+    for seed in (1, 2, 1):
+        torch.manual_seed(seed)
+        seen.append([loss(two_transitions())["loss_actor"].tolist() for _ in range(8)])
+    assert seen[0] == seen[2] != seen[1]
+    before = torch.random.get_rng_state()
+    noise = torch.rand(2, 2, 2, generator=torch.Generator().manual_seed(0))
+    same = [loss(two_transitions(noise=noise))["loss_actor"].tolist() for _ in range(2)]
+    assert same[0] == same[1]
+    assert torch.equal(torch.random.get_rng_state(), before)
+
+
+@pytest.mark.parametrize("action_space", ["categorical", "one-hot"])
+def test_the_loss_works_with_torchrl_alone(action_space):
+    """Two agents are paid 2 if both choose action 1, 1 if both choose 0; from chance play, they learn to."""
+    torch.manual_seed(0)
+    action = torch.randint(2, (400, 2))
+    paid = (action[:, 0] == action[:, 1]) * (1.0 + action[:, 0])
+    see, over = torch.ones(400, 2, 1), torch.ones(400, 1, dtype=torch.bool)
+    group = {"observation": see, "reward": paid[:, None, None].expand(400, 2, 1).clone()}
+    after = TensorDict({"agents": TensorDict(group, [400, 2]), "done": over, "terminated": over}, [400])
+    done = nn.functional.one_hot(action, 2) if action_space == "one-hot" else action
+    own = TensorDict({"observation": see, "action": done}, [400, 2])
+    buffer = TensorDictReplayBuffer(storage=LazyTensorStorage(400), batch_size=32)
+    buffer.extend(TensorDict({"agents": own, "next": after}, [400]))
+    actors, hidden = (
+        Linear([[0.0, 0.0]], [[0.0, 0.0]]),
+        nn.Sequential(nn.Linear(4, 16), nn.ReLU(), nn.Linear(16, 1)),
+    )
+    loss = MADDPGLoss(
+        TensorDictModule(actors, [("agents", "observation")], [("agents", "logits")]),
+        TensorDictModule(nn.Sequential(nn.Flatten(2), hidden), ["joint_action"], ["state_action_value"]),
+        action_space=action_space,
+    )
+    loss.set_keys(action=("agents", "action"), logits=("agents", "logits"), reward=("agents", "reward"))
+    updater, optimizer = SoftUpdate(loss, tau=0.05), torch.optim.Adam(loss.parameters(), lr=0.02)
+    before = loss.target_actor_network_params.get(("module", "weight")).clone()
+    for _ in range(200):
+        out = loss(buffer.sample())
+        optimizer.zero_grad()
+        (out["loss_actor"] + out["loss_value"]).backward()
+        optimizer.step()
+        updater.step()
+    likely = actors(see[:1]).softmax(-1)[0, :, 1]
+    assert (likely > 0.9).all(), likely
+    assert not torch.equal(loss.target_actor_network_params.get(("module", "weight")), before)
+    assert float(out["loss_value"]) < 0.05
+    assert ("agents", "action") in loss.in_keys
+    assert ("next", "agents", "reward") in loss.in_keys
+
+
+def test_what_the_loss_does_not_take_is_refused_by_name():
+    for how, message in [
+        ({"logit_penalty": -1.0}, "logit_penalty is -1.0; allowed: "),
+        ({"loss_function": "l3"}, "loss_function is 'l3'; allowed: "),
+        ({"action_space": "binary"}, "action_space is 'binary'; allowed: "),
+        ({"reduction": "max"}, "reduction is 'max'; allowed: "),
+    ]:
+        with pytest.raises(ValueError, match=message):
+            loss_of(Linear(*SURE), LinearCritics(*VALUES), **how)
+    loss = loss_of(Linear(*SURE), LinearCritics(*VALUES))
+    with pytest.raises(NotImplementedError, match="TDLambda"):
+        loss.make_value_estimator(ValueEstimators.TDLambda)
+
+
+# ---- in the library
+
+
+def learner_of(specs, **how):
+    agents = population(specs, **how)
+    (learner,) = agents.learners.values()
+    return agents, learner
+
+
+@pytest.mark.parametrize(("reward", "paid"), [("individual", [1.0, 2.0]), ("team", [6.0, 6.0])])
+def test_members_are_paid_what_each_wants_also_with_others_outside_the_team(reward, paid):
+    _, learner = learner_of([Scripted(), Team(TEAM, (1, 2), reward=reward), Scripted()])
+    learner.store(first_turn(2))
+    fields = learner.buffer.storage.fields
+    assert fields["reward"][0].tolist() == [paid, paid]
+    assert fields["action"][0].tolist() == [[1, 2], [1, 2]]
+    assert learner.engine.weights(0)["critic_network_params:module.heads.members.weights.0"].shape == (
+        2,
+        2 * 45 + 2 * 8,
+        8,
+    ), "the critics see the members' observations and actions alone"
+
+
+def test_the_critic_of_a_member_sees_what_all_members_do_and_observe_the_actor_only_its_own():
+    algorithm = MADDPG(settings=REPLAY)
+    team = algorithm.make_team([algorithm.make_network(GAME.spaces) for _ in range(3)], GAME.spaces)
+    seen = torch.randint(256, (2, 3, *GAME.observation_shape), dtype=torch.uint8)
+    other = seen.clone()
+    other[:, 2] = 255 - other[:, 2]
+    action = nn.functional.one_hot(torch.zeros(2, 3, 3, dtype=torch.int64), 8).float()
+    assert (team["critic"](seen, action) != team["critic"](other, action)).all()
+    moved = action.clone()
+    moved[:, 1, 2] = nn.functional.one_hot(torch.tensor(5), 8)  # in the row of member 1 alone
+    changed = (team["critic"](seen, action) != team["critic"](seen, moved)).squeeze(-1)
+    assert changed.tolist() == [[False, True, False]] * 2
+    assert (team["actor"](seen) != team["actor"](other)).any(-1).tolist() == [[False, False, True]] * 2
+
+
+@pytest.mark.parametrize("network", [None, MLP(hidden_cells=(5, 4))])
+def test_the_layers_of_critics_are_those_of_the_settings_or_of_the_network(network):
+    algorithm = MADDPG(
+        settings=replace(REPLAY, hidden_cells=(32, 32) if network else (5, 4)), network=network
+    )
+    team = algorithm.make_team([algorithm.make_network(GAME.spaces) for _ in range(2)], GAME.spaces)
+    assert [tuple(own.shape[1:]) for own in team["critic"].heads.members.weights] == [
+        (106, 5),
+        (5, 4),
+        (4, 1),
+    ]
+
+
+def test_returns_of_several_steps_are_those_of_each_member():
+    """Rewards 1, 2, 4, 8 .. of member 0, ten times that of member 1; the episode ends with the third turn."""
+    buffer = lane_buffer(
+        seeds=[(0,), (1,)],
+        transitions=10,
+        batch_size=4,
+        observation_shape=(2, 1),
+        action_shape=(2,),
+        reward_shape=(2,),
+        horizon=Horizon(3, 0.5),
+    )
+    for step in range(6):
+        ends = torch.full((2,), step == 2).numpy()
+        see, act = (
+            torch.zeros(2, 2, 1, dtype=torch.uint8).numpy(),
+            torch.zeros(2, 2, dtype=torch.int64).numpy(),
+        )
+        paid = (2.0**step * torch.tensor([[1.0, 10.0], [3.0, 30.0]])).numpy()
+        buffer.write(LaneTurn(see, act, see, paid, ends, ends))
+    got = buffer.storage.get(torch.tensor([[0, 1, 3], [0, 2, 3]]))
+    # 1 + 2/2 + 4/4 = 3; 2 + 4/2 = 4, since the episode ends; 4; 8 + 16/2 + 32/4 = 24.
+    wanted = [[[3, 30], [4, 40], [24, 240]], [[9, 90], [12, 120], [72, 720]]]
+    assert got["next", "reward"].squeeze(-1).tolist() == wanted
+    assert got["steps_to_next_obs"].squeeze(-1).tolist() == [[3, 2, 3], [3, 1, 3]]
+
+
+def test_a_team_that_was_stopped_goes_on_bit_for_bit_and_its_samples_too(tmp_path):
+    members = [Team(TEAM, (0, 2, 3), reward="individual"), Learning(DQN(settings=REPLAY))]
+    assert_goes_on_bit_for_bit(members, tmp_path, episodes=5)
+
+
+def test_a_run_is_built_again_is_evaluated_and_its_members_play_on_frozen(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    run, networks = ran(tmp_path, [Team(TEAM, (0, 1), reward="individual"), *[Scripted()] * 2])
+    loaded = cprl.load(run)
+    assert loaded.specs[0] == Team(TEAM, (0, 1), reward="individual")
+    assert len(networks) == 4
+    assert loaded.policy(1, worlds=2)(loaded.env(2).reset())["agents", "action"].shape == (2, 4)
+    assert evaluate_run(run, episodes=2) is not None
+    frozen = population([Frozen(run, 1, replica=1), Scripted(), Scripted(), Scripted()])
+    own = CommonsEnv(GAME, 2, seed=9).reset()["agents", "observation"][:, :1]
+    wanted = networks["replica_1/agent_1"](own).softmax(-1)
+    torch.testing.assert_close(frozen.others[0,].preferences(own), wanted)
+
+
+def test_what_is_no_team_of_maddpg_is_refused():
+    with pytest.raises(ValueError, match=r"the team has 1 agents; allowed for MADDPG: at least 2"):
+        population([Team(TEAM, (0,), reward="individual"), *[Scripted()] * 3])
+    with pytest.raises(ValueError, match=r'MADDPG does not support engine="torchrl"'):
+        TEAM.make_learner(GAME.spaces, agents=(0, 1), replicas=1, engine="torchrl")
+    with pytest.raises(ValueError, match=r"MADDPG is learned by a team"):
+        Learning(TEAM)
+
+
+def test_the_fastest_way_is_found_for_teams_of_two_and_of_four():
+    for members in (FOUR, (1, 3)):
+        others = [Scripted()] * (4 - len(members))
+        _, learner = learner_of([Team(TEAM, members, reward="individual"), *others])
+        assert not learner.engine._vmapped, "networks have a lane axis"
+
+
+@pytest.mark.slow
+def test_the_compiled_update_is_the_uncompiled_one():
+    ends = []
+    for engine in ("eager", "compiled"):
+        how = {"agents": FOUR, "replicas": 2, "reward_kind": "individual", "seed": 3}
+        learner = TEAM.make_learner(GAME.spaces, engine=engine, **how)
+        agents = population([Scripted()] * 4)
+        agents.learners, agents.others = {FOUR: learner}, {}
+        trained(agents, episodes=2)
+        ends.append([own.state_dict() for own in learner.networks().values()])
+    assert learner.engine._compiled.enabled
+    for eager, compiled in zip(*ends, strict=True):
+        for name, value in eager.items():
+            torch.testing.assert_close(compiled[name], value, rtol=1e-3, atol=1e-5)
+
+
+# ---- noise, for any algorithm that samples
+
+
+class NoisyLoss(DQNLoss):
+    """Learns from the transitions whose first uniform number is below a half, and keeps what it was given."""
+
+    given: ClassVar[list] = []
+
+    def forward(self, tensordict):
+        noise, asked = tensordict["noise"], self.reduction
+        self.given.append(noise)
+        self.reduction = "none"
+        each = super().forward(tensordict)["loss"] * (noise[..., 0] < 0.5)
+        self.reduction = asked
+        return TensorDict({"loss": each if asked == "none" else each.mean()}, [])
+
+
+@dataclass(frozen=True, kw_only=True)
+class Noisy(DQN):
+    noise_numbers: ClassVar[int] = 3
+
+    def make_loss(self, network):
+        loss = NoisyLoss(q_actor(network), delay_value=True, action_space="categorical")
+        loss.make_value_estimator(ValueEstimators.TD0, gamma=self.settings.gamma)
+        return loss
+
+
+@pytest.mark.parametrize("engine", ["eager", "torchrl"])
+def test_each_lane_has_uniform_numbers_of_its_own_whatever_trains_beside_it(engine):
+    given = []
+    for replicas, first in ((3, 0), (1, 2)):
+        how = {"agents": (0, 1), "replicas": replicas, "first_replica": first, "seed": 3, "engine": engine}
+        learner = Noisy(settings=REPLAY).make_learner(GAME.spaces, reward_kind="individual", **how)
+        NoisyLoss.given.clear()
+        agents = population([*[Learning(DQN(settings=REPLAY))] * 2, *[Scripted()] * 2], replicas=replicas)
+        agents.learners = {(0, 1): learner}
+        trained(agents, first=first, episodes=3 * replicas)
+        seen = torch.stack(NoisyLoss.given)
+        lanes = 2 * replicas
+        if engine == "torchrl":  # one agent after the other
+            seen = seen.view(-1, lanes, *seen.shape[1:])
+        assert seen.shape[1:] == (lanes, REPLAY.batch_size, 3)
+        given.append(seen)
+    least = min(map(len, given))
+    assert least > 5
+    torch.testing.assert_close(given[0][:least, 4:], given[1][:least], rtol=0, atol=0)
+    numbers = given[0].flatten()
+    assert len(numbers.unique()) > 0.99 * len(numbers)
+    assert 0.45 < float(numbers.mean()) < 0.55
+    assert ((numbers >= 0) & (numbers <= 1)).all()
+
+
+def test_weights_of_two_replicas_differ_and_those_of_a_replica_are_its_own():
+    agents, _ = learner_of([Team(TEAM, FOUR, reward="individual")])
+    trained(agents, episodes=2)
+    assert len({float(value.sum()) for value in weights(agents).values() if value.ndim == 2}) == 16
