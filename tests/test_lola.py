@@ -20,8 +20,8 @@ import cprl
 from cprl import Custom, Experiment
 from cprl.agents import Population
 from cprl.algorithms import DQN, LOLA, DQNSettings, LOLASettings
-from cprl.envs.make_env import make_env, spaces_of
 from cprl.envs.continuous import MaxOfTwoQuadratics
+from cprl.envs.make_env import make_env, spaces_of
 from cprl.envs.matrix import prisoners_dilemma
 from cprl.evaluation import crossplay
 from cprl.networks import Conv
