@@ -24,12 +24,14 @@ from cprl.envs.continuous import MaxOfTwoQuadratics
 from cprl.envs.make_env import make_env, spaces_of
 from cprl.envs.matrix import prisoners_dilemma
 from cprl.evaluation import crossplay
-from cprl.networks import Conv
+from cprl.networks import MLP, Conv
 from cprl.objectives import loaded_dice, lola_gradients, look_ahead_losses, looked_ahead
 from cprl.population import Frozen, Learning, Scripted, Team
 from cprl.training import train
 
-SETTINGS = LOLASettings(rollout_steps=12, hidden_cells=(8,), learning_rate=0.01, gae_lambda=0.95)
+SETTINGS = LOLASettings(
+    rollout_steps=12, look_ahead_rate=1.0, hidden_cells=(8,), learning_rate=0.01, gae_lambda=0.95
+)
 ESTIMATORS = ("policy_gradient", "dice")
 PAIR, FOUR = (0, 1), (0, 1, 2, 3)
 
@@ -356,10 +358,10 @@ SAMPLED = LOLASettings(
 """Rollouts of 50 episodes; policies and critics are tables of the last joint action, as in the paper."""
 
 
-def course(estimator, *, updates, **changes):
-    """The mean payoff a turn in the last tenth of training, by replica."""
-    settings = replace(SAMPLED, **changes)
-    algorithm = LOLA(settings=settings, estimator=estimator, network=Custom("lola_policies:Table"))
+def course(estimator, *, updates, is_table=True, **changes):
+    """The mean payoff a turn in the last tenth of training, by replica; policies are tables or linear."""
+    network = Custom("lola_policies:Table") if is_table else MLP(hidden_cells=())
+    algorithm = LOLA(settings=replace(SAMPLED, **changes), estimator=estimator, network=network)
     env = make_env(prisoners_dilemma(turns=TURNS), worlds=REPLICAS, seed=0)
     agents = Population(env, (Team(algorithm, PAIR, reward="individual"),), seed=1, engine="eager")
     (learner,) = agents.learners.values()

@@ -21,9 +21,10 @@ class LOLASettings:
     """Steps T of a rollout; an update takes several rollouts, see `cprl.algorithms.LOLA.estimator`."""
     gamma: float = 0.995
     """Discount factor per step, 0..1."""
-    look_ahead_rate: float = 1.0
+    look_ahead_rate: float = 0.03
     """The size of the step, by plain gradient descent, that each member expects of the others, 0..1e12; 0 is
-    naive learning."""
+    naive learning. The papers' 0.3 to 1 are for policies of five numbers; on boards of the commons 0.03 is a
+    step as long as a tenth of the weights, 1 a policy that has nothing to do with the present one."""
     optimizer: Optimizer = "adam"
     """The optimiser of the policies, of `torch.optim`; its other options are torch's defaults. The papers'
     is "sgd"."""
