@@ -1,9 +1,9 @@
 """One update of many agents for each of TorchRL's losses: the way that is found, and microseconds.
 
 One thread, batch 8, window 7 x 15 x 3, two hidden layers of 32 and 8 actions. There are four learners in each
-replica of `commons`; those of VDN, QMIX, MAPPO and IPPO are a team of four. Each loss runs in a process of
-its own, and the best of several repeats counts; what each compiles first takes up to a minute where torch has
-no cache.
+replica of `commons`; those of VDN, QMIX, MAPPO, IPPO and MADDPG are a team of four. Each loss runs in a
+process of its own, and the best of several repeats counts; what each compiles first takes up to a minute
+where torch has no cache.
 
     make bench
 """
@@ -21,9 +21,11 @@ from tensordict import TensorDict
 
 from cprl import presets
 from cprl.algorithms.actor_critic import IQL, SAC
-from cprl.algorithms.base import Algorithm, TeamAlgorithm
+from cprl.algorithms.base import Algorithm, OffPolicy, TeamAlgorithm
 from cprl.algorithms.dqn import CQL, DQN, DistributionalDQN
+from cprl.algorithms.maddpg import MADDPG
 from cprl.algorithms.on_policy import A2C, PPO, Reinforce
+from cprl.algorithms.pr2 import PR2
 from cprl.algorithms.teams import IPPO, MAPPO, QMIX, VDN
 from cprl.learners.engine.choice import TRIAL_LANES, fitting_engine, make_engine, trial_batch
 from cprl.learners.lanes import WEIGHTS, Lanes
@@ -40,6 +42,7 @@ ALGORITHMS = {
     "CQL": CQL(settings=REPLAY),
     "SAC": SAC(settings=REPLAY),
     "IQL": IQL(settings=REPLAY),
+    "PR2": PR2(settings=REPLAY),
     "PPO": PPO(settings=ROLLOUTS),
     "A2C": A2C(settings=ROLLOUTS),
     "REINFORCE": Reinforce(settings=ROLLOUTS),
@@ -47,6 +50,7 @@ ALGORITHMS = {
     "QMIX": QMIX(settings=REPLAY),
     "MAPPO": MAPPO(settings=ROLLOUTS),
     "IPPO": IPPO(settings=ROLLOUTS),
+    "MADDPG": MADDPG(settings=REPLAY),
 }
 BATCH = 8
 
@@ -62,10 +66,12 @@ def lanes_of(algorithm: Algorithm, learners: int) -> Lanes | Teams:
         first_replica=0,
         make_network=lambda: algorithm.make_network(game.spaces),
         stochastic=algorithm.stochastic,
+        sees_peers=getattr(algorithm, "sees_peers_actions", False),
     )
     if not isinstance(algorithm, TeamAlgorithm):
         return agents
-    return Teams(agents, lambda members: algorithm.make_team(members, game.spaces))
+    own_rewards = isinstance(algorithm, OffPolicy) and not algorithm.shares_reward
+    return Teams(agents, lambda members: algorithm.make_team(members, game.spaces), own_rewards=own_rewards)
 
 
 def update_us(name: str, learners: int, repeats: int) -> tuple[str, bool, float]:
@@ -75,10 +81,14 @@ def update_us(name: str, learners: int, repeats: int) -> tuple[str, bool, float]
     torch.manual_seed(0)
     algorithm = ALGORITHMS[name]
     lanes = lanes_of(algorithm, learners)
-    shapes = {"observation_shape": lanes.observation_shape, "action_shape": lanes.action_shape}
+    names = "observation_shape", "action_shape", "reward_shape"
+    shapes = {name: getattr(lanes, name) for name in names}
+    noise = algorithm.noise_numbers if isinstance(algorithm, OffPolicy) else 0
 
     def batch_of(count: int) -> TensorDict:
-        batch = trial_batch(count, actions=len(presets.game("commons").actions), **shapes)
+        batch = trial_batch(
+            count, actions=len(presets.game("commons").actions), noise_numbers=noise, **shapes
+        )
         return trial_rollout(batch) if isinstance(algorithm.settings, RolloutSettings) else batch
 
     networks = lanes_of(algorithm, max(learners, TRIAL_LANES * 4)).new_networks(WEIGHTS, "cpu")

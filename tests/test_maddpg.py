@@ -1,8 +1,9 @@
-"""MADDPG: critics that see the whole team, rewards of one's own, one-hot actions with straight-through gradients."""
+"""MADDPG: critics that see the whole team, rewards of one's own, gradients through one-hot actions."""
 
 from dataclasses import dataclass, replace
 from typing import ClassVar
 
+import numpy as np
 import pytest
 import torch
 from tensordict import TensorDict
@@ -15,8 +16,11 @@ from torchrl.objectives import DQNLoss, SoftUpdate, ValueEstimators
 
 import cprl
 from cprl import CommonsEnv
-from cprl.algorithms import DQN, MADDPG
+from cprl.agents import Population
+from cprl.algorithms import DQN, MADDPG, DQNSettings
 from cprl.algorithms.dqn import q_actor
+from cprl.envs import make_env
+from cprl.envs.matrix import MatrixGame
 from cprl.evaluation import evaluate_run
 from cprl.learners.buffer.gather import Horizon
 from cprl.learners.buffer.sampler import lane_buffer
@@ -58,8 +62,8 @@ def loss_of(actors, critics, *, sees=("joint_action",), gamma=0.5, **how):
 
 # Member 0 takes action 1 where it sees 1, else action 0 where it sees -1; member 1 the other way round.
 SURE = [[[-50.0, 50.0]], [[50.0, -50.0]]]
-# The critic of member 0 values its own actions at 1 and 2, the other's at 3 and 4; that of member 1 values the
-# actions of member 0 at 10 and 20, its own at 30 and 40.
+# The critic of member 0 values its own actions at 1 and 2, the other's at 3 and 4; that of member 1 values
+# the actions of member 0 at 10 and 20, its own at 30 and 40.
 VALUES = [[[1.0], [2.0], [3.0], [4.0]], [[10.0], [20.0], [30.0], [40.0]]]
 
 
@@ -80,7 +84,8 @@ def test_targets_are_those_of_the_target_policies_and_target_critics():
     loss.critic_network_params.data.zero_()
     out = loss(two_transitions())
     # After the first transition both see 1: member 0 takes action 1, member 1 action 0, which is worth
-    # 2 + 3 = 5 to member 0 and 20 + 30 = 50 to member 1: 5 + 0.5 * 5 = 7.5, 6 + 0.5 * 50 = 31. The second ends.
+    # 2 + 3 = 5 to member 0 and 20 + 30 = 50 to member 1: 5 + 0.5 * 5 = 7.5, 6 + 0.5 * 50 = 31. The second
+    # ends.
     assert out["target_value"].squeeze(-1).tolist() == [[7.5, 31.0], [7.0, 8.0]]
     # The critics say 0: squares 56.25 + 961 and 49 + 64, summed over members, of which the mean is 565.125.
     assert out["loss_value"].item() == 565.125
@@ -103,9 +108,9 @@ def test_critics_judge_the_actions_that_were_taken_and_several_steps_are_discoun
 def test_an_actors_own_action_is_a_new_one_and_the_others_are_those_of_the_batch():
     loss = loss_of(Linear(*SURE), LinearCritics(*VALUES), reduction="none", logit_penalty=0.1)
     out = loss(two_transitions())
-    # Both see 1, so member 0 would take action 1, member 1 action 0. In the first transition (0, 1) was taken:
-    # member 0 is worth 2 + 4, member 1 10 + 30; in the second 2 + 3 and 20 + 30. All logits are 50 or -50:
-    # 0.1 * 2500 for each member.
+    # Both see 1, so member 0 would take action 1, member 1 action 0. In the first transition (0, 1) was
+    # taken: to member 0 it is worth 2 + 4, to member 1 10 + 30; in the second 2 + 3 and 20 + 30. All logits
+    # are 50 or -50: 0.1 * 2500 for each member.
     assert out["loss_actor"].tolist() == [500.0 - 6.0 - 40.0, 500.0 - 5.0 - 50.0]
     loss.zero_grad()
     out["loss_actor"].sum().backward()
@@ -211,7 +216,7 @@ def test_the_loss_works_with_torchrl_alone(action_space):
     likely = actors(see[:1]).softmax(-1)[0, :, 1]
     assert (likely > 0.9).all(), likely
     assert not torch.equal(loss.target_actor_network_params.get(("module", "weight")), before)
-    assert float(out["loss_value"]) < 0.05
+    assert out["loss_value"].item() < 0.05
     assert ("agents", "action") in loss.in_keys
     assert ("next", "agents", "reward") in loss.in_keys
 
@@ -414,3 +419,60 @@ def test_weights_of_two_replicas_differ_and_those_of_a_replica_are_its_own():
     agents, _ = learner_of([Team(TEAM, FOUR, reward="individual")])
     trained(agents, episodes=2)
     assert len({float(value.sum()) for value in weights(agents).values() if value.ndim == 2}) == 16
+
+
+# ---- games with known answers
+
+REPLICAS = 10
+SETTINGS = DQNSettings(
+    buffer_size=5000,
+    batch_size=32,
+    learning_starts=100,
+    hidden_cells=(64, 64),
+    gamma=0.95,
+    learning_rate=3e-3,
+    tau=0.01,
+)
+
+
+def expected_returns(payoffs, *, turns):
+    """What members of a team get on average by their policies, after so many turns of a matrix game, in each
+    replica."""
+    table = np.asarray(payoffs)
+    game = MatrixGame(table)
+    env = make_env(game, worlds=REPLICAS, seed=1)
+    team = Team(MADDPG(settings=SETTINGS), tuple(range(game.agents)), reward="individual")
+    (learner,) = Population(env, [team], seed=1, engine="eager").learners.values()
+    moment = env.reset()
+    for _ in range(turns):
+        moment["agents", "action"] = learner.actor.choose(moment["agents", "observation"])
+        now, moment = env.step_and_maybe_reset(moment)
+        learner.store(now)
+        learner.update()
+    probs = learner.evaluation_actor(1).preferences(env.reset()["agents", "observation"]).numpy()
+    found = []
+    for of_agents in probs:
+        value = table
+        for own in of_agents:  # over the first axis that is left
+            value = np.tensordot(own, value, 1)
+        found.append(value.mean())
+    return found
+
+
+@pytest.mark.slow
+def test_six_agents_who_are_paid_if_all_do_the_same_agree_within_1500_turns():
+    """The game of proposition 1 of Lowe et al. (2017): from uniform policies, the gradient that a policy
+    estimates from one turn points the right way with a probability of the order of 0.5**N. The best is 1."""
+    payoffs = np.zeros((2,) * 6 + (6,))
+    payoffs[(0,) * 6] = payoffs[(1,) * 6] = 1.0
+    returns = expected_returns(payoffs, turns=1500)
+    assert sum(value > 0.9 for value in returns) >= 9, returns
+
+
+@pytest.mark.slow
+def test_in_the_penalty_game_without_a_penalty_both_find_one_of_the_two_best():
+    """Of Claus and Boutilier, "The Dynamics of Reinforcement Learning in Cooperative Multiagent Systems"
+    (1998), with k = 0: the best is 10, and two joint actions give it; a third equilibrium gives 2."""
+    table = np.array([[10.0, 0.0, 0.0], [0.0, 2.0, 0.0], [0.0, 0.0, 10.0]])
+    returns = expected_returns(np.stack([table, table], -1), turns=2000)
+    assert sum(value > 9.8 for value in returns) >= 9, returns

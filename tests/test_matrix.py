@@ -15,6 +15,7 @@ from torchrl.envs.utils import check_env_specs
 import cprl
 from cprl import Custom, Experiment, Study
 from cprl.algorithms import DQN, PPO, DQNSettings, RolloutSettings
+from cprl.commandline import parse
 from cprl.compat import LeanStepEnv
 from cprl.envs import make_env, spaces_of
 from cprl.envs.matrix import (
@@ -29,6 +30,7 @@ from cprl.envs.state import check_restorable
 from cprl.evaluation.same_game import differences
 from cprl.experiment import changes
 from cprl.population import Learning, Scripted
+from cprl.reporting import write_report
 from cprl.runs.episodes import read_episodes
 from cprl.runs.weights import load_weights
 from cprl.studies.trials import trials_of
@@ -369,6 +371,8 @@ def test_a_population_trains_stops_resumes_loads_and_meets_another(tmp_path, mon
     second = cprl.load(cprl.run(replace(EXPERIMENT, seed=9), tmp_path / "second", watch="off"))
     played = cprl.crossplay([loaded, second], episodes=2)
     assert played.cell("whole", "second").measures()["focal/return"].estimate is not None
+    with pytest.raises(ValueError, match=r"plays a game that reports no harvest; allowed in a report"):
+        write_report([whole], tmp_path / "report")
     third = cprl.load(cprl.run(replace(EXPERIMENT, game=chicken(turns=5)), tmp_path / "third", watch="off"))
     with pytest.raises(ValueError, match=r"have different games: MatrixGame.payoffs"):
         cprl.crossplay([loaded, third], episodes=2)
@@ -383,6 +387,12 @@ def test_a_study_varies_its_payoffs_and_turns():
     study = Study(EXPERIMENT, {"game.turns": [1, 5], "game.payoffs": [EXPERIMENT.game.payoffs, other]})
     found = {(own.experiment.game.turns, own.experiment.game.payoffs) for own in trials_of(study)}
     assert found == {(turns, table) for turns in (1, 5) for table in (EXPERIMENT.game.payoffs, other)}
+
+
+def test_its_numbers_are_flags_of_a_command_line():
+    words = ["mine", "--game.turns", "7", "--game.memory", "2", "--game.continue-prob", "0.5"]
+    experiment, _ = parse(lambda: EXPERIMENT, words)
+    assert experiment.game == replace(EXPERIMENT.game, turns=7, memory=2, continue_prob=0.5)
 
 
 def test_scripted_policies_that_read_a_window_are_refused():

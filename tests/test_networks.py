@@ -161,7 +161,10 @@ def test_every_algorithm_learns_with_every_network(kind, network):
         DQN,
         SAC,
         MAPPO,
-        *(pytest.param(kind, marks=pytest.mark.slow) for kind in (DistributionalDQN, QMIX, PPO, IPPO)),
+        *(
+            pytest.param(kind, marks=pytest.mark.slow)
+            for kind in (DistributionalDQN, QMIX, MADDPG, PPO, IPPO)
+        ),
     ],
 )
 def test_lanes_learn_with_any_network_what_each_would_alone(kind, network, monkeypatch):

@@ -171,6 +171,7 @@ ALLOWED = {
     ("SocialValueOrientation", "weight"): (1.9,),
     ("DistributionalDQN", "highest_return"): (1.9,),
     ("CQL", "conservative_weight"): (1.9,),
+    ("MADDPG", "logit_penalty"): (1.9,),
     **{
         (kind, name): (1.9,)
         for kind in ("PPO", "A2C", "MAPPO", "IPPO")

@@ -13,7 +13,7 @@ from test_finite import GAME, REPLAY, ROLLOUT
 import cprl
 from cprl import CommonsEnv, Experiment, cli
 from cprl.agents import Population
-from cprl.algorithms import DQN, IPPO, MAPPO, PPO, QMIX, SAC, VDN, Tabular, TabularSettings
+from cprl.algorithms import DQN, IPPO, MADDPG, MAPPO, PPO, QMIX, SAC, VDN, Tabular, TabularSettings
 from cprl.commandline import parse
 from cprl.learners.settings import DQNSettings
 from cprl.measuring.evaluate import evaluate
@@ -91,7 +91,9 @@ def test_members_of_a_team_start_with_the_weights_of_the_members_of_a_stored_one
             assert same(begun[f"replica_{replica}/agent_{agent}"], kept[f"replica_0/agent_{theirs}"])
 
 
-@pytest.mark.parametrize("algorithm", [MAPPO(settings=ROLLOUT), IPPO(settings=ROLLOUT)])
+@pytest.mark.parametrize(
+    "algorithm", [MAPPO(settings=ROLLOUT), IPPO(settings=ROLLOUT), MADDPG(settings=REPLAY)]
+)
 def test_teams_of_actors_start_likewise(stored, algorithm):
     kept = load_weights(Path(f"{stored}/teams/checkpoints/final.pt"))
     spec = Team(algorithm, agents=(0, 1), start_from=Frozen(f"{stored}/teams", 1, replica=None))

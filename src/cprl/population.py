@@ -127,7 +127,7 @@ class Team:
     share_parameters: bool = False
 
     def __post_init__(self) -> None:
-        checked("Team.share_parameters", self.share_parameters, SWITCH)
+        check_fields(self, {"share_parameters": SWITCH})
         allowed = _ALGORITHM if self.share_parameters else _TEAM_ALGORITHM
         check_fields(
             self, {"algorithm": allowed, "agents": _MEMBERS, "reward": PREFERENCE, "start_from": _START}

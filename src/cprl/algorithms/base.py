@@ -137,8 +137,9 @@ class OffPolicy(Algorithm):
     settings_kind: ClassVar[type[Any]] = DQNSettings
     can_share_parameters: ClassVar[bool] = True
     sees_peers_actions: ClassVar[bool] = False
-    """Whether "action" is [.., N] in place of [..]: first the agent's own action, then those of the others in
-    the order of their indices, whatever they learn by. Agents still act on their own observations alone."""
+    """Whether "action" is [.., N] in place of [..], or [.., N, D] of continuous actions: first the agent's
+    own action, then those of the others in the order of their indices, whatever they learn by. Agents still
+    act on their own observations alone."""
     action_noise: float = 0.0
     """The standard deviation of the Gaussian noise that exploring agents add to continuous actions, in units
     of actions; besides, they take a uniformly random one with the probability `epsilon` of the settings."""

@@ -8,6 +8,7 @@ Modules, in the order in which one reads them:
     distributional distributions of returns
     bounded        outputs within bounds: continuous actions
     joint          values of the actions of several agents together
+    answering      the same for continuous actions, and how peers answer them
     team           the networks of a team
     stacked        the networks of many lanes as one
 """

@@ -1,10 +1,32 @@
 """Several networks of one agent that are trained together."""
 
+from collections.abc import Mapping
+from typing import Final
+
 from torch import Tensor, nn
+
+from cprl.checks import Check, checked
+
+_NETWORKS: Final = Check(
+    lambda value: (
+        isinstance(value, Mapping)
+        and len(value) > 0
+        and all(isinstance(name, str) and name and "." not in name for name in value)
+        and all(isinstance(network, nn.Module) for network in value.values())
+    ),
+    "torch modules by name, at least one",
+)
 
 
 class AgentNetworks(nn.ModuleDict):
-    """Networks of one agent that are trained together, by name; the first one acts."""
+    """Networks of one agent that are trained together, by name; the first one acts.
+
+    Raises:
+        ValueError: for anything but a table of networks by name, at least one.
+    """
+
+    def __init__(self, modules: Mapping[str, nn.Module]) -> None:
+        super().__init__(checked("modules", modules, _NETWORKS))
 
     def forward(self, observation: Tensor) -> Tensor:
         """The output of the acting network."""

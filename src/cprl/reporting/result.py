@@ -78,15 +78,20 @@ def read_result(path: Path) -> Result:
     """Reads a run's directory, or its exported results.
 
     Raises:
-        ValueError: If the path has no run.
+        ValueError: If the path has no run, or one of a game without harvest.
         FileNotFoundError: If the run has no episodes or has not ended.
     """
-    recipe = read_recipe(path)
+    recipe, curves = read_recipe(path), curves_of(path)
+    if "collective_return" not in curves:
+        raise ValueError(
+            f"{path} plays a game that reports no harvest; allowed in a report beside the published study: a "
+            "commons; evaluate_run and crossplay measure the returns of others"
+        )
     return Result(
         path=path,
         recipe=recipe,
         experiment=Experiment.from_recipe(recipe, directory=path),
         report=read_json(path / "report.json"),
-        curves=curves_of(path),
+        curves=curves,
         study=published_experiment(recipe["recipe"]),
     )
