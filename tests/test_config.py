@@ -15,6 +15,7 @@ from cprl.algorithms import (
     DQN,
     IPPO,
     IQL,
+    LOLA,
     MADDPG,
     MAPPO,
     PPO,
@@ -24,6 +25,7 @@ from cprl.algorithms import (
     VDN,
     DistributionalDQN,
     DQNSettings,
+    LOLASettings,
     Reinforce,
     RolloutSettings,
     Tabular,
@@ -78,6 +80,7 @@ DQNS = st.builds(
     relu_on_outputs=st.booleans(),
 )
 ROLLOUTS = st.builds(RolloutSettings, max_grad_norm=st.none() | POSITIVE, epochs=st.integers(1, 9))
+LOOKS = st.builds(LOLASettings, max_grad_norm=st.none() | POSITIVE, critic_epochs=st.integers(0, 9))
 TABULARS = st.builds(TabularSettings, learning_rate=st.just("1/visits") | SHARES)
 NETWORKS = st.none() | st.builds(MLP) | st.builds(Conv, channels=st.just((4, 8))) | CUSTOM
 ALONE = st.one_of(
@@ -89,6 +92,7 @@ ALONE = st.one_of(
 TEAMS = st.one_of(
     *[st.builds(kind, settings=DQNS) for kind in (VDN, QMIX, MADDPG)],
     *[st.builds(kind, settings=ROLLOUTS) for kind in (MAPPO, IPPO)],
+    st.builds(LOLA, settings=LOOKS, estimator=st.sampled_from(["policy_gradient", "dice"])),
 )
 FROZEN = st.builds(
     Frozen, st.just("runs/earlier"), agent=st.integers(0, 3), replica=st.none() | st.integers(0, 9)
@@ -196,7 +200,7 @@ def test_every_kind_comes_back():
     }
     of_settings = {"settings": DQNSettings}
     of_settings |= dict.fromkeys(("PPO", "A2C", "Reinforce", "MAPPO", "IPPO"), RolloutSettings)
-    of_settings["Tabular"] = TabularSettings
+    of_settings |= {"Tabular": TabularSettings, "LOLA": LOLASettings}
     for name, kind in KINDS.items():
         if "settings" in [field.name for field in fields(kind)]:
             made[name] = kind(settings=of_settings.get(name, DQNSettings)())

@@ -15,6 +15,7 @@ from cprl import CommonsEnv, Custom, Experiment, Game, Rules, load, maps, run
 from cprl.algorithms import (
     DQN,
     IPPO,
+    LOLA,
     MADDPG,
     MAPPO,
     PPO,
@@ -24,6 +25,7 @@ from cprl.algorithms import (
     VDN,
     DistributionalDQN,
     DQNSettings,
+    LOLASettings,
     Reinforce,
     RolloutSettings,
     Tabular,
@@ -34,6 +36,7 @@ from cprl.envs.make_env import spaces_of
 from cprl.finite import FiniteCheck, NotFinite, NotFiniteError, places, summary
 from cprl.learners.base import LaneLosses
 from cprl.learners.engine.base import ListEngine
+from cprl.learners.lola.networks import LOLANetworks
 from cprl.learners.replay import ReplayLearner
 from cprl.networks.finite import all_finite, finite_lanes
 from cprl.population import Learning
@@ -55,6 +58,7 @@ REPLAY = DQNSettings(
     target_every_episodes=1,
 )
 ROLLOUT = RolloutSettings(rollout_steps=6, minibatch_size=3, epochs=2, hidden_cells=(8,), learning_rate=1e-3)
+LOOK = LOLASettings(rollout_steps=6, hidden_cells=(8,))
 LEARNERS = {
     "DQN": (DQN(settings=REPLAY), {}),
     "DQN with soft updates": (DQN(settings=replace(REPLAY, tau=0.1)), {}),
@@ -72,6 +76,8 @@ LEARNERS = {
     "IPPO": (IPPO(settings=ROLLOUT), {"reward_kind": "individual"}),
     "MADDPG": (MADDPG(settings=REPLAY), {"reward_kind": "individual"}),
     "MAPPO": (MAPPO(settings=ROLLOUT), {"reward_kind": "team"}),
+    "LOLA": (LOLA(settings=LOOK), {}),
+    "LOLA by DiCE": (LOLA(settings=LOOK, estimator="dice"), {}),
 }
 REPLICAS, BROKEN = 3, (1, 0)
 """The replica and the agent that break."""
@@ -93,6 +99,9 @@ def tensors_of(learner, replica, agent):
         return [own.data for own in learner.stock.each[lane].loss.parameters()]
     if isinstance(learner.engine, ListEngine):
         return [own.data for own in learner.engine.losses[lane].parameters()]
+    if isinstance(learner.engine, LOLANetworks):
+        stacks = (learner.engine.acting, learner.engine.playing)
+        return [own.data[replica] for stack in stacks for own in stack.parameters()[agent]]
     return [own[lane] for own in learner.engine.own.values()]
 
 
@@ -130,7 +139,8 @@ def play(learner, *, breaks=None, episodes=3, seed=2, **how):
 @pytest.mark.parametrize("name", LEARNERS)
 def test_a_lane_that_breaks_stops_the_training_and_is_named(name):
     learner = make_learner(name)
-    agents = r"agents 0, 1" if name in ("VDN", "QMIX", "IPPO", "MAPPO", "MADDPG") else "agent 0"
+    of_team = name in ("VDN", "QMIX", "IPPO", "MAPPO", "MADDPG") or name.startswith("LOLA")
+    agents = r"agents 0, 1" if of_team else "agent 0"
     with pytest.raises(NotFiniteError, match=rf"^at step \d+ .*the weights of {agents} in replica 1 are not"):
         play(learner, breaks=Breaks(learner, step=14))
     assert learner.finite()[[0, 2]].all()

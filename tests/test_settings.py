@@ -18,6 +18,7 @@ from cprl.algorithms import (
     DQN,
     IPPO,
     IQL,
+    LOLA,
     MADDPG,
     MAPPO,
     PPO,
@@ -27,6 +28,7 @@ from cprl.algorithms import (
     VDN,
     DistributionalDQN,
     DQNSettings,
+    LOLASettings,
     Reinforce,
     RolloutSettings,
     Tabular,
@@ -67,7 +69,7 @@ from cprl.runs.directory import read_recipe
 from cprl.runs.files import read_json
 
 GAME = presets.game("two_complex")
-REPLAY, ROLLOUTS, TABLES = DQNSettings(), RolloutSettings(), TabularSettings()
+REPLAY, ROLLOUTS, TABLES, LOOKS = DQNSettings(), RolloutSettings(), TabularSettings(), LOLASettings()
 SPACES = GAME.spaces
 EXPERIMENT = Experiment(name="mine", game=GAME, agents=[Scripted()] * 2, episodes=1)
 INSTITUTIONS = [
@@ -85,6 +87,8 @@ VALUES = [
     MaxOfTwoQuadratics(),
     *(kind(settings=REPLAY) for kind in (DQN, DistributionalDQN, CQL, SAC, IQL, PR2, VDN, QMIX, MADDPG)),
     *(kind(settings=ROLLOUTS) for kind in (PPO, A2C, Reinforce, MAPPO, IPPO)),
+    LOOKS,
+    LOLA(settings=LOOKS),
     Tabular(settings=TABLES),
     Bandit(),
     Learning(DQN(settings=REPLAY)),
@@ -127,12 +131,13 @@ NEVER = (
     *([], [[]], [NAN], ["x"], [None], [object()], 1.9),
     complex(1, 2),
 )
+SETTINGS = ("DQNSettings", "RolloutSettings", "LOLASettings")
 ALLOWED = {
     ("Frozen", "run"): ("3", "yes"),
     ("Experiment", "name"): ("3", "yes"),
     **{("Experiment", name): ([], ()) for name in ("transforms", "callbacks", "loggers")},
     **{("Spaces", name): ([], ()) for name in ("vectors", "observation_shape")},
-    **{(kind, "hidden_cells"): ([], ()) for kind in ("DQNSettings", "RolloutSettings", "MLP", "Conv")},
+    **{(kind, "hidden_cells"): ([], ()) for kind in (*SETTINGS, "MLP", "Conv")},
     ("DQNSettings", "replay_transforms"): ([], ()),
     ("DistributionalDQN", "lowest_return"): (-1, -0.5, 1.9),
     ("Spaces", "observation_scale"): (1.9,),
@@ -153,7 +158,12 @@ ALLOWED = {
     **dict.fromkeys((("Quota", "share"), ("Mediation", "refund")), (1.9,)),
     ("Monitoring", "cost"): (1.9,),
     ("RolloutSettings", "max_grad_norm"): (1.9,),
-    **{(kind, "learning_rate"): (1.9,) for kind in ("DQNSettings", "RolloutSettings")},
+    **{(kind, "learning_rate"): (1.9,) for kind in SETTINGS},
+    **{
+        ("LOLASettings", name): (1.9,)
+        for name in ("look_ahead_rate", "max_grad_norm", "critic_learning_rate")
+    },
+    ("LOLA", "entropy_coeff"): (1.9,),
     **{("SAC", name): (1.9,) for name in ("alpha_init",)},
     **{(kind, "temperature"): (1.9,) for kind in ("IQL", "PR2")},
     **{("InequityAversion", name): (1.9,) for name in ("alpha", "beta")},

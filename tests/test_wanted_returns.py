@@ -12,7 +12,18 @@ from one_road_parts import Dilemma
 import cprl
 from cprl import CommonsEnv, Custom, Experiment, Game, Rules, maps
 from cprl.agents import Population
-from cprl.algorithms import DQN, IPPO, PPO, QMIX, DQNSettings, RolloutSettings, Tabular, TabularSettings
+from cprl.algorithms import (
+    DQN,
+    IPPO,
+    LOLA,
+    PPO,
+    QMIX,
+    DQNSettings,
+    LOLASettings,
+    RolloutSettings,
+    Tabular,
+    TabularSettings,
+)
 from cprl.commandline import parse
 from cprl.envs import spaces_of
 from cprl.institutions import Tax
@@ -43,6 +54,7 @@ LEARNERS = {
     "rollouts of torchrl": (PPO(settings=ROLLOUTS), "torchrl"),
     "tables": (Tabular(settings=TabularSettings()), "eager"),
     "team": (IPPO(settings=ROLLOUTS), "eager"),
+    "look ahead": (LOLA(settings=LOLASettings(rollout_steps=20, hidden_cells=(8,))), "eager"),
 }
 BOARD = Game(
     map=maps.parse(".A>.A.A\nA.A.v.A\n..<.A.A"),
@@ -89,6 +101,8 @@ def stored(name, learner, turns):
         return torch.stack([turn["next", "reward"][:, 0] for turn in learner._rollout]).numpy()
     if name == "tables":
         return np.stack([turn["reward"] for turn in learner._turns])
+    if name == "look ahead":
+        return learner._rollouts["reward"][0, :turns].numpy()
     return learner._rollout["reward"][:turns].reshape(turns, -1).numpy()
 
 

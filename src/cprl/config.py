@@ -17,6 +17,7 @@ from cprl.algorithms import (
     DQN,
     IPPO,
     IQL,
+    LOLA,
     MADDPG,
     MAPPO,
     PPO,
@@ -26,6 +27,7 @@ from cprl.algorithms import (
     VDN,
     DistributionalDQN,
     DQNSettings,
+    LOLASettings,
     Reinforce,
     RolloutSettings,
     Tabular,
@@ -65,8 +67,8 @@ _OF_CPRL: Final[tuple[type[Any], ...]] = (
     *(Boundaries, ClosedPatches, ClosedSeason, GraduatedSanctions, Levies, Mediation),
     *(Monitoring, Quota, Sanctioner, Tax, Vote),
     *(DQN, DistributionalDQN, CQL, SAC, IQL, PPO, A2C, Reinforce, VDN, QMIX, MAPPO, IPPO, MADDPG, PR2),
-    Tabular,
-    *(DQNSettings, RolloutSettings, TabularSettings, Bandit, MLP, Conv),
+    *(LOLA, Tabular),
+    *(DQNSettings, RolloutSettings, LOLASettings, TabularSettings, Bandit, MLP, Conv),
     Custom,
 )
 KINDS: Final[dict[str, type[Any]]] = {kind.__name__: kind for kind in _OF_CPRL}

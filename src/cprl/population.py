@@ -110,7 +110,7 @@ class Team:
         algorithm: e.g. `cprl.algorithms.QMIX(settings=...)`; with `share_parameters` also one of independent
             agents, e.g. `DQN(settings=...)`.
         agents: their indices, ascending.
-        reward: "team", the sum of the rewards of all agents of the game; for IPPO, MADDPG and algorithms of
+        reward: "team", the sum of the rewards of all agents of the game; for IPPO, LOLA, MADDPG and those of
             independent agents also what each member wants by itself, see `Learning`.
         start_from: a member of a team of the same size; each member starts with the weights of the member
             at the same place in that team, see `Learning`. Mixers and central critics begin anew.

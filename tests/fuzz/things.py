@@ -22,6 +22,7 @@ from cprl.algorithms import (
     DQN,
     IPPO,
     IQL,
+    LOLA,
     MADDPG,
     MAPPO,
     PPO,
@@ -32,6 +33,7 @@ from cprl.algorithms import (
     Algorithm,
     DistributionalDQN,
     DQNSettings,
+    LOLASettings,
     Reinforce,
     RolloutSettings,
     Tabular,
@@ -81,6 +83,7 @@ REPLAY: Final = DQNSettings(
     buffer_size=40, batch_size=4, learning_starts=4, hidden_cells=(4,), epsilon_decay_steps=20
 )
 ROLLOUTS: Final = RolloutSettings(rollout_steps=4, minibatch_size=2, epochs=1, hidden_cells=(4,))
+LOOKS: Final = LOLASettings(rollout_steps=2, critic_epochs=1, hidden_cells=(4,))
 TABLES: Final = TabularSettings(epsilon_decay_steps=20, max_states=500)
 DQN_AGENT: Final = Learning(DQN(settings=REPLAY))
 EXPERIMENT: Final = Experiment(
@@ -118,6 +121,7 @@ EXAMPLES: Final[dict[type, tuple[Any, ...]]] = {
     Sanctioner: (Sanctioner(), Sanctioner(agents=(1,))),
     DQNSettings: (DQNSettings(), REPLAY),
     RolloutSettings: (RolloutSettings(), ROLLOUTS),
+    LOLASettings: (LOLASettings(), LOOKS),
     TabularSettings: (TabularSettings(), TABLES),
     MLP: (MLP(), MLP(hidden_cells=(4,))),
     Conv: (Conv(), Conv(channels=(2,), kernel_cells=3, hidden_cells=(4,))),
@@ -137,6 +141,7 @@ EXAMPLES: Final[dict[type, tuple[Any, ...]]] = {
     MADDPG: (MADDPG(settings=REPLAY, logit_penalty=0.0),),
     MAPPO: (MAPPO(settings=ROLLOUTS),),
     IPPO: (IPPO(settings=ROLLOUTS),),
+    LOLA: (LOLA(settings=LOOKS), LOLA(settings=LOOKS, estimator="dice")),
     Bandit: (Bandit(), Bandit(step_size=0.5, epsilon_end=0.0)),
     InequityAversion: (InequityAversion(alpha=5, beta=0.05, smoothing=0.9),),
     SocialValueOrientation: (SocialValueOrientation(angle=0.5, weight=1.0),),

@@ -7,6 +7,7 @@ Modules, in the order in which one reads them:
     pr2           PR2, which sees the actions of its peers
     on_policy     PPO, A2C, REINFORCE
     teams         VDN, QMIX, MAPPO, IPPO
+    lola          LOLA, by policy gradients or DiCE
     maddpg        MADDPG
     tabular       tabular Q-learning
 """
@@ -14,11 +15,13 @@ Modules, in the order in which one reads them:
 from cprl.algorithms.actor_critic import IQL, SAC
 from cprl.algorithms.base import Algorithm, OffPolicy, OnPolicy, TeamAlgorithm
 from cprl.algorithms.dqn import CQL, DQN, DistributionalDQN
+from cprl.algorithms.lola import LOLA
 from cprl.algorithms.maddpg import MADDPG
 from cprl.algorithms.on_policy import A2C, PPO, Reinforce
 from cprl.algorithms.pr2 import PR2
 from cprl.algorithms.tabular import Tabular
 from cprl.algorithms.teams import IPPO, MAPPO, QMIX, VDN
+from cprl.learners.lola.settings import LOLASettings
 from cprl.learners.settings import DQNSettings, RolloutSettings, TabularSettings
 
 __all__ = [
@@ -27,6 +30,7 @@ __all__ = [
     "DQN",
     "IPPO",
     "IQL",
+    "LOLA",
     "MADDPG",
     "MAPPO",
     "PPO",
@@ -37,6 +41,7 @@ __all__ = [
     "Algorithm",
     "DQNSettings",
     "DistributionalDQN",
+    "LOLASettings",
     "OffPolicy",
     "OnPolicy",
     "Reinforce",

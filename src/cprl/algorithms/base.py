@@ -46,6 +46,7 @@ _CHECKS: Final[dict[str, Check]] = {
     "clip_epsilon": number(1e-6, 0.999),
     "entropy_coeff": _WEIGHT,
     "critic_coeff": _WEIGHT,
+    "estimator": one_of("policy_gradient", "dice"),
     "logit_penalty": _WEIGHT,
     "mixing_cells": count(1, MOST_CELLS),
 }
@@ -240,7 +241,7 @@ class TeamAlgorithm(Algorithm):
         if self.shares_reward and reward != "team":
             raise ValueError(
                 f'reward is {named(reward)}; allowed for {name}: "team", the sum over all agents; '
-                f"DQN, PPO, IPPO and MADDPG support {named(reward)}"
+                f"DQN, PPO, IPPO, LOLA and MADDPG support {named(reward)}"
             )
         if members < self.fewest_members:
             raise ValueError(

@@ -19,6 +19,7 @@ from torchrl.objectives import (
 from cprl.algorithms.base import OffPolicy
 from cprl.compat import bootstrap_from_target
 from cprl.custom import Custom
+from cprl.learners.lola.settings import LOLASettings
 from cprl.learners.settings import DEFAULT_HIDDEN_CELLS, DQNSettings, RolloutSettings
 from cprl.networks.distributional import AtomNetwork
 from cprl.networks.mlp import MLP
@@ -175,7 +176,7 @@ def q_network_of(spaces: Spaces, settings: DQNSettings, network: Network | Custo
 
 def network_of(
     spaces: Spaces,
-    settings: DQNSettings | RolloutSettings,
+    settings: DQNSettings | RolloutSettings | LOLASettings,
     network: Network | Custom | None,
     *,
     outputs: int,

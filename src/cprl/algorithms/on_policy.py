@@ -12,6 +12,7 @@ from cprl.algorithms.actor_critic import policy
 from cprl.algorithms.base import OnPolicy
 from cprl.algorithms.dqn import network_of
 from cprl.custom import Custom
+from cprl.learners.lola.settings import LOLASettings
 from cprl.learners.settings import RolloutSettings
 from cprl.networks.agent import AgentNetworks
 from cprl.networks.specification import Network
@@ -94,7 +95,7 @@ class Reinforce(OnPolicy):
 
 
 def actor_and_critic(
-    spaces: Spaces, settings: RolloutSettings, network: Network | Custom | None
+    spaces: Spaces, settings: RolloutSettings | LOLASettings, network: Network | Custom | None
 ) -> AgentNetworks:
     """New networks of one agent: "actor" and "critic"."""
     sizes = {"actor": spaces.actions, "critic": 1}

@@ -9,6 +9,7 @@ Modules, in the order in which one reads them:
     teams        the same where a lane is a team
     replay       ReplayLearner: learns from a replay buffer
     rollouts     RolloutLearner: learns from rollouts of the present policy
+    lola/        LOLALearner: learns with the other members' learning in view
     decisions    Bandit: how agents learn what they decide at an episode's begin
     tabular      TabularLearner: Q-learning in tables
     single       the network and the loss of one DQN agent

@@ -5,10 +5,31 @@ Modules, in the order in which one reads them:
     pr2               probabilistic recursive reasoning: joint action values, the peers' expected answers
     stein             how particles, here samples of those answers, move towards a density
     pr2_actor_critic  the same for continuous actions, with an actor, a critic and a sampler of answers
+    lola              gradients and losses that look one learning step of the others ahead
+    dice              what rollouts say of returns, differentiable any number of times
+    lola_losses       LOLALoss, LOLADiCELoss: the two put together for policies
+    iterated          the exact values of policies that remember one turn of a repeated matrix game
 """
 
+from cprl.objectives.dice import dice_objective, loaded_dice, magic_box
+from cprl.objectives.iterated import iterated_value
+from cprl.objectives.lola import lola_gradients, look_ahead_losses, looked_ahead
+from cprl.objectives.lola_losses import LOLADiCELoss, LOLALoss
 from cprl.objectives.maddpg import MADDPGLoss
 from cprl.objectives.pr2 import PR2Loss
 from cprl.objectives.pr2_actor_critic import PR2ActorCriticLoss
 
-__all__ = ["MADDPGLoss", "PR2ActorCriticLoss", "PR2Loss"]
+__all__ = [
+    "LOLADiCELoss",
+    "LOLALoss",
+    "MADDPGLoss",
+    "PR2ActorCriticLoss",
+    "PR2Loss",
+    "dice_objective",
+    "iterated_value",
+    "loaded_dice",
+    "lola_gradients",
+    "look_ahead_losses",
+    "looked_ahead",
+    "magic_box",
+]
