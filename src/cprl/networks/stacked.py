@@ -11,10 +11,18 @@ from cprl.networks.agent import AgentNetworks
 from cprl.networks.answering import AnswerSampler, JointCritic
 from cprl.networks.bounded import BoundedNetwork
 from cprl.networks.distributional import AtomNetwork
+from cprl.networks.gaussian import GaussianNetwork
 from cprl.networks.joint import JointNetwork
 from cprl.networks.mlp import MLPNetwork
 
-_OVER_ANOTHER: Final = AnswerSampler, AtomNetwork, BoundedNetwork, JointCritic, JointNetwork
+_OVER_ANOTHER: Final = (
+    AnswerSampler,
+    AtomNetwork,
+    BoundedNetwork,
+    GaussianNetwork,
+    JointCritic,
+    JointNetwork,
+)
 """Networks that compute with the outputs of another, their attribute `network`, which has all weights."""
 
 
