@@ -20,8 +20,8 @@ from cprl.spaces import Spaces
 
 NOISE_SIZE: Final = 1
 """The normal numbers by which the sampler of answers draws one."""
-MEAN_RATE: Final = 0.03
-SCALE_RATE: Final = 0.008
+MEAN_RATE: Final = 0.015
+SCALE_RATE: Final = 0.0025
 """Critic and actor have one learning rate; by these factors the actor is slower, its scale slowest."""
 
 
