@@ -20,8 +20,8 @@ from cprl.spaces import Spaces
 
 NOISE_SIZE: Final = 1
 """The normal numbers by which the sampler of answers draws one."""
-MEAN_RATE: Final = 0.015
-SCALE_RATE: Final = 0.0025
+MEAN_RATE: Final = 0.05
+SCALE_RATE: Final = 0.1
 """Critic and actor have one learning rate; by these factors the actor is slower, its scale slowest."""
 
 
@@ -73,7 +73,7 @@ class PR2ActorCritic(OffPolicy):
         names = "hidden_cells", "glorot_uniform"
         how: dict[str, Any] = {name: getattr(self.settings, name) for name in names}
         actor = GaussianNetwork(
-            MLPNetwork(spaces.observation_shape, 2 * size, highest=highest, **how),
+            MLPNetwork(spaces.observation_shape, size, highest=highest, **how),
             low=low,
             high=high,
             scale=self.first_scale,

@@ -13,12 +13,12 @@ class GaussianNetwork(nn.Module):
     """A Gaussian policy: it acts by its mean, within bounds; losses read its standard deviation too.
 
     Args:
-        network: a network with 2 x D outputs, of the means and of the logarithms of the scales.
+        network: a network with D outputs, of the means.
         low: the least value of each number of an action.
         high: the largest.
-        scale: the standard deviation where the network gives 0, in units of actions.
+        scale: the standard deviation at first, in units of actions; it is the same whatever is observed.
         mean_rate: by which outputs for the mean are multiplied: the lower, the slower it moves.
-        scale_rate: the same of outputs for the logarithm of the scale.
+        scale_rate: the same of the weight that is the logarithm of the scale.
     """
 
     def __init__(
@@ -34,6 +34,7 @@ class GaussianNetwork(nn.Module):
         super().__init__()
         self.network, self.low, self.high = network, low, high
         self.scale, self.mean_rate, self.scale_rate = scale, mean_rate, scale_rate
+        self.widened = nn.Parameter(torch.zeros(()))
 
     def start_anywhere(self) -> None:
         """Moves the means to a uniformly random action, from torch's generator; for networks that end in a
@@ -46,17 +47,16 @@ class GaussianNetwork(nn.Module):
         if last is None:
             raise ValueError(f"network is a {type(self.network).__name__}; allowed: fully connected layers")
         with torch.no_grad():
-            size = len(last.bias) // 2
-            last.weight[:size] *= 0.1
-            share = (torch.rand(size) * 2 - 1) * _WITHIN
-            last.bias[:size] = torch.atanh(share) / self.mean_rate
+            last.weight *= 0.1
+            share = (torch.rand(len(last.bias)) * 2 - 1) * _WITHIN
+            last.bias[:] = torch.atanh(share) / self.mean_rate
 
     def policy(self, observation: Tensor) -> tuple[Tensor, Tensor]:
         """[..., *shape] to the mean and the standard deviation, each [..., D]."""
-        mean, logarithm = self.network(observation).chunk(2, -1)
-        share = (self.mean_rate * mean).tanh()
+        share = (self.mean_rate * self.network(observation)).tanh()
         action = self.low + (self.high - self.low) * 0.5 * (share + 1)
-        return action, self.scale * (self.scale_rate * logarithm).exp()
+        widened = self.widened.view(*self.widened.shape, *[1] * (action.ndim - self.widened.ndim))
+        return action, self.scale * (self.scale_rate * widened).exp().expand_as(action)
 
     def forward(self, observation: Tensor) -> Tensor:
         """[..., *shape] to actions [..., D], the mean."""
