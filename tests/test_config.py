@@ -26,6 +26,7 @@ from cprl.algorithms import (
     DistributionalDQN,
     DQNSettings,
     LOLASettings,
+    PR2ActorCritic,
     Reinforce,
     RolloutSettings,
     Tabular,
@@ -85,7 +86,7 @@ TABULARS = st.builds(TabularSettings, learning_rate=st.just("1/visits") | SHARES
 NETWORKS = st.none() | st.builds(MLP) | st.builds(Conv, channels=st.just((4, 8))) | CUSTOM
 ALONE = st.one_of(
     st.builds(DQN, settings=DQNS, double=st.booleans(), network=NETWORKS),
-    *[st.builds(kind, settings=DQNS) for kind in (DistributionalDQN, CQL, SAC, IQL, PR2)],
+    *[st.builds(kind, settings=DQNS) for kind in (DistributionalDQN, CQL, SAC, IQL, PR2, PR2ActorCritic)],
     *[st.builds(kind, settings=ROLLOUTS) for kind in (PPO, A2C, Reinforce)],
     st.builds(Tabular, settings=TABULARS),
 )

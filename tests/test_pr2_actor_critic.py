@@ -252,20 +252,23 @@ PAIRS = 10
 
 
 class Points(nn.Module):
-    """The actors of a game of one state, an action of each lane: [L, b, 1] to [L, b, 1]."""
+    """The actors of a game of one state: [L, b, 1] to the action of each lane and its scale, [L, b, 1]."""
 
     def __init__(self, starts):
         super().__init__()
         self.at = nn.Parameter(starts.view(-1, 1, 1).clone())
 
     def forward(self, observation):
-        return self.at.expand(*observation.shape[:-1], 1)
+        action = self.at.expand(*observation.shape[:-1], 1)
+        return action, torch.full_like(action, Schedule.scale)
 
 
 class Schedule:
-    """Of a training of 2400 steps: the first 1200 explore widely, then temperature and noise are annealed."""
+    """Of a training of 2400 steps: 400 of random actions, then a wide scale up to step 1200, from where on
+    temperature and scale are annealed."""
 
-    steps, batch, only_critics, hold, annealed = 2400, 32, 400, 1200, 1920
+    steps, batch, random, hold, annealed = 2400, 32, 400, 1200, 1920
+    scale = 4.5
 
     @classmethod
     def at(cls, step, start, end):
@@ -284,11 +287,10 @@ def learned(seed):
         return stack_lanes([kind(form(), observation_dims=1, action_scale=10.0, **how) for _ in range(lanes)])
 
     loss = PR2ActorCriticLoss(
-        actor := Points(starts),
+        TensorDictModule(actor := Points(starts), ["observation"], ["action", "scale"]),
         stacked(JointCritic, value_scale=20.0),
         stacked(AnswerSampler),
         temperature=5.0,
-        exploration=4.5,
         particles=8,
         reduction="none",
     )
@@ -300,9 +302,11 @@ def learned(seed):
     taken = torch.zeros(Schedule.steps, lanes)
     for step in range(Schedule.steps):
         loss.temperature.fill_(Schedule.at(step, 5.0, 0.5))
-        loss.exploration.fill_(Schedule.at(step, 4.5, 0.4))
-        drawn = torch.randn(lanes, generator=chance) * loss.exploration
+        Schedule.scale = Schedule.at(step, 4.5, 0.4)
+        drawn = torch.randn(lanes, generator=chance) * Schedule.scale
         taken[step] = (actor.at.detach().flatten() + drawn).clamp(-10, 10)
+        if step < Schedule.random:
+            taken[step] = torch.rand(lanes, generator=chance) * 20 - 10
         if step < Schedule.batch:
             continue
         index = torch.randint(step + 1, (lanes, Schedule.batch), generator=chance)
@@ -320,7 +324,7 @@ def learned(seed):
         for optimizer in optimizers:
             optimizer.zero_grad()
         sum(out.values()).mean(-1).sum().backward()
-        for optimizer in optimizers[: 1 if step < Schedule.only_critics else 2]:
+        for optimizer in optimizers[: 1 if step < Schedule.random else 2]:
             optimizer.step()
         targets.step()
     return actor.at.detach().view(PAIRS, 2)

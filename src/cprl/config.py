@@ -28,6 +28,7 @@ from cprl.algorithms import (
     DistributionalDQN,
     DQNSettings,
     LOLASettings,
+    PR2ActorCritic,
     Reinforce,
     RolloutSettings,
     Tabular,
@@ -66,8 +67,8 @@ _OF_CPRL: Final[tuple[type[Any], ...]] = (
     *(InequityAversion, SocialValueOrientation, Exchange),
     *(Boundaries, ClosedPatches, ClosedSeason, GraduatedSanctions, Levies, Mediation),
     *(Monitoring, Quota, Sanctioner, Tax, Vote),
-    *(DQN, DistributionalDQN, CQL, SAC, IQL, PPO, A2C, Reinforce, VDN, QMIX, MAPPO, IPPO, MADDPG, PR2),
-    *(LOLA, Tabular),
+    *(DQN, DistributionalDQN, CQL, SAC, IQL, PPO, A2C, Reinforce, VDN, QMIX, MAPPO, IPPO, MADDPG),
+    *(PR2, PR2ActorCritic, LOLA, Tabular),
     *(DQNSettings, RolloutSettings, LOLASettings, TabularSettings, Bandit, MLP, Conv),
     Custom,
 )

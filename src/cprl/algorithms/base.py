@@ -49,6 +49,10 @@ _CHECKS: Final[dict[str, Check]] = {
     "estimator": one_of("policy_gradient", "dice"),
     "logit_penalty": _WEIGHT,
     "mixing_cells": count(1, MOST_CELLS),
+    "action_noise": number(0, 1e9),
+    "first_scale": number(1e-6, 1e6),
+    "value_scale": number(1e-6, 1e6),
+    "particles": count(2, 1024),
 }
 """Of the fields of cprl's algorithms; one of the same name means the same in each."""
 
@@ -148,6 +152,10 @@ class OffPolicy(Algorithm):
     sample by: the entry "noise", float32 [.., noise_numbers] or [.., S, noise_numbers]. A loss that samples
     by torch's generator instead would make replicas depend on each other."""
 
+    def noise_numbers_in(self, spaces: Spaces) -> int:
+        """The `noise_numbers` of its loss in such spaces."""
+        return self.noise_numbers
+
     def make_learner(
         self, spaces: Spaces, *, agents: Sequence[int], engine: TrainingEngine = "compiled", **how: Any
     ) -> Learner:
@@ -162,7 +170,7 @@ class OffPolicy(Algorithm):
             "make_loss": self.make_loss,
             "stochastic": self.stochastic,
             "sees_peers": self.sees_peers_actions,
-            "noise_numbers": self.noise_numbers,
+            "noise_numbers": self.noise_numbers_in(spaces),
             "action_noise": self.action_noise,
         }
         if engine == "torchrl":

@@ -11,11 +11,20 @@ from cprl.networks.agent import AgentNetworks
 from cprl.networks.answering import AnswerSampler, JointCritic
 from cprl.networks.bounded import BoundedNetwork
 from cprl.networks.distributional import AtomNetwork
+from cprl.networks.gaussian import GaussianNetwork
 from cprl.networks.joint import JointNetwork
 from cprl.networks.mlp import MLPNetwork
 
-_OVER_ANOTHER: Final = AnswerSampler, AtomNetwork, BoundedNetwork, JointCritic, JointNetwork
-"""Networks that compute with the outputs of another, their attribute `network`, which has all weights."""
+_OVER_ANOTHER: Final = (
+    AnswerSampler,
+    AtomNetwork,
+    BoundedNetwork,
+    GaussianNetwork,
+    JointCritic,
+    JointNetwork,
+)
+"""Networks that compute with the outputs of another, their attribute `network`; weights of their own get a
+lane axis in front."""
 
 
 class StackedMLP(nn.Module):
@@ -141,6 +150,9 @@ def stack_lanes(networks: Sequence[nn.Module]) -> nn.Module:
     if isinstance(first, _OVER_ANOTHER) and all(type(network) is type(first) for network in networks):
         stack: Any = deepcopy(networks[0])
         stack.network = stack_lanes([network.network for network in networks])  # type: ignore[misc]
+        for name, _ in first.named_parameters(recurse=False):
+            own = torch.stack([getattr(network, name).detach() for network in networks])
+            setattr(stack, name, nn.Parameter(own))
         return stack  # type: ignore[no-any-return]
     if all(isinstance(network, AgentNetworks) for network in networks):
         parts = zip(*(network.values() for network in networks), strict=True)  # type: ignore[operator]
@@ -159,7 +171,11 @@ def lane_state(stack: nn.Module, lane: int) -> dict[str, Tensor]:
     the lane's network."""
     if isinstance(stack, _OVER_ANOTHER):
         own = {f"network.{name}": value for name, value in lane_state(stack.network, lane).items()}
-        return {**{name: value.clone() for name, value in stack.named_buffers(recurse=False)}, **own}
+        weights = {
+            name: value[lane].detach().clone() for name, value in stack.named_parameters(recurse=False)
+        }
+        buffers = {name: value.clone() for name, value in stack.named_buffers(recurse=False)}
+        return {**weights, **buffers, **own}
     state: dict[str, Tensor] = stack.lane_state(lane)  # type: ignore[operator]
     return state
 
