@@ -297,6 +297,24 @@ def test_torch_guards_hooks_on_request():
         assert not compat.fits(own, (hooked, torch.ones(2)))
 
 
+@ignored
+def test_torch_compiles_a_softmax_of_what_was_changed_in_place(tmp_path, monkeypatch):
+    def masked(values):
+        mask = torch.full((8, 8), -10000.0)
+        mask[torch.arange(8).unsqueeze(0), torch.arange(8).unsqueeze(1)] = 0
+        return torch.softmax(values + mask, dim=-1)
+
+    monkeypatch.setenv("TORCHINDUCTOR_CACHE_DIR", str(tmp_path))  # what is in the cache is not compiled again
+    values, own = torch.rand(8, 8), compat.with_own_code(masked)
+    with pytest.raises(torch._inductor.exc.InductorError, match="KeyError: 'buf1'"):
+        called_first(own, values)
+    torch._dynamo.reset()
+    with relies_on("LoopBody of torch._inductor", used_by="compat.sound_local_buffers"):
+        with compat.sound_local_buffers():
+            got = called_first(compat.with_own_code(masked), values)
+        torch.testing.assert_close(got, masked(values))
+
+
 def summed(values):
     total = 0.0
     for value in values:

@@ -19,6 +19,7 @@ from cprl.compat import (
     every_guard,
     fits,
     remember_vector_instructions,
+    sound_local_buffers,
     with_own_code,
     without_lookup,
 )
@@ -133,7 +134,7 @@ class Compiled:
             # variables of its code: not dynamic.
             self._compiled = torch.compile(own, fullgraph=True, dynamic=False, options=options)
             try:
-                with warnings.catch_warnings(), every_guard():
+                with warnings.catch_warnings(), every_guard(), sound_local_buffers():
                     for kind in (DeprecationWarning, FutureWarning):  # raised inside torch and TorchRL
                         warnings.simplefilter("ignore", kind)
                     return self._compiled(*arguments), not further
