@@ -31,7 +31,7 @@ class LOLA(TeamAlgorithm):
     compiles acting alone.
 
     Source: Foerster et al., "Learning with Opponent-Learning Awareness" (2018), and "DiCE: The Infinitely
-    Differentiable Monte Carlo Estimator" (2018); docs/opponent_aware_lola.md lists the departures.
+    Differentiable Monte Carlo Estimator" (2018); docs/algorithms.md lists the departures.
     """
 
     settings: LOLASettings

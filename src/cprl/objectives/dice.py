@@ -13,11 +13,12 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from cprl.arguments import number
+from cprl.arguments import number, object_of
 
 
 def magic_box(log_prob: Tensor) -> Tensor:
     """1, with the derivatives of probabilities relative to what they are: exp(x - stop_gradient(x))."""
+    object_of("log_prob", log_prob, Tensor, "a tensor of floats")
     return (log_prob - log_prob.detach()).exp()
 
 
@@ -88,6 +89,7 @@ class _Steps(NamedTuple):
 
 def _steps(log_prob: Tensor, gamma: float, done: Tensor | None) -> _Steps:
     number("gamma", gamma, low=0, high=1, allowed="0..1")
+    object_of("done", done, Tensor | None, "a tensor of bool, or None")
     joint = log_prob.sum(-1, keepdim=True)
     if done is None:
         done = torch.zeros_like(joint, dtype=torch.bool)
@@ -104,6 +106,10 @@ def _steps(log_prob: Tensor, gamma: float, done: Tensor | None) -> _Steps:
 
 
 def _same(name: str, given: Tensor, log_prob: Tensor) -> None:
+    for named, value in ((name, given), ("log_prob", log_prob)):
+        object_of(named, value, Tensor, "a tensor of floats")
+        if not value.is_floating_point():
+            raise ValueError(f"{named} is {value.dtype}; allowed: a tensor of floats")
     if given.shape != log_prob.shape or given.ndim < 2:
         raise ValueError(
             f"{name} is {list(given.shape)}, log_prob {list(log_prob.shape)}; allowed: [.., T, N] for both"

@@ -6,7 +6,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from cprl.arguments import number
+from cprl.arguments import number, object_of, refusal
 
 
 def iterated_value(probabilities: Tensor, payoffs: Tensor | Sequence[Any], *, gamma: float) -> Tensor:
@@ -28,11 +28,16 @@ def iterated_value(probabilities: Tensor, payoffs: Tensor | Sequence[Any], *, ga
     Source: Foerster et al., "Learning with Opponent-Learning Awareness" (2018), whose exact learners use it.
     """
     number("gamma", gamma, low=0, high=1 - 1e-9, allowed="0 or more, below 1")
-    paid = torch.as_tensor(payoffs, dtype=probabilities.dtype, device=probabilities.device)
-    agents, actions = paid.ndim - 1, paid.shape[0]
+    object_of("probabilities", probabilities, Tensor, "a tensor of floats")
+    try:
+        paid = torch.as_tensor(payoffs, dtype=probabilities.dtype, device=probabilities.device)
+    except (TypeError, ValueError, RuntimeError):
+        raise refusal("payoffs", payoffs, "numbers [A, .., A, N]") from None
+    agents, actions = max(0, paid.ndim - 1), paid.shape[0] if paid.ndim else 0
     joint = actions**agents
     wanted = (agents, joint + 1, actions)
-    if paid.shape != (*[actions] * agents, agents) or probabilities.shape[-3:] != wanted:
+    is_game = agents > 0 < actions and paid.shape == (*[actions] * agents, agents)
+    if not is_game or not probabilities.is_floating_point() or probabilities.shape[-3:] != wanted:
         raise ValueError(
             f"payoffs are {list(paid.shape)}, probabilities {list(probabilities.shape)}; allowed: "
             "[A, .., A, N] and [.., N, A**N + 1, A]"

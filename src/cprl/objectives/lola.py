@@ -15,7 +15,7 @@ from typing import Any, Final, Literal, TypeAlias, get_args
 import torch
 from torch import Tensor
 
-from cprl.arguments import integer, number
+from cprl.arguments import callable_of, integer, listed, number, object_of, objects
 from cprl.checks import checked, one_of
 
 Parameters: TypeAlias = Sequence[Sequence[Tensor]]
@@ -30,6 +30,7 @@ _Flat: TypeAlias = tuple[Tensor, ...]
 _Slopes: TypeAlias = dict[tuple[int, int], Tensor]
 """The gradient of the loss of an agent by a tensor, by the place of each."""
 
+_OBJECTIVE: Final = "a function of the parameters of N agents to their losses"
 _HIGHEST: Final = 1e12
 _MOST_STEPS: Final = 1000
 
@@ -61,9 +62,9 @@ def lola_gradients(
     """
     checked_rate(rate)
     checked_factor(factor)
-    if not objectives:
-        raise ValueError("objectives is empty; allowed: one or more")
-    flat, owners = _flat([[value.detach() for value in of] for of in parameters])
+    objectives = _functions("objectives", objectives)
+    flat, owners = _flat(parameters)
+    flat = tuple(value.detach() for value in flat)
     agents = range(len(parameters))
     followed = [(i, p) for i in agents for p, own in enumerate(owners) if factor == "both" or own == i]
     estimates: list[Any] = [
@@ -100,9 +101,10 @@ def looked_ahead(
     """
     checked_rate(rate)
     integer("steps", steps, 1, _MOST_STEPS)
-    if still is not None:
-        integer("still", still, 0, len(parameters) - 1)
+    callable_of("objective", objective, _OBJECTIVE)
     flat, owners = _flat(parameters)
+    if still is not None:
+        integer("still", still, 0, owners[-1])
     followed = [(i, p) for p, i in enumerate(owners) if i != still]
     for _ in range(steps):
         slopes = dict(zip(followed, _slopes(objective, owners, followed)(*flat)[0], strict=True))
@@ -136,6 +138,9 @@ def look_ahead_losses(
     Raises:
         ValueError: for what is not allowed, and losses of another number of agents.
     """
+    callable_of("inner", inner, _OBJECTIVE)
+    outer = _functions("outer", outer)
+    _flat(parameters)
     if len(outer) != len(parameters):
         raise ValueError(
             f"outer has {len(outer)} objectives; allowed: one for each of {len(parameters)} agents"
@@ -199,7 +204,18 @@ def _weights(
     return tuple(weight(j, p) for j, p in followed)
 
 
+def _functions(name: str, given: Any) -> tuple[Objective, ...]:
+    """One or more objectives; raises a ValueError for anything else."""
+    found = listed(name, given, f"a list of functions, each {_OBJECTIVE}")
+    for place, own in enumerate(found):
+        callable_of(f"{name}[{place}]", own, _OBJECTIVE)
+    if not found:
+        raise ValueError(f"{name} is empty; allowed: one or more")
+    return found
+
+
 def _of_agents(losses: Tensor, agents: int) -> Tensor:
+    object_of("what an objective gives", losses, Tensor, f"losses [.., {agents}]")
     if not losses.ndim or losses.shape[-1] != agents:
         raise ValueError(f"an objective gives losses {list(losses.shape)}; allowed: [.., {agents}]")
     return losses
@@ -211,9 +227,13 @@ def _mean(values: Sequence[Tensor]) -> Tensor:
 
 def _flat(parameters: Parameters) -> tuple[_Flat, list[int]]:
     """All tensors, and the agent of each."""
-    if not parameters or not all(len(of) for of in parameters):
+    by_agent = [
+        objects(f"parameters[{agent}]", of, Tensor, "tensors")
+        for agent, of in enumerate(listed("parameters", parameters, "a list of lists of tensors"))
+    ]
+    if not by_agent or not all(by_agent):
         raise ValueError("parameters lack those of an agent; allowed: one tensor or more for each agent")
-    pairs = [(value, agent) for agent, of in enumerate(parameters) for value in of]
+    pairs = [(value, agent) for agent, of in enumerate(by_agent) for value in of]
     return tuple(value for value, _ in pairs), [agent for _, agent in pairs]
 
 

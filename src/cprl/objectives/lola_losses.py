@@ -11,7 +11,7 @@ from tensordict.utils import NestedKey
 from torch import Tensor, nn
 from torchrl.objectives import LossModule
 
-from cprl.arguments import number
+from cprl.arguments import number, objects
 from cprl.objectives.dice import loaded_dice
 from cprl.objectives.lola import (
     Factor,
@@ -55,6 +55,9 @@ class _OfPolicies(LossModule):
         entropy_coeff: float = 0.0,
     ) -> None:
         super().__init__()
+        actors = objects(
+            "actors", actors, ProbabilisticTensorDictSequential, "policies, e.g. ProbabilisticActor"
+        )
         if len(actors) < 2:
             raise ValueError(f"there are {len(actors)} actors; allowed: two or more, one for each agent")
         self.look_ahead_rate = checked_rate(look_ahead_rate)

@@ -5,12 +5,13 @@ from typing import Any, Final, Literal, TypeAlias, get_args
 
 import torch
 from tensordict import TensorDict, TensorDictBase, TensorDictParams
-from tensordict.nn import TensorDictModule, dispatch
+from tensordict.nn import TensorDictModule, TensorDictModuleBase, dispatch
 from tensordict.utils import NestedKey, unravel_key
 from torch import Tensor
 from torchrl.objectives import LossModule, ValueEstimators
 from torchrl.objectives.utils import dispatch_value_estimator, distance_loss
 
+from cprl.arguments import object_of
 from cprl.checks import checked, number, one_of
 
 ActionSpace: TypeAlias = Literal["categorical", "one-hot"]
@@ -97,6 +98,8 @@ class MADDPGLoss(LossModule):
         checked("logit_penalty", logit_penalty, number(0, 1e6))
         checked("action_space", action_space, one_of(*get_args(ActionSpace)))
         checked("reduction", reduction, one_of("mean", "sum", "none"))
+        for name, network in (("actor_network", actor_network), ("critic_network", critic_network)):
+            object_of(name, network, TensorDictModuleBase, "a TensorDictModule")
         super().__init__()
         self._in_keys: list[NestedKey] | None = None
         self.convert_to_functional(actor_network, "actor_network", create_target_params=True)
