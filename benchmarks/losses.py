@@ -83,12 +83,11 @@ def update_us(name: str, learners: int, repeats: int) -> tuple[str, bool, float]
     lanes = lanes_of(algorithm, learners)
     names = "observation_shape", "action_shape", "reward_shape"
     shapes = {name: getattr(lanes, name) for name in names}
-    noise = algorithm.noise_numbers if isinstance(algorithm, OffPolicy) else 0
+    numbers = algorithm.noise_numbers if isinstance(algorithm, OffPolicy) else 0
+    noise = (*lanes.member_shape, numbers) if numbers else ()
 
     def batch_of(count: int) -> TensorDict:
-        batch = trial_batch(
-            count, actions=len(presets.game("commons").actions), noise_numbers=noise, **shapes
-        )
+        batch = trial_batch(count, actions=len(presets.game("commons").actions), noise_shape=noise, **shapes)
         return trial_rollout(batch) if isinstance(algorithm.settings, RolloutSettings) else batch
 
     networks = lanes_of(algorithm, max(learners, TRIAL_LANES * 4)).new_networks(WEIGHTS, "cpu")

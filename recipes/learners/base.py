@@ -105,7 +105,9 @@ WAYS: Final[dict[str, Way]] = {
     "PR2": Way(
         {"learning_rate": (1e-4, 1e-3), "temperature": (0.02, 0.1)},
         lambda *, steps, learning_rate, temperature: PR2(
-            settings=replay(learning_rate, steps=steps), temperature=temperature
+            settings=replay(learning_rate, steps=steps),
+            temperature=temperature,
+            entropy_bonus=False,  # with it agents are paid for every step that the board lives
         ),
     ),
     "LOLA": Way(
