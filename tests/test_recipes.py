@@ -3,7 +3,6 @@
 import importlib.util
 import json
 import re
-import sys
 from collections import Counter
 from dataclasses import replace
 from pathlib import Path
@@ -40,13 +39,11 @@ def recipe(name, folder=RECIPES):
 @pytest.mark.parametrize("board", ["two_complex", "commons"])
 def test_every_way_to_learn_has_four_candidates_of_its_own(board, monkeypatch):
     monkeypatch.syspath_prepend(str(RECIPES / "learners"))
-    monkeypatch.delitem(sys.modules, "base", raising=False)  # that of recipes/studies
     study = recipe(f"tuning_{board}", RECIPES / "learners").STUDY
     ways = Counter(condition.name.partition(":")[0] for condition in study.all_conditions)
     assert ways == dict.fromkeys(("DQN", "PPO", "IPPO", "VDN", "QMIX", "MAPPO", "MADDPG", "PR2", "LOLA"), 4)
     assert len({condition.checksum for condition in study.all_conditions}) == 36
     assert {condition.experiment.seed for condition in study.all_conditions} == {1000}
-    monkeypatch.delitem(sys.modules, "base")
 
 
 def run_recipe(name, out, *, own=None, watch="file", **changes):

@@ -3,7 +3,7 @@
 python recipes/learners/tuning_commons.py --jobs 2
 """
 
-from base import tuning
+from ways import tuning
 
 import cprl
 

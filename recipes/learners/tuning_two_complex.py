@@ -3,7 +3,7 @@
 python recipes/learners/tuning_two_complex.py --jobs 2
 """
 
-from base import tuning
+from ways import tuning
 
 import cprl
 
