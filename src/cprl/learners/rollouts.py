@@ -4,14 +4,13 @@ from collections.abc import Callable, Mapping, Sequence
 from copy import deepcopy
 from typing import Any, Final
 
-import numpy as np
 import torch
 from tensordict import TensorDict, TensorDictBase
 from torch import Tensor, nn
 from torchrl.objectives.value.functional import generalized_advantage_estimate
 
-from cprl.learners.buffer.storage import torch_dtype
-from cprl.learners.checks import check_learner, check_rollouts, refuse_continuous
+from cprl.learners.buffer.rollout import refuse_full, rollout_fields, write_turn
+from cprl.learners.checks import check_learner, refuse_continuous
 from cprl.learners.engine.base import Engine
 from cprl.learners.engine.choice import TRIAL_LANES, EngineName, make_engine, trial_batch, trial_rollout
 from cprl.learners.engine.functional import MakeLoss
@@ -102,9 +101,8 @@ class RolloutLearner:
         self.engine = self._make_engine(engine, make_loss, compile=compile, device=device)
         self.actor = self._lanes.actor(self.engine, compile=compile)
         self.rng = LaneRng(self._lanes.seeds(SAMPLING), settings.rollout_steps)
-        self._rollout = self._allocate(torch.device(device))
-        name = spaces.observation_dtype
-        self._dtypes: tuple[Any, ...] = (np.dtype(name), torch_dtype(name))
+        size = (settings.rollout_steps,)
+        self._rollout = rollout_fields(spaces, self._lanes, size, torch.device(device))
         self._size = 0
         self.steps = 0
 
@@ -149,24 +147,6 @@ class RolloutLearner:
         """The length of a rollout, in steps."""
         return self.settings.rollout_steps
 
-    def _allocate(self, device: torch.device) -> dict[str, Tensor]:
-        """Tensors for a rollout, zeros [T, L, ...] each."""
-        size, shape = (self.rollout_steps, self.lanes), self._lanes.observation_shape
-        dtype = torch_dtype(self.spaces.observation_dtype)
-        check_rollouts(size, shape, dtype, device)
-        forms: dict[str, tuple[tuple[int, ...], torch.dtype]] = {
-            "observation": (shape, dtype),
-            "action": (self._lanes.action_shape, torch.int64),
-            "next_observation": (shape, dtype),
-            "reward": (self._lanes.member_shape, torch.float32),
-            "done": ((), torch.bool),
-            "terminated": ((), torch.bool),
-        }
-        return {
-            name: torch.zeros((*size, *of_one), dtype=kind, device=device)
-            for name, (of_one, kind) in forms.items()
-        }
-
     def evaluation_actor(self, worlds: int) -> LaneActor:
         """An actor with the current weights, for `worlds` worlds of each replica."""
         return self._lanes.evaluation_actor(self.engine, worlds, epsilon=0.0)
@@ -182,20 +162,9 @@ class RolloutLearner:
             ValueError: if the rollout is full: call `update` after each step, or after a number of steps that
                 divides `rollout_steps`; and if the dtype of observations is not that of the spaces.
         """
-        if self._size == self.rollout_steps:
-            raise ValueError(
-                f"the rollout already has {self.rollout_steps} steps; call update() before store()"
-            )
+        refuse_full(self._size, self.rollout_steps)
         turn = self._lanes.rollout_turn(batch, wanted_in(self.wants, batch))
-        for seen in (turn.observation, turn.next_observation):
-            if seen.dtype not in self._dtypes:
-                raise ValueError(
-                    f"observations are {seen.dtype}; allowed: {self.spaces.observation_dtype}, from "
-                    "Spaces.observation_dtype: make the learner with the Spaces of the transformed "
-                    "environment"
-                )
-        for name, field in self._rollout.items():
-            field[self._size] = torch.as_tensor(getattr(turn, name))
+        write_turn(self._rollout, (self._size,), turn, self.spaces)
         self._size += 1
         self.steps += 1
 

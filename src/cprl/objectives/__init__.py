@@ -2,6 +2,7 @@
 
 Modules, in the order in which one reads them:
     maddpg            MADDPGLoss: an actor and a centralised critic for each of several agents
+    td_loss           what losses share whose targets bootstrap by one step
     pr2               probabilistic recursive reasoning: joint action values, the peers' expected answers
     stein             how particles, here samples of those answers, move towards a density
     pr2_actor_critic  the same for continuous actions, with an actor, a critic and a sampler of answers

@@ -2,24 +2,24 @@
 
 from dataclasses import dataclass
 from math import log
-from typing import Any, Final
+from typing import Final
 
 import torch
 from tensordict import TensorDict, TensorDictBase
 from tensordict.nn import TensorDictModule, TensorDictParams
 from tensordict.utils import NestedKey
 from torch import Tensor, nn
-from torchrl.objectives import LossModule, ValueEstimators
-from torchrl.objectives.utils import dispatch_value_estimator, distance_loss
+from torchrl.objectives.utils import distance_loss
 
 from cprl.arguments import choice, number, object_of, switch
 from cprl.networks.joint import chosen, marginal, soft_value
+from cprl.objectives.td_loss import TDLoss
 
 _VALUES: Final = "joint_action_value"
 _LOWEST_TEMPERATURE: Final = 1e-6
 
 
-class PR2Loss(LossModule):
+class PR2Loss(TDLoss):
     """The loss of PR2-Q: an agent expects its peers to answer each of its actions, and learns what that pays.
 
     The network values joint actions by pairs, q_j(s, a, b): the agent's own action and that of peer j; the
@@ -69,7 +69,6 @@ class PR2Loss(LossModule):
 
     tensor_keys: _AcceptedKeys
     default_keys = _AcceptedKeys
-    default_value_estimator = ValueEstimators.TD0
     out_keys = ["loss"]  # noqa: RUF012
 
     value_network: TensorDictModule
@@ -112,31 +111,10 @@ class PR2Loss(LossModule):
             self._in_keys = [keys.action, *own, *(("next", *_path(key)) for key in after)]
         return self._in_keys
 
-    def _forward_value_estimator_keys(self, **kwargs: Any) -> None:
-        self._in_keys = None
-        if self._value_estimator is not None:
-            self._value_estimator.set_keys(**self._estimator_keys())
-
     def _estimator_keys(self) -> dict[str, NestedKey]:
         keys = self.tensor_keys
         names = "value", "value_target", "reward", "done", "terminated"
         return {name: getattr(keys, name) for name in names}
-
-    def make_value_estimator(self, value_type: Any = None, **hyperparams: Any) -> "PR2Loss":
-        """Sets the discount, e.g. `make_value_estimator(ValueEstimators.TD0, gamma=0.99)`.
-
-        Raises:
-            NotImplementedError: for another estimator than TD0.
-        """
-        dispatch_value_estimator(
-            self,
-            self.default_value_estimator if value_type is None else value_type,
-            supported=(ValueEstimators.TD0,),
-            tensor_keys=self._estimator_keys(),
-            value_network=None,
-            **hyperparams,
-        )
-        return self
 
     def forward(self, tensordict: TensorDictBase) -> TensorDict:
         """The loss of a batch, under "loss"."""

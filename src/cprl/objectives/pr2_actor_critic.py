@@ -10,17 +10,16 @@ from tensordict import TensorDict, TensorDictBase
 from tensordict.nn import TensorDictModule, TensorDictParams
 from tensordict.utils import NestedKey, unravel_key
 from torch import Tensor, nn
-from torchrl.objectives import LossModule, ValueEstimators
-from torchrl.objectives.utils import dispatch_value_estimator
 
 from cprl.checks import checked, count, instance, number, one_of
 from cprl.objectives.stein import stein_direction
+from cprl.objectives.td_loss import TDLoss
 
 _NO_CERTAINTY: Final = 1e-6
 """Uniform numbers this close to 0 or 1 are moved inwards, where the normal quantile is finite."""
 
 
-class PR2ActorCriticLoss(LossModule):
+class PR2ActorCriticLoss(TDLoss):
     """The losses of PR2-AC: an actor that ascends what its actions pay once the peers have answered them.
 
     - The conditional, a sampler b = g(s, a, noise) of the peers' answer to the agent's action a, moves by the
@@ -76,7 +75,6 @@ class PR2ActorCriticLoss(LossModule):
 
     tensor_keys: _AcceptedKeys
     default_keys = _AcceptedKeys
-    default_value_estimator = ValueEstimators.TD0
     out_keys = ("loss_qvalue", "loss_actor", "loss_conditional")
 
     actor_network: TensorDictModule
@@ -134,31 +132,10 @@ class PR2ActorCriticLoss(LossModule):
     def in_keys(self, keys: list[NestedKey]) -> None:
         self._in_keys = keys
 
-    def _forward_value_estimator_keys(self, **_: Any) -> None:
-        self._in_keys = None
-        if self._value_estimator is not None:
-            self._value_estimator.set_keys(**self._estimator_keys())
-
     def _estimator_keys(self) -> dict[str, NestedKey]:
         keys = self.tensor_keys
         names = "value_target", "reward", "done", "terminated"
         return {"value": keys.state_action_value, **{name: getattr(keys, name) for name in names}}
-
-    def make_value_estimator(self, value_type: Any = None, **hyperparams: Any) -> "PR2ActorCriticLoss":
-        """Sets the discount, e.g. `make_value_estimator(ValueEstimators.TD0, gamma=0.99)`.
-
-        Raises:
-            NotImplementedError: for another estimator than TD0.
-        """
-        dispatch_value_estimator(
-            self,
-            self.default_value_estimator if value_type is None else value_type,
-            supported=(ValueEstimators.TD0,),
-            tensor_keys=self._estimator_keys(),
-            value_network=None,
-            **hyperparams,
-        )
-        return self
 
     def noise_numbers(self, action_size: int) -> int:
         """The uniform numbers that it takes for a transition, where an action has D numbers."""

@@ -3,15 +3,14 @@
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any, Final
 
-import numpy as np
 import torch
 from tensordict import TensorDict, TensorDictBase
 from torch import Tensor, nn
 from torchrl.objectives import LossModule
 from torchrl.objectives.value.functional import generalized_advantage_estimate
 
-from cprl.learners.buffer.storage import torch_dtype
-from cprl.learners.checks import check_learner, check_rollouts, refuse_continuous
+from cprl.learners.buffer.rollout import refuse_full, rollout_fields, write_turn
+from cprl.learners.checks import check_learner, refuse_continuous
 from cprl.learners.lanes import WEIGHTS, Lanes, StartFrom
 from cprl.learners.lola.networks import LOLANetworks
 from cprl.learners.lola.settings import LOLASettings
@@ -93,9 +92,8 @@ class LOLALearner:
         self.rollouts = 1 + len(agents) if self._looks_ahead else 2
         """The number P of rollouts that an update takes."""
         self.actor = self._lanes.actor(self.engine.playing, compile=compile)
-        self._rollouts = self._allocate(torch.device(device))
-        name = spaces.observation_dtype
-        self._dtypes: tuple[Any, ...] = (np.dtype(name), torch_dtype(name))
+        size = self.rollouts, settings.rollout_steps
+        self._rollouts = rollout_fields(spaces, self._lanes, size, torch.device(device))
         self._size, self._phase = 0, 0
         self.steps = 0
 
@@ -103,29 +101,6 @@ class LOLALearner:
     def rollout_steps(self) -> int:
         """The length of a rollout, in steps."""
         return self.settings.rollout_steps
-
-    def _allocate(self, device: torch.device) -> dict[str, Tensor]:
-        """Tensors for the rollouts of an update, zeros [P, T, L, ...] each."""
-        steps, lanes, shape = (
-            self.rollouts * self.rollout_steps,
-            len(self._lanes),
-            self._lanes.observation_shape,
-        )
-        dtype = torch_dtype(self.spaces.observation_dtype)
-        check_rollouts((steps, lanes), shape, dtype, device)
-        forms: dict[str, tuple[tuple[int, ...], torch.dtype]] = {
-            "observation": (shape, dtype),
-            "action": ((), torch.int64),
-            "next_observation": (shape, dtype),
-            "reward": ((), torch.float32),
-            "done": ((), torch.bool),
-            "terminated": ((), torch.bool),
-        }
-        size = self.rollouts, self.rollout_steps, lanes
-        return {
-            name: torch.zeros((*size, *of_one), dtype=kind, device=device)
-            for name, (of_one, kind) in forms.items()
-        }
 
     def evaluation_actor(self, worlds: int) -> LaneActor:
         """An actor with the present weights, for `worlds` worlds of each replica."""
@@ -142,20 +117,9 @@ class LOLALearner:
             ValueError: if the rollout is full: call `update` after each step, or after a number of steps that
                 divides `rollout_steps`; and if the dtype of observations is not that of the spaces.
         """
-        if self._size == self.rollout_steps:
-            raise ValueError(
-                f"the rollout already has {self.rollout_steps} steps; call update() before store()"
-            )
+        refuse_full(self._size, self.rollout_steps)
         turn = self._lanes.rollout_turn(batch, wanted_in(self.wants, batch))
-        for seen in (turn.observation, turn.next_observation):
-            if seen.dtype not in self._dtypes:
-                raise ValueError(
-                    f"observations are {seen.dtype}; allowed: {self.spaces.observation_dtype}, from "
-                    "Spaces.observation_dtype: make the learner with the Spaces of the transformed "
-                    "environment"
-                )
-        for name, field in self._rollouts.items():
-            field[self._phase, self._size] = torch.as_tensor(getattr(turn, name))
+        write_turn(self._rollouts, (self._phase, self._size), turn, self.spaces)
         self._size += 1
         self.steps += 1
 
