@@ -42,7 +42,7 @@ class PublishedExperiment:
     """The number of episodes in the study's figures."""
     window_episodes: int
     """The window of the study's running means. It gives none: this one has its nulls where the spectra of the
-    published curves have theirs, see tests/test_published.py."""
+    published curves have theirs, see `cprl.measuring.running_means`."""
     curves: Mapping[str, str]
     """The names of published curves by our name of the metric; `return_0` is the return of agent 0."""
 
