@@ -116,4 +116,5 @@ def _after(curve: Values, first: NDArray[np.int64]) -> Values:
 
 
 def _share(part: Values, whole: Values, *, undefined: float = 0.0) -> Values:
-    return np.divide(part, whole, out=np.full(np.shape(part), undefined), where=whole > 0)
+    shares: Values = np.divide(part, whole, out=np.full(np.shape(part), undefined), where=whole > 0)
+    return shares

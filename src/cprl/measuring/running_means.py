@@ -96,7 +96,7 @@ def _spectrum(at: Values, curve: Values) -> tuple[Values, Values]:
     every = np.arange(np.ceil(at[0]), at[-1])
     steps = np.diff(np.interp(every, at, curve))
     power = np.abs(np.fft.rfft(steps * np.hanning(len(steps)))) ** 2
-    frequency = np.fft.rfftfreq(len(steps))
+    frequency = np.asarray(np.fft.rfftfreq(len(steps)), np.float64)
     seen = (frequency > SLOWEST) & (frequency < FASTEST)
     return power[seen], frequency[seen]
 

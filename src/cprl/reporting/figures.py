@@ -8,8 +8,8 @@ import numpy as np
 from matplotlib.axes import Axes
 
 from cprl.measuring.names import title, unit
-from cprl.measuring.published import PHASED_RECIPE, SMOOTHED_EPISODES, curve
-from cprl.measuring.statistics import curve_interval
+from cprl.measuring.predictions import curve_prediction
+from cprl.measuring.published import PHASED_RECIPE, curve
 from cprl.plotting import style
 from cprl.plotting.bands import (
     STRIP_IN,
@@ -20,9 +20,8 @@ from cprl.plotting.bands import (
     mark_exploration,
     published_bands,
 )
-from cprl.population import exploration_steps
 from cprl.reporting.result import Result, Values
-from cprl.runs.curves import episode_of_step, running_mean
+from cprl.runs.curves import running_mean
 
 TITLES: Final = {
     "return_0": "return of the learner, apples",
@@ -32,7 +31,6 @@ TITLES: Final = {
 HEIGHT_IN: Final = 3.3
 MARGIN: Final = 0.04
 """Empty room above and below all curves, as a share of their range."""
-RESAMPLES: Final = 500
 
 Limits = tuple[float, float]
 
@@ -81,7 +79,7 @@ def _compared(result: Result) -> object:
 
 def _extent(result: Result, metric: str) -> Limits:
     """The lowest and the highest value in a figure."""
-    values = [running_mean(result.curves[metric]).ravel()]
+    values = [running_mean(result.curves[metric], result.window).ravel()]
     if result.study:
         values.append(curve(result.study.curves[metric])[1])
     random = _random(result, metric)
@@ -108,11 +106,10 @@ def _draw(result: Result, metric: str, limits: Limits, path: Path) -> None:
     figure, panels = style.new_figure(heights, title=result.title)
     axes = panels[-1]
     draw_bands(axes, strips.get("ours", []))
-    smoothed = running_mean(result.curves[metric])
+    smoothed = running_mean(result.curves[metric], result.window)
     _draw_curves(axes, smoothed, metric)
     _draw_published(axes, result, metric)
-    ends = exploration_steps(result.experiment.agents)
-    mark_exploration([axes], None if ends is None else episode_of_step(dict(result.curves), ends))
+    mark_exploration([axes], result.exploration_ends)
     add_keys(axes, *strips.values())
     low, high = limits
     margin = MARGIN * ((high - low) or 1.0)
@@ -126,8 +123,9 @@ def _draw(result: Result, metric: str, limits: Limits, path: Path) -> None:
 
 
 def _draw_curves(axes: Axes, smoothed: Values, metric: str) -> None:
-    """Each replica, [R, E], their mean and its interval; an agent's return in the agent's colour."""
-    middle, low, high = curve_interval(smoothed, resamples=RESAMPLES)
+    """Each replica, [R, E], their mean and its interval, and that of one run; an agent's return in the
+    agent's colour."""
+    middle, low, high = curve_prediction(smoothed, runs=None)
     replicas = len(smoothed)
     agent = metric.removeprefix("return_")
     of_agent = agent.isdecimal()
@@ -139,6 +137,8 @@ def _draw_curves(axes: Axes, smoothed: Values, metric: str) -> None:
         lines[0].set_label("ours, each replica")
         at, interval = np.arange(len(middle)), "ours, 95 % interval"
         axes.fill_between(at, low, high, color=wide, alpha=0.45, lw=0, label=interval, zorder=2.2)
+        for bound, label in zip(curve_prediction(smoothed)[1:], ("95 % of single runs", None), strict=True):
+            axes.plot(at, bound, color=wide, lw=0.8, ls=(0, (4, 2)), label=label, zorder=2.1)
     label = f"ours, mean of {replicas} replicas" if replicas > 1 else "ours, one replica"
     axes.plot(middle, linewidth=2.0, marker=dot, label=label, zorder=3, **bold)
 
@@ -156,6 +156,5 @@ def _draw_published(axes: Axes, result: Result, metric: str) -> None:
 
 def _note(result: Result) -> str:
     """How the curves are smoothed."""
-    window = min(SMOOTHED_EPISODES, result.curves["collective_return"].shape[1])
-    note = f"Running means over the episodes that follow: ours over {window}"
-    return f"{note}, published over {result.study.window_episodes}." if result.study else f"{note}."
+    window = min(result.window, result.curves["collective_return"].shape[1])
+    return f"Running means over the {window} episodes that follow."
