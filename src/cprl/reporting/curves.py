@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cprl.measuring.predictions import curve_prediction, prediction
-from cprl.measuring.published import EXPERIMENTS, curve
+from cprl.measuring.published import EXPERIMENTS, agreement, curve
 from cprl.measuring.running_means import estimate_window
 from cprl.reporting import verdicts
 from cprl.reporting.markdown import table
@@ -79,9 +79,9 @@ def distances(results: Sequence[Result]) -> list[str]:
         if found is None:
             rows.append([result.name, metric, TOO_FEW, *[""] * 8])
             continue
-        mean, published = found.ours.mean(0), found.published
-        off = np.abs(mean - published).mean()
-        correlation = np.corrcoef(mean, published)[0, 1] if np.ptp(mean) > 0 else np.nan
+        assert result.study is not None
+        own, published = running_mean(result.curves[metric], result.window).mean(0), found.published
+        correlation, off = agreement(result.study.curves[metric], own)
         levels = found.ours.mean(1)
         rows.append(
             [
