@@ -19,8 +19,8 @@ from cprl import arguments
 Values = NDArray[np.float64]
 
 SMOOTHED_EPISODES: Final = 100
-"""The window of our running means in episodes, where nothing else is asked for. Beside a published curve it is
-that curve's, `PublishedExperiment.window_episodes`. All are drawn at the first episode of a window."""
+"""The window of our running means in episodes, where nothing else is asked for. Beside a published curve it
+is that curve's, `PublishedExperiment.window_episodes`. All are drawn at the first episode of a window."""
 PHASED_RECIPE: Final = "commons"
 """Our recipe of experiment 5, the only one whose phases the study draws."""
 PHASES_BEGIN: Final = (450, 1500, 2400)

@@ -5,14 +5,13 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from cprl.commons.game import Game
 from cprl.measuring.predictions import prediction
 from cprl.reporting import verdicts
 from cprl.reporting.claims import with_interval
 from cprl.reporting.curves import RUNS
 from cprl.reporting.markdown import table
 from cprl.reporting.random_play import EPISODES, PUBLISHED_EPISODES, returns_by_chance
-from cprl.reporting.result import Result
+from cprl.reporting.result import TOO_FEW, Result
 
 Values = NDArray[np.float64]
 
@@ -25,11 +24,11 @@ def appendix(results: Sequence[Result]) -> list[str]:
 def _random(results: Sequence[Result]) -> list[str]:
     rows = []
     for result in results:
-        study, game = result.study, result.experiment.game
-        assert study is not None
-        if study.random is None or not isinstance(game, Game) or game.institutions:
+        if not result.has_random_score:
             continue
-        values = returns_by_chance(game)
+        study, values = result.study, returns_by_chance(result.experiment.game)
+        assert study is not None
+        assert study.random is not None
         rows.append(
             [
                 result.name,
@@ -59,11 +58,10 @@ def _trained(results: Sequence[Result]) -> list[str]:
         assert study is not None
         values = result.curves["collective_return"].mean(1)
         cells = [result.name, f"{study.number}", f"{study.trained}", with_interval(values)]
+        whole = result.curves["collective_return"].shape[1] >= study.episodes
         for runs in RUNS:
-            cells += [
-                f"{prediction(values, runs=runs)}",
-                verdicts.of_number(study.trained, values, runs=runs),
-            ]
+            judged = verdicts.of_number(study.trained, values, runs=runs)
+            cells += [f"{prediction(values, runs=runs)}", judged] if whole else ["", TOO_FEW]
         rows.append([*cells, _evaluated(result, "trained")])
     head = ["run", "experiment", "published", "mean over training, ours"]
     head += ["one run", "verdict", "mean of two runs", "verdict", "evaluation at epsilon 0.05, ours"]
@@ -76,13 +74,19 @@ def returns_of_others(results: Sequence[Result]) -> list[str]:
         [
             result.name,
             _evaluated(result, "random"),
-            with_interval(result.curves["collective_return"].mean(1)),
+            *(_part(result, first, end) for first, end in ((0, 150), (500, 1000), (0, None))),
             _evaluated(result, "trained"),
         ]
         for result in results
     ]
-    head = ["run", "random play", "mean over training", "evaluation"]
+    head = ["run", "random play", "first 150 episodes", "500 to 1000", "whole training", "evaluation"]
     return ["## Collective return", "", *table(head, rows)] if rows else []
+
+
+def _part(result: Result, first: int, end: int | None) -> str:
+    """The mean of these episodes over replicas; "" if there are too few."""
+    values = result.curves["collective_return"]
+    return with_interval(values[:, first:end].mean(1)) if values.shape[1] >= (end or 1) else ""
 
 
 def _evaluated(result: Result, policy: str) -> str:

@@ -172,10 +172,17 @@ def _settings(result: Result) -> dict[str, Any]:
 
 
 def _differing(runs: Sequence[tuple[Result, Combat]]) -> list[str]:
-    """The settings in which runs differ."""
+    """The settings in which runs differ, but for those that all runs with the same rules share: they belong
+    to the variant of the study."""
     tables = [_settings(result) for result, _ in runs]
     names = dict.fromkeys(name for one in tables for name in one)
-    return [name for name in names if len({repr(one.get(name)) for one in tables}) > 1]
+
+    def values(name: str, rules: object) -> set[str]:
+        return {repr(one.get(name)) for one in tables if one["rules"] == rules}
+
+    variants = {one["rules"] for one in tables}
+    varied = [name for name in names if any(len(values(name, rules)) > 1 for rules in variants)]
+    return ["rules"] * (len(variants) > 1) + varied
 
 
 def _published(result: Result, metric: str) -> tuple[Values, Values]:

@@ -6,6 +6,7 @@ from typing import Final
 
 import numpy as np
 from matplotlib.axes import Axes
+from PIL import Image
 
 from cprl.measuring.names import title, unit
 from cprl.measuring.predictions import curve_prediction
@@ -20,6 +21,7 @@ from cprl.plotting.bands import (
     mark_exploration,
     published_bands,
 )
+from cprl.reporting.random_play import returns_by_chance
 from cprl.reporting.result import Result, Values
 from cprl.runs.curves import running_mean
 
@@ -29,6 +31,8 @@ TITLES: Final = {
 }
 """Of the returns of single agents, which are drawn for experiment 4 alone."""
 HEIGHT_IN: Final = 3.3
+COLOURS: Final = 128
+"""The number of colours of a figure."""
 MARGIN: Final = 0.04
 """Empty room above and below all curves, as a share of their range."""
 
@@ -89,6 +93,8 @@ def _extent(result: Result, metric: str) -> Limits:
 
 def _random(result: Result, metric: str) -> float | None:
     """The mean of random play; None if there is no evaluation."""
+    if metric == "collective_return" and result.has_random_score:
+        return float(returns_by_chance(result.experiment.game).mean())
     found = result.evaluated("random")
     if found is None or metric not in found or np.isnan(found[metric]).all():
         return None
@@ -119,12 +125,20 @@ def _draw(result: Result, metric: str, limits: Limits, path: Path) -> None:
     for strip in panels[:-1]:
         draw_strip(strip, strips)
     style.legend_below(figure, [axes], note=_note(result))
-    style.save(figure, path)
+    _shrink(style.save(figure, path))
+
+
+def _shrink(path: Path) -> None:
+    """Writes a PNG again with few colours, a third of the size: results are committed."""
+    with Image.open(path) as picture:
+        few = picture.convert("RGB").quantize(
+            COLOURS, method=Image.Quantize.MAXCOVERAGE, dither=Image.Dither.NONE
+        )
+    few.save(path, optimize=True)
 
 
 def _draw_curves(axes: Axes, smoothed: Values, metric: str) -> None:
-    """Each replica, [R, E], their mean and its interval, and that of one run; an agent's return in the
-    agent's colour."""
+    """Each replica, [R, E], their mean and its interval; an agent's return in the agent's colour."""
     middle, low, high = curve_prediction(smoothed, runs=None)
     replicas = len(smoothed)
     agent = metric.removeprefix("return_")
@@ -137,8 +151,6 @@ def _draw_curves(axes: Axes, smoothed: Values, metric: str) -> None:
         lines[0].set_label("ours, each replica")
         at, interval = np.arange(len(middle)), "ours, 95 % interval"
         axes.fill_between(at, low, high, color=wide, alpha=0.45, lw=0, label=interval, zorder=2.2)
-        for bound, label in zip(curve_prediction(smoothed)[1:], ("95 % of single runs", None), strict=True):
-            axes.plot(at, bound, color=wide, lw=0.8, ls=(0, (4, 2)), label=label, zorder=2.1)
     label = f"ours, mean of {replicas} replicas" if replicas > 1 else "ours, one replica"
     axes.plot(middle, linewidth=2.0, marker=dot, label=label, zorder=3, **bold)
 

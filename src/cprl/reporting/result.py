@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 
 from cprl import presets
 from cprl.algorithms import DQN
+from cprl.commons.game import Game
 from cprl.experiment import Experiment
 from cprl.measuring.published import SMOOTHED_EPISODES, PublishedExperiment, published_experiment
 from cprl.population import Learning, exploration_steps
@@ -63,6 +64,13 @@ class Result:
     def variant(self) -> str | None:
         """The variant of the study's rules that its game has; None for others."""
         return presets.variant_of(self.experiment.game)
+
+    @property
+    def has_random_score(self) -> bool:
+        """Whether the study gives a random score, and the game is one that random play is played in."""
+        game, study = self.experiment.game, self.study
+        plain = isinstance(game, Game) and not game.institutions
+        return plain and study is not None and study.random is not None
 
     @property
     def window(self) -> int:
