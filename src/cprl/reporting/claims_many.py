@@ -7,6 +7,7 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
+from cprl import presets
 from cprl.measuring.combat import FALL, LONG, METRICS, RISE, Combat, combat
 from cprl.measuring.published import PHASED_RECIPE, PHASES_BEGIN, curve
 from cprl.measuring.shares import share
@@ -97,7 +98,8 @@ def combat_of(result: Result) -> Combat | None:
 
 
 def combat_section(results: Sequence[Result]) -> list[str]:
-    """The section on combat in every run of `commons`, replica by replica; empty without such a run."""
+    """The section on combat in every run on the board of experiment 5, replica by replica; empty without
+    one."""
     runs = [(one, found) for one in results if _is_commons(one) and (found := combat_of(one))]
     if not runs:
         return []
@@ -153,7 +155,10 @@ def _published_combat() -> Combat:
 
 
 def _is_commons(result: Result) -> bool:
-    return result.study is not None and result.study.recipe == PHASED_RECIPE
+    """Whether a run is of experiment 5, or of a study on its board."""
+    board = getattr(result.experiment.game, "map", None)
+    repeated = result.study is not None and result.study.recipe == PHASED_RECIPE
+    return repeated or board == presets.game("commons").map
 
 
 def _settings(result: Result) -> dict[str, Any]:

@@ -57,7 +57,7 @@ def write_report(runs: Sequence[Path], out: Path) -> Path:
         *curves.parts(of_study),
         *phases_of(of_study),
         *turning_points_of(of_study),
-        *claims_many.combat_section(of_study),
+        *claims_many.combat_section(results),
         *_claims(of_study),
         *_measures(results),
         *_figures(results, out),
