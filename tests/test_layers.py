@@ -59,6 +59,7 @@ PACKAGES = (
     "reporting",
     "flags",
     "commandline",
+    "evaluation_cli",
     "studies_options",
     "studies_cli",
     "cli",
