@@ -7,6 +7,7 @@ from collections import Counter
 from dataclasses import replace
 from pathlib import Path
 
+import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
 import torch
@@ -22,6 +23,8 @@ from cprl.population import Learning, Scripted
 from cprl.runs.checkpoints import Checkpointer, checkpoints_in, read_checkpoint
 from cprl.runs.episodes import EpisodeTable, read_episodes
 from cprl.runs.weights import load_weights, save_weights
+from cprl.studies import StudyTable
+from cprl.studies.tables.sources import design_of
 from cprl.training import train
 
 RECIPES = Path(__file__).parents[1] / "recipes"
@@ -44,6 +47,57 @@ def test_every_way_to_learn_has_four_candidates_of_its_own(board, monkeypatch):
     assert ways == dict.fromkeys(("DQN", "PPO", "IPPO", "VDN", "QMIX", "MAPPO", "MADDPG", "PR2", "LOLA"), 4)
     assert len({condition.checksum for condition in study.all_conditions}) == 36
     assert {condition.experiment.seed for condition in study.all_conditions} == {1000}
+
+
+def tuned(study, values):
+    """The table of a tuning in which each candidate got so much in fresh worlds."""
+    row = {"marks": "", "part": "evaluation", "metric": "collective_return", "episode": 0} | {
+        "window_episodes": 20,
+        "undefined": 0,
+    }
+    rows = [
+        {"condition": name, "checksum": "", "run": "", "replica": replica, "value": value + replica, **row}
+        for name, value in values.items()
+        for replica in range(2)
+    ]
+    table = pa.Table.from_pylist(rows)
+    return StudyTable(design=design_of(study), rows=table, window=10, lacking=(), made={})
+
+
+def test_the_comparison_of_learners_takes_the_candidates_that_got_most(monkeypatch):
+    monkeypatch.syspath_prepend(str(RECIPES / "learners"))
+    ways = recipe("ways", RECIPES / "learners")
+    study = ways.tuning("two_complex")
+    names = [condition.name for condition in study.all_conditions]
+    chosen = ways.winners(tuned(study, {name: -nth % 5 for nth, name in enumerate(names)}))
+    # -nth % 5 is 0 4 3 2, 1 0 4 3, ..: the second candidate of the first way, the third one of the second
+    assert list(chosen) == list(ways.WAYS)
+    assert f"DQN: {chosen['DQN']}" == names[1]
+    assert f"PPO: {chosen['PPO']}" == names[6]
+    compared = ways.comparison("two_complex", chosen, {"": 1200, "LOLA": 1500})
+    by_name = {condition.name: condition.experiment for condition in compared.all_conditions}
+    assert list(by_name) == [*ways.WAYS, "DQN as run"]
+    assert {name: own.episodes for name, own in by_name.items() if own.episodes != 1200} == {"LOLA": 1500}
+    assert {own.seed for own in by_name.values()} == {0}, "none of the tuning's"
+    settings = by_name["PPO"].agents[0].algorithm.settings
+    assert f"learning rate {settings.learning_rate}" in chosen["PPO"]
+    as_run = by_name["DQN as run"].agents[0].algorithm.settings
+    assert as_run == presets.dqn_settings("two_complex", variant="as_run")
+
+
+def test_agents_of_a_study_of_learners_meet_in_a_cross_play(tmp_path, monkeypatch, capsys):
+    monkeypatch.syspath_prepend(str(RECIPES / "learners"))
+    ways = recipe("ways", RECIPES / "learners")
+    few = {name: ways.WAYS[name].candidates(1000) for name in ("DQN", "MAPPO")}
+    algorithms = {name: next(iter(own.values())) for name, own in few.items()}
+    how = {"episodes": 2, "evaluation_episodes": 1, "replicas": 2}
+    study = ways.study("two_complex", algorithms, name="few", question="", expectation="", **how)
+    eager = replace(study, experiment=replace(study.experiment, engine="eager"))
+    cprl.run_study(eager, tmp_path / "few", results=False, progress=False)
+    recipe("cross_play", RECIPES / "learners").main(tmp_path / "few", episodes=1)
+    rows = pq.read_table(tmp_path / "few" / "cross_play.parquet").to_pydict()
+    assert set(rows["focal"]) == {"DQN", "MAPPO"} == set(rows["background"])
+    assert (tmp_path / "few" / "cross_play.png").exists()
 
 
 def run_recipe(name, out, *, own=None, watch="file", **changes):
