@@ -59,15 +59,17 @@ def run_in_miniature(tmp_path, capsys, **arguments):
     return run, capsys.readouterr().out
 
 
+BOARD_OF = {"two_against_random": "two_complex"}
 LANES = {"single_basic": 1, "single_complex": 1, "two_complex": 2, "two_against_random": 2, "commons": 4}
 
 
 @pytest.mark.parametrize(
     ("name", "variant"),
     [
-        pytest.param(name, variant, marks=[pytest.mark.slow] * (variant == "as_run"))
+        pytest.param(name, variant, marks=[pytest.mark.slow] * (variant != "published"))
         for name in LANES
         for variant in presets.VARIANTS
+        if (BOARD_OF.get(name, name), variant) in presets.GAMES
     ],
 )
 def test_recipes_of_replicas_leave_a_run_directory(name, variant, tmp_path, capsys):
