@@ -46,6 +46,26 @@ def test_every_way_to_learn_has_four_candidates_of_its_own(board, monkeypatch):
     assert {condition.experiment.seed for condition in study.all_conditions} == {1000}
 
 
+def test_the_study_of_experiment_3_has_the_two_programs_and_each_difference_alone():
+    conditions = {
+        own.name: own.experiment for own in recipe("experiment_3", RECIPES / "studies").STUDY.all_conditions
+    }
+    assert list(conditions) == ["as run", "gamma 0.999", "the fault", "10 April: both"]
+    of = {
+        variant: recipe("two_complex").experiment(variant=variant)
+        for variant in ("as_run", "as_run_10_april")
+    }
+    later, earlier = of["as_run"], of["as_run_10_april"]
+    assert {(own.episodes, own.replicas, own.seed) for own in conditions.values()} == {(6000, 8, 0)}
+    parts = {name: (own.game, own.agents) for name, own in conditions.items()}
+    assert parts == {
+        "as run": (later.game, later.agents),
+        "gamma 0.999": (later.game, earlier.agents),
+        "the fault": (earlier.game, later.agents),
+        "10 April: both": (earlier.game, earlier.agents),
+    }
+
+
 def run_recipe(name, out, *, own=None, watch="file", **changes):
     """Runs the experiment of a recipe, in miniature."""
     experiment = recipe(name).experiment(**(own or {}))

@@ -14,17 +14,19 @@ TRACES = sorted((Path(__file__).parent / "traces").glob("*.npz"))
 REGROW_PROB = {"none": (0.0,), "all": (0.0, 1.0)}
 
 
-EARLIER = "two_complex_10_april"
-"""The program of cba933a, in which agent 1's action "right" moves agent 0."""
+EARLIER, NO_BEAM = "two_complex_10_april", "two_complex_no_beam"
+"""Of cba933a and, without a beam, of 65e3bf7: agent 1's action "right" moves agent 0."""
 
 
 def traced_game(name: str):
     board, _, regrowth = name.rpartition("_")
-    if board == EARLIER:
+    if board in (EARLIER, NO_BEAM):
         game = presets.game("two_complex", variant="as_run_10_april")
     else:
         game = presets.game(board, variant="as_run")
-    return replace(game, rules=replace(game.rules, regrow_prob=REGROW_PROB[regrowth], episode_steps=10_000))
+    changed = {"regrow_prob": REGROW_PROB[regrowth], "episode_steps": 10_000}
+    changed |= {"may_fire": False} if board == NO_BEAM else {}
+    return replace(game, rules=replace(game.rules, **changed))
 
 
 @pytest.mark.parametrize("path", TRACES, ids=lambda path: path.stem)
@@ -44,8 +46,9 @@ def test_windows_rewards_tags_and_ends_equal_the_published_program(path):
             assert in_play == trace["untagged"][turn], f"agents in play differ in turn {turn}"
 
 
-def test_all_ten_traces_are_there():
-    names = {f"{board}_{regrowth}" for board in (*presets.BOARDS, EARLIER) for regrowth in REGROW_PROB}
+def test_all_twelve_traces_are_there():
+    boards = (*presets.BOARDS, EARLIER, NO_BEAM)
+    names = {f"{board}_{regrowth}" for board in boards for regrowth in REGROW_PROB}
     assert {path.stem for path in TRACES} == names
 
 
@@ -53,9 +56,10 @@ def test_one_trace_ends_by_depletion():
     assert [path.stem for path in TRACES if np.load(path)["done"].any()] == ["commons_none"]
 
 
+@pytest.mark.parametrize("board", [EARLIER, NO_BEAM])
 @pytest.mark.parametrize("regrowth", REGROW_PROB)
-def test_the_earlier_program_is_another_game_without_its_fault(regrowth):
-    path = Path(__file__).parent / "traces" / f"{EARLIER}_{regrowth}.npz"
+def test_the_programs_with_the_fault_play_another_game_without_it(board, regrowth):
+    path = Path(__file__).parent / "traces" / f"{board}_{regrowth}.npz"
     trace, game = np.load(path), traced_game(path.stem)
     batch = Batch(replace(game, rules=replace(game.rules, agent_1_right_moves_agent_0=False)), 1)
     output = batch.begin(batch.new_output())
