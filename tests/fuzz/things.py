@@ -100,7 +100,10 @@ TEAM: Final = Team(VDN(settings=REPLAY), agents=(0, 1))
 
 EXAMPLES: Final[dict[type, tuple[Any, ...]]] = {
     Map: (MEADOW.map, ALONE.map, maps.named("commons"), maps.rooms()),
-    Rules: (Rules(), MEADOW.rules, ALONE.rules, presets.game("commons", variant="as_run").rules),
+    Rules: (
+        *(Rules(), MEADOW.rules, ALONE.rules, presets.game("commons", variant="as_run").rules),
+        presets.game("two_complex", variant="as_run_10_april").rules,
+    ),
     Observation: (
         Observation(),
         Observation(area="full", encoding="one_hot"),
