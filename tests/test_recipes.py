@@ -3,6 +3,7 @@
 import importlib.util
 import json
 import re
+import sys
 from collections import Counter
 from dataclasses import replace
 from pathlib import Path
@@ -17,6 +18,7 @@ import cprl
 from cprl import CommonsEnv, presets
 from cprl.agents import Population
 from cprl.algorithms import DQN, PPO
+from cprl.commandline import parse
 from cprl.learners.replay import ReplayLearner
 from cprl.measuring.evaluate import evaluate
 from cprl.population import Learning, Scripted
@@ -24,6 +26,7 @@ from cprl.runs.checkpoints import Checkpointer, checkpoints_in, read_checkpoint
 from cprl.runs.episodes import EpisodeTable, read_episodes
 from cprl.runs.weights import load_weights, save_weights
 from cprl.studies import StudyTable
+from cprl.studies.conditions import Condition
 from cprl.studies.tables.sources import design_of
 from cprl.training import train
 
@@ -175,6 +178,19 @@ def test_recipes_of_replicas_leave_a_run_directory(name, variant, tmp_path, caps
             game.spaces, agents=[0], replicas=1, settings=settings, compile=False
         ).networks()
         restore_weights_of(network["replica_0/agent_0"], weights["replica_1/agent_2"])
+
+
+def test_a_version_of_the_program_on_the_command_line_is_a_condition_of_the_studies(monkeypatch):
+    monkeypatch.syspath_prepend(str(RECIPES / "studies"))
+    study = recipe("experiment_5", RECIPES / "studies").STUDY
+    sys.modules.pop("base")
+    line = "commons.py --variant as_run --gamma 0.997 --episodes 2600 --target-every-episodes 10"
+    words = f"{line} --optimizer keras_rmsprop --loss-function log_cosh".split()
+    experiment, _ = parse(recipe("commons").experiment, words)
+    assert experiment == cprl.Experiment.from_recipe(experiment.to_recipe("run"), directory="run")
+    assert Condition(experiment).checksum == study.all_conditions[-1].checksum
+    plain, _ = parse(recipe("commons").experiment, words[:-4])
+    assert Condition(plain).checksum == study.all_conditions[1].checksum
 
 
 def test_two_agents_without_the_beam_never_fire(tmp_path):

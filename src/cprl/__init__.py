@@ -21,7 +21,7 @@ Each imports only from those above it:
     games        games of the user's own, as a recipe holds them
     preferences  what agents want: the reward that each learns from
     networks     from observations to numbers
-    objectives   losses that TorchRL lacks: MADDPG, PR2, LOLA
+    objectives   losses that TorchRL lacks: log-cosh, MADDPG, PR2, LOLA
     policies     from observations to actions: learned, tabular and scripted agents
     collectors   one step of all worlds after the other
     learners     replay and rollouts, updates of many agents at once

@@ -82,7 +82,9 @@ def dqn_settings(board: Board, *, variant: Variant = "published") -> DQNSettings
     """The hyperparameters of the DQN agents on a board.
 
     The text gives the decay of epsilon on `commons` as 1,000,000 steps; versions of the program have
-    500,000, 1,000,000 and, the last one, 5,000,000. All variants use the value of the text.
+    500,000, 1,000,000 and, the last one, 5,000,000. All variants use the value of the text. Versions of the
+    program also had other discounts, optimisers and losses: `replace(dqn_settings("commons",
+    variant="as_run"), gamma=0.997, optimizer="keras_rmsprop")` with `DQN(..., loss_function="log_cosh")`.
 
     Raises:
         ValueError: if the board or variant is unknown, or the board has no such variant.

@@ -130,7 +130,11 @@ EXAMPLES: Final[dict[type, tuple[Any, ...]]] = {
     MLP: (MLP(), MLP(hidden_cells=(4,))),
     Conv: (Conv(), Conv(channels=(2,), kernel_cells=3, hidden_cells=(4,))),
     Custom: (Custom("torchrl.envs.transforms:RewardScaling", arguments={"loc": 0.0, "scale": 2.0}),),
-    DQN: (DQN(settings=REPLAY), DQN(settings=REPLAY, double=True, network=MLP(hidden_cells=(3,)))),
+    DQN: (
+        DQN(settings=REPLAY),
+        DQN(settings=REPLAY, double=True, network=MLP(hidden_cells=(3,))),
+        DQN(settings=replace(REPLAY, optimizer="keras_rmsprop"), loss_function="log_cosh"),
+    ),
     DistributionalDQN: (DistributionalDQN(settings=REPLAY, atoms=5),),
     CQL: (CQL(settings=REPLAY),),
     SAC: (SAC(settings=REPLAY),),
