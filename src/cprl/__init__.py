@@ -17,6 +17,7 @@ Each imports only from those above it:
     memory       devices, and what would not fit into their memory
     institutions  rules that people make: boundaries, quotas, taxes, sanctions, votes; numpy alone
     commons      the game: maps, rules, turns; numpy and numba alone
+    theory       games with a known answer: herders, appropriation, what apples can bear; numpy alone
     envs         TorchRL, PettingZoo, Gymnasium; make_env, where environments are put together
     games        games of the user's own, as a recipe holds them
     preferences  what agents want: the reward that each learns from
