@@ -172,8 +172,8 @@ def test_recipes_of_replicas_leave_a_run_directory(name, variant, tmp_path, caps
             (r, e) for r in range(2) for e in range(2)
         ]
     assert json.loads((run / "report.json").read_text())["training_s"] > 0
-    game, settings = presets.game("commons"), presets.dqn_settings("commons", variant=variant)
     if name == "commons":
+        game, settings = presets.game("commons"), presets.dqn_settings("commons", variant=variant)
         network = ReplayLearner(
             game.spaces, agents=[0], replicas=1, settings=settings, compile=False
         ).networks()

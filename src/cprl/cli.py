@@ -116,7 +116,8 @@ def play(
         others: the directory of a run, whose agents play, or random, greedy, sustainable, territorial,
             aggressive or pacifist; by default the agents of the run that is the board, else greedy.
         replica: of the run whose agents play.
-        variant: of the boards with a name, published or as_run; see docs/game.md.
+        variant: of the boards with a name: published, as_run or, of two_complex, as_run_10_april; see
+            docs/game.md.
         steps: turns of the episode at most; by default those of the game.
         seed: of all chance; the same seed and the same keys play the same again.
         decision: what you vote for in a game with votes or elections, by its number; by default chance votes.
