@@ -15,7 +15,8 @@ def experiment(*, variant: presets.Variant = "published") -> cprl.Experiment:
     """A DQN agent beside a random walker on `two_complex`.
 
     Args:
-        variant: the rules and the learner as the study is written, or as it was run.
+        variant: the rules and the learner as the study is written, as it was run, or as an earlier version of
+            its program (docs/game.md).
     """
     settings = presets.dqn_settings("two_complex", variant=variant)
     return cprl.Experiment(

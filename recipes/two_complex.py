@@ -18,7 +18,8 @@ def experiment(*, variant: presets.Variant = "published", beam: bool = True) -> 
     """Two independent DQN agents on `two_complex`.
 
     Args:
-        variant: the rules and the learner as the study is written, or as it was run.
+        variant: the rules and the learner as the study is written, as it was run, or as an earlier version of
+            its program (docs/game.md).
         beam: whether agents have the beam; without it nobody is tagged.
     """
     game = presets.game("two_complex", variant=variant)

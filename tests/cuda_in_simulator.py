@@ -161,7 +161,11 @@ def stopped() -> None:
         GraduatedSanctions(freeze_steps=((1,), (2,), (3,)), on="tags"),
     )
     rules = replace(
-        EVERYTHING.rules, pairwise_clashes=True, regrow_before_bites=True, freeze_counts_tag_turn=True
+        EVERYTHING.rules,
+        pairwise_clashes=True,
+        regrow_before_bites=True,
+        freeze_counts_tag_turn=True,
+        agent_1_right_moves_agent_0=True,
     )
     play(replace(EVERYTHING, rules=rules, institutions=own), turns=6)
 
@@ -169,7 +173,7 @@ def stopped() -> None:
 CHECKS: dict[str, Callable[[], None]] = {
     **{
         name: (lambda name=name: published(name))
-        for name in (f"{board}:{variant}" for board in presets.BOARDS for variant in presets.VARIANTS)
+        for name in (f"{board}:{variant}" for board, variant in presets.GAMES)
     },
     "forms": forms,
     "blocks": blocks,

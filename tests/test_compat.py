@@ -205,6 +205,26 @@ def test_conservative_q_learning_bootstraps_from_its_target():
         torch.testing.assert_close(loss(batch)["loss_qvalue"].detach(), by_hand)
 
 
+class Squared(compat.ReshapedLoss, DQNLoss):
+    """The squares of the losses of transitions."""
+
+    def reshape_each(self, losses):
+        return losses.square()
+
+
+def test_losses_of_transitions_pass_through_a_function_before_they_are_reduced():
+    batch, actor, found = transitions(6), q_actor(), {}
+    for kind in (DQNLoss, Squared):
+        for reduction in ("none", "mean"):
+            loss = kind(actor, delay_value=True, action_space="categorical", reduction=reduction)
+            loss.make_value_estimator(ValueEstimators.TD0, gamma=0.5)
+            compat.promise_targets(loss)
+            found[kind, reduction] = loss(batch)["loss"]
+    with relies_on("LossModule._reduce_loss", used_by="compat.ReshapedLoss"):
+        torch.testing.assert_close(found[Squared, "none"], found[DQNLoss, "none"].square())
+        torch.testing.assert_close(found[Squared, "mean"], found[DQNLoss, "none"].square().mean())
+
+
 def doubled(values):
     return values * 2
 

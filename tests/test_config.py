@@ -2,6 +2,7 @@
 
 import json
 from dataclasses import dataclass, fields
+from typing import get_args
 
 import pytest
 import torch
@@ -49,7 +50,9 @@ from cprl.institutions import (
     Vote,
 )
 from cprl.learners.decisions import Bandit
+from cprl.learners.settings import Optimizer
 from cprl.networks import MLP, Conv
+from cprl.objectives.log_cosh import DISTANCES
 from cprl.population import Frozen, Learning, Scripted, Team
 from cprl.preferences import Exchange, InequityAversion, SocialValueOrientation
 
@@ -79,13 +82,20 @@ DQNS = st.builds(
     replay_transforms=st.lists(CUSTOM, max_size=2).map(tuple),
     target_every_episodes=st.integers(1, 20),
     relu_on_outputs=st.booleans(),
+    optimizer=st.sampled_from(get_args(Optimizer)),
 )
 ROLLOUTS = st.builds(RolloutSettings, max_grad_norm=st.none() | POSITIVE, epochs=st.integers(1, 9))
 LOOKS = st.builds(LOLASettings, max_grad_norm=st.none() | POSITIVE, critic_epochs=st.integers(0, 9))
 TABULARS = st.builds(TabularSettings, learning_rate=st.just("1/visits") | SHARES)
 NETWORKS = st.none() | st.builds(MLP) | st.builds(Conv, channels=st.just((4, 8))) | CUSTOM
 ALONE = st.one_of(
-    st.builds(DQN, settings=DQNS, double=st.booleans(), network=NETWORKS),
+    st.builds(
+        DQN,
+        settings=DQNS,
+        double=st.booleans(),
+        loss_function=st.sampled_from(DISTANCES),
+        network=NETWORKS,
+    ),
     *[st.builds(kind, settings=DQNS) for kind in (DistributionalDQN, CQL, SAC, IQL, PR2, PR2ActorCritic)],
     *[st.builds(kind, settings=ROLLOUTS) for kind in (PPO, A2C, Reinforce)],
     st.builds(Tabular, settings=TABULARS),

@@ -21,7 +21,7 @@ from cprl.policies.single import RandomActor
 from cprl.training import train
 
 SCRIPT = Path(__file__).with_name("cuda_in_simulator.py")
-GAMES = [f"{board}:{variant}" for board in presets.BOARDS for variant in presets.VARIANTS]
+GAMES = [f"{board}:{variant}" for board, variant in presets.GAMES]
 
 GOVERNED = ["institutions", "stopped"]
 
@@ -50,8 +50,7 @@ def test_the_simulator_exits_without_an_error(simulated):
 
 
 @pytest.mark.gpu
-@pytest.mark.parametrize("variant", presets.VARIANTS)
-@pytest.mark.parametrize("board", presets.BOARDS)
+@pytest.mark.parametrize(("board", "variant"), presets.GAMES)
 def test_the_gpu_plays_the_same_game_as_the_cpu(board, variant):
     check_gpu(presets.game(board, variant=variant))
 

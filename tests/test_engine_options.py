@@ -32,6 +32,7 @@ OPTIMIZERS = {
     "adam": partial(torch.optim.Adam, eps=1e-6),
     "adamw": partial(torch.optim.AdamW, eps=1e-6),
     "rmsprop": partial(torch.optim.RMSprop, eps=1e-6),
+    "keras_rmsprop": partial(torch.optim.RMSprop, eps=1e-6, alpha=0.9),
     "sgd": torch.optim.SGD,
 }
 
@@ -363,7 +364,7 @@ def test_a_transform_that_does_not_fit_is_refused_by_name():
         (partial(DQNSettings, tau=1.5), "tau is 1.5"),
         (
             partial(DQNSettings, optimizer="lion"),
-            "optimizer is 'lion'; allowed: 'adam', 'adamw', 'rmsprop', 'sgd'",
+            "optimizer is 'lion'; allowed: 'adam', 'adamw', 'rmsprop', 'keras_rmsprop', 'sgd'",
         ),
         (partial(DQNSettings, learning_rate=0.0), "learning_rate is 0.0; allowed: a number in 1e-12"),
         (partial(DQNSettings, adam_eps=-1.0), "adam_eps is -1.0"),

@@ -6,16 +6,20 @@ import shutil
 from dataclasses import replace
 from math import isnan
 
+import matplotlib
 import numpy as np
 import pyarrow.parquet as pq
 import pytest
 import torch
+from PIL import Image
 from test_population import ALGORITHMS
 
 import cprl
 from cprl import CommonsEnv, Experiment, Game, Observation, Rules, cli, maps
 from cprl.agents import Population
+from cprl.evaluation import draw_gains, gains
 from cprl.evaluation.film import film
+from cprl.evaluation.gains import diagonal_returns
 from cprl.evaluation.lanes import Source, policies_of
 from cprl.evaluation.same_game import differences
 from cprl.learners.lanes import EVALUATION, lane_seeds
@@ -379,6 +383,84 @@ def test_runs_of_the_same_name_are_told_apart_by_their_paths(scripted, tmp_path)
     assert list(found.runs) == [str(scripted["greedy"]), str(copy)]
 
 
+def test_runs_get_the_names_that_they_are_given(scripted):
+    found = cprl.crossplay({"bites": scripted["greedy"], "waits": scripted["sustainable"]}, episodes=1)
+    assert list(found.runs) == ["bites", "waits"]
+    assert found.cell("waits", "bites").measures()["background/return"].estimate.value == 2.5
+    with pytest.raises(ValueError, match=r"a name of a run is 1; allowed: a text"):
+        cprl.crossplay({1: scripted["greedy"], "waits": scripted["sustainable"]})
+
+
+def with_returns(played, returns):
+    """The same cross-play with other returns: of both agents, by cell, focal agent and replica."""
+
+    def changed(at, agent, replica, episodes):
+        own = np.array(returns[at][agent][replica], dtype=float)
+        return [replace(episode, return_=own) for episode in episodes]
+
+    cells = {
+        at: replace(
+            cell,
+            by_agent={
+                agent: {r: changed(at, agent, r, episodes) for r, episodes in by_replica.items()}
+                for agent, by_replica in cell.by_agent.items()
+            },
+        )
+        for at, cell in played.cells.items()
+    }
+    return replace(played, cells=cells)
+
+
+def exploited(scripted):
+    """A cross-play of two replicas in which greedy agents exploit sustainable ones."""
+    found = cprl.crossplay(list(scripted.values()), episodes=1, replicas=[0, 1])
+    among_their_like = {0: [[5, 5], [7, 7]], 1: [[5, 5], [7, 7]]}
+    return with_returns(
+        found,
+        {
+            # focal agents 0 and 1, each in replicas 0 and 1; the focal agent's return stands at its index
+            ("greedy", "sustainable"): {0: [[9, 2], [12, 4]], 1: [[3, 9], [4, 10]]},
+            ("sustainable", "greedy"): {0: [[1, 2], [1, 3]], 1: [[2, 1], [3, 1]]},
+            ("sustainable", "sustainable"): among_their_like,
+            ("greedy", "greedy"): {0: [[2, 2], [2, 2]], 1: [[2, 2], [2, 2]]},
+        },
+    )
+
+
+def test_gains_are_differences_from_the_diagonal_paired_by_replica(scripted):
+    found = gains(exploited(scripted))
+    assert set(found) == {("greedy", "sustainable"), ("sustainable", "greedy")}
+    # Greedy among sustainable agents: focal (9 + 9) / 2 - 5 = 4 and (12 + 10) / 2 - 7 = 4 in replicas 0 and
+    # 1; background (2 + 3) / 2 - 5 = -2.5 and (4 + 4) / 2 - 7 = -3.
+    greedy = found["greedy", "sustainable"]
+    assert (greedy.focal.value, greedy.focal.low, greedy.focal.high) == (4, 4, 4)
+    assert greedy.background.value == -2.75
+    # Student's t for 1 degree of freedom at 97.5 % is 12.706; the standard error is 0.25.
+    assert greedy.background.high == pytest.approx(-2.75 + 12.706 * 0.25, abs=1e-3)
+    assert not greedy.exploits, "that interval holds 0"
+    assert gains(exploited(scripted), interval="bca")["greedy", "sustainable"].exploits
+    # Sustainable among greedy agents: focal 1 - 2; background 2 - 2 = 0 and 3 - 2 = 1.
+    sustainable = found["sustainable", "greedy"]
+    assert (sustainable.focal.value, sustainable.background.value) == (-1, 0.5)
+    assert not sustainable.exploits
+    assert diagonal_returns(exploited(scripted)) == {"greedy": 2, "sustainable": 6}
+    with pytest.raises(ValueError, match=r"played is 3; allowed: what crossplay\(\) gave"):
+        gains(3)
+
+
+def test_the_picture_of_gains_has_a_row_for_each_focal_run(scripted, tmp_path):
+    path = draw_gains(exploited(scripted), tmp_path / "new" / "gains.png")
+    with Image.open(path) as picture:
+        assert min(picture.size) > 500
+        colours = np.asarray(picture.convert("RGB")).reshape(-1, 3)
+    blue, red = (colours == shade(1.0)).all(1).sum(), (colours == shade(0.0)).all(1).sum()
+    assert min(blue, red) > 1000, "the largest gain and the largest loss"
+
+
+def shade(at):
+    return np.round(255 * np.array(matplotlib.colormaps["RdBu"](at)[:3]))
+
+
 def command(monkeypatch, capsys, *words):
     monkeypatch.setattr("sys.argv", ["cprl", *map(str, words)])
     cli.main()
@@ -430,6 +512,26 @@ def test_the_command_crossplay_tells_a_matrix_for_each_number_and_writes_the_epi
         command(monkeypatch, capsys, "crossplay", greedy, sustainable, "--out", out)
     with pytest.raises(SystemExit, match="cprl: the number of runs is 1; allowed: at least two"):
         command(monkeypatch, capsys, "crossplay", greedy)
+
+
+def test_the_command_crossplay_names_runs_and_draws_their_gains(scripted, tmp_path, monkeypatch, capsys):
+    greedy, sustainable = scripted.values()
+    figure = tmp_path / "gains.png"
+    words = ["crossplay", f"bites={greedy}", sustainable, "--episodes", 1, "--figure", figure]
+    text = command(monkeypatch, capsys, *words)
+    rows = [[cell.strip() for cell in line.split("│")[1:-1]] for line in text.splitlines() if "│" in line]
+    assert ["bites", "2.5 [2.5, 2.5]", "2.5 [2.5, 2.5]"] in rows
+    # In place of a sustainable agent, which gets nothing, a greedy one gets 2.5; the other gets as before.
+    assert ["bites", "", "2.5 [2.5, 2.5]"] in rows
+    assert ["sustainable", "-2.5 [-2.5, -2.5]", ""] in rows
+    assert text.splitlines()[-1] == f"Figure: {figure}"
+    assert figure.exists()
+    with pytest.raises(SystemExit, match=r"gains\.png exists and is not overwritten"):
+        command(monkeypatch, capsys, *words)
+    with pytest.raises(SystemExit, match=r"--figure is .*gains\.jpg; allowed: a name that ends in \.png"):
+        command(monkeypatch, capsys, *words[:-1], tmp_path / "gains.jpg")
+    with pytest.raises(SystemExit, match="bites names 2 runs; allowed: each its own, NAME=PATH"):
+        command(monkeypatch, capsys, "crossplay", f"bites={greedy}", f"bites={sustainable}")
 
 
 def test_social_measures_are_those_of_the_docs(scripted):

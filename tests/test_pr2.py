@@ -152,7 +152,7 @@ def test_the_loss_has_no_gradient_for_its_targets_and_takes_other_keys():
         ({"temperature": 0.0}, r"^temperature is 0\.0; allowed: 1e-6\.\.1e6"),
         ({"temperature": float("nan")}, r"^temperature is nan; allowed"),
         ({"entropy_bonus": 1}, r"^entropy_bonus is 1; allowed: True or False"),
-        ({"loss_function": "l3"}, r"^loss_function is 'l3'; allowed: l1, l2, smooth_l1"),
+        ({"loss_function": "l3"}, r"^loss_function is 'l3'; allowed: l1, l2, smooth_l1, log_cosh"),
         ({"reduction": "all"}, r"^reduction is 'all'; allowed: none, mean, sum"),
     ],
 )

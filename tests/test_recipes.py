@@ -3,10 +3,12 @@
 import importlib.util
 import json
 import re
+import sys
 from collections import Counter
 from dataclasses import replace
 from pathlib import Path
 
+import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
 import torch
@@ -16,12 +18,16 @@ import cprl
 from cprl import CommonsEnv, presets
 from cprl.agents import Population
 from cprl.algorithms import DQN, PPO
+from cprl.commandline import parse
 from cprl.learners.replay import ReplayLearner
 from cprl.measuring.evaluate import evaluate
 from cprl.population import Learning, Scripted
 from cprl.runs.checkpoints import Checkpointer, checkpoints_in, read_checkpoint
 from cprl.runs.episodes import EpisodeTable, read_episodes
 from cprl.runs.weights import load_weights, save_weights
+from cprl.studies import StudyTable
+from cprl.studies.conditions import Condition
+from cprl.studies.tables.sources import design_of
 from cprl.training import train
 
 RECIPES = Path(__file__).parents[1] / "recipes"
@@ -46,6 +52,77 @@ def test_every_way_to_learn_has_four_candidates_of_its_own(board, monkeypatch):
     assert {condition.experiment.seed for condition in study.all_conditions} == {1000}
 
 
+def tuned(study, values):
+    """The table of a tuning in which each candidate got so much in fresh worlds."""
+    row = {"marks": "", "part": "evaluation", "metric": "collective_return", "episode": 0} | {
+        "window_episodes": 20,
+        "undefined": 0,
+    }
+    rows = [
+        {"condition": name, "checksum": "", "run": "", "replica": replica, "value": value + replica, **row}
+        for name, value in values.items()
+        for replica in range(2)
+    ]
+    table = pa.Table.from_pylist(rows)
+    return StudyTable(design=design_of(study), rows=table, window=10, lacking=(), made={})
+
+
+def test_the_comparison_of_learners_takes_the_candidates_that_got_most(monkeypatch):
+    monkeypatch.syspath_prepend(str(RECIPES / "learners"))
+    ways = recipe("ways", RECIPES / "learners")
+    study = ways.tuning("two_complex")
+    names = [condition.name for condition in study.all_conditions]
+    chosen = ways.winners(tuned(study, {name: -nth % 5 for nth, name in enumerate(names)}))
+    # -nth % 5 is 0 4 3 2, 1 0 4 3, ..: the second candidate of the first way, the third one of the second
+    assert list(chosen) == list(ways.WAYS)
+    assert f"DQN: {chosen['DQN']}" == names[1]
+    assert f"PPO: {chosen['PPO']}" == names[6]
+    compared = ways.comparison("two_complex", chosen, {"": 1200, "LOLA": 1500})
+    by_name = {condition.name: condition.experiment for condition in compared.all_conditions}
+    assert list(by_name) == [*ways.WAYS, "DQN as run"]
+    assert {name: own.episodes for name, own in by_name.items() if own.episodes != 1200} == {"LOLA": 1500}
+    assert {own.seed for own in by_name.values()} == {0}, "none of the tuning's"
+    settings = by_name["PPO"].agents[0].algorithm.settings
+    assert f"learning rate {settings.learning_rate}" in chosen["PPO"]
+    as_run = by_name["DQN as run"].agents[0].algorithm.settings
+    assert as_run == presets.dqn_settings("two_complex", variant="as_run")
+
+
+def test_agents_of_a_study_of_learners_meet_in_a_cross_play(tmp_path, monkeypatch, capsys):
+    monkeypatch.syspath_prepend(str(RECIPES / "learners"))
+    ways = recipe("ways", RECIPES / "learners")
+    few = {name: ways.WAYS[name].candidates(1000) for name in ("DQN", "MAPPO")}
+    algorithms = {name: next(iter(own.values())) for name, own in few.items()}
+    how = {"episodes": 2, "evaluation_episodes": 1, "replicas": 2}
+    study = ways.study("two_complex", algorithms, name="few", question="", expectation="", **how)
+    eager = replace(study, experiment=replace(study.experiment, engine="eager"))
+    cprl.run_study(eager, tmp_path / "few", results=False, progress=False)
+    recipe("cross_play", RECIPES / "learners").main(tmp_path / "few", episodes=1)
+    rows = pq.read_table(tmp_path / "few" / "cross_play.parquet").to_pydict()
+    assert set(rows["focal"]) == {"DQN", "MAPPO"} == set(rows["background"])
+    assert (tmp_path / "few" / "cross_play.png").exists()
+
+
+def test_the_study_of_experiment_3_has_the_two_programs_and_each_difference_alone():
+    conditions = {
+        own.name: own.experiment for own in recipe("experiment_3", RECIPES / "studies").STUDY.all_conditions
+    }
+    assert list(conditions) == ["as run", "gamma 0.999", "the fault", "10 April: both"]
+    of = {
+        variant: recipe("two_complex").experiment(variant=variant)
+        for variant in ("as_run", "as_run_10_april")
+    }
+    later, earlier = of["as_run"], of["as_run_10_april"]
+    assert {(own.episodes, own.replicas, own.seed) for own in conditions.values()} == {(6000, 8, 0)}
+    parts = {name: (own.game, own.agents) for name, own in conditions.items()}
+    assert parts == {
+        "as run": (later.game, later.agents),
+        "gamma 0.999": (later.game, earlier.agents),
+        "the fault": (earlier.game, later.agents),
+        "10 April: both": (earlier.game, earlier.agents),
+    }
+
+
 def run_recipe(name, out, *, own=None, watch="file", **changes):
     """Runs the experiment of a recipe, in miniature."""
     experiment = recipe(name).experiment(**(own or {}))
@@ -59,15 +136,17 @@ def run_in_miniature(tmp_path, capsys, **arguments):
     return run, capsys.readouterr().out
 
 
+BOARD_OF = {"two_against_random": "two_complex"}
 LANES = {"single_basic": 1, "single_complex": 1, "two_complex": 2, "two_against_random": 2, "commons": 4}
 
 
 @pytest.mark.parametrize(
     ("name", "variant"),
     [
-        pytest.param(name, variant, marks=[pytest.mark.slow] * (variant == "as_run"))
+        pytest.param(name, variant, marks=[pytest.mark.slow] * (variant != "published"))
         for name in LANES
         for variant in presets.VARIANTS
+        if (BOARD_OF.get(name, name), variant) in presets.GAMES
     ],
 )
 def test_recipes_of_replicas_leave_a_run_directory(name, variant, tmp_path, capsys):
@@ -93,12 +172,25 @@ def test_recipes_of_replicas_leave_a_run_directory(name, variant, tmp_path, caps
             (r, e) for r in range(2) for e in range(2)
         ]
     assert json.loads((run / "report.json").read_text())["training_s"] > 0
-    game, settings = presets.game("commons"), presets.dqn_settings("commons", variant=variant)
     if name == "commons":
+        game, settings = presets.game("commons"), presets.dqn_settings("commons", variant=variant)
         network = ReplayLearner(
             game.spaces, agents=[0], replicas=1, settings=settings, compile=False
         ).networks()
         restore_weights_of(network["replica_0/agent_0"], weights["replica_1/agent_2"])
+
+
+def test_a_version_of_the_program_on_the_command_line_is_a_condition_of_the_studies(monkeypatch):
+    monkeypatch.syspath_prepend(str(RECIPES / "studies"))
+    study = recipe("experiment_5", RECIPES / "studies").STUDY
+    sys.modules.pop("base")
+    line = "commons.py --variant as_run --gamma 0.997 --episodes 2600 --target-every-episodes 10"
+    words = f"{line} --optimizer keras_rmsprop --loss-function log_cosh".split()
+    experiment, _ = parse(recipe("commons").experiment, words)
+    assert experiment == cprl.Experiment.from_recipe(experiment.to_recipe("run"), directory="run")
+    assert Condition(experiment).checksum == study.all_conditions[-1].checksum
+    plain, _ = parse(recipe("commons").experiment, words[:-4])
+    assert Condition(plain).checksum == study.all_conditions[1].checksum
 
 
 def test_two_agents_without_the_beam_never_fire(tmp_path):

@@ -29,6 +29,7 @@ WRONG = {
     "paint_over": [1],
     "mark_behind_if_vertical": [1],
     "self_paint_stays": [1],
+    "agent_1_right_moves_agent_0": [1, "yes"],
     "shuffle_starts": [1],
 }
 
@@ -58,7 +59,7 @@ def test_replace_checks_the_new_values():
 
 def test_every_quirk_is_off_as_published_and_on_as_run():
     switches = {field.name for field in fields(Rules) if field.default is False}
-    quirks = switches - {"walls_block_sight", "shuffle_starts"}
+    quirks = switches - {"walls_block_sight", "shuffle_starts", "agent_1_right_moves_agent_0"}
     assert len(quirks) == 8
     for board in presets.BOARDS:
         published = presets.game(board).rules

@@ -33,6 +33,7 @@ CASES = {
     "softer targets": DQN(settings=replace(SMALL, tau=0.01)),
     "another optimiser": DQN(settings=replace(SMALL, optimizer="rmsprop")),
     "another optimiser and rate": DQN(settings=replace(SMALL, optimizer="rmsprop", learning_rate=1e-2)),
+    "that of Keras": DQN(settings=replace(SMALL, optimizer="keras_rmsprop")),
     "larger batches": DQN(settings=replace(SMALL, batch_size=16)),
 }
 SHARING = ("plain", "another gamma", "another learning rate", "another exploration", "another target period")
@@ -108,6 +109,7 @@ def test_learners_that_differ_in_numbers_alone_share_code_and_differ_in_what_the
         pytest.param(("plain", "another buffer"), marks=pytest.mark.slow),
         pytest.param(("soft targets", "softer targets"), marks=pytest.mark.slow),
         pytest.param(("another optimiser", "another optimiser and rate"), marks=pytest.mark.slow),
+        pytest.param(("another optimiser", "that of Keras"), marks=pytest.mark.slow),
     ],
     ids=lambda cases: cases[1],
 )

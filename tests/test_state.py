@@ -24,8 +24,7 @@ def played_batch(game, worlds=3, steps=40, **how):
     return batch, output
 
 
-@pytest.mark.parametrize("variant", presets.VARIANTS)
-@pytest.mark.parametrize("board", presets.BOARDS)
+@pytest.mark.parametrize(("board", "variant"), presets.GAMES)
 def test_a_batch_that_loads_a_state_continues_like_the_original(board, variant):
     game = presets.game(board, variant=variant)
     game = Game(map=game.map, rules=game.rules, observation=Observation(scoreboard=True))

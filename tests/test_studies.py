@@ -326,4 +326,22 @@ def test_a_shipped_study_asks_a_question_and_says_what_is_expected(name, monkeyp
     assert len(study.all_conditions) >= 3
     assert Condition(study.experiment).checksum in [own.checksum for own in study.all_conditions]
     for module in (name, "base"):
-        sys.modules.pop(module)
+        sys.modules.pop(module, None)
+
+
+def test_the_studies_of_the_programs_versions_share_their_runs(monkeypatch):
+    monkeypatch.syspath_prepend(RECIPES)
+    names = "combat", "experiment_5", "published_schedule", "dip"
+    combat, experiment_5, schedule, dip = (import_module(name).STUDY for name in names)
+    for module in (*names, "base"):
+        sys.modules.pop(module, None)
+    trials = [trial.name for trial in trials_of(experiment_5)]
+    assert (len(combat.all_conditions), len(trials)) == (24, 16)
+    assert set(trials[:8]) <= {trial.name for trial in trials_of(combat)}
+    assert {name.partition("-")[2] for name in trials[8:]} == {"s1000-r4"}
+    for study, first in ((combat, 6), (experiment_5, 2)):
+        learns = [own.experiment.agents[0].algorithm for own in study.all_conditions]
+        assert {(own.settings.optimizer, own.loss_function) for own in learns[:first]} == {("adam", "l2")}
+    committed = {"dab4a686bb41": schedule, "2919eaddb858": dip}  # those of docs/results
+    for checksum, study in committed.items():
+        assert trials_of(study)[0].name == f"{checksum}-s0-r8"

@@ -207,6 +207,16 @@ def test_a_study_has_a_command_line(capsys):
     assert cprl.study_main is study_main
 
 
+def test_a_study_is_run_with_fewer_episodes_unless_they_are_what_it_varies():
+    out = study_main(STUDY, ["recipes/mine.py", "--episodes", "1", "--no-figures", "--out", "short"])
+    assert read_study(out).experiment.episodes == 1
+    assert [own.experiment.episodes for own in read_study(out).all_conditions] == [1, 1]
+    varied = Study(TINY, {"episodes": [2, 3]}, name="tiny_study")
+    with pytest.raises(SystemExit, match=r"--episodes is 1, and the study's condition .* says 2; allowed: "):
+        study_main(varied, ["recipes/mine.py", "--episodes", "1", "--out", "varied"])
+    assert not Path("varied").exists()
+
+
 def test_help_of_a_study_says_what_it_asks_and_expects(capsys):
     with pytest.raises(SystemExit):
         study_main(STUDY, ["recipes/mine.py", "--help"])

@@ -47,7 +47,7 @@ from cprl.algorithms import (
 from cprl.custom import Custom
 from cprl.learners.engine.functional import total
 from cprl.learners.torchrl import TorchRLReplayLearner, TorchRLRolloutLearner
-from cprl.objectives import PR2Loss
+from cprl.objectives import LogCoshDQNLoss, PR2Loss
 from cprl.policies.lanes import LaneActor
 from cprl.training import Training
 
@@ -77,6 +77,7 @@ OFF_POLICY = {
     "DQN as run": DQN(settings=REPLAY.__class__(**{**vars(REPLAY), **AS_RUN})),
     "double DQN": DQN(settings=REPLAY, double=True),
     "Huber": DQN(settings=REPLAY, loss_function="smooth_l1"),
+    "log-cosh": DQN(settings=REPLAY, loss_function="log_cosh"),
     "C51": DistributionalDQN(settings=REPLAY, atoms=11, highest_return=20.0),
     "CQL": CQL(settings=REPLAY),
     "SAC": SAC(settings=REPLAY),
@@ -90,6 +91,7 @@ ON_POLICY = {
 }
 LOSSES = {
     **dict.fromkeys(("published DQN", "DQN as run", "double DQN", "Huber"), DQNLoss),
+    "log-cosh": LogCoshDQNLoss,
     "C51": DistributionalDQNLoss,
     "CQL": DiscreteCQLLoss,
     "SAC": DiscreteSACLoss,
@@ -522,6 +524,7 @@ def test_updates_per_step_and_the_optimiser_are_those_of_the_settings():
         "adam": torch.optim.Adam,
         "adamw": torch.optim.AdamW,
         "rmsprop": torch.optim.RMSprop,
+        "keras_rmsprop": torch.optim.RMSprop,
         "sgd": torch.optim.SGD,
     }
     for name, kind in kinds.items():
@@ -558,7 +561,9 @@ def test_teams_and_tables_are_refused_by_name(team):
 def test_other_engines_settings_and_networks_are_refused():
     with pytest.raises(ValueError, match="engine is 'quick'; allowed: 'compiled', 'eager', 'torchrl'"):
         DQN(settings=REPLAY).make_learner(SPACES, engine="quick", **HOW)
-    with pytest.raises(ValueError, match="optimizer is 'lion'; allowed: 'adam', 'adamw', 'rmsprop', 'sgd'"):
+    with pytest.raises(
+        ValueError, match="optimizer is 'lion'; allowed: 'adam', 'adamw', 'rmsprop', 'keras_rmsprop', 'sgd'"
+    ):
         resumable(DQN(settings=changed(REPLAY, optimizer="lion")))
     for name in ("updates_per_step", "n_steps", "target_every_episodes"):
         with pytest.raises(ValueError, match=f"{name} is 0; allowed: an integer in 1"):

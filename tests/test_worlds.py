@@ -214,8 +214,7 @@ def test_the_invariants_hold_on_the_boards_with_walls(board, sight):
     assert check_no_beam_passes_a_wall(game, 6) > (50 if board == "crowded" else 0)
 
 
-@pytest.mark.parametrize("variant", presets.VARIANTS)
-@pytest.mark.parametrize("board", presets.BOARDS)
+@pytest.mark.parametrize(("board", "variant"), presets.GAMES)
 def test_a_world_does_not_depend_on_other_worlds_or_the_number_of_threads(board, variant):
     game = presets.game(board, variant=variant)
     check_worlds_are_independent(game, 5)

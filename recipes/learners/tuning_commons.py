@@ -3,11 +3,14 @@
 python recipes/learners/tuning_commons.py --jobs 2
 """
 
-from ways import tuning
+from ways import tuning, winners
 
 import cprl
+from cprl.studies import StudyTable
 
 STUDY = tuning("commons")
 
 if __name__ == "__main__":
-    cprl.study_main(STUDY)
+    OUT = cprl.study_main(STUDY)
+    for way, candidate in winners(StudyTable.read(OUT / "table.parquet")).items():
+        print(f"{way}: {candidate}")

@@ -1,11 +1,11 @@
-"""Ten ways to learn on two boards: what is compared, and with which settings.
+"""Nine ways to learn on two boards: what is compared, and with which settings.
 
 Each way has four candidates for its settings, the same number for all, and they are chosen on seeds that the
-comparison does not use: recipes/learners/tuning_BOARD.py train every candidate, CHOSEN says which one won.
+comparison does not use: recipes/learners/tuning_BOARD.py trains every candidate and prints which one won.
 """
 
-from collections.abc import Callable
-from dataclasses import dataclass
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, replace
 from itertools import product
 from typing import Any, Final, Literal
 
@@ -28,6 +28,8 @@ from cprl.algorithms import (
     TeamAlgorithm,
 )
 from cprl.population import AgentSpec, Learning, Team
+from cprl.studies import StudyTable
+from cprl.studies.tables.comparing import compare
 
 Board = Literal["two_complex", "commons"]
 GAMMA: Final = 0.99
@@ -148,6 +150,16 @@ def study(board: Board, algorithms: dict[str, Algorithm], **how: Any) -> cprl.St
     return cprl.Study(base, conditions=conditions, **how)
 
 
+def winners(table: StudyTable) -> dict[str, str]:
+    """The candidate of each way that gets most in fresh worlds, from the table of a tuning."""
+    best: dict[str, tuple[float, str]] = {}
+    for own in compare(table, "collective_return", part="evaluation").conditions:
+        way, _, candidate = own.condition.partition(": ")
+        value = own.estimate.value if own.estimate else float("-inf")
+        best[way] = max(best.get(way, (float("-inf"), "")), (value, candidate))
+    return {way: candidate for way, (_, candidate) in best.items()}
+
+
 def tuning(board: Board) -> cprl.Study:
     """Every candidate of every way, on seeds of its own."""
     steps = 150_000
@@ -169,3 +181,38 @@ def tuning(board: Board) -> cprl.Study:
             "for each way, the candidate with the highest mean return in the evaluation."
         ),
     )
+
+
+AS_RUN: Final = "DQN as run"
+
+
+def comparison(board: Board, chosen: Mapping[str, str], episodes: Mapping[str, int]) -> cprl.Study:
+    """The chosen candidate of every way, and the DQN of the published study, whose course is known.
+
+    Args:
+        board: its board.
+        chosen: the name of a candidate by way.
+        episodes: by way, as many as it takes for a million steps of each replica; "" for all others.
+    """
+    algorithms = {way: own.candidates(STEPS)[chosen[way]] for way, own in WAYS.items()}
+    algorithms[AS_RUN] = DQN(settings=presets.dqn_settings(board, variant="as_run"))
+    made = study(
+        board,
+        algorithms,
+        seed=0,
+        episodes=episodes[""],
+        evaluation_episodes=50,
+        replicas=5,
+        reference="DQN",
+        name=f"learners_{board}",
+        question="How do learners that see others do on a commons, beside those that do not?",
+        expectation=(
+            "Teams that share a reward (VDN, QMIX, MAPPO) harvest most and deplete least; of the others "
+            "those with rollouts deplete first. MADDPG, PR2 and LOLA do about as DQN and PPO do: they know "
+            "more of the others, but want the same."
+        ),
+    )
+    longer = {
+        way: {**own, "episodes": episodes.get(way, episodes[""])} for way, own in made.conditions.items()
+    }
+    return replace(made, conditions=longer)

@@ -1,7 +1,7 @@
-"""The experiment that every study of this folder varies: the tragedy of the commons on a short schedule.
+"""The experiments that the studies of this folder vary: the tragedy of the commons, on two schedules.
 
-Four independent DQN agents on `commons`, by the rules of the study as run, 200 episodes of 8 replicas; the
-schedule of recipes/tragedy.py.
+Four independent DQN agents on `commons`, by the rules of the study as run: `EXPERIMENT`, 200 episodes of 8
+replicas on the schedule of recipes/tragedy.py, and `PUBLISHED`, experiment 5 as run.
 """
 
 from dataclasses import replace
@@ -27,4 +27,11 @@ EXPERIMENT: Final = cprl.Experiment(
     episodes=200,
     replicas=8,
     evaluation_episodes=50,
+)
+
+PUBLISHED: Final = replace(
+    EXPERIMENT,
+    agents=(Learning(DQN(settings=presets.dqn_settings("commons", variant="as_run"))),) * 4,
+    episodes=4800,
+    evaluation_episodes=20,
 )

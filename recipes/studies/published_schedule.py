@@ -8,24 +8,12 @@ experiment 5 as run, whose results are committed; a study finds it finished in i
     cp -r docs/results/commons studies/runs/dab4a686bb41-s0-r8
 """
 
-from dataclasses import replace
-
-from base import EXPERIMENT
+from base import PUBLISHED
 
 import cprl
-from cprl import presets
-from cprl.algorithms import DQN
-from cprl.population import Learning
-
-SETTINGS = presets.dqn_settings("commons", variant="as_run")
 
 STUDY = cprl.Study(
-    replace(
-        EXPERIMENT,
-        agents=(Learning(DQN(settings=SETTINGS)),) * 4,
-        episodes=4800,
-        evaluation_episodes=20,
-    ),
+    PUBLISHED,
     conditions={
         "experiment 5 as run": {},
         "time-out of 100": {"game.rules.freeze_steps": 100},

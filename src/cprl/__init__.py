@@ -17,11 +17,12 @@ Each imports only from those above it:
     memory       devices, and what would not fit into their memory
     institutions  rules that people make: boundaries, quotas, taxes, sanctions, votes; numpy alone
     commons      the game: maps, rules, turns; numpy and numba alone
+    theory       games with a known answer: herders, appropriation, what apples can bear; numpy alone
     envs         TorchRL, PettingZoo, Gymnasium; make_env, where environments are put together
     games        games of the user's own, as a recipe holds them
     preferences  what agents want: the reward that each learns from
     networks     from observations to numbers
-    objectives   losses that TorchRL lacks: MADDPG, PR2, LOLA
+    objectives   losses that TorchRL lacks: log-cosh, MADDPG, PR2, LOLA
     policies     from observations to actions: learned, tabular and scripted agents
     collectors   one step of all worlds after the other
     learners     replay and rollouts, updates of many agents at once
@@ -50,6 +51,7 @@ Each imports only from those above it:
     reporting    finished runs beside the published study
     flags        the fields of an experiment as flags
     commandline  recipe_main: the command line of a recipe
+    evaluation_cli  cprl film, evaluate and crossplay
     studies_options  how a study is run, as options of a command line
     studies_cli  cprl sweep, and study_main: the command line of a recipe of a study
     cli          the command cprl

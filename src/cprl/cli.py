@@ -8,20 +8,14 @@ from contextlib import suppress
 from dataclasses import replace
 from importlib.metadata import version
 from pathlib import Path
-from typing import Any
 
 import tyro
-from rich.table import Table
 
-from cprl.commandline import in_a_sentence
-from cprl.evaluation.cross_play import Diagonal
-from cprl.evaluation.cross_play import crossplay as play_each_other
-from cprl.evaluation.evaluate import SEED, evaluate_run
-from cprl.evaluation.film import film as film_run
-from cprl.evaluation.film_video import SUFFIXES, film_video
-from cprl.evaluation.tables import agents_table, heading, matrices, run_table
+from cprl.commandline import Allow, in_a_sentence, make_importable
+from cprl.evaluation.evaluate import SEED
+from cprl.evaluation_cli import crossplay, evaluate, film
 from cprl.experiment import Experiment
-from cprl.output import OUT, console, keep_output, say
+from cprl.output import keep_output, say
 from cprl.play.opening import SEED as PLAY_SEED
 from cprl.play.opening import open_session
 from cprl.play.terminal import play_in_terminal
@@ -33,14 +27,10 @@ from cprl.reporting import write_report
 from cprl.running import run as run_experiment
 from cprl.runs.directory import read_recipe
 from cprl.runs.export import export_results
-from cprl.runs.labelled import refuse_to_write_over, write_table
 from cprl.studies.tables.table_command import runs_table
 from cprl.studies_cli import sweep
 from cprl.viewer.page import Page, has_display
 from cprl.viewer.streams import viewer
-
-Allow = tyro.conf.UseAppendAction[tuple[str, ...]]
-"""--allow A --allow B."""
 
 
 def run(
@@ -69,7 +59,7 @@ def run(
         linger: keep the recording served after the run, until Ctrl-C; with --watch serve or spawn.
         allow: code of your own, module:Class, that the recipe may import; may be repeated.
     """
-    _make_importable(allow)
+    make_importable(allow)
     directory = recipe if recipe.is_dir() else recipe.parent
     experiment = Experiment.from_recipe(read_recipe(recipe), allow=allow, directory=directory)
     if resume and out is None:
@@ -103,50 +93,6 @@ def report(runs: tuple[Path, ...], /, *, out: Path = Path("report")) -> None:
     say(write_report(runs, out))
 
 
-def film(
-    run: Path,
-    /,
-    *,
-    replica: int = 0,
-    episode: int = 0,
-    out: Path | None = None,
-    every: int | None = None,
-    fps: float | None = None,
-    width: int | None = None,
-    allow: Allow = (),
-) -> None:
-    """Lets the agents of a run play a fresh episode, recorded for the Rerun viewer or as a film.
-
-    Args:
-        run: the run's directory, or its results.
-        replica: whose agents.
-        episode: which of the fresh episodes; the same number plays the same again.
-        out: what is written: a recording for the viewer (.rrd), or a film of the board, the stock and the
-            harvests (.gif, or .mp4, which wants the extra "film"); by default film-<replica>-<episode>.rrd in
-            the run's directory.
-        every: of a .gif or .mp4: turns from one picture to the next; by default 1 for an .mp4, and for a .gif
-            as many as it takes for 300 pictures.
-        fps: of a .gif or .mp4: pictures per second, at most 50; by default 15.
-        width: of a .gif or .mp4, in pixels, 240 to 1920; by default 640.
-        allow: code of your own, module:Class, that the run may import; see docs/changing.md.
-    """
-    flags: dict[str, Any] = {"every": every, "fps": fps, "width": width}
-    given = {name: value for name, value in flags.items() if value is not None}
-    if out is not None and out.suffix not in (".rrd", *SUFFIXES):
-        raise ValueError(f"--out is {out}; allowed: a name that ends in .rrd, {', '.join(SUFFIXES)}")
-    is_video = out is not None and out.suffix in SUFFIXES
-    if given and not is_video:
-        raise ValueError(f"--{next(iter(given))} is for films; allowed: with --out FILE.gif or FILE.mp4")
-    _make_importable(allow)
-    prepare_process(SEED)
-    if out is not None and is_video:
-        path, played = film_video(run, out, replica=replica, episode=episode, allow=allow, **given)
-    else:
-        path, played = film_run(run, out, replica=replica, episode=episode, allow=allow)
-    say(f"{played.steps} steps, {played.outcome}")
-    say(f"{path}: {path.stat().st_size / 1000:.0f} kB" if is_video else f"Watch: {viewer()} {path}")
-
-
 def play(
     board: str,
     /,
@@ -170,14 +116,15 @@ def play(
         others: the directory of a run, whose agents play, or random, greedy, sustainable, territorial,
             aggressive or pacifist; by default the agents of the run that is the board, else greedy.
         replica: of the run whose agents play.
-        variant: of the boards with a name, published or as_run; see docs/game.md.
+        variant: of the boards with a name: published, as_run or, of two_complex, as_run_10_april; see
+            docs/game.md.
         steps: turns of the episode at most; by default those of the game.
         seed: of all chance; the same seed and the same keys play the same again.
         decision: what you vote for in a game with votes or elections, by its number; by default chance votes.
         terminal: play in the terminal, by lines of keys; also without pygame (extra "play") or a display.
         allow: code of your own, module:Class, that a run may import; see docs/changing.md.
     """
-    _make_importable(allow)
+    make_importable(allow)
     prepare_process(seed)
     session = open_session(
         board,
@@ -238,96 +185,6 @@ def export(run: Path, folder: Path, /) -> None:
         folder: where to.
     """
     say(export_results(run, folder))
-
-
-def evaluate(
-    run: Path,
-    /,
-    *,
-    episodes: int = 20,
-    greedy: bool = False,
-    seed: int = SEED,
-    replicas: tuple[int, ...] = (),
-    out: Path | None = None,
-    allow: Allow = (),
-) -> None:
-    """Lets all replicas of a run play fresh worlds, and prints the social metrics beside the random policy's.
-
-    Args:
-        run: the run's directory, or its results; of one that has not ended the newest checkpoint plays.
-        episodes: of each replica.
-        greedy: whether agents play what they hold best, without exploring or drawing.
-        seed: of the worlds and all chance; the same one gives the same numbers.
-        replicas: their numbers; by default all.
-        out: a parquet file to be, with every episode.
-        allow: code of your own, module:Class, that the run may import; see docs/changing.md.
-    """
-    _make_importable(allow)
-    if out is not None:
-        refuse_to_write_over(out)
-    prepare_process(seed)
-    evaluation = evaluate_run(
-        run, episodes=episodes, greedy=greedy, seed=seed, replicas=replicas, allow=allow
-    )
-    if out is not None:
-        write_table(out, evaluation.table())
-    _print(run_table(evaluation))
-    say(f"Weights: {evaluation.run.weights_from}")
-    if out is not None:
-        say(f"Episodes: {out}")
-
-
-def crossplay(
-    runs: tuple[Path, ...],
-    /,
-    *,
-    episodes: int = 20,
-    greedy: bool = False,
-    seed: int = SEED,
-    replicas: tuple[int, ...] = (),
-    diagonal: Diagonal = "self",
-    out: Path | None = None,
-    allow: Allow = (),
-) -> None:
-    """Lets agents of each run play among those of each other run, and prints how all fare.
-
-    Args:
-        runs: directories of runs of the same game, or their results.
-        episodes: of each replica with each focal agent.
-        greedy: whether agents play what they hold best, without exploring or drawing.
-        seed: of the worlds and all chance; the same one gives the same numbers.
-        replicas: their numbers; by default all that every run has.
-        diagonal: whom a run's agents meet there: "self", those they were trained with, or "cross_seed", those
-            of the run's next replica.
-        out: a parquet file to be, with every episode.
-        allow: code of your own, module:Class, that the run may import; see docs/changing.md.
-    """
-    _make_importable(allow)
-    if out is not None:
-        refuse_to_write_over(out)
-    prepare_process(seed)
-    played = play_each_other(
-        runs, episodes=episodes, greedy=greedy, seed=seed, replicas=replicas, diagonal=diagonal, allow=allow
-    )
-    if out is not None:
-        write_table(out, played.table())
-    say(heading(played))
-    _print(*matrices(played), agents_table(played))
-    if out is not None:
-        say(f"Episodes: {out}")
-
-
-def _make_importable(allow: tuple[str, ...]) -> None:
-    """Lets modules in the working directory be imported, as they are for a recipe that stands there."""
-    if allow:
-        sys.path.insert(0, os.getcwd())
-
-
-def _print(*tables: Table) -> None:
-    """Prints tables; into a file or pipe as wide as they are."""
-    shown = console(width=None if OUT.isatty() else 250)
-    for table in tables:
-        shown.print(table)
 
 
 def main() -> None:

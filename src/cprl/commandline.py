@@ -5,6 +5,7 @@ Its own arguments stand first; every number of the experiment can be changed by 
 """
 
 import inspect
+import os
 import sys
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
@@ -22,6 +23,8 @@ from cprl.flags import applied, flags_of
 from cprl.output import say
 
 OptionsT = TypeVar("OptionsT")
+Allow = tyro.conf.UseAppendAction[tuple[str, ...]]
+"""--allow A --allow B."""
 
 _OLD_WORDS: Final = {
     "--go-on": ("--resume",),
@@ -201,3 +204,9 @@ def _check_names(make_experiment: Callable[..., Experiment], options: Any) -> No
 def _description(make_experiment: Callable[..., Experiment], note: str) -> str:
     text = (inspect.getdoc(make_experiment) or "").partition("\nArgs:")[0].strip()
     return "\n\n".join(filter(None, [text, note, " ".join(_NOTE.split())]))
+
+
+def make_importable(allow: tuple[str, ...]) -> None:
+    """Lets modules in the working directory be imported, as they are for a recipe that stands there."""
+    if allow:
+        sys.path.insert(0, os.getcwd())

@@ -111,6 +111,23 @@ class LaneCategorical(torch.distributions.Categorical):
         return torch.multinomial(weights, size.numel(), True).T.reshape(self._extended_shape(size))
 
 
+class ReshapedLoss:
+    """Of a `LossModule` whose losses of single transitions pass through a function before they are weighed
+    and reduced; stands before the loss among the bases.
+
+    TorchRL's losses know their distances by name, see `torchrl.objectives.utils.distance_loss`, and hand what
+    those give to the private `LossModule._reduce_loss`, which this class overrides. The loss must call it
+    once. This is no `LossModule` itself: the class of one has a `forward`, which would hide that of the loss.
+    """
+
+    def reshape_each(self, losses: torch.Tensor) -> torch.Tensor:
+        """The function, of any shape."""
+        raise NotImplementedError
+
+    def _reduce_loss(self, loss: torch.Tensor, **how: Any) -> Any:
+        return super()._reduce_loss(self.reshape_each(loss), **how)  # type: ignore[misc]
+
+
 def updated_weights(loss: LossModule) -> list[str]:
     """The names of the weights whose targets a TorchRL target updater updates."""
     return [name for name, is_updated in loss._has_update_associated.items() if is_updated]

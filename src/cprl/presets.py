@@ -15,10 +15,13 @@ from cprl.envs.gymnasium_env import CommonsGymnasiumEnv
 from cprl.learners.settings import DQNSettings
 
 Board = Literal["single_basic", "single_complex", "two_complex", "commons"]
-Variant = Literal["published", "as_run"]
+Variant = Literal["published", "as_run", "as_run_10_april"]
 
 BOARDS: Final[tuple[Board, ...]] = get_args(Board)
 VARIANTS: Final[tuple[Variant, ...]] = get_args(Variant)
+"""`published`: as in the study's text; `as_run`: as in its program; `as_run_10_april`: as in its program for
+two agents from 10 to 13 April 2019, with a discount of 0.999 and `agent_1_right_moves_agent_0`; `two_complex`
+alone has it."""
 
 TO_THE_EDGE_CELLS: Final = 7
 """A beam of this length crosses all rows of `two_complex`."""
@@ -34,29 +37,33 @@ _AS_RUN: Final[dict[str, Any]] = {
     "mark_behind_if_vertical": True,
     "self_paint_stays": True,
 }
-_BOARD_RULES: Final[dict[tuple[str, str], dict[str, Any]]] = {
+_TWO_AS_RUN: Final[dict[str, Any]] = {
+    "window_rows": 5,
+    "beam_length_cells": (TO_THE_EDGE_CELLS, 6, TO_THE_EDGE_CELLS, 7),
+}
+_BOARD_RULES: Final[dict[tuple[Board, Variant], dict[str, Any]]] = {
     ("single_basic", "published"): {"may_fire": False},
     ("single_complex", "published"): {"may_fire": False},
     ("two_complex", "published"): {},
     ("commons", "published"): {"window_rows": 7, "window_columns": 15, "beam_length_cells": 6},
     ("single_basic", "as_run"): {"window_rows": 5, "may_fire": False},
     ("single_complex", "as_run"): {"window_rows": 5, "may_fire": False},
-    ("two_complex", "as_run"): {
-        "window_rows": 5,
-        "beam_length_cells": (TO_THE_EDGE_CELLS, 6, TO_THE_EDGE_CELLS, 7),
-    },
+    ("two_complex", "as_run"): _TWO_AS_RUN,
+    ("two_complex", "as_run_10_april"): {**_TWO_AS_RUN, "agent_1_right_moves_agent_0": True},
     ("commons", "as_run"): {"window_rows": 7, "window_columns": 15, "beam_length_cells": 6},
 }
+GAMES: Final[tuple[tuple[Board, Variant], ...]] = tuple(_BOARD_RULES)
+"""Every board with each of its variants."""
 
 
 def game(board: Board, *, variant: Variant = "published") -> Game:
-    """A published board with its rules: `published` as in the study's text, `as_run` as in its program.
+    """A published board with its rules, in one of `VARIANTS`.
 
     Raises:
-        ValueError: if the board or variant is unknown.
+        ValueError: if the board or variant is unknown, or the board has no such variant.
     """
     _check(board, variant)
-    quirks = _AS_RUN if variant == "as_run" else {}
+    quirks = {} if variant == "published" else _AS_RUN
     return Game(map=maps.named(board), rules=Rules(**quirks, **_BOARD_RULES[board, variant]))
 
 
@@ -75,14 +82,17 @@ def dqn_settings(board: Board, *, variant: Variant = "published") -> DQNSettings
     """The hyperparameters of the DQN agents on a board.
 
     The text gives the decay of epsilon on `commons` as 1,000,000 steps; versions of the program have
-    500,000, 1,000,000 and, the last one, 5,000,000. Both variants use the value of the text.
+    500,000, 1,000,000 and, the last one, 5,000,000. All variants use the value of the text. Versions of the
+    program also had other discounts, optimisers and losses: `replace(dqn_settings("commons",
+    variant="as_run"), gamma=0.997, optimizer="keras_rmsprop")` with `DQN(..., loss_function="log_cosh")`.
 
     Raises:
-        ValueError: if the board or variant is unknown.
+        ValueError: if the board or variant is unknown, or the board has no such variant.
     """
     _check(board, variant)
-    as_run = variant == "as_run"
+    as_run = variant != "published"
     return DQNSettings(
+        gamma=0.999 if variant == "as_run_10_april" else 0.995,
         epsilon_decay_steps=1_000_000 if board == "commons" else 500_000,
         relu_on_outputs=as_run,
         glorot_uniform=as_run,
@@ -96,16 +106,11 @@ def variant_of(game: object) -> Variant | None:
     """The variant of a published game, whether agents may fire or not; None for any other game."""
     if not isinstance(game, Game) or game.institutions:
         return None
-    for board in BOARDS:
-        for variant in VARIANTS:
-            published = _published(board, variant)
-            rules = replace(game.rules, may_fire=published.rules.may_fire)
-            if (game.map, rules, game.observation) == (
-                published.map,
-                published.rules,
-                published.observation,
-            ):
-                return variant
+    for board, variant in GAMES:
+        published = _published(board, variant)
+        rules = replace(game.rules, may_fire=published.rules.may_fire)
+        if (game.map, rules, game.observation) == (published.map, published.rules, published.observation):
+            return variant
     return None
 
 
@@ -116,3 +121,4 @@ def _published(board: Board, variant: Variant) -> Game:
 def _check(board: str, variant: str) -> None:
     checked("board", board, one_of(*BOARDS))
     checked("variant", variant, one_of(*VARIANTS))
+    checked(f"variant of {board}", variant, one_of(*(own for of, own in GAMES if of == board)))

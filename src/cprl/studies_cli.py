@@ -69,6 +69,8 @@ class MainOptions(StudyOptions):
 
     replicas: int | None = None
     """Of each condition; by default those of the study."""
+    episodes: int | None = None
+    """Of each condition; by default those of the study."""
     block: int | None = None
     """Replicas that one run trains side by side; with fewer, more processes share the work."""
 
@@ -100,7 +102,25 @@ def study_main(study: Study, argv: Sequence[str] | None = None) -> Path:
         given = {own: getattr(options, own) for own in ("replicas", "block")}
         changed = {own: value for own, value in given.items() if value is not None}
         wanted = replace(study, **changed) if changed else study
+        if options.episodes is not None:
+            wanted = _of_episodes(wanted, options.episodes)
         return carry_out(wanted, options, [sys.executable, *command])
+
+
+def _of_episodes(study: Study, episodes: int) -> Study:
+    """A study with other episodes than its own.
+
+    Raises:
+        ValueError: if it varies the episodes.
+    """
+    shorter = replace(study, experiment=replace(study.experiment, episodes=episodes))
+    for own in shorter.all_conditions:
+        if own.experiment.episodes != episodes:
+            raise ValueError(
+                f"--episodes is {episodes}, and the study's condition {own.name} says "
+                f"{own.experiment.episodes}; allowed: --episodes where no condition says how many"
+            )
+    return shorter
 
 
 def sweep(words: Sequence[str], /) -> None:

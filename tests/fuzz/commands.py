@@ -87,7 +87,7 @@ _SUBCOMMANDS: Final[dict[str, tuple[list[st.SearchStrategy[list[str]]], tuple[An
         (
             *(_flag("--agent", "0", "1"), _flag("--replica", "0", "1"), _flag("--steps", "1", "3")),
             *(_flag("--others", "greedy", "random"), _run("plain", "finished").map(_others)),
-            *(_flag("--variant", "published", "as_run"), _flag("--seed", "1", "0")),
+            *(_flag("--variant", "published", "as_run", "as_run_10_april"), _flag("--seed", "1", "0")),
             *_COMMON,
         ),
     ),
@@ -133,7 +133,7 @@ _OF_EXPERIMENTS: Final = _named(
 
 
 _OWN: Final = _named(
-    ("--variant", "published", "as_run"),
+    ("--variant", "published", "as_run", "as_run_10_april"),
     ("--neighbour", "greedy", "random"),
     ("--loss", "ppo", "sac"),
     ("--only", "commons"),

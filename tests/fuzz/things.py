@@ -100,7 +100,10 @@ TEAM: Final = Team(VDN(settings=REPLAY), agents=(0, 1))
 
 EXAMPLES: Final[dict[type, tuple[Any, ...]]] = {
     Map: (MEADOW.map, ALONE.map, maps.named("commons"), maps.rooms()),
-    Rules: (Rules(), MEADOW.rules, ALONE.rules, presets.game("commons", variant="as_run").rules),
+    Rules: (
+        *(Rules(), MEADOW.rules, ALONE.rules, presets.game("commons", variant="as_run").rules),
+        presets.game("two_complex", variant="as_run_10_april").rules,
+    ),
     Observation: (
         Observation(),
         Observation(area="full", encoding="one_hot"),
@@ -127,7 +130,11 @@ EXAMPLES: Final[dict[type, tuple[Any, ...]]] = {
     MLP: (MLP(), MLP(hidden_cells=(4,))),
     Conv: (Conv(), Conv(channels=(2,), kernel_cells=3, hidden_cells=(4,))),
     Custom: (Custom("torchrl.envs.transforms:RewardScaling", arguments={"loc": 0.0, "scale": 2.0}),),
-    DQN: (DQN(settings=REPLAY), DQN(settings=REPLAY, double=True, network=MLP(hidden_cells=(3,)))),
+    DQN: (
+        DQN(settings=REPLAY),
+        DQN(settings=REPLAY, double=True, network=MLP(hidden_cells=(3,))),
+        DQN(settings=replace(REPLAY, optimizer="keras_rmsprop"), loss_function="log_cosh"),
+    ),
     DistributionalDQN: (DistributionalDQN(settings=REPLAY, atoms=5),),
     CQL: (CQL(settings=REPLAY),),
     SAC: (SAC(settings=REPLAY),),

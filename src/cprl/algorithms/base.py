@@ -20,6 +20,7 @@ from cprl.learners.settings import DQNSettings, RolloutSettings
 from cprl.learners.torchrl import TorchRLReplayLearner, TorchRLRolloutLearner
 from cprl.networks.mlp import MOST_CELLS
 from cprl.networks.specification import Network
+from cprl.objectives.log_cosh import TORCHRL_DISTANCES
 from cprl.preferences.values import Preference, named
 from cprl.spaces import Spaces
 
@@ -32,7 +33,6 @@ update, uncompiled; "torchrl": by TorchRL's stock parts, one agent after the oth
 _WEIGHT: Final = number(0, 1e6)
 _CHECKS: Final[dict[str, Check]] = {
     "network": either(instance(Network | Custom, 'MLP, Conv, Custom("module:Class")'), NONE),
-    "loss_function": one_of("l1", "l2", "smooth_l1"),
     "double": SWITCH,
     "atoms": count(2, MOST_CELLS),
     "lowest_return": number(-1e9, 1e9),
@@ -77,6 +77,8 @@ class Algorithm:
     has_continuous_actions: ClassVar[bool] = False
     """Whether the acting network outputs an action of `Spaces.action_size` numbers, within their bounds; else
     agents choose from `Spaces.actions`. A game of the other kind is refused."""
+    loss_functions: ClassVar[tuple[str, ...]] = TORCHRL_DISTANCES
+    """What its field `loss_function` may be, if it has one."""
     can_share_parameters: ClassVar[bool] = False
     """Whether agents of a team can share one network, see `cprl.population.Team`."""
 
@@ -88,7 +90,8 @@ class Algorithm:
             if kind.__module__.startswith("cprl.algorithms.")
             for name in get_annotations(kind)
         }
-        check_fields(self, {name: own for name, own in _CHECKS.items() if name in of_cprl})
+        checks = {**_CHECKS, "loss_function": one_of(*self.loss_functions)}
+        check_fields(self, {name: own for name, own in checks.items() if name in of_cprl})
 
     def make_network(self, spaces: Spaces) -> nn.Module:
         """New networks of one agent, initialised from torch's generator. They map observations [..., *shape]

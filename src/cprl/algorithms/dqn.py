@@ -1,7 +1,8 @@
 """Algorithms that learn action values from replay: DQN and its variants, C51, CQL."""
 
 from dataclasses import dataclass
-from typing import Any
+from functools import partial
+from typing import Any, ClassVar
 
 import numpy as np
 import torch
@@ -24,6 +25,7 @@ from cprl.learners.settings import DEFAULT_HIDDEN_CELLS, DQNSettings, RolloutSet
 from cprl.networks.distributional import AtomNetwork
 from cprl.networks.mlp import MLP
 from cprl.networks.specification import Network, new_network
+from cprl.objectives.log_cosh import DISTANCES, LOG_COSH, LogCoshDQNLoss
 from cprl.spaces import Spaces
 
 
@@ -39,9 +41,11 @@ class DQN(OffPolicy):
     """Whether the network itself, not its target, chooses the action whose value bootstraps (van Hasselt,
     Guez and Silver, "Deep Reinforcement Learning with Double Q-learning", 2016)."""
     loss_function: str = "l2"
-    """The loss of the temporal-difference error: "l2", "smooth_l1" (Huber) or "l1"."""
+    """The loss of the temporal-difference error d: "l2", d^2; "smooth_l1" (Huber); "l1"; or "log_cosh",
+    ln cosh d, that of some versions of the study's program (`cprl.objectives.LogCoshDQNLoss`)."""
     network: Network | Custom | None = None
     """The architecture of the networks; None for fully connected layers of `settings.hidden_cells`."""
+    loss_functions: ClassVar[tuple[str, ...]] = DISTANCES
 
     def make_network(self, spaces: Spaces) -> nn.Module:
         """See `Algorithm`."""
@@ -49,13 +53,9 @@ class DQN(OffPolicy):
 
     def make_loss(self, network: nn.Module) -> LossModule:
         """See `Algorithm`."""
-        loss = DQNLoss(
-            q_actor(network),
-            delay_value=True,
-            double_dqn=self.double,
-            loss_function=self.loss_function,
-            action_space="categorical",
-        )
+        is_ours = self.loss_function == LOG_COSH
+        make = LogCoshDQNLoss if is_ours else partial(DQNLoss, loss_function=self.loss_function)
+        loss = make(q_actor(network), delay_value=True, double_dqn=self.double, action_space="categorical")
         loss.make_value_estimator(ValueEstimators.TD0, gamma=self.settings.gamma)
         return loss
 

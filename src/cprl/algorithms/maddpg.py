@@ -17,6 +17,7 @@ from cprl.networks.agent import AgentNetworks
 from cprl.networks.mlp import MLP, MLPNetwork
 from cprl.networks.specification import Network
 from cprl.networks.team import JointCritics, team_network
+from cprl.objectives.log_cosh import DISTANCES
 from cprl.objectives.maddpg import NUMBERS, MADDPGLoss
 from cprl.spaces import Spaces
 
@@ -38,7 +39,7 @@ class MADDPG(TeamAlgorithm, OffPolicy):
     logit_penalty: float = 1e-3
     """The weight of the mean squared logit in the actors' loss, 0..1e6; 1e-3 in the published program."""
     loss_function: str = "l2"
-    """The loss of the critics' temporal-difference errors: "l2", "smooth_l1" (Huber) or "l1"."""
+    """The loss of the critics' temporal-difference errors, as `DQN.loss_function`."""
     network: Network | Custom | None = None
     """The architecture of the networks; None for fully connected layers of `settings.hidden_cells`. The
     critics' fully connected layers read observations and actions side by side. Another network maps the
@@ -48,6 +49,7 @@ class MADDPG(TeamAlgorithm, OffPolicy):
     fewest_members: ClassVar[int] = 2
     stochastic: ClassVar[bool] = True
     noise_numbers: ClassVar[int] = NUMBERS
+    loss_functions: ClassVar[tuple[str, ...]] = DISTANCES
 
     def make_network(self, spaces: Spaces) -> nn.Module:
         """See `Algorithm`."""

@@ -13,6 +13,7 @@ from cprl.custom import Custom
 from cprl.learners.settings import DQNSettings
 from cprl.networks.joint import JointNetwork, JointValues
 from cprl.networks.specification import Network
+from cprl.objectives.log_cosh import DISTANCES
 from cprl.objectives.pr2 import PR2Loss
 from cprl.spaces import Spaces
 
@@ -38,10 +39,12 @@ class PR2(OffPolicy):
     """Whether values contain the entropy of the joint action, as in the paper, which pays agents for every
     step that they live; see `PR2Loss`."""
     loss_function: str = "l2"
+    """As `DQN.loss_function`."""
     network: Network | Custom | None = None
     """The architecture of the networks; None for fully connected layers of `settings.hidden_cells`."""
     stochastic: ClassVar[bool] = True
     sees_peers_actions: ClassVar[bool] = True
+    loss_functions: ClassVar[tuple[str, ...]] = DISTANCES
 
     def __post_init__(self) -> None:
         check_temperature(self)

@@ -225,7 +225,7 @@ class Batch:
 
     def _state_arrays(self) -> dict[str, NDArray[Any]]:
         """The driver's arrays of a state by name."""
-        found = {name: getattr(self.now, name) for name in states.NAMES}
+        found = {name: getattr(self.now, name) for name in states.names(self.game)}
         if self.memory is not None:
             found |= {name: getattr(self.memory, name) for name in REMEMBERED}
         return found

@@ -6,12 +6,26 @@ from cprl.commons.tables import Tables
 from cprl.commons.world import COL_STEP, ROW_STEP, Bools, Worlds
 
 
+def beam_row(world: Worlds, tables: Tables, shooter: int) -> int:
+    """The row from which a shooter fired: its own, unless another agent has moved it since."""
+    if tables.agent_1_right_moves_agent_0 and world.moved_after_firing[shooter]:
+        return world.row[shooter] - ROW_STEP[(world.heading[shooter] + 1) % 4]
+    return world.row[shooter]
+
+
+def beam_col(world: Worlds, tables: Tables, shooter: int) -> int:
+    """The column from which a shooter fired; see `beam_row`."""
+    if tables.agent_1_right_moves_agent_0 and world.moved_after_firing[shooter]:
+        return world.col[shooter] - COL_STEP[(world.heading[shooter] + 1) % 4]
+    return world.col[shooter]
+
+
 def beam_cell(world: Worlds, tables: Tables, shooter: int, ahead: int, side: int) -> int:
-    """The cell that lies `ahead` cells ahead of a shooter and `side` cells to its right."""
+    """The cell that lies `ahead` cells ahead of where a shooter fired and `side` cells to its right."""
     heading = world.heading[shooter]
     right = (heading + 1) % 4
-    row = world.row[shooter] + ahead * ROW_STEP[heading] + side * ROW_STEP[right]
-    col = world.col[shooter] + ahead * COL_STEP[heading] + side * COL_STEP[right]
+    row = beam_row(world, tables, shooter) + ahead * ROW_STEP[heading] + side * ROW_STEP[right]
+    col = beam_col(world, tables, shooter) + ahead * COL_STEP[heading] + side * COL_STEP[right]
     return cell_of(row, col, tables)
 
 
@@ -30,8 +44,8 @@ def is_hit(world: Worlds, tables: Tables, target: int, shooter: int) -> bool:
     """Whether the shooter's beam covers the target's cell."""
     heading = world.heading[shooter]
     right = (heading + 1) % 4
-    rows = world.row[target] - world.row[shooter]
-    cols = world.col[target] - world.col[shooter]
+    rows = world.row[target] - beam_row(world, tables, shooter)
+    cols = world.col[target] - beam_col(world, tables, shooter)
     ahead = rows * ROW_STEP[heading] + cols * COL_STEP[heading]
     side = rows * ROW_STEP[right] + cols * COL_STEP[right]
     return (
@@ -89,5 +103,16 @@ def take_out(world: Worlds, tables: Tables, i: int, freeze: int) -> None:
     world.out_steps[i] = max(world.out_steps[i], steps)
 
 
-FUNCTIONS = (beam_cell, beam_reach, is_hit, find_hits, take_out, take_out_of_play, count_hit, tag)
+FUNCTIONS = (
+    beam_row,
+    beam_col,
+    beam_cell,
+    beam_reach,
+    is_hit,
+    find_hits,
+    take_out,
+    take_out_of_play,
+    count_hit,
+    tag,
+)
 """The rules of this module, each after those it calls; `compiled.py` compiles them in this order."""

@@ -50,6 +50,11 @@ class Game:
                 'Observation.area is "full" and Rules.walls_block_sight is True; allowed: area="window" '
                 "where walls block sight"
             )
+        if self.rules.agent_1_right_moves_agent_0 and agents < 2:
+            raise ValueError(
+                f"Rules.agent_1_right_moves_agent_0 is True and the map has {agents} agent; "
+                "allowed: at least 2"
+            )
         check_sizes(self.map, self.rules)
         if self.observation.agents_apart and agents > MAX_AGENTS_APART:
             raise ValueError(

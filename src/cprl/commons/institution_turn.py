@@ -10,7 +10,15 @@ from cprl.commons.apples import draw, find_sprouts, grow, remove_apple
 from cprl.commons.beam import count_hit, find_hits, take_out, take_out_of_play
 from cprl.commons.chance import BALLOT, DETECTION
 from cprl.commons.institution_views import draw_institutions
-from cprl.commons.moves import act, cell_of, count_down, return_to_play, settle_clashes, settle_pairwise
+from cprl.commons.moves import (
+    act,
+    cell_of,
+    count_down,
+    note_moved_shooters,
+    return_to_play,
+    settle_clashes,
+    settle_pairwise,
+)
 from cprl.commons.tables import Tables
 from cprl.commons.turn import (
     begin_episode,
@@ -78,6 +86,7 @@ def play_governed_turn(
         settle_pairwise(world, scratch)
     else:
         settle_clashes(world, scratch)
+    note_moved_shooters(world, tables, scratch)
     sprouts = find_sprouts(world, tables, scratch)
     if tables.regrow_before_bites:
         grow(world, tables, scratch, sprouts)

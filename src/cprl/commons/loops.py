@@ -36,6 +36,7 @@ def one_world(w: Worlds, b: int) -> Worlds:
         w.in_play[b],
         w.on_board[b],
         w.fired[b],
+        w.moved_after_firing[b],
         w.hits[b],
         w.tagged_step[b],
         w.offences[b],

@@ -7,7 +7,7 @@ from cprl.commons.world import COL_STEP, ROW_STEP, Actions, Scratch, Worlds
 WALK_TURN = (0, 2, 3, 1)
 """Right turns by 90 degrees from the heading to the direction of a walk: forward, backward, left, right."""
 
-TURN_LEFT, TURN_RIGHT, FIRE = 4, 5, 6
+WALK_RIGHT, TURN_LEFT, TURN_RIGHT, FIRE = 3, 4, 5, 6
 
 
 def cell_of(row: int, col: int, tables: Tables) -> int:
@@ -33,13 +33,19 @@ def act(world: Worlds, tables: Tables, actions: Actions, scratch: Scratch) -> No
             continue
         action = actions[i]
         if action < TURN_LEFT:
-            walk(world, tables, i, (world.heading[i] + WALK_TURN[action]) % 4)
+            mover = moved_by(tables, i, action)
+            walk(world, tables, mover, (world.heading[mover] + WALK_TURN[action]) % 4)
         elif action == TURN_LEFT:
             world.heading[i] = (world.heading[i] + 3) % 4
         elif action == TURN_RIGHT:
             world.heading[i] = (world.heading[i] + 1) % 4
         elif action == FIRE and tables.has_beam:
             world.fired[i] = True
+
+
+def moved_by(tables: Tables, i: int, action: int) -> int:
+    """The agent that a walk of agent i moves: itself, or under `agent_1_right_moves_agent_0` another."""
+    return 0 if tables.agent_1_right_moves_agent_0 and i == 1 and action == WALK_RIGHT else i
 
 
 def walk(world: Worlds, tables: Tables, i: int, direction: int) -> None:
@@ -118,6 +124,13 @@ def settle_pairwise(world: Worlds, scratch: Scratch) -> None:
                 go_back(world, scratch, j)
 
 
+def note_moved_shooters(world: Worlds, tables: Tables, scratch: Scratch) -> None:
+    """Notes after all moves who no longer stands where it fired; no agent moves itself as it fires."""
+    if tables.agent_1_right_moves_agent_0:
+        for i in range(world.row.shape[0]):
+            world.moved_after_firing[i] = world.fired[i] and has_moved(world, scratch, i)
+
+
 def count_down(world: Worlds) -> None:
     """Counts this turn as missed for every agent out of play."""
     for i in range(world.row.shape[0]):
@@ -159,6 +172,7 @@ def place_at_starts(world: Worlds, tables: Tables) -> None:
         world.in_play[i] = True
         world.on_board[i] = True
         world.fired[i] = False
+        world.moved_after_firing[i] = False
         world.hits[i] = 0
         world.tagged_step[i] = 0
         world.offences[i] = 0
@@ -168,6 +182,7 @@ def place_at_starts(world: Worlds, tables: Tables) -> None:
 FUNCTIONS = (
     cell_of,
     is_wall,
+    moved_by,
     walk,
     act,
     go_back,
@@ -178,6 +193,7 @@ FUNCTIONS = (
     is_in_a_clash,
     settle_clashes,
     settle_pairwise,
+    note_moved_shooters,
     count_down,
     has_to_wait,
     return_to_play,

@@ -103,6 +103,11 @@ class Rules:
     """[run] Windows are drawn in the order of agent indices; each agent's cell is painted as "self" and
     stays so in the windows of later agents, whether the agent is in play or not."""
 
+    agent_1_right_moves_agent_0: bool = False
+    """[run] The action "right" of agent 1 moves agent 0 in its place, to the right of agent 0's own heading,
+    after agent 0's own action and even while agent 0 is out of play; a beam that agent 0 fires in this turn
+    begins where it fired. A fault of the program for two agents until 13 April 2019. At least two agents."""
+
     def __post_init__(self) -> None:
         check_fields(self, _CHECKS)
 
@@ -147,6 +152,7 @@ _SWITCHES: Final = (
     "paint_over",
     "mark_behind_if_vertical",
     "self_paint_stays",
+    "agent_1_right_moves_agent_0",
 )
 _CHECKS: Final[dict[str, Check]] = {
     "regrow_prob": Check(_are_probabilities, "one or more numbers, each 0 or 2**-32 (2.3e-10) to 1"),

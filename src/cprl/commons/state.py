@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from cprl.arguments import array, object_of
 from cprl.checks import shown
 from cprl.commons.game import Game
-from cprl.commons.world import PLAYING, TRUNCATED, Worlds, empty_worlds
+from cprl.commons.world import COL_STEP, PLAYING, ROW_STEP, TRUNCATED, Worlds, empty_worlds
 from cprl.institutions.memory import REMEMBERED, empty_memory
 
 State = dict[str, NDArray[Any]]
@@ -17,17 +17,26 @@ State = dict[str, NDArray[Any]]
 DERIVED: Final = ("near", "stock_left")
 """Entries of `Worlds` that are computed from the others."""
 
-NAMES: Final = tuple(name for name in Worlds._fields if name not in DERIVED)
-"""Entries of a state. With the game they determine the future completely."""
+OF_A_RULE: Final = {"moved_after_firing": "agent_1_right_moves_agent_0"}
+"""Entries of `Worlds` that only games with a rule have in their state, by the rule: so the states of others
+are those that earlier versions kept."""
+
+NAMES: Final = tuple(name for name in Worlds._fields if name not in (*DERIVED, *OF_A_RULE))
+"""Entries of every state; those of a game are `names`."""
 
 _MAX_INT32: Final = 2**31 - 1
+
+
+def names(game: Game) -> tuple[str, ...]:
+    """Entries of a state without institutions; with the game they determine the future completely."""
+    return NAMES + tuple(name for name, rule in OF_A_RULE.items() if getattr(game.rules, rule))
 
 
 def checked(state: Mapping[str, Any], *, worlds: int, game: Game) -> State:
     """Returns a state as arrays, after checking that the game can be in it.
 
     Args:
-        state: Arrays by the names in `NAMES`, with the shapes and dtypes of `Worlds`.
+        state: Arrays by the `names` of the game, with the shapes and dtypes of `Worlds`.
         worlds: The number of worlds B.
         game: The game.
 
@@ -36,7 +45,7 @@ def checked(state: Mapping[str, Any], *, worlds: int, game: Game) -> State:
             allowed.
     """
     empty = empty_worlds(worlds=worlds, agents=game.agents, sites=len(game.map.sites))
-    expected = {name: getattr(empty, name) for name in NAMES}
+    expected = {name: getattr(empty, name) for name in names(game)}
     if game.institutions:
         memory = empty_memory(game.governed_tables.institutions, worlds=worlds)
         expected |= {name: getattr(memory, name) for name in REMEMBERED}
@@ -113,12 +122,23 @@ def _check_places(arrays: State, game: Game) -> None:
     if game.map.walls:
         walls[tuple(np.array(game.map.walls).T)] = True
     _refuse(arrays, "row", walls[row, col], "a cell without a wall")
+    if game.rules.agent_1_right_moves_agent_0:
+        _check_moved(arrays, walls)
     if game.rules.pairwise_clashes:
         return
     shares = (row[:, :, None] == row[:, None]) & (col[:, :, None] == col[:, None])
     shares &= arrays["in_play"][:, :, None] & arrays["in_play"][:, None]
     shares &= ~np.eye(game.agents, dtype=np.bool_)
     _refuse(arrays, "row", shares.any(2), "a cell without another agent in play")
+
+
+def _check_moved(arrays: State, walls: NDArray[np.bool_]) -> None:
+    """Checks that whoever was moved after it fired did fire, from the cell to its left, which is no wall."""
+    moved, right = arrays["moved_after_firing"], (arrays["heading"] + 1) % 4
+    row, col = arrays["row"] - np.array(ROW_STEP)[right], arrays["col"] - np.array(COL_STEP)[right]
+    inside = np.pad(~walls, 1)[row + 1, col + 1]
+    allowed = "False but where the agent fired, from an open cell to its left"
+    _refuse(arrays, "moved_after_firing", moved & ~(arrays["fired"] & inside), allowed)
 
 
 def _refuse(arrays: State, name: str, wrong: NDArray[np.bool_], allowed: str) -> None:

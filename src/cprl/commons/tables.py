@@ -85,6 +85,7 @@ class Tables(NamedTuple):
     paint_over: bool
     mark_behind_if_vertical: bool
     self_paint_stays: bool
+    agent_1_right_moves_agent_0: bool
 
 
 class GovernedTables(NamedTuple):
@@ -264,4 +265,5 @@ def build_tables(board: Map, rules: Rules, observation: Observation, *, highest:
         paint_over=rules.paint_over,
         mark_behind_if_vertical=rules.mark_behind_if_vertical,
         self_paint_stays=rules.self_paint_stays,
+        agent_1_right_moves_agent_0=rules.agent_1_right_moves_agent_0,
     )

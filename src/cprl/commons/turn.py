@@ -9,6 +9,7 @@ from cprl.commons.chance import STARTS
 from cprl.commons.moves import (
     act,
     count_down,
+    note_moved_shooters,
     place_at_starts,
     return_to_play,
     settle_clashes,
@@ -34,6 +35,7 @@ def play_turn(world: Worlds, tables: Tables, actions: Actions, output: StepOutpu
         settle_pairwise(world, scratch)
     else:
         settle_clashes(world, scratch)
+    note_moved_shooters(world, tables, scratch)
     sprouts = find_sprouts(world, tables, scratch)
     if tables.regrow_before_bites:
         grow(world, tables, scratch, sprouts)

@@ -59,6 +59,9 @@ class Worlds(NamedTuple):
     """bool [B, N], whether the agent was in play at the end of the last turn, before anyone returned."""
     fired: Bools
     """bool [B, N], whether the agent fired in the last turn."""
+    moved_after_firing: Bools
+    """bool [B, N], whether another agent then moved it by one cell to its right, so that its beam begins one
+    cell to its left; only under `agent_1_right_moves_agent_0`, else all false."""
     hits: Ints
     """[B, N], hits since the last tag."""
     tagged_step: Ints
@@ -202,6 +205,7 @@ def empty_worlds(*, worlds: int, agents: int, sites: int) -> Worlds:
         in_play=bools(agents),
         on_board=bools(agents),
         fired=bools(agents),
+        moved_after_firing=bools(agents),
         hits=ints(agents),
         tagged_step=ints(agents),
         offences=ints(agents),

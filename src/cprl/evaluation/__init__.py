@@ -3,6 +3,7 @@
 Modules, in the order in which one reads them:
     evaluate    evaluate_run: all replicas of a run, beside the random policy
     cross_play  crossplay: a focal agent of one run among background agents of another
+    gains       what a focal agent gains over the agent whose place it takes, and what it costs the others
     film        an episode, every step recorded
     film_video  the same as a GIF or an MP4
     lanes       stored agents of all replicas side by side
@@ -11,9 +12,12 @@ Modules, in the order in which one reads them:
     turns            one episode of one world, turn by turn
     episode_picture  the board with the stock and the harvests so far
     video_files      GIF and MP4 out of pictures
+    gains_picture    gains as two matrices
 """
 
 from cprl.evaluation.cross_play import Cell, CrossPlay, crossplay
 from cprl.evaluation.evaluate import Evaluation, evaluate_run
+from cprl.evaluation.gains import Gain, gains
+from cprl.evaluation.gains_picture import draw_gains
 
-__all__ = ["Cell", "CrossPlay", "Evaluation", "crossplay", "evaluate_run"]
+__all__ = ["Cell", "CrossPlay", "Evaluation", "Gain", "crossplay", "draw_gains", "evaluate_run", "gains"]

@@ -25,12 +25,19 @@ from cprl import arguments
 from cprl.evaluation.evaluate import SEED, check, chosen_replicas, opened
 from cprl.evaluation.lanes import Played, Source, play, policies_of
 from cprl.evaluation.same_game import check_same_game
-from cprl.measuring.episodes import Episode
 from cprl.measuring.replicas import Measured, institution_measures, over_replicas, social_measures
 from cprl.runs.labelled import labelled
 from cprl.stored import LoadedRun
 
 Diagonal: TypeAlias = Literal["self", "cross_seed"]
+
+Whose: TypeAlias = Literal["focal", "background", "group"]
+_WHOSE: Final[dict[Whose, Callable[..., float]]] = {
+    "focal": lambda returns, at: returns[at],
+    "background": lambda returns, at: np.delete(returns, at).mean(),
+    "group": lambda returns, at: returns.sum(),
+}
+"""Of the agents' returns, float64 [N], and the focal agent's index."""
 
 SELF_PLAY: Final = -1
 """The focal agent of self-play in tables: every agent is focal and background."""
@@ -59,11 +66,7 @@ class Cell:
         agents = list(self.by_agent)
         if agent is not None:
             agents = [arguments.integer("agent", agent, 0, len(agents) - 1)]
-        returns = {
-            "focal/return": self._returns(agents, lambda returns, at: returns[at]),
-            "background/return": self._returns(agents, lambda returns, at: np.delete(returns, at).mean()),
-            "group/return": self._returns(agents, lambda returns, at: returns.sum()),
-        }
+        returns = {f"{whose}/return": over_replicas(self.returns(whose, agents)) for whose in _WHOSE}
         played = self._played(agents[:1] if self.is_self_play else agents)
         return {**returns, **social_measures(played), **institution_measures(played)}
 
@@ -75,14 +78,23 @@ class Cell:
                 together.setdefault(replica, []).extend(episodes)
         return together
 
-    def _returns(self, agents: Sequence[int], of: Callable[..., float]) -> Measured:
-        """A function of the agents' returns [N] and the focal agent's index, estimated over replicas."""
+    def returns(self, whose: Whose, agents: Sequence[int] = ()) -> dict[int, list[float]]:
+        """A return by replica, of each episode with each focal agent.
+
+        Args:
+            whose: "focal", "background", the mean of the background agents, or "group", the sum of all.
+            agents: the indices of focal agents; empty for all.
+
+        Raises:
+            ValueError: if `whose` is another word.
+        """
+        arguments.choice("whose", whose, _WHOSE)
         values: dict[int, list[float]] = {}
-        for agent in agents:
+        for agent in agents or self.by_agent:
             for replica, episodes in self.by_agent[agent].items():
-                own: list[Episode] = episodes
-                values.setdefault(replica, []).extend(float(of(one.return_, agent)) for one in own)
-        return over_replicas(values)
+                own = (float(_WHOSE[whose](one.return_, agent)) for one in episodes)
+                values.setdefault(replica, []).extend(own)
+        return values
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -129,7 +141,7 @@ class CrossPlay:
 
 
 def crossplay(
-    runs: Sequence[str | Path | LoadedRun],
+    runs: Sequence[str | Path | LoadedRun] | Mapping[str, str | Path | LoadedRun],
     *,
     episodes: int = 20,
     greedy: bool = False,
@@ -141,7 +153,8 @@ def crossplay(
     """Plays agents of each run with agents of each other run, one focal agent at a time.
 
     Args:
-        runs: at least two runs of the same game: directories, exported results, or values of `cprl.load`.
+        runs: at least two runs of the same game: directories, exported results, or values of `cprl.load`;
+            or a table of them by the names that they get, which are otherwise those of their directories.
         episodes: episodes of each replica with each focal agent, each in its own world.
         greedy: see `cprl.evaluate_run`.
         seed: the seed of the worlds and of all random numbers.
@@ -156,8 +169,7 @@ def crossplay(
             `cprl.evaluate_run`.
     """
     arguments.choice("diagonal", diagonal, get_args(Diagonal))
-    listed = arguments.listed("runs", runs, "a sequence of at least two runs")
-    named = _named([opened(run, allow) for run in listed])
+    named = _named(runs, allow)
     first, *_ = named.values()
     check_same_game(named)
     if first.game.agents == 1:
@@ -212,17 +224,26 @@ def _played_among(
     return {agent: played([*own[:agent], focal_source, *own[agent + 1 :]]) for agent in agents}
 
 
-def _named(runs: Sequence[LoadedRun]) -> dict[str, LoadedRun]:
-    """The runs by the names of their directories, or by their paths if names coincide."""
-    if len(runs) < 2:
+def _named(
+    runs: Sequence[str | Path | LoadedRun] | Mapping[str, str | Path | LoadedRun], allow: Sequence[str]
+) -> dict[str, LoadedRun]:
+    """The runs by given names, by names of their directories, or by their paths if those coincide."""
+    given: list[str] = []
+    if isinstance(runs, Mapping):
+        for name in runs:
+            arguments.object_of("a name of a run", name, str, "a text")
+        given, runs = list(runs), list(runs.values())
+    listed = arguments.listed("runs", runs, "a sequence of at least two runs")
+    opened_runs = [opened(run, allow) for run in listed]
+    if len(opened_runs) < 2:
         raise ValueError(
-            f"the number of runs is {len(runs)}; allowed: at least two: cprl crossplay RUN RUN..."
+            f"the number of runs is {len(opened_runs)}; allowed: at least two: cprl crossplay RUN RUN..."
         )
-    paths = [run.path.resolve() for run in runs]
+    paths = [run.path.resolve() for run in opened_runs]
     for place, path in enumerate(paths):
         if path in paths[:place]:
-            raise ValueError(f"{runs[place].path} is given twice; allowed: different runs")
-    names = [path.name for path in paths]
+            raise ValueError(f"{opened_runs[place].path} is given twice; allowed: different runs")
+    names = given or [path.name for path in paths]
     if len(set(names)) < len(names):
         names = [str(path) for path in paths]
-    return dict(zip(names, runs, strict=True))
+    return dict(zip(names, opened_runs, strict=True))

@@ -7,6 +7,7 @@ from rich.table import Table
 
 from cprl.evaluation.cross_play import CrossPlay
 from cprl.evaluation.evaluate import Evaluation
+from cprl.evaluation.gains import gains
 from cprl.evaluation.lanes import Played
 from cprl.measuring.names import with_unit
 from cprl.measuring.replicas import Measured, agents_without_harvest
@@ -56,7 +57,7 @@ def heading(played: CrossPlay) -> str:
 def matrices(played: CrossPlay) -> Iterator[Table]:
     """A matrix for each metric: rows are the focal agent's run, columns the background agents' run."""
     cells = {at: cell.measures() for at, cell in played.cells.items()}
-    rewards = _unit_of_cells(played)
+    rewards = unit_of_cells(played)
     for name in next(iter(cells.values())):
         of_name = [measured[name] for measured in cells.values()]
         if _says_nothing(name, of_name) or _repeats(name, cells.values()):
@@ -70,12 +71,31 @@ def matrices(played: CrossPlay) -> Iterator[Table]:
         yield table
 
 
+def gains_tables(played: CrossPlay) -> Iterator[Table]:
+    """A matrix of what focal agents gain, and one of what background agents do; see `gains`."""
+    found = gains(played)
+    rewards = unit_of_cells(played)
+    for whose, beside in (("focal", "the agent whose place it takes"), ("background", "the diagonal")):
+        title = with_unit(f"{whose}/return", rewards=rewards)
+        table = Table(
+            title=f"{title}, difference from {beside}, paired by replica [95 % interval by Student's t]",
+            title_justify="left",
+        )
+        table.add_column("focal \\ background")
+        for background in played.runs:
+            table.add_column(background, justify="right")
+        for focal in played.runs:
+            own = (found.get((focal, background)) for background in played.runs)
+            table.add_row(focal, *("" if gain is None else str(getattr(gain, whose)) for gain in own))
+        yield table
+
+
 def agents_table(played: CrossPlay) -> Table:
     """The returns of each cell by the index of the focal agent."""
     table = Table(title="returns by the focal agent's index", title_justify="left")
     for heading in ("focal", "background", "focal agent"):
         table.add_column(heading)
-    names, rewards = ("focal/return", "background/return", "group/return"), _unit_of_cells(played)
+    names, rewards = ("focal/return", "background/return", "group/return"), unit_of_cells(played)
     for name in names:
         table.add_column(with_unit(name, rewards=rewards), justify="right")
     for (focal, background), cell in played.cells.items():
@@ -95,7 +115,8 @@ def _repeats(name: str, cells: Iterable[Mapping[str, Measured]]) -> bool:
     return name == "collective_return" and not any("institutions/fines" in own for own in cells)
 
 
-def _unit_of_cells(played: CrossPlay) -> str:
+def unit_of_cells(played: CrossPlay) -> str:
+    """See `_unit_of_rewards`."""
     return _unit_of_rewards(next(iter(next(iter(played.cells.values())).by_agent.values())))
 
 

@@ -22,7 +22,10 @@ from cprl.checks import (
 from cprl.custom import Custom
 from cprl.networks.mlp import LAYERS
 
-Optimizer = Literal["adam", "adamw", "rmsprop", "sgd"]
+Optimizer = Literal["adam", "adamw", "rmsprop", "keras_rmsprop", "sgd"]
+"""Optimisers of `torch.optim` with torch's defaults; "keras_rmsprop" is `torch.optim.RMSprop` with the decay
+rate of Keras 2.2.4, 0.9 instead of 0.99. Both add epsilon outside of the square root, have no momentum and do
+not centre (`keras/optimizers.py` of that version)."""
 
 DEFAULT_HIDDEN_CELLS: Final = (32, 32)
 """Units of each hidden layer in the published study."""
@@ -75,7 +78,7 @@ class DQNSettings(Exploring):
     learning_rate: float = 1e-5
     """The optimiser's step size, 1e-12..100."""
     adam_eps: float = 1e-8
-    """Added to the denominator of Adam, AdamW and RMSprop, 1e-30..1; [run] 1e-7."""
+    """Added to the denominator of Adam, AdamW and both kinds of RMSprop, 1e-30..1; [run] 1e-7, Keras's."""
     hidden_cells: tuple[int, ...] = DEFAULT_HIDDEN_CELLS
     """Units of each hidden layer, with ReLU; used if the algorithm has no `network`."""
     updates_per_step: int = 1
@@ -84,7 +87,7 @@ class DQNSettings(Exploring):
     """Rewards that an n-step target sums before it bootstraps; fewer if the episode ends sooner. As TorchRL's
     `MultiStepTransform`; the study used 1."""
     optimizer: Optimizer = "adam"
-    """The optimiser of `torch.optim`; its other options are torch's defaults."""
+    """See `Optimizer`; [run] "adam", and "keras_rmsprop" in some versions of experiment 5."""
     tau: float | None = None
     """Soft target updates: the fraction by which targets move towards the network after each update, 1e-6..1;
     None for a copy every `target_every_episodes` episodes."""
@@ -100,8 +103,8 @@ class DQNSettings(Exploring):
     own_target_weights: bool = False
     """[run] Whether the target network has its own initial weights; else it starts as a copy."""
     mean_over_all_outputs: bool = False
-    """[run] Whether the squared error is averaged over all outputs, where all but the chosen action
-    contribute zero; else over the batch alone."""
+    """[run] Whether the loss is averaged over all A outputs, where all but the chosen action contribute zero;
+    else over the batch alone. Every loss is divided by A then, whatever its function."""
 
     def __post_init__(self) -> None:
         check_fields(self, _DQN)
@@ -130,7 +133,7 @@ class RolloutSettings:
     gamma: float = 0.995
     """Discount factor per step."""
     optimizer: Optimizer = "adam"
-    """The optimiser of `torch.optim`; its other options are torch's defaults."""
+    """See `Optimizer`."""
     gae_lambda: float = 0.95
     """Lambda of generalised advantage estimation, 0..1 (Schulman et al. 2016)."""
     normalize_advantage: bool = True
@@ -138,7 +141,7 @@ class RolloutSettings:
     learning_rate: float = 3e-4
     """The optimiser's step size, 1e-12..100."""
     adam_eps: float = 1e-5
-    """Added to the denominator of Adam, AdamW and RMSprop, 1e-30..1."""
+    """Added to the denominator of Adam, AdamW and both kinds of RMSprop, 1e-30..1."""
     max_grad_norm: float | None = 0.5
     """The norm to which an agent's gradient is clipped, 1e-6 or more; None for no clipping."""
     hidden_cells: tuple[int, ...] = DEFAULT_HIDDEN_CELLS

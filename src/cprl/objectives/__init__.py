@@ -2,6 +2,7 @@
 
 Modules, in the order in which one reads them:
     maddpg            MADDPGLoss: an actor and a centralised critic for each of several agents
+    log_cosh          ln cosh of an error, and TorchRL's DQN loss with it
     td_loss           what losses share whose targets bootstrap by one step
     pr2               probabilistic recursive reasoning: joint action values, the peers' expected answers
     stein             how particles, here samples of those answers, move towards a density
@@ -14,6 +15,7 @@ Modules, in the order in which one reads them:
 
 from cprl.objectives.dice import dice_objective, loaded_dice, magic_box
 from cprl.objectives.iterated import iterated_value
+from cprl.objectives.log_cosh import LogCoshDQNLoss, log_cosh
 from cprl.objectives.lola import lola_gradients, look_ahead_losses, looked_ahead
 from cprl.objectives.lola_losses import LOLADiCELoss, LOLALoss
 from cprl.objectives.maddpg import MADDPGLoss
@@ -23,12 +25,14 @@ from cprl.objectives.pr2_actor_critic import PR2ActorCriticLoss
 __all__ = [
     "LOLADiCELoss",
     "LOLALoss",
+    "LogCoshDQNLoss",
     "MADDPGLoss",
     "PR2ActorCriticLoss",
     "PR2Loss",
     "dice_objective",
     "iterated_value",
     "loaded_dice",
+    "log_cosh",
     "lola_gradients",
     "look_ahead_losses",
     "looked_ahead",

@@ -9,10 +9,11 @@ from tensordict.nn import TensorDictModule, TensorDictModuleBase, dispatch
 from tensordict.utils import NestedKey, unravel_key
 from torch import Tensor
 from torchrl.objectives import LossModule, ValueEstimators
-from torchrl.objectives.utils import dispatch_value_estimator, distance_loss
+from torchrl.objectives.utils import dispatch_value_estimator
 
 from cprl.arguments import object_of
 from cprl.checks import checked, number, one_of
+from cprl.objectives.log_cosh import DISTANCES, distance
 
 ActionSpace: TypeAlias = Literal["categorical", "one-hot"]
 
@@ -40,7 +41,7 @@ class MADDPGLoss(LossModule):
         critic_network: writes "state_action_value", float [.., S, 1], from such entries and "joint_action",
             float one-hot [.., S, S, A]: row i holds the actions of all members by which the critic of member
             i judges.
-        loss_function: of the critics' errors: "l2", "smooth_l1" or "l1".
+        loss_function: of the critics' errors: "l2", "smooth_l1", "l1" or "log_cosh".
         logit_penalty: the weight of the mean squared logit of each member in the actors' loss, 0 or more;
             1e-3 in the published program.
         action_space: "categorical" for actions int64 [.., S], "one-hot" for actions [.., S, A].
@@ -94,7 +95,7 @@ class MADDPGLoss(LossModule):
         action_space: ActionSpace = "categorical",
         reduction: str = "mean",
     ) -> None:
-        checked("loss_function", loss_function, one_of("l1", "l2", "smooth_l1"))
+        checked("loss_function", loss_function, one_of(*DISTANCES))
         checked("logit_penalty", logit_penalty, number(0, 1e6))
         checked("action_space", action_space, one_of(*get_args(ActionSpace)))
         checked("reduction", reduction, one_of("mean", "sum", "none"))
@@ -161,7 +162,7 @@ class MADDPGLoss(LossModule):
         value = self._values(
             tensordict, taken.unsqueeze(-3).expand(*_joint(taken)), self.critic_network_params
         )
-        errors = distance_loss(value, target, self.loss_function)
+        errors = distance(value, target, self.loss_function)
         actor_losses = self._actor_losses(tensordict, logits, taken, noise)
         with torch.no_grad():
             entropy = -(logits.softmax(-1) * logits.log_softmax(-1)).sum((-2, -1))

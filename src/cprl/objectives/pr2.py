@@ -9,10 +9,10 @@ from tensordict import TensorDict, TensorDictBase
 from tensordict.nn import TensorDictModule, TensorDictParams
 from tensordict.utils import NestedKey
 from torch import Tensor, nn
-from torchrl.objectives.utils import distance_loss
 
 from cprl.arguments import choice, number, object_of, switch
 from cprl.networks.joint import chosen, marginal, soft_value
+from cprl.objectives.log_cosh import DISTANCES, distance
 from cprl.objectives.td_loss import TDLoss
 
 _VALUES: Final = "joint_action_value"
@@ -43,7 +43,7 @@ class PR2Loss(TDLoss):
         entropy_bonus: whether soft values contain T times the entropy of the joint action, as in the paper:
             up to T log A for each agent and step, which pays them for living on. Else the sums are means, by
             which uniform play is worth what it is paid: lower by N T log A.
-        loss_function: of the temporal-difference error: "l2", "smooth_l1" (Huber) or "l1".
+        loss_function: of the temporal-difference error: "l2", "smooth_l1" (Huber), "l1" or "log_cosh".
         delay_value: whether soft values come from a target network.
         reduction: "none" (one loss per transition), "mean" or "sum".
 
@@ -90,7 +90,7 @@ class PR2Loss(TDLoss):
         object_of("value_network", value_network, nn.Module, "a TensorDictModule or a torch.nn.Module")
         switch("entropy_bonus", entropy_bonus)
         switch("delay_value", delay_value)
-        choice("loss_function", loss_function, ("l1", "l2", "smooth_l1"))
+        choice("loss_function", loss_function, DISTANCES)
         choice("reduction", reduction, ("none", "mean", "sum"))
         self.temperature = number(
             "temperature", temperature, low=_LOWEST_TEMPERATURE, high=1e6, allowed="1e-6..1e6"
@@ -122,7 +122,7 @@ class PR2Loss(TDLoss):
         value = chosen(self._joint(tensordict, self.value_network_params), tensordict.get(keys.action))
         target = self._target(tensordict)
         tensordict.set(keys.priority, (value.detach() - target).square().unsqueeze(-1))
-        loss = distance_loss(value, target, self.loss_function)
+        loss = distance(value, target, self.loss_function)
         return TensorDict({"loss": self._reduce_loss(loss, tensordict=tensordict)})
 
     def _target(self, tensordict: TensorDictBase) -> Tensor:

@@ -11,6 +11,7 @@ from matplotlib.legend import Legend
 from matplotlib.patheffects import Normal, Stroke
 
 from cprl.commons.colours import agent_colour
+from cprl.runs.files import write_atomically
 
 DPI: Final = 150
 WIDTH_IN: Final = 8.0
@@ -18,6 +19,8 @@ TITLE_CHARACTERS: Final = 84
 """The largest number of characters on a line of a title; then it wraps."""
 SMALL_PT: Final = 9
 """The size of the smallest text. A page shows a figure of 1,200 pixels at about 800."""
+CHARACTER_IN: Final = 0.083
+"""The width of a character of small text, about."""
 
 MEAN: Final = "#08519c"
 REPLICA: Final = "#6baed6"
@@ -87,7 +90,19 @@ def legend_below(figure: Figure, panels: Sequence[Axes], *, note: str = "", colu
     )
 
 
+def head(figure: Figure, title: str, note: str) -> None:
+    """A title, and below it what is drawn."""
+    width_in = figure.get_figwidth()
+    figure.suptitle(f"{wrapped(title, width_in)}\n{wrapped(note, width_in)}", fontsize=SMALL_PT + 1)
+
+
+def wrapped(title: str, width_in: float) -> str:
+    """The title of a panel of a width on several lines."""
+    return fill(title, int(width_in / CHARACTER_IN))
+
+
 def save(figure: Figure, path: Path) -> Path:
-    """Writes a PNG."""
-    figure.savefig(path, dpi=DPI)
+    """Writes a PNG atomically; its folder is created if missing."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    write_atomically(path, lambda file: figure.savefig(file, format="png", dpi=DPI))
     return path

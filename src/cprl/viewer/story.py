@@ -181,6 +181,6 @@ class Story:
 
 def published_phases(game: Game | None) -> dict[int, str]:
     """The phases of the study's figures by the episode in which they begin; empty for another game."""
-    if all(game != presets.game("commons", variant=variant) for variant in presets.VARIANTS):
+    if all(game != presets.game(board, variant=own) for board, own in presets.GAMES if board == "commons"):
         return {}
     return dict(zip((0, *PHASES_BEGIN), PHASES, strict=True))

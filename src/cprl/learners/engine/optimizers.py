@@ -12,12 +12,12 @@ BETA_1, BETA_2 = 0.9, 0.999
 """Adam's decay rates (Kingma and Ba 2015, torch's defaults)."""
 ADAMW_DECAY: Final = 0.01
 """AdamW's weight decay (Loshchilov and Hutter 2019, torch's default)."""
-RMSPROP_ALPHA: Final = 0.99
-"""RMSprop's decay rate (torch's default)."""
+RMSPROP_ALPHAS: Final = {"rmsprop": 0.99, "keras_rmsprop": 0.9}
+"""RMSprop's decay rate: torch's default, and that of Keras 2.2.4."""
 
 WITH_MEAN: Final = ("adam", "adamw")
 """Optimisers with a running mean of gradients."""
-WITH_SQUARE: Final = ("adam", "adamw", "rmsprop")
+WITH_SQUARE: Final = ("adam", "adamw", *RMSPROP_ALPHAS)
 """Optimisers with a running mean of squared gradients."""
 
 
@@ -29,8 +29,8 @@ def torch_optimizer(
         return torch.optim.Adam(parameters, lr=learning_rate, eps=eps, fused=True)
     if name == "adamw":
         return torch.optim.AdamW(parameters, lr=learning_rate, eps=eps, fused=True)
-    if name == "rmsprop":
-        return torch.optim.RMSprop(parameters, lr=learning_rate, eps=eps)
+    if name in RMSPROP_ALPHAS:
+        return torch.optim.RMSprop(parameters, lr=learning_rate, eps=eps, alpha=RMSPROP_ALPHAS[name])
     return torch.optim.SGD(parameters, lr=learning_rate, fused=True)
 
 
@@ -66,9 +66,10 @@ def change_weights(
             mean.mul_(BETA_1).add_(slope, alpha=1 - BETA_1)
             square.mul_(BETA_2).addcmul_(slope, slope, value=1 - BETA_2)
             weight.sub_(step_size * mean / (square.sqrt() * scale + eps))
-    elif name == "rmsprop":
+    elif name in RMSPROP_ALPHAS:
+        alpha = RMSPROP_ALPHAS[name]
         for weight, slope, square in zip(weights, gradients, squares, strict=True):
-            square.mul_(RMSPROP_ALPHA).addcmul_(slope, slope, value=1 - RMSPROP_ALPHA)
+            square.mul_(alpha).addcmul_(slope, slope, value=1 - alpha)
             weight.sub_(learning_rate * slope / (square.sqrt() + eps))
     else:
         for weight, slope in zip(weights, gradients, strict=True):

@@ -26,12 +26,11 @@ class LOLASettings:
     naive learning. The papers' 0.3 to 1 are for policies of five numbers; on boards of the commons 0.03 is a
     step as long as a tenth of the weights, 1 a policy that has nothing to do with the present one."""
     optimizer: Optimizer = "adam"
-    """The optimiser of the policies, of `torch.optim`; its other options are torch's defaults. The papers'
-    is "sgd"."""
+    """The optimiser of the policies, see `cprl.learners.settings.Optimizer`. The papers' is "sgd"."""
     learning_rate: float = 1e-3
     """Its step size, 1e-12..100."""
     adam_eps: float = 1e-5
-    """Added to the denominator of Adam, AdamW and RMSprop, 1e-30..1."""
+    """Added to the denominator of Adam, AdamW and both kinds of RMSprop, 1e-30..1."""
     max_grad_norm: float | None = None
     """The norm to which each member's gradient is clipped, 1e-6 or more; None for no clipping."""
     gae_lambda: float = 1.0

@@ -13,6 +13,7 @@ from torchrl.data.replay_buffers import Sampler
 from cprl.arguments import callable_of, object_of
 from cprl.learners.engine.base import is_finite, stacked_outputs
 from cprl.learners.engine.functional import MakeLoss, own_targets, total
+from cprl.learners.engine.optimizers import RMSPROP_ALPHAS
 from cprl.learners.lanes import SAMPLING, WEIGHTS, Lanes
 from cprl.learners.settings import Optimizer
 from cprl.networks.agent import parts_of
@@ -25,6 +26,7 @@ _OPTIMIZERS: Final[dict[Optimizer, type[torch.optim.Optimizer]]] = {
     "adam": torch.optim.Adam,
     "adamw": torch.optim.AdamW,
     "rmsprop": torch.optim.RMSprop,
+    "keras_rmsprop": torch.optim.RMSprop,
     "sgd": torch.optim.SGD,
 }
 _LARGEST_SEED: Final = 2**63 - 1
@@ -172,7 +174,7 @@ def make_optimizer(
 
     Args:
         parameters: the parameters to optimise.
-        name: "adam", "adamw", "rmsprop" or "sgd".
+        name: see `Optimizer`.
         learning_rate: its step size.
         eps: added to its denominator; "sgd" has none.
 
@@ -182,4 +184,6 @@ def make_optimizer(
     if name not in _OPTIMIZERS:
         raise ValueError(f"optimizer is {name!r}; allowed: {', '.join(_OPTIMIZERS)}")
     how: dict[str, Any] = {"lr": learning_rate} if name == "sgd" else {"lr": learning_rate, "eps": eps}
+    if name == "keras_rmsprop":
+        how["alpha"] = RMSPROP_ALPHAS[name]
     return _OPTIMIZERS[name](parameters, **how)

@@ -10,18 +10,15 @@ from matplotlib.figure import Figure
 from cprl.arguments import choice, refusal
 from cprl.arguments import path as path_of
 from cprl.measuring.statistics import Interval
-from cprl.plotting.style import MEAN, RANDOM_LINE, SMALL_PT
+from cprl.plotting.style import MEAN, RANDOM_LINE, SMALL_PT, head, save, wrapped
 from cprl.studies.figures.panels import (
     FAINT,
     MOST_CONDITIONS,
-    head,
     levels_note,
     names_of,
     replicas_text,
     short,
     with_counts,
-    wrapped,
-    write_figure,
 )
 from cprl.studies.tables.comparing import LAST, Compared, Comparison, compare, metrics_of
 from cprl.studies.tables.table import StudyTable
@@ -96,7 +93,7 @@ def by_condition(
         how = "Paired by replica" if first.is_paired else "Not paired: each condition has chance of its own"
         note = f"{replicas}. {how}; means of {first.episodes_text}; {first.interval_text}."
     head(figure, title, note)
-    return write_figure(figure, path)
+    return save(figure, path)
 
 
 def _draw_row(axes: Axes, place: int, own: Compared, kind: Kind) -> None:

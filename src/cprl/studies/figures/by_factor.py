@@ -13,18 +13,16 @@ from matplotlib.ticker import NullLocator
 from cprl.arguments import path as path_of
 from cprl.arguments import refusal
 from cprl.measuring.statistics import Interval
-from cprl.plotting.style import RANDOM_LINE, SMALL_PT
+from cprl.plotting.style import RANDOM_LINE, SMALL_PT, head, save
 from cprl.studies.figures.panels import (
     LEVEL,
     colours_of,
-    head,
     is_logarithmic,
     is_numeric,
     legend,
     levels_note,
     replicas_text,
     short,
-    write_figure,
 )
 from cprl.studies.tables.comparing import LAST, Compared, Comparison, compare, metrics_of
 from cprl.studies.tables.sources import Design
@@ -105,7 +103,7 @@ def by_factor(
     if others and list(lines) == [""]:
         note += f" Conditions differ in {', '.join(map(short, others))} too."
     head(figure, f"{design.name}: outcome by {short(factor)}", note)
-    return write_figure(figure, path)
+    return save(figure, path)
 
 
 @dataclass(frozen=True, kw_only=True)

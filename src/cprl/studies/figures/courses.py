@@ -12,18 +12,16 @@ from numpy.typing import NDArray
 from cprl.arguments import path as path_of
 from cprl.measuring.published import SMOOTHED_EPISODES
 from cprl.measuring.statistics import curve_interval
-from cprl.plotting.style import RANDOM_LINE, SMALL_PT
+from cprl.plotting.style import RANDOM_LINE, SMALL_PT, head, save
 from cprl.runs.curves import running_mean
 from cprl.studies.figures.panels import (
     MOST_CONDITIONS,
     colours_of,
-    head,
     legend,
     names_of,
     replicas_text,
     short,
     with_counts,
-    write_figure,
 )
 from cprl.studies.tables.comparing import compare, metrics_of
 from cprl.studies.tables.table import StudyTable
@@ -74,7 +72,7 @@ def courses(table: StudyTable, path: Path | str, *, metrics: Sequence[str] = ())
     else:
         figure = _apart(table, shown, chosen[0], names, curves)
     head(figure, f"{design.name}: the course of the training", note)
-    return write_figure(figure, path)
+    return save(figure, path)
 
 
 def _course(table: StudyTable, condition: str, metric: str) -> tuple[Values, Values, int]:

@@ -15,10 +15,10 @@ from matplotlib.ticker import MaxNLocator
 from cprl.arguments import object_of, refusal
 from cprl.arguments import path as path_of
 from cprl.measuring.statistics import Interval
-from cprl.plotting.style import SMALL_PT
+from cprl.plotting.cells import EMPTY, draw_cell
+from cprl.plotting.style import SMALL_PT, head, save, wrapped
 from cprl.studies.figures.panels import (
     MOST_CONDITIONS,
-    head,
     is_numeric,
     legend,
     levels_note,
@@ -26,8 +26,6 @@ from cprl.studies.figures.panels import (
     replicas_text,
     short,
     with_counts,
-    wrapped,
-    write_figure,
 )
 from cprl.studies.tables.comparing import LAST, Comparison, compare
 from cprl.studies.tables.outcomes import COLOURS, Endings
@@ -38,7 +36,6 @@ from cprl.studies.tables.windows import TRAINING
 
 _VALUES, _DIFFERENCES = "viridis", "RdBu"
 _CELL_IN: Final = (1.05, 0.55)
-_EMPTY: Final = "#f2f2f2"
 _WORD_CHARACTERS: Final = 12
 
 Grid = dict[tuple[Any, Any], str]
@@ -117,7 +114,7 @@ def heat_map(
     how = "paired by replica" if comparison.is_paired else "not paired"
     note = f"{levels_note(comparison)} Differences from {design.reference}, {how}.{fixed}"
     head(figure, f"{design.name}: {metric_title(metric)}", note)
-    return write_figure(figure, path)
+    return save(figure, path)
 
 
 def phase_diagram(
@@ -144,7 +141,7 @@ def phase_diagram(
     rules = "; ".join(found.rules)
     note = f"{replicas_text(table.replicas)}. In which phase a replica ends: {rules}.{fixed}"
     head(figure, f"{design.name}: phases at the end of the training", note)
-    return write_figure(figure, path)
+    return save(figure, path)
 
 
 def _checked(design: Design, factors: tuple[str, str]) -> tuple[Grid, str]:
@@ -188,18 +185,11 @@ def _draw_cells(
 ) -> None:
     for (row, column), name in grid.items():
         x, y = columns.index(column), rows.index(row)
-        colour, text = _EMPTY, "no run"
+        colour, text = EMPTY, "no run"
         if name in numbers:
             value, text = numbers[name]
             colour = colours(scale(value))
-        axes.add_patch(Rectangle((x - 0.5, y - 0.5), 1, 1, facecolor=colour, edgecolor="white"))
-        axes.text(x, y, text, ha="center", va="center", fontsize=SMALL_PT, color=_ink(colour))
-
-
-def _ink(colour: Any) -> str:
-    """Black on light cells, white on dark ones."""
-    red, green, blue, _ = matplotlib.colors.to_rgba(colour)
-    return "black" if 0.299 * red + 0.587 * green + 0.114 * blue > 0.5 else "white"
+        draw_cell(axes, x, y, colour, text)
 
 
 def _label_axes(axes: Axes, rows: Sequence[Any], columns: Sequence[Any], factors: tuple[str, str]) -> None:
@@ -217,12 +207,11 @@ def _squares(found: Endings, grid: Grid, factors: tuple[str, str]) -> Figure:
     axes = figure.add_subplot()
     for (row, column), name in grid.items():
         x, y, most = columns.index(column), rows.index(row), found.most_frequent(name)
-        colour, text = _EMPTY, "no run"
+        colour, text = EMPTY, "no run"
         if most is not None:
             label, number, of = most
             colour, text = COLOURS[label], f"{wrapped(label, 1.1)}\n{number} of {of}"
-        axes.add_patch(Rectangle((x - 0.5, y - 0.5), 1, 1, facecolor=colour, edgecolor="white"))
-        axes.text(x, y, text, ha="center", va="center", fontsize=SMALL_PT)
+        draw_cell(axes, x, y, colour, text)
     _label_axes(axes, rows, columns, factors)
     axes.set_ylabel(factors[0], fontsize=SMALL_PT)
     return figure

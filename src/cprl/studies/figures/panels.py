@@ -1,7 +1,6 @@
-"""What the figures of studies share: names, colours of conditions, notes, and how they are written."""
+"""What the figures of studies share: names, colours of conditions, notes, and legends."""
 
 from collections.abc import Mapping, Sequence
-from pathlib import Path
 from textwrap import fill
 from typing import Any, Final
 
@@ -10,8 +9,7 @@ from matplotlib.axes import Axes
 from matplotlib.colors import to_hex
 from matplotlib.figure import Figure
 
-from cprl.plotting.style import DPI, SMALL_PT
-from cprl.runs.files import write_atomically
+from cprl.plotting.style import CHARACTER_IN, SMALL_PT
 from cprl.studies.tables.comparing import Comparison
 from cprl.studies.tables.sources import Design
 
@@ -24,7 +22,6 @@ COLOURS: Final = ("#08519c", "#d95f02", "#1b9e77", "#7b3294", "#a50f15", "#8c6d3
 LEVEL: Final = "#08519c"
 FAINT: Final = "#9ecae1"
 NUMBERS_MAP: Final = "viridis"
-_CHARACTER_IN: Final = 0.083
 _APART: Final = 30
 """Levels whose largest is more than so many times the smallest stand on a logarithmic axis."""
 
@@ -86,18 +83,12 @@ def levels_note(comparison: Comparison) -> str:
     return f"Means of {comparison.episodes_text}, then over replicas; {comparison.interval_text}."
 
 
-def head(figure: Figure, title: str, note: str) -> None:
-    """A title, and below it what is drawn."""
-    characters = int(figure.get_figwidth() / _CHARACTER_IN)
-    figure.suptitle(f"{fill(title, characters)}\n{fill(note, characters)}", fontsize=SMALL_PT + 1)
-
-
 def legend(figure: Figure, axes: Axes, *, title: str | None = None) -> None:
     """A legend of a panel below the figure, each label once, in as many columns as there is room for."""
     entries = dict(zip(*reversed(axes.get_legend_handles_labels()), strict=True))
     if not entries:
         return
-    widest_in = _CHARACTER_IN * (max(map(len, entries)) + 6)
+    widest_in = CHARACTER_IN * (max(map(len, entries)) + 6)
     figure.legend(
         list(entries.values()),
         list(entries),
@@ -108,18 +99,6 @@ def legend(figure: Figure, axes: Axes, *, title: str | None = None) -> None:
         title_fontsize=SMALL_PT,
         frameon=False,
     )
-
-
-def wrapped(title: str, width_in: float) -> str:
-    """The title of a panel of a width on several lines."""
-    return fill(title, int(width_in / _CHARACTER_IN))
-
-
-def write_figure(figure: Figure, path: Path) -> Path:
-    """Writes a PNG atomically."""
-    path.parent.mkdir(parents=True, exist_ok=True)
-    write_atomically(path, lambda file: figure.savefig(file, format="png", dpi=DPI))
-    return path
 
 
 def _text(level: Any) -> str:

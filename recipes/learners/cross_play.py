@@ -1,0 +1,35 @@
+"""Who exploits whom? Each way's trained agents among those of each other, once a comparison has run.
+
+python recipes/learners/cross_play.py studies/learners_two_complex
+"""
+
+from pathlib import Path
+
+import tyro
+
+import cprl
+from cprl.evaluation import draw_gains
+from cprl.runs.labelled import write_table
+from cprl.studies.trials import trials_of
+
+
+def main(
+    comparison: Path, /, *, runs: Path | None = None, out: Path | None = None, episodes: int = 20
+) -> None:
+    """Plays the cross-play of a study's conditions: a focal agent of each among the agents of each other.
+
+    Args:
+        comparison: the study's directory.
+        runs: the directory of its runs, by default the study's own.
+        out: where cross_play.parquet and cross_play.png are written, by default the study's directory.
+        episodes: of each replica with each focal agent.
+    """
+    study, out = cprl.studies.read_study(comparison), out or comparison
+    trained = {own.condition.name: (runs or comparison / "runs") / own.name for own in trials_of(study)}
+    played = cprl.crossplay(trained, episodes=episodes)
+    write_table(out / "cross_play.parquet", played.table())
+    print(draw_gains(played, out / "cross_play.png"))
+
+
+if __name__ == "__main__":
+    tyro.cli(main)

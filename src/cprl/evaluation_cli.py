@@ -1,0 +1,180 @@
+"""`cprl film`, `cprl evaluate` and `cprl crossplay`: stored agents in fresh worlds."""
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+from rich.table import Table
+
+from cprl.commandline import Allow, make_importable
+from cprl.evaluation.cross_play import Diagonal
+from cprl.evaluation.cross_play import crossplay as play_each_other
+from cprl.evaluation.evaluate import SEED, evaluate_run
+from cprl.evaluation.film import film as film_run
+from cprl.evaluation.film_video import SUFFIXES, film_video
+from cprl.evaluation.gains_picture import draw_gains
+from cprl.evaluation.tables import agents_table, gains_tables, heading, matrices, run_table
+from cprl.output import OUT, console, say
+from cprl.process import prepare_process
+from cprl.runs.labelled import refuse_to_write_over, write_table
+from cprl.viewer.streams import viewer
+
+
+def film(
+    run: Path,
+    /,
+    *,
+    replica: int = 0,
+    episode: int = 0,
+    out: Path | None = None,
+    every: int | None = None,
+    fps: float | None = None,
+    width: int | None = None,
+    allow: Allow = (),
+) -> None:
+    """Lets the agents of a run play a fresh episode, recorded for the Rerun viewer or as a film.
+
+    Args:
+        run: the run's directory, or its results.
+        replica: whose agents.
+        episode: which of the fresh episodes; the same number plays the same again.
+        out: what is written: a recording for the viewer (.rrd), or a film of the board, the stock and the
+            harvests (.gif, or .mp4, which wants the extra "film"); by default film-<replica>-<episode>.rrd in
+            the run's directory.
+        every: of a .gif or .mp4: turns from one picture to the next; by default 1 for an .mp4, and for a .gif
+            as many as it takes for 300 pictures.
+        fps: of a .gif or .mp4: pictures per second, at most 50; by default 15.
+        width: of a .gif or .mp4, in pixels, 240 to 1920; by default 640.
+        allow: code of your own, module:Class, that the run may import; see docs/changing.md.
+    """
+    flags: dict[str, Any] = {"every": every, "fps": fps, "width": width}
+    given = {name: value for name, value in flags.items() if value is not None}
+    if out is not None and out.suffix not in (".rrd", *SUFFIXES):
+        raise ValueError(f"--out is {out}; allowed: a name that ends in .rrd, {', '.join(SUFFIXES)}")
+    is_video = out is not None and out.suffix in SUFFIXES
+    if given and not is_video:
+        raise ValueError(f"--{next(iter(given))} is for films; allowed: with --out FILE.gif or FILE.mp4")
+    make_importable(allow)
+    prepare_process(SEED)
+    if out is not None and is_video:
+        path, played = film_video(run, out, replica=replica, episode=episode, allow=allow, **given)
+    else:
+        path, played = film_run(run, out, replica=replica, episode=episode, allow=allow)
+    say(f"{played.steps} steps, {played.outcome}")
+    say(f"{path}: {path.stat().st_size / 1000:.0f} kB" if is_video else f"Watch: {viewer()} {path}")
+
+
+def evaluate(
+    run: Path,
+    /,
+    *,
+    episodes: int = 20,
+    greedy: bool = False,
+    seed: int = SEED,
+    replicas: tuple[int, ...] = (),
+    out: Path | None = None,
+    allow: Allow = (),
+) -> None:
+    """Lets all replicas of a run play fresh worlds, and prints the social metrics beside the random policy's.
+
+    Args:
+        run: the run's directory, or its results; of one that has not ended the newest checkpoint plays.
+        episodes: of each replica.
+        greedy: whether agents play what they hold best, without exploring or drawing.
+        seed: of the worlds and all chance; the same one gives the same numbers.
+        replicas: their numbers; by default all.
+        out: a parquet file to be, with every episode.
+        allow: code of your own, module:Class, that the run may import; see docs/changing.md.
+    """
+    make_importable(allow)
+    if out is not None:
+        refuse_to_write_over(out)
+    prepare_process(seed)
+    evaluation = evaluate_run(
+        run, episodes=episodes, greedy=greedy, seed=seed, replicas=replicas, allow=allow
+    )
+    if out is not None:
+        write_table(out, evaluation.table())
+    _print(run_table(evaluation))
+    say(f"Weights: {evaluation.run.weights_from}")
+    if out is not None:
+        say(f"Episodes: {out}")
+
+
+def crossplay(
+    runs: tuple[str, ...],
+    /,
+    *,
+    episodes: int = 20,
+    greedy: bool = False,
+    seed: int = SEED,
+    replicas: tuple[int, ...] = (),
+    diagonal: Diagonal = "self",
+    out: Path | None = None,
+    figure: Path | None = None,
+    allow: Allow = (),
+) -> None:
+    """Lets agents of each run play among those of each other run, and prints how all fare.
+
+    Args:
+        runs: directories of runs of the same game, or their results; NAME=PATH gives one another name.
+        episodes: of each replica with each focal agent.
+        greedy: whether agents play what they hold best, without exploring or drawing.
+        seed: of the worlds and all chance; the same one gives the same numbers.
+        replicas: their numbers; by default all that every run has.
+        diagonal: whom a run's agents meet there: "self", those they were trained with, or "cross_seed", those
+            of the run's next replica.
+        out: a parquet file to be, with every episode.
+        figure: a PNG to be: what focal agents gain, and what it costs the background agents.
+        allow: code of your own, module:Class, that the run may import; see docs/changing.md.
+    """
+    make_importable(allow)
+    for path in (out, figure):
+        if path is not None:
+            refuse_to_write_over(path)
+    if figure is not None and figure.suffix != ".png":
+        raise ValueError(f"--figure is {figure}; allowed: a name that ends in .png")
+    prepare_process(seed)
+    played = play_each_other(
+        _runs_by_name(runs),
+        episodes=episodes,
+        greedy=greedy,
+        seed=seed,
+        replicas=replicas,
+        diagonal=diagonal,
+        allow=allow,
+    )
+    if out is not None:
+        write_table(out, played.table())
+    say(heading(played))
+    _print(*matrices(played), *gains_tables(played), agents_table(played))
+    if out is not None:
+        say(f"Episodes: {out}")
+    if figure is not None:
+        say(f"Figure: {draw_gains(played, figure)}")
+
+
+def _runs_by_name(words: Sequence[str]) -> list[str] | dict[str, str]:
+    """Runs as `crossplay` takes them: paths, or a table where one has a name, NAME=PATH."""
+    pairs = [_name_and_path(word) for word in words]
+    if not any(name for name, _ in pairs):
+        return [path for _, path in pairs]
+    named = [(name or Path(path).resolve().name, path) for name, path in pairs]
+    names = [name for name, _ in named]
+    for name in names:
+        if names.count(name) > 1:
+            raise ValueError(f"{name} names {names.count(name)} runs; allowed: each its own, NAME=PATH")
+    return dict(named)
+
+
+def _name_and_path(word: str) -> tuple[str, str]:
+    """The parts of NAME=PATH; a path that is there may have "=" itself."""
+    name, equals, path = word.partition("=")
+    return (name, path) if equals and name and "/" not in name and not Path(word).exists() else ("", word)
+
+
+def _print(*tables: Table) -> None:
+    """Prints tables; into a file or pipe as wide as they are."""
+    shown = console(width=None if OUT.isatty() else 250)
+    for table in tables:
+        shown.print(table)

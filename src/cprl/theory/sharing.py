@@ -1,0 +1,200 @@
+"""SharingGame: agents take a number each, and every unit is worth the less the more are taken in all.
+
+Agent i takes x_i >= 0 and is paid x_i v(X) - c x_i + e, where X is the sum of all, c what a unit costs it and
+e a payment that does not depend on what anybody takes. What it takes lowers v(X) for everybody, and it feels
+an n-th of that: in the symmetric equilibrium v(X) + X v'(X) / n = c, at the group's optimum
+v(X) + X v'(X) = c.
+"""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import cached_property
+from math import inf
+from typing import Final
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from cprl import arguments
+from cprl.checks import MOST_NUMBER, Check, check_fields, count, instance, is_number
+from cprl.theory.worth import PowerWorth, Worth
+
+_HALVINGS: Final = 200
+
+
+@dataclass(frozen=True, kw_only=True)
+class SharingGame:
+    """n agents share what is worth v(X) a unit when they take X in all; see the module for the formulas.
+
+    Totals, payoffs and costs are numbers of Python, in units of one's own.
+
+    Raises:
+        ValueError: names the field, what came and what is allowed.
+    """
+
+    agents: int
+    """The number of agents n."""
+    worth: Worth
+    """v, what a unit is worth."""
+    cost: float
+    """c, what a unit costs who takes it, at least 0."""
+    most_each: float = inf
+    """The most that an agent can take, above 0."""
+    payment: float = 0.0
+    """e, what each agent is paid whatever it takes."""
+
+    def __post_init__(self) -> None:
+        check_fields(self, _CHECKS)
+
+    def payoffs(self, taken: ArrayLike) -> NDArray[np.float64]:
+        """What agents are paid, float64 [..., n].
+
+        Args:
+            taken: what each takes, float [..., n], from 0 to `most_each`.
+
+        Raises:
+            ValueError: for another shape, and for numbers that cannot be taken.
+        """
+        own = arguments.floats("taken", taken)
+        if own.ndim == 0 or own.shape[-1] != self.agents:
+            raise ValueError(f"taken is {list(own.shape)}; allowed: [..., {self.agents}], a number per agent")
+        if not ((own >= 0) & (own <= self.most_each)).all():  # NaN is refused too
+            raise ValueError(
+                f"taken has numbers from {own.min():g} to {own.max():g}; allowed: 0 to {self.most_each:g}"
+            )
+        values = np.vectorize(self.worth.at, otypes=[np.float64])(own.sum(-1))
+        paid: NDArray[np.float64] = own * (values - self.cost)[..., None] + self.payment
+        return paid
+
+    def surplus(self, total: float) -> float:
+        """What all agents together gain when they take so much in all: X (v(X) - c), without payments."""
+        total = _total(total, "total")
+        return total * (self.worth.at(total) - self.cost)
+
+    @cached_property
+    def nash_total(self) -> float:
+        """X* of the symmetric Nash equilibrium, in which each agent takes X* / n."""
+        return self._balance(1 / self.agents)
+
+    @cached_property
+    def optimum_total(self) -> float:
+        """X** that is best for the group."""
+        return self._balance(1.0)
+
+    @cached_property
+    def open_access_total(self) -> float:
+        """The total at which a unit is worth what it costs, and nobody gains anything."""
+        return self._balance(0.0)
+
+    @property
+    def price_of_anarchy(self) -> float:
+        """The surplus at the optimum over that in equilibrium, at least 1; 1 where nothing can be gained."""
+        best, found = self.surplus(self.optimum_total), self.surplus(self.nash_total)
+        if best <= 0:
+            return 1.0
+        return best / found if found > 0 else inf
+
+    @property
+    def rent_share(self) -> float:
+        """The surplus in equilibrium as a share of that at the optimum, the inverse of `price_of_anarchy`."""
+        return 1 / self.price_of_anarchy
+
+    def best_response(self, others: float) -> float:
+        """What an agent takes to gain most while all others together take so much.
+
+        It solves v(x + O) + x v'(x + O) = c, where O is what the others take.
+        """
+        others, worth = _total(others, "others"), self.worth
+
+        def gain(own: float) -> float:
+            return worth.at(own + others) + own * worth.slope(own + others) - self.cost
+
+        return _root(gain, min(self.most_each, max(worth.most - others, 0.0)))
+
+    def _balance(self, share: float) -> float:
+        """The total X with v(X) + share X v'(X) = c, or the nearest one that agents can take."""
+        worth, most = self.worth, self.agents * self.most_each
+        if isinstance(worth, PowerWorth):
+            return min(worth.balance(self.cost, share), most)
+
+        def gain(total: float) -> float:
+            return worth.at(total) + share * total * worth.slope(total) - self.cost
+
+        return _root(gain, min(worth.most, most))
+
+
+def herders(agents: int, *, worth: Worth | None = None, cost: float = 1.0) -> SharingGame:
+    """n herders graze a_i animals each on a common pasture; an animal is worth v(A) when A graze in all.
+
+    With v(A) = 10 - A^2 and c = 1 the optimum is A** = 1.7321, and A* = 1.7321, 2.1213, 2.5355, 2.7386 and
+    2.9704 for 1, 2, 5, 10 and 100 herders.
+
+    Source: M. Wiatrak, "Governing the Commons with Multi-Agent Reinforcement Learning" (2019), equations 2.1
+    to 2.5, on G. Hardin, "The Tragedy of the Commons" (1968).
+
+    Args:
+        agents: n.
+        worth: v; by default 10 - A^2.
+        cost: c, of an animal.
+    """
+    return SharingGame(agents=agents, worth=PowerWorth() if worth is None else worth, cost=cost)
+
+
+def appropriation(
+    agents: int = 8,
+    *,
+    tokens: float = 10.0,
+    outside: float = 5.0,
+    linear: float = 23.0,
+    quadratic: float = 0.25,
+) -> SharingGame:
+    """Agents divide their tokens between a common-pool resource and an outside activity.
+
+    The resource pays F(X) = linear X - quadratic X^2 for all X tokens in it, to each agent the share that its
+    tokens have; a token outside pays `outside`. With the numbers of the experiments 8 agents put in 8 tokens
+    each in equilibrium, 64 in all, where 36 were best; at 72 there is no rent, and in equilibrium 39.5 % of
+    the best one.
+
+    Source: E. Ostrom, R. Gardner and J. Walker, "Rules, Games, and Common-Pool Resources" (1994), chapter 5.
+
+    Args:
+        agents: n.
+        tokens: of each agent; 10 or 25 in the experiments.
+        outside: w, what a token earns outside.
+        linear: of F.
+        quadratic: of F.
+    """
+    worth = PowerWorth(top=linear, factor=quadratic, power=1.0)
+    return SharingGame(agents=agents, worth=worth, cost=outside, most_each=tokens, payment=tokens * outside)
+
+
+def _root(falling: Callable[[float], float], most: float) -> float:
+    """Where a falling function is 0, between 0 and `most`; one of these where it has one sign."""
+    if most <= 0 or falling(0.0) <= 0:
+        return 0.0
+    low, high = 0.0, float(np.nextafter(most, 0.0))  # a worth may have a kink where it becomes 0
+    if falling(high) >= 0:
+        return most
+    for _ in range(_HALVINGS):
+        middle = (low + high) / 2
+        if middle in (low, high):
+            break
+        low, high = (middle, high) if falling(middle) > 0 else (low, middle)
+    return (low + high) / 2
+
+
+def _total(value: float, name: str) -> float:
+    return arguments.number(name, value, low=0, high=MOST_NUMBER, allowed="a number >= 0")
+
+
+_CHECKS: Final[dict[str, Check]] = {
+    "agents": count(1),
+    "worth": instance(
+        Worth, "a Worth: PowerWorth, CallableWorth, or one of your own with `most`, `at`, `slope`"
+    ),
+    "cost": Check(lambda value: is_number(value, 0, MOST_NUMBER), "a number >= 0"),
+    "most_each": Check(
+        lambda value: value == inf or (is_number(value, 0, MOST_NUMBER) and value > 0), "a number above 0"
+    ),
+    "payment": Check(lambda value: is_number(value, -MOST_NUMBER, MOST_NUMBER), "a number"),
+}

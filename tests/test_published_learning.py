@@ -1,0 +1,286 @@
+"""How versions of the study's program learned: RMSprop as Keras has it, and the log-cosh of errors."""
+
+import math
+from dataclasses import replace
+
+import pytest
+import torch
+from tensordict import TensorDict
+from test_lanes import ACTIONS, COMPILED, ENGINES, assert_same_course, filled, networks
+from torch import nn
+from torchrl.modules import QValueActor
+from torchrl.objectives import DQNLoss, ValueEstimators
+
+from cprl import presets
+from cprl.algorithms import CQL, DQN, IQL, MADDPG, PR2, SAC, DQNSettings, RolloutSettings
+from cprl.compat import promise_targets
+from cprl.learners.engine.optimizers import change_weights, torch_optimizer
+from cprl.learners.torchrl.agents import make_optimizer
+from cprl.networks.joint import JointNetwork, JointValues
+from cprl.objectives import LogCoshDQNLoss, PR2Loss, log_cosh
+from cprl.objectives.log_cosh import DISTANCES, distance
+
+# Two steps of Keras's RMSprop with rho 0.9, learning rate 0.1 and, to see where it stands, epsilon 0.5, from
+# the weight 1 along the gradients 2 and -1:
+# the mean of squares is 0.1 * 4 = 0.4, its root 0.6324555; 1 - 0.1 * 2 / (0.6324555 + 0.5) = 0.8233926;
+# then 0.9 * 0.4 + 0.1 * 1 = 0.46, its root 0.6782330; 0.8233926 + 0.1 / (0.6782330 + 0.5) = 0.9082655.
+# (Inside of the root epsilon would give 1 - 0.2 / sqrt(0.9) = 0.7891815 after the first.)
+GRADIENTS, WEIGHTS, SQUARES = (2.0, -1.0), (0.8233926, 0.9082655), (0.4, 0.46)
+
+
+@pytest.mark.parametrize("make", [torch_optimizer, make_optimizer])
+def test_torchs_optimiser_takes_the_steps_of_keras(make):
+    weight = nn.Parameter(torch.ones(1, dtype=torch.float64))
+    if make is torch_optimizer:
+        optimizer = make("keras_rmsprop", [weight], learning_rate=0.1, eps=0.5)
+    else:
+        optimizer = make([weight], "keras_rmsprop", learning_rate=0.1, eps=0.5)
+    assert type(optimizer) is torch.optim.RMSprop
+    for gradient, after, square in zip(GRADIENTS, WEIGHTS, SQUARES, strict=True):
+        weight.grad = torch.full_like(weight, gradient)
+        optimizer.step()
+        assert weight.item() == pytest.approx(after, abs=1e-7)
+        assert optimizer.state[weight]["square_avg"].item() == pytest.approx(square)
+    assert set(optimizer.state[weight]) == {"step", "square_avg"}, "no momentum, not centred"
+
+
+def test_many_lanes_take_the_steps_of_keras():
+    weight, square = (torch.full((2, 1), start, dtype=torch.float64) for start in (1.0, 0.0))
+    for nth, gradient in enumerate(GRADIENTS):
+        change_weights(
+            "keras_rmsprop",
+            [weight],
+            [torch.tensor([[gradient], [0.0]], dtype=torch.float64)],
+            (),
+            [square],
+            step_size=torch.zeros(()),
+            scale=torch.zeros(()),
+            learning_rate=0.1,
+            eps=0.5,
+        )
+        assert weight[:, 0].tolist() == pytest.approx([WEIGHTS[nth], 1.0], abs=1e-7)
+        assert square[:, 0].tolist() == pytest.approx([SQUARES[nth], 0.0])
+
+
+def test_both_kinds_of_rmsprop_differ_in_their_decay_alone():
+    of_torch, of_keras = (
+        torch_optimizer(name, [nn.Parameter(torch.ones(1))], learning_rate=0.1, eps=0.5).param_groups[0]
+        for name in ("rmsprop", "keras_rmsprop")
+    )
+    differ = {name for name in of_torch if name != "params" and of_torch[name] != of_keras[name]}
+    assert (differ, of_torch["alpha"], of_keras["alpha"]) == ({"alpha"}, 0.99, 0.9)
+
+
+def test_log_cosh_and_its_derivative_are_those_worked_by_hand():
+    # e^d is 2, 1/3, 1: cosh d is (2 + 1/2) / 2 = 5/4, (3 + 1/3) / 2 = 5/3, 1; tanh d is (4 - 1) / (4 + 1),
+    # (1/9 - 1) / (1/9 + 1), 0.
+    error = torch.tensor([math.log(2), -math.log(3), 0.0], dtype=torch.float64, requires_grad=True)
+    loss = log_cosh(error)
+    assert loss.tolist() == pytest.approx([math.log(5 / 4), math.log(5 / 3), 0.0])
+    loss.sum().backward()
+    assert error.grad.tolist() == pytest.approx([0.6, -0.8, 0.0])
+
+
+@pytest.mark.parametrize("size", [90.0, 1e4, 1e30])
+def test_log_cosh_of_large_errors_does_not_overflow(size):
+    error = torch.tensor([size, -size], requires_grad=True)
+    loss = log_cosh(error)
+    assert error.dtype == loss.dtype == torch.float32
+    assert loss.tolist() == pytest.approx([size - math.log(2)] * 2)
+    loss.sum().backward()
+    assert error.grad.tolist() == [1.0, -1.0]
+
+
+def test_the_derivative_is_tanh_in_single_precision():
+    error = torch.linspace(-20, 20, 4001, requires_grad=True)
+    log_cosh(error).sum().backward()
+    torch.testing.assert_close(error.grad, error.detach().tanh(), rtol=0, atol=3e-7)
+
+
+def test_every_distance_is_that_of_torchrl_or_log_cosh():
+    value, target = torch.tensor([1.0, 3.0]), torch.tensor([2.0, 3.0])
+    # ln cosh 1 = ln 1.5430806 = 0.4337808.
+    of_one = {"l1": 1.0, "l2": 1.0, "smooth_l1": 0.5, "log_cosh": 0.4337808}
+    assert set(of_one) == set(DISTANCES)
+    for name, expected in of_one.items():
+        assert distance(value, target, name).tolist() == pytest.approx([expected, 0.0])
+
+
+class Table(nn.Module):
+    """Values 0.25 and 0.5 of two actions, whatever is seen."""
+
+    def __init__(self):
+        super().__init__()
+        self.values = nn.Parameter(torch.tensor([0.25, 0.5], dtype=torch.float64))
+
+    def forward(self, observation):
+        return self.values.expand(*observation.shape[:-1], 2)
+
+
+def dqn_of_a_table(**how):
+    actor = QValueActor(Table(), spec=None, action_space="categorical")
+    loss = LogCoshDQNLoss(actor, delay_value=True, action_space="categorical", **how)
+    loss.make_value_estimator(ValueEstimators.TD0, gamma=0.5)
+    promise_targets(loss)
+    return loss
+
+
+def two_turns():
+    after = {
+        "observation": torch.zeros(2, 1, dtype=torch.float64),
+        "reward": torch.tensor([[1.0], [-0.5]], dtype=torch.float64),
+        "done": torch.tensor([[False], [True]]),
+        "terminated": torch.tensor([[False], [True]]),
+    }
+    before = {"observation": torch.zeros(2, 1, dtype=torch.float64), "action": torch.tensor([0, 1])}
+    return TensorDict({**before, "next": TensorDict(after, [2])}, [2])
+
+
+@pytest.mark.parametrize("double", [False, True])
+def test_the_loss_of_a_batch_is_the_mean_log_cosh_of_its_errors(double):
+    # Targets are 1 + 0.5 * 0.5 = 1.25 and, after the end, -0.5, so both errors are 1: 0.25 - 1.25 = -1 and
+    # 0.5 + 0.5 = 1. ln cosh 1 = 0.4337808, tanh 1 = 0.7615942, of which the mean has half in each value.
+    loss = dqn_of_a_table(double_dqn=double)
+    out = loss(two_turns())["loss"]
+    assert out.item() == pytest.approx(0.4337808)
+    out.backward()
+    values = loss.value_network_params.flatten_keys(".").values()
+    assert next(iter(values)).grad.tolist() == pytest.approx([-0.7615942 / 2, 0.7615942 / 2])
+    assert dqn_of_a_table(reduction="sum")(two_turns())["loss"].item() == pytest.approx(2 * 0.4337808)
+    each = dqn_of_a_table(reduction="none")(two_turns())["loss"]
+    assert each.tolist() == pytest.approx([0.4337808] * 2)
+
+
+def test_the_loss_is_torchrls_in_all_else():
+    loss, batch = dqn_of_a_table(), two_turns()
+    assert isinstance(loss, DQNLoss)
+    loss(batch)
+    assert batch["td_error"].squeeze(-1).tolist() == [1.0, 1.0], "squares, as priorities always are"
+    weighed = two_turns().set("priority_weight", torch.tensor([3.0, 1.0], dtype=torch.float64))
+    weighed["next", "reward"] = torch.tensor([[1.0], [0.5]], dtype=torch.float64)
+    # The second error is now 0, and so its share: 3 / (3 + 1) of the first.
+    assert loss(weighed)["loss"].item() == pytest.approx(0.75 * 0.4337808)
+
+
+def make_loss(network):
+    return DQN(settings=DQNSettings(gamma=0.9), loss_function="log_cosh").make_loss(network)
+
+
+def course(engine, lanes, *, dtype=torch.float64, steps=60):
+    update = engine(
+        networks(lanes, dtype),
+        make_loss,
+        learning_rate=1e-3,
+        optimizer="keras_rmsprop",
+        adam_eps=1e-7,
+        loss_share=1 / ACTIONS,
+    )
+    buffer, losses = filled(lanes), []
+    for step in range(steps):
+        losses.append(update.update(buffer))
+        update.copy_to_targets(torch.tensor([step % 20 == lane for lane in lanes]))
+    return update, torch.stack(losses)
+
+
+@pytest.mark.parametrize("engine", ["vmapped", "lane_axis"])
+def test_the_fast_engines_end_where_a_list_of_losses_ends(engine):
+    lanes = [0, 1, 2]
+    reference, losses = course(ENGINES["list"], lanes)
+    update, their_losses = course(ENGINES[engine], lanes)
+    torch.testing.assert_close(their_losses, losses, rtol=1e-9, atol=1e-12)
+    assert_same_course(update, reference, lanes, lanes, 1e-9)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("engine", COMPILED)
+def test_the_compiled_engines_end_there_too(engine):
+    lanes = [0, 1, 2]
+    reference, losses = course(ENGINES["list"], lanes, dtype=torch.float32)
+    update, their_losses = course(COMPILED[engine], lanes, dtype=torch.float32)
+    assert update._compiled.enabled
+    torch.testing.assert_close(their_losses, losses, rtol=1e-4, atol=1e-6)
+    assert_same_course(update, reference, lanes, lanes, 1e-4)
+
+
+@pytest.mark.parametrize("engine", ENGINES)
+def test_a_lane_learns_as_it_would_alone(engine):
+    many, losses = course(ENGINES[engine], [2, 0, 1])
+    alone, own = course(ENGINES[engine], [1])
+    torch.testing.assert_close(losses[:, 2:], own, rtol=1e-9, atol=1e-12)
+    assert_same_course(alone, many, [0], [2], 1e-9)
+
+
+def test_as_run_the_loss_is_that_of_keras_over_all_outputs():
+    """Keras fits all outputs to targets that equal them but for the action taken, and takes the mean over
+    outputs, then over the batch."""
+    settings = replace(presets.dqn_settings("two_complex", variant="as_run"), buffer_size=20)
+    algorithm = DQN(settings=settings, loss_function="log_cosh")
+    spaces = presets.game("two_complex", variant="as_run").spaces
+    learner = algorithm.make_learner(spaces, agents=(0,), replicas=1, engine="torchrl")
+    agent, chance = learner.stock.each[0], torch.Generator().manual_seed(1)
+    seen, seen_next = torch.randint(256, (2, 8, *spaces.observation_shape), generator=chance).to(torch.uint8)
+    action, reward = torch.arange(8) % spaces.actions, torch.rand(8, 1, generator=chance)
+    ends = torch.zeros(8, 1, dtype=torch.bool)
+    after = {"observation": seen_next, "reward": reward, "done": ends, "terminated": ends}
+    batch = TensorDict({"observation": seen, "action": action, "next": TensorDict(after, [8])}, [8])
+    with agent.loss.target_value_network_params.to_module(agent.loss.value_network):
+        following = agent.loss.value_network(batch["next"].select("observation"))["action_value"].amax(-1)
+    outputs = agent.network(seen).detach()
+    targets = outputs.clone()
+    targets[range(8), action] = reward.squeeze(-1) + settings.gamma * following
+    assert agent.update(batch).item() == pytest.approx(log_cosh(outputs - targets).mean().item(), rel=1e-5)
+
+
+def test_pr2_takes_log_cosh_too():
+    torch.manual_seed(0)
+    network = JointNetwork(nn.Linear(4, 9), actions=3, peers=1, temperature=1.0)
+    after = {
+        "observation": torch.rand(5, 4),
+        "reward": torch.rand(5, 1),
+        "done": torch.zeros(5, 1, dtype=torch.bool),
+        "terminated": torch.zeros(5, 1, dtype=torch.bool),
+    }
+    batch = TensorDict(
+        {
+            "observation": torch.rand(5, 4),
+            "action": torch.tensor([[0, 1], [1, 2], [2, 0], [1, 1], [0, 2]]),
+            "next": TensorDict(after, [5]),
+        },
+        [5],
+    )
+    found = {}
+    for name in ("l1", "log_cosh"):
+        loss = PR2Loss(JointValues(network), temperature=1.0, loss_function=name, reduction="none")
+        promise_targets(loss.make_value_estimator(ValueEstimators.TD0, gamma=0.9))
+        found[name] = loss(batch)["loss"]
+    torch.testing.assert_close(found["log_cosh"], found["l1"].cosh().log())
+
+
+@pytest.mark.parametrize("kind", [CQL, SAC, IQL])
+def test_losses_of_torchrl_that_cannot_have_it_refuse_it_by_name(kind):
+    message = f"{kind.__name__}.loss_function is 'log_cosh'; allowed: 'l1', 'l2', 'smooth_l1'$"
+    with pytest.raises(ValueError, match=message):
+        kind(settings=DQNSettings(), loss_function="log_cosh")
+
+
+@pytest.mark.parametrize("kind", [DQN, PR2, MADDPG])
+def test_an_unknown_loss_function_is_refused_with_those_that_are_there(kind):
+    assert kind(settings=DQNSettings(), loss_function="log_cosh").loss_function == "log_cosh"
+    message = "loss_function is 'logcosh'.*; allowed: 'l1', 'l2', 'smooth_l1', 'log_cosh'$"
+    with pytest.raises(ValueError, match=message):
+        kind(settings=DQNSettings(), loss_function="logcosh")
+
+
+def test_the_learners_of_the_programs_versions_are_one_line_away():
+    settings = presets.dqn_settings("commons", variant="as_run")
+    version = DQN(
+        settings=replace(settings, gamma=0.997, optimizer="keras_rmsprop"), loss_function="log_cosh"
+    )
+    of_torch = version.make_loss(version.make_network(presets.game("commons").spaces))
+    assert isinstance(of_torch, LogCoshDQNLoss)
+    optimizer = make_optimizer(
+        of_torch.parameters(), version.settings.optimizer, learning_rate=1e-5, eps=version.settings.adam_eps
+    )
+    group = optimizer.param_groups[0]
+    assert (group["alpha"], group["eps"], group["momentum"], group["centered"]) == (0.9, 1e-7, 0, False)
+    assert RolloutSettings(optimizer="keras_rmsprop").optimizer == "keras_rmsprop"

@@ -1,0 +1,196 @@
+"""Games with a known answer: equilibria, optima, and what apples can bear."""
+
+from math import inf, sqrt
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from cprl import Map, Rules, maps, presets
+from cprl.commons.yields import sustainable_yield
+from cprl.theory import (
+    CallableWorth,
+    PowerWorth,
+    SharingGame,
+    appropriation,
+    exact_yield,
+    herders,
+    highest_yield,
+)
+from cprl.theory.yields import TOLERANCE
+
+
+@pytest.mark.parametrize(
+    ("agents", "nash", "anarchy"),
+    [(1, 1.7321, 1), (2, 2.1213, 1.0887), (5, 2.5355, 1.594), (10, 2.7386, 2.5298), (100, 2.9704, 19.8252)],
+)
+def test_herders_graze_more_animals_the_more_they_are(agents, nash, anarchy):
+    # v = 10 - A^2, c = 1: 10 - A^2 - 2 A^2 / n = 1, so A* = sqrt(9 / (1 + 2 / n)), and A** = sqrt(3).
+    game = herders(agents)
+    assert game.nash_total == pytest.approx(sqrt(9 / (1 + 2 / agents)))
+    assert game.nash_total == pytest.approx(nash, abs=5e-5)
+    assert game.optimum_total == pytest.approx(sqrt(3))
+    assert game.price_of_anarchy == pytest.approx(anarchy, abs=5e-5)
+
+
+def test_eight_agents_put_64_tokens_where_36_were_best():
+    game = appropriation()
+    # 23 - 0.25 X - 0.25 X / 8 = 5, 23 - 0.5 X = 5, and 23 - 0.25 X = 5
+    assert (game.nash_total, game.optimum_total, game.open_access_total) == (64, 36, 72)
+    # Rents: 18 * 64 - 0.25 * 64^2 = 128 and 18 * 36 - 0.25 * 36^2 = 324.
+    assert (game.surplus(64), game.surplus(36), game.surplus(72)) == (128, 324, 0)
+    assert game.rent_share == pytest.approx(128 / 324)
+    # One with 10 tokens that puts in 8: 8 * (23 - 16) in the resource and 2 * 5 outside.
+    assert game.payoffs([8] * 8).tolist() == [66] * 8
+    # Nobody else puts in anything: 23 - 0.5 x = 5 at x = 36, but it has 10.
+    assert game.best_response(0) == 10
+    few = appropriation(tokens=5)
+    assert few.nash_total == 8 * 5, "all that they have"
+    assert few.optimum_total == 36
+
+
+@settings(deadline=None)
+@given(
+    agents=st.integers(2, 200),
+    top=st.floats(0.5, 100),
+    factor=st.floats(0.01, 100),
+    power=st.floats(1, 6),
+    cost=st.floats(0, 0.9),
+)
+def test_two_or_more_take_more_than_is_best_for_all(agents, top, factor, power, cost):
+    worth = PowerWorth(top=top, factor=factor, power=power)
+    game = SharingGame(agents=agents, worth=worth, cost=cost * top)
+    assert game.optimum_total < game.nash_total < game.open_access_total
+    assert game.price_of_anarchy > 1
+    own = game.nash_total / agents
+    assert game.best_response(game.nash_total - own) == pytest.approx(own, rel=1e-6), "an equilibrium"
+    around = [game.surplus(game.optimum_total * by) for by in (0.9, 1, 1.1)]
+    assert max(around) == around[1], "the best total"
+
+
+@settings(deadline=None, max_examples=30)
+@given(agents=st.integers(1, 50), power=st.floats(1, 4), cost=st.floats(0, 5))
+def test_a_function_of_ones_own_gives_what_the_closed_form_gives(agents, power, cost):
+    closed = PowerWorth(top=10, factor=0.5, power=power)
+    own = CallableWorth(function=lambda total: 10 - 0.5 * total**power, most=closed.most)
+    exact = CallableWorth(function=own.function, most=own.most, derivative=closed.slope)
+    wanted = SharingGame(agents=agents, worth=closed, cost=cost)
+    for worth in (own, exact):
+        found = SharingGame(agents=agents, worth=worth, cost=cost)
+        for name in ("nash_total", "optimum_total", "open_access_total", "price_of_anarchy"):
+            assert getattr(found, name) == pytest.approx(getattr(wanted, name), rel=1e-5), name
+
+
+def test_one_alone_takes_what_is_best_and_at_a_corner_all_take_the_same():
+    alone = herders(1)
+    assert alone.nash_total == alone.optimum_total
+    assert alone.price_of_anarchy == 1
+    too_dear = herders(5, cost=11)
+    assert too_dear.nash_total == too_dear.optimum_total == too_dear.open_access_total == 0
+    assert too_dear.price_of_anarchy == 1
+    own = CallableWorth(function=lambda total: 10 - total, most=10)
+    assert SharingGame(agents=5, worth=own, cost=11).nash_total == 0
+    capped = SharingGame(agents=4, worth=PowerWorth(), cost=1, most_each=0.1)
+    assert capped.nash_total == capped.optimum_total == 0.4
+    kinked = CallableWorth(function=lambda total: 10 - total, most=2)
+    assert SharingGame(agents=2, worth=kinked, cost=1).optimum_total == 2, "then it is worth nothing at once"
+
+
+def test_payoffs_have_any_leading_axes():
+    game = herders(2)
+    taken = np.array([[[1, 1], [0, 2]], [[0, 0], [4, 4]]])
+    # v(2) = 6, less 1 each; v(0) = 10; v(8) = 0, so an animal costs 1 and brings nothing.
+    assert game.payoffs(taken).tolist() == [[[5, 5], [0, 10]], [[0, 0], [-4, -4]]]
+    assert game.payoffs(taken).sum(-1)[0].tolist() == [game.surplus(2)] * 2
+
+
+@pytest.mark.parametrize(
+    ("call", "message"),
+    [
+        (lambda: herders(0), r"SharingGame\.agents is 0; allowed: an integer in 1\.\."),
+        (lambda: herders(2, cost=-1), r"SharingGame\.cost is -1; allowed: a number >= 0"),
+        (lambda: herders(2, worth=3), r"SharingGame\.worth is 3; allowed: a Worth"),
+        (lambda: appropriation(tokens=0), r"SharingGame\.most_each is 0; allowed: a number above 0"),
+        (lambda: PowerWorth(power=0.5), r"PowerWorth\.power is 0\.5; allowed: a number in 1\.\.64"),
+        (lambda: herders(2).payoffs([1, 2, 3]), r"taken is \[3\]; allowed: \[\.\.\., 2\]"),
+        (lambda: herders(2).payoffs([1, -1]), r"taken has numbers from -1 to 1; allowed: 0 to inf"),
+        (
+            lambda: appropriation(2).payoffs([1, float("nan")]),
+            "taken has numbers from nan to nan",
+        ),
+        (lambda: herders(2).surplus(-1), r"total is -1; allowed: a number >= 0"),
+        (lambda: herders(2).best_response("1"), r"others is '1'; allowed: a number >= 0"),
+        (lambda: CallableWorth(function=3, most=1), r"CallableWorth\.function is 3; allowed: a function"),
+        (lambda: CallableWorth(function=lambda a: a, most=1), r"function is 0 at 0; allowed: above 0"),
+        (lambda: CallableWorth(function=lambda a: 1 + a, most=1), r"function rises at 0; allowed"),
+        (lambda: CallableWorth(function=lambda a: 1 / (1 + a), most=1), r"is less steep from .* on; allowed"),
+    ],
+)
+def test_what_does_not_fit_is_refused(call, message):
+    with pytest.raises(ValueError, match=message):
+        call()
+
+
+CROSS = maps.parse(
+    """
+    >Av
+    AAA
+    .A.
+    """
+)
+AS_RUN = presets.game("commons", variant="as_run").rules
+PUBLISHED = presets.game("commons").rules
+
+
+def test_a_cross_bears_a_tenth_of_an_apple_a_turn_and_keeps_three():
+    found = exact_yield(CROSS, AS_RUN)
+    # Three are kept, and each of the other two sites grows with 0.05 in any turn.
+    assert found.per_step == pytest.approx(0.1, abs=TOLERANCE)
+    assert found.kept == pytest.approx(3)
+    assert sustainable_yield(CROSS, AS_RUN) == pytest.approx(found.per_step), "the lower bound is reached"
+    one = exact_yield(CROSS, AS_RUN, bites_per_step=1, sees_growth=True)
+    assert one.per_step == pytest.approx(0.09987, abs=5e-6)
+    # Who chooses before it sees what grew waits on one site for 20 turns; meanwhile the other has grown.
+    assert exact_yield(CROSS, AS_RUN, bites_per_step=1).per_step == pytest.approx(0.0975)
+    assert exact_yield(CROSS, PUBLISHED).per_step == pytest.approx(2 * 0.05 / 1.05)
+
+
+def test_a_pair_is_worked_by_hand():
+    # Two sites near each other, 1/2 with one apple near and nothing with none: one is kept for ever.
+    pair = maps.parse("AA>")
+    rules = Rules(regrow_prob=(0.0, 0.5), regrow_before_bites=True)
+    assert exact_yield(pair, rules).per_step == pytest.approx(0.5)
+    assert highest_yield(pair, rules) == 1.0, "each of the two"
+    # Without growth in the turn of the bite a site is full, empty and perhaps full again: 0.5 / 1.5.
+    assert exact_yield(pair, Rules(regrow_prob=(0.0, 0.5))).per_step == pytest.approx(1 / 3)
+    assert exact_yield(maps.parse("A>"), PUBLISHED).per_step == 0
+
+
+@st.composite
+def boards(draw):
+    cells = draw(st.permutations([(r, c) for r in range(3) for c in range(4)]))
+    most = draw(st.integers(1, 5))
+    return Map(height=3, width=4, sites=tuple(cells[1 : most + 1]), starts=((*cells[0], 0),))
+
+
+@settings(deadline=None, max_examples=25)
+@given(
+    board=boards(),
+    probs=st.lists(st.sampled_from([0.0, 0.05, 0.2, 0.5, 1.0]), min_size=1, max_size=5),
+    before=st.booleans(),
+)
+def test_the_exact_yield_lies_between_the_bounds(board, probs, before):
+    rules = Rules(regrow_prob=tuple(probs), regrow_before_bites=before)
+    exact = exact_yield(board, rules).per_step
+    assert sustainable_yield(board, rules) - 1e-8 <= exact <= highest_yield(board, rules) + 1e-8
+    assert exact_yield(board, rules, bites_per_step=1).per_step <= min(exact, 1) + 1e-8
+    assert exact_yield(board, rules, sees_growth=True).per_step >= exact - 1e-8
+
+
+def test_boards_with_too_many_sites_are_refused():
+    with pytest.raises(ValueError, match=r"the board has 13 sites; allowed: up to 7"):
+        exact_yield(presets.game("single_basic").map, PUBLISHED)
+    with pytest.raises(ValueError, match="bites_per_step is 0; allowed: an integer >= 1"):
+        exact_yield(CROSS, PUBLISHED, bites_per_step=0)
+    assert inf > highest_yield(presets.game("commons").map, PUBLISHED) > 1
