@@ -9,11 +9,11 @@ import pytest
 from cprl import presets
 from cprl.algorithms import DQN
 from cprl.measuring.published import curve, published_experiment
-from cprl.population import Learning
+from cprl.population import Learning, Scripted
 from cprl.reporting import claims, curves
 from cprl.reporting.claims_many import combat_section, of_experiment_5
 from cprl.reporting.random_play import returns_by_chance
-from cprl.reporting.result import Result
+from cprl.reporting.result import Result, study_of
 
 EPISODES = np.arange(4800.0)
 COURSE = [0, 600, 1500, 2600, 4799]
@@ -61,6 +61,27 @@ def test_ours_are_running_means_over_the_window_of_the_published_curve(tmp_path,
     np.testing.assert_array_equal(found.published, values[kept])
     short = {"collective_return": ramp[:, :window]}
     assert curves.beside(a_result(tmp_path, recipe, short), "collective_return") is None
+
+
+def test_a_run_repeats_the_study_if_its_game_and_agents_do_whatever_its_name():
+    game = presets.game("two_complex", variant="as_run")
+    learner = Learning(DQN(settings=replace(presets.dqn_settings("two_complex"), gamma=0.999)))
+
+    def number(agents, game=game, name="trial"):
+        found = study_of(name, SimpleNamespace(game=game, agents=agents))
+        return found and found.number
+
+    assert number((learner, learner)) == 3
+    assert number((learner, Scripted("random"))) == 4
+    assert number((learner,), presets.game("single_basic")) == 1
+    assert number((learner,) * 4, presets.game("commons")) == 5
+    assert number((), None, name="single_complex") == 2, "by the name of the recipe"
+    assert number((learner, Scripted("greedy"))) is None
+    assert number((Scripted("random"),) * 2) is None
+    peaceful = replace(game, rules=replace(game.rules, may_fire=False))
+    assert number((learner, learner), peaceful) is None, "the study has a beam"
+    harsh = replace(game, rules=replace(game.rules, freeze_steps=50))
+    assert number((learner, learner), harsh) is None
 
 
 def test_combat_is_told_of_every_run_with_the_settings_in_which_they_differ(tmp_path):

@@ -16,7 +16,7 @@ from cprl.algorithms import DQN
 from cprl.commons.game import Game
 from cprl.experiment import Experiment
 from cprl.measuring.published import SMOOTHED_EPISODES, PublishedExperiment, published_experiment
-from cprl.population import Learning, exploration_steps
+from cprl.population import Learning, Scripted, exploration_steps
 from cprl.reporting.measures import Measures, measures
 from cprl.runs.curves import Phases, as_curves, curves_of, episode_of_step, phases_of, running_mean
 from cprl.runs.directory import read_recipe
@@ -25,6 +25,8 @@ from cprl.runs.files import read_json
 
 Values = NDArray[np.float64]
 
+PUBLISHED_GAMMA: Final = 0.995
+"""The discount of the text; titles name others."""
 TOO_FEW: Final = "too few episodes"
 
 
@@ -39,7 +41,7 @@ class Result:
     """`report.json`."""
     curves: Mapping[str, Values]
     study: PublishedExperiment | None
-    """The study's experiment that its recipe repeats."""
+    """The study's experiment that it repeats, see `study_of`."""
 
     @property
     def name(self) -> str:
@@ -54,10 +56,17 @@ class Result:
         if self.variant is not None:
             parts.append(f"{self.variant} rules")
         specs = [spec for spec in self.experiment.agents if isinstance(spec, Learning)]
-        settings = specs[0].algorithm.settings if specs and isinstance(specs[0].algorithm, DQN) else None
+        algorithm = specs[0].algorithm if specs else None
+        settings = algorithm.settings if isinstance(algorithm, DQN) else None
         if settings is not None:
             parts.append(f"targets replaced every {settings.target_every_episodes} episodes")
             parts.append(f"epsilon decays in {settings.epsilon_decay_steps:,} steps")
+            if settings.gamma != PUBLISHED_GAMMA:
+                parts.append(f"gamma {settings.gamma:g}")
+            if settings.optimizer != "adam":
+                parts.append(settings.optimizer)
+            if isinstance(algorithm, DQN) and algorithm.loss_function != "l2":
+                parts.append(algorithm.loss_function)
         return ", ".join([*parts, f"{replicas} replicas of {episodes:,} episodes"])
 
     @property
@@ -139,11 +148,31 @@ def read_result(path: Path) -> Result:
             f"{path} plays a game that reports no harvest; allowed in a report beside the published study: a "
             "commons; evaluate_run and crossplay measure the returns of others"
         )
+    experiment = Experiment.from_recipe(recipe, directory=path)
     return Result(
         path=path,
         recipe=recipe,
-        experiment=Experiment.from_recipe(recipe, directory=path),
+        experiment=experiment,
         report=read_json(path / "report.json"),
         curves=curves,
-        study=published_experiment(recipe["recipe"]),
+        study=study_of(recipe["recipe"], experiment),
     )
+
+
+def study_of(recipe: str, experiment: Experiment) -> PublishedExperiment | None:
+    """The study's experiment that a run repeats: by the name of its recipe, or since it plays a variant of
+    the study's game, beam included, with as many agents that learn by DQN, whatever their settings; None for
+    others."""
+    if (named := published_experiment(recipe)) is not None:
+        return named
+    game, specs = experiment.game, experiment.agents
+    if not isinstance(game, Game) or presets.variant_of(game) is None:
+        return None
+    if game.agents > 1 and not game.rules.may_fire:
+        return None
+    learns = [isinstance(spec, Learning) and isinstance(spec.algorithm, DQN) for spec in specs]
+    against_random = learns == [True, False] and specs[1] == Scripted("random")
+    if not (all(learns) or against_random):
+        return None
+    boards = {presets.game(board).map: board for board in presets.BOARDS}
+    return published_experiment("two_against_random" if against_random else boards[game.map])
