@@ -40,22 +40,3 @@ def test_a_curve_agrees_with_itself_and_not_with_its_mirror_image():
     assert agreement("exp3/return", same[:1000] + 7)[1] == pytest.approx(7, abs=0.2)
     with pytest.raises(ValueError, match="20 episodes have 2 points of exp3/return; allowed: at least 10"):
         agreement("exp3/return", same[:20])
-
-
-def test_published_curves_have_no_power_where_running_means_of_their_window_have_none():
-    """A running mean over w episodes of anything has nulls at the frequencies k / w."""
-    for study in EXPERIMENTS:
-        for name in study.curves.values():
-            episodes, values = curve(name)
-            at = np.arange(np.ceil(episodes[0]), episodes[-1])
-            steps = np.diff(np.interp(at, episodes, values))
-            power = np.abs(np.fft.rfft(steps * np.hanning(len(steps)))) ** 2
-            frequency = np.fft.rfftfreq(len(steps))
-            seen = (frequency > 0.002) & (frequency < 0.06)
-
-            def cost(window, power=power[seen], frequency=frequency[seen]):
-                """Minus the log likelihood (Whittle), of increments of running means of white noise."""
-                expected = np.sin(np.pi * frequency * window) ** 2 + 0.05
-                return np.log((power / expected).mean()) + np.log(expected).mean()
-
-            assert min(range(15, 251, 5), key=cost) == study.window_episodes, name

@@ -123,13 +123,19 @@ def distance_to_nearest(trace: Trace) -> Array:
     return nearest
 
 
-def shooting_distance(trace: Trace) -> tuple[Array, Array]:
+def shooting_distance(trace: Trace, *, agent: int | None = None) -> tuple[Array, Array]:
     """The mean distance to the nearest other agent when an agent fires, and in all steps, float64 [B] each.
 
     NaN where no agent fired while another was in play.
+
+    Args:
+        trace: the played episodes.
+        agent: the index of the agent whose distances are counted; None for all agents.
     """
     nearest = distance_to_nearest(trace)
     counted = np.isfinite(nearest) & trace.played[..., None]
+    if agent is not None:
+        counted &= np.arange(nearest.shape[-1]) == agent
 
     def mean_of(which: Array) -> Array:
         number = which.sum((0, 2))

@@ -19,8 +19,8 @@ from cprl import arguments
 Values = NDArray[np.float64]
 
 SMOOTHED_EPISODES: Final = 100
-"""The window of our running means beside the published curves, in episodes. Both are drawn at the first
-episode of a window; those of the study are `PublishedExperiment.window_episodes`."""
+"""The window of our running means in episodes, where nothing else is asked for. Beside a published curve it
+is that curve's, `PublishedExperiment.window_episodes`. All are drawn at the first episode of a window."""
 PHASED_RECIPE: Final = "commons"
 """Our recipe of experiment 5, the only one whose phases the study draws."""
 PHASES_BEGIN: Final = (450, 1500, 2400)
@@ -42,7 +42,7 @@ class PublishedExperiment:
     """The number of episodes in the study's figures."""
     window_episodes: int
     """The window of the study's running means. It gives none: this one has its nulls where the spectra of the
-    published curves have theirs, see tests/test_published.py."""
+    published curves have theirs, see `cprl.measuring.running_means`."""
     curves: Mapping[str, str]
     """The names of published curves by our name of the metric; `return_0` is the return of agent 0."""
 

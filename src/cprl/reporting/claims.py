@@ -1,146 +1,115 @@
-"""Measures for the study's claims: of training curves, and of trained agents in new worlds."""
+"""The study's claims, each with a measure, its interval over replicas and a verdict."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
-from functools import partial
-from pathlib import Path
-from typing import Any, Final
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from cprl.evaluation.evaluate import SEED
-from cprl.evaluation.lanes import Source, fresh_worlds, policies_of, random_policies
-from cprl.measuring.movement import Trace, overlap, rounds, shooting_distance, trace
-from cprl.measuring.statistics import Estimate, estimate
-from cprl.policies.assignment import AgentPolicies
-from cprl.runs.curves import curves_of, running_mean
-from cprl.stored import LoadedRun, load
+from cprl.measuring.predictions import prediction
+from cprl.measuring.shares import share
+from cprl.measuring.statistics import difference
+from cprl.reporting import verdicts
 
 Values = NDArray[np.float64]
 
-WORLDS: Final = 64
-"""The number of new worlds per replica in which trained agents play one episode each, as in evaluation."""
-
 
 @dataclass(frozen=True, kw_only=True)
-class Measure:
-    """A measure for a claim of the study."""
+class Claim:
+    """A claim of the study beside a run of ours, as a row of a table."""
 
-    name: str
-    trained: Estimate
-    """The value of the run, over its replicas."""
-    random: float | None
-    """The mean if all agents follow the random policy, in the same worlds; None for measures of training."""
-
-
-def measures(run: Path) -> list[Measure]:
-    """All measures of a run: of its training curves, and of its trained agents in new worlds.
-
-    Args:
-        run: The directory of the run, or of its exported results.
-    """
-    curves = curves_of(run)
-    found = [
-        Measure(name=name, trained=estimate(values), random=None)
-        for name, values in of_training(curves).items()
-    ]
-    loaded = load(run)
-    replicas = tuple(loaded.replicas)
-    trained = _at_play(loaded, replicas, partial(policies_of, [Source(loaded)] * loaded.game.agents))
-    by_chance = _by_chance(loaded, replicas)
-    for name, values in trained.items():
-        if np.isfinite(values).all():
-            found.append(Measure(name=name, trained=estimate(values), random=float(by_chance[name].mean())))
-    return found
+    claim: str
+    measure: str
+    published: str
+    """What the study's own figures say; "" where they cannot."""
+    ours: str
+    verdict: str
 
 
-_PLAYED_BY_CHANCE: Final[dict[Any, dict[str, Values]]] = {}
-
-
-def _by_chance(run: LoadedRun, replicas: tuple[int, ...]) -> dict[str, Values]:
-    """`of_play` of the random policy; the same for all runs of a game, so played once."""
-    key = run.game, run.experiment.transforms, replicas
-    if key not in _PLAYED_BY_CHANCE:
-        _PLAYED_BY_CHANCE[key] = _at_play(run, replicas, partial(random_policies, run))
-    return _PLAYED_BY_CHANCE[key]
-
-
-def _at_play(run: LoadedRun, replicas: Sequence[int], who: Callable[..., AgentPolicies]) -> dict[str, Values]:
-    """`of_play` of a game in the same fresh worlds, whoever plays."""
-    found: dict[str, list[Values]] = {}
-    for group, env in fresh_worlds(run, replicas, worlds=WORLDS, seed=SEED):
-        played = trace(env, who(group, worlds=WORLDS, seed=SEED))
-        for name, values in of_play(played, len(group)).items():
-            found.setdefault(name, []).append(values)
-    return {name: np.concatenate(values) for name, values in found.items()}
-
-
-def of_training(curves: dict[str, Values]) -> dict[str, Values]:
-    """Measures of training curves, float64 [R] each.
+def number(claim: str, measure: str, values: Values, *, published: float) -> Claim:
+    """A number that the study's figures give, beside the prediction interval of one run.
 
     Args:
-        curves: The curves of a run, as `curves_of` returns them.
+        claim: what the study says.
+        measure: what is measured.
+        values: of each replica, [R].
+        published: the same of the published curve.
     """
-    returns = running_mean(curves["collective_return"])
-    early = returns[:, : min(600, returns.shape[1])]
-    found = {
-        "mean collective return over training": curves["collective_return"].mean(1),
-        "collective return of the last 500 episodes": curves["collective_return"][:, -500:].mean(1),
-        "depth of the deepest dip before episode 600, share of the peak before it": dip_depth(early),
-        "episode of the highest collective return": returns.argmax(1).astype(np.float64),
-    }
-    agents = [curves[f"return_{agent}"] for agent in range(_agents(curves))]
-    if len(agents) > 1:
-        late = np.stack([of_agent[:, -500:].mean(1) for of_agent in agents])
-        found["return of the poorest agent over that of the richest, last 500 episodes"] = late.min(
-            0
-        ) / late.max(0)
-    return found
+    return Claim(
+        claim=claim,
+        measure=measure,
+        published=f"{published:.4g}",
+        ours=f"{with_interval(values)}, one run {prediction(values)}",
+        verdict=verdicts.of_number(published, values),
+    )
 
 
-def dip_depth(curves: Values) -> Values:
-    """The largest fall of each curve below its highest value so far, as a share of it, [R, E] to [R]."""
-    peaks = np.maximum.accumulate(curves, axis=1)
-    falls = np.divide(peaks - curves, peaks, out=np.zeros_like(peaks), where=peaks > 0)
-    deepest: Values = falls.max(1)
-    return deepest
+def side(
+    claim: str,
+    measure: str,
+    values: Values,
+    *,
+    above: float | None = None,
+    below: float | None = None,
+    published: float | None = None,
+) -> Claim:
+    """A mean that is claimed to lie above or below a bound; see `verdicts.of_claim`."""
+    found = prediction(values, runs=None)
+    return Claim(
+        claim=claim,
+        measure=measure,
+        published="" if published is None else f"{published:.4g}",
+        ours=with_interval(values),
+        verdict=verdicts.of_claim(found.low, found.high, above=above, below=below, replicas=len(values)),
+    )
 
 
-def of_play(played: Trace, replicas: int) -> dict[str, Values]:
-    """Measures of played episodes, float64 [R] each; NaN where no agent fired while another was in play.
-
-    Args:
-        played: One episode of each world; the worlds of a replica are adjacent.
-        replicas: The number of replicas R.
-    """
-
-    def by_replica(of_worlds: Values) -> Values:
-        return of_worlds.reshape(replicas, -1)
-
-    def mean(of_worlds: Values) -> Values:
-        """The mean of each replica over those of its worlds in which the value is finite."""
-        values = by_replica(of_worlds)
-        with np.errstate(invalid="ignore"):
-            means: Values = np.nansum(values, 1) / np.isfinite(values).sum(1)
-        return means
-
-    around = np.abs(rounds(played))
-    agents = around.shape[1]
-    found = {
-        f"rounds about the centre per 1000 steps, agent {agent}": mean(around[:, agent])
-        for agent in range(agents)
-    }
-    if agents > 1:
-        fired, always = shooting_distance(played)
-        shots, steps = played.fired.sum((0, 2)), played.played.sum(0)
-        found |= {
-            "overlap of the cells that two agents visit": mean(overlap(played)),
-            "steps to the nearest other when firing, over that in all steps": mean(fired) / mean(always),
-            "shots per 1000 steps, all agents": 1000 * by_replica(shots).sum(1) / by_replica(steps).sum(1),
-        }
-    return found
+def more(claim: str, measure: str, values: Values, reference: Values, *, paired: bool) -> Claim:
+    """A mean that is claimed to exceed another one, [R] each; see `verdicts.of_claim`."""
+    found = difference(values, reference, paired=paired, interval="t")
+    return Claim(
+        claim=claim,
+        measure=measure,
+        published="",
+        ours=f"{values.mean():.4g} and {reference.mean():.4g}, difference {found}",
+        verdict=verdicts.of_claim(found.low, found.high, above=0, replicas=min(len(values), len(reference))),
+    )
 
 
-def _agents(curves: dict[str, Values]) -> int:
-    return sum(name.startswith("return_") for name in curves)
+def alike(claim: str, measure: str, values: Values, *, within: tuple[float, float]) -> Claim:
+    """A mean that is claimed to lie between two bounds; see `verdicts.of_likeness`."""
+    found = prediction(values, runs=None)
+    return Claim(
+        claim=claim,
+        measure=f"{measure}, alike if {within[0]:g} to {within[1]:g}",
+        published="",
+        ours=with_interval(values),
+        verdict=verdicts.of_likeness(found.low, found.high, within=within, replicas=len(values)),
+    )
+
+
+def rule(claim: str, measure: str, shown: NDArray[Any]) -> Claim:
+    """What more than half of all runs are claimed to show, bool [R]; see `verdicts.of_share`."""
+    found = share(int(shown.sum()), len(shown))
+    return Claim(
+        claim=claim,
+        measure=f"{measure}; share of replicas",
+        published="",
+        ours=f"{found}",
+        verdict=verdicts.of_share(found),
+    )
+
+
+def with_interval(values: Values) -> str:
+    """The mean of replicas, [R], with its 95 % interval by Student's t."""
+    return f"{values.mean():.4g} {prediction(values, runs=None)}".strip()
+
+
+def rows_of(claims: Sequence[Claim]) -> list[list[str]]:
+    """The cells of a table of claims; see `HEAD`."""
+    return [[one.claim, one.measure, one.published, one.ours, one.verdict] for one in claims]
+
+
+HEAD = ["claim", "measure", "published", "ours", "verdict"]
+"""The head of a table of claims."""

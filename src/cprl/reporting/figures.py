@@ -6,10 +6,11 @@ from typing import Final
 
 import numpy as np
 from matplotlib.axes import Axes
+from PIL import Image
 
 from cprl.measuring.names import title, unit
-from cprl.measuring.published import PHASED_RECIPE, SMOOTHED_EPISODES, curve
-from cprl.measuring.statistics import curve_interval
+from cprl.measuring.predictions import curve_prediction
+from cprl.measuring.published import PHASED_RECIPE, curve
 from cprl.plotting import style
 from cprl.plotting.bands import (
     STRIP_IN,
@@ -20,9 +21,9 @@ from cprl.plotting.bands import (
     mark_exploration,
     published_bands,
 )
-from cprl.population import exploration_steps
+from cprl.reporting.random_play import returns_by_chance
 from cprl.reporting.result import Result, Values
-from cprl.runs.curves import episode_of_step, running_mean
+from cprl.runs.curves import running_mean
 
 TITLES: Final = {
     "return_0": "return of the learner, apples",
@@ -30,9 +31,10 @@ TITLES: Final = {
 }
 """Of the returns of single agents, which are drawn for experiment 4 alone."""
 HEIGHT_IN: Final = 3.3
+COLOURS: Final = 128
+"""The number of colours of a figure."""
 MARGIN: Final = 0.04
 """Empty room above and below all curves, as a share of their range."""
-RESAMPLES: Final = 500
 
 Limits = tuple[float, float]
 
@@ -81,7 +83,7 @@ def _compared(result: Result) -> object:
 
 def _extent(result: Result, metric: str) -> Limits:
     """The lowest and the highest value in a figure."""
-    values = [running_mean(result.curves[metric]).ravel()]
+    values = [running_mean(result.curves[metric], result.window).ravel()]
     if result.study:
         values.append(curve(result.study.curves[metric])[1])
     random = _random(result, metric)
@@ -91,6 +93,8 @@ def _extent(result: Result, metric: str) -> Limits:
 
 def _random(result: Result, metric: str) -> float | None:
     """The mean of random play; None if there is no evaluation."""
+    if metric == "collective_return" and result.has_random_score:
+        return float(returns_by_chance(result.experiment.game).mean())
     found = result.evaluated("random")
     if found is None or metric not in found or np.isnan(found[metric]).all():
         return None
@@ -108,11 +112,10 @@ def _draw(result: Result, metric: str, limits: Limits, path: Path) -> None:
     figure, panels = style.new_figure(heights, title=result.title)
     axes = panels[-1]
     draw_bands(axes, strips.get("ours", []))
-    smoothed = running_mean(result.curves[metric])
+    smoothed = running_mean(result.curves[metric], result.window)
     _draw_curves(axes, smoothed, metric)
     _draw_published(axes, result, metric)
-    ends = exploration_steps(result.experiment.agents)
-    mark_exploration([axes], None if ends is None else episode_of_step(dict(result.curves), ends))
+    mark_exploration([axes], result.exploration_ends)
     add_keys(axes, *strips.values())
     low, high = limits
     margin = MARGIN * ((high - low) or 1.0)
@@ -122,12 +125,21 @@ def _draw(result: Result, metric: str, limits: Limits, path: Path) -> None:
     for strip in panels[:-1]:
         draw_strip(strip, strips)
     style.legend_below(figure, [axes], note=_note(result))
-    style.save(figure, path)
+    _shrink(style.save(figure, path))
+
+
+def _shrink(path: Path) -> None:
+    """Writes a PNG again with few colours, a third of the size: results are committed."""
+    with Image.open(path) as picture:
+        few = picture.convert("RGB").quantize(
+            COLOURS, method=Image.Quantize.MAXCOVERAGE, dither=Image.Dither.NONE
+        )
+    few.save(path, optimize=True)
 
 
 def _draw_curves(axes: Axes, smoothed: Values, metric: str) -> None:
     """Each replica, [R, E], their mean and its interval; an agent's return in the agent's colour."""
-    middle, low, high = curve_interval(smoothed, resamples=RESAMPLES)
+    middle, low, high = curve_prediction(smoothed, runs=None)
     replicas = len(smoothed)
     agent = metric.removeprefix("return_")
     of_agent = agent.isdecimal()
@@ -156,6 +168,5 @@ def _draw_published(axes: Axes, result: Result, metric: str) -> None:
 
 def _note(result: Result) -> str:
     """How the curves are smoothed."""
-    window = min(SMOOTHED_EPISODES, result.curves["collective_return"].shape[1])
-    note = f"Running means over the episodes that follow: ours over {window}"
-    return f"{note}, published over {result.study.window_episodes}." if result.study else f"{note}."
+    window = min(result.window, result.curves["collective_return"].shape[1])
+    return f"Running means over the {window} episodes that follow."

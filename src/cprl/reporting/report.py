@@ -1,6 +1,7 @@
 """The report that compares finished runs with the published study: tables in Markdown, figures as PNG.
 
-It needs only exported results (`cprl.runs.export`), so that anyone can reproduce it.
+It needs only exported results (`cprl.runs.export`), so that anyone can reproduce it. Runs that repeat none of
+the study's experiments have tables of their own, without columns for what was published.
 """
 
 import os
@@ -13,14 +14,12 @@ import numpy as np
 
 from cprl import arguments
 from cprl.arguments import objects
-from cprl.measuring.published import EXPERIMENTS, SMOOTHED_EPISODES, agreement, curve
-from cprl.measuring.statistics import estimate
-from cprl.reporting.claims import measures
+from cprl.reporting import claims, claims_alone, claims_many, curves
+from cprl.reporting.appendix import appendix, returns_of_others
 from cprl.reporting.figures import axis_title, draw_figures
 from cprl.reporting.markdown import table
-from cprl.reporting.result import TOO_FEW, Result, Values, read_result
+from cprl.reporting.result import Result, read_result
 from cprl.reporting.turning import phases_of, turning_points_of
-from cprl.runs.curves import running_mean
 from cprl.runs.files import write_atomically
 
 
@@ -42,20 +41,25 @@ def write_report(runs: Sequence[Path], out: Path) -> Path:
     out = arguments.path("out", out)
     results = [read_result(arguments.path("runs", path)) for path in folders]
     (out / "figures").mkdir(parents=True, exist_ok=True)
+    of_study = [result for result in results if result.study]
     lines = [
         "# Tables and figures",
         "",
         "Made by `cprl report` from the results in this folder alone.",
-        "Intervals are 95 % bootstrap intervals over replicas; figures are running means over "
-        f"{SMOOTHED_EPISODES} episodes, drawn at the first of them, as in the study. "
-        f"The published curves are means over other windows: {_windows()}.",
+        *_how(of_study),
         "",
         *_runs(results),
-        *_appendix(results),
-        *_agreements(results),
-        *phases_of(results),
-        *turning_points_of(results),
-        *_claims(results),
+        *appendix(of_study),
+        *returns_of_others([result for result in results if not result.study]),
+        *(curves.windows() if of_study else []),
+        *curves.distances(of_study),
+        *curves.judged(of_study),
+        *curves.parts(of_study),
+        *phases_of(of_study),
+        *turning_points_of(of_study),
+        *claims_many.combat_section(results),
+        *_claims(of_study),
+        *_measures(results),
         *_figures(results, out),
     ]
     path = out / "tables.md"
@@ -64,15 +68,15 @@ def write_report(runs: Sequence[Path], out: Path) -> Path:
     return path
 
 
-def _windows() -> str:
-    found: dict[int, list[str]] = {}
-    for study in EXPERIMENTS:
-        found.setdefault(study.window_episodes, []).append(f"{study.number}")
-    by_window = (
-        f"{window} episodes (experiment{'s' * (len(numbers) > 1)} {' and '.join(numbers)})"
-        for window, numbers in found.items()
-    )
-    return ", ".join(by_window)
+def _how(of_study: Sequence[Result]) -> list[str]:
+    lines = ["Brackets after a mean are its 95 % interval over replicas by Student's t."]
+    if of_study:
+        lines += [
+            'Brackets under "one run" and "mean of two runs" are where further runs lie, with 95 % '
+            "(`cprl.measuring.predictions`); verdicts are explained in `cprl.reporting.verdicts`.",
+            "Running means of ours are over the window of the published curve, drawn at its first episode.",
+        ]
+    return lines
 
 
 def _runs(results: Sequence[Result]) -> list[str]:
@@ -106,51 +110,30 @@ def _command(line: str) -> str:
     )
 
 
-def _appendix(results: Sequence[Result]) -> list[str]:
-    rows = []
-    for result in results:
-        study, returns = result.study, result.curves["collective_return"]
-        evaluated = {name: _evaluated(result, name) for name in ("random", "trained")}
-        rows.append(
-            [
-                result.name,
-                f"{study.number}" if study else "",
-                f"{study.random}" if study and study.random is not None else "",
-                _estimate_cell(evaluated["random"]),
-                f"{study.trained}" if study else "",
-                _estimate_cell(returns.mean(1)),
-                _estimate_cell(evaluated["trained"]),
-            ]
-        )
-    head = ["run", "experiment", "random, published", "random, ours", "trained, published"]
-    head += ["mean over training, ours", "evaluation at epsilon 0.05, ours"]
-    return ["## Appendix A beside ours: collective return", "", *table(head, rows)]
-
-
-def _agreements(results: Sequence[Result]) -> list[str]:
-    rows = []
-    for result in results:
-        for metric, name in (result.study.curves if result.study else {}).items():
-            rows.append(
-                [result.name, metric, *_agreement_cells(name, running_mean(result.curves[metric]).mean(0))]
-            )
-    head = ["run", "metric", "correlation", "mean absolute difference", "of the published curve's range"]
-    return ["## Published curves beside ours", "", *table(head, rows)]
-
-
-def _agreement_cells(name: str, ours: Values) -> list[str]:
-    if len(ours) <= SMOOTHED_EPISODES:
-        return [TOO_FEW, "", ""]
-    correlation, difference = agreement(name, ours)
-    return [f"{correlation:.2f}", f"{difference:.3g}", f"{difference / np.ptp(curve(name)[1]):.0%}"]
-
-
 def _claims(results: Sequence[Result]) -> list[str]:
-    lines = ["## What the claims are judged by", ""]
+    """A table of the study's claims for each of its runs."""
+    lines: list[str] = []
     for result in results:
-        rows = [
-            [measure.name, str(measure.trained), "" if measure.random is None else f"{measure.random:.4g}"]
-            for measure in measures(result.path)
+        assert result.study is not None
+        found = {
+            1: lambda one: claims_alone.of_experiment_1(one),
+            2: lambda one: claims_alone.of_experiment_2(one),
+            3: lambda one: claims_alone.of_experiment_3(one, results),
+            4: lambda one: claims_alone.of_experiment_4(one, results),
+            5: lambda one: claims_many.of_experiment_5(one),
+        }[result.study.number](result)
+        lines += [f"### {result.name}", "", *table(claims.HEAD, claims.rows_of(list(found)))]
+    return ["## Claims", "", *lines] if lines else []
+
+
+def _measures(results: Sequence[Result]) -> list[str]:
+    lines = ["## Measures", ""]
+    for result in results:
+        own = result.measures
+        rows = [[name, claims.with_interval(values), ""] for name, values in own.training.items()]
+        rows += [
+            [name, claims.with_interval(values), f"{np.nanmean(own.random[name]):.4g}"]
+            for name, values in own.trained.items()
         ]
         lines += [f"### {result.name}", "", *table(["measure", "trained", "random policy"], rows)]
     return lines
@@ -161,13 +144,3 @@ def _figures(results: Sequence[Result], out: Path) -> list[str]:
     for result, metric, path in draw_figures(results, out / "figures"):
         lines += [f"![{result.name}, {axis_title(metric)}](figures/{path.name})", ""]
     return lines
-
-
-def _evaluated(result: Result, policy: str) -> Values | None:
-    """The mean collective return of each replica in its evaluation, [R]; None if there is no evaluation."""
-    found = result.evaluated(policy)
-    return None if found is None else found["collective_return"]
-
-
-def _estimate_cell(values: Values | None) -> str:
-    return "" if values is None else str(estimate(values))

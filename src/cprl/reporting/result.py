@@ -7,16 +7,20 @@ from pathlib import Path
 from typing import Any, Final
 
 import numpy as np
+import pyarrow as pa
 import pyarrow.parquet as pq
 from numpy.typing import NDArray
 
 from cprl import presets
 from cprl.algorithms import DQN
+from cprl.commons.game import Game
 from cprl.experiment import Experiment
-from cprl.measuring.published import PublishedExperiment, published_experiment
-from cprl.population import Learning
-from cprl.runs.curves import Phases, as_curves, curves_of, phases_of, running_mean
+from cprl.measuring.published import SMOOTHED_EPISODES, PublishedExperiment, published_experiment
+from cprl.population import Learning, exploration_steps
+from cprl.reporting.measures import Measures, measures
+from cprl.runs.curves import Phases, as_curves, curves_of, episode_of_step, phases_of, running_mean
 from cprl.runs.directory import read_recipe
+from cprl.runs.episodes import read_episodes
 from cprl.runs.files import read_json
 
 Values = NDArray[np.float64]
@@ -46,15 +50,62 @@ class Result:
     def title(self) -> str:
         """What was run, in a few words."""
         replicas, episodes = self.curves["collective_return"].shape
-        parts, variant = [self.recipe["recipe"]], presets.variant_of(self.experiment.game)
-        if variant is not None:
-            parts.append(f"{variant} rules")
+        parts = [self.recipe["recipe"]]
+        if self.variant is not None:
+            parts.append(f"{self.variant} rules")
         specs = [spec for spec in self.experiment.agents if isinstance(spec, Learning)]
         settings = specs[0].algorithm.settings if specs and isinstance(specs[0].algorithm, DQN) else None
         if settings is not None:
             parts.append(f"targets replaced every {settings.target_every_episodes} episodes")
             parts.append(f"epsilon decays in {settings.epsilon_decay_steps:,} steps")
         return ", ".join([*parts, f"{replicas} replicas of {episodes:,} episodes"])
+
+    @property
+    def variant(self) -> str | None:
+        """The variant of the study's rules that its game has; None for others."""
+        return presets.variant_of(self.experiment.game)
+
+    @property
+    def has_random_score(self) -> bool:
+        """Whether the study gives a random score, and the game is one that random play is played in."""
+        game, study = self.experiment.game, self.study
+        plain = isinstance(game, Game) and not game.institutions
+        return plain and study is not None and study.random is not None
+
+    @property
+    def window(self) -> int:
+        """The window of its running means in episodes: that of the published curves, if there are any."""
+        return self.study.window_episodes if self.study else SMOOTHED_EPISODES
+
+    @property
+    def exploration_ends(self) -> float | None:
+        """The episode in which the last epsilon reaches its end, the mean of replicas; None if none does."""
+        ends = exploration_steps(self.experiment.agents)
+        return None if ends is None else episode_of_step(dict(self.curves), ends)
+
+    @cached_property
+    def measures(self) -> Measures:
+        """Measures of its training, and of its agents in new worlds."""
+        return measures(self.path, window=self.window)
+
+    def of_agents(self, column: str) -> Values | None:
+        """A column of the table of episodes for each agent, float64 [R, E, N]; None if there is no such
+        column."""
+        table = self._table
+        if column not in table.column_names:
+            return None
+        replicas, episodes = self.curves["survival_steps"].shape
+        replica, episode, agent = (table[name].to_numpy() for name in ("replica", "episode", "agent"))
+        row = np.unique(replica, return_inverse=True)[1]
+        found = np.full((replicas, episodes, int(agent.max()) + 1), np.nan)
+        kept = episode < episodes
+        values = table[column].to_numpy(zero_copy_only=False).astype(np.float64)
+        found[row[kept], episode[kept], agent[kept]] = values[kept]
+        return found
+
+    @cached_property
+    def _table(self) -> pa.Table:
+        return read_episodes(self.path)
 
     @cached_property
     def phases(self) -> Phases | None:

@@ -16,9 +16,12 @@ SURVIVED: Final = 990
 
 
 def phases_of(results: Sequence[Result]) -> list[str]:
-    """The section on phases, those of the published curves first."""
+    """The section on phases, those of the published curves first; empty without a run of experiment 5."""
+    runs = _of_experiment_5(results)
+    if not runs:
+        return []
     rows = [["published curves", *_phase_cells(*_published_phases())]]
-    for result in _of_experiment_5(results):
+    for result in runs:
         cells = _phase_cells(*result.phases) if result.phases else [TOO_FEW, "", "", ""]
         rows.append([result.name, *cells])
     head = ["curves", "second phase from", "third", "fourth", "phases by their pattern"]
@@ -37,7 +40,7 @@ def turning_points_of(results: Sequence[Result]) -> list[str]:
     names = "collective_return", "survival_steps"
     rows = [["published curves", *_turning_cells(*(curve(study.curves[name]) for name in names)), ""]]
     for result in runs:
-        own = [running_mean(result.curves[name]) for name in names]
+        own = [running_mean(result.curves[name], result.window) for name in names]
         episodes = np.arange(own[0].shape[1], dtype=np.float64)
         lowest = own[1].min(1)
         cells = _turning_cells(*((episodes, curves.mean(0)) for curves in own))
