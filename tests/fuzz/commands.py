@@ -94,6 +94,10 @@ _SUBCOMMANDS: Final[dict[str, tuple[list[st.SearchStrategy[list[str]]], tuple[An
     "report": ([_run("plain")] * 2, (_flag("--out", "report", "a/b"),)),
     "export": ([_run("plain", "finished", "stopped"), st.just(["folder"])], (_flag("--watch", "off"),)),
     "evaluate": ([_run("plain", "finished", "results", "stopped")], _PLAYED),
+    "visits": (
+        [_run("plain", "finished", "results", "stopped")],
+        (*_PLAYED, _flag("--out", "maps.png", "some/maps.png"), _flag("--random")),
+    ),
     "crossplay": (
         [_run("plain", "finished"), _run("plain", "finished")],
         (*_PLAYED, _flag("--diagonal", "self", "cross_seed", "selfplay")),
