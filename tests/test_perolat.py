@@ -69,7 +69,7 @@ def test_equal_rooms_are_the_walls_of_the_study_of_walls(recipes):
     sums = [{own.checksum for own in study.all_conditions} for study in (walls, unequal)]
     assert len(sums[0] & sums[1]) == 2, "one for each length of the beam"
     boards = [own.experiment.game.map for own in unequal.all_conditions]
-    assert boards == [maps.rooms("single")] * 2 + [maps.rooms("unequal")] * 2
+    assert boards == [maps.rooms("single"), maps.rooms("unequal")] * 2
 
 
 def test_every_study_runs_and_its_conditions_share_what_does_not_vary(ran, recipes):

@@ -141,7 +141,7 @@ def claims() -> Iterator[Claim]:
         )
     for beam in BEAMS:
         walls, none = (
-            Of(study=perolat_walls.STUDY, condition=f"rooms={rooms}, beam_length_cells={beam}")
+            Of(study=perolat_walls.STUDY, condition=f"beam_length_cells={beam}, rooms={rooms}")
             for rooms in ("walls", "no walls")
         )
         yield Claim(
@@ -164,7 +164,7 @@ def claims() -> Iterator[Claim]:
         )
     for beam in BEAMS:
         equal, unequal = (
-            Of(study=perolat_unequal.STUDY, condition=f"rooms={rooms}, beam_length_cells={beam}")
+            Of(study=perolat_unequal.STUDY, condition=f"beam_length_cells={beam}, rooms={rooms}")
             for rooms in ("equal", "unequal")
         )
         yield Claim(

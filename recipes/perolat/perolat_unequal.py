@@ -13,11 +13,11 @@ from cprl import maps
 STUDY = cprl.Study(
     EXPERIMENT,
     {
+        "game.rules.beam_length_cells": list(BEAMS),
         "rooms": {
             "equal": {"game.map": maps.rooms("single")},
             "unequal": {"game.map": maps.rooms("unequal")},
         },
-        "game.rules.beam_length_cells": list(BEAMS),
     },
     name="perolat_unequal",
     question="Does it make agents less equal that one of four rooms is richer?",

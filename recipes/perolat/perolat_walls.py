@@ -13,11 +13,11 @@ from cprl import maps
 STUDY = cprl.Study(
     EXPERIMENT,
     {
+        "game.rules.beam_length_cells": list(BEAMS),
         "rooms": {
             "no walls": {"game.map": maps.rooms("none")},
             "walls": {"game.map": maps.rooms("single")},
         },
-        "game.rules.beam_length_cells": list(BEAMS),
     },
     name="perolat_walls",
     question="Do walls with one entrance to each room let agents exclude others, and what comes of it?",

@@ -51,14 +51,14 @@ def _others(run: list[str]) -> list[str]:
 
 _COMMON: Final = (_flag("--allow", *runs.ALLOW, "os:getcwd"),)
 _ALLOWED: Final = st.just(["--allow", runs.ALLOW[0]])
-_PLAYED: Final = (
+_FRESH: Final = (
     _flag("--episodes", "1", "2", "0"),
     _flag("--seed", "1", "0"),
     _flag("--replicas", "0", "1"),
     _flag("--greedy"),
-    _flag("--out", "table.parquet", "some/table.parquet"),
     *_COMMON,
 )
+_PLAYED: Final = (*_FRESH, _flag("--out", "table.parquet", "some/table.parquet"))
 _SUBCOMMANDS: Final[dict[str, tuple[list[st.SearchStrategy[list[str]]], tuple[Any, ...]]]] = {
     "run": (
         [_run("plain", "finished", "stopped", "results")],
@@ -96,7 +96,7 @@ _SUBCOMMANDS: Final[dict[str, tuple[list[st.SearchStrategy[list[str]]], tuple[An
     "evaluate": ([_run("plain", "finished", "results", "stopped")], _PLAYED),
     "visits": (
         [_run("plain", "finished", "results", "stopped")],
-        (*_PLAYED, _flag("--out", "maps.png", "some/maps.png"), _flag("--random")),
+        (*_FRESH, _flag("--figure", "maps.png", "some/maps.png"), _flag("--random")),
     ),
     "crossplay": (
         [_run("plain", "finished"), _run("plain", "finished")],

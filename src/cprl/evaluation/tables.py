@@ -49,8 +49,9 @@ def run_table(evaluation: Evaluation) -> Table:
 def territory_table(found: Territory) -> Table:
     """A row for each measure of territory: mean over replicas and 95 % interval, of the run's agents and of
     random ones; a dash where it is undefined in all."""
+    count = len(found.replicas)
     table = Table(
-        title=f"{found.run.path.name}: {len(found.replicas)} replicas, {found.episodes} episodes each, "
+        title=f"{found.run.path.name}: {count} replica{'s' * (count != 1)}, {found.episodes} episodes each, "
         f"seed {found.seed}\n{_INTERVALS}"
     )
     table.add_column()

@@ -33,8 +33,9 @@ def draw_visits(
 
     Hue is the agent. Brightness is the share of its time by its square root, the same scale in all maps, from
     the least to the longest stay of any agent. A ring is where the agent starts, small squares are sites, and
-    grey cells walls. In the last map a cell is brighter the larger the share that its owner has in all visits
-    of the cell, each agent's time counting the same: as agents have four hues, numbers say who it is.
+    grey cells walls. In the last map a cell has the hue of its owner; it is brighter the more time the owner
+    spends there, and the larger its share in the time of all. As agents have four hues, numbers say who owns
+    what, each where its owner spends most time.
 
     Args:
         found: what `cprl.evaluation.territory_of` returns.
@@ -132,15 +133,14 @@ def _show(panel: Axes, board: Map, image: Array) -> None:
 
 def _owners(panel: Axes, board: Map, shares: Array) -> None:
     """Shows who owns each cell, with the owner's number in the middle of what it owns."""
-    owner = owners(shares)
-    total = shares.sum(0)
-    most = np.divide(shares.max(0), total, out=np.zeros_like(total), where=total > 0)
+    owner, longest, total = owners(shares), shares.max(0), shares.sum(0)
+    alone = np.divide(longest, total, out=np.zeros_like(total), where=total > 0)
+    light = DARKEST + (1 - DARKEST) * np.sqrt(longest / max(longest.max(), 1e-12)) * alone
     hues = np.stack([_rgb(agent_colour(agent)) for agent in range(len(shares))])
-    _show(panel, board, _blend(hues[owner], np.where(owner >= 0, DARKEST + (1 - DARKEST) * most, 0.0)))
-    for agent, own in enumerate(shares * (owner == np.arange(len(shares))[:, None, None])):
-        if not own.any():
-            continue
-        rows, cols = np.indices(own.shape)
-        row, col = ((places * own).sum() / own.sum() for places in (rows, cols))
-        panel.text(col, row, str(agent), color="white", fontsize=7, ha="center", va="center")
+    _show(panel, board, _blend(hues[owner], np.where(owner >= 0, light, 0.0)))
+    for agent, share in enumerate(shares):
+        own = np.where(owner == agent, share, 0.0)
+        if own.any():
+            row, col = np.unravel_index(own.argmax(), own.shape)
+            panel.text(col, row, str(agent), color="white", fontsize=7, ha="center", va="center_baseline")
     panel.set_title("who spends most time where", fontsize=style.SMALL_PT)
