@@ -2,7 +2,8 @@
 
 J. Perolat et al., "A multi-agent reinforcement learning model of common-pool resource appropriation" (2017).
 docs/perolat.md says which numbers are the paper's, which it leaves open, how these recipes depart from it,
-and what they cost.
+and how the cost was measured: with 4 replicas a step takes 8.4 to 9.4 ms of a core, so a condition of 1,000
+episodes takes 2.6 core hours at most, and its process 3.1 GB of memory.
 """
 
 from typing import Final
