@@ -71,7 +71,9 @@ def test_combat_is_told_of_every_run_with_the_settings_in_which_they_differ(tmp_
         a_result(tmp_path, "commons", society(FELL), name="three", algorithm=DQN(settings=settings)),
         a_result(tmp_path, "single_basic", society(FELL), name="alone"),
     ]
-    results[1].study, results[1].experiment.game = None, presets.game("commons")  # of a study on its board
+    for result in results[:2]:
+        result.experiment.game = presets.game("commons", variant="as_run")
+    results[1].study = None  # a trial of some study, on the same board
     text = combat_section(results)
     head, _, published, ten, three, total = [line for line in text if line.startswith("|")]
     assert head.split(" | ")[1] == "target_every_episodes"

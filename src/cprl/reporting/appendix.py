@@ -24,11 +24,10 @@ def appendix(results: Sequence[Result]) -> list[str]:
 def _random(results: Sequence[Result]) -> list[str]:
     rows = []
     for result in results:
-        if not result.has_random_score:
+        game, study = result.random_game, result.study
+        if game is None or study is None or study.random is None:
             continue
-        study, values = result.study, returns_by_chance(result.experiment.game)
-        assert study is not None
-        assert study.random is not None
+        values = returns_by_chance(game)
         rows.append(
             [
                 result.name,

@@ -133,11 +133,13 @@ def _published(result: Result, episodes: int) -> Values:
 
 def _dip_at(curves: Values) -> Values:
     peaks = np.maximum.accumulate(curves, axis=1)
-    return ((peaks - curves) / np.maximum(peaks, 1e-12)).argmax(1).astype(np.float64)
+    deepest: Values = ((peaks - curves) / np.maximum(peaks, 1e-12)).argmax(1).astype(np.float64)
+    return deepest
 
 
 def _dip_bottom(curves: Values) -> Values:
-    return curves[np.arange(len(curves)), _dip_at(curves).astype(int)]
+    lowest: Values = curves[np.arange(len(curves)), _dip_at(curves).astype(int)]
+    return lowest
 
 
 def _greedy_returns(game: Game) -> Values:

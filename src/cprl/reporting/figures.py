@@ -93,8 +93,8 @@ def _extent(result: Result, metric: str) -> Limits:
 
 def _random(result: Result, metric: str) -> float | None:
     """The mean of random play; None if there is no evaluation."""
-    if metric == "collective_return" and result.has_random_score:
-        return float(returns_by_chance(result.experiment.game).mean())
+    if metric == "collective_return" and (game := result.random_game) is not None:
+        return float(returns_by_chance(game).mean())
     found = result.evaluated("random")
     if found is None or metric not in found or np.isnan(found[metric]).all():
         return None

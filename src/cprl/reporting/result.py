@@ -66,11 +66,12 @@ class Result:
         return presets.variant_of(self.experiment.game)
 
     @property
-    def has_random_score(self) -> bool:
-        """Whether the study gives a random score, and the game is one that random play is played in."""
+    def random_game(self) -> Game | None:
+        """The game of which the study gives a random score; None if it gives none, or the game has rules that
+        random play is not played with."""
         game, study = self.experiment.game, self.study
-        plain = isinstance(game, Game) and not game.institutions
-        return plain and study is not None and study.random is not None
+        scored = study is not None and study.random is not None
+        return game if scored and isinstance(game, Game) and not game.institutions else None
 
     @property
     def window(self) -> int:
