@@ -141,6 +141,6 @@ def _owners(panel: Axes, board: Map, shares: Array) -> None:
     for agent, share in enumerate(shares):
         own = np.where(owner == agent, share, 0.0)
         if own.any():
-            row, col = np.unravel_index(own.argmax(), own.shape)
+            row, col = divmod(int(own.argmax()), board.width)
             panel.text(col, row, str(agent), color="white", fontsize=7, ha="center", va="center_baseline")
     panel.set_title("who spends most time where", fontsize=style.SMALL_PT)
