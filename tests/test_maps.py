@@ -146,6 +146,21 @@ def test_all_boards_of_rooms_but_unequal_are_symmetric_under_half_a_turn():
             assert {(18 - row, 52 - col) for row, col in cells} == set(cells)
 
 
+def test_the_cells_of_a_room_hold_its_apples_and_its_agents_and_no_corridor():
+    cells = maps.room_cells()
+    assert cells.shape == (len(maps.ROOM_NAMES), 19, 53)
+    assert cells.sum((1, 2)).tolist() == [7 * 24] * 4
+    assert cells.any(0).sum() == 4 * 7 * 24, "no cell is in two rooms"
+    assert not cells[:, 8:11].any()
+    assert not cells[:, :, 25:28].any()
+    for entrances in ("single", "unequal"):
+        board = maps.rooms(entrances)
+        for room in range(4):
+            assert sum(cells[room][site] for site in board.sites) == 45
+        assert all(cells[agent % 4][start[:2]] for agent, start in enumerate(board.starts))
+    assert [room for room in range(4) if cells[room, 3, 6]] == [maps.ROOM_NAMES.index("north-west")]
+
+
 def test_fewer_agents_are_spread_over_the_rooms():
     starts = maps.rooms(agents=4).starts
     assert {(row > 9, col > 26) for row, col, _ in starts} == set(itertools.product((False, True), repeat=2))

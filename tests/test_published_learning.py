@@ -162,6 +162,23 @@ def test_the_loss_is_torchrls_in_all_else():
     assert loss(weighed)["loss"].item() == pytest.approx(0.75 * 0.4337808)
 
 
+@pytest.mark.parametrize(
+    ("how", "message"),
+    [
+        ({"value_network": 3}, "^value_network is 3; allowed: a QValueActor or a torch.nn.Module"),
+        ({"double_dqn": 1}, "^double_dqn is 1; allowed: True or False"),
+        ({"delay_value": None}, "^delay_value is None; allowed: True or False"),
+        ({"action_space": "any"}, "^action_space is 'any'; allowed: categorical, one-hot"),
+        ({"reduction": "all"}, "^reduction is 'all'; allowed: mean, sum, none"),
+    ],
+)
+def test_the_loss_refuses_what_it_cannot_be(how, message):
+    with pytest.raises(ValueError, match=message):
+        LogCoshDQNLoss(**{"value_network": nn.Linear(1, 2), **how})
+    with pytest.raises(ValueError, match=r"^error is 1\.0; allowed: a tensor"):
+        log_cosh(1.0)
+
+
 def make_loss(network):
     return DQN(settings=DQNSettings(gamma=0.9), loss_function="log_cosh").make_loss(network)
 

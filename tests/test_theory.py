@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from test_yields import AS_RUN, CROSS, PUBLISHED
 
 from cprl import Map, Rules, maps, presets
 from cprl.commons.yields import sustainable_yield
@@ -130,17 +131,6 @@ def test_payoffs_have_any_leading_axes():
 def test_what_does_not_fit_is_refused(call, message):
     with pytest.raises(ValueError, match=message):
         call()
-
-
-CROSS = maps.parse(
-    """
-    >Av
-    AAA
-    .A.
-    """
-)
-AS_RUN = presets.game("commons", variant="as_run").rules
-PUBLISHED = presets.game("commons").rules
 
 
 def test_a_cross_bears_a_tenth_of_an_apple_a_turn_and_keeps_three():

@@ -1,4 +1,4 @@
-"""`cprl film`, `cprl evaluate` and `cprl crossplay`: stored agents in fresh worlds."""
+"""`cprl film`, `cprl evaluate`, `cprl visits` and `cprl crossplay`: stored agents in fresh worlds."""
 
 from collections.abc import Sequence
 from pathlib import Path
@@ -13,7 +13,9 @@ from cprl.evaluation.evaluate import SEED, evaluate_run
 from cprl.evaluation.film import film as film_run
 from cprl.evaluation.film_video import SUFFIXES, film_video
 from cprl.evaluation.gains_picture import draw_gains
-from cprl.evaluation.tables import agents_table, gains_tables, heading, matrices, run_table
+from cprl.evaluation.tables import agents_table, gains_tables, heading, matrices, run_table, territory_table
+from cprl.evaluation.territory import territory_of
+from cprl.evaluation.visits_picture import check_picture, draw_visits
 from cprl.output import OUT, console, say
 from cprl.process import prepare_process
 from cprl.runs.labelled import refuse_to_write_over, write_table
@@ -99,6 +101,43 @@ def evaluate(
     say(f"Weights: {evaluation.run.weights_from}")
     if out is not None:
         say(f"Episodes: {out}")
+
+
+def visits(
+    run: Path,
+    /,
+    *,
+    episodes: int = 20,
+    greedy: bool = False,
+    seed: int = SEED,
+    replicas: tuple[int, ...] = (),
+    figure: Path | None = None,
+    random: bool = False,
+    allow: Allow = (),
+) -> None:
+    """Lets all replicas of a run play fresh worlds, and prints how far agents keep to cells of their own.
+
+    Args:
+        run: the run's directory, or its results; of one that has not ended the newest checkpoint plays.
+        episodes: of each replica.
+        greedy: whether agents play what they hold best, without exploring or drawing.
+        seed: of the worlds and all chance; the same one gives the same numbers.
+        replicas: their numbers; by default all. The first one is drawn.
+        figure: a PNG to be: a map for each agent of where it spends its time.
+        random: draw random agents in the same worlds instead.
+        allow: code of your own, module:Class, that the run may import; see docs/changing.md.
+    """
+    make_importable(allow)
+    if figure is not None:
+        check_picture(figure, "--figure")
+    elif random:
+        raise ValueError("--random says who is drawn; allowed: with --figure FILE.png")
+    prepare_process(seed)
+    found = territory_of(run, episodes=episodes, greedy=greedy, seed=seed, replicas=replicas, allow=allow)
+    _print(territory_table(found))
+    say(f"Weights: {found.run.weights_from}")
+    if figure is not None:
+        say(f"Figure: {draw_visits(found, figure, policy='random' if random else 'trained')}")
 
 
 def crossplay(

@@ -51,14 +51,14 @@ def _others(run: list[str]) -> list[str]:
 
 _COMMON: Final = (_flag("--allow", *runs.ALLOW, "os:getcwd"),)
 _ALLOWED: Final = st.just(["--allow", runs.ALLOW[0]])
-_PLAYED: Final = (
+_FRESH: Final = (
     _flag("--episodes", "1", "2", "0"),
     _flag("--seed", "1", "0"),
     _flag("--replicas", "0", "1"),
     _flag("--greedy"),
-    _flag("--out", "table.parquet", "some/table.parquet"),
     *_COMMON,
 )
+_PLAYED: Final = (*_FRESH, _flag("--out", "table.parquet", "some/table.parquet"))
 _SUBCOMMANDS: Final[dict[str, tuple[list[st.SearchStrategy[list[str]]], tuple[Any, ...]]]] = {
     "run": (
         [_run("plain", "finished", "stopped", "results")],
@@ -94,6 +94,10 @@ _SUBCOMMANDS: Final[dict[str, tuple[list[st.SearchStrategy[list[str]]], tuple[An
     "report": ([_run("plain")] * 2, (_flag("--out", "report", "a/b"),)),
     "export": ([_run("plain", "finished", "stopped"), st.just(["folder"])], (_flag("--watch", "off"),)),
     "evaluate": ([_run("plain", "finished", "results", "stopped")], _PLAYED),
+    "visits": (
+        [_run("plain", "finished", "results", "stopped")],
+        (*_FRESH, _flag("--figure", "maps.png", "some/maps.png"), _flag("--random")),
+    ),
     "crossplay": (
         [_run("plain", "finished"), _run("plain", "finished")],
         (*_PLAYED, _flag("--diagonal", "self", "cross_seed", "selfplay")),

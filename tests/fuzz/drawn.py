@@ -13,6 +13,7 @@ from cprl import CommonsEnv, maps, presets
 from cprl.algorithms import DQN
 from cprl.collectors import StepCollector
 from cprl.envs import parallel_env
+from cprl.evaluation import territory_of
 from cprl.measuring import phases
 from cprl.policies.lanes import random_agents
 from cprl.population import Scripted
@@ -29,6 +30,13 @@ _SEEDS: Final = st.sampled_from((0, 1, 7, 2**63, 2**64 - 2))
 _RUNS: Final = st.one_of(st.sampled_from(runs.NAMES).map(runs.folder), hints.PATHS)
 _FINISHED: Final = st.one_of(*[st.sampled_from(("plain", "plain", "finished")).map(runs.folder)] * 4, _RUNS)
 _ALLOW: Final = st.sampled_from((runs.ALLOW, runs.ALLOW, ()))
+_FRESH: Final = {
+    "run": _FINISHED,
+    "episodes": _FEW,
+    "seed": _SEEDS,
+    "replicas": st.sampled_from(((), (0,), (1, 0))),
+    "allow": _ALLOW,
+}
 _ENVS: Final = things.examples_of(CommonsEnv)
 _BOARD: Final = st.sampled_from(presets.BOARDS)
 _SHAPES: Final = st.sampled_from(((6, 2), (6, 2), (6, 2), (1, 1), (3, 6, 2), (0, 2)))
@@ -139,12 +147,12 @@ OWN: Final[dict[str, dict[str, st.SearchStrategy[Any]]]] = {
         "replicas": st.sampled_from(((), (0,), (1, 0))),
         "allow": _ALLOW,
     },
-    "cprl.evaluation.evaluate:evaluate_run": {
-        "run": _FINISHED,
-        "episodes": _FEW,
-        "seed": _SEEDS,
-        "replicas": st.sampled_from(((), (0,), (1, 0))),
-        "allow": _ALLOW,
+    "cprl.evaluation.evaluate:evaluate_run": _FRESH,
+    "cprl.evaluation.territory:territory_of": _FRESH,
+    "cprl.evaluation.visits_picture:draw_visits": {
+        "found": st.just(0).map(lambda _: territory_of(runs.folder("plain"), episodes=1)),
+        "path": st.sampled_from(("visits.png", "new/visits.png", "visits.gif")),
+        "replica": st.sampled_from((None, 0, 7)),
     },
     "cprl.learners.torchrl.replay:TorchRLReplayLearner": {**_LEARNER, "make_loss": st.just(_loss)},
     "cprl.learners.torchrl.rollouts:TorchRLRolloutLearner": {

@@ -4,6 +4,7 @@ Modules, in the order in which one reads them:
     evaluate    evaluate_run: all replicas of a run, beside the random policy
     cross_play  crossplay: a focal agent of one run among background agents of another
     gains       what a focal agent gains over the agent whose place it takes, and what it costs the others
+    territory   territory_of: where the agents of a run go and whom they tag
     film        an episode, every step recorded
     film_video  the same as a GIF or an MP4
     lanes       stored agents of all replicas side by side
@@ -13,11 +14,26 @@ Modules, in the order in which one reads them:
     episode_picture  the board with the stock and the harvests so far
     video_files      GIF and MP4 out of pictures
     gains_picture    gains as two matrices
+    visits_picture   a map for each agent of where it spends its time
 """
 
 from cprl.evaluation.cross_play import Cell, CrossPlay, crossplay
 from cprl.evaluation.evaluate import Evaluation, evaluate_run
 from cprl.evaluation.gains import Gain, gains
 from cprl.evaluation.gains_picture import draw_gains
+from cprl.evaluation.territory import Territory, territory_of
+from cprl.evaluation.visits_picture import draw_visits
 
-__all__ = ["Cell", "CrossPlay", "Evaluation", "Gain", "crossplay", "draw_gains", "evaluate_run", "gains"]
+__all__ = [
+    "Cell",
+    "CrossPlay",
+    "Evaluation",
+    "Gain",
+    "Territory",
+    "crossplay",
+    "draw_gains",
+    "draw_visits",
+    "evaluate_run",
+    "gains",
+    "territory_of",
+]

@@ -9,6 +9,7 @@ from cprl.evaluation.cross_play import CrossPlay
 from cprl.evaluation.evaluate import Evaluation
 from cprl.evaluation.gains import gains
 from cprl.evaluation.lanes import Played
+from cprl.evaluation.territory import Territory
 from cprl.measuring.names import with_unit
 from cprl.measuring.replicas import Measured, agents_without_harvest
 from cprl.measuring.reported import left_out
@@ -42,6 +43,23 @@ def run_table(evaluation: Evaluation) -> Table:
             *(f"{own[0]} of {own[1]}" for own in without if own),
         )
     table.caption = left_out(next(iter(evaluation.trained.values()))[0].reported) or None
+    return table
+
+
+def territory_table(found: Territory) -> Table:
+    """A row for each measure of territory: mean over replicas and 95 % interval, of the run's agents and of
+    random ones; a dash where it is undefined in all."""
+    count = len(found.replicas)
+    table = Table(
+        title=f"{found.run.path.name}: {count} replica{'s' * (count != 1)}, {found.episodes} episodes each, "
+        f"seed {found.seed}\n{_INTERVALS}"
+    )
+    table.add_column()
+    table.add_column(f"run's agents{how_they_play([found.run], found.greedy)}", justify="right")
+    table.add_column("random", justify="right")
+    trained, random = found.trained.measures(), found.random.measures()
+    for name in found.trained.by_replica:
+        table.add_row(name, *(str(own.get(name, "-")) for own in (trained, random)))
     return table
 
 

@@ -8,7 +8,7 @@ Arrays of a played episode with T steps, B worlds and N agents, at the start of 
 """
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
@@ -34,6 +34,8 @@ class Trace:
     played: Array
     board: tuple[int, int]
     """The height H and width W of the board in cells."""
+    tags: Array = field(default_factory=lambda: np.zeros((0, 4), np.int64))
+    """Every tag, int64 [K, 4] in order: its step and world, the agent that was tagged, and who tagged it."""
 
 
 def trace(
@@ -47,6 +49,7 @@ def trace(
         explore: Whether actors explore with their epsilon.
     """
     steps: list[tuple[Array, ...]] = []
+    tags: list[Array] = []
     exploration = ExplorationType.RANDOM if explore else ExplorationType.DETERMINISTIC
     now, read = env.worlds.now, env.worlds.driver.read
     with torch.no_grad(), set_exploration_type(exploration):
@@ -55,10 +58,20 @@ def trace(
             places = read(now.row), read(now.col)
             before = moment[keys.IN_PLAY].numpy(force=True), ~moment["done"][:, 0].numpy(force=True)
             moment = env.step(policy(moment))["next"].exclude(keys.REWARD)
+            hits = np.argwhere(moment[keys.TAGGED_BY].numpy(force=True))
+            tags.append(np.insert(hits, 0, len(steps), axis=1))
             steps.append((*places, *before, moment[keys.FIRED].numpy(force=True)))
     row, col, in_play, played, fired = (np.stack(entries) for entries in zip(*steps, strict=True))
     board = env.game.map.height, env.game.map.width
-    return Trace(row=row, col=col, in_play=in_play, fired=fired, played=played, board=board)
+    return Trace(
+        row=row,
+        col=col,
+        in_play=in_play,
+        fired=fired,
+        played=played,
+        board=board,
+        tags=np.concatenate(tags),
+    )
 
 
 def visits(trace: Trace) -> Array:

@@ -1,14 +1,15 @@
 """The logarithm of the hyperbolic cosine of an error, which neither torch nor TorchRL has as a loss."""
 
 from math import log
-from typing import Any, Final
+from typing import Final
 
-from tensordict.nn import TensorDictModule
-from torch import Tensor
+from torch import Tensor, nn
 from torch.nn.functional import softplus
+from torchrl.modules import QValueActor
 from torchrl.objectives import DQNLoss
 from torchrl.objectives.utils import distance_loss
 
+from cprl.arguments import choice, object_of, switch
 from cprl.compat import ReshapedLoss
 
 LOG_COSH: Final = "log_cosh"
@@ -20,14 +21,18 @@ DISTANCES: Final = (*TORCHRL_DISTANCES, LOG_COSH)
 
 
 def log_cosh(error: Tensor) -> Tensor:
-    """ln cosh of each error d, float of any shape: about d^2 / 2 near 0 and abs(d) - ln 2 far from it.
+    """ln cosh of each error d, a tensor of any shape: about d^2 / 2 near 0 and abs(d) - ln 2 far from it.
 
     Computed as d + softplus(-2 d) - ln 2, which does not overflow. Its derivative is tanh(d). In float32 both
     have a rounding error of about 1e-7, so the loss of an error below 1e-3 is hardly more than noise, its
     derivative is not.
 
     Source: the loss "logcosh" of Keras 2.2.4 (`keras/losses.py`).
+
+    Raises:
+        ValueError: for what is no tensor.
     """
+    object_of("error", error, Tensor, "a tensor")
     return error + softplus(-2.0 * error) - log(2)
 
 
@@ -45,12 +50,38 @@ class LogCoshDQNLoss(ReshapedLoss, DQNLoss):
     log-cosh is even: it is that of the absolute error, which `DQNLoss` computes for `loss_function="l1"`.
 
     Args:
-        value_network: see `DQNLoss`.
-        how: its other arguments but `loss_function`.
+        value_network: see `DQNLoss`, as of the others.
+        delay_value: whether there is a target network.
+        double_dqn: whether the network itself chooses the action whose value bootstraps.
+        action_space: "categorical" for actions as integers, or "one-hot".
+        reduction: "mean", "sum" or "none".
+
+    Raises:
+        ValueError: for a value that is not allowed.
     """
 
-    def __init__(self, value_network: TensorDictModule, **how: Any) -> None:
-        super().__init__(value_network, loss_function="l1", **how)
+    def __init__(
+        self,
+        value_network: QValueActor | nn.Module,
+        *,
+        delay_value: bool = True,
+        double_dqn: bool = False,
+        action_space: str = "categorical",
+        reduction: str = "mean",
+    ) -> None:
+        object_of("value_network", value_network, nn.Module, "a QValueActor or a torch.nn.Module")
+        switch("delay_value", delay_value)
+        switch("double_dqn", double_dqn)
+        choice("action_space", action_space, ("categorical", "one-hot"))
+        choice("reduction", reduction, ("mean", "sum", "none"))
+        super().__init__(
+            value_network,
+            loss_function="l1",
+            delay_value=delay_value,
+            double_dqn=double_dqn,
+            action_space=action_space,
+            reduction=reduction,
+        )
 
     def reshape_each(self, losses: Tensor) -> Tensor:
         """See `ReshapedLoss`."""

@@ -26,6 +26,8 @@ FILE_NAME: Final = "recipe.json"
 
 _RESUMES: Final = ("--resume", "--no-resume", "--go-on", "--no-go-on", "--take-over", "--no-take-over")
 _DIRECTORIES: Final = ("--out", "--runs")
+LONGEST_PATH: Final = 500
+"""The largest number of characters of a path that an error shows whole."""
 _NAMED: Final = 5
 """The largest number of differences between two recipes that an error names."""
 
@@ -229,7 +231,8 @@ def read_recipe(run: Path) -> dict[str, Any]:
         if not any(isinstance(recipe.get(name), dict) for name in ("experiment", "arguments")):
             raise TypeError('no table "experiment"')
     except (OSError, ValueError, TypeError) as error:
-        raise ValueError(f"{path} is not the recipe of a run: {error!r}") from error
+        name = path if len(str(path)) <= LONGEST_PATH else shown(str(path))
+        raise ValueError(f"{name} is not the recipe of a run: {error!r}") from error
     return recipe
 
 

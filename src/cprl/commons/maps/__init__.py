@@ -2,11 +2,12 @@
 
 from cprl.commons.maps.board import HEADING_OF_SIGN, SIGN_OF_HEADING, Cell, Map, Start
 from cprl.commons.maps.drawings import NAMES, named, parse
-from cprl.commons.maps.generators import crosses, random, rooms
+from cprl.commons.maps.generators import ROOM_NAMES, crosses, random, room_cells, rooms
 
 __all__ = [
     "HEADING_OF_SIGN",
     "NAMES",
+    "ROOM_NAMES",
     "SIGN_OF_HEADING",
     "Cell",
     "Map",
@@ -15,5 +16,6 @@ __all__ = [
     "named",
     "parse",
     "random",
+    "room_cells",
     "rooms",
 ]

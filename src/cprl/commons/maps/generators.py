@@ -7,6 +7,7 @@ from math import isqrt
 from typing import Final, Literal, get_args
 
 import numpy as np
+from numpy.typing import NDArray
 
 from cprl import arguments
 from cprl.commons.maps.board import (
@@ -47,6 +48,18 @@ _OPENINGS: Final = ((1, 24), (3, 28), (7, 1), (7, 8), (7, 40), (7, 48))
 """Openings in the walls of the upper half under "multiple"; the lower half likewise."""
 
 _NORTH_STARTS: Final = ((3, 6), (3, 46), (3, 10), (3, 42), (3, 14), (3, 38))
+
+ROOM_NAMES: Final = ("north-west", "north-east", "south-east", "south-west")
+_ROOMS: Final = tuple(
+    (slice(*rows), slice(*columns))
+    for rows, columns in (
+        ((0, 7), (0, 24)),
+        ((0, 7), (29, 53)),
+        ((12, 19), (29, 53)),
+        ((12, 19), (0, 24)),
+    )
+)
+"""Rows and columns of each room; all else is corridor or wall."""
 
 
 def crosses(
@@ -112,6 +125,17 @@ def rooms(entrances: Entrances = "single", *, agents: int = 12) -> Map:
         starts=_room_starts()[:agents],
         walls=_room_walls(entrances),
     )
+
+
+def room_cells() -> NDArray[np.bool_]:
+    """The cells of each room of `rooms`, bool [4, 19, 53], in the order of `ROOM_NAMES`.
+
+    Those of the corridor are in no room. They are the same without walls. Agent i begins in room i % 4.
+    """
+    cells = np.zeros((len(_ROOMS), ROOMS_HEIGHT, ROOMS_WIDTH), np.bool_)
+    for room, (rows, columns) in enumerate(_ROOMS):
+        cells[room, rows, columns] = True
+    return cells
 
 
 def _turned(cell: Cell) -> Cell:

@@ -1,0 +1,165 @@
+"""Territory: whether agents keep to cells of their own, and who tags whom where.
+
+Visits are shares [..., N, H, W], float64, as `cprl.measuring.movement.visits` returns them: for each agent
+the share of its steps in play that it spent in each cell. They sum to 1, or to 0 for an agent that was never
+in play, which then counts in none of these measures.
+
+Shares of few steps look more exclusive than they are, since agents that visit many cells seldom have hit the
+same ones by chance: average the visits of many episodes first, and compare with other agents, such as random
+ones, over as many steps from the same starts.
+"""
+
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from cprl import arguments
+from cprl.measuring.movement import Trace
+
+Array = NDArray[Any]
+
+_SUM_TOLERANCE = 1e-6
+
+
+def visitors(visits: ArrayLike) -> Array:
+    """How many agents share a cell, float64 [...], 1..N: 1 if each has cells of its own, N if all spend equal
+    shares of their time in each cell.
+
+    It is exp H(agent | cell): with p(i, c) = visits[i, c] / N, of the N agents that were in play, the entropy
+    of who it is that one meets in a cell, mean over the cells by how often one meets somebody there. NaN
+    without agents.
+
+    Args:
+        visits: shares [..., N, H, W].
+    """
+    shares, agents = _checked(visits)
+    within = shares.sum(-3, keepdims=True)
+    odds = np.divide(shares, within, out=np.zeros_like(shares), where=within > 0)
+    logs = np.log(odds, out=np.zeros_like(odds), where=odds > 0)
+    with np.errstate(invalid="ignore"):
+        found: Array = np.exp(-(shares * logs).sum((-3, -2, -1)) / agents)
+    return np.where(agents > 0, found, np.nan)
+
+
+def exclusion(visits: ArrayLike) -> Array:
+    """How far agents keep each other out of cells, float64 [...], 0..1: 1 if no cell has two visitors, 0 if
+    all agents spend equal shares of their time in each cell; NaN for fewer than two agents.
+
+    It is 1 - H(agent | cell) / log N, or the information about who an agent is that its cell gives, as a
+    share of all that there is; equal to the Jensen-Shannon divergence of the N distributions over cells,
+    divided by log N (J. Lin, "Divergence measures based on the Shannon entropy", 1991).
+
+    Args:
+        visits: shares [..., N, H, W].
+    """
+    _, agents = _checked(visits)
+    found = np.full(agents.shape, np.nan)
+    several = agents > 1
+    found[several] = 1 - np.log(visitors(visits)[several]) / np.log(agents[several])
+    inside: Array = np.clip(found, 0, 1)
+    return inside
+
+
+def owners(visits: ArrayLike) -> Array:
+    """The agent that spends the largest share of its time in each cell, int64 [..., H, W]; of equal ones the
+    first, and -1 where nobody was.
+
+    Args:
+        visits: shares [..., N, H, W].
+    """
+    shares, _ = _checked(visits)
+    found: Array = np.where(shares.any(-3), shares.argmax(-3), -1)
+    return found
+
+
+def time_within(visits: ArrayLike, regions: ArrayLike) -> Array:
+    """The share of its time that each agent spends in a region of its own, float64 [..., N]; NaN for an agent
+    that was never in play.
+
+    Args:
+        visits: shares [..., N, H, W].
+        regions: bool [N, H, W], the cells of each agent's region.
+
+    Raises:
+        ValueError: if regions has another shape.
+    """
+    shares, _ = _checked(visits)
+    own = np.asarray(regions)
+    if own.dtype != np.bool_ or own.shape != shares.shape[-3:]:
+        raise ValueError(
+            f"regions is {own.dtype} {list(own.shape)}; allowed: bool {list(shares.shape[-3:])}, the cells "
+            "of each agent's region"
+        )
+    inside = (shares * own).sum((-2, -1))
+    return np.where(shares.any((-2, -1)), inside, np.nan)
+
+
+def taggings(trace: Trace) -> Array:
+    """How often each agent was tagged by each, int64 [B, N, N]: row the tagged, column who tagged it.
+
+    An agent that several beams hit at once is counted for each of those who fired.
+    """
+    arguments.object_of("trace", trace, Trace, "a value of trace()")
+    _, worlds, agents = trace.row.shape
+    counts = np.zeros((worlds, agents, agents), np.int64)
+    np.add.at(counts, tuple(trace.tags[:, 1:].T), 1)
+    return counts
+
+
+def tagged_where(trace: Trace) -> Array:
+    """How often each agent was tagged in each cell, int64 [B, N, H, W].
+
+    The cell is that at the start of the step, before the agent moved in it. An agent that several beams hit
+    at once is counted once.
+    """
+    arguments.object_of("trace", trace, Trace, "a value of trace()")
+    _, worlds, agents = trace.row.shape
+    counts = np.zeros((worlds, agents, *trace.board), np.int64)
+    step, world, tagged = np.unique(trace.tags[:, :3], axis=0).T
+    cell = trace.row[step, world, tagged], trace.col[step, world, tagged]
+    np.add.at(counts, (world, tagged, *cell), 1)
+    return counts
+
+
+def defence(trace: Trace, visits: ArrayLike) -> Array:
+    """The share of tags with which an agent drives another one out of its own territory, float64 [B], 0..1.
+
+    A tag counts as 1 if the one who fired spends a larger share of its time in the cell of the tagged, as in
+    `tagged_where`, than the tagged itself, 0 if a smaller one, and 1/2 if they are equal. NaN where no agent
+    was tagged.
+
+    Args:
+        trace: played episodes.
+        visits: shares [N, H, W], or [B, N, H, W].
+    """
+    arguments.object_of("trace", trace, Trace, "a value of trace()")
+    shares, _ = _checked(visits)
+    worlds, wanted = trace.row.shape[1], (trace.row.shape[2], *trace.board)
+    if shares.shape not in (wanted, (worlds, *wanted)):
+        raise ValueError(
+            f"visits is {list(shares.shape)}; allowed: {list(wanted)} or {[worlds, *wanted]}, as in the trace"
+        )
+    shares = np.broadcast_to(shares, (worlds, *wanted))
+    step, world, tagged, by = trace.tags.T
+    cell = trace.row[step, world, tagged], trace.col[step, world, tagged]
+    more = np.sign(shares[world, by, *cell] - shares[world, tagged, *cell])
+    sums = np.bincount(world, (1 + more) / 2, minlength=worlds)
+    with np.errstate(invalid="ignore"):
+        found: Array = sums / np.bincount(world, minlength=worlds)
+    return found
+
+
+def _checked(visits: ArrayLike) -> tuple[Array, Array]:
+    """Visits as float64 [..., N, H, W], and of how many agents they are, int64 [...]."""
+    shares = arguments.floats("visits", visits)
+    if shares.ndim < 3:
+        raise ValueError(f"visits is {list(shares.shape)}; allowed: [..., N, H, W]")
+    sums = shares.sum((-2, -1))
+    is_one, is_zero = np.abs(sums - 1) < _SUM_TOLERANCE, sums == 0
+    if not (shares >= 0).all() or not (is_one | is_zero).all():
+        raise ValueError(
+            "visits holds negative numbers, NaN, or agents whose shares do not sum to 1; allowed: shares of "
+            "the time of each agent"
+        )
+    return shares, is_one.sum(-1)

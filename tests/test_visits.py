@@ -1,0 +1,109 @@
+"""Where agents of stored runs go in fresh worlds: measured beside random play, drawn, and told in a table."""
+
+import numpy as np
+import pytest
+from matplotlib.image import imread
+from test_evaluation import CORRIDORS, MEADOW, SEED, command, ran
+from test_population import ALGORITHMS
+
+import cprl
+from cprl.envs.matrix import stag_hunt
+from cprl.evaluation import territory_of
+from cprl.evaluation.territory import DEFENCE, EXCLUSION, OVERLAP, TAGS, VISITORS
+from cprl.evaluation.visits_picture import draw_visits
+from cprl.population import Learning, Scripted
+
+
+@pytest.fixture(scope="module")
+def corridors(tmp_path_factory):
+    """Two greedy agents, each in a corridor of its own."""
+    return ran(tmp_path_factory.mktemp("runs") / "greedy", CORRIDORS, [Scripted("greedy")] * 2, replicas=2)
+
+
+@pytest.fixture(scope="module")
+def meadow(tmp_path_factory):
+    """Two agents that learned a little, on a board without walls and with a beam."""
+    dqn = Learning(ALGORITHMS["DQN"])
+    return ran(tmp_path_factory.mktemp("runs") / "alike", MEADOW, [dqn] * 2)
+
+
+def test_agents_in_corridors_of_their_own_exclude_each_other(corridors):
+    found = territory_of(corridors, episodes=4)
+    measured = found.trained.measures()
+    assert measured[EXCLUSION].value == measured[VISITORS].value == 1
+    assert measured[OVERLAP].value == measured[TAGS].value == 0
+    assert DEFENCE not in measured, "nobody can fire"
+    # Agent 0 starts at (0, 0) and bites at columns 1 and 3 in steps 1 and 3; the cell of step t is that at
+    # its start. Agent 1 starts at (2, 4) and walks left. After step 3 the board is dead.
+    assert found.trained.visits.shape == (2, 2, 3, 5)
+    np.testing.assert_allclose(found.trained.visits[0, 0, 0], [1 / 3, 1 / 3, 1 / 3, 0, 0])
+    np.testing.assert_allclose(found.trained.visits[1, 1, 2], [0, 0, 1 / 3, 1 / 3, 1 / 3])
+
+
+def test_the_episodes_are_those_of_an_evaluation(meadow):
+    found, played = (ask(meadow, episodes=5, seed=SEED) for ask in (territory_of, cprl.evaluate_run))
+    for policy in ("trained", "random"):
+        stays = found.of(policy)
+        for place, replica in enumerate(found.replicas):
+            episodes = getattr(played, policy)[replica]
+            tagged_by = sum(own.tagged_by for own in episodes)
+            assert stays.taggings[place].tolist() == tagged_by.tolist()
+            tagged = sum(own.tagged for own in episodes)
+            assert stays.tagged_where[place].sum((1, 2)).tolist() == tagged.tolist()
+            per_1000 = 1000 * tagged_by.sum() / sum(own.steps for own in episodes)
+            assert stays.by_replica[TAGS][place] == pytest.approx(per_1000)
+    assert found.random.taggings.sum() > 0
+
+
+def test_a_replica_alone_stays_where_it_stays_among_all(meadow):
+    both = territory_of(meadow, episodes=3)
+    alone = territory_of(meadow, episodes=3, replicas=[2])
+    np.testing.assert_array_equal(alone.trained.visits[0], both.trained.visits[2])
+    np.testing.assert_array_equal(alone.random.tagged_where[0], both.random.tagged_where[2])
+    for name, values in both.random.by_replica.items():
+        np.testing.assert_array_equal(alone.random.by_replica[name], values[2:])
+
+
+def test_the_maps_show_where_each_agent_was_and_are_not_written_over(corridors, tmp_path):
+    found = territory_of(corridors, episodes=2)
+    path = draw_visits(found, tmp_path / "new" / "visits.png", replica=1)
+    picture = (imread(path)[..., :3] * 255).round()
+    for agent, colour in ((0, (86, 180, 233)), (1, (230, 97, 0))):
+        assert (np.abs(picture - colour).max(-1) < 2).sum() > 1000, f"agent {agent} in its hue"
+    with pytest.raises(FileExistsError, match=r"visits\.png exists and is not overwritten"):
+        draw_visits(found, path)
+
+
+@pytest.mark.parametrize(
+    ("more", "message"),
+    [
+        ({"replica": 2}, r"replica is 2; allowed: one that played, of \[0, 1\]"),
+        ({"policy": "greedy"}, "policy is 'greedy'; allowed: trained, random"),
+        ({"path": "visits.pdf"}, r"path is '.*visits.pdf'; allowed: a file whose name ends in .png"),
+    ],
+)
+def test_what_cannot_be_drawn_is_refused(more, message, corridors, tmp_path):
+    found = territory_of(corridors, episodes=1)
+    with pytest.raises(ValueError, match=message):
+        draw_visits(found, **{"path": tmp_path / "visits.png", **more})
+    assert not list(tmp_path.iterdir())
+
+
+def test_a_game_without_a_board_is_refused(tmp_path):
+    run = ran(tmp_path / "matrix", stag_hunt(), [Scripted("random")] * 2, replicas=1)
+    with pytest.raises(ValueError, match="plays a game without a board of cprl; allowed: a run"):
+        territory_of(run)
+
+
+def test_the_command_visits_tells_and_draws(meadow, tmp_path, monkeypatch, capsys):
+    out = tmp_path / "visits.png"
+    text = command(monkeypatch, capsys, "visits", meadow, "--episodes", 2, "--figure", out, "--random")
+    found = territory_of(meadow, episodes=2)
+    for name, own in found.random.measures().items():
+        (row,) = [row for row in text.splitlines() if row.startswith(f"│ {name} ")]
+        assert row.split("│")[3].strip() == str(own)
+    assert f"Figure: {out}" in text
+    assert imread(out).shape[1] == 1500
+    for words in (("--figure", out), ("--random",), ("--figure", tmp_path / "visits.gif")):
+        with pytest.raises(SystemExit, match=r"cprl: .*(exists|allowed: with --figure|ends in \.png)"):
+            command(monkeypatch, capsys, "visits", meadow, *words)
