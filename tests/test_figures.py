@@ -55,12 +55,11 @@ def drawn(monkeypatch):
     """The figures that are saved, in order; not rendered."""
     figures = []
 
-    def keep(figure, path):
+    def keep(figure, path, **how):
         figures.append(figure)
         return path
 
     monkeypatch.setattr(style, "save", keep)
-    monkeypatch.setattr(reported, "RESAMPLES", 5)
     return figures
 
 
@@ -207,6 +206,10 @@ def test_a_figure_is_written_with_150_dots_an_inch_and_a_long_title_wraps(tmp_pa
     with Image.open(style.save(figure, tmp_path / "a.png")) as picture:
         assert round(picture.info["dpi"][0]) == 150
         assert picture.width == 1200
+    with Image.open(style.save(figure, tmp_path / "few.png", colours=8)) as picture:
+        assert picture.width == 1200
+        assert len(picture.getcolors()) <= 8
+    assert (tmp_path / "few.png").stat().st_size < (tmp_path / "a.png").stat().st_size
     title = figure.get_suptitle()
     assert max(map(len, title.splitlines())) <= style.TITLE_CHARACTERS
     assert imread(tmp_path / "a.png")[:, 0].min() == 1, "nothing reaches over the edge"
@@ -248,7 +251,7 @@ def test_figures_that_are_compared_have_the_same_vertical_range(tmp_path, drawn)
 def test_a_figure_beside_the_published_curve_says_how_both_are_smoothed(tmp_path, drawn):
     _, _, path = next(reported.draw_figures([a_result("a", "commons", 500.0)], tmp_path))
     assert path == tmp_path / "a_collective_return.png"
-    assert note(drawn[0]) == "Running means over the episodes that follow: ours over 100, published over 30."
+    assert note(drawn[0]) == "Running means over the 30 episodes that follow."
     told = labels(drawn[0])
     assert told[:4] == ["ours, each replica", "ours, 95 % interval", "ours, mean of 3 replicas", "published"]
     assert "exploration ends, episode 101" in told
@@ -263,7 +266,7 @@ def test_one_replica_has_no_interval_and_an_experiment_of_ones_own_no_published_
     (path,) = [path for _, _, path in reported.draw_figures([result], tmp_path)]
     assert path.name == "a_collective_return.png"
     assert labels(drawn[0]) == ["ours, one replica", "exploration ends, episode 101"]
-    assert note(drawn[0]) == "Running means over the episodes that follow: ours over 100."
+    assert note(drawn[0]) == "Running means over the 100 episodes that follow."
     see_that_the_legend_is_whole(drawn[0])
 
 

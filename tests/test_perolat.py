@@ -72,6 +72,7 @@ def test_equal_rooms_are_the_walls_of_the_study_of_walls(recipes):
     assert boards == [maps.rooms("single"), maps.rooms("unequal")] * 2
 
 
+@pytest.mark.slow  # nine trainings
 def test_every_study_runs_and_its_conditions_share_what_does_not_vary(ran, recipes):
     studies = [recipes[name].STUDY for name in STUDIES]
     sources = [source for study in studies for source in sources_of(study, ran)[0]]
@@ -84,6 +85,7 @@ def test_every_study_runs_and_its_conditions_share_what_does_not_vary(ran, recip
         assert (own.hits_to_tag, own.freeze_steps) == (1, 25)
 
 
+@pytest.mark.slow  # nine trainings
 def test_the_table_of_claims_has_a_row_for_each_measure_and_says_what_is_not_run(
     ran, recipes, monkeypatch, tmp_path
 ):

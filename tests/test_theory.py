@@ -51,13 +51,16 @@ def test_eight_agents_put_64_tokens_where_36_were_best():
     assert few.optimum_total == 36
 
 
+NORMAL = {"allow_subnormal": False}  # another test may have told the processor to drop them
+
+
 @settings(deadline=None)
 @given(
     agents=st.integers(2, 200),
-    top=st.floats(0.5, 100),
-    factor=st.floats(0.01, 100),
-    power=st.floats(1, 6),
-    cost=st.floats(0, 0.9),
+    top=st.floats(0.5, 100, **NORMAL),
+    factor=st.floats(0.01, 100, **NORMAL),
+    power=st.floats(1, 6, **NORMAL),
+    cost=st.floats(0, 0.9, **NORMAL),
 )
 def test_two_or_more_take_more_than_is_best_for_all(agents, top, factor, power, cost):
     worth = PowerWorth(top=top, factor=factor, power=power)
@@ -71,7 +74,7 @@ def test_two_or_more_take_more_than_is_best_for_all(agents, top, factor, power, 
 
 
 @settings(deadline=None, max_examples=30)
-@given(agents=st.integers(1, 50), power=st.floats(1, 4), cost=st.floats(0, 5))
+@given(agents=st.integers(1, 50), power=st.floats(1, 4, **NORMAL), cost=st.floats(0, 5, **NORMAL))
 def test_a_function_of_ones_own_gives_what_the_closed_form_gives(agents, power, cost):
     closed = PowerWorth(top=10, factor=0.5, power=power)
     own = CallableWorth(function=lambda total: 10 - 0.5 * total**power, most=closed.most)
@@ -112,7 +115,7 @@ def test_payoffs_have_any_leading_axes():
         (lambda: herders(0), r"SharingGame\.agents is 0; allowed: an integer in 1\.\."),
         (lambda: herders(2, cost=-1), r"SharingGame\.cost is -1; allowed: a number >= 0"),
         (lambda: herders(2, worth=3), r"SharingGame\.worth is 3; allowed: a Worth"),
-        (lambda: appropriation(tokens=0), r"SharingGame\.most_each is 0; allowed: a number above 0"),
+        (lambda: appropriation(tokens=0), r"tokens is 0; allowed: a number above 0"),
         (lambda: PowerWorth(power=0.5), r"PowerWorth\.power is 0\.5; allowed: a number in 1\.\.64"),
         (lambda: herders(2).payoffs([1, 2, 3]), r"taken is \[3\]; allowed: \[\.\.\., 2\]"),
         (lambda: herders(2).payoffs([1, -1]), r"taken has numbers from -1 to 1; allowed: 0 to inf"),

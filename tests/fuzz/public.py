@@ -30,6 +30,7 @@ NOT_CALLED: Final = {
     "cprl.algorithms.base:TeamAlgorithm": "abstract; its subclasses have rows",
     "cprl.callbacks:Callback": "a Protocol, which nobody calls",
     "cprl.studies.executors.in_process:Executor": "a Protocol, which nobody calls",
+    "cprl.theory.worth:Worth": "a Protocol, which nobody calls",
 }
 """Public names without a row, each with the reason."""
 

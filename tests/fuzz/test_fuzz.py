@@ -12,7 +12,7 @@ from . import cases, public, register, runner, runs, table
 from .cases import Case, Target
 from .runner import ACCEPTED, REFUSED, Finding, Outcome
 
-OF_EACH = 4
+OF_EACH = 2
 """Cases of each target that the default tests run; `make fuzz` runs hundreds."""
 SLICES = {
     "values": lambda own: own.weight > 1,

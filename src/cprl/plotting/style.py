@@ -1,6 +1,7 @@
 """Sizes and colours of figures on white, and legends that lie beside the data."""
 
 from collections.abc import Sequence
+from io import BytesIO
 from pathlib import Path
 from textwrap import fill
 from typing import Any, Final
@@ -101,8 +102,30 @@ def wrapped(title: str, width_in: float) -> str:
     return fill(title, int(width_in / CHARACTER_IN))
 
 
-def save(figure: Figure, path: Path) -> Path:
-    """Writes a PNG atomically; its folder is created if missing."""
+def save(figure: Figure, path: Path, *, colours: int | None = None) -> Path:
+    """Writes a PNG atomically; its folder is created if missing.
+
+    Args:
+        figure: the figure.
+        path: the PNG.
+        colours: write it with so few, 2 to 256, which takes a third of the room; by default with all.
+    """
     path.parent.mkdir(parents=True, exist_ok=True)
-    write_atomically(path, lambda file: figure.savefig(file, format="png", dpi=DPI))
+    drawn = BytesIO()
+    figure.savefig(drawn, format="png", dpi=DPI)
+    if colours is not None:
+        drawn = _with_colours(drawn, colours)
+    write_atomically(path, lambda file: file.write(drawn.getvalue()))
     return path
+
+
+def _with_colours(drawn: BytesIO, colours: int) -> BytesIO:
+    from PIL import Image
+
+    few = BytesIO()
+    with Image.open(drawn) as picture:
+        chosen = picture.convert("RGB").quantize(
+            colours, method=Image.Quantize.MAXCOVERAGE, dither=Image.Dither.NONE
+        )
+    chosen.save(few, format="png", optimize=True)
+    return few

@@ -6,7 +6,6 @@ from typing import Final
 
 import numpy as np
 from matplotlib.axes import Axes
-from PIL import Image
 
 from cprl.measuring.names import title, unit
 from cprl.measuring.predictions import curve_prediction
@@ -125,16 +124,7 @@ def _draw(result: Result, metric: str, limits: Limits, path: Path) -> None:
     for strip in panels[:-1]:
         draw_strip(strip, strips)
     style.legend_below(figure, [axes], note=_note(result))
-    _shrink(style.save(figure, path))
-
-
-def _shrink(path: Path) -> None:
-    """Writes a PNG again with few colours, a third of the size: results are committed."""
-    with Image.open(path) as picture:
-        few = picture.convert("RGB").quantize(
-            COLOURS, method=Image.Quantize.MAXCOVERAGE, dither=Image.Dither.NONE
-        )
-    few.save(path, optimize=True)
+    style.save(figure, path, colours=COLOURS)
 
 
 def _draw_curves(axes: Axes, smoothed: Values, metric: str) -> None:

@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from cprl import arguments
-from cprl.checks import MOST_NUMBER, Check, check_fields, count, instance, is_number
+from cprl.checks import MOST_NUMBER, Check, check_arguments, check_fields, count, instance, is_number
 from cprl.theory.worth import PowerWorth, Worth
 
 _HALVINGS: Final = 200
@@ -136,6 +136,9 @@ def herders(agents: int, *, worth: Worth | None = None, cost: float = 1.0) -> Sh
         agents: n.
         worth: v; by default 10 - A^2.
         cost: c, of an animal.
+
+    Raises:
+        ValueError: see `SharingGame`.
     """
     return SharingGame(agents=agents, worth=PowerWorth() if worth is None else worth, cost=cost)
 
@@ -163,8 +166,12 @@ def appropriation(
         outside: w, what a token earns outside.
         linear: of F.
         quadratic: of F.
+
+    Raises:
+        ValueError: names the argument, what came and what is allowed.
     """
     worth = PowerWorth(top=linear, factor=quadratic, power=1.0)
+    check_arguments(_OF_APPROPRIATION, tokens=tokens, outside=outside)
     return SharingGame(agents=agents, worth=worth, cost=outside, most_each=tokens, payment=tokens * outside)
 
 
@@ -198,3 +205,4 @@ _CHECKS: Final[dict[str, Check]] = {
     ),
     "payment": Check(lambda value: is_number(value, -MOST_NUMBER, MOST_NUMBER), "a number"),
 }
+_OF_APPROPRIATION: Final[dict[str, Check]] = {"tokens": _CHECKS["most_each"], "outside": _CHECKS["cost"]}

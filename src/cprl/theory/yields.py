@@ -61,6 +61,7 @@ def exact_yield(
         ValueError: for more sites, and for a number of bites below 1.
         RuntimeError: where no policy is proven best, since apples hardly ever grow.
     """
+    _check(board, rules)
     sites = len(board.sites)
     if sites > MOST_SITES:
         raise ValueError(f"the board has {sites} sites; allowed: up to {MOST_SITES}")
@@ -90,12 +91,21 @@ def highest_yield(board: Map, rules: Rules) -> float:
     Args:
         board: the map.
         rules: its rules.
+
+    Raises:
+        ValueError: for anything else.
     """
+    _check(board, rules)
     first, _ = neighbours(board, rules)
     probs = np.array(rules.regrow_prob)
     highest = np.maximum.accumulate(probs)[np.minimum(np.diff(first), len(probs) - 1)]
     rate = highest if rules.regrow_before_bites else highest / (1 + highest)
     return float(rate.sum())
+
+
+def _check(board: object, rules: object) -> None:
+    arguments.object_of("board", board, Map, "a Map")
+    arguments.object_of("rules", rules, Rules, "Rules")
 
 
 def _growth(board: Map, rules: Rules) -> Floats:
