@@ -7,6 +7,8 @@ upgrade has broken. The rest of cprl uses public interfaces. Two exceptions are 
 - methods with an underscore that a library expects its subclasses to define (`EnvBase._reset`, `_step` and
   `_set_seed`, `Storage._empty`, `Sampler._empty`, `Logger._create_experiment`) are its interface for that.
 
+Nothing here is for users, and there is no `__all__`.
+
 Modules:
     tensordicts   entries of TensorDicts, read and written past its checks
     environments  environments and specs of TorchRL
@@ -15,58 +17,31 @@ Modules:
     recordings    recordings of Rerun
 """
 
-from cprl.compat.compiling import (
-    COMPILE_OPTIONS,
-    NO_GUARDS,
-    compiled_code,
-    every_guard,
-    fits,
-    remember_vector_instructions,
-    sound_local_buffers,
-    with_own_code,
-    without_lookup,
-)
-from cprl.compat.environments import LeanStepEnv, flag_spec
-from cprl.compat.losses import (
-    LaneCategorical,
-    ReshapedLoss,
-    bootstrap_from_target,
-    forget_cached_weights,
-    hard_update,
-    promise_targets,
-    refuse_updaters,
-    updated_weights,
-)
-from cprl.compat.recordings import end_recordings, keep_native, rows_made, send_chunk, send_made
-from cprl.compat.tensordicts import entry, put, put_all, unchecked_tensordict
-
-__all__ = [
-    "COMPILE_OPTIONS",
-    "NO_GUARDS",
-    "LaneCategorical",
-    "LeanStepEnv",
-    "ReshapedLoss",
-    "bootstrap_from_target",
-    "compiled_code",
-    "end_recordings",
-    "entry",
-    "every_guard",
-    "fits",
-    "flag_spec",
-    "forget_cached_weights",
-    "hard_update",
-    "keep_native",
-    "promise_targets",
-    "put",
-    "put_all",
-    "refuse_updaters",
-    "remember_vector_instructions",
-    "rows_made",
-    "send_chunk",
-    "send_made",
-    "sound_local_buffers",
-    "unchecked_tensordict",
-    "updated_weights",
-    "with_own_code",
-    "without_lookup",
-]
+from cprl.compat.compiling import COMPILE_OPTIONS as COMPILE_OPTIONS
+from cprl.compat.compiling import NO_GUARDS as NO_GUARDS
+from cprl.compat.compiling import compiled_code as compiled_code
+from cprl.compat.compiling import every_guard as every_guard
+from cprl.compat.compiling import fits as fits
+from cprl.compat.compiling import remember_vector_instructions as remember_vector_instructions
+from cprl.compat.compiling import sound_local_buffers as sound_local_buffers
+from cprl.compat.compiling import with_own_code as with_own_code
+from cprl.compat.compiling import without_lookup as without_lookup
+from cprl.compat.environments import LeanStepEnv as LeanStepEnv
+from cprl.compat.environments import flag_spec as flag_spec
+from cprl.compat.losses import LaneCategorical as LaneCategorical
+from cprl.compat.losses import ReshapedLoss as ReshapedLoss
+from cprl.compat.losses import bootstrap_from_target as bootstrap_from_target
+from cprl.compat.losses import forget_cached_weights as forget_cached_weights
+from cprl.compat.losses import hard_update as hard_update
+from cprl.compat.losses import promise_targets as promise_targets
+from cprl.compat.losses import refuse_updaters as refuse_updaters
+from cprl.compat.losses import updated_weights as updated_weights
+from cprl.compat.recordings import end_recordings as end_recordings
+from cprl.compat.recordings import keep_native as keep_native
+from cprl.compat.recordings import rows_made as rows_made
+from cprl.compat.recordings import send_chunk as send_chunk
+from cprl.compat.recordings import send_made as send_made
+from cprl.compat.tensordicts import entry as entry
+from cprl.compat.tensordicts import put as put
+from cprl.compat.tensordicts import put_all as put_all
+from cprl.compat.tensordicts import unchecked_tensordict as unchecked_tensordict
