@@ -76,6 +76,19 @@ def test_a_recipe_is_run_under_every_combination_and_the_same_line_does_nothing_
     assert "tiny: 4 of 4 trials finished" in capsys.readouterr().out
 
 
+def test_the_end_of_the_training_that_is_compared_may_be_longer(here):
+    line = f"mine.py --vary {FREEZE}=2,5 --episodes 30 --out here"
+    sweep(f"{line} --last 10")
+    assert "The last 10 episodes of training; means" in Path("here/summary.md").read_text()
+    before = {path: path.stat().st_mtime_ns for path in Path("here/runs").rglob("*")}
+    sweep(f"{line} --last 20")
+    assert "The last 20 episodes of training; means" in Path("here/summary.md").read_text()
+    assert before == {path: path.stat().st_mtime_ns for path in Path("here/runs").rglob("*")}
+    with pytest.raises(ValueError, match="last is 9; allowed: an integer >= 10, the episodes of a window"):
+        sweep(f"{line.replace('here', 'elsewhere')} --last 9")
+    assert not Path("elsewhere").exists()
+
+
 def test_a_dry_run_lists_all_trials_and_writes_nothing(here, capsys):
     sweep(f"mine.py --vary {FREEZE}=2,5 --dry-run")
     said = capsys.readouterr().out

@@ -25,6 +25,7 @@ from cprl.studies.progress import table_of
 from cprl.studies.search import SearchResult, run_search
 from cprl.studies.status import BEAT_S, Status
 from cprl.studies.study import Study
+from cprl.studies.tables.comparing import LAST
 from cprl.studies.trials import Outcome, Trial, trials_of
 
 _BEST: Final = 10
@@ -33,7 +34,7 @@ _BEST: Final = 10
 
 @dataclass(frozen=True, kw_only=True)
 class StudyOptions:
-    """How a study is run; nothing of it changes a number."""
+    """How a study is run and compared; nothing of it changes a run."""
 
     out: Path | None = None
     """The study's directory; by default studies/NAME. The same line continues a study that was stopped, and
@@ -49,6 +50,8 @@ class StudyOptions:
     """Of a Ray cluster: "auto", or HOST:PORT; with --on ray."""
     figures: bool = True
     """Write the table, summary and figures at the end."""
+    last: int = LAST
+    """Episodes at the end of the training that these compare; of long trainings rather 500."""
     watch: str = "off"
     """"serve", "spawn" or "connect ADDRESS": the table of all trials, and the returns of finished ones, in
     the Rerun viewer."""
@@ -98,7 +101,7 @@ def carry_out(what: Study | Search, options: StudyOptions, command: Sequence[str
     executor, again = executor_of(options), shlex.join(command)
     if options.dry_run:
         return _list(what, options)
-    names = ("runs", "allow", "watch")
+    names = ("runs", "allow", "watch", "last")
     how: dict[str, Any] = {"on": executor, **{own: getattr(options, own) for own in names}}
     how |= {"results": options.figures, "again": shlex.join([without_directories(command[0]), *command[1:]])}
     with _interruptible(again):

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Final
 
-from cprl.arguments import object_of, path, refusal, switch, texts
+from cprl.arguments import integer, object_of, path, refusal, switch, texts
 from cprl.runs.files import read_json, write_json
 from cprl.runs.lock import FILE_NAME as LOCK
 from cprl.runs.lock import RunLock, RunLockedError
@@ -15,7 +15,8 @@ from cprl.studies.executors import Executor, InProcess
 from cprl.studies.live import LiveStudy, check_live
 from cprl.studies.progress import Progress
 from cprl.studies.study import Study
-from cprl.studies.tables.table import StudyTable
+from cprl.studies.tables.comparing import LAST
+from cprl.studies.tables.table import WINDOW, StudyTable
 from cprl.studies.trials import Outcome, Task, Trial, task_of, trials_of
 
 FILE_NAME: Final = "study.json"
@@ -48,6 +49,7 @@ def run_study(
     progress: bool = True,
     watch: str = "off",
     results: bool = True,
+    last: int = LAST,
     again: str = "",
 ) -> StudyResult:
     """Runs what a study lacks; may be stopped at any moment, and called again.
@@ -66,6 +68,7 @@ def run_study(
             trials in the Rerun viewer, see `cprl.viewer.streams.open_live`.
         results: whether `table.parquet`, `summary.md` and `figures/` are written at the end, see
             `cprl.studies.results`.
+        last: episodes at the end of the training that these compare, at least 10.
         again: the command line that runs what is lacking, for the summary.
 
     Raises:
@@ -77,21 +80,27 @@ def run_study(
     trials = trials_of(study)
     check_executor(on)
     switch("results", results)
+    check_last(last)
     with as_driver(study, trials, out, folder, allow=allow, progress=progress, watch=watch) as driver:
         failed = driver.run(trials, on or InProcess())
-    table = results_of(study, trials, out, folder, again=again) if results else None
+    table = results_of(study, trials, out, folder, last=last, again=again) if results else None
     return StudyResult(study, out, folder, tuple(trials), failed, table)
 
 
 def results_of(
-    study: Study, trials: Sequence[Trial], out: Path, runs: Path, *, again: str
+    study: Study, trials: Sequence[Trial], out: Path, runs: Path, *, last: int, again: str
 ) -> StudyTable | None:
     """Writes table, summary and figures of what has finished; None if nothing has."""
     if all(trial.state(runs) != "finished" for trial in trials):
         return None
     from cprl.studies.results import write_results  # with matplotlib
 
-    return write_results(study, out, runs, again=again)
+    return write_results(study, out, runs, last=last, again=again)
+
+
+def check_last(last: int) -> None:
+    """Raises a ValueError for episodes that the table of a study does not tell apart."""
+    integer("last", last, WINDOW, allowed=f"an integer >= {WINDOW}, the episodes of a window of the table")
 
 
 def directory_of(study: Study, out: Path | str | None) -> Path:

@@ -21,6 +21,7 @@ from cprl.studies.execution import (
     Driver,
     as_driver,
     check_executor,
+    check_last,
     directory_of,
     results_of,
     write_study,
@@ -29,6 +30,7 @@ from cprl.studies.executors import Executor, InProcess
 from cprl.studies.factors import Distribution, Integers, LogUniform
 from cprl.studies.points import Point, Search, labels, value_of
 from cprl.studies.study import Study
+from cprl.studies.tables.comparing import LAST
 from cprl.studies.tables.table import StudyTable
 from cprl.studies.trials import Outcome, Trial, trials_of
 
@@ -70,13 +72,15 @@ def run_search(
     progress: bool = True,
     watch: str = "off",
     results: bool = True,
+    last: int = LAST,
     again: str = "",
 ) -> SearchResult:
     """Runs a search; may be stopped at any moment, and called again, with more points too.
 
     Args:
         search: what is searched.
-        out, on, runs, allow, progress, watch: see `cprl.studies.run_study`.
+        out, on, runs, allow, progress, watch, results, last, again: see `cprl.studies.run_study`; what the
+            search itself looks at is in `Search`.
 
     Raises:
         ModuleNotFoundError: where Optuna is not installed.
@@ -85,6 +89,7 @@ def run_search(
     object_of("search", search, Search, "a Search")
     check_executor(on)
     switch("results", results)
+    check_last(last)
     optuna = _optuna()
     asked = _Asked(search, optuna)
     batch = asked.next_batch()
@@ -104,7 +109,7 @@ def run_search(
             _write_journal(optuna, asked.study, out / JOURNAL)
             batch = asked.next_batch()
     trials = trials_of(study)
-    table = results_of(study, trials, out, folder, again=again) if results else None
+    table = results_of(study, trials, out, folder, last=last, again=again) if results else None
     return SearchResult(search, study, out, folder, tuple(asked.points), tuple(trials), tuple(failed), table)
 
 
