@@ -528,7 +528,9 @@ def test_the_command_crossplay_names_runs_and_draws_their_gains(scripted, tmp_pa
     assert figure.exists()
     with pytest.raises(SystemExit, match=r"gains\.png exists and is not overwritten"):
         command(monkeypatch, capsys, *words)
-    with pytest.raises(SystemExit, match=r"--figure is .*gains\.jpg; allowed: a name that ends in \.png"):
+    with pytest.raises(
+        SystemExit, match=r"--figure is '.*gains\.jpg'; allowed: a file whose name ends in \.png"
+    ):
         command(monkeypatch, capsys, *words[:-1], tmp_path / "gains.jpg")
     with pytest.raises(SystemExit, match="bites names 2 runs; allowed: each its own, NAME=PATH"):
         command(monkeypatch, capsys, "crossplay", f"bites={greedy}", f"bites={sustainable}")

@@ -15,8 +15,9 @@ from cprl.evaluation.film_video import SUFFIXES, film_video
 from cprl.evaluation.gains_picture import draw_gains
 from cprl.evaluation.tables import agents_table, gains_tables, heading, matrices, run_table, territory_table
 from cprl.evaluation.territory import territory_of
-from cprl.evaluation.visits_picture import check_picture, draw_visits
+from cprl.evaluation.visits_picture import draw_visits
 from cprl.output import OUT, console, say
+from cprl.plotting.style import check_picture
 from cprl.process import prepare_process
 from cprl.runs.labelled import refuse_to_write_over, write_table
 from cprl.viewer.streams import viewer
@@ -168,11 +169,10 @@ def crossplay(
         allow: code of your own, module:Class, that the run may import; see docs/changing.md.
     """
     make_importable(allow)
-    for path in (out, figure):
-        if path is not None:
-            refuse_to_write_over(path)
-    if figure is not None and figure.suffix != ".png":
-        raise ValueError(f"--figure is {figure}; allowed: a name that ends in .png")
+    if out is not None:
+        refuse_to_write_over(out)
+    if figure is not None:
+        check_picture(figure, "--figure")
     prepare_process(seed)
     played = play_each_other(
         _runs_by_name(runs),

@@ -41,13 +41,13 @@ def gains(played: CrossPlay, *, interval: Interval = "t") -> dict[tuple[str, str
     """
     object_of("played", played, CrossPlay, "what crossplay() gave")
 
+    means: dict[Whose, dict[tuple[str, str], list[float]]] = {
+        whose: {at: _means(played, at, whose) for at in played.cells} for whose in ("focal", "background")
+    }
+
     def gain(focal: str, background: str, whose: Whose) -> Estimate:
-        own, usual = (
-            {replica: fmean(values) for replica, values in played.cell(*at).returns(whose).items()}
-            for at in ((focal, background), (background, background))
-        )
-        pairs = [own[replica] for replica in played.replicas], [usual[replica] for replica in played.replicas]
-        return difference(*pairs, paired=True, interval=interval)
+        own, usual = means[whose][focal, background], means[whose][background, background]
+        return difference(own, usual, paired=True, interval=interval)
 
     return {
         (focal, background): Gain(
@@ -60,6 +60,10 @@ def gains(played: CrossPlay, *, interval: Interval = "t") -> dict[tuple[str, str
 
 def diagonal_returns(played: CrossPlay) -> Mapping[str, float]:
     """The mean return of an agent in each diagonal cell, by the name of the run."""
-    return {
-        name: fmean(map(fmean, played.cell(name, name).returns("focal").values())) for name in played.runs
-    }
+    return {name: fmean(_means(played, (name, name), "focal")) for name in played.runs}
+
+
+def _means(played: CrossPlay, at: tuple[str, str], whose: Whose) -> list[float]:
+    """The mean return of each replica in a cell, [R]."""
+    returns = played.cell(*at).returns(whose)
+    return [fmean(returns[replica]) for replica in played.replicas]

@@ -37,13 +37,13 @@ def draw_gains(played: CrossPlay, path: Path | str, *, interval: Interval = "t")
         interval: see `cprl.measuring.statistics.Interval`.
     """
     path, found = path_of("path", path), gains(played, interval=interval)
-    names = list(played.runs)
+    names, diagonal = list(played.runs), diagonal_returns(played)
     returns = with_unit("focal/return", rewards=unit_of_cells(played)).partition("/")[2]
     width = max(_CELL_IN[0] * len(names) + 2.6, _NARROWEST_IN)
     figure = Figure((width, 2 * (_CELL_IN[1] * len(names) + 0.9) + 1.2), layout="constrained")
     for axes, (whose, title) in zip(figure.subplots(2, 1), _PANELS.items(), strict=True):
         own = {at: getattr(gain, whose) for at, gain in found.items()}
-        _draw_matrix(axes, names, own, diagonal_returns(played))
+        _draw_matrix(axes, names, own, diagonal)
         axes.set_title(f"difference in {returns} of {title}", fontsize=SMALL_PT + 1)
     count = len(played.replicas)
     note = (

@@ -16,7 +16,6 @@ from cprl.commons.maps import Map
 from cprl.evaluation.territory import EXCLUSION, VISITORS, Policy, Territory
 from cprl.measuring.territory import owners
 from cprl.plotting import style
-from cprl.runs.labelled import refuse_to_write_over
 
 Array = NDArray[Any]
 
@@ -51,7 +50,7 @@ def draw_visits(
         FileExistsError: if the file exists.
     """
     arguments.object_of("found", found, Territory, "a value of territory_of")
-    path = check_picture(path)
+    path = style.check_picture(path)
     stays = found.of(policy)
     number = found.replicas[0] if replica is None else arguments.integer("replica", replica, 0)
     if number not in found.replicas:
@@ -73,22 +72,7 @@ def draw_visits(
         f"exclusion {index:.2f}, {sharing:.1f} agents share a cell"
     )
     figure.suptitle(fill(title, style.TITLE_CHARACTERS), fontsize=11)
-    path.parent.mkdir(parents=True, exist_ok=True)
     return style.save(figure, path)
-
-
-def check_picture(path: str | Path, name: str = "path") -> Path:
-    """The path of a picture to be, checked before hours of work.
-
-    Raises:
-        ValueError: if its name does not end in .png.
-        FileExistsError: if the file exists.
-    """
-    path = arguments.path(name, path)
-    if path.suffix != ".png":
-        raise arguments.refusal(name, str(path), "a file whose name ends in .png")
-    refuse_to_write_over(path)
-    return path
 
 
 def _panels(count: int, board: Map) -> tuple[Figure, list[Axes]]:

@@ -17,10 +17,10 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from cprl import arguments
+from cprl.measuring.statistics import CONFIDENCE
 
 Values = NDArray[np.float64]
 
-CONFIDENCE: Final = 0.95
 _BELOW_ONE: Final = np.nextafter(1.0, 0.0).item()
 
 
@@ -85,8 +85,7 @@ def curve_prediction(
 
     Raises:
         ValueError: if `curves` is not [R, E] with at least one replica and without infinity, or an argument
-        is
-            out of range.
+            is out of range.
     """
     own = arguments.floats("curves", curves)
     if own.ndim != 2 or not len(own):

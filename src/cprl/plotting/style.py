@@ -11,8 +11,10 @@ from matplotlib.figure import Figure
 from matplotlib.legend import Legend
 from matplotlib.patheffects import Normal, Stroke
 
+from cprl import arguments
 from cprl.commons.colours import agent_colour
 from cprl.runs.files import write_atomically
+from cprl.runs.labelled import refuse_to_write_over
 
 DPI: Final = 150
 WIDTH_IN: Final = 8.0
@@ -100,6 +102,20 @@ def head(figure: Figure, title: str, note: str) -> None:
 def wrapped(title: str, width_in: float) -> str:
     """The title of a panel of a width on several lines."""
     return fill(title, int(width_in / CHARACTER_IN))
+
+
+def check_picture(path: str | Path, name: str = "path") -> Path:
+    """The path of a picture to be, checked before hours of work.
+
+    Raises:
+        ValueError: if its name does not end in .png.
+        FileExistsError: if the file exists.
+    """
+    path = arguments.path(name, path)
+    if path.suffix != ".png":
+        raise arguments.refusal(name, str(path), "a file whose name ends in .png")
+    refuse_to_write_over(path)
+    return path
 
 
 def save(figure: Figure, path: Path, *, colours: int | None = None) -> Path:

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from cprl.measuring.predictions import prediction
 from cprl.measuring.shares import share
-from cprl.measuring.statistics import difference
+from cprl.measuring.statistics import difference, estimate
 from cprl.reporting import verdicts
 
 Values = NDArray[np.float64]
@@ -55,7 +55,7 @@ def side(
     published: float | None = None,
 ) -> Claim:
     """A mean that is claimed to lie above or below a bound; see `verdicts.of_claim`."""
-    found = prediction(values, runs=None)
+    found = estimate(values, interval="t")
     return Claim(
         claim=claim,
         measure=measure,
@@ -79,7 +79,7 @@ def more(claim: str, measure: str, values: Values, reference: Values, *, paired:
 
 def alike(claim: str, measure: str, values: Values, *, within: tuple[float, float]) -> Claim:
     """A mean that is claimed to lie between two bounds; see `verdicts.of_likeness`."""
-    found = prediction(values, runs=None)
+    found = estimate(values, interval="t")
     return Claim(
         claim=claim,
         measure=f"{measure}, alike if {within[0]:g} to {within[1]:g}",
@@ -103,7 +103,7 @@ def rule(claim: str, measure: str, shown: NDArray[Any]) -> Claim:
 
 def with_interval(values: Values) -> str:
     """The mean of replicas, [R], with its 95 % interval by Student's t."""
-    return f"{values.mean():.4g} {prediction(values, runs=None)}".strip()
+    return f"{estimate(values, interval='t')}"
 
 
 def rows_of(claims: Sequence[Claim]) -> list[list[str]]:

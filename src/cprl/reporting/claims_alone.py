@@ -13,7 +13,7 @@ from cprl.measuring.published import curve
 from cprl.policies.assignment import AgentPolicies
 from cprl.policies.scripted import ScriptedActor
 from cprl.reporting.claims import Claim, alike, more, number, side
-from cprl.reporting.measures import NEARNESS, OVERLAP, ROUNDS, dip_depth
+from cprl.reporting.measures import NEARNESS, OVERLAP, ROUNDS, dip_depth, falls
 from cprl.reporting.random_play import returns_by_chance
 from cprl.reporting.result import Result
 from cprl.runs.curves import running_mean
@@ -132,9 +132,7 @@ def _published(result: Result, episodes: int) -> Values:
 
 
 def _dip_at(curves: Values) -> Values:
-    peaks = np.maximum.accumulate(curves, axis=1)
-    deepest: Values = ((peaks - curves) / np.maximum(peaks, 1e-12)).argmax(1).astype(np.float64)
-    return deepest
+    return falls(curves).argmax(1).astype(np.float64)
 
 
 def _dip_bottom(curves: Values) -> Values:

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from cprl import presets
 from cprl.measuring.combat import FALL, LONG, METRICS, RISE, Combat, combat
-from cprl.measuring.published import PHASED_RECIPE, PHASES_BEGIN, curve
+from cprl.measuring.published import PHASED_RECIPE, PHASES_BEGIN, curve, published_experiment
 from cprl.measuring.shares import share
 from cprl.population import Learning
 from cprl.reporting import verdicts
@@ -145,13 +145,10 @@ def _combat_cells(found: Combat) -> list[str]:
 
 
 def _published_combat() -> Combat:
+    study = published_experiment(PHASED_RECIPE)
+    assert study is not None
     at = np.arange(0.0, 4740.0)
-    names = {
-        "collective_return": "exp5/efficiency",
-        "survival_steps": "exp5/sustainability",
-        "peacefulness": "exp5/peacefulness",
-    }
-    return combat({metric: np.interp(at, *curve(name))[None] for metric, name in names.items()})
+    return combat({metric: np.interp(at, *curve(study.curves[metric]))[None] for metric in METRICS})
 
 
 def _is_commons(result: Result) -> bool:

@@ -11,6 +11,7 @@ from cprl.measuring.predictions import curve_prediction, prediction
 from cprl.measuring.published import EXPERIMENTS, agreement, curve
 from cprl.measuring.running_means import estimate_window
 from cprl.reporting import verdicts
+from cprl.reporting.claims import with_interval
 from cprl.reporting.markdown import table
 from cprl.reporting.result import TOO_FEW, Result
 from cprl.runs.curves import running_mean
@@ -92,7 +93,7 @@ def distances(results: Sequence[Result]) -> list[str]:
                 f"{off:.3g}",
                 f"{off / np.ptp(published):.0%}",
                 f"{published.mean():.4g}",
-                f"{levels.mean():.4g} {prediction(levels, runs=None)}".strip(),
+                with_interval(levels),
                 *(f"{prediction(levels, runs=runs)}" for runs in RUNS),
             ]
         )
@@ -143,11 +144,11 @@ def parts(results: Sequence[Result]) -> list[str]:
         if found is None:
             continue
         own = result.curves[metric]
-        first = [f"{found.published[0]:.4g}", _with_interval(found.ours[:, 0])]
+        first = [f"{found.published[0]:.4g}", with_interval(found.ours[:, 0])]
         cells = [result.name, f"{found.at[0]:.0f}", *first]
         for begin, end in PARTS:
             values = own[:, begin:end].mean(1)
-            cells += [_published_part(result, begin, end), _with_interval(values)]
+            cells += [_published_part(result, begin, end), with_interval(values)]
         rows.append(cells)
     head = ["run", "first point at episode", "published", "ours, same window"]
     head += ["500 to 1000, published", "ours", "last 500, published", "ours"]
@@ -163,10 +164,6 @@ def _published_part(result: Result, begin: int, end: int | None) -> str:
         begin = result.study.episodes + begin - result.window
     inside = (at >= begin) & (at <= (np.inf if end is None else end - result.window))
     return f"{values[inside].mean():.4g}"
-
-
-def _with_interval(values: Values) -> str:
-    return f"{values.mean():.4g} {prediction(values, runs=None)}".strip()
 
 
 def _compared(results: Sequence[Result], only: Sequence[str] = ()) -> list[tuple[Result, str]]:

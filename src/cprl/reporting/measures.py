@@ -105,9 +105,14 @@ def of_training(curves: dict[str, Values], *, window: int = SMOOTHED_EPISODES) -
 
 def dip_depth(curves: Values) -> Values:
     """The largest fall of each curve below its highest value so far, as a share of it, [R, E] to [R]."""
-    peaks = np.maximum.accumulate(curves, axis=1)
-    deepest: Values = _share(peaks - curves, peaks).max(1)
+    deepest: Values = falls(curves).max(1)
     return deepest
+
+
+def falls(curves: Values) -> Values:
+    """How far each curve lies below its highest value so far, as a share of it, [R, E]."""
+    peaks = np.maximum.accumulate(curves, axis=1)
+    return _share(peaks - curves, peaks)
 
 
 def of_play(played: Trace, replicas: int) -> dict[str, Values]:

@@ -39,12 +39,12 @@ from numpy.typing import NDArray
 
 from cprl.measuring.predictions import prediction
 from cprl.measuring.shares import Share
+from cprl.measuring.statistics import CONFIDENCE
 
 Values = NDArray[np.float64]
 
 FEWEST: Final = 4
 """The fewest replicas that give a verdict."""
-CONFIDENCE: Final = 0.95
 READ: Final = 0.01
 """The error of reading a figure, as a share of its curve's range: the published survival of 1000 steps reads
 as 1002, half a percent. Where our replicas are all equal, nothing else is left to measure a distance by."""
