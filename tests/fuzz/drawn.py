@@ -13,6 +13,7 @@ from cprl import CommonsEnv, maps, presets
 from cprl.algorithms import DQN
 from cprl.collectors import StepCollector
 from cprl.envs import parallel_env
+from cprl.envs.matrix import stag_hunt
 from cprl.evaluation import territory_of
 from cprl.measuring import phases
 from cprl.policies.lanes import random_agents
@@ -148,6 +149,14 @@ OWN: Final[dict[str, dict[str, st.SearchStrategy[Any]]]] = {
         "allow": _ALLOW,
     },
     "cprl.evaluation.evaluate:evaluate_run": _FRESH,
+    "cprl.evaluation.populations:play_population": {
+        "where": st.sampled_from((things.MEADOW, stag_hunt(turns=2))),
+        "agents": st.sampled_from(([Scripted("random")] * 2, [Scripted("greedy"), Scripted("random")])),
+        "episodes": _FEW,
+        "replicas": _FEW,
+        "seed": _SEEDS,
+        "allow": _ALLOW,
+    },
     "cprl.evaluation.territory:territory_of": _FRESH,
     "cprl.evaluation.visits_picture:draw_visits": {
         "found": st.just(0).map(lambda _: territory_of(runs.folder("plain"), episodes=1)),

@@ -4,6 +4,7 @@ Modules, in the order in which one reads them:
     evaluate    evaluate_run: all replicas of a run, beside the random policy
     cross_play  crossplay: a focal agent of one run among background agents of another
     gains       what a focal agent gains over the agent whose place it takes, and what it costs the others
+    populations play_population: scripted and stored agents in any mix
     territory   territory_of: where the agents of a run go and whom they tag
     film        an episode, every step recorded
     film_video  the same as a GIF or an MP4
@@ -21,6 +22,7 @@ from cprl.evaluation.cross_play import Cell, CrossPlay, crossplay
 from cprl.evaluation.evaluate import Evaluation, evaluate_run
 from cprl.evaluation.gains import Gain, gains
 from cprl.evaluation.gains_picture import draw_gains
+from cprl.evaluation.populations import play_population
 from cprl.evaluation.territory import Territory, territory_of
 from cprl.evaluation.visits_picture import draw_visits
 
@@ -35,5 +37,6 @@ __all__ = [
     "draw_visits",
     "evaluate_run",
     "gains",
+    "play_population",
     "territory_of",
 ]

@@ -6,7 +6,7 @@ replica, agent) alone.
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from typing import TypeAlias
+from typing import Any, Protocol, TypeAlias
 
 from torchrl.envs import EnvBase
 
@@ -24,6 +24,19 @@ Played: TypeAlias = dict[int, list[Episode]]
 
 MakePolicies: TypeAlias = Callable[[Sequence[int]], AgentPolicies]
 """Makes the policies of all agents, given the indices of the replicas that play at once."""
+
+
+class Place(Protocol):
+    """A game whose fresh worlds can be played, e.g. a `LoadedRun`."""
+
+    @property
+    def game(self) -> Any:
+        """What is played."""
+        ...
+
+    def env(self, worlds: int = 1, *, seed: int = 0, first_world: int = 0) -> EnvBase:
+        """So many fresh worlds."""
+        ...
 
 
 @dataclass(frozen=True)
@@ -44,7 +57,7 @@ class Source:
 
 
 def play(
-    run: LoadedRun,
+    where: Place,
     policies: MakePolicies,
     replicas: Sequence[int],
     *,
@@ -55,7 +68,7 @@ def play(
     """Plays `episodes` fresh episodes of each replica; replica r plays the worlds from r x episodes on.
 
     Args:
-        run: the run with the game and transforms.
+        where: the game with its transforms.
         policies: see `MakePolicies`; each replica has `episodes` worlds, consecutive in the batch.
         replicas: the indices of the replicas, ascending.
         episodes: episodes of each replica.
@@ -63,7 +76,7 @@ def play(
         explore: see `cprl.measuring.evaluate.evaluate`.
     """
     played: Played = {}
-    for group, env in fresh_worlds(run, replicas, worlds=episodes, seed=seed):
+    for group, env in fresh_worlds(where, replicas, worlds=episodes, seed=seed):
         found = evaluate(env, policies(group), explore=explore)
         for place, replica in enumerate(group):
             played[replica] = found[place * episodes : (place + 1) * episodes]
@@ -71,7 +84,7 @@ def play(
 
 
 def fresh_worlds(
-    run: LoadedRun, replicas: Sequence[int], *, worlds: int, seed: int
+    where: Place, replicas: Sequence[int], *, worlds: int, seed: int
 ) -> Iterator[tuple[list[int], EnvBase]]:
     """The worlds of each replica, with as many replicas as possible in one environment.
 
@@ -79,7 +92,7 @@ def fresh_worlds(
         The indices of replicas, and an environment with their worlds in the same order, see `play`.
     """
     for group in _consecutive(replicas):
-        yield group, run.env(len(group) * worlds, seed=seed, first_world=group[0] * worlds)
+        yield group, where.env(len(group) * worlds, seed=seed, first_world=group[0] * worlds)
 
 
 def policies_of(

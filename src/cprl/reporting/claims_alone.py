@@ -132,7 +132,8 @@ def _published(result: Result, episodes: int) -> Values:
 
 
 def _dip_at(curves: Values) -> Values:
-    return falls(curves).argmax(1).astype(np.float64)
+    deepest: Values = falls(curves).argmax(1).astype(np.float64)
+    return deepest
 
 
 def _dip_bottom(curves: Values) -> Values:
