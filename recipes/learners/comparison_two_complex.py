@@ -1,0 +1,41 @@
+"""How do learners that see others do on `two_complex`? Nine ways to learn, and the study's own.
+
+    python recipes/learners/comparison_two_complex.py --jobs 2
+
+Every replica plays a million environment steps or more; all take some four core hours. Who exploits whom is
+the question of cross_play.py, on the runs of this study.
+"""
+
+from ways import comparison
+
+import cprl
+
+CHOSEN = {
+    "DQN": "learning rate 0.0001, tau 0.005",
+    "PPO": "learning rate 0.001, entropy coeff 0.05",
+    "IPPO": "learning rate 0.0003, entropy coeff 0.01",
+    "VDN": "learning rate 0.0001, tau 0.005",
+    "QMIX": "learning rate 0.0001, tau 0.005",
+    "MAPPO": "learning rate 0.001, entropy coeff 0.01",
+    "MADDPG": "learning rate 0.001, tau 0.02",
+    "PR2": "learning rate 0.001, temperature 0.1",
+    "LOLA": "learning rate 0.01, look ahead rate 0.01",
+}
+"""What tuning_two_complex.py chose; its table is in docs/results/learners."""
+
+EPISODES = {
+    "": 1500,
+    "DQN": 1800,
+    "PPO": 2200,
+    "IPPO": 1400,
+    "QMIX": 1300,
+    "MAPPO": 1300,
+    "MADDPG": 1600,
+    "LOLA": 1300,
+}
+"""More where boards were drained early in the tuning, so that a replica reaches its million steps."""
+
+STUDY = comparison("two_complex", CHOSEN, EPISODES)
+
+if __name__ == "__main__":
+    cprl.study_main(STUDY)
