@@ -1,4 +1,4 @@
-"""`cprl film`, `cprl evaluate`, `cprl visits` and `cprl crossplay`: stored agents in fresh worlds."""
+"""`cprl film`, `evaluate`, `visits`, `crossplay`, `schelling`: agents that do not learn, in fresh worlds."""
 
 from collections.abc import Sequence
 from pathlib import Path
@@ -13,11 +13,23 @@ from cprl.evaluation.evaluate import SEED, evaluate_run
 from cprl.evaluation.film import film as film_run
 from cprl.evaluation.film_video import SUFFIXES, film_video
 from cprl.evaluation.gains_picture import draw_gains
-from cprl.evaluation.tables import agents_table, gains_tables, heading, matrices, run_table, territory_table
+from cprl.evaluation.schelling import schelling as play_all_mixes
+from cprl.evaluation.schelling_picture import draw_schelling
+from cprl.evaluation.tables import (
+    agents_table,
+    gains_tables,
+    heading,
+    matrices,
+    run_table,
+    schelling_tables,
+    territory_table,
+)
 from cprl.evaluation.territory import territory_of
 from cprl.evaluation.visits_picture import draw_visits
+from cprl.evaluation.words import board_named
 from cprl.output import OUT, console, say
 from cprl.plotting.style import check_picture
+from cprl.presets import Variant
 from cprl.process import prepare_process
 from cprl.runs.labelled import refuse_to_write_over, write_table
 from cprl.viewer.streams import viewer
@@ -191,6 +203,62 @@ def crossplay(
         say(f"Episodes: {out}")
     if figure is not None:
         say(f"Figure: {draw_gains(played, figure)}")
+
+
+def schelling(
+    board: str,
+    /,
+    *,
+    restrained: str = "sustainable",
+    greedy: str = "greedy",
+    variant: Variant = "published",
+    episodes: int = 5,
+    replicas: int = 8,
+    seed: int = SEED,
+    out: Path | None = None,
+    figure: Path | None = None,
+    allow: Allow = (),
+) -> None:
+    """Lets restrained and greedy agents play in all mixes, and prints which social dilemma they are in.
+
+    Args:
+        board: commons, two_complex, single_complex or single_basic; or the directory of a run, whose game it
+            is then; or a file with a drawing.
+        restrained: who plays restrained: random, greedy, sustainable, territorial, aggressive or pacifist, or
+            the directory of a run, whose agents play.
+        greedy: who plays greedy, likewise.
+        variant: of the boards with a name: published, as_run or, of two_complex, as_run_10_april; see
+            docs/game.md.
+        episodes: of each replica and choice of restrained agents; with N agents these are N (N - 1) + 2.
+        replicas: of runs, their replicas from 0 on; of scripted agents, independent groups of episodes.
+        seed: of the worlds and all chance; the same one gives the same numbers.
+        out: a parquet file to be, with every episode.
+        figure: a PNG to be: the Schelling diagram.
+        allow: code of your own, module:Class, that a run may import; see docs/changing.md.
+    """
+    make_importable(allow)
+    if out is not None:
+        refuse_to_write_over(out)
+    if figure is not None:
+        check_picture(figure, "--figure")
+    prepare_process(seed)
+    game, run = board_named(board, variant, allow=allow)
+    found = play_all_mixes(
+        game if run is None else run,
+        restrained=restrained,
+        greedy=greedy,
+        episodes=episodes,
+        replicas=replicas,
+        seed=seed,
+        allow=allow,
+    )
+    if out is not None:
+        write_table(out, found.table())
+    _print(*schelling_tables(found))
+    if out is not None:
+        say(f"Episodes: {out}")
+    if figure is not None:
+        say(f"Figure: {draw_schelling(found, figure)}")
 
 
 def _runs_by_name(words: Sequence[str]) -> list[str] | dict[str, str]:

@@ -102,6 +102,15 @@ _SUBCOMMANDS: Final[dict[str, tuple[list[st.SearchStrategy[list[str]]], tuple[An
         [_run("plain", "finished"), _run("plain", "finished")],
         (*_PLAYED, _flag("--diagonal", "self", "cross_seed", "selfplay")),
     ),
+    "schelling": (
+        [_run("plain", "finished", "results")],
+        (
+            *(_flag("--restrained", "sustainable", "random"), _flag("--greedy", "greedy", "sustainable")),
+            *(_flag("--episodes", "1", "0"), _flag("--replicas", "1", "2"), _flag("--seed", "1", "0")),
+            *(_flag("--figure", "diagram.png", "diagram.gif"), _flag("--out", "table.parquet")),
+            *(_flag("--variant", "published", "as_run"), *_COMMON),
+        ),
+    ),
 }
 
 

@@ -14,7 +14,7 @@ from cprl.algorithms import DQN
 from cprl.collectors import StepCollector
 from cprl.envs import parallel_env
 from cprl.envs.matrix import stag_hunt
-from cprl.evaluation import territory_of
+from cprl.evaluation import schelling, territory_of
 from cprl.measuring import phases
 from cprl.policies.lanes import random_agents
 from cprl.population import Scripted
@@ -156,6 +156,19 @@ OWN: Final[dict[str, dict[str, st.SearchStrategy[Any]]]] = {
         "replicas": _FEW,
         "seed": _SEEDS,
         "allow": _ALLOW,
+    },
+    "cprl.evaluation.schelling:schelling": {
+        "where": st.just(things.MEADOW),
+        "restrained": st.sampled_from(("sustainable", "pacifist")),
+        "greedy": st.sampled_from(("greedy", "random")),
+        "episodes": _FEW,
+        "replicas": _FEW,
+        "seed": _SEEDS,
+        "allow": _ALLOW,
+    },
+    "cprl.evaluation.schelling_picture:draw_schelling": {
+        "found": st.just(0).map(lambda _: schelling(things.MEADOW, episodes=1, replicas=2)),
+        "path": st.sampled_from(("diagram.png", "new/diagram.png", "diagram.gif")),
     },
     "cprl.evaluation.territory:territory_of": _FRESH,
     "cprl.evaluation.visits_picture:draw_visits": {

@@ -5,16 +5,19 @@ Modules, in the order in which one reads them:
     cross_play  crossplay: a focal agent of one run among background agents of another
     gains       what a focal agent gains over the agent whose place it takes, and what it costs the others
     populations play_population: scripted and stored agents in any mix
+    schelling   what restrained and greedy agents get, by how many of the others are restrained
     territory   territory_of: where the agents of a run go and whom they tag
     film        an episode, every step recorded
     film_video  the same as a GIF or an MP4
     lanes       stored agents of all replicas side by side
     same_game   whether two runs can play together
+    words       what a word names: a board, and who plays
     tables      tables for the terminal
     turns            one episode of one world, turn by turn
     episode_picture  the board with the stock and the harvests so far
     video_files      GIF and MP4 out of pictures
     gains_picture    gains as two matrices
+    schelling_picture  a Schelling diagram
     visits_picture   a map for each agent of where it spends its time
 """
 
@@ -23,6 +26,8 @@ from cprl.evaluation.evaluate import Evaluation, evaluate_run
 from cprl.evaluation.gains import Gain, gains
 from cprl.evaluation.gains_picture import draw_gains
 from cprl.evaluation.populations import play_population
+from cprl.evaluation.schelling import SchellingDiagram, schelling
+from cprl.evaluation.schelling_picture import draw_schelling
 from cprl.evaluation.territory import Territory, territory_of
 from cprl.evaluation.visits_picture import draw_visits
 
@@ -31,12 +36,15 @@ __all__ = [
     "CrossPlay",
     "Evaluation",
     "Gain",
+    "SchellingDiagram",
     "Territory",
     "crossplay",
     "draw_gains",
+    "draw_schelling",
     "draw_visits",
     "evaluate_run",
     "gains",
     "play_population",
+    "schelling",
     "territory_of",
 ]

@@ -9,10 +9,12 @@ from cprl.evaluation.cross_play import CrossPlay
 from cprl.evaluation.evaluate import Evaluation
 from cprl.evaluation.gains import gains
 from cprl.evaluation.lanes import Played
+from cprl.evaluation.schelling import SchellingDiagram
 from cprl.evaluation.territory import Territory
 from cprl.measuring.names import with_unit
 from cprl.measuring.replicas import Measured, agents_without_harvest
 from cprl.measuring.reported import left_out
+from cprl.measuring.statistics import estimate
 from cprl.stored import LoadedRun
 
 
@@ -61,6 +63,37 @@ def territory_table(found: Territory) -> Table:
     for name in found.trained.by_replica:
         table.add_row(name, *(str(own.get(name, "-")) for own in (trained, random)))
     return table
+
+
+def schelling_tables(found: SchellingDiagram) -> Iterator[Table]:
+    """The payoffs by the number of restrained others, and the margins between them that make a dilemma."""
+    title = (
+        f"{found.replicas} replicas, {found.episodes} episodes each for each choice of restrained agents, "
+        f"seed {found.seed}\nmean over replicas [95 % interval by Student's t]"
+    )
+    payoffs = Table(title=title, title_justify="left")
+    for heading in (
+        f"restrained among the other {found.agents - 1}",
+        f"return of {found.restrained} (restrained)",
+        f"return of {found.greedy} (greedy)",
+    ):
+        payoffs.add_column(heading, justify="right")
+    for count in range(found.agents):
+        own = (of_kind[:, count] for of_kind in (found.restrained_payoffs, found.greedy_payoffs))
+        payoffs.add_row(str(count), *(str(estimate(values, interval="t")) for values in own))
+    yield payoffs
+    dilemma, last = found.dilemma(), found.agents - 1
+    margins = Table(title=f"{dilemma.name}, by returns", title_justify="left")
+    margins.add_column()
+    margins.add_column("difference, paired by replica", justify="right")
+    for name, margin in (
+        (f"restraint of all instead of none, R({last}) - G(0)", dilemma.restraint),
+        (f"company of the restrained, R({last}) - R(0)", dilemma.company),
+        ("fear, G(0) - R(0)", dilemma.fear),
+        (f"greed, G({last}) - R({last})", dilemma.greed),
+    ):
+        margins.add_row(name, str(margin))
+    yield margins
 
 
 def heading(played: CrossPlay) -> str:

@@ -1,0 +1,168 @@
+"""schelling: what restrained and greedy agents get, by how many of the others are restrained.
+
+All mixes of N agents are played: k restrained and N - k greedy ones, for k = 0 to N. Where both kinds play, a
+mix is played N times, with the restrained agents at the indices s to s + k - 1, cyclically, for each s, so
+that each index is restrained as often as every other. A replica's payoff is the mean over those and its
+episodes.
+
+Source: T. C. Schelling, "Hockey Helmets, Concealed Weapons, and Daylight Saving" (1973); for policies of
+agents that learn, E. Hughes et al. (2018) and J. Perolat et al. (2017).
+"""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Any
+
+import numpy as np
+import pyarrow as pa
+from numpy.typing import NDArray
+
+from cprl import arguments
+from cprl.evaluation.evaluate import SEED
+from cprl.evaluation.lanes import Played
+from cprl.evaluation.populations import place_of, play_population
+from cprl.evaluation.words import agent_named
+from cprl.measuring.dilemmas import Dilemma, dilemma
+from cprl.measuring.replicas import Measured, social_measures
+from cprl.measuring.statistics import Interval
+from cprl.runs.labelled import labelled
+
+Values = NDArray[np.float64]
+Who = tuple[int, ...]
+"""The indices of the restrained agents, ascending."""
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class SchellingDiagram:
+    """The episodes of all mixes of restrained and greedy agents; see the docstring of this module."""
+
+    agents: int
+    """N."""
+    restrained: str
+    greedy: str
+    """Who plays restrained, and who greedy: a scripted policy or a run."""
+    played: Mapping[Who, Played]
+    """The episodes by the indices of the restrained agents and the replica."""
+    replicas: int
+    episodes: int
+    """Of each replica and choice of restrained agents."""
+    seed: int
+
+    @cached_property
+    def restrained_payoffs(self) -> Values:
+        """R(k), float64 [R, N]: the mean return of a restrained agent, by the number k = 0 to N - 1 of
+        others that are restrained."""
+        return np.stack([self._payoffs(count + 1, of_restrained=True) for count in range(self.agents)], 1)
+
+    @cached_property
+    def greedy_payoffs(self) -> Values:
+        """G(k), float64 [R, N]: that of a greedy agent, likewise."""
+        return np.stack([self._payoffs(count, of_restrained=False) for count in range(self.agents)], 1)
+
+    @cached_property
+    def group_payoffs(self) -> Values:
+        """float64 [R, N + 1]: the mean return of all agents together, by how many of them are restrained."""
+        counts = np.arange(self.agents + 1)
+        group = np.zeros((self.replicas, len(counts)))
+        group[:, 1:] += counts[1:] * self.restrained_payoffs
+        group[:, :-1] += counts[:0:-1] * self.greedy_payoffs
+        return group
+
+    def dilemma(self, *, interval: Interval = "t") -> Dilemma:
+        """Which dilemma they make, if any."""
+        return dilemma(self.restrained_payoffs, self.greedy_payoffs, interval=interval)
+
+    def measures(self, count: int) -> dict[str, Measured]:
+        """The social metrics of the mixes with so many restrained agents.
+
+        Raises:
+            ValueError: for a number that is not in 0..N.
+        """
+        count = arguments.integer("count", count, 0, self.agents)
+        together: Played = {}
+        for who in self._mixes(count):
+            for replica, episodes in self.played[who].items():
+                together.setdefault(replica, []).extend(episodes)
+        return social_measures(together)
+
+    def table(self) -> pa.Table:
+        """All episodes with the columns of `episodes.parquet`, after "restrained", the indices of the
+        restrained agents as a text, e.g. "0 1"."""
+        return labelled(
+            ({"restrained": " ".join(map(str, who))}, replica, episodes)
+            for who, played in self.played.items()
+            for replica, episodes in played.items()
+        )
+
+    def _mixes(self, count: int) -> list[Who]:
+        return [who for who in self.played if len(who) == count]
+
+    def _payoffs(self, count: int, *, of_restrained: bool) -> Values:
+        """The mean return of a restrained or of a greedy agent, where so many are restrained, [R]."""
+        sums, shares = np.zeros(self.replicas), 0
+        for who in self._mixes(count):
+            own = [agent for agent in range(self.agents) if (agent in who) == of_restrained]
+            played = self.played[who]
+            for replica in range(self.replicas):
+                sums[replica] += np.mean([episode.return_[own] for episode in played[replica]])
+            shares += 1
+        return sums / shares
+
+
+def schelling(
+    where: Any,
+    *,
+    restrained: str = "sustainable",
+    greedy: str = "greedy",
+    episodes: int = 5,
+    replicas: int = 8,
+    seed: int = SEED,
+    allow: Sequence[str] = (),
+) -> SchellingDiagram:
+    """Plays all mixes of restrained and greedy agents: N (N - 1) + 2 populations.
+
+    Args:
+        where: a game, or a run, a value of `cprl.load`, whose game and transforms are used.
+        restrained: who plays restrained: a scripted policy, or the directory of a run, of whose replica r
+            the agent of the same index plays in replica r.
+        greedy: who plays greedy, likewise.
+        episodes: episodes of each replica and choice of restrained agents, each in its own world.
+        replicas: the number of replicas R; of scripted policies, of independent groups of episodes.
+        seed: the seed of the worlds, in which all mixes play, and of all random numbers.
+        allow: see `cprl.load`.
+
+    Raises:
+        ValueError: for a single agent, policies that are alike, and what `play_population` refuses.
+    """
+    agents = place_of(where).game.agents
+    if agents < 2:
+        raise ValueError("the game has 1 agent; allowed for a Schelling diagram: at least 2")
+    if restrained == greedy:
+        raise ValueError(f"restrained and greedy are both {greedy!r}; allowed: two ways to play")
+    specs = {
+        is_restrained: [agent_named(name_of, agent, replica=None, name=name) for agent in range(agents)]
+        for is_restrained, name, name_of in ((True, "restrained", restrained), (False, "greedy", greedy))
+    }
+    how: dict[str, Any] = {"episodes": episodes, "replicas": replicas, "seed": seed}
+    return SchellingDiagram(
+        agents=agents,
+        restrained=restrained,
+        greedy=greedy,
+        played={
+            who: play_population(
+                where, [specs[agent in who][agent] for agent in range(agents)], allow=allow, **how
+            )
+            for who in _mixes(agents)
+        },
+        **how,
+    )
+
+
+def _mixes(agents: int) -> list[Who]:
+    """The indices of the restrained agents of all mixes, by their number."""
+    return [
+        tuple(sorted((first + place) % agents for place in range(count)))
+        for count in range(agents + 1)
+        for first in range(agents if 0 < count < agents else 1)
+    ]

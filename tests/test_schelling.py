@@ -1,0 +1,121 @@
+"""What restrained and greedy agents get in all mixes, drawn and told."""
+
+import numpy as np
+import pytest
+from matplotlib.image import imread
+from test_evaluation import CORRIDORS, DQN, MEADOW, SEED, command, ran
+
+import cprl
+from cprl import Game, Rules, maps, presets
+from cprl.evaluation import draw_schelling, play_population, schelling
+from cprl.population import Scripted
+
+PATCH = Game(
+    map=maps.parse(
+        """
+        >.AA.<
+        ..AA..
+        v.AA.^
+        """
+    ),
+    rules=Rules(regrow_prob=(0.0, 0.05, 0.3), window_rows=6, window_columns=7, episode_steps=60),
+)
+"""Four agents around one patch that does not come back once it is bare."""
+
+
+@pytest.fixture(scope="module")
+def corridors():
+    return schelling(CORRIDORS, episodes=2, replicas=3)
+
+
+@pytest.fixture(scope="module")
+def patch():
+    return schelling(PATCH, episodes=3, replicas=2, seed=SEED)
+
+
+def test_payoffs_are_means_over_who_is_restrained(corridors):
+    # Nothing regrows. Greedy agents bite all that is in their corridors, 2 and 3 apples, restrained ones
+    # none: they never see three others near an apple. One restrained agent is once agent 0 and once agent 1.
+    assert sorted(corridors.played) == [(), (0,), (0, 1), (1,)]
+    assert corridors.restrained_payoffs.tolist() == [[0.0, 0.0]] * 3
+    assert corridors.greedy_payoffs.tolist() == [[2.5, 2.5]] * 3
+    assert corridors.group_payoffs.tolist() == [[5.0, 2.5, 0.0]] * 3
+    assert corridors.dilemma().name == "no dilemma"
+    assert corridors.measures(1)["collective_return"].estimate.value == 2.5
+
+
+def test_each_agent_is_as_often_restrained_as_every_other(patch):
+    assert sorted(map(len, patch.played)) == [0, 1, 1, 1, 1, 2, 2, 2, 2, 3, 3, 3, 3, 4]
+    for count in range(5):
+        own = [agent for who in patch.played if len(who) == count for agent in who]
+        assert len({own.count(agent) for agent in range(4)}) == 1
+
+
+def test_a_mix_is_the_population_of_its_agents(patch):
+    agents = [Scripted("sustainable" if agent in (0, 3) else "greedy") for agent in range(4)]
+    played = play_population(PATCH, agents, episodes=3, replicas=2, seed=SEED)
+    for replica, episodes in patch.played[0, 3].items():
+        assert [one.return_.tolist() for one in episodes] == [one.return_.tolist() for one in played[replica]]
+    # R(1): in each of the mixes (0, 1), (1, 2), (2, 3) and (0, 3) the two restrained agents.
+    pairs = ((0, 1), (1, 2), (2, 3), (0, 3))
+    own = [[one.return_[list(pair)].mean() for one in patch.played[pair][0]] for pair in pairs]
+    assert patch.restrained_payoffs[0, 1] == pytest.approx(np.mean(own))
+    group = [sum(one.return_.sum() for one in patch.played[pair][0]) for pair in pairs]
+    assert patch.group_payoffs[0, 2] == pytest.approx(sum(group) / 12)
+
+
+def test_the_table_has_every_episode(patch):
+    table = patch.table()
+    assert len(table) == 14 * 2 * 3 * 4, "mixes, replicas, episodes, agents"
+    assert set(table["restrained"].to_pylist()) >= {"", "0", "0 3", "0 1 2 3"}
+
+
+def test_agents_of_runs_play_restrained_or_greedy(tmp_path):
+    run = ran(tmp_path / "alike", MEADOW, [DQN] * 2)
+    found = schelling(cprl.load(run), restrained="sustainable", greedy=str(run), episodes=2, replicas=3)
+    trained = cprl.evaluate_run(run, episodes=2).trained
+    for replica, episodes in found.played[()].items():
+        assert [one.return_.tolist() for one in episodes] == [
+            one.return_.tolist() for one in trained[replica]
+        ]
+    with pytest.raises(ValueError, match="keeps no network of replica_3/agent_0"):
+        schelling(MEADOW, greedy=str(run), episodes=1, replicas=4)
+
+
+@pytest.mark.parametrize(
+    ("given", "answer"),
+    [
+        ({"where": presets.game("single_basic")}, "the game has 1 agent; allowed for a Schelling diagram"),
+        ({"greedy": "sustainable"}, "restrained and greedy are both 'sustainable'; allowed: two ways"),
+        ({"restrained": "kind"}, "restrained is 'kind'; allowed: random, greedy, .*, or a run's directory"),
+        ({"where": None}, "where is None; allowed: a game"),
+        ({"replicas": 0}, "replicas is 0"),
+    ],
+)
+def test_what_makes_no_diagram_is_refused(given, answer):
+    with pytest.raises(ValueError, match=answer):
+        schelling(**{"where": CORRIDORS, **given})
+
+
+def test_counts_outside_the_diagram_are_refused(corridors):
+    with pytest.raises(ValueError, match=r"count is 3; allowed: an integer from 0 to 2"):
+        corridors.measures(3)
+
+
+def test_the_diagram_is_drawn_once(corridors, tmp_path):
+    drawn = draw_schelling(corridors, tmp_path / "new" / "diagram.png")
+    assert imread(drawn).shape[1] > 1000
+    with pytest.raises(FileExistsError):
+        draw_schelling(corridors, drawn)
+
+
+def test_the_command_prints_the_dilemma(tmp_path, monkeypatch, capsys):
+    drawing = tmp_path / "patch.txt"
+    drawing.write_text(">.AA.<\n..AA..\n")
+    words = ["schelling", drawing, "--episodes", "1", "--replicas", "2", "--out", tmp_path / "all.parquet"]
+    printed = command(monkeypatch, capsys, *words, "--figure", tmp_path / "diagram.png")
+    assert "fear, G(0) - R(0)" in printed
+    assert (tmp_path / "all.parquet").exists()
+    assert (tmp_path / "diagram.png").exists()
+    with pytest.raises(SystemExit, match=r"all\.parquet exists and is not overwritten"):
+        command(monkeypatch, capsys, *words)
