@@ -120,6 +120,7 @@ def test_a_run_of_scripted_agents_gives_the_numbers_worked_by_hand(scripted):
             "peace": 2,
             "peacefulness": 3,
             "stock_left": 0,
+            "yield_share": 1,  # nothing grows, and all 5 are taken
             "agent_0/return": 2,
             "agent_1/return": 3,
         }

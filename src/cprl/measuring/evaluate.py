@@ -13,6 +13,7 @@ from cprl.envs.commons_env import CommonsEnv
 from cprl.envs.unwrap import agent_count
 from cprl.measuring.episodes import Episode, EpisodeTracker
 from cprl.measuring.institutional import institutions_of
+from cprl.measuring.yields import yield_of
 
 Policy = Callable[[TensorDictBase], TensorDictBase]
 
@@ -39,7 +40,7 @@ def evaluate(env: EnvBase, policy: Policy, *, explore: bool = False) -> list[Epi
     arguments.switch("explore", explore)
     is_commons = isinstance(env, CommonsEnv)
     longest = env.game.rules.episode_steps if is_commons else None
-    tracker = EpisodeTracker(worlds, agents, longest, institutions=institutions_of(env))
+    tracker = EpisodeTracker(worlds, agents, longest, institutions=institutions_of(env), **yield_of(env))
     exploration = ExplorationType.RANDOM if explore else ExplorationType.DETERMINISTIC
     episodes: dict[int, Episode] = {}
     with torch.no_grad(), set_exploration_type(exploration):

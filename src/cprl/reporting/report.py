@@ -18,6 +18,7 @@ from cprl.reporting import claims, claims_alone, claims_many, curves
 from cprl.reporting.appendix import appendix, returns_of_others
 from cprl.reporting.figures import axis_title, draw_figures
 from cprl.reporting.markdown import table
+from cprl.reporting.possible import shares_of
 from cprl.reporting.result import Result, read_result
 from cprl.reporting.turning import phases_of, turning_points_of
 from cprl.runs.files import write_atomically
@@ -49,6 +50,7 @@ def write_report(runs: Sequence[Path], out: Path) -> Path:
         *_how(of_study),
         "",
         *_runs(results),
+        *shares_of(results),
         *appendix(of_study),
         *returns_of_others([result for result in results if not result.study]),
         *(curves.windows() if of_study else []),

@@ -32,6 +32,8 @@ Values of the whole episode are repeated in the row of each agent. Values that t
 no column; nor has the wanted return outside of a training. It is null for agents that do not learn."""
 
 _WANTED: Final = "wanted_return"
+_LATER: Final = {_WANTED, "yield_share"}
+"""Columns that tables of earlier versions lack."""
 
 OF_INSTITUTIONS: Final = {
     "decision": pa.int32(),
@@ -96,8 +98,8 @@ def rows_of(episodes: Sequence[Episode], replica: int | None, schema: pa.Schema)
     """
     of_each = [_cells(episode, episode.world if replica is None else replica) for episode in episodes]
     for cells in of_each:
-        if _WANTED not in schema.names:  # a table that an earlier cprl began goes on without it
-            cells.pop(_WANTED, None)
+        for name in _LATER - set(schema.names):  # a table that an earlier cprl began goes on without it
+            cells.pop(name, None)
         if cells.keys() != set(schema.names):
             more, lacks = cells.keys() - set(schema.names), set(schema.names) - cells.keys()
             raise ValueError(

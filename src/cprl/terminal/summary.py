@@ -20,7 +20,14 @@ from cprl.terminal.progress import console_of
 from cprl.viewer.streams import viewer
 
 KEPT = ("recipe.json", "episodes.parquet", "run.rrd", "checkpoints", "figures")
-METRICS: Final = {"survival_steps": 1, "sustainability": 1, "equality": 2, "peacefulness": 1, "stock_left": 1}
+METRICS: Final = {
+    "yield_share": 2,
+    "survival_steps": 1,
+    "sustainability": 1,
+    "equality": 2,
+    "peacefulness": 1,
+    "stock_left": 1,
+}
 """The metrics that are printed if the game reports them, with their digits."""
 RETURN: Final = "return of all agents together"
 UNDEFINED: Final = "undefined"

@@ -7,6 +7,7 @@ from torchrl.envs import EnvBase
 
 from cprl.measuring import institutional, phases
 from cprl.measuring.reported import FIELDS, METRICS, available, left_out
+from cprl.measuring.yields import yield_of
 from cprl.viewer.scenery import Curves
 
 _SHOWN: Final[Mapping[str, tuple[str, ...]]] = {
@@ -31,6 +32,7 @@ def curves_of(env: EnvBase, agents: tuple[str, ...], reported: Sequence[str], *,
         episodes: of the run.
     """
     metrics = available({**METRICS, "stock_left": FIELDS["stock_left"]}, reported)
+    metrics += () if yield_of(env)["sustainable_yield"] is None else ("yield_share",)
     return Curves(
         agents=agents,
         replicas=env.batch_size.numel(),
