@@ -1,4 +1,4 @@
-"""The herders' game and appropriation, played again and again: do independent learners end at the equilibrium?
+"""The herders' game and appropriation, repeated: do independent learners end at the equilibrium?
 
     python recipes/theory/sharing.py --kind appropriation --learner tables --watch off
 

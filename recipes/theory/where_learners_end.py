@@ -2,8 +2,9 @@
 
     nice python recipes/theory/where_learners_end.py --out docs/results/theory        a few core minutes
 
-Trains the conditions of `CONDITIONS`, one after the other, writes what all agents took and gained, in the mean
-of each five episodes, to `taken.parquet`, and draws `taken.png`; what is there already is not trained again.
+Trains the conditions of `CONDITIONS`, one after the other, writes what all agents took and gained, in the
+mean of each five episodes, to `taken.parquet`, and draws `taken.png`; what is there already is not trained
+again.
 `--draw` draws and prints the table alone.
 
 What was expected, written down before the first run:
@@ -18,6 +19,7 @@ What was expected, written down before the first run:
 """
 
 import argparse
+from dataclasses import replace
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any, Final
@@ -38,7 +40,9 @@ from cprl.plotting.style import MARK, MEAN, RAW, SMALL_PT, WIDTH_IN, head, save
 from cprl.theory import SharingGame
 
 GAMES: Final = (("herders", 2), ("herders", 5), ("appropriation", 8))
-WAYS: Final = (("tables", "individual"), ("tables", "team"), ("PPO", "individual"), ("PPO", "team"))
+WAYS: Final = {("tables", "team"): 150, ("PPO", "individual"): 150, ("tables", "individual"): 300}
+"""How agents learn and what they are paid, with the number of episodes: tables with individual rewards settle
+long after exploration has ended."""
 CONDITIONS: Final = [(*game, *way) for way in WAYS for game in GAMES]
 BLOCK: Final = 5
 """Episodes of a row."""
@@ -72,6 +76,7 @@ class Taken:
 def measured(kind: Any, herd: int, learner: Any, wants: Any) -> pa.Table:
     """Trains a condition; a row for each block of episodes of each replica."""
     own = experiment(kind=kind, herd=herd, learner=learner, wants=wants)
+    own = replace(own, episodes=WAYS[learner, wants])
     taken = Taken(own.game)
     with TemporaryDirectory() as folder:
         how: dict[str, Any] = {"watch": "off", "figures": False, "keep_checkpoint": False}
