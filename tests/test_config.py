@@ -36,6 +36,7 @@ from cprl.algorithms import (
 from cprl.config import KINDS, custom_targets, differences, from_config, to_config
 from cprl.custom import Custom
 from cprl.envs.matrix import MatrixGame, prisoners_dilemma
+from cprl.envs.taking import TakingGame
 from cprl.institutions import (
     Boundaries,
     ClosedPatches,
@@ -55,6 +56,7 @@ from cprl.networks import MLP, Conv
 from cprl.objectives.log_cosh import DISTANCES
 from cprl.population import Frozen, Learning, Scripted, Team
 from cprl.preferences import Exchange, InequityAversion, SocialValueOrientation
+from cprl.theory import appropriation, herders
 
 SHARES = st.floats(1e-9, 1, allow_subnormal=False)
 POSITIVE = st.floats(1e-6, 100, allow_subnormal=False)
@@ -198,6 +200,8 @@ def test_every_kind_comes_back():
         "Game": presets.game("two_complex"),
         "Map": BOARD,
         "MatrixGame": prisoners_dilemma(),
+        "SharingGame": appropriation(),
+        "TakingGame": TakingGame(herders(5), levels=None, turns=9, continue_prob=0.5),
         "Learning": Learning(DQN(settings=DQNSettings())),
         "Team": Team(QMIX(settings=DQNSettings()), agents=(0, 1)),
         "Frozen": Frozen("runs/earlier", 1),

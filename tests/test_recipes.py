@@ -136,6 +136,31 @@ def run_in_miniature(tmp_path, capsys, **arguments):
     return run, capsys.readouterr().out
 
 
+@pytest.mark.parametrize(("kind", "herd"), [("herders", 2), ("appropriation", 8)])
+@pytest.mark.parametrize("learner", ["tables", "PPO"])
+def test_those_who_share_learn_alone_and_know_nothing_of_each_other(kind, herd, learner):
+    own = recipe("sharing", RECIPES / "theory").experiment(
+        kind=kind, herd=herd, learner=learner, wants="team"
+    )
+    assert own.game.agents == herd
+    assert own.game.remembered == 0
+    assert {(spec.reward, spec.algorithm.settings.gamma) for spec in own.agents} == {("team", 0.0)}
+
+
+def test_the_table_of_where_learners_end_follows_from_what_was_measured(monkeypatch, capsys):
+    monkeypatch.syspath_prepend(str(RECIPES / "theory"))
+    own = recipe("where_learners_end", RECIPES / "theory")
+    measured = pq.read_table(RECIPES.parent / "docs" / "results" / "theory" / "taken.parquet")
+    for condition in own.CONDITIONS:
+        found = own.of_condition(measured, condition)
+        assert found["total"].shape == (own.WAYS[condition[2:]] // own.BLOCK, 8)
+        sharing = own.sharing_of(*condition[:2])
+        assert found["gain"].max() <= sharing.surplus(sharing.optimum_total) * (1 + 1e-5)
+    own.print_table(measured)
+    page = (RECIPES.parent / "docs" / "theory.md").read_text()
+    assert capsys.readouterr().out in page
+
+
 BOARD_OF = {"two_against_random": "two_complex"}
 LANES = {"single_basic": 1, "single_complex": 1, "two_complex": 2, "two_against_random": 2, "commons": 4}
 

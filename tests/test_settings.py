@@ -41,6 +41,7 @@ from cprl.commandline import parse, recipe_main
 from cprl.config import KINDS, from_config, to_config
 from cprl.envs.continuous import MaxOfTwoQuadratics
 from cprl.envs.matrix import prisoners_dilemma
+from cprl.envs.taking import TakingGame
 from cprl.institutions import (
     Boundaries,
     ClosedPatches,
@@ -68,6 +69,7 @@ from cprl.preferences import Exchange, InequityAversion, SocialValueOrientation
 from cprl.running import run
 from cprl.runs.directory import read_recipe
 from cprl.runs.files import read_json
+from cprl.theory import PowerWorth, appropriation, herders
 
 GAME = presets.game("two_complex")
 REPLAY, ROLLOUTS, TABLES, LOOKS = DQNSettings(), RolloutSettings(), TabularSettings(), LOLASettings()
@@ -86,6 +88,7 @@ VALUES = [
     *(MLP(), Conv(), SPACES),
     prisoners_dilemma(turns=9),
     MaxOfTwoQuadratics(),
+    *(herders(2, cost=2.0), PowerWorth(), TakingGame(appropriation(), most=3.0, turns=9)),
     *(kind(settings=REPLAY) for kind in (DQN, DistributionalDQN, CQL, SAC, IQL, PR2, VDN, QMIX, MADDPG)),
     PR2ActorCritic(settings=REPLAY),
     *(kind(settings=ROLLOUTS) for kind in (PPO, A2C, Reinforce, MAPPO, IPPO)),
@@ -151,6 +154,10 @@ ALLOWED = {
         (("MaxOfTwoQuadratics", name) for name in ("bound", "wide_factor", "wide_width", "steep_width")),
         (1.9,),
     ),
+    **{("SharingGame", name): (1.9,) for name in ("cost", "most_each")},
+    ("SharingGame", "payment"): (-1, -0.5, 1.9),
+    **{("PowerWorth", name): (1.9,) for name in ("top", "factor", "power")},
+    ("TakingGame", "most"): (1.9,),
     ("Rules", "regrow_radius_cells"): (1.9,),
     ("Boundaries", "regions"): (["x"], ["x", "y"]),
     ("Boundaries", "owners"): (["x"], ["x", "y"]),
@@ -184,7 +191,8 @@ ALLOWED = {
 """What fits a field although it fits hardly any other."""
 OPTIONAL = {"tau", "max_grad_norm", "network", "start_from", "replica", "decisions"}
 OPTIONAL |= {"owners", "bite_fine", "step_fine", "fine", "monitor", "recovery_steps"}
-OPTIONAL_OF = {("Sanctioner", "agents"), ("MatrixGame", "memory")}
+OPTIONAL_OF = {("Sanctioner", "agents"), ("MatrixGame", "memory"), ("SharingGame", "most_each")}
+OPTIONAL_OF |= {("TakingGame", name) for name in ("levels", "most", "memory")}
 
 
 @pytest.mark.parametrize(("value", "field"), FIELDS)

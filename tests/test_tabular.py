@@ -9,6 +9,8 @@ import pytest
 import torch
 
 from cprl import CommonsEnv, Game, Observation, Rules, maps
+from cprl.envs import make_env, spaces_of
+from cprl.envs.matrix import prisoners_dilemma
 from cprl.learners.settings import TabularSettings
 from cprl.learners.tabular import TabularLearner
 from cprl.measuring.evaluate import evaluate
@@ -334,6 +336,21 @@ def test_a_training_beside_a_scripted_agent_goes_on_from_its_checkpoint(tmp_path
     size = whole.tables.size
     assert np.array_equal(whole.tables.values[:size], parts.tables.values[:size])
     assert np.array_equal(whole.tables.visits[:size], parts.tables.visits[:size])
+
+
+def test_the_table_of_an_agent_that_observes_floating_point_numbers_is_kept_as_a_network():
+    env = make_env(prisoners_dilemma(turns=5), worlds=2)
+    learner = TabularLearner(
+        spaces_of(env), agents=(0, 1), replicas=2, settings=TabularSettings(gamma=0.0, learning_rate=1.0)
+    )
+    train(env, {(0, 1): learner}, episodes=20)
+    table, network = learner.q_table(0), learner.networks()["replica_0/agent_0"]
+    seen = torch.from_numpy(table["observation"])
+    assert seen.dtype == torch.float32
+    assert sorted(seen.argmax(-1).tolist()) == [0, 1, 2, 3, 4], "four joint actions, and none yet"
+    assert np.array_equal(network(seen), table["values"])
+    assert set(table["values"].ravel().tolist()) == {-3, -2, -1, 0}
+    assert network(torch.full((1, 5), 0.5)).tolist() == [[0, 0]], "never met"
 
 
 def test_more_states_than_are_allowed_are_refused():

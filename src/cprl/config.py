@@ -43,6 +43,7 @@ from cprl.commons.rules import Rules
 from cprl.custom import Custom
 from cprl.envs.continuous import MaxOfTwoQuadratics
 from cprl.envs.matrix import MatrixGame
+from cprl.envs.taking import TakingGame
 from cprl.institutions import (
     Boundaries,
     ClosedPatches,
@@ -60,10 +61,11 @@ from cprl.learners.decisions import Bandit
 from cprl.networks import MLP, Conv
 from cprl.population import Frozen, Learning, Scripted, Team
 from cprl.preferences import Exchange, InequityAversion, SocialValueOrientation
+from cprl.theory import PowerWorth, SharingGame
 
 _OF_CPRL: Final[tuple[type[Any], ...]] = (
     *(Game, Map, Rules, Observation, Learning, Team, Scripted, Frozen),
-    *(MatrixGame, MaxOfTwoQuadratics),
+    *(MatrixGame, MaxOfTwoQuadratics, TakingGame, SharingGame, PowerWorth),
     *(InequityAversion, SocialValueOrientation, Exchange),
     *(Boundaries, ClosedPatches, ClosedSeason, GraduatedSanctions, Levies, Mediation),
     *(Monitoring, Quota, Sanctioner, Tax, Vote),

@@ -7,13 +7,25 @@ from cprl.custom import Custom
 from cprl.envs.continuous import MaxOfTwoQuadratics
 from cprl.envs.make_env import PlayableGame
 from cprl.envs.matrix import MatrixGame
+from cprl.envs.taking import TakingGame
+from cprl.theory import PowerWorth
 
-OF_CPRL: Final[tuple[type[Any], ...]] = (Game, MatrixGame, MaxOfTwoQuadratics)
+OF_CPRL: Final[tuple[type[Any], ...]] = (Game, MatrixGame, MaxOfTwoQuadratics, TakingGame)
 """Games that a recipe holds as values, and whose chance follows from the seed alone."""
 
 
 def stored_game(game: object) -> object:
-    """As a recipe holds it: a game of the user's by the name of its class."""
+    """As a recipe holds it: a game of the user's by the name of its class.
+
+    Raises:
+        ValueError: for a game that a recipe cannot hold; says what it can.
+    """
+    if isinstance(game, TakingGame) and not isinstance(game.sharing.worth, PowerWorth):
+        raise ValueError(
+            f"experiment.game.sharing.worth is a {type(game.sharing.worth).__name__}, which a recipe cannot "
+            'hold; allowed: a PowerWorth, or as the game Custom("module:function"), a function of yours that '
+            "makes it"
+        )
     if type(game) in OF_CPRL or isinstance(game, Game | Custom) or not isinstance(game, PlayableGame):
         return game
     kind = type(game)

@@ -5,7 +5,7 @@ from typing import Any, Final
 
 from cprl.checks import Check, check_fields, count, is_count, number, one_of, tuple_of
 
-_DTYPES: Final = (
+DTYPES: Final = (
     *("bool", "uint8", "uint16", "uint32", "uint64", "int8", "int16", "int32", "int64"),
     *("float16", "bfloat16", "float32", "float64"),
 )
@@ -85,7 +85,7 @@ def _is_vector(value: Any) -> bool:
 _CHECKS: Final[dict[str, Check]] = {
     "agents": count(1),
     "observation_shape": tuple_of(count(1)),
-    "observation_dtype": one_of(*_DTYPES),
+    "observation_dtype": one_of(*DTYPES),
     "observation_scale": number(1e-30, 2**64),
     "actions": count(0),
     "action_size": count(0, 2**16),

@@ -44,6 +44,7 @@ from cprl.algorithms import (
 from cprl.envs import make_env
 from cprl.envs.continuous import MaxOfTwoQuadratics
 from cprl.envs.matrix import MatrixGame, matching_pennies, prisoners_dilemma
+from cprl.envs.taking import TakingGame
 from cprl.institutions import (
     Boundaries,
     ClosedPatches,
@@ -67,6 +68,7 @@ from cprl.policies.lanes import random_agents
 from cprl.population import Frozen, Learning, Scripted, Team
 from cprl.preferences import Exchange, InequityAversion, SocialValueOrientation
 from cprl.spaces import Spaces
+from cprl.theory import CallableWorth, PowerWorth, SharingGame, appropriation, herders
 
 MEADOW: Final = Game(
     map=maps.parse(".A>.A\nA.A.A\n..<.A"),
@@ -112,6 +114,13 @@ EXAMPLES: Final[dict[type, tuple[Any, ...]]] = {
     Game: (MEADOW, ALONE, GOVERNED, presets.game("single_basic")),
     MaxOfTwoQuadratics: (MaxOfTwoQuadratics(), MaxOfTwoQuadratics(bound=6.0, steep_width=0.5)),
     MatrixGame: (prisoners_dilemma(), matching_pennies(turns=4, continue_prob=0.5, memory=2)),
+    PowerWorth: (PowerWorth(), PowerWorth(top=23.0, factor=0.25, power=1.0)),
+    CallableWorth: (CallableWorth(function=lambda total: 8 - total**3, most=2),),
+    SharingGame: (herders(2), appropriation()),
+    TakingGame: (
+        *(TakingGame(herders(2)), TakingGame(appropriation(), turns=4, memory=2, continue_prob=0.5)),
+        TakingGame(herders(3), levels=None, most=1.5),
+    ),
     Boundaries: (Boundaries.strips(height=3, width=5, agents=2, step_fine=0.5),),
     Quota: (Quota(), Quota(share=0.5, window_steps=3, by_stock=True, fine=1.0)),
     ClosedSeason: (ClosedSeason(), ClosedSeason(period_steps=4, closed_steps=2, fine=0.0)),

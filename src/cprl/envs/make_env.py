@@ -15,6 +15,7 @@ from cprl.custom import Custom, made
 from cprl.envs.commons_env import CommonsEnv
 from cprl.envs.matrix import MatrixGame
 from cprl.envs.state import env_state, load_env_state
+from cprl.envs.taking import TakingGame
 from cprl.envs.unwrap import commons_of
 from cprl.spaces import Spaces
 
@@ -72,7 +73,7 @@ def make_env(
     env: EnvBase
     if isinstance(playable, Game):
         env = CommonsEnv(playable, worlds, seed=seed, device=device, first_world=first_world)
-    elif isinstance(playable, MatrixGame):
+    elif isinstance(playable, MatrixGame | TakingGame):
         env = playable.make(worlds, seed, device, first_world=first_world)
     elif isinstance(playable, PlayableGame) and not isinstance(playable, type):
         env = playable.make(worlds, arguments.seed(seed + first_world, "seed + first_world"), device)

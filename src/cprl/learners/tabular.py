@@ -148,16 +148,16 @@ class TabularLearner:
         """The table of a lane, with one row for each of the n states that it has visited; for display.
 
         Returns:
-            "observation" uint8 [n, C, X, Y], "stock_gauge" float32 [n, 1] and "scoreboard" float32 [n, N]
-            if the game has them, "values" float64 [n, A] and "visits" int64 [n, A].
+            "observation" [n, C, X, Y] in its own dtype, "stock_gauge" float32 [n, 1] and "scoreboard" float32
+            [n, N] if the game has them, "values" float64 [n, A] and "visits" int64 [n, A].
         """
         flat, values, visits = self.tables.of_lane(lane)
         sizes = dict(self.spaces.vectors)
-        cells = int(np.prod(self.spaces.observation_shape))
-        table: dict[str, NDArray[Any]] = {
-            "observation": flat[:, :cells].reshape(len(flat), *self.spaces.observation_shape)
-        }
-        vectors = np.ascontiguousarray(flat[:, cells:]).view(np.float32)
+        shape, dtype = self.spaces.observation_shape, np.dtype(self.spaces.observation_dtype)
+        split = int(np.prod(shape)) * dtype.itemsize
+        seen = np.ascontiguousarray(flat[:, :split]).view(dtype)
+        table: dict[str, NDArray[Any]] = {"observation": seen.reshape(len(flat), *shape)}
+        vectors = np.ascontiguousarray(flat[:, split:]).view(np.float32)
         for name in self._observed[1:]:
             table[name], vectors = vectors[:, : sizes[name]], vectors[:, sizes[name] :]
         return {**table, "values": values, "visits": visits}
@@ -218,4 +218,4 @@ def table_network(spaces: Spaces) -> TableNetwork:
             f"agents of this game observe {', '.join(names)}; allowed for agents of a population: "
             "observation alone; leave the others out of Observation, or pass a TabularLearner to train"
         )
-    return TableNetwork(spaces.observation_shape, spaces.actions)
+    return TableNetwork(spaces.observation_shape, spaces.actions, observation_dtype=spaces.observation_dtype)

@@ -13,8 +13,9 @@ from torch import Tensor, nn
 from torchrl.envs.utils import ExplorationType, exploration_type
 
 from cprl import arguments
+from cprl.checks import checked, one_of
 from cprl.policies.rng import MOST_LANES, LaneRng, check_lanes
-from cprl.spaces import Spaces
+from cprl.spaces import DTYPES, Spaces
 
 NEVER_MET = 0
 """The row of states that are in no table; its values stay 0."""
@@ -142,35 +143,40 @@ def states_of(
 class TableNetwork(nn.Module):
     """The table of one agent as a network, so that it can be saved, loaded and frozen like any other.
 
-    Its state dict holds "states", uint8 [n, C X Y], and their "values", float64 [n, A]. It loads a state dict
-    with any number of states n; initially n is 0.
+    Its state dict holds "states", uint8 [n, bytes], the bytes of observations, and their "values", float64
+    [n, A]. It loads a state dict with any number of states n; initially n is 0.
 
     Args:
-        observation_shape: The shape (C, X, Y) of an observation.
+        observation_shape: The shape of an observation, (C, X, Y) of a window.
         actions: The number of actions A.
+        observation_dtype: The dtype of observations, by numpy's and torch's common name.
     """
 
     states: Tensor
     values: Tensor
 
-    def __init__(self, observation_shape: Sequence[int], actions: int) -> None:
+    def __init__(
+        self, observation_shape: Sequence[int], actions: int, *, observation_dtype: str = "uint8"
+    ) -> None:
         super().__init__()
         lengths = arguments.listed(
             "observation_shape", observation_shape, "the lengths of an observation's axes"
         )
         observation_shape = [arguments.integer("observation_shape", own, 1, 2**31 - 1) for own in lengths]
         actions = arguments.integer("actions", actions, 1, MOST_ACTIONS)
+        checked("observation_dtype", observation_dtype, one_of(*DTYPES))
         self.observation_dims = len(observation_shape)
-        self.register_buffer("states", torch.zeros((0, prod(observation_shape)), dtype=torch.uint8))
+        size = prod(observation_shape) * getattr(torch, observation_dtype).itemsize
+        self.register_buffer("states", torch.zeros((0, size), dtype=torch.uint8))
         self.register_buffer("values", torch.zeros((0, actions), dtype=torch.float64))
         self._rows: dict[bytes, int] = {}
         self.register_load_state_dict_pre_hook(_resize_to_stored_states)  # type: ignore[no-untyped-call]
         self.register_load_state_dict_post_hook(_find_them_again)  # type: ignore[no-untyped-call]
 
     def forward(self, observation: Tensor) -> Tensor:
-        """Maps observations, uint8 [..., C, X, Y], to values, float64 [..., A]; 0 for states never met."""
+        """Maps observations, [..., C, X, Y], to values, float64 [..., A]; 0 for states never met."""
         seen = observation.flatten(-self.observation_dims)
-        flat = seen.reshape(-1, seen.shape[-1]).numpy(force=True)
+        flat = np.ascontiguousarray(seen.reshape(-1, seen.shape[-1]).numpy(force=True))
         rows = torch.tensor([self._rows.get(state.tobytes(), -1) for state in flat])
         values, known = self.values.new_zeros((len(rows), self.values.shape[1])), rows >= 0
         values[known] = self.values[rows[known]]

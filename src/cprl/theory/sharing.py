@@ -16,7 +16,18 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from cprl import arguments
-from cprl.checks import MOST_NUMBER, Check, check_arguments, check_fields, count, instance, is_number
+from cprl.checks import (
+    MOST_NUMBER,
+    NONE,
+    Check,
+    check_arguments,
+    check_fields,
+    count,
+    either,
+    instance,
+    is_number,
+    number,
+)
 from cprl.theory.worth import PowerWorth, Worth
 
 _HALVINGS: Final = 200
@@ -38,8 +49,8 @@ class SharingGame:
     """v, what a unit is worth."""
     cost: float
     """c, what a unit costs who takes it, at least 0."""
-    most_each: float = inf
-    """The most that an agent can take, above 0."""
+    most_each: float | None = None
+    """The most that an agent can take, above 0; None for as much as it wants."""
     payment: float = 0.0
     """e, what each agent is paid whatever it takes."""
 
@@ -58,9 +69,9 @@ class SharingGame:
         own = arguments.floats("taken", taken)
         if own.ndim == 0 or own.shape[-1] != self.agents:
             raise ValueError(f"taken is {list(own.shape)}; allowed: [..., {self.agents}], a number per agent")
-        if not ((own >= 0) & (own <= self.most_each)).all():  # NaN is refused too
+        if not ((own >= 0) & (own <= self._limit) & np.isfinite(own)).all():
             raise ValueError(
-                f"taken has numbers from {own.min():g} to {own.max():g}; allowed: 0 to {self.most_each:g}"
+                f"taken has numbers from {own.min():g} to {own.max():g}; allowed: 0 to {self._limit:g}"
             )
         values = np.vectorize(self.worth.at, otypes=[np.float64])(own.sum(-1))
         paid: NDArray[np.float64] = own * (values - self.cost)[..., None] + self.payment
@@ -109,11 +120,15 @@ class SharingGame:
         def gain(own: float) -> float:
             return worth.at(own + others) + own * worth.slope(own + others) - self.cost
 
-        return _root(gain, min(self.most_each, max(worth.most - others, 0.0)))
+        return _root(gain, min(self._limit, max(worth.most - others, 0.0)))
+
+    @property
+    def _limit(self) -> float:
+        return inf if self.most_each is None else self.most_each
 
     def _balance(self, share: float) -> float:
         """The total X with v(X) + share X v'(X) = c, or the nearest one that agents can take."""
-        worth, most = self.worth, self.agents * self.most_each
+        worth, most = self.worth, self.agents * self._limit
         if isinstance(worth, PowerWorth):
             return min(worth.balance(self.cost, share), most)
 
@@ -194,15 +209,17 @@ def _total(value: float, name: str) -> float:
     return arguments.number(name, value, low=0, high=MOST_NUMBER, allowed="a number >= 0")
 
 
+_MOST: Final = 1e12
+_POSITIVE: Final = Check(
+    lambda value: is_number(value, 0, _MOST) and value > 0, f"a number above 0, up to {_MOST:g}"
+)
 _CHECKS: Final[dict[str, Check]] = {
     "agents": count(1),
     "worth": instance(
         Worth, "a Worth: PowerWorth, CallableWorth, or one of your own with `most`, `at`, `slope`"
     ),
-    "cost": Check(lambda value: is_number(value, 0, MOST_NUMBER), "a number >= 0"),
-    "most_each": Check(
-        lambda value: value == inf or (is_number(value, 0, MOST_NUMBER) and value > 0), "a number above 0"
-    ),
-    "payment": Check(lambda value: is_number(value, -MOST_NUMBER, MOST_NUMBER), "a number"),
+    "cost": number(0, _MOST),
+    "most_each": either(NONE, _POSITIVE),
+    "payment": number(-_MOST, _MOST),
 }
-_OF_APPROPRIATION: Final[dict[str, Check]] = {"tokens": _CHECKS["most_each"], "outside": _CHECKS["cost"]}
+_OF_APPROPRIATION: Final[dict[str, Check]] = {"tokens": _POSITIVE, "outside": _CHECKS["cost"]}
