@@ -7,7 +7,7 @@ from cprl.commandline import Allow, make_importable
 from cprl.evaluation.cross_play import crossplay
 from cprl.evaluation.egta import RESAMPLES, analyse
 from cprl.evaluation.egta_picture import draw_egta
-from cprl.evaluation.egta_tables import egta_tables
+from cprl.evaluation.egta_tables import egta_heading, egta_tables
 from cprl.evaluation.empirical_game import pairwise_game, play_empirical_game
 from cprl.evaluation.evaluate import SEED
 from cprl.evaluation_cli import print_tables, runs_by_name
@@ -71,6 +71,7 @@ def egta(
     if out is not None:
         write_table(out, game.episodes_table)
     found = analyse(game, alpha=alpha, resamples=resamples)
+    say(egta_heading(game))
     print_tables(*egta_tables(found))
     if out is not None:
         say(f"Episodes: {out}")

@@ -14,6 +14,7 @@ from matplotlib.figure import Figure
 
 from cprl.arguments import object_of
 from cprl.evaluation.egta import Analysis
+from cprl.evaluation.egta_tables import how_much_was_played
 from cprl.measuring.statistics import estimate
 from cprl.plotting import style
 from cprl.theory.evolution import replicator
@@ -44,12 +45,11 @@ def draw_egta(found: Analysis, path: Path | str) -> Path:
     draw = {2: _draw_line, 3: _draw_simplex}.get(len(found.game.names), _draw_deviations)
     draw(dynamics, found)
     _draw_rank(rank, found)
-    game, count = found.game, len(found.game.replicas)
+    game = found.game
     kind = f"pairwise reduction of {game.of_agents} agents" if game.is_reduction else f"{game.agents} agents"
     note = (
-        f"{kind}; {count} replica{'s' * (count != 1)}, {game.episodes} episodes each for each choice of who "
-        f"plays where; intervals: 95 %, of payoffs by Student's t, of shares by {found.resamples} resamples "
-        "of the replicas"
+        f"{kind}; {how_much_was_played(game)}; intervals: 95 %, of payoffs by Student's t, of shares by "
+        f"{found.resamples} resamples of the replicas"
     )
     style.head(figure, f"Empirical game of {', '.join(game.names)}", note)
     return style.save(figure, path)
@@ -107,7 +107,8 @@ def _draw_simplex(axes: Axes, found: Analysis) -> None:
     quiver = axes.quiver(
         *(mixtures @ _CORNERS).T, *arrows.T, lengths[:, 0], cmap="viridis", scale=24, width=0.005, pivot="mid"
     )
-    bar = axes.figure.colorbar(quiver, ax=axes, shrink=0.6, label="speed, of payoffs scaled to 0..1")
+    bar = axes.figure.colorbar(quiver, ax=axes, shrink=0.6)
+    bar.set_label("speed, of payoffs scaled to 0..1", fontsize=style.SMALL_PT)
     bar.ax.tick_params(labelsize=style.SMALL_PT)
     for mixture, share in zip(found.ends.mixtures, found.ends.shares, strict=True):
         at = mixture @ _CORNERS
@@ -120,7 +121,7 @@ def _draw_simplex(axes: Axes, found: Analysis) -> None:
         axes.annotate(
             name, corner, offset, textcoords="offset points", ha=align, va=height, fontsize=style.SMALL_PT
         )
-    axes.set(xlim=(-0.15, 1.15), ylim=(-0.15, 1.02), aspect="equal")
+    axes.set(xlim=(-0.08, 1.08), ylim=(-0.1, 1.06), aspect="equal")
     axes.set_axis_off()
     axes.set_title("replicator dynamics; dots: where starts end", fontsize=style.SMALL_PT)
 
@@ -152,7 +153,7 @@ def _draw_deviations(axes: Axes, found: Analysis) -> None:
             )
     for (x, y), name, share in zip(places, names, found.shares, strict=True):
         axes.plot(x, y, "o", color=style.MARK, markersize=5 + 14 * share.value, zorder=4)
-        axes.text(1.22 * x, 1.22 * y, name, ha="center", va="center", fontsize=style.SMALL_PT)
+        axes.text(1.32 * x, 1.22 * y, name, ha="center", va="center", fontsize=style.SMALL_PT)
     axes.set(xlim=(-1.6, 1.6), ylim=(-1.4, 1.4), aspect="equal")
     axes.set_axis_off()
     axes.set_title(

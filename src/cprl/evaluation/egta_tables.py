@@ -17,6 +17,25 @@ _LEAST: Final = 0.005
 """Smaller shares are not told."""
 
 
+def egta_heading(game: EmpiricalGame) -> str:
+    """The heading of the tables."""
+    how = how_they_play(list(game.runs.values()), game.greedy)
+    kind = "Pairwise reduction of the empirical game" if game.is_reduction else "Empirical game"
+    return (
+        f"{kind}: {how_much_was_played(game)}, seed {game.seed}{how}\n"
+        "returns: mean over replicas [95 % interval by Student's t]"
+    )
+
+
+def how_much_was_played(game: EmpiricalGame) -> str:
+    """Replicas and episodes, in words."""
+    replicas, episodes = len(game.replicas), game.episodes
+    return (
+        f"{replicas} replica{'s' * (replicas != 1)}, {episodes} episode{'s' * (episodes != 1)} each for each "
+        "choice of who plays where"
+    )
+
+
 def egta_tables(found: Analysis) -> Iterator[Table]:
     """The payoffs, the runs by alpha-rank, the equilibria, and where replicator dynamics end."""
     game = found.game
@@ -26,9 +45,9 @@ def egta_tables(found: Analysis) -> Iterator[Table]:
 
 
 def _pairs(game: EmpiricalGame) -> Table:
-    others = "the other agent" if game.of_agents == 2 else f"all other {game.of_agents - 1}"
-    table = Table(title=f"{_title(game)}\nreturn of an agent, by its run and that of {others}")
-    table.title_justify = "left"
+    others = "the other" if game.of_agents == 2 else f"all other {game.of_agents - 1}"
+    title = f"return of an agent, by its run and that of {others}"
+    table = Table(title=title, title_justify="left")
     table.add_column("an agent \\ others")
     for name in game.names:
         table.add_column(name, justify="right")
@@ -39,7 +58,7 @@ def _pairs(game: EmpiricalGame) -> Table:
 
 
 def _compositions(game: EmpiricalGame) -> Table:
-    title = f"{_title(game)}\nreturn of an agent of each run, by how many agents play as each"
+    title = "return of an agent of each run, by how many agents play as each"
     table = Table(title=title, title_justify="left")
     table.add_column("agents")
     for name in game.names:
@@ -99,16 +118,6 @@ def mixture_text(mixture: Values, names: Sequence[str]) -> str:
     """A mixture in words, e.g. "dqn 0.75, ppo 0.25"; one strategy by its name alone."""
     told = [(name, share) for name, share in zip(names, mixture, strict=True) if share >= _LEAST]
     return told[0][0] if len(told) == 1 else ", ".join(f"{name} {share:.2f}" for name, share in told)
-
-
-def _title(game: EmpiricalGame) -> str:
-    count = len(game.replicas)
-    how = how_they_play(list(game.runs.values()), game.greedy)
-    kind = "Pairwise reduction of the empirical game" if game.is_reduction else "Empirical game"
-    return (
-        f"{kind}: {count} replica{'s' * (count != 1)}, {game.episodes} episodes each for each choice of who "
-        f"plays where, seed {game.seed}{how}\nmean over replicas [95 % interval by Student's t]"
-    )
 
 
 def _mean(values: Values) -> Estimate:

@@ -29,7 +29,7 @@ MOST_PROFILES: Final = 256
 """S^N, e.g. 4 agents with 4 strategies; with more, OpenSpiel takes seconds."""
 MOST_ALPHA: Final = 500.0
 POPULATION: Final = 50
-STARTS: Final = 50
+STARTS: Final = 40
 
 _NOISES: Final = (1e-6, 1e-5, 1e-4, 1e-3)
 _LONGEST: Final = 400.0
