@@ -49,6 +49,7 @@ def test_intervals_that_hold_0_leave_several_dilemmas():
 
 def test_one_replica_tells_nothing_for_certain():
     found = of(3, 0, 5, 1, replicas=1)
+    assert found.name == "cannot be told"
     assert found.candidates[0] == "prisoner's dilemma"
     assert set(found.candidates) == {"prisoner's dilemma", "chicken", "stag hunt", "no dilemma"}
 

@@ -1,6 +1,7 @@
 """Games with a known answer: equilibria, optima, and what apples can bear."""
 
-from math import inf, sqrt
+from itertools import product
+from math import sqrt
 
 import numpy as np
 import pytest
@@ -9,6 +10,7 @@ from hypothesis import strategies as st
 from test_yields import AS_RUN, CROSS, PUBLISHED
 
 from cprl import Map, Rules, maps, presets
+from cprl.commons.near import neighbours
 from cprl.commons.yields import sustainable_yield
 from cprl.theory import (
     CallableWorth,
@@ -17,7 +19,7 @@ from cprl.theory import (
     appropriation,
     exact_yield,
     herders,
-    highest_yield,
+    yield_bounds,
 )
 from cprl.theory.yields import TOLERANCE
 
@@ -154,9 +156,13 @@ def test_a_pair_is_worked_by_hand():
     pair = maps.parse("AA>")
     rules = Rules(regrow_prob=(0.0, 0.5), regrow_before_bites=True)
     assert exact_yield(pair, rules).per_step == pytest.approx(0.5)
-    assert highest_yield(pair, rules) == 1.0, "each of the two"
+    both = yield_bounds(pair, rules)
+    assert (both.at_least, both.at_most, both.is_exact, both.kept.sum()) == (0.5, 0.5, True, 1)
     # Without growth in the turn of the bite a site is full, empty and perhaps full again: 0.5 / 1.5.
-    assert exact_yield(pair, Rules(regrow_prob=(0.0, 0.5))).per_step == pytest.approx(1 / 3)
+    late = Rules(regrow_prob=(0.0, 0.5))
+    assert exact_yield(pair, late).per_step == pytest.approx(1 / 3)
+    assert yield_bounds(pair, late).at_least == pytest.approx(1 / 3)
+    assert yield_bounds(pair, late).at_most == pytest.approx(1 / 2)
     assert exact_yield(maps.parse("A>"), PUBLISHED).per_step == 0
 
 
@@ -176,7 +182,11 @@ def boards(draw):
 def test_the_exact_yield_lies_between_the_bounds(board, probs, before):
     rules = Rules(regrow_prob=tuple(probs), regrow_before_bites=before)
     exact = exact_yield(board, rules).per_step
-    assert sustainable_yield(board, rules) - 1e-8 <= exact <= highest_yield(board, rules) + 1e-8
+    bounds = yield_bounds(board, rules)
+    assert sustainable_yield(board, rules) - 1e-8 <= bounds.at_least <= exact + 1e-8
+    assert exact <= bounds.at_most + 1e-8
+    if before:
+        assert bounds.is_exact or list(probs) != sorted(probs)
     assert exact_yield(board, rules, bites_per_step=1).per_step <= min(exact, 1) + 1e-8
     assert exact_yield(board, rules, sees_growth=True).per_step >= exact - 1e-8
 
@@ -186,4 +196,53 @@ def test_boards_with_too_many_sites_are_refused():
         exact_yield(presets.game("single_basic").map, PUBLISHED)
     with pytest.raises(ValueError, match="bites_per_step is 0; allowed: an integer >= 1"):
         exact_yield(CROSS, PUBLISHED, bites_per_step=0)
-    assert inf > highest_yield(presets.game("commons").map, PUBLISHED) > 1
+
+
+@settings(deadline=None, max_examples=25)
+@given(board=boards(), probs=st.lists(st.sampled_from([0.0, 0.05, 0.2, 0.5, 1.0]), min_size=1, max_size=5))
+def test_no_stock_grows_faster_than_the_bound(board, probs):
+    rules = Rules(regrow_prob=tuple(probs), regrow_before_bites=True)
+    first, near = neighbours(board, rules)
+    sites = len(board.sites)
+    around = [near[first[site] : first[site + 1]] for site in range(sites)]
+    growths = [
+        sum(
+            probs[min(sum(stock[other] for other in around[site]), len(probs) - 1)]
+            for site in range(sites)
+            if not stock[site]
+        )
+        for stock in product((0, 1), repeat=sites)
+    ]
+    assert yield_bounds(board, rules).at_most >= max(growths) - 1e-8
+    if list(probs) == sorted(probs):
+        assert yield_bounds(board, rules).at_most == pytest.approx(max(growths), abs=1e-8)
+
+
+@pytest.mark.parametrize(
+    ("board", "per_step"), [("single_basic", 0.5), ("single_complex", 0.9), ("commons", 2.51)]
+)
+def test_the_boards_as_run_bear_exactly_so_much(board, per_step):
+    game = presets.game(board, variant="as_run")
+    found = yield_bounds(game.map, game.rules)
+    assert found.is_exact
+    assert found.at_least == pytest.approx(per_step)
+
+
+def test_a_search_that_stops_early_leaves_bounds_apart():
+    game = presets.game("single_basic", variant="as_run")
+    found = yield_bounds(game.map, game.rules, nodes=2)
+    assert found.at_least <= 0.5 <= found.at_most
+    assert not found.is_exact
+
+
+@pytest.mark.parametrize(
+    ("given", "answer"),
+    [
+        ({"nodes": 0}, r"nodes is 0; allowed: an integer from 1"),
+        ({"board": "commons"}, "board is 'commons'; allowed: a Map"),
+        ({"rules": None}, "rules is None; allowed: Rules"),
+    ],
+)
+def test_bounds_of_anything_else_are_refused(given, answer):
+    with pytest.raises(ValueError, match=answer):
+        yield_bounds(**{"board": CROSS, "rules": AS_RUN, **given})

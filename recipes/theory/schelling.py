@@ -52,7 +52,7 @@ def row_of(board: str, rules: str, found: SchellingDiagram) -> list[str]:
     ends = [of_kind[:, at] for at in (-1, 0) for of_kind in (found.restrained_payoffs, found.greedy_payoffs)]
     dilemma = found.dilemma()
     return [
-        *(f"`{board}`", rules, Path(found.greedy).name),
+        *(f"`{board}`", rules, "trained DQN" if "/" in found.greedy else found.greedy),
         *(str(estimate(values, interval="t")) for values in ends),
         *(str(margin) for margin in (dilemma.restraint, dilemma.fear, dilemma.greed)),
         dilemma.name,

@@ -39,7 +39,7 @@ def draw_schelling(found: SchellingDiagram, path: Path | str, *, interval: Inter
         (found.restrained_payoffs, found.restrained, "restrained", _RESTRAINED, "o"),
         (found.greedy_payoffs, found.greedy, "greedy", _GREEDY, "s"),
     ):
-        _line(own, payoffs, interval, label=f"{Path(who).name} ({role})", color=colour, marker=marker)
+        _line(own, payoffs, interval, label=f"{role}: {Path(who).name}", color=colour, marker=marker)
     own.set_xlabel(f"restrained agents among the other {found.agents - 1}", fontsize=style.SMALL_PT)
     own.set_ylabel("return of the agent", fontsize=style.SMALL_PT)
     own.legend(fontsize=style.SMALL_PT)

@@ -26,6 +26,9 @@ from cprl import arguments
 from cprl.measuring.statistics import Estimate, Interval, difference
 
 NONE: Final = "no dilemma"
+UNTOLD: Final = "cannot be told"
+_ALL: Final = 4
+"""The number of names: three dilemmas, and none."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -51,7 +54,7 @@ class Dilemma:
     @property
     def name(self) -> str:
         """The dilemma, or those that it may be."""
-        return " or ".join(self.candidates)
+        return " or ".join(self.candidates) if len(self.candidates) < _ALL else UNTOLD
 
 
 def dilemma(restrained: ArrayLike, greedy: ArrayLike, *, interval: Interval = "t") -> Dilemma:

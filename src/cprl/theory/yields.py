@@ -1,6 +1,6 @@
-"""What apples can bear: exactly on a board of a few sites, and at most on any board.
+"""What apples can bear on a board of a few sites, exactly, for whoever can visit so many cells a turn.
 
-`cprl.commons.yields.sustainable_yield` is a lower bound for any board.
+`cprl.theory.growth` has bounds for any board.
 """
 
 from dataclasses import dataclass
@@ -79,28 +79,6 @@ def exact_yield(
         if gains.max() - found < TOLERANCE:
             return ExactYield(per_step=found, kept=float(long_run @ moves.left[policy]))
     raise RuntimeError(f"no policy was proven best in {_MOST_ROUNDS * _ROUNDS_AT_ONCE:,} rounds")
-
-
-def highest_yield(board: Map, rules: Rules) -> float:
-    """Apples per turn that no policy can exceed in the long run: a proven upper bound for any board.
-
-    A site with m others near grows an apple in a turn in which it is empty with at most the probability
-    p = max(`regrow_prob`[:m + 1]), and then stands full until it is bitten: p apples per turn at most under
-    `regrow_before_bites`, else p / (1 + p), since it is still full in the turn in which it is bitten.
-
-    Args:
-        board: the map.
-        rules: its rules.
-
-    Raises:
-        ValueError: for anything else.
-    """
-    _check(board, rules)
-    first, _ = neighbours(board, rules)
-    probs = np.array(rules.regrow_prob)
-    highest = np.maximum.accumulate(probs)[np.minimum(np.diff(first), len(probs) - 1)]
-    rate = highest if rules.regrow_before_bites else highest / (1 + highest)
-    return float(rate.sum())
 
 
 def _check(board: object, rules: object) -> None:

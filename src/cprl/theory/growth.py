@@ -1,0 +1,139 @@
+"""yield_bounds: how many apples a turn a board can bear, proven from below and from above.
+
+In a turn that begins with a stock s, a site k without an apple grows one with the probability p of the number
+of apples near it. So no policy gets more in the long run than the largest growth of any stock,
+
+    max over s of  sum over k empty in s of  p(apples of s near k).
+
+The same stock tells how to harvest: whoever takes an apple as soon as it grows, and nothing else, keeps s.
+Where apples grow before bites this gives all that grows, so that both bounds meet; else a harvested site is
+full in the turn in which it is bitten, and gives p / (1 + p) instead of p. The stock is found by integer
+programming (HiGHS, by scipy), whose own bound is a proof, too, where the search is stopped early.
+"""
+
+from dataclasses import dataclass
+from typing import Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from cprl import arguments
+from cprl.commons.maps import Map
+from cprl.commons.near import neighbours
+from cprl.commons.rules import Rules
+
+NODES: Final = 500
+"""Of the search in each patch of sites, by default: enough for a proof on those of all published boards."""
+_EXACT: Final = 1e-7
+
+Floats = NDArray[np.float64]
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class YieldBounds:
+    """Apples a turn that all agents together can harvest for ever, wherever they are."""
+
+    at_least: float
+    at_most: float
+    kept: NDArray[np.bool_]
+    """bool [K], a stock to keep: who harvests all other sites as soon as they grow gets `at_least`."""
+
+    @property
+    def is_exact(self) -> bool:
+        """Whether both bounds are the same, but for rounding."""
+        return self.at_most - self.at_least < _EXACT
+
+
+def yield_bounds(board: Map, rules: Rules, *, nodes: int = NODES) -> YieldBounds:
+    """What a board bears, from below and from above.
+
+    Ways, clashes and beams are left out, so that agents may get less than `at_least`; none get more than
+    `at_most` in the long run, nor on average in an episode of T turns more than the first stock and
+    T x `at_most`.
+
+    Args:
+        board: the map.
+        rules: its rules.
+        nodes: how long the search goes on: more bring the bounds together. The result follows from it alone,
+            not from the machine's speed.
+
+    Raises:
+        ValueError: for anything else.
+    """
+    arguments.object_of("board", board, Map, "a Map")
+    arguments.object_of("rules", rules, Rules, "Rules")
+    nodes = arguments.integer("nodes", nodes, 1, 2**31 - 1)
+    first, near = neighbours(board, rules)
+    around = [near[first[k] : first[k + 1]].astype(np.int64) for k in range(len(first) - 1)]
+    probs = np.array(rules.regrow_prob, np.float64)
+    counts = np.minimum(np.arange(max(map(len, around)) + 1), len(probs) - 1)
+    highest = np.maximum.accumulate(probs[counts])
+    lowest = np.minimum.accumulate(probs[counts][::-1])[::-1]
+    kept_rate = lowest if rules.regrow_before_bites else lowest / (1 + lowest)
+    kept, bound = _best_stock(around, kept_rate, nodes)
+    if not np.array_equal(kept_rate, highest):
+        _, bound = _best_stock(around, highest, nodes)
+    at_least = _growth(kept, around, kept_rate)
+    return YieldBounds(at_least=at_least, at_most=max(bound, at_least), kept=kept)
+
+
+def _growth(stock: NDArray[np.bool_], around: list[NDArray[np.int64]], rate: Floats) -> float:
+    """The sum over empty sites of the rate of the number of full ones near them."""
+    return float(sum(rate[stock[around[site]].sum()] for site in np.flatnonzero(~stock)))
+
+
+def _best_stock(around: list[NDArray[np.int64]], rate: Floats, nodes: int) -> tuple[NDArray[np.bool_], float]:
+    """The stock with the largest growth that is found, and a bound that no stock exceeds; each patch of sites
+    that are near each other, directly or by others, is searched by itself."""
+    from scipy.sparse import csr_array
+    from scipy.sparse.csgraph import connected_components
+
+    ends = np.concatenate(around), np.repeat(np.arange(len(around)), [len(near) for near in around])
+    links = csr_array((np.ones(len(ends[0])), ends), shape=(len(around), len(around)))
+    count, patch_of = connected_components(links, directed=False)
+    stock, bound = np.zeros(len(around), np.bool_), 0.0
+    for patch in range(count):
+        sites = np.flatnonzero(patch_of == patch)
+        own = [np.searchsorted(sites, around[site]) for site in sites]
+        stock[sites], most = _best_of_patch(own, rate, nodes)
+        bound += most
+    return stock, bound
+
+
+def _best_of_patch(
+    around: list[NDArray[np.int64]], rate: Floats, nodes: int
+) -> tuple[NDArray[np.bool_], float]:
+    """`_best_stock` of one patch, by integer programming.
+
+    x_k says that site k is full, z_km that it is empty with m or more full sites near, for each m at which
+    the rate rises: the growth is the sum of the rises.
+    """
+    from scipy.optimize import Bounds, LinearConstraint, milp
+    from scipy.sparse import csr_array
+
+    sites, rises = len(around), np.diff(rate)
+    steps = [
+        (site, count + 1)
+        for site, near in enumerate(around)
+        for count in np.flatnonzero(rises[: len(near)]).tolist()
+    ]
+    gain = np.array([-rate[0]] * sites + [rises[count - 1] for _, count in steps])
+    if not gain.any():
+        return np.zeros(sites, np.bool_), 0.0
+    cells: dict[tuple[int, int], float] = {}
+    for nth, (site, count) in enumerate(steps):
+        unless_full, where_near = 2 * nth, 2 * nth + 1
+        cells |= {(unless_full, sites + nth): 1.0, (unless_full, site): 1.0, (where_near, sites + nth): count}
+        cells |= {(where_near, int(other)): -1.0 for other in around[site]}
+    rows, columns = np.array(list(cells), np.int64).reshape(-1, 2).T
+    matrix = csr_array((list(cells.values()), (rows, columns)), shape=(2 * len(steps), len(gain)))
+    found = milp(
+        -gain,
+        constraints=LinearConstraint(matrix, ub=np.tile([1.0, 0.0], len(steps))) if steps else (),
+        integrality=np.ones(len(gain)),
+        bounds=Bounds(0, 1),
+        options={"node_limit": nodes},
+    )
+    if found.x is None:
+        raise RuntimeError(f"no stock was found in {nodes:,} nodes; allowed: more nodes")
+    return found.x[:sites] > 0.5, float(rate[0]) * sites - float(found.mip_dual_bound)
