@@ -60,6 +60,7 @@ PACKAGES = (
     "flags",
     "commandline",
     "evaluation_cli",
+    "egta_cli",
     "studies_options",
     "studies_cli",
     "cli",

@@ -12,6 +12,7 @@ from pathlib import Path
 import tyro
 
 from cprl.commandline import Allow, in_a_sentence, make_importable
+from cprl.egta_cli import egta
 from cprl.evaluation.evaluate import SEED
 from cprl.evaluation_cli import crossplay, evaluate, film, schelling, visits
 from cprl.experiment import Experiment
@@ -210,6 +211,7 @@ def main() -> None:
                 "visits": visits,
                 "crossplay": crossplay,
                 "schelling": schelling,
+                "egta": egta,
                 "sweep": sweep,
                 "table": runs_table,
             },

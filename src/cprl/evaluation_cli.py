@@ -110,7 +110,7 @@ def evaluate(
     )
     if out is not None:
         write_table(out, evaluation.table())
-    _print(run_table(evaluation))
+    print_tables(run_table(evaluation))
     say(f"Weights: {evaluation.run.weights_from}")
     if out is not None:
         say(f"Episodes: {out}")
@@ -147,7 +147,7 @@ def visits(
         raise ValueError("--random says who is drawn; allowed: with --figure FILE.png")
     prepare_process(seed)
     found = territory_of(run, episodes=episodes, greedy=greedy, seed=seed, replicas=replicas, allow=allow)
-    _print(territory_table(found))
+    print_tables(territory_table(found))
     say(f"Weights: {found.run.weights_from}")
     if figure is not None:
         say(f"Figure: {draw_visits(found, figure, policy='random' if random else 'trained')}")
@@ -187,7 +187,7 @@ def crossplay(
         check_picture(figure, "--figure")
     prepare_process(seed)
     played = play_each_other(
-        _runs_by_name(runs),
+        runs_by_name(runs),
         episodes=episodes,
         greedy=greedy,
         seed=seed,
@@ -198,7 +198,7 @@ def crossplay(
     if out is not None:
         write_table(out, played.table())
     say(heading(played))
-    _print(*matrices(played), *gains_tables(played), agents_table(played))
+    print_tables(*matrices(played), *gains_tables(played), agents_table(played))
     if out is not None:
         say(f"Episodes: {out}")
     if figure is not None:
@@ -254,15 +254,19 @@ def schelling(
     )
     if out is not None:
         write_table(out, found.table())
-    _print(*schelling_tables(found))
+    print_tables(*schelling_tables(found))
     if out is not None:
         say(f"Episodes: {out}")
     if figure is not None:
         say(f"Figure: {draw_schelling(found, figure)}")
 
 
-def _runs_by_name(words: Sequence[str]) -> list[str] | dict[str, str]:
-    """Runs as `crossplay` takes them: paths, or a table where one has a name, NAME=PATH."""
+def runs_by_name(words: Sequence[str]) -> list[str] | dict[str, str]:
+    """Runs as `crossplay` takes them: paths, or a table where one has a name, NAME=PATH.
+
+    Raises:
+        ValueError: if two have one name.
+    """
     pairs = [_name_and_path(word) for word in words]
     if not any(name for name, _ in pairs):
         return [path for _, path in pairs]
@@ -280,7 +284,7 @@ def _name_and_path(word: str) -> tuple[str, str]:
     return (name, path) if equals and name and "/" not in name and not Path(word).exists() else ("", word)
 
 
-def _print(*tables: Table) -> None:
+def print_tables(*tables: Table) -> None:
     """Prints tables; into a file or pipe as wide as they are."""
     shown = console(width=None if OUT.isatty() else 250)
     for table in tables:

@@ -12,6 +12,7 @@ from .cases import Case
 OF_FILES: Final = {
     "cprl.commandline:recipe_main",
     "cprl.evaluation.cross_play:crossplay",
+    "cprl.evaluation.empirical_game:play_empirical_game",
     "cprl.evaluation.evaluate:evaluate_run",
     "cprl.evaluation.populations:play_population",
     "cprl.evaluation.schelling:schelling",
@@ -40,6 +41,7 @@ OF_FILES: Final = {
 SLOW: Final = {
     "cprl.commandline:recipe_main",
     "cprl.evaluation.cross_play:crossplay",
+    "cprl.evaluation.empirical_game:play_empirical_game",
     "cprl.evaluation.evaluate:evaluate_run",
     "cprl.evaluation.populations:play_population",
     "cprl.evaluation.schelling:schelling",
@@ -51,6 +53,7 @@ SLOW: Final = {
     "cprl.terminal.figures:training_curve",
     "cprl.measuring.phases:find_phases",
     "cprl.measuring.phases:change_points",
+    "cprl.theory.evolution:replicator_ends",
 }
 """Those of which a case may take a tenth of a second or more."""
 

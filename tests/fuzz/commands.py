@@ -102,6 +102,13 @@ _SUBCOMMANDS: Final[dict[str, tuple[list[st.SearchStrategy[list[str]]], tuple[An
         [_run("plain", "finished"), _run("plain", "finished")],
         (*_PLAYED, _flag("--diagonal", "self", "cross_seed", "selfplay")),
     ),
+    "egta": (
+        [_run("plain", "finished"), _run("plain", "finished")],
+        (
+            *(*_PLAYED, _flag("--pairwise"), _flag("--figure", "game.png", "game.gif")),
+            *(_flag("--alpha", "1", "50", "0"), _flag("--resamples", "1", "0")),
+        ),
+    ),
     "schelling": (
         [_run("plain", "finished", "results")],
         (

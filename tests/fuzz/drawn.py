@@ -148,6 +148,13 @@ OWN: Final[dict[str, dict[str, st.SearchStrategy[Any]]]] = {
         "replicas": st.sampled_from(((), (0,), (1, 0))),
         "allow": _ALLOW,
     },
+    "cprl.evaluation.empirical_game:play_empirical_game": {
+        "runs": st.lists(_FINISHED, min_size=1, max_size=2),
+        "episodes": _FEW,
+        "seed": _SEEDS,
+        "replicas": st.sampled_from(((), (0,), (1, 0))),
+        "allow": _ALLOW,
+    },
     "cprl.evaluation.evaluate:evaluate_run": _FRESH,
     "cprl.evaluation.populations:play_population": {
         "where": st.sampled_from((things.MEADOW, stag_hunt(turns=2))),

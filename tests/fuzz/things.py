@@ -68,7 +68,7 @@ from cprl.policies.lanes import random_agents
 from cprl.population import Frozen, Learning, Scripted, Team
 from cprl.preferences import Exchange, InequityAversion, SocialValueOrientation
 from cprl.spaces import Spaces
-from cprl.theory import CallableWorth, PowerWorth, SharingGame, appropriation, herders
+from cprl.theory import CallableWorth, PayoffTable, PowerWorth, SharingGame, appropriation, herders
 
 MEADOW: Final = Game(
     map=maps.parse(".A>.A\nA.A.A\n..<.A"),
@@ -220,6 +220,11 @@ _MAKERS: Final[dict[type, tuple[Callable[[], Any], ...]]] = {
     nn.Module: (tiny_network, lambda: nn.Linear(2, 3), random_policy),
     Logger: (lambda: CSVLogger("fuzz", log_dir="logs"),),
     Console: (lambda: Console(quiet=True),),
+    PayoffTable: (
+        lambda: PayoffTable.of_pairs([[3, 0], [5, 1]]),
+        lambda: PayoffTable.of_pairs([[0, -1, 1], [1, 0, -1], [-1, 1, 0]]),
+        lambda: PayoffTable(agents=3, payoffs=np.arange(8.0).reshape(4, 2)),
+    ),
     Path: (lambda: Path("somewhere"), lambda: Path("some/where.pt")),
     Episode: (lambda: episodes()[0], lambda: episodes()[1]),
     torch.Tensor: (lambda: torch.zeros(6, 2), lambda: torch.ones(1, 6, 2), lambda: torch.rand(2, 6, 2)),

@@ -6,6 +6,8 @@ Modules, in the order in which one reads them:
     gains       what a focal agent gains over the agent whose place it takes, and what it costs the others
     populations play_population: scripted and stored agents in any mix
     schelling   what restrained and greedy agents get, by how many of the others are restrained
+    empirical_game  play_empirical_game: the game whose strategies are runs; pairwise_game: of a cross-play
+    egta        analyse: which runs last in it, by alpha-rank, equilibria and replicator dynamics
     territory   territory_of: where the agents of a run go and whom they tag
     film        an episode, every step recorded
     film_video  the same as a GIF or an MP4
@@ -18,10 +20,15 @@ Modules, in the order in which one reads them:
     video_files      GIF and MP4 out of pictures
     gains_picture    gains as two matrices
     schelling_picture  a Schelling diagram
+    egta_tables      an empirical game for the terminal
+    egta_picture     the dynamics of an empirical game, and its alpha-rank
     visits_picture   a map for each agent of where it spends its time
 """
 
 from cprl.evaluation.cross_play import Cell, CrossPlay, crossplay
+from cprl.evaluation.egta import Analysis, analyse
+from cprl.evaluation.egta_picture import draw_egta
+from cprl.evaluation.empirical_game import EmpiricalGame, pairwise_game, play_empirical_game
 from cprl.evaluation.evaluate import Evaluation, evaluate_run
 from cprl.evaluation.gains import Gain, gains
 from cprl.evaluation.gains_picture import draw_gains
@@ -32,18 +39,24 @@ from cprl.evaluation.territory import Territory, territory_of
 from cprl.evaluation.visits_picture import draw_visits
 
 __all__ = [
+    "Analysis",
     "Cell",
     "CrossPlay",
+    "EmpiricalGame",
     "Evaluation",
     "Gain",
     "SchellingDiagram",
     "Territory",
+    "analyse",
     "crossplay",
+    "draw_egta",
     "draw_gains",
     "draw_schelling",
     "draw_visits",
     "evaluate_run",
     "gains",
+    "pairwise_game",
+    "play_empirical_game",
     "play_population",
     "schelling",
     "territory_of",

@@ -169,7 +169,7 @@ def crossplay(
             `cprl.evaluate_run`.
     """
     arguments.choice("diagonal", diagonal, get_args(Diagonal))
-    named = _named(runs, allow)
+    named = named_runs(runs, allow)
     first, *_ = named.values()
     check_same_game(named)
     if first.game.agents == 1:
@@ -224,10 +224,21 @@ def _played_among(
     return {agent: played([*own[:agent], focal_source, *own[agent + 1 :]]) for agent in agents}
 
 
-def _named(
-    runs: Sequence[str | Path | LoadedRun] | Mapping[str, str | Path | LoadedRun], allow: Sequence[str]
+def named_runs(
+    runs: Sequence[str | Path | LoadedRun] | Mapping[str, str | Path | LoadedRun],
+    allow: Sequence[str],
+    command: str = "crossplay",
 ) -> dict[str, LoadedRun]:
-    """The runs by given names, by names of their directories, or by their paths if those coincide."""
+    """The runs by given names, by names of their directories, or by their paths if those coincide.
+
+    Args:
+        runs: see `crossplay`.
+        allow: see `cprl.load`.
+        command: what a message says that takes them.
+
+    Raises:
+        ValueError: for fewer than two, and for a run that is given twice.
+    """
     given: list[str] = []
     if isinstance(runs, Mapping):
         for name in runs:
@@ -237,7 +248,7 @@ def _named(
     opened_runs = [opened(run, allow) for run in listed]
     if len(opened_runs) < 2:
         raise ValueError(
-            f"the number of runs is {len(opened_runs)}; allowed: at least two: cprl crossplay RUN RUN..."
+            f"the number of runs is {len(opened_runs)}; allowed: at least two: cprl {command} RUN RUN..."
         )
     paths = [run.path.resolve() for run in opened_runs]
     for place, path in enumerate(paths):

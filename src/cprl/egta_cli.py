@@ -1,0 +1,79 @@
+"""`cprl egta`: which of several runs lasts where agents choose among them."""
+
+from math import inf
+from pathlib import Path
+
+from cprl.commandline import Allow, make_importable
+from cprl.evaluation.cross_play import crossplay
+from cprl.evaluation.egta import RESAMPLES, analyse
+from cprl.evaluation.egta_picture import draw_egta
+from cprl.evaluation.egta_tables import egta_heading, egta_tables
+from cprl.evaluation.empirical_game import pairwise_game, play_empirical_game
+from cprl.evaluation.evaluate import SEED
+from cprl.evaluation_cli import print_tables, runs_by_name
+from cprl.output import say
+from cprl.plotting.style import check_picture
+from cprl.process import prepare_process
+from cprl.runs.labelled import refuse_to_write_over, write_table
+from cprl.theory.evolution import check_alpha
+from cprl.theory.extras import check_extras
+
+
+def egta(
+    runs: tuple[str, ...],
+    /,
+    *,
+    episodes: int = 5,
+    pairwise: bool = False,
+    alpha: float = inf,
+    resamples: int = RESAMPLES,
+    greedy: bool = False,
+    seed: int = SEED,
+    replicas: tuple[int, ...] = (),
+    out: Path | None = None,
+    figure: Path | None = None,
+    allow: Allow = (),
+) -> None:
+    """Lets agents of runs play in all compositions, and prints which runs last: equilibria, alpha-rank,
+    replicator dynamics (extra "theory").
+
+    Args:
+        runs: directories of runs of the same game, or their results; NAME=PATH gives one another name.
+        episodes: of each replica and choice of who plays where.
+        pairwise: play one agent of each run among those of each other, as `cprl crossplay` does: cheaper,
+            and a reduction where there are more than two agents.
+        alpha: of alpha-rank, how strongly payoffs, scaled to 0..1, select; by default the limit.
+        resamples: of the replicas, for intervals.
+        greedy: whether agents play what they hold best, without exploring or drawing.
+        seed: of the worlds and all chance; the same one gives the same numbers.
+        replicas: their numbers; by default all that every run has.
+        out: a parquet file to be, with every episode.
+        figure: a PNG to be: the dynamics, and the shares by alpha-rank.
+        allow: code of your own, module:Class, that the run may import; see docs/changing.md.
+    """
+    check_extras()
+    check_alpha(alpha)
+    make_importable(allow)
+    if out is not None:
+        refuse_to_write_over(out)
+    if figure is not None:
+        check_picture(figure, "--figure")
+    prepare_process(seed)
+    named, chosen = runs_by_name(runs), list(replicas)
+    if pairwise:
+        game = pairwise_game(
+            crossplay(named, episodes=episodes, greedy=greedy, seed=seed, replicas=chosen, allow=allow)
+        )
+    else:
+        game = play_empirical_game(
+            named, episodes=episodes, greedy=greedy, seed=seed, replicas=chosen, allow=allow
+        )
+    if out is not None:
+        write_table(out, game.episodes_table)
+    found = analyse(game, alpha=alpha, resamples=resamples)
+    say(egta_heading(game))
+    print_tables(*egta_tables(found))
+    if out is not None:
+        say(f"Episodes: {out}")
+    if figure is not None:
+        say(f"Figure: {draw_egta(found, figure)}")

@@ -1,0 +1,198 @@
+"""play_empirical_game: the game whose strategies are stored runs, and whose payoffs are their returns.
+
+Each agent plays as a run, i.e. as the run's agent with its index. For N agents and S runs every composition
+is played, so many agents of one run and so many of the next: C = (N + S - 1)! / (N! (S - 1)!). A composition
+of several runs is played N times, with the agents of the first run from index s on, cyclically, then those of
+the second and so on, for each s, so that each run has each index as often as every other index. Replica r is
+that of all runs, in the same worlds for all compositions; agents of one run learned together.
+
+`pairwise_game` makes a game of two agents of what `crossplay` played, the payoffs of one focal agent by its
+run and that of the background agents. For N = 2 it is the same game. For more agents it is a reduction that
+knows what the first agent gains who deviates from the run of all others, and nothing of mixes; its equilibria
+in which one run is played are those of the whole game, the others need not be.
+"""
+
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
+
+import numpy as np
+import pyarrow as pa
+from numpy.typing import NDArray
+
+from cprl import arguments
+from cprl.evaluation.cross_play import CrossPlay, named_runs
+from cprl.evaluation.evaluate import SEED, check, chosen_replicas
+from cprl.evaluation.lanes import Played, Source, play, policies_of
+from cprl.evaluation.same_game import check_same_game
+from cprl.measuring.episodes import Episode
+from cprl.runs.labelled import labelled
+from cprl.stored import LoadedRun
+from cprl.theory.evolution import MOST_PROFILES
+from cprl.theory.payoff_table import PayoffTable, compositions
+
+Values = NDArray[np.float64]
+Who = tuple[int, ...]
+"""Which run each agent plays as."""
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class EmpiricalGame:
+    """A game of N agents whose strategies are S runs; see the docstring of this module."""
+
+    runs: Mapping[str, LoadedRun]
+    """The S runs by name."""
+    agents: int
+    """N of this game: 2 of a pairwise one."""
+    of_agents: int
+    """The agents of the game that was played."""
+    payoffs: Values
+    """float64 [R, C, S]: the mean return of an agent of a run by replica and composition, in the rows of
+    `cprl.theory.compositions(agents, S)`; NaN where nobody plays as the run."""
+    replicas: list[int]
+    episodes: int
+    """Of each replica and each choice of who plays where."""
+    seed: int
+    greedy: bool
+    episodes_table: pa.Table
+    """All episodes with the columns of `episodes.parquet`, after those that say who played: "runs", the
+    names of all agents' runs, or those of `CrossPlay.table`."""
+
+    @property
+    def names(self) -> list[str]:
+        """The names of the runs."""
+        return list(self.runs)
+
+    @property
+    def is_reduction(self) -> bool:
+        """Whether more agents played than this game has."""
+        return self.agents < self.of_agents
+
+    def table(self, replicas: Sequence[int] | None = None) -> PayoffTable:
+        """The mean payoffs over replicas.
+
+        Args:
+            replicas: their places in `payoffs`, e.g. a resample; by default all once.
+
+        Raises:
+            ValueError: for places that are not there.
+        """
+        last = len(self.payoffs) - 1
+        chosen = range(last + 1) if replicas is None else arguments.listed("replicas", replicas, "places")
+        places = [arguments.integer("a place of a replica", own, 0, last) for own in chosen]
+        if not places:
+            raise ValueError("replicas is empty; allowed: at least one place")
+        return PayoffTable(agents=self.agents, payoffs=self.payoffs[places].mean(0))
+
+
+def play_empirical_game(
+    runs: Sequence[str | Path | LoadedRun] | Mapping[str, str | Path | LoadedRun],
+    *,
+    episodes: int = 5,
+    greedy: bool = False,
+    seed: int = SEED,
+    replicas: Sequence[int] = (),
+    allow: Sequence[str] = (),
+) -> EmpiricalGame:
+    """Plays all compositions of runs.
+
+    Args:
+        runs: at least two runs of the same game, as for `crossplay`. With S runs and N agents up to 256
+            profiles S^N are allowed, e.g. four runs of four agents; `pairwise_game` has no such bound.
+        episodes: episodes of each replica and choice of who plays where, each in its own world; the choices
+            are N (C - S) + S.
+        greedy: see `cprl.evaluate_run`.
+        seed: the seed of the worlds and of all random numbers.
+        replicas: the indices of the replicas that play; by default all that every run has.
+        allow: see `cprl.load`.
+
+    Raises:
+        ValueError: if the runs have different games, the game has one agent, there are too many profiles, or
+            a run is given twice; and see `cprl.evaluate_run`.
+    """
+    named = named_runs(runs, allow, command="egta")
+    check_same_game(named)
+    agents = next(iter(named.values())).game.agents
+    if agents < 2:
+        raise ValueError("the game has 1 agent; allowed for an empirical game: at least 2")
+    if (profiles := len(named) ** agents) > MOST_PROFILES:
+        raise ValueError(
+            f"{len(named)} runs of {agents} agents have {profiles:,} profiles; allowed: at most "
+            f"{MOST_PROFILES}; crossplay and pairwise_game (cprl egta --pairwise) take more"
+        )
+    check(episodes=episodes, seed=seed, greedy=greedy, runs=list(named.values()))
+    numbers = chosen_replicas(named, replicas)
+    counts = compositions(agents, len(named))
+    played = {}
+    for own in counts.tolist():
+        for who in _choices(own):
+            sources = [Source(list(named.values())[run]) for run in who]
+            policies = partial(policies_of, sources, worlds=episodes, seed=seed)
+            played[who] = play(
+                sources[0].run, policies, numbers, episodes=episodes, seed=seed, explore=not greedy
+            )
+    return EmpiricalGame(
+        runs=named,
+        agents=agents,
+        of_agents=agents,
+        payoffs=np.array(
+            [[_payoffs(own, played, replica) for own in counts.tolist()] for replica in numbers]
+        ),
+        replicas=numbers,
+        episodes=episodes,
+        seed=seed,
+        greedy=greedy,
+        episodes_table=labelled(_rows(list(named), played)),
+    )
+
+
+def pairwise_game(played: CrossPlay) -> EmpiricalGame:
+    """The game of two agents that a cross-play makes; see the docstring of this module.
+
+    Args:
+        played: the cross-play; its `diagonal` says who plays where both play as one run.
+    """
+    arguments.object_of("played", played, CrossPlay, "what crossplay() gave")
+    names = list(played.runs)
+    returns = {at: cell.returns("focal") for at, cell in played.cells.items()}
+    matrices = [
+        [[np.mean(returns[focal, background][replica]) for background in names] for focal in names]
+        for replica in played.replicas
+    ]
+    return EmpiricalGame(
+        runs=played.runs,
+        agents=2,
+        of_agents=next(iter(played.runs.values())).game.agents,
+        payoffs=np.array([PayoffTable.of_pairs(own).payoffs for own in matrices]),
+        replicas=played.replicas,
+        episodes=played.episodes,
+        seed=played.seed,
+        greedy=played.greedy,
+        episodes_table=played.table(),
+    )
+
+
+def _choices(counts: Sequence[int]) -> list[Who]:
+    """Who plays at which index, for each of N shifts; of one run alone the one way."""
+    first = tuple(int(run) for run in np.repeat(np.arange(len(counts)), counts))
+    shifts = len(first) if len(set(first)) > 1 else 1
+    return [(*first[-shift:], *first[:-shift]) if shift else first for shift in range(shifts)]
+
+
+def _payoffs(counts: Sequence[int], played: Mapping[Who, Played], replica: int) -> list[float]:
+    """The mean return of an agent of each run, [S]; NaN for a run that does not play."""
+    returns: list[list[float]] = [[] for _ in counts]
+    for who in _choices(counts):
+        for episode in played[who][replica]:
+            for run, own in zip(who, episode.return_, strict=True):
+                returns[run].append(float(own))
+    return [float(np.mean(own)) if own else float("nan") for own in returns]
+
+
+def _rows(
+    names: Sequence[str], played: Mapping[Who, Played]
+) -> Iterator[tuple[dict[str, str], int, list[Episode]]]:
+    for who, by_replica in played.items():
+        for replica, episodes in by_replica.items():
+            yield {"runs": " ".join(names[run] for run in who)}, replica, episodes

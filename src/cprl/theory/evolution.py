@@ -1,0 +1,214 @@
+"""Which strategies last where they compete: alpha-rank and replicator dynamics, by OpenSpiel.
+
+Alpha-rank: each of the N agents stands for a population that plays one strategy. Now and then a mutant turns
+up in one of them, and takes it over the more probably, the more it gets beside what it replaces while the
+other populations stay as they are. How often each composition is seen in the long run ranks the strategies.
+Mutants are compared with those whose place they take, not with the other agents, so what lasts is what no
+agent gains by leaving: compositions that are equilibria, or cycles around none.
+
+Replicator dynamics: in one large population, agents meet by chance, N at a time; a strategy's share grows at
+the rate at which it gets more than the mean.
+
+Source: S. Omidshafiei et al., "Alpha-Rank: Multi-Agent Evaluation by Evolution" (2019), for several
+populations; M. Rowland et al., "Multiagent Evaluation under Incomplete Information" (2019), for the limit of
+infinite alpha.
+"""
+
+from dataclasses import dataclass
+from math import inf
+from typing import Any, Final
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from cprl import arguments
+from cprl.theory.extras import extra
+from cprl.theory.payoff_table import PayoffTable, Values, mixture_of
+
+MOST_PROFILES: Final = 256
+"""S^N, e.g. 4 agents with 4 strategies; with more, OpenSpiel takes seconds."""
+MOST_ALPHA: Final = 500.0
+POPULATION: Final = 50
+STARTS: Final = 40
+
+_NOISES: Final = (1e-6, 1e-5, 1e-4, 1e-3)
+_LONGEST: Final = 400.0
+_AT_REST: Final = 1e-6
+_SAME: Final = 0.01
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class AlphaRank:
+    """How often compositions and strategies are seen in the long run."""
+
+    compositions: Values
+    """float64 [C], of the rows of the table; sums to 1."""
+    shares: Values
+    """float64 [S], the mean share of the agents that play a strategy; sums to 1."""
+
+
+def alpha_rank(table: PayoffTable, *, alpha: float = inf, population: int = POPULATION) -> AlphaRank:
+    """Alpha-rank of a symmetric game, by OpenSpiel.
+
+    Payoffs are first scaled to 0..1, so that alpha means the same in every game. In the limit of infinite
+    alpha a mutant takes over if it gets more, with probability 1/2 if it gets the same (to 1e-5 of what it
+    gets), and else almost never; "almost" is 1e-6, or the next power of ten with which OpenSpiel can tell a
+    single long run from several, up to 1e-3.
+
+    Args:
+        table: with at most 256 profiles S^N; of a larger game its `reduced`.
+        alpha: how strongly payoffs select, above 0, up to 500, or infinite.
+        population: the agents of each population, for finite alpha.
+
+    Raises:
+        ValueError: for a larger table, numbers out of range, and for an alpha so high that the numbers of
+            mutants that get less and still take over are 0 in float64; the limit has no such bound.
+        ModuleNotFoundError: if OpenSpiel is not installed.
+    """
+    arguments.object_of("table", table, PayoffTable, "a PayoffTable")
+    population = arguments.integer("population", population, 2, 10_000)
+    profiles = table.strategies**table.agents
+    if profiles > MOST_PROFILES:
+        raise ValueError(
+            f"table has {table.strategies}^{table.agents} = {profiles:,} profiles; allowed: at most "
+            f"{MOST_PROFILES}, e.g. table.reduced"
+        )
+    of_profiles = _long_run(table, check_alpha(alpha), population)
+    played = np.array(np.unravel_index(np.arange(profiles), (table.strategies,) * table.agents)).T
+    found = np.zeros(len(table.counts))
+    for profile, chance in zip(played, of_profiles, strict=True):
+        counts = np.bincount(profile, minlength=table.strategies)
+        found[table.rows[tuple(counts.tolist())]] += chance
+    return AlphaRank(compositions=found, shares=found @ table.counts / table.agents)
+
+
+def check_alpha(alpha: float) -> float:
+    """An alpha that `alpha_rank` takes.
+
+    Raises:
+        ValueError: for anything else.
+    """
+    if isinstance(alpha, float) and alpha == inf:
+        return inf
+    allowed = f"a number above 0, up to {MOST_ALPHA:g}, or infinity"
+    return arguments.number("alpha", alpha, low=0, high=MOST_ALPHA, above=True, allowed=allowed)
+
+
+def _long_run(table: PayoffTable, alpha: float, population: int) -> Values:
+    """The share of each profile of N agents, [S^N], the last agent's strategy changing fastest."""
+    rank, tables = extra("open_spiel.python.egt.alpharank"), [_heuristic(table.normalised)] * table.agents
+    if alpha != inf:
+        try:
+            with np.errstate(over="ignore"):  # 1 / exp of much is 0, as it should be
+                found = rank.compute(tables, m=population, alpha=alpha)[2]
+        except ValueError as error:
+            raise ValueError(
+                f"alpha is {alpha:g}; allowed for this table: lower, or infinity, since mutants that get "
+                f"less take over with a probability that rounds to 0 ({error})"
+            ) from error
+        return _shares(found)
+    for noise in _NOISES:
+        try:
+            return _shares(rank.compute(tables, use_inf_alpha=True, inf_alpha_eps=noise)[2])
+        except ValueError as error:
+            last = error
+    raise last
+
+
+def _shares(found: Any) -> Values:
+    shares: Values = np.maximum(np.asarray(found, dtype=np.float64), 0.0)
+    whole: Values = shares / shares.sum()
+    return whole
+
+
+def _heuristic(table: PayoffTable) -> Any:
+    """The table as OpenSpiel has it, 0 where nobody plays."""
+    made = extra("open_spiel.python.egt.heuristic_payoff_table").PayoffTable(table.agents, table.strategies)
+    for counts, payoffs in zip(table.counts.tolist(), np.nan_to_num(table.payoffs), strict=True):
+        made[tuple(counts)] = payoffs
+    return made
+
+
+def replicator(table: PayoffTable, mixture: ArrayLike) -> Values:
+    """How fast the shares of the strategies change, float64 [S], which sums to 0: by OpenSpiel.
+
+    Args:
+        table: the game; time is in units of its payoffs.
+        mixture: the shares, float [S], that sum to 1.
+
+    Raises:
+        ValueError: for shares that do not.
+        ModuleNotFoundError: if OpenSpiel is not installed.
+    """
+    arguments.object_of("table", table, PayoffTable, "a PayoffTable")
+    shares = mixture_of(mixture, table.strategies)
+    found = extra("open_spiel.python.egt.dynamics").replicator(shares, table.against(shares))
+    return np.asarray(found, dtype=np.float64)
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Ends:
+    """Where replicator dynamics end."""
+
+    mixtures: Values
+    """float64 [K, S], the points of rest that were reached, the most frequent first."""
+    shares: Values
+    """float64 [K], of the starts that end there."""
+    unsettled: float
+    """The share of the starts that go on for ever, or for very long."""
+
+
+def replicator_ends(table: PayoffTable, *, starts: int = STARTS, seed: int = 0) -> Ends:
+    """Where replicator dynamics end that start anywhere, with all shares above 0.
+
+    Args:
+        table: the game.
+        starts: so many mixtures, drawn uniformly.
+        seed: the seed of these draws.
+
+    Raises:
+        ValueError: for numbers out of range.
+        ModuleNotFoundError: if OpenSpiel is not installed.
+    """
+    arguments.object_of("table", table, PayoffTable, "a PayoffTable")
+    starts = arguments.integer("starts", starts, 1, 10_000)
+    rng = np.random.default_rng(arguments.seed(seed))
+    reached = [_end(table, own) for own in rng.dirichlet(np.ones(table.strategies), starts)]
+    settled = [own for own in reached if own is not None]
+    groups: list[list[Values]] = []
+    for own in settled:
+        near = [group for group in groups if np.abs(group[0] - own).max() < _SAME]
+        if near:
+            near[0].append(own)
+        else:
+            groups.append([own])
+    groups.sort(key=len, reverse=True)
+    return Ends(
+        mixtures=np.array([np.mean(group, axis=0) for group in groups]).reshape(-1, table.strategies),
+        shares=np.array([len(group) / starts for group in groups]),
+        unsettled=1 - len(settled) / starts,
+    )
+
+
+def _end(table: PayoffTable, start: Values) -> Values | None:
+    """Where the dynamics end, or None if they are not at rest after a long time."""
+    from scipy import integrate
+
+    scaled, flow = table.normalised, extra("open_spiel.python.egt.dynamics").replicator
+
+    def speed(_: float, shares: Values) -> Values:
+        kept = np.maximum(shares, 0.0)
+        kept = kept / kept.sum()
+        return np.asarray(flow(kept, scaled.against_shares(kept)), dtype=np.float64)
+
+    def moves(time: float, shares: Values) -> float:
+        return float(np.abs(speed(time, shares)).max() - _AT_REST)
+
+    moves.terminal = True  # type: ignore[attr-defined]
+    if moves(0.0, start) <= 0:
+        return start
+    found = integrate.solve_ivp(
+        speed, (0.0, _LONGEST), start, method="LSODA", events=moves, rtol=1e-4, atol=1e-8
+    )
+    end: Values = np.maximum(found.y[:, -1], 0.0)
+    return end / end.sum() if found.status == 1 else None

@@ -1,0 +1,242 @@
+"""PayoffTable: a symmetric game of N agents with a few strategies, by how many agents play each.
+
+What an agent gets depends on its own strategy and on how many of the others play each, not on who they are.
+So N agents with S strategies need a row for each of the C = (N + S - 1)! / (N! (S - 1)!) compositions, not
+one for each of the S^N profiles. Empirical games, whose strategies are stored policies and whose payoffs are
+measured, are given in this way.
+
+Source: W. E. Walsh, R. Das, G. Tesauro and J. O. Kephart, "Analyzing Complex Strategic Interactions in
+Multi-Agent Systems" (2002); for the reduction to pairs, of which it is the case of two agents, M. P. Wellman,
+"Methods for Empirical Game-Theoretic Analysis" (2006).
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from itertools import combinations
+from math import comb, factorial
+from typing import Final, Self
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from cprl import arguments
+from cprl.theory.sharing import SharingGame
+
+Counts = NDArray[np.int64]
+Values = NDArray[np.float64]
+
+MOST_COMPOSITIONS: Final = 100_000
+_SUM: Final = 1e-6
+"""By how much the shares of a mixture may miss 1."""
+
+
+def compositions(agents: int, strategies: int) -> Counts:
+    """How many of N agents play each of S strategies, int64 [C, S], every way once; the first row has all of
+    them play strategy 0, the last one the last strategy.
+
+    Raises:
+        ValueError: for numbers out of range, and for more than 100,000 rows.
+    """
+    agents = arguments.integer("agents", agents, 1, 1000)
+    strategies = arguments.integer("strategies", strategies, 1, 1000)
+    rows = comb(agents + strategies - 1, agents)
+    if rows > MOST_COMPOSITIONS:
+        raise ValueError(
+            f"{agents} agents with {strategies} strategies have {rows:,} compositions; allowed: at most "
+            f"{MOST_COMPOSITIONS:,}"
+        )
+    places = combinations(range(agents + strategies - 1), strategies - 1)  # of bars among agents
+    bars = np.array(list(places), dtype=np.int64).reshape(rows, strategies - 1)
+    ends = np.pad(bars, ((0, 0), (1, 1)), constant_values=((0, 0), (-1, agents + strategies - 1)))
+    return np.ascontiguousarray((np.diff(ends, axis=1) - 1)[::-1])
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class PayoffTable:
+    """What agents get by how many play each strategy; see the docstring of this module.
+
+    Raises:
+        ValueError: names the field, what came and what is allowed.
+    """
+
+    agents: int
+    """The number of agents N, at least 2."""
+    payoffs: Values
+    """float64 [C, S], in units of one's own: what an agent gets who plays a strategy, for each row of
+    `counts`; finite where somebody plays it, elsewhere whatever is given becomes NaN."""
+
+    def __post_init__(self) -> None:
+        agents = arguments.integer("agents", self.agents, 2, 1000)
+        given = arguments.floats("payoffs", self.payoffs)
+        strategies = given.shape[1] if given.ndim == 2 else 0
+        rows = comb(agents + strategies - 1, agents) if strategies > 1 else 0
+        if given.ndim != 2 or strategies < 2 or len(given) != rows:
+            wanted = f"[{rows}, {strategies}]" if rows else "[C, S], of 2 or more strategies"
+            raise ValueError(f"payoffs is {list(given.shape)}; allowed with {agents} agents: {wanted}")
+        counts = compositions(agents, strategies)
+        payoffs = np.where(counts > 0, given, np.nan)
+        if not np.isfinite(payoffs[counts > 0]).all():
+            raise ValueError("payoffs has NaN or infinity where agents play; allowed: finite numbers")
+        object.__setattr__(self, "agents", agents)
+        object.__setattr__(self, "payoffs", payoffs)
+
+    @classmethod
+    def of_pairs(cls, matrix: ArrayLike) -> Self:
+        """The game of two agents: entry [i, j] is what one gets who plays i, where the other plays j.
+
+        Raises:
+            ValueError: if it is not float [S, S].
+        """
+        given = arguments.floats("matrix", matrix)
+        if given.ndim != 2 or given.shape[0] != given.shape[1] or len(given) < 2:
+            raise ValueError(f"matrix is {list(given.shape)}; allowed: [S, S], of 2 or more strategies")
+        counts = compositions(2, len(given))
+        other = counts[:, None, :] - np.eye(len(given), dtype=np.int64)  # [C, own strategy, the other's]
+        return cls(agents=2, payoffs=(other * given).sum(-1))
+
+    @property
+    def strategies(self) -> int:
+        """The number of strategies S."""
+        return int(self.payoffs.shape[1])
+
+    @cached_property
+    def counts(self) -> Counts:
+        """int64 [C, S]: how many agents play each strategy."""
+        return compositions(self.agents, self.strategies)
+
+    @cached_property
+    def rows(self) -> dict[tuple[int, ...], int]:
+        """The rows by their counts."""
+        return {tuple(own): row for row, own in enumerate(self.counts.tolist())}
+
+    @cached_property
+    def deviations(self) -> Values:
+        """float64 [C', S]: what an agent gets who plays a strategy, by how many of the other N - 1 play each,
+        in the rows of `compositions(N - 1, S)`."""
+        others, _ = self._others
+        steps = np.eye(self.strategies, dtype=np.int64)
+        return np.array(
+            [
+                [
+                    self.payoffs[self.rows[tuple((own + step).tolist())], strategy]
+                    for strategy, step in enumerate(steps)
+                ]
+                for own in others
+            ]
+        )
+
+    @cached_property
+    def pairs(self) -> Values:
+        """float64 [S, S]: entry [i, j] is what one agent gets who plays i, where all others play j."""
+        alone = [self.rows[tuple(own.tolist())] for own in self.counts if own.max() >= self.agents - 1]
+        found = np.empty((self.strategies, self.strategies))
+        for row in alone:
+            own, payoffs = self.counts[row], self.payoffs[row]
+            for focal in np.flatnonzero(own):
+                rest = own.copy()
+                rest[focal] -= 1
+                if rest.max() == self.agents - 1:
+                    found[focal, rest.argmax()] = payoffs[focal]
+        return found
+
+    @property
+    def reduced(self) -> "PayoffTable":
+        """The game of two agents with the payoffs of `pairs`, a reduction unless N is 2: it says what the
+        first agent gains who deviates from what all others play, and nothing of other compositions."""
+        return self.of_pairs(self.pairs)
+
+    @cached_property
+    def normalised(self) -> "PayoffTable":
+        """The same game with payoffs from 0 to 1; all 0 where they are all the same."""
+        low, high = float(np.nanmin(self.payoffs)), float(np.nanmax(self.payoffs))
+        return PayoffTable(agents=self.agents, payoffs=(self.payoffs - low) / ((high - low) or 1.0))
+
+    def against(self, mixture: ArrayLike) -> Values:
+        """What an agent gets by its strategy, float64 [S], if each of the others plays one by chance.
+
+        It is the mean over what the N - 1 others play, so it is also defined for strategies that nobody
+        plays. (OpenSpiel's `expected_payoff` of a heuristic payoff table is another number: the mean over
+        the compositions of all N agents in which the strategy occurs, as in K. Tuyls et al. (2018).)
+
+        Args:
+            mixture: the shares of the strategies, float [S], that sum to 1.
+
+        Raises:
+            ValueError: for anything else.
+        """
+        return self.against_shares(mixture_of(mixture, self.strategies))
+
+    def against_shares(self, shares: Values) -> Values:
+        """`against`, of float64 [S] that is known to be shares."""
+        others, ways = self._others
+        found: Values = (ways * np.prod(shares**others, axis=1)) @ self.deviations
+        return found
+
+    @cached_property
+    def _others(self) -> tuple[Counts, Values]:
+        """What the N - 1 others may play, and in how many ways, [C', S] and [C']."""
+        others = compositions(self.agents - 1, self.strategies)
+        return others, np.array([_ways(own) for own in others.tolist()])
+
+    @property
+    def pure_equilibria(self) -> list[tuple[int, ...]]:
+        """The counts of the compositions in which no agent gains if it alone plays another strategy."""
+        return [own for own in self.rows if all(gain <= 0 for gain in self._gains(own))]
+
+    def _gains(self, own: Sequence[int]) -> list[float]:
+        """What an agent gains by another strategy, for every strategy that is played."""
+        found = []
+        for played in np.flatnonzero(own):
+            for other in range(self.strategies):
+                if other != played:
+                    there = list(own)
+                    there[played] -= 1
+                    there[other] += 1
+                    got = self.payoffs[self.rows[tuple(there)], other]
+                    found.append(float(got - self.payoffs[self.rows[tuple(own)], played]))
+        return found
+
+
+def sharing_table(game: SharingGame, levels: ArrayLike) -> PayoffTable:
+    """A game of sharing in which agents choose among a few levels of what they take.
+
+    Args:
+        game: the game, of two or more agents.
+        levels: float [S], what an agent may take.
+
+    Raises:
+        ValueError: for levels that cannot be taken, or are fewer than two.
+    """
+    arguments.object_of("game", game, SharingGame, "a SharingGame, e.g. herders(2)")
+    taken = arguments.floats("levels", levels)
+    if taken.ndim != 1 or len(taken) < 2:
+        raise ValueError(f"levels is {list(taken.shape)}; allowed: [S], of 2 or more levels")
+    counts = compositions(game.agents, len(taken))
+    payoffs = np.zeros(counts.shape)
+    for row, own in enumerate(counts):
+        played = np.repeat(np.arange(len(taken)), own)
+        payoffs[row, played] = game.payoffs(taken[played])
+    return PayoffTable(agents=game.agents, payoffs=payoffs)
+
+
+def mixture_of(mixture: ArrayLike, strategies: int) -> Values:
+    """Shares of strategies, float64 [S], that sum to 1.
+
+    Raises:
+        ValueError: for anything else.
+    """
+    shares = arguments.floats("mixture", mixture)
+    is_mixture = shares.shape == (strategies,) and (shares >= 0).all() and abs(shares.sum() - 1) < _SUM
+    if not is_mixture:
+        allowed = f"[{strategies}] of shares from 0 to 1 that sum to 1"
+        raise arguments.refusal("mixture", shares.tolist(), allowed)
+    return shares
+
+
+def _ways(counts: Sequence[int]) -> float:
+    """In how many ways so many agents can play the strategies."""
+    left = factorial(sum(counts))
+    for count in counts:
+        left //= factorial(count)
+    return float(left)
