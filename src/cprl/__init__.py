@@ -51,7 +51,7 @@ Each imports only from those above it:
     reporting    finished runs beside the published study
     flags        the fields of an experiment as flags
     commandline  recipe_main: the command line of a recipe
-    evaluation_cli  cprl film, evaluate and crossplay
+    evaluation_cli  cprl film, evaluate, visits, crossplay and scenarios
     studies_options  how a study is run, as options of a command line
     studies_cli  cprl sweep, and study_main: the command line of a recipe of a study
     cli          the command cprl

@@ -13,7 +13,7 @@ import tyro
 
 from cprl.commandline import Allow, in_a_sentence, make_importable
 from cprl.evaluation.evaluate import SEED
-from cprl.evaluation_cli import crossplay, evaluate, film, visits
+from cprl.evaluation_cli import crossplay, evaluate, film, scenarios, visits
 from cprl.experiment import Experiment
 from cprl.output import keep_output, say
 from cprl.play.opening import SEED as PLAY_SEED
@@ -209,6 +209,7 @@ def main() -> None:
                 "evaluate": evaluate,
                 "visits": visits,
                 "crossplay": crossplay,
+                "scenarios": scenarios,
                 "sweep": sweep,
                 "table": runs_table,
             },

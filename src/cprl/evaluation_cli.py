@@ -1,4 +1,4 @@
-"""`cprl film`, `cprl evaluate`, `cprl visits` and `cprl crossplay`: stored agents in fresh worlds."""
+"""`cprl film`, `evaluate`, `visits`, `crossplay` and `scenarios`: stored agents in fresh worlds."""
 
 from collections.abc import Sequence
 from pathlib import Path
@@ -13,6 +13,9 @@ from cprl.evaluation.evaluate import SEED, evaluate_run
 from cprl.evaluation.film import film as film_run
 from cprl.evaluation.film_video import SUFFIXES, film_video
 from cprl.evaluation.gains_picture import draw_gains
+from cprl.evaluation.scenarios import draw_scenarios, run_scenarios
+from cprl.evaluation.scenarios.tables import heading as scenarios_heading
+from cprl.evaluation.scenarios.tables import scenario_tables
 from cprl.evaluation.tables import agents_table, gains_tables, heading, matrices, run_table, territory_table
 from cprl.evaluation.territory import territory_of
 from cprl.evaluation.visits_picture import draw_visits
@@ -191,6 +194,59 @@ def crossplay(
         say(f"Episodes: {out}")
     if figure is not None:
         say(f"Figure: {draw_gains(played, figure)}")
+
+
+def scenarios(
+    run: Path,
+    /,
+    *,
+    scenarios: tuple[str, ...] = (),
+    episodes: int = 5,
+    greedy: bool = False,
+    seed: int = SEED,
+    replicas: tuple[int, ...] = (),
+    out: Path | None = None,
+    figure: Path | None = None,
+    allow: Allow = (),
+) -> None:
+    """Lets a run's agents play among agents that they never met, and prints how they fare beside random and
+    greedy agents in their places.
+
+    Args:
+        run: the run's directory, or its results; of one that has not ended the newest checkpoint plays.
+        scenarios: their names, e.g. minority_among_greedy; by default all of the run's game.
+        episodes: of each replica in each placement.
+        greedy: whether stored agents play what they hold best, without exploring or drawing.
+        seed: of the worlds and all chance; the same one gives the same numbers.
+        replicas: their numbers; by default all.
+        out: a parquet file to be, with every episode.
+        figure: a PNG to be: the returns in each scenario.
+        allow: code of your own, module:Class, that the run may import; see docs/changing.md.
+    """
+    make_importable(allow)
+    if out is not None:
+        refuse_to_write_over(out)
+    if figure is not None:
+        check_picture(figure, "--figure")
+    prepare_process(seed)
+    scores = run_scenarios(
+        run,
+        scenarios=scenarios,
+        episodes=episodes,
+        greedy=greedy,
+        seed=seed,
+        replicas=replicas,
+        allow=allow,
+    )
+    if out is not None:
+        write_table(out, scores.table())
+    say(scenarios_heading(scores))
+    _print(*scenario_tables(scores))
+    say(f"Weights: {scores.run.weights_from}")
+    if out is not None:
+        say(f"Episodes: {out}")
+    if figure is not None:
+        say(f"Figure: {draw_scenarios(scores, figure)}")
 
 
 def _runs_by_name(words: Sequence[str]) -> list[str] | dict[str, str]:

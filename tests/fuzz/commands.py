@@ -102,6 +102,14 @@ _SUBCOMMANDS: Final[dict[str, tuple[list[st.SearchStrategy[list[str]]], tuple[An
         [_run("plain", "finished"), _run("plain", "finished")],
         (*_PLAYED, _flag("--diagonal", "self", "cross_seed", "selfplay")),
     ),
+    "scenarios": (
+        [_run("plain", "finished", "results", "stopped")],
+        (
+            *_PLAYED,
+            _flag("--scenarios", "minority_among_greedy", "minority_among_wolves"),
+            _flag("--figure", "scores.png", "some/scores.png"),
+        ),
+    ),
 }
 
 

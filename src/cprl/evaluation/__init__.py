@@ -5,6 +5,7 @@ Modules, in the order in which one reads them:
     cross_play  crossplay: a focal agent of one run among background agents of another
     gains       what a focal agent gains over the agent whose place it takes, and what it costs the others
     populations play_population: scripted and stored agents in any mix
+    scenarios   run_scenarios: a run among named backgrounds that it never met
     territory   territory_of: where the agents of a run go and whom they tag
     film        an episode, every step recorded
     film_video  the same as a GIF or an MP4
@@ -23,6 +24,7 @@ from cprl.evaluation.evaluate import Evaluation, evaluate_run
 from cprl.evaluation.gains import Gain, gains
 from cprl.evaluation.gains_picture import draw_gains
 from cprl.evaluation.populations import play_population
+from cprl.evaluation.scenarios import Scenario, Score, Scores, draw_scenarios, run_scenarios, scenarios_of
 from cprl.evaluation.territory import Territory, territory_of
 from cprl.evaluation.visits_picture import draw_visits
 
@@ -31,12 +33,18 @@ __all__ = [
     "CrossPlay",
     "Evaluation",
     "Gain",
+    "Scenario",
+    "Score",
+    "Scores",
     "Territory",
     "crossplay",
     "draw_gains",
+    "draw_scenarios",
     "draw_visits",
     "evaluate_run",
     "gains",
     "play_population",
+    "run_scenarios",
+    "scenarios_of",
     "territory_of",
 ]
