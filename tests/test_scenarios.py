@@ -1,7 +1,9 @@
 """Stored runs play among named backgrounds, and the numbers are those worked by hand."""
 
+import importlib.util
 from dataclasses import replace
 from functools import partial
+from pathlib import Path
 
 import pyarrow.parquet as pq
 import pytest
@@ -263,3 +265,16 @@ def test_odd_scenarios_are_refused(given, answer):
     how = {"name": "own", "game": MEADOW, "focal": "minority", "background": (Scripted("greedy"),) * 2}
     with pytest.raises(ValueError, match=answer):
         Scenario(**{**how, **given})
+
+
+def test_the_page_has_the_numbers_of_the_committed_estimates():
+    docs = Path(__file__).parents[1] / "docs"
+    spec = importlib.util.spec_from_file_location("scenarios_baseline", docs / "scenarios_baseline.py")
+    baseline = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(baseline)
+    page = (docs / "scenarios.md").read_text()
+    played = sorted(path.stem for path in baseline.OUT.glob("*.csv"))
+    assert played
+    assert set(played) <= set(baseline.POPULATIONS)
+    for name in played:
+        assert baseline.table(name) in page, name

@@ -7,6 +7,7 @@ from typing import Any, Final
 import pyarrow as pa
 from rich.table import Table
 
+from cprl.arguments import object_of
 from cprl.evaluation.scenarios.score import FOCAL_AGENTS, Scores
 from cprl.evaluation.tables import how_they_play
 from cprl.measuring.names import with_unit
@@ -78,8 +79,13 @@ def estimates(scores: Scores) -> pa.Table:
     """Every measure of every scenario as a row: "scenario", "focal" (who takes the focal places), "metric",
     "value", "low" and "high" (null where undefined), and how many "replicas", "episodes" and "undefined"
     episodes there were. Metrics "focal/advantage" and "background/advantage" of "random" and "greedy" are
-    what the run's agents, or the background among them, get more; see `Score.advantage`."""
-    rows = []
+    what the run's agents, or the background among them, get more; see `Score.advantage`.
+
+    Raises:
+        ValueError: if `scores` is not what `run_scenarios` gave.
+    """
+    object_of("scores", scores, Scores, "what run_scenarios() gave")
+    rows: list[dict[str, Any]] = []
     for name, score in scores.by_scenario.items():
         for who in FOCAL_AGENTS:
             for metric, measured in score.measures(who).items():
