@@ -38,7 +38,7 @@ COLUMNS: Final = {
     "more than beside greedy": ("greedy", "background/advantage"),
     "collective return": ("run", "collective_return"),
     "equality": ("run", "equality"),
-    "peacefulness": ("run", "peacefulness"),
+    "survival, steps": ("run", "survival_steps"),
 }
 """Columns of the page by who is focal and the metric."""
 
