@@ -61,6 +61,7 @@ PACKAGES = (
     "commandline",
     "evaluation_cli",
     "egta_cli",
+    "scenarios_cli",
     "studies_options",
     "studies_cli",
     "cli",

@@ -53,6 +53,7 @@ Each imports only from those above it:
     commandline  recipe_main: the command line of a recipe
     evaluation_cli  cprl film, evaluate, visits, crossplay and schelling
     egta_cli     cprl egta
+    scenarios_cli  cprl scenarios
     studies_options  how a study is run, as options of a command line
     studies_cli  cprl sweep, and study_main: the command line of a recipe of a study
     cli          the command cprl

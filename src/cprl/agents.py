@@ -68,7 +68,7 @@ class Population:
         self._game = None if commons is None else commons.game
         self._device = env.device or torch.device("cpu")
         self._groups = grouped(specs, self.spaces.agents)
-        _check_scripted(self._groups, self.spaces, self._game)
+        check_scripted(self._groups, self.spaces, self._game)
         numbers = range(first_replica, first_replica + self.replicas)
         self._frozen = {
             spec: frozen_agents(spec, self.spaces, self._game, allow, numbers)
@@ -193,8 +193,17 @@ def _learner(spec: Learning | Team, spaces: Spaces, agents: tuple[int, ...], who
     return learner
 
 
-def _check_scripted(groups: Sequence[tuple[AgentSpec, Any]], spaces: Spaces, game: Game | None) -> None:
-    """Refuses scripted policies where transforms changed the windows that they read."""
+def check_scripted(groups: Sequence[tuple[AgentSpec, Any]], spaces: Spaces, game: Game | None) -> None:
+    """Checks that no transform changed the windows that scripted policies read.
+
+    Args:
+        groups: specifications, and the agent indices of each.
+        spaces: what agents observe, transforms included.
+        game: what is played; None for a game that is not a `Game`.
+
+    Raises:
+        ValueError: names the agents and their policy.
+    """
     for spec, agents in groups:
         is_reading = isinstance(spec, Scripted) and spec.policy != "random"
         if (

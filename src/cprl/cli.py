@@ -28,6 +28,7 @@ from cprl.reporting import write_report
 from cprl.running import run as run_experiment
 from cprl.runs.directory import read_recipe
 from cprl.runs.export import export_results
+from cprl.scenarios_cli import scenarios
 from cprl.studies.tables.table_command import runs_table
 from cprl.studies_cli import sweep
 from cprl.viewer.page import Page, has_display
@@ -212,6 +213,7 @@ def main() -> None:
                 "crossplay": crossplay,
                 "schelling": schelling,
                 "egta": egta,
+                "scenarios": scenarios,
                 "sweep": sweep,
                 "table": runs_table,
             },

@@ -118,6 +118,14 @@ _SUBCOMMANDS: Final[dict[str, tuple[list[st.SearchStrategy[list[str]]], tuple[An
             *(_flag("--variant", "published", "as_run"), *_COMMON),
         ),
     ),
+    "scenarios": (
+        [_run("plain", "finished", "results", "stopped")],
+        (
+            *_PLAYED,
+            _flag("--scenarios", "minority_among_greedy", "minority_among_wolves"),
+            _flag("--figure", "scores.png", "some/scores.png"),
+        ),
+    ),
 }
 
 

@@ -177,6 +177,10 @@ OWN: Final[dict[str, dict[str, st.SearchStrategy[Any]]]] = {
         "found": st.just(0).map(lambda _: schelling(things.MEADOW, episodes=1, replicas=2)),
         "path": st.sampled_from(("diagram.png", "new/diagram.png", "diagram.gif")),
     },
+    "cprl.evaluation.scenarios.suite:run_scenarios": {
+        **_FRESH,
+        "scenarios": st.sampled_from(((), ["minority_among_greedy"], ["minority_among_wolves"])),
+    },
     "cprl.evaluation.territory:territory_of": _FRESH,
     "cprl.evaluation.visits_picture:draw_visits": {
         "found": st.just(0).map(lambda _: territory_of(runs.folder("plain"), episodes=1)),

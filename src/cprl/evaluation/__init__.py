@@ -8,6 +8,7 @@ Modules, in the order in which one reads them:
     schelling   what restrained and greedy agents get, by how many of the others are restrained
     empirical_game  play_empirical_game: the game whose strategies are runs; pairwise_game: of a cross-play
     egta        analyse: which runs last in it, by alpha-rank, equilibria and replicator dynamics
+    scenarios   run_scenarios: a run among named backgrounds that it never met
     territory   territory_of: where the agents of a run go and whom they tag
     film        an episode, every step recorded
     film_video  the same as a GIF or an MP4
@@ -33,6 +34,7 @@ from cprl.evaluation.evaluate import Evaluation, evaluate_run
 from cprl.evaluation.gains import Gain, gains
 from cprl.evaluation.gains_picture import draw_gains
 from cprl.evaluation.populations import play_population
+from cprl.evaluation.scenarios import Scenario, Score, Scores, draw_scenarios, run_scenarios, scenarios_of
 from cprl.evaluation.schelling import SchellingDiagram, schelling
 from cprl.evaluation.schelling_picture import draw_schelling
 from cprl.evaluation.territory import Territory, territory_of
@@ -45,12 +47,16 @@ __all__ = [
     "EmpiricalGame",
     "Evaluation",
     "Gain",
+    "Scenario",
     "SchellingDiagram",
+    "Score",
+    "Scores",
     "Territory",
     "analyse",
     "crossplay",
     "draw_egta",
     "draw_gains",
+    "draw_scenarios",
     "draw_schelling",
     "draw_visits",
     "evaluate_run",
@@ -58,6 +64,8 @@ __all__ = [
     "pairwise_game",
     "play_empirical_game",
     "play_population",
+    "run_scenarios",
+    "scenarios_of",
     "schelling",
     "territory_of",
 ]

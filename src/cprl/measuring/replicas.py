@@ -8,7 +8,7 @@ from statistics import fmean
 
 from cprl import arguments
 from cprl.measuring.episodes import Episode
-from cprl.measuring.statistics import Estimate, estimate
+from cprl.measuring.statistics import Estimate, Interval, estimate
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -30,8 +30,12 @@ class Measured:
         return f"{value}, undefined in {self.undefined} of {self.episodes}" if self.undefined else value
 
 
-def over_replicas(values: Mapping[int, Sequence[float]]) -> Measured:
+def over_replicas(values: Mapping[int, Sequence[float]], *, interval: Interval = "bca") -> Measured:
     """Estimates a metric from its values by replica, one per episode, NaN where undefined.
+
+    Args:
+        values: the values by replica.
+        interval: see `cprl.measuring.statistics.Interval`.
 
     Raises:
         ValueError: if there are no replicas, or a replica has no episodes.
@@ -47,7 +51,7 @@ def over_replicas(values: Mapping[int, Sequence[float]]) -> Measured:
     means = [fmean(own) for own in defined if own]
     episodes = sum(map(len, values.values()))
     return Measured(
-        estimate=estimate(means) if means else None,
+        estimate=estimate(means, interval=interval) if means else None,
         undefined=episodes - sum(map(len, defined)),
         episodes=episodes,
     )
@@ -72,12 +76,15 @@ def institution_metrics(episode: Episode) -> dict[str, float]:
     return {**episode.institutions, **{f"in_force_{nth}": value for nth, value in enumerate(in_force)}}
 
 
-def institution_measures(played: Mapping[int, Sequence[Episode]]) -> dict[str, Measured]:
+def institution_measures(
+    played: Mapping[int, Sequence[Episode]], *, interval: Interval = "bca"
+) -> dict[str, Measured]:
     """`institution_metrics` over replicas, by name, as `institutions/fines` and so on; empty for a game
     without institutions.
 
     Args:
         played: episodes by replica.
+        interval: see `cprl.measuring.statistics.Interval`.
 
     Raises:
         ValueError: see `over_replicas`.
@@ -89,17 +96,21 @@ def institution_measures(played: Mapping[int, Sequence[Episode]]) -> dict[str, M
     names = next((own[0] for own in by_replica.values() if own), {})
     return {
         f"institutions/{name}": over_replicas(
-            {replica: [metrics[name] for metrics in own] for replica, own in by_replica.items()}
+            {replica: [metrics[name] for metrics in own] for replica, own in by_replica.items()},
+            interval=interval,
         )
         for name in names
     }
 
 
-def social_measures(played: Mapping[int, Sequence[Episode]]) -> dict[str, Measured]:
+def social_measures(
+    played: Mapping[int, Sequence[Episode]], *, interval: Interval = "bca"
+) -> dict[str, Measured]:
     """`social_metrics` over replicas, by name.
 
     Args:
         played: episodes by replica.
+        interval: see `cprl.measuring.statistics.Interval`.
 
     Raises:
         ValueError: see `over_replicas`.
@@ -110,7 +121,8 @@ def social_measures(played: Mapping[int, Sequence[Episode]]) -> dict[str, Measur
     names = next((own[0] for own in metrics_by_replica.values() if own), {})
     return {
         name: over_replicas(
-            {replica: [metrics[name] for metrics in own] for replica, own in metrics_by_replica.items()}
+            {replica: [metrics[name] for metrics in own] for replica, own in metrics_by_replica.items()},
+            interval=interval,
         )
         for name in names or ("survival_steps",)  # every game has it; without episodes it raises the error
     }

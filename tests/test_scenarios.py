@@ -1,0 +1,280 @@
+"""Stored runs play among named backgrounds, and the numbers are those worked by hand."""
+
+import importlib.util
+from dataclasses import replace
+from functools import partial
+from pathlib import Path
+
+import pyarrow.parquet as pq
+import pytest
+from PIL import Image
+from test_evaluation import CORRIDORS, DQN, MEADOW, SEED, command, ran
+
+import cprl
+from cprl import Experiment, Observation, maps, presets
+from cprl.envs.matrix import stag_hunt
+from cprl.evaluation import Scenario, draw_scenarios, run_scenarios, scenarios_of
+from cprl.evaluation.lanes import Source, play, policies_of
+from cprl.evaluation.scenarios import backgrounds
+from cprl.evaluation.scenarios.tables import estimates, scenario_tables
+from cprl.population import Frozen, Learning, Scripted
+from cprl.runs.directory import read_recipe
+
+THREE_CORRIDORS = replace(
+    CORRIDORS,
+    map=maps.parse(
+        """
+        >A.A.
+        #####
+        #AAA<
+        #####
+        >A...
+        """
+    ),
+)
+"""Greedy agents bite 2, 3 and 1 apples, each in its own corridor; sustainable ones none."""
+
+
+@pytest.fixture(scope="module")
+def runs(tmp_path_factory):
+    """Runs of scripted agents in three corridors, two replicas, and two DQN agents on the meadow, three."""
+    folder = tmp_path_factory.mktemp("scenarios")
+    return {
+        **{
+            policy: ran(folder / policy, THREE_CORRIDORS, [Scripted(policy)] * 3, replicas=2)
+            for policy in ("greedy", "sustainable")
+        },
+        "learned": ran(folder / "learned", MEADOW, [DQN] * 2),
+    }
+
+
+def value(measured):
+    return measured.estimate.value
+
+
+def returns(played):
+    return {replica: [episode.return_.tolist() for episode in own] for replica, own in played.items()}
+
+
+def test_every_agent_is_focal_equally_often():
+    how = {"name": "own", "game": THREE_CORRIDORS, "background": (Scripted("greedy"),) * 3}
+    assert Scenario(focal="minority", **how).placements == ((0,), (1,), (2,))
+    assert Scenario(focal="majority", **how).placements == ((1, 2), (0, 2), (0, 1))
+
+
+def test_scores_are_those_worked_by_hand(runs):
+    scores = run_scenarios(runs["greedy"], episodes=2)
+    assert list(scores.by_scenario) == [
+        f"{focal}_among_{background}"
+        for background in ("greedy", "sustainable")
+        for focal in ("majority", "minority")
+    ]
+    # The focal agents are 1 and 2, 0 and 2, 0 and 1: ((3 + 1) / 2 + (2 + 1) / 2 + (2 + 3) / 2) / 3 = 2, and
+    # all together 4, 3 and 5. As a minority they get 2, 3 and 1.
+    for name, together in (("majority_among_sustainable", 4), ("minority_among_sustainable", 2)):
+        measures = scores.by_scenario[name].measures()
+        assert [value(measures[whose]) for whose in ("focal/return", "background/return")] == [2, 0]
+        assert value(measures["collective_return"]) == pytest.approx(together)
+        assert measures["focal/return"].episodes == 2 * 2 * 3, "replicas, episodes, placements"
+        assert measures["focal/return"].estimate.replicas == 2
+    assert value(scores.by_scenario["minority_among_greedy"].measures()["background/return"]) == 2
+
+
+def test_a_run_is_held_against_others_in_its_place(runs):
+    score = run_scenarios(runs["sustainable"], episodes=1).by_scenario["minority_among_greedy"]
+    # Sustainable agents get nothing, greedy ones in their place 2 on average; the others have corridors of
+    # their own, and get (3 + 1) / 2, (2 + 1) / 2 and (2 + 3) / 2 in either case.
+    ahead = score.advantage("greedy")
+    assert (ahead.value, ahead.low, ahead.high, ahead.replicas) == (-2, -2, -2, 2)
+    assert score.advantage("greedy", whose="background").value == 0
+    assert value(score.measures("greedy")["focal/return"]) == 2
+    assert value(score.measures("random")["focal/return"]) == -score.advantage("random").value
+    with pytest.raises(ValueError, match="focal is 'best'; allowed: run, random, greedy"):
+        score.measures("best")
+    with pytest.raises(ValueError, match="whose is 'group'; allowed: focal, background"):
+        score.returns("group")
+
+
+def test_a_stored_background_is_of_the_next_replica(runs):
+    learned = runs["learned"]
+    background = tuple(Frozen(str(learned), agent, replica=None) for agent in range(2))
+    own = Scenario(name="its_like", game=MEADOW, focal="minority", background=background)
+    score = run_scenarios(learned, scenarios=[own], episodes=2, seed=SEED).by_scenario["its_like"]
+    run = cprl.load(learned)
+    mine, theirs = Source(run), Source(run, {0: 1, 1: 2, 2: 0})
+    for focal, sources in (((0,), [mine, theirs]), ((1,), [theirs, mine])):
+        who = partial(policies_of, sources, worlds=2, seed=SEED)
+        expected = play(run, who, [0, 1, 2], episodes=2, seed=SEED, explore=True)
+        assert returns(score.played["run"][focal]) == returns(expected)
+    one = run_scenarios(learned, scenarios=[own], episodes=2, seed=SEED, replicas=[2]).by_scenario["its_like"]
+    for focal, played in one.played["run"].items():
+        assert returns(played) == {2: returns(score.played["run"][focal])[2]}, "alone as among all"
+    # Random agents in its place meet the same background of the same replica.
+    who = partial(
+        policies_of,
+        [Source(replace(run, experiment=experiment_of(run, [Scripted("random")] * 2))), theirs],
+        worlds=2,
+        seed=SEED,
+    )
+    expected = play(run, who, [0, 1, 2], episodes=2, seed=SEED, explore=True)
+    assert returns(score.played["random"][0,]) == returns(expected)
+
+
+def experiment_of(run, agents):
+    return replace(run.experiment, agents=tuple(agents))
+
+
+def test_two_agents_have_minorities_alone_and_without_a_beam_no_background_that_fires():
+    assert [one.name for one in scenarios_of(CORRIDORS)] == [
+        "minority_among_greedy",
+        "minority_among_sustainable",
+    ]
+    assert [one.name.partition("_among_")[2] for one in scenarios_of(MEADOW)] == list(backgrounds.SCRIPTED)
+    four = scenarios_of(presets.game("commons"))
+    assert [one.name for one in four][:2] == ["majority_among_greedy", "minority_among_greedy"]
+    assert len(four) == 2 * 5
+
+
+@pytest.mark.parametrize("name", [name for *_, name in backgrounds._COMMITTED])
+def test_committed_populations_are_backgrounds_on_their_own_game(name):
+    folder = backgrounds.results_folder() / name
+    experiment = Experiment.from_recipe(read_recipe(folder), directory=folder)
+    assert backgrounds.stored_for(experiment.game) == folder
+    assert all(isinstance(spec, Learning) for spec in experiment.agents)
+    assert scenarios_of(experiment.game)[-1].background == tuple(
+        Frozen(str(folder), agent, replica=None) for agent in range(experiment.game.agents)
+    )
+
+
+def test_without_a_checkout_stored_backgrounds_are_left_out_and_named(tmp_path, monkeypatch):
+    game = presets.game("two_complex", variant="as_run")
+    assert backgrounds.left_out_of(game) == backgrounds.left_out_of(MEADOW) == ""
+    monkeypatch.setattr(backgrounds, "results_folder", lambda: tmp_path)
+    assert [one.name for one in scenarios_of(game)][-1] == "minority_among_aggressive"
+    why = rf"minority_among_dqn: the stored population {tmp_path}/two_complex comes with a checkout of cprl"
+    assert backgrounds.left_out_of(game).startswith(why)
+
+
+def test_the_table_and_the_estimates_hold_every_number(runs):
+    scores = run_scenarios(runs["greedy"], scenarios=["minority_among_sustainable"], episodes=2)
+    table = scores.table().to_pylist()
+    assert len(table) == 3 * 3 * 2 * 2 * 3, "who is focal, placements, replicas, episodes, agents"
+    own = [row for row in table if (row["focal"], row["focal_agents"], row["episode"]) == ("run", "1", 0)]
+    assert [(row["replica"], row["agent"], row["return"]) for row in own if row["agent"] == 1] == [
+        (0, 1, 3.0),
+        (1, 1, 3.0),
+    ]
+    rows = {(row["focal"], row["metric"]): row for row in estimates(scores).to_pylist()}
+    assert rows["run", "focal/return"] == {
+        "scenario": "minority_among_sustainable",
+        "focal": "run",
+        "metric": "focal/return",
+        "value": 2.0,
+        "low": 2.0,
+        "high": 2.0,
+        "replicas": 2,
+        "episodes": 12,
+        "undefined": 0,
+    }
+    assert rows["greedy", "focal/advantage"]["value"] == 0
+    # A single agent of three harvests: 1 - (4 x its harvest) / (2 x 3 x its harvest).
+    assert rows["run", "equality"]["value"] == pytest.approx(1 / 3)
+    returns_table, social_table = scenario_tables(scores)
+    assert list(returns_table.columns[1].cells) == ["2 [2, 2]"]
+    assert list(social_table.columns[1].cells) == ["2 [2, 2]"]
+
+
+def test_the_picture_has_a_row_for_each_scenario(runs, tmp_path):
+    scores = run_scenarios(runs["greedy"], episodes=1)
+    with Image.open(draw_scenarios(scores, tmp_path / "new" / "scenarios.png")) as picture:
+        assert min(picture.size) > 500
+    with pytest.raises(ValueError, match=r"scores is 3; allowed: what run_scenarios\(\) gave"):
+        draw_scenarios(3, tmp_path / "other.png")
+
+
+def test_the_command_scenarios_tells_returns_and_social_metrics(runs, tmp_path, monkeypatch, capsys):
+    out, figure = tmp_path / "scenarios.parquet", tmp_path / "scenarios.png"
+    words = ["scenarios", runs["greedy"], "--episodes", 1, "--out", out, "--figure", figure]
+    text = command(monkeypatch, capsys, *words, "--scenarios", "majority_among_sustainable")
+    assert "Scenarios of greedy: 2 replicas, 1 episodes each in each placement, seed 30011" in text
+    rows = [[cell.strip() for cell in line.split("│")[1:-1]] for line in text.splitlines() if "│" in line]
+    assert [row[:2] for row in rows] == [
+        ["majority_among_sustainable", "2 [2, 2]"],
+        ["majority_among_sustainable", "4 [4, 4]"],
+    ]
+    assert pq.read_table(out).num_rows == 3 * 3 * 2 * 3, "who is focal, placements, replicas, agents"
+    assert figure.exists()
+    with pytest.raises(SystemExit, match=r"cprl: .*scenarios\.parquet exists and is not overwritten"):
+        command(monkeypatch, capsys, *words)
+    with pytest.raises(SystemExit, match=r"cprl: .*scenarios\.png exists and is not overwritten"):
+        command(monkeypatch, capsys, "scenarios", runs["greedy"], "--figure", figure)
+
+
+@pytest.mark.parametrize(
+    ("given", "answer"),
+    [
+        ({"scenarios": ["among_wolves"]}, "a scenario is 'among_wolves'; allowed for this game: majority_"),
+        ({"scenarios": ["minority_among_greedy"] * 2}, "minority_among_greedy is given twice; allowed: "),
+        ({"scenarios": "minority_among_greedy"}, "scenarios is 'minority_among_greedy'; allowed: names of"),
+        ({"scenarios": [3]}, "a scenario is 3; allowed: its name, or a value of Scenario"),
+        ({"scenarios": scenarios_of(CORRIDORS)[:1]}, "have different games: Map.* differ; allowed: the same"),
+        ({"episodes": 0}, "episodes is 0; allowed: an integer >= 1"),
+        ({"replicas": [2]}, r"has no replicas \[2\]; allowed: \[0, 1\]"),
+        ({"seed": 3}, "seed is 3, the training seed of .*greedy"),
+        ({"greedy": 1}, "greedy is 1"),
+        ({"run": 3}, "run is 3; allowed: a directory"),
+    ],
+)
+def test_what_cannot_be_played_is_refused(given, answer, runs):
+    with pytest.raises(ValueError, match=answer):
+        run_scenarios(**{"run": runs["greedy"], **given})
+
+
+def test_a_background_of_another_game_is_refused(runs):
+    other = tuple(Frozen(str(runs["learned"]), agent) for agent in (0, 1, 1))
+    own = Scenario(name="own", game=THREE_CORRIDORS, focal="minority", background=other)
+    with pytest.raises(ValueError, match=r"greedy and the background .*learned have different games: Map"):
+        run_scenarios(runs["greedy"], scenarios=[own])
+
+
+@pytest.mark.parametrize(
+    ("game", "answer"),
+    [
+        (stag_hunt(), "game is a MatrixGame; allowed: a cprl.Game, because scripted agents read its windows"),
+        (presets.game("single_basic"), "the game has 1 agent; allowed for scenarios: at least 2"),
+        (replace(MEADOW, observation=Observation(area="full")), "Observation.area is 'full'; allowed"),
+    ],
+)
+def test_games_without_scenarios_are_refused(game, answer):
+    with pytest.raises(ValueError, match=answer):
+        scenarios_of(game)
+
+
+@pytest.mark.parametrize(
+    ("given", "answer"),
+    [
+        ({"name": "among wolves"}, "Scenario.name is 'among wolves'; allowed: letters, digits and underscor"),
+        ({"game": 3}, "Scenario.game is 3; allowed: a cprl.Game"),
+        ({"focal": "half"}, "Scenario.focal is 'half'; allowed: 'majority', 'minority'"),
+        ({"background": (DQN,) * 2}, r"Scenario.background is .*; allowed: Scripted\(policy\) or Frozen"),
+        ({"background": (Scripted("greedy"),)}, "Scenario.background has 1 agents for a game of 2 agents; "),
+        ({"game": presets.game("single_basic")}, "Scenario.game has 1 agent; allowed: at least 2, focal and"),
+    ],
+)
+def test_odd_scenarios_are_refused(given, answer):
+    how = {"name": "own", "game": MEADOW, "focal": "minority", "background": (Scripted("greedy"),) * 2}
+    with pytest.raises(ValueError, match=answer):
+        Scenario(**{**how, **given})
+
+
+def test_the_page_has_the_numbers_of_the_committed_estimates():
+    docs = Path(__file__).parents[1] / "docs"
+    spec = importlib.util.spec_from_file_location("scenarios_baseline", docs / "scenarios_baseline.py")
+    baseline = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(baseline)
+    page = (docs / "scenarios.md").read_text()
+    played = sorted(path.stem for path in baseline.OUT.glob("*.csv"))
+    assert played
+    assert set(played) <= set(baseline.POPULATIONS)
+    for name in played:
+        assert baseline.table(name) in page, name
