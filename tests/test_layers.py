@@ -56,12 +56,14 @@ PACKAGES = (
     "evaluation",
     "play",
     "studies",
+    "exploiting",
     "reporting",
     "flags",
     "commandline",
     "evaluation_cli",
     "studies_options",
     "studies_cli",
+    "exploit_cli",
     "cli",
 )
 MODULES = sorted(path for path in SOURCE.rglob("*.py") if path.parent != SOURCE or path.name != "__init__.py")

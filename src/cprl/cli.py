@@ -15,6 +15,7 @@ from cprl.commandline import Allow, in_a_sentence, make_importable
 from cprl.evaluation.evaluate import SEED
 from cprl.evaluation_cli import crossplay, evaluate, film, schelling, visits
 from cprl.experiment import Experiment
+from cprl.exploit_cli import exploit
 from cprl.output import keep_output, say
 from cprl.play.opening import SEED as PLAY_SEED
 from cprl.play.opening import open_session
@@ -210,6 +211,7 @@ def main() -> None:
                 "visits": visits,
                 "crossplay": crossplay,
                 "schelling": schelling,
+                "exploit": exploit,
                 "sweep": sweep,
                 "table": runs_table,
             },

@@ -5,6 +5,7 @@ Modules, in the order in which one reads them:
     cross_play  crossplay: a focal agent of one run among background agents of another
     gains       what a focal agent gains over the agent whose place it takes, and what it costs the others
     populations play_population: scripted and stored agents in any mix
+    responses   play_responses: what trained best responses gain over the agents whose place they take
     schelling   what restrained and greedy agents get, by how many of the others are restrained
     territory   territory_of: where the agents of a run go and whom they tag
     film        an episode, every step recorded
@@ -13,6 +14,7 @@ Modules, in the order in which one reads them:
     same_game   whether two runs can play together
     words       what a word names: a board, and who plays
     tables      tables for the terminal
+    responses_table  what best responses gain, as tables for the terminal
     turns            one episode of one world, turn by turn
     episode_picture  the board with the stock and the harvests so far
     video_files      GIF and MP4 out of pictures
@@ -26,6 +28,7 @@ from cprl.evaluation.evaluate import Evaluation, evaluate_run
 from cprl.evaluation.gains import Gain, gains
 from cprl.evaluation.gains_picture import draw_gains
 from cprl.evaluation.populations import play_population
+from cprl.evaluation.responses import Exploitability, Response, play_responses
 from cprl.evaluation.schelling import SchellingDiagram, schelling
 from cprl.evaluation.schelling_picture import draw_schelling
 from cprl.evaluation.territory import Territory, territory_of
@@ -35,7 +38,9 @@ __all__ = [
     "Cell",
     "CrossPlay",
     "Evaluation",
+    "Exploitability",
     "Gain",
+    "Response",
     "SchellingDiagram",
     "Territory",
     "crossplay",
@@ -45,6 +50,7 @@ __all__ = [
     "evaluate_run",
     "gains",
     "play_population",
+    "play_responses",
     "schelling",
     "territory_of",
 ]
