@@ -196,7 +196,9 @@ def play_responses(
     check_population(population)
     trained = _opened(responses, population, allow)
     found = consecutive_replicas(population, replicas)
-    check_seeds(seed, episodes, [population, *(own for table in trained.values() for own in table.values())])
+    seed = check_seeds(
+        seed, episodes, [population, *(own for table in trained.values() for own in table.values())]
+    )
     itself = [Frozen(path_of(population), other, replica=None) for other in range(population.game.agents)]
     how: dict[str, Any] = {"episodes": episodes, "replicas": found, "allow": allow}
 
@@ -250,10 +252,12 @@ def consecutive_replicas(run: LoadedRun, replicas: int | None) -> int:
     return found
 
 
-def check_seeds(seed: int, episodes: int, runs: Sequence[LoadedRun]) -> None:
-    """Raises a ValueError where a seed of fresh worlds, or the next one, was trained with."""
-    check(episodes=episodes, seed=seed, greedy=False, runs=runs)
-    check(episodes=episodes, seed=seed + 1, greedy=False, runs=runs)
+def check_seeds(seed: int, episodes: int, runs: Sequence[LoadedRun]) -> int:
+    """The seed of fresh worlds; raises a ValueError where it, or the next one, was trained with."""
+    seed = arguments.seed(seed)
+    for own in (seed, seed + 1):
+        check(episodes=episodes, seed=own, greedy=False, runs=runs)
+    return seed
 
 
 def check_agents(agents: Sequence[Any], run: LoadedRun) -> tuple[int, ...]:
