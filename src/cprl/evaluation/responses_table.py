@@ -42,7 +42,7 @@ def _gains(found: Exploitability) -> Table:
 
 
 def _responses(found: Exploitability) -> Table:
-    table = Table(title="each trained response in all replicas, chosen or not", title_justify="left")
+    table = Table(title="each training, chosen or not", title_justify="left")
     for heading in ("agent", "response"):
         table.add_column(heading)
     table.add_column("gain", justify="right")
