@@ -56,6 +56,7 @@ PACKAGES = (
     "evaluation",
     "play",
     "studies",
+    "exploiting",
     "reporting",
     "flags",
     "commandline",
@@ -64,6 +65,7 @@ PACKAGES = (
     "scenarios_cli",
     "studies_options",
     "studies_cli",
+    "exploit_cli",
     "cli",
 )
 MODULES = sorted(path for path in SOURCE.rglob("*.py") if path.parent != SOURCE or path.name != "__init__.py")

@@ -48,6 +48,7 @@ Each imports only from those above it:
     evaluation   stored agents in fresh worlds, alone and among each other
     play         a person among trained or scripted agents
     studies      one experiment under many conditions: factors, trials, tables, figures
+    exploiting   best responses trained against stored agents, and what they gain
     reporting    finished runs beside the published study
     flags        the fields of an experiment as flags
     commandline  recipe_main: the command line of a recipe
@@ -56,6 +57,7 @@ Each imports only from those above it:
     scenarios_cli  cprl scenarios
     studies_options  how a study is run, as options of a command line
     studies_cli  cprl sweep, and study_main: the command line of a recipe of a study
+    exploit_cli  cprl exploit
     cli          the command cprl
 """
 

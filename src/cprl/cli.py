@@ -16,6 +16,7 @@ from cprl.egta_cli import egta
 from cprl.evaluation.evaluate import SEED
 from cprl.evaluation_cli import crossplay, evaluate, film, schelling, visits
 from cprl.experiment import Experiment
+from cprl.exploit_cli import exploit
 from cprl.output import keep_output, say
 from cprl.play.opening import SEED as PLAY_SEED
 from cprl.play.opening import open_session
@@ -214,6 +215,7 @@ def main() -> None:
                 "schelling": schelling,
                 "egta": egta,
                 "scenarios": scenarios,
+                "exploit": exploit,
                 "sweep": sweep,
                 "table": runs_table,
             },

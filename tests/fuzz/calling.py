@@ -4,6 +4,7 @@ from collections.abc import Callable
 from typing import Any, Final
 
 import cprl
+from cprl.exploiting import exploitability
 from cprl.terminal.figures import training_curve
 
 from . import runs
@@ -15,11 +16,14 @@ OF_FILES: Final = {
     "cprl.evaluation.empirical_game:play_empirical_game",
     "cprl.evaluation.evaluate:evaluate_run",
     "cprl.evaluation.populations:play_population",
+    "cprl.evaluation.responses:play_responses",
     "cprl.evaluation.schelling:schelling",
     "cprl.evaluation.schelling_picture:draw_schelling",
     "cprl.evaluation.scenarios.suite:run_scenarios",
     "cprl.evaluation.territory:territory_of",
     "cprl.evaluation.visits_picture:draw_visits",
+    "cprl.exploiting.exploit:exploitability",
+    "cprl.exploiting.plan:plan_responses",
     "cprl.reporting.report:write_report",
     "cprl.running:run",
     "cprl.runs.directory:start_run",
@@ -45,11 +49,14 @@ SLOW: Final = {
     "cprl.evaluation.empirical_game:play_empirical_game",
     "cprl.evaluation.evaluate:evaluate_run",
     "cprl.evaluation.populations:play_population",
+    "cprl.evaluation.responses:play_responses",
     "cprl.evaluation.schelling:schelling",
     "cprl.evaluation.schelling_picture:draw_schelling",
     "cprl.evaluation.scenarios.suite:run_scenarios",
     "cprl.evaluation.territory:territory_of",
     "cprl.evaluation.visits_picture:draw_visits",
+    "cprl.exploiting.exploit:exploitability",
+    "cprl.exploiting.plan:plan_responses",
     "cprl.reporting.report:write_report",
     "cprl.running:run",
     "cprl.terminal.figures:training_curve",
@@ -70,6 +77,11 @@ def _run(case: Case) -> Any:
         return cprl.run(**case.arguments)
 
 
+def _exploitability(case: Case) -> Any:
+    with runs.stopped_after(2):
+        return exploitability(**case.arguments)
+
+
 def _training_curve(case: Case) -> Any:
     name = getattr(case.arguments.get("run"), "name", "")
     own = {"run": runs.copied(name)} if name in runs.NAMES[:4] else {}
@@ -83,6 +95,7 @@ def _recipe_main(case: Case) -> Any:
 
 CALLS: Final[dict[str, Callable[[Case], Any]]] = {
     "cprl.training:train": _train,
+    "cprl.exploiting.exploit:exploitability": _exploitability,
     "cprl.terminal.figures:training_curve": _training_curve,
     "cprl.running:run": _run,
     "cprl.commandline:recipe_main": _recipe_main,

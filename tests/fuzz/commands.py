@@ -126,6 +126,14 @@ _SUBCOMMANDS: Final[dict[str, tuple[list[st.SearchStrategy[list[str]]], tuple[An
             _flag("--figure", "scores.png", "some/scores.png"),
         ),
     ),
+    "exploit": (
+        [_run("plain", "finished", "results")],
+        (
+            *(_flag("--agents", "0", "1"), _flag("--algorithms", "own", "PPO"), _flag("--seeds", "1", "2")),
+            *(_flag("--training-episodes", "1"), _flag("--replicas", "1"), _flag("--episodes", "1", "0")),
+            *(_flag("--seed", "1", "0"), _flag("--out", "out"), _flag("--dry-run"), *_COMMON),
+        ),
+    ),
 }
 
 

@@ -18,6 +18,7 @@ from cprl.evaluation import schelling, territory_of
 from cprl.measuring import phases
 from cprl.policies.lanes import random_agents
 from cprl.population import Scripted
+from cprl.studies import InProcess
 
 from . import hints, runs, things
 
@@ -37,6 +38,15 @@ _FRESH: Final = {
     "seed": _SEEDS,
     "replicas": st.sampled_from(((), (0,), (1, 0))),
     "allow": _ALLOW,
+}
+_RESPONSES: Final = {
+    **_FRESH,
+    "agents": st.sampled_from(((0,), (1, 0), (2,), ())),
+    "algorithms": st.sampled_from(((), ("own",), ("PPO", "DQN"), ("SAC",))),
+    "seeds": st.integers(1, 2),
+    "training_episodes": st.sampled_from((None, 1)),
+    "replicas": st.sampled_from((None, 1, 3)),
+    "device": st.just("cpu"),
 }
 _ENVS: Final = things.examples_of(CommonsEnv)
 _BOARD: Final = st.sampled_from(presets.BOARDS)
@@ -164,6 +174,21 @@ OWN: Final[dict[str, dict[str, st.SearchStrategy[Any]]]] = {
         "seed": _SEEDS,
         "allow": _ALLOW,
     },
+    "cprl.evaluation.responses:play_responses": {
+        "run": _FINISHED,
+        "responses": st.sampled_from((0, 0, 1, 2)).map(lambda own: {own: {"own": runs.folder("plain")}}),
+        "episodes": _FEW,
+        "replicas": st.sampled_from((None, 1, 3)),
+        "seed": _SEEDS,
+        "allow": _ALLOW,
+    },
+    "cprl.exploiting.exploit:exploitability": {
+        **_RESPONSES,
+        "out": st.sampled_from((None, "out", "some/out")),
+        "on": st.sampled_from((None, InProcess())),
+        "progress": st.booleans(),
+    },
+    "cprl.exploiting.plan:plan_responses": _RESPONSES,
     "cprl.evaluation.schelling:schelling": {
         "where": st.just(things.MEADOW),
         "restrained": st.sampled_from(("sustainable", "pacifist")),

@@ -5,6 +5,7 @@ Modules, in the order in which one reads them:
     cross_play  crossplay: a focal agent of one run among background agents of another
     gains       what a focal agent gains over the agent whose place it takes, and what it costs the others
     populations play_population: scripted and stored agents in any mix
+    responses   play_responses: what trained best responses gain over the agents whose place they take
     schelling   what restrained and greedy agents get, by how many of the others are restrained
     empirical_game  play_empirical_game: the game whose strategies are runs; pairwise_game: of a cross-play
     egta        analyse: which runs last in it, by alpha-rank, equilibria and replicator dynamics
@@ -16,6 +17,7 @@ Modules, in the order in which one reads them:
     same_game   whether two runs can play together
     words       what a word names: a board, and who plays
     tables      tables for the terminal
+    responses_table  what best responses gain, as tables for the terminal
     turns            one episode of one world, turn by turn
     episode_picture  the board with the stock and the harvests so far
     video_files      GIF and MP4 out of pictures
@@ -34,6 +36,7 @@ from cprl.evaluation.evaluate import Evaluation, evaluate_run
 from cprl.evaluation.gains import Gain, gains
 from cprl.evaluation.gains_picture import draw_gains
 from cprl.evaluation.populations import play_population
+from cprl.evaluation.responses import Exploitability, Response, play_responses
 from cprl.evaluation.scenarios import Scenario, Score, Scores, draw_scenarios, run_scenarios, scenarios_of
 from cprl.evaluation.schelling import SchellingDiagram, schelling
 from cprl.evaluation.schelling_picture import draw_schelling
@@ -46,7 +49,9 @@ __all__ = [
     "CrossPlay",
     "EmpiricalGame",
     "Evaluation",
+    "Exploitability",
     "Gain",
+    "Response",
     "Scenario",
     "SchellingDiagram",
     "Score",
@@ -64,6 +69,7 @@ __all__ = [
     "pairwise_game",
     "play_empirical_game",
     "play_population",
+    "play_responses",
     "run_scenarios",
     "scenarios_of",
     "schelling",

@@ -15,12 +15,13 @@ from cprl.measuring.statistics import Estimate, Interval, difference
 
 @dataclass(frozen=True, kw_only=True)
 class Gain:
-    """Differences of returns from the diagonal cell of the same background agents, paired by replica."""
+    """Differences of returns from those of the same background agents among themselves, paired by replica: in
+    cross-play from the diagonal cell."""
 
     focal: Estimate
     """Of the focal agent, from the agent of the background agents' run with the same index."""
     background: Estimate
-    """Of the mean of the background agents, from the same agents in the diagonal cell."""
+    """Of the mean of the background agents, from the same agents among themselves."""
 
     @property
     def exploits(self) -> bool:

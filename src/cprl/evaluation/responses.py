@@ -1,0 +1,308 @@
+"""play_responses: what best responses to stored agents gain, a lower bound of how exploitable these are.
+
+A population is exploitable where somebody who takes one agent's place, while all others stay as they are,
+gets more than that agent. How much the best such response gets is unknown; what a trained one gets is a lower
+bound. Of several trained ones the best is chosen for each replica, and the maximum of noisy numbers is too
+high; so a response is chosen by its returns in some fresh worlds, and what it gains is told of others.
+
+The gain is that of the game's own rewards, fines and transfers included, whatever the agents of the run want.
+
+Source: of exploitability, M. Lanctot et al., "A Unified Game-Theoretic Approach to Multiagent Reinforcement
+Learning" (2017); of lower bounds by trained responses, F. Timbers et al., "Approximate Exploitability:
+Learning a Best Response" (2022).
+"""
+
+import os
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+from typing import Any, Final
+
+import numpy as np
+import pyarrow as pa
+from numpy.typing import NDArray
+
+from cprl import arguments
+from cprl.evaluation.evaluate import SEED, check, opened
+from cprl.evaluation.gains import Gain
+from cprl.evaluation.lanes import Played
+from cprl.evaluation.populations import play_population
+from cprl.evaluation.same_game import check_same_game
+from cprl.measuring.statistics import Estimate, Interval, difference
+from cprl.population import Frozen
+from cprl.runs.labelled import labelled
+from cprl.stored import LoadedRun, load
+
+Values = NDArray[np.float64]
+NOBODY: Final = -1
+"""The focal agent in tables where the population itself plays."""
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Response:
+    """A trained response in the place of an agent, in the worlds where one is chosen and in those told of."""
+
+    agent: int
+    """The index of the agent whose place it takes."""
+    name: str
+    path: Path
+    """The run in which it was trained."""
+    choosing: Played
+    reporting: Played
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Exploitability:
+    """The episodes of a population and of responses to it; see the docstring of this module."""
+
+    run: LoadedRun
+    population: Played
+    """The episodes of the population itself, in the worlds told of, by replica."""
+    responses: Mapping[int, tuple[Response, ...]]
+    """By the index of the agent whose place they take."""
+    episodes: int
+    """Of each replica, in the worlds where responses are chosen, and as many in the others."""
+    seed: int
+    """Of the worlds told of; responses are chosen in worlds of the next seed."""
+
+    @property
+    def replicas(self) -> int:
+        """The number R of replicas."""
+        return len(self.population)
+
+    @property
+    def gain(self) -> Gain:
+        """What chosen responses gain over the agents they replace, and what the mean of the others does: the
+        mean over these agents, over replicas, with an interval by Student's t."""
+        return self._gain({agent: self._best(agent) for agent in self.responses}, "t")
+
+    def gain_of(self, agent: int, *, interval: Interval = "t") -> Gain:
+        """The same in the place of one agent.
+
+        Args:
+            agent: its index.
+            interval: see `cprl.measuring.statistics.Interval`.
+
+        Raises:
+            ValueError: if there are no responses in its place.
+        """
+        agent = self._known(agent)
+        return self._gain({agent: self._best(agent)}, interval)
+
+    def gain_of_response(self, response: Response, *, interval: Interval = "t") -> Gain:
+        """What one response gains in all replicas; nothing is chosen by these numbers."""
+        arguments.object_of("response", response, Response, "one of `responses`")
+        return self._gain({self._known(response.agent): response.reporting}, interval)
+
+    def chosen(self, agent: int) -> list[Response]:
+        """The response in the place of an agent for each replica: the one with the highest mean return there
+        in the worlds where one is chosen, of equal ones the first.
+
+        Raises:
+            ValueError: if there are no responses in its place.
+        """
+        return self._chosen[self._known(agent)]
+
+    def returns(self, agent: int) -> tuple[Values, Values]:
+        """The mean returns, float64 [R] each, of an agent of the population and of what was chosen to take
+        its place.
+
+        Raises:
+            ValueError: if there are no responses in its place.
+        """
+        agent = self._known(agent)
+        return _focal(self.population, agent), _focal(self._best(agent), agent)
+
+    def table(self) -> pa.Table:
+        """All episodes with the columns of `episodes.parquet`, after "worlds", "choosing" or "reporting";
+        "focal_agent", the index of the agent replaced, -1 where none is; "response", its name, "" for none;
+        and "chosen", 1 where it is the one chosen for the replica, else 0."""
+        parts: list[tuple[dict[str, str | int], int, Any]] = [
+            ({"worlds": "reporting", "focal_agent": NOBODY, "response": "", "chosen": 0}, replica, episodes)
+            for replica, episodes in self.population.items()
+        ]
+        for agent, responses in self.responses.items():
+            for response in responses:
+                for worlds in ("choosing", "reporting"):
+                    for replica, episodes in getattr(response, worlds).items():
+                        label: dict[str, str | int] = {"worlds": worlds, "focal_agent": agent}
+                        label |= {
+                            "response": response.name,
+                            "chosen": int(self._chosen[agent][replica] is response),
+                        }
+                        parts.append((label, replica, episodes))
+        return labelled(parts)
+
+    @cached_property
+    def _chosen(self) -> dict[int, list[Response]]:
+        found = {}
+        for agent, responses in self.responses.items():
+            returns = np.stack([_focal(own.choosing, agent) for own in responses])
+            found[agent] = [responses[place] for place in returns.argmax(0)]
+        return found
+
+    def _best(self, agent: int) -> Played:
+        """The episodes told of, with the response chosen for each replica."""
+        return {replica: own.reporting[replica] for replica, own in enumerate(self._chosen[agent])}
+
+    def _gain(self, among: Mapping[int, Played], interval: Interval) -> Gain:
+        """Of the episodes with responses by agent; the mean over agents comes first, since places of one
+        replica depend on each other."""
+
+        def over(whose: Callable[[Played, int], Values]) -> Estimate:
+            own = np.mean([whose(played, agent) for agent, played in among.items()], 0)
+            usual = np.mean([whose(self.population, agent) for agent in among], 0)
+            return difference(own, usual, paired=True, interval=interval)
+
+        return Gain(focal=over(_focal), background=over(_others))
+
+    def _known(self, agent: int) -> int:
+        if arguments.as_integer(agent) not in self.responses:
+            raise arguments.refusal("agent", agent, f"one of {sorted(self.responses)}, which have responses")
+        return int(agent)
+
+
+def play_responses(
+    run: str | Path | LoadedRun,
+    responses: Mapping[int, Mapping[str, str | Path]],
+    *,
+    episodes: int = 20,
+    replicas: int | None = None,
+    seed: int = SEED,
+    allow: Sequence[str] = (),
+) -> Exploitability:
+    """Plays a stored population, and trained responses in the places of its agents, in the same fresh worlds.
+
+    In replica r the agents of the population are those of the run's replica r, and the response is what the
+    replica r of its run learned in that place. All explore as in evaluation.
+
+    Args:
+        run: the population: its directory, or a value of `cprl.load`; its replicas are 0, 1 and so on.
+        responses: by the index of the agent whose place is taken, directories of runs by the names of
+            responses, e.g. {0: {"PPO": "runs/against"}}; they have the same game.
+        episodes: episodes of each replica with each response where one is chosen, and as many where the gain
+            is told.
+        replicas: how many of the run's replicas play, the first ones; by default all.
+        seed: of the worlds told of; the next seed is that of the worlds where responses are chosen. Neither
+            is the seed of a training.
+        allow: see `cprl.load`.
+
+    Raises:
+        ValueError: for a game of one agent, agents that the game does not have, runs of other games, replicas
+            that a run does not have, and for numbers out of range.
+    """
+    population = opened(run, allow)
+    check_population(population)
+    trained = _opened(responses, population, allow)
+    found = consecutive_replicas(population, replicas)
+    seed = check_seeds(
+        seed, episodes, [population, *(own for table in trained.values() for own in table.values())]
+    )
+    itself = [Frozen(path_of(population), other, replica=None) for other in range(population.game.agents)]
+    how: dict[str, Any] = {"episodes": episodes, "replicas": found, "allow": allow}
+
+    def played(agent: int, name: str, own: LoadedRun) -> Response:
+        among = list(itself)
+        among[agent] = Frozen(path_of(own), agent, replica=None)
+        choosing, reporting = (
+            play_population(population, among, seed=chance, **how) for chance in (seed + 1, seed)
+        )
+        return Response(agent=agent, name=name, path=own.path, choosing=choosing, reporting=reporting)
+
+    return Exploitability(
+        run=population,
+        population=play_population(population, itself, seed=seed, **how),
+        responses={
+            agent: tuple(played(agent, name, own) for name, own in table.items())
+            for agent, table in trained.items()
+        },
+        episodes=episodes,
+        seed=seed,
+    )
+
+
+def check_population(run: LoadedRun) -> None:
+    """Raises a ValueError for a run that no response can be measured against; says why."""
+    if run.game.agents < 2:
+        raise ValueError(
+            f"the game of {run.path} has 1 agent; allowed for best responses: at least 2, since it is the "
+            "others that are exploited"
+        )
+    if run.weights_from.name != "final.pt":
+        raise ValueError(
+            f"{run.path} was loaded with the weights {run.weights_from.name}; allowed: a run that has ended, "
+            "with its final weights, which responses meet"
+        )
+
+
+def consecutive_replicas(run: LoadedRun, replicas: int | None) -> int:
+    """How many replicas play: the first ones of a run, by default all.
+
+    Raises:
+        ValueError: if the run does not keep them, or the weights of one are NaN or infinite.
+    """
+    if replicas is None and run.replicas != list(range(len(run.replicas))):
+        raise ValueError(f"{run.path} keeps the replicas {run.replicas}; allowed: 0 and those that follow it")
+    most = len(run.replicas)
+    found = most if replicas is None else arguments.integer("replicas", replicas, 1, most)
+    for replica in range(found):
+        for agent in range(run.game.agents):
+            run.agent(agent, replica=replica)
+    return found
+
+
+def check_seeds(seed: int, episodes: int, runs: Sequence[LoadedRun]) -> int:
+    """The seed of fresh worlds; raises a ValueError where it, or the next one, was trained with."""
+    seed = arguments.seed(seed)
+    for own in (seed, seed + 1):
+        check(episodes=episodes, seed=own, greedy=False, runs=runs)
+    return seed
+
+
+def check_agents(agents: Sequence[Any], run: LoadedRun) -> tuple[int, ...]:
+    """Indices of agents of a run's game, at least one and each once.
+
+    Raises:
+        ValueError: for anything else.
+    """
+    found = [arguments.integer("an agent", own, 0, run.game.agents - 1) for own in agents]
+    if not found or len(set(found)) < len(found):
+        raise arguments.refusal("agents", list(agents), "indices of agents, at least one and each once")
+    return tuple(found)
+
+
+def path_of(run: LoadedRun) -> str:
+    """The directory of a run as `Frozen` names it, relative to where we stand."""
+    return os.path.relpath(run.path)
+
+
+def _opened(
+    responses: object, population: LoadedRun, allow: Sequence[str]
+) -> dict[int, dict[str, LoadedRun]]:
+    """Responses by agent and name, of the same game as the population."""
+    allowed = 'a table by agent of directories by name, e.g. {0: {"PPO": "runs/against"}}'
+    if not isinstance(responses, Mapping):
+        raise arguments.refusal("responses", responses, allowed)
+    found: dict[int, dict[str, LoadedRun]] = {}
+    for agent in check_agents(list(responses), population):
+        table = responses[agent]
+        if not isinstance(table, Mapping) or not table:
+            raise arguments.refusal(f"responses[{agent}]", table, allowed)
+        found[agent] = {}
+        for name, directory in table.items():
+            arguments.object_of("a name of a response", name, str, "a text")
+            own = load(arguments.path(f"responses[{agent}][{name!r}]", directory), allow=allow)
+            check_same_game({str(population.path): population, str(own.path): own})
+            found[agent][name] = own
+    return found
+
+
+def _focal(played: Played, agent: int) -> Values:
+    """The mean return of an agent in each replica, [R]."""
+    return np.array([np.mean([one.return_[agent] for one in own]) for own in played.values()])
+
+
+def _others(played: Played, agent: int) -> Values:
+    """The mean return of the other agents in each replica, [R]."""
+    return np.array([np.mean([np.delete(one.return_, agent) for one in own]) for own in played.values()])
