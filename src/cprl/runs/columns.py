@@ -51,7 +51,7 @@ LEFT_OUT: Final = b"left_out"
 
 def whole_schema() -> pa.Schema:
     """All columns and metrics, for a table without an episode."""
-    return _schema(COLUMNS, (), social.METRICS)
+    return _schema(COLUMNS, (), (*social.METRICS, "yield_share"))
 
 
 def _schema(columns: Iterable[str], more: Iterable[str], metrics: Iterable[str]) -> pa.Schema:
