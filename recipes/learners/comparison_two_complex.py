@@ -33,8 +33,8 @@ EPISODES = {
     "MADDPG": 1600,
     "LOLA": 1300,
 }
-"""More where boards were drained early, in the tuning or, with IPPO, in the first try of 1,400 episodes (0.5 to
-0.8 million steps), so that a replica reaches its million."""
+"""More where boards were drained early, in the tuning or, with IPPO, in a first try, in which 1,400 episodes
+were 0.5 to 0.8 million steps; so that a replica reaches its million."""
 
 STUDY = comparison("two_complex", CHOSEN, EPISODES)
 
