@@ -60,6 +60,7 @@ PACKAGES = (
     "reporting",
     "flags",
     "commandline",
+    "command_parts",
     "evaluation_cli",
     "egta_cli",
     "scenarios_cli",

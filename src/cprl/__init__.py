@@ -52,6 +52,7 @@ Each imports only from those above it:
     reporting    finished runs beside the published study
     flags        the fields of an experiment as flags
     commandline  recipe_main: the command line of a recipe
+    command_parts  what several commands do alike
     evaluation_cli  cprl film, evaluate, visits, crossplay and schelling
     egta_cli     cprl egta
     scenarios_cli  cprl scenarios

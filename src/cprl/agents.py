@@ -70,11 +70,8 @@ class Population:
         self._groups = grouped(specs, self.spaces.agents)
         check_scripted(self._groups, self.spaces, self._game)
         numbers = range(first_replica, first_replica + self.replicas)
-        self._frozen = {
-            spec: frozen_agents(spec, self.spaces, self._game, allow, numbers)
-            for spec, _ in self._groups
-            if isinstance(spec, Frozen)
-        }
+        frozen = (spec for spec, _ in self._groups if isinstance(spec, Frozen))
+        self._frozen = frozen_agents(frozen, self.spaces, self._game, allow, numbers)
         who = {
             "replicas": self.replicas,
             "seed": seed,

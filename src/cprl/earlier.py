@@ -1,6 +1,6 @@
 """Agents of earlier runs: those that play here, and those whose weights others start from."""
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from typing import Any
 
 import torch
@@ -17,15 +17,22 @@ from cprl.stored import LoadedRun, StoredAgent, load
 
 
 def frozen_agents(
-    spec: Frozen, spaces: Spaces, game: Game | None, allow: Sequence[str], replicas: Sequence[int]
-) -> list[StoredAgent]:
-    """The stored agent of each replica.
+    specs: Iterable[Frozen], spaces: Spaces, game: Game | None, allow: Sequence[str], replicas: Sequence[int]
+) -> dict[Frozen, list[StoredAgent]]:
+    """The stored agent of each replica, by specification; each run is read once.
 
     Raises:
         ValueError: where it was trained for other observations, actions or ballots, or is not kept.
     """
-    run = _fitting_run(spec.run, spaces, game, allow, is_to_decide=True)
-    return [run.agent(spec.agent, replica=_theirs(spec, replica)) for replica in replicas]
+    specs = tuple(specs)
+    runs = {
+        path: _fitting_run(path, spaces, game, allow, is_to_decide=True)
+        for path in dict.fromkeys(spec.run for spec in specs)
+    }
+    return {
+        spec: [runs[spec.run].agent(spec.agent, replica=_theirs(spec, replica)) for replica in replicas]
+        for spec in specs
+    }
 
 
 def _theirs(spec: Frozen, replica: int) -> int:

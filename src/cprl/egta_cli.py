@@ -3,6 +3,7 @@
 from math import inf
 from pathlib import Path
 
+from cprl.command_parts import check_files, print_tables, runs_by_name, tell_files
 from cprl.commandline import Allow, make_importable
 from cprl.evaluation.cross_play import crossplay
 from cprl.evaluation.egta import RESAMPLES, analyse
@@ -10,11 +11,9 @@ from cprl.evaluation.egta_picture import draw_egta
 from cprl.evaluation.egta_tables import egta_heading, egta_tables
 from cprl.evaluation.empirical_game import pairwise_game, play_empirical_game
 from cprl.evaluation.evaluate import SEED
-from cprl.evaluation_cli import print_tables, runs_by_name
 from cprl.output import say
-from cprl.plotting.style import check_picture
 from cprl.process import prepare_process
-from cprl.runs.labelled import refuse_to_write_over, write_table
+from cprl.runs.labelled import write_table
 from cprl.theory.evolution import check_alpha
 from cprl.theory.extras import check_extras
 
@@ -54,10 +53,7 @@ def egta(
     check_extras()
     check_alpha(alpha)
     make_importable(allow)
-    if out is not None:
-        refuse_to_write_over(out)
-    if figure is not None:
-        check_picture(figure, "--figure")
+    check_files(out, figure)
     prepare_process(seed)
     named, chosen = runs_by_name(runs), list(replicas)
     if pairwise:
@@ -73,7 +69,4 @@ def egta(
     found = analyse(game, alpha=alpha, resamples=resamples)
     say(egta_heading(game))
     print_tables(*egta_tables(found))
-    if out is not None:
-        say(f"Episodes: {out}")
-    if figure is not None:
-        say(f"Figure: {draw_egta(found, figure)}")
+    tell_files(out, figure, lambda path: draw_egta(found, path))

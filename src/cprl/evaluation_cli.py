@@ -1,11 +1,9 @@
 """`cprl film`, `evaluate`, `visits`, `crossplay`, `schelling`: agents that do not learn, in fresh worlds."""
 
-from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-from rich.table import Table
-
+from cprl.command_parts import check_files, print_tables, runs_by_name, tell_files
 from cprl.commandline import Allow, make_importable
 from cprl.evaluation.cross_play import Diagonal
 from cprl.evaluation.cross_play import crossplay as play_each_other
@@ -27,7 +25,7 @@ from cprl.evaluation.tables import (
 from cprl.evaluation.territory import territory_of
 from cprl.evaluation.visits_picture import draw_visits
 from cprl.evaluation.words import board_named
-from cprl.output import OUT, console, say
+from cprl.output import say
 from cprl.plotting.style import check_picture
 from cprl.presets import Variant
 from cprl.process import prepare_process
@@ -181,10 +179,7 @@ def crossplay(
         allow: code of your own, module:Class, that the run may import; see docs/changing.md.
     """
     make_importable(allow)
-    if out is not None:
-        refuse_to_write_over(out)
-    if figure is not None:
-        check_picture(figure, "--figure")
+    check_files(out, figure)
     prepare_process(seed)
     played = play_each_other(
         runs_by_name(runs),
@@ -199,10 +194,7 @@ def crossplay(
         write_table(out, played.table())
     say(heading(played))
     print_tables(*matrices(played), *gains_tables(played), agents_table(played))
-    if out is not None:
-        say(f"Episodes: {out}")
-    if figure is not None:
-        say(f"Figure: {draw_gains(played, figure)}")
+    tell_files(out, figure, lambda path: draw_gains(played, path))
 
 
 def schelling(
@@ -237,10 +229,7 @@ def schelling(
         allow: code of your own, module:Class, that a run may import; see docs/changing.md.
     """
     make_importable(allow)
-    if out is not None:
-        refuse_to_write_over(out)
-    if figure is not None:
-        check_picture(figure, "--figure")
+    check_files(out, figure)
     prepare_process(seed)
     game, run = board_named(board, variant, allow=allow)
     found = play_all_mixes(
@@ -255,37 +244,4 @@ def schelling(
     if out is not None:
         write_table(out, found.table())
     print_tables(*schelling_tables(found))
-    if out is not None:
-        say(f"Episodes: {out}")
-    if figure is not None:
-        say(f"Figure: {draw_schelling(found, figure)}")
-
-
-def runs_by_name(words: Sequence[str]) -> list[str] | dict[str, str]:
-    """Runs as `crossplay` takes them: paths, or a table where one has a name, NAME=PATH.
-
-    Raises:
-        ValueError: if two have one name.
-    """
-    pairs = [_name_and_path(word) for word in words]
-    if not any(name for name, _ in pairs):
-        return [path for _, path in pairs]
-    named = [(name or Path(path).resolve().name, path) for name, path in pairs]
-    names = [name for name, _ in named]
-    for name in names:
-        if names.count(name) > 1:
-            raise ValueError(f"{name} names {names.count(name)} runs; allowed: each its own, NAME=PATH")
-    return dict(named)
-
-
-def _name_and_path(word: str) -> tuple[str, str]:
-    """The parts of NAME=PATH; a path that is there may have "=" itself."""
-    name, equals, path = word.partition("=")
-    return (name, path) if equals and name and "/" not in name and not Path(word).exists() else ("", word)
-
-
-def print_tables(*tables: Table) -> None:
-    """Prints tables; into a file or pipe as wide as they are."""
-    shown = console(width=None if OUT.isatty() else 250)
-    for table in tables:
-        shown.print(table)
+    tell_files(out, figure, lambda path: draw_schelling(found, path))

@@ -2,15 +2,14 @@
 
 from pathlib import Path
 
+from cprl.command_parts import check_files, print_tables, tell_files
 from cprl.commandline import Allow, make_importable
 from cprl.evaluation.evaluate import SEED
 from cprl.evaluation.scenarios import draw_scenarios, run_scenarios
 from cprl.evaluation.scenarios.tables import heading, scenario_tables
-from cprl.evaluation_cli import print_tables
 from cprl.output import say
-from cprl.plotting.style import check_picture
 from cprl.process import prepare_process
-from cprl.runs.labelled import refuse_to_write_over, write_table
+from cprl.runs.labelled import write_table
 
 
 def scenarios(
@@ -41,10 +40,7 @@ def scenarios(
         allow: code of your own, module:Class, that the run may import; see docs/changing.md.
     """
     make_importable(allow)
-    if out is not None:
-        refuse_to_write_over(out)
-    if figure is not None:
-        check_picture(figure, "--figure")
+    check_files(out, figure)
     prepare_process(seed)
     scores = run_scenarios(
         run,
@@ -60,7 +56,4 @@ def scenarios(
     say(heading(scores))
     print_tables(*scenario_tables(scores))
     say(f"Weights: {scores.run.weights_from}")
-    if out is not None:
-        say(f"Episodes: {out}")
-    if figure is not None:
-        say(f"Figure: {draw_scenarios(scores, figure)}")
+    tell_files(out, figure, lambda path: draw_scenarios(scores, path))

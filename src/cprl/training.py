@@ -29,9 +29,8 @@ from cprl.learners.base import (
     check_numbers,
     learned_in,
 )
-from cprl.measuring.episodes import Episode, EpisodeTracker
-from cprl.measuring.institutional import institutions_of
-from cprl.measuring.yields import yield_of
+from cprl.measuring.episodes import Episode
+from cprl.measuring.tracking import tracker_of
 from cprl.policies.assignment import AgentIndices, AgentPolicies
 from cprl.policies.decisions import Decider
 from cprl.times import Times
@@ -100,9 +99,7 @@ class Training:
         self._collector = make_collector(env, AgentPolicies({**actors, **self.others}, decisions=decisions))
         self._turns = iter(self._collector)
         longest = None if commons is None else commons.game.rules.episode_steps
-        self._tracker = EpisodeTracker(
-            replicas, spaces.agents, longest, institutions=institutions_of(env), **yield_of(env)
-        )
+        self._tracker = tracker_of(env, longest)
         self._losses = {agents: LaneLosses(replicas, agents) for agents in self.learners}
         self._wanted = WantedReturns(replicas, spaces.agents, self.learners)
         self.finite = FiniteCheck(self.learners, spaces, on_nan=on_nan)

@@ -23,6 +23,7 @@ In reading order:
     sizes        the memory that B worlds take
     state        reads, checks and restores the state of B worlds
     batch        Batch: B worlds, played a turn at a time
+    playing      harvests: a whole episode in every world of a batch
     decoding     observations back to classes of cells
     sprites      agents as they are drawn: number, heading and second mark
     picture      an image of the board for people

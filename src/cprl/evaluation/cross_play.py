@@ -23,7 +23,7 @@ import pyarrow as pa
 
 from cprl import arguments
 from cprl.evaluation.evaluate import SEED, check, chosen_replicas, opened
-from cprl.evaluation.lanes import Played, Source, play, policies_of
+from cprl.evaluation.lanes import Played, Source, play, policies_of, pooled
 from cprl.evaluation.same_game import check_same_game
 from cprl.measuring.replicas import Measured, institution_measures, over_replicas, social_measures
 from cprl.runs.labelled import labelled
@@ -67,16 +67,9 @@ class Cell:
         if agent is not None:
             agents = [arguments.integer("agent", agent, 0, len(agents) - 1)]
         returns = {f"{whose}/return": over_replicas(self.returns(whose, agents)) for whose in _WHOSE}
-        played = self._played(agents[:1] if self.is_self_play else agents)
+        apart = agents[:1] if self.is_self_play else agents
+        played = pooled(self.by_agent[focal] for focal in apart)
         return {**returns, **social_measures(played), **institution_measures(played)}
-
-    def _played(self, agents: Sequence[int]) -> Played:
-        """The episodes with these focal agents, by replica."""
-        together: Played = {}
-        for agent in agents:
-            for replica, episodes in self.by_agent[agent].items():
-                together.setdefault(replica, []).extend(episodes)
-        return together
 
     def returns(self, whose: Whose, agents: Sequence[int] = ()) -> dict[int, list[float]]:
         """A return by replica, of each episode with each focal agent.

@@ -20,9 +20,8 @@ from cprl.evaluation.episode_picture import (
 from cprl.evaluation.film import fresh_episode
 from cprl.evaluation.turns import Turns
 from cprl.evaluation.video_files import check_can_write_mp4, write_gif, write_mp4
-from cprl.measuring.episodes import Episode, EpisodeTracker
-from cprl.measuring.institutional import institutions_of
-from cprl.measuring.yields import yield_of
+from cprl.measuring.episodes import Episode
+from cprl.measuring.tracking import tracker_of
 from cprl.memory import check_memory
 from cprl.policies.assignment import AgentPolicies
 from cprl.runs.labelled import refuse_to_write_over
@@ -127,9 +126,7 @@ def _play(
         return shown._replace(observation=shown.observation[:0])
 
     longest = commons.game.rules.episode_steps
-    tracker = EpisodeTracker(
-        1, commons.game.agents, longest, institutions=institutions_of(env), **yield_of(env)
-    )
+    tracker = tracker_of(env, longest)
     turns = Turns(env, policies)
     moments, violators = [now()], [set[int]()]
     while True:

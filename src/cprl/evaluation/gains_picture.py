@@ -16,12 +16,11 @@ from cprl.evaluation.tables import unit_of_cells
 from cprl.measuring.names import with_unit
 from cprl.measuring.statistics import Estimate, Interval
 from cprl.plotting.cells import EMPTY, draw_cell
-from cprl.plotting.style import SMALL_PT, head, save, wrapped
+from cprl.plotting.style import INTERVALS, SMALL_PT, head, save, wrapped
 
 _COLOURS: Final = "RdBu"
 _CELL_IN: Final = (0.82, 0.45)
 _NARROWEST_IN: Final = 7.0
-_INTERVALS: Final = {"t": "Student's t", "bca": "bootstrap of the replicas (BCa)"}
 _PANELS: Final = {
     "focal": "the focal agent, beside the agent whose place it takes",
     "background": "the background agents, beside themselves without it",
@@ -49,7 +48,7 @@ def draw_gains(played: CrossPlay, path: Path | str, *, interval: Interval = "t")
     note = (
         f"{count} replica{'s' * (count != 1)}, {played.episodes} episodes each with focal agent at each "
         f"index; diagonal ({played.diagonal.replace('_', '-')}): an agent's return. * the 95 % interval by "
-        f"{_INTERVALS[interval]} excludes 0, as that of about one in twenty would by chance; these are "
+        f"{INTERVALS[interval]} excludes 0, as that of about one in twenty would by chance; these are "
         f"{2 * len(found)}."
     )
     head(figure, "Cross-play: who gains among whom", note)

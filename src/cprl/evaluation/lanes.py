@@ -4,7 +4,7 @@ A step of all replicas takes as long as a step of one, and each lane's random nu
 replica, agent) alone.
 """
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, Protocol, TypeAlias
 
@@ -21,6 +21,16 @@ from cprl.stored import LoadedRun, stored_policies
 
 Played: TypeAlias = dict[int, list[Episode]]
 """Episodes by the index of the replica."""
+
+
+def pooled(parts: Iterable[Played]) -> Played:
+    """The episodes of several plays together, by replica."""
+    together: Played = {}
+    for played in parts:
+        for replica, episodes in played.items():
+            together.setdefault(replica, []).extend(episodes)
+    return together
+
 
 MakePolicies: TypeAlias = Callable[[Sequence[int]], AgentPolicies]
 """Makes the policies of all agents, given the indices of the replicas that play at once."""

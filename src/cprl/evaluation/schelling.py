@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 
 from cprl import arguments
 from cprl.evaluation.evaluate import SEED
-from cprl.evaluation.lanes import Played
+from cprl.evaluation.lanes import Played, pooled
 from cprl.evaluation.populations import place_of, play_population
 from cprl.evaluation.words import agent_named
 from cprl.measuring.dilemmas import Dilemma, dilemma
@@ -80,11 +80,7 @@ class SchellingDiagram:
             ValueError: for a number that is not in 0..N.
         """
         count = arguments.integer("count", count, 0, self.agents)
-        together: Played = {}
-        for who in self._mixes(count):
-            for replica, episodes in self.played[who].items():
-                together.setdefault(replica, []).extend(episodes)
-        return social_measures(together)
+        return social_measures(pooled(self.played[who] for who in self._mixes(count)))
 
     def table(self) -> pa.Table:
         """All episodes with the columns of `episodes.parquet`, after "restrained", the indices of the

@@ -15,7 +15,6 @@ from cprl.plotting import style
 _RESTRAINED: Final = "#1b7837"
 _GREEDY: Final = "#b2182b"
 _SIZE_IN: Final = (7.5, 3.6)
-_WORDS: Final = {"t": "Student's t", "bca": "bootstrap of the replicas (BCa)"}
 
 
 def draw_schelling(found: SchellingDiagram, path: Path | str, *, interval: Interval = "t") -> Path:
@@ -51,7 +50,7 @@ def draw_schelling(found: SchellingDiagram, path: Path | str, *, interval: Inter
         axes.tick_params(labelsize=style.SMALL_PT)
     note = (
         f"{found.replicas} replicas, {found.episodes} episodes each for each choice of restrained agents; "
-        f"bars: 95 % intervals by {_WORDS[interval]}"
+        f"bars: 95 % intervals by {style.INTERVALS[interval]}"
     )
     style.head(figure, f"Schelling diagram: {found.dilemma(interval=interval).name}", note)
     return style.save(figure, path)

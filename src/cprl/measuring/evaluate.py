@@ -10,10 +10,8 @@ from torchrl.envs.utils import ExplorationType, set_exploration_type
 
 from cprl import arguments
 from cprl.envs.commons_env import CommonsEnv
-from cprl.envs.unwrap import agent_count
-from cprl.measuring.episodes import Episode, EpisodeTracker
-from cprl.measuring.institutional import institutions_of
-from cprl.measuring.yields import yield_of
+from cprl.measuring.episodes import Episode
+from cprl.measuring.tracking import tracker_of
 
 Policy = Callable[[TensorDictBase], TensorDictBase]
 
@@ -34,13 +32,13 @@ def evaluate(env: EnvBase, policy: Policy, *, explore: bool = False) -> list[Epi
     Raises:
         ValueError: if the environment's batches lack entries or have wrong shapes, see `EpisodeTracker`.
     """
-    agents, worlds = agent_count(env), env.batch_size.numel()
+    worlds = env.batch_size.numel()
     if not callable(policy):
         raise arguments.refusal("policy", policy, "a function that writes the actions of all agents")
     arguments.switch("explore", explore)
     is_commons = isinstance(env, CommonsEnv)
     longest = env.game.rules.episode_steps if is_commons else None
-    tracker = EpisodeTracker(worlds, agents, longest, institutions=institutions_of(env), **yield_of(env))
+    tracker = tracker_of(env, longest)
     exploration = ExplorationType.RANDOM if explore else ExplorationType.DETERMINISTIC
     episodes: dict[int, Episode] = {}
     with torch.no_grad(), set_exploration_type(exploration):

@@ -5,8 +5,8 @@ from collections.abc import Iterator, Sequence
 import numpy as np
 
 from cprl.commons.game import Game
-from cprl.commons.yields import sustainable_yield
 from cprl.measuring.possible import possible
+from cprl.measuring.yields import yield_of_game
 from cprl.reporting.claims import with_interval
 from cprl.reporting.claims_alone import LAST
 from cprl.reporting.markdown import table
@@ -40,7 +40,8 @@ def _rows(result: Result) -> Iterator[list[str]]:
         return
     could = possible(game)
     harvests, steps = (result.curves[name][:, -LAST:] for name in ("collective_return", "survival_steps"))
-    bearable = sustainable_yield(game.map, game.rules) * steps + len(game.map.sites)
+    board = yield_of_game(game)
+    bearable = board["sustainable_yield"] * steps + board["first_stock"]
     own = harvests.mean(1)
     best, who = max((could.best_known, could.policy), (float(own.mean()), "this run"))
     yield [

@@ -6,8 +6,9 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from cprl.commons.batch import Batch, turn_of
+from cprl.commons.batch import Batch
 from cprl.commons.game import Game
+from cprl.commons.playing import harvests
 from cprl.evaluation.evaluate import SEED
 
 Values = NDArray[np.float64]
@@ -39,11 +40,6 @@ def returns_by_chance(game: Game, *, episodes: int = EPISODES) -> Values:
 def _played(game: Game, first: int, worlds: int) -> Values:
     """An episode in each of these worlds."""
     rng = np.random.default_rng([SEED, first])
+    size = worlds, game.agents
     batch = Batch(game, worlds, seed=SEED, first_world=first)
-    output = batch.begin(batch.new_output())
-    total = np.zeros(worlds)
-    while not turn_of(output).done.all():
-        actions = rng.integers(len(game.actions), size=(worlds, game.agents))
-        output = batch.play(actions, output)
-        total += turn_of(output).harvest.sum(1)
-    return total
+    return harvests(batch, lambda _: rng.integers(len(game.actions), size=size))

@@ -18,9 +18,10 @@ from numpy.typing import NDArray
 
 from cprl import arguments
 from cprl.checks import Check, check_fields, is_number
-from cprl.commons.batch import Batch, turn_of
+from cprl.commons.batch import Batch
 from cprl.commons.game import Game
 from cprl.commons.near import neighbours
+from cprl.commons.playing import harvests
 from cprl.theory.planner_rules import Agents, Board, Desk, Plan, decide
 
 SEED: Final = 50_021
@@ -82,11 +83,8 @@ def planned_harvest(
     arguments.object_of("planner", planner, Planner | None, "a Planner, or None for the best one")
     episodes = arguments.integer("episodes", episodes, 1, 2**20)
     game = replace(game, institutions=())
-    led = _Led(game, planner or best_planner(game), episodes, arguments.seed(seed))
-    total = np.zeros(episodes)
-    while not turn_of(led.output).done.all():
-        total += led.play()
-    return total
+    lead = _Lead(game, planner or best_planner(game))
+    return harvests(Batch(game, episodes, seed=arguments.seed(seed)), lead)
 
 
 @cache
@@ -96,13 +94,11 @@ def best_planner(game: Game) -> Planner:
     return CANDIDATES[int(np.argmax(found))]
 
 
-class _Led:
-    """Worlds whose agents a planner leads."""
+class _Lead:
+    """A planner that leads the agents of a game."""
 
-    def __init__(self, game: Game, planner: Planner, worlds: int, seed: int) -> None:
+    def __init__(self, game: Game, planner: Planner) -> None:
         self.game, self.planner = game, planner
-        self.batch = Batch(game, worlds, seed=seed)
-        self.output = self.batch.begin(self.batch.new_output())
         self._board = _board_of(game)
         sites, cells, agents = len(game.map.sites), self._board.site_at.shape, game.agents
         self._desk = Desk(
@@ -116,9 +112,9 @@ class _Led:
             queue=np.zeros((cells[0] * cells[1], 2), np.int32),
         )
 
-    def play(self) -> Values:
-        """Plays a turn; what was harvested in each world, [B]."""
-        state = self.batch.state()
+    def __call__(self, batch: Batch) -> NDArray[np.int64]:
+        """The actions of all agents, int64 [B, N]."""
+        state = batch.state()
         actions = np.full(state["row"].shape, len(self.game.actions) - 1, np.int64)  # the last one stays
         for world, step in enumerate(state["step"][:, 0]):
             plan = Plan(
@@ -128,9 +124,7 @@ class _Led:
             )
             agents = Agents(*(state[name][world] for name in Agents._fields))
             decide(self._board, state["stock"][world], agents, plan, self._desk, actions[world])
-        self.output = self.batch.play(actions, self.output)
-        harvest: Values = turn_of(self.output).harvest.sum(1, dtype=np.float64)
-        return harvest
+        return actions
 
 
 def _board_of(game: Game) -> Board:

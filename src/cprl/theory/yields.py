@@ -61,7 +61,8 @@ def exact_yield(
         ValueError: for more sites, and for a number of bites below 1.
         RuntimeError: where no policy is proven best, since apples hardly ever grow.
     """
-    _check(board, rules)
+    arguments.object_of("board", board, Map, "a Map")
+    arguments.object_of("rules", rules, Rules, "Rules")
     sites = len(board.sites)
     if sites > MOST_SITES:
         raise ValueError(f"the board has {sites} sites; allowed: up to {MOST_SITES}")
@@ -79,11 +80,6 @@ def exact_yield(
         if gains.max() - found < TOLERANCE:
             return ExactYield(per_step=found, kept=float(long_run @ moves.left[policy]))
     raise RuntimeError(f"no policy was proven best in {_MOST_ROUNDS * _ROUNDS_AT_ONCE:,} rounds")
-
-
-def _check(board: object, rules: object) -> None:
-    arguments.object_of("board", board, Map, "a Map")
-    arguments.object_of("rules", rules, Rules, "Rules")
 
 
 def _growth(board: Map, rules: Rules) -> Floats:

@@ -9,7 +9,7 @@ import numpy as np
 import pyarrow as pa
 
 from cprl import arguments
-from cprl.evaluation.lanes import Played
+from cprl.evaluation.lanes import Played, pooled
 from cprl.evaluation.scenarios.scenario import Scenario
 from cprl.measuring.replicas import Measured, institution_measures, over_replicas, social_measures
 from cprl.measuring.statistics import Estimate, difference
@@ -42,10 +42,7 @@ class Score:
         Raises:
             ValueError: if it is anything else.
         """
-        together: Played = {}
-        for played in self._of(focal).values():
-            for replica, episodes in played.items():
-                together.setdefault(replica, []).extend(episodes)
+        together = pooled(self._of(focal).values())
         return {
             "focal/return": over_replicas(self.returns("focal", focal), interval="t"),
             "background/return": over_replicas(self.returns("background", focal), interval="t"),
