@@ -1,5 +1,6 @@
 """RLlib's PPO on `commons` through PettingZoo: four agents, each with a network of its own."""
 
+import os
 from typing import Any
 
 import numpy as np
@@ -33,6 +34,7 @@ class FlatWindows(BaseParallelWrapper):
 
 def main(*, iterations: int = 20, worlds: int = 4, seed: int = 0) -> list[float]:
     """Trains on an episode in every world per iteration; returns the harvest of an agent in each."""
+    os.environ.setdefault("RAY_USAGE_STATS_ENABLED", "0")  # nothing is sent to Ray's makers
     ray.init("local", num_cpus=1, include_dashboard=False, object_store_memory=100_000_000)
     game = presets.game("commons")
     frames = worlds * game.rules.episode_steps
