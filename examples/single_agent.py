@@ -16,7 +16,7 @@ FLAT, VALUES, CHOSEN = ("agents", "flat"), ("agents", "action_value"), ("agents"
 ENDS = {"done": ("agents", "done"), "terminated": ("agents", "terminated")}
 
 
-def main(*, episodes: int = 120, seed: int = 0) -> dict[str, float]:
+def main(*, episodes: int = 40, seed: int = 0) -> dict[str, float]:
     """Trains; returns the harvest of an episode at random and greedily, means over 100 fresh worlds."""
     torch.manual_seed(seed)
     game = presets.game("single_basic")

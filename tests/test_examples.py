@@ -66,6 +66,12 @@ def test_the_single_agent_is_compared_with_random_play(example, shorter_episodes
     assert "episode 10: harvest" in capsys.readouterr().out
 
 
+@pytest.mark.slow
+def test_the_single_agent_earns_three_times_what_chance_does(example):
+    played = example("single_agent").main(episodes=20)
+    assert played["greedy"] >= 3 * played["random"]
+
+
 class TestSB3:
     """Stable-Baselines3 through PettingZoo and SuperSuit."""
 
