@@ -1,182 +1,59 @@
-"""One DQN agent alone on `single_basic` out of TorchRL's own parts, a whole training on one page to copy.
+"""One DQN agent alone on `single_basic`, out of TorchRL's stock parts."""
 
-    python examples/single_agent.py --watch serve
-
-To be read from top to bottom: TorchRL's replay buffer, `QValueActor`, `EGreedyModule` and `DQNLoss`. It has
-no checkpoints, and is several times slower than recipes, in which cprl does all this for many agents at once.
-Its schedule is its own: the published one (recipes/single_basic.py, with 8 replicas) takes an hour.
-Copy this file and change it: another map, rule, network or loss is one line.
-"""
-
-import logging
-from collections.abc import Sequence
-from dataclasses import replace
-from math import nan
-from pathlib import Path
-from statistics import fmean
+from math import prod
 
 import torch
 import tyro
-from tensordict.nn import TensorDictSequential
-from torchrl.data import Categorical, LazyTensorStorage, TensorDictReplayBuffer
-from torchrl.modules import EGreedyModule, QValueActor
-from torchrl.objectives import DQNLoss, HardUpdate
+from tensordict.nn import TensorDictModule, TensorDictSequential
+from torchrl.collectors import Collector
+from torchrl.data import LazyTensorStorage, TensorDictReplayBuffer
+from torchrl.modules import MLP, EGreedyModule, QValueModule
+from torchrl.objectives import DQNLoss, SoftUpdate
 
-import cprl
-from cprl import CommonsEnv, presets
-from cprl.algorithms import DQN
-from cprl.callbacks import Callback
-from cprl.collectors import StepCollector
-from cprl.commandline import in_a_sentence
-from cprl.learners.settings import DQNSettings
-from cprl.learners.transitions import transitions_of
-from cprl.measuring.episodes import EpisodeTracker
-from cprl.measuring.evaluate import evaluate
-from cprl.networks.mlp import MLPNetwork
-from cprl.output import say
-from cprl.policies.assignment import AgentPolicies
-from cprl.policies.single import RandomActor
-from cprl.population import Learning, exploration_steps
-from cprl.runs.directory import start_run
-from cprl.runs.episodes import EpisodeTable
-from cprl.runs.weights import BestWeights, restore_weights, save_weights
-from cprl.terminal.figures import training_curve
-from cprl.terminal.progress import ProgressBar
-from cprl.terminal.summary import summarise
-from cprl.viewer.callback import ViewerCallback
-from cprl.viewer.streams import check_watch
+from cprl import CommonsEnv, keys, presets
 
-PUBLISHED_LINE = ".venv/bin/python recipes/single_basic.py"
-SHORT = {"epsilon_decay_steps": 30_000, "batch_size": 64, "learning_rate": 3e-4, "target_every_episodes": 1}
-"""What differs from the published schedule, besides the number of episodes: it has to learn from 1/50 of the
-steps."""
+FLAT, VALUES, CHOSEN = ("agents", "flat"), ("agents", "action_value"), ("agents", "chosen_action_value")
+ENDS = {"done": ("agents", "done"), "terminated": ("agents", "terminated")}
 
 
-def main(
-    *,
-    episodes: int = 120,
-    evaluation_episodes: int = 100,
-    seed: int = 0,
-    out: Path | None = None,
-    watch: str = "file",
-) -> Path:
-    """Trains the agent, evaluates it on fresh worlds, and returns the run's directory.
-
-    Args:
-        episodes: how many to train.
-        evaluation_episodes: fresh episodes for the trained and for the random policy.
-        seed: of chance, weights, exploration and replay.
-        out: the run's directory; by default a new one under runs/.
-        watch: "file", or live as well: "serve" on 127.0.0.1, "spawn" a viewer, "connect ADDRESS".
-    """
-    check_watch(watch, can_be_off=False)
-    game = presets.game("single_basic")
-    settings = replace(presets.dqn_settings("single_basic"), **SHORT)
-    title = f"single_basic, published rules, short schedule, {episodes} episodes"
-    experiment = cprl.Experiment(
-        name="single_agent",
-        game=game,
-        agents=(Learning(DQN(settings=settings)),),
-        episodes=episodes,
-        seed=seed,
-        evaluation_episodes=evaluation_episodes,
-    )
-
+def main(*, episodes: int = 40, seed: int = 0) -> dict[str, float]:
+    """Trains; returns the harvest of an episode at random and greedily, means over 100 fresh worlds."""
     torch.manual_seed(seed)
-    torch.set_num_threads(1)
-    logging.getLogger("torchrl").setLevel(logging.WARNING)
-    run = start_run(out, experiment.name, experiment.to_recipe)
-    env, trial = CommonsEnv(game, seed=seed), CommonsEnv(game, 16, seed=seed + 1)
-
-    network = MLPNetwork(
-        game.observation_shape,
-        len(game.actions),
-        hidden_cells=settings.hidden_cells,
-        highest=game.observation.highest,
+    game = presets.game("single_basic")
+    env, turns = CommonsEnv(game, seed=seed), game.rules.episode_steps
+    network = MLP(prod(game.observation_shape), len(game.actions), num_cells=[64, 64])
+    pick = QValueModule("categorical", VALUES, out_keys=[keys.ACTION, VALUES, CHOSEN])
+    flat = TensorDictModule(lambda windows: windows.flatten(-3) / 255, [keys.OBSERVATION], [FLAT])
+    greedy = TensorDictSequential(flat, TensorDictModule(network, [FLAT], [VALUES]), pick)
+    annealed = {"eps_end": 0.05, "annealing_num_steps": episodes * turns // 2}
+    explore = EGreedyModule(env.full_action_spec_unbatched, action_key=keys.ACTION, **annealed)
+    loss = DQNLoss(greedy, action_space="categorical")
+    loss.set_keys(action=keys.ACTION, action_value=VALUES, value=CHOSEN, reward=keys.REWARD, **ENDS)
+    loss.make_value_estimator(gamma=0.99)
+    adam, target = torch.optim.Adam(loss.parameters(), lr=3e-4), SoftUpdate(loss, tau=0.005)
+    buffer = TensorDictReplayBuffer(storage=LazyTensorStorage(100_000), batch_size=64)
+    sizes = {"frames_per_batch": turns, "total_frames": episodes * turns}
+    stock = Collector(
+        env, TensorDictSequential(greedy, explore), **sizes, auto_register_policy_transforms=False
     )
-    spec = Categorical(len(game.actions), shape=(), dtype=torch.int64)
-    greedy = QValueActor(network, spec=spec, action_space="categorical")
-    explore = EGreedyModule(spec=spec, eps_init=settings.epsilon_start, eps_end=settings.epsilon_end)
-    policy = AgentPolicies([TensorDictSequential(greedy, explore)])  # explores under ExplorationType.RANDOM
-    loss = DQNLoss(greedy, loss_function="l2", action_space="categorical", delay_value=True)
-    loss.make_value_estimator(gamma=settings.gamma)
-    buffer = TensorDictReplayBuffer(
-        storage=LazyTensorStorage(settings.buffer_size),
-        batch_size=settings.batch_size,
-        generator=torch.Generator().manual_seed(seed),
-    )
-
-    networks = {"agent_0": network}
-    live, shown = None if watch == "file" else watch, experiment.to_config()
-    with (
-        ViewerCallback(run, env, title=title, episodes=episodes, recipe=shown, live=live) as viewer,
-        EpisodeTable(run / "episodes.parquet") as table,
-        ProgressBar(game, episodes=episodes) as bar,
-    ):
-        best = BestWeights(run, networks, policy=policy, env=trial, logger=viewer.logger)
-        callbacks = [table, viewer, best, bar]
-        learn(env, policy, network, explore, loss, buffer, settings, episodes, callbacks=callbacks)
-    save_weights(run, networks)
-
-    fresh = CommonsEnv(game, evaluation_episodes, seed=seed + 2)
-    played = {"random": evaluate(fresh, AgentPolicies([RandomActor(len(game.actions), seed=seed)]))}
-    played["greedy, last"] = evaluate(fresh, policy)
-    if best.path:
-        restore_weights(best.path, networks)
-        played[f"greedy, best (episode {best.best_episode})"] = evaluate(fresh, policy)
-    ends = exploration_steps(experiment.agents)
-    figure = training_curve(run, title=title, random=played["random"], exploration_steps=ends)
-    note = None if best.path else "No best weights: greedy play harvested nothing whenever it was tried"
-    summarise(run, title=title, played=played, figure=figure, note=note)
-    say(f"This was a shortened schedule. The published one, with 8 replicas: {PUBLISHED_LINE}")
-    return run
-
-
-def learn(
-    env: CommonsEnv,
-    policy: AgentPolicies,
-    network: MLPNetwork,
-    explore: EGreedyModule,
-    loss: DQNLoss,
-    buffer: TensorDictReplayBuffer,
-    settings: DQNSettings,
-    episodes: int,
-    *,
-    callbacks: Sequence[Callback],
-) -> None:
-    """One update a turn, as Mnih et al. (2015) do it; the target network is replaced as episodes end."""
-    adam = torch.optim.Adam(loss.parameters(), lr=settings.learning_rate, eps=settings.adam_eps, fused=True)
-    # HardUpdate copies at every (interval + 1)-th step, and once when it is made.
-    target = HardUpdate(loss, value_network_update_interval=settings.target_every_episodes - 1)
-    tracker = EpisodeTracker(1, env.game.agents, env.game.rules.episode_steps)
-    losses = []
-    for step, turn in enumerate(StepCollector(env, policy), start=1):
-        buffer.extend(transitions_of(0, turn))
-        explore.eps.fill_(settings.epsilon(step))
-        if len(buffer) >= settings.learning_starts:
-            error = loss(buffer.sample())["loss"]
+    for episode, batch in enumerate(stock):
+        for of_world, of_agents in ENDS.items():  # [1, T, 1] to [1, T, 1, 1], as the rewards are
+            batch["next", *of_agents] = batch["next", of_world].unsqueeze(-1)
+        buffer.extend(batch.reshape(-1))
+        explore.step(turns)
+        for _ in range(turns // 4):
             adam.zero_grad()
-            error.backward()
+            loss(buffer.sample())["loss"].backward()
             adam.step()
-            losses.append(error.item())
-        for callback in callbacks:
-            callback.on_step(turn)
-        for episode in tracker.add(turn):
-            with torch.no_grad():
-                values = network(turn["next", "agents", "observation"][:, 0])
-            learning = {
-                "agent_0/loss": fmean(losses) if losses else nan,
-                "agent_0/epsilon": settings.epsilon(step),
-                "agent_0/q": values.max().item(),
-            }
-            losses.clear()
             target.step()
-            for callback in callbacks:
-                callback.on_episode(episode, learning)
-            if episode.episode + 1 == episodes:
-                return
+        if episode % 10 == 9:
+            print(f"episode {episode + 1}: harvest {batch['next', *keys.REWARD].sum():.0f}", flush=True)
+    trial, played = CommonsEnv(game, 100, seed=seed + 1), {}
+    for name, policy in {"random": None, "greedy": greedy}.items():
+        steps = trial.rollout(turns, policy, break_when_any_done=False, break_when_all_done=True)
+        played[name] = steps["next", *keys.HARVEST].sum().item() / 100
+    return played
 
 
 if __name__ == "__main__":
-    with in_a_sentence("single_agent.py"):
-        tyro.cli(main)
+    print(tyro.cli(main))

@@ -1,75 +1,119 @@
-"""Examples in miniature. One agent out of plain TorchRL parts leaves a run's directory like any other."""
+"""The examples in miniature: cprl's games under other people's trainers."""
 
 import importlib.util
-import json
+import sys
 from pathlib import Path
 
 import pytest
 
-from cprl import CommonsEnv, Experiment, presets
-from cprl.measuring.evaluate import evaluate, mean_return
-from cprl.networks.mlp import MLPNetwork
-from cprl.policies.assignment import AgentPolicies
-from cprl.policies.single import QActor, RandomActor
-from cprl.runs.directory import read_recipe
-from cprl.runs.episodes import read_episodes
-from cprl.runs.weights import load_weights, restore_weights
+from cprl import Game, Rules, maps, presets
 
-_SPEC = importlib.util.spec_from_file_location(
-    "single_agent", Path(__file__).parents[1] / "examples" / "single_agent.py"
+EXAMPLES = Path(__file__).parents[1] / "examples"
+NAMES = sorted(path.stem for path in EXAMPLES.glob("*.py"))
+EASY = Game(
+    map=maps.parse(">.A.\n....\n.A.<"), rules=Rules(regrow_prob=(0.5,), may_fire=False, episode_steps=60)
 )
-EXAMPLE = importlib.util.module_from_spec(_SPEC)
-_SPEC.loader.exec_module(EXAMPLE)
-
-pytestmark = pytest.mark.usefixtures("shorter_episodes")
+"""Apples that always come back: whoever walks about harvests little, whoever stays near them a lot."""
 
 
-def run_in_miniature(tmp_path, capsys, **arguments):
-    run = EXAMPLE.main(episodes=11, evaluation_episodes=3, out=tmp_path / "run", **arguments)
-    return run, capsys.readouterr().out
+@pytest.fixture
+def example(monkeypatch):
+    """Loads an example, as a module that can be pickled."""
+
+    def loaded(name):
+        spec = importlib.util.spec_from_file_location(name, EXAMPLES / f"{name}.py")
+        module = importlib.util.module_from_spec(spec)
+        monkeypatch.setitem(sys.modules, name, module)
+        spec.loader.exec_module(module)
+        return module
+
+    return loaded
 
 
-def test_the_single_agent_leaves_a_run_directory(tmp_path, capsys):
-    run, told = run_in_miniature(tmp_path, capsys, seed=3)
-    kept = json.loads((run / "recipe.json").read_text())
-    assert kept["recipe"] == "single_agent"
-    experiment = Experiment.from_recipe(kept)
-    assert (experiment.seed, experiment.game) == (3, presets.game("single_basic"))
-    assert experiment.agents[0].algorithm.settings.learning_rate == 3e-4
-    assert read_episodes(run)["episode"].to_pylist() == list(range(11))
-    assert (run / "episodes.parquet").exists()
-    assert (run / "run.rrd").stat().st_size > 10_000
-    assert (run / "figures" / "training_curve.png").stat().st_size > 10_000
-    best = run / "checkpoints" / "best.pt"
-    assert best.exists() == ("greedy, best" in told), "there is none while the policy harvests nothing"
-    assert set(load_weights(run / "checkpoints" / "final.pt")) == {"agent_0"}
-    assert "random" in told
-    assert "greedy" in told
+@pytest.mark.parametrize("name", NAMES)
+def test_an_example_has_less_than_sixty_lines_and_a_row_in_the_docs(name):
+    assert len((EXAMPLES / f"{name}.py").read_text().splitlines()) < 60
+    page = (EXAMPLES.parent / "docs" / "trainers.md").read_text()
+    assert f"| [`{name}.py`](../examples/{name}.py) |" in page
 
 
-def test_the_single_agent_says_that_it_is_short_and_names_the_published_schedule(tmp_path, capsys):
-    run, told = run_in_miniature(tmp_path, capsys, watch="serve")
-    assert "Watch live (browser): http://127.0.0.1:" in told
-    assert "short schedule, 11 episodes" in " ".join(told.split())
-    assert "The published one, with 8 replicas: .venv/bin/python recipes/single_basic.py" in told
-    (agent,) = Experiment.from_recipe(read_recipe(run)).agents
-    assert agent.algorithm.settings.epsilon_decay_steps == 30_000
+def test_ippo_of_torchrls_parts_says_what_agents_harvest(example, shorter_episodes, capsys):
+    (harvest,) = example("torchrl_ippo").main(iterations=1, worlds=2)
+    assert harvest >= 0
+    assert f"iteration 1: an agent harvests {harvest:.1f} in an episode" in capsys.readouterr().out
 
 
-def test_a_directory_with_a_run_in_it_is_not_written_over(tmp_path, capsys):
-    run, _ = run_in_miniature(tmp_path, capsys)
-    with pytest.raises(FileExistsError):
-        run_in_miniature(tmp_path, capsys)
-    assert read_episodes(run).num_rows == 11
+def test_ppo_in_plain_torch_repeats_itself(example, shorter_episodes):
+    first, again, other = (
+        example("cleanrl_style_ppo").main(iterations=2, worlds=2, seed=s) for s in (3, 3, 4)
+    )
+    assert first == again
+    assert first != other
 
 
 @pytest.mark.slow
-def test_the_short_schedule_earns_three_times_what_chance_does(tmp_path):
-    run = EXAMPLE.main(out=tmp_path / "run")
-    game = presets.game("single_basic")
-    network = MLPNetwork(game.observation_shape, 7, highest=game.observation.highest)
-    restore_weights(run / "checkpoints" / "best.pt", {"agent_0": network})
-    fresh = CommonsEnv(game, 100, seed=1234)
-    greedy, _ = mean_return(evaluate(fresh, AgentPolicies([QActor(network, 7)])))
-    chance, _ = mean_return(evaluate(fresh, AgentPolicies([RandomActor(7)])))
-    assert greedy >= 3 * chance
+@pytest.mark.parametrize("name", ["torchrl_ippo", "cleanrl_style_ppo"])
+def test_plain_ppo_finds_apples_that_always_come_back(name, example, monkeypatch):
+    monkeypatch.setattr(presets, "game", lambda _: EASY)
+    harvests = example(name).main(iterations=20, worlds=8)
+    assert sum(harvests[-3:]) > 1.5 * sum(harvests[:3])
+
+
+def test_the_single_agent_is_compared_with_random_play(example, shorter_episodes, capsys):
+    played = example("single_agent").main(episodes=10)
+    assert set(played) == {"random", "greedy"}
+    assert min(played.values()) >= 0
+    assert "episode 10: harvest" in capsys.readouterr().out
+
+
+@pytest.mark.slow
+def test_the_single_agent_earns_three_times_what_chance_does(example):
+    played = example("single_agent").main(episodes=20)
+    assert played["greedy"] >= 3 * played["random"]
+
+
+class TestSB3:
+    """Stable-Baselines3 through PettingZoo and SuperSuit."""
+
+    @pytest.fixture
+    def sb3(self, example):
+        pytest.importorskip("stable_baselines3", reason="needs the extra sb3")
+        pytest.importorskip("supersuit", reason="needs the extra sb3")
+        return example("sb3_ppo")
+
+    @pytest.mark.filterwarnings("ignore:The `render_mode` attribute is not defined")
+    def test_ppo_learns_with_shared_weights(self, sb3, shorter_episodes):
+        harvests = sb3.main(iterations=2, worlds=2)
+        assert len(harvests) == 2
+        assert min(harvests) >= 0
+
+    @pytest.mark.filterwarnings("ignore:The `render_mode` attribute is not defined")
+    def test_copies_play_different_worlds_and_the_clock_is_not_an_ending(self, sb3, shorter_episodes):
+        env = sb3.worlds_of(presets.game("commons"), 2, seed=0)
+        env.reset()
+        differs = False
+        for _ in range(60):
+            seen, _, done, infos = env.step([0, 4, 0, 4] * 2)
+            differs = differs or (seen[:4] != seen[4:]).any()
+        assert differs, "apples grow elsewhere in the second world"
+        assert done.all()
+        assert all(info["TimeLimit.truncated"] for info in infos)
+
+
+@pytest.mark.slow
+@pytest.mark.filterwarnings("ignore")
+def test_rllib_learns_with_weights_for_each_agent(example, shorter_episodes, monkeypatch):
+    pytest.importorskip("ray.rllib.algorithms.ppo", reason="needs the extra rllib", exc_type=ImportError)
+    monkeypatch.setenv("RAY_USAGE_STATS_ENABLED", "0")
+    harvests = example("rllib_ppo").main(iterations=2, worlds=2)
+    assert len(harvests) == 2
+    assert min(harvests) >= 0
+
+
+@pytest.mark.filterwarnings("ignore")
+def test_benchmarl_learns_the_task(example, shorter_episodes, tmp_path):
+    if importlib.util.find_spec("benchmarl") is None:
+        pytest.skip("needs BenchMARL, installed as docs/trainers.md says")
+    harvest = example("benchmarl_task").main(iterations=2, worlds=2, out=str(tmp_path))
+    assert harvest >= 0
+    assert list(tmp_path.glob("ippo_commons_*/config.pkl"))

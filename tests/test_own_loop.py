@@ -1,0 +1,75 @@
+"""A loop of one's own in miniature: it leaves a run's directory like any other."""
+
+import importlib.util
+import json
+from pathlib import Path
+
+import pytest
+
+from cprl import CommonsEnv, Experiment, presets
+from cprl.measuring.evaluate import evaluate, mean_return
+from cprl.networks.mlp import MLPNetwork
+from cprl.policies.assignment import AgentPolicies
+from cprl.policies.single import QActor, RandomActor
+from cprl.runs.directory import read_recipe
+from cprl.runs.episodes import read_episodes
+from cprl.runs.weights import load_weights, restore_weights
+
+_SPEC = importlib.util.spec_from_file_location(
+    "own_loop", Path(__file__).parents[1] / "recipes" / "own_loop.py"
+)
+LOOP = importlib.util.module_from_spec(_SPEC)
+_SPEC.loader.exec_module(LOOP)
+
+pytestmark = pytest.mark.usefixtures("shorter_episodes")
+
+
+def run_in_miniature(tmp_path, capsys, **arguments):
+    run = LOOP.main(episodes=11, evaluation_episodes=3, out=tmp_path / "run", **arguments)
+    return run, capsys.readouterr().out
+
+
+def test_the_loop_leaves_a_run_directory(tmp_path, capsys):
+    run, told = run_in_miniature(tmp_path, capsys, seed=3)
+    kept = json.loads((run / "recipe.json").read_text())
+    assert kept["recipe"] == "own_loop"
+    experiment = Experiment.from_recipe(kept)
+    assert (experiment.seed, experiment.game) == (3, presets.game("single_basic"))
+    assert experiment.agents[0].algorithm.settings.learning_rate == 3e-4
+    assert read_episodes(run)["episode"].to_pylist() == list(range(11))
+    assert (run / "episodes.parquet").exists()
+    assert (run / "run.rrd").stat().st_size > 10_000
+    assert (run / "figures" / "training_curve.png").stat().st_size > 10_000
+    best = run / "checkpoints" / "best.pt"
+    assert best.exists() == ("greedy, best" in told), "there is none while the policy harvests nothing"
+    assert set(load_weights(run / "checkpoints" / "final.pt")) == {"agent_0"}
+    assert "random" in told
+    assert "greedy" in told
+
+
+def test_the_loop_says_that_it_is_short_and_names_the_published_schedule(tmp_path, capsys):
+    run, told = run_in_miniature(tmp_path, capsys, watch="serve")
+    assert "Watch live (browser): http://127.0.0.1:" in told
+    assert "short schedule, 11 episodes" in " ".join(told.split())
+    assert "The published one, with 8 replicas: .venv/bin/python recipes/single_basic.py" in told
+    (agent,) = Experiment.from_recipe(read_recipe(run)).agents
+    assert agent.algorithm.settings.epsilon_decay_steps == 30_000
+
+
+def test_a_directory_with_a_run_in_it_is_not_written_over(tmp_path, capsys):
+    run, _ = run_in_miniature(tmp_path, capsys)
+    with pytest.raises(FileExistsError):
+        run_in_miniature(tmp_path, capsys)
+    assert read_episodes(run).num_rows == 11
+
+
+@pytest.mark.slow
+def test_the_short_schedule_earns_three_times_what_chance_does(tmp_path):
+    run = LOOP.main(out=tmp_path / "run")
+    game = presets.game("single_basic")
+    network = MLPNetwork(game.observation_shape, 7, highest=game.observation.highest)
+    restore_weights(run / "checkpoints" / "best.pt", {"agent_0": network})
+    fresh = CommonsEnv(game, 100, seed=1234)
+    greedy, _ = mean_return(evaluate(fresh, AgentPolicies([QActor(network, 7)])))
+    chance, _ = mean_return(evaluate(fresh, AgentPolicies([RandomActor(7)])))
+    assert greedy >= 3 * chance
