@@ -7,7 +7,7 @@ INSTALLED := .venv/.installed
 
 VIEWER_PACKAGES := mesa-vulkan-drivers libvulkan1 chromium chromium-driver
 
-.PHONY: run docs-live lint test fuzz test-slow test-gpu test-viewer viewer-packages check bench bench-gpu clean
+.PHONY: run docs-live lint test test-oldest test-newest fuzz test-slow test-gpu test-viewer viewer-packages check bench bench-gpu clean
 
 run: $(INSTALLED)
 	$(BIN)/python recipes/tragedy.py --watch serve --linger --no-keep-checkpoint
@@ -21,6 +21,24 @@ test: $(INSTALLED)
 
 test-slow: $(INSTALLED)
 	$(BIN)/python -m pytest -m slow
+
+# The oldest and the newest versions that pyproject.toml allows, each in an environment of its own; see
+# docs/upgrading.md. ARGS="tests/test_compat.py" runs a part of the tests.
+MORE_TORCH := $(if $(TORCH_INDEX),--extra-index-url $(TORCH_INDEX))
+test-oldest test-newest: test-%: .venv-%/.installed
+	.venv-$*/bin/python -m pytest -n auto --dist worksteal $(ARGS)
+
+.venv-oldest/.installed: pyproject.toml tests/oldest.py
+	$(PYTHON) -m venv .venv-oldest
+	.venv-oldest/bin/python -m pip install -q packaging
+	.venv-oldest/bin/python tests/oldest.py dev > .venv-oldest/constraints.txt
+	.venv-oldest/bin/python -m pip install -q $(MORE_TORCH) -c .venv-oldest/constraints.txt -e ".[dev]"
+	touch $@
+
+.venv-newest/.installed: pyproject.toml
+	$(PYTHON) -m venv .venv-newest
+	.venv-newest/bin/python -m pip install -q $(MORE_TORCH) --upgrade --upgrade-strategy eager -e ".[dev]"
+	touch $@
 
 # Generated inputs for all that is public, 100,000 and more; the table is docs/fuzz.md. A part of it, and again
 # from another seed: `make fuzz FUZZ="--only Rules --seed 1"`, whose table is then left as it is.
@@ -66,4 +84,4 @@ $(INSTALLED): pyproject.toml constraints.txt
 	touch $@
 
 clean:
-	rm -rf .venv
+	rm -rf .venv .venv-oldest .venv-newest

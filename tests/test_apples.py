@@ -23,6 +23,14 @@ def test_an_empty_site_gives_nothing():
     assert play.harvest == [0]
 
 
+def test_every_site_is_full_at_the_start_of_an_episode_also_the_one_on_which_an_agent_starts():
+    board = maps.Map(height=1, width=4, sites=((0, 0), (0, 3)), starts=((0, 0, 1), (0, 2, 3)))
+    assert Play(board).output.stock[0, 0] == 2
+    assert Play(board).turn("stay").harvest == [1, 0]
+    assert Play(board).turn("forward", "stay").harvest == [0, 0], "it walked away"
+    assert Play(board).turn("stay").again().output.stock[0, 0] == 2
+
+
 def test_an_agent_that_may_not_harvest_a_site_leaves_its_apple():
     others = Boundaries.drawn(".1..\n....")
     play = Play(">A.<\n..A.", institutions=[others]).turn("forward", "stay")

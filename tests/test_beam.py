@@ -39,6 +39,12 @@ def test_two_agents_that_shoot_each_other_are_both_tagged():
     assert Play("A....\n.>.<.").turn("beam").in_play == [False, False]
 
 
+def test_an_agent_tagged_as_it_fires_still_hits_another():
+    play = Play("A.......\n.>.^.^..", beam_length_cells=2)
+    play.turn("stay", "turn_right", "stay").turn("beam", "beam", "stay")
+    assert play.in_play == [True, False, False]
+
+
 def test_an_agent_tagged_in_a_turn_still_harvests_in_that_turn():
     play = Play("..A..\n.>^..").turn("beam", "forward")
     assert play.harvest == [0, 1]
@@ -57,6 +63,19 @@ def test_an_agent_in_two_beams_takes_one_hit_per_turn():
     play.turn("beam", "stay", "stay")
     assert play.output.tagged_by[0].tolist()[1] == [True, False, False]
     assert play.in_play == [True, False, True]
+
+
+def test_hits_are_kept_between_turns_and_a_tag_or_a_new_episode_clears_them():
+    play = Play("A....\n.>.^.", hits_to_tag=2, freeze_steps=1)
+    play.turn("beam", "stay").turn("stay").turn("stay")
+    assert play.batch.now.hits[0].tolist() == [0, 1]
+    assert play.turn("beam", "stay").in_play == [True, False], "the second hit, three turns later"
+    assert play.batch.now.hits[0].tolist() == [0, 0]
+    assert play.turn("beam", "stay").in_play == [True, True], "nobody hits an agent out of play"
+    assert play.batch.now.hits[0].tolist() == [0, 0]
+    assert play.turn("beam", "stay").in_play == [True, True], "one hit since the tag"
+    play.again()
+    assert play.turn("beam", "stay").in_play == [True, True], "one hit in this episode"
 
 
 def test_the_beam_action_of_an_agent_that_may_not_fire_does_nothing():

@@ -4,6 +4,7 @@ A failure here names the part that an upgrade has changed, and where cprl relies
 """
 
 import gc
+import importlib
 import re
 import subprocess
 import sys
@@ -20,12 +21,13 @@ from torch import nn
 from torchrl.data import Binary
 from torchrl.envs import EnvBase
 from torchrl.modules import QValueActor
-from torchrl.objectives import DiscreteCQLLoss, DQNLoss, ValueEstimators
+from torchrl.objectives import DiscreteCQLLoss, DQNLoss, SoftUpdate, ValueEstimators
 
 from cprl import CommonsEnv, Game, Rules, compat, keys, maps
 from cprl.commons import compiled
-from cprl.compat import LaneCategorical
+from cprl.compat import LaneCategorical, losses, recordings
 from cprl.learners.engine.functional import FunctionalLoss, total, weights_of
+from cprl.libraries import fitting_versions, relying_on, require
 
 SOURCE = Path(compat.__file__).parents[1]
 SHORT = Game(
@@ -51,6 +53,85 @@ def test_a_failure_says_what_broke():
         relies_on("TensorDict._no_more", used_by="put"),
     ):
         TensorDict({}, [])._no_more()
+
+
+def test_every_part_of_compat_has_a_test_that_names_it():
+    shown = {name for name in vars(compat) if not name.startswith("_")}
+    modules = {path.stem for path in (SOURCE / "compat").glob("*.py")}
+    users = re.findall(r'used_by="([^"]+)"', Path(__file__).read_text())
+    named = set(re.findall(r"compat\.(\w+)", " ".join(users)))
+    assert shown - modules - named == set()
+
+
+def kept_here():
+    with compiled.kept_in(Path()):
+        pass
+
+
+TORCH, RERUN = r"torch \S+ has no torch\.", r"rerun-sdk \S+ has no rerun_bindings\."
+
+
+@pytest.mark.parametrize(
+    ("module", "part", "use", "message"),
+    [
+        ("torch._dynamo", "config", compat.every_guard, TORCH + r"_dynamo\.config"),
+        ("torch._inductor.loop_body", "LoopBody", compat.sound_local_buffers, TORCH + r".*LoopBody"),
+        (
+            "torch._C._dynamo.eval_frame",
+            "_debug_get_cache_entry_list",
+            lambda: compat.compiled_code(doubled),
+            TORCH + r".*_debug_get_cache_entry_list",
+        ),
+        (
+            "torch._dynamo.guards",
+            "DeletedGuardManagerWrapper",
+            lambda: compat.fits(doubled, ()),
+            TORCH + r".*DeletedGuardManagerWrapper",
+        ),
+        (
+            "torch._inductor.cpu_vec_isa",
+            "valid_vec_isa_list",
+            lambda: compat.remember_vector_instructions.__wrapped__(),
+            TORCH + r"_inductor\.cpu_vec_isa",
+        ),
+        *(
+            ("rerun_bindings", part, lambda part=part: recordings._binding.__wrapped__(part), RERUN + part)
+            for part in (
+                "flush_and_cleanup_orphaned_recordings",
+                "send_arrow_chunk",
+                "ChunkInternal",
+                "send_chunks",
+            )
+        ),
+        ("numba.core.config", "CACHE_DIR", kept_here, r"numba\.config\.CACHE_DIR"),
+    ],
+    ids=lambda value: value if isinstance(value, str) and "." not in value else "",
+)
+def test_a_part_that_an_upgrade_took_away_is_named_where_it_is_used(module, part, use, message, monkeypatch):
+    monkeypatch.delattr(importlib.import_module(module), part)
+    with pytest.raises(ImportError, match=rf"{message}.*, on which cprl \S+ relies; allowed: "):
+        use()
+
+
+def test_a_part_of_a_class_that_is_gone_is_named_when_cprl_is_imported():
+    class LossModule:
+        _has_gone = 1
+
+    require("torchrl", LossModule, "_has_gone")
+    with pytest.raises(ImportError, match=r"torchrl 0\.\S+ has no \S*LossModule\._reduce_loss, on which"):
+        require("torchrl", LossModule, "_has_gone", "_reduce_loss")
+    with pytest.raises(ImportError, match=r"has no LossModule\._has_update_associated"):
+        losses.updated_weights(LossModule())
+
+
+def test_the_versions_that_fit_are_those_of_the_package():
+    assert fitting_versions("torchrl") == "<0.15,>=0.14.1"
+    assert fitting_versions("no-such-library") == ""
+    with (
+        pytest.raises(ImportError, match=r"no-such-library \(not installed\) has no it, .*pyproject\.toml"),
+        relying_on("no-such-library", "it"),
+    ):
+        raise AttributeError("it")
 
 
 def test_entries_are_read_and_written_past_the_checks_of_tensordict():
@@ -158,6 +239,18 @@ def test_a_loss_does_not_warn_of_targets_that_are_promised():
         with warnings.catch_warnings():
             warnings.simplefilter("error")
             loss(transitions(4))
+
+
+def test_a_loss_refuses_updaters_of_torchrl_by_the_names_of_its_targets():
+    loss = q_loss()
+    with relies_on("LossModule._has_update_associated", used_by="compat.updated_weights"):
+        assert compat.updated_weights(loss) == []
+        compat.promise_targets(loss)
+        assert compat.updated_weights(loss) == ["value_network"]
+    with relies_on("TargetNetUpdater, which reads names first,", used_by="compat.refuse_updaters"):
+        compat.refuse_updaters(loss, "cprl updates these targets")
+        with pytest.raises(ValueError, match="cprl updates these targets"):
+            SoftUpdate(loss, eps=0.9)
 
 
 @pytest.mark.parametrize("make_loss", [q_loss, conservative_loss])
@@ -303,6 +396,20 @@ def test_code_that_depended_on_a_class_that_is_gone_fits_nothing():
     assert not compat.fits(own, (Doubling(), torch.ones(2)))
 
 
+def scaled(values):
+    return values * Doubling.factor
+
+
+@ignored
+def test_torch_leaves_guards_out_on_request(monkeypatch):
+    with relies_on("skip_all_guards_unsafe", used_by="compat.NO_GUARDS, beside compat.COMPILE_OPTIONS,"):
+        options = {**compat.COMPILE_OPTIONS, **compat.NO_GUARDS}
+        direct = torch.compile(compat.with_own_code(scaled), fullgraph=True, dynamic=False, options=options)
+        assert direct(torch.ones(2)).tolist() == [2.0, 2.0]
+        monkeypatch.setattr(Doubling, "factor", 3.0)
+        assert direct(torch.ones(2)).tolist() == [2.0, 2.0], "it no longer asks what it was made of"
+
+
 @ignored
 def test_torch_guards_hooks_on_request():
     def applied(module, values):
@@ -399,15 +506,16 @@ def test_a_policy_that_is_nan_changes_nothing_of_the_others():
     sound = torch.tensor([[0.5, -1.0, 2.0], [0.0, 0.1, 0.2]])
     whole, usual = LaneCategorical(logits=sound), torch.distributions.Categorical(logits=sound)
     broken = LaneCategorical(logits=torch.cat([sound, torch.full((1, 3), torch.nan)]))
-    assert torch.equal(whole.entropy(), usual.entropy())
-    assert torch.equal(broken.entropy()[:2], usual.entropy())
-    assert broken.entropy()[2] == 0
-    drawn = []
-    for own in (whole, usual):
-        torch.manual_seed(3)
-        drawn.append(own.sample((50,)))
-    assert torch.equal(*drawn)
-    assert broken.sample((50,)).shape == (50, 3)
+    with relies_on("torch.distributions.Categorical", used_by="compat.LaneCategorical"):
+        assert torch.equal(whole.entropy(), usual.entropy())
+        assert torch.equal(broken.entropy()[:2], usual.entropy())
+        assert broken.entropy()[2] == 0
+        drawn = []
+        for own in (whole, usual):
+            torch.manual_seed(3)
+            drawn.append(own.sample((50,)))
+        assert torch.equal(*drawn)
+        assert broken.sample((50,)).shape == (50, 3)
     action = torch.tensor([0, 1, 2])
     assert torch.equal(broken.log_prob(action)[:2], usual.log_prob(action[:2]))
     assert broken.log_prob(action)[2].isnan()
@@ -446,6 +554,11 @@ for number in range(4):
 # Rerun 0.41 never ends the recording into which it writes a blueprint; none left would be better.
 assert left[-1] - left[0] <= 2 * 3, left
 """
+
+
+def test_recordings_that_nothing_refers_to_can_be_ended():
+    with relies_on("rerun_bindings.flush_and_cleanup_orphaned_recordings", used_by="compat.end_recordings"):
+        compat.end_recordings()
 
 
 @pytest.mark.slow
@@ -504,6 +617,18 @@ def test_a_row_is_sent_as_rerun_itself_sends_columns(tmp_path):
         own = sent("own", lambda to: compat.send_chunk(to, "a/b", timelines(at), components(columns)))
         assert own
         assert own == sent("its", lambda to: to.send_columns("a/b", at, columns))
+    with relies_on("rerun_bindings.ChunkInternal", used_by="compat.rows_made and compat.send_made"):
+        made = compat.rows_made("a/b", components(columns))
+        assert len(made) == 2
+        static = []
+        for number, row in enumerate(made):
+            recording = rr.RecordingStream("cprl", recording_id="sent")
+            recording.save(tmp_path / f"row{number}")
+            compat.send_made(recording, row)
+            recording.disconnect()
+            chunks = [chunk.to_record_batch() for chunk in RrdReader(tmp_path / f"row{number}").stream()]
+            static += [batch.num_rows for batch in chunks if "a/b" in str(batch.schema.metadata)]
+        assert static == [1, 1]
 
 
 def test_what_ends_a_recording_waits_for_its_viewer_and_is_in_a_private_part():

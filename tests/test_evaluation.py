@@ -451,6 +451,8 @@ def test_gains_are_differences_from_the_diagonal_paired_by_replica(scripted):
 
 def test_the_picture_of_gains_has_a_row_for_each_focal_run(scripted, tmp_path):
     path = draw_gains(exploited(scripted), tmp_path / "new" / "gains.png")
+    with pytest.raises(ValueError, match=r"path is '.*gains\.pdf'; allowed: a file whose name ends in \.png"):
+        draw_gains(exploited(scripted), tmp_path / "gains.pdf")
     with Image.open(path) as picture:
         assert min(picture.size) > 500
         colours = np.asarray(picture.convert("RGB")).reshape(-1, 3)

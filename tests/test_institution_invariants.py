@@ -39,6 +39,9 @@ from cprl.institutions import (
 )
 from cprl.institutions.memory import REMEMBERED
 
+# Random walls and boundaries may part all agents from all apples.
+pytestmark = pytest.mark.filterwarnings("ignore:no agent can harvest:UserWarning")
+
 SEEDS = st.integers(0, 2**32 - 1)
 AS_RUN = {
     "pairwise_clashes": True,

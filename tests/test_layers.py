@@ -9,6 +9,7 @@ import cprl
 
 SOURCE = Path(__file__).parents[1] / "src" / "cprl"
 PACKAGES = (
+    "libraries",
     "compat",
     "checks",
     "arguments",

@@ -52,7 +52,7 @@ def test_turning_left_and_right_turns_the_heading_by_a_quarter():
 
 
 def test_edges_and_inner_walls_stop_a_move():
-    play = Play("#A..\n>#..")
+    play = Play("#A..\n>#..\n....")
     assert play.turn("forward").places == [(1, 0)]
     assert play.turn("left").places == [(1, 0)]
     assert play.turn("backward").places == [(1, 0)]

@@ -190,6 +190,8 @@ def test_the_picture_has_a_row_for_each_scenario(runs, tmp_path):
         assert min(picture.size) > 500
     with pytest.raises(ValueError, match=r"scores is 3; allowed: what run_scenarios\(\) gave"):
         draw_scenarios(3, tmp_path / "other.png")
+    with pytest.raises(ValueError, match=r"path is '.*other\.svg'; allowed: a file whose name ends in \.png"):
+        draw_scenarios(scores, tmp_path / "other.svg")
 
 
 def test_the_command_scenarios_tells_returns_and_social_metrics(runs, tmp_path, monkeypatch, capsys):

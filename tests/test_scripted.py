@@ -59,6 +59,7 @@ def test_greedy_takes_the_shortest_path_around_walls_to_the_nearest_apple():
     assert (scene.board, scene.bitten) == (drawn("..^.\nA##.\n...."), 2)
 
 
+@pytest.mark.filterwarnings("ignore:no agent can harvest:UserWarning")
 def test_greedy_wanders_if_a_wall_closes_off_the_only_apple():
     scene = Scene("..#A\n.^#.", "greedy", worlds=64, may_fire=False)
     scene.go(1)

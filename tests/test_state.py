@@ -66,6 +66,20 @@ def test_an_environment_loads_a_state_and_returns_its_observation():
     assert (after[0] == after[1]).all()
 
 
+def test_events_of_the_turn_before_are_not_told_but_windows_show_its_beams():
+    env = CommonsEnv(GAME, 1, seed=1)
+    moment = env.reset()
+    beams = torch.full((1, 2), GAME.actions.index("beam"))
+    after = env.step(moment.set(keys.ACTION, beams))["next"]
+    assert after[keys.FIRED].all()
+    state = env.worlds.state()
+    assert state["fired"].all()
+    shown = env.load(state)
+    assert torch.equal(shown[keys.OBSERVATION], after[keys.OBSERVATION])
+    for key in (keys.HARVEST, keys.FIRED, keys.HIT_BY, keys.TAGGED_BY, keys.REGROWN):
+        assert not shown[key].any(), key
+
+
 def test_loading_the_state_from_before_a_rollout_undoes_the_rollout():
     env = CommonsEnv(GAME, 1, seed=3)
     moment = env.reset()

@@ -226,6 +226,8 @@ def test_figures_of_a_grid_are_drawn_with_a_condition_that_has_no_run(grid_runs,
     }.items():
         width, height = size(draw(tmp_path / f"{name}.png"))
         assert min(width, height) > 300
+        with pytest.raises(ValueError, match=r"path is '.*\.pdf'; allowed: a file whose name ends in \.png"):
+            draw(tmp_path / f"{name}.pdf")
 
 
 def test_random_draws_are_drawn_as_points_and_have_no_heat_map(tmp_path):

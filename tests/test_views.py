@@ -70,6 +70,23 @@ def test_an_agent_out_of_play_sees_itself_but_is_hidden_from_others():
     assert windows(play, 0, 1) == [["bb#", "bb#", ".S#"], ["#o.", "#bb", "#Sb"]]
 
 
+def test_an_agent_that_returns_acts_for_a_turn_before_others_see_it():
+    play = Play("A.....\n.>.<..", window_rows=3, window_columns=3, freeze_steps=2).turn("beam", "stay")
+    play.turn("stay").turn("stay")
+    assert play.in_play == [True, True], "it has returned"
+    assert windows(play, 0) == [["..#", ".m#", ".S#"]], "two cells ahead there seems to be nobody"
+    play.turn("forward", "forward")
+    assert play.places == [(1, 1), (1, 3)], "they bump into each other"
+    assert windows(play, 0) == [[".o#", ".m#", ".S#"]]
+
+
+def test_the_beam_of_an_agent_that_is_tagged_as_it_fires_is_seen():
+    play = Play("A......\n>..<...\n...^...", window_rows=3, window_columns=7, beam_width_cells=1)
+    play.turn("beam", "beam", "stay")
+    assert play.in_play == [False, False, True]
+    assert windows(play, 2) == [["A......", "bbbbbb.", "...S..."]]
+
+
 FACING_DOWN = "....\n.v..\n...A\n>..."
 
 

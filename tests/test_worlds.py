@@ -17,6 +17,9 @@ from cprl.commons.batch import Batch
 from cprl.commons.near import neighbours
 from cprl.commons.world import COL_STEP, ROW_STEP, empty_scratch
 
+# Random walls and boundaries may part all agents from all apples.
+pytestmark = pytest.mark.filterwarnings("ignore:no agent can harvest:UserWarning")
+
 STAY = 7
 
 

@@ -1,6 +1,7 @@
 """cprl: common-pool resources and multi-agent reinforcement learning on TorchRL.
 
 Each imports only from those above it:
+    libraries    what an upgrade of a library has taken away, said by name
     compat       what relies on private parts of libraries
     checks       what users hand in, as tables by field: what fits, and how a refusal reads
     arguments    the same for the arguments of a function

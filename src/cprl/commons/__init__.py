@@ -5,6 +5,7 @@ In reading order:
     rules        every number of the game, with unit, range and source
     maps         boards: drawn, named or generated
     observation  what agents observe, and in which form
+    reach        whether any agent can come to an apple site
     game         Game: a map, its rules and its observations
     world        the arrays of B worlds: state, step output, scratch memory
     colours      the classes of cells and their colours

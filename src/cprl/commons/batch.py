@@ -231,7 +231,8 @@ class Batch:
         return found
 
     def load(self, state: Mapping[str, NDArray[Any]], output: Output) -> Output:
-        """Sets the state of the worlds and writes it into `output`, with no harvest, shots, hits or growth.
+        """Sets the state of the worlds and writes it into `output`, with no harvest, shots, hits or growth,
+        whatever happened in the turn before.
 
         Args:
             state: Arrays as returned by `state`, for the same number of worlds of the same game.

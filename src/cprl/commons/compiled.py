@@ -19,6 +19,7 @@ import numba
 from cprl.caches import cache_folder
 from cprl.commons.loops import FUNCTIONS, LOOPS
 from cprl.compile_clock import CLOCK
+from cprl.libraries import relying_on
 
 Compiled = dict[str, Callable[..., Any]]
 
@@ -34,7 +35,8 @@ def kept_in(folder: Path) -> Iterator[None]:
     Numba documents its setting as an environment variable, read when Numba is imported.
     """
     settings: Any = numba.config
-    usual = settings.CACHE_DIR
+    with relying_on("numba", "numba.config.CACHE_DIR"):
+        usual = settings.CACHE_DIR
     settings.CACHE_DIR = str(folder)
     try:
         yield
@@ -48,7 +50,9 @@ def machine_code(function: Any, *arguments: Any) -> Callable[..., Any]:
     Numba's own call looks at the types of all arguments each time; this one looks at none, so the caller
     must. `Dispatcher.compile` returns it, which Numba does not document.
     """
-    code: Callable[..., Any] = function.compile(tuple(map(numba.typeof, arguments)))
+    with relying_on("numba", "Dispatcher.compile"):
+        compile_for = function.compile
+    code: Callable[..., Any] = compile_for(tuple(map(numba.typeof, arguments)))
     return code
 
 

@@ -1,5 +1,6 @@
 """Game: a Map, its Rules, the agents' Observation, and the institutions that they live under."""
 
+import warnings
 from dataclasses import dataclass, field, fields
 from functools import cached_property
 from importlib import import_module
@@ -14,6 +15,7 @@ from cprl.commons.institution_entries import entries_shown, shows_places
 from cprl.commons.institution_tables import build_institution_tables
 from cprl.commons.maps import Map
 from cprl.commons.observation import Observation, channel_names
+from cprl.commons.reach import why_out_of_reach
 from cprl.commons.rules import Rules
 from cprl.commons.tables import GovernedTables, Tables, build_tables, check_sizes
 from cprl.commons.world import Bytes
@@ -26,6 +28,8 @@ from cprl.spaces import Spaces
 @dataclass(frozen=True, kw_only=True)
 class Game:
     """A map, its rules, what agents observe, and the rules that people make.
+
+    Warns (UserWarning) if no agent can reach a site that it may harvest: nobody then gets an apple.
 
     Raises:
         ValueError: If the observation does not fit the rules, or an institution does not fit the map, the
@@ -62,6 +66,9 @@ class Game:
                 f"{MAX_AGENTS_APART}"
             )
         check_institutions(self.institutions, self.map, self.rules, self.observation)
+        warning = why_out_of_reach(self.map, self.institutions, shuffle_starts=self.rules.shuffle_starts)
+        if warning is not None:
+            warnings.warn(warning, UserWarning, stacklevel=3)
 
     @property
     def agents(self) -> int:

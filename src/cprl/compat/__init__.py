@@ -1,7 +1,8 @@
 """Code that relies on private parts of torch, TorchRL, tensordict or Rerun, or works around their bugs.
 
 There is one function, class or constant for each, with a test in `tests/test_compat.py` that shows what an
-upgrade has broken. The rest of cprl uses public interfaces. Two exceptions are elsewhere:
+upgrade has broken. What is missing is an ImportError that names the part and the versions that fit
+(`cprl.libraries`). The rest of cprl uses public interfaces. Two exceptions are elsewhere:
 
 - code that relies on Numba is in `cprl.commons.compiled`, because the game works without torch;
 - methods with an underscore that a library expects its subclasses to define (`EnvBase._reset`, `_step` and

@@ -11,6 +11,10 @@ from unittest.mock import patch
 
 import torch
 
+from cprl.libraries import relying_on, require
+
+require("torch", torch.compiler, "skip_all_guards_unsafe")
+
 COMPILE_OPTIONS: Final[Mapping[str, Any]] = {"cpp_wrapper": True}
 """Options of `torch.compile`."""
 
@@ -21,11 +25,12 @@ NO_GUARDS: Final[Mapping[str, Any]] = {"guard_filter_fn": torch.compiler.skip_al
 def every_guard() -> AbstractContextManager[Any]:
     """While it is open, torch guards what it compiles also against hooks of modules and shared parameters,
     which it leaves out because they take time at each call; `fits` is asked once for each learner."""
-    import torch._dynamo  # takes a second
+    with relying_on("torch", "torch._dynamo.config with the settings of guards"):
+        import torch._dynamo  # takes a second
 
-    patched: AbstractContextManager[Any] = torch._dynamo.config.patch(
-        skip_nnmodule_hook_guards=False, skip_no_tensor_aliasing_guards_on_parameters=False
-    )
+        patched: AbstractContextManager[Any] = torch._dynamo.config.patch(
+            skip_nnmodule_hook_guards=False, skip_no_tensor_aliasing_guards_on_parameters=False
+        )
     return patched
 
 
@@ -33,9 +38,10 @@ def sound_local_buffers() -> AbstractContextManager[Any]:
     """While it is open, torch's C++ code keeps what an operation changes in place out of the buffers of fused
     loops. Torch 2.13 asks for reads of it by a name that nobody reads, and fails with a KeyError; the open
     issue pytorch/pytorch#196570 says more. IPPO with five teams of four on `commons` meets it."""
-    from torch._inductor.loop_body import LoopBody  # takes a second
+    with relying_on("torch", "torch._inductor.loop_body.LoopBody.get_read_expr"):
+        from torch._inductor.loop_body import LoopBody  # takes a second
 
-    find: Any = LoopBody.get_read_expr
+        find: Any = LoopBody.get_read_expr
 
     def read_of(body: Any, buffer_name: str) -> Any:
         """The index of a read; None, which equals no index, where there is none."""
@@ -55,10 +61,16 @@ def with_own_code(function: Any) -> FunctionType:
 
 def compiled_code(function: FunctionType) -> CodeType | None:
     """The code that torch compiled last for a function from `with_own_code`; None if there is none."""
-    from torch._C._dynamo.eval_frame import _debug_get_cache_entry_list
-
-    entries = _debug_get_cache_entry_list(function.__code__)
+    entries = _compiled_entries(function)
     return entries[-1].code if entries else None
+
+
+def _compiled_entries(function: FunctionType) -> Any:
+    """Torch's cache entries of a function, the last compiled last."""
+    with relying_on("torch", "torch._C._dynamo.eval_frame._debug_get_cache_entry_list"):
+        from torch._C._dynamo.eval_frame import _debug_get_cache_entry_list
+
+    return _debug_get_cache_entry_list(function.__code__)
 
 
 def fits(function: FunctionType, arguments: Sequence[Any]) -> bool:
@@ -68,10 +80,10 @@ def fits(function: FunctionType, arguments: Sequence[Any]) -> bool:
     for granted: types, functions, the numbers and texts that are constants in it, and the forms of tensors,
     whose values never are.
     """
-    from torch._C._dynamo.eval_frame import _debug_get_cache_entry_list
-    from torch._dynamo.guards import DeletedGuardManagerWrapper
+    with relying_on("torch", "torch._dynamo.guards.DeletedGuardManagerWrapper"):
+        from torch._dynamo.guards import DeletedGuardManagerWrapper
 
-    entries = _debug_get_cache_entry_list(function.__code__)
+    entries = _compiled_entries(function)
     guards = entries[-1].guard_manager if entries else None
     # Those of code that depended on an object that is gone hold for everything.
     if guards is None or isinstance(guards, DeletedGuardManagerWrapper):
@@ -101,11 +113,12 @@ def remember_vector_instructions() -> None:
     The answer is kept in torch's cache folder, for this version of torch, compiler and CPU, if every set
     that the CPU has can be used.
     """
-    from torch._inductor import cpu_vec_isa  # takes a second
-    from torch._inductor.cpp_builder import get_compiler_version_info, get_cpp_compiler
-    from torch._inductor.runtime.cache_dir_utils import cache_dir
+    with relying_on("torch", "torch._inductor.cpu_vec_isa and cpp_builder as they were"):
+        from torch._inductor import cpu_vec_isa  # takes a second
+        from torch._inductor.cpp_builder import get_compiler_version_info, get_cpp_compiler
+        from torch._inductor.runtime.cache_dir_utils import cache_dir
 
-    find, every = cpu_vec_isa.valid_vec_isa_list, cpu_vec_isa.supported_vec_isa_list
+        find, every = cpu_vec_isa.valid_vec_isa_list, cpu_vec_isa.supported_vec_isa_list
 
     @cache
     def remembered() -> list[Any]:

@@ -7,6 +7,10 @@ from tensordict import TensorDictBase
 from torchrl.data import Categorical
 from torchrl.envs import EnvBase
 
+from cprl.libraries import require
+
+require("torchrl", EnvBase, "_step_and_maybe_reset")
+
 
 class LeanStepEnv(EnvBase):
     """An `EnvBase` that steps and resets in its own method, `lean_step`.

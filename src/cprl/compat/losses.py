@@ -8,6 +8,10 @@ from tensordict import TensorDictBase
 from torchrl.objectives import HardUpdate, LossModule
 from torchrl.objectives.value import ValueEstimatorBase
 
+from cprl.libraries import relying_on, require
+
+require("torchrl", LossModule, "_reduce_loss")
+
 
 class LaneCategorical(torch.distributions.Categorical):
     """`Categorical` for the policies of several agents in one batch, of which one may be NaN.
@@ -49,12 +53,12 @@ class ReshapedLoss:
 
 def updated_weights(loss: LossModule) -> list[str]:
     """The names of the weights whose targets a TorchRL target updater updates."""
-    return [name for name, is_updated in loss._has_update_associated.items() if is_updated]
+    return [name for name, is_updated in _targets_of(loss).items() if is_updated]
 
 
 def refuse_updaters(loss: LossModule, message: str) -> None:
     """Makes a loss refuse TorchRL's target updaters, which read the names of its targets first."""
-    loss._has_update_associated = _Refusing(loss._has_update_associated, message)
+    loss._has_update_associated = _Refusing(_targets_of(loss), message)
 
 
 class _Refusing(dict[str, bool]):
@@ -71,8 +75,16 @@ class _Refusing(dict[str, bool]):
 def promise_targets(loss: LossModule) -> None:
     """Marks the targets of a loss as updated: it would warn that they have no TorchRL updater, while
     `Engine.copy_to_targets` updates them."""
-    for name in loss._has_update_associated:
-        loss._has_update_associated[name] = True
+    targets = _targets_of(loss)
+    for name in targets:
+        targets[name] = True
+
+
+def _targets_of(loss: LossModule) -> dict[str, bool]:
+    """By the names of weights that have targets, whether a TorchRL updater updates these."""
+    with relying_on("torchrl", "LossModule._has_update_associated"):
+        targets: dict[str, bool] = loss._has_update_associated
+    return targets
 
 
 def forget_cached_weights(loss: LossModule) -> None:

@@ -7,6 +7,11 @@ import torch
 from tensordict import TensorDict, TensorDictBase
 from tensordict.base import NO_DEFAULT
 
+from cprl.libraries import require
+
+require("tensordict", TensorDict, "_get_str", "_set_str", "_new_unsafe")
+require("tensordict", TensorDict({}, []), "_tensordict")
+
 
 def entry(tensordict: TensorDictBase, name: str) -> Any:
     """`tensordict.get(name)` without its handling of nested keys; takes a tenth of the time.

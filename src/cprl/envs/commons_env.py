@@ -254,6 +254,10 @@ class CommonsEnv(LeanStepEnv):
     def load(self, state: Mapping[str, NDArray[Any]]) -> TensorDict:
         """Sets all worlds to a state, and returns their entries as `reset` does.
 
+        The events of the turn before are not told: harvest, fired, hit_by, tagged_by, regrown, and of
+        institutions fines, transfers and violated are 0 and false, also where windows show the beam of an
+        agent whose "fired" in the state is true.
+
         Args:
             state: a value of `env.worlds.state()`: arrays by name, for as many worlds of the same game.
 

@@ -9,14 +9,13 @@ from matplotlib.axes import Axes
 from matplotlib.colors import Normalize
 from matplotlib.figure import Figure
 
-from cprl.arguments import path as path_of
 from cprl.evaluation.cross_play import CrossPlay
 from cprl.evaluation.gains import diagonal_returns, gains
 from cprl.evaluation.tables import unit_of_cells
 from cprl.measuring.names import with_unit
 from cprl.measuring.statistics import Estimate, Interval
 from cprl.plotting.cells import EMPTY, draw_cell
-from cprl.plotting.style import INTERVALS, SMALL_PT, head, save, wrapped
+from cprl.plotting.style import INTERVALS, SMALL_PT, head, picture_path, save, wrapped
 
 _COLOURS: Final = "RdBu"
 _CELL_IN: Final = (0.82, 0.45)
@@ -34,8 +33,11 @@ def draw_gains(played: CrossPlay, path: Path | str, *, interval: Interval = "t")
         played: the cross-play.
         path: the PNG.
         interval: see `cprl.measuring.statistics.Interval`.
+
+    Raises:
+        ValueError: if the name does not end in .png.
     """
-    path, found = path_of("path", path), gains(played, interval=interval)
+    path, found = picture_path(path), gains(played, interval=interval)
     names, diagonal = list(played.runs), diagonal_returns(played)
     returns = with_unit("focal/return", rewards=unit_of_cells(played)).partition("/")[2]
     width = max(_CELL_IN[0] * len(names) + 2.6, _NARROWEST_IN)

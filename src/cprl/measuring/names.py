@@ -12,7 +12,7 @@ NAMES: Final = {
     "peace": ("peace", "agents"),
     "peacefulness": ("peacefulness", "steps in play per agent"),
     "stock_left": ("stock left at the end", "apples"),
-    "yield_share": ("share of the map's yield", "ratio"),
+    "yield_share": ("yield share of the steps played", "ratio"),
 }
 """The words and the unit of each metric of an episode."""
 OF_INSTITUTIONS: Final = {

@@ -129,7 +129,8 @@ def phases(
     exploration: the first phase, if the collective return rises;
     tragedy: collective return, survival and peacefulness all fall;
     combat: after a tragedy, if the collective return rises;
-    cultivation: after a tragedy, if none of the four metrics rises or falls.
+    cultivation: after a tragedy, if none of the four metrics rises or falls, at whatever level: a board that
+    is steadily drained has this label too, so look at the level of the collective return beside it.
     A metric rises or falls if its line changes by more than `CHANGE` of the metric's range.
 
     Args:

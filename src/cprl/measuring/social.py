@@ -104,8 +104,11 @@ def yield_share(
     first_stock: float | Tensor,
     played: Tensor | None = None,
 ) -> Tensor:
-    """sum_i R_i / (sustainable_yield x T + first_stock), a ratio: the harvest relative to the map's yield.
+    """sum_i R_i / (sustainable_yield x T + first_stock), a ratio: the harvest relative to what the map
+    can bear in the T steps that were played.
 
+    Of two episodes with the same harvest the shorter one has the higher share, as agents have who take all at
+    once and end the episode.
     At least 0, and above 1 where the true yield exceeds the given lower bound. Undefined where nothing could
     be harvested.
 

@@ -106,16 +106,26 @@ def wrapped(title: str, width_in: float) -> str:
     return fill(title, int(width_in / CHARACTER_IN))
 
 
+def picture_path(path: str | Path, name: str = "path") -> Path:
+    """The path of a picture to be, whose folder may be missing; a picture that is there is drawn anew.
+
+    Raises:
+        ValueError: if its name does not end in .png.
+    """
+    path = arguments.path(name, path)
+    if path.suffix != ".png":
+        raise arguments.refusal(name, str(path), "a file whose name ends in .png")
+    return path
+
+
 def check_picture(path: str | Path, name: str = "path") -> Path:
-    """The path of a picture to be, checked before hours of work.
+    """`picture_path` of a new picture, checked before hours of work.
 
     Raises:
         ValueError: if its name does not end in .png.
         FileExistsError: if the file exists.
     """
-    path = arguments.path(name, path)
-    if path.suffix != ".png":
-        raise arguments.refusal(name, str(path), "a file whose name ends in .png")
+    path = picture_path(path, name)
     refuse_to_write_over(path)
     return path
 

@@ -147,8 +147,9 @@ def parts(results: Sequence[Result]) -> list[str]:
         first = [f"{found.published[0]:.4g}", with_interval(found.ours[:, 0])]
         cells = [result.name, f"{found.at[0]:.0f}", *first]
         for begin, end in PARTS:
-            values = own[:, begin:end].mean(1)
-            cells += [_published_part(result, begin, end), with_interval(values)]
+            part = own[:, begin:end]
+            whole = own.shape[1] >= (end or -begin)
+            cells += [_published_part(result, begin, end), with_interval(part.mean(1)) if whole else TOO_FEW]
         rows.append(cells)
     head = ["run", "first point at episode", "published", "ours, same window"]
     head += ["500 to 1000, published", "ours", "last 500, published", "ours"]

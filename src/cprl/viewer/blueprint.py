@@ -200,7 +200,7 @@ def _more(curves: Curves) -> Any:
         _social(curves, "Apples per step", "efficiency"),
         _social(curves, "Mean time of harvest, steps", "sustainability"),
         _social(curves, "Apples left at the end", "stock_left"),
-        _social(curves, "Share of what the map bears", "yield_share"),
+        _social(curves, "Yield share of the steps played", "yield_share"),
     )
 
 

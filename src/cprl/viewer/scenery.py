@@ -28,7 +28,7 @@ SOCIAL: Final = {
     "social/peace": ("peace", (204, 121, 167)),
     "social/peacefulness": ("peacefulness", (204, 121, 167)),
     "social/stock_left": ("apples left", PALETTE[APPLE]),
-    "social/yield_share": ("share of the yield", (0, 158, 115)),
+    "social/yield_share": ("yield share of the steps played", (0, 158, 115)),
 }
 """The name and colour of each line, because viewers assign different colours; agents have their own."""
 OTHERS: Final = {

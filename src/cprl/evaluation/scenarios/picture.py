@@ -7,10 +7,9 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from cprl.arguments import object_of
-from cprl.arguments import path as path_of
 from cprl.evaluation.scenarios.score import FocalAgents, Scores, Whose
 from cprl.measuring.statistics import Estimate
-from cprl.plotting.style import MARK, MEAN, SMALL_PT, head, save
+from cprl.plotting.style import MARK, MEAN, SMALL_PT, head, picture_path, save
 
 _LOOKS: Final[dict[tuple[FocalAgents, Whose], tuple[str, str, str]]] = {
     ("run", "focal"): ("o", MEAN, "focal agents: the run's"),
@@ -31,9 +30,12 @@ def draw_scenarios(scores: Scores, path: Path | str) -> Path:
     Args:
         scores: what `run_scenarios` gave.
         path: the PNG.
+
+    Raises:
+        ValueError: if the name does not end in .png.
     """
     object_of("scores", scores, Scores, "what run_scenarios() gave")
-    path = path_of("path", path)
+    path = picture_path(path)
     figure = Figure((8.0, _ROW_IN * len(scores.by_scenario) + 2.0), layout="constrained")
     axes = figure.subplots()
     _draw_rows(axes, scores)

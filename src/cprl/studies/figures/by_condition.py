@@ -8,9 +8,8 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from cprl.arguments import choice, refusal
-from cprl.arguments import path as path_of
 from cprl.measuring.statistics import Interval
-from cprl.plotting.style import MEAN, RANDOM_LINE, SMALL_PT, head, save, wrapped
+from cprl.plotting.style import MEAN, RANDOM_LINE, SMALL_PT, head, picture_path, save, wrapped
 from cprl.studies.figures.panels import (
     FAINT,
     MOST_CONDITIONS,
@@ -50,10 +49,10 @@ def by_condition(
         interval: likewise.
 
     Raises:
-        ValueError: for too many conditions, and for what does not fit.
+        ValueError: for too many conditions, another ending than .png, and for what does not fit.
     """
     choice("kind", kind, ("levels", "differences"))
-    design, path = table.design, path_of("path", path)
+    design, path = table.design, picture_path(path)
     shown = [own for own in design.conditions if kind == "levels" or own != design.reference]
     if kind == "differences" and not table.replicas[design.reference]:
         raise ValueError(f"the reference {design.reference} has no finished run; allowed: one that has")

@@ -10,10 +10,9 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.ticker import NullLocator
 
-from cprl.arguments import path as path_of
 from cprl.arguments import refusal
 from cprl.measuring.statistics import Interval
-from cprl.plotting.style import RANDOM_LINE, SMALL_PT, head, save
+from cprl.plotting.style import RANDOM_LINE, SMALL_PT, head, picture_path, save
 from cprl.studies.figures.panels import (
     LEVEL,
     colours_of,
@@ -65,9 +64,10 @@ def by_factor(
         interval: likewise.
 
     Raises:
-        ValueError: for a factor whose levels are not numbers, and for what does not fit.
+        ValueError: for a factor whose levels are not numbers, another ending than .png, and for what does
+            not fit.
     """
-    design, path = table.design, path_of("path", path)
+    design, path = table.design, picture_path(path)
     numeric = [own for own in design.factors if is_numeric([at[own] for at in design.conditions.values()])]
     if factor not in numeric:
         raise refusal(

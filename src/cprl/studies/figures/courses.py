@@ -9,10 +9,9 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
-from cprl.arguments import path as path_of
 from cprl.measuring.published import SMOOTHED_EPISODES
 from cprl.measuring.statistics import curve_interval
-from cprl.plotting.style import RANDOM_LINE, SMALL_PT, head, save
+from cprl.plotting.style import RANDOM_LINE, SMALL_PT, head, picture_path, save
 from cprl.runs.curves import running_mean
 from cprl.studies.figures.panels import (
     MOST_CONDITIONS,
@@ -51,9 +50,10 @@ def courses(table: StudyTable, path: Path | str, *, metrics: Sequence[str] = ())
         metrics: by default the collective return and survival; else the first that the table has.
 
     Raises:
-        ValueError: for metrics that the table lacks, and more than `MOST_CONDITIONS` conditions.
+        ValueError: for metrics that the table lacks, more than `MOST_CONDITIONS` conditions, and another
+            ending than .png.
     """
-    path, design = path_of("path", path), table.design
+    path, design = picture_path(path), table.design
     chosen = metrics_of(table, metrics or [own for own in METRICS if own in table.metrics])[
         : len(metrics) or 2
     ]

@@ -13,10 +13,9 @@ from matplotlib.patches import Rectangle
 from matplotlib.ticker import MaxNLocator
 
 from cprl.arguments import object_of, refusal
-from cprl.arguments import path as path_of
 from cprl.measuring.statistics import Interval
 from cprl.plotting.cells import EMPTY, draw_cell
-from cprl.plotting.style import SMALL_PT, head, save, wrapped
+from cprl.plotting.style import SMALL_PT, head, picture_path, save, wrapped
 from cprl.studies.figures.panels import (
     MOST_CONDITIONS,
     is_numeric,
@@ -85,9 +84,9 @@ def heat_map(
         interval: likewise.
 
     Raises:
-        ValueError: for what are no two factors of a grid.
+        ValueError: for what are no two factors of a grid, and another ending than .png.
     """
-    path, design = path_of("path", path), table.design
+    path, design = picture_path(path), table.design
     grid, fixed = _checked(design, factors)
     comparison = compare(table, metric, part=part, last=last, interval=interval)
     rows, columns = (_sorted({pair[nth] for pair in grid}) for nth in (0, 1))
@@ -129,9 +128,10 @@ def phase_diagram(
         factors: two factors; None for bars, of at most `MOST_CONDITIONS` conditions.
 
     Raises:
-        ValueError: for what are no two factors of a grid, and for too many conditions.
+        ValueError: for what are no two factors of a grid, for too many conditions, and another ending than
+            .png.
     """
-    path, design = path_of("path", path), table.design
+    path, design = picture_path(path), table.design
     object_of("found", found, Endings, "what endings() gave")
     if factors is None:
         figure, fixed = _bars(table, found), ""
