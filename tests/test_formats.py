@@ -14,12 +14,14 @@ from cprl.runs.checkpoints import read_checkpoint
 from cprl.runs.directory import read_recipe
 from cprl.runs.episodes import read_episodes
 from cprl.runs.files import checksum
+from cprl.runs.manifest import verify
 from cprl.studies import Study, read_study
 
 RESULTS = Path(__file__).parents[1] / "docs" / "results"
-RUNS = sorted(path.parent for path in RESULTS.rglob("recipe.json"))
+STORED = Path(__file__).parent / "stored" / "run"
+"""A run of format 2 with a manifest: two episodes of `single_basic`, whose recipe has its command line."""
+RUNS = [*sorted(path.parent for path in RESULTS.rglob("recipe.json")), STORED]
 STUDIES = sorted(path.parent for path in RESULTS.rglob("study.json"))
-OF_TODAY = RESULTS / "institutions" / "none"
 
 
 def generation(recipe):
@@ -37,7 +39,7 @@ def test_stored_runs_of_every_generation_are_there():
     assert set(manifests) == {False, True}, "with a manifest and without"
 
 
-@pytest.mark.parametrize("run", RUNS, ids=lambda run: str(run.relative_to(RESULTS)))
+@pytest.mark.parametrize("run", RUNS, ids=lambda run: f"{run.parent.name}-{run.name}")
 def test_a_stored_run_is_read_whatever_its_age(run):
     experiment = Experiment.from_recipe(read_recipe(run), directory=run)
     assert experiment == Experiment.from_recipe(experiment.to_recipe(), directory=None)
@@ -58,6 +60,16 @@ def test_the_agents_of_a_stored_run_of_each_generation_play(kind):
     assert step["agents", "action"].shape == (1, loaded.game.agents)
 
 
+def test_the_checksums_of_a_stored_run_still_hold():
+    listed = json.loads((STORED / "manifest.json").read_text())["files"]
+    assert set(listed) == {
+        *("checkpoints/final.pt", "episodes.parquet"),
+        *("evaluation/random.parquet", "evaluation/trained.parquet"),
+    }
+    for name in listed:
+        verify(STORED / name)
+
+
 @pytest.mark.parametrize("study", STUDIES, ids=lambda study: study.name)
 def test_a_stored_study_is_read(study):
     assert read_study(study).all_conditions
@@ -68,7 +80,7 @@ def newer(tmp_path):
     """A stored run of which a file gets the format after today's."""
 
     def made(name, **changes):
-        run = shutil.copytree(OF_TODAY, tmp_path / "run", dirs_exist_ok=True)
+        run = shutil.copytree(STORED, tmp_path / "run", dirs_exist_ok=True)
         table = json.loads((run / name).read_text()) if (run / name).exists() else {}
         (run / name).write_text(json.dumps({**table, **changes}))
         return run
@@ -113,7 +125,7 @@ def test_a_study_of_a_newer_cprl_is_refused_by_name():
 
 
 def test_a_field_that_another_cprl_wrote_is_refused_with_its_version(newer):
-    recipe = json.loads((OF_TODAY / "recipe.json").read_text())
+    recipe = json.loads((STORED / "recipe.json").read_text())
     kept = {**recipe["experiment"], "weather": "rain"}
     run = newer("recipe.json", experiment=kept, versions={**recipe["versions"], "cprl": "9.1"})
     with pytest.raises(ValueError, match=r"experiment\.weather is no field.*; cprl '9\.1' wrote it, and thi"):

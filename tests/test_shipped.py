@@ -3,6 +3,7 @@
 import subprocess
 import sys
 from pathlib import Path
+from types import ModuleType
 
 import pytest
 
@@ -59,11 +60,14 @@ def test_a_recipe_is_printed_as_it_is(monkeypatch, capsys):
 
 @pytest.mark.parametrize("name", [name for name, own in shipped_recipes().items() if own.imports])
 def test_a_printed_recipe_that_imports_others_finds_them_anywhere(name, elsewhere, monkeypatch):
-    monkeypatch.setattr(sys, "path", [str(elsewhere), *sys.path[1:]])
+    monkeypatch.setattr(sys, "path", ["before", str(elsewhere), *sys.path])
+    script = ModuleType("__main__")
+    script.__file__ = str(elsewhere / "mine.py")
+    monkeypatch.setitem(sys.modules, "__main__", script)
     code = compile(recipe_named(name).text(), "mine.py", "exec")
     exec(code, {"__name__": "mine"})
     folder = str(ROOT / "recipes" / recipe_named(name).folder)
-    assert sys.path.index(folder) == 1, "behind the folder of the script, whose own modules come first"
+    assert sys.path.index(folder) == 2, "behind the folder of the script, whose own modules come first"
 
 
 def test_a_module_of_ones_own_comes_before_that_of_the_recipes(elsewhere):

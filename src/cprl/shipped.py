@@ -147,7 +147,11 @@ def import_from(folder: str) -> None:
     folders = sorted({recipe.folder for recipe in shipped_recipes().values()} - {""})
     if folder not in folders:
         raise ValueError(f"folder is {shown(folder)}; allowed: {', '.join(folders)}")
-    sys.path.insert(1, str(recipes_folder() / folder))
+    script = getattr(sys.modules["__main__"], "__file__", None)
+    beside = None if script is None else Path(script).resolve().parent
+    # Libraries may have put folders before that of the script, as Ray does.
+    places = [nth for nth, own in enumerate(sys.path) if own and Path(own).resolve() == beside]
+    sys.path.insert(places[0] + 1 if places else 0, str(recipes_folder() / folder))
 
 
 def program_of(program: str) -> str:
