@@ -114,7 +114,7 @@ COMMANDS = {
     "scenarios": ("scenarios {run} --episodes 1", "scenario"),
     "exploit": ("exploit {run} --algorithms own --seeds 1 --training-episodes 1 --episodes 1", "Episodes:"),
     "sweep": (f"sweep two_complex --vary game.rules.freeze-steps=2,5 {SHORT} --replicas 1", "two_complex"),
-    "table": ("table one two --by seed", "seed"),
+    "table": ("table one two --by engine", "engine"),
     "report": ("report one", "report"),
 }
 """A miniature of each command, and a word of what it prints; the others have tests of their own."""
