@@ -7,7 +7,7 @@ INSTALLED := .venv/.installed
 
 VIEWER_PACKAGES := mesa-vulkan-drivers libvulkan1 chromium chromium-driver
 
-.PHONY: run docs-live lint test test-oldest test-newest fuzz test-slow test-gpu test-viewer viewer-packages check bench bench-gpu clean
+.PHONY: run docs-live lint test test-oldest test-newest fuzz test-slow test-wheel test-gpu test-viewer viewer-packages check bench bench-gpu clean
 
 run: $(INSTALLED)
 	$(BIN)/python recipes/tragedy.py --watch serve --linger --no-keep-checkpoint
@@ -52,6 +52,10 @@ test-viewer: $(INSTALLED) viewer-packages
 
 viewer-packages:
 	sh tests/install_viewers.sh $(VIEWER_PACKAGES)
+
+# The wheel, in a bare environment outside the checkout; pip fetches what it needs.
+test-wheel: $(INSTALLED)
+	$(BIN)/python -m pytest -m network tests/test_wheel.py
 
 lint: $(INSTALLED)
 	$(BIN)/ruff check .

@@ -22,6 +22,7 @@ from cprl.output import say
 from cprl.process import prepare_process
 from cprl.reporting import write_report
 from cprl.runs.export import export_results
+from cprl.shipped import recipe_named
 
 AS_RUN = ("--variant", "as_run")
 DECAY_500K = ("--epsilon-decay-steps", "500000")
@@ -80,7 +81,7 @@ def run(name: str, common: Sequence[str], *, runs: Path, results: Path) -> None:
     directory, log = runs / name, runs / f"{name}.log"
     if not (directory / "report.json").exists():
         runs.mkdir(parents=True, exist_ok=True)
-        command = [sys.executable, str(Path(__file__).with_name(f"{recipe}.py")), *arguments, *common]
+        command = [sys.executable, str(recipe_named(recipe).path), *arguments, *common]
         command += ["--no-keep-checkpoint", "--out", str(directory)]
         command += ["--resume"] if (directory / "recipe.json").exists() else []
         say(f"{name}: see {log}")

@@ -15,6 +15,7 @@ from cprl import presets
 from cprl.algorithms import DQN
 from cprl.output import say
 from cprl.population import Learning
+from cprl.shipped import cprl_here
 from cprl.terminal.course import course_of, in_sentences
 
 SHORT = {"learning_rate": 1e-4, "epsilon_decay_steps": 100_000, "gamma": 0.95}
@@ -22,13 +23,13 @@ SHORT = {"learning_rate": 1e-4, "epsilon_decay_steps": 100_000, "gamma": 0.95}
 
 NEXT = """\
 This was a short schedule. The published one, 8 replicas of 4,800 episodes, takes hours:
-    .venv/bin/python recipes/commons.py --variant as_run
+    {cprl} run commons --variant as_run
 Three things to try next:
-    .venv/bin/cprl film {run} --out tragedy.gif
+    {cprl} film {run} --out tragedy.gif
         one episode of the trained agents as a film
-    .venv/bin/cprl play {run}
+    {cprl} play {run}
         play among them yourself
-    .venv/bin/python recipes/tragedy.py --game.rules.freeze-steps 100 --watch serve --linger
+    {cprl} run tragedy --game.rules.freeze-steps 100 --watch serve --linger
         another rule: who is hit by the beam stays out four times as long"""
 
 
@@ -48,7 +49,7 @@ def experiment() -> cprl.Experiment:
 def tell(run: Path) -> None:
     """Says what happened, and what to try next."""
     say(in_sentences(course_of(run)))
-    say(NEXT.format(run=run))
+    say(NEXT.format(run=run, cprl=cprl_here()))
 
 
 if __name__ == "__main__":

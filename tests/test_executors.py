@@ -262,7 +262,7 @@ def test_a_study_runs_on_an_executor_and_on_nothing_else(tmp_path, on):
 
 def test_where_ray_is_missing_a_sentence_says_how_to_install_it(monkeypatch):
     monkeypatch.setattr(on_ray, "find_spec", lambda name: None)
-    with pytest.raises(ModuleNotFoundError, match=r'pip install -c constraints.txt -e "\.\[ray\]"'):
+    with pytest.raises(ModuleNotFoundError, match=r'pip install "cprl\[ray\]"'):
         Ray()
 
 

@@ -84,7 +84,7 @@ def test_what_a_recipe_would_import_is_refused_by_name():
 
 
 def test_a_recipe_of_another_format_is_refused():
-    with pytest.raises(ValueError, match=r"the format 3; allowed: 2"):
+    with pytest.raises(ValueError, match=r"the format 3, and cprl .* reads up to 2: a newer cprl wrote it"):
         Experiment.from_recipe({**EXPERIMENT.to_recipe(), "format": 3})
     with pytest.raises(ValueError, match=r"experiment\.replica is no field .* mean 'replicas'"):
         Experiment.from_recipe({"format": 2, "experiment": {"replica": 3}})

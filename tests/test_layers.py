@@ -17,6 +17,7 @@ PACKAGES = (
     "spaces",
     "custom",
     "output",
+    "shipped",
     "caches",
     "compile_clock",
     "times",
@@ -68,6 +69,7 @@ PACKAGES = (
     "studies_options",
     "studies_cli",
     "exploit_cli",
+    "recipes_cli",
     "cli",
 )
 MODULES = sorted(path for path in SOURCE.rglob("*.py") if path.parent != SOURCE or path.name != "__init__.py")

@@ -21,6 +21,7 @@ from cprl.measuring import Episode, social
 from cprl.runs.columns import COLUMNS
 from cprl.runs.directory import start_run
 from cprl.runs.episodes import EpisodeTable, read_episodes
+from cprl.runs.source import git_state
 
 
 def an_episode(number: int = 0, *, world: int = 0, **metrics: float) -> Episode:
@@ -280,19 +281,41 @@ def test_a_name_that_is_none_leaves_no_directory(tmp_path):
     assert list(tmp_path.iterdir()) == []
 
 
-def test_the_commit_is_kept_and_whether_a_tracked_file_was_changed(tmp_path, monkeypatch):
-    def commit_of_a_run(name):
-        return json.loads((start_run(tmp_path / name, "tragedy", recipe) / "recipe.json").read_text())["git"]
-
-    monkeypatch.chdir(tmp_path)
-    monkeypatch.setenv("GIT_CEILING_DIRECTORIES", str(tmp_path.parent))
-    assert commit_of_a_run("outside") is None
-    (tmp_path / "map.txt").write_text("A..")
+def a_checkout(folder, *names):
+    """A git folder with these files, committed by nobody in particular."""
+    for name in names:
+        (folder / name).parent.mkdir(parents=True, exist_ok=True)
+        (folder / name).write_text("A..")
     me = ["-c", "user.name=me", "-c", "user.email=me@example.org"]
-    for command in (["init", "-q"], ["add", "map.txt"], [*me, "commit", "-q", "-m", "a map"]):
-        subprocess.run(["git", *command], check=True)
-    clean = commit_of_a_run("clean")
+    for command in (["init", "-q"], ["add", *names], [*me, "commit", "-q", "--allow-empty", "-m", "a map"]):
+        subprocess.run(["git", *command], check=True, cwd=folder)
+
+
+def test_the_commit_of_the_code_is_known_and_whether_a_tracked_file_was_changed(tmp_path):
+    a_checkout(tmp_path, "src/cprl/__init__.py", "map.txt")
+    clean = git_state(tmp_path / "src" / "cprl")
     assert len(clean["commit"]) == 40
     assert clean["dirty"] is False
     (tmp_path / "map.txt").write_text("A.A")
-    assert commit_of_a_run("dirty") == {**clean, "dirty": True}
+    assert git_state(tmp_path / "src" / "cprl") == {**clean, "dirty": True}
+
+
+def test_somebody_elses_git_folder_says_nothing_of_the_code(tmp_path, monkeypatch):
+    a_checkout(tmp_path, "mine.py")
+    installed = tmp_path / ".venv" / "site-packages" / "cprl"
+    installed.mkdir(parents=True)
+    (installed / "__init__.py").write_text("")
+    assert git_state(installed) is None, "git does not track it, though it lies in a git folder"
+    here = git_state()
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setenv("GIT_DIR", str(tmp_path / ".git"))
+    kept = json.loads((start_run(tmp_path / "run", "tragedy", recipe) / "recipe.json").read_text())
+    assert kept["git"] == here, "that of cprl, wherever the process stands"
+
+
+def test_a_wheel_says_from_which_commit_it_was_built(tmp_path):
+    built = {"commit": "0" * 40, "dirty": False}
+    (tmp_path / "commit.json").write_text(json.dumps(built))
+    assert git_state(tmp_path) == built
+    (tmp_path / "commit.json").unlink()
+    assert git_state(tmp_path) is None

@@ -294,7 +294,7 @@ def test_the_runs_of_frozen_agents_are_kept_relative_to_the_study(tmp_path, monk
 @pytest.mark.parametrize(
     ("change", "message"),
     [
-        ({"format": 9}, "the study has the format 9; allowed: 1"),
+        ({"format": 9}, "the study has the format 9, and cprl .* reads up to 1: a newer cprl wrote it"),
         ({"factors": None}, "has no factors and conditions that it could have"),
         ({"factors": [["a", {"distribution": "Normal", "low": 0, "high": 1}]]}, "KeyError.*Normal"),
         ({"experiment": {"name": "x"}}, "lacks game, agents, episodes"),

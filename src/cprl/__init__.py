@@ -9,6 +9,7 @@ Each imports only from those above it:
     spaces       what agents observe and may do
     custom       the user's own code, as a text that a recipe can keep
     output       text for the terminal, which may close
+    shipped      the recipes that come with cprl
     caches       where compiled code is kept between runs
     compile_clock  whether code is being compiled, and for how long
     times        where the time of a training and of a run goes
@@ -60,6 +61,7 @@ Each imports only from those above it:
     studies_options  how a study is run, as options of a command line
     studies_cli  cprl sweep, and study_main: the command line of a recipe of a study
     exploit_cli  cprl exploit
+    recipes_cli  cprl recipe, and recipes that cprl run takes by name
     cli          the command cprl
 """
 

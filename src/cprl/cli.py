@@ -25,6 +25,8 @@ from cprl.play.window import NoWindowError, play_in_window
 from cprl.play.wording import ending, results_text, state
 from cprl.presets import Variant
 from cprl.process import prepare_process
+from cprl.recipes_cli import recipe as print_recipe
+from cprl.recipes_cli import refuse_unknown, run_by_name
 from cprl.reporting import write_report
 from cprl.running import run as run_experiment
 from cprl.runs.directory import read_recipe
@@ -51,6 +53,9 @@ def run(
 ) -> None:
     """Trains the experiment of a recipe or of a run anew, or resumes a run that was stopped.
 
+    A recipe that comes with cprl is run by its name, followed by its own flags: cprl run commons --episodes
+    200; cprl run commons --help lists them, and cprl recipe lists the names. What follows is for the others.
+
     Args:
         recipe: a recipe.json, or the directory of a run.
         out: the new run's directory; by default a new one under runs/, and with --resume the run itself.
@@ -62,6 +67,7 @@ def run(
         linger: keep the recording served after the run, until Ctrl-C; with --watch serve or spawn.
         allow: code of your own, module:Class, that the recipe may import; may be repeated.
     """
+    refuse_unknown(recipe)
     make_importable(allow)
     directory = recipe if recipe.is_dir() else recipe.parent
     experiment = Experiment.from_recipe(read_recipe(recipe), allow=allow, directory=directory)
@@ -200,10 +206,13 @@ def main() -> None:
         with in_a_sentence("cprl sweep"):
             sweep(sys.argv[2:])
         return
+    if run_by_name():
+        return
     with in_a_sentence("cprl"):
         tyro.extras.subcommand_cli_from_dict(
             {
                 "run": run,
+                "recipe": print_recipe,
                 "watch": watch,
                 "film": film,
                 "play": play,

@@ -21,6 +21,7 @@ from cprl.experiment import Experiment
 from cprl.finite import NotFiniteError
 from cprl.flags import applied, flags_of
 from cprl.output import say
+from cprl.shipped import program_of
 
 OptionsT = TypeVar("OptionsT")
 Allow = tyro.conf.UseAppendAction[tuple[str, ...]]
@@ -87,11 +88,11 @@ def recipe_main(
         SystemExit: where the command line or an experiment is refused, with the reason.
     """
     command = list(texts("argv", sys.argv if argv is None else argv, 1))
-    with in_a_sentence(Path(command[0]).name):
+    with in_a_sentence(program_of(command[0])):
         experiment, options = parse(make_experiment, command)
     from cprl.running import run
 
-    with in_a_sentence(Path(command[0]).name):
+    with in_a_sentence(program_of(command[0])):
         return run(experiment, command=command, at_end=at_end, **vars(options))
 
 
@@ -129,7 +130,7 @@ def parse(
             a field of the experiment.
         SystemExit: for `--help`, and for an argument that is unknown or of another type.
     """
-    return parse_with(make_experiment, command[1:], _OPTIONS, program=Path(command[0]).name)
+    return parse_with(make_experiment, command[1:], _OPTIONS, program=program_of(command[0]))
 
 
 def parse_with(

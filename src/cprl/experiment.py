@@ -29,11 +29,12 @@ from cprl.games import game_of, is_playable, stored_game
 from cprl.memory import DEVICE
 from cprl.population import SPEC, AgentSpec, Frozen, Learning, Team, refuse_undecided, specs_by_agent
 from cprl.preferences.values import check_preference
+from cprl.runs import formats
 from cprl.runs.old_recipes import experiment_config, upgraded_game
 
 LoggerName = Literal["csv", "tensorboard", "wandb"]
 LOGGERS: Final[tuple[LoggerName, ...]] = get_args(LoggerName)
-FORMAT: Final = 2
+FORMAT: Final = formats.RECIPE
 """Of `recipe.json`; those of before, which had "arguments", are read too."""
 MOST_SEED: Final = 2**64 - 2
 """Evaluation plays worlds of the next seed."""
@@ -132,9 +133,12 @@ class Experiment:
             directory: where the recipe is kept; runs of `Frozen` are then relative to where we stand.
 
         Raises:
-            ValueError: see `from_config`; for another format.
+            ValueError: see `from_config`; for another format. Says so where another cprl wrote the recipe.
         """
-        experiment = cls.from_config(recipe_config(recipe), allow=allow)
+        try:
+            experiment = cls.from_config(recipe_config(recipe), allow=allow)
+        except ValueError as error:
+            raise ValueError(f"{error}{formats.written_by_another(recipe)}") from error
         return experiment if directory is None or _is_old(recipe) else frozen_from(experiment, directory)
 
     def __eq__(self, other: object) -> bool:
@@ -153,6 +157,7 @@ def recipe_config(recipe: Mapping[str, Any]) -> dict[str, Any]:
     checked("the recipe", recipe, instance(Mapping, "a table"))
     check_nesting(recipe, "the recipe")
     if not _is_old(recipe):
+        formats.refuse_newer("the recipe", recipe, FORMAT)
         if recipe.get("format") != FORMAT or not isinstance(recipe.get("experiment"), Mapping):
             raise ValueError(
                 f"the recipe has the format {shown(recipe.get('format'))}; allowed: {FORMAT}, with a table "

@@ -35,6 +35,9 @@ class Output(io.TextIOBase):
         self.run: Path | None = None
         """The run that goes on without the output, for the sentence that says so."""
 
+    def __del__(self) -> None:
+        """Flushes nothing: since Python 3.13 `sys` may be gone by then, and `keep_output` has flushed."""
+
     @property
     def encoding(self) -> str:  # type: ignore[override]
         """That of the stream."""

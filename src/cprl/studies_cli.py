@@ -16,6 +16,7 @@ from cprl.commandline import in_a_sentence, parse_with
 from cprl.experiment import Experiment
 from cprl.output import keep_output
 from cprl.runs.directory import read_recipe
+from cprl.shipped import command_of, is_shipped, program_of, recipe_named
 from cprl.studies.factors import Distribution
 from cprl.studies.points import Search
 from cprl.studies.study import BLOCK, Study
@@ -23,7 +24,10 @@ from cprl.studies.words import factors_of
 from cprl.studies_options import StudyOptions, carry_out
 
 PROGRAM: Final = "cprl sweep"
-_RECIPE: Final = "A Python file with a function `experiment`, a recipe.json, or the directory of a run."
+_RECIPE: Final = (
+    "A Python file with a function `experiment`, the name of a recipe (cprl recipe lists them), a "
+    "recipe.json, or the directory of a run."
+)
 _MODULE: Final = "cprl_swept_recipe"
 _NOTE: Final = (
     "cprl sweep runs a recipe under several conditions. With --vary PATH=VALUES any value below is varied: "
@@ -92,7 +96,7 @@ def study_main(study: Study, argv: Sequence[str] | None = None) -> Path:
     object_of("study", study, Study, "a Study")
     command = list(texts("argv", sys.argv if argv is None else argv, 1))
     keep_output()
-    script = Path(command[0]).name
+    script = program_of(command[0])
 
     def read(options: Annotated[MainOptions, tyro.conf.arg(name="")] = MainOptions()) -> MainOptions:
         return options
@@ -104,7 +108,7 @@ def study_main(study: Study, argv: Sequence[str] | None = None) -> Path:
         wanted = replace(study, **changed) if changed else study
         if options.episodes is not None:
             wanted = _of_episodes(wanted, options.episodes)
-        return carry_out(wanted, options, [sys.executable, *command])
+        return carry_out(wanted, options, command_of(command))
 
 
 def _of_episodes(study: Study, episodes: int) -> Study:
@@ -127,8 +131,8 @@ def sweep(words: Sequence[str], /) -> None:
     """Runs a recipe under several conditions, or searches for good values: cprl sweep RECIPE --vary ...
 
     Args:
-        words: what stands after `cprl sweep`: first a Python file with a function `experiment`, a
-            recipe.json, or the directory of a run; then options.
+        words: what stands after `cprl sweep`: first a Python file with a function `experiment`, the name of
+            a recipe that comes with cprl, a recipe.json, or the directory of a run; then options.
     """
     if not words or words[0] in ("-h", "--help"):
         _print_help()
@@ -137,13 +141,13 @@ def sweep(words: Sequence[str], /) -> None:
             f"the first word after cprl sweep is {words[0]}; allowed: a recipe, e.g. cprl sweep "
             "recipes/commons.py --vary game.rules.freeze-steps=5,25,100"
         )
-    source = Path(words[0])
+    source = recipe_named(words[0]).path if is_shipped(words[0]) else Path(words[0])
     allow = [after for word, after in pairwise(words) if word == "--allow"]
     allow += [word.removeprefix("--allow=") for word in words if word.startswith("--allow=")]
     sys.path[:0] = [str(source.resolve().parent)] if source.suffix == ".py" else []
     sys.path[:0] = [os.getcwd()] if allow else []
     experiment, options = parse_with(
-        recipe_of(source, allow), words[1:], SweepOptions(), program=f"{PROGRAM} {source}", note=_NOTE
+        recipe_of(source, allow), words[1:], SweepOptions(), program=f"{PROGRAM} {words[0]}", note=_NOTE
     )
     carry_out(wanted(experiment, options), options, ["cprl", "sweep", *words])
 

@@ -33,12 +33,13 @@ from cprl.measuring.episodes import Episode
 from cprl.measuring.tracking import tracker_of
 from cprl.policies.assignment import AgentIndices, AgentPolicies
 from cprl.policies.decisions import Decider
+from cprl.runs import formats
 from cprl.times import Times
 
 MakeCollector = Callable[[EnvBase, nn.Module], BaseCollector]
 """A collector out of an environment and a policy; it yields batches [R], or [R, T] of T turns."""
 
-STATE_FORMAT: Final = 2
+STATE_FORMAT: Final = formats.TRAINING_STATE
 """Of `Training.state_dict`; 1 was that of cprl up to November 2026."""
 
 

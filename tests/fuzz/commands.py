@@ -72,6 +72,7 @@ _SUBCOMMANDS: Final[dict[str, tuple[list[st.SearchStrategy[list[str]]], tuple[An
             *_COMMON,
         ),
     ),
+    "recipe": ([], (st.sampled_from(("commons", "studies/time_out", "base")).map(_alone), _flag("--help"))),
     "watch": ([_run(*runs.NAMES)], (_flag("--help"),)),
     "film": (
         [_run("plain", "finished", "results")],
@@ -209,7 +210,7 @@ def _lines(draw: Any, first: list[st.SearchStrategy[list[str]]], flags: Any, mor
 
 def targets() -> list[Target]:
     """A target for each subcommand, for `cprl` alone, and for each recipe."""
-    more = {"watch": [], "report": [], "export": [], "play": ["--allow", "--terminal"]}
+    more = {"watch": [], "recipe": [], "report": [], "export": [], "play": ["--allow", "--terminal"]}
     found = [
         _target(f"cprl {name}", _subcommand(name), _lines(first, flags, more.get(name, ["--allow"])))
         for name, (first, flags) in _SUBCOMMANDS.items()

@@ -30,7 +30,7 @@ def check_can_write_mp4(path: Path) -> None:
     if find_spec("imageio_ffmpeg") is None:
         raise ModuleNotFoundError(
             f"{path}: an .mp4 needs imageio-ffmpeg, which is not installed; "
-            'run pip install -c constraints.txt -e ".[film]", or name a .gif'
+            'run pip install "cprl[film]", or name a .gif'
         )
 
 

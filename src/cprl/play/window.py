@@ -64,9 +64,7 @@ def _pygame() -> Any:
     try:
         import pygame
     except ImportError as error:
-        raise NoWindowError(
-            'pygame is not installed (pip install -c constraints.txt -e ".[play]")'
-        ) from error
+        raise NoWindowError('pygame is not installed (pip install "cprl[play]")') from error
     try:
         pygame.display.init()
     except pygame.error as error:

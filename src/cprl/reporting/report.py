@@ -100,13 +100,16 @@ def _runs(results: Sequence[Result]) -> list[str]:
 
 
 def _command(line: str) -> str:
-    """The command line from `recipes/` on, without the output directory and without `--go-on`."""
+    """The command line from `recipes/` on, or of `cprl`, without the output directory and without
+    `--go-on`."""
     words = shlex.split(line)
     if "--out" in words:
         at = words.index("--out")
         del words[at : at + 2]
     kept = [word for word in words if word not in ("--resume", "--go-on")]
     script = kept[0]
+    if script == "cprl":
+        return shlex.join(kept)
     return shlex.join(
         ["python", script[script.find("recipes/") :] if "recipes/" in script else script, *kept[1:]]
     )

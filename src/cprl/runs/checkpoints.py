@@ -15,6 +15,7 @@ import torch
 from rich.console import Console
 
 from cprl.output import console as safe_console
+from cprl.runs import formats
 from cprl.runs.directory import resume_command as command_to_resume
 from cprl.runs.files import checksum, place_atomically, refuse_special
 from cprl.runs.lock import RunLock
@@ -245,7 +246,8 @@ def read_checkpoint(path: Path) -> dict[str, Any]:
     """The state in a checkpoint; runs no code of the file.
 
     Raises:
-        ValueError: if the file is not a checkpoint, is truncated or was changed; names file and reason.
+        ValueError: if the file is not a checkpoint, is truncated or was changed, or a newer cprl wrote it;
+            names file and reason.
     """
     name = _NAME.fullmatch(path.name)
     if name is None:
@@ -263,4 +265,5 @@ def read_checkpoint(path: Path) -> dict[str, Any]:
         raise ValueError(f"{path} is not the state of a training: {error}") from error
     if not isinstance(state, dict):
         raise ValueError(f"{path} is not the state of a training, but a {type(state).__name__}")
+    formats.refuse_newer(path, state, formats.TRAINING_STATE)
     return state

@@ -3,7 +3,6 @@ the type of processor."""
 
 import platform
 import shlex
-import subprocess
 import sys
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
@@ -18,9 +17,12 @@ from cprl.arguments import path as path_of
 from cprl.checks import TEXT, checked, shown
 from cprl.config import custom_targets, differences
 from cprl.process import cpu
+from cprl.runs import formats
 from cprl.runs.files import read_json, write_json
 from cprl.runs.lock import FILE_NAME as LOCK_NAME
 from cprl.runs.lock import RunLock
+from cprl.runs.source import git_state
+from cprl.shipped import PROGRAM, command_of
 
 FILE_NAME: Final = "recipe.json"
 
@@ -51,9 +53,9 @@ def start_run(
         command: the command line, script first; by default that of this process.
 
     Returns:
-        The directory. Its `recipe.json` holds the recipe, versions, the git commit of the working directory
-        (None outside a checkout; dirty if a tracked file was changed), the type of processor, the time, and
-        the command without `--out` and without the directory of the script.
+        The directory. Its `recipe.json` holds the recipe, versions, the git commit of the code of cprl (see
+        `cprl.runs.source.git_state`), the type of processor, the time, and the command without `--out` and
+        without the directory of the script.
 
     Raises:
         FileExistsError: if `out` is not empty.
@@ -186,13 +188,14 @@ def resume_command(run: Path, command: Sequence[str] | None = None) -> str:
         allow = [word for target in targets for word in ("--allow", target)]
         return shlex.join(["cprl", "run", str(run), "--resume", *allow])
     kept = [word for word in _without_out(command) if word.replace("_", "-") not in _RESUMES]
-    return shlex.join([sys.executable, *kept, "--out", str(run), "--resume"])
+    return shlex.join([*command_of(kept), "--out", str(run), "--resume"])
 
 
 def _command(words: Sequence[str]) -> str:
     """A command line without local directories, because recipes are published: the script relative to the
     working directory, or its name alone, no `--out` and no `--runs`."""
-    return shlex.join([without_directories(words[0]), *_without_out(words[1:])])
+    first = words[0].split(" ") if words[0].startswith(PROGRAM) else [without_directories(words[0])]
+    return shlex.join([*first, *_without_out(words[1:])])
 
 
 def without_directories(program: str) -> str:
@@ -223,16 +226,21 @@ def read_recipe(run: Path) -> dict[str, Any]:
         run: the run's directory, or the file itself.
 
     Raises:
-        ValueError: if there is no run, or its recipe cannot be read; names file and reason.
+        ValueError: if there is no run, its recipe cannot be read, or a newer cprl wrote it; names file and
+            reason.
     """
     path = Path(run) if Path(run).suffix == ".json" else Path(run) / FILE_NAME
     try:
         recipe = read_json(path)
-        if not any(isinstance(recipe.get(name), dict) for name in ("experiment", "arguments")):
+        is_newer = isinstance(recipe.get("format"), int) and recipe["format"] > formats.RECIPE
+        if not is_newer and not any(
+            isinstance(recipe.get(name), dict) for name in ("experiment", "arguments")
+        ):
             raise TypeError('no table "experiment"')
     except (OSError, ValueError, TypeError) as error:
         name = path if len(str(path)) <= LONGEST_PATH else shown(str(path))
         raise ValueError(f"{name} is not the recipe of a run: {error!r}") from error
+    formats.refuse_newer(path, recipe, formats.RECIPE)
     return recipe
 
 
@@ -245,24 +253,6 @@ def versions() -> dict[str, str | None]:
         except PackageNotFoundError:
             found[package] = None
     return found
-
-
-def git_state() -> dict[str, str | bool] | None:
-    """The git commit of the working directory, and whether a tracked file differs from it; or None."""
-    commit = _git("rev-parse", "HEAD")
-    changes = _git("status", "--porcelain", "--untracked-files=no")
-    if commit is None or changes is None:
-        return None
-    return {"commit": commit, "dirty": changes != ""}
-
-
-def _git(*arguments: str) -> str | None:
-    """The output of git; None if there is no git, no checkout or no commit."""
-    try:
-        done = subprocess.run(["git", *arguments], capture_output=True, text=True, check=True, timeout=10)
-    except (OSError, subprocess.SubprocessError):
-        return None
-    return done.stdout.strip()
 
 
 def _new_directory(name: str, started: datetime) -> Path:

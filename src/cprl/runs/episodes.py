@@ -19,8 +19,9 @@ from tensordict import TensorDictBase
 
 from cprl.arguments import path as path_of
 from cprl.measuring import Episode
+from cprl.runs import formats
 from cprl.runs.columns import rows_of, schema_of, whole_schema
-from cprl.runs.files import refuse_special
+from cprl.runs.files import read_json, refuse_special
 from cprl.runs.journal import Content, Journal, read_journal, write_journal
 from cprl.runs.manifest import verify, write_listed
 
@@ -166,9 +167,12 @@ def read_episodes(run_directory: str | os.PathLike[str]) -> pa.Table:
 
     Raises:
         FileNotFoundError: if there are none.
-        ValueError: if the file is damaged, see `cprl.runs.manifest`.
+        ValueError: if the file is damaged, see `cprl.runs.manifest`, or a newer cprl wrote it.
     """
     path = path_of("run_directory", run_directory) / FILE_NAME
+    recipe = path.with_name("recipe.json")  # with the format of the journal, which has none of its own
+    if recipe.is_file():
+        formats.refuse_newer(recipe, read_json(recipe), formats.RECIPE)
     try:
         # The journal first: while it exists it holds every row, and a merge does not change it.
         return _as_table(read_journal(_journal_of(path)))

@@ -10,10 +10,11 @@ from errno import ENOENT
 from pathlib import Path
 from typing import BinaryIO, Final
 
+from cprl.runs import formats
 from cprl.runs.files import checksum, read_json, write_atomically, write_json
 
 FILE_NAME: Final = "manifest.json"
-FORMAT: Final = 1
+FORMAT: Final = formats.MANIFEST
 
 
 def write_listed(run: Path, name: str, write: Callable[[BinaryIO], object]) -> Path:
@@ -105,6 +106,7 @@ def _files(run: Path) -> dict[str, str]:
         table = read_json(path)
     except FileNotFoundError:
         return {}
+    formats.refuse_newer(path, table, FORMAT)
     files = table.get("files") if table.get("format") == FORMAT else None
     if not isinstance(files, dict) or not all(isinstance(own, str) for own in files.values()):
         raise ValueError(f"{path} is not the manifest of a run, of the format {FORMAT}")

@@ -234,6 +234,6 @@ def _optuna() -> Any:
         import optuna
     except ModuleNotFoundError as error:
         raise ModuleNotFoundError(
-            'Optuna is not installed; run pip install -c constraints.txt -e ".[optuna]"', name="optuna"
+            'Optuna is not installed; run pip install "cprl[optuna]"', name="optuna"
         ) from error
     return optuna

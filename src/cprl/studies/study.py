@@ -12,6 +12,7 @@ from typing import Any, Final
 from cprl.arguments import integer, object_of, refusal, switch
 from cprl.checks import DIRECTORY_NAME, check_nesting, checked, instance, shown
 from cprl.experiment import MOST_SEED, Experiment, frozen_from, frozen_relative_to
+from cprl.runs import formats
 from cprl.studies.conditions import Condition
 from cprl.studies.factors import (
     MOST_CONDITIONS,
@@ -28,7 +29,7 @@ from cprl.studies.factors import (
 from cprl.studies.naming import named, short_names
 from cprl.studies.paths import changed
 
-FORMAT: Final = 1
+FORMAT: Final = formats.STUDY
 """Of `Study.to_config`."""
 BLOCK: Final = 8
 """Replicas that one run trains side by side, if a study does not say."""
@@ -207,6 +208,7 @@ class Study:
         """
         checked("the study", table, instance(Mapping, "a table"))
         check_nesting(table, "the study")
+        formats.refuse_newer("the study", table, FORMAT)
         lacks = [name for name in ("experiment", "factors", "conditions", *_PLAIN) if name not in table]
         if table.get("format") != FORMAT or lacks:
             raise ValueError(

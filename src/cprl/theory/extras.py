@@ -26,6 +26,5 @@ def extra(module: str) -> Any:
 def _check(package: str) -> None:
     if find_spec(package) is None:
         raise ModuleNotFoundError(
-            f"{_PACKAGES[package]} need {package}, which is not installed; run "
-            'pip install -c constraints.txt -e ".[theory]"'
+            f'{_PACKAGES[package]} need {package}, which is not installed; run pip install "cprl[theory]"'
         )

@@ -64,9 +64,7 @@ class Ray:
         if self.memory_bytes is not None:
             integer("Ray.memory_bytes", self.memory_bytes, 1)
         if find_spec("ray") is None:
-            raise ModuleNotFoundError(
-                'Ray is not installed; run pip install -c constraints.txt -e ".[ray]"', name="ray"
-            )
+            raise ModuleNotFoundError('Ray is not installed; run pip install "cprl[ray]"', name="ray")
 
     def run(self, tasks: Sequence[Task]) -> Iterator[Outcome]:
         """Runs every task; they begin in order.

@@ -187,4 +187,7 @@ def _obey(pipe: Connection) -> None:
             pipe.recv()
         except (EOFError, OSError):
             os._exit(1)
-        os.kill(os.getpid(), signal.SIGTERM)
+        if sys.platform == "win32":  # where os.kill ends the process at once, without its handler
+            signal.raise_signal(signal.SIGTERM)
+        else:
+            os.kill(os.getpid(), signal.SIGTERM)

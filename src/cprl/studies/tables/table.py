@@ -33,6 +33,7 @@ from numpy.typing import NDArray
 
 from cprl.arguments import integer, object_of
 from cprl.arguments import path as path_of
+from cprl.runs import formats
 from cprl.runs.directory import versions
 from cprl.runs.files import write_atomically
 from cprl.studies.study import Study
@@ -41,7 +42,7 @@ from cprl.studies.tables.rows import rows_of
 from cprl.studies.tables.sources import Design, Lacking, Source, design_of, sources_of
 from cprl.studies.tables.windows import Windows, windows_of
 
-FORMAT: Final = 1
+FORMAT: Final = formats.STUDY_TABLE
 WINDOW: Final = 10
 """Episodes of a window, unless something else is asked for."""
 METADATA: Final = b"cprl"
@@ -164,6 +165,7 @@ class StudyTable:
             held = json.loads((rows.schema.metadata or {})[METADATA])
         except (pa.ArrowException, OSError, KeyError, ValueError) as error:
             raise ValueError(f"{path} is not the table of a study: {error!r}") from error
+        formats.refuse_newer(path, held, FORMAT)
         if held.get("format") != FORMAT:
             raise ValueError(f"{path} has the format {held.get('format')}; allowed: {FORMAT}")
         design = held["design"]

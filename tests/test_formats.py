@@ -1,0 +1,132 @@
+"""Files of runs have formats: stored ones of every generation are read, newer ones are refused by name."""
+
+import json
+import shutil
+from pathlib import Path
+
+import pytest
+import torch
+
+import cprl
+from cprl.experiment import Experiment
+from cprl.runs import formats
+from cprl.runs.checkpoints import read_checkpoint
+from cprl.runs.directory import read_recipe
+from cprl.runs.episodes import read_episodes
+from cprl.runs.files import checksum
+from cprl.runs.manifest import verify
+from cprl.studies import Study, read_study
+
+RESULTS = Path(__file__).parents[1] / "docs" / "results"
+STORED = Path(__file__).parent / "stored" / "run"
+"""A run of format 2 with a manifest: two episodes of `single_basic`, whose recipe has its command line."""
+RUNS = [*sorted(path.parent for path in RESULTS.rglob("recipe.json")), STORED]
+STUDIES = sorted(path.parent for path in RESULTS.rglob("study.json"))
+
+
+def generation(recipe):
+    """Which of the generations a stored recipe is of."""
+    if "arguments" not in recipe:
+        return f"format {recipe['format']}"
+    population = recipe["arguments"].get("population")
+    return {type(None): "a learner alone", dict: "indices", list: "members"}[type(population)]
+
+
+def test_stored_runs_of_every_generation_are_there():
+    found = {generation(read_recipe(run)) for run in RUNS}
+    assert found == {"a learner alone", "indices", "members", "format 2"}
+    manifests = [(run / "manifest.json").exists() for run in RUNS]
+    assert set(manifests) == {False, True}, "with a manifest and without"
+
+
+@pytest.mark.parametrize("run", RUNS, ids=lambda run: f"{run.parent.name}-{run.name}")
+def test_a_stored_run_is_read_whatever_its_age(run):
+    experiment = Experiment.from_recipe(read_recipe(run), directory=run)
+    assert experiment == Experiment.from_recipe(experiment.to_recipe(), directory=None)
+    table = read_episodes(run)
+    assert set(table["agent"].to_pylist()) == set(range(experiment.game.agents))
+    assert set(table["replica"].to_pylist()) == set(range(experiment.replicas))
+
+
+@pytest.mark.parametrize("kind", ["a learner alone", "indices", "members", "format 2"])
+def test_the_agents_of_a_stored_run_of_each_generation_play(kind):
+    run = next(
+        run
+        for run in RUNS
+        if generation(read_recipe(run)) == kind and (run / "checkpoints" / "final.pt").exists()
+    )
+    loaded = cprl.load(run)
+    step = loaded.policy()(loaded.env().reset())
+    assert step["agents", "action"].shape == (1, loaded.game.agents)
+
+
+def test_the_checksums_of_a_stored_run_still_hold():
+    listed = json.loads((STORED / "manifest.json").read_text())["files"]
+    assert set(listed) == {
+        *("checkpoints/final.pt", "episodes.parquet"),
+        *("evaluation/random.parquet", "evaluation/trained.parquet"),
+    }
+    for name in listed:
+        verify(STORED / name)
+
+
+@pytest.mark.parametrize("study", STUDIES, ids=lambda study: study.name)
+def test_a_stored_study_is_read(study):
+    assert read_study(study).all_conditions
+
+
+@pytest.fixture
+def newer(tmp_path):
+    """A stored run of which a file gets the format after today's."""
+
+    def made(name, **changes):
+        run = shutil.copytree(STORED, tmp_path / "run", dirs_exist_ok=True)
+        table = json.loads((run / name).read_text()) if (run / name).exists() else {}
+        (run / name).write_text(json.dumps({**table, **changes}))
+        return run
+
+    return made
+
+
+REFUSED = r"has the format {0}, and cprl \S+ reads up to {1}: a newer cprl wrote it; upgrade cprl"
+
+
+@pytest.mark.parametrize("read", [read_recipe, cprl.load, read_episodes])
+def test_a_recipe_of_a_newer_cprl_is_refused_by_name(read, newer):
+    run = newer("recipe.json", format=formats.RECIPE + 1)
+    with pytest.raises(ValueError, match=r"recipe\.json " + REFUSED.format(3, 2)):
+        read(run)
+
+
+def test_a_newer_recipe_is_refused_even_without_what_this_version_looks_for(tmp_path):
+    (tmp_path / "recipe.json").write_text('{"format": 7, "experiments": []}')
+    with pytest.raises(ValueError, match=REFUSED.format(7, 2)):
+        read_recipe(tmp_path)
+
+
+def test_what_a_newer_cprl_lists_in_the_manifest_is_refused_by_name(newer):
+    run = newer("manifest.json", format=formats.MANIFEST + 1, files={})
+    with pytest.raises(ValueError, match=r"manifest\.json " + REFUSED.format(2, 1)):
+        read_episodes(run)
+
+
+def test_a_checkpoint_of_a_newer_cprl_is_refused_by_name(tmp_path):
+    written = tmp_path / "written.pt"
+    torch.save({"format": formats.TRAINING_STATE + 1}, written)
+    path = written.rename(tmp_path / f"training-{20:012d}-{checksum(written)}.pt")
+    with pytest.raises(ValueError, match=r"training-\S+\.pt " + REFUSED.format(3, 2)):
+        read_checkpoint(path)
+
+
+def test_a_study_of_a_newer_cprl_is_refused_by_name():
+    table = read_study(STUDIES[0]).to_config()
+    with pytest.raises(ValueError, match="the study " + REFUSED.format(2, 1)):
+        Study.from_config({**table, "format": formats.STUDY + 1})
+
+
+def test_a_field_that_another_cprl_wrote_is_refused_with_its_version(newer):
+    recipe = json.loads((STORED / "recipe.json").read_text())
+    kept = {**recipe["experiment"], "weather": "rain"}
+    run = newer("recipe.json", experiment=kept, versions={**recipe["versions"], "cprl": "9.1"})
+    with pytest.raises(ValueError, match=r"experiment\.weather is no field.*; cprl '9\.1' wrote it, and thi"):
+        cprl.load(run)
