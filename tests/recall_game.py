@@ -50,7 +50,7 @@ class RecallEnv(EnvBase):
 
     def _reset(self, tensordict=None, **kwargs):
         which = torch.ones_like(self.turn, dtype=torch.bool)
-        if tensordict is not None and "_reset" in tensordict.keys():
+        if tensordict is not None and tensordict.get("_reset", None) is not None:
             which = tensordict["_reset"].reshape(-1, 1)
         self.turn = torch.where(which, 0, self.turn)
         self.episode = self.episode + which

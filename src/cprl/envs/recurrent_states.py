@@ -1,4 +1,4 @@
-"""Where an episode begins, the states of recurrent networks do: what environments and collectors do for it."""
+"""The states of recurrent networks where an episode begins: what environments and collectors do for them."""
 
 import torch
 from tensordict import TensorDictBase
@@ -9,7 +9,9 @@ from cprl import keys
 _NAME = keys.RECURRENT_STATE[1]
 
 
-def begin_states(carried: TensorDictBase, before: TensorDictBase, began: TensorDictBase | Tensor | None) -> None:
+def begin_states(
+    carried: TensorDictBase, before: TensorDictBase, began: TensorDictBase | Tensor | None
+) -> None:
     """Carries ("agents", "recurrent_state") on, with zeros where an episode begins; nothing where there is
     none.
 

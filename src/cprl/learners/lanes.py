@@ -54,8 +54,8 @@ Outputs = Callable[..., Any]
 class Acts(Protocol):
     """Evaluates the current networks of many lanes; an `Engine` does."""
 
-    def outputs(self, observation: Tensor, *recurrent: Tensor, part: int = 0) -> Any:
-        """The outputs of the networks: [L, k, ...] to [L, k, ...]; of recurrent ones also their states."""
+    def outputs(self, observation: Tensor, *, part: int = 0) -> Any:
+        """The outputs of the networks: [L, k, ...] to [L, k, ...]; recurrent ones read and give states."""
 
     def first(self, lanes: int) -> Outputs:
         """`outputs` of the first l lanes alone, with their weights as they are at each call."""

@@ -1,4 +1,4 @@
-"""What a learner from rollouts does for recurrent networks: states across rollouts, and sequences of turns."""
+"""What a learner from rollouts does for recurrent networks: states between rollouts, sequences of turns."""
 
 from collections.abc import Mapping
 from typing import Any, NamedTuple
@@ -65,9 +65,7 @@ class States:
         self, shapes: Mapping[str, tuple[int, ...]], lanes: Lanes | Teams, *, sequence: int, device: Any
     ) -> None:
         self._lanes, self._sequence = lanes, sequence
-        self._first = {
-            name: torch.zeros(len(lanes), *shape, device=device) for name, shape in shapes.items()
-        }
+        self._first = {name: torch.zeros(len(lanes), *shape, device=device) for name, shape in shapes.items()}
         self._ended = torch.ones(len(lanes), dtype=torch.bool, device=device)
         """Whether the episode of a lane ended with the last turn of the rollout before."""
 
@@ -125,11 +123,13 @@ class States:
         is_init = began.clone()
         is_init[:, 0] = True
         outputs, after = engine.outputs(observation, given, is_init, part=part)
-        before = torch.cat([given[:, :1], torch.where(_like(began[:, 1:], after[:, 1:]), 0.0, after[:, :-1])], 1)
+        before = torch.cat(
+            [given[:, :1], torch.where(_like(began[:, 1:], after[:, 1:]), 0.0, after[:, :-1])], 1
+        )
         return outputs, before, after
 
-    def orders(self, numbers: Tensor) -> Tensor:
-        """The turns of the minibatches of an epoch, int64 [minibatches, L, T'], from numbers [L, T]."""
+    def minibatches(self, numbers: Tensor) -> Tensor:
+        """The turns of an epoch's minibatches, int64 [minibatches, L, T'], from random numbers [L, T]."""
         order = numbers[:, :: self._sequence].argsort(-1).T
         return order.unsqueeze(-1) * self._sequence + torch.arange(self._sequence)
 

@@ -114,9 +114,8 @@ class RolloutLearner:
         networks = self._lanes.new_networks(WEIGHTS, device)
         refuse_other_parts(networks[0])
         shapes = states_in(networks[0])
-        self._states = (
-            States(shapes, self._lanes, sequence=settings.minibatch_size, device=device) if shapes else None
-        )
+        sequence = settings.minibatch_size
+        self._states = States(shapes, self._lanes, sequence=sequence, device=device) if shapes else None
         loss = make_loss(deepcopy(networks[0]))
         refuse_other_advantages(loss, settings)
         self._reads_logits = reads(loss, "logits")
@@ -180,17 +179,21 @@ class RolloutLearner:
         """Runs all epochs over a full rollout; returns the mean losses [R, S], or None if it is not full."""
         if self._size < self.rollout_steps:
             return None
-        batch, size = self._batch(), self.settings.minibatch_size
+        batch = self._batch()
         lane = torch.arange(self.lanes, device=batch["action"].device)[:, None]
         losses = []
         for _ in range(self.settings.epochs):
-            numbers = self.rng.next()
-            places = (
-                numbers.argsort(-1).split(size, -1) if self._states is None else self._states.orders(numbers)
-            )
+            places = self._minibatches(self.rng.next())
             losses += [self.engine.update_from(batch[lane, place.to(lane.device)]) for place in places]
         self._size = 0
         return self._lanes.by_agent(torch.stack(losses).mean(0))
+
+    def _minibatches(self, numbers: Tensor) -> Tensor:
+        """The steps of an epoch's minibatches, int64 [minibatches, L, size], from random numbers [L, T]."""
+        size = self.settings.minibatch_size
+        if self._states is not None:
+            return self._states.minibatches(numbers)
+        return numbers.argsort(-1).unflatten(-1, (-1, size)).transpose(0, 1)
 
     def _batch(self) -> TensorDict:
         """The rollout with advantages, [L, T], under the keys of TorchRL's losses; advantages are normalised
@@ -231,10 +234,9 @@ class RolloutLearner:
         if self._states is not None:
             return self._states.evaluate(self.engine, columns)
         logits = self.engine.outputs(columns["observation"], part=ACTOR)
-        values = (
-            self.engine.outputs(columns[name], part=CRITIC) for name in ("observation", "next_observation")
-        )
-        return Evaluated(logits, *values, {})
+        value = self.engine.outputs(columns["observation"], part=CRITIC)
+        next_value = self.engine.outputs(columns["next_observation"], part=CRITIC)
+        return Evaluated(logits, value, next_value, {})
 
     def _columns(self) -> dict[str, Tensor]:
         """The fields of the rollout, [L, T, ...]."""
@@ -252,7 +254,7 @@ class RolloutLearner:
         with torch.no_grad():
             seen = self._lanes.seen_next(batch)
             if self._states is None:
-                expected = self.engine.outputs(seen, part=CRITIC)
+                expected: Tensor = self.engine.outputs(seen, part=CRITIC)
             else:
                 expected = self._states.value_next(self.engine, self._columns(), self._size, seen)
         return expected.reshape(self.replicas, len(self.agents))

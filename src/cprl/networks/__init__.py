@@ -18,7 +18,7 @@ Modules, in the order in which one reads them:
 
 from cprl.networks.convolutional import Conv, ConvNetwork
 from cprl.networks.mlp import MLP, MLPNetwork
-from cprl.networks.recurrent import GRU, GRUNetwork
+from cprl.networks.recurrent import GRU
 from cprl.networks.specification import Network
 
-__all__ = ["GRU", "MLP", "Conv", "ConvNetwork", "GRUNetwork", "MLPNetwork", "Network"]
+__all__ = ["GRU", "MLP", "Conv", "ConvNetwork", "MLPNetwork", "Network"]

@@ -204,9 +204,7 @@ def _outputs(
     """
     lanes, _, steps = size
     leading, cells = features.shape[:-1], state.shape[-1]
-    gates = torch.baddbmm(
-        weights.input_bias, features.reshape(lanes, -1, features.shape[-1]), weights.input
-    )
+    gates = torch.baddbmm(weights.input_bias, features.reshape(lanes, -1, features.shape[-1]), weights.input)
     gates, state = gates.view(lanes, -1, steps, 3 * cells), state.reshape(*size, cells)
     if is_init is None:
         after = _step(weights, gates[:, :, 0], state[:, :, 0]).unsqueeze(2)

@@ -4,7 +4,6 @@ from collections.abc import Sequence
 from copy import deepcopy
 from typing import Any
 
-import torch
 from torch import Tensor, nn
 
 from cprl.networks.recurrent import GRUNetwork, StackedGRU
@@ -32,8 +31,8 @@ class RecurrentTeam(nn.Module):
     def forward(
         self, observation: Tensor, state: Tensor, is_init: Tensor | None = None
     ) -> tuple[Tensor, Tensor]:
-        """As `GRUNetwork.forward`: observations [..., S, *shape], states [..., S, H] and `is_init` [..., T] to
-        outputs [..., S, A] and states."""
+        """As `GRUNetwork.forward`: observations [..., S, *shape], states [..., S, H] and `is_init` [..., T]
+        to outputs [..., S, A] and states."""
         seen = observation.movedim(-self.observation_dims, 0)
         own = state.movedim(-2, 0)
         begins = None if is_init is None else is_init.expand(len(seen), *is_init.shape)

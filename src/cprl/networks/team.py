@@ -147,8 +147,8 @@ class CentralCritic(nn.Module):
         self.state_shape = state_shape_of(network)
 
     def forward(self, observation: Tensor, *recurrent: Tensor) -> Any:
-        """uint8 [..., S, C, X, Y] to the same value for each member, [..., S, 1]; with a recurrent network also
-        its state and `is_init`, and also to its states, see `cprl.networks.recurrent`."""
+        """uint8 [..., S, C, X, Y] to the same value for each member, [..., S, 1]; of a recurrent network with
+        its state and `is_init`, and to its states, see `cprl.networks.recurrent`."""
         if not recurrent:
             return self._for_each(self.network(observation))
         value, after = self.network(observation, *recurrent)

@@ -125,7 +125,7 @@ class AgentPolicies(TensorDictModuleBase):
         return action
 
     def _begin_states(self, agents: TensorDictBase, observation: Tensor, dim: int) -> None:
-        """Notes the states that actors read in this turn, zeros where there are none, and makes room for those
+        """Notes the states that actors read in this turn, zeros where there are none; makes room for those
         that they write.
 
         Raises:
@@ -137,8 +137,8 @@ class AgentPolicies(TensorDictModuleBase):
             before = torch.zeros(size, device=observation.device)
         elif tuple(before.shape) != size:
             raise ValueError(
-                f'("agents", "recurrent_state") is {list(before.shape)}; allowed: {list(size)}, from the same '
-                "policies in the turn before, or none"
+                f'("agents", "recurrent_state") is {list(before.shape)}; allowed: {list(size)}, from the '
+                "same policies in the turn before, or none"
             )
         keys.put(agents, "recurrent_state_before", before)
         keys.put(agents, "recurrent_state", torch.zeros_like(before))

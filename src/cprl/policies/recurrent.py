@@ -52,7 +52,7 @@ class RecurrentLaneActor(LaneActor):
         return actor
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
-        """Writes "action", int64 [R x k, S], and "recurrent_state" for "observation" and "recurrent_state"."""
+        """Writes "action", int64 [R x k, S], and "recurrent_state", from the turn's entries."""
         chosen, after = self.choose_with(tensordict.get("observation"), tensordict.get("recurrent_state"))
         return tensordict.set("action", chosen).set("recurrent_state", after)
 
