@@ -52,7 +52,7 @@ from cprl.institutions import (
 )
 from cprl.learners.decisions import Bandit
 from cprl.learners.settings import Optimizer
-from cprl.networks import MLP, Conv
+from cprl.networks import GRU, MLP, Conv
 from cprl.objectives.log_cosh import DISTANCES
 from cprl.population import Frozen, Learning, Scripted, Team
 from cprl.preferences import Exchange, InequityAversion, SocialValueOrientation
@@ -90,6 +90,7 @@ ROLLOUTS = st.builds(RolloutSettings, max_grad_norm=st.none() | POSITIVE, epochs
 LOOKS = st.builds(LOLASettings, max_grad_norm=st.none() | POSITIVE, critic_epochs=st.integers(0, 9))
 TABULARS = st.builds(TabularSettings, learning_rate=st.just("1/visits") | SHARES)
 NETWORKS = st.none() | st.builds(MLP) | st.builds(Conv, channels=st.just((4, 8))) | CUSTOM
+RECURRENT = st.builds(GRU, recurrent_cells=st.integers(1, 9), encoder=st.builds(Conv) | st.builds(MLP))
 ALONE = st.one_of(
     st.builds(
         DQN,
@@ -99,7 +100,7 @@ ALONE = st.one_of(
         network=NETWORKS,
     ),
     *[st.builds(kind, settings=DQNS) for kind in (DistributionalDQN, CQL, SAC, IQL, PR2, PR2ActorCritic)],
-    *[st.builds(kind, settings=ROLLOUTS) for kind in (PPO, A2C, Reinforce)],
+    *[st.builds(kind, settings=ROLLOUTS, network=NETWORKS | RECURRENT) for kind in (PPO, A2C, Reinforce)],
     st.builds(Tabular, settings=TABULARS),
 )
 TEAMS = st.one_of(

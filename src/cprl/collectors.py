@@ -14,6 +14,7 @@ from torchrl.envs.utils import ExplorationType, set_exploration_type
 
 from cprl.arguments import callable_of, object_of
 from cprl.checks import checked, count
+from cprl.envs.recurrent_states import begin_states
 
 
 class StepCollector(BaseCollector):
@@ -43,6 +44,7 @@ class StepCollector(BaseCollector):
         while True:
             with torch.no_grad(), set_exploration_type(ExplorationType.RANDOM):
                 now, self.carried = self.env.step_and_maybe_reset(self.policy(self.carried))
+                begin_states(self.carried, self.carried, now)
             yield now
 
     def resume_from(self, carried: TensorDictBase) -> None:

@@ -46,6 +46,14 @@ those of the following indices, cyclically. Only with `Observation.scoreboard`."
 STOCK_GAUGE: Final = (AGENTS, "stock_gauge")
 """float32 [B, N, 1]: the fraction of sites with an apple, 0..1. Only with `Observation.stock_gauge`."""
 
+RECURRENT_STATE: Final = (AGENTS, "recurrent_state")
+"""float32 [B, N, M]: the states of recurrent networks after this turn's observation, zeros beyond an agent's
+own. Policies write it, if an agent has such a network, and the next turn's policies read it; where it is
+missing, and where an episode begins, it is zero."""
+
+RECURRENT_STATE_BEFORE: Final = (AGENTS, "recurrent_state_before")
+"""float32 [B, N, M]: the states that policies read in this turn."""
+
 FINES: Final = (AGENTS, "fines")
 """float32 [B, N]: apples that institutions took from the agent this turn. This entry and all of institutions
 below are there only in games that have any."""

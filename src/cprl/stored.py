@@ -23,10 +23,11 @@ from cprl.learners.decisions import stored_decisions
 from cprl.learners.lanes import EVALUATION, lane_name, lane_seeds
 from cprl.networks.agent import acting_part
 from cprl.networks.finite import all_finite
+from cprl.networks.recurrent import state_shape_of
 from cprl.networks.stacked import stack_lanes
 from cprl.policies.assignment import AgentIndices, AgentPolicies
 from cprl.policies.decisions import ballot_sizes
-from cprl.policies.lanes import lane_actor
+from cprl.policies.recurrent import actor_of_lanes
 from cprl.policies.scripted import scripted_lanes
 from cprl.population import AgentSpec, Frozen, Learning, Scripted, Team, specs_by_agent
 from cprl.runs.checkpoints import FOLDER
@@ -217,24 +218,31 @@ def stored_actor(
     _, stochastic, epsilon, _ = kind
     spaces = playing.spaces if isinstance(playing, Game) else playing
     networks: list[Any] = [lane.network for lane in lanes]
-    actor = lane_actor(
-        _side_by_side(networks), spaces, seeds=seeds, agents=agents, worlds=worlds, stochastic=stochastic
+    actor = actor_of_lanes(
+        _side_by_side(networks),
+        spaces,
+        seeds=seeds,
+        agents=agents,
+        worlds=worlds,
+        stochastic=stochastic,
+        state_cells=(state_shape_of(networks[0]) or (0,))[-1],
     )
     actor.epsilon = epsilon
     return actor
 
 
-def _side_by_side(networks: Sequence[nn.Module]) -> Callable[[Tensor], Tensor]:
-    """What all networks give for what their lanes see, [L, k, ...] to [L, k, A]."""
+def _side_by_side(networks: Sequence[nn.Module]) -> Callable[..., Any]:
+    """What all networks give for what their lanes see, [L, k, ...] to [L, k, A]; of recurrent ones also their
+    states."""
     first = networks[0]
     if all(network is first for network in networks):
         first.requires_grad_(False)
-        return lambda seen: first(seen)
+        return lambda *seen: first(*seen)
     try:
         stack = stack_lanes(networks)
     except ValueError:  # of a form that does not stack, e.g. a network of the user's own
         return lambda seen: torch.stack([network(own) for network, own in zip(networks, seen, strict=True)])
-    return lambda seen: stack(seen)
+    return lambda *seen: stack(*seen)
 
 
 def load(run: str | Path, *, weights: str | None = None, allow: Sequence[str] = ()) -> LoadedRun:

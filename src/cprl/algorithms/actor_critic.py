@@ -14,6 +14,7 @@ from cprl.compat import LaneCategorical
 from cprl.custom import Custom
 from cprl.learners.settings import DQNSettings
 from cprl.networks.agent import AgentNetworks
+from cprl.networks.recurrent import state_shape_of
 from cprl.networks.specification import Network
 from cprl.spaces import Spaces
 
@@ -49,7 +50,7 @@ class SAC(OffPolicy):
         assert isinstance(network, AgentNetworks)
         loss = DiscreteSACLoss(
             policy(network["actor"]),
-            [_module(network[name], "action_value") for name in ("critic_0", "critic_1")],
+            [module_of(network[name], "action_value") for name in ("critic_0", "critic_1")],
             action_space="categorical",
             num_actions=network["actor"].outputs,
             num_qvalue_nets=2,
@@ -94,8 +95,8 @@ class IQL(OffPolicy):
         assert isinstance(network, AgentNetworks)
         loss = DiscreteIQLLoss(
             policy(network["actor"]),
-            [_module(network[name], "state_action_value") for name in ("critic_0", "critic_1")],
-            _module(network["value"], "state_value"),
+            [module_of(network[name], "state_action_value") for name in ("critic_0", "critic_1")],
+            module_of(network["value"], "state_value"),
             action_space="categorical",
             num_qvalue_nets=2,
             loss_function=self.loss_function,
@@ -107,9 +108,10 @@ class IQL(OffPolicy):
 
 
 def policy(network: nn.Module) -> ProbabilisticTensorDictSequential:
-    """TorchRL's categorical policy with a network's outputs as logits."""
+    """TorchRL's categorical policy with a network's outputs as logits; a recurrent network also reads
+    "recurrent_state" and "is_init", as `cprl.networks.recurrent` says."""
     return ProbabilisticActor(
-        TensorDictModule(network, ["observation"], ["logits"]),
+        module_of(network, "logits", state="recurrent_state"),
         in_keys=["logits"],
         out_keys=["action"],
         distribution_class=LaneCategorical,
@@ -117,5 +119,14 @@ def policy(network: nn.Module) -> ProbabilisticTensorDictSequential:
     )
 
 
-def _module(network: nn.Module, name: str) -> TensorDictModule:
-    return TensorDictModule(network, ["observation"], [name])
+def module_of(network: nn.Module, name: str, *, state: str = "recurrent_state") -> TensorDictModule:
+    """A network as a TensorDict module.
+
+    Args:
+        network: reads "observation".
+        name: the entry of its outputs.
+        state: the entry of the states before each step, of a recurrent network.
+    """
+    if state_shape_of(network) is None:
+        return TensorDictModule(network, ["observation"], [name])
+    return TensorDictModule(network, ["observation", state, "is_init"], [name, f"{state}_after"])

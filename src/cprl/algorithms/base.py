@@ -19,6 +19,7 @@ from cprl.learners.rollouts import RolloutLearner
 from cprl.learners.settings import DQNSettings, RolloutSettings
 from cprl.learners.torchrl import TorchRLReplayLearner, TorchRLRolloutLearner
 from cprl.networks.mlp import MOST_CELLS
+from cprl.networks.recurrent import GRU
 from cprl.networks.specification import Network
 from cprl.objectives.log_cosh import TORCHRL_DISTANCES
 from cprl.preferences.values import Preference, named
@@ -32,7 +33,7 @@ update, uncompiled; "torchrl": by TorchRL's stock parts, one agent after the oth
 
 _WEIGHT: Final = number(0, 1e6)
 _CHECKS: Final[dict[str, Check]] = {
-    "network": either(instance(Network | Custom, 'MLP, Conv, Custom("module:Class")'), NONE),
+    "network": either(instance(Network | Custom, 'MLP, Conv, GRU, Custom("module:Class")'), NONE),
     "double": SWITCH,
     "atoms": count(2, MOST_CELLS),
     "lowest_return": number(-1e9, 1e9),
@@ -81,6 +82,9 @@ class Algorithm:
     """What its field `loss_function` may be, if it has one."""
     can_share_parameters: ClassVar[bool] = False
     """Whether agents of a team can share one network, see `cprl.population.Team`."""
+    can_be_recurrent: ClassVar[bool] = False
+    """Whether its networks can be recurrent: its learner must learn from sequences, as `RolloutLearner` does,
+    and its loss must pass on their states, see `cprl.algorithms.actor_critic.policy`."""
 
     def __post_init__(self) -> None:
         self._check_settings()
@@ -92,6 +96,14 @@ class Algorithm:
         }
         checks = {**_CHECKS, "loss_function": one_of(*self.loss_functions)}
         check_fields(self, {name: own for name, own in checks.items() if name in of_cprl})
+        network = getattr(self, "network", None)
+        if isinstance(network, GRU) and not self.can_be_recurrent:
+            name = type(self).__name__
+            raise ValueError(
+                f"{name}.network is {network}; allowed for {name}, which does not learn from sequences: MLP, "
+                "Conv, Custom; PPO, A2C, Reinforce, IPPO and MAPPO learn recurrent networks, and "
+                "torchrl.envs.CatFrames shows any agent its latest observations"
+            )
 
     def make_network(self, spaces: Spaces) -> nn.Module:
         """New networks of one agent, initialised from torch's generator. They map observations [..., *shape]

@@ -2,13 +2,12 @@
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Protocol
+from typing import ClassVar, Protocol
 
-from tensordict.nn import TensorDictModule
 from torch import nn
 from torchrl.objectives import A2CLoss, ClipPPOLoss, LossModule, ReinforceLoss
 
-from cprl.algorithms.actor_critic import policy
+from cprl.algorithms.actor_critic import module_of, policy
 from cprl.algorithms.base import OnPolicy
 from cprl.algorithms.dqn import network_of
 from cprl.custom import Custom
@@ -33,6 +32,7 @@ class PPO(OnPolicy):
     critic_coeff: float = 0.5
     network: Network | Custom | None = None
     """The architecture of the networks; None for fully connected layers of `settings.hidden_cells`."""
+    can_be_recurrent: ClassVar[bool] = True
 
     def make_network(self, spaces: Spaces) -> nn.Module:
         """See `Algorithm`."""
@@ -55,6 +55,7 @@ class A2C(OnPolicy):
     critic_coeff: float = 0.5
     network: Network | Custom | None = None
     """The architecture of the networks; None for fully connected layers of `settings.hidden_cells`."""
+    can_be_recurrent: ClassVar[bool] = True
 
     def make_network(self, spaces: Spaces) -> nn.Module:
         """See `Algorithm`."""
@@ -82,6 +83,7 @@ class Reinforce(OnPolicy):
     settings: RolloutSettings
     network: Network | Custom | None = None
     """The architecture of the networks; None for fully connected layers of `settings.hidden_cells`."""
+    can_be_recurrent: ClassVar[bool] = True
 
     def make_network(self, spaces: Spaces) -> nn.Module:
         """See `Algorithm`."""
@@ -135,5 +137,5 @@ def clipped_loss(network: nn.Module, kind: Callable[..., LossModule], algorithm:
 
 def _loss(network: nn.Module, kind: Callable[..., LossModule], **how: object) -> LossModule:
     assert isinstance(network, AgentNetworks)
-    critic = TensorDictModule(network["critic"], ["observation"], ["state_value"])
+    critic = module_of(network["critic"], "state_value", state="critic_recurrent_state")
     return kind(policy(network["actor"]), critic, **how)

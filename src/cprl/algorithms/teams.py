@@ -101,6 +101,7 @@ class MAPPO(TeamAlgorithm, OnPolicy):
     critic_coeff: float = 0.5
     network: Network | Custom | None = None
     """The architecture of the networks; None for fully connected layers of `settings.hidden_cells`."""
+    can_be_recurrent: ClassVar[bool] = True
 
     def make_network(self, spaces: Spaces) -> nn.Module:
         """See `Algorithm`."""
@@ -133,6 +134,7 @@ class IPPO(TeamAlgorithm, OnPolicy):
     critic_coeff: float = 0.5
     network: Network | Custom | None = None
     """The architecture of the networks; None for fully connected layers of `settings.hidden_cells`."""
+    can_be_recurrent: ClassVar[bool] = True
     shares_reward: ClassVar[bool] = False
 
     def make_network(self, spaces: Spaces) -> nn.Module:

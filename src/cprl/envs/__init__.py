@@ -9,6 +9,7 @@ Modules, in the order in which one reads them:
     joint_action_env  what such games share: specs, clock, steps
     rendering        images of the worlds, for `CommonsEnv.render`
     drivers          where the worlds run: CPU threads or a GPU
+    recurrent_states  the states of recurrent networks where an episode begins
     state            the state of an environment and its transforms, for checkpoints
     pettingzoo_env   parallel_env and env, one world
     gymnasium_env    one world of one agent

@@ -18,6 +18,7 @@ from cprl.commons.game import Game, output_shapes
 from cprl.commons.world import Bytes, StepOutput
 from cprl.compat import LeanStepEnv, flag_spec, put_all, unchecked_tensordict
 from cprl.envs.drivers import device_of, drawn_seed, driver_for
+from cprl.envs.recurrent_states import begin_states
 from cprl.envs.rendering import images
 from cprl.institutions import COUNTS
 
@@ -232,7 +233,10 @@ class CommonsEnv(LeanStepEnv):
 
     def _reset(self, tensordict: TensorDictBase | None = None, **kwargs: Any) -> TensorDict:
         which = None if tensordict is None else tensordict.get("_reset", None)
-        return self._as_tensordict(self._begin(which))
+        begun = self._as_tensordict(self._begin(which))
+        if tensordict is not None:
+            begin_states(begun, tensordict, which)
+        return begun
 
     def _begin(self, which: Tensor | None) -> dict[str, Tensor]:
         """Starts the next episode of the marked worlds (bool [B, 1]; None for all), in new tensors."""
@@ -329,4 +333,6 @@ class CommonsEnv(LeanStepEnv):
         of_agents = keys.entry(tensordict, keys.AGENTS).items()
         others = {name: value for name, value in of_agents if name not in _OWN_AGENT_KEYS}
         put_all(keys.entry(carried, keys.AGENTS), others)
+        if resets and keys.RECURRENT_STATE[1] in others:
+            begin_states(carried, tensordict, done)
         return tensordict, carried

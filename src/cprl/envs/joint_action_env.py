@@ -15,6 +15,7 @@ from cprl import arguments, keys
 from cprl.commons.chance import LOW_WORD, WORD_BITS, philox4x32
 from cprl.compat import LeanStepEnv, flag_spec, put_all, unchecked_tensordict
 from cprl.envs.drivers import device_of, drawn_seed
+from cprl.envs.recurrent_states import begin_states
 
 _OWN_KEYS: Final = frozenset((keys.AGENTS, keys.DONE, keys.TERMINATED, keys.TRUNCATED, "next", "_reset"))
 _OWN_AGENT_KEYS: Final = frozenset(("observation", "reward"))
@@ -122,6 +123,8 @@ class JointActionEnv(LeanStepEnv):
         of_agents = keys.entry(tensordict, keys.AGENTS).items()
         others = {name: value for name, value in of_agents if name not in _OWN_AGENT_KEYS}
         put_all(keys.entry(carried, keys.AGENTS), others)
+        if keys.RECURRENT_STATE[1] in others:
+            begin_states(carried, tensordict, done)
         return tensordict, carried
 
     def _step(self, tensordict: TensorDictBase) -> TensorDict:
@@ -150,7 +153,10 @@ class JointActionEnv(LeanStepEnv):
             raise ValueError(
                 f'"_reset" is {which.dtype} {list(which.shape)}; allowed: bool [{self.batch_size[0]}, 1]'
             )
-        return self._reset_worlds(None if which is None else which.reshape(-1, 1))
+        begun = self._reset_worlds(None if which is None else which.reshape(-1, 1))
+        if tensordict is not None:
+            begin_states(begun, tensordict, which)
+        return begun
 
     def _reset_worlds(self, which: Tensor | None) -> TensorDict:
         """Begins the next episode of these worlds, bool [B, 1] (None: of all)."""

@@ -8,6 +8,7 @@ import torch
 from numpy.typing import NDArray
 from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
+from torch.nn.parameter import is_lazy
 from torchrl.envs import EnvBase, TransformedEnv
 
 from cprl.arguments import object_of
@@ -22,7 +23,7 @@ def env_state(env: EnvBase) -> dict[str, Any]:
         own = dict(base_env(env).state_dict())
     else:
         own = {name: _tensor(array) for name, array in commons.worlds.state().items()}
-    return {"worlds": own, "transforms": transforms_state(env)}
+    return {"worlds": own, "transforms": _all_of_transforms(env)}
 
 
 def load_env_state(env: EnvBase, state: Mapping[str, Any]) -> None:
@@ -39,7 +40,8 @@ def load_env_state(env: EnvBase, state: Mapping[str, Any]) -> None:
         base_env(env).load_state_dict(state["worlds"])
     else:
         commons.load({name: _array(name, tensor) for name, tensor in state["worlds"].items()})
-    load_transforms_state(env, state["transforms"])
+    if isinstance(env, TransformedEnv):
+        _load(env, dict(state["transforms"]))
 
 
 STEPS_TRIED: Final = 40
@@ -94,15 +96,42 @@ def _equal(one: TensorDictBase, other: TensorDictBase) -> bool:
     )
 
 
+_OF_WORLDS: Final = "_cat_buffers"
+"""In the name of what `torchrl.envs.CatFrames` keeps of the worlds themselves, their latest observations."""
+
+
 def transforms_state(env: EnvBase) -> dict[str, Any]:
-    """What the transforms have learned or been told, e.g. the statistics of a normalisation."""
-    return dict(env.transform.state_dict()) if isinstance(env, TransformedEnv) else {}
+    """What the transforms have learned or been told, e.g. the statistics of a normalisation; nothing of the
+    worlds themselves."""
+    return {name: value for name, value in _all_of_transforms(env).items() if _OF_WORLDS not in name}
 
 
 def load_transforms_state(env: EnvBase, state: Mapping[str, Any]) -> None:
-    """Gives the transforms of an environment what those of another had."""
+    """Gives the transforms of an environment what those of another had; what they keep of its own worlds
+    stays."""
     if isinstance(env, TransformedEnv):
-        env.transform.load_state_dict(dict(state))
+        _load(env, {name: value for name, value in state.items() if _OF_WORLDS not in name})
+
+
+def _all_of_transforms(env: EnvBase) -> dict[str, Any]:
+    """Also what transforms keep of the worlds, once these have been reset."""
+    if not isinstance(env, TransformedEnv):
+        return {}
+    kept = env.transform.state_dict(keep_vars=True)
+    sound = {name: value for name, value in kept.items() if not is_lazy(value)}
+    return {name: own.detach() if isinstance(own, Tensor) else own for name, own in sound.items()}
+
+
+def _load(env: TransformedEnv, state: dict[str, Any]) -> None:
+    """Loads the state of transforms; what they keep of the worlds may be missing."""
+    kept = env.transform.state_dict(keep_vars=True)
+    if not any(_OF_WORLDS in name for name in kept):
+        env.transform.load_state_dict(state)
+        return
+    missing, unexpected = env.transform.load_state_dict(state, strict=False)
+    wrong = sorted(name for name in (*missing, *unexpected) if _OF_WORLDS not in name)
+    if wrong:
+        raise ValueError(f"the state of the transforms lacks, or has beyond theirs, {', '.join(wrong)}")
 
 
 def carried_state(carried: TensorDictBase) -> dict[str, Any]:

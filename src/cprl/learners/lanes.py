@@ -9,13 +9,16 @@ import torch
 from tensordict import TensorDictBase
 from torch import Tensor, nn
 
+from cprl import keys
 from cprl.arguments import object_of
 from cprl.learners.checks import check_networks
 from cprl.learners.engine.shared import is_list
 from cprl.learners.transitions import LaneTurn, joint_actions, lane_turn, seen_next
 from cprl.networks.agent import acting_part
+from cprl.networks.recurrent import state_shape_of
 from cprl.networks.specification import refuse_unseen
-from cprl.policies.lanes import LaneActor, lane_actor
+from cprl.policies.lanes import LaneActor
+from cprl.policies.recurrent import actor_of_lanes
 from cprl.spaces import Spaces
 
 WEIGHTS, TARGET_WEIGHTS, EXPLORATION, SAMPLING, EVALUATION, EXHIBITION, NOISE = range(7)
@@ -44,15 +47,15 @@ def lane_names(*, replicas: Sequence[int], agents: Sequence[int]) -> list[str]:
     return [lane_name(replica, agent) for replica in replicas for agent in agents]
 
 
-Outputs = Callable[[Tensor], Tensor]
-"""The outputs of acting networks: [l, k, ...] to [l, k, ...] for l lanes."""
+Outputs = Callable[..., Any]
+"""The outputs of acting networks: [l, k, ...] to [l, k, ...] for l lanes; of recurrent ones also states."""
 
 
 class Acts(Protocol):
     """Evaluates the current networks of many lanes; an `Engine` does."""
 
-    def outputs(self, observation: Tensor, *, part: int = 0) -> Tensor:
-        """The outputs of the networks: [L, k, ...] to [L, k, ...]."""
+    def outputs(self, observation: Tensor, *, part: int = 0) -> Any:
+        """The outputs of the networks: [L, k, ...] to [L, k, ...]; recurrent ones read and give states."""
 
     def first(self, lanes: int) -> Outputs:
         """`outputs` of the first l lanes alone, with their weights as they are at each call."""
@@ -111,6 +114,9 @@ class Lanes:
         self.sharing = len(self.agents) if share_parameters else 1
         """The number of agents that share a network."""
         self._action_noise = action_noise
+        self.state_cells = 0
+        """The numbers H of the state of an acting network; known once there are networks, 0 for those without
+        a state."""
 
     def __len__(self) -> int:
         return self.replicas * len(self.agents)
@@ -158,6 +164,11 @@ class Lanes:
         """The observations of lanes after a turn, uint8 [L, 1, C, X, Y]."""
         return seen_next(batch)[:, list(self.agents)].flatten(0, 1).unsqueeze(1)
 
+    def recurrent_state(self, batch: TensorDictBase) -> Tensor:
+        """The states that lanes had before a turn, float32 [L, H]."""
+        states: Tensor = batch.get(keys.RECURRENT_STATE_BEFORE)
+        return states[:, list(self.agents), : self.state_cells].flatten(0, 1)
+
     def by_agent(self, losses: Tensor) -> Tensor:
         """Values of lanes, [L], as values of the agents of each replica, [R, S]."""
         return losses.view(self.replicas, len(self.agents))
@@ -177,6 +188,7 @@ class Lanes:
         first, *others = self.seeds(purpose)[:: self.sharing]
         networks = [init_network(self.make_network, first)]
         check_networks(networks[0], 1 + len(others), device)
+        self.state_cells = (state_shape_of(acting_part(networks[0])) or (0,))[-1]
         networks += [init_network(self.make_network, own) for own in others]
         for place, network in enumerate(networks):
             start, *same = (
@@ -194,25 +206,27 @@ class Lanes:
 
     def actor(self, engine: Acts, *, compile: bool) -> LaneActor:
         """The actor of training: the current weights, and random numbers of its own for each lane."""
-        return lane_actor(
+        return actor_of_lanes(
             engine.outputs,
             self.spaces,
             seeds=self.seeds(EXPLORATION),
             agents=len(self.agents),
             stochastic=self.stochastic,
             noise=self._action_noise,
+            state_cells=self.state_cells,
             compile=compile and not is_list(engine),
         )
 
     def evaluation_actor(self, engine: Acts, worlds: int, *, epsilon: float) -> LaneActor:
         """The actor of evaluation: the current weights, for `worlds` worlds of each replica."""
-        actor = lane_actor(
+        actor = actor_of_lanes(
             engine.outputs,
             self.spaces,
             seeds=self.seeds(EVALUATION),
             agents=len(self.agents),
             worlds=worlds,
             stochastic=self.stochastic,
+            state_cells=self.state_cells,
             first=partial(engine.first, len(self.agents)),
         )
         actor.epsilon = epsilon

@@ -218,7 +218,7 @@ class ReplayLearner:
         if self._lanes.stochastic or self.spaces.action_size:
             return torch.full((self.replicas, len(self.agents)), torch.nan)
         with torch.no_grad():
-            highest = self.engine.outputs(self._lanes.seen_next(batch)).amax(-1)
+            highest: Tensor = self.engine.outputs(self._lanes.seen_next(batch)).amax(-1)
         return highest.view(self.replicas, len(self.agents))
 
     def state_dict(self) -> dict[str, Any]:

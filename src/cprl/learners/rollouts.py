@@ -17,6 +17,7 @@ from cprl.learners.engine.functional import MakeLoss
 from cprl.learners.engine.refusals import reads, refuse_other_advantages
 from cprl.learners.engine.shared import SharedEngine
 from cprl.learners.lanes import SAMPLING, WEIGHTS, StartFrom
+from cprl.learners.recurrent import ACTOR, CRITIC, Evaluated, States, states_in
 from cprl.learners.settings import RolloutSettings
 from cprl.learners.teams import MakeTeam, lanes_of
 from cprl.learners.transitions import wanted_in
@@ -27,9 +28,6 @@ from cprl.preferences.values import Preference
 from cprl.preferences.wanted import WantedRewards
 from cprl.spaces import Spaces
 
-ACTOR, CRITIC = range(2)
-"""Positions of the actor and the critic among an agent's networks."""
-
 _SMALL: Final = 1e-8
 
 
@@ -37,7 +35,9 @@ class RolloutLearner:
     """R x S independent agents that learn from the latest steps of their current policies.
 
     After every `rollout_steps` steps the learner estimates advantages with TorchRL's GAE and updates for
-    `epochs` epochs. Each lane shuffles its own minibatches, and learns exactly as it would alone.
+    `epochs` epochs. Each lane shuffles its own minibatches, and learns exactly as it would alone. A minibatch
+    of recurrent networks is a sequence of consecutive steps, and their update is not compiled: it would take
+    torch longer to unroll the steps than the training.
 
     Args:
         spaces: the shape and dtype of observations, and the number of actions A.
@@ -113,6 +113,9 @@ class RolloutLearner:
         settings = self.settings
         networks = self._lanes.new_networks(WEIGHTS, device)
         refuse_other_parts(networks[0])
+        shapes = states_in(networks[0])
+        sequence = settings.minibatch_size
+        self._states = States(shapes, self._lanes, sequence=sequence, device=device) if shapes else None
         loss = make_loss(deepcopy(networks[0]))
         refuse_other_advantages(loss, settings)
         self._reads_logits = reads(loss, "logits")
@@ -132,8 +135,10 @@ class RolloutLearner:
             learning_rate=settings.learning_rate,
             adam_eps=settings.adam_eps,
             max_grad_norm=settings.max_grad_norm,
-            compile=compile,
-            trial=trial_rollout(trial, actions=self.spaces.actions if self._reads_logits else None),
+            compile=compile and not shapes,
+            trial=trial_rollout(
+                trial, actions=self.spaces.actions if self._reads_logits else None, states=shapes
+            ),
         )
         return SharedEngine(engine, self._lanes.sharing) if self._lanes.sharing > 1 else engine
 
@@ -163,6 +168,8 @@ class RolloutLearner:
                 divides `rollout_steps`; and if the dtype of observations is not that of the spaces.
         """
         refuse_full(self._size, self.rollout_steps)
+        if self._states is not None and not self._size:
+            self._states.begin(batch)
         turn = self._lanes.rollout_turn(batch, wanted_in(self.wants, batch))
         write_turn(self._rollout, (self._size,), turn, self.spaces)
         self._size += 1
@@ -172,30 +179,34 @@ class RolloutLearner:
         """Runs all epochs over a full rollout; returns the mean losses [R, S], or None if it is not full."""
         if self._size < self.rollout_steps:
             return None
-        batch, size = self._batch(), self.settings.minibatch_size
+        batch = self._batch()
         lane = torch.arange(self.lanes, device=batch["action"].device)[:, None]
         losses = []
         for _ in range(self.settings.epochs):
-            order = self.rng.next().argsort(-1).to(lane.device)
-            for first in range(0, self.rollout_steps, size):
-                place = order[:, first : first + size]
-                losses.append(self.engine.update_from(batch[lane, place]))
+            places = self._minibatches(self.rng.next())
+            losses += [self.engine.update_from(batch[lane, place.to(lane.device)]) for place in places]
         self._size = 0
         return self._lanes.by_agent(torch.stack(losses).mean(0))
+
+    def _minibatches(self, numbers: Tensor) -> Tensor:
+        """The steps of an epoch's minibatches, int64 [minibatches, L, size], from random numbers [L, T]."""
+        size = self.settings.minibatch_size
+        if self._states is not None:
+            return self._states.minibatches(numbers)
+        return numbers.argsort(-1).unflatten(-1, (-1, size)).transpose(0, 1)
 
     def _batch(self) -> TensorDict:
         """The rollout with advantages, [L, T], under the keys of TorchRL's losses; advantages are normalised
         within each lane if the settings say so."""
-        columns = {name: room.transpose(0, 1) for name, room in self._rollout.items()}
+        columns = self._columns()
         with torch.no_grad():
-            logits = self.engine.outputs(columns["observation"], part=ACTOR)
+            logits, value, next_value, entries = self._evaluated(columns)
             chances = logits.log_softmax(-1)
-            value = self.engine.outputs(columns["observation"], part=CRITIC)
             advantage, target = generalized_advantage_estimate(
                 self.settings.gamma,
                 self.settings.gae_lambda,
                 value,
-                self.engine.outputs(columns["next_observation"], part=CRITIC),
+                next_value,
                 *(_like(columns[name], value) for name in ("reward", "done", "terminated")),
                 time_dim=1,
             )
@@ -213,9 +224,23 @@ class RolloutLearner:
                 "value_target": target,
                 "state_value": value,
                 **({"logits": logits} if self._reads_logits else {}),
+                **entries,
             },
             [self.lanes, self.rollout_steps],
         )
+
+    def _evaluated(self, columns: Mapping[str, Tensor]) -> Evaluated:
+        """What the networks give for a rollout, [L, T, ...]."""
+        if self._states is not None:
+            return self._states.evaluate(self.engine, columns)
+        logits = self.engine.outputs(columns["observation"], part=ACTOR)
+        value = self.engine.outputs(columns["observation"], part=CRITIC)
+        next_value = self.engine.outputs(columns["next_observation"], part=CRITIC)
+        return Evaluated(logits, value, next_value, {})
+
+    def _columns(self) -> dict[str, Tensor]:
+        """The fields of the rollout, [L, T, ...]."""
+        return {name: field.transpose(0, 1) for name, field in self._rollout.items()}
 
     def end_episode(self, ended: Tensor) -> None:
         """Does nothing: a rollout continues into the next episode; advantages do not cross the boundary."""
@@ -227,7 +252,11 @@ class RolloutLearner:
     def values(self, batch: TensorDictBase) -> Tensor:
         """The value that each agent's critic gives to the state after a turn, [R, S]."""
         with torch.no_grad():
-            expected = self.engine.outputs(self._lanes.seen_next(batch), part=CRITIC)
+            seen = self._lanes.seen_next(batch)
+            if self._states is None:
+                expected: Tensor = self.engine.outputs(seen, part=CRITIC)
+            else:
+                expected = self._states.value_next(self.engine, self._columns(), self._size, seen)
         return expected.reshape(self.replicas, len(self.agents))
 
     def state_dict(self) -> dict[str, Any]:
@@ -244,6 +273,7 @@ class RolloutLearner:
             "exploration": self.actor.rng.state_dict(),
             "steps": self.steps,
             "wants": self.wants.state_dict(),
+            **({} if self._states is None else {"recurrent": self._states.state_dict()}),
         }
 
     def load_state_dict(self, state: Mapping[str, Any]) -> None:
@@ -255,6 +285,8 @@ class RolloutLearner:
         self.actor.rng.load_state_dict(state["exploration"])
         self._size, self.steps = int(state["size"]), int(state["steps"])
         self.wants.load_state_dict(state.get("wants", {}))
+        if self._states is not None:
+            self._states.load_state_dict(state["recurrent"])
 
 
 def _like(column: Tensor, value: Tensor) -> Tensor:

@@ -1,6 +1,7 @@
 """Teams: lanes that hold all members of a team instead of one agent, one team per replica."""
 
 from collections.abc import Callable, Sequence
+from functools import partial
 from typing import Any, Final
 
 import torch
@@ -11,6 +12,7 @@ from cprl.learners.engine.shared import is_list
 from cprl.learners.lanes import Acts, Lanes, init_network
 from cprl.learners.transitions import LaneTurn, lane_turn, seen_next
 from cprl.networks.agent import acting_part
+from cprl.networks.recurrent_team import RecurrentTeam
 from cprl.networks.team import ModuleTeam, SharedTeam, TeamNetwork
 from cprl.policies.lanes import LaneActor
 from cprl.spaces import Spaces
@@ -44,7 +46,7 @@ class Teams:
             self.seeds(0)[0],
         )
         acting = acting_part(form)
-        assert isinstance(acting, TeamNetwork | SharedTeam | ModuleTeam)
+        assert isinstance(acting, TeamNetwork | SharedTeam | ModuleTeam | RecurrentTeam)
         self._acting = acting
 
     def __len__(self) -> int:
@@ -128,6 +130,10 @@ class Teams:
         """The observations of teams after a turn, uint8 [R, 1, S, C, X, Y]."""
         return seen_next(batch)[:, list(self.members.agents)].unsqueeze(1)
 
+    def recurrent_state(self, batch: TensorDictBase) -> Tensor:
+        """The states that teams had before a turn, [R, S, H]."""
+        return self.members.recurrent_state(batch).view(len(self), *self.member_shape, -1)
+
     def by_agent(self, losses: Tensor) -> Tensor:
         """Values of teams, [R], repeated for each of their members, [R, S]."""
         return losses[:, None].expand(-1, len(self.members.agents))
@@ -178,21 +184,21 @@ class _Members:
         self._engine, self._teams = engine, teams
         self._size = len(teams), len(teams.members.agents)
 
-    def outputs(self, observation: Tensor, *, part: int = 0) -> Tensor:
-        """[R x S, k, C, X, Y] to [R x S, k, A]."""
-        by_team = observation.view(*self._size, *observation.shape[1:]).transpose(1, 2)
-        return self._engine.outputs(by_team, part=part).transpose(1, 2).flatten(0, 1)
+    def outputs(self, observation: Tensor, *recurrent: Tensor, part: int = 0) -> Any:
+        """[R x S, k, C, X, Y] to [R x S, k, A]; of recurrent networks also states, likewise."""
+        return self._by_team(partial(self._engine.outputs, part=part), observation, *recurrent)
 
-    def first(self, lanes: int) -> Callable[[Tensor], Tensor]:
+    def first(self, lanes: int) -> Callable[..., Any]:
         """`outputs` of the members of the first teams."""
+        return partial(self._by_team, self._engine.first(lanes // self._size[1]))
+
+    def _by_team(self, outputs: Callable[..., Any], *inputs: Tensor) -> Any:
+        """[r x S, k, ...] to [r x S, k, ...], through a function of [r, k, S, ...]."""
         members = self._size[1]
-        of_teams = self._engine.first(lanes // members)
-
-        def outputs(observation: Tensor) -> Tensor:
-            by_team = observation.view(-1, members, *observation.shape[1:]).transpose(1, 2)
-            return of_teams(by_team).transpose(1, 2).flatten(0, 1)
-
-        return outputs
+        given = outputs(*(own.view(-1, members, *own.shape[1:]).transpose(1, 2) for own in inputs))
+        if isinstance(given, tuple):
+            return tuple(own.transpose(1, 2).flatten(0, 1) for own in given)
+        return given.transpose(1, 2).flatten(0, 1)
 
     def network_state(self, lane: int) -> dict[str, Tensor]:
         """The weights of one member."""

@@ -3,6 +3,7 @@
 Modules, in the order in which one reads them:
     mlp            MLP: fully connected layers
     convolutional  Conv: convolutions over rows and columns
+    recurrent      GRU: a state that is kept from turn to turn
     specification  Network: which of them an algorithm has; networks of your own
     agent          several networks of one agent that learn together
     distributional distributions of returns
@@ -11,11 +12,13 @@ Modules, in the order in which one reads them:
     joint          values of the actions of several agents together
     answering      the same for continuous actions, and how peers answer them
     team           the networks of a team
+    recurrent_team the same for recurrent ones
     stacked        the networks of many lanes as one
 """
 
 from cprl.networks.convolutional import Conv, ConvNetwork
 from cprl.networks.mlp import MLP, MLPNetwork
+from cprl.networks.recurrent import GRU
 from cprl.networks.specification import Network
 
-__all__ = ["MLP", "Conv", "ConvNetwork", "MLPNetwork", "Network"]
+__all__ = ["GRU", "MLP", "Conv", "ConvNetwork", "MLPNetwork", "Network"]

@@ -98,6 +98,7 @@ class StackedModules(nn.Module):
             raise ValueError(f"the networks of the lanes have {len(forms)} architectures; allowed: 1")
         self.lanes, self.observation_dims = len(networks), int(first.observation_dims)
         self.outputs = getattr(first, "outputs", None)
+        self.state_shape = getattr(first, "state_shape", None)
         self._names = [name for name, _ in first.named_parameters()]
         self.__dict__["form"] = deepcopy(first)  # not a submodule: this module's weights are the stacked ones
         each = zip(*(network.parameters() for network in networks), strict=True)
@@ -110,18 +111,22 @@ class StackedModules(nn.Module):
             for name, weight in zip(self._names, self.weights, strict=True)
         }
 
-    def forward(self, observation: Tensor) -> Tensor:
-        """[L, ..., *shape], or flat [L x b, *shape], to the outputs of the networks."""
+    def forward(self, observation: Tensor, *recurrent: Tensor) -> Any:
+        """[L, ..., *shape], or flat [L x b, *shape], to the outputs of the networks; recurrent ones also read
+        and give what `cprl.networks.recurrent` says."""
         dims = self.observation_dims
         leading, shape = observation.shape[:-dims], observation.shape[-dims:]
 
-        def output(weights: list[Tensor], seen: Tensor) -> Tensor:
+        def output(weights: list[Tensor], *seen: Tensor) -> Any:
             named = dict(zip(self._names, weights, strict=True))
-            given: Tensor = torch.func.functional_call(self.__dict__["form"], named, (seen,))
-            return given
+            return torch.func.functional_call(self.__dict__["form"], named, seen)
 
-        by_lane = observation.reshape(self.lanes, -1, *shape)
-        given = torch.vmap(output)(list(self.weights), by_lane)
+        if recurrent:
+            apart = self.lanes, *((-1,) if len(leading) == 1 else leading[1:])
+            by_lane = [own.reshape(*apart, *own.shape[len(leading) :]) for own in (observation, *recurrent)]
+            each = torch.vmap(output)(list(self.weights), *by_lane)
+            return tuple(given.reshape(*leading, *given.shape[len(apart) :]) for given in each)
+        given = torch.vmap(output)(list(self.weights), observation.reshape(self.lanes, -1, *shape))
         return given.reshape(*leading, *given.shape[2:])
 
 

@@ -3,12 +3,15 @@
 from collections.abc import Sequence
 from copy import deepcopy
 from math import prod
+from typing import Any
 
 import torch
 from torch import Tensor, nn
 from torchrl.modules import QMixer
 
 from cprl.networks.mlp import MLPNetwork
+from cprl.networks.recurrent import GRUNetwork, state_shape_of
+from cprl.networks.recurrent_team import RecurrentTeam
 from cprl.networks.stacked import StackedMLP, lane_state, stack_lanes, through_layers
 
 
@@ -118,8 +121,11 @@ class ModuleTeam(nn.Module):
 
 def team_network(
     networks: Sequence[nn.Module], *, observation_dims: int
-) -> TeamNetwork | SharedTeam | ModuleTeam:
-    """The networks of the members of a team as one; a `SharedTeam` if they are all the same object."""
+) -> TeamNetwork | SharedTeam | ModuleTeam | RecurrentTeam:
+    """The networks of the members of a team as one; a `SharedTeam` if they are all the same object, and a
+    `RecurrentTeam` for recurrent ones."""
+    if all(isinstance(network, GRUNetwork) for network in networks):
+        return RecurrentTeam(networks)  # type: ignore[arg-type]
     if len(networks) > 1 and all(network is networks[0] for network in networks):
         return SharedTeam(networks[0], observation_dims=observation_dims)
     if all(isinstance(network, MLPNetwork) for network in networks):
@@ -138,10 +144,17 @@ class CentralCritic(nn.Module):
     def __init__(self, network: nn.Module, members: int) -> None:
         super().__init__()
         self.network, self.members = network, members
+        self.state_shape = state_shape_of(network)
 
-    def forward(self, observation: Tensor) -> Tensor:
-        """uint8 [..., S, C, X, Y] to the same value for each member, [..., S, 1]."""
-        value: Tensor = self.network(observation)
+    def forward(self, observation: Tensor, *recurrent: Tensor) -> Any:
+        """uint8 [..., S, C, X, Y] to the same value for each member, [..., S, 1]; of a recurrent network with
+        its state and `is_init`, and to its states, see `cprl.networks.recurrent`."""
+        if not recurrent:
+            return self._for_each(self.network(observation))
+        value, after = self.network(observation, *recurrent)
+        return self._for_each(value), after
+
+    def _for_each(self, value: Tensor) -> Tensor:
         return value.unsqueeze(-2).expand(*value.shape[:-1], self.members, 1)
 
     def stacked(self, critics: Sequence["CentralCritic"]) -> "CentralCritic":

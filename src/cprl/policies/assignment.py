@@ -12,6 +12,7 @@ from cprl import arguments, keys
 from cprl.compat import unchecked_tensordict
 from cprl.policies.decisions import Decider
 from cprl.policies.lanes import LaneActor
+from cprl.policies.recurrent import RecurrentLaneActor
 
 AgentIndices: TypeAlias = int | tuple[int, ...]
 """The agents that an actor or learner controls: one index, or several."""
@@ -33,6 +34,7 @@ class AgentPolicies(TensorDictModuleBase):
 
     Reads ("agents", "observation"), uint8 [B, N, C, X, Y], and the other entries of "agents" that an actor's
     `in_keys` name, e.g. "stock_gauge"; writes ("agents", "action"), int64 [B, N], or float32 [B, N, D].
+    Where actors are recurrent it also reads "recurrent_state" and writes it and "recurrent_state_before".
     With decisions it also reads "ballots_due", and writes ("agents", "decision"), int64 [B, N].
 
     Raises:
@@ -68,6 +70,8 @@ class AgentPolicies(TensorDictModuleBase):
         self._one_takes_all = self.indices == [tuple(taken)]
         self.actors = nn.ModuleList(by_agents.values())
         self.decisions = decisions
+        self._state_cells = max(int(getattr(actor, "state_cells", 0)) for actor in self.actors)
+        """The largest state of an agent; 0 if no actor is recurrent."""
         if decisions is not None:
             if decisions.agents != self.agents:
                 raise ValueError(
@@ -90,6 +94,8 @@ class AgentPolicies(TensorDictModuleBase):
                 f"there are {self.agents} actors for {observation.shape[dim]} agents; "
                 "allowed: one actor for each agent"
             )
+        if self._state_cells:
+            self._begin_states(agents, observation, dim)
         if self._one_takes_all:
             (actor,) = self.actors
             keys.put(agents, "action", self._choose(actor, agents, None, tensordict.batch_size))
@@ -109,11 +115,40 @@ class AgentPolicies(TensorDictModuleBase):
 
     def _choose(self, actor: nn.Module, agents: TensorDictBase, index: Any, batch_size: torch.Size) -> Tensor:
         """One actor's actions for the agents at an index, None for all; passes the entries it reads."""
+        if isinstance(actor, RecurrentLaneActor):
+            return self._choose_with(actor, agents, index)
         if isinstance(actor, LaneActor):  # the same as its forward, without a TensorDict
             return actor.choose(_at(agents, "observation", index))
         names = getattr(actor, "in_keys", ("observation",))
         view = unchecked_tensordict({name: _at(agents, name, index) for name in names}, batch_size)
         action: Tensor = actor(view).get("action")
+        return action
+
+    def _begin_states(self, agents: TensorDictBase, observation: Tensor, dim: int) -> None:
+        """Notes the states that actors read in this turn, zeros where there are none; makes room for those
+        that they write.
+
+        Raises:
+            ValueError: for states of other networks than these.
+        """
+        size = *observation.shape[: dim + 1], self._state_cells
+        before = agents.get("recurrent_state", None)
+        if before is None:
+            before = torch.zeros(size, device=observation.device)
+        elif tuple(before.shape) != size:
+            raise ValueError(
+                f'("agents", "recurrent_state") is {list(before.shape)}; allowed: {list(size)}, from the '
+                "same policies in the turn before, or none"
+            )
+        keys.put(agents, "recurrent_state_before", before)
+        keys.put(agents, "recurrent_state", torch.zeros_like(before))
+
+    def _choose_with(self, actor: RecurrentLaneActor, agents: TensorDictBase, index: Any) -> Tensor:
+        """A recurrent actor's actions; writes its states."""
+        index = () if index is None else index
+        before = _at(agents, "recurrent_state_before", index)[..., : actor.state_cells]
+        action, after = actor.choose_with(_at(agents, "observation", index), before)
+        keys.entry(agents, "recurrent_state")[(*index, ..., slice(actor.state_cells))] = after
         return action
 
 

@@ -37,19 +37,21 @@ class LaneActor(TensorDictModuleBase):
             outside 0..1.
     """
 
-    in_keys = ("observation",)
-    out_keys = ("action",)
+    in_keys: tuple[str, ...] = ("observation",)
+    out_keys: tuple[str, ...] = ("action",)
+    state_cells = 0
+    """The numbers of a recurrent state of each agent that it reads and writes."""
 
     def __init__(
         self,
-        values: Callable[[Tensor], Tensor] | None,
+        values: Callable[..., Any] | None,
         actions: int,
         *,
         seeds: Sequence[Sequence[int]],
         agents: int,
         worlds: int = 1,
         stochastic: bool = False,
-        first: Callable[[], Callable[[Tensor], Tensor]] | None = None,
+        first: Callable[[], Callable[..., Any]] | None = None,
         compile: bool = False,
     ) -> None:
         super().__init__()
@@ -116,7 +118,7 @@ class LaneActor(TensorDictModuleBase):
     def _explored(self, observation: Tensor, numbers: Tensor, epsilon: Tensor) -> Tensor:
         """Sampled actions of a stochastic policy, else epsilon-greedy actions; int64 [R x k, S]."""
         if self.stochastic:
-            return self._by_replica(self._sampled(observation, numbers))
+            return self._by_replica(self._sampled(self._values(observation), numbers))
         explores = numbers.view(-1, self.worlds, 2)[..., 0] < epsilon
         return self._by_replica(torch.where(explores, self._random(numbers), self._best(observation)))
 
@@ -130,7 +132,7 @@ class LaneActor(TensorDictModuleBase):
         chosen = actions.view(self.replicas, self.agents, self.worlds, *more).transpose(1, 2)
         return chosen.reshape(-1, self.agents, *more)
 
-    def preferences(self, observation: Tensor) -> Tensor | None:
+    def preferences(self, observation: Tensor, state: Tensor | None = None) -> Tensor | None:
         """What it chooses by: the probabilities of a stochastic policy, else the action values, for
         observations [R x k, S, C, X, Y]; float [R x k, S, A], None for agents that act at random.
 
@@ -138,9 +140,8 @@ class LaneActor(TensorDictModuleBase):
         """
         if self.values is None:
             return None
-        values = self._values(observation).view(self.replicas, self.agents, self.worlds, self.actions)
-        by_world = values.transpose(1, 2).reshape(-1, self.agents, self.actions)
-        return by_world.softmax(-1) if self.stochastic else by_world
+        values = self._by_replica(self._values(observation))
+        return values.softmax(-1) if self.stochastic else values
 
     def get_extra_state(self) -> dict[str, Any]:
         """The state of its random numbers; part of `state_dict`."""
@@ -154,20 +155,25 @@ class LaneActor(TensorDictModuleBase):
         """The greedy actions of each lane, int64 [L, k]."""
         return self._values(observation).argmax(-1)
 
-    def _sampled(self, observation: Tensor, numbers: Tensor) -> Tensor:
+    def _sampled(self, logits: Tensor, numbers: Tensor) -> Tensor:
         """Actions sampled from each lane's policy, int64 [L, k], by inverting the cumulative distribution at
         a uniform number in 0..1."""
-        shares = self._values(observation).double().softmax(-1).cumsum(-1)
+        shares = logits.double().softmax(-1).cumsum(-1)
         drawn = numbers.view(-1, self.worlds, 2)[..., 1:]
         return (drawn >= shares[..., :-1]).sum(-1)
 
     def _values(self, observation: Tensor) -> Tensor:
         """The outputs of each lane's network, [L, k, A]."""
         assert self.values is not None
-        shape = observation.shape[2:]
-        by_lane = observation.view(self.replicas, self.worlds, self.agents, *shape).transpose(1, 2)
         with torch.no_grad():
-            return self.values(by_lane.reshape(-1, self.worlds, *shape))
+            values: Tensor = self.values(self._by_lane(observation))
+        return values
+
+    def _by_lane(self, seen: Tensor) -> Tensor:
+        """Reshapes [R x k, S, ...] to [L, k, ...]."""
+        shape = seen.shape[2:]
+        by_lane = seen.view(self.replicas, self.worlds, self.agents, *shape).transpose(1, 2)
+        return by_lane.reshape(-1, self.worlds, *shape)
 
 
 class ContinuousLaneActor(LaneActor):
@@ -216,7 +222,7 @@ class ContinuousLaneActor(LaneActor):
         actor.epsilon = self.epsilon
         return actor
 
-    def preferences(self, observation: Tensor) -> Tensor | None:
+    def preferences(self, observation: Tensor, state: Tensor | None = None) -> Tensor | None:
         """None: there is no value or probability for each action."""
         return None
 

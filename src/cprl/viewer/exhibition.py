@@ -14,6 +14,7 @@ from tensordict import TensorDictBase
 from torchrl.envs import EnvBase, TransformedEnv
 
 from cprl.commons.game import Game
+from cprl.envs.recurrent_states import begin_states
 from cprl.envs.state import load_transforms_state, transforms_state
 from cprl.envs.unwrap import commons_of
 from cprl.viewer.live_board import LiveBoard, send_fixed
@@ -169,6 +170,7 @@ class Exhibition:
             self._recorder.add_board()
             return
         batch, self._carried = self._env.step_and_maybe_reset(self._policy(self._carried))
+        begin_states(self._carried, self._carried, batch)
         self._recorder.add(batch, step=0, episode=0)
         if isinstance(self._env, TransformedEnv) and self.steps % BATCH_STEPS == 0:
             load_transforms_state(self._env, transforms_state(self._trained))

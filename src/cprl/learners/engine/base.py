@@ -35,15 +35,17 @@ class Engine(Protocol):
     def copy_to_targets(self, which: Tensor) -> None:
         """Copies the weights of the marked lanes, bool [L], to their targets."""
 
-    def outputs(self, observation: Tensor, *, part: int = 0) -> Tensor:
-        """The outputs of the networks with their current weights: [L, k, ...] to [L, k, ...].
+    def outputs(self, observation: Tensor, *recurrent: Tensor, part: int = 0) -> Any:
+        """The outputs of the networks with their current weights: [L, k, ...] to [L, k, ...]; of recurrent
+        ones also their states.
 
         Args:
             observation: k observations of each lane.
+            recurrent: what recurrent networks read besides, likewise: see `cprl.networks.recurrent`.
             part: which of an agent's networks, see `cprl.networks.agent.parts_of`; the first one acts.
         """
 
-    def first(self, lanes: int) -> Callable[[Tensor], Tensor]:
+    def first(self, lanes: int) -> Callable[..., Any]:
         """`outputs` of the first l lanes alone: [l, k, ...] to [l, k, ...], with their weights as they are at
         each call; takes the shorter the fewer they are."""
 
@@ -127,11 +129,11 @@ class ListEngine:
                 target.data.lerp_(weight.data, self._tau)
         return loss.detach()
 
-    def outputs(self, observation: Tensor, *, part: int = 0) -> Tensor:
+    def outputs(self, observation: Tensor, *recurrent: Tensor, part: int = 0) -> Any:
         """See `Engine`."""
-        return stacked_outputs([own[part] for own in self._parts], observation)
+        return stacked_outputs([own[part] for own in self._parts], observation, *recurrent)
 
-    def first(self, lanes: int) -> Callable[[Tensor], Tensor]:
+    def first(self, lanes: int) -> Callable[..., Any]:
         """See `Engine`."""
         return partial(stacked_outputs, [own[0] for own in self._parts[:lanes]])
 
@@ -169,9 +171,12 @@ class ListEngine:
             optimizer.load_state_dict(own)
 
 
-def stacked_outputs(networks: Sequence[nn.Module], observation: Tensor) -> Tensor:
-    """The outputs of several networks: [l, k, ...] to [l, k, ...]."""
-    return torch.stack([own(seen) for own, seen in zip(networks, observation, strict=True)])
+def stacked_outputs(networks: Sequence[nn.Module], *inputs: Tensor) -> Any:
+    """The outputs of several networks: [l, k, ...] to [l, k, ...]; of recurrent ones also their states."""
+    given = [own(*seen) for own, *seen in zip(networks, *inputs, strict=True)]
+    if isinstance(given[0], tuple):
+        return tuple(torch.stack(each) for each in zip(*given, strict=True))
+    return torch.stack(given)
 
 
 def is_finite(loss: LossModule, optimizer: torch.optim.Optimizer) -> bool:

@@ -8,7 +8,7 @@
 """
 
 import warnings
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from copy import deepcopy
 from typing import Any, Final, Literal, get_args
 
@@ -185,9 +185,19 @@ def trial_batch(
     return batch
 
 
-def trial_rollout(transitions: TensorDict, *, actions: int | None = None) -> TensorDict:
-    """A synthetic batch of a rollout, from synthetic transitions; with logits if a number of actions is
-    given."""
+def trial_rollout(
+    transitions: TensorDict,
+    *,
+    actions: int | None = None,
+    states: Mapping[str, Sequence[int]] | None = None,
+) -> TensorDict:
+    """A synthetic batch of a rollout, from synthetic transitions.
+
+    Args:
+        transitions: see `trial_batch`.
+        actions: their number A, for a batch with logits.
+        states: the shapes of the states of recurrent networks by their entries; every third step is an init.
+    """
     chance = torch.Generator().manual_seed(1)
     batch = transitions.select("observation", "action")
     device = batch["action"].device
@@ -196,6 +206,11 @@ def trial_rollout(transitions: TensorDict, *, actions: int | None = None) -> Ten
     batch["action_log_prob"] = batch["advantage"].squeeze(-1) - 2.5
     if actions is not None:
         batch["logits"] = torch.rand((*batch["action"].shape, actions), generator=chance).to(device)
+    for name, shape in (states or {}).items():
+        batch[name] = torch.rand((*batch.batch_size, *shape), generator=chance).to(device)
+        batch["is_init"] = (torch.arange(batch.batch_size[1], device=device) % 3 == 0).expand(
+            batch.batch_size
+        )
     return batch
 
 

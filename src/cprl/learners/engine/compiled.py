@@ -213,15 +213,14 @@ class FunctionalEngine:
         losses = (each.mean() if self._vmapped else each.flatten(1).mean(-1)) * self._share
         return losses.sum(), losses
 
-    def outputs(self, observation: Tensor, *, part: int = 0) -> Tensor:
+    def outputs(self, observation: Tensor, *recurrent: Tensor, part: int = 0) -> Any:
         """See `Engine`."""
         name, network = self._parts[part]
         if not self._vmapped:
-            given: Tensor = network(observation)
-            return given
-        return vmapped(network, self._of_part(name), observation)
+            return network(observation, *recurrent)
+        return vmapped(network, self._of_part(name), observation, *recurrent)
 
-    def first(self, lanes: int) -> Callable[[Tensor], Tensor]:
+    def first(self, lanes: int) -> Callable[..., Any]:
         """See `Engine`."""
         name, network = self._parts[0]
         if self._vmapped:

@@ -2,7 +2,7 @@
 
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
-from typing import Final, NamedTuple
+from typing import Any, Final, NamedTuple
 
 import torch
 from tensordict import TensorDict, TensorDictBase
@@ -162,11 +162,10 @@ def stacked(networks: Sequence[nn.Module], make_loss: MakeLoss, *, lane_axis: bo
     )
 
 
-def vmapped(network: nn.Module, weights: Weights, observation: Tensor) -> Tensor:
+def vmapped(network: nn.Module, weights: Weights, *inputs: Tensor) -> Any:
     """The outputs of a network with the weights of each lane."""
 
-    def output(own: Weights, seen: Tensor) -> Tensor:
-        one: Tensor = torch.func.functional_call(network, own, (seen,))
-        return one
+    def output(own: Weights, *seen: Tensor) -> Any:
+        return torch.func.functional_call(network, own, seen)
 
-    return torch.vmap(output)(weights, observation)
+    return torch.vmap(output)(weights, *inputs)

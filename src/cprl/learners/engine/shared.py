@@ -1,6 +1,7 @@
 """SharedEngine: an engine whose networks each serve several agents, as one with a lane for each agent."""
 
 from collections.abc import Callable, Mapping
+from functools import partial
 from typing import Any
 
 from tensordict import TensorDict
@@ -32,21 +33,21 @@ class SharedEngine:
     def update_from(self, batch: TensorDict) -> Tensor:
         """See `Engine`."""
         lanes, size = batch.batch_size
-        together = batch.reshape(lanes // self._agents, self._agents * size)
+        apart = (self._agents, size) if "is_init" in batch else (self._agents * size,)
+        together = batch.reshape(lanes // self._agents, *apart)  # each sequence stays one
         return self.engine.update_from(together).repeat_interleave(self._agents)
 
     def copy_to_targets(self, which: Tensor) -> None:
         """See `Engine`; agents that share a network are marked together."""
         self.engine.copy_to_targets(which.view(-1, self._agents)[:, 0])
 
-    def outputs(self, observation: Tensor, *, part: int = 0) -> Tensor:
+    def outputs(self, observation: Tensor, *recurrent: Tensor, part: int = 0) -> Any:
         """See `Engine`."""
-        return self._by_network(lambda seen: self.engine.outputs(seen, part=part), observation)
+        return self._by_network(partial(self.engine.outputs, part=part), observation, *recurrent)
 
-    def first(self, lanes: int) -> Callable[[Tensor], Tensor]:
+    def first(self, lanes: int) -> Callable[..., Any]:
         """See `Engine`."""
-        of_networks = self.engine.first(lanes // self._agents)
-        return lambda observation: self._by_network(of_networks, observation)
+        return partial(self._by_network, self.engine.first(lanes // self._agents))
 
     def network_state(self, lane: int) -> Weights:
         """See `Engine`."""
@@ -68,11 +69,15 @@ class SharedEngine:
         """See `Engine`."""
         self.engine.load_state_dict(state)
 
-    def _by_network(self, outputs: Callable[[Tensor], Tensor], observation: Tensor) -> Tensor:
-        """[L, k, ...] to [L, k, ...], through a function of [R, S x k, ...]."""
+    def _by_network(self, outputs: Callable[..., Any], observation: Tensor, *recurrent: Tensor) -> Any:
+        """[L, k, ...] to [L, k, ...], through a function of [R, S x k, ...], or of recurrent networks of
+        [R, S, k, ...]."""
+        if recurrent:
+            inputs = [own.reshape(-1, self._agents, *own.shape[1:]) for own in (observation, *recurrent)]
+            return tuple(own.flatten(0, 1) for own in outputs(*inputs))
         lanes, size = observation.shape[:2]
         by_network = observation.reshape(lanes // self._agents, self._agents * size, *observation.shape[2:])
-        given = outputs(by_network)
+        given: Tensor = outputs(by_network)
         return given.reshape(lanes, size, *given.shape[2:])
 
 

@@ -151,7 +151,8 @@ class StockAgents:
 
     def outputs(self, observation: Tensor, *, part: int = 0) -> Tensor:
         """The outputs of the current networks: [L, k, *shape] to [L, k, ...]; part 0 acts."""
-        return stacked_outputs([agent.parts[part] for agent in self.each], observation)
+        given: Tensor = stacked_outputs([agent.parts[part] for agent in self.each], observation)
+        return given
 
     def first(self, lanes: int) -> Callable[[Tensor], Tensor]:
         """`outputs` of the first agents alone."""

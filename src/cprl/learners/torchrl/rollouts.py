@@ -18,7 +18,8 @@ from cprl.learners.checks import check_learner, check_rollouts, refuse_continuou
 from cprl.learners.engine.functional import MakeLoss
 from cprl.learners.engine.refusals import refuse_other_advantages
 from cprl.learners.lanes import Lanes, StartFrom
-from cprl.learners.rollouts import ACTOR, CRITIC, refuse_other_parts
+from cprl.learners.recurrent import ACTOR, CRITIC, states_in
+from cprl.learners.rollouts import refuse_other_parts
 from cprl.learners.settings import RolloutSettings
 from cprl.learners.torchrl.agents import MakeSampler, StockAgent, StockAgents, check_makers, sampler_of
 from cprl.learners.torchrl.buffers import nested, plain
@@ -226,8 +227,14 @@ def _add_old_policy(rollout: TensorDict, agent: StockAgent) -> None:
 
 
 def _on_policy(make_loss: MakeLoss, network: nn.Module, settings: RolloutSettings) -> LossModule:
-    """Makes the loss; refuses other networks than "actor" and "critic", and other advantages than GAE's."""
+    """Makes the loss; refuses other networks than "actor" and "critic", recurrent ones, and other advantages
+    than GAE's."""
     refuse_other_parts(network)
+    if states_in(network):
+        raise ValueError(
+            'the networks are recurrent; allowed with engine="torchrl", whose minibatches are single turns: '
+            'MLP, Conv, Custom; engine="compiled" and "eager" learn from sequences'
+        )
     loss = make_loss(network)
     refuse_other_advantages(loss, settings)
     return loss

@@ -1,0 +1,246 @@
+"""Recurrent networks: what an agent does depends on what it has seen since its episode began.
+
+A recurrent network is called in two ways. With an observation and a state it takes one step. With `is_init`
+as well, it takes the steps of sequences, whose time is the last axis before that of an observation: where
+`is_init` is True a step begins with the state of its own entry, elsewhere with that of the step before. So a
+sequence may hold several episodes, and may begin in the middle of one.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import Any, Final, NamedTuple
+
+import torch
+from torch import Tensor, nn
+
+from cprl.checks import Check, check_fields, count, instance
+from cprl.networks.convolutional import Conv
+from cprl.networks.mlp import MLP, MOST_CELLS, check_size
+from cprl.networks.stacked import lane_state, stack_lanes
+from cprl.spaces import Spaces
+
+_CHECKS: Final[dict[str, Check]] = {
+    "encoder": Check(
+        lambda value: instance(MLP | Conv, "").fits(value) and len(value.hidden_cells) > 0,
+        "MLP or Conv, with at least one of hidden_cells",
+    ),
+    "recurrent_cells": count(1, MOST_CELLS),
+}
+
+
+@dataclass(frozen=True, kw_only=True)
+class GRU:
+    """A layer of gated recurrent units between an encoder of observations and a linear layer.
+
+    Its state is zero where an episode begins. Source: Cho et al., "Learning Phrase Representations using RNN
+    Encoder-Decoder for Statistical Machine Translation" (2014), in the form of `torch.nn.GRU`.
+
+    Raises:
+        ValueError: if a value is not allowed; names it and says what is.
+    """
+
+    encoder: MLP | Conv = MLP(hidden_cells=(32,))  # noqa: RUF009 - a frozen value
+    """What reads the observation; its last hidden layer, with ReLU, is the input of the recurrent one."""
+    recurrent_cells: int = 32
+    """Units of the recurrent layer: the numbers that an agent remembers."""
+
+    def __post_init__(self) -> None:
+        check_fields(self, _CHECKS)
+
+    def make(
+        self,
+        spaces: Spaces,
+        outputs: int,
+        *,
+        relu_on_outputs: bool = False,
+        glorot_uniform: bool = False,
+        shape: Sequence[int] | None = None,
+    ) -> "GRUNetwork":
+        """A new network; see `cprl.networks.specification.new_network`.
+
+        Raises:
+            ValueError: if the encoder cannot read observations, and for `relu_on_outputs` or
+                `glorot_uniform`.
+        """
+        for name, value in {"relu_on_outputs": relu_on_outputs, "glorot_uniform": glorot_uniform}.items():
+            if value:
+                raise ValueError(f"settings.{name} is True; allowed with a recurrent network: False")
+        *hidden_cells, features = self.encoder.hidden_cells
+        first = replace(self.encoder, hidden_cells=tuple(hidden_cells))
+        encoder = first.make(spaces, features, relu_on_outputs=True, shape=shape)
+        return GRUNetwork(encoder, outputs, recurrent_cells=self.recurrent_cells)
+
+
+class _Weights(NamedTuple):
+    """The layers after the encoder, of L lanes: [L, in, out] and [L, 1, out]."""
+
+    input: Tensor
+    input_bias: Tensor
+    state: Tensor
+    state_bias: Tensor
+    head: Tensor
+    head_bias: Tensor
+
+
+class GRUNetwork(nn.Module):
+    """The network of a `GRU`.
+
+    Args:
+        encoder: a network with the attributes `outputs`, F of them, and `observation_dims`.
+        outputs: the number of outputs A.
+        recurrent_cells: units of the recurrent layer, H.
+
+    Raises:
+        TooLargeError: if there is too little memory for the weights.
+    """
+
+    def __init__(self, encoder: nn.Module, outputs: int, *, recurrent_cells: int) -> None:
+        super().__init__()
+        of_encoder: Any = encoder
+        check_size((of_encoder.outputs, 3 * recurrent_cells, outputs), more=3 * recurrent_cells**2)
+        self.encoder, self.outputs = encoder, outputs
+        self.observation_dims: int = of_encoder.observation_dims
+        self.state_shape = (recurrent_cells,)
+        """The shape of the state of one agent."""
+        self.cell = nn.GRUCell(of_encoder.outputs, recurrent_cells)
+        self.head = nn.Linear(recurrent_cells, outputs)
+
+    def forward(
+        self, observation: Tensor, state: Tensor, is_init: Tensor | None = None
+    ) -> tuple[Tensor, Tensor]:
+        """Takes one step, or the steps of sequences.
+
+        Args:
+            observation: uint8 or float [..., *shape]; of sequences [..., T, *shape].
+            state: before each step, [..., H] or [..., T, H]; of a step that is not in `is_init` not read.
+            is_init: bool [..., T], see the module; that of the first step of a sequence is taken for True.
+
+        Returns:
+            The outputs [..., A] or [..., T, A], and the states after each step, as `state`.
+        """
+        weights = _Weights(*(own[None] for own in _layers(self)))
+        steps = 1 if is_init is None else is_init.shape[-1]
+        return _outputs(weights, self.encoder(observation), state, is_init, (1, -1, steps))
+
+    def stacked(self, networks: Sequence["GRUNetwork"]) -> "StackedGRU":
+        """One network with the parameters of all lanes along a first axis; copies."""
+        return StackedGRU(networks)
+
+
+class StackedGRU(nn.Module):
+    """L networks like `GRUNetwork` whose parameters carry a lane axis, [L, in, out] and [L, 1, out].
+
+    Args:
+        networks: the networks of the lanes, of one architecture; their weights are copied.
+
+    Raises:
+        ValueError: if the networks differ in architecture.
+    """
+
+    def __init__(self, networks: Sequence[GRUNetwork]) -> None:
+        super().__init__()
+        first = networks[0]
+        forms = {(*own.cell.weight_ih.shape, own.outputs) for own in networks}
+        if len(forms) != 1:
+            raise ValueError(f"the networks of the lanes have {len(forms)} architectures; allowed: 1")
+        self.lanes, self.outputs = len(networks), first.outputs
+        self.observation_dims, self.state_shape = first.observation_dims, first.state_shape
+        self.encoder = stack_lanes([own.encoder for own in networks])
+        layers = zip(*map(_layers, networks), strict=True)
+        self.weights = nn.ParameterList(
+            [torch.stack([one.detach() for one in lanes]).contiguous() for lanes in layers]
+        )
+
+    def lane_state(self, lane: int) -> dict[str, Tensor]:
+        """Copies of the weights of one lane, as the state dict of its `GRUNetwork`."""
+        own = _Weights(*(weight[lane].detach() for weight in self.weights))
+        state = {f"encoder.{name}": value for name, value in lane_state(self.encoder, lane).items()}
+        return state | {
+            "cell.weight_ih": own.input.T.clone(),
+            "cell.weight_hh": own.state.T.clone(),
+            "cell.bias_ih": own.input_bias[0].clone(),
+            "cell.bias_hh": own.state_bias[0].clone(),
+            "head.weight": own.head.T.clone(),
+            "head.bias": own.head_bias[0].clone(),
+        }
+
+    def forward(
+        self, observation: Tensor, state: Tensor, is_init: Tensor | None = None
+    ) -> tuple[Tensor, Tensor]:
+        """As `GRUNetwork.forward`, with a lane axis first: [L, ...], or all flat: [L x T, ...]."""
+        dims, steps = self.observation_dims, 1
+        leading, shape = observation.shape[:-dims], observation.shape[-dims:]
+        if is_init is not None:
+            steps = leading[-1] if len(leading) > 1 else leading[0] // self.lanes
+        features = self.encoder(observation.reshape(self.lanes, -1, *shape))
+        features = features.reshape(*leading, features.shape[-1])
+        return _outputs(_Weights(*self.weights), features, state, is_init, (self.lanes, -1, steps))
+
+
+def _layers(network: GRUNetwork) -> _Weights:
+    """The layers of one network after its encoder, without a lane axis."""
+    cell, head = network.cell, network.head
+    return _Weights(
+        cell.weight_ih.T,
+        cell.bias_ih[None],
+        cell.weight_hh.T,
+        cell.bias_hh[None],
+        head.weight.T,
+        head.bias[None],
+    )
+
+
+def _outputs(
+    weights: _Weights, features: Tensor, state: Tensor, is_init: Tensor | None, size: tuple[int, int, int]
+) -> tuple[Tensor, Tensor]:
+    """The outputs and the states after each step, of features [..., F] and states [..., H].
+
+    Args:
+        weights: of L lanes.
+        features: of one step, or of sequences if `is_init` is given.
+        state: before each step.
+        is_init: see `GRUNetwork.forward`.
+        size: L, the sequences of each lane or -1, and the steps of each.
+    """
+    lanes, _, steps = size
+    leading, cells = features.shape[:-1], state.shape[-1]
+    gates = torch.baddbmm(weights.input_bias, features.reshape(lanes, -1, features.shape[-1]), weights.input)
+    gates, state = gates.view(lanes, -1, steps, 3 * cells), state.reshape(*size, cells)
+    if is_init is None:
+        after = _step(weights, gates[:, :, 0], state[:, :, 0]).unsqueeze(2)
+    else:
+        after = _through_time(weights, gates, state, is_init.reshape(*size, 1))
+    outputs = torch.baddbmm(weights.head_bias, after.reshape(lanes, -1, cells), weights.head)
+    return outputs.reshape(*leading, outputs.shape[-1]), after.reshape(*leading, cells)
+
+
+def _through_time(weights: _Weights, gates: Tensor, state: Tensor, is_init: Tensor) -> Tensor:
+    """The states after each step of sequences, [L, n, T, H]."""
+    now, after = state[:, :, 0], []
+    # Unbound once: the gradient of an index per step would be as large as the sequence.
+    each = zip(gates.unbind(2), state.unbind(2), is_init.unbind(2), strict=True)
+    for step, (of_input, given, begins) in enumerate(each):
+        now = _step(weights, of_input, torch.where(begins, given, now) if step else now)
+        after.append(now)
+    return torch.stack(after, 2)
+
+
+def _step(weights: _Weights, of_input: Tensor, state: Tensor) -> Tensor:
+    """The states after a step, [L, n, H], by the formulas of `torch.nn.GRU`.
+
+    Args:
+        weights: of L lanes.
+        of_input: what the reset gate, the update gate and the new value get from the input, [L, n, 3 H].
+        state: before the step, [L, n, H].
+    """
+    cells = state.shape[-1]
+    of_state = torch.baddbmm(weights.state_bias, state, weights.state)
+    both = (of_input[..., : 2 * cells] + of_state[..., : 2 * cells]).sigmoid()
+    reset, update = both.chunk(2, -1)
+    new = torch.addcmul(of_input[..., 2 * cells :], reset, of_state[..., 2 * cells :]).tanh()
+    return torch.lerp(new, state, update)
+
+
+def state_shape_of(network: nn.Module) -> tuple[int, ...] | None:
+    """The shape of the state of a recurrent network, None for one that has no state."""
+    return getattr(network, "state_shape", None)

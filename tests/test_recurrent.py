@@ -1,0 +1,502 @@
+"""Agents with recurrent networks: what they remember, when they forget it, and how they learn from it."""
+
+import os
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+from recall_game import Recall
+from test_networks import VECTORS
+from test_population import GAME, Returns, assert_goes_on_bit_for_bit, population, trained, weights
+from torch import nn
+from torchrl.envs import RewardScaling
+from torchrl.envs.utils import ExplorationType, set_exploration_type
+from torchrl.modules import GRUModule, set_recurrent_mode
+
+import cprl
+from cprl import CommonsEnv, Custom, Experiment
+from cprl.algorithms import (
+    A2C,
+    CQL,
+    DQN,
+    IPPO,
+    IQL,
+    LOLA,
+    MADDPG,
+    MAPPO,
+    PPO,
+    PR2,
+    QMIX,
+    SAC,
+    VDN,
+    DistributionalDQN,
+    DQNSettings,
+    LOLASettings,
+    Reinforce,
+    RolloutSettings,
+)
+from cprl.collectors import StepCollector, stock_collector
+from cprl.config import from_config, to_config
+from cprl.envs import make_env, spaces_of
+from cprl.envs.matrix import stag_hunt
+from cprl.evaluation.film import film
+from cprl.learners.rollouts import RolloutLearner
+from cprl.measuring.evaluate import evaluate
+from cprl.measuring.movement import trace
+from cprl.networks import GRU, MLP, Conv
+from cprl.networks.stacked import lane_state, stack_lanes
+from cprl.play.opening import open_session
+from cprl.population import Frozen, Learning, Scripted, Team
+from cprl.training import train
+
+SMALL = GRU(encoder=MLP(hidden_cells=(6,)), recurrent_cells=5)
+CONV = GRU(encoder=Conv(channels=(3,), hidden_cells=(6,)), recurrent_cells=5)
+ROLLOUTS = RolloutSettings(rollout_steps=20, minibatch_size=10, epochs=2)
+ON_POLICY = {
+    "PPO": PPO(settings=ROLLOUTS, network=SMALL),
+    "PPO, convolutions": PPO(settings=ROLLOUTS, network=CONV),
+    "A2C": A2C(settings=replace(ROLLOUTS, epochs=1), network=SMALL),
+    "REINFORCE": Reinforce(settings=replace(ROLLOUTS, epochs=1), network=SMALL),
+    "IPPO": IPPO(settings=ROLLOUTS, network=SMALL),
+    "MAPPO": MAPPO(settings=ROLLOUTS, network=SMALL),
+}
+FOUR = (0, 1, 2, 3)
+
+
+def specs(name, *, shares=False):
+    """Four agents of an algorithm, each by itself or as a team."""
+    algorithm = ON_POLICY[name]
+    if name in ("IPPO", "MAPPO") or shares:
+        reward = "team" if name == "MAPPO" else "individual"
+        return [Team(algorithm, FOUR, reward=reward, share_parameters=shares)]
+    return [Learning(algorithm)] * 4
+
+
+def sequences(batch, steps, cells, *, seed=0):
+    """States [batch, steps, cells] of which every third or so begins a sequence, and which do."""
+    chance = torch.Generator().manual_seed(seed)
+    is_init = torch.rand(batch, steps, generator=chance) < 0.3
+    is_init[:, 0] = True
+    return torch.rand(batch, steps, cells, generator=chance) - 0.5, is_init
+
+
+def test_the_recurrent_layer_equals_those_of_torch_and_torchrl():
+    """torch.nn.GRU over a whole sequence, TorchRL's GRUModule, which splits it where an episode begins."""
+    network = SMALL.make(VECTORS, 3)
+    layer = nn.GRU(6, 5, batch_first=True)
+    for name in ("weight_ih", "weight_hh", "bias_ih", "bias_hh"):
+        getattr(layer, f"{name}_l0").data.copy_(getattr(network.cell, name).data)
+    seen = torch.rand(4, 9, 6)
+    given, is_init = sequences(4, 9, 5)
+    outputs, after = network(seen, given, torch.zeros(4, 9, dtype=torch.bool))
+    expected, _ = layer(network.encoder(seen), given[None, :, 0].contiguous())
+    torch.testing.assert_close(after, expected)
+    torch.testing.assert_close(outputs, network.head(expected))
+    module = GRUModule(gru=layer, in_keys=["seen", "hidden", "is_init"], out_keys=["out", ("next", "hidden")])
+    nothing = torch.zeros(4, 9, 5)
+    with set_recurrent_mode(True):
+        played = module(
+            cprl.envs.commons_env.TensorDict(
+                {"seen": network.encoder(seen), "hidden": nothing[:, :, None], "is_init": is_init[..., None]},
+                [4, 9],
+            )
+        )
+    torch.testing.assert_close(network(seen, nothing, is_init)[1], played["out"])
+
+
+@pytest.mark.parametrize("network", [SMALL, CONV])
+def test_steps_one_by_one_give_what_a_sequence_gives(network):
+    of_one = network.make(GAME.spaces, 8)
+    seen = torch.randint(256, (2, 7, *GAME.observation_shape), dtype=torch.uint8)
+    given, is_init = sequences(2, 7, 5)
+    outputs, after = of_one(seen, given, is_init)
+    state = given[:, 0]
+    for step in range(7):
+        state = torch.where(is_init[:, step, None], given[:, step], state)
+        output, state = of_one(seen[:, step], state)
+        torch.testing.assert_close(output, outputs[:, step])
+        torch.testing.assert_close(state, after[:, step])
+
+
+@pytest.mark.parametrize("network", [SMALL, CONV])
+def test_a_lane_of_a_stack_gives_and_learns_what_its_network_does_alone(network):
+    networks = [network.make(GAME.spaces, 8) for _ in range(3)]
+    stack = stack_lanes(networks)
+    seen = torch.randint(256, (3, 7, *GAME.observation_shape), dtype=torch.uint8)
+    given, is_init = sequences(3, 7, 5)
+    outputs, after = stack(seen, given, is_init)
+    flat = stack(seen.flatten(0, 1), given.flatten(0, 1), is_init.flatten())
+    outputs.square().sum().backward()
+    for lane, own in enumerate(networks):
+        output, state = own(seen[lane], given[lane], is_init[lane])
+        torch.testing.assert_close(outputs[lane], output)
+        torch.testing.assert_close(after[lane], state)
+        output.square().sum().backward()
+        torch.testing.assert_close(stack.weights[2].grad[lane].T, own.cell.weight_hh.grad)
+        kept = lane_state(stack, lane)
+        assert all(torch.equal(kept[name], value) for name, value in own.state_dict().items())
+        assert kept.keys() == own.state_dict().keys()
+    torch.testing.assert_close(flat[0], outputs.flatten(0, 1))
+
+
+def test_the_gradient_runs_through_time_and_ends_where_a_sequence_begins():
+    network = SMALL.make(VECTORS, 3)
+    seen = torch.rand(1, 6, 6, requires_grad=True)
+    given, is_init = torch.zeros(1, 6, 5), torch.tensor([[True, False, False, True, False, False]])
+    network(seen, given, is_init)[0][0, 5].sum().backward()
+    reached = seen.grad[0].abs().sum(-1) > 0
+    assert reached.tolist() == [False, False, False, True, True, True]
+
+
+def batches(env, policy, steps, make=StepCollector):
+    turns = iter(make(env, policy))
+    return [next(turns) for _ in range(steps)]
+
+
+@pytest.mark.parametrize("kind", ["commons", "with transforms", "matrix", "own"])
+def test_a_state_goes_from_turn_to_turn_and_is_zero_where_an_episode_begins(kind):
+    env = {
+        "commons": lambda: CommonsEnv(GAME, 2, seed=3),
+        "with transforms": lambda: make_env(
+            GAME, worlds=2, seed=3, transforms=[RewardScaling(0.0, 2.0, in_keys=[("agents", "reward")])]
+        ),
+        "matrix": lambda: make_env(stag_hunt(turns=5), worlds=2, seed=3),
+        "own": lambda: make_env(Recall(turns=5), worlds=2, seed=3),
+    }[kind]()
+    learner = ON_POLICY["PPO"].make_learner(
+        spaces_of(env), agents=range(spaces_of(env).agents), replicas=2, engine="eager"
+    )
+    policy = cprl.policies.assignment.AgentPolicies({learner.agents: learner.actor})
+    played = batches(env, policy, 30)
+    first = True
+    for before, now in zip([None, *played], played, strict=False):
+        states = now["agents", "recurrent_state_before"]
+        began = torch.ones(2, dtype=torch.bool) if first else before["next", "done"][:, 0]
+        first = False
+        assert (states[began] == 0).all()
+        if before is not None:
+            kept = before["agents", "recurrent_state"][~began]
+            assert torch.equal(states[~began], kept)
+            assert (kept != 0).any() or not len(kept)
+    assert any(now["next", "done"].any() for now in played[:-1])
+
+
+def test_rollouts_and_collectors_of_torchrl_carry_and_reset_states_too():
+    env = CommonsEnv(GAME, 2, seed=3)
+    learner = ON_POLICY["PPO"].make_learner(env.game.spaces, agents=FOUR, replicas=2, engine="eager")
+    policy = cprl.policies.assignment.AgentPolicies({FOUR: learner.actor})
+    with set_exploration_type(ExplorationType.DETERMINISTIC):
+        played = env.rollout(30, policy, break_when_any_done=False)
+    (collected,) = batches(
+        CommonsEnv(GAME, 2, seed=3), policy, 1, lambda *how: stock_collector(*how, steps=30)
+    )
+    for found in (played, collected):
+        states = found["agents", "recurrent_state_before"]
+        began = torch.cat([torch.ones(2, 1, dtype=torch.bool), found["next", "done"][:, :-1, 0]], 1)
+        assert began.sum() > 2
+        assert (states[began] == 0).all()
+        assert ((states != 0).flatten(2).any(-1) == ~began).all()
+
+
+def test_a_rollout_is_evaluated_as_it_was_played_across_rollouts_and_episodes():
+    """The logits of `_batch` are those by which agents acted; so are those of any minibatch's own states."""
+    env = CommonsEnv(GAME, 2, seed=3)
+    learner = ON_POLICY["PPO"].make_learner(env.game.spaces, agents=FOUR, replicas=2, engine="eager")
+    policy = cprl.policies.assignment.AgentPolicies({FOUR: learner.actor})
+    turns = iter(StepCollector(env, policy))
+    for _ in range(3):  # episodes last 12 turns, rollouts 20
+        acted = []
+        for _ in range(20):
+            batch = next(turns)
+            learner.store(batch)
+            before = batch["agents", "recurrent_state_before"]
+            acted.append(learner.actor.preferences(batch["agents", "observation"], before))
+        found = learner._batch()
+        chances = torch.stack(acted, 1).flatten(0, 0).transpose(1, 2).flatten(0, 1)  # [R, T, S, A] to lanes
+        chosen = chances.gather(-1, found["action"].unsqueeze(-1)).squeeze(-1)
+        torch.testing.assert_close(found["action_log_prob"], chosen.log())
+        assert found["is_init"][:, [0, 10]].all()
+        half = found[:, 10:]
+        network = learner.networks()["replica_1/agent_2"]
+        logits, _ = network(half["observation"][6], half["recurrent_state"][6], half["is_init"][6])
+        own = logits.log_softmax(-1).gather(-1, half["action"][6][:, None])[:, 0]
+        torch.testing.assert_close(own, half["action_log_prob"][6])
+        assert (half["recurrent_state"][6, 0] != 0).any()
+        learner._size = 0  # the same weights play on
+
+
+def test_the_critic_goes_on_from_rollout_to_rollout_and_values_the_state_after_each_turn():
+    """Its values are those of its network over the whole history, the last observation of an episode too."""
+    env = make_env(Recall(turns=7), worlds=1)
+    settings = replace(ROLLOUTS, rollout_steps=10, minibatch_size=5)
+    learner = PPO(settings=settings, network=SMALL).make_learner(
+        spaces_of(env), agents=(0,), replicas=1, engine="eager"
+    )
+    policy = cprl.policies.assignment.AgentPolicies({(0,): learner.actor})
+    turns, played = iter(StepCollector(env, policy)), []
+    critic = dict(learner.engine._parts)["critic"]
+
+    def wanted(history):
+        """The value after the latest turn, step by step since its episode began."""
+        since = [place for place, own in enumerate(history[:-1]) if own["next", "done"].any()]
+        state = torch.zeros(1, 1, 5)
+        for own in history[since[-1] + 1 if since else 0 :]:
+            _, state = critic(own["agents", "observation"], state)
+        return critic(history[-1]["next", "agents", "observation"], state)[0]
+
+    for _ in range(30):
+        played.append(next(turns))
+        learner.store(played[-1])
+        torch.testing.assert_close(learner.values(played[-1]), wanted(played)[0])
+        if learner._size == 10:
+            evaluated = learner._evaluated(learner._columns())
+            torch.testing.assert_close(evaluated.next_value[0, -1:], wanted(played)[0])
+            learner._size = 0
+            torch.testing.assert_close(learner.values(played[-1]), wanted(played)[0])
+
+
+@pytest.mark.parametrize("name", ON_POLICY)
+def test_each_algorithm_moves_every_agents_weights_and_no_replica_knows_of_the_others(name):
+    together, alone = (
+        population(specs(name), replicas=3),
+        population(specs(name), replicas=1, first_replica=2),
+    )
+    before = weights(together)
+    _, returns = trained(together)
+    _, returns_alone = trained(alone, first=2)
+    assert returns[2] == returns_alone[0]
+    after = weights(together)
+    assert all(not torch.equal(after[key], value) for key, value in before.items() if "weight" in key)
+    own = {key: value for key, value in after.items() if key.startswith("replica_2")}
+    for key, value in weights(alone).items():
+        torch.testing.assert_close(value, own[key], rtol=1e-4, atol=1e-5)
+
+
+@pytest.mark.parametrize("name", ["PPO", "MAPPO"])
+def test_members_that_share_a_recurrent_network_each_have_a_state(name):
+    agents = population(specs(name, shares=True))
+    before = weights(agents)
+    trained(agents)
+    after = weights(agents)
+    for key, value in after.items():
+        assert torch.equal(value, after[f"{key.split('/')[0]}/agent_0/{key.split('/')[2]}"])
+        assert not torch.equal(value, before[key])
+    played = batches(CommonsEnv(GAME, 2, seed=9), agents.policy(1), 4)[-1]
+    states = played["agents", "recurrent_state"]
+    assert len({tuple(own) for own in states.flatten(0, 1).tolist()}) == 8
+
+
+@pytest.mark.parametrize("engine", ["lane_axis", "lane_axis_flat"])
+@pytest.mark.parametrize("name", ["PPO", "IPPO"])
+def test_every_engine_learns_the_same(name, engine):
+    algorithm, spaces = ON_POLICY[name], GAME.spaces
+
+    def made(kind):
+        team = {"make_team": lambda own: algorithm.make_team(own, spaces)} if name == "IPPO" else {}
+        return RolloutLearner(
+            spaces,
+            agents=FOUR,
+            replicas=2,
+            settings=ROLLOUTS,
+            make_network=lambda: algorithm.make_network(spaces),
+            make_loss=algorithm.make_loss,
+            engine=kind,
+            compile=False,
+            **team,
+        )
+
+    if name == "IPPO" and engine == "lane_axis_flat":
+        pytest.skip("a loss of a team reads the axis of its members")
+    one, other = made(engine), made("list")
+    for learner in (one, other):
+        env = CommonsEnv(GAME, 2, seed=3)
+        policy = cprl.policies.assignment.AgentPolicies({FOUR: learner.actor})
+        for batch in batches(env, policy, 20):
+            learner.store(batch)
+        learner.update()
+    for lane in range(one.lanes):
+        for key, value in one.engine.network_state(lane).items():
+            torch.testing.assert_close(
+                value, other.engine.network_state(lane)[key], rtol=1e-4, atol=1e-5, msg=key
+            )
+
+
+@pytest.mark.parametrize("name", ["PPO", "MAPPO"])
+def test_a_training_that_was_stopped_goes_on_bit_for_bit(name, tmp_path):
+    members = {
+        "PPO": [Learning(ON_POLICY["PPO"]), Learning(ON_POLICY["REINFORCE"])],
+        "MAPPO": [Team(ON_POLICY["MAPPO"], (0, 1))],
+    }[name] + [Scripted("greedy"), Scripted()]
+    assert_goes_on_bit_for_bit(members, tmp_path, episodes=7)
+
+
+@pytest.fixture(scope="module")
+def ran(tmp_path_factory):
+    """A run of recurrent agents of two sizes beside others that are not."""
+    folder = tmp_path_factory.mktemp("recurrent")
+    larger = replace(ON_POLICY["PPO"], network=GRU(encoder=MLP(hidden_cells=(4,)), recurrent_cells=7))
+    agents = [
+        Learning(ON_POLICY["PPO"]),
+        Learning(larger),
+        Learning(DQN(settings=DQNSettings(buffer_size=60, batch_size=4, hidden_cells=(8,)))),
+        Learning(ON_POLICY["PPO"]),
+    ]
+    experiment = Experiment(
+        name="recurrent",
+        game=GAME,
+        agents=agents,
+        replicas=2,
+        episodes=3,
+        seed=3,
+        evaluation_episodes=2,
+        engine="eager",
+    )
+    return experiment, cprl.run(experiment, folder / "run", watch="off")
+
+
+def test_a_stored_run_is_loaded_evaluated_filmed_and_played_against(ran, tmp_path):
+    experiment, run = ran
+    loaded = cprl.load(run)
+    assert loaded.experiment == experiment
+    assert from_config(to_config(CONV)) == CONV
+    found = cprl.evaluate_run(run, episodes=3)
+    for replica in (0, 1):
+        alone = evaluate(
+            loaded.env(3, seed=found.seed, first_world=3 * replica),
+            loaded.policy(replica, worlds=3, seed=found.seed),
+            explore=True,
+        )
+        for one, other in zip(found.trained[replica], alone, strict=True):
+            assert np.array_equal(one.return_, other.return_)
+    film(run)
+    assert (run / "film-0-0.rrd").stat().st_size > 10_000
+    session = open_session(str(run), agent=2, steps=5)
+    for _ in range(5):
+        session.act("forward")
+    assert session.has_ended
+    where = os.path.relpath(run)
+    earlier = [Frozen(where, 0), Frozen(where, 1), Scripted(), Learning(ON_POLICY["PPO"])]
+    started = replace(experiment, agents=earlier, seed=4, episodes=2)
+    other = cprl.run(started, tmp_path / "other", watch="off")
+    played = cprl.crossplay([run, other], episodes=2)
+    assert len(played.cells) == 4
+    moved = trace(loaded.env(2, seed=5), loaded.policy(worlds=2), explore=False)
+    greedy = evaluate(loaded.env(2, seed=5), loaded.policy(worlds=2))
+    assert [int(own.steps) for own in greedy] == moved.played.sum(0).tolist()
+
+
+def test_what_an_agent_does_depends_on_what_it_saw(ran):
+    """The same observation after different turns gives other probabilities."""
+    loaded = cprl.load(ran[1])
+    actor = loaded.policy().actors[0]
+    seen = torch.zeros(1, 2, *GAME.observation_shape, dtype=torch.uint8)
+    once, twice = torch.zeros(1, 2, 5), torch.ones(1, 2, 5)
+    assert not torch.equal(actor.preferences(seen, once), actor.preferences(seen, twice))
+    with pytest.raises(ValueError, match="state is None; allowed for recurrent networks"):
+        actor.preferences(seen)
+    with pytest.raises(ValueError, match="needs a state; allowed: choose_with"):
+        actor.choose(seen)
+
+
+def test_states_of_other_policies_are_refused(ran):
+    policy = cprl.load(ran[1]).policy()
+    moment = cprl.load(ran[1]).env().reset()
+    moment["agents", "recurrent_state"] = torch.zeros(1, 4, 5)
+    with pytest.raises(ValueError, match=r"is \[1, 4, 5\]; allowed: \[1, 4, 7\]"):
+        policy(moment)
+
+
+REPLAY = DQNSettings(buffer_size=60, batch_size=4)
+
+
+@pytest.mark.parametrize("kind", [DQN, DistributionalDQN, CQL, SAC, IQL, PR2, VDN, QMIX, MADDPG, LOLA])
+def test_algorithms_that_learn_from_single_transitions_are_refused_by_name(kind):
+    settings = LOLASettings() if kind is LOLA else REPLAY
+    with pytest.raises(
+        ValueError, match=rf"{kind.__name__}.network is GRU.*does not learn from sequences.*MAPPO learn"
+    ):
+        kind(settings=settings, network=SMALL)
+
+
+def test_other_wrong_values_are_refused_by_name(tmp_path):
+    with pytest.raises(ValueError, match=r"GRU.recurrent_cells is 0"):
+        GRU(recurrent_cells=0)
+    with pytest.raises(ValueError, match=r"GRU.encoder is a MLP; allowed: MLP or Conv, with at least one of"):
+        GRU(encoder=MLP(hidden_cells=()))
+    with pytest.raises(ValueError, match=r"GRU.encoder is a GRU"):
+        GRU(encoder=SMALL)
+    with pytest.raises(ValueError, match=r"the shape \[6\]; allowed for Conv"):
+        CONV.make(VECTORS, 3)
+    with pytest.raises(ValueError, match="relu_on_outputs is True; allowed with a recurrent network: False"):
+        SMALL.make(VECTORS, 3, relu_on_outputs=True)
+    stock = Experiment(
+        name="stock",
+        game=GAME,
+        agents=[Learning(ON_POLICY["PPO"])] * 4,
+        replicas=1,
+        episodes=1,
+        engine="torchrl",
+    )
+    with pytest.raises(ValueError, match='recurrent; allowed with engine="torchrl"'):
+        cprl.run(stock, tmp_path / "never", watch="off")
+    assert not (tmp_path / "never").exists()
+
+
+STACKED = Custom(
+    "torchrl.envs.transforms:CatFrames",
+    arguments={"N": 3, "dim": -3, "in_keys": [["agents", "observation"]]},
+)
+
+
+def test_latest_observations_are_stacked_by_a_transform_everywhere(tmp_path):
+    """CatFrames: three windows, the oldest first; an episode begins with its first one three times."""
+    env = make_env(GAME, worlds=2, seed=3, transforms=[STACKED])
+    assert spaces_of(env).observation_shape == (9, 3, 5)
+    plain = CommonsEnv(GAME, 2, seed=3)
+    seen, carried, bare, began = [], env.reset(), plain.reset(), torch.ones(2, 1)
+    for turn in range(26):
+        now = carried["agents", "observation"].unflatten(2, (3, 3))
+        assert torch.equal(now[:, :, -1], bare["agents", "observation"])
+        if not began.any():
+            assert torch.equal(now[:, :, :-1], seen[-1][:, :, 1:])
+        if began.all():
+            assert torch.equal(now, now[:, :, -1:].expand_as(now))
+        seen.append(now)
+        action = torch.full((2, 4), turn % 8)
+        carried["agents", "action"], bare["agents", "action"] = action, action.clone()
+        batch, carried = env.step_and_maybe_reset(carried)
+        _, bare = plain.step_and_maybe_reset(bare)
+        began = batch["next", "done"]
+    experiment = Experiment(
+        name="stacked",
+        game=GAME,
+        agents=[Learning(DQN(settings=replace(REPLAY, hidden_cells=(8,))))] * 4,
+        replicas=2,
+        episodes=3,
+        evaluation_episodes=2,
+        transforms=[STACKED],
+        engine="eager",
+    )
+    run = cprl.run(experiment, tmp_path / "run", watch="off")
+    assert cprl.load(run, allow=[STACKED.target]).spaces.observation_shape == (9, 3, 5)
+    assert len(cprl.evaluate_run(run, episodes=2, allow=[STACKED.target]).trained[0]) == 2
+
+
+@pytest.mark.slow
+def test_memory_is_what_a_game_of_recall_needs():
+    """The cue of the first of four turns says which of two actions pays in the last: 1, blindly 0.5."""
+
+    def reached(network):
+        env = make_env(Recall(turns=4), worlds=8)
+        settings = RolloutSettings(rollout_steps=64, minibatch_size=32, learning_rate=1e-2, gamma=0.9)
+        learner = PPO(settings=settings, network=network).make_learner(
+            spaces_of(env), agents=(0,), replicas=8, engine="eager"
+        )
+        returns = Returns()
+        train(env, {(0,): learner}, episodes=500, callbacks=[returns])
+        return [float(np.mean(own[-100:])) for own in returns.of.values()]
+
+    remembering = reached(GRU(encoder=MLP(hidden_cells=(8,)), recurrent_cells=8))
+    assert sorted(remembering)[1] > 0.9, remembering
+    assert max(reached(MLP(hidden_cells=(16,)))) < 0.7
