@@ -256,7 +256,10 @@ def test_the_critic_goes_on_from_rollout_to_rollout_and_values_the_state_after_e
             torch.testing.assert_close(learner.values(played[-1]), wanted(played)[0])
 
 
-@pytest.mark.parametrize("name", ON_POLICY)
+@pytest.mark.parametrize(
+    "name",
+    [name if name in ("PPO", "IPPO") else pytest.param(name, marks=pytest.mark.slow) for name in ON_POLICY],
+)
 def test_each_algorithm_moves_every_agents_weights_and_no_replica_knows_of_the_others(name):
     together, alone = (
         population(specs(name), replicas=3),
@@ -287,9 +290,10 @@ def test_members_that_share_a_recurrent_network_each_have_a_state(name):
     assert len({tuple(own) for own in states.flatten(0, 1).tolist()}) == 8
 
 
-@pytest.mark.parametrize("engine", ["lane_axis", "lane_axis_flat"])
-@pytest.mark.parametrize("name", ["PPO", "IPPO"])
-def test_every_engine_learns_the_same(name, engine):
+@pytest.mark.parametrize(
+    ("name", "engine"), [("PPO", "lane_axis"), ("PPO", "lane_axis_flat"), ("IPPO", "lane_axis")]
+)
+def test_every_engine_learns_what_a_list_of_losses_does(name, engine):
     algorithm, spaces = ON_POLICY[name], GAME.spaces
 
     def made(kind):
@@ -306,8 +310,6 @@ def test_every_engine_learns_the_same(name, engine):
             **team,
         )
 
-    if name == "IPPO" and engine == "lane_axis_flat":
-        pytest.skip("a loss of a team reads the axis of its members")
     one, other = made(engine), made("list")
     for learner in (one, other):
         env = CommonsEnv(GAME, 2, seed=3)
@@ -322,7 +324,7 @@ def test_every_engine_learns_the_same(name, engine):
             )
 
 
-@pytest.mark.parametrize("name", ["PPO", "MAPPO"])
+@pytest.mark.parametrize("name", ["PPO", pytest.param("MAPPO", marks=pytest.mark.slow)])
 def test_a_training_that_was_stopped_goes_on_bit_for_bit(name, tmp_path):
     members = {
         "PPO": [Learning(ON_POLICY["PPO"]), Learning(ON_POLICY["REINFORCE"])],

@@ -193,7 +193,7 @@ class RolloutLearner:
         size = self.settings.minibatch_size
         if self._states is not None:
             return self._states.minibatches(numbers)
-        return numbers.argsort(-1).unflatten(-1, (-1, size)).transpose(0, 1)
+        return numbers.argsort(-1).view(len(numbers), -1, size).transpose(0, 1)
 
     def _batch(self) -> TensorDict:
         """The rollout with advantages, [L, T], under the keys of TorchRL's losses; advantages are normalised
