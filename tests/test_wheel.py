@@ -138,10 +138,16 @@ def test_a_game_is_played_in_the_terminal(bare, run):
 
 def test_a_recording_is_served(bare, run):
     words = [str(bare.bin / "cprl"), "watch", run, "--serve"]
-    with subprocess.Popen(words, cwd=bare.folder, env=bare.env, stdout=subprocess.PIPE, text=True) as serving:
+    usual = signal.signal(signal.SIGINT, signal.default_int_handler)  # a shell's background job ignores it
+    serving = subprocess.Popen(words, cwd=bare.folder, env=bare.env, stdout=subprocess.PIPE, text=True)
+    signal.signal(signal.SIGINT, usual)
+    try:
         lines = [serving.stdout.readline() for _ in range(3)]
         serving.send_signal(signal.SIGINT)
-        assert serving.wait(60) == 0
+        assert serving.wait(120) == 0
+    finally:
+        serving.kill()
+        serving.communicate()
     assert lines[0].startswith("Watch (browser): http://127.0.0.1:")
 
 
