@@ -67,6 +67,7 @@ PACKAGES = (
     "studies_options",
     "studies_cli",
     "exploit_cli",
+    "docs_cli",
     "cli",
 )
 MODULES = sorted(path for path in SOURCE.rglob("*.py") if path.parent != SOURCE or path.name != "__init__.py")

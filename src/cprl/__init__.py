@@ -59,6 +59,7 @@ Each imports only from those above it:
     studies_options  how a study is run, as options of a command line
     studies_cli  cprl sweep, and study_main: the command line of a recipe of a study
     exploit_cli  cprl exploit
+    docs_cli     cprl docs
     cli          the command cprl
 """
 
