@@ -120,8 +120,8 @@ def test_a_page_that_links_to_nothing_fails_the_build(built, tmp_path):
     folder.mkdir()
     (folder / "index.md").write_text("# a\n\n[b](#nowhere)\n")
     text = re.sub(r"^(docs_dir|site_dir): .*$", rf"\1: {tmp_path}/\1", text, flags=re.MULTILINE)
-    text = text.replace("/docs_dir", "/pages")[: text.index("nav:\n- Home")] + "nav: [index.md]\n"
-    (tmp_path / "mkdocs.yml").write_text(text)
+    text = text.replace("/docs_dir", "/pages").split("\nnav:\n")[0]
+    (tmp_path / "mkdocs.yml").write_text(f"{text}\nnav: [index.md]\n")
     command = [sys.executable, "-m", "mkdocs", "build", "--strict", "-f", str(tmp_path / "mkdocs.yml")]
     done = subprocess.run(command, capture_output=True, text=True, check=False)
     assert done.returncode != 0

@@ -7,7 +7,6 @@ Modules, in the order in which one reads them:
     reference    the reference: packages by their docstrings, commands by their --help
     replays      the recordings of docs/results, and the page that plays them
 
-MkDocs with Material, whose makers mend it until May 2027, sees a plain folder of Markdown and mkdocs.yml, and no
-hooks, so that its successor Zensical can take its place: that was 0.0.73 or, with a dependency that pip did not
-find, 0.1.2 when this was written.
+MkDocs with Material, whose makers mend it until May 2027, sees a plain folder of Markdown and mkdocs.yml, and
+no hooks, so that its successor Zensical, 0.1 when this was written, can take its place.
 """

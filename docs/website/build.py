@@ -68,7 +68,7 @@ def _config(pages: Path, navigation: list[Any]) -> str:
 def _build(config: Path) -> None:
     """Runs MkDocs, and ends with its exit code where it fails.
 
-    Material's banner about MkDocs 2 is left out: pyproject.toml keeps MkDocs below 2.
+    Material's banner about its own end, of which `website` says more, is left out.
     """
     command = [sys.executable, "-m", "mkdocs", "build", "--strict", "--clean", "--config-file", str(config)]
     done = subprocess.run(command, env={**os.environ, "NO_MKDOCS_2_WARNING": "1"}, check=False)

@@ -1,7 +1,7 @@
 """The pages of the site: those of docs/, and whatever they link to elsewhere in the repository.
 
 The Markdown pages are read in the repository too, where `../recipes/commons.py` is a file. On the site a file
-of text is a page of its own, a folder a list of what it holds, and a recording is played by the page of replays.
+of text is a page of its own, a folder a list of what it holds; recordings are played by the page of replays.
 """
 
 import os
