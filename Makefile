@@ -4,17 +4,21 @@ PYTHON ?= python3
 TORCH_INDEX ?=
 BIN := .venv/bin
 INSTALLED := .venv/.installed
+DOCS_INSTALLED := .venv/.installed-docs
 
 VIEWER_PACKAGES := mesa-vulkan-drivers libvulkan1 chromium chromium-driver
 
-.PHONY: run docs-live lint test test-oldest test-newest fuzz test-slow test-wheel test-gpu test-viewer viewer-packages check bench bench-gpu clean
+.PHONY: run docs docs-serve lint test test-oldest test-newest fuzz test-slow test-wheel test-gpu test-viewer test-docs viewer-packages check bench bench-gpu clean
 
 run: $(INSTALLED)
 	$(BIN)/python recipes/tragedy.py --watch serve --linger --no-keep-checkpoint
 
-# Replays of the results in docs/results, in a browser; PORT takes another port than 8765.
-docs-live: $(INSTALLED)
-	@$(BIN)/python docs/replay_page.py $(if $(PORT),--port $(PORT))
+# The site of docs/*.md with the reference, warnings as errors; docs-serve opens it, PORT takes another port.
+docs: $(DOCS_INSTALLED)
+	cd docs && ../$(BIN)/python -m website.build
+
+docs-serve: docs
+	@$(BIN)/cprl docs $(if $(PORT),--port $(PORT))
 
 test: $(INSTALLED)
 	$(BIN)/python -m pytest -n auto --dist worksteal
@@ -49,6 +53,10 @@ fuzz: $(INSTALLED)
 # Real viewers without a screen, pictures of which are looked at; see docs/watching.md.
 test-viewer: $(INSTALLED) viewer-packages
 	$(BIN)/python -m pytest -m viewer
+
+# The site built and looked at in Chromium, at two widths.
+test-docs: $(DOCS_INSTALLED) viewer-packages
+	$(BIN)/python -m pytest -m docs
 
 viewer-packages:
 	sh tests/install_viewers.sh $(VIEWER_PACKAGES)
@@ -85,6 +93,11 @@ $(INSTALLED): pyproject.toml constraints.txt
 	$(PYTHON) -m venv .venv
 	$(if $(TORCH_INDEX),$(BIN)/python -m pip install -q -c constraints.txt --index-url $(TORCH_INDEX) torch)
 	$(BIN)/python -m pip install -q -c constraints.txt -e ".[dev]"
+	touch $@
+
+# Apart from dev, so that `make run` and `make test` install no more than they need.
+$(DOCS_INSTALLED): $(INSTALLED)
+	$(BIN)/python -m pip install -q -c constraints.txt -e ".[docs]"
 	touch $@
 
 clean:

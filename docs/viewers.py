@@ -95,8 +95,8 @@ def steady_picture(client: ViewerClient) -> bytes:
 
 
 @contextmanager
-def browser(page: str, *, size: tuple[int, int] = (1600, 1000)) -> Iterator[Callable[[], bytes]]:
-    """Headless Chromium with a page open; what is handed out takes a picture of it, PNG.
+def browser(page: str, *, size: tuple[int, int] = (1600, 1000)) -> Iterator["Browser"]:
+    """Headless Chromium with a page open; what is handed out, when called, takes a picture of it, PNG.
 
     Chromium is driven by chromium-driver, which speaks WebDriver: JSON over HTTP, no library is needed.
 
@@ -120,14 +120,44 @@ def browser(page: str, *, size: tuple[int, int] = (1600, 1000)) -> Iterator[Call
             session = (
                 f"{address}/session/{_asked(f'{address}/session', {'capabilities': wanted})['sessionId']}"
             )
-            _asked(f"{session}/url", {"url": page})
-            yield lambda: base64.b64decode(_patiently(f"{session}/screenshot"))
+            opened = Browser(session)
+            opened.open(page)
+            yield opened
         finally:
             if session:
                 with suppress(RuntimeError, OSError):  # a busy page may not answer; it ends with the driver
                     _asked(session, method="DELETE")
             process.terminate()
             process.wait()
+
+
+class Browser:
+    """A browser's window.
+
+    Args:
+        session: the address of its WebDriver session.
+    """
+
+    def __init__(self, session: str) -> None:
+        self._session = session
+
+    def __call__(self) -> bytes:
+        """A picture of what is in the window, PNG."""
+        return base64.b64decode(_patiently(f"{self._session}/screenshot"))
+
+    def open(self, page: str) -> None:
+        """Opens an address, and waits until it is loaded."""
+        _asked(f"{self._session}/url", {"url": page})
+
+    def run(self, script: str) -> Any:
+        """What a piece of JavaScript returns in the page."""
+        return _asked(f"{self._session}/execute/sync", {"script": script, "args": []})
+
+    def resize(self, width: int, height: int) -> None:
+        """Shows the page as a device of this size would; windows of Chromium are 500 wide at least."""
+        sizes = {"width": width, "height": height, "deviceScaleFactor": 1, "mobile": False}
+        command = {"cmd": "Emulation.setDeviceMetricsOverride", "params": sizes}
+        _asked(f"{self._session}/goog/cdp/execute", command)
 
 
 def _is_ready(address: str) -> bool:

@@ -1,5 +1,5 @@
 #!/bin/sh
-# Installs those of the named Debian packages that are missing; `make test-viewer` calls it.
+# Installs those of the named Debian packages that are missing; `make test-viewer` and `make test-docs` call it.
 set -eu
 
 missing=""

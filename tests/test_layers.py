@@ -70,6 +70,7 @@ PACKAGES = (
     "studies_cli",
     "exploit_cli",
     "recipes_cli",
+    "docs_cli",
     "cli",
 )
 MODULES = sorted(path for path in SOURCE.rglob("*.py") if path.parent != SOURCE or path.name != "__init__.py")

@@ -62,6 +62,7 @@ Each imports only from those above it:
     studies_cli  cprl sweep, and study_main: the command line of a recipe of a study
     exploit_cli  cprl exploit
     recipes_cli  cprl recipe, and recipes that cprl run takes by name
+    docs_cli     cprl docs
     cli          the command cprl
 """
 

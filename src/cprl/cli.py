@@ -3,15 +3,17 @@
 import os
 import sys
 import time
-from collections.abc import Sequence
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import replace
 from importlib.metadata import version
 from pathlib import Path
+from typing import Final
 
 import tyro
 
 from cprl.commandline import Allow, in_a_sentence, make_importable
+from cprl.docs_cli import docs
 from cprl.egta_cli import egta
 from cprl.evaluation.evaluate import SEED
 from cprl.evaluation_cli import crossplay, evaluate, film, schelling, visits
@@ -196,6 +198,28 @@ def export(run: Path, folder: Path, /) -> None:
     say(export_results(run, folder))
 
 
+COMMANDS: Final[Mapping[str, Callable[..., None]]] = {
+    "run": run,
+    "recipe": print_recipe,
+    "watch": watch,
+    "docs": docs,
+    "film": film,
+    "play": play,
+    "report": report,
+    "export": export,
+    "evaluate": evaluate,
+    "visits": visits,
+    "crossplay": crossplay,
+    "schelling": schelling,
+    "egta": egta,
+    "scenarios": scenarios,
+    "exploit": exploit,
+    "sweep": sweep,
+    "table": runs_table,
+}
+"""The subcommands, in the order in which `cprl --help` lists them."""
+
+
 def main() -> None:
     """The command line; what cannot be done is said in a line, and ends with exit code 1."""
     keep_output()
@@ -209,24 +233,4 @@ def main() -> None:
     if run_by_name():
         return
     with in_a_sentence("cprl"):
-        tyro.extras.subcommand_cli_from_dict(
-            {
-                "run": run,
-                "recipe": print_recipe,
-                "watch": watch,
-                "film": film,
-                "play": play,
-                "report": report,
-                "export": export,
-                "evaluate": evaluate,
-                "visits": visits,
-                "crossplay": crossplay,
-                "schelling": schelling,
-                "egta": egta,
-                "scenarios": scenarios,
-                "exploit": exploit,
-                "sweep": sweep,
-                "table": runs_table,
-            },
-            description=__doc__,
-        )
+        tyro.extras.subcommand_cli_from_dict(dict(COMMANDS), description=__doc__)

@@ -74,6 +74,7 @@ _SUBCOMMANDS: Final[dict[str, tuple[list[st.SearchStrategy[list[str]]], tuple[An
     ),
     "recipe": ([], (st.sampled_from(("commons", "studies/time_out", "base")).map(_alone), _flag("--help"))),
     "watch": ([_run(*runs.NAMES)], (_flag("--help"),)),
+    "docs": ([], (_flag("--port", "0", "70000"), _flag("--no-browser"))),
     "film": (
         [_run("plain", "finished", "results")],
         (
@@ -210,7 +211,14 @@ def _lines(draw: Any, first: list[st.SearchStrategy[list[str]]], flags: Any, mor
 
 def targets() -> list[Target]:
     """A target for each subcommand, for `cprl` alone, and for each recipe."""
-    more = {"watch": [], "recipe": [], "report": [], "export": [], "play": ["--allow", "--terminal"]}
+    more = {
+        "watch": [],
+        "recipe": [],
+        "report": [],
+        "export": [],
+        "docs": [],
+        "play": ["--allow", "--terminal"],
+    }
     found = [
         _target(f"cprl {name}", _subcommand(name), _lines(first, flags, more.get(name, ["--allow"])))
         for name, (first, flags) in _SUBCOMMANDS.items()
@@ -272,6 +280,8 @@ def _harmless() -> Iterator[None]:
     with (
         runs.stopped_after(2),
         mock.patch("os.execvp", stop),
+        mock.patch("cprl.docs_cli.Server.serve_forever", stop),
+        mock.patch("webbrowser.open", return_value=True),
         mock.patch("cprl.viewer.logger.open_live", return_value=(None, {})),
         mock.patch.object(subprocess, "run", _git_alone),
         mock.patch.object(sys, "path", list(sys.path)),

@@ -41,7 +41,9 @@ class Search:
             points, so it does not depend on the number of jobs.
         sampler: "tpe", "random" or "gp" (wants scipy and torch, which are there), or a function that makes
             a sampler of Optuna from a seed.
-        replicas, block, pairing: see `Study`.
+        replicas: see `Study`.
+        block: see `Study`.
+        pairing: see `Study`.
         name: by default that of the experiment.
 
     Raises:

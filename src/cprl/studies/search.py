@@ -79,8 +79,15 @@ def run_search(
 
     Args:
         search: what is searched.
-        out, on, runs, allow, progress, watch, results, last, again: see `cprl.studies.run_study`; what the
-            search itself looks at is in `Search`.
+        out: see `cprl.studies.run_study`.
+        on: see `cprl.studies.run_study`.
+        runs: see `cprl.studies.run_study`.
+        allow: see `cprl.studies.run_study`.
+        progress: see `cprl.studies.run_study`.
+        watch: see `cprl.studies.run_study`.
+        results: see `cprl.studies.run_study`.
+        last: see `cprl.studies.run_study`; what the search itself looks at is in `Search`.
+        again: see `cprl.studies.run_study`.
 
     Raises:
         ModuleNotFoundError: where Optuna is not installed.

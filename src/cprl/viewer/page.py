@@ -104,13 +104,13 @@ class _Handler(BaseHTTPRequestHandler):
 
     def _send_viewer(self, name: str) -> None:
         try:
-            with _ONE_AT_A_TIME:
-                content = web_viewer()[name]
+            found = viewer_file(name)
         except (OSError, HTTPException, TimeoutError) as error:
             self.send_error(503, "Rerun's web viewer cannot be read", str(error))
             return
-        self._begin(_FILES[name], len(content))
-        self.wfile.write(content)
+        if found is not None:
+            self._begin(found[0], len(found[1]))
+            self.wfile.write(found[1])
 
     def _begin(self, kind: str, size: int) -> None:
         self.send_response(200)
@@ -124,6 +124,18 @@ class _Handler(BaseHTTPRequestHandler):
 
 
 _ONE_AT_A_TIME: Final = Lock()
+
+
+def viewer_file(name: str) -> tuple[str, mmap.mmap] | None:
+    """The type and the content of a file of the web viewer, read when it is first asked for; None of others.
+
+    Raises:
+        OSError, TimeoutError: as of `web_viewer`.
+    """
+    if name not in _FILES:
+        return None
+    with _ONE_AT_A_TIME:
+        return _FILES[name], web_viewer()[name]
 
 
 @cache

@@ -1,0 +1,156 @@
+"""The reference: what users import, by the docstrings of its packages, and the commands by their --help."""
+
+import contextlib
+import io
+import os
+import re
+import sys
+from importlib import import_module
+from pathlib import Path
+from pkgutil import iter_modules
+from typing import Any, Final
+from unittest import mock
+
+FOLDER: Final = "reference"
+
+REFERENCE: Final = {
+    "cprl": "what most programs need",
+    "commons": "the game: rules, boards, observations, the state",
+    "presets": "the published games and settings",
+    "keys": "the TensorDict entries",
+    "spaces": "what agents observe and may do",
+    "envs": "TorchRL, PettingZoo, Gymnasium",
+    "institutions": "rules that people make",
+    "preferences": "what agents want",
+    "theory": "games with a known answer",
+    "games": "games of your own",
+    "custom": "code of your own in a recipe",
+    "networks": "from observations to numbers",
+    "objectives": "losses that TorchRL lacks",
+    "policies": "agents that follow a rule",
+    "algorithms": "what agents learn by",
+    "learners": "the hyper-parameters",
+    "population": "how each agent is specified",
+    "experiment": "an experiment, a value",
+    "callbacks": "what is called while a training runs",
+    "training": "the loop",
+    "measuring": "metrics and statistics",
+    "viewer": "recordings for the Rerun viewer",
+    "evaluation": "stored agents in fresh worlds and among each other",
+    "exploiting": "best responses against stored agents",
+    "studies": "one experiment under many conditions",
+    "reporting": "runs beside the published study",
+    "config": "values as JSON tables, and back",
+}
+"""A page each, in reading order, and what it is about."""
+
+_MODULES: Final = {
+    "commons": ("maps", "observation", "rules", "game", "state", "playing"),
+    "envs.matrix": (),
+    "learners": ("settings",),
+    "measuring": ("social", "phases", "statistics"),
+    "policies": ("scripted", "assignment"),
+    "viewer": ("callback", "logger"),
+}
+"""Modules of a package that its page shows too, beside what the package exports."""
+
+INTERNAL: Final = {
+    *("compat", "checks", "arguments", "output", "caches", "compile_clock", "times", "garbage", "process"),
+    *("compiling", "memory", "collectors", "runs", "plotting", "terminal", "finite", "stored", "earlier"),
+    *("agents", "outcome", "parts", "running", "play", "flags", "commandline", "command_parts"),
+    *("evaluation_cli", "egta_cli", "scenarios_cli", "studies_options", "studies_cli", "exploit_cli"),
+    *("docs_cli", "cli"),
+}
+"""Packages that no page shows: users reach what they hold by the names of `cprl` or by a command."""
+
+
+def stage_reference(folder: Path) -> dict[str, str]:
+    """Writes the pages; the title and the file of each."""
+    (folder / FOLDER).mkdir(parents=True, exist_ok=True)
+    pages = {"Commands": f"{FOLDER}/commands.md"}
+    (folder / pages["Commands"]).write_text(_commands_page(), encoding="utf-8")
+    for name in REFERENCE:
+        package = name if name == "cprl" else f"cprl.{name}"
+        pages[package] = f"{FOLDER}/{package}.md"
+        (folder / pages[package]).write_text(_package_page(package), encoding="utf-8")
+    return pages
+
+
+def _package_page(package: str) -> str:
+    """What a package says of itself, and an entry for each public name, which mkdocstrings fills."""
+    module = import_module(package)
+    said, modules = _split(module.__doc__ or "")
+    text = f"# {package}\n\n{said}\n"
+    for path in _public_names(package):
+        text += f"\n::: {path}\n"
+    return f"{text}\n## Modules\n\n```text\n{modules}\n```\n" if modules else text
+
+
+def _public_names(package: str) -> list[str]:
+    """The full names of what a package exports, of a module what it defines; then those of its modules."""
+    module = import_module(package)
+    exported = list(getattr(module, "__all__", ()))
+    defines = not hasattr(module, "__path__") and not exported
+    found = [f"{package}.{name}" for name in (_defined_by(module) if defines else exported)]
+    found = [path for path in found if not _is_elsewhere(path, package)]
+    for name in _MODULES.get(package.removeprefix("cprl."), ()):
+        below = import_module(f"{package}.{name}")
+        found += [f"{below.__name__}.{own}" for own in getattr(below, "__all__", None) or _defined_by(below)]
+    return found
+
+
+def _defined_by(module: Any) -> list[str]:
+    return [
+        name
+        for name, value in vars(module).items()
+        if not name.startswith("_")
+        and getattr(value, "__module__", None) == module.__name__
+        and (isinstance(value, type) or callable(value))
+    ]
+
+
+def _is_elsewhere(path: str, package: str) -> bool:
+    """Whether a page of its own shows this: a module that `cprl` hands on; or there is nothing to show."""
+    name = path.removeprefix(f"{package}.")
+    value = getattr(import_module(package), name)
+    return name.startswith("__") or isinstance(value, type(os))
+
+
+def _split(doc: str) -> tuple[str, str]:
+    """The text of a package's docstring, and the list of modules in it, which is indented."""
+    lines = doc.strip().splitlines()
+    listed = [line.removeprefix("    ") for line in lines if line.startswith("    ")]
+    text = [line for line in lines if not line.startswith("    ") and not line.endswith(":")]
+    return "\n".join(text).strip(), "\n".join(listed)
+
+
+def _commands_page() -> str:
+    """`cprl --help`, and that of each command."""
+    from cprl.cli import COMMANDS
+
+    text = f"# Commands\n\n{help_of()}\n"
+    for name in COMMANDS:
+        text += f"\n## cprl {name}\n\n{help_of(name)}\n"
+    return text
+
+
+def help_of(*words: str) -> str:
+    """What `cprl WORDS --help` prints, as a block of text."""
+    from cprl import cli
+
+    out = io.StringIO()
+    with (
+        mock.patch.object(sys, "argv", ["cprl", *words, "--help"]),
+        mock.patch.dict(os.environ, {"COLUMNS": "88", "NO_COLOR": "1"}),
+        contextlib.redirect_stdout(out),
+        contextlib.suppress(SystemExit),
+    ):
+        cli.main()
+    text = re.sub(r"\x1b\[[0-9;]*m", "", out.getvalue()).strip("\n")
+    lines = [line.rstrip() for line in text.splitlines()]
+    return "```text\n" + "\n".join(lines) + "\n```"
+
+
+def packages_there() -> set[str]:
+    """The packages and modules right below `cprl`."""
+    return {found.name for found in iter_modules(import_module("cprl").__path__)}

@@ -1,0 +1,43 @@
+"""The recordings of docs/results, and the page that plays them in Rerun's web viewer.
+
+The viewer itself is not copied: `cprl docs` serves that of the installed rerun-sdk beside the pages.
+"""
+
+import shutil
+from functools import cache
+from html import escape
+from pathlib import Path
+from typing import Final
+from urllib.parse import quote
+
+RESULTS: Final = Path(__file__).parents[1] / "results"
+PAGE: Final = "replays.md"
+FOLDER: Final = "recordings"
+
+_TEMPLATE: Final = Path(__file__).parent / "replays.md"
+"""The page, with {links} where they go."""
+
+
+@cache
+def recordings() -> dict[str, Path]:
+    """The committed replays by name: the run, and the file where a run has several."""
+    files = sorted(RESULTS.rglob("replay*.rrd"))
+    runs = [path.parent.relative_to(RESULTS).as_posix() for path in files]
+    return {
+        run if runs.count(run) == 1 else f"{run}/{path.stem}": path
+        for run, path in zip(runs, files, strict=True)
+    }
+
+
+def stage_replays(folder: Path) -> None:
+    """Writes the page and copies the recordings."""
+    for name, path in recordings().items():
+        target = folder / FOLDER / f"{name}.rrd"
+        target.parent.mkdir(parents=True, exist_ok=True)
+        shutil.copyfile(path, target)
+    links = "\n".join(
+        f'<a href="?replay={quote(name)}" data-recording="{FOLDER}/{quote(name)}.rrd">{escape(name)}</a>'
+        for name in recordings()
+    )
+    text = _TEMPLATE.read_text(encoding="utf-8").replace("{links}", links)
+    (folder / PAGE).write_text(text, encoding="utf-8")
