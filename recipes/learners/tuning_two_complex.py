@@ -11,6 +11,6 @@ from cprl.studies import StudyTable
 STUDY = tuning("two_complex")
 
 if __name__ == "__main__":
-    OUT = cprl.study_main(STUDY)
-    for way, candidate in winners(StudyTable.read(OUT / "table.parquet")).items():
+    TABLE = cprl.study_main(STUDY) / "table.parquet"
+    for way, candidate in winners(StudyTable.read(TABLE)).items() if TABLE.exists() else ():
         print(f"{way}: {candidate}")
