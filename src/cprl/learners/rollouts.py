@@ -35,9 +35,8 @@ class RolloutLearner:
     """R x S independent agents that learn from the latest steps of their current policies.
 
     After every `rollout_steps` steps the learner estimates advantages with TorchRL's GAE and updates for
-    `epochs` epochs. Each lane shuffles its own minibatches, and learns exactly as it would alone. A minibatch
-    of recurrent networks is a sequence of consecutive steps, and their update is not compiled: it would take
-    torch longer to unroll the steps than the training.
+    `epochs` epochs. Each lane shuffles its own minibatches, and learns exactly as it would alone. Minibatches
+    of recurrent networks are consecutive steps, and their update is not compiled (docs/networks.md).
 
     Args:
         spaces: the shape and dtype of observations, and the number of actions A.
