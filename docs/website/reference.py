@@ -6,8 +6,10 @@ import os
 import re
 import sys
 from importlib import import_module
+from importlib.util import find_spec
 from pathlib import Path
 from pkgutil import iter_modules
+from types import ModuleType
 from typing import Any, Final
 from unittest import mock
 
@@ -46,7 +48,6 @@ REFERENCE: Final = {
 
 _MODULES: Final = {
     "commons": ("maps", "observation", "rules", "game", "state", "playing"),
-    "envs.matrix": (),
     "learners": ("settings",),
     "measuring": ("social", "phases", "statistics"),
     "policies": ("scripted", "assignment"),
@@ -91,8 +92,11 @@ def _public_names(package: str) -> list[str]:
     module = import_module(package)
     exported = list(getattr(module, "__all__", ()))
     defines = not hasattr(module, "__path__") and not exported
-    found = [f"{package}.{name}" for name in (_defined_by(module) if defines else exported)]
-    found = [path for path in found if not _is_elsewhere(path, package)]
+    found = [
+        _path_of(package, name)
+        for name in (_defined_by(module) if defines else exported)
+        if not _is_elsewhere(module, name)
+    ]
     for name in _MODULES.get(package.removeprefix("cprl."), ()):
         below = import_module(f"{package}.{name}")
         found += [f"{below.__name__}.{own}" for own in getattr(below, "__all__", None) or _defined_by(below)]
@@ -109,11 +113,18 @@ def _defined_by(module: Any) -> list[str]:
     ]
 
 
-def _is_elsewhere(path: str, package: str) -> bool:
-    """Whether a page of its own shows this: a module that `cprl` hands on; or there is nothing to show."""
-    name = path.removeprefix(f"{package}.")
-    value = getattr(import_module(package), name)
-    return name.startswith("__") or isinstance(value, type(os))
+def _is_elsewhere(module: Any, name: str) -> bool:
+    """Whether another page shows this, as of the modules that `cprl` exports; or there is nothing to show."""
+    return name.startswith("__") or isinstance(getattr(module, name), ModuleType)
+
+
+def _path_of(package: str, name: str) -> str:
+    """The full name; where a module has the same name, as of `cprl.envs.make_env`, that of its definition."""
+    module = import_module(package)
+    if hasattr(module, "__path__") and find_spec(f"{package}.{name}"):
+        value = getattr(module, name)
+        return f"{value.__module__}.{value.__qualname__}"
+    return f"{package}.{name}"
 
 
 def _split(doc: str) -> tuple[str, str]:
