@@ -194,5 +194,5 @@ def test_what_is_no_game_is_refused(call, message):
 def test_a_missing_package_is_named_with_its_extra(monkeypatch):
     monkeypatch.setattr(needed, "find_spec", lambda name: None)
     for call in (lambda: equilibria(DILEMMA), lambda: alpha_rank(DILEMMA), needed.check_extras):
-        with pytest.raises(ModuleNotFoundError, match=r'is not installed; run pip install .*"\.\[theory\]"'):
+        with pytest.raises(ModuleNotFoundError, match=r'is not installed; run pip install "cprl\[theory\]"'):
             call()

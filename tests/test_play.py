@@ -260,7 +260,7 @@ def test_without_a_display_the_terminal_is_used_and_said(run, monkeypatch, capsy
 
 def test_without_pygame_the_reason_is_said(run, monkeypatch):
     monkeypatch.setitem(__import__("sys").modules, "pygame", None)
-    with pytest.raises(NoWindowError, match=r'pygame is not installed \(pip install .* -e "\.\[play\]"\)'):
+    with pytest.raises(NoWindowError, match=r'pygame is not installed \(pip install "cprl\[play\]"\)'):
         play_in_window(open_session(str(run)), "meadow")
 
 

@@ -41,6 +41,7 @@ def test_half_of_the_violations_are_detected_by_the_games_chance():
     assert all(own <= other for own, other in zip(rare, found, strict=True)), "found at 0.1, found at 0.5"
 
 
+@pytest.mark.filterwarnings("ignore:no agent can harvest:UserWarning")
 def test_agents_are_found_out_independently_of_each_other():
     everywhere = Boundaries.drawn("--------\n--------", owners=("", ""), step_fine=1.0)
     play = Play(BOARD, institutions=[everywhere, Monitoring(prob=0.5)])

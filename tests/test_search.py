@@ -204,7 +204,7 @@ def test_what_cannot_be_searched_is_refused(how, message):
 
 def test_without_optuna_a_sentence_names_the_extra(tmp_path, monkeypatch):
     monkeypatch.setitem(sys.modules, "optuna", None)
-    with pytest.raises(ModuleNotFoundError, match=r'pip install -c constraints\.txt -e "\.\[optuna\]"'):
+    with pytest.raises(ModuleNotFoundError, match=r'pip install "cprl\[optuna\]"'):
         run_search(a_search(), tmp_path / "out")
     assert not (tmp_path / "out").exists()
 

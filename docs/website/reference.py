@@ -60,7 +60,7 @@ INTERNAL: Final = {
     *("compiling", "memory", "collectors", "runs", "plotting", "terminal", "finite", "stored", "earlier"),
     *("agents", "outcome", "parts", "running", "play", "flags", "commandline", "command_parts"),
     *("evaluation_cli", "egta_cli", "scenarios_cli", "studies_options", "studies_cli", "exploit_cli"),
-    *("docs_cli", "cli"),
+    *("libraries", "shipped", "recipes_cli", "docs_cli", "cli"),
 }
 """Packages that no page shows: users reach what they hold by the names of `cprl` or by a command."""
 

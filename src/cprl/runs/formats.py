@@ -22,10 +22,10 @@ STUDY_TABLE: Final = 1
 """Of the table of a study."""
 
 
-def written_by_another(recipe: Mapping[str, Any]) -> str:
+def written_by_another(recipe: object) -> str:
     """The end of a message about a recipe that cannot be read: which cprl wrote it, where that was another
     than this; else nothing."""
-    versions = recipe.get("versions")
+    versions = recipe.get("versions") if isinstance(recipe, Mapping) else None
     wrote = versions.get("cprl") if isinstance(versions, Mapping) else None
     here = version("cprl")
     return f"; cprl {shown(wrote)} wrote it, and this is {here}" if wrote not in (None, here) else ""
