@@ -280,6 +280,11 @@ def ran(tmp_path, members, name="run"):
     return run, cprl.load(run).networks
 
 
+def test_agents_that_follow_a_script_are_not_called_trained(tmp_path, capsys):
+    ran(tmp_path, [Scripted("greedy")] * 4)
+    assert "trained" not in capsys.readouterr().out
+
+
 def test_a_mixed_run_is_kept_evaluated_and_built_again_from_its_directory(tmp_path, capsys):
     members = [Learning(ALGORITHMS["C51"]), Learning(ALGORITHMS["PPO"]), Scripted("greedy"), Scripted()]
     run, _ = ran(tmp_path, members)

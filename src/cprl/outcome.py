@@ -156,12 +156,14 @@ def write_evaluation(run: Path, played: Mapping[str, Sequence[Episode]], *, of_r
                 table.add(replace(episode, world=replica, episode=nth))
 
 
-def exploration(population: Population) -> str:
-    """With which probability learners of values explore in evaluation, for people; others draw from a
-    policy."""
+def heading(population: Population) -> str:
+    """What a table of the evaluation calls the agents: trained if any learns, and with which probability those of
+    action values explore; others draw from a policy."""
+    if not population.learners:
+        return "agents"
     chances = {
         learner.settings.epsilon_evaluation
         for learner in population.learners.values()
         if not learner.actor.stochastic
     }
-    return "".join(f", epsilon {chance:g}" for chance in sorted(chances))
+    return "trained" + "".join(f", epsilon {chance:g}" for chance in sorted(chances))

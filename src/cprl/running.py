@@ -16,7 +16,7 @@ from cprl.experiment import Experiment
 from cprl.finite import summary
 from cprl.garbage import cleared_up, free_earlier
 from cprl.measuring.episodes import Episode
-from cprl.outcome import evaluate_population, exploration, random_play, write_evaluation
+from cprl.outcome import evaluate_population, heading, random_play, write_evaluation
 from cprl.output import ERR, OUT, console
 from cprl.parts import Parts, make_logger_callback, make_parts, make_viewer, title_of
 from cprl.population import exploration_steps
@@ -255,7 +255,7 @@ def _train_and_evaluate(
     report = {**times.report(training.times), "steps": training.steps, "finished": _now()}
     also = {"not_finite": [asdict(one) for one in broken]} if broken else {}
     write_json(directory / REPORT, {**report, "episodes": experiment.episodes, **also})
-    columns = {"random": played["random"], f"trained{exploration(own.population)}": played["trained"]}
+    columns = {"random": played["random"], heading(own.population): played["trained"]}
     summarise(directory, title=title, played=columns, figure=figure, note=summary(broken))
 
 
