@@ -157,8 +157,8 @@ def write_evaluation(run: Path, played: Mapping[str, Sequence[Episode]], *, of_r
 
 
 def heading(population: Population) -> str:
-    """What a table of the evaluation calls the agents: trained if any learns, and with which probability those of
-    action values explore; others draw from a policy."""
+    """What a table of the evaluation calls the agents: trained, where any learns, and with which probability
+    those with action values explore; others draw from a policy."""
     if not population.learners:
         return "agents"
     chances = {
