@@ -62,7 +62,8 @@ viewer-packages:
 	sh tests/install_viewers.sh $(VIEWER_PACKAGES)
 
 # The wheel, in a bare environment outside the checkout; pip fetches what it needs.
-test-wheel: $(INSTALLED)
+# The site of the docs travels in the wheel.
+test-wheel: docs
 	$(BIN)/python -m pytest -m network tests/test_wheel.py
 
 lint: $(INSTALLED)

@@ -1,6 +1,7 @@
 """The wheel works outside the checkout, where pip installs it into a bare environment.
 
-`make test-wheel`; it needs the network, some minutes and about 1.5 GB of disk for a while.
+`make test-wheel`, which builds the docs first; it needs the network, some minutes and about 2.5 GB of disk
+for a while.
 """
 
 import json
@@ -11,6 +12,7 @@ import subprocess
 import sys
 import time
 from pathlib import Path
+from urllib.request import urlopen
 
 import pytest
 
@@ -122,7 +124,7 @@ COMMANDS = {
 
 def test_every_command_has_a_miniature(bare):
     listed = re.search(r"\{([a-z,\s]+)\}", bare.cprl("--help"))
-    assert set("".join(listed[1].split()).split(",")) == {*COMMANDS, "watch", "play", "egta"}
+    assert set("".join(listed[1].split()).split(",")) == {*COMMANDS, "watch", "docs", "play", "egta"}
 
 
 @pytest.mark.parametrize("name", list(COMMANDS))
@@ -136,19 +138,34 @@ def test_a_game_is_played_in_the_terminal(bare, run):
     assert "turn" in told
 
 
-def test_a_recording_is_served(bare, run):
-    words = [str(bare.bin / "cprl"), "watch", run, "--serve"]
+def serving(bare, *words, lines):
+    """The first lines that a command prints which serves until Ctrl-C, and what it serves at the root."""
     usual = signal.signal(signal.SIGINT, signal.default_int_handler)  # a shell's background job ignores it
-    serving = subprocess.Popen(words, cwd=bare.folder, env=bare.env, stdout=subprocess.PIPE, text=True)
+    command = [str(bare.bin / "cprl"), *words]
+    process = subprocess.Popen(command, cwd=bare.folder, env=bare.env, stdout=subprocess.PIPE, text=True)
     signal.signal(signal.SIGINT, usual)
     try:
-        lines = [serving.stdout.readline() for _ in range(3)]
-        serving.send_signal(signal.SIGINT)
-        assert serving.wait(120) == 0
+        told = [process.stdout.readline() for _ in range(lines)]
+        address = re.search(r"http://127\.0\.0\.1:\d+/", told[0])[0]
+        with urlopen(address, timeout=60) as answer:
+            page = answer.read().decode()
+        process.send_signal(signal.SIGINT)
+        assert process.wait(120) == 0
     finally:
-        serving.kill()
-        serving.communicate()
-    assert lines[0].startswith("Watch (browser): http://127.0.0.1:")
+        process.kill()
+        process.communicate()
+    return told, page
+
+
+def test_a_recording_is_served(bare, run):
+    told, page = serving(bare, "watch", run, "--serve", lines=3)
+    assert told[0].startswith("Watch (browser): ")
+    assert "rerun" in page.lower()
+
+
+def test_the_docs_are_in_the_wheel_and_served(bare):
+    _, page = serving(bare, "docs", "--no-browser", "--port", "0", lines=1)
+    assert "The first hour" in page
 
 
 def test_an_extra_that_is_lacking_is_named(bare, run):
