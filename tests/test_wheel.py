@@ -49,7 +49,8 @@ names: list[str] = [field for field in experiment().to_config()]
 class Bare:
     """An environment with the wheel, and a folder outside the checkout in which commands are run."""
 
-    def __init__(self, folder):
+    def __init__(self, folder, commit):
+        self.commit = commit
         self.folder, self.bin = folder / "work", folder / "env" / ("Scripts" if os.name == "nt" else "bin")
         self.folder.mkdir()
         left_out = ("PYTHONPATH", "VIRTUAL_ENV", "PYTHONHOME")
@@ -70,16 +71,22 @@ class Bare:
         return done.stdout + (done.stderr if code else "")
 
 
+def here():
+    """The commit of the checkout, "" without git."""
+    asked = ["git", "-C", ROOT, "rev-parse", "HEAD"]
+    return subprocess.run(asked, capture_output=True, text=True, check=False).stdout.strip()
+
+
 @pytest.fixture(scope="module")
 def bare(tmp_path_factory):
     folder = tmp_path_factory.mktemp("bare")
     pip = [sys.executable, "-m", "pip", "-q", "--disable-pip-version-check"]
-    began = time.monotonic()
+    began, commit = time.monotonic(), here()
     subprocess.run([*pip, "wheel", "--no-deps", "-w", folder, ROOT], check=True)
     (wheel,) = folder.glob("cprl-*.whl")
     built = time.monotonic()
     subprocess.run([sys.executable, "-m", "venv", folder / "env"], check=True)
-    own = Bare(folder)
+    own = Bare(folder, commit)
     own.python("-m", "pip", "install", "-q", "-c", ROOT / "constraints.txt", wheel, "mypy")
     installed = time.monotonic()
     size = sum(path.stat().st_size for path in (folder / "env").rglob("*") if path.is_file())
@@ -175,9 +182,7 @@ def test_an_extra_that_is_lacking_is_named(bare, run):
 def test_a_run_says_which_cprl_and_which_commit_it_is_of(bare, run):
     recipe = json.loads((bare.folder / run / "recipe.json").read_text())
     assert recipe["versions"]["cprl"] == bare.cprl("--version").split()[1]
-    asked = ["git", "-C", ROOT, "rev-parse", "HEAD"]
-    here = subprocess.run(asked, capture_output=True, text=True, check=False).stdout.strip()
-    assert (recipe["git"] or {}).get("commit", "") == here, "that of the wheel, not of this folder"
+    assert (recipe["git"] or {}).get("commit", "") == bare.commit, "that of the wheel, not of this folder"
     assert recipe["command"].startswith("cprl run two_complex --engine eager")
 
 
