@@ -27,7 +27,9 @@ ROOT = Path(__file__).parents[1]
 RECIPES = sorted(
     path.stem for path in (ROOT / "recipes").glob("*.py") if "recipe_main" in path.read_text(encoding="utf-8")
 )
-STORED = sorted((ROOT / "docs" / "results").rglob("recipe.json"))
+RESULTS = ROOT / "docs" / "results"
+# Trials of a study have the study's command, which gives no single experiment.
+STORED = sorted(set(RESULTS.rglob("recipe.json")) - set((RESULTS / "learners").rglob("recipe.json")))
 
 
 def experiment(*, variant: presets.Variant = "published", spare: int = 3) -> Experiment:
