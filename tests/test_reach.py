@@ -24,7 +24,7 @@ def game(drawing, *institutions, **rules):
 def without_a_warning(drawing, *institutions, **rules):
     with warnings.catch_warnings():
         warnings.simplefilter("error")
-        return game(drawing, *institutions, **rules)
+        assert game(drawing, *institutions, **rules).map == maps.parse(drawing)
 
 
 def test_one_is_warned_of_a_wall_between_all_agents_and_all_apples():

@@ -3,14 +3,13 @@
 import shutil
 import sys
 import webbrowser
-from http.client import HTTPException
-from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
+from http.server import ThreadingHTTPServer
 from pathlib import Path
 from typing import Any, Final
 from urllib.parse import unquote, urlsplit
 
 from cprl.output import say
-from cprl.viewer.page import LOCALHOST, has_display, viewer_file
+from cprl.viewer.page import LOCALHOST, LocalHandler, has_display
 
 SITE: Final = Path(__file__).parent / "docs_site"
 """Where `make docs` builds the site; a wheel carries it in the same place."""
@@ -44,38 +43,32 @@ _VIEWER_MAY: Final = (
 """What the browser lets pages and the viewer load: nothing from another server, such as Google's fonts."""
 
 
-class Handler(BaseHTTPRequestHandler):
+class Handler(LocalHandler):
     """Answers with a file of the site or of Rerun's web viewer."""
 
     site: Path = SITE
 
-    def do_GET(self) -> None:
+    def do_GET(self) -> None:  # noqa: N802 - so http.server calls it
         """Answers with the file that the path names, or says why not."""
-        if self._is_for_us():
+        if self.is_for_us():
             self._answer(with_content=True)
 
-    def do_HEAD(self) -> None:
+    def do_HEAD(self) -> None:  # noqa: N802
         """Answers likewise, without the content."""
-        if self._is_for_us():
+        if self.is_for_us():
             self._answer(with_content=False)
-
-    def _is_for_us(self) -> bool:
-        if urlsplit(f"//{self.headers.get('Host', '')}").hostname in (LOCALHOST, "localhost"):
-            return True
-        self.send_error(403, f"allowed hosts: {LOCALHOST}, localhost")  # a name elsewhere made to lead here
-        return False
 
     def _answer(self, *, with_content: bool) -> None:
         path = unquote(urlsplit(self.path).path).lstrip("/")
         folder, _, name = path.partition("/")
         if folder == _VIEWER:
-            self._send_viewer(name or "index.html", with_content=with_content)
+            self.send_viewer(name or "index.html", may=_VIEWER_MAY, with_content=with_content)
             return
         file = self._file(path)
         if file is None:
             self.send_error(404)
             return
-        self._begin(_KINDS[file.suffix], file.stat().st_size, _PAGES_MAY)
+        self.begin(_KINDS[file.suffix], file.stat().st_size, may=_PAGES_MAY)
         if with_content:
             with file.open("rb") as content:
                 shutil.copyfileobj(content, self.wfile)
@@ -90,31 +83,6 @@ class Handler(BaseHTTPRequestHandler):
             return found if inside and found.suffix in _KINDS and found.is_file() else None
         except (OSError, ValueError):  # a name that no file can have
             return None
-
-    def _send_viewer(self, name: str, *, with_content: bool) -> None:
-        try:
-            found = viewer_file(name)
-        except (OSError, HTTPException, TimeoutError) as error:
-            self.send_error(503, "Rerun's web viewer cannot be read", str(error))
-            return
-        if found is None:
-            self.send_error(404)
-            return
-        kind, content = found
-        self._begin(kind, len(content), _VIEWER_MAY)
-        if with_content:
-            self.wfile.write(content)
-
-    def _begin(self, kind: str, size: int, may: str) -> None:
-        self.send_response(200)
-        self.send_header("Content-Type", kind)
-        self.send_header("Content-Length", str(size))
-        self.send_header("rerun-final-length", str(size))  # of which the viewer shows how much it has loaded
-        self.send_header("Content-Security-Policy", may)
-        self.end_headers()
-
-    def log_message(self, format: str, *args: Any) -> None:
-        """Nothing: the terminal has the address alone."""
 
 
 class Server(ThreadingHTTPServer):

@@ -89,16 +89,14 @@ class LaneActor(TensorDictModuleBase):
         random numbers from the start; None where `values` are not known for them alone."""
         if self._first is None:
             return None
-        actor = LaneActor(
-            self._first(),
-            self.actions,
-            seeds=self._seeds[: self.agents],
-            agents=self.agents,
-            worlds=self.worlds,
-            stochastic=self.stochastic,
-        )
+        lanes = {"seeds": self._seeds[: self.agents], "agents": self.agents, "worlds": self.worlds}
+        actor = self._alike(self._first(), **lanes)
         actor.epsilon = self.epsilon
         return actor
+
+    def _alike(self, values: Callable[..., Any], **lanes: Any) -> "LaneActor":
+        """An actor for other lanes that chooses as this one does."""
+        return LaneActor(values, self.actions, stochastic=self.stochastic, **lanes)
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Writes "action", int64 [R x k, S], for "observation" [R x k, S, C, X, Y]."""
@@ -116,11 +114,15 @@ class LaneActor(TensorDictModuleBase):
         return chosen
 
     def _explored(self, observation: Tensor, numbers: Tensor, epsilon: Tensor) -> Tensor:
-        """Sampled actions of a stochastic policy, else epsilon-greedy actions; int64 [R x k, S]."""
+        """Exploring actions, int64 [R x k, S]."""
+        return self._by_replica(self._chosen(self._values(observation), numbers, epsilon))
+
+    def _chosen(self, values: Tensor, numbers: Tensor, epsilon: Tensor) -> Tensor:
+        """Sampled actions of a stochastic policy, else epsilon-greedy actions; int64 [L, k]."""
         if self.stochastic:
-            return self._by_replica(self._sampled(self._values(observation), numbers))
+            return self._sampled(values, numbers)
         explores = numbers.view(-1, self.worlds, 2)[..., 0] < epsilon
-        return self._by_replica(torch.where(explores, self._random(numbers), self._best(observation)))
+        return torch.where(explores, self._random(numbers), values.argmax(-1))
 
     def _random(self, numbers: Tensor) -> Tensor:
         """Random actions of each lane, int64 [L, k]."""
@@ -207,20 +209,9 @@ class ContinuousLaneActor(LaneActor):
         self._count = 1 + 2 * spaces.action_size
         self.rng = LaneRng(seeds, self._count * self.worlds)
 
-    def of_first_replica(self) -> "LaneActor | None":
+    def _alike(self, values: Callable[..., Any], **lanes: Any) -> LaneActor:
         """See `LaneActor`."""
-        if self._first is None:
-            return None
-        actor = ContinuousLaneActor(
-            self._first(),
-            self.spaces,
-            seeds=self._seeds[: self.agents],
-            agents=self.agents,
-            worlds=self.worlds,
-            noise=self.noise,
-        )
-        actor.epsilon = self.epsilon
-        return actor
+        return ContinuousLaneActor(values, self.spaces, noise=self.noise, **lanes)
 
     def preferences(self, observation: Tensor, state: Tensor | None = None) -> Tensor | None:
         """None: there is no value or probability for each action."""

@@ -35,21 +35,10 @@ class RecurrentLaneActor(LaneActor):
         is_compiled = bool(how.get("compile", False))
         self._explore = Compiled(type(self)._explored_with, what="agents act", enabled=is_compiled)
 
-    def of_first_replica(self) -> "RecurrentLaneActor | None":
+    def _alike(self, values: Callable[..., Any], **lanes: Any) -> LaneActor:
         """See `LaneActor`."""
-        if self._first is None:
-            return None
-        actor = RecurrentLaneActor(
-            self._first(),
-            self.actions,
-            state_cells=self.state_cells,
-            seeds=self._seeds[: self.agents],
-            agents=self.agents,
-            worlds=self.worlds,
-            stochastic=self.stochastic,
-        )
-        actor.epsilon = self.epsilon
-        return actor
+        how: dict[str, Any] = {"state_cells": self.state_cells, "stochastic": self.stochastic}
+        return RecurrentLaneActor(values, self.actions, **how, **lanes)
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Writes "action", int64 [R x k, S], and "recurrent_state", from the turn's entries."""
@@ -88,11 +77,7 @@ class RecurrentLaneActor(LaneActor):
     ) -> list[Tensor]:
         """Exploring actions, and the states afterwards."""
         values, after = self._step(observation, state)
-        if self.stochastic:
-            return [self._by_replica(self._sampled(values, numbers)), after]
-        explores = numbers.view(-1, self.worlds, 2)[..., 0] < epsilon
-        chosen = torch.where(explores, self._random(numbers), values.argmax(-1))
-        return [self._by_replica(chosen), after]
+        return [self._by_replica(self._chosen(values, numbers, epsilon)), after]
 
     def _step(self, observation: Tensor, state: Tensor) -> tuple[Tensor, Tensor]:
         """Outputs of each lane's network [L, k, A], and the states afterwards [R x k, S, H]."""

@@ -76,25 +76,66 @@ class _Server(ThreadingHTTPServer):
         """A browser that goes away is no error."""
 
 
-class _Handler(BaseHTTPRequestHandler):
+class LocalHandler(BaseHTTPRequestHandler):
+    """What servers on 127.0.0.1 share: for whom they answer, and the files of the web viewer."""
+
+    def is_for_us(self) -> bool:
+        """Whether a request names 127.0.0.1 or localhost as its host; else it is refused."""
+        if urlsplit(f"//{self.headers.get('Host', '')}").hostname in (LOCALHOST, "localhost"):
+            return True
+        self.send_error(403, f"allowed hosts: {LOCALHOST}, localhost")  # a name elsewhere made to lead here
+        return False
+
+    def begin(self, kind: str, size: int, *, may: str | None = None) -> None:
+        """Sends the headers of a file.
+
+        Args:
+            kind: its type.
+            size: its bytes.
+            may: what the browser lets it load, a Content-Security-Policy; None for anything.
+        """
+        self.send_response(200)
+        self.send_header("Content-Type", kind)
+        self.send_header("Content-Length", str(size))
+        self.send_header("rerun-final-length", str(size))  # of which the page shows how much it has loaded
+        if may is not None:
+            self.send_header("Content-Security-Policy", may)
+        self.end_headers()
+
+    def send_viewer(self, name: str, *, may: str | None = None, with_content: bool = True) -> None:
+        """Answers with a file of the web viewer, or says that there is none; see `begin`."""
+        try:
+            found = _viewer_file(name)
+        except (OSError, HTTPException, TimeoutError) as error:
+            self.send_error(503, "Rerun's web viewer cannot be read", str(error))
+            return
+        if found is None:
+            self.send_error(404)
+            return
+        kind, content = found
+        self.begin(kind, len(content), may=may)
+        if with_content:
+            self.wfile.write(content)
+
+    def log_message(self, format: str, *args: Any) -> None:
+        """Nothing: the terminal is the command's."""
+
+
+class _Handler(LocalHandler):
     recordings: Sequence[Path] = ()
 
     def do_GET(self) -> None:
         """Answers with a file of the web viewer, or a recording."""
-        host = urlsplit(f"//{self.headers.get('Host', '')}").hostname
-        if host not in (LOCALHOST, "localhost"):  # a page elsewhere whose name was made to lead here
-            self.send_error(403, f"allowed hosts: {LOCALHOST}, localhost")
+        if not self.is_for_us():
             return
         path = urlsplit(self.path).path.lstrip("/") or "index.html"
         recording = self._recording(path)
-        if recording is not None:
-            with recording.open("rb") as file:
-                self._begin("application/octet-stream", os.fstat(file.fileno()).st_size)
-                shutil.copyfileobj(file, self.wfile)
-        elif path in _FILES:
-            self._send_viewer(path)
-        else:
-            self.send_error(404)
+        if recording is None:
+            self.send_viewer(path)
+            return
+        with recording.open("rb") as file:
+            self.begin("application/octet-stream", os.fstat(file.fileno()).st_size)
+            shutil.copyfileobj(file, self.wfile)
 
     def _recording(self, path: str) -> Path | None:
         for number, own in enumerate(self.recordings):
@@ -102,31 +143,11 @@ class _Handler(BaseHTTPRequestHandler):
                 return own
         return None
 
-    def _send_viewer(self, name: str) -> None:
-        try:
-            found = viewer_file(name)
-        except (OSError, HTTPException, TimeoutError) as error:
-            self.send_error(503, "Rerun's web viewer cannot be read", str(error))
-            return
-        if found is not None:
-            self._begin(found[0], len(found[1]))
-            self.wfile.write(found[1])
-
-    def _begin(self, kind: str, size: int) -> None:
-        self.send_response(200)
-        self.send_header("Content-Type", kind)
-        self.send_header("Content-Length", str(size))
-        self.send_header("rerun-final-length", str(size))  # of which the page shows how much it has loaded
-        self.end_headers()
-
-    def log_message(self, format: str, *args: Any) -> None:
-        """Nothing: the terminal is the training's."""
-
 
 _ONE_AT_A_TIME: Final = Lock()
 
 
-def viewer_file(name: str) -> tuple[str, mmap.mmap] | None:
+def _viewer_file(name: str) -> tuple[str, mmap.mmap] | None:
     """The type and the content of a file of the web viewer, read when it is first asked for; None of others.
 
     Raises:
