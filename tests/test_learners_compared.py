@@ -9,7 +9,7 @@ import pytest
 from cprl.studies import StudyTable
 
 ROOT = Path(__file__).parents[1]
-BOARDS = ("two_complex",)
+BOARDS = ("two_complex", "commons")
 
 
 @pytest.fixture
