@@ -2,8 +2,8 @@
 
     python recipes/learners/comparison_commons.py --jobs 2
 
-Every replica plays a million environment steps or more. Who exploits whom is the question of cross_play.py, on
-the runs of this study.
+Every replica plays a million environment steps or more. Who exploits whom is the question of cross_play.py,
+on the runs of this study.
 """
 
 from ways import comparison

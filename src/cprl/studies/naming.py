@@ -1,6 +1,7 @@
 """What conditions and their levels are called, in names and on figures."""
 
 from collections.abc import Iterable, Mapping
+from dataclasses import fields, is_dataclass
 from typing import Any
 
 from cprl.checks import shown
@@ -17,10 +18,21 @@ def level_text(value: Any) -> str:
         return f"{value:.6g}"
     if isinstance(value, tuple) and all(isinstance(own, int | float) for own in value):
         return f"({', '.join(map(level_text, value))})"
+    if is_dataclass(value):
+        return _value_text(value)
     return value if isinstance(value, str) else shown(value)
 
 
+def _value_text(value: Any) -> str:
+    """A dataclass by its class and its first field, if that says more: "Learning(DQN)", "MLP((8, 8))"."""
+    kind = type(value).__name__
+    first = [getattr(value, own.name) for own in fields(value)[:1]]
+    inner = [type(own).__name__ if is_dataclass(own) else level_text(own) for own in first]
+    return kind if not inner or inner[0].startswith(kind) else f"{kind}({inner[0]})"
+
+
 def short_names(factors: Iterable[str]) -> dict[str, str]:
-    """The last word of each path, or the whole path where several factors share it."""
+    """The last word of each path, or the whole path where it is a number or several factors share it."""
     last = {own: own.rpartition(".")[2] for own in factors}
-    return {own: word if list(last.values()).count(word) == 1 else own for own, word in last.items()}
+    shared = {word for word in last.values() if word.isdigit() or list(last.values()).count(word) > 1}
+    return {own: own if word in shared else word for own, word in last.items()}
