@@ -59,10 +59,11 @@ def test_links_lead_to_the_same_page_list_or_replay_from_every_depth(tmp_path):
     assert "](repository/recipes/institutions.py.md)" in page
     assert "](replays.md?replay=institutions/monitoring)" in page
     assert "](results/institutions/index.md)" in page
-    readme = (tmp_path / "repository" / "README.md").read_text()
+    readme = (tmp_path / "repository" / "about.md").read_text()
     assert "](../game.md)" in readme
     recipe = (tmp_path / "repository" / "recipes" / "commons.py.md").read_text()
     assert (ROOT / "recipes" / "commons.py").read_text().rstrip() in recipe
+    assert not list(tmp_path.rglob("README.md")), "MkDocs takes it for its folder's page and drops it"
     for path in tmp_path.rglob("*.md"):
         outside = re.sub(r"^```.*?^```", "", path.read_text(), flags=re.MULTILINE | re.DOTALL)
         for target in re.findall(r"\]\(([^)#\s:]+)(?:#[^)]*)?\)", outside):

@@ -58,6 +58,8 @@ def place(path: Path) -> str:
     name = path.relative_to(DOCS).as_posix() if inside else f"repository/{path.relative_to(ROOT).as_posix()}"
     if path.is_dir():
         return f"{name}/index.md"
+    if path.name == "README.md":  # MkDocs takes it for its folder's page, which is a list
+        return f"{name.removesuffix(path.name)}about.md"
     if path.suffix == ".md" or path.suffix in IMAGES:
         return name
     if path.suffix == ".rrd":
