@@ -18,7 +18,7 @@ def level_text(value: Any) -> str:
         return f"{value:.6g}"
     if isinstance(value, tuple) and all(isinstance(own, int | float) for own in value):
         return f"({', '.join(map(level_text, value))})"
-    if is_dataclass(value):
+    if is_dataclass(value) and not isinstance(value, type):
         return _value_text(value)
     return value if isinstance(value, str) else shown(value)
 
@@ -26,9 +26,10 @@ def level_text(value: Any) -> str:
 def _value_text(value: Any) -> str:
     """A dataclass by its class and its first field, if that says more: "Learning(DQN)", "MLP((8, 8))"."""
     kind = type(value).__name__
-    first = [getattr(value, own.name) for own in fields(value)[:1]]
-    inner = [type(own).__name__ if is_dataclass(own) else level_text(own) for own in first]
-    return kind if not inner or inner[0].startswith(kind) else f"{kind}({inner[0]})"
+    first = next((getattr(value, own.name) for own in fields(value)), "")
+    inner = type(first).__name__ if is_dataclass(first) else level_text(first)
+    says_no_more = not inner or inner.startswith(kind)  # as DQNSettings of DQN
+    return kind if says_no_more else f"{kind}({inner})"
 
 
 def short_names(factors: Iterable[str]) -> dict[str, str]:
