@@ -8,7 +8,7 @@ DOCS_INSTALLED := .venv/.installed-docs
 
 VIEWER_PACKAGES := mesa-vulkan-drivers libvulkan1 chromium chromium-driver
 
-.PHONY: run docs docs-serve lint test test-oldest test-newest fuzz test-slow test-wheel test-gpu test-viewer test-docs viewer-packages check bench bench-gpu clean
+.PHONY: run docs docs-serve lint test test-integration test-oldest test-newest fuzz test-slow test-wheel test-gpu test-viewer test-docs viewer-packages check bench bench-gpu clean
 
 run: $(INSTALLED)
 	$(BIN)/python recipes/tragedy.py --watch serve --linger --no-keep-checkpoint
@@ -20,17 +20,24 @@ docs: $(DOCS_INSTALLED)
 docs-serve: docs
 	@$(BIN)/cprl docs $(if $(PORT),--port $(PORT))
 
+# ARGS="tests/test_lanes.py" runs a part of the tests.
+PYTEST := python -m pytest -n auto --dist worksteal
+NOT_HERE := not slow and not gpu and not viewer and not network and not docs
+
 test: $(INSTALLED)
-	$(BIN)/python -m pytest -n auto --dist worksteal
+	$(BIN)/$(PYTEST) $(ARGS)
+
+test-integration: $(INSTALLED)
+	$(BIN)/$(PYTEST) -m "integration and $(NOT_HERE)" $(ARGS)
 
 test-slow: $(INSTALLED)
 	$(BIN)/python -m pytest -m slow
 
 # The oldest and the newest versions that pyproject.toml allows, each in an environment of its own; see
-# docs/upgrading.md. ARGS="tests/test_compat.py" runs a part of the tests.
+# docs/upgrading.md.
 MORE_TORCH := $(if $(TORCH_INDEX),--extra-index-url $(TORCH_INDEX))
 test-oldest test-newest: test-%: .venv-%/.installed
-	.venv-$*/bin/python -m pytest -n auto --dist worksteal $(ARGS)
+	.venv-$*/bin/$(PYTEST) -m "$(NOT_HERE)" $(ARGS)
 
 .venv-oldest/.installed: pyproject.toml tests/oldest.py
 	$(PYTHON) -m venv .venv-oldest
@@ -71,7 +78,7 @@ lint: $(INSTALLED)
 	$(BIN)/ruff format --check .
 	$(BIN)/mypy
 
-check: lint test
+check: lint test test-integration
 
 bench: $(INSTALLED)
 	$(BIN)/python benchmarks/env_steps.py

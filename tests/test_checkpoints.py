@@ -54,6 +54,7 @@ def in_one_go(tmp_path_factory):
     return run
 
 
+@pytest.mark.integration
 @pytest.mark.parametrize(
     "engine", ["lane_axis", *(pytest.param(name, marks=pytest.mark.slow) for name in ("vmapped", "list"))]
 )
@@ -68,6 +69,7 @@ def test_a_training_that_was_ended_goes_on_bit_for_bit(engine, tmp_path):
     assert_same_run(parts, whole)
 
 
+@pytest.mark.integration
 def test_a_training_that_was_ended_before_its_first_checkpoint_begins_anew(tmp_path, in_one_go):
     with pytest.raises(ZeroDivisionError):
         train_and_die.main(tmp_path / "run", every_s=1000, episodes=EPISODES, callbacks=[Dying(80)])
@@ -89,6 +91,7 @@ def started(run, every_s="0.05"):
     raise AssertionError(f"it ended with {process.wait()} before it began")
 
 
+@pytest.mark.integration
 @pytest.mark.parametrize(
     "number", [signal.SIGTERM, pytest.param(signal.SIGINT, marks=pytest.mark.slow)], ids=str
 )

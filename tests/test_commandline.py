@@ -115,6 +115,7 @@ def test_words_of_earlier_versions_and_underscores_are_still_read(old, new):
     assert read(old) != read("")
 
 
+@pytest.mark.integration
 @pytest.mark.parametrize(
     "line",
     [
@@ -260,6 +261,7 @@ def test_each_field_is_explained_in_a_sentence():
     assert set(docs(Experiment)) == set(Experiment.__dataclass_fields__)
 
 
+@pytest.mark.integration
 @pytest.mark.parametrize("path", STORED, ids=lambda path: path.parent.name)
 def test_the_command_of_every_stored_result_still_gives_its_experiment(path):
     stored = json.loads(path.read_text())

@@ -338,6 +338,7 @@ def called_first(own, *arguments):
         return torch.compile(own, fullgraph=True, dynamic=False, options=options)(*arguments)
 
 
+@pytest.mark.integration
 @ignored
 def test_torch_hands_over_the_code_that_it_compiled():
     own = compiled_of_its_own(3)
@@ -352,6 +353,7 @@ def test_torch_hands_over_the_code_that_it_compiled():
     assert compat.compiled_code(own) is None, "it is gone from the cache"
 
 
+@pytest.mark.integration
 @ignored
 def test_torch_keeps_what_it_compiled_by_code_object():
     with relies_on("torch's cache of compiled code", used_by="compat.with_own_code"):
@@ -380,6 +382,7 @@ def multiplied(owner, values):
     return values * owner.layer(values).factor
 
 
+@pytest.mark.integration
 @ignored
 def test_code_that_depended_on_a_class_that_is_gone_fits_nothing():
     class Owner:
@@ -410,6 +413,7 @@ def test_torch_leaves_guards_out_on_request(monkeypatch):
         assert direct(torch.ones(2)).tolist() == [2.0, 2.0], "it no longer asks what it was made of"
 
 
+@pytest.mark.integration
 @ignored
 def test_torch_guards_hooks_on_request():
     def applied(module, values):
@@ -424,6 +428,7 @@ def test_torch_guards_hooks_on_request():
         assert not compat.fits(own, (hooked, torch.ones(2)))
 
 
+@pytest.mark.integration
 @ignored
 def test_torch_compiles_a_softmax_of_what_was_changed_in_place(tmp_path, monkeypatch):
     def masked(values):

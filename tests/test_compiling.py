@@ -18,6 +18,7 @@ class Owner:
     offset = 1.0
 
 
+@pytest.mark.integration
 def test_what_is_compiled_is_called_directly_and_compiled_again_for_another_form():
     step = Compiled(scaled_in_place, what="steps run", changes=(1,))
     for size in (3, 5):
@@ -32,6 +33,7 @@ def test_what_is_compiled_is_called_directly_and_compiled_again_for_another_form
     assert step((5,), Owner, values, factor) == 5 * 2.0**4 + 1
 
 
+@pytest.mark.integration
 def test_two_of_one_function_do_not_disturb_each_other():
     small, large = (Compiled(scaled_in_place, what="steps run", changes=(1,)) for _ in range(2))
     factor = torch.tensor(3.0)

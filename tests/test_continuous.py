@@ -235,6 +235,7 @@ def test_replay_keeps_the_numbers_of_actions_and_those_of_peers():
     assert learner.values(batch).isnan().all()
 
 
+@pytest.mark.integration
 @pytest.mark.parametrize("engine", ["eager", "torchrl"])
 def test_a_replica_learns_as_it_does_alone(engine):
     def trained(replicas, first):
@@ -258,6 +259,7 @@ def test_a_replica_learns_as_it_does_alone(engine):
     assert not torch.allclose(whole[:1], alone)
 
 
+@pytest.mark.integration
 def test_a_loss_of_torchrls_for_continuous_actions_runs_on_the_fast_engine_compiled():
     learner = ddpg().make_learner(SPACES, agents=(0, 1), replicas=2)
     assert isinstance(learner.engine, FunctionalEngine)
@@ -288,6 +290,7 @@ EXPERIMENT = Experiment(
 )
 
 
+@pytest.mark.integration
 def test_a_population_trains_stops_resumes_loads_and_meets_another(tmp_path, monkeypatch, capsys):
     allow = ["one_road_parts:Stopping", "continuous_agents:small_ddpg"]
     experiment = replace(EXPERIMENT, callbacks=[Custom(allow[0])])

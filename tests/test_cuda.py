@@ -39,12 +39,14 @@ def simulated():
     return done.stdout.splitlines(), done
 
 
+@pytest.mark.integration
 @pytest.mark.parametrize("check", [*GAMES, "forms", "blocks", "state", "unknown", *GOVERNED])
 def test_the_simulated_gpu_plays_the_same_game_as_the_cpu(simulated, check):
     lines, done = simulated
     assert f"{check} equal" in lines, done.stderr
 
 
+@pytest.mark.integration
 def test_the_simulator_exits_without_an_error(simulated):
     assert simulated[1].returncode == 0, simulated[1].stderr
 

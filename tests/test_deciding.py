@@ -326,6 +326,7 @@ def in_one_go(tmp_path_factory):
     return cprl.run(OWN, tmp_path_factory.mktemp("whole") / "run", watch="off")
 
 
+@pytest.mark.integration
 def test_a_run_that_is_killed_and_resumed_is_the_same(in_one_go, tmp_path, monkeypatch):
     run = tmp_path / "run"
     monkeypatch.setenv("STOP_AT_STEP", "41")
@@ -392,6 +393,7 @@ def test_where_decisions_last_for_several_episodes_the_evaluation_begins_with_a_
     assert [own.decision[:2].tolist() for own in played] == [[1, 1]] * 6
 
 
+@pytest.mark.integration
 def test_runs_play_with_each_other_as_they_decide(in_one_go, tmp_path):
     other = cprl.run(replace(OWN, seed=8, callbacks=()), tmp_path / "other", watch="off")
     found = cprl.crossplay([in_one_go, other], episodes=2, allow=ALLOW)
@@ -470,6 +472,7 @@ REPLAY = DQNSettings(
 )
 
 
+@pytest.mark.integration
 @pytest.mark.parametrize("engine", ["eager", "torchrl"])
 def test_engines_and_collectors_of_torchrl_have_the_same_decisions(engine):
     found = []

@@ -76,6 +76,7 @@ def blocks():
                 modules[name[1]] = code
 
 
+@pytest.mark.integration
 @pytest.mark.parametrize(("code", "modules"), list(blocks()))
 def test_python_in_the_docs_runs(code, modules, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)

@@ -70,6 +70,7 @@ def assert_same_sums(update, lane, by_hand, tolerance):
         torch.testing.assert_close(mine, theirs, rtol=tolerance, atol=tolerance)
 
 
+@pytest.mark.integration
 @pytest.mark.parametrize("engine", ENGINES)
 @pytest.mark.parametrize("name", OPTIMIZERS)
 def test_each_optimiser_changes_every_lane_as_torchs_own_does(engine, name):
@@ -182,6 +183,7 @@ def by_hand(lane, start, steps, *, n_steps, gamma):
     return rewards, last, ahead + 1
 
 
+@pytest.mark.integration
 @pytest.mark.parametrize(
     ("lanes", "n_steps"),
     [

@@ -145,6 +145,7 @@ def test_what_is_undefined_is_counted_apart_and_in_no_mean(scripted):
         over_replicas({0: [1.0], 1: []})
 
 
+@pytest.mark.integration
 @pytest.mark.parametrize("name", ["alike", "mixed"])
 def test_greedy_agents_play_what_the_policy_of_the_loaded_run_plays(name, learned):
     found = cprl.evaluate_run(learned[name], episodes=4, greedy=True, seed=SEED)

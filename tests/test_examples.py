@@ -59,6 +59,7 @@ def test_plain_ppo_finds_apples_that_always_come_back(name, example, monkeypatch
     assert sum(harvests[-3:]) > 1.5 * sum(harvests[:3])
 
 
+@pytest.mark.integration
 def test_the_single_agent_is_compared_with_random_play(example, shorter_episodes, capsys):
     played = example("single_agent").main(episodes=10)
     assert set(played) == {"random", "greedy"}

@@ -113,6 +113,7 @@ def assert_same_runs(folder, undisturbed):
     }
 
 
+@pytest.mark.integration
 def test_a_worker_process_that_is_killed_is_replaced_and_its_trial_ends_the_same(tmp_path, undisturbed):
     result = run_study(STUDY, tmp_path, on=Dying(1), results=False)
     assert result.failed == ()

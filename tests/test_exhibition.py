@@ -120,6 +120,7 @@ def steps(kept, count):
 FIRST, *OTHERS = EXPERIMENTS
 
 
+@pytest.mark.integration
 @pytest.mark.parametrize("name", [FIRST, *(pytest.param(name, marks=pytest.mark.slow) for name in OTHERS)])
 def test_an_exhibition_changes_nothing_that_is_learned(name, tmp_path, monkeypatch):
     monkeypatch.setattr(exhibition, "BATCH_S", 0.0)

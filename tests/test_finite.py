@@ -136,6 +136,7 @@ def play(learner, *, breaks=None, episodes=3, seed=2, **how):
     return train(env, {learner.agents: learner}, episodes=episodes, callbacks=callbacks, **how), witness
 
 
+@pytest.mark.integration
 @pytest.mark.parametrize("name", LEARNERS)
 def test_a_lane_that_breaks_stops_the_training_and_is_named(name):
     learner = make_learner(name)

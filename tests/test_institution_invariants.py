@@ -67,6 +67,7 @@ def check_untouched(game, seed):
             assert np.array_equal(array, own[:, :, :cells] if name == "observation" else own), name
 
 
+@pytest.mark.integration
 @QUICK
 @given(game=governed_games(harmless=True), seed=SEEDS)
 def test_payments_alone_leave_the_game_as_it_is_bit_for_bit(game, seed):
@@ -79,6 +80,7 @@ def test_payments_alone_leave_the_game_as_run_as_it_is(game, seed):
     check_untouched(game, seed)
 
 
+@pytest.mark.integration
 @QUICK
 @given(game=governed_games(), seed=SEEDS)
 def test_the_reward_is_the_harvest_less_fines_plus_transfers_and_an_ended_world_pays_nothing(game, seed):
@@ -94,6 +96,7 @@ def test_the_reward_is_the_harvest_less_fines_plus_transfers_and_an_ended_world_
         ended = moment.worlds.ended[:, 0] != PLAYING
 
 
+@pytest.mark.integration
 @QUICK
 @given(game=governed_games(), seed=SEEDS)
 def test_counts_add_up(game, seed):
@@ -253,6 +256,7 @@ def test_only_the_sanctioner_fires(game, seed):
         assert not moment.turn.fired[:, 1:].any()
 
 
+@pytest.mark.integration
 @QUICK
 @given(game=governed_games(ballots=False), seed=SEEDS, order=st.randoms(use_true_random=False))
 def test_the_order_of_institutions_changes_no_move_and_no_payment(game, seed, order):
@@ -279,6 +283,7 @@ def test_the_order_of_institutions_is_that_of_ballots_and_of_what_is_shown():
 IDLE = 7
 
 
+@pytest.mark.integration
 @QUICK
 @given(game=governed_games(), seed=SEEDS)
 def test_an_episode_does_not_know_what_was_done_in_the_one_before(game, seed):
@@ -295,6 +300,7 @@ def test_an_episode_does_not_know_what_was_done_in_the_one_before(game, seed):
         assert_same_moments(one, other)
 
 
+@pytest.mark.integration
 @QUICK
 @given(game=governed_games(), seed=SEEDS)
 def test_at_an_episodes_begin_everything_but_what_is_in_force_is_as_in_a_new_world(game, seed):
@@ -310,6 +316,7 @@ def test_at_an_episodes_begin_everything_but_what_is_in_force_is_as_in_a_new_wor
     assert set(apart) <= {"episode", *voted}
 
 
+@pytest.mark.integration
 @QUICK
 @given(game=governed_games(), seed=SEEDS, turns=st.integers(0, 25))
 def test_a_state_that_is_loaded_plays_on_bit_for_bit(game, seed, turns):
@@ -330,6 +337,7 @@ def test_a_state_that_is_loaded_plays_on_bit_for_bit(game, seed, turns):
         assert_same_moments(one, two)
 
 
+@pytest.mark.integration
 @QUICK
 @given(game=governed_games(), seed=SEEDS)
 def test_a_world_of_a_batch_plays_as_it_would_alone(game, seed):

@@ -191,6 +191,7 @@ def test_a_recording_without_institutions_has_nothing_of_them(tmp_path):
     assert not [name for name in entities(tmp_path / "run.rrd") if any(word in name for word in words)]
 
 
+@pytest.mark.integration
 def test_a_replay_marks_who_breaks_a_rule_in_its_turn_and_shows_payments(whole, tmp_path):
     path, episode = film(whole, tmp_path / "replay.rrd", allow=("paying_game:Charges",))
     frames, marks = column(path, "world/violators", "LineStrips2D:strips", "frame")

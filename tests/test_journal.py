@@ -31,6 +31,7 @@ def journal(tmp_path):
     return path
 
 
+@pytest.mark.integration
 def test_each_flipped_bit_is_refused_or_changes_nothing(journal):
     data, whole = journal.read_bytes(), read_journal(journal).batches
     assert whole == [batch(number) for number in range(4)]

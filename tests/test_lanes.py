@@ -109,6 +109,7 @@ def in_order(update, lane):
     return parts
 
 
+@pytest.mark.integration
 @pytest.mark.parametrize(
     "dtype", [torch.float64, pytest.param(torch.float32, marks=pytest.mark.slow)], ids=str
 )
@@ -123,6 +124,7 @@ def test_both_fast_engines_end_where_a_list_of_torchrl_losses_ends(engine, dtype
     assert (in_order(update, 0)[0] - start.linears[0].weight).abs().max() > 0.01, "it learned something"
 
 
+@pytest.mark.integration
 def test_the_compiled_step_ends_there_too():
     lanes = [0, 1, 2]
     reference, _ = trained(ListEngine, lanes)
@@ -142,6 +144,7 @@ def test_every_compiled_engine_in_both_precisions(engine, dtype):
     assert_same_course(update, reference, range(4), range(4), PRECISION[dtype])
 
 
+@pytest.mark.integration
 @pytest.mark.parametrize(
     "dtype", [torch.float64, pytest.param(torch.float32, marks=pytest.mark.slow)], ids=str
 )

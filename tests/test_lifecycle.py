@@ -71,6 +71,7 @@ def whole(tmp_path_factory):
     return path
 
 
+@pytest.mark.integration
 def test_a_finished_run_has_results_their_checksums_and_the_state_to_extend_it_from(whole):
     ending = next(path for path in contents(whole) if path.startswith("checkpoints/ending-"))
     results = ["checkpoints/final.pt", "episodes.parquet"]
@@ -89,6 +90,7 @@ def test_a_finished_run_has_results_their_checksums_and_the_state_to_extend_it_f
 SLOW = ("save_transforms", "training_curve", "write_json", "summarise")
 
 
+@pytest.mark.integration
 @pytest.mark.parametrize(
     "stage",
     ["save_weights", "evaluate_population", *(pytest.param(own, marks=pytest.mark.slow) for own in SLOW)],
@@ -120,6 +122,7 @@ def longer(tmp_path_factory):
     return run(replace(FIELD, episodes=9), tmp_path_factory.mktemp("longer") / "run")
 
 
+@pytest.mark.integration
 def test_a_finished_run_is_extended_bit_for_bit_and_its_earlier_results_are_kept(
     whole, longer, tmp_path, monkeypatch
 ):
@@ -171,6 +174,7 @@ def test_a_stopped_run_is_extended_too(longer, tmp_path, monkeypatch):
     assert_same(tmp_path / "run", longer)
 
 
+@pytest.mark.integration
 def test_what_cannot_be_extended_bit_for_bit_is_refused_before_anything_is_written(whole, tmp_path):
     bare = run(FIELD, tmp_path / "bare", keep_checkpoint=False)
     assert checkpoints_in(bare / "checkpoints") == []
@@ -269,6 +273,7 @@ def _often(*arguments, **how):
     return Checkpointer(*arguments, every_s=1e-9, **how)
 
 
+@pytest.mark.integration
 def test_a_shorter_journal_falls_back_to_the_checkpoint_before(whole, tmp_path, monkeypatch, capsys):
     monkeypatch.setenv("STOP_AT_STEP", "75")
     monkeypatch.setattr(running, "Checkpointer", _often)
@@ -339,6 +344,7 @@ def test_a_pipe_in_place_of_weights_is_refused_at_once(whole, tmp_path):
         cprl.load(path)
 
 
+@pytest.mark.integration
 def test_files_are_written_as_the_umask_says(tmp_path):
     before = os.umask(0o027)
     try:

@@ -227,6 +227,7 @@ def test_critics_learn_and_advantages_are_normalised_where_asked_and_gradients_c
         assert (moved > 0.9e-3).all()
 
 
+@pytest.mark.integration
 @pytest.mark.parametrize("estimator", ESTIMATORS)
 def test_a_team_that_was_stopped_goes_on_bit_for_bit(estimator, tmp_path):
     members = [
@@ -256,6 +257,7 @@ def test_a_run_is_built_again_evaluated_and_its_members_play_on_frozen_and_start
         )
 
 
+@pytest.mark.integration
 def test_lola_plays_a_matrix_game_in_an_experiment_and_meets_naive_learners_by_cross_play(tmp_path):
     runs = []
     for rate in (0.0, 1.0):
@@ -274,6 +276,7 @@ def test_lola_plays_a_matrix_game_in_an_experiment_and_meets_naive_learners_by_c
     assert met is not None
 
 
+@pytest.mark.integration
 @pytest.mark.parametrize(
     "network", [Conv(channels=(2,), hidden_cells=(4,)), Custom("test_networks:Own", {"cells": 3})]
 )

@@ -312,6 +312,7 @@ def test_returns_of_several_steps_are_those_of_each_member():
     assert got["steps_to_next_obs"].squeeze(-1).tolist() == [[3, 2, 3], [3, 1, 3]]
 
 
+@pytest.mark.integration
 def test_a_team_that_was_stopped_goes_on_bit_for_bit_and_its_samples_too(tmp_path):
     members = [Team(TEAM, (0, 2, 3), reward="individual"), Learning(DQN(settings=REPLAY))]
     assert_goes_on_bit_for_bit(members, tmp_path, episodes=5)
@@ -390,6 +391,7 @@ class Noisy(DQN):
         return loss
 
 
+@pytest.mark.integration
 @pytest.mark.parametrize("engine", ["eager", "torchrl"])
 def test_each_lane_has_uniform_numbers_of_its_own_whatever_trains_beside_it(engine):
     given = []

@@ -352,6 +352,7 @@ def test_a_subclass_of_the_users_own_is_kept_by_its_name():
     assert make_env(game).game == prisoners_dilemma(turns=2)
 
 
+@pytest.mark.integration
 def test_a_population_trains_stops_resumes_loads_and_meets_another(tmp_path, monkeypatch, capsys):
     experiment = replace(EXPERIMENT, callbacks=[Custom("one_road_parts:Stopping")])
     whole = cprl.run(experiment, tmp_path / "whole", watch="off")

@@ -138,6 +138,7 @@ def played(learner, steps=24):
     return [loss for loss in losses if loss is not None]
 
 
+@pytest.mark.integration
 @pytest.mark.parametrize("network", [CONV, OWN], ids=["conv", "own"])
 @pytest.mark.parametrize("kind", [*OF_REPLAY, *OF_ROLLOUTS])
 def test_every_algorithm_learns_with_every_network(kind, network):
@@ -154,6 +155,7 @@ def test_every_algorithm_learns_with_every_network(kind, network):
     assert own(seen).shape == (5, 8)
 
 
+@pytest.mark.integration
 @pytest.mark.parametrize("network", [CONV, OWN], ids=["conv", "own"])
 @pytest.mark.parametrize(
     "kind",

@@ -79,6 +79,7 @@ def in_one_go(tmp_path_factory):
     return cprl.run(MEADOW, tmp_path_factory.mktemp("whole") / "run", watch="off")
 
 
+@pytest.mark.integration
 def test_an_experiment_with_parts_of_its_own_is_stopped_resumed_evaluated_and_filmed(
     in_one_go, tmp_path, monkeypatch, capsys
 ):
@@ -163,6 +164,7 @@ DILEMMA = Experiment(
 DILEMMA_ALLOW = ("one_road_parts:Dilemma",)
 
 
+@pytest.mark.integration
 def test_a_matrix_game_is_trained_stopped_resumed_evaluated_and_cross_played(tmp_path, monkeypatch, capsys):
     experiment = replace(DILEMMA, callbacks=MEADOW.callbacks)
     whole = cprl.run(experiment, tmp_path / "whole")
@@ -217,6 +219,7 @@ def test_a_transform_that_changes_the_shape_of_observations_is_learned_from(tmp_
     assert not (tmp_path / "wrong").exists()
 
 
+@pytest.mark.integration
 def test_normalised_observations_are_floats_from_the_environment_to_the_stored_policy(tmp_path, capsys):
     norm = Custom(
         "torchrl.envs.transforms:ObservationNorm",
@@ -244,6 +247,7 @@ def test_a_game_that_hides_its_state_is_refused_before_anything_is_written(tmp_p
     assert not (tmp_path / "run").exists()
 
 
+@pytest.mark.integration
 def test_an_experiment_with_torchrls_own_engine_is_stopped_loaded_and_resumed(tmp_path, monkeypatch, capsys):
     experiment = replace(
         MEADOW,

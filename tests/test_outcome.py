@@ -4,6 +4,7 @@ import random
 from dataclasses import replace
 
 import numpy as np
+import pytest
 import torch
 from rerun.chunk import RrdReader
 from test_rerun_logger import column
@@ -77,6 +78,7 @@ def test_random_play_of_a_game_with_transforms_or_of_somebody_elses_is_played_ag
     assert not is_same_later(somebodys)
 
 
+@pytest.mark.integration
 def test_a_run_has_the_same_outcome_watched_or_not_and_its_recording_shows_the_end(tmp_path):
     off, watched = (cprl.run(EXPERIMENT, tmp_path / watch, watch=watch) for watch in ("off", "file"))
     for policy in ("random", "trained"):

@@ -80,6 +80,7 @@ def experiment():
     )
 
 
+@pytest.mark.integration
 def test_a_run_that_is_stopped_and_resumed_equals_the_undisturbed_one_bit_for_bit(
     licence, tmp_path, monkeypatch, capsys
 ):

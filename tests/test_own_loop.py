@@ -29,6 +29,7 @@ def run_in_miniature(tmp_path, capsys, **arguments):
     return run, capsys.readouterr().out
 
 
+@pytest.mark.integration
 def test_the_loop_leaves_a_run_directory(tmp_path, capsys):
     run, told = run_in_miniature(tmp_path, capsys, seed=3)
     kept = json.loads((run / "recipe.json").read_text())
@@ -47,6 +48,7 @@ def test_the_loop_leaves_a_run_directory(tmp_path, capsys):
     assert "greedy" in told
 
 
+@pytest.mark.integration
 def test_the_loop_says_that_it_is_short_and_names_the_published_schedule(tmp_path, capsys):
     run, told = run_in_miniature(tmp_path, capsys, watch="serve")
     assert "Watch live (browser): http://127.0.0.1:" in told
@@ -56,6 +58,7 @@ def test_the_loop_says_that_it_is_short_and_names_the_published_schedule(tmp_pat
     assert agent.algorithm.settings.epsilon_decay_steps == 30_000
 
 
+@pytest.mark.integration
 def test_a_directory_with_a_run_in_it_is_not_written_over(tmp_path, capsys):
     run, _ = run_in_miniature(tmp_path, capsys)
     with pytest.raises(FileExistsError):

@@ -27,6 +27,7 @@ def test_a_name_that_is_not_there_is_an_attribute_error():
         _ = cprl.lode
 
 
+@pytest.mark.integration
 def test_importing_cprl_leaves_the_viewer_and_stored_runs_out():
     code = (
         "import sys, cprl\n"

@@ -26,6 +26,7 @@ def society(replicas, noise, seed=0):
     return metrics
 
 
+@pytest.mark.integration
 @pytest.mark.parametrize("noise", [0.02, 0.3])
 def test_known_change_points_are_found_within_their_intervals(noise):
     found = change_points(EPISODES, society(8, noise), number=3, resamples=12)

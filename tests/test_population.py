@@ -113,6 +113,7 @@ def weights(agents):
     }
 
 
+@pytest.mark.integration
 @pytest.mark.parametrize("name", ALGORITHMS)
 def test_each_loss_moves_every_agents_weights_and_no_replica_knows_of_the_others(name):
     members = [Learning(ALGORITHMS[name])] * 4
@@ -258,6 +259,7 @@ def assert_goes_on_bit_for_bit(members, tmp_path, *, episodes):
         assert torch.equal(value, whole[key]), key
 
 
+@pytest.mark.integration
 @pytest.mark.parametrize("kind", ["PPO", pytest.param("SAC", marks=pytest.mark.slow), "DQN"])
 def test_a_mixed_training_that_was_stopped_goes_on_bit_for_bit(kind, tmp_path):
     members = [Learning(ALGORITHMS[kind]), Learning(ALGORITHMS["CQL"]), Scripted("greedy"), Scripted()]
@@ -280,11 +282,13 @@ def ran(tmp_path, members, name="run"):
     return run, cprl.load(run).networks
 
 
+@pytest.mark.integration
 def test_agents_that_follow_a_script_are_not_called_trained(tmp_path, capsys):
     ran(tmp_path, [Scripted("greedy")] * 4)
     assert "trained" not in capsys.readouterr().out
 
 
+@pytest.mark.integration
 def test_a_mixed_run_is_kept_evaluated_and_built_again_from_its_directory(tmp_path, capsys):
     members = [Learning(ALGORITHMS["C51"]), Learning(ALGORITHMS["PPO"]), Scripted("greedy"), Scripted()]
     run, _ = ran(tmp_path, members)
@@ -303,6 +307,7 @@ def test_a_mixed_run_is_kept_evaluated_and_built_again_from_its_directory(tmp_pa
     assert actions.shape == (2, 4)
 
 
+@pytest.mark.integration
 def test_a_frozen_agent_plays_what_it_learned_and_changes_no_more(tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
     run, earlier = ran(tmp_path, [Learning(ALGORITHMS["DQN"])] * 4)
@@ -326,6 +331,7 @@ def test_a_frozen_agent_plays_what_it_learned_and_changes_no_more(tmp_path, monk
     assert torch.equal(moved.agent(0).network(seen), earlier["replica_0/agent_2"](seen))
 
 
+@pytest.mark.integration
 def test_a_tabular_agent_is_a_member_like_any_other(tmp_path, capsys):
     algorithm = Tabular(settings=TabularSettings(epsilon_hold_steps=5, epsilon_decay_steps=40))
     members = [Learning(algorithm), Learning(ALGORITHMS["DQN"]), Learning(algorithm), Scripted("greedy")]
@@ -399,6 +405,7 @@ class PPOFromReplay(OffPolicy):
         return ALGORITHMS["PPO"].make_loss(network)
 
 
+@pytest.mark.integration
 def test_what_does_not_fit_is_refused_before_training_and_says_what_fits(tmp_path, capsys):
     dqn = Learning(ALGORITHMS["DQN"])
     with pytest.raises(ValueError, match="reward is 'group'; allowed: 'individual', 'team'"):

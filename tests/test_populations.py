@@ -19,6 +19,7 @@ def returns(played):
     return {replica: [episode.return_.tolist() for episode in own] for replica, own in played.items()}
 
 
+@pytest.mark.integration
 def test_the_agents_of_a_run_play_as_in_its_evaluation(alike):
     agents = [Frozen(str(alike), agent, replica=None) for agent in range(2)]
     played = play_population(MEADOW, agents, episodes=4, replicas=3, seed=SEED)

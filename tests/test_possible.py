@@ -33,12 +33,14 @@ CROSS = Game(
 """One agent and an isolated cross, which bears a tenth of an apple a turn."""
 
 
+@pytest.mark.integration
 def test_where_nothing_grows_a_planner_takes_all():
     assert planned_harvest(ROW, Planner(), episodes=3).tolist() == [4.0, 4.0, 4.0]
     could = possible(ROW)
     assert (could.best_known, could.error, could.at_most, could.policy) == (4.0, 0.0, 4.0, "planner")
 
 
+@pytest.mark.integration
 def test_a_planner_keeps_what_grows_and_takes_the_rest_at_the_end():
     # Greedy, an agent gets 5 apples and the board is bare. At most 5 + 300 * 0.1 = 35 can be had on average;
     # a planner that looks only a turn ahead takes all at once, too.

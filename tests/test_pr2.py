@@ -205,6 +205,7 @@ def test_agents_act_on_what_they_see_themselves_by_the_policy_of_their_joint_val
         assert learner.actor.choose(seen).shape == (2, 3)
 
 
+@pytest.mark.integration
 @pytest.mark.parametrize("engine", ["eager", "torchrl"])
 @pytest.mark.parametrize("n_steps", [1, 3])
 def test_a_replica_learns_among_others_what_it_learns_alone(engine, n_steps):
@@ -220,6 +221,7 @@ def test_a_replica_learns_among_others_what_it_learns_alone(engine, n_steps):
             torch.testing.assert_close(value, same.state_dict()[key], rtol=1e-4, atol=1e-5)
 
 
+@pytest.mark.integration
 def test_pr2_learns_beside_any_others_is_stored_plays_frozen_and_is_started_from(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
 

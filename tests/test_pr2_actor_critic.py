@@ -137,6 +137,7 @@ def test_a_stochastic_actor_ascends_the_mean_over_what_it_may_do():
     torch.testing.assert_close(slope, torch.tensor([-24.5]), rtol=1e-4, atol=1e-4)
 
 
+@pytest.mark.integration
 def test_the_conditional_learns_the_answers_that_suit_the_agent_as_often_as_they_do():
     # Q(a, b) = -(b - a / 2)^2 / 2 at T = 0.25: rho(b | a) is normal with mean a / 2 and variance 0.25.
     class Quadratic(nn.Module):
@@ -237,6 +238,7 @@ def payoff(own, peer):
     return torch.maximum(good, best)
 
 
+@pytest.mark.integration
 def test_gradient_ascent_finds_the_higher_summit_from_three_in_ten_starts():
     joint = torch.rand(20_000, 2, generator=torch.Generator().manual_seed(0)) * 20 - 10
     for _ in range(2000):

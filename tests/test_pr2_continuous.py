@@ -47,6 +47,7 @@ def trained(agents, **how):
     return made
 
 
+@pytest.mark.integration
 @pytest.mark.parametrize("engine", ["eager", "torchrl"])
 def test_a_replica_learns_among_others_what_it_learns_alone(engine):
     together, alone = (
@@ -96,6 +97,7 @@ def test_first_actions_are_uniform_and_the_scale_is_the_first_one():
         conv.start_anywhere()
 
 
+@pytest.mark.integration
 def test_it_learns_beside_others_is_stored_plays_frozen_and_is_started_from(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     made = Experiment(

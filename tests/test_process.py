@@ -34,6 +34,7 @@ def faults_before_and_after():
     return before, faults_of_rounds()
 
 
+@pytest.mark.integration
 @pytest.mark.skipif(platform.libc_ver()[0] != "glibc", reason="mallopt is glibc's")
 def test_memory_freed_in_one_round_is_reused_in_the_next():
     # In a process of its own: one that has run other tests has free memory that needs no new pages.

@@ -63,6 +63,7 @@ def test_no_time_left_is_shown_before_twenty_steps_were_timed(monkeypatch):
     assert all(" left" in line for line in lines[progress.TIMED_STEPS - 1 :])
 
 
+@pytest.mark.integration
 def test_a_compilation_is_reported_while_it_lasts_and_slows_no_estimate(monkeypatch):
     monkeypatch.setattr(progress, "_LINE_PERIOD_S", 0.02)
     monkeypatch.setattr(progress, "COMPILING_PERIOD_S", 0.2)

@@ -88,6 +88,7 @@ def test_the_comparison_of_learners_takes_the_candidates_that_got_most(monkeypat
     assert as_run == presets.dqn_settings("two_complex", variant="as_run")
 
 
+@pytest.mark.integration
 def test_agents_of_a_study_of_learners_meet_in_a_cross_play(tmp_path, monkeypatch, capsys):
     monkeypatch.syspath_prepend(str(RECIPES / "learners"))
     ways = recipe("ways", RECIPES / "learners")
@@ -164,6 +165,7 @@ BOARD_OF = {"two_against_random": "two_complex"}
 LANES = {"single_basic": 1, "single_complex": 1, "two_complex": 2, "two_against_random": 2, "commons": 4}
 
 
+@pytest.mark.integration
 @pytest.mark.parametrize(
     ("name", "variant"),
     [
@@ -217,6 +219,7 @@ def test_a_version_of_the_program_on_the_command_line_is_a_condition_of_the_stud
     assert Condition(plain).checksum == study.all_conditions[1].checksum
 
 
+@pytest.mark.integration
 def test_two_agents_without_the_beam_never_fire(tmp_path):
     how = {"replicas": 2, "episodes": 1, "evaluation_episodes": 1, "watch": "off"}
     run = run_recipe("two_complex", tmp_path / "run", own={"beam": False}, **how)
@@ -224,6 +227,7 @@ def test_two_agents_without_the_beam_never_fire(tmp_path):
     assert set(read_episodes(run).to_pydict()["shots"]) == {0}
 
 
+@pytest.mark.integration
 @pytest.mark.parametrize(
     "loss",
     [
@@ -246,6 +250,7 @@ def test_swapping_the_loss_is_one_argument_and_each_leaves_a_run_that_plays_agai
     assert len(evaluate(loaded.env(1), loaded.policy(1), explore=True)) == 1
 
 
+@pytest.mark.integration
 def test_unlike_neighbours_train_in_one_loop_are_recorded_and_evaluated(tmp_path, capsys):
     how = {"replicas": 2, "episodes": 5, "evaluation_episodes": 1}
     run = run_recipe("mixed", tmp_path / "run", own={"neighbour": "greedy"}, **how)
@@ -303,6 +308,7 @@ def test_fifty_episodes_of_commons_in_eight_replicas_are_those_of_each_alone(tmp
                 torch.testing.assert_close(state[name], value, rtol=1e-4, atol=1e-6)
 
 
+@pytest.mark.integration
 def test_a_run_is_loaded_from_its_directory_alone(tmp_path):
     how = {"replicas": 2, "episodes": 2, "evaluation_episodes": 1}
     run = run_recipe("two_against_random", tmp_path / "run", own={"variant": "as_run"}, **how)
@@ -322,6 +328,7 @@ def test_a_run_is_loaded_from_its_directory_alone(tmp_path):
         loaded.policy(7)
 
 
+@pytest.mark.integration
 def test_a_run_that_was_stopped_is_loaded_from_its_newest_checkpoint(tmp_path, monkeypatch):
     how = {"replicas": 2, "episodes": 3, "evaluation_episodes": 1}
 
@@ -354,6 +361,7 @@ def test_a_run_that_was_stopped_is_loaded_from_its_newest_checkpoint(tmp_path, m
         cprl.load(tmp_path / "run")
 
 
+@pytest.mark.integration
 def test_the_run_of_a_plain_agent_is_loaded_too(tmp_path, capsys):
     run, _ = run_in_miniature(tmp_path, capsys)
     network = cprl.load(run).networks["replica_0/agent_0"]
@@ -364,6 +372,7 @@ def test_the_run_of_a_plain_agent_is_loaded_too(tmp_path, capsys):
         assert len(evaluate(loaded.env(2), loaded.policy(worlds=2))) == 2
 
 
+@pytest.mark.integration
 def test_a_run_that_cannot_be_loaded_says_which_file_and_why(tmp_path, capsys):
     run, _ = run_in_miniature(tmp_path, capsys)
     weights = run / "checkpoints" / "final.pt"
@@ -393,6 +402,7 @@ def test_a_run_that_cannot_be_loaded_says_which_file_and_why(tmp_path, capsys):
         cprl.load(tmp_path)
 
 
+@pytest.mark.integration
 def test_the_tragedy_ends_with_what_happened_and_what_to_try_next(tmp_path, capsys, monkeypatch):
     own = recipe("tragedy")
     words = ["recipes/tragedy.py", "--out", str(tmp_path / "run"), "--engine", "eager", "--watch", "off"]
@@ -413,6 +423,7 @@ def test_what_is_called_at_the_end_must_be_a_function(tmp_path):
     assert not (tmp_path / "run").exists()
 
 
+@pytest.mark.integration
 @pytest.mark.parametrize("watch", ["telepathy", "connect", "connect nobody", "connect rerun+http://:x/proxy"])
 @pytest.mark.parametrize(
     "name", sorted({path.stem for path in RECIPES.glob("*.py")} - {"reproduce", "own_loop"})

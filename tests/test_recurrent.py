@@ -256,6 +256,7 @@ def test_the_critic_goes_on_from_rollout_to_rollout_and_values_the_state_after_e
             torch.testing.assert_close(learner.values(played[-1]), wanted(played)[0])
 
 
+@pytest.mark.integration
 @pytest.mark.parametrize(
     "name",
     [name if name in ("PPO", "IPPO") else pytest.param(name, marks=pytest.mark.slow) for name in ON_POLICY],
@@ -324,6 +325,7 @@ def test_every_engine_learns_what_a_list_of_losses_does(name, engine):
             )
 
 
+@pytest.mark.integration
 @pytest.mark.parametrize("name", ["PPO", pytest.param("MAPPO", marks=pytest.mark.slow)])
 def test_a_training_that_was_stopped_goes_on_bit_for_bit(name, tmp_path):
     members = {
@@ -357,6 +359,7 @@ def ran(tmp_path_factory):
     return experiment, cprl.run(experiment, folder / "run", watch="off")
 
 
+@pytest.mark.integration
 def test_a_stored_run_is_loaded_evaluated_filmed_and_played_against(ran, tmp_path):
     experiment, run = ran
     loaded = cprl.load(run)
@@ -451,6 +454,7 @@ STACKED = Custom(
 )
 
 
+@pytest.mark.integration
 def test_latest_observations_are_stacked_by_a_transform_everywhere(tmp_path):
     """CatFrames: three windows, the oldest first; an episode begins with its first one three times."""
     env = make_env(GAME, worlds=2, seed=3, transforms=[STACKED])

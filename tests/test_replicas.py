@@ -74,6 +74,7 @@ def trained(engine, *, replicas, first=0, episodes=12, agents=(0, 1), settings=S
     return made, witness
 
 
+@pytest.mark.integration
 @pytest.mark.parametrize(
     "engine", [*(pytest.param(name, marks=pytest.mark.slow) for name in ENGINES[:2]), "lane_axis"]
 )
@@ -89,6 +90,7 @@ def test_each_replica_is_trained_as_it_would_be_alone(engine, agents):
         np.testing.assert_allclose(courses[replica][1], losses, rtol=1e-4, equal_nan=True)
 
 
+@pytest.mark.integration
 def test_all_engines_take_the_same_course():
     courses = [trained(engine, replicas=2)[1].course(1) for engine in ENGINES]
     for returns, losses in courses[1:]:

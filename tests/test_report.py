@@ -52,6 +52,7 @@ def run(tmp_path_factory):
         return cprl.run(replace(experiment, **how), tmp_path_factory.mktemp("runs") / "four")
 
 
+@pytest.mark.integration
 def test_what_is_kept_says_the_same_as_the_run(run, tmp_path):
     folder = export_results(run, tmp_path / "kept")
     assert export_results(run, folder) == folder, "again over the same"
@@ -71,6 +72,7 @@ def test_what_is_kept_says_the_same_as_the_run(run, tmp_path):
     assert not (tmp_path / "other").exists()
 
 
+@pytest.mark.integration
 def test_a_report_tells_every_number_from_the_results_alone(run, tmp_path):
     folder = export_results(run, tmp_path / "two_against_random")
     text = write_report([folder], tmp_path).read_text()
@@ -92,6 +94,7 @@ def test_a_report_tells_every_number_from_the_results_alone(run, tmp_path):
     assert write_report([folder], tmp_path / "again").read_text() == text, "the same from the same"
 
 
+@pytest.mark.integration
 def test_runs_that_are_not_the_studys_have_no_columns_for_what_was_published(run, tmp_path):
     own = export_results(run, tmp_path / "fishery")
     content = json.loads((own / "recipe.json").read_text())
@@ -167,6 +170,7 @@ def test_watch_opens_all_recordings_of_a_run_as_one(tmp_path, monkeypatch, capsy
     assert opened[0][1:] == [str(tmp_path / "run-2.rrd"), str(tmp_path / "run.rrd")]
 
 
+@pytest.mark.integration
 def test_reproduce_runs_what_is_missing_and_reports(tmp_path, monkeypatch, capsys):
     reproduce = recipe("reproduce")
     asked = []

@@ -62,6 +62,7 @@ def test_every_agent_is_focal_equally_often():
     assert Scenario(focal="majority", **how).placements == ((1, 2), (0, 2), (0, 1))
 
 
+@pytest.mark.integration
 def test_scores_are_those_worked_by_hand(runs):
     scores = run_scenarios(runs["greedy"], episodes=2)
     assert list(scores.by_scenario) == [

@@ -70,6 +70,7 @@ def test_the_table_has_every_episode(patch):
     assert set(table["restrained"].to_pylist()) >= {"", "0", "0 3", "0 1 2 3"}
 
 
+@pytest.mark.integration
 def test_agents_of_runs_play_restrained_or_greedy(tmp_path):
     run = ran(tmp_path / "alike", MEADOW, [DQN] * 2)
     found = schelling(cprl.load(run), restrained="sustainable", greedy=str(run), episodes=2, replicas=3)

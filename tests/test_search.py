@@ -66,6 +66,7 @@ def told(result):
     return [(own.number, own.name, own.value, own.is_repeated) for own in result.points]
 
 
+@pytest.mark.integration
 def test_points_get_better_and_are_the_same_again(tmp_path, worth):
     first = run_search(a_search(28), tmp_path / "a", on=Counting(), progress=False)
     again = run_search(a_search(13), tmp_path / "b", on=Counting(), progress=False)
@@ -75,6 +76,7 @@ def test_points_get_better_and_are_the_same_again(tmp_path, worth):
     assert first.ranked[0].value == max(own.value for own in first.points)
 
 
+@pytest.mark.integration
 def test_a_search_that_was_stopped_anywhere_runs_the_rest_alone(tmp_path, worth):
     class Killed(Counting):
         def run(self, tasks):
@@ -163,6 +165,7 @@ def test_what_is_kept_is_read_by_optunas_own_tools_and_as_a_study(tmp_path, wort
     assert not list(tmp_path.glob(".optuna*"))
 
 
+@pytest.mark.integration
 def test_a_value_is_the_mean_over_replicas_of_the_episodes_asked_for(tmp_path):
     experiment = replace(ONE, episodes=4, replicas=2, evaluation_episodes=3)
     factors = {RATE: LogUniform(1e-4, 1e-3)}

@@ -89,6 +89,7 @@ def compilations(monkeypatch):
     return made
 
 
+@pytest.mark.integration
 def test_learners_that_differ_in_numbers_alone_share_code_and_differ_in_what_they_learn(compilations):
     learned = {case: digest(trained(case)) for case in SHARING}
     assert sorted(compilations) == ["_explored_of_its_own", "_step_of_its_own"]
@@ -98,6 +99,7 @@ def test_learners_that_differ_in_numbers_alone_share_code_and_differ_in_what_the
     assert digest(trained("plain")) == learned["plain"], "what others learned in between changes nothing"
 
 
+@pytest.mark.integration
 @pytest.mark.parametrize(
     "cases",
     [
@@ -130,6 +132,7 @@ def test_after_others_in_one_process_everyone_learns_as_alone_in_a_fresh_one():
     assert digest(trained("plain", seed=3)) == alone("plain", 3)
 
 
+@pytest.mark.integration
 def test_a_learner_that_shares_code_trains_its_own_weights_alone(compilations):
     first = trained("plain")
     before = digest(first)
@@ -161,6 +164,7 @@ def shared_call(owner):
     return compiling.Compiled(scaled, what="tests run")((), owner, torch.ones(3)).tolist()
 
 
+@pytest.mark.integration
 def test_tensors_of_an_owner_are_its_own_and_everything_else_is_a_constant(compilations):
     assert shared_call(Owner()) == [4.0] * 3
     assert shared_call(Owner(offset=5.0)) == [12.0] * 3
@@ -176,6 +180,7 @@ def test_tensors_of_an_owner_are_its_own_and_everything_else_is_a_constant(compi
     assert len(compilations) == 4
 
 
+@pytest.mark.integration
 def test_closures_are_constants_too(compilations):
     def times(number):
         return lambda values: values * number
@@ -194,6 +199,7 @@ def test_shared_code_that_gives_other_numbers_is_given_up(compilations, monkeypa
     assert len(compilations) == 2
 
 
+@pytest.mark.integration
 def test_only_so_many_forms_are_kept(compilations, monkeypatch):
     monkeypatch.setattr(compiling, "MOST_SHARED", 2)
     for factor in (1.0, 2.0, 3.0):

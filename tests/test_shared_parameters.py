@@ -52,6 +52,7 @@ def by_member(agents):
     return torch.stack(flat).unflatten(0, (agents.replicas, -1))
 
 
+@pytest.mark.integration
 @pytest.mark.parametrize("name", EVERY)
 def test_members_share_one_network_in_each_replica_which_learns_as_it_would_alone(name):
     together = population([shared(EVERY[name])], replicas=3)
@@ -110,12 +111,14 @@ def test_members_explore_each_by_random_numbers_of_its_own():
     assert len(set(chosen[1][0].tolist())) > 1
 
 
+@pytest.mark.integration
 @pytest.mark.parametrize("name", ["DQN", "PPO", "IPPO"])
 def test_who_was_stopped_continues_bit_for_bit(name, tmp_path):
     members = [shared(EVERY[name], (0, 1, 2)), Learning(DQN(settings=REPLAY))]
     assert_goes_on_bit_for_bit(members, tmp_path, episodes=4)
 
 
+@pytest.mark.integration
 def test_a_run_is_built_again_plays_frozen_and_others_start_from_it(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     members = [shared(DQN(settings=REPLAY), (0, 1)), shared(TEAMS["IPPO"], (2, 3), reward="individual")]

@@ -58,6 +58,7 @@ def test_a_recipe_is_printed_as_it_is(monkeypatch, capsys):
     assert capsys.readouterr().out == (ROOT / "recipes" / "commons.py").read_text()
 
 
+@pytest.mark.integration
 @pytest.mark.parametrize("name", [name for name, own in shipped_recipes().items() if own.imports])
 def test_a_printed_recipe_that_imports_others_finds_them_anywhere(name, elsewhere, monkeypatch):
     monkeypatch.setattr(sys, "path", ["before", str(elsewhere), *sys.path])
@@ -70,6 +71,7 @@ def test_a_printed_recipe_that_imports_others_finds_them_anywhere(name, elsewher
     assert sys.path.index(folder) == 2, "behind the folder of the script, whose own modules come first"
 
 
+@pytest.mark.integration
 def test_a_module_of_ones_own_comes_before_that_of_the_recipes(elsewhere):
     (elsewhere / "mine.py").write_text(recipe_named("studies/time_out").text())
     (elsewhere / "base.py").write_text("raise SystemExit('my own base')")

@@ -67,6 +67,7 @@ ENGINES.remove(("torchrl", TABLE))
 COMPILED = [pytest.param("compiled", agent, marks=pytest.mark.slow) for agent in range(4)]
 
 
+@pytest.mark.integration
 @pytest.mark.parametrize(("engine", "agent"), [*ENGINES, *COMPILED])
 def test_agents_start_with_the_weights_of_a_stored_one(stored, engine, agent):
     kept = load_weights(Path(f"{stored}/alone/checkpoints/final.pt"))
@@ -134,6 +135,7 @@ def test_without_updates_it_plays_what_was_stored(stored):
     assert played[0] == played[1]
 
 
+@pytest.mark.integration
 def test_a_training_that_starts_from_another_is_run_stopped_and_resumed_without_it(
     stored, tmp_path, monkeypatch
 ):

@@ -210,6 +210,7 @@ def size(path):
         return image.size
 
 
+@pytest.mark.integration
 def test_figures_of_a_grid_are_drawn_with_a_condition_that_has_no_run(grid_runs, tmp_path):
     table = study_table(GRID, grid_runs)
     found = endings(sources_of(GRID, grid_runs)[0])
@@ -278,6 +279,7 @@ def test_other_factors_are_held_at_the_levels_of_the_reference():
 # What is written
 
 
+@pytest.mark.integration
 def test_the_results_of_a_study_are_a_table_a_summary_and_figures(grid_runs, tmp_path):
     table = write_results(GRID, tmp_path, grid_runs, again="cprl sweep grid.py")
     figures = {path.name for path in (tmp_path / "figures").iterdir()}
@@ -298,6 +300,7 @@ def test_the_results_of_a_study_are_a_table_a_summary_and_figures(grid_runs, tmp
     assert not list(tmp_path.rglob("*.partial"))
 
 
+@pytest.mark.integration
 def test_results_are_written_again_over_earlier_ones_and_none_of_those_is_left(grid_runs, tmp_path):
     (tmp_path / "figures").mkdir()
     (tmp_path / "figures" / "map_old.png").write_bytes(b"")

@@ -55,6 +55,7 @@ def sweep(line):
     sweep_words(shlex.split(line))
 
 
+@pytest.mark.integration
 def test_a_recipe_is_run_under_every_combination_and_the_same_line_does_nothing_again(capsys):
     line = (
         f"mine.py --vary game.rules.freeze-steps=2,5 --vary {GAMMA}=0.5 --turns 7 --episodes 1 --replicas 2"
@@ -76,6 +77,7 @@ def test_a_recipe_is_run_under_every_combination_and_the_same_line_does_nothing_
     assert "tiny: 4 of 4 trials finished" in capsys.readouterr().out
 
 
+@pytest.mark.integration
 def test_the_end_of_the_training_that_is_compared_may_be_longer(here):
     line = f"mine.py --vary {FREEZE}=2,5 --episodes 30 --out here"
     sweep(f"{line} --last 10")
@@ -97,6 +99,7 @@ def test_a_dry_run_lists_all_trials_and_writes_nothing(here, capsys):
     assert sorted(path.name for path in here.iterdir()) == ["mine.py"]
 
 
+@pytest.mark.integration
 def test_a_failed_condition_does_not_end_the_study_and_is_listed_with_what_tries_it_again(
     capsys, monkeypatch
 ):
@@ -209,6 +212,7 @@ def test_cprl_lists_sweep_among_its_commands(monkeypatch, capsys):
 STUDY = Study(TINY, {FREEZE: [2, 5]}, name="tiny_study", question="What if?", expectation="Nothing.")
 
 
+@pytest.mark.integration
 def test_a_study_has_a_command_line(capsys):
     line = ["recipes/mine.py", "--replicas", "2", "--block", "1", "--runs", "pool"]
     out = study_main(STUDY, line)
@@ -264,6 +268,7 @@ def test_ray_is_asked_for_by_name():
     assert executor_of(StudyOptions(on="ray", address="auto", jobs=3)) == Ray("auto", jobs=3)
 
 
+@pytest.mark.integration
 def test_a_study_that_is_interrupted_says_what_is_kept_and_how_to_continue(capsys):
     Path("study.py").write_text(
         "import os, signal\n"
@@ -290,6 +295,7 @@ def test_a_study_that_is_interrupted_says_what_is_kept_and_how_to_continue(capsy
     assert "tiny_study: 1 of 2 trials finished" in capsys.readouterr().out
 
 
+@pytest.mark.integration
 def test_a_second_process_on_the_same_study_says_so(tmp_path, capsys):
     from cprl.runs.lock import RunLock
 

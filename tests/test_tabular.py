@@ -189,6 +189,7 @@ def test_where_nothing_is_left_to_chance_it_learns_the_very_values(known):
     assert model.best()[0].max() == pytest.approx(1 + GAMMA), "two steps, two apples"
 
 
+@pytest.mark.integration
 @pytest.mark.parametrize("known", [AGAIN], ids=["regrowth"], indirect=True)
 def test_with_regrowth_its_policy_is_worth_what_value_iterations_is(known):
     game, model, rows = known

@@ -356,6 +356,7 @@ def test_a_worth_of_the_users_own_is_a_game_by_the_name_of_the_function_that_mak
     assert make_env(back.game).game == own_game()
 
 
+@pytest.mark.integration
 def test_a_population_trains_stops_resumes_loads_and_meets_another(tmp_path, monkeypatch, capsys):
     experiment = replace(EXPERIMENT, callbacks=[Custom("one_road_parts:Stopping")])
     whole = cprl.run(experiment, tmp_path / "whole", watch="off")

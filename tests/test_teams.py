@@ -51,6 +51,7 @@ def team_of(name, **how):
     return agents, learner
 
 
+@pytest.mark.integration
 @pytest.mark.parametrize("name", TEAMS)
 def test_each_team_moves_every_members_weights_and_no_replica_knows_of_the_others(name):
     together, learner = team_of(name, replicas=3)
@@ -72,6 +73,7 @@ def test_each_team_moves_every_members_weights_and_no_replica_knows_of_the_other
     )
 
 
+@pytest.mark.integration
 @pytest.mark.parametrize("name", TEAMS)
 def test_each_team_takes_the_way_that_agrees_with_a_list_of_torchrls_losses(name):
     algorithm = TEAMS[name]
@@ -208,12 +210,14 @@ def test_the_teams_value_grows_with_each_members_value():
     assert not torch.equal(doubled, mixing(chosen, state)), "how it mixes depends on what is seen"
 
 
+@pytest.mark.integration
 @pytest.mark.parametrize("name", ["QMIX", "MAPPO"])
 def test_a_team_that_was_stopped_goes_on_bit_for_bit(name, tmp_path):
     members = [Team(TEAMS[name], (0, 1, 2)), Learning(DQN(settings=REPLAY))]
     assert_goes_on_bit_for_bit(members, tmp_path, episodes=4)
 
 
+@pytest.mark.integration
 def test_a_teams_run_is_built_again_and_its_members_play_on_frozen(tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
     members = [Team(TEAMS["QMIX"], (0, 1)), Team(TEAMS["IPPO"], (2, 3), reward="individual")]

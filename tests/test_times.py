@@ -78,6 +78,7 @@ def test_what_a_training_leaves_in_cycles_is_freed_at_its_end():
         gc.enable()
 
 
+@pytest.mark.integration
 def test_a_training_that_compiled_is_freed_when_the_next_one_begins(monkeypatch):
     monkeypatch.setattr(garbage, "_is_set_aside", False)
     with cleared_up():

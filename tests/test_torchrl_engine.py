@@ -198,6 +198,7 @@ def first_and_slow(names, *first):
     return [pytest.param(name, marks=[] if name in first else pytest.mark.slow) for name in names]
 
 
+@pytest.mark.integration
 @pytest.mark.parametrize("name", first_and_slow(OFF_POLICY, "published DQN"))
 def test_from_the_same_draws_both_engines_have_the_same_weights_after_updates_from_replay(name):
     fast, stock = both(OFF_POLICY[name])
@@ -218,6 +219,7 @@ def test_from_the_same_draws_both_engines_have_the_same_weights_after_updates_fr
     assert all((before - after).abs().max() > 1e-4 for before, after in zip(first, last, strict=True))
 
 
+@pytest.mark.integration
 @pytest.mark.parametrize("name", first_and_slow(ON_POLICY, "PPO"))
 def test_from_the_same_draws_both_engines_have_the_same_weights_after_updates_from_rollouts(name):
     fast, stock = both(ON_POLICY[name])
@@ -285,6 +287,7 @@ def leaves(state):
     return dict(torch.utils._pytree.tree_flatten_with_path(state)[0])
 
 
+@pytest.mark.integration
 @pytest.mark.parametrize(
     ("name", "steps"),
     [
@@ -320,6 +323,7 @@ def test_a_stopped_learner_continues_bit_for_bit(name, steps):
         assert torch.equal(own, other) if isinstance(own, torch.Tensor) else own == other, where
 
 
+@pytest.mark.integration
 def test_a_stopped_training_continues_bit_for_bit_from_what_a_checkpoint_keeps():
     def training():
         groups = {(0,): (DQN, REPLAY), (1,): (PPO, ROLLOUT)}
@@ -350,6 +354,7 @@ def test_a_stopped_training_continues_bit_for_bit_from_what_a_checkpoint_keeps()
                 assert torch.equal(mine, theirs)
 
 
+@pytest.mark.integration
 @pytest.mark.parametrize("name", ["published DQN", pytest.param("PPO", marks=pytest.mark.slow)])
 def test_a_replica_learns_the_same_whichever_others_are_trained_with_it(name):
     algorithm = {**OFF_POLICY, **ON_POLICY}[name]
@@ -446,6 +451,7 @@ def test_n_steps_sum_the_rewards_of_an_episode_and_keep_its_last_flags():
                 assert torch.equal(kept["next", flag][step], came[last]["next", flag][replica])
 
 
+@pytest.mark.integration
 @pytest.mark.parametrize("name", [name for name in OFF_POLICY if name != "IQL"])
 def test_what_follows_n_steps_is_discounted_by_as_many(name):
     algorithm = replace(

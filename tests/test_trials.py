@@ -100,6 +100,7 @@ run_task(task(Path({folder!r})))
 """
 
 
+@pytest.mark.integration
 def test_a_trial_that_is_killed_in_its_training_is_resumed_bit_for_bit(tmp_path, undisturbed):
     own = task(tmp_path)
     code = KILLED.format(tests=str(Path(__file__).parent), folder=str(tmp_path))
@@ -147,6 +148,7 @@ def test_a_trial_waits_while_another_process_runs_it(tmp_path, undisturbed, monk
     assert len(waited) == 1
 
 
+@pytest.mark.integration
 def test_the_lock_of_another_host_is_taken_over_once_its_trial_is_silent(tmp_path, undisturbed, monkeypatch):
     own = task(tmp_path)
     own.directory.mkdir(parents=True)
@@ -173,6 +175,7 @@ def written_at(run):
     return (run / "report.json").stat().st_mtime_ns
 
 
+@pytest.mark.integration
 def test_a_study_runs_what_is_missing_and_an_edited_one_keeps_what_is_there(tmp_path):
     first = run_study(STUDY, tmp_path, results=False)
     assert first.failed == ()
@@ -188,6 +191,7 @@ def test_a_study_runs_what_is_missing_and_an_edited_one_keeps_what_is_there(tmp_
     assert read_study(tmp_path) == edited
 
 
+@pytest.mark.integration
 def test_studies_may_share_their_runs(tmp_path):
     run_study(STUDY, tmp_path / "a", runs=tmp_path / "pool", results=False)
     shared = run_study(Study(TINY, {FREEZE: [25, 30]}), tmp_path / "b", runs=tmp_path / "pool", results=False)
@@ -219,6 +223,7 @@ def test_nothing_is_written_where_a_study_is_refused(tmp_path):
     assert not (tmp_path / "x").exists()
 
 
+@pytest.mark.integration
 def test_a_study_varies_code_of_ones_own_and_a_process_that_knows_nothing_of_it_runs_it(tmp_path):
     fatigue = Custom("one_road_parts:Fatigue", arguments={"per_step": 0.5})
     study = Study(replace(TINY, transforms=(fatigue,)), {"transforms.0.arguments.per_step": [0.0, 0.5]})

@@ -95,6 +95,7 @@ def test_a_queue_that_stays_full_is_refused_and_the_end_has_a_deadline(short):
     assert time.monotonic() - started < 2
 
 
+@pytest.mark.integration
 @pytest.mark.parametrize("reads", [0, pytest.param(5_000, marks=pytest.mark.slow)])
 def test_a_viewer_that_never_answers_harms_neither_the_training_nor_the_file(
     reads, stalling, short, tmp_path, recwarn

@@ -219,6 +219,7 @@ def test_what_is_wanted_is_made_of_what_is_left_after_fines_and_transfers():
     assert wanted == pytest.approx(sum(episode.return_.sum() for episode in kept.episodes), abs=1e-4)
 
 
+@pytest.mark.integration
 @pytest.mark.parametrize("update_every", [1, 2])
 @pytest.mark.parametrize("name", ["replay", "rollouts", "replay of torchrl", "team"])
 def test_a_training_that_was_stopped_wants_on_bit_for_bit(name, update_every, tmp_path):
@@ -280,6 +281,7 @@ EXPERIMENT = Experiment(
 )
 
 
+@pytest.mark.integration
 def test_a_run_keeps_preferences_in_its_recipe_and_its_table(tmp_path):
     run = cprl.run(EXPERIMENT, tmp_path / "run", watch="off")
     loaded = cprl.load(run)

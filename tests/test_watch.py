@@ -97,12 +97,14 @@ def receiving():
         process.wait()
 
 
+@pytest.mark.integration
 @pytest.mark.parametrize("live", [None, "serve"])
 def test_watching_changes_nothing_that_is_learned(live, tmp_path, unwatched):
     assert course(tmp_path, live=live) == unwatched
     assert column(tmp_path / "run.rrd", "social/equality", "Scalars:scalars", "episode")[0] == list(range(8))
 
 
+@pytest.mark.integration
 def test_a_viewer_that_is_killed_half_way_changes_nothing(tmp_path, unwatched):
     with receiving() as (process, address):
         killing = Doing(60, process.kill)

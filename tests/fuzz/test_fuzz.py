@@ -29,6 +29,7 @@ def compiled():
     runs.root()
 
 
+@pytest.mark.integration
 @pytest.mark.filterwarnings("ignore::pytest.PytestUnraisableExceptionWarning")  # cases leave files open
 @pytest.mark.parametrize("which", SLICES)
 def test_generated_inputs_are_accepted_or_refused_as_documented(which, tmp_path, monkeypatch):
