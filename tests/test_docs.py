@@ -15,6 +15,7 @@ from cprl.measuring.series import OF_AGENTS
 from cprl.runs.columns import OF_INSTITUTIONS
 
 ROOT = Path(__file__).parents[1]
+INTERVAL = r"-?[\d.,]+ \[[^\]]*\d[^\]]*\]"
 PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md"))]
 
 
@@ -116,3 +117,10 @@ def test_links_between_pages_lead_somewhere():
             if heading:
                 headings = re.findall(r"^#+ (.*)$", path.read_text(), re.MULTILINE)
                 assert heading in [text.lower().replace(" ", "-") for text in headings], (page.name, heading)
+
+
+def test_every_interval_of_the_reproduction_stands_in_the_tables_that_the_report_wrote():
+    tables = (ROOT / "docs/results/tables.md").read_text()
+    told = re.findall(INTERVAL, (ROOT / "docs/results.md").read_text())
+    assert len(told) > 90
+    assert [one for one in told if one not in tables] == []
