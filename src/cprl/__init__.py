@@ -30,6 +30,7 @@ Each imports only from those above it:
     learners     replay and rollouts, updates of many agents at once
     algorithms   what agents learn by: DQN, PPO, QMIX and so on, frozen values
     population   how each agent is specified: Learning, Team, Scripted, Frozen
+    annotations  whether a value is of an annotated type
     config       values as JSON tables, and back
     presets      the published games and hyper-parameters by name
     measuring    social metrics, episodes, phases, statistics
@@ -41,6 +42,7 @@ Each imports only from those above it:
     finite       what is NaN or infinite in a training, found and named
     training     the loop: act, store, update, measure, record
     experiment   Experiment: what is trained and how, a value
+    stored_agents  agents of stored runs, as policies
     stored       load: a run built again from its directory
     earlier      agents of earlier runs: that play, and that others start from
     agents       the learners and policies of a population

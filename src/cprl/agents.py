@@ -27,7 +27,7 @@ from cprl.policies.scripted import scripted_lanes
 from cprl.population import AgentSpec, Frozen, Learning, Scripted, Team, grouped, refuse_undecided
 from cprl.preferences.values import named
 from cprl.spaces import Spaces
-from cprl.stored import stored_actor
+from cprl.stored_agents import stored_actor
 
 
 class Population:

@@ -13,7 +13,8 @@ from cprl.learners.lanes import lane_name
 from cprl.networks.agent import acting_part
 from cprl.population import Frozen, Learning, Team, refuse_sharing
 from cprl.spaces import Spaces
-from cprl.stored import LoadedRun, StoredAgent, load
+from cprl.stored import LoadedRun, load
+from cprl.stored_agents import StoredAgent
 
 
 def frozen_agents(

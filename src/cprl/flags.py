@@ -14,9 +14,9 @@ from typing import Annotated, Any, Final, Literal, Union, get_args, get_origin, 
 
 import tyro
 
+from cprl.annotations import fits
 from cprl.commons import maps
 from cprl.commons.maps import Map
-from cprl.config import fits
 from cprl.custom import Custom
 
 _DRAWN: Final = "as drawn"

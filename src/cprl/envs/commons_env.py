@@ -9,18 +9,17 @@ import torch
 from numpy.typing import NDArray
 from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
-from torchrl.data import Bounded, Categorical, Composite, Unbounded
 
 from cprl import arguments, keys
 from cprl.checks import shown
 from cprl.commons.batch import Batch, Output, output_of, turn_of
 from cprl.commons.game import Game, output_shapes
 from cprl.commons.world import Bytes, StepOutput
-from cprl.compat import LeanStepEnv, flag_spec, put_all, unchecked_tensordict
+from cprl.compat import LeanStepEnv, put_all, unchecked_tensordict
+from cprl.envs.commons_specs import DONE_ENTRIES, WORLD_ENTRIES, specs_of
 from cprl.envs.drivers import device_of, drawn_seed, driver_for
 from cprl.envs.recurrent_states import begin_states
 from cprl.envs.rendering import images
-from cprl.institutions import COUNTS
 
 _AGENT_ENTRIES = ("observation", "harvest", "in_play", "fired", "hit_by", "tagged_by")
 _TORCH_TYPES = {
@@ -32,14 +31,12 @@ _TORCH_TYPES = {
 }
 _WHOLE_NUMBERS = (torch.int64, torch.int32, torch.int16, torch.int8, torch.uint8)
 """The dtypes of actions that convert to int64 without a change of any number."""
-_WORLD_ENTRIES = ("stock", "regrown")
-_DONE_ENTRIES = ("done", "terminated", "truncated")
 _AHEAD_BYTES = 2**16
 """Below this size, memory is allocated for sixteen turns at once: an allocation takes as long as a world."""
 _AHEAD_TURNS = 16
 _BALLOT_ENTRIES = (keys.IN_FORCE, keys.BALLOTS_DUE)
 _OWN_KEYS = frozenset(
-    (*_WORLD_ENTRIES, *_DONE_ENTRIES, *_BALLOT_ENTRIES, keys.STATE, keys.AGENTS, "next", "_reset")
+    (*WORLD_ENTRIES, *DONE_ENTRIES, *_BALLOT_ENTRIES, keys.STATE, keys.AGENTS, "next", "_reset")
 )
 _PAID_ENTRIES = ("fines", "transfers", "violated", "counts")
 """Entries of agents in games with institutions."""
@@ -100,7 +97,7 @@ class CommonsEnv(LeanStepEnv):
         self._agents_size = torch.Size([worlds, game.agents])
         paid = _PAID_ENTRIES if game.institutions else ()
         self._agent_entries = (*_AGENT_ENTRIES, *paid, *(name for name, _ in game.spaces.vectors))
-        self._world_entries = (*_WORLD_ENTRIES, *(_BALLOT_ENTRIES if game.ballots else ()))
+        self._world_entries = (*WORLD_ENTRIES, *(_BALLOT_ENTRIES if game.ballots else ()))
         self._decides, self._is_governed = game.decisions > 0, bool(game.institutions)
         self._with_state = state
         self._forms = {
@@ -114,59 +111,9 @@ class CommonsEnv(LeanStepEnv):
         self.output: StepOutput
         self._whole: Output
         self._show_in(*self._fresh())
-        self._make_specs()
-
-    def _make_specs(self) -> None:
-        (worlds,), per_agent = self.batch_size, tuple(self._agents_size)
-        game, agents = self.game, self.game.agents
-
-        def group(**specs: Any) -> Composite:
-            return Composite(agents=Composite(**specs, shape=per_agent), shape=(worlds,))
-
-        decision = {"decision": Categorical(game.decisions, shape=per_agent, dtype=torch.int64)}
-        self.action_spec = group(
-            action=Categorical(len(self.game.actions), shape=per_agent, dtype=torch.int64),
-            **(decision if self._decides else {}),
-        )
-        self.reward_spec = group(reward=Unbounded(shape=(*per_agent, 1), dtype=torch.float32))
-        sites = len(self.game.map.sites)
-        observation_spec = group(
-            observation=Bounded(
-                0, game.observation_highest, shape=(*per_agent, *game.observation_shape), dtype=torch.uint8
-            ),
-            harvest=Bounded(0, 1, shape=per_agent, dtype=torch.float32),
-            in_play=flag_spec(*per_agent),
-            fired=flag_spec(*per_agent),
-            hit_by=flag_spec(*per_agent, agents),
-            tagged_by=flag_spec(*per_agent, agents),
-        )
-        if game.observation.scoreboard:
-            most = float(game.rules.episode_steps)
-            observation_spec[keys.SCOREBOARD] = Bounded(
-                0, most, shape=(*per_agent, agents), dtype=torch.float32
-            )
-        if game.observation.stock_gauge:
-            observation_spec[keys.STOCK_GAUGE] = Bounded(0, 1, shape=(*per_agent, 1), dtype=torch.float32)
-        if self._is_governed:
-            self._add_specs_of_institutions(observation_spec)
-        for name in _WORLD_ENTRIES:
-            observation_spec[name] = Bounded(0, sites, shape=(worlds, 1), dtype=torch.int64)
-        if self._with_state:
-            board = self.game.map.height, self.game.map.width
-            observation_spec[keys.STATE] = Bounded(0, 255, shape=(worlds, 3, *board), dtype=torch.uint8)
-        self.observation_spec = observation_spec
-        self.done_spec = Composite({name: flag_spec(worlds, 1) for name in _DONE_ENTRIES}, shape=(worlds,))
-
-    def _add_specs_of_institutions(self, specs: Composite) -> None:
-        game, per_agent = self.game, tuple(self._agents_size)
-        for key in (keys.FINES, keys.TRANSFERS):
-            specs[key] = Unbounded(shape=per_agent, dtype=torch.float32)
-        specs[keys.VIOLATED] = flag_spec(*per_agent)
-        specs[keys.COUNTS] = Unbounded(shape=(*per_agent, len(COUNTS)), dtype=torch.int32)
-        if game.ballots:
-            of_ballots = (self._size, len(game.ballots))
-            specs[keys.IN_FORCE] = Unbounded(shape=of_ballots, dtype=torch.float32)
-            specs[keys.BALLOTS_DUE] = flag_spec(*of_ballots)
+        specs = specs_of(game, worlds, state=state)
+        self.action_spec, self.observation_spec = specs.action, specs.observation
+        self.reward_spec, self.done_spec = specs.reward, specs.done
 
     def _fresh(self) -> tuple[dict[str, Tensor], Output]:
         """New memory for the output of a turn: as tensors by name, and the same memory as arrays."""
@@ -198,7 +145,7 @@ class CommonsEnv(LeanStepEnv):
         agents = {name: tensors[name] for name in self._agent_entries}
         if reward is not None:
             agents["reward"] = reward
-        entries: dict[str, Any] = {name: tensors[name] for name in (*self._world_entries, *_DONE_ENTRIES)}
+        entries: dict[str, Any] = {name: tensors[name] for name in (*self._world_entries, *DONE_ENTRIES)}
         if self._with_state:
             boards = torch.as_tensor(self.worlds.boards(self.output), device=self.device)
             entries[keys.STATE] = self._colours[boards.long()].permute(0, 3, 1, 2)

@@ -17,7 +17,8 @@ from cprl.measuring.evaluate import evaluate
 from cprl.policies.assignment import AgentPolicies
 from cprl.policies.decisions import decider_by_chance
 from cprl.policies.lanes import random_lanes
-from cprl.stored import LoadedRun, stored_policies
+from cprl.stored import LoadedRun
+from cprl.stored_agents import stored_policies
 
 Played: TypeAlias = dict[int, list[Episode]]
 """Episodes by the index of the replica."""

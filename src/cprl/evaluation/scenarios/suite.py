@@ -21,7 +21,8 @@ from cprl.evaluation.scenarios.scenario import Scenario
 from cprl.evaluation.scenarios.score import FOCAL_AGENTS, FocalAgents, Score, Scores
 from cprl.policies.assignment import AgentPolicies
 from cprl.population import Frozen, Scripted
-from cprl.stored import LoadedRun, StoredAgent, load, stored_policies
+from cprl.stored import LoadedRun, load
+from cprl.stored_agents import StoredAgent, stored_policies
 
 Member: TypeAlias = Callable[[int], StoredAgent]
 """Who plays with an agent index, by the index of the replica."""
