@@ -10,7 +10,7 @@ import torch
 from matrix_game import MatrixGame
 from torchrl.envs import Transform, TransformedEnv
 
-import cprl.training
+import cprl.training.training
 from cprl import CommonsEnv, Custom, Experiment, Game, Rules, load, maps, run
 from cprl.algorithms import (
     DQN,
@@ -182,7 +182,7 @@ NOTHING = np.zeros((3, 2))
 
 @pytest.fixture
 def looks_every_step(monkeypatch):
-    monkeypatch.setattr(cprl.training, "EVERY_STEPS", 1)
+    monkeypatch.setattr(cprl.training.training, "EVERY_STEPS", 1)
 
 
 def test_a_single_infinite_loss_is_named_with_its_step_and_whether_the_weights_are_sound():

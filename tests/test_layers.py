@@ -56,6 +56,7 @@ PACKAGES = (
     "agents",
     "outcome",
     "parts",
+    "leftovers",
     "running",
     "evaluation",
     "play",

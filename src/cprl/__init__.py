@@ -48,6 +48,7 @@ Each imports only from those above it:
     agents       the learners and policies of a population
     outcome      trained agents in fresh worlds, beside the random policy
     parts        what is made of an experiment before anything is written
+    leftovers    what a run leaves in its directory: removed, or said
     running      run: an experiment from its learners to its report
     evaluation   stored agents in fresh worlds, alone and among each other
     play         a person among trained or scripted agents

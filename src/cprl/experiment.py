@@ -27,10 +27,19 @@ from cprl.envs.make_env import PlayableGame
 from cprl.finite import OnNan
 from cprl.games import game_of, is_playable, stored_game
 from cprl.memory import DEVICE
-from cprl.population import SPEC, AgentSpec, Frozen, Learning, Team, refuse_undecided, specs_by_agent
+from cprl.population import (
+    SPEC,
+    AgentSpec,
+    Frozen,
+    Learning,
+    Team,
+    refuse_undecided,
+    specs_by_agent,
+    with_run_moved,
+)
 from cprl.preferences.values import check_preference
 from cprl.runs import formats
-from cprl.runs.old_recipes import experiment_config, upgraded_game
+from cprl.runs.old_recipes import experiment_config, has_old_rules, upgraded_game
 
 LoggerName = Literal["csv", "tensorboard", "wandb"]
 LOGGERS: Final[tuple[LoggerName, ...]] = get_args(LoggerName)
@@ -164,7 +173,7 @@ def recipe_config(recipe: Mapping[str, Any]) -> dict[str, Any]:
                 '"experiment"'
             )
         experiment = dict(recipe["experiment"])
-        if _has_old_rules(experiment.get("game")):
+        if has_old_rules(experiment.get("game")):
             experiment["game"] = upgraded_game(experiment["game"])
         return experiment
     try:
@@ -192,27 +201,8 @@ def changes(before: Experiment, now: Experiment) -> list[str]:
     return differences(before.to_config(), now.to_config(), "experiment")
 
 
-def _has_old_rules(game: object) -> bool:
-    """Whether the rules of a game have a field that is an institution now."""
-    if not isinstance(game, Mapping) or game.get("kind") != "Game":
-        return False
-    rules = game.get("rules")
-    if not isinstance(rules, Mapping) or not isinstance(game.get("map"), Mapping):
-        return False
-    return "may_bite" in rules or any(isinstance(rules.get(n), list) for n in ("may_fire", "freeze_steps"))
-
-
 def _is_old(recipe: Mapping[str, Any]) -> bool:
     return "arguments" in recipe and "format" not in recipe
-
-
-def with_run_moved(spec: Any, moved: Callable[[str], str]) -> Any:
-    """A specification of an agent whose stored run, if it has one, is in another directory."""
-    if isinstance(spec, Frozen):
-        return replace(spec, run=moved(spec.run))
-    if isinstance(spec, Learning | Team) and spec.start_from is not None:
-        return replace(spec, start_from=replace(spec.start_from, run=moved(spec.start_from.run)))
-    return spec
 
 
 def _with_runs(experiment: Experiment, moved: Callable[[str], str]) -> Experiment:

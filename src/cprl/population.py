@@ -5,8 +5,8 @@ remaining agent indices in order.
 """
 
 import os
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
 from typing import Any, Final, TypeAlias
 
 from cprl.algorithms.base import Algorithm, TeamAlgorithm
@@ -230,3 +230,12 @@ def exploration_steps(specs: Sequence[AgentSpec]) -> int | None:
         if isinstance(own, Exploring) and own.epsilon_end < own.epsilon_start
     ]
     return max(ends, default=None)
+
+
+def with_run_moved(spec: Any, moved: Callable[[str], str]) -> Any:
+    """A specification of an agent whose stored run, if it has one, is in another directory."""
+    if isinstance(spec, Frozen):
+        return replace(spec, run=moved(spec.run))
+    if isinstance(spec, Learning | Team) and spec.start_from is not None:
+        return replace(spec, start_from=replace(spec.start_from, run=moved(spec.start_from.run)))
+    return spec

@@ -1,8 +1,7 @@
 """run: one experiment from its learners to its report: train, save, evaluate in fresh worlds, summarise."""
 
-import shutil
 from collections.abc import Callable, Mapping, Sequence
-from contextlib import ExitStack, suppress
+from contextlib import ExitStack
 from dataclasses import asdict
 from datetime import datetime
 from pathlib import Path
@@ -15,25 +14,23 @@ from cprl.envs.state import transforms_state
 from cprl.experiment import Experiment
 from cprl.finite import summary
 from cprl.garbage import cleared_up, free_earlier
+from cprl.leftovers import remove, say_what_changed, say_what_is_kept, tidy_up
 from cprl.measuring.episodes import Episode
 from cprl.outcome import evaluate_population, heading, random_play, write_evaluation
-from cprl.output import ERR, OUT, console
+from cprl.output import OUT
 from cprl.parts import Parts, make_logger_callback, make_parts, make_viewer, title_of
 from cprl.population import exploration_steps
 from cprl.process import prepare_process
 from cprl.runs.checkpoints import FOLDER, Checkpointer, checkpoints_in
 from cprl.runs.directory import (
-    changed_circumstances,
     refuse_another_run,
     resume_command,
     start_run,
-    write_changed_circumstances,
     write_on_nan,
 )
 from cprl.runs.episodes import EpisodeTable
 from cprl.runs.extension import REPORT, extend, refuse_to_extend
 from cprl.runs.files import write_json
-from cprl.runs.lock import FILE_NAME as LOCK
 from cprl.runs.lock import RunLockedError
 from cprl.runs.loggers import check_logger
 from cprl.runs.weights import save_decisions, save_transforms, save_weights
@@ -132,7 +129,7 @@ def run(
         if episodes < experiment.episodes:
             refuse_to_extend(out, episodes, own.callbacks)
         elif (out / REPORT).exists():
-            _tidy_up(out, keep_checkpoint=keep_checkpoint, take_over=take_over)
+            tidy_up(out, keep_checkpoint=keep_checkpoint, take_over=take_over)
             return out
         directory = out
     else:
@@ -149,20 +146,20 @@ def run(
     try:
         with checkpointer:
             if resume:
-                _say_what_changed(directory)
+                say_what_changed(directory)
                 write_on_nan(directory, experiment.on_nan)
             if episodes < experiment.episodes:
                 extend(directory, episodes, experiment.episodes)
             viewer = closing.enter_context(make_viewer(watch, directory, own, experiment))
             _train_and_evaluate(directory, experiment, own, viewer, checkpointer, began, times, figures)
             checkpointer.done()
-            _say_what_is_kept(directory)
+            say_what_is_kept(directory)
     except BaseException as error:
         closing.close()
         if began.has_begun or (resume and isinstance(error, OSError)):
             error.add_note(f"To resume: {checkpointer.resume_command}")
         elif not resume and not isinstance(error, RunLockedError):
-            _remove(directory, but_keep_empty=is_there)
+            remove(directory, but_keep_empty=is_there)
         raise
     with closing:
         if at_end is not None:
@@ -186,47 +183,6 @@ def _check(
         callable_of("at_end", at_end, "a function of the run's directory, or None")
     for logger in experiment.loggers:
         check_logger(logger.resolve() if isinstance(logger, Custom) else logger)
-
-
-def _tidy_up(finished: Path, *, keep_checkpoint: bool, take_over: bool) -> None:
-    """Says that a run is finished, and tidies up if its process died before it had."""
-    if (finished / LOCK).exists():
-        with Checkpointer(finished, keep_ending=keep_checkpoint, take_over=take_over) as left:
-            left.done()
-    console().print(f"{finished} is finished; with more --episodes it is extended", soft_wrap=True)
-
-
-def _remove(directory: Path, *, but_keep_empty: bool) -> None:
-    """Removes a run that never began; nobody else has written into its directory."""
-    with suppress(OSError):
-        for path in directory.iterdir():
-            if path.is_dir():
-                shutil.rmtree(path)
-            else:
-                path.unlink()
-        if not but_keep_empty:
-            directory.rmdir()
-
-
-def _say_what_is_kept(directory: Path) -> None:
-    for kept in checkpoints_in(directory / FOLDER):
-        console().print(
-            f"Kept so that it can be extended (--resume with more --episodes): {kept}, "
-            f"{kept.stat().st_size / 1e6:,.1f} MB",
-            soft_wrap=True,
-        )
-
-
-def _say_what_changed(directory: Path) -> None:
-    changed = changed_circumstances(directory)
-    if changed:
-        console(ERR).print(
-            f"Warning: {directory} was begun under other versions, so that numbers may differ from those of "
-            f"an undisturbed run: {'; '.join(changed)}",
-            soft_wrap=True,
-            markup=False,
-        )
-        write_changed_circumstances(directory)
 
 
 def _train_and_evaluate(

@@ -3,6 +3,7 @@
 Modules, in the order in which one reads them:
     make_env         make_env, the one place where an environment is assembled; spaces_of
     commons_env      CommonsEnv, TorchRL: B worlds at once
+    commons_specs    what it takes and gives
     matrix/          MatrixGame, MatrixEnv: payoff tables, played once or several times
     taking/          TakingGame, TakingEnv: how much to take of what is shared, once or several times
     continuous       MaxOfTwoQuadratics: two agents choose a number each

@@ -5,6 +5,7 @@ Modules, in the order in which one reads them:
     cross_play  crossplay: a focal agent of one run among background agents of another
     gains       what a focal agent gains over the agent whose place it takes, and what it costs the others
     populations play_population: scripted and stored agents in any mix
+    respondable which runs, replicas, agents and seeds best responses can be measured with
     responses   play_responses: what trained best responses gain over the agents whose place they take
     schelling   what restrained and greedy agents get, by how many of the others are restrained
     empirical_game  play_empirical_game: the game whose strategies are runs; pairwise_game: of a cross-play

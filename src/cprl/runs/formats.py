@@ -15,7 +15,7 @@ RECIPE: Final = 2
 MANIFEST: Final = 1
 """Of `manifest.json`, and of what it lists: weights, tables, transforms, decisions."""
 TRAINING_STATE: Final = 2
-"""Of checkpoints."""
+"""Of checkpoints; 1 was that of cprl up to November 2026."""
 STUDY: Final = 1
 """Of `study.json`."""
 STUDY_TABLE: Final = 1

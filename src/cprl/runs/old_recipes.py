@@ -39,6 +39,16 @@ def experiment_config(recipe: Mapping[str, Any]) -> dict[str, Any]:
     }
 
 
+def has_old_rules(game: object) -> bool:
+    """Whether the rules of a game have a field that is an institution now."""
+    if not isinstance(game, Mapping) or game.get("kind") != "Game":
+        return False
+    rules = game.get("rules")
+    if not isinstance(rules, Mapping) or not isinstance(game.get("map"), Mapping):
+        return False
+    return "may_bite" in rules or any(isinstance(rules.get(n), list) for n in ("may_fire", "freeze_steps"))
+
+
 def upgraded_game(game: Mapping[str, Any]) -> dict[str, Any]:
     """The table of a game whose rules may have fields of before December 2026, which are institutions now:
     `may_bite`, and `may_fire` and `freeze_steps` by agent.

@@ -11,7 +11,7 @@ import numpy as np
 from cprl.arguments import refusal
 from cprl.checks import MOST_NUMBER, is_count, is_number
 from cprl.config import from_config, to_config
-from cprl.experiment import with_run_moved
+from cprl.population import with_run_moved
 from cprl.studies.paths import normalised
 
 _ALLOWED: Final = (

@@ -1,9 +1,9 @@
-"""The loop: act, store, update, measure, record."""
+"""Training: one step after the other, with a state that can be read and set."""
 
 import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
-from typing import Any, Final
+from typing import Any
 
 import numpy as np
 import torch
@@ -14,7 +14,7 @@ from torchrl.collectors import BaseCollector
 from torchrl.envs import EnvBase
 
 from cprl.arguments import callable_of, object_of
-from cprl.callbacks import SavesTraining, check_callbacks
+from cprl.callbacks import check_callbacks
 from cprl.collectors import StepCollector
 from cprl.envs.make_env import check_env, spaces_of
 from cprl.envs.state import carried_state, env_state, load_carried, load_env_state
@@ -38,9 +38,6 @@ from cprl.times import Times
 
 MakeCollector = Callable[[EnvBase, nn.Module], BaseCollector]
 """A collector out of an environment and a policy; it yields batches [R], or [R, T] of T turns."""
-
-STATE_FORMAT: Final = formats.TRAINING_STATE
-"""Of `Training.state_dict`; 1 was that of cprl up to November 2026."""
 
 
 class Training:
@@ -214,7 +211,7 @@ class Training:
         self.finite.check_weights(self.steps)
         self.finite.saved_step = self.steps
         return {
-            "format": STATE_FORMAT,
+            "format": formats.TRAINING_STATE,
             "steps": self.steps,
             **self.times.state_dict(),
             "played": list(self._played),
@@ -257,10 +254,11 @@ class Training:
         Raises:
             ValueError: for the state of a training of another version of cprl.
         """
-        if state.get("format", 1) != STATE_FORMAT:
+        if state.get("format", 1) != formats.TRAINING_STATE:
             raise ValueError(
-                f"the state has the format {state.get('format', 1)}, this version resumes {STATE_FORMAT}; "
-                "finish the run with the version that began it (its recipe.json has the commit)"
+                f"the state has the format {state.get('format', 1)}, this version resumes "
+                f"{formats.TRAINING_STATE}; finish the run with the version that began it (its recipe.json "
+                "has the commit)"
             )
         self.times.load_state_dict(state)
         self.steps, self._played = int(state["steps"]), list(state["played"])
@@ -290,60 +288,3 @@ def _return_to_decide_by(episode: Episode) -> NDArray[np.float64]:
     """What each agent's decisions are learned from, float64 [N]: its wanted return, else its return."""
     wanted = episode.wanted_return
     return episode.return_ if wanted is None else np.where(np.isnan(wanted), episode.return_, wanted)
-
-
-def train(
-    env: EnvBase,
-    learners: Mapping[tuple[int, ...], Learner],
-    *,
-    episodes: int,
-    others: Mapping[AgentIndices, nn.Module] | None = None,
-    decisions: Decider | None = None,
-    callbacks: Sequence[Any] = (),
-    checkpointer: SavesTraining | None = None,
-    update_every: int = 1,
-    make_collector: MakeCollector = StepCollector,
-    on_nan: OnNan = "stop",
-) -> Training:
-    """Plays so many episodes of every replica; each learner stores every turn and then updates.
-
-    Args:
-        env: see `Training`, also for all that is not said here.
-        learners: by the indices of their agents.
-        episodes: how many to play.
-        others: the actors of the agents that do not learn.
-        decisions: what all agents decide, where the game asks them.
-        callbacks: called after each turn and each episode.
-        checkpointer: where the training resumes from, and saves its state now and then.
-        update_every: steps k after which each learner updates, then k times.
-        make_collector: what plays.
-        on_nan: "stop" or "continue".
-
-    Returns:
-        The training, which is over.
-
-    Raises:
-        ValueError: see `Training`; with a checkpointer also for what has no state to resume from.
-        NotFiniteError: where a number is not finite, before a checkpoint holds it; see `cprl.finite`.
-    """
-    training = Training(
-        env,
-        learners,
-        episodes=episodes,
-        others=others,
-        decisions=decisions,
-        callbacks=callbacks,
-        update_every=update_every,
-        make_collector=make_collector,
-        on_nan=on_nan,
-    )
-    if checkpointer is not None:
-        object_of("checkpointer", checkpointer, SavesTraining, "None, or what has `restore` and `after_step`")
-        training.state_dict()  # what cannot be saved is refused now, not when the first checkpoint is due
-        checkpointer.restore(training)
-    training.start()
-    while not training.is_over:
-        training.step()
-        if checkpointer is not None:
-            checkpointer.after_step(training)
-    return training
