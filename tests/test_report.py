@@ -18,6 +18,7 @@ from cprl import presets
 from cprl.evaluation.film import film
 from cprl.measuring.movement import Trace
 from cprl.measuring.published import curve, published_experiment
+from cprl.population import Scripted
 from cprl.reporting import write_report
 from cprl.reporting.measures import ROUNDS, dip_depth, measures, of_play, of_training
 from cprl.reporting.result import Result
@@ -107,6 +108,17 @@ def test_runs_that_are_not_the_studys_have_no_columns_for_what_was_published(run
     assert "(figures/fishery_collective_return.png)" in text
     both = write_report([own, export_results(run, tmp_path / "two_against_random")], tmp_path).read_text()
     assert "| fishery |" not in both.split("## Appendix A")[1].split("## Collective return")[0]
+
+
+def test_agents_of_which_none_learns_are_not_called_trained(run, tmp_path):
+    game = cprl.Game(map=cprl.maps.parse(">.A.\n.A.<"), rules=cprl.Rules(episode_steps=20))
+    agents = [Scripted("random")] * 2
+    alone = cprl.Experiment(name="scripted", game=game, agents=agents, episodes=12, engine="eager")
+    scripted = cprl.run(alone, tmp_path / "scripted")
+    measures = write_report([scripted], tmp_path).read_text().split("## Measures")[1]
+    assert "| measure | agents | random policy |" in measures
+    assert "trained |" not in measures
+    assert "| measure | trained | random policy |" in write_report([run], tmp_path).read_text()
 
 
 def test_the_command_writes_a_report(run, tmp_path, capsys, monkeypatch):

@@ -140,7 +140,8 @@ def _measures(results: Sequence[Result]) -> list[str]:
             [name, claims.with_interval(values), f"{np.nanmean(own.random[name]):.4g}"]
             for name, values in own.trained.items()
         ]
-        lines += [f"### {result.name}", "", *table(["measure", "trained", "random policy"], rows)]
+        agents = "trained" if result.learns else "agents"
+        lines += [f"### {result.name}", "", *table(["measure", agents, "random policy"], rows)]
     return lines
 
 

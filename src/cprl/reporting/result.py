@@ -16,7 +16,7 @@ from cprl.algorithms import DQN
 from cprl.commons.game import Game
 from cprl.experiment import Experiment
 from cprl.measuring.published import SMOOTHED_EPISODES, PublishedExperiment, published_experiment
-from cprl.population import Learning, Scripted, exploration_steps
+from cprl.population import Learning, Scripted, Team, exploration_steps
 from cprl.reporting.measures import Measures, measures
 from cprl.runs.curves import Phases, as_curves, curves_of, episode_of_step, phases_of, running_mean
 from cprl.runs.directory import read_recipe
@@ -68,6 +68,11 @@ class Result:
             if isinstance(algorithm, DQN) and algorithm.loss_function != "l2":
                 parts.append(algorithm.loss_function)
         return ", ".join([*parts, f"{replicas} replicas of {episodes:,} episodes"])
+
+    @property
+    def learns(self) -> bool:
+        """Whether any of its agents learns."""
+        return any(isinstance(spec, Learning | Team) for spec in self.experiment.agents)
 
     @property
     def variant(self) -> str | None:
