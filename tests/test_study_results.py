@@ -1,5 +1,6 @@
 """What a study's table says: means, differences, phases, figures and the summary; numbers worked by hand."""
 
+import json
 import sys
 from pathlib import Path
 
@@ -332,6 +333,19 @@ def test_the_summary_of_runs_under_other_versions_says_so(tmp_path, monkeypatch)
     write_results(PAIRED, tmp_path, tmp_path / "runs")
     text = (tmp_path / "summary.md").read_text()
     assert "- The runs were made under more than one processor: Xeon in 1 run; Epyc in 1 run" in text
+
+
+def test_the_summary_says_how_many_steps_each_replica_learned_from_where_the_runs_do(tmp_path, monkeypatch):
+    monkeypatch.setattr("cprl.studies.results._draw", lambda *_: iter(()))
+    write_study(PAIRED, tmp_path / "runs", harvest)
+    write_results(PAIRED, tmp_path, tmp_path / "runs")
+    assert "environment steps" not in (tmp_path / "summary.md").read_text(), "runs of before did not say"
+    for nth, trial in enumerate(trials_of(PAIRED)):
+        (tmp_path / "runs" / trial.name / "report.json").write_text(json.dumps({"steps": 1000 + nth}))
+    write_results(PAIRED, tmp_path, tmp_path / "runs")
+    told = (tmp_path / "summary.md").read_text().split("| condition | episodes | environment steps |")[1]
+    counts = [line.split("|")[3].strip() for line in told.splitlines()[2:] if line]
+    assert counts == ["1,000", "1,001"]
 
 
 # The command line

@@ -8,7 +8,8 @@ from typing import Final
 from cprl.arguments import object_of
 from cprl.arguments import path as path_of
 from cprl.measuring.statistics import Interval
-from cprl.runs.files import write_atomically
+from cprl.runs.extension import REPORT
+from cprl.runs.files import read_json, write_atomically
 from cprl.studies.figures.by_condition import by_condition
 from cprl.studies.figures.by_factor import by_factor
 from cprl.studies.figures.courses import courses
@@ -17,7 +18,7 @@ from cprl.studies.figures.panels import MOST_CONDITIONS, is_numeric
 from cprl.studies.study import Study
 from cprl.studies.tables.comparing import LAST, compare, metrics_of
 from cprl.studies.tables.outcomes import Endings, endings
-from cprl.studies.tables.sources import sources_of
+from cprl.studies.tables.sources import Source, sources_of
 from cprl.studies.tables.table import WINDOW, StudyTable, study_table
 from cprl.studies.tables.texts import cells, markdown, metric_title
 from cprl.studies.tables.windows import EVALUATION, RANDOM, TRAINING
@@ -74,7 +75,7 @@ def write_results(
     table.write(out / TABLE)
     figures = list(_draw(table, found, out / FIGURES, last, interval)) if metrics else []
     _remove_stale(out / FIGURES, [name for name, _ in figures])
-    lines = _summary(study, table, found, figures, last, interval, again)
+    lines = [*_summary(study, table, found, figures, last, interval, again), *_lengths(table, sources)]
     content = ("\n".join(lines).rstrip() + "\n").encode("utf-8", "replace")
     write_atomically(out / SUMMARY, lambda file: file.write(content))
     return table
@@ -202,6 +203,32 @@ def _made(table: StudyTable) -> list[str]:
     if table.mixed:
         return [*lines, *(f"- {own}" for own in table.mixed), ""]
     return [*lines, f"All under {', '.join(f'{name} {own}' for name, own in first.items())}.", ""]
+
+
+def _lengths(table: StudyTable, sources: Sequence[Source]) -> list[str]:
+    """How long the runs of each condition were, where their reports say so."""
+    rows = []
+    for condition in table.design.conditions:
+        own = [source for source in sources if source.condition == condition]
+        reports = [read_json(source.run / REPORT) for source in own]
+        steps = {int(report["steps"]) for report in reports if "steps" in report}
+        if steps:
+            episodes = _range({source.episodes for source in own})
+            rows.append(f"| {condition.replace('|', chr(92) + '|')} | {episodes} | {_range(steps)} |")
+    if not rows:
+        return []
+    what = (
+        "How long each replica trained. The replicas of a run take each step together until every one has "
+        "played its episodes; those whose episodes are short play and learn on, in episodes that are in no "
+        "table."
+    )
+    return [what, "", "| condition | episodes | environment steps |", "|---|---:|---:|", *rows, ""]
+
+
+def _range(numbers: set[int]) -> str:
+    """The numbers, from the least to the most."""
+    least, most = min(numbers), max(numbers)
+    return f"{least:,}" if least == most else f"{least:,} to {most:,}"
 
 
 def _file_name(factor: str) -> str:
