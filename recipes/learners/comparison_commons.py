@@ -29,7 +29,7 @@ EPISODES = {
     "PPO": 2000,
     "IPPO": 2000,
     "QMIX": 1010,
-    "MADDPG": 1030,
+    "MADDPG": 1180,
     "PR2": 1200,
     "DQN as run": 1050,
 }
