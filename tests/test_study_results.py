@@ -346,6 +346,9 @@ def test_the_summary_says_how_many_steps_each_replica_learned_from_where_the_run
     told = (tmp_path / "summary.md").read_text().split("| condition | episodes | environment steps |")[1]
     counts = [line.split("|")[3].strip() for line in told.splitlines()[2:] if line]
     assert counts == ["1,000", "1,001"]
+    (tmp_path / "runs" / trials_of(PAIRED)[0].name / "report.json").write_text("{")
+    write_results(PAIRED, tmp_path, tmp_path / "runs")
+    assert "1,000 |" not in (tmp_path / "summary.md").read_text(), "a damaged report ends no summary"
 
 
 # The command line

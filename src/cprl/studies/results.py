@@ -210,8 +210,7 @@ def _lengths(table: StudyTable, sources: Sequence[Source]) -> list[str]:
     rows = []
     for condition in table.design.conditions:
         own = [source for source in sources if source.condition == condition]
-        reports = [read_json(source.run / REPORT) for source in own]
-        steps = {int(report["steps"]) for report in reports if "steps" in report}
+        steps = {steps for source in own if (steps := _steps_of(source.run)) is not None}
         if steps:
             episodes = _range({source.episodes for source in own})
             rows.append(f"| {condition.replace('|', chr(92) + '|')} | {episodes} | {_range(steps)} |")
@@ -223,6 +222,15 @@ def _lengths(table: StudyTable, sources: Sequence[Source]) -> list[str]:
         "table."
     )
     return [what, "", "| condition | episodes | environment steps |", "|---|---:|---:|", *rows, ""]
+
+
+def _steps_of(run: Path) -> int | None:
+    """Those that a run says it trained; None for a report of before, or one that cannot be read."""
+    try:
+        steps = read_json(run / REPORT).get("steps")
+    except (OSError, ValueError):
+        return None
+    return steps if isinstance(steps, int) else None
 
 
 def _range(numbers: set[int]) -> str:
