@@ -52,7 +52,7 @@ from cprl.institutions import (
 )
 from cprl.learners.decisions import Bandit
 from cprl.learners.settings import Optimizer
-from cprl.networks import GRU, MLP, Conv
+from cprl.networks import GRU, LSTM, MLP, Conv
 from cprl.objectives.log_cosh import DISTANCES
 from cprl.population import Frozen, Learning, Scripted, Team
 from cprl.preferences import Exchange, InequityAversion, SocialValueOrientation
@@ -90,7 +90,8 @@ ROLLOUTS = st.builds(RolloutSettings, max_grad_norm=st.none() | POSITIVE, epochs
 LOOKS = st.builds(LOLASettings, max_grad_norm=st.none() | POSITIVE, critic_epochs=st.integers(0, 9))
 TABULARS = st.builds(TabularSettings, learning_rate=st.just("1/visits") | SHARES)
 NETWORKS = st.none() | st.builds(MLP) | st.builds(Conv, channels=st.just((4, 8))) | CUSTOM
-RECURRENT = st.builds(GRU, recurrent_cells=st.integers(1, 9), encoder=st.builds(Conv) | st.builds(MLP))
+OF_RECURRENT = {"recurrent_cells": st.integers(1, 9), "encoder": st.builds(Conv) | st.builds(MLP)}
+RECURRENT = st.builds(GRU, **OF_RECURRENT) | st.builds(LSTM, **OF_RECURRENT)
 ALONE = st.one_of(
     st.builds(
         DQN,

@@ -12,7 +12,7 @@ from test_population import GAME, Returns, assert_goes_on_bit_for_bit, populatio
 from torch import nn
 from torchrl.envs import RewardScaling
 from torchrl.envs.utils import ExplorationType, set_exploration_type
-from torchrl.modules import GRUModule, set_recurrent_mode
+from torchrl.modules import GRUModule, LSTMModule, set_recurrent_mode
 
 import cprl
 from cprl import CommonsEnv, Custom, Experiment
@@ -44,17 +44,19 @@ from cprl.evaluation.film import film
 from cprl.learners.rollouts import RolloutLearner
 from cprl.measuring.evaluate import evaluate
 from cprl.measuring.movement import trace
-from cprl.networks import GRU, MLP, Conv
+from cprl.networks import GRU, LSTM, MLP, Conv
 from cprl.networks.stacked import lane_state, stack_lanes
 from cprl.play.opening import open_session
 from cprl.population import Frozen, Learning, Scripted, Team
 from cprl.training import train
 
 SMALL = GRU(encoder=MLP(hidden_cells=(6,)), recurrent_cells=5)
+LONG = LSTM(encoder=MLP(hidden_cells=(6,)), recurrent_cells=5)
 CONV = GRU(encoder=Conv(channels=(3,), hidden_cells=(6,)), recurrent_cells=5)
 ROLLOUTS = RolloutSettings(rollout_steps=20, minibatch_size=10, epochs=2)
 ON_POLICY = {
     "PPO": PPO(settings=ROLLOUTS, network=SMALL),
+    "PPO, LSTM": PPO(settings=ROLLOUTS, network=LONG),
     "PPO, convolutions": PPO(settings=ROLLOUTS, network=CONV),
     "A2C": A2C(settings=replace(ROLLOUTS, epochs=1), network=SMALL),
     "REINFORCE": Reinforce(settings=replace(ROLLOUTS, epochs=1), network=SMALL),
@@ -62,6 +64,7 @@ ON_POLICY = {
     "MAPPO": MAPPO(settings=ROLLOUTS, network=SMALL),
 }
 FOUR = (0, 1, 2, 3)
+QUICK = ("PPO", "PPO, LSTM", "IPPO")
 
 
 def specs(name, *, shares=False):
@@ -105,11 +108,46 @@ def test_the_recurrent_layer_equals_those_of_torch_and_torchrl():
     torch.testing.assert_close(network(seen, nothing, is_init)[1], played["out"])
 
 
-@pytest.mark.parametrize("network", [SMALL, CONV])
+def test_long_short_term_memory_equals_that_of_torch_and_torchrl():
+    """torch.nn.LSTM over a whole sequence, TorchRL's LSTMModule, which splits it where an episode begins."""
+    network = LONG.make(VECTORS, 3)
+    layer = nn.LSTM(6, 5, batch_first=True)
+    for name in ("weight_ih", "weight_hh", "bias_ih", "bias_hh"):
+        getattr(layer, f"{name}_l0").data.copy_(getattr(network.cell, name).data)
+    seen = torch.rand(4, 9, 6)
+    given, is_init = sequences(4, 9, 10)
+    outputs, after = network(seen, given, torch.zeros(4, 9, dtype=torch.bool))
+    first = tuple(own[None].contiguous() for own in given[:, 0].chunk(2, -1))
+    expected, (_, memory) = layer(network.encoder(seen), first)
+    torch.testing.assert_close(after[..., :5], expected)
+    torch.testing.assert_close(after[:, -1, 5:], memory[0])
+    torch.testing.assert_close(outputs, network.head(expected))
+    module = LSTMModule(
+        lstm=layer,
+        in_keys=["seen", "hidden", "memory", "is_init"],
+        out_keys=["out", ("next", "hidden"), ("next", "memory")],
+    )
+    nothing = torch.zeros(4, 9, 1, 5)
+    with set_recurrent_mode(True):
+        played = module(
+            cprl.envs.commons_env.TensorDict(
+                {
+                    "seen": network.encoder(seen),
+                    "hidden": nothing,
+                    "memory": nothing.clone(),
+                    "is_init": is_init[..., None],
+                },
+                [4, 9],
+            )
+        )
+    torch.testing.assert_close(network(seen, torch.zeros(4, 9, 10), is_init)[1][..., :5], played["out"])
+
+
+@pytest.mark.parametrize("network", [SMALL, LONG, CONV])
 def test_steps_one_by_one_give_what_a_sequence_gives(network):
     of_one = network.make(GAME.spaces, 8)
     seen = torch.randint(256, (2, 7, *GAME.observation_shape), dtype=torch.uint8)
-    given, is_init = sequences(2, 7, 5)
+    given, is_init = sequences(2, 7, *of_one.state_shape)
     outputs, after = of_one(seen, given, is_init)
     state = given[:, 0]
     for step in range(7):
@@ -119,12 +157,12 @@ def test_steps_one_by_one_give_what_a_sequence_gives(network):
         torch.testing.assert_close(state, after[:, step])
 
 
-@pytest.mark.parametrize("network", [SMALL, CONV])
+@pytest.mark.parametrize("network", [SMALL, LONG, CONV])
 def test_a_lane_of_a_stack_gives_and_learns_what_its_network_does_alone(network):
     networks = [network.make(GAME.spaces, 8) for _ in range(3)]
     stack = stack_lanes(networks)
     seen = torch.randint(256, (3, 7, *GAME.observation_shape), dtype=torch.uint8)
-    given, is_init = sequences(3, 7, 5)
+    given, is_init = sequences(3, 7, *stack.state_shape)
     outputs, after = stack(seen, given, is_init)
     flat = stack(seen.flatten(0, 1), given.flatten(0, 1), is_init.flatten())
     outputs.square().sum().backward()
@@ -138,6 +176,13 @@ def test_a_lane_of_a_stack_gives_and_learns_what_its_network_does_alone(network)
         assert all(torch.equal(kept[name], value) for name, value in own.state_dict().items())
         assert kept.keys() == own.state_dict().keys()
     torch.testing.assert_close(flat[0], outputs.flatten(0, 1))
+
+
+def test_networks_of_two_kinds_do_not_stack():
+    """Four gates of three units are as many numbers as three gates of four."""
+    kinds = GRU(recurrent_cells=4), LSTM(recurrent_cells=3)
+    with pytest.raises(ValueError, match="the networks of the lanes have 2 architectures; allowed: 1"):
+        stack_lanes([kind.make(GAME.spaces, 8) for kind in kinds])
 
 
 def test_the_gradient_runs_through_time_and_ends_where_a_sequence_begins():
@@ -259,7 +304,7 @@ def test_the_critic_goes_on_from_rollout_to_rollout_and_values_the_state_after_e
 @pytest.mark.integration
 @pytest.mark.parametrize(
     "name",
-    [name if name in ("PPO", "IPPO") else pytest.param(name, marks=pytest.mark.slow) for name in ON_POLICY],
+    [own if own in QUICK else pytest.param(own, marks=pytest.mark.slow) for own in ON_POLICY],
 )
 def test_each_algorithm_moves_every_agents_weights_and_no_replica_knows_of_the_others(name):
     together, alone = (
@@ -292,7 +337,8 @@ def test_members_that_share_a_recurrent_network_each_have_a_state(name):
 
 
 @pytest.mark.parametrize(
-    ("name", "engine"), [("PPO", "lane_axis"), ("PPO", "lane_axis_flat"), ("IPPO", "lane_axis")]
+    ("name", "engine"),
+    [("PPO", "lane_axis"), ("PPO", "lane_axis_flat"), ("PPO, LSTM", "lane_axis_flat"), ("IPPO", "lane_axis")],
 )
 def test_every_engine_learns_what_a_list_of_losses_does(name, engine):
     algorithm, spaces = ON_POLICY[name], GAME.spaces
@@ -329,7 +375,7 @@ def test_every_engine_learns_what_a_list_of_losses_does(name, engine):
 @pytest.mark.parametrize("name", ["PPO", pytest.param("MAPPO", marks=pytest.mark.slow)])
 def test_a_training_that_was_stopped_goes_on_bit_for_bit(name, tmp_path):
     members = {
-        "PPO": [Learning(ON_POLICY["PPO"]), Learning(ON_POLICY["REINFORCE"])],
+        "PPO": [Learning(ON_POLICY["PPO"]), Learning(ON_POLICY["PPO, LSTM"])],
         "MAPPO": [Team(ON_POLICY["MAPPO"], (0, 1))],
     }[name] + [Scripted("greedy"), Scripted()]
     assert_goes_on_bit_for_bit(members, tmp_path, episodes=7)
@@ -339,7 +385,7 @@ def test_a_training_that_was_stopped_goes_on_bit_for_bit(name, tmp_path):
 def ran(tmp_path_factory):
     """A run of recurrent agents of two sizes beside others that are not."""
     folder = tmp_path_factory.mktemp("recurrent")
-    larger = replace(ON_POLICY["PPO"], network=GRU(encoder=MLP(hidden_cells=(4,)), recurrent_cells=7))
+    larger = replace(ON_POLICY["PPO"], network=LSTM(encoder=MLP(hidden_cells=(4,)), recurrent_cells=7))
     agents = [
         Learning(ON_POLICY["PPO"]),
         Learning(larger),
@@ -408,20 +454,22 @@ def test_states_of_other_policies_are_refused(ran):
     policy = cprl.load(ran[1]).policy()
     moment = cprl.load(ran[1]).env().reset()
     moment["agents", "recurrent_state"] = torch.zeros(1, 4, 5)
-    with pytest.raises(ValueError, match=r"is \[1, 4, 5\]; allowed: \[1, 4, 7\]"):
+    with pytest.raises(ValueError, match=r"is \[1, 4, 5\]; allowed: \[1, 4, 14\]"):
         policy(moment)
 
 
 REPLAY = DQNSettings(buffer_size=60, batch_size=4)
 
 
+@pytest.mark.parametrize("network", [SMALL, LONG])
 @pytest.mark.parametrize("kind", [DQN, DistributionalDQN, CQL, SAC, IQL, PR2, VDN, QMIX, MADDPG, LOLA])
-def test_algorithms_that_learn_from_single_transitions_are_refused_by_name(kind):
+def test_algorithms_that_learn_from_single_transitions_are_refused_by_name(kind, network):
     settings = LOLASettings() if kind is LOLA else REPLAY
     with pytest.raises(
-        ValueError, match=rf"{kind.__name__}.network is GRU.*does not learn from sequences.*MAPPO learn"
+        ValueError,
+        match=rf"{kind.__name__}.network is (GRU|LSTM).*does not learn from sequences.*MAPPO learn",
     ):
-        kind(settings=settings, network=SMALL)
+        kind(settings=settings, network=network)
 
 
 def test_other_wrong_values_are_refused_by_name(tmp_path):
@@ -503,6 +551,7 @@ def test_memory_is_what_a_game_of_recall_needs():
         train(env, {(0,): learner}, episodes=500, callbacks=[returns])
         return [float(np.mean(own[-100:])) for own in returns.of.values()]
 
-    remembering = reached(GRU(encoder=MLP(hidden_cells=(8,)), recurrent_cells=8))
-    assert sorted(remembering)[1] > 0.9, remembering
+    for kind in (GRU, LSTM):
+        remembering = reached(kind(encoder=MLP(hidden_cells=(8,)), recurrent_cells=8))
+        assert sorted(remembering)[1] > 0.9, (kind, remembering)
     assert max(reached(MLP(hidden_cells=(16,)))) < 0.7

@@ -61,7 +61,7 @@ from cprl.learners.rollouts import RolloutLearner
 from cprl.learners.settings import Exploring
 from cprl.learners.tabular import TabularLearner
 from cprl.memory import TooLargeError
-from cprl.networks import GRU, MLP, Conv, ConvNetwork, MLPNetwork
+from cprl.networks import GRU, LSTM, MLP, Conv, ConvNetwork, MLPNetwork
 from cprl.networks.specification import new_network
 from cprl.policies.rng import LaneRng
 from cprl.population import Frozen, Learning, Scripted, Team, specs_by_agent
@@ -85,7 +85,7 @@ VALUES = [
     Observation(),
     Exploring(),
     *(REPLAY, ROLLOUTS, TABLES),
-    *(MLP(), Conv(), GRU(), SPACES),
+    *(MLP(), Conv(), GRU(), LSTM(), SPACES),
     prisoners_dilemma(turns=9),
     MaxOfTwoQuadratics(),
     *(herders(2, cost=2.0), PowerWorth(), TakingGame(appropriation(), most=3.0, turns=9)),
@@ -288,7 +288,7 @@ def test_an_unknown_keyword_is_pythons_own_type_error():
         (partial(MLPNetwork, (3, 2), 1.5), r"^outputs is 1\.5; allowed: an integer in 1"),
         (partial(ConvNetwork, (3, 2), 2), r"^observation_shape is \(3, 2\); allowed: a tuple of 3 or more"),
         (partial(ConvNetwork, (3, 2, 2), 2, kernel_cells=2), r"^kernel_cells is 2; allowed: 1, 3, 5"),
-        (partial(new_network, 3, SPACES, 2), r"^network is 3; allowed: MLP, Conv, GRU, Custom"),
+        (partial(new_network, 3, SPACES, 2), r"^network is 3; allowed: MLP, Conv, GRU, LSTM, Custom"),
         (partial(new_network, MLP(), GAME, 2), r"^spaces is a Game; allowed: a Spaces"),
         (partial(specs_by_agent, [3], 1), r"^agents\[0\] is 3; allowed: Learning, Team, Scripted, Frozen"),
         (partial(specs_by_agent, 3, 1), r"^specs is 3; allowed: a tuple"),

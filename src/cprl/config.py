@@ -58,7 +58,7 @@ from cprl.institutions import (
     Vote,
 )
 from cprl.learners.decisions import Bandit
-from cprl.networks import GRU, MLP, Conv
+from cprl.networks import GRU, LSTM, MLP, Conv
 from cprl.population import Frozen, Learning, Scripted, Team
 from cprl.preferences import Exchange, InequityAversion, SocialValueOrientation
 from cprl.theory import PowerWorth, SharingGame
@@ -71,7 +71,7 @@ _OF_CPRL: Final[tuple[type[Any], ...]] = (
     *(Monitoring, Quota, Sanctioner, Tax, Vote),
     *(DQN, DistributionalDQN, CQL, SAC, IQL, PPO, A2C, Reinforce, VDN, QMIX, MAPPO, IPPO, MADDPG),
     *(PR2, PR2ActorCritic, LOLA, Tabular),
-    *(DQNSettings, RolloutSettings, LOLASettings, TabularSettings, Bandit, MLP, Conv, GRU),
+    *(DQNSettings, RolloutSettings, LOLASettings, TabularSettings, Bandit, MLP, Conv, GRU, LSTM),
     Custom,
 )
 KINDS: Final[dict[str, type[Any]]] = {kind.__name__: kind for kind in _OF_CPRL}

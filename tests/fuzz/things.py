@@ -62,7 +62,7 @@ from cprl.learners.base import Learner
 from cprl.learners.decisions import Bandit
 from cprl.measuring import Episode
 from cprl.measuring.evaluate import evaluate
-from cprl.networks import GRU, MLP, Conv, MLPNetwork
+from cprl.networks import GRU, LSTM, MLP, Conv, MLPNetwork
 from cprl.policies.assignment import AgentPolicies
 from cprl.policies.lanes import random_agents
 from cprl.population import Frozen, Learning, Scripted, Team
@@ -139,6 +139,7 @@ EXAMPLES: Final[dict[type, tuple[Any, ...]]] = {
     MLP: (MLP(), MLP(hidden_cells=(4,))),
     Conv: (Conv(), Conv(channels=(2,), kernel_cells=3, hidden_cells=(4,))),
     GRU: (GRU(), GRU(encoder=MLP(hidden_cells=(4,)), recurrent_cells=3)),
+    LSTM: (LSTM(), LSTM(encoder=MLP(hidden_cells=(4,)), recurrent_cells=3)),
     Custom: (Custom("torchrl.envs.transforms:RewardScaling", arguments={"loc": 0.0, "scale": 2.0}),),
     DQN: (
         DQN(settings=REPLAY),

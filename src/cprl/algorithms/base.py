@@ -19,7 +19,7 @@ from cprl.learners.rollouts import RolloutLearner
 from cprl.learners.settings import DQNSettings, RolloutSettings
 from cprl.learners.torchrl import TorchRLReplayLearner, TorchRLRolloutLearner
 from cprl.networks.mlp import MOST_CELLS
-from cprl.networks.recurrent import GRU
+from cprl.networks.recurrent import Recurrent
 from cprl.networks.specification import Network
 from cprl.objectives.log_cosh import TORCHRL_DISTANCES
 from cprl.preferences.values import Preference, named
@@ -33,7 +33,7 @@ update, uncompiled; "torchrl": by TorchRL's stock parts, one agent after the oth
 
 _WEIGHT: Final = number(0, 1e6)
 _CHECKS: Final[dict[str, Check]] = {
-    "network": either(instance(Network | Custom, 'MLP, Conv, GRU, Custom("module:Class")'), NONE),
+    "network": either(instance(Network | Custom, 'MLP, Conv, GRU, LSTM, Custom("module:Class")'), NONE),
     "double": SWITCH,
     "atoms": count(2, MOST_CELLS),
     "lowest_return": number(-1e9, 1e9),
@@ -97,7 +97,7 @@ class Algorithm:
         checks = {**_CHECKS, "loss_function": one_of(*self.loss_functions)}
         check_fields(self, {name: own for name, own in checks.items() if name in of_cprl})
         network = getattr(self, "network", None)
-        if isinstance(network, GRU) and not self.can_be_recurrent:
+        if isinstance(network, Recurrent) and not self.can_be_recurrent:
             name = type(self).__name__
             raise ValueError(
                 f"{name}.network is {network}; allowed for {name}, which does not learn from sequences: MLP, "

@@ -32,7 +32,9 @@ def states_in(network: nn.Module) -> dict[str, tuple[int, ...]]:
         return {}
     for (name, _), shape in zip(parts, shapes, strict=True):
         if shape is None:
-            raise ValueError(f'the "{name}" is not recurrent; allowed beside a network that is: a GRU')
+            raise ValueError(
+                f'the "{name}" is not recurrent; allowed beside a network that is: a GRU or an LSTM'
+            )
     return {name: shape for name, shape in zip(NAMES, shapes, strict=True) if shape is not None}
 
 

@@ -3,7 +3,7 @@
 Modules, in the order in which one reads them:
     mlp            MLP: fully connected layers
     convolutional  Conv: convolutions over rows and columns
-    recurrent      GRU: a state that is kept from turn to turn
+    recurrent      GRU, LSTM: a state that is kept from turn to turn
     specification  Network: which of them an algorithm has; networks of your own
     agent          several networks of one agent that learn together
     distributional distributions of returns
@@ -18,7 +18,7 @@ Modules, in the order in which one reads them:
 
 from cprl.networks.convolutional import Conv, ConvNetwork
 from cprl.networks.mlp import MLP, MLPNetwork
-from cprl.networks.recurrent import GRU
+from cprl.networks.recurrent import GRU, LSTM
 from cprl.networks.specification import Network
 
-__all__ = ["GRU", "MLP", "Conv", "ConvNetwork", "MLPNetwork", "Network"]
+__all__ = ["GRU", "LSTM", "MLP", "Conv", "ConvNetwork", "MLPNetwork", "Network"]

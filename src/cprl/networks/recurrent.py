@@ -8,7 +8,7 @@ sequence may hold several episodes, and may begin in the middle of one.
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import Any, Final, NamedTuple
+from typing import Any, ClassVar, Final, Literal, NamedTuple
 
 import torch
 from torch import Tensor, nn
@@ -19,6 +19,7 @@ from cprl.networks.mlp import MLP, MOST_CELLS, check_size
 from cprl.networks.stacked import lane_state, stack_lanes
 from cprl.spaces import Spaces
 
+Kind = Literal["GRU", "LSTM"]
 _CHECKS: Final[dict[str, Check]] = {
     "encoder": Check(
         lambda value: instance(MLP | Conv, "").fits(value) and len(value.hidden_cells) > 0,
@@ -29,20 +30,17 @@ _CHECKS: Final[dict[str, Check]] = {
 
 
 @dataclass(frozen=True, kw_only=True)
-class GRU:
-    """A layer of gated recurrent units between an encoder of observations and a linear layer.
+class Recurrent:
+    """A recurrent layer between an encoder of observations and a linear layer: a `GRU` or an `LSTM`.
 
-    Its state is zero where an episode begins. Source: Cho et al., "Learning Phrase Representations using RNN
-    Encoder-Decoder for Statistical Machine Translation" (2014), in the form of `torch.nn.GRU`.
-
-    Raises:
-        ValueError: if a value is not allowed; names it and says what is.
+    Its state is zero where an episode begins.
     """
 
     encoder: MLP | Conv = MLP(hidden_cells=(32,))  # noqa: RUF009 - a frozen value
     """What reads the observation; its last hidden layer, with ReLU, is the input of the recurrent one."""
     recurrent_cells: int = 32
-    """Units of the recurrent layer: the numbers that an agent remembers."""
+    """Units H of the recurrent layer."""
+    kind: ClassVar[Kind]
 
     def __post_init__(self) -> None:
         check_fields(self, _CHECKS)
@@ -55,7 +53,7 @@ class GRU:
         relu_on_outputs: bool = False,
         glorot_uniform: bool = False,
         shape: Sequence[int] | None = None,
-    ) -> "GRUNetwork":
+    ) -> "RecurrentNetwork":
         """A new network; see `cprl.networks.specification.new_network`.
 
         Raises:
@@ -68,7 +66,35 @@ class GRU:
         *hidden_cells, features = self.encoder.hidden_cells
         first = replace(self.encoder, hidden_cells=tuple(hidden_cells))
         encoder = first.make(spaces, features, relu_on_outputs=True, shape=shape)
-        return GRUNetwork(encoder, outputs, recurrent_cells=self.recurrent_cells)
+        return RecurrentNetwork(encoder, outputs, kind=self.kind, recurrent_cells=self.recurrent_cells)
+
+
+@dataclass(frozen=True, kw_only=True)
+class GRU(Recurrent):
+    """A layer of gated recurrent units; its state is the H numbers that it puts out.
+
+    Source: Cho et al., "Learning Phrase Representations using RNN Encoder-Decoder for Statistical Machine
+    Translation" (2014), in the form of `torch.nn.GRU`.
+
+    Raises:
+        ValueError: if a value is not allowed; names it and says what is.
+    """
+
+    kind: ClassVar[Kind] = "GRU"
+
+
+@dataclass(frozen=True, kw_only=True)
+class LSTM(Recurrent):
+    """A layer of long short-term memory; its state is 2 H numbers, those that it puts out and then its cells.
+
+    Source: Hochreiter and Schmidhuber, "Long Short-Term Memory" (1997), with the forget gate of Gers et al.,
+    "Learning to Forget" (2000), in the form of `torch.nn.LSTM`.
+
+    Raises:
+        ValueError: if a value is not allowed; names it and says what is.
+    """
+
+    kind: ClassVar[Kind] = "LSTM"
 
 
 class _Weights(NamedTuple):
@@ -82,27 +108,30 @@ class _Weights(NamedTuple):
     head_bias: Tensor
 
 
-class GRUNetwork(nn.Module):
-    """The network of a `GRU`.
+class RecurrentNetwork(nn.Module):
+    """The network of a `GRU` or an `LSTM`.
 
     Args:
         encoder: a network with the attributes `outputs`, F of them, and `observation_dims`.
         outputs: the number of outputs A.
-        recurrent_cells: units of the recurrent layer, H.
+        kind: of the recurrent layer.
+        recurrent_cells: units of the recurrent layer, H; the state of one agent has K numbers, H or 2 H.
 
     Raises:
         TooLargeError: if there is too little memory for the weights.
     """
 
-    def __init__(self, encoder: nn.Module, outputs: int, *, recurrent_cells: int) -> None:
+    def __init__(self, encoder: nn.Module, outputs: int, *, kind: Kind, recurrent_cells: int) -> None:
         super().__init__()
         of_encoder: Any = encoder
-        check_size((of_encoder.outputs, 3 * recurrent_cells, outputs), more=3 * recurrent_cells**2)
+        gates = 4 if kind == "LSTM" else 3
+        check_size((of_encoder.outputs, gates * recurrent_cells, outputs), more=gates * recurrent_cells**2)
         self.encoder, self.outputs = encoder, outputs
         self.observation_dims: int = of_encoder.observation_dims
-        self.state_shape = (recurrent_cells,)
-        """The shape of the state of one agent."""
-        self.cell = nn.GRUCell(of_encoder.outputs, recurrent_cells)
+        self.state_shape = (2 * recurrent_cells if kind == "LSTM" else recurrent_cells,)
+        """The shape of the state of one agent, (K,)."""
+        make_cell = nn.LSTMCell if kind == "LSTM" else nn.GRUCell
+        self.cell: nn.LSTMCell | nn.GRUCell = make_cell(of_encoder.outputs, recurrent_cells)
         self.head = nn.Linear(recurrent_cells, outputs)
 
     def forward(
@@ -112,7 +141,7 @@ class GRUNetwork(nn.Module):
 
         Args:
             observation: uint8 or float [..., *shape]; of sequences [..., T, *shape].
-            state: before each step, [..., H] or [..., T, H]; of a step that is not in `is_init` not read.
+            state: before each step, [..., K] or [..., T, K]; of a step that is not in `is_init` not read.
             is_init: bool [..., T], see the module; that of the first step of a sequence is taken for True.
 
         Returns:
@@ -122,13 +151,13 @@ class GRUNetwork(nn.Module):
         steps = 1 if is_init is None else is_init.shape[-1]
         return _outputs(weights, self.encoder(observation), state, is_init, (1, -1, steps))
 
-    def stacked(self, networks: Sequence["GRUNetwork"]) -> "StackedGRU":
+    def stacked(self, networks: Sequence["RecurrentNetwork"]) -> "StackedRecurrent":
         """One network with the parameters of all lanes along a first axis; copies."""
-        return StackedGRU(networks)
+        return StackedRecurrent(networks)
 
 
-class StackedGRU(nn.Module):
-    """L networks like `GRUNetwork` whose parameters carry a lane axis, [L, in, out] and [L, 1, out].
+class StackedRecurrent(nn.Module):
+    """L networks like `RecurrentNetwork` whose parameters carry a lane axis, [L, in, out] and [L, 1, out].
 
     Args:
         networks: the networks of the lanes, of one architecture; their weights are copied.
@@ -137,10 +166,10 @@ class StackedGRU(nn.Module):
         ValueError: if the networks differ in architecture.
     """
 
-    def __init__(self, networks: Sequence[GRUNetwork]) -> None:
+    def __init__(self, networks: Sequence[RecurrentNetwork]) -> None:
         super().__init__()
         first = networks[0]
-        forms = {(*own.cell.weight_ih.shape, own.outputs) for own in networks}
+        forms = {(*own.cell.weight_ih.shape, *own.cell.weight_hh.shape, own.outputs) for own in networks}
         if len(forms) != 1:
             raise ValueError(f"the networks of the lanes have {len(forms)} architectures; allowed: 1")
         self.lanes, self.outputs = len(networks), first.outputs
@@ -152,7 +181,7 @@ class StackedGRU(nn.Module):
         )
 
     def lane_state(self, lane: int) -> dict[str, Tensor]:
-        """Copies of the weights of one lane, as the state dict of its `GRUNetwork`."""
+        """Copies of the weights of one lane, as the state dict of its `RecurrentNetwork`."""
         own = _Weights(*(weight[lane].detach() for weight in self.weights))
         state = {f"encoder.{name}": value for name, value in lane_state(self.encoder, lane).items()}
         return state | {
@@ -167,7 +196,7 @@ class StackedGRU(nn.Module):
     def forward(
         self, observation: Tensor, state: Tensor, is_init: Tensor | None = None
     ) -> tuple[Tensor, Tensor]:
-        """As `GRUNetwork.forward`, with a lane axis first: [L, ...], or all flat: [L x T, ...]."""
+        """As `RecurrentNetwork.forward`, with a lane axis first: [L, ...], or all flat: [L x T, ...]."""
         dims, steps = self.observation_dims, 1
         leading, shape = observation.shape[:-dims], observation.shape[-dims:]
         if is_init is not None:
@@ -177,7 +206,7 @@ class StackedGRU(nn.Module):
         return _outputs(_Weights(*self.weights), features, state, is_init, (self.lanes, -1, steps))
 
 
-def _layers(network: GRUNetwork) -> _Weights:
+def _layers(network: RecurrentNetwork) -> _Weights:
     """The layers of one network after its encoder, without a lane axis."""
     cell, head = network.cell, network.head
     return _Weights(
@@ -193,29 +222,30 @@ def _layers(network: GRUNetwork) -> _Weights:
 def _outputs(
     weights: _Weights, features: Tensor, state: Tensor, is_init: Tensor | None, size: tuple[int, int, int]
 ) -> tuple[Tensor, Tensor]:
-    """The outputs and the states after each step, of features [..., F] and states [..., H].
+    """The outputs and the states after each step, of features [..., F] and states [..., K].
 
     Args:
         weights: of L lanes.
         features: of one step, or of sequences if `is_init` is given.
         state: before each step.
-        is_init: see `GRUNetwork.forward`.
+        is_init: see `RecurrentNetwork.forward`.
         size: L, the sequences of each lane or -1, and the steps of each.
     """
     lanes, _, steps = size
-    leading, cells = features.shape[:-1], state.shape[-1]
+    leading, numbers = features.shape[:-1], state.shape[-1]
     gates = torch.baddbmm(weights.input_bias, features.reshape(lanes, -1, features.shape[-1]), weights.input)
-    gates, state = gates.view(lanes, -1, steps, 3 * cells), state.reshape(*size, cells)
+    gates, state = gates.view(lanes, -1, steps, gates.shape[-1]), state.reshape(*size, numbers)
     if is_init is None:
         after = _step(weights, gates[:, :, 0], state[:, :, 0]).unsqueeze(2)
     else:
         after = _through_time(weights, gates, state, is_init.reshape(*size, 1))
-    outputs = torch.baddbmm(weights.head_bias, after.reshape(lanes, -1, cells), weights.head)
-    return outputs.reshape(*leading, outputs.shape[-1]), after.reshape(*leading, cells)
+    put_out = after[..., : weights.state.shape[-2]].reshape(lanes, -1, weights.state.shape[-2])
+    outputs = torch.baddbmm(weights.head_bias, put_out, weights.head)
+    return outputs.reshape(*leading, outputs.shape[-1]), after.reshape(*leading, numbers)
 
 
 def _through_time(weights: _Weights, gates: Tensor, state: Tensor, is_init: Tensor) -> Tensor:
-    """The states after each step of sequences, [L, n, T, H]."""
+    """The states after each step of sequences, [L, n, T, K]."""
     now, after = state[:, :, 0], []
     # Unbound once: the gradient of an index per step would be as large as the sequence.
     each = zip(gates.unbind(2), state.unbind(2), is_init.unbind(2), strict=True)
@@ -226,19 +256,34 @@ def _through_time(weights: _Weights, gates: Tensor, state: Tensor, is_init: Tens
 
 
 def _step(weights: _Weights, of_input: Tensor, state: Tensor) -> Tensor:
-    """The states after a step, [L, n, H], by the formulas of `torch.nn.GRU`.
+    """The states after a step, [L, n, K].
 
     Args:
         weights: of L lanes.
-        of_input: what the reset gate, the update gate and the new value get from the input, [L, n, 3 H].
-        state: before the step, [L, n, H].
+        of_input: what the gates get from the input, [L, n, gates x H].
+        state: before the step, [L, n, K].
     """
+    cells, gates = weights.state.shape[-2:]
+    return (_gru_step if gates == 3 * cells else _lstm_step)(weights, of_input, state)
+
+
+def _gru_step(weights: _Weights, of_input: Tensor, state: Tensor) -> Tensor:
+    """By the formulas of `torch.nn.GRU`; gates are reset, update and the new value."""
     cells = state.shape[-1]
     of_state = torch.baddbmm(weights.state_bias, state, weights.state)
     both = (of_input[..., : 2 * cells] + of_state[..., : 2 * cells]).sigmoid()
     reset, update = both.chunk(2, -1)
     new = torch.addcmul(of_input[..., 2 * cells :], reset, of_state[..., 2 * cells :]).tanh()
     return torch.lerp(new, state, update)
+
+
+def _lstm_step(weights: _Weights, of_input: Tensor, state: Tensor) -> Tensor:
+    """By the formulas of `torch.nn.LSTM`; gates are input, forget, the new value and output."""
+    hidden, memory = state.chunk(2, -1)
+    gates = of_input + torch.baddbmm(weights.state_bias, hidden, weights.state)
+    enters, stays, new, leaves = gates.chunk(4, -1)
+    memory = torch.addcmul(stays.sigmoid() * memory, enters.sigmoid(), new.tanh())
+    return torch.cat([leaves.sigmoid() * memory.tanh(), memory], -1)
 
 
 def state_shape_of(network: nn.Module) -> tuple[int, ...] | None:

@@ -6,7 +6,7 @@ from typing import Any
 
 from torch import Tensor, nn
 
-from cprl.networks.recurrent import GRUNetwork, StackedGRU
+from cprl.networks.recurrent import RecurrentNetwork, StackedRecurrent
 from cprl.networks.stacked import lane_state
 
 
@@ -19,20 +19,22 @@ class RecurrentTeam(nn.Module):
             each member, which is kept.
     """
 
-    def __init__(self, networks: Sequence[GRUNetwork]) -> None:
+    def __init__(self, networks: Sequence[RecurrentNetwork]) -> None:
         super().__init__()
         first = networks[0]
         self.shares = len(networks) > 1 and all(network is first for network in networks)
-        self.members: GRUNetwork | StackedGRU = first if self.shares else StackedGRU(networks)
+        self.members: RecurrentNetwork | StackedRecurrent = (
+            first if self.shares else StackedRecurrent(networks)
+        )
         self.observation_dims, self.outputs = 1 + first.observation_dims, first.outputs
         self.state_shape = len(networks), *first.state_shape
-        """The shape of the states of a team, (S, H)."""
+        """The shape of the states of a team, (S, K)."""
 
     def forward(
         self, observation: Tensor, state: Tensor, is_init: Tensor | None = None
     ) -> tuple[Tensor, Tensor]:
-        """As `GRUNetwork.forward`: observations [..., S, *shape], states [..., S, H] and `is_init` [..., T]
-        to outputs [..., S, A] and states."""
+        """As `RecurrentNetwork.forward`: observations [..., S, *shape], states [..., S, K] and `is_init`
+        [..., T] to outputs [..., S, A] and states."""
         seen = observation.movedim(-self.observation_dims, 0)
         own = state.movedim(-2, 0)
         begins = None if is_init is None else is_init.expand(len(seen), *is_init.shape)

@@ -11,10 +11,10 @@ from cprl.checks import checked, instance
 from cprl.custom import Custom
 from cprl.networks.convolutional import Conv
 from cprl.networks.mlp import MLP
-from cprl.networks.recurrent import GRU
+from cprl.networks.recurrent import GRU, LSTM
 from cprl.spaces import Spaces
 
-Network: TypeAlias = MLP | Conv | GRU
+Network: TypeAlias = MLP | Conv | GRU | LSTM
 """A network of cprl. A network of your own is a `Custom`, called with (spaces, outputs) and its arguments."""
 
 
@@ -29,7 +29,7 @@ def new_network(
 ) -> nn.Module:
     """A new network from observations [..., *shape] to [..., outputs], initialised from torch's generator.
 
-    That of a `GRU` also reads and returns a state, see `cprl.networks.recurrent`.
+    That of a `GRU` or an `LSTM` also reads and returns a state, see `cprl.networks.recurrent`.
 
     Args:
         network: the architecture.
@@ -44,7 +44,7 @@ def new_network(
         ValueError: if agents observe entries that networks do not read, if the network cannot read the
             observation, or if it does not support `relu_on_outputs` or `glorot_uniform`.
     """
-    checked("network", network, instance(Network | Custom, 'MLP, Conv, GRU, Custom("module:Class")'))
+    checked("network", network, instance(Network | Custom, 'MLP, Conv, GRU, LSTM, Custom("module:Class")'))
     refuse_unseen(spaces)
     if not isinstance(network, Custom):
         return network.make(

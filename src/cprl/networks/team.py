@@ -10,7 +10,7 @@ from torch import Tensor, nn
 from torchrl.modules import QMixer
 
 from cprl.networks.mlp import MLPNetwork
-from cprl.networks.recurrent import GRUNetwork, state_shape_of
+from cprl.networks.recurrent import RecurrentNetwork, state_shape_of
 from cprl.networks.recurrent_team import RecurrentTeam
 from cprl.networks.stacked import StackedMLP, lane_state, stack_lanes, through_layers
 
@@ -124,7 +124,7 @@ def team_network(
 ) -> TeamNetwork | SharedTeam | ModuleTeam | RecurrentTeam:
     """The networks of the members of a team as one; a `SharedTeam` if they are all the same object, and a
     `RecurrentTeam` for recurrent ones."""
-    if all(isinstance(network, GRUNetwork) for network in networks):
+    if all(isinstance(network, RecurrentNetwork) for network in networks):
         return RecurrentTeam(networks)  # type: ignore[arg-type]
     if len(networks) > 1 and all(network is networks[0] for network in networks):
         return SharedTeam(networks[0], observation_dims=observation_dims)
