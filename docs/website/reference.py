@@ -58,18 +58,8 @@ _MODULES: Final = {
 INTERNAL: Final = {
     *("compat", "checks", "arguments", "output", "caches", "compile_clock", "times", "garbage", "process"),
     *("compiling", "memory", "collectors", "runs", "plotting", "terminal", "finite", "stored", "earlier"),
-    *(
-        "annotations",
-        "stored_agents",
-        "agents",
-        "outcome",
-        "parts",
-        "running",
-        "play",
-        "flags",
-        "commandline",
-        "command_parts",
-    ),
+    *("annotations", "stored_agents", "agents", "outcome", "parts", "leftovers", "running", "play", "flags"),
+    *("commandline", "command_parts"),
     *("evaluation_cli", "egta_cli", "scenarios_cli", "studies_options", "studies_cli", "exploit_cli"),
     *("libraries", "shipped", "recipes_cli", "docs_cli", "cli"),
 }
