@@ -84,12 +84,17 @@ def sequences(batch, steps, cells, *, seed=0):
     return torch.rand(batch, steps, cells, generator=chance) - 0.5, is_init
 
 
+def with_weights_of(network, layer):
+    """A layer of torch with the weights of a network's recurrent one."""
+    for name in ("weight_ih", "weight_hh", "bias_ih", "bias_hh"):
+        getattr(layer, f"{name}_l0").data.copy_(getattr(network.cell, name).data)
+    return layer
+
+
 def test_the_recurrent_layer_equals_those_of_torch_and_torchrl():
     """torch.nn.GRU over a whole sequence, TorchRL's GRUModule, which splits it where an episode begins."""
     network = SMALL.make(VECTORS, 3)
-    layer = nn.GRU(6, 5, batch_first=True)
-    for name in ("weight_ih", "weight_hh", "bias_ih", "bias_hh"):
-        getattr(layer, f"{name}_l0").data.copy_(getattr(network.cell, name).data)
+    layer = with_weights_of(network, nn.GRU(6, 5, batch_first=True))
     seen = torch.rand(4, 9, 6)
     given, is_init = sequences(4, 9, 5)
     outputs, after = network(seen, given, torch.zeros(4, 9, dtype=torch.bool))
@@ -111,9 +116,7 @@ def test_the_recurrent_layer_equals_those_of_torch_and_torchrl():
 def test_long_short_term_memory_equals_that_of_torch_and_torchrl():
     """torch.nn.LSTM over a whole sequence, TorchRL's LSTMModule, which splits it where an episode begins."""
     network = LONG.make(VECTORS, 3)
-    layer = nn.LSTM(6, 5, batch_first=True)
-    for name in ("weight_ih", "weight_hh", "bias_ih", "bias_hh"):
-        getattr(layer, f"{name}_l0").data.copy_(getattr(network.cell, name).data)
+    layer = with_weights_of(network, nn.LSTM(6, 5, batch_first=True))
     seen = torch.rand(4, 9, 6)
     given, is_init = sequences(4, 9, 10)
     outputs, after = network(seen, given, torch.zeros(4, 9, dtype=torch.bool))
