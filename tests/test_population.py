@@ -332,6 +332,54 @@ def test_a_frozen_agent_plays_what_it_learned_and_changes_no_more(tmp_path, monk
 
 
 @pytest.mark.integration
+def test_frozen_agents_of_one_run_act_as_lanes_of_one_actor_and_as_alone(tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    run, _ = ran(tmp_path, [Learning(ALGORITHMS["DQN"])] * 3 + [Learning(ALGORITHMS["PPO"])])
+    specs = [
+        Frozen(run, 2, replica=1),
+        Frozen(run, 0, replica=None),
+        Frozen(run, 3, replica=None),
+        Frozen(run, 1, replica=(1, 0)),
+    ]
+    together = population(specs).others
+    assert list(together) == [(0, 1, 3), (2,)], "agents of one kind"
+    seen = CommonsEnv(GAME, 2, seed=9).reset()["agents", "observation"]
+    chosen = torch.stack([together[0, 1, 3].choose(seen[:, [0, 1, 3]]) for _ in range(20)])
+    for place, agent in enumerate((0, 1, 3)):
+        members = [Scripted()] * 4
+        members[agent] = specs[agent]
+        alone = population(members).others[agent,]
+        for turn in chosen:
+            assert torch.equal(turn[:, place], alone.choose(seen[:, [agent]])[:, 0])
+
+
+@pytest.mark.integration
+def test_each_replica_can_have_a_frozen_agent_of_its_own(tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    run, earlier = ran(tmp_path, [Learning(ALGORITHMS["DQN"])] * 4)
+    spec = Frozen(run, 2, replica=[1, 0])
+    assert spec.replica == (1, 0)
+    actor = population([spec, *[Scripted()] * 3]).others[0,]
+    actor.epsilon = 0.0
+    seen = CommonsEnv(GAME, 2, seed=9).reset()["agents", "observation"][:, :1]
+    learned = [
+        earlier[f"replica_{replica}/agent_2"](own).argmax(-1)
+        for replica, own in zip((1, 0), seen, strict=True)
+    ]
+    assert torch.equal(actor.choose(seen), torch.stack(learned))
+    again, _ = ran(tmp_path, [Frozen("run", 2, replica=(1, 0)), *[Scripted()] * 3], name="again")
+    loaded = cprl.load(again)
+    assert loaded.specs[0] == Frozen("run", 2, replica=(1, 0))
+    assert torch.equal(loaded.agent(0, replica=1).network(seen), earlier["replica_0/agent_2"](seen))
+    with pytest.raises(ValueError, match=r"for each of 1 replicas, none for that of index 1"):
+        ran(tmp_path, [Frozen("run", 2, replica=(1,)), *[Scripted()] * 3], name="too_few")
+    assert not (tmp_path / "too_few").exists()
+    for wrong in ((), (0, -1), "0"):
+        with pytest.raises(ValueError, match="replica"):
+            Frozen("run", 2, replica=wrong)
+
+
+@pytest.mark.integration
 def test_a_tabular_agent_is_a_member_like_any_other(tmp_path, capsys):
     algorithm = Tabular(settings=TabularSettings(epsilon_hold_steps=5, epsilon_decay_steps=40))
     members = [Learning(algorithm), Learning(ALGORITHMS["DQN"]), Learning(algorithm), Scripted("greedy")]

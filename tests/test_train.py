@@ -14,6 +14,7 @@ from cprl.learners.replay import ReplayLearner
 from cprl.learners.settings import DQNSettings
 from cprl.measuring.evaluate import evaluate, mean_return
 from cprl.policies.assignment import AgentPolicies
+from cprl.policies.lanes import random_lanes
 from cprl.policies.single import RandomActor
 from cprl.runs.checkpoints import Checkpointer
 from cprl.runs.episodes import EpisodeTable, read_episodes
@@ -210,6 +211,18 @@ def test_two_callbacks_of_one_class_each_have_their_own_state():
     one.step()
     other.load_state_dict(one.state_dict())
     assert [own.count for own in other.callbacks] == [11, 21]
+
+
+def test_a_state_with_other_actors_of_agents_that_do_not_learn_is_refused_before_anything_is_set():
+    def training(others):
+        return Training(CommonsEnv(GAME, seed=0), {}, episodes=1, others=others)
+
+    apart = training({(agent,): random_lanes(8, seeds=[(agent,)], agents=1) for agent in (0, 1)})
+    apart.step()
+    together = training({(0, 1): random_lanes(8, seeds=[(0,), (1,)], agents=2)})
+    with pytest.raises(ValueError, match=r"has 2 actors .* for \[\[0, 1\]\]; finish the run"):
+        together.load_state_dict(apart.state_dict())
+    assert together.steps == 0
 
 
 def test_a_callback_that_nothing_would_call_is_refused():

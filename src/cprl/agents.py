@@ -1,6 +1,6 @@
 """Population: the learners and policies of a population, in every replica of a training."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from typing import Any
 
@@ -27,7 +27,7 @@ from cprl.policies.scripted import scripted_lanes
 from cprl.population import AgentSpec, Frozen, Learning, Scripted, Team, grouped, refuse_undecided
 from cprl.preferences.values import named
 from cprl.spaces import Spaces
-from cprl.stored_agents import stored_actor
+from cprl.stored_agents import StoredAgent, stored_actor
 
 
 class Population:
@@ -72,6 +72,7 @@ class Population:
         numbers = range(first_replica, first_replica + self.replicas)
         frozen = (spec for spec, _ in self._groups if isinstance(spec, Frozen))
         self._frozen = frozen_agents(frozen, self.spaces, self._game, allow, numbers)
+        self._acting = _acting_together(self._groups, self._frozen)
         who = {
             "replicas": self.replicas,
             "seed": seed,
@@ -120,13 +121,13 @@ class Population:
         replicas, all by default."""
         actors: dict[AgentIndices, nn.Module] = {}
         numbers = range(self._first, self._first + (replicas or self.replicas))
-        for spec, agents in self._groups:
+        for agents, specs in self._acting.items():
             how: dict[str, Any] = {"agents": len(agents), "worlds": worlds}
             how["seeds"] = lane_seeds(self.seed, replicas=numbers, agents=agents, purpose=purpose)
-            if isinstance(spec, Scripted):
-                actors[agents] = scripted_lanes(spec.policy, self._game or self.spaces, **how)
-            elif isinstance(spec, Frozen):
-                stored = [own for own in self._frozen[spec][: len(numbers)] for _ in agents]
+            if isinstance(specs[0], Scripted):
+                actors[agents] = scripted_lanes(specs[0].policy, self._game or self.spaces, **how)
+            else:
+                stored = [self._frozen[spec][place] for place in range(len(numbers)) for spec in specs]
                 actors[agents] = stored_actor(stored, self._game or self.spaces, **how)
         return actors
 
@@ -169,6 +170,20 @@ class Population:
             for learner in self.learners.values()
             for name, network in learner.networks().items()
         }
+
+
+def _acting_together(
+    groups: Sequence[tuple[AgentSpec, tuple[int, ...]]], stored: Mapping[Frozen, Sequence[StoredAgent]]
+) -> dict[tuple[int, ...], tuple[Any, ...]]:
+    """The specification of each agent that does not learn, by the agents that act as lanes of one actor:
+    scripted ones that are specified alike, and agents of one kind from one stored run."""
+    alike: dict[Any, dict[int, Scripted | Frozen]] = {}
+    for spec, agents in groups:
+        if isinstance(spec, Scripted | Frozen):
+            key = spec if isinstance(spec, Scripted) else (spec.run, stored[spec][0].kind)
+            alike.setdefault(key, {}).update(dict.fromkeys(agents, spec))
+    together = [dict(sorted(specs.items())) for specs in alike.values()]
+    return {tuple(specs): tuple(specs.values()) for specs in together}
 
 
 def _learner(spec: Learning | Team, spaces: Spaces, agents: tuple[int, ...], who: dict[str, Any]) -> Learner:

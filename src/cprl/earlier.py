@@ -31,14 +31,9 @@ def frozen_agents(
         for path in dict.fromkeys(spec.run for spec in specs)
     }
     return {
-        spec: [runs[spec.run].agent(spec.agent, replica=_theirs(spec, replica)) for replica in replicas]
+        spec: [runs[spec.run].agent(spec.agent, replica=spec.replica_for(replica)) for replica in replicas]
         for spec in specs
     }
-
-
-def _theirs(spec: Frozen, replica: int) -> int:
-    """The replica of the stored run."""
-    return replica if spec.replica is None else spec.replica
 
 
 def _fitting_run(
@@ -104,8 +99,9 @@ def start_weights(
     weights = {}
     for replica in replicas:
         for agent, stored_agent in zip(agents, theirs, strict=True):
-            where = f"{lane_name(_theirs(source, replica), stored_agent)} of {source.run}"
-            stored = run.agent(stored_agent, replica=_theirs(source, replica))
+            taken = source.replica_for(replica)
+            where = f"{lane_name(taken, stored_agent)} of {source.run}"
+            stored = run.agent(stored_agent, replica=taken)
             weights[lane_name(replica, agent)] = _weights(stored, algorithm, spaces, where)
     return weights
 

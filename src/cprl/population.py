@@ -10,7 +10,19 @@ from dataclasses import dataclass, replace
 from typing import Any, Final, TypeAlias
 
 from cprl.algorithms.base import Algorithm, TeamAlgorithm
-from cprl.checks import NONE, SWITCH, Check, check_fields, checked, count, either, instance, is_count, one_of
+from cprl.checks import (
+    NONE,
+    SWITCH,
+    Check,
+    check_fields,
+    checked,
+    count,
+    either,
+    instance,
+    is_count,
+    one_of,
+    tuple_of,
+)
 from cprl.custom import Custom
 from cprl.learners.decisions import Bandit
 from cprl.learners.settings import Exploring
@@ -48,6 +60,7 @@ _PATH: Final = Check(_is_path, f"the path of a run's directory, up to {_MOST_PAT
 _MEMBERS: Final = Check(_are_members, "ascending agent indices, at least one")
 _ALGORITHM: Final = _algorithm(Algorithm)
 _TEAM_ALGORITHM: Final = _algorithm(TeamAlgorithm)
+_THEIRS: Final = either(count(0), tuple_of(count(0), 1), NONE)
 
 
 @dataclass(frozen=True)
@@ -57,17 +70,33 @@ class Frozen:
     Args:
         run: the directory of the run, or of its results.
         agent: the index of the agent in that run.
-        replica: the replica of that run; None for the replica of the same number in each replica.
+        replica: the replica of that run; None for the replica of the same number in each replica; or one for
+            each replica here, e.g. (0, 1, 0, 1) where four play against two.
     """
 
     run: str
     agent: int
-    replica: int | None = 0
+    replica: int | tuple[int, ...] | None = 0
 
     def __post_init__(self) -> None:
         if isinstance(self.run, os.PathLike):
             object.__setattr__(self, "run", os.fspath(self.run))
-        check_fields(self, {"run": _PATH, "agent": count(0), "replica": either(count(0), NONE)})
+        check_fields(self, {"run": _PATH, "agent": count(0), "replica": _THEIRS})
+
+    def replica_for(self, replica: int) -> int:
+        """The replica of that run for a replica here.
+
+        Raises:
+            ValueError: where each replica has one, and this has none.
+        """
+        if not isinstance(self.replica, tuple):
+            return replica if self.replica is None else self.replica
+        if replica >= len(self.replica):
+            raise ValueError(
+                f"{self} names a replica for each of {len(self.replica)} replicas, none for that of index "
+                f"{replica}; allowed: as many as play"
+            )
+        return self.replica[replica]
 
 
 _START: Final = either(instance(Frozen, "Frozen(run, agent, replica)"), NONE)

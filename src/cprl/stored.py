@@ -100,8 +100,7 @@ class LoadedRun:
         if isinstance(spec, Frozen):
             if spec.run not in self._earlier:
                 self._earlier[spec.run] = load(spec.run, allow=self.allow)
-            theirs = replica if spec.replica is None else spec.replica
-            return self._earlier[spec.run].agent(spec.agent, replica=theirs)
+            return self._earlier[spec.run].agent(spec.agent, replica=spec.replica_for(replica))
         lane = lane_name(replica, agent)
         if lane not in self.networks:
             raise ValueError(f"{self.path} keeps no network of {lane}; kept are {sorted(self.networks)}")

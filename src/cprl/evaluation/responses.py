@@ -171,7 +171,7 @@ class Exploitability:
 
 def play_responses(
     run: str | Path | LoadedRun,
-    responses: Mapping[int, Mapping[str, str | Path]],
+    responses: Mapping[int, Mapping[str, str | Path | Frozen]],
     *,
     episodes: int = 20,
     replicas: int | None = None,
@@ -180,13 +180,15 @@ def play_responses(
 ) -> Exploitability:
     """Plays a stored population, and trained responses in the places of its agents, in the same fresh worlds.
 
-    In replica r the agents of the population are those of the run's replica r, and the response is what the
-    replica r of its run learned in that place. All explore as in evaluation.
+    In replica r the agents of the population are those of the run's replica r, and the response is what
+    replica r of its run learned in that place, or another replica that a `Frozen` names. All explore as in
+    evaluation.
 
     Args:
         run: the population: its directory, or a value of `cprl.load`; its replicas are 0, 1 and so on.
         responses: by the index of the agent whose place is taken, directories of runs by the names of
-            responses, e.g. {0: {"PPO": "runs/against"}}; they have the same game.
+            responses, e.g. {0: {"PPO": "runs/against"}}, or what they learned in that place, e.g.
+            {0: {"PPO": Frozen("runs/against", 0, replica=(2, 3))}}; they have the same game.
         episodes: episodes of each replica with each response where one is chosen, and as many where the gain
             is told.
         replicas: how many of the run's replicas play, the first ones; by default all.
@@ -202,15 +204,14 @@ def play_responses(
     check_population(population)
     trained = _opened(responses, population, allow)
     found = consecutive_replicas(population, replicas)
-    seed = check_seeds(
-        seed, episodes, [population, *(own for table in trained.values() for own in table.values())]
-    )
+    stored = [run for table in trained.values() for run, _ in table.values()]
+    seed = check_seeds(seed, episodes, [population, *stored])
     itself = [Frozen(path_of(population), other, replica=None) for other in range(population.game.agents)]
     how: dict[str, Any] = {"episodes": episodes, "replicas": found, "allow": allow}
 
-    def played(agent: int, name: str, own: LoadedRun) -> Response:
+    def played(agent: int, name: str, own: LoadedRun, response: Frozen) -> Response:
         among = list(itself)
-        among[agent] = Frozen(path_of(own), agent, replica=None)
+        among[agent] = response
         choosing, reporting = (
             play_population(population, among, seed=chance, **how) for chance in (seed + 1, seed)
         )
@@ -220,7 +221,7 @@ def play_responses(
         run=population,
         population=play_population(population, itself, seed=seed, **how),
         responses={
-            agent: tuple(played(agent, name, own) for name, own in table.items())
+            agent: tuple(played(agent, name, *own) for name, own in table.items())
             for agent, table in trained.items()
         },
         episodes=episodes,
@@ -230,22 +231,26 @@ def play_responses(
 
 def _opened(
     responses: object, population: LoadedRun, allow: Sequence[str]
-) -> dict[int, dict[str, LoadedRun]]:
-    """Responses by agent and name, of the same game as the population."""
-    allowed = 'a table by agent of directories by name, e.g. {0: {"PPO": "runs/against"}}'
+) -> dict[int, dict[str, tuple[LoadedRun, Frozen]]]:
+    """Responses by agent and name, of the same game as the population: their runs, and what plays of them."""
+    allowed = 'a table by agent of directories, or of Frozen, by name, e.g. {0: {"PPO": "runs/against"}}'
     if not isinstance(responses, Mapping):
         raise arguments.refusal("responses", responses, allowed)
-    found: dict[int, dict[str, LoadedRun]] = {}
+    found: dict[int, dict[str, tuple[LoadedRun, Frozen]]] = {}
     for agent in check_agents(list(responses), population):
         table = responses[agent]
         if not isinstance(table, Mapping) or not table:
             raise arguments.refusal(f"responses[{agent}]", table, allowed)
         found[agent] = {}
-        for name, directory in table.items():
+        for name, given in table.items():
             arguments.object_of("a name of a response", name, str, "a text")
-            own = load(arguments.path(f"responses[{agent}][{name!r}]", directory), allow=allow)
+            where = f"responses[{agent}][{name!r}]"
+            own = load(given.run if isinstance(given, Frozen) else arguments.path(where, given), allow=allow)
             check_same_game({str(population.path): population, str(own.path): own})
-            found[agent][name] = own
+            plays = given if isinstance(given, Frozen) else Frozen(path_of(own), agent, replica=None)
+            if plays.agent != agent:
+                raise arguments.refusal(where, given, f"agent {agent} of a run, whose place it takes")
+            found[agent][name] = own, plays
     return found
 
 

@@ -41,12 +41,18 @@ def refuse_to_write_over(path: Path) -> None:
         raise FileExistsError(f"{path} exists and is not overwritten; use another name")
 
 
-def write_table(path: Path, table: pa.Table) -> None:
-    """Writes a parquet file atomically.
+def write_table(path: Path, table: pa.Table, *, over: bool = False) -> None:
+    """Writes a parquet file atomically, as small as it gets.
+
+    Args:
+        path: the file.
+        table: what it holds.
+        over: whether a file that exists is replaced.
 
     Raises:
-        FileExistsError: if the file exists.
+        FileExistsError: if the file exists and is not to be replaced.
     """
-    refuse_to_write_over(path)
+    if not over:
+        refuse_to_write_over(path)
     path.parent.mkdir(parents=True, exist_ok=True)
-    write_atomically(path, lambda file: pq.write_table(table, file))
+    write_atomically(path, lambda file: pq.write_table(table, file, compression="zstd", compression_level=19))

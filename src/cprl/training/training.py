@@ -3,7 +3,7 @@
 import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
-from typing import Any
+from typing import Any, Final
 
 import numpy as np
 import torch
@@ -31,13 +31,14 @@ from cprl.learners.base import (
 )
 from cprl.measuring.episodes import Episode
 from cprl.measuring.tracking import tracker_of
-from cprl.policies.assignment import AgentIndices, AgentPolicies
+from cprl.policies.assignment import AgentIndices, AgentPolicies, agent_indices
 from cprl.policies.decisions import Decider
 from cprl.runs import formats
 from cprl.times import Times
 
 MakeCollector = Callable[[EnvBase, nn.Module], BaseCollector]
 """A collector out of an environment and a policy; it yields batches [R], or [R, T] of T turns."""
+_FINISH_THERE: Final = "finish the run with the version that began it (its recipe.json has the commit)"
 
 
 class Training:
@@ -257,8 +258,12 @@ class Training:
         if state.get("format", 1) != formats.TRAINING_STATE:
             raise ValueError(
                 f"the state has the format {state.get('format', 1)}, this version resumes "
-                f"{formats.TRAINING_STATE}; finish the run with the version that began it (its recipe.json "
-                "has the commit)"
+                f"{formats.TRAINING_STATE}; {_FINISH_THERE}"
+            )
+        if len(state["others"]) != len(self.others):
+            raise ValueError(
+                f"the state has {len(state['others'])} actors of agents that do not learn; this version has "
+                f"them for {[list(agent_indices(own)) for own in self.others]}; {_FINISH_THERE}"
             )
         self.times.load_state_dict(state)
         self.steps, self._played = int(state["steps"]), list(state["played"])

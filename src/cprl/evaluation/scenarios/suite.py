@@ -151,7 +151,7 @@ def _background(spec: Scripted | Frozen, stored: Mapping[str, LoadedRun]) -> Mem
 
     def theirs(replica: int) -> StoredAgent:
         following = run.replicas[(replica + 1) % len(run.replicas)]
-        return run.agent(spec.agent, replica=following if spec.replica is None else spec.replica)
+        return run.agent(spec.agent, replica=following if spec.replica is None else spec.replica_for(replica))
 
     return theirs
 
