@@ -29,7 +29,7 @@ RECIPES = sorted(
 )
 RESULTS = ROOT / "docs" / "results"
 # Trials of a study have the study's command, which gives no single experiment.
-STORED = sorted(set(RESULTS.rglob("recipe.json")) - set((RESULTS / "learners").rglob("recipe.json")))
+STORED = sorted(set(RESULTS.rglob("recipe.json")) - set((RESULTS / "studies").rglob("recipe.json")))
 
 
 def experiment(*, variant: presets.Variant = "published", spare: int = 3) -> Experiment:
