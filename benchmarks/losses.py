@@ -125,6 +125,8 @@ def main(*, learners: tuple[int, ...] = (4, 32), repeats: int = 5, only: tuple[s
         repeats: of which the best counts.
         only: which losses, by name; by default all.
     """
+    if unknown := sorted(set(only) - set(ALGORITHMS)):
+        raise SystemExit(f"--only names {', '.join(unknown)}; allowed: {', '.join(ALGORITHMS)}")
     table = Table(
         "loss", "way", "compiled", title=f"us an update of so many learners, batch {BATCH}, one thread"
     )
