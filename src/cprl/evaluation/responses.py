@@ -245,12 +245,13 @@ def _opened(
         for name, given in table.items():
             arguments.object_of("a name of a response", name, str, "a text")
             where = f"responses[{agent}][{name!r}]"
-            own = load(given.run if isinstance(given, Frozen) else arguments.path(where, given), allow=allow)
-            check_same_game({str(population.path): population, str(own.path): own})
-            plays = given if isinstance(given, Frozen) else Frozen(path_of(own), agent, replica=None)
-            if plays.agent != agent:
+            if not isinstance(given, Frozen):
+                given = Frozen(str(arguments.path(where, given)), agent, replica=None)
+            if given.agent != agent:
                 raise arguments.refusal(where, given, f"agent {agent} of a run, whose place it takes")
-            found[agent][name] = own, plays
+            own = load(given.run, allow=allow)
+            check_same_game({str(population.path): population, str(own.path): own})
+            found[agent][name] = own, given
     return found
 
 

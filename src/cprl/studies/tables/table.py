@@ -35,7 +35,7 @@ from cprl.arguments import integer, object_of
 from cprl.arguments import path as path_of
 from cprl.runs import formats
 from cprl.runs.directory import versions
-from cprl.runs.files import write_atomically
+from cprl.runs.labelled import write_table
 from cprl.studies.study import Study
 from cprl.studies.tables.circumstances import Circumstances, circumstances_of, marks, sentences
 from cprl.studies.tables.rows import rows_of
@@ -152,8 +152,7 @@ class StudyTable:
     def write(self, path: Path | str) -> Path:
         """Writes a parquet file atomically, which `read` gives back; replaces an older one."""
         path = path_of("path", path)
-        path.parent.mkdir(parents=True, exist_ok=True)
-        write_atomically(path, lambda file: pq.write_table(self.rows, file, compression="zstd"))
+        write_table(path, self.rows, over=True)
         return path
 
     @classmethod
