@@ -100,6 +100,27 @@ def test_a_dry_run_lists_all_trials_and_writes_nothing(here, capsys):
 
 
 @pytest.mark.integration
+def test_a_part_of_a_study_is_run_by_the_levels_that_its_conditions_have(here, capsys):
+    """Levels are whole words: freeze_steps=2 is not freeze_steps=25."""
+    line = f"mine.py --vary {FREEZE}=2,25 --vary {GAMMA}=0.5,0.55 --episodes 1 --no-figures --out here"
+    sweep(f"{line} --only freeze_steps=2 --dry-run")
+    said = capsys.readouterr().out
+    assert "freeze_steps=2, gamma=0.55" in said
+    assert "freeze_steps=25" not in said
+    assert not Path("here").exists()
+    sweep(f'{line} --only "gamma=0.5, freeze_steps=2" --only "freeze_steps=25, gamma=0.55"')
+    states = {own.condition.name: own.state(Path("here/runs")) for own in trials_of(read_study("here"))}
+    assert [name for name, state in states.items() if state == "finished"] == [
+        "freeze_steps=2, gamma=0.5",
+        "freeze_steps=25, gamma=0.55",
+    ]
+    assert len(states) == 4
+    with pytest.raises(ValueError, match=r"only is 'gamma=0.9'; allowed: a condition or levels of some: fr"):
+        sweep(f"{line.replace('here', 'elsewhere')} --only gamma=0.9")
+    assert not Path("elsewhere").exists()
+
+
+@pytest.mark.integration
 def test_a_failed_condition_does_not_end_the_study_and_is_listed_with_what_tries_it_again(
     capsys, monkeypatch
 ):
@@ -144,6 +165,7 @@ def test_a_failed_condition_does_not_end_the_study_and_is_listed_with_what_tries
         (f"mine.py --vary {FREEZE}=2 --search 3 --draws 3", "--draws is not for a search"),
         (f"mine.py --vary {FREEZE}=2 --search 3 --maximise peace --minimise peace", "allowed: one of them"),
         (f"mine.py --vary {FREEZE}=2 --search 3 --maximise luck", "metric is 'luck'; allowed: "),
+        (f"mine.py --vary {FREEZE}=2 --search 3 --only freeze_steps=2", "--only is for studies"),
         (f"mine.py --vary {FREEZE}=2 --reference best", "reference is 'best'; allowed: the name of"),
         (f"mine.py --vary {FREEZE}=2 --jobs 0", "--jobs is 0; allowed"),
         (f"mine.py --vary {FREEZE}=2 --jobs 2 --on here", "--jobs is 2 with --on here"),

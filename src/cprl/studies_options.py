@@ -17,7 +17,7 @@ import tyro
 from cprl.arguments import integer
 from cprl.output import console, say
 from cprl.runs.directory import without_directories
-from cprl.studies.execution import RUNS, STATUS, StudyResult, directory_of, run_study
+from cprl.studies.execution import RUNS, STATUS, StudyResult, directory_of, run_study, trials_with
 from cprl.studies.executors import Executor, InProcess, Processes, Ray
 from cprl.studies.overview import Overview, label_of
 from cprl.studies.points import Search
@@ -43,6 +43,9 @@ class StudyOptions:
     """The directory of the runs, which several studies may share; by default runs/ in the study's."""
     jobs: int | None = None
     """Trials that run at the same time."""
+    only: tyro.conf.UseAppendAction[tuple[str, ...]] = ()
+    """Run a condition alone, or those with some levels: "gamma=0.9", "gamma=0.9, freeze_steps=5"; may be
+    repeated. The others stay as they are, so that several machines can share a study."""
     on: Literal["here", "processes", "ray"] | None = None
     """Where trials are run: one after the other in this process, in processes on this machine, or by Ray
     (extra "ray"); by default here, and in processes with more than one of --jobs."""
@@ -99,6 +102,8 @@ def carry_out(what: Study | Search, options: StudyOptions, command: Sequence[str
         SystemExit: with code 1 where trials have failed, and where it was interrupted.
     """
     executor, again = executor_of(options), shlex.join(command)
+    if options.only and isinstance(what, Search):
+        raise ValueError("--only is for studies, and this is a search; allowed: one without the other")
     if options.dry_run:
         return _list(what, options)
     names = ("runs", "allow", "watch", "last")
@@ -110,7 +115,7 @@ def carry_out(what: Study | Search, options: StudyOptions, command: Sequence[str
             result = run_search(what, options.out, **how)
             _say_best(result)
         else:
-            result = run_study(what, options.out, **how)
+            result = run_study(what, options.out, only=options.only, **how)
     say(result.out)
     if result.failed:
         _say_failed(result, again)
@@ -126,7 +131,8 @@ def _list(what: Study | Search, options: StudyOptions) -> Path:
         factors = ", ".join(f"{name}: {own}" for name, own in what.factors.items())
         say(f"{what.points} points of {factors}, found one after the other, in {out}; nothing was written")
         return out
-    trials, runs = trials_of(study), out / RUNS if options.runs is None else options.runs
+    trials = trials_with(trials_of(study), options.only)
+    runs = out / RUNS if options.runs is None else options.runs
     overview = Overview(trials, runs=runs, status=out / STATUS)
     now = overview.look()
     if now.counts["unfinished"]:  # those that run say something new within a second

@@ -13,6 +13,7 @@ from cprl.runs.lock import FILE_NAME as LOCK
 from cprl.runs.lock import RunLock, RunLockedError
 from cprl.studies.executors import Executor, InProcess
 from cprl.studies.live import LiveStudy, check_live
+from cprl.studies.naming import BETWEEN
 from cprl.studies.progress import Progress
 from cprl.studies.study import Study
 from cprl.studies.tables.comparing import LAST
@@ -45,6 +46,7 @@ def run_study(
     *,
     on: Executor | None = None,
     runs: Path | str | None = None,
+    only: Sequence[str] = (),
     allow: Sequence[str] = (),
     progress: bool = True,
     watch: str = "off",
@@ -62,6 +64,8 @@ def run_study(
             was changed keeps the runs that are there.
         on: where trials are run, see `cprl.studies.executors`; by default in this process.
         runs: the directory of the runs, which several studies may share; by default `runs` in `out`.
+        only: the conditions that are run now, by their names or by some of the levels in these, such as
+            "gamma=0.9" or "gamma=0.9, freeze_steps=5"; the others stay as they are. By default all are run.
         allow: the user's own code, "module:Class", that stored runs of `Frozen` agents may import.
         progress: whether a table of all trials is shown; lines where the output is not a terminal.
         watch: "off", or "serve", "spawn", "connect ADDRESS" for the same table and the returns of finished
@@ -78,13 +82,34 @@ def run_study(
     out = directory_of(study, out)
     folder = out / RUNS if runs is None else path("runs", runs)
     trials = trials_of(study)
+    chosen = trials_with(trials, only)
     check_executor(on)
     switch("results", results)
     check_last(last)
     with as_driver(study, trials, out, folder, allow=allow, progress=progress, watch=watch) as driver:
-        failed = driver.run(trials, on or InProcess())
+        failed = driver.run(chosen, on or InProcess())
     table = results_of(study, trials, out, folder, last=last, again=again) if results else None
     return StudyResult(study, out, folder, tuple(trials), failed, table)
+
+
+def trials_with(trials: Sequence[Trial], only: Sequence[str]) -> list[Trial]:
+    """The trials of conditions that have one of some names, or its levels; without any, all of them.
+
+    Raises:
+        ValueError: for what is in no name; says which names there are.
+    """
+    wanted = [set(levels.split(BETWEEN)) for levels in texts("only", only)]
+    names = list(dict.fromkeys(trial.condition.name for trial in trials))
+    for levels, text in zip(wanted, only, strict=True):
+        if not any(levels <= set(name.split(BETWEEN)) for name in names):
+            raise refusal("only", text, f"a condition or levels of some: {'; '.join(names)}")
+    if not wanted:
+        return [*trials]
+    return [
+        trial
+        for trial in trials
+        if any(levels <= set(trial.condition.name.split(BETWEEN)) for levels in wanted)
+    ]
 
 
 def results_of(

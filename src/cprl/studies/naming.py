@@ -6,10 +6,13 @@ from typing import Any
 
 from cprl.checks import shown
 
+BETWEEN = ", "
+"""Between the levels in the name of a condition."""
+
 
 def named(levels: Mapping[str, Any]) -> str:
     """The name of a condition, e.g. "freeze_steps=5, gamma=0.9"."""
-    return ", ".join(f"{name}={level_text(value)}" for name, value in levels.items())
+    return BETWEEN.join(f"{name}={level_text(value)}" for name, value in levels.items())
 
 
 def level_text(value: Any) -> str:
