@@ -164,7 +164,7 @@ def test_transitions_of_lanes_are_those_of_the_agents():
         lanes = lane_turn(agents, batch)
         for place, agent in enumerate(agents):
             alone = transitions_of(agent, batch)
-            own = lanes._make(entry[place :: len(agents)] for entry in lanes)
+            own = lanes._make(entry if entry is None else entry[place :: len(agents)] for entry in lanes)
             assert np.array_equal(own.observation, alone["observation"])
             assert np.array_equal(own.action, alone["action"])
             assert np.array_equal(own.next_observation, alone["next", "observation"])

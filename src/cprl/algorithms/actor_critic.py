@@ -3,18 +3,17 @@
 from dataclasses import dataclass
 from typing import ClassVar
 
-from tensordict.nn import ProbabilisticTensorDictSequential, TensorDictModule
+from tensordict.nn import ProbabilisticTensorDictSequential
 from torch import nn
 from torchrl.modules import ProbabilisticActor
 from torchrl.objectives import DiscreteIQLLoss, DiscreteSACLoss, LossModule, ValueEstimators
 
 from cprl.algorithms.base import OffPolicy
-from cprl.algorithms.dqn import network_of
+from cprl.algorithms.dqn import module_of, network_of
 from cprl.compat import LaneCategorical
 from cprl.custom import Custom
 from cprl.learners.settings import DQNSettings
 from cprl.networks.agent import AgentNetworks
-from cprl.networks.recurrent import state_shape_of
 from cprl.networks.specification import Network
 from cprl.spaces import Spaces
 
@@ -117,16 +116,3 @@ def policy(network: nn.Module) -> ProbabilisticTensorDictSequential:
         distribution_class=LaneCategorical,
         return_log_prob=True,
     )
-
-
-def module_of(network: nn.Module, name: str, *, state: str = "recurrent_state") -> TensorDictModule:
-    """A network as a TensorDict module.
-
-    Args:
-        network: reads "observation".
-        name: the entry of its outputs.
-        state: the entry of the states before each step, of a recurrent network.
-    """
-    if state_shape_of(network) is None:
-        return TensorDictModule(network, ["observation"], [name])
-    return TensorDictModule(network, ["observation", state, "is_init"], [name, f"{state}_after"])

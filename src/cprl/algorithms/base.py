@@ -83,8 +83,8 @@ class Algorithm:
     can_share_parameters: ClassVar[bool] = False
     """Whether agents of a team can share one network, see `cprl.population.Team`."""
     can_be_recurrent: ClassVar[bool] = False
-    """Whether its networks can be recurrent: its learner must learn from sequences, as `RolloutLearner` does,
-    and its loss must pass on their states, see `cprl.algorithms.actor_critic.policy`."""
+    """Whether its networks can be recurrent: its loss must pass on the states of sequences, see
+    `cprl.algorithms.dqn.module_of`."""
 
     def __post_init__(self) -> None:
         self._check_settings()
@@ -101,7 +101,7 @@ class Algorithm:
             name = type(self).__name__
             raise ValueError(
                 f"{name}.network is {network}; allowed for {name}, which does not learn from sequences: MLP, "
-                "Conv, Custom; PPO, A2C, Reinforce, IPPO and MAPPO learn recurrent networks, and "
+                "Conv, Custom; DQN, PPO, A2C, Reinforce, IPPO and MAPPO learn recurrent networks, and "
                 "torchrl.envs.CatFrames shows any agent its latest observations"
             )
 

@@ -7,6 +7,7 @@ from typing import Any, ClassVar
 import numpy as np
 import torch
 from tensordict import TensorDictBase
+from tensordict.nn import TensorDictModule
 from torch import nn
 from torchrl.modules import DistributionalQValueActor, QValueActor
 from torchrl.objectives import (
@@ -24,6 +25,7 @@ from cprl.learners.lola.settings import LOLASettings
 from cprl.learners.settings import DEFAULT_HIDDEN_CELLS, DQNSettings, RolloutSettings
 from cprl.networks.distributional import AtomNetwork
 from cprl.networks.mlp import MLP
+from cprl.networks.recurrent import state_shape_of
 from cprl.networks.specification import Network, new_network
 from cprl.objectives.log_cosh import DISTANCES, LOG_COSH, LogCoshDQNLoss
 from cprl.spaces import Spaces
@@ -32,6 +34,11 @@ from cprl.spaces import Spaces
 @dataclass(frozen=True, kw_only=True)
 class DQN(OffPolicy):
     """Deep Q-learning with a target network, TorchRL's `DQNLoss`; the algorithm of the study.
+
+    With a recurrent network, and `sequence_steps` of the settings, it is that of Hausknecht and Stone, "Deep
+    Recurrent Q-Learning for Partially Observable MDPs" (2015), but that sequences begin with the states by
+    which the agent acted, not with zeros: those are the stored states of Kapturowski et al., "Recurrent
+    Experience Replay in Distributed Reinforcement Learning" (2019), without a burn-in.
 
     Source: Mnih et al., "Human-level control through deep reinforcement learning" (2015).
     """
@@ -46,6 +53,7 @@ class DQN(OffPolicy):
     network: Network | Custom | None = None
     """The architecture of the networks; None for fully connected layers of `settings.hidden_cells`."""
     loss_functions: ClassVar[tuple[str, ...]] = DISTANCES
+    can_be_recurrent: ClassVar[bool] = True
 
     def make_network(self, spaces: Spaces) -> nn.Module:
         """See `Algorithm`."""
@@ -205,5 +213,19 @@ def network_of(
 
 
 def q_actor(network: nn.Module) -> QValueActor:
-    """TorchRL's `QValueActor` with a network's outputs as action values."""
-    return QValueActor(network, spec=None, action_space="categorical")
+    """TorchRL's `QValueActor` with a network's outputs as action values; for recurrent ones see
+    `module_of`."""
+    return QValueActor(module_of(network, "action_value"), spec=None, action_space="categorical")
+
+
+def module_of(network: nn.Module, name: str, *, state: str = "recurrent_state") -> TensorDictModule:
+    """A network as a TensorDict module.
+
+    Args:
+        network: reads "observation".
+        name: the entry of its outputs.
+        state: the entry of the states before each step, of a recurrent network.
+    """
+    if state_shape_of(network) is None:
+        return TensorDictModule(network, ["observation"], [name])
+    return TensorDictModule(network, ["observation", state, "is_init"], [name, f"{state}_after"])

@@ -7,9 +7,9 @@ from typing import ClassVar, Protocol
 from torch import nn
 from torchrl.objectives import A2CLoss, ClipPPOLoss, LossModule, ReinforceLoss
 
-from cprl.algorithms.actor_critic import module_of, policy
+from cprl.algorithms.actor_critic import policy
 from cprl.algorithms.base import OnPolicy
-from cprl.algorithms.dqn import network_of
+from cprl.algorithms.dqn import module_of, network_of
 from cprl.custom import Custom
 from cprl.learners.lola.settings import LOLASettings
 from cprl.learners.settings import RolloutSettings

@@ -13,7 +13,7 @@ from cprl import keys
 from cprl.arguments import object_of
 from cprl.learners.checks import check_networks
 from cprl.learners.engine.shared import is_list
-from cprl.learners.transitions import LaneTurn, joint_actions, lane_turn, seen_next
+from cprl.learners.transitions import LaneTurn, array_of, joint_actions, lane_turn, seen_next
 from cprl.networks.agent import acting_part
 from cprl.networks.recurrent import state_shape_of
 from cprl.networks.specification import refuse_unseen
@@ -154,7 +154,13 @@ class Lanes:
     def turn(self, batch: TensorDictBase, rewards: Any) -> LaneTurn:
         """One transition of every lane, as a replay buffer stores it; see `lane_turn`."""
         turn = lane_turn(self.agents, batch, rewards)
-        return turn._replace(action=joint_actions(self.agents, batch)) if self.sees_peers else turn
+        if self.sees_peers:
+            turn = turn._replace(action=joint_actions(self.agents, batch))
+        if self.state_cells:
+            states = self.recurrent_state(batch), self.recurrent_state(batch, keys.RECURRENT_STATE)
+            before, after = map(array_of, states)
+            turn = turn._replace(recurrent_state=before, next_recurrent_state=after)
+        return turn
 
     def rollout_turn(self, batch: TensorDictBase, rewards: Any) -> LaneTurn:
         """One transition of every lane, as a rollout stores it; see `lane_turn`."""
@@ -164,9 +170,11 @@ class Lanes:
         """The observations of lanes after a turn, uint8 [L, 1, C, X, Y]."""
         return seen_next(batch)[:, list(self.agents)].flatten(0, 1).unsqueeze(1)
 
-    def recurrent_state(self, batch: TensorDictBase) -> Tensor:
-        """The states that lanes had before a turn, float32 [L, H]."""
-        states: Tensor = batch.get(keys.RECURRENT_STATE_BEFORE)
+    def recurrent_state(
+        self, batch: TensorDictBase, entry: tuple[str, str] = keys.RECURRENT_STATE_BEFORE
+    ) -> Tensor:
+        """The states that lanes had before a turn, or by another entry after it, float32 [L, H]."""
+        states: Tensor = batch.get(entry)
         return states[:, list(self.agents), : self.state_cells].flatten(0, 1)
 
     def by_agent(self, losses: Tensor) -> Tensor:

@@ -3,12 +3,13 @@
 from collections.abc import Callable, Mapping, Sequence
 from copy import deepcopy
 from functools import partial
-from typing import Any
+from typing import Any, Final
 
 import torch
 from tensordict import TensorDictBase
 from torch import Tensor, nn
 
+from cprl import keys
 from cprl.learners.buffer.gather import Horizon
 from cprl.learners.buffer.sampler import lane_buffer, transformed
 from cprl.learners.checks import check_learner, refuse_continuous
@@ -17,15 +18,20 @@ from cprl.learners.engine.choice import TRIAL_LANES, EngineName, make_engine, tr
 from cprl.learners.engine.functional import MakeLoss
 from cprl.learners.engine.refusals import refuse_for_replay
 from cprl.learners.engine.shared import SharedEngine
-from cprl.learners.lanes import NOISE, SAMPLING, TARGET_WEIGHTS, WEIGHTS, StartFrom
+from cprl.learners.lanes import NOISE, SAMPLING, TARGET_WEIGHTS, WEIGHTS, Lanes, StartFrom
 from cprl.learners.settings import DQNSettings
 from cprl.learners.single import dqn_loss, q_network
-from cprl.learners.teams import MakeTeam, lanes_of
+from cprl.learners.teams import MakeTeam, Teams, lanes_of
 from cprl.learners.transitions import wanted_in
+from cprl.networks.agent import acting_part
+from cprl.networks.recurrent import state_shape_of
 from cprl.policies.lanes import LaneActor
 from cprl.preferences.values import Preference, named
 from cprl.preferences.wanted import WantedRewards
 from cprl.spaces import Spaces
+
+COMPILED_STEPS: Final = 16
+"""The longest sequences whose update is compiled: torch unrolls their turns, and takes seconds for each."""
 
 
 class ReplayLearner:
@@ -33,7 +39,8 @@ class ReplayLearner:
 
     Each lane has its own network, target network, optimiser state, replay buffer and random numbers, and
     learns exactly as it would alone. The loss and the replay buffer are TorchRL's, see
-    `cprl.learners.engine.base`.
+    `cprl.learners.engine.base`. Recurrent networks learn from sequences of `sequence_steps` turns, which
+    begin with the states by which agents acted; the update of more than `COMPILED_STEPS` is not compiled.
 
     Args:
         spaces: the shape and dtype of observations, and the number of actions A.
@@ -67,7 +74,8 @@ class ReplayLearner:
     Raises:
         ValueError: for a loss that needs the latest steps of the current policy (see
             `cprl.learners.rollouts`), for a team without the team reward, unless it has `own_rewards`, and
-            for one that sees its peers.
+            for one that sees its peers; for a recurrent network without sequences, or of a team, and for
+            sequences without such a network.
     """
 
     def __init__(
@@ -146,6 +154,9 @@ class ReplayLearner:
         settings, device = self.settings, self._shapes["device"]
         actions, own_targets = self.spaces.actions, settings.own_target_weights
         networks = self._lanes.new_networks(WEIGHTS, device)
+        self._state_cells = (state_shape_of(acting_part(networks[0])) or (0,))[-1]
+        self._refuse_other_sequences()
+        self._shapes |= {"state_cells": self._state_cells, "sequence_steps": settings.sequence_steps}
         trial = trial_batch(min(len(networks), TRIAL_LANES), actions=actions, **self._shapes)
         trial = transformed(trial, settings.replay_transforms)
         refuse_for_replay(make_loss(deepcopy(networks[0])), settings, trial[0])
@@ -159,10 +170,21 @@ class ReplayLearner:
             adam_eps=settings.adam_eps,
             tau=settings.tau,
             loss_share=1 / actions if settings.mean_over_all_outputs else 1.0,
-            compile=compile,
+            compile=compile and settings.sequence_steps <= COMPILED_STEPS,
             trial=trial,
         )
         return SharedEngine(engine, self._lanes.sharing) if self._lanes.sharing > 1 else engine
+
+    def _refuse_other_sequences(self) -> None:
+        """Raises a ValueError unless recurrent networks, and they alone, learn from sequences."""
+        steps, is_recurrent = self.settings.sequence_steps, self._state_cells > 0
+        if is_recurrent != (steps > 1):
+            kind, allowed = ("a", "2 or more") if is_recurrent else ("no", "1")
+            raise ValueError(
+                f"settings.sequence_steps is {steps}; allowed with {kind} recurrent network: {allowed}"
+            )
+        if is_recurrent and isinstance(self._lanes, Teams):
+            raise ValueError("the networks are recurrent; allowed for teams that learn from replay: others")
 
     @property
     def lanes(self) -> int:
@@ -217,8 +239,13 @@ class ReplayLearner:
         outputs a policy, or a continuous action."""
         if self._lanes.stochastic or self.spaces.action_size:
             return torch.full((self.replicas, len(self.agents)), torch.nan)
+        seen = [self._lanes.seen_next(batch)]
+        if self._state_cells:
+            assert isinstance(self._lanes, Lanes)
+            seen.append(self._lanes.recurrent_state(batch, keys.RECURRENT_STATE).unsqueeze(1))
         with torch.no_grad():
-            highest: Tensor = self.engine.outputs(self._lanes.seen_next(batch)).amax(-1)
+            outputs = self.engine.outputs(*seen)
+        highest: Tensor = (outputs[0] if self._state_cells else outputs).amax(-1)
         return highest.view(self.replicas, len(self.agents))
 
     def state_dict(self) -> dict[str, Any]:

@@ -69,7 +69,7 @@ class DQNSettings(Exploring):
     buffer_size: int = 100_000
     """Capacity of the replay buffer, in transitions."""
     batch_size: int = 8
-    """Transitions in a minibatch."""
+    """Transitions in a minibatch, or sequences of `sequence_steps` transitions."""
     learning_starts: int = 16
     """Transitions stored before the first update; after that each environment step is followed by
     `updates_per_step` updates."""
@@ -86,6 +86,10 @@ class DQNSettings(Exploring):
     n_steps: int = 1
     """Rewards that an n-step target sums before it bootstraps; fewer if the episode ends sooner. As TorchRL's
     `MultiStepTransform`; the study used 1."""
+    sequence_steps: int = 1
+    """Consecutive turns T of each sampled sequence, through which gradients of a recurrent network run: 2 or
+    more for such a network, 1 for any other. A minibatch then has `batch_size` sequences. Hausknecht and
+    Stone (2015) took 10 turns, Kapturowski et al. (2019) 80."""
     optimizer: Optimizer = "adam"
     """See `Optimizer`; [run] "adam", and "keras_rmsprop" in some versions of experiment 5."""
     tau: float | None = None
@@ -109,11 +113,15 @@ class DQNSettings(Exploring):
     def __post_init__(self) -> None:
         check_fields(self, _DQN)
         longest = max(1, min(self.learning_starts, self.buffer_size // 2))
-        if self.n_steps > longest:
-            raise ValueError(
-                f"DQNSettings.n_steps is {self.n_steps}; allowed: up to learning_starts, "
-                f"{self.learning_starts}, and half of buffer_size, {self.buffer_size}"
-            )
+        for name, turns in {"n_steps": self.n_steps, "sequence_steps": self.sequence_steps}.items():
+            if turns > longest:
+                raise ValueError(
+                    f"DQNSettings.{name} is {turns}; allowed: up to learning_starts, "
+                    f"{self.learning_starts}, and half of buffer_size, {self.buffer_size}"
+                )
+        if self.sequence_steps > 1 and (self.n_steps > 1 or self.replay_transforms):
+            other = f"n_steps {self.n_steps}" if self.n_steps > 1 else "replay_transforms"
+            raise ValueError(f"DQNSettings.sequence_steps is {self.sequence_steps}; allowed with {other}: 1")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -218,6 +226,7 @@ _DQN: Final[dict[str, Check]] = {
     "learning_starts": count(1, MOST_INT64),
     "updates_per_step": count(1),
     "n_steps": count(1, 1000),
+    "sequence_steps": count(1, 1000),
     "tau": either(number(1e-6, 1), Check(NONE.fits, "None for copies every target_every_episodes episodes")),
     "replay_transforms": tuple_of(
         instance(

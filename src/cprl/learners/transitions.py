@@ -29,6 +29,10 @@ class LaneTurn(NamedTuple):
     """bool [L]."""
     terminated: Any
     """bool [L]."""
+    recurrent_state: Any = None
+    """float32 [L, K], before the turn, of lanes with a recurrent network that learn from replay."""
+    next_recurrent_state: Any = None
+    """After it, likewise."""
 
 
 def lane_turn(agents: tuple[int, ...], batch: TensorDictBase, rewards: Any = None) -> LaneTurn:
@@ -164,13 +168,17 @@ def turn_of(transitions: TensorDictBase) -> LaneTurn:
     reward = following.get("reward").squeeze(-1)
     before = transitions.get("observation"), transitions.get("action")
     turn = *before, following.get("observation"), reward, *flags
-    return LaneTurn(*map(array_of, turn))
+    states = (own.get("recurrent_state", None) for own in (transitions, following))
+    return LaneTurn(*map(array_of, turn), *(None if own is None else array_of(own) for own in states))
 
 
 def transitions_in(turn: LaneTurn) -> TensorDict:
     """`turn_of`, the other way round."""
-    entries = {name: torch.as_tensor(value) for name, value in turn._asdict().items()}
+    given = {name: value for name, value in turn._asdict().items() if value is not None}
+    entries = {name: torch.as_tensor(value) for name, value in given.items()}
     lanes = [len(entries["done"])]
     following = {name: entries.pop(name).unsqueeze(-1) for name in ("reward", "done", "terminated")}
-    following["observation"] = entries.pop("next_observation")
+    for name in ("observation", "recurrent_state"):
+        if f"next_{name}" in entries:
+            following[name] = entries.pop(f"next_{name}")
     return TensorDict({**entries, "next": TensorDict(following, lanes)}, lanes)

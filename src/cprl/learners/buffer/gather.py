@@ -1,4 +1,4 @@
-"""What is read from a `LaneStorage`: transitions, or returns of several steps."""
+"""What is read from a `LaneStorage`: transitions, returns of several steps, or sequences."""
 
 from typing import Final, NamedTuple
 
@@ -8,6 +8,9 @@ from torch import Tensor
 
 FIELDS: Final = ("observation", "action", "reward", "done", "terminated", "row")
 """What a storage holds, in the order in which it holds it."""
+
+STATE: Final = "recurrent_state"
+"""What a storage for sequences holds besides."""
 
 Fields = dict[str, Tensor]
 
@@ -58,6 +61,29 @@ def gather(fields: Fields, index: Tensor, rows: int, horizon: Horizon | None = N
     )
     entries = {"observation": seen(row), "action": fields["action"][index, lane], "next": following}
     return TensorDict({**entries, **more}, [lanes, size])
+
+
+def sequences(fields: Fields, index: Tensor, rows: int, steps: int) -> TensorDict:
+    """Sequences [L, b, T] of T turns from places [L, b] of a `LaneStorage` on, for recurrent networks.
+
+    Entries are those of `gather`, the states with which agents acted, "recurrent_state", float32
+    [L, b, T, K], and "is_init", bool [L, b, T], as `cprl.networks.recurrent` says: where a sequence or an
+    episode begins. Those of "next" are of the turns after; where a sequence begins, the turn after its first
+    one does so too. The T - 1 turns that follow each place must have been written.
+    """
+    lanes, size = index.shape
+    ahead = torch.arange(steps, device=index.device)
+    places = ((index.unsqueeze(-1) + ahead) % len(fields["done"])).reshape(lanes, -1)
+    batch = gather(fields, places, rows)
+    lane = torch.arange(lanes, device=index.device)[:, None]
+    row, states = fields["row"][places, lane], fields[STATE]
+    for owner, at in ((batch, row), (batch["next"], row + 1)):
+        found = states.index_select(0, (lane * rows + at % rows).reshape(-1))
+        owner.set(STATE, found.reshape(*places.shape, *states.shape[1:]))
+    turns: TensorDict = batch.reshape(lanes, size, steps)
+    ends = (turns["next", "done"] | turns["next", "terminated"]).squeeze(-1)
+    is_init = torch.cat([torch.ones_like(ends[..., :1]), ends[..., :-1]], -1)
+    return turns.set("is_init", is_init).set(("next", "is_init"), is_init.clone())
 
 
 def sampled(

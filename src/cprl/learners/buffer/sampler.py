@@ -43,8 +43,7 @@ class LaneSampler(Sampler):
     def draw(self, storage: LaneStorage) -> Tensor:
         """Positions in the ring, int64 [L, b]."""
         oldest, written = storage.oldest()
-        if storage.horizon is not None:  # the newest transitions have no full return yet
-            written -= storage.horizon.steps - 1
+        written -= storage.steps_after  # the newest transitions have no full return or sequence yet
         shares = array_of(self.rng.next().to(storage.device)) * (written - oldest)[:, None]
         # numpy on the CPU: for so few numbers torch takes three times as long.
         numbers = shares.astype(np.int64) if isinstance(shares, np.ndarray) else shares.long()
@@ -145,6 +144,8 @@ def lane_buffer(
     noise_seeds: Sequence[Sequence[int]] | None = None,
     observation_dtype: str = "uint8",
     horizon: Horizon | None = None,
+    state_cells: int = 0,
+    sequence_steps: int = 1,
     device: str | torch.device = "cpu",
 ) -> LaneBuffer:
     """TorchRL's replay buffer over `LaneStorage` and `LaneSampler`.
@@ -152,7 +153,7 @@ def lane_buffer(
     Args:
         seeds: the sampling seed of each of the L lanes.
         transitions: capacity per lane.
-        batch_size: transitions sampled per lane.
+        batch_size: transitions sampled per lane, or sequences.
         observation_shape: (C, X, Y); (S, C, X, Y) if a lane is a team of S agents.
         action_shape: the shape of a lane's action: () for one agent, (S,) for a team; with D last if actions
             are continuous.
@@ -163,6 +164,8 @@ def lane_buffer(
         noise_seeds: the seed of the numbers of each lane; by default `seeds`.
         observation_dtype: see `Spaces.observation_dtype`.
         horizon: steps and discount of n-step returns, sampled in place of rewards; None for single steps.
+        state_cells: the numbers of the state of a recurrent network; 0 for one without.
+        sequence_steps: turns of sampled sequences; 1 for transitions.
         device: the device of the storage.
 
     The size is logged before allocation, under "cprl", if it is a mebibyte or more.
@@ -179,9 +182,11 @@ def lane_buffer(
         observation_shape,
         item_bytes=dtype.itemsize,
         action_bytes=kind.itemsize,
+        state_cells=state_cells,
         **shapes,
     )
-    sampled = len(seeds) * batch_size * prod(observation_shape) * 2 * (dtype.itemsize + 4)  # and as float32
+    windows = len(seeds) * batch_size * sequence_steps * 2
+    sampled = windows * prod(observation_shape) * (dtype.itemsize + 4)  # and as float32
     check_memory(
         f"the replay buffers of {len(seeds)} lanes x {transitions:,} transitions",
         needed + sampled,
@@ -203,6 +208,8 @@ def lane_buffer(
         action_dtype=kind,
         dtype=dtype,
         horizon=horizon,
+        state_cells=state_cells,
+        sequence_steps=sequence_steps,
         device=device,
         **shapes,
     )

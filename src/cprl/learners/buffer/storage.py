@@ -15,7 +15,7 @@ from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
 from torchrl.data.replay_buffers import Storage
 
-from cprl.learners.buffer.gather import Fields, Horizon, gather
+from cprl.learners.buffer.gather import STATE, Fields, Horizon, gather, sequences
 from cprl.learners.transitions import LaneTurn, array_of, turn_of
 
 ENDS_PER_TRANSITION: Final = 0.02
@@ -47,6 +47,7 @@ def storage_bytes(
     action_bytes: int = 8,
     reward_shape: Sequence[int] = (),
     item_bytes: int = 1,
+    state_cells: int = 0,
 ) -> int:
     """Bytes that `LaneStorage` allocates.
 
@@ -58,8 +59,9 @@ def storage_bytes(
         action_bytes: bytes of one number of it.
         reward_shape: the shape of its reward.
         item_bytes: bytes of one number of an observation.
+        state_cells: the numbers of a recurrent state.
     """
-    windows = _rows(transitions) * prod(observation_shape) * item_bytes
+    windows = _rows(transitions) * (prod(observation_shape) * item_bytes + 4 * state_cells)
     return lanes * (
         windows + transitions * (action_bytes * prod(action_shape) + 4 * prod(reward_shape) + 8 + 1 + 1)
     )
@@ -72,7 +74,7 @@ def _rows(transitions: int) -> int:
 
 
 class LaneStorage(Storage):
-    """Stores up to T transitions of each of L lanes.
+    """Stores up to T transitions of each of L lanes; those of recurrent agents with their states.
 
     Args:
         lanes: the number of lanes L.
@@ -83,10 +85,13 @@ class LaneStorage(Storage):
         reward_shape: the shape of a lane's reward: (S,) for a team whose members have their own, else ().
         dtype: the dtype of observations.
         horizon: steps and discount of the returns that `get` returns as rewards; None for single steps.
+        state_cells: the numbers K of the state of a lane's recurrent network; 0 for one without.
+        sequence_steps: turns of the sequences that `get` returns; 1 for transitions.
         device: the device of the tensors.
 
     Inputs and outputs are TensorDicts with TorchRL's default keys: "observation", "action" and "next" with
-    "observation", "reward", "done" and "terminated"; [L] or [1, L] for a step, [L, b] for a sample.
+    "observation", "reward", "done" and "terminated", with a state also "recurrent_state" and that of "next";
+    [L] or [1, L] for a step, [L, b] for a sample, or as `sequences` says.
     """
 
     def __init__(
@@ -100,12 +105,13 @@ class LaneStorage(Storage):
         reward_shape: Sequence[int] = (),
         dtype: torch.dtype = torch.uint8,
         horizon: Horizon | None = None,
+        state_cells: int = 0,
+        sequence_steps: int = 1,
         device: str | torch.device = "cpu",
     ) -> None:
         super().__init__(transitions)
-        self.horizon = horizon
+        self.horizon, self.sequence_steps = horizon, sequence_steps
         self.lanes, self.rows, self.device = lanes, _rows(transitions), torch.device(device)
-        self.shape_of_observation = tuple(observation_shape)
 
         def allocate(*shape: int, kind: torch.dtype) -> Tensor:
             if self.device.type != "cpu":
@@ -123,7 +129,11 @@ class LaneStorage(Storage):
             "row": allocate(transitions, lanes, kind=torch.int64),
         }
         """Observations [L x rows, ...], actions and rewards [T, L, ...], the rest [T, L]; `row` counts the
-        observations that a lane has written."""
+        observations that a lane has written. A state [L x rows, K] stands in the row of the observation that
+        the lane saw next."""
+        if state_cells:
+            self.fields[STATE] = allocate(lanes * self.rows, state_cells, kind=torch.float32)
+        self._of_rows = [name for name in self.fields if name in ("observation", STATE)]
         # Steps are written with numpy on the CPU: for so few numbers torch takes five times as long.
         self._arrays = {name: array_of(field) for name, field in self.fields.items()}
         self._lane = array_of(torch.arange(lanes, device=self.device))
@@ -136,6 +146,11 @@ class LaneStorage(Storage):
         self._next_row, self._oldest = array_of(zeros), array_of(zeros.clone())
         self._begins, self._any_begins = array_of(zeros == 0), True
         self._written = 0
+
+    @property
+    def steps_after(self) -> int:
+        """How many turns must have been written after one from which `get` can start."""
+        return (self.sequence_steps if self.horizon is None else self.horizon.steps) - 1
 
     def __len__(self) -> int:
         """Transitions stored in the fullest lane."""
@@ -169,10 +184,11 @@ class LaneStorage(Storage):
                 f"{windows.dtype}, from Spaces.observation_dtype: make the learner with the Spaces of the "
                 "transformed environment"
             )
-        if self._any_begins:
-            first = self._begins
-            windows[(self._base + row % self.rows)[first]] = turn.observation[first]
-        windows[self._base + (row + 1) % self.rows] = turn.next_observation
+        for name in self._of_rows:
+            if self._any_begins:
+                first = self._begins
+                arrays[name][(self._base + row % self.rows)[first]] = getattr(turn, name)[first]
+            arrays[name][self._base + (row + 1) % self.rows] = getattr(turn, f"next_{name}")
         arrays["action"][place] = turn.action
         arrays["reward"][place] = turn.reward
         arrays["done"][place] = turn.done
@@ -198,17 +214,18 @@ class LaneStorage(Storage):
         self._oldest = oldest
 
     def get(self, index: Tensor) -> TensorDict:
-        """The transitions at positions [L, b] of the ring."""
+        """The transitions at positions [L, b] of the ring, or the sequences that begin there."""
+        if self.sequence_steps > 1:
+            return sequences(self.fields, index, self.rows, self.sequence_steps)
         return gather(self.fields, index, self.rows, self.horizon)
 
     def state_dict(self) -> dict[str, Any]:
         """The written part of all fields; once the storage is full, the tensors themselves, not copies."""
         kept = len(self)
-        windows = self.fields["observation"].view(self.lanes, self.rows, *self.shape_of_observation)
         used = min(self.rows, int(self._next_row.max()) + 1)
         return {
             **{name: _part(array, array[:kept]) for name, array in self.fields.items()},
-            "observation": _part(windows, windows[:, :used]),
+            **{name: _part(rows, rows[:, :used]) for name, rows in self._by_row().items()},
             "next_row": torch.as_tensor(self._next_row),
             "begins": torch.as_tensor(self._begins),
             "oldest": torch.as_tensor(self._oldest),
@@ -217,19 +234,25 @@ class LaneStorage(Storage):
 
     def load_state_dict(self, state_dict: Mapping[str, Any]) -> None:
         """Continues from the state of a storage with the same sizes."""
-        windows = self.fields["observation"].view(self.lanes, self.rows, *self.shape_of_observation)
-        stored = state_dict["observation"]
-        if len(stored) != self.lanes or stored.shape[1] > self.rows or stored.shape[2:] != windows.shape[2:]:
-            allowed = [self.lanes, f"up to {self.rows}", *self.shape_of_observation]
+        by_row, stored = self._by_row(), state_dict["observation"]
+        shape = by_row["observation"].shape
+        if len(stored) != self.lanes or stored.shape[1] > self.rows or stored.shape[2:] != shape[2:]:
+            allowed = [self.lanes, f"up to {self.rows}", *shape[2:]]
             raise ValueError(f"the state's observations are {list(stored.shape)}; allowed: {allowed}")
-        windows[:, : stored.shape[1]] = stored
+        for name, rows in by_row.items():
+            rows[:, : state_dict[name].shape[1]] = state_dict[name]
         for name, array in self.fields.items():
-            if name != "observation":
+            if name not in by_row:
                 array[: len(state_dict[name])] = state_dict[name]
         own = {name: state_dict[name].to(self.device, copy=True) for name in ("next_row", "begins", "oldest")}
         self._next_row, self._begins = array_of(own["next_row"]), array_of(own["begins"])
         self._oldest, self._written = array_of(own["oldest"]), int(state_dict["written"])
         self._any_begins = bool(self._begins.any())
+
+    def _by_row(self) -> Fields:
+        """The fields of rows, [L, rows, ...]."""
+        fields = {name: self.fields[name] for name in self._of_rows}
+        return {name: field.view(self.lanes, self.rows, *field.shape[1:]) for name, field in fields.items()}
 
     def _empty(self) -> None:
         self._begin()

@@ -150,11 +150,13 @@ def trial_batch(
     noise_shape: Sequence[int] = (),
     observation_dtype: str = "uint8",
     horizon: Horizon | None = None,
+    state_cells: int = 0,
+    sequence_steps: int = 1,
     device: str | torch.device = "cpu",
 ) -> TensorDict:
-    """Synthetic transitions [lanes, 8], always the same; one in eight ends an episode. For the arguments see
-    `lane_buffer`."""
-    transitions = TRIAL_TRANSITIONS + (horizon.steps - 1 if horizon else 0)
+    """Synthetic transitions [lanes, 8], or sequences, always the same; an episode ends with every eighth
+    turn. For the arguments see `lane_buffer`."""
+    transitions = TRIAL_TRANSITIONS + (horizon.steps if horizon else sequence_steps) - 1
     buffer = lane_buffer(
         seeds=[(lane,) for lane in range(lanes)],
         transitions=transitions,
@@ -166,6 +168,8 @@ def trial_batch(
         noise_shape=noise_shape,
         observation_dtype=observation_dtype,
         horizon=horizon,
+        state_cells=state_cells,
+        sequence_steps=sequence_steps,
         device=device,
     )
     chance = torch.Generator().manual_seed(0)
@@ -179,7 +183,8 @@ def trial_batch(
             action = torch.rand((lanes, *action_shape), generator=chance)
         ends = torch.full((lanes,), step % 8 == 7)
         reward = torch.rand((lanes, *reward_shape), generator=chance)
-        turn = seen[0], action, seen[1], reward, ends, ends
+        states = torch.rand((2, lanes, state_cells), generator=chance) if state_cells else ()
+        turn = seen[0], action, seen[1], reward, ends, ends, *states
         buffer.storage.write(LaneTurn(*(array_of(entry.to(device)) for entry in turn)))
     batch: TensorDict = buffer.sample()
     return batch

@@ -94,9 +94,9 @@ class FunctionalEngine:
 
     def update(self, buffer: LaneBuffer) -> Tensor:
         """See `Engine`."""
-        if buffer.has_transforms:
-            return self.update_from(buffer.sample())
         storage: LaneStorage = buffer.storage
+        if buffer.has_transforms or storage.sequence_steps > 1:
+            return self.update_from(buffer.sample())
         index = buffer.sampler.draw(storage)
         self.steps += 1
         noise = None if buffer.noise is None else buffer.noise.next()

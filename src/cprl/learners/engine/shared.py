@@ -2,6 +2,7 @@
 
 from collections.abc import Callable, Mapping
 from functools import partial
+from math import prod
 from typing import Any
 
 from tensordict import TensorDict
@@ -32,9 +33,11 @@ class SharedEngine:
 
     def update_from(self, batch: TensorDict) -> Tensor:
         """See `Engine`."""
-        lanes, size = batch.batch_size
-        apart = (self._agents, size) if "is_init" in batch else (self._agents * size,)
-        together = batch.reshape(lanes // self._agents, *apart)  # each sequence stays one
+        lanes, *sizes = batch.batch_size
+        if "is_init" in batch:  # each sequence stays one
+            *sequences, steps = sizes
+            sizes = [prod(sequences), steps]
+        together = batch.reshape(lanes // self._agents, self._agents * sizes[0], *sizes[1:])
         return self.engine.update_from(together).repeat_interleave(self._agents)
 
     def copy_to_targets(self, which: Tensor) -> None:

@@ -28,6 +28,8 @@ from cprl.learners.torchrl.agents import MakeSampler, StockAgents, check_makers,
 from cprl.learners.torchrl.buffers import buffer_state, load_buffer, nested, plain
 from cprl.learners.transitions import wanted_in
 from cprl.memory import check_memory
+from cprl.networks.agent import acting_part
+from cprl.networks.recurrent import state_shape_of
 from cprl.policies.lanes import LaneActor
 from cprl.preferences.values import Preference
 from cprl.preferences.wanted import WantedRewards
@@ -138,6 +140,16 @@ class TorchRLReplayLearner:
     def _refuse_unfit(self, make_loss: MakeLoss, device: str | torch.device, noise_numbers: int) -> None:
         """The checks of the fast engine, on a loss of its own and synthetic transitions of one agent."""
         settings = self.settings
+        with torch.random.fork_rng(devices=[]):
+            network = self._lanes.make_network().to(device)
+            loss = make_loss(network)
+        steps = settings.sequence_steps
+        if steps > 1 or state_shape_of(acting_part(network)) is not None:
+            raise ValueError(
+                f'settings.sequence_steps is {steps}; allowed with engine="torchrl", whose buffers give '
+                'single transitions: 1, with MLP, Conv, Custom; engine="compiled" and "eager" learn from '
+                "sequences"
+            )
         trial = trial_batch(
             1,
             self._lanes.observation_shape,
@@ -149,8 +161,6 @@ class TorchRLReplayLearner:
             noise_shape=(noise_numbers,) if noise_numbers else (),
             device=device,
         )
-        with torch.random.fork_rng(devices=[]):
-            loss = make_loss(self._lanes.make_network().to(device))
         refuse_for_replay(loss, settings, transformed(trial, settings.replay_transforms)[0])
 
     def _init_targets(self, make_loss: MakeLoss) -> None:

@@ -1,0 +1,345 @@
+"""DQN with a recurrent network: the sequences that its replay buffer gives, and what is learned from them."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+from recall_game import Recall
+from test_population import GAME, Returns, assert_goes_on_bit_for_bit, population, trained, weights
+
+import cprl
+from cprl import CommonsEnv, Custom, Experiment
+from cprl.algorithms import DQN, SAC, VDN, DQNSettings
+from cprl.collectors import StepCollector
+from cprl.envs import make_env, spaces_of
+from cprl.learners.replay import ReplayLearner
+from cprl.networks import GRU, LSTM, MLP, Conv
+from cprl.policies.assignment import AgentPolicies
+from cprl.population import Learning, Scripted, Team
+from cprl.training import train
+
+SMALL = GRU(encoder=MLP(hidden_cells=(6,)), recurrent_cells=5)
+LONG = LSTM(encoder=MLP(hidden_cells=(6,)), recurrent_cells=5)
+CONV = GRU(encoder=Conv(channels=(3,), hidden_cells=(6,)), recurrent_cells=5)
+SETTINGS = DQNSettings(
+    buffer_size=60,
+    batch_size=4,
+    learning_starts=8,
+    sequence_steps=6,
+    learning_rate=1e-3,
+    epsilon_hold_steps=0,
+    epsilon_decay_steps=60,
+    target_every_episodes=2,
+)
+DQNS = {
+    "GRU": DQN(settings=SETTINGS, network=SMALL),
+    "LSTM, double, log-cosh": DQN(settings=SETTINGS, network=LONG, double=True, loss_function="log_cosh"),
+    "convolutions": DQN(settings=replace(SETTINGS, tau=0.1), network=CONV),
+}
+FOUR = (0, 1, 2, 3)
+
+
+def made(algorithm, *, replicas=2, **how):
+    return algorithm.make_learner(GAME.spaces, agents=FOUR, replicas=replicas, engine="eager", **how)
+
+
+def play(learner, steps):
+    """Plays and stores so many turns; returns each, as it was played."""
+    turns = iter(
+        StepCollector(CommonsEnv(GAME, learner.replicas, seed=3), AgentPolicies({FOUR: learner.actor}))
+    )
+    played = []
+    for _ in range(steps):
+        played.append(next(turns).clone())
+        learner.store(played[-1])
+    return played
+
+
+def of_lane(played, name, lane, after=False):
+    """An entry of a lane in each turn."""
+    turns = [turn["next"] if after else turn for turn in played]
+    found = [turn["agents", name] if ("agents", name) in turn.keys(True) else turn[name] for turn in turns]
+    return torch.stack([own.flatten(0, 1)[lane] if own.ndim > 2 else own[lane // 4] for own in found])
+
+
+@pytest.mark.parametrize("steps", [17, 200])
+def test_a_sequence_is_what_was_played_from_some_turn_on(steps):
+    """Also where the ring has come round three times; episodes last up to 12 turns, sequences 6."""
+    learner = made(DQNS["GRU"])
+    played = play(learner, steps)
+    batch, starts = learner.buffer.sample(), []
+    assert batch.batch_size == torch.Size([8, 4, 6])
+    for lane in range(8):
+        actions = torch.stack([turn["agents", "action"].flatten()[lane] for turn in played])
+        seen = of_lane(played, "observation", lane)
+        before = of_lane(played, "recurrent_state_before", lane)
+        after = of_lane(played, "recurrent_state", lane)
+        done = of_lane(played, "done", lane, after=True)[:, 0]
+        for own in batch[lane]:
+            fits = [
+                place
+                for place in range(max(0, steps - 60), steps - 5)
+                if torch.equal(own["recurrent_state"], before[place : place + 6])
+                and torch.equal(own["action"], actions[place : place + 6])
+                and torch.equal(own["observation"], seen[place : place + 6])
+            ]
+            assert fits
+            now = slice(fits[0], fits[0] + 6)
+            starts.append(fits[0])
+            assert torch.equal(own["next", "done"][:, 0], done[now])
+            assert torch.equal(own["next", "recurrent_state"], after[now])
+            seen_next = of_lane(played, "observation", lane, after=True)
+            assert torch.equal(own["next", "observation"], seen_next[now])
+            began = torch.cat([torch.tensor([True]), done[now][:-1]])
+            assert torch.equal(own["is_init"], began)
+            assert torch.equal(own["next", "is_init"], began)
+    assert len(set(starts)) > 8 if steps > 20 else set(starts) <= set(range(12))
+
+
+def test_every_turn_is_sampled_once_enough_follow_it():
+    learner = made(DQNS["GRU"], replicas=1)
+    play(learner, 100)
+    oldest, written = learner.buffer.storage.oldest()
+    drawn = torch.cat([learner.buffer.sampler.draw(learner.buffer.storage) for _ in range(200)], 1)
+    places = {int(place) % 60 for place in range(int(oldest[0]), written - 5)}
+    assert set(drawn.flatten().tolist()) == places
+
+
+@pytest.mark.parametrize("double", [False, True])
+def test_the_loss_is_that_of_a_network_that_goes_through_the_turns_by_itself(double):
+    """One step of the network after the other, with the state of the one before, for the network and its
+    targets, whose sequences are of the observations after each turn."""
+    learner = made(replace(DQNS["GRU"], double=double))
+    targets = learner.networks()  # copied to the targets at the end of an episode, which nobody tells here
+    play(learner, 40)
+    for _ in range(3):
+        learner.update()
+    networks, batch = learner.networks(), learner.buffer.sample()
+
+    def values(network, turns):
+        found, state = [], None
+        for turn in turns:
+            state = turn["recurrent_state"] if turn["is_init"] else state
+            output, state = network(turn["observation"], state)
+            found.append(output)
+        return torch.stack(found)
+
+    wanted = []
+    for own, target, sequences in zip(networks.values(), targets.values(), batch, strict=True):
+        errors = []
+        for sequence in sequences:
+            chosen = values(own, sequence).gather(-1, sequence["action"][:, None])[:, 0]
+            after = values(target, sequence["next"])
+            best = (values(own, sequence["next"]) if double else after).argmax(-1, keepdim=True)
+            goes_on = ~sequence["next", "terminated"][:, 0]
+            bootstrap = 0.995 * after.gather(-1, best)[:, 0] * goes_on
+            errors.append(chosen - sequence["next", "reward"][:, 0] - bootstrap)
+        wanted.append(torch.cat(errors).square().mean())
+    found = learner.engine.update_from(batch)
+    torch.testing.assert_close(found, torch.stack(wanted).detach())
+
+
+@pytest.mark.parametrize("name", DQNS)
+@pytest.mark.parametrize("engine", ["lane_axis", "lane_axis_flat", "vmapped"])
+def test_every_engine_learns_what_a_list_of_losses_does(name, engine):
+    algorithm = DQNS[name]
+
+    def learned(kind):
+        learner = ReplayLearner(
+            GAME.spaces,
+            agents=FOUR,
+            replicas=2,
+            settings=algorithm.settings,
+            make_network=lambda: algorithm.make_network(GAME.spaces),
+            make_loss=algorithm.make_loss,
+            engine=kind,
+            compile=False,
+        )
+        play(learner, 30)
+        for _ in range(3):
+            learner.update()
+        return learner
+
+    one, other = learned(engine), learned("list")
+    for lane in range(one.lanes):
+        for key, value in one.engine.network_state(lane).items():
+            expected = other.engine.network_state(lane)[key]
+            torch.testing.assert_close(value, expected, rtol=1e-4, atol=1e-5, msg=key)
+
+
+@pytest.mark.parametrize("name", DQNS)
+def test_the_fastest_engine_is_chosen_without_a_warning(name, recwarn):
+    assert type(made(DQNS[name]).engine).__name__ == "FunctionalEngine"
+    assert not recwarn.list
+
+
+@pytest.mark.integration
+@pytest.mark.parametrize("name", DQNS)
+def test_all_weights_move_and_no_replica_knows_of_the_others(name):
+    members = [Learning(DQNS[name])] * 4
+    together, alone = population(members, replicas=3), population(members, replicas=1, first_replica=2)
+    before = weights(together)
+    _, returns = trained(together)
+    _, returns_alone = trained(alone, first=2)
+    assert returns[2] == returns_alone[0]
+    after = weights(together)
+    assert all(not torch.equal(after[key], value) for key, value in before.items() if "weight" in key)
+    own = {key: value for key, value in after.items() if key.startswith("replica_2")}
+    for key, value in weights(alone).items():
+        torch.testing.assert_close(value, own[key.replace("replica_0", "replica_2")], rtol=1e-4, atol=1e-5)
+
+
+@pytest.mark.integration
+def test_the_compiled_update_learns_what_the_eager_one_does():
+    """Sequences of up to `COMPILED_STEPS` are compiled."""
+    learners = [
+        DQNS["GRU"].make_learner(GAME.spaces, agents=FOUR, replicas=1, engine=engine)
+        for engine in ("compiled", "eager")
+    ]
+    for learner in learners:
+        play(learner, 20)
+        for _ in range(2):
+            learner.update()
+    one, other = (learner.networks() for learner in learners)
+    for lane, network in one.items():
+        for key, value in network.state_dict().items():
+            torch.testing.assert_close(value, other[lane].state_dict()[key], rtol=1e-4, atol=1e-5)
+
+
+def test_agents_that_share_a_network_learn_from_the_sequences_of_all():
+    members = [Team(DQNS["GRU"], FOUR, share_parameters=True)]
+    agents = population(members)
+    before = weights(agents)
+    trained(agents)
+    for key, value in weights(agents).items():
+        replica, _, name = key.split("/")
+        assert torch.equal(value, weights(agents)[f"{replica}/agent_0/{name}"])
+        assert not torch.equal(value, before[key])
+
+
+def test_the_value_after_a_turn_knows_the_turns_before():
+    learner = made(DQNS["GRU"], replicas=1)
+    played = play(learner, 30)
+    network = learner.networks()["replica_0/agent_2"]
+    state, place = torch.zeros(5), max(t for t, turn in enumerate(played[:-1]) if turn["next", "done"].any())
+    for turn in played[place + 1 :]:
+        _, state = network(turn["agents", "observation"][0, 2], state)
+    expected, _ = network(played[-1]["next", "agents", "observation"][0, 2], state)
+    assert len(played[place + 1 :]) > 1
+    torch.testing.assert_close(learner.values(played[-1])[0, 2], expected.max())
+
+
+@pytest.mark.integration
+def test_a_training_that_was_stopped_goes_on_bit_for_bit(tmp_path):
+    members = [
+        Learning(DQNS["GRU"]),
+        Learning(DQNS["LSTM, double, log-cosh"]),
+        Scripted("greedy"),
+        Scripted(),
+    ]
+    assert_goes_on_bit_for_bit(members, tmp_path, episodes=7)
+
+
+@pytest.mark.integration
+def test_a_run_is_stored_loaded_and_evaluated(tmp_path):
+    agents = [Learning(DQNS["GRU"])] * 2 + [Learning(DQNS["LSTM, double, log-cosh"]), Scripted("greedy")]
+    experiment = Experiment(
+        name="remembers",
+        game=GAME,
+        agents=agents,
+        replicas=2,
+        episodes=3,
+        evaluation_episodes=2,
+        engine="eager",
+    )
+    run = cprl.run(experiment, tmp_path / "run", watch="off")
+    loaded = cprl.load(run)
+    assert loaded.experiment == experiment
+    assert loaded.policy().actors[0].state_cells == 5
+    assert len(cprl.evaluate_run(run, episodes=3).trained[1]) == 3
+
+
+SEQUENCES = {"sequence_steps": 4}
+
+
+@pytest.mark.parametrize(
+    ("wrong", "message"),
+    [
+        (
+            lambda: made(DQN(settings=DQNSettings(), network=SMALL)),
+            "sequence_steps is 1; allowed with a recurrent network: 2 or more",
+        ),
+        (
+            lambda: made(DQN(settings=DQNSettings(**SEQUENCES))),
+            "sequence_steps is 4; allowed with no recurrent network: 1",
+        ),
+        (
+            lambda: made(SAC(settings=DQNSettings(**SEQUENCES))),
+            "sequence_steps is 4; allowed with no recurrent network: 1",
+        ),
+        (
+            lambda: population([Team(VDN(settings=DQNSettings(**SEQUENCES)), FOUR, reward="team")]),
+            "sequence_steps is 4; allowed with no recurrent network: 1",
+        ),
+        (lambda: DQNSettings(sequence_steps=4, n_steps=2), "sequence_steps is 4; allowed with n_steps 2: 1"),
+        (lambda: DQNSettings(sequence_steps=17), "sequence_steps is 17; allowed: up to learning_starts, 16"),
+        (lambda: DQNSettings(sequence_steps=0), "sequence_steps is 0"),
+        (
+            lambda: DQNSettings(**SEQUENCES, replay_transforms=(Custom("torchrl.envs:RewardScaling"),)),
+            "sequence_steps is 4; allowed with replay_transforms: 1",
+        ),
+    ],
+)
+def test_what_does_not_fit_is_refused_by_name(wrong, message):
+    with pytest.raises(ValueError, match=message):
+        wrong()
+
+
+@pytest.mark.parametrize(
+    ("agent", "engine", "message"),
+    [
+        (
+            DQN(settings=DQNSettings(), network=SMALL),
+            "eager",
+            "sequence_steps is 1; allowed with a recurrent",
+        ),
+        (DQNS["GRU"], "torchrl", 'sequence_steps is 6; allowed with engine="torchrl"'),
+    ],
+)
+def test_a_run_that_is_refused_leaves_nothing(agent, engine, message, tmp_path):
+    agents = [Learning(agent)] * 4
+    wrong = Experiment(name="never", game=GAME, agents=agents, replicas=1, episodes=1, engine=engine)
+    with pytest.raises(ValueError, match=message):
+        cprl.run(wrong, tmp_path / "never", watch="off")
+    assert not (tmp_path / "never").exists()
+
+
+@pytest.mark.slow
+def test_memory_is_what_a_game_of_recall_needs():
+    """The cue of the first of four turns says which of two actions pays in the last: 1, blindly 0.5."""
+
+    def reached(network, steps):
+        env = make_env(Recall(turns=4), worlds=8)
+        settings = DQNSettings(
+            sequence_steps=steps,
+            batch_size=16,
+            learning_rate=3e-3,
+            gamma=0.9,
+            buffer_size=4000,
+            learning_starts=64,
+            epsilon_hold_steps=0,
+            epsilon_decay_steps=1000,
+            epsilon_end=0.02,
+            target_every_episodes=10,
+        )
+        algorithm = DQN(settings=settings, network=network)
+        learner = algorithm.make_learner(spaces_of(env), agents=(0,), replicas=8, engine="eager")
+        returns = Returns()
+        train(env, {(0,): learner}, episodes=600, callbacks=[returns])
+        return [float(np.mean(own[-100:])) for own in returns.of.values()]
+
+    for kind in (GRU, LSTM):
+        remembering = reached(kind(encoder=MLP(hidden_cells=(8,)), recurrent_cells=8), 6)
+        assert sorted(remembering)[1] > 0.9, (kind, remembering)
+    assert max(reached(MLP(hidden_cells=(16,)), 1)) < 0.7
