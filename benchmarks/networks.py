@@ -21,7 +21,7 @@ from cprl.algorithms import DQN, PPO, DQNSettings, RolloutSettings
 from cprl.algorithms.base import Algorithm, TrainingEngine
 from cprl.collectors import StepCollector
 from cprl.learners.base import Learner
-from cprl.learners.replay import COMPILED_STEPS
+from cprl.learners.recurrent import COMPILED_STEPS
 from cprl.networks import GRU, LSTM, MLP, Conv
 from cprl.networks.specification import Network
 from cprl.policies.assignment import AgentPolicies

@@ -10,7 +10,7 @@ from test_population import GAME, Returns, assert_goes_on_bit_for_bit, populatio
 
 import cprl
 from cprl import CommonsEnv, Custom, Experiment
-from cprl.algorithms import DQN, SAC, VDN, DQNSettings
+from cprl.algorithms import DQN, PPO, SAC, VDN, DQNSettings, RolloutSettings
 from cprl.collectors import StepCollector
 from cprl.envs import make_env, spaces_of
 from cprl.learners.replay import ReplayLearner
@@ -140,6 +140,7 @@ def test_the_loss_is_that_of_a_network_that_goes_through_the_turns_by_itself(dou
     torch.testing.assert_close(found, torch.stack(wanted).detach())
 
 
+@pytest.mark.integration
 @pytest.mark.parametrize("name", DQNS)
 @pytest.mark.parametrize("engine", ["lane_axis", "lane_axis_flat", "vmapped"])
 def test_every_engine_learns_what_a_list_of_losses_does(name, engine):
@@ -190,11 +191,18 @@ def test_all_weights_move_and_no_replica_knows_of_the_others(name):
         torch.testing.assert_close(value, own[key.replace("replica_0", "replica_2")], rtol=1e-4, atol=1e-5)
 
 
+FEW_TURNS = {
+    "DQN": DQN(settings=replace(SETTINGS, sequence_steps=3), network=SMALL),
+    "PPO": PPO(settings=RolloutSettings(rollout_steps=20, minibatch_size=4, epochs=1), network=SMALL),
+}
+
+
 @pytest.mark.integration
-def test_the_compiled_update_learns_what_the_eager_one_does():
+@pytest.mark.parametrize("name", ["DQN", pytest.param("PPO", marks=pytest.mark.slow)])
+def test_the_compiled_update_learns_what_the_eager_one_does(name):
     """Sequences of up to `COMPILED_STEPS` are compiled."""
     learners = [
-        DQNS["GRU"].make_learner(GAME.spaces, agents=FOUR, replicas=1, engine=engine)
+        FEW_TURNS[name].make_learner(GAME.spaces, agents=FOUR, replicas=1, engine=engine)
         for engine in ("compiled", "eager")
     ]
     for learner in learners:
@@ -207,6 +215,7 @@ def test_the_compiled_update_learns_what_the_eager_one_does():
             torch.testing.assert_close(value, other[lane].state_dict()[key], rtol=1e-4, atol=1e-5)
 
 
+@pytest.mark.integration
 def test_agents_that_share_a_network_learn_from_the_sequences_of_all():
     members = [Team(DQNS["GRU"], FOUR, share_parameters=True)]
     agents = population(members)

@@ -1,7 +1,7 @@
-"""What a learner from rollouts does for recurrent networks: states between rollouts, sequences of turns."""
+"""What learners do for recurrent networks: states between rollouts, sequences of turns."""
 
 from collections.abc import Mapping
-from typing import Any, NamedTuple
+from typing import Any, Final, NamedTuple
 
 import torch
 from tensordict import TensorDictBase
@@ -12,6 +12,9 @@ from cprl.learners.lanes import Lanes
 from cprl.learners.teams import Teams
 from cprl.networks.agent import parts_of
 from cprl.networks.recurrent import state_shape_of
+
+COMPILED_STEPS: Final = 16
+"""The longest sequences whose update is compiled: torch unrolls their turns, and takes seconds for each."""
 
 ACTOR, CRITIC = range(2)
 """Positions of the actor and the critic among an agent's networks."""

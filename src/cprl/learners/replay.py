@@ -3,7 +3,7 @@
 from collections.abc import Callable, Mapping, Sequence
 from copy import deepcopy
 from functools import partial
-from typing import Any, Final
+from typing import Any
 
 import torch
 from tensordict import TensorDictBase
@@ -19,6 +19,7 @@ from cprl.learners.engine.functional import MakeLoss
 from cprl.learners.engine.refusals import refuse_for_replay
 from cprl.learners.engine.shared import SharedEngine
 from cprl.learners.lanes import NOISE, SAMPLING, TARGET_WEIGHTS, WEIGHTS, Lanes, StartFrom
+from cprl.learners.recurrent import COMPILED_STEPS
 from cprl.learners.settings import DQNSettings
 from cprl.learners.single import dqn_loss, q_network
 from cprl.learners.teams import MakeTeam, Teams, lanes_of
@@ -29,9 +30,6 @@ from cprl.policies.lanes import LaneActor
 from cprl.preferences.values import Preference, named
 from cprl.preferences.wanted import WantedRewards
 from cprl.spaces import Spaces
-
-COMPILED_STEPS: Final = 16
-"""The longest sequences whose update is compiled: torch unrolls their turns, and takes seconds for each."""
 
 
 class ReplayLearner:

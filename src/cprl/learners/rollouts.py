@@ -17,7 +17,7 @@ from cprl.learners.engine.functional import MakeLoss
 from cprl.learners.engine.refusals import reads, refuse_other_advantages
 from cprl.learners.engine.shared import SharedEngine
 from cprl.learners.lanes import SAMPLING, WEIGHTS, StartFrom
-from cprl.learners.recurrent import ACTOR, CRITIC, Evaluated, States, states_in
+from cprl.learners.recurrent import ACTOR, COMPILED_STEPS, CRITIC, Evaluated, States, states_in
 from cprl.learners.settings import RolloutSettings
 from cprl.learners.teams import MakeTeam, lanes_of
 from cprl.learners.transitions import wanted_in
@@ -36,7 +36,7 @@ class RolloutLearner:
 
     After every `rollout_steps` steps the learner estimates advantages with TorchRL's GAE and updates for
     `epochs` epochs. Each lane shuffles its own minibatches, and learns exactly as it would alone. Minibatches
-    of recurrent networks are consecutive steps, and their update is not compiled (docs/networks.md).
+    of recurrent networks are consecutive steps, and the update of more than `COMPILED_STEPS` is not compiled.
 
     Args:
         spaces: the shape and dtype of observations, and the number of actions A.
@@ -134,7 +134,7 @@ class RolloutLearner:
             learning_rate=settings.learning_rate,
             adam_eps=settings.adam_eps,
             max_grad_norm=settings.max_grad_norm,
-            compile=compile and not shapes,
+            compile=compile and (not shapes or sequence <= COMPILED_STEPS),
             trial=trial_rollout(
                 trial, actions=self.spaces.actions if self._reads_logits else None, states=shapes
             ),
