@@ -3,6 +3,7 @@
 import pytest
 
 from cprl.algorithms import DQN, VDN, DQNSettings
+from cprl.institutions import Quota, Sanctioner
 from cprl.networks import MLP
 from cprl.population import Learning, Scripted, Team
 from cprl.studies.naming import level_text, named, short_names
@@ -21,6 +22,8 @@ LEARNER = DQN(settings=DQNSettings())
         (Learning(LEARNER), "Learning(DQN)"),
         (Team(VDN(settings=DQNSettings()), (0, 1)), "Team(VDN)"),
         (MLP(hidden_cells=(8, 8)), "MLP((8, 8))"),
+        ((), "()"),
+        ((Quota(share=0.5), Sanctioner()), "(Quota(0.5), Sanctioner)"),
     ],
 )
 def test_a_level_is_told_by_its_value_and_an_agent_by_what_it_is(level, text):

@@ -19,7 +19,7 @@ def level_text(value: Any) -> str:
     """A level in a few words, for names and figures."""
     if isinstance(value, float):
         return f"{value:.6g}"
-    if isinstance(value, tuple) and all(isinstance(own, int | float) for own in value):
+    if isinstance(value, tuple):
         return f"({', '.join(map(level_text, value))})"
     if is_dataclass(value) and not isinstance(value, type):
         return _value_text(value)
@@ -27,11 +27,13 @@ def level_text(value: Any) -> str:
 
 
 def _value_text(value: Any) -> str:
-    """A dataclass by its class and its first field, if that says more: "Learning(DQN)", "MLP((8, 8))"."""
+    """A dataclass by its class and its first field that is no switch, if that says more: "Learning(DQN)",
+    "MLP((8, 8))"."""
     kind = type(value).__name__
-    first = next((getattr(value, own.name) for own in fields(value)), "")
+    each = (getattr(value, own.name) for own in fields(value))
+    first = next((own for own in each if not isinstance(own, bool)), "")
     inner = type(first).__name__ if is_dataclass(first) else level_text(first)
-    says_no_more = not inner or inner.startswith(kind)  # as DQNSettings of DQN
+    says_no_more = first is None or not inner or inner.startswith(kind)  # as DQNSettings of DQN
     return kind if says_no_more else f"{kind}({inner})"
 
 
