@@ -20,6 +20,7 @@ from cprl.learners.engine.compiled import FunctionalEngine
 from cprl.learners.replay import ReplayLearner
 from cprl.learners.settings import DQNSettings, RolloutSettings
 from cprl.learners.single import dqn_loss
+from cprl.training import train
 
 GAME = Game(
     map=maps.parse(".A>.A\n.A.A.\n..<.A"),
@@ -161,6 +162,25 @@ def test_several_updates_a_step_are_each_from_a_sample_of_their_own():
     assert one.engine.steps == 3
     assert losses[15].shape == (2, 2)
     assert three.buffer.sampler.rng.state_dict().keys() == one.buffer.sampler.rng.state_dict().keys()
+
+
+def test_several_steps_an_update_are_counted_from_the_first_possible_one():
+    """16 transitions are wanted first, the 16th is the first step that counts."""
+    fourth = learner(replace(SETTINGS, steps_per_update=4, updates_per_step=2))
+    losses = played(fourth, steps=30)
+    assert [step for step, own in enumerate(losses, 1) if own is not None] == [19, 23, 27]
+    assert fourth.engine.steps == 6
+    again = learner(replace(SETTINGS, steps_per_update=4))
+    again.load_state_dict(deepcopy(fourth.state_dict()))
+    assert [step for step, own in enumerate(played(again, steps=4), 31) if own is not None] == [31]
+
+
+@pytest.mark.parametrize("update_every", [1, 4, 6, 8])
+def test_steps_an_update_and_updates_that_wait_for_several_steps_agree(update_every):
+    """A loop that asks for k updates after every k steps gets as many as one that asks after each."""
+    often = learner(replace(SETTINGS, steps_per_update=4, learning_starts=1))
+    train(CommonsEnv(GAME, 2, seed=3), {(0, 1): often}, episodes=2, update_every=update_every)
+    assert often.engine.steps == often.steps // update_every * update_every // 4
 
 
 def test_with_tau_no_target_is_copied():
@@ -359,6 +379,7 @@ def test_a_transform_that_does_not_fit_is_refused_by_name():
         (partial(DQNSettings, gamma=1.5), "gamma is 1.5"),
         (partial(DQNSettings, buffer_size=0), "buffer_size is 0; allowed: an integer in 1"),
         (partial(DQNSettings, updates_per_step=0), "updates_per_step is 0; allowed: an integer in 1"),
+        (partial(DQNSettings, steps_per_update=0), "steps_per_update is 0; allowed: an integer in 1"),
         (partial(DQNSettings, n_steps=0), "n_steps is 0; allowed: an integer in 1"),
         (partial(DQNSettings, n_steps=17), "n_steps is 17; allowed: up to learning_starts, 16"),
         (partial(DQNSettings, n_steps=4, buffer_size=6), "n_steps is 4; .* half of buffer_size, 6"),

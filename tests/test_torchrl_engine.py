@@ -547,6 +547,20 @@ def test_updates_per_step_and_the_optimiser_are_those_of_the_settings():
         assert len(steps) == 3 * 3, "from the 16th turn on"
 
 
+def test_between_updates_nothing_is_learned_by_either_engine():
+    settings = changed(REPLAY, steps_per_update=4)
+    stock = resumable(DQN(settings=settings))
+    fast = DQN(settings=settings).make_learner(
+        stock.spaces, agents=stock.agents, replicas=stock.replicas, engine="eager"
+    )
+    for learner in (stock, fast):
+        played, losses = turns(learner.actor), []
+        for _ in range(30):
+            learner.store(next(played))
+            losses.append(learner.update())
+        assert [turn for turn, own in enumerate(losses, 1) if own is not None] == [19, 23, 27]
+
+
 @pytest.mark.parametrize(
     "team",
     [

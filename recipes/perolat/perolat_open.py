@@ -3,7 +3,7 @@
     python recipes/perolat/perolat_open.py --jobs 2 --runs studies/runs
 
 Random agents are in the evaluation of every condition. See perolat_base.py.
-Three conditions, at most 8 core hours.
+Three conditions, at most 6 core hours.
 """
 
 from perolat_base import BEAMS, EXPERIMENT

@@ -3,7 +3,7 @@
     python recipes/perolat/perolat_unequal.py --jobs 2 --runs studies/runs
 
 Equal rooms are the walls of perolat_walls.py, whose runs are shared by `--runs`. See perolat_base.py.
-Four conditions, at most 10 core hours; half of them are shared.
+Four conditions, at most 7 core hours; half of them are shared.
 """
 
 from perolat_base import BEAMS, EXPERIMENT

@@ -3,7 +3,7 @@
     python recipes/perolat/perolat_walls.py --jobs 2 --runs studies/runs
 
 `cprl visits RUN --figure visits.png` draws where the agents of a run go. See perolat_base.py.
-Four conditions, at most 10 core hours.
+Four conditions, at most 7 core hours.
 """
 
 from perolat_base import BEAMS, EXPERIMENT

@@ -8,7 +8,8 @@ Modules, in the order in which one reads them:
     lanes        a lane is one agent of one replica: seeds, networks, actors
     teams        the same where a lane is a team
     replay       ReplayLearner: learns from a replay buffer
-    recurrent    what a learner from rollouts does for recurrent networks
+    pace         when learners from replay update
+    recurrent    what learners do for recurrent networks
     rollouts     RolloutLearner: learns from rollouts of the present policy
     lola/        LOLALearner: learns with the other members' learning in view
     decisions    Bandit: how agents learn what they decide at an episode's begin

@@ -19,6 +19,7 @@ from cprl.learners.engine.functional import MakeLoss
 from cprl.learners.engine.refusals import refuse_for_replay
 from cprl.learners.engine.shared import SharedEngine
 from cprl.learners.lanes import NOISE, SAMPLING, TARGET_WEIGHTS, WEIGHTS, Lanes, StartFrom
+from cprl.learners.pace import Pace
 from cprl.learners.recurrent import COMPILED_STEPS
 from cprl.learners.settings import DQNSettings
 from cprl.learners.single import dqn_loss, q_network
@@ -143,7 +144,7 @@ class ReplayLearner:
         for transform in settings.replay_transforms:
             self.buffer.append_transform(transform.make())
         self.actor = self._lanes.actor(self.engine, compile=compile)
-        self.steps = 0
+        self.steps, self._pace = 0, Pace(settings)
         self.actor.epsilon = settings.epsilon(0)
         self._episodes = torch.zeros(replicas, dtype=torch.int64)
 
@@ -201,12 +202,13 @@ class ReplayLearner:
         """Stores one step of every replica, as the collector yields it."""
         self.buffer.write(self._lanes.turn(batch, wanted_in(self.wants, batch)))
         self.steps += 1
+        self._pace.stored(self.steps)
         self.actor.explore_with(self.settings.epsilon(self.steps))
 
     def update(self) -> Tensor | None:
         """Updates every lane `updates_per_step` times; returns the mean losses [R, S], or None while fewer
-        than `learning_starts` transitions are stored."""
-        if self.steps < self.settings.learning_starts:
+        than `learning_starts` transitions are stored, and between updates, see `steps_per_update`."""
+        if not self._pace.take(self.steps):
             return None
         losses = self.engine.update(self.buffer)
         if self.settings.updates_per_step > 1:
@@ -262,6 +264,7 @@ class ReplayLearner:
             "sampler": self.buffer.sampler.state_dict(),
             "exploration": self.actor.rng.state_dict(),
             "steps": self.steps,
+            "owed": self._pace.owed,
             "episodes": self._episodes,
             "wants": self.wants.state_dict(),
         }
@@ -276,7 +279,7 @@ class ReplayLearner:
         if self.buffer.has_transforms:
             self.buffer.transform.load_state_dict(state["transforms"])
         self.actor.rng.load_state_dict(state["exploration"])
-        self.steps = int(state["steps"])
+        self.steps, self._pace.owed = int(state["steps"]), int(state.get("owed", 0))
         self.actor.epsilon = self.settings.epsilon(self.steps)
         self._episodes = state["episodes"].clone()
         self.wants.load_state_dict(state.get("wants", {}))

@@ -71,8 +71,8 @@ class DQNSettings(Exploring):
     batch_size: int = 8
     """Transitions in a minibatch, or sequences of `sequence_steps` transitions."""
     learning_starts: int = 16
-    """Transitions stored before the first update; after that each environment step is followed by
-    `updates_per_step` updates."""
+    """Transitions stored before the first update; after that `updates_per_step` updates follow every
+    `steps_per_update` environment steps."""
     gamma: float = 0.995
     """Discount factor per step."""
     learning_rate: float = 1e-5
@@ -82,7 +82,10 @@ class DQNSettings(Exploring):
     hidden_cells: tuple[int, ...] = DEFAULT_HIDDEN_CELLS
     """Units of each hidden layer, with ReLU; used if the algorithm has no `network`."""
     updates_per_step: int = 1
-    """Updates per environment step, each with a new minibatch."""
+    """Updates per environment step, or after `steps_per_update` of them, each with a new minibatch."""
+    steps_per_update: int = 1
+    """Environment steps from one update to the next; the study updates after each, Mnih et al. (2015) after
+    every fourth, with minibatches of 32."""
     n_steps: int = 1
     """Rewards that an n-step target sums before it bootstraps; fewer if the episode ends sooner. As TorchRL's
     `MultiStepTransform`; the study used 1."""
@@ -225,6 +228,7 @@ _DQN: Final[dict[str, Check]] = {
     "batch_size": count(1),
     "learning_starts": count(1, MOST_INT64),
     "updates_per_step": count(1),
+    "steps_per_update": count(1, MOST_INT64),
     "n_steps": count(1, 1000),
     "sequence_steps": count(1, 1000),
     "tau": either(number(1e-6, 1), Check(NONE.fits, "None for copies every target_every_episodes episodes")),

@@ -23,6 +23,7 @@ from cprl.learners.engine.choice import trial_batch
 from cprl.learners.engine.functional import MakeLoss, targets_of
 from cprl.learners.engine.refusals import refuse_for_replay
 from cprl.learners.lanes import NOISE, TARGET_WEIGHTS, Lanes, StartFrom
+from cprl.learners.pace import Pace
 from cprl.learners.settings import DQNSettings
 from cprl.learners.torchrl.agents import MakeSampler, StockAgents, check_makers, sampler_of
 from cprl.learners.torchrl.buffers import buffer_state, load_buffer, nested, plain
@@ -134,7 +135,7 @@ class TorchRLReplayLearner:
         of_batch = settings.batch_size, (noise_numbers,), self.stock.device
         self._noise = [Noise([own], *of_batch) for own in self._lanes.seeds(NOISE) if noise_numbers]
         self.actor = self._lanes.actor(self.stock, compile=False)
-        self.steps = 0
+        self.steps, self._pace = 0, Pace(settings)
         self.actor.epsilon = settings.epsilon(0)
 
     def _refuse_unfit(self, make_loss: MakeLoss, device: str | torch.device, noise_numbers: int) -> None:
@@ -210,12 +211,13 @@ class TorchRLReplayLearner:
         for lane, buffer in enumerate(self.buffers):
             buffer.extend(turn[lane : lane + 1])
         self.steps += 1
+        self._pace.stored(self.steps)
         self.actor.epsilon = self.settings.epsilon(self.steps)
 
     def update(self) -> Tensor | None:
         """Updates every agent `updates_per_step` times; returns the mean losses [R, S], or None while fewer
-        than `learning_starts` transitions are stored."""
-        if self.steps < self.settings.learning_starts or not len(self.buffers[0]):
+        than `learning_starts` transitions are stored, and between updates, see `steps_per_update`."""
+        if not len(self.buffers[0]) or not self._pace.take(self.steps):
             return None
         losses = [self._update(lane) for lane in range(len(self.stock))]
         return self._lanes.by_agent(torch.stack(losses))
@@ -266,6 +268,7 @@ class TorchRLReplayLearner:
             "noise": [own.rng.state_dict() for own in self._noise],
             "exploration": self.actor.rng.state_dict(),
             "steps": self.steps,
+            "owed": self._pace.owed,
             "wants": self.wants.state_dict(),
         }
 
@@ -285,7 +288,7 @@ class TorchRLReplayLearner:
         for noise, own in zip(self._noise, state.get("noise", ()), strict=True):
             noise.rng.load_state_dict(own)
         self.actor.rng.load_state_dict(state["exploration"])
-        self.steps = int(state["steps"])
+        self.steps, self._pace.owed = int(state["steps"]), int(state.get("owed", 0))
         self.wants.load_state_dict(state.get("wants", {}))
         self.actor.epsilon = self.settings.epsilon(self.steps)
 
