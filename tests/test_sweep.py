@@ -166,6 +166,7 @@ def test_a_failed_condition_does_not_end_the_study_and_is_listed_with_what_tries
         (f"mine.py --vary {FREEZE}=2 --search 3 --maximise peace --minimise peace", "allowed: one of them"),
         (f"mine.py --vary {FREEZE}=2 --search 3 --maximise luck", "metric is 'luck'; allowed: "),
         (f"mine.py --vary {FREEZE}=2 --search 3 --only freeze_steps=2", "--only is for studies"),
+        (f"mine.py --vary {FREEZE}=2 --search 3 --keep-checkpoints", "--keep-checkpoints is for studies"),
         (f"mine.py --vary {FREEZE}=2 --reference best", "reference is 'best'; allowed: the name of"),
         (f"mine.py --vary {FREEZE}=2 --jobs 0", "--jobs is 0; allowed"),
         (f"mine.py --vary {FREEZE}=2 --jobs 2 --on here", "--jobs is 2 with --on here"),

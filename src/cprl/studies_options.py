@@ -46,6 +46,9 @@ class StudyOptions:
     only: tyro.conf.UseAppendAction[tuple[str, ...]] = ()
     """Run a condition alone, or those with some levels: "gamma=0.9", "gamma=0.9, freeze_steps=5"; may be
     repeated. The others stay as they are, so that several machines can share a study."""
+    keep_checkpoints: bool = False
+    """Keep the state of each training, buffers included (an agent's takes as much as its buffer), so that the
+    same study with more --episodes goes on from there."""
     on: Literal["here", "processes", "ray"] | None = None
     """Where trials are run: one after the other in this process, in processes on this machine, or by Ray
     (extra "ray"); by default here, and in processes with more than one of --jobs."""
@@ -102,8 +105,12 @@ def carry_out(what: Study | Search, options: StudyOptions, command: Sequence[str
         SystemExit: with code 1 where trials have failed, and where it was interrupted.
     """
     executor, again = executor_of(options), shlex.join(command)
-    if options.only and isinstance(what, Search):
-        raise ValueError("--only is for studies, and this is a search; allowed: one without the other")
+    if isinstance(what, Search):
+        for flag, value in {"--only": options.only, "--keep-checkpoints": options.keep_checkpoints}.items():
+            if value:
+                raise ValueError(
+                    f"{flag} is for studies, and this is a search; allowed: one without the other"
+                )
     if options.dry_run:
         return _list(what, options)
     names = ("runs", "allow", "watch", "last")
@@ -115,7 +122,8 @@ def carry_out(what: Study | Search, options: StudyOptions, command: Sequence[str
             result = run_search(what, options.out, **how)
             _say_best(result)
         else:
-            result = run_study(what, options.out, only=options.only, **how)
+            how |= {"only": options.only, "keep_checkpoints": options.keep_checkpoints}
+            result = run_study(what, options.out, **how)
     say(result.out)
     if result.failed:
         _say_failed(result, again)

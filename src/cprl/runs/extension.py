@@ -30,7 +30,7 @@ def refuse_to_extend(run: Path, episodes: int, callbacks: Iterable[Any]) -> None
         ValueError: if it would not; says why.
     """
     for callback in callbacks:
-        if hasattr(callback, "on_start") and not getattr(callback, "is_extendable", False):
+        if depends_on_episodes(callback):
             raise ValueError(
                 f"{run} has the callback {type(callback).__name__}, whose on_start sees the number of "
                 "episodes, so that a longer training may differ from the first episode on; if it does not: "
@@ -50,6 +50,11 @@ def refuse_to_extend(run: Path, episodes: int, callbacks: Iterable[Any]) -> None
             f"{run} was stopped while its last replicas played their last episodes, and keeps no state from "
             "before; finish it with as many episodes as it has"
         )
+
+
+def depends_on_episodes(callback: Any) -> bool:
+    """Whether a callback, or a class of callbacks, may depend on the number of episodes of a training."""
+    return hasattr(callback, "on_start") and not getattr(callback, "is_extendable", False)
 
 
 def extend(run: Path, before: int, episodes: int) -> None:

@@ -7,6 +7,7 @@ Modules, in the order in which one reads them:
     conditions   one experiment of a study, and the checksum that names its runs
     study        Study: factors, replicas, pairing; a value
     status       what a trial says of itself while it runs
+    extending    runs that go on from shorter ones
     trials       one run of a study, run or resumed, whatever was there
     executors    where trials are run
     overview     how far every trial is

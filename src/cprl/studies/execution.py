@@ -5,7 +5,7 @@ from collections.abc import Iterator, Sequence
 from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Final
+from typing import Any, Final
 
 from cprl.arguments import integer, object_of, path, refusal, switch, texts
 from cprl.runs.files import read_json, write_json
@@ -47,6 +47,7 @@ def run_study(
     on: Executor | None = None,
     runs: Path | str | None = None,
     only: Sequence[str] = (),
+    keep_checkpoints: bool = False,
     allow: Sequence[str] = (),
     progress: bool = True,
     watch: str = "off",
@@ -66,6 +67,8 @@ def run_study(
         runs: the directory of the runs, which several studies may share; by default `runs` in `out`.
         only: the conditions that are run now, by their names or by some of the levels in these, such as
             "gamma=0.9" or "gamma=0.9, freeze_steps=5"; the others stay as they are. By default all are run.
+        keep_checkpoints: whether runs keep the state of their trainings, buffers included, so that the same
+            study with more episodes goes on from them, bit for bit.
         allow: the user's own code, "module:Class", that stored runs of `Frozen` agents may import.
         progress: whether a table of all trials is shown; lines where the output is not a terminal.
         watch: "off", or "serve", "spawn", "connect ADDRESS" for the same table and the returns of finished
@@ -85,8 +88,18 @@ def run_study(
     chosen = trials_with(trials, only)
     check_executor(on)
     switch("results", results)
+    switch("keep_checkpoints", keep_checkpoints)
     check_last(last)
-    with as_driver(study, trials, out, folder, allow=allow, progress=progress, watch=watch) as driver:
+    with as_driver(
+        study,
+        trials,
+        out,
+        folder,
+        allow=allow,
+        keep_checkpoints=keep_checkpoints,
+        progress=progress,
+        watch=watch,
+    ) as driver:
         failed = driver.run(chosen, on or InProcess())
     table = results_of(study, trials, out, folder, last=last, again=again) if results else None
     return StudyResult(study, out, folder, tuple(trials), failed, table)
@@ -142,8 +155,18 @@ def check_executor(on: object) -> None:
 class Driver:
     """What runs trials of a study whose directory is there; made by `as_driver`."""
 
-    def __init__(self, out: Path, runs: Path, *, allow: Sequence[str], progress: bool, title: str) -> None:
-        self._out, self._runs, self._allow = out, runs, allow
+    def __init__(
+        self,
+        out: Path,
+        runs: Path,
+        *,
+        allow: Sequence[str],
+        progress: bool,
+        title: str,
+        keep_checkpoints: bool = False,
+    ) -> None:
+        self._out, self._runs = out, runs
+        self._how: dict[str, Any] = {"allow": allow, "keep_checkpoint": keep_checkpoints}
         self._progress, self._title = progress, title
         self.viewer: LiveStudy | None = None
         self.others = ""
@@ -164,7 +187,7 @@ class Driver:
         )
         if self.others:
             shown.say(self.others)
-        tasks = tasks_of(trials, runs=self._runs, status=self._out / STATUS, allow=self._allow)
+        tasks = tasks_of(trials, runs=self._runs, status=self._out / STATUS, **self._how)
         outcomes = executor.run(tasks)
         with shown, ExitStack() as stack:
             stack.callback(getattr(outcomes, "close", lambda: None))  # stops what it started
@@ -189,6 +212,7 @@ def as_driver(
     allow: Sequence[str],
     progress: bool,
     watch: str,
+    keep_checkpoints: bool = False,
 ) -> Iterator[Driver]:
     """Checks all that is asked for, then makes a study's directory.
 
@@ -199,7 +223,9 @@ def as_driver(
     texts("allow", allow)
     check_live(watch)
     tasks_of(trials, runs=runs, status=out / STATUS, allow=allow)
-    driver = Driver(out, runs, allow=allow, progress=progress, title=study.name)
+    driver = Driver(
+        out, runs, allow=allow, progress=progress, title=study.name, keep_checkpoints=keep_checkpoints
+    )
     runs.mkdir(parents=True, exist_ok=True)
     out.mkdir(parents=True, exist_ok=True)
     write_study(study, out)
@@ -213,9 +239,9 @@ def as_driver(
         yield driver
 
 
-def tasks_of(trials: Sequence[Trial], *, runs: Path, status: Path, allow: Sequence[str]) -> list[Task]:
-    """The task of each trial."""
-    return [task_of(trial, runs=runs, status=status, allow=allow) for trial in trials]
+def tasks_of(trials: Sequence[Trial], *, runs: Path, status: Path, **how: Any) -> list[Task]:
+    """The task of each trial; for other arguments see `task_of`."""
+    return [task_of(trial, runs=runs, status=status, **how) for trial in trials]
 
 
 def _others(out: Path) -> str:

@@ -125,6 +125,8 @@ class StatusFile:
 class StatusCallback:
     """Counts the steps and episodes of a training for its `StatusFile`; a callback of `cprl.training`."""
 
+    is_extendable = True
+
     def __init__(self, file: StatusFile) -> None:
         self._said = file.said
 

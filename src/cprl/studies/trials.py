@@ -22,6 +22,7 @@ from cprl.runs.extension import REPORT
 from cprl.runs.lock import FILE_NAME as LOCK
 from cprl.runs.lock import RunLock, RunLockedError
 from cprl.studies.conditions import Condition
+from cprl.studies.extending import begin_from_shorter
 from cprl.studies.status import Status, StatusCallback, StatusFile, is_silent
 from cprl.studies.study import Block, Study
 
@@ -90,6 +91,8 @@ class Task:
     """Targets of `Custom` that may be imported."""
     paths: tuple[str, ...] = ()
     """Directories from which they are imported."""
+    keep_checkpoint: bool = False
+    """Whether the finished run keeps the state of its training, so that a longer trial can go on from it."""
     command: tuple[str, ...] = ("cprl", "sweep")
     """The command line of the study, which the recipe keeps."""
 
@@ -110,7 +113,9 @@ class Outcome(NamedTuple):
     """Whether anything had to be done."""
 
 
-def task_of(trial: Trial, *, runs: Path, status: Path, allow: Sequence[str] = ()) -> Task:
+def task_of(
+    trial: Trial, *, runs: Path, status: Path, allow: Sequence[str] = (), keep_checkpoint: bool = False
+) -> Task:
     """The task of a trial.
 
     Classes of the user's own that the experiment itself has are allowed: it was made with them.
@@ -120,6 +125,7 @@ def task_of(trial: Trial, *, runs: Path, status: Path, allow: Sequence[str] = ()
         runs: the directory in which its own is.
         status: the directory in which it says how far it is.
         allow: further targets of `Custom`, those of stored runs that agents come from.
+        keep_checkpoint: whether its run keeps the state of its training.
     """
     recipe = trial.experiment.to_recipe(runs / trial.name)
     targets = tuple(dict.fromkeys([*custom_targets(recipe["experiment"]), *allow]))
@@ -130,6 +136,7 @@ def task_of(trial: Trial, *, runs: Path, status: Path, allow: Sequence[str] = ()
         recipe=recipe,
         allow=targets,
         paths=tuple(map(os.path.abspath, sys.path)) if targets else (),
+        keep_checkpoint=keep_checkpoint,
         command=tuple(sys.argv),
     )
 
@@ -137,8 +144,9 @@ def task_of(trial: Trial, *, runs: Path, status: Path, allow: Sequence[str] = ()
 def run_task(task: Task) -> Outcome:
     """Makes a trial a finished one; may be called any number of times, anywhere.
 
-    What is there is kept: a finished trial is left as it is, an unfinished one is resumed. While another
-    process runs it, this one waits, and takes it over where that one has died.
+    What is there is kept: a finished trial is left as it is, an unfinished one is resumed, and one that is
+    not there goes on from a shorter one if that can be, see `cprl.studies.extending`. While another process
+    runs it, this one waits, and takes it over where that one has died.
 
     What it prints is in `log.txt` beside its status, and why it failed in `failed.txt`.
     """
@@ -165,8 +173,10 @@ def _run(task: Task, run: Path, status: Status) -> None:
 
     silent = is_silent(status, PATIENCE_S)
     while state_of(run) != "finished":
-        is_begun, take_over = state_of(run) == "unfinished", next(silent)
         experiment = Experiment.from_recipe(task.recipe, allow=task.allow, directory=run)
+        if not run.exists():
+            begin_from_shorter(run, experiment, task.recipe)
+        is_begun, take_over = state_of(run) == "unfinished", next(silent)
         try:
             if is_begun:  # another study may have begun it, under another name
                 experiment = replace(experiment, name=str(read_recipe(run)["experiment"]["name"]))
@@ -178,7 +188,7 @@ def _run(task: Task, run: Path, status: Status) -> None:
                     run,
                     resume=is_begun,
                     take_over=take_over,
-                    keep_checkpoint=False,
+                    keep_checkpoint=task.keep_checkpoint,
                     watch="off",
                     figures=False,
                     allow=task.allow,
