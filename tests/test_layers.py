@@ -75,6 +75,7 @@ PACKAGES = (
     "recipes_cli",
     "docs_cli",
     "cli",
+    "__main__",
 )
 MODULES = sorted(path for path in SOURCE.rglob("*.py") if path.parent != SOURCE or path.name != "__init__.py")
 

@@ -1,5 +1,6 @@
 """What the package shows from outside: its names, version and types."""
 
+import runpy
 import subprocess
 import sys
 from importlib.metadata import version
@@ -44,6 +45,14 @@ def test_the_version_is_that_of_the_installed_package(capsys, monkeypatch):
     monkeypatch.setattr(sys, "argv", ["cprl", "--version"])
     cli.main()
     assert capsys.readouterr().out == f"cprl {version('cprl')}\n"
+
+
+def test_the_command_works_by_the_name_of_the_package_too(capsys, monkeypatch):
+    """Where the scripts of Python are not on the path; messages and recipes say `cprl` all the same."""
+    monkeypatch.setattr(sys, "argv", ["/some/where/cprl/__main__.py", "--version"])
+    runpy.run_module("cprl", run_name="__main__", alter_sys=False)
+    assert capsys.readouterr().out == f"cprl {version('cprl')}\n"
+    assert sys.argv[0] == "cprl"
 
 
 def test_type_checkers_find_the_types():

@@ -61,7 +61,7 @@ INTERNAL: Final = {
     *("annotations", "stored_agents", "agents", "outcome", "parts", "leftovers", "running", "play", "flags"),
     *("commandline", "command_parts"),
     *("evaluation_cli", "egta_cli", "scenarios_cli", "studies_options", "studies_cli", "exploit_cli"),
-    *("libraries", "shipped", "recipes_cli", "docs_cli", "cli"),
+    *("libraries", "shipped", "recipes_cli", "docs_cli", "cli", "__main__"),
 }
 """Packages that no page shows: users reach what they hold by the names of `cprl` or by a command."""
 

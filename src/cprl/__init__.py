@@ -67,6 +67,7 @@ Each imports only from those above it:
     recipes_cli  cprl recipe, and recipes that cprl run takes by name
     docs_cli     cprl docs
     cli          the command cprl
+    __main__     the same as python -m cprl
 """
 
 from importlib import import_module
