@@ -1,5 +1,6 @@
 """A run's directory: never written over, gone on with only by the same recipe."""
 
+import json
 import shlex
 import sys
 from dataclasses import replace
@@ -12,6 +13,7 @@ from cprl.custom import Custom
 from cprl.experiment import Experiment
 from cprl.population import Frozen, Learning
 from cprl.runs.directory import read_recipe, refuse_another_run, resume_command, start_run
+from cprl.studies.paths import changed
 
 AGENT = Learning(DQN(settings=presets.dqn_settings("commons")))
 EXPERIMENT = Experiment(
@@ -69,6 +71,24 @@ def test_another_recipe_is_refused_by_what_differs(change, message, tmp_path):
     run = begin(tmp_path / "run")
     with pytest.raises(ValueError, match=message):
         resume(run, replace(EXPERIMENT, **change))
+
+
+def test_fields_that_a_later_version_has_are_no_difference_while_they_have_their_default(tmp_path):
+    """A version that did not know a field did what its default says."""
+    run = begin(tmp_path / "run")
+    recipe = json.loads((run / "recipe.json").read_text())
+    for agent in recipe["experiment"]["agents"][:2]:
+        del agent["algorithm"]["settings"]["steps_per_update"]
+    del recipe["experiment"]["game"]["rules"]["walls_block_sight"]
+    (run / "recipe.json").write_text(json.dumps(recipe))
+    assert resume(run) == EXPERIMENT.episodes
+    settings = "agents.0.algorithm.settings"
+    with pytest.raises(ValueError, match=r"settings\.steps_per_update was not there, is 4$"):
+        resume(run, changed(EXPERIMENT, {f"{settings}.steps_per_update": 4}))
+    del recipe["experiment"]["agents"][0]["algorithm"]["settings"]
+    (run / "recipe.json").write_text(json.dumps(recipe))
+    with pytest.raises(ValueError, match=r"algorithm\.settings was not there, is "):
+        resume(run)
 
 
 def test_a_run_of_an_older_cprl_is_not_resumed(tmp_path):

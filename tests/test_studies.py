@@ -13,12 +13,12 @@ from tiny_study import FREEZE, GAMMA, LEARNING, MIXED, SETTINGS, TINY
 
 from cprl import Study, maps, presets
 from cprl.algorithms import DQN, PPO
-from cprl.config import KINDS
+from cprl.config import KINDS, defaults_of
 from cprl.experiment import MOST_SEED, Experiment
 from cprl.learners.settings import RolloutSettings
 from cprl.population import Frozen, Learning, Scripted, Team
 from cprl.studies import Integers, LogUniform, Uniform
-from cprl.studies.conditions import FORMAT, Condition, defaults_of
+from cprl.studies.conditions import FORMAT, Condition
 from cprl.studies.factors import drawn
 from cprl.studies.paths import changed, values_at
 from cprl.studies.trials import trials_of

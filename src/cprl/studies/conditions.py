@@ -3,11 +3,11 @@
 import hashlib
 import json
 from collections.abc import Mapping
-from dataclasses import MISSING, dataclass, field, fields
+from dataclasses import dataclass, field
 from functools import cached_property
 from typing import Any, Final
 
-from cprl.config import KINDS, to_config
+from cprl.config import without_defaults
 from cprl.experiment import Experiment
 
 FORMAT: Final = 1
@@ -41,35 +41,5 @@ class Condition:
         the same.
         """
         table = {name: own for name, own in self.experiment.to_config().items() if name not in UNNAMED}
-        kept = {"format": FORMAT, "experiment": _without_defaults(table, Experiment)}
+        kept = {"format": FORMAT, "experiment": without_defaults(table, Experiment)}
         return hashlib.blake2b(json.dumps(kept, sort_keys=True).encode(), digest_size=6).hexdigest()
-
-
-def defaults_of(kind: Any) -> dict[str, Any]:
-    """The defaults of the fields of a dataclass as a recipe holds them; those without one are left out."""
-    found = {}
-    for own in fields(kind):
-        if own.init and own.default is not MISSING:
-            found[own.name] = own.default
-        elif own.init and own.default_factory is not MISSING:
-            found[own.name] = own.default_factory()
-    tables = {  # the arguments of a Custom are a table already
-        name: value if isinstance(value, Mapping) else to_config(value) for name, value in found.items()
-    }
-    return {name: _without_defaults(table) for name, table in tables.items()}
-
-
-def _without_defaults(table: Any, kind: Any = None) -> Any:
-    """A table of `to_config` without the fields that have their default, and with 1.0 as 1."""
-    if isinstance(table, list):
-        return [_without_defaults(own) for own in table]
-    if isinstance(table, float) and table.is_integer():
-        return int(table)
-    if not isinstance(table, Mapping):
-        return table
-    if table.get("kind") == "Custom":
-        return dict(table)
-    kind = KINDS.get(str(table.get("kind"))) if kind is None else kind
-    left_out = {} if kind is None else defaults_of(kind)
-    plain = {name: _without_defaults(own) for name, own in table.items()}
-    return {name: own for name, own in plain.items() if name not in left_out or own != left_out[name]}

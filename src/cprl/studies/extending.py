@@ -6,6 +6,7 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, Final
 
+from cprl.config import differences
 from cprl.experiment import Experiment
 from cprl.runs.checkpoints import FOLDER, checkpoints_in, is_ending
 from cprl.runs.directory import FILE_NAME as RECIPE
@@ -42,7 +43,7 @@ def begin_from_shorter(run: Path, experiment: Experiment, recipe: Mapping[str, A
         if (
             own is not None
             and own["episodes"] < wanted["episodes"]
-            and {**own, **_FREE} == {**wanted, **_FREE}
+            and not differences({**own, **_FREE}, {**wanted, **_FREE}, "experiment")
             and any(map(is_ending, checkpoints_in(other.parent / FOLDER)))
         ):
             found.append((own["episodes"], other.parent))
