@@ -102,7 +102,7 @@ def test_a_dry_run_lists_all_trials_and_writes_nothing(here, capsys):
 @pytest.mark.integration
 def test_a_part_of_a_study_is_run_by_the_levels_that_its_conditions_have(here, capsys):
     """Levels are whole words: freeze_steps=2 is not freeze_steps=25."""
-    line = f"mine.py --vary {FREEZE}=2,25 --vary {GAMMA}=0.5,0.55 --episodes 1 --no-figures --out here"
+    line = f"mine.py --vary {FREEZE}=2,25 --vary {GAMMA}=0.5,0.55 --episodes 1 --out here"
     sweep(f"{line} --only freeze_steps=2 --dry-run")
     said = capsys.readouterr().out
     assert "freeze_steps=2, gamma=0.55" in said
@@ -115,6 +115,8 @@ def test_a_part_of_a_study_is_run_by_the_levels_that_its_conditions_have(here, c
         "freeze_steps=25, gamma=0.55",
     ]
     assert len(states) == 4
+    again = f"This line runs what is lacking: `cprl sweep {shlex.join(shlex.split(line))}`"
+    assert again in Path("here/summary.md").read_text()
     with pytest.raises(ValueError, match=r"only is 'gamma=0.9'; allowed: a condition or levels of some: fr"):
         sweep(f"{line.replace('here', 'elsewhere')} --only gamma=0.9")
     assert not Path("elsewhere").exists()

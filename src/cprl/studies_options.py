@@ -16,7 +16,7 @@ import tyro
 
 from cprl.arguments import integer
 from cprl.output import console, say
-from cprl.runs.directory import without_directories
+from cprl.runs.directory import without_directories, without_options
 from cprl.studies.execution import RUNS, STATUS, StudyResult, directory_of, run_study, trials_with
 from cprl.studies.executors import Executor, InProcess, Processes, Ray
 from cprl.studies.overview import Overview, label_of
@@ -115,7 +115,8 @@ def carry_out(what: Study | Search, options: StudyOptions, command: Sequence[str
         return _list(what, options)
     names = ("runs", "allow", "watch", "last")
     how: dict[str, Any] = {"on": executor, **{own: getattr(options, own) for own in names}}
-    how |= {"results": options.figures, "again": shlex.join([without_directories(command[0]), *command[1:]])}
+    whole = without_options(command[1:], ["--only"])  # what a part of a study lacks, it lacks
+    how |= {"results": options.figures, "again": shlex.join([without_directories(command[0]), *whole])}
     with _interruptible(again):
         result: StudyResult | SearchResult
         if isinstance(what, Search):

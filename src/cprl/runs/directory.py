@@ -209,12 +209,17 @@ def without_directories(program: str) -> str:
 
 def _without_out(words: Sequence[str]) -> list[str]:
     """The words of a command line without `--out DIRECTORY`, and `--runs DIRECTORY` of a study."""
+    return without_options(words, _DIRECTORIES)
+
+
+def without_options(words: Sequence[str], options: Sequence[str]) -> list[str]:
+    """The words of a command line without some options, such as "--out", and the value of each."""
     given, left = list(words), []
     while given:
         word = given.pop(0)
-        if word in _DIRECTORIES and given:
+        if word in options and given:
             given.pop(0)
-        elif not word.startswith(tuple(f"{own}=" for own in _DIRECTORIES)):
+        elif not word.startswith(tuple(f"{own}=" for own in options)):
             left.append(word)
     return left
 
