@@ -1,6 +1,5 @@
 """What the package shows from outside: its names, version and types."""
 
-import runpy
 import subprocess
 import sys
 from importlib.metadata import version
@@ -47,12 +46,12 @@ def test_the_version_is_that_of_the_installed_package(capsys, monkeypatch):
     assert capsys.readouterr().out == f"cprl {version('cprl')}\n"
 
 
-def test_the_command_works_by_the_name_of_the_package_too(capsys, monkeypatch):
-    """Where the scripts of Python are not on the path; messages and recipes say `cprl` all the same."""
-    monkeypatch.setattr(sys, "argv", ["/some/where/cprl/__main__.py", "--version"])
-    runpy.run_module("cprl", run_name="__main__", alter_sys=False)
-    assert capsys.readouterr().out == f"cprl {version('cprl')}\n"
-    assert sys.argv[0] == "cprl"
+@pytest.mark.integration
+def test_the_command_works_by_the_name_of_the_package_too():
+    """Where the scripts of Python are not on the path; it is called `cprl` all the same."""
+    words = [sys.executable, "-m", "cprl", "--help"]
+    said = subprocess.run(words, capture_output=True, text=True, check=True, timeout=120).stdout
+    assert said.startswith("usage: cprl [-h]")
 
 
 def test_type_checkers_find_the_types():
