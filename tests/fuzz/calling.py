@@ -29,6 +29,7 @@ OF_FILES: Final = {
     "cprl.runs.directory:start_run",
     "cprl.runs.episodes:EpisodeTable",
     "cprl.runs.episodes:read_episodes",
+    "cprl.runs.episodes:read_table",
     "cprl.runs.export:export_results",
     "cprl.runs.loggers:LoggerCallback",
     "cprl.runs.weights:BestWeights",

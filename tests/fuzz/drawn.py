@@ -30,6 +30,12 @@ def _chance() -> torch.Generator:
 _FEW: Final = st.integers(1, 3)
 _SEEDS: Final = st.sampled_from((0, 1, 7, 2**63, 2**64 - 2))
 _RUNS: Final = st.one_of(st.sampled_from(runs.NAMES).map(runs.folder), hints.PATHS)
+_TABLES: Final = st.one_of(
+    st.sampled_from(("plain", "finished", "stopped")).map(
+        lambda name: runs.folder(name) / "episodes.parquet"
+    ),
+    hints.PATHS,
+)
 _FINISHED: Final = st.one_of(*[st.sampled_from(("plain", "plain", "finished")).map(runs.folder)] * 4, _RUNS)
 _ALLOW: Final = st.sampled_from((runs.ALLOW, runs.ALLOW, ()))
 _FRESH: Final = {
@@ -302,6 +308,7 @@ OWN: Final[dict[str, dict[str, st.SearchStrategy[Any]]]] = {
         "command": st.sampled_from((None, ["recipe.py", "--seed", "3"])),
     },
     "cprl.runs.episodes:read_episodes": {"run_directory": _RUNS},
+    "cprl.runs.episodes:read_table": {"path": _TABLES},
     "cprl.runs.episodes:EpisodeTable": {"path": st.just(Path("episodes.parquet"))},
     "cprl.runs.export:export_results": {"run": _FINISHED, "folder": hints.PATHS},
     "cprl.runs.loggers:LoggerCallback": {"replicas": _FEW, "agents": st.sampled_from((None, ["a", "b"]))},

@@ -182,17 +182,19 @@ def read_episodes(run_directory: str | os.PathLike[str]) -> pa.Table:
     return read_table(path)
 
 
-def read_table(path: Path) -> pa.Table:
+def read_table(path: str | os.PathLike[str]) -> pa.Table:
     """A parquet file of a run, checked against its manifest.
 
     Raises:
         FileNotFoundError: if there is no such file.
         ValueError: if it is damaged or no parquet file; names it.
     """
+    path = path_of("path", path)
     refuse_special(path)
     verify(path)
     try:
-        return pq.read_table(path)
+        with open(path, "rb") as file:
+            return pq.read_table(file)
     except FileNotFoundError:
         raise
     except (pa.ArrowException, OSError) as error:
