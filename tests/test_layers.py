@@ -40,6 +40,7 @@ PACKAGES = (
     "population",
     "annotations",
     "config",
+    "differences",
     "presets",
     "measuring",
     "runs",

@@ -113,23 +113,28 @@ def weights(agents):
     }
 
 
+def assert_all_weights_move_and_replicas_learn_apart(together, alone):
+    """Three replicas, and the last of them alone: it learns the same."""
+    before = weights(together)
+    _, returns = trained(together)
+    _, returns_alone = trained(alone, first=2)
+    assert returns[2] == returns_alone[0]
+    after, after_alone = weights(together), weights(alone)
+    for key, value in after.items():
+        if not key.endswith("support"):
+            assert not torch.equal(value, before[key]), f"{key} has not moved"
+    for key, value in after_alone.items():
+        torch.testing.assert_close(value, after[key], rtol=1e-4, atol=1e-5)
+
+
 @pytest.mark.integration
 @pytest.mark.parametrize("name", ALGORITHMS)
 def test_each_loss_moves_every_agents_weights_and_no_replica_knows_of_the_others(name):
     members = [Learning(ALGORITHMS[name])] * 4
     together, alone = population(members, replicas=3), population(members, replicas=1, first_replica=2)
     (learner,) = together.learners.values()
-    before = weights(together)
-    _, returns = trained(together)
-    _, returns_alone = trained(alone, first=2)
-    assert returns[2] == returns_alone[0]
-    after, after_alone = weights(together), weights(alone)
+    assert_all_weights_move_and_replicas_learn_apart(together, alone)
     assert len(together.networks()) == 12
-    for key, value in after.items():
-        if not key.endswith("support"):
-            assert not torch.equal(value, before[key]), f"{key} has not moved"
-    for key, value in after_alone.items():
-        torch.testing.assert_close(value, after[key], rtol=1e-4, atol=1e-5)
     made = [learner.engine.network_state(lane) for lane in range(12)]
     assert len({float(sum(value.sum() for value in state.values())) for state in made}) == 12, "lanes differ"
 

@@ -8,7 +8,15 @@ import pytest
 import torch
 from recall_game import Recall
 from test_networks import VECTORS
-from test_population import GAME, Returns, assert_goes_on_bit_for_bit, population, trained, weights
+from test_population import (
+    GAME,
+    Returns,
+    assert_all_weights_move_and_replicas_learn_apart,
+    assert_goes_on_bit_for_bit,
+    population,
+    trained,
+    weights,
+)
 from torch import nn
 from torchrl.envs import RewardScaling
 from torchrl.envs.utils import ExplorationType, set_exploration_type
@@ -314,15 +322,7 @@ def test_each_algorithm_moves_every_agents_weights_and_no_replica_knows_of_the_o
         population(specs(name), replicas=3),
         population(specs(name), replicas=1, first_replica=2),
     )
-    before = weights(together)
-    _, returns = trained(together)
-    _, returns_alone = trained(alone, first=2)
-    assert returns[2] == returns_alone[0]
-    after = weights(together)
-    assert all(not torch.equal(after[key], value) for key, value in before.items() if "weight" in key)
-    own = {key: value for key, value in after.items() if key.startswith("replica_2")}
-    for key, value in weights(alone).items():
-        torch.testing.assert_close(value, own[key], rtol=1e-4, atol=1e-5)
+    assert_all_weights_move_and_replicas_learn_apart(together, alone)
 
 
 @pytest.mark.parametrize("name", ["PPO", "MAPPO"])

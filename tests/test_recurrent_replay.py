@@ -6,7 +6,15 @@ import numpy as np
 import pytest
 import torch
 from recall_game import Recall
-from test_population import GAME, Returns, assert_goes_on_bit_for_bit, population, trained, weights
+from test_population import (
+    GAME,
+    Returns,
+    assert_all_weights_move_and_replicas_learn_apart,
+    assert_goes_on_bit_for_bit,
+    population,
+    trained,
+    weights,
+)
 
 import cprl
 from cprl import CommonsEnv, Custom, Experiment
@@ -180,15 +188,7 @@ def test_the_fastest_engine_is_chosen_without_a_warning(name, recwarn):
 def test_all_weights_move_and_no_replica_knows_of_the_others(name):
     members = [Learning(DQNS[name])] * 4
     together, alone = population(members, replicas=3), population(members, replicas=1, first_replica=2)
-    before = weights(together)
-    _, returns = trained(together)
-    _, returns_alone = trained(alone, first=2)
-    assert returns[2] == returns_alone[0]
-    after = weights(together)
-    assert all(not torch.equal(after[key], value) for key, value in before.items() if "weight" in key)
-    own = {key: value for key, value in after.items() if key.startswith("replica_2")}
-    for key, value in weights(alone).items():
-        torch.testing.assert_close(value, own[key.replace("replica_0", "replica_2")], rtol=1e-4, atol=1e-5)
+    assert_all_weights_move_and_replicas_learn_apart(together, alone)
 
 
 FEW_TURNS = {

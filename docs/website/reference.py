@@ -59,7 +59,7 @@ INTERNAL: Final = {
     *("compat", "checks", "arguments", "output", "caches", "compile_clock", "times", "garbage", "process"),
     *("compiling", "memory", "collectors", "runs", "plotting", "terminal", "finite", "stored", "earlier"),
     *("annotations", "stored_agents", "agents", "outcome", "parts", "leftovers", "running", "play", "flags"),
-    *("commandline", "command_parts"),
+    *("commandline", "command_parts", "differences"),
     *("evaluation_cli", "egta_cli", "scenarios_cli", "studies_options", "studies_cli", "exploit_cli"),
     *("libraries", "shipped", "recipes_cli", "docs_cli", "cli", "__main__"),
 }

@@ -32,6 +32,7 @@ Each imports only from those above it:
     population   how each agent is specified: Learning, Team, Scripted, Frozen
     annotations  whether a value is of an annotated type
     config       values as JSON tables, and back
+    differences  how two such tables differ
     presets      the published games and hyper-parameters by name
     measuring    social metrics, episodes, phases, statistics
     runs         what is kept of a run: recipe, table of episodes, checkpoints, weights

@@ -21,8 +21,9 @@ from cprl.checks import (
     shown,
 )
 from cprl.commons.game import Game
-from cprl.config import custom_targets, differences, fields_from_config, fields_to_config
+from cprl.config import custom_targets, fields_from_config, fields_to_config
 from cprl.custom import Custom
+from cprl.differences import differences
 from cprl.envs.make_env import PlayableGame
 from cprl.finite import OnNan
 from cprl.games import game_of, is_playable, stored_game

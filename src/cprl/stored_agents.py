@@ -10,7 +10,7 @@ from torch import Tensor, nn
 from cprl.commons.game import Game
 from cprl.learners.decisions import stored_decisions
 from cprl.learners.lanes import EVALUATION, lane_seeds
-from cprl.networks.recurrent import state_shape_of
+from cprl.networks.recurrent import state_cells_of
 from cprl.networks.stacked import stack_lanes
 from cprl.policies.assignment import AgentIndices, AgentPolicies
 from cprl.policies.recurrent import actor_of_lanes
@@ -94,7 +94,7 @@ def stored_actor(
         agents=agents,
         worlds=worlds,
         stochastic=stochastic,
-        state_cells=(state_shape_of(networks[0]) or (0,))[-1],
+        state_cells=state_cells_of(networks[0]),
     )
     actor.epsilon = epsilon
     return actor

@@ -15,7 +15,7 @@ from cprl.learners.checks import check_networks
 from cprl.learners.engine.shared import is_list
 from cprl.learners.transitions import LaneTurn, array_of, joint_actions, lane_turn, seen_next
 from cprl.networks.agent import acting_part
-from cprl.networks.recurrent import state_shape_of
+from cprl.networks.recurrent import state_cells_of
 from cprl.networks.specification import refuse_unseen
 from cprl.policies.lanes import LaneActor
 from cprl.policies.recurrent import actor_of_lanes
@@ -196,7 +196,7 @@ class Lanes:
         first, *others = self.seeds(purpose)[:: self.sharing]
         networks = [init_network(self.make_network, first)]
         check_networks(networks[0], 1 + len(others), device)
-        self.state_cells = (state_shape_of(acting_part(networks[0])) or (0,))[-1]
+        self.state_cells = state_cells_of(acting_part(networks[0]))
         networks += [init_network(self.make_network, own) for own in others]
         for place, network in enumerate(networks):
             start, *same = (

@@ -26,7 +26,7 @@ from cprl.learners.single import dqn_loss, q_network
 from cprl.learners.teams import MakeTeam, Teams, lanes_of
 from cprl.learners.transitions import wanted_in
 from cprl.networks.agent import acting_part
-from cprl.networks.recurrent import state_shape_of
+from cprl.networks.recurrent import state_cells_of
 from cprl.policies.lanes import LaneActor
 from cprl.preferences.values import Preference, named
 from cprl.preferences.wanted import WantedRewards
@@ -153,7 +153,7 @@ class ReplayLearner:
         settings, device = self.settings, self._shapes["device"]
         actions, own_targets = self.spaces.actions, settings.own_target_weights
         networks = self._lanes.new_networks(WEIGHTS, device)
-        self._state_cells = (state_shape_of(acting_part(networks[0])) or (0,))[-1]
+        self._state_cells = state_cells_of(acting_part(networks[0]))
         self._refuse_other_sequences()
         self._shapes |= {"state_cells": self._state_cells, "sequence_steps": settings.sequence_steps}
         trial = trial_batch(min(len(networks), TRIAL_LANES), actions=actions, **self._shapes)

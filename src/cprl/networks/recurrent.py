@@ -289,3 +289,8 @@ def _lstm_step(weights: _Weights, of_input: Tensor, state: Tensor) -> Tensor:
 def state_shape_of(network: nn.Module) -> tuple[int, ...] | None:
     """The shape of the state of a recurrent network, None for one that has no state."""
     return getattr(network, "state_shape", None)
+
+
+def state_cells_of(network: nn.Module) -> int:
+    """The numbers of the state of a recurrent network, 0 for one that has no state."""
+    return (state_shape_of(network) or (0,))[-1]

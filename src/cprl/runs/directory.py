@@ -15,7 +15,8 @@ from typing import Any, Final
 from cprl.arguments import callable_of, texts
 from cprl.arguments import path as path_of
 from cprl.checks import TEXT, checked, shown
-from cprl.config import custom_targets, differences
+from cprl.config import custom_targets
+from cprl.differences import differences
 from cprl.process import cpu
 from cprl.runs import formats
 from cprl.runs.files import read_json, write_json

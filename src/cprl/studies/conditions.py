@@ -7,7 +7,7 @@ from dataclasses import dataclass, field
 from functools import cached_property
 from typing import Any, Final
 
-from cprl.config import without_defaults
+from cprl.differences import without_defaults
 from cprl.experiment import Experiment
 
 FORMAT: Final = 1

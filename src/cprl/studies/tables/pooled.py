@@ -8,7 +8,8 @@ from typing import Any, Final
 
 from cprl.arguments import listed, refusal, texts
 from cprl.arguments import path as path_of
-from cprl.config import differences, to_config
+from cprl.config import to_config
+from cprl.differences import differences
 from cprl.experiment import Experiment
 from cprl.runs.directory import FILE_NAME as RECIPE
 from cprl.runs.directory import read_recipe
