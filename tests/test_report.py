@@ -117,6 +117,9 @@ def test_agents_of_which_none_learns_are_not_called_trained(run, tmp_path):
     scripted = cprl.run(alone, tmp_path / "scripted")
     measures = write_report([scripted], tmp_path).read_text().split("## Measures")[1]
     assert "| measure | agents | random policy |" in measures
+    assert "last 500" not in measures, "there were 12 episodes"
+    returns = write_report([scripted], tmp_path).read_text().split("## Collective return")[1]
+    assert "| run | random play | whole training | evaluation |" in returns
     assert "trained |" not in measures
     assert "| measure | trained | random policy |" in write_report([run], tmp_path).read_text()
 
@@ -266,6 +269,13 @@ def test_measures_of_training_know_rich_and_poor():
         == [1 / 3] * 3
     )
     assert found["mean collective return over training"].tolist() == [4.0] * 3
+    dip, peak = "depth of the deepest dip before episode 600", "episode of the highest collective return"
+    assert all(any(name.startswith(own) for name in found) for own in (dip, peak))
+    short = of_training({name: values[:, :20] for name, values in curves.items()})
+    assert list(short) == [
+        "mean collective return over training",
+        "return of the poorest agent over that of the richest, whole training",
+    ]
 
 
 def test_every_published_experiment_is_reproduced():

@@ -68,7 +68,12 @@ def _trained(results: Sequence[Result]) -> list[str]:
 
 
 def returns_of_others(results: Sequence[Result]) -> list[str]:
-    """The section on the returns of runs that repeat none of the study's experiments; empty without any."""
+    """The section on the returns of runs that repeat none of the study's experiments; empty without any.
+
+    A column that no run has an entry for is left out.
+    """
+    if not results:
+        return []
     rows = [
         [
             result.name,
@@ -79,7 +84,9 @@ def returns_of_others(results: Sequence[Result]) -> list[str]:
         for result in results
     ]
     head = ["run", "random play", "first 150 episodes", "500 to 1000", "whole training", "evaluation"]
-    return ["## Collective return", "", *table(head, rows)] if rows else []
+    kept = [place for place, cells in enumerate(zip(*rows, strict=True)) if any(cells)]
+    whole = [[row[place] for place in kept] for row in (head, *rows)]
+    return ["## Collective return", "", *table(whole[0], whole[1:])]
 
 
 def _part(result: Result, first: int, end: int | None) -> str:

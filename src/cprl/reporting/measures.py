@@ -79,24 +79,29 @@ def _at_play(run: LoadedRun, replicas: Sequence[int], who: Callable[..., AgentPo
 
 
 def of_training(curves: dict[str, Values], *, window: int = SMOOTHED_EPISODES) -> dict[str, Values]:
-    """Measures of training curves, float64 [R] each.
+    """Measures of training curves, float64 [R] each; without those of more episodes than there were.
 
     Args:
         curves: The curves of a run, as `curves_of` returns them.
         window: The window of the running means in episodes.
     """
     returns = running_mean(curves["collective_return"], window)
-    early = returns[:, : min(600, returns.shape[1])]
-    found = {
-        "mean collective return over training": curves["collective_return"].mean(1),
-        "collective return of the last 500 episodes": curves["collective_return"][:, -500:].mean(1),
-        "survival in the last 500 episodes, steps": curves["survival_steps"][:, -500:].mean(1),
-        "depth of the deepest dip before episode 600, share of the peak before it": dip_depth(early),
-        "episode of the highest collective return": returns.argmax(1).astype(np.float64),
-    }
+    episodes = curves["collective_return"].shape[1]
+    has_last = episodes >= 500
+    found = {"mean collective return over training": curves["collective_return"].mean(1)}
+    if has_last:
+        found |= {
+            "collective return of the last 500 episodes": curves["collective_return"][:, -500:].mean(1),
+            "survival in the last 500 episodes, steps": curves["survival_steps"][:, -500:].mean(1),
+        }
+    if episodes >= 600:
+        dip = "depth of the deepest dip before episode 600, share of the peak before it"
+        found[dip] = dip_depth(returns[:, :600])
+    if episodes > window:
+        found["episode of the highest collective return"] = returns.argmax(1).astype(np.float64)
     agents = [curves[f"return_{agent}"] for agent in range(_agents(curves))]
     if len(agents) > 1:
-        for when, first in (("last 500 episodes", -500), ("whole training", 0)):
+        for when, first in (*[("last 500 episodes", -500)] * has_last, ("whole training", 0)):
             means = np.stack([of_agent[:, first:].mean(1) for of_agent in agents])
             name = f"return of the poorest agent over that of the richest, {when}"
             found[name] = _share(means.min(0), means.max(0))
