@@ -24,11 +24,11 @@ def shares_of(results: Sequence[Result]) -> list[str]:
         "",
         f"Harvests are means over the last {LAST} episodes of training, or all of a shorter one, over "
         "replicas with t intervals. The best known policy is a planner that sees all and harvests for the "
-        "group (`cprl.theory.planned_harvest`), or the run itself if it gets more. No policy gets more on average "
-        "than the bound: what the board holds at first, and the most that it can grow "
-        "(`cprl.theory.yield_bounds`). The yield share (docs/metrics.md) counts in what the board can bear "
-        "for ever in the steps that were played, so that it is high, too, for agents who take all at once, "
-        "and end the episode. Shares are of means, but for the yield share, a mean over episodes.",
+        "group (`cprl.theory.planned_harvest`), or the run itself if it gets more. No policy gets more on "
+        "average than the bound: what the board holds at first, and the most that it can grow "
+        "(`cprl.theory.yield_bounds`). The yield share (docs/metrics.md) counts in what the board can "
+        "bear for ever in the steps that were played, so that it is high, too, for agents who take all at "
+        "once, and end the episode. Shares are of means, but for the yield share, a mean over episodes.",
         "",
         *table(head, rows),
     ]
