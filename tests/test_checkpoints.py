@@ -222,6 +222,7 @@ def test_a_full_disk_leaves_the_checkpoints_before(tmp_path, monkeypatch):
     assert list((tmp_path / "checkpoints").iterdir()) == [kept]
 
 
+@pytest.mark.integration
 def test_a_table_goes_on_behind_the_rows_of_a_checkpoint(tmp_path):
     with pytest.raises(ZeroDivisionError):
         train_and_die.main(tmp_path / "run", every_s=1000, callbacks=[Dying(200)])

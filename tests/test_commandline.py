@@ -101,6 +101,7 @@ def test_a_recipes_own_arguments_come_before_the_changes_to_what_they_make():
     assert [spec.algorithm.settings.target_every_episodes for spec in given.agents[:2]] == [7, 9]
 
 
+@pytest.mark.integration
 @pytest.mark.parametrize(
     ("old", "new"),
     [
@@ -183,6 +184,7 @@ def test_help_lists_the_recipes_own_arguments_first_and_equal_agents_once(capsys
     assert f"{docs(cprl.Rules)['episode_steps']} (default: 1000)" in words
 
 
+@pytest.mark.integration
 def test_a_value_of_several_kinds_has_the_fields_of_the_kind_that_it_is_and_no_subcommands(capsys):
     first = Learning(DQN(settings=DQNSettings(), network=MLP(hidden_cells=(8,))), reward=Exchange(0.5))
     mixed = replace(experiment(), agents=[first, *experiment().agents[1:]])
@@ -209,6 +211,7 @@ def test_a_board_is_given_by_its_name_and_a_drawing_stays():
     assert given.game.map == cprl.maps.named("two_complex")
 
 
+@pytest.mark.integration
 def test_what_a_command_line_cannot_say_stays_as_it_is():
     base = experiment()
     sanctions = GraduatedSanctions(freeze_steps=((1, 2),) * 4, on="tags")

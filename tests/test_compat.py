@@ -361,6 +361,7 @@ def test_torch_keeps_what_it_compiled_by_code_object():
         assert compat.compiled_code(two) is not compat.compiled_code(five)
 
 
+@pytest.mark.integration
 @ignored
 def test_torch_says_for_which_arguments_its_code_is_right():
     own = compiled_of_its_own(2)

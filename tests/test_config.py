@@ -188,6 +188,7 @@ MATRICES = st.builds(
 )
 
 
+@pytest.mark.integration
 @settings(max_examples=200, deadline=None)
 @given(value=SPECS | GAMES | MATRICES | CUSTOM | st.tuples(SPECS, GAMES) | st.just(FIRING))
 def test_a_value_comes_back_from_its_table_as_it_was(value):

@@ -277,6 +277,7 @@ def test_an_override_changes_what_is_in_force_and_not_what_agents_decided():
 # ---- a vote that is learned
 
 
+@pytest.mark.integration
 @pytest.mark.parametrize(("board", "majority", "choice"), [(ONE_RICH, (1, 2), 1), (TWO_RICH, (0, 1), 0)])
 def test_a_majority_finds_the_tax_that_pays_it_more(board, majority, choice):
     game = Game(map=board, rules=RULES, institutions=(VOTE,))
@@ -293,6 +294,7 @@ def test_a_majority_finds_the_tax_that_pays_it_more(board, majority, choice):
 # ---- stop and resume
 
 
+@pytest.mark.integration
 def test_a_training_that_is_stopped_decides_and_learns_on_bit_for_bit():
     def made():
         env = make_env(MEADOW, worlds=2, seed=4)

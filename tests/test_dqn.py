@@ -154,6 +154,7 @@ def test_the_actor_follows_the_learner_and_epsilon_its_steps():
     assert torch.equal(chosen()[:, 0], best)
 
 
+@pytest.mark.integration
 def test_the_same_seed_learns_the_same():
     def weights(seed):
         agent = learner(SHORT.spaces, seed=seed)

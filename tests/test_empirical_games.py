@@ -78,6 +78,7 @@ def test_each_run_has_each_index_as_often_as_every_other():
             assert at == [count * len(choices) / 4] * 4
 
 
+@pytest.mark.integration
 def test_of_two_agents_crossplay_makes_the_same_game(tmp_path):
     runs = scripted_runs(tmp_path, MEADOW, "greedy", "random")
     whole = play_empirical_game(runs, episodes=2, seed=SEED)
@@ -98,6 +99,7 @@ def test_of_more_agents_crossplay_makes_the_reduction(three):
     assert "greedy greedy random" in whole.episodes_table["runs"].to_pylist()
 
 
+@pytest.mark.integration
 def test_certainty_is_the_share_of_resampled_replicas(made):
     pytest.importorskip("open_spiel")
     pytest.importorskip("nashpy")
@@ -115,6 +117,7 @@ def test_certainty_is_the_share_of_resampled_replicas(made):
     assert all(list(table.columns) for table in egta_tables(one))
 
 
+@pytest.mark.integration
 @pytest.mark.parametrize("runs", [3, 4])
 def test_analyses_are_drawn_for_any_number_of_runs(runs, made, tmp_path):
     pytest.importorskip("open_spiel")
@@ -128,6 +131,7 @@ def test_analyses_are_drawn_for_any_number_of_runs(runs, made, tmp_path):
         draw_egta(found, drawn)
 
 
+@pytest.mark.integration
 def test_the_command_tells_and_draws_which_run_lasts(corridors, tmp_path, monkeypatch, capsys):
     pytest.importorskip("open_spiel")
     pytest.importorskip("nashpy")
@@ -147,6 +151,7 @@ def test_the_command_tells_and_draws_which_run_lasts(corridors, tmp_path, monkey
         command(monkeypatch, capsys, "egta", *words, "--alpha", "-1")
 
 
+@pytest.mark.integration
 def test_the_command_tells_all_compositions_of_more_agents(three, tmp_path, monkeypatch, capsys):
     pytest.importorskip("open_spiel")
     pytest.importorskip("nashpy")

@@ -93,6 +93,7 @@ def by_engine(engine, *, steps=40, **how):
     return update, losses
 
 
+@pytest.mark.integration
 @pytest.mark.parametrize("engine", ENGINES)
 def test_soft_targets_move_as_torchrls_soft_update_moves_them(engine):
     update, _ = by_engine(engine, tau=0.1)
@@ -314,6 +315,7 @@ def test_a_loss_that_takes_no_notice_of_the_steps_is_refused():
         learner(replace(SETTINGS, n_steps=3), make_loss=partial(dqn_loss, gamma=0.5))
 
 
+@pytest.mark.integration
 def test_an_agent_that_was_stopped_continues_bit_for_bit_with_all_of_these():
     settings = replace(
         SETTINGS,

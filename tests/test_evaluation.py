@@ -238,6 +238,7 @@ def test_the_same_call_plays_the_same_whoever_drew_before_and_a_replica_the_same
     assert told(first.trained[0]) != told(first.trained[1]), "replicas play different worlds"
 
 
+@pytest.mark.integration
 def test_a_run_that_has_not_ended_plays_by_its_newest_checkpoint(tmp_path):
     env, members = CommonsEnv(MEADOW, 2, seed=3), [C51, SAC]
     agents = Population(env, members, seed=3, engine="eager")
@@ -321,6 +322,7 @@ def test_each_cell_is_what_the_loaded_runs_policies_play_with_one_focal_agent(le
     assert told(diagonal.by_agent[1][2]) == told(at_home.trained[2])
 
 
+@pytest.mark.integration
 def test_on_the_diagonal_a_cross_seed_agent_is_of_the_next_replica(learned):
     runs = list(learned.values())
     how = {"episodes": 2, "seed": SEED, "greedy": True}
@@ -339,6 +341,7 @@ def test_on_the_diagonal_a_cross_seed_agent_is_of_the_next_replica(learned):
         cprl.crossplay(runs, diagonal="cross_seed", replicas=[1])
 
 
+@pytest.mark.integration
 def test_what_does_not_fit_is_refused_and_says_what_fits(learned, scripted, tmp_path):
     alike, mixed = learned.values()
     with pytest.raises(ValueError, match="episodes is 0; allowed: an integer >= 1"):

@@ -37,12 +37,14 @@ def test_an_example_has_less_than_sixty_lines_and_a_row_in_the_docs(name):
     assert f"| [`{name}.py`](../examples/{name}.py) |" in page
 
 
+@pytest.mark.integration
 def test_ippo_of_torchrls_parts_says_what_agents_harvest(example, shorter_episodes, capsys):
     (harvest,) = example("torchrl_ippo").main(iterations=1, worlds=2)
     assert harvest >= 0
     assert f"iteration 1: an agent harvests {harvest:.1f} in an episode" in capsys.readouterr().out
 
 
+@pytest.mark.integration
 def test_ppo_in_plain_torch_repeats_itself(example, shorter_episodes):
     first, again, other = (
         example("cleanrl_style_ppo").main(iterations=2, worlds=2, seed=s) for s in (3, 3, 4)

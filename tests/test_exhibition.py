@@ -192,6 +192,7 @@ def test_it_plays_ten_to_twelve_steps_a_second_however_often_the_training_asks(t
     assert captions[-1] == ["present policy, episode 7, epsilon 1.00"]
 
 
+@pytest.mark.integration
 @pytest.mark.parametrize("seconds", [0.003, 0.05])
 def test_a_slow_exhibition_takes_one_percent_of_the_time(seconds, tmp_path, monkeypatch):
     kept, played, step = Kept(tmp_path), [], Exhibition._step

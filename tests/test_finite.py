@@ -152,6 +152,7 @@ FEW = ("PPO", "Tabular", "VDN")
 CONTINUING = [name if name in FEW else pytest.param(name, marks=pytest.mark.slow) for name in LEARNERS]
 
 
+@pytest.mark.integration
 @pytest.mark.parametrize("name", CONTINUING)
 def test_with_continue_a_broken_lane_is_named_once_and_other_replicas_learn_as_without_it(name):
     whole, sound = make_learner(name), make_learner(name)
@@ -371,6 +372,7 @@ def experiment(**changes):
     return Experiment(name="breaks", game=GAME, agents=(Learning(DQN(settings=REPLAY)),) * 2, **how)
 
 
+@pytest.mark.integration
 def test_an_experiment_says_what_happens_and_its_summary_names_who_is_broken(
     tmp_path, capsys, looks_every_step
 ):
@@ -427,6 +429,7 @@ def test_compiled_lanes_learn_on_beside_a_broken_one(name):
             assert all(torch.equal(mine[key], theirs[key]) for key in theirs)
 
 
+@pytest.mark.integration
 def test_a_training_that_stopped_is_resumed_with_continue(tmp_path, looks_every_step):
     with pytest.raises(NotFiniteError, match=r"at step 6 .*agent 0 in replica 1") as stopped:
         run(

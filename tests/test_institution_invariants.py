@@ -74,6 +74,7 @@ def test_payments_alone_leave_the_game_as_it_is_bit_for_bit(game, seed):
     check_untouched(game, seed)
 
 
+@pytest.mark.integration
 @settings(max_examples=30, deadline=None)
 @given(game=governed_games(harmless=True, **AS_RUN), seed=SEEDS)
 def test_payments_alone_leave_the_game_as_run_as_it_is(game, seed):
@@ -217,6 +218,7 @@ def test_nobody_harvests_more_than_a_quota_in_a_window(game, seed, share, window
     assert not counts["excess_bites"].any()
 
 
+@pytest.mark.integration
 @QUICK
 @given(game=with_one(lambda game: boundaries(game.map, st.none(), st.none())), seed=SEEDS)
 def test_nobody_harvests_in_the_region_of_others(game, seed):
@@ -227,6 +229,7 @@ def test_nobody_harvests_in_the_region_of_others(game, seed):
             assert own.regions[row][col] in ("." + own.signs_of(agent))
 
 
+@pytest.mark.integration
 @QUICK
 @given(game=games(), seed=SEEDS, cost=FINES, monitor=st.sampled_from([None, 0]))
 def test_inspection_costs_the_same_in_every_turn_until_the_end(game, seed, cost, monitor):
@@ -358,6 +361,7 @@ def test_the_number_of_threads_changes_nothing(threads):
         assert_same_moments(mine, theirs)
 
 
+@pytest.mark.integration
 @QUICK
 @given(game=governed_games(), seed=SEEDS, turns=st.integers(1, 20))
 def test_a_new_episode_of_some_worlds_leaves_the_others_alone(game, seed, turns):

@@ -206,6 +206,7 @@ def test_the_stacked_networks_give_what_each_gives():
         StackedMLP([each[0], MLPNetwork(SHAPE, ACTIONS, hidden_cells=(8,))])
 
 
+@pytest.mark.integration
 def test_a_users_own_network_is_vmapped():
     class Own(nn.Module):
         def __init__(self, lane):
@@ -276,6 +277,7 @@ class Remembered:
             del kept[: -self.most]
 
 
+@pytest.mark.integration
 @pytest.mark.parametrize("lanes", [[0], [0, 1, 2, 9]])
 def test_every_transition_kept_is_what_came_and_the_last_ones_are_kept(lanes):
     buffer, remembered = filled(lanes, steps=0, transitions=30), Remembered(lanes, 30)

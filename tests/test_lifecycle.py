@@ -231,6 +231,7 @@ def test_a_run_that_is_written_is_locked_by_name_until_its_process_dies(tmp_path
     assert not (tmp_path / "run.lock").exists()
 
 
+@pytest.mark.integration
 def test_a_lock_of_another_host_is_refused_unless_it_is_taken_over(whole, tmp_path):
     stopped = shutil.copytree(whole, tmp_path / "run")
     (stopped / "report.json").unlink()
@@ -297,6 +298,7 @@ def _make_newest_have_one_episode_more(kept, path):
     kept[-1].rename(kept[-1].with_name(f"training-{state['steps']:012d}-{checksum(kept[-1])}.pt"))
 
 
+@pytest.mark.integration
 def test_going_on_under_other_versions_is_said(whole, tmp_path, capsys):
     other = shutil.copytree(whole, tmp_path / "run")
     (other / "report.json").unlink()

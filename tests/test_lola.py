@@ -44,6 +44,7 @@ def team(estimator="policy_gradient", agents=FOUR, **changes):
     return Team(lola(estimator, **changes), agents, reward="individual")
 
 
+@pytest.mark.integration
 @pytest.mark.parametrize("estimator", ESTIMATORS)
 def test_each_team_moves_every_members_weights_and_no_replica_knows_of_the_others(estimator):
     together = population([team(estimator)], replicas=3)
@@ -237,6 +238,7 @@ def test_a_team_that_was_stopped_goes_on_bit_for_bit(estimator, tmp_path):
     assert_goes_on_bit_for_bit(members, tmp_path, episodes=8)
 
 
+@pytest.mark.integration
 def test_a_run_is_built_again_evaluated_and_its_members_play_on_frozen_and_start_others(
     tmp_path, monkeypatch
 ):

@@ -251,6 +251,7 @@ def assert_unbiased(estimates, exact, errors=4.5):
     return error
 
 
+@pytest.mark.integration
 @pytest.mark.parametrize("kind", ["plain", "baseline", "loaded"])
 def test_dice_estimates_first_and_mixed_second_derivatives_without_bias(kind):
     exact = derivatives(listed, [[own.clone().requires_grad_()] for (own,) in POINT])
@@ -285,6 +286,7 @@ def _with(baseline, seen, action, paid, parameters):
     return -dice_objective(taken, paid, gamma=GAMMA, baseline=baseline).mean(-2)
 
 
+@pytest.mark.integration
 def test_two_batches_estimate_lolas_gradient_without_bias_and_one_batch_does_not():
     lanes, rate = 20_000, 1.0
     exact = torch.cat([slope for (slope,) in lola_gradients([listed], POINT, rate=rate)[0]])

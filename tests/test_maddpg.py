@@ -182,6 +182,7 @@ def test_without_noise_samples_come_from_torchs_generator_and_with_it_not():
     assert torch.equal(torch.random.get_rng_state(), before)
 
 
+@pytest.mark.integration
 @pytest.mark.parametrize("action_space", ["categorical", "one-hot"])
 def test_the_loss_works_with_torchrl_alone(action_space):
     """Two agents are paid 2 if both choose action 1, 1 if both choose 0; from chance play, they learn to."""
@@ -318,6 +319,7 @@ def test_a_team_that_was_stopped_goes_on_bit_for_bit_and_its_samples_too(tmp_pat
     assert_goes_on_bit_for_bit(members, tmp_path, episodes=5)
 
 
+@pytest.mark.integration
 def test_a_run_is_built_again_is_evaluated_and_its_members_play_on_frozen(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     run, networks = ran(tmp_path, [Team(TEAM, (0, 1), reward="individual"), *[Scripted()] * 2])

@@ -227,6 +227,7 @@ def test_the_central_critic_reads_the_observations_of_all_members(network):
     assert torch.equal(team["actor"](other)[:, :2], team["actor"](seen)[:, :2])
 
 
+@pytest.mark.integration
 def test_a_learner_with_convolutions_continues_bit_for_bit():
     (_, first), (_, second) = learner_of(DQN, CONV), learner_of(DQN, CONV)
     played(first)

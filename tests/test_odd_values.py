@@ -145,6 +145,7 @@ def test_a_large_random_board_takes_less_than_a_second():
     assert (len(board.sites), board.agents) == (27_000, 12)
 
 
+@pytest.mark.integration
 def test_sites_far_apart_are_counted_without_walking_over_the_board():
     board = Map(height=400, width=400, sites=((0, 0), (399, 399), (0, 5)), starts=((1, 1, 0),))
     first, sites = neighbours(board, Rules(regrow_radius_cells=400))
@@ -245,6 +246,7 @@ def test_one_world_takes_integers_of_any_library(action):
     assert world.world.batch.now.step.sum() == 1
 
 
+@pytest.mark.integration
 def test_the_histories_of_long_episodes_grow_with_them():
     rules = Rules(may_fire=False, regrow_prob=(0.5,), episode_steps=5000)
     env = CommonsEnv(Game(map=GAME.map, rules=rules), 1)

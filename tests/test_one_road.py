@@ -203,6 +203,7 @@ def test_scripted_policies_that_read_a_window_are_refused_where_there_is_none():
     assert not Path("never").exists()
 
 
+@pytest.mark.integration
 def test_a_transform_that_changes_the_shape_of_observations_is_learned_from(tmp_path, capsys):
     flat = Custom(
         "torchrl.envs.transforms:FlattenObservation",

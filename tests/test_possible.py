@@ -69,6 +69,7 @@ def test_boards_with_a_name_are_looked_up_and_other_rules_are_not():
     assert could.best_known < 13 + 20 * 0.5 < KNOWN["single_basic", "as_run"].best_known
 
 
+@pytest.mark.integration
 def test_known_harvests_lie_below_their_bounds():
     assert {board for board, _ in KNOWN} == set(presets.BOARDS)
     for (board, variant), known in KNOWN.items():

@@ -60,6 +60,7 @@ def test_a_replica_learns_among_others_what_it_learns_alone(engine):
             torch.testing.assert_close(value, same[key], rtol=1e-4, atol=1e-5)
 
 
+@pytest.mark.integration
 def test_it_runs_on_the_lane_axis_and_moves_every_network():
     _, made = population((PR2S, PR2S))
     (learner,) = made.learners.values()

@@ -199,6 +199,7 @@ def course(engine, lanes, *, dtype=torch.float64, steps=60):
     return update, torch.stack(losses)
 
 
+@pytest.mark.integration
 @pytest.mark.parametrize("engine", ["vmapped", "lane_axis"])
 def test_the_fast_engines_end_where_a_list_of_losses_ends(engine):
     lanes = [0, 1, 2]
@@ -219,6 +220,7 @@ def test_the_compiled_engines_end_there_too(engine):
     assert_same_course(update, reference, lanes, lanes, 1e-4)
 
 
+@pytest.mark.integration
 @pytest.mark.parametrize("engine", ENGINES)
 def test_a_lane_learns_as_it_would_alone(engine):
     many, losses = course(ENGINES[engine], [2, 0, 1])

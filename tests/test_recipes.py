@@ -206,6 +206,7 @@ def test_recipes_of_replicas_leave_a_run_directory(name, variant, tmp_path, caps
         restore_weights_of(network["replica_0/agent_0"], weights["replica_1/agent_2"])
 
 
+@pytest.mark.integration
 def test_a_version_of_the_program_on_the_command_line_is_a_condition_of_the_studies(monkeypatch):
     monkeypatch.syspath_prepend(str(RECIPES / "studies"))
     study = recipe("experiment_5", RECIPES / "studies").STUDY

@@ -325,6 +325,7 @@ def test_each_algorithm_moves_every_agents_weights_and_no_replica_knows_of_the_o
     assert_all_weights_move_and_replicas_learn_apart(together, alone)
 
 
+@pytest.mark.integration
 @pytest.mark.parametrize("name", ["PPO", "MAPPO"])
 def test_members_that_share_a_recurrent_network_each_have_a_state(name):
     agents = population(specs(name, shares=True))
@@ -339,6 +340,7 @@ def test_members_that_share_a_recurrent_network_each_have_a_state(name):
     assert len({tuple(own) for own in states.flatten(0, 1).tolist()}) == 8
 
 
+@pytest.mark.integration
 @pytest.mark.parametrize(
     ("name", "engine"),
     [("PPO", "lane_axis"), ("PPO", "lane_axis_flat"), ("PPO, LSTM", "lane_axis_flat"), ("IPPO", "lane_axis")],

@@ -71,6 +71,7 @@ def of_lane(played, name, lane, after=False):
     return torch.stack([own.flatten(0, 1)[lane] if own.ndim > 2 else own[lane // 4] for own in found])
 
 
+@pytest.mark.integration
 @pytest.mark.parametrize("steps", [17, 200])
 def test_a_sequence_is_what_was_played_from_some_turn_on(steps):
     """Also where the ring has come round three times; episodes last up to 12 turns, sequences 6."""
@@ -114,6 +115,7 @@ def test_every_turn_is_sampled_once_enough_follow_it():
     assert set(drawn.flatten().tolist()) == places
 
 
+@pytest.mark.integration
 @pytest.mark.parametrize("double", [False, True])
 def test_the_loss_is_that_of_a_network_that_goes_through_the_turns_by_itself(double):
     """One step of the network after the other, with the state of the one before, for the network and its

@@ -109,6 +109,7 @@ def test_as_run_targets_start_from_weights_of_their_own_and_the_loss_is_shared_o
         assert torch.equal(own[0], target[0]) is same
 
 
+@pytest.mark.integration
 def test_every_replica_is_told_of_so_many_episodes_and_of_its_losses(tmp_path):
     with EpisodeTable(tmp_path / "episodes.parquet") as table:
         witness = Witness()
@@ -136,6 +137,7 @@ def test_targets_follow_each_replicas_own_episodes():
     assert copied == [[True, True, False, False], [False, False, True, True]]
 
 
+@pytest.mark.integration
 @pytest.mark.parametrize("worlds", [1, 4])
 def test_the_lean_collector_yields_what_torchrls_own_yields(worlds):
     # By a policy that follows from the window alone: the stock collector calls it once to see its entries.
@@ -172,6 +174,7 @@ def test_transitions_of_lanes_are_those_of_the_agents():
                 assert np.array_equal(getattr(own, name), alone["next", name].squeeze(-1))
 
 
+@pytest.mark.integration
 def test_a_lane_explores_by_its_own_numbers_and_only_where_asked():
     def values(seen):
         return torch.zeros(*seen.shape[:2], 8).index_fill(2, torch.tensor(5), 1.0)
@@ -209,6 +212,7 @@ def test_lanes_by_worlds_reach_the_right_network():
             assert chosen[world, agent] == agents.engine.outputs(seen)[lane, 0].argmax()
 
 
+@pytest.mark.integration
 @pytest.mark.parametrize("engine", ENGINES)
 def test_the_first_replica_alone_acts_with_the_weights_of_the_moment(engine):
     agents = learner(engine, replicas=3)
@@ -227,6 +231,7 @@ def test_the_first_replica_alone_acts_with_the_weights_of_the_moment(engine):
             assert torch.equal(alone.choose(windows[:1]), of_all.choose(windows)[:1])
 
 
+@pytest.mark.integration
 def test_trained_replicas_are_evaluated_side_by_side_on_fresh_worlds():
     agents, _ = trained("lane_axis", replicas=2)
     env = CommonsEnv(GAME, 2 * 5, seed=9)

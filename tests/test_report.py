@@ -110,6 +110,7 @@ def test_runs_that_are_not_the_studys_have_no_columns_for_what_was_published(run
     assert "| fishery |" not in both.split("## Appendix A")[1].split("## Collective return")[0]
 
 
+@pytest.mark.integration
 def test_agents_of_which_none_learns_are_not_called_trained(run, tmp_path):
     game = cprl.Game(map=cprl.maps.parse(">.A.\n.A.<"), rules=cprl.Rules(episode_steps=20))
     agents = [Scripted("random")] * 2
@@ -124,6 +125,7 @@ def test_agents_of_which_none_learns_are_not_called_trained(run, tmp_path):
     assert "| measure | trained | random policy |" in write_report([run], tmp_path).read_text()
 
 
+@pytest.mark.integration
 def test_the_command_writes_a_report(run, tmp_path, capsys, monkeypatch):
     from cprl import cli
 

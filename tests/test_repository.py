@@ -21,6 +21,7 @@ def committed():
     return [name for name in listed.stdout.decode().split("\0") if name and (ROOT / name).is_file()]
 
 
+@pytest.mark.integration
 def test_no_committed_file_holds_a_path_of_a_machine():
     # Recordings, weights and tables too, as far as they are not compressed.
     found = [

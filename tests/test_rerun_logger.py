@@ -323,6 +323,7 @@ def trained(run, *, watched):
     return torch.cat([weight.flatten() for weight in network.parameters()]), torch.get_rng_state()
 
 
+@pytest.mark.integration
 def test_a_watched_training_records_every_turn_and_learns_the_very_same(tmp_path):
     (weights, state), (watched, other_state) = (
         trained(tmp_path, watched=False),

@@ -185,6 +185,7 @@ def test_the_table_and_the_estimates_hold_every_number(runs):
     assert list(social_table.columns[1].cells) == ["2 [2, 2]"]
 
 
+@pytest.mark.integration
 def test_the_picture_has_a_row_for_each_scenario(runs, tmp_path):
     scores = run_scenarios(runs["greedy"], episodes=1)
     with Image.open(draw_scenarios(scores, tmp_path / "new" / "scenarios.png")) as picture:

@@ -110,6 +110,7 @@ def test_the_diagram_is_drawn_once(corridors, tmp_path):
         draw_schelling(corridors, drawn)
 
 
+@pytest.mark.integration
 def test_the_command_prints_the_dilemma(tmp_path, monkeypatch, capsys):
     drawing = tmp_path / "patch.txt"
     drawing.write_text(">.AA.<\n..AA..\n")

@@ -171,6 +171,7 @@ def mean(episodes, name):
     return float(np.mean([np.sum(getattr(episode, name)) for episode in episodes]))
 
 
+@pytest.mark.integration
 def test_a_single_greedy_agent_harvests_far_more_than_a_random_one():
     game = presets.game("single_basic")
     returns = {policy: mean(population(policy, game, 8), "return_") for policy in ("random", "greedy")}
@@ -247,6 +248,7 @@ def test_the_actions_of_a_lane_do_not_depend_on_other_lanes(policy):
             assert torch.equal(chosen[own, agent], expected[:, 0])
 
 
+@pytest.mark.integration
 def test_epsilon_is_the_probability_of_a_random_action_while_exploring():
     game = Game(map=maps.parse("A..\n...\n^.."), rules=Rules())
     actor = ScriptedActor("greedy", game, seeds=[(lane,) for lane in range(4000)], agents=1)

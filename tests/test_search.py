@@ -102,6 +102,7 @@ def test_a_search_that_was_stopped_anywhere_runs_the_rest_alone(tmp_path, worth)
     assert ran + last.run_so_far == whole.run_so_far, "each once, in the same order"
 
 
+@pytest.mark.integration
 def test_more_points_continue_a_search(tmp_path, worth):
     run_search(a_search(8), tmp_path, on=Counting(), progress=False)
     more = Counting()
@@ -220,6 +221,7 @@ def test_a_sweep_can_be_a_search():
     assert search.factors == {FREEZE: Integers(1, 9), GAMMA: (0.5, 0.9)}
 
 
+@pytest.mark.integration
 @pytest.mark.parametrize("sampler", ["random", "gp", lambda seed: optuna.samplers.RandomSampler(seed=seed)])
 def test_other_samplers_propose_the_same_points_again_too(tmp_path, worth, sampler):
     first, again = (

@@ -191,6 +191,7 @@ def test_closures_are_constants_too(compilations):
     assert len(compilations) == 2
 
 
+@pytest.mark.integration
 def test_shared_code_that_gives_other_numbers_is_given_up(compilations, monkeypatch):
     """As a second line of defence: with guards that let everything through."""
     monkeypatch.setattr(compiling, "fits", lambda *_: True)

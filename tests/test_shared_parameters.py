@@ -139,6 +139,7 @@ def test_a_run_is_built_again_plays_frozen_and_others_start_from_it(tmp_path, mo
         assert torch.equal(value, networks[lane].state_dict()[key])
 
 
+@pytest.mark.integration
 def test_weights_that_differ_are_refused_as_a_start(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     run, _ = ran(tmp_path, [Team(TEAMS["VDN"], FOUR)])

@@ -79,6 +79,7 @@ def test_a_module_of_ones_own_comes_before_that_of_the_recipes(elsewhere):
     assert (done.returncode, done.stderr.strip()) == (1, "my own base")
 
 
+@pytest.mark.integration
 def test_a_recipe_is_run_by_its_name_with_its_own_flags(elsewhere, monkeypatch, capsys):
     call(monkeypatch, f"run two_complex --variant as_run --no-beam {SHORT} --out run")
     experiment = cprl.load("run").experiment

@@ -330,6 +330,7 @@ def test_a_shipped_study_asks_a_question_and_says_what_is_expected(name, monkeyp
         sys.modules.pop(module, None)
 
 
+@pytest.mark.integration
 def test_the_studies_of_the_programs_versions_share_their_runs(monkeypatch):
     monkeypatch.syspath_prepend(RECIPES)
     names = "combat", "experiment_5", "published_schedule", "dip"

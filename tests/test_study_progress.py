@@ -98,6 +98,7 @@ def test_failures_have_their_reason(looked, tmp_path):
     )
 
 
+@pytest.mark.integration
 def test_a_table_is_never_higher_than_a_screen_and_counts_the_rest(tmp_path):
     study = Study(TINY, {FREEZE: range(1, 101)})
     trials = trials_of(study)

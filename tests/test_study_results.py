@@ -232,6 +232,7 @@ def test_figures_of_a_grid_are_drawn_with_a_condition_that_has_no_run(grid_runs,
             draw(tmp_path / f"{name}.pdf")
 
 
+@pytest.mark.integration
 def test_random_draws_are_drawn_as_points_and_have_no_heat_map(tmp_path):
     factors = {"agents.*.algorithm.settings.gamma": Uniform(0.5, 0.9), TIME_OUT: [5, 25]}
     study = Study(EXPERIMENT, factors, draws=4, name="draws", replicas=1)

@@ -180,6 +180,7 @@ def shortfall(learner, lane, model, rows):
 EXPLORES = {"gamma": GAMMA, "epsilon_end": 1.0}
 
 
+@pytest.mark.integration
 @pytest.mark.parametrize("known", [ONCE], ids=["no regrowth"], indirect=True)
 def test_where_nothing_is_left_to_chance_it_learns_the_very_values(known):
     game, model, rows = known
@@ -259,6 +260,7 @@ def test_what_comes_after_the_clock_counts_and_nothing_after_the_last_apple():
     assert value_at_the_start(learner, "forward") == 1.0, "1 + 0.5 x 0, not 1 + 0.5 x 0.5"
 
 
+@pytest.mark.integration
 def test_the_learned_policy_plays_through_its_evaluation_actor():
     learner = learned(ONCE, TabularSettings(learning_rate=1.0, **EXPLORES), episodes=40)
     ends = evaluate(CommonsEnv(ONCE, 6, seed=1), AgentPolicies({(0,): learner.evaluation_actor(3)}))

@@ -173,6 +173,7 @@ def boards(draw):
     return Map(height=3, width=4, sites=tuple(cells[1 : most + 1]), starts=((*cells[0], 0),))
 
 
+@pytest.mark.integration
 @settings(deadline=None, max_examples=25)
 @given(
     board=boards(),
@@ -218,6 +219,7 @@ def test_no_stock_grows_faster_than_the_bound(board, probs):
         assert yield_bounds(board, rules).at_most == pytest.approx(max(growths), abs=1e-8)
 
 
+@pytest.mark.integration
 @pytest.mark.parametrize(
     ("board", "per_step"), [("single_basic", 0.5), ("single_complex", 0.9), ("commons", 2.51)]
 )

@@ -525,6 +525,7 @@ def test_replay_transforms_change_what_is_sampled():
     assert torch.equal(sampled["next", "reward"], 10 * buffer.storage[:]["next", "reward"][sampled["index"]])
 
 
+@pytest.mark.integration
 def test_updates_per_step_and_the_optimiser_are_those_of_the_settings():
     kinds = {
         "adam": torch.optim.Adam,

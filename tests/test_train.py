@@ -64,6 +64,7 @@ def test_two_learners_sit_side_by_side_and_each_stores_its_own_turns():
     assert not torch.equal(first, second)
 
 
+@pytest.mark.integration
 def test_training_again_with_the_same_seeds_gives_the_same_episodes():
     def returns():
         torch.manual_seed(3)

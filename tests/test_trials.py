@@ -118,6 +118,7 @@ def test_a_trial_that_is_killed_in_its_training_is_resumed_bit_for_bit(tmp_path,
     assert_same(own.directory, undisturbed)
 
 
+@pytest.mark.integration
 def test_a_failure_is_noted_with_its_reason_and_forgotten_when_it_is_mended(tmp_path, monkeypatch):
     own = task(tmp_path)
     status = Status(Path(own.status), own.name)
@@ -200,6 +201,7 @@ def test_studies_may_share_their_runs(tmp_path):
     assert not (tmp_path / "b" / "runs").exists()
 
 
+@pytest.mark.integration
 def test_a_condition_that_fails_does_not_end_the_study(tmp_path, monkeypatch):
     from cprl import running
 

@@ -30,6 +30,7 @@ def false_alarms(replicas, runs, *, repetitions=200, **how):
     return np.mean(found)
 
 
+@pytest.mark.integration
 @pytest.mark.parametrize("heavy", [False, True])
 @pytest.mark.parametrize("replicas", [4, 8])
 @pytest.mark.parametrize("runs", [1, 2])

@@ -306,6 +306,7 @@ def test_a_run_keeps_preferences_in_its_recipe_and_its_table(tmp_path):
         )  # fmt: skip
 
 
+@pytest.mark.integration
 def test_agents_that_start_from_stored_weights_want_what_they_are_told(tmp_path):
     cprl.run(EXPERIMENT, tmp_path / "first", watch="off")
     start = Frozen(str(tmp_path / "first"), agent=0, replica=None)

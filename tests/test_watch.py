@@ -116,6 +116,7 @@ def test_a_viewer_that_is_killed_half_way_changes_nothing(tmp_path, unwatched):
     assert episodes == list(range(8)), "the file has it all"
 
 
+@pytest.mark.integration
 def test_an_address_where_nobody_listens_is_told_once_and_changes_nothing(tmp_path, unwatched):
     address = f"rerun+http://127.0.0.1:{free_port()}/proxy"
     started = time.monotonic()
@@ -141,6 +142,7 @@ def disk_of(size, folder):
 only_root = pytest.mark.skipif(os.geteuid() != 0, reason="only root may mount a disk that fills up")
 
 
+@pytest.mark.integration
 @only_root
 def test_a_disk_that_fills_up_is_told_once_and_changes_nothing(tmp_path, unwatched):
     with disk_of(3000, tmp_path / "disk") as disk:
@@ -159,6 +161,7 @@ def test_a_disk_that_fills_up_is_told_once_and_changes_nothing(tmp_path, unwatch
         assert (disk / "run.rrd").stat().st_size > 50_000, "and the recording had been begun"
 
 
+@pytest.mark.integration
 @only_root
 def test_a_disk_that_is_full_from_the_start_is_told_once_and_changes_nothing(tmp_path, unwatched):
     with disk_of(96, tmp_path / "disk") as disk:
@@ -183,6 +186,7 @@ def test_without_a_display_no_viewer_is_spawned_and_the_addresses_stay(tmp_path,
     assert "Watch live (browser): http://127.0.0.1:" in capsys.readouterr().out
 
 
+@pytest.mark.integration
 def test_several_replicas_are_told_as_their_mean_and_each(tmp_path):
     returns = {}
 
@@ -234,6 +238,7 @@ def fake(number, world, *, returned, tagged):
     )
 
 
+@pytest.mark.integration
 def test_a_society_that_rises_falls_and_recovers_is_told_as_a_story(tmp_path):
     corners, apples = [0, 400, 800, 1200, 1600], [100, 500, 150, 400, 400]
     with ViewerCallback(tmp_path, CommonsEnv(GAME, 2), title="run", episodes=1600) as viewer:
@@ -293,6 +298,7 @@ def see_the_first_episode(recording):
     assert steps == sorted(steps)
 
 
+@pytest.mark.integration
 def test_the_file_of_a_run_that_goes_on_holds_all_up_to_its_last_flush(tmp_path):
     """As it is left by a process that is killed."""
     left = tmp_path / "left.rrd"

@@ -173,6 +173,7 @@ def test_no_two_agents_in_play_share_a_cell_and_no_agent_stands_in_a_wall(game, 
     check_places(game, seed)
 
 
+@pytest.mark.integration
 @settings(max_examples=60, deadline=None)
 @given(games(), st.integers(0, 2**32), st.randoms(use_true_random=False))
 def test_the_game_does_not_depend_on_agent_indices(game, seed, random):

@@ -96,6 +96,7 @@ def best_set(board, rules):
     return sets[int(np.argmax(bounds))], max(bounds)
 
 
+@pytest.mark.integration
 @settings(max_examples=150, deadline=None)
 @given(board=boards(sites=7), rules=RULES)
 def test_no_set_of_harvested_sites_bears_less_than_is_claimed(board, rules):
