@@ -123,21 +123,21 @@ class Claim:
 
 
 def claims() -> Iterator[Claim]:
-    """The claims, each for both lengths of the beam."""
-    for beam in BEAMS:
-        here = f"beam of {beam}"
-        trained = Of(study=perolat_open.STUDY, condition=here)
+    """The claims, each for both lengths of the beam; the first one also without a beam."""
+    *beams, none = perolat_open.STUDY.conditions
+    for here in (*beams, none):
         yield Claim(
             text="agents who learn harvest less than random ones, and deplete the open commons",
             measures=("harvest, apples", "survival, steps"),
             more=Of(study=perolat_open.STUDY, condition=here, policy="random"),
-            less=trained,
+            less=Of(study=perolat_open.STUDY, condition=here),
         )
+    for here in beams:
         yield Claim(
             text="without a beam the open commons is depleted sooner",
             measures=("survival, steps", "mean time of harvest, steps", "harvest, apples"),
-            more=trained,
-            less=Of(study=perolat_open.STUDY, condition="no beam"),
+            more=Of(study=perolat_open.STUDY, condition=here),
+            less=Of(study=perolat_open.STUDY, condition=none),
         )
     for beam in BEAMS:
         walls, none = (
