@@ -112,8 +112,9 @@ def test_the_table_of_claims_has_a_row_for_each_measure_and_says_what_is_not_run
     for policy in ("trained", "random"):
         apples = sum(read_table(run / "evaluation" / f"{policy}.parquet")["harvest"].to_pylist())
         assert f": {apples / 4:.4g} [" in harvest, "two episodes of two replicas"
-    nowhere = claims.table(tmp_path).splitlines()[2:]
-    assert all("not run: " in row for row in nowhere)
+    for nowhere in (claims.table(tmp_path), claims.table(ran, episodes=3)):
+        assert all("not run: " in row for row in nowhere.splitlines()[2:])
+    assert claims.table(ran, episodes=SMALL["episodes"]).splitlines()[2:] == rows
 
 
 def test_a_verdict_says_whether_an_interval_excludes_nothing_and_on_which_side(recipes):

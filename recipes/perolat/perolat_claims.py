@@ -9,7 +9,7 @@ territory are of 20 further episodes, played here.
 """
 
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cache
 from pathlib import Path
 from typing import Final
@@ -185,13 +185,20 @@ def verdict(found: Estimate) -> str:
     return "contradicted" if found.high < 0 else f"cannot be told with {found.replicas} replicas"
 
 
-def row(claim: Claim, name: str, runs: Path) -> str:
+def finished_runs(study: Study, runs: Path, episodes: int | None) -> dict[str, Path]:
+    """The finished runs of a study by condition; with `episodes`, those of as many, not of its own."""
+    if episodes is not None:
+        study = replace(study, experiment=replace(study.experiment, episodes=episodes))
+    return {source.condition: source.run for source in sources_of(study, runs)[0]}
+
+
+def row(claim: Claim, name: str, runs: Path, episodes: int | None = None) -> str:
     """A row of the table."""
     both = claim.more, claim.less
     cells = [claim.text, name, *map(str, both)]
     found: list[Values] = []
     for own in both:
-        finished = {source.condition: source.run for source in sources_of(own.study, runs)[0]}
+        finished = finished_runs(own.study, runs, episodes)
         if own.condition not in finished:
             return line(*cells, "", f"not run: {own.condition}")
         found.append(MEASURES[name](finished[own.condition], own.policy))
@@ -209,27 +216,30 @@ def line(*cells: str) -> str:
     return f"| {' | '.join(cells)} |"
 
 
-def table(runs: Path) -> str:
+def table(runs: Path, episodes: int | None = None) -> str:
     """All claims as a Markdown table.
 
     Args:
         runs: the directory of the runs of the three studies.
+        episodes: how many episodes they were trained for, where it is not as the studies say.
     """
     head = [
         "| claim | measure | should have more | should have less | difference | |",
         "|---|---|---|---|---|---|",
     ]
-    return "\n".join([*head, *(row(claim, name, runs) for claim in claims() for name in claim.measures)])
+    rows = (row(claim, name, runs, episodes) for claim in claims() for name in claim.measures)
+    return "\n".join([*head, *rows])
 
 
-def main(*, runs: Path = Path("studies/runs"), out: Path | None = None) -> None:
+def main(*, runs: Path = Path("studies/runs"), episodes: int | None = None, out: Path | None = None) -> None:
     """Prints the table, or writes it.
 
     Args:
         runs: the directory of the runs of the three studies.
+        episodes: how many episodes they were trained for, where it is not as the studies say.
         out: a .md to be.
     """
-    text = table(runs)
+    text = table(runs, episodes)
     if out is None:
         print(text)
     else:

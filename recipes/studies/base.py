@@ -31,6 +31,7 @@ EXPERIMENT: Final = cprl.Experiment(
 
 PUBLISHED: Final = replace(
     EXPERIMENT,
+    name="commons",
     agents=(Learning(DQN(settings=presets.dqn_settings("commons", variant="as_run"))),) * 4,
     episodes=4800,
     evaluation_episodes=20,
