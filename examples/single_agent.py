@@ -33,9 +33,8 @@ def main(*, episodes: int = 40, seed: int = 0) -> dict[str, float]:
     adam, target = torch.optim.Adam(loss.parameters(), lr=3e-4), SoftUpdate(loss, tau=0.005)
     buffer = TensorDictReplayBuffer(storage=LazyTensorStorage(100_000), batch_size=64)
     sizes = {"frames_per_batch": turns, "total_frames": episodes * turns}
-    stock = Collector(
-        env, TensorDictSequential(greedy, explore), **sizes, auto_register_policy_transforms=False
-    )
+    sizes["auto_register_policy_transforms"] = False
+    stock = Collector(env, TensorDictSequential(greedy, explore), **sizes)
     for episode, batch in enumerate(stock):
         for of_world, of_agents in ENDS.items():  # [1, T, 1] to [1, T, 1, 1], as the rewards are
             batch["next", *of_agents] = batch["next", of_world].unsqueeze(-1)
@@ -50,8 +49,9 @@ def main(*, episodes: int = 40, seed: int = 0) -> dict[str, float]:
             print(f"episode {episode + 1}: harvest {batch['next', *keys.REWARD].sum():.0f}", flush=True)
     trial, played = CommonsEnv(game, 100, seed=seed + 1), {}
     for name, policy in {"random": None, "greedy": greedy}.items():
-        steps = trial.rollout(turns, policy, break_when_any_done=False, break_when_all_done=True)
-        played[name] = steps["next", *keys.HARVEST].sum().item() / 100
+        steps = trial.rollout(turns, policy, break_when_any_done=False, break_when_all_done=True)["next"]
+        playing = steps["done"].cumsum(1) - steps["done"].long() == 0  # a rollout repeats a world's last step
+        played[name] = (steps[keys.HARVEST] * playing).sum().item() / 100
     return played
 
 

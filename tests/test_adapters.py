@@ -286,3 +286,16 @@ def test_a_window_shows_one_image_after_the_other_and_closes():
     assert (window._image.get_array() == 200).all()
     window.close()
     assert not matplotlib.pyplot.get_fignums()
+
+
+def test_without_a_seed_two_environments_play_different_worlds():
+    for make in (lambda: parallel_env(SHORT), lambda: CommonsGymnasiumEnv(SINGLE[0])):
+        first, second = (make().world.batch.state()["seed"].item() for _ in range(2))
+        assert first != second
+
+
+def test_what_has_not_begun_cannot_be_shown():
+    world = parallel_env(SHORT, render_mode="rgb_array")
+    for show in (world.render, world.state):
+        with pytest.raises(ValueError, match=r"has not begun; allowed: reset\(\) before"):
+            show()

@@ -69,6 +69,16 @@ def test_the_single_agent_is_compared_with_random_play(example, shorter_episodes
     assert "episode 10: harvest" in capsys.readouterr().out
 
 
+@pytest.mark.integration
+def test_the_single_agent_counts_no_apple_twice(example, monkeypatch):
+    # Two apples, and none grows again: a world ends with the second bite, others play on.
+    two = Game(map=maps.parse(">AA"), rules=Rules(regrow_prob=(0.0,), may_fire=False, episode_steps=40))
+    monkeypatch.setattr(presets, "game", lambda _: two)
+    played = example("single_agent").main(episodes=10)
+    assert 0 < played["random"] <= 2
+    assert played["greedy"] <= 2
+
+
 @pytest.mark.slow
 def test_the_single_agent_earns_three_times_what_chance_does(example):
     played = example("single_agent").main(episodes=20)

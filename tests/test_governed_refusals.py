@@ -264,3 +264,35 @@ def test_a_state_from_before_the_first_episode_can_be_put_back():
     other = Batch(batch.game, 2)
     other.load(batch.state(), other.new_output())
     assert all(np.array_equal(array, other.state()[name]) for name, array in batch.state().items())
+
+
+@pytest.mark.parametrize(
+    ("make", "message"),
+    [
+        (
+            lambda: Sanctioner(agents=(0,), override_prob=0.5),
+            r"override_prob is 0\.5 and nobody is elected; allowed: 0\.0, or others where agents is None",
+        ),
+        (lambda: Sanctioner(agents=(0,), period_episodes=3), "period_episodes is 3 and nobody is elected"),
+        (
+            lambda: Monitoring(monitor=1, period_episodes=2),
+            'period_episodes is 2 and nobody is elected; allowed: 1, or others where monitor is "elected"',
+        ),
+    ],
+)
+def test_what_is_said_of_an_election_that_is_not_held_is_refused(make, message):
+    with pytest.raises(ValueError, match=message):
+        make()
+
+
+def test_an_unobserved_vote_hides_its_result_and_not_the_quota_that_is_voted_on():
+    observation = replace(PLAIN.observation, encoding="one_hot")
+    shown = [
+        replace(
+            PLAIN, observation=observation, institutions=(Vote(on=quota, observed=observed),)
+        ).entries_shown
+        for quota, observed in ((Quota(), False), (Quota(observed=False), True))
+    ]
+    assert [entry.startswith("quota left") for entry in shown[0]] == [True, False]
+    assert len(shown[1]) == 1
+    assert not shown[1][0].startswith("quota")

@@ -14,8 +14,14 @@ from torchrl.envs.utils import check_env_specs
 
 from cprl import CommonsEnv, Game, Rules, maps
 from cprl.collectors import StepCollector
-from cprl.envs import parallel_env
-from cprl.envs.state import check_restorable, env_state, load_env_state
+from cprl.envs import make_env, parallel_env
+from cprl.envs.state import (
+    check_restorable,
+    env_state,
+    load_env_state,
+    load_transforms_state,
+    transforms_state,
+)
 from cprl.policies.assignment import AgentPolicies
 from cprl.policies.lanes import random_agents
 from cprl.preferences import (
@@ -198,6 +204,16 @@ def test_each_agent_may_want_something_else():
     rewards, ended = np.array([[3.0, 0.0, 1.0]], np.float32), np.array([False])
     got = WantedRewards(["individual", "team", Exchange(0.5)]).add(rewards, ended)
     assert got[0].tolist() == close(3, 4, 1.25)
+
+
+def test_what_a_transform_remembers_of_its_worlds_is_none_of_what_transforms_have_learned():
+    game = Game(map=maps.parse("A>.A\nA.<A"), rules=Rules(regrow_prob=(0.5,)))
+    envs = [make_env(game, worlds=worlds, transforms=[PreferenceTransform(AVERSE)]) for worlds in (2, 3)]
+    for env in envs:
+        env.rollout(4)
+    assert transforms_state(envs[0]) == {}
+    load_transforms_state(envs[1], env_state(envs[0])["transforms"])
+    assert envs[1].transform[0].get_extra_state().shape[1] == 3, "its own three worlds"
 
 
 class TestRefusals:

@@ -43,7 +43,10 @@ def test_a_quota_with_a_fine_lets_bites_happen_and_charges_those_above_it():
 
 def test_a_part_of_an_apple_is_none():
     # 0.9 x 1 apple in a window of 1 turn: nobody may harvest.
-    play = Play(BOARD, institutions=[Quota(share=0.9, window_steps=1)], **SURE)
+    with pytest.warns(
+        UserWarning, match=r"window_steps is 1: .* take 0\.9 apples at most, .* windows of 2 turns"
+    ):
+        play = Play(BOARD, institutions=[Quota(share=0.9, window_steps=1)], **SURE)
     assert play.turn("forward").harvest == [0, 0]
     assert Play(BOARD, institutions=[Quota(share=1, window_steps=1)], **SURE).turn("forward").harvest == [
         1,

@@ -1,5 +1,6 @@
 """CommonsEnv keeps TorchRL's contracts, and plays the very game of `cprl.commons`."""
 
+from copy import deepcopy
 from functools import partial
 
 import numpy as np
@@ -9,11 +10,24 @@ from boards import random_actions
 from tensordict import TensorDict, assert_close
 from tensordict.nn import TensorDictModuleBase
 from torchrl.collectors import Collector
-from torchrl.envs import EnvBase, ParallelEnv, RewardSum, SerialEnv, TransformedEnv
+from torchrl.envs import (
+    DTypeCastTransform,
+    EnvBase,
+    ParallelEnv,
+    RewardSum,
+    SerialEnv,
+    StepCounter,
+    TimeMaxPool,
+    Transform,
+    TransformedEnv,
+    VecNormV2,
+)
 from torchrl.envs.utils import check_env_specs
 
 from cprl import CommonsEnv, Game, Rules, keys, maps, presets
 from cprl.commons.batch import Batch
+from cprl.envs import make_env
+from cprl.envs.state import check_restorable, load_transforms_state, transforms_state
 
 SHORT = Game(
     map=maps.parse(".A>.A\n.A.A.\n..<.A"),
@@ -302,3 +316,70 @@ def test_agents_with_entries_of_their_own_batch_size_keep_it():
     env = CommonsEnv(SHORT, worlds=2)
     assert isinstance(env.reset()[keys.AGENTS], TensorDict)
     assert env.reset()[keys.AGENTS].batch_size == (2, 2)
+
+
+def test_a_step_that_leaves_out_a_world_that_is_playing_is_refused():
+    env = CommonsEnv(SHORT, worlds=2)
+    moment = env.rand_action(env.reset())
+    with pytest.raises(
+        ValueError, match=r'"_step" leaves out world 1, which is playing; allowed: masks that'
+    ):
+        env.step(moment.clone().set("_step", torch.tensor([[True], [False]])))
+    moment = env.step(moment.set("_step", torch.ones(2, 1, dtype=torch.bool)))["next"]
+    assert moment["agents", "observation"].shape[0] == 2
+
+
+def test_a_board_with_a_rim_of_walls_is_played_under_transforms():
+    game = Game(map=maps.parse("#####\n#>AA#\n#####"), rules=Rules(window_rows=3, window_columns=3))
+    env = make_env(game, worlds=2, transforms=[StepCounter()])
+    steps = env.rollout(3)
+    assert steps["next", "agents", "harvest"].sum() >= 0
+    new = CommonsEnv(game, worlds=2)
+    new.load(CommonsEnv(game, worlds=2).worlds.state())
+    with pytest.raises(ValueError, match=r"the worlds have not begun; allowed: begin\(\) or load\(\) first"):
+        new.step(TensorDict({"agents": {"action": torch.zeros(2, 1, dtype=torch.int64)}}, [2]))
+
+
+@pytest.mark.filterwarnings("ignore:Support of VecNormV2 for containers:UserWarning")  # TorchRL's own
+def test_transforms_that_learn_are_put_back_and_share_nothing():
+    check_restorable(lambda: make_env(SHORT, worlds=2, transforms=[as_floats(), normalised(VecNormV2)]))
+    first, second = (make_env(SHORT, worlds=2, transforms=[as_floats(), normalised(VecNormV2)]) for _ in "ab")
+    first.rollout(3)
+    load_transforms_state(second, transforms_state(first))
+    before = {name: deepcopy(value) for name, value in transforms_state(first).items()}
+    second.rollout(9, break_when_any_done=False)
+    assert str(transforms_state(first)) == str(before)
+    assert str(transforms_state(second)) != str(before)
+
+
+def test_a_transform_that_cannot_be_put_back_is_named():
+    pool = TimeMaxPool(in_keys=[keys.OBSERVATION], T=2)
+    with pytest.raises(ValueError, match=r"the transforms DTypeCastTransform, TimeMaxPool .*; allowed: "):
+        make_env(SHORT, worlds=2, transforms=[as_floats(), pool])
+    with pytest.raises(ValueError, match="the state_dict of Forgetful does not hold all of its state"):
+        check_restorable(lambda: make_env(SHORT, worlds=2, transforms=[Forgetful()]))
+
+
+def as_floats():
+    """Observations as normalisations want them."""
+    return DTypeCastTransform(torch.uint8, torch.float32, in_keys=[keys.OBSERVATION])
+
+
+def normalised(kind):
+    return kind(in_keys=[keys.OBSERVATION])
+
+
+class Forgetful(Transform):
+    """Adds a count of its own to observations, which no state_dict has."""
+
+    def __init__(self):
+        super().__init__(in_keys=[keys.OBSERVATION], out_keys=[keys.OBSERVATION])
+        self.count = 0
+
+    def _call(self, next_tensordict):
+        self.count += 1
+        seen = next_tensordict[keys.OBSERVATION]
+        return next_tensordict.set(keys.OBSERVATION, seen + self.count)
+
+    def _reset(self, tensordict, tensordict_reset):
+        return tensordict_reset

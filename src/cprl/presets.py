@@ -68,7 +68,7 @@ def game(board: Board, *, variant: Variant = "published") -> Game:
 
 
 def gymnasium_env(
-    board: Board, *, variant: Variant = "published", seed: int = 0, render_mode: str | None = None
+    board: Board, *, variant: Variant = "published", seed: int | None = None, render_mode: str | None = None
 ) -> CommonsGymnasiumEnv:
     """A published board for one agent as a Gymnasium environment, for `gymnasium.make`.
 

@@ -7,7 +7,7 @@ from cprl.checks import Check, check_fields, count, is_count, number, one_of, tu
 
 DTYPES: Final = (
     *("bool", "uint8", "uint16", "uint32", "uint64", "int8", "int16", "int32", "int64"),
-    *("float16", "bfloat16", "float32", "float64"),
+    *("float16", "float32", "float64"),  # numpy has no bfloat16
 )
 
 

@@ -245,7 +245,7 @@ class Batch:
         for name, values in checked.items():
             self.driver.write(arrays[name], values)
         self._run("refresh_worlds", self._all_worlds, output)
-        self._has_begun = True
+        self._has_begun = bool((checked["episode"] >= 0).all())
         return output
 
     def check(self, actions: Actions) -> None:

@@ -34,7 +34,7 @@ def entries_shown(institutions: Sequence[Institution], agents: int) -> list[tupl
     entries: list[tuple[int, int]] = []
     quotas, seasons, ballot = 0, 0, 0
     for own in institutions:
-        if own.observed:
+        if own.observed or isinstance(own, Vote):  # what is voted on has an "observed" of its own
             entries += _SHOWN_BY[type(own)](own, quotas, seasons, ballot, agents)
         quotas += isinstance(own, Quota) or (isinstance(own, Vote) and isinstance(own.on, Quota))
         seasons += isinstance(own, ClosedSeason)
@@ -55,7 +55,7 @@ def _shown_by_season(own: Any, quotas: int, seasons: int, ballot: int, agents: i
 
 def _shown_by_vote(own: Any, quotas: int, seasons: int, ballot: int, agents: int) -> _Entries:
     also = _shown_by_quota(own.on, quotas, seasons, ballot, agents) if isinstance(own.on, Quota) else []
-    return [(shows.IN_FORCE, ballot), *(also if own.on.observed else [])]
+    return [*([(shows.IN_FORCE, ballot)] if own.observed else []), *(also if own.on.observed else [])]
 
 
 def _shown_by_monitoring(own: Any, quotas: int, seasons: int, ballot: int, agents: int) -> _Entries:

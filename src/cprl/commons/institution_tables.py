@@ -1,5 +1,7 @@
 """The institutions of a game as lookup tables for the compiled rules."""
 
+import math
+import warnings
 from collections.abc import Sequence
 from typing import Any
 
@@ -29,6 +31,7 @@ from cprl.institutions import (
 )
 from cprl.institutions.boundaries import OPEN
 from cprl.institutions.choice import Ballot, ballots, is_decided
+from cprl.institutions.limits import ROUNDING
 from cprl.institutions.memory import InstitutionTables
 
 
@@ -128,6 +131,8 @@ def _quota_tables(institutions: Sequence[Institution], board: Map, rules: Rules)
     voted = ballots(institutions, board.agents)
     found = _voted(institutions, Quota)
     of_agent = sustainable_yield(board, rules) / board.agents if found else 0.0
+    for quota, ballot in found:
+        _warn_of_less_than_an_apple(quota, of_agent * _most(quota, ballot, voted))
     return {
         "quota_unit": _floats([of_agent * quota.window_steps for quota, _ in found]),
         "quota_full": _floats(
@@ -140,6 +145,19 @@ def _quota_tables(institutions: Sequence[Institution], board: Map, rules: Rules)
         "quota_stopped": _bools([quota.fine is None for quota, _ in found]),
         "quota_fine": _floats([_fine(quota.fine) for quota, _ in found]),
     }
+
+
+def _warn_of_less_than_an_apple(quota: Quota, apples_a_turn: float) -> None:
+    """Warns of a quota that stops every bite although its share is not 0."""
+    apples = apples_a_turn * quota.window_steps
+    if quota.fine is None and 0 < apples < 1 - ROUNDING:
+        warnings.warn(
+            f"Quota.window_steps is {quota.window_steps}: in such a window an agent may take {apples:.3g} "
+            "apples at most, so nobody ever harvests; an apple is allowed in windows of "
+            f"{math.ceil((1 - ROUNDING) / apples_a_turn)} turns or more",
+            UserWarning,
+            stacklevel=2,
+        )
 
 
 def _season_tables(institutions: Sequence[Institution]) -> dict[str, Any]:

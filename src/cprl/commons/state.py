@@ -116,12 +116,15 @@ def _check_memory(arrays: State, game: Game) -> None:
 
 
 def _check_places(arrays: State, game: Game) -> None:
-    """Checks that no agent is in a wall, and that agents in play share a cell only if the rules allow it."""
+    """Checks that no agent is in a wall, and that agents in play share a cell only if the rules allow it.
+
+    In worlds that have not begun, agents are nowhere yet.
+    """
     row, col = arrays["row"], arrays["col"]
     walls = np.zeros((game.map.height, game.map.width), np.bool_)
     if game.map.walls:
         walls[tuple(np.array(game.map.walls).T)] = True
-    _refuse(arrays, "row", walls[row, col], "a cell without a wall")
+    _refuse(arrays, "row", walls[row, col] & (arrays["episode"] >= 0), "a cell without a wall")
     if game.rules.agent_1_right_moves_agent_0:
         _check_moved(arrays, walls)
     if game.rules.pairwise_clashes:

@@ -14,7 +14,7 @@ from cprl import arguments, keys
 from cprl.checks import shown
 from cprl.commons.batch import Batch, Output, output_of, turn_of
 from cprl.commons.game import Game, output_shapes
-from cprl.commons.world import Bytes, StepOutput
+from cprl.commons.world import PLAYING, Bytes, StepOutput
 from cprl.compat import LeanStepEnv, put_all, unchecked_tensordict
 from cprl.envs.commons_specs import DONE_ENTRIES, WORLD_ENTRIES, specs_of
 from cprl.envs.drivers import device_of, drawn_seed, driver_for
@@ -235,10 +235,27 @@ class CommonsEnv(LeanStepEnv):
         if self._decides:
             decisions = self._as_array(self._chosen(tensordict, "decision").contiguous())
             self.worlds.check_decisions(decisions)
+        stepped = tensordict.get("_step", None)
+        if stepped is not None:
+            self._check_stepped(stepped.reshape(-1))
         self._show_in(*self._fresh())
         self.worlds.play_checked(actions, self._whole, decisions)
         reward = self._tensors["reward"] if self._is_governed else self._tensors["harvest"].clone()
         return self._as_tensordict(self._tensors, reward.unsqueeze(-1))
+
+    def _check_stepped(self, stepped: Tensor) -> None:
+        """That the worlds that a "_step" mask, bool [B], leaves out have all ended.
+
+        Raises:
+            ValueError: for one that has not: all worlds play each turn.
+        """
+        playing = self.worlds.driver.read(self.worlds.now.ended)[:, 0] == PLAYING
+        left_out = playing & ~stepped.numpy(force=True)
+        if left_out.any():
+            raise ValueError(
+                f'"_step" leaves out world {int(left_out.argmax())}, which is playing; allowed: masks that '
+                "leave out worlds that have ended, since all others play every turn together"
+            )
 
     def _chosen(self, tensordict: TensorDictBase, name: str) -> Tensor:
         """("agents", "action") or ("agents", "decision"), int64 on the device of the worlds.

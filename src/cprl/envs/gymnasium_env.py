@@ -20,7 +20,8 @@ class CommonsGymnasiumEnv(gymnasium.Env[Any, Any]):
 
     Args:
         game: The game, see `presets.game`; its map has one agent.
-        seed: The seed of all random numbers, 0 to 2**64 - 1; `reset(seed=...)` restarts with another seed.
+        seed: The seed of all random numbers, 0 to 2**64 - 1; `reset(seed=...)` restarts with another one.
+            None draws one from torch's generator, another for each environment, as `CommonsEnv` does.
         render_mode: "rgb_array", "human" or None.
 
     Raises:
@@ -33,7 +34,7 @@ class CommonsGymnasiumEnv(gymnasium.Env[Any, Any]):
         "render_fps": RENDER_FPS,
     }
 
-    def __init__(self, game: Game, *, seed: int = 0, render_mode: str | None = None) -> None:
+    def __init__(self, game: Game, *, seed: int | None = None, render_mode: str | None = None) -> None:
         arguments.object_of("game", game, Game, "a cprl.Game")
         if game.agents != 1:
             raise ValueError(

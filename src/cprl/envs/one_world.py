@@ -12,6 +12,7 @@ from cprl.commons.batch import Batch, Output, turn_of
 from cprl.commons.game import Game
 from cprl.commons.picture import world_image
 from cprl.commons.world import Bytes, GovernedOutput
+from cprl.envs.drivers import drawn_seed
 from cprl.envs.window import Window
 from cprl.institutions.memory import Payments
 
@@ -26,7 +27,7 @@ class OneWorld:
 
     Args:
         game: The game.
-        seed: The seed of all random numbers, 0 to 2**64 - 1.
+        seed: The seed of all random numbers, 0 to 2**64 - 1; None for one drawn by `drawn_seed`.
         title: The title of the window under `render_mode="human"`.
         render_mode: One of `RENDER_MODES`, or None.
 
@@ -35,11 +36,11 @@ class OneWorld:
         RuntimeError: If the render mode is "human" and no window can be opened.
     """
 
-    def __init__(self, game: Game, *, seed: int, title: str, render_mode: str | None) -> None:
+    def __init__(self, game: Game, *, seed: int | None, title: str, render_mode: str | None) -> None:
         if render_mode is not None and not (isinstance(render_mode, str) and render_mode in RENDER_MODES):
             raise arguments.refusal("render_mode", render_mode, f"None, {', '.join(RENDER_MODES)}")
         self.game = game
-        self.batch = Batch(game, 1, seed=seed)
+        self.batch = Batch(game, 1, seed=drawn_seed() if seed is None else seed)
         self._show_in(self.batch.new_output())
         self._decisions = np.zeros((1, game.agents), np.int64)
         self.render_mode = render_mode
@@ -106,8 +107,7 @@ class OneWorld:
             ValueError: If there is not one action per agent, one is no integer or out of range, or the
                 episode has not begun; the world is unchanged.
         """
-        if not self._has_begun:
-            raise ValueError("the episode has not begun; allowed: reset() before the first step")
+        self._check_begun("the first step")
         last = len(self.game.actions) - 1
         row = [
             arguments.integer(f"the action of {name}", action, 0, last)
@@ -157,8 +157,17 @@ class OneWorld:
         """Whether the episode ran out of time."""
         return bool(self.output.truncated[0, 0])
 
+    def _check_begun(self, what: str) -> None:
+        if not self._has_begun:
+            raise ValueError(f"the episode has not begun; allowed: reset() before {what}")
+
     def state(self) -> Bytes:
-        """The whole board in RGB: uint8 [3, H, W]."""
+        """The whole board in RGB: uint8 [3, H, W].
+
+        Raises:
+            ValueError: If the episode has not begun.
+        """
+        self._check_begun("state()")
         board = self.game.palette[self.batch.boards(self.output)[0]]
         return np.ascontiguousarray(board.transpose(2, 0, 1))
 
@@ -166,13 +175,14 @@ class OneWorld:
         """Returns an image, uint8 [rows, columns, 3], under "rgb_array"; shows it in a window under "human".
 
         Raises:
-            ValueError: If there is no render mode.
+            ValueError: If there is no render mode, or the episode has not begun.
         """
         if self.render_mode is None:
             raise ValueError(
                 'render_mode is None, so render() is unavailable; allowed: "rgb_array" or "human", chosen '
                 "when the environment is made"
             )
+        self._check_begun("render()")
         image = world_image(self.game.map, self.batch.show(self.output))
         if self._window is None:
             return image

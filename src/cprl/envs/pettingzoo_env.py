@@ -27,7 +27,8 @@ class CommonsParallelEnv(ParallelEnv[str, Any, int]):
 
     Args:
         game: The game, see `presets.game`.
-        seed: The seed of all random numbers, 0 to 2**64 - 1; `reset(seed=...)` restarts with another seed.
+        seed: The seed of all random numbers, 0 to 2**64 - 1; `reset(seed=...)` restarts with another one.
+            None draws one from torch's generator, another for each environment, as `CommonsEnv` does.
         render_mode: "rgb_array", "human" or None.
 
     Raises:
@@ -42,7 +43,7 @@ class CommonsParallelEnv(ParallelEnv[str, Any, int]):
         "is_parallelizable": True,
     }
 
-    def __init__(self, game: Game, *, seed: int = 0, render_mode: str | None = None) -> None:
+    def __init__(self, game: Game, *, seed: int | None = None, render_mode: str | None = None) -> None:
         arguments.object_of("game", game, Game, "a cprl.Game")
         self.game, self.render_mode = game, render_mode
         self.world = OneWorld(game, seed=seed, title="cprl commons", render_mode=render_mode)
@@ -123,11 +124,13 @@ class CommonsParallelEnv(ParallelEnv[str, Any, int]):
         return {name: self.world.info(i) for i, name in enumerate(self.agents)}
 
 
-def parallel_env(game: Game, seed: int = 0, *, render_mode: str | None = None) -> CommonsParallelEnv:
+def parallel_env(
+    game: Game, seed: int | None = None, *, render_mode: str | None = None
+) -> CommonsParallelEnv:
     """The game as a PettingZoo `ParallelEnv`; see `CommonsParallelEnv`."""
     return CommonsParallelEnv(game, seed=seed, render_mode=render_mode)
 
 
-def env(game: Game, seed: int = 0, *, render_mode: str | None = None) -> AECEnv[str, Any, int]:
+def env(game: Game, seed: int | None = None, *, render_mode: str | None = None) -> AECEnv[str, Any, int]:
     """The game as a PettingZoo `AECEnv`: agents act one by one; a turn is played after the last has acted."""
     return parallel_to_aec(parallel_env(game, seed, render_mode=render_mode))

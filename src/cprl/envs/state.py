@@ -1,6 +1,7 @@
 """The whole state of an environment and of its transforms, for checkpoints."""
 
 from collections.abc import Callable, Mapping
+from copy import deepcopy
 from typing import Any, Final
 
 import numpy as np
@@ -9,7 +10,7 @@ from numpy.typing import NDArray
 from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
 from torch.nn.parameter import is_lazy
-from torchrl.envs import EnvBase, TransformedEnv
+from torchrl.envs import Compose, EnvBase, TransformedEnv
 
 from cprl.arguments import object_of
 from cprl.envs.unwrap import base_env, commons_of
@@ -30,7 +31,7 @@ def load_env_state(env: EnvBase, state: Mapping[str, Any]) -> None:
     """Puts an environment, made with the same arguments, where `env_state` found it.
 
     Raises:
-        ValueError: if the state is of another form, or a commons cannot be in it.
+        ValueError: if the state is of another form, or a commons or a transform cannot be in it.
     """
     object_of("state", state, Mapping, "a value of env_state")
     for name in ("worlds", "transforms"):
@@ -72,12 +73,24 @@ def check_restorable(make: Callable[[], EnvBase]) -> None:
         torch.manual_seed(1)
         found = _played(second, copied, STEPS_TRIED)
     if not all(_equal(one, other) for one, other in zip(found, expected, strict=True)):
-        kind = type(base_env(first)).__name__
         raise ValueError(
-            f"the state_dict of {kind} does not hold all of its state: put back where it was, it plays on "
-            "differently, so a run that is stopped could not be resumed; register what it keeps as buffers "
-            "(register_buffer), or define state_dict and load_state_dict"
+            f"the state_dict of {_at_fault(first)} does not hold all of its state: put back where it was, it "
+            "plays on differently, so a run that is stopped could not be resumed; register what it keeps as "
+            "buffers (register_buffer), or define state_dict and load_state_dict"
         )
+
+
+def _at_fault(env: EnvBase) -> str:
+    """What may keep something beside its state: a commons does not, so its transforms do."""
+    if commons_of(env) is None or not isinstance(env, TransformedEnv):
+        return type(base_env(env)).__name__
+    return " or ".join(_kinds(env))
+
+
+def _kinds(env: TransformedEnv) -> list[str]:
+    """The types of the transforms."""
+    listed = env.transform if isinstance(env.transform, Compose) else [env.transform]
+    return [type(own).__name__ for own in listed]
 
 
 def _played(env: EnvBase, carried: TensorDictBase, steps: int) -> list[TensorDictBase]:
@@ -96,21 +109,38 @@ def _equal(one: TensorDictBase, other: TensorDictBase) -> bool:
     )
 
 
-_OF_WORLDS: Final = "_cat_buffers"
+_FRAMES: Final = "_cat_buffers"
 """In the name of what `torchrl.envs.CatFrames` keeps of the worlds themselves, their latest observations."""
+_EXTRA: Final = "_extra_state"
+"""The end of the name under which torch has what a module's `get_extra_state` gives."""
 
 
 def transforms_state(env: EnvBase) -> dict[str, Any]:
     """What the transforms have learned or been told, e.g. the statistics of a normalisation; nothing of the
     worlds themselves."""
-    return {name: value for name, value in _all_of_transforms(env).items() if _OF_WORLDS not in name}
+    return {name: value for name, value in _all_of_transforms(env).items() if not _is_of_worlds(env, name)}
 
 
 def load_transforms_state(env: EnvBase, state: Mapping[str, Any]) -> None:
     """Gives the transforms of an environment what those of another had; what they keep of its own worlds
-    stays."""
+    stays.
+
+    Raises:
+        ValueError: if a transform cannot be in this state.
+    """
     if isinstance(env, TransformedEnv):
-        _load(env, {name: value for name, value in state.items() if _OF_WORLDS not in name})
+        _load(env, {name: value for name, value in state.items() if not _is_of_worlds(env, name)})
+
+
+def _is_of_worlds(env: EnvBase, name: str) -> bool:
+    """Whether a transform keeps this of the worlds themselves: latest observations, or the extra state of a
+    transform that has `remembers_worlds`."""
+    if _FRAMES in name:
+        return True
+    if not name.endswith(f".{_EXTRA}") or not isinstance(env, TransformedEnv):
+        return False
+    owner = dict(env.transform.named_modules()).get(name.removesuffix(f".{_EXTRA}"))
+    return bool(getattr(owner, "remembers_worlds", False))
 
 
 def _all_of_transforms(env: EnvBase) -> dict[str, Any]:
@@ -123,15 +153,21 @@ def _all_of_transforms(env: EnvBase) -> dict[str, Any]:
 
 
 def _load(env: TransformedEnv, state: dict[str, Any]) -> None:
-    """Loads the state of transforms; what they keep of the worlds may be missing."""
-    kept = env.transform.state_dict(keep_vars=True)
-    if not any(_OF_WORLDS in name for name in kept):
-        env.transform.load_state_dict(state)
-        return
-    missing, unexpected = env.transform.load_state_dict(state, strict=False)
-    wrong = sorted(name for name in (*missing, *unexpected) if _OF_WORLDS not in name)
+    """Loads a copy of the state of transforms; what they keep of the worlds may be missing."""
+    kinds = ", ".join(_kinds(env))
+    try:  # a copy, since some transforms keep the very tensors that they are given
+        missing, unexpected = env.transform.load_state_dict(deepcopy(state), strict=False)
+    except (KeyError, RuntimeError, TypeError) as error:
+        raise ValueError(
+            f"the transforms {kinds} refuse the state of the same transforms: {error}; allowed: transforms "
+            "whose load_state_dict takes what their state_dict gives"
+        ) from error
+    wrong = sorted(name for name in (*missing, *unexpected) if not _is_of_worlds(env, name))
     if wrong:
-        raise ValueError(f"the state of the transforms lacks, or has beyond theirs, {', '.join(wrong)}")
+        raise ValueError(
+            f"the state of the transforms {kinds} lacks, or has beyond theirs, {', '.join(wrong)}; allowed: "
+            "transforms whose load_state_dict takes what their state_dict gives"
+        )
 
 
 def carried_state(carried: TensorDictBase) -> dict[str, Any]:

@@ -1,7 +1,7 @@
 """What all institutions share."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from typing import ClassVar, Final
 
 from cprl.checks import NONE, SWITCH, Check, either, number
@@ -52,3 +52,25 @@ def check_agent_indices(name: str, indices: Sequence[int], agents: int) -> None:
     for agent in indices:
         if agent >= agents:
             raise ValueError(f"{name} has agent {agent}; allowed on this map: 0 to {agents - 1}")
+
+
+OF_ELECTIONS: Final = ("period_episodes", "override_prob")
+"""The fields that say how an election is held."""
+
+
+def check_no_election(own: Institution, elects: str) -> None:
+    """Checks that an institution without an election says nothing about how one is held.
+
+    Args:
+        own: the institution.
+        elects: what it would have to be for an election, in words.
+
+    Raises:
+        ValueError: For the first field of `OF_ELECTIONS` that does not have its default.
+    """
+    for field in fields(own):
+        if field.name in OF_ELECTIONS and (value := getattr(own, field.name)) != field.default:
+            raise ValueError(
+                f"{type(own).__name__}.{field.name} is {value!r} and nobody is elected; allowed: "
+                f"{field.default!r}, or others where {elects}"
+            )

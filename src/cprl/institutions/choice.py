@@ -6,7 +6,13 @@ from math import prod
 from typing import Any, ClassVar, Final, NamedTuple
 
 from cprl.checks import Check, check_fields, count, instance, is_count, is_number
-from cprl.institutions.base import OBSERVED, PROBABILITY, Institution, check_agent_indices
+from cprl.institutions.base import (
+    OBSERVED,
+    PROBABILITY,
+    Institution,
+    check_agent_indices,
+    check_no_election,
+)
 from cprl.institutions.monitoring import ELECTED, Monitoring
 from cprl.institutions.quotas import Quota
 from cprl.institutions.taxes import Tax
@@ -79,6 +85,8 @@ class Sanctioner(Institution):
 
     def __post_init__(self) -> None:
         check_fields(self, _SANCTIONER)
+        if self.agents is not None:
+            check_no_election(self, "agents is None, so that they are elected")
 
     def check_board(self, *, agents: int, height: int, width: int) -> None:
         """See `Institution.check_board`."""

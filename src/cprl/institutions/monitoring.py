@@ -4,7 +4,14 @@ from dataclasses import dataclass
 from typing import Any, ClassVar, Final
 
 from cprl.checks import Check, check_fields, count, is_count
-from cprl.institutions.base import AMOUNT, OBSERVED, PROBABILITY, Institution, check_agent_indices
+from cprl.institutions.base import (
+    AMOUNT,
+    OBSERVED,
+    PROBABILITY,
+    Institution,
+    check_agent_indices,
+    check_no_election,
+)
 
 ELECTED: Final = "elected"
 
@@ -39,6 +46,8 @@ class Monitoring(Institution):
 
     def __post_init__(self) -> None:
         check_fields(self, _CHECKS)
+        if self.monitor != ELECTED:
+            check_no_election(self, f'monitor is "{ELECTED}"')
 
     def check_board(self, *, agents: int, height: int, width: int) -> None:
         """See `Institution.check_board`."""

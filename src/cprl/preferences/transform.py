@@ -1,7 +1,7 @@
 """PreferenceTransform: rewards as agents want them, for TorchRL programs of one's own."""
 
 from collections.abc import Sequence
-from typing import Final
+from typing import ClassVar, Final
 
 import torch
 from tensordict import TensorDictBase
@@ -36,6 +36,9 @@ class PreferenceTransform(Transform):
         ValueError: for what is no preference, and once it is in an environment, for rewards of another shape
             and preferences that its number of agents does not allow.
     """
+
+    remembers_worlds: ClassVar[bool] = True
+    """That its extra state is of the worlds that are played, so that no other worlds begin with it."""
 
     def __init__(
         self,
