@@ -8,12 +8,15 @@ import pytest
 import torch
 from rerun.chunk import RrdReader
 from test_rerun_logger import column
+from torchrl.envs import Transform
 
 import cprl
 from cprl import Game, Rules, maps
 from cprl.algorithms import DQN
 from cprl.custom import Custom
+from cprl.envs.state import load_transforms_state, transforms_state
 from cprl.learners.settings import DQNSettings
+from cprl.measuring.evaluate import evaluate
 from cprl.outcome import evaluate_population, fresh_env, is_same_later, random_play
 from cprl.parts import make_parts
 from cprl.population import Learning, Scripted
@@ -100,3 +103,33 @@ def test_a_run_has_the_same_outcome_watched_or_not_and_its_recording_shows_the_e
     lines = column(watched / "run.rrd", "random_play/survival_steps", "Scalars:scalars", "episode")
     assert lines[0] == [0, 1, 2]
     RrdReader(watched / "run.rrd").store()  # which a file without its footer refuses
+
+
+class Counting(Transform):
+    """Counts the observations that it has seen, as statistics of a normalisation would."""
+
+    def __init__(self):
+        super().__init__()
+        self.register_buffer("seen", torch.zeros(()))
+
+    def _call(self, next_tensordict):
+        self.seen += 1
+        return next_tensordict
+
+    def _reset(self, tensordict, tensordict_reset):
+        return self._call(tensordict_reset)
+
+
+def test_what_transforms_have_learned_is_the_same_for_everybody_who_is_evaluated(monkeypatch):
+    experiment = replace(EXPERIMENT, transforms=(Custom("test_outcome:Counting"),))
+    made = make_parts(experiment, ())
+    load_transforms_state(made.env, {"transforms.0.seen": torch.tensor(100.0)})
+    begun = []
+
+    def noting(env, policy, **how):
+        begun.append(transforms_state(env)["transforms.0.seen"].item())
+        return evaluate(env, policy, **how)
+
+    monkeypatch.setattr("cprl.outcome.evaluate", noting)
+    evaluate_population(experiment, made.env, made.population)
+    assert begun == [100, 100], "random play does not count"

@@ -2,14 +2,17 @@
 
 import importlib.util
 import json
+import os
 import sys
 from dataclasses import replace
 from pathlib import Path
+from shutil import copytree
 from types import SimpleNamespace
 
 import numpy as np
 import pyarrow as pa
 import pytest
+import torch
 from rerun.chunk import RrdReader
 from test_rerun_logger import column
 
@@ -18,7 +21,7 @@ from cprl import presets
 from cprl.evaluation.film import film
 from cprl.measuring.movement import Trace
 from cprl.measuring.published import curve, published_experiment
-from cprl.population import Scripted
+from cprl.population import Frozen, Scripted
 from cprl.reporting import write_report
 from cprl.reporting.measures import ROUNDS, dip_depth, measures, of_play, of_training
 from cprl.reporting.result import Result
@@ -71,6 +74,34 @@ def test_what_is_kept_says_the_same_as_the_run(run, tmp_path):
         export_results(run, tmp_path / "other")
     (tmp_path / "aside").rename(run / "report.json")
     assert not (tmp_path / "other").exists()
+
+
+@pytest.mark.integration
+def test_an_export_never_replaces_a_run(run, tmp_path):
+    other = tmp_path / "other"
+    copytree(run, other)
+    before = {path: path.read_bytes() for path in other.rglob("*") if path.is_file()}
+    for folder, why in ((run, "the run itself"), (other, "a run of its own: it has run.rrd")):
+        with pytest.raises(ValueError, match=rf"folder is .*, {why}.*; allowed: a new folder, or one with"):
+            export_results(run, folder)
+    assert {path: path.read_bytes() for path in other.rglob("*") if path.is_file()} == before
+    kept = export_results(run, tmp_path / "kept")
+    content = json.loads((kept / "recipe.json").read_text())
+    content["experiment"]["seed"] += 1
+    (kept / "recipe.json").write_text(json.dumps(content))
+    with pytest.raises(ValueError, match=r"which holds another run: experiment\.seed was 1, is 0"):
+        export_results(run, kept)
+
+
+@pytest.mark.integration
+def test_exported_results_find_the_runs_of_frozen_agents(run, tmp_path):
+    loaded = cprl.load(run).experiment
+    agents = (loaded.agents[0], Frozen(os.path.relpath(run), 0))
+    among = cprl.run(replace(loaded, agents=agents, episodes=2), tmp_path / "deep" / "er" / "among")
+    folder = export_results(among, tmp_path / "small")
+    mine, theirs = (cprl.load(own).agent(1).network.state_dict() for own in (among, folder))
+    assert all(torch.equal(mine[name], theirs[name]) for name in mine)
+    assert export_results(among, folder) == folder, "again over the same"
 
 
 @pytest.mark.integration

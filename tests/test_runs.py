@@ -3,7 +3,7 @@
 import json
 import shlex
 import sys
-from dataclasses import replace
+from dataclasses import MISSING, fields, replace
 
 import pytest
 
@@ -31,7 +31,24 @@ def begin(run, experiment=EXPERIMENT, **how):
 
 
 def resume(run, experiment=EXPERIMENT):
-    return refuse_another_run(run, experiment.to_recipe)
+    return refuse_another_run(run, experiment.to_recipe, Experiment)
+
+
+def test_a_field_that_a_later_version_added_to_experiments_is_no_difference(tmp_path):
+    run = begin(tmp_path / "run")
+    (run / "episodes.arrows").touch()
+    whole = read_recipe(run)
+    has_default = {own.name for own in fields(Experiment) if own.default is not MISSING} - {"episodes"}
+    assert {"update_every", "seed", "on_nan"} <= has_default
+    for name in has_default & {*whole["experiment"]}:
+        less = {own: value for own, value in whole["experiment"].items() if own != name}
+        (run / "recipe.json").write_text(json.dumps({**whole, "experiment": less}))
+        default = replace(EXPERIMENT, **{name: Experiment.__dataclass_fields__[name].default})
+        assert resume(run, default) == 3, name
+    less = {own: value for own, value in whole["experiment"].items() if own != "update_every"}
+    (run / "recipe.json").write_text(json.dumps({**whole, "experiment": less}))
+    with pytest.raises(ValueError, match=r"experiment\.update_every was not there, is 7"):
+        resume(run, replace(EXPERIMENT, update_every=7))
 
 
 def test_a_stopped_run_is_resumed_by_the_same_recipe(tmp_path):

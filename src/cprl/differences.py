@@ -13,18 +13,24 @@ from cprl.config import KINDS, to_config
 _ABSENT: Final = object()
 
 
-def differences(before: object, now: object, where: str) -> list[str]:
+def differences(before: object, now: object, where: str, kind: Any = None) -> list[str]:
     """How two tables differ, a sentence for each place.
 
     A field that the earlier one lacks, and that has its default in the later one, is no difference: a version
     that did not know the field did what its default says.
+
+    Args:
+        before: the earlier table.
+        now: the later one.
+        where: what they are of, in words.
+        kind: the dataclass that they are of, where they do not say it themselves.
     """
     if isinstance(before, Mapping) and isinstance(now, Mapping):
         if before.get("kind") == now.get("kind"):
             return [
                 line
                 for name in {**before, **now}
-                if not _is_default_of_later(name, before, now)
+                if not _is_default_of_later(name, before, now, kind)
                 for line in differences(before.get(name, _ABSENT), now.get(name, _ABSENT), f"{where}.{name}")
             ]
     elif isinstance(before, list) and isinstance(now, list) and len(before) == len(now):
@@ -33,11 +39,13 @@ def differences(before: object, now: object, where: str) -> list[str]:
     return [] if before == now else [f"{where} was {_held(before)}, is {_held(now)}"]
 
 
-def _is_default_of_later(name: str, before: Mapping[str, Any], now: Mapping[str, Any]) -> bool:
+def _is_default_of_later(
+    name: str, before: Mapping[str, Any], now: Mapping[str, Any], kind: Any = None
+) -> bool:
     """Whether a field is one of a later version, and says nothing that the earlier one did not do."""
     if before.get(name) is None and now.get(name) is None:
         return True
-    kind = KINDS.get(str(now.get("kind")))
+    kind = KINDS.get(str(now.get("kind"))) if kind is None else kind
     if name in before or kind is None:
         return False
     defaults = defaults_of(kind)

@@ -199,7 +199,7 @@ def frozen_from(experiment: Experiment, directory: str | Path) -> Experiment:
 
 def changes(before: Experiment, now: Experiment) -> list[str]:
     """How two experiments differ, a sentence for each place."""
-    return differences(before.to_config(), now.to_config(), "experiment")
+    return differences(before.to_config(), now.to_config(), "experiment", Experiment)
 
 
 def _is_old(recipe: Mapping[str, Any]) -> bool:

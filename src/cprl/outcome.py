@@ -133,7 +133,7 @@ def evaluate_population(
         fresh.reset()  # the trained agents play the second episode of each world
     if _keeps_decisions(trained):
         fresh = fresh_env(experiment)  # or its first one, where what others decided would stay in force
-        load_transforms_state(fresh, transforms_state(trained))
+    load_transforms_state(fresh, transforms_state(trained))  # which random play may have changed
     return {"random": random, "trained": evaluate(fresh, population.policy(worlds), explore=True)}
 
 

@@ -123,7 +123,7 @@ def run(
     is_begun = resume and out is not None and bool(checkpoints_in(out / FOLDER))
     own = make_parts(experiment, allow, starts=not is_begun)
     own.callbacks += check_callbacks(callbacks)
-    episodes = refuse_another_run(out, experiment.to_recipe) if resume else experiment.episodes
+    episodes = refuse_another_run(out, experiment.to_recipe, Experiment) if resume else experiment.episodes
     is_there = out is not None and out.exists()
     if resume and out is not None:
         if episodes < experiment.episodes:

@@ -90,13 +90,17 @@ def start_run(
     return directory
 
 
-def refuse_another_run(out: Path | None, to_recipe: Callable[[Path], Mapping[str, Any]]) -> int:
+def refuse_another_run(
+    out: Path | None, to_recipe: Callable[[Path], Mapping[str, Any]], kind: Any = None
+) -> int:
     """Refuses to resume what was not begun with the same recipe; only the number of episodes may grow,
     and `on_nan` be another.
 
     Args:
         out: the directory of the stopped run.
         to_recipe: see `start_run`.
+        kind: the dataclass of what the recipe holds, `cprl.Experiment`; fields that an earlier version did
+            not know are then no differences while they have their defaults.
 
     Returns:
         The number of episodes of the run so far, below that of the recipe if it is to be extended.
@@ -117,7 +121,7 @@ def refuse_another_run(out: Path | None, to_recipe: Callable[[Path], Mapping[str
         )
     before, asked = kept["experiment"], now["experiment"]
     free = {"episodes": 0, "on_nan": ""}
-    differ = differences({**before, **free}, {**asked, **free}, "experiment")
+    differ = differences({**before, **free}, {**asked, **free}, "experiment", kind)
     if differ:
         more = f"; and {len(differ) - _NAMED} more" if len(differ) > _NAMED else ""
         raise ValueError(f"{out} was started with another recipe: {'; '.join(differ[:_NAMED])}{more}")

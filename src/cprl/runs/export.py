@@ -1,14 +1,20 @@
 """Exports the results of a run, small enough to commit: its directory without recording and buffers."""
 
+import json
+import os
+from collections.abc import Mapping
 from pathlib import Path
+from typing import Any, Final
 
 import pyarrow as pa
 import pyarrow.parquet as pq
 
 from cprl.arguments import path as path_of
+from cprl.differences import differences
+from cprl.runs.directory import FILE_NAME as RECIPE
 from cprl.runs.directory import read_recipe
 from cprl.runs.episodes import FILE_NAME, read_episodes, read_table
-from cprl.runs.manifest import refuse_missing, verify, write_listed
+from cprl.runs.manifest import refuse_missing, unlist, verify, write_listed
 from cprl.runs.weights import DECISIONS, TRANSFORMS
 
 _IF_ANY = tuple(f"checkpoints/{name}" for name in (TRANSFORMS, DECISIONS))
@@ -20,18 +26,23 @@ def export_results(run: Path, folder: Path) -> Path:
 
     Args:
         run: the run's directory.
-        folder: the target; files of an earlier copy are replaced.
+        folder: the target, new, empty, or with an earlier copy of a run of the same experiment, whose files
+            are replaced.
+
+    The runs of `Frozen` agents are not copied: the recipe names them from the folder on, so a folder that is
+    moved finds them where it would find a run beside it.
 
     Returns:
         The folder, which `cprl.load`, `read_episodes` and `cprl report` accept like the run itself. Metrics
         and returns are float32, and rows are sorted by replica, episode and agent.
 
     Raises:
-        ValueError: if there is no run, or a file of it is damaged.
+        ValueError: if there is no run, a file of it is damaged, or the folder holds another run.
         FileNotFoundError: if the run has not ended, or lost a file since.
     """
     run, folder = path_of("run", run), path_of("folder", folder)
-    read_recipe(run)
+    recipe = read_recipe(run)
+    _refuse_another(folder, run, recipe)
     for name in _WHOLE:
         if not (run / name).exists():
             raise FileNotFoundError(f"{run / name} does not exist: has the run ended?")
@@ -40,12 +51,59 @@ def export_results(run: Path, folder: Path) -> Path:
     for name in copied:
         verify(run / name)
     folder.mkdir(parents=True, exist_ok=True)
+    for name in {*_IF_ANY} - {*copied}:  # of an earlier copy
+        unlist(folder, name)
+        (folder / name).unlink(missing_ok=True)
     for name in copied:
         _copy(run / name, folder, name)
+    moved = _with_frozen_moved(recipe, run, folder)
+    if moved != recipe:
+        content = (json.dumps(moved, indent=2) + "\n").encode()
+        write_listed(folder, RECIPE, lambda file: file.write(content))
     _write(read_episodes(run), folder, FILE_NAME)
     for path in sorted((run / "evaluation").glob("*.parquet")):
         _write(read_table(path), folder, f"evaluation/{path.name}")
     return folder
+
+
+_OF_RUNS: Final = ("run.lock", "run.rrd", "episodes.arrows", "logs", "checkpoints/*-*.pt")
+"""Files that a run leaves and an export does not."""
+
+
+def _refuse_another(folder: Path, run: Path, recipe: Mapping[str, Any]) -> None:
+    """Refuses to write over what is no earlier copy of such a run.
+
+    Raises:
+        ValueError: for the run itself, another run, and a copy of another experiment; says what is allowed.
+    """
+    allowed = "allowed: a new folder, or one with an earlier export of the same experiment"
+    if folder.exists() and folder.resolve() == run.resolve():
+        raise ValueError(f"folder is {folder}, the run itself; {allowed}")
+    for pattern in _OF_RUNS:
+        for path in folder.glob(pattern):
+            raise ValueError(f"folder is {folder}, a run of its own: it has {path.name}; {allowed}")
+    if (folder / RECIPE).exists():
+        there = _with_frozen_moved(read_recipe(folder), folder, run)
+        differ = differences(_experiment(there), _experiment(recipe), "experiment")
+        if differ:
+            raise ValueError(f"folder is {folder}, which holds another run: {differ[0]}; {allowed}")
+
+
+def _experiment(recipe: Mapping[str, Any]) -> Any:
+    """What the recipe says of the experiment, but for how long it is."""
+    return {**(recipe.get("experiment") or recipe), "episodes": 0}
+
+
+def _with_frozen_moved(table: Any, run: Path, folder: Path) -> Any:
+    """A recipe whose paths of `Frozen` agents, which are relative to `run`, are relative to `folder`."""
+    if isinstance(table, list):
+        return [_with_frozen_moved(own, run, folder) for own in table]
+    if not isinstance(table, Mapping):
+        return table
+    moved = {name: _with_frozen_moved(own, run, folder) for name, own in table.items()}
+    if moved.get("kind") == "Frozen" and isinstance(moved.get("run"), str):
+        moved["run"] = os.path.relpath(run / moved["run"], folder)
+    return moved
 
 
 def _copy(path: Path, folder: Path, name: str) -> None:

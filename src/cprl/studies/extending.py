@@ -43,7 +43,7 @@ def begin_from_shorter(run: Path, experiment: Experiment, recipe: Mapping[str, A
         if (
             own is not None
             and own["episodes"] < wanted["episodes"]
-            and not differences({**own, **_FREE}, {**wanted, **_FREE}, "experiment")
+            and not differences({**own, **_FREE}, {**wanted, **_FREE}, "experiment", Experiment)
             and any(map(is_ending, checkpoints_in(other.parent / FOLDER)))
         ):
             found.append((own["episodes"], other.parent))
