@@ -6,6 +6,7 @@ import shutil
 import signal
 import socket
 from dataclasses import replace
+from pathlib import Path
 
 import pytest
 import torch
@@ -14,7 +15,7 @@ from test_one_road import MEADOW, REPLAY
 import cprl
 from cprl import Custom, cli, maps, running
 from cprl.algorithms import DQN
-from cprl.population import Learning, Scripted
+from cprl.population import Frozen, Learning, Scripted
 from cprl.runs.checkpoints import Checkpointer, checkpoints_in, is_ending, read_checkpoint
 from cprl.runs.episodes import read_episodes, read_table
 from cprl.runs.export import export_results
@@ -172,6 +173,38 @@ def test_a_stopped_run_is_extended_too(longer, tmp_path, monkeypatch):
     monkeypatch.delenv("STOP_AT_STEP")
     run(replace(stopping, episodes=9), tmp_path / "run", resume=True)
     assert_same(tmp_path / "run", longer)
+
+
+@pytest.mark.integration
+def test_stored_agents_play_with_the_weights_they_had_when_the_run_began(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    earlier = replace(FIELD, agents=[LEARNING, Scripted("random")])
+    run(earlier, Path("earlier"))
+    stopping = replace(
+        FIELD,
+        agents=[LEARNING, Frozen("earlier", 0)],
+        callbacks=[Custom("one_road_parts:Stopping")],
+    )
+    run(stopping, Path("whole"))
+    (played,) = json.loads(Path("whole/recipe.json").read_text())["frozen"].values()
+    assert played == checksum(Path("earlier/checkpoints/final.pt"))
+    monkeypatch.setenv("STOP_AT_STEP", "31")
+    with pytest.raises(SystemExit):
+        run(stopping, Path("stopped"))
+    monkeypatch.delenv("STOP_AT_STEP")
+    run(replace(earlier, episodes=9), Path("earlier"), resume=True)
+    assert checksum(Path("earlier/checkpoints/final.pt")) != played
+    run(stopping, Path("stopped"), resume=True)
+    mine, theirs = (load_weights(Path(own) / "checkpoints" / "final.pt") for own in ("stopped", "whole"))
+    assert repr(mine) == repr(theirs)
+    export_results(Path("whole"), Path("deep/er/kept"))
+    before = load_weights(Path("earlier/checkpoints/final-5.pt"))["replica_0/agent_0"]
+    for folder in ("whole", "stopped", "deep/er/kept"):
+        mine = cprl.load(folder, allow=["one_road_parts:Stopping"]).agent(1).network.state_dict()
+        assert all(torch.equal(mine[name], before[name]) for name in before), folder
+    Path("earlier/checkpoints/final-5.pt").unlink()
+    with pytest.raises(ValueError, match="earlier no longer has the weights that play in whole"):
+        cprl.load("whole", allow=["one_road_parts:Stopping"]).agent(1)
 
 
 @pytest.mark.integration

@@ -9,7 +9,7 @@ from torch import Tensor, nn
 from torchrl.envs import EnvBase
 
 from cprl.algorithms.base import refuse_actions
-from cprl.arguments import objects, texts
+from cprl.arguments import object_of, objects, texts
 from cprl.checks import MOST_SEED, checked, count
 from cprl.commons.game import Game
 from cprl.custom import Custom
@@ -42,6 +42,8 @@ class Population:
         allow: what stored runs of `Frozen` agents may import, see `cprl.load`.
         starts: whether agents that start from stored weights get them; False where a checkpoint follows,
             which has later ones.
+        weights: the names of the weights that `Frozen` agents play with, see `cprl.load`, by their run; of
+            runs that are not in it the final ones.
 
     Raises:
         ValueError: for specifications that do not fit the environment or each other; says what does.
@@ -57,6 +59,7 @@ class Population:
         engine: str = "compiled",
         allow: Sequence[str] = (),
         starts: bool = True,
+        weights: Mapping[str, str] | None = None,
     ) -> None:
         specs = objects("specs", specs, AgentSpec, "Learning, Team, Scripted or Frozen")
         checked("seed", seed, count(0, MOST_SEED))
@@ -71,7 +74,9 @@ class Population:
         check_scripted(self._groups, self.spaces, self._game)
         numbers = range(first_replica, first_replica + self.replicas)
         frozen = (spec for spec, _ in self._groups if isinstance(spec, Frozen))
-        self._frozen = frozen_agents(frozen, self.spaces, self._game, allow, numbers)
+        named_weights = {} if weights is None else weights
+        object_of("weights", named_weights, Mapping, "the names of weights by run")
+        self._frozen = frozen_agents(frozen, self.spaces, self._game, allow, numbers, named_weights)
         self._acting = _acting_together(self._groups, self._frozen)
         who = {
             "replicas": self.replicas,

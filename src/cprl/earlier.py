@@ -1,6 +1,6 @@
 """Agents of earlier runs: those that play here, and those whose weights others start from."""
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
 
 import torch
@@ -18,16 +18,29 @@ from cprl.stored_agents import StoredAgent
 
 
 def frozen_agents(
-    specs: Iterable[Frozen], spaces: Spaces, game: Game | None, allow: Sequence[str], replicas: Sequence[int]
+    specs: Iterable[Frozen],
+    spaces: Spaces,
+    game: Game | None,
+    allow: Sequence[str],
+    replicas: Sequence[int],
+    weights: Mapping[str, str],
 ) -> dict[Frozen, list[StoredAgent]]:
     """The stored agent of each replica, by specification; each run is read once.
+
+    Args:
+        specs: the specifications.
+        spaces: what agents observe and may do here.
+        game: the game, if it is one of cprl's.
+        allow: what the stored runs may import.
+        replicas: the numbers of the replicas.
+        weights: the names of the weights, by run; of others the final ones.
 
     Raises:
         ValueError: where it was trained for other observations, actions or ballots, or is not kept.
     """
     specs = tuple(specs)
     runs = {
-        path: _fitting_run(path, spaces, game, allow, is_to_decide=True)
+        path: _fitting_run(path, spaces, game, allow, weights=weights.get(path), is_to_decide=True)
         for path in dict.fromkeys(spec.run for spec in specs)
     }
     return {
@@ -37,11 +50,17 @@ def frozen_agents(
 
 
 def _fitting_run(
-    path: str, spaces: Spaces, game: Game | None, allow: Sequence[str], *, is_to_decide: bool = False
+    path: str,
+    spaces: Spaces,
+    game: Game | None,
+    allow: Sequence[str],
+    *,
+    weights: str | None = None,
+    is_to_decide: bool = False,
 ) -> LoadedRun:
     """The stored run, refused where it was trained for other observations or actions, or other ballots if its
     agents are to decide here."""
-    run = load(path, allow=allow)
+    run = load(path, weights=weights, allow=allow)
     theirs = run.spaces
     differences: list[tuple[str, Any, Any]] = [
         ("observations", theirs.observation_shape, spaces.observation_shape),

@@ -1,6 +1,6 @@
 """The parts of an experiment: what is made of it before anything is written, and what logs its training."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass
 from functools import partial
@@ -31,7 +31,13 @@ class Parts:
     callbacks: list[Any]
 
 
-def make_parts(experiment: Experiment, allow: Sequence[str], *, starts: bool = True) -> Parts:
+def make_parts(
+    experiment: Experiment,
+    allow: Sequence[str],
+    *,
+    starts: bool = True,
+    weights: Mapping[str, str] | None = None,
+) -> Parts:
     """The parts; raises a ValueError for whatever does not fit.
 
     Args:
@@ -39,6 +45,7 @@ def make_parts(experiment: Experiment, allow: Sequence[str], *, starts: bool = T
         allow: see `cprl.run`.
         starts: whether agents start with the weights of stored ones, where they ask for it; a training that
             is resumed reads its own.
+        weights: those that `Frozen` agents play with, see `Population`.
     """
     make = partial(
         make_env,
@@ -58,6 +65,7 @@ def make_parts(experiment: Experiment, allow: Sequence[str], *, starts: bool = T
         engine=experiment.engine,
         allow=allow,
         starts=starts,
+        weights=weights,
     )
     with torch.random.fork_rng(devices=[]):
         fresh_env(experiment)  # what the evaluation cannot have is refused now, not after hours

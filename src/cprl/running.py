@@ -19,10 +19,12 @@ from cprl.measuring.episodes import Episode
 from cprl.outcome import evaluate_population, heading, random_play, write_evaluation
 from cprl.output import OUT
 from cprl.parts import Parts, make_logger_callback, make_parts, make_viewer, title_of
-from cprl.population import exploration_steps
+from cprl.population import Frozen, exploration_steps
 from cprl.process import prepare_process
 from cprl.runs.checkpoints import FOLDER, Checkpointer, checkpoints_in
+from cprl.runs.directory import FILE_NAME as RECIPE
 from cprl.runs.directory import (
+    read_recipe,
     refuse_another_run,
     resume_command,
     start_run,
@@ -33,6 +35,7 @@ from cprl.runs.extension import REPORT, extend, refuse_to_extend
 from cprl.runs.files import write_json
 from cprl.runs.lock import RunLockedError
 from cprl.runs.loggers import check_logger
+from cprl.runs.partners import weights_of, write_partners
 from cprl.runs.weights import save_decisions, save_transforms, save_weights
 from cprl.terminal.figures import training_curve
 from cprl.terminal.progress import ProgressBar
@@ -121,7 +124,8 @@ def run(
     _check(experiment, switches, allow=allow, watch=watch, at_end=at_end)
     prepare_process(experiment.seed)
     is_begun = resume and out is not None and bool(checkpoints_in(out / FOLDER))
-    own = make_parts(experiment, allow, starts=not is_begun)
+    weights = _partners_then(experiment, out) if resume and out is not None else {}
+    own = make_parts(experiment, allow, starts=not is_begun, weights=weights)
     own.callbacks += check_callbacks(callbacks)
     episodes = refuse_another_run(out, experiment.to_recipe, Experiment) if resume else experiment.episodes
     is_there = out is not None and out.exists()
@@ -134,6 +138,7 @@ def run(
         directory = out
     else:
         directory = start_run(out, experiment.name, experiment.to_recipe, command=command)
+        write_partners(directory, _partners(experiment))
     OUT.run = directory
     checkpointer = Checkpointer(
         directory,
@@ -167,6 +172,19 @@ def run(
         if linger and viewer is not None:
             stay_served(viewer.logger, viewer.play_on)
     return directory
+
+
+def _partners(experiment: Experiment) -> list[str]:
+    """The runs whose agents play."""
+    return sorted({spec.run for spec in experiment.agents if isinstance(spec, Frozen)})
+
+
+def _partners_then(experiment: Experiment, run: Path) -> dict[str, str]:
+    """The names of the weights of `Frozen` agents that played when a run began, by their run."""
+    partners = _partners(experiment)
+    recipe = read_recipe(run) if partners and (run / RECIPE).exists() else {}
+    names = {partner: weights_of(recipe, run, partner) for partner in partners}
+    return {partner: name for partner, name in names.items() if name is not None}
 
 
 def _check(

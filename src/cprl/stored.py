@@ -29,6 +29,7 @@ from cprl.runs.checkpoints import FOLDER
 from cprl.runs.directory import FILE_NAME, read_recipe
 from cprl.runs.episodes import read_episodes
 from cprl.runs.kept import kept_of
+from cprl.runs.partners import weights_of
 from cprl.spaces import Spaces
 from cprl.stored_agents import StoredAgent, stored_policies
 
@@ -99,7 +100,8 @@ class LoadedRun:
             return StoredAgent(("scripted", spec.policy))
         if isinstance(spec, Frozen):
             if spec.run not in self._earlier:
-                self._earlier[spec.run] = load(spec.run, allow=self.allow)
+                weights = weights_of(self.recipe, self.path, spec.run)
+                self._earlier[spec.run] = load(spec.run, weights=weights, allow=self.allow)
             return self._earlier[spec.run].agent(spec.agent, replica=spec.replica_for(replica))
         lane = lane_name(replica, agent)
         if lane not in self.networks:

@@ -15,6 +15,7 @@ from cprl.runs.directory import FILE_NAME as RECIPE
 from cprl.runs.directory import read_recipe
 from cprl.runs.episodes import FILE_NAME, read_episodes, read_table
 from cprl.runs.manifest import refuse_missing, unlist, verify, write_listed
+from cprl.runs.partners import FIELD as FROZEN
 from cprl.runs.weights import DECISIONS, TRANSFORMS
 
 _IF_ANY = tuple(f"checkpoints/{name}" for name in (TRANSFORMS, DECISIONS))
@@ -57,6 +58,8 @@ def export_results(run: Path, folder: Path) -> Path:
     for name in copied:
         _copy(run / name, folder, name)
     moved = _with_frozen_moved(recipe, run, folder)
+    if FROZEN in recipe:
+        moved[FROZEN] = {os.path.relpath(run / own, folder): digest for own, digest in recipe[FROZEN].items()}
     if moved != recipe:
         content = (json.dumps(moved, indent=2) + "\n").encode()
         write_listed(folder, RECIPE, lambda file: file.write(content))
