@@ -17,7 +17,7 @@ from cprl.config import KINDS
 from cprl.differences import defaults_of
 from cprl.experiment import MOST_SEED, Experiment
 from cprl.learners.settings import RolloutSettings
-from cprl.population import Frozen, Learning, Scripted, Team
+from cprl.population import Frozen, Learning, Scripted, Team, stored_of
 from cprl.studies import Integers, LogUniform, Uniform
 from cprl.studies.conditions import FORMAT, Condition
 from cprl.studies.factors import drawn
@@ -206,6 +206,35 @@ def test_the_first_block_is_the_run_of_the_recipe_itself():
     study = Study(replace(TINY, seed=3, replicas=2))
     (trial,) = trials_of(study)
     assert trial.experiment == replace(TINY, seed=3, replicas=2)
+
+
+def partners(study):
+    """The stored replica of the second agent in each replica of a study."""
+    return [
+        stored_of(own.experiment.agents[1]).replica_for(replica)
+        for own in trials_of(study)
+        for replica in range(own.block.replicas)
+    ]
+
+
+@pytest.mark.parametrize("starts", [False, True])
+def test_each_block_has_the_stored_partners_of_its_own_replicas(starts):
+    def playing(replica, replicas=5):
+        stored = Frozen("runs/a", 1, replica=replica)
+        second = replace(LEARNING, start_from=stored) if starts else stored
+        return replace(TINY, agents=(LEARNING, second), replicas=replicas)
+
+    named = (7, 7, 3, 0, 1)
+    assert partners(Study(playing(None), block=2)) == [0, 1, 2, 3, 4]
+    assert partners(Study(playing(named), block=2)) == [*named]
+    assert partners(Study(playing(3), block=2)) == [3] * 5
+    for whole in (playing(None), playing(named)):
+        (trial,) = trials_of(Study(whole))
+        assert trial.experiment == whole, "the recipe that it always had"
+    with pytest.raises(ValueError, match=r"replica is \(7, 7, 3, 0, 1\), of 5 numbers; allowed: 4 of them"):
+        playing(named, replicas=4)
+    with pytest.raises(ValueError, match=r"of condition 'unchanged' is .*, of 5 numbers; allowed: 6 of them"):
+        Study(playing(named), replicas=6)
 
 
 def test_more_replicas_and_levels_keep_the_runs_that_are_there():

@@ -261,10 +261,20 @@ def exploration_steps(specs: Sequence[AgentSpec]) -> int | None:
     return max(ends, default=None)
 
 
+def stored_of(spec: Any) -> Frozen | None:
+    """The stored agent that plays or that is started from; None where there is none."""
+    return spec if isinstance(spec, Frozen) else getattr(spec, "start_from", None)
+
+
+def with_stored(spec: Any, changed: Callable[[Frozen], Frozen]) -> Any:
+    """A specification of an agent with another stored agent in place of its own, if it has one."""
+    if isinstance(spec, Frozen):
+        return changed(spec)
+    if isinstance(spec, Learning | Team) and spec.start_from is not None:
+        return replace(spec, start_from=changed(spec.start_from))
+    return spec
+
+
 def with_run_moved(spec: Any, moved: Callable[[str], str]) -> Any:
     """A specification of an agent whose stored run, if it has one, is in another directory."""
-    if isinstance(spec, Frozen):
-        return replace(spec, run=moved(spec.run))
-    if isinstance(spec, Learning | Team) and spec.start_from is not None:
-        return replace(spec, start_from=replace(spec.start_from, run=moved(spec.start_from.run)))
-    return spec
+    return with_stored(spec, lambda stored: replace(stored, run=moved(stored.run)))

@@ -12,6 +12,7 @@ from typing import Any, Final
 from cprl.arguments import integer, object_of, refusal, switch
 from cprl.checks import DIRECTORY_NAME, check_nesting, checked, instance, shown
 from cprl.experiment import MOST_SEED, Experiment, frozen_from, frozen_relative_to
+from cprl.population import stored_of
 from cprl.runs import formats
 from cprl.studies.conditions import Condition
 from cprl.studies.factors import (
@@ -99,6 +100,21 @@ class Study:
         if self.reference_name not in [own.name for own in self.all_conditions]:
             names = ", ".join(own.name for own in self.all_conditions[:10])
             raise refusal("reference", self.reference, f"the name of a condition: {names}")
+        for own in self.all_conditions:
+            self._check_stored(own)
+
+    def _check_stored(self, condition: Condition) -> None:
+        """Refuses stored agents that are named for another number of replicas than the study's."""
+        for place, spec in enumerate(condition.experiment.agents):
+            stored = stored_of(spec)
+            theirs = None if stored is None else stored.replica
+            if isinstance(theirs, tuple) and len(theirs) != self.replicas:
+                where = f"agents.{place}" if stored is spec else f"agents.{place}.start_from"
+                raise ValueError(
+                    f"{where}.replica of condition {condition.name!r} is {shown(theirs)}, of {len(theirs)} "
+                    f"numbers; allowed: {self.replicas} of them, one for each replica of the study; one "
+                    "number for all; or None"
+                )
 
     @cached_property
     def all_conditions(self) -> tuple[Condition, ...]:
