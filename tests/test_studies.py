@@ -9,6 +9,7 @@ from pathlib import Path
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from my_game import Dilemma
 from tiny_study import FREEZE, GAMMA, LEARNING, MIXED, SETTINGS, TINY
 
 from cprl import Study, maps, presets
@@ -307,6 +308,26 @@ def test_a_study_becomes_json_and_comes_back_the_same(name):
     back = there_and_back(study)
     assert back == study
     assert [own.checksum for own in back.all_conditions] == [own.checksum for own in study.all_conditions]
+
+
+def test_a_game_of_ones_own_is_a_level_and_what_a_study_cannot_keep_is_refused():
+    two = (Dilemma(), Dilemma(payoffs=((3.0, 0.5), (4.0, 1.0))))
+    of_game = replace(TINY, game=two[0])
+    for own in (
+        Study(of_game, {"game": two}),
+        Study(of_game, {"size": {"a": {}, "b": {"game": two[1]}}}),
+        Study(TINY, conditions={"a": {}, "b": {"game": two[1]}}),
+    ):
+        back = Study.from_config(json.loads(json.dumps(own.to_config())), allow=["my_game:Dilemma"])
+        assert back == own
+        assert back.all_conditions[1].experiment.game == two[1], "no Custom, but the game"
+        assert [one.checksum for one in back.all_conditions] == [one.checksum for one in own.all_conditions]
+
+    class Inner(Dilemma):
+        """Nobody can import it."""
+
+    with pytest.raises(ValueError, match=r"Inner, which no recipe can name; allowed: a class at the top"):
+        Study(of_game, {"game": [Inner()]})
 
 
 def test_the_runs_of_frozen_agents_are_kept_relative_to_the_study(tmp_path, monkeypatch):

@@ -11,6 +11,8 @@ import numpy as np
 from cprl.arguments import refusal
 from cprl.checks import MOST_NUMBER, is_count, is_number
 from cprl.config import from_config, to_config
+from cprl.custom import Custom
+from cprl.games import game_of, stored_game
 from cprl.population import with_run_moved
 from cprl.studies.paths import normalised
 
@@ -125,36 +127,48 @@ def factor_to_config(name: str, factor: Factor, place: Callable[[str], str]) -> 
         return {"distribution": type(factor).__name__, "low": factor.low, "high": factor.high}
     if isinstance(factor, Mapping):
         return {"levels": [[level, changes_to_config(own, place)] for level, own in factor.items()]}
-    return {"values": to_config(_moved(factor, place), f"factors[{name!r}]")}
+    return {"values": to_config(_stored(factor, place), f"factors[{name!r}]")}
 
 
-def factor_from_config(table: Mapping[str, Any], allow: Sequence[str], place: Callable[[str], str]) -> Factor:
+def factor_from_config(
+    name: str, table: Mapping[str, Any], allow: Sequence[str], place: Callable[[str], str]
+) -> Factor:
     """The factor that `factor_to_config` gave."""
     if "distribution" in table:
         made: Distribution = DISTRIBUTIONS[table["distribution"]](low=table["low"], high=table["high"])
         return made
     if "levels" in table:
         return {level: changes_from_config(own, allow, place) for level, own in table["levels"]}
-    values: tuple[Any, ...] = _moved(from_config(table["values"], allow=allow), place)
-    return values
+    values = from_config(table["values"], allow=allow)
+    return tuple(_read(name, own, place) for own in values)
 
 
 def changes_to_config(changes: Mapping[str, Any], place: Callable[[str], str]) -> dict[str, Any]:
     """Values by path as JSON can hold them."""
-    return {path: to_config(_moved(value, place), path) for path, value in changes.items()}
+    return {path: to_config(_stored(value, place), path) for path, value in changes.items()}
 
 
 def changes_from_config(
     table: Mapping[str, Any], allow: Sequence[str], place: Callable[[str], str]
 ) -> dict[str, Any]:
     """The values by path that `changes_to_config` gave."""
-    return {path: _moved(from_config(value, path, allow=allow), place) for path, value in table.items()}
+    return {path: _read(path, from_config(value, path, allow=allow), place) for path, value in table.items()}
 
 
-def _moved(value: Any, place: Callable[[str], str]) -> Any:
-    """A value whose `Frozen` agents have their runs elsewhere."""
+def _stored(value: Any, place: Callable[[str], str]) -> Any:
+    """A value as JSON can hold it: with `Frozen` agents whose runs are elsewhere, and a game of the user's
+    own by the name of its class."""
     if isinstance(value, tuple | list):
-        return tuple(_moved(own, place) for own in value)
+        return tuple(_stored(own, place) for own in value)
+    return with_run_moved(stored_game(value), place)
+
+
+def _read(path: str, value: Any, place: Callable[[str], str]) -> Any:
+    """The value of which `_stored` was kept."""
+    if isinstance(value, tuple):
+        return tuple(_read(path, own, place) for own in value)
+    if path == "game" and isinstance(value, Custom):
+        return game_of(value)
     return with_run_moved(value, place)
 
 

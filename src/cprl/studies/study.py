@@ -102,6 +102,7 @@ class Study:
             raise refusal("reference", self.reference, f"the name of a condition: {names}")
         for own in self.all_conditions:
             self._check_stored(own)
+        self.to_config()  # refuses what `study.json` could not hold
 
     def _check_stored(self, condition: Condition) -> None:
         """Refuses stored agents that are named for another number of replicas than the study's."""
@@ -235,7 +236,7 @@ class Study:
         place = _no_change if directory is None else partial(_joined, str(directory))
         experiment = Experiment.from_config(table["experiment"], allow=allow)
         try:
-            factors = {name: factor_from_config(own, allow, place) for name, own in table["factors"]}
+            factors = {name: factor_from_config(name, own, allow, place) for name, own in table["factors"]}
             named = {name: changes_from_config(own, allow, place) for name, own in table["conditions"]}
         except (KeyError, TypeError, AttributeError) as error:
             raise ValueError(
