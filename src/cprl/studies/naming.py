@@ -15,6 +15,19 @@ def named(levels: Mapping[str, Any]) -> str:
     return BETWEEN.join(f"{name}={level_text(value)}" for name, value in levels.items())
 
 
+def levels_in(name: str) -> list[str]:
+    """The levels in the name of a condition; those of a tuple or an agent, in brackets, are not apart."""
+    found: list[str] = []
+    depth = 0
+    for part in name.split(BETWEEN):
+        if depth:
+            found[-1] += BETWEEN + part
+        else:
+            found.append(part)
+        depth = max(0, depth + sum((own in "([{") - (own in ")]}") for own in part))
+    return found
+
+
 def level_text(value: Any) -> str:
     """A level in a few words, for names and figures."""
     if isinstance(value, float):
