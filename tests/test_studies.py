@@ -23,6 +23,7 @@ from cprl.studies import Integers, LogUniform, Uniform
 from cprl.studies.conditions import FORMAT, Condition
 from cprl.studies.factors import drawn
 from cprl.studies.paths import changed, values_at
+from cprl.studies.study import _apart
 from cprl.studies.trials import trials_of
 
 
@@ -269,6 +270,12 @@ def test_conditions_that_words_do_not_tell_apart_are_numbered():
     others = [[LEARNING, Learning(DQN(settings=replace(SETTINGS, gamma=own)))] for own in (0.1, 0.2)]
     names = [own.name for own in Study(TINY, {"agents": others}).all_conditions]
     assert names[1] == f"{names[0]} #2"
+
+
+def test_a_number_that_another_condition_has_in_its_name_is_left_out():
+    names = ("beam", "beam #2", "beam", "beam")
+    found = _apart(Condition(replace(TINY, episodes=1 + nth), name=own) for nth, own in enumerate(names))
+    assert [own.name for own in found] == ["beam", "beam #2", "beam #3", "beam #4"]
 
 
 @settings(deadline=None, max_examples=30)

@@ -2,7 +2,6 @@
 
 import hashlib
 import os
-from collections import Counter
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass, field, replace
 from functools import cached_property, partial
@@ -27,7 +26,7 @@ from cprl.studies.factors import (
     factor_to_config,
     grid,
 )
-from cprl.studies.naming import named, short_names
+from cprl.studies.naming import named, short_names, unlike
 from cprl.studies.paths import changed
 
 FORMAT: Final = formats.STUDY
@@ -100,8 +99,8 @@ class Study:
         if self.reference_name not in [own.name for own in self.all_conditions]:
             names = ", ".join(own.name for own in self.all_conditions[:10])
             raise refusal("reference", self.reference, f"the name of a condition: {names}")
-        for own in self.all_conditions:
-            self._check_stored(own)
+        for condition in self.all_conditions:
+            self._check_stored(condition)
         self.to_config()  # refuses what `study.json` could not hold
 
     def _check_stored(self, condition: Condition) -> None:
@@ -280,13 +279,14 @@ UNCHANGED: Final = "unchanged"
 
 def _apart(conditions: Iterable[Condition]) -> tuple[Condition, ...]:
     """Conditions with a number after their name where others have the same, e.g. of unlike agents."""
-    times: Counter[str] = Counter()
-    found = []
+    conditions = tuple(conditions)
+    taken = {own.name for own in conditions}
+    found: dict[str, Condition] = {}
     for own in conditions:
-        times[own.name] += 1
-        is_first = times[own.name] == 1
-        found.append(own if is_first else replace(own, name=f"{own.name} #{times[own.name]}"))
-    return tuple(found)
+        name = unlike(own.name, taken) if own.name in found else own.name
+        taken.add(name)
+        found[name] = own if name == own.name else replace(own, name=name)
+    return tuple(found.values())
 
 
 def _no_change(run: str) -> str:
