@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 from my_game import Dilemma
 from tiny_study import FREEZE, GAMMA, LEARNING, MIXED, SETTINGS, TINY
 
-from cprl import Study, maps, presets
+from cprl import Custom, Study, maps, presets
 from cprl.algorithms import DQN, PPO
 from cprl.config import KINDS
 from cprl.differences import defaults_of
@@ -347,6 +347,50 @@ def test_the_runs_of_frozen_agents_are_kept_relative_to_the_study(tmp_path, monk
     assert "../../runs/a" in json.dumps(table)
     assert "../../runs/b" in json.dumps(table)
     assert there_and_back(study, directory="studies/x") == study
+
+
+def test_a_run_of_a_frozen_agent_is_the_same_however_its_path_is_written():
+    plain, *others = [
+        Study(replace(TINY, agents=(LEARNING, Frozen(own, 0))))
+        for own in ("runs/a", "runs/a/", "./runs//a", "runs/b/../a")
+    ]
+    for other in others:
+        assert other == plain
+        assert other.all_conditions[0].checksum == plain.all_conditions[0].checksum
+        back = Study.from_config(json.loads(json.dumps(other.to_config("studies/x"))), directory="studies/x")
+        assert back.all_conditions[0].checksum == plain.all_conditions[0].checksum
+
+
+@pytest.mark.parametrize("starts", [False, True])
+def test_runs_that_are_levels_are_kept_relative_to_the_study_and_other_texts_as_they_are(
+    tmp_path, monkeypatch, starts
+):
+    (tmp_path / "sub").mkdir()
+    monkeypatch.chdir(tmp_path)
+    stored = Frozen("runs/a", 0)
+    second, path = (
+        (replace(LEARNING, start_from=stored), "agents.1.start_from.run")
+        if starts
+        else (stored, "agents.1.run")
+    )
+    fatigue = Custom("one_road_parts:Fatigue", arguments={"run": "runs/a"})
+    experiment = replace(TINY, agents=(LEARNING, second), transforms=(fatigue,))
+    for study in (
+        Study(experiment, {path: ["runs/a", "runs/b/"]}, reference="run=runs/b"),
+        Study(experiment, {"partner": {"a": {}, "b": {path.replace("_", "-"): "runs/b"}}}),
+        Study(experiment, conditions={"a": {}, "b": {path: "runs/b"}}),
+        Study(experiment, {"transforms.0.arguments.run": ["runs/b", "runs/c"]}),
+    ):
+        table = json.loads(json.dumps(study.to_config("studies/x")))
+        how = {"allow": ["one_road_parts:Fatigue"]}
+        assert Study.from_config(table, directory="studies/x", **how) == study
+        monkeypatch.chdir(tmp_path / "sub")
+        if study.reference is None:
+            elsewhere = Study.from_config(table, directory="../studies/x", **how).all_conditions[1].experiment
+            ours = study.all_conditions[1].experiment
+            assert stored_of(elsewhere.agents[1]).run == f"../{stored_of(ours.agents[1]).run}"
+            assert elsewhere.transforms == ours.transforms
+        monkeypatch.chdir(tmp_path)
 
 
 @pytest.mark.parametrize(

@@ -7,6 +7,7 @@ remaining agent indices in order.
 import os
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from posixpath import normpath
 from typing import Any, Final, TypeAlias
 
 from cprl.algorithms.base import Algorithm, TeamAlgorithm
@@ -82,6 +83,7 @@ class Frozen:
         if isinstance(self.run, os.PathLike):
             object.__setattr__(self, "run", os.fspath(self.run))
         check_fields(self, {"run": _PATH, "agent": count(0), "replica": _THEIRS})
+        object.__setattr__(self, "run", normpath(self.run))  # of "runs/x/" and "runs/x", the same checksum
 
     def replica_for(self, replica: int) -> int:
         """The replica of that run for a replica here.
