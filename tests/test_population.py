@@ -376,7 +376,7 @@ def test_each_replica_can_have_a_frozen_agent_of_its_own(tmp_path, monkeypatch, 
     loaded = cprl.load(again)
     assert loaded.specs[0] == Frozen("run", 2, replica=(1, 0))
     assert torch.equal(loaded.agent(0, replica=1).network(seen), earlier["replica_0/agent_2"](seen))
-    with pytest.raises(ValueError, match=r"for each of 1 replicas, none for that of index 1"):
+    with pytest.raises(ValueError, match=r"agents\[0\].replica is \(1,\), of 1 numbers; allowed: 2"):
         ran(tmp_path, [Frozen("run", 2, replica=(1,)), *[Scripted()] * 3], name="too_few")
     assert not (tmp_path / "too_few").exists()
     for wrong in ((), (0, -1), "0"):

@@ -9,6 +9,8 @@ import numpy as np
 import pytest
 from tiny_study import FREEZE, GAMMA, TINY
 
+from cprl.algorithms import PPO, RolloutSettings
+from cprl.population import Learning
 from cprl.runs.curves import as_curves, curves_of
 from cprl.runs.episodes import read_table
 from cprl.studies import Integers, LogUniform, Search, Uniform, read_study, run_search
@@ -47,6 +49,8 @@ def worth(monkeypatch):
     """The best time-out is 40."""
 
     def value(search, point, runs):
+        if point.reason:
+            return None
         (trial,) = search_trials(search, point)
         run = runs / trial.name
         return -abs(rules_of(run)["freeze_steps"] - 40.0) if run.exists() else None
@@ -119,6 +123,58 @@ def test_points_that_come_twice_are_run_once(tmp_path, worth):
     assert sum(own.is_repeated for own in result.points) == 12 - len(executor.run_so_far)
     assert {own.value for own in result.points if own.name == "freeze_steps=30"} == {-10.0}
     assert len(result.study.all_conditions) == len(executor.run_so_far)
+
+
+STEPS = "agents.*.algorithm.settings.rollout_steps"
+PPO_ONE = replace(
+    ONE, agents=(Learning(PPO(settings=RolloutSettings(rollout_steps=20, minibatch_size=10))),) * 2
+)
+
+
+@pytest.mark.integration
+def test_levels_that_the_experiment_refuses_together_are_kept_with_the_reason_and_the_search_goes_on(
+    tmp_path, worth
+):
+    every = {"update_every": [1, 2, 3], STEPS: [20, 30]}  # 3 does not divide 20
+    executor = Counting()
+    search = Search(PPO_ONE, every, points=12, at_once=12, sampler="random")
+    result = run_search(search, tmp_path, on=executor, progress=False)
+    refused = [own for own in result.points if own.reason]
+    assert {own.name for own in refused} == {"update_every=3, rollout_steps=20"}
+    assert {own.value for own in refused} == {None}
+    assert value_of(search, refused[0], result.runs) is None
+    assert all("update_every is 3; it must divide" in own.reason for own in refused)
+    assert len(result.points) == 12
+    assert len(result.study.all_conditions) == len(executor.run_so_far) == 5
+    table = json.loads((tmp_path / FILE_NAME).read_text())
+    assert [own["reason"] for own in table["points"]] == [own.reason for own in result.points]
+
+
+@pytest.mark.integration
+def test_a_search_begins_with_the_first_points_that_fit_and_is_refused_where_none_does(tmp_path, worth):
+    class Proposes(optuna.samplers.RandomSampler):
+        """Three points that do not fit, then one that does."""
+
+        def sample_independent(self, study, trial, name, distribution):
+            return {"update_every": 3, STEPS: "20" if trial.number < 3 else "30"}[name]
+
+    how = {"at_once": 2, "sampler": lambda seed: Proposes()}
+    levels = {"update_every": Integers(1, 3), STEPS: [20, 30]}
+    result = run_search(
+        Search(PPO_ONE, levels, points=4, **how), tmp_path / "a", on=Counting(), progress=False
+    )
+    assert [bool(own.reason) for own in result.points] == [True, True, True, False]
+    with pytest.raises(ValueError, match=r"none of the search's 3 points fits; the first, .*must divide"):
+        run_search(Search(PPO_ONE, levels, points=3, **how), tmp_path / "b", on=Counting(), progress=False)
+    assert not (tmp_path / "b").exists()
+
+
+@pytest.mark.integration
+def test_a_search_is_refused_only_where_no_levels_fit_together():
+    for seed in range(4):
+        Search(replace(PPO_ONE, seed=seed), {"update_every": [3], STEPS: [20, 30]}, points=1)
+    with pytest.raises(ValueError, match="update_every is 3; it must divide"):
+        Search(PPO_ONE, {"update_every": [3], STEPS: [20]}, points=1)
 
 
 def test_named_levels_and_the_lowest_value(tmp_path, worth):

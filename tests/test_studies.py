@@ -9,19 +9,21 @@ from pathlib import Path
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from my_game import Dilemma
 from tiny_study import FREEZE, GAMMA, LEARNING, MIXED, SETTINGS, TINY
 
-from cprl import Study, maps, presets
+from cprl import Custom, Study, maps, presets
 from cprl.algorithms import DQN, PPO
 from cprl.config import KINDS
 from cprl.differences import defaults_of
 from cprl.experiment import MOST_SEED, Experiment
 from cprl.learners.settings import RolloutSettings
-from cprl.population import Frozen, Learning, Scripted, Team
+from cprl.population import Frozen, Learning, Scripted, Team, stored_of
 from cprl.studies import Integers, LogUniform, Uniform
 from cprl.studies.conditions import FORMAT, Condition
 from cprl.studies.factors import drawn
 from cprl.studies.paths import changed, values_at
+from cprl.studies.study import _apart
 from cprl.studies.trials import trials_of
 
 
@@ -208,6 +210,35 @@ def test_the_first_block_is_the_run_of_the_recipe_itself():
     assert trial.experiment == replace(TINY, seed=3, replicas=2)
 
 
+def partners(study):
+    """The stored replica of the second agent in each replica of a study."""
+    return [
+        stored_of(own.experiment.agents[1]).replica_for(replica)
+        for own in trials_of(study)
+        for replica in range(own.block.replicas)
+    ]
+
+
+@pytest.mark.parametrize("starts", [False, True])
+def test_each_block_has_the_stored_partners_of_its_own_replicas(starts):
+    def playing(replica, replicas=5):
+        stored = Frozen("runs/a", 1, replica=replica)
+        second = replace(LEARNING, start_from=stored) if starts else stored
+        return replace(TINY, agents=(LEARNING, second), replicas=replicas)
+
+    named = (7, 7, 3, 0, 1)
+    assert partners(Study(playing(None), block=2)) == [0, 1, 2, 3, 4]
+    assert partners(Study(playing(named), block=2)) == [*named]
+    assert partners(Study(playing(3), block=2)) == [3] * 5
+    for whole in (playing(None), playing(named)):
+        (trial,) = trials_of(Study(whole))
+        assert trial.experiment == whole, "the recipe that it always had"
+    with pytest.raises(ValueError, match=r"replica is \(7, 7, 3, 0, 1\), of 5 numbers; allowed: 4 of them"):
+        playing(named, replicas=4)
+    with pytest.raises(ValueError, match=r"of condition 'unchanged' is .*, of 5 numbers; allowed: 6 of them"):
+        Study(playing(named), replicas=6)
+
+
 def test_more_replicas_and_levels_keep_the_runs_that_are_there():
     names = {own.name for own in trials_of(Study(TINY, {FREEZE: [5, 25]}, replicas=2, block=2))}
     more = {own.name for own in trials_of(Study(TINY, {FREEZE: [5, 25, 50]}, replicas=4, block=2))}
@@ -239,6 +270,12 @@ def test_conditions_that_words_do_not_tell_apart_are_numbered():
     others = [[LEARNING, Learning(DQN(settings=replace(SETTINGS, gamma=own)))] for own in (0.1, 0.2)]
     names = [own.name for own in Study(TINY, {"agents": others}).all_conditions]
     assert names[1] == f"{names[0]} #2"
+
+
+def test_a_number_that_another_condition_has_in_its_name_is_left_out():
+    names = ("beam", "beam #2", "beam", "beam")
+    found = _apart(Condition(replace(TINY, episodes=1 + nth), name=own) for nth, own in enumerate(names))
+    assert [own.name for own in found] == ["beam", "beam #2", "beam #3", "beam #4"]
 
 
 @settings(deadline=None, max_examples=30)
@@ -280,6 +317,26 @@ def test_a_study_becomes_json_and_comes_back_the_same(name):
     assert [own.checksum for own in back.all_conditions] == [own.checksum for own in study.all_conditions]
 
 
+def test_a_game_of_ones_own_is_a_level_and_what_a_study_cannot_keep_is_refused():
+    two = (Dilemma(), Dilemma(payoffs=((3.0, 0.5), (4.0, 1.0))))
+    of_game = replace(TINY, game=two[0])
+    for own in (
+        Study(of_game, {"game": two}),
+        Study(of_game, {"size": {"a": {}, "b": {"game": two[1]}}}),
+        Study(TINY, conditions={"a": {}, "b": {"game": two[1]}}),
+    ):
+        back = Study.from_config(json.loads(json.dumps(own.to_config())), allow=["my_game:Dilemma"])
+        assert back == own
+        assert back.all_conditions[1].experiment.game == two[1], "no Custom, but the game"
+        assert [one.checksum for one in back.all_conditions] == [one.checksum for one in own.all_conditions]
+
+    class Inner(Dilemma):
+        """Nobody can import it."""
+
+    with pytest.raises(ValueError, match=r"Inner, which no recipe can name; allowed: a class at the top"):
+        Study(of_game, {"game": [Inner()]})
+
+
 def test_the_runs_of_frozen_agents_are_kept_relative_to_the_study(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     study = Study(
@@ -290,6 +347,50 @@ def test_the_runs_of_frozen_agents_are_kept_relative_to_the_study(tmp_path, monk
     assert "../../runs/a" in json.dumps(table)
     assert "../../runs/b" in json.dumps(table)
     assert there_and_back(study, directory="studies/x") == study
+
+
+def test_a_run_of_a_frozen_agent_is_the_same_however_its_path_is_written():
+    plain, *others = [
+        Study(replace(TINY, agents=(LEARNING, Frozen(own, 0))))
+        for own in ("runs/a", "runs/a/", "./runs//a", "runs/b/../a")
+    ]
+    for other in others:
+        assert other == plain
+        assert other.all_conditions[0].checksum == plain.all_conditions[0].checksum
+        back = Study.from_config(json.loads(json.dumps(other.to_config("studies/x"))), directory="studies/x")
+        assert back.all_conditions[0].checksum == plain.all_conditions[0].checksum
+
+
+@pytest.mark.parametrize("starts", [False, True])
+def test_runs_that_are_levels_are_kept_relative_to_the_study_and_other_texts_as_they_are(
+    tmp_path, monkeypatch, starts
+):
+    (tmp_path / "sub").mkdir()
+    monkeypatch.chdir(tmp_path)
+    stored = Frozen("runs/a", 0)
+    second, path = (
+        (replace(LEARNING, start_from=stored), "agents.1.start_from.run")
+        if starts
+        else (stored, "agents.1.run")
+    )
+    fatigue = Custom("one_road_parts:Fatigue", arguments={"run": "runs/a"})
+    experiment = replace(TINY, agents=(LEARNING, second), transforms=(fatigue,))
+    for study in (
+        Study(experiment, {path: ["runs/a", "runs/b/"]}, reference="run=runs/b"),
+        Study(experiment, {"partner": {"a": {}, "b": {path.replace("_", "-"): "runs/b"}}}),
+        Study(experiment, conditions={"a": {}, "b": {path: "runs/b"}}),
+        Study(experiment, {"transforms.0.arguments.run": ["runs/b", "runs/c"]}),
+    ):
+        table = json.loads(json.dumps(study.to_config("studies/x")))
+        how = {"allow": ["one_road_parts:Fatigue"]}
+        assert Study.from_config(table, directory="studies/x", **how) == study
+        monkeypatch.chdir(tmp_path / "sub")
+        if study.reference is None:
+            elsewhere = Study.from_config(table, directory="../studies/x", **how).all_conditions[1].experiment
+            ours = study.all_conditions[1].experiment
+            assert stored_of(elsewhere.agents[1]).run == f"../{stored_of(ours.agents[1]).run}"
+            assert elsewhere.transforms == ours.transforms
+        monkeypatch.chdir(tmp_path)
 
 
 @pytest.mark.parametrize(

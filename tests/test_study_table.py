@@ -15,6 +15,7 @@ from cprl.runs.directory import write_changed_circumstances
 from cprl.studies.status import Status
 from cprl.studies.tables.circumstances import circumstances_of
 from cprl.studies.tables.pooled import pooled_table, runs_in
+from cprl.studies.tables.sources import design_of
 from cprl.studies.tables.table import METADATA, StudyTable, study_table
 from cprl.studies.trials import trials_of
 
@@ -242,6 +243,18 @@ def test_conditions_that_words_do_not_tell_apart_are_numbered_and_not_merged(tmp
     for nth, name in enumerate((first, second)):
         rows = rows_of(table, condition=name, metric="collective_return", part="evaluation")
         assert [own["value"] for own in rows] == [nth, nth]
+
+
+def test_a_condition_whose_name_ends_in_a_number_stays_itself():
+    named = Study(EXPERIMENT, conditions={"beam #2": {TIME_OUT: 7}, "beam": {}})
+    design = design_of(named)
+    assert list(design.conditions) == ["beam #2", "beam"]
+    assert design.reference == "beam"
+    levels = Study(EXPERIMENT, {"size": {"beam #2": {TIME_OUT: 7}, "beam": {}}})
+    assert [own["size"] for own in design_of(levels).conditions.values()] == ["beam #2", "beam"]
+    agents = [[replace(EXPERIMENT.agents[0], reward=own)] * 2 for own in ("individual", "team")]
+    design = design_of(Study(EXPERIMENT, {"agents": agents}))
+    assert len({own["agents"] for own in design.conditions.values()}) == 2
 
 
 # Any runs at hand

@@ -20,6 +20,7 @@ from cprl.runs.episodes import read_episodes
 from cprl.runs.lock import FILE_NAME as LOCK
 from cprl.runs.lock import RunLock
 from cprl.studies import read_study, trials
+from cprl.studies.execution import trials_with
 from cprl.studies.status import Status
 from cprl.studies.trials import run_task, state_of, task_of, trials_of
 
@@ -216,6 +217,26 @@ def test_a_condition_that_fails_does_not_end_the_study(tmp_path, monkeypatch):
     result = run_study(STUDY, tmp_path, results=False)
     assert [(own.reason, own.state) for own in result.failed] == [("RuntimeError: broken", "failed")]
     assert state_of(tmp_path / "runs" / result.trials[1].name) == "finished"
+
+
+def test_a_part_of_a_study_is_chosen_by_whole_levels_and_not_by_parts_of_them():
+    cells = "agents.*.algorithm.settings.hidden_cells"
+    trials = trials_of(Study(TINY, {cells: [(32, 32), (32, 8, 32), (8, 32)], FREEZE: [2, 5]}))
+
+    def chosen(*only):
+        return [
+            (own.condition.levels[cells], own.condition.levels[FREEZE]) for own in trials_with(trials, only)
+        ]
+
+    assert chosen("hidden_cells=(32, 32)") == [((32, 32), 2), ((32, 32), 5)]
+    assert chosen("freeze_steps=5, hidden_cells=(32, 8, 32)") == [((32, 8, 32), 5)]
+    assert chosen("hidden_cells=(8, 32), freeze_steps=2") == [((8, 32), 2)]
+    named = trials_of(Study(TINY, conditions={"a (b, c": {}, "d), e": {FREEZE: 3}}))
+    assert [own.condition.name for own in trials_with(named, ["a (b, c"])] == ["a (b, c"]
+    assert [own.condition.name for own in trials_with(named, ["e"])] == ["d), e"]
+    for part in ("32", "8, 32)", "", ", "):
+        with pytest.raises(ValueError, match="allowed: a condition or levels of some"):
+            trials_with(trials, [part])
 
 
 def test_nothing_is_written_where_a_study_is_refused(tmp_path):

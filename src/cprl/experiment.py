@@ -36,6 +36,7 @@ from cprl.population import (
     Team,
     refuse_undecided,
     specs_by_agent,
+    stored_of,
     with_run_moved,
 )
 from cprl.preferences.values import check_preference
@@ -265,13 +266,8 @@ def _check_agents(experiment: Experiment) -> None:
             raise ValueError(f"experiment.agents: {error}") from error
     for place, spec in enumerate(experiment.agents):
         where = f"experiment.agents[{place}]"
-        stored = spec if isinstance(spec, Frozen) else getattr(spec, "start_from", None)
-        if stored is not None and Path(stored.run).is_absolute():
-            name = f"{where}.run" if stored is spec else f"{where}.start_from.run"
-            raise ValueError(
-                f"{name} is {stored.run}, an absolute path, which is another one on another machine; "
-                "allowed: a path relative to where we stand"
-            )
+        if (stored := stored_of(spec)) is not None:
+            _check_stored(where if stored is spec else f"{where}.start_from", stored, experiment.replicas)
         if isinstance(spec, Learning | Team) and not isinstance(experiment.game, Custom):
             check_preference(f"{where}.reward", spec.reward, experiment.game.agents)
         if isinstance(spec, Team) and isinstance(spec.algorithm, TeamAlgorithm):
@@ -282,6 +278,19 @@ def _check_agents(experiment: Experiment) -> None:
                 f"experiment.update_every is {experiment.update_every}; it must divide "
                 f"{where}.algorithm.settings.rollout_steps, {steps}"
             )
+
+
+def _check_stored(where: str, stored: Frozen, replicas: int) -> None:
+    if Path(stored.run).is_absolute():
+        raise ValueError(
+            f"{where}.run is {stored.run}, an absolute path, which is another one on another machine; "
+            "allowed: a path relative to where we stand"
+        )
+    if isinstance(stored.replica, tuple) and len(stored.replica) != replicas:
+        raise ValueError(
+            f"{where}.replica is {shown(stored.replica)}, of {len(stored.replica)} numbers; allowed: "
+            f"{replicas} of them, one for each replica of the experiment; one number for all; or None"
+        )
 
 
 def _check_engine(experiment: Experiment) -> None:

@@ -7,6 +7,7 @@ remaining agent indices in order.
 import os
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from posixpath import normpath
 from typing import Any, Final, TypeAlias
 
 from cprl.algorithms.base import Algorithm, TeamAlgorithm
@@ -82,6 +83,7 @@ class Frozen:
         if isinstance(self.run, os.PathLike):
             object.__setattr__(self, "run", os.fspath(self.run))
         check_fields(self, {"run": _PATH, "agent": count(0), "replica": _THEIRS})
+        object.__setattr__(self, "run", normpath(self.run))  # of "runs/x/" and "runs/x", the same checksum
 
     def replica_for(self, replica: int) -> int:
         """The replica of that run for a replica here.
@@ -261,10 +263,20 @@ def exploration_steps(specs: Sequence[AgentSpec]) -> int | None:
     return max(ends, default=None)
 
 
+def stored_of(spec: Any) -> Frozen | None:
+    """The stored agent that plays or that is started from; None where there is none."""
+    return spec if isinstance(spec, Frozen) else getattr(spec, "start_from", None)
+
+
+def with_stored(spec: Any, changed: Callable[[Frozen], Frozen]) -> Any:
+    """A specification of an agent with another stored agent in place of its own, if it has one."""
+    if isinstance(spec, Frozen):
+        return changed(spec)
+    if isinstance(spec, Learning | Team) and spec.start_from is not None:
+        return replace(spec, start_from=changed(spec.start_from))
+    return spec
+
+
 def with_run_moved(spec: Any, moved: Callable[[str], str]) -> Any:
     """A specification of an agent whose stored run, if it has one, is in another directory."""
-    if isinstance(spec, Frozen):
-        return replace(spec, run=moved(spec.run))
-    if isinstance(spec, Learning | Team) and spec.start_from is not None:
-        return replace(spec, start_from=replace(spec.start_from, run=moved(spec.start_from.run)))
-    return spec
+    return with_stored(spec, lambda stored: replace(stored, run=moved(stored.run)))

@@ -162,6 +162,9 @@ def _say_best(result: SearchResult) -> None:
     say(f"{search.name}: {len(result.points)} points; the {words} {search.metric}, means over replicas:")
     for point in result.ranked[:_BEST]:
         say(f"  {point.value:10.6g}  {point.name}")
+    refused = [own for own in result.points if own.reason]
+    if refused:
+        say(f"  {len(refused)} points were refused, e.g. {refused[0].name}: {refused[0].reason}")
 
 
 def _say_failed(result: StudyResult | SearchResult, again: str) -> None:

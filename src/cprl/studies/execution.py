@@ -13,7 +13,7 @@ from cprl.runs.lock import FILE_NAME as LOCK
 from cprl.runs.lock import RunLock, RunLockedError
 from cprl.studies.executors import Executor, InProcess
 from cprl.studies.live import LiveStudy, check_live
-from cprl.studies.naming import BETWEEN
+from cprl.studies.naming import levels_in
 from cprl.studies.progress import Progress
 from cprl.studies.study import Study
 from cprl.studies.tables.comparing import LAST
@@ -111,17 +111,15 @@ def trials_with(trials: Sequence[Trial], only: Sequence[str]) -> list[Trial]:
     Raises:
         ValueError: for what is in no name; says which names there are.
     """
-    wanted = [set(levels.split(BETWEEN)) for levels in texts("only", only)]
+    wanted = [set(levels_in(levels)) for levels in texts("only", only)]
     names = list(dict.fromkeys(trial.condition.name for trial in trials))
     for levels, text in zip(wanted, only, strict=True):
-        if not any(levels <= set(name.split(BETWEEN)) for name in names):
+        if not any(levels <= set(levels_in(name)) for name in names):
             raise refusal("only", text, f"a condition or levels of some: {'; '.join(names)}")
     if not wanted:
         return [*trials]
     return [
-        trial
-        for trial in trials
-        if any(levels <= set(trial.condition.name.split(BETWEEN)) for levels in wanted)
+        trial for trial in trials if any(levels <= set(levels_in(trial.condition.name)) for levels in wanted)
     ]
 
 

@@ -1,9 +1,11 @@
 """What the conditions of a study differ in: factors with levels, and distributions of random draws."""
 
+import re
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import product
 from math import exp, log
+from posixpath import normpath
 from typing import Any, Final, TypeAlias
 
 import numpy as np
@@ -11,6 +13,8 @@ import numpy as np
 from cprl.arguments import refusal
 from cprl.checks import MOST_NUMBER, is_count, is_number
 from cprl.config import from_config, to_config
+from cprl.custom import Custom
+from cprl.games import game_of, stored_game
 from cprl.population import with_run_moved
 from cprl.studies.paths import normalised
 
@@ -85,7 +89,9 @@ def checked_factors(factors: object) -> dict[str, Factor]:
     """Factors as a study keeps them; raises a ValueError for what are none."""
     if not isinstance(factors, Mapping):
         raise refusal("factors", factors, "a table of factors by the path of a field, or by name")
-    return {_name(name, own): _factor(f"factors[{name!r}]", own) for name, own in factors.items()}
+    return {
+        _name(name, own): _of_path(name, _factor(f"factors[{name!r}]", own)) for name, own in factors.items()
+    }
 
 
 def grid(factors: Mapping[str, Factor]) -> Iterator[dict[str, Level]]:
@@ -125,37 +131,61 @@ def factor_to_config(name: str, factor: Factor, place: Callable[[str], str]) -> 
         return {"distribution": type(factor).__name__, "low": factor.low, "high": factor.high}
     if isinstance(factor, Mapping):
         return {"levels": [[level, changes_to_config(own, place)] for level, own in factor.items()]}
-    return {"values": to_config(_moved(factor, place), f"factors[{name!r}]")}
+    return {"values": to_config(_stored(name, factor, place), f"factors[{name!r}]")}
 
 
-def factor_from_config(table: Mapping[str, Any], allow: Sequence[str], place: Callable[[str], str]) -> Factor:
+def factor_from_config(
+    name: str, table: Mapping[str, Any], allow: Sequence[str], place: Callable[[str], str]
+) -> Factor:
     """The factor that `factor_to_config` gave."""
     if "distribution" in table:
         made: Distribution = DISTRIBUTIONS[table["distribution"]](low=table["low"], high=table["high"])
         return made
     if "levels" in table:
         return {level: changes_from_config(own, allow, place) for level, own in table["levels"]}
-    values: tuple[Any, ...] = _moved(from_config(table["values"], allow=allow), place)
-    return values
+    values = from_config(table["values"], allow=allow)
+    return tuple(_read(name, own, place) for own in values)
 
 
 def changes_to_config(changes: Mapping[str, Any], place: Callable[[str], str]) -> dict[str, Any]:
     """Values by path as JSON can hold them."""
-    return {path: to_config(_moved(value, place), path) for path, value in changes.items()}
+    return {path: to_config(_stored(path, value, place), path) for path, value in changes.items()}
 
 
 def changes_from_config(
     table: Mapping[str, Any], allow: Sequence[str], place: Callable[[str], str]
 ) -> dict[str, Any]:
     """The values by path that `changes_to_config` gave."""
-    return {path: _moved(from_config(value, path, allow=allow), place) for path, value in table.items()}
+    return {path: _read(path, from_config(value, path, allow=allow), place) for path, value in table.items()}
 
 
-def _moved(value: Any, place: Callable[[str], str]) -> Any:
-    """A value whose `Frozen` agents have their runs elsewhere."""
+def _stored(path: str, value: Any, place: Callable[[str], str]) -> Any:
+    """A value at a path as JSON can hold it: with `Frozen` agents whose runs are elsewhere, and a game of the
+    user's own by the name of its class."""
     if isinstance(value, tuple | list):
-        return tuple(_moved(own, place) for own in value)
+        return tuple(_stored(path, own, place) for own in value)
+    return _moved(path, stored_game(value), place)
+
+
+def _read(path: str, value: Any, place: Callable[[str], str]) -> Any:
+    """The value of which `_stored` was kept."""
+    if isinstance(value, tuple):
+        return tuple(_read(path, own, place) for own in value)
+    if path == "game" and isinstance(value, Custom):
+        return game_of(value)
+    return _moved(path, value, place)
+
+
+def _moved(path: str, value: Any, place: Callable[[str], str]) -> Any:
+    """A value at a path with the run of its `Frozen` agent elsewhere, where it has or is one."""
+    if isinstance(value, str):
+        return place(value) if _is_run(path) else value
     return with_run_moved(value, place)
+
+
+def _is_run(path: str) -> bool:
+    """Whether a path names the run of a `Frozen` agent, and no argument of the user's own of that name."""
+    return re.fullmatch(r"agents\.(\*|\d+)(\.start_from)?\.run", path.replace("-", "_")) is not None
 
 
 def _name(name: object, factor: object) -> str:
@@ -164,6 +194,13 @@ def _name(name: object, factor: object) -> str:
             return name
         raise refusal("a factor's name", name, "a text")
     return normalised(name)
+
+
+def _of_path(path: str, factor: Factor) -> Factor:
+    """A factor with runs as `Frozen` has them, so that its levels have the same names when it is read."""
+    if isinstance(factor, tuple) and _is_run(path):
+        return tuple(normpath(own) if isinstance(own, str) and own else own for own in factor)
+    return factor
 
 
 def _factor(where: str, value: Any) -> Factor:

@@ -1,7 +1,8 @@
 """What conditions and their levels are called, in names and on figures."""
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Container, Iterable, Mapping
 from dataclasses import fields, is_dataclass
+from itertools import chain, count
 from typing import Any
 
 from cprl.checks import shown
@@ -13,6 +14,25 @@ BETWEEN = ", "
 def named(levels: Mapping[str, Any]) -> str:
     """The name of a condition, e.g. "freeze_steps=5, gamma=0.9"."""
     return BETWEEN.join(f"{name}={level_text(value)}" for name, value in levels.items())
+
+
+def unlike(name: str, taken: Container[str]) -> str:
+    """A name; with the lowest number from 2 on that is free where it is taken."""
+    numbered = (f"{name} #{nth}" for nth in count(2))
+    return next(own for own in chain([name], numbered) if own not in taken)
+
+
+def levels_in(name: str) -> list[str]:
+    """The levels in the name of a condition; those of a tuple or an agent, in brackets, are not apart."""
+    found: list[str] = []
+    depth = 0
+    for part in name.split(BETWEEN):
+        if depth:
+            found[-1] += BETWEEN + part
+        else:
+            found.append(part)
+        depth = max(0, depth + sum((own in "([{") - (own in ")]}") for own in part))
+    return found
 
 
 def level_text(value: Any) -> str:

@@ -21,6 +21,8 @@ from cprl.studies.study import BLOCK, Study
 from cprl.studies.trials import trials_of
 
 SAMPLERS: Final = ("tpe", "random", "gp")
+_TRIES: Final = 100
+"""Random combinations of levels of which one has to fit."""
 Sampler = str | Callable[[int], Any]
 """One of `SAMPLERS`, or what makes a sampler of Optuna from a seed."""
 
@@ -75,22 +77,37 @@ class Search:
         if not callable(self.sampler) and self.sampler not in SAMPLERS:
             raise refusal("sampler", self.sampler, f"{', '.join(SAMPLERS)}, or a function of a seed")
         _check_metric(self.metric, self.experiment)
-        drawn = self._study(self.factors, draws=1)
+        drawn = self._drawn()
         object.__setattr__(self, "factors", drawn.factors)
         object.__setattr__(self, "name", drawn.name)
 
     def study_of(self, points: Sequence["Point"]) -> Study:
-        """The study of these points, as named conditions; those that came twice once."""
-        return self._study(conditions={own.name: own.changes for own in points if not own.is_repeated})
+        """The study of these points, as named conditions; those that came twice once, and none that was
+        refused."""
+        kept = [own for own in points if not own.is_repeated and not own.reason]
+        return self._study(conditions={own.name: own.changes for own in kept})
+
+    def _drawn(self) -> Study:
+        """The study of one random combination of levels, the first that fits; some may contradict each
+        other, which is no reason to refuse a search of the others."""
+        refused = []
+        for nth in range(_TRIES):
+            try:
+                experiment = replace(self.experiment, seed=self.experiment.seed + nth)
+                return self._study(self.factors, draws=1, experiment=experiment)
+            except ValueError as error:
+                refused.append(error)
+        raise refused[0]
 
     def _study(self, factors: Mapping[str, Factor] | None = None, **others: Any) -> Study:
         how: dict[str, Any] = {
+            "experiment": self.experiment,
             "replicas": self.replicas,
             "block": self.block,
             "pairing": self.pairing,
             "name": self.name,
         }
-        return Study(self.experiment, factors or {}, **how, **others)
+        return Study(factors=factors or {}, **{**how, **others})
 
     def point(self, number: int, proposed: Mapping[str, Any]) -> "Point":
         """The point with these levels."""
@@ -115,13 +132,18 @@ class Point:
     changes: Mapping[str, Any]
     """What it changes in the experiment, by path."""
     value: float | None = None
-    """The mean of the metric over replicas; None where a run of it failed, or it is undefined."""
+    """The mean of the metric over replicas; None where a run of it failed, it is undefined, or refused."""
     is_repeated: bool = False
     """Whether it equals an earlier one, whose runs count."""
+    reason: str = ""
+    """Why the experiment refuses these levels together; such a point is not run."""
 
 
 def value_of(search: Search, point: Point, runs: Path) -> float | None:
-    """The metric of a point, the mean of its replicas; None if a run of it has not finished."""
+    """The metric of a point, the mean of its replicas; None if a run of it has not finished, or the
+    experiment refuses it."""
+    if point.reason:
+        return None
     found: list[float] = []
     for trial in trials_of(search.study_of([replace(point, is_repeated=False)])):
         run = runs / trial.name

@@ -99,7 +99,7 @@ def run_search(
     check_last(last)
     optuna = _optuna()
     asked = _Asked(search, optuna)
-    batch = asked.next_batch()
+    batch = asked.first_batch()
     study = search.study_of(batch)
     out = directory_of(study, out)
     folder = out / RUNS if runs is None else path_of("runs", runs)
@@ -133,6 +133,21 @@ class _Asked:
         self._first: dict[str, Point] = {}
         """By checksum, the first point that has it."""
 
+    def first_batch(self) -> list[Point]:
+        """The first points of which one fits.
+
+        Raises:
+            ValueError: where the experiment refuses every point of the search.
+        """
+        while batch := self.next_batch():
+            if not all(own.reason for own in batch):
+                return batch
+            self.tell([None] * len(batch))
+        raise ValueError(
+            f"none of the search's {len(self.points)} points fits; the first, {self.points[0].name}: "
+            f"{self.points[0].reason}"
+        )
+
     def next_batch(self) -> list[Point]:
         """The next points, at most `at_once` of them."""
         first = len(self.points)
@@ -143,8 +158,12 @@ class _Asked:
         return [point for _, point in self._waiting]
 
     def _named(self, point: Point) -> Point:
-        """A point that is known as such, or one whose name no other one has."""
-        checksum = self._search.study_of([point]).all_conditions[0].checksum
+        """A point that is known as such, or one whose name no other one has; with the reason where the
+        experiment refuses its levels together, since later ones may fit."""
+        try:
+            checksum = self._search.study_of([point]).all_conditions[0].checksum
+        except ValueError as error:
+            return replace(point, reason=str(error))
         if checksum in self._first:
             first = self._first[checksum]
             return replace(point, name=first.name, changes=first.changes, is_repeated=True)
@@ -178,7 +197,7 @@ def _space_of(search: Search, optuna: Any) -> dict[str, Any]:
 def _run_batch(
     search: Search, batch: Sequence[Point], driver: Driver, executor: Executor, *, of: _Asked
 ) -> tuple[Outcome, ...]:
-    new = [own for own in batch if not own.is_repeated]
+    new = [own for own in batch if not own.is_repeated and not own.reason]
     if not new:
         return ()
     values = [own.value for own in of.points if own.value is not None]
@@ -202,7 +221,7 @@ def _sampler(optuna: Any, search: Search, number: int) -> Any:
 
 
 def _as_table(search: Search, points: Sequence[Point]) -> dict[str, Any]:
-    columns = ("number", "name", "value", "is_repeated")
+    columns = ("number", "name", "value", "is_repeated", "reason")
     return {
         **{own: getattr(search, own) for own in ("metric", "direction", "over", "last", "at_once")},
         "points": [

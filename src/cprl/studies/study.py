@@ -2,7 +2,6 @@
 
 import hashlib
 import os
-from collections import Counter
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass, field, replace
 from functools import cached_property, partial
@@ -12,6 +11,7 @@ from typing import Any, Final
 from cprl.arguments import integer, object_of, refusal, switch
 from cprl.checks import DIRECTORY_NAME, check_nesting, checked, instance, shown
 from cprl.experiment import MOST_SEED, Experiment, frozen_from, frozen_relative_to
+from cprl.population import stored_of
 from cprl.runs import formats
 from cprl.studies.conditions import Condition
 from cprl.studies.factors import (
@@ -26,7 +26,7 @@ from cprl.studies.factors import (
     factor_to_config,
     grid,
 )
-from cprl.studies.naming import named, short_names
+from cprl.studies.naming import named, short_names, unlike
 from cprl.studies.paths import changed
 
 FORMAT: Final = formats.STUDY
@@ -99,6 +99,22 @@ class Study:
         if self.reference_name not in [own.name for own in self.all_conditions]:
             names = ", ".join(own.name for own in self.all_conditions[:10])
             raise refusal("reference", self.reference, f"the name of a condition: {names}")
+        for condition in self.all_conditions:
+            self._check_stored(condition)
+        self.to_config()  # refuses what `study.json` could not hold
+
+    def _check_stored(self, condition: Condition) -> None:
+        """Refuses stored agents that are named for another number of replicas than the study's."""
+        for place, spec in enumerate(condition.experiment.agents):
+            stored = stored_of(spec)
+            theirs = None if stored is None else stored.replica
+            if isinstance(theirs, tuple) and len(theirs) != self.replicas:
+                where = f"agents.{place}" if stored is spec else f"agents.{place}.start_from"
+                raise ValueError(
+                    f"{where}.replica of condition {condition.name!r} is {shown(theirs)}, of {len(theirs)} "
+                    f"numbers; allowed: {self.replicas} of them, one for each replica of the study; one "
+                    "number for all; or None"
+                )
 
     @cached_property
     def all_conditions(self) -> tuple[Condition, ...]:
@@ -219,7 +235,7 @@ class Study:
         place = _no_change if directory is None else partial(_joined, str(directory))
         experiment = Experiment.from_config(table["experiment"], allow=allow)
         try:
-            factors = {name: factor_from_config(own, allow, place) for name, own in table["factors"]}
+            factors = {name: factor_from_config(name, own, allow, place) for name, own in table["factors"]}
             named = {name: changes_from_config(own, allow, place) for name, own in table["conditions"]}
         except (KeyError, TypeError, AttributeError) as error:
             raise ValueError(
@@ -263,13 +279,14 @@ UNCHANGED: Final = "unchanged"
 
 def _apart(conditions: Iterable[Condition]) -> tuple[Condition, ...]:
     """Conditions with a number after their name where others have the same, e.g. of unlike agents."""
-    times: Counter[str] = Counter()
-    found = []
+    conditions = tuple(conditions)
+    taken = {own.name for own in conditions}
+    found: dict[str, Condition] = {}
     for own in conditions:
-        times[own.name] += 1
-        is_first = times[own.name] == 1
-        found.append(own if is_first else replace(own, name=f"{own.name} #{times[own.name]}"))
-    return tuple(found)
+        name = unlike(own.name, taken) if own.name in found else own.name
+        taken.add(name)
+        found[name] = own if name == own.name else replace(own, name=name)
+    return tuple(found.values())
 
 
 def _no_change(run: str) -> str:

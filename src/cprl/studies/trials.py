@@ -11,11 +11,13 @@ import traceback
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager, redirect_stderr, redirect_stdout
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 from typing import Any, Final, Literal, NamedTuple
 
 from cprl.config import custom_targets
 from cprl.experiment import Experiment
+from cprl.population import Frozen, with_stored
 from cprl.runs.directory import FILE_NAME as RECIPE
 from cprl.runs.directory import read_recipe
 from cprl.runs.extension import REPORT
@@ -61,11 +63,23 @@ def trials_of(study: Study) -> list[Trial]:
                 condition.experiment,
                 seed=study.seed_of(condition, block),
                 replicas=block.replicas,
+                agents=tuple(with_stored(own, partial(_of_block, block)) for own in agents),
             ),
         )
         for block in study.blocks
         for condition in study.all_conditions
+        for agents in (condition.experiment.agents,)
     ]
+
+
+def _of_block(block: Block, stored: Frozen) -> Frozen:
+    """A stored agent in the replicas of a block, which a run numbers from 0 again."""
+    last = block.first + block.replicas
+    if isinstance(stored.replica, tuple):
+        return replace(stored, replica=stored.replica[block.first : last])
+    if stored.replica is None and block.first:
+        return replace(stored, replica=tuple(range(block.first, last)))
+    return stored
 
 
 def state_of(run: Path) -> State:

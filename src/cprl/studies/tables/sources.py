@@ -1,11 +1,11 @@
 """What a table is made of: runs, each with its condition and its replicas; and what is lacking."""
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Final
 
-from cprl.studies.naming import level_text
+from cprl.studies.naming import level_text, unlike
 from cprl.studies.status import Status
 from cprl.studies.study import Study
 from cprl.studies.trials import State, trials_of
@@ -74,15 +74,17 @@ class Design:
 
 def design_of(study: Study) -> Design:
     """The conditions of a study."""
-    names = _names(study)
     levels: dict[str, dict[int, Any]] = {name: {} for name in study.factors}
     for name, own in ((name, own) for own in study.all_conditions for name in study.factors):
         at = own.levels[name]
-        levels[name].setdefault(id(at), _unlike(plain_level(at), levels[name].values()))
+        if id(at) not in levels[name]:
+            plain = plain_level(at)
+            alike = set(levels[name].values())
+            levels[name][id(at)] = unlike(plain, alike) if isinstance(plain, str) else plain
     return Design(
         name=study.name,
         conditions={
-            names[own.checksum]: {name: levels[name][id(own.levels[name])] for name in study.factors}
+            own.name: {name: levels[name][id(own.levels[name])] for name in study.factors}
             for own in study.all_conditions
         },
         reference=study.reference_name,
@@ -99,14 +101,14 @@ def sources_of(study: Study, runs: Path, status: Path | None = None) -> tuple[li
         runs: the directory of its runs.
         status: where its trials say why they failed, if it is there.
     """
-    finished, lacking, names = [], [], _names(study)
+    finished, lacking = [], []
     for trial in trials_of(study):
         state, of = trial.state(runs), trial.condition
         if state == "finished":
             source = Source(
                 run=runs / trial.name,
                 name=trial.name,
-                condition=names[of.checksum],
+                condition=of.name,
                 checksum=of.checksum,
                 first=trial.block.first,
                 replicas=trial.block.replicas,
@@ -119,7 +121,7 @@ def sources_of(study: Study, runs: Path, status: Path | None = None) -> tuple[li
             lacking.append(
                 Lacking(
                     name=trial.name,
-                    condition=names[of.checksum],
+                    condition=of.name,
                     replicas=trial.block.replicas,
                     reason=reason,
                 )
@@ -130,17 +132,3 @@ def sources_of(study: Study, runs: Path, status: Path | None = None) -> tuple[li
 def plain_level(value: Any) -> Any:
     """A level as a table holds it: a number or truth value as it is, else a text."""
     return value if isinstance(value, bool | int | float) else level_text(value)
-
-
-def _names(study: Study) -> dict[str, str]:
-    """The name of each condition by its checksum; those of the same name are numbered."""
-    found: dict[str, str] = {}
-    for own in study.all_conditions:
-        found[own.checksum] = _unlike(own.name, found.values())
-    return found
-
-
-def _unlike(value: Any, others: Iterable[Any]) -> Any:
-    """A value; a text with a number where another is the same, as of values that words do not tell apart."""
-    alike = sum(isinstance(own, str) and own.partition(" #")[0] == value for own in others)
-    return f"{value} #{alike + 1}" if alike else value
