@@ -160,6 +160,14 @@ def test_an_argument_of_a_recipes_own_must_not_hide_one_of_the_experiment():
         read("", hides)
 
 
+def test_an_argument_runs_of_a_recipes_own_is_refused_since_no_line_that_resumes_keeps_it():
+    def hides(*, runs: int = 1) -> Experiment:
+        return replace(experiment(), replicas=runs)
+
+    with pytest.raises(ValueError, match=r"argument 'runs' of its own, .*; allowed: another name"):
+        read("--runs 3", hides)
+
+
 def test_help_lists_the_recipes_own_arguments_first_and_equal_agents_once(capsys, monkeypatch):
     monkeypatch.setenv("COLUMNS", "80")
     with pytest.raises(SystemExit):

@@ -193,6 +193,7 @@ def _check_names(make_experiment: Callable[..., Experiment], options: Any) -> No
         *Experiment.__dataclass_fields__,
         *RunOptions.__dataclass_fields__,
         *options.__dataclass_fields__,
+        "runs",  # the directory of a study's runs, which no recipe.json and no line that resumes keeps
     }
     for name in inspect.signature(make_experiment).parameters:
         if name in taken:
