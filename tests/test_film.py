@@ -126,6 +126,22 @@ def test_a_film_that_is_interrupted_leaves_no_file(runs, tmp_path, monkeypatch, 
     assert list(tmp_path.iterdir()) == []
 
 
+def test_a_recording_that_is_interrupted_leaves_no_file_and_can_be_made_again(runs, tmp_path, monkeypatch):
+    with monkeypatch.context() as patch:
+        patch.setattr("cprl.evaluation.film._Events.on_step", interrupt)
+        with pytest.raises(KeyboardInterrupt):
+            film(runs / "greedy", tmp_path / "own.rrd")
+    assert list(tmp_path.iterdir()) == []
+    path, _ = film(runs / "greedy", tmp_path / "own.rrd")
+    with pytest.raises(FileExistsError, match=r"own\.rrd exists and is not overwritten"):
+        film(runs / "greedy", path)
+    assert path.exists()
+
+
+def interrupt(*_):
+    raise KeyboardInterrupt
+
+
 @pytest.mark.parametrize(
     ("words", "said"),
     [
