@@ -88,6 +88,16 @@ def test_the_comparison_of_learners_takes_the_candidates_that_got_most(monkeypat
     assert as_run == presets.dqn_settings("two_complex", variant="as_run")
 
 
+def test_candidates_that_were_not_trained_are_not_chosen(monkeypatch, capsys):
+    monkeypatch.syspath_prepend(str(RECIPES / "learners"))
+    ways = recipe("ways", RECIPES / "learners")
+    study = ways.tuning("two_complex")
+    first, *others = [condition.name for condition in study.all_conditions]
+    assert ways.winners(tuned(study, {first: 3})) == {"DQN": first.removeprefix("DQN: ")}
+    told = capsys.readouterr().out.splitlines()
+    assert told == [f"Not evaluated, and not chosen from: {name}" for name in others]
+
+
 @pytest.mark.integration
 def test_agents_of_a_study_of_learners_meet_in_a_cross_play(tmp_path, monkeypatch, capsys):
     monkeypatch.syspath_prepend(str(RECIPES / "learners"))
