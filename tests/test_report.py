@@ -190,6 +190,27 @@ def test_watch_opens_all_recordings_of_a_run_as_one(tmp_path, monkeypatch, capsy
     assert opened[0][1:] == [str(tmp_path / "run-2.rrd"), str(tmp_path / "run.rrd")]
 
 
+def test_watch_opens_the_viewer_of_the_package_where_no_command_is_at_hand(tmp_path, monkeypatch):
+    from cprl import cli
+
+    opened = []
+    (tmp_path / "run.rrd").touch()
+    monkeypatch.setenv("DISPLAY", ":9")
+    monkeypatch.setenv("PATH", str(tmp_path))
+    monkeypatch.setattr(sys, "executable", str(tmp_path / "python"))
+    monkeypatch.setattr(cli.os, "execvp", lambda program, command: opened.append(command))
+    cli.watch(tmp_path)
+    assert [Path(word).is_file() for word in opened[0]] == [True, True]
+
+
+def test_watch_refuses_a_file_that_is_no_recording(tmp_path):
+    from cprl import cli
+
+    (tmp_path / "recipe.json").touch()
+    with pytest.raises(ValueError, match=r"recipe\.json is no recording; allowed: .* that ends in \.rrd"):
+        cli.watch(tmp_path / "recipe.json")
+
+
 @pytest.mark.integration
 def test_reproduce_runs_what_is_missing_and_reports(tmp_path, monkeypatch, capsys):
     reproduce = recipe("reproduce")
