@@ -179,6 +179,13 @@ def test_boards_wider_than_the_picture_are_drawn_smaller():
     assert picture._board_size[0] <= 240
 
 
+@pytest.mark.parametrize("height", [30, 300, 9000])
+def test_boards_higher_than_the_picture_are_drawn_smaller(height):
+    picture = EpisodePicture(maps.parse("\n".join(["A>", *["A."] * (height - 1)])), steps=10, width=240)
+    assert picture._board_size[1] <= 480
+    assert picture.size[1] < 1000, "a GIF holds at most 65,535 rows"
+
+
 @pytest.mark.parametrize(("number", "top"), [(0, 10), (10, 10), (11, 20), (201, 500), (1001, 2000)])
 def test_axes_end_at_round_numbers(number, top):
     assert nice(number) == top
