@@ -152,6 +152,15 @@ def test_what_the_experiment_refuses_is_said_in_a_line(line, message):
         recipe_main(experiment, ["recipes/mine.py", *line.split()])
 
 
+def test_to_take_over_a_run_that_is_not_resumed_is_refused(tmp_path):
+    said = "--take-over is for runs that are there; allowed: with --resume"
+    with pytest.raises(SystemExit, match=said):
+        recipe_main(experiment, ["recipes/mine.py", "--take-over", "--out", str(tmp_path / "new")])
+    with pytest.raises(ValueError, match=said):
+        cli.run(tmp_path, take_over=True)
+    assert list(tmp_path.iterdir()) == []
+
+
 def test_an_argument_of_a_recipes_own_must_not_hide_one_of_the_experiment():
     def hides(*, seed: int = 0) -> Experiment:
         return replace(experiment(), seed=seed)

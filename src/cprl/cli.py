@@ -13,7 +13,7 @@ from typing import Final
 
 import tyro
 
-from cprl.commandline import Allow, in_a_sentence, make_importable
+from cprl.commandline import TAKES_NOTHING_OVER, Allow, in_a_sentence, make_importable
 from cprl.docs_cli import docs
 from cprl.egta_cli import egta
 from cprl.evaluation.evaluate import SEED
@@ -71,6 +71,8 @@ def run(
         allow: code of your own, module:Class, that the recipe may import; may be repeated.
     """
     refuse_unknown(recipe)
+    if take_over and not resume:
+        raise ValueError(TAKES_NOTHING_OVER)
     make_importable(allow)
     directory = recipe if recipe.is_dir() else recipe.parent
     experiment = Experiment.from_recipe(read_recipe(recipe), allow=allow, directory=directory)
