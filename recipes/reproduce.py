@@ -3,8 +3,9 @@
     python recipes/reproduce.py --runs ~/cprl-runs --results docs/results
 
 Every run is resumable: started again with the same --runs, this resumes where it was stopped, and what is
-finished is not run again. As soon as a run is finished its results are kept in --results; in the end the
-report is written there. About an hour for each single board and two for each `commons`, on one core.
+finished is not run again; a run of another recipe or with other flags is refused. As soon as a run is
+finished its results are kept in --results; in the end the report is written there. About an hour for each
+single board and two for each `commons`, on one core.
 """
 
 import os
@@ -13,6 +14,7 @@ import sys
 from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
+from threading import Event
 from typing import Literal
 
 import tyro
@@ -68,27 +70,54 @@ def main(
             raise ValueError(f"there is no experiment {name!r}; allowed: {', '.join(EXPERIMENTS)}")
     common = ["--replicas", str(replicas), "--engine", engine]
     common += [] if episodes is None else ["--episodes", str(episodes)]
-    with ThreadPoolExecutor(processes or os.cpu_count()) as pool:
-        for ended in [pool.submit(run, name, common, runs=runs, results=results) for name in only]:
-            ended.result()
+    run_all(only, common, runs=runs, results=results, processes=processes)
     prepare_process(0)
     return write_report([results / name for name in only], results)
 
 
+def run_all(
+    names: Sequence[str], common: Sequence[str], *, runs: Path, results: Path, processes: int | None
+) -> None:
+    """Runs experiments, some at once; after Ctrl-C or once one has failed, those that wait are not begun."""
+    is_over = Event()
+
+    def one(name: str) -> None:
+        if is_over.is_set():
+            return
+        try:
+            run(name, common, runs=runs, results=results)
+        except BaseException:
+            is_over.set()
+            raise
+
+    with ThreadPoolExecutor(processes or os.cpu_count()) as pool:
+        try:
+            for ended in [pool.submit(one, name) for name in names]:
+                ended.result()
+        finally:
+            is_over.set()
+
+
 def run(name: str, common: Sequence[str], *, runs: Path, results: Path) -> None:
-    """Runs an experiment in a process of its own, or resumes it, and keeps its results."""
+    """Runs an experiment in a process of its own, or resumes it, and keeps its results.
+
+    What is finished is resumed too: its recipe refuses a run of another one, and then has nothing to do.
+
+    Raises:
+        ChildProcessError: if it fails or is stopped; ends with the last line of its log.
+    """
     recipe, *arguments = EXPERIMENTS[name]
     directory, log = runs / name, runs / f"{name}.log"
-    if not (directory / "report.json").exists():
-        runs.mkdir(parents=True, exist_ok=True)
-        command = [sys.executable, str(recipe_named(recipe).path), *arguments, *common]
-        command += ["--no-keep-checkpoint", "--out", str(directory)]
-        command += ["--resume"] if (directory / "recipe.json").exists() else []
-        say(f"{name}: see {log}")
-        with open(log, "a") as told:
-            done = subprocess.run(command, stdout=told, stderr=subprocess.STDOUT, check=False)
-        if done.returncode or not (directory / "report.json").exists():
-            raise RuntimeError(f"{name} ended with {done.returncode} before it was finished; see {log}")
+    runs.mkdir(parents=True, exist_ok=True)
+    command = [sys.executable, str(recipe_named(recipe).path), *arguments, *common]
+    command += ["--no-keep-checkpoint", "--out", str(directory)]
+    command += ["--resume"] if (directory / "recipe.json").exists() else []
+    say(f"{name}: see {log}")
+    with open(log, "a") as told:
+        done = subprocess.run(command, stdout=told, stderr=subprocess.STDOUT, check=False)
+    if done.returncode or not (directory / "report.json").exists():
+        *_, last = ["", *log.read_text(encoding="utf-8", errors="replace").splitlines()]
+        raise ChildProcessError(f"{name} ended with {done.returncode} and is not finished; see {log}: {last}")
     say(f"{name}: {export_results(directory, results / name)}")
 
 

@@ -7,6 +7,7 @@ than the published one, which recipes/commons.py has.
 Copy this file and change it: another map, rule, network or loss is one line.
 """
 
+import shlex
 from dataclasses import replace
 from pathlib import Path
 
@@ -49,7 +50,7 @@ def experiment() -> cprl.Experiment:
 def tell(run: Path) -> None:
     """Says what happened, and what to try next."""
     say(in_sentences(course_of(run)))
-    say(NEXT.format(run=run, cprl=cprl_here()))
+    say(NEXT.format(run=shlex.quote(str(run)), cprl=shlex.quote(cprl_here())))
 
 
 if __name__ == "__main__":

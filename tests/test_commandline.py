@@ -152,12 +152,29 @@ def test_what_the_experiment_refuses_is_said_in_a_line(line, message):
         recipe_main(experiment, ["recipes/mine.py", *line.split()])
 
 
+def test_to_take_over_a_run_that_is_not_resumed_is_refused(tmp_path):
+    said = "--take-over is for runs that are there; allowed: with --resume"
+    with pytest.raises(SystemExit, match=said):
+        recipe_main(experiment, ["recipes/mine.py", "--take-over", "--out", str(tmp_path / "new")])
+    with pytest.raises(ValueError, match=said):
+        cli.run(tmp_path, take_over=True)
+    assert list(tmp_path.iterdir()) == []
+
+
 def test_an_argument_of_a_recipes_own_must_not_hide_one_of_the_experiment():
     def hides(*, seed: int = 0) -> Experiment:
         return replace(experiment(), seed=seed)
 
     with pytest.raises(ValueError, match="argument 'seed' of its own, which every experiment has"):
         read("", hides)
+
+
+def test_an_argument_runs_of_a_recipes_own_is_refused_since_no_line_that_resumes_keeps_it():
+    def hides(*, runs: int = 1) -> Experiment:
+        return replace(experiment(), replicas=runs)
+
+    with pytest.raises(ValueError, match=r"argument 'runs' of its own, .*; allowed: another name"):
+        read("--runs 3", hides)
 
 
 def test_help_lists_the_recipes_own_arguments_first_and_equal_agents_once(capsys, monkeypatch):

@@ -71,6 +71,27 @@ def test_what_is_no_tragedy_is_called_none(tmp_path, returns, lengths, ending):
     assert "the tragedy of the commons" not in in_sentences(course)
 
 
+def test_a_course_beside_random_play_that_gets_nothing_has_no_shares_of_it(tmp_path):
+    course = course_of(write_run(tmp_path / "run", RISE_AND_FALL, LENGTHS, random=(0.0, 0.0)))
+    said = in_sentences(course)
+    assert "reached 600 around episode 25, where random play gets none. " in said
+    assert "they got 200, 67% below that peak. " in said
+    assert "better off than agents who never learned: no tragedy" in said
+
+
+def test_a_course_of_agents_who_never_harvest_is_no_tragedy(tmp_path):
+    run = write_run(tmp_path / "run", [0.0] * 40, [1000.0] * 20 + [10.0] * 20, random=(0.0, 0.0))
+    path = run / "episodes.parquet"
+    table = pq.read_table(path)
+    nothing = pa.array(np.zeros(len(table)))
+    where = table.column_names.index("collective_return")
+    pq.write_table(table.set_column(where, "collective_return", nothing), path)
+    course = course_of(run)
+    assert not course.is_tragedy
+    assert "In the last 30 episodes they got 0. " in in_sentences(course)
+    assert "no better off than agents who never learned" in in_sentences(course)
+
+
 def test_a_game_that_reports_no_harvest_has_no_course(tmp_path):
     run = write_run(tmp_path / "run", RISE_AND_FALL, LENGTHS)
     table = pq.read_table(run / "episodes.parquet").drop_columns(["collective_return"])

@@ -126,6 +126,22 @@ def test_a_film_that_is_interrupted_leaves_no_file(runs, tmp_path, monkeypatch, 
     assert list(tmp_path.iterdir()) == []
 
 
+def test_a_recording_that_is_interrupted_leaves_no_file_and_can_be_made_again(runs, tmp_path, monkeypatch):
+    with monkeypatch.context() as patch:
+        patch.setattr("cprl.evaluation.film._Events.on_step", interrupt)
+        with pytest.raises(KeyboardInterrupt):
+            film(runs / "greedy", tmp_path / "own.rrd")
+    assert list(tmp_path.iterdir()) == []
+    path, _ = film(runs / "greedy", tmp_path / "own.rrd")
+    with pytest.raises(FileExistsError, match=r"own\.rrd exists and is not overwritten"):
+        film(runs / "greedy", path)
+    assert path.exists()
+
+
+def interrupt(*_):
+    raise KeyboardInterrupt
+
+
 @pytest.mark.parametrize(
     ("words", "said"),
     [
@@ -161,6 +177,13 @@ def test_boards_wider_than_the_picture_are_drawn_smaller():
     picture = EpisodePicture(wide, steps=10, width=240)
     assert picture.size[0] == 240
     assert picture._board_size[0] <= 240
+
+
+@pytest.mark.parametrize("height", [30, 300, 9000])
+def test_boards_higher_than_the_picture_are_drawn_smaller(height):
+    picture = EpisodePicture(maps.parse("\n".join(["A>", *["A."] * (height - 1)])), steps=10, width=240)
+    assert picture._board_size[1] <= 480
+    assert picture.size[1] < 1000, "a GIF holds at most 65,535 rows"
 
 
 @pytest.mark.parametrize(("number", "top"), [(0, 10), (10, 10), (11, 20), (201, 500), (1001, 2000)])

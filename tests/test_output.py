@@ -7,6 +7,7 @@ import sys
 from pathlib import Path
 
 import pytest
+from rich.table import Table
 
 from cprl.output import Output, console
 
@@ -70,6 +71,18 @@ def test_what_an_output_cannot_show_is_written_plainly():
     console(output).print("12.0 ± 0.5 \u00d7 3 …  日")
     stream.flush()
     assert stream.buffer.getvalue().decode("ascii") == "12.0 +- 0.5 x 3 ...  ?\n"
+
+
+def test_square_brackets_and_colons_in_names_and_paths_are_shown_as_they_are():
+    stream = io.StringIO()
+    table = Table(title="a [b]", caption="c [d]")
+    table.add_column("column [e]")
+    table.add_row("row [/f] :apple:")
+    shown = console(Output(lambda: stream), width=120)
+    shown.print(table)
+    shown.print("To resume: --out runs/[g]", soft_wrap=True)
+    for name in ("a [b]", "c [d]", "column [e]", "row [/f] :apple:", "--out runs/[g]"):
+        assert name in stream.getvalue()
 
 
 def training(folder, *, watch="off", shell="", env=None):

@@ -163,6 +163,7 @@ def test_a_game_without_a_beam_has_no_key_for_it():
         (["chess"], r"board is 'chess'; allowed: single_basic, .*, a run's directory, or a file with a draw"),
         (["commons", "--others", "nobody"], "others is 'nobody'; allowed: random, greedy, .*directory"),
         (["commons", "--agent", "4"], "agent is 4; allowed: an integer from 0 to 3"),
+        (["commons", "--replica", "3"], 'replica is 3, and others is "greedy"; allowed: with the agents of'),
         (["commons", "--steps", "0"], "steps is 0; allowed: an integer >= 1"),
         (["odd.txt"], r"odd\.txt: unknown sign 'x' at row 0, column 1"),
         (

@@ -38,6 +38,13 @@ def test_lines_count_episodes_from_where_a_stopped_training_was(monkeypatch):
     assert (shown[0], shown[-1]) == (3, 8)
 
 
+def test_the_bar_shows_square_brackets_of_the_title_as_they_are():
+    told = io.StringIO()
+    with ProgressBar(GAME, episodes=9, title="run [a]", console=Console(file=told, force_terminal=True)):
+        pass
+    assert "run [a]" in told.getvalue()
+
+
 def printed(bar_of, *, steps, compile_s=0.0):
     """What a bar prints of so many steps of one world, a millisecond each, the first with a compilation."""
     told = io.StringIO()

@@ -88,6 +88,16 @@ def test_the_comparison_of_learners_takes_the_candidates_that_got_most(monkeypat
     assert as_run == presets.dqn_settings("two_complex", variant="as_run")
 
 
+def test_candidates_that_were_not_trained_are_not_chosen(monkeypatch, capsys):
+    monkeypatch.syspath_prepend(str(RECIPES / "learners"))
+    ways = recipe("ways", RECIPES / "learners")
+    study = ways.tuning("two_complex")
+    first, *others = [condition.name for condition in study.all_conditions]
+    assert ways.winners(tuned(study, {first: 3})) == {"DQN": first.removeprefix("DQN: ")}
+    told = capsys.readouterr().out.splitlines()
+    assert told == [f"Not evaluated, and not chosen from: {name}" for name in others]
+
+
 @pytest.mark.integration
 def test_agents_of_a_study_of_learners_meet_in_a_cross_play(tmp_path, monkeypatch, capsys):
     monkeypatch.syspath_prepend(str(RECIPES / "learners"))
@@ -98,10 +108,14 @@ def test_agents_of_a_study_of_learners_meet_in_a_cross_play(tmp_path, monkeypatc
     study = ways.study("two_complex", algorithms, name="few", question="", expectation="", **how)
     eager = replace(study, experiment=replace(study.experiment, engine="eager"))
     cprl.run_study(eager, tmp_path / "few", results=False, progress=False)
-    recipe("cross_play", RECIPES / "learners").main(tmp_path / "few", episodes=1)
+    cross_play = recipe("cross_play", RECIPES / "learners")
+    cross_play.main(tmp_path / "few", episodes=1)
     rows = pq.read_table(tmp_path / "few" / "cross_play.parquet").to_pydict()
     assert set(rows["focal"]) == {"DQN", "MAPPO"} == set(rows["background"])
     assert (tmp_path / "few" / "cross_play.png").exists()
+    monkeypatch.setattr(cprl, "crossplay", None)  # it would be called before anything is written
+    with pytest.raises(FileExistsError, match=r"cross_play\.parquet exists and is not overwritten"):
+        cross_play.main(tmp_path / "few", episodes=1)
 
 
 def test_the_study_of_experiment_3_has_the_two_programs_and_each_difference_alone():

@@ -3,7 +3,10 @@
 import importlib.util
 import json
 import os
+import signal
 import sys
+import threading
+import time
 from dataclasses import replace
 from pathlib import Path
 from shutil import copytree
@@ -218,6 +221,27 @@ def test_watch_opens_all_recordings_of_a_run_as_one(tmp_path, monkeypatch, capsy
     assert opened[0][1:] == [str(tmp_path / "run-2.rrd"), str(tmp_path / "run.rrd")]
 
 
+def test_watch_opens_the_viewer_of_the_package_where_no_command_is_at_hand(tmp_path, monkeypatch):
+    from cprl import cli
+
+    opened = []
+    (tmp_path / "run.rrd").touch()
+    monkeypatch.setenv("DISPLAY", ":9")
+    monkeypatch.setenv("PATH", str(tmp_path))
+    monkeypatch.setattr(sys, "executable", str(tmp_path / "python"))
+    monkeypatch.setattr(cli.os, "execvp", lambda program, command: opened.append(command))
+    cli.watch(tmp_path)
+    assert [Path(word).is_file() for word in opened[0]] == [True, True]
+
+
+def test_watch_refuses_a_file_that_is_no_recording(tmp_path):
+    from cprl import cli
+
+    (tmp_path / "recipe.json").touch()
+    with pytest.raises(ValueError, match=r"recipe\.json is no recording; allowed: .* that ends in \.rrd"):
+        cli.watch(tmp_path / "recipe.json")
+
+
 @pytest.mark.integration
 def test_reproduce_runs_what_is_missing_and_reports(tmp_path, monkeypatch, capsys):
     reproduce = recipe("reproduce")
@@ -232,8 +256,9 @@ def test_reproduce_runs_what_is_missing_and_reports(tmp_path, monkeypatch, capsy
             at.mkdir()
             (at / "recipe.json").write_text("{}")  # it was stopped
             return type("Done", (), {"returncode": 0})
-        (at / "recipe.json").unlink(missing_ok=True)
-        cprl.run(replace(recipe(name).experiment(variant="as_run"), **small), at)
+        if not (at / "report.json").exists():
+            (at / "recipe.json").unlink(missing_ok=True)
+            cprl.run(replace(recipe(name).experiment(variant="as_run"), **small), at)
         return type("Done", (), {"returncode": 0})
 
     game = presets.game
@@ -251,16 +276,64 @@ def test_reproduce_runs_what_is_missing_and_reports(tmp_path, monkeypatch, capsy
         "only": ("single_basic",),
         "processes": 1,
     }
-    with pytest.raises(RuntimeError, match=r"single_basic ended with 0 before it was finished; see .*log"):
+    with pytest.raises(ChildProcessError, match=r"single_basic ended with 0 and is not finished; see .*log"):
         reproduce.main(**how)
     report = reproduce.main(**how)
     assert "--resume" in asked[1]
     assert "| single_basic | 1 | 32.47 | " in report.read_text()
     assert "(figures/single_basic_collective_return.png)" in report.read_text()
     reproduce.main(**how)
-    assert len(asked) == 2, "what is finished is not run again"
+    assert "--resume" in asked[2], "its recipe says whether what is finished is this experiment"
     with pytest.raises(ValueError, match="there is no experiment 'fishery'; allowed: commons, single_basic"):
         reproduce.main(runs=tmp_path, only=("fishery",))
+
+
+def test_reproduce_refuses_a_finished_run_of_another_recipe_with_the_words_of_its_recipe(
+    tmp_path, monkeypatch
+):
+    reproduce = recipe("reproduce")
+    finished = tmp_path / "single_basic"
+    finished.mkdir()
+    for name in ("recipe.json", "report.json"):
+        (finished / name).write_text("{}")
+
+    def refuse(command, *, stdout, **how):
+        assert command[-1] == "--resume"
+        stdout.write("single_basic.py: it was started with another recipe: episodes 9 and 5\n")
+        return SimpleNamespace(returncode=1)
+
+    monkeypatch.setattr(reproduce, "subprocess", SimpleNamespace(run=refuse, STDOUT=None))
+    with pytest.raises(ChildProcessError, match=r"single_basic ended with 1 .*: episodes 9 and 5$"):
+        reproduce.run("single_basic", [], runs=tmp_path, results=tmp_path / "results")
+
+
+def test_reproduce_begins_nothing_more_once_an_experiment_has_failed(tmp_path, monkeypatch):
+    reproduce, begun = recipe("reproduce"), []
+
+    def fail(name, common, **where):
+        begun.append(name)
+        raise ChildProcessError(name)
+
+    monkeypatch.setattr(reproduce, "run", fail)
+    where = {"runs": tmp_path, "results": tmp_path}
+    with pytest.raises(ChildProcessError, match="commons"):
+        reproduce.run_all(["commons", "single_basic", "two_complex"], [], processes=1, **where)
+    assert begun == ["commons"]
+
+
+def test_reproduce_begins_nothing_more_after_ctrl_c(tmp_path, monkeypatch):
+    reproduce, begun = recipe("reproduce"), []
+
+    def interrupted(name, common, **where):
+        begun.append(name)
+        signal.pthread_kill(threading.main_thread().ident, signal.SIGINT)
+        time.sleep(0.2)  # as a training that saves its state
+
+    monkeypatch.setattr(reproduce, "run", interrupted)
+    where = {"runs": tmp_path, "results": tmp_path}
+    with pytest.raises(KeyboardInterrupt):
+        reproduce.run_all(["commons", "single_basic", "two_complex"], [], processes=1, **where)
+    assert begun == ["commons"]
 
 
 def test_curves_are_those_of_each_replica_and_agent():

@@ -1,5 +1,8 @@
 """What restrained and greedy agents get in all mixes, drawn and told."""
 
+import importlib.util
+from pathlib import Path
+
 import numpy as np
 import pytest
 from matplotlib.image import imread
@@ -121,3 +124,27 @@ def test_the_command_prints_the_dilemma(tmp_path, monkeypatch, capsys):
     assert (tmp_path / "diagram.png").exists()
     with pytest.raises(SystemExit, match=r"all\.parquet exists and is not overwritten"):
         command(monkeypatch, capsys, *words)
+
+
+def test_the_recipe_leaves_out_diagrams_of_trained_agents_that_are_not_there(tmp_path, monkeypatch, capsys):
+    path = Path(__file__).parents[1] / "recipes" / "theory" / "schelling.py"
+    spec = importlib.util.spec_from_file_location("schelling_recipe", path)
+    recipe = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(recipe)
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "commons").mkdir()
+    (tmp_path / "commons" / "recipe.json").touch()
+    asked = [(board, who) for board, rules, who in recipe.diagrams(Path()) if rules == "as run"]
+    assert asked == [
+        ("commons", "greedy"),
+        ("commons", "territorial"),
+        ("commons", "commons"),
+        ("two_complex", "greedy"),
+        ("two_complex", "territorial"),
+    ]
+    told = capsys.readouterr().out
+    assert told == "two_complex holds no run; the diagram of two_complex with trained agents is left out\n"
+    (tmp_path / "commons_as_run_trained.png").touch()
+    monkeypatch.setattr(recipe, "schelling", None)  # it would be called
+    with pytest.raises(FileExistsError, match=r"commons_as_run_trained\.png exists"):
+        recipe.main(out=Path(), trained=Path())

@@ -355,6 +355,14 @@ def test_the_summary_says_how_many_steps_each_replica_learned_from_where_the_run
 # The command line
 
 
+@pytest.mark.parametrize("part", ["evaluation", "random"])
+def test_cprl_table_refuses_to_count_episodes_of_another_part_than_the_training(part, monkeypatch):
+    command = ["cprl", "table", "runs", "--by", "name", "--part", part, "--last", "30"]
+    monkeypatch.setattr(sys, "argv", command)
+    with pytest.raises(SystemExit, match=f"--last counts episodes of the training; .* without --part {part}"):
+        cli.main()
+
+
 def test_cprl_table_prints_any_runs_by_a_field_and_writes_them(tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
     write_study(PAIRED, Path("runs"), harvest)

@@ -2,6 +2,7 @@
 
 import io
 import re
+import shlex
 from dataclasses import replace
 from pathlib import Path
 
@@ -32,6 +33,17 @@ def told_of(tmp_path, **played):
     text = output.getvalue()
     cells = [[cell.strip() for cell in re.split("[│┃]", line)[1:-1]] for line in text.splitlines()]
     return {row[0]: row[1:] for row in cells if row}, text
+
+
+def test_the_line_that_watches_again_can_be_copied(tmp_path):
+    run = tmp_path / "own run [a]"
+    run.mkdir()
+    (run / "run.rrd").touch()
+    output = io.StringIO()
+    console = Console(file=output, width=200, markup=False)
+    summarise(run, title="a run", played={"random": [episode(0, [3, 1])]}, console=console)
+    (line,) = (line for line in output.getvalue().splitlines() if line.startswith("Watch again: "))
+    assert shlex.split(line)[-1] == str(run / "run.rrd")
 
 
 def test_rows_have_units_and_say_whose_return_is_the_measure(tmp_path):

@@ -8,6 +8,8 @@ from pathlib import Path
 import tyro
 
 import cprl
+from cprl.command_parts import check_files
+from cprl.commandline import in_a_sentence
 from cprl.evaluation import draw_gains
 from cprl.runs.labelled import write_table
 from cprl.studies.trials import trials_of
@@ -25,11 +27,15 @@ def main(
         episodes: of each replica with each focal agent.
     """
     study, out = cprl.studies.read_study(comparison), out or comparison
+    table, figure = out / "cross_play.parquet", out / "cross_play.png"
+    check_files(table, figure)
+    out.mkdir(parents=True, exist_ok=True)
     trained = {own.condition.name: (runs or comparison / "runs") / own.name for own in trials_of(study)}
     played = cprl.crossplay(trained, episodes=episodes)
-    write_table(out / "cross_play.parquet", played.table())
-    print(draw_gains(played, out / "cross_play.png"))
+    write_table(table, played.table())
+    print(draw_gains(played, figure))
 
 
 if __name__ == "__main__":
-    tyro.cli(main)
+    with in_a_sentence("cross_play.py"):
+        tyro.cli(main)

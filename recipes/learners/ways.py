@@ -27,6 +27,7 @@ from cprl.algorithms import (
     RolloutSettings,
     TeamAlgorithm,
 )
+from cprl.output import say
 from cprl.population import AgentSpec, Learning, Team
 from cprl.studies import StudyTable
 from cprl.studies.tables.comparing import compare
@@ -151,12 +152,17 @@ def study(board: Board, algorithms: dict[str, Algorithm], **how: Any) -> cprl.St
 
 
 def winners(table: StudyTable) -> dict[str, str]:
-    """The candidate of each way that gets most in fresh worlds, from the table of a tuning."""
+    """The candidate of each way that gets most in fresh worlds, from the table of a tuning.
+
+    Candidates that were not trained are not chosen, which is said.
+    """
     best: dict[str, tuple[float, str]] = {}
     for own in compare(table, "collective_return", part="evaluation").conditions:
         way, _, candidate = own.condition.partition(": ")
-        value = own.estimate.value if own.estimate else float("-inf")
-        best[way] = max(best.get(way, (float("-inf"), "")), (value, candidate))
+        if own.estimate is None:
+            say(f"Not evaluated, and not chosen from: {own.condition}")
+        else:
+            best[way] = max(best.get(way, (float("-inf"), "")), (own.estimate.value, candidate))
     return {way: candidate for way, (_, candidate) in best.items()}
 
 

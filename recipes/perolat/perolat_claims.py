@@ -23,6 +23,7 @@ from numpy.typing import NDArray
 from perolat_base import BEAMS
 
 from cprl import Study, maps
+from cprl.commandline import in_a_sentence
 from cprl.evaluation.territory import DEFENCE, EXCLUSION, OVERLAP, TAGS, Territory, territory_of
 from cprl.measuring.statistics import Estimate, difference, estimate
 from cprl.measuring.territory import time_within
@@ -237,14 +238,19 @@ def main(*, runs: Path = Path("studies/runs"), episodes: int | None = None, out:
     Args:
         runs: the directory of the runs of the three studies.
         episodes: how many episodes they were trained for, where it is not as the studies say.
-        out: a .md to be.
+        out: a .md to be, which is written over.
     """
+    if out is not None:
+        out.parent.mkdir(parents=True, exist_ok=True)
+        if out.is_dir():
+            raise IsADirectoryError(f"--out is {out}, a directory; allowed: the name of a file")
     text = table(runs, episodes)
     if out is None:
         print(text)
     else:
-        out.write_text(text + "\n")
+        out.write_text(text + "\n", encoding="utf-8")
 
 
 if __name__ == "__main__":
-    tyro.cli(main)
+    with in_a_sentence("perolat_claims.py"):
+        tyro.cli(main)

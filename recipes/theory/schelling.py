@@ -11,6 +11,7 @@ a quota with sanctions ends it: a greedy agent is out of play most of the time.
 All take about half an hour of a core.
 """
 
+from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
 from typing import Final
@@ -18,10 +19,15 @@ from typing import Final
 import tyro
 
 from cprl import Game, presets
+from cprl.commandline import in_a_sentence
 from cprl.evaluation import SchellingDiagram, draw_schelling, schelling
 from cprl.institutions import GraduatedSanctions, Quota, Tax
 from cprl.measuring.statistics import estimate
+from cprl.output import say
+from cprl.plotting.style import check_picture
+from cprl.policies.scripted import SCRIPTED_POLICIES
 from cprl.reporting.markdown import table
+from cprl.runs.directory import FILE_NAME
 
 BOARDS: Final = ("commons", "two_complex")
 RULES: Final = {
@@ -52,7 +58,7 @@ def row_of(board: str, rules: str, found: SchellingDiagram) -> list[str]:
     ends = [of_kind[:, at] for at in (-1, 0) for of_kind in (found.restrained_payoffs, found.greedy_payoffs)]
     dilemma = found.dilemma()
     return [
-        *(f"`{board}`", rules, "trained DQN" if "/" in found.greedy else found.greedy),
+        *(f"`{board}`", rules, found.greedy if found.greedy in SCRIPTED_POLICIES else "trained DQN"),
         *(str(estimate(values, interval="t")) for values in ends),
         *(str(margin) for margin in (dilemma.restraint, dilemma.fear, dilemma.greed)),
         dilemma.name,
@@ -74,28 +80,45 @@ HEADINGS: Final = (
 )
 
 
+def diagrams(trained: Path) -> Iterator[tuple[str, str, str]]:
+    """Board, rules and who plays greedy of each diagram; says where there is no run of trained agents."""
+    for board in BOARDS:
+        for rules in RULES:
+            greedy = [*GREEDY[: 1 if rules == "no beam" else None]]
+            yield from ((board, rules, who) for who in greedy)
+            if rules == "as run":
+                run = trained / board
+                if (run / FILE_NAME).exists():
+                    yield board, rules, str(run)
+                else:
+                    say(f"{run} holds no run; the diagram of {board} with trained agents is left out")
+
+
 def main(*, out: Path, trained: Path = Path("docs/results"), episodes: int = 5, replicas: int = 8) -> None:
     """Measures all diagrams; restrained agents are the scripted "sustainable".
 
     Args:
         out: where to: table.md and a figure for each diagram.
-        trained: a directory of runs by the names of boards, whose agents play greedy in further diagrams.
+        trained: a directory of runs by the names of boards, whose agents play greedy in further diagrams;
+            a board without a run there has none.
         episodes: of each replica and choice of restrained agents.
         replicas: of trained agents, those from 0 on; of scripted ones, groups of episodes.
     """
+    asked = []
+    for board, rules, who in diagrams(trained):
+        name = f"{board}_{rules}_{who if who in SCRIPTED_POLICIES else 'trained'}"
+        figure = check_picture(out / f"{name.replace(',', '').replace(' ', '_')}.png")
+        asked.append((board, rules, who, figure))
+    out.mkdir(parents=True, exist_ok=True)
     rows = []
-    for board in BOARDS:
-        for rules in RULES:
-            greedy = [*GREEDY[: 1 if rules == "no beam" else None]]
-            greedy += [str(trained / board)] * (rules == "as run")
-            for who in greedy:
-                found = schelling(game_of(board, rules), greedy=who, episodes=episodes, replicas=replicas)
-                name = f"{board}_{rules}_{'trained' if '/' in who else who}"
-                draw_schelling(found, out / f"{name.replace(',', '').replace(' ', '_')}.png")
-                rows.append(row_of(board, rules, found))
-                print(*rows[-1], sep="; ", flush=True)
+    for board, rules, who, figure in asked:
+        found = schelling(game_of(board, rules), greedy=who, episodes=episodes, replicas=replicas)
+        draw_schelling(found, figure)
+        rows.append(row_of(board, rules, found))
+        say("; ".join(rows[-1]))
     (out / "table.md").write_text("\n".join(table(HEADINGS, rows)), encoding="utf-8")
 
 
 if __name__ == "__main__":
-    tyro.cli(main)
+    with in_a_sentence("schelling.py"):
+        tyro.cli(main)

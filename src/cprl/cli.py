@@ -1,6 +1,7 @@
 """The command `cprl`: what can be done with runs that are there. `cprl --version` prints its version."""
 
 import os
+import shlex
 import sys
 import time
 from collections.abc import Callable, Mapping, Sequence
@@ -12,7 +13,7 @@ from typing import Final
 
 import tyro
 
-from cprl.commandline import Allow, in_a_sentence, make_importable
+from cprl.commandline import TAKES_NOTHING_OVER, Allow, in_a_sentence, make_importable
 from cprl.docs_cli import docs
 from cprl.egta_cli import egta
 from cprl.evaluation.evaluate import SEED
@@ -70,6 +71,8 @@ def run(
         allow: code of your own, module:Class, that the recipe may import; may be repeated.
     """
     refuse_unknown(recipe)
+    if take_over and not resume:
+        raise ValueError(TAKES_NOTHING_OVER)
     make_importable(allow)
     directory = recipe if recipe.is_dir() else recipe.parent
     experiment = Experiment.from_recipe(read_recipe(recipe), allow=allow, directory=directory)
@@ -167,6 +170,8 @@ def watch(run: Path, /, *, serve: bool = False) -> None:
         run: the run's directory, or a single .rrd file.
         serve: serve it for browsers on 127.0.0.1 instead, until Ctrl-C, as without a display.
     """
+    if run.is_file() and run.suffix != ".rrd":
+        raise ValueError(f"{run} is no recording; allowed: a run's directory, or a file that ends in .rrd")
     files = [run] if run.is_file() else sorted(run.glob("*.rrd"))
     if not files:
         raise ValueError(f"{run} holds no recording (*.rrd); recipes write one unless watch is off")
@@ -181,7 +186,7 @@ def _serve(files: Sequence[Path], *, why: str) -> None:
     """Serves recordings and the web viewer until Ctrl-C."""
     page = Page(files)
     say(f"Watch (browser): {page.address()}")
-    say(f"Watch (native): {viewer()} {' '.join(page.recordings)}")
+    say(f"Watch (native): {shlex.join([viewer(), *page.recordings])}")
     say(f"{why}served on 127.0.0.1 until Ctrl-C")
     with suppress(KeyboardInterrupt):
         while True:

@@ -27,6 +27,8 @@ OptionsT = TypeVar("OptionsT")
 Allow = tyro.conf.UseAppendAction[tuple[str, ...]]
 """--allow A --allow B."""
 
+TAKES_NOTHING_OVER: Final = "--take-over is for runs that are there; allowed: with --resume"
+
 _OLD_WORDS: Final = {
     "--go-on": ("--resume",),
     "--no-go-on": ("--no-resume",),
@@ -90,6 +92,8 @@ def recipe_main(
     command = list(texts("argv", sys.argv if argv is None else argv, 1))
     with in_a_sentence(program_of(command[0])):
         experiment, options = parse(make_experiment, command)
+        if options.take_over and not options.resume:
+            raise ValueError(TAKES_NOTHING_OVER)
     from cprl.running import run
 
     with in_a_sentence(program_of(command[0])):
@@ -193,6 +197,7 @@ def _check_names(make_experiment: Callable[..., Experiment], options: Any) -> No
         *Experiment.__dataclass_fields__,
         *RunOptions.__dataclass_fields__,
         *options.__dataclass_fields__,
+        "runs",  # the directory of a study's runs, which no recipe.json and no line that resumes keeps
     }
     for name in inspect.signature(make_experiment).parameters:
         if name in taken:

@@ -1,5 +1,6 @@
 """`cprl film`, `evaluate`, `visits`, `crossplay`, `schelling`: agents that do not learn, in fresh worlds."""
 
+import shlex
 from pathlib import Path
 from typing import Any
 
@@ -74,7 +75,10 @@ def film(
     else:
         path, played = film_run(run, out, replica=replica, episode=episode, allow=allow)
     say(f"{played.steps} steps, {played.outcome}")
-    say(f"{path}: {path.stat().st_size / 1000:.0f} kB" if is_video else f"Watch: {viewer()} {path}")
+    if is_video:
+        say(f"{path}: {path.stat().st_size / 1000:.0f} kB")
+    else:
+        say(f"Watch: {shlex.join([viewer(), str(path)])}")
 
 
 def evaluate(

@@ -109,8 +109,12 @@ ERR: Final = Output(lambda: _behind(sys.stderr))
 
 
 def console(output: Output = OUT, *, width: int | None = None) -> Console:
-    """A console that no closed output and no encoding can stop, by default on standard output."""
-    return Console(file=cast(TextIO, output), width=width)
+    """A console that no closed output and no encoding can stop, by default on standard output.
+
+    Square brackets and colons in texts are shown as they are: they may be those of a path or a name. What is
+    to have a style is a `rich.text.Text`.
+    """
+    return Console(file=cast(TextIO, output), width=width, markup=False, emoji=False)
 
 
 def say(*what: object) -> None:

@@ -20,6 +20,8 @@ SMALLEST_WIDTH, DEFAULT_WIDTH, LARGEST_WIDTH = 240, 640, 1920
 SMALLEST_CELL_PIXELS: Final = 8
 """Boards with more cells than fit in this size are drawn with it, and then made smaller."""
 
+_BOARD_HEIGHT: Final = 2
+"""The height of the board in the picture, at most, as a multiple of the picture's width."""
 _DIAMOND_BEYOND: Final = 0.22
 """How far a violator's diamond goes beyond its cell, in cells."""
 _TEXT: Final = (228, 231, 236)
@@ -49,9 +51,11 @@ class EpisodePicture:
         self.board, self.steps, self._most = board, steps, most_harvested
         self._unit = max(10, width // 46)
         self._font = ImageFont.load_default(self._unit)
-        self._cell = max(SMALLEST_CELL_PIXELS, (width - 1) // board.width)
+        highest = _BOARD_HEIGHT * width
+        fitting = min((width - 1) // board.width, (highest - 1) // board.height)
+        self._cell = max(SMALLEST_CELL_PIXELS, fitting)
         wide, high = board.width * self._cell + 1, board.height * self._cell + 1
-        shrink = min(1.0, width / wide)
+        shrink = min(1.0, width / wide, highest / high)
         self._board_size = max(1, int(wide * shrink)), max(1, int(high * shrink))
         self._half = (width - 3 * self._unit) // 2
         self._legend = _Legend(len(board.starts), self._half, self._font)

@@ -11,6 +11,7 @@ from cprl import arguments, keys
 from cprl.envs.unwrap import commons_of
 from cprl.measuring.episodes import Episode
 from cprl.policies.assignment import AgentPolicies
+from cprl.runs.labelled import refuse_to_write_over
 from cprl.stored import LoadedRun, load
 from cprl.training import train
 from cprl.viewer.callback import ViewerCallback
@@ -67,7 +68,8 @@ def film(
 
     Args:
         run: its directory, or its exported results.
-        out: the recording, a .rrd; by default `film-<replica>-<episode>.rrd` in the run's directory.
+        out: the recording, a .rrd, complete or absent; by default `film-<replica>-<episode>.rrd` in the run's
+            directory.
         replica: the index of the agents' replica.
         episode: the index of the fresh episode; equal indices give equal episodes.
         allow: see `cprl.load`.
@@ -85,8 +87,18 @@ def film(
         raise arguments.refusal("out", str(out), "a .rrd; film_video makes a .gif or an .mp4")
     fresh = fresh_episode(run, replica=replica, episode=episode, allow=allow)
     target = Path(run) / f"film-{replica}-{episode}.rrd" if out is None else Path(out)
-    others = dict(zip(fresh.policies.indices, fresh.policies.actors, strict=True))
+    refuse_to_write_over(target)
     target.parent.mkdir(parents=True, exist_ok=True)
+    try:
+        return target, _recorded(fresh, target)
+    except BaseException:  # a recording of half an episode would stand in the way of the next attempt
+        target.unlink(missing_ok=True)
+        raise
+
+
+def _recorded(fresh: FreshEpisode, target: Path) -> Episode:
+    """Plays the episode into a recording."""
+    others = dict(zip(fresh.policies.indices, fresh.policies.actors, strict=True))
     with ViewerCallback(
         target.parent,
         fresh.env,
@@ -106,7 +118,7 @@ def film(
             callbacks=[viewer, *_decisions(viewer, fresh), *_offences(viewer, fresh), events],
         )
     assert events.episode is not None
-    return target, events.episode
+    return events.episode
 
 
 def _decisions(viewer: ViewerCallback, fresh: FreshEpisode) -> list[Decisions]:

@@ -61,7 +61,8 @@ def film_video(
         every: turns from one picture to the next; by default 1 for an .mp4, and for a .gif as many as
             it takes for 300 pictures.
         fps: pictures per second, above 0, at most 50; in a .gif rounded to hundredths of a second a picture.
-        width: of the pictures in pixels, 240 to 1920; the height follows from the board.
+        width: of the pictures in pixels, 240 to 1920; the height follows from the board, which is
+            at most twice as high.
         allow: see `cprl.load`.
 
     Returns:

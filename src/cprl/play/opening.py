@@ -9,6 +9,7 @@ from cprl.agents import Population
 from cprl.envs.make_env import make_env
 from cprl.evaluation.words import agent_named, board_named
 from cprl.play.session import Session
+from cprl.policies.scripted import SCRIPTED_POLICIES
 from cprl.population import Scripted
 from cprl.presets import Variant
 
@@ -55,6 +56,8 @@ def open_session(
         game = replace(game, rules=replace(game.rules, episode_steps=steps))
     agent = arguments.integer("agent", agent, 0, game.agents - 1)
     others = others if others is not None else DEFAULT_OTHERS if run is None else board
+    if replica and others in SCRIPTED_POLICIES:
+        raise ValueError(f'replica is {replica}, and others is "{others}"; allowed: with the agents of a run')
     specs = [agent_named(others, index, replica=replica) for index in range(game.agents)]
     specs[agent] = Scripted("random")
     if run is None:

@@ -43,7 +43,8 @@ class Course:
     def is_tragedy(self) -> bool:
         """Whether agents who learn end worse off than agents who do not, after they had been better off."""
         return (
-            self.last_return <= BELOW_RANDOM * self.random_return
+            self.random_return > 0
+            and self.last_return <= BELOW_RANDOM * self.random_return
             and self.peak_return >= PEAK_OVER_RANDOM * self.random_return
             and self.last_survival_steps <= SURVIVAL_SHARE * self.longest_steps
         )
@@ -89,10 +90,7 @@ def in_sentences(course: Course) -> str:
     """
     object_of("course", course, Course, "a Course, see course_of")
     own = course
-    over, change = own.peak_return / own.random_return, own.last_return / own.peak_return - 1
     last = min(LAST_EPISODES, own.episodes)
-    to_random = own.last_return / own.random_return - 1
-    than_random = f"{abs(to_random):.0%} {'less' if to_random < 0 else 'more'} than random play gets"
     if own.is_tragedy:
         meaning = (
             "Each agent learned to take what pays now, and all of them, trained, end worse off than agents "
@@ -105,11 +103,29 @@ def in_sentences(course: Course) -> str:
     return " ".join(
         [
             f"The agents began at {own.first_return:.0f} apples an episode, all together, and reached "
-            f"{own.peak_return:.0f} around episode {own.peak_episode + PEAK_EPISODES // 2}, {over:.1f} times "
-            f"the {own.random_return:.0f} ± {own.random_error:.0f} of random play.",
-            f"In the last {last} episodes they got {own.last_return:.0f}, {abs(change):.0%} below that peak "
-            f"and {than_random}.",
+            f"{own.peak_return:.0f} around episode {own.peak_episode + PEAK_EPISODES // 2}, "
+            f"{_peak_beside_random(own)}.",
+            f"In the last {last} episodes they got {own.last_return:.0f}{_last_beside_peak_and_random(own)}.",
             f"Boards that can last {own.longest_steps} steps now last {own.last_survival_steps:.0f}.",
             meaning,
         ]
     )
+
+
+def _peak_beside_random(own: Course) -> str:
+    """Nothing is a number of times what random play gets where that gets nothing."""
+    if not own.random_return:
+        return "where random play gets none"
+    over = own.peak_return / own.random_return
+    return f"{over:.1f} times the {own.random_return:.0f} ± {own.random_error:.0f} of random play"
+
+
+def _last_beside_peak_and_random(own: Course) -> str:
+    """Shares of the peak and of random play; of nothing there are none."""
+    parts = []
+    if own.peak_return:
+        parts.append(f"{abs(own.last_return / own.peak_return - 1):.0%} below that peak")
+    if own.random_return:
+        change = own.last_return / own.random_return - 1
+        parts.append(f"{abs(change):.0%} {'less' if change < 0 else 'more'} than random play gets")
+    return f", {' and '.join(parts)}" if parts else ""

@@ -1,5 +1,6 @@
 """The results of a run, printed in the terminal."""
 
+import shlex
 from collections.abc import Callable, Iterator, Mapping
 from math import isnan
 from pathlib import Path
@@ -76,7 +77,8 @@ def summarise(
     if figure:
         console.print(f"Training curve: {figure}", soft_wrap=True)
     if "run.rrd" in kept:
-        console.print(f"Watch again: {viewer()} {run / 'run.rrd'}", soft_wrap=True)
+        watch = shlex.join([viewer(), str(run / "run.rrd")])
+        console.print(f"Watch again: {watch}", soft_wrap=True)
 
 
 def _table(title: str, played: Mapping[str, list[Episode]]) -> Table:

@@ -1,5 +1,6 @@
 """The streams of one recording: to a file and, on request, live on 127.0.0.1."""
 
+import shlex
 import shutil
 import socket
 import subprocess
@@ -15,7 +16,7 @@ from urllib.parse import urlsplit
 from cprl.checks import SWITCH, Check, checked, shown
 from cprl.viewer import deadline
 from cprl.viewer.deadline import abandon, exit_in_time, within
-from cprl.viewer.page import LOCALHOST, Page, free_port, has_display
+from cprl.viewer.page import LOCALHOST, Page, _binary, free_port, has_display
 from cprl.viewer.sending import LiveStream, Stream
 
 RUN, REPLAY = "cprl", "cprl replay"
@@ -141,7 +142,7 @@ def open_live(
         grpc.append(address)
     if live == "spawn":
         _spawn(grpc)
-    page, native = Page(), " ".join([viewer(), "--connect", *grpc])
+    page, native = Page(), shlex.join([viewer(), "--connect", *grpc])
     return Live(stream, exhibition, {"browser": page.address(*grpc), "native": native}, page)
 
 
@@ -197,9 +198,13 @@ def _spawn(grpc: list[str]) -> None:
 
 
 def viewer() -> str:
-    """The command of Rerun's native viewer: the one next to this Python, if there is one."""
+    """The command of Rerun's native viewer: the one next to this Python, if there is one, else that of the
+    shell, else that of the package, which is neither where packages are installed into a folder of their own.
+    """
     beside = Path(sys.executable).with_name("rerun")
-    return str(beside) if beside.exists() else "rerun"
+    if beside.exists():
+        return str(beside)
+    return "rerun" if shutil.which("rerun") else str(_binary())
 
 
 def _warn_of(what: str, why: object) -> None:

@@ -27,7 +27,7 @@ def runs_table(
     by: tyro.conf.UseAppendAction[tuple[str, ...]],
     metric: tyro.conf.UseAppendAction[tuple[str, ...]] = (),
     part: Part = TRAINING,
-    last: int = LAST,
+    last: int | None = None,
     interval: Interval = "bca",
     reference: str | None = None,
     window: int = WINDOW,
@@ -42,11 +42,12 @@ def runs_table(
             be repeated.
         metric: what is compared, e.g. collective_return; may be repeated.
         part: of the runs: their training, their agents in fresh worlds, or random play in these.
-        last: episodes at the end of the training that are compared.
+        last: episodes at the end of the training that are compared, by default 30.
         interval: "bca", by bootstrap of the replicas, or "t", by Student's t.
         reference: the name of the condition that others are compared with, e.g. freeze_steps=25; by default
             the first.
-        window: episodes of a row of the table that is written; 1 for episodes one by one.
+        window: episodes of a row of the table, of which --last compares whole ones and --out FILE.parquet
+            writes all; 1 for episodes one by one.
         out: a file to be: .parquet with every window of episodes, replica and metric, or .md with what is
             printed.
         allow: code of your own, module:Class, that a run's recipe may name; may be repeated.
@@ -55,10 +56,12 @@ def runs_table(
         if out.suffix not in SUFFIXES:
             raise ValueError(f"--out is {out}; allowed: a name that ends in {' or '.join(SUFFIXES)}")
         refuse_to_write_over(out)
+    if last is not None and part != TRAINING:
+        raise ValueError(f"--last counts episodes of the training; allowed: without --part {part}")
     if not runs:
         raise ValueError("cprl table wants at least one run: cprl table RUN... --by FIELD")
     found = pooled_table(runs, by=by, window=window, reference=reference, allow=allow)
-    compared = _compared(found, metric, part, last, interval)
+    compared = _compared(found, metric, part, LAST if last is None else last, interval)
     shown = console(width=None if OUT.isatty() else 250)
     for own in compared:
         shown.print(rich_table(own))
