@@ -17,6 +17,7 @@ import cprl
 from cprl import Game, Rules, maps, presets
 from cprl.algorithms import DQN, PPO
 from cprl.learners.settings import DQNSettings, RolloutSettings
+from cprl.measuring import phases
 from cprl.measuring.phases import PHASES
 from cprl.measuring.published import published_experiment
 from cprl.plotting import style
@@ -169,6 +170,13 @@ def test_phases_need_a_group_and_numbers_in_every_window():
     assert phases_of({**curves, "equality": nobody}) is None
     alone = {name: values for name, values in curves.items() if name != "return_1"}
     assert phases_of(alone) is None
+
+
+def test_trainings_too_long_for_the_search_of_phases_are_drawn_without(tmp_path, drawn, monkeypatch):
+    monkeypatch.setattr(phases, "LONGEST", 1000)
+    for episodes in (1000, 1001):
+        training_curve(a_run(tmp_path / f"{episodes}", the_tragedy(1, episodes)), title="long")
+    assert [len(figure.axes) for figure in drawn] == [3, 2], "the strip of phases, and the two metrics"
 
 
 def test_the_published_phases_end_with_the_figure():

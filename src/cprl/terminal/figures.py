@@ -63,7 +63,7 @@ def training_curve(
     """Plots the collective return in each episode of a run, and survival below it.
 
     Every episode and replica is faint, the mean over replicas and its highest point bold. Running means are
-    centred. Trainings of at least 1,000 episodes have their phases as bands behind the curves; those of the
+    centred. Trainings of 1,000 to 100,000 episodes have their phases as bands behind the curves; those of the
     published curves stand above if the run repeats their experiment. A game without a harvest has one panel,
     the return of all its agents. Games with institutions have two more, violations and fines of all agents.
 
