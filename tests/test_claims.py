@@ -75,7 +75,14 @@ def test_a_run_repeats_the_study_if_its_game_and_agents_do_whatever_its_name():
     assert number((learner, Scripted("random"))) == 4
     assert number((learner,), presets.game("single_basic")) == 1
     assert number((learner,) * 4, presets.game("commons")) == 5
-    assert number((), None, name="single_complex") == 2, "by the name of the recipe"
+    alone = presets.game("single_complex")
+    rules = replace(alone.rules, episode_steps=40)
+    assert number((), replace(alone, rules=rules), name="single_complex") == 2, "by the name of the recipe"
+    by_chance = (Scripted("random"),)
+    assert number(by_chance, alone, name="single_basic") is None, "on another map"
+    assert number(by_chance * 2, name="commons") is None, "of two agents"
+    assert number(by_chance * 2, name="two_against_random") == 4
+    assert number(by_chance * 4, None, name="commons") is None, "a game without a map"
     assert number((learner, Scripted("greedy"))) is None
     assert number((Scripted("random"),) * 2) is None
     peaceful = replace(game, rules=replace(game.rules, may_fire=False))

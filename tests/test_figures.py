@@ -1,5 +1,6 @@
 """Figures: everything drawn is in the legend, which lies beside the data; phases only in long trainings."""
 
+import json
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -16,6 +17,7 @@ from test_results import an_episode
 import cprl
 from cprl import Game, Rules, maps, presets
 from cprl.algorithms import DQN, PPO
+from cprl.config import to_config
 from cprl.learners.settings import DQNSettings, RolloutSettings
 from cprl.measuring import phases
 from cprl.measuring.phases import PHASES
@@ -29,8 +31,9 @@ from cprl.runs.curves import centres, episode_of_step, phases_of
 from cprl.terminal.figures import training_curve
 
 
-def a_run(folder, metrics, *, recipe=None):
-    """A run of two agents who share what is harvested; metrics are [R, E] by name."""
+def a_run(folder, metrics, *, recipe=None, board="commons"):
+    """A run of two agents who share what is harvested; metrics are [R, E] by name. Its recipe says that it
+    was played on a board of the study."""
     replicas, episodes = next(iter(metrics.values())).shape
     shape = replicas, episodes, 2
     replica, episode, agent = (axis.ravel() for axis in np.indices(shape))
@@ -40,7 +43,8 @@ def a_run(folder, metrics, *, recipe=None):
     folder.mkdir(parents=True, exist_ok=True)
     pq.write_table(pa.table(columns), folder / "episodes.parquet")
     if recipe:
-        (folder / "recipe.json").write_text(f'{{"recipe": "{recipe}", "experiment": {{}}}}')
+        experiment = {"game": to_config(presets.game(board))}
+        (folder / "recipe.json").write_text(json.dumps({"recipe": recipe, "experiment": experiment}))
     return folder
 
 
@@ -155,6 +159,12 @@ def test_phases_are_drawn_from_a_thousand_episodes_on(episodes, has_bands, tmp_p
 
 def test_a_run_of_another_experiment_has_no_published_phases(tmp_path, drawn):
     training_curve(a_run(tmp_path / "run", the_tragedy(1, 1000), recipe="mixed"), title="mixed")
+    assert [label.get_text() for label in drawn[0].axes[0].get_yticklabels()] == ["this run"]
+
+
+def test_a_run_that_only_has_the_name_of_the_studys_has_no_published_phases(tmp_path, drawn):
+    run = a_run(tmp_path / "run", the_tragedy(1, 1000), recipe="commons", board="two_complex")
+    training_curve(run, title="commons")
     assert [label.get_text() for label in drawn[0].axes[0].get_yticklabels()] == ["this run"]
 
 

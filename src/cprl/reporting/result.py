@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from cprl import presets
 from cprl.algorithms import DQN
 from cprl.commons.game import Game
+from cprl.commons.maps import Map
 from cprl.experiment import Experiment
 from cprl.measuring.published import SMOOTHED_EPISODES, PublishedExperiment, published_experiment
 from cprl.population import Learning, Scripted, Team, exploration_steps
@@ -165,12 +166,13 @@ def read_result(path: Path) -> Result:
 
 
 def study_of(recipe: str, experiment: Experiment) -> PublishedExperiment | None:
-    """The study's experiment that a run repeats: by the name of its recipe, or since it plays a variant of
-    the study's game, beam included, with as many agents that learn by DQN, whatever their settings; None for
-    others."""
-    if (named := published_experiment(recipe)) is not None:
-        return named
+    """The study's experiment that a run repeats: by the name of its recipe, if it plays on the study's map,
+    which has the number of agents, whatever the rules; or since it plays a variant of the study's game, beam
+    included, with as many agents that learn by DQN, whatever their settings; None for others."""
     game, specs = experiment.game, experiment.agents
+    named = published_experiment(recipe)
+    if named is not None and isinstance(game, Game) and game.map == _map_of(named):
+        return named
     if not isinstance(game, Game) or presets.variant_of(game) is None:
         return None
     if game.agents > 1 and not game.rules.may_fire:
@@ -181,3 +183,8 @@ def study_of(recipe: str, experiment: Experiment) -> PublishedExperiment | None:
         return None
     boards = {presets.game(board).map: board for board in presets.BOARDS}
     return published_experiment("two_against_random" if against_random else boards[game.map])
+
+
+def _map_of(study: PublishedExperiment) -> Map:
+    board = "two_complex" if study.recipe == "two_against_random" else study.recipe
+    return next(presets.game(own).map for own in presets.BOARDS if own == board)

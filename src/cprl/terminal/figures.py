@@ -9,8 +9,10 @@ import numpy as np
 from matplotlib.axes import Axes
 from numpy.typing import NDArray
 
+from cprl import presets
 from cprl.arguments import objects, path
 from cprl.checks import NONE, TEXT, checked, count, either
+from cprl.config import to_config
 from cprl.measuring.episodes import Episode
 from cprl.measuring.names import title as metric_title
 from cprl.measuring.names import unit
@@ -196,5 +198,10 @@ def _note(window: int, *, is_over: bool) -> str:
 
 
 def _is_published(run: Path) -> bool:
-    """Whether a run repeats the experiment whose phases the study draws."""
-    return (run / RECIPE).exists() and read_recipe(run)["recipe"] == PHASED_RECIPE
+    """Whether a run repeats the experiment whose phases the study draws: by the name of its recipe, on the
+    study's map, which has the number of agents."""
+    if not (run / RECIPE).exists():
+        return False
+    recipe = read_recipe(run)
+    game = (recipe.get("experiment") or {}).get("game") or {}
+    return recipe["recipe"] == PHASED_RECIPE and game.get("map") == to_config(presets.game("commons").map)
