@@ -57,10 +57,9 @@ def _trained(results: Sequence[Result]) -> list[str]:
         assert study is not None
         values = result.curves["collective_return"].mean(1)
         cells = [result.name, f"{study.number}", f"{study.trained}", with_interval(values)]
-        whole = result.curves["collective_return"].shape[1] >= study.episodes
         for runs in RUNS:
             judged = verdicts.of_number(study.trained, values, runs=runs)
-            cells += [f"{prediction(values, runs=runs)}", judged] if whole else ["", TOO_FEW]
+            cells += [f"{prediction(values, runs=runs)}", judged] if result.is_whole else ["", TOO_FEW]
         rows.append([*cells, _evaluated(result, "trained")])
     head = ["run", "experiment", "published", "mean over training, ours"]
     head += ["one run", "verdict", "mean of two runs", "verdict", "evaluation at epsilon 0.05, ours"]

@@ -89,6 +89,11 @@ class Result:
         return game if scored and isinstance(game, Game) and not game.institutions else None
 
     @property
+    def is_whole(self) -> bool:
+        """Whether it has as many episodes as the study's experiment, or more."""
+        return self.study is not None and self.curves["collective_return"].shape[1] >= self.study.episodes
+
+    @property
     def window(self) -> int:
         """The window of its running means in episodes: that of the published curves, if there are any."""
         return self.study.window_episodes if self.study else SMOOTHED_EPISODES
