@@ -1,6 +1,6 @@
 """Result: the files of a finished run that a report needs."""
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -43,6 +43,8 @@ class Result:
     curves: Mapping[str, Values]
     study: PublishedExperiment | None
     """The study's experiment that it repeats, see `study_of`."""
+    allow: Sequence[str] = ()
+    """The user's own code, "module:Class", that the run may import."""
 
     @property
     def name(self) -> str:
@@ -107,7 +109,7 @@ class Result:
     @cached_property
     def measures(self) -> Measures:
         """Measures of its training, and of its agents in new worlds."""
-        return measures(self.path, window=self.window)
+        return measures(self.path, window=self.window, allow=self.allow)
 
     def of_agents(self, column: str) -> Values | None:
         """A column of the table of episodes for each agent, float64 [R, E, N]; None if there is no such
@@ -146,11 +148,15 @@ class Result:
         return {name: running_mean(values, values.shape[1])[:, 0] for name, values in curves.items()}
 
 
-def read_result(path: Path) -> Result:
+def read_result(path: Path, *, allow: Sequence[str] = ()) -> Result:
     """Reads a run's directory, or its exported results.
 
+    Args:
+        path: The directory.
+        allow: See `cprl.load`.
+
     Raises:
-        ValueError: If the path has no run, or one of a game without harvest.
+        ValueError: If the path has no run, or one of a game without harvest; for code that is not allowed.
         FileNotFoundError: If the run has no episodes or has not ended.
     """
     recipe, curves = read_recipe(path), curves_of(path)
@@ -159,7 +165,7 @@ def read_result(path: Path) -> Result:
             f"{path} plays a game that reports no harvest; allowed in a report beside the published study: a "
             "commons; evaluate_run and crossplay measure the returns of others"
         )
-    experiment = Experiment.from_recipe(recipe, directory=path)
+    experiment = Experiment.from_recipe(recipe, allow=allow, directory=path)
     return Result(
         path=path,
         recipe=recipe,
@@ -167,6 +173,7 @@ def read_result(path: Path) -> Result:
         report=read_json(path / "report.json"),
         curves=curves,
         study=study_of(recipe["recipe"], experiment),
+        allow=allow,
     )
 
 
