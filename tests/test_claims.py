@@ -11,6 +11,7 @@ from cprl.algorithms import DQN
 from cprl.measuring.published import curve, published_experiment
 from cprl.population import Learning, Scripted
 from cprl.reporting import claims, curves
+from cprl.reporting.appendix import appendix
 from cprl.reporting.claims_alone import (
     of_experiment_1,
     of_experiment_2,
@@ -133,6 +134,18 @@ def test_the_claims_on_four_agents_are_judged_by_what_their_curves_show(tmp_path
     short = {name: own[:, :1000] for name, own in society(FELL).items()}
     told = {one.claim for one in of_experiment_5(a_result(tmp_path, "commons", short))}
     assert "equality about 0.87 in the end" not in told, "1,000 episodes do not reach the study's last phase"
+
+
+def test_a_longer_training_is_compared_over_as_many_episodes_as_the_study_had(tmp_path):
+    whole = {name: own.repeat(2, 1)[:, :6000] for name, own in society(FELL).items()}
+    longer = {name: np.concatenate([own, np.zeros((8, 3000))], 1) for name, own in whole.items()}
+
+    def row(metrics):
+        result = a_result(tmp_path, "single_basic", metrics)
+        return next(line for line in appendix([result]) if line.startswith("| made_up"))
+
+    assert row(longer) == row(whole)
+    assert "too few" not in row(longer)
 
 
 def test_claims_on_more_episodes_than_there_were_have_no_verdict(tmp_path):

@@ -56,12 +56,12 @@ def of_experiment_2(result: Result) -> Iterator[Claim]:
 
 def of_experiment_3(result: Result, others: Sequence[Result]) -> Iterator[Claim]:
     """Two learners get more than one, alike, in territories, use the beam less and less, and sustain."""
-    own = result.curves["collective_return"].mean(1)
+    own = result.over_training("collective_return")
     alone = [one for one in others if one.study and one.study.number == 2]
     for one in alone:
         measure = f"mean over training, and that of {one.name}; published 191.7 and 177.4"
         claim = "the sum is about 8 % above experiment 2"
-        above = more(claim, measure, own, one.curves["collective_return"].mean(1), paired=False)
+        above = more(claim, measure, own, one.over_training("collective_return"), paired=False)
         yield where(result.is_whole and one.is_whole, above)
     played = result.measures
     ratio = played.training["return of the poorest agent over that of the richest, whole training"]
@@ -103,7 +103,7 @@ def of_experiment_4(result: Result, others: Sequence[Result]) -> Iterator[Claim]
         measure = "running means at episodes 450 to 550, and the first"
         claim = "while the learner's rises"
         yield more(claim, measure, learner[:, fallen].mean(1), learner[:, 0], paired=True)
-    values, measure = result.curves["return_1"].mean(1), "its mean over training"
+    values, measure = result.over_training("return_1"), "its mean over training"
     gets = number("the random agent gets 28.9 apples", measure, values, published=28.9)
     yield where(result.is_whole, gets)
     played, of_learner = result.measures, f"{NEARNESS}, agent 0"

@@ -95,6 +95,11 @@ class Result:
         """Whether it has as many episodes as the study's experiment, or more."""
         return self.study is not None and self.curves["collective_return"].shape[1] >= self.study.episodes
 
+    def over_training(self, metric: str) -> Values:
+        """The mean of a metric over the training of each replica, [R]; of a longer training than the study's,
+        over as many episodes as that has."""
+        return self.curves[metric][:, : self.study.episodes if self.study else None].mean(1)
+
     @property
     def window(self) -> int:
         """The window of its running means in episodes: that of the published curves, if there are any."""
