@@ -98,7 +98,8 @@ class Result:
     def over_training(self, metric: str) -> Values:
         """The mean of a metric over the training of each replica, [R]; of a longer training than the study's,
         over as many episodes as that has."""
-        return self.curves[metric][:, : self.study.episodes if self.study else None].mean(1)
+        means: Values = self.curves[metric][:, : self.study.episodes if self.study else None].mean(1)
+        return means
 
     @property
     def window(self) -> int:

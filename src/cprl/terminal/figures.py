@@ -204,4 +204,5 @@ def _is_published(run: Path) -> bool:
         return False
     recipe = read_recipe(run)
     game = (recipe.get("experiment") or {}).get("game") or {}
-    return recipe["recipe"] == PHASED_RECIPE and game.get("map") == to_config(presets.game("commons").map)
+    is_same: bool = game.get("map") == to_config(presets.game("commons").map)
+    return is_same and recipe["recipe"] == PHASED_RECIPE

@@ -133,7 +133,8 @@ def _takes_over(gain: Values, population: int) -> Values:
     is_none = np.abs(gain) <= 1e-14
     size = np.where(is_none, 1.0, np.abs(gain))
     ratio = np.log(-np.expm1(-size)) - np.log(-np.expm1(-population * size))
-    return np.where(is_none, -np.log(population), ratio + np.minimum(gain, 0.0) * (population - 1))
+    found: Values = np.where(is_none, -np.log(population), ratio + np.minimum(gain, 0.0) * (population - 1))
+    return found
 
 
 def _stationary(rates: Values) -> Values:
