@@ -11,7 +11,15 @@ from cprl.algorithms import DQN
 from cprl.measuring.published import curve, published_experiment
 from cprl.population import Learning, Scripted
 from cprl.reporting import claims, curves
+from cprl.reporting.appendix import appendix
+from cprl.reporting.claims_alone import (
+    of_experiment_1,
+    of_experiment_2,
+    of_experiment_3,
+    of_experiment_4,
+)
 from cprl.reporting.claims_many import combat_section, of_experiment_5
+from cprl.reporting.measures import of_training
 from cprl.reporting.random_play import returns_by_chance
 from cprl.reporting.result import Result, study_of
 
@@ -75,7 +83,14 @@ def test_a_run_repeats_the_study_if_its_game_and_agents_do_whatever_its_name():
     assert number((learner, Scripted("random"))) == 4
     assert number((learner,), presets.game("single_basic")) == 1
     assert number((learner,) * 4, presets.game("commons")) == 5
-    assert number((), None, name="single_complex") == 2, "by the name of the recipe"
+    alone = presets.game("single_complex")
+    rules = replace(alone.rules, episode_steps=40)
+    assert number((), replace(alone, rules=rules), name="single_complex") == 2, "by the name of the recipe"
+    by_chance = (Scripted("random"),)
+    assert number(by_chance, alone, name="single_basic") is None, "on another map"
+    assert number(by_chance * 2, name="commons") is None, "of two agents"
+    assert number(by_chance * 2, name="two_against_random") == 4
+    assert number(by_chance * 4, None, name="commons") is None, "a game without a map"
     assert number((learner, Scripted("greedy"))) is None
     assert number((Scripted("random"),) * 2) is None
     peaceful = replace(game, rules=replace(game.rules, may_fire=False))
@@ -119,6 +134,43 @@ def test_the_claims_on_four_agents_are_judged_by_what_their_curves_show(tmp_path
     short = {name: own[:, :1000] for name, own in society(FELL).items()}
     told = {one.claim for one in of_experiment_5(a_result(tmp_path, "commons", short))}
     assert "equality about 0.87 in the end" not in told, "1,000 episodes do not reach the study's last phase"
+
+
+def test_a_longer_training_is_compared_over_as_many_episodes_as_the_study_had(tmp_path):
+    whole = {name: own.repeat(2, 1)[:, :6000] for name, own in society(FELL).items()}
+    longer = {name: np.concatenate([own, np.zeros((8, 3000))], 1) for name, own in whole.items()}
+
+    def row(metrics):
+        result = a_result(tmp_path, "single_basic", metrics)
+        return next(line for line in appendix([result]) if line.startswith("| made_up"))
+
+    assert row(longer) == row(whole)
+    assert "too few" not in row(longer)
+
+
+def test_claims_on_more_episodes_than_there_were_have_no_verdict(tmp_path):
+    short = {name: own[:, :300] for name, own in society(FELL).items()}
+    short |= {"return_0": short["collective_return"], "return_1": short["collective_return"] / 2}
+
+    def told(claims_of, recipe, *others, curves=short):
+        result = a_result(tmp_path, recipe, curves)
+        result.measures = SimpleNamespace(training=of_training(curves), trained={}, random={})
+        result.of_agents = lambda column: curves["equality"][..., None].repeat(2, -1)
+        return {one.claim: one.verdict for one in claims_of(result, *others)}
+
+    few = "too few episodes"
+    assert set(told(of_experiment_1, "single_basic").values()) == {few}
+    assert told(of_experiment_2, "single_complex") == {"no dip": few}
+    two = told(of_experiment_3, "two_complex", [])
+    assert two == {"both earn almost the same": few, "two manage the resource sustainably": few}
+    assert set(told(of_experiment_4, "two_against_random", []).values()) == {few}
+    four = told(of_experiment_5, "commons")
+    assert four["survival falls to 612 steps"] == few
+    longer = {name: own[:, :2000] for name, own in society(FELL).items()}
+    assert told(of_experiment_5, "commons", curves=longer)["survival falls to 612 steps"] != few
+    early = told(of_experiment_1, "single_basic", curves=longer)
+    assert early.pop("then it recovers") == few, "before 6,000 episodes"
+    assert few not in early.values()
 
 
 def test_each_kind_of_claim_has_a_measure_an_interval_and_a_verdict():

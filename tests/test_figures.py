@@ -1,5 +1,6 @@
 """Figures: everything drawn is in the legend, which lies beside the data; phases only in long trainings."""
 
+import json
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -16,7 +17,9 @@ from test_results import an_episode
 import cprl
 from cprl import Game, Rules, maps, presets
 from cprl.algorithms import DQN, PPO
+from cprl.config import to_config
 from cprl.learners.settings import DQNSettings, RolloutSettings
+from cprl.measuring import phases
 from cprl.measuring.phases import PHASES
 from cprl.measuring.published import published_experiment
 from cprl.plotting import style
@@ -28,8 +31,9 @@ from cprl.runs.curves import centres, episode_of_step, phases_of
 from cprl.terminal.figures import training_curve
 
 
-def a_run(folder, metrics, *, recipe=None):
-    """A run of two agents who share what is harvested; metrics are [R, E] by name."""
+def a_run(folder, metrics, *, recipe=None, board="commons"):
+    """A run of two agents who share what is harvested; metrics are [R, E] by name. Its recipe says that it
+    was played on a board of the study."""
     replicas, episodes = next(iter(metrics.values())).shape
     shape = replicas, episodes, 2
     replica, episode, agent = (axis.ravel() for axis in np.indices(shape))
@@ -39,7 +43,8 @@ def a_run(folder, metrics, *, recipe=None):
     folder.mkdir(parents=True, exist_ok=True)
     pq.write_table(pa.table(columns), folder / "episodes.parquet")
     if recipe:
-        (folder / "recipe.json").write_text(f'{{"recipe": "{recipe}", "experiment": {{}}}}')
+        experiment = {"game": to_config(presets.game(board))}
+        (folder / "recipe.json").write_text(json.dumps({"recipe": recipe, "experiment": experiment}))
     return folder
 
 
@@ -157,6 +162,12 @@ def test_a_run_of_another_experiment_has_no_published_phases(tmp_path, drawn):
     assert [label.get_text() for label in drawn[0].axes[0].get_yticklabels()] == ["this run"]
 
 
+def test_a_run_that_only_has_the_name_of_the_studys_has_no_published_phases(tmp_path, drawn):
+    run = a_run(tmp_path / "run", the_tragedy(1, 1000), recipe="commons", board="two_complex")
+    training_curve(run, title="commons")
+    assert [label.get_text() for label in drawn[0].axes[0].get_yticklabels()] == ["this run"]
+
+
 def test_phases_need_a_group_and_numbers_in_every_window():
     curves = {**the_tragedy(2, 1200), "return_0": np.ones((2, 1200)), "return_1": np.ones((2, 1200))}
     changes, found = phases_of(curves, resamples=1)
@@ -169,6 +180,13 @@ def test_phases_need_a_group_and_numbers_in_every_window():
     assert phases_of({**curves, "equality": nobody}) is None
     alone = {name: values for name, values in curves.items() if name != "return_1"}
     assert phases_of(alone) is None
+
+
+def test_trainings_too_long_for_the_search_of_phases_are_drawn_without(tmp_path, drawn, monkeypatch):
+    monkeypatch.setattr(phases, "LONGEST", 1000)
+    for episodes in (1000, 1001):
+        training_curve(a_run(tmp_path / f"{episodes}", the_tragedy(1, episodes)), title="long")
+    assert [len(figure.axes) for figure in drawn] == [3, 2], "the strip of phases, and the two metrics"
 
 
 def test_the_published_phases_end_with_the_figure():

@@ -206,6 +206,7 @@ def test_limits_charge_so_much_for_each_bite_beyond_them(game, seed):
     assert not transfers.any()
 
 
+@pytest.mark.filterwarnings("ignore:Quota.window_steps is .* nobody ever harvests:UserWarning")
 @QUICK
 @given(game=games(), seed=SEEDS, share=st.sampled_from([0.3, 1.0]), window=st.integers(1, 9))
 def test_nobody_harvests_more_than_a_quota_in_a_window(game, seed, share, window):

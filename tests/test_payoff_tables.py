@@ -16,6 +16,7 @@ from cprl.theory import (
     sharing_table,
 )
 from cprl.theory import extras as needed
+from cprl.theory.evolution import _heuristic
 
 DILEMMA = PayoffTable.of_pairs([[3, 0], [5, 1]])
 STAG_HUNT = PayoffTable.of_pairs([[4, 0], [3, 1]])
@@ -132,11 +133,27 @@ def test_alpha_rank_of_games_worked_by_hand_without_a_warning(alpha, open_spiel)
         assert found.compositions == pytest.approx(np.array([1, mixed, both]) / (1 + mixed + both))
 
 
-def test_an_alpha_that_splits_the_chain_is_refused_and_the_limit_is_not(open_spiel):
-    with pytest.raises(ValueError, match=r"alpha is 50; allowed for this table: lower, or infinity"):
-        alpha_rank(STAG_HUNT, alpha=50)
-    assert alpha_rank(STAG_HUNT).compositions == pytest.approx([0.5, 0, 0.5], abs=1e-4)
-    assert alpha_rank(CHICKEN).compositions == pytest.approx([0, 1, 0], abs=1e-4)
+@pytest.mark.parametrize("alpha", [1.0, 5.0, 50.0, 500.0, inf])
+def test_where_several_compositions_are_almost_never_left_each_keeps_its_share(alpha, open_spiel):
+    assert alpha_rank(STAG_HUNT, alpha=alpha).compositions == pytest.approx([0.5, 0, 0.5], abs=1e-4)
+    assert alpha_rank(CHICKEN, alpha=max(alpha, 5)).compositions == pytest.approx([0, 1, 0], abs=1e-3)
+    # Two conventions that pay 100 and 90 each, 0 apart. Who leaves one loses 1 or 0.9, who joins one gains as
+    # much. A convention is entered as often as it is left, so shares are in proportion to f(1) / f(-1) and
+    # f(0.9) / f(-0.9); of 50 mutants f(u) / f(-u) = exp(49 u).
+    if alpha == 1:
+        found = alpha_rank(PayoffTable.of_pairs([[100, 0], [0, 90]]), alpha=alpha).compositions
+        assert found[[0, 2]] == pytest.approx(np.array([np.exp(4.9), 1]) / (1 + np.exp(4.9)))
+
+
+def test_alpha_rank_is_that_of_open_spiel_where_that_finds_a_single_long_run(open_spiel):
+    rng = np.random.default_rng(0)
+    for agents, strategies in ((2, 2), (2, 4), (3, 3)):
+        counts = compositions(agents, strategies)
+        table = PayoffTable(agents=agents, payoffs=rng.normal(size=(len(counts), strategies)))
+        theirs = open_spiel.compute([_heuristic(table.normalised)] * agents, m=50, alpha=0.2)[2]
+        played = np.array(np.unravel_index(np.arange(len(theirs)), (strategies,) * agents))
+        shares = [theirs @ (played == own).mean(0) for own in range(strategies)]
+        assert alpha_rank(table, alpha=0.2).shares == pytest.approx(shares)
 
 
 def test_alpha_rank_of_more_agents_is_by_what_the_leaving_one_gains(open_spiel):

@@ -21,6 +21,7 @@ from test_rerun_logger import column
 
 import cprl
 from cprl import presets
+from cprl.custom import Custom
 from cprl.evaluation.film import film
 from cprl.measuring.movement import Trace
 from cprl.measuring.published import curve, published_experiment
@@ -171,6 +172,31 @@ def test_the_command_writes_a_report(run, tmp_path, capsys, monkeypatch):
     monkeypatch.setattr("sys.argv", ["cprl", "report"])
     with pytest.raises(SystemExit, match="cprl: cprl report wants at least one run"):
         cli.main()
+
+
+@pytest.mark.integration
+def test_a_report_imports_code_of_ones_own_where_it_is_allowed(tmp_path, capsys, monkeypatch):
+    from cprl import cli
+
+    game = cprl.Game(map=cprl.maps.parse(">.A.\n.A.<"), rules=cprl.Rules(episode_steps=5))
+    target = "torchrl.envs:StepCounter"
+    own = cprl.Experiment(
+        name="counted",
+        game=game,
+        agents=[Scripted("random")] * 2,
+        episodes=4,
+        evaluation_episodes=2,
+        engine="eager",
+        transforms=(Custom(target, {}),),
+    )
+    run = cprl.run(own, tmp_path / "counted", watch="off", allow=[target])
+    with pytest.raises(ValueError, match=target):
+        write_report([run], tmp_path / "report")
+    assert "| counted |" in write_report([run], tmp_path / "report", allow=[target]).read_text()
+    line = ["cprl", "report", str(run), "--allow", target, "--out", str(tmp_path / "again")]
+    monkeypatch.setattr("sys.argv", line)
+    cli.main()
+    assert capsys.readouterr().out.splitlines()[-1] == str(tmp_path / "again" / "tables.md")
 
 
 def views_of(path):

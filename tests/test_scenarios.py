@@ -15,7 +15,7 @@ from cprl import Experiment, Observation, maps, presets
 from cprl.envs.matrix import stag_hunt
 from cprl.evaluation import Scenario, draw_scenarios, run_scenarios, scenarios_of
 from cprl.evaluation.lanes import Source, play, policies_of
-from cprl.evaluation.scenarios import backgrounds
+from cprl.evaluation.scenarios import backgrounds, suite
 from cprl.evaluation.scenarios.tables import estimates, scenario_tables
 from cprl.population import Frozen, Learning, Scripted
 from cprl.runs.directory import read_recipe
@@ -119,6 +119,31 @@ def test_a_stored_background_is_of_the_next_replica(runs):
     )
     expected = play(run, who, [0, 1, 2], episodes=2, seed=SEED, explore=True)
     assert returns(score.played["random"][0,]) == returns(expected)
+
+
+def keeping(run, *replicas):
+    """A run as if only these replicas had been kept."""
+    lanes = {f"replica_{number}" for number in replicas}
+    kept = {lane: own for lane, own in run.networks.items() if lane.split("/")[0] in lanes}
+    return replace(run, networks=kept)
+
+
+def test_where_replicas_are_missing_the_next_one_that_is_kept_is_the_background(runs):
+    run = keeping(cprl.load(runs["learned"]), 1, 2)
+    assert [suite._following(run, replica) for replica in (0, 1, 2, 3)] == [2, 2, 1, 1]
+
+
+def test_a_run_of_a_single_replica_is_not_its_own_background(runs, monkeypatch):
+    run = cprl.load(runs["learned"])
+    monkeypatch.setattr(suite, "load", lambda path, allow: keeping(run, 1))
+    background = tuple(Frozen(str(run.path), agent, replica=None) for agent in range(2))
+    own = Scenario(name="itself", game=MEADOW, focal="minority", background=background)
+    answer = "the scenario itself has the background .*learned, which keeps the single replica 1, so that"
+    with pytest.raises(ValueError, match=answer):
+        run_scenarios(keeping(run, 1), scenarios=[own], episodes=1)
+    assert run_scenarios(run, scenarios=[own], episodes=1, replicas=[0]).by_scenario, "another replica"
+    asked = replace(own, background=tuple(replace(spec, replica=1) for spec in background))
+    assert run_scenarios(keeping(run, 1), scenarios=[asked], episodes=1).by_scenario, "asked for"
 
 
 def experiment_of(run, agents):

@@ -7,10 +7,13 @@ from test_rerun_logger import GAME, SCENE, column, static, strict_rerun
 from test_watch import fake
 
 from cprl import CommonsEnv, presets
+from cprl.measuring.phases import LONGEST
 from cprl.measuring.published import PHASES_BEGIN
+from cprl.measuring.reported import reported_by
 from cprl.viewer import compiling
 from cprl.viewer.blueprint import layout
 from cprl.viewer.callback import ViewerCallback
+from cprl.viewer.contents import curves_of
 from cprl.viewer.header import Header, played
 from cprl.viewer.logger import RerunLogger
 from cprl.viewer.recipe import as_table
@@ -148,6 +151,15 @@ def test_phases_of_the_published_game_stand_beside_those_found():
     )
     assert published_phases(presets.game("single_basic")) == {}
     assert published_phases(None) == {}
+
+
+def test_a_recording_of_a_training_too_long_for_the_search_has_no_phases():
+    env = CommonsEnv(GAME, 1)
+    shown = {
+        episodes: curves_of(env, GAME.agent_names, reported_by(env), episodes=episodes).has_phases
+        for episodes in (999, 1000, LONGEST, LONGEST + 1)
+    }
+    assert shown == {999: False, 1000: True, LONGEST: True, LONGEST + 1: False}
 
 
 def test_while_code_is_compiled_the_live_header_says_for_how_long(monkeypatch):

@@ -94,17 +94,19 @@ def run(
     say(done)
 
 
-def report(runs: tuple[Path, ...], /, *, out: Path = Path("report")) -> None:
+def report(runs: tuple[Path, ...], /, *, out: Path = Path("report"), allow: Allow = ()) -> None:
     """Writes tables and figures of finished runs beside the published study.
 
     Args:
         runs: directories of runs, or of results.
         out: where to: tables.md and figures/.
+        allow: code of your own, module:Class, that a run may import; see docs/changing.md.
     """
     if not runs:
         raise ValueError("cprl report wants at least one run: cprl report RUN...")
+    make_importable(allow)
     prepare_process(SEED)
-    say(write_report(runs, out))
+    say(write_report(runs, out, allow=allow))
 
 
 def play(

@@ -286,6 +286,7 @@ OWN: Final[dict[str, dict[str, st.SearchStrategy[Any]]]] = {
     "cprl.reporting.report:write_report": {
         "runs": st.lists(_FINISHED, min_size=1, max_size=2),
         "out": hints.PATHS,
+        "allow": _ALLOW,
     },
     "cprl.preferences.wanted:wanted_rewards": {
         "rewards": st.sampled_from((np.ones((2, 3), np.float32), torch.zeros(1, 2), np.ones((2, 1)))),

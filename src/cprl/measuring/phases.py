@@ -28,7 +28,8 @@ METRICS: Final = ("collective_return", "equality", "survival_steps", "peacefulne
 GRID: Final = 50
 """The resolution of change points in episodes; running means over 100 episodes allow no finer one."""
 LONGEST: Final = 100_000
-"""The largest number of episodes; the search takes time in proportion to its square."""
+"""The largest number of episodes; the search takes time in proportion to its square. Longer trainings have
+no phases."""
 SHORTEST: Final = 200
 """The minimum length of a phase in episodes."""
 FEWEST_EPISODES: Final = 1_000

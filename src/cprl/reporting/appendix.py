@@ -55,14 +55,13 @@ def _trained(results: Sequence[Result]) -> list[str]:
     for result in results:
         study = result.study
         assert study is not None
-        values = result.curves["collective_return"].mean(1)
+        values = result.over_training("collective_return")
         cells = [result.name, f"{study.number}", f"{study.trained}", with_interval(values)]
-        whole = result.curves["collective_return"].shape[1] >= study.episodes
         for runs in RUNS:
             judged = verdicts.of_number(study.trained, values, runs=runs)
-            cells += [f"{prediction(values, runs=runs)}", judged] if whole else ["", TOO_FEW]
+            cells += [f"{prediction(values, runs=runs)}", judged] if result.is_whole else ["", TOO_FEW]
         rows.append([*cells, _evaluated(result, "trained")])
-    head = ["run", "experiment", "published", "mean over training, ours"]
+    head = ["run", "experiment", "published", "mean over training (at most the study's episodes), ours"]
     head += ["one run", "verdict", "mean of two runs", "verdict", "evaluation at epsilon 0.05, ours"]
     return ["## Appendix A beside ours: mean over training", "", *table(head, rows)]
 

@@ -1,7 +1,7 @@
 """The study's claims, each with a measure, its interval over replicas and a verdict."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -11,6 +11,7 @@ from cprl.measuring.predictions import prediction
 from cprl.measuring.shares import share
 from cprl.measuring.statistics import difference, estimate
 from cprl.reporting import verdicts
+from cprl.reporting.result import TOO_FEW
 
 Values = NDArray[np.float64]
 
@@ -99,6 +100,11 @@ def rule(claim: str, measure: str, shown: NDArray[Any]) -> Claim:
         ours=f"{found}",
         verdict=verdicts.of_share(found),
     )
+
+
+def where(is_long: bool, claim: Claim) -> Claim:
+    """A claim; its verdict says so where the training is too short for it."""
+    return claim if is_long else replace(claim, verdict=TOO_FEW)
 
 
 def with_interval(values: Values) -> str:

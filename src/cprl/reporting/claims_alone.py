@@ -12,7 +12,7 @@ from cprl.measuring.evaluate import evaluate
 from cprl.measuring.published import curve
 from cprl.policies.assignment import AgentPolicies
 from cprl.policies.scripted import ScriptedActor
-from cprl.reporting.claims import Claim, alike, more, number, side
+from cprl.reporting.claims import Claim, alike, more, number, side, where
 from cprl.reporting.measures import NEARNESS, OVERLAP, ROUNDS, dip_depth, falls
 from cprl.reporting.random_play import returns_by_chance
 from cprl.reporting.result import Result
@@ -30,20 +30,21 @@ GREEDY_WORLDS = 1_000
 def of_experiment_1(result: Result) -> Iterator[Claim]:
     """It learns where the apples are, strips them near episode 300, and recovers."""
     early = running_mean(result.curves["collective_return"], result.window)[:, :EARLY]
-    published = _published(result, EARLY)
-    yield number("a dip in the early training", _DIP, dip_depth(early), published=dip_depth(published)[0])
-    yield number(
-        "the dip is near episode 300", "its episode", _dip_at(early), published=_dip_at(published)[0]
-    )
+    published, is_long = _published(result, EARLY), early.shape[1] >= EARLY
+    depth, at = dip_depth(published)[0], _dip_at(published)[0]
+    yield where(is_long, number("a dip in the early training", _DIP, dip_depth(early), published=depth))
+    yield where(is_long, number("the dip is near episode 300", "its episode", _dip_at(early), published=at))
     late = result.curves["collective_return"][:, -LAST:].mean(1)
     measure = "return of the last 500 episodes, and lowest in the dip"
-    yield more("then it recovers", measure, late, _dip_bottom(early), paired=True)
+    recovers = more("then it recovers", measure, late, _dip_bottom(early), paired=True)
+    yield where(result.is_whole, recovers)
 
 
 def of_experiment_2(result: Result) -> Iterator[Claim]:
     """No dip, since depletion pays as much as random play; a policy that circles."""
     early = running_mean(result.curves["collective_return"], result.window)[:, :EARLY]
-    yield number("no dip", _DIP, dip_depth(early), published=dip_depth(_published(result, EARLY))[0])
+    depth = dip_depth(_published(result, EARLY))[0]
+    yield where(early.shape[1] >= EARLY, number("no dip", _DIP, dip_depth(early), published=depth))
     game = result.experiment.game
     if isinstance(game, Game):
         ratio = _greedy_returns(game) / returns_by_chance(game).mean()
@@ -55,16 +56,17 @@ def of_experiment_2(result: Result) -> Iterator[Claim]:
 
 def of_experiment_3(result: Result, others: Sequence[Result]) -> Iterator[Claim]:
     """Two learners get more than one, alike, in territories, use the beam less and less, and sustain."""
-    own = result.curves["collective_return"].mean(1)
+    own = result.over_training("collective_return")
     alone = [one for one in others if one.study and one.study.number == 2]
     for one in alone:
         measure = f"mean over training, and that of {one.name}; published 191.7 and 177.4"
         claim = "the sum is about 8 % above experiment 2"
-        yield more(claim, measure, own, one.curves["collective_return"].mean(1), paired=False)
+        above = more(claim, measure, own, one.over_training("collective_return"), paired=False)
+        yield where(result.is_whole and one.is_whole, above)
     played = result.measures
     ratio = played.training["return of the poorest agent over that of the richest, whole training"]
     claim, measure = "both earn almost the same", "the lower mean over training over the higher one"
-    yield alike(claim, measure, ratio, within=(0.8, 1.2))
+    yield where(result.is_whole, alike(claim, measure, ratio, within=(0.8, 1.2)))
     if OVERLAP in played.trained:
         measure = "overlap of the cells that the two visit, random agents' and theirs"
         yield more(
@@ -101,8 +103,9 @@ def of_experiment_4(result: Result, others: Sequence[Result]) -> Iterator[Claim]
         measure = "running means at episodes 450 to 550, and the first"
         claim = "while the learner's rises"
         yield more(claim, measure, learner[:, fallen].mean(1), learner[:, 0], paired=True)
-    values, measure = result.curves["return_1"].mean(1), "its mean over training"
-    yield number("the random agent gets 28.9 apples", measure, values, published=28.9)
+    values, measure = result.over_training("return_1"), "its mean over training"
+    gets = number("the random agent gets 28.9 apples", measure, values, published=28.9)
+    yield where(result.is_whole, gets)
     played, of_learner = result.measures, f"{NEARNESS}, agent 0"
     if of_learner in played.trained:
         yield side("it tags when near", of_learner, played.trained[of_learner], below=1)
@@ -110,7 +113,8 @@ def of_experiment_4(result: Result, others: Sequence[Result]) -> Iterator[Claim]
     if shots is not None:
         late = shots[:, -LAST:, 0].mean(1)
         measure = "the learner's shots an episode, a random agent's and its own, last 500"
-        yield more("it tags occasionally", measure, shots[:, -LAST:, 1].mean(1), late, paired=True)
+        tags = more("it tags occasionally", measure, shots[:, -LAST:, 1].mean(1), late, paired=True)
+        yield where(result.is_whole, tags)
     yield from _circles(result)
     yield from _lasts(result, "it prevents depletion")
     empty, pairs = _ends_empty(result), [one for one in others if one.study and one.study.number == 3]
@@ -118,7 +122,8 @@ def of_experiment_4(result: Result, others: Sequence[Result]) -> Iterator[Claim]
         theirs = _ends_empty(one)
         if empty is not None and theirs is not None:
             measure = f"episodes of the last 500 that end empty, {one.name} and here"
-            yield more("and better than two learners", measure, theirs, empty, paired=False)
+            better = more("and better than two learners", measure, theirs, empty, paired=False)
+            yield where(result.is_whole and one.is_whole, better)
 
 
 _DIP = "deepest fall below the peak so far before episode 600, as a share of it"
@@ -169,4 +174,4 @@ def _lasts(result: Result, claim: str) -> Iterator[Claim]:
     empty = _ends_empty(result)
     if empty is not None:
         measure = "share of the last 500 episodes that end empty, sustainable if below a half"
-        yield side(claim, measure, empty, below=0.5)
+        yield where(result.is_whole, side(claim, measure, empty, below=0.5))

@@ -13,7 +13,7 @@ from cprl.measuring.published import PHASED_RECIPE, PHASES_BEGIN, curve, publish
 from cprl.measuring.shares import share
 from cprl.population import Learning
 from cprl.reporting import verdicts
-from cprl.reporting.claims import Claim, more, number, rule, side
+from cprl.reporting.claims import Claim, more, number, rule, side, where
 from cprl.reporting.markdown import table
 from cprl.reporting.result import Result
 from cprl.runs.curves import running_mean
@@ -44,8 +44,11 @@ def of_experiment_5(result: Result) -> Iterator[Claim]:
                 **{"above" if sign > 0 else "below": 0.0},
             )
     survival = running_mean(curves["survival_steps"], result.window).min(1)
-    published = float(_published(result, "survival_steps")[1].min())
-    yield number("survival falls to 612 steps", "lowest running mean", survival, published=published)
+    at, values = _published(result, "survival_steps")
+    falls = number(
+        "survival falls to 612 steps", "lowest running mean", survival, published=float(values.min())
+    )
+    yield where(episodes > at[values.argmin()], falls)
     found = combat_of(result)
     if found is not None:
         yield rule("tragedy", "return, survival and peacefulness fall together", found.tragedy)

@@ -40,14 +40,15 @@ class Measures:
     """Of the random policy in the same worlds."""
 
 
-def measures(run: Path, *, window: int = SMOOTHED_EPISODES) -> Measures:
+def measures(run: Path, *, window: int = SMOOTHED_EPISODES, allow: Sequence[str] = ()) -> Measures:
     """All measures of a run: of its training curves, and of its trained agents in new worlds.
 
     Args:
         run: The directory of the run, or of its exported results.
         window: The window of the running means of which some measures are, in episodes.
+        allow: See `cprl.load`.
     """
-    loaded = load(run)
+    loaded = load(run, allow=allow)
     replicas = tuple(loaded.replicas)
     trained = _at_play(loaded, replicas, partial(policies_of, [Source(loaded)] * loaded.game.agents))
     return Measures(

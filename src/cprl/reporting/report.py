@@ -24,23 +24,25 @@ from cprl.reporting.turning import phases_of, turning_points_of
 from cprl.runs.files import write_atomically
 
 
-def write_report(runs: Sequence[Path], out: Path) -> Path:
+def write_report(runs: Sequence[Path], out: Path, *, allow: Sequence[str] = ()) -> Path:
     """Writes `tables.md` and its figures.
 
     Args:
         runs: The directories of runs, or of exported results.
         out: The folder of the report; created if missing.
+        allow: See `cprl.load`.
 
     Returns:
         The path `out/tables.md`.
 
     Raises:
-        ValueError: If a path has no run.
+        ValueError: If a path has no run, or code of the user's own that is not allowed.
         FileNotFoundError: If a run has no episodes or has not ended.
     """
     folders = objects("runs", runs, (str, os.PathLike), "paths")
     out = arguments.path("out", out)
-    results = [read_result(arguments.path("runs", path)) for path in folders]
+    allow = arguments.texts("allow", tuple(arguments.listed("allow", allow, "texts")))
+    results = [read_result(arguments.path("runs", path), allow=allow) for path in folders]
     (out / "figures").mkdir(parents=True, exist_ok=True)
     of_study = [result for result in results if result.study]
     lines = [

@@ -1,6 +1,6 @@
 """Result: the files of a finished run that a report needs."""
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from cprl import presets
 from cprl.algorithms import DQN
 from cprl.commons.game import Game
+from cprl.commons.maps import Map
 from cprl.experiment import Experiment
 from cprl.measuring.published import SMOOTHED_EPISODES, PublishedExperiment, published_experiment
 from cprl.population import Learning, Scripted, Team, exploration_steps
@@ -42,6 +43,8 @@ class Result:
     curves: Mapping[str, Values]
     study: PublishedExperiment | None
     """The study's experiment that it repeats, see `study_of`."""
+    allow: Sequence[str] = ()
+    """The user's own code, "module:Class", that the run may import."""
 
     @property
     def name(self) -> str:
@@ -88,6 +91,17 @@ class Result:
         return game if scored and isinstance(game, Game) and not game.institutions else None
 
     @property
+    def is_whole(self) -> bool:
+        """Whether it has as many episodes as the study's experiment, or more."""
+        return self.study is not None and self.curves["collective_return"].shape[1] >= self.study.episodes
+
+    def over_training(self, metric: str) -> Values:
+        """The mean of a metric over the training of each replica, [R]; of a longer training than the study's,
+        over as many episodes as that has."""
+        means: Values = self.curves[metric][:, : self.study.episodes if self.study else None].mean(1)
+        return means
+
+    @property
     def window(self) -> int:
         """The window of its running means in episodes: that of the published curves, if there are any."""
         return self.study.window_episodes if self.study else SMOOTHED_EPISODES
@@ -101,7 +115,7 @@ class Result:
     @cached_property
     def measures(self) -> Measures:
         """Measures of its training, and of its agents in new worlds."""
-        return measures(self.path, window=self.window)
+        return measures(self.path, window=self.window, allow=self.allow)
 
     def of_agents(self, column: str) -> Values | None:
         """A column of the table of episodes for each agent, float64 [R, E, N]; None if there is no such
@@ -140,11 +154,15 @@ class Result:
         return {name: running_mean(values, values.shape[1])[:, 0] for name, values in curves.items()}
 
 
-def read_result(path: Path) -> Result:
+def read_result(path: Path, *, allow: Sequence[str] = ()) -> Result:
     """Reads a run's directory, or its exported results.
 
+    Args:
+        path: The directory.
+        allow: See `cprl.load`.
+
     Raises:
-        ValueError: If the path has no run, or one of a game without harvest.
+        ValueError: If the path has no run, or one of a game without harvest; for code that is not allowed.
         FileNotFoundError: If the run has no episodes or has not ended.
     """
     recipe, curves = read_recipe(path), curves_of(path)
@@ -153,7 +171,7 @@ def read_result(path: Path) -> Result:
             f"{path} plays a game that reports no harvest; allowed in a report beside the published study: a "
             "commons; evaluate_run and crossplay measure the returns of others"
         )
-    experiment = Experiment.from_recipe(recipe, directory=path)
+    experiment = Experiment.from_recipe(recipe, allow=allow, directory=path)
     return Result(
         path=path,
         recipe=recipe,
@@ -161,16 +179,18 @@ def read_result(path: Path) -> Result:
         report=read_json(path / "report.json"),
         curves=curves,
         study=study_of(recipe["recipe"], experiment),
+        allow=allow,
     )
 
 
 def study_of(recipe: str, experiment: Experiment) -> PublishedExperiment | None:
-    """The study's experiment that a run repeats: by the name of its recipe, or since it plays a variant of
-    the study's game, beam included, with as many agents that learn by DQN, whatever their settings; None for
-    others."""
-    if (named := published_experiment(recipe)) is not None:
-        return named
+    """The study's experiment that a run repeats: by the name of its recipe, if it plays on the study's map,
+    which has the number of agents, whatever the rules; or since it plays a variant of the study's game, beam
+    included, with as many agents that learn by DQN, whatever their settings; None for others."""
     game, specs = experiment.game, experiment.agents
+    named = published_experiment(recipe)
+    if named is not None and isinstance(game, Game) and game.map == _map_of(named):
+        return named
     if not isinstance(game, Game) or presets.variant_of(game) is None:
         return None
     if game.agents > 1 and not game.rules.may_fire:
@@ -181,3 +201,8 @@ def study_of(recipe: str, experiment: Experiment) -> PublishedExperiment | None:
         return None
     boards = {presets.game(board).map: board for board in presets.BOARDS}
     return published_experiment("two_against_random" if against_random else boards[game.map])
+
+
+def _map_of(study: PublishedExperiment) -> Map:
+    board = "two_complex" if study.recipe == "two_against_random" else study.recipe
+    return next(presets.game(own).map for own in presets.BOARDS if own == board)

@@ -9,8 +9,10 @@ import numpy as np
 from matplotlib.axes import Axes
 from numpy.typing import NDArray
 
+from cprl import presets
 from cprl.arguments import objects, path
 from cprl.checks import NONE, TEXT, checked, count, either
+from cprl.config import to_config
 from cprl.measuring.episodes import Episode
 from cprl.measuring.names import title as metric_title
 from cprl.measuring.names import unit
@@ -63,7 +65,7 @@ def training_curve(
     """Plots the collective return in each episode of a run, and survival below it.
 
     Every episode and replica is faint, the mean over replicas and its highest point bold. Running means are
-    centred. Trainings of at least 1,000 episodes have their phases as bands behind the curves; those of the
+    centred. Trainings of 1,000 to 100,000 episodes have their phases as bands behind the curves; those of the
     published curves stand above if the run repeats their experiment. A game without a harvest has one panel,
     the return of all its agents. Games with institutions have two more, violations and fines of all agents.
 
@@ -196,5 +198,11 @@ def _note(window: int, *, is_over: bool) -> str:
 
 
 def _is_published(run: Path) -> bool:
-    """Whether a run repeats the experiment whose phases the study draws."""
-    return (run / RECIPE).exists() and read_recipe(run)["recipe"] == PHASED_RECIPE
+    """Whether a run repeats the experiment whose phases the study draws: by the name of its recipe, on the
+    study's map, which has the number of agents."""
+    if not (run / RECIPE).exists():
+        return False
+    recipe = read_recipe(run)
+    game = (recipe.get("experiment") or {}).get("game") or {}
+    is_same: bool = game.get("map") == to_config(presets.game("commons").map)
+    return is_same and recipe["recipe"] == PHASED_RECIPE

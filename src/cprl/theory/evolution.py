@@ -48,7 +48,10 @@ class AlphaRank:
 
 
 def alpha_rank(table: PayoffTable, *, alpha: float = inf, population: int = POPULATION) -> AlphaRank:
-    """Alpha-rank of a symmetric game, by OpenSpiel.
+    """Alpha-rank of a symmetric game; in the limit of infinite alpha by OpenSpiel.
+
+    For finite alpha it has the numbers of OpenSpiel where that finds a single long run, and others where
+    OpenSpiel's probabilities round, see `_stationary`.
 
     Payoffs are first scaled to 0..1, so that alpha means the same in every game. In the limit of infinite
     alpha a mutant takes over if it gets more, with probability 1/2 if it gets the same (to 1e-5 of what it
@@ -61,8 +64,7 @@ def alpha_rank(table: PayoffTable, *, alpha: float = inf, population: int = POPU
         population: the agents of each population, for finite alpha.
 
     Raises:
-        ValueError: for a larger table, numbers out of range, and for an alpha so high that the numbers of
-            mutants that get less and still take over are 0 in float64; the limit has no such bound.
+        ValueError: for a larger table, and numbers out of range.
         ModuleNotFoundError: if OpenSpiel is not installed.
     """
     arguments.object_of("table", table, PayoffTable, "a PayoffTable")
@@ -96,23 +98,65 @@ def check_alpha(alpha: float) -> float:
 
 def _long_run(table: PayoffTable, alpha: float, population: int) -> Values:
     """The share of each profile of N agents, [S^N], the last agent's strategy changing fastest."""
-    rank, tables = extra("open_spiel.python.egt.alpharank"), [_heuristic(table.normalised)] * table.agents
+    rank = extra("open_spiel.python.egt.alpharank")
     if alpha != inf:
-        try:
-            with np.errstate(over="ignore"):  # 1 / exp of much is 0, as it should be
-                found = rank.compute(tables, m=population, alpha=alpha)[2]
-        except ValueError as error:
-            raise ValueError(
-                f"alpha is {alpha:g}; allowed for this table: lower, or infinity, since mutants that get "
-                f"less take over with a probability that rounds to 0 ({error})"
-            ) from error
-        return _shares(found)
+        return _stationary(_takeovers(table.normalised, alpha, population))
+    tables = [_heuristic(table.normalised)] * table.agents
     for noise in _NOISES:
         try:
             return _shares(rank.compute(tables, use_inf_alpha=True, inf_alpha_eps=noise)[2])
         except ValueError as error:
             last = error
     raise last
+
+
+def _takeovers(table: PayoffTable, alpha: float, population: int) -> Values:
+    """The logarithms of the probabilities, up to a factor, with which a profile is followed by another one,
+    [S^N, S^N]; those of OpenSpiel, which round to 0 for a high alpha."""
+    agents, strategies = table.agents, table.strategies
+    numbers = np.arange(strategies**agents)
+    played = np.array(np.unravel_index(numbers, (strategies,) * agents)).T
+    rows = [table.rows[tuple(np.bincount(own, minlength=strategies).tolist())] for own in played]
+    payoffs = table.payoffs[rows]  # [S^N, S]
+    found = np.full((len(numbers), len(numbers)), -inf)
+    for agent in range(agents):
+        now = payoffs[numbers, played[:, agent]]
+        for mutant in range(strategies):
+            then = numbers + (mutant - played[:, agent]) * strategies ** (agents - 1 - agent)
+            found[numbers, then] = _takes_over(alpha * (payoffs[then, mutant] - now), population)
+    return found
+
+
+def _takes_over(gain: Values, population: int) -> Values:
+    """The logarithm of the probability (1 - exp(-gain)) / (1 - exp(-population x gain)) that a mutant takes
+    over a population, like `gain`, which is alpha times what it gets more."""
+    is_none = np.abs(gain) <= 1e-14
+    size = np.where(is_none, 1.0, np.abs(gain))
+    ratio = np.log(-np.expm1(-size)) - np.log(-np.expm1(-population * size))
+    found: Values = np.where(is_none, -np.log(population), ratio + np.minimum(gain, 0.0) * (population - 1))
+    return found
+
+
+def _stationary(rates: Values) -> Values:
+    """The stationary distribution of a chain, [P], without subtraction and in logarithms, so that states that
+    are almost never left keep their shares.
+
+    Source: W. Grassmann, M. Taksar and D. Heyman, "Regenerative Analysis and Steady State Distributions for
+    Markov Chains" (1985).
+
+    Args:
+        rates: the logarithms of its transitions up to a factor, [P, P], each state reached from each; changed
+            in place, and the diagonal is not read.
+    """
+    shares = np.zeros(len(rates))
+    for last in range(len(rates) - 1, 0, -1):
+        rates[:last, last] -= np.logaddexp.reduce(rates[last, :last])
+        through = rates[:last, last, None] + rates[last, :last]
+        rates[:last, :last] = np.logaddexp(rates[:last, :last], through)
+    for state in range(1, len(rates)):
+        shares[state] = np.logaddexp.reduce(shares[:state] + rates[:state, state])
+    found: Values = np.exp(shares - np.logaddexp.reduce(shares))
+    return found
 
 
 def _shares(found: Any) -> Values:

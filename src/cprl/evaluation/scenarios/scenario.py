@@ -37,8 +37,8 @@ class Scenario:
     """How many agents are focal, see `Focal`; in a game of two agents both are one."""
     background: tuple[Scripted | Frozen, ...]
     """Who plays with each agent index where it is not focal. `Frozen(run, agent, replica=None)` is, beside
-    replica r of the focal run, the agent of replica r + 1 of its own run, the first one after the last:
-    so agents of one replica, trained together or from the same seed, never meet."""
+    replica r of the focal run, the agent of the next replica that its own run keeps, the first one after
+    the last: so agents of one replica, trained together or from the same seed, never meet."""
 
     def __post_init__(self) -> None:
         check_fields(

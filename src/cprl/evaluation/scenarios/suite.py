@@ -64,6 +64,7 @@ def run_scenarios(
     stored = _stored(loaded, chosen, allow)
     check(episodes=episodes, seed=seed, greedy=greedy, runs=[loaded, *stored.values()])
     numbers = chosen_replicas({str(loaded.path): loaded}, replicas)
+    _refuse_meeting_itself(loaded, chosen, stored, numbers)
 
     def played(members: Sequence[Member]) -> Played:
         who = partial(_policies, loaded.game, members, worlds=episodes, seed=seed)
@@ -150,10 +151,40 @@ def _background(spec: Scripted | Frozen, stored: Mapping[str, LoadedRun]) -> Mem
     run = stored[spec.run]
 
     def theirs(replica: int) -> StoredAgent:
-        following = run.replicas[(replica + 1) % len(run.replicas)]
-        return run.agent(spec.agent, replica=following if spec.replica is None else spec.replica_for(replica))
+        number = _following(run, replica) if spec.replica is None else spec.replica_for(replica)
+        return run.agent(spec.agent, replica=number)
 
     return theirs
+
+
+def _following(run: LoadedRun, replica: int) -> int:
+    """The number of the replica of a background that plays beside this one: of those that it keeps the next,
+    the first after the last."""
+    kept = run.replicas  # some may be missing
+    before = kept.index(replica) if replica in kept else replica
+    return kept[(before + 1) % len(kept)]
+
+
+def _refuse_meeting_itself(
+    run: LoadedRun, scenarios: Sequence[Scenario], stored: Mapping[str, LoadedRun], replicas: Sequence[int]
+) -> None:
+    """Raises a ValueError for a background that has no other replica than one that it would play beside."""
+    for scenario in scenarios:
+        for spec in scenario.background:
+            if not isinstance(spec, Frozen) or spec.replica is not None:
+                continue
+            own = stored[spec.run]
+            if (
+                own.experiment.seed == run.experiment.seed
+                and len(own.replicas) == 1
+                and own.replicas[0] in replicas
+            ):
+                raise ValueError(
+                    f"the scenario {scenario.name} has the background {own.path}, which keeps the single "
+                    f"replica {own.replicas[0]}, so that agents trained together or from the same seed, "
+                    f"{run.experiment.seed}, would meet; allowed: a run of at least 2 replicas, one of "
+                    "another seed, or a Frozen with the number of its replica"
+                )
 
 
 def _policies(
