@@ -2,6 +2,7 @@
 
 from collections import deque
 from dataclasses import replace
+from functools import partial
 from io import BytesIO
 
 import pytest
@@ -478,6 +479,23 @@ def replay_learner_of(make_loss, **changes):
         make_loss=make_loss,
         **HOW,
     )
+
+
+def test_a_loss_of_each_transition_learns_as_their_mean():
+    def of(reduction):
+        learner = replay_learner_of(partial(made, reduction=reduction))
+        played = turns(learner.actor)
+        losses = [take(learner, next(played)) for _ in range(20)]
+        return losses[-1], learner.stock.network_state(0)
+
+    def made(network, *, reduction):
+        loss = DQN(settings=REPLAY).make_loss(network)
+        loss.reduction = reduction
+        return loss
+
+    (of_each, weights), (of_mean, expected) = of("none"), of("mean")
+    assert of_each.tolist() == of_mean.tolist()
+    assert all(weights[name].equal(expected[name]) for name in expected)
 
 
 class OneStepLoss(DQNLoss):
