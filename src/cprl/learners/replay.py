@@ -198,6 +198,10 @@ class ReplayLearner:
         """A copy of each lane's current acting network, by "replica_0/agent_0" and so on."""
         return self._lanes.networks(self.engine)
 
+    def begin(self) -> None:
+        """Ends the episodes that an earlier training left unfinished; see `Learner`."""
+        self.buffer.storage.cut()
+
     def store(self, batch: TensorDictBase) -> None:
         """Stores one step of every replica, as the collector yields it."""
         self.buffer.write(self._lanes.turn(batch, wanted_in(self.wants, batch)))

@@ -159,6 +159,12 @@ class RolloutLearner:
         """A copy of each lane's current acting network, by "replica_0/agent_0" and so on."""
         return self._lanes.networks(self.engine)
 
+    def begin(self) -> None:
+        """Drops the rollout that an earlier training left unfinished; see `Learner`."""
+        self._size = 0
+        if self._states is not None:
+            self._states.forget()
+
     def store(self, batch: TensorDictBase) -> None:
         """Stores one step of every replica, as the collector yields it.
 
