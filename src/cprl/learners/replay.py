@@ -72,9 +72,9 @@ class ReplayLearner:
 
     Raises:
         ValueError: for a loss that needs the latest steps of the current policy (see
-            `cprl.learners.rollouts`), for a team without the team reward, unless it has `own_rewards`, and
-            for one that sees its peers; for a recurrent network without sequences, or of a team, and for
-            sequences without such a network.
+            `cprl.learners.rollouts`), and for settings of targets if it has none; for a team without the team
+            reward, unless it has `own_rewards`, and for one that sees its peers; for a recurrent network
+            without sequences, or of a team, and for sequences without such a network.
     """
 
     def __init__(

@@ -126,7 +126,6 @@ class TorchRLReplayLearner:
             loss_share=1 / spaces.actions if settings.mean_over_all_outputs else 1.0,
             device=device,
         )
-        _check(settings, self.stock.each[0].loss)
         self.updaters = [_target_updater(agent.loss, settings) for agent in self.stock.each]
         if settings.own_target_weights:
             self._init_targets(make_loss)
@@ -318,12 +317,6 @@ def _target_updater(loss: LossModule, settings: DQNSettings) -> TargetNetUpdater
         return SoftUpdate(loss, tau=settings.tau)
     # HardUpdate copies at every (interval + 1)-th step.
     return HardUpdate(loss, value_network_update_interval=settings.target_every_episodes - 1)
-
-
-def _check(settings: DQNSettings, loss: LossModule) -> None:
-    for name, default in (("tau", None), ("own_target_weights", False)):
-        if getattr(settings, name) != default and not targets_of(loss):
-            raise ValueError(f"{name} is {getattr(settings, name)}, and the loss has no targets")
 
 
 def _check_memory(lanes: Lanes, settings: DQNSettings, device: torch.device) -> None:
