@@ -265,8 +265,8 @@ class TorchRLReplayLearner:
 
     def values(self, batch: TensorDictBase) -> Tensor:
         """The highest action value of each agent at the end of a turn, [R, S]; NaN where its network
-        outputs a policy."""
-        if self._lanes.stochastic:
+        outputs a policy, or a continuous action."""
+        if self._lanes.stochastic or self.spaces.action_size:
             return torch.full((self.replicas, len(self.agents)), torch.nan)
         with torch.no_grad():
             return self._lanes.by_agent(self.stock.outputs(self._lanes.seen_next(batch)).amax(-1))
