@@ -10,6 +10,7 @@ from torch import Tensor, nn
 from torchrl.objectives.value.functional import generalized_advantage_estimate
 
 from cprl.learners.buffer.rollout import refuse_full, rollout_fields, write_turn
+from cprl.learners.buffer.sampler import steps_ahead
 from cprl.learners.checks import check_learner, refuse_continuous
 from cprl.learners.engine.base import Engine
 from cprl.learners.engine.choice import TRIAL_LANES, EngineName, make_engine, trial_batch, trial_rollout
@@ -99,7 +100,8 @@ class RolloutLearner:
         )
         self.engine = self._make_engine(engine, make_loss, compile=compile, device=device)
         self.actor = self._lanes.actor(self.engine, compile=compile)
-        self.rng = LaneRng(self._lanes.seeds(SAMPLING), settings.rollout_steps)
+        steps = settings.rollout_steps
+        self.rng = LaneRng(self._lanes.seeds(SAMPLING), steps, ahead=steps_ahead(steps))
         size = (settings.rollout_steps,)
         self._rollout = rollout_fields(spaces, self._lanes, size, torch.device(device))
         self._size = 0
