@@ -14,9 +14,13 @@ import torch
 import train_and_die
 from rich.console import Console
 
+from cprl.algorithms import PPO, RolloutSettings
+from cprl.learners.lanes import SAMPLING, lane_seeds
+from cprl.policies.rng import DRAWN_AHEAD, LaneRng
 from cprl.runs.checkpoints import Checkpointer, checkpoints_in, read_checkpoint
 from cprl.runs.episodes import EpisodeTable, read_episodes
 from cprl.runs.weights import load_weights
+from cprl.spaces import Spaces
 
 SCRIPT = Path(train_and_die.__file__)
 EPISODES = 25
@@ -242,3 +246,22 @@ def test_a_table_goes_on_behind_the_rows_of_a_checkpoint(tmp_path):
     with pytest.raises(KeyboardInterrupt):
         resume(6)
     assert read_episodes(tmp_path / "run").equals(rows.slice(0, 6))
+
+
+def test_few_numbers_of_rollout_learners_are_drawn_ahead_and_earlier_states_hold_more():
+    spaces = Spaces(agents=2, observation_shape=(3, 2, 2), actions=3)
+
+    def learner():
+        algorithm = PPO(settings=RolloutSettings(hidden_cells=(4,)))
+        return algorithm.make_learner(spaces, agents=(0, 1), replicas=1, engine="eager", seed=4)
+
+    seeds = lane_seeds(4, replicas=range(1), agents=(0, 1), purpose=SAMPLING)
+    before, now = LaneRng(seeds, 250, ahead=DRAWN_AHEAD), learner()
+    for _ in range(70):  # more than are drawn ahead
+        assert torch.equal(now.rng.next(), before.next())
+    state = now.state_dict()
+    assert state["draws"]["numbers"].numel() <= 2 * 2**14
+    resumed = learner()
+    resumed.load_state_dict({**state, "draws": before.state_dict()})
+    for _ in range(DRAWN_AHEAD):  # past those of the state
+        assert torch.equal(resumed.rng.next(), now.rng.next())

@@ -298,6 +298,15 @@ def test_every_algorithm_of_replay_learns_from_returns_of_several_steps(algorith
     assert torch.isfinite(losses[-1]).all()
 
 
+@pytest.mark.parametrize("engine", ["eager", "torchrl"])
+@pytest.mark.parametrize("algorithm", [SAC, IQL, DistributionalDQN])
+def test_relu_on_outputs_is_refused_where_no_q_values_act(algorithm, engine):
+    made = algorithm(settings=replace(SETTINGS, relu_on_outputs=True))
+    message = rf"settings\.relu_on_outputs is True; allowed for {algorithm.__name__}, .*: False"
+    with pytest.raises(ValueError, match=message):
+        made.make_learner(GAME.spaces, agents=(0,), replicas=1, engine=engine)
+
+
 def test_a_loss_that_takes_no_notice_of_the_steps_is_refused():
     def make_loss(network):
         loss = dqn_loss(network, gamma=SETTINGS.gamma)

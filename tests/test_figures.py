@@ -16,7 +16,7 @@ from test_results import an_episode
 
 import cprl
 from cprl import Game, Rules, maps, presets
-from cprl.algorithms import DQN, PPO
+from cprl.algorithms import DQN, IQL, MADDPG, PPO, PR2, SAC
 from cprl.config import to_config
 from cprl.learners.settings import DQNSettings, RolloutSettings
 from cprl.measuring import phases
@@ -24,7 +24,7 @@ from cprl.measuring.phases import PHASES
 from cprl.measuring.published import published_experiment
 from cprl.plotting import style
 from cprl.plotting.bands import UNNAMED, bands_of, published_bands
-from cprl.population import Learning, Scripted, exploration_steps
+from cprl.population import Learning, Scripted, Team, exploration_steps
 from cprl.reporting import figures as reported
 from cprl.reporting.result import Result
 from cprl.runs.curves import centres, episode_of_step, phases_of
@@ -201,6 +201,10 @@ def test_exploration_ends_with_the_last_agents_epsilon():
     assert exploration_steps([dqn(800, 1000), Scripted(), dqn(0, 2000)]) == 2000
     assert exploration_steps([Learning(PPO(settings=RolloutSettings())), Scripted()]) is None
     assert exploration_steps([dqn(0, 10, epsilon_start=0.1, epsilon_end=0.1)]) is None, "it never falls"
+    policies = [Learning(kind(settings=DQNSettings())) for kind in (SAC, IQL, PR2)]
+    team = Team(MADDPG(settings=DQNSettings()), agents=(3, 4))
+    assert exploration_steps([*policies, team]) is None, "they draw from their policies"
+    assert exploration_steps([*policies, dqn(0, 70)]) == 70
     steps = {"survival_steps": np.array([[10.0, 10.0, 10.0], [5.0, 5.0, 20.0]])}
     assert episode_of_step(steps, 20) == 1.5, "in the second and in the third episode"
     assert episode_of_step(steps, 31) is None

@@ -5,6 +5,7 @@ from functools import partial
 
 import pytest
 import torch
+from tensordict import TensorDict
 from torch import nn
 
 from cprl import CommonsEnv, Game, Rules, maps
@@ -31,6 +32,7 @@ from cprl.custom import Custom
 from cprl.learners.engine import choice
 from cprl.learners.engine.base import ListEngine
 from cprl.learners.engine.compiled import FunctionalEngine
+from cprl.learners.engine.functional import own_targets
 from cprl.learners.replay import ReplayLearner
 from cprl.networks import MLP, Conv, ConvNetwork, MLPNetwork
 from cprl.networks.specification import new_network
@@ -288,3 +290,25 @@ def test_networks_are_made_without_hidden_layers_too():
     for network in (MLP(hidden_cells=()), Conv(hidden_cells=())):
         assert network.make(SPACES, 8)(torch.zeros(2, *SPACES.observation_shape)).shape == (2, 8)
     assert isinstance(Conv().make(SPACES, 8), ConvNetwork)
+
+
+RANGES = [(-5.0, 100.0, 51), (-10.0, 200.0, 51), (0.0, 250.0, 31), (-0.3, 0.0, 7), (1e8, 1e8 + 999, 51)]
+RANGES += [(low, high, atoms) for low in (-100, -7, 0) for high in (1, 12.5, 60, 300) for atoms in (11, 101)]
+
+
+@pytest.mark.parametrize(("lowest", "highest", "atoms"), RANGES)
+def test_c51_takes_returns_beyond_its_range_for_its_first_and_last_atom(lowest, highest, atoms):
+    algorithm = DistributionalDQN(settings=REPLAY, lowest_return=lowest, highest_return=highest, atoms=atoms)
+    network = algorithm.make_network(VECTORS)
+    loss = algorithm.make_loss(network)
+    own_targets(loss)
+    loss.reduction = "none"
+    seen, ends = torch.rand(4, 6), torch.ones(4, 1, dtype=torch.bool)
+    reward = torch.tensor([1e12, -1e12, -1e12, 1e12])[:, None]
+    after = TensorDict({"observation": seen, "reward": reward, "done": ends, "terminated": ends}, [4])
+    batch = TensorDict({"observation": seen, "action": torch.zeros(4, dtype=torch.int64), "next": after}, [4])
+    chances = network.atom_logits(seen)[..., 0].log_softmax(-1)
+    atom = torch.tensor([atoms - 1, 0, 0, atoms - 1])
+    expected = -chances[torch.arange(4), atom]
+    torch.testing.assert_close(loss(batch)["loss"], expected, rtol=1e-4, atol=1e-4)
+    assert network.support[[0, -1]].tolist() == pytest.approx([lowest, highest], rel=1e-6, abs=1e-6)

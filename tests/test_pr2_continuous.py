@@ -47,6 +47,13 @@ def trained(agents, **how):
     return made
 
 
+@pytest.mark.parametrize("engine", ["eager", "torchrl"])
+def test_no_value_of_a_state_is_shown_where_networks_output_an_action(engine):
+    env, made = population((PR2S, PR2S), engine=engine)
+    turn = env.rollout(1)[:, 0]
+    assert all(learner.values(turn).isnan().all() for learner in made.learners.values())
+
+
 @pytest.mark.integration
 @pytest.mark.parametrize("engine", ["eager", "torchrl"])
 def test_a_replica_learns_among_others_what_it_learns_alone(engine):

@@ -162,7 +162,7 @@ def test_the_lean_collector_yields_what_torchrls_own_yields(worlds):
 
 def test_transitions_of_lanes_are_those_of_the_agents():
     batch = CommonsEnv(GAME, 3).rollout(1)[:, 0]
-    for agents in ((0, 1), (1,)):
+    for agents in ((0, 1), (1,), (1, 0)):
         lanes = lane_turn(agents, batch)
         for place, agent in enumerate(agents):
             alone = transitions_of(agent, batch)

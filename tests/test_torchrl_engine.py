@@ -2,6 +2,7 @@
 
 from collections import deque
 from dataclasses import replace
+from functools import partial
 from io import BytesIO
 
 import pytest
@@ -46,6 +47,7 @@ from cprl.algorithms import (
 )
 from cprl.custom import Custom
 from cprl.learners.engine.functional import total
+from cprl.learners.replay import ReplayLearner
 from cprl.learners.torchrl import TorchRLReplayLearner, TorchRLRolloutLearner
 from cprl.objectives import LogCoshDQNLoss, PR2Loss
 from cprl.policies.lanes import LaneActor
@@ -480,6 +482,23 @@ def replay_learner_of(make_loss, **changes):
     )
 
 
+def test_a_loss_of_each_transition_learns_as_their_mean():
+    def of(reduction):
+        learner = replay_learner_of(partial(made, reduction=reduction))
+        played = turns(learner.actor)
+        losses = [take(learner, next(played)) for _ in range(20)]
+        return losses[-1], learner.stock.network_state(0)
+
+    def made(network, *, reduction):
+        loss = DQN(settings=REPLAY).make_loss(network)
+        loss.reduction = reduction
+        return loss
+
+    (of_each, weights), (of_mean, expected) = of("none"), of("mean")
+    assert of_each.tolist() == of_mean.tolist()
+    assert all(weights[name].equal(expected[name]) for name in expected)
+
+
 class OneStepLoss(DQNLoss):
     """Discounts the value behind a return by one step, however many rewards were summed."""
 
@@ -611,7 +630,8 @@ def test_other_engines_settings_and_networks_are_refused():
         resumable(DQN(settings=changed(REPLAY, buffer_size=10**12)))
 
 
-def test_targets_are_refused_for_a_loss_that_has_none():
+@pytest.mark.parametrize("kind", [TorchRLReplayLearner, ReplayLearner])
+def test_targets_are_refused_for_a_loss_that_has_none(kind):
     def without_targets(network):
         loss = DQNLoss(
             DQN(settings=REPLAY).make_loss(network).value_network,
@@ -623,7 +643,7 @@ def test_targets_are_refused_for_a_loss_that_has_none():
         return loss
 
     def make(**changes):
-        return TorchRLReplayLearner(
+        return kind(
             SPACES,
             settings=changed(REPLAY, **changes),
             make_network=lambda: DQN(settings=REPLAY).make_network(SPACES),
@@ -631,8 +651,8 @@ def test_targets_are_refused_for_a_loss_that_has_none():
             **HOW,
         )
 
-    assert make().updaters == [None] * 4
-    with pytest.raises(ValueError, match=r"tau is 0\.1, and the loss has no targets"):
+    assert getattr(make(), "updaters", [None] * 4) == [None] * 4
+    with pytest.raises(ValueError, match=r"tau is 0\.1; allowed: None, because DQNLoss has no targets"):
         make(tau=0.1)
-    with pytest.raises(ValueError, match="own_target_weights is True, and the loss has no targets"):
+    with pytest.raises(ValueError, match="own_target_weights is True; allowed: False, because DQNL"):
         make(own_target_weights=True)

@@ -8,11 +8,12 @@ import pytest
 import torch
 
 from cprl import CommonsEnv, Game, Rules, maps
-from cprl.algorithms import DQN
+from cprl.algorithms import DQN, LOLA, PPO, LOLASettings, RolloutSettings
 from cprl.collectors import stock_collector
 from cprl.learners.replay import ReplayLearner
-from cprl.learners.settings import DQNSettings
+from cprl.learners.settings import DEFAULT_HIDDEN_CELLS, DQNSettings
 from cprl.measuring.evaluate import evaluate, mean_return
+from cprl.networks import GRU
 from cprl.policies.assignment import AgentPolicies
 from cprl.policies.lanes import random_lanes
 from cprl.policies.single import RandomActor
@@ -26,6 +27,8 @@ GAME = Game(
 )
 
 SETTINGS = DQNSettings(buffer_size=200, learning_rate=1e-3, hidden_cells=(8,), epsilon_hold_steps=5)
+
+ROLLOUTS = RolloutSettings(rollout_steps=8, minibatch_size=4, epochs=1, hidden_cells=(8,))
 
 
 class Witness:
@@ -158,6 +161,85 @@ def test_what_was_played_before_an_interruption_is_kept(tmp_path):
             CommonsEnv(GAME), {(0,): learner()}, others=agents, episodes=9, callbacks=[table, Interrupting()]
         )
     assert read_episodes(tmp_path)["episode"].to_pylist() == [0, 0, 1, 1, 2, 2]
+
+
+UNEVEN = Game(
+    map=maps.parse(".A>A.A\n.A.<.A"), rules=Rules(episode_steps=400, regrow_prob=(0.0, 0.0, 0.0, 0.0))
+)
+"""Boards that are empty at different turns in different worlds."""
+
+
+def train_twice(agents):
+    """Two trainings of the same learner, which the first leaves in the midst of an episode; their turns."""
+    came = [Witness(), Witness()]
+    for seed, witness in enumerate(came):
+        env = CommonsEnv(UNEVEN, 3, seed=seed)
+        train(env, {(0, 1): agents}, episodes=1, callbacks=[witness])
+    first, second = ([turn.clone() for turn in witness.turns] for witness in came)
+    assert 0 < first[-1]["next", "done"].sum() < 3
+    return first, second
+
+
+@pytest.mark.integration
+@pytest.mark.parametrize("engine", ["eager", "torchrl"])
+@pytest.mark.parametrize("steps", [1, 3])
+def test_what_a_second_training_stores_does_not_follow_the_last_turn_of_the_first(engine, steps):
+    settings = DQNSettings(
+        buffer_size=1000, hidden_cells=(8,), n_steps=steps, gamma=0.5, learning_starts=5000
+    )
+    how = {"agents": (0, 1), "replicas": 3, "engine": engine}
+    agents = DQN(settings=settings).make_learner(UNEVEN.spaces, **how)
+    first, second = train_twice(agents)
+    came = [*first, *second]
+    for lane in range(6):
+        replica, agent = divmod(lane, 2)
+        done = [turn["next", "done"][replica].item() for turn in came]
+        done[len(first) - 1] = True
+        places = torch.arange(len(came) - steps)
+        if engine == "eager":
+            kept = agents.buffer.storage.get(places.expand(6, -1))[lane]
+        else:
+            kept = agents.buffers[lane].storage[:][: len(places)]
+        for place in places.tolist():
+            rewards, last = 0.0, place
+            for ahead in range(steps):
+                last = place + ahead
+                rewards += 0.5**ahead * came[last]["next", "agents", "reward"][replica, agent].item()
+                if done[last]:
+                    break
+            before, after = came[place]["agents"], came[last]["next", "agents"]
+            assert torch.equal(kept["observation"][place], before["observation"][replica, agent])
+            assert torch.equal(kept["next", "observation"][place], after["observation"][replica, agent])
+            assert kept["next", "reward"][place].item() == pytest.approx(rewards)
+
+
+@pytest.mark.integration
+@pytest.mark.parametrize(
+    ("algorithm", "engine", "wanted"),
+    [
+        (PPO(settings=ROLLOUTS), "eager", 8),
+        (PPO(settings=replace(ROLLOUTS, hidden_cells=DEFAULT_HIDDEN_CELLS), network=GRU()), "eager", 8),
+        (PPO(settings=ROLLOUTS), "torchrl", 8),
+        (LOLA(settings=LOLASettings(rollout_steps=4, hidden_cells=(8,)), estimator="dice"), None, 12),
+    ],
+)
+def test_a_second_training_begins_its_rollouts_anew(algorithm, engine, wanted):
+    how = {"agents": (0, 1), "replicas": 3, "engine": engine}
+    agents = algorithm.make_learner(UNEVEN.spaces, **{name: own for name, own in how.items() if own})
+
+    def weights():
+        return [value for own in agents.networks().values() for value in own.state_dict().values()]
+
+    first = Training(CommonsEnv(UNEVEN, 3, seed=0), {(0, 1): agents}, episodes=1)
+    for _ in range(11):
+        first.step()
+    before, second = weights(), Training(CommonsEnv(UNEVEN, 3, seed=1), {(0, 1): agents}, episodes=1)
+    states = agents.state_dict().get("recurrent")
+    assert states is None or states["ended"].all()
+    for _ in range(wanted):
+        assert all(map(torch.equal, weights(), before))
+        second.step()
+    assert not all(map(torch.equal, weights(), before))
 
 
 def test_evaluation_plays_one_episode_in_every_world_and_changes_no_seed():

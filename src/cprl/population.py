@@ -251,10 +251,11 @@ def grouped(specs: Sequence[AgentSpec], agents: int) -> list[tuple[AgentSpec, tu
 def exploration_steps(specs: Sequence[AgentSpec]) -> int | None:
     """The environment step of a replica at which the last agent's epsilon has reached its end.
 
-    None if no agent explores by epsilon, or only by an algorithm of the user's own.
+    None if no agent explores by epsilon, or only by an algorithm of the user's own. Agents that draw from a
+    policy do not, though the settings of those that learn from replay have an epsilon.
     """
     algorithms = [spec.algorithm for spec in specs if isinstance(spec, Learning | Team)]
-    settings = [own.settings for own in algorithms if not isinstance(own, Custom)]
+    settings = [own.settings for own in algorithms if not isinstance(own, Custom) and not own.stochastic]
     ends = [
         own.epsilon_hold_steps + own.epsilon_decay_steps
         for own in settings

@@ -9,7 +9,7 @@ from torchrl.modules import ProbabilisticActor
 from torchrl.objectives import DiscreteIQLLoss, DiscreteSACLoss, LossModule, ValueEstimators
 
 from cprl.algorithms.base import OffPolicy
-from cprl.algorithms.dqn import module_of, network_of
+from cprl.algorithms.dqn import module_of, network_of, refuse_relu
 from cprl.compat import LaneCategorical
 from cprl.custom import Custom
 from cprl.learners.settings import DQNSettings
@@ -46,6 +46,7 @@ class SAC(OffPolicy):
 
     def make_loss(self, network: nn.Module) -> LossModule:
         """See `Algorithm`."""
+        refuse_relu(type(self).__name__, self.settings)
         assert isinstance(network, AgentNetworks)
         loss = DiscreteSACLoss(
             policy(network["actor"]),
@@ -91,6 +92,7 @@ class IQL(OffPolicy):
 
     def make_loss(self, network: nn.Module) -> LossModule:
         """See `Algorithm`."""
+        refuse_relu(type(self).__name__, self.settings)
         assert isinstance(network, AgentNetworks)
         loss = DiscreteIQLLoss(
             policy(network["actor"]),

@@ -106,6 +106,7 @@ class DistributionalDQN(OffPolicy):
 
     def make_loss(self, network: nn.Module) -> LossModule:
         """See `Algorithm`."""
+        refuse_relu(type(self).__name__, self.settings)
         assert isinstance(network, AtomNetwork)
         actor = DistributionalQValueActor(
             AtomLogits(network), support=network.support, spec=None, action_space="categorical"
@@ -180,6 +181,19 @@ def q_network_of(spaces: Spaces, settings: DQNSettings, network: Network | Custo
     """A new network of one agent, which outputs the value of each action."""
     relu = settings.relu_on_outputs
     return network_of(spaces, settings, network, outputs=spaces.actions, relu_on_outputs=relu)
+
+
+def refuse_relu(name: str, settings: DQNSettings) -> None:
+    """Raises a ValueError for `relu_on_outputs` of an algorithm without Q values to act by.
+
+    It is called where losses are made, not where networks are: runs of earlier versions, which took no notice
+    of that setting, can still be loaded.
+    """
+    if settings.relu_on_outputs:
+        raise ValueError(
+            f"settings.relu_on_outputs is True; allowed for {name}, whose acting network does not output Q "
+            "values: False"
+        )
 
 
 def network_of(

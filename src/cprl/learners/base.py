@@ -29,7 +29,9 @@ class Learner(Protocol):
     settings: Any
     """The hyperparameters.
 
-    A learner may also have `wants`, a `cprl.preferences.WantedRewards`: what its agents want.
+    A learner may also have `wants`, a `cprl.preferences.WantedRewards`: what its agents want. And `begin()`,
+    which a training calls before its first turn: whatever the learner has stored of an earlier training, the
+    next turn begins new episodes.
     """
 
     def store(self, batch: TensorDictBase) -> None:

@@ -74,6 +74,10 @@ class States:
         self._ended = torch.ones(len(lanes), dtype=torch.bool, device=device)
         """Whether the episode of a lane ended with the last turn of the rollout before."""
 
+    def forget(self) -> None:
+        """The next rollout begins with new episodes."""
+        self._ended.fill_(True)
+
     def begin(self, batch: TensorDictBase) -> None:
         """Notes by which states agents act in the first turn of a rollout."""
         self._first[NAMES[ACTOR]].copy_(self._lanes.recurrent_state(batch))

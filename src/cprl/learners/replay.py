@@ -72,9 +72,9 @@ class ReplayLearner:
 
     Raises:
         ValueError: for a loss that needs the latest steps of the current policy (see
-            `cprl.learners.rollouts`), for a team without the team reward, unless it has `own_rewards`, and
-            for one that sees its peers; for a recurrent network without sequences, or of a team, and for
-            sequences without such a network.
+            `cprl.learners.rollouts`), and for settings of targets if it has none; for a team without the team
+            reward, unless it has `own_rewards`, and for one that sees its peers; for a recurrent network
+            without sequences, or of a team, and for sequences without such a network.
     """
 
     def __init__(
@@ -197,6 +197,10 @@ class ReplayLearner:
     def networks(self) -> dict[str, nn.Module]:
         """A copy of each lane's current acting network, by "replica_0/agent_0" and so on."""
         return self._lanes.networks(self.engine)
+
+    def begin(self) -> None:
+        """Ends the episodes that an earlier training left unfinished; see `Learner`."""
+        self.buffer.storage.cut()
 
     def store(self, batch: TensorDictBase) -> None:
         """Stores one step of every replica, as the collector yields it."""

@@ -10,6 +10,7 @@ from torch import Tensor, nn
 from torchrl.objectives.value.functional import generalized_advantage_estimate
 
 from cprl.learners.buffer.rollout import refuse_full, rollout_fields, write_turn
+from cprl.learners.buffer.sampler import steps_ahead
 from cprl.learners.checks import check_learner, refuse_continuous
 from cprl.learners.engine.base import Engine
 from cprl.learners.engine.choice import TRIAL_LANES, EngineName, make_engine, trial_batch, trial_rollout
@@ -99,7 +100,8 @@ class RolloutLearner:
         )
         self.engine = self._make_engine(engine, make_loss, compile=compile, device=device)
         self.actor = self._lanes.actor(self.engine, compile=compile)
-        self.rng = LaneRng(self._lanes.seeds(SAMPLING), settings.rollout_steps)
+        steps = settings.rollout_steps
+        self.rng = LaneRng(self._lanes.seeds(SAMPLING), steps, ahead=steps_ahead(steps))
         size = (settings.rollout_steps,)
         self._rollout = rollout_fields(spaces, self._lanes, size, torch.device(device))
         self._size = 0
@@ -158,6 +160,12 @@ class RolloutLearner:
     def networks(self) -> dict[str, nn.Module]:
         """A copy of each lane's current acting network, by "replica_0/agent_0" and so on."""
         return self._lanes.networks(self.engine)
+
+    def begin(self) -> None:
+        """Drops the rollout that an earlier training left unfinished; see `Learner`."""
+        self._size = 0
+        if self._states is not None:
+            self._states.forget()
 
     def store(self, batch: TensorDictBase) -> None:
         """Stores one step of every replica, as the collector yields it.

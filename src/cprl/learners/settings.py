@@ -104,7 +104,7 @@ class DQNSettings(Exploring):
     target_every_episodes: int = 3
     """Episodes between copies of the network to its target if `tau` is None; experiment 5 used 3 or 10."""
     relu_on_outputs: bool = False
-    """[run] Whether the Q values pass through ReLU too."""
+    """[run] Whether the Q values pass through ReLU too; refused for C51, SAC and IQL."""
     glorot_uniform: bool = False
     """[run] Whether weights are initialised Glorot-uniform and biases to zero; else torch's default."""
     own_target_weights: bool = False

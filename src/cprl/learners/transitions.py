@@ -51,7 +51,7 @@ def lane_turn(agents: tuple[int, ...], batch: TensorDictBase, rewards: Any = Non
     before, after = entry(batch, keys.AGENTS), entry(batch, "next")
     agents_after = entry(after, keys.AGENTS)
     observation, action = array_of(entry(before, "observation")), entry(before, "action")
-    everyone = len(agents) == observation.shape[1]
+    everyone = list(agents) == list(range(observation.shape[1]))
     lanes, windows, at = len(observation) * len(agents), observation.shape[2:], list(agents)
 
     def of(tensor: Tensor, *shape: int) -> Any:

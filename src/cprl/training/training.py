@@ -101,6 +101,9 @@ class Training:
         self._tracker = tracker_of(env, longest)
         self._losses = {agents: LaneLosses(replicas, agents) for agents in self.learners}
         self._wanted = WantedReturns(replicas, spaces.agents, self.learners)
+        for learner in self.learners.values():
+            if hasattr(learner, "begin"):
+                learner.begin()
         self.finite = FiniteCheck(self.learners, spaces, on_nan=on_nan)
         self._on_step = [own.on_step for own in self.callbacks if hasattr(own, "on_step")]
         self._played = [0] * replicas

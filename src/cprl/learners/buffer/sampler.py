@@ -19,7 +19,7 @@ from cprl.memory import check_memory, free_bytes
 from cprl.policies.rng import DRAWN_AHEAD, LaneRng
 
 NUMBERS_AHEAD: Final = 2**14
-"""Numbers for losses that sample, which are generated at once for each lane."""
+"""About as many numbers for losses that sample, or for an epoch, are generated at once for each lane."""
 
 
 class LaneSampler(Sampler):
@@ -69,6 +69,11 @@ class LaneSampler(Sampler):
         self.load_state_dict(torch.load(path, weights_only=True))
 
 
+def steps_ahead(count: int) -> int:
+    """Steps whose numbers are generated at once, `count` for each: they are part of every checkpoint."""
+    return min(DRAWN_AHEAD, max(1, NUMBERS_AHEAD // count))
+
+
 class Noise:
     """Uniform numbers in 0..1 for losses that sample: a batch of them for each update and lane.
 
@@ -88,7 +93,7 @@ class Noise:
     ) -> None:
         self._size, self._device = (len(seeds), batch_size, *shape), torch.device(device)
         count = batch_size * prod(shape)
-        self.rng = LaneRng(seeds, count, ahead=min(DRAWN_AHEAD, max(1, NUMBERS_AHEAD // count)))
+        self.rng = LaneRng(seeds, count, ahead=steps_ahead(count))
 
     def next(self) -> Tensor:
         """The numbers of the next batch, float32 [L, b, *shape]."""

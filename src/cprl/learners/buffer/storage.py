@@ -201,6 +201,13 @@ class LaneStorage(Storage):
         if self._written % LOOKS_EVERY == 0:
             self._forget()
 
+    def cut(self) -> None:
+        """Ends the running episodes, as a time limit would: what is written next does not follow them."""
+        if self._written:
+            self._arrays["done"][(self._written - 1) % self.max_size] = True
+            self._next_row = self._next_row + ~self._begins
+            self._begins, self._any_begins = self._begins | True, True
+
     def _forget(self) -> None:
         """Excludes transitions whose observations are about to be overwritten from sampling."""
         oldest = _at_least(self._oldest, self._written - int(self.max_size))

@@ -9,7 +9,7 @@ from torch import Tensor
 from torchrl.objectives import A2CLoss, LossModule, PPOLoss, ReinforceLoss, ValueEstimators
 from torchrl.objectives.value import GAE, TD0Estimator, ValueEstimatorBase
 
-from cprl.learners.engine.functional import own_targets, total
+from cprl.learners.engine.functional import own_targets, targets_of, total
 from cprl.learners.settings import DQNSettings, RolloutSettings
 
 _OF_ONE_STEP: Final = (None, ValueEstimators.TD0, TD0Estimator)
@@ -25,6 +25,7 @@ def refuse_for_replay(loss: LossModule, settings: DQNSettings, batch: TensorDict
         batch: synthetic transitions of one lane, [b].
     """
     refuse_on_policy(loss)
+    _refuse_without_targets(loss, settings)
     name = type(loss).__name__
     if settings.n_steps == 1:
         return
@@ -57,6 +58,16 @@ def refuse_on_policy(loss: LossModule) -> None:
             "replay buffer samples single transitions; allowed: ValueEstimators.TD0, with n_steps for longer "
             "returns"
         )
+
+
+def _refuse_without_targets(loss: LossModule, settings: DQNSettings) -> None:
+    """Raises a ValueError for settings of targets, if a loss has none."""
+    for name, default in (("tau", None), ("own_target_weights", False)):
+        if getattr(settings, name) != default and not targets_of(loss):
+            raise ValueError(
+                f"{name} is {getattr(settings, name)}; allowed: {default}, because {type(loss).__name__} has "
+                "no targets"
+            )
 
 
 def refuse_other_advantages(loss: LossModule, settings: RolloutSettings) -> None:

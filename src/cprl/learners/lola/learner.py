@@ -110,6 +110,11 @@ class LOLALearner:
         """A copy of each member's present acting network, by "replica_0/agent_0" and so on."""
         return self._lanes.networks(self.engine.acting)
 
+    def begin(self) -> None:
+        """Drops the rollouts that an earlier training left unfinished; see `Learner`."""
+        self._size, self._phase = 0, 0
+        self.engine.play(None)
+
     def store(self, batch: TensorDictBase) -> None:
         """Stores one step of every replica, as the collector yields it.
 

@@ -126,7 +126,6 @@ class TorchRLReplayLearner:
             loss_share=1 / spaces.actions if settings.mean_over_all_outputs else 1.0,
             device=device,
         )
-        _check(settings, self.stock.each[0].loss)
         self.updaters = [_target_updater(agent.loss, settings) for agent in self.stock.each]
         if settings.own_target_weights:
             self._init_targets(make_loss)
@@ -186,14 +185,22 @@ class TorchRLReplayLearner:
             generator=generator,
         )
         if settings.n_steps > 1:
-            # With its default `done_keys` a transition would keep the flags of its first step, and bootstrap
-            # from the end of an episode that terminated within its n steps.
-            buffer.append_transform(MultiStepTransform(settings.n_steps, settings.gamma, done_keys=[]))
+            buffer.append_transform(self._multi_step())
             # `DistributionalDQNLoss` would read [b] as one discount for each atom.
             buffer.append_transform(UnsqueezeTransform(dim=-1, in_keys=["steps_to_next_obs"]))
         for transform in settings.replay_transforms:
             buffer.append_transform(made(transform))
         return buffer
+
+    def _multi_step(self) -> MultiStepTransform:
+        # With its default `done_keys` a transition would keep the flags of its first step, and bootstrap from
+        # the end of an episode that terminated within its n steps.
+        return MultiStepTransform(self.settings.n_steps, self.settings.gamma, done_keys=[])
+
+    def _hold_back(self, lane: int) -> None:
+        """Gives a new `MultiStepTransform` the latest turns."""
+        for turn in self._last:
+            self.buffers[lane].transform.inv(turn[lane : lane + 1].clone())
 
     def evaluation_actor(self, worlds: int) -> LaneActor:
         """An actor with the current weights and `epsilon_evaluation`, for `worlds` worlds of each replica."""
@@ -202,6 +209,16 @@ class TorchRLReplayLearner:
     def networks(self) -> dict[str, nn.Module]:
         """A copy of each agent's current acting network, by "replica_0/agent_0" and so on."""
         return self._lanes.networks(self.stock)
+
+    def begin(self) -> None:
+        """Ends the episodes that an earlier training left unfinished; see `Learner`. Whole transitions know
+        nothing of those after them; `MultiStepTransform` sums up to the last that it holds back."""
+        if self._last:
+            self._last[-1]["next", "done"].fill_(True)
+            for lane, buffer in enumerate(self.buffers):
+                buffer.transform.pop(0)
+                buffer.transform.insert(0, self._multi_step())
+                self._hold_back(lane)
 
     def store(self, batch: TensorDictBase) -> None:
         """Stores one step of every replica, as the collector yields it."""
@@ -248,8 +265,8 @@ class TorchRLReplayLearner:
 
     def values(self, batch: TensorDictBase) -> Tensor:
         """The highest action value of each agent at the end of a turn, [R, S]; NaN where its network
-        outputs a policy."""
-        if self._lanes.stochastic:
+        outputs a policy, or a continuous action."""
+        if self._lanes.stochastic or self.spaces.action_size:
             return torch.full((self.replicas, len(self.agents)), torch.nan)
         with torch.no_grad():
             return self._lanes.by_agent(self.stock.outputs(self._lanes.seen_next(batch)).amax(-1))
@@ -282,8 +299,7 @@ class TorchRLReplayLearner:
         self._make_buffers()
         self._last = [nested(turn) for turn in state["last"]]
         for lane, buffer in enumerate(self.buffers):
-            for turn in self._last:
-                buffer.transform.inv(turn[lane : lane + 1].clone())
+            self._hold_back(lane)
             load_buffer(buffer, self._generators[lane], state["buffers"][lane])
         for noise, own in zip(self._noise, state.get("noise", ()), strict=True):
             noise.rng.load_state_dict(own)
@@ -301,12 +317,6 @@ def _target_updater(loss: LossModule, settings: DQNSettings) -> TargetNetUpdater
         return SoftUpdate(loss, tau=settings.tau)
     # HardUpdate copies at every (interval + 1)-th step.
     return HardUpdate(loss, value_network_update_interval=settings.target_every_episodes - 1)
-
-
-def _check(settings: DQNSettings, loss: LossModule) -> None:
-    for name, default in (("tau", None), ("own_target_weights", False)):
-        if getattr(settings, name) != default and not targets_of(loss):
-            raise ValueError(f"{name} is {getattr(settings, name)}, and the loss has no targets")
 
 
 def _check_memory(lanes: Lanes, settings: DQNSettings, device: torch.device) -> None:

@@ -131,6 +131,10 @@ class TorchRLRolloutLearner:
         """A copy of each agent's current acting network, by "replica_0/agent_0" and so on."""
         return self._lanes.networks(self.stock)
 
+    def begin(self) -> None:
+        """Drops the rollout that an earlier training left unfinished; see `Learner`."""
+        self._rollout = []
+
     def store(self, batch: TensorDictBase) -> None:
         """Stores one step of every replica, as the collector yields it.
 
