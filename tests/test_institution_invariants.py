@@ -40,7 +40,10 @@ from cprl.institutions import (
 from cprl.institutions.memory import REMEMBERED
 
 # Random walls and boundaries may part all agents from all apples.
-pytestmark = pytest.mark.filterwarnings("ignore:no agent can harvest:UserWarning")
+pytestmark = [
+    pytest.mark.filterwarnings("ignore:no agent can harvest:UserWarning"),
+    pytest.mark.filterwarnings("ignore:Quota.window_steps is .* nobody ever harvests:UserWarning"),
+]
 
 SEEDS = st.integers(0, 2**32 - 1)
 AS_RUN = {
@@ -206,7 +209,6 @@ def test_limits_charge_so_much_for_each_bite_beyond_them(game, seed):
     assert not transfers.any()
 
 
-@pytest.mark.filterwarnings("ignore:Quota.window_steps is .* nobody ever harvests:UserWarning")
 @QUICK
 @given(game=games(), seed=SEEDS, share=st.sampled_from([0.3, 1.0]), window=st.integers(1, 9))
 def test_nobody_harvests_more_than_a_quota_in_a_window(game, seed, share, window):
