@@ -131,6 +131,18 @@ def test_a_report_tells_every_number_from_the_results_alone(run, tmp_path):
 
 
 @pytest.mark.integration
+def test_a_report_of_runs_of_one_name_is_refused_and_other_names_are_links(run, tmp_path):
+    one, two = (export_results(run, tmp_path / folder / "a run | of mine") for folder in ("one", "two"))
+    with pytest.raises(ValueError, match=r"both named 'a run \| of mine'; allowed: runs whose"):
+        write_report([one, two], tmp_path / "report")
+    assert not (tmp_path / "report").exists()
+    text = write_report([one], tmp_path / "report").read_text()
+    assert "](figures/a%20run%20%7C%20of%20mine_collective_return.png)" in text
+    assert (tmp_path / "report" / "figures" / "a run | of mine_collective_return.png").exists()
+    assert "| a run \\| of mine | two_against_random" in text
+
+
+@pytest.mark.integration
 def test_runs_that_are_not_the_studys_have_no_columns_for_what_was_published(run, tmp_path):
     own = export_results(run, tmp_path / "fishery")
     content = json.loads((own / "recipe.json").read_text())

@@ -73,6 +73,8 @@ class DistributionalDQN(OffPolicy):
     """C51: learns the distribution of returns over fixed atoms, TorchRL's `DistributionalDQNLoss`.
 
     Source: Bellemare, Dabney and Munos, "A Distributional Perspective on Reinforcement Learning" (2017).
+    Theirs bootstraps from the action that the target network values most; TorchRL's loss lets the network
+    itself choose it, as double DQN does, and takes its distribution from the target.
     """
 
     settings: DQNSettings

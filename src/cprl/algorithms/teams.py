@@ -57,7 +57,7 @@ class QMIX(TeamAlgorithm, OffPolicy):
 
     The mixing network reads the observations of all members. Source: Rashid et al., "QMIX: Monotonic Value
     Function Factorisation for Deep Multi-Agent Reinforcement Learning" (2018). Here members share no weights,
-    and their networks are not recurrent.
+    unless `Team.share_parameters` says so, and their networks are not recurrent.
     """
 
     settings: DQNSettings
@@ -91,7 +91,7 @@ class MAPPO(TeamAlgorithm, OnPolicy):
     """PPO with an actor per member and a central critic of all observations, TorchRL's `MAPPOLoss`.
 
     Source: Yu et al., "The Surprising Effectiveness of PPO in Cooperative Multi-Agent Games" (2022); here
-    without value normalisation, and members share no weights.
+    without value normalisation, and members share no weights, unless `Team.share_parameters` says so.
     """
 
     settings: RolloutSettings

@@ -9,6 +9,7 @@ import shlex
 from collections.abc import Sequence
 from datetime import timedelta
 from pathlib import Path
+from urllib.parse import quote
 
 import numpy as np
 
@@ -36,19 +37,21 @@ def write_report(runs: Sequence[Path], out: Path, *, allow: Sequence[str] = ()) 
         The path `out/tables.md`.
 
     Raises:
-        ValueError: If a path has no run, or code of the user's own that is not allowed.
+        ValueError: If a path has no run, or code of the user's own that is not allowed, or two runs have the
+            same name.
         FileNotFoundError: If a run has no episodes or has not ended.
     """
     folders = objects("runs", runs, (str, os.PathLike), "paths")
     out = arguments.path("out", out)
     allow = arguments.texts("allow", tuple(arguments.listed("allow", allow, "texts")))
     results = [read_result(arguments.path("runs", path), allow=allow) for path in folders]
+    _refuse_equal_names(results)
     (out / "figures").mkdir(parents=True, exist_ok=True)
     of_study = [result for result in results if result.study]
     lines = [
         "# Tables and figures",
         "",
-        "Made by `cprl report` from the results in this folder alone.",
+        "Made by `cprl report` from the results of these runs alone.",
         *_how(of_study),
         "",
         *_runs(results),
@@ -70,6 +73,18 @@ def write_report(runs: Sequence[Path], out: Path, *, allow: Sequence[str] = ()) 
     text = "\n".join(lines) + "\n"
     write_atomically(path, lambda file: file.write(text.encode()))
     return path
+
+
+def _refuse_equal_names(results: Sequence[Result]) -> None:
+    """Tables and figures name runs by their directories."""
+    first: dict[str, Path] = {}
+    for result in results:
+        if result.name in first:
+            raise ValueError(
+                f"runs has {first[result.name]} and {result.path}, both named {result.name!r}; allowed: runs "
+                "whose directories have different names"
+            )
+        first[result.name] = result.path
 
 
 def _how(of_study: Sequence[Result]) -> list[str]:
@@ -150,5 +165,5 @@ def _measures(results: Sequence[Result]) -> list[str]:
 def _figures(results: Sequence[Result], out: Path) -> list[str]:
     lines = ["## Figures", ""]
     for result, metric, path in draw_figures(results, out / "figures"):
-        lines += [f"![{result.name}, {axis_title(metric)}](figures/{path.name})", ""]
+        lines += [f"![{result.name}, {axis_title(metric)}](figures/{quote(path.name)})", ""]
     return lines
