@@ -369,8 +369,12 @@ def test_reproduce_begins_nothing_more_after_ctrl_c(tmp_path, monkeypatch):
 
     monkeypatch.setattr(reproduce, "run", interrupted)
     where = {"runs": tmp_path, "results": tmp_path}
-    with pytest.raises(KeyboardInterrupt):
-        reproduce.run_all(["commons", "single_basic", "two_complex"], [], processes=1, **where)
+    before = signal.signal(signal.SIGINT, signal.default_int_handler)  # a shell's background jobs ignore it
+    try:
+        with pytest.raises(KeyboardInterrupt):
+            reproduce.run_all(["commons", "single_basic", "two_complex"], [], processes=1, **where)
+    finally:
+        signal.signal(signal.SIGINT, before)
     assert begun == ["commons"]
 
 
