@@ -254,6 +254,7 @@ def a_result(name, recipe, level, *, agents=()):
     )
 
 
+@pytest.mark.integration
 def test_figures_that_are_compared_have_the_same_vertical_range(tmp_path, drawn):
     results = [
         a_result("a", "single_basic", 100.0),
