@@ -99,6 +99,7 @@ def test_the_table_of_claims_has_a_row_for_each_measure_and_says_what_is_not_run
         "as claimed",
         "contradicted",
         "cannot be told with 2 replicas",
+        "cannot be told with 1 replica",
         "undefined in all replicas",
     }
     (harvest,) = (

@@ -183,7 +183,8 @@ def verdict(found: Estimate) -> str:
     """What the interval of a difference that should be positive says."""
     if found.low > 0:
         return "as claimed"
-    return "contradicted" if found.high < 0 else f"cannot be told with {found.replicas} replicas"
+    several = "s" * (found.replicas != 1)  # of some a measure is undefined
+    return "contradicted" if found.high < 0 else f"cannot be told with {found.replicas} replica{several}"
 
 
 def finished_runs(study: Study, runs: Path, episodes: int | None) -> dict[str, Path]:
