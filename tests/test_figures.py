@@ -184,6 +184,7 @@ def test_phases_need_a_group_and_numbers_in_every_window():
 
 def test_trainings_too_long_for_the_search_of_phases_are_drawn_without(tmp_path, drawn, monkeypatch):
     monkeypatch.setattr(phases, "LONGEST", 1000)
+    monkeypatch.setattr(phases, "EPISODES", range(phases.FEWEST_EPISODES, phases.LONGEST + 1))
     for episodes in (1000, 1001):
         training_curve(a_run(tmp_path / f"{episodes}", the_tragedy(1, episodes)), title="long")
     assert [len(figure.axes) for figure in drawn] == [3, 2], "the strip of phases, and the two metrics"

@@ -4,7 +4,9 @@ from collections.abc import Callable, Mapping, Sequence
 from contextlib import ExitStack
 from dataclasses import asdict
 from datetime import datetime
+from functools import partial
 from pathlib import Path
+from typing import Any
 
 from cprl.arguments import callable_of, object_of, path, texts
 from cprl.callbacks import check_callbacks
@@ -35,7 +37,7 @@ from cprl.runs.extension import REPORT, extend, refuse_to_extend
 from cprl.runs.files import write_json
 from cprl.runs.lock import RunLockedError
 from cprl.runs.loggers import check_logger
-from cprl.runs.partners import weights_of, write_partners
+from cprl.runs.partners import partners_of, weights_of
 from cprl.runs.weights import save_decisions, save_transforms, save_weights
 from cprl.terminal.figures import training_curve
 from cprl.terminal.progress import ProgressBar
@@ -137,8 +139,7 @@ def run(
             return out
         directory = out
     else:
-        directory = start_run(out, experiment.name, experiment.to_recipe, command=command)
-        write_partners(directory, _partners(experiment))
+        directory = start_run(out, experiment.name, partial(_recipe_of, experiment), command=command)
     OUT.run = directory
     checkpointer = Checkpointer(
         directory,
@@ -172,6 +173,11 @@ def run(
         if linger and viewer is not None:
             stay_served(viewer.logger, viewer.play_on)
     return directory
+
+
+def _recipe_of(experiment: Experiment, directory: Path) -> dict[str, Any]:
+    """What `recipe.json` says of a run that begins."""
+    return {**experiment.to_recipe(directory), **partners_of(directory, _partners(experiment))}
 
 
 def _partners(experiment: Experiment) -> list[str]:

@@ -34,6 +34,8 @@ SHORTEST: Final = 200
 """The minimum length of a phase in episodes."""
 FEWEST_EPISODES: Final = 1_000
 """Phases are found in trainings of at least so many episodes; in shorter ones they would be noise."""
+EPISODES: Final = range(FEWEST_EPISODES, LONGEST + 1)
+"""The numbers of episodes of trainings that have phases."""
 CHANGE: Final = 0.25
 """The share of its range by which a metric's line must rise or fall to count as rising or falling."""
 

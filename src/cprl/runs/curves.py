@@ -112,13 +112,13 @@ def phases_of(curves: dict[str, Values], *, centred: bool = False, resamples: in
         resamples: of the replicas, for the intervals of the change points.
 
     Returns:
-        None for fewer than `phases.FEWEST_EPISODES` episodes, more than `phases.LONGEST`, a single agent, a
-        game that does not report the metrics, or a metric that is undefined in a whole window.
+        None for a number of episodes that is not in `phases.EPISODES`, a single agent, a game that does not
+        report the metrics, or a metric that is undefined in a whole window.
     """
     if not set(phases.METRICS) <= set(curves) or "return_1" not in curves:
         return None
     whole = curves["survival_steps"]
-    if not phases.FEWEST_EPISODES <= whole.shape[1] <= phases.LONGEST:
+    if whole.shape[1] not in phases.EPISODES:
         return None
     smoothed = {name: running_mean(curves[name]) for name in phases.METRICS}
     if any(np.isnan(means).all(0).any() for means in smoothed.values()):

@@ -6,15 +6,14 @@ from pathlib import Path
 from typing import Any, Final
 
 from cprl.runs.checkpoints import FOLDER
-from cprl.runs.directory import FILE_NAME, read_recipe
-from cprl.runs.files import checksum, write_json
+from cprl.runs.files import checksum
 
 FIELD: Final = "frozen"
 """Of `recipe.json`: the checksum of the weights of each run whose agents play, by the path of that run."""
 
 
-def write_partners(run: Path, partners: Iterable[str]) -> None:
-    """Writes into the recipe of a run which weights of other runs play in it; those that have not ended keep
+def partners_of(run: Path, partners: Iterable[str]) -> dict[str, dict[str, str]]:
+    """What the recipe of a run says of which weights of other runs play in it; those that have not ended keep
     changing, and are left out.
 
     Args:
@@ -23,8 +22,7 @@ def write_partners(run: Path, partners: Iterable[str]) -> None:
     """
     final = {own: Path(own) / FOLDER / "final.pt" for own in partners}
     found = {os.path.relpath(own, run): checksum(path) for own, path in final.items() if path.exists()}
-    if found:
-        write_json(run / FILE_NAME, {**read_recipe(run), FIELD: found})
+    return {FIELD: found} if found else {}
 
 
 def weights_of(recipe: Mapping[str, Any], run: Path, partner: str) -> str | None:

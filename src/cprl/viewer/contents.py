@@ -33,12 +33,11 @@ def curves_of(env: EnvBase, agents: tuple[str, ...], reported: Sequence[str], *,
     """
     metrics = available({**METRICS, "stock_left": FIELDS["stock_left"]}, reported)
     metrics += () if yield_of(env)["sustainable_yield"] is None else ("yield_share",)
-    has_phases = phases.FEWEST_EPISODES <= episodes <= phases.LONGEST and set(phases.METRICS) <= set(metrics)
     return Curves(
         agents=agents,
         replicas=env.batch_size.numel(),
         metrics=metrics,
-        has_phases=has_phases,
+        has_phases=episodes in phases.EPISODES and set(phases.METRICS) <= set(metrics),
         has_tags="tagged_by" in reported,
         institutions=institutional.metrics_of(env, reported),
         in_force=institutional.decisions_of(env) if "in_force" in reported else (),
