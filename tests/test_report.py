@@ -81,6 +81,32 @@ def test_what_is_kept_says_the_same_as_the_run(run, tmp_path):
 
 
 @pytest.mark.integration
+def test_results_without_weights_are_reported_but_never_played(run, tmp_path):
+    whole = export_results(run, tmp_path / "two_against_random")
+    everything = write_report([whole], tmp_path / "whole").read_text()
+    folder = export_results(run, whole, weights=False)
+    assert not (folder / "checkpoints" / "final.pt").exists(), "that of the earlier export is gone"
+    with pytest.raises(ValueError, match=r"two_against_random keeps no weights: its results were exported"):
+        cprl.load(folder)
+    with pytest.raises(FileNotFoundError, match=r"final\.pt does not exist"):
+        export_results(folder, tmp_path / "with them")
+    text = write_report([folder], tmp_path / "less").read_text()
+    assert "Exported without weights: nobody could play" in text
+    assert "Exported without weights" not in everything
+    of_play = ("it tags when near", "its policy circles", "| shots per 1000 steps, all agents |")
+    assert all(name in everything and name not in text for name in of_play)
+    (kept,) = [line for line in everything.splitlines() if line.startswith("| it prevents depletion |")]
+    assert kept in text, "claims on the training stay"
+    again = export_results(folder, tmp_path / "copy", weights=False)
+    tables = [(own / "episodes.parquet").read_bytes() for own in (again, folder)]
+    assert tables[0] == tables[1]
+    export_results(run, folder)
+    (folder / "checkpoints" / "final.pt").unlink()
+    with pytest.raises(FileNotFoundError, match="listed in the manifest, and not there"):
+        write_report([folder], tmp_path / "lost")
+
+
+@pytest.mark.integration
 def test_an_export_never_replaces_a_run(run, tmp_path):
     other = tmp_path / "other"
     copytree(run, other)

@@ -195,14 +195,16 @@ def _serve(files: Sequence[Path], *, why: str) -> None:
             time.sleep(1)
 
 
-def export(run: Path, folder: Path, /) -> None:
+def export(run: Path, folder: Path, /, *, weights: bool = True) -> None:
     """Copies what a report needs of a finished run, small enough to be committed.
 
     Args:
         run: the run's directory.
         folder: where to.
+        weights: also the trained weights. Without them a report tells of the training alone, and nothing can
+            play the agents.
     """
-    say(export_results(run, folder))
+    say(export_results(run, folder, weights=weights))
 
 
 COMMANDS: Final[Mapping[str, Callable[..., None]]] = {

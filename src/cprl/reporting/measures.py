@@ -15,6 +15,7 @@ from cprl.measuring.movement import Trace, overlap, rounds, shooting_distance, t
 from cprl.measuring.published import SMOOTHED_EPISODES
 from cprl.policies.assignment import AgentPolicies
 from cprl.runs.curves import curves_of, running_mean
+from cprl.runs.kept import lacks_weights
 from cprl.stored import LoadedRun, load
 
 Values = NDArray[np.float64]
@@ -35,9 +36,10 @@ class Measures:
     training: Mapping[str, Values]
     """Of its training curves."""
     trained: Mapping[str, Values]
-    """Of its trained agents in new worlds; only those defined in all replicas."""
+    """Of its trained agents in new worlds; only those defined in all replicas; empty where the results were
+    exported without weights."""
     random: Mapping[str, Values]
-    """Of the random policy in the same worlds."""
+    """Of the random policy in the same worlds; likewise."""
 
 
 def measures(run: Path, *, window: int = SMOOTHED_EPISODES, allow: Sequence[str] = ()) -> Measures:
@@ -48,11 +50,14 @@ def measures(run: Path, *, window: int = SMOOTHED_EPISODES, allow: Sequence[str]
         window: The window of the running means of which some measures are, in episodes.
         allow: See `cprl.load`.
     """
+    training = of_training(curves_of(run), window=window)
+    if lacks_weights(run):
+        return Measures(training=training, trained={}, random={})
     loaded = load(run, allow=allow)
     replicas = tuple(loaded.replicas)
     trained = _at_play(loaded, replicas, partial(policies_of, [Source(loaded)] * loaded.game.agents))
     return Measures(
-        training=of_training(curves_of(run), window=window),
+        training=training,
         trained={name: values for name, values in trained.items() if np.isfinite(values).all()},
         random=_by_chance(loaded, replicas),
     )

@@ -19,6 +19,7 @@ from cprl.reporting import claims, claims_alone, claims_many, curves
 from cprl.reporting.appendix import appendix, returns_of_others
 from cprl.reporting.figures import axis_title, draw_figures
 from cprl.reporting.markdown import table
+from cprl.reporting.measures import Measures
 from cprl.reporting.possible import shares_of
 from cprl.reporting.result import Result, read_result
 from cprl.reporting.turning import phases_of, turning_points_of
@@ -158,8 +159,18 @@ def _measures(results: Sequence[Result]) -> list[str]:
             for name, values in own.trained.items()
         ]
         agents = "trained" if result.learns else "agents"
-        lines += [f"### {result.name}", "", *table(["measure", agents, "random policy"], rows)]
+        lines += [f"### {result.name}", "", *_without_weights(own)]
+        lines += table(["measure", agents, "random policy"], rows)
     return lines
+
+
+def _without_weights(own: Measures) -> list[str]:
+    if own.random:
+        return []
+    return [
+        "Exported without weights: nobody could play, so measures and claims are of the training alone.",
+        "",
+    ]
 
 
 def _figures(results: Sequence[Result], out: Path) -> list[str]:

@@ -19,16 +19,20 @@ from cprl.runs.partners import FIELD as FROZEN
 from cprl.runs.weights import DECISIONS, TRANSFORMS
 
 _IF_ANY = tuple(f"checkpoints/{name}" for name in (TRANSFORMS, DECISIONS))
-_WHOLE = ("recipe.json", "report.json", "checkpoints/final.pt")
+_WHOLE = ("recipe.json", "report.json")
+_WEIGHTS = "checkpoints/final.pt"
 
 
-def export_results(run: Path, folder: Path) -> Path:
+def export_results(run: Path, folder: Path, *, weights: bool = True) -> Path:
     """Copies the files of a finished run that a report needs: recipe, episodes, evaluation, weights.
 
     Args:
         run: the run's directory.
         folder: the target, new, empty, or with an earlier copy of a run of the same experiment, whose files
             are replaced.
+        weights: whether trained weights are copied, which are most of a short run. Without them a report has
+            what the training and its evaluation tell; nothing can play the agents, and `cprl.load` refuses
+            the copy.
 
     The runs of `Frozen` agents are not copied: the recipe names them from the folder on, so a folder that is
     moved finds them where it would find a run beside it.
@@ -44,15 +48,16 @@ def export_results(run: Path, folder: Path) -> Path:
     run, folder = path_of("run", run), path_of("folder", folder)
     recipe = read_recipe(run)
     _refuse_another(folder, run, recipe)
-    for name in _WHOLE:
+    for name in (*_WHOLE, _WEIGHTS) if weights else _WHOLE:
         if not (run / name).exists():
             raise FileNotFoundError(f"{run / name} does not exist: has the run ended?")
     refuse_missing(run)
-    copied = [name for name in (*_WHOLE, *_IF_ANY) if (run / name).exists()]
+    of_agents = (_WEIGHTS, *_IF_ANY)
+    copied = [name for name in (*_WHOLE, *(of_agents if weights else ())) if (run / name).exists()]
     for name in copied:
         verify(run / name)
     folder.mkdir(parents=True, exist_ok=True)
-    for name in {*_IF_ANY} - {*copied}:  # of an earlier copy
+    for name in {*of_agents} - {*copied}:  # of an earlier copy
         unlist(folder, name)
         (folder / name).unlink(missing_ok=True)
     for name in copied:
@@ -120,6 +125,11 @@ def _write(table: pa.Table, folder: Path, name: str) -> None:
         [(own.name, pa.float32() if own.type == pa.float64() else own.type) for own in table.schema]
     ).with_metadata(table.schema.metadata)
     small = ordered.cast(kinds)
-    write_listed(
-        folder, name, lambda file: pq.write_table(small, file, compression="zstd", compression_level=19)
-    )
+    numbers = [own.name for own in kinds if pa.types.is_integer(own.type) or pa.types.is_floating(own.type)]
+    how: dict[str, Any] = {  # split into bytes, numbers take a quarter less
+        "compression": "zstd",
+        "compression_level": 19,
+        "use_byte_stream_split": numbers,
+        "use_dictionary": [own.name for own in kinds if own.name not in numbers],
+    }
+    write_listed(folder, name, lambda file: pq.write_table(small, file, **how))

@@ -5,6 +5,8 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from cprl.runs.checkpoints import FOLDER, checkpoints_in, read_checkpoint
+from cprl.runs.extension import REPORT
+from cprl.runs.manifest import refuse_missing
 from cprl.runs.weights import DECISIONS, TRANSFORMS, load_weights
 
 
@@ -48,6 +50,18 @@ def _beside(path: Path, name: str | None) -> dict[str, Any]:
     return load_weights(path) if path.exists() else {}
 
 
+def lacks_weights(run: Path) -> bool:
+    """Whether a run has ended and keeps no weights, since its results were exported without them.
+
+    Raises:
+        FileNotFoundError: if the run had them: its manifest lists a file that is not there.
+    """
+    if not (run / REPORT).exists() or (run / FOLDER / "final.pt").exists():
+        return False
+    refuse_missing(run)
+    return True
+
+
 def _from_checkpoint(run: Path, final: Path) -> Kept:
     reasons = []
     for checkpoint in reversed(checkpoints_in(run / FOLDER)):
@@ -60,6 +74,11 @@ def _from_checkpoint(run: Path, final: Path) -> Kept:
         networks = {lane: own for networks in of_learners for lane, own in networks.items()}
         decisions = state.get("decisions", {}).get("_extra_state", {}).get("learned", {})
         return Kept(checkpoint, networks, state.get("env", {}).get("transforms", {}), decisions)
+    if not reasons and lacks_weights(run):
+        raise ValueError(
+            f"{run} keeps no weights: its results were exported without them; allowed: the run itself, or an "
+            "export with weights"
+        )
     raise ValueError(
         "; ".join([f"{final} is not there, nor a readable checkpoint: has {run} been trained?", *reasons])
     )
