@@ -3,7 +3,7 @@
 A population is exploitable where somebody who takes one agent's place, while all others stay as they are,
 gets more than that agent. How much the best such response gets is unknown; what a trained one gets is a lower
 bound. Of several trained ones the best is chosen for each replica, and the maximum of noisy numbers is too
-high; so a response is chosen by its returns in some fresh worlds, and what it gains is told of others.
+high; so a response is chosen by its returns in some fresh worlds, and what it gains is measured in others.
 
 The gain is that of the game's own rewards, fines and transfers included, whatever the agents of the run want.
 
@@ -47,7 +47,7 @@ NOBODY: Final = -1
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Response:
-    """A trained response in the place of an agent, in the worlds where one is chosen and in those told of."""
+    """A trained response in the place of an agent, in the worlds of the choice and in those reported."""
 
     agent: int
     """The index of the agent whose place it takes."""
@@ -64,13 +64,13 @@ class Exploitability:
 
     run: LoadedRun
     population: Played
-    """The episodes of the population itself, in the worlds told of, by replica."""
+    """The episodes of the population itself, in the worlds reported, by replica."""
     responses: Mapping[int, tuple[Response, ...]]
     """By the index of the agent whose place they take."""
     episodes: int
     """Of each replica, in the worlds where responses are chosen, and as many in the others."""
     seed: int
-    """Of the worlds told of; responses are chosen in worlds of the next seed."""
+    """Of the worlds reported; responses are chosen in worlds of the next seed."""
 
     @property
     def replicas(self) -> int:
@@ -149,7 +149,7 @@ class Exploitability:
         return found
 
     def _best(self, agent: int) -> Played:
-        """The episodes told of, with the response chosen for each replica."""
+        """The episodes reported, with the response chosen for each replica."""
         return {replica: own.reporting[replica] for replica, own in enumerate(self._chosen[agent])}
 
     def _gain(self, among: Mapping[int, Played], interval: Interval) -> Gain:
@@ -190,9 +190,9 @@ def play_responses(
             responses, e.g. {0: {"PPO": "runs/against"}}, or what they learned in that place, e.g.
             {0: {"PPO": Frozen("runs/against", 0, replica=(2, 3))}}; they have the same game.
         episodes: episodes of each replica with each response where one is chosen, and as many where the gain
-            is told.
+            is measured.
         replicas: how many of the run's replicas play, the first ones; by default all.
-        seed: of the worlds told of; the next seed is that of the worlds where responses are chosen. Neither
+        seed: of the worlds reported; the next seed is that of the worlds where responses are chosen. Neither
             is the seed of a training.
         allow: see `cprl.load`.
 

@@ -32,7 +32,7 @@ correlated by (2 / 3)**2, and those of the next but one by (1 / 6)**2."""
 
 @dataclass(frozen=True, kw_only=True)
 class WindowEstimate:
-    """The window of a running mean, and how well it is told from others."""
+    """The window of a running mean, and how clearly it differs from others."""
 
     window_episodes: int
     """The candidate with the largest likelihood."""

@@ -4,7 +4,7 @@ Modules, in the order in which one reads them:
     session   Session: the turns of an episode, without any input or output
     opening   which board, and who the others are
     keys      the keys and the actions they stand for
-    wording   what a person is told, in words
+    wording   what a person who plays reads
     terminal  in the terminal, by lines of keys
     window    in a window, by pygame
 """

@@ -1,4 +1,4 @@
-"""What a person who plays is told, in words."""
+"""What a person who plays reads."""
 
 from collections.abc import Iterator
 from math import isnan
