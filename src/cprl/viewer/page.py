@@ -170,7 +170,7 @@ def web_viewer() -> Mapping[str, mmap.mmap]:
         TimeoutError: if it does not answer in time.
     """
     port = free_port()
-    command = [str(_binary()), "--serve-web", "--bind", LOCALHOST, "--port", str(free_port())]
+    command = [str(viewer_binary()), "--serve-web", "--bind", LOCALHOST, "--port", str(free_port())]
     process = subprocess.Popen(
         [*command, "--web-viewer-port", str(port)],
         stdin=subprocess.DEVNULL,
@@ -199,15 +199,15 @@ def _wait_for(port: int, process: "subprocess.Popen[bytes]") -> None:
     ends = time.monotonic() + _START_S
     while time.monotonic() < ends:
         if process.poll() is not None:
-            raise OSError(f"{_binary()} ended with code {process.returncode}")
+            raise OSError(f"{viewer_binary()} ended with code {process.returncode}")
         with socket.socket() as probe:
             if probe.connect_ex((LOCALHOST, port)) == 0:
                 return
         time.sleep(0.05)
-    raise TimeoutError(f"{_binary()} did not answer within {_START_S:g} s")
+    raise TimeoutError(f"{viewer_binary()} did not answer within {_START_S:g} s")
 
 
-def _binary() -> Path:
+def viewer_binary() -> Path:
     """Rerun's command itself; the script `rerun` beside Python leaves it running when it is ended."""
     import rerun_cli
 

@@ -16,7 +16,7 @@ from urllib.parse import urlsplit
 from cprl.checks import SWITCH, Check, checked, shown
 from cprl.viewer import deadline
 from cprl.viewer.deadline import abandon, exit_in_time, within
-from cprl.viewer.page import LOCALHOST, Page, _binary, free_port, has_display
+from cprl.viewer.page import LOCALHOST, Page, free_port, has_display, viewer_binary
 from cprl.viewer.sending import LiveStream, Stream
 
 RUN, REPLAY = "cprl", "cprl replay"
@@ -204,7 +204,7 @@ def viewer() -> str:
     beside = Path(sys.executable).with_name("rerun")
     if beside.exists():
         return str(beside)
-    return "rerun" if shutil.which("rerun") else str(_binary())
+    return "rerun" if shutil.which("rerun") else str(viewer_binary())
 
 
 def _warn_of(what: str, why: object) -> None:
