@@ -16,7 +16,7 @@ from cprl.studies.figures.by_condition import by_condition
 from cprl.studies.figures.by_factor import _Axis, by_factor
 from cprl.studies.figures.courses import courses
 from cprl.studies.figures.diagrams import grids, heat_map, phase_diagram
-from cprl.studies.figures.panels import is_logarithmic, is_numeric
+from cprl.studies.figures.panels import is_logarithmic, is_numeric, replicas_text, with_counts
 from cprl.studies.results import write_results
 from cprl.studies.tables.comparing import compare, metrics_of
 from cprl.studies.tables.outcomes import ending, endings
@@ -233,6 +233,15 @@ def test_figures_of_a_grid_are_drawn_with_a_condition_that_has_no_run(grid_runs,
 
 
 @pytest.mark.integration
+def test_conditions_that_were_not_run_do_not_count_among_the_replicas_of_a_figure():
+    assert replicas_text({"as run": 8, "no beam": 8, "later": 0}) == "8 replicas each"
+    assert replicas_text({"as run": 16, "no beam": 8, "later": 0}) == "8 to 16 replicas each (n)"
+    assert replicas_text({"later": 0}) == "0 replicas each"
+    names = {"as run": "as run", "later": "later"}
+    assert with_counts(names, {"as run": 8, "later": 0}) == names
+    assert with_counts(names, {"as run": 8, "later": 4})["later"] == "later (n=4)"
+
+
 def test_random_draws_are_drawn_as_points_and_have_no_heat_map(tmp_path):
     factors = {"agents.*.algorithm.settings.gamma": Uniform(0.5, 0.9), TIME_OUT: [5, 25]}
     study = Study(EXPERIMENT, factors, draws=4, name="draws", replicas=1)

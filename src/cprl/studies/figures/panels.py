@@ -64,8 +64,8 @@ def colours_of(names: Sequence[str], levels: Sequence[Any]) -> dict[str, str]:
 
 
 def replicas_text(replicas: Mapping[str, int]) -> str:
-    """How many replicas conditions have, e.g. "8 replicas each"."""
-    counts = sorted(set(replicas.values()))
+    """How many replicas conditions have, e.g. "8 replicas each", but for those that were not run."""
+    counts = _counts(replicas)
     if len(counts) == 1:
         return f"{counts[0]} replica{'s' * (counts[0] != 1)} each"
     return f"{counts[0]} to {counts[-1]} replicas each (n)"
@@ -73,9 +73,13 @@ def replicas_text(replicas: Mapping[str, int]) -> str:
 
 def with_counts(names: Mapping[str, str], replicas: Mapping[str, int]) -> dict[str, str]:
     """Names of conditions, with the number of replicas where it is not the same for all."""
-    if len(set(replicas.values())) == 1:
+    if len(_counts(replicas)) == 1:
         return dict(names)
     return {own: f"{name} (n={replicas[own]})" for own, name in names.items()}
+
+
+def _counts(replicas: Mapping[str, int]) -> list[int]:
+    return sorted({own for own in replicas.values() if own}) or [0]
 
 
 def levels_note(comparison: Comparison) -> str:
