@@ -10,6 +10,7 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 
 from cprl.arguments import path as path_of
+from cprl.arguments import switch
 from cprl.differences import differences
 from cprl.runs.directory import FILE_NAME as RECIPE
 from cprl.runs.directory import read_recipe
@@ -46,6 +47,7 @@ def export_results(run: Path, folder: Path, *, weights: bool = True) -> Path:
         FileNotFoundError: if the run has not ended, or lost a file since.
     """
     run, folder = path_of("run", run), path_of("folder", folder)
+    switch("weights", weights)
     recipe = read_recipe(run)
     _refuse_another(folder, run, recipe)
     for name in (*_WHOLE, _WEIGHTS) if weights else _WHOLE:
