@@ -9,6 +9,7 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
+from cprl import arguments
 from cprl.evaluation.evaluate import SEED
 from cprl.evaluation.lanes import Source, fresh_worlds, policies_of, random_policies
 from cprl.measuring.movement import Trace, overlap, rounds, shooting_distance, trace
@@ -121,7 +122,14 @@ def dip_depth(curves: Values) -> Values:
 
 
 def falls(curves: Values) -> Values:
-    """How far each curve lies below its highest value so far, as a share of it, [R, E]."""
+    """How far each curve lies below its highest value so far, as a share of it, [R, E].
+
+    Raises:
+        ValueError: if the curves are no array of numbers, [R, E].
+    """
+    curves = arguments.floats("curves", curves)
+    if curves.ndim != 2:
+        raise arguments.refusal("curves", list(curves.shape), "an array [R, E]")
     peaks = np.maximum.accumulate(curves, axis=1)
     return _share(peaks - curves, peaks)
 

@@ -8,6 +8,8 @@ import pyarrow as pa
 import torch
 from numpy.typing import NDArray
 
+from cprl import arguments
+from cprl.checks import checked, count
 from cprl.institutions import COUNTS
 from cprl.measuring import phases, social
 from cprl.measuring.institutions import summary
@@ -85,8 +87,14 @@ def running_mean(values: Values, window: int = SMOOTHED_EPISODES) -> Values:
     """Means over `window` consecutive values, each at the position of the first, [..., len - window + 1].
 
     With fewer values, the mean of all. Undefined values are skipped; NaN where no value is defined.
+
+    Raises:
+        ValueError: if the values are no array of numbers with an axis, or the window is no positive integer.
     """
-    window = min(window, values.shape[-1])
+    values = arguments.floats("values", values)
+    if not values.ndim:
+        raise arguments.refusal("values", values.item(), "an array of numbers, [..., E]")
+    window = min(checked("window", window, count(1)), values.shape[-1])
     defined = ~np.isnan(values)
     sums = np.cumsum(_after_a_zero(np.where(defined, values, 0.0)), -1)
     counts = np.cumsum(_after_a_zero(defined.astype(np.float64)), -1)
