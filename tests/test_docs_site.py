@@ -166,7 +166,8 @@ def test_chromium_shows_the_pages_and_no_page_is_wider_than_the_window(built, wi
             assert show.run("return [...document.images].every((own) => own.naturalWidth > 0)"), page
             (tmp_path / f"{page.replace('/', '_')}.png").write_bytes(show())
         show.open(f"{built}/reference/cprl.envs.html")
-        assert show.run("return !!document.getElementById('cprl.envs.CommonsEnv')")
+        has_entry = "return !!document.getElementById('cprl.envs.CommonsEnv')"
+        wait_until(lambda: show.run(has_entry), 20.0, "CommonsEnv is not on its page of the reference")
         assert Image.open(BytesIO(show())).size[0] == width
 
 
