@@ -19,7 +19,7 @@ from cprl.algorithms import DQN
 from cprl.population import Learning
 
 SETTINGS = presets.dqn_settings("single_basic", variant="as_run")
-SETTING = "agents.*.algorithm.settings"
+BY = "agents.*.algorithm.settings"
 
 STUDY = cprl.Study(
     cprl.Experiment(
@@ -31,9 +31,9 @@ STUDY = cprl.Study(
     ),
     conditions={
         "as run": {},
-        "decay 400,000": {f"{SETTING}.epsilon_decay_steps": 400_000},
-        "decay 300,000": {f"{SETTING}.epsilon_decay_steps": 300_000},
-        "gamma 0.999": {f"{SETTING}.gamma": 0.999},
+        "decay 400,000": {f"{BY}.epsilon_decay_steps": 400_000},
+        "decay 300,000": {f"{BY}.epsilon_decay_steps": 300_000},
+        "gamma 0.999": {f"{BY}.gamma": 0.999},
     },
     replicas=16,
     name="dip",
