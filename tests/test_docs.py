@@ -120,12 +120,12 @@ def test_links_between_pages_lead_somewhere():
 
 
 def test_every_interval_of_the_reproduction_stands_in_a_report_or_is_printed_by_the_page_itself(capsys):
-    page = (ROOT / "docs/results.md").read_text()
+    page = "".join((ROOT / "docs" / name).read_text() for name in ("results.md", "explanations.md"))
     reports = "experiment_3", "dip", "combat"
     written = "tables.md", *(f"studies/{name}/report/tables.md" for name in reports)
     tables = "".join((ROOT / "docs/results" / own).read_text() for own in written)
     for code in re.findall(r"```python\n(.*?)```", page, re.DOTALL):
-        exec(compile(code, "docs/results.md", "exec"), {"__name__": "docs"})
+        exec(compile(code, "docs/explanations.md", "exec"), {"__name__": "docs"})
     tables += capsys.readouterr().out
     told = re.findall(INTERVAL, page)
     assert len(told) > 90
