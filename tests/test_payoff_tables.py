@@ -7,6 +7,8 @@ import pytest
 
 from cprl.theory import (
     PayoffTable,
+    PowerWorth,
+    SharingGame,
     alpha_rank,
     compositions,
     equilibria,
@@ -179,6 +181,22 @@ def test_replicator_dynamics_follow_what_pays(open_spiel):
     assert sorted(np.round(ends.mixtures).tolist()) == [[0, 1], [1, 0]], "by where one starts"
     assert replicator_ends(CHICKEN, starts=3).mixtures == pytest.approx(np.array([[1 / 3, 2 / 3]]), abs=1e-3)
     assert replicator_ends(ROCK_PAPER_SCISSORS, starts=1).unsettled == 1.0
+
+
+@pytest.mark.parametrize("gap", [0.2, 0.02, 0.001])
+def test_replicator_dynamics_leave_a_dominated_strategy_however_slowly(gap):
+    # Who plays the second strategy gets `gap` more whatever the other plays, of payoffs from 0 to 1 + gap.
+    table = PayoffTable(agents=2, payoffs=np.array([[1.0, 0.0], [0.0, 1 + gap], [0.0, gap]]))
+    ends = replicator_ends(table, starts=20)
+    assert ends.unsettled == 0
+    assert ends.mixtures == pytest.approx(np.array([[0.0, 1.0]]), abs=0.01)
+
+
+def test_equilibria_that_tie_but_for_rounding_are_all_told():
+    # 30 (1 - 0.6) = 40 (1 - 0.7): beside one that takes 30, to take 30 or 40 pays the same.
+    worth = PowerWorth(top=1.0, factor=0.01, power=1.0)
+    table = sharing_table(SharingGame(agents=2, worth=worth, cost=0.0), [30, 40])
+    assert table.pure_equilibria == [(2, 0), (1, 1)]
 
 
 @pytest.mark.parametrize(

@@ -99,8 +99,8 @@ def test_one_alone_takes_what_is_best_and_at_a_corner_all_take_the_same():
     assert SharingGame(agents=5, worth=own, cost=11).nash_total == 0
     capped = SharingGame(agents=4, worth=PowerWorth(), cost=1, most_each=0.1)
     assert capped.nash_total == capped.optimum_total == 0.4
-    kinked = CallableWorth(function=lambda total: 10 - total, most=2)
-    assert SharingGame(agents=2, worth=kinked, cost=1).optimum_total == 2, "then it is worth nothing at once"
+    kinked = CallableWorth(function=lambda total: min(10 - total, 100 * (2 - total)), most=2)
+    assert SharingGame(agents=2, worth=kinked, cost=1).optimum_total == pytest.approx(190 / 99), "at the kink"
 
 
 def test_payoffs_have_any_leading_axes():
@@ -131,6 +131,19 @@ def test_payoffs_have_any_leading_axes():
         (lambda: CallableWorth(function=lambda a: a, most=1), r"function is 0 at 0; allowed: above 0"),
         (lambda: CallableWorth(function=lambda a: 1 + a, most=1), r"function rises at 0; allowed"),
         (lambda: CallableWorth(function=lambda a: 1 / (1 + a), most=1), r"is less steep from .* on; allowed"),
+        (lambda: CallableWorth(function=lambda a: 10 - a, most=2), r"function is 8 at `most`, 2; allowed: 0"),
+        (lambda: CallableWorth(function=lambda a: 5, most=3), r"function is 5 at `most`, 3; allowed: 0"),
+        (lambda: CallableWorth(function=lambda a: 1 / a, most=3), r"function fails at 0 \(ZeroDivisionError"),
+        (lambda: CallableWorth(function=lambda a: "5", most=3), r"function at 0 is '5'; allowed: a number"),
+        (
+            lambda: CallableWorth(function=lambda a: 10 - a, most=10, derivative=lambda a: 1.0),
+            r"derivative is 1 at 0; allowed: the derivative of the function, there from -1 to",
+        ),
+        (
+            lambda: CallableWorth(function=lambda a: 9 - a**2, most=3, derivative=lambda a: -1e-9),
+            r"derivative is -1e-09 at 0\.046875; allowed: the derivative of the function",
+        ),
+        (lambda: herders(2, worth=PowerWorth), r"SharingGame\.worth is .*; allowed: a Worth"),
     ],
 )
 def test_what_does_not_fit_is_refused(call, message):
@@ -217,6 +230,14 @@ def test_no_stock_grows_faster_than_the_bound(board, probs):
     assert yield_bounds(board, rules).at_most >= max(growths) - 1e-8
     if list(probs) == sorted(probs):
         assert yield_bounds(board, rules).at_most == pytest.approx(max(growths), abs=1e-8)
+
+
+def test_what_is_kept_is_worth_its_own_growth_where_more_apples_near_mean_less():
+    cross = maps.parse(".A.\nAAA\n.A>")
+    rules = Rules(regrow_prob=(0.05, 0.02), regrow_before_bites=True)
+    bounds, exact = yield_bounds(cross, rules), exact_yield(cross, rules).per_step
+    assert bounds.at_least == pytest.approx(0.25)
+    assert bounds.at_most == pytest.approx(exact) == pytest.approx(0.25)
 
 
 @pytest.mark.integration

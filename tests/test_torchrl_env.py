@@ -358,6 +358,22 @@ def test_a_transform_that_cannot_be_put_back_is_named():
         make_env(SHORT, worlds=2, transforms=[as_floats(), pool])
     with pytest.raises(ValueError, match="the state_dict of Forgetful does not hold all of its state"):
         check_restorable(lambda: make_env(SHORT, worlds=2, transforms=[Forgetful()]))
+    with pytest.raises(ValueError, match="the state_dict of Dearer does not hold all of its state"):
+        check_restorable(lambda: make_env(SHORT, worlds=2, transforms=[Dearer()]))
+
+
+class Dearer(Transform):
+    """Takes the more from each reward, the more was taken before: a memory that shows in rewards alone."""
+
+    def __init__(self):
+        super().__init__()
+        self.taken = 0.0
+
+    def _step(self, tensordict, next_tensordict):
+        reward = next_tensordict[keys.REWARD]
+        self.taken += float(reward.sum())
+        next_tensordict[keys.REWARD] = reward * 0.9**self.taken
+        return next_tensordict
 
 
 def as_floats():

@@ -189,8 +189,8 @@ def one_of(*names: str) -> Check:
 
 
 def instance(kind: Any, allowed: str) -> Check:
-    """An instance of a class, or of one of several."""
-    return Check(lambda value: isinstance(value, kind), allowed)
+    """An instance of a class, or of one of several; no class, although one has what a protocol asks for."""
+    return Check(lambda value: isinstance(value, kind) and not isinstance(value, type), allowed)
 
 
 def tuple_of(check: Check, at_least: int = 0) -> Check:

@@ -2,6 +2,7 @@
 
 from collections.abc import Callable, Mapping
 from copy import deepcopy
+from itertools import chain
 from typing import Any, Final
 
 import numpy as np
@@ -64,7 +65,7 @@ def check_restorable(make: Callable[[], EnvBase]) -> None:
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(0)
         first, second = make(), make()
-        carried = _played(first, first.reset(), STEPS_TRIED)[-1]
+        carried = _played(first, first.reset(), STEPS_TRIED)[-1][1]
         fresh = second.reset()
         load_env_state(second, env_state(first))
         copied = load_carried(fresh, carried_state(carried))
@@ -72,7 +73,8 @@ def check_restorable(make: Callable[[], EnvBase]) -> None:
         expected = _played(first, carried, STEPS_TRIED)
         torch.manual_seed(1)
         found = _played(second, copied, STEPS_TRIED)
-    if not all(_equal(one, other) for one, other in zip(found, expected, strict=True)):
+    pairs = zip(chain(*found), chain(*expected), strict=True)
+    if not all(_equal(one, other) for one, other in pairs):
         raise ValueError(
             f"the state_dict of {_at_fault(first)} does not hold all of its state: put back where it was, it "
             "plays on differently, so a run that is stopped could not be resumed; register what it keeps as "
@@ -93,12 +95,12 @@ def _kinds(env: TransformedEnv) -> list[str]:
     return [type(own).__name__ for own in listed]
 
 
-def _played(env: EnvBase, carried: TensorDictBase, steps: int) -> list[TensorDictBase]:
-    """What is carried after each of so many steps of random actions."""
+def _played(env: EnvBase, carried: TensorDictBase, steps: int) -> list[tuple[TensorDictBase, TensorDictBase]]:
+    """So many steps of random actions, rewards included, and what is carried after each."""
     found = []
     for _ in range(steps):
-        carried = env.step_and_maybe_reset(env.rand_action(carried.clone()))[1]
-        found.append(carried.clone())
+        step, carried = env.step_and_maybe_reset(env.rand_action(carried.clone()))
+        found.append((step["next"].clone(), carried.clone()))
     return found
 
 

@@ -32,8 +32,11 @@ POPULATION: Final = 50
 STARTS: Final = 40
 
 _NOISES: Final = (1e-6, 1e-5, 1e-4, 1e-3)
-_LONGEST: Final = 400.0
+_STEPS: Final = 1500
+"""Of the integration, whose steps are the longer the slower the shares change."""
 _AT_REST: Final = 1e-6
+_NO_GAIN: Final = 1e-5
+"""By how much a strategy may get more than the mean at rest, as a share of the range of the payoffs."""
 _SAME: Final = 0.01
 
 
@@ -235,24 +238,34 @@ def replicator_ends(table: PayoffTable, *, starts: int = STARTS, seed: int = 0) 
 
 
 def _end(table: PayoffTable, start: Values) -> Values | None:
-    """Where the dynamics end, or None if they are not at rest after a long time."""
+    """Where the dynamics end, or None if they are not at rest after a long time.
+
+    Shares hardly change where a strategy that gets more is rare, too; that is no rest.
+    """
     from scipy import integrate
 
     scaled, flow = table.normalised, extra("open_spiel.python.egt.dynamics").replicator
 
-    def speed(_: float, shares: Values) -> Values:
-        kept = np.maximum(shares, 0.0)
-        kept = kept / kept.sum()
-        return np.asarray(flow(kept, scaled.against_shares(kept)), dtype=np.float64)
+    def shares_of(cells: Values) -> Values:
+        kept = np.maximum(cells, 0.0)
+        whole: Values = kept / kept.sum()
+        return whole
 
-    def moves(time: float, shares: Values) -> float:
-        return float(np.abs(speed(time, shares)).max() - _AT_REST)
+    def speed(_: float, cells: Values) -> Values:
+        shares = shares_of(cells)
+        return np.asarray(flow(shares, scaled.against_shares(shares)), dtype=np.float64)
 
-    moves.terminal = True  # type: ignore[attr-defined]
-    if moves(0.0, start) <= 0:
-        return start
-    found = integrate.solve_ivp(
-        speed, (0.0, _LONGEST), start, method="LSODA", events=moves, rtol=1e-4, atol=1e-8
-    )
-    end: Values = np.maximum(found.y[:, -1], 0.0)
-    return end / end.sum() if found.status == 1 else None
+    def is_at_rest(cells: Values) -> bool:
+        shares = shares_of(cells)
+        payoffs = scaled.against_shares(shares)
+        gains = payoffs - shares @ payoffs
+        return bool(np.abs(shares * gains).max() <= _AT_REST and gains.max() <= _NO_GAIN)
+
+    solver = integrate.LSODA(speed, 0.0, start, np.inf, rtol=1e-4, atol=1e-8)
+    for _ in range(_STEPS):
+        if is_at_rest(solver.y):
+            return shares_of(solver.y)
+        solver.step()
+        if solver.status != "running":
+            return None
+    return None

@@ -6,8 +6,9 @@ of apples near it. So no policy gets more in the long run than the largest growt
     max over s of  sum over k empty in s of  p(apples of s near k).
 
 The same stock tells how to harvest: whoever takes an apple as soon as it grows, and nothing else, keeps s.
-Where apples grow before bites this gives all that grows, so that both bounds meet; else a harvested site is
-full in the turn in which it is bitten, and gives p / (1 + p) instead of p. The stock is found by integer
+Where apples grow before bites this gives all that grows, so that both bounds meet if p never falls with the
+number of apples; else a harvested site is full in the turn in which it is bitten, and gives p / (1 + p)
+instead of p. The stock is found by integer
 programming (HiGHS, by scipy), whose own bound is a proof, too, where the search is stopped early.
 """
 
@@ -73,7 +74,8 @@ def yield_bounds(board: Map, rules: Rules, *, nodes: int = NODES) -> YieldBounds
     kept, bound = _best_stock(around, kept_rate, nodes)
     if not np.array_equal(kept_rate, highest):
         _, bound = _best_stock(around, highest, nodes)
-    at_least = _growth(kept, around, kept_rate)
+    # A stock that is kept has the growth of its own counts, also where more apples near mean less.
+    at_least = _growth(kept, around, probs[counts] if rules.regrow_before_bites else kept_rate)
     return YieldBounds(at_least=at_least, at_most=max(bound, at_least), kept=kept)
 
 

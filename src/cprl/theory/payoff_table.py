@@ -29,6 +29,8 @@ Values = NDArray[np.float64]
 MOST_COMPOSITIONS: Final = 100_000
 _SUM: Final = 1e-6
 """By how much the shares of a mixture may miss 1."""
+_ROUNDING: Final = 1e-9
+"""Of payoffs, as a share of their range."""
 
 
 def compositions(agents: int, strategies: int) -> Counts:
@@ -181,8 +183,10 @@ class PayoffTable:
 
     @property
     def pure_equilibria(self) -> list[tuple[int, ...]]:
-        """The counts of the compositions in which no agent gains if it alone plays another strategy."""
-        return [own for own in self.rows if all(gain <= 0 for gain in self._gains(own))]
+        """The counts of the compositions in which no agent gains if it alone plays another strategy, but for
+        rounding."""
+        most = _ROUNDING * float(np.nanmax(self.payoffs) - np.nanmin(self.payoffs))
+        return [own for own in self.rows if all(gain <= most for gain in self._gains(own))]
 
     def _gains(self, own: Sequence[int]) -> list[float]:
         """What an agent gains by another strategy, for every strategy that is played."""

@@ -89,7 +89,11 @@ def planned_harvest(
 
 @cache
 def best_planner(game: Game) -> Planner:
-    """The candidate that harvests most in 10 episodes, in other worlds than those of `planned_harvest`."""
+    """The candidate that harvests most in 10 episodes, in other worlds than those of `planned_harvest`.
+
+    Raises:
+        ValueError: for what `planned_harvest` refuses.
+    """
     found = [planned_harvest(game, own, episodes=10, seed=_SEED_OF_CHOICE).mean() for own in CANDIDATES]
     return CANDIDATES[int(np.argmax(found))]
 

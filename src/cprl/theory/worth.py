@@ -5,8 +5,8 @@ from dataclasses import dataclass
 from itertools import pairwise
 from typing import Final, Protocol, runtime_checkable
 
-from cprl.arguments import callable_of
-from cprl.checks import Check, check_fields, checked, is_number
+from cprl import arguments
+from cprl.checks import MOST_NUMBER, Check, check_fields, checked, is_number
 
 _STEP: Final = 1e-6
 """Of the numerical slope, as a share of the range."""
@@ -82,11 +82,13 @@ _CHECKS: Final[dict[str, Check]] = {
 
 @dataclass(frozen=True, kw_only=True)
 class CallableWorth:
-    """A function of your own: positive below `most`, falling there, and never less steeply.
+    """A function of your own: positive below `most`, falling there to 0, and never less steeply.
 
     Raises:
-        ValueError: names the field, what came and what is allowed; also where the function rises, becomes
-            less steep or is not positive at one of the totals at which it is tried.
+        ValueError: names the field, what came and what is allowed; also where the function, at one of the
+            totals at which it is tried, fails or gives no number, rises, becomes less steep, or is not
+            positive; where it is not 0 at `most`, to a thousandth of its highest value; and where the
+            derivative is none of this function.
     """
 
     function: Callable[[float], float]
@@ -97,12 +99,18 @@ class CallableWorth:
     """v'(A); by default from differences of the function."""
 
     def __post_init__(self) -> None:
-        callable_of("CallableWorth.function", self.function, "a function of the total")
+        arguments.callable_of("CallableWorth.function", self.function, "a function of the total")
         if self.derivative is not None:
-            callable_of("CallableWorth.derivative", self.derivative, "a function of the total, or None")
+            arguments.callable_of(
+                "CallableWorth.derivative", self.derivative, "a function of the total, or None"
+            )
         object.__setattr__(self, "most", checked("CallableWorth.most", self.most, _positive()))
-        totals = [self.most * nth / _TRIED for nth in range(_TRIED)]
-        _check_shape(totals, list(map(self.at, totals)))
+        totals = [self.most * nth / _TRIED for nth in range(_TRIED + 1)]
+        values = [_number_of("function", self.function, total) for total in totals]
+        _check_shape(totals, values)
+        if self.derivative is not None:
+            slopes = [_number_of("derivative", self.derivative, total) for total in totals[:-1]]
+            _check_slopes(totals, values, slopes)
 
     def at(self, total: float) -> float:
         """v(A)."""
@@ -120,13 +128,28 @@ class CallableWorth:
 _TRIED: Final = 64
 """Totals at which a function of the user's own is tried."""
 _ROUNDING: Final = 1e-9
+_NOTHING: Final = 1e-3
+"""What a unit may still be worth at `most`, as a share of the highest value."""
+
+
+def _number_of(field: str, function: Callable[[float], float], total: float) -> float:
+    """What a function of the user's own gives for a total."""
+    where = f"CallableWorth.{field}"
+    try:
+        value = function(total)
+    except Exception as error:
+        failed = f"{type(error).__name__}: {error}"
+        raise ValueError(f"{where} fails at {total:g} ({failed}); allowed: a number there") from error
+    return arguments.number(
+        f"{where} at {total:g}", value, low=-MOST_NUMBER, high=MOST_NUMBER, allowed="a number"
+    )
 
 
 def _check_shape(totals: list[float], values: list[float]) -> None:
-    """Refuses a function that is not positive, does not fall, or falls less and less steeply."""
+    """Refuses a function that is not positive, does not fall, falls less and less steeply, or not to 0."""
     where, margin = "CallableWorth.function", _ROUNDING * max(map(abs, values))
     falls = [before - after for before, after in pairwise(values)]
-    for total, value in zip(totals, values, strict=True):
+    for total, value in zip(totals[:-1], values, strict=False):
         if not value > 0:
             raise ValueError(f"{where} is {value:g} at {total:g}; allowed: above 0 below `most`")
     for total, fall in zip(totals, falls, strict=False):
@@ -137,4 +160,22 @@ def _check_shape(totals: list[float], values: list[float]) -> None:
             raise ValueError(
                 f"{where} is less steep from {total:g} on; allowed: one that falls ever more steeply, or a "
                 "straight line"
+            )
+    if abs(values[-1]) > _NOTHING * max(values):
+        raise ValueError(
+            f"{where} is {values[-1]:g} at `most`, {totals[-1]:g}; allowed: 0 there, where a unit is worth "
+            "nothing any more"
+        )
+
+
+def _check_slopes(totals: list[float], values: list[float], slopes: list[float]) -> None:
+    """Refuses what is no derivative: that of a function which falls ever more steeply lies between the slopes
+    of the chords before and after."""
+    chords = [(after - before) / totals[1] for before, after in pairwise(values)]
+    margin = _ROUNDING * max(map(abs, chords))
+    for total, slope, before, after in zip(totals, slopes, [0.0, *chords], chords, strict=False):
+        if not after - margin <= slope <= before + margin:
+            raise ValueError(
+                f"CallableWorth.derivative is {slope:g} at {total:g}; allowed: the derivative of the "
+                f"function, there from {after:g} to {before:g}"
             )
