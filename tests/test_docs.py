@@ -1,8 +1,11 @@
 """What the docs say is so: names are compared, code is run."""
 
 import ast
+import functools
 import importlib
 import re
+import shlex
+import subprocess
 import sys
 from pathlib import Path
 
@@ -10,6 +13,7 @@ import pytest
 from rerun.chunk import RrdReader
 from test_rerun_logger import trained
 
+from cprl import cli
 from cprl.measuring import institutions, names
 from cprl.measuring.series import OF_AGENTS
 from cprl.runs.columns import OF_INSTITUTIONS
@@ -66,12 +70,17 @@ def test_the_docs_name_what_is_logged_and_kept_of_institutions():
     assert columns == [*OF_INSTITUTIONS, "in_force_<v>"]
 
 
+def codes(page):
+    """The blocks of Python of a page."""
+    return re.findall(r"```python\n(.*?)```", page.read_text(), re.DOTALL)
+
+
 def blocks():
     """Each block of Python, with the modules that its page has shown before: blocks that begin with the name
     of their file, `# own.py`."""
     for page in PAGES:
         modules = {}
-        for number, code in enumerate(re.findall(r"```python\n(.*?)```", page.read_text(), re.DOTALL)):
+        for number, code in enumerate(codes(page)):
             yield pytest.param(code, dict(modules), id=f"{page.name}-{number}")
             if name := re.match(r"# (\w+)\.py\n", code):
                 modules[name[1]] = code
@@ -91,6 +100,39 @@ def test_python_in_the_docs_runs(code, modules, tmp_path, monkeypatch):
     assert _names_bound_by(code) <= set(left), "it ran to its last line"
     for name in modules:
         sys.modules.pop(name, None)
+
+
+@pytest.mark.integration
+def test_the_collector_of_several_processes_runs_as_a_script(tmp_path):
+    (code,) = (code for code in codes(ROOT / "docs/workers.md") if '__name__ == "__main__"' in code)
+    (tmp_path / "collect.py").write_text(code)
+    done = subprocess.run([sys.executable, "collect.py"], cwd=tmp_path, capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr
+    assert done.stdout
+
+
+def command_lines():
+    """What a shell would run of the subcommands of `cprl`, but for those whose options a recipe adds."""
+    for page in PAGES:
+        for block in re.findall(r"```sh\n(.*?)```", page.read_text(), re.DOTALL):
+            for line in block.replace("\\\n", " ").splitlines():
+                words = shlex.split(re.split(r" [>|] ", line)[0], comments=True)
+                if words and Path(words[0]).name == "cprl" and words[1] not in ("run", "sweep", "--version"):
+                    yield pytest.param(words[1:], id=f"{page.name}: {' '.join(words[1:])}"[:80])
+
+
+@pytest.mark.parametrize("words", list(command_lines()))
+def test_every_command_in_the_docs_has_these_options(words, monkeypatch, capsys):
+    called = []
+
+    def instead(command):
+        return functools.wraps(command)(lambda *given, **options: called.append((given, options)))
+
+    stubs = {name: instead(command) for name, command in cli.COMMANDS.items()}
+    monkeypatch.setattr(cli, "COMMANDS", stubs)
+    monkeypatch.setattr(sys, "argv", ["cprl", *words])
+    cli.main()
+    assert len(called) == 1, capsys.readouterr().err
 
 
 def _names_bound_by(code):

@@ -30,6 +30,8 @@ from dataclasses import replace
 import cprl
 from cprl import CommonsEnv, Game, Rules, maps, presets
 from cprl.algorithms import DQN
+from cprl.envs import make_env
+from cprl.envs.matrix import MatrixGame
 from cprl.population import Learning
 
 
@@ -41,6 +43,9 @@ def experiment(*, freeze_steps: int = 5) -> cprl.Experiment:
 
 
 env = CommonsEnv(Game(map=maps.parse("A.>"), rules=Rules(freeze_steps=3)), worlds=2)
+worlds = make_env(experiment().game, worlds=2)
+study = cprl.Study(experiment(), {"game.rules.freeze_steps": [5, 25]}, replicas=2)
+chicken = MatrixGame([[[6, 6], [2, 7]], [[7, 2], [0, 0]]])
 names: list[str] = [field for field in experiment().to_config()]
 """
 """What a user might write; it holds no type but those of cprl."""

@@ -55,7 +55,7 @@ MOST_SEED: Final = 2**64 - 2
 class Experiment:
     """What is trained and how; equals what `recipe.json` holds.
 
-    Lists become tuples. Two are equal where their recipes are.
+    Lists become tuples, though type checkers ask for tuples. Two are equal where their recipes are.
 
     Raises:
         ValueError: names the field, what came and what is allowed.

@@ -70,7 +70,7 @@ class Integers:
 
 
 Distribution: TypeAlias = Uniform | LogUniform | Integers
-Factor: TypeAlias = tuple[Any, ...] | Mapping[str, Mapping[str, Any]] | Distribution
+Factor: TypeAlias = Sequence[Any] | Mapping[str, Mapping[str, Any]] | Distribution
 """Values of the field that its path names; or levels by name, each with its changes; or a distribution."""
 
 DISTRIBUTIONS: Final[dict[str, type[Any]]] = {own.__name__: own for own in (Uniform, LogUniform, Integers)}

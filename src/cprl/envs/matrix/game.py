@@ -26,7 +26,7 @@ class MatrixGame:
         ValueError: names the field, what came and what is allowed.
     """
 
-    payoffs: tuple[Any, ...]
+    payoffs: Any
     """What all N agents are paid, float [A, ..., A, N]: an axis for the action of each agent, and their
     payoffs last; nested tuples, lists or an array."""
     _: KW_ONLY
