@@ -1,7 +1,9 @@
 """How often intervals of eight replicas hold the truth, and how often the rule of `cprl report` contradicts
-curves that are drawn as ours are; the numbers stand in docs/results.md.
+curves that are drawn as ours are; the numbers stand in docs/results.md. And how often the interval of a
+difference of nothing excludes 0, by the number of replicas: docs/studies.md.
 
 python docs/verdict_rates.py
+python docs/verdict_rates.py --differences
 """
 
 from collections.abc import Callable
@@ -11,7 +13,7 @@ import tyro
 from numpy.typing import NDArray
 from scipy import stats
 
-from cprl.measuring.statistics import estimate
+from cprl.measuring.statistics import difference, estimate
 from cprl.reporting import verdicts
 
 Values = NDArray[np.float64]
@@ -24,11 +26,15 @@ LAWS: dict[str, tuple[Draw, float]] = {
 }
 """Distributions of replicas, with their means."""
 POINTS, WINDOW = 400, 20
+PAIRS = 2, 3, 4, 5, 6, 8, 10, 12, 16, 24, 32
 
 
-def main(*, replicas: int = 8, repetitions: int = 1_000, seed: int = 0) -> None:
-    """Prints two tables in Markdown."""
+def main(*, replicas: int = 8, repetitions: int = 1_000, seed: int = 0, differences: bool = False) -> None:
+    """Prints two tables in Markdown, or that of differences."""
     rng = np.random.default_rng(seed)
+    if differences:
+        _differences(rng, repetitions)
+        return
     print("| replicas are | percentile | BCa | t |\n|---|---:|---:|---:|")
     for name, (draw, mean) in LAWS.items():
         held = np.zeros(3)
@@ -57,6 +63,19 @@ def main(*, replicas: int = 8, repetitions: int = 1_000, seed: int = 0) -> None:
                 alarms += of_curve.verdict == verdicts.CONTRADICTED
             rates.append(f"{alarms / repetitions:.1%}")
         print(f"| {name} | {' | '.join(rates)} |", flush=True)
+
+
+def _differences(rng: np.random.Generator, repetitions: int) -> None:
+    """How often the interval of the difference of two conditions excludes 0 that are the same, by the number
+    of replicas, which are normal and paired."""
+    print("| replicas | BCa | t |\n|---:|---:|---:|")
+    for pairs in PAIRS:
+        excluded = np.zeros(2)
+        for _ in range(repetitions):
+            one, other = rng.normal(size=(2, pairs))
+            found = [difference(one, other, paired=True, interval=own) for own in ("bca", "t")]
+            excluded += [own.low > 0 or own.high < 0 for own in found]
+        print(f"| {pairs} | " + " | ".join(f"{own:.1%}" for own in excluded / repetitions) + " |", flush=True)
 
 
 def _percentile(sample: Values, rng: np.random.Generator) -> tuple[float, float]:

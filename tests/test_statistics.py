@@ -3,7 +3,13 @@
 import numpy as np
 import pytest
 
-from cprl.measuring.statistics import curve_interval, estimate, inter_quartile_mean
+from cprl.measuring.statistics import (
+    curve_interval,
+    difference,
+    estimate,
+    excluded_by_chance,
+    inter_quartile_mean,
+)
 
 
 def test_the_inter_quartile_mean_ignores_a_quarter_at_each_end():
@@ -66,3 +72,20 @@ def test_a_curve_has_an_interval_at_each_episode():
     assert np.isnan([middle[3], low[3], high[3]]).all()
     with pytest.raises(ValueError, match=r"curves is \[4\]; allowed: \[R, E\]"):
         curve_interval(curves[0])
+
+
+def test_what_is_said_of_chance_is_about_what_happens_by_chance():
+    rng = np.random.default_rng(0)
+    for replicas, cases, told in ((2, 2, "two"), (4, 5, "five"), (9, 9, "eight")):
+        excluded = 0
+        for _ in range(200):
+            one, other = rng.normal(size=(2, replicas))
+            found = difference(one, other, paired=True)
+            excluded += found.low > 0 or found.high < 0
+        assert excluded / 200 == pytest.approx(1 / cases, abs=0.08)
+        assert excluded_by_chance("bca", replicas) == f"one in {told}"
+        assert excluded_by_chance("t", replicas) == "one in twenty"
+    assert excluded_by_chance("bca", 1000) == "one in twenty"
+    for wrong in (("sd", 4), ("t", 0)):
+        with pytest.raises(ValueError, match="allowed"):
+            excluded_by_chance(*wrong)

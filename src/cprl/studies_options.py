@@ -15,6 +15,7 @@ from typing import Any, Final, Literal
 import tyro
 
 from cprl.arguments import integer
+from cprl.measuring.statistics import Interval
 from cprl.output import console, say
 from cprl.runs.directory import without_directories, without_options
 from cprl.studies.execution import RUNS, STATUS, StudyResult, directory_of, run_study, trials_with
@@ -58,6 +59,8 @@ class StudyOptions:
     """Write the table, summary and figures at the end."""
     last: int = LAST
     """Episodes at the end of the training that these compare; of long trainings rather 500."""
+    interval: Interval = "bca"
+    """How their intervals are computed: "bca", the bootstrap, too narrow for few replicas; "t", Student's."""
     watch: str = "off"
     """"serve", "spawn" or "connect ADDRESS": the table of all trials, and the returns of finished ones, in
     the Rerun viewer."""
@@ -113,7 +116,7 @@ def carry_out(what: Study | Search, options: StudyOptions, command: Sequence[str
                 )
     if options.dry_run:
         return _list(what, options)
-    names = ("runs", "allow", "watch", "last")
+    names = ("runs", "allow", "watch", "last", "interval")
     how: dict[str, Any] = {"on": executor, **{own: getattr(options, own) for own in names}}
     whole = without_options(command[1:], ["--only"])  # what a part of a study lacks, it lacks
     how |= {"results": options.figures, "again": shlex.join([without_directories(command[0]), *whole])}

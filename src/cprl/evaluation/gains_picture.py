@@ -13,7 +13,7 @@ from cprl.evaluation.cross_play import CrossPlay
 from cprl.evaluation.gains import diagonal_returns, gains
 from cprl.evaluation.tables import unit_of_cells
 from cprl.measuring.names import with_unit
-from cprl.measuring.statistics import Estimate, Interval
+from cprl.measuring.statistics import Estimate, Interval, excluded_by_chance
 from cprl.plotting.cells import EMPTY, draw_cell
 from cprl.plotting.style import INTERVALS, SMALL_PT, head, picture_path, save, wrapped
 
@@ -47,10 +47,11 @@ def draw_gains(played: CrossPlay, path: Path | str, *, interval: Interval = "t")
         _draw_matrix(axes, names, own, diagonal)
         axes.set_title(f"difference in {returns} of {title}", fontsize=SMALL_PT + 1)
     count = len(played.replicas)
+    by_chance = excluded_by_chance(interval, count)
     note = (
         f"{count} replica{'s' * (count != 1)}, {played.episodes} episodes each with focal agent at each "
         f"index; diagonal ({played.diagonal.replace('_', '-')}): an agent's return. * the 95 % interval by "
-        f"{INTERVALS[interval]} excludes 0, as that of about one in twenty would by chance; these are "
+        f"{INTERVALS[interval]} excludes 0, as that of about {by_chance} would by chance; these are "
         f"{2 * len(found)}."
     )
     head(figure, "Cross-play: who gains among whom", note)

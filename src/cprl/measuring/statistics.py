@@ -27,6 +27,19 @@ Interval = Literal["bca", "t"]
 there are several samples or that is undefined; "t", of means alone, by Student's t, which is wider and right
 for few replicas if their values are about normally distributed."""
 
+_BY_CHANCE: Final = {
+    2: "two",
+    3: "three",
+    4: "five",
+    6: "seven",
+    8: "eight",
+    10: "ten",
+    16: "twelve",
+    50: "twenty",
+}
+"""By the number of replicas, in one of how many cases the bootstrap's interval of a difference of nothing
+excludes 0: python docs/verdict_rates.py --differences."""
+
 CONFIDENCE: Final = 0.95
 RESAMPLES: Final = 2000
 _BELOW_ONE: Final = np.nextafter(1.0, 0.0).item()
@@ -47,6 +60,25 @@ class Estimate:
         """The value with its interval, of a single replica the value alone."""
         has_interval = np.isfinite([self.low, self.high]).all()
         return f"{self.value:.4g} [{self.low:.4g}, {self.high:.4g}]" if has_interval else f"{self.value:.4g}"
+
+
+def excluded_by_chance(interval: Interval, replicas: int) -> str:
+    """In how many cases an interval excludes 0 where there is no difference, e.g. "one in twenty".
+
+    Intervals by Student's t do in one of twenty. Bootstraps of a few replicas are too narrow, and do more
+    often.
+
+    Args:
+        interval: how the interval is computed.
+        replicas: of each condition.
+
+    Raises:
+        ValueError: for anything else.
+    """
+    arguments.choice("interval", interval, get_args(Interval))
+    replicas = arguments.integer("replicas", replicas, 1)
+    cases = [own for fewest, own in _BY_CHANCE.items() if fewest <= max(replicas, 2)]
+    return f"one in {'twenty' if interval == 't' else cases[-1]}"
 
 
 def mean(values: ArrayLike, axis: int = -1) -> Any:

@@ -5,9 +5,10 @@ from collections.abc import Iterator, Sequence
 from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Final
+from typing import Any, Final, get_args
 
-from cprl.arguments import integer, object_of, path, refusal, switch, texts
+from cprl.arguments import choice, integer, object_of, path, refusal, switch, texts
+from cprl.measuring.statistics import Interval
 from cprl.runs.files import read_json, write_json
 from cprl.runs.lock import FILE_NAME as LOCK
 from cprl.runs.lock import RunLock, RunLockedError
@@ -53,6 +54,7 @@ def run_study(
     watch: str = "off",
     results: bool = True,
     last: int = LAST,
+    interval: Interval = "bca",
     again: str = "",
 ) -> StudyResult:
     """Runs what a study lacks; may be stopped at any moment, and called again.
@@ -76,6 +78,7 @@ def run_study(
         results: whether `table.parquet`, `summary.md` and `figures/` are written at the end, see
             `cprl.studies.results`.
         last: episodes at the end of the training that these compare, at least 10.
+        interval: how their intervals are computed, see `cprl.measuring.statistics.Interval`.
         again: the command line that runs what is lacking, for the summary.
 
     Raises:
@@ -90,6 +93,7 @@ def run_study(
     switch("results", results)
     switch("keep_checkpoints", keep_checkpoints)
     check_last(last)
+    choice("interval", interval, get_args(Interval))
     with as_driver(
         study,
         trials,
@@ -101,7 +105,8 @@ def run_study(
         watch=watch,
     ) as driver:
         failed = driver.run(chosen, on or InProcess())
-    table = results_of(study, trials, out, folder, last=last, again=again) if results else None
+    how: Any = {"last": last, "interval": interval, "again": again}
+    table = results_of(study, trials, out, folder, **how) if results else None
     return StudyResult(study, out, folder, tuple(trials), failed, table)
 
 
@@ -123,15 +128,13 @@ def trials_with(trials: Sequence[Trial], only: Sequence[str]) -> list[Trial]:
     ]
 
 
-def results_of(
-    study: Study, trials: Sequence[Trial], out: Path, runs: Path, *, last: int, again: str
-) -> StudyTable | None:
-    """Writes table, summary and figures of what has finished; None if nothing has."""
+def results_of(study: Study, trials: Sequence[Trial], out: Path, runs: Path, **how: Any) -> StudyTable | None:
+    """Writes table, summary and figures of what has finished, see `write_results`; None if nothing has."""
     if all(trial.state(runs) != "finished" for trial in trials):
         return None
     from cprl.studies.results import write_results  # with matplotlib
 
-    return write_results(study, out, runs, last=last, again=again)
+    return write_results(study, out, runs, **how)
 
 
 def check_last(last: int) -> None:

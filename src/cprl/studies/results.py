@@ -7,7 +7,7 @@ from typing import Final
 
 from cprl.arguments import object_of
 from cprl.arguments import path as path_of
-from cprl.measuring.statistics import Interval
+from cprl.measuring.statistics import Interval, excluded_by_chance
 from cprl.runs.extension import REPORT
 from cprl.runs.files import read_json, write_atomically
 from cprl.studies.figures.by_condition import by_condition
@@ -171,8 +171,10 @@ def _compared(table: StudyTable, part: str, last: int, interval: Interval) -> li
     if len(table.design.conditions) > 1:
         differences = cells(every, "differences")
         count = len(differences.rows) * len(chosen)
+        fewest = min((own.replicas for one in every for own in one.conditions if own.replicas), default=1)
+        by_chance = excluded_by_chance(interval, fewest)
         lines += [
-            f"{differences.heading} Bold: the interval excludes 0, as that of about one in twenty would by "
+            f"{differences.heading} Bold: the interval excludes 0, as that of about {by_chance} would by "
             f"chance; these are {count}.",
             "",
             *markdown(differences),

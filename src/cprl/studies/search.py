@@ -11,10 +11,11 @@ from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any, Final
+from typing import Any, Final, get_args
 
-from cprl.arguments import object_of, switch
+from cprl.arguments import choice, object_of, switch
 from cprl.arguments import path as path_of
+from cprl.measuring.statistics import Interval
 from cprl.runs.files import write_json
 from cprl.studies.execution import (
     RUNS,
@@ -73,6 +74,7 @@ def run_search(
     watch: str = "off",
     results: bool = True,
     last: int = LAST,
+    interval: Interval = "bca",
     again: str = "",
 ) -> SearchResult:
     """Runs a search; may be stopped at any moment, and called again, with more points too.
@@ -87,6 +89,7 @@ def run_search(
         watch: see `cprl.studies.run_study`.
         results: see `cprl.studies.run_study`.
         last: see `cprl.studies.run_study`; what the search itself looks at is in `Search`.
+        interval: see `cprl.studies.run_study`.
         again: see `cprl.studies.run_study`.
 
     Raises:
@@ -97,6 +100,7 @@ def run_search(
     check_executor(on)
     switch("results", results)
     check_last(last)
+    choice("interval", interval, get_args(Interval))
     optuna = _optuna()
     asked = _Asked(search, optuna)
     batch = asked.first_batch()
@@ -116,7 +120,8 @@ def run_search(
             _write_journal(optuna, asked.study, out / JOURNAL)
             batch = asked.next_batch()
     trials = trials_of(study)
-    table = results_of(study, trials, out, folder, last=last, again=again) if results else None
+    how: Any = {"last": last, "interval": interval, "again": again}
+    table = results_of(study, trials, out, folder, **how) if results else None
     return SearchResult(search, study, out, folder, tuple(asked.points), tuple(trials), tuple(failed), table)
 
 
