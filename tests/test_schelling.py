@@ -1,6 +1,7 @@
 """What restrained and greedy agents get in all mixes, drawn and told."""
 
 import importlib.util
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -84,6 +85,8 @@ def test_agents_of_runs_play_restrained_or_greedy(tmp_path):
         ]
     with pytest.raises(ValueError, match="keeps no network of replica_3/agent_0"):
         schelling(MEADOW, greedy=str(run), episodes=1, replicas=4)
+    with pytest.raises(ValueError, match=r"restrained and greedy are .* and .*, the same run; allowed: two"):
+        schelling(MEADOW, restrained=str(run), greedy=f"{run}/", episodes=1)
 
 
 @pytest.mark.parametrize(
@@ -91,6 +94,13 @@ def test_agents_of_runs_play_restrained_or_greedy(tmp_path):
     [
         ({"where": presets.game("single_basic")}, "the game has 1 agent; allowed for a Schelling diagram"),
         ({"greedy": "sustainable"}, "restrained and greedy are both 'sustainable'; allowed: two ways"),
+        (
+            {
+                "where": replace(CORRIDORS, rules=replace(CORRIDORS.rules, may_fire=False)),
+                "restrained": "territorial",
+            },
+            "restrained is 'territorial' and greedy 'greedy', which play alike without a beam; allowed: two",
+        ),
         ({"restrained": "kind"}, "restrained is 'kind'; allowed: random, greedy, .*, or a run's directory"),
         ({"where": None}, "where is None; allowed: a game"),
         ({"replicas": 0}, "replicas is 0"),

@@ -12,13 +12,14 @@ agents that learn, E. Hughes et al. (2018) and J. Perolat et al. (2017).
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Any
+from typing import Any, Final
 
 import numpy as np
 import pyarrow as pa
 from numpy.typing import NDArray
 
 from cprl import arguments
+from cprl.commons.game import Game
 from cprl.evaluation.evaluate import SEED
 from cprl.evaluation.lanes import Played, pooled
 from cprl.evaluation.populations import place_of, play_population
@@ -26,7 +27,10 @@ from cprl.evaluation.words import agent_named
 from cprl.measuring.dilemmas import Dilemma, dilemma
 from cprl.measuring.replicas import Measured, social_measures
 from cprl.measuring.statistics import Interval
+from cprl.policies.scripted import SCRIPTED_POLICIES
 from cprl.runs.labelled import labelled
+
+_ALIKE_WITHOUT_A_BEAM: Final = {"greedy", "territorial"}
 
 Values = NDArray[np.float64]
 Who = tuple[int, ...]
@@ -134,8 +138,7 @@ def schelling(
     agents = place_of(where).game.agents
     if agents < 2:
         raise ValueError("the game has 1 agent; allowed for a Schelling diagram: at least 2")
-    if restrained == greedy:
-        raise ValueError(f"restrained and greedy are both {greedy!r}; allowed: two ways to play")
+    _check_unlike(place_of(where).game, restrained, greedy)
     specs = {
         is_restrained: [agent_named(name_of, agent, replica=None, name=name) for agent in range(agents)]
         for is_restrained, name, name_of in ((True, "restrained", restrained), (False, "greedy", greedy))
@@ -153,6 +156,22 @@ def schelling(
         },
         **how,
     )
+
+
+def _check_unlike(game: Any, restrained: str, greedy: str) -> None:
+    """Refuses the same policy twice, also in other words."""
+    one, other = (
+        who if who in SCRIPTED_POLICIES else arguments.path("who plays", who).resolve()
+        for who in (restrained, greedy)
+    )
+    if one == other:
+        words = f"both {greedy!r}" if restrained == greedy else f"{restrained!r} and {greedy!r}, the same run"
+        raise ValueError(f"restrained and greedy are {words}; allowed: two ways to play")
+    if isinstance(game, Game) and not game.rules.may_fire and {one, other} <= _ALIKE_WITHOUT_A_BEAM:
+        raise ValueError(
+            f"restrained is {restrained!r} and greedy {greedy!r}, which play alike without a beam; "
+            "allowed: two ways to play"
+        )
 
 
 def _mixes(agents: int) -> list[Who]:

@@ -9,6 +9,7 @@ from typing import Any, Final, get_args
 
 from cprl.arguments import choice, integer, object_of, path, refusal, switch, texts
 from cprl.measuring.statistics import Interval
+from cprl.runs.directory import FILE_NAME as RECIPE
 from cprl.runs.files import read_json, write_json
 from cprl.runs.lock import FILE_NAME as LOCK
 from cprl.runs.lock import RunLock, RunLockedError
@@ -143,8 +144,18 @@ def check_last(last: int) -> None:
 
 
 def directory_of(study: Study, out: Path | str | None) -> Path:
-    """The directory of a study, by default `studies/<name>`."""
-    return Path("studies") / study.name if out is None else path("out", out)
+    """The directory of a study, by default `studies/<name>`.
+
+    Raises:
+        ValueError: for a file, and for the directory of a run.
+    """
+    found = Path("studies") / study.name if out is None else path("out", out)
+    allowed = "a new directory, or that of an earlier study"
+    if found.exists() and not found.is_dir():
+        raise ValueError(f"out is {found}, a file; allowed: {allowed}")
+    if (found / RECIPE).exists():
+        raise ValueError(f"out is {found}, the directory of a run; allowed: {allowed}")
+    return found
 
 
 def check_executor(on: object) -> None:
