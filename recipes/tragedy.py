@@ -50,7 +50,7 @@ def experiment() -> cprl.Experiment:
 def tell(run: Path) -> None:
     """Says what happened, and what to try next."""
     say(in_sentences(course_of(run)))
-    say(NEXT.format(run=shlex.quote(str(run)), cprl=shlex.quote(cprl_here())))
+    say(NEXT.format(run=shlex.quote(str(run)), cprl=shlex.join(cprl_here())))
 
 
 if __name__ == "__main__":
