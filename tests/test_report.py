@@ -26,7 +26,7 @@ from cprl.evaluation.film import film
 from cprl.measuring.movement import Trace
 from cprl.measuring.published import curve, published_experiment
 from cprl.population import Frozen, Scripted
-from cprl.reporting import write_report
+from cprl.reporting import report, write_report
 from cprl.reporting.measures import ROUNDS, dip_depth, measures, of_play, of_training
 from cprl.reporting.result import Result
 from cprl.reporting.turning import turning_points_of
@@ -235,6 +235,20 @@ def test_a_report_imports_code_of_ones_own_where_it_is_allowed(tmp_path, capsys,
     monkeypatch.setattr("sys.argv", line)
     cli.main()
     assert capsys.readouterr().out.splitlines()[-1] == str(tmp_path / "again" / "tables.md")
+
+
+@pytest.mark.parametrize(
+    ("stored", "listed"),
+    [
+        ("cprl run commons --seed 3", "cprl run commons --seed 3"),
+        (".venv/bin/cprl run commons --seed 3 --resume", "cprl run commons --seed 3"),
+        (r"'.venv\Scripts\cprl' run commons", "cprl run commons"),
+        ("cprl/recipes/commons.py --go-on", "python recipes/commons.py"),
+        ("cprl.py", "python cprl.py"),
+    ],
+)
+def test_a_report_lists_a_run_by_the_command_or_the_recipe_that_made_it(stored, listed):
+    assert report._command(stored) == listed
 
 
 def views_of(path):
