@@ -299,6 +299,24 @@ def test_watch_opens_all_recordings_of_a_run_as_one(tmp_path, monkeypatch, capsy
     assert opened[0][1:] == [str(tmp_path / "run-2.rrd"), str(tmp_path / "run.rrd")]
 
 
+def test_watch_waits_for_the_viewer_on_windows_where_no_program_replaces_another(tmp_path, monkeypatch):
+    from cprl import cli
+
+    def call(command):
+        opened.append(command)
+        return 3
+
+    opened = []
+    (tmp_path / "run.rrd").touch()
+    monkeypatch.setattr(sys, "platform", "win32")
+    monkeypatch.setattr(cli.subprocess, "call", call)
+    monkeypatch.setattr(cli, "viewer", lambda: "rerun")
+    with pytest.raises(SystemExit) as ended:
+        cli.watch(tmp_path)
+    assert ended.value.code == 3
+    assert opened == [["rerun", str(tmp_path / "run.rrd")]]
+
+
 def test_watch_opens_the_viewer_of_the_package_where_no_command_is_at_hand(tmp_path, monkeypatch):
     from cprl import cli
 

@@ -14,7 +14,7 @@ import tyro
 from cprl.arguments import object_of, texts
 from cprl.commandline import in_a_sentence, parse_with
 from cprl.experiment import Experiment
-from cprl.output import keep_output
+from cprl.output import keep_output, printed
 from cprl.runs.directory import read_recipe
 from cprl.shipped import is_shipped, program_of, recipe_named
 from cprl.studies.factors import Distribution
@@ -228,7 +228,8 @@ def recipe_of(source: Path, allow: Sequence[str] = ()) -> Callable[..., Experime
     made: Callable[..., Experiment] | None = getattr(module, "experiment", None)
     if not callable(made):
         if hasattr(module, "STUDY"):
-            raise ValueError(f"{source} describes a study, which is run by itself: python {source}")
+            line = printed(["python", str(source)])
+            raise ValueError(f"{source} describes a study, which is run by itself: {line}")
         raise ValueError(f"{source} has no function `experiment`; allowed: one that gives an Experiment")
     return made
 

@@ -1,7 +1,6 @@
 """How a study is run, as options of a command line: `cprl sweep` and recipes of studies share them."""
 
 import os
-import shlex
 import signal
 import sys
 import time
@@ -15,7 +14,7 @@ from typing import Any, Final, Literal
 import tyro
 
 from cprl.arguments import integer
-from cprl.output import console, say
+from cprl.output import console, printed, say
 from cprl.runs.directory import without_directories, without_options
 from cprl.shipped import command_of, named_command
 from cprl.studies.execution import RUNS, STATUS, StudyResult, directory_of, run_study, trials_with
@@ -105,7 +104,7 @@ def carry_out(what: Study | Search, options: StudyOptions, command: Sequence[str
         ValueError: for whatever does not fit, before anything is written.
         SystemExit: with code 1 where trials have failed, and where it was interrupted.
     """
-    executor, again = executor_of(options), shlex.join(command_of(command))
+    executor, again = executor_of(options), printed(command_of(command))
     if isinstance(what, Search):
         for flag, value in {"--only": options.only, "--keep-checkpoints": options.keep_checkpoints}.items():
             if value:
@@ -118,7 +117,7 @@ def carry_out(what: Study | Search, options: StudyOptions, command: Sequence[str
     how: dict[str, Any] = {"on": executor, **{own: getattr(options, own) for own in names}}
     program, *words = named_command(command)
     whole = without_options(words, ["--only"])  # what a part of a study lacks, it lacks
-    how |= {"results": options.figures, "again": shlex.join([without_directories(program), *whole])}
+    how |= {"results": options.figures, "again": printed([without_directories(program), *whole])}
     with _interruptible(again):
         result: StudyResult | SearchResult
         if isinstance(what, Search):
