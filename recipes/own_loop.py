@@ -34,20 +34,20 @@ from cprl.learners.transitions import transitions_of
 from cprl.measuring.episodes import EpisodeTracker
 from cprl.measuring.evaluate import evaluate
 from cprl.networks.mlp import MLPNetwork
-from cprl.output import say
+from cprl.output import printed, say
 from cprl.policies.assignment import AgentPolicies
 from cprl.policies.single import RandomActor
 from cprl.population import Learning, exploration_steps
 from cprl.runs.directory import start_run
 from cprl.runs.episodes import EpisodeTable
 from cprl.runs.weights import BestWeights, restore_weights, save_weights
+from cprl.shipped import cprl_here
 from cprl.terminal.figures import training_curve
 from cprl.terminal.progress import ProgressBar
 from cprl.terminal.summary import summarise
 from cprl.viewer.callback import ViewerCallback
 from cprl.viewer.streams import check_watch
 
-PUBLISHED_LINE = ".venv/bin/python recipes/single_basic.py"
 SHORT = {"epsilon_decay_steps": 30_000, "batch_size": 64, "learning_rate": 3e-4, "target_every_episodes": 1}
 """What differs from the published schedule, besides the number of episodes: it has to learn from 1/50 of the
 steps."""
@@ -129,7 +129,8 @@ def main(
     figure = training_curve(run, title=title, random=played["random"], exploration_steps=ends)
     note = None if best.path else "No best weights: greedy play harvested nothing whenever it was tried"
     summarise(run, title=title, played=played, figure=figure, note=note)
-    say(f"This was a shortened schedule. The published one, with 8 replicas: {PUBLISHED_LINE}")
+    published = printed([*cprl_here(), "run", "single_basic"])
+    say(f"This was a shortened schedule. The published one, with 8 replicas: {published}")
     return run
 
 

@@ -7,14 +7,13 @@ than the published one, which recipes/commons.py has.
 Copy this file and change it: another map, rule, network or loss is one line.
 """
 
-import shlex
 from dataclasses import replace
 from pathlib import Path
 
 import cprl
 from cprl import presets
 from cprl.algorithms import DQN
-from cprl.output import say
+from cprl.output import printed, say
 from cprl.population import Learning
 from cprl.shipped import cprl_here
 from cprl.terminal.course import course_of, in_sentences
@@ -50,7 +49,7 @@ def experiment() -> cprl.Experiment:
 def tell(run: Path) -> None:
     """Says what happened, and what to try next."""
     say(in_sentences(course_of(run)))
-    say(NEXT.format(run=shlex.quote(str(run)), cprl=shlex.quote(cprl_here())))
+    say(NEXT.format(run=printed([str(run)]), cprl=printed(cprl_here())))
 
 
 if __name__ == "__main__":

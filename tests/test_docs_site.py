@@ -99,6 +99,13 @@ def test_the_page_of_replays_names_every_committed_one(tmp_path):
         assert (tmp_path / path).stat().st_size > 100_000
 
 
+def test_the_page_of_replays_has_all_that_its_script_fills():
+    script = (DOCS / "website" / "assets" / "replays.js").read_text()
+    filled = set(re.findall(r'getElementById\("([^"]+)"\)', script))
+    assert filled == {"replay", "replay-note", "replay-missing", "replay-wanted"}
+    assert filled == set(re.findall(r'id="([^"]+)"', (DOCS / "website" / replays.PAGE).read_text()))
+
+
 @pytest.fixture(scope="module")
 def built():
     """The site, built anew with warnings as errors, and where it is served."""
@@ -224,3 +231,13 @@ def test_the_page_of_replays_from_the_disk_says_what_plays_them(built):
     with browser((SITE / "replays.html").as_uri(), size=(900, 600)) as show:
         wait_until(lambda: show.run("return !document.getElementById('replay-note').hidden"), 20, "no note")
         assert "cprl docs" in show.run("return document.getElementById('replay-note').textContent")
+
+
+@pytest.mark.docs
+def test_the_page_of_replays_says_that_a_replay_is_not_there(built):
+    with browser(f"{built}/replays.html?replay=institutions/nobody", size=(900, 600)) as show:
+        wait_until(
+            lambda: show.run("return !document.getElementById('replay-missing').hidden"), 60, "no note"
+        )
+        said = show.run("return document.getElementById('replay-missing').textContent")
+        assert "The replay institutions/nobody is not here" in said

@@ -22,6 +22,7 @@ from cprl.runs.export import export_results
 from cprl.runs.files import checksum
 from cprl.runs.lock import RunLock, RunLockedError
 from cprl.runs.weights import load_weights
+from cprl.shipped import cprl_here
 
 LEARNING = Learning(DQN(settings=replace(REPLAY, hidden_cells=(8,))))
 FIELD = replace(
@@ -104,7 +105,7 @@ def test_a_run_interrupted_in_any_stage_is_finished_by_resuming_it(stage, whole,
         patched.setattr(running, stage, interrupted)
         with pytest.raises(InterruptionError) as ended:
             run(FIELD, tmp_path / "run")
-    assert ended.value.__notes__ == [f"To resume: cprl run {tmp_path / 'run'} --resume"]
+    assert ended.value.__notes__ == [f"To resume: {' '.join(cprl_here())} run {tmp_path / 'run'} --resume"]
     assert checkpoints_in(tmp_path / "run" / "checkpoints")
     assert run(FIELD, tmp_path / "run", resume=True) == tmp_path / "run"
     assert_same(tmp_path / "run", whole)

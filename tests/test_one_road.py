@@ -18,6 +18,7 @@ from cprl.population import Learning, Scripted
 from cprl.runs.checkpoints import checkpoints_in
 from cprl.runs.episodes import read_episodes
 from cprl.runs.weights import load_weights
+from cprl.shipped import cprl_here
 
 HERE = Path(__file__).parent
 REPLAY = DQNSettings(
@@ -90,7 +91,7 @@ def test_an_experiment_with_parts_of_its_own_is_stopped_resumed_evaluated_and_fi
     assert stopped.value.code == 0
     told = capsys.readouterr().out
     flags = " ".join(f"--allow {target}" for target in ALLOW)
-    assert f"To resume: cprl run {run} --resume {flags}" in told
+    assert f"To resume: {' '.join(cprl_here())} run {run} --resume {flags}" in told
     assert len(checkpoints_in(run / "checkpoints")) == 1
     monkeypatch.delenv("STOP_AT_STEP")
     monkeypatch.setattr("sys.argv", ["cprl", "run", str(run), "--resume", *flags.split(), "--watch", "off"])

@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 from rich.table import Table
 
-from cprl.output import Output, console
+from cprl.output import Output, console, printed
 
 HERE = Path(__file__).parent
 TRAINS = f"""
@@ -133,3 +133,16 @@ def test_a_training_runs_in_any_terminal(env, tmp_path):
     code, out, _ = training(tmp_path, watch="serve", env=env)
     assert code == 0
     assert "run" in out
+
+
+@pytest.mark.parametrize(
+    ("platform", "line"),
+    [
+        ("linux", r"""'C:\my runs\cprl' film 'it'"'"'s' a.gif"""),
+        ("darwin", r"""'C:\my runs\cprl' film 'it'"'"'s' a.gif"""),
+        ("win32", r""""C:\my runs\cprl" film it's a.gif"""),
+    ],
+)
+def test_a_command_to_be_copied_is_quoted_for_the_shell_of_the_platform(platform, line, monkeypatch):
+    monkeypatch.setattr(sys, "platform", platform)
+    assert printed([r"C:\my runs\cprl", "film", "it's", "a.gif"]) == line

@@ -2,6 +2,7 @@
 
 import importlib.util
 import json
+import shlex
 from pathlib import Path
 
 import pytest
@@ -14,6 +15,7 @@ from cprl.policies.single import QActor, RandomActor
 from cprl.runs.directory import read_recipe
 from cprl.runs.episodes import read_episodes
 from cprl.runs.weights import load_weights, restore_weights
+from cprl.shipped import cprl_here
 
 _SPEC = importlib.util.spec_from_file_location(
     "own_loop", Path(__file__).parents[1] / "recipes" / "own_loop.py"
@@ -53,7 +55,7 @@ def test_the_loop_says_that_it_is_short_and_names_the_published_schedule(tmp_pat
     run, told = run_in_miniature(tmp_path, capsys, watch="serve")
     assert "Watch live (browser): http://127.0.0.1:" in told
     assert "short schedule, 11 episodes" in " ".join(told.split())
-    assert "The published one, with 8 replicas: .venv/bin/python recipes/single_basic.py" in told
+    assert f"The published one, with 8 replicas: {shlex.join(cprl_here())} run single_basic\n" in told
     (agent,) = Experiment.from_recipe(read_recipe(run)).agents
     assert agent.algorithm.settings.epsilon_decay_steps == 30_000
 

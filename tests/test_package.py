@@ -27,12 +27,22 @@ def test_a_name_that_is_not_there_is_an_attribute_error():
         _ = cprl.lode
 
 
+def test_the_viewer_exports_its_logger():
+    from cprl import viewer
+    from cprl.viewer import RerunLogger, logger
+
+    assert RerunLogger is logger.RerunLogger
+    with pytest.raises(AttributeError, match=r"module 'cprl\.viewer' has no attribute 'RerunLoger'"):
+        _ = viewer.RerunLoger
+
+
 @pytest.mark.integration
 def test_importing_cprl_leaves_the_viewer_and_stored_runs_out():
     code = (
         "import sys, cprl\n"
         "heavy = {'rerun', 'pyarrow', 'matplotlib', 'scipy.stats', 'cprl.stored', 'cprl.evaluation'}\n"
-        "loaded = heavy & set(sys.modules)\n"
+        "import cprl.viewer\n"
+        "loaded = (heavy | {'cprl.viewer.logger'}) & set(sys.modules)\n"
         "sys.exit(str(sorted(loaded)) if loaded else 0)"
     )
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)

@@ -26,7 +26,7 @@ from cprl.evaluation.film import film
 from cprl.measuring.movement import Trace
 from cprl.measuring.published import curve, published_experiment
 from cprl.population import Frozen, Scripted
-from cprl.reporting import write_report
+from cprl.reporting import report, write_report
 from cprl.reporting.measures import ROUNDS, dip_depth, measures, of_play, of_training
 from cprl.reporting.result import Result
 from cprl.reporting.turning import turning_points_of
@@ -237,6 +237,20 @@ def test_a_report_imports_code_of_ones_own_where_it_is_allowed(tmp_path, capsys,
     assert capsys.readouterr().out.splitlines()[-1] == str(tmp_path / "again" / "tables.md")
 
 
+@pytest.mark.parametrize(
+    ("stored", "listed"),
+    [
+        ("cprl run commons --seed 3", "cprl run commons --seed 3"),
+        (".venv/bin/cprl run commons --seed 3 --resume", "cprl run commons --seed 3"),
+        (r"'.venv\Scripts\cprl' run commons", "cprl run commons"),
+        ("cprl/recipes/commons.py --go-on", "python recipes/commons.py"),
+        ("cprl.py", "python cprl.py"),
+    ],
+)
+def test_a_report_lists_a_run_by_the_command_or_the_recipe_that_made_it(stored, listed):
+    assert report._command(stored) == listed
+
+
 def views_of(path):
     """The names of the views that a recording opens with."""
     reader, component = RrdReader(path), "ViewBlueprint:display_name"
@@ -283,6 +297,24 @@ def test_watch_opens_all_recordings_of_a_run_as_one(tmp_path, monkeypatch, capsy
         (tmp_path / name).touch()
     cli.main()
     assert opened[0][1:] == [str(tmp_path / "run-2.rrd"), str(tmp_path / "run.rrd")]
+
+
+def test_watch_waits_for_the_viewer_on_windows_where_no_program_replaces_another(tmp_path, monkeypatch):
+    from cprl import cli
+
+    def call(command):
+        opened.append(command)
+        return 3
+
+    opened = []
+    (tmp_path / "run.rrd").touch()
+    monkeypatch.setattr(sys, "platform", "win32")
+    monkeypatch.setattr(cli.subprocess, "call", call)
+    monkeypatch.setattr(cli, "viewer", lambda: "rerun")
+    with pytest.raises(SystemExit) as ended:
+        cli.watch(tmp_path)
+    assert ended.value.code == 3
+    assert opened == [["rerun", str(tmp_path / "run.rrd")]]
 
 
 def test_watch_opens_the_viewer_of_the_package_where_no_command_is_at_hand(tmp_path, monkeypatch):

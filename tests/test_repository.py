@@ -2,6 +2,7 @@
 
 import re
 import subprocess
+import tomllib
 from pathlib import Path
 
 import pytest
@@ -44,3 +45,18 @@ def test_the_gate_closes(line):
 )
 def test_the_gate_lets_through(line):
     assert not PATH.search(line)
+
+
+@pytest.mark.parametrize("page", ["README.md", "CHANGELOG.md", "CONTRIBUTING.md"])
+def test_what_a_page_links_to_is_in_the_source_distribution_too(page):
+    settings = tomllib.loads((ROOT / "pyproject.toml").read_text())
+    sdist = settings["tool"]["hatch"]["build"]["targets"]["sdist"]
+    always = ["/README.md", "/pyproject.toml"]
+    links = {f"/{link}" for link in re.findall(r"\]\(([^)#:]+)[)#]", (ROOT / page).read_text())}
+
+    def lies_in(link, places):
+        return any(f"{link}/".startswith(f"{place}/") for place in places)
+
+    assert links
+    assert [own for own in links if not lies_in(own, sdist["include"] + always)] == []
+    assert [own for own in links if lies_in(own, sdist["exclude"])] == []

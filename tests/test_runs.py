@@ -13,6 +13,7 @@ from cprl.custom import Custom
 from cprl.experiment import Experiment
 from cprl.population import Frozen, Learning
 from cprl.runs.directory import read_recipe, refuse_another_run, resume_command, start_run
+from cprl.shipped import cprl_here
 from cprl.studies.paths import changed
 
 AGENT = Learning(DQN(settings=presets.dqn_settings("commons")))
@@ -145,5 +146,6 @@ def test_the_line_that_resumes_is_the_one_that_began_with_the_runs_directory(giv
 def test_a_run_that_python_began_is_resumed_by_the_command_cprl(tmp_path):
     experiment = replace(EXPERIMENT, callbacks=(Custom("my:Callback"), Custom("my:Other")))
     run = begin(tmp_path / "run", experiment)
-    assert resume_command(run) == f"cprl run {run} --resume --allow my:Callback --allow my:Other"
-    assert resume_command(tmp_path) == f"cprl run {tmp_path} --resume"
+    cprl = shlex.join(cprl_here())
+    assert resume_command(run) == f"{cprl} run {run} --resume --allow my:Callback --allow my:Other"
+    assert resume_command(tmp_path) == f"{cprl} run {tmp_path} --resume"

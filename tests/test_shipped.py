@@ -1,5 +1,7 @@
 """Recipes that come with cprl: listed, printed, and run by their names."""
 
+import os
+import shlex
 import subprocess
 import sys
 from pathlib import Path
@@ -10,7 +12,15 @@ import pytest
 import cprl
 from cprl import cli, shipped
 from cprl.runs.directory import resume_command, start_run
-from cprl.shipped import import_from, is_shipped, recipe_named, run_shipped, shipped_recipes
+from cprl.shipped import (
+    command_of,
+    cprl_here,
+    import_from,
+    is_shipped,
+    recipe_named,
+    run_shipped,
+    shipped_recipes,
+)
 
 ROOT = Path(__file__).parents[1]
 SHORT = (
@@ -93,9 +103,60 @@ def test_a_recipe_is_run_by_its_name_with_its_own_flags(elsewhere, monkeypatch, 
 
 def test_the_line_that_resumes_a_recipe_run_by_its_name_is_that_command(tmp_path):
     words = [f"{shipped.PROGRAM}studies/time_out", "--seed", "3", "--out", "there"]
-    assert resume_command(tmp_path, words) == f"cprl run studies/time_out --seed 3 --out {tmp_path} --resume"
+    typed = f"{shlex.join(cprl_here())} run studies/time_out"
+    assert resume_command(tmp_path, words) == f"{typed} --seed 3 --out {tmp_path} --resume"
     recipe = start_run(tmp_path / "run", "x", lambda directory: {"experiment": {}}, command=words)
     assert '"command": "cprl run studies/time_out --seed 3"' in (recipe / "recipe.json").read_text()
+
+
+@pytest.fixture
+def python(tmp_path, monkeypatch):
+    """A Python in a folder `bin` of an environment, without the script `cprl`, and off the path."""
+    folder = tmp_path / "environment" / "bin"
+    folder.mkdir(parents=True)
+    monkeypatch.setattr(sys, "executable", str(folder / "python"))
+    monkeypatch.setenv("PATH", os.defpath)
+    return folder / "python"
+
+
+def install(python):
+    """The script `cprl` beside a Python."""
+    script = python.with_name("cprl")
+    script.write_text("#!/bin/sh")
+    script.chmod(0o755)
+    return script
+
+
+def test_the_command_is_called_by_name_on_the_path_else_by_path_else_by_its_module(
+    python, tmp_path, monkeypatch
+):
+    assert cprl_here() == [str(python), "-m", "cprl"]
+    script = install(python)
+    assert cprl_here() == [str(script)]
+    monkeypatch.chdir(tmp_path)
+    assert cprl_here() == ["environment/bin/cprl"]
+    monkeypatch.chdir(python.parent)
+    assert cprl_here() == [str(script)], "a shell does not look in the working directory"
+    monkeypatch.setenv("PATH", str(python.parent))
+    assert cprl_here() == ["cprl"]
+
+
+@pytest.mark.parametrize(
+    "program", ["cprl", ".venv/bin/cprl", "/elsewhere/bin/cprl", r"C:\venv\Scripts\cprl.exe", "cprl run mrun"]
+)
+def test_a_line_to_type_calls_the_command_however_it_was_called(program, python):
+    words = [program, *([] if program.endswith("mrun") else ["run", "mrun"]), "--seed", "3"]
+    assert command_of(words) == [str(python), "-m", "cprl", "run", "mrun", "--seed", "3"]
+    script = install(python)
+    assert command_of(words) == [str(script), "run", "mrun", "--seed", "3"]
+    assert command_of(["cprl/mine.py", "--seed", "3"]) == [str(python), "cprl/mine.py", "--seed", "3"]
+
+
+def test_the_line_that_resumes_a_run_from_its_directory_can_be_typed_where_no_script_is(python, tmp_path):
+    typed = f"{python} -m cprl run {tmp_path}"
+    assert resume_command(tmp_path) == f"{typed} --resume"
+    words = ["cprl", "run", str(tmp_path), "--resume"]
+    assert resume_command(tmp_path, words) == f"{typed} --out {tmp_path} --resume"
 
 
 def test_a_study_is_run_by_its_name(elsewhere, monkeypatch, capsys):

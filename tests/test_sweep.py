@@ -13,13 +13,14 @@ import pytest
 from tiny_study import FREEZE, GAMMA, TINY
 
 import cprl
-from cprl import Study, cli, run_study
+from cprl import Study, cli, run_study, studies_options
 from cprl.runs.directory import start_run
+from cprl.shipped import cprl_here
 from cprl.studies import InProcess, Processes, Ray, read_study
 from cprl.studies.trials import trials_of
 from cprl.studies_cli import recipe_of, study_main
 from cprl.studies_cli import sweep as sweep_words
-from cprl.studies_options import StudyOptions, executor_of
+from cprl.studies_options import StudyOptions, carry_out, executor_of
 
 ROOT = Path(__file__).parents[1]
 RECIPE = '''
@@ -146,7 +147,7 @@ def test_a_failed_condition_does_not_end_the_study_and_is_listed_with_what_tries
     said = capsys.readouterr().out
     assert "1 of 2 trials failed; the others are kept:" in said
     assert "  freeze_steps=5, replica 0: RuntimeError: out of luck\n    studies/tiny/status/" in said
-    assert f"To try them again: cprl sweep {line}" in said
+    assert f"To try them again: {' '.join(cprl_here())} sweep {line}" in said
     sweep(f"{line} --dry-run")
     assert re.search(r"replica 0  failed +0/1  RuntimeError: out of luck", capsys.readouterr().out)
     monkeypatch.setattr(running, "run", run)
@@ -295,6 +296,31 @@ def test_ray_is_asked_for_by_name():
     pytest.importorskip("ray")
     assert executor_of(StudyOptions(on="ray")) == Ray()
     assert executor_of(StudyOptions(on="ray", address="auto", jobs=3)) == Ray("auto", jobs=3)
+
+
+@pytest.mark.parametrize(
+    ("command", "typed", "published"),
+    [
+        (["cprl", "sweep", "mine.py"], "/bin/py -m cprl sweep mine.py", "cprl sweep mine.py"),
+        (["cprl run studies/time_out"], "/bin/py -m cprl run studies/time_out", "cprl run studies/time_out"),
+        (["my study.py"], "/bin/py 'my study.py'", "py 'my study.py'"),
+    ],
+)
+def test_what_continues_a_study_can_be_typed_here_and_its_summary_names_no_place(
+    command, typed, published, monkeypatch, capsys
+):
+    def interrupted(what, out, **how):
+        summary.append(how["again"])
+        raise KeyboardInterrupt
+
+    summary = []
+    monkeypatch.setattr(sys, "executable", "/bin/py")
+    monkeypatch.setattr("cprl.shipped.which", lambda *_, **__: None)
+    monkeypatch.setattr(studies_options, "run_study", interrupted)
+    with pytest.raises(SystemExit):
+        carry_out(Study(TINY), StudyOptions(only=("x=1",)), [*command, "--only", "x=1"])
+    assert f"To continue: {typed} --only x=1\n" in capsys.readouterr().out
+    assert summary == [published]
 
 
 @pytest.mark.integration

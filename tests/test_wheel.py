@@ -180,6 +180,11 @@ def test_the_docs_are_in_the_wheel_and_served(bare):
     assert "The first hour" in page
 
 
+def test_the_wheel_holds_how_to_cite_it_and_what_has_changed(bare):
+    code = "from importlib.metadata import files; print(*(own.name for own in files('cprl')))"
+    assert {"CHANGELOG.md", "CITATION.cff", "CONTRIBUTING.md"} <= set(bare.python("-c", code).split())
+
+
 def test_an_extra_that_is_lacking_is_named(bare, run):
     assert 'pip install "cprl[theory]"' in bare.cprl("egta one two --episodes 1", code=1)
 

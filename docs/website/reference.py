@@ -51,7 +51,7 @@ _MODULES: Final = {
     "learners": ("settings",),
     "measuring": ("social", "phases", "statistics"),
     "policies": ("scripted", "assignment"),
-    "viewer": ("callback", "logger"),
+    "viewer": ("callback",),
 }
 """Modules of a package that its page shows too, beside what the package exports."""
 

@@ -1,7 +1,7 @@
 """The command `cprl`: what can be done with runs that are there. `cprl --version` prints its version."""
 
 import os
-import shlex
+import subprocess
 import sys
 import time
 from collections.abc import Callable, Mapping, Sequence
@@ -20,7 +20,7 @@ from cprl.evaluation.evaluate import SEED
 from cprl.evaluation_cli import crossplay, evaluate, film, schelling, visits
 from cprl.experiment import Experiment
 from cprl.exploit_cli import exploit
-from cprl.output import keep_output, say
+from cprl.output import keep_output, printed, say
 from cprl.play.opening import SEED as PLAY_SEED
 from cprl.play.opening import open_session
 from cprl.play.terminal import play_in_terminal
@@ -181,6 +181,8 @@ def watch(run: Path, /, *, serve: bool = False) -> None:
         _serve(files, why="" if serve else "There is no display: ")
         return
     command = [viewer(), *map(str, files)]
+    if sys.platform == "win32":  # where execvp ends this process at once, and quotes nothing
+        sys.exit(subprocess.call(command))
     os.execvp(command[0], command)
 
 
@@ -188,7 +190,7 @@ def _serve(files: Sequence[Path], *, why: str) -> None:
     """Serves recordings and the web viewer until Ctrl-C."""
     page = Page(files)
     say(f"Watch (browser): {page.address()}")
-    say(f"Watch (native): {shlex.join([viewer(), *page.recordings])}")
+    say(f"Watch (native): {printed([viewer(), *page.recordings])}")
     say(f"{why}served on 127.0.0.1 until Ctrl-C")
     with suppress(KeyboardInterrupt):
         while True:

@@ -1,6 +1,5 @@
 """`cprl film`, `evaluate`, `visits`, `crossplay`, `schelling`: agents that do not learn, in fresh worlds."""
 
-import shlex
 from pathlib import Path
 from typing import Any
 
@@ -26,7 +25,7 @@ from cprl.evaluation.tables import (
 from cprl.evaluation.territory import territory_of
 from cprl.evaluation.visits_picture import draw_visits
 from cprl.evaluation.words import board_named
-from cprl.output import say
+from cprl.output import printed, say
 from cprl.plotting.style import check_picture
 from cprl.presets import Variant
 from cprl.process import prepare_process
@@ -78,7 +77,7 @@ def film(
     if is_video:
         say(f"{path}: {path.stat().st_size / 1000:.0f} kB")
     else:
-        say(f"Watch: {shlex.join([viewer(), str(path)])}")
+        say(f"Watch: {printed([viewer(), str(path)])}")
 
 
 def evaluate(

@@ -4,8 +4,10 @@ import atexit
 import contextlib
 import io
 import os
+import shlex
+import subprocess
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from functools import cache
 from pathlib import Path
 from typing import Final, TextIO, cast
@@ -121,6 +123,11 @@ def say(*what: object) -> None:
     """Prints a line, like `print`; what cannot be a text is shortened."""
     OUT.write(" ".join(map(_text, what)) + "\n")
     OUT.flush()
+
+
+def printed(words: Sequence[str]) -> str:
+    """A command line to be copied, quoted for the shell of this platform."""
+    return subprocess.list2cmdline(words) if sys.platform == "win32" else shlex.join(words)
 
 
 def _text(value: object) -> str:

@@ -5,7 +5,7 @@ from pathlib import Path
 
 from cprl.checks import shown
 from cprl.commandline import in_a_sentence
-from cprl.output import OUT, say
+from cprl.output import OUT, printed, say
 from cprl.shipped import PROGRAM, is_shipped, recipe_named, recipe_names, run_shipped, shipped_recipes
 
 
@@ -52,7 +52,9 @@ def refuse_unknown(path: Path) -> None:
         ValueError: says what to type instead.
     """
     if path.suffix == ".py" and path.is_file():
-        raise ValueError(f"{path} is a recipe of your own, which Python runs: python {path}")
+        raise ValueError(
+            f"{path} is a recipe of your own, which Python runs: {printed(['python', str(path)])}"
+        )
     if path.exists():
         return
     name = path.as_posix()

@@ -8,7 +8,7 @@ import sys
 from collections.abc import Sequence
 from contextlib import suppress
 from dataclasses import dataclass
-from pathlib import Path
+from pathlib import Path, PureWindowsPath
 from shutil import which
 from types import ModuleType
 from typing import Final
@@ -159,20 +159,36 @@ def program_of(program: str) -> str:
     return program if program.startswith(PROGRAM) else Path(program).name
 
 
-def command_of(words: Sequence[str]) -> list[str]:
-    """A command line, program first, as words that can be typed again."""
+def is_cprl(program: str) -> bool:
+    """Whether a program, as a command line names it on any platform, is the command `cprl`."""
+    return PureWindowsPath(program).name in ("cprl", "cprl.exe")
+
+
+def named_command(words: Sequence[str]) -> list[str]:
+    """A command line, script first, as words with the program first: this Python, or "cprl" by its name."""
     if words[0].startswith(PROGRAM):
         return [*words[0].split(" "), *words[1:]]
-    return [sys.executable, *words]
+    return ["cprl", *words[1:]] if is_cprl(words[0]) else [sys.executable, *words]
 
 
-def cprl_here() -> str:
-    """How the command `cprl` of this Python is called: by its name where the shell finds it, else by path."""
+def command_of(words: Sequence[str]) -> list[str]:
+    """A command line, script first, as words that can be typed here."""
+    program, *others = named_command(words)
+    return [*cprl_here(), *others] if program == "cprl" else [program, *others]
+
+
+def cprl_here() -> list[str]:
+    """How the command `cprl` of this Python is called: by its name where the shell finds it, else by path,
+    and by `python -m cprl` where there is no such script beside Python."""
     path = which("cprl", path=str(Path(sys.executable).parent))
-    if path is None or path == which("cprl"):
-        return "cprl"
-    here = Path.cwd()
-    return str(Path(path).relative_to(here) if Path(path).is_relative_to(here) else path)
+    if path is None:
+        return [sys.executable, "-m", "cprl"]
+    if path == which("cprl"):
+        return ["cprl"]
+    script, here = Path(path), Path.cwd()
+    # In the folder of the script its name alone would be looked up on the path.
+    is_below = script.is_relative_to(here) and script.parent != here
+    return [str(script.relative_to(here) if is_below else script)]
 
 
 def _read(path: Path, name: str) -> Recipe:

@@ -14,9 +14,9 @@ import tyro
 from cprl.arguments import object_of, texts
 from cprl.commandline import in_a_sentence, parse_with
 from cprl.experiment import Experiment
-from cprl.output import keep_output
+from cprl.output import keep_output, printed
 from cprl.runs.directory import read_recipe
-from cprl.shipped import command_of, is_shipped, program_of, recipe_named
+from cprl.shipped import is_shipped, program_of, recipe_named
 from cprl.studies.factors import Distribution
 from cprl.studies.points import Search
 from cprl.studies.study import BLOCK, Study
@@ -108,7 +108,7 @@ def study_main(study: Study, argv: Sequence[str] | None = None) -> Path:
         wanted = replace(study, **changed) if changed else study
         if options.episodes is not None:
             wanted = _of_episodes(wanted, options.episodes)
-        return carry_out(wanted, options, command_of(command))
+        return carry_out(wanted, options, command)
 
 
 def _of_episodes(study: Study, episodes: int) -> Study:
@@ -228,7 +228,8 @@ def recipe_of(source: Path, allow: Sequence[str] = ()) -> Callable[..., Experime
     made: Callable[..., Experiment] | None = getattr(module, "experiment", None)
     if not callable(made):
         if hasattr(module, "STUDY"):
-            raise ValueError(f"{source} describes a study, which is run by itself: python {source}")
+            line = printed(["python", str(source)])
+            raise ValueError(f"{source} describes a study, which is run by itself: {line}")
         raise ValueError(f"{source} has no function `experiment`; allowed: one that gives an Experiment")
     return made
 

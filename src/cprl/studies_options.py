@@ -1,7 +1,6 @@
 """How a study is run, as options of a command line: `cprl sweep` and recipes of studies share them."""
 
 import os
-import shlex
 import signal
 import sys
 import time
@@ -16,8 +15,9 @@ import tyro
 
 from cprl.arguments import integer
 from cprl.measuring.statistics import Interval
-from cprl.output import console, say
+from cprl.output import console, printed, say
 from cprl.runs.directory import without_directories, without_options
+from cprl.shipped import command_of, named_command
 from cprl.studies.execution import RUNS, STATUS, StudyResult, directory_of, run_study, trials_with
 from cprl.studies.executors import Executor, InProcess, Processes, Ray
 from cprl.studies.overview import Overview, label_of
@@ -98,7 +98,7 @@ def carry_out(what: Study | Search, options: StudyOptions, command: Sequence[str
     Args:
         what: the study or search.
         options: how it is run.
-        command: the command line, which is said where it can be used again.
+        command: the command line, script first, which is said where it can be used again.
 
     Returns:
         The study's directory.
@@ -107,7 +107,7 @@ def carry_out(what: Study | Search, options: StudyOptions, command: Sequence[str
         ValueError: for whatever does not fit, before anything is written.
         SystemExit: with code 1 where trials have failed, and where it was interrupted.
     """
-    executor, again = executor_of(options), shlex.join(command)
+    executor, again = executor_of(options), printed(command_of(command))
     if isinstance(what, Search):
         for flag, value in {"--only": options.only, "--keep-checkpoints": options.keep_checkpoints}.items():
             if value:
@@ -118,8 +118,9 @@ def carry_out(what: Study | Search, options: StudyOptions, command: Sequence[str
         return _list(what, options)
     names = ("runs", "allow", "watch", "last", "interval")
     how: dict[str, Any] = {"on": executor, **{own: getattr(options, own) for own in names}}
-    whole = without_options(command[1:], ["--only"])  # what a part of a study lacks, it lacks
-    how |= {"results": options.figures, "again": shlex.join([without_directories(command[0]), *whole])}
+    program, *words = named_command(command)
+    whole = without_options(words, ["--only"])  # what a part of a study lacks, it lacks
+    how |= {"results": options.figures, "again": printed([without_directories(program), *whole])}
     with _interruptible(again):
         result: StudyResult | SearchResult
         if isinstance(what, Search):

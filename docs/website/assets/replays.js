@@ -22,10 +22,18 @@
       document.getElementById("replay-note").hidden = false;
       return;
     }
+    let isThere = wanted === null;
     for (const link of links) {
       // An installed package carries some of the recordings only.
       if (!(await isServed(link.dataset.recording))) link.remove();
-      else if (link.textContent === wanted) play(link);
+      else if (link.textContent === wanted) {
+        play(link);
+        isThere = true;
+      }
+    }
+    if (!isThere) {
+      document.getElementById("replay-wanted").textContent = wanted;
+      document.getElementById("replay-missing").hidden = false;
     }
   }
   begin();

@@ -68,7 +68,7 @@ class Rules:
 
     walls_block_sight: bool = False
     """Whether a window shows only cells in line of sight, that is, the straight line between the two cell
-    centres crosses no wall (ours; the boards of both studies have no inner walls)."""
+    centres crosses the interior of no wall (ours)."""
 
     episode_steps: int = 1000
     """The number of turns after which an episode is truncated [W]. At least 1."""

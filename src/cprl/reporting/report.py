@@ -24,6 +24,7 @@ from cprl.reporting.possible import shares_of
 from cprl.reporting.result import Result, read_result
 from cprl.reporting.turning import phases_of, turning_points_of
 from cprl.runs.files import write_atomically
+from cprl.shipped import is_cprl
 
 
 def write_report(runs: Sequence[Path], out: Path, *, allow: Sequence[str] = ()) -> Path:
@@ -126,8 +127,8 @@ def _command(line: str) -> str:
         del words[at : at + 2]
     kept = [word for word in words if word not in ("--resume", "--go-on")]
     script = kept[0]
-    if script == "cprl":
-        return shlex.join(kept)
+    if is_cprl(script):
+        return shlex.join(["cprl", *kept[1:]])
     return shlex.join(
         ["python", script[script.find("recipes/") :] if "recipes/" in script else script, *kept[1:]]
     )

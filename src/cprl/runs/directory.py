@@ -17,13 +17,14 @@ from cprl.arguments import path as path_of
 from cprl.checks import TEXT, checked, shown
 from cprl.config import custom_targets
 from cprl.differences import differences
+from cprl.output import printed
 from cprl.process import cpu
 from cprl.runs import formats
 from cprl.runs.files import read_json, write_json
 from cprl.runs.lock import FILE_NAME as LOCK_NAME
 from cprl.runs.lock import RunLock
 from cprl.runs.source import git_state
-from cprl.shipped import PROGRAM, command_of
+from cprl.shipped import PROGRAM, command_of, cprl_here
 
 FILE_NAME: Final = "recipe.json"
 
@@ -191,9 +192,9 @@ def resume_command(run: Path, command: Sequence[str] | None = None) -> str:
         path = run / FILE_NAME
         targets = custom_targets(read_json(path).get("experiment")) if path.exists() else []
         allow = [word for target in targets for word in ("--allow", target)]
-        return shlex.join(["cprl", "run", str(run), "--resume", *allow])
+        return printed([*cprl_here(), "run", str(run), "--resume", *allow])
     kept = [word for word in _without_out(command) if word.replace("_", "-") not in _RESUMES]
-    return shlex.join([*command_of(kept), "--out", str(run), "--resume"])
+    return printed([*command_of(kept), "--out", str(run), "--resume"])
 
 
 def _command(words: Sequence[str]) -> str:

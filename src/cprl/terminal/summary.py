@@ -1,6 +1,5 @@
 """The results of a run, printed in the terminal."""
 
-import shlex
 from collections.abc import Callable, Iterator, Mapping
 from math import isnan
 from pathlib import Path
@@ -16,6 +15,7 @@ from cprl.measuring.episodes import Episode
 from cprl.measuring.names import title as metric_title
 from cprl.measuring.replicas import social_metrics
 from cprl.measuring.reported import left_out
+from cprl.output import printed
 from cprl.terminal.institutions import institutions_table
 from cprl.terminal.progress import console_of
 from cprl.viewer.streams import viewer
@@ -77,7 +77,7 @@ def summarise(
     if figure:
         console.print(f"Training curve: {figure}", soft_wrap=True)
     if "run.rrd" in kept:
-        watch = shlex.join([viewer(), str(run / "run.rrd")])
+        watch = printed([viewer(), str(run / "run.rrd")])
         console.print(f"Watch again: {watch}", soft_wrap=True)
 
 

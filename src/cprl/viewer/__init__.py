@@ -40,3 +40,17 @@ Modules, in the order in which one reads them:
     tabs       the parts of the layout that show images and drawn plots
     blueprint  the layout of the viewer
 """
+
+from importlib import import_module
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from cprl.viewer.logger import RerunLogger
+
+__all__ = ["RerunLogger"]
+
+
+def __getattr__(name: str) -> Any:
+    if name == "RerunLogger":  # with it come the learners and the layout, half a second of import
+        return getattr(import_module("cprl.viewer.logger"), name)
+    raise AttributeError(f"module {__name__!r} has no attribute {name!r}")

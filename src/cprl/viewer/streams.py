@@ -1,6 +1,5 @@
 """The streams of one recording: to a file and, on request, live on 127.0.0.1."""
 
-import shlex
 import shutil
 import socket
 import subprocess
@@ -14,6 +13,7 @@ from typing import Any, Final
 from urllib.parse import urlsplit
 
 from cprl.checks import SWITCH, Check, checked, shown
+from cprl.output import printed
 from cprl.viewer import deadline
 from cprl.viewer.deadline import abandon, exit_in_time, within
 from cprl.viewer.page import LOCALHOST, Page, free_port, has_display, viewer_binary
@@ -142,7 +142,7 @@ def open_live(
         grpc.append(address)
     if live == "spawn":
         _spawn(grpc)
-    page, native = Page(), shlex.join([viewer(), "--connect", *grpc])
+    page, native = Page(), printed([viewer(), "--connect", *grpc])
     return Live(stream, exhibition, {"browser": page.address(*grpc), "native": native}, page)
 
 
