@@ -30,9 +30,9 @@ def experiment(
         variant: the rules and the learner as the study is written, or as it was run.
         epsilon_decay_steps: of exploration; versions of the study's program have 500,000 too.
         target_every_episodes: episodes between replacements of targets; the study's program has 3 or 10.
-        gamma: the discount factor; versions of April 2019 have 0.997.
-        optimizer: "adam" or, in some of those versions, "keras_rmsprop".
-        loss_function: "l2", the squared error, or, in some of those versions, "log_cosh".
+        gamma: the discount factor; versions of the study's program of April 2019 have 0.997.
+        optimizer: "adam" or, as in some versions of the study's program of April 2019, "keras_rmsprop".
+        loss_function: "l2", the squared error, or, as in some of the same versions, "log_cosh".
     """
     settings = replace(
         presets.dqn_settings("commons", variant=variant),

@@ -11,7 +11,7 @@ from torchrl.objectives import DDPGLoss, ValueEstimators
 from cprl.algorithms.base import OffPolicy
 from cprl.algorithms.dqn import network_of
 from cprl.learners.settings import DQNSettings
-from cprl.networks.agent import AgentNetworks
+from cprl.networks import AgentNetworks
 from cprl.networks.bounded import BoundedNetwork
 from cprl.networks.mlp import MLPNetwork
 

@@ -259,7 +259,7 @@ def test_a_loss_computes_with_whatever_weights_are_put_in_now(make_loss):
     for loss in (*losses, function):
         compat.promise_targets(loss)
         loss.reduction = "none"
-    wanted = [total(loss(batch.clone())) for loss in losses]
+    wanted = [total(loss(batch.clone()), loss) for loss in losses]
     function, weights = FunctionalLoss(function), [weights_of(loss) for loss in losses]
     with relies_on(
         "LossModule, which reads weights from its attributes and keeps them in _cache,",

@@ -284,7 +284,10 @@ class MyDQN(DQN):
         (torch.nn.Linear(1, 1), r'is a Linear, which .*Custom\("torch\.nn\.modules\.linear:Linear", arg'),
         (torch.nn.Linear, r"is a class, which .*:Linear"),
         (lambda: 0, r'is a function, .*Custom\("module:name", .*at the top of a module'),
-        (MyDQN(settings=DQNSettings()), r"is a MyDQN, which .*test_config:MyDQN"),
+        (
+            MyDQN(settings=DQNSettings()),
+            r'is a MyDQN, which .*Custom\("module:function", .*docs/algorithms\.md, "An algorithm of',
+        ),
         (float("nan"), r"is nan; allowed: a finite number"),
         ({"a": 1}, r"is a dict, which a recipe cannot hold"),
     ],

@@ -159,6 +159,17 @@ def test_greedy_agents_play_what_the_policy_of_the_loaded_run_plays(name, learne
     assert values(found.measures())["collective_return"] == pytest.approx(np.mean(means))
 
 
+@pytest.mark.parametrize(("worlds", "of_policy"), [(4, 1), (2, 4)])
+@pytest.mark.parametrize("name", ["alike", "mixed"])
+def test_a_policy_for_another_number_of_worlds_is_refused(name, worlds, of_policy, learned):
+    run = cprl.load(learned[name])
+    plays = "1 world" if of_policy == 1 else f"{of_policy} worlds"
+    message = f"the policy plays {plays} and the environment has {worlds}; allowed: as many"
+    with pytest.raises(ValueError, match=rf"{message}, e\.g\. run\.policy\(replica, worlds={worlds}\)"):
+        run.env(worlds=worlds).rollout(3, run.policy(0, worlds=of_policy))
+    assert run.env(worlds=worlds).rollout(3, run.policy(0, worlds=worlds)).batch_size[0] == worlds
+
+
 class Own(torch.nn.Module):
     """A network of the user's own, which cannot be stacked with its like."""
 

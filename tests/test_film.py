@@ -1,17 +1,19 @@
 """An episode of stored agents as a GIF or an MP4."""
 
 import subprocess
+from dataclasses import replace
 
 import numpy as np
 import pytest
+import torch
 from imageio_ffmpeg import get_ffmpeg_exe
 from PIL import Image
 
-from cprl import Experiment, Game, Rules, cli, maps
+from cprl import Experiment, Game, Rules, cli, load, maps
 from cprl.commons.colours import APPLE, PALETTE, agent_colour
 from cprl.evaluation import video_files
 from cprl.evaluation.episode_picture import EpisodePicture, nice
-from cprl.evaluation.film import film
+from cprl.evaluation.film import film, fresh_episode
 from cprl.evaluation.film_video import film_video
 from cprl.population import Scripted
 from cprl.runs.directory import start_run
@@ -90,6 +92,29 @@ def test_the_film_is_the_episode_that_the_recording_has(runs, tmp_path):
     assert filmed.metrics == pytest.approx(recorded.metrics, nan_ok=True)
     _, other = film_video(runs / "random", tmp_path / "other.gif", episode=4, every=9, width=240)
     assert other.metrics["sustainability"] != recorded.metrics["sustainability"]
+
+
+def test_with_the_seed_of_an_evaluation_its_worlds_are_filmed(tmp_path):
+    growing = replace(
+        CORRIDORS,
+        rules=replace(CORRIDORS.rules, regrow_prob=(0.0, 0.3), shuffle_starts=True, episode_steps=30),
+    )
+    own = Experiment(name="own", game=growing, agents=(Scripted("greedy"),) * 2, replicas=2, episodes=1)
+    run = start_run(tmp_path / "own", "own", own.to_recipe)
+    save_weights(run, {})
+    worlds = load(run).env(2 * 3, seed=77)
+    stay = torch.full((6, 2), 6)
+
+    def played(env, actions):
+        moment = env.reset()
+        for _ in range(25):
+            moment = env.step_mdp(env.step(moment.set(("agents", "action"), actions)))
+        return moment["agents", "observation"]
+
+    of_evaluation = played(worlds, stay)
+    for seed, is_same in ((77, True), (78, False)):
+        one = fresh_episode(run, replica=1, episode=3 * 1 + 1, seed=seed)
+        assert torch.equal(played(one.env, stay[:1])[0], of_evaluation[4]) is is_same
 
 
 def test_an_mp4_has_a_picture_for_each_turn_and_holds_the_last(runs, tmp_path):

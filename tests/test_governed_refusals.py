@@ -99,7 +99,8 @@ def test_what_does_not_fit_the_game_is_refused(institutions, message):
 
 @pytest.mark.parametrize("wrong", [(Tax,), ("Tax",), Tax(), {"tax": Tax()}, (None,), 3])
 def test_what_is_no_institution_is_refused(wrong):
-    with pytest.raises(ValueError, match=r"^Game\.institutions.*; allowed: "):
+    allowed = r"(a list of )?values of cprl\.institutions; one of your own goes into Experiment\.transforms"
+    with pytest.raises(ValueError, match=rf"^Game\.institutions.*; allowed: {allowed}$"):
         replace(PLAIN, institutions=wrong)
 
 

@@ -166,6 +166,31 @@ def test_an_extension_that_is_interrupted_is_resumed(whole, longer, tmp_path, mo
 
 
 @pytest.mark.slow
+def test_a_run_without_a_checkpoint_says_that_it_begins_with_the_first_episode(tmp_path, monkeypatch, capsys):
+    def interrupted(*_):
+        raise InterruptionError
+
+    with monkeypatch.context() as patched:
+        patched.setattr(running.Checkpointer, "after_step", interrupted)
+        with pytest.raises(InterruptionError):
+            run(FIELD, tmp_path / "run")
+        assert "No checkpoint yet" not in capsys.readouterr().out
+        with pytest.raises(InterruptionError):
+            run(FIELD, tmp_path / "run", resume=True)
+    assert "No checkpoint yet: begins with the first episode\n" in capsys.readouterr().out
+    monkeypatch.setenv("STOP_AT_STEP", "41")
+    stopping = replace(FIELD, callbacks=[Custom("one_road_parts:Stopping")])
+    with pytest.raises(SystemExit):
+        run(stopping, tmp_path / "stopped")
+    capsys.readouterr()
+    monkeypatch.setenv("STOP_AT_STEP", "43")
+    with pytest.raises(SystemExit):
+        run(stopping, tmp_path / "stopped", resume=True)
+    said = capsys.readouterr().out
+    assert "Resuming from step 41" in said
+    assert "No checkpoint yet" not in said
+
+
 def test_a_stopped_run_is_extended_too(longer, tmp_path, monkeypatch):
     monkeypatch.setenv("STOP_AT_STEP", "41")
     stopping = replace(FIELD, callbacks=[Custom("one_road_parts:Stopping")])

@@ -8,7 +8,8 @@ import torch
 from tensordict import TensorDict
 from tensordict.nn import TensorDictModule
 from test_networks import GAME, REPLAY, ROLLOUTS, SPACES, played
-from torchrl.objectives import ClipPPOLoss, HardUpdate, KLPENPPOLoss, SoftUpdate, ValueEstimators
+from torchrl.modules import QValueActor
+from torchrl.objectives import ClipPPOLoss, DQNLoss, HardUpdate, KLPENPPOLoss, SoftUpdate, ValueEstimators
 
 from cprl import CommonsEnv, Observation
 from cprl.algorithms import A2C, DQN, PPO, QMIX
@@ -197,3 +198,49 @@ def test_what_no_network_sees_is_refused_but_tables_read_it(observed):
     with pytest.raises(ValueError, match="allowed for networks"):
         QMIX(settings=REPLAY).make_learner(spaces, agents=(0, 1), replicas=1, reward_kind="team")
     TabularLearner(spaces, agents=(0,), replicas=1, settings=TabularSettings())
+
+
+class OnlyErrors(DQNLoss):
+    """Returns the errors under a name that TorchRL does not call a loss."""
+
+    def forward(self, tensordict):
+        return super().forward(tensordict).select("loss").rename_key_("loss", "td")
+
+
+class OnlyANumber(DQNLoss):
+    """Returns the loss itself."""
+
+    def forward(self, tensordict):
+        return super().forward(tensordict)["loss"]
+
+
+class OnlyTheCritics(ClipPPOLoss):
+    """Returns the loss of the critic itself."""
+
+    def forward(self, tensordict):
+        return super().forward(tensordict)["loss_critic"]
+
+
+@pytest.mark.parametrize("engine", ["compiled", "eager", "torchrl"])
+@pytest.mark.parametrize(
+    ("kind", "came"),
+    [
+        (OnlyErrors, r"TensorDict with the entries \['td'\]"),
+        (OnlyANumber, "Tensor"),
+        (OnlyTheCritics, "Tensor"),
+    ],
+)
+def test_a_loss_that_returns_none_is_refused_by_name_before_training(kind, came, engine):
+    algorithm = PPO(settings=ROLLOUTS) if kind is OnlyTheCritics else DQN(settings=REPLAY)
+
+    def make_loss(network):
+        if isinstance(algorithm, PPO):
+            made = PPO(settings=ROLLOUTS).make_loss(network)
+            return kind(made.actor_network, made.critic_network)
+        actor = QValueActor(network, spec=None, action_space="categorical")
+        return kind(actor, delay_value=True, action_space="categorical")
+
+    object.__setattr__(algorithm, "make_loss", make_loss)
+    allowed = f"{kind.__name__} returns a {came}; allowed: a TensorDict with entries whose names begin with"
+    with pytest.raises(ValueError, match=f"the loss test_refusals:{allowed}"):
+        algorithm.make_learner(SPACES, agents=(0,), replicas=1, engine=engine)

@@ -164,6 +164,7 @@ def test_a_failed_condition_does_not_end_the_study_and_is_listed_with_what_tries
         ("nowhere --vary x=1", "is not the recipe of a run"),
         (f"mine.py --vary {FREEZE}=2,2", "are equal; allowed: each once"),
         (f"mine.py --vary {FREEZE}=2,-1", "Rules.freeze_steps is -1"),
+        ("mine.py --vary turns=5,10", "turns is an argument of the recipe, the same in all conditions"),
         ("mine.py --vary seed=1,2", "which the study itself decides"),
         ("mine.py --vary game.rules.freeze-step=1", "did you mean 'freeze_steps'"),
         (f"mine.py --vary {FREEZE}=integers(1,9)", "has a range; allowed: values, or a range"),

@@ -467,7 +467,7 @@ def test_what_follows_n_steps_is_discounted_by_as_many(name):
 
     def with_steps(steps):
         changed = batch.clone().set("steps_to_next_obs", torch.full_like(batch["steps_to_next_obs"], steps))
-        return total(loss(changed)).item()
+        return total(loss(changed), loss).item()
 
     assert with_steps(1) != with_steps(3)
 

@@ -100,7 +100,7 @@ def report(runs: tuple[Path, ...], /, *, out: Path = Path("report"), allow: Allo
     Args:
         runs: directories of runs, or of results.
         out: where to: tables.md and figures/.
-        allow: code of your own, module:Class, that a run may import; see docs/changing.md.
+        allow: code of your own, module:Class, that a run may import; see docs/experiments.md.
     """
     if not runs:
         raise ValueError("cprl report wants at least one run: cprl report RUN...")
@@ -138,7 +138,7 @@ def play(
         seed: of all chance; the same seed and the same keys play the same again.
         decision: what you vote for in a game with votes or elections, by its number; by default chance votes.
         terminal: play in the terminal, by lines of keys; also without pygame (extra "play") or a display.
-        allow: code of your own, module:Class, that a run may import; see docs/changing.md.
+        allow: code of your own, module:Class, that a run may import; see docs/experiments.md.
     """
     make_importable(allow)
     prepare_process(seed)

@@ -33,6 +33,7 @@ from cprl.algorithms import (
     Tabular,
     TabularSettings,
 )
+from cprl.algorithms.base import Algorithm
 from cprl.annotations import fits, type_text
 from cprl.arguments import objects
 from cprl.checks import check_nesting, shown
@@ -262,6 +263,12 @@ def _refusal(value: object, where: str) -> str:
     name = getattr(named, "__qualname__", "<none>")
     target = f"{named.__module__}:{name}" if "<" not in name else "module:name"
     also = " of a class or function at the top of a module" if "<" in name else ""
+    if isinstance(value, Algorithm):
+        return (
+            f"{where} is a {name}, which a recipe cannot hold; allowed: algorithms of cprl, or "
+            'Custom("module:function", arguments={...}) of a function at the top of a module that makes it '
+            'from numbers, texts and lists, see docs/algorithms.md, "An algorithm of your own"'
+        )
     what = "a class" if isinstance(value, type) else f"a {type(value).__name__}"
     return (
         f"{where} is {what}, which a recipe cannot hold; allowed: values of cprl, or "

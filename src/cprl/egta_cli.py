@@ -48,7 +48,7 @@ def egta(
         replicas: their numbers; by default all that every run has.
         out: a parquet file to be, with every episode.
         figure: a PNG to be: the dynamics, and the shares by alpha-rank.
-        allow: code of your own, module:Class, that the run may import; see docs/changing.md.
+        allow: code of your own, module:Class, that the run may import; see docs/experiments.md.
     """
     check_extras()
     check_alpha(alpha)

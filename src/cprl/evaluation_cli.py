@@ -8,6 +8,7 @@ from cprl.commandline import Allow, make_importable
 from cprl.evaluation.cross_play import Diagonal
 from cprl.evaluation.cross_play import crossplay as play_each_other
 from cprl.evaluation.evaluate import SEED, evaluate_run
+from cprl.evaluation.film import SEED as FILM_SEED
 from cprl.evaluation.film import film as film_run
 from cprl.evaluation.film_video import SUFFIXES, film_video
 from cprl.evaluation.gains_picture import draw_gains
@@ -39,6 +40,7 @@ def film(
     *,
     replica: int = 0,
     episode: int = 0,
+    seed: int = FILM_SEED,
     out: Path | None = None,
     every: int | None = None,
     fps: float | None = None,
@@ -51,6 +53,9 @@ def film(
         run: the run's directory, or its results.
         replica: whose agents.
         episode: which of the fresh episodes; the same number plays the same again.
+        seed: of the worlds and all chance. With the seed of cprl evaluate, 30011 by default, the world of its
+            episode E of replica R is --episode R x EPISODES + E; what agents draw by chance differs. The
+            run's own evaluation plays by the seed of its experiment + 1.
         out: what is written: a recording for the viewer (.rrd), or a film of the board, the stock and the
             harvests (.gif, or .mp4, which wants the extra "film"); by default film-<replica>-<episode>.rrd in
             the run's directory.
@@ -58,7 +63,7 @@ def film(
             as many as it takes for 300 pictures.
         fps: of a .gif or .mp4: pictures per second, at most 50; by default 15.
         width: of a .gif or .mp4, in pixels, 240 to 1920; by default 640.
-        allow: code of your own, module:Class, that the run may import; see docs/changing.md.
+        allow: code of your own, module:Class, that the run may import; see docs/experiments.md.
     """
     flags: dict[str, Any] = {"every": every, "fps": fps, "width": width}
     given = {name: value for name, value in flags.items() if value is not None}
@@ -68,11 +73,12 @@ def film(
     if given and not is_video:
         raise ValueError(f"--{next(iter(given))} is for films; allowed: with --out FILE.gif or FILE.mp4")
     make_importable(allow)
-    prepare_process(SEED)
+    prepare_process(seed)
+    how: dict[str, Any] = {"replica": replica, "episode": episode, "seed": seed, "allow": allow}
     if out is not None and is_video:
-        path, played = film_video(run, out, replica=replica, episode=episode, allow=allow, **given)
+        path, played = film_video(run, out, **how, **given)
     else:
-        path, played = film_run(run, out, replica=replica, episode=episode, allow=allow)
+        path, played = film_run(run, out, **how)
     say(f"{played.steps} steps, {played.outcome}")
     if is_video:
         say(f"{path}: {path.stat().st_size / 1000:.0f} kB")
@@ -100,7 +106,7 @@ def evaluate(
         seed: of the worlds and all chance; the same one gives the same numbers.
         replicas: their numbers; by default all.
         out: a parquet file to be, with every episode.
-        allow: code of your own, module:Class, that the run may import; see docs/changing.md.
+        allow: code of your own, module:Class, that the run may import; see docs/experiments.md.
     """
     make_importable(allow)
     if out is not None:
@@ -139,7 +145,7 @@ def visits(
         replicas: their numbers; by default all. The first one is drawn.
         figure: a PNG to be: a map for each agent of where it spends its time.
         random: draw random agents in the same worlds instead.
-        allow: code of your own, module:Class, that the run may import; see docs/changing.md.
+        allow: code of your own, module:Class, that the run may import; see docs/experiments.md.
     """
     make_importable(allow)
     if figure is not None:
@@ -179,7 +185,7 @@ def crossplay(
             of the run's next replica.
         out: a parquet file to be, with every episode.
         figure: a PNG to be: what focal agents gain, and what it costs the background agents.
-        allow: code of your own, module:Class, that the run may import; see docs/changing.md.
+        allow: code of your own, module:Class, that the run may import; see docs/experiments.md.
     """
     make_importable(allow)
     check_files(out, figure)
@@ -229,7 +235,7 @@ def schelling(
         seed: of the worlds and all chance; the same one gives the same numbers.
         out: a parquet file to be, with every episode.
         figure: a PNG to be: the Schelling diagram.
-        allow: code of your own, module:Class, that a run may import; see docs/changing.md.
+        allow: code of your own, module:Class, that a run may import; see docs/experiments.md.
     """
     make_importable(allow)
     check_files(out, figure)

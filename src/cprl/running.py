@@ -19,7 +19,7 @@ from cprl.garbage import cleared_up, free_earlier
 from cprl.leftovers import remove, say_what_changed, say_what_is_kept, tidy_up
 from cprl.measuring.episodes import Episode
 from cprl.outcome import evaluate_population, heading, random_play, write_evaluation
-from cprl.output import OUT
+from cprl.output import OUT, say
 from cprl.parts import Parts, make_logger_callback, make_parts, make_viewer, title_of
 from cprl.population import Frozen, exploration_steps
 from cprl.process import prepare_process
@@ -153,6 +153,8 @@ def run(
         with checkpointer:
             if resume:
                 say_what_changed(directory)
+                if not is_begun:
+                    say("No checkpoint yet: begins with the first episode")
                 write_on_nan(directory, experiment.on_nan)
             if episodes < experiment.episodes:
                 extend(directory, episodes, experiment.episodes)

@@ -37,7 +37,7 @@ def scenarios(
         replicas: their numbers; by default all.
         out: a parquet file to be, with every episode.
         figure: a PNG to be: the returns in each scenario.
-        allow: code of your own, module:Class, that the run may import; see docs/changing.md.
+        allow: code of your own, module:Class, that the run may import; see docs/experiments.md.
     """
     make_importable(allow)
     check_files(out, figure)

@@ -1,10 +1,11 @@
 """`cprl sweep`, and `study_main`: the command line of a recipe that describes a study."""
 
 import importlib.util
+import inspect
 import os
 import sys
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
 from itertools import pairwise
 from pathlib import Path
 from typing import Annotated, Any, Final, Literal
@@ -146,10 +147,23 @@ def sweep(words: Sequence[str], /) -> None:
     allow += [word.removeprefix("--allow=") for word in words if word.startswith("--allow=")]
     sys.path[:0] = [str(source.resolve().parent)] if source.suffix == ".py" else []
     sys.path[:0] = [os.getcwd()] if allow else []
-    experiment, options = parse_with(
-        recipe_of(source, allow), words[1:], SweepOptions(), program=f"{PROGRAM} {words[0]}", note=_NOTE
-    )
+    make = recipe_of(source, allow)
+    program = f"{PROGRAM} {words[0]}"
+    experiment, options = parse_with(make, words[1:], SweepOptions(), program=program, note=_NOTE)
+    _refuse_arguments(options.vary, make)
     carry_out(wanted(experiment, options), options, ["cprl", "sweep", *words])
+
+
+def _refuse_arguments(vary: Sequence[str], make_experiment: Callable[..., Experiment]) -> None:
+    """Raises a ValueError where an argument of the recipe is varied, and no field of the experiment."""
+    own = {*inspect.signature(make_experiment).parameters} - {field.name for field in fields(Experiment)}
+    for word in vary:
+        name = word.partition("=")[0].replace("-", "_")
+        if name in own:
+            raise ValueError(
+                f"the path {name} matches nothing: {name} is an argument of the recipe, the same in all "
+                "conditions; allowed: a field of the experiment, e.g. game.rules.freeze_steps"
+            )
 
 
 def wanted(experiment: Experiment, options: SweepOptions) -> Study | Search:

@@ -46,7 +46,10 @@ class Game:
             object_of(f"Game.{name}", getattr(self, name), kind, f"a cprl.{kind.__name__}")
         agents = self.agents
         institutions = objects(
-            "Game.institutions", self.institutions, Institution, "a sequence of values of cprl.institutions"
+            "Game.institutions",
+            self.institutions,
+            Institution,
+            "values of cprl.institutions; one of your own goes into Experiment.transforms",
         )
         object.__setattr__(self, "institutions", tuple(institutions))
         if self.observation.area == "full" and self.rules.walls_block_sight:

@@ -35,7 +35,7 @@ class FreshEpisode:
 
 
 def fresh_episode(
-    run: str | Path, *, replica: int = 0, episode: int = 0, allow: Sequence[str] = ()
+    run: str | Path, *, replica: int = 0, episode: int = 0, seed: int = SEED, allow: Sequence[str] = ()
 ) -> FreshEpisode:
     """The world and the agents of an episode that is filmed; equal numbers give equal episodes. See `film`.
 
@@ -44,14 +44,15 @@ def fresh_episode(
     """
     episode = arguments.integer("episode", episode, 0, 2**32 - 1)
     replica = arguments.integer("replica", replica, 0)
+    seed = arguments.seed(seed)
     arguments.object_of("run", run, (str, Path), "a directory")
     loaded = load(run, allow=allow)
     if replica not in loaded.replicas:
         raise ValueError(f"replica is {replica}; allowed: {', '.join(map(str, loaded.replicas))}")
     return FreshEpisode(
         run=loaded,
-        env=loaded.env(1, seed=SEED, first_world=episode),
-        policies=loaded.policy(replica, seed=SEED + episode),
+        env=loaded.env(1, seed=seed, first_world=episode),
+        policies=loaded.policy(replica, seed=seed + episode),
         title=f"{Path(run).name}, agents of replica {replica}, fresh episode {episode}",
     )
 
@@ -62,6 +63,7 @@ def film(
     *,
     replica: int = 0,
     episode: int = 0,
+    seed: int = SEED,
     allow: Sequence[str] = (),
 ) -> tuple[Path, Episode]:
     """Records an episode of a run's agents in a fresh world, with the exploration of evaluation.
@@ -72,6 +74,8 @@ def film(
             directory.
         replica: the index of the agents' replica.
         episode: the index of the fresh episode; equal indices give equal episodes.
+        seed: of the worlds and all chance. The world is that of `evaluate_run` with the same seed, of number
+            replica x episodes + episode there; what agents draw is their own.
         allow: see `cprl.load`.
 
     Returns:
@@ -85,7 +89,7 @@ def film(
     arguments.object_of("out", out, (str, Path, type(None)), "a path, or None")
     if out is not None and Path(out).suffix != ".rrd":
         raise arguments.refusal("out", str(out), "a .rrd; film_video makes a .gif or an .mp4")
-    fresh = fresh_episode(run, replica=replica, episode=episode, allow=allow)
+    fresh = fresh_episode(run, replica=replica, episode=episode, seed=seed, allow=allow)
     target = Path(run) / f"film-{replica}-{episode}.rrd" if out is None else Path(out)
     refuse_to_write_over(target)
     target.parent.mkdir(parents=True, exist_ok=True)

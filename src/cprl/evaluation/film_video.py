@@ -17,7 +17,7 @@ from cprl.evaluation.episode_picture import (
     SMALLEST_WIDTH,
     EpisodePicture,
 )
-from cprl.evaluation.film import fresh_episode
+from cprl.evaluation.film import SEED, fresh_episode
 from cprl.evaluation.turns import Turns
 from cprl.evaluation.video_files import check_can_write_mp4, write_gif, write_mp4
 from cprl.measuring.episodes import Episode
@@ -42,6 +42,7 @@ def film_video(
     *,
     replica: int = 0,
     episode: int = 0,
+    seed: int = SEED,
     every: int | None = None,
     fps: float = DEFAULT_FPS,
     width: int = DEFAULT_WIDTH,
@@ -58,6 +59,8 @@ def film_video(
         out: the film, a .gif or, with imageio-ffmpeg, an .mp4; complete or absent.
         replica: the index of the agents' replica.
         episode: the index of the fresh episode; equal indices give equal episodes.
+        seed: of the worlds and all chance. The world is that of `evaluate_run` with the same seed, of number
+            replica x episodes + episode there; what agents draw is their own.
         every: turns from one picture to the next; by default 1 for an .mp4, and for a .gif as many as
             it takes for 300 pictures.
         fps: pictures per second, above 0, at most 50; in a .gif rounded to hundredths of a second a picture.
@@ -85,7 +88,7 @@ def film_video(
     refuse_to_write_over(path)
     if path.suffix == ".mp4":
         check_can_write_mp4(path)
-    fresh = fresh_episode(run, replica=replica, episode=episode, allow=allow)
+    fresh = fresh_episode(run, replica=replica, episode=episode, seed=seed, allow=allow)
     commons = commons_of(fresh.env)
     if commons is None:
         raise ValueError(f"{run} plays a game without a board of cprl; allowed: a run of a cprl.Game")

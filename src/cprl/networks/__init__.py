@@ -16,9 +16,10 @@ Modules, in the order in which one reads them:
     stacked        the networks of many lanes as one
 """
 
+from cprl.networks.agent import AgentNetworks
 from cprl.networks.convolutional import Conv, ConvNetwork
 from cprl.networks.mlp import MLP, MLPNetwork
 from cprl.networks.recurrent import GRU, LSTM
 from cprl.networks.specification import Network
 
-__all__ = ["GRU", "LSTM", "MLP", "Conv", "ConvNetwork", "MLPNetwork", "Network"]
+__all__ = ["GRU", "LSTM", "MLP", "AgentNetworks", "Conv", "ConvNetwork", "MLPNetwork", "Network"]

@@ -38,7 +38,8 @@ class AgentPolicies(TensorDictModuleBase):
     With decisions it also reads "ballots_due", and writes ("agents", "decision"), int64 [B, N].
 
     Raises:
-        ValueError: if an agent has no actor or several.
+        ValueError: if an agent has no actor or several; when called, for another number of worlds than actors
+            play.
     """
 
     in_keys: tuple[Any, ...] = (keys.OBSERVATION,)
@@ -72,6 +73,8 @@ class AgentPolicies(TensorDictModuleBase):
         self.decisions = decisions
         self._state_cells = max(int(getattr(actor, "state_cells", 0)) for actor in self.actors)
         """The largest state of an agent; 0 if no actor is recurrent."""
+        self._worlds = max(_worlds_of(actor) for actor in self.actors)
+        """How many worlds all replicas play together; 0 if actors play any number."""
         if decisions is not None:
             if decisions.agents != self.agents:
                 raise ValueError(
@@ -84,6 +87,12 @@ class AgentPolicies(TensorDictModuleBase):
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Writes the action of every agent, and its decision, in all worlds at once."""
         agents = keys.entry(tensordict, keys.AGENTS)
+        if self._worlds and tensordict.batch_size.numel() != self._worlds:
+            there = tensordict.batch_size.numel()
+            raise ValueError(
+                f"the policy plays {self._worlds} world{'s' * (self._worlds > 1)} and the environment has "
+                f"{there}; allowed: as many, e.g. run.policy(replica, worlds={there})"
+            )
         if self.decisions is not None:
             due = keys.entry(tensordict, keys.BALLOTS_DUE)
             keys.put(agents, "decision", self.decisions.decide(due))
@@ -155,3 +164,8 @@ class AgentPolicies(TensorDictModuleBase):
 def _at(agents: TensorDictBase, name: str, index: Any) -> Tensor:
     value: Tensor = keys.entry(agents, name)
     return value if index is None else value[index]
+
+
+def _worlds_of(actor: nn.Module) -> int:
+    """How many worlds an actor plays in all replicas; 0 for an actor that plays any number."""
+    return int(getattr(actor, "replicas", 0)) * int(getattr(actor, "worlds", 0))

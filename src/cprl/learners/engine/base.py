@@ -118,7 +118,7 @@ class ListEngine:
         return torch.stack([self._learn(lane, batch[lane]) for lane in range(len(self.losses))])
 
     def _learn(self, lane: int, batch: TensorDict) -> Tensor:
-        loss = total(self.losses[lane](batch)).mean() * self._share
+        loss = total(self.losses[lane](batch), self.losses[lane]).mean() * self._share
         self._optimizers[lane].zero_grad()
         loss.backward()  # type: ignore[no-untyped-call]
         if self._max_norm is not None:

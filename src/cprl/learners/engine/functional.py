@@ -5,7 +5,7 @@ from contextlib import suppress
 from typing import Any, Final, NamedTuple
 
 import torch
-from tensordict import TensorDict, TensorDictBase
+from tensordict import TensorDict, is_tensor_collection
 from tensordict.nn import TensorDictParams
 from torch import Tensor, nn
 from torchrl.objectives import LossModule
@@ -61,7 +61,7 @@ class FunctionalLoss:
             setattr(self.module, name, own[name])
         if not torch.compiler.is_compiling():
             forget_cached_weights(self.module)
-        losses = total(self.module(batch))
+        losses = total(self.module(batch), self.module)
         for name in (*self._groups, *self._singles):
             setattr(self.module, name, None)
         return losses
@@ -78,9 +78,25 @@ def own_targets(loss: LossModule) -> None:
     promise_targets(loss)
 
 
-def total(out: TensorDictBase) -> Tensor:
-    """The sum of all entries that TorchRL calls a loss."""
-    losses = [value for key, value in out.items() if key.startswith("loss")]
+def total(out: Any, loss: LossModule) -> Tensor:
+    """The sum of all entries that TorchRL calls a loss.
+
+    Args:
+        out: what the loss returned.
+        loss: named in the error.
+
+    Raises:
+        ValueError: if it is no TensorDict, or has no such entry.
+    """
+    entries = dict(out.items()) if is_tensor_collection(out) else {}
+    losses = [value for name, value in entries.items() if name.startswith("loss")]
+    if not losses:
+        kind = type(loss)
+        has = f" with the entries {sorted(entries)}" if entries else ""
+        raise ValueError(
+            f"the loss {kind.__module__}:{kind.__qualname__} returns a {type(out).__name__}{has}; allowed: "
+            'a TensorDict with entries whose names begin with "loss"'
+        )
     summed: Tensor = sum(losses[1:], losses[0])
     return summed
 

@@ -9,6 +9,7 @@ from torch import Tensor
 from torchrl.objectives import A2CLoss, LossModule, PPOLoss, ReinforceLoss, ValueEstimators
 from torchrl.objectives.value import GAE, TD0Estimator, ValueEstimatorBase
 
+from cprl.compat import promise_targets
 from cprl.learners.engine.functional import own_targets, targets_of, total
 from cprl.learners.settings import DQNSettings, RolloutSettings
 
@@ -88,6 +89,18 @@ def refuse_other_advantages(loss: LossModule, settings: RolloutSettings) -> None
                 )
 
 
+def refuse_other_outputs(loss: LossModule, batch: TensorDict) -> None:
+    """Raises a ValueError if a loss returns no entry that is a loss.
+
+    Args:
+        loss: the loss of one lane; it is called.
+        batch: a synthetic batch of one lane, [b].
+    """
+    promise_targets(loss)
+    with torch.no_grad(), torch.random.fork_rng(devices=[]):
+        total(loss(batch.clone()), loss)
+
+
 def reads(loss: LossModule, key: str) -> bool:
     """Whether an entry is among the keys that a loss reads."""
     try:
@@ -119,7 +132,7 @@ def _ignores_steps(loss: LossModule, batch: TensorDict) -> bool:
         tried["next", "terminated"] = torch.full_like(tried["next", "terminated"], ends)
         with torch.no_grad(), torch.random.fork_rng(devices=[]):
             torch.manual_seed(0)
-            value: Tensor = total(loss(tried)).mean()
+            value: Tensor = total(loss(tried), loss).mean()
         return value
 
     bootstraps = not torch.equal(of(1, ends=False), of(1, ends=True))

@@ -132,7 +132,7 @@ class LOLANetworks:
 
     def update_policies(self, rollouts: TensorDict) -> None:
         """One step of all policies."""
-        self.policy_steps.descend(total(self.loss(rollouts)))
+        self.policy_steps.descend(total(self.loss(rollouts), self.loss))
 
     def update_critics(self, observation: Tensor, target: Tensor) -> None:
         """One step of all critics along their mean squared errors.

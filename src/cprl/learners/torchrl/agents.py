@@ -81,7 +81,8 @@ class StockAgent:
 
     def update(self, batch: TensorDictBase) -> Tensor:
         """One optimiser step on a batch [b]; returns the loss, 0-d."""
-        loss = total(self.loss(batch)).mean() * self._share  # some losses give one for each transition
+        losses = total(self.loss(batch), self.loss)
+        loss = losses.mean() * self._share  # some losses give one for each transition
         self.optimizer.zero_grad()
         loss.backward()  # type: ignore[no-untyped-call]
         if self._max_norm is not None:

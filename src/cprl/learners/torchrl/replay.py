@@ -21,7 +21,7 @@ from cprl.learners.buffer.storage import torch_dtype
 from cprl.learners.checks import check_learner, refuse_continuous
 from cprl.learners.engine.choice import trial_batch
 from cprl.learners.engine.functional import MakeLoss, targets_of
-from cprl.learners.engine.refusals import refuse_for_replay
+from cprl.learners.engine.refusals import refuse_for_replay, refuse_other_outputs
 from cprl.learners.lanes import NOISE, TARGET_WEIGHTS, Lanes, StartFrom
 from cprl.learners.pace import Pace
 from cprl.learners.settings import DQNSettings
@@ -161,7 +161,9 @@ class TorchRLReplayLearner:
             noise_shape=(noise_numbers,) if noise_numbers else (),
             device=device,
         )
-        refuse_for_replay(loss, settings, transformed(trial, settings.replay_transforms)[0])
+        batch = transformed(trial, settings.replay_transforms)[0]
+        refuse_for_replay(loss, settings, batch)
+        refuse_other_outputs(loss, batch)
 
     def _init_targets(self, make_loss: MakeLoss) -> None:
         """Gives targets initial weights of their own; the updaters have made them copies."""

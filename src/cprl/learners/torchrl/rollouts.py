@@ -1,6 +1,7 @@
 """TorchRLRolloutLearner: independent on-policy agents that learn by stock parts."""
 
 from collections.abc import Callable, Mapping, Sequence
+from functools import partial
 from typing import Any
 
 import torch
@@ -15,8 +16,9 @@ from torchrl.objectives.value import GAE
 from cprl.envs.drivers import device_of
 from cprl.learners.buffer.storage import torch_dtype
 from cprl.learners.checks import check_learner, check_rollouts, refuse_continuous
+from cprl.learners.engine.choice import trial_batch
 from cprl.learners.engine.functional import MakeLoss
-from cprl.learners.engine.refusals import refuse_other_advantages
+from cprl.learners.engine.refusals import refuse_other_advantages, refuse_other_outputs
 from cprl.learners.lanes import Lanes, StartFrom
 from cprl.learners.recurrent import ACTOR, CRITIC, states_in
 from cprl.learners.rollouts import refuse_other_parts
@@ -92,15 +94,15 @@ class TorchRLRolloutLearner:
             stochastic=True,
             start_from=start_from,
         )
-        self.stock = StockAgents(
-            self._lanes,
-            lambda network: _on_policy(make_loss, network, settings),
-            optimizer=settings.optimizer,
-            learning_rate=settings.learning_rate,
-            eps=settings.adam_eps,
-            max_grad_norm=settings.max_grad_norm,
-            device=device,
-        )
+        how: dict[str, Any] = {
+            "optimizer": settings.optimizer,
+            "learning_rate": settings.learning_rate,
+            "eps": settings.adam_eps,
+            "max_grad_norm": settings.max_grad_norm,
+        }
+        of_agent = partial(_on_policy, make_loss, settings)
+        self._refuse_other_outputs(of_agent, device, **how)
+        self.stock = StockAgents(self._lanes, of_agent, device=device, **how)
         self.estimators = [_gae(agent.parts[CRITIC], settings) for agent in self.stock.each]
         size, dtype = (settings.rollout_steps, len(self._lanes)), torch_dtype(spaces.observation_dtype)
         check_rollouts(size, spaces.observation_shape, dtype, device)
@@ -117,6 +119,22 @@ class TorchRLRolloutLearner:
         self.actor = self._lanes.actor(self.stock, compile=False)
         self._rollout: list[TensorDict] = []
         self.steps = 0
+
+    def _refuse_other_outputs(self, make_loss: MakeLoss, device: torch.device, **how: Any) -> None:
+        """Raises a ValueError for a loss that returns none, on synthetic transitions of one agent."""
+        with torch.random.fork_rng(devices=[]):
+            agent = StockAgent(self._lanes.make_network().to(device), make_loss, **how)
+        trial = trial_batch(
+            1,
+            self._lanes.observation_shape,
+            self.spaces.actions,
+            action_shape=self._lanes.action_shape,
+            observation_dtype=self.spaces.observation_dtype,
+            device=device,
+        )[0]
+        _gae(agent.parts[CRITIC], self.settings)(trial)
+        _add_old_policy(trial, agent)
+        refuse_other_outputs(agent.loss, trial)
 
     @property
     def rollout_steps(self) -> int:
@@ -230,7 +248,7 @@ def _add_old_policy(rollout: TensorDict, agent: StockAgent) -> None:
     rollout.update({"logits": logits, "action_log_prob": chosen})
 
 
-def _on_policy(make_loss: MakeLoss, network: nn.Module, settings: RolloutSettings) -> LossModule:
+def _on_policy(make_loss: MakeLoss, settings: RolloutSettings, network: nn.Module) -> LossModule:
     """Makes the loss; refuses other networks than "actor" and "critic", recurrent ones, and other advantages
     than GAE's."""
     refuse_other_parts(network)
