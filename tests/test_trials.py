@@ -133,15 +133,22 @@ def test_a_failure_is_noted_with_its_reason_and_forgotten_when_it_is_mended(tmp_
     assert status.failure() is None
 
 
-def test_a_trial_waits_while_another_process_runs_it(tmp_path, undisturbed, monkeypatch):
+@pytest.mark.parametrize("is_begun", [False, True])
+def test_a_trial_waits_while_another_process_runs_it(tmp_path, undisturbed, monkeypatch, is_begun):
     own = task(tmp_path)
     own.directory.mkdir(parents=True)
+    if is_begun:
+        shutil.copy(undisturbed / "recipe.json", own.directory)
     lock = RunLock(own.directory)
     lock.__enter__()
     waited = []
+    status = Status(Path(own.status), own.name)
+    status.folder.mkdir(parents=True, exist_ok=True)
+    status.path.write_text('{"episodes": 3, "of": 4}')
 
     def finished_elsewhere(seconds):
         waited.append(seconds)
+        assert status.read() == {"episodes": 3, "of": 4}, "what the one says that runs it"
         lock.__exit__(None, None, None)
         shutil.copytree(undisturbed, own.directory, dirs_exist_ok=True)
 
@@ -159,9 +166,22 @@ def test_the_lock_of_another_host_is_taken_over_once_its_trial_is_silent(tmp_pat
     (own.directory / LOCK).write_text(json.dumps(holder))
     monkeypatch.setattr(trials, "PATIENCE_S", 0.3)
     monkeypatch.setattr(trials, "_POLL_S", 0.05)
+    silent_since, said = [], []
+    before = trials.is_silent
+
+    def watched(status, patience_s):
+        for is_silent in before(status, patience_s):
+            said.append(status.read())
+            silent_since.append(is_silent)
+            yield is_silent
+
+    monkeypatch.setattr(trials, "is_silent", watched)
     began = time.monotonic()
     assert run_task(own).state == "finished"
     assert time.monotonic() - began > 0.3
+    assert silent_since[-1]
+    assert not any(silent_since[:-1])
+    assert said == [{}] * len(said), "who waits says nothing"
     assert_same(own.directory, undisturbed)
 
 

@@ -192,7 +192,10 @@ def _run(task: Task, run: Path, status: Status) -> None:
             begin_from_shorter(run, experiment, task.recipe)
         is_begun, take_over = state_of(run) == "unfinished", next(silent)
         try:
-            if is_begun:  # another study may have begun it, under another name
+            if is_begun:
+                with RunLock(run, take_over=take_over):
+                    pass  # refused while another process runs it, whose status stays as it is
+                # Another study may have begun it, under another name.
                 experiment = replace(experiment, name=str(read_recipe(run)["experiment"]["name"]))
             else:
                 _clear(run, take_over=take_over)
