@@ -93,8 +93,7 @@ def run_study(
     check_executor(on)
     switch("results", results)
     switch("keep_checkpoints", keep_checkpoints)
-    check_last(last)
-    choice("interval", interval, get_args(Interval))
+    check_comparison(last, interval)
     with as_driver(
         study,
         trials,
@@ -138,9 +137,10 @@ def results_of(study: Study, trials: Sequence[Trial], out: Path, runs: Path, **h
     return write_results(study, out, runs, **how)
 
 
-def check_last(last: int) -> None:
-    """Raises a ValueError for episodes that the table of a study does not tell apart."""
+def check_comparison(last: int, interval: str) -> None:
+    """Raises a ValueError for episodes that the table of a study does not tell apart, and for no interval."""
     integer("last", last, WINDOW, allowed=f"an integer >= {WINDOW}, the episodes of a window of the table")
+    choice("interval", interval, get_args(Interval))
 
 
 def directory_of(study: Study, out: Path | str | None) -> Path:

@@ -11,9 +11,9 @@ from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any, Final, get_args
+from typing import Any, Final
 
-from cprl.arguments import choice, object_of, switch
+from cprl.arguments import object_of, switch
 from cprl.arguments import path as path_of
 from cprl.measuring.statistics import Interval
 from cprl.runs.files import write_json
@@ -21,8 +21,8 @@ from cprl.studies.execution import (
     RUNS,
     Driver,
     as_driver,
+    check_comparison,
     check_executor,
-    check_last,
     directory_of,
     results_of,
     write_study,
@@ -99,8 +99,7 @@ def run_search(
     object_of("search", search, Search, "a Search")
     check_executor(on)
     switch("results", results)
-    check_last(last)
-    choice("interval", interval, get_args(Interval))
+    check_comparison(last, interval)
     optuna = _optuna()
     asked = _Asked(search, optuna)
     batch = asked.first_batch()
