@@ -19,7 +19,8 @@ from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
 from cprl.measuring.statistics import Estimate, curve_interval, estimate
-from cprl.plotting.style import DPI, INTERVAL, MEAN, RANDOM_LINE, SMALL_PT
+from cprl.plotting import style
+from cprl.plotting.style import INTERVAL, MEAN, RANDOM_LINE, SMALL_PT
 from cprl.runs.curves import as_curves, centres, curves_of, running_mean
 from cprl.runs.episodes import read_table
 
@@ -91,7 +92,7 @@ def forest(differences: dict[str, dict[str, Estimate]], path: Path) -> None:
         f"difference from none, paired by replica; means of the last {LAST} episodes, 95 % intervals",
         fontsize=SMALL_PT + 1,
     )
-    figure.savefig(path, dpi=DPI)
+    style.save(figure, path)
 
 
 def courses(runs: dict[str, Path], path: Path) -> None:
@@ -121,7 +122,7 @@ def courses(runs: dict[str, Path], path: Path) -> None:
     handles, labels = grid[0].get_legend_handles_labels()
     labels[1] = "with the institution"
     figure.legend(handles, labels, loc="outside upper center", ncols=3, fontsize=SMALL_PT)
-    figure.savefig(path, dpi=DPI)
+    style.save(figure, path)
 
 
 def main(*, runs: Path, figures: Path) -> None:

@@ -130,30 +130,31 @@ def check_picture(path: str | Path, name: str = "path") -> Path:
     return path
 
 
-def save(figure: Figure, path: Path, *, colours: int | None = None) -> Path:
+def save(figure: Figure, path: Path, *, colours: int = 256) -> Path:
     """Writes a PNG atomically; its folder is created if missing.
 
     Args:
         figure: the figure.
         path: the PNG.
-        colours: write it with so few, 2 to 256, which takes a third of the room; by default with all.
+        colours: how many it has, 2 to 256; a PNG of 256 takes a third of the room of one with all, and
+            looks the same.
     """
     path.parent.mkdir(parents=True, exist_ok=True)
     drawn = BytesIO()
     figure.savefig(drawn, format="png", dpi=DPI)
-    if colours is not None:
-        drawn = _with_colours(drawn, colours)
-    write_atomically(path, lambda file: file.write(drawn.getvalue()))
+    few = _with_colours(drawn, colours)
+    write_atomically(path, lambda file: file.write(few.getvalue()))
     return path
 
 
 def _with_colours(drawn: BytesIO, colours: int) -> BytesIO:
+    """A picture as a PNG with so few colours, each near those that it stands for."""
     from PIL import Image
 
     few = BytesIO()
     with Image.open(drawn) as picture:
         chosen = picture.convert("RGB").quantize(
-            colours, method=Image.Quantize.MAXCOVERAGE, dither=Image.Dither.NONE
+            colours, method=Image.Quantize.MAXCOVERAGE, kmeans=2, dither=Image.Dither.NONE
         )
-    chosen.save(few, format="png", optimize=True)
+        chosen.save(few, format="png", optimize=True, dpi=(DPI, DPI))
     return few
