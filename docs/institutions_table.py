@@ -6,7 +6,7 @@
     python docs/institutions_table.py --runs runs --figures docs/institutions
 
 A number is the mean of the last 30 episodes of a replica, then over replicas, with the 95 % interval by
-bootstrap of the replicas. A difference is paired: replica r has the same seeds under each institution and
+Student's t over replicas. A difference is paired: replica r has the same seeds under each institution and
 under none.
 """
 

@@ -43,7 +43,7 @@ def main(*, replicas: int = 8, repetitions: int = 1_000, seed: int = 0, differen
             found = [_percentile(sample, rng)]
             found += [
                 (one.low, one.high)
-                for one in (estimate(sample, resamples=1000), estimate(sample, interval="t"))
+                for one in (estimate(sample, interval="bca", resamples=1000), estimate(sample))
             ]
             held += [low <= mean <= high for low, high in found]
         print(f"| {name} | " + " | ".join(f"{share:.1%}" for share in held / repetitions) + " |", flush=True)

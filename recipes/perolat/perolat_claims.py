@@ -208,8 +208,8 @@ def row(claim: Claim, name: str, runs: Path, episodes: int | None = None) -> str
     pairs = pairs[:, np.isfinite(pairs).all(0)]
     if not pairs.size:
         return line(*cells, "", "undefined in all replicas")
-    cells[2:] = [f"{own}: {estimate(one, interval='t')}" for own, one in zip(both, pairs, strict=True)]
-    apart = difference(*pairs, paired=True, interval="t")
+    cells[2:] = [f"{own}: {estimate(one)}" for own, one in zip(both, pairs, strict=True)]
+    apart = difference(*pairs, paired=True)
     return line(*cells, str(apart), verdict(apart))
 
 

@@ -158,11 +158,11 @@ def print_table(table: pa.Table) -> None:
         if found:
             sharing = sharing_of(condition[0], condition[1])
             end = -round(LAST * len(found["episode"]))
-            taken = estimate(found["total"][end:].mean(0), interval="t")
+            taken = estimate(found["total"][end:].mean(0))
             share = 100 * found["gain"][end:].mean(0) / sharing.surplus(sharing.optimum_total)
             theory = f"{sharing.nash_total:.4g} | {sharing.optimum_total:.4g}"
             cells = " | ".join(map(str, condition))
-            print(f"| {cells} | {taken} | {theory} | {estimate(share, interval='t')} |")
+            print(f"| {cells} | {taken} | {theory} | {estimate(share)} |")
 
 
 def main() -> None:

@@ -59,8 +59,9 @@ class StudyOptions:
     """Write the table, summary and figures at the end."""
     last: int = LAST
     """Episodes at the end of the training that these compare; of long trainings rather 500."""
-    interval: Interval = "bca"
-    """How their intervals are computed: "bca", the bootstrap, too narrow for few replicas; "t", Student's."""
+    interval: Interval = "t"
+    """How their intervals are computed: "t", by Student's t; "bca", by a bootstrap, too narrow for few
+    replicas."""
     watch: str = "off"
     """"serve", "spawn" or "connect ADDRESS": the table of all trials, and the returns of finished ones, in
     the Rerun viewer."""

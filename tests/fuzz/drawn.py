@@ -248,8 +248,6 @@ OWN: Final[dict[str, dict[str, st.SearchStrategy[Any]]]] = {
     "cprl.measuring.phases:phases": {**_PHASES, "changes": st.sampled_from(((300.0,), (300.0, 700.0), ()))},
     "cprl.measuring.statistics:curve_interval": {
         "curves": st.sampled_from(((1, 4), (3, 5))).map(np.ones),
-        "resamples": _FEW,
-        "seed": _SEEDS,
         "confidence": st.sampled_from((0.5, 0.95)),
     },
     "cprl.measuring.statistics:estimate": {

@@ -52,7 +52,7 @@ def draw_egta(found: Analysis, path: Path | str) -> Path:
         f"{found.resamples} resamples of the replicas"
     )
     style.head(figure, f"Empirical game of {', '.join(game.names)}", note)
-    return style.save(figure, path)
+    return style.save(figure, path, colours=style.SHADES)
 
 
 def _draw_line(axes: Axes, found: Analysis) -> None:
@@ -60,7 +60,7 @@ def _draw_line(axes: Axes, found: Analysis) -> None:
     shares, (first, second) = np.linspace(0, 1, _POINTS), found.game.names
     tables = [found.game.table([place]) for place in range(len(found.game.payoffs))]
     curves = np.array([[_gain(table, share) for share in shares] for table in tables])
-    means = [estimate(own, interval="t") for own in curves.T]
+    means = [estimate(own) for own in curves.T]
     middle = np.array([own.value for own in means])
     axes.fill_between(
         shares, [own.low for own in means], [own.high for own in means], color=style.REPLICA, alpha=0.35, lw=0
@@ -134,7 +134,7 @@ def _draw_deviations(axes: Axes, found: Analysis) -> None:
     pairs = np.array([game.table([place]).pairs for place in range(len(game.payoffs))])
     for to in range(len(names)):
         for start in range(len(names)):
-            gain = estimate(pairs[:, to, start] - pairs[:, start, start], interval="t")
+            gain = estimate(pairs[:, to, start] - pairs[:, start, start])
             if to == start or gain.value <= 0:
                 continue
             colour, line = (style.MEAN, "-") if gain.low > 0 else (_UNCERTAIN, "--")

@@ -121,7 +121,7 @@ def mixture_text(mixture: Values, names: Sequence[str]) -> str:
 
 
 def _mean(values: Values) -> Estimate:
-    return estimate(values, interval="t")
+    return estimate(values)
 
 
 def _share(own: Estimate) -> str:

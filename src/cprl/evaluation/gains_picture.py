@@ -15,7 +15,7 @@ from cprl.evaluation.tables import unit_of_cells
 from cprl.measuring.names import with_unit
 from cprl.measuring.statistics import Estimate, Interval, excluded_by_chance
 from cprl.plotting.cells import EMPTY, draw_cell
-from cprl.plotting.style import INTERVALS, SMALL_PT, head, picture_path, save, wrapped
+from cprl.plotting.style import INTERVALS, SHADES, SMALL_PT, head, picture_path, save, wrapped
 
 _COLOURS: Final = "RdBu"
 _CELL_IN: Final = (0.82, 0.45)
@@ -55,7 +55,7 @@ def draw_gains(played: CrossPlay, path: Path | str, *, interval: Interval = "t")
         f"{2 * len(found)}."
     )
     head(figure, "Cross-play: who gains among whom", note)
-    return save(figure, path)
+    return save(figure, path, colours=SHADES)
 
 
 def _draw_matrix(

@@ -32,7 +32,7 @@ def _gains(found: Exploitability) -> Table:
     table.add_column("chosen in replicas")
     for agent in found.responses:
         gain, returns = found.gain_of(agent), found.returns(agent)
-        means = (str(estimate(values, interval="t")) for values in returns)
+        means = (str(estimate(values)) for values in returns)
         chosen = Counter(response.name for response in found.chosen(agent))
         names = "\n".join(f"{name}: {times}" for name, times in chosen.most_common())
         table.add_row(str(agent), *means, str(gain.focal), str(gain.background), names)

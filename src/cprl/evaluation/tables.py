@@ -69,7 +69,7 @@ def schelling_tables(found: SchellingDiagram) -> Iterator[Table]:
     """The payoffs by the number of restrained others, and the margins between them that make a dilemma."""
     title = (
         f"{found.replicas} replicas, {found.episodes} episodes each for each choice of restrained agents, "
-        f"seed {found.seed}\nmean over replicas [95 % interval by Student's t]"
+        f"seed {found.seed}\n{_INTERVALS}"
     )
     payoffs = Table(title=title, title_justify="left")
     for heading in (
@@ -80,7 +80,7 @@ def schelling_tables(found: SchellingDiagram) -> Iterator[Table]:
         payoffs.add_column(heading, justify="right")
     for count in range(found.agents):
         own = (of_kind[:, count] for of_kind in (found.restrained_payoffs, found.greedy_payoffs))
-        payoffs.add_row(str(count), *(str(estimate(values, interval="t")) for values in own))
+        payoffs.add_row(str(count), *(str(estimate(values)) for values in own))
     yield payoffs
     dilemma, last = found.dilemma(), found.agents - 1
     margins = Table(title=f"{dilemma.name}, by returns", title_justify="left")
@@ -185,4 +185,4 @@ def how_they_play(runs: list[LoadedRun], greedy: bool) -> str:
     return "".join(f", epsilon {chance:g}" for chance in sorted(chances))
 
 
-_INTERVALS: Final = "mean over replicas [95 % bootstrap interval]"
+_INTERVALS: Final = "mean over replicas [95 % interval by Student's t]"

@@ -72,7 +72,7 @@ def draw_visits(
         f"exclusion {index:.2f}, {sharing:.1f} agents share a cell"
     )
     figure.suptitle(fill(title, style.TITLE_CHARACTERS), fontsize=11)
-    return style.save(figure, path)
+    return style.save(figure, path, colours=style.SHADES)
 
 
 def _panels(count: int, board: Map) -> tuple[Figure, list[Axes]]:

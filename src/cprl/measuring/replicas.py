@@ -30,7 +30,7 @@ class Measured:
         return f"{value}, undefined in {self.undefined} of {self.episodes}" if self.undefined else value
 
 
-def over_replicas(values: Mapping[int, Sequence[float]], *, interval: Interval = "bca") -> Measured:
+def over_replicas(values: Mapping[int, Sequence[float]], *, interval: Interval = "t") -> Measured:
     """Estimates a metric from its values by replica, one per episode, NaN where undefined.
 
     Args:
@@ -77,7 +77,7 @@ def institution_metrics(episode: Episode) -> dict[str, float]:
 
 
 def institution_measures(
-    played: Mapping[int, Sequence[Episode]], *, interval: Interval = "bca"
+    played: Mapping[int, Sequence[Episode]], *, interval: Interval = "t"
 ) -> dict[str, Measured]:
     """`institution_metrics` over replicas, by name, as `institutions/fines` and so on; empty for a game
     without institutions.
@@ -104,7 +104,7 @@ def institution_measures(
 
 
 def social_measures(
-    played: Mapping[int, Sequence[Episode]], *, interval: Interval = "bca"
+    played: Mapping[int, Sequence[Episode]], *, interval: Interval = "t"
 ) -> dict[str, Measured]:
     """`social_metrics` over replicas, by name.
 

@@ -1,4 +1,4 @@
-"""Statistics over replicas: means, differences, and their intervals by bootstrap or by Student's t.
+"""Statistics over replicas: means, differences, and their intervals by Student's t or by bootstrap.
 
 A replica is one independent repetition of a whole training. Episodes and agents within a replica depend on
 each other, so the bootstrap resamples replicas, never episodes. Values are float64 [R], one number per
@@ -22,10 +22,10 @@ from cprl.memory import check_memory
 
 Values = NDArray[np.float64]
 Statistic = Literal["mean", "iqm"]
-Interval = Literal["bca", "t"]
-"""How an interval is computed: "bca", the bias-corrected and accelerated bootstrap, or by percentiles where
-there are several samples or that is undefined; "t", of means alone, by Student's t, which is wider and right
-for few replicas if their values are about normally distributed."""
+Interval = Literal["t", "bca"]
+"""How an interval is computed: "t", of means alone, by Student's t, right for few replicas if their values
+are about normally distributed; "bca", the bias-corrected and accelerated bootstrap, or by percentiles where
+there are several samples or that is undefined, which is too narrow for few replicas."""
 
 _BY_CHANCE: Final = {
     2: "two",
@@ -108,7 +108,7 @@ _STATISTICS: Final[dict[Statistic, Callable[..., Any]]] = {"mean": mean, "iqm": 
 def estimate(
     *strata: ArrayLike,
     statistic: Statistic = "mean",
-    interval: Interval = "bca",
+    interval: Interval | None = None,
     confidence: float = CONFIDENCE,
     resamples: int = RESAMPLES,
     seed: int = 0,
@@ -121,7 +121,8 @@ def estimate(
     Args:
         strata: float [R] each.
         statistic: "mean", or "iqm" for the inter-quartile mean.
-        interval: "bca", or "t" for means; see `Interval`.
+        interval: see `Interval`; by default "t" for means, and "bca" for inter-quartile means, which have no
+            other.
         confidence: The confidence of the interval, between 0 and 1, exclusive.
         resamples: The number of bootstrap resamples.
         seed: The seed of the resampling.
@@ -134,6 +135,8 @@ def estimate(
     if not samples:
         raise ValueError("there are no values; allowed: at least one stratum")
     arguments.choice("statistic", statistic, _STATISTICS)
+    if interval is None:
+        interval = "t" if statistic == "mean" else "bca"
     arguments.choice("interval", interval, get_args(Interval))
     if interval == "t" and statistic != "mean":
         raise ValueError(f'interval is "t" and statistic is {shown(statistic)}; allowed: "mean", or "bca"')
@@ -156,7 +159,7 @@ def difference(
     reference: ArrayLike,
     *,
     paired: bool,
-    interval: Interval = "bca",
+    interval: Interval = "t",
     confidence: float = CONFIDENCE,
     resamples: int = RESAMPLES,
     seed: int = 0,
@@ -199,16 +202,12 @@ def difference(
     return Estimate(value=value, low=low, high=high, replicas=sum(map(len, samples)))
 
 
-def curve_interval(
-    curves: ArrayLike, *, confidence: float = CONFIDENCE, resamples: int = RESAMPLES, seed: int = 0
-) -> tuple[Values, Values, Values]:
-    """The mean of several curves and its percentile bootstrap interval at each episode.
+def curve_interval(curves: ArrayLike, *, confidence: float = CONFIDENCE) -> tuple[Values, Values, Values]:
+    """The mean of several curves and its interval by Student's t at each episode.
 
     Args:
         curves: float [R, E], a curve of E episodes per replica; NaN where undefined.
         confidence: The confidence of the interval, between 0 and 1, exclusive.
-        resamples: The number of bootstrap resamples.
-        seed: The seed of the resampling.
 
     Returns:
         Mean, low and high, float64 [E]; NaN where no replica has a value, for low and high also where only
@@ -217,28 +216,23 @@ def curve_interval(
     Raises:
         ValueError: If `curves` is not [R, E] with at least one replica and without infinity, or an argument
             is out of range.
-        MemoryError: If there are too many resamples.
     """
+    from scipy import stats
+
     all_curves = arguments.floats("curves", curves)
     if all_curves.ndim != 2 or not len(all_curves):
         raise ValueError(f"curves is {list(all_curves.shape)}; allowed: [R, E], a curve per replica")
     if np.isinf(all_curves).any():
         raise ValueError("curves holds infinity; allowed: finite numbers, and NaN where undefined")
-    numbers = len(all_curves) ** 2 + all_curves.shape[1]
-    resamples, seed = _bootstrap(confidence, resamples, seed, numbers)
+    _check_confidence(confidence)
     defined = ~np.isnan(all_curves)
-    filled, replicas = np.where(defined, all_curves, 0.0), len(all_curves)
-    chosen = np.random.default_rng(seed).integers(replicas, size=(resamples, replicas))
-    times = (chosen[:, :, None] == np.arange(replicas)).sum(1)  # count of each replica in each resample
-    with np.errstate(invalid="ignore", divide="ignore"):
-        middle = filled.sum(0) / defined.sum(0)
-        resampled = (times @ filled) / (times @ defined)
-    margin = (1 - confidence) / 2
-    low, high = np.full((2, all_curves.shape[1]), np.nan)
-    several = defined.sum(0) > 1
-    if several.any():
-        low[several], high[several] = np.nanquantile(resampled[:, several], [margin, 1 - margin], axis=0)
-    return middle, low, high
+    replicas = defined.sum(0)
+    with np.errstate(invalid="ignore", divide="ignore"):  # NaN of none, and of one its interval
+        middle = np.where(defined, all_curves, 0.0).sum(0) / replicas
+        squares = np.where(defined, all_curves - middle, 0.0) ** 2
+        error = np.sqrt(squares.sum(0) / (replicas - 1) / replicas)
+    reach = stats.t.ppf((1 + confidence) / 2, replicas - 1) * error
+    return middle, middle - reach, middle + reach
 
 
 def _interval(
@@ -293,10 +287,14 @@ def _t_interval(
 
 def _bootstrap(confidence: float, resamples: int, seed: int, numbers: int) -> tuple[int, int]:
     """Resamples and seed, after checking them; `numbers`: those that each resample holds."""
-    arguments.number("confidence", confidence, low=0, high=_BELOW_ONE, above=True, allowed="above 0, below 1")
+    _check_confidence(confidence)
     resamples, seed = arguments.integer("resamples", resamples, 1, 2**40), arguments.seed(seed)
     check_memory(f"resamples is {resamples:,}: they", 8 * resamples * numbers, "fewer resamples")
     return resamples, seed
+
+
+def _check_confidence(confidence: float) -> None:
+    arguments.number("confidence", confidence, low=0, high=_BELOW_ONE, above=True, allowed="above 0, below 1")
 
 
 def _checked(values: ArrayLike) -> Values:

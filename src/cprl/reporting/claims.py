@@ -56,7 +56,7 @@ def side(
     published: float | None = None,
 ) -> Claim:
     """A mean that is claimed to lie above or below a bound; see `verdicts.of_claim`."""
-    found = estimate(values, interval="t")
+    found = estimate(values)
     return Claim(
         claim=claim,
         measure=measure,
@@ -68,7 +68,7 @@ def side(
 
 def more(claim: str, measure: str, values: Values, reference: Values, *, paired: bool) -> Claim:
     """A mean that is claimed to exceed another one, [R] each; see `verdicts.of_claim`."""
-    found = difference(values, reference, paired=paired, interval="t")
+    found = difference(values, reference, paired=paired)
     return Claim(
         claim=claim,
         measure=measure,
@@ -80,7 +80,7 @@ def more(claim: str, measure: str, values: Values, reference: Values, *, paired:
 
 def alike(claim: str, measure: str, values: Values, *, within: tuple[float, float]) -> Claim:
     """A mean that is claimed to lie between two bounds; see `verdicts.of_likeness`."""
-    found = estimate(values, interval="t")
+    found = estimate(values)
     return Claim(
         claim=claim,
         measure=f"{measure}, alike if {within[0]:g} to {within[1]:g}",
@@ -109,7 +109,7 @@ def where(is_long: bool, claim: Claim) -> Claim:
 
 def with_interval(values: Values) -> str:
     """The mean of replicas, [R], with its 95 % interval by Student's t."""
-    return f"{estimate(values, interval='t')}"
+    return f"{estimate(values)}"
 
 
 def rows_of(claims: Sequence[Claim]) -> list[list[str]]:

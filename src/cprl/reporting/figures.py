@@ -30,8 +30,6 @@ TITLES: Final = {
 }
 """Of the returns of single agents, which are drawn for experiment 4 alone."""
 HEIGHT_IN: Final = 3.3
-COLOURS: Final = 128
-"""The number of colours of a figure."""
 MARGIN: Final = 0.04
 """Empty room above and below all curves, as a share of their range."""
 
@@ -124,7 +122,7 @@ def _draw(result: Result, metric: str, limits: Limits, path: Path) -> None:
     for strip in panels[:-1]:
         draw_strip(strip, strips)
     style.legend_below(figure, [axes], note=_note(result))
-    style.save(figure, path, colours=COLOURS)
+    style.save(figure, path)
 
 
 def _draw_curves(axes: Axes, smoothed: Values, metric: str) -> None:

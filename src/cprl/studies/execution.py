@@ -55,7 +55,7 @@ def run_study(
     watch: str = "off",
     results: bool = True,
     last: int = LAST,
-    interval: Interval = "bca",
+    interval: Interval = "t",
     again: str = "",
 ) -> StudyResult:
     """Runs what a study lacks; may be stopped at any moment, and called again.

@@ -41,7 +41,7 @@ def write_results(
     *,
     window: int = WINDOW,
     last: int = LAST,
-    interval: Interval = "bca",
+    interval: Interval = "t",
     again: str = "",
 ) -> StudyTable:
     """Writes `table.parquet`, `summary.md` and `figures/`; again over what an earlier call wrote.
@@ -52,7 +52,7 @@ def write_results(
         runs: the directory of its runs.
         window: see `cprl.studies.tables.table.study_table`.
         last: episodes at the end of the training that are compared.
-        interval: "bca" or "t", see `cprl.measuring.statistics.Interval`.
+        interval: "t" or "bca", see `cprl.measuring.statistics.Interval`.
         again: the command line that runs what is lacking, for the summary.
 
     Returns:

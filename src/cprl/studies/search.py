@@ -74,7 +74,7 @@ def run_search(
     watch: str = "off",
     results: bool = True,
     last: int = LAST,
-    interval: Interval = "bca",
+    interval: Interval = "t",
     again: str = "",
 ) -> SearchResult:
     """Runs a search; may be stopped at any moment, and called again, with more points too.

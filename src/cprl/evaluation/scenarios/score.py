@@ -44,10 +44,10 @@ class Score:
         """
         together = pooled(self._of(focal).values())
         return {
-            "focal/return": over_replicas(self.returns("focal", focal), interval="t"),
-            "background/return": over_replicas(self.returns("background", focal), interval="t"),
-            **social_measures(together, interval="t"),
-            **institution_measures(together, interval="t"),
+            "focal/return": over_replicas(self.returns("focal", focal)),
+            "background/return": over_replicas(self.returns("background", focal)),
+            **social_measures(together),
+            **institution_measures(together),
         }
 
     def returns(self, whose: Whose, focal: FocalAgents = "run") -> dict[int, list[float]]:
@@ -83,7 +83,7 @@ class Score:
         """
         own, other = self.returns(whose), self.returns(whose, over)
         means = [[fmean(values[replica]) for replica in own] for values in (own, other)]
-        return difference(*means, paired=True, interval="t")
+        return difference(*means, paired=True)
 
     def _of(self, focal: FocalAgents) -> Mapping[tuple[int, ...], Played]:
         arguments.choice("focal", focal, FOCAL_AGENTS)

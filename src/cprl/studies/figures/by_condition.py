@@ -35,7 +35,7 @@ def by_condition(
     metrics: Sequence[str] = (),
     part: str = TRAINING,
     last: int = LAST,
-    interval: Interval = "bca",
+    interval: Interval = "t",
 ) -> Path:
     """Draws the conditions one below the other: means over replicas, or differences from the reference.
 

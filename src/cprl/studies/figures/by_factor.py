@@ -43,7 +43,7 @@ def by_factor(
     metrics: Sequence[str] = (),
     part: str = TRAINING,
     last: int = LAST,
-    interval: Interval = "bca",
+    interval: Interval = "t",
 ) -> Path:
     """Draws metrics against a factor whose levels are numbers.
 

@@ -66,7 +66,7 @@ def courses(table: StudyTable, path: Path | str, *, metrics: Sequence[str] = ())
     over = f"{windows[0]} to {windows[-1]}" if len(windows) > 1 else f"{windows[0]}"
     note = f"{replicas_text(table.replicas)}. "
     note += f"Centred running means over {over} episodes" if windows[-1] > 1 else "Nothing is smoothed"
-    note += ", then over replicas; bands: 95% intervals by bootstrap of the replicas."
+    note += ", then over replicas; bands: 95% intervals over replicas by Student's t."
     if len(shown) <= _MOST_TOGETHER:
         figure = _together(table, shown, chosen, names, curves)
     else:
@@ -166,6 +166,6 @@ def _draw(axes: Axes, course: tuple[Values, Values, int], colour: str, label: st
     at, values, _ = course
     if not len(at):
         return
-    middle, low, high = curve_interval(values, resamples=500)
+    middle, low, high = curve_interval(values)
     axes.fill_between(at, low, high, color=colour, alpha=0.2, linewidth=0)
     axes.plot(at, middle, color=colour, linewidth=2, marker="." if len(at) < 3 else None, label=label)

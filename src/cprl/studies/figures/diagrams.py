@@ -15,7 +15,7 @@ from matplotlib.ticker import MaxNLocator
 from cprl.arguments import object_of, refusal
 from cprl.measuring.statistics import Interval
 from cprl.plotting.cells import EMPTY, draw_cell
-from cprl.plotting.style import SMALL_PT, head, picture_path, save, wrapped
+from cprl.plotting.style import SHADES, SMALL_PT, head, picture_path, save, wrapped
 from cprl.studies.figures.panels import (
     MOST_CONDITIONS,
     is_numeric,
@@ -68,7 +68,7 @@ def heat_map(
     metric: str = "collective_return",
     part: str = TRAINING,
     last: int = LAST,
-    interval: Interval = "bca",
+    interval: Interval = "t",
 ) -> Path:
     """Draws a metric over two factors: its mean with the number of replicas, and its difference.
 
@@ -113,7 +113,7 @@ def heat_map(
     how = "paired by replica" if comparison.is_paired else "not paired"
     note = f"{levels_note(comparison)} Differences from {design.reference}, {how}.{fixed}"
     head(figure, f"{design.name}: {metric_title(metric)}", note)
-    return save(figure, path)
+    return save(figure, path, colours=SHADES)
 
 
 def phase_diagram(

@@ -108,7 +108,7 @@ def compare(
     *,
     part: str = TRAINING,
     last: int = LAST,
-    interval: Interval = "bca",
+    interval: Interval = "t",
 ) -> Comparison:
     """A metric under every condition, with intervals over replicas.
 
@@ -117,7 +117,7 @@ def compare(
         metric: one of its metrics.
         part: "training", "evaluation" or "random".
         last: of training: episodes at its end; those of whole windows.
-        interval: "bca" or "t", see `cprl.measuring.statistics.Interval`.
+        interval: "t" or "bca", see `cprl.measuring.statistics.Interval`.
 
     Raises:
         ValueError: for a metric that the table lacks, for fewer episodes than a window, and for what does not

@@ -28,7 +28,7 @@ def runs_table(
     metric: tyro.conf.UseAppendAction[tuple[str, ...]] = (),
     part: Part = TRAINING,
     last: int | None = None,
-    interval: Interval = "bca",
+    interval: Interval = "t",
     reference: str | None = None,
     window: int = WINDOW,
     out: Path | None = None,
@@ -43,7 +43,7 @@ def runs_table(
         metric: what is compared, e.g. collective_return; may be repeated.
         part: of the runs: their training, their agents in fresh worlds, or random play in these.
         last: episodes at the end of the training that are compared, by default 30.
-        interval: "bca", by bootstrap of the replicas, or "t", by Student's t.
+        interval: "t", by Student's t, or "bca", by bootstrap of the replicas.
         reference: the name of the condition that others are compared with, e.g. freeze_steps=25; by default
             the first.
         window: episodes of a row of the table, of which --last compares whole ones and --out FILE.parquet
