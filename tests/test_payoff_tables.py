@@ -192,6 +192,21 @@ def test_replicator_dynamics_leave_a_dominated_strategy_however_slowly(gap):
     assert ends.mixtures == pytest.approx(np.array([[0.0, 1.0]]), abs=0.01)
 
 
+def test_a_solver_that_fails_where_dynamics_have_come_to_rest_has_found_their_end(open_spiel, monkeypatch):
+    class FailsAtRest:
+        def __init__(self, *_, **__):
+            self.y, self.status = np.array([0.5, 0.5]), "running"
+
+        def step(self):
+            assert self.status == "running"
+            self.y, self.status = np.array([0.0, 1.0]), "failed"
+
+    monkeypatch.setattr("scipy.integrate.LSODA", FailsAtRest)
+    ends = replicator_ends(DILEMMA, starts=1)
+    assert ends.unsettled == 0
+    assert ends.mixtures.tolist() == [[0.0, 1.0]]
+
+
 def test_equilibria_that_tie_but_for_rounding_are_all_told():
     # 30 (1 - 0.6) = 40 (1 - 0.7): beside one that takes 30, to take 30 or 40 pays the same.
     worth = PowerWorth(top=1.0, factor=0.01, power=1.0)

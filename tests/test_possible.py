@@ -92,6 +92,7 @@ def test_known_harvests_are_those_that_are_computed(board):
     ("call", "answer"),
     [
         (lambda: planned_harvest("commons"), "game is 'commons'; allowed: a cprl.Game"),
+        (lambda: best_planner(["commons"]), r"game is \['commons'\]; allowed: a cprl.Game"),
         (lambda: planned_harvest(ROW, "best"), "planner is 'best'; allowed: a Planner"),
         (lambda: planned_harvest(ROW, episodes=0), "episodes is 0; allowed: an integer"),
         (lambda: Planner(patience_steps=0), "patience_steps is 0; allowed: a number of at least 1"),

@@ -22,7 +22,7 @@ from cprl.runs.lock import RunLock
 from cprl.studies import read_study, trials
 from cprl.studies.execution import trials_with
 from cprl.studies.status import Status
-from cprl.studies.trials import run_task, state_of, task_of, trials_of
+from cprl.studies.trials import Outcome, run_task, state_of, task_of, trials_of
 
 STUDY = Study(TINY, {FREEZE: [5, 25]})
 
@@ -155,6 +155,44 @@ def test_a_trial_waits_while_another_process_runs_it(tmp_path, undisturbed, monk
     monkeypatch.setattr(trials.time, "sleep", finished_elsewhere)
     assert run_task(own).state == "finished"
     assert len(waited) == 1
+
+
+@pytest.mark.parametrize("is_begun", [False, True])
+def test_a_task_that_does_not_wait_leaves_a_trial_to_the_process_that_runs_it(
+    tmp_path, undisturbed, is_begun
+):
+    own = replace(task(tmp_path), waits=False)
+    own.directory.mkdir(parents=True)
+    if is_begun:
+        shutil.copy(undisturbed / "recipe.json", own.directory)
+    status = Status(Path(own.status), own.name)
+    status.folder.mkdir(parents=True, exist_ok=True)
+    status.path.write_text('{"episodes": 3, "of": 4}')
+    with RunLock(own.directory):
+        before = sorted(own.directory.iterdir())
+        assert run_task(own) == Outcome(own.name, "elsewhere")
+        assert sorted(own.directory.iterdir()) == before
+    assert status.read() == {"episodes": 3, "of": 4}
+    assert run_task(own).worked, "as soon as nobody else runs it"
+
+
+def test_a_trial_that_another_process_runs_does_not_hold_up_the_others(tmp_path, monkeypatch, capsys):
+    first, second = (own.name for own in trials_of(STUDY))
+    lock = RunLock(tmp_path / "runs" / first)
+    (tmp_path / "runs" / first).mkdir(parents=True)
+    lock.__enter__()
+
+    class Clock:
+        @staticmethod
+        def sleep(_):
+            assert state_of(tmp_path / "runs" / second) == "finished", "before it waits for the first"
+            lock.__exit__(None, None, None)
+
+    monkeypatch.setattr(trials, "time", Clock)
+    result = run_study(STUDY, tmp_path, results=False)
+    assert not result.failed
+    assert state_of(tmp_path / "runs" / first) == "finished"
+    assert "elsewhere" not in capsys.readouterr().out
 
 
 @pytest.mark.integration

@@ -15,6 +15,7 @@ from cprl.differences import differences
 from cprl.runs.directory import FILE_NAME as RECIPE
 from cprl.runs.directory import read_recipe
 from cprl.runs.episodes import FILE_NAME, read_episodes, read_table
+from cprl.runs.labelled import small
 from cprl.runs.manifest import refuse_missing, unlist, verify, write_listed
 from cprl.runs.partners import FIELD as FROZEN
 from cprl.runs.weights import DECISIONS, TRANSFORMS
@@ -126,12 +127,5 @@ def _write(table: pa.Table, folder: Path, name: str) -> None:
     kinds = pa.schema(
         [(own.name, pa.float32() if own.type == pa.float64() else own.type) for own in table.schema]
     ).with_metadata(table.schema.metadata)
-    small = ordered.cast(kinds)
-    numbers = [own.name for own in kinds if pa.types.is_integer(own.type) or pa.types.is_floating(own.type)]
-    how: dict[str, Any] = {  # split into bytes, numbers take a quarter less
-        "compression": "zstd",
-        "compression_level": 19,
-        "use_byte_stream_split": numbers,
-        "use_dictionary": [own.name for own in kinds if own.name not in numbers],
-    }
-    write_listed(folder, name, lambda file: pq.write_table(small, file, **how))
+    smaller = ordered.cast(kinds)
+    write_listed(folder, name, lambda file: pq.write_table(smaller, file, **small(smaller)))

@@ -2,7 +2,10 @@
 
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import replace
+from functools import partial
+from io import BytesIO
 from pathlib import Path
+from typing import Any, Final
 
 import pyarrow as pa
 import pyarrow.parquet as pq
@@ -10,6 +13,8 @@ import pyarrow.parquet as pq
 from cprl.measuring import Episode
 from cprl.runs.episodes import as_table
 from cprl.runs.files import write_atomically
+
+_COMPRESSED: Final = {"compression": "zstd", "compression_level": 19}
 
 Label = Mapping[str, str | int]
 """The values of the first columns, by name."""
@@ -42,7 +47,7 @@ def refuse_to_write_over(path: Path) -> None:
 
 
 def write_table(path: Path, table: pa.Table, *, over: bool = False) -> None:
-    """Writes a parquet file atomically, as small as it gets.
+    """Writes a parquet file atomically, in little room.
 
     Args:
         path: the file.
@@ -55,4 +60,26 @@ def write_table(path: Path, table: pa.Table, *, over: bool = False) -> None:
     if not over:
         refuse_to_write_over(path)
     path.parent.mkdir(parents=True, exist_ok=True)
-    write_atomically(path, lambda file: pq.write_table(table, file, compression="zstd", compression_level=19))
+    how = small(table)
+    write_atomically(path, lambda file: pq.write_table(table, file, **how))
+
+
+def small(table: pa.Table) -> dict[str, Any]:
+    """How parquet holds a table in little room: each column by dictionary, split into bytes, or as it is,
+    whichever is smallest."""
+    chosen: dict[str, list[str]] = {"use_dictionary": [], "use_byte_stream_split": []}
+    for field in table.schema:
+        ways: list[dict[str, Any]] = [{"use_dictionary": True}, {"use_dictionary": False}]
+        if pa.types.is_integer(field.type) or pa.types.is_floating(field.type):
+            ways.append({"use_dictionary": False, "use_byte_stream_split": True})
+        best = min(ways, key=partial(_size, table.select([field.name])))
+        for way, columns in chosen.items():
+            if best.get(way):
+                columns.append(field.name)
+    return {**_COMPRESSED, **chosen}
+
+
+def _size(column: pa.Table, how: Mapping[str, Any]) -> int:
+    written = BytesIO()
+    pq.write_table(column, written, compression="zstd", compression_level=3, **how)  # which is quick
+    return written.tell()

@@ -3,7 +3,7 @@
 import json
 from collections.abc import Iterator, Sequence
 from contextlib import ExitStack, contextmanager, suppress
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Final, get_args
 
@@ -187,8 +187,11 @@ class Driver:
     def run(
         self, trials: Sequence[Trial], executor: Executor, *, title: str | None = None
     ) -> tuple[Outcome, ...]:
-        """Runs trials, shows how far they are, and returns those that failed."""
-        failed = []
+        """Runs trials, shows how far they are, and returns those that failed.
+
+        Those that another process runs come last: all others first, then it waits for these.
+        """
+        failed: list[Outcome] = []
         shown = Progress(
             trials,
             runs=self._runs,
@@ -200,18 +203,32 @@ class Driver:
         if self.others:
             shown.say(self.others)
         tasks = tasks_of(trials, runs=self._runs, status=self._out / STATUS, **self._how)
-        outcomes = executor.run(tasks)
-        with shown, ExitStack() as stack:
-            stack.callback(getattr(outcomes, "close", lambda: None))  # stops what it started
+        with shown:
             try:
-                for outcome in outcomes:
-                    shown.ended(outcome)
-                    if outcome.state == "failed":
-                        failed.append(outcome)
+                for waits in (False, True):
+                    ended = _round(executor, [replace(task, waits=waits) for task in tasks], shown)
+                    failed += [outcome for outcome in ended if outcome.state == "failed"]
+                    elsewhere = {outcome.name for outcome in ended if outcome.state == "elsewhere"}
+                    if not elsewhere:
+                        break
+                    tasks = [task for task in tasks if task.name in elsewhere]
             except BaseException as error:
                 error.add_note(_kept(trials, self._runs))
                 raise
         return tuple(failed)
+
+
+def _round(executor: Executor, tasks: Sequence[Task], shown: Progress) -> list[Outcome]:
+    """Runs tasks once, and shows how those ended that are not run elsewhere."""
+    ended = []
+    outcomes = executor.run(tasks)
+    with ExitStack() as stack:
+        stack.callback(getattr(outcomes, "close", lambda: None))  # stops what it started
+        for outcome in outcomes:
+            if outcome.state != "elsewhere":
+                shown.ended(outcome)
+            ended.append(outcome)
+    return ended
 
 
 @contextmanager
@@ -264,7 +281,7 @@ def _others(out: Path) -> str:
     who = f", process {holder['pid']} on {holder.get('host')}" if "pid" in holder else ""
     return (
         f"{out} is run by somebody else too{who}, or was when its host went down: each trial is run by "
-        "whoever begins it first, the other waits for it"
+        "whoever begins it first, the other goes on with the rest"
     )
 
 

@@ -109,6 +109,8 @@ class Task:
     """Whether the finished run keeps the state of its training, so that a longer trial can go on from it."""
     command: tuple[str, ...] = ("cprl", "sweep")
     """The command line of the study, which the recipe keeps."""
+    waits: bool = True
+    """Whether it waits while another process runs the trial, and takes it over where that one has died."""
 
     @property
     def directory(self) -> Path:
@@ -120,7 +122,8 @@ class Outcome(NamedTuple):
     """How a trial ended."""
 
     name: str
-    state: Literal["finished", "failed"]
+    state: Literal["finished", "failed", "elsewhere"]
+    """"elsewhere" if another process runs it, and the task does not wait."""
     reason: str = ""
     """Of a failure: the error in a line."""
     worked: bool = False
@@ -159,8 +162,8 @@ def run_task(task: Task) -> Outcome:
     """Makes a trial a finished one; may be called any number of times, anywhere.
 
     What is there is kept: a finished trial is left as it is, an unfinished one is resumed, and one that is
-    not there goes on from a shorter one if that can be, see `cprl.studies.extending`. While another process
-    runs it, this one waits, and takes it over where that one has died.
+    not there goes on from a shorter one if that can be, see `cprl.studies.extending`. For what happens while
+    another process runs it see `Task.waits`.
 
     What it prints is in `log.txt` beside its status, and why it failed in `failed.txt`.
     """
@@ -173,16 +176,18 @@ def run_task(task: Task) -> Outcome:
     status.folder.mkdir(parents=True, exist_ok=True)
     try:
         with _printing_into(status.log):
-            _run(task, run, status)
+            ended = _run(task, run, status)
     except Exception as error:
         status.fail(f"{type(error).__name__}: {error}", traceback.format_exc())
         return Outcome(task.name, "failed", f"{type(error).__name__}: {error}", True)
+    if not ended:
+        return Outcome(task.name, "elsewhere")
     status.tidy_up()
     return Outcome(task.name, "finished", worked=True)
 
 
-def _run(task: Task, run: Path, status: Status) -> None:
-    """Runs or resumes a trial as soon as nobody else does."""
+def _run(task: Task, run: Path, status: Status) -> bool:
+    """Runs or resumes a trial as soon as nobody else does; False if it does not wait for that."""
     from cprl.running import run as run_experiment
 
     silent = is_silent(status, PATIENCE_S)
@@ -214,7 +219,10 @@ def _run(task: Task, run: Path, status: Status) -> None:
         except (RunLockedError, FileExistsError):  # somebody else began it
             if state_of(run) == "missing" and not (run / LOCK).exists():
                 raise
+            if not task.waits:
+                return False
             time.sleep(_POLL_S)
+    return True
 
 
 def _clear(run: Path, *, take_over: bool) -> None:

@@ -265,7 +265,7 @@ def _end(table: PayoffTable, start: Values) -> Values | None:
     for _ in range(_STEPS):
         if is_at_rest(solver.y):
             return shares_of(solver.y)
-        solver.step()
         if solver.status != "running":
             return None
+        solver.step()
     return None

@@ -87,13 +87,18 @@ def planned_harvest(
     return harvests(Batch(game, episodes, seed=arguments.seed(seed)), lead)
 
 
-@cache
 def best_planner(game: Game) -> Planner:
     """The candidate that harvests most in 10 episodes, in other worlds than those of `planned_harvest`.
 
     Raises:
         ValueError: for what `planned_harvest` refuses.
     """
+    arguments.object_of("game", game, Game, "a cprl.Game")
+    return _best_planner(game)
+
+
+@cache
+def _best_planner(game: Game) -> Planner:
     found = [planned_harvest(game, own, episodes=10, seed=_SEED_OF_CHOICE).mean() for own in CANDIDATES]
     return CANDIDATES[int(np.argmax(found))]
 
