@@ -103,7 +103,7 @@ def test_a_viewer_that_never_answers_harms_neither_the_training_nor_the_file(
     unwatched = course()
     address, started = stalling(reads), time.monotonic()
     assert course(tmp_path, live=f"connect {address}") == unwatched
-    assert time.monotonic() - started < IN_ALL_S
+    assert time.monotonic() - started < 10
     (told,) = [str(own.message) for own in recwarn if own.category is RuntimeWarning]
     assert told.startswith(f"the Rerun viewer at {address}")
     assert "the run continues without it" in told
@@ -134,9 +134,7 @@ if {closes}: logger.close()
     return float(ended.stdout.splitlines()[-1]), ended.stderr
 
 
-BUSY_S = 10.0
-"""What a busy machine may add; without deadlines a process would hang for good."""
-IN_ALL_S = deadline.CONNECT_S + deadline.CLOSE_S + deadline.STALL_S + BUSY_S
+IN_ALL_S = deadline.CONNECT_S + deadline.CLOSE_S + deadline.STALL_S + 1
 """The most that a viewer may cost a process."""
 
 

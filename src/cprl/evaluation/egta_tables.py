@@ -53,7 +53,7 @@ def _pairs(game: EmpiricalGame) -> Table:
         table.add_column(name, justify="right")
     pairs = np.array([game.table([place]).pairs for place in range(len(game.payoffs))])
     for place, name in enumerate(game.names):
-        table.add_row(name, *(str(_mean(pairs[:, place, other])) for other in range(len(game.names))))
+        table.add_row(name, *(str(estimate(pairs[:, place, other])) for other in range(len(game.names))))
     return table
 
 
@@ -64,7 +64,7 @@ def _compositions(game: EmpiricalGame) -> Table:
     for name in game.names:
         table.add_column(name, justify="right")
     for row, counts in enumerate(compositions(game.agents, len(game.names)).tolist()):
-        own = (str(_mean(game.payoffs[:, row, run])) if count else "" for run, count in enumerate(counts))
+        own = (str(estimate(game.payoffs[:, row, run])) if count else "" for run, count in enumerate(counts))
         table.add_row(composition_text(counts, game.names), *own)
     return table
 
@@ -118,10 +118,6 @@ def mixture_text(mixture: Values, names: Sequence[str]) -> str:
     """A mixture in words, e.g. "dqn 0.75, ppo 0.25"; one strategy by its name alone."""
     told = [(name, share) for name, share in zip(names, mixture, strict=True) if share >= _LEAST]
     return told[0][0] if len(told) == 1 else ", ".join(f"{name} {share:.2f}" for name, share in told)
-
-
-def _mean(values: Values) -> Estimate:
-    return estimate(values)
 
 
 def _share(own: Estimate) -> str:
