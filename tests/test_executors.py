@@ -20,7 +20,7 @@ from cprl.learners.buffer.storage import storage_bytes
 from cprl.population import Learning, Scripted
 from cprl.runs.checkpoints import Checkpointer
 from cprl.studies import InProcess, Processes, Ray, run_study
-from cprl.studies.execution import STATUS
+from cprl.studies.directory import STATUS
 from cprl.studies.executors import memory, on_ray, processes
 from cprl.studies.executors.memory import BASE_BYTES, MemoryNeeds, estimated_bytes
 from cprl.studies.status import Status

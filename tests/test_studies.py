@@ -20,10 +20,9 @@ from cprl.experiment import MOST_SEED, Experiment
 from cprl.learners.settings import RolloutSettings
 from cprl.population import Frozen, Learning, Scripted, Team, stored_of
 from cprl.studies import Integers, LogUniform, Uniform
-from cprl.studies.conditions import FORMAT, Condition
+from cprl.studies.conditions import FORMAT, Condition, apart
 from cprl.studies.factors import drawn
 from cprl.studies.paths import changed, values_at
-from cprl.studies.study import _apart
 from cprl.studies.trials import trials_of
 
 
@@ -274,7 +273,7 @@ def test_conditions_that_words_do_not_tell_apart_are_numbered():
 
 def test_a_number_that_another_condition_has_in_its_name_is_left_out():
     names = ("beam", "beam #2", "beam", "beam")
-    found = _apart(Condition(replace(TINY, episodes=1 + nth), name=own) for nth, own in enumerate(names))
+    found = apart(Condition(replace(TINY, episodes=1 + nth), name=own) for nth, own in enumerate(names))
     assert [own.name for own in found] == ["beam", "beam #2", "beam #3", "beam #4"]
 
 

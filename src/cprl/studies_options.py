@@ -18,7 +18,8 @@ from cprl.measuring.statistics import Interval
 from cprl.output import console, printed, say
 from cprl.runs.directory import without_directories, without_options
 from cprl.shipped import command_of, named_command
-from cprl.studies.execution import RUNS, STATUS, StudyResult, directory_of, run_study, trials_with
+from cprl.studies.directory import RUNS, STATUS, directory_of
+from cprl.studies.execution import StudyResult, run_study, trials_with
 from cprl.studies.executors import Executor, InProcess, Processes, Ray
 from cprl.studies.overview import Overview, label_of
 from cprl.studies.points import Search

@@ -5,14 +5,11 @@ from typing import Any, Final
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
 
 from cprl.institutions import Institution
 from cprl.measuring import institutional, social
 from cprl.measuring.episode import Episode
-
-Array = NDArray[Any]
-Turns = dict[str, Array]
+from cprl.measuring.turns import Array, Turns
 
 _AS_COUNTED: Final = ("shots", "tagged", "tagged_by")
 """Fields of an episode that are copied from the tracker's state unchanged."""

@@ -1,7 +1,7 @@
 """Collects whole episodes from the batches of a collector."""
 
 from collections.abc import Iterator, Mapping, Sequence
-from typing import Any, Final
+from typing import Final
 
 import numpy as np
 import torch
@@ -9,13 +9,14 @@ from numpy.typing import NDArray
 from tensordict import TensorDictBase
 from torch import Tensor
 
-from cprl import arguments, keys
+from cprl import arguments
 from cprl.institutions import Institution
 from cprl.measuring import institutional
-from cprl.measuring.ended import Array, Turns, episodes_of
+from cprl.measuring.ended import episodes_of
 from cprl.measuring.episode import Episode
 from cprl.measuring.institutions import check_groups, groups_of
 from cprl.measuring.reported import OF_INSTITUTIONS, OPTIONAL, reported_in
+from cprl.measuring.turns import Array, TurnReader, Turns
 from cprl.memory import check_memory
 
 __all__ = ["Episode", "EpisodeTracker"]
@@ -88,11 +89,9 @@ class EpisodeTracker:
             check_groups(groups, agents)
         self._widths: institutional.Widths = {}
         self._every_world = np.arange(worlds)
-        self._checked: torch.Size | None = None
         self._episode = np.zeros(worlds, np.int64)
         self._has_institutions = False
-        self._of_agents: tuple[str, ...] = ()
-        self._of_worlds: tuple[str, ...] = ()
+        self._reader = TurnReader((), worlds=worlds, agents=agents, widths={})
         self._histories: dict[str, Array] = {}
         self._running: dict[str, Array] = {}
 
@@ -105,14 +104,7 @@ class EpisodeTracker:
         if self.reported is None:
             arguments.object_of("tensordict", tensordict, TensorDictBase, "a TensorDict with the next turns")
             self._begin(reported_in(tensordict), institutional.widths_in(tensordict))
-            if tensordict.get(keys.DONE, None) is None:
-                raise self._missing(tensordict)
-        try:
-            turns, size = self._read(tensordict), tensordict.batch_size
-        except KeyError as error:
-            raise self._missing(tensordict) from error
-        if size != self._checked:
-            self._check(turns, size)
+        turns, size = self._reader.read(tensordict), tensordict.batch_size
         if len(size) == 1:
             return self._add_turn(turns)
         episodes = []
@@ -203,60 +195,13 @@ class EpisodeTracker:
             **institutional.arrays(reported, worlds, agents, widths),
         }
         self._has_institutions = not set(reported).isdisjoint(OF_INSTITUTIONS)
-        of_worlds = tuple(name for name in reported if name in ("stock", "in_force"))
-        self._of_agents = ("reward", *(name for name in reported if name not in ("in_play", *of_worlds)))
-        self._of_worlds = (*of_worlds, keys.TERMINATED, keys.DONE)
+        self._reader = TurnReader(reported, worlds=worlds, agents=agents, widths=widths)
 
     def _capacity(self, steps: int) -> int:
         """The initial capacity of histories, in steps, at least `steps`."""
         if self.max_steps is None:
             return max(steps, _FIRST_CAPACITY_STEPS)
         return max(steps, min(self.max_steps, _LARGEST_FIRST_CAPACITY_STEPS))
-
-    def _read(self, tensordict: TensorDictBase) -> Turns:
-        """All entries as arrays, [B, ...] or [B, T, ...], without a copy if the batch is on the CPU.
-
-        "had_ended", the worlds that had ended before the turn, is included only if a world has ended now.
-        """
-        following, entry = keys.entry(tensordict, "next"), keys.entry
-        agents = entry(following, keys.AGENTS)
-        tensors = {name: entry(agents, name) for name in self._of_agents}
-        tensors |= {name: entry(following, name) for name in self._of_worlds}
-        if "in_play" in self._histories:
-            tensors["in_play"] = entry(entry(tensordict, keys.AGENTS), "in_play")
-        turns = {name: tensor.numpy(force=True) for name, tensor in tensors.items()}
-        if np.count_nonzero(turns["done"]):  # a tenth of the time that `any` takes on so few
-            turns["had_ended"] = entry(tensordict, keys.DONE).numpy(force=True)
-            if tensordict.get(keys.BALLOTS_DUE, None) is not None:
-                turns["decision"] = entry(entry(tensordict, keys.AGENTS), "decision").numpy(force=True)
-        return turns
-
-    def _missing(self, tensordict: TensorDictBase) -> ValueError:
-        """The error for a batch that lacks an entry."""
-        needed: dict[Any, str] = {keys.DONE: "done"}
-        needed |= {("next", name): f"next, {name}" for name in self._of_worlds}
-        needed |= {("next", keys.AGENTS, name): f"next, agents, {name}" for name in self._of_agents}
-        if "in_play" in self._histories:
-            needed[keys.IN_PLAY] = "agents, in_play"
-        missing = [f"({name})" for key, name in needed.items() if tensordict.get(key, None) is None]
-        return ValueError(
-            f"the batch lacks {', '.join(missing)}; allowed: batches with rewards, done and terminated, "
-            "and the optional entries of the first batch"
-        )
-
-    def _check(self, turns: Turns, size: torch.Size) -> None:
-        """Checks the shapes of a batch, once per batch size, because checking takes longer than counting."""
-        if len(size) not in (1, 2) or size[0] != self.worlds:
-            raise ValueError(f"the batch is {list(size)}; allowed: [{self.worlds}] or [{self.worlds}, T]")
-        one, agents = (1,), (self.agents,)
-        own: dict[str, tuple[int, ...]] = dict.fromkeys(("harvest", "fired", "in_play", "decision"), agents)
-        own |= {"reward": agents + one, "hit_by": agents * 2, "tagged_by": agents * 2}
-        own |= institutional.shapes(self.agents, self._widths)
-        for name, array in turns.items():
-            allowed = (*size, *own.get(name, one))
-            if array.shape != allowed:
-                raise ValueError(f'"{name}" of the batch is {list(array.shape)}; allowed: {list(allowed)}')
-        self._checked = size
 
     def _add_turn(self, turn: Turns) -> list[Episode]:
         self._count(turn)

@@ -8,19 +8,18 @@ the degrees of freedom of B. L. Welch, "The generalization of 'Student's' proble
 population variances are involved" (1947).
 """
 
-import warnings
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any, Final, Literal, get_args
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from cprl import arguments
 from cprl.checks import shown
+from cprl.measuring.intervals import Values, bootstrap_interval, t_interval
 from cprl.memory import check_memory
 
-Values = NDArray[np.float64]
 Statistic = Literal["mean", "iqm"]
 Interval = Literal["t", "bca"]
 """How an interval is computed: "t", of means alone, by Student's t, right for few replicas if their values
@@ -147,9 +146,9 @@ def estimate(
         return sum(of_one(part, axis=axis) for part in parts) / len(parts)
 
     if interval == "t":
-        low, high = _t_interval(samples, [1 / len(samples)] * len(samples), confidence)
+        low, high = t_interval(samples, [1 / len(samples)] * len(samples), confidence)
     else:
-        low, high = _interval(samples, overall, confidence, resamples, seed)
+        low, high = bootstrap_interval(samples, overall, confidence, resamples, seed)
     replicas = sum(len(sample) for sample in samples)
     return Estimate(value=float(overall(*samples)), low=low, high=high, replicas=replicas)
 
@@ -195,9 +194,9 @@ def difference(
         return own.mean(axis) - other.mean(axis)
 
     if interval == "t":
-        low, high = _t_interval(samples, [1.0, -1.0], confidence)
+        low, high = t_interval(samples, [1.0, -1.0], confidence)
     else:
-        low, high = _interval(samples, overall, confidence, resamples, seed)
+        low, high = bootstrap_interval(samples, overall, confidence, resamples, seed)
     value = float(overall(samples[0], samples[1]))
     return Estimate(value=value, low=low, high=high, replicas=sum(map(len, samples)))
 
@@ -233,56 +232,6 @@ def curve_interval(curves: ArrayLike, *, confidence: float = CONFIDENCE) -> tupl
         error = np.sqrt(squares.sum(0) / (replicas - 1) / replicas)
     reach = stats.t.ppf((1 + confidence) / 2, replicas - 1) * error
     return middle, middle - reach, middle + reach
-
-
-def _interval(
-    samples: Sequence[Values], overall: Callable[..., Any], confidence: float, resamples: int, seed: int
-) -> tuple[float, float]:
-    """The bias-corrected and accelerated (BCa) interval where it is defined, else the percentile interval."""
-    from scipy import stats
-
-    if any(len(sample) < 2 for sample in samples):
-        return float("nan"), float("nan")
-    if all(np.ptp(sample) == 0 for sample in samples):
-        same = float(overall(*samples))
-        return same, same
-    methods: tuple[Literal["BCa", "percentile"], ...] = ("BCa", "percentile")
-    for method in methods if len(samples) == 1 else methods[1:]:
-        with warnings.catch_warnings():  # where it is undefined, which is seen from the outcome
-            warnings.simplefilter("ignore", RuntimeWarning)
-            found = stats.bootstrap(
-                samples,
-                overall,
-                n_resamples=resamples,
-                confidence_level=confidence,
-                method=method,
-                rng=np.random.default_rng(seed),
-                vectorized=True,
-            ).confidence_interval
-        if np.isfinite([found.low, found.high]).all():
-            return float(found.low), float(found.high)
-    return float("nan"), float("nan")
-
-
-def _t_interval(
-    samples: Sequence[Values], weights: Sequence[float], confidence: float
-) -> tuple[float, float]:
-    """The interval of a weighted sum of means by Student's t, with the degrees of freedom of Welch."""
-    from scipy import stats
-
-    if any(len(sample) < 2 for sample in samples):
-        return float("nan"), float("nan")
-    middle = sum(weight * float(own.mean()) for weight, own in zip(weights, samples, strict=True))
-    parts = [
-        weight**2 * float(own.var(ddof=1)) / len(own) for weight, own in zip(weights, samples, strict=True)
-    ]
-    if sum(parts) == 0:
-        return middle, middle
-    freedom = sum(parts) ** 2 / sum(
-        part**2 / (len(own) - 1) for part, own in zip(parts, samples, strict=True)
-    )
-    reach = float(stats.t.ppf((1 + confidence) / 2, freedom)) * sum(parts) ** 0.5
-    return middle - reach, middle + reach
 
 
 def _bootstrap(confidence: float, resamples: int, seed: int, numbers: int) -> tuple[int, int]:

@@ -13,6 +13,8 @@ Modules, in the order in which one reads them:
     overview     how far every trial is
     progress     the same in the terminal
     live         the same in the Rerun viewer
+    directory    a study's directory: what it is, its runs, how far its trials are
+    driver       runs trials, and shows how far they are
     execution    run_study: every trial of a study
     points       Search: values of factors at which a metric is best
     search       run_search: points that Optuna proposes, each run as a condition
@@ -22,7 +24,8 @@ Modules, in the order in which one reads them:
     results      write_results: table, summary and figures of a study
 """
 
-from cprl.studies.execution import StudyResult, read_study, run_study
+from cprl.studies.directory import read_study
+from cprl.studies.execution import StudyResult, run_study
 from cprl.studies.executors import InProcess, Processes, Ray
 from cprl.studies.factors import Integers, LogUniform, Uniform
 from cprl.studies.points import Search

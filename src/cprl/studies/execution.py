@@ -1,30 +1,20 @@
 """run_study: every trial of a study, wherever an executor runs it."""
 
-import json
-from collections.abc import Iterator, Sequence
-from contextlib import ExitStack, contextmanager, suppress
-from dataclasses import dataclass, replace
+from collections.abc import Sequence
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Final, get_args
+from typing import Any, get_args
 
 from cprl.arguments import choice, integer, object_of, path, refusal, switch, texts
 from cprl.measuring.statistics import Interval
-from cprl.runs.directory import FILE_NAME as RECIPE
-from cprl.runs.files import read_json, write_json
-from cprl.runs.lock import FILE_NAME as LOCK
-from cprl.runs.lock import RunLock, RunLockedError
+from cprl.studies.directory import RUNS, directory_of
+from cprl.studies.driver import as_driver, check_executor
 from cprl.studies.executors import Executor, InProcess
-from cprl.studies.live import LiveStudy, check_live
 from cprl.studies.naming import levels_in
-from cprl.studies.progress import Progress
 from cprl.studies.study import Study
 from cprl.studies.tables.comparing import LAST
 from cprl.studies.tables.table import WINDOW, StudyTable
-from cprl.studies.trials import Outcome, Task, Trial, task_of, trials_of
-
-FILE_NAME: Final = "study.json"
-RUNS, STATUS = "runs", "status"
-"""Folders of a study's directory."""
+from cprl.studies.trials import Outcome, Trial, trials_of
 
 
 @dataclass(frozen=True, eq=False)
@@ -141,177 +131,3 @@ def check_comparison(last: int, interval: str) -> None:
     """Raises a ValueError for episodes that the table of a study does not tell apart, and for no interval."""
     integer("last", last, WINDOW, allowed=f"an integer >= {WINDOW}, the episodes of a window of the table")
     choice("interval", interval, get_args(Interval))
-
-
-def directory_of(study: Study, out: Path | str | None) -> Path:
-    """The directory of a study, by default `studies/<name>`.
-
-    Raises:
-        ValueError: for a file, and for the directory of a run.
-    """
-    found = Path("studies") / study.name if out is None else path("out", out)
-    allowed = "a new directory, or that of an earlier study"
-    if found.exists() and not found.is_dir():
-        raise ValueError(f"out is {found}, a file; allowed: {allowed}")
-    if (found / RECIPE).exists():
-        raise ValueError(f"out is {found}, the directory of a run; allowed: {allowed}")
-    return found
-
-
-def check_executor(on: object) -> None:
-    """Raises a ValueError for what runs no trials."""
-    if on is not None and (isinstance(on, type) or not isinstance(on, Executor)):
-        raise refusal("on", on, "InProcess(), Processes(jobs), Ray(), another Executor, or None")
-
-
-class Driver:
-    """What runs trials of a study whose directory is there; made by `as_driver`."""
-
-    def __init__(
-        self,
-        out: Path,
-        runs: Path,
-        *,
-        allow: Sequence[str],
-        progress: bool,
-        title: str,
-        keep_checkpoints: bool = False,
-    ) -> None:
-        self._out, self._runs = out, runs
-        self._how: dict[str, Any] = {"allow": allow, "keep_checkpoint": keep_checkpoints}
-        self._progress, self._title = progress, title
-        self.viewer: LiveStudy | None = None
-        self.others = ""
-        """Who runs the study too, in a sentence."""
-
-    def run(
-        self, trials: Sequence[Trial], executor: Executor, *, title: str | None = None
-    ) -> tuple[Outcome, ...]:
-        """Runs trials, shows how far they are, and returns those that failed.
-
-        Those that another process runs come last: all others first, then it waits for these.
-        """
-        failed: list[Outcome] = []
-        shown = Progress(
-            trials,
-            runs=self._runs,
-            status=self._out / STATUS,
-            title=title or self._title,
-            is_shown=self._progress,
-            watchers=[] if self.viewer is None else [self.viewer.show],
-        )
-        if self.others:
-            shown.say(self.others)
-        tasks = tasks_of(trials, runs=self._runs, status=self._out / STATUS, **self._how)
-        with shown:
-            try:
-                for waits in (False, True):
-                    ended = _round(executor, [replace(task, waits=waits) for task in tasks], shown)
-                    failed += [outcome for outcome in ended if outcome.state == "failed"]
-                    elsewhere = {outcome.name for outcome in ended if outcome.state == "elsewhere"}
-                    if not elsewhere:
-                        break
-                    tasks = [task for task in tasks if task.name in elsewhere]
-            except BaseException as error:
-                error.add_note(_kept(trials, self._runs))
-                raise
-        return tuple(failed)
-
-
-def _round(executor: Executor, tasks: Sequence[Task], shown: Progress) -> list[Outcome]:
-    """Runs tasks once, and shows how those ended that are not run elsewhere."""
-    ended = []
-    outcomes = executor.run(tasks)
-    with ExitStack() as stack:
-        stack.callback(getattr(outcomes, "close", lambda: None))  # stops what it started
-        for outcome in outcomes:
-            if outcome.state != "elsewhere":
-                shown.ended(outcome)
-            ended.append(outcome)
-    return ended
-
-
-@contextmanager
-def as_driver(
-    study: Study,
-    trials: Sequence[Trial],
-    out: Path,
-    runs: Path,
-    *,
-    allow: Sequence[str],
-    progress: bool,
-    watch: str,
-    keep_checkpoints: bool = False,
-) -> Iterator[Driver]:
-    """Checks all that is asked for, then makes a study's directory.
-
-    Raises:
-        ValueError: for whatever does not fit, before anything is written.
-    """
-    switch("progress", progress)
-    texts("allow", allow)
-    check_live(watch)
-    tasks_of(trials, runs=runs, status=out / STATUS, allow=allow)
-    driver = Driver(
-        out, runs, allow=allow, progress=progress, title=study.name, keep_checkpoints=keep_checkpoints
-    )
-    runs.mkdir(parents=True, exist_ok=True)
-    out.mkdir(parents=True, exist_ok=True)
-    write_study(study, out)
-    with ExitStack() as stack:
-        try:
-            stack.enter_context(RunLock(out))
-        except RunLockedError:
-            driver.others = _others(out)
-        if watch != "off":
-            driver.viewer = stack.enter_context(LiveStudy(watch, runs=runs, title=study.name))
-        yield driver
-
-
-def tasks_of(trials: Sequence[Trial], *, runs: Path, status: Path, **how: Any) -> list[Task]:
-    """The task of each trial; for other arguments see `task_of`."""
-    return [task_of(trial, runs=runs, status=status, **how) for trial in trials]
-
-
-def _others(out: Path) -> str:
-    """Who runs a study too."""
-    holder = {}
-    with suppress(OSError, ValueError):
-        holder = json.loads((out / LOCK).read_bytes())
-    who = f", process {holder['pid']} on {holder.get('host')}" if "pid" in holder else ""
-    return (
-        f"{out} is run by somebody else too{who}, or was when its host went down: each trial is run by "
-        "whoever begins it first, the other goes on with the rest"
-    )
-
-
-def _kept(trials: Sequence[Trial], runs: Path) -> str:
-    states = [trial.state(runs) for trial in trials]
-    return (
-        f"{states.count('finished')} of {len(trials)} trials are finished and {states.count('unfinished')} "
-        f"begun; all of it is kept in {runs}, and the same study continues from there"
-    )
-
-
-def write_study(study: Study, out: Path) -> None:
-    """Writes what a study is into its directory."""
-    write_json(out / FILE_NAME, study.to_config(out))
-
-
-def read_study(out: Path | str, *, allow: Sequence[str] = ()) -> Study:
-    """The study of a directory.
-
-    Args:
-        out: the directory.
-        allow: the user's own code, "module:Class", that it may import.
-
-    Raises:
-        ValueError: where there is none, and for what is not allowed.
-    """
-    out = path("out", out)
-    texts("allow", allow)
-    try:
-        table = read_json(out / FILE_NAME)
-    except (OSError, ValueError) as error:
-        raise ValueError(f"{out / FILE_NAME} is not the file of a study: {error!r}") from error
-    return Study.from_config(table, allow=allow, directory=out)

@@ -17,16 +17,9 @@ from cprl.arguments import object_of, switch
 from cprl.arguments import path as path_of
 from cprl.measuring.statistics import Interval
 from cprl.runs.files import write_json
-from cprl.studies.execution import (
-    RUNS,
-    Driver,
-    as_driver,
-    check_comparison,
-    check_executor,
-    directory_of,
-    results_of,
-    write_study,
-)
+from cprl.studies.directory import RUNS, directory_of, write_study
+from cprl.studies.driver import Driver, as_driver, check_executor
+from cprl.studies.execution import check_comparison, results_of
 from cprl.studies.executors import Executor, InProcess
 from cprl.studies.factors import Distribution, Integers, LogUniform
 from cprl.studies.points import Point, Search, labels, value_of

@@ -3,7 +3,7 @@
 import hashlib
 import os
 from collections.abc import Iterable, Iterator, Mapping
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from functools import cached_property, partial
 from pathlib import Path
 from typing import Any, Final
@@ -13,7 +13,7 @@ from cprl.checks import DIRECTORY_NAME, check_nesting, checked, instance, shown
 from cprl.experiment import MOST_SEED, Experiment, frozen_from, frozen_relative_to
 from cprl.population import stored_of
 from cprl.runs import formats
-from cprl.studies.conditions import Condition
+from cprl.studies.conditions import Condition, apart, experiment_at
 from cprl.studies.factors import (
     MOST_CONDITIONS,
     Factor,
@@ -26,8 +26,7 @@ from cprl.studies.factors import (
     factor_to_config,
     grid,
 )
-from cprl.studies.naming import named, short_names, unlike
-from cprl.studies.paths import changed
+from cprl.studies.naming import named, short_names
 
 FORMAT: Final = formats.STUDY
 """Of `Study.to_config`."""
@@ -121,7 +120,7 @@ class Study:
         """Every condition, in order, each once."""
         by_sum: dict[str, Condition] = {}
         for name, levels in self._levels():
-            changed_to = _of_level(self.experiment, levels)
+            changed_to = experiment_at(self.experiment, levels)
             own = Condition(changed_to, {factor: at.value for factor, at in levels.items()}, name)
             if (other := by_sum.setdefault(own.checksum, own)) is not own and self.draws is None:
                 raise ValueError(f"conditions {other.name!r} and {name!r} are equal; allowed: each once")
@@ -131,7 +130,7 @@ class Study:
             raise ValueError(
                 f"draws is {self.draws}; the factors have no more than {len(by_sum)} combinations that differ"
             )
-        return _apart(by_sum.values())
+        return apart(by_sum.values())
 
     @cached_property
     def blocks(self) -> tuple["Block", ...]:
@@ -277,35 +276,12 @@ UNCHANGED: Final = "unchanged"
 """The one condition of a study without factors."""
 
 
-def _apart(conditions: Iterable[Condition]) -> tuple[Condition, ...]:
-    """Conditions with a number after their name where others have the same, e.g. of unlike agents."""
-    conditions = tuple(conditions)
-    taken = {own.name for own in conditions}
-    found: dict[str, Condition] = {}
-    for own in conditions:
-        name = unlike(own.name, taken) if own.name in found else own.name
-        taken.add(name)
-        found[name] = own if name == own.name else replace(own, name=name)
-    return tuple(found.values())
-
-
 def _no_change(run: str) -> str:
     return run
 
 
 def _joined(directory: str, run: str) -> str:
     return os.path.relpath(os.path.join(directory, run))
-
-
-def _of_level(experiment: Experiment, levels: Mapping[str, Level]) -> Experiment:
-    changes = {path: value for own in levels.values() for path, value in own.changes.items()}
-    twice = sum(len(own.changes) for own in levels.values()) - len(changes)
-    if twice:
-        raise ValueError(f"two factors change the same field, of {', '.join(changes)}; allowed: one each")
-    refused = [path for path in changes if path in ("seed", "replicas", "name")]
-    if refused:
-        raise ValueError(f"a factor is {refused[0]}, which the study itself decides; allowed: other fields")
-    return changed(experiment, changes) if changes else experiment
 
 
 def _checked_conditions(conditions: object) -> dict[str, dict[str, Any]]:
