@@ -1,4 +1,4 @@
-"""A package imports only from packages above it."""
+"""A package imports only from packages above it, and a module has one subject."""
 
 import ast
 from pathlib import Path
@@ -110,6 +110,11 @@ def test_a_package_imports_only_from_packages_above_it(path):
 )
 def test_the_gate_closes(line):
     assert wrong_imports("commons", line)
+
+
+def test_a_module_has_300_lines_at_most():
+    lines = {str(path.relative_to(SOURCE)): len(path.read_text().splitlines()) for path in MODULES}
+    assert {name: count for name, count in lines.items() if count > 300} == {}
 
 
 def test_the_game_knows_nothing_of_torch():

@@ -12,9 +12,9 @@ import pytest
 
 from cprl.commons.batch import Batch, turn_of
 from cprl.config import from_config
-from cprl.experiment import FORMAT, recipe_config
 from cprl.institutions import Boundaries, GraduatedSanctions, Sanctioner
 from cprl.runs.old_recipes import upgraded_game
+from cprl.runs.recipes import FORMAT, recipe_config
 
 CASES = json.loads((Path(__file__).parent / "traces" / "old_rules.json").read_text())
 OUTPUTS = ("observation", "harvest", "in_play", "fired", "hit_by", "tagged_by", "stock", "regrown", "done")

@@ -12,7 +12,6 @@ from cprl.checks import (
     DIRECTORY_NAME,
     Check,
     check_fields,
-    check_nesting,
     checked,
     count,
     instance,
@@ -41,12 +40,10 @@ from cprl.population import (
 )
 from cprl.preferences.values import check_preference
 from cprl.runs import formats
-from cprl.runs.old_recipes import experiment_config, has_old_rules, upgraded_game
+from cprl.runs.recipes import FORMAT, is_old, recipe_config
 
 LoggerName = Literal["csv", "tensorboard", "wandb"]
 LOGGERS: Final[tuple[LoggerName, ...]] = get_args(LoggerName)
-FORMAT: Final = formats.RECIPE
-"""Of `recipe.json`; those of before, which had "arguments", are read too."""
 MOST_SEED: Final = 2**64 - 2
 """Evaluation plays worlds of the next seed."""
 
@@ -150,42 +147,13 @@ class Experiment:
             experiment = cls.from_config(recipe_config(recipe), allow=allow)
         except ValueError as error:
             raise ValueError(f"{error}{formats.written_by_another(recipe)}") from error
-        return experiment if directory is None or _is_old(recipe) else frozen_from(experiment, directory)
+        return experiment if directory is None or is_old(recipe) else frozen_from(experiment, directory)
 
     def __eq__(self, other: object) -> bool:
         return self.to_config() == other.to_config() if isinstance(other, Experiment) else NotImplemented
 
     def __hash__(self) -> int:
         return hash((self.name, self.episodes, self.replicas, self.seed))
-
-
-def recipe_config(recipe: Mapping[str, Any]) -> dict[str, Any]:
-    """The experiment of a recipe, of today's format or of any before, as `Experiment.to_config` gives it.
-
-    Raises:
-        ValueError: for another format, and for one of before that lacks what each had.
-    """
-    checked("the recipe", recipe, instance(Mapping, "a table"))
-    check_nesting(recipe, "the recipe")
-    if not _is_old(recipe):
-        formats.refuse_newer("the recipe", recipe, FORMAT)
-        if recipe.get("format") != FORMAT or not isinstance(recipe.get("experiment"), Mapping):
-            raise ValueError(
-                f"the recipe has the format {shown(recipe.get('format'))}; allowed: {FORMAT}, with a table "
-                '"experiment"'
-            )
-        experiment = dict(recipe["experiment"])
-        if has_old_rules(experiment.get("game")):
-            experiment["game"] = upgraded_game(experiment["game"])
-        return experiment
-    try:
-        table = experiment_config(recipe)
-        for agent in table["agents"]:
-            if agent["kind"] == "Frozen":  # absolute at that time
-                agent["run"] = os.path.relpath(agent["run"])
-    except (KeyError, TypeError, AttributeError, ValueError) as error:
-        raise ValueError(f"the recipe holds no game and agents of cprl: {error!r}") from error
-    return table
 
 
 def frozen_relative_to(experiment: Experiment, directory: str | Path) -> Experiment:
@@ -201,10 +169,6 @@ def frozen_from(experiment: Experiment, directory: str | Path) -> Experiment:
 def changes(before: Experiment, now: Experiment) -> list[str]:
     """How two experiments differ, a sentence for each place."""
     return differences(before.to_config(), now.to_config(), "experiment", Experiment)
-
-
-def _is_old(recipe: Mapping[str, Any]) -> bool:
-    return "arguments" in recipe and "format" not in recipe
 
 
 def _with_runs(experiment: Experiment, moved: Callable[[str], str]) -> Experiment:

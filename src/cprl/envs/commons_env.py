@@ -22,13 +22,6 @@ from cprl.envs.recurrent_states import begin_states
 from cprl.envs.rendering import images
 
 _AGENT_ENTRIES = ("observation", "harvest", "in_play", "fired", "hit_by", "tagged_by")
-_TORCH_TYPES = {
-    np.uint8: torch.uint8,
-    np.float32: torch.float32,
-    np.bool_: torch.bool,
-    np.int64: torch.int64,
-    np.int32: torch.int32,
-}
 _WHOLE_NUMBERS = (torch.int64, torch.int32, torch.int16, torch.int8, torch.uint8)
 """The dtypes of actions that convert to int64 without a change of any number."""
 _AHEAD_BYTES = 2**16
@@ -101,7 +94,8 @@ class CommonsEnv(LeanStepEnv):
         self._decides, self._is_governed = game.decisions > 0, bool(game.institutions)
         self._with_state = state
         self._forms = {
-            name: (shape, _TORCH_TYPES[dtype]) for name, (shape, dtype) in output_shapes(game, worlds).items()
+            name: (shape, torch.from_numpy(np.empty(0, dtype)).dtype)
+            for name, (shape, dtype) in output_shapes(game, worlds).items()
         }
         self._colours = torch.from_numpy(game.palette).to(device)
         output_bytes = sum(prod(shape) * dtype.itemsize for shape, dtype in self._forms.values())

@@ -11,6 +11,7 @@ Modules, in the order in which one reads them:
     pace         when learners from replay update
     recurrent    what learners do for recurrent networks
     rollouts     RolloutLearner: learns from rollouts of the present policy
+    advantages   the advantages of a rollout, by TorchRL's GAE
     lola/        LOLALearner: learns with the other members' learning in view
     decisions    Bandit: how agents learn what they decide at an episode's begin
     tabular      TabularLearner: Q-learning in tables

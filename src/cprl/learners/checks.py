@@ -9,7 +9,8 @@ from torch import nn
 
 from cprl.checks import Check, checked, count, instance, is_count
 from cprl.memory import check_memory
-from cprl.preferences.values import Preference, check_preference
+from cprl.networks.agent import AgentNetworks, parts_of
+from cprl.preferences.values import Preference, check_preference, named
 from cprl.spaces import Spaces
 
 _LEAST_BYTES: Final = 4096
@@ -92,3 +93,18 @@ def check_rollouts(
         "fewer rollout_steps or fewer replicas",
         device=device,
     )
+
+
+def refuse_unshared_reward(*, is_sharing: bool, reward_kind: Preference) -> None:
+    """Raises a ValueError for a team that learns from replay by something else than the team reward."""
+    if is_sharing and reward_kind != "team":
+        raise ValueError(
+            f'reward is {named(reward_kind)}; allowed for a team that learns from replay: "team"'
+        )
+
+
+def refuse_other_parts(network: nn.Module) -> None:
+    """Raises a ValueError if the networks of an agent are not "actor" and "critic"."""
+    parts = list(parts_of(network))
+    if not isinstance(network, AgentNetworks) or parts[:2] != ["actor", "critic"]:
+        raise ValueError(f'an agent has the networks {parts}; allowed: "actor" and "critic"')

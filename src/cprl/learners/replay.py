@@ -12,7 +12,7 @@ from torch import Tensor, nn
 from cprl import keys
 from cprl.learners.buffer.gather import Horizon
 from cprl.learners.buffer.sampler import lane_buffer, transformed
-from cprl.learners.checks import check_learner, refuse_continuous
+from cprl.learners.checks import check_learner, refuse_continuous, refuse_unshared_reward
 from cprl.learners.engine.base import Engine
 from cprl.learners.engine.choice import TRIAL_LANES, EngineName, make_engine, trial_batch
 from cprl.learners.engine.functional import MakeLoss
@@ -28,7 +28,7 @@ from cprl.learners.transitions import wanted_in
 from cprl.networks.agent import acting_part
 from cprl.networks.recurrent import state_cells_of
 from cprl.policies.lanes import LaneActor
-from cprl.preferences.values import Preference, named
+from cprl.preferences.values import Preference
 from cprl.preferences.wanted import WantedRewards
 from cprl.spaces import Spaces
 
@@ -101,7 +101,7 @@ class ReplayLearner:
         action_noise: float = 0.0,
         device: str | torch.device = "cpu",
     ) -> None:
-        _refuse_unshared_reward(is_sharing=bool(make_team) and not own_rewards, reward_kind=reward_kind)
+        refuse_unshared_reward(is_sharing=bool(make_team) and not own_rewards, reward_kind=reward_kind)
         check_learner(spaces, settings, DQNSettings, agents, replicas, first_replica, seed, reward_kind)
         if make_network is None or make_loss is None or settings.mean_over_all_outputs:
             refuse_continuous("a learner of action values", spaces)
@@ -287,13 +287,6 @@ class ReplayLearner:
         self.actor.epsilon = self.settings.epsilon(self.steps)
         self._episodes = state["episodes"].clone()
         self.wants.load_state_dict(state.get("wants", {}))
-
-
-def _refuse_unshared_reward(*, is_sharing: bool, reward_kind: Preference) -> None:
-    if is_sharing and reward_kind != "team":
-        raise ValueError(
-            f'reward is {named(reward_kind)}; allowed for a team that learns from replay: "team"'
-        )
 
 
 def _default_network(spaces: Spaces, settings: DQNSettings) -> nn.Module:

@@ -2,16 +2,16 @@
 
 from collections.abc import Callable, Mapping, Sequence
 from copy import deepcopy
-from typing import Any, Final
+from typing import Any
 
 import torch
 from tensordict import TensorDict, TensorDictBase
 from torch import Tensor, nn
-from torchrl.objectives.value.functional import generalized_advantage_estimate
 
+from cprl.learners.advantages import advantages
 from cprl.learners.buffer.rollout import refuse_full, rollout_fields, write_turn
 from cprl.learners.buffer.sampler import steps_ahead
-from cprl.learners.checks import check_learner, refuse_continuous
+from cprl.learners.checks import check_learner, refuse_continuous, refuse_other_parts
 from cprl.learners.engine.base import Engine
 from cprl.learners.engine.choice import TRIAL_LANES, EngineName, make_engine, trial_batch, trial_rollout
 from cprl.learners.engine.functional import MakeLoss
@@ -22,14 +22,11 @@ from cprl.learners.recurrent import ACTOR, COMPILED_STEPS, CRITIC, Evaluated, St
 from cprl.learners.settings import RolloutSettings
 from cprl.learners.teams import MakeTeam, lanes_of
 from cprl.learners.transitions import wanted_in
-from cprl.networks.agent import AgentNetworks, parts_of
 from cprl.policies.lanes import LaneActor
 from cprl.policies.rng import LaneRng
 from cprl.preferences.values import Preference
 from cprl.preferences.wanted import WantedRewards
 from cprl.spaces import Spaces
-
-_SMALL: Final = 1e-8
 
 
 class RolloutLearner:
@@ -209,18 +206,7 @@ class RolloutLearner:
         with torch.no_grad():
             logits, value, next_value, entries = self._evaluated(columns)
             chances = logits.log_softmax(-1)
-            advantage, target = generalized_advantage_estimate(
-                self.settings.gamma,
-                self.settings.gae_lambda,
-                value,
-                next_value,
-                *(_like(columns[name], value) for name in ("reward", "done", "terminated")),
-                time_dim=1,
-            )
-        if self.settings.normalize_advantage:
-            of_lane = tuple(range(1, advantage.ndim))
-            spread = advantage.std(of_lane, keepdim=True)
-            advantage = (advantage - advantage.mean(of_lane, keepdim=True)) / (spread + _SMALL)
+            advantage, target = advantages(columns, value, next_value, settings=self.settings)
         chosen = chances.gather(-1, columns["action"].unsqueeze(-1)).squeeze(-1)
         return TensorDict(
             {
@@ -294,17 +280,3 @@ class RolloutLearner:
         self.wants.load_state_dict(state.get("wants", {}))
         if self._states is not None:
             self._states.load_state_dict(state["recurrent"])
-
-
-def _like(column: Tensor, value: Tensor) -> Tensor:
-    """A field of lanes [L, T], or of team members [L, T, S], expanded to the shape of values, whose last axis
-    has size 1."""
-    one_each = [1] * (value.ndim - column.ndim)
-    return column.reshape(*column.shape, *one_each).expand_as(value)
-
-
-def refuse_other_parts(network: nn.Module) -> None:
-    """Raises a ValueError if the networks of an agent are not "actor" and "critic"."""
-    parts = list(parts_of(network))
-    if not isinstance(network, AgentNetworks) or parts[:2] != ["actor", "critic"]:
-        raise ValueError(f'an agent has the networks {parts}; allowed: "actor" and "critic"')

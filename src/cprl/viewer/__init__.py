@@ -19,16 +19,18 @@ Modules, in the order in which one reads them:
     offences   in a replay: who breaks a rule, and what is paid
     decisions  in a replay: what each agent's policy says of its actions
     compiling  while code is compiled, the live header says so
-    recorder   which episodes are recorded frame by frame
-    frames     frames of one world, collected in memory
+    filming    which episodes are recorded frame by frame
+    recorder   the frames of one world, step by step
+    frames     frames collected in memory
     logger     RerunLogger: TorchRL's logger interface on a recording
+    media      numbers, histograms and videos, as Rerun takes them
     batches    numbers and texts as columns, in batches
     recipe     the recipe as a table
     names      files and ids of a run's recordings
     exhibition a world that the present policy plays, for viewers alone
     live_board the exhibited board, as viewers get it
     streams    to a file, and served live
-    sending    one stream, which may fail without harm
+    sending    the streams of a recording, each of which may fail without harm
     page       the web viewer's page on 127.0.0.1, and recordings for it
     deadline   calls that may wait for a viewer, with deadlines
     lingering  a finished run stays served until Ctrl-C

@@ -12,7 +12,6 @@ from rich.console import Console
 from tensordict import TensorDictBase
 from torchrl.envs import EnvBase
 
-from cprl import keys
 from cprl.arguments import object_of
 from cprl.arguments import path as path_of
 from cprl.checks import NONE, TEXT, check_nesting, checked, count, either
@@ -23,12 +22,13 @@ from cprl.measuring.series import Series, Values, numbers_of
 from cprl.viewer.compiling import CompilingNotice
 from cprl.viewer.contents import curves_of, missing_in
 from cprl.viewer.exhibition import Exhibited, Exhibition
+from cprl.viewer.filming import Filming
 from cprl.viewer.header import has_died
 from cprl.viewer.institution_views import institution_views
 from cprl.viewer.logger import RerunLogger
 from cprl.viewer.names import FILE_NAME, free_name, recording_id
 from cprl.viewer.plots import Plots
-from cprl.viewer.recorder import FrameRecorder, scene_of
+from cprl.viewer.recorder import scene_of
 from cprl.viewer.story import Story
 from cprl.viewer.tags import Tags
 from cprl.viewer.views import Views
@@ -98,17 +98,11 @@ class ViewerCallback:
             recording_id=recording_id(run, file_name or FILE_NAME),
             console=console,
         )
-        self._recorder = (
-            None
-            if commons is None or scene is None
-            else FrameRecorder(commons, episodes=episodes, scene=scene)
-        )
+        self._filming = Filming(commons, self.logger, scene, episodes=episodes)
         self.exhibition: Exhibition | None = None
         """What the present policy plays for viewers; None where nothing is exhibited."""
         if exhibited is not None and scene is not None:
             self.exhibition = Exhibition(*exhibited, trained=env, scene=scene, live=self.logger.live)
-        self.every = 0 if self._recorder is None else self._recorder.every
-        """Episodes from one with frames to the next; 0 for no frames."""
         self._series = Series(curves.replicas)
         self.plots = Plots(self.logger, curves, episodes=episodes)
         game = None if commons is None else commons.game
@@ -118,15 +112,19 @@ class ViewerCallback:
             else Story(self.logger, curves, episodes=episodes, window=self.plots.window, game=game)
         )
         self._views = Views(
-            commons, self.logger, curves if scene is None else scene, episodes=episodes, every=self.every
+            commons,
+            self.logger,
+            curves if scene is None else scene,
+            episodes=episodes,
+            every=self._filming.every,
         )
         self._institutions = institution_views(self.logger, commons)
         has_tags = curves.has_tags and len(self._agents) > 1
         self._sampled = self._views.sampled
         self._tags = Tags(self.logger, len(self._agents)) if has_tags else None
         self._step = self._episode = 0
-        self._shows_next = self._has_died = False
-        self._is_recording = self.is_shown
+        self._has_died = False
+        self._filming.choose(0)
         self._rate_at = time.perf_counter()
         self._rate_step = 0
         self.logger.log_hparams({"run": run.name, **(recipe or {})})
@@ -145,27 +143,13 @@ class ViewerCallback:
         Otherwise it only counts: reading a tensor each turn would cost a training some percent.
         """
         self._step += 1
-        if not self._is_recording and self._step % self._sampled:
+        if not self._filming.is_on and self._step % self._sampled:
             return  # nothing is due; whatever runs here displaces a training's data from the fast caches
-        self._is_recording = self.is_shown
+        self._filming.choose(self._episode)
         if self.exhibition is not None:
             self.exhibition.on_step(episode=self._episode)
-        self._views.on_step(self._step, self._episode, self._record(batch))
-
-    def _record(self, batch: TensorDictBase) -> int | None:
-        """Copies a frame if this episode's are recorded; returns its number, None if there is none."""
-        if self._recorder is None or not self._is_recording:
-            return None
-        if keys.entry(keys.entry(batch, "next"), keys.DONE)[
-            0, 0
-        ]:  # the board is already that of the next episode
-            self._send_frames()
-            return None
-        self._recorder.add(batch, step=self._step, episode=self._episode)
-        frame = self.logger.frames + self._recorder.pending - 1
-        if self._recorder.is_due:
-            self._send_frames()
-        return frame
+        frame = self._filming.add(batch, step=self._step, episode=self._episode)
+        self._views.on_step(self._step, self._episode, frame)
 
     def on_episode(self, episode: Episode, learning: Mapping[str, float]) -> None:
         """Logs the numbers of an episode, and its events, once all replicas have ended it."""
@@ -174,7 +158,7 @@ class ViewerCallback:
             if self._institutions is not None and episode.episode % self._views.every == 0:
                 self.logger.at(step=self._step, episode=episode.episode)
                 self._institutions.on_episode(episode)
-            self._episode, self._shows_next = episode.episode + 1, False
+            self._episode, self._filming.shows_next = episode.episode + 1, False
         if self._tags is not None and episode.tagged_by is not None:
             self._tags.add(episode.tagged_by)
         self._views.on_episode(episode)
@@ -187,7 +171,7 @@ class ViewerCallback:
             self._stop_notice()
             self.logger.at(step=self._step, episode=episode.episode)
             self._log(episode.episode, of_all)
-        self._is_recording = self.is_shown
+        self._filming.choose(self._episode)
 
     def _show_status(self, status: str) -> None:
         """Shows a status in the header of the live view; from any thread."""
@@ -197,7 +181,7 @@ class ViewerCallback:
     def _log_death(self, episode: Episode) -> None:
         """Logs the step of the last apple in the first replica, for the first time and where one sees it."""
         step = episode.depletion_step or -1
-        if step > 0 and (self.is_shown or not self._has_died):
+        if step > 0 and (self._filming.is_shown(self._episode) or not self._has_died):
             self.logger.at(step=self._step, episode=episode.episode)
             self.logger.log_text(f"episode {episode.episode:,}: last apple taken in step {step}")
             self._has_died = True
@@ -212,7 +196,7 @@ class ViewerCallback:
             self._rate_at, self._rate_step = now, self._step
         if self.story is not None:
             events = self.story.on_episode(episode, of_all, None if died is None else float(np.nansum(died)))
-            self._shows_next |= any(event.startswith("new best") for event in events)
+            self._filming.shows_next |= any(event.startswith("new best") for event in events)
         if self._tags is not None:
             self._tags.on_episode(episode)
 
@@ -239,7 +223,7 @@ class ViewerCallback:
         Args:
             played: the episodes of its evaluation, "trained" and "random".
         """
-        self._send_frames()
+        self._filming.send()
         self._views.close()
         if self.story is not None:
             self.story.finished(played["trained"], played["random"])
@@ -254,24 +238,9 @@ class ViewerCallback:
         if self.exhibition is not None:
             self.exhibition.play_on(stop, episode=self._episode)
 
-    @property
-    def is_shown(self) -> bool:
-        """Whether the frames of the current episode are recorded."""
-        last = self._episodes - 1
-        return (
-            self.every > 0
-            and self._episode <= last
-            and (self._episode % self.every == 0 or self._shows_next or self._episode == last)
-        )
-
-    def _send_frames(self) -> None:
-        frames = None if self._recorder is None else self._recorder.take()
-        if frames is not None:
-            self.logger.log_frames(frames)
-
     def flush(self) -> None:
         """Sends all that waits, to the file and to viewers."""
-        self._send_frames()
+        self._filming.send()
         self.logger.flush()
 
     def state_dict(self) -> dict[str, Any]:
@@ -280,8 +249,7 @@ class ViewerCallback:
         return {
             "step": self._step,
             "episode": self._episode,
-            "shows_next": self._shows_next,
-            "frames": self.logger.frames,
+            **self._filming.state_dict(),
             "series": self._series.state_dict(),
             "plots": self.plots.state_dict(),
             "views": self._views.state_dict(),
@@ -292,9 +260,8 @@ class ViewerCallback:
     def load_state_dict(self, state: Mapping[str, Any]) -> None:
         """Continues from a state that `state_dict` returned."""
         self._step = self._rate_step = int(state["step"])
-        self._episode, self._shows_next = int(state["episode"]), bool(state["shows_next"])
-        self._is_recording = self.is_shown
-        self.logger.frames = int(state["frames"])
+        self._episode = int(state["episode"])
+        self._filming.load_state_dict(state, episode=self._episode)
         self._series.load_state_dict(state["series"])
         self.plots.load_state_dict(state.get("plots", {}))
         self._views.load_state_dict(state.get("views", {}))
@@ -321,7 +288,7 @@ class ViewerCallback:
         self._stop_notice()
         if self.exhibition is not None:
             self.exhibition.close()
-        self._send_frames()
+        self._filming.send()
         self._views.close()
         if self.story is not None:
             self.story.close()

@@ -6,7 +6,6 @@ from pathlib import Path
 from typing import Any, Final
 
 import numpy as np
-import torch
 from numpy.typing import NDArray
 from rich.console import Console
 from torch import Tensor
@@ -19,10 +18,11 @@ from cprl.output import console as safe_console
 from cprl.viewer.batches import Numbers, log_now, send_waiting, times
 from cprl.viewer.blueprint import layout
 from cprl.viewer.deadline import release
+from cprl.viewer.media import format_of, histogram_of, images_of, numbers_in
 from cprl.viewer.names import FILE_NAME
 from cprl.viewer.recipe import as_table
-from cprl.viewer.scenery import Curves, Scene, classes, lines, state_colours
-from cprl.viewer.sending import FLUSH_TIMEOUT_S, LiveStream, Stream
+from cprl.viewer.scenery import Curves, Scene
+from cprl.viewer.sending import FLUSH_TIMEOUT_S, Streams
 from cprl.viewer.stage import columns, fixed
 from cprl.viewer.streams import REPLAY, RUN, Live, open_file, open_live
 
@@ -89,7 +89,7 @@ class RerunLogger(Logger):
         """What viewers are sent; nothing where the recording is written to a file alone."""
         self._live, self._exhibits, self._console = live, exhibits, console or safe_console()
         self._application = REPLAY if isinstance(self.curves, Scene) and self.curves.is_replay else RUN
-        self._streams: list[Stream] = []
+        self._streams = Streams()
         self.frames = 0
         """Frames recorded so far, including those in earlier files of the recording."""
         self._now = (0, 0)
@@ -97,8 +97,6 @@ class RerunLogger(Logger):
         super().__init__(exp_name, str(log_dir))
 
     def _create_experiment(self) -> list[Any]:
-        import rerun as rr
-
         recording_id = self.recording_id
         Path(self.log_dir).mkdir(parents=True, exist_ok=True)
         file = open_file(
@@ -108,21 +106,14 @@ class RerunLogger(Logger):
             period_s=_FILE_PERIOD_S,
             application=self._application,
         )
-        self._streams += [file] if file else []
+        self._streams.add(file)
         if self._live:
             self._go_live(recording_id, layout(self.curves, live=True))
         self.do(lambda recording: recording.send_recording_name(self.exp_name))
-        self.log_static("/", classes(self.curves))
-        for entity, style in lines(self.curves).items():
-            self.log_static(entity, style)
-        for entity, colours in state_colours(self.curves).items():
-            self.log_static(entity, colours)
-        self.log_static("header", rr.TextDocument.from_fields(media_type=rr.MediaType.MARKDOWN))
-        if self.scene is not None:
-            for entity, parts in fixed(self.scene).items():
-                self.log_static(entity, *parts)
+        for entity, parts in fixed(self.curves).items():
+            self.log_static(entity, *parts)
         self.do(lambda recording: recording.flush(timeout_sec=FLUSH_TIMEOUT_S))
-        return [each.recording for each in self._streams]
+        return self._streams.recordings
 
     def _go_live(self, recording_id: str, blueprint: Any) -> None:
         self.live = open_live(
@@ -133,7 +124,7 @@ class RerunLogger(Logger):
             application=self._application,
             exhibits=self._exhibits,
         )
-        self._streams += [self.live.stream] if self.live.stream else []
+        self._streams.add(self.live.stream)
         for where, address in self.addresses.items():
             self._console.print(f"Watch live ({where}): {address}", soft_wrap=True, highlight=False)
 
@@ -144,9 +135,7 @@ class RerunLogger(Logger):
 
     def do(self, what: Callable[[Any], object], *, live_only: bool = False) -> None:
         """Calls a function with each recording, or with that to viewers alone, in the thread that sends."""
-        for each in self._streams:
-            if isinstance(each, LiveStream) or not live_only:
-                each.do(what)
+        self._streams.do(what, live_only=live_only)
 
     def log_static(self, entity: str, *what: Any) -> None:
         """Logs archetypes that hold at all times."""
@@ -158,7 +147,7 @@ class RerunLogger(Logger):
     @property
     def is_live(self) -> bool:
         """Whether there is a stream to viewers."""
-        return any(isinstance(each, LiveStream) for each in self._streams)
+        return self._streams.is_live
 
     def log_row(self, name: str, what: Any) -> None:
         """Logs an archetype at the time set by `at`."""
@@ -176,7 +165,7 @@ class RerunLogger(Logger):
     def log_scalar(self, name: str, value: Any, step: int | None = None, **kwargs: Any) -> None:
         """Logs a number, or a list, array or tensor of numbers as name/0, name/1 and so on."""
         if isinstance(value, Tensor | np.ndarray | list | tuple):
-            numbers = np.asarray(value.detach().cpu() if isinstance(value, Tensor) else value).reshape(-1)
+            numbers = numbers_in(value)
             if numbers.size != 1:
                 for index, number in enumerate(numbers):
                     self.log_scalar(f"{name}/{index}", float(number), step)
@@ -200,11 +189,8 @@ class RerunLogger(Logger):
         self._send(name, at, rr.TextDocument.columns(text=[text]), live_only=True)
 
     def _wait(self, name: str, step: int, values: list[float] | str) -> None:
-        row = step, self._now[1], self.frames, values
-        for each in self._streams:
-            each.waiting.setdefault(name, []).append(row)
-            if each.is_due:
-                send_waiting(each)
+        for each in self._streams.hold(name, (step, self._now[1], self.frames, values)):
+            send_waiting(each)
 
     def log_states(self, name: str, states: Mapping[int, str], *, live_only: bool = False) -> None:
         """Logs states by the episode from which they hold; their step is the one set by `at`."""
@@ -239,8 +225,7 @@ class RerunLogger(Logger):
         import rerun as rr
 
         at = times([self._now[0]], [self._now[1]], [self.frames])
-        what = rr.TextLog.columns(text=[text], level=[level])
-        self._send("log", at, what)
+        self._send("log", at, rr.TextLog.columns(text=[text], level=[level]))
 
     def log_hparams(self, cfg: Any) -> None:
         """Logs a mapping, as a table, or a Markdown text, as the recipe of the run."""
@@ -258,35 +243,20 @@ class RerunLogger(Logger):
         """
         import rerun as rr
 
-        clip = torch.as_tensor(video).cpu()
-        clip = clip[0] if clip.ndim == 5 else clip
-        if clip.ndim != 4:
-            raise ValueError(f"the video is {list(video.shape)}; allowed: [T, C, H, W] or [1, T, C, H, W]")
-        images = clip.permute(0, 2, 3, 1).to(torch.uint8).numpy()
+        images = images_of(video)
         first = max(self._now[0] if step is None else int(step), self._clips_end.get(name, 0))
         self._clips_end[name] = first + len(images)
-        form = rr.components.ImageFormat(
-            width=images.shape[2],
-            height=images.shape[1],
-            color_model="L" if images.shape[3] == 1 else "RGB",
-            channel_datatype=rr.ChannelDatatype.U8,
-        )
-        self.log_static(name, rr.Image.from_fields(format=form))
+        self.log_static(name, rr.Image.from_fields(format=format_of(images)))
         count = len(images)
         at = times(range(first, first + count), [self._now[1]] * count, [self.frames] * count)
-        what = rr.Image.columns(buffer=images.reshape(count, -1).copy())
-        self._send(name, at, what)
+        self._send(name, at, rr.Image.columns(buffer=images.reshape(count, -1).copy()))
 
     def log_histogram(
         self, name: str, data: Any, *, bins: int = 30, step: int | None = None, **kwargs: Any
     ) -> None:
         """Logs a histogram of values in equal bins, as bars."""
-        import rerun as rr
-
-        values = np.asarray(data.detach().cpu() if isinstance(data, Tensor) else data).reshape(-1)
-        counts, edges = np.histogram(values, bins=bins)
         now = self._now[0] if step is None else int(step), self._now[1], self.frames
-        bars = rr.BarChart(counts, abscissa=(edges[:-1] + edges[1:]) / 2)
+        bars = histogram_of(numbers_in(data), bins=bins)
         self.do(lambda recording: log_now(recording, name, bars, now))
 
     def flush(self) -> None:
@@ -303,22 +273,17 @@ class RerunLogger(Logger):
     @property
     def is_served(self) -> bool:
         """Whether viewers can still connect: the live stream is open and served."""
-        return bool(self.addresses) and any(
-            isinstance(each, LiveStream) and each.recording is not None for each in self._streams
-        )
+        return bool(self.addresses) and self._streams.is_open_live
 
     def close_file(self) -> None:
         """Flushes and closes the file, which gets its footer; the live stream goes on."""
         self.flush()
-        for each in self._streams:
-            if not isinstance(each, LiveStream):
-                each.close()
+        self._streams.close(live=False)
 
     def shutdown(self) -> None:
         """Flushes and closes the recording; the file gets its footer. A second call does nothing."""
         self.flush()
-        for each in self._streams:
-            each.close()
+        self._streams.close()
         self.live.close()
         self.experiment.clear()
         release()

@@ -1,8 +1,8 @@
-"""One recording stream, to a file or to viewers, that may fail without harm to the run."""
+"""The streams of one recording, to a file or to viewers, each of which may fail without harm to the run."""
 
 import time
 import warnings
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from functools import partial
 from typing import Any, Final, TypeAlias
 
@@ -14,8 +14,11 @@ _KEEPS_UP: Final = 1
 """The number of calls that may wait for viewers that keep up."""
 
 
-Waiting: TypeAlias = dict[str, list[tuple[int, int, int, list[float] | str]]]
-"""Numbers and texts by entity: (step, episode, frame, a number for each line or a Markdown text)."""
+Row: TypeAlias = tuple[int, int, int, list[float] | str]
+"""Step, episode, frame, and a number for each line or a Markdown text."""
+
+Waiting: TypeAlias = dict[str, list[Row]]
+"""Numbers and texts by entity."""
 
 
 class Stream:
@@ -79,7 +82,7 @@ class Stream:
         warnings.warn(
             f"the Rerun {self.name} failed, the run continues without it: {error}",
             RuntimeWarning,
-            stacklevel=4,
+            stacklevel=5,
         )
 
 
@@ -107,3 +110,50 @@ class LiveStream(Stream):
     def _fail(self, error: Exception) -> None:
         abandon(self.recording)
         super()._fail(error)
+
+
+class Streams:
+    """Those of one recording: to its file, and to viewers."""
+
+    def __init__(self) -> None:
+        self._each: list[Stream] = []
+
+    def add(self, stream: Stream | None) -> None:
+        """Adds a stream; None adds nothing."""
+        self._each += [] if stream is None else [stream]
+
+    def __iter__(self) -> Iterator[Stream]:
+        return iter(self._each)
+
+    @property
+    def recordings(self) -> list[Any]:
+        """The `rerun.RecordingStream` of each."""
+        return [each.recording for each in self._each]
+
+    @property
+    def is_live(self) -> bool:
+        """Whether there is a stream to viewers."""
+        return any(isinstance(each, LiveStream) for each in self._each)
+
+    @property
+    def is_open_live(self) -> bool:
+        """Whether a stream to viewers is neither closed nor failed."""
+        return any(isinstance(each, LiveStream) and each.recording is not None for each in self._each)
+
+    def do(self, what: Callable[[Any], object], *, live_only: bool = False) -> None:
+        """Calls a function with each recording, or with that to viewers alone, in the thread that sends."""
+        for each in self._each:
+            if isinstance(each, LiveStream) or not live_only:
+                each.do(what)
+
+    def hold(self, name: str, row: Row) -> list[Stream]:
+        """Buffers a row of an entity; returns the streams whose buffers are to be sent now."""
+        for each in self._each:
+            each.waiting.setdefault(name, []).append(row)
+        return [each for each in self._each if each.is_due]
+
+    def close(self, *, live: bool = True) -> None:
+        """Closes all, or all but those to viewers."""
+        for each in self._each:
+            if live or not isinstance(each, LiveStream):
+                each.close()

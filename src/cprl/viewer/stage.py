@@ -11,7 +11,7 @@ from cprl.commons.decoding import UNSEEN
 from cprl.commons.sprites import INK_COLOUR, MARK_COLOUR
 from cprl.commons.world import Bools, Bytes
 from cprl.viewer.frames import mosaic, mosaic_size, window_corners
-from cprl.viewer.scenery import Scene, window_classes
+from cprl.viewer.scenery import Curves, Scene, classes, lines, state_colours, window_classes
 from cprl.viewer.strokes import (
     OUT_HALF_CELLS,
     OUT_STROKE_CELLS,
@@ -43,8 +43,18 @@ def image_form(size: tuple[int, int]) -> Any:
     return rr.components.ImageFormat(width=size[1], height=size[0], channel_datatype=rr.ChannelDatatype.U8)
 
 
-def fixed(scene: Scene) -> dict[str, list[Any]]:
-    """The static parts of a recording, by entity: sizes of images, agents' names, colours and frames."""
+def fixed(curves: Curves) -> dict[str, list[Any]]:
+    """The static parts of a recording, by entity: names and colours of what it shows, and of a `Scene` also
+    sizes of images and the agents' frames."""
+    import rerun as rr
+
+    styles = lines(curves) | state_colours(curves)
+    header = rr.TextDocument.from_fields(media_type=rr.MediaType.MARKDOWN)
+    parts = {"/": [classes(curves)], **{entity: [own] for entity, own in styles.items()}, "header": [header]}
+    return parts | (_fixed_on_board(curves) if isinstance(curves, Scene) else {})
+
+
+def _fixed_on_board(scene: Scene) -> dict[str, list[Any]]:
     import rerun as rr
 
     form, image = image_form, rr.SegmentationImage.from_fields

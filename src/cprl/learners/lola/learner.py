@@ -10,11 +10,10 @@ from torchrl.objectives import LossModule
 from torchrl.objectives.value.functional import generalized_advantage_estimate
 
 from cprl.learners.buffer.rollout import refuse_full, rollout_fields, write_turn
-from cprl.learners.checks import check_learner, refuse_continuous
+from cprl.learners.checks import check_learner, refuse_continuous, refuse_other_parts
 from cprl.learners.lanes import WEIGHTS, Lanes, StartFrom
 from cprl.learners.lola.networks import LOLANetworks
 from cprl.learners.lola.settings import LOLASettings
-from cprl.learners.rollouts import refuse_other_parts
 from cprl.learners.transitions import wanted_in
 from cprl.objectives import LOLADiCELoss, dice_objective
 from cprl.policies.lanes import LaneActor

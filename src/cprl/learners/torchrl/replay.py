@@ -1,23 +1,18 @@
 """TorchRLReplayLearner: independent agents that learn from replay with TorchRL's stock parts."""
 
 from collections.abc import Callable, Mapping, Sequence
-from math import prod
-from typing import Any, Final
+from typing import Any
 
 import torch
-from tensordict import TensorDict, TensorDictBase
+from tensordict import TensorDictBase
 from torch import Tensor, nn
-from torchrl.data import LazyTensorStorage, TensorDictReplayBuffer
 from torchrl.data.replay_buffers import RandomSampler
-from torchrl.envs.transforms import MultiStepTransform, UnsqueezeTransform
 from torchrl.objectives import HardUpdate, LossModule, SoftUpdate
 from torchrl.objectives.utils import TargetNetUpdater
 
-from cprl.custom import made
 from cprl.envs.drivers import device_of
 from cprl.learners.buffer.gather import Horizon
 from cprl.learners.buffer.sampler import Noise, transformed
-from cprl.learners.buffer.storage import torch_dtype
 from cprl.learners.checks import check_learner, refuse_continuous
 from cprl.learners.engine.choice import trial_batch
 from cprl.learners.engine.functional import MakeLoss, targets_of
@@ -25,19 +20,15 @@ from cprl.learners.engine.refusals import refuse_for_replay, refuse_other_output
 from cprl.learners.lanes import NOISE, TARGET_WEIGHTS, Lanes, StartFrom
 from cprl.learners.pace import Pace
 from cprl.learners.settings import DQNSettings
-from cprl.learners.torchrl.agents import MakeSampler, StockAgents, check_makers, sampler_of
-from cprl.learners.torchrl.buffers import buffer_state, load_buffer, nested, plain
+from cprl.learners.torchrl.agents import MakeSampler, StockAgents, check_makers
+from cprl.learners.torchrl.buffers import StockBuffers, check_buffers
 from cprl.learners.transitions import wanted_in
-from cprl.memory import check_memory
 from cprl.networks.agent import acting_part
 from cprl.networks.recurrent import state_shape_of
 from cprl.policies.lanes import LaneActor
 from cprl.preferences.values import Preference
 from cprl.preferences.wanted import WantedRewards
 from cprl.spaces import Spaces
-
-BYTES_BESIDE: Final = 4 + 1 + 1
-"""Bytes of a transition without its observations and actions: reward, done, terminated."""
 
 
 class TorchRLReplayLearner:
@@ -103,7 +94,6 @@ class TorchRLReplayLearner:
         device = device_of(device)
         self.spaces, self.settings, self.agents = spaces, settings, tuple(agents)
         self.replicas, self.seed, self.wants = replicas, seed, WantedRewards(reward_kind)
-        self._make_sampler: MakeSampler = make_sampler or (lambda lane: RandomSampler())
         self._lanes = Lanes(
             spaces,
             agents=agents,
@@ -129,8 +119,10 @@ class TorchRLReplayLearner:
         self.updaters = [_target_updater(agent.loss, settings) for agent in self.stock.each]
         if settings.own_target_weights:
             self._init_targets(make_loss)
-        _check_memory(self._lanes, settings, self.stock.device)
-        self._make_buffers()
+        check_buffers(self._lanes, settings, self.stock.device)
+        self.buffers = StockBuffers(
+            settings, self.stock.generators, make_sampler or _random_sampler, self.stock.device
+        )
         of_batch = settings.batch_size, (noise_numbers,), self.stock.device
         self._noise = [Noise([own], *of_batch) for own in self._lanes.seeds(NOISE) if noise_numbers]
         self.actor = self._lanes.actor(self.stock, compile=False)
@@ -172,38 +164,6 @@ class TorchRLReplayLearner:
             for name, values in targets_of(make_loss(network)).items():
                 getattr(agent.loss, f"target_{name}").data.copy_(values.data)
 
-    def _make_buffers(self) -> None:
-        """An empty replay buffer for each agent."""
-        self._generators = self.stock.generators()
-        self.buffers = [self._buffer(lane, own) for lane, own in enumerate(self._generators)]
-        self._last: list[TensorDict] = []  # turns that `MultiStepTransform` holds back
-
-    def _buffer(self, lane: int, generator: torch.Generator) -> TensorDictReplayBuffer:
-        settings = self.settings
-        buffer = TensorDictReplayBuffer(
-            storage=LazyTensorStorage(settings.buffer_size, device=self.stock.device),
-            sampler=sampler_of(self._make_sampler, lane),
-            batch_size=settings.batch_size,
-            generator=generator,
-        )
-        if settings.n_steps > 1:
-            buffer.append_transform(self._multi_step())
-            # `DistributionalDQNLoss` would read [b] as one discount for each atom.
-            buffer.append_transform(UnsqueezeTransform(dim=-1, in_keys=["steps_to_next_obs"]))
-        for transform in settings.replay_transforms:
-            buffer.append_transform(made(transform))
-        return buffer
-
-    def _multi_step(self) -> MultiStepTransform:
-        # With its default `done_keys` a transition would keep the flags of its first step, and bootstrap from
-        # the end of an episode that terminated within its n steps.
-        return MultiStepTransform(self.settings.n_steps, self.settings.gamma, done_keys=[])
-
-    def _hold_back(self, lane: int) -> None:
-        """Gives a new `MultiStepTransform` the latest turns."""
-        for turn in self._last:
-            self.buffers[lane].transform.inv(turn[lane : lane + 1].clone())
-
     def evaluation_actor(self, worlds: int) -> LaneActor:
         """An actor with the current weights and `epsilon_evaluation`, for `worlds` worlds of each replica."""
         return self._lanes.evaluation_actor(self.stock, worlds, epsilon=self.settings.epsilon_evaluation)
@@ -215,20 +175,11 @@ class TorchRLReplayLearner:
     def begin(self) -> None:
         """Ends the episodes that an earlier training left unfinished; see `Learner`. Whole transitions know
         nothing of those after them; `MultiStepTransform` sums up to the last that it holds back."""
-        if self._last:
-            self._last[-1]["next", "done"].fill_(True)
-            for lane, buffer in enumerate(self.buffers):
-                buffer.transform.pop(0)
-                buffer.transform.insert(0, self._multi_step())
-                self._hold_back(lane)
+        self.buffers.end_episodes()
 
     def store(self, batch: TensorDictBase) -> None:
         """Stores one step of every replica, as the collector yields it."""
-        turn = self.stock.transitions(batch, wanted_in(self.wants, batch))
-        if self.settings.n_steps > 1:
-            self._last = [*self._last, turn.clone()][-self.settings.n_steps :]
-        for lane, buffer in enumerate(self.buffers):
-            buffer.extend(turn[lane : lane + 1])
+        self.buffers.extend(self.stock.transitions(batch, wanted_in(self.wants, batch)))
         self.steps += 1
         self._pace.stored(self.steps)
         self.actor.epsilon = self.settings.epsilon(self.steps)
@@ -282,8 +233,7 @@ class TorchRLReplayLearner:
             "networks": self._lanes.states(self.stock),
             "agents": [agent.state_dict() for agent in self.stock.each],
             "updaters": [updater.state_dict() if updater else {} for updater in self.updaters],
-            "buffers": [buffer_state(*own) for own in zip(self.buffers, self._generators, strict=True)],
-            "last": [plain(turn) for turn in self._last],
+            **self.buffers.state_dict(),
             "noise": [own.rng.state_dict() for own in self._noise],
             "exploration": self.actor.rng.state_dict(),
             "steps": self.steps,
@@ -298,17 +248,17 @@ class TorchRLReplayLearner:
         for updater, own in zip(self.updaters, state["updaters"], strict=True):
             if updater is not None:
                 updater.load_state_dict(own)
-        self._make_buffers()
-        self._last = [nested(turn) for turn in state["last"]]
-        for lane, buffer in enumerate(self.buffers):
-            self._hold_back(lane)
-            load_buffer(buffer, self._generators[lane], state["buffers"][lane])
+        self.buffers.load_state_dict(state)
         for noise, own in zip(self._noise, state.get("noise", ()), strict=True):
             noise.rng.load_state_dict(own)
         self.actor.rng.load_state_dict(state["exploration"])
         self.steps, self._pace.owed = int(state["steps"]), int(state.get("owed", 0))
         self.wants.load_state_dict(state.get("wants", {}))
         self.actor.epsilon = self.settings.epsilon(self.steps)
+
+
+def _random_sampler(lane: int) -> RandomSampler:
+    return RandomSampler()
 
 
 def _target_updater(loss: LossModule, settings: DQNSettings) -> TargetNetUpdater | None:
@@ -319,19 +269,3 @@ def _target_updater(loss: LossModule, settings: DQNSettings) -> TargetNetUpdater
         return SoftUpdate(loss, tau=settings.tau)
     # HardUpdate copies at every (interval + 1)-th step.
     return HardUpdate(loss, value_network_update_interval=settings.target_every_episodes - 1)
-
-
-def _check_memory(lanes: Lanes, settings: DQNSettings, device: torch.device) -> None:
-    """Checks memory in advance: stock storage holds the observations before and after each transition, and
-    its pages are only committed as they fill, so a machine with too little would fail hours later."""
-    spaces = lanes.spaces
-    observation = prod(spaces.observation_shape) * torch_dtype(spaces.observation_dtype).itemsize
-    beside = 8 * prod(lanes.action_shape) + BYTES_BESIDE
-    wanted = len(lanes) * settings.buffer_size * (2 * observation + beside)
-    wanted += settings.batch_size * 2 * (observation + 4 * prod(spaces.observation_shape))
-    check_memory(
-        f"the replay buffers of {len(lanes)} agents x {settings.buffer_size:,} transitions",
-        wanted,
-        'a smaller buffer_size or batch_size, fewer replicas, or engine="compiled", which needs half',
-        device=device,
-    )

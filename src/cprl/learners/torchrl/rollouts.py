@@ -15,13 +15,12 @@ from torchrl.objectives.value import GAE
 
 from cprl.envs.drivers import device_of
 from cprl.learners.buffer.storage import torch_dtype
-from cprl.learners.checks import check_learner, check_rollouts, refuse_continuous
+from cprl.learners.checks import check_learner, check_rollouts, refuse_continuous, refuse_other_parts
 from cprl.learners.engine.choice import trial_batch
 from cprl.learners.engine.functional import MakeLoss
 from cprl.learners.engine.refusals import refuse_other_advantages, refuse_other_outputs
 from cprl.learners.lanes import Lanes, StartFrom
 from cprl.learners.recurrent import ACTOR, CRITIC, states_in
-from cprl.learners.rollouts import refuse_other_parts
 from cprl.learners.settings import RolloutSettings
 from cprl.learners.torchrl.agents import MakeSampler, StockAgent, StockAgents, check_makers, sampler_of
 from cprl.learners.torchrl.buffers import nested, plain
