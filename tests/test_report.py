@@ -25,10 +25,12 @@ from cprl.custom import Custom
 from cprl.evaluation.film import film
 from cprl.measuring.movement import Trace
 from cprl.measuring.published import curve, published_experiment
+from cprl.measuring.statistics import estimate
 from cprl.population import Frozen, Scripted
 from cprl.reporting import report, write_report
 from cprl.reporting.measures import ROUNDS, dip_depth, measures, of_play, of_training
-from cprl.reporting.result import Result
+from cprl.reporting.pooled import pooled
+from cprl.reporting.result import Result, read_result
 from cprl.reporting.turning import turning_points_of
 from cprl.runs.curves import as_curves, running_mean
 from cprl.runs.episodes import read_episodes
@@ -169,6 +171,49 @@ def test_a_report_of_runs_of_one_name_is_refused_and_other_names_are_links(run, 
 
 
 @pytest.mark.integration
+def test_runs_of_one_experiment_are_pooled_where_it_is_asked_for(run, tmp_path):
+    one = export_results(run, tmp_path / "one")
+    other, longer = copytree(one, tmp_path / "other"), copytree(one, tmp_path / "longer")
+    with_field(other, "seed", 1000)
+    with_field(longer, "seed", 2000)
+    with_field(longer, "update_every", 2)
+    text = write_report([one, longer, other], tmp_path / "pooled", pool=True).read_text()
+    returns = as_curves(read_episodes(run))["collective_return"].mean(1)
+    twice = estimate(np.concatenate([returns, returns]))
+    assert f"| one+other | 4 | 184.07 | {twice} |" in text
+    assert f"| longer | 4 | 184.07 | {estimate(returns)} |" in text
+    assert "| one |" in text.split("## Share of the possible")[0], "each run has made its training"
+    assert "| one |" not in text.split("## Share of the possible")[1]
+    assert (tmp_path / "pooled" / "figures" / "one+other_return_1.png").exists()
+    apart = write_report([one, longer, other], tmp_path / "apart").read_text()
+    assert f"| one | 4 | 184.07 | {estimate(returns)} |" in apart, "nothing is pooled unless it is asked for"
+
+    both, single = pooled([read_result(one), read_result(other)])[0], read_result(one)
+    assert both.title == single.title.replace("2 replicas", "4 replicas")
+    for columns in (both.of_agents("return"), both.evaluated("trained")["collective_return"]):
+        assert np.array_equal(columns[:2], columns[2:])
+    assert both.of_agents("no such column") is None
+    assert both.measures.trained.keys() == single.measures.trained.keys()
+    assert all(len(values) == 4 for values in both.measures.training.values())
+
+
+@pytest.mark.integration
+def test_runs_of_the_same_replicas_are_not_pooled(run, tmp_path):
+    one = export_results(run, tmp_path / "one")
+    other = copytree(one, tmp_path / "other")
+    with pytest.raises(ValueError, match=r"both of seed 0, which have the same replicas; allowed in a pool"):
+        write_report([one, other], tmp_path / "report", pool=True)
+    assert not (tmp_path / "report").exists()
+
+
+def with_field(run, name, value):
+    """Changes a field of the experiment in a run's recipe."""
+    recipe = json.loads((run / "recipe.json").read_text())
+    recipe["experiment"][name] = value
+    (run / "recipe.json").write_text(json.dumps(recipe))
+
+
+@pytest.mark.integration
 def test_runs_that_are_not_the_studys_have_no_columns_for_what_was_published(run, tmp_path):
     own = export_results(run, tmp_path / "fishery")
     content = json.loads((own / "recipe.json").read_text())
@@ -204,7 +249,8 @@ def test_the_command_writes_a_report(run, tmp_path, capsys, monkeypatch):
 
     monkeypatch.setattr("sys.argv", ["cprl", "export", str(run), str(tmp_path / "kept")])
     cli.main()
-    monkeypatch.setattr("sys.argv", ["cprl", "report", str(tmp_path / "kept"), "--out", str(tmp_path / "r")])
+    command = ["cprl", "report", str(tmp_path / "kept"), "--out", str(tmp_path / "r"), "--pool"]
+    monkeypatch.setattr("sys.argv", command)
     cli.main()
     assert capsys.readouterr().out.splitlines()[-1] == str(tmp_path / "r" / "tables.md")
     monkeypatch.setattr("sys.argv", ["cprl", "report"])

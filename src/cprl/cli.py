@@ -94,19 +94,23 @@ def run(
     say(done)
 
 
-def report(runs: tuple[Path, ...], /, *, out: Path = Path("report"), allow: Allow = ()) -> None:
+def report(
+    runs: tuple[Path, ...], /, *, out: Path = Path("report"), pool: bool = False, allow: Allow = ()
+) -> None:
     """Writes tables and figures of finished runs beside the published study.
 
     Args:
         runs: directories of runs, or of results.
         out: where to: tables.md and figures/.
+        pool: runs that differ in nothing but name, seed and the number of replicas are one, of all their
+            replicas.
         allow: code of your own, module:Class, that a run may import; see docs/experiments.md.
     """
     if not runs:
         raise ValueError("cprl report wants at least one run: cprl report RUN...")
     make_importable(allow)
     prepare_process(SEED)
-    say(write_report(runs, out, allow=allow))
+    say(write_report(runs, out, pool=pool, allow=allow))
 
 
 def play(

@@ -4,6 +4,7 @@ Modules, in the order in which one reads them:
     report        the tables in Markdown, and their figures
     verdicts      when a number, a curve or a claim is contradicted
     result        the files of a run that a report needs
+    pooled        runs of one experiment under several seeds, as one result
     random_play   10,000 episodes of random play
     appendix      appendix A beside ours
     curves        the published curves beside ours, under their own windows

@@ -20,6 +20,7 @@ from cprl.reporting.appendix import appendix, returns_of_others
 from cprl.reporting.figures import axis_title, draw_figures
 from cprl.reporting.markdown import table
 from cprl.reporting.measures import Measures
+from cprl.reporting.pooled import pooled
 from cprl.reporting.possible import shares_of
 from cprl.reporting.result import Result, read_result
 from cprl.reporting.turning import phases_of, turning_points_of
@@ -27,12 +28,14 @@ from cprl.runs.files import write_atomically
 from cprl.shipped import is_cprl
 
 
-def write_report(runs: Sequence[Path], out: Path, *, allow: Sequence[str] = ()) -> Path:
+def write_report(runs: Sequence[Path], out: Path, *, pool: bool = False, allow: Sequence[str] = ()) -> Path:
     """Writes `tables.md` and its figures.
 
     Args:
         runs: The directories of runs, or of exported results.
         out: The folder of the report; created if missing.
+        pool: Whether runs that differ in nothing but name, seed and the number of replicas are one, of all
+            their replicas, named after all of them.
         allow: See `cprl.load`.
 
     Returns:
@@ -40,14 +43,18 @@ def write_report(runs: Sequence[Path], out: Path, *, allow: Sequence[str] = ()) 
 
     Raises:
         ValueError: If a path has no run, or code of the user's own that is not allowed, or two runs have the
-            same name.
+            same name; in a pool, if two runs of one experiment have the same seed.
         FileNotFoundError: If a run has no episodes or has not ended.
     """
     folders = objects("runs", runs, (str, os.PathLike), "paths")
     out = arguments.path("out", out)
     allow = arguments.texts("allow", tuple(arguments.listed("allow", allow, "texts")))
+    arguments.switch("pool", pool)
     results = [read_result(arguments.path("runs", path), allow=allow) for path in folders]
     _refuse_equal_names(results)
+    each = results
+    if pool:
+        results = pooled(each)
     (out / "figures").mkdir(parents=True, exist_ok=True)
     of_study = [result for result in results if result.study]
     lines = [
@@ -56,7 +63,7 @@ def write_report(runs: Sequence[Path], out: Path, *, allow: Sequence[str] = ()) 
         "Made by `cprl report` from the results of these runs alone.",
         *_how(of_study),
         "",
-        *_runs(results),
+        *_runs(each),
         *shares_of(results),
         *appendix(of_study),
         *returns_of_others([result for result in results if not result.study]),
