@@ -15,6 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cprl import arguments
+from cprl.presets import Board
 
 Values = NDArray[np.float64]
 
@@ -34,6 +35,8 @@ class PublishedExperiment:
     number: int
     recipe: str
     """The name of our recipe, in recipes/."""
+    board: Board
+    """The board that it plays on, see `cprl.presets.game`."""
     random: float | None
     """The mean collective return of the random policy; None for experiment 4, where the study gives none."""
     trained: float
@@ -51,6 +54,7 @@ EXPERIMENTS: Final = (
     PublishedExperiment(
         number=1,
         recipe="single_basic",
+        board="single_basic",
         random=32.47,
         trained=174.65,
         episodes=6000,
@@ -60,6 +64,7 @@ EXPERIMENTS: Final = (
     PublishedExperiment(
         number=2,
         recipe="single_complex",
+        board="single_complex",
         random=59.53,
         trained=177.45,
         episodes=6000,
@@ -69,6 +74,7 @@ EXPERIMENTS: Final = (
     PublishedExperiment(
         number=3,
         recipe="two_complex",
+        board="two_complex",
         random=92.57,
         trained=191.72,
         episodes=6000,
@@ -78,6 +84,7 @@ EXPERIMENTS: Final = (
     PublishedExperiment(
         number=4,
         recipe="two_against_random",
+        board="two_complex",
         random=None,
         trained=184.07,
         episodes=6000,
@@ -91,6 +98,7 @@ EXPERIMENTS: Final = (
     PublishedExperiment(
         number=5,
         recipe="commons",
+        board="commons",
         random=264.53,
         trained=491.17,
         episodes=4800,

@@ -14,7 +14,6 @@ from numpy.typing import NDArray
 from cprl import presets
 from cprl.algorithms import DQN
 from cprl.commons.game import Game
-from cprl.commons.maps import Map
 from cprl.experiment import Experiment
 from cprl.measuring.published import SMOOTHED_EPISODES, PublishedExperiment, published_experiment
 from cprl.population import Learning, Scripted, Team, exploration_steps
@@ -189,7 +188,7 @@ def study_of(recipe: str, experiment: Experiment) -> PublishedExperiment | None:
     included, with as many agents that learn by DQN, whatever their settings; None for others."""
     game, specs = experiment.game, experiment.agents
     named = published_experiment(recipe)
-    if named is not None and isinstance(game, Game) and game.map == _map_of(named):
+    if named is not None and isinstance(game, Game) and game.map == presets.game(named.board).map:
         return named
     if not isinstance(game, Game) or presets.variant_of(game) is None:
         return None
@@ -201,8 +200,3 @@ def study_of(recipe: str, experiment: Experiment) -> PublishedExperiment | None:
         return None
     boards = {presets.game(board).map: board for board in presets.BOARDS}
     return published_experiment("two_against_random" if against_random else boards[game.map])
-
-
-def _map_of(study: PublishedExperiment) -> Map:
-    board = "two_complex" if study.recipe == "two_against_random" else study.recipe
-    return next(presets.game(own).map for own in presets.BOARDS if own == board)
