@@ -118,15 +118,15 @@ def cost(run: Path, repeats: int) -> Cost:
     for _ in range(steps // BLOCK):
         seconds(None)
     with ViewerCallback(run, env, title="cost", episodes=EPISODES) as watch:
-        every, watch.every = watch.every, 1
+        every, watch.filming.every = watch.filming.every, 1
         shown = ratio(watch)
-        watch.every = 10**9
+        watch.filming.every = 10**9
         others = ratio(watch)
     policy = PresentPolicy({AGENTS: (learner.evaluation_actor(1), learner.actor)}, {}, replicas=REPLICAS)
     world = CommonsEnv(game, 1, seed=0, first_world=2**31)
     how = {"title": "cost", "episodes": EPISODES, "live": "serve", "exhibited": (policy, world)}
     with ViewerCallback(run, env, **how) as watch:
-        watch.every = 10**9
+        watch.filming.every = 10**9
         watch.exhibition._clock, watch.exhibition._due = clock, clock()
         before = watch.exhibition.steps, clock()
         live = ratio(watch)
@@ -162,7 +162,7 @@ def size(run: Path, episodes: int) -> tuple[int, int]:
         training = Training(env, {}, others=at_random, episodes=10**9, callbacks=[witness])
         unseen = TensorDict({}, [REPLICAS])
         for number in range(episodes):
-            if watch.is_shown:
+            if watch.filming.is_shown(number):
                 for _ in range(game.rules.episode_steps):
                     training.step()
             else:

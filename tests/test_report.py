@@ -170,47 +170,88 @@ def test_a_report_of_runs_of_one_name_is_refused_and_other_names_are_links(run, 
     assert "| a run \\| of mine | two_against_random" in text
 
 
-@pytest.mark.integration
-def test_runs_of_one_experiment_are_pooled_where_it_is_asked_for(run, tmp_path):
-    one = export_results(run, tmp_path / "one")
-    other, longer = copytree(one, tmp_path / "other"), copytree(one, tmp_path / "longer")
-    with_field(other, "seed", 1000)
-    with_field(longer, "seed", 2000)
-    with_field(longer, "update_every", 2)
-    text = write_report([one, longer, other], tmp_path / "pooled", pool=True).read_text()
-    returns = as_curves(read_episodes(run))["collective_return"].mean(1)
-    twice = estimate(np.concatenate([returns, returns]))
-    assert f"| one+other | 4 | 184.07 | {twice} |" in text
-    assert f"| longer | 4 | 184.07 | {estimate(returns)} |" in text
-    assert "| one |" in text.split("## Share of the possible")[0], "each run has made its training"
-    assert "| one |" not in text.split("## Share of the possible")[1]
-    assert (tmp_path / "pooled" / "figures" / "one+other_return_1.png").exists()
-    apart = write_report([one, longer, other], tmp_path / "apart").read_text()
-    assert f"| one | 4 | 184.07 | {estimate(returns)} |" in apart, "nothing is pooled unless it is asked for"
+@pytest.fixture(scope="module")
+def other(run):
+    """The same experiment with another seed and number of replicas."""
+    experiment = cprl.load(run).experiment
+    return cprl.run(replace(experiment, seed=1000, replicas=3), run.with_name("other"), watch="off")
 
-    both, single = pooled([read_result(one), read_result(other)])[0], read_result(one)
-    assert both.title == single.title.replace("2 replicas", "4 replicas")
-    for columns in (both.of_agents("return"), both.evaluated("trained")["collective_return"]):
-        assert np.array_equal(columns[:2], columns[2:])
+
+@pytest.mark.integration
+def test_runs_of_one_experiment_are_pooled_where_it_is_asked_for(run, other, tmp_path):
+    longer = export_results(run, tmp_path / "longer")
+    with_field(longer, "experiment", lambda experiment: {**experiment, "seed": 2000, "update_every": 2})
+    text = write_report([run, longer, other], tmp_path / "pooled", pool=True).read_text()
+    mine, theirs = (as_curves(read_episodes(own))["collective_return"].mean(1) for own in (run, other))
+    assert len(mine) == 2
+    assert len(theirs) == 3
+    assert f"| four+other | 4 | 184.07 | {estimate(np.concatenate([mine, theirs]))} |" in text
+    assert f"| longer | 4 | 184.07 | {estimate(mine)} |" in text, "of another experiment"
+    assert "as runs of one experiment: four and other as four+other.\n" in text
+    before, after = text.split("## Share of the possible")
+    assert "| four | two_against_random" in before, "each run has its training and its command"
+    assert "| four |" not in after
+    assert (tmp_path / "pooled" / "figures" / "four+other_return_1.png").exists()
+    apart = write_report([run, other], tmp_path / "apart").read_text()
+    assert f"| four | 4 | 184.07 | {estimate(mine)} |" in apart, "nothing is pooled unless it is asked for"
+    none = write_report([run, longer], tmp_path / "none", pool=True).read_text()
+    assert "Nothing is pooled: no two runs have experiments equal but for name, seed" in none
+
+
+@pytest.mark.integration
+def test_a_pool_has_what_its_runs_have_replica_by_replica(run, other):
+    parts = [read_result(run), read_result(other)]
+    (both,) = pooled(parts)
+    assert "5 replicas of 12 episodes" in both.title
+    for of in (
+        lambda result: result.curves["survival_steps"],
+        lambda result: result.of_agents("return"),
+        lambda result: result.evaluated("trained")["collective_return"],
+        lambda result: result.measures.training["mean collective return over training"],
+    ):
+        np.testing.assert_array_equal(of(both), np.concatenate([of(part) for part in parts]))
     assert both.of_agents("no such column") is None
-    assert both.measures.trained.keys() == single.measures.trained.keys()
-    assert all(len(values) == 4 for values in both.measures.training.values())
+    trained, random = both.measures.trained, both.measures.random
+    assert {len(values) for values in (*trained.values(), *random.values())} == {5}
+    name = ROUNDS.format(agent=0)
+    np.testing.assert_array_equal(trained[name][:2], parts[0].measures.trained[name])
+    assert not np.array_equal(random[name][:2], random[name][2:4]), "each run plays in worlds of its own"
+
+
+@pytest.mark.integration
+def test_a_pool_of_which_a_run_has_no_weights_is_of_trainings_alone(run, other, tmp_path):
+    light = export_results(other, tmp_path / "light", weights=False)
+    text = write_report([run, light], tmp_path / "report", pool=True).read_text()
+    assert "Exported without weights, some of the runs: nobody could play" in text
+    assert "shots per 1000 steps" not in text
+
+
+@pytest.mark.integration
+def test_a_pool_is_named_so_that_its_figures_can_be_written(run, other, tmp_path):
+    one, two = export_results(run, tmp_path / ("a" * 100)), export_results(other, tmp_path / ("b" * 100))
+    (both,) = pooled([read_result(one), read_result(two)])
+    assert both.name == "a" * 100 + "+1 more"
+    four = export_results(run, tmp_path / "four+other")
+    with_field(four, "experiment", lambda experiment: {**experiment, "update_every": 2})
+    with pytest.raises(ValueError, match=r"both named 'four\+other'"):
+        write_report([run, other, four], tmp_path / "report", pool=True)
+    assert not (tmp_path / "report").exists()
 
 
 @pytest.mark.integration
 def test_runs_of_the_same_replicas_are_not_pooled(run, tmp_path):
-    one = export_results(run, tmp_path / "one")
-    other = copytree(one, tmp_path / "other")
+    again = export_results(run, tmp_path / "again")
     with pytest.raises(ValueError, match=r"both of seed 0, which have the same replicas; allowed in a pool"):
-        write_report([one, other], tmp_path / "report", pool=True)
+        write_report([run, again], tmp_path / "report", pool=True)
     assert not (tmp_path / "report").exists()
+    with_field(again, "recipe", lambda name: "mine")
+    assert len(pooled([read_result(run), read_result(again)])) == 2, "one repeats experiment 4, by its name"
 
 
-def with_field(run, name, value):
-    """Changes a field of the experiment in a run's recipe."""
+def with_field(run, name, changed):
+    """Changes an entry of a run's recipe."""
     recipe = json.loads((run / "recipe.json").read_text())
-    recipe["experiment"][name] = value
-    (run / "recipe.json").write_text(json.dumps(recipe))
+    (run / "recipe.json").write_text(json.dumps({**recipe, name: changed(recipe[name])}))
 
 
 @pytest.mark.integration

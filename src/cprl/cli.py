@@ -102,8 +102,8 @@ def report(
     Args:
         runs: directories of runs, or of results.
         out: where to: tables.md and figures/.
-        pool: runs that differ in nothing but name, seed and the number of replicas are one, of all their
-            replicas.
+        pool: runs whose experiments differ in nothing but name, seed, replicas and on_nan are one, of all
+            their replicas.
         allow: code of your own, module:Class, that a run may import; see docs/experiments.md.
     """
     if not runs:

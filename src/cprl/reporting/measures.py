@@ -43,12 +43,15 @@ class Measures:
     """Of the random policy in the same worlds; likewise."""
 
 
-def measures(run: Path, *, window: int = SMOOTHED_EPISODES, allow: Sequence[str] = ()) -> Measures:
+def measures(
+    run: Path, *, window: int = SMOOTHED_EPISODES, seed: int = SEED, allow: Sequence[str] = ()
+) -> Measures:
     """All measures of a run: of its training curves, and of its trained agents in new worlds.
 
     Args:
         run: The directory of the run, or of its exported results.
         window: The window of the running means of which some measures are, in episodes.
+        seed: The seed of the new worlds.
         allow: See `cprl.load`.
     """
     training = of_training(curves_of(run), window=window)
@@ -56,30 +59,34 @@ def measures(run: Path, *, window: int = SMOOTHED_EPISODES, allow: Sequence[str]
         return Measures(training=training, trained={}, random={})
     loaded = load(run, allow=allow)
     replicas = tuple(loaded.replicas)
-    trained = _at_play(loaded, replicas, partial(policies_of, [Source(loaded)] * loaded.game.agents))
+    trained = _at_play(
+        loaded, replicas, partial(policies_of, [Source(loaded)] * loaded.game.agents), seed=seed
+    )
     return Measures(
         training=training,
         trained={name: values for name, values in trained.items() if np.isfinite(values).all()},
-        random=_by_chance(loaded, replicas),
+        random=_by_chance(loaded, replicas, seed=seed),
     )
 
 
 _PLAYED_BY_CHANCE: Final[dict[Any, dict[str, Values]]] = {}
 
 
-def _by_chance(run: LoadedRun, replicas: tuple[int, ...]) -> dict[str, Values]:
+def _by_chance(run: LoadedRun, replicas: tuple[int, ...], *, seed: int) -> dict[str, Values]:
     """`of_play` of the random policy; the same for all runs of a game, so played once."""
-    key = run.game, run.experiment.transforms, replicas
+    key = run.game, run.experiment.transforms, replicas, seed
     if key not in _PLAYED_BY_CHANCE:
-        _PLAYED_BY_CHANCE[key] = _at_play(run, replicas, partial(random_policies, run))
+        _PLAYED_BY_CHANCE[key] = _at_play(run, replicas, partial(random_policies, run), seed=seed)
     return _PLAYED_BY_CHANCE[key]
 
 
-def _at_play(run: LoadedRun, replicas: Sequence[int], who: Callable[..., AgentPolicies]) -> dict[str, Values]:
+def _at_play(
+    run: LoadedRun, replicas: Sequence[int], who: Callable[..., AgentPolicies], *, seed: int
+) -> dict[str, Values]:
     """`of_play` of a game in the same fresh worlds, whoever plays."""
     found: dict[str, list[Values]] = {}
-    for group, env in fresh_worlds(run, replicas, worlds=WORLDS, seed=SEED):
-        played = trace(env, who(group, worlds=WORLDS, seed=SEED))
+    for group, env in fresh_worlds(run, replicas, worlds=WORLDS, seed=seed):
+        played = trace(env, who(group, worlds=WORLDS, seed=seed))
         for name, values in of_play(played, len(group)).items():
             found.setdefault(name, []).append(values)
     return {name: np.concatenate(values) for name, values in found.items()}

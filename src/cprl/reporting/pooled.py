@@ -1,36 +1,46 @@
 """Runs of one experiment under several seeds, as one result of all their replicas."""
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from functools import cached_property
+from typing import Final
 
 import numpy as np
 
-from cprl.reporting.measures import Measures
+from cprl.evaluation.evaluate import SEED
+from cprl.reporting.measures import Measures, measures, of_training
 from cprl.reporting.result import Result, Values
-from cprl.studies.conditions import Condition
+from cprl.runs.kept import lacks_weights
+from cprl.studies.conditions import UNNAMED, Condition
+
+_LONGEST_NAME: Final = 80
+"""Of a pool; figures are named after it."""
 
 
 @dataclass(kw_only=True, eq=False)
 class PooledResult(Result):
-    """Several runs that differ in nothing but name, seed and the number of replicas; what they are is told by
-    the first.
+    """Several runs of one experiment; what they are is told by the first."""
 
-    Where agents are measured at play, replica r of each plays the same fresh worlds, as those of two
-    experiments do.
-    """
-
-    parts: Sequence[Result] = field(kw_only=True)
+    parts: Sequence[Result]
 
     @property
     def name(self) -> str:
-        """The names of the runs' directories, joined by "+"."""
-        return "+".join(part.name for part in self.parts)
+        """The names of the runs' directories, or that of the first and the number of others."""
+        first, *others = (part.name for part in self.parts)
+        whole = "+".join([first, *others])
+        return whole if len(whole) <= _LONGEST_NAME else f"{first}+{len(others)} more"
 
     @cached_property
     def measures(self) -> Measures:
-        """Measures of all trainings; those of agents at play where all runs have them."""
-        each = [part.measures for part in self.parts]
+        """Measures of all trainings, and of agents at play where all runs have weights: each run's in worlds
+        of its own, so that replicas are independent."""
+        if any(lacks_weights(part.path) for part in self.parts):
+            training = of_training(dict(self.curves), window=self.window)
+            return Measures(training=training, trained={}, random={})
+        each = [
+            measures(part.path, window=self.window, seed=SEED + nth, allow=part.allow)
+            for nth, part in enumerate(self.parts)
+        ]
         return Measures(
             training=_joined([own.training for own in each]),
             trained=_joined([own.trained for own in each]),
@@ -53,12 +63,16 @@ class PooledResult(Result):
 def pooled(results: Sequence[Result]) -> list[Result]:
     """Results of which those of one experiment are one, in the place of the first; others as they are.
 
+    An experiment is one whatever its runs are called, but what repeats an experiment of the study is pooled
+    only with what repeats it, too.
+
     Raises:
         ValueError: for two runs of one experiment with the same seed, whose replicas are the same.
     """
-    groups: dict[str, list[Result]] = {}
+    groups: dict[tuple[str, int | None], list[Result]] = {}
     for result in results:
-        group = groups.setdefault(Condition(result.experiment).checksum, [])
+        number = None if result.study is None else result.study.number
+        group = groups.setdefault((Condition(result.experiment).checksum, number), [])
         same = [other.path for other in group if other.experiment.seed == result.experiment.seed]
         if same:
             raise ValueError(
@@ -81,6 +95,18 @@ def _of(parts: Sequence[Result]) -> PooledResult:
         allow=first.allow,
         parts=parts,
     )
+
+
+def told(results: Sequence[Result]) -> list[str]:
+    """What is pooled, in a paragraph."""
+    pools = [
+        f"{' and '.join(part.name for part in own.parts)} as {own.name}"
+        for own in results
+        if isinstance(own, PooledResult)
+    ]
+    if pools:
+        return [f"From here on these are one, as runs of one experiment: {'; '.join(pools)}.", ""]
+    return [f"Nothing is pooled: no two runs have experiments equal but for {', '.join(UNNAMED)}.", ""]
 
 
 def _joined(tables: Sequence[Mapping[str, Values]]) -> dict[str, Values]:

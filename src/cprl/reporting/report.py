@@ -19,8 +19,7 @@ from cprl.reporting import claims, claims_alone, claims_many, curves
 from cprl.reporting.appendix import appendix, returns_of_others
 from cprl.reporting.figures import axis_title, draw_figures
 from cprl.reporting.markdown import table
-from cprl.reporting.measures import Measures
-from cprl.reporting.pooled import pooled
+from cprl.reporting.pooled import PooledResult, pooled, told
 from cprl.reporting.possible import shares_of
 from cprl.reporting.result import Result, read_result
 from cprl.reporting.turning import phases_of, turning_points_of
@@ -34,8 +33,8 @@ def write_report(runs: Sequence[Path], out: Path, *, pool: bool = False, allow: 
     Args:
         runs: The directories of runs, or of exported results.
         out: The folder of the report; created if missing.
-        pool: Whether runs that differ in nothing but name, seed and the number of replicas are one, of all
-            their replicas, named after all of them.
+        pool: Whether runs whose experiments differ in nothing but name, seed, the number of replicas and
+            `on_nan` are one, of all their replicas.
         allow: See `cprl.load`.
 
     Returns:
@@ -55,6 +54,7 @@ def write_report(runs: Sequence[Path], out: Path, *, pool: bool = False, allow: 
     each = results
     if pool:
         results = pooled(each)
+        _refuse_equal_names(results)
     (out / "figures").mkdir(parents=True, exist_ok=True)
     of_study = [result for result in results if result.study]
     lines = [
@@ -64,6 +64,7 @@ def write_report(runs: Sequence[Path], out: Path, *, pool: bool = False, allow: 
         *_how(of_study),
         "",
         *_runs(each),
+        *(told(results) if pool else []),
         *shares_of(results),
         *appendix(of_study),
         *returns_of_others([result for result in results if not result.study]),
@@ -167,16 +168,18 @@ def _measures(results: Sequence[Result]) -> list[str]:
             for name, values in own.trained.items()
         ]
         agents = "trained" if result.learns else "agents"
-        lines += [f"### {result.name}", "", *_without_weights(own)]
+        lines += [f"### {result.name}", "", *_without_weights(result)]
         lines += table(["measure", agents, "random policy"], rows)
     return lines
 
 
-def _without_weights(own: Measures) -> list[str]:
-    if own.random:
+def _without_weights(result: Result) -> list[str]:
+    if result.measures.random:
         return []
+    some = ", some of the runs" if isinstance(result, PooledResult) else ""
     return [
-        "Exported without weights: nobody could play, so measures and claims are of the training alone.",
+        f"Exported without weights{some}: nobody could play, so measures and claims are of the training "
+        "alone.",
         "",
     ]
 

@@ -4,7 +4,7 @@ Modules, in the order in which one reads them:
     paths        places of values in an experiment, as texts
     factors      levels, and distributions of random draws
     naming       what conditions and levels are called
-    conditions   one experiment of a study, and the checksum that names its runs
+    conditions   one experiment of a study: what levels make of it, and the checksum that names its runs
     study        Study: factors, replicas, pairing; a value
     status       what a trial says of itself while it runs
     extending    runs that go on from shorter ones

@@ -83,7 +83,7 @@ class ViewerCallback:
         checked("file_name", file_name, either(TEXT, NONE))
         check_nesting(recipe, "recipe")
         run = path_of("run", run)
-        self.env, self._episodes = env, episodes
+        self.env = env
         self._agents, reported = agent_names(env), reported_by(env)
         curves, commons = curves_of(env, self._agents, reported, episodes=episodes), commons_of(env)
         scene = None if commons is None else scene_of(commons, curves, is_replay=is_replay)
@@ -98,7 +98,8 @@ class ViewerCallback:
             recording_id=recording_id(run, file_name or FILE_NAME),
             console=console,
         )
-        self._filming = Filming(commons, self.logger, scene, episodes=episodes)
+        self.filming = Filming(commons, self.logger, scene, episodes=episodes)
+        """Which episodes are recorded frame by frame."""
         self.exhibition: Exhibition | None = None
         """What the present policy plays for viewers; None where nothing is exhibited."""
         if exhibited is not None and scene is not None:
@@ -116,7 +117,7 @@ class ViewerCallback:
             self.logger,
             curves if scene is None else scene,
             episodes=episodes,
-            every=self._filming.every,
+            every=self.filming.every,
         )
         self._institutions = institution_views(self.logger, commons)
         has_tags = curves.has_tags and len(self._agents) > 1
@@ -124,7 +125,7 @@ class ViewerCallback:
         self._tags = Tags(self.logger, len(self._agents)) if has_tags else None
         self._step = self._episode = 0
         self._has_died = False
-        self._filming.choose(0)
+        self.filming.choose(0)
         self._rate_at = time.perf_counter()
         self._rate_step = 0
         self.logger.log_hparams({"run": run.name, **(recipe or {})})
@@ -143,12 +144,12 @@ class ViewerCallback:
         Otherwise it only counts: reading a tensor each turn would cost a training some percent.
         """
         self._step += 1
-        if not self._filming.is_on and self._step % self._sampled:
+        if not self.filming.is_on and self._step % self._sampled:
             return  # nothing is due; whatever runs here displaces a training's data from the fast caches
-        self._filming.choose(self._episode)
+        self.filming.choose(self._episode)
         if self.exhibition is not None:
             self.exhibition.on_step(episode=self._episode)
-        frame = self._filming.add(batch, step=self._step, episode=self._episode)
+        frame = self.filming.add(batch, step=self._step, episode=self._episode)
         self._views.on_step(self._step, self._episode, frame)
 
     def on_episode(self, episode: Episode, learning: Mapping[str, float]) -> None:
@@ -158,7 +159,7 @@ class ViewerCallback:
             if self._institutions is not None and episode.episode % self._views.every == 0:
                 self.logger.at(step=self._step, episode=episode.episode)
                 self._institutions.on_episode(episode)
-            self._episode, self._filming.shows_next = episode.episode + 1, False
+            self._episode, self.filming.shows_next = episode.episode + 1, False
         if self._tags is not None and episode.tagged_by is not None:
             self._tags.add(episode.tagged_by)
         self._views.on_episode(episode)
@@ -171,7 +172,7 @@ class ViewerCallback:
             self._stop_notice()
             self.logger.at(step=self._step, episode=episode.episode)
             self._log(episode.episode, of_all)
-        self._filming.choose(self._episode)
+        self.filming.choose(self._episode)
 
     def _show_status(self, status: str) -> None:
         """Shows a status in the header of the live view; from any thread."""
@@ -181,7 +182,7 @@ class ViewerCallback:
     def _log_death(self, episode: Episode) -> None:
         """Logs the step of the last apple in the first replica, for the first time and where one sees it."""
         step = episode.depletion_step or -1
-        if step > 0 and (self._filming.is_shown(self._episode) or not self._has_died):
+        if step > 0 and (self.filming.is_shown(self._episode) or not self._has_died):
             self.logger.at(step=self._step, episode=episode.episode)
             self.logger.log_text(f"episode {episode.episode:,}: last apple taken in step {step}")
             self._has_died = True
@@ -196,7 +197,7 @@ class ViewerCallback:
             self._rate_at, self._rate_step = now, self._step
         if self.story is not None:
             events = self.story.on_episode(episode, of_all, None if died is None else float(np.nansum(died)))
-            self._filming.shows_next |= any(event.startswith("new best") for event in events)
+            self.filming.shows_next |= any(event.startswith("new best") for event in events)
         if self._tags is not None:
             self._tags.on_episode(episode)
 
@@ -223,7 +224,7 @@ class ViewerCallback:
         Args:
             played: the episodes of its evaluation, "trained" and "random".
         """
-        self._filming.send()
+        self.filming.send()
         self._views.close()
         if self.story is not None:
             self.story.finished(played["trained"], played["random"])
@@ -240,7 +241,7 @@ class ViewerCallback:
 
     def flush(self) -> None:
         """Sends all that waits, to the file and to viewers."""
-        self._filming.send()
+        self.filming.send()
         self.logger.flush()
 
     def state_dict(self) -> dict[str, Any]:
@@ -249,7 +250,7 @@ class ViewerCallback:
         return {
             "step": self._step,
             "episode": self._episode,
-            **self._filming.state_dict(),
+            **self.filming.state_dict(),
             "series": self._series.state_dict(),
             "plots": self.plots.state_dict(),
             "views": self._views.state_dict(),
@@ -261,7 +262,7 @@ class ViewerCallback:
         """Continues from a state that `state_dict` returned."""
         self._step = self._rate_step = int(state["step"])
         self._episode = int(state["episode"])
-        self._filming.load_state_dict(state, episode=self._episode)
+        self.filming.load_state_dict(state, episode=self._episode)
         self._series.load_state_dict(state["series"])
         self.plots.load_state_dict(state.get("plots", {}))
         self._views.load_state_dict(state.get("views", {}))
@@ -288,7 +289,7 @@ class ViewerCallback:
         self._stop_notice()
         if self.exhibition is not None:
             self.exhibition.close()
-        self._filming.send()
+        self.filming.send()
         self._views.close()
         if self.story is not None:
             self.story.close()

@@ -173,8 +173,7 @@ class TorchRLReplayLearner:
         return self._lanes.networks(self.stock)
 
     def begin(self) -> None:
-        """Ends the episodes that an earlier training left unfinished; see `Learner`. Whole transitions know
-        nothing of those after them; `MultiStepTransform` sums up to the last that it holds back."""
+        """Ends the episodes that an earlier training left unfinished; see `Learner`."""
         self.buffers.end_episodes()
 
     def store(self, batch: TensorDictBase) -> None:
