@@ -5,6 +5,7 @@ A failure here names the part that an upgrade has changed, and where cprl relies
 
 import gc
 import importlib
+import inspect
 import re
 import subprocess
 import sys
@@ -560,6 +561,19 @@ for number in range(4):
 # Rerun 0.41 never ends the recording into which it writes a blueprint; none left would be better.
 assert left[-1] - left[0] <= 2 * 3, left
 """
+
+
+def test_torch_is_quiet_about_operations_that_its_code_calls_by_the_dispatcher(caplog):
+    with relies_on("the logger of torch._inductor.ir", used_by="compat.quiet_about_fallbacks"):
+        from torch._inductor import ir
+
+        assert '"%s is missing a c-shim implementation' in inspect.getsource(ir)
+        with compat.quiet_about_fallbacks():
+            ir.log.warning("%s is missing a c-shim implementation", "aten.multinomial")
+            ir.log.warning("something else")
+        assert caplog.messages == ["something else"]
+        ir.log.warning("%s is missing a c-shim implementation", "aten.multinomial")
+        assert len(caplog.messages) == 2
 
 
 def test_recordings_that_nothing_refers_to_can_be_ended():

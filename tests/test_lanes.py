@@ -333,12 +333,12 @@ def test_what_it_takes_is_told_before_and_what_cannot_fit_is_refused(caplog):
     assert storage_bytes(20, 100_000, (3, 7, 15)) < 0.8e9
     with caplog.at_level("INFO", logger="cprl"):
         lane_buffer(seeds=[(0,), (1,)], transitions=10_000, batch_size=8, observation_shape=SHAPE)
-    assert "Replay buffers of 2 lanes x 10,000 transitions: 0.00 GiB of " in caplog.text
+    assert "Replay buffers of 2 learners x 10,000 transitions: 0.00 GiB of " in caplog.text
     buffer = filled([0, 1])
     storage = buffer.storage
     taken = sum(field.numel() * field.element_size() for field in storage.fields.values())
     assert taken == storage_bytes(2, 40, SHAPE)
-    with pytest.raises(MemoryError, match=r"200 lanes x 10,000,000 transitions take [\d.]+ GiB; .* are free"):
+    with pytest.raises(MemoryError, match=r"200 learners x 10,000,000 .* take [\d.]+ GiB; .* are free"):
         lane_buffer(
             seeds=[(lane,) for lane in range(200)],
             transitions=10_000_000,

@@ -567,13 +567,13 @@ MANY = {**HOW, "replicas": 2**20}
         (
             DQN(settings=DQNSettings(hidden_cells=WIDE[:1])),
             {**HOW, "replicas": 200},
-            r"networks of 400 lanes, ",
+            r"networks of 400 learners, ",
         ),
         (DQN(settings=REPLAY), MANY, r"1048576 replicas of 2 agents take .*: use fewer replicas"),
         (
             PPO(settings=RolloutSettings(rollout_steps=2**28, minibatch_size=1)),
             HOW,
-            r"(rollouts of 2 lanes x 268,435,456 steps|random numbers of 2 lanes, 268,435,456 a step)",
+            r"(rollouts of 2 learners x 268,435,456 steps|random numbers of 2 agents, 268,435,456 a step)",
         ),
     ],
 )
@@ -594,7 +594,7 @@ def test_tables_of_too_many_agents_are_refused_too(monkeypatch):
 
 def test_an_evaluation_that_no_memory_has_is_refused_before_anything_is_written(tmp_path, monkeypatch):
     monkeypatch.setattr("cprl.memory.free_bytes", lambda device="cpu": 50 * 2**20)
-    with pytest.raises(TooLargeError, match=r"random numbers of 2 lanes, .* fewer evaluation episodes"):
+    with pytest.raises(TooLargeError, match=r"random numbers of 2 agents, .* fewer evaluation episodes"):
         run(replace(EXPERIMENT, evaluation_episodes=1000), tmp_path / "run", watch="off")
     assert list(tmp_path.iterdir()) == []
 
@@ -602,7 +602,7 @@ def test_an_evaluation_that_no_memory_has_is_refused_before_anything_is_written(
 def test_the_refusal_of_what_is_too_large_is_a_value_error_and_a_memory_error():
     assert issubclass(TooLargeError, ValueError)
     assert issubclass(TooLargeError, MemoryError)
-    with pytest.raises(TooLargeError, match=r"^random numbers of 2 lanes, 2,147,483,647 a step .* take 65,5"):
+    with pytest.raises(TooLargeError, match=r"^random numbers of 2 agents, 2,147,483,647 a .* take 65,5"):
         LaneRng([(0,), (1,)], 2**31 - 1)
 
 

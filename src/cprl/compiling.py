@@ -18,6 +18,7 @@ from cprl.compat import (
     compiled_code,
     every_guard,
     fits,
+    quiet_about_fallbacks,
     remember_vector_instructions,
     sound_local_buffers,
     with_own_code,
@@ -134,7 +135,7 @@ class Compiled:
             # variables of its code: not dynamic.
             self._compiled = torch.compile(own, fullgraph=True, dynamic=False, options=options)
             try:
-                with warnings.catch_warnings(), every_guard(), sound_local_buffers():
+                with warnings.catch_warnings(), every_guard(), sound_local_buffers(), quiet_about_fallbacks():
                     for kind in (DeprecationWarning, FutureWarning):  # raised inside torch and TorchRL
                         warnings.simplefilter("ignore", kind)
                     return self._compiled(*arguments), not further

@@ -23,6 +23,7 @@ from cprl.compat.compiling import NO_GUARDS as NO_GUARDS
 from cprl.compat.compiling import compiled_code as compiled_code
 from cprl.compat.compiling import every_guard as every_guard
 from cprl.compat.compiling import fits as fits
+from cprl.compat.compiling import quiet_about_fallbacks as quiet_about_fallbacks
 from cprl.compat.compiling import remember_vector_instructions as remember_vector_instructions
 from cprl.compat.compiling import sound_local_buffers as sound_local_buffers
 from cprl.compat.compiling import with_own_code as with_own_code

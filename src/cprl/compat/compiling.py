@@ -1,7 +1,8 @@
 """torch.compile: what it is asked for, its cache and its guards."""
 
-from collections.abc import Mapping, Sequence
-from contextlib import AbstractContextManager, suppress
+import logging
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import AbstractContextManager, contextmanager, suppress
 from functools import cache
 from hashlib import sha256
 from pathlib import Path
@@ -103,6 +104,22 @@ def without_lookup(function: FunctionType, code: CodeType) -> FunctionType:
         code: from `compiled_code`.
     """
     return FunctionType(code, dict(function.__globals__), function.__name__)
+
+
+@contextmanager
+def quiet_about_fallbacks() -> Iterator[None]:
+    """While it is open, torch does not warn of each operation, such as sampling, that its C++ code calls by
+    torch's dispatcher instead of a function of its own; the results are the same."""
+
+    def says_more(record: logging.LogRecord) -> bool:
+        return "missing a c-shim" not in str(record.msg)
+
+    torch_log = logging.getLogger("torch._inductor.ir")
+    torch_log.addFilter(says_more)
+    try:
+        yield
+    finally:
+        torch_log.removeFilter(says_more)
 
 
 @cache

@@ -69,7 +69,7 @@ def check_networks(network: nn.Module, lanes: int, device: str | torch.device) -
     """Raises a TooLargeError if a device has too little memory to train a network like this for each lane."""
     size = sum(value.numel() * value.element_size() for value in network.parameters())
     check_memory(
-        f"the networks of {lanes} lanes, {size / 2**20:,.1f} MiB each, with targets and optimisers",
+        f"the networks of {lanes} learners, {size / 2**20:,.1f} MiB each, with targets and optimisers",
         lanes * size * _COPIES,
         "smaller networks or fewer replicas",
         device=device,
@@ -88,7 +88,7 @@ def check_rollouts(
         device: the device of rollouts and updates.
     """
     check_memory(
-        f"the rollouts of {size[1]} lanes x {size[0]:,} steps",
+        f"the rollouts of {size[1]} learners x {size[0]:,} steps",
         prod(size) * (2 * prod(shape) * (dtype.itemsize + 4) + 64),
         "fewer rollout_steps or fewer replicas",
         device=device,

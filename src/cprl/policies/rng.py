@@ -57,7 +57,7 @@ class LaneRng:
         self.lanes, self.count = len(own), arguments.integer("count", count, 1, 2**40)
         self._ahead = arguments.integer("ahead", ahead, 1, DRAWN_AHEAD)
         check_memory(
-            f"random numbers of {self.lanes:,} lanes, {self.count:,} a step and {self._ahead} steps ahead,",
+            f"random numbers of {self.lanes:,} agents, {self.count:,} a step and {self._ahead} steps ahead,",
             8 * 2 * self._ahead * self.lanes * self.count,
             "smaller batches or rollouts, fewer evaluation episodes or fewer replicas",
         )

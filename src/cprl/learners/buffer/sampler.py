@@ -193,14 +193,14 @@ def lane_buffer(
     windows = len(seeds) * batch_size * sequence_steps * 2
     sampled = windows * prod(observation_shape) * (dtype.itemsize + 4)  # and as float32
     check_memory(
-        f"the replay buffers of {len(seeds)} lanes x {transitions:,} transitions",
+        f"the replay buffers of {len(seeds)} learners x {transitions:,} transitions",
         needed + sampled,
         "a smaller buffer_size or batch_size, or fewer replicas",
         device=device,
     )
     if needed >= 2**20:
         logging.getLogger("cprl").info(
-            "Replay buffers of %d lanes x %s transitions: %.2f GiB of %.1f GiB free",
+            "Replay buffers of %d learners x %s transitions: %.2f GiB of %.1f GiB free",
             len(seeds),
             f"{transitions:,}",
             needed / 2**30,
