@@ -3,7 +3,7 @@
     for seed in 1 2 3; do python recipes/tragedy.py --seed $seed --watch off --out runs/tragedy-$seed; done
     python docs/tragedy_seeds.py runs/tragedy-*
 
-Intervals are those of the mean over replicas, 95 %, by bootstrap, as when docs/tragedy.md was written.
+Intervals are those of the mean over replicas, 95 %, by Student's t.
 """
 
 import sys
@@ -33,11 +33,11 @@ def main(runs: list[Path]) -> None:
         cells = [
             load(run).experiment.seed,
             course.replicas,
-            _told(estimate(peak.mean(1), interval="bca")),
+            _told(estimate(peak.mean(1))),
             course.peak_episode,
-            _told(estimate(last, interval="bca")),
+            _told(estimate(last)),
             f"{change:+.0%} of {course.random_return:.0f} ± {course.random_error:.1f}",
-            _told(estimate(lengths, interval="bca")),
+            _told(estimate(lengths)),
             "yes" if course.is_tragedy else "no",
         ]
         print("| " + " | ".join(map(str, cells)) + " |")
