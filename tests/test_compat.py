@@ -405,6 +405,7 @@ def scaled(values):
     return values * Doubling.factor
 
 
+@pytest.mark.integration
 @ignored
 def test_torch_leaves_guards_out_on_request(monkeypatch):
     with relies_on("skip_all_guards_unsafe", used_by="compat.NO_GUARDS, beside compat.COMPILE_OPTIONS,"):

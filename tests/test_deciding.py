@@ -489,6 +489,7 @@ def test_engines_and_collectors_of_torchrl_have_the_same_decisions(engine):
     assert found[0][:2] == found[2][:2]
 
 
+@pytest.mark.integration
 def test_transforms_and_teams_decide_too():
     scaled = Custom(
         "torchrl.envs.transforms:RewardScaling",

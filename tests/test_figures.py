@@ -283,6 +283,7 @@ def test_figures_that_are_compared_have_the_same_vertical_range(tmp_path, drawn)
     assert limits["c", "collective_return"] != limits["a", "collective_return"], "of another board"
 
 
+@pytest.mark.integration
 def test_a_figure_beside_the_published_curve_says_how_both_are_smoothed(tmp_path, drawn):
     _, _, path = next(reported.draw_figures([a_result("a", "commons", 500.0)], tmp_path))
     assert path == tmp_path / "a_collective_return.png"

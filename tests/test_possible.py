@@ -53,6 +53,7 @@ def test_a_planner_keeps_what_grows_and_takes_the_rest_at_the_end():
     )
 
 
+@pytest.mark.integration
 def test_institutions_and_beams_do_not_change_what_a_board_could_give():
     taxed = replace(ROW, institutions=(Tax(rate=0.5),))
     assert planned_harvest(taxed, Planner(), episodes=2).tolist() == [4.0, 4.0]
