@@ -464,6 +464,7 @@ def test_gains_are_differences_from_the_diagonal_paired_by_replica(scripted):
         gains(3)
 
 
+@pytest.mark.integration
 def test_the_picture_of_gains_has_a_row_for_each_focal_run(scripted, tmp_path):
     path = draw_gains(exploited(scripted), tmp_path / "new" / "gains.png")
     with pytest.raises(ValueError, match=r"path is '.*gains\.pdf'; allowed: a file whose name ends in \.png"):
@@ -532,6 +533,7 @@ def test_the_command_crossplay_tells_a_matrix_for_each_number_and_writes_the_epi
         command(monkeypatch, capsys, "crossplay", greedy)
 
 
+@pytest.mark.integration
 def test_the_command_crossplay_names_runs_and_draws_their_gains(scripted, tmp_path, monkeypatch, capsys):
     greedy, sustainable = scripted.values()
     figure = tmp_path / "gains.png"

@@ -234,6 +234,7 @@ def test_a_figure_is_written_with_150_dots_an_inch_and_a_long_title_wraps(tmp_pa
     assert imread(tmp_path / "a.png")[:, 0].min() == 1, "nothing reaches over the edge"
 
 
+@pytest.mark.integration
 @pytest.mark.parametrize("colours", [style.COLOURS, style.SHADES])
 def test_a_figure_of_few_colours_looks_like_one_with_all_in_half_the_room(colours, tmp_path):
     figure, (axes,) = style.new_figure([3.0], title="heat")

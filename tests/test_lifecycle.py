@@ -191,6 +191,7 @@ def test_a_run_without_a_checkpoint_says_that_it_begins_with_the_first_episode(t
     assert "No checkpoint yet" not in said
 
 
+@pytest.mark.integration
 def test_a_stopped_run_is_extended_too(longer, tmp_path, monkeypatch):
     monkeypatch.setenv("STOP_AT_STEP", "41")
     stopping = replace(FIELD, callbacks=[Custom("one_road_parts:Stopping")])

@@ -44,6 +44,7 @@ def text_of(session):
     return board_text(session).plain.splitlines()
 
 
+@pytest.mark.integration
 def test_the_person_decides_for_one_agent_and_the_others_for_themselves(run):
     session = open_session(str(run), agent=0, seed=1)
     assert text_of(session) == [". A 0>. A .", "##. . . . .", ". . A A 1<."]

@@ -172,6 +172,7 @@ TURNS = st.lists(
 )
 
 
+@pytest.mark.integration
 @settings(deadline=None)
 @given(preference=PREFERENCES, turns=TURNS, data=st.data())
 def test_each_world_remembers_its_own_episode_alone(preference, turns, data):

@@ -181,6 +181,7 @@ def refused(spec, match):
         population([spec, *[Scripted()] * others])
 
 
+@pytest.mark.integration
 def test_what_cannot_be_started_from_is_refused_by_name(stored, tmp_path):
     dqn, ppo, run = ALONE[0], ALONE[1], f"{stored}/alone"
     refused(replace(dqn, start_from=Frozen(run, 4)), r"agent is 4; .*alone has the agents 0 to 3")

@@ -138,6 +138,7 @@ def test_lines_come_while_trials_run(tmp_path, capsys, monkeypatch):
     assert 3 <= len(capsys.readouterr().out.splitlines()) <= 14
 
 
+@pytest.mark.integration
 def test_in_a_terminal_one_table_is_drawn_again_and_again(tmp_path, monkeypatch):
     class Terminal(io.StringIO):
         def isatty(self):
@@ -153,6 +154,7 @@ def test_in_a_terminal_one_table_is_drawn_again_and_again(tmp_path, monkeypatch)
     assert "1 of 1 trials finished, 1 of 1 episodes" in said.splitlines()[-2]
 
 
+@pytest.mark.integration
 def test_nothing_is_printed_where_no_progress_is_wanted(tmp_path, capsys):
     run_study(
         Study(replace(TINY, episodes=1), {FREEZE: [2]}), tmp_path / "out", progress=False, results=False
@@ -163,6 +165,7 @@ def test_nothing_is_printed_where_no_progress_is_wanted(tmp_path, capsys):
     assert not (tmp_path / "other").exists()
 
 
+@pytest.mark.integration
 def test_viewers_get_the_table_and_the_returns_of_finished_trials(tmp_path, capsys, monkeypatch):
     sent = []
 

@@ -242,6 +242,7 @@ def test_conditions_that_were_not_run_do_not_count_among_the_replicas_of_a_figur
     assert with_counts(names, {"as run": 8, "later": 4})["later"] == "later (n=4)"
 
 
+@pytest.mark.integration
 def test_random_draws_are_drawn_as_points_and_have_no_heat_map(tmp_path):
     factors = {"agents.*.algorithm.settings.gamma": Uniform(0.5, 0.9), TIME_OUT: [5, 25]}
     study = Study(EXPERIMENT, factors, draws=4, name="draws", replicas=1)

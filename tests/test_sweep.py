@@ -256,6 +256,7 @@ def test_a_study_has_a_command_line(capsys):
     assert cprl.study_main is study_main
 
 
+@pytest.mark.integration
 def test_a_study_is_run_with_fewer_episodes_unless_they_are_what_it_varies():
     out = study_main(STUDY, ["recipes/mine.py", "--episodes", "1", "--no-figures", "--out", "short"])
     assert read_study(out).experiment.episodes == 1

@@ -388,6 +388,7 @@ ACTOR_CRITIC = PR2ActorCritic(settings=replace(SMALL, epsilon_start=0.5), first_
 TABLES = Tabular(settings=TabularSettings(epsilon_decay_steps=20))
 
 
+@pytest.mark.integration
 @pytest.mark.parametrize(
     ("levels", "agents", "engine"),
     [
@@ -413,6 +414,7 @@ def test_learners_of_every_kind_play_it(levels, agents, engine, tmp_path):
     assert -10 <= evaluated.value <= 50
 
 
+@pytest.mark.integration
 def test_levels_are_for_those_who_choose_and_numbers_for_those_who_do_not(tmp_path):
     for game, agents, message in (
         (replace(PAIR, levels=None), [Learning(DQN(settings=SMALL))] * 2, r"DQN.* actions of 1 numbers in 0"),

@@ -46,6 +46,7 @@ def assert_same(run, other):
         assert (run / path).read_bytes() == (other / path).read_bytes()
 
 
+@pytest.mark.integration
 def test_a_missing_trial_is_run_and_a_finished_one_left_as_it_is(tmp_path):
     own = task(tmp_path)
     assert state_of(own.directory) == "missing"
@@ -57,6 +58,7 @@ def test_a_missing_trial_is_run_and_a_finished_one_left_as_it_is(tmp_path):
     assert {path: path.stat().st_mtime_ns for path in own.directory.rglob("*")} == before
 
 
+@pytest.mark.integration
 def test_a_trial_prints_into_its_log_and_says_how_far_it_is(tmp_path, capsys):
     own = task(tmp_path)
     run_task(own)
@@ -69,6 +71,7 @@ def test_a_trial_prints_into_its_log_and_says_how_far_it_is(tmp_path, capsys):
     assert not list(tmp_path.rglob("*.partial"))
 
 
+@pytest.mark.integration
 def test_what_a_killed_process_left_before_its_recipe_is_no_obstacle(tmp_path, undisturbed):
     own = task(tmp_path)
     own.directory.mkdir(parents=True)
@@ -78,6 +81,7 @@ def test_what_a_killed_process_left_before_its_recipe_is_no_obstacle(tmp_path, u
     assert_same(own.directory, undisturbed)
 
 
+@pytest.mark.integration
 def test_a_trial_that_was_killed_before_its_first_checkpoint_starts_over(tmp_path, undisturbed):
     own = task(tmp_path)
     shutil.copytree(undisturbed, own.directory)
@@ -157,6 +161,7 @@ def test_a_trial_waits_while_another_process_runs_it(tmp_path, undisturbed, monk
     assert len(waited) == 1
 
 
+@pytest.mark.integration
 @pytest.mark.parametrize("is_begun", [False, True])
 def test_a_task_that_does_not_wait_leaves_a_trial_to_the_process_that_runs_it(
     tmp_path, undisturbed, is_begun
@@ -176,6 +181,7 @@ def test_a_task_that_does_not_wait_leaves_a_trial_to_the_process_that_runs_it(
     assert run_task(own).worked, "as soon as nobody else runs it"
 
 
+@pytest.mark.integration
 def test_a_trial_that_another_process_runs_does_not_hold_up_the_others(tmp_path, monkeypatch, capsys):
     first, second = (own.name for own in trials_of(STUDY))
     lock = RunLock(tmp_path / "runs" / first)
@@ -223,6 +229,7 @@ def test_the_lock_of_another_host_is_taken_over_once_its_trial_is_silent(tmp_pat
     assert_same(own.directory, undisturbed)
 
 
+@pytest.mark.integration
 def test_a_run_that_another_study_began_under_another_name_is_gone_on_with(tmp_path, undisturbed):
     own = task(tmp_path, Study(replace(TINY, name="other"), {FREEZE: [5]}))
     own.directory.mkdir(parents=True)

@@ -381,6 +381,7 @@ def test_agents_without_others_are_refused_before_anything_is_written(tmp_path):
     assert list(tmp_path.iterdir()) == []
 
 
+@pytest.mark.integration
 def test_a_game_of_ones_own_has_preferences_too(tmp_path):
     agents = [
         Learning(DQN(settings=REPLAY), reward=Exchange(0.25)),
