@@ -112,11 +112,6 @@ def test_the_gate_closes(line):
     assert wrong_imports("commons", line)
 
 
-def test_a_module_has_300_lines_at_most():
-    lines = {str(path.relative_to(SOURCE)): len(path.read_text().splitlines()) for path in MODULES}
-    assert {name: count for name, count in lines.items() if count > 300} == {}
-
-
 def test_the_game_knows_nothing_of_torch():
     for path in (SOURCE / "commons").rglob("*.py"):
         imports = [
