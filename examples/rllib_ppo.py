@@ -24,7 +24,8 @@ class FlatWindows(BaseParallelWrapper):
         return Box(0, 1, (self.env.observation_space(agent).sample().size,), np.float32)
 
     def reset(self, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Any, Any]:
-        windows, infos = self.env.reset(seed, options)
+        # RLlib's seeds come again in other runners and iterations; a world has its own, drawn from torch.
+        windows, infos = self.env.reset(None, options)
         return {agent: np.float32(window.ravel() / 255) for agent, window in windows.items()}, infos
 
     def step(self, actions: dict[str, int]) -> tuple[Any, ...]:
@@ -32,23 +33,22 @@ class FlatWindows(BaseParallelWrapper):
         return {agent: np.float32(window.ravel() / 255) for agent, window in windows.items()}, *others
 
 
-def main(*, iterations: int = 20, worlds: int = 4, seed: int = 0) -> list[float]:
-    """Trains on an episode in every world per iteration; returns the harvest of an agent in each."""
+def main(*, iterations: int = 20, worlds: int = 4, runners: int = 0, seed: int = 0) -> list[float]:
+    """Trains on an episode in every world of every runner; returns an agent's harvest in each iteration."""
     os.environ.setdefault("RAY_USAGE_STATS_ENABLED", "0")  # nothing is sent to Ray's makers
-    ray.init("local", num_cpus=1, include_dashboard=False, object_store_memory=100_000_000)
+    ray.init("local", num_cpus=1 + runners, include_dashboard=False, object_store_memory=100_000_000)
     game = presets.game("commons")
-    frames = worlds * game.rules.episode_steps
+    frames = max(runners, 1) * worlds * game.rules.episode_steps
     register_env("commons", lambda _: ParallelPettingZooEnv(FlatWindows(parallel_env(game))))
-    ppo = PPOConfig().environment("commons").debugging(seed=seed * worlds)  # world i plays this seed + i
-    ppo.env_runners(num_env_runners=0, num_envs_per_env_runner=worlds, batch_mode="complete_episodes")
+    ppo = PPOConfig().environment("commons").debugging(seed=seed * (runners + 1))  # runner i: this + i
+    ppo.env_runners(num_env_runners=runners, num_envs_per_env_runner=worlds, batch_mode="complete_episodes")
     ppo.multi_agent(policies=set(game.agent_names), policy_mapping_fn=lambda agent, *_, **__: agent)
     ppo.rl_module(model_config=DefaultModelConfig(fcnet_hiddens=[64, 64]))
     ppo.training(train_batch_size_per_learner=frames, minibatch_size=frames // 16, num_epochs=4)
     ppo.training(lr=1e-3, gamma=0.99, lambda_=0.95, entropy_coeff=0.01)
     trainer, harvests = ppo.build_algo(), []
     for iteration in range(iterations):
-        finished = trainer.train()["env_runners"]["episode_return_mean"]
-        harvests.append(float(finished) / game.agents)
+        harvests.append(float(trainer.train()["env_runners"]["episode_return_mean"]) / game.agents)
         print(f"iteration {iteration + 1}: an agent harvests {harvests[-1]:.1f} in an episode", flush=True)
     trainer.stop()
     ray.shutdown()

@@ -2,11 +2,16 @@
 
 import importlib.util
 import sys
+from collections import Counter
+from dataclasses import replace
 from pathlib import Path
+from unittest.mock import MagicMock
 
 import pytest
+import torch
 
 from cprl import Game, Rules, maps, presets
+from cprl.envs import parallel_env
 
 EXAMPLES = Path(__file__).parents[1] / "examples"
 NAMES = sorted(path.stem for path in EXAMPLES.glob("*.py"))
@@ -14,6 +19,20 @@ EASY = Game(
     map=maps.parse(">.A.\n....\n.A.<"), rules=Rules(regrow_prob=(0.5,), may_fire=False, episode_steps=60)
 )
 """Apples that always come back: whoever walks about harvests little, whoever stays near them a lot."""
+
+RLLIB = [
+    "ray",
+    "ray.rllib.algorithms.ppo",
+    "ray.rllib.core.rl_module.default_model_config",
+    "ray.rllib.env.wrappers.pettingzoo_env",
+    "ray.tune.registry",
+]
+
+
+def game_of(env):
+    """The seed and the number of the episode that a world plays: all that its chance depends on."""
+    world = env.world.batch.now
+    return int(world.seed[0, 0]), int(world.episode[0, 0])
 
 
 @pytest.fixture
@@ -113,14 +132,56 @@ class TestSB3:
         assert all(info["TimeLimit.truncated"] for info in infos)
 
 
-@pytest.mark.slow
-@pytest.mark.filterwarnings("ignore")
-def test_rllib_learns_with_weights_for_each_agent(example, shorter_episodes, monkeypatch):
-    pytest.importorskip("ray.rllib.algorithms.ppo", reason="needs the extra rllib", exc_type=ImportError)
-    monkeypatch.setenv("RAY_USAGE_STATS_ENABLED", "0")
-    harvests = example("rllib_ppo").main(iterations=2, worlds=2)
-    assert len(harvests) == 2
-    assert min(harvests) >= 0
+class TestRLlib:
+    """RLlib resets world i of runner w with the seed s + w + i, in each iteration anew."""
+
+    def test_worlds_of_all_runners_differ_and_play_on_from_iteration_to_iteration(self, example, monkeypatch):
+        for name in RLLIB:
+            monkeypatch.setitem(sys.modules, name, MagicMock())  # the wrapper needs none of it
+        rllib, games = example("rllib_ppo"), []
+        for runner in range(3):
+            torch.manual_seed(5 + runner)  # as RLlib does before a runner makes its worlds
+            worlds = [rllib.FlatWindows(parallel_env(EASY)) for _ in range(3)]
+            for _ in range(2):
+                for i, world in enumerate(worlds):
+                    world.reset(seed=5 + runner + i)
+                    games.append(game_of(world.env))
+        assert len(set(games)) == 3 * 3 * 2
+        assert len({seed for seed, _ in games}) == 3 * 3, "the worlds of a runner keep their seeds"
+
+    @pytest.mark.slow
+    @pytest.mark.filterwarnings("ignore")
+    @pytest.mark.parametrize(("runners", "worlds"), [(0, 2), (2, 2)])
+    def test_no_two_episodes_of_a_training_are_the_same_game(
+        self, example, monkeypatch, tmp_path, runners, worlds
+    ):
+        pytest.importorskip("ray.rllib.algorithms.ppo", reason="needs the extra rllib", exc_type=ImportError)
+        monkeypatch.setenv("RAY_USAGE_STATS_ENABLED", "0")
+        short = replace(EASY, rules=replace(EASY.rules, episode_steps=30))
+        monkeypatch.setattr(presets, "game", lambda _: short)
+        rllib, log = example("rllib_ppo"), tmp_path / "seeds"
+
+        def logged(game):
+            env = parallel_env(game)
+            play = env.step
+
+            def step(actions):
+                with log.open("a") as file:
+                    file.write(f"{game_of(env)}\n")
+                return play(actions)
+
+            env.step = step
+            return env
+
+        monkeypatch.setattr(rllib, "parallel_env", logged)
+        for module in (rllib, sys.modules[__name__]):  # runners could not import them
+            importlib.import_module("ray.cloudpickle").register_pickle_by_value(module)
+        harvests = rllib.main(iterations=2, worlds=worlds, runners=runners)
+        assert len(harvests) == 2
+        assert min(harvests) >= 0
+        turns = Counter(log.read_text().splitlines())
+        assert len(turns) >= max(runners, 1) * worlds * 2, "an episode for each world and iteration"
+        assert max(turns.values()) <= short.rules.episode_steps, "no episode was played twice"
 
 
 @pytest.mark.filterwarnings("ignore")
