@@ -412,7 +412,7 @@ def test_runs_play_with_each_other_as_they_decide(in_one_go, tmp_path):
 def test_films_and_people_who_play_have_decisions(in_one_go, tmp_path, monkeypatch):
     best = cprl.load(in_one_go, allow=ALLOW).policy(0).decisions.best()[0]
     _, filmed = film(in_one_go, tmp_path / "film.rrd", allow=ALLOW)
-    _, drawn = film_video(in_one_go, tmp_path / "film.gif", allow=ALLOW)
+    _, (drawn,) = film_video(in_one_go, tmp_path / "film.gif", allow=ALLOW)
     for episode in (filmed, drawn):
         assert choices_of(episode.decision, (2, 3))[:2].tolist() == best[:2].tolist()
     session = open_session(str(in_one_go), agent=1, decision=5, allow=ALLOW)

@@ -1,7 +1,8 @@
-"""An episode of stored agents as a GIF or an MP4."""
+"""Episodes of stored agents, side by side, as a GIF or an MP4."""
 
 import subprocess
 from dataclasses import replace
+from itertools import pairwise
 
 import numpy as np
 import pytest
@@ -10,11 +11,14 @@ from imageio_ffmpeg import get_ffmpeg_exe
 from PIL import Image
 
 from cprl import Experiment, Game, Rules, cli, load, maps
-from cprl.commons.colours import APPLE, PALETTE, agent_colour
+from cprl.commons.colours import APPLE, GROUND, PALETTE, agent_colour
+from cprl.commons.picture import EMPTY_SITE_COLOUR
 from cprl.evaluation import video_files
 from cprl.evaluation.episode_picture import EpisodePicture, nice
 from cprl.evaluation.film import film, fresh_episode
+from cprl.evaluation.film_video import _titles as titles_of
 from cprl.evaluation.film_video import film_video
+from cprl.institutions import Monitoring, Quota
 from cprl.population import Scripted
 from cprl.runs.directory import start_run
 from cprl.runs.weights import save_weights
@@ -36,15 +40,42 @@ LEFT = [5, 3, 2, 0]
 """Apples on the board at the start and after each turn."""
 
 
+MEADOW = Game(
+    map=maps.parse("\n".join([".A.", "A>A", ".A.", "...", "^.<"])),
+    rules=Rules(regrow_prob=(0.0, 0.5), window_rows=4, window_columns=3, episode_steps=12, freeze_steps=0),
+)
+"""A higher board, more agents and a longer clock than the corridors."""
+
+
+def stored(folder, name, game=CORRIDORS, policy="greedy"):
+    """A run of scripted agents."""
+    agents = (Scripted(policy),) * len(game.map.starts)
+    experiment = Experiment(name=name, game=game, agents=agents, episodes=1)
+    save_weights(start_run(folder, name, experiment.to_recipe), {})
+    return folder
+
+
 @pytest.fixture(scope="module")
 def runs(tmp_path_factory):
-    """Runs on the corridors by the policy of both agents."""
+    """Runs on the corridors by the policy of both agents, and one on another board."""
     folder = tmp_path_factory.mktemp("runs")
     for policy in ("greedy", "random"):
-        agents = (Scripted(policy), Scripted(policy))
-        own = Experiment(name=policy, game=CORRIDORS, agents=agents, episodes=1)
-        save_weights(start_run(folder / policy, policy, own.to_recipe), {})
+        stored(folder / policy, policy, policy=policy)
+    stored(folder / "meadow", "meadow", MEADOW, "random")
     return folder
+
+
+@pytest.fixture
+def drawn(monkeypatch):
+    """What is drawn from now on: the number of moments, the title and the words of each picture."""
+    pictures, draw = [], EpisodePicture.draw
+
+    def noted(picture, moments, title, **words):
+        pictures.append((len(moments), title, words["end"], words["card"]))
+        return draw(picture, moments, title, **words)
+
+    monkeypatch.setattr(EpisodePicture, "draw", noted)
+    return pictures
 
 
 def frames_of(path):
@@ -58,39 +89,103 @@ def frames_of(path):
     return np.stack(pictures), durations
 
 
-def apples_in(picture, size):
+def sites_in(picture, game=CORRIDORS):
+    """The colour in the middle of each site of a film of one run, [K, 3]."""
+    seen = EpisodePicture(game.map, steps=9, width=picture.shape[1])
+    boxes = [seen.cell_box(*site) for site in game.map.sites]
+    return np.array([picture[int(box[1] + box[3]) // 2, int(box[0] + box[2]) // 2] for box in boxes])
+
+
+def apples_in(picture):
     """How many cells of the board look like an apple."""
-    cell = (size - 1) // CORRIDORS.map.width
-    top = next(row for row in range(len(picture)) if (picture[row] == (28, 30, 36)).all(-1).mean() > 0.9)
-    centres = [
-        picture[top + row * cell + cell // 2, (size - 1) % cell // 2 + col * cell + cell // 2]
-        for row, col in CORRIDORS.map.sites
-    ]
-    return sum((centre == PALETTE[APPLE]).all() for centre in centres)
+    return (sites_in(picture) == PALETTE[APPLE]).all(-1).sum()
 
 
-def test_a_gif_shows_the_board_die_and_the_last_picture_stays(runs, tmp_path):
-    path, played = film_video(runs / "greedy", tmp_path / "own.gif", width=300, fps=10)
+def test_a_gif_shows_the_board_die_and_ends_with_a_card_of_two_seconds(runs, tmp_path, drawn):
+    path, (played,) = film_video(runs / "greedy", tmp_path / "film.gif", width=300, fps=10)
     assert (played.steps, played.harvest.tolist(), played.stock_left) == (3, [2, 3], 0)
     pictures, durations = frames_of(path)
-    assert [apples_in(picture, 300) for picture in pictures] == LEFT
-    assert durations == [100, 100, 100, 2000]
+    assert [apples_in(picture) for picture in pictures[:-1]] == LEFT
+    assert durations == [100, 100, 100, 100, 2000]
     for agent in range(2):
         assert (pictures[0] == agent_colour(agent)).all(-1).sum() > 400, "a cell of its colour"
     assert len(pictures[0]) < 600
+    ends, cards = zip(*[words[2:] for words in drawn[-5:]], strict=True)
+    assert ends == ("", "", "", *["dead at turn 3 of 9"] * 2)
+    assert cards == ("", "", "", "", "dead at turn 3 of 9 · 5 apples")
+
+
+def test_a_film_of_a_board_that_lives_says_what_is_left(runs, tmp_path, drawn):
+    _, (played,) = film_video(runs / "meadow", tmp_path / "film.gif", width=240)
+    apples = int(played.harvest.sum())
+    assert drawn[-1][2:] == ("", f"{played.stock_left} of 4 apples left · {apples} apple{'s'[: apples != 1]}")
+
+
+def test_sites_without_an_apple_are_dim_squares(runs, tmp_path):
+    path, _ = film_video(runs / "greedy", tmp_path / "film.gif", width=300)
+    dead = sites_in(frames_of(path)[0][3])
+    under_agents = [(0, 3), (2, 1)]
+    empty = [dead[place] for place, site in enumerate(CORRIDORS.map.sites) if site not in under_agents]
+    assert (np.array(empty) == EMPTY_SITE_COLOUR).all()
+    assert np.array(EMPTY_SITE_COLOUR).sum() > 1.5 * np.array(PALETTE[GROUND]).sum()
+
+
+def test_populations_play_side_by_side_on_one_clock(runs, tmp_path):
+    path, played = film_video(runs / "greedy", tmp_path / "both.gif", beside=[runs / "random"], width=480)
+    assert [episode.steps for episode in played] == [3, 9]
+    both, durations = frames_of(path)
+    assert len(both) == 1 + 9 + 1
+    assert durations[-1] == 2000
+    left, right = both[:, :, :240], both[:, :, 240:]
+    assert [apples_in(picture) for picture in left] == [*LEFT, *[0] * 6, 0]
+    assert (left[3:-1] == left[3]).all(), "the dead board waits"
+    assert all((now != before).any() for before, now in pairwise(right)), "the other plays"
+    _, alone = film_video(runs / "random", tmp_path / "alone.gif", width=240)
+    assert alone[0].harvest.tolist() == played[1].harvest.tolist(), "as it plays alone"
+
+
+def test_boards_agents_and_clocks_may_differ_side_by_side(runs, tmp_path):
+    path, played = film_video(
+        runs / "greedy", tmp_path / "film.mp4", beside=(runs / "meadow",), width=500, fps=5
+    )
+    assert [(episode.steps, len(episode.harvest)) for episode in played] == [(3, 2), (12, 3)]
+    high = EpisodePicture(MEADOW.map, steps=12, width=250).size[1]
+    assert pictures_of(path, 500, high).shape[0] == 1 + 12 + 2 * 5
+
+
+def test_titles_are_what_tells_runs_apart(runs, tmp_path):
+    limits = Quota(fine=1.0), Monitoring(prob=0.5)
+    governed = [
+        stored(tmp_path / name, "two_rules", replace(CORRIDORS, institutions=institutions))
+        for name, institutions in (("one", ()), ("two", limits), ("three", limits))
+    ]
+
+    def titles(*names):
+        return titles_of([fresh_episode(name) for name in names])
+
+    assert titles(runs / "greedy") == ["Greedy"]
+    assert titles(runs / "greedy", runs / "random") == ["Greedy", "Random"]
+    assert titles(*governed[:2]) == ["No rule", "Quota and monitoring"]
+    assert titles(*governed) == ["one", "two", "three"], "two have the same rules, all the same name"
+
+
+def test_titles_of_your_own_stand_above_the_boards(runs, tmp_path, drawn):
+    own = ["Été", "quotas, 50 %"]
+    film_video(runs / "greedy", tmp_path / "a.gif", beside=[runs / "greedy"], titles=own, width=480)
+    assert [title for _, title, _, _ in drawn[-2:]] == own
 
 
 def test_every_nth_turn_is_shown_and_always_the_last(runs, tmp_path):
     path, _ = film_video(runs / "greedy", tmp_path / "own.gif", every=2, width=300)
-    assert [apples_in(picture, 300) for picture in frames_of(path)[0]] == [LEFT[0], LEFT[2], LEFT[3]]
+    assert [apples_in(picture) for picture in frames_of(path)[0][:-1]] == [LEFT[0], LEFT[2], LEFT[3]]
 
 
 def test_the_film_is_the_episode_that_the_recording_has(runs, tmp_path):
     _, recorded = film(runs / "random", tmp_path / "own.rrd", episode=3)
-    _, filmed = film_video(runs / "random", tmp_path / "own.gif", episode=3, every=9, width=240)
+    _, (filmed,) = film_video(runs / "random", tmp_path / "own.gif", episode=3, every=9, width=240)
     assert filmed.harvest.tolist() == recorded.harvest.tolist()
     assert filmed.metrics == pytest.approx(recorded.metrics, nan_ok=True)
-    _, other = film_video(runs / "random", tmp_path / "other.gif", episode=4, every=9, width=240)
+    _, (other,) = film_video(runs / "random", tmp_path / "other.gif", episode=4, every=9, width=240)
     assert other.metrics["sustainability"] != recorded.metrics["sustainability"]
 
 
@@ -117,12 +212,16 @@ def test_with_the_seed_of_an_evaluation_its_worlds_are_filmed(tmp_path):
         assert torch.equal(played(one.env, stay[:1])[0], of_evaluation[4]) is is_same
 
 
-def test_an_mp4_has_a_picture_for_each_turn_and_holds_the_last(runs, tmp_path):
-    path, _ = film_video(runs / "greedy", tmp_path / "own.mp4", width=240, fps=5)
-    wide, high = EpisodePicture(CORRIDORS.map, steps=9, width=240).size
+def pictures_of(path, wide, high):
+    """The pictures of an MP4, [frames, height, width, 3]."""
     words = ["-loglevel", "error", "-i", path, "-f", "rawvideo", "-pix_fmt", "rgb24", "-"]
     raw = subprocess.run([get_ffmpeg_exe(), *words], check=True, capture_output=True).stdout
-    pictures = np.frombuffer(raw, np.uint8).reshape(-1, high, wide, 3)
+    return np.frombuffer(raw, np.uint8).reshape(-1, high, wide, 3)
+
+
+def test_an_mp4_has_a_picture_for_each_turn_and_holds_the_card(runs, tmp_path):
+    path, _ = film_video(runs / "greedy", tmp_path / "own.mp4", width=240, fps=5)
+    pictures = pictures_of(path, *EpisodePicture(CORRIDORS.map, steps=9, width=240).size)
     assert len(pictures) == len(LEFT) + 2 * 5, "two seconds"
     greens = [(np.abs(picture.astype(int) - PALETTE[APPLE]) < 30).all(-1).sum() for picture in pictures]
     assert greens[0] > 2 * greens[3] > 0, "the area of the plot is left"
@@ -178,12 +277,19 @@ def interrupt(*_):
         (["--out", "own.gif", "--width", "5000"], "width is 5000; allowed: an integer from 240 to 1,920"),
         (["--out", "there.gif"], r"there\.gif exists and is not overwritten"),
         (["--out", "own.gif", "--replica", "4"], "replica is 4; allowed: 0"),
+        (["--beside", "{random}"], "--beside is for films"),
+        (["--out", "own.gif", "--beside", "{meadow}", "gone"], "gone"),
+        (["--out", "own.gif", "--beside", "{meadow}", "--titles", "One"], "titles is"),
+        (["--out", "own.gif", "--titles", "One\nand more"], "titles is"),
+        (["--out", "own.gif", "--beside", "{meadow}", "--width", "479"], "width is 479"),
+        (["--out", "own.gif", "--beside", *["{random}"] * 8], "beside is"),
     ],
 )
 def test_what_cannot_be_filmed_is_refused_before_anything_is_played(runs, tmp_path, monkeypatch, words, said):
     monkeypatch.chdir(tmp_path)
     (tmp_path / "there.gif").touch()
-    monkeypatch.setattr("cprl.stored.LoadedRun.env", lambda *_, **__: pytest.fail("played"))
+    monkeypatch.setattr("cprl.evaluation.turns.Turns.play", lambda *_: pytest.fail("played"))
+    words = [word.format(random=runs / "random", meadow=runs / "meadow") for word in words]
     monkeypatch.setattr("sys.argv", ["cprl", "film", str(runs / "random"), *words])
     with pytest.raises(SystemExit, match=said):
         cli.main()
@@ -195,6 +301,12 @@ def test_the_command_says_what_it_wrote(runs, tmp_path, monkeypatch, capsys):
     monkeypatch.setattr("sys.argv", ["cprl", "film", str(runs / "greedy"), *words])
     cli.main()
     assert capsys.readouterr().out.splitlines()[0] == "3 steps, apples: 2, 3; 0 left"
+    words = ["--beside", str(runs / "meadow"), "--out", str(tmp_path / "both.gif"), "--width", "480"]
+    monkeypatch.setattr("sys.argv", ["cprl", "film", str(runs / "greedy"), *words])
+    cli.main()
+    first, second, _ = capsys.readouterr().out.splitlines()
+    assert first == f"{runs / 'greedy'}: 3 steps, apples: 2, 3; 0 left"
+    assert second.startswith(f"{runs / 'meadow'}: 12 steps")
 
 
 def test_boards_wider_than_the_picture_are_drawn_smaller():

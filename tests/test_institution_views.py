@@ -233,7 +233,7 @@ def test_a_mark_is_a_diamond_around_the_agent(tmp_path):
 
 def test_a_film_marks_who_broke_a_rule_since_its_last_picture(whole, tmp_path):
     allow = ("paying_game:Charges",)
-    path, episode = film_video(whole, tmp_path / "film.gif", width=400, every=1, allow=allow)
+    path, (episode,) = film_video(whole, tmp_path / "film.gif", width=400, every=1, allow=allow)
     assert episode.violations.sum() > 0
     pictures, _ = frames_of(path)
     picture = EpisodePicture(GAME.map, steps=30, width=400)

@@ -38,6 +38,8 @@ def film(
     run: Path,
     /,
     *,
+    beside: tuple[Path, ...] = (),
+    titles: tuple[str, ...] = (),
     replica: int = 0,
     episode: int = 0,
     seed: int = FILM_SEED,
@@ -51,6 +53,9 @@ def film(
 
     Args:
         run: the run's directory, or its results.
+        beside: of a .gif or .mp4: more runs, whose agents play beside them on one clock.
+        titles: of a .gif or .mp4: one for the run and one for each beside it; by default their institutions,
+            or the names of their experiments.
         replica: whose agents.
         episode: which of the fresh episodes; the same number plays the same again.
         seed: of the worlds and all chance. With the seed of cprl evaluate, 30011 by default, the world of its
@@ -62,11 +67,12 @@ def film(
         every: of a .gif or .mp4: turns from one picture to the next; by default 1 for an .mp4, and for a .gif
             as many as it takes for 300 pictures.
         fps: of a .gif or .mp4: pictures per second, at most 50; by default 15.
-        width: of a .gif or .mp4, in pixels, 240 to 1920; by default 640.
+        width: of a .gif or .mp4, in pixels, at most 1920 and at least 240 for each run; by default 640 for
+            each that has room.
         allow: code of your own, module:Class, that the run may import; see docs/experiments.md.
     """
-    flags: dict[str, Any] = {"every": every, "fps": fps, "width": width}
-    given = {name: value for name, value in flags.items() if value is not None}
+    flags: dict[str, Any] = {"beside": beside, "titles": titles, "every": every, "fps": fps, "width": width}
+    given = {name: value for name, value in flags.items() if value not in (None, ())}
     if out is not None and out.suffix not in (".rrd", *SUFFIXES):
         raise ValueError(f"--out is {out}; allowed: a name that ends in .rrd, {', '.join(SUFFIXES)}")
     is_video = out is not None and out.suffix in SUFFIXES
@@ -74,15 +80,15 @@ def film(
         raise ValueError(f"--{next(iter(given))} is for films; allowed: with --out FILE.gif or FILE.mp4")
     make_importable(allow)
     prepare_process(seed)
-    how: dict[str, Any] = {"replica": replica, "episode": episode, "seed": seed, "allow": allow}
+    which: dict[str, Any] = {"replica": replica, "episode": episode, "seed": seed, "allow": allow}
     if out is not None and is_video:
-        path, played = film_video(run, out, **how, **given)
-    else:
-        path, played = film_run(run, out, **how)
-    say(f"{played.steps} steps, {played.outcome}")
-    if is_video:
+        path, episodes = film_video(run, out, **which, **given)
+        for name, played in zip((run, *beside), episodes, strict=True):
+            say(f"{f'{name}: ' if beside else ''}{played.steps} steps, {played.outcome}")
         say(f"{path}: {path.stat().st_size / 1000:.0f} kB")
     else:
+        path, played = film_run(run, out, **which)
+        say(f"{played.steps} steps, {played.outcome}")
         say(f"Watch: {printed([viewer(), str(path)])}")
 
 

@@ -49,6 +49,10 @@ def _others(run: list[str]) -> list[str]:
     return ["--others", *run]
 
 
+def _beside(run: list[str]) -> list[str]:
+    return ["--beside", *run]
+
+
 _COMMON: Final = (_flag("--allow", *runs.ALLOW, "os:getcwd"),)
 _ALLOWED: Final = st.just(["--allow", runs.ALLOW[0]])
 _FRESH: Final = (
@@ -80,7 +84,8 @@ _SUBCOMMANDS: Final[dict[str, tuple[list[st.SearchStrategy[list[str]]], tuple[An
         (
             *(_flag("--replica", "0", "1"), _flag("--episode", "0", "3")),
             _flag("--out", "film.rrd", "film.gif", "a/film.gif", "film.avi"),
-            *(_flag("--every", "1", "5"), _flag("--fps", "5", "0.5"), _flag("--width", "240", "300")),
+            *(_flag("--every", "1", "5"), _flag("--fps", "5", "0.5"), _flag("--width", "240", "600")),
+            *(_run("plain", "results").map(_beside), _flag("--titles", "one", "two")),
             *_COMMON,
         ),
     ),

@@ -38,7 +38,7 @@ WINDOW_CAPTION: Final = "in the study's colours: self blue, others red"
 PALETTE: Final[dict[int, Colour]] = {
     GROUND: (16, 18, 22),
     WALL: (70, 74, 84),
-    APPLE: (0, 110, 70),
+    APPLE: (31, 163, 90),
     BEAM: (200, 200, 200),
 }
 """Red, green and blue of the classes in pictures for people; agents have `agent_colour`."""

@@ -15,6 +15,8 @@ from cprl.memory import check_memory
 
 LARGEST_CELL_PIXELS: Final = 1000
 GRID_COLOUR: Final = (28, 30, 36)
+EMPTY_SITE_COLOUR: Final = (40, 43, 51)
+"""Of a site without an apple: dim, so that a field that is harvested bare still looks like a field."""
 
 
 def board_image(
@@ -60,19 +62,15 @@ def board_image(
     check_memory(f"cell_pixels is {size}: the pixels", 3 * pixels, "fewer pixels")
     image = np.empty((board.height * size + 1, board.width * size + 1, 3), np.uint8)
     image[:] = GRID_COLOUR
-    kinds = np.full((board.height, board.width), GROUND)
-    for cell in board.walls:
-        kinds[cell] = WALL
-    for cell, apple in zip(board.sites, stock, strict=True):
-        kinds[cell] = APPLE if apple else GROUND
     for r in range(board.height):
         for c in range(board.width):
-            kind = int(kinds[r, c])
-            inset = size // 6 if kind == APPLE else 0
-            image[r * size + 1 : (r + 1) * size, c * size + 1 : (c + 1) * size] = PALETTE[GROUND]
-            _fill(image, r, c, size, inset, PALETTE[kind])
-            if beams is not None and beams[r, c]:
-                _fill(image, r, c, size, 2 * size // 5, PALETTE[BEAM])
+            _fill(image, r, c, size, 0, PALETTE[GROUND])
+    for r, c in board.walls:
+        _fill(image, r, c, size, 0, PALETTE[WALL])
+    for (r, c), apple in zip(board.sites, stock, strict=True):
+        _fill(image, r, c, size, size // 6, PALETTE[APPLE] if apple else EMPTY_SITE_COLOUR)
+    for r, c in () if beams is None else np.argwhere(beams):
+        _fill(image, r, c, size, 2 * size // 5, PALETTE[BEAM])
     for i, (r, c, h) in enumerate(zip(row, col, heading, strict=True)):
         if in_play is None or in_play[i]:
             _draw_agent(image, int(r), int(c), int(h), size, i)

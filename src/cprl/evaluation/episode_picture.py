@@ -1,9 +1,12 @@
-"""EpisodePicture: the board, with the stock and the harvests so far below it; for films and for play."""
+"""EpisodePicture: one population's board, its stock and its harvests so far; for films and for play."""
 
 from collections.abc import Sequence
+from functools import cache
 from math import ceil
+from pathlib import Path
 from typing import Any, Final
 
+import matplotlib
 import numpy as np
 from numpy.typing import NDArray
 from PIL import Image, ImageDraw, ImageFont
@@ -22,15 +25,18 @@ SMALLEST_CELL_PIXELS: Final = 8
 
 _BOARD_HEIGHT: Final = 2
 """The height of the board in the picture, at most, as a multiple of the picture's width."""
+_PLOT_HEIGHT: Final = 7
+"""In units, which are the height of small text."""
 _DIAMOND_BEYOND: Final = 0.22
 """How far a violator's diamond goes beyond its cell, in cells."""
 _TEXT: Final = (228, 231, 236)
 _FAINT: Final = (140, 146, 158)
 _LINE: Final = (52, 56, 66)
+_DEAD: Final = (255, 122, 60)
 
 
 class EpisodePicture:
-    """Draws any turn of an episode: a caption, the board, the apples on it and each agent's harvest so far.
+    """Draws any turn of an episode: a title, the board, the apples on it and each agent's harvest so far.
 
     Args:
         board: the map.
@@ -38,42 +44,54 @@ class EpisodePicture:
         width: of the picture in pixels, 240 to 1920.
         most_harvested: the top of the axis of harvests, in apples; None where it is not known before, so that
             the axis grows with the episode.
+        height: of the picture in pixels, at least what it takes, so that different boards can stand side by
+            side; by default what it takes.
 
     Raises:
         ValueError: for a width that is out of range.
     """
 
     def __init__(
-        self, board: Map, *, steps: int, width: int = DEFAULT_WIDTH, most_harvested: int | None = None
+        self,
+        board: Map,
+        *,
+        steps: int,
+        width: int = DEFAULT_WIDTH,
+        most_harvested: int | None = None,
+        height: int = 0,
     ) -> None:
         width = arguments.integer("width", width, SMALLEST_WIDTH, LARGEST_WIDTH)
         width -= width % 2  # which videos want
         self.board, self.steps, self._most = board, steps, most_harvested
-        self._unit = max(10, width // 46)
-        self._font = ImageFont.load_default(self._unit)
+        self._unit = unit = max(10, width // 46)
+        self._font, self._large = _font(unit), _font(2 * unit)
         highest = _BOARD_HEIGHT * width
-        fitting = min((width - 1) // board.width, (highest - 1) // board.height)
+        room = width - 2 * unit
+        fitting = min((room - 1) // board.width, (highest - 1) // board.height)
         self._cell = max(SMALLEST_CELL_PIXELS, fitting)
         wide, high = board.width * self._cell + 1, board.height * self._cell + 1
-        shrink = min(1.0, width / wide, highest / high)
+        shrink = min(1.0, room / wide, highest / high)
         self._board_size = max(1, int(wide * shrink)), max(1, int(high * shrink))
-        self._half = (width - 3 * self._unit) // 2
+        self._half = (width - 3 * unit) // 2
         self._legend = _Legend(len(board.starts), self._half, self._font)
-        self._line = line = self._unit + self._unit // 2
-        self._caption_height = line + self._unit // 2
-        self._plot_top = self._caption_height + self._board_size[1] + self._unit // 2
-        self._plot_height = 5 * self._unit
-        self._axes_top = self._plot_top + line * (1 + self._legend.rows)
-        height = self._axes_top + self._plot_height + 2 * line
+        self._line = line = unit + unit // 2
+        self._title_height, self._plot_height = 3 * unit, _PLOT_HEIGHT * unit
+        below = unit // 2 + 5 * unit // 2 + line * (1 + self._legend.rows) + self._plot_height + 2 * line
+        height = max(height, self._title_height + self._board_size[1] + below)
         self.size: tuple[int, int] = width, height + height % 2
         """The width and height in pixels, both even."""
+        self._numbers_top = self.size[1] - below + unit // 2
+        self._axes_top = self.size[1] - 2 * line - self._plot_height
+        self._middle = (self._title_height + self.size[1] - below) // 2
+        self._board_top = self._middle - self._board_size[1] // 2
 
     def draw(
         self,
         moments: Sequence[Shown],
         title: str,
         *,
-        note: str = "",
+        end: str = "",
+        card: str = "",
         own: int | None = None,
         violators: Sequence[int] = (),
     ) -> Bytes:
@@ -81,8 +99,9 @@ class EpisodePicture:
 
         Args:
             moments: the episode so far: the board as it began, then after each turn.
-            title: what is shown, above the board on the left; shortened where the room ends.
-            note: what is to be said of this moment, after the turn above the board on the right.
+            title: what is shown, in large type; smaller where the room ends.
+            end: how the episode ended, beside the title and in orange; the turn while this is empty.
+            card: what came of the episode, in large type across the board.
             own: the index of the agent that gets a white frame; None for no frame.
             violators: the indices of agents that get a white diamond, since they broke a rule.
 
@@ -91,17 +110,18 @@ class EpisodePicture:
         """
         image = Image.new("RGB", self.size, PALETTE[GROUND])
         draw = ImageDraw.Draw(image)
-        turn = f"turn {len(moments) - 1:,} of {self.steps:,}{f', {note}' if note else ''}"
-        self._caption(draw, title, turn)
+        self._caption(draw, title, end, f"turn {len(moments) - 1:,} of {self.steps:,}")
         drawn = Image.fromarray(world_image(self.board, moments[-1], cell_pixels=self._cell))
         if drawn.size != self._board_size:
             drawn = drawn.resize(self._board_size, Image.Resampling.BOX)
-        image.paste(drawn, ((self.size[0] - self._board_size[0]) // 2, self._caption_height))
+        image.paste(drawn, ((self.size[0] - self._board_size[0]) // 2, self._board_top))
         if own is not None and moments[-1].in_play[own]:
             at = self.cell_box(int(moments[-1].row[own]), int(moments[-1].col[own]))
             draw.rectangle(at, outline=_TEXT, width=max(1, self._unit // 6))
         for agent in violators:
             self._mark(draw, agent, moments[-1])
+        if card:
+            self._card(draw, card, _DEAD if end else _TEXT)
         self._plot_stock(draw, np.array([moment.stock.sum(dtype=np.int64) for moment in moments]))
         self._plot_harvests(draw, np.array([moment.harvested for moment in moments]))
         return np.asarray(image)
@@ -121,24 +141,30 @@ class EpisodePicture:
         wide, high = self._board_size
         left = (self.size[0] - wide) // 2
         across, down = wide / self.board.width, high / self.board.height
-        top = self._caption_height + row * down
+        top = self._board_top + row * down
         return left + col * across, top, left + (col + 1) * across, top + down
 
-    def _caption(self, draw: ImageDraw.ImageDraw, title: str, turn: str) -> None:
-        edge = self._unit // 2
-        right = self.size[0] - edge
-        draw.text((right, edge), turn, _TEXT, self._font, anchor="ra")
-        room = right - edge - self._unit - self._font.getlength(turn)
-        if self._font.getlength(title) > room:
-            while title and self._font.getlength(f"{title}...") > room:
-                title = title[:-1]
-            title = f"{title}..." if title else ""
-        draw.text((edge, edge), title, _TEXT, self._font)
+    def _caption(self, draw: ImageDraw.ImageDraw, title: str, end: str, turn: str) -> None:
+        """The title on the left, the turn or the end on the right."""
+        edge, middle = self._unit, self._title_height // 2
+        words, colour = (end, _DEAD) if end else (turn, _TEXT)
+        font = _fitting(words, (self.size[0] - 3 * edge) / 2, 4 * self._unit // 3)
+        draw.text((self.size[0] - edge, middle), words, colour, font, anchor="rm")
+        room = self.size[0] - 3 * edge - font.getlength(words)
+        draw.text((edge, middle), title, _TEXT, _fitting(title, room, 2 * self._unit), anchor="lm")
+
+    def _card(self, draw: ImageDraw.ImageDraw, text: str, colour: Colour) -> None:
+        """A band across the board with a text."""
+        middle, deep = self._middle, 2 * self._unit
+        left, right = self._unit, self.size[0] - self._unit
+        draw.rectangle((left, middle - deep, right, middle + deep), PALETTE[GROUND], colour)
+        font = _fitting(text, right - left - 2 * self._unit, 2 * self._unit)
+        draw.text((self.size[0] / 2, middle), text, colour, font, anchor="mm")
 
     def _plot_stock(self, draw: ImageDraw.ImageDraw, stock: NDArray[np.int64]) -> None:
         """The apples on the board, [T], as an area."""
         left, sites = self._unit, len(self.board.sites)
-        self._axes(draw, left, f"apples on the board: {stock[-1]} of {sites}")
+        self._axes(draw, left, f"{stock[-1]:,} of {sites:,}", "apples on the board")
         path = self._points(left, stock, sites)
         floor = self._axes_top + self._plot_height
         draw.polygon([(path[0][0], floor), *path, (path[-1][0], floor)], PALETTE[APPLE], PALETTE[APPLE])
@@ -147,15 +173,19 @@ class EpisodePicture:
         """Each agent's harvest so far, [T, N], as lines in their colours, which a legend repeats."""
         left = 2 * self._unit + self._half
         most = nice(int(harvests.max(initial=0)) if self._most is None else self._most)
-        self._axes(draw, left, f"apples harvested; the axis ends at {most:,}")
+        self._axes(draw, left, f"{harvests[-1].sum():,}", "apples harvested")
         for agent in range(harvests.shape[1]):
             path = self._points(left, harvests[:, agent], most)
             draw.line(path, agent_colour(agent), max(1, self._unit // 6))
-        self._legend.draw(draw, (left, self._plot_top + self._line), harvests[-1])
+        below = self._axes_top - self._line * self._legend.rows
+        self._legend.draw(draw, (left, below), harvests[-1])
 
-    def _axes(self, draw: ImageDraw.ImageDraw, left: int, title: str) -> None:
+    def _axes(self, draw: ImageDraw.ImageDraw, left: int, number: str, words: str) -> None:
+        """The frame of a plot over turns; above it a large number and what it counts."""
         top, high, wide, below = self._axes_top, self._plot_height, self._half, self._unit // 4
-        draw.text((left, self._plot_top), title, _TEXT, self._font)
+        draw.text((left, self._numbers_top), number, _TEXT, self._large)
+        under = self._numbers_top + 5 * self._unit // 2
+        draw.text((left, under), words, _FAINT, _fitting(words, wide, self._unit))
         draw.rectangle((left, top, left + wide, top + high), outline=_LINE)
         draw.text((left, top + high + below), "0", _FAINT, self._font)
         draw.text((left + wide / 2, top + high + below), "turn", _FAINT, self._font, anchor="ma")
@@ -170,6 +200,18 @@ class EpisodePicture:
         return points if len(points) > 1 else points * 2
 
 
+@cache
+def _font(pixels: int) -> ImageFont.FreeTypeFont:
+    """DejaVu Sans, which matplotlib brings: Pillow's own font has no letters beyond English."""
+    return ImageFont.truetype(Path(matplotlib.get_data_path(), "fonts/ttf/DejaVuSans.ttf"), pixels)
+
+
+def _fitting(text: str, room: float, largest: int) -> ImageFont.FreeTypeFont:
+    """The font in the largest size, in pixels, in which a text has room."""
+    wide = _font(largest).getlength(text)
+    return _font(largest if wide <= room else max(1, int(largest * room / wide)))
+
+
 class _Legend:
     """The number of each agent in its colour, with its harvest, in as many rows as it takes.
 
@@ -179,7 +221,7 @@ class _Legend:
         font: of the text.
     """
 
-    def __init__(self, agents: int, wide: int, font: ImageFont.ImageFont | ImageFont.FreeTypeFont) -> None:
+    def __init__(self, agents: int, wide: int, font: ImageFont.FreeTypeFont) -> None:
         self._font, self._agents = font, agents
         self._item = int(font.getlength("00:0000  "))
         self._in_a_row = max(1, wide // self._item)

@@ -31,7 +31,6 @@ class FreshEpisode:
     env: EnvBase
     """One world, with the run's transforms."""
     policies: AgentPolicies
-    title: str
 
 
 def fresh_episode(
@@ -48,12 +47,12 @@ def fresh_episode(
     arguments.object_of("run", run, (str, Path), "a directory")
     loaded = load(run, allow=allow)
     if replica not in loaded.replicas:
-        raise ValueError(f"replica is {replica}; allowed: {', '.join(map(str, loaded.replicas))}")
+        replicas = ", ".join(map(str, loaded.replicas))
+        raise ValueError(f"replica is {replica}; allowed: {replicas}, those of {run}")
     return FreshEpisode(
         run=loaded,
         env=loaded.env(1, seed=seed, first_world=episode),
         policies=loaded.policy(replica, seed=seed + episode),
-        title=f"{Path(run).name}, agents of replica {replica}, fresh episode {episode}",
     )
 
 
@@ -93,20 +92,21 @@ def film(
     target = Path(run) / f"film-{replica}-{episode}.rrd" if out is None else Path(out)
     refuse_to_write_over(target)
     target.parent.mkdir(parents=True, exist_ok=True)
+    title = f"{Path(run).name}, agents of replica {replica}, fresh episode {episode}"
     try:
-        return target, _recorded(fresh, target)
+        return target, _recorded(fresh, target, title)
     except BaseException:  # a recording of half an episode would stand in the way of the next attempt
         target.unlink(missing_ok=True)
         raise
 
 
-def _recorded(fresh: FreshEpisode, target: Path) -> Episode:
+def _recorded(fresh: FreshEpisode, target: Path, title: str) -> Episode:
     """Plays the episode into a recording."""
     others = dict(zip(fresh.policies.indices, fresh.policies.actors, strict=True))
     with ViewerCallback(
         target.parent,
         fresh.env,
-        title=fresh.title,
+        title=title,
         episodes=1,
         recipe=fresh.run.recipe,
         file_name=target.name,

@@ -1,11 +1,13 @@
-"""film_video: an episode of the agents of a stored run as a GIF or an MP4."""
+"""film_video: an episode of the agents of stored runs, side by side, as a GIF or an MP4."""
 
+import re
 from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
 from math import ceil
 from pathlib import Path
 from typing import Final
 
-from torchrl.envs import EnvBase
+import numpy as np
 
 from cprl import arguments, keys
 from cprl.commons.world import Bytes, Shown
@@ -17,13 +19,12 @@ from cprl.evaluation.episode_picture import (
     SMALLEST_WIDTH,
     EpisodePicture,
 )
-from cprl.evaluation.film import SEED, fresh_episode
+from cprl.evaluation.film import SEED, FreshEpisode, fresh_episode
 from cprl.evaluation.turns import Turns
 from cprl.evaluation.video_files import check_can_write_mp4, write_gif, write_mp4
 from cprl.measuring.episodes import Episode
 from cprl.measuring.tracking import tracker_of
 from cprl.memory import check_memory
-from cprl.policies.assignment import AgentPolicies
 from cprl.runs.labelled import refuse_to_write_over
 
 SUFFIXES: Final = (".gif", ".mp4")
@@ -40,16 +41,22 @@ def film_video(
     run: str | Path,
     out: str | Path,
     *,
+    beside: Sequence[str | Path] = (),
+    titles: Sequence[str] = (),
     replica: int = 0,
     episode: int = 0,
     seed: int = SEED,
     every: int | None = None,
     fps: float = DEFAULT_FPS,
-    width: int = DEFAULT_WIDTH,
+    width: int | None = None,
     allow: Sequence[str] = (),
-) -> tuple[Path, Episode]:
-    """Films an episode of a run's agents: the board, the apples on it and each agent's harvest so far; under
-    institutions, agents that broke a rule since the last picture have a white diamond around them.
+) -> tuple[Path, tuple[Episode, ...]]:
+    """Film an episode of a run's agents, beside those of other runs if there are any.
+
+    A film shows the board, the apples on it and each agent's harvest so far, turn by turn, and ends with a
+    card of two seconds that says what came of it; under institutions, agents that broke a rule since the last
+    picture have a white diamond around them. Populations side by side play on one clock; one whose board is
+    dead waits for the others.
 
     It is the episode that `cprl.evaluation.film.film` records with the same numbers; the first and the last
     board are always in the film.
@@ -57,6 +64,10 @@ def film_video(
     Args:
         run: its directory, or its exported results.
         out: the film, a .gif or, with imageio-ffmpeg, an .mp4; complete or absent.
+        beside: more runs, whose agents are shown to the right of the first. Games may differ; where they do
+            not, all play the same fresh world.
+        titles: of the run and those beside it, one each; by default the institutions of each, or the names of
+            their experiments.
         replica: the index of the agents' replica.
         episode: the index of the fresh episode; equal indices give equal episodes.
         seed: of the worlds and all chance. The world is that of `evaluate_run` with the same seed, of number
@@ -64,15 +75,16 @@ def film_video(
         every: turns from one picture to the next; by default 1 for an .mp4, and for a .gif as many as
             it takes for 300 pictures.
         fps: pictures per second, above 0, at most 50; in a .gif rounded to hundredths of a second a picture.
-        width: of the pictures in pixels, 240 to 1920; the height follows from the board, which is
-            at most twice as high.
+        width: of the pictures in pixels, at most 1920, and at least 240 for each run; by default 640 for each
+            run that has room. The height follows from the boards, each at most twice as high as its part is
+            wide.
         allow: see `cprl.load`.
 
     Returns:
-        The film, and the episode.
+        The film, and the episode of each run.
 
     Raises:
-        ValueError: if the run cannot be loaded, see `cprl.load`, plays a game without a board, or an argument
+        ValueError: if a run cannot be loaded, see `cprl.load`, plays a game without a board, or an argument
             is out of range.
         FileExistsError: if the film exists.
         ModuleNotFoundError: for an .mp4 without imageio-ffmpeg.
@@ -81,49 +93,127 @@ def film_video(
     path = arguments.path("out", out)
     if path.suffix not in SUFFIXES:
         raise arguments.refusal("out", str(path), f"a file whose name ends in {' or '.join(SUFFIXES)}")
+    runs = (run, *arguments.listed("beside", beside, "a sequence of runs"))
+    most_runs = LARGEST_WIDTH // SMALLEST_WIDTH
+    if len(runs) > most_runs:
+        raise arguments.refusal("beside", f"{len(runs) - 1} runs", f"at most {most_runs - 1}")
+    titles = arguments.texts("titles", titles)
+    if titles and (len(titles) != len(runs) or not all(map(str.isprintable, titles))):
+        raise arguments.refusal("titles", titles, f"a line of text for each of {len(runs)} runs")
     every = None if every is None else arguments.integer("every", every, 1)
     allowed = f"a number above 0, at most {MOST_FPS:g}"
     fps = arguments.number("fps", fps, low=0.0, high=MOST_FPS, above=True, allowed=allowed)
-    arguments.integer("width", width, SMALLEST_WIDTH, LARGEST_WIDTH)
+    width = min(LARGEST_WIDTH, DEFAULT_WIDTH * len(runs)) if width is None else width
+    width = arguments.integer("width", width, SMALLEST_WIDTH * len(runs), LARGEST_WIDTH) // len(runs)
     refuse_to_write_over(path)
     if path.suffix == ".mp4":
         check_can_write_mp4(path)
-    fresh = fresh_episode(run, replica=replica, episode=episode, seed=seed, allow=allow)
-    commons = commons_of(fresh.env)
-    if commons is None:
-        raise ValueError(f"{run} plays a game without a board of cprl; allowed: a run of a cprl.Game")
-    moments, violators, played = _play(fresh.env, commons, fresh.policies)
-    board, steps = commons.game.map, commons.game.rules.episode_steps
-    most = int(moments[-1].harvested.max())
-    picture = EpisodePicture(board, steps=steps, width=width, most_harvested=most)
+    fresh = [fresh_episode(one, replica=replica, episode=episode, seed=seed, allow=allow) for one in runs]
+    panels = _panels(fresh, titles or _titles(fresh), width)
+    length = max(len(panel.moments) for panel in panels)
     if every is None:
-        every = 1 if path.suffix == ".mp4" else ceil(len(moments) / GIF_FRAMES)
-    chosen = sorted({*range(0, len(moments), every), len(moments) - 1})
-    end = "no apple is left" if played.terminated else ""
+        every = 1 if path.suffix == ".mp4" else ceil(length / GIF_FRAMES)
+    chosen = sorted({*range(0, length, every), length - 1})
 
     def draw(turns: Sequence[int]) -> Iterator[Bytes]:
+        """The pictures after these turns, and the end card."""
         for turn in turns:
-            note = end if turn == len(moments) - 1 else ""
-            first = max((other for other in chosen if other < turn), default=-1) + 1
-            broke = sorted(set().union(*violators[first : turn + 1]))
-            yield picture.draw(moments[: turn + 1], fresh.title, note=note, violators=broke)
+            since = max((other for other in chosen if other < turn), default=-1) + 1
+            yield np.concatenate([panel.draw(turn, since=since) for panel in panels], 1)
+        yield np.concatenate([panel.draw(length, since=length, card=True) for panel in panels], 1)
 
+    wide, high = sum(panel.picture.size[0] for panel in panels), panels[0].picture.size[1]
     path.parent.mkdir(parents=True, exist_ok=True)
     if path.suffix == ".mp4":
-        write_mp4(path, draw(chosen), picture.size, fps=fps)
+        write_mp4(path, draw(chosen), (wide, high), fps=fps)
     else:
-        needed = 3 * len(chosen) * picture.size[0] * picture.size[1]
-        check_memory(f"every is {every}: {len(chosen):,} pictures", needed, "fewer or smaller pictures")
-        samples = chosen[:: ceil(len(chosen) / _SAMPLES)] + chosen[-1:]
+        check_memory(
+            f"every is {every}: {len(chosen):,} pictures",
+            3 * len(chosen) * wide * high,
+            "fewer or smaller pictures",
+        )
+        samples = chosen[:: ceil(len(chosen) / _SAMPLES)]
         write_gif(path, draw(chosen), list(draw(samples)), fps=fps)
-    return path, played
+    return path, tuple(panel.played for panel in panels)
 
 
-def _play(
-    env: EnvBase, commons: CommonsEnv, policies: AgentPolicies
-) -> tuple[list[Shown], list[set[int]], Episode]:
+def _titles(fresh: Sequence[FreshEpisode]) -> Sequence[str]:
+    """Return what tells runs apart: their institutions, their names, or the names of their directories."""
+    kinds = [[type(kind).__name__ for kind in _commons(population).game.institutions] for population in fresh]
+    rules = [re.sub("(?<=[a-z])(?=[A-Z])", " ", " and ".join(names)).lower() for names in kinds]
+    names = [population.run.experiment.name.replace("_", " ") for population in fresh]
+    titles = [rule or "no rule" for rule in rules] if any(rules) else names
+    for candidates in (titles, names):
+        if len(set(candidates)) == len(fresh):
+            return [title[0].upper() + title[1:] for title in candidates]
+    return [population.run.path.resolve().name for population in fresh]
+
+
+def _commons(fresh: FreshEpisode) -> CommonsEnv:
+    """The world that is filmed, of a game with a board."""
+    commons = commons_of(fresh.env)
+    if commons is None:
+        raise ValueError(
+            f"{fresh.run.path} plays a game without a board of cprl; allowed: a run of a cprl.Game"
+        )
+    return commons
+
+
+@dataclass(frozen=True, kw_only=True)
+class _Panel:
+    """What a film shows of one population."""
+
+    title: str
+    picture: EpisodePicture
+    moments: list[Shown]
+    """The board as the episode began, then after each turn."""
+    violators: list[set[int]]
+    """The agents that broke a rule in the turn that led to each moment."""
+    played: Episode
+
+    def draw(self, turn: int, *, since: int, card: bool = False) -> Bytes:
+        """The population after a turn of the film's clock, or at its end if that was before.
+
+        Args:
+            turn: the turn.
+            since: the first turn whose violators are marked.
+            card: whether to say what came of the episode.
+        """
+        last, sites = len(self.moments) - 1, len(self.picture.board.sites)
+        left, apples = int(self.moments[last].stock.sum()), int(self.moments[last].harvested.sum())
+        is_dead = self.played.terminated and left == 0
+        dead = f"dead at turn {last:,} of {self.picture.steps:,}" if is_dead else ""
+        outcome = dead or f"{left:,} of {sites:,} apples left"
+        return self.picture.draw(
+            self.moments[: turn + 1],
+            self.title,
+            end=dead if turn >= last else "",
+            card=f"{outcome} · {apples:,} apple{'' if apples == 1 else 's'}" if card else "",
+            violators=sorted(set().union(*self.violators[since : turn + 1])),
+        )
+
+
+def _panels(fresh: Sequence[FreshEpisode], titles: Sequence[str], width: int) -> list[_Panel]:
+    """Play the episodes; return what is shown of each, in panels of one size with one axis of harvests."""
+    games = [_commons(population).game for population in fresh]
+    episodes = [_play(population) for population in fresh]
+    most = max(int(moments[-1].harvested.max()) for moments, _, _ in episodes)
+    height = max(EpisodePicture(game.map, steps=1, width=width).size[1] for game in games)
+    panels = []
+    for title, game, (moments, violators, played) in zip(titles, games, episodes, strict=True):
+        picture = EpisodePicture(
+            game.map, steps=game.rules.episode_steps, width=width, most_harvested=most, height=height
+        )
+        panels.append(
+            _Panel(title=title, picture=picture, moments=moments, violators=violators, played=played)
+        )
+    return panels
+
+
+def _play(fresh: FreshEpisode) -> tuple[list[Shown], list[set[int]], Episode]:
     """All boards of the episode, that at its start first, without what agents observe; the agents that broke
     a rule in the turn that led to each; and the episode."""
+    env, commons = fresh.env, _commons(fresh)
 
     def now() -> Shown:
         shown = commons.worlds.show(commons.output)
@@ -131,7 +221,7 @@ def _play(
 
     longest = commons.game.rules.episode_steps
     tracker = tracker_of(env, longest)
-    turns = Turns(env, policies)
+    turns = Turns(env, fresh.policies)
     moments, violators = [now()], [set[int]()]
     while True:
         batch = turns.play()

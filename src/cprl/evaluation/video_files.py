@@ -127,7 +127,7 @@ def write_mp4(path: Path, pictures: Iterable[Bytes], size: tuple[int, int], *, f
             last = None
             for last in pictures:
                 video.send(np.ascontiguousarray(last))
-            for _ in range(round(HOLD_S * fps)):
+            for _ in range(round(HOLD_S * fps) - 1):
                 video.send(np.ascontiguousarray(last))
 
         def write(file: BinaryIO) -> None:

@@ -13,7 +13,7 @@ from cprl.play.keys import ACTION_NAMES, ARROWS, keys_of
 from cprl.play.session import Session
 from cprl.play.wording import ending, happened, results
 
-WIDTHS: Final = (960, 800, 640, 480, 320, 240)
+WIDTHS: Final = (960, 800, 720, 640, 480, 320, 240)
 """Of the window, in pixels; the first at which it is at most HIGHEST is taken."""
 HIGHEST: Final = 860
 
@@ -129,8 +129,8 @@ class WindowPicture:
     def draw(self) -> Bytes:
         """The picture of the present turn: uint8 [height, width, 3], RGB."""
         session = self.session
-        note = ending(session) if session.has_ended else ""
-        episode = self._episode.draw(session.moments, self.title, note=note, own=session.agent)
+        end = ending(session) if session.has_ended else ""
+        episode = self._episode.draw(session.moments, self.title, end=end, own=session.agent)
         image = Image.new("RGB", self.size, PALETTE[GROUND])
         image.paste(Image.fromarray(episode), (0, 0))
         draw = ImageDraw.Draw(image)
