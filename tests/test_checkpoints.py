@@ -19,6 +19,7 @@ from cprl.learners.lanes import SAMPLING, lane_seeds
 from cprl.policies.rng import DRAWN_AHEAD, LaneRng
 from cprl.runs.checkpoints import Checkpointer, checkpoints_in, read_checkpoint
 from cprl.runs.episodes import EpisodeTable, read_episodes
+from cprl.runs.files import write_atomically
 from cprl.runs.weights import load_weights
 from cprl.spaces import Spaces
 
@@ -124,7 +125,7 @@ def test_it_survives_sigkill_at_twenty_random_moments(tmp_path):
         time.sleep(chance.uniform(0.0, 0.25))
         process.kill()
         process.communicate()
-        while_writing += (run / "checkpoints" / "training.partial").exists()
+        while_writing += any((run / "checkpoints").glob("training.*.partial"))
         kept = checkpoints_in(run / "checkpoints")
         moments.append((read_checkpoint(kept[-1])["steps"] if kept else 0, read_episodes(run).num_rows))
         assert len(kept) <= 3
@@ -134,6 +135,31 @@ def test_it_survives_sigkill_at_twenty_random_moments(tmp_path):
     assert [steps for steps, _ in moments] == sorted(steps for steps, _ in moments), "nothing kept was lost"
     train_and_die.main(run, every_s=1000)
     assert_same_run(run, tmp_path / "one_go")
+
+
+def test_two_writers_of_a_file_do_not_notice_each_other(tmp_path):
+    path = tmp_path / "table"
+
+    def write_slowly(file):
+        file.write(b"fir")
+        write_atomically(path, lambda other: other.write(b"second"))
+        assert path.read_bytes() == b"second"
+        file.write(b"st")
+
+    write_atomically(path, write_slowly)
+    assert path.read_bytes() == b"first"
+    assert [*tmp_path.iterdir()] == [path]
+
+
+def test_what_killed_processes_left_half_written_is_removed_by_the_next_one(tmp_path):
+    run = tmp_path / "run"
+    left = [run / f"recipe.json.{8 * '0'}.partial", run / "checkpoints" / f"training.{8 * 'f'}.partial"]
+    left[1].parent.mkdir(parents=True)
+    for path in [*left, run / "of_mine.partial"]:
+        path.touch()
+    with Checkpointer(run):
+        assert not any(path.exists() for path in left)
+    assert (run / "of_mine.partial").exists()
 
 
 class State:

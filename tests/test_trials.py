@@ -75,7 +75,7 @@ def test_a_trial_prints_into_its_log_and_says_how_far_it_is(tmp_path, capsys):
 def test_what_a_killed_process_left_before_its_recipe_is_no_obstacle(tmp_path, undisturbed):
     own = task(tmp_path)
     own.directory.mkdir(parents=True)
-    (own.directory / "recipe.json.partial").write_text("{")
+    (own.directory / "recipe.json.0123abcd.partial").write_text("{")
     (own.directory / LOCK).write_text("")
     assert run_task(own).state == "finished"
     assert_same(own.directory, undisturbed)

@@ -52,11 +52,11 @@ def test_the_gate_closes(twin, tmp_path):
     weights = torch.load(run / "checkpoints" / "final.pt", weights_only=True)
     next(iter(next(iter(weights.values())).values())).view(torch.int32).view(-1)[0] ^= 1
     torch.save(weights, run / "checkpoints" / "final.pt")
-    (run / "checkpoints" / "training.partial").touch()
+    (run / "checkpoints" / "training.0123abcd.partial").touch()
     (run / "report.json").unlink()
     assert differences(run, whole) == [
         "report.json is missing",
-        "checkpoints/training.partial is left",
+        "checkpoints/training.0123abcd.partial is left",
         "checkpoints/final.pt differs",
         "episodes.parquet differs",
     ]

@@ -17,16 +17,13 @@ from rich.console import Console
 from cprl.output import console as safe_console
 from cprl.runs import formats
 from cprl.runs.directory import resume_command as command_to_resume
-from cprl.runs.files import checksum, place_atomically, refuse_special
+from cprl.runs.files import checksum, place_atomically, refuse_special, remove_partial
 from cprl.runs.lock import RunLock
 
 FOLDER: Final = "checkpoints"
 EVERY_S: Final = 300.0
 KEPT: Final = 2
 """Checkpoints that are kept: the newest, and one more in case it is unreadable."""
-
-PARTIAL: Final = "training.partial"
-"""The suffix of a checkpoint that is being written, or whose writing was interrupted."""
 
 _NAME: Final = re.compile(r"(training|ending)-(\d{12})-([0-9a-f]{32})\.pt")
 _SIGNALS: Final = (signal.SIGINT, signal.SIGTERM)
@@ -147,7 +144,7 @@ class Checkpointer:
         self._refuse_deleted()
         self.folder.mkdir(exist_ok=True)
         path = place_atomically(
-            self.folder / PARTIAL,
+            self.folder / kind,
             lambda file: torch.save(training.state_dict(), file),
             lambda partial: self.folder / f"{kind}-{training.steps:012d}-{checksum(partial)}.pt",
         )
@@ -172,7 +169,6 @@ class Checkpointer:
         for path in checkpoints_in(self.folder):
             if not (self.keep_ending and is_ending(path)):
                 path.unlink()
-        (self.folder / PARTIAL).unlink(missing_ok=True)
 
     def _refuse_deleted(self) -> None:
         """Ends a run whose directory was deleted, or made again by somebody else; nothing is recreated."""
@@ -189,6 +185,7 @@ class Checkpointer:
         self._lock = RunLock(self.run, take_over=self._take_over).__enter__()
         found = self.run.stat()
         self._place = (found.st_dev, found.st_ino)
+        remove_partial(self.run, self.folder, self.run / "evaluation", self.run / "figures")
         # Python handles signals in the main thread only; in other threads handlers stay as they are.
         for number in _SIGNALS if current_thread() is main_thread() else ():
             self._usual[number] = signal.signal(number, self._stop)

@@ -3,13 +3,17 @@
 import hashlib
 import json
 import os
+import secrets
 import sys
 from collections.abc import Callable
 from contextlib import suppress
 from pathlib import Path
-from typing import Any, BinaryIO
+from typing import Any, BinaryIO, Final
 
 from cprl.checks import check_nesting
+
+_PARTIAL: Final = f"*.{8 * '[0-9a-f]'}.partial"
+"""The names of files that are being written, or whose writing was interrupted."""
 
 
 def write_atomically(path: Path, write: Callable[[BinaryIO], object]) -> None:
@@ -19,24 +23,23 @@ def write_atomically(path: Path, write: Callable[[BinaryIO], object]) -> None:
         path: the file; an existing file is replaced.
         write: writes the content.
     """
-    place_atomically(path.with_name(path.name + ".partial"), write, lambda partial: path)
+    place_atomically(path, write, lambda partial: path)
 
 
-def place_atomically(
-    partial: Path, write: Callable[[BinaryIO], object], name: Callable[[Path], Path]
-) -> Path:
+def place_atomically(path: Path, write: Callable[[BinaryIO], object], name: Callable[[Path], Path]) -> Path:
     """Like `write_atomically`, for a file whose name depends on its content.
 
     Args:
-        partial: the temporary name.
+        path: names the temporary file, to which each writer adds letters of its own.
         write: writes the content.
         name: returns the final name, given the complete temporary file.
 
     Returns:
         The file.
     """
+    partial = path.with_name(f"{path.name}.{secrets.token_hex(4)}.partial")
     try:
-        with open(partial, "wb") as file:
+        with open(partial, "xb") as file:
             write(file)
             file.flush()
             os.fsync(file.fileno())
@@ -50,6 +53,13 @@ def place_atomically(
             raise OSError(error.errno, error.strerror, str(partial)) from error
         raise
     return path
+
+
+def remove_partial(*folders: Path) -> None:
+    """Removes the temporary files that killed processes left in folders, where nobody else writes now."""
+    for folder in folders:
+        for path in folder.glob(_PARTIAL):
+            path.unlink(missing_ok=True)
 
 
 def write_json(path: Path, value: object) -> None:

@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from cprl.arguments import refusal, switch, texts
+from cprl.runs.files import remove_partial
 from cprl.runs.lock import FILE_NAME as LOCK
 from cprl.runs.lock import RunLock, RunLockedError
 from cprl.studies.directory import STATUS, write_study
@@ -121,6 +122,7 @@ def as_driver(
     with ExitStack() as stack:
         try:
             stack.enter_context(RunLock(out))
+            remove_partial(out, out / STATUS, out / "figures")
         except RunLockedError:
             driver.others = _others(out)
         if watch != "off":

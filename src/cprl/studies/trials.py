@@ -21,6 +21,7 @@ from cprl.population import Frozen, with_stored
 from cprl.runs.directory import FILE_NAME as RECIPE
 from cprl.runs.directory import read_recipe
 from cprl.runs.extension import REPORT
+from cprl.runs.files import remove_partial
 from cprl.runs.lock import FILE_NAME as LOCK
 from cprl.runs.lock import RunLock, RunLockedError
 from cprl.studies.conditions import Condition
@@ -230,8 +231,7 @@ def _clear(run: Path, *, take_over: bool) -> None:
     if not run.exists():
         return
     with RunLock(run, take_over=take_over):
-        for path in run.glob("*.partial") if state_of(run) == "missing" else ():
-            path.unlink(missing_ok=True)
+        remove_partial(run)
 
 
 @contextmanager
