@@ -23,6 +23,7 @@ from cprl.studies import InProcess, Processes, Ray, run_study
 from cprl.studies.directory import STATUS
 from cprl.studies.executors import memory, on_ray, processes
 from cprl.studies.executors.memory import BASE_BYTES, MemoryNeeds, estimated_bytes
+from cprl.studies.executors.stopping import Stopping
 from cprl.studies.status import Status
 from cprl.studies.trials import run_task, task_of, trials_of
 
@@ -180,23 +181,40 @@ def wait_until_both_train(out, process):
 
 
 @pytest.mark.slow
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
 @pytest.mark.parametrize("on", ["Processes(2)", "Ray(jobs=2)"])
-def test_a_study_that_is_asked_to_stop_saves_and_the_same_line_continues_it(tmp_path, on):
+def test_a_study_that_is_asked_to_stop_saves_and_the_same_line_continues_it(tmp_path, on, number):
     out = tmp_path / "study"
     with started(out, on, episodes=100_000) as process:
         workers = wait_until_both_train(out, process)
-        process.send_signal(signal.SIGINT)
+        process.send_signal(number)
         said, _ = process.communicate(timeout=60)
-    assert process.returncode == 0, said
+    assert process.returncode == (128 + number if number == signal.SIGTERM else -number), said
     assert "Stopping: each trial finishes its step and saves a checkpoint" in said
     assert "Stopped; 2 trials are left. The same line again continues the study." in said
-    assert "Traceback" not in said
+    assert ("Traceback" in said) == (number == signal.SIGINT), "of a KeyboardInterrupt, by Python"
     assert still_alive(workers, 5) == []
     for run in (out / "runs").iterdir():
         assert list((run / "checkpoints").glob("training-*.pt")), said
         assert not (run / "run.lock").exists()
     for log in (out / STATUS).glob("*.log"):
         assert "Stopped; everything up to step" in log.read_text()
+
+
+@pytest.mark.parametrize(
+    ("number", "kind"), [(signal.SIGINT, KeyboardInterrupt), (signal.SIGTERM, SystemExit)], ids=str
+)
+def test_a_study_stopped_in_worker_processes_ends_as_its_signal_says(number, kind, capsys):
+    def stopped():
+        with Stopping() as stopping:
+            os.kill(os.getpid(), number)
+            assert stopping.asked == 1
+            stopping.end(2)
+
+    with pytest.raises(kind) as ended:
+        stopped()
+    assert getattr(ended.value, "code", None) in (None, 143)
+    assert "2 trials are left" in capsys.readouterr().out
 
 
 @pytest.mark.slow

@@ -5,7 +5,9 @@ import os
 import shutil
 import signal
 import socket
+import time
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 
 import pytest
@@ -17,6 +19,7 @@ from cprl import Custom, cli, maps, running
 from cprl.algorithms import DQN
 from cprl.population import Frozen, Learning, Scripted
 from cprl.runs.checkpoints import Checkpointer, checkpoints_in, is_ending, read_checkpoint
+from cprl.runs.directory import start_run
 from cprl.runs.episodes import read_episodes, read_table
 from cprl.runs.export import export_results
 from cprl.runs.files import checksum
@@ -56,6 +59,66 @@ def assert_same(run, other):
     for name in ("random", "trained"):
         one, two = (read_table(each / "evaluation" / f"{name}.parquet") for each in (run, other))
         assert one.equals(two)
+
+
+class Signals:
+    """Sends a signal to this process after a step."""
+
+    def __init__(self, number, step):
+        self.number, self.left = number, step
+
+    def on_step(self, batch):
+        self.left -= 1
+        if self.left == 0:
+            os.kill(os.getpid(), self.number)
+
+
+@pytest.mark.parametrize(
+    ("number", "kind"), [(signal.SIGINT, KeyboardInterrupt), (signal.SIGTERM, SystemExit)], ids=str
+)
+def test_a_run_that_a_signal_stops_is_saved_and_raises_what_the_signal_means(number, kind, tmp_path, capsys):
+    with pytest.raises(kind) as ended:
+        run(FIELD, tmp_path / "run", callbacks=[Signals(number, 30)])
+    assert getattr(ended.value, "code", None) in (None, 128 + signal.SIGTERM)
+    assert len(checkpoints_in(tmp_path / "run" / "checkpoints")) == 1
+    assert "Stopped; everything up to step" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_a_command_that_a_signal_stops_says_once_what_resumes_and_exits_as_shells_count(
+    number, tmp_path, monkeypatch, capsys
+):
+    begun = start_run(tmp_path / "begun", "field", FIELD.to_recipe)
+    run_it = partial(cprl.run, callbacks=[Signals(number, 30)])
+    monkeypatch.setattr(cli, "run_experiment", run_it)
+    words = ["cprl", "run", str(begun), "--out", str(tmp_path / "run"), "--watch", "off"]
+    monkeypatch.setattr("sys.argv", words)
+    with pytest.raises(SystemExit) as ended:
+        cli.main()
+    assert ended.value.code == 128 + number
+    assert capsys.readouterr().out.count("To resume: ") == 1
+
+
+def test_sigterm_ends_a_command_as_ctrl_c_does_so_that_files_are_cleared_away(tmp_path, monkeypatch):
+    cleared = tmp_path / "cleared"
+
+    def half(*_, **__):
+        try:
+            os.kill(os.getpid(), signal.SIGTERM)
+            time.sleep(5)
+        finally:
+            cleared.touch()
+
+    before = signal.signal(signal.SIGTERM, signal.SIG_IGN)  # not the end of the tests
+    try:
+        monkeypatch.setattr(cli, "export_results", half)
+        monkeypatch.setattr("sys.argv", ["cprl", "export", "a", "b"])
+        with pytest.raises(SystemExit) as ended:
+            cli.main()
+    finally:
+        signal.signal(signal.SIGTERM, before)
+    assert ended.value.code == 143
+    assert cleared.exists()
 
 
 def contents(run):

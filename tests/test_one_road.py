@@ -1,5 +1,6 @@
 """What an experiment names works everywhere: training, stop, resume, evaluation, film, from its recipe."""
 
+import signal
 import subprocess
 import sys
 import time
@@ -88,7 +89,7 @@ def test_an_experiment_with_parts_of_its_own_is_stopped_resumed_evaluated_and_fi
     monkeypatch.setenv("STOP_AT_STEP", "71")
     with pytest.raises(SystemExit) as stopped:
         cprl.run(MEADOW, run, watch="off")
-    assert stopped.value.code == 0
+    assert stopped.value.code == 128 + signal.SIGTERM
     told = capsys.readouterr().out
     flags = " ".join(f"--allow {target}" for target in ALLOW)
     assert f"To resume: {' '.join(cprl_here())} run {run} --resume {flags}" in told

@@ -327,7 +327,8 @@ def test_what_continues_a_study_can_be_typed_here_and_its_summary_names_no_place
 
 
 @pytest.mark.integration
-def test_a_study_that_is_interrupted_says_what_is_kept_and_how_to_continue(capsys):
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_a_study_that_is_interrupted_says_what_is_kept_and_how_to_continue(number, capsys):
     Path("study.py").write_text(
         "import os, signal\n"
         "from tiny_study import FREEZE, TINY\n"
@@ -342,10 +343,10 @@ def test_a_study_that_is_interrupted_says_what_is_kept_and_how_to_continue(capsy
         "cprl.study_main(cprl.Study(TINY, {FREEZE: [2, 5]}, name='short'))\n"
     )
     paths = os.pathsep.join([str(ROOT / "src"), str(ROOT / "tests")])
-    environment = {**os.environ, "PYTHONPATH": paths, "STOP": str(int(signal.SIGTERM))}
+    environment = {**os.environ, "PYTHONPATH": paths, "STOP": str(int(number))}
     command = [sys.executable, "study.py", "--out", "kept"]
     stopped = subprocess.run(command, env=environment, capture_output=True, text=True, timeout=100)
-    assert stopped.returncode == 128 + signal.SIGTERM, stopped.stderr
+    assert stopped.returncode == 128 + number, stopped.stderr
     assert "1 of 2 trials are finished and 0 begun; all of it is kept in kept/runs" in stopped.stdout
     assert f"To continue: {shlex.join(command)}" in stopped.stdout
     assert json.loads(Path("kept/study.json").read_text())["name"] == "short"

@@ -13,7 +13,7 @@ from typing import Final
 
 import tyro
 
-from cprl.commandline import TAKES_NOTHING_OVER, Allow, in_a_sentence, make_importable
+from cprl.commandline import TAKES_NOTHING_OVER, Allow, ended_by_sigterm, in_a_sentence, make_importable
 from cprl.docs_cli import docs
 from cprl.egta_cli import egta
 from cprl.evaluation.evaluate import SEED
@@ -247,5 +247,5 @@ def main() -> None:
         return
     if run_by_name():
         return
-    with in_a_sentence("cprl"):
+    with in_a_sentence("cprl"), ended_by_sigterm():
         tyro.extras.subcommand_cli_from_dict(dict(COMMANDS), description=__doc__)

@@ -6,11 +6,14 @@ Its own arguments stand first; every number of the experiment can be changed by 
 
 import inspect
 import os
+import signal
 import sys
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
+from threading import current_thread, main_thread
+from types import FrameType
 from typing import Annotated, Any, Final, TypeVar
 
 import tyro
@@ -20,7 +23,7 @@ from cprl.checks import checked, instance
 from cprl.experiment import Experiment
 from cprl.finite import NotFiniteError
 from cprl.flags import applied, flags_of
-from cprl.output import say
+from cprl.output import RESUMES, say
 from cprl.shipped import program_of
 
 OptionsT = TypeVar("OptionsT")
@@ -87,7 +90,8 @@ def recipe_main(
 
     Raises:
         ValueError: where `argv` is no list of texts.
-        SystemExit: where the command line or an experiment is refused, with the reason.
+        SystemExit: where the command line or an experiment is refused, with the reason; with code 130 or 143
+            where SIGINT (Ctrl-C) or SIGTERM interrupted the run.
     """
     command = list(texts("argv", sys.argv if argv is None else argv, 1))
     with in_a_sentence(program_of(command[0])):
@@ -103,13 +107,17 @@ def recipe_main(
 @contextmanager
 def in_a_sentence(program: str) -> Iterator[None]:
     """Ends the process with a sentence and exit code 1 for what is refused, for files that cannot be written
-    or read, and for a package that is not installed; with exit code 130 after Ctrl-C. Any other error keeps
-    its traceback, as a ValueError of a training that has begun does."""
+    or read, and for a package that is not installed; with exit code 130 after Ctrl-C, and with 143 after a
+    SIGTERM that something here turns into `SystemExit`. Any other error keeps its traceback, as a ValueError
+    of a training that has begun does."""
     try:
         yield
-    except KeyboardInterrupt as error:
-        say("\n".join([f"{program}: interrupted", *getattr(error, "__notes__", [])]))
-        sys.exit(130)
+    except (KeyboardInterrupt, SystemExit) as error:
+        notes = [note for note in getattr(error, "__notes__", []) if not note.startswith(RESUMES)]
+        if isinstance(error, SystemExit) and not notes:
+            raise
+        say("\n".join([f"{program}: interrupted", *notes]))
+        sys.exit(130 if isinstance(error, KeyboardInterrupt) else error.code)
     except (ValueError, OSError, MemoryError, ModuleNotFoundError) as error:
         notes = getattr(error, "__notes__", [])
         if notes and not isinstance(error, OSError | MemoryError | NotFiniteError):
@@ -117,6 +125,23 @@ def in_a_sentence(program: str) -> Iterator[None]:
         if isinstance(error, BrokenPipeError) and not notes:  # `--help | head`: its reader has seen enough
             sys.exit(0)
         sys.exit("\n".join([_shortened(f"{program}: {error}"), *notes]))
+
+
+@contextmanager
+def ended_by_sigterm() -> Iterator[None]:
+    """Ends the block at SIGTERM as Ctrl-C does, so that no half of a file stays, by `SystemExit` with 143."""
+
+    def stop(number: int, frame: FrameType | None) -> None:
+        raise SystemExit(128 + number)
+
+    if current_thread() is not main_thread():  # which alone gets signals
+        yield
+        return
+    usual = signal.signal(signal.SIGTERM, stop)
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGTERM, usual)
 
 
 def _shortened(text: str) -> str:

@@ -21,6 +21,9 @@ PLAIN: Final = str.maketrans(
 )
 """What stands for characters that the output cannot show; others become question marks."""
 
+RESUMES: Final = "To resume: "
+"""What stands before the command line that resumes a run."""
+
 
 class Output(io.TextIOBase):
     """The standard output of the moment. What can no longer be written is dropped, which is said once.

@@ -19,7 +19,7 @@ from cprl.garbage import cleared_up, free_earlier
 from cprl.leftovers import remove, say_what_changed, say_what_is_kept, tidy_up
 from cprl.measuring.episodes import Episode
 from cprl.outcome import evaluate_population, heading, random_play, write_evaluation
-from cprl.output import OUT, say
+from cprl.output import OUT, RESUMES, say
 from cprl.parts import Parts, make_logger_callback, make_parts, make_viewer, title_of
 from cprl.population import Frozen, exploration_steps
 from cprl.process import prepare_process
@@ -108,6 +108,9 @@ def run(
     Raises:
         ValueError: for whatever does not fit, before anything is written; `RunLockedError` where another
             process writes the run.
+        KeyboardInterrupt: after the first SIGINT (Ctrl-C), when the state is saved and the line that resumes
+            is said; the second ends the process at once.
+        SystemExit: with code 143 after SIGTERM, likewise.
         FileExistsError: where `out` is not empty and `resume` is not given.
         OSError: for a full disk or a deleted directory; the message names it. What was written before is
             intact, and the run can be resumed.
@@ -165,7 +168,7 @@ def run(
     except BaseException as error:
         closing.close()
         if began.has_begun or (resume and isinstance(error, OSError)):
-            error.add_note(f"To resume: {checkpointer.resume_command}")
+            error.add_note(f"{RESUMES}{checkpointer.resume_command}")
         elif not resume and not isinstance(error, RunLockedError):
             remove(directory, but_keep_empty=is_there)
         raise

@@ -92,7 +92,8 @@ def study_main(study: Study, argv: Sequence[str] | None = None) -> Path:
 
     Raises:
         ValueError: where `argv` is no list of texts, or `study` no study.
-        SystemExit: where the command line is refused, with the reason; with code 1 where trials failed.
+        SystemExit: where the command line is refused, with the reason; with code 1 where trials failed, and
+            130 or 143 where SIGINT (Ctrl-C) or SIGTERM interrupted it.
     """
     object_of("study", study, Study, "a Study")
     command = list(texts("argv", sys.argv if argv is None else argv, 1))

@@ -1,21 +1,20 @@
 """How a study is run, as options of a command line: `cprl sweep` and recipes of studies share them."""
 
 import os
-import signal
 import sys
 import time
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
-from types import FrameType
 from typing import Any, Final, Literal
 
 import tyro
 
 from cprl.arguments import integer
+from cprl.commandline import ended_by_sigterm
 from cprl.measuring.statistics import Interval
-from cprl.output import console, printed, say
+from cprl.output import RESUMES, console, printed, say
 from cprl.runs.directory import without_directories, without_options
 from cprl.shipped import command_of, named_command
 from cprl.studies.directory import RUNS, STATUS, directory_of
@@ -107,7 +106,7 @@ def carry_out(what: Study | Search, options: StudyOptions, command: Sequence[str
 
     Raises:
         ValueError: for whatever does not fit, before anything is written.
-        SystemExit: with code 1 where trials have failed, and where it was interrupted.
+        SystemExit: with code 1 where trials have failed, and 130 or 143 where it was interrupted.
     """
     executor, again = executor_of(options), printed(command_of(command))
     if isinstance(what, Search):
@@ -188,16 +187,10 @@ def _say_failed(result: StudyResult | SearchResult, again: str) -> None:
 @contextmanager
 def _interruptible(again: str) -> Iterator[None]:
     """Says what is kept, and what continues, where the block is ended by Ctrl-C (SIGINT) or SIGTERM."""
-
-    def stop(number: int, frame: FrameType | None) -> None:
-        raise SystemExit(128 + number)
-
-    usual = signal.signal(signal.SIGTERM, stop)
     try:
-        yield
+        with ended_by_sigterm():
+            yield
     except (KeyboardInterrupt, SystemExit) as error:
-        kept = [note for note in getattr(error, "__notes__", []) if not note.startswith("To resume")]
+        kept = [note for note in getattr(error, "__notes__", []) if not note.startswith(RESUMES)]
         say("\n".join(["Interrupted.", *kept, f"To continue: {again}"]))
         sys.exit(130 if isinstance(error, KeyboardInterrupt) else error.code)
-    finally:
-        signal.signal(signal.SIGTERM, usual)

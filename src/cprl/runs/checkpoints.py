@@ -9,11 +9,12 @@ from collections.abc import Mapping
 from pathlib import Path
 from threading import current_thread, main_thread
 from types import FrameType, TracebackType
-from typing import Any, Final, Protocol, Self
+from typing import Any, Final, NoReturn, Protocol, Self
 
 import torch
 from rich.console import Console
 
+from cprl.output import RESUMES
 from cprl.output import console as safe_console
 from cprl.runs import formats
 from cprl.runs.directory import resume_command as command_to_resume
@@ -48,8 +49,9 @@ class Checkpointer:
 
     Within its block the run is locked, see `RunLock`. A checkpoint is written to a temporary file, synced to
     disk and then renamed; its name includes the checksum of its content. On the first SIGINT or SIGTERM the
-    checkpointer finishes the current step, saves the state, prints the command that resumes and exits with
-    code 0; the second signal ends the process at once. Once the training is over, the first signal exits.
+    checkpointer finishes the current step, saves the state, prints the command that resumes and raises what
+    `interruption` makes of the signal; the second signal ends the process at once. Once the training is over,
+    the first signal raises it.
 
     The checkpoints stay until `done` is called, when whatever follows the training is finished too.
 
@@ -81,7 +83,9 @@ class Checkpointer:
         self.resume_command = command_to_resume(run) if resume_command is None else resume_command
         self.console = console or safe_console()
         self._saved = time.monotonic()
-        self._is_training, self._asked_to_stop = True, False
+        self._is_training = True
+        self._asked_to_stop: int | None = None
+        """The signal."""
         self._has_ending = not keep_ending
         self._place: tuple[int, int] | None = None
         self._lock: RunLock | None = None
@@ -120,12 +124,12 @@ class Checkpointer:
     def after_step(self, training: HasState) -> None:
         """Saves a checkpoint if one is due, or if the process was asked to stop; then stops it."""
         ends = training.is_ending and not self._has_ending
-        if self._asked_to_stop:
+        if self._asked_to_stop is not None:
             path = self.save(training, kind="ending" if ends else "training")
             self.console.print(
                 f"Stopped; everything up to step {training.steps:,} is saved in {path}", soft_wrap=True
             )
-            self._stop_now()
+            self._stop_now(self._asked_to_stop)
         self._is_training = not training.is_over
         if ends:
             self.save(training, kind="ending")
@@ -203,20 +207,26 @@ class Checkpointer:
             self._lock.__exit__(kind, error, traceback)
 
     def _stop(self, number: int, frame: FrameType | None) -> None:
-        if self._asked_to_stop:
+        if self._asked_to_stop is not None:
             signal.signal(number, signal.SIG_DFL)
             os.kill(os.getpid(), number)
             return
-        self._asked_to_stop = True
+        self._asked_to_stop = number
         if self._is_training:
             self.console.print("Stopping after this step; signal again to stop at once.")
             return
         self.console.print("Stopped after the training, which is saved.")
-        self._stop_now()
+        self._stop_now(number)
 
-    def _stop_now(self) -> None:
-        self.console.print(f"To resume: {self.resume_command}", soft_wrap=True, highlight=False)
-        raise SystemExit(0)
+    def _stop_now(self, number: int) -> NoReturn:
+        self.console.print(f"{RESUMES}{self.resume_command}", soft_wrap=True, highlight=False)
+        raise interruption(number)
+
+
+def interruption(number: int) -> BaseException:
+    """Return what ends a process that saved everything after a signal: `KeyboardInterrupt` for SIGINT, which
+    Python turns into exit code 130, and `SystemExit` with code 143 for SIGTERM, as shells count."""
+    return KeyboardInterrupt() if number == signal.SIGINT else SystemExit(128 + number)
 
 
 def _is_sound(training: HasState) -> bool:

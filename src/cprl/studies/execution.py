@@ -74,6 +74,9 @@ def run_study(
 
     Raises:
         ValueError: for whatever does not fit, before anything is written.
+        KeyboardInterrupt: after SIGINT (Ctrl-C), when every trial that runs has saved its state; a note says
+            what is kept.
+        SystemExit: with code 143 after SIGTERM, likewise.
     """
     object_of("study", study, Study, "a Study")
     out = directory_of(study, out)

@@ -12,8 +12,8 @@ class Executor(Protocol):
     """Runs tasks; an outcome is yielded as soon as a task has ended, in whatever order.
 
     It stops what it started when its iterator is closed. At the first SIGINT or SIGTERM of the process that
-    iterates, every running trial finishes its step and saves a checkpoint, and the process exits with code 0;
-    the same line again continues.
+    iterates, every running trial finishes its step and saves a checkpoint, and `KeyboardInterrupt` or
+    `SystemExit` with code 143 is raised; the same line again continues.
     """
 
     def run(self, tasks: Sequence[Task]) -> Iterator[Outcome]:

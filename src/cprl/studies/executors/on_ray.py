@@ -71,7 +71,8 @@ class Ray:
 
         Raises:
             ConnectionError: where there is no cluster at the address.
-            SystemExit: with code 0 after SIGINT or SIGTERM, when every worker has saved a checkpoint.
+            KeyboardInterrupt: after SIGINT, when every worker has saved a checkpoint.
+            SystemExit: with code 143 after SIGTERM, likewise.
         """
         if not tasks:
             return

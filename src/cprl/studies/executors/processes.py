@@ -53,7 +53,8 @@ class Processes:
         """Runs every task; they begin in order.
 
         Raises:
-            SystemExit: with code 0 after SIGINT or SIGTERM, when every worker has saved a checkpoint.
+            KeyboardInterrupt: after SIGINT, when every worker has saved a checkpoint.
+            SystemExit: with code 143 after SIGTERM, likewise.
         """
         waiting, tried = deque(tasks), Counter[str]()
         workers = [_Worker() for _ in range(min(self.jobs, len(tasks)))]

@@ -6,6 +6,7 @@ from types import FrameType, TracebackType
 from typing import Any, Final, NoReturn, Self
 
 from cprl.output import console
+from cprl.runs.checkpoints import interruption
 
 _SIGNALS: Final = (signal.SIGINT, signal.SIGTERM)
 
@@ -19,6 +20,7 @@ class Stopping:
 
     def __init__(self) -> None:
         self.asked = 0
+        self._number: int = signal.SIGINT
         self._usual: dict[int, Any] = {}
 
     def __enter__(self) -> Self:
@@ -37,6 +39,7 @@ class Stopping:
 
     def _ask(self, number: int, frame: FrameType | None) -> None:
         self.asked += 1
+        self._number = number
         if self.asked == 1:
             console().print(
                 "Stopping: each trial finishes its step and saves a checkpoint; signal again to kill them.",
@@ -44,7 +47,7 @@ class Stopping:
             )
 
     def end(self, left: int) -> NoReturn:
-        """Says how many trials are left, and exits with code 0."""
+        """Say how many trials are left, and raise what `interruption` makes of the signal."""
         trials = "1 trial is" if left == 1 else f"{left} trials are"
         console().print(f"Stopped; {trials} left. The same line again continues the study.", soft_wrap=True)
-        raise SystemExit(0)
+        raise interruption(self._number)
