@@ -12,6 +12,9 @@ from study_runs import EXPERIMENT, TIME_OUT, write_run, write_study
 from cprl import Study, cli
 from cprl.measuring.statistics import difference, estimate
 from cprl.studies.factors import Uniform
+from cprl.studies.figures import by_factor as by_factor_module
+from cprl.studies.figures import courses as courses_module
+from cprl.studies.figures import diagrams
 from cprl.studies.figures.by_condition import by_condition
 from cprl.studies.figures.by_factor import _Axis, by_factor
 from cprl.studies.figures.courses import courses
@@ -251,6 +254,75 @@ def test_random_draws_are_drawn_as_points_and_have_no_heat_map(tmp_path):
     size(by_factor(table, "agents.*.algorithm.settings.gamma", tmp_path / "gamma.png"))
     with pytest.raises(ValueError, match="allowed: none, as the conditions are no grid of two factors"):
         heat_map(table, (TIME_OUT, "agents.*.algorithm.settings.gamma"), tmp_path / "map.png")
+
+
+@pytest.fixture
+def drawn(monkeypatch):
+    """The figures that are drawn, instead of their files."""
+    figures = []
+    for module in (by_factor_module, courses_module, diagrams):
+        monkeypatch.setattr(module, "save", lambda figure, path, **how: figures.append(figure))
+    return figures
+
+
+def dashes(figure):
+    """The dashed lines of a figure's first panel with their colours, but for those of the legend."""
+    lines = [own for own in figure.axes[0].lines if own.get_marker() == "_"]
+    return [(own.get_color(), own.get_ydata().tolist()) for own in lines]
+
+
+def unlike(tmp_path, factors, random):
+    """A table of a study in which random play gets what a function of the levels says."""
+    study = Study(EXPERIMENT, factors, name="unlike", replicas=2)
+    for trial in trials_of(study):
+        by_chance = random(trial.condition.levels)
+        write_run(tmp_path / trial.name, trial.experiment, lambda *_: 0, random=by_chance)
+    return study_table(study, tmp_path)
+
+
+@pytest.mark.integration
+def test_random_play_under_unlike_rules_is_a_line_each_in_the_colour_of_its_conditions(tmp_path, drawn):
+    table = unlike(tmp_path, {TIME_OUT: [1, 5], SEES: [3, 5]}, lambda at: 4 if at[SEES] == 3 else -70)
+    by_factor(table, TIME_OUT, "unlike.png")
+    (blue, above), (orange, below) = dashes(drawn[0])
+    assert (above, below) == ([4, 4], [-70, -70])
+    trained = [own.get_color() for own in drawn[0].axes[0].lines if own.get_marker() == "o"]
+    assert trained == [blue, orange]
+
+
+@pytest.mark.integration
+def test_random_play_that_belongs_to_no_line_is_not_drawn(tmp_path, drawn, monkeypatch):
+    monkeypatch.setattr(by_factor_module, "_MOST_LINES", 1)
+    factors = {TIME_OUT: [1, 5], SEES: [3, 5]}
+    by_factor(unlike(tmp_path / "unlike", factors, lambda at: at[SEES]), TIME_OUT, "unlike.png")
+    assert dashes(drawn[0]) == []
+    by_factor(unlike(tmp_path / "same", factors, lambda at: at[TIME_OUT]), TIME_OUT, "same.png")
+    assert sorted(set(dashes(drawn[1])[0][1])) == [1, 5]
+
+
+@pytest.mark.integration
+def test_a_course_below_0_is_drawn_whole(tmp_path, drawn):
+    study = Study(EXPERIMENT, {TIME_OUT: [1, 5]}, name="below", replicas=2)
+    write_study(study, tmp_path, lambda condition, *_: condition.levels[TIME_OUT] - 60)
+    courses(study_table(study, tmp_path), "courses.png")
+    assert drawn[0].axes[0].get_ylim()[0] < -59
+    assert drawn[0].axes[1].get_ylim()[0] == 0
+
+
+@pytest.mark.integration
+@pytest.mark.parametrize("draw", ["heat_map", "phase_diagram"])
+def test_levels_are_mapped_in_the_order_in_which_they_were_given(tmp_path, drawn, draw):
+    words = {"tall": {SEES: 9}, "low": {SEES: 3}, "middle": {SEES: 5}}
+    study = Study(EXPERIMENT, {TIME_OUT: [25, 1], "view": words}, name="order", replicas=2)
+    table = study_table(study, tmp_path)
+    if draw == "heat_map":
+        write_study(study, tmp_path, lambda *_: 1)
+        heat_map(study_table(study, tmp_path), (TIME_OUT, "view"), "map.png")
+    else:
+        phase_diagram(table, endings([]), "phases.png", factors=(TIME_OUT, "view"))
+    axes = drawn[0].axes[0]
+    assert [own.get_text() for own in axes.get_xticklabels()] == ["tall", "low", "middle"]
+    assert [own.get_text() for own in axes.get_yticklabels()] == ["25", "1"]
 
 
 def test_numbers_that_are_far_apart_stand_on_a_logarithmic_axis_and_names_on_none():

@@ -1,6 +1,6 @@
 """Figures of metrics against a factor whose levels are numbers."""
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Final, Self
@@ -23,7 +23,7 @@ from cprl.studies.figures.panels import (
     replicas_text,
     short,
 )
-from cprl.studies.tables.comparing import LAST, Compared, Comparison, compare, metrics_of
+from cprl.studies.tables.comparing import LAST, Compared, compare, metrics_of
 from cprl.studies.tables.sources import Design
 from cprl.studies.tables.table import StudyTable
 from cprl.studies.tables.texts import metric_title
@@ -52,7 +52,8 @@ def by_factor(
 
     Points are means over replicas with their intervals, faint ones single replicas. Conditions that are equal
     but for this factor are joined by a line, which has a colour of its own if there are several. In random
-    draws, where hardly any are, points stand alone: the other factors vary too.
+    draws, where hardly any are, points stand alone: the other factors vary too. Dashes are random play under
+    each condition; there are none where it differs and points stand alone that have the same level.
 
     Args:
         table: the table.
@@ -82,17 +83,23 @@ def by_factor(
         design.conditions[own[0]][others[0]] if len(others) == 1 else nth
         for nth, own in enumerate(lines.values())
     ]
-    colours = {"": LEVEL} if len(lines) == 1 else colours_of(list(lines), only)
+    colours = dict.fromkeys(lines, LEVEL) if len(lines) == 1 else colours_of(list(lines), only)
     figure, panels = _grid(len(comparisons))
     axis = _Axis.of(factor, table)
+    random = {own.metric: compare(table, own.metric, part=RANDOM).by_name for own in comparisons}
+    is_same = all(_is_same(own.values(), factor) for own in random.values())
     for axes, comparison in zip(panels, comparisons, strict=True):
-        random = compare(table, comparison.metric, part=RANDOM)
         for name, members in lines.items():
             found = [comparison.by_name[own] for own in members]
             at = [axis.places[design.conditions[own][factor]] for own in members]
-            colour = colours[name] if len(lines) > 1 else LEVEL
-            _draw_line(axes, at, found, colour, name, joined=design.is_grid)
-        _draw_random(axes, [axis.places[own[factor]] for own in design.conditions.values()], random)
+            _draw_line(axes, at, found, colours[name], name, joined=design.is_grid)
+            if is_same or len(lines) > 1:
+                chance = [random[comparison.metric][own] for own in members]
+                colour = RANDOM_LINE["color"] if is_same else colours[name]
+                _draw_random(axes, at, chance, colour, joined=design.is_grid)
+        if is_same or len(lines) > 1:
+            label = "random play" if is_same else "random play, in the colour of its conditions"
+            axes.plot([], [], label=label, **RANDOM_LINE)
         axis.draw(axes)
         axes.set_title(metric_title(comparison.metric), fontsize=SMALL_PT + 1)
         axes.tick_params(labelsize=SMALL_PT)
@@ -202,12 +209,21 @@ def _draw_line(
     )
 
 
-def _draw_random(axes: Axes, at: Sequence[float], random: Comparison) -> None:
-    """Random play: its mean over the conditions with a level, by level."""
-    by_level: dict[float, list[float]] = {}
-    for x, own in zip(at, random.conditions, strict=True):
-        by_level.setdefault(x, []).extend([] if own.estimate is None else [own.estimate.value])
-    if any(by_level.values()):
-        order = sorted(by_level)
-        means = [float(np.mean(by_level[x])) if by_level[x] else np.nan for x in order]
-        axes.plot(order, means, marker="_", markersize=9, label="random play", **RANDOM_LINE)
+def _is_same(random: Iterable[Compared], factor: str) -> bool:
+    """Whether random play is the same under all conditions of each level of a factor."""
+    of_level: dict[float, set[float]] = {}
+    for own in random:
+        if own.estimate is not None:
+            of_level.setdefault(own.levels[factor], set()).add(round(own.estimate.value, 6))
+    return all(len(values) == 1 for values in of_level.values())
+
+
+def _draw_random(
+    axes: Axes, at: Sequence[float], random: Sequence[Compared], colour: str, *, joined: bool
+) -> None:
+    """Random play under each of the conditions that a line joins."""
+    means = [np.nan if own.estimate is None else own.estimate.value for own in random]
+    look = {**RANDOM_LINE, "color": colour}
+    if not (joined and len(set(at)) == len(at)):
+        look["linestyle"] = "none"
+    axes.plot(at, means, marker="_", markersize=9, **look)

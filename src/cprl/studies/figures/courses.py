@@ -102,10 +102,12 @@ def _together(
     panels = figure.subplots(len(metrics), 1, sharex=True, squeeze=False)[:, 0]
     levels = [next(iter(design.conditions[own].values()), own) for own in shown]
     colours = colours_of(shown, levels if len(design.factors) == 1 else list(shown))
-    for axes, metric in zip(panels, metrics, strict=True):
-        random = compare(table, metric, part=RANDOM).by_name
-        found = {own: random[own].estimate for own in shown}
-        same = len({round(own.value, 6) for own in found.values() if own is not None}) == 1
+    random = [compare(table, metric, part=RANDOM).by_name for metric in metrics]
+    levels_of = [{own: by_name[own].estimate for own in shown} for by_name in random]
+    same = all(
+        len({round(own.value, 6) for own in found.values() if own is not None}) <= 1 for found in levels_of
+    )
+    for axes, metric, found in zip(panels, metrics, levels_of, strict=True):
         for name in shown:
             _draw(axes, curves[name, metric], colours[name], names[name].replace("\n", " "))
             level = found[name]
@@ -118,7 +120,7 @@ def _together(
             else:
                 axes.plot([], [], **RANDOM_LINE, label="random play, in the colour of its condition")
         axes.set_ylabel(metric_title(metric), fontsize=SMALL_PT + 1)
-        axes.set_ylim(0, None)
+        _begin_at_0([axes])
         axes.tick_params(labelsize=SMALL_PT)
     panels[-1].set_xlabel("episode", fontsize=SMALL_PT + 1)
     heading = short(design.factors[0]) if len(design.factors) == 1 else None
@@ -148,10 +150,10 @@ def _apart(
         _draw(axes, curves[name, metric], "#08519c", "the condition of the panel")
         level = random[name].estimate
         if level is not None:
-            axes.axhline(level.value, **RANDOM_LINE, label="random play")
+            axes.axhline(level.value, **RANDOM_LINE, label="random play under the condition of the panel")
         axes.set_title(names[name], fontsize=SMALL_PT)
         axes.tick_params(labelsize=SMALL_PT)
-    panels[0].set_ylim(0, None)  # of all; earlier it would cut what is drawn later
+    _begin_at_0(panels)  # earlier it would cut what is drawn later
     for axes in panels[len(others) :]:
         axes.set_visible(False)
     for axes in panels[max(len(others) - columns, 0) : len(others)]:
@@ -160,6 +162,12 @@ def _apart(
     figure.supylabel(metric_title(metric), fontsize=SMALL_PT + 1)
     legend(figure, panels[0])
     return figure
+
+
+def _begin_at_0(panels: Sequence[Axes]) -> None:
+    """Lets the axis that panels share begin at 0, unless some of what they show is below."""
+    if all(axes.dataLim.y0 >= 0 for axes in panels):
+        panels[0].set_ylim(0, None)
 
 
 def _draw(axes: Axes, course: tuple[Values, Values, int], colour: str, label: str) -> None:

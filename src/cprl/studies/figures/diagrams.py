@@ -18,7 +18,6 @@ from cprl.plotting.cells import EMPTY, draw_cell
 from cprl.plotting.style import SHADES, SMALL_PT, head, picture_path, save, wrapped
 from cprl.studies.figures.panels import (
     MOST_CONDITIONS,
-    is_numeric,
     legend,
     levels_note,
     names_of,
@@ -72,7 +71,8 @@ def heat_map(
 ) -> Path:
     """Draws a metric over two factors: its mean with the number of replicas, and its difference.
 
-    Differences are from the reference; those whose interval excludes 0 have a star.
+    Levels are in the order of the conditions. Differences are from the reference; those whose interval
+    excludes 0 have a star.
 
     Args:
         table: the table.
@@ -89,7 +89,7 @@ def heat_map(
     path, design = picture_path(path), table.design
     grid, fixed = _checked(design, factors)
     comparison = compare(table, metric, part=part, last=last, interval=interval)
-    rows, columns = (_sorted({pair[nth] for pair in grid}) for nth in (0, 1))
+    rows, columns = ([*dict.fromkeys(pair[nth] for pair in grid)] for nth in (0, 1))
     figure = Figure(
         (max(2 * _CELL_IN[0] * len(columns) + 3.4, 8.0), _CELL_IN[1] * len(rows) + 2.3), layout="constrained"
     )
@@ -202,7 +202,7 @@ def _label_axes(axes: Axes, rows: Sequence[Any], columns: Sequence[Any], factors
 
 def _squares(found: Endings, grid: Grid, factors: tuple[str, str]) -> Figure:
     """The most frequent phase over two factors."""
-    rows, columns = (_sorted({pair[nth] for pair in grid}) for nth in (0, 1))
+    rows, columns = ([*dict.fromkeys(pair[nth] for pair in grid)] for nth in (0, 1))
     figure = Figure((max(1.3 * len(columns) + 2.5, 7.0), 0.6 * len(rows) + 2.2), layout="constrained")
     axes = figure.add_subplot()
     for (row, column), name in grid.items():
@@ -253,11 +253,6 @@ def _bars(table: StudyTable, found: Endings) -> Figure:
         axes.set_ylabel(short(design.factors[0]), fontsize=SMALL_PT)
     legend(figure, axes)
     return figure
-
-
-def _sorted(levels: set[Any]) -> list[Any]:
-    found = sorted(levels, key=str)
-    return sorted(found) if is_numeric(found) else found
 
 
 def _word(level: Any) -> str:
