@@ -153,7 +153,7 @@ def _apart(
             axes.axhline(level.value, **RANDOM_LINE, label="random play under the condition of the panel")
         axes.set_title(names[name], fontsize=SMALL_PT)
         axes.tick_params(labelsize=SMALL_PT)
-    _begin_at_0(panels)  # earlier it would cut what is drawn later
+    _begin_at_0(list(panels))  # earlier it would cut what is drawn later
     for axes in panels[len(others) :]:
         axes.set_visible(False)
     for axes in panels[max(len(others) - columns, 0) : len(others)]:
