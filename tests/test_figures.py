@@ -10,6 +10,7 @@ import pyarrow.parquet as pq
 import pytest
 from matplotlib.collections import PolyCollection
 from matplotlib.image import imread
+from matplotlib.text import Text
 from PIL import Image
 from test_phases import CORNERS, society
 from test_results import an_episode
@@ -232,6 +233,18 @@ def test_a_figure_is_written_with_150_dots_an_inch_and_a_long_title_wraps(tmp_pa
     title = figure.get_suptitle()
     assert max(map(len, title.splitlines())) <= style.TITLE_CHARACTERS
     assert imread(tmp_path / "a.png")[:, 0].min() == 1, "nothing reaches over the edge"
+
+
+@pytest.mark.parametrize("name", ["pay_$1_or_$_", "$a$", r"\$5"])
+def test_names_in_figures_are_no_formulas(name, tmp_path):
+    figure, (axes,) = style.new_figure([1.0], title=name)
+    axes.plot([1, 2], label=name)
+    axes.set_xticks([0, 1], [name, "other"])
+    style.legend_below(figure, [axes])
+    style.save(figure, tmp_path / "a.png")
+    texts = [text for text in figure.findobj(Text) if text.get_text() == name]
+    assert len(texts) >= 3, "the title, the tick and the legend"
+    assert not any(text.get_parse_math() for text in texts)
 
 
 @pytest.mark.integration

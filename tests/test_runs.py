@@ -4,6 +4,7 @@ import json
 import shlex
 import sys
 from dataclasses import MISSING, fields, replace
+from pathlib import Path
 
 import pytest
 
@@ -71,6 +72,14 @@ def test_the_recipe_of_a_run_is_its_experiment(tmp_path, monkeypatch):
     assert recipe["experiment"]["agents"][3]["run"] == "../earlier"
     assert Experiment.from_recipe(recipe, directory=run) == EXPERIMENT
     assert read_recipe(run / "recipe.json") == recipe
+
+
+@pytest.mark.parametrize("name", ["x.json", "recipe.json", "x.rrd", "a b", "-x", "~x", "a=b,c", "[0]*", "é"])
+def test_the_directory_of_a_run_may_have_any_name(name, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    run = begin(Path(name))
+    assert run == Path(name)
+    assert Experiment.from_recipe(read_recipe(run), directory=run) == EXPERIMENT
 
 
 @pytest.mark.parametrize(

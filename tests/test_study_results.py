@@ -236,6 +236,16 @@ def test_figures_of_a_grid_are_drawn_with_a_condition_that_has_no_run(grid_runs,
 
 
 @pytest.mark.integration
+@pytest.mark.parametrize("name", ["_x", "pay_$1_or_$_", "[/]", "a|b"])
+def test_a_condition_of_any_name_is_in_the_legend_of_the_courses(name, tmp_path, drawn):
+    study = Study(EXPERIMENT, conditions={name: {TIME_OUT: 1}, "other": {}}, name="names", replicas=1)
+    runs = write_study(study, tmp_path, lambda *_: 5)
+    courses(study_table(study, runs), tmp_path / "courses.png")
+    (legend,) = drawn[0].legends
+    assert any(name in text.get_text() for text in legend.get_texts())
+
+
+@pytest.mark.integration
 def test_conditions_that_were_not_run_do_not_count_among_the_replicas_of_a_figure():
     assert replicas_text({"as run": 8, "no beam": 8, "later": 0}) == "8 replicas each"
     assert replicas_text({"as run": 16, "no beam": 8, "later": 0}) == "8 to 16 replicas each (n)"

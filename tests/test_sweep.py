@@ -212,7 +212,7 @@ def test_help_says_how_values_are_written_and_what_a_command_line_cannot_change(
 
 
 def test_a_stored_recipe_is_varied_too(tmp_path, capsys):
-    run = start_run(tmp_path / "old", TINY.name, TINY.to_recipe)
+    run = start_run(tmp_path / "old.py", TINY.name, TINY.to_recipe)
     for source in (run, run / "recipe.json"):
         sweep(f"{source} --vary {FREEZE}=2,5 --dry-run")
         assert "freeze_steps=5, replica 0  missing" in capsys.readouterr().out

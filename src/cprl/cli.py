@@ -38,7 +38,7 @@ from cprl.scenarios_cli import scenarios
 from cprl.studies.tables.table_command import runs_table
 from cprl.studies_cli import sweep
 from cprl.viewer.page import Page, has_display
-from cprl.viewer.streams import viewer
+from cprl.viewer.streams import to_watch, viewer
 
 
 def run(
@@ -184,7 +184,7 @@ def watch(run: Path, /, *, serve: bool = False) -> None:
     if serve or not has_display():
         _serve(files, why="" if serve else "There is no display: ")
         return
-    command = [viewer(), *map(str, files)]
+    command = to_watch(*files)
     if sys.platform == "win32":  # where execvp ends this process at once, and quotes nothing
         sys.exit(subprocess.call(command))
     os.execvp(command[0], command)

@@ -31,7 +31,7 @@ from cprl.plotting.style import check_picture
 from cprl.presets import Variant
 from cprl.process import prepare_process
 from cprl.runs.labelled import refuse_to_write_over, write_table
-from cprl.viewer.streams import viewer
+from cprl.viewer.streams import to_watch
 
 
 def film(
@@ -89,7 +89,7 @@ def film(
     else:
         path, played = film_run(run, out, **which)
         say(f"{played.steps} steps, {played.outcome}")
-        say(f"Watch: {printed([viewer(), str(path)])}")
+        say(f"Watch: {printed(to_watch(path))}")
 
 
 def evaluate(

@@ -146,7 +146,7 @@ def sweep(words: Sequence[str], /) -> None:
     source = recipe_named(words[0]).path if is_shipped(words[0]) else Path(words[0])
     allow = [after for word, after in pairwise(words) if word == "--allow"]
     allow += [word.removeprefix("--allow=") for word in words if word.startswith("--allow=")]
-    sys.path[:0] = [str(source.resolve().parent)] if source.suffix == ".py" else []
+    sys.path[:0] = [str(source.resolve().parent)] if source.suffix == ".py" and source.is_file() else []
     sys.path[:0] = [os.getcwd()] if allow else []
     make = recipe_of(source, allow)
     program = f"{PROGRAM} {words[0]}"
@@ -225,7 +225,7 @@ def recipe_of(source: Path, allow: Sequence[str] = ()) -> Callable[..., Experime
     Raises:
         ValueError: where it is none of them.
     """
-    if source.suffix != ".py":
+    if source.suffix != ".py" or source.is_dir():
         directory = source if source.is_dir() else source.parent
         stored = Experiment.from_recipe(read_recipe(source), allow=allow, directory=directory)
 

@@ -10,6 +10,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.legend import Legend
 from matplotlib.patheffects import Normal, Stroke
+from matplotlib.text import Text
 
 from cprl import arguments
 from cprl.commons.colours import agent_colour
@@ -135,8 +136,13 @@ def check_picture(path: str | Path, name: str = "path") -> Path:
 
 
 def save(figure: Figure, path: Path, *, colours: int = COLOURS) -> Path:
-    """Writes a PNG of so few colours atomically; its folder is created if missing."""
+    """Write a PNG of so few colours atomically; its folder is created if missing.
+
+    Texts are drawn as they are: a name with two dollar signs is no formula.
+    """
     path.parent.mkdir(parents=True, exist_ok=True)
+    for text in figure.findobj(Text):
+        text.set_parse_math(False)
     drawn = BytesIO()
     figure.savefig(drawn, format="png", dpi=DPI)
     few = _with_colours(drawn, colours)

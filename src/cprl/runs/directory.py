@@ -240,7 +240,7 @@ def read_recipe(run: Path) -> dict[str, Any]:
         ValueError: if there is no run, its recipe cannot be read, or a newer cprl wrote it; names file and
             reason.
     """
-    path = Path(run) if Path(run).suffix == ".json" else Path(run) / FILE_NAME
+    path = Path(run) if Path(run).is_file() else Path(run) / FILE_NAME
     try:
         recipe = read_json(path)
         is_newer = isinstance(recipe.get("format"), int) and recipe["format"] > formats.RECIPE

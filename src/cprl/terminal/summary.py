@@ -18,7 +18,7 @@ from cprl.measuring.reported import left_out
 from cprl.output import printed
 from cprl.terminal.institutions import institutions_table
 from cprl.terminal.progress import console_of
-from cprl.viewer.streams import viewer
+from cprl.viewer.streams import to_watch
 
 KEPT = ("recipe.json", "episodes.parquet", "run.rrd", "checkpoints", "figures")
 METRICS: Final = {
@@ -77,7 +77,7 @@ def summarise(
     if figure:
         console.print(f"Training curve: {figure}", soft_wrap=True)
     if "run.rrd" in kept:
-        watch = printed([viewer(), str(run / "run.rrd")])
+        watch = printed(to_watch(run / "run.rrd"))
         console.print(f"Watch again: {watch}", soft_wrap=True)
 
 

@@ -207,6 +207,11 @@ def viewer() -> str:
     return "rerun" if shutil.which("rerun") else str(viewer_binary())
 
 
+def to_watch(*recordings: Path) -> list[str]:
+    """Return the command line that opens recordings in the native viewer, whatever their names begin with."""
+    return [viewer(), *(f"./{path}" if str(path).startswith("-") else str(path) for path in recordings)]
+
+
 def _warn_of(what: str, why: object) -> None:
     warnings.warn(f"the Rerun {what}: {why}; the run continues without it", RuntimeWarning, stacklevel=3)
 

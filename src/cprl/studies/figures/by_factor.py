@@ -152,6 +152,7 @@ class _Axis:
         """A tick for each level where there are few, with the number of replicas where it differs."""
         if not self.is_even and is_logarithmic(list(self.counts)):
             axes.set_xscale("log")
+            axes.xaxis.set_major_formatter("{x:g}")  # of matplotlib's own, formulas are texts like names
             axes.xaxis.set_minor_locator(NullLocator())
         if len(self.counts) <= _MOST_LINES:
             is_same = len(set(self.counts.values())) == 1

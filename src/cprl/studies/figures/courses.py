@@ -176,4 +176,5 @@ def _draw(axes: Axes, course: tuple[Values, Values, int], colour: str, label: st
         return
     middle, low, high = curve_interval(values)
     axes.fill_between(at, low, high, color=colour, alpha=0.2, linewidth=0)
+    label = f"\N{ZERO WIDTH SPACE}{label}" if label.startswith("_") else label  # matplotlib would hide it
     axes.plot(at, middle, color=colour, linewidth=2, marker="." if len(at) < 3 else None, label=label)
