@@ -486,3 +486,28 @@ def test_results_are_not_exported_without_a_file_that_the_run_had(whole, tmp_pat
     with pytest.raises(FileNotFoundError, match=r"listed in the manifest.*evaluation/trained\.parquet"):
         export_results(lost, tmp_path / "results")
     assert not (tmp_path / "results").exists()
+
+
+@pytest.mark.parametrize("name", ["checkpoints/final.pt", "evaluation/trained.parquet"])
+def test_a_run_that_lost_a_file_of_its_manifest_is_refused_by_that_file(name, whole, tmp_path):
+    lost = shutil.copytree(whole, tmp_path / "run")
+    (lost / name).unlink()
+    longer = replace(FIELD, episodes=FIELD.episodes + 1)
+    before = contents(lost)
+    for use in (
+        lambda: cprl.load(lost),
+        lambda: cprl.evaluate_run(lost, episodes=1),
+        lambda: run(FIELD, lost, resume=True),
+        lambda: run(longer, lost, resume=True),
+    ):
+        with pytest.raises(FileNotFoundError, match=name):
+            use()
+    assert contents(lost) == before
+
+
+def test_an_ended_run_without_its_weights_is_never_played_from_an_older_checkpoint(whole, tmp_path):
+    lost = shutil.copytree(whole, tmp_path / "run")
+    (lost / "checkpoints" / "final.pt").unlink()
+    (lost / "manifest.json").unlink()
+    with pytest.raises(ValueError, match=r"final\.pt"):
+        cprl.load(lost)

@@ -134,6 +134,17 @@ def test_what_is_not_finished_is_named_and_not_part_of_the_table(runs, tmp_path)
         assert str(own) in str(table)
 
 
+def test_two_trials_whose_directories_were_swapped_are_named_and_not_part_of_the_table(tmp_path):
+    write_study(STUDY, tmp_path, harvest)
+    one, other = (trial.name for trial in trials_of(STUDY)[:2])
+    (tmp_path / one).rename(tmp_path / "aside")
+    (tmp_path / other).rename(tmp_path / one)
+    (tmp_path / "aside").rename(tmp_path / other)
+    table = study_table(STUDY, tmp_path)
+    assert {lacking.name for lacking in table.lacking} == {one, other}
+    assert not {one, other} & set(table.rows["run"].to_pylist())
+
+
 def test_a_study_none_of_whose_runs_is_there_has_an_empty_table(tmp_path):
     table = study_table(STUDY, tmp_path)
     assert (len(table.rows), table.metrics, len(table.lacking)) == (0, (), 4)

@@ -12,6 +12,7 @@ from dataclasses import replace
 from pathlib import Path
 
 import pytest
+from study_runs import EXPERIMENT, TIME_OUT, write_run
 from tiny_study import FREEZE, TINY
 
 from cprl import Custom, Study, run_study
@@ -236,6 +237,28 @@ def test_a_run_that_another_study_began_under_another_name_is_gone_on_with(tmp_p
     shutil.copy(undisturbed / "recipe.json", own.directory)
     assert run_task(own).state == "finished"
     assert json.loads((own.directory / "recipe.json").read_text())["recipe"] == "tiny"
+
+
+def test_a_trial_in_the_directory_of_another_is_a_failure_by_name_and_stays_as_it_is(tmp_path):
+    study = Study(EXPERIMENT, {TIME_OUT: [5, 25]})
+    first, second = trials_of(study)
+    run = write_run(tmp_path / "runs" / first.name, second.experiment, lambda *_: 1)
+    before = {path: path.read_bytes() for path in run.rglob("*") if path.is_file()}
+    result = run_study(study, tmp_path, only=["freeze_steps=5"], progress=False)
+    (failed,) = result.failed
+    assert failed.name == first.name
+    assert "freeze_steps" in failed.reason
+    assert {path: path.read_bytes() for path in run.rglob("*") if path.is_file()} == before
+    assert result.table is None
+
+
+def test_a_finished_trial_that_lost_a_file_of_its_manifest_is_a_failure_by_that_file(tmp_path):
+    study = Study(EXPERIMENT)
+    (trial,) = trials_of(study)
+    run = write_run(tmp_path / "runs" / trial.name, trial.experiment, lambda *_: 1)
+    (run / "evaluation" / "trained.parquet").unlink()
+    (failed,) = run_study(study, tmp_path, progress=False, results=False).failed
+    assert "evaluation/trained.parquet" in failed.reason
 
 
 def written_at(run):

@@ -8,10 +8,16 @@ from cprl.output import ERR, console
 from cprl.runs.checkpoints import FOLDER, Checkpointer, checkpoints_in
 from cprl.runs.directory import changed_circumstances, write_changed_circumstances
 from cprl.runs.lock import FILE_NAME as LOCK
+from cprl.runs.manifest import refuse_missing
 
 
 def tidy_up(finished: Path, *, keep_checkpoint: bool, take_over: bool) -> None:
-    """Says that a run is finished, and tidies up if its process died before it had."""
+    """Says that a run is finished, and tidies up if its process died before it had.
+
+    Raises:
+        FileNotFoundError: if a file that its manifest lists is not there.
+    """
+    refuse_missing(finished)
     if (finished / LOCK).exists():
         with Checkpointer(finished, keep_ending=keep_checkpoint, take_over=take_over) as left:
             left.done()

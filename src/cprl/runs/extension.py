@@ -6,7 +6,7 @@ from typing import Any, Final
 
 from cprl.runs.checkpoints import FOLDER, checkpoints_in, is_ending, read_checkpoint, steps_of
 from cprl.runs.directory import write_more_episodes
-from cprl.runs.manifest import rename_listed
+from cprl.runs.manifest import refuse_missing, rename_listed
 
 REPORT: Final = "report.json"
 """Written when everything of a run is finished."""
@@ -28,7 +28,9 @@ def refuse_to_extend(run: Path, episodes: int, callbacks: Iterable[Any]) -> None
 
     Raises:
         ValueError: if it would not; says why.
+        FileNotFoundError: if a file that its manifest lists is not there.
     """
+    refuse_missing(run)
     for callback in callbacks:
         if depends_on_episodes(callback):
             raise ValueError(

@@ -32,8 +32,10 @@ def kept_of(run: Path, name: str | None = None) -> Kept:
             checkpoint of a run that has not ended.
 
     Raises:
+        FileNotFoundError: if a file that the manifest lists is not there; names each.
         ValueError: if there is nothing readable; names each file with its reason.
     """
+    refuse_missing(run)
     folder = run / FOLDER
     path = folder / f"{name or 'final'}.pt"
     if name is None and not path.exists():
@@ -63,6 +65,11 @@ def lacks_weights(run: Path) -> bool:
 
 
 def _from_checkpoint(run: Path, final: Path) -> Kept:
+    if lacks_weights(run):
+        raise ValueError(
+            f"{run} keeps no weights: its results were exported without them, or {final} was lost; allowed: "
+            "the run itself, or an export with weights"
+        )
     reasons = []
     for checkpoint in reversed(checkpoints_in(run / FOLDER)):
         try:
@@ -74,11 +81,6 @@ def _from_checkpoint(run: Path, final: Path) -> Kept:
         networks = {lane: own for networks in of_learners for lane, own in networks.items()}
         decisions = state.get("decisions", {}).get("_extra_state", {}).get("learned", {})
         return Kept(checkpoint, networks, state.get("env", {}).get("transforms", {}), decisions)
-    if not reasons and lacks_weights(run):
-        raise ValueError(
-            f"{run} keeps no weights: its results were exported without them; allowed: the run itself, or an "
-            "export with weights"
-        )
     raise ValueError(
         "; ".join([f"{final} is not there, nor a readable checkpoint: has {run} been trained?", *reasons])
     )

@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Any, Final, Literal
 
 from cprl.studies.status import Status
+from cprl.studies.tables.sources import REASONS
 from cprl.studies.trials import Trial
 from cprl.terminal.progress import in_words
 
@@ -153,9 +154,11 @@ class Overview:
                 left_s=(of - episodes) / seen.speed if seen.speed else None,
                 compiling_s=_number(seen.said, "compiling_s"),
             )
-        if (reason := self._failure(trial)) is not None:
+        reason = self._failure(trial) or (REASONS["refused"] if state == "refused" else None)
+        if reason is not None:
             return Row(trial=trial, state="failed", episodes=episodes, of=of, reason=reason)
-        return Row(trial=trial, state=state, episodes=episodes, of=of)
+        unfinished: TrialState = "missing" if state == "missing" else "unfinished"
+        return Row(trial=trial, state=unfinished, episodes=episodes, of=of)
 
     def _listen(self, trial: Trial) -> _Seen:
         """What a trial says now, and how fast it is."""

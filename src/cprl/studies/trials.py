@@ -16,6 +16,7 @@ from pathlib import Path
 from typing import Any, Final, Literal, NamedTuple
 
 from cprl.config import custom_targets
+from cprl.differences import differences
 from cprl.experiment import Experiment
 from cprl.population import Frozen, with_stored
 from cprl.runs.directory import FILE_NAME as RECIPE
@@ -24,12 +25,14 @@ from cprl.runs.extension import REPORT
 from cprl.runs.files import remove_partial
 from cprl.runs.lock import FILE_NAME as LOCK
 from cprl.runs.lock import RunLock, RunLockedError
+from cprl.runs.manifest import refuse_missing
+from cprl.runs.recipes import recipe_config
 from cprl.studies.conditions import Condition
 from cprl.studies.extending import begin_from_shorter
 from cprl.studies.status import Status, StatusCallback, StatusFile, is_silent
 from cprl.studies.study import Block, Study
 
-State = Literal["missing", "unfinished", "finished"]
+State = Literal["missing", "unfinished", "finished", "refused"]
 PATIENCE_S: Final = 60.0
 """Seconds without a sign of life after which a trial is taken over that another host has locked."""
 _POLL_S: Final = 1.0
@@ -50,8 +53,15 @@ class Trial:
         return f"{self.condition.checksum}-s{self.experiment.seed}-r{self.experiment.replicas}"
 
     def state(self, runs: Path) -> State:
-        """What its directory holds."""
-        return state_of(runs / self.name)
+        """What its directory holds; "refused" is a finished run of another trial."""
+        run = runs / self.name
+        state = state_of(run)
+        if state == "finished":
+            try:
+                refuse_another(run, self.experiment.to_recipe(run))
+            except ValueError:
+                return "refused"
+        return state
 
 
 def trials_of(study: Study) -> list[Trial]:
@@ -81,6 +91,29 @@ def _of_block(block: Block, stored: Frozen) -> Frozen:
     if stored.replica is None and block.first:
         return replace(stored, replica=tuple(range(block.first, last)))
     return stored
+
+
+def refuse_another(run: Path, recipe: Mapping[str, Any]) -> None:
+    """Refuses a finished run that is not the trial whose name its directory has, e.g. since it was renamed.
+
+    Args:
+        run: the directory of the trial.
+        recipe: what `Experiment.to_recipe` gives for the trial and this directory.
+
+    Raises:
+        ValueError: if its recipe is another; names the first difference.
+    """
+    stored, trial = recipe_config(read_recipe(run)), recipe["experiment"]
+    differ = differences({**stored, **_FREE}, {**trial, **_FREE}, "experiment", Experiment)
+    if differ:
+        raise ValueError(
+            f"{run} was started as another trial than its name says: {differ[0]}; give it back its name, or "
+            "move it away"
+        )
+
+
+_FREE: Final = {"name": "", "on_nan": ""}
+"""Fields that may differ between runs of the same trial."""
 
 
 def state_of(run: Path) -> State:
@@ -163,28 +196,32 @@ def run_task(task: Task) -> Outcome:
     """Makes a trial a finished one; may be called any number of times, anywhere.
 
     What is there is kept: a finished trial is left as it is, an unfinished one is resumed, and one that is
-    not there goes on from a shorter one if that can be, see `cprl.studies.extending`. For what happens while
-    another process runs it see `Task.waits`.
+    not there goes on from a shorter one if that can be, see `cprl.studies.extending`; a run of another
+    experiment, or one that lost results, is a failure. For what happens while another process runs it see
+    `Task.waits`.
 
     What it prints is in `log.txt` beside its status, and why it failed in `failed.txt`.
     """
     run, status = task.directory, Status(Path(task.status), task.name)
-    if state_of(run) == "finished":
-        status.tidy_up()
-        return Outcome(task.name, "finished")
+    was_finished = state_of(run) == "finished"
     sys.path += [path for path in task.paths if path not in sys.path]
     sys.argv = list(task.command)  # that of a worker process would name its machine's directories
     status.folder.mkdir(parents=True, exist_ok=True)
     try:
-        with _printing_into(status.log):
-            ended = _run(task, run, status)
+        if was_finished:
+            refuse_another(run, task.recipe)
+            refuse_missing(run)
+            ended = True
+        else:
+            with _printing_into(status.log):
+                ended = _run(task, run, status)
     except Exception as error:
         status.fail(f"{type(error).__name__}: {error}", traceback.format_exc())
         return Outcome(task.name, "failed", f"{type(error).__name__}: {error}", True)
     if not ended:
         return Outcome(task.name, "elsewhere")
     status.tidy_up()
-    return Outcome(task.name, "finished", worked=True)
+    return Outcome(task.name, "finished", worked=not was_finished)
 
 
 def _run(task: Task, run: Path, status: Status) -> bool:

@@ -14,6 +14,7 @@ REASONS: Final[dict[State, str]] = {
     "missing": "was not begun",
     "unfinished": "has not ended",
     "finished": "is finished",
+    "refused": "has another recipe than its name says, or none that can be read: was it renamed?",
 }
 
 
