@@ -1,6 +1,6 @@
 # `make run` and `make test` are all that a newcomer needs; each makes .venv first.
 PYTHON ?= python3
-# Where to take torch from; empty means wherever pip takes it from (see README, "Install").
+# Where to take torch from; empty means wherever pip takes it from (see docs/install.md).
 TORCH_INDEX ?=
 BIN := .venv/bin
 INSTALLED := .venv/.installed

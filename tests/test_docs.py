@@ -70,6 +70,22 @@ def test_the_docs_name_what_is_logged_and_kept_of_institutions():
     assert columns == [*OF_INSTITUTIONS, "in_force_<v>"]
 
 
+def test_the_rules_of_the_readme_have_the_numbers_of_the_page_of_institutions():
+    def rows(page, heading):
+        text = (ROOT / page).read_text().split(f"\n## {heading}\n")[1].split("\n## ")[0]
+        cells = [
+            line.replace("*", "").strip("| ").split(" | ") for line in text.splitlines() if line[:1] == "|"
+        ]
+        return [[float(cell.split(" [")[0]) for cell in row[1:]] for row in cells if row[-1][0].isdigit()]
+
+    readme = rows("README.md", "Five rules")
+    measured = rows("docs/institutions.md", "What they do to the tragedy")
+    assert len(readme) == 6, "with that of none"
+    harvest, net, equality, survival = 0, 1, 2, 4
+    of_page = [[row[column] for column in (harvest, net, survival, equality)] for row in measured]
+    assert [row for row in readme if row not in of_page] == []
+
+
 def codes(page):
     """The blocks of Python of a page."""
     return re.findall(r"```python\n(.*?)```", page.read_text(), re.DOTALL)

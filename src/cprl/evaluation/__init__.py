@@ -13,7 +13,7 @@ Modules, in the order in which one reads them:
     scenarios   run_scenarios: a run among named backgrounds that it never met
     territory   territory_of: where the agents of a run go and whom they tag
     film        an episode, every step recorded
-    film_video  the same as a GIF or an MP4
+    film_video  the same as a GIF or an MP4, several runs side by side
     lanes       stored agents of all replicas side by side
     same_game   whether two runs can play together
     words       what a word names: a board, and who plays
