@@ -4,6 +4,7 @@ import importlib
 import re
 import signal
 import sys
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -24,16 +25,16 @@ ALLOW = ("licence:Licence", "one_road_parts:Stopping")
 BOARD = maps.parse("A>..<.A\n.......\nA.....A")
 
 
-@pytest.fixture
-def licence(tmp_path_factory, monkeypatch):
-    """The module of the page, where a user would have it."""
-    (code,) = re.findall(r"```python\n(# licence\.py\n.*?)```", PAGE.read_text(), re.DOTALL)
+@pytest.fixture(params=["licence"])
+def licence(request, tmp_path_factory, monkeypatch):
+    """A module of the page, where a user would have it."""
+    (code,) = re.findall(rf"```python\n(# {request.param}\.py\n.*?)```", PAGE.read_text(), re.DOTALL)
     folder = tmp_path_factory.mktemp("own")
-    (folder / "licence.py").write_text(code)
+    (folder / f"{request.param}.py").write_text(code)
     monkeypatch.syspath_prepend(folder)
     importlib.invalidate_caches()
-    yield importlib.import_module("licence")
-    del sys.modules["licence"]
+    yield importlib.import_module(request.param)
+    del sys.modules[request.param]
 
 
 def game(**rules):
@@ -103,3 +104,28 @@ def test_a_run_that_is_stopped_and_resumed_equals_the_undisturbed_one_bit_for_bi
     one, two = (cprl.evaluate_run(run, episodes=2, allow=ALLOW).table() for run in (parts, whole))
     assert repr(one.to_pydict()) == repr(two.to_pydict())
     assert cprl.load(parts, allow=ALLOW).experiment == experiment()
+
+
+@pytest.mark.integration
+@pytest.mark.parametrize("licence", ["reserve"], indirect=True)
+@pytest.mark.parametrize("engine", ["eager", "torchrl"])
+def test_a_transform_stops_bites_in_a_training_by_putting_apples_back(licence, engine, tmp_path):
+    ungoverned = replace(game(regrow_prob=(0.0,), episode_steps=40, may_fire=False), institutions=())
+    experiment = Experiment(
+        name="reserve",
+        game=ungoverned,
+        agents=(Learning(DQN(settings=DQNSettings(buffer_size=100, learning_starts=4, batch_size=2))),) * 2,
+        episodes=4,
+        replicas=2,
+        evaluation_episodes=4,
+        transforms=(Custom("reserve:Reserve", arguments={"least": 3}),),
+        engine=engine,
+    )
+    run = cprl.run(experiment, tmp_path / "run", watch="off", allow=["reserve:Reserve"])
+    table = read_episodes(run)
+    assert table["return"].to_pylist() == table["harvest"].to_pylist()
+    assert min(table["stock_left"].to_pylist()) == 3, "some episode came down to what is kept, none below"
+    assert set(table["steps"].to_pylist()) == {40}, "with apples left, only the clock ends an episode"
+    together = [sum(pair) for pair in zip(*[iter(table["harvest"].to_pylist())] * 2, strict=True)]
+    left = table["stock_left"].to_pylist()[::2]
+    assert together == [len(BOARD.sites) - stock for stock in left]

@@ -34,7 +34,10 @@ class Rules:
 
     regrow_prob: tuple[float, ...] = (0.0, 0.01, 0.01, 0.05, 0.05, 0.1)
     """Probability per turn that an empty site grows an apple, indexed by the number of apples near it [W];
-    the last entry also applies to every larger number. Each 0, or 2**-32 (2.3e-10) to 1."""
+    the last entry also applies to every larger number. Each 0, or 2**-32 (2.3e-10) to 1.
+
+    With K sites, growth is logistic in the stock by `tuple(r * s / K for s in range(K + 1))` and
+    `regrow_radius_cells=1000`."""
 
     regrow_radius_cells: float = 2.0
     """The distance up to which apples count as near, in cells, measured by `regrow_norm`, inclusive [W].
