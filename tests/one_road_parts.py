@@ -44,6 +44,7 @@ class Bored:
 
     def on_episode(self, episode, learning) -> None:
         self.episodes += 1
+        learning["bored/episodes"] = torch.tensor(self.episodes)
         if self.episodes >= self.from_episode:
             for learner in self.training.learners.values():
                 learner.actor.epsilon = min(learner.actor.epsilon, self.epsilon)

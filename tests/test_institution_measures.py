@@ -277,6 +277,17 @@ def test_an_episode_has_what_was_paid_broken_counted_and_decided():
     assert episode.metrics["equality"] == 1.0, "of the harvest alone"
 
 
+def test_a_table_has_the_counts_of_the_institutions_that_the_game_has_and_no_others():
+    (episode,) = played(*an_episode(), institutions=[Quota(share=0.5, window_steps=10), Monitoring(prob=0.5)])
+    table = as_table([episode], 0)
+    assert set(COUNTS) & set(table.column_names) == {"excess_bites", "violations", "detections"}
+    of_counts = {name for name, needs in NEEDS.items() if "counts" in needs}
+    curves = as_curves(table)
+    measured = {name.removeprefix("institutions/") for name in curves}
+    assert measured & of_counts == {"excess_bites", "detection_rate"} == of_counts & set(episode.institutions)
+    assert curves["institutions/detection_rate"] == [[0.5]]
+
+
 def test_with_groups_inequality_within_and_between_them_is_measured():
     (episode,) = played(*an_episode(), institutions=[Levies(groups=((0,), (1,)))])
     assert episode.institutions["net_equality_within"] == 1.0

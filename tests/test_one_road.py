@@ -104,6 +104,12 @@ def test_an_experiment_with_parts_of_its_own_is_stopped_resumed_evaluated_and_fi
     assert (run / "film-0-0.rrd").stat().st_size > 10_000
 
 
+def test_what_a_callback_writes_into_learning_is_logged(in_one_go):
+    lines = (in_one_go / "logs/csv/scalars/bored/episodes.csv").read_text().split()
+    assert [line.split(",")[0] for line in lines] == [str(number) for number in range(6)]
+    assert lines[0] == "0,1.5", "the mean of the first and the second"
+
+
 def test_the_reward_is_what_the_transforms_make_of_it_and_the_harvest_is_not(in_one_go):
     table = read_episodes(in_one_go).to_pydict()
     bitten = [(own, paid) for own, paid in zip(table["harvest"], table["return"], strict=True) if own]

@@ -28,6 +28,7 @@ from cprl.measuring.published import curve, published_experiment
 from cprl.measuring.statistics import estimate
 from cprl.population import Frozen, Scripted
 from cprl.reporting import report, write_report
+from cprl.reporting.claims import undefined_in
 from cprl.reporting.measures import ROUNDS, dip_depth, measures, of_play, of_training
 from cprl.reporting.pooled import pooled
 from cprl.reporting.result import Result, read_result
@@ -540,6 +541,12 @@ def test_running_means_stand_at_their_first_episode_and_leave_out_what_is_undefi
     assert running_mean(np.array([1.0, 2.0, 6.0, 4.0]), 2).tolist() == [1.5, 4.0, 5.0]
     assert running_mean(np.array([[1.0, np.nan, 3.0]]), 2).tolist() == [[1.0, 3.0]]
     assert running_mean(np.array([1.0, 2.0]), 5).tolist() == [1.5]
+
+
+def test_a_report_counts_the_episodes_in_which_a_metric_is_undefined():
+    equality = np.array([[0.5, np.nan, 1.0], [np.nan, np.nan, 1.0]])
+    assert undefined_in(equality) == ", undefined in 3 of 6 episodes"
+    assert undefined_in(equality[:, 2:]) == ""
 
 
 def test_a_dip_is_measured_from_the_peak_before_it():

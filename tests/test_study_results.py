@@ -311,6 +311,15 @@ def test_random_play_that_belongs_to_no_line_is_not_drawn(tmp_path, drawn, monke
 
 
 @pytest.mark.integration
+def test_a_figure_counts_the_episodes_in_which_a_metric_is_undefined(tmp_path, drawn):
+    study = Study(EXPERIMENT, {TIME_OUT: [1, 5]}, name="idle", replicas=2)
+    idle = {"equality": lambda replica, number: NAN if number == 39 else 0.5}
+    table = study_table(study, write_study(study, tmp_path, lambda *_: 1, **idle))
+    by_factor(table, TIME_OUT, "idle.png", metrics=["equality"])
+    assert "undefined in 4 of 120 episodes" in drawn[0].axes[0].get_title().replace("\n", " ")
+
+
+@pytest.mark.integration
 def test_a_course_below_0_is_drawn_whole(tmp_path, drawn):
     study = Study(EXPERIMENT, {TIME_OUT: [1, 5]}, name="below", replicas=2)
     write_study(study, tmp_path, lambda condition, *_: condition.levels[TIME_OUT] - 60)

@@ -65,11 +65,20 @@ def test_a_policy_that_harvests_nothing_has_words_instead_of_nan(tmp_path):
     busy = [episode(0, [2, 2], equality=1.0), episode(1, [0, 0], equality=nan, sustainability=nan)]
     rows, text = told_of(tmp_path, random=idle, trained=busy)
     assert rows["times that of random play"] == ["undefined", "undefined"]
-    assert rows["equality (1 - Gini), 0 to 1"] == ["undefined", "1.00"]
+    assert rows["equality (1 - Gini), 0 to 1"] == ["undefined", "1.00, undefined in 1 of 2"]
     assert "nan" not in text
     assert "random: nobody harvested anything, so equality and sustainability are undefined" in text
-    assert "trained: equality and sustainability leave out 1 of 2 episodes" in text
     assert "times that of random play: undefined, because it is not above 0" in text
+
+
+def test_episodes_with_an_undefined_net_equality_are_counted(tmp_path):
+    fined = [
+        replace(episode(number, [2, 2]), fines=np.zeros(2), institutions={"net_equality": equality})
+        for number, equality in enumerate([0.5, float("nan"), 0.7])
+    ]
+    rows, _ = told_of(tmp_path, trained=fined)
+    (cells,) = (cells for name, cells in rows.items() if "net" in name)
+    assert cells == ["0.60, undefined in 1 of 3"]
 
 
 def test_one_episode_has_no_error_and_one_policy_no_baseline(tmp_path):

@@ -1,6 +1,6 @@
 """What is called while a training runs."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from typing import Any, Final, Protocol, runtime_checkable
 
 from tensordict import TensorDictBase
@@ -33,8 +33,12 @@ class Callback(Protocol):
     def on_step(self, batch: TensorDictBase) -> None:
         """One turn of every world, as the collector yields it, [R]."""
 
-    def on_episode(self, episode: Episode, learning: Mapping[str, float]) -> None:
-        """An episode has ended; what was learned in it: `agent_0/loss`, `agent_0/epsilon`, ..."""
+    def on_episode(self, episode: Episode, learning: dict[str, float]) -> None:
+        """An episode has ended; what was learned in it: `agent_0/loss`, `agent_0/epsilon`, ...
+
+        A number that is written into `learning` under a name of one's own is logged with the others, by the
+        loggers and the viewer of a run, and by callbacks that come later in a `Training`.
+        """
 
 
 HOOKS: Final = ("on_start", "on_step", "on_episode")

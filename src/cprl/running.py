@@ -278,7 +278,7 @@ def _train(
             others=own.population.others,
             decisions=own.population.decisions,
             episodes=experiment.episodes,
-            callbacks=[began, table, bar, *shown, *loggers, *own.callbacks],
+            callbacks=[began, table, bar, *own.callbacks, *shown, *loggers],
             checkpointer=checkpointer,
             update_every=experiment.update_every,
             on_nan=experiment.on_nan,

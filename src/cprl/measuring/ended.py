@@ -71,5 +71,5 @@ def episodes_of(
             metrics={name: float(values[k]) for name, values in metrics.items()},
             institutions={name: float(values[k]) for name, values in came.items()},
             **fields,
-            **institutional.fields_of(ended, k),
+            **institutional.fields_of(ended, k, of_game),
         )

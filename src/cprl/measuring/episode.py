@@ -55,7 +55,7 @@ class Episode:
     violations: NDArray[np.int64] | None = None
     """[N], steps in which the agent broke a rule of an institution."""
     counts: Mapping[str, NDArray[np.int64]] | None = None
-    """[N] by name, what institutions counted, see `cprl.institutions.COUNTS`."""
+    """[N] by name, what the game's institutions counted, see `cprl.measuring.institutions.counts_for`."""
     decision: NDArray[np.int64] | None = None
     """[N], what each agent had decided, see `cprl.institutions.choice.ballots`; None in games that ask
     nothing."""

@@ -108,12 +108,13 @@ def count(running: Mapping[str, Array], turn: Mapping[str, Array]) -> None:
             running["in_force"][first] = turn["in_force"][first]
 
 
-def fields_of(ended: Mapping[str, Array], index: int) -> dict[str, Any]:
+def fields_of(ended: Mapping[str, Array], index: int, of_game: Sequence[Institution]) -> dict[str, Any]:
     """The fields of `Episode` about institutions of one of the episodes that end, from their arrays."""
-    found: dict[str, Any] = {name: ended[name][index] for name in INSTITUTIONAL if name in ended}
-    if "counts" in found:
-        found["counts"] = {name: found["counts"][:, column] for column, name in enumerate(COUNTS)}
-    return found
+    fields: dict[str, Any] = {name: ended[name][index] for name in INSTITUTIONAL if name in ended}
+    if "counts" in fields:
+        counted = institutions.counts_for(of_game)
+        fields["counts"] = {name: fields["counts"][:, COUNTS.index(name)] for name in counted}
+    return fields
 
 
 def measured(

@@ -22,6 +22,7 @@ from torch import Tensor
 
 from cprl.arguments import integer, listed, objects, refusal
 from cprl.institutions import (
+    COUNTS,
     Boundaries,
     ClosedPatches,
     ClosedSeason,
@@ -76,6 +77,20 @@ KINDS: Final[Mapping[str, tuple[type[Institution], ...]]] = MappingProxyType(
 )
 """The institutions without which a metric says nothing; all others concern every institution."""
 
+COUNTED: Final[Mapping[str, tuple[str, ...]]] = MappingProxyType(
+    {
+        "trespasses": ("trespasses",),
+        "excess_bites": ("excess_bites",),
+        "closed_bites": ("closed_bites",),
+        "own_share_of_bites": ("own_bites", "foreign_bites"),
+        "detection_rate": ("detections", "violations"),
+        "recidivism": ("returns_to_violation", "violations"),
+        "sanctions_per_violation": ("sanctions", "violations"),
+        "unjust_share_of_tags": ("unjust_tags",),
+    }
+)
+"""Which of `cprl.institutions.COUNTS` each metric is computed from."""
+
 Groups = Sequence[Sequence[int]]
 """The indices of the agents of each group; each agent belongs to one group."""
 
@@ -93,6 +108,13 @@ def metrics_for(institutions: Sequence[Institution]) -> tuple[str, ...]:
     return tuple(
         name for name in NEEDS if name not in KINDS or any(isinstance(own, KINDS[name]) for own in there)
     )
+
+
+def counts_for(institutions: Sequence[Institution]) -> tuple[str, ...]:
+    """The names of `cprl.institutions.COUNTS` that say something of a game with these institutions; of a game
+    with none, whose entries are somebody's own, all."""
+    needed = {name for metric in metrics_for(institutions) for name in COUNTED.get(metric, ())}
+    return tuple(name for name in COUNTS if name == "violations" or name in needed)
 
 
 def groups_of(institutions: Sequence[Institution]) -> Groups | None:
@@ -119,7 +141,7 @@ def summary(
         fines: what institutions took from it.
         transfers: what they gave it.
         violations: turns in which it broke a rule.
-        counts: by the names of `cprl.institutions.COUNTS`, all of them.
+        counts: by the names of `cprl.institutions.COUNTS`; metrics of those that are lacking are left out.
         in_play_steps: turns in which it was in play.
         tags: how often it tagged somebody.
         groups: agents that belong together, for `OF_GROUPS`.
@@ -131,13 +153,12 @@ def summary(
     if violations is not None and in_play_steps is not None:
         found["violations_per_step"] = violations_per_step(violations, in_play_steps)
     if counts is not None:
-        found |= {name: total(name, counts[name]) for name in ("trespasses", "excess_bites", "closed_bites")}
-        found["own_share_of_bites"] = own_share_of_bites(counts["own_bites"], counts["foreign_bites"])
-        broken = counts["violations"]
-        found["detection_rate"] = detection_rate(counts["detections"], broken)
-        found["recidivism"] = recidivism(counts["returns_to_violation"], broken)
-        found["sanctions_per_violation"] = sanctions_per_violation(counts["sanctions"], broken)
-        if tags is not None:
+        totals = ("trespasses", "excess_bites", "closed_bites")
+        found |= {name: total(name, counts[name]) for name in totals if name in counts}
+        for name, ratio in _RATIOS.items():
+            if counts.keys() >= set(COUNTED[name]):
+                found[name] = ratio(*(counts[count] for count in COUNTED[name]))
+        if tags is not None and "unjust_tags" in counts:
             found["unjust_share_of_tags"] = unjust_share_of_tags(counts["unjust_tags"], tags)
     incomes = {} if harvest is None else {"": harvest}
     if harvest is not None and fines is not None and transfers is not None:
@@ -195,6 +216,14 @@ def sanctions_per_violation(sanctions: Tensor, violations: Tensor) -> Tensor:
     Above 1 where tags are sanctioned too. Undefined without a violation.
     """
     return _ratio(total("sanctions", sanctions), total("violations", violations))
+
+
+_RATIOS: Final = {
+    "own_share_of_bites": own_share_of_bites,
+    "detection_rate": detection_rate,
+    "recidivism": recidivism,
+    "sanctions_per_violation": sanctions_per_violation,
+}
 
 
 def unjust_share_of_tags(unjust_tags: Tensor, tags: Tensor) -> Tensor:

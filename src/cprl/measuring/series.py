@@ -23,6 +23,9 @@ def numbers_of(episode: Episode, learning: Mapping[str, float], agents: Sequence
         episode: the episode.
         learning: the numbers of learning in it, by agent index: `agent_0/loss` and so on.
         agents: the agents' names, which replace `agent_0` and so on.
+
+    Raises:
+        ValueError: for something else than numbers by name in `learning`, as a callback may write there.
     """
     numbers = {f"social/{name}": value for name, value in social_metrics(episode).items()}
     for agent, value in zip(agents, episode.return_, strict=True):
@@ -33,8 +36,12 @@ def numbers_of(episode: Episode, learning: Mapping[str, float], agents: Sequence
             numbers |= {f"{agent}/{name}": float(own) for agent, own in zip(agents, values, strict=True)}
     named = {f"agent_{index}": agent for index, agent in enumerate(agents)}
     for name, value in learning.items():
+        arguments.object_of("a name in learning", name, str, "a text")
         of, slash, what = name.partition("/")
-        numbers[f"{named.get(of, of)}{slash}{what}"] = value
+        try:
+            numbers[f"{named.get(of, of)}{slash}{what}"] = float(value)
+        except (TypeError, ValueError, RuntimeError) as error:
+            raise arguments.refusal(f"learning[{name!r}]", value, "a number") from error
     return numbers
 
 

@@ -112,6 +112,12 @@ def with_interval(values: Values) -> str:
     return f"{estimate(values)}"
 
 
+def undefined_in(values: Values) -> str:
+    """In how many episodes a metric is undefined, which are in no mean, [R, E]; "" in none."""
+    count = int(np.isnan(values).sum())
+    return f", undefined in {count:,} of {values.size:,} episodes" if count else ""
+
+
 def rows_of(claims: Sequence[Claim]) -> list[list[str]]:
     """The cells of a table of claims; see `HEAD`."""
     return [[one.claim, one.measure, one.published, one.ours, one.verdict] for one in claims]

@@ -13,7 +13,7 @@ from cprl.measuring.published import PHASED_RECIPE, PHASES_BEGIN, curve, publish
 from cprl.measuring.shares import share
 from cprl.population import Learning
 from cprl.reporting import verdicts
-from cprl.reporting.claims import Claim, more, number, rule, side, where
+from cprl.reporting.claims import Claim, more, number, rule, side, undefined_in, where
 from cprl.reporting.markdown import table
 from cprl.reporting.result import Result
 from cprl.runs.curves import running_mean
@@ -66,10 +66,11 @@ def of_experiment_5(result: Result) -> Iterator[Claim]:
         )
         at, values = _published(result, "equality")
         late = float(values[at >= at[-1] - LAST].mean())
+        equality = curves["equality"][:, -LAST:]
         yield number(
             "equality about 0.87 in the end",
-            "mean of the last 500 episodes",
-            np.nanmean(curves["equality"][:, -LAST:], axis=1),
+            f"mean of the last 500 episodes{undefined_in(equality)}",
+            np.nanmean(equality, axis=1),
             published=late,
         )
     yield from _tagging(result)

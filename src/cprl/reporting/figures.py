@@ -20,6 +20,7 @@ from cprl.plotting.bands import (
     mark_exploration,
     published_bands,
 )
+from cprl.reporting.claims import undefined_in
 from cprl.reporting.random_play import returns_by_chance
 from cprl.reporting.result import Result, Values
 from cprl.runs.curves import running_mean
@@ -121,7 +122,7 @@ def _draw(result: Result, metric: str, limits: Limits, path: Path) -> None:
     axes.set_xlabel("first episode of a running mean" if smoothed.shape[1] > 1 else "episode")
     for strip in panels[:-1]:
         draw_strip(strip, strips)
-    style.legend_below(figure, [axes], note=_note(result))
+    style.legend_below(figure, [axes], note=_note(result, metric))
     style.save(figure, path)
 
 
@@ -154,7 +155,8 @@ def _draw_published(axes: Axes, result: Result, metric: str) -> None:
         axes.axhline(random, **style.RANDOM_LINE, label=label)
 
 
-def _note(result: Result) -> str:
-    """How the curves are smoothed."""
-    window = min(result.window, result.curves["collective_return"].shape[1])
-    return f"Running means over the {window} episodes that follow."
+def _note(result: Result, metric: str) -> str:
+    """How the curves are smoothed, and how many episodes are in none of their means."""
+    values = result.curves[metric]
+    window = min(result.window, values.shape[1])
+    return f"Running means over the {window} episodes that follow{undefined_in(values)}."

@@ -42,8 +42,9 @@ OF_INSTITUTIONS: Final = {
     "violations": pa.int32(),
     **{name: pa.int32() for name in COUNTS if name != "violations"},
 }
-"""The columns of a game with institutions, between those of `COLUMNS` and the metrics; then one for each
-decision in force, `in_force_0` and so on, float64."""
+"""The columns of a game with institutions, between those of `COLUMNS` and the metrics; those of counts only
+where `cprl.measuring.institutions.counts_for` has them. One for each decision in force follows, `in_force_0`
+and so on, float64."""
 
 LEFT_OUT: Final = b"left_out"
 """The key of the schema's metadata whose value says which columns are left out, and why, if any are."""

@@ -75,8 +75,8 @@ def _of_institutions(
 
     others = ("harvest", "in_play_steps", "fines", "transfers", "violations")
     given: dict[str, Any] = {name: values(name) for name in others if name in table.column_names}
-    if set(COUNTS) <= set(table.column_names):
-        given["counts"] = {name: values(name) for name in COUNTS}
+    if "violations" in given:
+        given["counts"] = {name: values(name) for name in COUNTS if name in table.column_names}
     curves = {name: found.numpy() for name, found in summary(**given).items()}
     decided = [name for name in table.column_names if name.startswith("in_force_")]
     curves |= {name: values(name)[..., 0].numpy() for name in decided}

@@ -139,22 +139,19 @@ def _with_error(values: list[float]) -> str:
 
 
 def _mean(measured: list[dict[str, float]], name: str, digits: int) -> str:
-    """The mean of a metric over the episodes in which it is defined."""
+    """The mean of a metric over the episodes in which it is defined, and the number of the others."""
     defined = [metrics[name] for metrics in measured if not isnan(metrics[name])]
-    return f"{fmean(defined):.{digits}f}" if defined else UNDEFINED
+    if not defined:
+        return UNDEFINED
+    others = len(measured) - len(defined)
+    return f"{fmean(defined):.{digits}f}" + f", {UNDEFINED} in {others} of {len(measured)}" * (others > 0)
 
 
 def _notes(played: Mapping[str, list[Episode]]) -> Iterator[str]:
-    """Why numbers are undefined, or means of fewer episodes."""
+    """Why numbers are undefined."""
     for policy, own in played.items():
-        empty = sum(episode.harvest is not None and not episode.harvest.any() for episode in own)
-        if empty == len(own):
+        if all(episode.harvest is not None and not episode.harvest.any() for episode in own):
             yield f"{policy}: nobody harvested anything, so equality and sustainability are undefined"
-        elif empty:
-            yield (
-                f"{policy}: equality and sustainability leave out {empty} of {len(own)} episodes, in which "
-                "nobody harvested anything"
-            )
     baseline = next(iter(played))
     of = _returns if played[baseline][0].harvest is None else _harvests
     if len(played) > 1 and fmean(map(of, played[baseline])) <= 0:

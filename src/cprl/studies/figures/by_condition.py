@@ -17,11 +17,11 @@ from cprl.studies.figures.panels import (
     names_of,
     replicas_text,
     short,
+    title_of,
     with_counts,
 )
 from cprl.studies.tables.comparing import LAST, Compared, Comparison, compare, metrics_of
 from cprl.studies.tables.table import StudyTable
-from cprl.studies.tables.texts import metric_title
 from cprl.studies.tables.windows import RANDOM, TRAINING
 
 Kind = Literal["levels", "differences"]
@@ -72,7 +72,7 @@ def by_condition(
             axes.axvline(0, **RANDOM_LINE)
         else:
             _mark_random(axes, shown, compare(table, comparison.metric, part=RANDOM))
-        axes.set_title(wrapped(metric_title(comparison.metric), 9.5 / len(panels)), fontsize=SMALL_PT)
+        axes.set_title(wrapped(title_of(comparison), 9.5 / len(panels)), fontsize=SMALL_PT)
         axes.set_yticks(range(len(shown)), [names[own] for own in shown])
         axes.tick_params(labelsize=SMALL_PT)
         axes.locator_params(axis="x", nbins=3)

@@ -12,7 +12,7 @@ from matplotlib.ticker import NullLocator
 
 from cprl.arguments import refusal
 from cprl.measuring.statistics import Interval
-from cprl.plotting.style import RANDOM_LINE, SMALL_PT, head, picture_path, save
+from cprl.plotting.style import RANDOM_LINE, SMALL_PT, head, picture_path, save, wrapped
 from cprl.studies.figures.panels import (
     LEVEL,
     colours_of,
@@ -22,11 +22,11 @@ from cprl.studies.figures.panels import (
     levels_note,
     replicas_text,
     short,
+    title_of,
 )
 from cprl.studies.tables.comparing import LAST, Compared, compare, metrics_of
 from cprl.studies.tables.sources import Design
 from cprl.studies.tables.table import StudyTable
-from cprl.studies.tables.texts import metric_title
 from cprl.studies.tables.windows import RANDOM, TRAINING
 
 _COLUMNS: Final = 3
@@ -101,7 +101,7 @@ def by_factor(
             label = "random play" if is_same else "random play, in the colour of its conditions"
             axes.plot([], [], label=label, **RANDOM_LINE)
         axis.draw(axes)
-        axes.set_title(metric_title(comparison.metric), fontsize=SMALL_PT + 1)
+        axes.set_title(wrapped(title_of(comparison), 3.6), fontsize=SMALL_PT + 1)
         axes.tick_params(labelsize=SMALL_PT)
     for axes in panels[-_COLUMNS:]:
         axes.set_xlabel(axis.title, fontsize=SMALL_PT)

@@ -23,13 +23,14 @@ from cprl.studies.figures.panels import (
     names_of,
     replicas_text,
     short,
+    title_of,
     with_counts,
 )
 from cprl.studies.tables.comparing import LAST, Comparison, compare
 from cprl.studies.tables.outcomes import COLOURS, Endings
 from cprl.studies.tables.sources import Design
 from cprl.studies.tables.table import StudyTable
-from cprl.studies.tables.texts import digits_for, metric_title
+from cprl.studies.tables.texts import digits_for
 from cprl.studies.tables.windows import TRAINING
 
 _VALUES, _DIFFERENCES = "viridis", "RdBu"
@@ -112,7 +113,7 @@ def heat_map(
     panels[1].set_title("difference (* interval excludes 0)", fontsize=SMALL_PT + 1)
     how = "paired by replica" if comparison.is_paired else "not paired"
     note = f"{levels_note(comparison)} Differences from {design.reference}, {how}.{fixed}"
-    head(figure, f"{design.name}: {metric_title(metric)}", note)
+    head(figure, f"{design.name}: {title_of(comparison)}", note)
     return save(figure, path, colours=SHADES)
 
 

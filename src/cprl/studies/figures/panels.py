@@ -12,6 +12,7 @@ from matplotlib.figure import Figure
 from cprl.plotting.style import CHARACTER_IN, SMALL_PT
 from cprl.studies.tables.comparing import Comparison
 from cprl.studies.tables.sources import Design
+from cprl.studies.tables.texts import metric_title
 
 MOST_CONDITIONS: Final = 60
 """A figure with a row for each condition has at most so many rows."""
@@ -85,6 +86,14 @@ def _counts(replicas: Mapping[str, int]) -> list[int]:
 def levels_note(comparison: Comparison) -> str:
     """What points and intervals are."""
     return f"Means of {comparison.episodes_text}, then over replicas; {comparison.interval_text}."
+
+
+def title_of(comparison: Comparison) -> str:
+    """A metric with its unit, and in how many episodes it is undefined, which are in no mean."""
+    undefined = sum(own.undefined for own in comparison.conditions)
+    of = sum(own.episodes for own in comparison.conditions)
+    name = metric_title(comparison.metric)
+    return f"{name}, undefined in {undefined:,} of {of:,} episodes" if undefined else name
 
 
 def legend(figure: Figure, axes: Axes, *, title: str | None = None) -> None:
