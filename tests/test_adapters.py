@@ -253,8 +253,15 @@ def test_a_step_after_the_end_of_an_episode_asks_for_reset():
     world = parallel_env(replace(SHORT, rules=replace(SHORT.rules, episode_steps=1)))
     world.reset()
     world.step({"agent_0": 0, "agent_1": 0})
-    with pytest.raises(ValueError, match=r"the episode has ended: call reset\(\)"):
-        world.step({"agent_0": 0, "agent_1": 0})
+    for actions in ({"agent_0": 0, "agent_1": 0}, {}):
+        with pytest.raises(ValueError, match=r"has ended; allowed: reset\(\)"):
+            world.step(actions)
+
+
+@pytest.mark.parametrize("actions", [{"agent_0": 0, "agent_1": 0}, {}])
+def test_a_step_before_the_first_episode_asks_for_reset(actions):
+    with pytest.raises(ValueError, match=r"has not begun; allowed: reset\(\)"):
+        parallel_env(SHORT).step(actions)
 
 
 def test_gymnasium_refuses_games_of_several_agents():

@@ -106,7 +106,9 @@ def test_a_signal_ends_it_after_the_step_with_the_line_that_goes_on(number, tmp_
     time.sleep(0.3)
     process.send_signal(number)
     told, _ = process.communicate(timeout=60)
-    assert process.returncode == (128 + number if number == signal.SIGTERM else -number), told
+    # An unhandled KeyboardInterrupt ends Python by SIGINT, or with 1 where TorchRL is imported.
+    allowed = {signal.SIGTERM: (143,), signal.SIGINT: (-number, 1)}[number]
+    assert process.returncode in allowed, told
     assert "Stopping after this step" in told
     assert f"To resume: python {SCRIPT} {run}" in told
     assert len(checkpoints_in(run / "checkpoints")) == 1

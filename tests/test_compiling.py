@@ -4,6 +4,7 @@ import warnings
 
 import pytest
 import torch
+from tensordict import TensorDict
 
 from cprl import compiling
 from cprl.compiling import Compiled, largest_difference
@@ -40,6 +41,29 @@ def test_two_of_one_function_do_not_disturb_each_other():
     for _ in range(2):
         assert small((), Owner, torch.ones(2), factor) == 7
         assert large((), Owner, torch.ones(4), factor) == 13
+
+
+def through_a_module(owner, values, keeps):
+    """What a module gives with weights that were computed, as a lane's are."""
+    with TensorDict({"weight": values.clone()}).to_module(owner, preserve_module_state=keeps):
+        return owner.weight.detach() * 1
+
+
+class Holder(torch.nn.Module):
+    def __init__(self):
+        super().__init__()
+        self.weight = torch.nn.Parameter(torch.ones(3))
+
+
+@pytest.mark.integration
+def test_weights_put_into_a_module_as_tensordict_does_by_default_do_not_compile_and_the_cure_is_said():
+    by_default, cured = (Compiled(through_a_module, what="steps run") for _ in range(2))
+    with pytest.warns(RuntimeWarning, match="preserve_module_state=False"):
+        assert by_default((True,), Holder(), torch.full((3,), 2.0), True).tolist() == [2.0] * 3
+    with warnings.catch_warnings():
+        warnings.simplefilter("error", RuntimeWarning)
+        assert cured((False,), Holder(), torch.full((3,), 2.0), False).tolist() == [2.0] * 3
+    assert (by_default.enabled, cured.enabled) == (False, True)
 
 
 @pytest.fixture

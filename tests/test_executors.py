@@ -189,7 +189,9 @@ def test_a_study_that_is_asked_to_stop_saves_and_the_same_line_continues_it(tmp_
         workers = wait_until_both_train(out, process)
         process.send_signal(number)
         said, _ = process.communicate(timeout=60)
-    assert process.returncode == (128 + number if number == signal.SIGTERM else -number), said
+    # An unhandled KeyboardInterrupt ends Python by SIGINT, or with 1 where TorchRL is imported.
+    allowed = {signal.SIGTERM: (143,), signal.SIGINT: (-number, 1)}[number]
+    assert process.returncode in allowed, said
     assert "Stopping: each trial finishes its step and saves a checkpoint" in said
     assert "Stopped; 2 trials are left. The same line again continues the study." in said
     assert ("Traceback" in said) == (number == signal.SIGINT), "of a KeyboardInterrupt, by Python"

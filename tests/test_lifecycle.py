@@ -24,7 +24,7 @@ from cprl.runs.episodes import read_episodes, read_table
 from cprl.runs.export import export_results
 from cprl.runs.files import checksum
 from cprl.runs.lock import RunLock, RunLockedError
-from cprl.runs.weights import load_weights
+from cprl.runs.weights import load_weights, save_weights
 from cprl.shipped import cprl_here
 
 LEARNING = Learning(DQN(settings=replace(REPLAY, hidden_cells=(8,))))
@@ -119,6 +119,15 @@ def test_sigterm_ends_a_command_as_ctrl_c_does_so_that_files_are_cleared_away(tm
         signal.signal(signal.SIGTERM, before)
     assert ended.value.code == 143
     assert cleared.exists()
+
+
+def test_a_network_whose_module_is_not_there_is_missed_by_name_and_not_its_weights(tmp_path):
+    experiment = replace(FIELD, agents=[Learning(DQN(settings=REPLAY, network=Custom("gone:Net")))] * 2)
+    stored = start_run(tmp_path / "run", "field", experiment.to_recipe)
+    save_weights(stored, {"replica_0/agent_0": torch.nn.Linear(2, 8)})
+    with pytest.raises(ValueError, match=r"gone:Net.*No module named 'gone'.*PYTHONPATH") as missed:
+        cprl.load(stored, allow=["gone:Net"])
+    assert "weights" not in str(missed.value)
 
 
 def contents(run):

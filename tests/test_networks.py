@@ -238,6 +238,25 @@ def test_a_learner_with_convolutions_continues_bit_for_bit():
         assert torch.equal(mine, theirs)
 
 
+class Windows(nn.Linear):
+    """Knows the windows of single agents alone."""
+
+    def __init__(self, spaces, outputs):
+        channels, rows, cols = spaces.observation_shape
+        super().__init__(channels * rows * cols, outputs)
+
+    def forward(self, observation):
+        return super().forward(observation.float().flatten(-3))
+
+
+@pytest.mark.parametrize(("algorithm", "settings"), [(MAPPO, ROLLOUTS), (MADDPG, REPLAY)])
+def test_a_network_of_ones_own_that_cannot_be_a_critic_is_named_with_what_a_critic_sees(algorithm, settings):
+    team = algorithm(settings=settings, network=Custom("test_networks:Windows"))
+    members = [team.make_network(SPACES) for _ in range(2)]
+    with pytest.raises(ValueError, match=r"test_networks:Windows of a critic.* members first.*\(2, "):
+        team.make_team(members, SPACES)
+
+
 class Narrow(nn.Module):
     """Gives one output too few."""
 

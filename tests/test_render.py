@@ -98,7 +98,7 @@ def test_torchrls_video_recorder_takes_the_worlds_as_a_grid_or_one_of_them(world
 )
 def test_wrong_arguments_are_refused(wrong, said):
     env = CommonsEnv(MEADOW, 2, seed=1)
-    with pytest.raises(ValueError, match=r"the worlds have not begun; allowed: reset\(\) before the first"):
+    with pytest.raises(ValueError, match=r"the worlds have not begun; allowed: reset\(\) or load\(\) before"):
         env.render()
     env.reset()
     with pytest.raises(ValueError, match=said):

@@ -464,6 +464,12 @@ def test_cprl_table_refuses_to_count_episodes_of_another_part_than_the_training(
         cli.main()
 
 
+def test_cprl_table_without_a_field_to_group_by_says_the_flag(monkeypatch):
+    monkeypatch.setattr(sys, "argv", ["cprl", "table", "runs"])
+    with pytest.raises(SystemExit, match=r"cprl table RUN\.\.\. --by "):
+        cli.main()
+
+
 def test_cprl_table_prints_any_runs_by_a_field_and_writes_them(tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
     write_study(PAIRED, Path("runs"), harvest)

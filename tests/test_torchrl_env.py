@@ -336,7 +336,7 @@ def test_a_board_with_a_rim_of_walls_is_played_under_transforms():
     assert steps["next", "agents", "harvest"].sum() >= 0
     new = CommonsEnv(game, worlds=2)
     new.load(CommonsEnv(game, worlds=2).worlds.state())
-    with pytest.raises(ValueError, match=r"the worlds have not begun; allowed: begin\(\) or load\(\) first"):
+    with pytest.raises(ValueError, match=r"have not begun; allowed: reset\(\) or load\(\)"):
         new.step(TensorDict({"agents": {"action": torch.zeros(2, 1, dtype=torch.int64)}}, [2]))
 
 

@@ -34,6 +34,13 @@ MOST_SHARED: Final = 16
 """Compiled forms of one function that are kept for other learners; of more, the oldest is dropped."""
 
 
+_TO_MODULE_CURE: Final = (
+    "; if a loss of your own writes `with params.to_module(network):`, write "
+    "`params.to_module(network, preserve_module_state=False)` (docs/algorithms.md)"
+)
+"""Tensordict makes a new parameter by default, which torch does not compile."""
+
+
 class _Shared(NamedTuple):
     """What was compiled for some learner."""
 
@@ -102,8 +109,9 @@ class Compiled:
             result, is_guarded = self._first_call(own, arguments)
         except Exception as error:
             self.enabled = False
+            cure = _TO_MODULE_CURE if "torch.nn.Parameter()" in str(error) else ""
             warnings.warn(
-                f"torch.compile failed, {self._what} uncompiled and several times slower: {error}",
+                f"torch.compile failed, {self._what} uncompiled and several times slower{cure}: {error}",
                 RuntimeWarning,
                 stacklevel=4,
             )

@@ -65,7 +65,9 @@ class Custom:
             for part in name.split("."):
                 found = getattr(found, part)
         except (ImportError, AttributeError) as error:
-            raise ValueError(f"Custom({self.target!r}) cannot be imported: {error}") from error
+            cure = "; allowed: a module in the folder where the command is given, or in one of PYTHONPATH"
+            cure = cure if isinstance(error, ModuleNotFoundError) else ""
+            raise ValueError(f"Custom({self.target!r}) cannot be imported: {error}{cure}") from error
         return found
 
     def make(self, *positional: Any) -> Any:

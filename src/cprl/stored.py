@@ -192,21 +192,28 @@ def load(run: str | Path, *, weights: str | None = None, allow: Sequence[str] = 
 
 def _networks(path: Path, weights: Any, run: LoadedRun) -> dict[str, nn.Module]:
     networks = {}
+    recipe, lacking = (
+        f"{run.path / FILE_NAME}: a network cannot be made",
+        f"{path} holds no weights of this run",
+    )
+    reason = lacking
     try:
         for name, state in weights.items():
             lane = name if "/" in name else f"replica_0/{name}"
             spec = run.specs[int(lane.rpartition("_")[2])]
             if not isinstance(spec, Learning | Team):
                 raise ValueError(f"{lane} is the network of an agent that does not learn")
+            reason = recipe
             network = acting_part(made(spec.algorithm).make_network(run.spaces))
+            reason = lacking
             network.load_state_dict(state)
             networks[lane] = network
     except Exception as error:
-        raise ValueError(f"{path} holds no weights of this run: {error}") from error
+        raise ValueError(f"{reason}: {error}") from error
     if not networks and any(isinstance(spec, Learning | Team) for spec in run.specs):
-        raise ValueError(f"{path} holds no weights of this run: it is empty")
+        raise ValueError(f"{lacking}: it is empty")
     if networks and not any(map(_is_finite, networks.values())):
-        raise ValueError(f"{path} holds no weights of this run: all are NaN or infinite")
+        raise ValueError(f"{lacking}: all are NaN or infinite")
     return networks
 
 

@@ -257,7 +257,7 @@ class Batch:
         """
         arguments.array("actions", actions, (self.size, self.game.agents), np.int64)
         if not self._has_begun:
-            raise ValueError("the worlds have not begun; allowed: begin() or load() first")
+            raise ValueError("the worlds have not begun; allowed: reset() or load() before the first step")
         known = len(self.game.actions)
         at = self.driver.first_unknown(actions, known)
         if at >= 0:

@@ -107,7 +107,7 @@ class OneWorld:
             ValueError: If there is not one action per agent, one is no integer or out of range, or the
                 episode has not begun; the world is unchanged.
         """
-        self._check_begun("the first step")
+        self.check_begun("the first step")
         last = len(self.game.actions) - 1
         row = [
             arguments.integer(f"the action of {name}", action, 0, last)
@@ -157,7 +157,8 @@ class OneWorld:
         """Whether the episode ran out of time."""
         return bool(self.output.truncated[0, 0])
 
-    def _check_begun(self, what: str) -> None:
+    def check_begun(self, what: str) -> None:
+        """Raise a ValueError where no episode has begun; `what` would be done in it."""
         if not self._has_begun:
             raise ValueError(f"the episode has not begun; allowed: reset() before {what}")
 
@@ -167,7 +168,7 @@ class OneWorld:
         Raises:
             ValueError: If the episode has not begun.
         """
-        self._check_begun("state()")
+        self.check_begun("state()")
         board = self.game.palette[self.batch.boards(self.output)[0]]
         return np.ascontiguousarray(board.transpose(2, 0, 1))
 
@@ -182,7 +183,7 @@ class OneWorld:
                 'render_mode is None, so render() is unavailable; allowed: "rgb_array" or "human", chosen '
                 "when the environment is made"
             )
-        self._check_begun("render()")
+        self.check_begun("render()")
         image = world_image(self.game.map, self.batch.show(self.output))
         if self._window is None:
             return image

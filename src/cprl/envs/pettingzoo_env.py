@@ -83,15 +83,15 @@ class CommonsParallelEnv(ParallelEnv[str, Any, int]):
         """Plays one turn with one action per agent.
 
         Raises:
-            ValueError: If an action is missing, superfluous, no integer or out of range; the world is
-                unchanged.
+            ValueError: If an action is missing, superfluous, no integer or out of range, or the episode has
+                not begun or has ended; the world is unchanged.
         """
         arguments.object_of("actions", actions, Mapping, "a dict with an action for each agent")
+        self.world.check_begun("the first step")
+        if not self.agents:
+            raise ValueError("the episode has ended; allowed: reset() before the next step")
         if set(actions) != set(self.agents):
-            raise ValueError(
-                f"actions has the agents {shown(list(actions))}; allowed: exactly {self.agents}"
-                + ("" if self.agents else ", because the episode has ended: call reset()")
-            )
+            raise ValueError(f"actions has the agents {shown(list(actions))}; allowed: exactly {self.agents}")
         self.world.play([actions[name] for name in self.agents])
         rewards = {name: self.world.reward(i) for i, name in enumerate(self.agents)}
         terminations = dict.fromkeys(self.agents, self.world.terminated)

@@ -19,7 +19,7 @@ def images(batch: Batch, output: StepOutput, *, world: int | None, cell_pixels: 
         MemoryError: if the images do not fit into memory.
     """
     if not batch.has_begun:
-        raise ValueError("the worlds have not begun; allowed: reset() before the first render()")
+        raise ValueError("the worlds have not begun; allowed: reset() or load() before the first render()")
     board, size = batch.game.map, batch.size
     cell_pixels = arguments.integer("cell_pixels", cell_pixels, SMALLEST_CELL_PIXELS, LARGEST_CELL_PIXELS)
     if world is not None:

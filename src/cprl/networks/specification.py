@@ -57,9 +57,22 @@ def new_network(
                 f"settings.{name} is True; allowed with a network of your own, {network.target}: False; "
                 "implement it in the network"
             )
+    name = f"the network {network.target}"
     if shape is not None:
         spaces = replace(spaces, observation_shape=tuple(shape))
-    return _checked(network.make(spaces, outputs), network.target, spaces, outputs)
+        name += " of a critic, whose observation has the members first,"
+    return _checked(_made(network, name, spaces, outputs), name, spaces, outputs)
+
+
+def _made(network: Custom, name: str, spaces: Spaces, outputs: int) -> Any:
+    """What a user's own code makes for observations."""
+    network.resolve()
+    try:
+        return network.make(spaces, outputs)
+    except Exception as error:  # a user's network may raise anything
+        raise ValueError(
+            f"{name} cannot be made for observations of {spaces.observation_shape}: {error}"
+        ) from error
 
 
 def refuse_unseen(spaces: Spaces) -> None:
@@ -74,10 +87,10 @@ def refuse_unseen(spaces: Spaces) -> None:
         )
 
 
-def _checked(made: Any, target: str, spaces: Spaces, outputs: int) -> nn.Module:
+def _checked(made: Any, name: str, spaces: Spaces, outputs: int) -> nn.Module:
     """A user's network, after a check that it reads observations."""
     if not isinstance(made, nn.Module):
-        raise ValueError(f"the network {target} is a {type(made).__name__}; allowed: a torch.nn.Module")
+        raise ValueError(f"{name} is a {type(made).__name__}; allowed: a torch.nn.Module")
     shape, dtype = spaces.observation_shape, spaces.observation_dtype
     was_training = made.training
     try:
@@ -85,13 +98,10 @@ def _checked(made: Any, target: str, spaces: Spaces, outputs: int) -> nn.Module:
             given = made.eval()(torch.zeros(2, *shape, dtype=getattr(torch, dtype)))
     except Exception as error:  # a user's network may raise anything
         raise ValueError(
-            f"the network {target} cannot read observations [2, {', '.join(map(str, shape))}] of {dtype}: "
-            f"{error}"
+            f"{name} cannot read observations [2, {', '.join(map(str, shape))}] of {dtype}: {error}"
         ) from error
     if tuple(given.shape) != (2, outputs):
-        raise ValueError(
-            f"the network {target} outputs {list(given.shape)} for two observations; allowed: [2, {outputs}]"
-        )
+        raise ValueError(f"{name} outputs {list(given.shape)} for two observations; allowed: [2, {outputs}]")
     made.train(was_training)
     for name, value in {"outputs": outputs, "observation_dims": len(shape)}.items():
         if not hasattr(made, name):

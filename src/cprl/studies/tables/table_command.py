@@ -60,6 +60,10 @@ def runs_table(
         raise ValueError(f"--last counts episodes of the training; allowed: without --part {part}")
     if not runs:
         raise ValueError("cprl table wants at least one run: cprl table RUN... --by FIELD")
+    if not by:
+        raise ValueError(
+            "cprl table wants a field that tells runs apart: cprl table RUN... --by game.rules.freeze-steps"
+        )
     found = pooled_table(runs, by=by, window=window, reference=reference, allow=allow)
     compared = _compared(found, metric, part, LAST if last is None else last, interval)
     shown = console(width=None if OUT.isatty() else 250)
