@@ -25,7 +25,7 @@ from cprl.studies.tables.comparing import compare, metrics_of
 from cprl.studies.tables.outcomes import ending, endings
 from cprl.studies.tables.sources import design_of, sources_of
 from cprl.studies.tables.table import StudyTable, study_table
-from cprl.studies.tables.texts import cells, markdown
+from cprl.studies.tables.texts import Cells, cells, markdown
 from cprl.studies.trials import trials_of
 
 SEES = "game.rules.window_rows"
@@ -203,6 +203,20 @@ def test_the_most_frequent_phase_of_a_condition_is_counted_over_replicas(tmp_pat
     assert found.most_frequent("freeze_steps=5") == ("decline", 2, 3)
     assert dict(found.labels["freeze_steps=5"]) == {0: "harvesting", 1: "decline", 2: "decline"}
     assert found.most_frequent("freeze_steps=25") is None
+
+
+@pytest.mark.parametrize(
+    ("name", "written"),
+    [
+        ("a|b", r"a\|b"),
+        ("pay_$1_or_$_", r"pay_\$1_or_\$_"),
+        ("*a*", r"\*a\*"),
+        ("<b>", r"\<b>"),
+        ("a\nb", "a b"),
+    ],
+)
+def test_names_in_a_table_in_markdown_are_texts_and_take_one_line(name, written):
+    assert markdown(Cells("", ["condition", "x"], [[name, "**1**"]]))[2] == f"| {written} | **1** |"
 
 
 # Figures

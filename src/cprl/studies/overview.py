@@ -9,6 +9,7 @@ from typing import Any, Final, Literal
 
 from cprl.studies.status import Status
 from cprl.studies.tables.sources import REASONS
+from cprl.studies.tables.texts import cell
 from cprl.studies.trials import Trial
 from cprl.terminal.progress import in_words
 
@@ -196,14 +197,10 @@ def markdown(snapshot: Snapshot, *, title: str, most: int = 200) -> str:
     rows, rest = snapshot.fitting(most)
     lines = [f"# {title}", "", snapshot.line, "", "| trial | state | episodes | |", "|---|---|---:|---|"]
     lines += [
-        f"| {_cell(row.label)} | {row.state} | {row.episodes:,} / {row.of:,} | {_cell(row.note)} |"
+        f"| {cell(row.label)} | {row.state} | {row.episodes:,} / {row.of:,} | {cell(row.note)} |"
         for row in rows
     ]
     return "\n".join([*lines, *(["", rest] if rest else [])])
-
-
-def _cell(text: str) -> str:
-    return text.replace("|", "\\|").replace("\n", " ")
 
 
 def _is_new(said: Mapping[str, Any]) -> bool:

@@ -1,5 +1,6 @@
 """Comparisons as tables in Markdown and in the terminal; the number of replicas is in each."""
 
+import re
 from collections.abc import Sequence
 from math import isnan
 from typing import Literal, NamedTuple
@@ -90,10 +91,14 @@ def metric_title(metric: str) -> str:
 def markdown(found: Cells) -> list[str]:
     """The lines of a table, numbers to the right, followed by an empty line."""
     rule = "|---|" + "---:|" * (len(found.head) - 1)
-    rows = [
-        "| " + " | ".join(own.replace("|", "\\|") for own in row) + " |" for row in [found.head, *found.rows]
-    ]
-    return [rows[0], rule, *rows[1:], ""]
+    rows = [[*map(cell, found.head)], *([cell(row[0]), *row[1:]] for row in found.rows)]
+    lines = [f"| {' | '.join(row)} |" for row in rows]
+    return [lines[0], rule, *lines[1:], ""]
+
+
+def cell(name: str) -> str:
+    """Return a name of a user's as a cell of a table in Markdown, in which its signs mean nothing."""
+    return re.sub(r"[\\`*<$|]", r"\\\g<0>", " ".join(name.splitlines()))
 
 
 def rich_table(found: Cells) -> Table:
