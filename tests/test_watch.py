@@ -26,6 +26,7 @@ from cprl.measuring import Episode, social
 from cprl.training import train
 from cprl.viewer.callback import ViewerCallback
 from cprl.viewer.page import free_port
+from cprl.viewer.streams import to_watch
 
 GAME = Game(
     map=maps.parse(".A>.A\n.A.A.\n..<.A"),
@@ -169,6 +170,10 @@ def test_a_disk_that_is_full_from_the_start_is_told_once_and_changes_nothing(tmp
             assert course(disk, live="serve") == unwatched
         assert len(caught) == 1
         assert not (disk / "run.rrd").exists()
+
+
+def test_the_name_of_a_recording_is_no_flag_of_the_viewer():
+    assert to_watch(Path("-x/run.rrd"), Path("a/run.rrd"))[1:] == ["./-x/run.rrd", "a/run.rrd"]
 
 
 def test_a_way_to_watch_that_is_none_is_refused_before_anything_begins(tmp_path):
