@@ -7,16 +7,19 @@ import shlex
 import signal
 import subprocess
 import sys
+from contextlib import ExitStack
 from pathlib import Path
 
 import pytest
 from tiny_study import FREEZE, GAMMA, TINY
 
 import cprl
-from cprl import Study, cli, run_study, studies_options
+from cprl import Study, cli, studies_options
 from cprl.runs.directory import start_run
+from cprl.runs.lock import RunLockedError
 from cprl.shipped import cprl_here
 from cprl.studies import InProcess, Processes, Ray, read_study
+from cprl.studies.driver import as_driver
 from cprl.studies.trials import trials_of
 from cprl.studies_cli import recipe_of, study_main
 from cprl.studies_cli import sweep as sweep_words
@@ -354,14 +357,56 @@ def test_a_study_that_is_interrupted_says_what_is_kept_and_how_to_continue(numbe
     assert "tiny_study: 1 of 2 trials finished" in capsys.readouterr().out
 
 
-@pytest.mark.integration
-def test_a_second_process_on_the_same_study_says_so(tmp_path, capsys):
-    from cprl.runs.lock import RunLock
+BESIDE = """
+import sys
+sys.path[:0] = {paths!r}
+import cprl
+from tiny_study import FREEZE, TINY
+out, *levels = sys.argv[1:]
+study = cprl.Study(TINY, {{FREEZE: [int(level) for level in levels]}}, name="short")
+cprl.run_study(study, out, results=False)
+"""
 
-    (tmp_path / "out").mkdir()
-    with RunLock(tmp_path / "out"):
-        run_study(STUDY, tmp_path / "out")
-    said = capsys.readouterr().out
-    assert f"is run by somebody else too, process {os.getpid()} on" in said
-    assert "each trial is run by whoever begins it first" in said
-    assert "2 of 2 trials finished" in said
+
+@pytest.mark.integration
+def test_the_same_study_is_shared_and_another_one_is_refused_while_anybody_runs_it(tmp_path):
+    out = tmp_path / "out"
+
+    def beside(*levels):
+        code = BESIDE.format(paths=[str(ROOT / "src"), str(ROOT / "tests")])
+        command = [sys.executable, "-c", code, str(out), *map(str, levels)]
+        return subprocess.run(command, capture_output=True, text=True, timeout=100)
+
+    study = Study(TINY, {FREEZE: [2, 5]}, name="short")
+    with ExitStack() as stack:
+        driver = stack.enter_context(driven(study, out))
+        assert not driver.others
+        before = {path: path.read_bytes() for path in out.rglob("*") if path.is_file()}
+        refused = beside(2, 9)
+        assert refused.returncode == 1
+        assert f"RunLockedError: {out} is run as another study by process {os.getpid()} on" in refused.stderr
+        assert {path: path.read_bytes() for path in out.rglob("*") if path.is_file()} == before
+        shared = beside(2, 5)
+        assert f"is run by somebody else too, process {os.getpid()} on" in shared.stdout
+        assert "2 of 2 trials finished" in shared.stdout
+        second = stack.enter_context(driven(study, out))
+        assert second.others
+    assert beside(2, 9).returncode == 0, "nobody runs it now"
+    assert not (out / "run.lock").exists()
+
+
+def test_who_shares_a_study_keeps_another_one_out_when_the_first_has_left(tmp_path):
+    study, other = (Study(TINY, {FREEZE: [2, level]}, name="short") for level in (5, 9))
+    first = ExitStack()
+    first.enter_context(driven(study, tmp_path))
+    with driven(study, tmp_path):
+        first.close()
+        with pytest.raises(RunLockedError, match=str(tmp_path)), driven(other, tmp_path):
+            raise AssertionError
+    with driven(other, tmp_path) as driver:
+        assert not driver.others
+
+
+def driven(study, out):
+    """A driver of a study."""
+    return as_driver(study, trials_of(study), out, out / "runs", allow=(), progress=False, watch="off")

@@ -72,10 +72,10 @@ class RunLock:
         self._file = file
         return True
 
-    def _sign(self, file: int) -> None:
+    def _sign(self, file: int, **more: str) -> None:
         """Writes who holds the lock; where the disk is full the file is removed."""
         try:
-            _write(file, _this_process())
+            _write(file, {**_this_process(), **more})
         except OSError as error:
             self.path.unlink(missing_ok=True)
             raise OSError(error.errno, error.strerror, str(self.path)) from error
@@ -107,6 +107,64 @@ class RunLock:
         if self._is_still_there(self._file):  # nobody else's, where the directory was deleted and made again
             with suppress(OSError):
                 self.path.unlink()
+        os.close(self._file)
+        self._file = None
+
+
+class StudyLock(RunLock):
+    """Holds the lock of a study's directory together with all who run the same study; a context manager.
+
+    Args:
+        out: the study's directory, which exists.
+        study: what tells the study from others, written into the lock file.
+
+    Raises:
+        RunLockedError: names the process that runs another study there.
+    """
+
+    def __init__(self, out: Path, study: str) -> None:
+        super().__init__(out)
+        self._study = study
+        self.is_alone = False
+        """Whether nobody else ran the study when it was locked."""
+
+    def _is_taken(self) -> bool:
+        file = os.open(self.path, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o666)
+        try:
+            with suppress(BlockingIOError):
+                fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+                if _holder(file).get("host") in (None, socket.gethostname()):
+                    self._sign(file, study=self._study)
+                    self.is_alone = True
+            fcntl.flock(file, fcntl.LOCK_SH)  # whoever else had it exclusively had it for this moment
+            if not self._is_still_there(file):
+                os.close(file)
+                return False
+            holder = _holder(file)
+            if holder.get("study") != self._study:
+                raise RunLockedError(
+                    f"{self.path.parent} is run as another study by {_named(holder)}; wait until it ends, or "
+                    f"take another directory; if it ended with its machine, delete {self.path}"
+                )
+        except BaseException:
+            with suppress(OSError):
+                os.close(file)
+            raise
+        self._file = file
+        return True
+
+    def __exit__(self, *error: Any) -> None:
+        """Leaves the lock to those who still run the study, if there are any."""
+        if self._file is None:
+            return
+        try:
+            fcntl.flock(self._file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            others = _holder(self._file).get("host") != socket.gethostname()
+        except BlockingIOError:
+            others = True
+        if not others:
+            super().__exit__(*error)
+            return
         os.close(self._file)
         self._file = None
 

@@ -1,5 +1,6 @@
 """Driver: runs trials of a study, beside whoever else runs it, and shows how far they are."""
 
+import hashlib
 import json
 from collections.abc import Iterator, Sequence
 from contextlib import ExitStack, contextmanager, suppress
@@ -10,7 +11,7 @@ from typing import Any
 from cprl.arguments import refusal, switch, texts
 from cprl.runs.files import remove_partial
 from cprl.runs.lock import FILE_NAME as LOCK
-from cprl.runs.lock import RunLock, RunLockedError
+from cprl.runs.lock import StudyLock
 from cprl.studies.directory import STATUS, write_study
 from cprl.studies.executors import Executor
 from cprl.studies.live import LiveStudy, check_live
@@ -104,10 +105,12 @@ def as_driver(
     watch: str,
     keep_checkpoints: bool = False,
 ) -> Iterator[Driver]:
-    """Checks all that is asked for, then makes a study's directory.
+    """Checks all that is asked for, then makes a study's directory, and locks it with all who run the same
+    study.
 
     Raises:
-        ValueError: for whatever does not fit, before anything is written.
+        ValueError: for whatever does not fit, before anything is written; `RunLockedError` where another
+            study is run there.
     """
     switch("progress", progress)
     texts("allow", allow)
@@ -116,15 +119,16 @@ def as_driver(
     driver = Driver(
         out, runs, allow=allow, progress=progress, title=study.name, keep_checkpoints=keep_checkpoints
     )
-    runs.mkdir(parents=True, exist_ok=True)
     out.mkdir(parents=True, exist_ok=True)
-    write_study(study, out)
     with ExitStack() as stack:
-        try:
-            stack.enter_context(RunLock(out))
+        content = json.dumps(study.to_config(out), sort_keys=True).encode()
+        lock = stack.enter_context(StudyLock(out, hashlib.blake2b(content, digest_size=6).hexdigest()))
+        if lock.is_alone:
             remove_partial(out, out / STATUS, out / "figures")
-        except RunLockedError:
+        else:
             driver.others = _others(out)
+        runs.mkdir(parents=True, exist_ok=True)
+        write_study(study, out)
         if watch != "off":
             driver.viewer = stack.enter_context(LiveStudy(watch, runs=runs, title=study.name))
         yield driver

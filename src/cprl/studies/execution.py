@@ -51,6 +51,7 @@ def run_study(
     """Runs what a study lacks; may be stopped at any moment, and called again.
 
     A trial that fails does not end the study. Two processes that run the same study share its trials.
+    Another study in the same directory is refused until they end.
 
     Args:
         study: what is run.
@@ -98,8 +99,8 @@ def run_study(
         watch=watch,
     ) as driver:
         failed = driver.run(chosen, on or InProcess())
-    how: Any = {"last": last, "interval": interval, "again": again}
-    table = results_of(study, trials, out, folder, **how) if results else None
+        how: Any = {"last": last, "interval": interval, "again": again}
+        table = results_of(study, trials, out, folder, **how) if results else None
     return StudyResult(study, out, folder, tuple(trials), failed, table)
 
 

@@ -111,9 +111,9 @@ def run_search(
             write_json(out / FILE_NAME, _as_table(search, asked.points))
             _write_journal(optuna, asked.study, out / JOURNAL)
             batch = asked.next_batch()
-    trials = trials_of(study)
-    how: Any = {"last": last, "interval": interval, "again": again}
-    table = results_of(study, trials, out, folder, **how) if results else None
+        trials = trials_of(study)
+        how: Any = {"last": last, "interval": interval, "again": again}
+        table = results_of(study, trials, out, folder, **how) if results else None
     return SearchResult(search, study, out, folder, tuple(asked.points), tuple(trials), tuple(failed), table)
 
 
