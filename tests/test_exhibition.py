@@ -315,21 +315,24 @@ def test_a_game_without_a_board_has_no_exhibition_and_one_event_says_so(tmp_path
         Exhibition(Some(), env, trained=env, scene=None, live=Live())
 
 
-def test_parts_that_never_change_are_sent_once_to_the_server_that_keeps_them(tmp_path):
+def test_parts_that_never_change_are_sent_once_to_the_server_that_keeps_them_and_formats_with_frames(
+    tmp_path,
+):
     kept = Kept(tmp_path)
     kept.exhibition.on_step(episode=0)
     for stream in kept.streams:
         stream.close()
-    sent = {}
-    for path in kept.paths:
-        chunks = RrdReader(path).stream()
-        sent[path.stem] = {
-            name
-            for chunk in chunks
-            if chunk.entity_path.startswith("/exhibition")
-            for name in chunk.to_record_batch().schema.names
-        }
-    assert "SegmentationImage:format" in sent["live"]
-    assert "SegmentationImage:format" not in sent["exhibition"]
-    assert "SegmentationImage:buffer" in sent["exhibition"]
-    assert np.all([not name.startswith("windows") for name in sent["exhibition"]])
+    live, frames = (
+        [
+            set(chunk.to_record_batch().schema.names)
+            for chunk in RrdReader(path).stream()
+            if chunk.entity_path == "/exhibition/board"
+        ]
+        for path in kept.paths
+    )
+    assert "AnnotationContext:context" in set().union(*live)
+    image = {"SegmentationImage:buffer", "SegmentationImage:format"}
+    assert all(image <= frame for frame in frames), "a frame without its format draws nothing"
+    assert not any(image & part for part in live), "a format that comes after a frame hides it"
+    assert len(frames) == 1 + BATCH_STEPS
+    assert "windows" not in {name.partition(":")[0] for frame in frames for name in frame}

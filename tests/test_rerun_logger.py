@@ -186,6 +186,27 @@ def test_torchrls_logger_interface_is_there(tmp_path):
     assert column(path, "log", "TextLog:text")[1] == [["an apple fell"]]
 
 
+def test_no_image_comes_before_its_format_else_viewers_draw_nothing_until_the_next(tmp_path):
+    with RerunLogger("run", tmp_path, scene=SCENE) as logger:
+        form = rr.components.ImageFormat(width=2, height=1, channel_datatype=rr.ChannelDatatype.U8)
+        logger.log_static("later", rr.SegmentationImage.from_fields(format=form))
+        pixels = rr.SegmentationImage.columns(buffer=np.zeros((1, 2), np.uint8))
+        logger.log_columns("later", ([1], [0], [0]), pixels)
+        for first in (0, 2):
+            logger.log_video("clip", torch.zeros(2, 3, 4, 5, dtype=torch.uint8), step=first)
+        logger.log_frames(frames(3)[0])
+    drawn, formats = set(), set()
+    for chunk in RrdReader(tmp_path / "run.rrd").stream():
+        for name in chunk.to_record_batch().schema.names:
+            if name.endswith("Image:format"):
+                assert not (chunk.is_static and chunk.entity_path in drawn), "a later one hides it"
+                formats.add(chunk.entity_path)
+        if any(name.endswith("Image:buffer") for name in chunk.to_record_batch().schema.names):
+            assert chunk.entity_path in formats
+            drawn.add(chunk.entity_path)
+    assert drawn == {"/later", "/clip", "/world/board", "/world/beams", "/windows"}
+
+
 def test_a_recording_is_never_written_over(tmp_path):
     RerunLogger("run", tmp_path).shutdown()
     before = (tmp_path / "run.rrd").read_bytes()

@@ -12,10 +12,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 from PIL import Image
+from test_exhibition import ALONE, population_of
 from test_rerun_logger import column
 from viewers import browser, free_port, native_viewer, steady_picture, wait_until
 
 from cprl.commons.colours import APPLE, PALETTE, agent_colour
+from cprl.outcome import exhibited
+from cprl.viewer.callback import ViewerCallback
 from cprl.viewer.logger import RerunLogger
 from cprl.viewer.page import Page
 from cprl.viewer.scenery import SOCIAL, Scene
@@ -106,14 +109,14 @@ def sources(addresses):
     return addresses["native"].split("--connect ")[1].split()
 
 
-def look_until(is_there, take_picture, path):
+def look_until(is_there, take_picture, path, *, limit_s=LIMIT_S):
     """Takes pictures until one shows what it should; the last one is kept in `path`."""
 
     def shows():
         path.write_bytes(take_picture())
         return is_there(path.read_bytes())
 
-    wait_until(shows, LIMIT_S, f"{path} does not show it", every_s=1.0)
+    wait_until(shows, limit_s, f"{path} does not show it", every_s=1.0)
 
 
 def shows_all(picture):
@@ -131,6 +134,21 @@ class Moves:
         self.left -= self.last is not None and seen != self.last
         self.last = seen
         return self.left <= 0
+
+
+@pytest.mark.parametrize("size", [(1600, 1000), (1280, 720)])
+def test_the_board_is_there_before_the_first_step_is_played(size, tmp_path):
+    env, population = population_of(ALONE)
+    shown = exhibited(ALONE, env, population)
+    with ViewerCallback(tmp_path, env, title="run", episodes=3, live="serve", exhibited=shown) as viewer:
+        with native_viewer(connect_to=sources(viewer.logger.addresses), size=size) as client:
+            look_until(
+                lambda picture: len(spots(picture, BOARD, PALETTE[APPLE], within=4)) > 3000,
+                client.take_screenshot,
+                tmp_path / "first.png",
+                limit_s=60,
+            )
+        assert viewer.exhibition.steps == 0
 
 
 def test_reruns_viewer_shows_a_live_training(training, tmp_path):

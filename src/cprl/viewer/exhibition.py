@@ -110,7 +110,8 @@ class Exhibition:
         """Whether it has ended, because it failed or has no viewers."""
         if live.stream is not None:
             live.stream.do(partial(send_fixed, scene=scene))
-        self._send(_before_the_first_step(commons.game), 0)  # compiling may take half a minute
+        # Compiling may take half a minute, and of a run that is resumed no policy is loaded yet.
+        self._send(_before_the_first_step(commons.game), "the board as an episode begins")
 
     def on_step(self, *, episode: int) -> None:
         """Plays the steps of two seconds if they are due; `episode` is the training's, for the caption."""
@@ -160,7 +161,7 @@ class Exhibition:
         self._count = max(1, min(BATCH_STEPS, affordable))
         frames = self._recorder.take()
         if frames is not None:
-            self._send(frames, episode)
+            self._send(frames, caption_of(self._policy, episode))
 
     def _step(self) -> None:
         """One step of the world, of which the recorder then has a frame; the first only begins an episode."""
@@ -175,9 +176,8 @@ class Exhibition:
         if isinstance(self._env, TransformedEnv) and self.steps % BATCH_STEPS == 0:
             load_transforms_state(self._env, transforms_state(self._trained))
 
-    def _send(self, frames: Mapping[str, NDArray[Any]], episode: int) -> None:
+    def _send(self, frames: Mapping[str, NDArray[Any]], caption: str) -> None:
         if self._live.exhibition is not None:
-            caption = caption_of(self._policy, episode)
             shown = partial(self._board.send, frames=frames, caption=caption)
             self._live.exhibition.do(partial(shown, wait=self._wait, lasting_s=BATCH_S))
 

@@ -45,11 +45,14 @@ _THIN: Final = 0.01
 
 
 def send_fixed(recording: Any, *, scene: Scene) -> None:
-    """Sends what never changes, to the server that keeps it for viewers that come later."""
+    """Sends what never changes, to the server that keeps it for viewers that come later.
+
+    The format of the image is not among it, but in each frame: a viewer that gets it after a frame, for the
+    first time or again, shows no board until the next frame.
+    """
     import rerun as rr
 
-    form = image_form((scene.height + 2 * RIM_CELLS, scene.width + 2 * RIM_CELLS))
-    picture = rr.SegmentationImage.from_fields(format=form, opacity=1.0, draw_order=-10.0)
+    picture = rr.SegmentationImage.from_fields(opacity=1.0, draw_order=-10.0)
     recording.log(_BOARD, _classes(len(scene.agents)), picture, static=True)
     low = scene.height + 2 * RIM_CELLS + _ROOM_CELLS
     line = [(0.0, low), (scene.width + 2 * RIM_CELLS, low)]  # hidden; the view makes room for what it shows
@@ -111,7 +114,10 @@ class LiveBoard:
         """When each line is drawn: its agent is in play 0, out 1, or out with its cell to itself 2."""
         self._colours = np.concatenate([colours[strokes.owner] for strokes, _, colours, _ in kinds])
         self._radii = np.repeat(np.array([radius for *_, radius in kinds], np.float32), lines)
+        size = scene.height + 2 * RIM_CELLS, scene.width + 2 * RIM_CELLS
         picture = rr.SegmentationImage.columns(buffer=np.zeros((1, 1), np.uint8))
+        self._form = components(rr.SegmentationImage.columns(format=[image_form(size)]))
+        """The format of the image, as one row."""
         drawn = rr.LineStrips2D.columns(strips=np.zeros((1, 2, 2), np.float32), colors=[0], radii=[0.0])
         kept = {own.component_descriptor(): own.as_arrow_array().type for own in (*picture, *drawn)}
         self._forms = {kind.component.partition(":")[2]: (kind, form) for kind, form in kept.items()}
@@ -153,7 +159,7 @@ class LiveBoard:
             "colors": (counts, self._colours[line]),
             "radii": (counts, self._radii[line]),
         }
-        made = {}
+        made = {kind: row.take([0] * len(pictures)) for kind, row in self._form.items()}
         for name, (of_row, values) in parts.items():
             kind, form = self._forms[name]
             made[kind] = ragged(form, of_row, values)

@@ -246,10 +246,10 @@ class RerunLogger(Logger):
         images = images_of(video)
         first = max(self._now[0] if step is None else int(step), self._clips_end.get(name, 0))
         self._clips_end[name] = first + len(images)
-        self.log_static(name, rr.Image.from_fields(format=format_of(images)))
         count = len(images)
         at = times(range(first, first + count), [self._now[1]] * count, [self.frames] * count)
-        self._send(name, at, rr.Image.columns(buffer=images.reshape(count, -1).copy()))
+        buffer = images.reshape(count, -1).copy()
+        self._send(name, at, rr.Image.columns(buffer=buffer, format=[format_of(images)] * count))
 
     def log_histogram(
         self, name: str, data: Any, *, bins: int = 30, step: int | None = None, **kwargs: Any

@@ -219,6 +219,11 @@ def _warn_of(what: str, why: object) -> None:
 def _recording(application: str, recording_id: str, *, send_properties: bool = True) -> Any:
     import rerun as rr
 
-    recording = rr.RecordingStream(application, recording_id=recording_id, send_properties=send_properties)
+    recording = rr.RecordingStream(
+        application,
+        recording_id=recording_id,
+        send_properties=send_properties,
+        batcher_config=rr.ChunkBatcherConfig(flush_num_rows=1),  # columns would overtake rows that wait
+    )
     recording.set_log_time_enabled(False)
     return recording
