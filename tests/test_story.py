@@ -25,9 +25,17 @@ HEADER = Header(episodes=4800, replicas=8, unit="apples")
 
 
 def headers(path):
-    """The first line of each header, with its episode."""
-    episodes, texts = column(path, "header", "TextDocument:text", "episode")
-    return [(episode, text[0].splitlines()[0]) for episode, text in zip(episodes, texts, strict=True)]
+    """The first line of each header that was sent."""
+    chunks = [chunk for chunk in RrdReader(path).stream() if chunk.entity_path == "/header"]
+    assert all(chunk.is_static for chunk in chunks), "the newest holds at all times"
+    texts = [column for chunk in chunks for column in texts_of(chunk.to_record_batch())]
+    return [text.splitlines()[0] for (text,) in texts]
+
+
+def texts_of(batch):
+    """The Markdown texts of a chunk, none if it has others."""
+    name = "TextDocument:text"
+    return batch.column(name).to_pylist() if name in batch.schema.names else []
 
 
 def test_the_header_says_where_a_run_is():
@@ -78,19 +86,16 @@ def test_the_header_goes_from_the_beginning_to_the_end(tmp_path):
                 viewer.on_episode(
                     fake(number, world, returned=100.0 * world, tagged=0), {"agent_0/epsilon": 0.9}
                 )
+            viewer.flush()
         viewer.finished({"trained": trained, "random": random})
         RrdReader(tmp_path / "run.rrd").store()  # closed, with its footer
-    told = headers(tmp_path / "run.rrd")
-    assert [line for _, line in told[:2]] == ["# Episode 1 of 6 · begins", "# Episode 1 of 6 · compiling"]
-    assert told[2] == (
-        0,
-        "# Episode 1 of 6 · exploring · 50 apples (random play 282) · 0 of 2 boards died early",
-    )
-    assert told[-2][1].endswith("· 2 of 2 boards died early")
-    assert told[-1] == (
-        5,
-        "# Finished, 6 episodes · trained 100 apples, random play 282 · 4 of 4 boards died early",
-    )
+    texts = headers(tmp_path / "run.rrd")
+    assert texts[:2] == ["# Episode 1 of 6 · begins", "# Episode 1 of 6 · compiling"]
+    line = "# Episode 1 of 6 · exploring · 50 apples (random play 282) · 0 of 2 boards died early"
+    assert texts[2] == line
+    assert texts[-2].endswith("· 2 of 2 boards died early")
+    line = "# Finished, 6 episodes · trained 100 apples, random play 282 · 4 of 4 boards died early"
+    assert texts[-1] == line
     _, events = column(tmp_path / "run.rrd", "log", "TextLog:text")
     (words, *_) = [text[0] for text in events if text[0].startswith("random play")]
     assert words.startswith("random play 282.0 ± 2 apples in 2 fresh episodes (mean and its standard error)")
@@ -101,13 +106,25 @@ def test_a_training_without_an_evaluation_ends_with_a_header_of_its_own(tmp_path
     with ViewerCallback(tmp_path, CommonsEnv(GAME, 1), title="run", episodes=2) as viewer:
         for number in range(2):
             viewer.on_episode(fake(number, 0, returned=30.0, tagged=0), {})
-    assert headers(tmp_path / "run.rrd")[-1] == (1, "# Finished, 2 episodes · 30 apples at the end")
+    assert headers(tmp_path / "run.rrd")[-1] == "# Finished, 2 episodes · 30 apples at the end"
 
 
-def test_a_run_that_was_stopped_is_not_finished(tmp_path):
-    with ViewerCallback(tmp_path, CommonsEnv(GAME, 1), title="run", episodes=9) as viewer:
+def test_a_run_that_was_stopped_says_so_and_where_it_goes_on_when_it_is_resumed(tmp_path):
+    env = CommonsEnv(GAME, 1)
+    with ViewerCallback(tmp_path, env, title="run", episodes=9) as viewer:
         viewer.on_episode(fake(0, 0, returned=30.0, tagged=0), {})
-    assert headers(tmp_path / "run.rrd")[-1][1].startswith("# Episode 1 of 9")
+        state = viewer.state_dict()
+    assert headers(tmp_path / "run.rrd")[-1] == "# Stopped after 1 of 9 episodes · 30 apples"
+    with ViewerCallback(tmp_path, env, title="run", episodes=9) as resumed:
+        resumed.load_state_dict(state)
+    assert headers(tmp_path / "run-2.rrd")[-2] == "# Episode 1 of 9 · begins · 30 apples"
+
+
+def test_of_many_headers_a_recording_has_the_newest_of_each_batch(tmp_path):
+    with ViewerCallback(tmp_path, CommonsEnv(GAME, 1), title="run", episodes=99) as viewer:
+        for number in range(50):
+            viewer.on_episode(fake(number, 0, returned=30.0, tagged=0), {})
+    assert len(headers(tmp_path / "run.rrd")) == 2, "that of the beginning and of the end"
 
 
 def test_where_exploration_ends_the_strip_changes_and_an_event_says_so(tmp_path):
@@ -127,6 +144,7 @@ def test_the_live_label_goes_on_after_a_resume_also_from_a_state_of_before(tmp_p
     def play(viewer, numbers):
         for number in numbers:
             viewer.on_episode(fake(number, 0, returned=600.0 if number < 30 else 200.0, tagged=1), {})
+            viewer.flush()
 
     env = CommonsEnv(GAME, 1)
     with ViewerCallback(tmp_path, env, title="run", episodes=60, file_name="whole.rrd") as whole:
@@ -141,7 +159,7 @@ def test_the_live_label_goes_on_after_a_resume_also_from_a_state_of_before(tmp_p
             resumed.load_state_dict(own)
             play(resumed, range(40, 60))
         assert headers(tmp_path / name)[-20:] == headers(tmp_path / "whole.rrd")[-20:]
-    assert "tragedy" in headers(tmp_path / "now.rrd")[-2][1]
+    assert "tragedy" in headers(tmp_path / "now.rrd")[-2]
 
 
 def test_phases_of_the_published_game_stand_beside_those_found():
@@ -235,7 +253,7 @@ def test_the_file_closes_while_the_live_view_goes_on(tmp_path):
         logger.log_document("header", "# two")
         logger.flush()
     assert not logger.is_served
-    assert column(tmp_path / "run.rrd", "header", "TextDocument:text")[1] == [["# one"]]
+    assert headers(tmp_path / "run.rrd") == ["# one"]
     assert static(tmp_path / "run.rrd", "header", "TextDocument:media_type") == ["text/markdown"]
 
 

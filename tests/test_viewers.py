@@ -5,6 +5,7 @@ import signal
 import subprocess
 import sys
 import threading
+import time
 from contextlib import contextmanager
 from io import BytesIO
 from pathlib import Path
@@ -13,7 +14,7 @@ import numpy as np
 import pytest
 from PIL import Image
 from test_exhibition import ALONE, population_of
-from test_rerun_logger import column
+from test_story import headers
 from viewers import browser, free_port, native_viewer, steady_picture, wait_until
 
 from cprl.commons.colours import APPLE, PALETTE, agent_colour
@@ -196,8 +197,11 @@ def test_the_end_of_a_run_is_seen_and_the_trained_policy_plays_on(tmp_path):
             changed.last = running
             look_until(changed, client.take_screenshot, tmp_path / "ended.png")
             look_until(Moves(BOARD, 3), client.take_screenshot, tmp_path / "plays_on.png")
-        texts = column(tmp_path / "run" / "run.rrd", "header", "TextDocument:text")[1]
-        assert "Finished" in texts[-1][0]
+            ended = part((tmp_path / "plays_on.png").read_bytes(), HEADER).tobytes()
+            client.set_time("episode", sequence=0, play_state="paused")
+            time.sleep(2)
+            assert part(client.take_screenshot(), HEADER).tobytes() == ended, "wherever the cursor is"
+        assert "Finished" in headers(tmp_path / "run" / "run.rrd")[-1]
         process.send_signal(signal.SIGINT)
         assert process.wait(LIMIT_S) == 0
 

@@ -44,13 +44,17 @@ def log_now(recording: Any, name: str, what: Any, now: tuple[int, int, int]) -> 
 
 
 def send_waiting(stream: Stream) -> None:
-    """Sends the buffered numbers and texts of one stream, one chunk per entity."""
+    """Sends the buffered numbers and texts of one stream, one chunk per entity; of texts the newest, by
+    `send_text`."""
     waiting = stream.take()
 
     def send(recording: Any) -> None:
         known: dict[Any, dict[str, Any]] = {}  # most names have the same times
         for name, rows in waiting.items():
             *at, values = zip(*rows, strict=True)
+            if isinstance(text := values[-1], str):
+                send_text(recording, name, text)
+                continue
             if tuple(at) not in known:
                 known[tuple(at)] = timelines(times(*at))
             send_chunk(recording, name, known[tuple(at)], components(_columns(values)))
@@ -59,10 +63,18 @@ def send_waiting(stream: Stream) -> None:
     stream.do(send)
 
 
-def _columns(values: Sequence[Any]) -> Any:
-    """Markdown texts, or equally many numbers in each row."""
+def send_text(recording: Any, name: str, text: str) -> None:
+    """Sends a Markdown text without a time, which takes the place of the one before at all times.
+
+    A server sends it before the history, so who connects late never reads an old one as the present.
+    """
     import rerun as rr
 
-    if isinstance(values[0], str):
-        return rr.TextDocument.columns(text=list(values))
+    send_chunk(recording, name, {}, components(rr.TextDocument.columns(text=[text])))
+
+
+def _columns(values: Sequence[Any]) -> Any:
+    """Equally many numbers in each row."""
+    import rerun as rr
+
     return rr.Scalars.columns(scalars=np.concatenate(values)).partition([len(own) for own in values])

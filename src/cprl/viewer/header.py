@@ -87,6 +87,11 @@ class Header:
         """At the end of a training without an evaluation."""
         return f"# Finished, {self.episodes:,} episodes · {self._amount(mean)} at the end"
 
+    def stopped(self, episode: int, mean: float) -> str:
+        """At the end of a run that was stopped after so many episodes; it can be resumed."""
+        amount = "" if isnan(mean) else f" · {self._amount(mean)}"
+        return f"# Stopped after {episode:,} of {self.episodes:,} episodes{amount}"
+
     def notes(self, *, window: int, of_mean: int | None = None) -> str:
         """How to read the lines of plots.
 

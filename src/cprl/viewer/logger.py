@@ -15,7 +15,7 @@ from cprl.arguments import object_of
 from cprl.arguments import path as path_of
 from cprl.checks import NONE, TEXT, check_nesting, checked, either
 from cprl.output import console as safe_console
-from cprl.viewer.batches import Numbers, log_now, send_waiting, times
+from cprl.viewer.batches import Numbers, log_now, send_text, send_waiting, times
 from cprl.viewer.blueprint import layout
 from cprl.viewer.deadline import release
 from cprl.viewer.media import format_of, histogram_of, images_of, numbers_in
@@ -178,15 +178,12 @@ class RerunLogger(Logger):
         self._wait(name, self._now[0], [float(value) for value in values])
 
     def log_document(self, name: str, text: str) -> None:
-        """Logs a Markdown text that takes the place of the one before, sent with the numbers."""
+        """Logs a Markdown text that takes the place of the one before at all times, sent with the numbers."""
         self._wait(name, self._now[0], text)
 
     def show_live(self, name: str, text: str) -> None:
-        """Shows a Markdown text in the live view at once, and not in the file; from any thread."""
-        import rerun as rr
-
-        at = times([self._now[0]], [self._now[1]], [self.frames])
-        self._send(name, at, rr.TextDocument.columns(text=[text]), live_only=True)
+        """`log_document` in the live view alone, and at once; from any thread."""
+        self.do(lambda recording: send_text(recording, name, text), live_only=True)
 
     def _wait(self, name: str, step: int, values: list[float] | str) -> None:
         for each in self._streams.hold(name, (step, self._now[1], self.frames, values)):

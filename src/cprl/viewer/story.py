@@ -2,7 +2,7 @@
 
 from collections.abc import Mapping, Sequence
 from math import isfinite
-from typing import Any, Final
+from typing import Any
 
 from cprl import presets
 from cprl.commons.game import Game
@@ -15,9 +15,6 @@ from cprl.viewer.events import EventDetector
 from cprl.viewer.header import Header, Played, played
 from cprl.viewer.logger import RerunLogger
 from cprl.viewer.scenery import ANOTHER, STRIPS, Curves
-
-MOST_HEADERS: Final = 5000
-"""Rows of the header in a recording, about; in longer runs some episodes have none of their own."""
 
 _NOW, _FOUND, _PUBLISHED = STRIPS
 
@@ -84,16 +81,19 @@ class Story:
             events += self._detector.add({name.removeprefix("social/"): mean for name, mean in means.items()})
         for event in events:
             self._logger.log_text(f"episode {episode:,}: {event}")
-        if episode % -(-self._episodes // MOST_HEADERS) == 0 or self._ended == self._episodes:
-            line = self._header.line(
-                episode=self._ended,
-                label=self._now.label,
-                mean=self._now.mean,
-                random_play=self.baseline,
-                died=died,
-            )
-            self._document(line, of_mean=min(self._now.window, self._ended))
+        self._show_episode(died)
         return events
+
+    def _show_episode(self, died: float | None) -> None:
+        """Says in the header where the run is after an episode."""
+        line = self._header.line(
+            episode=self._ended,
+            label=self._now.label,
+            mean=self._now.mean,
+            random_play=self.baseline,
+            died=died,
+        )
+        self._document(line, of_mean=min(self._now.window, self._ended))
 
     def _label(self, episode: int, means: Mapping[str, float]) -> list[str]:
         """Takes the live label from the episode's means; the event if it changes."""
@@ -123,11 +123,15 @@ class Story:
         self._is_told = True
 
     def close(self) -> None:
-        """Logs the end of a run that is over, if `finished` did not."""
-        if self._ended >= self._episodes and not self._is_told:
-            self._tell_phases()
-            self._document(self._header.ended(self._now.mean))
-            self._is_told = True
+        """Logs the end of a run that is over or was stopped, if `finished` did not."""
+        if self._is_told:
+            return
+        if self._ended < self._episodes:
+            self._document(self._header.stopped(self._ended, self._now.mean))
+            return
+        self._tell_phases()
+        self._document(self._header.ended(self._now.mean))
+        self._is_told = True
 
     def _tell_phases(self) -> None:
         if self._detector is None or not self._curves.has_phases:
@@ -177,6 +181,8 @@ class Story:
             self._ended = len(self._detector.returns)
         if self._ended:
             self._logger.log_states(_NOW, {self._ended - 1: self._now.label})
+            self._show_episode(None)
+            self._logger.flush()
 
 
 def published_phases(game: Game | None) -> dict[int, str]:
