@@ -209,7 +209,7 @@ def test_a_recipe_records_each_time_it_is_resumed_under_other_circumstances(tmp_
     )
     for versions in ("2.1", "2.1", "2.2"):
         now = {"versions": {"torch": versions}, "git": None, "cpu": "Xeon"}
-        monkeypatch.setattr("cprl.runs.directory._circumstances", lambda now=now: now)
+        monkeypatch.setattr("cprl.runs.directory._circumstances", lambda recipe, now=now: now)
         write_changed_circumstances(run)
     resumed = json.loads((run / "recipe.json").read_text())["resumed"]
     assert [own["versions"]["torch"] for own in resumed] == ["2.1", "2.2"]

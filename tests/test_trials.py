@@ -9,17 +9,21 @@ import subprocess
 import sys
 import time
 from dataclasses import replace
+from importlib import invalidate_caches
 from pathlib import Path
 
+import pyarrow.compute as pc
 import pytest
 from study_runs import EXPERIMENT, TIME_OUT, write_run
 from tiny_study import FREEZE, TINY
 
+import cprl
 from cprl import Custom, Study, run_study
 from cprl.runs.checkpoints import FOLDER as CHECKPOINTS
+from cprl.runs.directory import changed_circumstances, start_run
 from cprl.runs.episodes import read_episodes
 from cprl.runs.lock import FILE_NAME as LOCK
-from cprl.runs.lock import RunLock
+from cprl.runs.lock import RunLock, RunLockedError
 from cprl.studies import read_study, trials
 from cprl.studies.execution import trials_with
 from cprl.studies.status import Status
@@ -259,6 +263,116 @@ def test_a_finished_trial_that_lost_a_file_of_its_manifest_is_a_failure_by_that_
     (run / "evaluation" / "trained.parquet").unlink()
     (failed,) = run_study(study, tmp_path, progress=False, results=False).failed
     assert "evaluation/trained.parquet" in failed.reason
+
+
+class Written:
+    """An executor that writes runs instead of training them, each with a harvest of so many apples."""
+
+    def __init__(self, study, apples):
+        self.names = []
+        self._trials, self._apples = {trial.name: trial for trial in trials_of(study)}, apples
+
+    def run(self, tasks):
+        for task in tasks:
+            if state_of(task.directory) == "missing":
+                write_run(task.directory, self._trials[task.name].experiment, lambda *_: self._apples)
+                self.names.append(task.name)
+            yield Outcome(task.name, "finished")
+
+
+@pytest.fixture
+def write_module(tmp_path, monkeypatch):
+    """Writes a module `own_callback`, which is then imported anew, as in another process."""
+
+    def write(text):
+        (tmp_path / "own_callback.py").write_text(text)
+        monkeypatch.delitem(sys.modules, "own_callback", raising=False)
+        invalidate_caches()
+
+    monkeypatch.setattr(sys, "dont_write_bytecode", True)
+    monkeypatch.syspath_prepend(tmp_path)
+    return write
+
+
+def test_a_study_runs_anew_what_was_made_with_other_code_and_keeps_what_was_there(
+    tmp_path, write_module, capsys
+):
+    study = Study(replace(EXPERIMENT, callbacks=(Custom("own_callback:Callback"),)))
+    (trial,) = trials_of(study)
+    write_module("class Callback: ...")
+    first = run_study(study, tmp_path / "study", on=Written(study, 1.0), results=False)
+    kept = read_episodes(first.runs / trial.name)
+    same = Written(study, 2.0)
+    write_module("class Callback: ...")
+    run_study(study, tmp_path / "study", on=same, results=False)
+    assert same.names == []
+    edited = Written(study, 2.0)
+    write_module("class Callback: apples = 2")
+    capsys.readouterr()
+    table = run_study(study, tmp_path / "study", on=edited).table
+    assert edited.names == [trial.name]
+    rows = table.rows.filter(pc.field("metric") == "collective_return")
+    assert set(rows["value"].to_pylist()) == {2.0, 4.0}, "4 of random play"
+    (earlier,) = (tmp_path / "study" / "runs-earlier").iterdir()
+    assert read_episodes(earlier).equals(kept)
+    assert str(earlier) in capsys.readouterr().out
+
+
+def test_a_trial_that_another_process_makes_with_other_code_is_refused_by_its_directory(
+    tmp_path, write_module
+):
+    study = Study(replace(EXPERIMENT, callbacks=(Custom("own_callback:Callback"),)))
+    (trial,) = trials_of(study)
+    write_module("class Callback: ...")
+    run = write_run(tmp_path / "runs" / trial.name, trial.experiment, lambda *_: 1.0, is_finished=False)
+    write_module("class Callback: apples = 2")
+    with RunLock(run), pytest.raises(RunLockedError, match=trial.name):
+        run_study(study, tmp_path, progress=False)
+
+
+def test_a_recipe_without_a_checksum_of_code_is_taken_as_it_is(tmp_path, write_module):
+    study = Study(replace(EXPERIMENT, callbacks=(Custom("own_callback:Callback"),)))
+    (trial,) = trials_of(study)
+    write_module("class Callback: ...")
+    run = write_run(tmp_path / "runs" / trial.name, trial.experiment, lambda *_: 1.0, code=None)
+    assert changed_circumstances(run) == []
+    executor = Written(study, 2.0)
+    run_study(study, tmp_path, on=executor, progress=False, results=False)
+    assert executor.names == []
+
+
+def test_code_that_was_edited_and_not_imported_again_is_what_a_recipe_keeps(tmp_path, write_module):
+    experiment = replace(EXPERIMENT, callbacks=(Custom("own_callback:Callback"),))
+    write_module("class Callback: ...")
+    experiment.callbacks[0].resolve()
+    (tmp_path / "own_callback.py").write_text("class Callback: apples = 2")
+    run = start_run(tmp_path / "run", "run", experiment.to_recipe)
+    assert [*json.loads((run / "recipe.json").read_text())["code_text"].values()] == ["class Callback: ..."]
+
+
+@pytest.mark.integration
+def test_loading_evaluating_and_resuming_warn_of_other_code_and_the_recipe_keeps_each_text(
+    tmp_path, write_module, capsys
+):
+    target = "own_callback:Callback"
+    experiment = replace(TINY, callbacks=(Custom(target),))
+    text = "class Callback:\n    is_extendable = True\n    def on_episode(self, episode, learning): ...\n"
+    write_module(text)
+    run = cprl.run(experiment, tmp_path / "run", watch="off", figures=False)
+    cprl.load(run, allow=[target])
+    assert "own_callback" not in capsys.readouterr().err
+    write_module(text + "# edited\n")
+    for use in (
+        lambda: cprl.load(run, allow=[target]),
+        lambda: cprl.evaluate_run(run, episodes=1, allow=[target]),
+        lambda: cprl.run(replace(experiment, episodes=3), run, resume=True, watch="off", figures=False),
+    ):
+        use()
+        assert "own_callback" in capsys.readouterr().err
+    recipe = json.loads((run / "recipe.json").read_text())
+    assert set(recipe["code_text"].values()) == {text, text + "# edited\n"}
+    assert recipe["code_text"][recipe["code"]["own_callback"]] == text
+    assert recipe["code_text"][recipe["extended"][0]["code"]["own_callback"]] == text + "# edited\n"
 
 
 def written_at(run):

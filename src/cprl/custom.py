@@ -3,8 +3,10 @@
 import importlib
 import json
 import re
+import sys
 from collections.abc import Mapping
 from dataclasses import dataclass, field
+from importlib.util import find_spec
 from typing import Any, Final
 
 from cprl.checks import Check, check_nesting, checked, instance
@@ -68,6 +70,7 @@ class Custom:
             cure = "; allowed: a module in the folder where the command is given, or in one of PYTHONPATH"
             cure = cure if isinstance(error, ModuleNotFoundError) else ""
             raise ValueError(f"Custom({self.target!r}) cannot be imported: {error}{cure}") from error
+        source_of(module)
         return found
 
     def make(self, *positional: Any) -> Any:
@@ -81,6 +84,30 @@ class Custom:
             return target(*positional, **{name: _with_keys(value) for name, value in self.arguments.items()})
         except TypeError as error:
             raise ValueError(f"Custom({self.target!r}) does not take its arguments: {error}") from error
+
+
+_IMPORTED: Final[dict[str, tuple[object, str | None]]] = {}
+"""The text of each module that was imported, with its `__spec__`, which is another after a reload."""
+
+
+def source_of(module: str) -> str | None:
+    """Return the text of a module, without importing it; of one that is imported, the text that runs.
+
+    A file that is edited after a `Custom` of it was made does not change it before it is imported anew. None
+    where there is no file, e.g. for what was typed into a notebook.
+    """
+    imported = sys.modules.get(module)
+    try:
+        spec = find_spec(module) if imported is None else imported.__spec__
+        loader: Any = spec.loader if spec is not None else getattr(imported, "__loader__", None)
+        if imported is not None and module in _IMPORTED and _IMPORTED[module][0] is spec:
+            return _IMPORTED[module][1]
+        text: str | None = loader.get_source(module)
+    except (ImportError, AttributeError, ValueError):
+        return None
+    if imported is not None:
+        _IMPORTED[module] = spec, text
+    return text
 
 
 def made(value: Any, *positional: Any) -> Any:

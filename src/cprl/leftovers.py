@@ -4,9 +4,9 @@ import shutil
 from contextlib import suppress
 from pathlib import Path
 
-from cprl.output import ERR, console
+from cprl.output import console
 from cprl.runs.checkpoints import FOLDER, Checkpointer, checkpoints_in
-from cprl.runs.directory import changed_circumstances, write_changed_circumstances
+from cprl.runs.directory import changed_circumstances, say_changes, write_changed_circumstances
 from cprl.runs.lock import FILE_NAME as LOCK
 from cprl.runs.manifest import refuse_missing
 
@@ -47,13 +47,8 @@ def say_what_is_kept(directory: Path) -> None:
 
 
 def say_what_changed(directory: Path) -> None:
-    """Warns where a run that goes on was begun under other versions, and writes that down."""
+    """Warns where a run that goes on was begun under other versions or other code, and writes that down."""
     changed = changed_circumstances(directory)
+    say_changes(directory, changed)
     if changed:
-        console(ERR).print(
-            f"Warning: {directory} was begun under other versions, so that numbers may differ from those of "
-            f"an undisturbed run: {'; '.join(changed)}",
-            soft_wrap=True,
-            markup=False,
-        )
         write_changed_circumstances(directory)

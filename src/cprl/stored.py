@@ -26,7 +26,7 @@ from cprl.policies.assignment import AgentPolicies
 from cprl.policies.decisions import ballot_sizes
 from cprl.population import AgentSpec, Frozen, Learning, Scripted, Team, specs_by_agent
 from cprl.runs.checkpoints import FOLDER
-from cprl.runs.directory import FILE_NAME, read_recipe
+from cprl.runs.directory import FILE_NAME, changed_code, read_recipe, say_changes
 from cprl.runs.episodes import read_episodes
 from cprl.runs.kept import kept_of
 from cprl.runs.partners import weights_of
@@ -149,6 +149,8 @@ class LoadedRun:
 def load(run: str | Path, *, weights: str | None = None, allow: Sequence[str] = ()) -> LoadedRun:
     """Builds a run again from its directory; runs no code that it holds.
 
+    Warns on standard error where the user's own code is no longer what the run was made with.
+
     Files outside the directory are read for `Frozen` agents alone: the recipe names their runs by paths,
     which may lead anywhere, e.g. "../other". They are read when such an agent is asked for, without code.
 
@@ -174,6 +176,7 @@ def load(run: str | Path, *, weights: str | None = None, allow: Sequence[str] = 
         experiment = Experiment.from_recipe(recipe, directory=run, allow=allow)
     except ValueError as error:
         raise ValueError(f"{run / FILE_NAME}: {error}") from error
+    say_changes(run, [f"the text of {module}, which its recipe keeps" for module in changed_code(recipe)])
     kept = kept_of(run, weights)
     loaded = LoadedRun(
         path=run,

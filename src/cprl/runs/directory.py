@@ -16,11 +16,12 @@ from cprl.arguments import callable_of, texts
 from cprl.arguments import path as path_of
 from cprl.checks import TEXT, checked, shown
 from cprl.config import custom_targets
+from cprl.custom import source_of
 from cprl.differences import differences
-from cprl.output import printed
+from cprl.output import ERR, console, printed
 from cprl.process import cpu
 from cprl.runs import formats
-from cprl.runs.files import read_json, write_json
+from cprl.runs.files import digest_of, read_json, write_json
 from cprl.runs.lock import FILE_NAME as LOCK_NAME
 from cprl.runs.lock import RunLock
 from cprl.runs.source import git_state
@@ -76,9 +77,11 @@ def start_run(
     try:
         with RunLock(directory):
             _refuse_contents(directory)
+            recipe = to_recipe(directory)
             recipe = {
-                **to_recipe(directory),
-                **_circumstances(),
+                **recipe,
+                **_circumstances(recipe),
+                **_code_text(recipe),
                 "started": started.isoformat(timespec="seconds"),
                 "command": _command(sys.argv if command is None else command),
             }
@@ -138,7 +141,8 @@ def refuse_another_run(
 def write_more_episodes(run: Path, episodes: int) -> None:
     """Writes into a run's recipe that it is extended to so many episodes, and by which versions."""
     recipe = read_recipe(run)
-    earlier = {"episodes": recipe["experiment"]["episodes"], **_circumstances()}
+    earlier = {"episodes": recipe["experiment"]["episodes"], **_circumstances(recipe)}
+    recipe |= _code_text(recipe)
     recipe["experiment"]["episodes"] = episodes
     recipe["extended"] = [*recipe.get("extended", []), earlier]
     write_json(run / FILE_NAME, recipe)
@@ -153,11 +157,13 @@ def write_on_nan(run: Path, on_nan: str) -> None:
 
 
 def changed_circumstances(run: Path) -> list[str]:
-    """What differs now from when a run was started: versions, git commit, processor; a sentence for each.
+    """What differs now from when a run was started: versions, git commit, processor, the user's own code; a
+    sentence for each.
 
     Numbers may then differ from those of an undisturbed run.
     """
-    recipe, now = read_recipe(run), _circumstances()
+    recipe = read_recipe(run)
+    now = _circumstances(recipe)
     return [
         line
         for name in now
@@ -167,17 +173,60 @@ def changed_circumstances(run: Path) -> list[str]:
 
 
 def write_changed_circumstances(run: Path) -> None:
-    """Writes into a run's recipe under which versions, git commit and processor it is resumed, if they are
-    not those of its last process."""
-    recipe, now = read_recipe(run), _circumstances()
+    """Writes into a run's recipe under which versions, git commit, processor and code of the user's own it is
+    resumed, if they are not those of its last process."""
+    recipe = read_recipe(run)
+    now = _circumstances(recipe)
     before = recipe.get("resumed") or [recipe]
     if any(before[-1].get(name) != now[name] for name in now):
         recipe["resumed"] = [*recipe.get("resumed", []), now]
+        recipe |= _code_text(recipe)
         write_json(run / FILE_NAME, recipe)
 
 
-def _circumstances() -> dict[str, Any]:
-    return {"versions": versions(), "git": git_state(), "cpu": cpu()}
+def say_changes(run: Path, changes: Sequence[str]) -> None:
+    """Warns on standard error where a run is used under other circumstances than those it was made under."""
+    if changes:
+        console(ERR).print(
+            f"Warning: {run} was begun under other versions or other code, so that numbers may differ from "
+            f"those of an undisturbed run: {'; '.join(changes)}",
+            soft_wrap=True,
+            markup=False,
+        )
+
+
+def changed_code(recipe: Mapping[str, Any]) -> list[str]:
+    """Return the modules of the user's own that have another text now than when a run or a part of it began.
+
+    Those of which the recipe of an earlier cprl has no checksum, and those that are gone, count as unchanged.
+    """
+    now = _code(recipe)
+    parts = (recipe, *recipe.get("extended", ()), *recipe.get("resumed", ()))
+    before = [item for part in parts for item in (part.get("code") or {}).items()]
+    return sorted({module for module, digest in before if now.get(module, digest) != digest})
+
+
+def _circumstances(recipe: Mapping[str, Any]) -> dict[str, Any]:
+    code = _code(recipe)
+    return {"versions": versions(), "git": git_state(), "cpu": cpu(), **({"code": code} if code else {})}
+
+
+def _code(recipe: Mapping[str, Any]) -> dict[str, str]:
+    """The checksum of the text of each module that a `Custom` of a recipe names."""
+    return {module: digest_of(text) for module, text in _sources(recipe).items()}
+
+
+def _code_text(recipe: Mapping[str, Any]) -> dict[str, dict[str, str]]:
+    """What a recipe says of these texts: each by its checksum, with those of before."""
+    texts = {digest_of(text): text for text in _sources(recipe).values()}
+    return {"code_text": {**recipe.get("code_text", {}), **texts}} if texts else {}
+
+
+def _sources(recipe: Mapping[str, Any]) -> dict[str, str]:
+    """The text of each module that a `Custom` of a recipe names, without packages whose versions it has."""
+    modules = {target.partition(":")[0] for target in custom_targets(recipe.get("experiment"))}
+    texts = {own: source_of(own) for own in sorted(modules) if own.partition(".")[0] not in PACKAGES}
+    return {module: text for module, text in texts.items() if text is not None}
 
 
 def resume_command(run: Path, command: Sequence[str] | None = None) -> str:

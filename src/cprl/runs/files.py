@@ -101,6 +101,11 @@ def checksum(path: Path) -> str:
     return digest.hexdigest()
 
 
+def digest_of(text: str) -> str:
+    """BLAKE2b of a text, 16 bytes in hexadecimal."""
+    return hashlib.blake2b(text.encode(), digest_size=16).hexdigest()
+
+
 def sync_folder(folder: Path) -> None:
     """Syncs a folder, so that a new name in it survives a power failure, if the system supports it."""
     if sys.platform == "win32":

@@ -17,7 +17,7 @@ from cprl.studies.executors import Executor
 from cprl.studies.live import LiveStudy, check_live
 from cprl.studies.progress import Progress
 from cprl.studies.study import Study
-from cprl.studies.trials import Outcome, Task, Trial, task_of
+from cprl.studies.trials import Outcome, Task, Trial, move_aside, task_of
 
 
 def check_executor(on: object) -> None:
@@ -51,9 +51,14 @@ class Driver:
     ) -> tuple[Outcome, ...]:
         """Runs trials, shows how far they are, and returns those that failed.
 
-        Those that another process runs come last: all others first, then it waits for these.
+        Those that another process runs come last: all others first, then it waits for these. Those that were
+        made with other code of the user's own are moved aside and run anew.
+
+        Raises:
+            RunLockedError: where another process runs such a trial.
         """
         failed: list[Outcome] = []
+        moved = [aside for trial in trials if (aside := move_aside(self._runs / trial.name)) is not None]
         shown = Progress(
             trials,
             runs=self._runs,
@@ -64,6 +69,10 @@ class Driver:
         )
         if self.others:
             shown.say(self.others)
+        if moved:
+            kept = f"{moved[0]}{f' and {len(moved) - 1} more' if moved[1:] else ''}"
+            anew = f"{len(moved)} of {len(trials)} trials are run anew, as the user's own code has changed"
+            shown.say(f"{anew}; what was there is kept: {kept}")
         tasks = tasks_of(trials, runs=self._runs, status=self._out / STATUS, **self._how)
         with shown:
             try:

@@ -10,7 +10,7 @@ from cprl.differences import differences
 from cprl.experiment import Experiment
 from cprl.runs.checkpoints import FOLDER, checkpoints_in, is_ending
 from cprl.runs.directory import FILE_NAME as RECIPE
-from cprl.runs.directory import read_recipe
+from cprl.runs.directory import changed_code, read_recipe
 from cprl.runs.extension import REPORT, depends_on_episodes
 from cprl.runs.lock import FILE_NAME as LOCK
 
@@ -65,11 +65,12 @@ def begin_from_shorter(run: Path, experiment: Experiment, recipe: Mapping[str, A
 
 
 def _experiment_of(run: Path) -> dict[str, Any] | None:
-    """The experiment of a finished run; None for any other directory."""
+    """The experiment of a finished run; None for any other directory, and one made with other code."""
     if not (run / REPORT).exists():
         return None
     try:
-        found: dict[str, Any] = read_recipe(run)["experiment"]
-        return found if isinstance(found["episodes"], int) else None
+        recipe = read_recipe(run)
+        found: dict[str, Any] = recipe["experiment"]
+        return found if isinstance(found["episodes"], int) and not changed_code(recipe) else None
     except (OSError, ValueError, KeyError, TypeError):
         return None

@@ -5,6 +5,7 @@ there: nothing, a run that was killed at any moment, or a finished one, of which
 """
 
 import os
+import shutil
 import sys
 import time
 import traceback
@@ -12,6 +13,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager, redirect_stderr, redirect_stdout
 from dataclasses import dataclass, replace
 from functools import partial
+from itertools import count
 from pathlib import Path
 from typing import Any, Final, Literal, NamedTuple
 
@@ -20,7 +22,7 @@ from cprl.differences import differences
 from cprl.experiment import Experiment
 from cprl.population import Frozen, with_stored
 from cprl.runs.directory import FILE_NAME as RECIPE
-from cprl.runs.directory import read_recipe
+from cprl.runs.directory import changed_code, read_recipe
 from cprl.runs.extension import REPORT
 from cprl.runs.files import remove_partial
 from cprl.runs.lock import FILE_NAME as LOCK
@@ -114,6 +116,31 @@ def refuse_another(run: Path, recipe: Mapping[str, Any]) -> None:
 
 _FREE: Final = {"name": "", "on_nan": ""}
 """Fields that may differ between runs of the same trial."""
+
+
+def move_aside(run: Path) -> Path | None:
+    """Moves a run out of the way that was made with other code of the user's own; nothing of it is lost.
+
+    Returns:
+        Where it is now: in a folder beside that of the runs, `runs-earlier`; None for any other run.
+
+    Raises:
+        RunLockedError: if another process runs it.
+    """
+    try:
+        if state_of(run) == "missing" or not changed_code(read_recipe(run)):
+            return None
+    except ValueError:  # its recipe cannot be read, which is a failure of the trial
+        return None
+    earlier = Path(os.path.abspath(run.parent))
+    earlier = earlier.with_name(f"{earlier.name}-earlier")
+    with RunLock(run):
+        earlier.mkdir(exist_ok=True)
+        taken = {path.name for path in earlier.iterdir()}
+        aside = earlier / next(name for n in count(1) if (name := f"{run.name}-{n}") not in taken)
+        shutil.move(run, aside)
+    (aside / LOCK).unlink(missing_ok=True)
+    return aside
 
 
 def state_of(run: Path) -> State:

@@ -1,4 +1,4 @@
-"""Under which versions, git commit and processor runs were made, and which of them differ from the rest."""
+"""Under which versions, code, commit and processor runs were made, and which of them differ from the rest."""
 
 from collections import Counter
 from collections.abc import Mapping
@@ -13,7 +13,8 @@ _NAMED: Final = 4
 """The largest number of runs that a sentence names."""
 
 Circumstances = Mapping[str, str]
-"""The version of each package, the git commit and the type of processor, by name. Where a run was resumed
+"""The version of each package, the checksum of each module of the user's own, the git commit and the type of
+processor, by name. Where a run was resumed
 under others, all of them in order, with " then " between them."""
 
 
@@ -63,6 +64,7 @@ def sentences(made: Mapping[str, Circumstances]) -> list[str]:
 
 def _of(recipe: Mapping[str, Any]) -> dict[str, str]:
     found = {name: str(own) for name, own in (recipe.get("versions") or {}).items() if own is not None}
+    found |= {module: str(digest)[:12] for module, digest in (recipe.get("code") or {}).items()}
     git = recipe.get("git")
     if isinstance(git, Mapping):
         found["git"] = f"{str(git.get('commit'))[:12]}{' with changes' if git.get('dirty') else ''}"
