@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+import rerun as rr
 from rerun.chunk import RrdReader
 from test_rerun_logger import GAME, SCENE, column, static, strict_rerun
 from test_watch import fake
@@ -11,6 +12,7 @@ from cprl.measuring.phases import LONGEST
 from cprl.measuring.published import PHASES_BEGIN
 from cprl.measuring.reported import reported_by
 from cprl.viewer import compiling
+from cprl.viewer.batches import send_waiting
 from cprl.viewer.blueprint import layout
 from cprl.viewer.callback import ViewerCallback
 from cprl.viewer.contents import curves_of
@@ -18,6 +20,7 @@ from cprl.viewer.header import Header, played
 from cprl.viewer.logger import RerunLogger
 from cprl.viewer.recipe import as_table
 from cprl.viewer.scenery import Curves
+from cprl.viewer.sending import LiveStream, Stream
 from cprl.viewer.story import published_phases
 
 __all__ = ["strict_rerun"]
@@ -25,17 +28,9 @@ HEADER = Header(episodes=4800, replicas=8, unit="apples")
 
 
 def headers(path):
-    """The first line of each header that was sent."""
-    chunks = [chunk for chunk in RrdReader(path).stream() if chunk.entity_path == "/header"]
-    assert all(chunk.is_static for chunk in chunks), "the newest holds at all times"
-    texts = [column for chunk in chunks for column in texts_of(chunk.to_record_batch())]
-    return [text.splitlines()[0] for (text,) in texts]
-
-
-def texts_of(batch):
-    """The Markdown texts of a chunk, none if it has others."""
-    name = "TextDocument:text"
-    return batch.column(name).to_pylist() if name in batch.schema.names else []
+    """The first line of each header, with its episode."""
+    episodes, texts = column(path, "header", "TextDocument:text", "episode")
+    return [(episode, text[0].splitlines()[0]) for episode, text in zip(episodes, texts, strict=True)]
 
 
 def test_the_header_says_where_a_run_is():
@@ -86,16 +81,19 @@ def test_the_header_goes_from_the_beginning_to_the_end(tmp_path):
                 viewer.on_episode(
                     fake(number, world, returned=100.0 * world, tagged=0), {"agent_0/epsilon": 0.9}
                 )
-            viewer.flush()
         viewer.finished({"trained": trained, "random": random})
         RrdReader(tmp_path / "run.rrd").store()  # closed, with its footer
-    texts = headers(tmp_path / "run.rrd")
-    assert texts[:2] == ["# Episode 1 of 6 · begins", "# Episode 1 of 6 · compiling"]
-    line = "# Episode 1 of 6 · exploring · 50 apples (random play 282) · 0 of 2 boards died early"
-    assert texts[2] == line
-    assert texts[-2].endswith("· 2 of 2 boards died early")
-    line = "# Finished, 6 episodes · trained 100 apples, random play 282 · 4 of 4 boards died early"
-    assert texts[-1] == line
+    told = headers(tmp_path / "run.rrd")
+    assert [line for _, line in told[:2]] == ["# Episode 1 of 6 · begins", "# Episode 1 of 6 · compiling"]
+    assert told[2] == (
+        0,
+        "# Episode 1 of 6 · exploring · 50 apples (random play 282) · 0 of 2 boards died early",
+    )
+    assert told[-2][1].endswith("· 2 of 2 boards died early")
+    assert told[-1] == (
+        5,
+        "# Finished, 6 episodes · trained 100 apples, random play 282 · 4 of 4 boards died early",
+    )
     _, events = column(tmp_path / "run.rrd", "log", "TextLog:text")
     (words, *_) = [text[0] for text in events if text[0].startswith("random play")]
     assert words.startswith("random play 282.0 ± 2 apples in 2 fresh episodes (mean and its standard error)")
@@ -106,7 +104,7 @@ def test_a_training_without_an_evaluation_ends_with_a_header_of_its_own(tmp_path
     with ViewerCallback(tmp_path, CommonsEnv(GAME, 1), title="run", episodes=2) as viewer:
         for number in range(2):
             viewer.on_episode(fake(number, 0, returned=30.0, tagged=0), {})
-    assert headers(tmp_path / "run.rrd")[-1] == "# Finished, 2 episodes · 30 apples at the end"
+    assert headers(tmp_path / "run.rrd")[-1] == (1, "# Finished, 2 episodes · 30 apples at the end")
 
 
 def test_a_run_that_was_stopped_says_so_and_where_it_goes_on_when_it_is_resumed(tmp_path):
@@ -114,17 +112,24 @@ def test_a_run_that_was_stopped_says_so_and_where_it_goes_on_when_it_is_resumed(
     with ViewerCallback(tmp_path, env, title="run", episodes=9) as viewer:
         viewer.on_episode(fake(0, 0, returned=30.0, tagged=0), {})
         state = viewer.state_dict()
-    assert headers(tmp_path / "run.rrd")[-1] == "# Stopped after 1 of 9 episodes · 30 apples"
+    assert headers(tmp_path / "run.rrd")[-1] == (0, "# Stopped after 1 of 9 episodes · 30 apples")
     with ViewerCallback(tmp_path, env, title="run", episodes=9) as resumed:
         resumed.load_state_dict(state)
-    assert headers(tmp_path / "run-2.rrd")[-2] == "# Episode 1 of 9 · begins · 30 apples"
+    assert headers(tmp_path / "run-2.rrd")[-2] == (1, "# Episode 1 of 9 · begins · 30 apples")
 
 
-def test_of_many_headers_a_recording_has_the_newest_of_each_batch(tmp_path):
-    with ViewerCallback(tmp_path, CommonsEnv(GAME, 1), title="run", episodes=99) as viewer:
-        for number in range(50):
-            viewer.on_episode(fake(number, 0, returned=30.0, tagged=0), {})
-    assert len(headers(tmp_path / "run.rrd")) == 2, "that of the beginning and of the end"
+@pytest.mark.parametrize("kind", [LiveStream, Stream])
+def test_viewers_get_the_newest_header_at_all_times_and_files_each_at_its_own(kind, tmp_path):
+    recording = rr.RecordingStream("cprl", recording_id="one")
+    recording.save(tmp_path / "kept.rrd")
+    stream = kind("stream", recording, period_s=1)
+    stream.waiting["header"] = [(0, 0, 0, "# Episode 1"), (10, 1, 0, "# Episode 2")]
+    send_waiting(stream)
+    stream.close()
+    (chunk,) = RrdReader(tmp_path / "kept.rrd").stream().filter(content="/header")
+    assert chunk.is_static == (kind is LiveStream), "who connects late reads no old one as the present"
+    expected = [["# Episode 2"]] if kind is LiveStream else [["# Episode 1"], ["# Episode 2"]]
+    assert chunk.to_record_batch().column("TextDocument:text").to_pylist() == expected
 
 
 def test_where_exploration_ends_the_strip_changes_and_an_event_says_so(tmp_path):
@@ -144,7 +149,6 @@ def test_the_live_label_goes_on_after_a_resume_also_from_a_state_of_before(tmp_p
     def play(viewer, numbers):
         for number in numbers:
             viewer.on_episode(fake(number, 0, returned=600.0 if number < 30 else 200.0, tagged=1), {})
-            viewer.flush()
 
     env = CommonsEnv(GAME, 1)
     with ViewerCallback(tmp_path, env, title="run", episodes=60, file_name="whole.rrd") as whole:
@@ -159,7 +163,7 @@ def test_the_live_label_goes_on_after_a_resume_also_from_a_state_of_before(tmp_p
             resumed.load_state_dict(own)
             play(resumed, range(40, 60))
         assert headers(tmp_path / name)[-20:] == headers(tmp_path / "whole.rrd")[-20:]
-    assert "tragedy" in headers(tmp_path / "now.rrd")[-2]
+    assert "tragedy" in headers(tmp_path / "now.rrd")[-2][1]
 
 
 def test_phases_of_the_published_game_stand_beside_those_found():
@@ -253,7 +257,7 @@ def test_the_file_closes_while_the_live_view_goes_on(tmp_path):
         logger.log_document("header", "# two")
         logger.flush()
     assert not logger.is_served
-    assert headers(tmp_path / "run.rrd") == ["# one"]
+    assert column(tmp_path / "run.rrd", "header", "TextDocument:text")[1] == [["# one"]]
     assert static(tmp_path / "run.rrd", "header", "TextDocument:media_type") == ["text/markdown"]
 
 

@@ -201,7 +201,7 @@ def test_the_end_of_a_run_is_seen_and_the_trained_policy_plays_on(tmp_path):
             client.set_time("episode", sequence=0, play_state="paused")
             time.sleep(2)
             assert part(client.take_screenshot(), HEADER).tobytes() == ended, "wherever the cursor is"
-        assert "Finished" in headers(tmp_path / "run" / "run.rrd")[-1]
+        assert "Finished" in headers(tmp_path / "run" / "run.rrd")[-1][1]
         process.send_signal(signal.SIGINT)
         assert process.wait(LIMIT_S) == 0
 

@@ -7,7 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cprl.compat import send_chunk
-from cprl.viewer.sending import FLUSH_TIMEOUT_S, Stream
+from cprl.viewer.sending import FLUSH_TIMEOUT_S, LiveStream, Stream
 
 TIMELINES: Final = ("step", "episode", "frame")
 """The timelines of every row: environment steps of the run, episodes, and frames recorded so far."""
@@ -44,16 +44,19 @@ def log_now(recording: Any, name: str, what: Any, now: tuple[int, int, int]) -> 
 
 
 def send_waiting(stream: Stream) -> None:
-    """Sends the buffered numbers and texts of one stream, one chunk per entity; of texts the newest, by
-    `send_text`."""
+    """Sends the buffered numbers and texts of one stream, one chunk per entity.
+
+    Of texts viewers get the newest alone, by `send_text`. Files keep each with its time: of static texts in
+    several files of one recording a viewer shows the one that it loads last.
+    """
     waiting = stream.take()
 
     def send(recording: Any) -> None:
         known: dict[Any, dict[str, Any]] = {}  # most names have the same times
         for name, rows in waiting.items():
             *at, values = zip(*rows, strict=True)
-            if isinstance(text := values[-1], str):
-                send_text(recording, name, text)
+            if isinstance(stream, LiveStream) and isinstance(values[-1], str):
+                send_text(recording, name, values[-1])
                 continue
             if tuple(at) not in known:
                 known[tuple(at)] = timelines(times(*at))
@@ -74,7 +77,9 @@ def send_text(recording: Any, name: str, text: str) -> None:
 
 
 def _columns(values: Sequence[Any]) -> Any:
-    """Equally many numbers in each row."""
+    """Markdown texts, or equally many numbers in each row."""
     import rerun as rr
 
+    if isinstance(values[0], str):
+        return rr.TextDocument.columns(text=list(values))
     return rr.Scalars.columns(scalars=np.concatenate(values)).partition([len(own) for own in values])

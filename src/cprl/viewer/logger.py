@@ -178,7 +178,7 @@ class RerunLogger(Logger):
         self._wait(name, self._now[0], [float(value) for value in values])
 
     def log_document(self, name: str, text: str) -> None:
-        """Logs a Markdown text that takes the place of the one before at all times, sent with the numbers."""
+        """Logs a Markdown text in place of the one before, live at all times; it is sent with the numbers."""
         self._wait(name, self._now[0], text)
 
     def show_live(self, name: str, text: str) -> None:

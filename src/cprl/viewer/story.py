@@ -2,7 +2,7 @@
 
 from collections.abc import Mapping, Sequence
 from math import isfinite
-from typing import Any
+from typing import Any, Final
 
 from cprl import presets
 from cprl.commons.game import Game
@@ -15,6 +15,9 @@ from cprl.viewer.events import EventDetector
 from cprl.viewer.header import Header, Played, played
 from cprl.viewer.logger import RerunLogger
 from cprl.viewer.scenery import ANOTHER, STRIPS, Curves
+
+MOST_HEADERS: Final = 5000
+"""Rows of the header in a recording, about; in longer runs some episodes have none of their own."""
 
 _NOW, _FOUND, _PUBLISHED = STRIPS
 
@@ -81,7 +84,8 @@ class Story:
             events += self._detector.add({name.removeprefix("social/"): mean for name, mean in means.items()})
         for event in events:
             self._logger.log_text(f"episode {episode:,}: {event}")
-        self._show_episode(died)
+        if episode % -(-self._episodes // MOST_HEADERS) == 0 or self._ended == self._episodes:
+            self._show_episode(died)
         return events
 
     def _show_episode(self, died: float | None) -> None:
