@@ -23,6 +23,7 @@ from cprl.runs.directory import start_run
 from cprl.runs.episodes import read_episodes, read_table
 from cprl.runs.export import export_results
 from cprl.runs.files import checksum
+from cprl.runs.labelled import refuse_to_write_over
 from cprl.runs.lock import RunLock, RunLockedError
 from cprl.runs.weights import load_weights, save_weights
 from cprl.shipped import cprl_here
@@ -520,3 +521,47 @@ def test_an_ended_run_without_its_weights_is_never_played_from_an_older_checkpoi
     (lost / "manifest.json").unlink()
     with pytest.raises(ValueError, match=r"final\.pt"):
         cprl.load(lost)
+
+
+LINKS = ("run.lock", "episodes.arrows", "report.json", "recipe.json", "run.rrd", "checkpoints/final.pt")
+
+
+@pytest.mark.parametrize("name", [*LINKS, "checkpoints", "evaluation", "figures", "logs"])
+def test_a_run_with_a_link_out_of_it_is_refused_by_the_link_and_what_it_leads_to_stays(name, whole, tmp_path):
+    begun, outside = shutil.copytree(whole, tmp_path / "run"), tmp_path / "outside"
+    (begun / "report.json").unlink()
+    if (begun / name).exists():
+        (begun / name).rename(outside)
+    elif name != "report.json":  # with which the run would be finished, and nothing written
+        outside.write_text("a file of mine")
+    (begun / name).symlink_to(outside)
+    before = {path: path.read_bytes() for path in tmp_path.rglob("*") if path.is_file()}
+    with pytest.raises(ValueError, match=f"{name} is a symbolic link"):
+        run(FIELD, begun, resume=True)
+    assert {path: path.read_bytes() for path in tmp_path.rglob("*") if path.is_file()} == before
+
+
+def test_a_run_that_is_reached_through_a_link_and_links_within_it_are_no_obstacle(tmp_path):
+    (tmp_path / "disk").mkdir()
+    (tmp_path / "runs").symlink_to(tmp_path / "disk")
+    begun = start_run(tmp_path / "runs" / "run", "run", FIELD.to_recipe)
+    (begun / "my_recipe.json").symlink_to(begun / "recipe.json")
+    (begun / "logs" / "wandb").mkdir(parents=True)
+    (begun / "logs" / "wandb" / "debug.log").symlink_to(tmp_path / "debug.log")
+    with RunLock(begun):
+        assert (tmp_path / "disk" / "run" / "run.lock").exists()
+
+
+def test_results_are_not_exported_through_a_link(whole, tmp_path):
+    (tmp_path / "results").mkdir()
+    (tmp_path / "outside").mkdir()
+    (tmp_path / "results" / "evaluation").symlink_to(tmp_path / "outside")
+    with pytest.raises(ValueError, match="evaluation is a symbolic link"):
+        export_results(whole, tmp_path / "results")
+    assert contents(tmp_path / "outside") == []
+
+
+def test_a_film_is_not_written_through_a_link_to_a_file_that_is_not_there(tmp_path):
+    (tmp_path / "film.rrd").symlink_to(tmp_path / "outside.rrd")
+    with pytest.raises(FileExistsError, match=r"film\.rrd"):
+        refuse_to_write_over(tmp_path / "film.rrd")

@@ -26,6 +26,7 @@ from cprl.runs.lock import FILE_NAME as LOCK
 from cprl.runs.lock import RunLock, RunLockedError
 from cprl.studies import read_study, trials
 from cprl.studies.execution import trials_with
+from cprl.studies.results import write_results
 from cprl.studies.status import Status
 from cprl.studies.trials import Outcome, run_task, state_of, task_of, trials_of
 
@@ -263,6 +264,32 @@ def test_a_finished_trial_that_lost_a_file_of_its_manifest_is_a_failure_by_that_
     (run / "evaluation" / "trained.parquet").unlink()
     (failed,) = run_study(study, tmp_path, progress=False, results=False).failed
     assert "evaluation/trained.parquet" in failed.reason
+
+
+@pytest.mark.parametrize("name", ["study.json", "run.lock", "table.parquet", "status", "figures"])
+def test_a_study_with_a_link_out_of_it_is_refused_by_the_link(name, tmp_path):
+    study = Study(EXPERIMENT)
+    (tmp_path / "study").mkdir()
+    (tmp_path / "outside").mkdir()
+    (tmp_path / "study" / name).symlink_to(
+        tmp_path / "outside" / "file" if "." in name else tmp_path / "outside"
+    )
+    for use in (
+        lambda: run_study(study, tmp_path / "study", on=Written(study, 1.0), progress=False),
+        lambda: write_results(study, tmp_path / "study", tmp_path / "runs"),
+    ):
+        with pytest.raises(ValueError, match=f"{name} is a symbolic link"):
+            use()
+    assert list((tmp_path / "outside").iterdir()) == []
+
+
+def test_the_runs_of_a_study_may_be_a_link_to_another_disk(tmp_path):
+    study = Study(EXPERIMENT)
+    (tmp_path / "study").mkdir()
+    (tmp_path / "disk").mkdir()
+    (tmp_path / "study" / "runs").symlink_to(tmp_path / "disk")
+    result = run_study(study, tmp_path / "study", on=Written(study, 1.0), progress=False, results=False)
+    assert state_of(tmp_path / "disk" / result.trials[0].name) == "finished"
 
 
 class Written:

@@ -15,6 +15,7 @@ from cprl.differences import differences
 from cprl.runs.directory import FILE_NAME as RECIPE
 from cprl.runs.directory import read_recipe
 from cprl.runs.episodes import FILE_NAME, read_episodes, read_table
+from cprl.runs.files import refuse_links
 from cprl.runs.labelled import small
 from cprl.runs.manifest import refuse_missing, unlist, verify, write_listed
 from cprl.runs.partners import FIELD as FROZEN
@@ -51,6 +52,7 @@ def export_results(run: Path, folder: Path, *, weights: bool = True) -> Path:
     switch("weights", weights)
     recipe = read_recipe(run)
     _refuse_another(folder, run, recipe)
+    refuse_links(folder)
     for name in (*_WHOLE, _WEIGHTS) if weights else _WHOLE:
         if not (run / name).exists():
             raise FileNotFoundError(f"{run / name} does not exist: has the run ended?")

@@ -92,6 +92,32 @@ def refuse_special(path: Path) -> None:
         raise ValueError(f"{path} is not a file")
 
 
+_APART: Final = ("runs", "runs-earlier")
+"""Folders of a study that may be links, as to another disk: each run in them is looked at by itself."""
+_OF_OTHERS: Final = ("wandb",)
+"""Folders in which a logger keeps links of its own."""
+
+
+def refuse_links(folder: Path) -> None:
+    """Refuses the directory of a run or study if a symbolic link leads out of it, to what would be written.
+
+    The directory itself may be reached through a link.
+
+    Raises:
+        ValueError: names the link.
+    """
+    place = Path(os.path.realpath(folder))
+    for parent, folders, names in os.walk(folder):
+        folders[:] = [name for name in folders if name not in _APART]
+        for path in (Path(parent, name) for name in (*folders, *names)):
+            if path.is_symlink() and not Path(os.path.realpath(path)).is_relative_to(place):
+                raise ValueError(
+                    f"{path} is a symbolic link out of {folder}, where nothing is written; replace it by a "
+                    "copy, or remove it"
+                )
+        folders[:] = [name for name in folders if name not in _OF_OTHERS]
+
+
 def checksum(path: Path) -> str:
     """BLAKE2b of a file's content, 16 bytes in hexadecimal."""
     digest = hashlib.blake2b(digest_size=16)

@@ -1,5 +1,6 @@
 """Episodes of several policies in one table, with columns that label them."""
 
+import os
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import replace
 from functools import partial
@@ -42,7 +43,7 @@ def refuse_to_write_over(path: Path) -> None:
     Raises:
         FileExistsError: if the file exists.
     """
-    if path.exists():
+    if os.path.lexists(path):  # a link to a file that is not there would be written through
         raise FileExistsError(f"{path} exists and is not overwritten; use another name")
 
 

@@ -9,6 +9,8 @@ from pathlib import Path
 from types import TracebackType
 from typing import Any, Final, Self
 
+from cprl.runs.files import refuse_links
+
 try:
     import fcntl
 except ImportError:  # Windows has no flock; runs are not locked there
@@ -36,6 +38,7 @@ class RunLock:
 
     Raises:
         RunLockedError: names the process that holds the lock.
+        ValueError: if a symbolic link leads out of the directory, see `cprl.runs.files.refuse_links`.
     """
 
     def __init__(self, run: Path, *, take_over: bool = False) -> None:
@@ -43,6 +46,7 @@ class RunLock:
         self._file: int | None = None
 
     def __enter__(self) -> Self:
+        refuse_links(self.path.parent)
         if fcntl is None:
             return self
         while not self._is_taken():

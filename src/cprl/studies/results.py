@@ -9,7 +9,7 @@ from cprl.arguments import object_of
 from cprl.arguments import path as path_of
 from cprl.measuring.statistics import Interval, excluded_by_chance
 from cprl.runs.extension import REPORT
-from cprl.runs.files import read_json, write_atomically
+from cprl.runs.files import read_json, refuse_links, write_atomically
 from cprl.studies.figures.by_condition import by_condition
 from cprl.studies.figures.by_factor import by_factor
 from cprl.studies.figures.courses import courses
@@ -65,6 +65,7 @@ def write_results(
     object_of("study", study, Study, "a Study")
     out, folder = path_of("out", out), path_of("runs", runs)
     object_of("again", again, str, "a command line")
+    refuse_links(out)
     status = out / _STATUS
     table = study_table(study, folder, window=window, status=status if status.exists() else None)
     metrics = metrics_of(table)
