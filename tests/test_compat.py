@@ -3,6 +3,7 @@
 A failure here names the part that an upgrade has changed, and where cprl relies on it.
 """
 
+import errno
 import gc
 import importlib
 import inspect
@@ -17,6 +18,7 @@ import numba
 import numpy as np
 import pytest
 import torch
+from filelock import FileLock
 from tensordict import TensorDict
 from torch import nn
 from torchrl.data import Binary
@@ -483,6 +485,69 @@ def test_numba_keeps_compiled_functions_where_it_is_told(tmp_path):
         assert before == numba.config.CACHE_DIR
         assert function(np.ones(2)) == 2
         assert list(tmp_path.rglob("*.nbi")), "nothing was kept"
+
+
+@pytest.fixture
+def kept_summed(tmp_path):
+    """A function that Numba keeps in a folder."""
+    with compiled.kept_in(tmp_path):
+        return compiled.kept_on_disk(summed)
+
+
+def test_a_full_disk_leaves_compiled_functions_unkept_and_they_run(kept_summed, tmp_path, monkeypatch):
+    def full(*_):
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    with relies_on("Dispatcher._cache.disable of Numba", used_by="cprl.commons.compiled.kept_on_disk"):
+        monkeypatch.setattr("numba.core.caching.IndexDataCacheFile.save", full)
+        with pytest.warns(RuntimeWarning, match="No space left on device.*CPRL_CACHE"):
+            assert kept_summed(np.ones(2)) == 2
+        assert not list(tmp_path.rglob("*.nbi"))
+
+
+def test_a_process_that_never_ends_to_compile_is_waited_for_no_longer_than_some_time(
+    kept_summed, monkeypatch
+):
+    monkeypatch.setattr(compiled, "_WAIT_S", 0.05)
+    with FileLock(Path(kept_summed.stats.cache_path) / "summed.lock"):
+        assert kept_summed(np.ones(2)) == 2
+
+
+COMPILES_IN_STEP = """
+import sys, time
+from pathlib import Path
+import numpy as np
+from cprl.commons import compiled
+
+def doubled(values):
+    return values * 2
+
+folder = Path(sys.argv[1])
+with compiled.kept_in(folder / "cache"):
+    function = compiled.kept_on_disk(doubled)
+(folder / f"ready-{sys.argv[2]}").touch()
+while len(list(folder.glob("ready-*"))) < 3:
+    time.sleep(0.001)
+function(np.ones(2))
+print(sum(function.stats.cache_misses.values()))
+"""
+
+
+@pytest.mark.integration
+def test_of_processes_that_start_together_one_compiles_and_the_others_read(tmp_path):
+    script = tmp_path / "script.py"
+    script.write_text(COMPILES_IN_STEP)
+    started = [
+        subprocess.Popen([sys.executable, script, tmp_path, str(number)], stdout=subprocess.PIPE, text=True)
+        for number in range(3)
+    ]
+    assert sorted(process.communicate(timeout=100)[0].strip() for process in started) == ["0", "0", "1"]
+
+
+def test_rules_that_numba_is_told_not_to_compile_are_refused_by_the_variable(monkeypatch):
+    monkeypatch.setattr(numba.config, "DISABLE_JIT", 1)
+    with pytest.raises(ValueError, match="NUMBA_DISABLE_JIT"):
+        compiled.machine_code(summed, np.ones(3))
 
 
 LIBRARY_PARTS = (

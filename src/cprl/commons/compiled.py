@@ -1,20 +1,21 @@
 """Compiles the rules: every target is built from the same plain Python functions.
 
 What relies on private parts of Numba is here, each in a function or constant of its own: `CPU_OPTIONS`,
-`kept_in` and `machine_code`. `tests/test_compat.py` has a test for each.
+`kept_in`, `kept_on_disk` and `machine_code`. `tests/test_compat.py` has a test for each.
 """
 
 import hashlib
 import os
 import warnings
 from collections.abc import Callable, Iterable, Iterator, Mapping
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager, suppress
 from functools import cache, partial
 from pathlib import Path
 from types import FunctionType
 from typing import Any, Final
 
 import numba
+from filelock import FileLock
 
 from cprl.caches import cache_folder
 from cprl.commons.loops import FUNCTIONS, LOOPS
@@ -27,6 +28,10 @@ CPU_OPTIONS: Final[Mapping[str, Any]] = {"nogil": True, "error_model": "numpy", 
 """Of `numba.njit`. `_nrt`, which is private, refuses any allocation inside a function, and spares the
 counting of references to the many arrays handed on, which would take fifty times as long as the game."""
 
+_SETTINGS: Final[Any] = numba.config
+_WAIT_S: Final = 300.0
+"""How long a process waits for another one that compiles the same, before it does so itself."""
+
 
 @contextmanager
 def kept_in(folder: Path) -> Iterator[None]:
@@ -34,14 +39,57 @@ def kept_in(folder: Path) -> Iterator[None]:
 
     Numba documents its setting as an environment variable, read when Numba is imported.
     """
-    settings: Any = numba.config
     with relying_on("numba", "numba.config.CACHE_DIR"):
-        usual = settings.CACHE_DIR
-    settings.CACHE_DIR = str(folder)
+        usual = _SETTINGS.CACHE_DIR
+    _SETTINGS.CACHE_DIR = str(folder)
     try:
         yield
     finally:
-        settings.CACHE_DIR = usual
+        _SETTINGS.CACHE_DIR = usual
+
+
+def kept_on_disk(function: FunctionType, **options: Any) -> Any:
+    """Compile a function with Numba, and keep it on disk as far as the disk takes it.
+
+    Of processes that lack it at the same time one compiles it, and the others wait and read it. Where it
+    cannot be kept or read, e.g. on a full disk, each compiles it.
+
+    Args:
+        function: a plain function.
+        options: of `numba.njit`.
+    """
+    try:
+        made: Any = numba.njit(**options, cache=True)(function)
+    except RuntimeError:  # no folder for it is writable
+        return numba.njit(**options)(function)
+    if _SETTINGS.DISABLE_JIT:
+        return made
+    with relying_on("numba", "Dispatcher.compile and its cache"):
+        compile_for, stop_caching, folder = made.compile, made._cache.disable, Path(made.stats.cache_path)
+
+    def compiled_once(types: Any) -> Any:
+        with _alone(folder / f"{function.__name__}.lock", but_if=f"*.{function.__name__}-*.nbi"):
+            try:
+                return compile_for(types)
+            except OSError as error:
+                _warn(folder, str(error))
+                stop_caching()
+                return compile_for(types)  # what it gave before it was to be kept, if there is that
+
+    made.compile = compiled_once
+    return made
+
+
+@contextmanager
+def _alone(path: Path, *, but_if: str) -> Iterator[None]:
+    """Holds a lock among processes, unless the folder of the lock has a file like `but_if`; without a lock
+    where it cannot be had, or not within minutes."""
+    lock = FileLock(path, timeout=_WAIT_S)
+    with ExitStack() as stack:
+        with suppress(OSError, NotImplementedError):  # `Timeout` is an OSError
+            if not any(path.parent.glob(but_if)):
+                stack.enter_context(lock)
+        yield
 
 
 def machine_code(function: Any, *arguments: Any) -> Callable[..., Any]:
@@ -49,7 +97,15 @@ def machine_code(function: Any, *arguments: Any) -> Callable[..., Any]:
 
     Numba's own call looks at the types of all arguments each time; this one looks at none, so the caller
     must. `Dispatcher.compile` returns it, which Numba does not document.
+
+    Raises:
+        ValueError: where NUMBA_DISABLE_JIT leaves functions as they are.
     """
+    if _SETTINGS.DISABLE_JIT:
+        raise ValueError(
+            "NUMBA_DISABLE_JIT is set, and the rules of the game run as machine code alone; allowed: an "
+            "environment without it"
+        )
     with relying_on("numba", "Dispatcher.compile"):
         compile_for = function.compile
     code: Callable[..., Any] = compile_for(tuple(map(numba.typeof, arguments)))
@@ -73,10 +129,10 @@ def compiled(functions: Iterable[Any], jit: Callable[[FunctionType], Callable[..
 def _jit_for_cpu(function: FunctionType, *, on_disk: bool) -> Callable[..., Any]:
     """Compiles a function for CPU threads."""
     options = dict(CPU_OPTIONS)
-    if function.__name__ in (*LOOPS, "first_unknown"):
-        options |= {"cache": on_disk}
-    else:
+    if function.__name__ not in (*LOOPS, "first_unknown"):
         options |= {"forceinline": True, "no_cpython_wrapper": True, "no_cfunc_wrapper": True}
+    elif on_disk:
+        return kept_on_disk(function, **options)
     return numba.njit(**options)(function)
 
 
@@ -120,13 +176,17 @@ def _can_write(folder: Path) -> bool:
         reason = "it is not writable"
     except OSError as error:
         reason = str(error)
+    _warn(folder, reason)
+    return False
+
+
+def _warn(folder: Path, reason: str) -> None:
     warnings.warn(
         f"the compiled rules cannot be cached in {folder} ({reason}): every process compiles them again, "
         "which takes about ten seconds; set CPRL_CACHE to a writable folder",
         RuntimeWarning,
-        stacklevel=2,
+        stacklevel=3,
     )
-    return False
 
 
 def _fingerprint() -> str:

@@ -46,7 +46,7 @@ from torchrl.envs.utils import ExplorationType, exploration_type
 
 from cprl import arguments
 from cprl.commons import colours
-from cprl.commons.compiled import CPU_OPTIONS, compiled
+from cprl.commons.compiled import CPU_OPTIONS, compiled, kept_on_disk
 from cprl.commons.decoding import UNSEEN, classes_seen
 from cprl.commons.game import Game
 from cprl.commons.near import distance
@@ -261,9 +261,6 @@ def _choose_all() -> Callable[..., None]:
             options |= {"no_cpython_wrapper": True, "no_cfunc_wrapper": True}
             return numba.njit(**options)(function)
         function.__name__ = function.__qualname__ = name
-        try:
-            return numba.njit(**options, cache=True)(function)
-        except RuntimeError:  # no cache folder is writable
-            return numba.njit(**options)(function)
+        return kept_on_disk(function, **options)
 
     return compiled(scripted_rules.FUNCTIONS, jit)["choose_all"]

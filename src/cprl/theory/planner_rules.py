@@ -5,9 +5,9 @@ Plain loops for Numba. Cells are (row, column), directions are headings: 0 up, 1
 
 from typing import Any, Final, NamedTuple
 
-import numba
 from numpy.typing import NDArray
 
+from cprl.commons.compiled import kept_on_disk
 from cprl.commons.moves import WALK_TURN
 from cprl.commons.world import COL_STEP, ROW_STEP
 
@@ -18,10 +18,7 @@ FAR: Final = 1 << 30
 
 def _jit(function: Any) -> Any:
     """Compiles a function, kept on disk where a folder for that is writable."""
-    try:
-        return numba.njit(nogil=True, error_model="numpy", cache=True)(function)
-    except RuntimeError:
-        return numba.njit(nogil=True, error_model="numpy")(function)
+    return kept_on_disk(function, nogil=True, error_model="numpy")
 
 
 class Board(NamedTuple):
