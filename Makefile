@@ -81,6 +81,7 @@ lint: $(INSTALLED)
 check: lint test test-integration
 
 bench: $(INSTALLED)
+	$(BIN)/python benchmarks/start_up.py
 	$(BIN)/python benchmarks/env_steps.py
 	$(BIN)/python benchmarks/observation_forms.py
 	$(BIN)/python benchmarks/institutions.py

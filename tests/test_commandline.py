@@ -302,7 +302,6 @@ def runs(monkeypatch):
         return Path("a run")
 
     monkeypatch.setitem(sys.modules, "cprl.running", SimpleNamespace(run=run))
-    monkeypatch.setattr(cli, "run_experiment", run)
     return asked
 
 

@@ -91,7 +91,7 @@ def test_a_command_that_a_signal_stops_says_once_what_resumes_and_exits_as_shell
 ):
     begun = start_run(tmp_path / "begun", "field", FIELD.to_recipe)
     run_it = partial(cprl.run, callbacks=[Signals(number, 30)])
-    monkeypatch.setattr(cli, "run_experiment", run_it)
+    monkeypatch.setattr("cprl.running.run", run_it)
     words = ["cprl", "run", str(begun), "--out", str(tmp_path / "run"), "--watch", "off"]
     monkeypatch.setattr("sys.argv", words)
     with pytest.raises(SystemExit) as ended:
@@ -102,6 +102,7 @@ def test_a_command_that_a_signal_stops_says_once_what_resumes_and_exits_as_shell
 
 def test_sigterm_ends_a_command_as_ctrl_c_does_so_that_files_are_cleared_away(tmp_path, monkeypatch):
     cleared = tmp_path / "cleared"
+    begun = start_run(tmp_path / "begun", "field", FIELD.to_recipe)
 
     def half(*_, **__):
         try:
@@ -112,8 +113,8 @@ def test_sigterm_ends_a_command_as_ctrl_c_does_so_that_files_are_cleared_away(tm
 
     before = signal.signal(signal.SIGTERM, signal.SIG_IGN)  # not the end of the tests
     try:
-        monkeypatch.setattr(cli, "export_results", half)
-        monkeypatch.setattr("sys.argv", ["cprl", "export", "a", "b"])
+        monkeypatch.setattr("cprl.runs.export.export_results", half)
+        monkeypatch.setattr("sys.argv", ["cprl", "export", str(begun), "b"])
         with pytest.raises(SystemExit) as ended:
             cli.main()
     finally:

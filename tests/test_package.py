@@ -10,6 +10,34 @@ import pytest
 import cprl
 from cprl import cli
 
+PACKAGES = (
+    *("algorithms", "callbacks", "commons", "envs", "evaluation", "exploiting", "institutions", "keys"),
+    *("learners", "measuring", "networks", "objectives", "policies", "population", "preferences", "presets"),
+    *("reporting", "spaces", "studies", "theory", "training", "viewer"),
+)
+"""What users import."""
+TAKES_SECONDS = ("torch", "numba", "pyarrow", "scipy", "matplotlib", "rerun")
+"""Packages whose import takes the longest."""
+NEED_NOTHING = (
+    *(["--version"], ["recipe"], ["evalute"], ["run", "comons"], ["evaluate", "none", "--episods", "3"]),
+    *(["evaluate", "none"], ["--help"]),
+)
+"""Command lines of which every answer is known before any run is read."""
+ALL_THAT_NEED_NOTHING = (
+    *([name, "--help"] for name in cli.COMMANDS),
+    *([name, "none", "--episods", "3"] for name in cli.COMMANDS if name != "sweep"),
+    *([name, "runs/none"] for name in cli.COMMANDS if name not in ("export", "docs")),
+    *(["export", "runs/none", "copy"], ["table", "runs/none", "--by", "seed"], ["docs", "--port", "-1"]),
+    *(["recipe", "commons"], ["sweep", "comons", "--vary", "seed=1,2"]),
+)
+
+
+def run_alone(code):
+    """Runs code in a process of its own, which has imported nothing yet."""
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr
+    return done.stdout
+
 
 def test_dir_shows_all_and_only_the_public_names():
     assert dir(cprl) == sorted(cprl.__all__)
@@ -18,8 +46,14 @@ def test_dir_shows_all_and_only_the_public_names():
         assert getattr(cprl, name) is not None, name
 
 
-def test_what_is_imported_when_used_is_public():
-    assert set(cprl._IMPORTED_WHEN_USED) <= set(cprl.__all__)
+def test_tab_shows_the_packages():
+    assert set(PACKAGES) <= set(dir(cprl))
+
+
+@pytest.mark.integration
+def test_packages_are_attributes_after_import_cprl_alone():
+    lines = [f"assert cprl.{name}.__name__ == 'cprl.{name}'" for name in reversed(PACKAGES)]
+    run_alone("\n".join(["import cprl", *lines]))
 
 
 def test_a_name_that_is_not_there_is_an_attribute_error():
@@ -36,17 +70,30 @@ def test_the_viewer_exports_its_logger():
         _ = viewer.RerunLoger
 
 
-@pytest.mark.integration
-def test_importing_cprl_leaves_the_viewer_and_stored_runs_out():
-    code = (
-        "import sys, cprl\n"
-        "heavy = {'rerun', 'pyarrow', 'matplotlib', 'scipy.stats', 'cprl.stored', 'cprl.evaluation'}\n"
-        "import cprl.viewer\n"
-        "loaded = (heavy | {'cprl.viewer.logger'}) & set(sys.modules)\n"
-        "sys.exit(str(sorted(loaded)) if loaded else 0)"
+@pytest.mark.parametrize(
+    "lines", [NEED_NOTHING, pytest.param(ALL_THAT_NEED_NOTHING, marks=pytest.mark.integration)]
+)
+def test_help_and_mistakes_are_answered_before_what_takes_seconds_is_imported(lines):
+    run_alone(
+        "import sys\n"
+        "from cprl import cli\n"
+        f"for words in {lines}:\n"
+        "    sys.argv = ['cprl', *words]\n"
+        "    try:\n"
+        "        cli.main()\n"
+        "    except SystemExit:\n"
+        "        pass\n"
+        f"    loaded = [name for name in {TAKES_SECONDS} if name in sys.modules]\n"
+        "    assert not loaded, (words, loaded)\n"
     )
-    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)
-    assert done.returncode == 0, done.stderr
+
+
+def test_importing_cprl_is_enough_for_gymnasium_to_know_its_boards():
+    run_alone(
+        "import cprl, gymnasium, sys\n"
+        "gymnasium.spec('cprl/SingleBasic-v0')\n"
+        "assert 'torch' not in sys.modules"
+    )
 
 
 def test_the_version_is_that_of_the_installed_package(capsys, monkeypatch):

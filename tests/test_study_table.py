@@ -11,10 +11,10 @@ import pytest
 from study_runs import EXPERIMENT, TIME_OUT, with_seed, write_run, write_study
 
 from cprl import Study
-from cprl.runs.directory import write_changed_circumstances
+from cprl.runs.directory import runs_in, write_changed_circumstances
 from cprl.studies.status import Status
 from cprl.studies.tables.circumstances import circumstances_of
-from cprl.studies.tables.pooled import pooled_table, runs_in
+from cprl.studies.tables.pooled import pooled_table
 from cprl.studies.tables.sources import design_of
 from cprl.studies.tables.table import METADATA, StudyTable, study_table
 from cprl.studies.trials import trials_of

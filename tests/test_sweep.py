@@ -14,7 +14,7 @@ import pytest
 from tiny_study import FREEZE, GAMMA, TINY
 
 import cprl
-from cprl import Study, cli, studies_options
+from cprl import Study, cli
 from cprl.runs.directory import start_run
 from cprl.runs.lock import RunLockedError
 from cprl.shipped import cprl_here
@@ -322,7 +322,7 @@ def test_what_continues_a_study_can_be_typed_here_and_its_summary_names_no_place
     summary = []
     monkeypatch.setattr(sys, "executable", "/bin/py")
     monkeypatch.setattr("cprl.shipped.which", lambda *_, **__: None)
-    monkeypatch.setattr(studies_options, "run_study", interrupted)
+    monkeypatch.setattr("cprl.studies.run_study", interrupted)
     with pytest.raises(SystemExit):
         carry_out(Study(TINY), StudyOptions(only=("x=1",)), [*command, "--only", "x=1"])
     assert f"To continue: {typed} --only x=1\n" in capsys.readouterr().out

@@ -63,7 +63,7 @@ Each imports only from those above it:
     egta_cli     cprl egta
     scenarios_cli  cprl scenarios
     studies_options  how a study is run, as options of a command line
-    studies_cli  cprl sweep, and study_main: the command line of a recipe of a study
+    studies_cli  cprl sweep and cprl table; study_main: the command line of a recipe of a study
     exploit_cli  cprl exploit
     recipes_cli  cprl recipe, and recipes that cprl run takes by name
     docs_cli     cprl docs
@@ -75,24 +75,48 @@ from importlib import import_module
 from importlib.metadata import version
 from typing import TYPE_CHECKING, Any, Final
 
-from cprl import keys, presets
-from cprl.commons import maps
-from cprl.commons.game import Game
-from cprl.commons.maps import Map
-from cprl.commons.observation import Observation
-from cprl.commons.rules import Rules
-from cprl.envs import CommonsEnv
-from cprl.training import train
+import gymnasium
 
 if TYPE_CHECKING:
+    from cprl import (
+        algorithms,
+        callbacks,
+        commons,
+        envs,
+        evaluation,
+        exploiting,
+        institutions,
+        keys,
+        learners,
+        measuring,
+        networks,
+        objectives,
+        policies,
+        population,
+        preferences,
+        presets,
+        reporting,
+        spaces,
+        studies,
+        theory,
+        training,
+        viewer,
+    )
     from cprl.commandline import recipe_main
+    from cprl.commons import maps
+    from cprl.commons.game import Game
+    from cprl.commons.maps import Map
+    from cprl.commons.observation import Observation
+    from cprl.commons.rules import Rules
     from cprl.custom import Custom
+    from cprl.envs import CommonsEnv
     from cprl.evaluation import crossplay, evaluate_run
     from cprl.experiment import Experiment
     from cprl.running import run
     from cprl.stored import load
     from cprl.studies import Study, run_study
     from cprl.studies_cli import study_main
+    from cprl.training import train
 
     __version__: str
 
@@ -106,41 +130,83 @@ __all__ = [
     "Rules",
     "Study",
     "__version__",
+    "algorithms",
+    "callbacks",
+    "commons",
     "crossplay",
+    "envs",
     "evaluate_run",
+    "evaluation",
+    "exploiting",
+    "institutions",
     "keys",
+    "learners",
     "load",
     "maps",
+    "measuring",
+    "networks",
+    "objectives",
+    "policies",
+    "population",
+    "preferences",
     "presets",
     "recipe_main",
+    "reporting",
     "run",
     "run_study",
+    "spaces",
+    "studies",
     "study_main",
+    "theory",
     "train",
+    "training",
+    "viewer",
 ]
 
-_IMPORTED_WHEN_USED: Final = {
+_MODULES: Final = {
+    "CommonsEnv": "cprl.envs",
     "Custom": "cprl.custom",
     "Experiment": "cprl.experiment",
+    "Game": "cprl.commons.game",
+    "Map": "cprl.commons.maps",
+    "Observation": "cprl.commons.observation",
+    "Rules": "cprl.commons.rules",
+    "Study": "cprl.studies",
     "crossplay": "cprl.evaluation",
     "evaluate_run": "cprl.evaluation",
     "load": "cprl.stored",
+    "maps": "cprl.commons",
     "recipe_main": "cprl.commandline",
     "run": "cprl.running",
     "run_study": "cprl.studies",
-    "Study": "cprl.studies",
     "study_main": "cprl.studies_cli",
+    "train": "cprl.training",
 }
-"""Where these names stand; with them come the viewer and all that is recorded, half a second of import."""
+"""Where names are that no package is called. All are imported when they are used: torch alone takes seconds,
+which `cprl --help` and mistyped commands need not wait for."""
 
 
 def __getattr__(name: str) -> Any:
     if name == "__version__":
         return version("cprl")
-    if name in _IMPORTED_WHEN_USED:
-        return getattr(import_module(_IMPORTED_WHEN_USED[name]), name)
-    raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    if name not in __all__:
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    if name in _MODULES:
+        return getattr(import_module(_MODULES[name]), name)
+    return import_module(f"cprl.{name}")
 
 
 def __dir__() -> list[str]:
     return list(__all__)
+
+
+def _register() -> None:
+    """Registers the boards for one agent with `gymnasium.make`, which imports them when it makes one."""
+    gymnasium.register("cprl/Commons-v0", entry_point="cprl.envs.gymnasium_env:CommonsGymnasiumEnv")
+    for name, board in (("SingleBasic", "single_basic"), ("SingleComplex", "single_complex")):
+        gymnasium.register(
+            f"cprl/{name}-v0", entry_point="cprl.presets:gymnasium_env", kwargs={"board": board}
+        )
+
+
+_register()

@@ -13,32 +13,24 @@ from typing import Final
 
 import tyro
 
+from cprl.arguments import PLAY_SEED, SEED
+from cprl.command_parts import check_runs
 from cprl.commandline import TAKES_NOTHING_OVER, Allow, ended_by_sigterm, in_a_sentence, make_importable
 from cprl.docs_cli import docs
 from cprl.egta_cli import egta
-from cprl.evaluation.evaluate import SEED
 from cprl.evaluation_cli import crossplay, evaluate, film, schelling, visits
-from cprl.experiment import Experiment
 from cprl.exploit_cli import exploit
 from cprl.output import keep_output, printed, say
-from cprl.play.opening import SEED as PLAY_SEED
-from cprl.play.opening import open_session
-from cprl.play.terminal import play_in_terminal
-from cprl.play.window import NoWindowError, play_in_window
-from cprl.play.wording import ending, results_text, state
-from cprl.presets import Variant
+from cprl.presets import Variant, check_board
 from cprl.process import prepare_process
 from cprl.recipes_cli import recipe as print_recipe
 from cprl.recipes_cli import refuse_unknown, run_by_name
-from cprl.reporting import write_report
-from cprl.running import run as run_experiment
 from cprl.runs.directory import read_recipe
-from cprl.runs.export import export_results
 from cprl.scenarios_cli import scenarios
-from cprl.studies.tables.table_command import runs_table
-from cprl.studies_cli import sweep
+from cprl.studies_cli import runs_table, sweep
 from cprl.viewer.page import Page, has_display
-from cprl.viewer.streams import to_watch, viewer
+
+# Commands import what they need once their words are checked: torch takes seconds, which a mistake need not.
 
 
 def run(
@@ -74,8 +66,12 @@ def run(
     if take_over and not resume:
         raise ValueError(TAKES_NOTHING_OVER)
     make_importable(allow)
-    directory = recipe if recipe.is_dir() else recipe.parent
-    experiment = Experiment.from_recipe(read_recipe(recipe), allow=allow, directory=directory)
+    directory, kept = recipe if recipe.is_dir() else recipe.parent, read_recipe(recipe)
+
+    from cprl.experiment import Experiment
+    from cprl.running import run as run_experiment
+
+    experiment = Experiment.from_recipe(kept, allow=allow, directory=directory)
     if resume and out is None:
         out = directory
     if episodes is not None:
@@ -109,6 +105,10 @@ def report(
     if not runs:
         raise ValueError("cprl report wants at least one run: cprl report RUN...")
     make_importable(allow)
+    check_runs(*runs)
+
+    from cprl.reporting import write_report
+
     prepare_process(SEED)
     say(write_report(runs, out, pool=pool, allow=allow))
 
@@ -145,6 +145,13 @@ def play(
         allow: code of your own, module:Class, that a run may import; see docs/experiments.md.
     """
     make_importable(allow)
+    check_board(board)
+
+    from cprl.play.opening import open_session
+    from cprl.play.terminal import play_in_terminal
+    from cprl.play.window import NoWindowError, play_in_window
+    from cprl.play.wording import ending, results_text, state
+
     prepare_process(seed)
     session = open_session(
         board,
@@ -184,6 +191,9 @@ def watch(run: Path, /, *, serve: bool = False) -> None:
     if serve or not has_display():
         _serve(files, why="" if serve else "There is no display: ")
         return
+
+    from cprl.viewer.streams import to_watch
+
     command = to_watch(*files)
     if sys.platform == "win32":  # where execvp ends this process at once, and quotes nothing
         sys.exit(subprocess.call(command))
@@ -192,6 +202,8 @@ def watch(run: Path, /, *, serve: bool = False) -> None:
 
 def _serve(files: Sequence[Path], *, why: str) -> None:
     """Serves recordings and the web viewer until Ctrl-C."""
+    from cprl.viewer.streams import viewer
+
     page = Page(files)
     say(f"Watch (browser): {page.address()}")
     say(f"Watch (native): {printed([viewer(), *page.recordings])}")
@@ -210,6 +222,10 @@ def export(run: Path, folder: Path, /, *, weights: bool = True) -> None:
         weights: also the trained weights. Without them a report tells of the training alone, and nothing can
             play the agents.
     """
+    check_runs(run)
+
+    from cprl.runs.export import export_results
+
     say(export_results(run, folder, weights=weights))
 
 

@@ -6,11 +6,11 @@ from pathlib import Path
 from rich.table import Table
 
 from cprl.output import OUT, console, say
-from cprl.plotting.style import check_picture
-from cprl.runs.labelled import refuse_to_write_over
+from cprl.runs.directory import read_recipe
+from cprl.runs.files import refuse_to_write_over
 
 
-def check_files(out: Path | None, figure: Path | None) -> None:
+def check_files(out: Path | None = None, figure: Path | None = None) -> None:
     """Checks what `--out` and `--figure` name before hours of work.
 
     Raises:
@@ -20,7 +20,19 @@ def check_files(out: Path | None, figure: Path | None) -> None:
     if out is not None:
         refuse_to_write_over(out)
     if figure is not None:
+        from cprl.plotting.style import check_picture
+
         check_picture(figure, "--figure")
+
+
+def check_runs(*runs: Path | str) -> None:
+    """Checks that runs are there, before what plays their agents is imported, which takes seconds.
+
+    Raises:
+        ValueError: for a path that is no run.
+    """
+    for run in runs:
+        read_recipe(Path(run))
 
 
 def tell_files(out: Path | None, figure: Path | None, draw: Callable[[Path], Path]) -> None:

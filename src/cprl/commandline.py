@@ -14,17 +14,17 @@ from dataclasses import dataclass
 from pathlib import Path
 from threading import current_thread, main_thread
 from types import FrameType
-from typing import Annotated, Any, Final, TypeVar
+from typing import TYPE_CHECKING, Annotated, Any, Final, TypeVar
 
 import tyro
 
 from cprl.arguments import callable_of, texts
 from cprl.checks import checked, instance
-from cprl.experiment import Experiment
-from cprl.finite import NotFiniteError
-from cprl.flags import applied, flags_of
 from cprl.output import RESUMES, say
 from cprl.shipped import program_of
+
+if TYPE_CHECKING:
+    from cprl.experiment import Experiment
 
 OptionsT = TypeVar("OptionsT")
 Allow = tyro.conf.UseAppendAction[tuple[str, ...]]
@@ -72,7 +72,7 @@ class RunOptions:
 
 
 def recipe_main(
-    make_experiment: Callable[..., Experiment],
+    make_experiment: "Callable[..., Experiment]",
     argv: Sequence[str] | None = None,
     *,
     at_end: Callable[[Path], object] | None = None,
@@ -120,8 +120,11 @@ def in_a_sentence(program: str) -> Iterator[None]:
         sys.exit(130 if isinstance(error, KeyboardInterrupt) else error.code)
     except (ValueError, OSError, MemoryError, ModuleNotFoundError) as error:
         notes = getattr(error, "__notes__", [])
-        if notes and not isinstance(error, OSError | MemoryError | NotFiniteError):
-            raise
+        if notes and not isinstance(error, OSError | MemoryError):
+            from cprl.finite import NotFiniteError  # which the training that has begun has imported
+
+            if not isinstance(error, NotFiniteError):
+                raise
         if isinstance(error, BrokenPipeError) and not notes:  # `--help | head`: its reader has seen enough
             sys.exit(0)
         sys.exit("\n".join([_shortened(f"{program}: {error}"), *notes]))
@@ -150,8 +153,8 @@ def _shortened(text: str) -> str:
 
 
 def parse(
-    make_experiment: Callable[..., Experiment], command: Sequence[str]
-) -> tuple[Experiment, RunOptions]:
+    make_experiment: "Callable[..., Experiment]", command: Sequence[str]
+) -> "tuple[Experiment, RunOptions]":
     """The experiment that a command line, script first, asks for, and how it is to be run.
 
     Raises:
@@ -163,13 +166,13 @@ def parse(
 
 
 def parse_with(
-    make_experiment: Callable[..., Experiment],
+    make_experiment: "Callable[..., Experiment]",
     words: Sequence[str],
     options: OptionsT,
     *,
     program: str,
     note: str = "",
-) -> tuple[Experiment, OptionsT]:
+) -> "tuple[Experiment, OptionsT]":
     """Like `parse`, with options of another kind.
 
     Args:
@@ -179,6 +182,9 @@ def parse_with(
         program: what stands before these words, for messages.
         note: what `--help` says after the recipe's own text.
     """
+    from cprl.experiment import Experiment
+    from cprl.flags import applied, flags_of
+
     callable_of("make_experiment", make_experiment, "a function that gives an Experiment")
     given = _in_todays_words(words)
     _check_names(make_experiment, options)
@@ -217,7 +223,9 @@ def _in_todays_words(given: Sequence[str]) -> list[str]:
     return words
 
 
-def _check_names(make_experiment: Callable[..., Experiment], options: Any) -> None:
+def _check_names(make_experiment: "Callable[..., Experiment]", options: Any) -> None:
+    from cprl.experiment import Experiment
+
     taken = {
         *Experiment.__dataclass_fields__,
         *RunOptions.__dataclass_fields__,
@@ -232,7 +240,7 @@ def _check_names(make_experiment: Callable[..., Experiment], options: Any) -> No
             )
 
 
-def _description(make_experiment: Callable[..., Experiment], note: str) -> str:
+def _description(make_experiment: "Callable[..., Experiment]", note: str) -> str:
     text = (inspect.getdoc(make_experiment) or "").partition("\nArgs:")[0].strip()
     return "\n\n".join(filter(None, [text, note, " ".join(_NOTE.split())]))
 

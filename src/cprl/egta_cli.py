@@ -3,19 +3,11 @@
 from math import inf
 from pathlib import Path
 
-from cprl.command_parts import check_files, print_tables, runs_by_name, tell_files
+from cprl.arguments import EGTA_RESAMPLES, SEED
+from cprl.command_parts import check_files, check_runs, print_tables, runs_by_name, tell_files
 from cprl.commandline import Allow, make_importable
-from cprl.evaluation.cross_play import crossplay
-from cprl.evaluation.egta import RESAMPLES, analyse
-from cprl.evaluation.egta_picture import draw_egta
-from cprl.evaluation.egta_tables import egta_heading, egta_tables
-from cprl.evaluation.empirical_game import pairwise_game, play_empirical_game
-from cprl.evaluation.evaluate import SEED
 from cprl.output import say
 from cprl.process import prepare_process
-from cprl.runs.labelled import write_table
-from cprl.theory.evolution import check_alpha
-from cprl.theory.extras import check_extras
 
 
 def egta(
@@ -25,7 +17,7 @@ def egta(
     episodes: int = 5,
     pairwise: bool = False,
     alpha: float = inf,
-    resamples: int = RESAMPLES,
+    resamples: int = EGTA_RESAMPLES,
     greedy: bool = False,
     seed: int = SEED,
     replicas: tuple[int, ...] = (),
@@ -50,12 +42,23 @@ def egta(
         figure: a PNG to be: the dynamics, and the shares by alpha-rank.
         allow: code of your own, module:Class, that the run may import; see docs/experiments.md.
     """
-    check_extras()
-    check_alpha(alpha)
     make_importable(allow)
     check_files(out, figure)
-    prepare_process(seed)
     named, chosen = runs_by_name(runs), list(replicas)
+    check_runs(*(named.values() if isinstance(named, dict) else named))
+
+    from cprl.evaluation.cross_play import crossplay
+    from cprl.evaluation.egta import analyse
+    from cprl.evaluation.egta_picture import draw_egta
+    from cprl.evaluation.egta_tables import egta_heading, egta_tables
+    from cprl.evaluation.empirical_game import pairwise_game, play_empirical_game
+    from cprl.runs.labelled import write_table
+    from cprl.theory.evolution import check_alpha
+    from cprl.theory.extras import check_extras
+
+    check_extras()
+    check_alpha(alpha)
+    prepare_process(seed)
     if pairwise:
         game = pairwise_game(
             crossplay(named, episodes=episodes, greedy=greedy, seed=seed, replicas=chosen, allow=allow)

@@ -3,35 +3,12 @@
 from pathlib import Path
 from typing import Any
 
-from cprl.command_parts import check_files, print_tables, runs_by_name, tell_files
+from cprl.arguments import FILM_SEED, FILM_SUFFIXES, SEED, Diagonal
+from cprl.command_parts import check_files, check_runs, print_tables, runs_by_name, tell_files
 from cprl.commandline import Allow, make_importable
-from cprl.evaluation.cross_play import Diagonal
-from cprl.evaluation.cross_play import crossplay as play_each_other
-from cprl.evaluation.evaluate import SEED, evaluate_run
-from cprl.evaluation.film import SEED as FILM_SEED
-from cprl.evaluation.film import film as film_run
-from cprl.evaluation.film_video import SUFFIXES, film_video
-from cprl.evaluation.gains_picture import draw_gains
-from cprl.evaluation.schelling import schelling as play_all_mixes
-from cprl.evaluation.schelling_picture import draw_schelling
-from cprl.evaluation.tables import (
-    agents_table,
-    gains_tables,
-    heading,
-    matrices,
-    run_table,
-    schelling_tables,
-    territory_table,
-)
-from cprl.evaluation.territory import territory_of
-from cprl.evaluation.visits_picture import draw_visits
-from cprl.evaluation.words import board_named
 from cprl.output import printed, say
-from cprl.plotting.style import check_picture
-from cprl.presets import Variant
+from cprl.presets import Variant, check_board
 from cprl.process import prepare_process
-from cprl.runs.labelled import refuse_to_write_over, write_table
-from cprl.viewer.streams import to_watch
 
 
 def film(
@@ -73,12 +50,18 @@ def film(
     """
     flags: dict[str, Any] = {"beside": beside, "titles": titles, "every": every, "fps": fps, "width": width}
     given = {name: value for name, value in flags.items() if value not in (None, ())}
-    if out is not None and out.suffix not in (".rrd", *SUFFIXES):
-        raise ValueError(f"--out is {out}; allowed: a name that ends in .rrd, {', '.join(SUFFIXES)}")
-    is_video = out is not None and out.suffix in SUFFIXES
+    if out is not None and out.suffix not in (".rrd", *FILM_SUFFIXES):
+        raise ValueError(f"--out is {out}; allowed: a name that ends in .rrd, {', '.join(FILM_SUFFIXES)}")
+    is_video = out is not None and out.suffix in FILM_SUFFIXES
     if given and not is_video:
         raise ValueError(f"--{next(iter(given))} is for films; allowed: with --out FILE.gif or FILE.mp4")
     make_importable(allow)
+    check_runs(run, *beside)
+
+    from cprl.evaluation.film import film as film_run
+    from cprl.evaluation.film_video import film_video
+    from cprl.viewer.streams import to_watch
+
     prepare_process(seed)
     which: dict[str, Any] = {"replica": replica, "episode": episode, "seed": seed, "allow": allow}
     if out is not None and is_video:
@@ -115,8 +98,13 @@ def evaluate(
         allow: code of your own, module:Class, that the run may import; see docs/experiments.md.
     """
     make_importable(allow)
-    if out is not None:
-        refuse_to_write_over(out)
+    check_files(out)
+    check_runs(run)
+
+    from cprl.evaluation.evaluate import evaluate_run
+    from cprl.evaluation.tables import run_table
+    from cprl.runs.labelled import write_table
+
     prepare_process(seed)
     evaluation = evaluate_run(
         run, episodes=episodes, greedy=greedy, seed=seed, replicas=replicas, allow=allow
@@ -154,10 +142,15 @@ def visits(
         allow: code of your own, module:Class, that the run may import; see docs/experiments.md.
     """
     make_importable(allow)
-    if figure is not None:
-        check_picture(figure, "--figure")
-    elif random:
+    if random and figure is None:
         raise ValueError("--random says who is drawn; allowed: with --figure FILE.png")
+    check_files(figure=figure)
+    check_runs(run)
+
+    from cprl.evaluation.tables import territory_table
+    from cprl.evaluation.territory import territory_of
+    from cprl.evaluation.visits_picture import draw_visits
+
     prepare_process(seed)
     found = territory_of(run, episodes=episodes, greedy=greedy, seed=seed, replicas=replicas, allow=allow)
     print_tables(territory_table(found))
@@ -195,9 +188,17 @@ def crossplay(
     """
     make_importable(allow)
     check_files(out, figure)
+    named = runs_by_name(runs)
+    check_runs(*(named.values() if isinstance(named, dict) else named))
+
+    from cprl.evaluation.cross_play import crossplay as play_each_other
+    from cprl.evaluation.gains_picture import draw_gains
+    from cprl.evaluation.tables import agents_table, gains_tables, heading, matrices
+    from cprl.runs.labelled import write_table
+
     prepare_process(seed)
     played = play_each_other(
-        runs_by_name(runs),
+        named,
         episodes=episodes,
         greedy=greedy,
         seed=seed,
@@ -245,6 +246,14 @@ def schelling(
     """
     make_importable(allow)
     check_files(out, figure)
+    check_board(board)
+
+    from cprl.evaluation.schelling import schelling as play_all_mixes
+    from cprl.evaluation.schelling_picture import draw_schelling
+    from cprl.evaluation.tables import schelling_tables
+    from cprl.evaluation.words import board_named
+    from cprl.runs.labelled import write_table
+
     prepare_process(seed)
     game, run = board_named(board, variant, allow=allow)
     found = play_all_mixes(

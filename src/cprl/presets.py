@@ -5,14 +5,17 @@ its appendix A, and the parameters and behaviour of the study's program.
 """
 
 from dataclasses import replace
-from typing import Any, Final, Literal, get_args
+from typing import TYPE_CHECKING, Any, Final, Literal, get_args
 
+from cprl.arguments import path, refusal
 from cprl.checks import checked, one_of
 from cprl.commons import maps
 from cprl.commons.game import Game
 from cprl.commons.rules import Rules
-from cprl.envs.gymnasium_env import CommonsGymnasiumEnv
-from cprl.learners.settings import DQNSettings
+
+if TYPE_CHECKING:
+    from cprl.envs.gymnasium_env import CommonsGymnasiumEnv
+    from cprl.learners.settings import DQNSettings
 
 Board = Literal["single_basic", "single_complex", "two_complex", "commons"]
 Variant = Literal["published", "as_run", "as_run_10_april"]
@@ -56,6 +59,16 @@ GAMES: Final[tuple[tuple[Board, Variant], ...]] = tuple(_BOARD_RULES)
 """Every board with each of its variants."""
 
 
+def check_board(board: object) -> None:
+    """Refuse a word that names neither a published board nor a run's directory nor a file.
+
+    Raises:
+        ValueError: Names the boards.
+    """
+    if board not in BOARDS and not path("board", board).exists():
+        raise refusal("board", board, f"{', '.join(BOARDS)}, a run's directory, or a file with a drawing")
+
+
 def game(board: Board, *, variant: Variant = "published") -> Game:
     """A published board with its rules, in one of `VARIANTS`.
 
@@ -69,16 +82,18 @@ def game(board: Board, *, variant: Variant = "published") -> Game:
 
 def gymnasium_env(
     board: Board, *, variant: Variant = "published", seed: int | None = None, render_mode: str | None = None
-) -> CommonsGymnasiumEnv:
+) -> "CommonsGymnasiumEnv":
     """A published board for one agent as a Gymnasium environment, for `gymnasium.make`.
 
     Raises:
         ValueError: if the board or variant is unknown, or the board has several agents.
     """
+    from cprl.envs.gymnasium_env import CommonsGymnasiumEnv
+
     return CommonsGymnasiumEnv(game(board, variant=variant), seed=seed, render_mode=render_mode)
 
 
-def dqn_settings(board: Board, *, variant: Variant = "published") -> DQNSettings:
+def dqn_settings(board: Board, *, variant: Variant = "published") -> "DQNSettings":
     """The hyperparameters of the DQN agents on a board.
 
     The text gives the decay of epsilon on `commons` as 1,000,000 steps; versions of the program have
@@ -89,6 +104,8 @@ def dqn_settings(board: Board, *, variant: Variant = "published") -> DQNSettings
     Raises:
         ValueError: if the board or variant is unknown, or the board has no such variant.
     """
+    from cprl.learners.settings import DQNSettings
+
     _check(board, variant)
     as_run = variant != "published"
     return DQNSettings(

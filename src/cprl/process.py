@@ -10,8 +10,6 @@ from functools import cache
 from pathlib import Path
 from typing import Final
 
-import torch
-
 from cprl.caches import cache_folder
 from cprl.checks import MOST_SEED, checked, count
 from cprl.output import OUT, keep_output
@@ -38,6 +36,8 @@ def prepare_process(seed: int) -> None:
         ValueError: for a seed that is no integer from 0 to 2**64 - 1.
     """
     checked("seed", seed, count(0, MOST_SEED))
+    import torch
+
     keep_output()
     torch.manual_seed(seed)
     torch.set_num_threads(1)

@@ -2,14 +2,11 @@
 
 from pathlib import Path
 
-from cprl.command_parts import check_files, print_tables, tell_files
+from cprl.arguments import SEED
+from cprl.command_parts import check_files, check_runs, print_tables, tell_files
 from cprl.commandline import Allow, make_importable
-from cprl.evaluation.evaluate import SEED
-from cprl.evaluation.scenarios import draw_scenarios, run_scenarios
-from cprl.evaluation.scenarios.tables import heading, scenario_tables
 from cprl.output import say
 from cprl.process import prepare_process
-from cprl.runs.labelled import write_table
 
 
 def scenarios(
@@ -41,6 +38,12 @@ def scenarios(
     """
     make_importable(allow)
     check_files(out, figure)
+    check_runs(run)
+
+    from cprl.evaluation.scenarios import draw_scenarios, run_scenarios
+    from cprl.evaluation.scenarios.tables import heading, scenario_tables
+    from cprl.runs.labelled import write_table
+
     prepare_process(seed)
     scores = run_scenarios(
         run,

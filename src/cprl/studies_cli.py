@@ -1,4 +1,4 @@
-"""`cprl sweep`, and `study_main`: the command line of a recipe that describes a study."""
+"""`cprl sweep` and `cprl table`, and `study_main`: the command line of a recipe that describes a study."""
 
 import importlib.util
 import inspect
@@ -8,21 +8,22 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, fields, replace
 from itertools import pairwise
 from pathlib import Path
-from typing import Annotated, Any, Final, Literal
+from typing import TYPE_CHECKING, Annotated, Any, Final, Literal
 
 import tyro
 
-from cprl.arguments import object_of, texts
+from cprl.arguments import BLOCK, LAST, WINDOW, Interval, object_of, texts
 from cprl.commandline import in_a_sentence, parse_with
-from cprl.experiment import Experiment
-from cprl.output import keep_output, printed
-from cprl.runs.directory import read_recipe
+from cprl.output import OUT, console, keep_output, printed, say
+from cprl.runs.directory import read_recipe, runs_in
+from cprl.runs.files import refuse_to_write_over, write_atomically
 from cprl.shipped import is_shipped, program_of, recipe_named
-from cprl.studies.factors import Distribution
-from cprl.studies.points import Search
-from cprl.studies.study import BLOCK, Study
-from cprl.studies.words import factors_of
 from cprl.studies_options import StudyOptions, carry_out
+
+if TYPE_CHECKING:
+    from cprl.experiment import Experiment
+    from cprl.studies import Search, Study, StudyTable
+    from cprl.studies.tables.texts import Cells
 
 PROGRAM: Final = "cprl sweep"
 _RECIPE: Final = (
@@ -30,6 +31,9 @@ _RECIPE: Final = (
     "recipe.json, or the directory of a run."
 )
 _MODULE: Final = "cprl_swept_recipe"
+_TRAINING: Final = "training"
+_TABLE_SUFFIXES: Final = (".parquet", ".md")
+Part = Literal["training", "evaluation", "random"]
 _NOTE: Final = (
     "cprl sweep runs a recipe under several conditions. With --vary PATH=VALUES any value below is varied: "
     'commas stand between values, "x" or spaces between the numbers of one value (hidden-cells=32x32,64x64). '
@@ -80,7 +84,7 @@ class MainOptions(StudyOptions):
     """Replicas that one run trains side by side; with fewer, more processes share the work."""
 
 
-def study_main(study: Study, argv: Sequence[str] | None = None) -> Path:
+def study_main(study: "Study", argv: Sequence[str] | None = None) -> Path:
     """Runs a study as the command line asks for it; a recipe of a study ends with it.
 
     Args:
@@ -95,6 +99,8 @@ def study_main(study: Study, argv: Sequence[str] | None = None) -> Path:
         SystemExit: where the command line is refused, with the reason; with code 1 where trials failed, and
             130 or 143 where SIGINT (Ctrl-C) or SIGTERM interrupted it.
     """
+    from cprl.studies import Study
+
     object_of("study", study, Study, "a Study")
     command = list(texts("argv", sys.argv if argv is None else argv, 1))
     keep_output()
@@ -113,7 +119,7 @@ def study_main(study: Study, argv: Sequence[str] | None = None) -> Path:
         return carry_out(wanted, options, command)
 
 
-def _of_episodes(study: Study, episodes: int) -> Study:
+def _of_episodes(study: "Study", episodes: int) -> "Study":
     """A study with other episodes than its own.
 
     Raises:
@@ -155,8 +161,10 @@ def sweep(words: Sequence[str], /) -> None:
     carry_out(wanted(experiment, options), options, ["cprl", "sweep", *words])
 
 
-def _refuse_arguments(vary: Sequence[str], make_experiment: Callable[..., Experiment]) -> None:
+def _refuse_arguments(vary: Sequence[str], make_experiment: "Callable[..., Experiment]") -> None:
     """Raises a ValueError where an argument of the recipe is varied, and no field of the experiment."""
+    from cprl.experiment import Experiment
+
     own = {*inspect.signature(make_experiment).parameters} - {field.name for field in fields(Experiment)}
     for word in vary:
         name = word.partition("=")[0].replace("-", "_")
@@ -167,12 +175,16 @@ def _refuse_arguments(vary: Sequence[str], make_experiment: Callable[..., Experi
             )
 
 
-def wanted(experiment: Experiment, options: SweepOptions) -> Study | Search:
+def wanted(experiment: "Experiment", options: SweepOptions) -> "Study | Search":
     """The study or search that a sweep is.
 
     Raises:
         ValueError: for options that contradict each other, and for whatever the study refuses.
     """
+    from cprl.studies import Search, Study
+    from cprl.studies.factors import Distribution
+    from cprl.studies.words import factors_of
+
     if not options.vary:
         raise ValueError("nothing is varied; allowed: --vary PATH=VALUE,VALUE..., at least once")
     factors = factors_of(experiment, options.vary)
@@ -214,7 +226,7 @@ def _print_help() -> None:
     tyro.cli(read, args=["--help"], prog=PROGRAM, description=about, config=_CONFIG)
 
 
-def recipe_of(source: Path, allow: Sequence[str] = ()) -> Callable[..., Experiment]:
+def recipe_of(source: Path, allow: Sequence[str] = ()) -> "Callable[..., Experiment]":
     """What makes the experiment of a recipe.
 
     Args:
@@ -226,8 +238,11 @@ def recipe_of(source: Path, allow: Sequence[str] = ()) -> Callable[..., Experime
         ValueError: where it is none of them.
     """
     if source.suffix != ".py" or source.is_dir():
-        directory = source if source.is_dir() else source.parent
-        stored = Experiment.from_recipe(read_recipe(source), allow=allow, directory=directory)
+        directory, kept = source if source.is_dir() else source.parent, read_recipe(source)
+
+        from cprl.experiment import Experiment
+
+        stored = Experiment.from_recipe(kept, allow=allow, directory=directory)
 
         def experiment() -> Experiment:
             return stored
@@ -249,7 +264,94 @@ def recipe_of(source: Path, allow: Sequence[str] = ()) -> Callable[..., Experime
     return made
 
 
-def _about(study: Study) -> str:
+def runs_table(
+    runs: tuple[Path, ...],
+    /,
+    *,
+    by: tyro.conf.UseAppendAction[tuple[str, ...]],
+    metric: tyro.conf.UseAppendAction[tuple[str, ...]] = (),
+    part: Part = _TRAINING,
+    last: int | None = None,
+    interval: Interval = "t",
+    reference: str | None = None,
+    window: int = WINDOW,
+    out: Path | None = None,
+    allow: tyro.conf.UseAppendAction[tuple[str, ...]] = (),
+) -> None:
+    """Compares any runs, grouped by fields of their experiments, with intervals over replicas.
+
+    Args:
+        runs: directories of runs, or of directories that hold them.
+        by: the path of a field, e.g. game.rules.freeze-steps, agents.*.algorithm.settings.gamma or name; may
+            be repeated.
+        metric: what is compared, e.g. collective_return; may be repeated.
+        part: of the runs: their training, their agents in fresh worlds, or random play in these.
+        last: episodes at the end of the training that are compared, by default 30.
+        interval: "t", by Student's t, or "bca", by bootstrap of the replicas.
+        reference: the name of the condition that others are compared with, e.g. freeze_steps=25; by default
+            the first.
+        window: episodes of a row of the table, of which --last compares whole ones and --out FILE.parquet
+            writes all; 1 for episodes one by one.
+        out: a file to be: .parquet with every window of episodes, replica and metric, or .md with what is
+            printed.
+        allow: code of your own, module:Class, that a run's recipe may name; may be repeated.
+    """
+    if out is not None:
+        if out.suffix not in _TABLE_SUFFIXES:
+            raise ValueError(f"--out is {out}; allowed: a name that ends in {' or '.join(_TABLE_SUFFIXES)}")
+        refuse_to_write_over(out)
+    if last is not None and part != _TRAINING:
+        raise ValueError(f"--last counts episodes of the training; allowed: without --part {part}")
+    if not runs:
+        raise ValueError("cprl table wants at least one run: cprl table RUN... --by FIELD")
+    if not by:
+        raise ValueError(
+            "cprl table wants a field that tells runs apart: cprl table RUN... --by game.rules.freeze-steps"
+        )
+    runs_in(runs)
+
+    from cprl.studies.tables.pooled import pooled_table
+    from cprl.studies.tables.texts import rich_table
+
+    found = pooled_table(runs, by=by, window=window, reference=reference, allow=allow)
+    compared = _compared(found, metric, part, LAST if last is None else last, interval)
+    shown = console(width=None if OUT.isatty() else 250)
+    for own in compared:
+        shown.print(rich_table(own))
+    say(str(found))
+    if out is not None:
+        _write(found, compared, out)
+        say(f"Written: {out}")
+
+
+def _compared(
+    found: "StudyTable", metrics: Sequence[str], part: Part, last: int, interval: Interval
+) -> "list[Cells]":
+    """Levels, and differences where there is more than one condition."""
+    from cprl.studies.tables.comparing import compare, metrics_of
+    from cprl.studies.tables.texts import cells
+
+    chosen = metrics_of(found, metrics)
+    if not chosen:
+        return []
+    every = [compare(found, own, part=part, last=last, interval=interval) for own in chosen]
+    several = len(found.design.conditions) > 1
+    return [cells(every), cells(every, "differences")] if several else [cells(every)]
+
+
+def _write(found: "StudyTable", compared: "Sequence[Cells]", out: Path) -> None:
+    if out.suffix == ".parquet":
+        found.write(out)
+        return
+    from cprl.studies.tables.texts import markdown
+
+    lines = [line for own in compared for line in (own.heading, "", *markdown(own))]
+    content = "\n".join([*lines, *str(found).split("\n"), ""]).encode()
+    out.parent.mkdir(parents=True, exist_ok=True)
+    write_atomically(out, lambda file: file.write(content))
+
+
+def _about(study: "Study") -> str:
     parts = [study.question, f"Expected: {study.expectation}" if study.expectation else ""]
     names = ", ".join(own.name for own in study.all_conditions[:_LISTED])
     more = f" and {len(study.all_conditions) - _LISTED} more" if study.all_conditions[_LISTED:] else ""

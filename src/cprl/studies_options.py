@@ -7,27 +7,20 @@ from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Final, Literal
+from typing import TYPE_CHECKING, Any, Final, Literal
 
 import tyro
 
-from cprl.arguments import integer
+from cprl.arguments import LAST, Interval, integer
 from cprl.commandline import ended_by_sigterm
-from cprl.measuring.statistics import Interval
 from cprl.output import RESUMES, console, printed, say
 from cprl.runs.directory import without_directories, without_options
 from cprl.shipped import command_of, named_command
-from cprl.studies.directory import RUNS, STATUS, directory_of
-from cprl.studies.execution import StudyResult, run_study, trials_with
-from cprl.studies.executors import Executor, InProcess, Processes, Ray
-from cprl.studies.overview import Overview, label_of
-from cprl.studies.points import Search
-from cprl.studies.progress import table_of
-from cprl.studies.search import SearchResult, run_search
-from cprl.studies.status import BEAT_S, Status
-from cprl.studies.study import Study
-from cprl.studies.tables.comparing import LAST
-from cprl.studies.trials import Outcome, Trial, trials_of
+
+if TYPE_CHECKING:
+    from cprl.studies import Search, SearchResult, Study, StudyResult
+    from cprl.studies.executors import Executor
+    from cprl.studies.trials import Outcome, Trial
 
 _BEST: Final = 10
 """Points of a search that are printed."""
@@ -71,12 +64,14 @@ class StudyOptions:
     """A class of somebody's own that stored runs may import, "module:Class"; may be repeated."""
 
 
-def executor_of(options: StudyOptions) -> Executor:
+def executor_of(options: StudyOptions) -> "Executor":
     """Where trials are run.
 
     Raises:
         ValueError: for options that contradict each other.
     """
+    from cprl.studies.executors import InProcess, Processes, Ray
+
     jobs, on = options.jobs, options.on
     if jobs is not None:
         integer("--jobs", jobs, 1, 4096)
@@ -93,7 +88,7 @@ def executor_of(options: StudyOptions) -> Executor:
     return Processes(jobs or cores)
 
 
-def carry_out(what: Study | Search, options: StudyOptions, command: Sequence[str]) -> Path:
+def carry_out(what: "Study | Search", options: StudyOptions, command: Sequence[str]) -> Path:
     """Runs a study or a search as the command line asks for it, and says what came of it.
 
     Args:
@@ -108,6 +103,8 @@ def carry_out(what: Study | Search, options: StudyOptions, command: Sequence[str
         ValueError: for whatever does not fit, before anything is written.
         SystemExit: with code 1 where trials have failed, and 130 or 143 where it was interrupted.
     """
+    from cprl.studies import Search, run_search, run_study
+
     executor, again = executor_of(options), printed(command_of(command))
     if isinstance(what, Search):
         for flag, value in {"--only": options.only, "--keep-checkpoints": options.keep_checkpoints}.items():
@@ -137,8 +134,16 @@ def carry_out(what: Study | Search, options: StudyOptions, command: Sequence[str
     return result.out
 
 
-def _list(what: Study | Search, options: StudyOptions) -> Path:
+def _list(what: "Study | Search", options: StudyOptions) -> Path:
     """Prints all trials and their states."""
+    from cprl.studies import Search, Study
+    from cprl.studies.directory import RUNS, STATUS, directory_of
+    from cprl.studies.execution import trials_with
+    from cprl.studies.overview import Overview
+    from cprl.studies.progress import table_of
+    from cprl.studies.status import BEAT_S
+    from cprl.studies.trials import trials_of
+
     study = Study(what.experiment, name=what.name) if isinstance(what, Search) else what
     out = directory_of(study, options.out)
     if isinstance(what, Search):
@@ -161,7 +166,7 @@ def _list(what: Study | Search, options: StudyOptions) -> Path:
     return out
 
 
-def _say_best(result: SearchResult) -> None:
+def _say_best(result: "SearchResult") -> None:
     search = result.search
     words = {"maximise": "highest", "minimise": "lowest"}[search.direction]
     say(f"{search.name}: {len(result.points)} points; the {words} {search.metric}, means over replicas:")
@@ -172,8 +177,12 @@ def _say_best(result: SearchResult) -> None:
         say(f"  {len(refused)} points were refused, e.g. {refused[0].name}: {refused[0].reason}")
 
 
-def _say_failed(result: StudyResult | SearchResult, again: str) -> None:
+def _say_failed(result: "StudyResult | SearchResult", again: str) -> None:
     """Lists the trials that failed, where to look, and what to do."""
+    from cprl.studies.directory import STATUS
+    from cprl.studies.overview import label_of
+    from cprl.studies.status import Status
+
     trials: dict[str, Trial] = {trial.name: trial for trial in result.trials}
     outcomes: dict[str, Outcome] = {own.name: own for own in result.failed}
     lines = [f"{len(outcomes)} of {len(trials)} trials failed; the others are kept:"]

@@ -26,7 +26,12 @@ from .child import Life, live
 DEADLINE_S: Final = 180.0
 """The longest that a process may take; one that takes longer hangs."""
 
-_PRELOADED: Final = ("cprl.cli", "torch._inductor.compile_fx", "matplotlib.backends.backend_agg")
+_PRELOADED: Final = (
+    "cprl.running",
+    "cprl.studies",
+    "torch._inductor.compile_fx",
+    "matplotlib.backends.backend_agg",
+)
 _QUIET: Final = {"OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1", "TORCHINDUCTOR_COMPILE_THREADS": "1"}
 """No thread is running when a process is forked."""
 

@@ -17,7 +17,7 @@ Modules, in the order in which one reads them:
 """
 
 from cprl.envs.commons_env import CommonsEnv
-from cprl.envs.gymnasium_env import CommonsGymnasiumEnv, register
+from cprl.envs.gymnasium_env import CommonsGymnasiumEnv
 from cprl.envs.make_env import make_env, spaces_of
 from cprl.envs.pettingzoo_env import CommonsParallelEnv, env, parallel_env
 
@@ -30,5 +30,3 @@ __all__ = [
     "parallel_env",
     "spaces_of",
 ]
-
-register()

@@ -76,12 +76,3 @@ class CommonsGymnasiumEnv(gymnasium.Env[Any, Any]):
     def close(self) -> None:
         """Closes the window, if it is open."""
         self.world.close()
-
-
-def register() -> None:
-    """Registers the boards with `gymnasium.make`; `cprl.envs` calls it on import."""
-    gymnasium.register("cprl/Commons-v0", entry_point=f"{__name__}:{CommonsGymnasiumEnv.__name__}")
-    for name, board in (("SingleBasic", "single_basic"), ("SingleComplex", "single_complex")):
-        gymnasium.register(
-            f"cprl/{name}-v0", entry_point="cprl.presets:gymnasium_env", kwargs={"board": board}
-        )

@@ -22,14 +22,13 @@ import numpy as np
 import pyarrow as pa
 
 from cprl import arguments
+from cprl.arguments import Diagonal
 from cprl.evaluation.evaluate import SEED, check, chosen_replicas, opened
 from cprl.evaluation.lanes import Played, Source, play, policies_of, pooled
 from cprl.evaluation.same_game import check_same_game
 from cprl.measuring.replicas import Measured, institution_measures, over_replicas, social_measures
 from cprl.runs.labelled import labelled
 from cprl.stored import LoadedRun
-
-Diagonal: TypeAlias = Literal["self", "cross_seed"]
 
 Whose: TypeAlias = Literal["focal", "background", "group"]
 _WHOSE: Final[dict[Whose, Callable[..., float]]] = {

@@ -20,8 +20,6 @@ from cprl.theory.equilibria import MOST_STRATEGIES, Equilibrium, equilibria
 from cprl.theory.evolution import AlphaRank, Ends, alpha_rank, replicator_ends
 from cprl.theory.payoff_table import PayoffTable, Values
 
-RESAMPLES = 200
-
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Analysis:
@@ -49,7 +47,7 @@ class Analysis:
 
 
 def analyse(
-    game: EmpiricalGame, *, alpha: float = inf, resamples: int = RESAMPLES, seed: int = 0
+    game: EmpiricalGame, *, alpha: float = inf, resamples: int = arguments.EGTA_RESAMPLES, seed: int = 0
 ) -> Analysis:
     """Analyses an empirical game.
 

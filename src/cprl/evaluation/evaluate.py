@@ -4,20 +4,17 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
-from typing import Final
 
 import pyarrow as pa
 
 from cprl import arguments
+from cprl.arguments import SEED as SEED
 from cprl.envs.unwrap import agent_names
 from cprl.evaluation.lanes import Played, Source, play, policies_of, random_policies
 from cprl.measuring.replicas import Measured, institution_measures, over_replicas, social_measures
 from cprl.measuring.series import OF_AGENTS
 from cprl.runs.labelled import labelled
 from cprl.stored import LoadedRun, load
-
-SEED: Final = 30_011
-"""The default seed of fresh worlds; no training of ours uses it."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)

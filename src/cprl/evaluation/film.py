@@ -8,19 +8,17 @@ from tensordict import TensorDictBase
 from torchrl.envs import EnvBase
 
 from cprl import arguments, keys
+from cprl.arguments import FILM_SEED as SEED
 from cprl.envs.unwrap import commons_of
 from cprl.measuring.episodes import Episode
 from cprl.policies.assignment import AgentPolicies
-from cprl.runs.labelled import refuse_to_write_over
+from cprl.runs.files import refuse_to_write_over
 from cprl.stored import LoadedRun, load
 from cprl.training import train
 from cprl.viewer.callback import ViewerCallback
 from cprl.viewer.decisions import Decisions
 from cprl.viewer.institutions import has_institutions
 from cprl.viewer.offences import Offences, events
-
-SEED = 20_011
-"""The seed of fresh worlds; no training of ours uses it."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)

@@ -10,6 +10,8 @@ from typing import Final
 import numpy as np
 
 from cprl import arguments, keys
+from cprl.arguments import FILM_SEED as SEED
+from cprl.arguments import FILM_SUFFIXES as SUFFIXES
 from cprl.commons.world import Bytes, Shown
 from cprl.envs.commons_env import CommonsEnv
 from cprl.envs.unwrap import commons_of
@@ -19,15 +21,14 @@ from cprl.evaluation.episode_picture import (
     SMALLEST_WIDTH,
     EpisodePicture,
 )
-from cprl.evaluation.film import SEED, FreshEpisode, fresh_episode
+from cprl.evaluation.film import FreshEpisode, fresh_episode
 from cprl.evaluation.turns import Turns
 from cprl.evaluation.video_files import check_can_write_mp4, write_gif, write_mp4
 from cprl.measuring.episodes import Episode
 from cprl.measuring.tracking import tracker_of
 from cprl.memory import check_memory
-from cprl.runs.labelled import refuse_to_write_over
+from cprl.runs.files import refuse_to_write_over
 
-SUFFIXES: Final = (".gif", ".mp4")
 DEFAULT_FPS: Final = 15.0
 MOST_FPS: Final = 50.0
 """Browsers slow a GIF down that is faster."""

@@ -1,6 +1,7 @@
 """What a word names: a board to play on, and who plays."""
 
 from collections.abc import Sequence
+from pathlib import Path
 from typing import Final
 
 from cprl import arguments, presets
@@ -30,12 +31,10 @@ def board_named(
         ValueError: for anything else, and for a variant of what is no published board.
     """
     arguments.choice("variant", variant, presets.VARIANTS)
+    presets.check_board(board)
     if board in presets.BOARDS:
         return presets.game(board, variant=variant), None
-    path = arguments.path("board", board)
-    if not path.is_dir() and not path.is_file():
-        names = ", ".join(presets.BOARDS)
-        raise ValueError(f"board is {board!r}; allowed: {names}, a run's directory, or a file with a drawing")
+    path = Path(board)
     if variant != "published":
         raise ValueError(
             f'variant is "{variant}"; allowed with {board}: "published", since it names no preset'

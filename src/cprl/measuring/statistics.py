@@ -16,15 +16,12 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from cprl import arguments
+from cprl.arguments import Interval as Interval
 from cprl.checks import shown
 from cprl.measuring.intervals import Values, bootstrap_interval, t_interval
 from cprl.memory import check_memory
 
 Statistic = Literal["mean", "iqm"]
-Interval = Literal["t", "bca"]
-"""How an interval is computed: "t", of means alone, by Student's t, right for few replicas if their values
-are about normally distributed; "bca", the bias-corrected and accelerated bootstrap, or by percentiles where
-there are several samples or that is undefined, which is too narrow for few replicas."""
 
 _BY_CHANCE: Final = {
     2: "two",

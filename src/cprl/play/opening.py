@@ -13,8 +13,6 @@ from cprl.policies.scripted import SCRIPTED_POLICIES
 from cprl.population import Scripted
 from cprl.presets import Variant
 
-SEED: Final = 40_011
-"""The default seed; no training of ours uses it."""
 DEFAULT_OTHERS: Final = "greedy"
 
 
@@ -26,7 +24,7 @@ def open_session(
     replica: int = 0,
     variant: Variant = "published",
     steps: int | None = None,
-    seed: int = SEED,
+    seed: int = arguments.PLAY_SEED,
     decision: int | None = None,
     allow: Sequence[str] = (),
 ) -> Session:

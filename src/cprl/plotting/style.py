@@ -14,8 +14,7 @@ from matplotlib.text import Text
 
 from cprl import arguments
 from cprl.commons.colours import agent_colour
-from cprl.runs.files import write_atomically
-from cprl.runs.labelled import refuse_to_write_over
+from cprl.runs.files import refuse_to_write_over, write_atomically
 
 DPI: Final = 150
 COLOURS: Final = 128

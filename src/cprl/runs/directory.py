@@ -4,7 +4,7 @@ the type of processor."""
 import platform
 import shlex
 import sys
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from contextlib import suppress
 from datetime import datetime
 from importlib.metadata import PackageNotFoundError, version
@@ -12,12 +12,10 @@ from itertools import count
 from pathlib import Path
 from typing import Any, Final
 
-from cprl.arguments import callable_of, texts
+from cprl.arguments import callable_of, listed, refusal, texts
 from cprl.arguments import path as path_of
 from cprl.checks import TEXT, checked, shown
-from cprl.config import custom_targets
 from cprl.custom import source_of
-from cprl.differences import differences
 from cprl.output import ERR, console, printed
 from cprl.process import cpu
 from cprl.runs import formats
@@ -123,6 +121,8 @@ def refuse_another_run(
             f"{out} was started by an older cprl, whose trainings this version cannot resume; its agents can "
             "still be loaded and evaluated"
         )
+    from cprl.differences import differences
+
     before, asked = kept["experiment"], now["experiment"]
     free = {"episodes": 0, "on_nan": ""}
     differ = differences({**before, **free}, {**asked, **free}, "experiment", kind)
@@ -162,6 +162,8 @@ def changed_circumstances(run: Path) -> list[str]:
 
     Numbers may then differ from those of an undisturbed run.
     """
+    from cprl.differences import differences
+
     recipe = read_recipe(run)
     now = _circumstances(recipe)
     return [
@@ -224,6 +226,8 @@ def _code_text(recipe: Mapping[str, Any]) -> dict[str, dict[str, str]]:
 
 def _sources(recipe: Mapping[str, Any]) -> dict[str, str]:
     """The text of each module that a `Custom` of a recipe names, without packages whose versions it has."""
+    from cprl.config import custom_targets
+
     modules = {target.partition(":")[0] for target in custom_targets(recipe.get("experiment"))}
     texts = {own: source_of(own) for own in sorted(modules) if own.partition(".")[0] not in PACKAGES}
     return {module: text for module, text in texts.items() if text is not None}
@@ -238,6 +242,8 @@ def resume_command(run: Path, command: Sequence[str] | None = None) -> str:
             from Python without one, which `cprl run` resumes.
     """
     if command is None:
+        from cprl.config import custom_targets
+
         path = run / FILE_NAME
         targets = custom_targets(read_json(path).get("experiment")) if path.exists() else []
         allow = [word for target in targets for word in ("--allow", target)]
@@ -302,6 +308,29 @@ def read_recipe(run: Path) -> dict[str, Any]:
         raise ValueError(f"{name} is not the recipe of a run: {error!r}") from error
     formats.refuse_newer(path, recipe, formats.RECIPE)
     return recipe
+
+
+def runs_in(paths: Iterable[Path | str]) -> list[Path]:
+    """The runs among paths: each is a run's directory, or one that holds runs, in order.
+
+    Raises:
+        ValueError: for a path that is neither, and for one that is there twice.
+    """
+    runs: list[Path] = []
+    for path in listed("runs", paths, "directories of runs"):
+        folder = path_of("runs", path)
+        is_run = (folder / FILE_NAME).exists()
+        inside = [folder] if is_run else sorted(recipe.parent for recipe in folder.glob(f"*/{FILE_NAME}"))
+        if not inside:
+            raise ValueError(f"{folder} is no run; allowed: directories of runs, or one that holds some")
+        runs += inside
+    if not runs:
+        raise refusal("runs", paths, "at least one directory of a run")
+    places = [run.resolve() for run in runs]
+    for run, place in zip(runs, places, strict=True):
+        if places.count(place) > 1:
+            raise ValueError(f"{run} is there twice; allowed: each run once")
+    return runs
 
 
 def versions() -> dict[str, str | None]:

@@ -16,6 +16,16 @@ _PARTIAL: Final = f"*.{8 * '[0-9a-f]'}.partial"
 """The names of files that are being written, or whose writing was interrupted."""
 
 
+def refuse_to_write_over(path: Path) -> None:
+    """Checks before hours of work that its output file does not exist.
+
+    Raises:
+        FileExistsError: if the file exists.
+    """
+    if os.path.lexists(path):  # a link to a file that is not there would be written through
+        raise FileExistsError(f"{path} exists and is not overwritten; use another name")
+
+
 def write_atomically(path: Path, write: Callable[[BinaryIO], object]) -> None:
     """Writes a temporary file, syncs it to disk and renames it.
 

@@ -1,6 +1,5 @@
 """Episodes of several policies in one table, with columns that label them."""
 
-import os
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import replace
 from functools import partial
@@ -13,7 +12,7 @@ import pyarrow.parquet as pq
 
 from cprl.measuring import Episode
 from cprl.runs.episodes import as_table
-from cprl.runs.files import write_atomically
+from cprl.runs.files import refuse_to_write_over, write_atomically
 
 _COMPRESSED: Final = {"compression": "zstd", "compression_level": 19}
 
@@ -35,16 +34,6 @@ def labelled(parts: Iterable[tuple[Label, int, Sequence[Episode]]]) -> pa.Table:
             table = table.add_column(place, pa.field(name, kind), pa.array([value] * len(table), kind))
         tables.append(table)
     return pa.concat_tables(tables)
-
-
-def refuse_to_write_over(path: Path) -> None:
-    """Checks before hours of work that its output file does not exist.
-
-    Raises:
-        FileExistsError: if the file exists.
-    """
-    if os.path.lexists(path):  # a link to a file that is not there would be written through
-        raise FileExistsError(f"{path} exists and is not overwritten; use another name")
 
 
 def write_table(path: Path, table: pa.Table, *, over: bool = False) -> None:

@@ -9,7 +9,7 @@ from typing import Any, Final, Literal
 
 import numpy as np
 
-from cprl.arguments import integer, object_of, refusal
+from cprl.arguments import BLOCK, integer, object_of, refusal
 from cprl.commons.game import Game
 from cprl.experiment import Experiment
 from cprl.measuring import social
@@ -17,7 +17,7 @@ from cprl.runs.curves import as_curves, curves_of
 from cprl.runs.episodes import read_table
 from cprl.studies.factors import Distribution, Factor, levels_of
 from cprl.studies.naming import level_text, named, short_names
-from cprl.studies.study import BLOCK, Study
+from cprl.studies.study import Study
 from cprl.studies.trials import trials_of
 
 SAMPLERS: Final = ("tpe", "random", "gp")

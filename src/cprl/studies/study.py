@@ -8,7 +8,7 @@ from functools import cached_property, partial
 from pathlib import Path
 from typing import Any, Final
 
-from cprl.arguments import integer, object_of, refusal, switch
+from cprl.arguments import BLOCK, integer, object_of, refusal, switch
 from cprl.checks import DIRECTORY_NAME, check_nesting, checked, instance, shown
 from cprl.experiment import MOST_SEED, Experiment, frozen_from, frozen_relative_to
 from cprl.population import stored_of
@@ -30,8 +30,6 @@ from cprl.studies.naming import named, short_names
 
 FORMAT: Final = formats.STUDY
 """Of `Study.to_config`."""
-BLOCK: Final = 8
-"""Replicas that one run trains side by side, if a study does not say."""
 _TRIES: Final = 20
 """Draws for each one that is kept, at most."""
 SEEDS_APART: Final = 1000

@@ -10,5 +10,4 @@ Modules, in the order in which one reads them:
     comparing    means over replicas, and differences from the reference
     texts        comparisons in Markdown and in the terminal
     outcomes     in which phase each replica ends
-    table_command  the command cprl table
 """

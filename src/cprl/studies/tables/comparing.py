@@ -8,13 +8,12 @@ from typing import Any, Final, get_args
 import numpy as np
 from numpy.typing import NDArray
 
+from cprl.arguments import LAST as LAST
 from cprl.arguments import choice, integer, object_of, refusal
 from cprl.measuring.statistics import CONFIDENCE, Estimate, Interval, difference, estimate
 from cprl.studies.tables.table import StudyTable
 from cprl.studies.tables.windows import NET, PARTS, TRAINING
 
-LAST: Final = 30
-"""Episodes at the end of a training that are compared, unless something else is asked for."""
 METRICS: Final = (
     "collective_return",
     NET,

@@ -6,13 +6,11 @@ from itertools import combinations
 from pathlib import Path
 from typing import Any, Final
 
-from cprl.arguments import listed, refusal, texts
-from cprl.arguments import path as path_of
+from cprl.arguments import refusal, texts
 from cprl.config import to_config
 from cprl.differences import differences
 from cprl.experiment import Experiment
-from cprl.runs.directory import FILE_NAME as RECIPE
-from cprl.runs.directory import read_recipe
+from cprl.runs.directory import read_recipe, runs_in
 from cprl.studies.conditions import UNNAMED, Condition
 from cprl.studies.naming import named, short_names
 from cprl.studies.paths import ALL, normalised, values_at
@@ -22,30 +20,6 @@ from cprl.studies.trials import state_of
 
 _MOST_NAMED: Final = 5
 _NOT_COMPARED: Final = (*UNNAMED, "evaluation_episodes")
-
-
-def runs_in(paths: Iterable[Path | str]) -> list[Path]:
-    """The runs among paths: each is a run's directory, or one that holds runs, in order.
-
-    Raises:
-        ValueError: for a path that is neither, and for one that is there twice.
-    """
-    found: list[Path] = []
-    for own in listed("runs", paths, "directories of runs"):
-        folder = path_of("runs", own)
-        runs = (
-            [folder] if (folder / RECIPE).exists() else sorted(p.parent for p in folder.glob(f"*/{RECIPE}"))
-        )
-        if not runs:
-            raise ValueError(f"{folder} is no run; allowed: directories of runs, or one that holds some")
-        found += runs
-    if not found:
-        raise refusal("runs", paths, "at least one directory of a run")
-    places = [own.resolve() for own in found]
-    for own, place in zip(found, places, strict=True):
-        if places.count(place) > 1:
-            raise ValueError(f"{own} is there twice; allowed: each run once")
-    return found
 
 
 def pooled_table(

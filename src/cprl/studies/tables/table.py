@@ -31,6 +31,7 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 from numpy.typing import NDArray
 
+from cprl.arguments import WINDOW as WINDOW
 from cprl.arguments import integer, object_of
 from cprl.arguments import path as path_of
 from cprl.runs import formats
@@ -43,8 +44,6 @@ from cprl.studies.tables.sources import Design, Lacking, Source, design_of, sour
 from cprl.studies.tables.windows import Windows, windows_of
 
 FORMAT: Final = formats.STUDY_TABLE
-WINDOW: Final = 10
-"""Episodes of a window, unless something else is asked for."""
 METADATA: Final = b"cprl"
 """The key of the metadata: the study, its conditions, how the runs were made, and what is lacking."""
 

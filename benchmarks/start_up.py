@@ -1,0 +1,48 @@
+"""What an answer of the command line costs: processor time of a process, user and system, the least of five.
+
+make bench
+"""
+
+import resource
+import sys
+from subprocess import DEVNULL, run
+from typing import Final
+
+import tyro
+
+MOST_S: Final = 0.4
+"""What is allowed where the answer needs nothing of a run."""
+AT_ONCE: Final = (
+    ("-c", "import cprl"),
+    *(("-m", "cprl", "--version"), ("-m", "cprl", "--help"), ("-m", "cprl", "recipe")),
+    *(("-m", "cprl", "run", "comons"), ("-m", "cprl", "evalute"), ("-m", "cprl", "evaluate", "none")),
+)
+OTHERS: Final = (("-m", "cprl", "run", "commons", "--help"), ("-c", "import cprl.running"))
+"""Of a recipe's flags the types are needed, and so torch."""
+
+
+def least_s(words: tuple[str, ...], times: int) -> float:
+    """The processor time of `python WORDS`, in seconds."""
+    spent = []
+    for _ in range(times):
+        before = resource.getrusage(resource.RUSAGE_CHILDREN)
+        run([sys.executable, *words], stdout=DEVNULL, stderr=DEVNULL)
+        after = resource.getrusage(resource.RUSAGE_CHILDREN)
+        spent.append(after.ru_utime + after.ru_stime - before.ru_utime - before.ru_stime)
+    return min(spent)
+
+
+def main(times: int = 5) -> None:
+    """Prints the time of each, and ends with exit code 1 where an answer takes longer than is allowed.
+
+    Args:
+        times: processes of each.
+    """
+    seconds = {words: least_s(words, times) for words in (*AT_ONCE, *OTHERS)}
+    for words, value in seconds.items():
+        print(f"{value:6.2f} s  python {' '.join(words)}")
+    sys.exit(int(max(seconds[words] for words in AT_ONCE) > MOST_S))
+
+
+if __name__ == "__main__":
+    tyro.cli(main)
