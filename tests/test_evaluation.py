@@ -15,20 +15,28 @@ from PIL import Image
 from test_population import ALGORITHMS
 
 import cprl
-from cprl import CommonsEnv, Experiment, Game, Observation, Rules, cli, maps
+from cprl import CommonsEnv, Experiment, Game, Observation, Rules, cli, maps, presets
 from cprl.agents import Population
+from cprl.envs.make_env import spaces_of
 from cprl.evaluation import draw_gains, gains
 from cprl.evaluation.film import film
 from cprl.evaluation.gains import diagonal_returns
 from cprl.evaluation.lanes import Source, policies_of
 from cprl.evaluation.same_game import differences
+from cprl.evaluation.turns import Turns
 from cprl.learners.lanes import EVALUATION, lane_seeds
 from cprl.measuring.evaluate import evaluate
+from cprl.measuring.movement import trace
 from cprl.measuring.names import with_unit
 from cprl.measuring.replicas import agents_without_harvest, over_replicas, social_measures
+from cprl.networks.mlp import MLPNetwork
+from cprl.policies.assignment import AgentPolicies
+from cprl.policies.lanes import LaneActor, random_agents
 from cprl.population import Frozen, Learning, Scripted
+from cprl.process import one_thread
 from cprl.runs.checkpoints import Checkpointer
 from cprl.runs.directory import start_run
+from cprl.stored_agents import StoredAgent, stored_policies
 from cprl.training import train
 
 CORRIDORS = Game(
@@ -247,6 +255,45 @@ def test_the_same_call_plays_the_same_whoever_drew_before_and_a_replica_the_same
     other = cprl.evaluate_run(learned[name], episodes=2, seed=SEED)
     assert told(other.trained[0]) != told(first.trained[0])
     assert told(first.trained[0]) != told(first.trained[1]), "replicas play different worlds"
+
+
+def test_an_evaluation_computes_in_one_thread_and_leaves_their_number_as_it_was():
+    env, threads = CommonsEnv(presets.game("two_complex"), 1, seed=0), []
+    random = AgentPolicies(random_agents(spaces_of(env), (0, 1), replicas=1, seed=0))
+
+    def policy(batch):
+        threads.append(torch.get_num_threads())
+        return random(batch)
+
+    before = torch.get_num_threads()
+    torch.set_num_threads(2)
+    try:
+        evaluate(env, policy)
+        trace(env, policy)
+        Turns(env, policy).play()
+        assert set(threads) == {1}
+        assert torch.get_num_threads() == 2
+    finally:
+        torch.set_num_threads(before)
+
+
+def test_an_agent_values_actions_alone_as_among_others_to_the_last_bit():
+    spaces = presets.game("two_complex").spaces
+    shape = spaces.observation_shape
+    torch.manual_seed(0)
+    agents = [StoredAgent(("trained", False, 0.0, "DQN"), MLPNetwork(shape, 8)) for _ in range(8)]
+    seen = torch.randint(0, 256, (8, 1, *shape), dtype=torch.uint8)
+
+    def values(lanes):
+        network = stored_policies(
+            [[agents[lane] for lane in lanes]], spaces, replicas=lanes, worlds=1, seed=0
+        )
+        (actor,) = (own for own in network.modules() if isinstance(own, LaneActor))
+        return actor.preferences(seen[lanes])
+
+    with one_thread():
+        together = values(range(8))
+        assert all(torch.equal(values([lane]), together[[lane]]) for lane in range(8))
 
 
 @pytest.mark.integration

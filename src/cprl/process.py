@@ -5,7 +5,8 @@ import logging
 import os
 import platform
 import sys
-from contextlib import suppress
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
 from functools import cache
 from pathlib import Path
 from typing import Final
@@ -49,6 +50,17 @@ def prepare_process(seed: int) -> None:
     own.setLevel(logging.INFO)
     if not own.handlers:
         own.addHandler(logging.StreamHandler(OUT))
+
+
+@contextmanager
+def one_thread() -> Iterator[None]:
+    """Lets torch compute in one thread, as trainings do: the last bits of products depend on their number."""
+    threads = torch.get_num_threads()
+    torch.set_num_threads(1)
+    try:
+        yield
+    finally:
+        torch.set_num_threads(threads)
 
 
 @cache

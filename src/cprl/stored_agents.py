@@ -54,7 +54,8 @@ def stored_policies(
     for same in alike.values():
         seeds = lane_seeds(seed, replicas=replicas, agents=same, purpose=EVALUATION)
         lanes = [agents[agent][place] for place in range(len(replicas)) for agent in same]
-        actors[tuple(same)] = stored_actor(lanes, playing, seeds=seeds, agents=len(same), worlds=worlds)
+        how: dict[str, Any] = {"seeds": seeds, "agents": len(same), "worlds": worlds}
+        actors[tuple(same)] = stored_actor(lanes, playing, stacks=True, **how)
     values = [[own.decisions for own in of_replicas] for of_replicas in agents]
     decisions = (
         stored_decisions(values, playing, replicas=replicas, worlds=worlds, seed=seed)
@@ -71,6 +72,7 @@ def stored_actor(
     seeds: Sequence[Sequence[int]],
     agents: int,
     worlds: int,
+    stacks: bool = False,
 ) -> nn.Module:
     """One actor for stored agents of one kind; the one place where an actor is made of a stored agent.
 
@@ -80,6 +82,8 @@ def stored_actor(
         seeds: of each lane's random numbers.
         agents: how many agents of a replica it controls.
         worlds: how many worlds of each replica are played side by side.
+        stacks: whether lanes of one and the same network are stacked too, so that its values are, to the last
+            bit, those that it has among others.
     """
     kind = lanes[0].kind
     if kind[0] == "scripted":
@@ -88,7 +92,7 @@ def stored_actor(
     spaces = playing.spaces if isinstance(playing, Game) else playing
     networks: list[Any] = [lane.network for lane in lanes]
     actor = actor_of_lanes(
-        _side_by_side(networks),
+        _side_by_side(networks, stacks=stacks),
         spaces,
         seeds=seeds,
         agents=agents,
@@ -100,11 +104,11 @@ def stored_actor(
     return actor
 
 
-def _side_by_side(networks: Sequence[nn.Module]) -> Callable[..., Any]:
+def _side_by_side(networks: Sequence[nn.Module], *, stacks: bool) -> Callable[..., Any]:
     """What all networks give for what their lanes see, [L, k, ...] to [L, k, A]; of recurrent ones also their
     states."""
     first = networks[0]
-    if all(network is first for network in networks):
+    if not stacks and all(network is first for network in networks):
         first.requires_grad_(False)
         return lambda *seen: first(*seen)
     try:

@@ -7,6 +7,8 @@ from tensordict import TensorDictBase
 from torchrl.envs import EnvBase
 from torchrl.envs.utils import ExplorationType, set_exploration_type, step_mdp
 
+from cprl.process import one_thread
+
 Policy = Callable[[TensorDictBase], TensorDictBase]
 
 
@@ -34,7 +36,7 @@ class Turns:
         if self.has_ended:
             raise ValueError("the episode has ended; allowed: turns up to its end")
         env = self.env
-        with torch.no_grad(), set_exploration_type(ExplorationType.RANDOM):
+        with torch.no_grad(), one_thread(), set_exploration_type(ExplorationType.RANDOM):
             batch: TensorDictBase = env.step(self.policy(self._moment))
         self._moment = step_mdp(
             batch, reward_keys=env.reward_keys, action_keys=env.action_keys, done_keys=env.done_keys

@@ -12,12 +12,13 @@ from cprl import arguments
 from cprl.envs.commons_env import CommonsEnv
 from cprl.measuring.episodes import Episode
 from cprl.measuring.tracking import tracker_of
+from cprl.process import one_thread
 
 Policy = Callable[[TensorDictBase], TensorDictBase]
 
 
 def evaluate(env: EnvBase, policy: Policy, *, explore: bool = False) -> list[Episode]:
-    """Plays the next episode of each world to its end.
+    """Plays the next episode of each world to its end; torch computes in one thread.
 
     Args:
         env: B worlds, batch size [B]; all are reset. A world of a `CommonsEnv` that has ended does not change
@@ -41,7 +42,7 @@ def evaluate(env: EnvBase, policy: Policy, *, explore: bool = False) -> list[Epi
     tracker = tracker_of(env, longest)
     exploration = ExplorationType.RANDOM if explore else ExplorationType.DETERMINISTIC
     episodes: dict[int, Episode] = {}
-    with torch.no_grad(), set_exploration_type(exploration):
+    with torch.no_grad(), one_thread(), set_exploration_type(exploration):
         for batch in _until_ended(env, policy) if is_commons else _again_and_again(env, policy):
             for episode in tracker.add(batch):
                 episodes.setdefault(episode.world, episode)

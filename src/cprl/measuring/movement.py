@@ -19,6 +19,7 @@ from torchrl.envs.utils import ExplorationType, set_exploration_type
 
 from cprl import arguments, keys
 from cprl.envs.commons_env import CommonsEnv
+from cprl.process import one_thread
 
 Array = NDArray[Any]
 
@@ -52,7 +53,7 @@ def trace(
     tags: list[Array] = []
     exploration = ExplorationType.RANDOM if explore else ExplorationType.DETERMINISTIC
     now, read = env.worlds.now, env.worlds.driver.read
-    with torch.no_grad(), set_exploration_type(exploration):
+    with torch.no_grad(), one_thread(), set_exploration_type(exploration):
         moment = env.reset()
         while not moment["done"].all():
             places = read(now.row), read(now.col)
