@@ -55,6 +55,8 @@ def prepare_process(seed: int) -> None:
 @contextmanager
 def one_thread() -> Iterator[None]:
     """Lets torch compute in one thread, as trainings do: the last bits of products depend on their number."""
+    import torch
+
     threads = torch.get_num_threads()
     torch.set_num_threads(1)
     try:
