@@ -9,9 +9,13 @@ from urllib.parse import parse_qs, urlsplit
 
 import psutil
 import pytest
+from rerun.chunk import RrdReader
+from test_rerun_logger import SCENE, column, frames
+from test_story import headers
 
 from cprl import cli
 from cprl.viewer import page
+from cprl.viewer.logger import RerunLogger
 from cprl.viewer.page import LOCALHOST, Page
 
 FILES = {name: f"the content of {name}".encode() for name in page._FILES}
@@ -90,20 +94,32 @@ def test_a_viewer_that_cannot_be_read_is_said_to_the_browser(served, monkeypatch
 def test_without_a_display_or_on_request_a_run_is_served_until_it_is_interrupted(
     serve, tmp_path, monkeypatch, capsys
 ):
-    (tmp_path / "run.rrd").write_bytes(b"rows")
+    with RerunLogger("run", tmp_path, scene=SCENE) as logger:
+        logger.log_frames(frames(3)[0])
+        for episode, text in enumerate(("# Episode 1", "# Finished")):
+            logger.at(step=episode, episode=episode)
+            logger.log_document("header", text)
+    (tmp_path / "film.rrd").write_bytes(b"half a recording")
     monkeypatch.setattr(cli, "has_display", lambda: serve)
     told = []
 
     def interrupted(seconds):
         told.append(capsys.readouterr().out)
         port = int(re.search(r"http://127\.0\.0\.1:(\d+)/\?", told[0])[1])
-        assert answer(port, "/recordings/0/run.rrd") == (200, b"rows")
+        assert answer(port, "/recordings/1/film.rrd") == (200, b"half a recording")
+        assert answer(port, "/recordings/2/run.rrd") == (200, (tmp_path / "run.rrd").read_bytes())
+        (tmp_path / "light.rrd").write_bytes(answer(port, "/recordings/0/header-1.rrd")[1])
         raise KeyboardInterrupt
 
     monkeypatch.setattr(cli.time, "sleep", interrupted)
     cli.watch(tmp_path, serve=serve)
     assert told[0].endswith("served on 127.0.0.1 until Ctrl-C\n")
     assert ("There is no display" in told[0]) != serve
+    assert headers(tmp_path / "light.rrd")[-1] == (1, "# Finished"), "without the rest before it"
+    whole, light = (RrdReader(tmp_path / name).recordings() for name in ("run.rrd", "light.rrd"))
+    assert [store.recording_id for store in light] == [store.recording_id for store in whole]
+    assert not column(tmp_path / "light.rrd", "world/board", "SegmentationImage:buffer")[0]
+    assert RrdReader(tmp_path / "light.rrd").blueprints(), "of the two a viewer may load this one first"
 
 
 def test_a_run_without_a_recording_is_refused(tmp_path):

@@ -9,6 +9,7 @@ from contextlib import suppress
 from dataclasses import replace
 from importlib.metadata import version
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import Final
 
 import tyro
@@ -28,7 +29,7 @@ from cprl.recipes_cli import refuse_unknown, run_by_name
 from cprl.runs.directory import read_recipe
 from cprl.scenarios_cli import scenarios
 from cprl.studies_cli import runs_table, sweep
-from cprl.viewer.page import Page, has_display
+from cprl.viewer.page import Page, has_display, headers_of
 
 # Commands import what they need once their words are checked: torch takes seconds, which a mistake need not.
 
@@ -204,11 +205,11 @@ def _serve(files: Sequence[Path], *, why: str) -> None:
     """Serves recordings and the web viewer until Ctrl-C."""
     from cprl.viewer.streams import viewer
 
-    page = Page(files)
-    say(f"Watch (browser): {page.address()}")
-    say(f"Watch (native): {printed([viewer(), *page.recordings])}")
-    say(f"{why}served on 127.0.0.1 until Ctrl-C")
-    with suppress(KeyboardInterrupt):
+    with TemporaryDirectory() as folder, suppress(KeyboardInterrupt):
+        page = Page([*headers_of(files, Path(folder)), *files])
+        say(f"Watch (browser): {page.address()}")
+        say(f"Watch (native): {printed([viewer(), *page.recordings])}")
+        say(f"{why}served on 127.0.0.1 until Ctrl-C")
         while True:
             time.sleep(1)
 

@@ -8,7 +8,9 @@ import subprocess
 import sys
 import tempfile
 import time
+import warnings
 from collections.abc import Mapping, Sequence
+from contextlib import suppress
 from functools import cache
 from http.client import HTTPException
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
@@ -67,6 +69,27 @@ class Page:
         """Stops serving. A second call does nothing."""
         self._server.shutdown()
         self._server.server_close()
+
+
+def headers_of(recordings: Sequence[Path], folder: Path) -> list[Path]:
+    """Write recordings without all but layout and headers, for a viewer to load first.
+
+    A browser may load a recording for minutes, and meanwhile would show old headers as the present.
+    A recording that cannot be read is left out.
+    """
+    from rerun.chunk import RrdReader
+
+    written = []
+    for number, recording in enumerate(recordings):
+        target = folder / f"header-{number}.rrd"
+        with warnings.catch_warnings(), suppress(RuntimeError, subprocess.CalledProcessError):
+            warnings.simplefilter("ignore")  # the recording of a run that was killed has no footer
+            entities = {chunk.entity_path for chunk in RrdReader(recording).stream()} - {"/header"}
+            drop = [word for entity in entities for word in ("--drop-entity", entity)]
+            command = [viewer_binary(), "rrd", "filter", *drop, "--output", target, recording.absolute()]
+            subprocess.run(list(map(str, command)), stderr=subprocess.DEVNULL, check=True)
+            written.append(target)
+    return written
 
 
 class _Server(ThreadingHTTPServer):
