@@ -19,7 +19,7 @@ from cprl.studies.figures.by_condition import by_condition
 from cprl.studies.figures.by_factor import _Axis, by_factor
 from cprl.studies.figures.courses import courses
 from cprl.studies.figures.diagrams import grids, heat_map, phase_diagram
-from cprl.studies.figures.panels import is_logarithmic, is_numeric, replicas_text, with_counts
+from cprl.studies.figures.panels import is_logarithmic, is_numeric, is_one, replicas_text, with_counts
 from cprl.studies.results import write_results
 from cprl.studies.tables.comparing import compare, metrics_of
 from cprl.studies.tables.outcomes import ending, endings
@@ -356,6 +356,12 @@ def test_levels_are_mapped_in_the_order_in_which_they_were_given(tmp_path, drawn
     axes = drawn[0].axes[0]
     assert [own.get_text() for own in axes.get_xticklabels()] == ["tall", "low", "middle"]
     assert [own.get_text() for own in axes.get_yticklabels()] == ["25", "1"]
+
+
+def test_random_play_of_a_table_in_float32_is_that_of_one_in_float64():
+    exported = [estimate([float(np.float32(0.9055097465415143))]), None, estimate([0.9055097465415143])]
+    assert is_one(exported)
+    assert not is_one([*exported, estimate([0.9056])])
 
 
 def test_numbers_that_are_far_apart_stand_on_a_logarithmic_axis_and_names_on_none():

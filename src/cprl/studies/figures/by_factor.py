@@ -11,13 +11,14 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import NullLocator
 
 from cprl.arguments import refusal
-from cprl.measuring.statistics import Interval
+from cprl.measuring.statistics import Estimate, Interval
 from cprl.plotting.style import RANDOM_LINE, SMALL_PT, head, picture_path, save, wrapped
 from cprl.studies.figures.panels import (
     LEVEL,
     colours_of,
     is_logarithmic,
     is_numeric,
+    is_one,
     legend,
     levels_note,
     replicas_text,
@@ -212,11 +213,10 @@ def _draw_line(
 
 def _is_same(random: Iterable[Compared], factor: str) -> bool:
     """Whether random play is the same under all conditions of each level of a factor."""
-    of_level: dict[float, set[float]] = {}
+    of_level: dict[float, list[Estimate | None]] = {}
     for own in random:
-        if own.estimate is not None:
-            of_level.setdefault(own.levels[factor], set()).add(round(own.estimate.value, 6))
-    return all(len(values) == 1 for values in of_level.values())
+        of_level.setdefault(own.levels[factor], []).append(own.estimate)
+    return all(map(is_one, of_level.values()))
 
 
 def _draw_random(

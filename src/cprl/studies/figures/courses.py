@@ -16,6 +16,7 @@ from cprl.runs.curves import running_mean
 from cprl.studies.figures.panels import (
     MOST_CONDITIONS,
     colours_of,
+    is_one,
     legend,
     names_of,
     replicas_text,
@@ -104,9 +105,7 @@ def _together(
     colours = colours_of(shown, levels if len(design.factors) == 1 else list(shown))
     random = [compare(table, metric, part=RANDOM).by_name for metric in metrics]
     levels_of = [{own: by_name[own].estimate for own in shown} for by_name in random]
-    same = all(
-        len({round(own.value, 6) for own in found.values() if own is not None}) <= 1 for found in levels_of
-    )
+    same = all(is_one(found.values()) for found in levels_of)
     for axes, metric, found in zip(panels, metrics, levels_of, strict=True):
         for name in shown:
             _draw(axes, curves[name, metric], colours[name], names[name].replace("\n", " "))

@@ -1,6 +1,7 @@
 """What the figures of studies share: names, colours of conditions, notes, and legends."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
+from math import isclose
 from textwrap import fill
 from typing import Any, Final
 
@@ -9,6 +10,7 @@ from matplotlib.axes import Axes
 from matplotlib.colors import to_hex
 from matplotlib.figure import Figure
 
+from cprl.measuring.statistics import Estimate
 from cprl.plotting.style import CHARACTER_IN, SMALL_PT
 from cprl.studies.tables.comparing import Comparison
 from cprl.studies.tables.sources import Design
@@ -86,6 +88,12 @@ def _counts(replicas: Mapping[str, int]) -> list[int]:
 def levels_note(comparison: Comparison) -> str:
     """What points and intervals are."""
     return f"Means of {comparison.episodes_text}, then over replicas; {comparison.interval_text}."
+
+
+def is_one(estimates: Iterable[Estimate | None]) -> bool:
+    """Whether estimates are one number, but for the rounding of exported tables to float32."""
+    values = [own.value for own in estimates if own is not None]
+    return not values or isclose(min(values), max(values), rel_tol=1e-6)
 
 
 def title_of(comparison: Comparison) -> str:
