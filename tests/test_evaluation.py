@@ -198,6 +198,16 @@ def test_networks_that_do_not_stack_play_the_same(learned):
             assert told(one.trained[replica]) == told(other.trained[replica])
 
 
+def test_a_loaded_run_and_what_is_played_with_it_are_printed_in_a_line(learned):
+    loaded = cprl.load(learned["alike"])
+    for fact in (str(loaded.path), "'alike'", "3 episodes", "3 replicas", "2 agents"):
+        assert fact in repr(loaded)
+    played = cprl.evaluate_run(learned["alike"], episodes=1)
+    pairs = cprl.crossplay(learned, episodes=1)
+    for printed in (loaded, played, pairs, loaded.agent(0), played.trained[0][0]):
+        assert len(repr(printed).replace(str(loaded.path), "RUN")) <= 300, printed
+
+
 def test_agents_explore_with_the_runs_epsilon_for_evaluation(learned, tmp_path):
     always = shutil.copytree(learned["alike"], tmp_path / "always")
     text = json.loads((always / "recipe.json").read_text())

@@ -22,8 +22,7 @@ from cprl.runs.checkpoints import Checkpointer, checkpoints_in, is_ending, read_
 from cprl.runs.directory import start_run
 from cprl.runs.episodes import read_episodes, read_table
 from cprl.runs.export import export_results
-from cprl.runs.files import checksum
-from cprl.runs.labelled import refuse_to_write_over
+from cprl.runs.files import checksum, refuse_to_write_over
 from cprl.runs.lock import RunLock, RunLockedError
 from cprl.runs.weights import load_weights, save_weights
 from cprl.shipped import cprl_here

@@ -6,9 +6,14 @@ from importlib.metadata import version
 from importlib.resources import files
 
 import pytest
+from tiny_study import FREEZE, SETTINGS, TINY
+from torchrl.envs import StepCounter, TransformedEnv
 
 import cprl
-from cprl import cli
+from cprl import cli, presets
+from cprl.envs import CommonsGymnasiumEnv, parallel_env
+from cprl.envs.matrix import MatrixEnv, stag_hunt
+from cprl.learners.replay import ReplayLearner
 
 PACKAGES = (
     *("algorithms", "callbacks", "commons", "envs", "evaluation", "exploiting", "institutions", "keys"),
@@ -54,6 +59,32 @@ def test_tab_shows_the_packages():
 def test_packages_are_attributes_after_import_cprl_alone():
     lines = [f"assert cprl.{name}.__name__ == 'cprl.{name}'" for name in reversed(PACKAGES)]
     run_alone("\n".join(["import cprl", *lines]))
+
+
+def is_short(value, *facts):
+    text = repr(value)
+    return len(text) <= 300 and " object at " not in text and all(fact in text for fact in facts)
+
+
+def test_what_is_printed_says_in_a_line_what_one_asks_first():
+    game, alone = presets.game("commons"), presets.game("single_basic")
+    env = cprl.CommonsEnv(game, worlds=3)
+    for printed in (env, TransformedEnv(env, StepCounter())):
+        assert is_short(printed, "12 x 24", "4 agents", "worlds=3", "cpu"), printed
+    assert is_short(MatrixEnv(stag_hunt(), worlds=3), "2 agents", "worlds=3")
+    for adapter in (parallel_env(game), CommonsGymnasiumEnv(alone)):
+        assert is_short(adapter, "Game("), adapter
+    assert is_short(game.map, "12 x 24", "89 sites", "4 agents")
+    assert is_short(TINY, "'tiny'", "2 episodes", "1 replicas")
+    assert is_short(cprl.Study(TINY, {FREEZE: [5, 25]}, name="both"), "'both'", "2 conditions")
+    learner = ReplayLearner(game.spaces, agents=(0, 1), replicas=2, settings=SETTINGS, seed=0, compile=False)
+    assert is_short(learner, "agents=(0, 1)", "replicas=2")
+
+
+@pytest.mark.parametrize("rules", [cprl.Rules(), cprl.Rules(freeze_steps=5, may_fire=False)])
+def test_rules_are_printed_by_what_they_change(rules):
+    assert eval(repr(rules), {"Rules": cprl.Rules}) == rules
+    assert len(repr(rules)) < 60
 
 
 def test_a_name_that_is_not_there_is_an_attribute_error():

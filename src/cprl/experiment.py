@@ -89,6 +89,12 @@ class Experiment:
     """What happens when a loss, weight, reward or observation is NaN or infinite: "stop" ends the training;
     "continue" warns, and the others train on."""
 
+    def __repr__(self) -> str:
+        return (
+            f"Experiment({self.name!r}, {self.game!r}, {self.episodes} episodes, {self.replicas} replicas, "
+            f"seed={self.seed})"
+        )
+
     def __post_init__(self) -> None:
         check_fields(self, _CHECKS, "experiment")
         _check_game(self.game)

@@ -54,6 +54,13 @@ class LoadedRun:
     _earlier: dict[str, "LoadedRun"] = field(default_factory=dict, repr=False)
     """Runs whose agents are frozen in this one, read once."""
 
+    def __repr__(self) -> str:
+        run = self.experiment
+        return (
+            f"LoadedRun({str(self.path)!r}, {run.name!r}, {run.episodes} episodes, {run.replicas} replicas, "
+            f"{self.game.agents} agents)"
+        )
+
     @cached_property
     def game(self) -> Any:
         """What was played."""

@@ -29,6 +29,10 @@ class StoredAgent:
     decisions: Tensor | None = None
     """The values of its choices on all ballots, float64 [C]; None if it decides by chance, or nothing."""
 
+    def __repr__(self) -> str:
+        acts = ", ".join(str(value) for value in self.kind[:3])
+        return f"StoredAgent({acts}, network={type(self.network).__name__})"
+
 
 def stored_policies(
     agents: Sequence[Sequence[StoredAgent]],

@@ -73,6 +73,10 @@ class Game:
         if warning is not None:
             warnings.warn(warning, UserWarning, stacklevel=3)
 
+    def __repr__(self) -> str:
+        names = "".join(f", {type(institution).__name__}" for institution in self.institutions)
+        return f"Game({self.map.height} x {self.map.width}, {self.agents} agents{names})"
+
     @property
     def agents(self) -> int:
         """The number of agents N."""

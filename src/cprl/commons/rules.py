@@ -5,7 +5,7 @@ Sources: [W] M. Wiatrak, "Governing the Commons with Multi-Agent Reinforcement L
 `docs/game.md` describes the game in words.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from typing import Any, Final, Literal, get_args
 
 from cprl.checks import SWITCH, Check, check_fields, is_bool, is_count, is_number, one_of
@@ -110,6 +110,11 @@ class Rules:
     """[run] The action "right" of agent 1 moves agent 0 in its place, to the right of agent 0's own heading,
     after agent 0's own action and even while agent 0 is out of play; a beam that agent 0 fires in this turn
     begins where it fired. A fault of the program for two agents until 13 April 2019. At least two agents."""
+
+    def __repr__(self) -> str:
+        pairs = ((field, getattr(self, field.name)) for field in fields(self))
+        changed = [f"{field.name}={value!r}" for field, value in pairs if value != field.default]
+        return f"Rules({', '.join(changed)})"
 
     def __post_init__(self) -> None:
         check_fields(self, _CHECKS)

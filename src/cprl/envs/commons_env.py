@@ -109,6 +109,9 @@ class CommonsEnv(LeanStepEnv):
         self.action_spec, self.observation_spec = specs.action, specs.observation
         self.reward_spec, self.done_spec = specs.reward, specs.done
 
+    def __repr__(self) -> str:
+        return f"CommonsEnv({self.game!r}, worlds={self._size}, device={str(self.device)!r})"
+
     def _fresh(self) -> tuple[dict[str, Tensor], Output]:
         """New memory for the output of a turn: as tensors by name, and the same memory as arrays."""
         if not self._ahead:

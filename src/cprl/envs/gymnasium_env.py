@@ -46,6 +46,9 @@ class CommonsGymnasiumEnv(gymnasium.Env[Any, Any]):
         self.observation_space = self.world.observation_space()
         self.action_space = spaces.Discrete(len(game.actions))
 
+    def __repr__(self) -> str:
+        return f"{type(self).__name__}({self.game!r})"
+
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[Observed, dict[str, Any]]:

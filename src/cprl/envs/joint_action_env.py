@@ -76,6 +76,10 @@ class JointActionEnv(LeanStepEnv):
         self._set_seed(seed)
         self._make_specs(observation_size, action(self._agents_size))
 
+    def __repr__(self) -> str:
+        worlds, agents = self._agents_size
+        return f"{type(self).__name__}({agents} agents, worlds={worlds}, device={str(self.device)!r})"
+
     def _make_specs(self, observation_size: int, action: TensorSpec) -> None:
         size, of_agents = self.batch_size, self._agents_size
 

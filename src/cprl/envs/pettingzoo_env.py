@@ -63,6 +63,9 @@ class CommonsParallelEnv(ParallelEnv[str, Any, int]):
         arguments.choice("agent", agent, self.possible_agents)
         return self.action_spaces[agent]
 
+    def __repr__(self) -> str:
+        return f"{type(self).__name__}({self.game!r})"
+
     def reset(
         self, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[dict[str, Observed], Infos]:

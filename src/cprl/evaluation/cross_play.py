@@ -12,7 +12,7 @@ with the background agents.
 """
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import partial
 from itertools import product
 from pathlib import Path
@@ -48,7 +48,7 @@ class Cell:
 
     focal: str
     background: str
-    by_agent: Mapping[int, Played]
+    by_agent: Mapping[int, Played] = field(repr=False)
     """The episodes by the index of the focal agent; in self-play the same episodes for each."""
     is_self_play: bool
 
@@ -102,6 +102,10 @@ class CrossPlay:
     seed: int
     greedy: bool
     diagonal: Diagonal
+
+    def __repr__(self) -> str:
+        names = ", ".join(self.runs)
+        return f"CrossPlay({names}; replicas {self.replicas}, {self.episodes} episodes, seed={self.seed})"
 
     def cell(self, focal: str, background: str) -> Cell:
         """The cell of two runs, by their names.

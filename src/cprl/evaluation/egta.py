@@ -8,7 +8,7 @@ it. With few replicas such intervals are too narrow rather than too wide.
 """
 
 from collections import Counter
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from math import inf
 
 import numpy as np
@@ -26,23 +26,23 @@ class Analysis:
     """What an empirical game amounts to; see the docstring of this module."""
 
     game: EmpiricalGame
-    table: PayoffTable
+    table: PayoffTable = field(repr=False)
     """The means over replicas."""
     alpha: float
     resamples: int
     """Of the bootstrap; 0 for a single replica."""
-    rank: AlphaRank
+    rank: AlphaRank = field(repr=False)
     shares: tuple[Estimate, ...]
     """The share of the agents that play as each run in the long run of alpha-rank, with its interval."""
-    pure: dict[tuple[int, ...], float]
+    pure: dict[tuple[int, ...], float] = field(repr=False)
     """The compositions in which no agent gains by playing as another run, by the number of agents of each
     run, with the share of the resamples that have it too; NaN for a single replica."""
     equilibria: tuple[Equilibrium, ...]
     """By nashpy, of a game of two agents, of a larger one of its reduction; empty for more than 6 runs."""
-    in_support: Values
+    in_support: Values = field(repr=False)
     """float64 [S]: the share of the resamples in which a run is played in a symmetric equilibrium of two
     agents; NaN for a single replica, more than 6 runs, and for a game of more agents."""
-    ends: Ends
+    ends: Ends = field(repr=False)
     """Where replicator dynamics end."""
 
 

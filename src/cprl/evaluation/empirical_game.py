@@ -59,6 +59,11 @@ class EmpiricalGame:
     """All episodes with the columns of `episodes.parquet`, after those that say who played: "runs", the
     names of all agents' runs, or those of `CrossPlay.table`."""
 
+    def __repr__(self) -> str:
+        names = ", ".join(self.runs)
+        played = f"{self.agents} agents, replicas {self.replicas}, {self.episodes} episodes"
+        return f"EmpiricalGame({names}; {played})"
+
     @property
     def names(self) -> list[str]:
         """The names of the runs."""

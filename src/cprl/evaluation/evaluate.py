@@ -1,7 +1,7 @@
 """evaluate_run: compares the agents of a stored run with the random policy in fresh worlds."""
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
 
@@ -24,9 +24,9 @@ class Evaluation:
     run: LoadedRun
     seed: int
     greedy: bool
-    trained: Played
+    trained: Played = field(repr=False)
     """The episodes by replica; replica r plays the worlds from r x episodes on."""
-    random: Played
+    random: Played = field(repr=False)
     """The episodes of uniformly random agents in the same worlds."""
 
     def measures(self, policy: str = "trained") -> dict[str, Measured]:

@@ -1,7 +1,7 @@
 """film: records an episode of the agents of a stored run, step by step."""
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 
 from tensordict import TensorDictBase
@@ -26,9 +26,9 @@ class FreshEpisode:
     """A fresh world of a run's game, and who plays in it."""
 
     run: LoadedRun
-    env: EnvBase
+    env: EnvBase = field(repr=False)
     """One world, with the run's transforms."""
-    policies: AgentPolicies
+    policies: AgentPolicies = field(repr=False)
 
 
 def fresh_episode(

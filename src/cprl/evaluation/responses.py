@@ -13,7 +13,7 @@ Learning a Best Response" (2022).
 """
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
 from typing import Any, Final
@@ -54,8 +54,8 @@ class Response:
     name: str
     path: Path
     """The run in which it was trained."""
-    choosing: Played
-    reporting: Played
+    choosing: Played = field(repr=False)
+    reporting: Played = field(repr=False)
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -63,9 +63,9 @@ class Exploitability:
     """The episodes of a population and of responses to it; see the docstring of this module."""
 
     run: LoadedRun
-    population: Played
+    population: Played = field(repr=False)
     """The episodes of the population itself, in the worlds reported, by replica."""
-    responses: Mapping[int, tuple[Response, ...]]
+    responses: Mapping[int, tuple[Response, ...]] = field(repr=False)
     """By the index of the agent whose place they take."""
     episodes: int
     """Of each replica, in the worlds where responses are chosen, and as many in the others."""

@@ -10,7 +10,7 @@ agents that learn, E. Hughes et al. (2018) and J. Perolat et al. (2017).
 """
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import cached_property
 from typing import Any, Final
 
@@ -46,7 +46,7 @@ class SchellingDiagram:
     restrained: str
     greedy: str
     """Who plays restrained, and who greedy: a scripted policy or a run."""
-    played: Mapping[Who, Played]
+    played: Mapping[Who, Played] = field(repr=False)
     """The episodes by the indices of the restrained agents and the replica."""
     replicas: int
     episodes: int

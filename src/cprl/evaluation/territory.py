@@ -1,7 +1,7 @@
 """territory_of: where the agents of a stored run go in fresh worlds and whom they tag, beside random play."""
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
 from typing import Any, Final, Literal, get_args
@@ -61,8 +61,8 @@ class Territory:
     """Of each replica."""
     replicas: tuple[int, ...]
     """Their indices in the run, R of them, as in the arrays of `Stays`."""
-    trained: Stays
-    random: Stays
+    trained: Stays = field(repr=False)
+    random: Stays = field(repr=False)
 
     def of(self, policy: Policy) -> Stays:
         """The stays of the run's agents or of random ones.

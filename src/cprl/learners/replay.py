@@ -148,6 +148,9 @@ class ReplayLearner:
         self.actor.epsilon = settings.epsilon(0)
         self._episodes = torch.zeros(replicas, dtype=torch.int64)
 
+    def __repr__(self) -> str:
+        return f"ReplayLearner(agents={self.agents}, replicas={self.replicas})"
+
     def _make_engine(self, name: EngineName | None, make_loss: MakeLoss, *, compile: bool) -> Engine:
         """The engine of all lanes, with new networks."""
         settings, device = self.settings, self._shapes["device"]

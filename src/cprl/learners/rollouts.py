@@ -104,6 +104,9 @@ class RolloutLearner:
         self._size = 0
         self.steps = 0
 
+    def __repr__(self) -> str:
+        return f"RolloutLearner(agents={self.agents}, replicas={self.replicas})"
+
     def _make_engine(
         self, name: EngineName | None, make_loss: MakeLoss, *, compile: bool, device: str | torch.device
     ) -> Engine:

@@ -79,6 +79,9 @@ class TabularLearner:
         self._observed, self._every_lane = observed_entries(spaces), range(self.lanes)
         self._turns: deque[dict[str, NDArray[Any]]] = deque()
 
+    def __repr__(self) -> str:
+        return f"TabularLearner(agents={self.agents}, replicas={self.replicas})"
+
     @property
     def lanes(self) -> int:
         """The number of lanes L = R x S."""

@@ -65,6 +65,11 @@ class Episode:
     """`cprl.measuring.institutions.summary` of the episode; NaN where undefined, empty without
     institutions."""
 
+    def __repr__(self) -> str:
+        returns = [round(value, 2) for value in self.return_.tolist()]
+        ended = f"{self.steps} steps, terminated={self.terminated}"
+        return f"Episode(world={self.world}, episode={self.episode}, {ended}, returns={returns})"
+
     @property
     def outcome(self) -> str:
         """The outcome as text: apples if the game reports a harvest, else returns."""

@@ -35,6 +35,9 @@ class PreferenceWrapper(BaseParallelWrapper[str, Any, Any]):
         self.wants = WantedRewards(preferences)
         self.wants.check_agents(len(env.possible_agents))
 
+    def __repr__(self) -> str:
+        return f"PreferenceWrapper({self.env!r})"
+
     def reset(
         self, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[dict[str, Any], dict[str, dict[str, Any]]]:

@@ -1,7 +1,7 @@
 """run_study: every trial of a study, wherever an executor runs it."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, get_args
 
@@ -25,10 +25,10 @@ class StudyResult:
     out: Path
     runs: Path
     """The directory of its runs."""
-    trials: tuple[Trial, ...]
+    trials: tuple[Trial, ...] = field(repr=False)
     failed: tuple[Outcome, ...]
     """The trials that failed, with their reasons."""
-    table: StudyTable | None
+    table: StudyTable | None = field(repr=False)
     """What came out; None if nothing has finished, and where no results were asked for."""
 
 

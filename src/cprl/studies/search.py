@@ -9,7 +9,7 @@ import hashlib
 import tempfile
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, Final
 
@@ -42,10 +42,10 @@ class SearchResult:
     """Of all points, as named conditions."""
     out: Path
     runs: Path
-    points: tuple[Point, ...]
-    trials: tuple[Trial, ...]
+    points: tuple[Point, ...] = field(repr=False)
+    trials: tuple[Trial, ...] = field(repr=False)
     failed: tuple[Outcome, ...]
-    table: StudyTable | None
+    table: StudyTable | None = field(repr=False)
     """What came out; None if nothing has finished, and where no results were asked for."""
 
     @property

@@ -72,6 +72,11 @@ class Study:
     question: str = field(default="", kw_only=True)
     expectation: str = field(default="", kw_only=True)
 
+    def __repr__(self) -> str:
+        return (
+            f"Study({self.name!r}, {len(self.all_conditions)} conditions, {self.replicas} replicas of each)"
+        )
+
     def __post_init__(self) -> None:
         object_of("experiment", self.experiment, Experiment, "an Experiment")
         keep = object.__setattr__

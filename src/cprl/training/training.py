@@ -110,6 +110,9 @@ class Training:
         self.steps = 0
         self.times = Times()
 
+    def __repr__(self) -> str:
+        return f"Training({self.env!r}, {self.steps} steps, {self.episodes} episodes)"
+
     @property
     def is_over(self) -> bool:
         """Whether every replica has played its episodes."""

@@ -49,6 +49,9 @@ class Map:
         _check_entries(self)
         _check_cells(self)
 
+    def __repr__(self) -> str:
+        return f"Map({self.height} x {self.width}, {len(self.sites)} sites, {self.agents} agents)"
+
     @property
     def agents(self) -> int:
         """The number of agents N."""

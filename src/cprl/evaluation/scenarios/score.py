@@ -1,7 +1,7 @@
 """Score, Scores: what a run's agents, and others in their places, reached in scenarios."""
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from statistics import fmean
 from typing import Final, Literal, TypeAlias, get_args
 
@@ -28,7 +28,7 @@ class Score:
     """The episodes of one scenario."""
 
     scenario: Scenario
-    played: Mapping[FocalAgents, Mapping[tuple[int, ...], Played]]
+    played: Mapping[FocalAgents, Mapping[tuple[int, ...], Played]] = field(repr=False)
     """The episodes by who is focal, the indices of the focal agents, and the replica."""
 
     def measures(self, focal: FocalAgents = "run") -> dict[str, Measured]:
@@ -95,7 +95,7 @@ class Scores:
     """What a run reached in scenarios."""
 
     run: LoadedRun
-    by_scenario: Mapping[str, Score]
+    by_scenario: Mapping[str, Score] = field(repr=False)
     """The scores by the name of the scenario."""
     replicas: list[int]
     episodes: int

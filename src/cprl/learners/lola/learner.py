@@ -96,6 +96,9 @@ class LOLALearner:
         self._size, self._phase = 0, 0
         self.steps = 0
 
+    def __repr__(self) -> str:
+        return f"LOLALearner(agents={self.agents}, replicas={self.replicas})"
+
     @property
     def rollout_steps(self) -> int:
         """The length of a rollout, in steps."""

@@ -129,6 +129,9 @@ class TorchRLReplayLearner:
         self.steps, self._pace = 0, Pace(settings)
         self.actor.epsilon = settings.epsilon(0)
 
+    def __repr__(self) -> str:
+        return f"TorchRLReplayLearner(agents={self.agents}, replicas={self.replicas})"
+
     def _refuse_unfit(self, make_loss: MakeLoss, device: str | torch.device, noise_numbers: int) -> None:
         """The checks of the fast engine, on a loss of its own and synthetic transitions of one agent."""
         settings = self.settings

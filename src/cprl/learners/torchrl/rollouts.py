@@ -119,6 +119,9 @@ class TorchRLRolloutLearner:
         self._rollout: list[TensorDict] = []
         self.steps = 0
 
+    def __repr__(self) -> str:
+        return f"TorchRLRolloutLearner(agents={self.agents}, replicas={self.replicas})"
+
     def _refuse_other_outputs(self, make_loss: MakeLoss, device: torch.device, **how: Any) -> None:
         """Raises a ValueError for a loss that returns none, on synthetic transitions of one agent."""
         with torch.random.fork_rng(devices=[]):

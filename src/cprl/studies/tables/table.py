@@ -20,7 +20,7 @@ A factor with the name of another column is called "factor NAME".
 
 import json
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import cached_property
 from importlib.util import find_spec
 from pathlib import Path
@@ -53,11 +53,11 @@ class StudyTable:
     """The results of a study; see the module for the columns of `rows`."""
 
     design: Design
-    rows: pa.Table
+    rows: pa.Table = field(repr=False)
     window: int
     lacking: tuple[Lacking, ...]
     """The runs that are no part of it: not finished, failed or damaged."""
-    made: Mapping[str, Circumstances]
+    made: Mapping[str, Circumstances] = field(repr=False)
     """Versions, git commit and processor of each run in it."""
 
     @cached_property
