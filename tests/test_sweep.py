@@ -407,6 +407,12 @@ def test_who_shares_a_study_keeps_another_one_out_when_the_first_has_left(tmp_pa
         assert not driver.others
 
 
+def test_where_nothing_can_be_locked_nobody_else_is_said_to_run_a_study(tmp_path, monkeypatch):
+    monkeypatch.setattr("cprl.runs.lock.fcntl", None)
+    with driven(Study(TINY, {FREEZE: [2, 5]}, name="short"), tmp_path) as driver:
+        assert not driver.others
+
+
 def driven(study, out):
     """A driver of a study."""
     return as_driver(study, trials_of(study), out, out / "runs", allow=(), progress=False, watch="off")

@@ -129,10 +129,11 @@ class StudyLock(RunLock):
     def __init__(self, out: Path, study: str) -> None:
         super().__init__(out)
         self._study = study
-        self.is_alone = False
-        """Whether nobody else ran the study when it was locked."""
+        self.is_alone = True
+        """Whether nobody else is known to have run the study when it was locked."""
 
     def _is_taken(self) -> bool:
+        self.is_alone = False
         file = os.open(self.path, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o666)
         try:
             with suppress(BlockingIOError):
