@@ -17,8 +17,8 @@ AT_ONCE: Final = (
     *(("-m", "cprl", "--version"), ("-m", "cprl", "--help"), ("-m", "cprl", "recipe")),
     *(("-m", "cprl", "run", "comons"), ("-m", "cprl", "evalute"), ("-m", "cprl", "evaluate", "none")),
 )
-OTHERS: Final = (("-m", "cprl", "run", "commons", "--help"), ("-c", "import cprl.running"))
-"""Of a recipe's flags the types are needed, and so torch."""
+OTHERS: Final = (("-m", "cprl", "run", "commons", "--help"),)
+"""The flags of a recipe are made of its experiment, which needs torch."""
 
 
 def least_s(words: tuple[str, ...], times: int) -> float:

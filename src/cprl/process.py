@@ -37,9 +37,10 @@ def prepare_process(seed: int) -> None:
         ValueError: for a seed that is no integer from 0 to 2**64 - 1.
     """
     checked("seed", seed, count(0, MOST_SEED))
+    keep_output()
+
     import torch
 
-    keep_output()
     torch.manual_seed(seed)
     torch.set_num_threads(1)
     torch.set_flush_denormal(True)
