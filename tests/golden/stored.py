@@ -1,0 +1,99 @@
+"""What stored runs do in fresh worlds: evaluated, mixed, among named backgrounds, and where they go.
+
+python tests/golden/stored.py KIND FOLDER      writes what that kind of evaluation gave to found.json
+"""
+
+import json
+import sys
+from dataclasses import asdict
+from itertools import pairwise
+from pathlib import Path
+
+import numpy as np
+from golden import checksum, columns
+
+RESULTS = Path(__file__).parents[2] / "docs" / "results"
+TEN_TARGETS = "commons_targets_10"
+
+
+def runs() -> dict[str, Path]:
+    """The stored runs that keep weights, by their path below docs/results."""
+    found = sorted(path.parents[1] for path in RESULTS.rglob("checkpoints/*.pt"))
+    return {path.relative_to(RESULTS).as_posix(): path for path in found}
+
+
+def evaluated() -> dict[str, object]:
+    import cprl
+
+    found = {}
+    for name, path in runs().items():
+        for greedy in (False, True):
+            played = cprl.evaluate_run(path, episodes=1, greedy=greedy)
+            label = f"{name}{', greedy' * greedy}"
+            found[label] = columns(played.table())
+            found[f"{label}, estimates"] = {
+                metric: [measured.estimate.value, measured.estimate.low, measured.estimate.high]
+                for metric, measured in played.measures("trained").items()
+                if measured.estimate is not None
+            }
+    return found
+
+
+def crossed() -> dict[str, object]:
+    """Cross-play of neighbours among the six ways of `swap_the_loss`, and of two runs of `commons`."""
+    import cprl
+
+    names = [name for name in runs() if name.startswith("swap_the_loss")]
+    pairs = [*pairwise(names), ("commons", TEN_TARGETS)]
+    played = {
+        f"{one}, {other}": cprl.crossplay([RESULTS / one, RESULTS / other], episodes=1, replicas=(0, 1))
+        for one, other in pairs
+    }
+    return {name: columns(cross.table()) for name, cross in played.items()}
+
+
+def schelling() -> dict[str, object]:
+    from cprl import presets
+    from cprl.evaluation import schelling
+
+    boards = {board: presets.game(board, variant="as_run") for board in ("two_complex", "commons")}
+    return {board: columns(schelling(game, episodes=1, replicas=2).table()) for board, game in boards.items()}
+
+
+def scenarios() -> dict[str, object]:
+    from cprl.evaluation import run_scenarios
+
+    return {
+        name: columns(run_scenarios(RESULTS / name, episodes=1, replicas=(0, 1)).table())
+        for name in ("two_complex", "commons", "swap_the_loss/ppo")
+    }
+
+
+def territory() -> dict[str, object]:
+    from cprl.evaluation import territory_of
+
+    found = {}
+    for name in ("commons", "two_complex"):
+        played = territory_of(RESULTS / name, episodes=1, replicas=(0, 1))
+        for policy in ("trained", "random"):
+            stays = asdict(played.of(policy))
+            numbers = {key: list(map(float, value)) for key, value in stays.pop("by_replica").items()}
+            arrays = {key: checksum(np.asarray(value)) for key, value in stays.items()}
+            found[f"{name}, {policy}"] = {**arrays, **numbers}
+    return found
+
+
+def responses() -> dict[str, object]:
+    """The episodes of the best responses that were trained against stored runs."""
+    import pyarrow.parquet as pq
+
+    tables = sorted((RESULTS / "exploitability").glob("*.parquet"))
+    return {path.stem: columns(pq.read_table(path)) for path in tables}
+
+
+KINDS = {kind.__name__: kind for kind in (evaluated, crossed, schelling, scenarios, territory, responses)}
+
+if __name__ == "__main__":
+    kind, folder = sys.argv[1:]
+    found = {f"{kind}: {name}": case for name, case in KINDS[kind]().items()}
+    Path(folder, "found.json").write_text(json.dumps(found))

@@ -1,0 +1,19 @@
+"""Every algorithm learns what it learned, stopped in the middle or not: tables, weights, evaluations."""
+
+import pytest
+from golden import IS_X86, hold, in_a_process
+
+FAMILIES = ("dqn", "off-policy", "on-policy", "recurrent", "teams", "opponent-aware", "mixed")
+pytestmark = [
+    pytest.mark.integration,
+    pytest.mark.skipif(not IS_X86, reason="its sums are those of x86-64"),
+]
+
+
+@pytest.mark.parametrize("family", FAMILIES)
+def test_a_family_of_algorithms_learns_what_it_did(family, tmp_path):
+    found = in_a_process("trainings.py", family, folder=tmp_path)
+    assert {name: case["differs after a stop"] for name, case in found.items()} == {
+        name: [] for name in found
+    }
+    hold("training", found)
