@@ -10,9 +10,9 @@ PROJECT = {
     "name": "cprl",
     "dependencies": ["torch>=2.13,<2.14", "Pillow>=11"],
     "optional-dependencies": {
-        "play": ["pygame>=2.6,<3; python_version < '3.14'"],
-        "all": ["cprl[play]", "ray~=2.60"],
-        "dev": ["cprl[all,play]", "pytest==8.1"],
+        "film": ["imageio-ffmpeg>=0.6,<0.9; python_version < '3.14'"],
+        "all": ["cprl[film]", "ray~=2.60"],
+        "dev": ["cprl[all,film]", "pytest==8.1"],
     },
 }
 
@@ -24,7 +24,7 @@ def test_each_requirement_is_pinned_to_its_lower_bound_with_those_of_extras_of_e
         "Pillow": "Pillow==11",
         "pytest": "pytest==8.1",
         "ray": "ray==2.60",
-        "pygame": 'pygame==2.6; python_version < "3.14"',
+        "imageio-ffmpeg": 'imageio-ffmpeg==0.6; python_version < "3.14"',
     }
     assert list(oldest(PROJECT, [])) == ["torch==2.13", "Pillow==11"]
 

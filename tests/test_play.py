@@ -1,22 +1,19 @@
-"""A person plays among others: the session, the terminal, the window."""
+"""A person plays among others: the session, the terminal."""
 
 import io
 import re
 from pathlib import Path
 
-import numpy as np
 import pytest
 from matrix_game import MatrixGame
 
 from cprl import Experiment, Game, Rules, cli, maps, presets
-from cprl.commons.colours import APPLE, PALETTE, agent_colour
 from cprl.measuring.episodes import EpisodeTracker
 from cprl.measuring.replicas import social_metrics
 from cprl.play.keys import help_of
 from cprl.play.opening import open_session
 from cprl.play.session import Session
 from cprl.play.terminal import board_text, play_in_terminal
-from cprl.play.window import NoWindowError, WindowPicture, play_in_window
 from cprl.population import Scripted
 from cprl.runs.directory import start_run
 from cprl.runs.weights import save_weights
@@ -176,7 +173,7 @@ def test_a_game_without_a_beam_has_no_key_for_it():
 def test_what_cannot_be_played_is_refused(tmp_path, monkeypatch, words, said):
     monkeypatch.chdir(tmp_path)
     (tmp_path / "odd.txt").write_text(".x>A\n")
-    monkeypatch.setattr("sys.argv", ["cprl", "play", "--terminal", *words])
+    monkeypatch.setattr("sys.argv", ["cprl", "play", *words])
     with pytest.raises(SystemExit, match=said):
         cli.main()
 
@@ -186,84 +183,6 @@ def test_agents_of_another_game_are_refused(run, monkeypatch):
         open_session("two_complex", others=str(run))
     with pytest.raises(ValueError, match="replica is -1"):
         open_session(str(run), replica=-1)
-
-
-@pytest.fixture
-def dummy(monkeypatch):
-    """pygame with SDL's dummy driver, and a function that presses keys before the window opens."""
-    monkeypatch.setenv("SDL_VIDEODRIVER", "dummy")
-    monkeypatch.setenv("PYGAME_HIDE_SUPPORT_PROMPT", "1")
-    pygame = pytest.importorskip("pygame")
-    pygame.display.init()
-
-    def press(*names):
-        for name in names:
-            key = pygame.key.key_code(name)
-            text = name if len(name) == 1 else ""
-            pygame.event.post(pygame.event.Event(pygame.KEYDOWN, key=key, unicode=text, mod=0))
-
-    return press
-
-
-def test_keys_in_the_window_play_turns_until_escape(run, dummy):
-    session = open_session(str(run), seed=1)
-    dummy("w", "up", "left", "p", "escape")
-    play_in_window(session, "meadow")
-    assert session.turn == 3, "p is no key"
-    assert session.harvested == [1, 0]
-    assert text_of(session)[0] == ". A . . 0^."
-
-
-def test_the_window_passes_the_turns_of_a_person_who_is_out_of_play(tmp_path, dummy):
-    (tmp_path / "lane.txt").write_text(">..<A\n")
-    session = open_session(str(tmp_path / "lane.txt"), others="aggressive", steps=4)
-    dummy(".")
-    import pygame
-
-    post = pygame.event.wait
-
-    def wait(timeout):
-        event = post(1)
-        return pygame.event.Event(pygame.QUIT) if session.has_ended else event
-
-    with pytest.MonkeyPatch.context() as patched:
-        patched.setattr(pygame.event, "wait", wait)
-        play_in_window(session, "lane")
-    assert session.turn == 4
-
-
-def test_the_window_shows_the_board_the_person_and_the_keys(run):
-    session = open_session(str(run), seed=1)
-    picture = WindowPicture(session, "meadow")
-    first = picture.draw()
-    assert first.shape == (picture.size[1], picture.size[0], 3)
-    apple = first[round(np.mean(picture._episode.cell_box(0, 1)[1::2])), :]
-    assert (apple == PALETTE[APPLE]).all(-1).any()
-    mine = (first == agent_colour(0)).all(-1)
-    assert mine[picture._episode.size[1] :].sum() > 50, "its line is in the agent's colour"
-    session.act("forward")
-    assert (picture.draw() != first).any()
-    while not session.has_ended:
-        session.act("stay")
-    assert "time is over" in picture._first_line()
-
-
-def test_without_a_display_the_terminal_is_used_and_said(run, monkeypatch, capsys):
-    for name in ("DISPLAY", "WAYLAND_DISPLAY", "SDL_VIDEODRIVER"):
-        monkeypatch.delenv(name, raising=False)
-    monkeypatch.setattr(pytest.importorskip("pygame").display, "get_driver", lambda: "offscreen")
-    monkeypatch.setattr("sys.stdin", io.StringIO("quit\n"))
-    monkeypatch.setattr("sys.argv", ["cprl", "play", str(run)])
-    cli.main()
-    told = capsys.readouterr().out.splitlines()
-    assert told[0].startswith("there is no display")
-    assert told[0].endswith("you play in the terminal")
-
-
-def test_without_pygame_the_reason_is_said(run, monkeypatch):
-    monkeypatch.setitem(__import__("sys").modules, "pygame", None)
-    with pytest.raises(NoWindowError, match=r'pygame is not installed \(pip install "cprl\[play\]"\)'):
-        play_in_window(open_session(str(run)), "meadow")
 
 
 def test_a_session_wants_a_board():

@@ -146,7 +146,7 @@ def test_a_command_works_outside_the_checkout(name, bare, run):
 
 
 def test_a_game_is_played_in_the_terminal(bare, run):
-    told = bare.cprl(f"play {run} --terminal --steps 3", input="w\nwww\nquit\n")
+    told = bare.cprl(f"play {run} --steps 3", input="w\nwww\nquit\n")
     assert "turn" in told
 
 

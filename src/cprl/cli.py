@@ -125,10 +125,9 @@ def play(
     steps: int | None = None,
     seed: int = PLAY_SEED,
     decision: int | None = None,
-    terminal: bool = False,
     allow: Allow = (),
 ) -> None:
-    """Lets you play among trained or scripted agents, a turn for each key, and measures the episode.
+    """Lets you play in the terminal among trained or scripted agents, and measures the episode.
 
     Args:
         board: commons, two_complex, single_complex or single_basic; or the directory of a run, whose game it
@@ -142,7 +141,6 @@ def play(
         steps: turns of the episode at most; by default those of the game.
         seed: of all chance; the same seed and the same keys play the same again.
         decision: what you vote for in a game with votes or elections, by its number; by default chance votes.
-        terminal: play in the terminal, by lines of keys; also without pygame (extra "play") or a display.
         allow: code of your own, module:Class, that a run may import; see docs/experiments.md.
     """
     make_importable(allow)
@@ -150,8 +148,6 @@ def play(
 
     from cprl.play.opening import open_session
     from cprl.play.terminal import play_in_terminal
-    from cprl.play.window import NoWindowError, play_in_window
-    from cprl.play.wording import ending, results_text, state
 
     prepare_process(seed)
     session = open_session(
@@ -165,16 +161,7 @@ def play(
         decision=decision,
         allow=allow,
     )
-    if not terminal:
-        try:
-            play_in_window(session, f"cprl play {board}")
-        except NoWindowError as error:
-            say(f"{error}; you play in the terminal")
-            terminal = True
-        else:
-            say(f"{state(session)}; {ending(session)}\n{results_text(session)}")
-    if terminal:
-        play_in_terminal(session)
+    play_in_terminal(session)
 
 
 def watch(run: Path, /, *, serve: bool = False) -> None:

@@ -222,7 +222,7 @@ def targets() -> list[Target]:
         "report": [],
         "export": [],
         "docs": [],
-        "play": ["--allow", "--terminal"],
+        "play": ["--allow"],
     }
     found = [
         _target(f"cprl {name}", _subcommand(name), _lines(first, flags, more.get(name, ["--allow"])))

@@ -22,11 +22,10 @@ class CommonsGymnasiumEnv(gymnasium.Env[Any, Any]):
         game: The game, see `presets.game`; its map has one agent.
         seed: The seed of all random numbers, 0 to 2**64 - 1; `reset(seed=...)` restarts with another one.
             None draws one from torch's generator, another for each environment, as `CommonsEnv` does.
-        render_mode: "rgb_array", "human" or None.
+        render_mode: "rgb_array" or None.
 
     Raises:
         ValueError: If the game has several agents, or the seed or the render mode is not allowed.
-        RuntimeError: If the render mode is "human" and no window can be opened.
     """
 
     metadata = {  # noqa: RUF012  (as Gymnasium declares it)
@@ -42,7 +41,7 @@ class CommonsGymnasiumEnv(gymnasium.Env[Any, Any]):
                 "cprl.envs.parallel_env (PettingZoo) or CommonsEnv (TorchRL)"
             )
         self.game, self.render_mode = game, render_mode
-        self.world = OneWorld(game, seed=seed, title="cprl commons", render_mode=render_mode)
+        self.world = OneWorld(game, seed=seed, render_mode=render_mode)
         self.observation_space = self.world.observation_space()
         self.action_space = spaces.Discrete(len(game.actions))
 
@@ -68,14 +67,10 @@ class CommonsGymnasiumEnv(gymnasium.Env[Any, Any]):
         world.play([action])
         return world.observation(0), world.reward(0), world.terminated, world.truncated, world.info(0)
 
-    def render(self) -> Bytes | None:
-        """Returns an image, uint8 [rows, columns, 3], under "rgb_array"; shows it in a window under "human".
+    def render(self) -> Bytes:
+        """Return an image, uint8 [rows, columns, 3].
 
         Raises:
             ValueError: If there is no render mode.
         """
         return self.world.render()
-
-    def close(self) -> None:
-        """Closes the window, if it is open."""
-        self.world.close()

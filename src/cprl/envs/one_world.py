@@ -13,10 +13,9 @@ from cprl.commons.game import Game
 from cprl.commons.picture import world_image
 from cprl.commons.world import Bytes, GovernedOutput
 from cprl.envs.drivers import drawn_seed
-from cprl.envs.window import Window
 from cprl.institutions.memory import Payments
 
-RENDER_MODES: Final = ("rgb_array", "human")
+RENDER_MODES: Final = ("rgb_array",)
 RENDER_FPS: Final = 15
 
 Observed = NDArray[Any] | dict[str, NDArray[Any]]
@@ -28,15 +27,13 @@ class OneWorld:
     Args:
         game: The game.
         seed: The seed of all random numbers, 0 to 2**64 - 1; None for one drawn by `drawn_seed`.
-        title: The title of the window under `render_mode="human"`.
         render_mode: One of `RENDER_MODES`, or None.
 
     Raises:
         ValueError: If the seed or the render mode is not allowed.
-        RuntimeError: If the render mode is "human" and no window can be opened.
     """
 
-    def __init__(self, game: Game, *, seed: int | None, title: str, render_mode: str | None) -> None:
+    def __init__(self, game: Game, *, seed: int | None, render_mode: str | None) -> None:
         if render_mode is not None and not (isinstance(render_mode, str) and render_mode in RENDER_MODES):
             raise arguments.refusal("render_mode", render_mode, f"None, {', '.join(RENDER_MODES)}")
         self.game = game
@@ -44,7 +41,6 @@ class OneWorld:
         self._show_in(self.batch.new_output())
         self._decisions = np.zeros((1, game.agents), np.int64)
         self.render_mode = render_mode
-        self._window = Window(title) if render_mode == "human" else None
         self._names = game.agent_names
         self._has_begun = False
 
@@ -85,8 +81,6 @@ class OneWorld:
         self._decisions = decided
         self._show_in(self.batch.begin(self.batch.new_output()))
         self._has_begun = True
-        if self._window:
-            self.render()
 
     def _checked(self, decisions: Any) -> NDArray[np.int64]:
         """Decisions by name as int64 [1, N]."""
@@ -115,8 +109,6 @@ class OneWorld:
         ]
         output, decisions = self.batch.new_output(), self._decisions if self.game.decisions else None
         self._show_in(self.batch.play_checked(np.array([row], np.int64), output, decisions))
-        if self._window:
-            self.render()
 
     def observation(self, agent: int) -> Observed:
         """The observation of an agent, an element of `observation_space`."""
@@ -172,28 +164,19 @@ class OneWorld:
         board = self.game.palette[self.batch.boards(self.output)[0]]
         return np.ascontiguousarray(board.transpose(2, 0, 1))
 
-    def render(self) -> Bytes | None:
-        """Returns an image, uint8 [rows, columns, 3], under "rgb_array"; shows it in a window under "human".
+    def render(self) -> Bytes:
+        """Return an image, uint8 [rows, columns, 3].
 
         Raises:
             ValueError: If there is no render mode, or the episode has not begun.
         """
         if self.render_mode is None:
             raise ValueError(
-                'render_mode is None, so render() is unavailable; allowed: "rgb_array" or "human", chosen '
-                "when the environment is made"
+                'render_mode is None, so render() is unavailable; allowed: "rgb_array", chosen when the '
+                "environment is made"
             )
         self.check_begun("render()")
-        image = world_image(self.game.map, self.batch.show(self.output))
-        if self._window is None:
-            return image
-        self._window.show(image)
-        return None
-
-    def close(self) -> None:
-        """Closes the window, if it is open."""
-        if self._window:
-            self._window.close()
+        return world_image(self.game.map, self.batch.show(self.output))
 
 
 def _paid(payments: Payments, agent: int) -> dict[str, Any]:

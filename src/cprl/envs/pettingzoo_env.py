@@ -29,11 +29,10 @@ class CommonsParallelEnv(ParallelEnv[str, Any, int]):
         game: The game, see `presets.game`.
         seed: The seed of all random numbers, 0 to 2**64 - 1; `reset(seed=...)` restarts with another one.
             None draws one from torch's generator, another for each environment, as `CommonsEnv` does.
-        render_mode: "rgb_array", "human" or None.
+        render_mode: "rgb_array" or None.
 
     Raises:
         ValueError: If the seed or the render mode is not allowed.
-        RuntimeError: If the render mode is "human" and no window can be opened.
     """
 
     metadata: ClassVar[dict[str, Any]] = {
@@ -46,7 +45,7 @@ class CommonsParallelEnv(ParallelEnv[str, Any, int]):
     def __init__(self, game: Game, *, seed: int | None = None, render_mode: str | None = None) -> None:
         arguments.object_of("game", game, Game, "a cprl.Game")
         self.game, self.render_mode = game, render_mode
-        self.world = OneWorld(game, seed=seed, title="cprl commons", render_mode=render_mode)
+        self.world = OneWorld(game, seed=seed, render_mode=render_mode)
         self.possible_agents = list(game.agent_names)
         self.agents: list[str] = []
         self.observation_spaces = {name: self.world.observation_space() for name in self.possible_agents}
@@ -108,17 +107,13 @@ class CommonsParallelEnv(ParallelEnv[str, Any, int]):
         """The whole board in RGB: uint8 [3, H, W]."""
         return self.world.state()
 
-    def render(self) -> Bytes | None:
-        """Returns an image, uint8 [rows, columns, 3], under "rgb_array"; shows it in a window under "human".
+    def render(self) -> Bytes:
+        """Return an image, uint8 [rows, columns, 3].
 
         Raises:
             ValueError: If there is no render mode.
         """
         return self.world.render()
-
-    def close(self) -> None:
-        """Closes the window, if it is open."""
-        self.world.close()
 
     def _observations(self) -> dict[str, Observed]:
         return {name: self.world.observation(i) for i, name in enumerate(self.agents)}

@@ -1,4 +1,4 @@
-"""EpisodePicture: one population's board, its stock and its harvests so far; for films and for play."""
+"""EpisodePicture: one population's board, its stock and its harvests so far; for films."""
 
 from collections.abc import Sequence
 from functools import cache
@@ -92,7 +92,6 @@ class EpisodePicture:
         *,
         end: str = "",
         card: str = "",
-        own: int | None = None,
         violators: Sequence[int] = (),
     ) -> Bytes:
         """The picture of the last of these moments.
@@ -102,7 +101,6 @@ class EpisodePicture:
             title: what is shown, in large type; smaller where the room ends.
             end: how the episode ended, beside the title and in orange; the turn while this is empty.
             card: what came of the episode, in large type across the board.
-            own: the index of the agent that gets a white frame; None for no frame.
             violators: the indices of agents that get a white diamond, since they broke a rule.
 
         Returns:
@@ -115,9 +113,6 @@ class EpisodePicture:
         if drawn.size != self._board_size:
             drawn = drawn.resize(self._board_size, Image.Resampling.BOX)
         image.paste(drawn, ((self.size[0] - self._board_size[0]) // 2, self._board_top))
-        if own is not None and moments[-1].in_play[own]:
-            at = self.cell_box(int(moments[-1].row[own]), int(moments[-1].col[own]))
-            draw.rectangle(at, outline=_TEXT, width=max(1, self._unit // 6))
         for agent in violators:
             self._mark(draw, agent, moments[-1])
         if card:

@@ -6,5 +6,4 @@ Modules, in the order in which one reads them:
     keys      the keys and the actions they stand for
     wording   what a person who plays reads
     terminal  in the terminal, by lines of keys
-    window    in a window, by pygame
 """

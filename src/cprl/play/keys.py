@@ -14,10 +14,6 @@ LETTERS: Final = {
     "f": "beam",
     ".": "stay",
 }
-"""The same in the window and in the terminal."""
-
-ARROWS: Final = {"up": "w", "down": "s", "left": "q", "right": "e", "space": "."}
-"""The window's other keys, by pygame's names, and the letters they stand for."""
 
 ACTION_NAMES: Final = {
     "forward": "step forward",

@@ -40,14 +40,9 @@ def ending(session: Session) -> str:
     return "no apple is left" if session.stock == 0 else "time is over"
 
 
-def results(session: Session) -> list[tuple[str, str, str]]:
-    """Each social metric of the turns played: its name, value, words and unit; none before the first."""
-    return [(name, _number(value), title(name)) for name, value in session.metrics().items()]
-
-
 def results_text(session: Session) -> str:
-    """The same as lines of text."""
-    lines = [f"{name:17s} {value:>9s}  {words}" for name, value, words in results(session)]
+    """Return the social metrics of the turns played, a line each: name, value, words and unit."""
+    lines = [f"{name:17s} {_number(value):>9s}  {title(name)}" for name, value in session.metrics().items()]
     return "\n".join(lines) or "No turn was played, so there is nothing to measure."
 
 
