@@ -5,16 +5,14 @@ import sys
 import time
 from dataclasses import replace
 
-import numpy as np
 import pytest
 from rich.console import Console
 from tiny_study import FREEZE, TINY
 
 from cprl import Study, run_study
-from cprl.runs.curves import curves_of
 from cprl.runs.files import write_json
-from cprl.studies import live, overview
-from cprl.studies.overview import Overview, markdown
+from cprl.studies import overview
+from cprl.studies.overview import Overview
 from cprl.studies.progress import Progress, table_of
 from cprl.studies.status import Status
 from cprl.studies.trials import Outcome, trials_of
@@ -93,9 +91,6 @@ def test_failures_have_their_reason(looked, tmp_path):
     now = own.look()
     assert now.rows[0].trial is trials[2], "failed ones stand before those that are missing"
     assert now.rows[0].reason == "ValueError: of | chance"
-    assert "| freeze_steps=9, replicas 0-1 | failed | 0 / 20 | ValueError: of \\| chance |" in markdown(
-        now, title="mine"
-    )
 
 
 @pytest.mark.integration
@@ -163,40 +158,3 @@ def test_nothing_is_printed_where_no_progress_is_wanted(tmp_path, capsys):
     with pytest.raises(ValueError, match="progress is 'no'; allowed: True or False"):
         run_study(STUDY, tmp_path / "other", progress="no")
     assert not (tmp_path / "other").exists()
-
-
-@pytest.mark.integration
-def test_viewers_get_the_table_and_the_returns_of_finished_trials(tmp_path, capsys, monkeypatch):
-    sent = []
-
-    class Recording:
-        def __getattr__(self, name):
-            return lambda *what, **how: sent.append((name, what))
-
-    class Stream:
-        def do(self, what):
-            what(Recording())
-
-        def close(self):
-            sent.append(("close", ()))
-
-    addresses = {"browser": "http://there"}
-    monkeypatch.setattr(live, "open_live", lambda *_, **__: live_of(Stream(), addresses))
-    study = Study(replace(TINY, episodes=3, replicas=2), {FREEZE: [2]})
-    result = run_study(study, tmp_path / "out", watch="serve", results=False)
-    assert "Watch live (browser): http://there" in capsys.readouterr().out
-    tables = [what[1].text.as_arrow_array()[0].as_py() for name, what in sent if what[:1] == ("table",)]
-    assert "| freeze_steps=2, replicas 0-1 | finished | 6 / 6 |  |" in tables[-1]
-    (curve,) = [what for name, what in sent if name == "send_columns"]
-    assert curve[0] == "/collective_return/freeze_steps\\=2\\,\\ replicas\\ 0-1"
-    episodes, values = live.returns_of(result.runs / result.trials[0].name)
-    harvests = curves_of(result.runs / result.trials[0].name)["collective_return"]  # [2, 3]
-    assert np.array_equal(episodes, [0, 1, 2]), "a tenth of three episodes is one"
-    assert np.allclose(values, harvests.mean(0))
-    assert sent[-1] == ("close", ())
-
-
-def live_of(stream, addresses):
-    from cprl.viewer.streams import Live
-
-    return Live(stream, None, addresses)

@@ -183,7 +183,6 @@ def test_a_failed_condition_does_not_end_the_study_and_is_listed_with_what_tries
         (f"mine.py --vary {FREEZE}=2 --jobs 0", "--jobs is 0; allowed"),
         (f"mine.py --vary {FREEZE}=2 --jobs 2 --on here", "--jobs is 2 with --on here"),
         (f"mine.py --vary {FREEZE}=2 --address auto", "--address is for --on ray"),
-        (f"mine.py --vary {FREEZE}=2 --watch file", "watch is 'file'; allowed: \"off\""),
     ],
 )  # fmt: skip
 def test_what_cannot_be_is_refused_before_anything_is_written(here, line, message):
@@ -415,4 +414,4 @@ def test_where_nothing_can_be_locked_nobody_else_is_said_to_run_a_study(tmp_path
 
 def driven(study, out):
     """A driver of a study."""
-    return as_driver(study, trials_of(study), out, out / "runs", allow=(), progress=False, watch="off")
+    return as_driver(study, trials_of(study), out, out / "runs", allow=(), progress=False)

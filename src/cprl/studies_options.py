@@ -55,9 +55,6 @@ class StudyOptions:
     interval: Interval = "t"
     """How their intervals are computed: "t", by Student's t; "bca", by a bootstrap, too narrow for few
     replicas."""
-    watch: str = "off"
-    """"serve", "spawn" or "connect ADDRESS": the table of all trials, and the returns of finished ones, in
-    the Rerun viewer."""
     dry_run: bool = False
     """List all conditions, trials and their states; run and write nothing."""
     allow: tyro.conf.UseAppendAction[tuple[str, ...]] = ()
@@ -114,7 +111,7 @@ def carry_out(what: "Study | Search", options: StudyOptions, command: Sequence[s
                 )
     if options.dry_run:
         return _list(what, options)
-    names = ("runs", "allow", "watch", "last", "interval")
+    names = ("runs", "allow", "last", "interval")
     how: dict[str, Any] = {"on": executor, **{own: getattr(options, own) for own in names}}
     program, *words = named_command(command)
     whole = without_options(words, ["--only"])  # what a part of a study lacks, it lacks

@@ -12,7 +12,6 @@ Modules, in the order in which one reads them:
     executors    where trials are run
     overview     how far every trial is
     progress     the same in the terminal
-    live         the same in the Rerun viewer
     directory    a study's directory: what it is, its runs, how far its trials are
     driver       runs trials, and shows how far they are
     execution    run_study: every trial of a study

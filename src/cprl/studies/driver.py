@@ -14,7 +14,6 @@ from cprl.runs.lock import FILE_NAME as LOCK
 from cprl.runs.lock import StudyLock
 from cprl.studies.directory import STATUS, write_study
 from cprl.studies.executors import Executor
-from cprl.studies.live import LiveStudy, check_live
 from cprl.studies.progress import Progress
 from cprl.studies.study import Study
 from cprl.studies.trials import Outcome, Task, Trial, move_aside, task_of
@@ -42,7 +41,6 @@ class Driver:
         self._out, self._runs = out, runs
         self._how: dict[str, Any] = {"allow": allow, "keep_checkpoint": keep_checkpoints}
         self._progress, self._title = progress, title
-        self.viewer: LiveStudy | None = None
         self.others = ""
         """Who runs the study too, in a sentence."""
 
@@ -65,7 +63,6 @@ class Driver:
             status=self._out / STATUS,
             title=title or self._title,
             is_shown=self._progress,
-            watchers=[] if self.viewer is None else [self.viewer.show],
         )
         if self.others:
             shown.say(self.others)
@@ -111,7 +108,6 @@ def as_driver(
     *,
     allow: Sequence[str],
     progress: bool,
-    watch: str,
     keep_checkpoints: bool = False,
 ) -> Iterator[Driver]:
     """Checks all that is asked for, then makes a study's directory, and locks it with all who run the same
@@ -123,7 +119,6 @@ def as_driver(
     """
     switch("progress", progress)
     texts("allow", allow)
-    check_live(watch)
     tasks_of(trials, runs=runs, status=out / STATUS, allow=allow)
     driver = Driver(
         out, runs, allow=allow, progress=progress, title=study.name, keep_checkpoints=keep_checkpoints
@@ -138,8 +133,6 @@ def as_driver(
             driver.others = _others(out)
         runs.mkdir(parents=True, exist_ok=True)
         write_study(study, out)
-        if watch != "off":
-            driver.viewer = stack.enter_context(LiveStudy(watch, runs=runs, title=study.name))
         yield driver
 
 

@@ -42,7 +42,6 @@ def run_study(
     keep_checkpoints: bool = False,
     allow: Sequence[str] = (),
     progress: bool = True,
-    watch: str = "off",
     results: bool = True,
     last: int = LAST,
     interval: Interval = "t",
@@ -65,8 +64,6 @@ def run_study(
             study with more episodes goes on from them, bit for bit.
         allow: the user's own code, "module:Class", that stored runs of `Frozen` agents may import.
         progress: whether a table of all trials is shown; lines where the output is not a terminal.
-        watch: "off", or "serve", "spawn", "connect ADDRESS" for the same table and the returns of finished
-            trials in the Rerun viewer, see `cprl.viewer.streams.open_live`.
         results: whether `table.parquet`, `summary.md` and `figures/` are written at the end, see
             `cprl.studies.results`.
         last: episodes at the end of the training that these compare, at least 10.
@@ -96,7 +93,6 @@ def run_study(
         allow=allow,
         keep_checkpoints=keep_checkpoints,
         progress=progress,
-        watch=watch,
     ) as driver:
         failed = driver.run(chosen, on or InProcess())
         how: Any = {"last": last, "interval": interval, "again": again}

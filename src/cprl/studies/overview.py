@@ -9,7 +9,6 @@ from typing import Any, Final, Literal
 
 from cprl.studies.status import Status
 from cprl.studies.tables.sources import REASONS
-from cprl.studies.tables.texts import cell
 from cprl.studies.trials import Trial
 from cprl.terminal.progress import in_words
 
@@ -190,17 +189,6 @@ def label_of(trial: Trial) -> str:
     first, last = trial.block.first, trial.block.first + trial.block.replicas - 1
     numbers = f"replica {first}" if first == last else f"replicas {first}-{last}"
     return f"{trial.condition.name}, {numbers}"
-
-
-def markdown(snapshot: Snapshot, *, title: str, most: int = 200) -> str:
-    """The table of a study as Markdown."""
-    rows, rest = snapshot.fitting(most)
-    lines = [f"# {title}", "", snapshot.line, "", "| trial | state | episodes | |", "|---|---|---:|---|"]
-    lines += [
-        f"| {cell(row.label)} | {row.state} | {row.episodes:,} / {row.of:,} | {cell(row.note)} |"
-        for row in rows
-    ]
-    return "\n".join([*lines, *(["", rest] if rest else [])])
 
 
 def _is_new(said: Mapping[str, Any]) -> bool:

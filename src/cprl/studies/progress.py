@@ -2,7 +2,7 @@
 
 import sys
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from threading import Event, Thread
 from types import TracebackType
@@ -38,7 +38,6 @@ class Progress:
         status: the directory in which they say how far they are.
         title: what the study is called.
         is_shown: whether anything is printed.
-        watchers: called with every snapshot, in that thread.
     """
 
     def __init__(
@@ -49,14 +48,13 @@ class Progress:
         status: Path,
         title: str,
         is_shown: bool = True,
-        watchers: Sequence[Callable[[Snapshot], object]] = (),
     ) -> None:
         stream = getattr(sys.stdout, "rich_proxied_file", sys.stdout)  # trials replace sys.stdout
         self._console = console(Output(lambda: stream))
         self._labels = {trial.name: label_of(trial) for trial in trials}
         self._failures: dict[str, str] = {}
         self._overview = Overview(trials, runs=runs, status=status, failures=self._failures)
-        self._title, self._is_shown, self._watchers = title, is_shown, watchers
+        self._title, self._is_shown = title, is_shown
         self._ended = 0
         self._is_over = Event()
         self._live: Live | None = None
@@ -120,8 +118,6 @@ class Progress:
     def _show(self, now: Snapshot) -> Snapshot:
         if self._live is not None:
             self._live.update(self._table(now), refresh=True)
-        for watcher in self._watchers:
-            watcher(now)
         return now
 
     def _table(self, now: Snapshot) -> Any:

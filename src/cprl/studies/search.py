@@ -64,7 +64,6 @@ def run_search(
     runs: Path | str | None = None,
     allow: Sequence[str] = (),
     progress: bool = True,
-    watch: str = "off",
     results: bool = True,
     last: int = LAST,
     interval: Interval = "t",
@@ -79,7 +78,6 @@ def run_search(
         runs: see `cprl.studies.run_study`.
         allow: see `cprl.studies.run_study`.
         progress: see `cprl.studies.run_study`.
-        watch: see `cprl.studies.run_study`.
         results: see `cprl.studies.run_study`.
         last: see `cprl.studies.run_study`; what the search itself looks at is in `Search`.
         interval: see `cprl.studies.run_study`.
@@ -100,9 +98,7 @@ def run_search(
     out = directory_of(study, out)
     folder = out / RUNS if runs is None else path_of("runs", runs)
     failed: list[Outcome] = []
-    with as_driver(
-        study, trials_of(study), out, folder, allow=allow, progress=progress, watch=watch
-    ) as driver:
+    with as_driver(study, trials_of(study), out, folder, allow=allow, progress=progress) as driver:
         while batch:
             failed += _run_batch(search, batch, driver, on or InProcess(), of=asked)
             asked.tell([value_of(search, own, folder) for own in batch])
