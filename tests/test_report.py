@@ -148,7 +148,7 @@ def test_a_report_tells_every_number_from_the_results_alone(run, tmp_path):
     for metric in ("collective_return", "return_0", "return_1"):
         figure = tmp_path / "figures" / f"two_against_random_{metric}.png"
         assert figure.stat().st_size > 10_000
-        assert f"(figures/{figure.name})" in text
+        assert f"(figures/{figure.name})" in (tmp_path / "figures.md").read_text()
     assert "| two_against_random | return_1 | too few episodes |" in text
     assert "| shots per 1000 steps, all agents | " in text
     assert "| 4 | return_1 | 50 | 27.9 | 137 |" in text, "windows of the published curves"
@@ -166,7 +166,8 @@ def test_a_report_of_runs_of_one_name_is_refused_and_other_names_are_links(run, 
         write_report([one, two], tmp_path / "report")
     assert not (tmp_path / "report").exists()
     text = write_report([one], tmp_path / "report").read_text()
-    assert "](figures/a%20run%20%7C%20of%20mine_collective_return.png)" in text
+    figures = (tmp_path / "report" / "figures.md").read_text()
+    assert "](figures/a%20run%20%7C%20of%20mine_collective_return.png)" in figures
     assert (tmp_path / "report" / "figures" / "a run | of mine_collective_return.png").exists()
     assert "| a run \\| of mine | two_against_random" in text
 
@@ -265,7 +266,7 @@ def test_runs_that_are_not_the_studys_have_no_columns_for_what_was_published(run
     assert "published" not in before + after, "in between stands the command, which may say anything"
     assert "| fishery | " in after
     assert "| shots per 1000 steps, all agents | " in text
-    assert "(figures/fishery_collective_return.png)" in text
+    assert "(figures/fishery_collective_return.png)" in (tmp_path / "figures.md").read_text()
     both = write_report([own, export_results(run, tmp_path / "two_against_random")], tmp_path).read_text()
     assert "| fishery |" not in both.split("## Appendix A")[1].split("## Collective return")[0]
 
@@ -465,7 +466,7 @@ def test_reproduce_runs_what_is_missing_and_reports(tmp_path, monkeypatch, capsy
     report = reproduce.main(**how)
     assert "--resume" in asked[1]
     assert "| single_basic | 1 | 32.47 | " in report.read_text()
-    assert "(figures/single_basic_collective_return.png)" in report.read_text()
+    assert "(figures/single_basic_collective_return.png)" in report.with_name("figures.md").read_text()
     reproduce.main(**how)
     assert "--resume" in asked[2], "its recipe says whether what is finished is this experiment"
     with pytest.raises(ValueError, match="there is no experiment 'fishery'; allowed: commons, single_basic"):

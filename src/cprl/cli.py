@@ -98,7 +98,7 @@ def report(
 
     Args:
         runs: directories of runs, or of results.
-        out: where to: tables.md and figures/.
+        out: where to: tables.md, figures.md and figures/.
         pool: runs whose experiments differ in nothing but name, seed, replicas and on_nan are one, of all
             their replicas.
         allow: code of your own, module:Class, that a run may import; see docs/experiments.md.

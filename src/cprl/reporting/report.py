@@ -28,7 +28,7 @@ from cprl.shipped import is_cprl
 
 
 def write_report(runs: Sequence[Path], out: Path, *, pool: bool = False, allow: Sequence[str] = ()) -> Path:
-    """Writes `tables.md` and its figures.
+    """Writes `tables.md`, and figures that `figures.md` shows.
 
     Args:
         runs: The directories of runs, or of exported results.
@@ -58,7 +58,7 @@ def write_report(runs: Sequence[Path], out: Path, *, pool: bool = False, allow: 
     (out / "figures").mkdir(parents=True, exist_ok=True)
     of_study = [result for result in results if result.study]
     lines = [
-        "# Tables and figures",
+        "# Tables",
         "",
         "Made by `cprl report` from the results of these runs alone.",
         *_how(of_study),
@@ -77,10 +77,13 @@ def write_report(runs: Sequence[Path], out: Path, *, pool: bool = False, allow: 
         *claims_many.combat_section(results),
         *_claims(of_study),
         *_measures(results),
-        *_figures(results, out),
     ]
-    path = out / "tables.md"
-    text = "\n".join(lines) + "\n"
+    _write(out / "figures.md", _figures(results, out))
+    return _write(out / "tables.md", lines)
+
+
+def _write(path: Path, lines: Sequence[str]) -> Path:
+    text = "\n".join(lines).rstrip("\n") + "\n"
     write_atomically(path, lambda file: file.write(text.encode()))
     return path
 
@@ -185,7 +188,7 @@ def _without_weights(result: Result) -> list[str]:
 
 
 def _figures(results: Sequence[Result], out: Path) -> list[str]:
-    lines = ["## Figures", ""]
+    lines = ["# Figures", ""]
     for result, metric, path in draw_figures(results, out / "figures"):
         lines += [f"![{result.name}, {axis_title(metric)}](figures/{quote(path.name)})", ""]
     return lines
