@@ -16,6 +16,7 @@ from rerun.chunk import RrdReader
 from rich.console import Console
 from test_rerun_logger import column
 from test_torchrl_logs import Corridor
+from torchrl.data import Bounded
 from torchrl.envs import (
     Compose,
     GymWrapper,
@@ -29,6 +30,7 @@ from torchrl.envs.utils import check_env_specs
 
 from cprl import CommonsEnv, Game, Rules, maps
 from cprl.collectors import StepCollector
+from cprl.envs import spaces_of
 from cprl.evaluation.tables import run_table
 from cprl.measuring import EpisodeTracker, social
 from cprl.measuring.evaluate import evaluate
@@ -376,3 +378,12 @@ def test_parquet_readers_of_others_read_the_table(tmp_path):
             table.add(replace(episode, episode=7), replica=3)
     assert pq.read_table(tmp_path / "episodes.parquet")["replica"].to_pylist() == [3, 3]
     assert np.array_equal(read_episodes(tmp_path)["episode"], [7, 7])
+
+
+def test_actions_of_numbers_are_refused_by_the_name_of_their_entry():
+    env = CommonsEnv(Game(map=maps.parse(">.A<"), rules=Rules()), 1, seed=0)
+    spec = env.full_action_spec.clone()
+    spec["agents", "action"] = Bounded(-1, 1, shape=(1, 2, 1), dtype=torch.float32)
+    env.full_action_spec = spec
+    with pytest.raises(ValueError, match=r'\("agents", "action"\)'):
+        spaces_of(env)

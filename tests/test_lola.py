@@ -20,7 +20,6 @@ import cprl
 from cprl import Custom, Experiment
 from cprl.agents import Population
 from cprl.algorithms import DQN, LOLA, DQNSettings, LOLASettings
-from cprl.envs.continuous import MaxOfTwoQuadratics
 from cprl.envs.make_env import make_env, spaces_of
 from cprl.envs.matrix import prisoners_dilemma
 from cprl.evaluation import crossplay
@@ -323,10 +322,6 @@ def test_what_does_not_fit_is_refused_and_says_what_does():
         (
             lambda: Population(make_env(GAME, worlds=1, seed=0), (team(),), engine="torchrl"),
             r'LOLA does not support engine="torchrl"',
-        ),
-        (
-            lambda: Population(make_env(MaxOfTwoQuadratics(), worlds=1, seed=0), (team("dice", PAIR),)),
-            r"LOLA",
         ),
         (
             lambda: Team(lola(), PAIR, reward="individual", share_parameters=True),

@@ -29,7 +29,6 @@ from cprl.algorithms import (
     DistributionalDQN,
     DQNSettings,
     LOLASettings,
-    PR2ActorCritic,
     Reinforce,
     RolloutSettings,
     Tabular,
@@ -39,7 +38,6 @@ from cprl.checks import MOST_NESTED, plain
 from cprl.collectors import stock_collector
 from cprl.commandline import parse, recipe_main
 from cprl.config import KINDS, from_config, to_config
-from cprl.envs.continuous import MaxOfTwoQuadratics
 from cprl.envs.matrix import prisoners_dilemma
 from cprl.envs.taking import TakingGame
 from cprl.institutions import (
@@ -87,10 +85,8 @@ VALUES = [
     *(REPLAY, ROLLOUTS, TABLES),
     *(MLP(), Conv(), GRU(), LSTM(), SPACES),
     prisoners_dilemma(turns=9),
-    MaxOfTwoQuadratics(),
     *(herders(2, cost=2.0), PowerWorth(), TakingGame(appropriation(), most=3.0, turns=9)),
     *(kind(settings=REPLAY) for kind in (DQN, DistributionalDQN, CQL, SAC, IQL, PR2, VDN, QMIX, MADDPG)),
-    PR2ActorCritic(settings=REPLAY),
     *(kind(settings=ROLLOUTS) for kind in (PPO, A2C, Reinforce, MAPPO, IPPO)),
     LOOKS,
     LOLA(settings=LOOKS),
@@ -146,14 +142,6 @@ ALLOWED = {
     ("DQNSettings", "replay_transforms"): ([], ()),
     ("DistributionalDQN", "lowest_return"): (-1, -0.5, 1.9),
     ("Spaces", "observation_scale"): (1.9,),
-    **{("Spaces", name): (-1, -0.5, 1.9) for name in ("action_low", "action_high")},
-    **dict.fromkeys(
-        (("MaxOfTwoQuadratics", name) for name in ("wide_top", "steep_top", "steep_height")), (-1, -0.5, 1.9)
-    ),
-    **dict.fromkeys(
-        (("MaxOfTwoQuadratics", name) for name in ("bound", "wide_factor", "wide_width", "steep_width")),
-        (1.9,),
-    ),
     **{("SharingGame", name): (1.9,) for name in ("cost", "most_each")},
     ("SharingGame", "payment"): (-1, -0.5, 1.9),
     **{("PowerWorth", name): (1.9,) for name in ("top", "factor", "power")},
@@ -174,8 +162,7 @@ ALLOWED = {
     },
     ("LOLA", "entropy_coeff"): (1.9,),
     **{("SAC", name): (1.9,) for name in ("alpha_init",)},
-    **{(kind, "temperature"): (1.9,) for kind in ("IQL", "PR2", "PR2ActorCritic")},
-    **{("PR2ActorCritic", name): (1.9,) for name in ("action_noise", "first_scale", "value_scale")},
+    **{(kind, "temperature"): (1.9,) for kind in ("IQL", "PR2")},
     **{("InequityAversion", name): (1.9,) for name in ("alpha", "beta")},
     ("SocialValueOrientation", "angle"): (-1, -0.5, 1.9),
     ("SocialValueOrientation", "weight"): (1.9,),

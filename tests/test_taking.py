@@ -20,7 +20,6 @@ from cprl.algorithms import (
     PPO,
     DQNSettings,
     LOLASettings,
-    PR2ActorCritic,
     RolloutSettings,
     Tabular,
     TabularSettings,
@@ -88,7 +87,7 @@ GAMES = st.builds(
     top=st.floats(0.5, 50),
     power=st.floats(1, 4),
     cost=st.just(0.0) | st.floats(0.01, 0.9),
-    levels=st.integers(2, 30) | st.none(),
+    levels=st.integers(2, 30),
     cap=st.none() | st.floats(0.01, 2),
 )
 
@@ -116,8 +115,7 @@ def test_equilibrium_and_optimum_lie_within_what_agents_can_take_by_default(game
     assert 0 < sharing.optimum_total <= sharing.nash_total <= most * (1 + 1e-12)
     limit = sharing.most_each
     assert game.most_each == pytest.approx(min(2 * sharing.nash_total / game.agents, limit or np.inf))
-    if game.levels is not None:
-        assert (game.amounts[0], game.amounts[-1], len(game.amounts)) == (0, game.most_each, game.levels)
+    assert (game.amounts[0], game.amounts[-1], len(game.amounts)) == (0, game.most_each, game.levels)
 
 
 def test_by_default_appropriators_choose_half_tokens_and_herders_have_the_equilibrium_in_the_middle():
@@ -125,7 +123,6 @@ def test_by_default_appropriators_choose_half_tokens_and_herders_have_the_equili
     assert LAB.most_each == 10
     assert TakingGame(herders(5)).amounts[10] == pytest.approx(2.5355 / 5, abs=1e-4)
     assert PAIR.amounts == (0, 0.5, 1, 1.5, 2)
-    assert TakingGame(herders(5), levels=None).amounts == ()
 
 
 def test_agents_see_the_share_that_they_took_and_that_all_took():
@@ -170,10 +167,9 @@ def test_a_repeated_game_is_truncated_by_its_clock_and_begins_again():
     assert found == [on, on, [True, False, True], on]
 
 
-@pytest.mark.parametrize("levels", [5, None])
-def test_a_world_that_is_over_stays_as_it_is_and_pays_nothing(levels):
-    env = make_env(replace(PAIR, levels=levels, turns=2), worlds=2)
-    one = torch.ones(2, 2, dtype=torch.int64) if levels else torch.full((2, 2, 1), 0.5)
+def test_a_world_that_is_over_stays_as_it_is_and_pays_nothing():
+    env = make_env(replace(PAIR, turns=2), worlds=2)
+    one = torch.ones(2, 2, dtype=torch.int64)
     moment = env.reset()
     for _ in range(2):
         moment = env.step(moment.set(("agents", "action"), one))["next"]
@@ -187,11 +183,11 @@ def test_a_world_that_is_over_stays_as_it_is_and_pays_nothing(levels):
     assert again["agents", "observation"][:, 0].tolist() == [[1, 0.25, 0.25], [1, 0.5, 0.5]]
 
 
-CONTINUOUS = TakingGame(herders(3), levels=None, turns=4, memory=2, continue_prob=0.6)
+CHANCY = TakingGame(herders(3), turns=4, memory=2, continue_prob=0.6)
 
 
 @pytest.mark.parametrize("worlds", [1, 3])
-@pytest.mark.parametrize("game", [replace(LAB, turns=1), LAB, CONTINUOUS, own_game()])
+@pytest.mark.parametrize("game", [replace(LAB, turns=1), LAB, CHANCY, own_game()])
 def test_it_is_an_environment_of_torchrl_that_can_be_put_where_it_was(game, worlds):
     env = make_env(game, worlds=worlds)
     check_env_specs(env)
@@ -200,13 +196,11 @@ def test_it_is_an_environment_of_torchrl_that_can_be_put_where_it_was(game, worl
     assert moment["next", "agents", "reward"].shape == (worlds, game.agents, 1)
     check_restorable(lambda: make_env(game, worlds=worlds))
     spaces = spaces_of(env)
-    assert (spaces.agents, spaces.actions, spaces.action_size) == (
-        (game.agents, game.levels, 0) if game.levels else (game.agents, 0, 1)
-    )
+    assert (spaces.agents, spaces.actions) == (game.agents, game.levels)
     assert (spaces.observation_dtype, spaces.observation_scale) == ("float32", 1.0)
 
 
-@pytest.mark.parametrize("game", [replace(PAIR, turns=4, continue_prob=0.6), CONTINUOUS])
+@pytest.mark.parametrize("game", [replace(PAIR, turns=4, continue_prob=0.6), CHANCY])
 def test_the_lean_step_equals_torchrls_own(game):
     class Stock(TakingEnv):
         _step_and_maybe_reset = EnvBase._step_and_maybe_reset
@@ -265,8 +259,8 @@ def rolled(env, actions):
         (lambda: replace(LAB, most=10.5), r"most is 10.5; allowed: up to sharing.most_each, 10"),
         (lambda: replace(LAB, most=0), r"most is 0; allowed: None or a number above 0"),
         (lambda: TakingGame(herders(2, cost=11)), r"most is None; allowed in a game in which nobody gains"),
-        (lambda: replace(own_game(), levels=None), r"levels is None; allowed with a CallableWorth: 2 or mo"),
-        (lambda: replace(LAB, levels=1), r"levels is 1; allowed: None or an integer in 2..65536"),
+        (lambda: replace(LAB, levels=None), r"levels"),
+        (lambda: replace(LAB, levels=1), r"levels is 1; allowed: an integer in 2..65536"),
         (
             lambda: TakingGame(herders(10**6)),
             r"levels is 21; allowed for 1,000,000 agents: so many that they have fewer than 4,194,304 tot",
@@ -290,9 +284,6 @@ def test_a_game_without_gain_can_be_played_with_amounts_of_ones_own():
         (PAIR, torch.tensor([[-1, 0]]), r"has numbers from -1 to 0"),
         (PAIR, torch.tensor([[0.0, 1.0]]), r"is torch.float32 \[1, 2\]; allowed: int64 \[1, 2\]"),
         (PAIR, None, r"is missing"),
-        (replace(PAIR, levels=None), torch.tensor([[[0.0], [2.5]]]), r"from 0 to 2.5; allowed: 0 to 2"),
-        (replace(PAIR, levels=None), torch.tensor([[[0.0], [torch.nan]]]), r"has numbers from nan to nan"),
-        (replace(PAIR, levels=None), torch.tensor([[0, 1]]), r"int64 \[1, 2\]; allowed: float32 \[1, 2, 1\]"),
     ],
 )
 def test_actions_that_nobody_can_take_are_refused_and_change_nothing(game, action, message):
@@ -384,45 +375,31 @@ def test_a_population_trains_stops_resumes_loads_and_meets_another(tmp_path, mon
         cprl.crossplay([loaded, third], episodes=2)
 
 
-ACTOR_CRITIC = PR2ActorCritic(settings=replace(SMALL, epsilon_start=0.5), first_scale=0.5)
 TABLES = Tabular(settings=TabularSettings(epsilon_decay_steps=20))
 
 
 @pytest.mark.integration
 @pytest.mark.parametrize(
-    ("levels", "agents", "engine"),
+    ("agents", "engine"),
     [
-        pytest.param(5, [Learning(TABLES)] * 2, "eager", id="tables"),
-        pytest.param(None, [Learning(ACTOR_CRITIC)] * 2, "eager", id="continuous"),
+        pytest.param([Learning(TABLES)] * 2, "eager", id="tables"),
         pytest.param(
-            *(5, [Learning(DQN(settings=SMALL)), Learning(PPO(settings=ROLLOUTS))], "torchrl"),
+            *([Learning(DQN(settings=SMALL)), Learning(PPO(settings=ROLLOUTS))], "torchrl"),
             marks=pytest.mark.slow,
             id="stock TorchRL",
         ),
         pytest.param(
-            *(5, [Team(LOLA(settings=LOLASettings(rollout_steps=2, hidden_cells=(4,))), (0, 1))], "eager"),
+            *([Team(LOLA(settings=LOLASettings(rollout_steps=2, hidden_cells=(4,))), (0, 1))], "eager"),
             marks=pytest.mark.slow,
             id="LOLA",
         ),
     ],
 )
-def test_learners_of_every_kind_play_it(levels, agents, engine, tmp_path):
-    game = replace(EXPERIMENT.game, levels=levels)
-    experiment = replace(EXPERIMENT, game=game, agents=agents, episodes=3, engine=engine)
+def test_learners_of_every_kind_play_it(agents, engine, tmp_path):
+    experiment = replace(EXPERIMENT, agents=agents, episodes=3, engine=engine)
     run = cprl.load(cprl.run(experiment, tmp_path / "run", watch="off"))
     evaluated = cprl.evaluate_run(run, episodes=2).measures()["agent_1/return"].estimate
     assert -10 <= evaluated.value <= 50
-
-
-@pytest.mark.integration
-def test_levels_are_for_those_who_choose_and_numbers_for_those_who_do_not(tmp_path):
-    for game, agents, message in (
-        (replace(PAIR, levels=None), [Learning(DQN(settings=SMALL))] * 2, r"DQN.* actions of 1 numbers in 0"),
-        (PAIR, [Learning(ACTOR_CRITIC)] * 2, r"PR2ActorCritic.*5 actions to choose from"),
-    ):
-        with pytest.raises(ValueError, match=message):
-            cprl.run(replace(EXPERIMENT, game=game, agents=agents), tmp_path / "never", watch="off")
-    assert not (tmp_path / "never").exists()
 
 
 def test_two_games_differ_in_the_fields_that_differ():

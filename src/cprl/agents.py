@@ -8,7 +8,6 @@ import torch
 from torch import Tensor, nn
 from torchrl.envs import EnvBase
 
-from cprl.algorithms.base import refuse_actions
 from cprl.arguments import object_of, objects, texts
 from cprl.checks import MOST_SEED, checked, count
 from cprl.commons.game import Game
@@ -195,7 +194,6 @@ def _learner(spec: Learning | Team, spaces: Spaces, agents: tuple[int, ...], who
     sharing: dict[str, Any] = (
         {"share_parameters": True} if isinstance(spec, Team) and spec.share_parameters else {}
     )
-    refuse_actions(algorithm_of(spec), spaces)
     learner = algorithm_of(spec).make_learner(
         spaces, agents=agents, reward_kind=spec.reward, **sharing, **who
     )

@@ -27,7 +27,6 @@ from cprl.algorithms import (
     DistributionalDQN,
     DQNSettings,
     LOLASettings,
-    PR2ActorCritic,
     Reinforce,
     RolloutSettings,
     Tabular,
@@ -42,7 +41,6 @@ from cprl.commons.maps import Map
 from cprl.commons.observation import Observation
 from cprl.commons.rules import Rules
 from cprl.custom import Custom
-from cprl.envs.continuous import MaxOfTwoQuadratics
 from cprl.envs.matrix import MatrixGame
 from cprl.envs.taking import TakingGame
 from cprl.institutions import (
@@ -66,12 +64,12 @@ from cprl.theory import PowerWorth, SharingGame
 
 _OF_CPRL: Final[tuple[type[Any], ...]] = (
     *(Game, Map, Rules, Observation, Learning, Team, Scripted, Frozen),
-    *(MatrixGame, MaxOfTwoQuadratics, TakingGame, SharingGame, PowerWorth),
+    *(MatrixGame, TakingGame, SharingGame, PowerWorth),
     *(InequityAversion, SocialValueOrientation, Exchange),
     *(Boundaries, ClosedPatches, ClosedSeason, GraduatedSanctions, Levies, Mediation),
     *(Monitoring, Quota, Sanctioner, Tax, Vote),
     *(DQN, DistributionalDQN, CQL, SAC, IQL, PPO, A2C, Reinforce, VDN, QMIX, MAPPO, IPPO, MADDPG),
-    *(PR2, PR2ActorCritic, LOLA, Tabular),
+    *(PR2, LOLA, Tabular),
     *(DQNSettings, RolloutSettings, LOLASettings, TabularSettings, Bandit, MLP, Conv, GRU, LSTM),
     Custom,
 )

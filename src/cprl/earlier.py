@@ -66,7 +66,6 @@ def _fitting_run(
         ("observations", theirs.observation_shape, spaces.observation_shape),
         ("observations of the dtype", theirs.observation_dtype, spaces.observation_dtype),
         ("a number of actions of", theirs.actions, spaces.actions),
-        ("to choose", theirs.actions_text, spaces.actions_text),
     ]
     if game is not None and isinstance(run.game, Game):
         if is_to_decide and game.ballots:

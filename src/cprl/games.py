@@ -4,13 +4,12 @@ from typing import Any, Final
 
 from cprl.commons.game import Game
 from cprl.custom import Custom
-from cprl.envs.continuous import MaxOfTwoQuadratics
 from cprl.envs.make_env import PlayableGame
 from cprl.envs.matrix import MatrixGame
 from cprl.envs.taking import TakingGame
 from cprl.theory import PowerWorth
 
-OF_CPRL: Final[tuple[type[Any], ...]] = (Game, MatrixGame, MaxOfTwoQuadratics, TakingGame)
+OF_CPRL: Final[tuple[type[Any], ...]] = (Game, MatrixGame, TakingGame)
 """Games that a recipe holds as values, and whose chance follows from the seed alone."""
 
 

@@ -17,8 +17,7 @@ OBSERVATION: Final = (AGENTS, "observation")
 with C = 3 channels, 0..255."""
 
 ACTION: Final = (AGENTS, "action")
-"""int64 [B, N]: each agent's action, an index into `cprl.commons.rules.ACTIONS`; in games with continuous
-actions float32 [B, N, D]."""
+"""int64 [B, N]: each agent's action, an index into `cprl.commons.rules.ACTIONS`."""
 
 REWARD: Final = (AGENTS, "reward")
 """float32 [B, N, 1]: the reward of the turn, harvest - fines + transfers."""

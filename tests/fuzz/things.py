@@ -34,7 +34,6 @@ from cprl.algorithms import (
     DistributionalDQN,
     DQNSettings,
     LOLASettings,
-    PR2ActorCritic,
     Reinforce,
     RolloutSettings,
     Tabular,
@@ -42,7 +41,6 @@ from cprl.algorithms import (
     TeamAlgorithm,
 )
 from cprl.envs import make_env
-from cprl.envs.continuous import MaxOfTwoQuadratics
 from cprl.envs.matrix import MatrixGame, matching_pennies, prisoners_dilemma
 from cprl.envs.taking import TakingGame
 from cprl.institutions import (
@@ -112,14 +110,13 @@ EXAMPLES: Final[dict[type, tuple[Any, ...]]] = {
         Observation(agents_apart=True, scoreboard=True, stock_gauge=True),
     ),
     Game: (MEADOW, ALONE, GOVERNED, presets.game("single_basic")),
-    MaxOfTwoQuadratics: (MaxOfTwoQuadratics(), MaxOfTwoQuadratics(bound=6.0, steep_width=0.5)),
     MatrixGame: (prisoners_dilemma(), matching_pennies(turns=4, continue_prob=0.5, memory=2)),
     PowerWorth: (PowerWorth(), PowerWorth(top=23.0, factor=0.25, power=1.0)),
     CallableWorth: (CallableWorth(function=lambda total: 8 - total**3, most=2),),
     SharingGame: (herders(2), appropriation()),
     TakingGame: (
         *(TakingGame(herders(2)), TakingGame(appropriation(), turns=4, memory=2, continue_prob=0.5)),
-        TakingGame(herders(3), levels=None, most=1.5),
+        TakingGame(herders(3), levels=4, most=1.5),
     ),
     Boundaries: (Boundaries.strips(height=3, width=5, agents=2, step_fine=0.5),),
     Quota: (Quota(), Quota(share=0.5, window_steps=3, by_stock=True, fine=1.0)),
@@ -150,7 +147,6 @@ EXAMPLES: Final[dict[type, tuple[Any, ...]]] = {
     CQL: (CQL(settings=REPLAY),),
     SAC: (SAC(settings=REPLAY),),
     PR2: (PR2(settings=REPLAY, temperature=0.5, entropy_bonus=False),),
-    PR2ActorCritic: (PR2ActorCritic(settings=REPLAY, particles=2),),
     IQL: (IQL(settings=REPLAY),),
     PPO: (PPO(settings=ROLLOUTS),),
     A2C: (A2C(settings=ROLLOUTS),),

@@ -5,7 +5,6 @@ Modules, in the order in which one reads them:
     dqn           DQN and its variants, C51, CQL
     actor_critic  SAC, IQL
     pr2           PR2, which sees the actions of its peers
-    pr2_actor_critic  PR2 with continuous actions
     on_policy     PPO, A2C, REINFORCE
     teams         VDN, QMIX, MAPPO, IPPO
     lola          LOLA, by policy gradients or DiCE
@@ -20,7 +19,6 @@ from cprl.algorithms.lola import LOLA
 from cprl.algorithms.maddpg import MADDPG
 from cprl.algorithms.on_policy import A2C, PPO, Reinforce
 from cprl.algorithms.pr2 import PR2
-from cprl.algorithms.pr2_actor_critic import PR2ActorCritic
 from cprl.algorithms.tabular import Tabular
 from cprl.algorithms.teams import IPPO, MAPPO, QMIX, VDN
 from cprl.learners.lola.settings import LOLASettings
@@ -46,7 +44,6 @@ __all__ = [
     "LOLASettings",
     "OffPolicy",
     "OnPolicy",
-    "PR2ActorCritic",
     "Reinforce",
     "RolloutSettings",
     "Tabular",

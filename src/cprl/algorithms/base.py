@@ -50,10 +50,6 @@ _CHECKS: Final[dict[str, Check]] = {
     "estimator": one_of("policy_gradient", "dice"),
     "logit_penalty": _WEIGHT,
     "mixing_cells": count(1, MOST_CELLS),
-    "action_noise": number(0, 1e9),
-    "first_scale": number(1e-6, 1e6),
-    "value_scale": number(1e-6, 1e6),
-    "particles": count(2, 1024),
 }
 """Of the fields of cprl's algorithms; one of the same name means the same in each."""
 
@@ -75,9 +71,6 @@ class Algorithm:
     stochastic: ClassVar[bool] = False
     """Whether the acting network outputs the logits of a policy, from which actions are sampled; else it
     outputs action values, and actions are epsilon-greedy."""
-    has_continuous_actions: ClassVar[bool] = False
-    """Whether the acting network outputs an action of `Spaces.action_size` numbers, within their bounds; else
-    agents choose from `Spaces.actions`. A game of the other kind is refused."""
     loss_functions: ClassVar[tuple[str, ...]] = TORCHRL_DISTANCES
     """What its field `loss_function` may be, if it has one."""
     can_share_parameters: ClassVar[bool] = False
@@ -156,20 +149,12 @@ class OffPolicy(Algorithm):
     settings_kind: ClassVar[type[Any]] = DQNSettings
     can_share_parameters: ClassVar[bool] = True
     sees_peers_actions: ClassVar[bool] = False
-    """Whether "action" is [.., N] in place of [..], or [.., N, D] of continuous actions: first the agent's
-    own action, then those of the others in the order of their indices, whatever they learn by. Agents still
-    act on their own observations alone."""
-    action_noise: float = 0.0
-    """The standard deviation of the Gaussian noise that exploring agents add to continuous actions, in units
-    of actions; besides, they take a uniformly random one with the probability `epsilon` of the settings."""
+    """Whether "action" is [.., N] in place of [..]: first the agent's own action, then those of the others in
+    the order of their indices, whatever they learn by. Agents still act on their own observations alone."""
     noise_numbers: ClassVar[int] = 0
     """How many uniform numbers in 0..1 the loss reads for each transition, of each member of a team, to
     sample by: the entry "noise", float32 [.., noise_numbers] or [.., S, noise_numbers]. A loss that samples
     by torch's generator instead would make replicas depend on each other."""
-
-    def noise_numbers_in(self, spaces: Spaces) -> int:
-        """The `noise_numbers` of its loss in such spaces."""
-        return self.noise_numbers
 
     def make_learner(
         self, spaces: Spaces, *, agents: Sequence[int], engine: TrainingEngine = "compiled", **how: Any
@@ -177,7 +162,6 @@ class OffPolicy(Algorithm):
         """See `Algorithm`."""
         self._check_settings()
         _check_engine(engine)
-        refuse_actions(self, spaces)
         how |= {
             "agents": agents,
             "settings": self.settings,
@@ -185,8 +169,7 @@ class OffPolicy(Algorithm):
             "make_loss": self.make_loss,
             "stochastic": self.stochastic,
             "sees_peers": self.sees_peers_actions,
-            "noise_numbers": self.noise_numbers_in(spaces),
-            "action_noise": self.action_noise,
+            "noise_numbers": self.noise_numbers,
         }
         if engine == "torchrl":
             _refuse_sharing(how)
@@ -212,7 +195,6 @@ class OnPolicy(Algorithm):
         """See `Algorithm`."""
         self._check_settings()
         _check_engine(engine)
-        refuse_actions(self, spaces)
         how |= {
             "agents": agents,
             "settings": self.settings,
@@ -277,19 +259,6 @@ def _refuse_sharing(how: dict[str, Any]) -> None:
     if how.pop("share_parameters", False):
         raise ValueError(
             'share_parameters is True; allowed with engine="torchrl", which trains independent agents: False'
-        )
-
-
-def refuse_actions(algorithm: Any, spaces: Spaces) -> None:
-    """Raises a ValueError if an algorithm is for continuous actions and the game has a number of them to
-    choose from, or the other way round."""
-    checked("spaces", spaces, instance(Spaces, "a Spaces, e.g. Game.spaces"))
-    is_continuous = bool(getattr(algorithm, "has_continuous_actions", False))
-    if is_continuous != bool(spaces.action_size):
-        kind = "actions of numbers within bounds" if is_continuous else "a number of actions to choose from"
-        raise ValueError(
-            f"agents that learn by {type(algorithm).__name__} would have {spaces.actions_text}; allowed for "
-            f"it: {kind}"
         )
 
 

@@ -8,7 +8,7 @@ from torch import nn
 from torchrl.objectives import LossModule
 
 from cprl.algorithms.actor_critic import policy
-from cprl.algorithms.base import TeamAlgorithm, TrainingEngine, refuse_actions
+from cprl.algorithms.base import TeamAlgorithm, TrainingEngine
 from cprl.algorithms.on_policy import actor_and_critic
 from cprl.custom import Custom
 from cprl.learners.base import Learner
@@ -78,7 +78,6 @@ class LOLA(TeamAlgorithm):
         """See `Algorithm`."""
         self._refuse_torchrl(engine)
         self._check_settings()
-        refuse_actions(self, spaces)
         self._check_team(len(agents), reward_kind)
         return LOLALearner(
             spaces,

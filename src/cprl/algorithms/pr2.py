@@ -1,7 +1,7 @@
 """PR2: agents that learn the values of joint actions and expect their peers to answer."""
 
 from dataclasses import dataclass
-from typing import Any, ClassVar, Final
+from typing import ClassVar, Final
 
 from torch import nn
 from torchrl.objectives import LossModule, ValueEstimators
@@ -47,7 +47,7 @@ class PR2(OffPolicy):
     loss_functions: ClassVar[tuple[str, ...]] = DISTANCES
 
     def __post_init__(self) -> None:
-        check_temperature(self)
+        checked(f"{type(self).__name__}.temperature", self.temperature, _TEMPERATURE)
         super().__post_init__()
 
     def make_network(self, spaces: Spaces) -> nn.Module:
@@ -56,7 +56,11 @@ class PR2(OffPolicy):
         Raises:
             ValueError: for a game of one agent.
         """
-        check_peers(self, spaces)
+        if spaces.agents < 2:
+            raise ValueError(
+                f"{type(self).__name__} learns from the actions of its peers, and the game has "
+                f"{spaces.agents} agent; allowed: games of 2 agents or more; for one agent use DQN or SAC"
+            )
         peers, actions = spaces.agents - 1, spaces.actions
         values = network_of(
             spaces,
@@ -78,17 +82,3 @@ class PR2(OffPolicy):
         )
         loss.make_value_estimator(ValueEstimators.TD0, gamma=self.settings.gamma)
         return loss
-
-
-def check_peers(algorithm: object, spaces: Spaces) -> None:
-    """Raises a ValueError for an algorithm that learns from its peers' actions in a game of one agent."""
-    if spaces.agents < 2:
-        raise ValueError(
-            f"{type(algorithm).__name__} learns from the actions of its peers, and the game has "
-            f"{spaces.agents} agent; allowed: games of 2 agents or more; for one agent use DQN or SAC"
-        )
-
-
-def check_temperature(algorithm: Any) -> None:
-    """Raises a ValueError for a temperature that is no number above 0."""
-    checked(f"{type(algorithm).__name__}.temperature", algorithm.temperature, _TEMPERATURE)

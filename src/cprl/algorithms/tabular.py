@@ -4,7 +4,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any, ClassVar
 
-from cprl.algorithms.base import Algorithm, TrainingEngine, refuse_actions
+from cprl.algorithms.base import Algorithm, TrainingEngine
 from cprl.learners.base import Learner
 from cprl.learners.settings import TabularSettings
 from cprl.learners.tabular import TabularLearner, table_network
@@ -33,7 +33,6 @@ class Tabular(Algorithm):
         """See `Algorithm`; tables are neither compiled nor on a GPU."""
         self._check_settings()
         self._refuse_torchrl(engine)
-        refuse_actions(self, spaces)
         self.make_network(spaces)
         how.pop("device", None)
         return TabularLearner(spaces, agents=agents, settings=self.settings, **how)

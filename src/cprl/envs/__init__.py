@@ -6,7 +6,6 @@ Modules, in the order in which one reads them:
     commons_specs    what it takes and gives
     matrix/          MatrixGame, MatrixEnv: payoff tables, played once or several times
     taking/          TakingGame, TakingEnv: how much to take of what is shared, once or several times
-    continuous       MaxOfTwoQuadratics: two agents choose a number each
     joint_action_env  what such games share: specs, clock, steps
     rendering        images of the worlds, for `CommonsEnv.render`
     drivers          where the worlds run: CPU threads or a GPU

@@ -96,7 +96,11 @@ def spaces_of(env: EnvBase) -> Spaces:
     """
     arguments.object_of("env", env, EnvBase, "a TorchRL environment")
     observation, action = _spec(env, "observation"), _spec(env, "action")
-    actions = _actions(action)
+    if not isinstance(action, Categorical) or action.ndim != 2:
+        raise ValueError(
+            f'("agents", "action") has the spec {type(action).__name__} {list(action.shape)} of '
+            f"{action.dtype}; allowed: Categorical [worlds, agents]"
+        )
     worlds, agents = action.shape[:2]
     if observation.shape[:2] != action.shape[:2]:
         raise ValueError(
@@ -118,23 +122,8 @@ def spaces_of(env: EnvBase) -> Spaces:
         observation_shape=tuple(shape[2:]),
         observation_dtype=str(dtype).removeprefix("torch."),
         observation_scale=highest,
+        actions=int(action.n),
         vectors=vectors,
-        **actions,
-    )
-
-
-def _actions(spec: Any) -> dict[str, Any]:
-    """The fields of `Spaces` that say what agents may do."""
-    if isinstance(spec, Categorical) and spec.ndim == 2:
-        return {"actions": int(spec.n)}
-    if isinstance(spec, Bounded) and spec.ndim == 3 and spec.dtype == torch.float32:
-        low, high = (bound.unique().tolist() for bound in (spec.low, spec.high))
-        if len(low) == len(high) == 1:
-            return {"actions": 0, "action_size": spec.shape[-1], "action_low": low[0], "action_high": high[0]}
-    raise ValueError(
-        f'("agents", "action") has the spec {type(spec).__name__} {list(spec.shape)} of {spec.dtype}; '
-        "allowed: Categorical [worlds, agents], or Bounded [worlds, agents, numbers] of float32 with the "
-        "same bounds for all numbers"
     )
 
 

@@ -56,15 +56,6 @@ def check_learner(
     check_memory(f"{replicas} replicas of {len(agents)} agents", lanes * _LEAST_BYTES, "fewer replicas")
 
 
-def refuse_continuous(what: str, spaces: Spaces) -> None:
-    """Raises a ValueError if actions are continuous, for what needs a number of them to choose from."""
-    if spaces.action_size:
-        raise ValueError(
-            f"agents have {spaces.actions_text}; allowed for {what}: a number of actions to choose from; "
-            "actions of numbers are for an algorithm whose `has_continuous_actions` is True"
-        )
-
-
 def check_networks(network: nn.Module, lanes: int, device: str | torch.device) -> None:
     """Raises a TooLargeError if a device has too little memory to train a network like this for each lane."""
     size = sum(value.numel() * value.element_size() for value in network.parameters())

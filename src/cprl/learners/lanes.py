@@ -85,7 +85,6 @@ class Lanes:
         start_from: the weights with which the acting networks of lanes start, see `StartFrom`.
         share_parameters: whether the agents of a replica share one network, initialised as that of the first.
         sees_peers: whether a lane's stored action is that of all N agents, see `transitions.joint_actions`.
-        action_noise: of continuous actions, see `ContinuousLaneActor`.
 
     Raises:
         ValueError: if agents observe entries that networks do not read.
@@ -104,7 +103,6 @@ class Lanes:
         start_from: StartFrom | None = None,
         share_parameters: bool = False,
         sees_peers: bool = False,
-        action_noise: float = 0.0,
     ) -> None:
         refuse_unseen(spaces)
         self.spaces, self.agents, self.replicas, self.seed = spaces, tuple(agents), replicas, seed
@@ -113,7 +111,6 @@ class Lanes:
         self._start_from, self.sees_peers = weights_to_start(start_from), sees_peers
         self.sharing = len(self.agents) if share_parameters else 1
         """The number of agents that share a network."""
-        self._action_noise = action_noise
         self.state_cells = 0
         """The numbers H of the state of an acting network; known once there are networks, 0 for those without
         a state."""
@@ -133,8 +130,8 @@ class Lanes:
 
     @property
     def action_shape(self) -> tuple[int, ...]:
-        """The shape of a lane's stored action: () or (D,), with a first axis N if it sees those of peers."""
-        return *((self.spaces.agents,) if self.sees_peers else ()), *self.spaces.action_shape
+        """The shape of a lane's stored action: (), or (N,) if it sees those of peers."""
+        return (self.spaces.agents,) if self.sees_peers else ()
 
     @property
     def member_shape(self) -> tuple[int, ...]:
@@ -220,7 +217,6 @@ class Lanes:
             seeds=self.seeds(EXPLORATION),
             agents=len(self.agents),
             stochastic=self.stochastic,
-            noise=self._action_noise,
             state_cells=self.state_cells,
             compile=compile and not is_list(engine),
         )

@@ -12,7 +12,7 @@ from torch import Tensor, nn
 from cprl import keys
 from cprl.learners.buffer.gather import Horizon
 from cprl.learners.buffer.sampler import lane_buffer, transformed
-from cprl.learners.checks import check_learner, refuse_continuous, refuse_unshared_reward
+from cprl.learners.checks import check_learner, refuse_unshared_reward
 from cprl.learners.engine.base import Engine
 from cprl.learners.engine.choice import TRIAL_LANES, EngineName, make_engine, trial_batch
 from cprl.learners.engine.functional import MakeLoss
@@ -67,7 +67,6 @@ class ReplayLearner:
             others, such as critics, are new.
         share_parameters: whether the agents of a replica share one network, which learns from all of them.
         sees_peers: whether transitions have the actions of all agents, see `transitions.joint_actions`.
-        action_noise: of continuous actions, see `cprl.policies.lanes.ContinuousLaneActor`.
         device: the torch device of networks, buffers and updates.
 
     Raises:
@@ -98,13 +97,10 @@ class ReplayLearner:
         start_from: StartFrom | None = None,
         share_parameters: bool = False,
         sees_peers: bool = False,
-        action_noise: float = 0.0,
         device: str | torch.device = "cpu",
     ) -> None:
         refuse_unshared_reward(is_sharing=bool(make_team) and not own_rewards, reward_kind=reward_kind)
         check_learner(spaces, settings, DQNSettings, agents, replicas, first_replica, seed, reward_kind)
-        if make_network is None or make_loss is None or settings.mean_over_all_outputs:
-            refuse_continuous("a learner of action values", spaces)
         self.spaces, self.settings, self.agents = spaces, settings, tuple(agents)
         self.replicas, self.seed, self.wants = replicas, seed, WantedRewards(reward_kind)
         self._lanes = lanes_of(
@@ -120,14 +116,12 @@ class ReplayLearner:
             start_from=start_from,
             share_parameters=share_parameters,
             sees_peers=sees_peers,
-            action_noise=action_noise,
         )
         make_loss = make_loss or partial(dqn_loss, gamma=settings.gamma)
         self._shapes: dict[str, Any] = {
             "observation_shape": self._lanes.observation_shape,
             "action_shape": self._lanes.action_shape,
             "reward_shape": self._lanes.reward_shape,
-            "action_dtype": spaces.action_dtype,
             "noise_shape": (*self._lanes.member_shape, noise_numbers) if noise_numbers else (),
             "observation_dtype": spaces.observation_dtype,
             "horizon": Horizon(settings.n_steps, settings.gamma) if settings.n_steps > 1 else None,
@@ -243,8 +237,8 @@ class ReplayLearner:
 
     def values(self, batch: TensorDictBase) -> Tensor:
         """The highest action value of each agent at the end of a turn, [R, S]; NaN where its network
-        outputs a policy, or a continuous action."""
-        if self._lanes.stochastic or self.spaces.action_size:
+        outputs a policy."""
+        if self._lanes.stochastic:
             return torch.full((self.replicas, len(self.agents)), torch.nan)
         seen = [self._lanes.seen_next(batch)]
         if self._state_cells:

@@ -11,7 +11,7 @@ from torch import Tensor, nn
 from cprl.learners.advantages import advantages
 from cprl.learners.buffer.rollout import refuse_full, rollout_fields, write_turn
 from cprl.learners.buffer.sampler import steps_ahead
-from cprl.learners.checks import check_learner, refuse_continuous, refuse_other_parts
+from cprl.learners.checks import check_learner, refuse_other_parts
 from cprl.learners.engine.base import Engine
 from cprl.learners.engine.choice import TRIAL_LANES, EngineName, make_engine, trial_batch, trial_rollout
 from cprl.learners.engine.functional import MakeLoss
@@ -80,7 +80,6 @@ class RolloutLearner:
         device: str | torch.device = "cpu",
     ) -> None:
         check_learner(spaces, settings, RolloutSettings, agents, replicas, first_replica, seed, reward_kind)
-        refuse_continuous("a learner from rollouts", spaces)
         self.spaces, self.settings, self.agents = spaces, settings, tuple(agents)
         self.replicas, self.seed, self.wants = replicas, seed, WantedRewards(reward_kind)
         self._lanes = lanes_of(

@@ -22,7 +22,7 @@ from tensordict import TensorDictBase
 from torch import Tensor, nn
 
 from cprl import keys
-from cprl.learners.checks import check_learner, refuse_continuous
+from cprl.learners.checks import check_learner
 from cprl.learners.lanes import EVALUATION, EXPLORATION, StartFrom, lane_names, lane_seeds, weights_to_start
 from cprl.learners.settings import TabularSettings
 from cprl.learners.transitions import lane_turn, wanted_in
@@ -65,7 +65,6 @@ class TabularLearner:
         start_from: StartFrom | None = None,
     ) -> None:
         check_learner(spaces, settings, TabularSettings, agents, replicas, first_replica, seed, reward_kind)
-        refuse_continuous("tables", spaces)
         self.spaces, self.settings, self.seed, self.agents = spaces, settings, seed, tuple(agents)
         self.wants, start = WantedRewards(reward_kind), weights_to_start(start_from)
         self.replicas, self._numbers = replicas, range(first_replica, first_replica + replicas)

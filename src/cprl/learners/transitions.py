@@ -19,8 +19,7 @@ class LaneTurn(NamedTuple):
     observation: Any
     """uint8 [L, C, X, Y]."""
     action: Any
-    """int64 [L], or float32 [L, D]; with an axis N after L for lanes that see the actions of their peers, see
-    `joint_actions`."""
+    """int64 [L], or [L, N] for lanes that see the actions of their peers, see `joint_actions`."""
     next_observation: Any
     """uint8 [L, C, X, Y]."""
     reward: Any
@@ -50,7 +49,7 @@ def lane_turn(agents: tuple[int, ...], batch: TensorDictBase, rewards: Any = Non
     entry = keys.entry
     before, after = entry(batch, keys.AGENTS), entry(batch, "next")
     agents_after = entry(after, keys.AGENTS)
-    observation, action = array_of(entry(before, "observation")), entry(before, "action")
+    observation = array_of(entry(before, "observation"))
     everyone = list(agents) == list(range(observation.shape[1]))
     lanes, windows, at = len(observation) * len(agents), observation.shape[2:], list(agents)
 
@@ -67,7 +66,7 @@ def lane_turn(agents: tuple[int, ...], batch: TensorDictBase, rewards: Any = Non
 
     return LaneTurn(
         of(entry(before, "observation"), *windows),
-        of(action, *action.shape[2:]),
+        of(entry(before, "action")),
         of(entry(agents_after, "observation"), *windows),
         of(entry(agents_after, "reward")) if rewards is None else picked(rewards),
         of_world(entry(after, keys.DONE)),
@@ -83,14 +82,13 @@ def joint_actions(agents: tuple[int, ...], batch: TensorDictBase) -> Any:
         batch: a turn of every replica, see `lane_turn`.
 
     Returns:
-        int64 [R x S, N], or float32 [R x S, N, D]: first a lane's own action, then the others' in the order
-        of their indices. They are those that agents chose, also where an agent was out of play and its action
-        did not count.
+        int64 [R x S, N]: first a lane's own action, then the others' in the order of their indices. They are
+        those that agents chose, also where an agent was out of play and its action did not count.
     """
     actions = array_of(keys.entry(keys.entry(batch, keys.AGENTS), "action"))
     everyone = actions.shape[1]
     order = [[own, *(other for other in range(everyone) if other != own)] for own in agents]
-    return actions[:, order].reshape(len(actions) * len(agents), everyone, *actions.shape[2:])
+    return actions[:, order].reshape(len(actions) * len(agents), everyone)
 
 
 def wanted_in(wants: WantedRewards, batch: TensorDictBase) -> Any:

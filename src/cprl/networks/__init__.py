@@ -7,10 +7,7 @@ Modules, in the order in which one reads them:
     specification  Network: which of them an algorithm has; networks of your own
     agent          several networks of one agent that learn together
     distributional distributions of returns
-    bounded        outputs within bounds: continuous actions
-    gaussian       the same with a scale, a Gaussian policy
     joint          values of the actions of several agents together
-    answering      the same for continuous actions, and how peers answer them
     team           the networks of a team
     recurrent_team the same for recurrent ones
     stacked        the networks of many lanes as one

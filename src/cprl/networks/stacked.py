@@ -8,21 +8,11 @@ import torch
 from torch import Tensor, nn
 
 from cprl.networks.agent import AgentNetworks
-from cprl.networks.answering import AnswerSampler, JointCritic
-from cprl.networks.bounded import BoundedNetwork
 from cprl.networks.distributional import AtomNetwork
-from cprl.networks.gaussian import GaussianNetwork
 from cprl.networks.joint import JointNetwork
 from cprl.networks.mlp import MLPNetwork
 
-_OVER_ANOTHER: Final = (
-    AnswerSampler,
-    AtomNetwork,
-    BoundedNetwork,
-    GaussianNetwork,
-    JointCritic,
-    JointNetwork,
-)
+_OVER_ANOTHER: Final = AtomNetwork, JointNetwork
 """Networks that compute with the outputs of another, their attribute `network`; weights of their own get a
 lane axis in front."""
 

@@ -5,8 +5,6 @@ Modules, in the order in which one reads them:
     log_cosh          ln cosh of an error, and TorchRL's DQN loss with it
     td_loss           what losses share whose targets bootstrap by one step
     pr2               probabilistic recursive reasoning: joint action values, the peers' expected answers
-    stein             how particles, here samples of those answers, move towards a density
-    pr2_actor_critic  the same for continuous actions, with an actor, a critic and a sampler of answers
     lola              gradients and losses that look one learning step of the others ahead
     dice              what rollouts say of returns, differentiable any number of times
     lola_losses       LOLALoss, LOLADiCELoss: the two put together for policies
@@ -20,14 +18,12 @@ from cprl.objectives.lola import lola_gradients, look_ahead_losses, looked_ahead
 from cprl.objectives.lola_losses import LOLADiCELoss, LOLALoss
 from cprl.objectives.maddpg import MADDPGLoss
 from cprl.objectives.pr2 import PR2Loss
-from cprl.objectives.pr2_actor_critic import PR2ActorCriticLoss
 
 __all__ = [
     "LOLADiCELoss",
     "LOLALoss",
     "LogCoshDQNLoss",
     "MADDPGLoss",
-    "PR2ActorCriticLoss",
     "PR2Loss",
     "dice_objective",
     "iterated_value",

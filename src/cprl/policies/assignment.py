@@ -33,7 +33,7 @@ class AgentPolicies(TensorDictModuleBase):
         decisions: what the agents decide, where a game asks them (`Game.decisions`); None in other games.
 
     Reads ("agents", "observation"), uint8 [B, N, C, X, Y], and the other entries of "agents" that an actor's
-    `in_keys` name, e.g. "stock_gauge"; writes ("agents", "action"), int64 [B, N], or float32 [B, N, D].
+    `in_keys` name, e.g. "stock_gauge"; writes ("agents", "action"), int64 [B, N].
     Where actors are recurrent it also reads "recurrent_state" and writes it and "recurrent_state_before".
     With decisions it also reads "ballots_due", and writes ("agents", "decision"), int64 [B, N].
 
@@ -115,9 +115,7 @@ class AgentPolicies(TensorDictModuleBase):
             index = (*[slice(None)] * dim, at)
             action = self._choose(actor, agents, index, tensordict.batch_size)
             if chosen is None:
-                own = action.shape[dim + isinstance(indices, tuple) :]  # (D,) of continuous actions
-                kind = action.dtype if action.is_floating_point() else torch.int64
-                chosen = observation.new_empty((*observation.shape[: dim + 1], *own), dtype=kind)
+                chosen = observation.new_empty(observation.shape[: dim + 1], dtype=torch.int64)
             chosen[index] = action
         agents.set("action", chosen)
         return tensordict

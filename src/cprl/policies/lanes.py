@@ -129,7 +129,7 @@ class LaneActor(TensorDictModuleBase):
         return (numbers.view(-1, self.worlds, 2)[..., 1] * self.actions).long()
 
     def _by_replica(self, actions: Tensor) -> Tensor:
-        """Reshapes [L, k] to [R x k, S], or [L, k, D] to [R x k, S, D]."""
+        """Reshapes [L, k, ...] to [R x k, S, ...]."""
         more = actions.shape[2:]
         chosen = actions.view(self.replicas, self.agents, self.worlds, *more).transpose(1, 2)
         return chosen.reshape(-1, self.agents, *more)
@@ -178,90 +178,6 @@ class LaneActor(TensorDictModuleBase):
         return by_lane.reshape(-1, self.worlds, *shape)
 
 
-class ContinuousLaneActor(LaneActor):
-    """Chooses actions of D numbers for S agents of every replica; other arguments are those of `LaneActor`.
-
-    Exploring agents take a uniformly random action with the probability `epsilon`; else they add Gaussian
-    noise to what their network gives. Actions stay within their bounds.
-
-    Args:
-        values: maps observations [L, k, ...] to actions [L, k, D]; None for agents that act at random.
-        spaces: the number of numbers D and their bounds.
-        noise: the standard deviation of the noise, in units of actions.
-    """
-
-    def __init__(
-        self,
-        values: Callable[[Tensor], Tensor] | None,
-        spaces: Spaces,
-        *,
-        seeds: Sequence[Sequence[int]],
-        agents: int,
-        worlds: int = 1,
-        noise: float = 0.0,
-        first: Callable[[], Callable[[Tensor], Tensor]] | None = None,
-        compile: bool = False,
-    ) -> None:
-        how: dict[str, Any] = {"seeds": seeds, "agents": agents, "worlds": worlds}
-        super().__init__(values, 1, first=first, compile=compile, **how)
-        self.spaces = spaces
-        self.noise = arguments.number("noise", noise, low=0, high=1e9, allowed="a number of at least 0")
-        self._count = 1 + 2 * spaces.action_size
-        self.rng = LaneRng(seeds, self._count * self.worlds)
-
-    def _alike(self, values: Callable[..., Any], **lanes: Any) -> LaneActor:
-        """See `LaneActor`."""
-        return ContinuousLaneActor(values, self.spaces, noise=self.noise, **lanes)
-
-    def preferences(self, observation: Tensor, state: Tensor | None = None) -> Tensor | None:
-        """None: there is no value or probability for each action."""
-        return None
-
-    def _explored(self, observation: Tensor, numbers: Tensor, epsilon: Tensor) -> Tensor:
-        """Exploring actions, float32 [R x k, S, D]."""
-        drawn = numbers.view(-1, self.worlds, self._count)
-        chosen = self._best(observation)
-        if self.noise:
-            spread = torch.special.ndtri(drawn[..., 1 + self.spaces.action_size :].clamp(1e-12, 1 - 1e-12))
-            chosen = self._bounded(chosen + self.noise * spread)
-        return self._by_replica(torch.where(drawn[..., :1] < epsilon, self._random(numbers), chosen))
-
-    def _random(self, numbers: Tensor) -> Tensor:
-        """Random actions of each lane, float32 [L, k, D]."""
-        low, high = self.spaces.action_low, self.spaces.action_high
-        drawn = numbers.view(-1, self.worlds, self._count)[..., 1 : 1 + self.spaces.action_size]
-        return self._bounded(low + (high - low) * drawn)
-
-    def _best(self, observation: Tensor) -> Tensor:
-        """What each lane's network gives, float32 [L, k, D]."""
-        return self._bounded(self._values(observation))
-
-    def _bounded(self, action: Tensor) -> Tensor:
-        return action.to(torch.float32).clamp(self.spaces.action_low, self.spaces.action_high)
-
-
-def lane_actor(
-    values: Callable[[Tensor], Tensor] | None,
-    spaces: Spaces,
-    *,
-    stochastic: bool = False,
-    noise: float = 0.0,
-    **how: Any,
-) -> LaneActor:
-    """The actor for what agents may do: a `ContinuousLaneActor` or a `LaneActor`, see there.
-
-    Raises:
-        ValueError: for noise where agents choose from a number of actions, and for logits where they do not.
-    """
-    if not spaces.action_size:
-        if noise:
-            raise arguments.refusal("noise", noise, f"0 for agents that have {spaces.actions_text}")
-        return LaneActor(values, spaces.actions, stochastic=stochastic, **how)
-    if stochastic:
-        raise arguments.refusal("stochastic", stochastic, f"False for agents that have {spaces.actions_text}")
-    return ContinuousLaneActor(values, spaces, noise=noise, **how)
-
-
 def random_agents(
     spaces: Spaces, agents: tuple[int, ...], *, replicas: int, seed: int, worlds: int = 1
 ) -> dict[int | tuple[int, ...], nn.Module]:
@@ -277,7 +193,5 @@ def random_lanes(
     actions: int | Spaces, *, seeds: Sequence[Sequence[int]], agents: int, worlds: int = 1
 ) -> LaneActor:
     """An actor of agents that act uniformly at random, given how many actions there are or the spaces."""
-    how: dict[str, Any] = {"seeds": seeds, "agents": agents, "worlds": worlds}
-    return (
-        lane_actor(None, actions, **how) if isinstance(actions, Spaces) else LaneActor(None, actions, **how)
-    )
+    count = actions.actions if isinstance(actions, Spaces) else actions
+    return LaneActor(None, count, seeds=seeds, agents=agents, worlds=worlds)

@@ -10,7 +10,7 @@ from torchrl.envs.utils import ExplorationType, exploration_type
 
 from cprl import arguments
 from cprl.compiling import Compiled
-from cprl.policies.lanes import LaneActor, lane_actor
+from cprl.policies.lanes import LaneActor
 from cprl.spaces import Spaces
 
 
@@ -90,12 +90,8 @@ class RecurrentLaneActor(LaneActor):
 def actor_of_lanes(
     values: Callable[..., Any] | None, spaces: Spaces, *, state_cells: int = 0, **how: Any
 ) -> LaneActor:
-    """The actor for networks with states of so many numbers, or without: a `RecurrentLaneActor`, or what
-    `lane_actor` gives for the other arguments."""
+    """The actor for networks with states of so many numbers, or without: a `RecurrentLaneActor` or a
+    `LaneActor`."""
     if not state_cells or values is None:
-        return lane_actor(values, spaces, **how)
-    if spaces.action_size:
-        allowed = f"0 for agents that have {spaces.actions_text}"
-        raise arguments.refusal("state_cells", state_cells, allowed)
-    how.pop("noise", None)
+        return LaneActor(values, spaces.actions, **how)
     return RecurrentLaneActor(values, spaces.actions, state_cells=state_cells, **how)

@@ -5,12 +5,11 @@ from typing import Any, Final
 import numpy as np
 import torch
 from torch import Tensor
-from torchrl.data import Bounded, Categorical, TensorSpec
+from torchrl.data import Categorical, TensorSpec
 
 from cprl import arguments
 from cprl.envs.joint_action_env import JointActionEnv
 from cprl.envs.taking.game import TakingGame
-from cprl.theory.worth import PowerWorth
 
 OBSERVED: Final = ("played", "own", "total")
 """The numbers by which an agent observes a turn: 1 if there was such a turn, the share that it took of the
@@ -20,8 +19,8 @@ most that it can take, and the share that all took of the most that all can take
 class TakingEnv(JointActionEnv):
     """B worlds of a `TakingGame`, batch size [B], all agents in the group "agents".
 
-    Entries: ("agents", "action") int64 [B, N], a level, or float32 [B, N, 1], an amount;
-    ("agents", "reward") float32 [B, N, 1], computed in double precision; done, terminated and truncated bool
+    Entries: ("agents", "action") int64 [B, N], a level; ("agents", "reward") float32 [B, N, 1],
+    computed in double precision; done, terminated and truncated bool
     [B, 1]; and ("agents", "observation") float32: where nothing is remembered the number 1, [B, N, 1]; else
     the numbers of `OBSERVED` of each remembered turn, the last one first; all 0 for a turn before the first.
 
@@ -59,52 +58,38 @@ class TakingEnv(JointActionEnv):
             device=device,
             first_world=first_world,
         )
-        if game.levels is not None:
-            sharing, totals = game.sharing, game.agents * (game.levels - 1) + 1
-            taken = np.linspace(0, game.agents * game.most_each, totals)
-            gains = np.vectorize(sharing.worth.at, otypes=[np.float64])(taken) - sharing.cost
-            self._amounts = torch.tensor(game.amounts, dtype=torch.float64, device=self.device)
-            self._gains = torch.from_numpy(gains).to(self.device)
-            """What a unit is worth beyond its cost, by the sum of all levels."""
+        sharing, totals = game.sharing, game.agents * (game.levels - 1) + 1
+        taken = np.linspace(0, game.agents * game.most_each, totals)
+        gains = np.vectorize(sharing.worth.at, otypes=[np.float64])(taken) - sharing.cost
+        self._amounts = torch.tensor(game.amounts, dtype=torch.float64, device=self.device)
+        self._gains = torch.from_numpy(gains).to(self.device)
+        """What a unit is worth beyond its cost, by the sum of all levels."""
         shape = (*self._agents_size, self._remembered, len(OBSERVED))
         self.register_buffer("seen", torch.zeros(shape, device=self.device))
 
     def _action_spec(self, shape: torch.Size) -> TensorSpec:
-        if self.game.levels is not None:
-            return Categorical(self.game.levels, shape=shape, dtype=torch.int64)
-        return Bounded(0, self.game.most_each, shape=(*shape, 1), dtype=torch.float32)
+        return Categorical(self.game.levels, shape=shape, dtype=torch.int64)
 
     def checked_action(self, action: Any) -> Tensor:
-        """int64 [B, N], levels, or float32 [B, N, 1], amounts; raises a ValueError for anything else."""
-        levels, size = self.game.levels, list(self._agents_size)
-        dtype, size = (torch.float32, [*size, 1]) if levels is None else (torch.int64, size)
-        if not isinstance(action, Tensor) or action.dtype != dtype or list(action.shape) != size:
+        """int64 [B, N], levels; raises a ValueError for anything else."""
+        size, most = list(self._agents_size), self.game.levels - 1
+        if not isinstance(action, Tensor) or action.dtype != torch.int64 or list(action.shape) != size:
             kind = f"{action.dtype} {list(action.shape)}" if isinstance(action, Tensor) else type(action)
-            allowed = str(dtype).removeprefix("torch.")
-            raise ValueError(f'("agents", "action") is {kind}; allowed: {allowed} {size}')
+            raise ValueError(f'("agents", "action") is {kind}; allowed: int64 {size}')
         least, largest = action.aminmax()
-        most = self.game.most_each if levels is None else levels - 1
-        if not (least >= 0 and largest <= most):  # NaN is refused too
+        if least < 0 or largest > most:
             raise ValueError(
                 f'("agents", "action") has numbers from {least.item():g} to {largest.item():g}; allowed: 0 '
-                f"to {most:g}"
+                f"to {most}"
             )
         return action
 
     def pay(self, action: Tensor, over: Tensor | None) -> Tensor:
         """The payoffs of what was taken, [B, N], which agents remember."""
-        sharing, levels = self.game.sharing, self.game.levels
-        if levels is None:
-            own, each = action.squeeze(-1).double(), self.game.most_each
-            total = own.sum(-1, keepdim=True)
-            gains = _worth(sharing.worth, total) - sharing.cost
-            paid = own * gains + sharing.payment
-        else:
-            own, each = action, levels - 1
-            total = own.sum(-1, keepdim=True)
-            paid = self._amounts[own] * self._gains[total] + sharing.payment
+        total, most = action.sum(-1, keepdim=True), self.game.levels - 1
+        paid = self._amounts[action] * self._gains[total] + self.game.sharing.payment
         if self._remembered:
-            self._remember(own / each, total / (each * self.game.agents), over)
+            self._remember(action / most, total / (most * self.game.agents), over)
         return paid.float()
 
     def _remember(self, own: Tensor, total: Tensor, over: Tensor | None) -> None:
@@ -127,10 +112,3 @@ class TakingEnv(JointActionEnv):
         seen: Any = self._buffers["seen"]
         marked = torch.ones_like(seen, dtype=torch.bool) if which is None else which[..., None, None]
         self._buffers["seen"] = seen.masked_fill(marked, 0.0)
-
-
-def _worth(worth: Any, total: Tensor) -> Tensor:
-    """`PowerWorth.at` of totals."""
-    assert isinstance(worth, PowerWorth)
-    values: Tensor = worth.top - worth.factor * total**worth.power
-    return values.clamp(min=0.0)

@@ -7,7 +7,6 @@ import numpy as np
 
 from cprl.checks import NONE, Check, check_fields, count, either, instance, is_number
 from cprl.theory.sharing import SharingGame
-from cprl.theory.worth import PowerWorth
 
 if TYPE_CHECKING:
     from cprl.envs.taking.env import TakingEnv
@@ -21,13 +20,13 @@ class TakingGame:
     """A game in which each of n agents chooses, all at once, how much it takes of what they share.
 
     Agents are paid `SharingGame.payoffs`. They choose one of `levels` evenly spaced amounts from 0 to
-    `most_each`, or, without levels, any number in between. Where it is played for several turns, agents
+    `most_each`. Where it is played for several turns, agents
     observe what they took in the last ones. An episode of one turn terminates. One of several is truncated:
     its end is a clock that nobody sees, so agents learn as if it went on; with a `continue_prob` below 1 it
     terminates where no further turn follows.
 
     A recipe holds games whose worth is a `PowerWorth`. A worth of your own, e.g. a `CallableWorth`, can be
-    played by levels; in an experiment the game is then a `Custom` of a function that makes it.
+    played; in an experiment the game is then a `Custom` of a function that makes it.
 
     Raises:
         ValueError: names the field, what came and what is allowed.
@@ -36,8 +35,8 @@ class TakingGame:
     sharing: SharingGame
     """What agents are paid, and how many they are; e.g. `cprl.theory.herders(5)`."""
     _: KW_ONLY
-    levels: int | None = 21
-    """From how many evenly spaced amounts an agent chooses, 0 the first; None for continuous actions."""
+    levels: int = 21
+    """From how many evenly spaced amounts an agent chooses, 0 the first."""
     most: float | None = None
     """The most that an agent can take in a turn. By default twice what it takes in the symmetric equilibrium,
     or what the game itself allows, `SharingGame.most_each`, if that is less."""
@@ -63,10 +62,7 @@ class TakingGame:
             )
         if self.most is not None and limit is not None and self.most > limit:
             raise ValueError(f"{name}.most is {self.most:g}; allowed: up to sharing.most_each, {limit:g}")
-        if self.levels is None and not isinstance(self.sharing.worth, PowerWorth):
-            kind = type(self.sharing.worth).__name__
-            raise ValueError(f"{name}.levels is None; allowed with a {kind}: 2 or more, or a PowerWorth")
-        if self.levels is not None and self.agents * (self.levels - 1) >= _MOST_TOTALS:
+        if self.agents * (self.levels - 1) >= _MOST_TOTALS:
             raise ValueError(
                 f"{name}.levels is {self.levels}; allowed for {self.agents:,} agents: so many that they have "
                 f"fewer than {_MOST_TOTALS:,} totals"
@@ -87,8 +83,8 @@ class TakingGame:
 
     @property
     def amounts(self) -> tuple[float, ...]:
-        """What an agent takes by its action 0, 1 and so on; empty where actions are continuous."""
-        return () if self.levels is None else tuple(np.linspace(0, self.most_each, self.levels).tolist())
+        """What an agent takes by its action 0, 1 and so on."""
+        return tuple(np.linspace(0, self.most_each, self.levels).tolist())
 
     @property
     def remembered(self) -> int:
@@ -115,7 +111,7 @@ def _is_positive(value: Any) -> bool:
 
 _CHECKS: Final[dict[str, Check]] = {
     "sharing": instance(SharingGame, "a cprl.theory.SharingGame, e.g. herders(5)"),
-    "levels": either(NONE, count(2, 2**16)),
+    "levels": count(2, 2**16),
     "most": either(NONE, Check(_is_positive, f"a number above 0, up to {_MOST:g}")),
     "turns": count(1),
     "memory": either(NONE, count(0, 64)),

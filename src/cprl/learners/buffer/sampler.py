@@ -143,7 +143,6 @@ def lane_buffer(
     batch_size: int,
     observation_shape: Sequence[int],
     action_shape: Sequence[int] = (),
-    action_dtype: str = "int64",
     reward_shape: Sequence[int] = (),
     noise_shape: Sequence[int] = (),
     noise_seeds: Sequence[Sequence[int]] | None = None,
@@ -160,9 +159,7 @@ def lane_buffer(
         transitions: capacity per lane.
         batch_size: transitions sampled per lane, or sequences.
         observation_shape: (C, X, Y); (S, C, X, Y) if a lane is a team of S agents.
-        action_shape: the shape of a lane's action: () for one agent, (S,) for a team; with D last if actions
-            are continuous.
-        action_dtype: see `Spaces.action_dtype`.
+        action_shape: the shape of a lane's action: () for one agent, (S,) for a team.
         reward_shape: the shape of a lane's reward: (S,) for a team whose members have their own, else ().
         noise_shape: of the uniform numbers that the loss reads with each transition: the entry "noise",
             float32 [L, b, *noise_shape]; () for none.
@@ -180,13 +177,11 @@ def lane_buffer(
     """
     dtype = torch_dtype(observation_dtype)
     shapes: dict[str, Any] = {"action_shape": action_shape, "reward_shape": reward_shape}
-    kind = torch_dtype(action_dtype)
     needed = storage_bytes(
         len(seeds),
         transitions,
         observation_shape,
         item_bytes=dtype.itemsize,
-        action_bytes=kind.itemsize,
         state_cells=state_cells,
         **shapes,
     )
@@ -210,7 +205,6 @@ def lane_buffer(
         lanes=len(seeds),
         transitions=transitions,
         observation_shape=observation_shape,
-        action_dtype=kind,
         dtype=dtype,
         horizon=horizon,
         state_cells=state_cells,

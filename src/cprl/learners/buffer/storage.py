@@ -44,7 +44,6 @@ def storage_bytes(
     observation_shape: Sequence[int],
     *,
     action_shape: Sequence[int] = (),
-    action_bytes: int = 8,
     reward_shape: Sequence[int] = (),
     item_bytes: int = 1,
     state_cells: int = 0,
@@ -56,15 +55,12 @@ def storage_bytes(
         transitions: the capacity per lane, T.
         observation_shape: (C, X, Y).
         action_shape: the shape of a lane's action.
-        action_bytes: bytes of one number of it.
         reward_shape: the shape of its reward.
         item_bytes: bytes of one number of an observation.
         state_cells: the numbers of a recurrent state.
     """
     windows = _rows(transitions) * (prod(observation_shape) * item_bytes + 4 * state_cells)
-    return lanes * (
-        windows + transitions * (action_bytes * prod(action_shape) + 4 * prod(reward_shape) + 8 + 1 + 1)
-    )
+    return lanes * (windows + transitions * (8 * prod(action_shape) + 4 * prod(reward_shape) + 8 + 1 + 1))
 
 
 def _rows(transitions: int) -> int:
@@ -81,7 +77,6 @@ class LaneStorage(Storage):
         transitions: the capacity per lane, T.
         observation_shape: (C, X, Y); (S, C, X, Y) if a lane is a team of S agents.
         action_shape: the shape of a lane's action: () for one agent, (S,) for a team.
-        action_dtype: its dtype.
         reward_shape: the shape of a lane's reward: (S,) for a team whose members have their own, else ().
         dtype: the dtype of observations.
         horizon: steps and discount of the returns that `get` returns as rewards; None for single steps.
@@ -101,7 +96,6 @@ class LaneStorage(Storage):
         transitions: int,
         observation_shape: Sequence[int],
         action_shape: Sequence[int] = (),
-        action_dtype: torch.dtype = torch.int64,
         reward_shape: Sequence[int] = (),
         dtype: torch.dtype = torch.uint8,
         horizon: Horizon | None = None,
@@ -122,7 +116,7 @@ class LaneStorage(Storage):
 
         self.fields: Fields = {
             "observation": allocate(lanes * self.rows, *observation_shape, kind=dtype),
-            "action": allocate(transitions, lanes, *action_shape, kind=action_dtype),
+            "action": allocate(transitions, lanes, *action_shape, kind=torch.int64),
             "reward": allocate(transitions, lanes, *reward_shape, kind=torch.float32),
             "done": allocate(transitions, lanes, kind=torch.bool),
             "terminated": allocate(transitions, lanes, kind=torch.bool),

@@ -145,7 +145,6 @@ def trial_batch(
     actions: int,
     *,
     action_shape: Sequence[int] = (),
-    action_dtype: str = "int64",
     reward_shape: Sequence[int] = (),
     noise_shape: Sequence[int] = (),
     observation_dtype: str = "uint8",
@@ -163,7 +162,6 @@ def trial_batch(
         batch_size=8,
         observation_shape=observation_shape,
         action_shape=action_shape,
-        action_dtype=action_dtype,
         reward_shape=reward_shape,
         noise_shape=noise_shape,
         observation_dtype=observation_dtype,
@@ -177,10 +175,7 @@ def trial_batch(
         seen = torch.randint(256, (2, lanes, *observation_shape), generator=chance).to(torch.uint8)
         if observation_dtype != "uint8":
             seen = (seen > 127).to(torch_dtype(observation_dtype))
-        if action_dtype == "int64":
-            action = torch.randint(actions, (lanes, *action_shape), generator=chance)
-        else:
-            action = torch.rand((lanes, *action_shape), generator=chance)
+        action = torch.randint(actions, (lanes, *action_shape), generator=chance)
         ends = torch.full((lanes,), step % 8 == 7)
         reward = torch.rand((lanes, *reward_shape), generator=chance)
         states = torch.rand((2, lanes, state_cells), generator=chance) if state_cells else ()

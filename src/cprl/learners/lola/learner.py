@@ -10,7 +10,7 @@ from torchrl.objectives import LossModule
 from torchrl.objectives.value.functional import generalized_advantage_estimate
 
 from cprl.learners.buffer.rollout import refuse_full, rollout_fields, write_turn
-from cprl.learners.checks import check_learner, refuse_continuous, refuse_other_parts
+from cprl.learners.checks import check_learner, refuse_other_parts
 from cprl.learners.lanes import WEIGHTS, Lanes, StartFrom
 from cprl.learners.lola.networks import LOLANetworks
 from cprl.learners.lola.settings import LOLASettings
@@ -71,7 +71,6 @@ class LOLALearner:
         device: str | torch.device = "cpu",
     ) -> None:
         check_learner(spaces, settings, LOLASettings, agents, replicas, first_replica, seed, reward_kind)
-        refuse_continuous("LOLA", spaces)
         self.spaces, self.settings, self.agents = spaces, settings, tuple(agents)
         self.replicas, self.seed, self.wants = replicas, seed, WantedRewards(reward_kind)
         self._lanes = Lanes(

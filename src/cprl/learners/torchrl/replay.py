@@ -13,7 +13,7 @@ from torchrl.objectives.utils import TargetNetUpdater
 from cprl.envs.drivers import device_of
 from cprl.learners.buffer.gather import Horizon
 from cprl.learners.buffer.sampler import Noise, transformed
-from cprl.learners.checks import check_learner, refuse_continuous
+from cprl.learners.checks import check_learner
 from cprl.learners.engine.choice import trial_batch
 from cprl.learners.engine.functional import MakeLoss, targets_of
 from cprl.learners.engine.refusals import refuse_for_replay, refuse_other_outputs
@@ -57,7 +57,6 @@ class TorchRLReplayLearner:
         start_from: the weights with which acting networks, and their targets, start, by the lane's name; the
             others, such as critics, are new.
         sees_peers: whether transitions have the actions of all agents, see `transitions.joint_actions`.
-        action_noise: see `ReplayLearner`.
         device: the torch device of networks, buffers and updates.
 
     Raises:
@@ -84,12 +83,9 @@ class TorchRLReplayLearner:
         noise_numbers: int = 0,
         start_from: StartFrom | None = None,
         sees_peers: bool = False,
-        action_noise: float = 0.0,
         device: str | torch.device = "cpu",
     ) -> None:
         check_learner(spaces, settings, DQNSettings, agents, replicas, first_replica, seed, reward_kind)
-        if settings.mean_over_all_outputs:
-            refuse_continuous("settings.mean_over_all_outputs", spaces)
         check_makers(make_network, make_loss, make_sampler)
         device = device_of(device)
         self.spaces, self.settings, self.agents = spaces, settings, tuple(agents)
@@ -104,7 +100,6 @@ class TorchRLReplayLearner:
             stochastic=stochastic,
             start_from=start_from,
             sees_peers=sees_peers,
-            action_noise=action_noise,
         )
         self._refuse_unfit(make_loss, device, noise_numbers)
         self.stock = StockAgents(
@@ -150,7 +145,6 @@ class TorchRLReplayLearner:
             self._lanes.observation_shape,
             self.spaces.actions,
             action_shape=self._lanes.action_shape,
-            action_dtype=self.spaces.action_dtype,
             observation_dtype=self.spaces.observation_dtype,
             horizon=Horizon(settings.n_steps, settings.gamma) if settings.n_steps > 1 else None,
             noise_shape=(noise_numbers,) if noise_numbers else (),
@@ -220,8 +214,8 @@ class TorchRLReplayLearner:
 
     def values(self, batch: TensorDictBase) -> Tensor:
         """The highest action value of each agent at the end of a turn, [R, S]; NaN where its network
-        outputs a policy, or a continuous action."""
-        if self._lanes.stochastic or self.spaces.action_size:
+        outputs a policy."""
+        if self._lanes.stochastic:
             return torch.full((self.replicas, len(self.agents)), torch.nan)
         with torch.no_grad():
             return self._lanes.by_agent(self.stock.outputs(self._lanes.seen_next(batch)).amax(-1))

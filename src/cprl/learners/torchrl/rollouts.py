@@ -15,7 +15,7 @@ from torchrl.objectives.value import GAE
 
 from cprl.envs.drivers import device_of
 from cprl.learners.buffer.storage import torch_dtype
-from cprl.learners.checks import check_learner, check_rollouts, refuse_continuous, refuse_other_parts
+from cprl.learners.checks import check_learner, check_rollouts, refuse_other_parts
 from cprl.learners.engine.choice import trial_batch
 from cprl.learners.engine.functional import MakeLoss
 from cprl.learners.engine.refusals import refuse_other_advantages, refuse_other_outputs
@@ -78,7 +78,6 @@ class TorchRLRolloutLearner:
         device: str | torch.device = "cpu",
     ) -> None:
         check_learner(spaces, settings, RolloutSettings, agents, replicas, first_replica, seed, reward_kind)
-        refuse_continuous("a learner from rollouts", spaces)
         check_makers(make_network, make_loss, make_sampler)
         device = device_of(device)
         self.spaces, self.settings, self.agents = spaces, settings, tuple(agents)
