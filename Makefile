@@ -8,7 +8,7 @@ DOCS_INSTALLED := .venv/.installed-docs
 
 VIEWER_PACKAGES := mesa-vulkan-drivers libvulkan1 chromium chromium-driver
 
-.PHONY: run docs docs-serve lint test test-integration test-oldest test-newest fuzz test-slow test-wheel test-gpu test-viewer test-docs viewer-packages check bench bench-gpu clean
+.PHONY: run docs docs-serve lint test test-integration test-oldest test-newest test-slow test-wheel test-gpu test-viewer test-docs viewer-packages check bench bench-gpu clean
 
 run: $(INSTALLED)
 	$(BIN)/python recipes/tragedy.py --watch serve --linger --no-keep-checkpoint
@@ -50,12 +50,6 @@ test-oldest test-newest: test-%: .venv-%/.installed
 	$(PYTHON) -m venv .venv-newest
 	.venv-newest/bin/python -m pip install -q $(MORE_TORCH) --upgrade --upgrade-strategy eager -e ".[dev]"
 	touch $@
-
-# Generated inputs for all that is public, 100,000 and more; the table is docs/fuzz.md. A part of it, and again
-# from another seed: `make fuzz FUZZ="--only Rules --seed 1"`, whose table is then left as it is.
-FUZZ ?= --out docs/fuzz.md
-fuzz: $(INSTALLED)
-	$(BIN)/python -W ignore -m tests.fuzz $(FUZZ)
 
 # Real viewers without a screen, pictures of which are looked at; see docs/watching.md.
 test-viewer: $(INSTALLED) viewer-packages

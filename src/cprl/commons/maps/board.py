@@ -1,6 +1,7 @@
 """Map: a board with its walls, its apple sites and the starts of the agents."""
 
 from collections.abc import Iterable
+from contextlib import suppress
 from dataclasses import dataclass
 from typing import Any, Final
 
@@ -99,7 +100,8 @@ def cells_of(name: str, entries: Any, form: tuple[str, ...] = CELL) -> tuple[Any
     """
     allowed = f"({', '.join(form)}), integers"
     if not isinstance(entries, type) and callable(getattr(entries, "tolist", None)):
-        entries = entries.tolist()
+        with suppress(NotImplementedError):  # of a tensor without data, which is refused below
+            entries = entries.tolist()
     found = []
     for place, entry in enumerate(listed(name, entries, f"a sequence of {allowed} each")):
         numbers = tuple(map(as_integer, listed(f"{name}[{place}]", entry, allowed)))
