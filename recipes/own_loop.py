@@ -68,7 +68,7 @@ def main(
         evaluation_episodes: fresh episodes for the trained and for the random policy.
         seed: of chance, weights, exploration and replay.
         out: the run's directory; by default a new one under runs/.
-        watch: "file", or live as well: "serve" on 127.0.0.1, "spawn" a viewer, "connect ADDRESS".
+        watch: "file", or live as well: "serve" on 127.0.0.1, "spawn" a viewer.
     """
     check_watch(watch, can_be_off=False)
     game = presets.game("single_basic")

@@ -69,7 +69,7 @@ def test_every_number_is_changed_by_its_place():
         "--replicas 2 --game.rules.freeze-steps 50 --agents.1.algorithm.settings.gamma 0.9 --variant as_run "
         "--agents.3.policy pacifist --agents.2.algorithm.settings.max-grad-norm None --loggers csv wandb "
         "--game.rules.regrow-prob 0 0.5 --game.rules.beam-length-cells 1 2 3 4 --game.rules.no-may-fire "
-        "--agents.0.algorithm.double --agents.0.reward team --out here --watch 'connect rerun+http://there'"
+        "--agents.0.algorithm.double --agents.0.reward team --out here --watch serve"
     )
     first, second, third, _ = experiment().agents
     base = experiment(variant="as_run")
@@ -93,7 +93,7 @@ def test_every_number_is_changed_by_its_place():
         ),
         loggers=("csv", "wandb"),
     )
-    assert options == RunOptions(out=Path("here"), watch="connect rerun+http://there")
+    assert options == RunOptions(out=Path("here"), watch="serve")
 
 
 def test_a_recipes_own_arguments_come_before_the_changes_to_what_they_make():

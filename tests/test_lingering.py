@@ -68,7 +68,7 @@ def test_a_finished_run_stays_served_until_it_is_asked_to_end(lingering, number)
     assert "Traceback" not in errors
 
 
-@pytest.mark.parametrize("watch", ["off", "file", "connect rerun+http://127.0.0.1:9876/proxy"])
+@pytest.mark.parametrize("watch", ["off", "file"])
 def test_lingering_without_anything_served_is_refused_before_anything_is_written(watch, tmp_path):
     with pytest.raises(ValueError, match=f'linger is True, but watch is "{re.escape(watch)}", which serves'):
         cprl.run(EXPERIMENT, tmp_path / "run", watch=watch, linger=True)

@@ -143,7 +143,7 @@ def test_where_nothing_can_be_resumed_that_is_said(tmp_path):
         ("--out elsewhere --seed 3", " --seed 3"),
         ("--seed 3 --out=elsewhere --resume", " --seed 3"),
         ("--go-on --seed 3 --go_on", " --seed 3"),
-        ("--watch 'connect rerun+http://there'", " --watch 'connect rerun+http://there'"),
+        ("--name 'an orchard'", " --name 'an orchard'"),
     ],
 )
 def test_the_line_that_resumes_is_the_one_that_began_with_the_runs_directory(given, line, tmp_path):

@@ -59,7 +59,7 @@ def run(
         episodes: instead of those of the recipe; with --resume more of them extend the run.
         take_over: resume a run that a process on another host has locked.
         keep_checkpoint: keep the state of the training of a finished run, so that it can be extended.
-        watch: "file", or live as well: "serve", "spawn", "connect ADDRESS"; "off" for no recording.
+        watch: "file", or live as well: "serve", "spawn"; "off" for no recording.
         linger: keep the recording served after the run, until Ctrl-C; with --watch serve or spawn.
         allow: code of your own, module:Class, that the recipe may import; may be repeated.
     """

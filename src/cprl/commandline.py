@@ -64,7 +64,7 @@ class RunOptions:
     keep_checkpoint: bool = True
     """Keep the state of the training of a finished run, buffers included, so that it can be extended."""
     watch: str = "file"
-    """"file", or live as well: "serve", "spawn", "connect ADDRESS"; "off" for no recording."""
+    """"file", or live as well: "serve", "spawn"; "off" for no recording."""
     linger: bool = False
     """Keep the recording served after the run is finished, until Ctrl-C; with watch "serve" or "spawn"."""
     allow: tyro.conf.UseAppendAction[tuple[str, ...]] = ()

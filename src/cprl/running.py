@@ -89,7 +89,7 @@ def run(
         take_over: whether to resume a run that a process on another host has locked.
         keep_checkpoint: whether a finished run keeps the state of its training, buffers included, so that it
             can be extended.
-        watch: "file" for a recording for the Rerun viewer; "serve", "spawn" or "connect ADDRESS" to watch
+        watch: "file" for a recording for the Rerun viewer; "serve" or "spawn" to watch
             live as well, see `cprl.viewer.streams.open_live`; "off" for none.
         linger: whether the recording stays served after the run, until Ctrl-C (SIGINT) or SIGTERM; only with
             `watch` "serve" or "spawn".

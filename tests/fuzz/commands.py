@@ -72,7 +72,7 @@ _SUBCOMMANDS: Final[dict[str, tuple[list[st.SearchStrategy[list[str]]], tuple[An
             _flag("--take-over"),
             _flag("--no-keep-checkpoint"),
             _flag("--episodes", "4"),
-            _flag("--watch", "off", "file", "serve", "connect rerun+http://127.0.0.1:1/proxy"),
+            _flag("--watch", "off", "file", "serve"),
             *_COMMON,
         ),
     ),

@@ -55,7 +55,7 @@ class ViewerCallback:
         title: the title in the viewer.
         episodes: the number of episodes of the run; determines how often frames are recorded.
         recipe: the recipe that the viewer shows.
-        live: "serve", "spawn" or "connect ADDRESS", see `cprl.viewer.streams`; None for the file alone.
+        live: "serve" or "spawn", see `cprl.viewer.streams`; None for the file alone.
         exhibited: what is exhibited live: the present policy and one world for it, see
             `cprl.viewer.exhibition`.
         file_name: the name of the recording instead of `run.rrd`; there must be no such file.

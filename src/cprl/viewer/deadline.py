@@ -13,9 +13,6 @@ from cprl.compat import end_recordings, keep_native
 
 T = TypeVar("T")
 
-CONNECT_S: Final = 4.0
-"""Seconds within which a viewer must accept a connection."""
-
 STALL_S: Final = 2.0
 """Seconds that a training waits for a place in the queue of a viewer that has stopped taking data."""
 
@@ -109,6 +106,8 @@ class Sender:
 
 def release() -> None:
     """Ends the threads of recordings that are closed; a viewer that went away was reported when it did."""
+    if _ABANDONED:  # it would wait for their viewers
+        return
     with suppress(TimeoutError, RuntimeError):
         within(CLOSE_S, end_recordings)
 

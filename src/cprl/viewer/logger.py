@@ -45,8 +45,8 @@ class RerunLogger(Logger):
         log_dir: the run's directory, where the recording is written.
         scene: the contents of the board; needed to log frames.
         curves: the numbers that are plotted, if there is no scene, which has them too.
-        live: "serve", "spawn" or "connect ADDRESS", see `cprl.viewer.streams.open_live`; None for the file
-            alone. The recording and the page of the web viewer are served on 127.0.0.1 only.
+        live: "serve" or "spawn", see `cprl.viewer.streams.open_live`; None for the file alone. The recording
+            and the page of the web viewer are served on 127.0.0.1 only.
         exhibits: whether viewers are sent an exhibition too, see `cprl.viewer.exhibition`.
         file_name: the name of the recording.
         recording_id: the viewer shows files with the same id as one recording; by default a new id.

@@ -1,21 +1,16 @@
 """The streams of one recording: to a file and, on request, live on 127.0.0.1."""
 
 import shutil
-import socket
 import subprocess
 import sys
 import warnings
-from collections.abc import Callable
 from dataclasses import dataclass, field
-from functools import partial
 from pathlib import Path
 from typing import Any, Final
-from urllib.parse import urlsplit
 
-from cprl.checks import SWITCH, Check, checked, shown
+from cprl import arguments
 from cprl.output import printed
-from cprl.viewer import deadline
-from cprl.viewer.deadline import abandon, exit_in_time, within
+from cprl.viewer.deadline import exit_in_time
 from cprl.viewer.page import LOCALHOST, Page, free_port, has_display, viewer_binary
 from cprl.viewer.sending import LiveStream, Stream
 
@@ -32,7 +27,7 @@ EXHIBITION_MEMORY: Final = "1MB"
 NEEDED_BYTES: Final = 2_000_000
 """The free disk space needed to start a recording; its layout and static parts take a tenth."""
 
-_LIVE: Final = '"serve", "spawn" or "connect rerun+http://HOST:PORT/proxy"'
+_LIVE: Final = "serve", "spawn"
 
 
 def check_watch(watch: str, *, can_be_off: bool = True) -> None:
@@ -45,23 +40,7 @@ def check_watch(watch: str, *, can_be_off: bool = True) -> None:
     Raises:
         ValueError: if the value is not allowed; names it and the allowed values.
     """
-    checked("watch", watch, Check(lambda value: isinstance(value, str), f'"file", "off", {_LIVE}'))
-    checked("can_be_off", can_be_off, SWITCH)
-    if watch != "file" and not (can_be_off and watch == "off"):
-        offs = '"off", ' if can_be_off else ""
-        _check(watch, f'"file", {offs}{_LIVE}', name="watch")
-
-
-def _check(live: str, allowed: str, *, name: str = "live") -> None:
-    how, _, address = live.partition(" ")
-    where = urlsplit(address.removeprefix("rerun+"))
-    try:
-        connects = how == "connect" and address.startswith("rerun+http") and bool(where.hostname)
-        connects = connects and where.port != 0
-    except ValueError:  # the port is not a number
-        connects = False
-    if not connects and live not in ("serve", "spawn"):
-        raise ValueError(f"{name} is {shown(live)}; allowed: {allowed}")
+    arguments.choice("watch", watch, ("file", *(("off",) if can_be_off else ()), *_LIVE))
 
 
 @dataclass(frozen=True)
@@ -115,8 +94,7 @@ def open_live(
 
     Args:
         live: "serve": serves the recording on free ports of 127.0.0.1; viewers can connect at any time and
-            get the history. "spawn": the same, and starts Rerun's native viewer. "connect ADDRESS": sends to
-            a listening viewer, such as rerun+http://127.0.0.1:9876/proxy.
+            get the history. "spawn": the same, and starts Rerun's native viewer.
         recording_id: the id of the recording.
         blueprint: its layout.
         period_s: seconds between two batches of buffered numbers.
@@ -126,18 +104,12 @@ def open_live(
     Raises:
         ValueError: if `live` is anything else.
     """
-    _check(live, _LIVE)
-    made = partial(_recording, application, recording_id)
-    if live.startswith("connect "):
-        address, exhibition = live.partition(" ")[2], None
-        stream = _connect(address, made, blueprint, period_s)
-        if exhibits and stream is not None:
-            exhibition = _connect(address, partial(made, send_properties=False), blueprint, period_s)
-        return Live(stream, exhibition)
-    stream, *grpc = _serve("live view", made(), blueprint, period_s, SERVER_MEMORY)
+    arguments.choice("live", live, _LIVE)
+    recording = _recording(application, recording_id)
+    stream, *grpc = _serve("live view", recording, blueprint, period_s, SERVER_MEMORY)
     exhibition = None
     if exhibits:  # with the layout as well: a viewer may hear of the recording here first
-        recording = made(send_properties=False)
+        recording = _recording(application, recording_id, send_properties=False)
         exhibition, address = _serve("exhibition", recording, blueprint, period_s, EXHIBITION_MEMORY)
         grpc.append(address)
     if live == "spawn":
@@ -156,29 +128,6 @@ def _serve(name: str, recording: Any, blueprint: Any, period_s: float, memory: s
         rr.GrpcServerSink(LOCALHOST, port, server_memory_limit=memory), default_blueprint=blueprint
     )
     return LiveStream(name, recording, period_s=period_s), f"rerun+http://{LOCALHOST}:{port}/proxy"
-
-
-def _connect(address: str, made: Callable[[], Any], blueprint: Any, period_s: float) -> Stream | None:
-    """A stream to a listening viewer; None, with a warning, if there is none.
-
-    Without this check Rerun would wait for the viewer and eventually block the training.
-    """
-    where = urlsplit(address.removeprefix("rerun+"))
-
-    def connect() -> Any:
-        socket.create_connection((where.hostname or LOCALHOST, where.port or 9876), timeout=2).close()
-        recording = made()
-        recording.connect_grpc(address, default_blueprint=blueprint)
-        return recording
-
-    exit_in_time()
-    try:
-        recording = within(deadline.CONNECT_S, connect)
-    except OSError as error:
-        abandon(error)
-        _warn_of(f"viewer at {address}", error)
-        return None
-    return LiveStream(f"viewer at {address}", recording, period_s=period_s)
 
 
 def _spawn(grpc: list[str]) -> None:
