@@ -67,8 +67,9 @@ def test_without_arguments_the_recipe_is_as_it_stands():
 def test_every_number_is_changed_by_its_place():
     given, options = read(
         "--replicas 2 --game.rules.freeze-steps 50 --agents.1.algorithm.settings.gamma 0.9 --variant as_run "
-        "--agents.3.policy pacifist --agents.2.algorithm.settings.max-grad-norm None --loggers csv wandb "
-        "--game.rules.regrow-prob 0 0.5 --game.rules.beam-length-cells 1 2 3 4 --game.rules.no-may-fire "
+        "--agents.3.policy pacifist --agents.2.algorithm.settings.max-grad-norm None "
+        "--loggers tensorboard wandb --game.rules.regrow-prob 0 0.5 --game.rules.beam-length-cells 1 2 3 4 "
+        "--game.rules.no-may-fire "
         "--agents.0.algorithm.double --agents.0.reward team --out here --watch serve"
     )
     first, second, third, _ = experiment().agents
@@ -91,7 +92,7 @@ def test_every_number_is_changed_by_its_place():
             Learning(PPO(settings=replace(third.algorithm.settings, max_grad_norm=None))),
             Scripted("pacifist"),
         ),
-        loggers=("csv", "wandb"),
+        loggers=("tensorboard", "wandb"),
     )
     assert options == RunOptions(out=Path("here"), watch="serve")
 
@@ -243,7 +244,7 @@ def test_what_a_command_line_cannot_say_stays_as_it_is():
         kept, seed=4, agents=(Learning(Custom("my:algorithm"), reward="team"), *base.agents[1:])
     )
     assert read("--game.institutions.1.share 0.5", lambda: kept)[0].game.institutions[1] == Quota(share=0.5)
-    for line in ("--game.institutions.0.freeze-steps 3", "--game.institutions.2.share 1", "--loggers csv"):
+    for line in ("--game.institutions.0.freeze-steps 3", "--game.institutions.2.share 1", "--loggers wandb"):
         with pytest.raises(SystemExit):
             read(line, lambda: kept)
 

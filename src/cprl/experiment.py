@@ -42,7 +42,7 @@ from cprl.preferences.values import check_preference
 from cprl.runs import formats
 from cprl.runs.recipes import FORMAT, is_old, recipe_config
 
-LoggerName = Literal["csv", "tensorboard", "wandb"]
+LoggerName = Literal["tensorboard", "wandb"]
 LOGGERS: Final[tuple[LoggerName, ...]] = get_args(LoggerName)
 MOST_SEED: Final = 2**64 - 2
 """Evaluation plays worlds of the next seed."""
@@ -79,7 +79,7 @@ class Experiment:
     callbacks: tuple[Custom, ...] = ()
     """Callbacks of the training; see `cprl.training`."""
     loggers: tuple[LoggerName | Custom, ...] = ()
-    """TorchRL's loggers that get every series: "csv", "tensorboard", "wandb", or one of your own."""
+    """TorchRL's loggers that get every series: "tensorboard", "wandb", or one of your own."""
     device: str = "cpu"
     """Where agents learn, e.g. "cpu" or "cuda:0"."""
     engine: TrainingEngine = "compiled"

@@ -44,7 +44,7 @@ ENGINES: Final = ("eager", "compiled")
 
 
 def experiment(name: str, engine: str = "eager") -> Experiment:
-    """One of the trainings in `AGENTS`, of two replicas; that of PPO logs its series to CSV files."""
+    """One of the trainings in `AGENTS`, of two replicas."""
     agents = AGENTS[name]
     return Experiment(
         name=name,
@@ -54,6 +54,5 @@ def experiment(name: str, engine: str = "eager") -> Experiment:
         replicas=2,
         seed=3,
         evaluation_episodes=4,
-        loggers=("csv",) if name == "ppo" else (),
         engine=engine,
     )

@@ -166,7 +166,7 @@ _OF_EXPERIMENTS: Final = _named(
     ("--agents.0.algorithm.settings.buffer-size", "100"),
     ("--agents.0.algorithm.settings.hidden-cells", "4"),
     ("--agents.0.reward", "team"),
-    ("--loggers", "csv", "wandb"),
+    ("--loggers", "wandb"),
     ("--out", "there", "a/b"),
     ("--watch", "off", "file", "spawn"),
     ("--resume",),

@@ -18,6 +18,6 @@ Modules, in the order in which one reads them:
     extension    more episodes for a run that is finished or stopped
     weights      trained networks, the state of transforms, the values of decisions
     kept         what a run keeps of its agents, ended or not
-    loggers      TorchRL's loggers: CSV, TensorBoard, W&B
+    loggers      TorchRL's loggers: TensorBoard, W&B
     export       a finished run, small enough to commit
 """
