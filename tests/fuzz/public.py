@@ -29,6 +29,8 @@ NOT_CALLED: Final = {
     "cprl.algorithms.base:OnPolicy": "abstract; its subclasses have rows",
     "cprl.algorithms.base:TeamAlgorithm": "abstract; its subclasses have rows",
     "cprl.callbacks:Callback": "a Protocol, which nobody calls",
+    "cprl.callbacks:SavesTraining": "a Protocol, which nobody calls",
+    "cprl.population:refuse_sharing": "of values that are made already",
     "cprl.studies.executors.in_process:Executor": "a Protocol, which nobody calls",
     "cprl.theory.worth:Worth": "a Protocol, which nobody calls",
 }
