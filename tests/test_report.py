@@ -105,7 +105,7 @@ def test_results_without_weights_are_reported_but_never_played(run, tmp_path):
     assert tables[0] == tables[1]
     export_results(run, folder)
     (folder / "checkpoints" / "final.pt").unlink()
-    with pytest.raises(FileNotFoundError, match="listed in the manifest, and not there"):
+    with pytest.raises(ValueError, match=r"checkpoints/final\.pt"):
         write_report([folder], tmp_path / "lost")
 
 

@@ -15,7 +15,7 @@ def tidy_up(finished: Path, *, keep_checkpoint: bool, take_over: bool) -> None:
     """Says that a run is finished, and tidies up if its process died before it had.
 
     Raises:
-        FileNotFoundError: if a file that its manifest lists is not there.
+        ValueError: if a file that its manifest lists is not there.
     """
     refuse_missing(finished)
     if (finished / LOCK).exists():

@@ -120,6 +120,7 @@ def test_a_board_plays_as_it_did(board, variant):
     hold("game", {f"{board}, {variant}": played(shortened(presets.game(board, variant=variant)))})
 
 
+@pytest.mark.integration
 @pytest.mark.parametrize("form", FORMS)
 @pytest.mark.parametrize(("board", "variant"), GAMES)
 def test_a_form_of_observation_shows_what_it_did(board, variant, form):
@@ -134,6 +135,7 @@ def test_an_institution_rules_as_it_did(name):
     hold("institutions", {name: played(game)})
 
 
+@pytest.mark.integration
 @pytest.mark.parametrize("name", INSTITUTIONS)
 def test_an_institution_rules_as_it_did_in_the_game_as_run(name):
     observation = Observation(agents_apart=True, encoding="one_hot")

@@ -74,6 +74,7 @@ def shortened(value):
     ]
 
 
+@pytest.mark.integration
 @pytest.mark.parametrize("path", RECIPES, ids=lambda path: below(path, ROOT))
 def test_a_recipe_makes_the_experiment_that_it_made(path, monkeypatch):
     made = {
@@ -92,6 +93,7 @@ def targets(value):
     return [target for part in value for target in targets(part)] if isinstance(value, list) else []
 
 
+@pytest.mark.integration
 @pytest.mark.parametrize("path", STORED, ids=lambda path: below(path, RESULTS))
 def test_a_stored_recipe_is_read_as_it_was(path):
     recipe = json.loads(path.read_text())

@@ -45,8 +45,8 @@ def export_results(run: Path, folder: Path, *, weights: bool = True) -> Path:
         and returns are float32, and rows are sorted by replica, episode and agent.
 
     Raises:
-        ValueError: if there is no run, a file of it is damaged, or the folder holds another run.
-        FileNotFoundError: if the run has not ended, or lost a file since.
+        ValueError: if there is no run, a file of it is damaged or lost, or the folder holds another run.
+        FileNotFoundError: if the run has not ended.
     """
     run, folder = path_of("run", run), path_of("folder", folder)
     switch("weights", weights)

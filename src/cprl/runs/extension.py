@@ -27,8 +27,7 @@ def refuse_to_extend(run: Path, episodes: int, callbacks: Iterable[Any]) -> None
             it unless it has a true `is_extendable`.
 
     Raises:
-        ValueError: if it would not; says why.
-        FileNotFoundError: if a file that its manifest lists is not there.
+        ValueError: if it would not, or lacks a file that its manifest lists; says why.
     """
     refuse_missing(run)
     for callback in callbacks:

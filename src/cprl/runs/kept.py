@@ -32,8 +32,8 @@ def kept_of(run: Path, name: str | None = None) -> Kept:
             checkpoint of a run that has not ended.
 
     Raises:
-        FileNotFoundError: if a file that the manifest lists is not there; names each.
-        ValueError: if there is nothing readable; names each file with its reason.
+        ValueError: if a file that the manifest lists is not there, or nothing is readable; names each file
+            with its reason.
     """
     refuse_missing(run)
     folder = run / FOLDER
@@ -56,7 +56,7 @@ def lacks_weights(run: Path) -> bool:
     """Whether a run has ended and keeps no weights, since its results were exported without them.
 
     Raises:
-        FileNotFoundError: if the run had them: its manifest lists a file that is not there.
+        ValueError: if the run had them: its manifest lists a file that is not there.
     """
     if not (run / REPORT).exists() or (run / FOLDER / "final.pt").exists():
         return False

@@ -6,7 +6,6 @@ the journal of episodes one for each episode.
 """
 
 from collections.abc import Callable
-from errno import ENOENT
 from pathlib import Path
 from typing import BinaryIO, Final
 
@@ -91,11 +90,11 @@ def verify(path: Path) -> None:
 
 
 def refuse_missing(run: Path) -> None:
-    """Raises a FileNotFoundError where a file that the manifest lists is not there; names each."""
+    """Raises a ValueError where a file that the manifest lists is not there; names each."""
     missing = [name for name in _files(run) if not (run / name).exists()]
     if missing:
-        raise FileNotFoundError(
-            ENOENT, "listed in the manifest, and not there", f"{run}: {', '.join(missing)}"
+        raise ValueError(
+            f"{run} lacks {', '.join(missing)}, which its {FILE_NAME} lists; restore it, or take another run"
         )
 
 
