@@ -104,21 +104,6 @@ def test_a_recipes_own_arguments_come_before_the_changes_to_what_they_make():
 
 @pytest.mark.integration
 @pytest.mark.parametrize(
-    ("old", "new"),
-    [
-        ("--learn_every 5 --no-compile --go-on --out x", "--update-every 5 --engine eager --resume --out x"),
-        ("--learn-every=5 --compile", "--update-every=5 --engine compiled"),
-        ("--game.rules.freeze_steps 3 --evaluation_episodes 2", "--game.rules.freeze-steps 3 --evaluation-ep"
-         "isodes 2"),
-    ],
-)  # fmt: skip
-def test_words_of_earlier_versions_and_underscores_are_still_read(old, new):
-    assert read(old) == read(new)
-    assert read(old) != read("")
-
-
-@pytest.mark.integration
-@pytest.mark.parametrize(
     "line",
     [
         "--gama 0.9",

@@ -8,7 +8,7 @@ import pytest
 from my_game import Callback, Dilemma
 
 from cprl import presets
-from cprl.algorithms import DQN, IPPO, PPO, QMIX, DQNSettings, RolloutSettings, Tabular, TabularSettings
+from cprl.algorithms import DQN, PPO, QMIX, DQNSettings, RolloutSettings, Tabular, TabularSettings
 from cprl.custom import Custom
 from cprl.experiment import Experiment, changes, frozen_from, frozen_relative_to
 from cprl.institutions import Tax
@@ -16,8 +16,6 @@ from cprl.population import Frozen, Learning, Scripted, Team
 
 RESULTS = Path(__file__).parents[1] / "docs" / "results"
 RECIPES = sorted(RESULTS.rglob("recipe.json"))
-OLD = [path for path in RECIPES if "arguments" in json.loads(path.read_text())]
-"""Of before `Experiment`."""
 DQN_AGENT = Learning(DQN(settings=DQNSettings()))
 EXPERIMENT = Experiment(
     name="mixed",
@@ -40,29 +38,6 @@ def test_the_recipe_of_every_stored_result_is_an_experiment(path):
     experiment = Experiment.from_recipe(recipe)
     assert experiment.name == recipe["recipe"]
     assert Experiment.from_recipe(as_stored(experiment.to_recipe())) == experiment
-
-
-@pytest.mark.parametrize("path", OLD, ids=lambda path: str(path.parent.relative_to(RESULTS)))
-def test_an_old_recipe_says_the_same_as_it_did(path):
-    recipe = json.loads(path.read_text())
-    experiment, old = Experiment.from_recipe(recipe), recipe["arguments"]
-    assert (experiment.episodes, experiment.replicas, experiment.seed) == (
-        old["episodes"],
-        old["replicas"],
-        old["seed"],
-    )
-    variant = presets.variant_of(experiment.game)
-    assert variant == old.get("variant", "published")
-    settings = experiment.agents[0].algorithm.settings
-    kept = old["learner"] if "learner" in old else old["population"][0]["settings"]
-    for name, value in kept.items():
-        if name not in ("kind", "priority_alpha"):
-            assert getattr(settings, name) == (tuple(value) if isinstance(value, list) else value)
-
-
-def test_there_are_results_of_all_three_generations():
-    kinds = {type(json.loads(path.read_text())["arguments"].get("population")) for path in OLD}
-    assert kinds == {type(None), dict, list}
 
 
 def test_an_experiment_equals_what_its_recipe_holds():
@@ -190,50 +165,6 @@ def test_a_run_of_frozen_agents_is_kept_relative_to_the_run_that_has_them(tmp_pa
     monkeypatch.chdir(tmp_path / "runs")
     seen = Experiment.from_recipe(recipe, directory="later")
     assert seen.agents[0] == Frozen("earlier", 0)
-
-
-def old_recipe(*members):
-    game = presets.game("two_complex")
-    table = Experiment(name="old", game=game, agents=[DQN_AGENT] * 2, episodes=1).to_config()["game"]
-    plain = {
-        name: {key: own for key, own in table[name].items() if key != "kind"}
-        for name in ("map", "rules", "observation")
-    }
-    return {"recipe": "old", "arguments": {"episodes": 7, "game": plain, "population": list(members)}}
-
-
-def test_equal_members_that_learned_as_a_team_are_one_team():
-    member = {
-        "member": "Learner",
-        "paid": "own",
-        "algorithm": "IPPO",
-        "clip_epsilon": 0.1,
-        "settings": {"kind": "RolloutSettings", "epochs": 2},
-    }
-    ippo = IPPO(settings=RolloutSettings(epochs=2), clip_epsilon=0.1)
-    assert Experiment.from_recipe(old_recipe(member, member)).agents == (
-        Team(ippo, agents=(0, 1), reward="individual"),
-    )
-    scripted = {"member": "Scripted", "manner": "greedy"}
-    assert Experiment.from_recipe(old_recipe(scripted, {**member, "paid": "group"})).agents == (
-        Scripted("greedy"),
-        Team(ippo, agents=(1,), reward="team"),
-    )
-
-
-def test_an_old_run_of_frozen_agents_is_found_from_where_we_stand(tmp_path, monkeypatch):
-    monkeypatch.chdir(tmp_path)
-    frozen = {"member": "Frozen", "run": str(tmp_path / "runs" / "a"), "agent": 1, "replica": 2}
-    old = Experiment.from_recipe(old_recipe(frozen, {"member": "Scripted", "manner": "random"}))
-    assert old.agents == (Frozen("runs/a", 1, 2), Scripted("random"))
-
-
-def test_an_old_recipe_that_cannot_be_read_says_why():
-    with pytest.raises(ValueError, match=r"the recipe holds no game and agents of cprl: KeyError\('game'\)"):
-        Experiment.from_recipe({"recipe": "old", "arguments": {}})
-    mine = {"member": "Learner", "paid": "own", "algorithm": "Mine", "settings": {"kind": "DQNSettings"}}
-    with pytest.raises(ValueError, match=r"experiment\.agents\[0\]\.algorithm\.kind is 'Mine'"):
-        Experiment.from_recipe(old_recipe(mine, mine))
 
 
 def test_a_published_game_with_institutions_is_no_published_game():

@@ -332,7 +332,7 @@ def test_a_report_imports_code_of_ones_own_where_it_is_allowed(tmp_path, capsys,
         ("cprl run commons --seed 3", "cprl run commons --seed 3"),
         (".venv/bin/cprl run commons --seed 3 --resume", "cprl run commons --seed 3"),
         (r"'.venv\Scripts\cprl' run commons", "cprl run commons"),
-        ("cprl/recipes/commons.py --go-on", "python recipes/commons.py"),
+        ("cprl/recipes/commons.py --resume", "python recipes/commons.py"),
         ("cprl.py", "python cprl.py"),
     ],
 )

@@ -1,7 +1,5 @@
 """The wall of replicas, where agents go, the stock over the turn, and the Lorenz curve, as recorded."""
 
-from dataclasses import replace
-
 import numpy as np
 import pytest
 import torch
@@ -16,7 +14,6 @@ from cprl.viewer.callback import ViewerCallback
 from cprl.viewer.lorenz import gini, lorenz_curve
 from cprl.viewer.panels import Panels
 from cprl.viewer.stage import boards
-from cprl.viewer.turns import Turns
 from cprl.viewer.wall import Wall
 
 GAME = Game(
@@ -149,24 +146,6 @@ def test_a_resumed_recording_goes_on_counting(tmp_path):
     other, _ = recorded(tmp_path / "b", episodes=2)
     other._views.load_state_dict(state)
     assert repr(other._views.state_dict()) == repr(state)
-    other._views.load_state_dict({})
-    assert repr(other._views.state_dict()["visits"]) == repr(state["visits"]), "an older state has no views"
-
-
-def test_the_line_of_a_running_episode_goes_on_from_an_older_state_with_more_points():
-    game = replace(GAME, rules=replace(GAME.rules, episode_steps=1000))
-    turns = Turns(CommonsEnv(game, 2, seed=1), Listener())
-    older = np.full((2, 201, 2), np.nan)  # a point every five turns; replica 1 has just begun
-    older[0, :5] = [(0, 9), (5, 8), (10, 7), (15, 6), (20, 5)]
-    older[1, 0] = 0, 9
-    turns.load_state_dict({"playing": older.tolist(), "ended": [[], []], "died": [False, True]})
-    playing = np.array(turns.state_dict()["playing"])
-    assert playing.shape == (2, 101, 2)
-    # Now a place every ten turns, where the latest point stays.
-    assert playing[0, :3].tolist() == [[5, 8], [15, 6], [20, 5]]
-    assert playing[1, 0].tolist() == [0, 9]
-    assert np.isnan(playing[0, 3:]).all()
-    assert np.isnan(playing[1, 1:]).all()
 
 
 def test_the_wall_marks_a_board_that_has_died(run):

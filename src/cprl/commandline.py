@@ -32,15 +32,6 @@ Allow = tyro.conf.UseAppendAction[tuple[str, ...]]
 
 TAKES_NOTHING_OVER: Final = "--take-over is for runs that are there; allowed: with --resume"
 
-_OLD_WORDS: Final = {
-    "--go-on": ("--resume",),
-    "--no-go-on": ("--no-resume",),
-    "--learn-every": ("--update-every",),
-    "--compile": ("--engine", "compiled"),
-    "--no-compile": ("--engine", "eager"),
-}
-"""Flags of earlier versions, and what they are now."""
-
 _NOTE: Final = (
     "Every value of the experiment below can be changed by its place. Agents that equal one before are not "
     "listed; they have the same arguments by their own number. What is not listed cannot be changed on the "
@@ -186,7 +177,7 @@ def parse_with(
     from cprl.flags import applied, flags_of
 
     callable_of("make_experiment", make_experiment, "a function that gives an Experiment")
-    given = _in_todays_words(words)
+    given = list(words)
     _check_names(make_experiment, options)
     made, _ = tyro.cli(
         make_experiment, args=given, prog=program, return_unknown_args=True, add_help=False, config=_CONFIG
@@ -212,15 +203,6 @@ def parse_with(
 _LONGEST: Final = 1500
 _OPTIONS: Final = RunOptions()
 _CONFIG: Final = (tyro.conf.HelptextFromCommentsOff,)
-
-
-def _in_todays_words(given: Sequence[str]) -> list[str]:
-    words: list[str] = []
-    for word in given:
-        flag, equals, value = word.partition("=")
-        new = _OLD_WORDS.get(flag.replace("_", "-"))
-        words += [word] if new is None else [*new[:-1], new[-1] + equals + value]
-    return words
 
 
 def _check_names(make_experiment: "Callable[..., Experiment]", options: Any) -> None:

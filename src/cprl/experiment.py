@@ -40,7 +40,7 @@ from cprl.population import (
 )
 from cprl.preferences.values import check_preference
 from cprl.runs import formats
-from cprl.runs.recipes import FORMAT, is_old, recipe_config
+from cprl.runs.recipes import FORMAT, recipe_config
 
 LoggerName = Literal["tensorboard", "wandb"]
 LOGGERS: Final[tuple[LoggerName, ...]] = get_args(LoggerName)
@@ -139,7 +139,7 @@ class Experiment:
         allow: Iterable[str] = (),
         directory: str | Path | None = None,
     ) -> "Experiment":
-        """The experiment of a recipe, of today's format or of any before.
+        """The experiment of a recipe.
 
         Args:
             recipe: what `recipe.json` holds.
@@ -153,7 +153,7 @@ class Experiment:
             experiment = cls.from_config(recipe_config(recipe), allow=allow)
         except ValueError as error:
             raise ValueError(f"{error}{formats.written_by_another(recipe)}") from error
-        return experiment if directory is None or is_old(recipe) else frozen_from(experiment, directory)
+        return experiment if directory is None else frozen_from(experiment, directory)
 
     def __eq__(self, other: object) -> bool:
         return self.to_config() == other.to_config() if isinstance(other, Experiment) else NotImplemented

@@ -39,10 +39,10 @@ class Times:
         return {"spent_s": self.spent_s, "compiling_s": self.compiling_s, "busy_s": self.busy_s}
 
     def load_state_dict(self, state: Mapping[str, Any]) -> None:
-        """Continues from a state of `state_dict`; one of cprl up to November 2026 has "spent_s" alone."""
+        """Continues from a state of `state_dict`."""
         self._began, self._compiled_s = time.monotonic(), CLOCK.total_s
-        self._before = {name: float(state.get(name, 0.0)) for name in self._before}
-        self.busy_s = float(state.get("busy_s", 0.0))
+        self._before = {name: float(state[name]) for name in self._before}
+        self.busy_s = float(state["busy_s"])
 
 
 class RunTimes:

@@ -131,12 +131,12 @@ def _runs(results: Sequence[Result]) -> list[str]:
 
 def _command(line: str) -> str:
     """The command line from `recipes/` on, or of `cprl`, without the output directory and without
-    `--go-on`."""
+    `--resume`."""
     words = shlex.split(line)
     if "--out" in words:
         at = words.index("--out")
         del words[at : at + 2]
-    kept = [word for word in words if word not in ("--resume", "--go-on")]
+    kept = [word for word in words if word != "--resume"]
     script = kept[0]
     if is_cprl(script):
         return shlex.join(["cprl", *kept[1:]])

@@ -3,8 +3,7 @@
 Modules, in the order in which one reads them:
     directory    the run's directory and recipe.json
     formats      the numbers of the formats of files; newer ones are refused
-    old_recipes  recipes of earlier formats
-    recipes      the experiment of a recipe, whatever its format
+    recipes      the experiment of a recipe
     source       from which commit the code of cprl is
     files        files that are never left half written
     lock         at most one process writes a run

@@ -27,7 +27,7 @@ from cprl.shipped import PROGRAM, command_of, cprl_here
 
 FILE_NAME: Final = "recipe.json"
 
-_RESUMES: Final = ("--resume", "--no-resume", "--go-on", "--no-go-on", "--take-over", "--no-take-over")
+_RESUMES: Final = ("--resume", "--no-resume", "--take-over", "--no-take-over")
 _DIRECTORIES: Final = ("--out", "--runs")
 LONGEST_PATH: Final = 500
 """The largest number of characters of a path that an error shows whole."""
@@ -118,8 +118,7 @@ def refuse_another_run(
         raise ValueError(f"{out} is a run of {kept.get('recipe')!r}; this is {now['recipe']!r}")
     if kept.get("format") != now["format"]:
         raise ValueError(
-            f"{out} was started by an older cprl, whose trainings this version cannot resume; its agents can "
-            "still be loaded and evaluated"
+            f"{out} has a recipe of the format {shown(kept.get('format'))}; allowed: {now['format']}"
         )
     from cprl.differences import differences
 
@@ -286,7 +285,7 @@ def without_options(words: Sequence[str], options: Sequence[str]) -> list[str]:
 
 
 def read_recipe(run: Path) -> dict[str, Any]:
-    """The recipe that `start_run` wrote; for runs older than `cprl.Experiment`, the recipe in its old format.
+    """The recipe that `start_run` wrote.
 
     Args:
         run: the run's directory, or the file itself.
@@ -299,9 +298,7 @@ def read_recipe(run: Path) -> dict[str, Any]:
     try:
         recipe = read_json(path)
         is_newer = isinstance(recipe.get("format"), int) and recipe["format"] > formats.RECIPE
-        if not is_newer and not any(
-            isinstance(recipe.get(name), dict) for name in ("experiment", "arguments")
-        ):
+        if not is_newer and not isinstance(recipe.get("experiment"), dict):
             raise TypeError('no table "experiment"')
     except (OSError, ValueError, TypeError) as error:
         name = path if len(str(path)) <= LONGEST_PATH else shown(str(path))

@@ -1,7 +1,7 @@
 """The formats of the files of runs and studies: one number each, which grows when an older cprl could not
 read what a newer one writes.
 
-docs/experiments.md ("Versions of files") says which file has which, and what reads older ones.
+docs/experiments.md ("Versions of files") says which file has which.
 """
 
 from collections.abc import Mapping
@@ -11,11 +11,11 @@ from typing import Any, Final
 from cprl.checks import shown
 
 RECIPE: Final = 2
-"""Of `recipe.json`, and of the journal and `report.json` beside it. Those of format 1 have no number."""
+"""Of `recipe.json`, and of the journal and `report.json` beside it."""
 MANIFEST: Final = 1
 """Of `manifest.json`, and of what it lists: weights, tables, transforms, decisions."""
 TRAINING_STATE: Final = 2
-"""Of checkpoints; 1 was that of cprl up to November 2026."""
+"""Of checkpoints."""
 STUDY: Final = 1
 """Of `study.json`."""
 STUDY_TABLE: Final = 1

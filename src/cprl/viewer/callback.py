@@ -264,8 +264,8 @@ class ViewerCallback:
         self._episode = int(state["episode"])
         self.filming.load_state_dict(state, episode=self._episode)
         self._series.load_state_dict(state["series"])
-        self.plots.load_state_dict(state.get("plots", {}))
-        self._views.load_state_dict(state.get("views", {}))
+        self.plots.load_state_dict(state["plots"])
+        self._views.load_state_dict(state["views"])
         self.logger.at(step=self._step, episode=self._episode)
         if self.story is not None:
             self.story.load_state_dict(state["story"] or {})

@@ -171,18 +171,11 @@ class Story:
         }
 
     def load_state_dict(self, state: Mapping[str, Any]) -> None:
-        """Continues from a state that `state_dict` returned, or from that of `EventDetector` alone, which is
-        what recordings up to November 2026 kept."""
-        events = state.get("events", state)
-        if self._detector is not None and events:
-            self._detector.load_state_dict(events)
-        if "now" in state:
-            self._now.load_state_dict(state["now"])
-            self._ended = int(state["ended"])
-        elif self._detector is not None:
-            for value in self._detector.returns:
-                self._now.add(value)
-            self._ended = len(self._detector.returns)
+        """Continues from a state that `state_dict` returned."""
+        if self._detector is not None and state["events"]:
+            self._detector.load_state_dict(state["events"])
+        self._now.load_state_dict(state["now"])
+        self._ended = int(state["ended"])
         if self._ended:
             self._logger.log_states(_NOW, {self._ended - 1: self._now.label})
             self._show_episode(None)

@@ -40,7 +40,5 @@ class Tags:
         return [own.tolist() for own in self._last]
 
     def load_state_dict(self, state: list[Any]) -> None:
-        """Continues from a state that `state_dict` returned, or from the one matrix that recordings up to
-        November 2026 kept."""
-        tags = np.array(state, np.float64)
-        self._last = list(tags if tags.ndim == 3 else tags[None])
+        """Continues from a state that `state_dict` returned."""
+        self._last = list(np.array(state, np.float64))

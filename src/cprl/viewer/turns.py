@@ -94,10 +94,6 @@ class Turns:
     def load_state_dict(self, state: dict[str, Any]) -> None:
         """Continues from a state that `state_dict` returned."""
         self._looks.take()
-        playing = np.array(state["playing"])
-        self._playing[:] = np.nan
-        for replica, points in enumerate(playing):  # as many of an older state as there is room for
-            known = points[~np.isnan(points[:, 0])]
-            self._playing[replica, known[:, 0].astype(int) // self.stride] = known
+        self._playing[:] = state["playing"]
         self._ended = [[(turn, stock) for turn, stock in line] for line in state["ended"]]
         self._died = list(state["died"])

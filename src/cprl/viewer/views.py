@@ -102,9 +102,9 @@ class Views:
         return {"logged": self._logged, "ended": self._ended, **views}
 
     def load_state_dict(self, state: Mapping[str, Any]) -> None:
-        """Continues from a state that `state_dict` returned; views that an older state lacks begin anew."""
-        self._logged = int(state.get("logged", 0))
-        self._ended = int(state.get("ended", self._logged))
+        """Continues from a state that `state_dict` returned; views that it lacks begin anew."""
+        self._logged = int(state["logged"])
+        self._ended = int(state["ended"])
         for name, view in self._there().items():
             if name in state:
                 view.load_state_dict(state[name])
