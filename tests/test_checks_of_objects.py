@@ -12,7 +12,6 @@ from cprl.arguments import callable_of, object_of, objects, path, texts
 from cprl.checks import plain
 from cprl.collectors import StepCollector
 from cprl.learners.lanes import weights_to_start
-from cprl.measuring import statistics
 from cprl.measuring.evaluate import evaluate
 from cprl.output import say
 from cprl.population import Scripted
@@ -69,7 +68,6 @@ def test_a_tensor_without_values_stays_as_it_is(empty):
         (lambda: cprl.load("x", weights=[]), "weights is "),
         (lambda: cprl.run(3), "experiment is 3"),
         (lambda: StepCollector(3, print), "env is 3"),
-        (lambda: statistics.mean([1.0], axis="a"), "axis is 'a'"),
         (lambda: evaluate(CommonsEnv(COMMONS), print, explore=torch.zeros(0)), "explore is "),
         (lambda: weights_to_start(True), "start_from is True"),
         (lambda: Map(height=1, width=9, sites=np.float32, starts=()), "Map.sites is "),
@@ -100,11 +98,6 @@ def test_what_is_nested_too_deeply_for_python_is_printed_all_the_same(capsys):
         nested = [nested]
     say(nested)
     assert capsys.readouterr().out == "[[[[[...]]]]]\n"
-
-
-def test_few_resamples_give_an_interval_without_a_warning():
-    found = statistics.estimate([1.0, 2.0, 4.0], resamples=1)
-    assert found.value == pytest.approx(7 / 3)
 
 
 def test_a_recipe_that_is_nested_too_deeply_is_refused_before_a_recording_is_made(tmp_path):

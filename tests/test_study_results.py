@@ -56,21 +56,21 @@ def grid_runs(tmp_path_factory):
 
 def test_an_interval_by_t_is_that_of_the_tables():
     # 1, 2, 3, 4: mean 2.5, standard error sqrt(5/3) / 2 = 0.6455, t of 3 degrees of freedom 3.1824.
-    found = estimate([1, 2, 3, 4], interval="t")
+    found = estimate([1, 2, 3, 4])
     assert (found.value, found.replicas) == (2.5, 4)
     assert (found.low, found.high) == pytest.approx((2.5 - 2.0543, 2.5 + 2.0543), abs=1e-4)
-    assert np.isnan(estimate([3.0], interval="t").low)
-    same = estimate([2.0, 2.0], interval="t")
+    assert np.isnan(estimate([3.0]).low)
+    same = estimate([2.0, 2.0])
     assert (same.low, same.high) == (2.0, 2.0)
 
 
 def test_a_paired_difference_is_far_narrower_than_one_of_two_samples():
     values, reference = [3.0, 104.0, 208.0], [0.0, 100.0, 200.0]
-    pairs = difference(values, reference, paired=True, interval="t")
+    pairs = difference(values, reference, paired=True)
     # The differences are 3, 4 and 8: mean 5, standard error sqrt(7 / 3) = 1.5275, t of 2 is 4.3027.
     assert pairs.value == 5
     assert (pairs.low, pairs.high) == pytest.approx((5 - 6.5724, 5 + 6.5724), abs=1e-3)
-    apart = difference(values, reference, paired=False, interval="t")
+    apart = difference(values, reference, paired=False)
     # Welch: variances 10508.3 and 10000 of 3 each, standard error 82.68; 3.9976 degrees of freedom, t 2.7770.
     assert (apart.value, apart.replicas) == (5, 6)
     assert apart.high - 5 == pytest.approx(229.6, abs=0.2)
@@ -85,11 +85,6 @@ def test_a_paired_difference_is_far_narrower_than_one_of_two_samples():
             lambda: difference([1, 2], [1], paired=True),
             "values has 2 replicas and reference 1; allowed in pairs",
         ),
-        (lambda: estimate([1, 2], interval="z"), "interval is 'z'; allowed: t, bca"),
-        (
-            lambda: estimate([1, 2], interval="t", statistic="iqm"),
-            r'interval is "t" and statistic is \'iqm\'',
-        ),
     ],
 )
 def test_statistics_that_do_not_fit_are_refused(call, message):
@@ -101,7 +96,7 @@ def test_statistics_that_do_not_fit_are_refused(call, message):
 
 
 def test_conditions_are_compared_by_the_last_episodes_and_pairs_of_replicas(pairs):
-    found = compare(pairs, "collective_return", interval="t")
+    found = compare(pairs, "collective_return")
     reference, other = found.conditions
     # Episodes 10 to 39 have the mean 24.5.
     assert reference.values == {0: 24.5, 1: 124.5, 2: 224.5}
@@ -120,7 +115,7 @@ def test_conditions_are_compared_by_the_last_episodes_and_pairs_of_replicas(pair
 def test_without_pairing_the_difference_is_that_of_two_samples_and_says_so(tmp_path):
     study = Study(EXPERIMENT, {TIME_OUT: [5, 25]}, name="apart", replicas=3, pairing=False)
     table = study_table(study, write_study(study, tmp_path, harvest))
-    found = compare(table, "collective_return", interval="t")
+    found = compare(table, "collective_return")
     assert found.conditions[1].difference.replicas == 6
     assert found.conditions[1].difference.high > 200
     assert "not paired" in cells([found], "differences").heading
@@ -151,8 +146,6 @@ def test_a_table_in_markdown_has_replicas_intervals_and_differences_that_exclude
     )
     assert [row[:2] for row in levels.rows] == [["freeze_steps=5", "3"], ["freeze_steps=25", "3"]]
     assert differences.rows == [["freeze_steps=25", "3", "+5.0 [-1.6, +11.6]"]]
-    bca = cells([compare(pairs, "collective_return", interval="bca")], "differences").rows[0][2]
-    assert bca == "**+5.00 [+3.33, +8.00]**"  # of resampled means of 3, 4 and 8
 
 
 @pytest.mark.parametrize(
@@ -160,7 +153,6 @@ def test_a_table_in_markdown_has_replicas_intervals_and_differences_that_exclude
     [
         ({"metric": "wealth"}, "metric is 'wealth'; allowed: collective_return, "),
         ({"part": "sleep"}, "part is 'sleep'; allowed: training, evaluation, random"),
-        ({"interval": "z"}, "interval is 'z'; allowed: t, bca"),
         ({"last": 5}, "last is 5; allowed: at least 10, the episodes of a window"),
     ],
 )

@@ -91,9 +91,6 @@ def test_the_end_of_the_training_that_is_compared_may_be_longer(here):
     assert "The last 20 episodes of training; means" in Path("here/summary.md").read_text()
     assert "95% intervals over replicas by Student's t" in Path("here/summary.md").read_text()
     assert "as that of about one in twenty would by chance" in Path("here/summary.md").read_text()
-    sweep(f"{line} --last 20 --interval bca")
-    assert "95% intervals by bootstrap of the replicas (BCa)" in Path("here/summary.md").read_text()
-    assert "as that of about one in two would by chance" in Path("here/summary.md").read_text()
     assert before == {path: path.stat().st_mtime_ns for path in Path("here/runs").rglob("*")}
     with pytest.raises(ValueError, match="last is 9; allowed: an integer >= 10, the episodes of a window"):
         sweep(f"{line.replace('here', 'elsewhere')} --last 9")

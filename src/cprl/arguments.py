@@ -36,10 +36,6 @@ EGTA_RESAMPLES: Final = 200
 
 Diagonal = Literal["self", "cross_seed"]
 """Whom a run's agents meet in the cross-play with their own run."""
-Interval = Literal["t", "bca"]
-"""How an interval is computed: "t", of means alone, by Student's t, right for few replicas if their values
-are about normally distributed; "bca", the bias-corrected and accelerated bootstrap, or by percentiles where
-there are several samples or that is undefined, which is too narrow for few replicas."""
 
 
 def refusal(name: str, value: object, allowed: str) -> ValueError:

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Final, Literal
 
 import tyro
 
-from cprl.arguments import BLOCK, LAST, WINDOW, Interval, object_of, texts
+from cprl.arguments import BLOCK, LAST, WINDOW, object_of, texts
 from cprl.commandline import in_a_sentence, parse_with
 from cprl.output import OUT, console, keep_output, printed, say
 from cprl.runs.directory import read_recipe, runs_in
@@ -272,7 +272,6 @@ def runs_table(
     metric: tyro.conf.UseAppendAction[tuple[str, ...]] = (),
     part: Part = _TRAINING,
     last: int | None = None,
-    interval: Interval = "t",
     reference: str | None = None,
     window: int = WINDOW,
     out: Path | None = None,
@@ -287,7 +286,6 @@ def runs_table(
         metric: what is compared, e.g. collective_return; may be repeated.
         part: of the runs: their training, their agents in fresh worlds, or random play in these.
         last: episodes at the end of the training that are compared, by default 30.
-        interval: "t", by Student's t, or "bca", by bootstrap of the replicas.
         reference: the name of the condition that others are compared with, e.g. freeze_steps=25; by default
             the first.
         window: episodes of a row of the table, of which --last compares whole ones and --out FILE.parquet
@@ -314,7 +312,7 @@ def runs_table(
     from cprl.studies.tables.texts import rich_table
 
     found = pooled_table(runs, by=by, window=window, reference=reference, allow=allow)
-    compared = _compared(found, metric, part, LAST if last is None else last, interval)
+    compared = _compared(found, metric, part, LAST if last is None else last)
     shown = console(width=None if OUT.isatty() else 250)
     for own in compared:
         shown.print(rich_table(own))
@@ -324,9 +322,7 @@ def runs_table(
         say(f"Written: {out}")
 
 
-def _compared(
-    found: "StudyTable", metrics: Sequence[str], part: Part, last: int, interval: Interval
-) -> "list[Cells]":
+def _compared(found: "StudyTable", metrics: Sequence[str], part: Part, last: int) -> "list[Cells]":
     """Levels, and differences where there is more than one condition."""
     from cprl.studies.tables.comparing import compare, metrics_of
     from cprl.studies.tables.texts import cells
@@ -334,7 +330,7 @@ def _compared(
     chosen = metrics_of(found, metrics)
     if not chosen:
         return []
-    every = [compare(found, own, part=part, last=last, interval=interval) for own in chosen]
+    every = [compare(found, own, part=part, last=last) for own in chosen]
     several = len(found.design.conditions) > 1
     return [cells(every), cells(every, "differences")] if several else [cells(every)]
 

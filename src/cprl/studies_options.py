@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any, Final, Literal
 
 import tyro
 
-from cprl.arguments import LAST, Interval, integer
+from cprl.arguments import LAST, integer
 from cprl.commandline import ended_by_sigterm
 from cprl.output import RESUMES, console, printed, say
 from cprl.runs.directory import without_directories, without_options
@@ -52,9 +52,6 @@ class StudyOptions:
     """Write the table, summary and figures at the end."""
     last: int = LAST
     """Episodes at the end of the training that these compare; of long trainings rather 500."""
-    interval: Interval = "t"
-    """How their intervals are computed: "t", by Student's t; "bca", by a bootstrap, too narrow for few
-    replicas."""
     dry_run: bool = False
     """List all conditions, trials and their states; run and write nothing."""
     allow: tyro.conf.UseAppendAction[tuple[str, ...]] = ()
@@ -111,7 +108,7 @@ def carry_out(what: "Study | Search", options: StudyOptions, command: Sequence[s
                 )
     if options.dry_run:
         return _list(what, options)
-    names = ("runs", "allow", "last", "interval")
+    names = ("runs", "allow", "last")
     how: dict[str, Any] = {"on": executor, **{own: getattr(options, own) for own in names}}
     program, *words = named_command(command)
     whole = without_options(words, ["--only"])  # what a part of a study lacks, it lacks

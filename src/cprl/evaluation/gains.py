@@ -10,7 +10,7 @@ from statistics import fmean
 
 from cprl.arguments import object_of
 from cprl.evaluation.cross_play import CrossPlay, Whose
-from cprl.measuring.statistics import Estimate, Interval, difference
+from cprl.measuring.statistics import Estimate, difference
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -29,7 +29,7 @@ class Gain:
         return self.focal.low > 0 and self.background.high < 0
 
 
-def gains(played: CrossPlay, *, interval: Interval = "t") -> dict[tuple[str, str], Gain]:
+def gains(played: CrossPlay) -> dict[tuple[str, str], Gain]:
     """The gains of all cells but the diagonal, by the names of the focal and of the background agents' run.
 
     Each number is first averaged over a replica's episodes and focal agents; replicas are paired, because
@@ -38,7 +38,6 @@ def gains(played: CrossPlay, *, interval: Interval = "t") -> dict[tuple[str, str
 
     Args:
         played: the cross-play.
-        interval: see `cprl.measuring.statistics.Interval`.
     """
     object_of("played", played, CrossPlay, "what crossplay() gave")
 
@@ -48,7 +47,7 @@ def gains(played: CrossPlay, *, interval: Interval = "t") -> dict[tuple[str, str
 
     def gain(focal: str, background: str, whose: Whose) -> Estimate:
         own, usual = means[whose][focal, background], means[whose][background, background]
-        return difference(own, usual, paired=True, interval=interval)
+        return difference(own, usual, paired=True)
 
     return {
         (focal, background): Gain(

@@ -13,9 +13,9 @@ from cprl.evaluation.cross_play import CrossPlay
 from cprl.evaluation.gains import diagonal_returns, gains
 from cprl.evaluation.tables import unit_of_cells
 from cprl.measuring.names import with_unit
-from cprl.measuring.statistics import Estimate, Interval, excluded_by_chance
+from cprl.measuring.statistics import Estimate
 from cprl.plotting.cells import EMPTY, draw_cell
-from cprl.plotting.style import INTERVALS, SHADES, SMALL_PT, head, picture_path, save, wrapped
+from cprl.plotting.style import SHADES, SMALL_PT, head, picture_path, save, wrapped
 
 _COLOURS: Final = "RdBu"
 _CELL_IN: Final = (0.82, 0.45)
@@ -26,18 +26,17 @@ _PANELS: Final = {
 }
 
 
-def draw_gains(played: CrossPlay, path: Path | str, *, interval: Interval = "t") -> Path:
+def draw_gains(played: CrossPlay, path: Path | str) -> Path:
     """Draws `gains`, a row for each focal agent's run, a column for each of background agents.
 
     Args:
         played: the cross-play.
         path: the PNG.
-        interval: see `cprl.measuring.statistics.Interval`.
 
     Raises:
         ValueError: if the name does not end in .png.
     """
-    path, found = picture_path(path), gains(played, interval=interval)
+    path, found = picture_path(path), gains(played)
     names, diagonal = list(played.runs), diagonal_returns(played)
     returns = with_unit("focal/return", rewards=unit_of_cells(played)).partition("/")[2]
     width = max(_CELL_IN[0] * len(names) + 2.6, _NARROWEST_IN)
@@ -47,11 +46,10 @@ def draw_gains(played: CrossPlay, path: Path | str, *, interval: Interval = "t")
         _draw_matrix(axes, names, own, diagonal)
         axes.set_title(f"difference in {returns} of {title}", fontsize=SMALL_PT + 1)
     count = len(played.replicas)
-    by_chance = excluded_by_chance(interval, count)
     note = (
         f"{count} replica{'s' * (count != 1)}, {played.episodes} episodes each with focal agent at each "
         f"index; diagonal ({played.diagonal.replace('_', '-')}): an agent's return. * the 95 % interval by "
-        f"{INTERVALS[interval]} excludes 0, as that of about {by_chance} would by chance; these are "
+        f"Student's t excludes 0, as that of about one in twenty would by chance; these are "
         f"{2 * len(found)}."
     )
     head(figure, "Cross-play: who gains among whom", note)

@@ -35,7 +35,7 @@ from cprl.evaluation.respondable import (
     path_of,
 )
 from cprl.evaluation.same_game import check_same_game
-from cprl.measuring.statistics import Estimate, Interval, difference
+from cprl.measuring.statistics import Estimate, difference
 from cprl.population import Frozen
 from cprl.runs.labelled import labelled
 from cprl.stored import LoadedRun, load
@@ -81,25 +81,24 @@ class Exploitability:
     def gain(self) -> Gain:
         """What chosen responses gain over the agents they replace, and what the mean of the others does: the
         mean over these agents, over replicas, with an interval by Student's t."""
-        return self._gain({agent: self._best(agent) for agent in self.responses}, "t")
+        return self._gain({agent: self._best(agent) for agent in self.responses})
 
-    def gain_of(self, agent: int, *, interval: Interval = "t") -> Gain:
+    def gain_of(self, agent: int) -> Gain:
         """The same in the place of one agent.
 
         Args:
             agent: its index.
-            interval: see `cprl.measuring.statistics.Interval`.
 
         Raises:
             ValueError: if there are no responses in its place.
         """
         agent = self._known(agent)
-        return self._gain({agent: self._best(agent)}, interval)
+        return self._gain({agent: self._best(agent)})
 
-    def gain_of_response(self, response: Response, *, interval: Interval = "t") -> Gain:
+    def gain_of_response(self, response: Response) -> Gain:
         """What one response gains in all replicas; nothing is chosen by these numbers."""
         arguments.object_of("response", response, Response, "one of `responses`")
-        return self._gain({self._known(response.agent): response.reporting}, interval)
+        return self._gain({self._known(response.agent): response.reporting})
 
     def chosen(self, agent: int) -> list[Response]:
         """The response in the place of an agent for each replica: the one with the highest mean return there
@@ -152,14 +151,14 @@ class Exploitability:
         """The episodes reported, with the response chosen for each replica."""
         return {replica: own.reporting[replica] for replica, own in enumerate(self._chosen[agent])}
 
-    def _gain(self, among: Mapping[int, Played], interval: Interval) -> Gain:
+    def _gain(self, among: Mapping[int, Played]) -> Gain:
         """Of the episodes with responses by agent; the mean over agents comes first, since places of one
         replica depend on each other."""
 
         def over(whose: Callable[[Played, int], Values]) -> Estimate:
             own = np.mean([whose(played, agent) for agent, played in among.items()], 0)
             usual = np.mean([whose(self.population, agent) for agent in among], 0)
-            return difference(own, usual, paired=True, interval=interval)
+            return difference(own, usual, paired=True)
 
         return Gain(focal=over(_focal), background=over(_others))
 

@@ -26,7 +26,6 @@ from cprl.evaluation.populations import place_of, play_population
 from cprl.evaluation.words import agent_named
 from cprl.measuring.dilemmas import Dilemma, dilemma
 from cprl.measuring.replicas import Measured, social_measures
-from cprl.measuring.statistics import Interval
 from cprl.policies.scripted import SCRIPTED_POLICIES
 from cprl.runs.labelled import labelled
 
@@ -73,9 +72,9 @@ class SchellingDiagram:
         group[:, :-1] += counts[:0:-1] * self.greedy_payoffs
         return group
 
-    def dilemma(self, *, interval: Interval = "t") -> Dilemma:
+    def dilemma(self) -> Dilemma:
         """Which dilemma they make, if any."""
-        return dilemma(self.restrained_payoffs, self.greedy_payoffs, interval=interval)
+        return dilemma(self.restrained_payoffs, self.greedy_payoffs)
 
     def measures(self, count: int) -> dict[str, Measured]:
         """The social metrics of the mixes with so many restrained agents.

@@ -9,7 +9,7 @@ from matplotlib.figure import Figure
 
 from cprl.arguments import object_of
 from cprl.evaluation.schelling import SchellingDiagram, Values
-from cprl.measuring.statistics import Interval, estimate
+from cprl.measuring.statistics import estimate
 from cprl.plotting import style
 
 _RESTRAINED: Final = "#1b7837"
@@ -17,14 +17,13 @@ _GREEDY: Final = "#b2182b"
 _SIZE_IN: Final = (7.5, 3.6)
 
 
-def draw_schelling(found: SchellingDiagram, path: Path | str, *, interval: Interval = "t") -> Path:
+def draw_schelling(found: SchellingDiagram, path: Path | str) -> Path:
     """Draws what an agent gets that is restrained or greedy, by how many of the others are restrained; beside
     it what all get together.
 
     Args:
         found: the diagram.
         path: the PNG.
-        interval: see `cprl.measuring.statistics.Interval`.
 
     Raises:
         ValueError: if the name does not end in .png.
@@ -38,11 +37,11 @@ def draw_schelling(found: SchellingDiagram, path: Path | str, *, interval: Inter
         (found.restrained_payoffs, found.restrained, "restrained", _RESTRAINED, "o"),
         (found.greedy_payoffs, found.greedy, "greedy", _GREEDY, "s"),
     ):
-        _line(own, payoffs, interval, label=f"{role}: {Path(who).name}", color=colour, marker=marker)
+        _line(own, payoffs, label=f"{role}: {Path(who).name}", color=colour, marker=marker)
     own.set_xlabel(f"restrained agents among the other {found.agents - 1}", fontsize=style.SMALL_PT)
     own.set_ylabel("return of the agent", fontsize=style.SMALL_PT)
     own.legend(fontsize=style.SMALL_PT)
-    _line(group, found.group_payoffs, interval, color=style.MEAN, marker="o")
+    _line(group, found.group_payoffs, color=style.MEAN, marker="o")
     group.set_xlabel(f"restrained agents of {found.agents}", fontsize=style.SMALL_PT)
     group.set_ylabel("return of all together", fontsize=style.SMALL_PT)
     for axes in (own, group):
@@ -50,15 +49,15 @@ def draw_schelling(found: SchellingDiagram, path: Path | str, *, interval: Inter
         axes.tick_params(labelsize=style.SMALL_PT)
     note = (
         f"{found.replicas} replicas, {found.episodes} episodes each for each choice of restrained agents; "
-        f"bars: 95 % intervals by {style.INTERVALS[interval]}"
+        f"bars: 95 % intervals by Student's t"
     )
-    style.head(figure, f"Schelling diagram: {found.dilemma(interval=interval).name}", note)
+    style.head(figure, f"Schelling diagram: {found.dilemma().name}", note)
     return style.save(figure, path)
 
 
-def _line(axes: Axes, values: Values, interval: Interval, **how: Any) -> None:
+def _line(axes: Axes, values: Values, **how: Any) -> None:
     """Means of [R, K] at 0 to K - 1 with their intervals."""
-    found = [estimate(own, interval=interval) for own in values.T]
+    found = [estimate(own) for own in values.T]
     means = np.array([own.value for own in found])
     reach = np.abs(np.array([(own.low, own.high) for own in found]).T - means)
     axes.errorbar(range(len(means)), means, np.nan_to_num(reach), capsize=2, markersize=5, **how)

@@ -23,7 +23,7 @@ from typing import Final
 from numpy.typing import ArrayLike
 
 from cprl import arguments
-from cprl.measuring.statistics import Estimate, Interval, difference
+from cprl.measuring.statistics import Estimate, difference
 
 NONE: Final = "no dilemma"
 UNTOLD: Final = "cannot be told"
@@ -57,13 +57,12 @@ class Dilemma:
         return " or ".join(self.candidates) if len(self.candidates) < _ALL else UNTOLD
 
 
-def dilemma(restrained: ArrayLike, greedy: ArrayLike, *, interval: Interval = "t") -> Dilemma:
+def dilemma(restrained: ArrayLike, greedy: ArrayLike) -> Dilemma:
     """Which dilemma payoffs make.
 
     Args:
         restrained: R(k), float [R, N]: of each of R replicas, for k = 0 to N - 1 others that are restrained.
         greedy: G(k), likewise. Replicas are paired.
-        interval: see `cprl.measuring.statistics.Interval`.
 
     Raises:
         ValueError: for other shapes, a single agent, and numbers that are not finite.
@@ -80,9 +79,7 @@ def dilemma(restrained: ArrayLike, greedy: ArrayLike, *, interval: Interval = "t
         "fear": (other[:, 0], own[:, 0]),
         "greed": (other[:, -1], own[:, -1]),
     }
-    return Dilemma(
-        **{name: difference(*pair, paired=True, interval=interval) for name, pair in pairs.items()}
-    )
+    return Dilemma(**{name: difference(*pair, paired=True) for name, pair in pairs.items()})
 
 
 def _name(restraint: bool, company: bool, fear: bool, greed: bool) -> str:

@@ -8,7 +8,7 @@ from statistics import fmean
 
 from cprl import arguments
 from cprl.measuring.episodes import Episode
-from cprl.measuring.statistics import Estimate, Interval, estimate
+from cprl.measuring.statistics import Estimate, estimate
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -30,12 +30,11 @@ class Measured:
         return f"{value}, undefined in {self.undefined} of {self.episodes}" if self.undefined else value
 
 
-def over_replicas(values: Mapping[int, Sequence[float]], *, interval: Interval = "t") -> Measured:
+def over_replicas(values: Mapping[int, Sequence[float]]) -> Measured:
     """Estimates a metric from its values by replica, one per episode, NaN where undefined.
 
     Args:
         values: the values by replica.
-        interval: see `cprl.measuring.statistics.Interval`.
 
     Raises:
         ValueError: if there are no replicas, or a replica has no episodes.
@@ -51,7 +50,7 @@ def over_replicas(values: Mapping[int, Sequence[float]], *, interval: Interval =
     means = [fmean(own) for own in defined if own]
     episodes = sum(map(len, values.values()))
     return Measured(
-        estimate=estimate(means, interval=interval) if means else None,
+        estimate=estimate(means) if means else None,
         undefined=episodes - sum(map(len, defined)),
         episodes=episodes,
     )
@@ -76,15 +75,12 @@ def institution_metrics(episode: Episode) -> dict[str, float]:
     return {**episode.institutions, **{f"in_force_{nth}": value for nth, value in enumerate(in_force)}}
 
 
-def institution_measures(
-    played: Mapping[int, Sequence[Episode]], *, interval: Interval = "t"
-) -> dict[str, Measured]:
+def institution_measures(played: Mapping[int, Sequence[Episode]]) -> dict[str, Measured]:
     """`institution_metrics` over replicas, by name, as `institutions/fines` and so on; empty for a game
     without institutions.
 
     Args:
         played: episodes by replica.
-        interval: see `cprl.measuring.statistics.Interval`.
 
     Raises:
         ValueError: see `over_replicas`.
@@ -97,20 +93,16 @@ def institution_measures(
     return {
         f"institutions/{name}": over_replicas(
             {replica: [metrics[name] for metrics in own] for replica, own in by_replica.items()},
-            interval=interval,
         )
         for name in names
     }
 
 
-def social_measures(
-    played: Mapping[int, Sequence[Episode]], *, interval: Interval = "t"
-) -> dict[str, Measured]:
+def social_measures(played: Mapping[int, Sequence[Episode]]) -> dict[str, Measured]:
     """`social_metrics` over replicas, by name.
 
     Args:
         played: episodes by replica.
-        interval: see `cprl.measuring.statistics.Interval`.
 
     Raises:
         ValueError: see `over_replicas`.
@@ -122,7 +114,6 @@ def social_measures(
     return {
         name: over_replicas(
             {replica: [metrics[name] for metrics in own] for replica, own in metrics_by_replica.items()},
-            interval=interval,
         )
         for name in names or ("survival_steps",)  # every game has it; without episodes it raises the error
     }

@@ -36,8 +36,6 @@ RAW: Final = "#b5b5b5"
 RANDOM_LINE: Final[dict[str, Any]] = {"color": "#555555", "linestyle": "--", "linewidth": 1.4, "zorder": 2.5}
 PUBLISHED: Final = "#000000"
 MARK: Final = "#a50f15"
-INTERVALS: Final = {"t": "Student's t", "bca": "bootstrap of the replicas (BCa)"}
-"""What a figure calls each `cprl.measuring.statistics.Interval`."""
 _EDGE: Final = "#303030"
 AGENTS_OF_A_DASH: Final = 4
 _DASHES: Final = ("-", (0, (6, 2)), (0, (4, 1, 1, 1)), (0, (1, 1)))

@@ -3,10 +3,9 @@
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, get_args
+from typing import Any
 
-from cprl.arguments import choice, integer, object_of, path, refusal, switch, texts
-from cprl.measuring.statistics import Interval
+from cprl.arguments import integer, object_of, path, refusal, switch, texts
 from cprl.studies.directory import RUNS, directory_of
 from cprl.studies.driver import as_driver, check_executor
 from cprl.studies.executors import Executor, InProcess
@@ -44,7 +43,6 @@ def run_study(
     progress: bool = True,
     results: bool = True,
     last: int = LAST,
-    interval: Interval = "t",
     again: str = "",
 ) -> StudyResult:
     """Runs what a study lacks; may be stopped at any moment, and called again.
@@ -67,7 +65,6 @@ def run_study(
         results: whether `table.parquet`, `summary.md` and `figures/` are written at the end, see
             `cprl.studies.results`.
         last: episodes at the end of the training that these compare, at least 10.
-        interval: how their intervals are computed, see `cprl.measuring.statistics.Interval`.
         again: the command line that runs what is lacking, for the summary.
 
     Raises:
@@ -84,7 +81,7 @@ def run_study(
     check_executor(on)
     switch("results", results)
     switch("keep_checkpoints", keep_checkpoints)
-    check_comparison(last, interval)
+    check_comparison(last)
     with as_driver(
         study,
         trials,
@@ -95,7 +92,7 @@ def run_study(
         progress=progress,
     ) as driver:
         failed = driver.run(chosen, on or InProcess())
-        how: Any = {"last": last, "interval": interval, "again": again}
+        how: Any = {"last": last, "again": again}
         table = results_of(study, trials, out, folder, **how) if results else None
     return StudyResult(study, out, folder, tuple(trials), failed, table)
 
@@ -127,7 +124,6 @@ def results_of(study: Study, trials: Sequence[Trial], out: Path, runs: Path, **h
     return write_results(study, out, runs, **how)
 
 
-def check_comparison(last: int, interval: str) -> None:
-    """Raises a ValueError for episodes that the table of a study does not tell apart, and for no interval."""
+def check_comparison(last: int) -> None:
+    """Raises a ValueError for episodes that the table of a study does not tell apart."""
     integer("last", last, WINDOW, allowed=f"an integer >= {WINDOW}, the episodes of a window of the table")
-    choice("interval", interval, get_args(Interval))

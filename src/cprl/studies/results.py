@@ -7,7 +7,6 @@ from typing import Final
 
 from cprl.arguments import object_of
 from cprl.arguments import path as path_of
-from cprl.measuring.statistics import Interval, excluded_by_chance
 from cprl.runs.extension import REPORT
 from cprl.runs.files import read_json, refuse_links, write_atomically
 from cprl.studies.figures.by_condition import by_condition
@@ -41,7 +40,6 @@ def write_results(
     *,
     window: int = WINDOW,
     last: int = LAST,
-    interval: Interval = "t",
     again: str = "",
 ) -> StudyTable:
     """Writes `table.parquet`, `summary.md` and `figures/`; again over what an earlier call wrote.
@@ -52,7 +50,6 @@ def write_results(
         runs: the directory of its runs.
         window: see `cprl.studies.tables.table.study_table`.
         last: episodes at the end of the training that are compared.
-        interval: "t" or "bca", see `cprl.measuring.statistics.Interval`.
         again: the command line that runs what is lacking, for the summary.
 
     Returns:
@@ -70,19 +67,19 @@ def write_results(
     table = study_table(study, folder, window=window, status=status if status.exists() else None)
     metrics = metrics_of(table)
     for own in metrics[:1]:
-        compare(table, own, last=last, interval=interval)
+        compare(table, own, last=last)
     sources = [own for own in sources_of(study, folder)[0] if own.name in table.made]
     found = endings(sources)
     table.write(out / TABLE)
-    figures = list(_draw(table, found, out / FIGURES, last, interval)) if metrics else []
+    figures = list(_draw(table, found, out / FIGURES, last)) if metrics else []
     _remove_stale(out / FIGURES, [name for name, _ in figures])
-    lines = [*_summary(study, table, found, figures, last, interval, again), *_lengths(table, sources)]
+    lines = [*_summary(study, table, found, figures, last, again), *_lengths(table, sources)]
     content = ("\n".join(lines).rstrip() + "\n").encode("utf-8", "replace")
     write_atomically(out / SUMMARY, lambda file: file.write(content))
     return table
 
 
-def _draw(table: StudyTable, found: Endings, folder: Path, last: int, interval: Interval) -> Iterator[Drawn]:
+def _draw(table: StudyTable, found: Endings, folder: Path, last: int) -> Iterator[Drawn]:
     """Draws what fits the study: by each numeric factor, by condition, and over each two factors."""
     design = table.design
     few = len(design.conditions) <= MOST_CONDITIONS
@@ -90,23 +87,23 @@ def _draw(table: StudyTable, found: Endings, folder: Path, last: int, interval: 
     for factor in design.factors:
         if is_numeric([own[factor] for own in design.conditions.values()]):
             name = f"by_{_file_name(factor)}.png"
-            by_factor(table, factor, folder / name, last=last, interval=interval)
+            by_factor(table, factor, folder / name, last=last)
             yield name, f"Outcome by {factor}"
     if few:
-        by_condition(table, folder / "levels.png", last=last, interval=interval)
+        by_condition(table, folder / "levels.png", last=last)
         yield "levels.png", "Outcome by condition"
         courses(table, folder / "courses.png")
         yield "courses.png", "The course of the training"
         phase_diagram(table, found, folder / "phases.png")
         yield "phases.png", "In which phases replicas end"
     if few and len(design.conditions) > 1 and table.replicas[design.reference]:
-        by_condition(table, folder / "differences.png", kind="differences", last=last, interval=interval)
+        by_condition(table, folder / "differences.png", kind="differences", last=last)
         yield "differences.png", f"Differences from {design.reference}"
     for one, other in every:
         pair = f"{_file_name(one)}_{_file_name(other)}"
         for metric in metrics_of(table)[:_MAPPED]:
             name = f"map_{pair}_{metric}.png"
-            heat_map(table, (one, other), folder / name, metric=metric, last=last, interval=interval)
+            heat_map(table, (one, other), folder / name, metric=metric, last=last)
             yield name, f"{metric_title(metric)} by {one} and {other}"
         name = f"phases_{pair}.png"
         phase_diagram(table, found, folder / name, factors=(one, other))
@@ -126,7 +123,6 @@ def _summary(
     found: Endings,
     figures: Sequence[Drawn],
     last: int,
-    interval: Interval,
     again: str,
 ) -> list[str]:
     """The lines of the summary."""
@@ -137,8 +133,8 @@ def _summary(
     lines += _lacking(table, again)
     if not table.metrics:
         return lines
-    lines += _compared(table, TRAINING, last, interval)
-    lines += _compared(table, EVALUATION, last, interval)
+    lines += _compared(table, TRAINING, last)
+    lines += _compared(table, EVALUATION, last)
     lines += _phases(table, found)
     lines += ["## Figures", ""] if figures else []
     for name, what in figures:
@@ -162,26 +158,24 @@ def _lacking(table: StudyTable, again: str) -> list[str]:
     return ["## What is not in these results", "", *(f"- {own}" for own in table.lacking), "", how, ""]
 
 
-def _compared(table: StudyTable, part: str, last: int, interval: Interval) -> list[str]:
+def _compared(table: StudyTable, part: str, last: int) -> list[str]:
     """Levels and differences of a part of the runs."""
     chosen = metrics_of(table)
-    every = [compare(table, own, part=part, last=last, interval=interval) for own in chosen]
+    every = [compare(table, own, part=part, last=last) for own in chosen]
     lines = ["## Training" if part == TRAINING else "## Trained agents in fresh worlds", ""]
     levels = cells(every)
     lines += [levels.heading, "", *markdown(levels)]
     if len(table.design.conditions) > 1:
         differences = cells(every, "differences")
         count = len(differences.rows) * len(chosen)
-        fewest = min((own.replicas for one in every for own in one.conditions if own.replicas), default=1)
-        by_chance = excluded_by_chance(interval, fewest)
         lines += [
-            f"{differences.heading} Bold: the interval excludes 0, as that of about {by_chance} would by "
+            f"{differences.heading} Bold: the interval excludes 0, as that of about one in twenty would by "
             f"chance; these are {count}.",
             "",
             *markdown(differences),
         ]
     if part == EVALUATION:
-        random = cells([compare(table, own, part=RANDOM, interval=interval) for own in chosen])
+        random = cells([compare(table, own, part=RANDOM) for own in chosen])
         lines += [random.heading, "", *markdown(random)]
     return lines
 

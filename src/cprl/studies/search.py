@@ -15,7 +15,6 @@ from typing import Any, Final
 
 from cprl.arguments import object_of, switch
 from cprl.arguments import path as path_of
-from cprl.measuring.statistics import Interval
 from cprl.runs.files import write_json
 from cprl.studies.directory import RUNS, directory_of, write_study
 from cprl.studies.driver import Driver, as_driver, check_executor
@@ -66,7 +65,6 @@ def run_search(
     progress: bool = True,
     results: bool = True,
     last: int = LAST,
-    interval: Interval = "t",
     again: str = "",
 ) -> SearchResult:
     """Runs a search; may be stopped at any moment, and called again, with more points too.
@@ -80,7 +78,6 @@ def run_search(
         progress: see `cprl.studies.run_study`.
         results: see `cprl.studies.run_study`.
         last: see `cprl.studies.run_study`; what the search itself looks at is in `Search`.
-        interval: see `cprl.studies.run_study`.
         again: see `cprl.studies.run_study`.
 
     Raises:
@@ -90,7 +87,7 @@ def run_search(
     object_of("search", search, Search, "a Search")
     check_executor(on)
     switch("results", results)
-    check_comparison(last, interval)
+    check_comparison(last)
     optuna = _optuna()
     asked = _Asked(search, optuna)
     batch = asked.first_batch()
@@ -108,7 +105,7 @@ def run_search(
             _write_journal(optuna, asked.study, out / JOURNAL)
             batch = asked.next_batch()
         trials = trials_of(study)
-        how: Any = {"last": last, "interval": interval, "again": again}
+        how: Any = {"last": last, "again": again}
         table = results_of(study, trials, out, folder, **how) if results else None
     return SearchResult(search, study, out, folder, tuple(asked.points), tuple(trials), tuple(failed), table)
 

@@ -8,7 +8,6 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from cprl.arguments import choice, refusal
-from cprl.measuring.statistics import Interval
 from cprl.plotting.style import MEAN, RANDOM_LINE, SMALL_PT, head, picture_path, save, wrapped
 from cprl.studies.figures.panels import (
     FAINT,
@@ -35,7 +34,6 @@ def by_condition(
     metrics: Sequence[str] = (),
     part: str = TRAINING,
     last: int = LAST,
-    interval: Interval = "t",
 ) -> Path:
     """Draws the conditions one below the other: means over replicas, or differences from the reference.
 
@@ -46,7 +44,6 @@ def by_condition(
         metrics: see `by_factor`.
         part: see `cprl.studies.tables.comparing.compare`.
         last: likewise.
-        interval: likewise.
 
     Raises:
         ValueError: for too many conditions, another ending than .png, and for what does not fit.
@@ -58,9 +55,7 @@ def by_condition(
         raise ValueError(f"the reference {design.reference} has no finished run; allowed: one that has")
     if not 0 < len(shown) <= MOST_CONDITIONS:
         raise refusal("table", table, f"1 to {MOST_CONDITIONS} conditions, not {len(shown)}")
-    comparisons = [
-        compare(table, own, part=part, last=last, interval=interval) for own in metrics_of(table, metrics)
-    ]
+    comparisons = [compare(table, own, part=part, last=last) for own in metrics_of(table, metrics)]
     names = with_counts(names_of(design), table.replicas)
     rows_in = 0.34 if all("\n" not in names[own] for own in shown) else 0.46
     figure = Figure((12.0, rows_in * len(shown) + 1.8), layout="constrained")

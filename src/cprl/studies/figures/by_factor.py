@@ -11,7 +11,7 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import NullLocator
 
 from cprl.arguments import refusal
-from cprl.measuring.statistics import Estimate, Interval
+from cprl.measuring.statistics import Estimate
 from cprl.plotting.style import RANDOM_LINE, SMALL_PT, head, picture_path, save, wrapped
 from cprl.studies.figures.panels import (
     LEVEL,
@@ -44,7 +44,6 @@ def by_factor(
     metrics: Sequence[str] = (),
     part: str = TRAINING,
     last: int = LAST,
-    interval: Interval = "t",
 ) -> Path:
     """Draws metrics against a factor whose levels are numbers.
 
@@ -63,7 +62,6 @@ def by_factor(
         metrics: by default those of `cprl.studies.tables.comparing.METRICS` that it has.
         part: see `cprl.studies.tables.comparing.compare`.
         last: likewise.
-        interval: likewise.
 
     Raises:
         ValueError: for a factor whose levels are not numbers, another ending than .png, and for what does
@@ -75,9 +73,7 @@ def by_factor(
         raise refusal(
             "factor", factor, ", ".join(numeric) or "none, as no factor has levels that are numbers"
         )
-    comparisons = [
-        compare(table, own, part=part, last=last, interval=interval) for own in metrics_of(table, metrics)
-    ]
+    comparisons = [compare(table, own, part=part, last=last) for own in metrics_of(table, metrics)]
     lines = _lines(design, factor)
     others = [own for own in design.factors if own != factor]
     only = [

@@ -13,7 +13,6 @@ from matplotlib.patches import Rectangle
 from matplotlib.ticker import MaxNLocator
 
 from cprl.arguments import object_of, refusal
-from cprl.measuring.statistics import Interval
 from cprl.plotting.cells import EMPTY, draw_cell
 from cprl.plotting.style import SHADES, SMALL_PT, head, picture_path, save, wrapped
 from cprl.studies.figures.panels import (
@@ -68,7 +67,6 @@ def heat_map(
     metric: str = "collective_return",
     part: str = TRAINING,
     last: int = LAST,
-    interval: Interval = "t",
 ) -> Path:
     """Draws a metric over two factors: its mean with the number of replicas, and its difference.
 
@@ -82,14 +80,13 @@ def heat_map(
         metric: one of its metrics.
         part: see `cprl.studies.tables.comparing.compare`.
         last: likewise.
-        interval: likewise.
 
     Raises:
         ValueError: for what are no two factors of a grid, and another ending than .png.
     """
     path, design = picture_path(path), table.design
     grid, fixed = _checked(design, factors)
-    comparison = compare(table, metric, part=part, last=last, interval=interval)
+    comparison = compare(table, metric, part=part, last=last)
     rows, columns = ([*dict.fromkeys(pair[nth] for pair in grid)] for nth in (0, 1))
     figure = Figure(
         (max(2 * _CELL_IN[0] * len(columns) + 3.4, 8.0), _CELL_IN[1] * len(rows) + 2.3), layout="constrained"

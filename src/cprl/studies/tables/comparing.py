@@ -3,14 +3,14 @@
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Any, Final, get_args
+from typing import Any, Final
 
 import numpy as np
 from numpy.typing import NDArray
 
 from cprl.arguments import LAST as LAST
 from cprl.arguments import choice, integer, object_of, refusal
-from cprl.measuring.statistics import CONFIDENCE, Estimate, Interval, difference, estimate
+from cprl.measuring.statistics import CONFIDENCE, Estimate, difference, estimate
 from cprl.studies.tables.table import StudyTable
 from cprl.studies.tables.windows import NET, PARTS, TRAINING
 
@@ -65,7 +65,6 @@ class Comparison:
     last: tuple[int, int]
     """The smallest and the largest number of episodes of a replica that the values are means of: those at the
     end of a training, or all of another part."""
-    interval: Interval
     is_paired: bool
     reference: str
     conditions: tuple[Compared, ...]
@@ -95,10 +94,7 @@ class Comparison:
     @property
     def interval_text(self) -> str:
         """How intervals are computed."""
-        if self.interval == "t":
-            return f"{CONFIDENCE:.0%} intervals over replicas by Student's t"
-        kind = "BCa" if self.is_paired else "BCa; of differences percentiles"
-        return f"{CONFIDENCE:.0%} intervals by bootstrap of the replicas ({kind})"
+        return f"{CONFIDENCE:.0%} intervals over replicas by Student's t"
 
 
 def compare(
@@ -107,7 +103,6 @@ def compare(
     *,
     part: str = TRAINING,
     last: int = LAST,
-    interval: Interval = "t",
 ) -> Comparison:
     """A metric under every condition, with intervals over replicas.
 
@@ -116,7 +111,6 @@ def compare(
         metric: one of its metrics.
         part: "training", "evaluation" or "random".
         last: of training: episodes at its end; those of whole windows.
-        interval: "t" or "bca", see `cprl.measuring.statistics.Interval`.
 
     Raises:
         ValueError: for a metric that the table lacks, for fewer episodes than a window, and for what does not
@@ -126,18 +120,17 @@ def compare(
     if metric not in table.metrics:
         raise refusal("metric", metric, ", ".join(table.metrics) or "none, as the table has no finished run")
     choice("part", part, PARTS)
-    choice("interval", interval, get_args(Interval))
     integer("last", last, 1)
     if part == TRAINING and last < table.window:
         raise refusal("last", last, f"at least {table.window}, the episodes of a window of the table")
-    asked = metric, part, last, interval
+    asked = metric, part, last
     if asked not in table.comparisons:
         table.comparisons[asked] = _compared(table, *asked)
     own: Comparison = table.comparisons[asked]
     return own
 
 
-def _compared(table: StudyTable, metric: str, part: str, last: int, interval: Interval) -> Comparison:
+def _compared(table: StudyTable, metric: str, part: str, last: int) -> Comparison:
     found = {name: _of_condition(table, name, metric, part, last) for name in table.design.conditions}
     lengths = [length for *_, length in found.values() if length]
     reference, is_paired = table.design.reference, table.design.is_paired
@@ -146,7 +139,7 @@ def _compared(table: StudyTable, metric: str, part: str, last: int, interval: In
         defined = [own for own in values.values() if not np.isnan(own)]
         other = None
         if name != reference:
-            other = _difference(values, found[reference][0], is_paired, interval)
+            other = _difference(values, found[reference][0], is_paired)
         compared.append(
             Compared(
                 condition=name,
@@ -154,7 +147,7 @@ def _compared(table: StudyTable, metric: str, part: str, last: int, interval: In
                 values=values,
                 episodes=length * len(values),
                 undefined=undefined,
-                estimate=estimate(defined, interval=interval) if defined else None,
+                estimate=estimate(defined) if defined else None,
                 difference=other,
             )
         )
@@ -162,7 +155,6 @@ def _compared(table: StudyTable, metric: str, part: str, last: int, interval: In
         metric=metric,
         part=part,
         last=(min(lengths, default=0), max(lengths, default=0)),
-        interval=interval,
         is_paired=is_paired,
         reference=reference,
         conditions=tuple(compared),
@@ -200,14 +192,14 @@ def _of_condition(
 
 
 def _difference(
-    values: Mapping[int, float], reference: Mapping[int, float], is_paired: bool, interval: Interval
+    values: Mapping[int, float], reference: Mapping[int, float], is_paired: bool
 ) -> Estimate | None:
     if is_paired:
         both = [own for own in values if own in reference]
         pairs = np.array([(values[own], reference[own]) for own in both], dtype=np.float64).reshape(-1, 2)
         pairs = pairs[~np.isnan(pairs).any(1)]
-        return difference(*pairs.T, paired=True, interval=interval) if len(pairs) else None
+        return difference(*pairs.T, paired=True) if len(pairs) else None
     samples = [[x for x in own.values() if not np.isnan(x)] for own in (values, reference)]
     if not all(samples):
         return None
-    return difference(samples[0], samples[1], paired=False, interval=interval)
+    return difference(samples[0], samples[1], paired=False)
