@@ -1,7 +1,6 @@
 """The game whose strategies are stored runs: what is played, what it amounts to, told and drawn."""
 
 from dataclasses import replace
-from math import inf
 
 import numpy as np
 import pytest
@@ -124,7 +123,7 @@ def test_analyses_are_drawn_for_any_number_of_runs(runs, made, tmp_path):
     pytest.importorskip("nashpy")
     rng = np.random.default_rng(runs)
     game = with_payoffs(made, [f"run {own}" for own in range(runs)], rng.random((3, runs, runs)))
-    found = analyse(game, resamples=3, alpha=inf)
+    found = analyse(game, resamples=3)
     drawn = draw_egta(found, tmp_path / "new" / "game.png")
     assert imread(drawn).shape[1] > 1000
     with pytest.raises(FileExistsError):
@@ -147,8 +146,6 @@ def test_the_command_tells_and_draws_which_run_lasts(corridors, tmp_path, monkey
     assert out.exists()
     with pytest.raises(SystemExit, match=r"game\.parquet exists and is not overwritten"):
         command(monkeypatch, capsys, "egta", *words, "--out", out)
-    with pytest.raises(SystemExit, match=r"alpha is -1"):
-        command(monkeypatch, capsys, "egta", *words, "--alpha", "-1")
 
 
 @pytest.mark.integration

@@ -60,7 +60,6 @@ def test_each_study_asks_a_question_and_says_what_the_paper_leads_to_expect(name
     assert study.name == name
     assert study.question.endswith("?")
     assert study.expectation.startswith("After Perolat et al.: ")
-    assert study.pairing
     assert study.replicas >= 2
 
 

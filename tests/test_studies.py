@@ -105,7 +105,6 @@ def test_what_does_not_fit_is_refused_by_its_path(factors, message):
     [
         ({"replicas": 0}, "replicas is 0; allowed: an integer from 1"),
         ({"block": 1.5}, "block is 1.5; allowed: an integer from 1"),
-        ({"pairing": 1}, "pairing is 1; allowed: True or False"),
         ({"reference": "x"}, "reference is 'x'; allowed: the name of a condition: unchanged"),
         ({"draws": 2}, "draws is given without factors"),
         ({"conditions": {"a": 3}}, r"conditions\['a'\] is 3; allowed: a table"),
@@ -199,8 +198,6 @@ def test_blocks_have_seeds_of_their_own_and_pairs_the_same_in_every_condition():
     found = [(own.condition.name, own.experiment.seed, own.experiment.replicas) for own in trials_of(study)]
     pairs = [("freeze_steps=5", "freeze_steps=25"), (0, 1000, 2000), (2, 2, 1)]
     assert found == [(name, seed, size) for seed, size in zip(*pairs[1:], strict=True) for name in pairs[0]]
-    unpaired = [own.experiment.seed for own in trials_of(replace(study, pairing=False))]
-    assert len(set(unpaired)) == 6
 
 
 def test_the_first_block_is_the_run_of_the_recipe_itself():
@@ -299,7 +296,7 @@ def test_a_range_that_is_none_is_refused(kind, low, high):
 ON_POLICY = Learning(PPO(settings=RolloutSettings()))
 STUDIES = {
     "grid": Study(TINY, {FREEZE: [5, 25], "agents": [[LEARNING] * 2, [ON_POLICY, Scripted("random")]]}),
-    "levels": Study(TINY, {"b": {"x": {}, "y": {"game.rules.regrow_prob": (0, 0.5)}}}, pairing=False),
+    "levels": Study(TINY, {"b": {"x": {}, "y": {"game.rules.regrow_prob": (0, 0.5)}}}),
     "draws": Study(TINY, {GAMMA: LogUniform(0.1, 0.9)}, draws=2, question="Why?", expectation="Thus."),
     "named": Study(
         TINY, conditions={"a": {}, "b": {FREEZE: 3}}, reference="b", replicas=9, block=4, name="n"
@@ -447,3 +444,10 @@ def test_the_studies_of_the_programs_versions_share_their_runs(monkeypatch):
     committed = {"dab4a686bb41": schedule, "2919eaddb858": dip}  # those of docs/results
     for checksum, study in committed.items():
         assert trials_of(study)[0].name == f"{checksum}-s0-r8"
+
+
+def test_a_stored_study_says_that_it_is_paired_or_is_refused():
+    table = there_and_back(STUDIES["grid"]).to_config()
+    assert Study.from_config({**table, "pairing": True}) == STUDIES["grid"]
+    with pytest.raises(ValueError, match="pairing"):
+        Study.from_config({**table, "pairing": False})

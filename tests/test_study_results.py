@@ -112,15 +112,6 @@ def test_conditions_are_compared_by_the_last_episodes_and_pairs_of_replicas(pair
     assert evaluated.episodes_text == "3 fresh episodes of the trained agents"
 
 
-def test_without_pairing_the_difference_is_that_of_two_samples_and_says_so(tmp_path):
-    study = Study(EXPERIMENT, {TIME_OUT: [5, 25]}, name="apart", replicas=3, pairing=False)
-    table = study_table(study, write_study(study, tmp_path, harvest))
-    found = compare(table, "collective_return")
-    assert found.conditions[1].difference.replicas == 6
-    assert found.conditions[1].difference.high > 200
-    assert "not paired" in cells([found], "differences").heading
-
-
 def test_replicas_without_a_value_are_counted_and_pairs_are_those_that_both_have(tmp_path):
     def equality(replica, number):
         return NAN if replica == 1 or number == 39 else 0.25

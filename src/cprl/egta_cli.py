@@ -1,6 +1,5 @@
 """`cprl egta`: which of several runs lasts where agents choose among them."""
 
-from math import inf
 from pathlib import Path
 
 from cprl.arguments import EGTA_RESAMPLES, SEED
@@ -16,7 +15,6 @@ def egta(
     *,
     episodes: int = 5,
     pairwise: bool = False,
-    alpha: float = inf,
     resamples: int = EGTA_RESAMPLES,
     greedy: bool = False,
     seed: int = SEED,
@@ -33,7 +31,6 @@ def egta(
         episodes: of each replica and choice of who plays where.
         pairwise: play one agent of each run among those of each other, as `cprl crossplay` does: cheaper,
             and a reduction where there are more than two agents.
-        alpha: of alpha-rank, how strongly payoffs, scaled to 0..1, select; by default the limit.
         resamples: of the replicas, for intervals.
         greedy: whether agents play what they hold best, without exploring or drawing.
         seed: of the worlds and all chance; the same one gives the same numbers.
@@ -53,11 +50,9 @@ def egta(
     from cprl.evaluation.egta_tables import egta_heading, egta_tables
     from cprl.evaluation.empirical_game import pairwise_game, play_empirical_game
     from cprl.runs.labelled import write_table
-    from cprl.theory.evolution import check_alpha
     from cprl.theory.extras import check_extras
 
     check_extras()
-    check_alpha(alpha)
     prepare_process(seed)
     if pairwise:
         game = pairwise_game(
@@ -69,7 +64,7 @@ def egta(
         )
     if out is not None:
         write_table(out, game.episodes_table)
-    found = analyse(game, alpha=alpha, resamples=resamples)
+    found = analyse(game, resamples=resamples)
     say(egta_heading(game))
     print_tables(*egta_tables(found))
     tell_files(out, figure, lambda path: draw_egta(found, path))

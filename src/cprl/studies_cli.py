@@ -54,8 +54,6 @@ class SweepOptions(StudyOptions):
     """So many random combinations instead of all."""
     block: int = BLOCK
     """Replicas that one run trains side by side; with fewer, more processes share the work."""
-    pairing: bool = True
-    """Replica r has the same seeds and worlds in each condition."""
     reference: str | None = None
     """The name of the condition that others are compared with, e.g. "freeze_steps=25"."""
     search: int | None = None
@@ -188,7 +186,7 @@ def wanted(experiment: "Experiment", options: SweepOptions) -> "Study | Search":
     if not options.vary:
         raise ValueError("nothing is varied; allowed: --vary PATH=VALUE,VALUE..., at least once")
     factors = factors_of(experiment, options.vary)
-    how: dict[str, Any] = {"block": options.block, "pairing": options.pairing}
+    how: dict[str, Any] = {"block": options.block}
     if options.search is None:
         for own in ("maximise", "minimise", *_OF_SEARCH):
             if getattr(options, own) != getattr(SweepOptions(), own):

@@ -9,7 +9,6 @@ it. With few replicas such intervals are too narrow rather than too wide.
 
 from collections import Counter
 from dataclasses import dataclass, field
-from math import inf
 
 import numpy as np
 
@@ -28,7 +27,6 @@ class Analysis:
     game: EmpiricalGame
     table: PayoffTable = field(repr=False)
     """The means over replicas."""
-    alpha: float
     resamples: int
     """Of the bootstrap; 0 for a single replica."""
     rank: AlphaRank = field(repr=False)
@@ -46,14 +44,11 @@ class Analysis:
     """Where replicator dynamics end."""
 
 
-def analyse(
-    game: EmpiricalGame, *, alpha: float = inf, resamples: int = arguments.EGTA_RESAMPLES, seed: int = 0
-) -> Analysis:
+def analyse(game: EmpiricalGame, *, resamples: int = arguments.EGTA_RESAMPLES, seed: int = 0) -> Analysis:
     """Analyses an empirical game.
 
     Args:
         game: of `play_empirical_game` or `pairwise_game`.
-        alpha: see `cprl.theory.alpha_rank`.
         resamples: the number of bootstrap resamples of the replicas.
         seed: the seed of the resampling, and of the starts of the replicator dynamics.
 
@@ -69,14 +64,13 @@ def analyse(
     # Few replicas have few resamples that differ: each is analysed once.
     times = Counter(tuple(sorted(own)) for own in drawn.tolist())
     again = [(game.table(own), count) for own, count in times.items()]
-    rank = alpha_rank(table, alpha=alpha)
+    rank = alpha_rank(table)
     return Analysis(
         game=game,
         table=table,
-        alpha=alpha,
         resamples=len(drawn),
         rank=rank,
-        shares=_shares(rank, again, alpha, replicas),
+        shares=_shares(rank, again, replicas),
         pure=_certainty(table, again),
         equilibria=_equilibria(table.reduced),
         in_support=_in_support(table, again),
@@ -84,12 +78,10 @@ def analyse(
     )
 
 
-def _shares(
-    rank: AlphaRank, again: list[tuple[PayoffTable, int]], alpha: float, replicas: int
-) -> tuple[Estimate, ...]:
+def _shares(rank: AlphaRank, again: list[tuple[PayoffTable, int]], replicas: int) -> tuple[Estimate, ...]:
     bounds = np.full((2, len(rank.shares)), np.nan)
     if again:
-        found = [np.tile(alpha_rank(own, alpha=alpha).shares, (count, 1)) for own, count in again]
+        found = [np.tile(alpha_rank(own).shares, (count, 1)) for own, count in again]
         margin = (1 - CONFIDENCE) / 2
         bounds = np.quantile(np.concatenate(found), [margin, 1 - margin], axis=0)
     return tuple(

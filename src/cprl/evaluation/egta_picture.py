@@ -4,7 +4,7 @@ Of two runs: what the first gains over the second, by how many play as it. Of th
 direction in which shares move. Of more: which run a first deviating agent gains by.
 """
 
-from math import inf, isnan
+from math import isnan
 from pathlib import Path
 from typing import Final
 
@@ -174,5 +174,4 @@ def _draw_rank(axes: Axes, found: Analysis) -> None:
     axes.set(xlim=(0, 1), ylim=(len(places) - 0.5, -0.5))
     axes.tick_params(labelsize=style.SMALL_PT)
     axes.set_xlabel("share of the agents in the long run", fontsize=style.SMALL_PT)
-    alpha = "infinite alpha" if found.alpha == inf else f"alpha {found.alpha:g}"
-    axes.set_title(f"alpha-rank, {alpha}", fontsize=style.SMALL_PT)
+    axes.set_title("alpha-rank, infinite alpha", fontsize=style.SMALL_PT)

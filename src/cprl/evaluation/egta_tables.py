@@ -1,7 +1,7 @@
 """What an empirical game amounts to, as tables for the terminal."""
 
 from collections.abc import Iterator, Sequence
-from math import inf, isnan
+from math import isnan
 from typing import Final
 
 import numpy as np
@@ -70,8 +70,7 @@ def _compositions(game: EmpiricalGame) -> Table:
 
 
 def _runs(found: Analysis) -> Table:
-    alpha = "the limit of infinite alpha" if found.alpha == inf else f"alpha {found.alpha:g}"
-    title = f"alpha-rank at {alpha}: share of the agents in the long run"
+    title = "alpha-rank at the limit of infinite alpha: share of the agents in the long run"
     if found.resamples:
         title += f" [95 % interval, {found.resamples} resamples of the replicas]"
     table = Table(title=title, title_justify="left")

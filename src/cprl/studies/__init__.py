@@ -5,7 +5,7 @@ Modules, in the order in which one reads them:
     factors      levels, and distributions of random draws
     naming       what conditions and levels are called
     conditions   one experiment of a study: what levels make of it, and the checksum that names its runs
-    study        Study: factors, replicas, pairing; a value
+    study        Study: factors, replicas; a value
     status       what a trial says of itself while it runs
     extending    runs that go on from shorter ones
     trials       one run of a study, run or resumed, whatever was there

@@ -45,7 +45,6 @@ class Search:
             a sampler of Optuna from a seed.
         replicas: see `Study`.
         block: see `Study`.
-        pairing: see `Study`.
         name: by default that of the experiment.
 
     Raises:
@@ -63,7 +62,6 @@ class Search:
     sampler: Sampler = field(default="tpe", kw_only=True)
     replicas: int | None = field(default=None, kw_only=True)
     block: int = field(default=BLOCK, kw_only=True)
-    pairing: bool = field(default=True, kw_only=True)
     name: str = field(default="", kw_only=True)
 
     def __post_init__(self) -> None:
@@ -104,7 +102,6 @@ class Search:
             "experiment": self.experiment,
             "replicas": self.replicas,
             "block": self.block,
-            "pairing": self.pairing,
             "name": self.name,
         }
         return Study(factors=factors or {}, **{**how, **others})

@@ -1,6 +1,5 @@
 """Study: one experiment under several conditions, each repeated by the same replicas; a value."""
 
-import hashlib
 import os
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass, field
@@ -8,7 +7,7 @@ from functools import cached_property, partial
 from pathlib import Path
 from typing import Any, Final
 
-from cprl.arguments import BLOCK, integer, object_of, refusal, switch
+from cprl.arguments import BLOCK, integer, object_of, refusal
 from cprl.checks import DIRECTORY_NAME, check_nesting, checked, instance, shown
 from cprl.experiment import MOST_SEED, Experiment, frozen_from, frozen_relative_to
 from cprl.population import stored_of
@@ -48,7 +47,6 @@ class Study:
         draws: so many random combinations of the factors' levels instead of their grid.
         replicas: of each condition; by default those of the experiment.
         block: replicas that one run trains side by side; fewer can be spread over more processes.
-        pairing: whether replica r has the same seeds and worlds in each condition.
         reference: the name of the condition that others are compared with; by default the first one that
             changes nothing, else the first.
         name: by default that of the experiment.
@@ -66,7 +64,6 @@ class Study:
     draws: int | None = field(default=None, kw_only=True)
     replicas: int | None = field(default=None, kw_only=True)
     block: int = field(default=BLOCK, kw_only=True)
-    pairing: bool = field(default=True, kw_only=True)
     reference: str | None = field(default=None, kw_only=True)
     name: str = field(default="", kw_only=True)
     question: str = field(default="", kw_only=True)
@@ -87,7 +84,6 @@ class Study:
         checked("name", self.name, DIRECTORY_NAME)
         integer("replicas", self.replicas, 1, 2**20)
         integer("block", self.block, 1, 2**20)
-        switch("pairing", self.pairing)
         for own in ("question", "expectation"):
             object_of(own, getattr(self, own), str, "a text")
         if self.factors and self.conditions:
@@ -163,13 +159,6 @@ class Study:
         """The names of the factors; of named conditions "condition" alone."""
         return tuple(self.factors) if self.factors else (CONDITION,)
 
-    def seed_of(self, condition: Condition, block: "Block") -> int:
-        """The seed of a block of replicas of a condition."""
-        if self.pairing:
-            return block.seed
-        digest = hashlib.blake2b(f"{condition.checksum} {block.seed}".encode(), digest_size=6)
-        return int.from_bytes(digest.digest())
-
     def _levels(self) -> Iterator[tuple[str, dict[str, Level]]]:
         """The name and levels of each condition; of draws more than are asked for, as some may be equal."""
         if self.conditions:
@@ -233,6 +222,8 @@ class Study:
                 f"the study has the format {shown(table.get('format'))}"
                 f"{' and lacks ' + ', '.join(lacks) if lacks else ''}; allowed: {FORMAT}, complete"
             )
+        if table.get("pairing") is False:
+            raise ValueError("the study has pairing false; allowed: true")
         allow = tuple(allow)
         place = _no_change if directory is None else partial(_joined, str(directory))
         experiment = Experiment.from_config(table["experiment"], allow=allow)
@@ -265,12 +256,12 @@ class Block:
     """The number of the first one in the study."""
     replicas: int
     seed: int
-    """Of the run, where conditions are paired."""
+    """Of the run."""
 
 
 _PLAIN: Final = (
     *("name", "question", "expectation"),
-    *("draws", "replicas", "block", "pairing", "reference"),
+    *("draws", "replicas", "block", "reference"),
 )
 """Fields that JSON can hold as they are."""
 CONDITION: Final = "condition"

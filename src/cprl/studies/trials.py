@@ -74,7 +74,7 @@ def trials_of(study: Study) -> list[Trial]:
             block,
             replace(
                 condition.experiment,
-                seed=study.seed_of(condition, block),
+                seed=block.seed,
                 replicas=block.replicas,
                 agents=tuple(with_stored(own, partial(_of_block, block)) for own in agents),
             ),

@@ -15,7 +15,6 @@ infinite alpha.
 """
 
 from dataclasses import dataclass
-from math import inf
 from typing import Any, Final
 
 import numpy as np
@@ -27,8 +26,6 @@ from cprl.theory.payoff_table import PayoffTable, Values, mixture_of
 
 MOST_PROFILES: Final = 256
 """S^N, e.g. 4 agents with 4 strategies; with more, OpenSpiel takes seconds."""
-MOST_ALPHA: Final = 500.0
-POPULATION: Final = 50
 STARTS: Final = 40
 
 _NOISES: Final = (1e-6, 1e-5, 1e-4, 1e-3)
@@ -50,35 +47,28 @@ class AlphaRank:
     """float64 [S], the mean share of the agents that play a strategy; sums to 1."""
 
 
-def alpha_rank(table: PayoffTable, *, alpha: float = inf, population: int = POPULATION) -> AlphaRank:
-    """Alpha-rank of a symmetric game; in the limit of infinite alpha by OpenSpiel.
+def alpha_rank(table: PayoffTable) -> AlphaRank:
+    """Alpha-rank of a symmetric game in the limit of infinite alpha, by OpenSpiel.
 
-    For finite alpha it has the numbers of OpenSpiel where that finds a single long run, and others where
-    OpenSpiel's probabilities round, see `_stationary`.
-
-    Payoffs are first scaled to 0..1, so that alpha means the same in every game. In the limit of infinite
-    alpha a mutant takes over if it gets more, with probability 1/2 if it gets the same (to 1e-5 of what it
-    gets), and else almost never; "almost" is 1e-6, or the next power of ten with which OpenSpiel can tell a
-    single long run from several, up to 1e-3.
+    Payoffs are first scaled to 0..1. A mutant takes over if it gets more, with probability 1/2 if it gets the
+    same (to 1e-5 of what it gets), and else almost never; "almost" is 1e-6, or the next power of ten with
+    which OpenSpiel can tell a single long run from several, up to 1e-3.
 
     Args:
         table: with at most 256 profiles S^N; of a larger game its `reduced`.
-        alpha: how strongly payoffs select, above 0, up to 500, or infinite.
-        population: the agents of each population, for finite alpha.
 
     Raises:
-        ValueError: for a larger table, and numbers out of range.
+        ValueError: for a larger table.
         ModuleNotFoundError: if OpenSpiel is not installed.
     """
     arguments.object_of("table", table, PayoffTable, "a PayoffTable")
-    population = arguments.integer("population", population, 2, 10_000)
     profiles = table.strategies**table.agents
     if profiles > MOST_PROFILES:
         raise ValueError(
             f"table has {table.strategies}^{table.agents} = {profiles:,} profiles; allowed: at most "
             f"{MOST_PROFILES}, e.g. table.reduced"
         )
-    of_profiles = _long_run(table, check_alpha(alpha), population)
+    of_profiles = _long_run(table)
     played = np.array(np.unravel_index(np.arange(profiles), (table.strategies,) * table.agents)).T
     found = np.zeros(len(table.counts))
     for profile, chance in zip(played, of_profiles, strict=True):
@@ -87,23 +77,9 @@ def alpha_rank(table: PayoffTable, *, alpha: float = inf, population: int = POPU
     return AlphaRank(compositions=found, shares=found @ table.counts / table.agents)
 
 
-def check_alpha(alpha: float) -> float:
-    """An alpha that `alpha_rank` takes.
-
-    Raises:
-        ValueError: for anything else.
-    """
-    if isinstance(alpha, float) and alpha == inf:
-        return inf
-    allowed = f"a number above 0, up to {MOST_ALPHA:g}, or infinity"
-    return arguments.number("alpha", alpha, low=0, high=MOST_ALPHA, above=True, allowed=allowed)
-
-
-def _long_run(table: PayoffTable, alpha: float, population: int) -> Values:
+def _long_run(table: PayoffTable) -> Values:
     """The share of each profile of N agents, [S^N], the last agent's strategy changing fastest."""
     rank = extra("open_spiel.python.egt.alpharank")
-    if alpha != inf:
-        return _stationary(_takeovers(table.normalised, alpha, population))
     tables = [_heuristic(table.normalised)] * table.agents
     for noise in _NOISES:
         try:
@@ -111,55 +87,6 @@ def _long_run(table: PayoffTable, alpha: float, population: int) -> Values:
         except ValueError as error:
             last = error
     raise last
-
-
-def _takeovers(table: PayoffTable, alpha: float, population: int) -> Values:
-    """The logarithms of the probabilities, up to a factor, with which a profile is followed by another one,
-    [S^N, S^N]; those of OpenSpiel, which round to 0 for a high alpha."""
-    agents, strategies = table.agents, table.strategies
-    numbers = np.arange(strategies**agents)
-    played = np.array(np.unravel_index(numbers, (strategies,) * agents)).T
-    rows = [table.rows[tuple(np.bincount(own, minlength=strategies).tolist())] for own in played]
-    payoffs = table.payoffs[rows]  # [S^N, S]
-    found = np.full((len(numbers), len(numbers)), -inf)
-    for agent in range(agents):
-        now = payoffs[numbers, played[:, agent]]
-        for mutant in range(strategies):
-            then = numbers + (mutant - played[:, agent]) * strategies ** (agents - 1 - agent)
-            found[numbers, then] = _takes_over(alpha * (payoffs[then, mutant] - now), population)
-    return found
-
-
-def _takes_over(gain: Values, population: int) -> Values:
-    """The logarithm of the probability (1 - exp(-gain)) / (1 - exp(-population x gain)) that a mutant takes
-    over a population, like `gain`, which is alpha times what it gets more."""
-    is_none = np.abs(gain) <= 1e-14
-    size = np.where(is_none, 1.0, np.abs(gain))
-    ratio = np.log(-np.expm1(-size)) - np.log(-np.expm1(-population * size))
-    found: Values = np.where(is_none, -np.log(population), ratio + np.minimum(gain, 0.0) * (population - 1))
-    return found
-
-
-def _stationary(rates: Values) -> Values:
-    """The stationary distribution of a chain, [P], without subtraction and in logarithms, so that states that
-    are almost never left keep their shares.
-
-    Source: W. Grassmann, M. Taksar and D. Heyman, "Regenerative Analysis and Steady State Distributions for
-    Markov Chains" (1985).
-
-    Args:
-        rates: the logarithms of its transitions up to a factor, [P, P], each state reached from each; changed
-            in place, and the diagonal is not read.
-    """
-    shares = np.zeros(len(rates))
-    for last in range(len(rates) - 1, 0, -1):
-        rates[:last, last] -= np.logaddexp.reduce(rates[last, :last])
-        through = rates[:last, last, None] + rates[last, :last]
-        rates[:last, :last] = np.logaddexp(rates[:last, :last], through)
-    for state in range(1, len(rates)):
-        shares[state] = np.logaddexp.reduce(shares[:state] + rates[:state, state])
-    found: Values = np.exp(shares - np.logaddexp.reduce(shares))
-    return found
 
 
 def _shares(found: Any) -> Values:

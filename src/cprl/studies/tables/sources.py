@@ -89,7 +89,7 @@ def design_of(study: Study) -> Design:
             for own in study.all_conditions
         },
         reference=study.reference_name,
-        is_paired=study.pairing,
+        is_paired=True,
         is_grid=study.draws is None,
     )
 
