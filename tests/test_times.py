@@ -54,12 +54,6 @@ def test_a_training_that_goes_on_counts_what_it_took_before(clock):
     }
 
 
-def test_the_state_of_an_earlier_version_has_the_whole_time_alone(clock):
-    training = Times()
-    training.load_state_dict({"spent_s": 5.0, "steps": 3})
-    assert (training.spent_s, training.busy_s) == (5.0, 0.0)
-
-
 class Learner:
     """Something in a cycle, as learners and buffers are."""
 
