@@ -11,7 +11,7 @@ from pathlib import Path
 
 import psutil
 import pytest
-from faults.driver import differences, still_alive
+from same_runs import differences, still_alive
 from tiny_study import FREEZE, LEARNING, TINY
 
 from cprl import Study

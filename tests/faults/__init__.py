@@ -1,1 +1,0 @@
-"""Faults: trainings that are killed, starved of space, locked out or spoilt; see `docs/reliability.md`."""
