@@ -84,7 +84,7 @@ def experiments() -> dict[str, dict[str, object]]:
         return DQN(settings=settings(variant, **changes))
 
     as_run, plain = settings("as_run"), settings("published")
-    rollouts = RolloutSettings(rollout_steps=20, minibatch_size=10, epochs=2)
+    rollouts = RolloutSettings(rollout_steps=20, minibatch_size=10, learning_rate=0.02)  # so that it clips
     sequences = settings("published", sequence_steps=4)
     lola = LOLASettings(rollout_steps=20, critic_epochs=2)
     governed = replace(
