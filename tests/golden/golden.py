@@ -29,7 +29,7 @@ LIKE_EVERY_MACHINE = {
 IS_X86 = platform.machine() in ("x86_64", "AMD64")
 
 
-def hold(subject, values, *, may_gain=False):
+def assert_held(subject, values, *, may_gain=False):
     """Compare the cases of a subject with its file: `values` maps each case to numbers, texts, lists, tables.
 
     Cases that stand in the file and are not given are not looked at, so tests may hold a part each. With

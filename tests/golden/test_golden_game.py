@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
-from golden import checksum, hold
+from golden import assert_held, checksum
 
 from cprl import CommonsEnv, Game, Observation, Rules, maps, presets
 from cprl.institutions import (
@@ -117,7 +117,7 @@ def shortened(game, **changes):
 
 @pytest.mark.parametrize(("board", "variant"), GAMES)
 def test_a_board_plays_as_it_did(board, variant):
-    hold("game", {f"{board}, {variant}": played(shortened(presets.game(board, variant=variant)))})
+    assert_held("game", {f"{board}, {variant}": played(shortened(presets.game(board, variant=variant)))})
 
 
 @pytest.mark.integration
@@ -125,14 +125,14 @@ def test_a_board_plays_as_it_did(board, variant):
 @pytest.mark.parametrize(("board", "variant"), GAMES)
 def test_a_form_of_observation_shows_what_it_did(board, variant, form):
     game = shortened(presets.game(board, variant=variant), observation=FORMS[form])
-    hold("observations", {f"{board}, {variant}, {form}": played(game)})
+    assert_held("observations", {f"{board}, {variant}, {form}": played(game)})
 
 
 @pytest.mark.parametrize("name", INSTITUTIONS)
 def test_an_institution_rules_as_it_did(name):
     observation = Observation(agents_apart="mediation" in name)
     game = shortened(presets.game("commons"), institutions=INSTITUTIONS[name], observation=observation)
-    hold("institutions", {name: played(game)})
+    assert_held("institutions", {name: played(game)})
 
 
 @pytest.mark.integration
@@ -141,7 +141,7 @@ def test_an_institution_rules_as_it_did_in_the_game_as_run(name):
     observation = Observation(agents_apart=True, encoding="one_hot")
     game = presets.game("commons", variant="as_run")
     game = shortened(game, institutions=INSTITUTIONS[name], observation=observation)
-    hold("institutions", {f"{name}, as run": played(game)})
+    assert_held("institutions", {f"{name}, as run": played(game)})
 
 
 @pytest.mark.parametrize("name", OTHER_RULES)
@@ -149,4 +149,4 @@ def test_rules_that_no_preset_has_play_as_they_did(name):
     rules = Rules(
         regrow_prob=(0, 0.05, 0.2), freeze_steps=8, episode_steps=EPISODE_STEPS, **OTHER_RULES[name]
     )
-    hold("rules", {name: played(Game(map=WALLED, rules=rules))})
+    assert_held("rules", {name: played(Game(map=WALLED, rules=rules))})

@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import get_args
 
 import pytest
-from golden import hold
+from golden import assert_held
 
 from cprl import Experiment, Study
 
@@ -82,7 +82,7 @@ def test_a_recipe_makes_the_experiment_that_it_made(path, monkeypatch):
         for words, experiment in experiments(module_of(path, monkeypatch))
     }
     if made:
-        hold("recipes", made, may_gain=True)
+        assert_held("recipes", made, may_gain=True)
 
 
 def targets(value):
@@ -98,7 +98,7 @@ def targets(value):
 def test_a_stored_recipe_is_read_as_it_was(path):
     recipe = json.loads(path.read_text())
     read = Experiment.from_recipe(recipe, allow=targets(recipe), directory=path.parent)
-    hold("stored_recipes", {below(path.parent, RESULTS): shortened(read.to_config())}, may_gain=True)
+    assert_held("stored_recipes", {below(path.parent, RESULTS): shortened(read.to_config())}, may_gain=True)
 
 
 @pytest.mark.parametrize("path", STUDIES, ids=lambda path: below(path, RESULTS))
@@ -106,4 +106,4 @@ def test_the_conditions_of_a_stored_study_keep_their_checksums(path):
     table = json.loads(path.read_text())
     study = Study.from_config(table, allow=targets(table), directory=path.parent)
     conditions = {condition.name: condition.checksum for condition in study.all_conditions}
-    hold("conditions", {below(path.parent, RESULTS): conditions})
+    assert_held("conditions", {below(path.parent, RESULTS): conditions})

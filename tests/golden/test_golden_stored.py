@@ -1,7 +1,7 @@
 """The stored runs do in fresh worlds what they did, however they are evaluated."""
 
 import pytest
-from golden import IS_X86, hold, in_a_process
+from golden import IS_X86, assert_held, in_a_process
 from stored import KINDS
 
 pytestmark = [
@@ -12,4 +12,4 @@ pytestmark = [
 
 @pytest.mark.parametrize("kind", KINDS)
 def test_stored_runs_do_what_they_did(kind, tmp_path):
-    hold("stored", in_a_process("stored.py", kind, folder=tmp_path))
+    assert_held("stored", in_a_process("stored.py", kind, folder=tmp_path))

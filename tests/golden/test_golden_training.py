@@ -1,7 +1,7 @@
 """Every algorithm learns what it learned, stopped in the middle or not: tables, weights, evaluations."""
 
 import pytest
-from golden import IS_X86, hold, in_a_process
+from golden import IS_X86, assert_held, in_a_process
 
 FAMILIES = ("dqn", "off-policy", "on-policy", "recurrent", "teams", "opponent-aware", "mixed")
 pytestmark = [
@@ -16,4 +16,4 @@ def test_a_family_of_algorithms_learns_what_it_did(family, tmp_path):
     assert {name: case["differs after a stop"] for name, case in found.items()} == {
         name: [] for name in found
     }
-    hold("training", found)
+    assert_held("training", found)
