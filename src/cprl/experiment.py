@@ -43,7 +43,6 @@ from cprl.runs import formats
 from cprl.runs.recipes import FORMAT, recipe_config
 
 LoggerName = Literal["tensorboard", "wandb"]
-LOGGERS: Final[tuple[LoggerName, ...]] = get_args(LoggerName)
 MOST_SEED: Final = 2**64 - 2
 """Evaluation plays worlds of the next seed."""
 

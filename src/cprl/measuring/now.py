@@ -17,7 +17,6 @@ HARVESTING: Final = "harvesting"
 TRAGEDY: Final = "tragedy"
 RECOVERY: Final = "recovery"
 DECLINE: Final = "decline"
-LABELS: Final = (BEGINS, EXPLORING, HARVESTING, TRAGEDY, DECLINE, RECOVERY)
 
 FEWEST: Final = 10
 """Episodes of the running mean at least; before there are as many nothing is judged."""

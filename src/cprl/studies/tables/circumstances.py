@@ -14,8 +14,7 @@ _NAMED: Final = 4
 
 Circumstances = Mapping[str, str]
 """The version of each package, the checksum of each module of the user's own, the git commit and the type of
-processor, by name. Where a run was resumed
-under others, all of them in order, with " then " between them."""
+processor, by name. Where a run was resumed under others, all of them in order, with " then " between them."""
 
 
 def circumstances_of(run: Path) -> Circumstances:
