@@ -24,7 +24,7 @@ from numba.cuda import compile_ptx, dispatcher
 from cprl import Game, presets
 from cprl.commons.batch import output_of
 from cprl.commons.cuda import kernels
-from cprl.commons.game import output_shapes
+from cprl.commons.game import output_forms
 from cprl.commons.world import Governed, Scratch, StepOutput, Worlds, empty_scratch, empty_worlds
 from cprl.institutions import Tax
 from cprl.institutions.memory import Memory, empty_memory
@@ -37,7 +37,7 @@ def arguments(game: Game, worlds: int = 4) -> dict[str, tuple[Any, ...]]:
     window = tables.window_cells.shape[1]
     sheet = empty_scratch(agents=agents, sites=sites, cells=tables.background.size, window=window)
     scratch = Scratch(*(np.zeros((worlds, *each.shape), each.dtype, order="F") for each in sheet))
-    told = StepOutput(**{name: np.zeros(*form) for name, form in output_shapes(game, worlds).items()})
+    told = StepOutput(**{name: np.zeros(*form) for name, form in output_forms(game, worlds).items()})
     actions, marks = np.zeros((worlds, agents), np.int64), np.zeros(worlds, np.bool_)
     boards = np.zeros((worlds, game.map.height, game.map.width), np.uint8)
     on_gpu = Worlds(*map(np.asfortranarray, state))
@@ -45,7 +45,7 @@ def arguments(game: Game, worlds: int = 4) -> dict[str, tuple[Any, ...]]:
     ruled = replace(game, institutions=(Tax(),))
     memory = empty_memory(ruled.governed_tables.institutions, worlds=worlds)
     governed = Governed(on_gpu, Memory(*map(np.asfortranarray, memory)), actions)
-    paid = output_of([np.zeros(*form) for form in output_shapes(ruled, worlds).values()])
+    paid = output_of([np.zeros(*form) for form in output_forms(ruled, worlds).values()])
     of_governed = {
         f"{name[:-6]}governed_worlds": what for name, what in loops.items() if name != "show_worlds"
     }

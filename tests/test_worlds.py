@@ -318,7 +318,7 @@ def test_a_changed_rule_changes_the_cache_folder(tmp_path, monkeypatch):
 def test_the_rules_play_the_same_game_without_compilation(variant):
     # Numba's CUDA simulator runs them in this way.
     game = presets.game("two_complex", variant=variant)
-    plain = compiled.compiled(loops.FUNCTIONS, lambda function: function)
+    plain = compiled.compiled(loops.ENTRIES, lambda function: function)
     actions = random_actions(25, 2, game, seed=1)
     batch = Batch(game, 2, seed=1)
     scratch = empty_scratch(

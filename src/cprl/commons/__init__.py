@@ -6,7 +6,7 @@ In reading order:
     maps         boards: drawn, named or generated
     observation  what agents observe, and in which form
     reach        whether any agent can come to an apple site
-    game         Game: a map, its rules and its observations
+    game         Game: a map, its rules and its observations; the memory that worlds of it take
     world        the arrays of B worlds: state, step output, scratch memory
     colours      the classes of cells and their colours
     near         which sites are near each other
@@ -21,7 +21,6 @@ In reading order:
     compiled     compiles the rules for a target
     threads      CpuThreads: runs the loops on CPU threads
     cuda         CudaThreads: runs the loops on a GPU
-    sizes        the memory that B worlds take
     state        reads, checks and restores the state of B worlds
     batch        Batch: B worlds, played a turn at a time
     playing      harvests: a whole episode in every world of a batch

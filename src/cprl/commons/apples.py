@@ -127,18 +127,3 @@ def bite(world: Worlds, tables: Tables, harvest: NDArray[np.float32]) -> None:
                 remove_apple(world, tables, k)
                 harvest[i] = 1.0
                 world.harvested[i] += 1
-
-
-FUNCTIONS = (
-    fill,
-    add_apple,
-    remove_apple,
-    recount,
-    draw,
-    draw_first_bytes,
-    has_sprouted,
-    find_sprouts,
-    grow,
-    bite,
-)
-"""The rules of this module, each after those it calls; `compiled.py` compiles them in this order."""

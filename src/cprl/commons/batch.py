@@ -8,9 +8,8 @@ from numpy.typing import DTypeLike, NDArray
 
 from cprl import arguments
 from cprl.commons import state as states
-from cprl.commons.game import Game, output_shapes
+from cprl.commons.game import Game, check_worlds_fit, output_forms
 from cprl.commons.loops import Loop
-from cprl.commons.sizes import check_worlds_fit
 from cprl.commons.threads import CpuThreads
 from cprl.commons.world import (
     Actions,
@@ -129,7 +128,7 @@ class Batch:
 
     def new_output(self) -> Output:
         """New arrays for the output of a turn."""
-        shapes = output_shapes(self.game, self.size)
+        shapes = output_forms(self.game, self.size)
         return output_of([self.driver.empty(*form) for form in shapes.values()])
 
     def _run(
@@ -290,7 +289,7 @@ def turn_of(output: Output) -> StepOutput:
 
 
 def output_of(arrays: Iterable[Any]) -> Output:
-    """An output out of its arrays, in the order of `output_shapes`."""
+    """An output out of its arrays, in the order of `output_forms`."""
     found = list(arrays)
     turn = StepOutput(*found[: len(StepOutput._fields)])
     rest = found[len(StepOutput._fields) :]

@@ -101,18 +101,3 @@ def take_out(world: Worlds, tables: Tables, i: int, freeze: int) -> None:
     world.in_play[i] = False
     world.tagged_step[i] = world.step[0]
     world.out_steps[i] = max(world.out_steps[i], steps)
-
-
-FUNCTIONS = (
-    beam_row,
-    beam_col,
-    beam_cell,
-    beam_reach,
-    is_hit,
-    find_hits,
-    take_out,
-    take_out_of_play,
-    count_hit,
-    tag,
-)
-"""The rules of this module, each after those it calls; `compiled.py` compiles them in this order."""

@@ -18,7 +18,7 @@ import numba
 from filelock import FileLock
 
 from cprl.caches import cache_folder
-from cprl.commons.loops import FUNCTIONS, LOOPS
+from cprl.commons.loops import ENTRIES
 from cprl.compile_clock import CLOCK
 from cprl.libraries import relying_on
 
@@ -113,23 +113,34 @@ def machine_code(function: Any, *arguments: Any) -> Callable[..., Any]:
 
 
 def compiled(functions: Iterable[Any], jit: Callable[[FunctionType], Callable[..., Any]]) -> Compiled:
-    """Compiles plain functions by name; each calls the compiled versions of those before it.
+    """Compile plain functions, and before each of them the functions of `cprl` that it calls.
 
     Args:
-        functions: Plain functions, each after those it calls.
+        functions: Plain functions; those that they call are their globals.
         jit: Compiles one function for the target.
+
+    Returns:
+        Each of `functions`, compiled, by its name.
     """
-    done: Compiled = {}
-    for function in functions:
-        names = {**function.__globals__, **done}
-        done[function.__name__] = jit(FunctionType(function.__code__, names, function.__name__))
-    return done
+    done: dict[FunctionType, Callable[..., Any]] = {}
+
+    def compile_one(function: FunctionType) -> Callable[..., Any]:
+        if function not in done:
+            names = dict(function.__globals__)
+            for name in function.__code__.co_names:
+                called = names.get(name)
+                if isinstance(called, FunctionType) and called.__module__.startswith("cprl."):
+                    names[name] = compile_one(called)
+            done[function] = jit(FunctionType(function.__code__, names, function.__name__))
+        return done[function]
+
+    return {function.__name__: compile_one(function) for function in functions}
 
 
 def _jit_for_cpu(function: FunctionType, *, on_disk: bool) -> Callable[..., Any]:
     """Compiles a function for CPU threads."""
     options = dict(CPU_OPTIONS)
-    if function.__name__ not in (*LOOPS, "first_unknown"):
+    if function.__name__ not in (entry.__name__ for entry in ENTRIES):
         options |= {"forceinline": True, "no_cpython_wrapper": True, "no_cfunc_wrapper": True}
     elif on_disk:
         return kept_on_disk(function, **options)
@@ -147,7 +158,7 @@ def rules_for_cpu() -> Compiled:
     folder = cache_folder() / _fingerprint()
     on_disk = _can_write(folder)
     with kept_in(folder):
-        return compiled(FUNCTIONS, partial(_jit_for_cpu, on_disk=on_disk))
+        return compiled(ENTRIES, partial(_jit_for_cpu, on_disk=on_disk))
 
 
 _entries: dict[str, Callable[..., None]] = {}

@@ -14,9 +14,8 @@ import numpy as np
 from numpy.typing import DTypeLike, NDArray
 
 from cprl.commons.compiled import compiled
-from cprl.commons.game import Game
-from cprl.commons.loops import FUNCTIONS, LOOPS, Loop
-from cprl.commons.sizes import check_worlds_fit
+from cprl.commons.game import Game, check_worlds_fit
+from cprl.commons.loops import ENTRIES, LOOPS, Loop, one_scratch
 from cprl.commons.tables import GovernedTables, Tables
 from cprl.commons.world import (
     Actions,
@@ -132,7 +131,7 @@ class CudaThreads:
 @cache
 def kernels() -> dict[str, Any]:
     """The kernels by name: one for each loop, and `find_unknown`; compiled at their first launch."""
-    rules = compiled(FUNCTIONS, _jit_for_gpu)
+    rules = compiled((*ENTRIES, one_scratch), _jit_for_gpu)
     launched: dict[str, Any] = {loop: _kernel(rules[loop], rules["one_scratch"]) for loop in LOOPS}
     return {**launched, "find_unknown": _find_unknown(rules["first_unknown"])}
 

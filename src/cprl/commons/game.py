@@ -4,7 +4,8 @@ import warnings
 from dataclasses import dataclass, field, fields
 from functools import cached_property
 from importlib import import_module
-from typing import Any
+from math import prod
+from typing import Any, Final
 
 import numpy as np
 
@@ -18,10 +19,12 @@ from cprl.commons.observation import Observation, channel_names
 from cprl.commons.reach import why_out_of_reach
 from cprl.commons.rules import Rules
 from cprl.commons.tables import GovernedTables, Tables, build_tables, check_sizes
-from cprl.commons.world import Bytes
+from cprl.commons.world import Bytes, StepOutput, empty_worlds
 from cprl.institutions import COUNTS, Institution
+from cprl.institutions.arrays import Form, forms_of
 from cprl.institutions.choice import Ballot, ballots, decision_options
-from cprl.institutions.memory import SHOWN
+from cprl.institutions.memory import SHOWN, Payments, empty_memory
+from cprl.memory import check_memory
 from cprl.spaces import Spaces
 
 
@@ -202,42 +205,36 @@ class Game:
         return {own.name: getattr(self, own.name) for own in fields(self)}
 
 
-Shapes = dict[str, tuple[tuple[int, ...], type[np.generic]]]
-
-
-def output_shapes(game: Game, worlds: int) -> Shapes:
-    """The shape and dtype of each entry of `StepOutput`, for B worlds of a game, and then of `Payments` if it
+def output_forms(game: Game, worlds: int) -> dict[str, Form]:
+    """The shape and dtype of each array of `StepOutput`, for B worlds of a game, and then of `Payments` if it
     has institutions."""
-    return _of_a_turn(game, worlds) | (_of_payments(game, worlds) if game.institutions else {})
+    channels, rows, columns = game.observation_shape
+    sizes = {"B": worlds, "N": game.agents}
+    turn = {"C": channels, "X": rows, "Y": columns, "S": game.scoreboard_size, "G": game.stock_gauge_size}
+    forms = forms_of(StepOutput, **sizes, **turn)
+    if game.institutions:
+        forms |= forms_of(Payments, **sizes, C=len(COUNTS), V=len(game.ballots))
+    return forms
 
 
-def _of_payments(game: Game, worlds: int) -> Shapes:
-    of_agent = worlds, game.agents
-    return {
-        "reward": (of_agent, np.float32),
-        "fines": (of_agent, np.float32),
-        "transfers": (of_agent, np.float32),
-        "violated": (of_agent, np.bool_),
-        "counts": ((*of_agent, len(COUNTS)), np.int32),
-        "in_force": ((worlds, len(game.ballots)), np.float32),
-        "ballots_due": ((worlds, len(game.ballots)), np.bool_),
-    }
+OUTPUTS_HELD: Final = 3
+"""The step outputs that an environment holds at once, at least: the current one, the next, and a copy."""
 
 
-def _of_a_turn(game: Game, worlds: int) -> Shapes:
-    of_agent = worlds, game.agents
-    return {
-        "observation": ((*of_agent, *game.observation_shape), np.uint8),
-        "harvest": (of_agent, np.float32),
-        "in_play": (of_agent, np.bool_),
-        "fired": (of_agent, np.bool_),
-        "hit_by": ((*of_agent, game.agents), np.bool_),
-        "tagged_by": ((*of_agent, game.agents), np.bool_),
-        "scoreboard": ((*of_agent, game.scoreboard_size), np.float32),
-        "stock_gauge": ((*of_agent, game.stock_gauge_size), np.float32),
-        "stock": ((worlds, 1), np.int64),
-        "regrown": ((worlds, 1), np.int64),
-        "terminated": ((worlds, 1), np.bool_),
-        "truncated": ((worlds, 1), np.bool_),
-        "done": ((worlds, 1), np.bool_),
-    }
+def bytes_of_worlds(game: Game, worlds: int) -> int:
+    """The bytes that B worlds take at least: their state, and `OUTPUTS_HELD` step outputs."""
+    state = [*empty_worlds(worlds=1, agents=game.agents, sites=len(game.map.sites))]
+    if game.institutions:
+        state += empty_memory(game.governed_tables.institutions, worlds=1)
+    outputs = sum(prod(shape) * np.dtype(dtype).itemsize for shape, dtype in output_forms(game, 1).values())
+    return worlds * (sum(array.nbytes for array in state) + OUTPUTS_HELD * outputs)
+
+
+def check_worlds_fit(game: Game, worlds: int, *, free: int | None = None) -> None:
+    """Raise a MemoryError if B worlds do not fit into memory; `free`: bytes of it, None for main memory."""
+    check_memory(
+        f"worlds is {worlds:,}: {'their arrays' if worlds > 1 else 'its arrays'}",
+        bytes_of_worlds(game, worlds),
+        "fewer worlds, or a smaller map, window or number of agents",
+        free=free,
+    )

@@ -5,7 +5,6 @@ The parts are those of `turn`; where institutions decide, this module asks their
 
 import numpy as np
 
-from cprl.commons import institution_views
 from cprl.commons.apples import draw, find_sprouts, grow, remove_apple
 from cprl.commons.beam import count_hit, find_hits, take_out, take_out_of_play
 from cprl.commons.chance import BALLOT, DETECTION
@@ -29,7 +28,6 @@ from cprl.commons.turn import (
     write_state,
 )
 from cprl.commons.world import PLAYING, Actions, Scratch, StepOutput, Worlds
-from cprl.institutions import deciding, limits, paying, showing
 from cprl.institutions.deciding import appoint, hold_ballot, is_due
 from cprl.institutions.limits import (
     add_to_patch,
@@ -272,25 +270,3 @@ def write_payments(
     for ballot in range(payments.in_force.shape[0]):
         payments.in_force[ballot] = memory.in_force[ballot]
         payments.ballots_due[ballot] = world.step[0] == 0 and is_due(rules, ballot, world.episode[0])
-
-
-FUNCTIONS = (
-    *deciding.FUNCTIONS,
-    *limits.FUNCTIONS,
-    *paying.FUNCTIONS,
-    *showing.FUNCTIONS,
-    *institution_views.FUNCTIONS,
-    stock_share,
-    forget,
-    begin_ballots,
-    clear_turn,
-    decide,
-    bite_by_rules,
-    tag_by_rules,
-    pursue_violations,
-    write_payments,
-    play_governed_turn,
-    begin_governed_episode,
-    refresh_governed_output,
-)
-"""The rules of this module, each after those it calls; `compiled.py` compiles them in this order."""

@@ -59,7 +59,3 @@ def draw_institutions(
             first += cells
         if rules.shown_kind.shape[0] > 0:
             draw_entries(memory, rules, i, world.step[0], planes[first:])
-
-
-FUNCTIONS = (is_shown_forbidden, draw_forbidden, draw_entries, draw_institutions)
-"""The rules of this module, each after those it calls; `compiled.py` compiles them in this order."""

@@ -177,26 +177,3 @@ def place_at_starts(world: Worlds, tables: Tables) -> None:
         world.tagged_step[i] = 0
         world.offences[i] = 0
         world.harvested[i] = 0
-
-
-FUNCTIONS = (
-    cell_of,
-    is_wall,
-    moved_by,
-    walk,
-    act,
-    go_back,
-    has_moved,
-    share_a_cell,
-    have_swapped,
-    clash,
-    is_in_a_clash,
-    settle_clashes,
-    settle_pairwise,
-    note_moved_shooters,
-    count_down,
-    has_to_wait,
-    return_to_play,
-    place_at_starts,
-)
-"""The rules of this module, each after those it calls; `compiled.py` compiles them in this order."""

@@ -10,7 +10,7 @@ from numpy.typing import DTypeLike, NDArray
 
 from cprl import arguments
 from cprl.commons.compiled import entry_for_cpu, rules_for_cpu
-from cprl.commons.game import Game, output_shapes
+from cprl.commons.game import Game, output_forms
 from cprl.commons.loops import Loop
 from cprl.commons.tables import GovernedTables, Tables
 from cprl.commons.world import (
@@ -56,7 +56,7 @@ class CpuThreads:
         self.threads = min(limit, worlds if threads else -(-worlds // WORLDS_PER_THREAD))
         self.tables: Tables = game.tables
         self.governed_tables: GovernedTables | None = game.governed_tables if game.institutions else None
-        self._expected = tuple(output_shapes(game, worlds).values())
+        self._expected = tuple(output_forms(game, worlds).values())
         self._output: StepOutput | GovernedOutput | None = None
         self._scratch = [
             empty_scratch(

@@ -2,7 +2,6 @@
 
 import numpy as np
 
-from cprl.commons import apples, beam, chance, moves, views
 from cprl.commons.apples import bite, draw, fill, find_sprouts, grow, recount
 from cprl.commons.beam import find_hits, tag
 from cprl.commons.chance import STARTS
@@ -126,21 +125,3 @@ def write_state(world: Worlds, tables: Tables, output: StepOutput, scratch: Scra
     output.truncated[0] = world.ended[0] == TRUNCATED
     output.done[0] = world.ended[0] != PLAYING
     draw_windows(world, tables, scratch, output.observation)
-
-
-FUNCTIONS = (
-    chance.philox4x32,
-    *moves.FUNCTIONS,
-    *beam.FUNCTIONS,
-    *apples.FUNCTIONS,
-    *views.FUNCTIONS,
-    keep_old_stock,
-    check_end,
-    clear_events,
-    write_state,
-    play_turn,
-    shuffle_starts,
-    begin_episode,
-    refresh_output,
-)
-"""All rules, each after those it calls; `compiled.py` compiles them in this order."""

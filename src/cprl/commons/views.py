@@ -149,21 +149,3 @@ def draw_board(world: Worlds, tables: Tables, scratch: Scratch, board: Bytes) ->
     for row in range(board.shape[0]):
         for col in range(board.shape[1]):
             board[row, col] = class_of(scratch.picture[cell_of(row, col, tables)])
-
-
-FUNCTIONS = (
-    class_of,
-    paint_apples,
-    mark_cell,
-    paint_mark,
-    paint_beam,
-    paint_of,
-    paint_agents,
-    paint_agents_over,
-    paint,
-    look,
-    cut_window,
-    draw_windows,
-    draw_board,
-)
-"""The rules of this module, each after those it calls; `compiled.py` compiles them in this order."""

@@ -3,12 +3,13 @@
 The rules are written for one world: they receive these tuples without the axis B.
 """
 
-from typing import Any, NamedTuple, TypeAlias, TypeVar
+from typing import Annotated, Any, NamedTuple, TypeAlias, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
 
 from cprl.commons.chance import SITES_PER_DRAW
+from cprl.institutions.arrays import forms_of, zeros
 from cprl.institutions.memory import Memory, Payments
 
 Ints: TypeAlias = NDArray[np.int32]
@@ -31,83 +32,82 @@ COL_STEP = (0, 1, 0, -1)
 
 
 class Worlds(NamedTuple):
-    """The state of B worlds; arrays are int32 unless stated otherwise."""
+    """The state of B worlds of N agents and K sites."""
 
-    seed: Words
-    """uint64 [B, 1]. All random numbers of a world follow from its seed, number, episode and step."""
-    number: Words
-    """uint64 [B, 1], the index of this world among all worlds of its seed; below 2**32."""
-    stock: Bytes
-    """uint8 [B, K], 1 where a site holds an apple."""
-    stock_before: Bytes
-    """uint8 [B, K], the stock at the start of the turn; updated only under `picture_shows_old_stock`."""
-    near: Indices
-    """uint32 [B, K], the number of apples near each site; derived from `stock`."""
-    stock_left: Ints
-    """[B, 1], the sum of `stock`; derived from it."""
-    row: Ints
-    """[B, N], 0 is the top row."""
-    col: Ints
-    """[B, N], 0 is the leftmost column."""
-    heading: Ints
-    """[B, N], 0 up, 1 right, 2 down, 3 left."""
-    out_steps: Ints
-    """[B, N], the number of turns that the agent still has to miss."""
-    in_play: Bools
-    """bool [B, N], whether the agent acts in the coming turn."""
-    on_board: Bools
-    """bool [B, N], whether the agent was in play at the end of the last turn, before anyone returned."""
-    fired: Bools
-    """bool [B, N], whether the agent fired in the last turn."""
-    moved_after_firing: Bools
-    """bool [B, N], whether another agent then moved it by one cell to its right, so that its beam begins one
-    cell to its left; only under `agent_1_right_moves_agent_0`, else all false."""
-    hits: Ints
-    """[B, N], hits since the last tag."""
-    tagged_step: Ints
-    """[B, N], the step at which the agent was last tagged; 0 for never."""
-    offences: Ints
-    """[B, N], how often the agent was tagged in this episode."""
-    harvested: Ints
-    """[B, N], apples harvested in this episode."""
-    step: Ints
-    """[B, 1], turns played in this episode."""
-    episode: Ints
-    """[B, 1], the index of the episode since the seed was set; -1 before the first."""
-    ended: Ints
-    """[B, 1], PLAYING, TERMINATED or TRUNCATED."""
+    seed: Annotated[Words, "B 1"]
+    """All random numbers of a world follow from its seed, number, episode and step."""
+    number: Annotated[Words, "B 1"]
+    """The index of this world among all worlds of its seed; below 2**32."""
+    stock: Annotated[Bytes, "B K"]
+    """1 where a site holds an apple."""
+    stock_before: Annotated[Bytes, "B K"]
+    """The stock at the start of the turn; updated only under `picture_shows_old_stock`."""
+    near: Annotated[Indices, "B K"]
+    """The number of apples near each site; derived from `stock`."""
+    stock_left: Annotated[Ints, "B 1"]
+    """The sum of `stock`; derived from it."""
+    row: Annotated[Ints, "B N"]
+    """0 is the top row."""
+    col: Annotated[Ints, "B N"]
+    """0 is the leftmost column."""
+    heading: Annotated[Ints, "B N"]
+    """0 up, 1 right, 2 down, 3 left."""
+    out_steps: Annotated[Ints, "B N"]
+    """The number of turns that the agent still has to miss."""
+    in_play: Annotated[Bools, "B N"]
+    """Whether the agent acts in the coming turn."""
+    on_board: Annotated[Bools, "B N"]
+    """Whether the agent was in play at the end of the last turn, before anyone returned."""
+    fired: Annotated[Bools, "B N"]
+    """Whether the agent fired in the last turn."""
+    moved_after_firing: Annotated[Bools, "B N"]
+    """Whether another agent then moved it by one cell to its right, so that its beam begins one cell to its
+    left; only under `agent_1_right_moves_agent_0`, else all false."""
+    hits: Annotated[Ints, "B N"]
+    """Hits since the last tag."""
+    tagged_step: Annotated[Ints, "B N"]
+    """The step at which the agent was last tagged; 0 for never."""
+    offences: Annotated[Ints, "B N"]
+    """How often the agent was tagged in this episode."""
+    harvested: Annotated[Ints, "B N"]
+    """Apples harvested in this episode."""
+    step: Annotated[Ints, "B 1"]
+    """Turns played in this episode."""
+    episode: Annotated[Ints, "B 1"]
+    """The index of the episode since the seed was set; -1 before the first."""
+    ended: Annotated[Ints, "B 1"]
+    """PLAYING, TERMINATED or TRUNCATED."""
 
 
 class StepOutput(NamedTuple):
     """The output of a turn, written into arrays that the caller provides (usually torch memory)."""
 
-    observation: Bytes
-    """uint8 [B, N, C, X, Y]."""
-    harvest: NDArray[np.float32]
-    """float32 [B, N], apples harvested in this turn."""
-    in_play: Bools
-    """bool [B, N], whether the agent acts in the coming turn."""
-    fired: Bools
-    """bool [B, N], whether the agent fired in this turn."""
-    hit_by: Bools
-    """bool [B, N, N]; row: the agent hit, column: the shooter."""
-    tagged_by: Bools
-    """bool [B, N, N]; row: the agent tagged, column: the shooter."""
-    scoreboard: NDArray[np.float32]
-    """float32 [B, N, N], one row per observer: the harvest of every agent in this episode, the observer's own
-    first, then of the following agent indices, cyclically; [B, N, 0] without a scoreboard."""
-    stock_gauge: NDArray[np.float32]
-    """float32 [B, N, 1], the share of all sites that hold an apple; [B, N, 0] without a stock gauge."""
-    stock: NDArray[np.int64]
-    """int64 [B, 1], apples on the board."""
-    regrown: NDArray[np.int64]
-    """int64 [B, 1], apples that grew in this turn."""
-    terminated: Bools
-    """bool [B, 1], no apple is left and none can grow."""
-    truncated: Bools
-    """bool [B, 1], the episode ran out of time."""
-    done: Bools
-    """bool [B, 1], terminated or truncated."""
+    observation: Annotated[Bytes, "B N C X Y"]
+    harvest: Annotated[NDArray[np.float32], "B N"]
+    """Apples harvested in this turn."""
+    in_play: Annotated[Bools, "B N"]
+    """Whether the agent acts in the coming turn."""
+    fired: Annotated[Bools, "B N"]
+    """Whether the agent fired in this turn."""
+    hit_by: Annotated[Bools, "B N N"]
+    """Whom a beam hit: row the agent hit, column the shooter."""
+    tagged_by: Annotated[Bools, "B N N"]
+    """Whom a beam tagged: row the agent tagged, column the shooter."""
+    scoreboard: Annotated[NDArray[np.float32], "B N S"]
+    """One row per observer: the harvest of every agent in this episode, the observer's own first, then of the
+    following agent indices, cyclically; S is N, or 0 without a scoreboard."""
+    stock_gauge: Annotated[NDArray[np.float32], "B N G"]
+    """The share of all sites that hold an apple; G is 1, or 0 without a stock gauge."""
+    stock: Annotated[NDArray[np.int64], "B 1"]
+    """Apples on the board."""
+    regrown: Annotated[NDArray[np.int64], "B 1"]
+    """Apples that grew in this turn."""
+    terminated: Annotated[Bools, "B 1"]
+    """No apple is left and none can grow."""
+    truncated: Annotated[Bools, "B 1"]
+    """The episode ran out of time."""
+    done: Annotated[Bools, "B 1"]
+    """Terminated or truncated."""
 
 
 class GovernedOutput(NamedTuple):
@@ -137,25 +137,22 @@ class Governed(NamedTuple):
 
 
 class Scratch(NamedTuple):
-    """Working memory for one turn, one per thread: the rules allocate nothing.
+    """Working memory for one turn, one per thread: the rules allocate nothing."""
 
-    Arrays are int32 unless stated otherwise.
-    """
-
-    start_row: Ints
-    """[N], the row in which each agent began the turn."""
-    start_col: Ints
-    """[N], the column in which each agent began the turn."""
-    blocked: Bools
-    """bool [N], whether the agent's move is being cancelled, or its return to play."""
-    words: NDArray[np.int64]
-    """int64 [K / 4, rounded up to a multiple of 4], random 32-bit words; one word serves four sites."""
-    sprouts: Ints
-    """[K], the sites that grow an apple in this turn come first."""
-    picture: Ints
-    """[cells], the board and a rim of wall around it, as paints (see `Tables.paints`)."""
-    seen: Ints
-    """[X * Y], the paints of the window being written."""
+    start_row: Annotated[Ints, "N"]
+    """The row in which each agent began the turn."""
+    start_col: Annotated[Ints, "N"]
+    """The column in which each agent began the turn."""
+    blocked: Annotated[Bools, "N"]
+    """Whether the agent's move is being cancelled, or its return to play."""
+    words: Annotated[NDArray[np.int64], "words"]
+    """Random 32-bit words, K / 4 rounded up to a multiple of 4; one word serves four sites."""
+    sprouts: Annotated[Ints, "K"]
+    """The sites that grow an apple in this turn come first."""
+    picture: Annotated[Ints, "cells"]
+    """The board and a rim of wall around it, as paints (see `Tables.paints`)."""
+    seen: Annotated[Ints, "window"]
+    """The paints of the window being written, X * Y of them."""
 
 
 class Shown(NamedTuple):
@@ -181,39 +178,9 @@ class Shown(NamedTuple):
 
 def empty_worlds(*, worlds: int, agents: int, sites: int) -> Worlds:
     """Memory for B worlds, all zero except `episode`, which is -1; `Batch.begin` starts the first episode."""
-
-    def ints(*shape: int) -> Ints:
-        return np.zeros((worlds, *shape), np.int32)
-
-    def bools(*shape: int) -> Bools:
-        return np.zeros((worlds, *shape), np.bool_)
-
-    def bytes_(*shape: int) -> Bytes:
-        return np.zeros((worlds, *shape), np.uint8)
-
-    return Worlds(
-        seed=np.zeros((worlds, 1), np.uint64),
-        number=np.zeros((worlds, 1), np.uint64),
-        stock=bytes_(sites),
-        stock_before=bytes_(sites),
-        near=np.zeros((worlds, sites), np.uint32),
-        stock_left=ints(1),
-        row=ints(agents),
-        col=ints(agents),
-        heading=ints(agents),
-        out_steps=ints(agents),
-        in_play=bools(agents),
-        on_board=bools(agents),
-        fired=bools(agents),
-        moved_after_firing=bools(agents),
-        hits=ints(agents),
-        tagged_step=ints(agents),
-        offences=ints(agents),
-        harvested=ints(agents),
-        step=ints(1),
-        episode=np.full((worlds, 1), -1, np.int32),
-        ended=ints(1),
-    )
+    empty = zeros(Worlds, B=worlds, N=agents, K=sites)
+    empty.episode[:] = -1
+    return empty
 
 
 CACHE_LINE_BYTES = 128
@@ -222,16 +189,8 @@ CACHE_LINE_BYTES = 128
 
 def empty_scratch(*, agents: int, sites: int, cells: int, window: int) -> Scratch:
     """The working memory of one thread; `window`: cells X * Y of a window."""
-
-    def padded(length: int, dtype: type[np.generic] = np.int32) -> NDArray[Any]:
-        return np.zeros(length + CACHE_LINE_BYTES, dtype)[:length]
-
+    words = 4 * -(-sites // SITES_PER_DRAW)
+    forms = forms_of(Scratch, N=agents, K=sites, words=words, cells=cells, window=window)
     return Scratch(
-        start_row=padded(agents),
-        start_col=padded(agents),
-        blocked=padded(agents, np.bool_),
-        words=padded(4 * -(-sites // SITES_PER_DRAW), np.int64),
-        sprouts=padded(sites),
-        picture=padded(cells),
-        seen=padded(window),
+        *(np.zeros(length + CACHE_LINE_BYTES, dtype)[:length] for (length,), dtype in forms.values())
     )

@@ -13,7 +13,7 @@ from torch import Tensor
 from cprl import arguments, keys
 from cprl.checks import shown
 from cprl.commons.batch import Batch, Output, output_of, turn_of
-from cprl.commons.game import Game, output_shapes
+from cprl.commons.game import Game, output_forms
 from cprl.commons.world import PLAYING, Bytes, StepOutput
 from cprl.compat import LeanStepEnv, put_all, unchecked_tensordict
 from cprl.envs.commons_specs import DONE_ENTRIES, WORLD_ENTRIES, specs_of
@@ -95,7 +95,7 @@ class CommonsEnv(LeanStepEnv):
         self._with_state = state
         self._forms = {
             name: (shape, torch.from_numpy(np.empty(0, dtype)).dtype)
-            for name, (shape, dtype) in output_shapes(game, worlds).items()
+            for name, (shape, dtype) in output_forms(game, worlds).items()
         }
         self._colours = torch.from_numpy(game.palette).to(device)
         output_bytes = sum(prod(shape) * dtype.itemsize for shape, dtype in self._forms.values())

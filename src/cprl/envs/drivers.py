@@ -10,8 +10,7 @@ from torch import Tensor
 
 from cprl import arguments
 from cprl.commons.batch import Driver
-from cprl.commons.game import Game
-from cprl.commons.sizes import check_worlds_fit
+from cprl.commons.game import Game, check_worlds_fit
 from cprl.commons.threads import CpuThreads
 
 

@@ -9,6 +9,7 @@ Values: `Game(..., institutions=(Quota(share=0.8), Tax(rate=0.2)))`.
     sanctions   GraduatedSanctions, and Mediation of tags
     choice      Vote and Sanctioner: what agents decide themselves
 Rules, on one world's arrays, compiled by `cprl.commons` for every target:
+    arrays      tuples of arrays, allocated and cut into worlds
     memory      the arrays: memory, payments, parameters
     deciding    votes and elections
     limits      which bites and steps are stopped or forbidden

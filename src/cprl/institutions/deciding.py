@@ -76,7 +76,3 @@ def appoint(memory: Memory, tables: InstitutionTables) -> None:
             memory.may_fire[i] = memory.in_force[tables.fire_ballot] == i
         else:
             memory.may_fire[i] = tables.may_fire[i]
-
-
-FUNCTIONS = (is_due, choice_of, votes_for, median_choice, elected_choice, hold_ballot, appoint)
-"""The rules of this module, each after those it calls."""

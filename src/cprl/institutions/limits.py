@@ -128,20 +128,3 @@ def is_known_forbidden(memory: Memory, tables: InstitutionTables, i: int, cell: 
         if tables.own_shown[boundary] and not tables.own[boundary, i, cell]:
             return True
     return tables.patch_shown and site >= 0 and is_patch_closed(memory, tables, site)
-
-
-FUNCTIONS = (
-    open_windows,
-    is_season_closed,
-    is_patch_closed,
-    is_above_quota,
-    stops_bite,
-    violate,
-    add_to_patch,
-    note_bite,
-    note_step,
-    count_patches,
-    close_patches,
-    is_known_forbidden,
-)
-"""The rules of this module, each after those it calls."""

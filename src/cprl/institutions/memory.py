@@ -3,10 +3,12 @@
 Letters: B worlds, N agents, C counts, S entries shown, V ballots, Q quotas, T taxes, P patches.
 """
 
-from typing import Final, NamedTuple, TypeAlias
+from typing import Annotated, Final, NamedTuple, TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
+
+from cprl.institutions.arrays import zeros
 
 Ints: TypeAlias = NDArray[np.int32]
 Bytes: TypeAlias = NDArray[np.uint8]
@@ -48,44 +50,44 @@ later than a sanction."""
 class Memory(NamedTuple):
     """What institutions remember of B worlds. All but `in_force` is cleared at an episode's begin."""
 
-    in_force: Numbers
-    """float64 [B, V], what each ballot decided: a tax rate, a quota's share or an agent index."""
-    allowed: Numbers
-    """float64 [B, Q], the apples that an agent may harvest in the current window."""
-    taken: Ints
-    """int32 [B, Q, N], apples harvested in the current window."""
-    income: Numbers
-    """float64 [B, T, N], apples harvested in the current period of each tax."""
-    level: Ints
-    """int32 [B, N], the level of the next sanction."""
-    offence_step: Ints
-    """int32 [B, N], the step of the last offence, or at which the level last fell."""
-    violation_step: Ints
-    """int32 [B, N], the step of the last violation; 0 for never."""
-    may_fire: Bools
-    """bool [B, N], whether the agent may fire; derived from `in_force`."""
-    detected: Bools
-    """bool [B, N], whether a violation was detected in the last turn."""
-    closed: Bools
-    """bool [B, P], whether the patch is closed in the coming turn; derived from the stock."""
-    counts: Ints
-    """int32 [B, N, C], the `COUNTS` of this episode."""
-    sanctioned: Bools
-    """bool [B, N], whether the agent was sanctioned in an earlier turn of this episode; working memory."""
-    broke: Bools
-    """bool [B, N], whether the agent violated a rule in this turn; working memory."""
-    unjust: Bools
-    """bool [B, N], whether the agent tagged unjustly in this turn; working memory."""
-    due: Numbers
-    """float64 [B, N], the fines that follow if this turn's violations are detected; working memory."""
-    fines: Numbers
-    """float64 [B, N], apples taken in this turn; working memory."""
-    transfers: Numbers
-    """float64 [B, N], apples given in this turn; working memory."""
-    owed: Numbers
-    """float64 [B, N], the tax that each agent owes; working memory."""
-    patch_stock: Ints
-    """int32 [B, P], apples on each patch; derived from the stock."""
+    in_force: Annotated[Numbers, "B V"]
+    """What each ballot decided: a tax rate, a quota's share or an agent index."""
+    allowed: Annotated[Numbers, "B Q"]
+    """The apples that an agent may harvest in the current window."""
+    taken: Annotated[Ints, "B Q N"]
+    """Apples harvested in the current window."""
+    income: Annotated[Numbers, "B T N"]
+    """Apples harvested in the current period of each tax."""
+    level: Annotated[Ints, "B N"]
+    """The level of the next sanction."""
+    offence_step: Annotated[Ints, "B N"]
+    """The step of the last offence, or at which the level last fell."""
+    violation_step: Annotated[Ints, "B N"]
+    """The step of the last violation; 0 for never."""
+    may_fire: Annotated[Bools, "B N"]
+    """Whether the agent may fire; derived from `in_force`."""
+    detected: Annotated[Bools, "B N"]
+    """Whether a violation was detected in the last turn."""
+    closed: Annotated[Bools, "B P"]
+    """Whether the patch is closed in the coming turn; derived from the stock."""
+    counts: Annotated[Ints, "B N C"]
+    """The `COUNTS` of this episode."""
+    sanctioned: Annotated[Bools, "B N"]
+    """Whether the agent was sanctioned in an earlier turn of this episode; working memory."""
+    broke: Annotated[Bools, "B N"]
+    """Whether the agent violated a rule in this turn; working memory."""
+    unjust: Annotated[Bools, "B N"]
+    """Whether the agent tagged unjustly in this turn; working memory."""
+    due: Annotated[Numbers, "B N"]
+    """The fines that follow if this turn's violations are detected; working memory."""
+    fines: Annotated[Numbers, "B N"]
+    """Apples taken in this turn; working memory."""
+    transfers: Annotated[Numbers, "B N"]
+    """Apples given in this turn; working memory."""
+    owed: Annotated[Numbers, "B N"]
+    """The tax that each agent owes; working memory."""
+    patch_stock: Annotated[Ints, "B P"]
+    """Apples on each patch; derived from the stock."""
 
 
 WORKING: Final = ("sanctioned", "broke", "unjust", "due", "fines", "transfers", "owed")
@@ -99,20 +101,20 @@ REMEMBERED: Final = tuple(name for name in Memory._fields if name not in (*WORKI
 class Payments(NamedTuple):
     """What institutions output in a turn, written into arrays that the caller provides."""
 
-    reward: Floats
-    """float32 [B, N], harvest - fines + transfers."""
-    fines: Floats
-    """float32 [B, N], apples taken."""
-    transfers: Floats
-    """float32 [B, N], apples given."""
-    violated: Bools
-    """bool [B, N], whether the agent broke a rule in this turn, detected or not."""
-    counts: Ints
-    """int32 [B, N, C], the `COUNTS` of this episode so far."""
-    in_force: Floats
-    """float32 [B, V], what each ballot decided."""
-    ballots_due: Bools
-    """bool [B, V], whether the ballot is held in the coming turn."""
+    reward: Annotated[Floats, "B N"]
+    """Harvest - fines + transfers."""
+    fines: Annotated[Floats, "B N"]
+    """Apples taken."""
+    transfers: Annotated[Floats, "B N"]
+    """Apples given."""
+    violated: Annotated[Bools, "B N"]
+    """Whether the agent broke a rule in this turn, detected or not."""
+    counts: Annotated[Ints, "B N C"]
+    """The `COUNTS` of this episode so far."""
+    in_force: Annotated[Floats, "B V"]
+    """What each ballot decided."""
+    ballots_due: Annotated[Bools, "B V"]
+    """Whether the ballot is held in the coming turn."""
 
 
 SHOWN: Final = (
@@ -249,26 +251,15 @@ class InstitutionTables(NamedTuple):
 
 def empty_memory(tables: InstitutionTables, *, worlds: int) -> Memory:
     """Memory for B worlds, all zero, except that the first choice of each ballot is in force."""
-    agents, patches = tables.may_fire.shape[0], tables.patch_sites.shape[0]
-    quotas, taxes = tables.quota_unit.shape[0], tables.tax_steps.shape[0]
-    return Memory(
-        in_force=np.tile(tables.ballot_choice[:, 0], (worlds, 1)),
-        allowed=np.zeros((worlds, quotas), np.float64),
-        taken=np.zeros((worlds, quotas, agents), np.int32),
-        income=np.zeros((worlds, taxes, agents), np.float64),
-        level=np.zeros((worlds, agents), np.int32),
-        offence_step=np.zeros((worlds, agents), np.int32),
-        violation_step=np.zeros((worlds, agents), np.int32),
-        may_fire=np.zeros((worlds, agents), np.bool_),
-        detected=np.zeros((worlds, agents), np.bool_),
-        closed=np.zeros((worlds, patches), np.bool_),
-        counts=np.zeros((worlds, agents, len(COUNTS)), np.int32),
-        sanctioned=np.zeros((worlds, agents), np.bool_),
-        broke=np.zeros((worlds, agents), np.bool_),
-        unjust=np.zeros((worlds, agents), np.bool_),
-        due=np.zeros((worlds, agents), np.float64),
-        fines=np.zeros((worlds, agents), np.float64),
-        transfers=np.zeros((worlds, agents), np.float64),
-        owed=np.zeros((worlds, agents), np.float64),
-        patch_stock=np.zeros((worlds, patches), np.int32),
+    empty = zeros(
+        Memory,
+        B=worlds,
+        N=tables.may_fire.shape[0],
+        C=len(COUNTS),
+        V=tables.ballot_choice.shape[0],
+        Q=tables.quota_unit.shape[0],
+        T=tables.tax_steps.shape[0],
+        P=tables.patch_sites.shape[0],
     )
+    empty.in_force[:] = tables.ballot_choice[:, 0]
+    return empty

@@ -129,19 +129,3 @@ def collect_taxes(memory: Memory, tables: InstitutionTables, turn: int, is_over:
             for i in range(agents):
                 if tables.tax_group[tax, i] >= 0:
                     pay_out(memory, tables, tax, i)
-
-
-FUNCTIONS = (
-    recover,
-    time_out,
-    offend,
-    mediate,
-    note_violation,
-    charge,
-    pay_monitor,
-    tax_of,
-    pay_out,
-    has_income,
-    collect_taxes,
-)
-"""The rules of this module, each after those it calls."""

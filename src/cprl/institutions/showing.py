@@ -83,7 +83,3 @@ def shown_entry(memory: Memory, tables: InstitutionTables, i: int, entry: int, t
     if kind == IS_ELECTED:
         return 1.0 if memory.in_force[argument] == i else 0.0
     return 0.0
-
-
-FUNCTIONS = (part_left, season_left, has_mark, quota_left, shown_entry)
-"""The rules of this module, each after those it calls; also in need of those of `limits`."""

@@ -6,7 +6,7 @@ cells behind it are not in the window, so no path leads there. `cprl.policies.sc
 functions.
 """
 
-from typing import Any, Final, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
@@ -119,15 +119,3 @@ def apples_near(roles: Bytes, frame: Frame, cell: int) -> int:
     for away in frame.near:
         count += roles[cell + away] == APPLE
     return count
-
-
-FUNCTIONS: Final[tuple[Any, ...]] = (
-    spread,
-    count_own_steps,
-    count_others_steps,
-    nearest,
-    step_to,
-    is_beside_an_agent,
-    apples_near,
-)
-"""The functions of this module, each after those it calls."""

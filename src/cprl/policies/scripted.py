@@ -263,4 +263,4 @@ def _choose_all() -> Callable[..., None]:
         function.__name__ = function.__qualname__ = name
         return kept_on_disk(function, **options)
 
-    return compiled(scripted_rules.FUNCTIONS, jit)["choose_all"]
+    return compiled([scripted_rules.choose_all], jit)["choose_all"]

@@ -4,13 +4,12 @@ Plain functions that `cprl.policies.scripted` compiles; cells and framed windows
 `cprl.policies.paths`.
 """
 
-from typing import Any, Final, NamedTuple, TypeAlias
+from typing import Final, NamedTuple, TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
 
 from cprl.commons.world import Actions, Bytes
-from cprl.policies import paths
 from cprl.policies.paths import (
     AGENT,
     APPLE,
@@ -196,19 +195,3 @@ def choose_all(
     for n in range(roles.shape[0]):
         explores = numbers[n, EXPLORES] < epsilon
         chosen[n] = choose(RANDOM if explores else policy, roles[n], frame, numbers[n], settings, scratch)
-
-
-FUNCTIONS: Final[tuple[Any, ...]] = (
-    *paths.FUNCTIONS,
-    target_apples,
-    exclude_apple,
-    exclude_sparse_apples,
-    exclude_apples_nearer_to_others,
-    walk_to,
-    wander,
-    has_target,
-    pursue,
-    choose,
-    choose_all,
-)
-"""All functions, each after those it calls."""
