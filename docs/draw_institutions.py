@@ -45,7 +45,7 @@ from cprl.institutions import (
     Tax,
     Vote,
 )
-from cprl.plotting.style import MARK, MEAN, RAW, on_white
+from cprl.terminal.style import MARK, MEAN, RAW, on_white
 
 FOLDER: Final = Path(__file__).parent / "institutions"
 DPI: Final = 110

@@ -9,7 +9,7 @@ from typing import Final
 import numpy as np
 from matplotlib.figure import Figure
 
-from cprl.plotting.style import MARK, MEAN, RAW, SMALL_PT, head, save
+from cprl.terminal.style import MARK, MEAN, RAW, SMALL_PT, head, save
 from cprl.theory import herders
 
 PATH: Final = Path(__file__).parent / "theory" / "herders.png"

@@ -15,8 +15,8 @@ from cprl.commons.batch import Batch, turn_of
 from cprl.commons.colours import agent_colour
 from cprl.commons.picture import world_image
 from cprl.institutions import COUNTS, Institution
-from cprl.plotting.style import MARK, MEAN, RAW
 from cprl.policies.scripted import ScriptedActor, ScriptedPolicy
+from cprl.terminal.style import MARK, MEAN, RAW
 
 SEED: Final = 3
 WIDTH_IN, TEXT_PT = 7.2, 9.5

@@ -19,10 +19,10 @@ from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
 from cprl.measuring.statistics import Estimate, curve_interval, estimate
-from cprl.plotting import style
-from cprl.plotting.style import INTERVAL, MEAN, RANDOM_LINE, SMALL_PT
 from cprl.runs.curves import as_curves, centres, curves_of, running_mean
 from cprl.runs.episodes import read_table
+from cprl.terminal import style
+from cprl.terminal.style import INTERVAL, MEAN, RANDOM_LINE, SMALL_PT
 
 NONE: Final = "none"
 NAMES: Final = {

@@ -16,7 +16,7 @@ import pyarrow.csv
 import tyro
 
 from cprl.evaluation import draw_scenarios, run_scenarios
-from cprl.evaluation.scenarios.tables import estimates
+from cprl.evaluation.scenarios import estimates
 from cprl.process import prepare_process
 from cprl.runs.files import write_atomically
 

@@ -31,7 +31,7 @@ from torchrl.envs.utils import check_env_specs
 from cprl import CommonsEnv, Game, Rules, maps
 from cprl.collectors import StepCollector
 from cprl.envs import spaces_of
-from cprl.evaluation.tables import run_table
+from cprl.evaluation.evaluate import run_table
 from cprl.measuring import EpisodeTracker, social
 from cprl.measuring.evaluate import evaluate
 from cprl.measuring.replicas import agents_without_harvest, social_measures

@@ -681,7 +681,7 @@ def test_a_row_is_sent_as_rerun_itself_sends_columns(tmp_path):
     import rerun as rr
     from rerun.chunk import RrdReader
 
-    from cprl.viewer.batches import components, timelines, times
+    from cprl.viewer.logger import components, timelines, times
 
     columns = rr.Points2D.columns(positions=np.ones((2, 2)), labels=["one", "two"])
     at = times([3, 4], [0, 1], [5, 6])

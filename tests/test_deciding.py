@@ -18,16 +18,14 @@ from cprl.algorithms import DQN, VDN, DQNSettings, Tabular, TabularSettings
 from cprl.collectors import stock_collector
 from cprl.commandline import parse
 from cprl.envs.make_env import make_env
-from cprl.evaluation.film import film
-from cprl.evaluation.film_video import film_video
-from cprl.evaluation.turns import Turns
+from cprl.evaluation.film import film, film_video
+from cprl.evaluation.lanes import Turns
+from cprl.evaluation.play import Session, open_session
 from cprl.institutions import Sanctioner, Tax, Vote
 from cprl.institutions.deciding import choice_of
 from cprl.learners.decisions import Bandit, BanditDecider
 from cprl.measuring.evaluate import evaluate
 from cprl.outcome import evaluate_population, exhibited, random_play
-from cprl.play.opening import open_session
-from cprl.play.session import Session
 from cprl.policies.assignment import AgentPolicies
 from cprl.policies.decisions import UNTRIED, Decider, choices_of, decision_of
 from cprl.policies.lanes import random_agents

@@ -11,8 +11,8 @@ from cprl.policies.lanes import LaneActor, random_lanes
 from cprl.policies.scripted import scripted_lanes
 from cprl.training import train
 from cprl.viewer.callback import ViewerCallback
-from cprl.viewer.decisions import Decisions
 from cprl.viewer.panels import APART, BAR, HIGH, decision_panels
+from cprl.viewer.replay import Decisions
 
 GAME = Game(
     map=maps.parse(".A>.A\n.A#A.\nv.<.>"),

@@ -10,7 +10,7 @@ from test_evaluation import CORRIDORS, MEADOW, SEED, command, ran
 import cprl
 from cprl import Game, Rules, maps
 from cprl.evaluation import analyse, draw_egta, pairwise_game, play_empirical_game
-from cprl.evaluation.egta_tables import egta_tables
+from cprl.evaluation.egta import egta_tables
 from cprl.evaluation.empirical_game import _choices
 from cprl.population import Scripted
 from cprl.theory import PayoffTable, compositions

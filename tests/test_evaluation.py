@@ -19,11 +19,10 @@ from cprl import CommonsEnv, Experiment, Game, Observation, Rules, cli, maps, pr
 from cprl.agents import Population
 from cprl.envs.make_env import spaces_of
 from cprl.evaluation import draw_gains, gains
+from cprl.evaluation.cross_play import diagonal_returns
+from cprl.evaluation.evaluate import differences
 from cprl.evaluation.film import film
-from cprl.evaluation.gains import diagonal_returns
-from cprl.evaluation.lanes import Source, policies_of
-from cprl.evaluation.same_game import differences
-from cprl.evaluation.turns import Turns
+from cprl.evaluation.lanes import Source, Turns, policies_of
 from cprl.learners.lanes import EVALUATION, lane_seeds
 from cprl.measuring.evaluate import evaluate
 from cprl.measuring.movement import trace

@@ -22,11 +22,10 @@ from cprl.population import Learning, Scripted, Team
 from cprl.training import train
 from cprl.viewer import exhibition
 from cprl.viewer.callback import ViewerCallback
-from cprl.viewer.contents import curves_of
 from cprl.viewer.exhibition import BATCH_S, BATCH_STEPS, Exhibition, caption_of
-from cprl.viewer.recorder import scene_of
-from cprl.viewer.sending import Stream
-from cprl.viewer.streams import Live
+from cprl.viewer.frames import scene_of
+from cprl.viewer.scenery import curves_of
+from cprl.viewer.streams import Live, Stream
 
 REPLAY = DQNSettings(buffer_size=300, batch_size=4, hidden_cells=(8,), epsilon_hold_steps=10)
 ROLLOUT = RolloutSettings(rollout_steps=20, minibatch_size=10, hidden_cells=(8,))

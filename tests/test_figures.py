@@ -23,13 +23,12 @@ from cprl.learners.settings import DQNSettings, RolloutSettings
 from cprl.measuring import phases
 from cprl.measuring.phases import PHASES
 from cprl.measuring.published import published_experiment
-from cprl.plotting import style
-from cprl.plotting.bands import UNNAMED, bands_of, published_bands
 from cprl.population import Learning, Scripted, Team, exploration_steps
 from cprl.reporting import figures as reported
 from cprl.reporting.result import Result
 from cprl.runs.curves import centres, episode_of_step, phases_of
-from cprl.terminal.figures import training_curve
+from cprl.terminal import style
+from cprl.terminal.figures import UNNAMED, bands_of, published_bands, training_curve
 
 
 def a_run(folder, metrics, *, recipe=None, board="commons"):

@@ -13,11 +13,10 @@ from PIL import Image
 from cprl import Experiment, Game, Rules, cli, load, maps
 from cprl.commons.colours import APPLE, GROUND, PALETTE, agent_colour
 from cprl.commons.picture import EMPTY_SITE_COLOUR
-from cprl.evaluation import video_files
-from cprl.evaluation.episode_picture import EpisodePicture, nice
-from cprl.evaluation.film import film, fresh_episode
-from cprl.evaluation.film_video import _titles as titles_of
-from cprl.evaluation.film_video import film_video
+from cprl.evaluation import film_pictures
+from cprl.evaluation.film import _titles as titles_of
+from cprl.evaluation.film import film, film_video, fresh_episode
+from cprl.evaluation.film_pictures import EpisodePicture, nice
 from cprl.institutions import Monitoring, Quota
 from cprl.population import Scripted
 from cprl.runs.directory import start_run
@@ -228,7 +227,7 @@ def test_an_mp4_has_a_picture_for_each_turn_and_holds_the_card(runs, tmp_path):
 
 
 def test_an_mp4_without_imageio_ffmpeg_is_refused_in_a_sentence(runs, tmp_path, monkeypatch):
-    monkeypatch.setattr(video_files, "find_spec", lambda name: None)
+    monkeypatch.setattr(film_pictures, "find_spec", lambda name: None)
     monkeypatch.setattr("sys.argv", ["cprl", "film", str(runs / "greedy"), "--out", str(tmp_path / "a.mp4")])
     with pytest.raises(SystemExit, match=r"a\.mp4: an \.mp4 needs imageio-ffmpeg, .* or name a \.gif"):
         cli.main()
@@ -288,7 +287,7 @@ def interrupt(*_):
 def test_what_cannot_be_filmed_is_refused_before_anything_is_played(runs, tmp_path, monkeypatch, words, said):
     monkeypatch.chdir(tmp_path)
     (tmp_path / "there.gif").touch()
-    monkeypatch.setattr("cprl.evaluation.turns.Turns.play", lambda *_: pytest.fail("played"))
+    monkeypatch.setattr("cprl.evaluation.lanes.Turns.play", lambda *_: pytest.fail("played"))
     words = [word.format(random=runs / "random", meadow=runs / "meadow") for word in words]
     monkeypatch.setattr("sys.argv", ["cprl", "film", str(runs / "random"), *words])
     with pytest.raises(SystemExit, match=said):

@@ -18,25 +18,22 @@ from torchrl.envs import TransformedEnv
 import cprl
 from cprl import CommonsEnv, Custom, Experiment, Game, Rules, maps
 from cprl.evaluation import evaluate_run
-from cprl.evaluation.episode_picture import EpisodePicture
-from cprl.evaluation.film import film
-from cprl.evaluation.film_video import film_video
-from cprl.evaluation.tables import run_table
+from cprl.evaluation.evaluate import run_table
+from cprl.evaluation.film import film, film_video
+from cprl.evaluation.film_pictures import EpisodePicture
 from cprl.institutions import Boundaries, GraduatedSanctions, Monitoring, Sanctioner, Tax, Vote
 from cprl.measuring.reported import reported_by
 from cprl.policies.lanes import random_agents
 from cprl.population import Scripted
 from cprl.runs.episodes import read_episodes
 from cprl.terminal.figures import training_curve
-from cprl.terminal.institutions import institutions_table
-from cprl.terminal.summary import _mean, summarise
+from cprl.terminal.summary import _mean, institutions_table, summarise
 from cprl.training import train
 from cprl.viewer.blueprint import layout
 from cprl.viewer.callback import ViewerCallback
-from cprl.viewer.contents import curves_of
-from cprl.viewer.institution_views import borders, in_words, regions_of
 from cprl.viewer.institutions import has_institutions, lines, tabs
-from cprl.viewer.scenery import Curves
+from cprl.viewer.scenery import Curves, curves_of
+from cprl.viewer.views import borders, in_words, regions_of
 
 GAME = Game(
     map=maps.parse(".A>.A.A\n.A#A.AA\nv.<.AA>"),
@@ -211,7 +208,7 @@ def test_a_replay_marks_who_breaks_a_rule_in_its_turn_and_shows_payments(whole, 
 
 
 def test_a_mark_is_a_diamond_around_the_agent(tmp_path):
-    from cprl.viewer.offences import Offences
+    from cprl.viewer.replay import Offences
 
     env = TransformedEnv(CommonsEnv(GAME, 1, seed=1), Charges())
     seen = Remembers(env.base_env)

@@ -4,7 +4,7 @@ import numpy as np
 
 from cprl import maps
 from cprl.commons.colours import APPLE, BEAM, FIRST_AGENT, GROUND, MARK, WALL, agent_colour
-from cprl.viewer.live_board import LiveBoard
+from cprl.viewer.exhibition import LiveBoard
 from cprl.viewer.scenery import Scene
 
 BOARD = maps.parse(".A>\n.A<")

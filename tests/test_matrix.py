@@ -27,7 +27,7 @@ from cprl.envs.matrix import (
     stag_hunt,
 )
 from cprl.envs.state import check_restorable
-from cprl.evaluation.same_game import differences
+from cprl.evaluation.evaluate import differences
 from cprl.experiment import changes
 from cprl.population import Learning, Scripted
 from cprl.reporting import write_report

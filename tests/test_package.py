@@ -16,7 +16,7 @@ from cprl.envs.matrix import MatrixEnv, stag_hunt
 from cprl.learners.replay import ReplayLearner
 
 PACKAGES = (
-    *("algorithms", "callbacks", "commons", "envs", "evaluation", "exploiting", "institutions", "keys"),
+    *("algorithms", "callbacks", "commons", "envs", "evaluation", "institutions", "keys"),
     *("learners", "measuring", "networks", "objectives", "policies", "population", "preferences", "presets"),
     *("reporting", "spaces", "studies", "theory", "training", "viewer"),
 )

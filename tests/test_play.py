@@ -8,12 +8,9 @@ import pytest
 from matrix_game import MatrixGame
 
 from cprl import Experiment, Game, Rules, cli, maps, presets
+from cprl.evaluation.play import Session, board_text, help_of, open_session, play_in_terminal
 from cprl.measuring.episodes import EpisodeTracker
 from cprl.measuring.replicas import social_metrics
-from cprl.play.keys import help_of
-from cprl.play.opening import open_session
-from cprl.play.session import Session
-from cprl.play.terminal import board_text, play_in_terminal
 from cprl.population import Scripted
 from cprl.runs.directory import start_run
 from cprl.runs.weights import save_weights

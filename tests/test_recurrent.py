@@ -49,12 +49,12 @@ from cprl.config import from_config, to_config
 from cprl.envs import make_env, spaces_of
 from cprl.envs.matrix import stag_hunt
 from cprl.evaluation.film import film
+from cprl.evaluation.play import open_session
 from cprl.learners.rollouts import RolloutLearner
 from cprl.measuring.evaluate import evaluate
 from cprl.measuring.movement import trace
 from cprl.networks import GRU, LSTM, MLP, Conv
 from cprl.networks.stacked import lane_state, stack_lanes
-from cprl.play.opening import open_session
 from cprl.population import Frozen, Learning, Scripted, Team
 from cprl.training import train
 

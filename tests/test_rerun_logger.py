@@ -19,8 +19,9 @@ from cprl.learners.settings import DQNSettings
 from cprl.policies.single import RandomActor
 from cprl.training import train
 from cprl.viewer.callback import ViewerCallback
-from cprl.viewer.frames import Frame, FrameBuffer, mosaic, window_corners
+from cprl.viewer.frames import Frame, FrameBuffer
 from cprl.viewer.logger import RerunLogger
+from cprl.viewer.panels import mosaic, window_corners
 from cprl.viewer.scenery import Scene
 from cprl.viewer.stage import boards
 

@@ -14,9 +14,9 @@ import cprl
 from cprl import Experiment, Observation, maps, presets
 from cprl.envs.matrix import stag_hunt
 from cprl.evaluation import Scenario, draw_scenarios, run_scenarios, scenarios_of
+from cprl.evaluation import scenarios as module
 from cprl.evaluation.lanes import Source, play, policies_of
-from cprl.evaluation.scenarios import backgrounds, suite
-from cprl.evaluation.scenarios.tables import estimates, scenario_tables
+from cprl.evaluation.scenarios import estimates, scenario_tables
 from cprl.population import Frozen, Learning, Scripted
 from cprl.runs.directory import read_recipe
 
@@ -130,12 +130,12 @@ def keeping(run, *replicas):
 
 def test_where_replicas_are_missing_the_next_one_that_is_kept_is_the_background(runs):
     run = keeping(cprl.load(runs["learned"]), 1, 2)
-    assert [suite._following(run, replica) for replica in (0, 1, 2, 3)] == [2, 2, 1, 1]
+    assert [module._following(run, replica) for replica in (0, 1, 2, 3)] == [2, 2, 1, 1]
 
 
 def test_a_run_of_a_single_replica_is_not_its_own_background(runs, monkeypatch):
     run = cprl.load(runs["learned"])
-    monkeypatch.setattr(suite, "load", lambda path, allow: keeping(run, 1))
+    monkeypatch.setattr(module, "load", lambda path, allow: keeping(run, 1))
     background = tuple(Frozen(str(run.path), agent, replica=None) for agent in range(2))
     own = Scenario(name="itself", game=MEADOW, focal="minority", background=background)
     answer = "the scenario itself has the background .*learned, which keeps the single replica 1, so that"
@@ -155,17 +155,17 @@ def test_two_agents_have_minorities_alone_and_without_a_beam_no_background_that_
         "minority_among_greedy",
         "minority_among_sustainable",
     ]
-    assert [one.name.partition("_among_")[2] for one in scenarios_of(MEADOW)] == list(backgrounds.SCRIPTED)
+    assert [one.name.partition("_among_")[2] for one in scenarios_of(MEADOW)] == list(module.SCRIPTED)
     four = scenarios_of(presets.game("commons"))
     assert [one.name for one in four][:2] == ["majority_among_greedy", "minority_among_greedy"]
     assert len(four) == 2 * 5
 
 
-@pytest.mark.parametrize("name", [name for *_, name in backgrounds._COMMITTED])
+@pytest.mark.parametrize("name", [name for *_, name in module._COMMITTED])
 def test_committed_populations_are_backgrounds_on_their_own_game(name):
-    folder = backgrounds.results_folder() / name
+    folder = module.results_folder() / name
     experiment = Experiment.from_recipe(read_recipe(folder), directory=folder)
-    assert backgrounds.stored_for(experiment.game) == folder
+    assert module.stored_for(experiment.game) == folder
     assert all(isinstance(spec, Learning) for spec in experiment.agents)
     assert scenarios_of(experiment.game)[-1].background == tuple(
         Frozen(str(folder), agent, replica=None) for agent in range(experiment.game.agents)
@@ -174,11 +174,11 @@ def test_committed_populations_are_backgrounds_on_their_own_game(name):
 
 def test_without_a_checkout_stored_backgrounds_are_left_out_and_named(tmp_path, monkeypatch):
     game = presets.game("two_complex", variant="as_run")
-    assert backgrounds.left_out_of(game) == backgrounds.left_out_of(MEADOW) == ""
-    monkeypatch.setattr(backgrounds, "results_folder", lambda: tmp_path)
+    assert module.left_out_of(game) == module.left_out_of(MEADOW) == ""
+    monkeypatch.setattr(module, "results_folder", lambda: tmp_path)
     assert [one.name for one in scenarios_of(game)][-1] == "minority_among_aggressive"
     why = rf"minority_among_dqn: the stored population {tmp_path}/two_complex comes with a checkout of cprl"
-    assert backgrounds.left_out_of(game).startswith(why)
+    assert module.left_out_of(game).startswith(why)
 
 
 def test_the_table_and_the_estimates_hold_every_number(runs):

@@ -6,7 +6,7 @@ import pytest
 from cprl import maps
 from cprl.commons.picture import board_image
 from cprl.commons.sprites import BODY, INK, MARKED, agent_sprite, number_pixels
-from cprl.viewer.strokes import marks, numbers, numbers_and_headings
+from cprl.viewer.stage import marks, numbers, numbers_and_headings
 
 
 def test_digits_are_drawn_on_three_by_five_pixels():

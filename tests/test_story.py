@@ -11,17 +11,13 @@ from cprl import CommonsEnv, presets
 from cprl.measuring.phases import LONGEST
 from cprl.measuring.published import PHASES_BEGIN
 from cprl.measuring.reported import reported_by
-from cprl.viewer import compiling
-from cprl.viewer.batches import send_waiting
+from cprl.viewer import callback
 from cprl.viewer.blueprint import layout
 from cprl.viewer.callback import ViewerCallback
-from cprl.viewer.contents import curves_of
-from cprl.viewer.header import Header, played
-from cprl.viewer.logger import RerunLogger
-from cprl.viewer.recipe import as_table
-from cprl.viewer.scenery import Curves
-from cprl.viewer.sending import LiveStream, Stream
-from cprl.viewer.story import published_phases
+from cprl.viewer.logger import RerunLogger, as_table, send_waiting
+from cprl.viewer.scenery import Curves, curves_of
+from cprl.viewer.story import Header, played, published_phases
+from cprl.viewer.streams import LiveStream, Stream
 
 __all__ = ["strict_rerun"]
 HEADER = Header(episodes=4800, replicas=8, unit="apples")
@@ -181,7 +177,7 @@ def test_a_recording_of_a_training_too_long_for_the_search_has_no_phases():
 
 
 def test_while_code_is_compiled_the_live_header_says_for_how_long(monkeypatch):
-    monkeypatch.setattr(compiling, "_PERIOD_S", 0.02)
+    monkeypatch.setattr(callback, "_PERIOD_S", 0.02)
     told = []
 
     def tell(status):
@@ -189,8 +185,8 @@ def test_while_code_is_compiled_the_live_header_says_for_how_long(monkeypatch):
         if status == "begins":
             notice.stop()
 
-    notice = compiling.CompilingNotice(tell)
-    with compiling.CLOCK.running():
+    notice = callback.CompilingNotice(tell)
+    with callback.CLOCK.running():
         while len(told) < 2:
             pass
     while told[-1] != "begins":

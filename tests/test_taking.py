@@ -29,7 +29,7 @@ from cprl.compat import LeanStepEnv
 from cprl.envs import make_env, spaces_of
 from cprl.envs.state import check_restorable
 from cprl.envs.taking import TakingEnv, TakingGame
-from cprl.evaluation.same_game import differences
+from cprl.evaluation.evaluate import differences
 from cprl.experiment import changes
 from cprl.population import Learning, Scripted, Team
 from cprl.reporting import write_report

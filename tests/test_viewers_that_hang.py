@@ -10,15 +10,15 @@ import time
 import pytest
 from test_watch import connected
 
-from cprl.viewer import deadline
-from cprl.viewer.deadline import Sender, within
+from cprl.viewer import streams
+from cprl.viewer.streams import Sender, within
 
 
 @pytest.fixture
 def short(monkeypatch):
     """Deadlines of a third of a second."""
     for name in ("STALL_S", "CLOSE_S"):
-        monkeypatch.setattr(deadline, name, 0.3)
+        monkeypatch.setattr(streams, name, 0.3)
 
 
 def test_what_takes_too_long_is_not_waited_for():
@@ -33,15 +33,15 @@ def test_what_takes_too_long_is_not_waited_for():
 
 def test_calls_are_made_in_their_order_and_all_before_the_end():
     made, sender = [], Sender()
-    for number in range(3 * deadline.QUEUED_CALLS):
+    for number in range(3 * streams.QUEUED_CALLS):
         sender.put(lambda number=number: made.append(number))
     sender.close()
-    assert made == list(range(3 * deadline.QUEUED_CALLS))
+    assert made == list(range(3 * streams.QUEUED_CALLS))
 
 
 def fill(sender):
     """More calls that never return than the queue holds."""
-    for _ in range(deadline.QUEUED_CALLS + 2):
+    for _ in range(streams.QUEUED_CALLS + 2):
         sender.put(threading.Event().wait)
 
 
@@ -95,9 +95,9 @@ def test_a_served_recording_does_not_wait_for_a_viewer_that_stands_still(end, tm
             slowest, closing = map(float, next(lines).split())
             started = time.monotonic()
             _, errors = process.communicate(timeout=60)
-            assert slowest < deadline.STALL_S + 1
-            assert closing < deadline.CLOSE_S + 1
-            assert time.monotonic() - started < deadline.CLOSE_S + deadline.STALL_S + 1
+            assert slowest < streams.STALL_S + 1
+            assert closing < streams.CLOSE_S + 1
+            assert time.monotonic() - started < streams.CLOSE_S + streams.STALL_S + 1
             assert process.returncode == 0
             if end == "closes":
                 assert errors.count("live view failed, the run continues without it") == 1

@@ -11,10 +11,9 @@ from cprl.measuring import Episode, social
 from cprl.policies.lanes import random_agents
 from cprl.training import train
 from cprl.viewer.callback import ViewerCallback
-from cprl.viewer.lorenz import gini, lorenz_curve
 from cprl.viewer.panels import Panels
 from cprl.viewer.stage import boards
-from cprl.viewer.wall import Wall
+from cprl.viewer.views import Wall, gini, lorenz_curve
 
 GAME = Game(
     map=maps.parse(".A>.A\n.A#A.\n..<.A"),
@@ -181,8 +180,8 @@ class Listener:
 def test_viewers_get_the_wall_every_two_seconds_and_the_file_does_not(run, monkeypatch):
     _, viewer, _ = run
     clock, listener = iter(np.arange(10.0, 20.0, 0.8)), Listener()
-    monkeypatch.setattr("cprl.viewer.wall.time.perf_counter", lambda: next(clock))
-    monkeypatch.setattr("cprl.viewer.wall.send_chunk", Listener.take)
+    monkeypatch.setattr("cprl.viewer.views.time.perf_counter", lambda: next(clock))
+    monkeypatch.setattr("cprl.viewer.views.send_chunk", Listener.take)
     wall = Wall(viewer.env, listener, scene=viewer.logger.scene, recorded_steps=100)
     for step in range(1, 10):
         wall.on_step(step, 3, None)

@@ -9,8 +9,7 @@ from test_population import ALGORITHMS
 import cprl
 from cprl.envs.matrix import stag_hunt
 from cprl.evaluation import territory_of
-from cprl.evaluation.territory import DEFENCE, EXCLUSION, OVERLAP, TAGS, VISITORS
-from cprl.evaluation.visits_picture import draw_visits
+from cprl.evaluation.territory import DEFENCE, EXCLUSION, OVERLAP, TAGS, VISITORS, draw_visits
 from cprl.population import Learning, Scripted
 
 

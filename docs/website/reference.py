@@ -39,7 +39,6 @@ REFERENCE: Final = {
     "measuring": "metrics and statistics",
     "viewer": "recordings for the Rerun viewer",
     "evaluation": "stored agents in fresh worlds and among each other",
-    "exploiting": "best responses against stored agents",
     "studies": "one experiment under many conditions",
     "reporting": "runs beside the published study",
     "config": "values as JSON tables, and back",
@@ -57,8 +56,8 @@ _MODULES: Final = {
 
 INTERNAL: Final = {
     *("compat", "checks", "arguments", "output", "caches", "compile_clock", "times", "garbage", "process"),
-    *("compiling", "memory", "collectors", "runs", "plotting", "terminal", "finite", "stored", "earlier"),
-    *("annotations", "stored_agents", "agents", "outcome", "parts", "leftovers", "running", "play", "flags"),
+    *("compiling", "memory", "collectors", "runs", "terminal", "finite", "stored", "earlier"),
+    *("annotations", "stored_agents", "agents", "outcome", "parts", "leftovers", "running", "flags"),
     *("commandline", "command_parts", "differences"),
     *("evaluation_cli", "egta_cli", "scenarios_cli", "studies_options", "studies_cli", "exploit_cli"),
     *("libraries", "shipped", "recipes_cli", "docs_cli", "cli", "__main__"),

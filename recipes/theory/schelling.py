@@ -24,10 +24,10 @@ from cprl.evaluation import SchellingDiagram, draw_schelling, schelling
 from cprl.institutions import GraduatedSanctions, Quota, Tax
 from cprl.measuring.statistics import estimate
 from cprl.output import say
-from cprl.plotting.style import check_picture
 from cprl.policies.scripted import SCRIPTED_POLICIES
 from cprl.reporting.markdown import table
 from cprl.runs.directory import FILE_NAME
+from cprl.terminal.style import check_picture
 
 BOARDS: Final = ("commons", "two_complex")
 RULES: Final = {

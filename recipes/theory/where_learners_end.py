@@ -36,7 +36,7 @@ import cprl
 from cprl import keys
 from cprl.envs.taking import TakingGame
 from cprl.measuring.statistics import estimate
-from cprl.plotting.style import MARK, MEAN, RAW, SMALL_PT, WIDTH_IN, head, save
+from cprl.terminal.style import MARK, MEAN, RAW, SMALL_PT, WIDTH_IN, head, save
 from cprl.theory import SharingGame
 
 GAMES: Final = (("herders", 2), ("herders", 5), ("appropriation", 8))

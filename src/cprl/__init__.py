@@ -36,7 +36,6 @@ Each imports only from those above it:
     presets      the published games and hyper-parameters by name
     measuring    social metrics, episodes, phases, statistics
     runs         what is kept of a run: recipe, table of episodes, checkpoints, weights
-    plotting     what all figures share: sizes, colours, legends, bands of phases
     viewer       recordings for the Rerun viewer
     terminal     progress, summary, figures
     callbacks    what is called while a training runs
@@ -51,10 +50,8 @@ Each imports only from those above it:
     parts        what is made of an experiment before anything is written
     leftovers    what a run leaves in its directory: removed, or said
     running      run: an experiment from its learners to its report
-    evaluation   stored agents in fresh worlds, alone and among each other
-    play         a person among trained or scripted agents
     studies      one experiment under many conditions: factors, trials, tables, figures
-    exploiting   best responses trained against stored agents, and what they gain
+    evaluation   stored agents in fresh worlds: alone, among each other and people, against best responses
     reporting    finished runs beside the published study
     flags        the fields of an experiment as flags
     commandline  recipe_main: the command line of a recipe
@@ -84,7 +81,6 @@ if TYPE_CHECKING:
         commons,
         envs,
         evaluation,
-        exploiting,
         institutions,
         keys,
         learners,
@@ -137,7 +133,6 @@ __all__ = [
     "envs",
     "evaluate_run",
     "evaluation",
-    "exploiting",
     "institutions",
     "keys",
     "learners",

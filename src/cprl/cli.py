@@ -146,8 +146,7 @@ def play(
     make_importable(allow)
     check_board(board)
 
-    from cprl.play.opening import open_session
-    from cprl.play.terminal import play_in_terminal
+    from cprl.evaluation.play import open_session, play_in_terminal
 
     prepare_process(seed)
     session = open_session(

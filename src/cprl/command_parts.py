@@ -20,7 +20,7 @@ def check_files(out: Path | None = None, figure: Path | None = None) -> None:
     if out is not None:
         refuse_to_write_over(out)
     if figure is not None:
-        from cprl.plotting.style import check_picture
+        from cprl.terminal.style import check_picture
 
         check_picture(figure, "--figure")
 

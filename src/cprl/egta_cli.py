@@ -45,9 +45,7 @@ def egta(
     check_runs(*(named.values() if isinstance(named, dict) else named))
 
     from cprl.evaluation.cross_play import crossplay
-    from cprl.evaluation.egta import analyse
-    from cprl.evaluation.egta_picture import draw_egta
-    from cprl.evaluation.egta_tables import egta_heading, egta_tables
+    from cprl.evaluation.egta import analyse, draw_egta, egta_heading, egta_tables
     from cprl.evaluation.empirical_game import pairwise_game, play_empirical_game
     from cprl.runs.labelled import write_table
     from cprl.theory.extras import check_extras

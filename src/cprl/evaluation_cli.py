@@ -59,7 +59,7 @@ def film(
     check_runs(run, *beside)
 
     from cprl.evaluation.film import film as film_run
-    from cprl.evaluation.film_video import film_video
+    from cprl.evaluation.film import film_video
     from cprl.viewer.streams import to_watch
 
     prepare_process(seed)
@@ -101,8 +101,7 @@ def evaluate(
     check_files(out)
     check_runs(run)
 
-    from cprl.evaluation.evaluate import evaluate_run
-    from cprl.evaluation.tables import run_table
+    from cprl.evaluation.evaluate import evaluate_run, run_table
     from cprl.runs.labelled import write_table
 
     prepare_process(seed)
@@ -147,9 +146,7 @@ def visits(
     check_files(figure=figure)
     check_runs(run)
 
-    from cprl.evaluation.tables import territory_table
-    from cprl.evaluation.territory import territory_of
-    from cprl.evaluation.visits_picture import draw_visits
+    from cprl.evaluation.territory import draw_visits, territory_of, territory_table
 
     prepare_process(seed)
     found = territory_of(run, episodes=episodes, greedy=greedy, seed=seed, replicas=replicas, allow=allow)
@@ -191,9 +188,8 @@ def crossplay(
     named = runs_by_name(runs)
     check_runs(*(named.values() if isinstance(named, dict) else named))
 
+    from cprl.evaluation.cross_play import agents_table, draw_gains, gains_tables, heading, matrices
     from cprl.evaluation.cross_play import crossplay as play_each_other
-    from cprl.evaluation.gains_picture import draw_gains
-    from cprl.evaluation.tables import agents_table, gains_tables, heading, matrices
     from cprl.runs.labelled import write_table
 
     prepare_process(seed)
@@ -248,10 +244,9 @@ def schelling(
     check_files(out, figure)
     check_board(board)
 
+    from cprl.evaluation.populations import board_named
+    from cprl.evaluation.schelling import draw_schelling, schelling_tables
     from cprl.evaluation.schelling import schelling as play_all_mixes
-    from cprl.evaluation.schelling_picture import draw_schelling
-    from cprl.evaluation.tables import schelling_tables
-    from cprl.evaluation.words import board_named
     from cprl.runs.labelled import write_table
 
     prepare_process(seed)

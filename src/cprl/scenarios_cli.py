@@ -40,8 +40,7 @@ def scenarios(
     check_files(out, figure)
     check_runs(run)
 
-    from cprl.evaluation.scenarios import draw_scenarios, run_scenarios
-    from cprl.evaluation.scenarios.tables import heading, scenario_tables
+    from cprl.evaluation.scenarios import draw_scenarios, heading, run_scenarios, scenario_tables
     from cprl.runs.labelled import write_table
 
     prepare_process(seed)

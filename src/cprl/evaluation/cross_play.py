@@ -11,24 +11,42 @@ effects: the focal agent of the diagonal is then from the run's next replica, tr
 with the background agents.
 """
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import partial
 from itertools import product
 from pathlib import Path
+from statistics import fmean
 from typing import Final, Literal, TypeAlias, get_args
 
+import matplotlib
 import numpy as np
 import pyarrow as pa
+from matplotlib.axes import Axes
+from matplotlib.colors import Normalize
+from matplotlib.figure import Figure
+from rich.table import Table
 
 from cprl import arguments
-from cprl.arguments import Diagonal
-from cprl.evaluation.evaluate import SEED, check, chosen_replicas, opened
+from cprl.arguments import Diagonal, object_of
+from cprl.evaluation.evaluate import (
+    INTERVALS,
+    SEED,
+    check,
+    check_same_game,
+    chosen_replicas,
+    how_they_play,
+    opened,
+    says_nothing,
+    unit_of_rewards,
+)
 from cprl.evaluation.lanes import Played, Source, play, policies_of, pooled
-from cprl.evaluation.same_game import check_same_game
+from cprl.measuring.names import with_unit
 from cprl.measuring.replicas import Measured, institution_measures, over_replicas, social_measures
+from cprl.measuring.statistics import Estimate, difference
 from cprl.runs.labelled import labelled
 from cprl.stored import LoadedRun
+from cprl.terminal.style import EMPTY, SHADES, SMALL_PT, draw_cell, head, picture_path, save, wrapped
 
 Whose: TypeAlias = Literal["focal", "background", "group"]
 _WHOSE: Final[dict[Whose, Callable[..., float]]] = {
@@ -254,3 +272,194 @@ def named_runs(
     if len(set(names)) < len(names):
         names = [str(path) for path in paths]
     return dict(zip(names, opened_runs, strict=True))
+
+
+@dataclass(frozen=True, kw_only=True)
+class Gain:
+    """Differences of returns from those of the same background agents among themselves, paired by replica: in
+    cross-play from the diagonal cell."""
+
+    focal: Estimate
+    """Of the focal agent, from the agent of the background agents' run with the same index."""
+    background: Estimate
+    """Of the mean of the background agents, from the same agents among themselves."""
+
+    @property
+    def exploits(self) -> bool:
+        """Whether the focal agent gains and the background agents lose, both by intervals without 0."""
+        return self.focal.low > 0 and self.background.high < 0
+
+
+def gains(played: CrossPlay) -> dict[tuple[str, str], Gain]:
+    """The gains of all cells but the diagonal, by the names of the focal and of the background agents' run.
+
+    Each number is first averaged over a replica's episodes and focal agents; replicas are paired, because
+    both cells have the same background agents and worlds. With `diagonal="cross_seed"` the agent whose place
+    is taken was not trained with the background agents either, so that a gain is due to the run alone.
+
+    Args:
+        played: the cross-play.
+    """
+    object_of("played", played, CrossPlay, "what crossplay() gave")
+
+    means: dict[Whose, dict[tuple[str, str], list[float]]] = {
+        whose: {at: _means(played, at, whose) for at in played.cells} for whose in ("focal", "background")
+    }
+
+    def gain(focal: str, background: str, whose: Whose) -> Estimate:
+        own, usual = means[whose][focal, background], means[whose][background, background]
+        return difference(own, usual, paired=True)
+
+    return {
+        (focal, background): Gain(
+            focal=gain(focal, background, "focal"), background=gain(focal, background, "background")
+        )
+        for focal, background in played.cells
+        if focal != background
+    }
+
+
+def diagonal_returns(played: CrossPlay) -> Mapping[str, float]:
+    """The mean return of an agent in each diagonal cell, by the name of the run."""
+    return {name: fmean(_means(played, (name, name), "focal")) for name in played.runs}
+
+
+def _means(played: CrossPlay, at: tuple[str, str], whose: Whose) -> list[float]:
+    """The mean return of each replica in a cell, [R]."""
+    returns = played.cell(*at).returns(whose)
+    return [fmean(returns[replica]) for replica in played.replicas]
+
+
+_COLOURS: Final = "RdBu"
+_CELL_IN: Final = (0.82, 0.45)
+_NARROWEST_IN: Final = 7.0
+_PANELS: Final = {
+    "focal": "the focal agent, beside the agent whose place it takes",
+    "background": "the background agents, beside themselves without it",
+}
+
+
+def draw_gains(played: CrossPlay, path: Path | str) -> Path:
+    """Draws `gains`, a row for each focal agent's run, a column for each of background agents.
+
+    Args:
+        played: the cross-play.
+        path: the PNG.
+
+    Raises:
+        ValueError: if the name does not end in .png.
+    """
+    path, found = picture_path(path), gains(played)
+    names, diagonal = list(played.runs), diagonal_returns(played)
+    returns = with_unit("focal/return", rewards=unit_of_cells(played)).partition("/")[2]
+    width = max(_CELL_IN[0] * len(names) + 2.6, _NARROWEST_IN)
+    figure = Figure((width, 2 * (_CELL_IN[1] * len(names) + 0.9) + 1.2), layout="constrained")
+    for axes, (whose, title) in zip(figure.subplots(2, 1), _PANELS.items(), strict=True):
+        own = {at: getattr(gain, whose) for at, gain in found.items()}
+        _draw_matrix(axes, names, own, diagonal)
+        axes.set_title(f"difference in {returns} of {title}", fontsize=SMALL_PT + 1)
+    count = len(played.replicas)
+    note = (
+        f"{count} replica{'s' * (count != 1)}, {played.episodes} episodes each with focal agent at each "
+        f"index; diagonal ({played.diagonal.replace('_', '-')}): an agent's return. * the 95 % interval by "
+        f"Student's t excludes 0, as that of about one in twenty would by chance; these are "
+        f"{2 * len(found)}."
+    )
+    head(figure, "Cross-play: who gains among whom", note)
+    return save(figure, path, colours=SHADES)
+
+
+def _draw_matrix(
+    axes: Axes,
+    names: list[str],
+    gains_by_cell: Mapping[tuple[str, str], Estimate],
+    diagonal: Mapping[str, float],
+) -> None:
+    reach = max(abs(own.value) for own in gains_by_cell.values()) or 1.0
+    scale, colours = Normalize(-reach, reach), matplotlib.colormaps[_COLOURS]
+    for (focal, background), own in gains_by_cell.items():
+        star = " *" if own.low > 0 or own.high < 0 else ""
+        at = names.index(background), names.index(focal)
+        draw_cell(axes, *at, colours(scale(own.value)), f"{own.value:+.3g}{star}")
+    for place, name in enumerate(names):
+        draw_cell(axes, place, place, EMPTY, f"{diagonal[name]:.3g}")
+    labels = [wrapped(name, _CELL_IN[0]) for name in names]
+    axes.set_xticks(range(len(names)), labels)
+    axes.set_yticks(range(len(names)), names)
+    axes.set(xlim=(-0.5, len(names) - 0.5), ylim=(len(names) - 0.5, -0.5))
+    axes.set_xlabel("background agents", fontsize=SMALL_PT)
+    axes.set_ylabel("focal agent", fontsize=SMALL_PT)
+    axes.tick_params(labelsize=SMALL_PT, length=0)
+    axes.figure.colorbar(matplotlib.cm.ScalarMappable(scale, _COLOURS), ax=axes).ax.tick_params(
+        labelsize=SMALL_PT
+    )
+
+
+def heading(played: CrossPlay) -> str:
+    """The heading of the matrices."""
+    how = how_they_play(list(played.runs.values()), played.greedy)
+    return (
+        f"Cross-play: {len(played.replicas)} replicas, {played.episodes} episodes each with focal agent at "
+        f"each index, seed {played.seed}{how}, diagonal: {played.diagonal}\n{INTERVALS}"
+    )
+
+
+def matrices(played: CrossPlay) -> Iterator[Table]:
+    """A matrix for each metric: rows are the focal agent's run, columns the background agents' run."""
+    cells = {at: cell.measures() for at, cell in played.cells.items()}
+    rewards = unit_of_cells(played)
+    for name in next(iter(cells.values())):
+        of_name = [measured[name] for measured in cells.values()]
+        if says_nothing(name, of_name) or _repeats(name, cells.values()):
+            continue
+        table = Table(title=with_unit(name, rewards=rewards), title_justify="left")
+        table.add_column("focal \\ background")
+        for background in played.runs:
+            table.add_column(background, justify="right")
+        for focal in played.runs:
+            table.add_row(focal, *(str(cells[focal, background][name]) for background in played.runs))
+        yield table
+
+
+def gains_tables(played: CrossPlay) -> Iterator[Table]:
+    """A matrix of what focal agents gain, and one of what background agents do; see `gains`."""
+    found = gains(played)
+    rewards = unit_of_cells(played)
+    for whose, beside in (("focal", "the agent whose place it takes"), ("background", "the diagonal")):
+        title = with_unit(f"{whose}/return", rewards=rewards)
+        table = Table(
+            title=f"{title}, difference from {beside}, paired by replica [95 % interval by Student's t]",
+            title_justify="left",
+        )
+        table.add_column("focal \\ background")
+        for background in played.runs:
+            table.add_column(background, justify="right")
+        for focal in played.runs:
+            own = (found.get((focal, background)) for background in played.runs)
+            table.add_row(focal, *("" if gain is None else str(getattr(gain, whose)) for gain in own))
+        yield table
+
+
+def agents_table(played: CrossPlay) -> Table:
+    """The returns of each cell by the index of the focal agent."""
+    table = Table(title="returns by the focal agent's index", title_justify="left")
+    for heading in ("focal", "background", "focal agent"):
+        table.add_column(heading)
+    names, rewards = ("focal/return", "background/return", "group/return"), unit_of_cells(played)
+    for name in names:
+        table.add_column(with_unit(name, rewards=rewards), justify="right")
+    for (focal, background), cell in played.cells.items():
+        for agent in cell.by_agent:
+            measured = cell.measures(agent)
+            table.add_row(focal, background, str(agent), *(str(measured[name]) for name in names))
+    return table
+
+
+def _repeats(name: str, cells: Iterable[Mapping[str, Measured]]) -> bool:
+    """Whether group/return says the same: a reward is an apple but for what institutions take and give."""
+    return name == "collective_return" and not any("institutions/fines" in own for own in cells)
+
+
+def unit_of_cells(played: CrossPlay) -> str:
+    """See `unit_of_rewards`."""
+    return unit_of_rewards(next(iter(next(iter(played.cells.values())).by_agent.values())))

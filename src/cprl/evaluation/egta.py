@@ -8,16 +8,26 @@ it. With few replicas such intervals are too narrow rather than too wide.
 """
 
 from collections import Counter
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
+from math import isnan
+from pathlib import Path
+from typing import Final
 
 import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from rich.table import Table
 
 from cprl import arguments
+from cprl.arguments import object_of
 from cprl.evaluation.empirical_game import EmpiricalGame
-from cprl.measuring.statistics import CONFIDENCE, Estimate
+from cprl.evaluation.evaluate import how_they_play
+from cprl.measuring.statistics import CONFIDENCE, Estimate, estimate
+from cprl.terminal import style
 from cprl.theory.equilibria import MOST_STRATEGIES, Equilibrium, equilibria
-from cprl.theory.evolution import AlphaRank, Ends, alpha_rank, replicator_ends
-from cprl.theory.payoff_table import PayoffTable, Values
+from cprl.theory.evolution import AlphaRank, Ends, alpha_rank, replicator, replicator_ends
+from cprl.theory.payoff_table import PayoffTable, Values, compositions
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -112,3 +122,271 @@ def _in_support(table: PayoffTable, again: list[tuple[PayoffTable, int]]) -> Val
         symmetric = [found for found in equilibria(own) if found.is_symmetric]
         shares[sorted({run for found in symmetric for run in found.support})] += count
     return shares / sum(count for _, count in again)
+
+
+_LEAST: Final = 0.005
+"""Smaller shares are not told."""
+
+
+def egta_heading(game: EmpiricalGame) -> str:
+    """The heading of the tables."""
+    how = how_they_play(list(game.runs.values()), game.greedy)
+    kind = "Pairwise reduction of the empirical game" if game.is_reduction else "Empirical game"
+    return (
+        f"{kind}: {how_much_was_played(game)}, seed {game.seed}{how}\n"
+        "returns: mean over replicas [95 % interval by Student's t]"
+    )
+
+
+def how_much_was_played(game: EmpiricalGame) -> str:
+    """Replicas and episodes, in words."""
+    replicas, episodes = len(game.replicas), game.episodes
+    return (
+        f"{replicas} replica{'s' * (replicas != 1)}, {episodes} episode{'s' * (episodes != 1)} each for each "
+        "choice of who plays where"
+    )
+
+
+def egta_tables(found: Analysis) -> Iterator[Table]:
+    """The payoffs, the runs by alpha-rank, the equilibria, and where replicator dynamics end."""
+    game = found.game
+    yield _pairs(game) if game.agents == 2 else _compositions(game)
+    yield _runs(found)
+    yield _equilibria_table(found)
+
+
+def _pairs(game: EmpiricalGame) -> Table:
+    others = "the other" if game.of_agents == 2 else f"all other {game.of_agents - 1}"
+    title = f"return of an agent, by its run and that of {others}"
+    table = Table(title=title, title_justify="left")
+    table.add_column("an agent \\ others")
+    for name in game.names:
+        table.add_column(name, justify="right")
+    pairs = np.array([game.table([place]).pairs for place in range(len(game.payoffs))])
+    for place, name in enumerate(game.names):
+        table.add_row(name, *(str(estimate(pairs[:, place, other])) for other in range(len(game.names))))
+    return table
+
+
+def _compositions(game: EmpiricalGame) -> Table:
+    title = "return of an agent of each run, by how many agents play as each"
+    table = Table(title=title, title_justify="left")
+    table.add_column("agents")
+    for name in game.names:
+        table.add_column(name, justify="right")
+    for row, counts in enumerate(compositions(game.agents, len(game.names)).tolist()):
+        own = (str(estimate(game.payoffs[:, row, run])) if count else "" for run, count in enumerate(counts))
+        table.add_row(composition_text(counts, game.names), *own)
+    return table
+
+
+def _runs(found: Analysis) -> Table:
+    title = "alpha-rank at the limit of infinite alpha: share of the agents in the long run"
+    if found.resamples:
+        title += f" [95 % interval, {found.resamples} resamples of the replicas]"
+    table = Table(title=title, title_justify="left")
+    table.add_column("run")
+    table.add_column("share", justify="right")
+    is_told = not np.isnan(found.in_support).any()
+    if is_told:
+        table.add_column("resamples in which a symmetric equilibrium plays it", justify="right")
+    for name, share, certain in zip(found.game.names, found.shares, found.in_support, strict=True):
+        table.add_row(name, _share(share), *([f"{certain:.0%}"] if is_told else []))
+    return table
+
+
+def _equilibria_table(found: Analysis) -> Table:
+    game = found.game
+    table = Table(title="equilibria", title_justify="left")
+    table.add_column("")
+    table.add_column("what is played")
+    table.add_column("how certain", justify="right")
+    for counts, certain in found.pure.items():
+        told = "" if isnan(certain) else f"in {certain:.0%} of the resamples"
+        table.add_row("no agent gains by another run", composition_text(counts, game.names), told)
+    if not found.pure:
+        table.add_row("no agent gains by another run", "no composition", "")
+    of_pair = "Nash equilibrium (nashpy)" if game.agents == 2 else "Nash equilibrium of pairs (nashpy)"
+    for own in found.equilibria:
+        both = [mixture_text(side, game.names) for side in (own.first, own.second)]
+        table.add_row(of_pair, both[0] if own.is_symmetric else " against ".join(both), "")
+    for mixture, share in zip(found.ends.mixtures, found.ends.shares, strict=True):
+        told = f"from {share:.0%} of the starts"
+        table.add_row("end of replicator dynamics", mixture_text(mixture, game.names), told)
+    if found.ends.unsettled > 0:
+        told = f"from {found.ends.unsettled:.0%} of the starts"
+        table.add_row("end of replicator dynamics", "none, or a late one", told)
+    return table
+
+
+def composition_text(counts: Sequence[int], names: Sequence[str]) -> str:
+    """A composition in words, e.g. "3 dqn, 1 ppo"."""
+    return ", ".join(f"{count} {name}" for count, name in zip(counts, names, strict=True) if count)
+
+
+def mixture_text(mixture: Values, names: Sequence[str]) -> str:
+    """A mixture in words, e.g. "dqn 0.75, ppo 0.25"; one strategy by its name alone."""
+    told = [(name, share) for name, share in zip(names, mixture, strict=True) if share >= _LEAST]
+    return told[0][0] if len(told) == 1 else ", ".join(f"{name} {share:.2f}" for name, share in told)
+
+
+def _share(own: Estimate) -> str:
+    told = f"{own.value:.2f}"
+    return told if isnan(own.low) else f"{told} [{own.low:.2f}, {own.high:.2f}]"
+
+
+_SIZE_IN: Final = (9.0, 4.3)
+_POINTS: Final = 41
+_GRID: Final = 14
+_CORNERS: Final = np.array([[0.0, 0.0], [1.0, 0.0], [0.5, 3**0.5 / 2]])
+_UNCERTAIN: Final = "#9a9a9a"
+
+
+def draw_egta(found: Analysis, path: Path | str) -> Path:
+    """Draws an analysis.
+
+    Args:
+        found: the analysis.
+        path: the PNG.
+
+    Raises:
+        ValueError: if the name does not end in .png.
+        FileExistsError: if the file exists.
+    """
+    object_of("found", found, Analysis, "what analyse() gave")
+    path = style.check_picture(path)
+    figure = Figure(_SIZE_IN, layout="constrained")
+    dynamics, rank = figure.subplots(1, 2, width_ratios=(1.35, 1))
+    draw = {2: _draw_line, 3: _draw_simplex}.get(len(found.game.names), _draw_deviations)
+    draw(dynamics, found)
+    _draw_rank(rank, found)
+    game = found.game
+    kind = f"pairwise reduction of {game.of_agents} agents" if game.is_reduction else f"{game.agents} agents"
+    note = (
+        f"{kind}; {how_much_was_played(game)}; intervals: 95 %, of payoffs by Student's t, of shares by "
+        f"{found.resamples} resamples of the replicas"
+    )
+    style.head(figure, f"Empirical game of {', '.join(game.names)}", note)
+    return style.save(figure, path, colours=style.SHADES)
+
+
+def _draw_line(axes: Axes, found: Analysis) -> None:
+    """What the first run gains over the second, by its share, with the points of rest."""
+    shares, (first, second) = np.linspace(0, 1, _POINTS), found.game.names
+    tables = [found.game.table([place]) for place in range(len(found.game.payoffs))]
+    curves = np.array([[_gain(table, share) for share in shares] for table in tables])
+    means = [estimate(own) for own in curves.T]
+    middle = np.array([own.value for own in means])
+    axes.fill_between(
+        shares, [own.low for own in means], [own.high for own in means], color=style.REPLICA, alpha=0.35, lw=0
+    )
+    axes.plot(shares, middle, color=style.MEAN)
+    axes.axhline(0, color=style.RAW, lw=1, zorder=1)
+    for at, is_stable in _rests(shares, middle):
+        face = style.MARK if is_stable else "white"
+        axes.plot(at, 0, "o", markersize=8, color=style.MARK, markerfacecolor=face, clip_on=False, zorder=4)
+    for start in (0.12, 0.37, 0.62, 0.87):
+        ahead = 0.03 if np.interp(start, shares, middle) > 0 else -0.03
+        axes.annotate(
+            "", (start + ahead, 0), (start - ahead, 0), arrowprops={"arrowstyle": "->", "color": style.MARK}
+        )
+    axes.set_xlim(-0.02, 1.02)
+    axes.set_xlabel(f"share that plays as {first}", fontsize=style.SMALL_PT)
+    axes.set_ylabel(f"return as {first} less that as {second}", fontsize=style.SMALL_PT)
+    axes.tick_params(labelsize=style.SMALL_PT)
+    axes.set_title("replicator dynamics: rests that attract (filled) or repel", fontsize=style.SMALL_PT)
+
+
+def _gain(table: PayoffTable, share: float) -> float:
+    own, other = table.against([share, 1 - share])
+    return float(own - other)
+
+
+def _rests(shares: Values, gains: Values) -> list[tuple[float, bool]]:
+    """Where nothing changes, and whether shares nearby move there."""
+    found = [(0.0, bool(gains[0] < 0)), (1.0, bool(gains[-1] > 0))]
+    for place in np.flatnonzero(gains[:-1] * gains[1:] < 0):
+        low, high = gains[place], gains[place + 1]
+        at = shares[place] + (shares[place + 1] - shares[place]) * low / (low - high)
+        found.append((float(at), bool(low > 0)))
+    return found
+
+
+def _draw_simplex(axes: Axes, found: Analysis) -> None:
+    """The direction in which shares move, where they end, and the corners by name."""
+    axes.plot(*np.vstack([_CORNERS, _CORNERS[:1]]).T, color=style.RAW, lw=1)
+    mixtures = (compositions(_GRID - 3, 3) + 1) / _GRID
+    moves = np.array([replicator(found.table.normalised, own) for own in mixtures]) @ _CORNERS
+    lengths = np.linalg.norm(moves, axis=1, keepdims=True)
+    arrows = np.divide(moves, lengths, out=np.zeros_like(moves), where=lengths > 0)
+    quiver = axes.quiver(
+        *(mixtures @ _CORNERS).T, *arrows.T, lengths[:, 0], cmap="viridis", scale=24, width=0.005, pivot="mid"
+    )
+    bar = axes.figure.colorbar(quiver, ax=axes, shrink=0.6)
+    bar.set_label("speed, of payoffs scaled to 0..1", fontsize=style.SMALL_PT)
+    bar.ax.tick_params(labelsize=style.SMALL_PT)
+    for mixture, share in zip(found.ends.mixtures, found.ends.shares, strict=True):
+        at = mixture @ _CORNERS
+        axes.plot(*at, "o", color=style.MARK, markersize=9, zorder=4)
+        axes.annotate(f"{share:.0%}", at, (8, 8), textcoords="offset points", fontsize=style.SMALL_PT)
+    for corner, name, (align, height) in zip(
+        _CORNERS, found.game.names, (("center", "top"), ("center", "top"), ("center", "bottom")), strict=True
+    ):
+        offset = (0, 16 if height == "bottom" else -12)
+        axes.annotate(
+            name, corner, offset, textcoords="offset points", ha=align, va=height, fontsize=style.SMALL_PT
+        )
+    axes.set(xlim=(-0.08, 1.08), ylim=(-0.1, 1.06), aspect="equal")
+    axes.set_axis_off()
+    axes.set_title("replicator dynamics; dots: where starts end", fontsize=style.SMALL_PT)
+
+
+def _draw_deviations(axes: Axes, found: Analysis) -> None:
+    """An arrow from the run that all play to each by which one agent gains."""
+    game, names = found.game, found.game.names
+    angles = np.pi / 2 - 2 * np.pi * np.arange(len(names)) / len(names)
+    places = np.stack([np.cos(angles), np.sin(angles)], 1)
+    pairs = np.array([game.table([place]).pairs for place in range(len(game.payoffs))])
+    for to in range(len(names)):
+        for start in range(len(names)):
+            gain = estimate(pairs[:, to, start] - pairs[:, start, start])
+            if to == start or gain.value <= 0:
+                continue
+            colour, line = (style.MEAN, "-") if gain.low > 0 else (_UNCERTAIN, "--")
+            axes.annotate(
+                "",
+                places[to],
+                places[start],
+                arrowprops={
+                    "arrowstyle": "-|>",
+                    "color": colour,
+                    "linestyle": line,
+                    "shrinkA": 16,
+                    "shrinkB": 16,
+                    "connectionstyle": "arc3,rad=0.12",
+                },
+            )
+    for (x, y), name, share in zip(places, names, found.shares, strict=True):
+        axes.plot(x, y, "o", color=style.MARK, markersize=5 + 14 * share.value, zorder=4)
+        axes.text(1.32 * x, 1.22 * y, name, ha="center", va="center", fontsize=style.SMALL_PT)
+    axes.set(xlim=(-1.6, 1.6), ylim=(-1.4, 1.4), aspect="equal")
+    axes.set_axis_off()
+    axes.set_title(
+        "by which run one agent gains where all play another\n(dashed: the interval holds 0)",
+        fontsize=style.SMALL_PT,
+    )
+
+
+def _draw_rank(axes: Axes, found: Analysis) -> None:
+    """The share of each run in the long run of alpha-rank, with its interval."""
+    places = np.arange(len(found.shares))
+    values = np.array([own.value for own in found.shares])
+    axes.barh(places, values, color=style.REPLICA, height=0.6)
+    for place, own in enumerate(found.shares):
+        if not isnan(own.low):
+            axes.plot([own.low, own.high], [place, place], color=style.PUBLISHED, lw=1.4)
+    axes.set_yticks(places, [style.wrapped(name, 1.6) for name in found.game.names])
+    axes.set(xlim=(0, 1), ylim=(len(places) - 0.5, -0.5))
+    axes.tick_params(labelsize=style.SMALL_PT)
+    axes.set_xlabel("share of the agents in the long run", fontsize=style.SMALL_PT)
+    axes.set_title("alpha-rank, infinite alpha", fontsize=style.SMALL_PT)

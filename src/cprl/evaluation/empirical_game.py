@@ -23,9 +23,8 @@ from numpy.typing import NDArray
 
 from cprl import arguments
 from cprl.evaluation.cross_play import CrossPlay, named_runs
-from cprl.evaluation.evaluate import SEED, check, chosen_replicas
+from cprl.evaluation.evaluate import SEED, check, check_same_game, chosen_replicas
 from cprl.evaluation.lanes import Played, Source, play, policies_of
-from cprl.evaluation.same_game import check_same_game
 from cprl.measuring.episodes import Episode
 from cprl.runs.labelled import labelled
 from cprl.stored import LoadedRun

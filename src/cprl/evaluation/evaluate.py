@@ -1,20 +1,90 @@
 """evaluate_run: compares the agents of a stored run with the random policy in fresh worlds."""
 
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, field, fields, is_dataclass
 from functools import partial
 from pathlib import Path
+from typing import Any, Final
 
 import pyarrow as pa
+import torch
+from rich.table import Table
 
 from cprl import arguments
 from cprl.arguments import SEED as SEED
+from cprl.commons.game import Game
 from cprl.envs.unwrap import agent_names
 from cprl.evaluation.lanes import Played, Source, play, policies_of, random_policies
-from cprl.measuring.replicas import Measured, institution_measures, over_replicas, social_measures
+from cprl.measuring.names import with_unit
+from cprl.measuring.replicas import (
+    Measured,
+    agents_without_harvest,
+    institution_measures,
+    over_replicas,
+    social_measures,
+)
+from cprl.measuring.reported import left_out
 from cprl.measuring.series import OF_AGENTS
 from cprl.runs.labelled import labelled
 from cprl.stored import LoadedRun, load
+
+_LONGEST: Final = 40
+"""The largest number of characters of a value in a message."""
+
+
+def check_same_game(runs: Mapping[str, LoadedRun]) -> None:
+    """Checks that all runs, by name, have the game of the first.
+
+    Raises:
+        ValueError: names the differences.
+    """
+    first, *others = runs
+    for other in others:
+        found = differences(runs[first].game, runs[other].game)
+        found += transform_differences(runs[first], runs[other])
+        if found:
+            raise ValueError(
+                f"{first} and {other} have different games: {'; '.join(found)}; allowed: runs of the same "
+                "game"
+            )
+
+
+def differences(game: Any, other: Any) -> list[str]:
+    """The fields in which games differ, of a commons those of map, rules and observation, with their values
+    if they are short, and the institutions."""
+    if not (isinstance(game, Game) and isinstance(other, Game)):
+        if game == other:
+            return []
+        alike = is_dataclass(game) and type(game) is type(other)
+        return (_field_differences(game, other) if alike else []) or [f"{game!r} and {other!r}"]
+    pairs = (game.map, other.map), (game.rules, other.rules), (game.observation, other.observation)
+    found = [line for mine, theirs in pairs for line in _field_differences(mine, theirs)]
+    if game.institutions != other.institutions:
+        names = (", ".join(type(own).__name__ for own in of.institutions) or "none" for of in (game, other))
+        found.append(f"institutions {' and '.join(names)}, or their values")
+    return found
+
+
+def _field_differences(mine: Any, theirs: Any) -> list[str]:
+    found = []
+    for entry in fields(mine):
+        one, two = getattr(mine, entry.name), getattr(theirs, entry.name)
+        if one != two:
+            values = f"{one!r} and {two!r}"
+            short = len(values) <= 2 * _LONGEST
+            found.append(f"{type(mine).__name__}.{entry.name} {values if short else 'differ'}")
+    return found
+
+
+def transform_differences(run: LoadedRun, other: LoadedRun) -> list[str]:
+    """The differences between the transforms of two runs: their specification and their learned state."""
+    if run.experiment.transforms != other.experiment.transforms:
+        return [f"transforms {run.experiment.transforms} and {other.experiment.transforms}"]
+    mine, theirs = run.transforms_state, other.transforms_state
+    unlike = [
+        name for name in mine if not torch.equal(torch.as_tensor(mine[name]), torch.as_tensor(theirs[name]))
+    ]
+    return [f"the learned state of the transforms differs: {', '.join(unlike)}"] if unlike else []
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -159,3 +229,55 @@ def check(*, episodes: int, seed: int, greedy: bool, runs: Sequence[LoadedRun]) 
             raise ValueError(
                 f"seed is {seed}, the training seed of {run.path}; allowed: any other seed, for fresh worlds"
             )
+
+
+INTERVALS: Final = "mean over replicas [95 % interval by Student's t]"
+
+
+def run_table(evaluation: Evaluation) -> Table:
+    """A row for each metric: mean over replicas and 95 % interval, of the run's agents and random agents.
+
+    Metrics of institutions that are undefined everywhere, since the game has other institutions, have none.
+    """
+    replicas = len(evaluation.trained)
+    episodes = len(next(iter(evaluation.trained.values())))
+    table = Table(
+        title=f"{evaluation.run.path.name}: {replicas} replicas, {episodes} episodes each, "
+        f"seed {evaluation.seed}\n{INTERVALS}"
+    )
+    table.add_column()
+    table.add_column(f"run's agents{how_they_play([evaluation.run], evaluation.greedy)}", justify="right")
+    table.add_column("random", justify="right")
+    trained, random = evaluation.measures("trained"), evaluation.measures("random")
+    rewards = unit_of_rewards(evaluation.trained)
+    for name, measured in trained.items():
+        if says_nothing(name, [measured, random[name]]):
+            continue
+        table.add_row(with_unit(name, rewards=rewards), str(measured), str(random[name]))
+    without = [agents_without_harvest(played) for played in (evaluation.trained, evaluation.random)]
+    if None not in without:
+        table.add_row(
+            "agents without a harvest, not in sustainability",
+            *(f"{own[0]} of {own[1]}" for own in without if own),
+        )
+    table.caption = left_out(next(iter(evaluation.trained.values()))[0].reported) or None
+    return table
+
+
+def says_nothing(name: str, measured: Iterable[Measured]) -> bool:
+    """Whether it is a metric of institutions that is undefined everywhere."""
+    return name.startswith("institutions/") and all(own.estimate is None for own in measured)
+
+
+def unit_of_rewards(played: Played) -> str:
+    """Rewards are apples in a game that reports harvests; in another they have no unit."""
+    return "apples" if next(iter(played.values()))[0].harvest is not None else ""
+
+
+def how_they_play(runs: list[LoadedRun], greedy: bool) -> str:
+    """The epsilon of the agents that learned values, as text."""
+    if greedy:
+        return ", greedy"
+    agents = [run.agent(agent, replica=run.replicas[0]) for run in runs for agent in range(run.game.agents)]
+    chances = {agent.kind[2] for agent in agents if agent.kind[0] == "trained" and not agent.kind[1]}
+    return "".join(f", epsilon {chance:g}" for chance in sorted(chances))

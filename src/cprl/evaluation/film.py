@@ -1,24 +1,42 @@
-"""film: records an episode of the agents of a stored run, step by step."""
+"""Film an episode of the agents of stored runs: as a recording, or side by side as a GIF or an MP4."""
 
-from collections.abc import Mapping, Sequence
+import re
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
+from math import ceil
 from pathlib import Path
+from typing import Final
 
+import numpy as np
 from tensordict import TensorDictBase
 from torchrl.envs import EnvBase
 
 from cprl import arguments, keys
 from cprl.arguments import FILM_SEED as SEED
+from cprl.arguments import FILM_SUFFIXES as SUFFIXES
+from cprl.commons.world import Bytes, Shown
+from cprl.envs.commons_env import CommonsEnv
 from cprl.envs.unwrap import commons_of
+from cprl.evaluation.film_pictures import (
+    DEFAULT_WIDTH,
+    LARGEST_WIDTH,
+    SMALLEST_WIDTH,
+    EpisodePicture,
+    check_can_write_mp4,
+    write_gif,
+    write_mp4,
+)
+from cprl.evaluation.lanes import Turns
 from cprl.measuring.episodes import Episode
+from cprl.measuring.tracking import tracker_of
+from cprl.memory import check_memory
 from cprl.policies.assignment import AgentPolicies
 from cprl.runs.files import refuse_to_write_over
 from cprl.stored import LoadedRun, load
 from cprl.training import train
 from cprl.viewer.callback import ViewerCallback
-from cprl.viewer.decisions import Decisions
 from cprl.viewer.institutions import has_institutions
-from cprl.viewer.offences import Offences, events
+from cprl.viewer.replay import Decisions, Offences, events
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -168,3 +186,208 @@ class _Events:
     def _log(self, event: str) -> None:
         self.viewer.logger.at(step=self._step, episode=0)
         self.viewer.log_event(f"step {self._step:,}: {event}")
+
+
+DEFAULT_FPS: Final = 15.0
+MOST_FPS: Final = 50.0
+"""Browsers slow a GIF down that is faster."""
+GIF_FRAMES: Final = 300
+"""The pictures of a GIF, at most, unless `every` is given."""
+_SAMPLES: Final = 24
+"""The pictures from which a GIF's palette is taken."""
+
+
+def film_video(
+    run: str | Path,
+    out: str | Path,
+    *,
+    beside: Sequence[str | Path] = (),
+    titles: Sequence[str] = (),
+    replica: int = 0,
+    episode: int = 0,
+    seed: int = SEED,
+    every: int | None = None,
+    fps: float = DEFAULT_FPS,
+    width: int | None = None,
+    allow: Sequence[str] = (),
+) -> tuple[Path, tuple[Episode, ...]]:
+    """Film an episode of a run's agents, beside those of other runs if there are any.
+
+    A film shows the board, the apples on it and each agent's harvest so far, turn by turn, and ends with a
+    card of two seconds that says what came of it; under institutions, agents that broke a rule since the last
+    picture have a white diamond around them. Populations side by side play on one clock; one whose board is
+    dead waits for the others.
+
+    It is the episode that `cprl.evaluation.film.film` records with the same numbers; the first and the last
+    board are always in the film.
+
+    Args:
+        run: its directory, or its exported results.
+        out: the film, a .gif or, with imageio-ffmpeg, an .mp4; complete or absent.
+        beside: more runs, whose agents are shown to the right of the first. Games may differ; where they do
+            not, all play the same fresh world.
+        titles: of the run and those beside it, one each; by default the institutions of each, or the names of
+            their experiments.
+        replica: the index of the agents' replica.
+        episode: the index of the fresh episode; equal indices give equal episodes.
+        seed: of the worlds and all chance. The world is that of `evaluate_run` with the same seed, of number
+            replica x episodes + episode there; what agents draw is their own.
+        every: turns from one picture to the next; by default 1 for an .mp4, and for a .gif as many as
+            it takes for 300 pictures.
+        fps: pictures per second, above 0, at most 50; in a .gif rounded to hundredths of a second a picture.
+        width: of the pictures in pixels, at most 1920, and at least 240 for each run; by default 640 for each
+            run that has room. The height follows from the boards, each at most twice as high as its part is
+            wide.
+        allow: see `cprl.load`.
+
+    Returns:
+        The film, and the episode of each run.
+
+    Raises:
+        ValueError: if a run cannot be loaded, see `cprl.load`, plays a game without a board, or an argument
+            is out of range.
+        FileExistsError: if the film exists.
+        ModuleNotFoundError: for an .mp4 without imageio-ffmpeg.
+        MemoryError: if the pictures of a .gif do not fit into memory.
+    """
+    path = arguments.path("out", out)
+    if path.suffix not in SUFFIXES:
+        raise arguments.refusal("out", str(path), f"a file whose name ends in {' or '.join(SUFFIXES)}")
+    runs = (run, *arguments.listed("beside", beside, "a sequence of runs"))
+    most_runs = LARGEST_WIDTH // SMALLEST_WIDTH
+    if len(runs) > most_runs:
+        raise arguments.refusal("beside", f"{len(runs) - 1} runs", f"at most {most_runs - 1}")
+    titles = arguments.texts("titles", titles)
+    if titles and (len(titles) != len(runs) or not all(map(str.isprintable, titles))):
+        raise arguments.refusal("titles", titles, f"a line of text for each of {len(runs)} runs")
+    every = None if every is None else arguments.integer("every", every, 1)
+    allowed = f"a number above 0, at most {MOST_FPS:g}"
+    fps = arguments.number("fps", fps, low=0.0, high=MOST_FPS, above=True, allowed=allowed)
+    width = min(LARGEST_WIDTH, DEFAULT_WIDTH * len(runs)) if width is None else width
+    width = arguments.integer("width", width, SMALLEST_WIDTH * len(runs), LARGEST_WIDTH) // len(runs)
+    refuse_to_write_over(path)
+    if path.suffix == ".mp4":
+        check_can_write_mp4(path)
+    fresh = [fresh_episode(one, replica=replica, episode=episode, seed=seed, allow=allow) for one in runs]
+    panels = _panels(fresh, titles or _titles(fresh), width)
+    length = max(len(panel.moments) for panel in panels)
+    if every is None:
+        every = 1 if path.suffix == ".mp4" else ceil(length / GIF_FRAMES)
+    chosen = sorted({*range(0, length, every), length - 1})
+
+    def draw(turns: Sequence[int]) -> Iterator[Bytes]:
+        """The pictures after these turns, and the end card."""
+        for turn in turns:
+            since = max((other for other in chosen if other < turn), default=-1) + 1
+            yield np.concatenate([panel.draw(turn, since=since) for panel in panels], 1)
+        yield np.concatenate([panel.draw(length, since=length, card=True) for panel in panels], 1)
+
+    wide, high = sum(panel.picture.size[0] for panel in panels), panels[0].picture.size[1]
+    path.parent.mkdir(parents=True, exist_ok=True)
+    if path.suffix == ".mp4":
+        write_mp4(path, draw(chosen), (wide, high), fps=fps)
+    else:
+        check_memory(
+            f"every is {every}: {len(chosen):,} pictures",
+            3 * len(chosen) * wide * high,
+            "fewer or smaller pictures",
+        )
+        samples = chosen[:: ceil(len(chosen) / _SAMPLES)]
+        write_gif(path, draw(chosen), list(draw(samples)), fps=fps)
+    return path, tuple(panel.played for panel in panels)
+
+
+def _titles(fresh: Sequence[FreshEpisode]) -> Sequence[str]:
+    """Return what tells runs apart: their institutions, their names, or the names of their directories."""
+    kinds = [[type(kind).__name__ for kind in _commons(population).game.institutions] for population in fresh]
+    rules = [re.sub("(?<=[a-z])(?=[A-Z])", " ", " and ".join(names)).lower() for names in kinds]
+    names = [population.run.experiment.name.replace("_", " ") for population in fresh]
+    titles = [rule or "no rule" for rule in rules] if any(rules) else names
+    for candidates in (titles, names):
+        if len(set(candidates)) == len(fresh):
+            return [title[0].upper() + title[1:] for title in candidates]
+    return [population.run.path.resolve().name for population in fresh]
+
+
+def _commons(fresh: FreshEpisode) -> CommonsEnv:
+    """The world that is filmed, of a game with a board."""
+    commons = commons_of(fresh.env)
+    if commons is None:
+        raise ValueError(
+            f"{fresh.run.path} plays a game without a board of cprl; allowed: a run of a cprl.Game"
+        )
+    return commons
+
+
+@dataclass(frozen=True, kw_only=True)
+class _Panel:
+    """What a film shows of one population."""
+
+    title: str
+    picture: EpisodePicture
+    moments: list[Shown]
+    """The board as the episode began, then after each turn."""
+    violators: list[set[int]]
+    """The agents that broke a rule in the turn that led to each moment."""
+    played: Episode
+
+    def draw(self, turn: int, *, since: int, card: bool = False) -> Bytes:
+        """The population after a turn of the film's clock, or at its end if that was before.
+
+        Args:
+            turn: the turn.
+            since: the first turn whose violators are marked.
+            card: whether to say what came of the episode.
+        """
+        last, sites = len(self.moments) - 1, len(self.picture.board.sites)
+        left, apples = int(self.moments[last].stock.sum()), int(self.moments[last].harvested.sum())
+        is_dead = self.played.terminated and left == 0
+        dead = f"dead at turn {last:,} of {self.picture.steps:,}" if is_dead else ""
+        outcome = dead or f"{left:,} of {sites:,} apples left"
+        return self.picture.draw(
+            self.moments[: turn + 1],
+            self.title,
+            end=dead if turn >= last else "",
+            card=f"{outcome} · {apples:,} apple{'' if apples == 1 else 's'}" if card else "",
+            violators=sorted(set().union(*self.violators[since : turn + 1])),
+        )
+
+
+def _panels(fresh: Sequence[FreshEpisode], titles: Sequence[str], width: int) -> list[_Panel]:
+    """Play the episodes; return what is shown of each, in panels of one size with one axis of harvests."""
+    games = [_commons(population).game for population in fresh]
+    episodes = [_play(population) for population in fresh]
+    most = max(int(moments[-1].harvested.max()) for moments, _, _ in episodes)
+    height = max(EpisodePicture(game.map, steps=1, width=width).size[1] for game in games)
+    panels = []
+    for title, game, (moments, violators, played) in zip(titles, games, episodes, strict=True):
+        picture = EpisodePicture(
+            game.map, steps=game.rules.episode_steps, width=width, most_harvested=most, height=height
+        )
+        panels.append(
+            _Panel(title=title, picture=picture, moments=moments, violators=violators, played=played)
+        )
+    return panels
+
+
+def _play(fresh: FreshEpisode) -> tuple[list[Shown], list[set[int]], Episode]:
+    """All boards of the episode, that at its start first, without what agents observe; the agents that broke
+    a rule in the turn that led to each; and the episode."""
+    env, commons = fresh.env, _commons(fresh)
+
+    def now() -> Shown:
+        shown = commons.worlds.show(commons.output)
+        return shown._replace(observation=shown.observation[:0])
+
+    longest = commons.game.rules.episode_steps
+    tracker = tracker_of(env, longest)
+    turns = Turns(env, fresh.policies)
+    moments, violators = [now()], [set[int]()]
+    while True:
+        batch = turns.play()
+        ended = tracker.add(batch)
+        moments.append(now())
+        violated = batch.get(("next", *keys.VIOLATED), None)
+        violators.append(set() if violated is None else set(violated[0].nonzero()[:, 0].tolist()))
+        if ended:
+            return moments, violators, ended[0]

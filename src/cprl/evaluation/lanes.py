@@ -8,7 +8,10 @@ from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, Protocol, TypeAlias
 
+import torch
+from tensordict import TensorDictBase
 from torchrl.envs import EnvBase
+from torchrl.envs.utils import ExplorationType, set_exploration_type, step_mdp
 
 from cprl.commons.game import Game
 from cprl.learners.lanes import EVALUATION, lane_seeds
@@ -17,6 +20,7 @@ from cprl.measuring.evaluate import evaluate
 from cprl.policies.assignment import AgentPolicies
 from cprl.policies.decisions import decider_by_chance
 from cprl.policies.lanes import random_lanes
+from cprl.process import one_thread
 from cprl.stored import LoadedRun
 from cprl.stored_agents import stored_policies
 
@@ -148,3 +152,39 @@ def _consecutive(numbers: Sequence[int]) -> list[list[int]]:
         else:
             groups.append([number])
     return groups
+
+
+Policy = Callable[[TensorDictBase], TensorDictBase]
+
+
+class Turns:
+    """An episode that is played turn by turn, with the exploration of training and evaluation.
+
+    Unlike a collector it does not reset an environment that has ended, so that the last board can be seen.
+
+    Args:
+        env: one world, batch size [1], with its transforms; it is reset.
+        policy: writes the actions of all agents, e.g. `cprl.policies.assignment.AgentPolicies`.
+    """
+
+    def __init__(self, env: EnvBase, policy: Policy) -> None:
+        self.env, self.policy = env, policy
+        self._moment: TensorDictBase = env.reset()
+        self.has_ended = False
+
+    def play(self) -> TensorDictBase:
+        """Plays the next turn; returns its entries, batch size [1], see `cprl.keys`.
+
+        Raises:
+            ValueError: if the episode has ended.
+        """
+        if self.has_ended:
+            raise ValueError("the episode has ended; allowed: turns up to its end")
+        env = self.env
+        with torch.no_grad(), one_thread(), set_exploration_type(ExplorationType.RANDOM):
+            batch: TensorDictBase = env.step(self.policy(self._moment))
+        self._moment = step_mdp(
+            batch, reward_keys=env.reward_keys, action_keys=env.action_keys, done_keys=env.done_keys
+        )
+        self.has_ended = bool(batch["next", "done"].any())
+        return batch

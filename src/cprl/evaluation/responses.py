@@ -12,7 +12,9 @@ Learning" (2017); of lower bounds by trained responses, F. Timbers et al., "Appr
 Learning a Best Response" (2022).
 """
 
-from collections.abc import Callable, Mapping, Sequence
+import os
+from collections import Counter
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
@@ -21,24 +23,73 @@ from typing import Any, Final
 import numpy as np
 import pyarrow as pa
 from numpy.typing import NDArray
+from rich.table import Table
 
 from cprl import arguments
-from cprl.evaluation.evaluate import SEED, opened
-from cprl.evaluation.gains import Gain
+from cprl.evaluation.cross_play import Gain
+from cprl.evaluation.evaluate import SEED, check, check_same_game, how_they_play, opened
 from cprl.evaluation.lanes import Played
 from cprl.evaluation.populations import play_population
-from cprl.evaluation.respondable import (
-    check_agents,
-    check_population,
-    check_seeds,
-    consecutive_replicas,
-    path_of,
-)
-from cprl.evaluation.same_game import check_same_game
-from cprl.measuring.statistics import Estimate, difference
+from cprl.measuring.statistics import Estimate, difference, estimate
 from cprl.population import Frozen
 from cprl.runs.labelled import labelled
 from cprl.stored import LoadedRun, load
+
+
+def check_population(run: LoadedRun) -> None:
+    """Raises a ValueError for a run that no response can be measured against; says why."""
+    if run.game.agents < 2:
+        raise ValueError(
+            f"the game of {run.path} has 1 agent; allowed for best responses: at least 2, since it is the "
+            "others that are exploited"
+        )
+    if run.weights_from.name != "final.pt":
+        raise ValueError(
+            f"{run.path} was loaded with the weights {run.weights_from.name}; allowed: a run that has ended, "
+            "with its final weights, which responses meet"
+        )
+
+
+def consecutive_replicas(run: LoadedRun, replicas: int | None) -> int:
+    """How many replicas play: the first ones of a run, by default all.
+
+    Raises:
+        ValueError: if the run does not keep them, or the weights of one are NaN or infinite.
+    """
+    if replicas is None and run.replicas != list(range(len(run.replicas))):
+        raise ValueError(f"{run.path} keeps the replicas {run.replicas}; allowed: 0 and those that follow it")
+    most = len(run.replicas)
+    found = most if replicas is None else arguments.integer("replicas", replicas, 1, most)
+    for replica in range(found):
+        for agent in range(run.game.agents):
+            run.agent(agent, replica=replica)
+    return found
+
+
+def check_seeds(seed: int, episodes: int, runs: Sequence[LoadedRun]) -> int:
+    """The seed of fresh worlds; raises a ValueError where it, or the next one, was trained with."""
+    seed = arguments.seed(seed)
+    for own in (seed, seed + 1):
+        check(episodes=episodes, seed=own, greedy=False, runs=runs)
+    return seed
+
+
+def check_agents(agents: Sequence[Any], run: LoadedRun) -> tuple[int, ...]:
+    """Indices of agents of a run's game, at least one and each once.
+
+    Raises:
+        ValueError: for anything else.
+    """
+    found = [arguments.integer("an agent", own, 0, run.game.agents - 1) for own in agents]
+    if not found or len(set(found)) < len(found):
+        raise arguments.refusal("agents", list(agents), "indices of agents, at least one and each once")
+    return tuple(found)
+
+
+def path_of(run: LoadedRun) -> str:
+    """The directory of a run as `Frozen` names it, relative to where we stand."""
+    return os.path.relpath(run.path)
+
 
 Values = NDArray[np.float64]
 NOBODY: Final = -1
@@ -262,3 +313,45 @@ def _focal(played: Played, agent: int) -> Values:
 def _others(played: Played, agent: int) -> Values:
     """The mean return of the other agents in each replica, [R]."""
     return np.array([np.mean([np.delete(one.return_, agent) for one in own]) for own in played.values()])
+
+
+def exploitability_tables(found: Exploitability) -> Iterator[Table]:
+    """A row for each agent that was replaced and one for their mean, then one for each trained response."""
+    yield _gains(found)
+    yield _responses(found)
+
+
+def _gains(found: Exploitability) -> Table:
+    count = found.replicas
+    how = how_they_play([found.run], greedy=False)
+    table = Table(
+        title=f"{found.run.path.name}: {count} replica{'s' * (count != 1)}, {found.episodes} episodes each, "
+        f"seed {found.seed}{how}\nWhat trained responses gain is a lower bound of what can be gained.\n"
+        "mean over replicas [95 % interval by Student's t]; gain and change paired by replica",
+        title_justify="left",
+    )
+    headings = ("return of the agent", "of the best response", "gain", "change of the others, mean")
+    table.add_column("agent")
+    for heading in headings:
+        table.add_column(heading, justify="right")
+    table.add_column("chosen in replicas")
+    for agent in found.responses:
+        gain, returns = found.gain_of(agent), found.returns(agent)
+        means = (str(estimate(values)) for values in returns)
+        chosen = Counter(response.name for response in found.chosen(agent))
+        names = "\n".join(f"{name}: {times}" for name, times in chosen.most_common())
+        table.add_row(str(agent), *means, str(gain.focal), str(gain.background), names)
+    if len(found.responses) > 1:
+        table.add_row("mean", "", "", str(found.gain.focal), str(found.gain.background), "")
+    return table
+
+
+def _responses(found: Exploitability) -> Table:
+    table = Table(title="each training, chosen or not", title_justify="left")
+    for heading in ("agent", "response"):
+        table.add_column(heading)
+    table.add_column("gain", justify="right")
+    for agent, responses in found.responses.items():
+        for response in responses:
+            table.add_row(str(agent), response.name, str(found.gain_of_response(response).focal))
+    return table

@@ -9,25 +9,31 @@ Source: T. C. Schelling, "Hockey Helmets, Concealed Weapons, and Daylight Saving
 agents that learn, E. Hughes et al. (2018) and J. Perolat et al. (2017).
 """
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
+from pathlib import Path
 from typing import Any, Final
 
 import numpy as np
 import pyarrow as pa
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
 from numpy.typing import NDArray
+from rich.table import Table
 
 from cprl import arguments
+from cprl.arguments import object_of
 from cprl.commons.game import Game
-from cprl.evaluation.evaluate import SEED
+from cprl.evaluation.evaluate import INTERVALS, SEED
 from cprl.evaluation.lanes import Played, pooled
-from cprl.evaluation.populations import place_of, play_population
-from cprl.evaluation.words import agent_named
+from cprl.evaluation.populations import agent_named, place_of, play_population
 from cprl.measuring.dilemmas import Dilemma, dilemma
 from cprl.measuring.replicas import Measured, social_measures
+from cprl.measuring.statistics import estimate
 from cprl.policies.scripted import SCRIPTED_POLICIES
 from cprl.runs.labelled import labelled
+from cprl.terminal import style
 
 _ALIKE_WITHOUT_A_BEAM: Final = {"greedy", "territorial"}
 
@@ -180,3 +186,86 @@ def _mixes(agents: int) -> list[Who]:
         for count in range(agents + 1)
         for first in range(agents if 0 < count < agents else 1)
     ]
+
+
+_RESTRAINED: Final = "#1b7837"
+_GREEDY: Final = "#b2182b"
+_SIZE_IN: Final = (7.5, 3.6)
+
+
+def draw_schelling(found: SchellingDiagram, path: Path | str) -> Path:
+    """Draws what an agent gets that is restrained or greedy, by how many of the others are restrained; beside
+    it what all get together.
+
+    Args:
+        found: the diagram.
+        path: the PNG.
+
+    Raises:
+        ValueError: if the name does not end in .png.
+        FileExistsError: if the file exists.
+    """
+    object_of("found", found, SchellingDiagram, "what schelling() gave")
+    path = style.check_picture(path)
+    figure = Figure(_SIZE_IN, layout="constrained")
+    own, group = figure.subplots(1, 2)
+    for payoffs, who, role, colour, marker in (
+        (found.restrained_payoffs, found.restrained, "restrained", _RESTRAINED, "o"),
+        (found.greedy_payoffs, found.greedy, "greedy", _GREEDY, "s"),
+    ):
+        _line(own, payoffs, label=f"{role}: {Path(who).name}", color=colour, marker=marker)
+    own.set_xlabel(f"restrained agents among the other {found.agents - 1}", fontsize=style.SMALL_PT)
+    own.set_ylabel("return of the agent", fontsize=style.SMALL_PT)
+    own.legend(fontsize=style.SMALL_PT)
+    _line(group, found.group_payoffs, color=style.MEAN, marker="o")
+    group.set_xlabel(f"restrained agents of {found.agents}", fontsize=style.SMALL_PT)
+    group.set_ylabel("return of all together", fontsize=style.SMALL_PT)
+    for axes in (own, group):
+        axes.set_ylim(bottom=min(0.0, axes.get_ylim()[0]))
+        axes.tick_params(labelsize=style.SMALL_PT)
+    note = (
+        f"{found.replicas} replicas, {found.episodes} episodes each for each choice of restrained agents; "
+        f"bars: 95 % intervals by Student's t"
+    )
+    style.head(figure, f"Schelling diagram: {found.dilemma().name}", note)
+    return style.save(figure, path)
+
+
+def _line(axes: Axes, values: Values, **how: Any) -> None:
+    """Means of [R, K] at 0 to K - 1 with their intervals."""
+    found = [estimate(own) for own in values.T]
+    means = np.array([own.value for own in found])
+    reach = np.abs(np.array([(own.low, own.high) for own in found]).T - means)
+    axes.errorbar(range(len(means)), means, np.nan_to_num(reach), capsize=2, markersize=5, **how)
+    axes.set_xticks(range(len(means)))
+
+
+def schelling_tables(found: SchellingDiagram) -> Iterator[Table]:
+    """The payoffs by the number of restrained others, and the margins between them that make a dilemma."""
+    title = (
+        f"{found.replicas} replicas, {found.episodes} episodes each for each choice of restrained agents, "
+        f"seed {found.seed}\n{INTERVALS}"
+    )
+    payoffs = Table(title=title, title_justify="left")
+    for heading in (
+        f"restrained among the other {found.agents - 1}",
+        f"return of {found.restrained} (restrained)",
+        f"return of {found.greedy} (greedy)",
+    ):
+        payoffs.add_column(heading, justify="right")
+    for count in range(found.agents):
+        own = (of_kind[:, count] for of_kind in (found.restrained_payoffs, found.greedy_payoffs))
+        payoffs.add_row(str(count), *(str(estimate(values)) for values in own))
+    yield payoffs
+    dilemma, last = found.dilemma(), found.agents - 1
+    margins = Table(title=f"{dilemma.name}, by returns", title_justify="left")
+    margins.add_column()
+    margins.add_column("difference, paired by replica", justify="right")
+    for name, margin in (
+        (f"restraint of all instead of none, R({last}) - G(0)", dilemma.restraint),
+        (f"company of the restrained, R({last}) - R(0)", dilemma.company),
+        ("fear, G(0) - R(0)", dilemma.fear),
+        (f"greed, G({last}) - R({last})", dilemma.greed),
+    ):
+        margins.add_row(name, str(margin))
+    yield margins

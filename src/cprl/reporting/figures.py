@@ -10,8 +10,12 @@ from matplotlib.axes import Axes
 from cprl.measuring.names import title, unit
 from cprl.measuring.predictions import curve_prediction
 from cprl.measuring.published import PHASED_RECIPE, curve
-from cprl.plotting import style
-from cprl.plotting.bands import (
+from cprl.reporting.claims import undefined_in
+from cprl.reporting.random_play import returns_by_chance
+from cprl.reporting.result import Result, Values
+from cprl.runs.curves import running_mean
+from cprl.terminal import style
+from cprl.terminal.figures import (
     STRIP_IN,
     add_keys,
     bands_of,
@@ -20,10 +24,6 @@ from cprl.plotting.bands import (
     mark_exploration,
     published_bands,
 )
-from cprl.reporting.claims import undefined_in
-from cprl.reporting.random_play import returns_by_chance
-from cprl.reporting.result import Result, Values
-from cprl.runs.curves import running_mean
 
 TITLES: Final = {
     "return_0": "return of the learner, apples",

@@ -1,9 +1,9 @@
 """Terminal output and figures of a run.
 
 Modules, in the order in which one reads them:
-    progress      a bar while a training runs
-    summary       what a run came to
-    institutions  what came of institutions, as a table below it
-    course        the same in four sentences: peak, fall, survival, meaning
-    figures       the training curve
+    progress  a bar while a training runs
+    summary   what a run came to
+    course    the same in four sentences: peak, fall, survival, meaning
+    figures   the training curve
+    style     what all figures share: sizes, colours, legends
 """

@@ -13,8 +13,55 @@ from typing import Any, Final, Literal
 
 from cprl.commons.colours import WINDOW_CAPTION
 from cprl.viewer import institutions
-from cprl.viewer.scenery import BACKGROUND, Curves, Scene
-from cprl.viewer.tabs import decisions, fates, places, row
+from cprl.viewer.panels import BOUNDS, Panels, decision_panels, row
+from cprl.viewer.scenery import BACKGROUND, Curves, Scene, has_lorenz, has_wall
+
+
+def fates(curves: Curves) -> Any:
+    """All boards at once, and how long each replica's apples lasted."""
+    if not isinstance(curves, Scene):
+        return None
+    wall = _panels("All replicas; framed: died in its last episode", "wall", curves, curves.replicas)
+    return row(
+        "Replicas",
+        wall if has_wall(curves) else None,
+        _drawn("Apples on the board, over the turn", "turn"),
+    )
+
+
+def places(curves: Curves) -> Any:
+    """Where agents go, and how evenly they share."""
+    name = "Where agents go in the first replica, by episodes"
+    return row(
+        "Places and shares",
+        _panels(name, "visits", curves, len(curves.agents)) if isinstance(curves, Scene) else None,
+        _drawn("Lorenz curve: harvest in %", "lorenz") if has_lorenz(curves) else None,
+    )
+
+
+def _panels(name: str, origin: str, scene: Scene, count: int) -> Any:
+    """A view of several boards."""
+    bounds = Panels(count, (scene.height + 2, scene.width + 2)).bounds
+    return _flat(name, origin, bounds)
+
+
+def _drawn(name: str, origin: str) -> Any:
+    """A view of a plot that is drawn with `Axes`."""
+    return _flat(name, origin, BOUNDS)
+
+
+def _flat(name: str, origin: str, bounds: tuple[tuple[float, float], tuple[float, float]]) -> Any:
+    import rerun.blueprint as rrb
+
+    visible = rrb.VisualBounds2D(x_range=bounds[0], y_range=bounds[1])
+    return rrb.Spatial2DView(name=name, origin=f"/{origin}", background=BACKGROUND, visual_bounds=visible)
+
+
+def decisions(scene: Scene) -> Any:
+    """What the agents choose by, arranged as their windows."""
+    bounds = decision_panels(len(scene.agents), scene.actions, scene.window).bounds
+    return _flat("What policies say (L, R turn, B beam, S stay), taken: white", "decisions", bounds)
+
 
 _HEADER, _STRIP, _VIEW = 97, 40, 207
 """Heights in a window of 1280 x 720, in pixels: the header, a strip, boards or plots. The rows share out any

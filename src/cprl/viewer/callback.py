@@ -1,13 +1,15 @@
 """ViewerCallback: records a training for the Rerun viewer, and shows it live."""
 
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
-from threading import Event
+from statistics import fmean
+from threading import Event, Thread
 from types import TracebackType
 from typing import Any, Final, Self
 
 import numpy as np
+from numpy.typing import NDArray
 from rich.console import Console
 from tensordict import TensorDictBase
 from torchrl.envs import EnvBase
@@ -15,23 +17,144 @@ from torchrl.envs import EnvBase
 from cprl.arguments import object_of
 from cprl.arguments import path as path_of
 from cprl.checks import NONE, TEXT, check_nesting, checked, count, either
+from cprl.compile_clock import CLOCK
 from cprl.envs.unwrap import agent_names, commons_of
 from cprl.measuring.episodes import Episode
+from cprl.measuring.recent import Recent
+from cprl.measuring.replicas import social_metrics
 from cprl.measuring.reported import reported_by
-from cprl.measuring.series import Series, Values, numbers_of
-from cprl.viewer.compiling import CompilingNotice
-from cprl.viewer.contents import curves_of, missing_in
+from cprl.measuring.series import OF_AGENTS, Series, Values, mean_of, numbers_of
 from cprl.viewer.exhibition import Exhibited, Exhibition
-from cprl.viewer.filming import Filming
-from cprl.viewer.header import has_died
-from cprl.viewer.institution_views import institution_views
-from cprl.viewer.logger import RerunLogger
-from cprl.viewer.names import FILE_NAME, free_name, recording_id
-from cprl.viewer.plots import Plots
-from cprl.viewer.recorder import scene_of
-from cprl.viewer.story import Story
-from cprl.viewer.tags import Tags
-from cprl.viewer.views import Views
+from cprl.viewer.frames import Filming, scene_of
+from cprl.viewer.logger import FILE_NAME, RerunLogger, free_name, recording_id
+from cprl.viewer.scenery import RANDOM_PLAY, Curves, curves_of, missing_in
+from cprl.viewer.story import Story, has_died
+from cprl.viewer.views import Views, institution_views
+
+_PERIOD_S: Final = 1.0
+
+
+class CompilingNotice:
+    """Calls a function once a second while code is compiled, in a thread of its own, until it is stopped.
+
+    Args:
+        show: called with "compiling, 12 s so far", and with "begins" once nothing is compiled any more; from
+            another thread.
+    """
+
+    def __init__(self, show: Callable[[str], object]) -> None:
+        self._show, self._over = show, Event()
+        self._before_s = CLOCK.total_s
+        Thread(target=self._watch, daemon=True, name="cprl compiling").start()
+
+    def stop(self) -> None:
+        """Ends the thread; a second call does nothing."""
+        self._over.set()
+
+    def _watch(self) -> None:
+        was_running = False
+        while not self._over.wait(_PERIOD_S):
+            if CLOCK.is_running:
+                self._show(f"compiling, {CLOCK.total_s - self._before_s:.0f} s so far")
+            elif was_running:
+                self._show("begins")
+            was_running = CLOCK.is_running
+
+
+WINDOW: Final = 0.02
+"""The share of the run's episodes whose mean is the bold line."""
+SHORTEST: Final = 10
+"""Its episodes at least."""
+_WITH_MEAN: Final = tuple(f"/{name}" for name in ("return", *OF_AGENTS))
+
+
+def _of_institutions(episode: Episode) -> dict[str, float]:
+    return {f"institutions/{name}": value for name, value in episode.institutions.items()}
+
+
+class Plots:
+    """Logs the lines of each episode: social metrics, those of institutions and what agents get and pay
+    with a running mean, all else as it is.
+
+    Args:
+        logger: where they are logged.
+        curves: what is plotted.
+        episodes: of the run; determines the window of running means.
+    """
+
+    def __init__(self, logger: RerunLogger, curves: Curves, *, episodes: int) -> None:
+        self._logger, self._curves = logger, curves
+        self.window = max(SHORTEST, round(WINDOW * episodes))
+        """Episodes of a running mean."""
+        self._recent: dict[str, Recent] = {}
+        self._random: dict[str, float] = {}
+
+    def random_play(self, episodes: Sequence[Episode]) -> None:
+        """Sets the lines of random play: the mean of each metric in these episodes, where it is defined."""
+        metrics = [{**social_metrics(episode), **_of_institutions(episode)} for episode in episodes]
+        for name in (*self._curves.metrics, *(f"institutions/{own}" for own in self._curves.institutions)):
+            defined = [own[name] for own in metrics if name in own and own[name] == own[name]]
+            if defined:
+                self._random[name] = fmean(defined)
+
+    def on_episode(self, of_all: Mapping[str, Values]) -> None:
+        """Logs an episode at the logger's time: the numbers [R] of each name."""
+        for name, values in of_all.items():
+            is_social = name.startswith(("social/", "institutions/"))
+            singles = values.tolist() if is_social and len(values) > 1 else []
+            line = [*singles, mean := mean_of(values)]
+            if is_social or name.endswith(_WITH_MEAN):
+                line.append(self._recent.setdefault(name, Recent(self.window)).add(mean))
+            self._logger.log_lines(name, line)
+        for name, mean in self._random.items():
+            self._logger.log_scalar(f"{RANDOM_PLAY}/{name}", mean)
+
+    def state_dict(self) -> dict[str, Any]:
+        """The last values of each running mean."""
+        return {name: recent.state_dict() for name, recent in self._recent.items()}
+
+    def load_state_dict(self, state: Mapping[str, Any]) -> None:
+        """Continues from a state that `state_dict` returned."""
+        for name, own in state.items():
+            self._recent.setdefault(name, Recent(self.window)).load_state_dict(own)
+
+
+EVERY: Final = 10
+"""Episodes from one matrix to the next."""
+OVER: Final = 5
+"""A matrix sums the tags of so many times `EVERY` episodes, the last ones."""
+
+
+class Tags:
+    """Sums the tags of the last episodes, over all replicas.
+
+    Args:
+        logger: where the matrices are logged.
+        agents: the number of agents N.
+    """
+
+    def __init__(self, logger: RerunLogger, agents: int) -> None:
+        self._logger = logger
+        self._last = [np.zeros((agents, agents))]
+
+    def add(self, tagged_by: NDArray[np.int64]) -> None:
+        """Adds the tags of an episode of a replica, [N, N]: row tagged, column by whom."""
+        self._last[-1] += tagged_by
+
+    def on_episode(self, episode: int) -> None:
+        """Logs the matrix if it is due after an episode, counted from 0, that all replicas have ended."""
+        if (episode + 1) % EVERY == 0:
+            self._logger.log_matrix("tags", np.sum(self._last, 0), ("tagged", "by whom"))
+            self._last = [*self._last[1 - OVER :], np.zeros_like(self._last[0])]
+
+    def state_dict(self) -> list[Any]:
+        """The matrices that are summed."""
+        return [own.tolist() for own in self._last]
+
+    def load_state_dict(self, state: list[Any]) -> None:
+        """Continues from a state that `state_dict` returned."""
+        self._last = list(np.array(state, np.float64))
+
 
 _DIED: Final = "died"
 """Among an episode's numbers, whether the board died early."""

@@ -6,8 +6,8 @@ from typing import Any, Final
 from cprl.commons.colours import agent_colour
 from cprl.measuring.names import OF_INSTITUTIONS
 from cprl.measuring.series import OF_AGENTS
+from cprl.viewer.panels import row
 from cprl.viewer.scenery import RANDOM_PLAY, Curves, running
-from cprl.viewer.tabs import row
 
 COLOURS: Final = {
     "violations": (213, 94, 0),

@@ -1,11 +1,15 @@
 """RerunLogger: records a run with Rerun, to a file and, on request, live on 127.0.0.1."""
 
+import itertools
+import json
 import time
-from collections.abc import Callable, Mapping, Sequence
+import uuid
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import Any, Final
+from typing import Any, Final, TypeAlias
 
 import numpy as np
+import torch
 from numpy.typing import NDArray
 from rich.console import Console
 from torch import Tensor
@@ -13,18 +17,208 @@ from torchrl.record.loggers import Logger
 
 from cprl.arguments import object_of
 from cprl.arguments import path as path_of
-from cprl.checks import NONE, TEXT, check_nesting, checked, either
+from cprl.checks import NONE, TEXT, check_nesting, checked, either, shown
+from cprl.compat import send_chunk
 from cprl.output import console as safe_console
-from cprl.viewer.batches import Numbers, log_now, send_text, send_waiting, times
+from cprl.runs.directory import FILE_NAME as RECIPE_FILE
+from cprl.runs.files import read_json
 from cprl.viewer.blueprint import layout
-from cprl.viewer.deadline import release
-from cprl.viewer.media import format_of, histogram_of, images_of, numbers_in
-from cprl.viewer.names import FILE_NAME
-from cprl.viewer.recipe import as_table
 from cprl.viewer.scenery import Curves, Scene
-from cprl.viewer.sending import FLUSH_TIMEOUT_S, Streams
 from cprl.viewer.stage import columns, fixed
-from cprl.viewer.streams import REPLAY, RUN, Live, open_file, open_live
+from cprl.viewer.streams import (
+    FLUSH_TIMEOUT_S,
+    REPLAY,
+    RUN,
+    Live,
+    LiveStream,
+    Stream,
+    Streams,
+    open_file,
+    open_live,
+    release,
+)
+
+FILE_NAME: Final = "run.rrd"
+
+
+def free_name(run: Path) -> str:
+    """run.rrd, or run-2.rrd and so on if the run has a recording already."""
+    names = (FILE_NAME if nth == 1 else f"run-{nth}.rrd" for nth in itertools.count(1))
+    return next(name for name in names if not (run / name).exists())
+
+
+def recording_id(run: Path, file_name: str) -> str | None:
+    """The recording id, the same when a run is resumed or extended; None where there is no run."""
+    if not (run / RECIPE_FILE).exists():
+        return None
+    recipe = read_json(run / RECIPE_FILE)
+    same = {name: own for name, own in recipe.items() if name not in ("experiment", "extended")}
+    return str(uuid.uuid5(uuid.NAMESPACE_URL, file_name + json.dumps(same, sort_keys=True)))
+
+
+_LONGEST: Final = 90
+"""Characters of a value in the table; the recipe of the run has them all."""
+
+
+def as_table(recipe: Mapping[Any, Any]) -> str:
+    """The table; texts of several lines, such as drawn boards, stand below it as they are.
+
+    An entry of a list that equals the first is one row that says so.
+    """
+    rows, texts = [], []
+    for place, value in _places(recipe, ""):
+        if isinstance(value, str) and "\n" in value:
+            texts.append(f"`{place}`\n\n```\n{value}\n```")
+        else:
+            rows.append(f"| {_cell(place)} | {_cell(_short(value))} |")
+    return "\n\n".join(["\n".join(["| place | value |", "| --- | --- |", *rows]), *texts])
+
+
+def _places(value: Any, place: str) -> Iterator[tuple[str, Any]]:
+    """Each value that holds no others, with its dotted place."""
+    if isinstance(value, Mapping) and value:
+        for name, own in value.items():
+            yield from _places(own, f"{place}.{name}" if place else str(name))
+    elif isinstance(value, list | tuple) and any(isinstance(own, Mapping) for own in value):
+        for index, own in enumerate(value):
+            if index and own == value[0]:
+                yield f"{place}.{index}", f"as {place}.0"
+            else:
+                yield from _places(own, f"{place}.{index}")
+    else:
+        yield place, value
+
+
+def _short(value: Any) -> str:
+    text = value if isinstance(value, str) else repr(value) if isinstance(value, float) else _plain(value)
+    return text if len(text) <= _LONGEST else f"{text[:_LONGEST]} ..."
+
+
+def _plain(value: Any) -> str:
+    try:
+        return str(value)
+    except Exception:  # of whatever kind a user's object raises
+        return shown(value)
+
+
+def _cell(text: str) -> str:
+    return text.replace("|", "\\|").replace("\n", " ")
+
+
+def numbers_in(data: Any) -> NDArray[Any]:
+    """The numbers of a tensor, an array or a list, [n]."""
+    return np.asarray(data.detach().cpu() if isinstance(data, Tensor) else data).reshape(-1)
+
+
+def histogram_of(numbers: NDArray[Any], *, bins: int) -> Any:
+    """A `rerun.BarChart` of numbers, [n], in equal bins."""
+    import rerun as rr
+
+    counts, edges = np.histogram(numbers, bins=bins)
+    return rr.BarChart(counts, abscissa=(edges[:-1] + edges[1:]) / 2)
+
+
+def images_of(video: Tensor) -> NDArray[np.uint8]:
+    """The images of a video, uint8 [T, H, W, C].
+
+    Raises:
+        ValueError: for a video that is not [T, C, H, W] or [1, T, C, H, W].
+    """
+    clip = torch.as_tensor(video).cpu()
+    clip = clip[0] if clip.ndim == 5 else clip
+    if clip.ndim != 4:
+        raise ValueError(f"the video is {list(video.shape)}; allowed: [T, C, H, W] or [1, T, C, H, W]")
+    images: NDArray[np.uint8] = clip.permute(0, 2, 3, 1).to(torch.uint8).numpy()
+    return images
+
+
+def format_of(images: NDArray[np.uint8]) -> Any:
+    """The `rerun.components.ImageFormat` of images, [T, H, W, C]."""
+    import rerun as rr
+
+    return rr.components.ImageFormat(
+        width=images.shape[2],
+        height=images.shape[1],
+        color_model="L" if images.shape[3] == 1 else "RGB",
+        channel_datatype=rr.ChannelDatatype.U8,
+    )
+
+
+TIMELINES: Final = ("step", "episode", "frame")
+"""The timelines of every row: environment steps of the run, episodes, and frames recorded so far."""
+
+Numbers: TypeAlias = "Sequence[int] | NDArray[np.integer[Any]]"
+
+
+def times(steps: Numbers, episodes: Numbers, frames: Numbers) -> list[Any]:
+    """The timelines of each row."""
+    import rerun as rr
+
+    return [
+        rr.TimeColumn(name, sequence=np.asarray(numbers, np.int64))
+        for name, numbers in zip(TIMELINES, (steps, episodes, frames), strict=True)
+    ]
+
+
+def components(columns: Iterable[Any]) -> dict[Any, Any]:
+    """Columns of an archetype as `cprl.compat.send_chunk` takes them."""
+    return {own.component_descriptor(): own.as_arrow_array() for own in columns}
+
+
+def timelines(at: Iterable[Any]) -> dict[str, Any]:
+    """`times` as `cprl.compat.send_chunk` takes them."""
+    return {own.timeline_name(): own.as_arrow_array() for own in at}
+
+
+def log_now(recording: Any, name: str, what: Any, now: tuple[int, int, int]) -> None:
+    """Logs one row that has no columns, such as a tensor, at a (step, episode, frame)."""
+    for timeline, number in zip(TIMELINES, now, strict=True):
+        recording.set_time(timeline, sequence=number)
+    recording.log(name, what)
+    recording.reset_time()
+
+
+def send_waiting(stream: Stream) -> None:
+    """Sends the buffered numbers and texts of one stream, one chunk per entity.
+
+    Of texts viewers get the newest alone, by `send_text`. Files keep each with its time: of static texts in
+    several files of one recording a viewer shows the one that it loads last.
+    """
+    waiting = stream.take()
+
+    def send(recording: Any) -> None:
+        known: dict[Any, dict[str, Any]] = {}  # most names have the same times
+        for name, rows in waiting.items():
+            *at, values = zip(*rows, strict=True)
+            if isinstance(stream, LiveStream) and isinstance(values[-1], str):
+                send_text(recording, name, values[-1])
+                continue
+            if tuple(at) not in known:
+                known[tuple(at)] = timelines(times(*at))
+            send_chunk(recording, name, known[tuple(at)], components(_columns(values)))
+        recording.flush(timeout_sec=FLUSH_TIMEOUT_S)
+
+    stream.do(send)
+
+
+def send_text(recording: Any, name: str, text: str) -> None:
+    """Sends a Markdown text without a time, which takes the place of the one before at all times.
+
+    A server sends it before the history, so who connects late never reads an old one as the present.
+    """
+    import rerun as rr
+
+    send_chunk(recording, name, {}, components(rr.TextDocument.columns(text=[text])))
+
+
+def _columns(values: Sequence[Any]) -> Any:
+    """Markdown texts, or equally many numbers in each row."""
+    import rerun as rr
+
+    if isinstance(values[0], str):
+        return rr.TextDocument.columns(text=list(values))
+    return rr.Scalars.columns(scalars=np.concatenate(values)).partition([len(own) for own in values])
+
 
 _LIVE_PERIOD_S: Final = 4.0
 """Sending a dozen numbers takes some ten milliseconds, in which a training waits for Python's lock."""

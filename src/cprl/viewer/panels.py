@@ -1,4 +1,4 @@
-"""Panels: several boards side by side in one image, each with a line of text above it."""
+"""Places in the viewer: several boards in one image, and plots whose horizontal axis is no timeline."""
 
 from collections.abc import Sequence
 from math import ceil
@@ -7,7 +7,54 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
-from cprl.viewer.frames import window_corners
+from cprl.commons.decoding import UNSEEN
+from cprl.commons.world import Bytes
+
+WINDOWS_APART_PIXELS: Final = 1
+WINDOWS_WIDE: Final = 1.7
+"""The width of the viewer's area for windows, divided by its height, approximately."""
+
+
+def window_corners(
+    agents: int, window: tuple[int, int], *, wide: float = WINDOWS_WIDE
+) -> list[tuple[int, int]]:
+    """The top-left corner (row, col) of each agent's window in a mosaic with cells as large as possible.
+
+    Args:
+        agents: the number of agents N.
+        window: (X, Y).
+        wide: the width of the viewer's area, divided by its height.
+    """
+    rows, cols = (length + WINDOWS_APART_PIXELS for length in window)
+
+    def cell_size(columns: int) -> float:
+        return min(wide / (columns * cols), 1 / (ceil(agents / columns) * rows))
+
+    columns = max(range(1, agents + 1), key=cell_size)
+    return [(agent // columns * rows, agent % columns * cols) for agent in range(agents)]
+
+
+def mosaic_size(agents: int, window: tuple[int, int]) -> tuple[int, int]:
+    """The rows and columns of the mosaic, in pixels."""
+    corners = window_corners(agents, window)
+    return max(row for row, _ in corners) + window[0], max(col for _, col in corners) + window[1]
+
+
+def mosaic(windows: Bytes) -> Bytes:
+    """The windows of all agents in a mosaic at `window_corners`, with UNSEEN between them.
+
+    Args:
+        windows: uint8 [T, N, X, Y], classes of `classes_seen`.
+
+    Returns:
+        uint8 [T, rows, columns], with the size of `mosaic_size`.
+    """
+    frames, agents, rows, columns = windows.shape
+    joined = np.full((frames, *mosaic_size(agents, (rows, columns))), UNSEEN, np.uint8)
+    for agent, (top, left) in enumerate(window_corners(agents, (rows, columns))):
+        joined[:, top : top + rows, left : left + columns] = windows[:, agent]
+    return joined
+
 
 _WIDE: Final = 3.0
 """The width of half a tab of the viewer, divided by its height, about."""
@@ -87,3 +134,69 @@ def decision_panels(agents: int, actions: int, window: tuple[int, int]) -> Panel
     """The places of the agents' panels, arranged as their windows (X, Y) are."""
     columns = sum(row == 0 for row, _ in window_corners(agents, window))
     return Panels(agents, (HIGH + BELOW, actions * (BAR + APART) + APART), columns=columns)
+
+
+def row(name: str, *views: Any) -> Any:
+    """The views that are there side by side, as a tab; None if there is none."""
+    import rerun.blueprint as rrb
+
+    there = [view for view in views if view is not None]
+    return rrb.Horizontal(*there, name=name) if there else None
+
+
+PLOT_WIDE, PLOT_HIGH = 260.0, 80.0
+"""The size of the plotting area, in the view's units; (0, 0) is its top left."""
+TITLE = PLOT_WIDE / 2, -16.0
+"""Where a title hangs."""
+BOUNDS: Final = ((-24.0, PLOT_WIDE + 16.0), (TITLE[1], PLOT_HIGH + 26.0))
+"""What the view shows, x and y: the area with room for texts."""
+_GREY, _FAINT, _TEXT = (120, 120, 120), (50, 52, 58), (200, 200, 200)
+
+
+class Axes:
+    """Two axes from 0 on, with their ticks; the view's name says what the vertical one is.
+
+    Args:
+        x: the name and unit of the horizontal axis.
+        x_end: the largest number on the horizontal axis.
+        y_end: the largest number on the vertical axis.
+    """
+
+    def __init__(self, x: str, *, x_end: float, y_end: float) -> None:
+        self.name = x
+        self.ends = np.array((x_end, y_end))
+
+    def placed(self, x: Any, y: Any) -> NDArray[np.float32]:
+        """Where numbers are in the view: [points, 2]."""
+        share = np.stack([np.asarray(x, np.float64), np.asarray(y, np.float64)], -1) / self.ends
+        placed: NDArray[np.float32] = (share * (PLOT_WIDE, -PLOT_HIGH) + (0, PLOT_HIGH)).astype(np.float32)
+        return placed
+
+    def drawn(self) -> tuple[Any, Any]:
+        """The axes with lines at their ticks, and the texts, as Rerun's archetypes."""
+        import rerun as rr
+
+        ticks = [_ticks(float(end)) for end in self.ends]
+        upright = [self.placed([tick, tick], [0, self.ends[1]]) for tick in ticks[0]]
+        level = [self.placed([0, self.ends[0]], [tick, tick]) for tick in ticks[1]]
+        count = len(upright) + len(level)
+        rim = self.placed([0, 0, self.ends[0]], [self.ends[1], 0, 0])
+        below = [(*self.placed(tick, 0)[:1], PLOT_HIGH + 1.0) for tick in ticks[0]]
+        left = [(-10.0, self.placed(0, tick)[1] - 6.0) for tick in ticks[1]]
+        texts = [*map(_short, ticks[0]), *map(_short, ticks[1]), self.name]
+        points = [*below, *left, (PLOT_WIDE / 2, PLOT_HIGH + 13.0)]
+        lines = rr.LineStrips2D(
+            [*upright, *level, rim], colors=[*[_FAINT] * count, _GREY], radii=[*[0.1] * count, 0.3]
+        )
+        return lines, rr.Points2D(points, labels=texts, colors=_TEXT, radii=0.0, show_labels=True)
+
+
+def _ticks(end: float) -> list[float]:
+    """Four or five round numbers from 0 on."""
+    size = 10 ** np.floor(np.log10(end))
+    step = next(part * size for part in (0.1, 0.2, 0.25, 0.5, 1.0, 2.0) if end / (part * size) <= 5)
+    return [step * index for index in range(int(end / step + 1e-9) + 1)]
+
+
+def _short(number: float) -> str:
+    return f"{number:g}"

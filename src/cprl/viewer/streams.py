@@ -1,18 +1,298 @@
-"""The streams of one recording: to a file and, on request, live on 127.0.0.1."""
+"""The streams of one recording, to a file and live: each may fail without harm to the run."""
 
+import atexit
 import shutil
 import subprocess
 import sys
+import time
 import warnings
+from collections.abc import Callable, Iterator
+from contextlib import suppress
 from dataclasses import dataclass, field
+from functools import cache, partial
 from pathlib import Path
-from typing import Any, Final
+from queue import Full, Queue
+from threading import Thread
+from typing import Any, Final, TypeAlias, TypeVar
 
 from cprl import arguments
+from cprl.compat import end_recordings, keep_native
 from cprl.output import printed
-from cprl.viewer.deadline import exit_in_time
 from cprl.viewer.page import LOCALHOST, Page, free_port, has_display, viewer_binary
-from cprl.viewer.sending import LiveStream, Stream
+
+T = TypeVar("T")
+
+STALL_S: Final = 2.0
+"""Seconds that a training waits for a place in the queue of a viewer that has stopped taking data."""
+
+CLOSE_S: Final = 5.0
+"""Seconds within which a viewer must take the last data when a run ends, and when the interpreter exits."""
+
+QUEUED_CALLS: Final = 256
+"""Calls that wait for a viewer; the frames of about thirty episodes."""
+
+_ABANDONED: Final[list[object]] = []
+"""Recordings whose viewer does not answer; dropping the last reference to one would wait for its viewer."""
+
+
+def within(seconds: float, what: Callable[[], T]) -> T:
+    """The result of a function, called in a thread that nothing waits for after the deadline.
+
+    Raises:
+        TimeoutError: if there is none after so many seconds; the thread goes on by itself.
+        Exception: what the function raises.
+    """
+    results: list[T] = []
+    errors: list[Exception] = []
+
+    def call() -> None:
+        try:
+            results.append(what())
+        except Exception as error:
+            errors.append(error)
+
+    thread = Thread(target=call, daemon=True)
+    thread.start()
+    thread.join(seconds)
+    if errors:
+        raise errors[0]
+    if not results:
+        raise TimeoutError(f"no answer within {seconds:g} s")
+    return results[0]
+
+
+class Sender:
+    """Calls functions, one after the other, in a thread of its own, until one of them fails."""
+
+    def __init__(self) -> None:
+        self._queue: Queue[Callable[[], object] | None] = Queue(QUEUED_CALLS)
+        self._error: Exception | None = None
+        self._thread = Thread(target=self._work, daemon=True, name="cprl viewer")
+        self._thread.start()
+
+    @property
+    def waiting(self) -> int:
+        """The number of calls that have not been begun, approximately."""
+        return self._queue.qsize()
+
+    def put(self, what: Callable[[], object] | None) -> None:
+        """Queues a call; waits at most `STALL_S`.
+
+        Raises:
+            TimeoutError: if the queue is full.
+            Exception: what an earlier call raised; the thread has then ended.
+        """
+        if self._error is not None:
+            raise self._error
+        try:
+            self._queue.put(what, timeout=STALL_S)
+        except Full:
+            raise TimeoutError(f"it has taken no data for {STALL_S:g} s and the queue is full") from None
+
+    def close(self) -> None:
+        """Ends the thread when all calls are done; waits at most `CLOSE_S`.
+
+        Raises:
+            TimeoutError: if they are not done by then.
+            Exception: what a call raised.
+        """
+        ends = time.monotonic() + CLOSE_S
+        self.put(None)
+        self._thread.join(max(0.0, ends - time.monotonic()))
+        if self._error is not None:
+            raise self._error
+        if self._thread.is_alive():
+            raise TimeoutError(f"it has not taken the last data within {CLOSE_S:g} s")
+
+    def _work(self) -> None:
+        while (what := self._queue.get()) is not None:
+            try:
+                what()
+            except Exception as error:
+                self._error = error
+                return
+
+
+def release() -> None:
+    """Ends the threads of recordings that are closed; a viewer that went away was reported when it did."""
+    if _ABANDONED:  # it would wait for their viewers
+        return
+    with suppress(TimeoutError, RuntimeError):
+        within(CLOSE_S, end_recordings)
+
+
+def abandon(recording: object) -> None:
+    """Keeps a recording whose viewer does not answer, so that nothing disconnects it and waits."""
+    _ABANDONED.append(recording)
+
+
+@cache
+def exit_in_time() -> None:
+    """Gives Rerun's own last flush, when the interpreter exits, a deadline; it has none of itself."""
+    import rerun as rr
+
+    def shutdown() -> None:
+        with suppress(TimeoutError):
+            within(STALL_S if _ABANDONED else CLOSE_S, rr.rerun_shutdown)
+            if not _ABANDONED:
+                return
+        # A shutdown that waits holds a lock, for which the end of any other recording would wait.
+        rr.RecordingStream.__del__ = keep_native  # type: ignore[method-assign]
+
+    rr.unregister_shutdown()
+    atexit.register(shutdown)
+
+
+FLUSH_TIMEOUT_S: Final = 5.0
+
+_KEEPS_UP: Final = 1
+"""The number of calls that may wait for viewers that keep up."""
+
+
+Row: TypeAlias = tuple[int, int, int, list[float] | str]
+"""Step, episode, frame, and a number for each line or a Markdown text."""
+
+Waiting: TypeAlias = dict[str, list[Row]]
+"""Numbers and texts by entity."""
+
+
+class Stream:
+    """One recording stream. If it fails, it warns once, and the run continues without it.
+
+    Args:
+        name: the name in warnings.
+        recording: a `rerun.RecordingStream`.
+        period_s: seconds between two batches of buffered numbers.
+    """
+
+    def __init__(self, name: str, recording: Any, *, period_s: float) -> None:
+        self.name, self.recording, self.period_s = name, recording, period_s
+        self.waiting: Waiting = {}
+        """Numbers that have not been sent."""
+        self._sent = time.perf_counter()
+
+    @property
+    def is_behind(self) -> bool:
+        """Whether viewers do not keep up, so that what can be left out should be."""
+        return False
+
+    @property
+    def is_due(self) -> bool:
+        """Whether the buffered numbers should be sent now."""
+        return time.perf_counter() - self._sent > self.period_s
+
+    def take(self) -> Waiting:
+        """The buffered numbers; the buffer is empty afterwards."""
+        taken, self.waiting = self.waiting, {}
+        self._sent = time.perf_counter()
+        return taken
+
+    def do(self, what: Callable[[Any], object]) -> None:
+        """Calls a function with the stream, unless the stream has failed."""
+        if self.recording is None:
+            return
+        try:
+            self._call(what)
+        except Exception as error:
+            self._fail(error)
+
+    def close(self) -> None:
+        """Disconnects; the file gets its footer. A second call does nothing."""
+        if self.recording is None:
+            return
+        try:
+            self._disconnect()
+        except Exception as error:
+            self._fail(error)
+        self.recording = None
+
+    def _call(self, what: Callable[[Any], object]) -> None:
+        what(self.recording)
+
+    def _disconnect(self) -> None:
+        self.recording.disconnect()
+
+    def _fail(self, error: Exception) -> None:
+        self.recording = None
+        warnings.warn(
+            f"the Rerun {self.name} failed, the run continues without it: {error}",
+            RuntimeWarning,
+            stacklevel=5,
+        )
+
+
+class LiveStream(Stream):
+    """A stream to viewers. Its calls are made in a thread of its own, because a viewer that stands still, or
+    accepts a connection and never reads, makes them wait forever; see `cprl.viewer.streams`.
+    """
+
+    def __init__(self, name: str, recording: Any, *, period_s: float) -> None:
+        super().__init__(name, recording, period_s=period_s)
+        self._sender = Sender()
+
+    @property
+    def is_behind(self) -> bool:
+        """Whether calls wait that viewers have not taken."""
+        return self._sender.waiting > _KEEPS_UP
+
+    def _call(self, what: Callable[[Any], object]) -> None:
+        self._sender.put(partial(what, self.recording))
+
+    def _disconnect(self) -> None:
+        self._sender.put(self.recording.disconnect)
+        self._sender.close()
+
+    def _fail(self, error: Exception) -> None:
+        abandon(self.recording)
+        super()._fail(error)
+
+
+class Streams:
+    """Those of one recording: to its file, and to viewers."""
+
+    def __init__(self) -> None:
+        self._each: list[Stream] = []
+
+    def add(self, stream: Stream | None) -> None:
+        """Adds a stream; None adds nothing."""
+        self._each += [] if stream is None else [stream]
+
+    def __iter__(self) -> Iterator[Stream]:
+        return iter(self._each)
+
+    @property
+    def recordings(self) -> list[Any]:
+        """The `rerun.RecordingStream` of each."""
+        return [each.recording for each in self._each]
+
+    @property
+    def is_live(self) -> bool:
+        """Whether there is a stream to viewers."""
+        return any(isinstance(each, LiveStream) for each in self._each)
+
+    @property
+    def is_open_live(self) -> bool:
+        """Whether a stream to viewers is neither closed nor failed."""
+        return any(isinstance(each, LiveStream) and each.recording is not None for each in self._each)
+
+    def do(self, what: Callable[[Any], object], *, live_only: bool = False) -> None:
+        """Calls a function with each recording, or with that to viewers alone, in the thread that sends."""
+        for each in self._each:
+            if isinstance(each, LiveStream) or not live_only:
+                each.do(what)
+
+    def hold(self, name: str, row: Row) -> list[Stream]:
+        """Buffers a row of an entity; returns the streams whose buffers are to be sent now."""
+        for each in self._each:
+            each.waiting.setdefault(name, []).append(row)
+        return [each for each in self._each if each.is_due]
+
+    def close(self, *, live: bool = True) -> None:
+        """Closes all, or all but those to viewers."""
+        for each in self._each:
+            if live or not isinstance(each, LiveStream):
+                each.close()
+
 
 RUN, REPLAY = "cprl", "cprl replay"
 """The application ids of runs and of replays: a viewer keeps one layout for each. Recordings of a run that is

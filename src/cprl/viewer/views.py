@@ -1,17 +1,529 @@
-"""Views: the wall of replicas, where agents go, the stock over the turn and the Lorenz curve."""
+"""Views of a training besides its lines: the boards of all replicas, where agents go, the stock over the
+turn, the Lorenz curve, what institutions do.
+"""
 
-from collections.abc import Mapping
-from math import gcd
-from typing import Any, Final
+import time
+from collections.abc import Mapping, Sequence
+from functools import partial
+from itertools import chain
+from math import ceil, gcd
+from typing import Any, Final, TypeAlias
 
+import numpy as np
+from numpy.typing import NDArray
+
+from cprl.commons.colours import GROUND, PALETTE, WALL, agent_colour
+from cprl.commons.decoding import UNSEEN
+from cprl.compat import send_chunk
 from cprl.envs.commons_env import CommonsEnv
+from cprl.institutions import Boundaries
 from cprl.measuring.episodes import Episode
-from cprl.viewer.logger import RerunLogger
-from cprl.viewer.lorenz import Lorenz
-from cprl.viewer.scenery import Curves, Scene, has_lorenz, has_wall
-from cprl.viewer.turns import Turns
-from cprl.viewer.visits import SAMPLED_EVERY, Visits
-from cprl.viewer.wall import Wall
+from cprl.viewer.institutions import has_institutions, lines
+from cprl.viewer.logger import RerunLogger, components, timelines, times
+from cprl.viewer.panels import TITLE, Axes, Panels
+from cprl.viewer.scenery import BACKGROUND, STATES, Curves, Scene, has_lorenz, has_wall
+from cprl.viewer.stage import RIM_CELLS, boards, image_form
+from cprl.viewer.story import has_died
+
+ROOM: Final = 100
+"""Looks that are kept, at most."""
+
+
+class Looks:
+    """Keeps some arrays of the worlds as they are at some steps.
+
+    A copy takes a microsecond; adding up right away takes twenty, since whatever runs between two steps of a
+    training runs out of cold caches.
+
+    Args:
+        env: the worlds.
+        names: the arrays, by their names in `cprl.commons.world.Worlds`.
+    """
+
+    def __init__(self, env: CommonsEnv, names: Sequence[str]) -> None:
+        self._read = env.worlds.driver.read
+        arrays = [getattr(env.worlds.now, name) for name in names]
+        self._pairs = [(array, np.empty((ROOM, *array.shape), array.dtype)) for array in arrays]
+        self._on_cpu = all(isinstance(array, np.ndarray) for array in arrays)
+        self._count = 0
+
+    @property
+    def is_full(self) -> bool:
+        """Whether `take` must be called before `add`."""
+        return self._count == ROOM
+
+    def add(self) -> None:
+        """Copies the arrays as they are now."""
+        at = self._count
+        self._count = at + 1
+        for array, kept in self._pairs:
+            kept[at] = array if self._on_cpu else self._read(array)
+
+    def take(self) -> list[NDArray[Any]]:
+        """The copies [T, ...] of each array, good until the next `add`; there are none afterwards."""
+        count, self._count = self._count, 0
+        return [kept[:count] for _, kept in self._pairs]
+
+
+WALL_BYTES: Final = 4_000_000
+"""The target size of the wall in a file, about."""
+_LIVE_PERIOD_S: Final = 2.0
+_LIVE_ROWS: Final = 10_000
+"""From then on rows for viewers get rarer, because a server's memory holds them: period = time / rows."""
+_FEWEST_STEPS: Final = 10
+"""Steps from one row of the file to the next, at least."""
+_DIED: Final = STATES["tragedy"]
+_Row = tuple[int, int, int, Any, list[str], Any]
+"""A step, episode and frame, the image, and the label and outline of each board."""
+
+
+class Wall:
+    """Logs the boards of all replicas: same rules, as many fates.
+
+    Viewers get them every two seconds, after hours more rarely; the file gets every `stride`-th step of the
+    episodes whose frames are recorded. A board is outlined while the last episode of its replica has ended
+    because no apple was left.
+
+    Args:
+        env: the worlds, one for each replica R.
+        logger: where they are logged.
+        scene: the contents of a board.
+        recorded_steps: the steps of the run whose frames are recorded, about; determines the stride.
+    """
+
+    def __init__(self, env: CommonsEnv, logger: RerunLogger, *, scene: Scene, recorded_steps: int) -> None:
+        import rerun as rr
+
+        self._env, self._logger, self._scene = env, logger, scene
+        self._panels = Panels(scene.replicas, (scene.height + 2, scene.width + 2))
+        rows, columns = self._panels.shape
+        row_bytes = 100 + 20 * scene.replicas + 0.35 * rows * columns
+        self.stride = max(_FEWEST_STEPS, ceil(recorded_steps * row_bytes / WALL_BYTES))
+        """Steps from one row of the file to the next."""
+        self._died = np.zeros(scene.replicas, np.bool_)
+        self._rows: list[_Row] = []
+        self._began = self._due = time.perf_counter()
+        form = rr.SegmentationImage.from_fields(format=image_form(self._panels.shape), opacity=1.0)
+        logger.log_static("wall/boards", form)
+        logger.log_static("wall/labels", self._panels.labels())
+        logger.log_static("wall/died", self._panels.frames())
+
+    def on_step(self, step: int, episode: int, frame: int | None) -> None:
+        """Logs the boards if they are due; `frame` is the number of the recorded one, if any."""
+        if frame is not None and step % self.stride == 0:
+            self._rows.append(self._row(step, episode, frame))
+        elif (now := time.perf_counter()) > self._due:
+            self._due = now + max(_LIVE_PERIOD_S, (now - self._began) / _LIVE_ROWS)
+            if self._logger.is_live:
+                self._send([self._row(step, episode, self._logger.frames)], live_only=True)
+
+    def on_episode(self, episode: Episode) -> None:
+        """Notes whether the replica's board has died, and sends the rows of the episode."""
+        self._died[episode.world] = bool(has_died(episode))
+        if episode.world == 0:
+            self.send()
+
+    def send(self) -> None:
+        """Sends the rows that wait for the file."""
+        if self._rows:
+            self._send(self._rows)
+            self._rows = []
+
+    def _row(self, step: int, episode: int, frame: int) -> _Row:
+        """A step, episode and frame, the image, and the label and outline of each board."""
+        now, read = self._env.worlds.now, self._env.worlds.driver.read
+        state = {name: read(getattr(now, name)) for name in ("stock", "in_play", "row", "col")}
+        image = self._panels.joined(boards(self._scene, {"step": state["stock"], **state}), UNSEEN)
+        turns = read(now.step)[:, 0].tolist()
+        labels = [f"{replica}: turn {turn}" for replica, turn in enumerate(turns)]
+        outlines = np.where(self._died[:, None], _DIED, BACKGROUND).astype(np.uint8)
+        return step, episode, frame, image, labels, outlines
+
+    def _send(self, rows: list[_Row], *, live_only: bool = False) -> None:
+        self._logger.do(partial(_send_rows, rows=rows), live_only=live_only)
+
+    def state_dict(self) -> list[bool]:
+        """Whether each replica's last episode died; rows are sent first."""
+        self.send()
+        died: list[bool] = self._died.tolist()
+        return died
+
+    def load_state_dict(self, state: list[bool]) -> None:
+        """Continues from a state that `state_dict` returned."""
+        self._died = np.array(state, np.bool_)
+
+
+def _send_rows(recording: Any, *, rows: list[_Row]) -> None:
+    """Sends rows, for viewers in the thread that sends."""
+    import rerun as rr
+
+    steps, episodes, frames, images, labels, outlines = zip(*rows, strict=True)
+    at, replicas = timelines(times(steps, episodes, frames)), [len(labels[0])] * len(rows)
+    parts = {
+        "wall/boards": rr.SegmentationImage.columns(buffer=np.stack(images).reshape(len(rows), -1)),
+        "wall/labels": rr.Points2D.columns(labels=list(chain(*labels))).partition(replicas),
+        "wall/died": rr.Boxes2D.columns(colors=np.concatenate(outlines)).partition(replicas),
+    }
+    for entity, columns in parts.items():
+        send_chunk(recording, entity, at, components(columns))
+
+
+SAMPLED_EVERY: Final = 10
+"""Steps from one look at the agents' cells to the next."""
+_DARKEST: Final = 0.35
+"""The brightness of a cell that was visited once; 1 is the cell with the longest stay."""
+
+
+class Visits:
+    """Counts the agents' cells in the first replica, the one that is shown, every `SAMPLED_EVERY` steps.
+
+    The image has a map for each agent: hue the agent, brightness the time it spent on the cell while in play,
+    by its square root, as a share of the longest time that any agent spent on one cell.
+
+    Args:
+        env: the worlds; the first is counted.
+        logger: where the maps are logged, as `visits`.
+        scene: the contents of the board.
+    """
+
+    def __init__(self, env: CommonsEnv, logger: RerunLogger, *, scene: Scene) -> None:
+        self._logger, self._looks = logger, Looks(env, ("row", "col", "in_play"))
+        self._size = scene.height, scene.width
+        self._agents = np.arange(len(scene.agents)) * scene.height * scene.width
+        self._counts = np.zeros(len(scene.agents) * scene.height * scene.width, np.int64)
+        self._panels = Panels(len(scene.agents), (scene.height + 2, scene.width + 2))
+        self._walls = np.ones((scene.height + 2, scene.width + 2), np.bool_)
+        self._walls[1:-1, 1:-1] = False
+        for row, col in scene.walls:
+            self._walls[row + 1, col + 1] = True
+        self._hues = np.array([agent_colour(agent) for agent in range(len(scene.agents))])
+        self._ended = self._logged = 0
+        logger.log_static("visits/labels", self._panels.labels())
+
+    def on_step(self, step: int) -> None:
+        """Notes where the agents are, if it is time."""
+        if step % SAMPLED_EVERY:
+            return
+        self._looks.add()
+        if self._looks.is_full:
+            self._count()
+
+    def _count(self) -> None:
+        """Counts where the agents in play were."""
+        row, col, in_play = (kept[:, 0] for kept in self._looks.take())
+        cells = self._agents + row * self._size[1] + col
+        self._counts += np.bincount(cells[in_play], minlength=len(self._counts))
+
+    def on_episode(self, episode: Episode) -> None:
+        """Notes how many episodes the first replica has ended."""
+        if episode.world == 0:
+            self._ended = episode.episode + 1
+
+    def log(self) -> None:
+        """Logs the maps at the logger's time, and counts from zero."""
+        import rerun as rr
+
+        image = self._panels.joined(self.maps(), PALETTE[GROUND])
+        self._logger.log_row("visits", rr.Image(image))
+        first, last = self._logged + 1, max(self._ended, self._logged + 1)
+        episodes = f"episode {last}" if first == last else f"{first} to {last}"
+        texts = [f"{agent}: {episodes}" for agent in range(len(self._agents))]
+        self._logger.log_row("visits/labels", rr.Points2D.from_fields(labels=texts))
+        self._counts[:] = 0
+        self._logged = self._ended
+
+    def maps(self) -> Any:
+        """The maps of the time since the last image: uint8 [N, H + 2, W + 2, 3], with a rim of wall."""
+        self._count()
+        counts = self._counts.reshape(-1, *self._size)
+        share = np.sqrt(counts / max(1, counts.max()))
+        light = np.where(counts > 0, _DARKEST + (1 - _DARKEST) * share, 0.0)[..., None]
+        inner = np.array(PALETTE[GROUND]) * (1 - light) + self._hues[:, None, None] * light
+        whole = np.pad(inner, ((0, 0), (1, 1), (1, 1), (0, 0)))
+        whole[:, self._walls] = PALETTE[WALL]
+        return whole.round().astype(np.uint8)
+
+    def state_dict(self) -> dict[str, Any]:
+        """The counts [N x H x W], and the episodes ended and logged."""
+        self._count()
+        return {"counts": self._counts.tolist(), "ended": self._ended, "logged": self._logged}
+
+    def load_state_dict(self, state: Mapping[str, Any]) -> None:
+        """Continues from a state that `state_dict` returned."""
+        self._looks.take()
+        self._counts[:] = state["counts"]
+        self._ended, self._logged = int(state["ended"]), int(state["logged"])
+
+
+POINTS: Final = 100
+"""The points of a line, at most."""
+_LIVED: Final = (150, 150, 150)
+_TEXT: Final = (200, 200, 200)
+
+
+class Turns:
+    """Logs the apples on the board over the turns of each replica's last episode, grey where the board lived
+    until the time was up, in the colour of a tragedy where it died.
+
+    Args:
+        env: the worlds, one for each replica R.
+        logger: where the lines are logged, as `turn/lines`.
+    """
+
+    def __init__(self, env: CommonsEnv, logger: RerunLogger) -> None:
+        game, replicas = env.game, env.worlds.size
+        self._logger, self._looks = logger, Looks(env, ("step", "stock_left"))
+        self.stride = ceil(game.rules.episode_steps / POINTS)
+        """Turns from one point to the next."""
+        self._every_replica = np.arange(replicas)
+        self._playing = np.full((replicas, game.rules.episode_steps // self.stride + 1, 2), np.nan)
+        """[R, points, 2], turn and stock of the episodes that are being played."""
+        self._ended: list[list[tuple[float, float]]] = [[] for _ in range(replicas)]
+        self._died = [False] * replicas
+        self._axes = Axes(
+            "turn of the episode",
+            x_end=game.rules.episode_steps,
+            y_end=max(1, len(game.map.sites)),
+        )
+        lines, texts = self._axes.drawn()
+        logger.log_static("turn/axes", lines)
+        logger.log_static("turn/axes/texts", texts)
+
+    def on_step(self, step: int) -> None:
+        """Notes the stock of every replica, each at its own turn, if it is time."""
+        if step % self.stride:
+            return
+        self._looks.add()
+        if self._looks.is_full:
+            self._place()
+
+    def _place(self) -> None:
+        """Places the points that were noted, the latest last: it stays where two have the same place."""
+        turn, stock = (kept[..., 0] for kept in self._looks.take())
+        point = self._every_replica, turn // self.stride
+        self._playing[(*point, 0)], self._playing[(*point, 1)] = turn, stock
+
+    def on_episode(self, episode: Episode) -> None:
+        """Ends the line of a replica."""
+        self._place()
+        playing = self._playing[episode.world]
+        points = playing[playing[:, 0] < episode.steps]
+        end = [] if episode.stock_left is None else [(float(episode.steps), float(episode.stock_left))]
+        self._ended[episode.world] = [*map(tuple, points.tolist()), *end]
+        self._died[episode.world] = bool(has_died(episode))
+        playing[1:] = np.nan  # the first point is already that of the next episode, which begins alike
+
+    def log(self) -> None:
+        """Logs the lines at the logger's time."""
+        import rerun as rr
+
+        shown = [replica for replica, line in enumerate(self._ended) if len(line) > 1]
+        if not shown:
+            return
+        strips = [self._axes.placed(*np.array(self._ended[replica]).T) for replica in shown]
+        colours = [STATES["tragedy"] if self._died[replica] else _LIVED for replica in shown]
+        self._logger.log_row("turn/lines", rr.LineStrips2D(strips, colors=colours, radii=0.5))
+        died = sum(self._died)
+        text = f"last episode of each replica: {died} of {len(shown)} boards died (orange)"
+        title = rr.Points2D([TITLE], labels=[text], radii=0.0, colors=_TEXT, show_labels=True)
+        self._logger.log_row("turn/title", title)
+
+    def state_dict(self) -> dict[str, Any]:
+        """The points of the running and of the last episodes."""
+        self._place()
+        return {"playing": self._playing.tolist(), "ended": self._ended, "died": self._died}
+
+    def load_state_dict(self, state: dict[str, Any]) -> None:
+        """Continues from a state that `state_dict` returned."""
+        self._looks.take()
+        self._playing[:] = state["playing"]
+        self._ended = [[(turn, stock) for turn, stock in line] for line in state["ended"]]
+        self._died = list(state["died"])
+
+
+_EVEN: Final = (150, 150, 150)
+_FIRST: Final = (0, 158, 115)
+_LAST: Final = (230, 160, 0)
+
+
+def lorenz_curve(harvest: NDArray[np.float64]) -> NDArray[np.float64]:
+    """The share of the harvest that the k agents with the least have together, k = 0..N; [N + 1].
+
+    The area between it and the diagonal, doubled, is the Gini coefficient, 1 - equality. NaN without harvest.
+    """
+    total = harvest.sum()
+    if total <= 0:
+        return np.full(len(harvest) + 1, np.nan)
+    return np.concatenate([[0.0], np.sort(harvest).cumsum() / total])
+
+
+def gini(curve: NDArray[np.float64]) -> float:
+    """The Gini coefficient of a Lorenz curve [N + 1], 0 for equal shares."""
+    return float(1 - (curve[1:] + curve[:-1]).sum() / (len(curve) - 1))
+
+
+class Lorenz:
+    """Logs the mean Lorenz curve of the episodes of all replicas since the last one, beside the first one.
+
+    The mean is over episodes, so its Gini coefficient is 1 minus their mean equality; episodes without a
+    harvest have no curve and are left out.
+
+    Args:
+        logger: where the curves are logged, as `lorenz`.
+        agents: the number of agents N.
+    """
+
+    def __init__(self, logger: RerunLogger, agents: int) -> None:
+        self._logger, self._agents = logger, agents
+        self._sums: dict[int, NDArray[np.float64]] = {}
+        self._first: tuple[list[float], str] | None = None
+        self._axes = Axes("agents, the poorest first, %", x_end=100, y_end=100)
+        lines, texts = self._axes.drawn()
+        logger.log_static("lorenz/axes", lines)
+        logger.log_static("lorenz/axes/texts", texts)
+
+    def on_episode(self, episode: Episode) -> None:
+        """Adds an episode of a replica."""
+        if episode.harvest is not None and episode.harvest.sum() > 0:
+            row = np.append(lorenz_curve(episode.harvest), 1.0)
+            self._sums[episode.episode] = self._sums.get(episode.episode, 0.0) + row
+
+    def log(self, first: int, last: int) -> None:
+        """Logs the curve of these episodes, counted from 1, at the logger's time, if any had a harvest."""
+        import rerun as rr
+
+        taken = [self._sums.pop(episode) for episode in sorted(self._sums) if episode < last]
+        if not taken:
+            return
+        *total, count = np.sum(taken, 0)
+        curve = np.array(total) / count
+        episodes = f"episode {last}" if first == last else f"episodes {first} to {last}"
+        self._first = self._first or (curve.tolist(), episodes)
+        earliest, began = np.array(self._first[0]), self._first[1]
+        share = np.linspace(0, 100, self._agents + 1)
+        curves = share / 100, earliest, curve
+        strips = [self._axes.placed(share, 100 * own) for own in curves]
+        lines = rr.LineStrips2D(strips, colors=[_EVEN, _FIRST, _LAST], radii=[0.3, 0.5, 1.0])
+        self._logger.log_row("lorenz", lines)
+        text = (
+            f"Gini {gini(curve):.2f}: {episodes}, {count:.0f} with a harvest "
+            f"(green: {began}, {gini(earliest):.2f}; grey: equal shares)"
+        )
+        title = rr.Points2D([TITLE], labels=[text], radii=0.0, colors=_TEXT, show_labels=True)
+        self._logger.log_row("lorenz/title", title)
+
+    def state_dict(self) -> dict[str, Any]:
+        """The sums of curves and their numbers, by episode, and the first curve."""
+        sums = [[episode, *row.tolist()] for episode, row in self._sums.items()]
+        return {"sums": sums, "first": self._first}
+
+    def load_state_dict(self, state: dict[str, Any]) -> None:
+        """Continues from a state that `state_dict` returned."""
+        self._sums = {int(episode): np.array(row) for episode, *row in state["sums"]}
+        first = state["first"]
+        self._first = None if first is None else (list(first[0]), str(first[1]))
+
+
+Regions: TypeAlias = list[tuple[list[int], NDArray[np.bool_]]]
+"""The owners of each region, and its cells, bool [H, W]."""
+
+_SHARED: Final = (150, 150, 150)
+"""The colour of regions of several agents."""
+_OPACITY: Final = 170
+_INSET_CELLS, _BORDER_CELLS = 0.08, 0.04
+
+
+def institution_views(logger: RerunLogger, env: CommonsEnv | None) -> "InstitutionViews | None":
+    """What a recording shows of institutions; None for a game without them."""
+    if not has_institutions(logger.curves):
+        return None
+    return InstitutionViews(logger, logger.curves, regions=[] if env is None else regions_of(env))
+
+
+class InstitutionViews:
+    """Logs what a recording shows of institutions besides the numbers of episodes; made for games with them.
+
+    Args:
+        logger: of the recording.
+        curves: what is plotted; a `Scene` if there is a board.
+        regions: of a game with `Boundaries`, see `regions_of`.
+    """
+
+    def __init__(self, logger: RerunLogger, curves: Curves, *, regions: Regions) -> None:
+        self._logger, self._curves = logger, curves
+        for entity, style in lines(curves).items():
+            logger.log_static(entity, style)
+        if regions and isinstance(curves, Scene):
+            logger.log_static("world/regions", borders(regions))
+
+    def on_episode(self, episode: Episode) -> None:
+        """Logs an event of an episode, at the logger's time: what was decided, broken and paid."""
+        told = in_words(episode, self._curves)
+        if told:
+            self._logger.log_text(f"episode {episode.episode:,}: {told}")
+
+
+def in_words(episode: Episode, curves: Curves) -> str:
+    """What was decided, broken and paid in an episode, e.g. "3 violations; agent 2 fined 1.5"; "" if nothing
+    was."""
+    parts = []
+    if episode.in_force is not None:
+        decided = zip(curves.in_force, episode.in_force, strict=False)
+        parts.append(", ".join(f"{title}: {value:g}" for title, value in decided))
+    if episode.violations is not None and episode.violations.any():
+        broken = int(episode.violations.sum())
+        parts.append(f"{broken:,} violation{'s' * (broken > 1)}")
+    fines = [] if episode.fines is None else episode.fines.tolist()
+    parts.append(", ".join(f"agent {nth} fined {own:.4g}" for nth, own in enumerate(fines) if own > 0))
+    return "; ".join(part for part in parts if part)
+
+
+def regions_of(env: CommonsEnv) -> Regions:
+    """The regions of all `Boundaries` of a game; those that are open to all are none."""
+    found: Regions = []
+    for own in env.game.institutions:
+        if isinstance(own, Boundaries):
+            signs = np.array([list(line) for line in own.regions])
+            of_agents = [own.signs_of(agent) for agent in range(env.game.agents)]
+            for sign in sorted(set("".join(of_agents))):
+                owners = [agent for agent, ours in enumerate(of_agents) if sign in ours]
+                found.append((owners, signs == sign))
+    return found
+
+
+def borders(regions: Regions) -> Any:
+    """The borders of regions in the hue of their owner, or grey where several share one, as lines."""
+    import rerun as rr
+
+    strips, colours = [], []
+    for owners, cells in regions:
+        found = _borders(cells)
+        strips += found
+        hue = agent_colour(owners[0]) if len(owners) == 1 else _SHARED
+        colours += [(*hue, _OPACITY)] * len(found)
+    return rr.LineStrips2D(strips, colors=colours, radii=_BORDER_CELLS, draw_order=-4.0)
+
+
+def _borders(cells: NDArray[np.bool_]) -> list[list[tuple[float, float]]]:
+    """The sides of cells beyond which the region ends, (x, y), a little inside of it."""
+    around = np.pad(cells, 1)
+    sides = {  # where the neighbour is, and from which to which corner of a cell the side goes
+        (-1, 0): ((0, 0), (1, 0)),
+        (1, 0): ((0, 1), (1, 1)),
+        (0, -1): ((0, 0), (0, 1)),
+        (0, 1): ((1, 0), (1, 1)),
+    }
+    strips = []
+    for (down, right), corners in sides.items():
+        height, width = cells.shape
+        beyond = around[1 + down : 1 + down + height, 1 + right : 1 + right + width]
+        inset = -_INSET_CELLS * right, -_INSET_CELLS * down
+        for row_, col in np.argwhere(cells & ~beyond).tolist():
+            strips.append(
+                [(col + x + inset[0] + RIM_CELLS, row_ + y + inset[1] + RIM_CELLS) for x, y in corners]
+            )
+    return strips
+
 
 LONGEST: Final = 50
 """Episodes from one image of visits, stock and Lorenz curve to the next, at most."""

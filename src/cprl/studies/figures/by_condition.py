@@ -8,7 +8,6 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from cprl.arguments import choice, refusal
-from cprl.plotting.style import MEAN, RANDOM_LINE, SMALL_PT, head, picture_path, save, wrapped
 from cprl.studies.figures.panels import (
     FAINT,
     MOST_CONDITIONS,
@@ -22,6 +21,7 @@ from cprl.studies.figures.panels import (
 from cprl.studies.tables.comparing import LAST, Compared, Comparison, compare, metrics_of
 from cprl.studies.tables.table import StudyTable
 from cprl.studies.tables.windows import RANDOM, TRAINING
+from cprl.terminal.style import MEAN, RANDOM_LINE, SMALL_PT, head, picture_path, save, wrapped
 
 Kind = Literal["levels", "differences"]
 

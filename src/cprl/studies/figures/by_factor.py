@@ -12,7 +12,6 @@ from matplotlib.ticker import NullLocator
 
 from cprl.arguments import refusal
 from cprl.measuring.statistics import Estimate
-from cprl.plotting.style import RANDOM_LINE, SMALL_PT, head, picture_path, save, wrapped
 from cprl.studies.figures.panels import (
     LEVEL,
     colours_of,
@@ -29,6 +28,7 @@ from cprl.studies.tables.comparing import LAST, Compared, compare, metrics_of
 from cprl.studies.tables.sources import Design
 from cprl.studies.tables.table import StudyTable
 from cprl.studies.tables.windows import RANDOM, TRAINING
+from cprl.terminal.style import RANDOM_LINE, SMALL_PT, head, picture_path, save, wrapped
 
 _COLUMNS: Final = 3
 _MOST_LINES: Final = 8

@@ -11,7 +11,6 @@ from numpy.typing import NDArray
 
 from cprl.measuring.published import SMOOTHED_EPISODES
 from cprl.measuring.statistics import curve_interval
-from cprl.plotting.style import RANDOM_LINE, SMALL_PT, head, picture_path, save
 from cprl.runs.curves import running_mean
 from cprl.studies.figures.panels import (
     MOST_CONDITIONS,
@@ -27,6 +26,7 @@ from cprl.studies.tables.comparing import compare, metrics_of
 from cprl.studies.tables.table import StudyTable
 from cprl.studies.tables.texts import metric_title
 from cprl.studies.tables.windows import RANDOM, TRAINING
+from cprl.terminal.style import RANDOM_LINE, SMALL_PT, head, picture_path, save
 
 METRICS: Final = ("collective_return", "survival_steps")
 """What is drawn unless something else is asked for."""

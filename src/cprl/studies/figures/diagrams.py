@@ -13,8 +13,6 @@ from matplotlib.patches import Rectangle
 from matplotlib.ticker import MaxNLocator
 
 from cprl.arguments import object_of, refusal
-from cprl.plotting.cells import EMPTY, draw_cell
-from cprl.plotting.style import SHADES, SMALL_PT, head, picture_path, save, wrapped
 from cprl.studies.figures.panels import (
     MOST_CONDITIONS,
     legend,
@@ -31,6 +29,7 @@ from cprl.studies.tables.sources import Design
 from cprl.studies.tables.table import StudyTable
 from cprl.studies.tables.texts import digits_for
 from cprl.studies.tables.windows import TRAINING
+from cprl.terminal.style import EMPTY, SHADES, SMALL_PT, draw_cell, head, picture_path, save, wrapped
 
 _VALUES, _DIFFERENCES = "viridis", "RdBu"
 _CELL_IN: Final = (1.05, 0.55)

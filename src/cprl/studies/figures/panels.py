@@ -11,10 +11,10 @@ from matplotlib.colors import to_hex
 from matplotlib.figure import Figure
 
 from cprl.measuring.statistics import Estimate
-from cprl.plotting.style import CHARACTER_IN, SMALL_PT
 from cprl.studies.tables.comparing import Comparison
 from cprl.studies.tables.sources import Design
 from cprl.studies.tables.texts import metric_title
+from cprl.terminal.style import CHARACTER_IN, SMALL_PT
 
 MOST_CONDITIONS: Final = 60
 """A figure with a row for each condition has at most so many rows."""

@@ -25,12 +25,12 @@ import numpy as np
 
 from cprl.measuring.now import DECLINE, HARVESTING, LEAST_LOSS, LOST, RECOVERY, REGAINED, TRAGEDY
 from cprl.measuring.phases import FEWEST_EPISODES
-from cprl.plotting.bands import COLOURS as PHASE_COLOURS
-from cprl.plotting.bands import UNNAMED
 from cprl.runs.curves import Values, as_curves, curves_of, phases_of, running_mean
 from cprl.runs.episodes import read_table
 from cprl.studies.tables.sources import Source
 from cprl.terminal.course import BELOW_RANDOM, LAST_EPISODES, PEAK_EPISODES, PEAK_OVER_RANDOM
+from cprl.terminal.figures import COLOURS as PHASE_COLOURS
+from cprl.terminal.figures import UNNAMED
 
 NO_BETTER: Final = "no better"
 COLOURS: Final = {

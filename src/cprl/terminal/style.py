@@ -1,4 +1,4 @@
-"""Sizes and colours of figures on white, and legends that lie beside the data."""
+"""What all figures share: sizes and colours on white, legends that lie beside the data, cells of a matrix."""
 
 from collections.abc import Sequence
 from io import BytesIO
@@ -7,8 +7,10 @@ from textwrap import fill
 from typing import Any, Final
 
 from matplotlib.axes import Axes
+from matplotlib.colors import to_rgba
 from matplotlib.figure import Figure
 from matplotlib.legend import Legend
+from matplotlib.patches import Rectangle
 from matplotlib.patheffects import Normal, Stroke
 from matplotlib.text import Text
 
@@ -158,3 +160,19 @@ def _with_colours(drawn: BytesIO, colours: int) -> BytesIO:
         )
         chosen.save(few, format="png", optimize=True, dpi=(DPI, DPI))
     return few
+
+
+EMPTY: Final = "#f2f2f2"
+"""The colour of a cell without a number."""
+
+
+def draw_cell(axes: Axes, x: int, y: int, colour: Any, text: str) -> None:
+    """Draws the cell about (x, y), one unit wide and high."""
+    axes.add_patch(Rectangle((x - 0.5, y - 0.5), 1, 1, facecolor=colour, edgecolor="white"))
+    axes.text(x, y, text, ha="center", va="center", fontsize=SMALL_PT, color=_ink(colour))
+
+
+def _ink(colour: Any) -> str:
+    """Black on light cells, white on dark ones."""
+    red, green, blue, _ = to_rgba(colour)
+    return "black" if 0.299 * red + 0.587 * green + 0.114 * blue > 0.5 else "white"

@@ -1,0 +1,647 @@
+"""Scenarios: agents of a stored run among named backgrounds that they never met.
+
+In the manner of Melting Pot (J. Z. Leibo et al., "Scalable Evaluation of Multi-Agent Reinforcement Learning
+with Melting Pot", 2021): focal agents, which are judged, share a board with background agents, which are part
+of the test. A focal majority receives one of the background agents ("resident mode"); a focal minority is one
+agent among background agents ("visitor mode").
+
+A scenario is called by its focal agents and its background, e.g. "minority_among_greedy". Together with the
+board and its variant this names a score that others can hold theirs against.
+
+The focal agents are those of the run, each with its own index, so that everybody starts where it was trained
+to. Every placement of a scenario is played by every replica, in the same worlds for the run's agents and for
+those that it is held against; a number is a replica's mean over episodes and placements, estimated over
+replicas, because only replicas are independent.
+"""
+
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from functools import partial
+from math import isnan
+from pathlib import Path
+from statistics import fmean
+from typing import Any, Final, Literal, TypeAlias, get_args
+
+import numpy as np
+import pyarrow as pa
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from rich.table import Table
+
+from cprl import arguments, presets
+from cprl.agents import check_scripted
+from cprl.arguments import object_of
+from cprl.checks import Check, check_fields, instance, one_of
+from cprl.commons.game import Game
+from cprl.evaluation.evaluate import (
+    SEED,
+    check,
+    chosen_replicas,
+    differences,
+    how_they_play,
+    opened,
+    transform_differences,
+)
+from cprl.evaluation.lanes import Played, play, pooled
+from cprl.measuring.names import with_unit
+from cprl.measuring.replicas import Measured, institution_measures, over_replicas, social_measures
+from cprl.measuring.statistics import Estimate, difference
+from cprl.policies.assignment import AgentPolicies
+from cprl.population import Frozen, Scripted
+from cprl.runs.labelled import labelled
+from cprl.stored import LoadedRun, load
+from cprl.stored_agents import StoredAgent, stored_policies
+from cprl.terminal.style import MARK, MEAN, SMALL_PT, head, picture_path, save
+
+Focal: TypeAlias = Literal["majority", "minority"]
+"""How many agents are focal: "majority", all but one; "minority", one."""
+
+_BACKGROUND: Final = "Scripted(policy) or Frozen(run, agent, replica) for each agent of the game"
+
+
+def _is_background(value: Any) -> bool:
+    return isinstance(value, tuple) and all(isinstance(spec, Scripted | Frozen) for spec in value)
+
+
+def _is_name(value: Any) -> bool:
+    return isinstance(value, str) and value.isidentifier()
+
+
+@dataclass(frozen=True, kw_only=True)
+class Scenario:
+    """A background on a board, and how many of the agents are focal.
+
+    Raises:
+        ValueError: names the field, what came and what is allowed.
+    """
+
+    name: str
+    """What it is called, e.g. "minority_among_greedy": letters, digits and underscores."""
+    game: Game
+    """The board with its rules, for at least 2 agents; scripted policies need windows as observations."""
+    focal: Focal
+    """How many agents are focal, see `Focal`; in a game of two agents both are one."""
+    background: tuple[Scripted | Frozen, ...]
+    """Who plays with each agent index where it is not focal. `Frozen(run, agent, replica=None)` is, beside
+    replica r of the focal run, the agent of the next replica that its own run keeps, the first one after
+    the last: so agents of one replica, trained together or from the same seed, never meet."""
+
+    def __post_init__(self) -> None:
+        check_fields(
+            self,
+            {
+                "name": Check(_is_name, "letters, digits and underscores, not a digit first"),
+                "game": instance(Game, "a cprl.Game"),
+                "focal": one_of(*get_args(Focal)),
+                "background": Check(_is_background, _BACKGROUND),
+            },
+        )
+        if self.game.agents < 2:
+            raise ValueError(
+                f"Scenario.game has {self.game.agents} agent; allowed: at least 2, focal and background"
+            )
+        if len(self.background) != self.game.agents:
+            raise ValueError(
+                f"Scenario.background has {len(self.background)} agents for a game of {self.game.agents} "
+                f"agents; allowed: {_BACKGROUND}"
+            )
+
+    @property
+    def placements(self) -> tuple[tuple[int, ...], ...]:
+        """The indices of the focal agents in turn, so that every agent is focal equally often: as a minority
+        each alone, as a majority all without agent 0, without agent 1 and so on."""
+        everyone = range(self.game.agents)
+        if self.focal == "minority":
+            return tuple((agent,) for agent in everyone)
+        return tuple(tuple(agent for agent in everyone if agent != other) for other in everyone)
+
+
+SCRIPTED: Final = ("greedy", "sustainable", "territorial", "aggressive")
+"""Backgrounds in which all agents follow one scripted policy."""
+
+STORED: Final = "dqn"
+"""The background of the population that DQN trained on the very game, where one is committed."""
+
+_COMMITTED: Final[tuple[tuple[presets.Board, presets.Variant, bool, str], ...]] = (
+    ("commons", "as_run", True, "commons"),
+    ("commons", "published", True, "commons_published"),
+    ("two_complex", "as_run", True, "two_complex"),
+    ("two_complex", "as_run", False, "two_complex_no_beam"),
+)
+"""Board, variant, whether agents may fire, and the folder of `docs/results` with the population."""
+
+
+def results_folder() -> Path:
+    """The folder with the results that come with a checkout of cprl, which is `docs/results`; an installed
+    wheel has none."""
+    return Path(presets.__file__).parents[2] / "docs" / "results"
+
+
+def stored_for(game: Game) -> Path | None:
+    """The folder of the committed population that was trained on a game, whether it is at hand or not; None
+    if there is none."""
+    for board, variant, may_fire, name in _COMMITTED:
+        published = presets.game(board, variant=variant)
+        if game == replace(published, rules=replace(published.rules, may_fire=may_fire)):
+            return results_folder() / name
+    return None
+
+
+def left_out_of(game: Game) -> str:
+    """Which scenarios of a game are not at hand and why; "" if all are."""
+    folder = stored_for(game)
+    if folder is None or folder.is_dir():
+        return ""
+    names = " and ".join(_name(focal, STORED) for focal in _modes(game))
+    return f"{names}: the stored population {folder} comes with a checkout of cprl, and is not there"
+
+
+def scenarios_of(game: Game) -> tuple[Scenario, ...]:
+    """All named scenarios of a game: as a majority and as a minority among each of `SCRIPTED`, and among the
+    committed population that DQN trained on this very game, if there is one and its folder is at hand.
+
+    In a game of two agents a majority and a minority are the same, so that it has the minorities alone.
+    Without a beam "territorial" and "aggressive" have nothing to fire, and are left out.
+
+    Args:
+        game: a `cprl.Game` for at least 2 agents, with windows as observations.
+
+    Raises:
+        ValueError: for any other game.
+    """
+    check_game(game)
+    everyone = range(game.agents)
+    backgrounds: dict[str, tuple[Scripted | Frozen, ...]] = {
+        policy: (Scripted(policy),) * game.agents
+        for policy in SCRIPTED
+        if game.rules.may_fire or policy not in ("territorial", "aggressive")
+    }
+    folder = stored_for(game)
+    if folder is not None and folder.is_dir():
+        backgrounds[STORED] = tuple(Frozen(str(folder), agent, replica=None) for agent in everyone)
+    return tuple(
+        Scenario(name=_name(focal, name), game=game, focal=focal, background=background)
+        for name, background in backgrounds.items()
+        for focal in _modes(game)
+    )
+
+
+def check_game(game: object) -> None:
+    """Checks that a game can have scenarios.
+
+    Raises:
+        ValueError: if it is no `cprl.Game`, has a single agent, or shows agents something else than windows.
+    """
+    arguments.object_of("game", game, Game, "a cprl.Game, because scripted agents read its windows")
+    if isinstance(game, Game) and game.agents < 2:
+        raise ValueError(f"the game has {game.agents} agent; allowed for scenarios: at least 2")
+    if isinstance(game, Game) and game.observation.area != "window":
+        raise ValueError(
+            f"Observation.area is {game.observation.area!r}; allowed for scenarios: 'window', because "
+            "scripted agents rely on the agent's position in it"
+        )
+
+
+def _modes(game: Game) -> tuple[Focal, ...]:
+    return ("minority",) if game.agents == 2 else ("majority", "minority")
+
+
+def _name(focal: Focal, background: str) -> str:
+    return f"{focal}_among_{background}"
+
+
+FocalAgents: TypeAlias = Literal["run", "random", "greedy"]
+"""Who takes the focal places: the run's agents, or agents that follow a scripted policy."""
+FOCAL_AGENTS: Final[tuple[FocalAgents, ...]] = get_args(FocalAgents)
+
+Whose: TypeAlias = Literal["focal", "background"]
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Score:
+    """The episodes of one scenario."""
+
+    scenario: Scenario
+    played: Mapping[FocalAgents, Mapping[tuple[int, ...], Played]] = field(repr=False)
+    """The episodes by who is focal, the indices of the focal agents, and the replica."""
+
+    def measures(self, focal: FocalAgents = "run") -> dict[str, Measured]:
+        """focal/return and background/return, the mean return of a focal and of a background agent, then the
+        social metrics of all agents together, and those of institutions as `institutions/fines` and so on;
+        intervals by Student's t.
+
+        Args:
+            focal: who takes the focal places, one of `FOCAL_AGENTS`.
+
+        Raises:
+            ValueError: if it is anything else.
+        """
+        together = pooled(self._of(focal).values())
+        return {
+            "focal/return": over_replicas(self.returns("focal", focal)),
+            "background/return": over_replicas(self.returns("background", focal)),
+            **social_measures(together),
+            **institution_measures(together),
+        }
+
+    def returns(self, whose: Whose, focal: FocalAgents = "run") -> dict[int, list[float]]:
+        """The mean return per agent by replica, of each episode of each placement.
+
+        Args:
+            whose: "focal" or "background".
+            focal: who takes the focal places.
+
+        Raises:
+            ValueError: if a word is another one.
+        """
+        arguments.choice("whose", whose, get_args(Whose))
+        values: dict[int, list[float]] = {}
+        for places, played in self._of(focal).items():
+            rest = np.setdiff1d(np.arange(self.scenario.game.agents), places)
+            agents = list(places) if whose == "focal" else rest.tolist()
+            for replica, episodes in played.items():
+                own = (float(episode.return_[agents].mean()) for episode in episodes)
+                values.setdefault(replica, []).extend(own)
+        return values
+
+    def advantage(self, over: FocalAgents, *, whose: Whose = "focal") -> Estimate:
+        """What the run's agents get more than others would in their places; or what the background gets
+        more among them. Paired by replica, which plays the same worlds; the interval is by Student's t.
+
+        Args:
+            over: "random" or "greedy".
+            whose: "focal" or "background".
+
+        Raises:
+            ValueError: if a word is another one.
+        """
+        own, other = self.returns(whose), self.returns(whose, over)
+        means = [[fmean(values[replica]) for replica in own] for values in (own, other)]
+        return difference(*means, paired=True)
+
+    def _of(self, focal: FocalAgents) -> Mapping[tuple[int, ...], Played]:
+        arguments.choice("focal", focal, FOCAL_AGENTS)
+        return self.played[focal]
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Scores:
+    """What a run reached in scenarios."""
+
+    run: LoadedRun
+    by_scenario: Mapping[str, Score] = field(repr=False)
+    """The scores by the name of the scenario."""
+    replicas: list[int]
+    episodes: int
+    """Episodes of each replica in each placement."""
+    seed: int
+    greedy: bool
+    left_out: str
+    """Which named scenarios of the game were not at hand and why; "" if none was, or others were asked
+    for."""
+
+    def table(self) -> pa.Table:
+        """All episodes with the columns of `episodes.parquet`, after "scenario", "focal" (who takes the focal
+        places: "run", "random" or "greedy") and "focal_agents" (their indices, e.g. "0 2 3")."""
+        return labelled(
+            (
+                {"scenario": name, "focal": focal, "focal_agents": " ".join(map(str, places))},
+                replica,
+                episodes,
+            )
+            for name, score in self.by_scenario.items()
+            for focal, by_places in score.played.items()
+            for places, played in by_places.items()
+            for replica, episodes in played.items()
+        )
+
+
+Member: TypeAlias = Callable[[int], StoredAgent]
+"""Who plays with an agent index, by the index of the replica."""
+
+
+def run_scenarios(
+    run: str | Path | LoadedRun,
+    *,
+    scenarios: Sequence[str | Scenario] = (),
+    episodes: int = 5,
+    greedy: bool = False,
+    seed: int = SEED,
+    replicas: Sequence[int] = (),
+    allow: Sequence[str] = (),
+) -> Scores:
+    """Plays scenarios with the agents of a stored run in the focal places, and with random and with greedy
+    agents in these places, in the same worlds.
+
+    Args:
+        run: its directory, its exported results, or a value of `cprl.load`.
+        scenarios: names of `scenarios_of` the run's game, or scenarios of your own on the same game; by
+            default all that it has.
+        episodes: episodes of each replica in each placement, each in its own world.
+        greedy: whether stored agents take their best action, see `cprl.evaluate_run`.
+        seed: the seed of the worlds and of all random numbers; equal seeds give equal episodes.
+        replicas: the indices of the replicas that play; by default all.
+        allow: see `cprl.load`; for stored backgrounds too.
+
+    Raises:
+        ValueError: for a game that has no scenarios, see `scenarios_of`; for a scenario that is unknown,
+            given twice, or of another game (names the differences); if the seed trained an agent; and see
+            `cprl.evaluate_run`.
+    """
+    loaded = opened(run, allow)
+    check_game(loaded.game)
+    everyone = tuple(range(loaded.game.agents))
+    check_scripted([(Scripted("greedy"), everyone)], loaded.spaces, loaded.game)
+    chosen = _chosen(loaded, scenarios)
+    stored = _stored(loaded, chosen, allow)
+    check(episodes=episodes, seed=seed, greedy=greedy, runs=[loaded, *stored.values()])
+    numbers = chosen_replicas({str(loaded.path): loaded}, replicas)
+    _refuse_meeting_itself(loaded, chosen, stored, numbers)
+
+    def played(members: Sequence[Member]) -> Played:
+        who = partial(_policies, loaded.game, members, worlds=episodes, seed=seed)
+        return play(loaded, who, numbers, episodes=episodes, seed=seed, explore=not greedy)
+
+    scores = {}
+    for scenario in chosen:
+        background = [_background(spec, stored) for spec in scenario.background]
+        scores[scenario.name] = Score(
+            scenario=scenario,
+            played={
+                focal: {
+                    places: played(
+                        [
+                            _focal(loaded, focal, agent) if agent in places else background[agent]
+                            for agent in everyone
+                        ]
+                    )
+                    for places in scenario.placements
+                }
+                for focal in FOCAL_AGENTS
+            },
+        )
+    return Scores(
+        run=loaded,
+        by_scenario=scores,
+        replicas=numbers,
+        episodes=episodes,
+        seed=seed,
+        greedy=greedy,
+        left_out="" if scenarios else left_out_of(loaded.game),
+    )
+
+
+def _chosen(run: LoadedRun, scenarios: Sequence[str | Scenario]) -> list[Scenario]:
+    """The scenarios by their names or as they are, checked against the run's game."""
+    named = {scenario.name: scenario for scenario in scenarios_of(run.game)}
+    found: dict[str, Scenario] = {}
+    for given in arguments.listed("scenarios", scenarios, "names of scenarios, or values of Scenario"):
+        arguments.object_of("a scenario", given, (str, Scenario), "its name, or a value of Scenario")
+        if isinstance(given, str) and given not in named:
+            why = left_out_of(run.game)
+            raise ValueError(
+                f"a scenario is {given!r}; allowed for this game: {', '.join(named)}"
+                + (f"; not at hand are {why}" if why else "")
+            )
+        scenario = named[given] if isinstance(given, str) else given
+        if scenario.name in found:
+            raise ValueError(f"{scenario.name} is given twice; allowed: scenarios with different names")
+        _check_game_of(f"the scenario {scenario.name}", differences(run.game, scenario.game), run)
+        found[scenario.name] = scenario
+    return list((found or named).values())
+
+
+def _stored(run: LoadedRun, scenarios: Sequence[Scenario], allow: Sequence[str]) -> dict[str, LoadedRun]:
+    """The runs of the stored background agents by their paths."""
+    specs = (spec for scenario in scenarios for spec in scenario.background)
+    paths = dict.fromkeys(spec.run for spec in specs if isinstance(spec, Frozen))
+    runs = {path: load(path, allow=allow) for path in paths}
+    for path, stored in runs.items():
+        found = differences(run.game, stored.game) + transform_differences(run, stored)
+        _check_game_of(f"the background {path}", found, run)
+    return runs
+
+
+def _check_game_of(what: str, found: Sequence[str], run: LoadedRun) -> None:
+    if found:
+        raise ValueError(
+            f"{run.path} and {what} have different games: {'; '.join(found)}; allowed: the same game"
+        )
+
+
+def _focal(run: LoadedRun, focal: FocalAgents, agent: int) -> Member:
+    """The agent in a focal place."""
+    if focal == "run":
+        return lambda replica: run.agent(agent, replica=replica)
+    return lambda _: StoredAgent(("scripted", focal))
+
+
+def _background(spec: Scripted | Frozen, stored: Mapping[str, LoadedRun]) -> Member:
+    """The agent in a background place; see `Scenario.background`."""
+    if isinstance(spec, Scripted):
+        return lambda _: StoredAgent(("scripted", spec.policy))
+    run = stored[spec.run]
+
+    def theirs(replica: int) -> StoredAgent:
+        number = _following(run, replica) if spec.replica is None else spec.replica_for(replica)
+        return run.agent(spec.agent, replica=number)
+
+    return theirs
+
+
+def _following(run: LoadedRun, replica: int) -> int:
+    """The number of the replica of a background that plays beside this one: of those that it keeps the next,
+    the first after the last."""
+    kept = run.replicas  # some may be missing
+    before = kept.index(replica) if replica in kept else replica
+    return kept[(before + 1) % len(kept)]
+
+
+def _refuse_meeting_itself(
+    run: LoadedRun, scenarios: Sequence[Scenario], stored: Mapping[str, LoadedRun], replicas: Sequence[int]
+) -> None:
+    """Raises a ValueError for a background that has no other replica than one that it would play beside."""
+    for scenario in scenarios:
+        for spec in scenario.background:
+            if not isinstance(spec, Frozen) or spec.replica is not None:
+                continue
+            own = stored[spec.run]
+            if (
+                own.experiment.seed == run.experiment.seed
+                and len(own.replicas) == 1
+                and own.replicas[0] in replicas
+            ):
+                raise ValueError(
+                    f"the scenario {scenario.name} has the background {own.path}, which keeps the single "
+                    f"replica {own.replicas[0]}, so that agents trained together or from the same seed, "
+                    f"{run.experiment.seed}, would meet; allowed: a run of at least 2 replicas, one of "
+                    "another seed, or a Frozen with the number of its replica"
+                )
+
+
+def _policies(
+    game: Any, members: Sequence[Member], replicas: Sequence[int], *, worlds: int, seed: int
+) -> AgentPolicies:
+    """The policies of all agents of these replicas."""
+    found = [[member(replica) for replica in replicas] for member in members]
+    return stored_policies(found, game, replicas=replicas, worlds=worlds, seed=seed)
+
+
+SOCIAL: Final = ("collective_return", "equality", "sustainability", "survival_steps", "peacefulness")
+"""The social metrics of the table in the terminal; the others are in `estimates`."""
+
+_SCHEMA: Final = pa.schema(
+    [
+        ("scenario", pa.string()),
+        ("focal", pa.string()),
+        ("metric", pa.string()),
+        ("value", pa.float64()),
+        ("low", pa.float64()),
+        ("high", pa.float64()),
+        ("replicas", pa.int32()),
+        ("episodes", pa.int32()),
+        ("undefined", pa.int32()),
+    ]
+)
+
+
+def heading(scores: Scores) -> str:
+    """The heading of the tables."""
+    how = how_they_play([scores.run], scores.greedy)
+    return (
+        f"Scenarios of {scores.run.path.name}: {len(scores.replicas)} replicas, {scores.episodes} episodes "
+        f"each in each placement, seed {scores.seed}{how}\nmean over replicas [95 % interval by Student's t]"
+    )
+
+
+def scenario_tables(scores: Scores) -> Iterator[Table]:
+    """A table of returns, a row for each scenario, and one of social metrics of all agents together."""
+    yield _returns_table(scores)
+    yield _social_table(scores)
+
+
+def _returns_table(scores: Scores) -> Table:
+    table = Table(title="return per agent (apples)", title_justify="left")
+    table.add_column("scenario")
+    for name in (
+        *("focal: the run's agents", "random in their place", "greedy in their place"),
+        *("run's - random's, paired", "run's - greedy's, paired", "background"),
+    ):
+        table.add_column(name, justify="right")
+    for name, score in scores.by_scenario.items():
+        focal = [str(score.measures(who)["focal/return"]) for who in FOCAL_AGENTS]
+        ahead = [str(score.advantage(who)) for who in ("random", "greedy")]
+        table.add_row(name, *focal, *ahead, str(score.measures()["background/return"]))
+    table.caption = f"Left out: {scores.left_out}." if scores.left_out else None
+    return table
+
+
+def _social_table(scores: Scores) -> Table:
+    table = Table(
+        title="all agents together, with the run's agents in the focal places", title_justify="left"
+    )
+    table.add_column("scenario")
+    for name in SOCIAL:
+        table.add_column(with_unit(name), justify="right")
+    for name, score in scores.by_scenario.items():
+        measures = score.measures()
+        table.add_row(name, *(str(measures[metric]) for metric in SOCIAL))
+    return table
+
+
+def estimates(scores: Scores) -> pa.Table:
+    """Every measure of every scenario as a row: "scenario", "focal" (who takes the focal places), "metric",
+    "value", "low" and "high" (null where undefined), and how many "replicas", "episodes" and "undefined"
+    episodes there were. Metrics "focal/advantage" and "background/advantage" of "random" and "greedy" are
+    what the run's agents, or the background among them, get more; see `Score.advantage`.
+
+    Raises:
+        ValueError: if `scores` is not what `run_scenarios` gave.
+    """
+    object_of("scores", scores, Scores, "what run_scenarios() gave")
+    rows: list[dict[str, Any]] = []
+    for name, score in scores.by_scenario.items():
+        for who in FOCAL_AGENTS:
+            for metric, measured in score.measures(who).items():
+                rows.append(
+                    {"scenario": name, "focal": who, "metric": metric}
+                    | _numbers(measured.estimate)
+                    | {"episodes": measured.episodes, "undefined": measured.undefined}
+                )
+            if who == "run":
+                continue
+            for whose in ("focal", "background"):
+                rows.append(
+                    {"scenario": name, "focal": who, "metric": f"{whose}/advantage"}
+                    | _numbers(score.advantage(who, whose=whose))
+                    | {"episodes": rows[-1]["episodes"], "undefined": 0}
+                )
+    return pa.Table.from_pylist(rows, schema=_SCHEMA)
+
+
+def _numbers(found: Estimate | None) -> dict[str, Any]:
+    if found is None:
+        return {"value": None, "low": None, "high": None, "replicas": 0}
+    low, high = (None if isnan(bound) else bound for bound in (found.low, found.high))
+    return {"value": found.value, "low": low, "high": high, "replicas": found.replicas}
+
+
+_LOOKS: Final[dict[tuple[FocalAgents, Whose], tuple[str, str, str]]] = {
+    ("run", "focal"): ("o", MEAN, "focal agents: the run's"),
+    ("greedy", "focal"): ("s", MARK, "greedy in their place"),
+    ("random", "focal"): ("D", "#8a8a8a", "random in their place"),
+    ("run", "background"): ("|", "#000000", "background agents, beside the run's"),
+}
+"""Marker, colour and name of each number."""
+_ROW_IN: Final = 0.55
+_BAND: Final = 0.16
+"""The distance between two numbers of a scenario, in rows."""
+
+
+def draw_scenarios(scores: Scores, path: Path | str) -> Path:
+    """Draws the mean return per agent, a row for each scenario: of the run's agents in the focal places, of
+    greedy and of random ones there, and of the background; intervals by Student's t.
+
+    Args:
+        scores: what `run_scenarios` gave.
+        path: the PNG.
+
+    Raises:
+        ValueError: if the name does not end in .png.
+    """
+    object_of("scores", scores, Scores, "what run_scenarios() gave")
+    path = picture_path(path)
+    figure = Figure((8.0, _ROW_IN * len(scores.by_scenario) + 2.0), layout="constrained")
+    axes = figure.subplots()
+    _draw_rows(axes, scores)
+    figure.legend(loc="outside lower center", ncols=2, fontsize=SMALL_PT, frameon=False)
+    count = len(scores.replicas)
+    note = (
+        f"{count} replica{'s' * (count != 1)}, {scores.episodes} episodes each in each placement, the same "
+        "worlds for all; mean over replicas, 95 % interval by Student's t."
+    )
+    head(figure, f"Scenarios of {scores.run.path.name}", note)
+    return save(figure, path)
+
+
+def _draw_rows(axes: Axes, scores: Scores) -> None:
+    names = list(scores.by_scenario)
+    for place, ((who, whose), (marker, colour, label)) in enumerate(_LOOKS.items()):
+        found = [scores.by_scenario[name].measures(who)[f"{whose}/return"].estimate for name in names]
+        rows = [row + _BAND * (place - (len(_LOOKS) - 1) / 2) for row in range(len(names))]
+        values = [own for own in found if own is not None]  # a return is always defined
+        axes.plot(
+            [own.value for own in values], rows, marker, color=colour, markersize=6, label=label, zorder=3
+        )
+        for row, own in zip(rows, values, strict=True):
+            _draw_interval(axes, row, own, colour)
+    for row in range(1, len(names)):
+        axes.axhline(row - 0.5, color="#dddddd", linewidth=0.8)
+    axes.set_yticks(range(len(names)), [name.replace("_", " ") for name in names])
+    axes.set_ylim(len(names) - 0.5, -0.5)
+    axes.set_xlabel("return per agent, apples", fontsize=SMALL_PT)
+    axes.tick_params(labelsize=SMALL_PT)
+
+
+def _draw_interval(axes: Axes, row: float, own: Estimate, colour: str) -> None:
+    axes.plot([own.low, own.high], [row, row], color=colour, linewidth=2)
