@@ -1,29 +1,33 @@
-"""TakingGame: a game of people who share a resource, as something that agents play."""
+"""Games of people who share a resource: agents choose at once how much they take, once or for several turns.
+
+`TakingGame` is a `cprl.theory.SharingGame` that agents play, and `TakingEnv` plays B worlds of one.
+"""
 
 from dataclasses import KW_ONLY, dataclass, fields
-from typing import TYPE_CHECKING, Any, Final
+from typing import Any, ClassVar, Final
 
 import numpy as np
+import torch
+from torch import Tensor
 
 from cprl.checks import NONE, Check, check_fields, count, either, instance, is_number
+from cprl.envs.stage_games import CLOCK_CHECKS, StageEnv, StageGame
 from cprl.theory.sharing import SharingGame
-
-if TYPE_CHECKING:
-    from cprl.envs.taking.env import TakingEnv
 
 _MOST_TOTALS: Final = 2**22
 """How many totals there may be when agents choose from levels."""
+OBSERVED: Final = ("played", "own", "total")
+"""The numbers by which an agent observes a turn: 1 if there was such a turn, the share that it took of the
+most that it can take, and the share that all took of the most that all can take."""
 
 
 @dataclass(frozen=True)
-class TakingGame:
+class TakingGame(StageGame):
     """A game in which each of n agents chooses, all at once, how much it takes of what they share.
 
     Agents are paid `SharingGame.payoffs`. They choose one of `levels` evenly spaced amounts from 0 to
-    `most_each`. Where it is played for several turns, agents
-    observe what they took in the last ones. An episode of one turn terminates. One of several is truncated:
-    its end is a clock that nobody sees, so agents learn as if it went on; with a `continue_prob` below 1 it
-    terminates where no further turn follows.
+    `most_each`. Where it is played for several turns, agents observe what they took in the last ones. When it
+    ends, see `StageGame`.
 
     A recipe holds games whose worth is a `PowerWorth`. A worth of your own, e.g. a `CallableWorth`, can be
     played; in an experiment the game is then a `Custom` of a function that makes it.
@@ -50,28 +54,29 @@ class TakingGame:
 
     def __post_init__(self) -> None:
         check_fields(self, _CHECKS)
-        name = "TakingGame"
-        if self.turns == 1 and self.continue_prob < 1:
-            raise ValueError(
-                f"{name}.continue_prob is {self.continue_prob}; allowed in a game of one turn: 1.0"
-            )
+        self.check_clock()
         limit = self.sharing.most_each
         if self.most is None and self.sharing.nash_total <= 0:
             raise ValueError(
-                f"{name}.most is None; allowed in a game in which nobody gains by taking: a number above 0"
+                "TakingGame.most is None; allowed where nobody gains by taking: a number above 0"
             )
         if self.most is not None and limit is not None and self.most > limit:
-            raise ValueError(f"{name}.most is {self.most:g}; allowed: up to sharing.most_each, {limit:g}")
+            raise ValueError(f"TakingGame.most is {self.most:g}; allowed: up to sharing.most_each, {limit:g}")
         if self.agents * (self.levels - 1) >= _MOST_TOTALS:
             raise ValueError(
-                f"{name}.levels is {self.levels}; allowed for {self.agents:,} agents: so many that they have "
-                f"fewer than {_MOST_TOTALS:,} totals"
+                f"TakingGame.levels is {self.levels}; allowed for {self.agents:,} agents: so many that they "
+                f"have fewer than {_MOST_TOTALS:,} totals"
             )
 
     @property
     def agents(self) -> int:
         """The number of agents N."""
         return self.sharing.agents
+
+    @property
+    def actions(self) -> int:
+        """The number of actions: `levels`."""
+        return self.levels
 
     @property
     def most_each(self) -> float:
@@ -86,19 +91,12 @@ class TakingGame:
         """What an agent takes by its action 0, 1 and so on."""
         return tuple(np.linspace(0, self.most_each, self.levels).tolist())
 
-    @property
-    def remembered(self) -> int:
-        """The number of turns that agents observe: `memory`, or what its default means."""
-        return int(self.turns > 1) if self.memory is None else self.memory
-
     def to_config(self) -> dict[str, Any]:
         """Its fields."""
         return {own.name: getattr(self, own.name) for own in fields(self)}
 
     def make(self, worlds: int, seed: int, device: Any, *, first_world: int = 0) -> "TakingEnv":
         """Its environment, so many worlds; see `TakingEnv`."""
-        from cprl.envs.taking.env import TakingEnv
-
         return TakingEnv(self, worlds, seed=seed, device=device, first_world=first_world)
 
 
@@ -113,7 +111,35 @@ _CHECKS: Final[dict[str, Check]] = {
     "sharing": instance(SharingGame, "a cprl.theory.SharingGame, e.g. herders(5)"),
     "levels": count(2, 2**16),
     "most": either(NONE, Check(_is_positive, f"a number above 0, up to {_MOST:g}")),
-    "turns": count(1),
-    "memory": either(NONE, count(0, 64)),
-    "continue_prob": Check(lambda value: is_number(value, 0, 1) and value > 0, "a number above 0, at most 1"),
+    **CLOCK_CHECKS,
 }
+
+
+class TakingEnv(StageEnv):
+    """B worlds of a `TakingGame`; entries as in `StageEnv`, rewards computed in double precision.
+
+    Of each remembered turn, the last one first, agents observe the numbers of `OBSERVED`; all 0 for a turn
+    before the first.
+    """
+
+    memory_name: ClassVar[str] = "seen"
+    game: TakingGame
+
+    def prepare(self) -> Tensor:
+        game, totals = self.game, self.game.agents * (self.game.levels - 1) + 1
+        taken = np.linspace(0, game.agents * game.most_each, totals)
+        gains = np.vectorize(game.sharing.worth.at, otypes=[np.float64])(taken) - game.sharing.cost
+        self._amounts = torch.tensor(game.amounts, dtype=torch.float64, device=self.device)
+        self._gains = torch.from_numpy(gains).to(self.device)
+        """What a unit is worth beyond its cost, by the sum of all levels."""
+        return torch.zeros(len(OBSERVED), device=self.device)
+
+    def pay(self, action: Tensor) -> tuple[Tensor, Tensor]:
+        total, most = action.sum(-1, keepdim=True), self.game.levels - 1
+        paid = self._amounts[action] * self._gains[total] + self.game.sharing.payment
+        own, of_all = action / most, total / (most * self.game.agents)
+        turn = torch.stack((torch.ones_like(own), own, of_all.expand_as(own)), -1).float()
+        return paid.float(), turn.clamp(0, 1)
+
+    def observe(self, memory: Tensor) -> Tensor:
+        return memory.flatten(2).clone()
