@@ -34,7 +34,7 @@ from viewers import VIEWER, native_viewer
 
 from cprl.commons.colours import APPLE, PALETTE
 
-IMPORTS = "import cprl; cprl.recipe_main; import cprl.running"
+IMPORTS = "import cprl; cprl.recipe_main; import cprl.training.running"
 ADDRESS = re.compile(r"rerun\+http://127\.0\.0\.1:\d+/proxy")
 COMMAND = ("recipes/tragedy.py", "--watch", "serve", "--linger")
 LATER_S = (10.0, 60.0, 120.0)

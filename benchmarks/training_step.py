@@ -28,7 +28,7 @@ from cprl import CommonsEnv, presets
 from cprl.learners.replay import ReplayLearner
 from cprl.measuring.episodes import EpisodeTracker
 from cprl.policies.assignment import AgentPolicies
-from cprl.process import prepare_process
+from cprl.system.process import prepare_process
 from cprl.training import Training
 
 CASES: Final[tuple[tuple[presets.Board, int, int], ...]] = (

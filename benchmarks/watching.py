@@ -34,7 +34,7 @@ from cprl.learners.replay import ReplayLearner
 from cprl.measuring import Episode
 from cprl.policies.lanes import random_agents
 from cprl.policies.present import PresentPolicy
-from cprl.process import prepare_process
+from cprl.system.process import prepare_process
 from cprl.training import Training
 from cprl.viewer.callback import ViewerCallback
 

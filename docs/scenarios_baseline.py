@@ -17,8 +17,8 @@ import tyro
 
 from cprl.evaluation import draw_scenarios, run_scenarios
 from cprl.evaluation.scenarios import estimates
-from cprl.process import prepare_process
 from cprl.runs.files import write_atomically
+from cprl.system.process import prepare_process
 
 DOCS: Final = Path(__file__).parent
 OUT: Final = DOCS / "results" / "scenarios"

@@ -26,25 +26,25 @@ from torchrl.objectives import DQNLoss, HardUpdate
 import cprl
 from cprl import CommonsEnv, presets
 from cprl.algorithms import DQN
-from cprl.callbacks import Callback
-from cprl.collectors import StepCollector
-from cprl.commandline import in_a_sentence
+from cprl.commands.recipe import in_a_sentence
 from cprl.learners.settings import DQNSettings
 from cprl.learners.transitions import transitions_of
 from cprl.measuring.episodes import EpisodeTracker
 from cprl.measuring.evaluate import evaluate
 from cprl.networks.mlp import MLPNetwork
-from cprl.output import printed, say
 from cprl.policies.assignment import AgentPolicies
 from cprl.policies.single import RandomActor
 from cprl.population import Learning, exploration_steps
 from cprl.runs.directory import start_run
 from cprl.runs.episodes import EpisodeTable
 from cprl.runs.weights import BestWeights, restore_weights, save_weights
-from cprl.shipped import cprl_here
+from cprl.system.output import printed, say
+from cprl.system.shipped import cprl_here
 from cprl.terminal.figures import training_curve
 from cprl.terminal.progress import ProgressBar
 from cprl.terminal.summary import summarise
+from cprl.training.callbacks import Callback
+from cprl.training.collectors import StepCollector
 from cprl.viewer.callback import ViewerCallback
 from cprl.viewer.streams import check_watch
 

@@ -19,12 +19,12 @@ from typing import Literal
 
 import tyro
 
-from cprl.commandline import in_a_sentence
-from cprl.output import say
-from cprl.process import prepare_process
+from cprl.commands.recipe import in_a_sentence
 from cprl.reporting import write_report
 from cprl.runs.export import export_results
-from cprl.shipped import recipe_named
+from cprl.system.output import say
+from cprl.system.process import prepare_process
+from cprl.system.shipped import recipe_named
 
 AS_RUN = ("--variant", "as_run")
 DECAY_500K = ("--epsilon-decay-steps", "500000")

@@ -13,9 +13,9 @@ from pathlib import Path
 import cprl
 from cprl import presets
 from cprl.algorithms import DQN
-from cprl.output import printed, say
 from cprl.population import Learning
-from cprl.shipped import cprl_here
+from cprl.system.output import printed, say
+from cprl.system.shipped import cprl_here
 from cprl.terminal.course import course_of, in_sentences
 
 SHORT = {"learning_rate": 1e-4, "epsilon_decay_steps": 100_000, "gamma": 0.95}

@@ -29,7 +29,6 @@ from torchrl.envs import (
 from torchrl.envs.utils import check_env_specs
 
 from cprl import CommonsEnv, Game, Rules, maps
-from cprl.collectors import StepCollector
 from cprl.envs import spaces_of
 from cprl.evaluation.evaluate import run_table
 from cprl.measuring import EpisodeTracker, social
@@ -45,6 +44,7 @@ from cprl.runs.labelled import labelled
 from cprl.terminal.figures import training_curve
 from cprl.terminal.progress import ProgressBar
 from cprl.terminal.summary import summarise
+from cprl.training.collectors import StepCollector
 from cprl.viewer.callback import ViewerCallback
 
 GAME = Game(

@@ -15,13 +15,13 @@ import train_and_die
 from rich.console import Console
 
 from cprl.algorithms import PPO, RolloutSettings
+from cprl.commons.spaces import Spaces
 from cprl.learners.lanes import SAMPLING, lane_seeds
 from cprl.policies.rng import DRAWN_AHEAD, LaneRng
 from cprl.runs.checkpoints import Checkpointer, checkpoints_in, read_checkpoint
 from cprl.runs.episodes import EpisodeTable, read_episodes
 from cprl.runs.files import write_atomically
 from cprl.runs.weights import load_weights
-from cprl.spaces import Spaces
 
 SCRIPT = Path(train_and_die.__file__)
 EPISODES = 25

@@ -10,13 +10,13 @@ import cprl
 from cprl import CommonsEnv, Map, presets
 from cprl.arguments import callable_of, object_of, objects, path, texts
 from cprl.checks import plain
-from cprl.collectors import StepCollector
 from cprl.learners.lanes import weights_to_start
 from cprl.measuring.evaluate import evaluate
-from cprl.output import say
 from cprl.population import Scripted
 from cprl.runs.episodes import read_episodes
 from cprl.runs.export import export_results
+from cprl.system.output import say
+from cprl.training.collectors import StepCollector
 from cprl.viewer.callback import ViewerCallback
 
 COMMONS = presets.game("commons")

@@ -12,11 +12,12 @@ import pytest
 from my_game import Dilemma
 
 import cprl
-from cprl import Experiment, cli, presets
+from cprl import Experiment, presets
 from cprl.algorithms import DQN, PPO, QMIX, DQNSettings, RolloutSettings
-from cprl.commandline import RunOptions, parse, recipe_main
+from cprl.commands import main as cli
+from cprl.commands.flags import applied, docs, flags_of
+from cprl.commands.recipe import RunOptions, parse, recipe_main
 from cprl.custom import Custom
-from cprl.flags import applied, docs, flags_of
 from cprl.institutions import GraduatedSanctions, Quota
 from cprl.networks import MLP
 from cprl.population import Learning, Scripted, Team
@@ -280,14 +281,14 @@ def test_the_command_of_every_stored_result_still_gives_its_experiment(path):
 
 @pytest.fixture
 def runs(monkeypatch):
-    """What `cprl.running.run` was asked for, which trains nothing."""
+    """What `cprl.training.running.run` was asked for, which trains nothing."""
     asked = []
 
     def run(experiment, out=None, **how):
         asked.append((experiment, out, how))
         return Path("a run")
 
-    monkeypatch.setitem(sys.modules, "cprl.running", SimpleNamespace(run=run))
+    monkeypatch.setitem(sys.modules, "cprl.training.running", SimpleNamespace(run=run))
     return asked
 
 

@@ -26,11 +26,12 @@ from torchrl.envs import EnvBase
 from torchrl.modules import QValueActor
 from torchrl.objectives import DiscreteCQLLoss, DQNLoss, SoftUpdate, ValueEstimators
 
-from cprl import CommonsEnv, Game, Rules, compat, keys, maps
+from cprl import CommonsEnv, Game, Rules, keys, maps
 from cprl.commons import compiled
-from cprl.compat import LaneCategorical, losses, recordings
 from cprl.learners.engine.functional import FunctionalLoss, total, weights_of
-from cprl.libraries import fitting_versions, relying_on, require
+from cprl.system import compat
+from cprl.system.compat import LaneCategorical, losses, recordings
+from cprl.system.libraries import fitting_versions, relying_on, require
 
 SOURCE = Path(compat.__file__).parents[1]
 SHORT = Game(
@@ -571,7 +572,7 @@ def test_private_parts_of_libraries_are_used_in_their_home_alone():
         for number, line in enumerate(path.read_text().splitlines(), 1)
         if any(re.search(part, line) for part in LIBRARY_PARTS)
     ]
-    assert found == [], "move these into cprl.compat, with a test here"
+    assert found == [], "move these into cprl.system.compat, with a test here"
 
 
 def test_a_policy_that_is_nan_changes_nothing_of_the_others():
@@ -600,7 +601,7 @@ _RECORDINGS = """
 import os, sys
 from pathlib import Path
 import rerun as rr
-from cprl.compat import end_recordings
+from cprl.system.compat import end_recordings
 from cprl.viewer.logger import RerunLogger
 
 folder = Path(sys.argv[1])

@@ -6,8 +6,8 @@ import pytest
 import torch
 from tensordict import TensorDict
 
-from cprl import compiling
-from cprl.compiling import Compiled, largest_difference
+from cprl.system import compiling
+from cprl.system.compiling import Compiled, largest_difference
 
 
 def scaled_in_place(owner, values, factor):

@@ -32,9 +32,8 @@ from cprl.algorithms import (
     Tabular,
     TabularSettings,
 )
-from cprl.config import KINDS, custom_targets, from_config, to_config
+from cprl.config import KINDS, custom_targets, differences, from_config, to_config
 from cprl.custom import Custom
-from cprl.differences import differences
 from cprl.envs.matrix import MatrixGame, prisoners_dilemma
 from cprl.envs.taking import TakingGame
 from cprl.institutions import (

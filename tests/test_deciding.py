@@ -12,11 +12,10 @@ from hypothesis import strategies as st
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 
 import cprl
-from cprl import CommonsEnv, Custom, Experiment, Game, Rules, cli, keys, maps
-from cprl.agents import Population
+from cprl import CommonsEnv, Custom, Experiment, Game, Rules, keys, maps
 from cprl.algorithms import DQN, VDN, DQNSettings, Tabular, TabularSettings
-from cprl.collectors import stock_collector
-from cprl.commandline import parse
+from cprl.commands import main as cli
+from cprl.commands.recipe import parse
 from cprl.envs.make_env import make_env
 from cprl.evaluation.film import film, film_video
 from cprl.evaluation.lanes import Turns
@@ -25,7 +24,6 @@ from cprl.institutions import Sanctioner, Tax, Vote
 from cprl.institutions.deciding import choice_of
 from cprl.learners.decisions import Bandit, BanditDecider
 from cprl.measuring.evaluate import evaluate
-from cprl.outcome import evaluate_population, exhibited, random_play
 from cprl.policies.assignment import AgentPolicies
 from cprl.policies.decisions import UNTRIED, Decider, choices_of, decision_of
 from cprl.policies.lanes import random_agents
@@ -34,6 +32,9 @@ from cprl.runs.episodes import read_episodes
 from cprl.runs.export import export_results
 from cprl.runs.weights import load_weights
 from cprl.training import Training, train
+from cprl.training.agents import Population
+from cprl.training.collectors import stock_collector
+from cprl.training.outcome import evaluate_population, exhibited, random_play
 
 RULES = Rules(
     regrow_prob=(0.0, 0.5), window_rows=3, window_columns=3, episode_steps=8, may_fire=False, freeze_steps=1

@@ -13,7 +13,7 @@ import pytest
 from rerun.chunk import RrdReader
 from test_rerun_logger import trained
 
-from cprl import cli
+from cprl.commands import main as cli
 from cprl.measuring import institutions, names
 from cprl.measuring.series import OF_AGENTS
 from cprl.runs.columns import OF_INSTITUTIONS

@@ -9,7 +9,8 @@ from urllib.request import Request, urlopen
 
 import pytest
 
-from cprl import cli, docs_cli
+from cprl.commands import docs as docs_cli
+from cprl.commands import main as cli
 from cprl.viewer import page
 
 VIEWER = {name: name.encode() for name in page._FILES}

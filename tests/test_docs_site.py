@@ -16,9 +16,9 @@ from rerun.chunk import RrdReader
 from viewers import browser, wait_until
 from website import navigation, pages, reference, replays
 
-from cprl.cli import COMMANDS
+from cprl.commands.docs import SITE, Handler, Server
+from cprl.commands.main import COMMANDS
 from cprl.commons.colours import APPLE, FIRST_AGENT
-from cprl.docs_cli import SITE, Handler, Server
 
 ROOT = Path(__file__).parents[1]
 DOCS = ROOT / "docs"

@@ -10,9 +10,9 @@ from torchrl.envs.utils import ExplorationType, set_exploration_type
 
 from cprl import CommonsEnv, Game, Rules, keys, maps, presets
 from cprl.algorithms import DQN
+from cprl.commons.spaces import Spaces
 from cprl.learners.settings import DQNSettings
 from cprl.learners.transitions import transitions_of
-from cprl.spaces import Spaces
 
 SHORT = Game(
     map=maps.parse(".A>.A\n.A.A.\n..<.A"),

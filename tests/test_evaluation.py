@@ -15,8 +15,8 @@ from PIL import Image
 from test_population import ALGORITHMS
 
 import cprl
-from cprl import CommonsEnv, Experiment, Game, Observation, Rules, cli, maps, presets
-from cprl.agents import Population
+from cprl import CommonsEnv, Experiment, Game, Observation, Rules, maps, presets
+from cprl.commands import main as cli
 from cprl.envs.make_env import spaces_of
 from cprl.evaluation import draw_gains, gains
 from cprl.evaluation.cross_play import diagonal_returns
@@ -32,11 +32,12 @@ from cprl.networks.mlp import MLPNetwork
 from cprl.policies.assignment import AgentPolicies
 from cprl.policies.lanes import LaneActor, random_agents
 from cprl.population import Frozen, Learning, Scripted
-from cprl.process import one_thread
 from cprl.runs.checkpoints import Checkpointer
 from cprl.runs.directory import start_run
-from cprl.stored_agents import StoredAgent, stored_policies
+from cprl.system.process import one_thread
 from cprl.training import train
+from cprl.training.agents import Population
+from cprl.training.stored_agents import StoredAgent, stored_policies
 
 CORRIDORS = Game(
     map=maps.parse(

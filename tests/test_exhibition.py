@@ -14,12 +14,12 @@ from torchrl.envs import Transform
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 
 from cprl import Custom, Experiment, Game, Rules, maps
-from cprl.agents import Population
 from cprl.algorithms import DQN, MAPPO, PPO, DQNSettings, RolloutSettings
 from cprl.envs.make_env import make_env
-from cprl.outcome import exhibited, fresh_env
 from cprl.population import Learning, Scripted, Team
 from cprl.training import train
+from cprl.training.agents import Population
+from cprl.training.outcome import exhibited, fresh_env
 from cprl.viewer import exhibition
 from cprl.viewer.callback import ViewerCallback
 from cprl.viewer.exhibition import BATCH_S, BATCH_STEPS, Exhibition, caption_of

@@ -10,7 +10,8 @@ import torch
 from imageio_ffmpeg import get_ffmpeg_exe
 from PIL import Image
 
-from cprl import Experiment, Game, Rules, cli, load, maps
+from cprl import Experiment, Game, Rules, load, maps
+from cprl.commands import main as cli
 from cprl.commons.colours import APPLE, GROUND, PALETTE, agent_colour
 from cprl.commons.picture import EMPTY_SITE_COLOUR
 from cprl.evaluation import film_pictures

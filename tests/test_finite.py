@@ -31,9 +31,8 @@ from cprl.algorithms import (
     Tabular,
     TabularSettings,
 )
-from cprl.commandline import parse
+from cprl.commands.recipe import parse
 from cprl.envs.make_env import spaces_of
-from cprl.finite import FiniteCheck, NotFinite, NotFiniteError, places, summary
 from cprl.learners.base import LaneLosses
 from cprl.learners.engine.base import ListEngine
 from cprl.learners.lola.networks import LOLANetworks
@@ -42,6 +41,7 @@ from cprl.networks.finite import all_finite, finite_lanes
 from cprl.population import Learning
 from cprl.runs.checkpoints import Checkpointer, checkpoints_in
 from cprl.training import Training, train
+from cprl.training.finite import FiniteCheck, NotFinite, NotFiniteError, places, summary
 
 GAME = Game(
     map=maps.parse(".A>.A.A\nA.A...A\n..<.A.A"),

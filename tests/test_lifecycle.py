@@ -15,8 +15,9 @@ import torch
 from test_one_road import MEADOW, REPLAY
 
 import cprl
-from cprl import Custom, cli, maps, running
+from cprl import Custom, maps
 from cprl.algorithms import DQN
+from cprl.commands import main as cli
 from cprl.population import Frozen, Learning, Scripted
 from cprl.runs.checkpoints import Checkpointer, checkpoints_in, is_ending, read_checkpoint
 from cprl.runs.directory import start_run
@@ -25,7 +26,8 @@ from cprl.runs.export import export_results
 from cprl.runs.files import checksum, refuse_to_write_over
 from cprl.runs.lock import RunLock, RunLockedError
 from cprl.runs.weights import load_weights, save_weights
-from cprl.shipped import cprl_here
+from cprl.system.shipped import cprl_here
+from cprl.training import running
 
 LEARNING = Learning(DQN(settings=replace(REPLAY, hidden_cells=(8,))))
 FIELD = replace(
@@ -90,7 +92,7 @@ def test_a_command_that_a_signal_stops_says_once_what_resumes_and_exits_as_shell
 ):
     begun = start_run(tmp_path / "begun", "field", FIELD.to_recipe)
     run_it = partial(cprl.run, callbacks=[Signals(number, 30)])
-    monkeypatch.setattr("cprl.running.run", run_it)
+    monkeypatch.setattr("cprl.training.running.run", run_it)
     words = ["cprl", "run", str(begun), "--out", str(tmp_path / "run"), "--watch", "off"]
     monkeypatch.setattr("sys.argv", words)
     with pytest.raises(SystemExit) as ended:

@@ -14,7 +14,7 @@ from rerun.chunk import RrdReader
 from test_outcome import EXPERIMENT
 
 import cprl
-from cprl.commandline import parse
+from cprl.commands.recipe import parse
 from cprl.viewer.lingering import check_linger
 
 SCRIPT = f"""

@@ -8,10 +8,10 @@ from matrix_game import MatrixGame, tit_for_tat
 from test_any_game import play
 from torchrl.record.loggers import CSVLogger
 
-from cprl.collectors import StepCollector
 from cprl.measuring import EpisodeTracker
 from cprl.runs import loggers
 from cprl.runs.loggers import LoggerCallback, check_logger, make_logger
+from cprl.training.collectors import StepCollector
 
 
 def csv_of(folder):

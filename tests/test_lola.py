@@ -18,7 +18,6 @@ from test_population import (
 
 import cprl
 from cprl import Custom, Experiment
-from cprl.agents import Population
 from cprl.algorithms import DQN, LOLA, DQNSettings, LOLASettings
 from cprl.envs.make_env import make_env, spaces_of
 from cprl.envs.matrix import prisoners_dilemma
@@ -27,6 +26,7 @@ from cprl.networks import MLP, Conv
 from cprl.objectives import loaded_dice, lola_gradients, look_ahead_losses, looked_ahead
 from cprl.population import Frozen, Learning, Scripted, Team
 from cprl.training import train
+from cprl.training.agents import Population
 
 SETTINGS = LOLASettings(
     rollout_steps=12, look_ahead_rate=1.0, hidden_cells=(8,), learning_rate=0.01, gae_lambda=0.95

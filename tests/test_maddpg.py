@@ -16,7 +16,6 @@ from torchrl.objectives import DQNLoss, SoftUpdate, ValueEstimators
 
 import cprl
 from cprl import CommonsEnv
-from cprl.agents import Population
 from cprl.algorithms import DQN, MADDPG, DQNSettings
 from cprl.algorithms.dqn import q_actor
 from cprl.envs import make_env
@@ -29,6 +28,7 @@ from cprl.networks import MLP
 from cprl.objectives import MADDPGLoss
 from cprl.objectives.maddpg import sampled_one_hot, straight_through
 from cprl.population import Frozen, Learning, Scripted, Team
+from cprl.training.agents import Population
 
 pytestmark = pytest.mark.filterwarnings("ignore:No target network updater:UserWarning")
 TEAM = MADDPG(settings=REPLAY)

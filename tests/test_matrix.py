@@ -15,8 +15,7 @@ from torchrl.envs.utils import check_env_specs
 import cprl
 from cprl import Custom, Experiment, Study
 from cprl.algorithms import DQN, PPO, DQNSettings, RolloutSettings
-from cprl.commandline import parse
-from cprl.compat import LeanStepEnv
+from cprl.commands.recipe import parse
 from cprl.envs import make_env, spaces_of
 from cprl.envs.matrix import (
     MatrixEnv,
@@ -34,6 +33,7 @@ from cprl.reporting import write_report
 from cprl.runs.episodes import read_episodes
 from cprl.runs.weights import load_weights
 from cprl.studies.trials import trials_of
+from cprl.system.compat import LeanStepEnv
 
 C, D = 0, 1
 IPD = prisoners_dilemma(turns=3)

@@ -28,6 +28,7 @@ from cprl.algorithms import (
     RolloutSettings,
     TeamAlgorithm,
 )
+from cprl.commons.spaces import Spaces
 from cprl.custom import Custom
 from cprl.learners.engine import choice
 from cprl.learners.engine.base import ListEngine
@@ -37,7 +38,6 @@ from cprl.learners.replay import ReplayLearner
 from cprl.networks import MLP, Conv, ConvNetwork, MLPNetwork
 from cprl.networks.specification import new_network
 from cprl.networks.stacked import stack_lanes
-from cprl.spaces import Spaces
 
 GAME = Game(
     map=maps.parse(".A>.A\n.A.A.\n..<.A"),

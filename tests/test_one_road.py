@@ -11,15 +11,16 @@ import pytest
 from one_road_parts import Dilemma
 
 import cprl
-from cprl import Custom, Experiment, Game, Rules, cli, maps
+from cprl import Custom, Experiment, Game, Rules, maps
 from cprl.algorithms import DQN, PPO, DQNSettings, RolloutSettings
+from cprl.commands import main as cli
 from cprl.evaluation.film import film
 from cprl.networks import Conv
 from cprl.population import Learning, Scripted
 from cprl.runs.checkpoints import checkpoints_in
 from cprl.runs.episodes import read_episodes
 from cprl.runs.weights import load_weights
-from cprl.shipped import cprl_here
+from cprl.system.shipped import cprl_here
 
 HERE = Path(__file__).parent
 REPLAY = DQNSettings(
@@ -128,7 +129,7 @@ def test_no_command_imports_what_is_not_allowed(in_one_go, monkeypatch, capsys):
 def test_it_survives_sigkill(in_one_go, tmp_path):
     run = tmp_path / "run"
     script = (
-        "import sys, functools, cprl.running as r, test_one_road as t\n"
+        "import sys, functools, cprl.training.running as r, test_one_road as t\n"
         "r.Checkpointer = functools.partial(r.Checkpointer, every_s=1e-9)\n"
         f"r.run(t.MEADOW, {str(run)!r}, watch='off', resume='--resume' in sys.argv)\n"
     )

@@ -5,7 +5,6 @@ from statistics import fmean
 import pytest
 
 from cprl import CommonsEnv, Game, Rules, maps
-from cprl.agents import Population
 from cprl.algorithms.actor_critic import IQL, SAC
 from cprl.algorithms.dqn import CQL, DQN, DistributionalDQN
 from cprl.algorithms.on_policy import A2C, PPO, Reinforce
@@ -13,6 +12,7 @@ from cprl.learners.settings import DQNSettings, RolloutSettings
 from cprl.measuring.evaluate import evaluate
 from cprl.population import Learning
 from cprl.training import train
+from cprl.training.agents import Population
 
 STEPS = 24
 GAME = Game(

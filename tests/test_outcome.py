@@ -17,10 +17,9 @@ from cprl.custom import Custom
 from cprl.envs.state import load_transforms_state, transforms_state
 from cprl.learners.settings import DQNSettings
 from cprl.measuring.evaluate import evaluate
-from cprl.outcome import evaluate_population, fresh_env, is_same_later, random_play
-from cprl.parts import make_parts
 from cprl.population import Learning, Scripted
 from cprl.runs.episodes import read_table
+from cprl.training.outcome import evaluate_population, fresh_env, is_same_later, make_parts, random_play
 
 GAME = Game(
     map=maps.parse(".A>.A\n.A.A.\n..<.A"),
@@ -67,7 +66,7 @@ def test_random_play_moves_no_generator_even_of_a_game_that_draws_from_global_on
         torch.rand(1), random.random(), np.random.rand()  # noqa: NPY002
         return env
 
-    monkeypatch.setattr("cprl.outcome.fresh_env", drawing)
+    monkeypatch.setattr("cprl.training.outcome.fresh_env", drawing)
     before = states()
     random_play(EXPERIMENT, made.population)
     assert states() == before
@@ -130,6 +129,6 @@ def test_what_transforms_have_learned_is_the_same_for_everybody_who_is_evaluated
         begun.append(transforms_state(env)["transforms.0.seen"].item())
         return evaluate(env, policy, **how)
 
-    monkeypatch.setattr("cprl.outcome.evaluate", noting)
+    monkeypatch.setattr("cprl.training.outcome.evaluate", noting)
     evaluate_population(experiment, made.env, made.population)
     assert begun == [100, 100], "random play does not count"

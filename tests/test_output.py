@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 from rich.table import Table
 
-from cprl.output import Output, console, printed
+from cprl.system.output import Output, console, printed
 
 HERE = Path(__file__).parent
 TRAINS = f"""

@@ -15,7 +15,7 @@ from cprl.policies.single import QActor, RandomActor
 from cprl.runs.directory import read_recipe
 from cprl.runs.episodes import read_episodes
 from cprl.runs.weights import load_weights, restore_weights
-from cprl.shipped import cprl_here
+from cprl.system.shipped import cprl_here
 
 _SPEC = importlib.util.spec_from_file_location(
     "own_loop", Path(__file__).parents[1] / "recipes" / "own_loop.py"

@@ -10,15 +10,16 @@ from tiny_study import FREEZE, SETTINGS, TINY
 from torchrl.envs import StepCounter, TransformedEnv
 
 import cprl
-from cprl import cli, presets
+from cprl import presets
+from cprl.commands import main as cli
 from cprl.envs import CommonsGymnasiumEnv, parallel_env
 from cprl.envs.matrix import MatrixEnv, stag_hunt
 from cprl.learners.replay import ReplayLearner
 
 PACKAGES = (
-    *("algorithms", "callbacks", "commons", "envs", "evaluation", "institutions", "keys"),
+    *("algorithms", "commons", "envs", "evaluation", "institutions", "keys"),
     *("learners", "measuring", "networks", "objectives", "policies", "population", "preferences", "presets"),
-    *("reporting", "spaces", "studies", "theory", "training", "viewer"),
+    *("reporting", "studies", "theory", "training", "viewer"),
 )
 """What users import."""
 TAKES_SECONDS = ("torch", "numba", "pyarrow", "scipy", "matplotlib", "rerun")
@@ -107,7 +108,7 @@ def test_the_viewer_exports_its_logger():
 def test_help_and_mistakes_are_answered_before_what_takes_seconds_is_imported(lines):
     run_alone(
         "import sys\n"
-        "from cprl import cli\n"
+        "from cprl.commands import main as cli\n"
         f"for words in {lines}:\n"
         "    sys.argv = ['cprl', *words]\n"
         "    try:\n"

@@ -13,7 +13,7 @@ from rerun.chunk import RrdReader
 from test_rerun_logger import SCENE, column, frames
 from test_story import headers
 
-from cprl import cli
+from cprl.commands import main as cli
 from cprl.viewer import page
 from cprl.viewer.logger import RerunLogger
 from cprl.viewer.page import LOCALHOST, Page

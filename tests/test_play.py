@@ -7,7 +7,8 @@ from pathlib import Path
 import pytest
 from matrix_game import MatrixGame
 
-from cprl import Experiment, Game, Rules, cli, maps, presets
+from cprl import Experiment, Game, Rules, maps, presets
+from cprl.commands import main as cli
 from cprl.evaluation.play import Session, board_text, help_of, open_session, play_in_terminal
 from cprl.measuring.episodes import EpisodeTracker
 from cprl.measuring.replicas import social_metrics

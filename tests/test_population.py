@@ -9,7 +9,6 @@ from torchrl.objectives import ClipPPOLoss
 
 import cprl
 from cprl import CommonsEnv, Experiment, Game, Observation, Rules, maps
-from cprl.agents import Population
 from cprl.algorithms.actor_critic import IQL, SAC
 from cprl.algorithms.base import OffPolicy
 from cprl.algorithms.dqn import CQL, DQN, DistributionalDQN
@@ -26,6 +25,7 @@ from cprl.population import Frozen, Learning, Scripted
 from cprl.preferences import WantedRewards
 from cprl.runs.checkpoints import Checkpointer, checkpoints_in
 from cprl.training import train
+from cprl.training.agents import Population
 
 GAME = Game(
     map=maps.parse(

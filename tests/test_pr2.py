@@ -13,7 +13,6 @@ from torchrl.objectives import SoftUpdate, ValueEstimators
 
 import cprl
 from cprl import CommonsEnv, Experiment, Game, Rules, keys, maps
-from cprl.agents import Population
 from cprl.algorithms import DQN, PR2, VDN, DQNSettings
 from cprl.envs import make_env
 from cprl.envs.matrix import MatrixGame, stag_hunt
@@ -24,6 +23,7 @@ from cprl.networks.joint import chosen, conditional, marginal, soft_value
 from cprl.objectives import PR2Loss
 from cprl.population import Frozen, Learning, Scripted
 from cprl.training import train
+from cprl.training.agents import Population
 
 GAME = Game(
     map=maps.parse(".A>A.A\nAA.A.A\n.A<A>A"),

@@ -13,7 +13,6 @@ from torchrl.envs import TransformedEnv
 from torchrl.envs.utils import check_env_specs
 
 from cprl import CommonsEnv, Game, Rules, maps
-from cprl.collectors import StepCollector
 from cprl.envs import make_env, parallel_env
 from cprl.envs.state import (
     check_restorable,
@@ -33,6 +32,7 @@ from cprl.preferences import (
     WantedRewards,
     wanted_rewards,
 )
+from cprl.training.collectors import StepCollector
 
 AVERSE = InequityAversion(alpha=5, beta=0.05, smoothing=0.9)
 FAIR = SocialValueOrientation(angle=math.pi / 4, weight=0.5)

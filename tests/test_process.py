@@ -9,7 +9,7 @@ import sys
 import numpy as np
 import pytest
 
-from cprl.process import _M_MMAP_THRESHOLD, _M_TRIM_THRESHOLD, prepare_process
+from cprl.system.process import _M_MMAP_THRESHOLD, _M_TRIM_THRESHOLD, prepare_process
 
 resource = pytest.importorskip("resource", reason="page faults are counted by Unix")
 

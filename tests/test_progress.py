@@ -9,8 +9,8 @@ from rich.console import Console
 from tensordict import TensorDict
 
 from cprl import CommonsEnv, Game, Rules, maps
-from cprl.compile_clock import CLOCK
 from cprl.policies.lanes import random_lanes
+from cprl.system.compile_clock import CLOCK
 from cprl.terminal import progress
 from cprl.terminal.progress import ProgressBar
 from cprl.training import train

@@ -13,12 +13,12 @@ from torchrl.objectives import DQNLoss, ValueEstimators
 
 from cprl import presets
 from cprl.algorithms import CQL, DQN, IQL, MADDPG, PR2, SAC, DQNSettings, RolloutSettings
-from cprl.compat import promise_targets
 from cprl.learners.engine.optimizers import change_weights, torch_optimizer
 from cprl.learners.torchrl.agents import make_optimizer
 from cprl.networks.joint import JointNetwork, JointValues
 from cprl.objectives import LogCoshDQNLoss, PR2Loss, log_cosh
 from cprl.objectives.log_cosh import DISTANCES, distance
+from cprl.system.compat import promise_targets
 
 # Two steps of Keras's RMSprop with rho 0.9, learning rate 0.1 and, to see where it stands, epsilon 0.5, from
 # the weight 1 along the gradients 2 and -1:

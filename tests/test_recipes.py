@@ -15,9 +15,8 @@ from rerun.chunk import RrdReader
 
 import cprl
 from cprl import CommonsEnv, presets
-from cprl.agents import Population
 from cprl.algorithms import DQN, PPO
-from cprl.commandline import parse
+from cprl.commands.recipe import parse
 from cprl.learners.replay import ReplayLearner
 from cprl.measuring.evaluate import evaluate
 from cprl.population import Learning, Scripted
@@ -28,6 +27,7 @@ from cprl.studies import StudyTable
 from cprl.studies.conditions import Condition
 from cprl.studies.tables.sources import design_of
 from cprl.training import train
+from cprl.training.agents import Population
 
 RECIPES = Path(__file__).parents[1] / "recipes"
 

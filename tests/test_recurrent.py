@@ -44,7 +44,6 @@ from cprl.algorithms import (
     Reinforce,
     RolloutSettings,
 )
-from cprl.collectors import StepCollector, stock_collector
 from cprl.config import from_config, to_config
 from cprl.envs import make_env, spaces_of
 from cprl.envs.matrix import stag_hunt
@@ -57,6 +56,7 @@ from cprl.networks import GRU, LSTM, MLP, Conv
 from cprl.networks.stacked import lane_state, stack_lanes
 from cprl.population import Frozen, Learning, Scripted, Team
 from cprl.training import train
+from cprl.training.collectors import StepCollector, stock_collector
 
 SMALL = GRU(encoder=MLP(hidden_cells=(6,)), recurrent_cells=5)
 LONG = LSTM(encoder=MLP(hidden_cells=(6,)), recurrent_cells=5)

@@ -19,13 +19,13 @@ from test_population import (
 import cprl
 from cprl import CommonsEnv, Custom, Experiment
 from cprl.algorithms import DQN, PPO, SAC, VDN, DQNSettings, RolloutSettings
-from cprl.collectors import StepCollector
 from cprl.envs import make_env, spaces_of
 from cprl.learners.replay import ReplayLearner
 from cprl.networks import GRU, LSTM, MLP, Conv
 from cprl.policies.assignment import AgentPolicies
 from cprl.population import Learning, Scripted, Team
 from cprl.training import train
+from cprl.training.collectors import StepCollector
 
 SMALL = GRU(encoder=MLP(hidden_cells=(6,)), recurrent_cells=5)
 LONG = LSTM(encoder=MLP(hidden_cells=(6,)), recurrent_cells=5)

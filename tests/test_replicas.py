@@ -11,7 +11,6 @@ from torchrl.collectors import Collector
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 
 from cprl import CommonsEnv, Game, Rules, keys, maps
-from cprl.collectors import StepCollector
 from cprl.learners.replay import ReplayLearner
 from cprl.learners.settings import DQNSettings
 from cprl.learners.transitions import lane_turn, transitions_of
@@ -21,6 +20,7 @@ from cprl.policies.lanes import LaneActor, random_lanes
 from cprl.policies.single import RandomActor
 from cprl.runs.episodes import EpisodeTable, read_episodes
 from cprl.training import train
+from cprl.training.collectors import StepCollector
 
 GAME = Game(
     map=maps.parse(".A>.A\n.A.A.\n..<.A"),

@@ -288,7 +288,7 @@ def test_agents_of_which_none_learns_are_not_called_trained(run, tmp_path):
 
 @pytest.mark.integration
 def test_the_command_writes_a_report(run, tmp_path, capsys, monkeypatch):
-    from cprl import cli
+    from cprl.commands import main as cli
 
     monkeypatch.setattr("sys.argv", ["cprl", "export", str(run), str(tmp_path / "kept")])
     cli.main()
@@ -303,7 +303,7 @@ def test_the_command_writes_a_report(run, tmp_path, capsys, monkeypatch):
 
 @pytest.mark.integration
 def test_a_report_imports_code_of_ones_own_where_it_is_allowed(tmp_path, capsys, monkeypatch):
-    from cprl import cli
+    from cprl.commands import main as cli
 
     game = cprl.Game(map=cprl.maps.parse(">.A.\n.A.<"), rules=cprl.Rules(episode_steps=5))
     target = "torchrl.envs:StepCounter"
@@ -349,7 +349,7 @@ def views_of(path):
 
 
 def test_a_stored_policy_plays_again_and_every_step_is_recorded(run, tmp_path, capsys, monkeypatch):
-    from cprl import cli
+    from cprl.commands import main as cli
 
     path, played = film(run, tmp_path / "a.rrd", replica=1, episode=3)
     steps, boards = column(path, "/world/board", "SegmentationImage:buffer", "step")
@@ -374,7 +374,7 @@ def test_a_stored_policy_plays_again_and_every_step_is_recorded(run, tmp_path, c
 
 
 def test_watch_opens_all_recordings_of_a_run_as_one(tmp_path, monkeypatch, capsys):
-    from cprl import cli
+    from cprl.commands import main as cli
 
     opened = []
     monkeypatch.setenv("DISPLAY", ":9")  # without one it is served until Ctrl-C
@@ -389,7 +389,7 @@ def test_watch_opens_all_recordings_of_a_run_as_one(tmp_path, monkeypatch, capsy
 
 
 def test_watch_waits_for_the_viewer_on_windows_where_no_program_replaces_another(tmp_path, monkeypatch):
-    from cprl import cli
+    from cprl.commands import main as cli
 
     def call(command):
         opened.append(command)
@@ -407,7 +407,7 @@ def test_watch_waits_for_the_viewer_on_windows_where_no_program_replaces_another
 
 
 def test_watch_opens_the_viewer_of_the_package_where_no_command_is_at_hand(tmp_path, monkeypatch):
-    from cprl import cli
+    from cprl.commands import main as cli
 
     opened = []
     (tmp_path / "run.rrd").touch()
@@ -420,7 +420,7 @@ def test_watch_opens_the_viewer_of_the_package_where_no_command_is_at_hand(tmp_p
 
 
 def test_watch_refuses_a_file_that_is_no_recording(tmp_path):
-    from cprl import cli
+    from cprl.commands import main as cli
 
     (tmp_path / "recipe.json").touch()
     with pytest.raises(ValueError, match=r"recipe\.json is no recording; allowed: .* that ends in \.rrd"):

@@ -10,6 +10,7 @@ import pytest
 from tiny_study import FREEZE, GAMMA, TINY
 
 from cprl.algorithms import PPO, RolloutSettings
+from cprl.commands.studies import SweepOptions, wanted
 from cprl.population import Learning
 from cprl.runs.curves import as_curves, curves_of
 from cprl.runs.episodes import read_table
@@ -17,7 +18,6 @@ from cprl.studies import Integers, LogUniform, Search, Uniform, read_study, run_
 from cprl.studies.points import value_of
 from cprl.studies.search import FILE_NAME, JOURNAL
 from cprl.studies.trials import Outcome, trials_of
-from cprl.studies_cli import SweepOptions, wanted
 
 optuna = pytest.importorskip("optuna")
 

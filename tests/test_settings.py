@@ -35,8 +35,7 @@ from cprl.algorithms import (
     TabularSettings,
 )
 from cprl.checks import MOST_NESTED, plain
-from cprl.collectors import stock_collector
-from cprl.commandline import parse, recipe_main
+from cprl.commands.recipe import parse, recipe_main
 from cprl.config import KINDS, from_config, to_config
 from cprl.envs.matrix import prisoners_dilemma
 from cprl.envs.taking import TakingGame
@@ -58,16 +57,17 @@ from cprl.learners.replay import ReplayLearner
 from cprl.learners.rollouts import RolloutLearner
 from cprl.learners.settings import Exploring
 from cprl.learners.tabular import TabularLearner
-from cprl.memory import TooLargeError
 from cprl.networks import GRU, LSTM, MLP, Conv, ConvNetwork, MLPNetwork
 from cprl.networks.specification import new_network
 from cprl.policies.rng import LaneRng
 from cprl.population import Frozen, Learning, Scripted, Team, specs_by_agent
 from cprl.preferences import Exchange, InequityAversion, SocialValueOrientation
-from cprl.running import run
 from cprl.runs.directory import read_recipe
 from cprl.runs.files import read_json
+from cprl.system.memory import TooLargeError
 from cprl.theory import PowerWorth, appropriation, herders
+from cprl.training.collectors import stock_collector
+from cprl.training.running import run
 
 GAME = presets.game("two_complex")
 REPLAY, ROLLOUTS, TABLES, LOOKS = DQNSettings(), RolloutSettings(), TabularSettings(), LOLASettings()
@@ -554,7 +554,7 @@ MANY = {**HOW, "replicas": 2**20}
 )
 @pytest.mark.parametrize("engine", ["eager", "torchrl"])
 def test_what_no_memory_has_is_refused_before_it_is_allocated(algorithm, how, engine, message, monkeypatch):
-    for place in ("memory", "learners.buffer.sampler"):
+    for place in ("system.memory", "learners.buffer.sampler"):
         monkeypatch.setattr(f"cprl.{place}.free_bytes", lambda device="cpu": 2 * 2**30)
     with pytest.raises(TooLargeError, match=message) as refused:
         algorithm.make_learner(SPACES, **{**how, "engine": engine})
@@ -562,13 +562,13 @@ def test_what_no_memory_has_is_refused_before_it_is_allocated(algorithm, how, en
 
 
 def test_tables_of_too_many_agents_are_refused_too(monkeypatch):
-    monkeypatch.setattr("cprl.memory.free_bytes", lambda device="cpu": 2 * 2**30)
+    monkeypatch.setattr("cprl.system.memory.free_bytes", lambda device="cpu": 2 * 2**30)
     with pytest.raises(TooLargeError, match="1048576 replicas of 2 agents take 8"):
         Tabular(settings=TABLES).make_learner(SPACES, **MANY)
 
 
 def test_an_evaluation_that_no_memory_has_is_refused_before_anything_is_written(tmp_path, monkeypatch):
-    monkeypatch.setattr("cprl.memory.free_bytes", lambda device="cpu": 50 * 2**20)
+    monkeypatch.setattr("cprl.system.memory.free_bytes", lambda device="cpu": 50 * 2**20)
     with pytest.raises(TooLargeError, match=r"random numbers of 2 agents, .* fewer evaluation episodes"):
         run(replace(EXPERIMENT, evaluation_episodes=1000), tmp_path / "run", watch="off")
     assert list(tmp_path.iterdir()) == []

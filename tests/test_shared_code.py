@@ -10,9 +10,10 @@ import pytest
 import torch
 from torch import nn
 
-from cprl import CommonsEnv, Game, Rules, compiling, maps
+from cprl import CommonsEnv, Game, Rules, maps
 from cprl.algorithms import DQN, DQNSettings
-from cprl.process import prepare_process
+from cprl.system import compiling
+from cprl.system.process import prepare_process
 from cprl.training import Training
 
 AGENTS = (0, 1)

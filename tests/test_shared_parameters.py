@@ -19,7 +19,6 @@ from test_teams import TEAMS, first_turn
 
 import cprl
 from cprl import CommonsEnv, Custom, Experiment
-from cprl.agents import Population
 from cprl.algorithms import DQN, PPO, Tabular, TabularSettings
 from cprl.algorithms.base import TeamAlgorithm
 from cprl.learners.engine.choice import trial_batch
@@ -27,6 +26,7 @@ from cprl.learners.engine.shared import SharedEngine
 from cprl.learners.settings import DEFAULT_HIDDEN_CELLS
 from cprl.networks import Conv
 from cprl.population import Frozen, Learning, Scripted, Team
+from cprl.training.agents import Population
 
 FOUR = tuple(range(4))
 EVERY = {

@@ -10,9 +10,10 @@ from types import ModuleType
 import pytest
 
 import cprl
-from cprl import cli, shipped
+from cprl.commands import main as cli
 from cprl.runs.directory import resume_command, start_run
-from cprl.shipped import (
+from cprl.system import shipped
+from cprl.system.shipped import (
     command_of,
     cprl_here,
     import_from,

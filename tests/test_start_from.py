@@ -11,15 +11,16 @@ import torch
 from test_finite import GAME, REPLAY, ROLLOUT
 
 import cprl
-from cprl import CommonsEnv, Experiment, cli
-from cprl.agents import Population
+from cprl import CommonsEnv, Experiment
 from cprl.algorithms import DQN, IPPO, MADDPG, MAPPO, PPO, QMIX, SAC, VDN, Tabular, TabularSettings
-from cprl.commandline import parse
+from cprl.commands import main as cli
+from cprl.commands.recipe import parse
 from cprl.learners.settings import DQNSettings
 from cprl.measuring.evaluate import evaluate
 from cprl.population import Frozen, Learning, Scripted, Team
 from cprl.runs.checkpoints import checkpoints_in
 from cprl.runs.weights import load_weights, save_weights
+from cprl.training.agents import Population
 
 FOUR = replace(GAME, map=cprl.maps.parse(".A>.A.A\nA<A.v.A\n..<.A.A"))
 ALONE = (

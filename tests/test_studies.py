@@ -14,8 +14,7 @@ from tiny_study import FREEZE, GAMMA, LEARNING, MIXED, SETTINGS, TINY
 
 from cprl import Custom, Study, maps, presets
 from cprl.algorithms import DQN, PPO
-from cprl.config import KINDS
-from cprl.differences import defaults_of
+from cprl.config import KINDS, defaults_of
 from cprl.experiment import MOST_SEED, Experiment
 from cprl.learners.settings import RolloutSettings
 from cprl.population import Frozen, Learning, Scripted, Team, stored_of

@@ -9,7 +9,8 @@ import pytest
 from PIL import Image
 from study_runs import EXPERIMENT, TIME_OUT, write_run, write_study
 
-from cprl import Study, cli
+from cprl import Study
+from cprl.commands import main as cli
 from cprl.measuring.statistics import difference, estimate
 from cprl.studies.factors import Uniform
 from cprl.studies.figures import by_factor as by_factor_module

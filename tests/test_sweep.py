@@ -14,16 +14,17 @@ import pytest
 from tiny_study import FREEZE, GAMMA, TINY
 
 import cprl
-from cprl import Study, cli
+from cprl import Study
+from cprl.commands import main as cli
+from cprl.commands.studies import recipe_of, study_main
+from cprl.commands.studies import sweep as sweep_words
+from cprl.commands.studies_options import StudyOptions, carry_out, executor_of
 from cprl.runs.directory import start_run
 from cprl.runs.lock import RunLockedError
-from cprl.shipped import cprl_here
 from cprl.studies import InProcess, Processes, Ray, read_study
 from cprl.studies.driver import as_driver
 from cprl.studies.trials import trials_of
-from cprl.studies_cli import recipe_of, study_main
-from cprl.studies_cli import sweep as sweep_words
-from cprl.studies_options import StudyOptions, carry_out, executor_of
+from cprl.system.shipped import cprl_here
 
 ROOT = Path(__file__).parents[1]
 RECIPE = '''
@@ -132,7 +133,7 @@ def test_a_part_of_a_study_is_run_by_the_levels_that_its_conditions_have(here, c
 def test_a_failed_condition_does_not_end_the_study_and_is_listed_with_what_tries_it_again(
     capsys, monkeypatch
 ):
-    from cprl import running
+    from cprl.training import running
 
     def fails_at_5(experiment, *arguments, **how):
         if experiment.game.rules.freeze_steps == 5:
@@ -317,7 +318,7 @@ def test_what_continues_a_study_can_be_typed_here_and_its_summary_names_no_place
 
     summary = []
     monkeypatch.setattr(sys, "executable", "/bin/py")
-    monkeypatch.setattr("cprl.shipped.which", lambda *_, **__: None)
+    monkeypatch.setattr("cprl.system.shipped.which", lambda *_, **__: None)
     monkeypatch.setattr("cprl.studies.run_study", interrupted)
     with pytest.raises(SystemExit):
         carry_out(Study(TINY), StudyOptions(only=("x=1",)), [*command, "--only", "x=1"])
@@ -332,7 +333,7 @@ def test_a_study_that_is_interrupted_says_what_is_kept_and_how_to_continue(numbe
         "import os, signal\n"
         "from tiny_study import FREEZE, TINY\n"
         "import cprl\n"
-        "from cprl import running\n"
+        "from cprl.training import running\n"
         "run = running.run\n"
         "def stopped(experiment, *given, **how):\n"
         "    if experiment.game.rules.freeze_steps == 5 and os.environ.get('STOP'):\n"

@@ -24,8 +24,7 @@ from cprl.algorithms import (
     Tabular,
     TabularSettings,
 )
-from cprl.commandline import parse
-from cprl.compat import LeanStepEnv
+from cprl.commands.recipe import parse
 from cprl.envs import make_env, spaces_of
 from cprl.envs.state import check_restorable
 from cprl.envs.taking import TakingEnv, TakingGame
@@ -36,6 +35,7 @@ from cprl.reporting import write_report
 from cprl.runs.episodes import read_episodes
 from cprl.runs.weights import load_weights
 from cprl.studies.trials import trials_of
+from cprl.system.compat import LeanStepEnv
 from cprl.theory import CallableWorth, PowerWorth, SharingGame, appropriation, herders
 
 DONES = ("done", "terminated", "truncated")

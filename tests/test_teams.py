@@ -20,7 +20,6 @@ from test_population import (
 
 import cprl
 from cprl import CommonsEnv, Game, Rules, maps, presets
-from cprl.agents import Population
 from cprl.algorithms.dqn import DQN
 from cprl.algorithms.maddpg import MADDPG
 from cprl.algorithms.teams import IPPO, MAPPO, QMIX, VDN
@@ -33,6 +32,7 @@ from cprl.networks.agent import acting_part
 from cprl.networks.team import Mixing, TeamNetwork
 from cprl.population import Frozen, Learning, Scripted, Team
 from cprl.training import train
+from cprl.training.agents import Population
 
 TEAMS = {
     "VDN": VDN(settings=REPLAY),

@@ -6,9 +6,9 @@ from types import SimpleNamespace
 
 import pytest
 
-from cprl import garbage, times
-from cprl.garbage import cleared_up, free_earlier, set_aside
-from cprl.times import RunTimes, Times
+from cprl.system import compile_clock, times
+from cprl.system.compile_clock import cleared_up, free_earlier, set_aside
+from cprl.system.times import RunTimes, Times
 
 
 @pytest.fixture
@@ -74,7 +74,7 @@ def test_what_a_training_leaves_in_cycles_is_freed_at_its_end():
 
 @pytest.mark.integration
 def test_a_training_that_compiled_is_freed_when_the_next_one_begins(monkeypatch):
-    monkeypatch.setattr(garbage, "_is_set_aside", False)
+    monkeypatch.setattr(compile_clock, "_is_set_aside", False)
     with cleared_up():
         learner = Learner()
         left = weakref.ref(learner)

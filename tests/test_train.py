@@ -9,7 +9,6 @@ import torch
 
 from cprl import CommonsEnv, Game, Rules, maps
 from cprl.algorithms import DQN, LOLA, PPO, LOLASettings, RolloutSettings
-from cprl.collectors import stock_collector
 from cprl.learners.replay import ReplayLearner
 from cprl.learners.settings import DEFAULT_HIDDEN_CELLS, DQNSettings
 from cprl.measuring.evaluate import evaluate, mean_return
@@ -20,6 +19,7 @@ from cprl.policies.single import RandomActor
 from cprl.runs.checkpoints import Checkpointer
 from cprl.runs.episodes import EpisodeTable, read_episodes
 from cprl.training import Training, train
+from cprl.training.collectors import stock_collector
 
 GAME = Game(
     map=maps.parse(".A>.A\n.A.A.\n..<.A"),

@@ -134,7 +134,7 @@ def test_a_failure_is_noted_with_its_reason_and_forgotten_when_it_is_mended(tmp_
     own = task(tmp_path)
     status = Status(Path(own.status), own.name)
     with monkeypatch.context() as patched:
-        patched.setattr("cprl.running.evaluate_population", lambda *_, **__: 1 / 0)
+        patched.setattr("cprl.training.running.evaluate_population", lambda *_, **__: 1 / 0)
         failed = run_task(own)
     assert (failed.state, failed.reason) == ("failed", "ZeroDivisionError: division by zero")
     assert status.failure() == "ZeroDivisionError: division by zero"
@@ -433,7 +433,7 @@ def test_studies_may_share_their_runs(tmp_path):
 
 @pytest.mark.integration
 def test_a_condition_that_fails_does_not_end_the_study(tmp_path, monkeypatch):
-    from cprl import running
+    from cprl.training import running
 
     usual = running.evaluate_population
 

@@ -19,12 +19,12 @@ import torch
 from tensordict import TensorDict
 
 from cprl import CommonsEnv, Game, Rules, maps
-from cprl.agents import Population
 from cprl.algorithms.base import TeamAlgorithm
 from cprl.algorithms.dqn import DQN
 from cprl.algorithms.teams import QMIX, VDN
 from cprl.learners.settings import DQNSettings
 from cprl.population import Learning, Team
+from cprl.training.agents import Population
 
 START, SAFE, DARING, OVER = range(4)
 PAYOFFS = torch.tensor([[[7.0, 7.0], [7.0, 7.0]], [[0.0, 1.0], [1.0, 8.0]]])

@@ -18,7 +18,7 @@ from test_story import headers
 from viewers import browser, free_port, native_viewer, steady_picture, wait_until
 
 from cprl.commons.colours import APPLE, PALETTE, agent_colour
-from cprl.outcome import exhibited
+from cprl.training.outcome import exhibited
 from cprl.viewer.callback import ViewerCallback
 from cprl.viewer.logger import RerunLogger
 from cprl.viewer.page import Page

@@ -11,7 +11,6 @@ from one_road_parts import Dilemma
 
 import cprl
 from cprl import CommonsEnv, Custom, Experiment, Game, Rules, maps
-from cprl.agents import Population
 from cprl.algorithms import (
     DQN,
     IPPO,
@@ -24,7 +23,7 @@ from cprl.algorithms import (
     Tabular,
     TabularSettings,
 )
-from cprl.commandline import parse
+from cprl.commands.recipe import parse
 from cprl.envs import spaces_of
 from cprl.institutions import Tax
 from cprl.measuring.episodes import EpisodeTracker
@@ -34,6 +33,7 @@ from cprl.runs.checkpoints import Checkpointer, checkpoints_in
 from cprl.runs.columns import rows_of, schema_of
 from cprl.runs.episodes import EpisodeTable, read_episodes
 from cprl.training import Training, train
+from cprl.training.agents import Population
 
 AVERSE = InequityAversion(alpha=5, beta=0.05, smoothing=0.9)
 PREFERENCES = {

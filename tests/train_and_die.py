@@ -10,10 +10,10 @@ from cprl import CommonsEnv, Game, Rules, maps
 from cprl.learners.replay import ReplayLearner
 from cprl.learners.settings import DQNSettings
 from cprl.policies.lanes import random_lanes
-from cprl.process import prepare_process
 from cprl.runs.checkpoints import Checkpointer
 from cprl.runs.episodes import EpisodeTable
 from cprl.runs.weights import save_weights
+from cprl.system.process import prepare_process
 from cprl.training import train
 
 GAME = Game(

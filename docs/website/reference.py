@@ -20,12 +20,10 @@ REFERENCE: Final = {
     "commons": "the game: rules, boards, observations, the state",
     "presets": "the published games and settings",
     "keys": "the TensorDict entries",
-    "spaces": "what agents observe and may do",
     "envs": "TorchRL, PettingZoo, Gymnasium",
     "institutions": "rules that people make",
     "preferences": "what agents want",
     "theory": "games with a known answer",
-    "games": "games of your own",
     "custom": "code of your own in a recipe",
     "networks": "from observations to numbers",
     "objectives": "losses that TorchRL lacks",
@@ -34,7 +32,6 @@ REFERENCE: Final = {
     "learners": "the hyper-parameters",
     "population": "how each agent is specified",
     "experiment": "an experiment, a value",
-    "callbacks": "what is called while a training runs",
     "training": "the loop",
     "measuring": "metrics and statistics",
     "viewer": "recordings for the Rerun viewer",
@@ -46,22 +43,17 @@ REFERENCE: Final = {
 """A page each, in reading order, and what it is about."""
 
 _MODULES: Final = {
-    "commons": ("maps", "observation", "rules", "game", "state", "playing"),
+    "envs": ("games",),
+    "commons": ("maps", "observation", "rules", "game", "spaces", "state", "playing"),
     "learners": ("settings",),
     "measuring": ("social", "phases", "statistics"),
     "policies": ("scripted", "assignment"),
+    "training": ("callbacks",),
     "viewer": ("callback",),
 }
 """Modules of a package that its page shows too, beside what the package exports."""
 
-INTERNAL: Final = {
-    *("compat", "checks", "arguments", "output", "caches", "compile_clock", "times", "garbage", "process"),
-    *("compiling", "memory", "collectors", "runs", "terminal", "finite", "stored", "earlier"),
-    *("annotations", "stored_agents", "agents", "outcome", "parts", "leftovers", "running", "flags"),
-    *("commandline", "command_parts", "differences"),
-    *("evaluation_cli", "egta_cli", "scenarios_cli", "studies_options", "studies_cli", "exploit_cli"),
-    *("libraries", "shipped", "recipes_cli", "docs_cli", "cli", "__main__"),
-}
+INTERNAL: Final = {"checks", "arguments", "system", "runs", "terminal", "commands", "__main__"}
 """Packages that no page shows: users reach what they hold by the names of `cprl` or by a command."""
 
 
@@ -137,7 +129,7 @@ def _split(doc: str) -> tuple[str, str]:
 
 def _commands_page() -> str:
     """`cprl --help`, and that of each command."""
-    from cprl.cli import COMMANDS
+    from cprl.commands.main import COMMANDS
 
     text = f"# Commands\n\n{help_of()}\n"
     for name in COMMANDS:
@@ -147,7 +139,7 @@ def _commands_page() -> str:
 
 def help_of(*words: str) -> str:
     """What `cprl WORDS --help` prints, as a block of text."""
-    from cprl import cli
+    from cprl.commands import main as cli
 
     out = io.StringIO()
     with (

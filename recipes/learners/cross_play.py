@@ -8,8 +8,8 @@ from pathlib import Path
 import tyro
 
 import cprl
-from cprl.command_parts import check_files
-from cprl.commandline import in_a_sentence
+from cprl.commands.parts import check_files
+from cprl.commands.recipe import in_a_sentence
 from cprl.evaluation import draw_gains
 from cprl.runs.labelled import write_table
 from cprl.studies.trials import trials_of

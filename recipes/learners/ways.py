@@ -27,10 +27,10 @@ from cprl.algorithms import (
     RolloutSettings,
     TeamAlgorithm,
 )
-from cprl.output import say
 from cprl.population import AgentSpec, Learning, Team
 from cprl.studies import StudyTable
 from cprl.studies.tables.comparing import compare
+from cprl.system.output import say
 
 Board = Literal["two_complex", "commons"]
 GAMMA: Final = 0.99

@@ -23,7 +23,7 @@ from numpy.typing import NDArray
 from perolat_base import BEAMS
 
 from cprl import Study, maps
-from cprl.commandline import in_a_sentence
+from cprl.commands.recipe import in_a_sentence
 from cprl.evaluation.territory import DEFENCE, EXCLUSION, OVERLAP, TAGS, Territory, territory_of
 from cprl.measuring.statistics import Estimate, difference, estimate
 from cprl.measuring.territory import time_within

@@ -19,14 +19,14 @@ from typing import Final
 import tyro
 
 from cprl import Game, presets
-from cprl.commandline import in_a_sentence
+from cprl.commands.recipe import in_a_sentence
 from cprl.evaluation import SchellingDiagram, draw_schelling, schelling
 from cprl.institutions import GraduatedSanctions, Quota, Tax
 from cprl.measuring.statistics import estimate
-from cprl.output import say
 from cprl.policies.scripted import SCRIPTED_POLICIES
 from cprl.reporting.markdown import table
 from cprl.runs.directory import FILE_NAME
+from cprl.system.output import say
 from cprl.terminal.style import check_picture
 
 BOARDS: Final = ("commons", "two_complex")

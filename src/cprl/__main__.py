@@ -2,7 +2,7 @@
 
 import sys
 
-from cprl.cli import main
+from cprl.commands.main import main
 
 if __name__ == "__main__":
     sys.argv[0] = "cprl"  # what recipes keep and messages repeat

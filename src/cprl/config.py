@@ -8,7 +8,8 @@ from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import MISSING, fields, is_dataclass
 from difflib import get_close_matches
 from math import isfinite
-from typing import Any, Final, TypeVar, get_type_hints
+from types import NoneType, UnionType
+from typing import Any, Final, Literal, TypeVar, Union, get_args, get_origin, get_type_hints
 
 from cprl.algorithms import (
     A2C,
@@ -33,7 +34,6 @@ from cprl.algorithms import (
     TabularSettings,
 )
 from cprl.algorithms.base import Algorithm
-from cprl.annotations import fits, type_text
 from cprl.arguments import objects
 from cprl.checks import check_nesting, shown
 from cprl.commons.game import Game
@@ -277,3 +277,115 @@ def _refusal(value: object, where: str) -> str:
 def _meant(name: object, known: Iterable[str]) -> str:
     close = get_close_matches(str(name), list(known), n=1)
     return f" (did you mean {close[0]!r}?)" if close else ""
+
+
+def fits(value: object, hint: Any) -> bool:
+    """Whether a value is of an annotated type; whole numbers are numbers too, True and False are not."""
+    origin, arguments = get_origin(hint), get_args(hint)
+    if hint is Any:
+        return True
+    if origin in (Union, UnionType):
+        return any(fits(value, own) for own in arguments)
+    if origin is Literal:
+        return any(value == own and type(value) is type(own) for own in arguments)
+    if origin is tuple:
+        if not isinstance(value, tuple | list):
+            return False
+        if arguments[-1:] == (Ellipsis,):
+            return all(fits(entry, arguments[0]) for entry in value)
+        return len(value) == len(arguments) and all(map(fits, value, arguments))
+    if hint is float:
+        return isinstance(value, float | int) and not isinstance(value, bool)
+    if hint is int:
+        return isinstance(value, int) and not isinstance(value, bool)
+    return isinstance(value, origin or hint)
+
+
+def type_text(hint: Any) -> str:
+    """A type in words, for messages."""
+    origin, arguments = get_origin(hint), get_args(hint)
+    if origin in (Union, UnionType):
+        return " or ".join(map(type_text, arguments))
+    if origin is Literal:
+        return ", ".join(map(repr, arguments))
+    if origin is tuple:
+        inner = ", ".join("..." if own is Ellipsis else type_text(own) for own in arguments)
+        return f"({inner})"
+    words = {int: "a whole number", float: "a number", bool: "True or False", str: "a text", NoneType: "None"}
+    return words.get(hint) or f"a {getattr(hint, '__name__', hint)}"
+
+
+_ABSENT: Final = object()
+
+
+def differences(before: object, now: object, where: str, kind: Any = None) -> list[str]:
+    """How two tables differ, a sentence for each place.
+
+    A field that the earlier one lacks, and that has its default in the later one, is no difference: a version
+    that did not know the field did what its default says.
+
+    Args:
+        before: the earlier table.
+        now: the later one.
+        where: what they are of, in words.
+        kind: the dataclass that they are of, where they do not say it themselves.
+    """
+    if isinstance(before, Mapping) and isinstance(now, Mapping):
+        if before.get("kind") == now.get("kind"):
+            return [
+                line
+                for name in {**before, **now}
+                if not _is_default_of_later(name, before, now, kind)
+                for line in differences(before.get(name, _ABSENT), now.get(name, _ABSENT), f"{where}.{name}")
+            ]
+    elif isinstance(before, list) and isinstance(now, list) and len(before) == len(now):
+        pairs = enumerate(zip(before, now, strict=True))
+        return [line for place, (a, b) in pairs for line in differences(a, b, f"{where}[{place}]")]
+    return [] if before == now else [f"{where} was {_held(before)}, is {_held(now)}"]
+
+
+def _is_default_of_later(
+    name: str, before: Mapping[str, Any], now: Mapping[str, Any], kind: Any = None
+) -> bool:
+    """Whether a field is one of a later version, and says nothing that the earlier one did not do."""
+    if before.get(name) is None and now.get(name) is None:
+        return True
+    kind = KINDS.get(str(now.get("kind"))) if kind is None else kind
+    if name in before or kind is None:
+        return False
+    defaults = defaults_of(kind)
+    return name in defaults and without_defaults(now[name]) == defaults[name]
+
+
+def defaults_of(kind: Any) -> dict[str, Any]:
+    """The defaults of the fields of a dataclass as a recipe holds them; those without one are left out."""
+    found = {}
+    for own in fields(kind):
+        if own.init and own.default is not MISSING:
+            found[own.name] = own.default
+        elif own.init and own.default_factory is not MISSING:
+            found[own.name] = own.default_factory()
+    tables = {  # the arguments of a Custom are a table already
+        name: value if isinstance(value, Mapping) else to_config(value) for name, value in found.items()
+    }
+    return {name: without_defaults(table) for name, table in tables.items()}
+
+
+def without_defaults(table: Any, kind: Any = None) -> Any:
+    """A table of `to_config` without the fields that have their default, and with 1.0 as 1."""
+    if isinstance(table, list):
+        return [without_defaults(own) for own in table]
+    if isinstance(table, float) and table.is_integer():
+        return int(table)
+    if not isinstance(table, Mapping):
+        return table
+    if table.get("kind") == "Custom":
+        return dict(table)
+    kind = KINDS.get(str(table.get("kind"))) if kind is None else kind
+    left_out = {} if kind is None else defaults_of(kind)
+    plain = {name: without_defaults(own) for name, own in table.items()}
+    return {name: own for name, own in plain.items() if name not in left_out or own != left_out[name]}
+
+
+def _held(value: object) -> str:
+    return "not there" if value is _ABSENT else shown(value)

@@ -20,13 +20,10 @@ from cprl.checks import (
     shown,
 )
 from cprl.commons.game import Game
-from cprl.config import custom_targets, fields_from_config, fields_to_config
+from cprl.config import custom_targets, differences, fields_from_config, fields_to_config
 from cprl.custom import Custom
-from cprl.differences import differences
+from cprl.envs.games import game_of, is_playable, stored_game
 from cprl.envs.make_env import PlayableGame
-from cprl.finite import OnNan
-from cprl.games import game_of, is_playable, stored_game
-from cprl.memory import DEVICE
 from cprl.population import (
     SPEC,
     AgentSpec,
@@ -41,8 +38,12 @@ from cprl.population import (
 from cprl.preferences.values import check_preference
 from cprl.runs import formats
 from cprl.runs.recipes import FORMAT, recipe_config
+from cprl.system.memory import DEVICE
 
 LoggerName = Literal["tensorboard", "wandb"]
+OnNan = Literal["stop", "continue"]
+"""What a training does when a number is not finite: "stop" ends it by a `NotFiniteError`; "continue" warns
+once of each agent and trains on."""
 MOST_SEED: Final = 2**64 - 2
 """Evaluation plays worlds of the next seed."""
 

@@ -6,8 +6,8 @@ R replicas, C channels, X rows and Y columns of an agent's window (its own row i
 
 from typing import Final
 
-from cprl.compat import entry as entry
-from cprl.compat import put as put
+from cprl.system.compat import entry as entry
+from cprl.system.compat import put as put
 
 AGENTS: Final = "agents"
 """The group of agents, a nested TensorDict of batch size [B, N]."""

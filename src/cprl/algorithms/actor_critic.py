@@ -10,12 +10,12 @@ from torchrl.objectives import DiscreteIQLLoss, DiscreteSACLoss, LossModule, Val
 
 from cprl.algorithms.base import OffPolicy
 from cprl.algorithms.dqn import module_of, network_of, refuse_relu
-from cprl.compat import LaneCategorical
+from cprl.commons.spaces import Spaces
 from cprl.custom import Custom
 from cprl.learners.settings import DQNSettings
 from cprl.networks.agent import AgentNetworks
 from cprl.networks.specification import Network
-from cprl.spaces import Spaces
+from cprl.system.compat import LaneCategorical
 
 
 @dataclass(frozen=True, kw_only=True)

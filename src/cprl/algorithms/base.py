@@ -12,6 +12,7 @@ from torch import nn
 from torchrl.objectives import LossModule
 
 from cprl.checks import NONE, SWITCH, Check, check_fields, checked, count, either, instance, number, one_of
+from cprl.commons.spaces import Spaces
 from cprl.custom import Custom
 from cprl.learners.base import Learner
 from cprl.learners.replay import ReplayLearner
@@ -23,7 +24,6 @@ from cprl.networks.recurrent import Recurrent
 from cprl.networks.specification import Network
 from cprl.objectives.log_cosh import TORCHRL_DISTANCES
 from cprl.preferences.values import Preference, named
-from cprl.spaces import Spaces
 
 TrainingEngine: TypeAlias = Literal["compiled", "eager", "torchrl"]
 """How agents are updated. "compiled": all together, in one update that torch compiles; "eager": the same

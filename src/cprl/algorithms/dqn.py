@@ -19,7 +19,7 @@ from torchrl.objectives import (
 )
 
 from cprl.algorithms.base import OffPolicy
-from cprl.compat import bootstrap_from_target
+from cprl.commons.spaces import Spaces
 from cprl.custom import Custom
 from cprl.learners.lola.settings import LOLASettings
 from cprl.learners.settings import DEFAULT_HIDDEN_CELLS, DQNSettings, RolloutSettings
@@ -28,7 +28,7 @@ from cprl.networks.mlp import MLP
 from cprl.networks.recurrent import state_shape_of
 from cprl.networks.specification import Network, new_network
 from cprl.objectives.log_cosh import DISTANCES, LOG_COSH, LogCoshDQNLoss
-from cprl.spaces import Spaces
+from cprl.system.compat import bootstrap_from_target
 
 
 @dataclass(frozen=True, kw_only=True)

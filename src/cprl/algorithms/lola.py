@@ -10,6 +10,7 @@ from torchrl.objectives import LossModule
 from cprl.algorithms.actor_critic import policy
 from cprl.algorithms.base import TeamAlgorithm, TrainingEngine
 from cprl.algorithms.on_policy import actor_and_critic
+from cprl.commons.spaces import Spaces
 from cprl.custom import Custom
 from cprl.learners.base import Learner
 from cprl.learners.lola.learner import LOLALearner
@@ -17,7 +18,6 @@ from cprl.learners.lola.settings import LOLASettings
 from cprl.networks.specification import Network
 from cprl.objectives import LOLADiCELoss, LOLALoss
 from cprl.preferences.values import Preference
-from cprl.spaces import Spaces
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -11,6 +11,7 @@ from torchrl.objectives import LossModule, ValueEstimators
 
 from cprl.algorithms.base import OffPolicy, TeamAlgorithm
 from cprl.algorithms.dqn import network_of
+from cprl.commons.spaces import Spaces
 from cprl.custom import Custom
 from cprl.learners.settings import DQNSettings
 from cprl.networks.agent import AgentNetworks
@@ -19,7 +20,6 @@ from cprl.networks.specification import Network
 from cprl.networks.team import JointCritics, team_network
 from cprl.objectives.log_cosh import DISTANCES
 from cprl.objectives.maddpg import NUMBERS, MADDPGLoss
-from cprl.spaces import Spaces
 
 
 @dataclass(frozen=True, kw_only=True)

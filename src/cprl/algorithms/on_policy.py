@@ -10,12 +10,12 @@ from torchrl.objectives import A2CLoss, ClipPPOLoss, LossModule, ReinforceLoss
 from cprl.algorithms.actor_critic import policy
 from cprl.algorithms.base import OnPolicy
 from cprl.algorithms.dqn import module_of, network_of
+from cprl.commons.spaces import Spaces
 from cprl.custom import Custom
 from cprl.learners.lola.settings import LOLASettings
 from cprl.learners.settings import RolloutSettings
 from cprl.networks.agent import AgentNetworks
 from cprl.networks.specification import Network
-from cprl.spaces import Spaces
 
 
 @dataclass(frozen=True, kw_only=True)

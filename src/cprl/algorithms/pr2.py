@@ -9,13 +9,13 @@ from torchrl.objectives import LossModule, ValueEstimators
 from cprl.algorithms.base import OffPolicy
 from cprl.algorithms.dqn import network_of
 from cprl.checks import Check, checked, number
+from cprl.commons.spaces import Spaces
 from cprl.custom import Custom
 from cprl.learners.settings import DQNSettings
 from cprl.networks.joint import JointNetwork, JointValues
 from cprl.networks.specification import Network
 from cprl.objectives.log_cosh import DISTANCES
 from cprl.objectives.pr2 import PR2Loss
-from cprl.spaces import Spaces
 
 _TEMPERATURE: Final[Check] = number(1e-6, 1e6)
 

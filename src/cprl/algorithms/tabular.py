@@ -5,11 +5,11 @@ from dataclasses import dataclass
 from typing import Any, ClassVar
 
 from cprl.algorithms.base import Algorithm, TrainingEngine
+from cprl.commons.spaces import Spaces
 from cprl.learners.base import Learner
 from cprl.learners.settings import TabularSettings
 from cprl.learners.tabular import TabularLearner, table_network
 from cprl.policies.tabular import TableNetwork
-from cprl.spaces import Spaces
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -16,12 +16,12 @@ from torchrl.objectives.multiagent import IPPOLoss, MAPPOLoss, QMixerLoss
 from cprl.algorithms.base import OffPolicy, OnPolicy, TeamAlgorithm
 from cprl.algorithms.dqn import network_of, q_actor, q_network_of
 from cprl.algorithms.on_policy import actor_and_critic, clipped_loss
+from cprl.commons.spaces import Spaces
 from cprl.custom import Custom
 from cprl.learners.settings import DQNSettings, RolloutSettings
 from cprl.networks.agent import AgentNetworks
 from cprl.networks.specification import Network
 from cprl.networks.team import CentralCritic, Mixing, team_network
-from cprl.spaces import Spaces
 
 _CHOSEN, _OF_TEAM = "chosen_action_value", "team_value"
 

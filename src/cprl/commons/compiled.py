@@ -17,10 +17,10 @@ from typing import Any, Final
 import numba
 from filelock import FileLock
 
-from cprl.caches import cache_folder
 from cprl.commons.loops import ENTRIES
-from cprl.compile_clock import CLOCK
-from cprl.libraries import relying_on
+from cprl.system.compile_clock import CLOCK
+from cprl.system.libraries import relying_on
+from cprl.system.process import cache_folder
 
 Compiled = dict[str, Callable[..., Any]]
 

@@ -18,14 +18,14 @@ from cprl.commons.maps import Map
 from cprl.commons.observation import Observation, channel_names
 from cprl.commons.reach import why_out_of_reach
 from cprl.commons.rules import Rules
+from cprl.commons.spaces import Spaces
 from cprl.commons.tables import GovernedTables, Tables, build_tables, check_sizes
 from cprl.commons.world import Bytes, StepOutput, empty_worlds
 from cprl.institutions import COUNTS, Institution
 from cprl.institutions.arrays import Form, forms_of
 from cprl.institutions.choice import Ballot, ballots, decision_options
 from cprl.institutions.memory import SHOWN, Payments, empty_memory
-from cprl.memory import check_memory
-from cprl.spaces import Spaces
+from cprl.system.memory import check_memory
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -11,7 +11,7 @@ from cprl.commons.game import Game
 from cprl.commons.maps import Map
 from cprl.commons.sprites import BODY, INK, INK_COLOUR, MARK_COLOUR, MARKED, agent_sprite
 from cprl.commons.world import ROW_STEP, Bools, Bytes, Ints, Shown
-from cprl.memory import check_memory
+from cprl.system.memory import check_memory
 
 LARGEST_CELL_PIXELS: Final = 1000
 GRID_COLOUR: Final = (28, 30, 36)

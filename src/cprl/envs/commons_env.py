@@ -15,11 +15,11 @@ from cprl.checks import shown
 from cprl.commons.batch import Batch, Output, output_of, turn_of
 from cprl.commons.game import Game, output_forms
 from cprl.commons.world import PLAYING, Bytes, StepOutput
-from cprl.compat import LeanStepEnv, put_all, unchecked_tensordict
 from cprl.envs.commons_specs import DONE_ENTRIES, WORLD_ENTRIES, specs_of
 from cprl.envs.drivers import device_of, drawn_seed, driver_for
 from cprl.envs.recurrent_states import begin_states
 from cprl.envs.rendering import images
+from cprl.system.compat import LeanStepEnv, put_all, unchecked_tensordict
 
 _AGENT_ENTRIES = ("observation", "harvest", "in_play", "fired", "hit_by", "tagged_by")
 _WHOLE_NUMBERS = (torch.int64, torch.int32, torch.int16, torch.int8, torch.uint8)

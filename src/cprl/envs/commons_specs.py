@@ -7,8 +7,8 @@ from torchrl.data import Bounded, Categorical, Composite, Unbounded
 
 from cprl import keys
 from cprl.commons.game import Game
-from cprl.compat import flag_spec
 from cprl.institutions import COUNTS
+from cprl.system.compat import flag_spec
 
 WORLD_ENTRIES = ("stock", "regrown")
 DONE_ENTRIES = ("done", "terminated", "truncated")

@@ -11,13 +11,13 @@ from torchrl.envs import Compose, EnvBase, Transform, TransformedEnv
 
 from cprl import arguments, keys
 from cprl.commons.game import Game
+from cprl.commons.spaces import Spaces
 from cprl.custom import Custom, made
 from cprl.envs.commons_env import CommonsEnv
 from cprl.envs.matrix import MatrixGame
 from cprl.envs.state import env_state, load_env_state
 from cprl.envs.taking import TakingGame
 from cprl.envs.unwrap import commons_of
-from cprl.spaces import Spaces
 
 
 @runtime_checkable

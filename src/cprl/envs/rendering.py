@@ -6,7 +6,7 @@ from cprl import arguments
 from cprl.commons.batch import Batch
 from cprl.commons.picture import LARGEST_CELL_PIXELS, world_image
 from cprl.commons.world import Bytes, StepOutput
-from cprl.memory import check_memory
+from cprl.system.memory import check_memory
 
 SMALLEST_CELL_PIXELS = 8
 

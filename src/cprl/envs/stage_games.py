@@ -13,9 +13,9 @@ from torchrl.data import Bounded, Categorical, Composite, TensorSpec, Unbounded
 from cprl import arguments, keys
 from cprl.checks import NONE, Check, count, either, is_number
 from cprl.commons.chance import LOW_WORD, WORD_BITS, philox4x32
-from cprl.compat import LeanStepEnv, flag_spec, put_all, unchecked_tensordict
 from cprl.envs.drivers import device_of, drawn_seed
 from cprl.envs.recurrent_states import begin_states
+from cprl.system.compat import LeanStepEnv, flag_spec, put_all, unchecked_tensordict
 
 _OWN_KEYS: Final = frozenset((keys.AGENTS, keys.DONE, keys.TERMINATED, keys.TRUNCATED, "next", "_reset"))
 _OWN_AGENT_KEYS: Final = frozenset(("observation", "reward"))

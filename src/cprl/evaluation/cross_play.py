@@ -45,8 +45,8 @@ from cprl.measuring.names import with_unit
 from cprl.measuring.replicas import Measured, institution_measures, over_replicas, social_measures
 from cprl.measuring.statistics import Estimate, difference
 from cprl.runs.labelled import labelled
-from cprl.stored import LoadedRun
 from cprl.terminal.style import EMPTY, SHADES, SMALL_PT, draw_cell, head, picture_path, save, wrapped
+from cprl.training.stored import LoadedRun
 
 Whose: TypeAlias = Literal["focal", "background", "group"]
 _WHOSE: Final[dict[Whose, Callable[..., float]]] = {

@@ -26,7 +26,7 @@ from cprl.measuring.replicas import (
 from cprl.measuring.reported import left_out
 from cprl.measuring.series import OF_AGENTS
 from cprl.runs.labelled import labelled
-from cprl.stored import LoadedRun, load
+from cprl.training.stored import LoadedRun, load
 
 _LONGEST: Final = 40
 """The largest number of characters of a value in a message."""

@@ -29,11 +29,11 @@ from cprl.evaluation.film_pictures import (
 from cprl.evaluation.lanes import Turns
 from cprl.measuring.episodes import Episode
 from cprl.measuring.tracking import tracker_of
-from cprl.memory import check_memory
 from cprl.policies.assignment import AgentPolicies
 from cprl.runs.files import refuse_to_write_over
-from cprl.stored import LoadedRun, load
+from cprl.system.memory import check_memory
 from cprl.training import train
+from cprl.training.stored import LoadedRun, load
 from cprl.viewer.callback import ViewerCallback
 from cprl.viewer.institutions import has_institutions
 from cprl.viewer.replay import Decisions, Offences, events

@@ -15,7 +15,6 @@ from torch import Tensor
 from torchrl.envs import EnvBase
 
 from cprl import arguments, keys
-from cprl.agents import Population
 from cprl.commons.colours import APPLE, BEAM, PALETTE, WALL, Colour, agent_colour
 from cprl.commons.game import Game
 from cprl.commons.maps.board import SIGN_OF_HEADING
@@ -26,10 +25,11 @@ from cprl.evaluation.lanes import Policy, Turns
 from cprl.evaluation.populations import agent_named, board_named
 from cprl.measuring import social
 from cprl.measuring.names import title
-from cprl.output import OUT, console, say
 from cprl.policies.scripted import SCRIPTED_POLICIES
 from cprl.population import Scripted
 from cprl.presets import Variant
+from cprl.system.output import OUT, console, say
+from cprl.training.agents import Population
 
 LETTERS: Final = {
     "w": "forward",

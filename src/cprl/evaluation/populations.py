@@ -8,19 +8,19 @@ from typing import Any, Final
 from torchrl.envs import EnvBase
 
 from cprl import arguments, presets
-from cprl.agents import Population
 from cprl.commons import maps
 from cprl.commons.game import Game
 from cprl.commons.rules import Rules
 from cprl.custom import made
+from cprl.envs.games import is_playable
 from cprl.envs.make_env import make_env
 from cprl.evaluation.evaluate import SEED, check
 from cprl.evaluation.lanes import Place, Played, play
-from cprl.games import is_playable
 from cprl.policies.scripted import SCRIPTED_POLICIES
 from cprl.population import AgentSpec, Frozen, Scripted, specs_by_agent
 from cprl.presets import Variant
-from cprl.stored import LoadedRun, load
+from cprl.training.agents import Population
+from cprl.training.stored import LoadedRun, load
 
 _SPECS: Final = "Scripted(policy) or Frozen(run, agent, replica)"
 

@@ -33,7 +33,7 @@ from cprl.evaluation.populations import play_population
 from cprl.measuring.statistics import Estimate, difference, estimate
 from cprl.population import Frozen
 from cprl.runs.labelled import labelled
-from cprl.stored import LoadedRun, load
+from cprl.training.stored import LoadedRun, load
 
 
 def check_population(run: LoadedRun) -> None:

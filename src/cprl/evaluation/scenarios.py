@@ -29,7 +29,6 @@ from matplotlib.figure import Figure
 from rich.table import Table
 
 from cprl import arguments, presets
-from cprl.agents import check_scripted
 from cprl.arguments import object_of
 from cprl.checks import Check, check_fields, instance, one_of
 from cprl.commons.game import Game
@@ -49,9 +48,10 @@ from cprl.measuring.statistics import Estimate, difference
 from cprl.policies.assignment import AgentPolicies
 from cprl.population import Frozen, Scripted
 from cprl.runs.labelled import labelled
-from cprl.stored import LoadedRun, load
-from cprl.stored_agents import StoredAgent, stored_policies
 from cprl.terminal.style import MARK, MEAN, SMALL_PT, head, picture_path, save
+from cprl.training.agents import check_scripted
+from cprl.training.stored import LoadedRun, load
+from cprl.training.stored_agents import StoredAgent, stored_policies
 
 Focal: TypeAlias = Literal["majority", "minority"]
 """How many agents are focal: "majority", all but one; "minority", one."""

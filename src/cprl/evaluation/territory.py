@@ -32,8 +32,8 @@ from cprl.measuring.movement import Trace, overlap, trace, visits
 from cprl.measuring.statistics import Estimate, estimate
 from cprl.measuring.territory import owners
 from cprl.policies.assignment import AgentPolicies
-from cprl.stored import LoadedRun
 from cprl.terminal import style
+from cprl.training.stored import LoadedRun
 
 Array = NDArray[Any]
 Policy = Literal["trained", "random"]

@@ -8,10 +8,10 @@ import torch
 from torch import nn
 
 from cprl.checks import Check, checked, count, instance, is_count
-from cprl.memory import check_memory
+from cprl.commons.spaces import Spaces
 from cprl.networks.agent import AgentNetworks, parts_of
 from cprl.preferences.values import Preference, check_preference, named
-from cprl.spaces import Spaces
+from cprl.system.memory import check_memory
 
 _LEAST_BYTES: Final = 4096
 """Of a lane, whatever it learns by: its name, seeds and random number generators."""

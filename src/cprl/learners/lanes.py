@@ -11,6 +11,7 @@ from torch import Tensor, nn
 
 from cprl import keys
 from cprl.arguments import object_of
+from cprl.commons.spaces import Spaces
 from cprl.learners.checks import check_networks
 from cprl.learners.engine.shared import is_list
 from cprl.learners.transitions import LaneTurn, array_of, joint_actions, lane_turn, seen_next
@@ -19,7 +20,6 @@ from cprl.networks.recurrent import state_cells_of
 from cprl.networks.specification import refuse_unseen
 from cprl.policies.lanes import LaneActor
 from cprl.policies.recurrent import actor_of_lanes
-from cprl.spaces import Spaces
 
 WEIGHTS, TARGET_WEIGHTS, EXPLORATION, SAMPLING, EVALUATION, EXHIBITION, NOISE = range(7)
 """The purposes of a lane's random numbers; each has its own seed."""

@@ -10,6 +10,7 @@ from tensordict import TensorDictBase
 from torch import Tensor, nn
 
 from cprl import keys
+from cprl.commons.spaces import Spaces
 from cprl.learners.buffer.gather import Horizon
 from cprl.learners.buffer.sampler import lane_buffer, transformed
 from cprl.learners.checks import check_learner, refuse_unshared_reward
@@ -30,7 +31,6 @@ from cprl.networks.recurrent import state_cells_of
 from cprl.policies.lanes import LaneActor
 from cprl.preferences.values import Preference
 from cprl.preferences.wanted import WantedRewards
-from cprl.spaces import Spaces
 
 
 class ReplayLearner:

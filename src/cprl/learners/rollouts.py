@@ -8,6 +8,7 @@ import torch
 from tensordict import TensorDict, TensorDictBase
 from torch import Tensor, nn
 
+from cprl.commons.spaces import Spaces
 from cprl.learners.advantages import advantages
 from cprl.learners.buffer.rollout import refuse_full, rollout_fields, write_turn
 from cprl.learners.buffer.sampler import steps_ahead
@@ -26,7 +27,6 @@ from cprl.policies.lanes import LaneActor
 from cprl.policies.rng import LaneRng
 from cprl.preferences.values import Preference
 from cprl.preferences.wanted import WantedRewards
-from cprl.spaces import Spaces
 
 
 class RolloutLearner:

@@ -22,6 +22,7 @@ from tensordict import TensorDictBase
 from torch import Tensor, nn
 
 from cprl import keys
+from cprl.commons.spaces import Spaces
 from cprl.learners.checks import check_learner
 from cprl.learners.lanes import EVALUATION, EXPLORATION, StartFrom, lane_names, lane_seeds, weights_to_start
 from cprl.learners.settings import TabularSettings
@@ -29,7 +30,6 @@ from cprl.learners.transitions import lane_turn, wanted_in
 from cprl.policies.tabular import NEVER_MET, QTables, TableNetwork, TabularActor, observed_entries, states_of
 from cprl.preferences.values import Preference
 from cprl.preferences.wanted import WantedRewards
-from cprl.spaces import Spaces
 
 
 class TabularLearner:

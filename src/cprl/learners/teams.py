@@ -8,6 +8,7 @@ import torch
 from tensordict import TensorDictBase
 from torch import Tensor, nn
 
+from cprl.commons.spaces import Spaces
 from cprl.learners.engine.shared import is_list
 from cprl.learners.lanes import Acts, Lanes, init_network
 from cprl.learners.transitions import LaneTurn, lane_turn, seen_next
@@ -15,7 +16,6 @@ from cprl.networks.agent import acting_part
 from cprl.networks.recurrent_team import RecurrentTeam
 from cprl.networks.team import ModuleTeam, SharedTeam, TeamNetwork
 from cprl.policies.lanes import LaneActor
-from cprl.spaces import Spaces
 
 MakeTeam = Callable[[Sequence[nn.Module]], nn.Module]
 """Makes the networks of a team from those of its members: `AgentNetworks`, that of `team_network` first.

@@ -17,7 +17,7 @@ from cprl.measuring.episode import Episode
 from cprl.measuring.institutions import check_groups, groups_of
 from cprl.measuring.reported import OF_INSTITUTIONS, OPTIONAL, reported_in
 from cprl.measuring.turns import Array, TurnReader, Turns
-from cprl.memory import check_memory
+from cprl.system.memory import check_memory
 
 __all__ = ["Episode", "EpisodeTracker"]
 

@@ -12,7 +12,7 @@ from cprl import arguments
 from cprl.envs.commons_env import CommonsEnv
 from cprl.measuring.episodes import Episode
 from cprl.measuring.tracking import tracker_of
-from cprl.process import one_thread
+from cprl.system.process import one_thread
 
 Policy = Callable[[TensorDictBase], TensorDictBase]
 

@@ -19,7 +19,7 @@ from torchrl.envs.utils import ExplorationType, set_exploration_type
 
 from cprl import arguments, keys
 from cprl.envs.commons_env import CommonsEnv
-from cprl.process import one_thread
+from cprl.system.process import one_thread
 
 Array = NDArray[Any]
 

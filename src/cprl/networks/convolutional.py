@@ -10,8 +10,8 @@ from torch import Tensor, nn
 from torchrl import modules
 
 from cprl.checks import Check, check_arguments, check_fields, count, is_count, tuple_of
+from cprl.commons.spaces import Spaces
 from cprl.networks.mlp import LAYERS, NETWORK_CHECKS, check_size, glorot_uniform_, layers
-from cprl.spaces import Spaces
 
 _CHECKS: Final[dict[str, Check]] = {
     "channels": layers(1),

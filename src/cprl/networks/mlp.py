@@ -10,8 +10,8 @@ from torch import Tensor, nn
 from torchrl import modules
 
 from cprl.checks import SWITCH, Check, check_arguments, check_fields, count, is_count, number, tuple_of
-from cprl.memory import check_memory
-from cprl.spaces import Spaces
+from cprl.commons.spaces import Spaces
+from cprl.system.memory import check_memory
 
 MOST_LAYERS: Final = 64
 MOST_CELLS: Final = 2**16

@@ -14,10 +14,10 @@ import torch
 from torch import Tensor, nn
 
 from cprl.checks import Check, check_fields, count, instance
+from cprl.commons.spaces import Spaces
 from cprl.networks.convolutional import Conv
 from cprl.networks.mlp import MLP, MOST_CELLS, check_size
 from cprl.networks.stacked import lane_state, stack_lanes
-from cprl.spaces import Spaces
 
 Kind = Literal["GRU", "LSTM"]
 _CHECKS: Final[dict[str, Check]] = {

@@ -8,11 +8,11 @@ import torch
 from torch import nn
 
 from cprl.checks import checked, instance
+from cprl.commons.spaces import Spaces
 from cprl.custom import Custom
 from cprl.networks.convolutional import Conv
 from cprl.networks.mlp import MLP
 from cprl.networks.recurrent import GRU, LSTM
-from cprl.spaces import Spaces
 
 Network: TypeAlias = MLP | Conv | GRU | LSTM
 """A network of cprl. A network of your own is a `Custom`, called with (spaces, outputs) and its arguments."""

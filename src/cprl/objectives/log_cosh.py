@@ -10,7 +10,7 @@ from torchrl.objectives import DQNLoss
 from torchrl.objectives.utils import distance_loss
 
 from cprl.arguments import choice, object_of, switch
-from cprl.compat import ReshapedLoss
+from cprl.system.compat import ReshapedLoss
 
 LOG_COSH: Final = "log_cosh"
 """Its name among loss functions."""

@@ -9,10 +9,10 @@ from tensordict.nn import TensorDictModuleBase
 from torch import Tensor, nn
 
 from cprl import arguments, keys
-from cprl.compat import unchecked_tensordict
 from cprl.policies.decisions import Decider
 from cprl.policies.lanes import LaneActor
 from cprl.policies.recurrent import RecurrentLaneActor
+from cprl.system.compat import unchecked_tensordict
 
 AgentIndices: TypeAlias = int | tuple[int, ...]
 """The agents that an actor or learner controls: one index, or several."""

@@ -10,9 +10,9 @@ from torch import Tensor, nn
 from torchrl.envs.utils import ExplorationType, exploration_type
 
 from cprl import arguments
-from cprl.compiling import Compiled
+from cprl.commons.spaces import Spaces
 from cprl.policies.rng import MOST_LANES, LaneRng, check_lanes
-from cprl.spaces import Spaces
+from cprl.system.compiling import Compiled
 
 
 class LaneActor(TensorDictModuleBase):
@@ -182,7 +182,7 @@ def random_agents(
     spaces: Spaces, agents: tuple[int, ...], *, replicas: int, seed: int, worlds: int = 1
 ) -> dict[int | tuple[int, ...], nn.Module]:
     """Uniformly random actors of some agents of every replica, by the indices of the agents."""
-    arguments.object_of("spaces", spaces, Spaces, "a cprl.spaces.Spaces")
+    arguments.object_of("spaces", spaces, Spaces, "a cprl.commons.spaces.Spaces")
     agents = arguments.listed("agents", agents, "the indices of agents")
     replicas, seed = arguments.integer("replicas", replicas, 1, MOST_LANES), arguments.seed(seed)
     seeds = [(seed, replica, agent) for replica in range(replicas) for agent in agents]

@@ -10,10 +10,10 @@ from tensordict.nn import TensorDictModuleBase
 from torch import nn
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 
-from cprl.compat import unchecked_tensordict
 from cprl.policies.assignment import AgentIndices, AgentPolicies
 from cprl.policies.decisions import Decider
 from cprl.policies.lanes import LaneActor
+from cprl.system.compat import unchecked_tensordict
 
 
 class FirstReplica(TensorDictModuleBase):

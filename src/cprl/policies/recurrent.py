@@ -9,9 +9,9 @@ from torch import Tensor
 from torchrl.envs.utils import ExplorationType, exploration_type
 
 from cprl import arguments
-from cprl.compiling import Compiled
+from cprl.commons.spaces import Spaces
 from cprl.policies.lanes import LaneActor
-from cprl.spaces import Spaces
+from cprl.system.compiling import Compiled
 
 
 class RecurrentLaneActor(LaneActor):

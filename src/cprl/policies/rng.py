@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 
 from cprl import arguments
-from cprl.memory import check_memory
+from cprl.system.memory import check_memory
 
 DRAWN_AHEAD: Final = 1024
 """Steps whose numbers are generated at once."""

@@ -50,13 +50,13 @@ from cprl.commons.compiled import CPU_OPTIONS, compiled, kept_on_disk
 from cprl.commons.decoding import UNSEEN, classes_seen
 from cprl.commons.game import Game
 from cprl.commons.near import distance
+from cprl.commons.spaces import Spaces
 from cprl.commons.world import Bytes
 from cprl.policies import paths, scripted_rules
 from cprl.policies.lanes import random_lanes
 from cprl.policies.paths import AGENT, APPLE, OPEN, UNKNOWN, WALL, Frame, Scratch
 from cprl.policies.rng import LaneRng, check_lanes
 from cprl.policies.scripted_rules import NUMBERS, Settings
-from cprl.spaces import Spaces
 
 ScriptedPolicy = Literal["random", "greedy", "sustainable", "territorial", "aggressive", "pacifist"]
 SCRIPTED_POLICIES: Final[tuple[ScriptedPolicy, ...]] = get_args(ScriptedPolicy)

@@ -14,8 +14,8 @@ from torchrl.envs.utils import ExplorationType, exploration_type
 
 from cprl import arguments
 from cprl.checks import checked, one_of
+from cprl.commons.spaces import DTYPES, Spaces
 from cprl.policies.rng import MOST_LANES, LaneRng, check_lanes
-from cprl.spaces import DTYPES, Spaces
 
 NEVER_MET = 0
 """The row of states that are in no table; its values stay 0."""
@@ -220,7 +220,7 @@ class TabularActor(TensorDictModuleBase):
         self, tables: QTables, spaces: Spaces, *, seeds: Sequence[Sequence[int]], agents: int, worlds: int = 1
     ) -> None:
         super().__init__()
-        arguments.object_of("spaces", spaces, Spaces, "a cprl.spaces.Spaces")
+        arguments.object_of("spaces", spaces, Spaces, "a cprl.commons.spaces.Spaces")
         self.in_keys = observed_entries(spaces)
         self.tables, self.actions, self.epsilon = tables, spaces.actions, 1.0
         self.agents, self.worlds, self.replicas = check_lanes(seeds, agents=agents, worlds=worlds)

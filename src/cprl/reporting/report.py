@@ -24,7 +24,7 @@ from cprl.reporting.possible import shares_of
 from cprl.reporting.result import Result, read_result
 from cprl.reporting.turning import phases_of, turning_points_of
 from cprl.runs.files import write_atomically
-from cprl.shipped import is_cprl
+from cprl.system.shipped import is_cprl
 
 
 def write_report(runs: Sequence[Path], out: Path, *, pool: bool = False, allow: Sequence[str] = ()) -> Path:

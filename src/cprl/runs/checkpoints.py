@@ -14,12 +14,12 @@ from typing import Any, Final, NoReturn, Protocol, Self
 import torch
 from rich.console import Console
 
-from cprl.output import RESUMES
-from cprl.output import console as safe_console
 from cprl.runs import formats
 from cprl.runs.directory import resume_command as command_to_resume
 from cprl.runs.files import checksum, place_atomically, refuse_special, remove_partial
 from cprl.runs.lock import RunLock
+from cprl.system.output import RESUMES
+from cprl.system.output import console as safe_console
 
 FOLDER: Final = "checkpoints"
 EVERY_S: Final = 300.0

@@ -16,14 +16,14 @@ from cprl.arguments import callable_of, listed, refusal, texts
 from cprl.arguments import path as path_of
 from cprl.checks import TEXT, checked, shown
 from cprl.custom import source_of
-from cprl.output import ERR, console, printed
-from cprl.process import cpu
 from cprl.runs import formats
 from cprl.runs.files import digest_of, read_json, write_json
 from cprl.runs.lock import FILE_NAME as LOCK_NAME
 from cprl.runs.lock import RunLock
 from cprl.runs.source import git_state
-from cprl.shipped import PROGRAM, command_of, cprl_here
+from cprl.system.output import ERR, console, printed
+from cprl.system.process import cpu
+from cprl.system.shipped import PROGRAM, command_of, cprl_here
 
 FILE_NAME: Final = "recipe.json"
 
@@ -120,7 +120,7 @@ def refuse_another_run(
         raise ValueError(
             f"{out} has a recipe of the format {shown(kept.get('format'))}; allowed: {now['format']}"
         )
-    from cprl.differences import differences
+    from cprl.config import differences
 
     before, asked = kept["experiment"], now["experiment"]
     free = {"episodes": 0, "on_nan": ""}
@@ -161,7 +161,7 @@ def changed_circumstances(run: Path) -> list[str]:
 
     Numbers may then differ from those of an undisturbed run.
     """
-    from cprl.differences import differences
+    from cprl.config import differences
 
     recipe = read_recipe(run)
     now = _circumstances(recipe)

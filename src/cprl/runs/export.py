@@ -11,7 +11,7 @@ import pyarrow.parquet as pq
 
 from cprl.arguments import path as path_of
 from cprl.arguments import switch
-from cprl.differences import differences
+from cprl.config import differences
 from cprl.runs.directory import FILE_NAME as RECIPE
 from cprl.runs.directory import read_recipe
 from cprl.runs.episodes import FILE_NAME, read_episodes, read_table

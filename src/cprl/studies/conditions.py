@@ -7,7 +7,7 @@ from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import Any, Final
 
-from cprl.differences import without_defaults
+from cprl.config import without_defaults
 from cprl.experiment import Experiment
 from cprl.studies.factors import Level
 from cprl.studies.naming import unlike

@@ -6,7 +6,7 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, Final
 
-from cprl.differences import differences
+from cprl.config import differences
 from cprl.experiment import Experiment
 from cprl.runs.checkpoints import FOLDER, checkpoints_in, is_ending
 from cprl.runs.directory import FILE_NAME as RECIPE

@@ -14,7 +14,7 @@ from cprl.arguments import refusal
 from cprl.checks import MOST_NUMBER, is_count, is_number
 from cprl.config import from_config, to_config
 from cprl.custom import Custom
-from cprl.games import game_of, stored_game
+from cprl.envs.games import game_of, stored_game
 from cprl.population import with_run_moved
 from cprl.studies.paths import normalised
 

@@ -10,11 +10,11 @@ from dataclasses import fields, is_dataclass, replace
 from difflib import get_close_matches
 from typing import Any, Final, get_args, get_origin, get_type_hints
 
-from cprl.annotations import fits, type_text
 from cprl.arguments import refusal
 from cprl.checks import shown
 from cprl.commons import maps
 from cprl.commons.maps import Map
+from cprl.config import fits, type_text
 from cprl.custom import Custom
 from cprl.experiment import Experiment
 from cprl.population import Learning, Team

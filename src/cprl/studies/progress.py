@@ -13,9 +13,9 @@ from rich.live import Live
 from rich.table import Table
 from rich.text import Text
 
-from cprl.output import Output, console
 from cprl.studies.overview import Overview, Snapshot, label_of
 from cprl.studies.trials import Outcome, Trial
+from cprl.system.output import Output, console
 
 _TABLE_PERIOD_S: Final = 1.0
 _LINE_PERIOD_S: Final = 10.0

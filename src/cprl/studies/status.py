@@ -19,11 +19,11 @@ from typing import Any, Final, Self
 import psutil
 from tensordict import TensorDictBase
 
-from cprl.compile_clock import CLOCK
 from cprl.experiment import Experiment
 from cprl.measuring.episodes import Episode
-from cprl.process import cpu
 from cprl.runs.files import write_json
+from cprl.system.compile_clock import CLOCK
+from cprl.system.process import cpu
 from cprl.training import Training
 
 BEAT_S: Final = 1.0

@@ -17,8 +17,7 @@ from itertools import count
 from pathlib import Path
 from typing import Any, Final, Literal, NamedTuple
 
-from cprl.config import custom_targets
-from cprl.differences import differences
+from cprl.config import custom_targets, differences
 from cprl.experiment import Experiment
 from cprl.population import Frozen, with_stored
 from cprl.runs.directory import FILE_NAME as RECIPE
@@ -253,7 +252,7 @@ def run_task(task: Task) -> Outcome:
 
 def _run(task: Task, run: Path, status: Status) -> bool:
     """Runs or resumes a trial as soon as nobody else does; False if it does not wait for that."""
-    from cprl.running import run as run_experiment
+    from cprl.training.running import run as run_experiment
 
     silent = is_silent(status, PATIENCE_S)
     while state_of(run) != "finished":

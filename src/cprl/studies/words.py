@@ -11,9 +11,9 @@ from math import isfinite
 from types import NoneType, UnionType
 from typing import Any, Final, Literal, Union, get_args, get_origin
 
-from cprl.annotations import fits, type_text
 from cprl.checks import shown
 from cprl.commons.maps import Map
+from cprl.config import fits, type_text
 from cprl.experiment import Experiment
 from cprl.studies import factors
 from cprl.studies.factors import Distribution, Factor, Integers

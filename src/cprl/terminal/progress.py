@@ -13,9 +13,9 @@ from tensordict import TensorDictBase
 
 from cprl.arguments import object_of
 from cprl.checks import checked, count
-from cprl.compile_clock import CLOCK
 from cprl.measuring.episodes import Episode
-from cprl.output import console as safe_console
+from cprl.system.compile_clock import CLOCK
+from cprl.system.output import console as safe_console
 
 _BAR_PERIOD_S: Final = 0.25
 _LINE_PERIOD_S: Final = 10.0

@@ -16,7 +16,7 @@ from cprl.measuring.names import title
 from cprl.measuring.names import title as metric_title
 from cprl.measuring.replicas import institution_metrics, social_metrics
 from cprl.measuring.reported import INSTITUTIONAL, left_out
-from cprl.output import printed
+from cprl.system.output import printed
 from cprl.terminal.progress import console_of
 from cprl.viewer.streams import to_watch
 

@@ -1,4 +1,4 @@
-"""Training: one step after the other, with a state that can be read and set."""
+"""train: a training from its first step to its last."""
 
 import time
 from collections.abc import Callable, Mapping, Sequence
@@ -14,12 +14,10 @@ from torchrl.collectors import BaseCollector
 from torchrl.envs import EnvBase
 
 from cprl.arguments import callable_of, object_of
-from cprl.callbacks import check_callbacks
-from cprl.collectors import StepCollector
 from cprl.envs.make_env import check_env, spaces_of
 from cprl.envs.state import carried_state, env_state, load_carried, load_env_state
 from cprl.envs.unwrap import commons_of
-from cprl.finite import EVERY_STEPS, FiniteCheck, OnNan
+from cprl.experiment import OnNan
 from cprl.learners.base import (
     LaneLosses,
     Learner,
@@ -34,7 +32,10 @@ from cprl.measuring.tracking import tracker_of
 from cprl.policies.assignment import AgentIndices, AgentPolicies, agent_indices
 from cprl.policies.decisions import Decider
 from cprl.runs import formats
-from cprl.times import Times
+from cprl.system.times import Times
+from cprl.training.callbacks import SavesTraining, check_callbacks
+from cprl.training.collectors import StepCollector
+from cprl.training.finite import EVERY_STEPS, FiniteCheck
 
 MakeCollector = Callable[[EnvBase, nn.Module], BaseCollector]
 """A collector out of an environment and a policy; it yields batches [R], or [R, T] of T turns."""
@@ -55,9 +56,9 @@ class Training:
         decisions: what all agents decide, and learn to, where the game asks them; see `Game.decisions`.
         callbacks: called after each turn and each episode, in this order; see `Callback`.
         update_every: steps k after which each learner updates, then k times.
-        make_collector: `StepCollector`, or for TorchRL's own `cprl.collectors.stock_collector`.
+        make_collector: `StepCollector`, or for TorchRL's own `cprl.training.collectors.stock_collector`.
         on_nan: whether the training stops where a loss, weight, reward or observation is not finite, see
-            `cprl.finite`.
+            `cprl.training.finite`.
 
     Raises:
         ValueError: for agents without a learner or actor, or with two; another number of worlds than the
@@ -299,3 +300,60 @@ def _return_to_decide_by(episode: Episode) -> NDArray[np.float64]:
     """What each agent's decisions are learned from, float64 [N]: its wanted return, else its return."""
     wanted = episode.wanted_return
     return episode.return_ if wanted is None else np.where(np.isnan(wanted), episode.return_, wanted)
+
+
+def train(
+    env: EnvBase,
+    learners: Mapping[tuple[int, ...], Learner],
+    *,
+    episodes: int,
+    others: Mapping[AgentIndices, nn.Module] | None = None,
+    decisions: Decider | None = None,
+    callbacks: Sequence[Any] = (),
+    checkpointer: SavesTraining | None = None,
+    update_every: int = 1,
+    make_collector: MakeCollector = StepCollector,
+    on_nan: OnNan = "stop",
+) -> Training:
+    """Plays so many episodes of every replica; each learner stores every turn and then updates.
+
+    Args:
+        env: see `Training`, also for all that is not said here.
+        learners: by the indices of their agents.
+        episodes: how many to play.
+        others: the actors of the agents that do not learn.
+        decisions: what all agents decide, where the game asks them.
+        callbacks: called after each turn and each episode.
+        checkpointer: where the training resumes from, and saves its state now and then.
+        update_every: steps k after which each learner updates, then k times.
+        make_collector: what plays.
+        on_nan: "stop" or "continue".
+
+    Returns:
+        The training, which is over.
+
+    Raises:
+        ValueError: see `Training`; with a checkpointer also for what has no state to resume from.
+        NotFiniteError: where a number is not finite, before a checkpoint holds it.
+    """
+    training = Training(
+        env,
+        learners,
+        episodes=episodes,
+        others=others,
+        decisions=decisions,
+        callbacks=callbacks,
+        update_every=update_every,
+        make_collector=make_collector,
+        on_nan=on_nan,
+    )
+    if checkpointer is not None:
+        object_of("checkpointer", checkpointer, SavesTraining, "None, or what has `restore` and `after_step`")
+        training.state_dict()  # what cannot be saved is refused now, not when the first checkpoint is due
+        checkpointer.restore(training)
+    training.start()
+    while not training.is_over:
+        training.step()
+        if checkpointer is not None:
+            checkpointer.after_step(training)
+    return training

@@ -17,13 +17,13 @@ from torchrl.envs import EnvBase
 from cprl.arguments import object_of
 from cprl.arguments import path as path_of
 from cprl.checks import NONE, TEXT, check_nesting, checked, count, either
-from cprl.compile_clock import CLOCK
 from cprl.envs.unwrap import agent_names, commons_of
 from cprl.measuring.episodes import Episode
 from cprl.measuring.recent import Recent
 from cprl.measuring.replicas import social_metrics
 from cprl.measuring.reported import reported_by
 from cprl.measuring.series import OF_AGENTS, Series, Values, mean_of, numbers_of
+from cprl.system.compile_clock import CLOCK
 from cprl.viewer.exhibition import Exhibited, Exhibition
 from cprl.viewer.frames import Filming, scene_of
 from cprl.viewer.logger import FILE_NAME, RerunLogger, free_name, recording_id

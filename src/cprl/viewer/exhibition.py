@@ -28,10 +28,10 @@ from cprl.commons.colours import (
 from cprl.commons.game import Game
 from cprl.commons.sprites import INK_COLOUR, MARK_COLOUR
 from cprl.commons.world import Bytes
-from cprl.compat import rows_made, send_chunk, send_made
 from cprl.envs.recurrent_states import begin_states
 from cprl.envs.state import load_transforms_state, transforms_state
 from cprl.envs.unwrap import commons_of
+from cprl.system.compat import rows_made, send_chunk, send_made
 from cprl.viewer.frames import FrameRecorder
 from cprl.viewer.logger import components
 from cprl.viewer.scenery import BACKGROUND, Scene
@@ -55,7 +55,7 @@ from cprl.viewer.streams import Live
 
 
 def ragged(form: Any, counts: NDArray[np.integer[Any]], values: NDArray[Any]) -> Any:
-    """Rows of numbers, lines or bytes, as `cprl.compat.send_chunk` takes them.
+    """Rows of numbers, lines or bytes, as `cprl.system.compat.send_chunk` takes them.
 
     Args:
         form: the `pyarrow` type of the column: lists of numbers, of lists of numbers, or of lists of points.

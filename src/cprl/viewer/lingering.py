@@ -6,7 +6,7 @@ from threading import Event, current_thread, main_thread
 from types import FrameType
 from typing import Final
 
-from cprl.output import console
+from cprl.system.output import console
 from cprl.viewer.logger import RerunLogger
 
 _SIGNALS: Final = (signal.SIGINT, signal.SIGTERM)

@@ -18,10 +18,10 @@ from torchrl.record.loggers import Logger
 from cprl.arguments import object_of
 from cprl.arguments import path as path_of
 from cprl.checks import NONE, TEXT, check_nesting, checked, either, shown
-from cprl.compat import send_chunk
-from cprl.output import console as safe_console
 from cprl.runs.directory import FILE_NAME as RECIPE_FILE
 from cprl.runs.files import read_json
+from cprl.system.compat import send_chunk
+from cprl.system.output import console as safe_console
 from cprl.viewer.blueprint import layout
 from cprl.viewer.scenery import Curves, Scene
 from cprl.viewer.stage import columns, fixed
@@ -161,12 +161,12 @@ def times(steps: Numbers, episodes: Numbers, frames: Numbers) -> list[Any]:
 
 
 def components(columns: Iterable[Any]) -> dict[Any, Any]:
-    """Columns of an archetype as `cprl.compat.send_chunk` takes them."""
+    """Columns of an archetype as `cprl.system.compat.send_chunk` takes them."""
     return {own.component_descriptor(): own.as_arrow_array() for own in columns}
 
 
 def timelines(at: Iterable[Any]) -> dict[str, Any]:
-    """`times` as `cprl.compat.send_chunk` takes them."""
+    """`times` as `cprl.system.compat.send_chunk` takes them."""
     return {own.timeline_name(): own.as_arrow_array() for own in at}
 
 

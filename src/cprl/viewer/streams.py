@@ -16,8 +16,8 @@ from threading import Thread
 from typing import Any, Final, TypeAlias, TypeVar
 
 from cprl import arguments
-from cprl.compat import end_recordings, keep_native
-from cprl.output import printed
+from cprl.system.compat import end_recordings, keep_native
+from cprl.system.output import printed
 from cprl.viewer.page import LOCALHOST, Page, free_port, has_display, viewer_binary
 
 T = TypeVar("T")

@@ -14,10 +14,10 @@ from numpy.typing import NDArray
 
 from cprl.commons.colours import GROUND, PALETTE, WALL, agent_colour
 from cprl.commons.decoding import UNSEEN
-from cprl.compat import send_chunk
 from cprl.envs.commons_env import CommonsEnv
 from cprl.institutions import Boundaries
 from cprl.measuring.episodes import Episode
+from cprl.system.compat import send_chunk
 from cprl.viewer.institutions import has_institutions, lines
 from cprl.viewer.logger import RerunLogger, components, timelines, times
 from cprl.viewer.panels import TITLE, Axes, Panels

@@ -9,10 +9,10 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from cprl.commons.spaces import Spaces
 from cprl.learners.buffer.storage import torch_dtype
 from cprl.learners.checks import check_rollouts
 from cprl.learners.transitions import LaneTurn
-from cprl.spaces import Spaces
 
 
 class LaneShapes(Protocol):

@@ -15,8 +15,8 @@ from cprl.custom import Custom
 from cprl.learners.buffer.gather import Horizon
 from cprl.learners.buffer.storage import LaneStorage, storage_bytes, torch_dtype
 from cprl.learners.transitions import LaneTurn, array_of, transitions_in, turn_of
-from cprl.memory import check_memory, free_bytes
 from cprl.policies.rng import DRAWN_AHEAD, LaneRng
+from cprl.system.memory import check_memory, free_bytes
 
 NUMBERS_AHEAD: Final = 2**14
 """About as many numbers for losses that sample, or for an epoch, are generated at once for each lane."""

@@ -16,7 +16,6 @@ import torch
 from tensordict import TensorDict
 from torch import Tensor, nn
 
-from cprl.compiling import TOLERANCE
 from cprl.learners.buffer.gather import Horizon
 from cprl.learners.buffer.sampler import lane_buffer
 from cprl.learners.buffer.storage import torch_dtype
@@ -24,6 +23,7 @@ from cprl.learners.engine.base import Engine, ListEngine
 from cprl.learners.engine.compiled import FunctionalEngine
 from cprl.learners.engine.functional import MakeLoss, groups_of, own_targets
 from cprl.learners.transitions import LaneTurn, array_of
+from cprl.system.compiling import TOLERANCE
 
 EngineName = Literal["lane_axis", "lane_axis_flat", "vmapped", "list"]
 

@@ -9,7 +9,6 @@ import torch
 from tensordict import TensorDict
 from torch import Tensor, nn
 
-from cprl.compiling import Compiled
 from cprl.learners.buffer.gather import FIELDS, Horizon, sampled
 from cprl.learners.buffer.sampler import LaneBuffer
 from cprl.learners.buffer.storage import LaneStorage
@@ -19,6 +18,7 @@ from cprl.learners.settings import Optimizer
 from cprl.networks.agent import parts_of
 from cprl.networks.finite import finite_lanes
 from cprl.networks.stacked import lane_state, stack_lanes
+from cprl.system.compiling import Compiled
 
 
 class FunctionalEngine:

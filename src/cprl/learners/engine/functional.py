@@ -10,8 +10,8 @@ from tensordict.nn import TensorDictParams
 from torch import Tensor, nn
 from torchrl.objectives import LossModule
 
-from cprl.compat import forget_cached_weights, promise_targets, refuse_updaters, updated_weights
 from cprl.networks.stacked import stack_lanes
+from cprl.system.compat import forget_cached_weights, promise_targets, refuse_updaters, updated_weights
 
 MakeLoss = Callable[[nn.Module], LossModule]
 """Makes one agent's loss from its network; see `cprl.learners.single.dqn_loss`."""

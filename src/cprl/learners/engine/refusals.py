@@ -9,9 +9,9 @@ from torch import Tensor
 from torchrl.objectives import A2CLoss, LossModule, PPOLoss, ReinforceLoss, ValueEstimators
 from torchrl.objectives.value import GAE, TD0Estimator, ValueEstimatorBase
 
-from cprl.compat import promise_targets
 from cprl.learners.engine.functional import own_targets, targets_of, total
 from cprl.learners.settings import DQNSettings, RolloutSettings
+from cprl.system.compat import promise_targets
 
 _OF_ONE_STEP: Final = (None, ValueEstimators.TD0, TD0Estimator)
 _OF_ROLLOUTS: Final = (None, ValueEstimators.GAE, ValueEstimators.MAGAE)

@@ -9,6 +9,7 @@ from torch import Tensor, nn
 from torchrl.objectives import LossModule
 from torchrl.objectives.value.functional import generalized_advantage_estimate
 
+from cprl.commons.spaces import Spaces
 from cprl.learners.buffer.rollout import refuse_full, rollout_fields, write_turn
 from cprl.learners.checks import check_learner, refuse_other_parts
 from cprl.learners.lanes import WEIGHTS, Lanes, StartFrom
@@ -19,7 +20,6 @@ from cprl.objectives import LOLADiCELoss, dice_objective
 from cprl.policies.lanes import LaneActor
 from cprl.preferences.values import Preference
 from cprl.preferences.wanted import WantedRewards
-from cprl.spaces import Spaces
 
 _SMALL: Final = 1e-8
 

@@ -15,7 +15,7 @@ from cprl.learners.buffer.storage import torch_dtype
 from cprl.learners.lanes import Lanes
 from cprl.learners.settings import DQNSettings
 from cprl.learners.torchrl.agents import MakeSampler, sampler_of
-from cprl.memory import check_memory
+from cprl.system.memory import check_memory
 
 _BYTES_BESIDE: Final = 4 + 1 + 1
 """Bytes of a transition without its observations and actions: reward, done, terminated."""

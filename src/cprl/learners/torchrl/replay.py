@@ -10,6 +10,7 @@ from torchrl.data.replay_buffers import RandomSampler
 from torchrl.objectives import HardUpdate, LossModule, SoftUpdate
 from torchrl.objectives.utils import TargetNetUpdater
 
+from cprl.commons.spaces import Spaces
 from cprl.envs.drivers import device_of
 from cprl.learners.buffer.gather import Horizon
 from cprl.learners.buffer.sampler import Noise, transformed
@@ -28,7 +29,6 @@ from cprl.networks.recurrent import state_shape_of
 from cprl.policies.lanes import LaneActor
 from cprl.preferences.values import Preference
 from cprl.preferences.wanted import WantedRewards
-from cprl.spaces import Spaces
 
 
 class TorchRLReplayLearner:

@@ -13,6 +13,7 @@ from torchrl.data.replay_buffers import SamplerWithoutReplacement
 from torchrl.objectives import LossModule
 from torchrl.objectives.value import GAE
 
+from cprl.commons.spaces import Spaces
 from cprl.envs.drivers import device_of
 from cprl.learners.buffer.storage import torch_dtype
 from cprl.learners.checks import check_learner, check_rollouts, refuse_other_parts
@@ -28,7 +29,6 @@ from cprl.learners.transitions import wanted_in
 from cprl.policies.lanes import LaneActor
 from cprl.preferences.values import Preference
 from cprl.preferences.wanted import WantedRewards
-from cprl.spaces import Spaces
 
 
 class TorchRLRolloutLearner:

@@ -6,11 +6,11 @@ from pathlib import Path
 from typing import Final
 
 from cprl.commons.game import Game
+from cprl.commons.spaces import Spaces
 from cprl.envs.make_env import make_env, spaces_of
 from cprl.experiment import Experiment
 from cprl.learners.buffer.storage import storage_bytes, torch_dtype
 from cprl.population import Learning, Team
-from cprl.spaces import Spaces
 from cprl.studies.status import Status
 from cprl.studies.trials import Task, state_of
 

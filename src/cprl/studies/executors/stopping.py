@@ -5,8 +5,8 @@ from threading import current_thread, main_thread
 from types import FrameType, TracebackType
 from typing import Any, Final, NoReturn, Self
 
-from cprl.output import console
 from cprl.runs.checkpoints import interruption
+from cprl.system.output import console
 
 _SIGNALS: Final = (signal.SIGINT, signal.SIGTERM)
 

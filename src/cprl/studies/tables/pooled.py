@@ -7,8 +7,7 @@ from pathlib import Path
 from typing import Any, Final
 
 from cprl.arguments import refusal, texts
-from cprl.config import to_config
-from cprl.differences import differences
+from cprl.config import differences, to_config
 from cprl.experiment import Experiment
 from cprl.runs.directory import read_recipe, runs_in
 from cprl.studies.conditions import UNNAMED, Condition

@@ -1,0 +1,266 @@
+"""`cprl film`, `evaluate`, `visits`, `crossplay`, `schelling`: agents that do not learn, in fresh worlds."""
+
+from pathlib import Path
+from typing import Any
+
+from cprl.arguments import FILM_SEED, FILM_SUFFIXES, SEED, Diagonal
+from cprl.commands.parts import check_files, check_runs, print_tables, runs_by_name, tell_files
+from cprl.commands.recipe import Allow, make_importable
+from cprl.presets import Variant, check_board
+from cprl.system.output import printed, say
+from cprl.system.process import prepare_process
+
+
+def film(
+    run: Path,
+    /,
+    *,
+    beside: tuple[Path, ...] = (),
+    titles: tuple[str, ...] = (),
+    replica: int = 0,
+    episode: int = 0,
+    seed: int = FILM_SEED,
+    out: Path | None = None,
+    every: int | None = None,
+    fps: float | None = None,
+    width: int | None = None,
+    allow: Allow = (),
+) -> None:
+    """Lets the agents of a run play a fresh episode, recorded for the Rerun viewer or as a film.
+
+    Args:
+        run: the run's directory, or its results.
+        beside: of a .gif or .mp4: more runs, whose agents play beside them on one clock.
+        titles: of a .gif or .mp4: one for the run and one for each beside it; by default their institutions,
+            or the names of their experiments.
+        replica: whose agents.
+        episode: which of the fresh episodes; the same number plays the same again.
+        seed: of the worlds and all chance. With the seed of cprl evaluate, 30011 by default, the world of its
+            episode E of replica R is --episode R x EPISODES + E; what agents draw by chance differs. The
+            run's own evaluation plays by the seed of its experiment + 1.
+        out: what is written: a recording for the viewer (.rrd), or a film of the board, the stock and the
+            harvests (.gif, or .mp4, which wants the extra "film"); by default film-<replica>-<episode>.rrd in
+            the run's directory.
+        every: of a .gif or .mp4: turns from one picture to the next; by default 1 for an .mp4, and for a .gif
+            as many as it takes for 300 pictures.
+        fps: of a .gif or .mp4: pictures per second, at most 50; by default 15.
+        width: of a .gif or .mp4, in pixels, at most 1920 and at least 240 for each run; by default 640 for
+            each that has room.
+        allow: code of your own, module:Class, that the run may import; see docs/experiments.md.
+    """
+    flags: dict[str, Any] = {"beside": beside, "titles": titles, "every": every, "fps": fps, "width": width}
+    given = {name: value for name, value in flags.items() if value not in (None, ())}
+    if out is not None and out.suffix not in (".rrd", *FILM_SUFFIXES):
+        raise ValueError(f"--out is {out}; allowed: a name that ends in .rrd, {', '.join(FILM_SUFFIXES)}")
+    is_video = out is not None and out.suffix in FILM_SUFFIXES
+    if given and not is_video:
+        raise ValueError(f"--{next(iter(given))} is for films; allowed: with --out FILE.gif or FILE.mp4")
+    make_importable(allow)
+    check_runs(run, *beside)
+
+    from cprl.evaluation.film import film as film_run
+    from cprl.evaluation.film import film_video
+    from cprl.viewer.streams import to_watch
+
+    prepare_process(seed)
+    which: dict[str, Any] = {"replica": replica, "episode": episode, "seed": seed, "allow": allow}
+    if out is not None and is_video:
+        path, episodes = film_video(run, out, **which, **given)
+        for name, played in zip((run, *beside), episodes, strict=True):
+            say(f"{f'{name}: ' if beside else ''}{played.steps} steps, {played.outcome}")
+        say(f"{path}: {path.stat().st_size / 1000:.0f} kB")
+    else:
+        path, played = film_run(run, out, **which)
+        say(f"{played.steps} steps, {played.outcome}")
+        say(f"Watch: {printed(to_watch(path))}")
+
+
+def evaluate(
+    run: Path,
+    /,
+    *,
+    episodes: int = 20,
+    greedy: bool = False,
+    seed: int = SEED,
+    replicas: tuple[int, ...] = (),
+    out: Path | None = None,
+    allow: Allow = (),
+) -> None:
+    """Lets all replicas of a run play fresh worlds, and prints the social metrics beside the random policy's.
+
+    Args:
+        run: the run's directory, or its results; of one that has not ended the newest checkpoint plays.
+        episodes: of each replica.
+        greedy: whether agents play what they hold best, without exploring or drawing.
+        seed: of the worlds and all chance; the same one gives the same numbers.
+        replicas: their numbers; by default all.
+        out: a parquet file to be, with every episode.
+        allow: code of your own, module:Class, that the run may import; see docs/experiments.md.
+    """
+    make_importable(allow)
+    check_files(out)
+    check_runs(run)
+
+    from cprl.evaluation.evaluate import evaluate_run, run_table
+    from cprl.runs.labelled import write_table
+
+    prepare_process(seed)
+    evaluation = evaluate_run(
+        run, episodes=episodes, greedy=greedy, seed=seed, replicas=replicas, allow=allow
+    )
+    if out is not None:
+        write_table(out, evaluation.table())
+    print_tables(run_table(evaluation))
+    say(f"Weights: {evaluation.run.weights_from}")
+    if out is not None:
+        say(f"Episodes: {out}")
+
+
+def visits(
+    run: Path,
+    /,
+    *,
+    episodes: int = 20,
+    greedy: bool = False,
+    seed: int = SEED,
+    replicas: tuple[int, ...] = (),
+    figure: Path | None = None,
+    random: bool = False,
+    allow: Allow = (),
+) -> None:
+    """Lets all replicas of a run play fresh worlds, and prints how far agents keep to cells of their own.
+
+    Args:
+        run: the run's directory, or its results; of one that has not ended the newest checkpoint plays.
+        episodes: of each replica.
+        greedy: whether agents play what they hold best, without exploring or drawing.
+        seed: of the worlds and all chance; the same one gives the same numbers.
+        replicas: their numbers; by default all. The first one is drawn.
+        figure: a PNG to be: a map for each agent of where it spends its time.
+        random: draw random agents in the same worlds instead.
+        allow: code of your own, module:Class, that the run may import; see docs/experiments.md.
+    """
+    make_importable(allow)
+    if random and figure is None:
+        raise ValueError("--random says who is drawn; allowed: with --figure FILE.png")
+    check_files(figure=figure)
+    check_runs(run)
+
+    from cprl.evaluation.territory import draw_visits, territory_of, territory_table
+
+    prepare_process(seed)
+    found = territory_of(run, episodes=episodes, greedy=greedy, seed=seed, replicas=replicas, allow=allow)
+    print_tables(territory_table(found))
+    say(f"Weights: {found.run.weights_from}")
+    if figure is not None:
+        say(f"Figure: {draw_visits(found, figure, policy='random' if random else 'trained')}")
+
+
+def crossplay(
+    runs: tuple[str, ...],
+    /,
+    *,
+    episodes: int = 20,
+    greedy: bool = False,
+    seed: int = SEED,
+    replicas: tuple[int, ...] = (),
+    diagonal: Diagonal = "self",
+    out: Path | None = None,
+    figure: Path | None = None,
+    allow: Allow = (),
+) -> None:
+    """Lets agents of each run play among those of each other run, and prints how all fare.
+
+    Args:
+        runs: directories of runs of the same game, or their results; NAME=PATH gives one another name.
+        episodes: of each replica with each focal agent.
+        greedy: whether agents play what they hold best, without exploring or drawing.
+        seed: of the worlds and all chance; the same one gives the same numbers.
+        replicas: their numbers; by default all that every run has.
+        diagonal: whom a run's agents meet there: "self", those they were trained with, or "cross_seed", those
+            of the run's next replica.
+        out: a parquet file to be, with every episode.
+        figure: a PNG to be: what focal agents gain, and what it costs the background agents.
+        allow: code of your own, module:Class, that the run may import; see docs/experiments.md.
+    """
+    make_importable(allow)
+    check_files(out, figure)
+    named = runs_by_name(runs)
+    check_runs(*(named.values() if isinstance(named, dict) else named))
+
+    from cprl.evaluation.cross_play import agents_table, draw_gains, gains_tables, heading, matrices
+    from cprl.evaluation.cross_play import crossplay as play_each_other
+    from cprl.runs.labelled import write_table
+
+    prepare_process(seed)
+    played = play_each_other(
+        named,
+        episodes=episodes,
+        greedy=greedy,
+        seed=seed,
+        replicas=replicas,
+        diagonal=diagonal,
+        allow=allow,
+    )
+    if out is not None:
+        write_table(out, played.table())
+    say(heading(played))
+    print_tables(*matrices(played), *gains_tables(played), agents_table(played))
+    tell_files(out, figure, lambda path: draw_gains(played, path))
+
+
+def schelling(
+    board: str,
+    /,
+    *,
+    restrained: str = "sustainable",
+    greedy: str = "greedy",
+    variant: Variant = "published",
+    episodes: int = 5,
+    replicas: int = 8,
+    seed: int = SEED,
+    out: Path | None = None,
+    figure: Path | None = None,
+    allow: Allow = (),
+) -> None:
+    """Lets restrained and greedy agents play in all mixes, and prints which social dilemma they are in.
+
+    Args:
+        board: commons, two_complex, single_complex or single_basic; or the directory of a run, whose game it
+            is then; or a file with a drawing.
+        restrained: who plays restrained: random, greedy, sustainable, territorial, aggressive or pacifist, or
+            the directory of a run, whose agents play.
+        greedy: who plays greedy, likewise.
+        variant: of the boards with a name: published, as_run or, of two_complex, as_run_10_april; see
+            docs/game.md.
+        episodes: of each replica and choice of restrained agents; with N agents these are N (N - 1) + 2.
+        replicas: of runs, their replicas from 0 on; of scripted agents, independent groups of episodes.
+        seed: of the worlds and all chance; the same one gives the same numbers.
+        out: a parquet file to be, with every episode.
+        figure: a PNG to be: the Schelling diagram.
+        allow: code of your own, module:Class, that a run may import; see docs/experiments.md.
+    """
+    make_importable(allow)
+    check_files(out, figure)
+    check_board(board)
+
+    from cprl.evaluation.populations import board_named
+    from cprl.evaluation.schelling import draw_schelling, schelling_tables
+    from cprl.evaluation.schelling import schelling as play_all_mixes
+    from cprl.runs.labelled import write_table
+
+    prepare_process(seed)
+    game, run = board_named(board, variant, allow=allow)
+    found = play_all_mixes(
+        game if run is None else run,
+        restrained=restrained,
+        greedy=greedy,
+        episodes=episodes,
+        replicas=replicas,
+        seed=seed,
+        allow=allow,
+    )
+    if out is not None:
+        write_table(out, found.table())
+    print_tables(*schelling_tables(found))
+    tell_files(out, figure, lambda path: draw_schelling(found, path))

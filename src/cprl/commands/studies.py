@@ -1,0 +1,359 @@
+"""`cprl sweep` and `cprl table`, and `study_main`: the command line of a recipe that describes a study."""
+
+import importlib.util
+import inspect
+import os
+import sys
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, fields, replace
+from itertools import pairwise
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any, Final, Literal
+
+import tyro
+
+from cprl.arguments import BLOCK, LAST, WINDOW, object_of, texts
+from cprl.commands.recipe import in_a_sentence, parse_with
+from cprl.commands.studies_options import StudyOptions, carry_out
+from cprl.runs.directory import read_recipe, runs_in
+from cprl.runs.files import refuse_to_write_over, write_atomically
+from cprl.system.output import OUT, console, keep_output, printed, say
+from cprl.system.shipped import is_shipped, program_of, recipe_named
+
+if TYPE_CHECKING:
+    from cprl.experiment import Experiment
+    from cprl.studies import Search, Study, StudyTable
+    from cprl.studies.tables.texts import Cells
+
+PROGRAM: Final = "cprl sweep"
+_RECIPE: Final = (
+    "A Python file with a function `experiment`, the name of a recipe (cprl recipe lists them), a "
+    "recipe.json, or the directory of a run."
+)
+_MODULE: Final = "cprl_swept_recipe"
+_TRAINING: Final = "training"
+_TABLE_SUFFIXES: Final = (".parquet", ".md")
+Part = Literal["training", "evaluation", "random"]
+_NOTE: Final = (
+    "cprl sweep runs a recipe under several conditions. With --vary PATH=VALUES any value below is varied: "
+    'commas stand between values, "x" or spaces between the numbers of one value (hidden-cells=32x32,64x64). '
+    "agents.*.PATH means every agent that learns, agents.0.PATH one. Values may also be True, False, None, "
+    "names, and boards by their names. With --draws or --search a range may stand in their place: "
+    "uniform(LOW,HIGH), loguniform(LOW,HIGH) or integers(LOW,HIGH). Every other flag below is the same in "
+    "all conditions; --replicas are those of each condition."
+)
+
+
+@dataclass(frozen=True, kw_only=True)
+class SweepOptions(StudyOptions):
+    """What is varied, and how it is run."""
+
+    vary: tyro.conf.UseAppendAction[tuple[str, ...]] = ()
+    """PATH=VALUE,VALUE,... e.g. game.rules.freeze-steps=5,25,100; repeated, every combination is run."""
+    draws: int | None = None
+    """So many random combinations instead of all."""
+    block: int = BLOCK
+    """Replicas that one run trains side by side; with fewer, more processes share the work."""
+    reference: str | None = None
+    """The name of the condition that others are compared with, e.g. "freeze_steps=25"."""
+    search: int | None = None
+    """Find good values in so many points proposed by Optuna (extra "optuna"), instead of running all."""
+    maximise: str | None = None
+    """With --search: the metric that shall be high; by default collective_return."""
+    minimise: str | None = None
+    """With --search: the metric that shall be low."""
+    over: Literal["evaluation", "training"] = "evaluation"
+    """With --search: the episodes that count, those of the evaluation or the last 30 of the training."""
+    sampler: Literal["tpe", "random", "gp"] = "tpe"
+    """With --search: how points are proposed."""
+    at_once: int = 4
+    """With --search: points that are proposed together; a multiple of --jobs keeps all of them busy."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class MainOptions(StudyOptions):
+    """How a study is run."""
+
+    replicas: int | None = None
+    """Of each condition; by default those of the study."""
+    episodes: int | None = None
+    """Of each condition; by default those of the study."""
+    block: int | None = None
+    """Replicas that one run trains side by side; with fewer, more processes share the work."""
+
+
+def study_main(study: "Study", argv: Sequence[str] | None = None) -> Path:
+    """Runs a study as the command line asks for it; a recipe of a study ends with it.
+
+    Args:
+        study: what is run.
+        argv: the command line, script first; by default that of this process.
+
+    Returns:
+        The study's directory.
+
+    Raises:
+        ValueError: where `argv` is no list of texts, or `study` no study.
+        SystemExit: where the command line is refused, with the reason; with code 1 where trials failed, and
+            130 or 143 where SIGINT (Ctrl-C) or SIGTERM interrupted it.
+    """
+    from cprl.studies import Study
+
+    object_of("study", study, Study, "a Study")
+    command = list(texts("argv", sys.argv if argv is None else argv, 1))
+    keep_output()
+    script = program_of(command[0])
+
+    def read(options: Annotated[MainOptions, tyro.conf.arg(name="")] = MainOptions()) -> MainOptions:
+        return options
+
+    with in_a_sentence(script):
+        options = tyro.cli(read, args=command[1:], prog=script, description=_about(study), config=_CONFIG)
+        given = {own: getattr(options, own) for own in ("replicas", "block")}
+        changed = {own: value for own, value in given.items() if value is not None}
+        wanted = replace(study, **changed) if changed else study
+        if options.episodes is not None:
+            wanted = _of_episodes(wanted, options.episodes)
+        return carry_out(wanted, options, command)
+
+
+def _of_episodes(study: "Study", episodes: int) -> "Study":
+    """A study with other episodes than its own.
+
+    Raises:
+        ValueError: if it varies the episodes.
+    """
+    shorter = replace(study, experiment=replace(study.experiment, episodes=episodes))
+    for own in shorter.all_conditions:
+        if own.experiment.episodes != episodes:
+            raise ValueError(
+                f"--episodes is {episodes}, and the study's condition {own.name} says "
+                f"{own.experiment.episodes}; allowed: --episodes where no condition says how many"
+            )
+    return shorter
+
+
+def sweep(words: Sequence[str], /) -> None:
+    """Runs a recipe under several conditions, or searches for good values: cprl sweep RECIPE --vary ...
+
+    Args:
+        words: what stands after `cprl sweep`: first a Python file with a function `experiment`, the name of
+            a recipe that comes with cprl, a recipe.json, or the directory of a run; then options.
+    """
+    if not words or words[0] in ("-h", "--help"):
+        _print_help()
+    if words[0].startswith("-"):
+        raise ValueError(
+            f"the first word after cprl sweep is {words[0]}; allowed: a recipe, e.g. cprl sweep "
+            "recipes/commons.py --vary game.rules.freeze-steps=5,25,100"
+        )
+    source = recipe_named(words[0]).path if is_shipped(words[0]) else Path(words[0])
+    allow = [after for word, after in pairwise(words) if word == "--allow"]
+    allow += [word.removeprefix("--allow=") for word in words if word.startswith("--allow=")]
+    sys.path[:0] = [str(source.resolve().parent)] if source.suffix == ".py" and source.is_file() else []
+    sys.path[:0] = [os.getcwd()] if allow else []
+    make = recipe_of(source, allow)
+    program = f"{PROGRAM} {words[0]}"
+    experiment, options = parse_with(make, words[1:], SweepOptions(), program=program, note=_NOTE)
+    _refuse_arguments(options.vary, make)
+    carry_out(wanted(experiment, options), options, ["cprl", "sweep", *words])
+
+
+def _refuse_arguments(vary: Sequence[str], make_experiment: "Callable[..., Experiment]") -> None:
+    """Raises a ValueError where an argument of the recipe is varied, and no field of the experiment."""
+    from cprl.experiment import Experiment
+
+    own = {*inspect.signature(make_experiment).parameters} - {field.name for field in fields(Experiment)}
+    for word in vary:
+        name = word.partition("=")[0].replace("-", "_")
+        if name in own:
+            raise ValueError(
+                f"the path {name} matches nothing: {name} is an argument of the recipe, the same in all "
+                "conditions; allowed: a field of the experiment, e.g. game.rules.freeze_steps"
+            )
+
+
+def wanted(experiment: "Experiment", options: SweepOptions) -> "Study | Search":
+    """The study or search that a sweep is.
+
+    Raises:
+        ValueError: for options that contradict each other, and for whatever the study refuses.
+    """
+    from cprl.studies import Search, Study
+    from cprl.studies.factors import Distribution
+    from cprl.studies.words import factors_of
+
+    if not options.vary:
+        raise ValueError("nothing is varied; allowed: --vary PATH=VALUE,VALUE..., at least once")
+    factors = factors_of(experiment, options.vary)
+    how: dict[str, Any] = {"block": options.block}
+    if options.search is None:
+        for own in ("maximise", "minimise", *_OF_SEARCH):
+            if getattr(options, own) != getattr(SweepOptions(), own):
+                raise ValueError(f"--{own.replace('_', '-')} is for a search; allowed: with --search POINTS")
+        ranges = [name for name, own in factors.items() if isinstance(own, Distribution)]
+        if ranges and options.draws is None:
+            raise ValueError(f"{ranges[0]} has a range; allowed: values, or a range with --draws or --search")
+        return Study(experiment, factors, draws=options.draws, reference=options.reference, **how)
+    for own in ("draws", "reference"):
+        if getattr(options, own) is not None:
+            raise ValueError(f"--{own} is not for a search; allowed: one of --{own} and --search")
+    if options.maximise is not None and options.minimise is not None:
+        raise ValueError("--maximise and --minimise are given; allowed: one of them")
+    return Search(
+        experiment,
+        factors,
+        points=options.search,
+        metric=options.maximise or options.minimise or "collective_return",
+        direction="maximise" if options.minimise is None else "minimise",
+        **{own: getattr(options, own) for own in _OF_SEARCH},
+        **how,
+    )
+
+
+def _print_help() -> None:
+    """Prints what holds for every recipe, and ends the process."""
+
+    def read(
+        recipe: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(help=_RECIPE)],
+        options: Annotated[SweepOptions, tyro.conf.arg(name="")] = _DEFAULTS,
+    ) -> None:
+        """Never called."""
+
+    about = f"{_NOTE} The flags of a recipe are listed by cprl sweep RECIPE --help."
+    tyro.cli(read, args=["--help"], prog=PROGRAM, description=about, config=_CONFIG)
+
+
+def recipe_of(source: Path, allow: Sequence[str] = ()) -> "Callable[..., Experiment]":
+    """What makes the experiment of a recipe.
+
+    Args:
+        source: a Python file with a function `experiment`, which is imported and not run; a recipe.json; or
+            the directory of a run.
+        allow: the user's own code, "module:Class", that a recipe.json may import.
+
+    Raises:
+        ValueError: where it is none of them.
+    """
+    if source.suffix != ".py" or source.is_dir():
+        directory, kept = source if source.is_dir() else source.parent, read_recipe(source)
+
+        from cprl.experiment import Experiment
+
+        stored = Experiment.from_recipe(kept, allow=allow, directory=directory)
+
+        def experiment() -> Experiment:
+            return stored
+
+        experiment.__doc__ = f"The experiment of {source}."
+        return experiment
+    spec = importlib.util.spec_from_file_location(_MODULE, source)
+    if not source.is_file() or spec is None or spec.loader is None:
+        raise ValueError(f"the recipe is {source}; allowed: a Python file, a recipe.json, a run's directory")
+    module = importlib.util.module_from_spec(spec)
+    sys.modules[_MODULE] = module  # tyro reads its types
+    spec.loader.exec_module(module)
+    made: Callable[..., Experiment] | None = getattr(module, "experiment", None)
+    if not callable(made):
+        if hasattr(module, "STUDY"):
+            line = printed(["python", str(source)])
+            raise ValueError(f"{source} describes a study, which is run by itself: {line}")
+        raise ValueError(f"{source} has no function `experiment`; allowed: one that gives an Experiment")
+    return made
+
+
+def runs_table(
+    runs: tuple[Path, ...],
+    /,
+    *,
+    by: tyro.conf.UseAppendAction[tuple[str, ...]],
+    metric: tyro.conf.UseAppendAction[tuple[str, ...]] = (),
+    part: Part = _TRAINING,
+    last: int | None = None,
+    reference: str | None = None,
+    window: int = WINDOW,
+    out: Path | None = None,
+    allow: tyro.conf.UseAppendAction[tuple[str, ...]] = (),
+) -> None:
+    """Compares any runs, grouped by fields of their experiments, with intervals over replicas.
+
+    Args:
+        runs: directories of runs, or of directories that hold them.
+        by: the path of a field, e.g. game.rules.freeze-steps, agents.*.algorithm.settings.gamma or name; may
+            be repeated.
+        metric: what is compared, e.g. collective_return; may be repeated.
+        part: of the runs: their training, their agents in fresh worlds, or random play in these.
+        last: episodes at the end of the training that are compared, by default 30.
+        reference: the name of the condition that others are compared with, e.g. freeze_steps=25; by default
+            the first.
+        window: episodes of a row of the table, of which --last compares whole ones and --out FILE.parquet
+            writes all; 1 for episodes one by one.
+        out: a file to be: .parquet with every window of episodes, replica and metric, or .md with what is
+            printed.
+        allow: code of your own, module:Class, that a run's recipe may name; may be repeated.
+    """
+    if out is not None:
+        if out.suffix not in _TABLE_SUFFIXES:
+            raise ValueError(f"--out is {out}; allowed: a name that ends in {' or '.join(_TABLE_SUFFIXES)}")
+        refuse_to_write_over(out)
+    if last is not None and part != _TRAINING:
+        raise ValueError(f"--last counts episodes of the training; allowed: without --part {part}")
+    if not runs:
+        raise ValueError("cprl table wants at least one run: cprl table RUN... --by FIELD")
+    if not by:
+        raise ValueError(
+            "cprl table wants a field that tells runs apart: cprl table RUN... --by game.rules.freeze-steps"
+        )
+    runs_in(runs)
+
+    from cprl.studies.tables.pooled import pooled_table
+    from cprl.studies.tables.texts import rich_table
+
+    found = pooled_table(runs, by=by, window=window, reference=reference, allow=allow)
+    compared = _compared(found, metric, part, LAST if last is None else last)
+    shown = console(width=None if OUT.isatty() else 250)
+    for own in compared:
+        shown.print(rich_table(own))
+    say(str(found))
+    if out is not None:
+        _write(found, compared, out)
+        say(f"Written: {out}")
+
+
+def _compared(found: "StudyTable", metrics: Sequence[str], part: Part, last: int) -> "list[Cells]":
+    """Levels, and differences where there is more than one condition."""
+    from cprl.studies.tables.comparing import compare, metrics_of
+    from cprl.studies.tables.texts import cells
+
+    chosen = metrics_of(found, metrics)
+    if not chosen:
+        return []
+    every = [compare(found, own, part=part, last=last) for own in chosen]
+    several = len(found.design.conditions) > 1
+    return [cells(every), cells(every, "differences")] if several else [cells(every)]
+
+
+def _write(found: "StudyTable", compared: "Sequence[Cells]", out: Path) -> None:
+    if out.suffix == ".parquet":
+        found.write(out)
+        return
+    from cprl.studies.tables.texts import markdown
+
+    lines = [line for own in compared for line in (own.heading, "", *markdown(own))]
+    content = "\n".join([*lines, *str(found).split("\n"), ""]).encode()
+    out.parent.mkdir(parents=True, exist_ok=True)
+    write_atomically(out, lambda file: file.write(content))
+
+
+def _about(study: "Study") -> str:
+    parts = [study.question, f"Expected: {study.expectation}" if study.expectation else ""]
+    names = ", ".join(own.name for own in study.all_conditions[:_LISTED])
+    more = f" and {len(study.all_conditions) - _LISTED} more" if study.all_conditions[_LISTED:] else ""
+    parts.append(f"{len(study.all_conditions)} conditions: {names}{more}; {study.replicas} replicas of each.")
+    return "\n\n".join(filter(None, parts))
+
+
+_LISTED: Final = 20
+_CONFIG: Final = (tyro.conf.HelptextFromCommentsOff,)
+_DEFAULTS: Final = SweepOptions()
+_OF_SEARCH: Final = ("over", "sampler", "at_once")

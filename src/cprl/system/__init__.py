@@ -1,0 +1,13 @@
+"""The process and the libraries under it: compilation, caches, memory, output.
+
+Modules:
+    libraries      what an upgrade of a library has taken away, said by name
+    compat         what relies on private parts of libraries, a module a library
+    compile_clock  whether code is being compiled, for how long, and what it leaves in memory
+    compiling      functions compiled by torch
+    memory         devices, and what would not fit into their memory
+    output         text for the terminal, which may close
+    process        settings of the process that trains, and where compiled code is kept
+    shipped        the recipes that come with cprl, and how a command is typed again
+    times          where the time of a training and of a run goes
+"""

@@ -1,0 +1,115 @@
+"""Losses of TorchRL, their targets and estimators."""
+
+from collections.abc import Mapping
+from typing import Any
+
+import torch
+from tensordict import TensorDictBase
+from torchrl.objectives import HardUpdate, LossModule
+from torchrl.objectives.value import ValueEstimatorBase
+
+from cprl.system.libraries import relying_on, require
+
+require("torchrl", LossModule, "_reduce_loss")
+
+
+class LaneCategorical(torch.distributions.Categorical):
+    """`Categorical` for the policies of several agents in one batch, of which one may be NaN.
+
+    TorchRL's PPO losses replace the entropies of the whole batch by samples if one of them is not finite, and
+    torch refuses to sample from NaN, on a GPU for the rest of the process. Here NaN has entropy 0 and is
+    sampled uniformly; the log-probabilities, and so that agent's loss, stay NaN. Nothing else differs.
+    """
+
+    def entropy(self) -> torch.Tensor:
+        """As of `Categorical`, and 0 for NaN."""
+        entropy: torch.Tensor = super().entropy()  # type: ignore[no-untyped-call]
+        # Compiled losses take a sample, made below, where the entropy is NaN.
+        return entropy if torch.compiler.is_compiling() else entropy.nan_to_num(nan=0.0)
+
+    def sample(self, sample_shape: Any = ()) -> torch.Tensor:
+        """As of `Categorical`, and uniform for NaN."""
+        size = torch.Size(sample_shape)
+        weights = self.probs.reshape(-1, self._num_events).nan_to_num(nan=1.0)
+        return torch.multinomial(weights, size.numel(), True).T.reshape(self._extended_shape(size))
+
+
+class ReshapedLoss:
+    """Of a `LossModule` whose losses of single transitions pass through a function before they are weighed
+    and reduced; stands before the loss among the bases.
+
+    TorchRL's losses know their distances by name, see `torchrl.objectives.utils.distance_loss`, and hand what
+    those give to the private `LossModule._reduce_loss`, which this class overrides. The loss must call it
+    once. This is no `LossModule` itself: the class of one has a `forward`, which would hide that of the loss.
+    """
+
+    def reshape_each(self, losses: torch.Tensor) -> torch.Tensor:
+        """The function, of any shape."""
+        raise NotImplementedError
+
+    def _reduce_loss(self, loss: torch.Tensor, **how: Any) -> Any:
+        return super()._reduce_loss(self.reshape_each(loss), **how)  # type: ignore[misc]
+
+
+def updated_weights(loss: LossModule) -> list[str]:
+    """The names of the weights whose targets a TorchRL target updater updates."""
+    return [name for name, is_updated in _targets_of(loss).items() if is_updated]
+
+
+def refuse_updaters(loss: LossModule, message: str) -> None:
+    """Makes a loss refuse TorchRL's target updaters, which read the names of its targets first."""
+    loss._has_update_associated = _Refusing(_targets_of(loss), message)
+
+
+class _Refusing(dict[str, bool]):
+    """One class for all losses: compiled code is shared only between learners of the same classes."""
+
+    def __init__(self, names: Mapping[str, bool], message: str) -> None:
+        super().__init__(names)
+        self._message = message
+
+    def keys(self) -> Any:
+        raise ValueError(self._message)
+
+
+def promise_targets(loss: LossModule) -> None:
+    """Marks the targets of a loss as updated: it would warn that they have no TorchRL updater, while
+    `Engine.copy_to_targets` updates them."""
+    targets = _targets_of(loss)
+    for name in targets:
+        targets[name] = True
+
+
+def _targets_of(loss: LossModule) -> dict[str, bool]:
+    """By the names of weights that have targets, whether a TorchRL updater updates these."""
+    with relying_on("torchrl", "LossModule._has_update_associated"):
+        targets: dict[str, bool] = loss._has_update_associated
+    return targets
+
+
+def forget_cached_weights(loss: LossModule) -> None:
+    """Clears the detached weights that some losses cache at a call, so that they can be replaced."""
+    loss.__dict__.pop("_cache", None)
+
+
+def hard_update(loss: LossModule, *, every: int) -> HardUpdate:
+    """A `HardUpdate` that copies to targets at every `every`-th call of `step`, at least 1.
+
+    TorchRL counts one call more: with an interval of 2 it copies at every third call.
+    """
+    return HardUpdate(loss, value_network_update_interval=every - 1)
+
+
+def bootstrap_from_target(estimator: ValueEstimatorBase) -> None:
+    """Makes the estimator of a `DiscreteCQLLoss` bootstrap from the target network.
+
+    The loss passes the target weights as `params`, but its estimator ignores them and would bootstrap from
+    the network itself.
+    """
+    estimate = estimator.value_estimate
+
+    def by_target(tensordict: TensorDictBase, *, params: TensorDictBase) -> torch.Tensor:
+        target: torch.Tensor = estimate(tensordict, target_params=params)
+        return target
+
+    estimator.value_estimate = by_target

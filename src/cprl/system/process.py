@@ -1,0 +1,105 @@
+"""Settings of the process in which a training runs, and the type of processor that it runs on."""
+
+import ctypes
+import logging
+import os
+import platform
+import sys
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
+from functools import cache
+from pathlib import Path
+from typing import Final
+
+from cprl.checks import MOST_SEED, checked, count
+from cprl.system.output import OUT, keep_output
+
+_M_TRIM_THRESHOLD: Final = -1
+_M_MMAP_THRESHOLD: Final = -3
+"""Parameters of mallopt, from glibc's malloc.h."""
+_MAX_THRESHOLD_BYTES: Final = 32 * 2**20
+"""glibc's highest value of M_MMAP_THRESHOLD, in bytes (mallopt(3))."""
+
+
+def prepare_process(seed: int) -> None:
+    """Prepares the process for a training.
+
+    Prepares the standard streams for being closed (`cprl.system.output`), seeds torch's global generator,
+    limits torch to one thread, flushes denormal numbers to zero, makes glibc reuse freed memory, keeps what
+    torch compiles in `cache_folder` unless $TORCHINDUCTOR_CACHE_DIR says where, and logs warnings of TorchRL
+    and messages of cprl.
+
+    The networks are so small that a second thread slows them down, up to a hundredfold on a busy machine.
+    Denormal numbers in Adam's moments of dead weights slow a long run by a factor of up to 1.9.
+
+    Raises:
+        ValueError: for a seed that is no integer from 0 to 2**64 - 1.
+    """
+    checked("seed", seed, count(0, MOST_SEED))
+    keep_output()
+
+    import torch
+
+    torch.manual_seed(seed)
+    torch.set_num_threads(1)
+    torch.set_flush_denormal(True)
+    _keep_freed_memory()
+    _keep_compiled_code()
+    logging.getLogger("torchrl").setLevel(logging.WARNING)
+    own = logging.getLogger("cprl")
+    own.setLevel(logging.INFO)
+    if not own.handlers:
+        own.addHandler(logging.StreamHandler(OUT))
+
+
+@contextmanager
+def one_thread() -> Iterator[None]:
+    """Lets torch compute in one thread, as trainings do: the last bits of products depend on their number."""
+    import torch
+
+    threads = torch.get_num_threads()
+    torch.set_num_threads(1)
+    try:
+        yield
+    finally:
+        torch.set_num_threads(threads)
+
+
+@cache
+def cpu() -> str:
+    """The type of this machine's processor; numbers may differ in the last bits on another."""
+    with suppress(OSError):
+        for line in Path("/proc/cpuinfo").read_text(encoding="utf-8", errors="replace").splitlines():
+            name, _, value = line.partition(":")
+            if name.strip() == "model name":
+                return value.strip()
+    return platform.processor() or platform.machine()
+
+
+def _keep_freed_memory() -> None:
+    """Makes glibc keep the memory that a step frees, up to the limit of glibc's own dynamic adjustment.
+
+    Otherwise, depending on the layout of the heap, glibc may return its end to the system after each step and
+    request it again in the next, page by page.
+    """
+    mallopt = getattr(ctypes.CDLL(None), "mallopt", None) if sys.platform == "linux" else None
+    if mallopt is not None:
+        mallopt(_M_MMAP_THRESHOLD, _MAX_THRESHOLD_BYTES)
+        mallopt(_M_TRIM_THRESHOLD, 2 * _MAX_THRESHOLD_BYTES)
+
+
+def _keep_compiled_code() -> None:
+    """Makes torch keep compiled code where the rules' is, and not in the folder for temporary files, which
+    many machines empty when they start."""
+    folder = cache_folder() / "torch"
+    with suppress(OSError):
+        folder.mkdir(parents=True, exist_ok=True)
+        if os.access(folder, os.W_OK):
+            os.environ.setdefault("TORCHINDUCTOR_CACHE_DIR", str(folder))
+
+
+def cache_folder() -> Path:
+    """$CPRL_CACHE, or the folder cprl in the user's cache folder."""
+    if "CPRL_CACHE" in os.environ:
+        return Path(os.environ["CPRL_CACHE"])
+    return Path(os.environ.get("XDG_CACHE_HOME", Path.home() / ".cache")) / "cprl"

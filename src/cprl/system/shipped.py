@@ -1,0 +1,210 @@
+"""The recipes that come with cprl: at the top of a checkout, or in the package that a wheel installs.
+
+A recipe is named by its path without ".py": `commons`, `studies/time_out`.
+"""
+
+import ast
+import sys
+from collections.abc import Sequence
+from contextlib import suppress
+from dataclasses import dataclass
+from pathlib import Path, PureWindowsPath
+from shutil import which
+from types import ModuleType
+from typing import Final
+
+from cprl.checks import TEXT, checked, shown
+
+PROGRAM: Final = "cprl run "
+"""How the program of a shipped recipe begins, where a script has its path."""
+
+_PACKAGE: Final = Path(__file__).parents[1]
+
+
+@dataclass(frozen=True, kw_only=True)
+class Recipe:
+    """A recipe that comes with cprl, or a module that recipes share."""
+
+    name: str
+    """Its path without ".py", e.g. "studies/time_out"."""
+    path: Path
+    about: str
+    """The first line of its docstring."""
+    runs: bool
+    """Whether it is run; otherwise other recipes import it."""
+    imports: tuple[str, ...]
+    """The modules of its folder that it imports."""
+
+    @property
+    def folder(self) -> str:
+        """The folder of its name, e.g. "studies"; "" for none."""
+        return self.name.rpartition("/")[0]
+
+    def text(self) -> str:
+        """Its source; one that imports modules of its folder gets a line by which any copy finds these."""
+        source = self.path.read_text(encoding="utf-8")
+        if not self.imports:
+            return source
+        lines = source.splitlines(keepends=True)
+        tree = ast.parse(source)
+        first = next(
+            node.lineno
+            for node in tree.body
+            if isinstance(node, ast.Import)
+            or (isinstance(node, ast.ImportFrom) and node.module != "__future__")
+        )
+        needed = ", ".join(f"{name}.py" for name in self.imports)
+        lines[first - 1 : first - 1] = [
+            "from cprl.system.shipped import import_from\n\n",
+            f"# {needed} of that folder; one beside this file comes first.\n",
+            f'import_from("{self.folder}")\n\n',
+        ]
+        return "".join(lines)
+
+
+def recipes_folder() -> Path:
+    """The folder that holds the recipes.
+
+    Raises:
+        FileNotFoundError: if there is none, as where the source was copied alone.
+    """
+    for folder in (_PACKAGE / "recipes", _PACKAGE.parents[1] / "recipes"):
+        if folder.is_dir():
+            return folder
+    raise FileNotFoundError(f"the recipes of cprl are neither in {_PACKAGE} nor in a checkout around it")
+
+
+def shipped_recipes() -> dict[str, Recipe]:
+    """All recipes by name, and the modules that they share, in the order of their names."""
+    folder = recipes_folder()
+    paths = sorted(folder.rglob("*.py"), key=lambda path: (len(path.relative_to(folder).parts), path))
+    found = [_read(path, path.relative_to(folder).with_suffix("").as_posix()) for path in paths]
+    return {recipe.name: recipe for recipe in found}
+
+
+def recipe_named(name: str) -> Recipe:
+    """A recipe by its name.
+
+    Raises:
+        ValueError: if there is none; lists those that there are.
+    """
+    checked("name", name, TEXT)
+    recipes = shipped_recipes()
+    if name not in recipes:
+        raise ValueError(f"there is no recipe {shown(name)}; allowed: {recipe_names()}")
+    return recipes[name]
+
+
+def recipe_names() -> str:
+    """The names of all recipes that can be run, for messages."""
+    return ", ".join(own.name for own in shipped_recipes().values() if own.runs)
+
+
+def is_shipped(word: str) -> bool:
+    """Whether a word names a recipe, and no file or directory of a run that is there."""
+    path = Path(word)
+    with suppress(OSError, ValueError):  # too long, or with a null, for a path
+        if path.is_file() or (path / "recipe.json").exists():
+            return False
+    return word in shipped_recipes()
+
+
+def run_shipped(name: str, words: Sequence[str]) -> None:
+    """Runs a recipe as `python RECIPE.py` does, as the main module of this process.
+
+    Args:
+        name: of the recipe.
+        words: its command line, without the program.
+
+    Raises:
+        ValueError: if there is no such recipe, or it is a module that recipes share.
+    """
+    recipe = recipe_named(name)
+    if not recipe.runs:
+        raise ValueError(f"{name} runs nothing: other recipes import it; cprl recipe {name} prints it")
+    module = ModuleType("__main__", recipe.about)
+    module.__file__ = str(recipe.path)
+    code = compile(recipe.path.read_text(encoding="utf-8"), str(recipe.path), "exec")
+    before = sys.argv, sys.path[:], sys.modules["__main__"]
+    sys.argv, sys.modules["__main__"] = [f"{PROGRAM}{name}", *words], module
+    sys.path.insert(0, str(recipe.path.parent))
+    try:
+        exec(code, vars(module))
+    finally:
+        sys.argv, sys.path[:], sys.modules["__main__"] = before
+
+
+def import_from(folder: str) -> None:
+    """Lets the modules that the recipes of a folder share be imported by name, as copies of recipes do.
+
+    Args:
+        folder: e.g. "studies". Modules beside the script that runs come first.
+
+    Raises:
+        ValueError: if there is no such folder.
+    """
+    checked("folder", folder, TEXT)
+    folders = sorted({recipe.folder for recipe in shipped_recipes().values()} - {""})
+    if folder not in folders:
+        raise ValueError(f"folder is {shown(folder)}; allowed: {', '.join(folders)}")
+    script = getattr(sys.modules["__main__"], "__file__", None)
+    beside = None if script is None else Path(script).resolve().parent
+    # Libraries may have put folders before that of the script, as Ray does.
+    places = [nth for nth, own in enumerate(sys.path) if own and Path(own).resolve() == beside]
+    sys.path.insert(places[0] + 1 if places else 0, str(recipes_folder() / folder))
+
+
+def program_of(program: str) -> str:
+    """What messages call a program: the name of a script, or `cprl run NAME`."""
+    return program if program.startswith(PROGRAM) else Path(program).name
+
+
+def is_cprl(program: str) -> bool:
+    """Whether a program, as a command line names it on any platform, is the command `cprl`."""
+    return PureWindowsPath(program).name in ("cprl", "cprl.exe")
+
+
+def named_command(words: Sequence[str]) -> list[str]:
+    """A command line, script first, as words with the program first: this Python, or "cprl" by its name."""
+    if words[0].startswith(PROGRAM):
+        return [*words[0].split(" "), *words[1:]]
+    return ["cprl", *words[1:]] if is_cprl(words[0]) else [sys.executable, *words]
+
+
+def command_of(words: Sequence[str]) -> list[str]:
+    """A command line, script first, as words that can be typed here."""
+    program, *others = named_command(words)
+    return [*cprl_here(), *others] if program == "cprl" else [program, *others]
+
+
+def cprl_here() -> list[str]:
+    """How the command `cprl` of this Python is called: by its name where the shell finds it, else by path,
+    and by `python -m cprl` where there is no such script beside Python."""
+    path = which("cprl", path=str(Path(sys.executable).parent))
+    if path is None:
+        return [sys.executable, "-m", "cprl"]
+    if path == which("cprl"):
+        return ["cprl"]
+    script, here = Path(path), Path.cwd()
+    # In the folder of the script its name alone would be looked up on the path.
+    is_below = script.is_relative_to(here) and script.parent != here
+    return [str(script.relative_to(here) if is_below else script)]
+
+
+def _read(path: Path, name: str) -> Recipe:
+    tree = ast.parse(path.read_text(encoding="utf-8"))
+    runs = any(isinstance(node, ast.If) and "__name__" in ast.unparse(node.test) for node in tree.body)
+    about = (ast.get_docstring(tree) or "").partition("\n")[0]
+    imported = {
+        alias
+        for node in tree.body
+        for alias in (
+            [own.name for own in node.names]
+            if isinstance(node, ast.Import)
+            else [node.module or ""]
+            if isinstance(node, ast.ImportFrom)
+            else []
+        )
+    }
+    beside = {own.stem for own in path.parent.glob("*.py")} if "/" in name else set()
+    return Recipe(name=name, path=path, about=about, runs=runs, imports=tuple(sorted(imported & beside)))
