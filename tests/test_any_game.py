@@ -96,7 +96,7 @@ def test_each_metric_needs_what_is_said_and_nothing_else():
         )
         assert tuple(part) == available(METRICS, given)
         assert all(torch.equal(part[name], whole[name]) for name in part)
-    with pytest.raises(ValueError, match="harvest, in_play and played are None; allowed: at least one"):
+    with pytest.raises(ValueError, match="harvest, in_play and played are None"):
         social.summary(None, None)
     with pytest.raises(ValueError, match="sustainable_yield is given and harvest is None"):
         social.summary(None, None, played=played, sustainable_yield=1.0, first_stock=1.0)
@@ -177,7 +177,7 @@ def test_what_the_first_batch_reported_is_wanted_of_all():
         tracker.add(bare)
     other = EpisodeTracker(1, 2)
     other.add(bare)
-    with pytest.raises(ValueError, match=r"a game that reports \['harvest'\]; allowed: \[\]"):
+    with pytest.raises(ValueError, match=r"a game that reports \['harvest'\]"):
         other.load_state_dict(tracker.state_dict())
     with pytest.raises(ValueError, match=r"lacks \(next, agents, reward\)"):
         EpisodeTracker(1, 2).add(bare.exclude(("next", "agents", "reward")))
@@ -193,9 +193,7 @@ def test_its_table_has_the_columns_that_there_are_and_says_what_is_left_out(tmp_
     with EpisodeTable(tmp_path / "episodes.parquet") as table:
         episodes = play(MatrixGame(2), tit_for_tat, 13, callbacks=[table])
         (other,) = play(MatrixGame(1, with_harvest=True), tit_for_tat, 5)
-        with pytest.raises(
-            ValueError, match=r"has the extra columns \['collective_return', .*'harvest'.*\] and lacks \[\]"
-        ):
+        with pytest.raises(ValueError, match=r"has the extra columns \['collective_return'"):
             table.add(other)
         going_on = read_episodes(tmp_path)
     kept = read_episodes(tmp_path)
@@ -233,10 +231,10 @@ def test_a_game_that_must_not_be_stepped_when_it_has_ended_is_evaluated():
 
 
 def test_an_environment_whose_rewards_are_not_of_agents_in_worlds_is_refused():
-    with pytest.raises(ValueError, match=r"the environment has batch size \[\]; allowed: \[B\], B worlds"):
+    with pytest.raises(ValueError, match=r"the environment has batch size \[\]"):
         evaluate(GymWrapper(Corridor()), tit_for_tat)
     env = TransformedEnv(MatrixGame(2), RenameTransform([("agents", "reward")], ["reward"]))
-    with pytest.raises(ValueError, match=r'\("agents", "reward"\) is None; allowed: \[2, N, 1\]'):
+    with pytest.raises(ValueError, match=r'\("agents", "reward"\) is None'):
         evaluate(env, tit_for_tat)
 
 

@@ -17,7 +17,6 @@ from cprl.runs.episodes import read_episodes
 from cprl.runs.export import export_results
 from cprl.system.output import say
 from cprl.training.collectors import StepCollector
-from cprl.viewer.callback import ViewerCallback
 
 COMMONS = presets.game("commons")
 
@@ -98,14 +97,3 @@ def test_what_is_nested_too_deeply_for_python_is_printed_all_the_same(capsys):
         nested = [nested]
     say(nested)
     assert capsys.readouterr().out == "[[[[[...]]]]]\n"
-
-
-def test_a_recipe_that_is_nested_too_deeply_is_refused_before_a_recording_is_made(tmp_path):
-    recipe = {}
-    for _ in range(2000):
-        recipe = {"a": recipe}
-    with pytest.raises(ValueError, match="recipe is nested more than 64 deep"):
-        ViewerCallback(tmp_path, CommonsEnv(COMMONS), title="deep", episodes=1, recipe=recipe)
-    with pytest.raises(ValueError, match="file_name is "):
-        ViewerCallback(tmp_path, CommonsEnv(COMMONS), title="odd", episodes=1, file_name=torch.zeros(2))
-    assert list(tmp_path.iterdir()) == []

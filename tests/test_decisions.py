@@ -15,8 +15,7 @@ from cprl.viewer.panels import APART, BAR, HIGH, decision_panels
 from cprl.viewer.replay import Decisions
 
 GAME = Game(
-    map=maps.parse(".A>.A\n.A#A.\nv.<.>"),
-    rules=Rules(window_rows=3, window_columns=5, episode_steps=9),
+    map=maps.parse(".A>.A\n.A#A.\nv.<.>"), rules=Rules(window_rows=3, window_columns=5, episode_steps=9)
 )
 VALUES = torch.tensor([1.0, 5.0, 4.0, 4.0, 3.5, 4.5, -90.0, 4.0])
 

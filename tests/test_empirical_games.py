@@ -159,26 +159,14 @@ def test_the_command_tells_all_compositions_of_more_agents(three, tmp_path, monk
     assert "Pairwise reduction" in command(monkeypatch, capsys, *words, "--pairwise")
 
 
-def test_what_makes_no_game_is_refused(corridors, three, made):
-    with pytest.raises(
-        ValueError, match=r"the number of runs is 1; allowed: at least two: cprl egta RUN RUN"
-    ):
+def test_what_makes_no_game_is_refused(corridors, three):
+    with pytest.raises(ValueError, match="the number of runs is 1"):
         play_empirical_game([corridors["greedy"]])
     with pytest.raises(ValueError, match="have different games"):
         play_empirical_game([corridors["greedy"], three["greedy"]])
-    with pytest.raises(ValueError, match="played is 3; allowed: what crossplay"):
-        pairwise_game(3)
-    with pytest.raises(ValueError, match="game is 3; allowed: what play_empirical_game"):
-        analyse(3)
-    with pytest.raises(ValueError, match="a place of a replica is 2; allowed: an integer from 0 to 1"):
-        made.table([2])
-    with pytest.raises(ValueError, match="replicas is empty; allowed"):
-        made.table([])
 
 
 def test_more_profiles_than_alpha_rank_takes_are_refused_before_play(three, monkeypatch):
     monkeypatch.setattr("cprl.evaluation.empirical_game.MOST_PROFILES", 7)
-    with pytest.raises(
-        ValueError, match=r"2 runs of 3 agents have 8 profiles; allowed: at most 7; crossplay"
-    ):
+    with pytest.raises(ValueError, match="2 runs of 3 agents have 8 profiles"):
         play_empirical_game(three)

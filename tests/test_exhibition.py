@@ -55,9 +55,7 @@ ALONE = Experiment(
 EXPERIMENTS = {
     "mixed, with a transform": ALONE,
     "a team": replace(
-        ALONE,
-        agents=[Team(MAPPO(settings=ROLLOUT), agents=(0, 1, 2)), Scripted("random")],
-        transforms=[],
+        ALONE, agents=[Team(MAPPO(settings=ROLLOUT), agents=(0, 1, 2)), Scripted("random")], transforms=[]
     ),
     "TorchRL's own engine": replace(ALONE, transforms=[], engine="torchrl"),
 }
@@ -272,7 +270,7 @@ def test_an_exhibition_that_fails_warns_once_and_ends(tmp_path, monkeypatch):
     kept = Kept(tmp_path)
     kept.exhibition.on_step(episode=0)
     monkeypatch.setattr(kept.world, "step_and_maybe_reset", lambda moment: 1 / 0)
-    with pytest.warns(RuntimeWarning, match="the exhibition failed, the run continues.*division") as caught:
+    with pytest.warns(RuntimeWarning, match="the exhibition failed, the run") as caught:
         steps(kept, 8)
     assert len(caught) == 1
 
@@ -310,7 +308,7 @@ def test_a_game_without_a_board_has_no_exhibition_and_one_event_says_so(tmp_path
         batch = chunk.to_record_batch()
         texts += batch.column("TextLog:text").to_pylist()
     assert ["no exhibition: the game has no board"] in texts
-    with pytest.raises(ValueError, match=r"a MatrixGame of batch size \[1\]; allowed: one world of a C"):
+    with pytest.raises(ValueError, match=r"a MatrixGame of batch size \[1\]"):
         Exhibition(Some(), env, trained=env, scene=None, live=Live())
 
 

@@ -27,7 +27,7 @@ from cprl.policies.lanes import random_agents
 from cprl.population import Scripted
 from cprl.runs.episodes import read_episodes
 from cprl.terminal.figures import training_curve
-from cprl.terminal.summary import _mean, institutions_table, summarise
+from cprl.terminal.summary import institutions_table, summarise
 from cprl.training import train
 from cprl.viewer.blueprint import layout
 from cprl.viewer.callback import ViewerCallback
@@ -276,7 +276,7 @@ def printed(what):
 def test_the_summary_has_a_table_of_institutions(whole):
     found = evaluate_run(whole, episodes=2, allow=("paying_game:Charges",))
     played = {"random": found.random[0], "trained": found.trained[0]}
-    table = institutions_table(played, _mean)
+    table = institutions_table(played)
     assert isinstance(table, Table)
     text = printed(table)
     paid = [np.mean([one.fines.sum() for one in own]) for own in played.values()]
@@ -291,7 +291,7 @@ def test_the_summary_has_a_table_of_institutions(whole):
     assert "where one may bite" not in text, "nothing counted a bite"
     nothing = dict.fromkeys(("fines", "transfers", "violations", "counts", "in_force"))
     without = {"trained": [replace(one, **nothing) for one in found.trained[0]]}
-    assert institutions_table(without, _mean) is None
+    assert institutions_table(without) is None
 
 
 def test_what_is_printed_at_the_end_says_it_too(whole):

@@ -15,7 +15,7 @@ from test_outcome import EXPERIMENT
 
 import cprl
 from cprl.commands.recipe import parse
-from cprl.viewer.lingering import check_linger
+from cprl.viewer.watching import check_linger
 
 SCRIPT = f"""
 import sys; sys.path.insert(0, {str(Path(__file__).parent)!r})
@@ -31,10 +31,7 @@ def lingering(tmp_path):
     """A run that is finished and stays served, its process and the port of its page."""
     run = tmp_path / "run"
     process = subprocess.Popen(
-        [sys.executable, "-u", "-c", SCRIPT, run],
-        stdout=subprocess.PIPE,
-        stderr=subprocess.PIPE,
-        text=True,
+        [sys.executable, "-u", "-c", SCRIPT, run], stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
     )
     try:
         heard = []

@@ -14,7 +14,7 @@ from cprl.commons.near import neighbours
 from cprl.commons.picture import first_image
 from cprl.envs import CommonsGymnasiumEnv, make_env, parallel_env
 from cprl.envs.state import load_env_state
-from cprl.evaluation import crossplay, evaluate_run, scenarios_of
+from cprl.evaluation import crossplay, scenarios_of
 from cprl.evaluation.film import film
 from cprl.measuring import phases, published, statistics
 from cprl.measuring.episodes import EpisodeTracker
@@ -91,8 +91,6 @@ def with_regrowth(*probabilities):
         (lambda: phases.find_phases([0, 1e9], {"a": [1, 2]}), "episodes are 0 to 1e.09; allowed: at most"),
         (lambda: crossplay(["a", "b"], diagonal="selfplay"), "diagonal is 'selfplay'; allowed: self, cross_"),
         (lambda: crossplay([]), "the number of runs is 0; allowed: at least two"),
-        (lambda: crossplay("ab"), "runs is 'ab'; allowed: a sequence of at least two runs"),
-        (lambda: evaluate_run(3), "run is 3; allowed: a directory"),
         (lambda: scenarios_of(3), "game is 3; allowed: a cprl.Game, because scripted"),
         (lambda: film("run", replica=1.5), "replica is 1.5; allowed: an integer >= 0"),
         (lambda: film("run", episode=2**32), "episode is 4294967296; allowed: an integer from 0"),

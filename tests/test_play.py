@@ -79,7 +79,7 @@ def test_the_metrics_are_those_of_an_episode(run):
             session.act(action)
     (episode,) = ended
     assert session.metrics() == pytest.approx(social_metrics(episode), nan_ok=True)
-    with pytest.raises(ValueError, match="the episode has ended; allowed: turns up to its end"):
+    with pytest.raises(ValueError, match="the episode has ended"):
         session.act("stay")
 
 
@@ -156,16 +156,13 @@ def test_a_game_without_a_beam_has_no_key_for_it():
 @pytest.mark.parametrize(
     ("words", "said"),
     [
-        (["chess"], r"board is 'chess'; allowed: single_basic, .*, a run's directory, or a file with a draw"),
-        (["commons", "--others", "nobody"], "others is 'nobody'; allowed: random, greedy, .*directory"),
-        (["commons", "--agent", "4"], "agent is 4; allowed: an integer from 0 to 3"),
-        (["commons", "--replica", "3"], 'replica is 3, and others is "greedy"; allowed: with the agents of'),
-        (["commons", "--steps", "0"], "steps is 0; allowed: an integer >= 1"),
+        (["chess"], "board is 'chess'"),
+        (["commons", "--others", "nobody"], "others is 'nobody'"),
+        (["commons", "--agent", "4"], "agent is 4"),
+        (["commons", "--replica", "3"], 'replica is 3, and others is "greedy"'),
+        (["commons", "--steps", "0"], "steps is 0"),
         (["odd.txt"], r"odd\.txt: unknown sign 'x' at row 0, column 1"),
-        (
-            ["odd.txt", "--variant", "as_run"],
-            r'variant is "as_run"; allowed with odd\.txt: "published"',
-        ),
+        (["odd.txt", "--variant", "as_run"], 'variant is "as_run"'),
     ],
 )
 def test_what_cannot_be_played_is_refused(tmp_path, monkeypatch, words, said):
@@ -177,12 +174,12 @@ def test_what_cannot_be_played_is_refused(tmp_path, monkeypatch, words, said):
 
 
 def test_agents_of_another_game_are_refused(run, monkeypatch):
-    with pytest.raises(ValueError, match=r"the agents of .* have observations \(3, 3, 5\); this game has"):
+    with pytest.raises(ValueError, match=r"the agents of .* have observations \(3, 3"):
         open_session("two_complex", others=str(run))
     with pytest.raises(ValueError, match="replica is -1"):
         open_session(str(run), replica=-1)
 
 
 def test_a_session_wants_a_board():
-    with pytest.raises(ValueError, match="env is a MatrixGame; allowed: a CommonsEnv, which has a board"):
+    with pytest.raises(ValueError, match="env is a MatrixGame"):
         Session(MatrixGame(), lambda moment: moment)

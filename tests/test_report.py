@@ -399,7 +399,7 @@ def test_watch_waits_for_the_viewer_on_windows_where_no_program_replaces_another
     (tmp_path / "run.rrd").touch()
     monkeypatch.setattr(sys, "platform", "win32")
     monkeypatch.setattr(cli.subprocess, "call", call)
-    monkeypatch.setattr("cprl.viewer.streams.viewer", lambda: "rerun")
+    monkeypatch.setattr("cprl.viewer.page.viewer", lambda: "rerun")
     with pytest.raises(SystemExit) as ended:
         cli.watch(tmp_path)
     assert ended.value.code == 3

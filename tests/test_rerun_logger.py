@@ -319,7 +319,7 @@ def test_a_stream_that_fails_is_dropped_with_one_warning_and_the_other_goes_on(t
     with RerunLogger("run", tmp_path, scene=SCENE, live="serve") as logger:
         live = next(stream for stream in logger._streams if stream.name == "live view")
         live.recording = Broken()
-        with pytest.warns(RuntimeWarning, match="live view failed.*no space left") as caught:
+        with pytest.warns(RuntimeWarning, match=r"live view failed.*no space left") as caught:
             fail(live, logger)
         assert len(caught) == 1
         with warnings.catch_warnings():

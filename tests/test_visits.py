@@ -76,9 +76,9 @@ def test_the_maps_show_where_each_agent_was_and_are_not_written_over(corridors, 
 @pytest.mark.parametrize(
     ("more", "message"),
     [
-        ({"replica": 2}, r"replica is 2; allowed: one that played, of \[0, 1\]"),
-        ({"policy": "greedy"}, "policy is 'greedy'; allowed: trained, random"),
-        ({"path": "visits.pdf"}, r"path is '.*visits.pdf'; allowed: a file whose name ends in .png"),
+        ({"replica": 2}, "replica is 2"),
+        ({"policy": "greedy"}, "policy is 'greedy'"),
+        ({"path": "visits.pdf"}, "path is '.*visits.pdf'"),
     ],
 )
 def test_what_cannot_be_drawn_is_refused(more, message, corridors, tmp_path):
@@ -90,7 +90,7 @@ def test_what_cannot_be_drawn_is_refused(more, message, corridors, tmp_path):
 
 def test_a_game_without_a_board_is_refused(tmp_path):
     run = ran(tmp_path / "matrix", stag_hunt(), [Scripted("random")] * 2, replicas=1)
-    with pytest.raises(ValueError, match="plays a game without a board of cprl; allowed: a run"):
+    with pytest.raises(ValueError, match="plays a game without a board of cprl"):
         territory_of(run)
 
 

@@ -28,8 +28,7 @@ from cprl.learners.settings import DQNSettings
 from cprl.measuring import Episode, social
 from cprl.training import train
 from cprl.viewer.callback import ViewerCallback
-from cprl.viewer.page import free_port
-from cprl.viewer.streams import to_watch
+from cprl.viewer.page import free_port, to_watch
 
 GAME = Game(
     map=maps.parse(".A>.A\n.A.A.\n..<.A"),
@@ -146,9 +145,7 @@ def test_a_disk_that_fills_up_is_told_once_and_changes_nothing(tmp_path, unwatch
                 while file.write(bytes(1000)):
                     pass
 
-        with pytest.warns(
-            RuntimeWarning, match="the Rerun file failed, the run continues without it"
-        ) as caught:
+        with pytest.warns(RuntimeWarning, match="the Rerun file failed, the run continues") as caught:
             assert course(disk, live="serve", others=[Doing(30, fill)]) == unwatched
         assert len(caught) == 1
         assert os.statvfs(disk).f_bfree == 0, "the disk really was full"
@@ -199,12 +196,7 @@ def test_several_replicas_are_told_as_their_mean_and_each(tmp_path):
         means.append(mean)
         assert running == pytest.approx(np.mean(means[-10:]))
     names = static(tmp_path / "run.rrd", "social/collective_return", "SeriesLines:names")
-    assert names == [
-        "replica 0",
-        "replica 1",
-        "collective return, mean",
-        "collective return, running mean",
-    ]
+    assert names == ["replica 0", "replica 1", "collective return, mean", "collective return, running mean"]
     assert {len(own) for own in column(tmp_path / "run.rrd", "agent_1/q", "Scalars:scalars")[1]} == {1}
 
 

@@ -60,7 +60,7 @@ def film(
 
     from cprl.evaluation.film import film as film_run
     from cprl.evaluation.film import film_video
-    from cprl.viewer.streams import to_watch
+    from cprl.viewer.page import to_watch
 
     prepare_process(seed)
     which: dict[str, Any] = {"replica": replica, "episode": episode, "seed": seed, "allow": allow}

@@ -179,7 +179,7 @@ def watch(run: Path, /, *, serve: bool = False) -> None:
         _serve(files, why="" if serve else "There is no display: ")
         return
 
-    from cprl.viewer.streams import to_watch
+    from cprl.viewer.page import to_watch
 
     command = to_watch(*files)
     if sys.platform == "win32":  # where execvp ends this process at once, and quotes nothing
@@ -189,7 +189,7 @@ def watch(run: Path, /, *, serve: bool = False) -> None:
 
 def _serve(files: Sequence[Path], *, why: str) -> None:
     """Serves recordings and the web viewer until Ctrl-C."""
-    from cprl.viewer.streams import viewer
+    from cprl.viewer.page import viewer
 
     with TemporaryDirectory() as folder, suppress(KeyboardInterrupt):
         page = Page([*headers_of(files, Path(folder)), *files])

@@ -28,7 +28,7 @@ from matplotlib.figure import Figure
 from rich.table import Table
 
 from cprl import arguments
-from cprl.arguments import Diagonal, object_of
+from cprl.arguments import Diagonal
 from cprl.evaluation.evaluate import (
     INTERVALS,
     SEED,
@@ -76,9 +76,6 @@ class Cell:
 
         Args:
             agent: the index of the focal agent; None for the mean over all indices.
-
-        Raises:
-            ValueError: if there is no such agent.
         """
         agents = list(self.by_agent)
         if agent is not None:
@@ -94,11 +91,7 @@ class Cell:
         Args:
             whose: "focal", "background", the mean of the background agents, or "group", the sum of all.
             agents: the indices of focal agents; empty for all.
-
-        Raises:
-            ValueError: if `whose` is another word.
         """
-        arguments.choice("whose", whose, _WHOSE)
         values: dict[int, list[float]] = {}
         for agent in agents or self.by_agent:
             for replica, episodes in self.by_agent[agent].items():
@@ -126,11 +119,7 @@ class CrossPlay:
         return f"CrossPlay({names}; replicas {self.replicas}, {self.episodes} episodes, seed={self.seed})"
 
     def cell(self, focal: str, background: str) -> Cell:
-        """The cell of two runs, by their names.
-
-        Raises:
-            ValueError: if a name is unknown.
-        """
+        """The cell of two runs, by their names."""
         if (focal, background) not in self.cells:
             raise ValueError(f"the cell is {(focal, background)}; allowed: two of the runs {list(self.runs)}")
         return self.cells[focal, background]
@@ -170,17 +159,10 @@ def crossplay(
         runs: at least two runs of the same game: directories, exported results, or values of `cprl.load`;
             or a table of them by the names that they get, which are otherwise those of their directories.
         episodes: episodes of each replica with each focal agent, each in its own world.
-        greedy: see `cprl.evaluate_run`.
         seed: the seed of the worlds and of all random numbers.
         replicas: the indices of the replicas that play; by default all that every run has.
         diagonal: the pairing of a run with itself: "self", agents that were trained together, or
             "cross_seed", a focal agent of the run's next replica.
-        allow: see `cprl.load`.
-
-    Raises:
-        ValueError: if the runs have different games (names the differences), the game has one agent, a run is
-            given twice, `diagonal` is another word, or "cross_seed" has a single replica; and see
-            `cprl.evaluate_run`.
     """
     arguments.choice("diagonal", diagonal, get_args(Diagonal))
     named = named_runs(runs, allow)
@@ -243,23 +225,11 @@ def named_runs(
     allow: Sequence[str],
     command: str = "crossplay",
 ) -> dict[str, LoadedRun]:
-    """The runs by given names, by names of their directories, or by their paths if those coincide.
-
-    Args:
-        runs: see `crossplay`.
-        allow: see `cprl.load`.
-        command: what a message says that takes them.
-
-    Raises:
-        ValueError: for fewer than two, and for a run that is given twice.
-    """
+    """The runs by given names, by names of their directories, or by their paths if those coincide."""
     given: list[str] = []
     if isinstance(runs, Mapping):
-        for name in runs:
-            arguments.object_of("a name of a run", name, str, "a text")
         given, runs = list(runs), list(runs.values())
-    listed = arguments.listed("runs", runs, "a sequence of at least two runs")
-    opened_runs = [opened(run, allow) for run in listed]
+    opened_runs = [opened(run, allow) for run in runs]
     if len(opened_runs) < 2:
         raise ValueError(
             f"the number of runs is {len(opened_runs)}; allowed: at least two: cprl {command} RUN RUN..."
@@ -296,12 +266,7 @@ def gains(played: CrossPlay) -> dict[tuple[str, str], Gain]:
     Each number is first averaged over a replica's episodes and focal agents; replicas are paired, because
     both cells have the same background agents and worlds. With `diagonal="cross_seed"` the agent whose place
     is taken was not trained with the background agents either, so that a gain is due to the run alone.
-
-    Args:
-        played: the cross-play.
     """
-    object_of("played", played, CrossPlay, "what crossplay() gave")
-
     means: dict[Whose, dict[tuple[str, str], list[float]]] = {
         whose: {at: _means(played, at, whose) for at in played.cells} for whose in ("focal", "background")
     }
@@ -340,15 +305,7 @@ _PANELS: Final = {
 
 
 def draw_gains(played: CrossPlay, path: Path | str) -> Path:
-    """Draws `gains`, a row for each focal agent's run, a column for each of background agents.
-
-    Args:
-        played: the cross-play.
-        path: the PNG.
-
-    Raises:
-        ValueError: if the name does not end in .png.
-    """
+    """Draws `gains`, a row for each focal agent's run, a column for each of background agents."""
     path, found = picture_path(path), gains(played)
     names, diagonal = list(played.runs), diagonal_returns(played)
     returns = with_unit("focal/return", rewards=unit_of_cells(played)).partition("/")[2]

@@ -20,7 +20,6 @@ from matplotlib.figure import Figure
 from rich.table import Table
 
 from cprl import arguments
-from cprl.arguments import object_of
 from cprl.evaluation.empirical_game import EmpiricalGame
 from cprl.evaluation.evaluate import how_they_play
 from cprl.measuring.statistics import CONFIDENCE, Estimate, estimate
@@ -58,17 +57,14 @@ def analyse(game: EmpiricalGame, *, resamples: int = arguments.EGTA_RESAMPLES, s
     """Analyses an empirical game.
 
     Args:
-        game: of `play_empirical_game` or `pairwise_game`.
         resamples: the number of bootstrap resamples of the replicas.
         seed: the seed of the resampling, and of the starts of the replicator dynamics.
 
     Raises:
-        ValueError: for numbers out of range, and see `cprl.theory.alpha_rank`.
         ModuleNotFoundError: if OpenSpiel or nashpy is not installed.
     """
-    arguments.object_of("game", game, EmpiricalGame, "what play_empirical_game() or pairwise_game() gave")
     resamples = arguments.integer("resamples", resamples, 1, 100_000)
-    rng, replicas = np.random.default_rng(arguments.seed(seed)), len(game.payoffs)
+    rng, replicas = np.random.default_rng(seed), len(game.payoffs)
     table = game.table()
     drawn = rng.integers(replicas, size=(resamples if replicas > 1 else 0, replicas))
     # Few replicas have few resamples that differ: each is analysed once.
@@ -245,15 +241,9 @@ _UNCERTAIN: Final = "#9a9a9a"
 def draw_egta(found: Analysis, path: Path | str) -> Path:
     """Draws an analysis.
 
-    Args:
-        found: the analysis.
-        path: the PNG.
-
     Raises:
-        ValueError: if the name does not end in .png.
         FileExistsError: if the file exists.
     """
-    object_of("found", found, Analysis, "what analyse() gave")
     path = style.check_picture(path)
     figure = Figure(_SIZE_IN, layout="constrained")
     dynamics, rank = figure.subplots(1, 2, width_ratios=(1.35, 1))

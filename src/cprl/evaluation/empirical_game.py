@@ -21,7 +21,6 @@ import numpy as np
 import pyarrow as pa
 from numpy.typing import NDArray
 
-from cprl import arguments
 from cprl.evaluation.cross_play import CrossPlay, named_runs
 from cprl.evaluation.evaluate import SEED, check, check_same_game, chosen_replicas
 from cprl.evaluation.lanes import Played, Source, play, policies_of
@@ -78,13 +77,8 @@ class EmpiricalGame:
 
         Args:
             replicas: their places in `payoffs`, e.g. a resample; by default all once.
-
-        Raises:
-            ValueError: for places that are not there.
         """
-        last = len(self.payoffs) - 1
-        chosen = range(last + 1) if replicas is None else arguments.listed("replicas", replicas, "places")
-        places = [arguments.integer("a place of a replica", own, 0, last) for own in chosen]
+        places = range(len(self.payoffs)) if replicas is None else replicas
         if not places:
             raise ValueError("replicas is empty; allowed: at least one place")
         return PayoffTable(agents=self.agents, payoffs=self.payoffs[places].mean(0))
@@ -106,14 +100,8 @@ def play_empirical_game(
             profiles S^N are allowed, e.g. four runs of four agents; `pairwise_game` has no such bound.
         episodes: episodes of each replica and choice of who plays where, each in its own world; the choices
             are N (C - S) + S.
-        greedy: see `cprl.evaluate_run`.
         seed: the seed of the worlds and of all random numbers.
         replicas: the indices of the replicas that play; by default all that every run has.
-        allow: see `cprl.load`.
-
-    Raises:
-        ValueError: if the runs have different games, the game has one agent, there are too many profiles, or
-            a run is given twice; and see `cprl.evaluate_run`.
     """
     named = named_runs(runs, allow, command="egta")
     check_same_game(named)
@@ -157,7 +145,6 @@ def pairwise_game(played: CrossPlay) -> EmpiricalGame:
     Args:
         played: the cross-play; its `diagonal` says who plays where both play as one run.
     """
-    arguments.object_of("played", played, CrossPlay, "what crossplay() gave")
     names = list(played.runs)
     returns = {at: cell.returns("focal") for at, cell in played.cells.items()}
     matrices = [

@@ -33,11 +33,7 @@ _LONGEST: Final = 40
 
 
 def check_same_game(runs: Mapping[str, LoadedRun]) -> None:
-    """Checks that all runs, by name, have the game of the first.
-
-    Raises:
-        ValueError: names the differences.
-    """
+    """Checks that all runs, by name, have the game of the first."""
     first, *others = runs
     for other in others:
         found = differences(runs[first].game, runs[other].game)
@@ -105,9 +101,6 @@ class Evaluation:
 
         Args:
             policy: "trained" or "random".
-
-        Raises:
-            ValueError: if it is anything else.
         """
         arguments.choice("policy", policy, ("trained", "random"))
         played = {"trained": self.trained, "random": self.random}[policy]
@@ -158,11 +151,6 @@ def evaluate_run(
         seed: the seed of the worlds and of all random numbers; equal seeds give equal episodes.
         replicas: the indices of the replicas that play; by default all. A replica's episodes do not depend on
             the others.
-        allow: see `cprl.load`.
-
-    Raises:
-        ValueError: if a number is out of range, a replica does not exist, the seed is that of the training,
-            or the run cannot be loaded, see `cprl.load`.
     """
     loaded = opened(run, allow)
     check(episodes=episodes, seed=seed, greedy=greedy, runs=[loaded])
@@ -180,12 +168,7 @@ def evaluate_run(
 
 
 def opened(run: str | Path | LoadedRun, allow: Sequence[str] = ()) -> LoadedRun:
-    """A run, loaded if it is a directory.
-
-    Raises:
-        ValueError: if it is neither, or cannot be loaded, see `cprl.load`.
-    """
-    arguments.object_of("run", run, (str, Path, LoadedRun), "a directory, or a value of cprl.load")
+    """A run, loaded if it is a directory."""
     return run if isinstance(run, LoadedRun) else load(run, allow=allow)
 
 
@@ -193,17 +176,9 @@ def chosen_replicas(runs: Mapping[str, LoadedRun], replicas: Sequence[int]) -> l
     """The chosen replicas, or all that every run has, ascending.
 
     Args:
-        runs: the runs by name.
         replicas: the indices of the chosen replicas; empty for all.
-
-    Raises:
-        ValueError: if a run does not have them, or the runs have none in common.
     """
-    allowed = "the indices of replicas"
-    chosen = {
-        arguments.integer("a replica", replica, 0, allowed="an integer >= 0")
-        for replica in arguments.listed("replicas", replicas, allowed)
-    }
+    chosen = set(replicas)
     common = sorted(set.intersection(*(set(run.replicas) for run in runs.values())))
     for name, run in runs.items():
         missing = sorted(chosen - set(run.replicas))
@@ -216,14 +191,9 @@ def chosen_replicas(runs: Mapping[str, LoadedRun], replicas: Sequence[int]) -> l
 
 
 def check(*, episodes: int, seed: int, greedy: bool, runs: Sequence[LoadedRun]) -> None:
-    """Checks the arguments of an evaluation, and that no agent was trained in the worlds.
-
-    Raises:
-        ValueError: names the value and what is allowed.
-    """
+    """Checks the arguments of an evaluation, and that no agent was trained in the worlds."""
     arguments.integer("episodes", episodes, 1)
     arguments.seed(seed)
-    arguments.switch("greedy", greedy)
     for run in runs:
         if run.experiment.seed == seed:
             raise ValueError(

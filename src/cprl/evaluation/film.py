@@ -52,15 +52,10 @@ class FreshEpisode:
 def fresh_episode(
     run: str | Path, *, replica: int = 0, episode: int = 0, seed: int = SEED, allow: Sequence[str] = ()
 ) -> FreshEpisode:
-    """The world and the agents of an episode that is filmed; equal numbers give equal episodes. See `film`.
-
-    Raises:
-        ValueError: if the run cannot be loaded, see `cprl.load`, or a number is out of range.
-    """
+    """The world and the agents of an episode that is filmed; equal numbers give equal episodes."""
     episode = arguments.integer("episode", episode, 0, 2**32 - 1)
     replica = arguments.integer("replica", replica, 0)
     seed = arguments.seed(seed)
-    arguments.object_of("run", run, (str, Path), "a directory")
     loaded = load(run, allow=allow)
     if replica not in loaded.replicas:
         replicas = ", ".join(map(str, loaded.replicas))
@@ -84,24 +79,18 @@ def film(
     """Records an episode of a run's agents in a fresh world, with the exploration of evaluation.
 
     Args:
-        run: its directory, or its exported results.
         out: the recording, a .rrd, complete or absent; by default `film-<replica>-<episode>.rrd` in the run's
             directory.
-        replica: the index of the agents' replica.
         episode: the index of the fresh episode; equal indices give equal episodes.
         seed: of the worlds and all chance. The world is that of `evaluate_run` with the same seed, of number
             replica x episodes + episode there; what agents draw is their own.
-        allow: see `cprl.load`.
 
     Returns:
         The recording, and the episode.
 
     Raises:
-        ValueError: if the run cannot be loaded, see `cprl.load`, a number is out of range, or the suffix is
-            another.
         FileExistsError: if the recording exists.
     """
-    arguments.object_of("out", out, (str, Path, type(None)), "a path, or None")
     if out is not None and Path(out).suffix != ".rrd":
         raise arguments.refusal("out", str(out), "a .rrd; film_video makes a .gif or an .mp4")
     fresh = fresh_episode(run, replica=replica, episode=episode, seed=seed, allow=allow)
@@ -222,13 +211,11 @@ def film_video(
     board are always in the film.
 
     Args:
-        run: its directory, or its exported results.
         out: the film, a .gif or, with imageio-ffmpeg, an .mp4; complete or absent.
         beside: more runs, whose agents are shown to the right of the first. Games may differ; where they do
             not, all play the same fresh world.
         titles: of the run and those beside it, one each; by default the institutions of each, or the names of
             their experiments.
-        replica: the index of the agents' replica.
         episode: the index of the fresh episode; equal indices give equal episodes.
         seed: of the worlds and all chance. The world is that of `evaluate_run` with the same seed, of number
             replica x episodes + episode there; what agents draw is their own.
@@ -238,26 +225,21 @@ def film_video(
         width: of the pictures in pixels, at most 1920, and at least 240 for each run; by default 640 for each
             run that has room. The height follows from the boards, each at most twice as high as its part is
             wide.
-        allow: see `cprl.load`.
 
     Returns:
         The film, and the episode of each run.
 
     Raises:
-        ValueError: if a run cannot be loaded, see `cprl.load`, plays a game without a board, or an argument
-            is out of range.
         FileExistsError: if the film exists.
         ModuleNotFoundError: for an .mp4 without imageio-ffmpeg.
-        MemoryError: if the pictures of a .gif do not fit into memory.
     """
-    path = arguments.path("out", out)
+    path = Path(out)
     if path.suffix not in SUFFIXES:
         raise arguments.refusal("out", str(path), f"a file whose name ends in {' or '.join(SUFFIXES)}")
-    runs = (run, *arguments.listed("beside", beside, "a sequence of runs"))
+    runs = (run, *beside)
     most_runs = LARGEST_WIDTH // SMALLEST_WIDTH
     if len(runs) > most_runs:
         raise arguments.refusal("beside", f"{len(runs) - 1} runs", f"at most {most_runs - 1}")
-    titles = arguments.texts("titles", titles)
     if titles and (len(titles) != len(runs) or not all(map(str.isprintable, titles))):
         raise arguments.refusal("titles", titles, f"a line of text for each of {len(runs)} runs")
     every = None if every is None else arguments.integer("every", every, 1)
@@ -335,8 +317,6 @@ class _Panel:
         """The population after a turn of the film's clock, or at its end if that was before.
 
         Args:
-            turn: the turn.
-            since: the first turn whose violators are marked.
             card: whether to say what came of the episode.
         """
         last, sites = len(self.moments) - 1, len(self.picture.board.sites)

@@ -16,7 +16,6 @@ import numpy as np
 from numpy.typing import NDArray
 from PIL import Image, ImageDraw, ImageFont
 
-from cprl import arguments
 from cprl.commons.colours import APPLE, GROUND, PALETTE, Colour, agent_colour
 from cprl.commons.maps import Map
 from cprl.commons.picture import world_image
@@ -45,16 +44,12 @@ class EpisodePicture:
     """Draws any turn of an episode: a title, the board, the apples on it and each agent's harvest so far.
 
     Args:
-        board: the map.
         steps: the length of the turn axis, in turns: the longest that an episode can be.
         width: of the picture in pixels, 240 to 1920.
         most_harvested: the top of the axis of harvests, in apples; None where it is not known before, so that
             the axis grows with the episode.
         height: of the picture in pixels, at least what it takes, so that different boards can stand side by
             side; by default what it takes.
-
-    Raises:
-        ValueError: for a width that is out of range.
     """
 
     def __init__(
@@ -66,7 +61,6 @@ class EpisodePicture:
         most_harvested: int | None = None,
         height: int = 0,
     ) -> None:
-        width = arguments.integer("width", width, SMALLEST_WIDTH, LARGEST_WIDTH)
         width -= width % 2  # which videos want
         self.board, self.steps, self._most = board, steps, most_harvested
         self._unit = unit = max(10, width // 46)
@@ -219,7 +213,6 @@ class _Legend:
     Args:
         agents: how many.
         wide: the room in pixels.
-        font: of the text.
     """
 
     def __init__(self, agents: int, wide: int, font: ImageFont.FreeTypeFont) -> None:
@@ -270,7 +263,6 @@ def write_gif(path: Path, pictures: Iterable[Bytes], samples: Sequence[Bytes], *
     """Writes a GIF that repeats, with one palette for all pictures.
 
     Args:
-        path: the file; an existing file is replaced.
         pictures: uint8 [height, width, 3] each, RGB.
         samples: some of the pictures; their most frequent colours are exact, others become the nearest.
         fps: pictures per second; a GIF counts hundredths of a second, so it is rounded to 100 / n.
@@ -342,7 +334,6 @@ def write_mp4(path: Path, pictures: Iterable[Bytes], size: tuple[int, int], *, f
     """Writes an H.264 video.
 
     Args:
-        path: the file; an existing file is replaced.
         pictures: uint8 [height, width, 3] each, RGB.
         size: (width, height) in pixels, both even.
         fps: pictures per second.

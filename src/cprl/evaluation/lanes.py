@@ -59,7 +59,6 @@ class Source:
     """The run from which an agent is taken in every replica: the run's agent with the same index.
 
     Args:
-        run: the run.
         replicas: the run's replica for each index of a replica, if they differ.
     """
 
@@ -72,24 +71,9 @@ class Source:
 
 
 def play(
-    where: Place,
-    policies: MakePolicies,
-    replicas: Sequence[int],
-    *,
-    episodes: int,
-    seed: int,
-    explore: bool,
+    where: Place, policies: MakePolicies, replicas: Sequence[int], *, episodes: int, seed: int, explore: bool
 ) -> Played:
-    """Plays `episodes` fresh episodes of each replica; replica r plays the worlds from r x episodes on.
-
-    Args:
-        where: the game with its transforms.
-        policies: see `MakePolicies`; each replica has `episodes` worlds, consecutive in the batch.
-        replicas: the indices of the replicas, ascending.
-        episodes: episodes of each replica.
-        seed: the seed of the worlds.
-        explore: see `cprl.measuring.evaluate.evaluate`.
-    """
+    """Plays `episodes` fresh episodes of each replica; replica r plays the worlds from r x episodes on."""
     played: Played = {}
     for group, env in fresh_worlds(where, replicas, worlds=episodes, seed=seed):
         found = evaluate(env, policies(group), explore=explore)
@@ -116,13 +100,7 @@ def policies_of(
     """The policies of all agents of these replicas, from stored runs.
 
     Args:
-        sources: the sources of agent 0, 1 and so on.
-        replicas: the indices of the replicas.
-        worlds: the number of worlds of each replica.
         seed: the seed of random numbers, together with the replica and the agent.
-
-    Raises:
-        ValueError: if a run has no network of an agent; names those that it has.
     """
     found = [
         [source.run.agent(agent, replica=source.replica(replica)) for replica in replicas]
@@ -173,11 +151,7 @@ class Turns:
         self.has_ended = False
 
     def play(self) -> TensorDictBase:
-        """Plays the next turn; returns its entries, batch size [1], see `cprl.keys`.
-
-        Raises:
-            ValueError: if the episode has ended.
-        """
+        """Plays the next turn; returns its entries, batch size [1], see `cprl.keys`."""
         if self.has_ended:
             raise ValueError("the episode has ended; allowed: turns up to its end")
         env = self.env

@@ -82,11 +82,7 @@ class Session:
     Args:
         env: one world of a `CommonsEnv`, with or without transforms; it is reset.
         others: writes the actions of all agents; that of the person's agent is replaced.
-        agent: the index of the person's agent.
         decision: what it decides, see `Game.decisions`; None for what `others` write.
-
-    Raises:
-        ValueError: if the environment is of another kind, or has no such agent or decision.
     """
 
     def __init__(self, env: EnvBase, others: Policy, *, agent: int = 0, decision: int | None = None) -> None:
@@ -131,11 +127,7 @@ class Session:
         return int(self.moments[-1].stock.sum(dtype=np.int64))
 
     def act(self, action: str) -> TurnPlayed:
-        """Plays a turn: the person's agent takes this action, the others choose theirs.
-
-        Raises:
-            ValueError: if the game has no action of this name, or the episode has ended; nothing is played.
-        """
+        """Plays a turn: the person's agent takes this action, the others choose theirs."""
         arguments.choice("action", action, self.game.actions)
         self._action = self.game.actions.index(action)
         batch = self._turns.play()
@@ -232,7 +224,6 @@ def play_in_terminal(session: Session, read_line: Callable[[], str] | None = Non
     """Plays the episode: a line of keys is played key by key; `quit`, Ctrl-C or the end of input ends it.
 
     Args:
-        session: the episode.
         read_line: returns a line with its newline, or "" at the end; by default that of standard input.
     """
     read_line = read_line or sys.stdin.readline
@@ -326,23 +317,14 @@ def open_session(
     """An episode for a person and others.
 
     Args:
-        board: see `cprl.evaluation.populations.board_named`.
-        agent: the index of the person's agent.
         others: the directory of a run, whose agents with the same indices play, or a scripted policy; by
             default the agents of the run that `board` names, else "greedy".
         replica: the index of the run's replica whose agents play.
-        variant: of a published board, see `presets.game`.
         steps: turns of the episode at most, in place of those of the game.
         seed: of all random numbers; equal seeds and equal actions give equal episodes.
         decision: what the person decides in a game with votes or elections, 0 to `Game.decisions` - 1; None
             for a choice by chance, as of a scripted agent.
-        allow: see `cprl.load`.
-
-    Raises:
-        ValueError: for a board or others that are unknown, or do not fit each other; says what does.
     """
-    seed = arguments.seed(seed)
-    replica = arguments.integer("replica", replica, 0)
     game, run = board_named(board, variant, allow=allow)
     if steps is not None:
         steps = arguments.integer("steps", steps, 1)

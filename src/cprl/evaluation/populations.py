@@ -46,17 +46,12 @@ def play_population(
         greedy: whether stored agents take their best action; else they explore as in evaluation.
         seed: the seed of the worlds and of all random numbers; with one seed all populations play in the
             same worlds.
-        allow: what stored runs may import, see `cprl.load`.
 
     Returns:
         Episodes by the index of the replica, 0 to R - 1.
-
-    Raises:
-        ValueError: for agents that learn or do not fit the game, for the training seed of a stored agent, and
-            for numbers out of range.
     """
     place = place_of(where)
-    specs = specs_by_agent(arguments.objects("agents", agents, AgentSpec, _SPECS), place.game.agents)
+    specs = specs_by_agent(agents, place.game.agents)
     for agent, spec in enumerate(specs):
         if not isinstance(spec, Scripted | Frozen):
             raise ValueError(f"agents[{agent}] is a {type(spec).__name__}; allowed: {_SPECS}")
@@ -69,11 +64,7 @@ def play_population(
 
 
 def place_of(where: Any) -> Place:
-    """A run as it is, a game as what makes fresh worlds of it.
-
-    Raises:
-        ValueError: if it is neither.
-    """
+    """A run as it is, a game as what makes fresh worlds of it."""
     if isinstance(where, LoadedRun):
         return where
     if not is_playable(where):
@@ -101,11 +92,6 @@ def board_named(
     Args:
         board: the name of a published board, the directory of a run, whose game it is then, or a file with a
             drawing, see `cprl.maps.parse`, played by the published rules.
-        variant: of a published board, see `presets.game`.
-        allow: see `cprl.load`.
-
-    Raises:
-        ValueError: for anything else, and for a variant of what is no published board.
     """
     arguments.choice("variant", variant, presets.VARIANTS)
     presets.check_board(board)
@@ -134,16 +120,10 @@ def agent_named(who: str, agent: int, *, replica: int | None, name: str = "other
 
     Args:
         who: the name of a scripted policy, or the directory of a run.
-        agent: the index.
-        replica: the run's replica, see `Frozen`.
-        name: what an error calls the word.
-
-    Raises:
-        ValueError: for anything else.
     """
     if who in SCRIPTED_POLICIES:
         return Scripted(who)
-    if not arguments.path(name, who).is_dir():
+    if not Path(who).is_dir():
         names = ", ".join(SCRIPTED_POLICIES)
         raise ValueError(f"{name} is {who!r}; allowed: {names}, or a run's directory")
     return Frozen(str(who), agent, replica)

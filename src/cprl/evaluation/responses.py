@@ -51,11 +51,7 @@ def check_population(run: LoadedRun) -> None:
 
 
 def consecutive_replicas(run: LoadedRun, replicas: int | None) -> int:
-    """How many replicas play: the first ones of a run, by default all.
-
-    Raises:
-        ValueError: if the run does not keep them, or the weights of one are NaN or infinite.
-    """
+    """How many replicas play: the first ones of a run, by default all."""
     if replicas is None and run.replicas != list(range(len(run.replicas))):
         raise ValueError(f"{run.path} keeps the replicas {run.replicas}; allowed: 0 and those that follow it")
     most = len(run.replicas)
@@ -75,11 +71,7 @@ def check_seeds(seed: int, episodes: int, runs: Sequence[LoadedRun]) -> int:
 
 
 def check_agents(agents: Sequence[Any], run: LoadedRun) -> tuple[int, ...]:
-    """Indices of agents of a run's game, at least one and each once.
-
-    Raises:
-        ValueError: for anything else.
-    """
+    """Indices of agents of a run's game, at least one and each once."""
     found = [arguments.integer("an agent", own, 0, run.game.agents - 1) for own in agents]
     if not found or len(set(found)) < len(found):
         raise arguments.refusal("agents", list(agents), "indices of agents, at least one and each once")
@@ -135,37 +127,23 @@ class Exploitability:
         return self._gain({agent: self._best(agent) for agent in self.responses})
 
     def gain_of(self, agent: int) -> Gain:
-        """The same in the place of one agent.
-
-        Args:
-            agent: its index.
-
-        Raises:
-            ValueError: if there are no responses in its place.
-        """
+        """The same in the place of one agent."""
         agent = self._known(agent)
         return self._gain({agent: self._best(agent)})
 
     def gain_of_response(self, response: Response) -> Gain:
         """What one response gains in all replicas; nothing is chosen by these numbers."""
-        arguments.object_of("response", response, Response, "one of `responses`")
         return self._gain({self._known(response.agent): response.reporting})
 
     def chosen(self, agent: int) -> list[Response]:
         """The response in the place of an agent for each replica: the one with the highest mean return there
         in the worlds where one is chosen, of equal ones the first.
-
-        Raises:
-            ValueError: if there are no responses in its place.
         """
         return self._chosen[self._known(agent)]
 
     def returns(self, agent: int) -> tuple[Values, Values]:
         """The mean returns, float64 [R] each, of an agent of the population and of what was chosen to take
         its place.
-
-        Raises:
-            ValueError: if there are no responses in its place.
         """
         agent = self._known(agent)
         return _focal(self.population, agent), _focal(self._best(agent), agent)
@@ -244,11 +222,6 @@ def play_responses(
         replicas: how many of the run's replicas play, the first ones; by default all.
         seed: of the worlds reported; the next seed is that of the worlds where responses are chosen. Neither
             is the seed of a training.
-        allow: see `cprl.load`.
-
-    Raises:
-        ValueError: for a game of one agent, agents that the game does not have, runs of other games, replicas
-            that a run does not have, and for numbers out of range.
     """
     population = opened(run, allow)
     check_population(population)
@@ -293,10 +266,9 @@ def _opened(
             raise arguments.refusal(f"responses[{agent}]", table, allowed)
         found[agent] = {}
         for name, given in table.items():
-            arguments.object_of("a name of a response", name, str, "a text")
             where = f"responses[{agent}][{name!r}]"
             if not isinstance(given, Frozen):
-                given = Frozen(str(arguments.path(where, given)), agent, replica=None)
+                given = Frozen(str(given), agent, replica=None)
             if given.agent != agent:
                 raise arguments.refusal(where, given, f"agent {agent} of a run, whose place it takes")
             own = load(given.run, allow=allow)

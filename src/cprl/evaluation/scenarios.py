@@ -29,7 +29,6 @@ from matplotlib.figure import Figure
 from rich.table import Table
 
 from cprl import arguments, presets
-from cprl.arguments import object_of
 from cprl.checks import Check, check_fields, instance, one_of
 from cprl.commons.game import Game
 from cprl.evaluation.evaluate import (
@@ -69,11 +68,7 @@ def _is_name(value: Any) -> bool:
 
 @dataclass(frozen=True, kw_only=True)
 class Scenario:
-    """A background on a board, and how many of the agents are focal.
-
-    Raises:
-        ValueError: names the field, what came and what is allowed.
-    """
+    """A background on a board, and how many of the agents are focal."""
 
     name: str
     """What it is called, e.g. "minority_among_greedy": letters, digits and underscores."""
@@ -165,9 +160,6 @@ def scenarios_of(game: Game) -> tuple[Scenario, ...]:
 
     Args:
         game: a `cprl.Game` for at least 2 agents, with windows as observations.
-
-    Raises:
-        ValueError: for any other game.
     """
     check_game(game)
     everyone = range(game.agents)
@@ -186,16 +178,12 @@ def scenarios_of(game: Game) -> tuple[Scenario, ...]:
     )
 
 
-def check_game(game: object) -> None:
-    """Checks that a game can have scenarios.
-
-    Raises:
-        ValueError: if it is no `cprl.Game`, has a single agent, or shows agents something else than windows.
-    """
+def check_game(game: Any) -> None:
+    """Checks that a game can have scenarios."""
     arguments.object_of("game", game, Game, "a cprl.Game, because scripted agents read its windows")
-    if isinstance(game, Game) and game.agents < 2:
+    if game.agents < 2:
         raise ValueError(f"the game has {game.agents} agent; allowed for scenarios: at least 2")
-    if isinstance(game, Game) and game.observation.area != "window":
+    if game.observation.area != "window":
         raise ValueError(
             f"Observation.area is {game.observation.area!r}; allowed for scenarios: 'window', because "
             "scripted agents rely on the agent's position in it"
@@ -232,11 +220,8 @@ class Score:
 
         Args:
             focal: who takes the focal places, one of `FOCAL_AGENTS`.
-
-        Raises:
-            ValueError: if it is anything else.
         """
-        together = pooled(self._of(focal).values())
+        together = pooled(self.played[focal].values())
         return {
             "focal/return": over_replicas(self.returns("focal", focal)),
             "background/return": over_replicas(self.returns("background", focal)),
@@ -249,14 +234,9 @@ class Score:
 
         Args:
             whose: "focal" or "background".
-            focal: who takes the focal places.
-
-        Raises:
-            ValueError: if a word is another one.
         """
-        arguments.choice("whose", whose, get_args(Whose))
         values: dict[int, list[float]] = {}
-        for places, played in self._of(focal).items():
+        for places, played in self.played[focal].items():
             rest = np.setdiff1d(np.arange(self.scenario.game.agents), places)
             agents = list(places) if whose == "focal" else rest.tolist()
             for replica, episodes in played.items():
@@ -271,17 +251,10 @@ class Score:
         Args:
             over: "random" or "greedy".
             whose: "focal" or "background".
-
-        Raises:
-            ValueError: if a word is another one.
         """
         own, other = self.returns(whose), self.returns(whose, over)
         means = [[fmean(values[replica]) for replica in own] for values in (own, other)]
         return difference(*means, paired=True)
-
-    def _of(self, focal: FocalAgents) -> Mapping[tuple[int, ...], Played]:
-        arguments.choice("focal", focal, FOCAL_AGENTS)
-        return self.played[focal]
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -341,12 +314,6 @@ def run_scenarios(
         greedy: whether stored agents take their best action, see `cprl.evaluate_run`.
         seed: the seed of the worlds and of all random numbers; equal seeds give equal episodes.
         replicas: the indices of the replicas that play; by default all.
-        allow: see `cprl.load`; for stored backgrounds too.
-
-    Raises:
-        ValueError: for a game that has no scenarios, see `scenarios_of`; for a scenario that is unknown,
-            given twice, or of another game (names the differences); if the seed trained an agent; and see
-            `cprl.evaluate_run`.
     """
     loaded = opened(run, allow)
     check_game(loaded.game)
@@ -395,8 +362,7 @@ def _chosen(run: LoadedRun, scenarios: Sequence[str | Scenario]) -> list[Scenari
     """The scenarios by their names or as they are, checked against the run's game."""
     named = {scenario.name: scenario for scenario in scenarios_of(run.game)}
     found: dict[str, Scenario] = {}
-    for given in arguments.listed("scenarios", scenarios, "names of scenarios, or values of Scenario"):
-        arguments.object_of("a scenario", given, (str, Scenario), "its name, or a value of Scenario")
+    for given in scenarios:
         if isinstance(given, str) and given not in named:
             why = left_out_of(run.game)
             raise ValueError(
@@ -554,11 +520,7 @@ def estimates(scores: Scores) -> pa.Table:
     "value", "low" and "high" (null where undefined), and how many "replicas", "episodes" and "undefined"
     episodes there were. Metrics "focal/advantage" and "background/advantage" of "random" and "greedy" are
     what the run's agents, or the background among them, get more; see `Score.advantage`.
-
-    Raises:
-        ValueError: if `scores` is not what `run_scenarios` gave.
     """
-    object_of("scores", scores, Scores, "what run_scenarios() gave")
     rows: list[dict[str, Any]] = []
     for name, score in scores.by_scenario.items():
         for who in FOCAL_AGENTS:
@@ -601,15 +563,7 @@ _BAND: Final = 0.16
 def draw_scenarios(scores: Scores, path: Path | str) -> Path:
     """Draws the mean return per agent, a row for each scenario: of the run's agents in the focal places, of
     greedy and of random ones there, and of the background; intervals by Student's t.
-
-    Args:
-        scores: what `run_scenarios` gave.
-        path: the PNG.
-
-    Raises:
-        ValueError: if the name does not end in .png.
     """
-    object_of("scores", scores, Scores, "what run_scenarios() gave")
     path = picture_path(path)
     figure = Figure((8.0, _ROW_IN * len(scores.by_scenario) + 2.0), layout="constrained")
     axes = figure.subplots()

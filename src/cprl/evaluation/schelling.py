@@ -22,8 +22,6 @@ from matplotlib.figure import Figure
 from numpy.typing import NDArray
 from rich.table import Table
 
-from cprl import arguments
-from cprl.arguments import object_of
 from cprl.commons.game import Game
 from cprl.evaluation.evaluate import INTERVALS, SEED
 from cprl.evaluation.lanes import Played, pooled
@@ -83,12 +81,7 @@ class SchellingDiagram:
         return dilemma(self.restrained_payoffs, self.greedy_payoffs)
 
     def measures(self, count: int) -> dict[str, Measured]:
-        """The social metrics of the mixes with so many restrained agents.
-
-        Raises:
-            ValueError: for a number that is not in 0..N.
-        """
-        count = arguments.integer("count", count, 0, self.agents)
+        """The social metrics of the mixes with so many restrained agents."""
         return social_measures(pooled(self.played[who] for who in self._mixes(count)))
 
     def table(self) -> pa.Table:
@@ -131,14 +124,9 @@ def schelling(
         where: a game, or a run, a value of `cprl.load`, whose game and transforms are used.
         restrained: who plays restrained: a scripted policy, or the directory of a run, of whose replica r
             the agent of the same index plays in replica r.
-        greedy: who plays greedy, likewise.
         episodes: episodes of each replica and choice of restrained agents, each in its own world.
         replicas: the number of replicas R; of scripted policies, of independent groups of episodes.
         seed: the seed of the worlds, in which all mixes play, and of all random numbers.
-        allow: see `cprl.load`.
-
-    Raises:
-        ValueError: for a single agent, policies that are alike, and what `play_population` refuses.
     """
     agents = place_of(where).game.agents
     if agents < 2:
@@ -165,10 +153,7 @@ def schelling(
 
 def _check_unlike(game: Any, restrained: str, greedy: str) -> None:
     """Refuses the same policy twice, also in other words."""
-    one, other = (
-        who if who in SCRIPTED_POLICIES else arguments.path("who plays", who).resolve()
-        for who in (restrained, greedy)
-    )
+    one, other = (who if who in SCRIPTED_POLICIES else Path(who).resolve() for who in (restrained, greedy))
     if one == other:
         words = f"both {greedy!r}" if restrained == greedy else f"{restrained!r} and {greedy!r}, the same run"
         raise ValueError(f"restrained and greedy are {words}; allowed: two ways to play")
@@ -197,15 +182,9 @@ def draw_schelling(found: SchellingDiagram, path: Path | str) -> Path:
     """Draws what an agent gets that is restrained or greedy, by how many of the others are restrained; beside
     it what all get together.
 
-    Args:
-        found: the diagram.
-        path: the PNG.
-
     Raises:
-        ValueError: if the name does not end in .png.
         FileExistsError: if the file exists.
     """
-    object_of("found", found, SchellingDiagram, "what schelling() gave")
     path = style.check_picture(path)
     figure = Figure(_SIZE_IN, layout="constrained")
     own, group = figure.subplots(1, 2)

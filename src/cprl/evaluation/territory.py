@@ -18,14 +18,7 @@ from cprl import arguments
 from cprl.commons.colours import APPLE, GROUND, PALETTE, WALL, agent_colour
 from cprl.commons.game import Game
 from cprl.commons.maps import Map
-from cprl.evaluation.evaluate import (
-    INTERVALS,
-    SEED,
-    check,
-    chosen_replicas,
-    how_they_play,
-    opened,
-)
+from cprl.evaluation.evaluate import INTERVALS, SEED, check, chosen_replicas, how_they_play, opened
 from cprl.evaluation.lanes import Source, fresh_worlds, policies_of, random_policies
 from cprl.measuring import territory
 from cprl.measuring.movement import Trace, overlap, trace, visits
@@ -81,11 +74,7 @@ class Territory:
     random: Stays = field(repr=False)
 
     def of(self, policy: Policy) -> Stays:
-        """The stays of the run's agents or of random ones.
-
-        Raises:
-            ValueError: if the policy is neither "trained" nor "random".
-        """
+        """The stays of the run's agents or of random ones."""
         arguments.choice("policy", policy, POLICIES)
         return self.trained if policy == "trained" else self.random
 
@@ -109,10 +98,6 @@ def territory_of(
         greedy: whether agents take their best action; else they explore as in evaluation.
         seed: the seed of the worlds and of all random numbers.
         replicas: the indices of the replicas that play; by default all.
-        allow: see `cprl.load`.
-
-    Raises:
-        ValueError: for what `cprl.evaluate_run` refuses, and for a game without a board of cprl.
     """
     loaded = opened(run, allow)
     check(episodes=episodes, seed=seed, greedy=greedy, runs=[loaded])
@@ -199,8 +184,6 @@ def draw_visits(
     what, each where its owner spends most time.
 
     Args:
-        found: what `cprl.evaluation.territory_of` returns.
-        path: the PNG.
         replica: the index of the replica in the run; by default the first one that played.
         policy: "trained" for the run's agents, "random" for random ones.
 
@@ -208,10 +191,8 @@ def draw_visits(
         The path.
 
     Raises:
-        ValueError: if an argument does not fit.
         FileExistsError: if the file exists.
     """
-    arguments.object_of("found", found, Territory, "a value of territory_of")
     path = style.check_picture(path)
     stays = found.of(policy)
     number = found.replicas[0] if replica is None else arguments.integer("replica", replica, 0)

@@ -6,7 +6,6 @@ from math import nan, sqrt
 from pathlib import Path
 from typing import Final
 
-from cprl.arguments import object_of, path
 from cprl.runs.curves import as_curves, curves_of, running_mean
 from cprl.runs.episodes import read_table
 
@@ -53,14 +52,9 @@ class Course:
 def course_of(run: Path) -> Course:
     """The course of a finished run of a game that reports its harvest and how long its boards last.
 
-    Args:
-        run: the run's directory.
-
     Raises:
         FileNotFoundError: if the run has no evaluation.
-        ValueError: if the game does not report `collective_return` and `survival_steps`.
     """
-    run = path("run", run)
     curves = curves_of(run)
     lacking = sorted({"collective_return", "survival_steps"} - set(curves))
     if lacking:
@@ -83,12 +77,7 @@ def course_of(run: Path) -> Course:
 
 
 def in_sentences(course: Course) -> str:
-    """Four sentences: the peak, what came after it, how long boards last, and what that means.
-
-    Raises:
-        ValueError: for anything else than a course.
-    """
-    object_of("course", course, Course, "a Course, see course_of")
+    """Four sentences: the peak, what came after it, how long boards last, and what that means."""
     own = course
     last = min(LAST_EPISODES, own.episodes)
     if own.is_tragedy:

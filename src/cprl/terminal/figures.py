@@ -13,8 +13,6 @@ from matplotlib.patches import Rectangle
 from numpy.typing import NDArray
 
 from cprl import presets
-from cprl.arguments import objects, path
-from cprl.checks import NONE, TEXT, checked, count, either
 from cprl.config import to_config
 from cprl.measuring.episodes import Episode
 from cprl.measuring.names import title as metric_title
@@ -153,8 +151,6 @@ def training_curve(
     the return of all its agents. Games with institutions have two more, violations and fines of all agents.
 
     Args:
-        run: the run's directory.
-        title: what was run, with its schedule.
         random: episodes of the random policy, whose means are dashed lines.
         smoothed: the largest window of the running means, in episodes; they take in at most 1/20 of all.
         exploration_steps: the environment step of a replica at which exploration ends, see
@@ -163,11 +159,7 @@ def training_curve(
     Returns:
         The PNG, `figures/training_curve.png` of the run.
     """
-    run = path("run", run)
-    title = checked("title", title, TEXT).encode("utf-8", "replace").decode()
-    checked("smoothed", smoothed, count(1))
-    checked("exploration_steps", exploration_steps, either(count(0), NONE))
-    random = None if random is None else list(objects("random", random, Episode, "an Episode"))
+    title = title.encode("utf-8", "replace").decode()
     curves = curves_of(run)
     panels = _panels(curves, random)
     episodes = panels[0].values.shape[1]

@@ -11,8 +11,6 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, ProgressColum
 from rich.text import Text
 from tensordict import TensorDictBase
 
-from cprl.arguments import object_of
-from cprl.checks import checked, count
 from cprl.measuring.episodes import Episode
 from cprl.system.compile_clock import CLOCK
 from cprl.system.output import console as safe_console
@@ -24,13 +22,6 @@ COMPILING_PERIOD_S: Final = 2.0
 """Seconds of compiling after which a line says so, and between such lines, which come ever more slowly."""
 TIMED_STEPS: Final = 20
 """Steps that are timed before a remaining time is shown."""
-
-
-def console_of(console: Console | None) -> Console:
-    """The console, by default that of standard output; raises a ValueError for anything else."""
-    if console is not None:
-        object_of("console", console, Console, "a Console of rich, or None")
-    return console or safe_console()
 
 
 def in_words(seconds: float) -> str:
@@ -51,10 +42,6 @@ class ProgressBar:
     Args:
         game: a game or its environment. The length of an episode is `episode_steps` of its `rules`, if it has
             them; else that of the last episode.
-        episodes: the number of episodes of the run.
-        title: the title of the bar.
-        replicas: the number of replicas R.
-        console: the console; by default standard output.
     """
 
     def __init__(
@@ -66,9 +53,7 @@ class ProgressBar:
         replicas: int = 1,
         console: Console | None = None,
     ) -> None:
-        self.console = console_of(console)
-        checked("episodes", episodes, count(1))
-        checked("replicas", replicas, count(1))
+        self.console = console or safe_console()
         rules = getattr(getattr(game, "game", game), "rules", None)
         self._title, self._clock = title, getattr(rules, "episode_steps", None)
         self._last_steps = 0
@@ -140,11 +125,9 @@ class ProgressBar:
                 self.console.print(f"{self._title}: compiling, {spent_s:.0f} s so far", soft_wrap=True)
 
     def state_dict(self) -> dict[str, int]:
-        """The number of episodes that have ended."""
         return {"episodes": self._episodes}
 
     def load_state_dict(self, state: Mapping[str, int]) -> None:
-        """Continues counting from a state."""
         self._episodes = self._before = int(state["episodes"])
 
     def __enter__(self) -> Self:
@@ -155,10 +138,7 @@ class ProgressBar:
         return self
 
     def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        traceback: TracebackType | None,
+        self, kind: type[BaseException] | None, error: BaseException | None, traceback: TracebackType | None
     ) -> None:
         self._is_over.set()
         if self._lines.is_alive():

@@ -48,7 +48,6 @@ def new_figure(heights_in: Sequence[float], *, title: str) -> tuple[Figure, list
 
     Args:
         heights_in: the height of each panel in inches, at least one.
-        title: above the panels.
     """
     lines = fill(title, TITLE_CHARACTERS)
     height = sum(heights_in) + 1.9 + 0.2 * lines.count("\n")
@@ -78,10 +77,7 @@ def legend_below(figure: Figure, panels: Sequence[Axes], *, note: str = "", colu
     """A legend of everything in the panels that has a label, each label once, below them all.
 
     Args:
-        figure: the figure.
-        panels: its panels.
         note: a sentence above the entries, e.g. how the curves are smoothed.
-        columns: of the entries.
     """
     entries: dict[str, Any] = {}
     for panel in panels:
@@ -111,12 +107,8 @@ def wrapped(title: str, width_in: float) -> str:
 
 
 def picture_path(path: str | Path, name: str = "path") -> Path:
-    """The path of a picture to be, whose folder may be missing; a picture that is there is drawn anew.
-
-    Raises:
-        ValueError: if its name does not end in .png.
-    """
-    path = arguments.path(name, path)
+    """The path of a picture to be, whose folder may be missing; a picture that is there is drawn anew."""
+    path = Path(path)
     if path.suffix != ".png":
         raise arguments.refusal(name, str(path), "a file whose name ends in .png")
     return path
@@ -126,7 +118,6 @@ def check_picture(path: str | Path, name: str = "path") -> Path:
     """`picture_path` of a new picture, checked before hours of work.
 
     Raises:
-        ValueError: if its name does not end in .png.
         FileExistsError: if the file exists.
     """
     path = picture_path(path, name)

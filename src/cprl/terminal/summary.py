@@ -9,31 +9,22 @@ from typing import Final
 from rich.console import Console
 from rich.table import Table
 
-from cprl.arguments import object_of, objects, path
-from cprl.checks import TEXT, checked
 from cprl.measuring.episodes import Episode
-from cprl.measuring.names import title
 from cprl.measuring.names import title as metric_title
 from cprl.measuring.replicas import institution_metrics, social_metrics
 from cprl.measuring.reported import INSTITUTIONAL, left_out
+from cprl.system.output import console as safe_console
 from cprl.system.output import printed
-from cprl.terminal.progress import console_of
-from cprl.viewer.streams import to_watch
+from cprl.viewer.page import to_watch
 
 _OF_AGENTS: Final = {"fines": "fined", "transfers": "given", "violations": "violations"}
 
 
-def institutions_table(
-    played: Mapping[str, Sequence[Episode]], mean: Callable[[list[dict[str, float]], str, int], str]
-) -> Table | None:
+def institutions_table(played: Mapping[str, Sequence[Episode]]) -> Table | None:
     """A column for each policy; a row for each metric, then one for each agent: what it was fined and given,
     and its violations. None for a game without institutions.
 
     Shares of something that never happened have no row.
-
-    Args:
-        played: episodes by the name of the policy, at least one of each.
-        mean: the text for a metric of several episodes, from its name and digits.
     """
     first = next(iter(played.values()))[0]
     if all(getattr(first, name) is None for name in INSTITUTIONAL):
@@ -46,7 +37,7 @@ def institutions_table(
     for metric in institution_metrics(first):
         values = [metrics[metric] for own in measured.values() for metrics in own]
         if "equality" in metric or not all(map(isnan, values)):
-            table.add_row(_title(metric), *(mean(own, metric, 2) for own in measured.values()))
+            table.add_row(_title(metric), *(_mean(own, metric, 2) for own in measured.values()))
     fields = {name: word for name, word in _OF_AGENTS.items() if getattr(first, name) is not None}
     if fields:
         table.add_section()
@@ -64,7 +55,7 @@ def _title(metric: str) -> str:
     prefix = "in_force_"
     if metric.startswith(prefix):
         return f"in force: decision {metric.removeprefix(prefix)}"
-    return title(f"institutions/{metric}")
+    return metric_title(f"institutions/{metric}")
 
 
 KEPT = ("recipe.json", "episodes.parquet", "run.rrd", "checkpoints", "figures")
@@ -93,23 +84,11 @@ def summarise(
     """Prints a table that compares policies, the metrics that are left out, and the files of the run.
 
     Args:
-        run: the run's directory.
-        title: what was run, with its schedule.
         played: episodes in fresh worlds by the name of the policy; the first policy is the baseline.
-        figure: the training curve.
-        note: a sentence below the table.
-        console: the console; by default standard output.
     """
-    run, console = path("run", run), console_of(console)
-    checked("title", title, TEXT)
-    object_of("played", played, Mapping, "episodes by the name of the policy, at least one")
-    for name, episodes in played.items():
-        if not objects(f"played[{name!r}]", episodes, Episode, "an Episode"):
-            raise ValueError(f"played[{name!r}] is empty; allowed: at least one episode")
-    if not played:
-        raise ValueError("played is empty; allowed: the episodes of at least one policy")
+    console = console or safe_console()
     console.print(_table(title, played))
-    of_institutions = institutions_table(played, _mean)
+    of_institutions = institutions_table(played)
     if of_institutions is not None:
         console.print(of_institutions)
     for line in _notes(played):

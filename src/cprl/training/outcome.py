@@ -6,7 +6,7 @@ from contextlib import AbstractContextManager, contextmanager, nullcontext
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
-from typing import Any, Final
+from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
 import torch
@@ -26,7 +26,9 @@ from cprl.runs.directory import read_recipe
 from cprl.runs.episodes import EpisodeTable
 from cprl.runs.loggers import LoggerCallback, make_logger
 from cprl.training.agents import Population
-from cprl.viewer.callback import ViewerCallback
+
+if TYPE_CHECKING:
+    from cprl.viewer.callback import ViewerCallback
 
 EXHIBITED_WORLD: Final = 2**31
 """The number of the exhibited world; those of a training, of as many replicas, are smaller."""
@@ -234,9 +236,11 @@ def make_logger_callback(logger: str | Custom, directory: Path, env: EnvBase) ->
 
 def make_viewer(
     watch: str, directory: Path, own: Parts, experiment: Experiment
-) -> AbstractContextManager[ViewerCallback | None]:
+) -> "AbstractContextManager[ViewerCallback | None]":
     if watch == "off":
         return nullcontext()
+    from cprl.viewer.callback import ViewerCallback
+
     recipe = read_recipe(directory)
     shown = {name: recipe.get(name) for name in ("command", "started", "git", "versions")}
     return ViewerCallback(

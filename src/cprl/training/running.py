@@ -7,7 +7,7 @@ from dataclasses import asdict
 from datetime import datetime
 from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from cprl.arguments import callable_of, object_of, path, texts
 from cprl.checks import SWITCH, checked
@@ -58,10 +58,11 @@ from cprl.training.outcome import (
     title_of,
     write_evaluation,
 )
-from cprl.viewer.callback import ViewerCallback
-from cprl.viewer.lingering import check_linger
-from cprl.viewer.lingering import linger as stay_served
-from cprl.viewer.streams import check_watch
+from cprl.viewer.watching import check_linger, check_watch
+from cprl.viewer.watching import linger as stay_served
+
+if TYPE_CHECKING:
+    from cprl.viewer.callback import ViewerCallback
 
 
 class _Began:
@@ -232,7 +233,7 @@ def _train_and_evaluate(
     directory: Path,
     experiment: Experiment,
     own: Parts,
-    viewer: ViewerCallback | None,
+    viewer: "ViewerCallback | None",
     checkpointer: Checkpointer,
     began: _Began,
     times: RunTimes,
@@ -263,7 +264,7 @@ def _train(
     experiment: Experiment,
     own: Parts,
     *,
-    viewer: ViewerCallback | None,
+    viewer: "ViewerCallback | None",
     checkpointer: Checkpointer,
     began: _Began,
 ) -> tuple[Training, list[Episode] | None]:

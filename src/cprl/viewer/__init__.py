@@ -10,7 +10,7 @@ Modules, in the order in which one reads them:
     logger     RerunLogger: TorchRL's logger interface on a recording
     streams    to a file and served live, each of which may fail without harm
     page       the web viewer's page on 127.0.0.1, and recordings for it
-    lingering  a finished run stays served until Ctrl-C
+    watching   a finished run stays served until Ctrl-C
     scenery    what a recording shows, with names and colours
     institutions  lines and tabs of games with institutions
     panels     places in the viewer: several boards in one image, and plots that are not over time

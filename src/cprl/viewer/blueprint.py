@@ -11,6 +11,10 @@ A new tab is a function of `Curves` that returns a view or None, named in `_TABS
 from collections.abc import Callable
 from typing import Any, Final, Literal
 
+import rerun as rr
+import rerun.blueprint as rrb
+from rerun.blueprint.encodings import TimelineColumn
+
 from cprl.commons.colours import WINDOW_CAPTION
 from cprl.viewer import institutions
 from cprl.viewer.panels import BOUNDS, Panels, decision_panels, row
@@ -23,9 +27,7 @@ def fates(curves: Curves) -> Any:
         return None
     wall = _panels("All replicas; framed: died in its last episode", "wall", curves, curves.replicas)
     return row(
-        "Replicas",
-        wall if has_wall(curves) else None,
-        _drawn("Apples on the board, over the turn", "turn"),
+        "Replicas", wall if has_wall(curves) else None, _drawn("Apples on the board, over the turn", "turn")
     )
 
 
@@ -51,7 +53,6 @@ def _drawn(name: str, origin: str) -> Any:
 
 
 def _flat(name: str, origin: str, bounds: tuple[tuple[float, float], tuple[float, float]]) -> Any:
-    import rerun.blueprint as rrb
 
     visible = rrb.VisualBounds2D(x_range=bounds[0], y_range=bounds[1])
     return rrb.Spatial2DView(name=name, origin=f"/{origin}", background=BACKGROUND, visual_bounds=visible)
@@ -80,8 +81,6 @@ def layout(curves: Curves, *, live: bool = False, ended: bool = False) -> Any:
     Returns:
         A `rerun.blueprint.Blueprint`.
     """
-    import rerun.blueprint as rrb
-
     if isinstance(curves, Scene) and curves.is_replay:
         return _laid_out(_replay(curves), timeline="step", play_state="playing")
     strips = 3 if curves.has_phases and (ended or not live) else 1
@@ -104,8 +103,6 @@ def _laid_out(views: Any, *, timeline: str, play_state: Literal["playing", "foll
     The timeline of the time panel is the axis of every plot: episodes, and in a replay, which records all
     its steps, steps. Boards of a run are played back on `frame`, which counts recorded frames alone.
     """
-    import rerun.blueprint as rrb
-
     return rrb.Blueprint(
         views,
         rrb.BlueprintPanel(state="collapsed"),
@@ -117,8 +114,6 @@ def _laid_out(views: Any, *, timeline: str, play_state: Literal["playing", "foll
 def _replay(scene: Scene) -> Any:
     """A large board, the agents' windows, and the harvest and stock of one episode, turn by turn, and what
     institutions take and give."""
-    import rerun.blueprint as rrb
-
     paid = [*_of(scene.agents, institutions.PAID), *_of(scene.agents, institutions.GIVEN)]
     payments = (
         [_plot("Fined (down) and given (up) in the turn, apples", *paid)]
@@ -141,15 +136,12 @@ def _replay(scene: Scene) -> Any:
 
 
 def _header() -> Any:
-    import rerun.blueprint as rrb
 
     return rrb.TextDocumentView(name="Now", origin="/header", titlebar=False)
 
 
 def _top(curves: Curves, *, live: bool) -> Any:
     """The board, the agents' windows and the events side by side; without a board the events alone."""
-    import rerun.blueprint as rrb
-
     if not isinstance(curves, Scene):
         return _events()
     boards = _boards(live=live)
@@ -158,8 +150,6 @@ def _top(curves: Curves, *, live: bool) -> Any:
 
 def _boards(*, live: bool) -> Any:
     """The boards, in tabs if there are several: live, the present policy's and that of recorded frames."""
-    import rerun.blueprint as rrb
-
     if not live:
         return _world()
     present = rrb.Spatial2DView(name="Present policy", origin="/exhibition", background=BACKGROUND)
@@ -167,15 +157,12 @@ def _boards(*, live: bool) -> Any:
 
 
 def _world(name: str = "Board") -> Any:
-    import rerun.blueprint as rrb
 
     return rrb.Spatial2DView(name=name, origin="/world", background=BACKGROUND)
 
 
 def _windows(*, is_wide: bool = False, live: bool = False) -> Any:
     """The windows, with the caption that fits; live they are those of the recorded episode."""
-    import rerun.blueprint as rrb
-
     name = f"What agents see, {WINDOW_CAPTION}" if is_wide else "Windows: self blue, others red"
     if live:
         name = "Recorded: self blue, others red"
@@ -184,9 +171,6 @@ def _windows(*, is_wide: bool = False, live: bool = False) -> Any:
 
 def _events() -> Any:
     """The events, whose texts say when; the viewer's own column is so narrow that it cuts the numbers."""
-    import rerun.blueprint as rrb
-    from rerun.blueprint.encodings import TimelineColumn
-
     hidden = [TimelineColumn("step", visible=False)]
     columns = rrb.TextLogColumns(timeline_columns=hidden, text_log_columns=["Body"])
     return rrb.TextLogView(name="Events", origin="/log", columns=columns)
@@ -194,14 +178,11 @@ def _events() -> Any:
 
 def _strip() -> Any:
     """The live label, below it the phases found at the end and the published ones, as bands over episodes."""
-    import rerun.blueprint as rrb
-
     contents = ["+ /now", "+ /phase/**"]
     return rrb.StateTimelineView(name="Phases", contents=contents, time_view=_whole(), titlebar=False)
 
 
 def _plots(curves: Curves) -> Any:
-    import rerun.blueprint as rrb
 
     tabs = [tab for make in _TABS if (tab := make(curves)) is not None]
     tabs[2:2] = institutions.tabs(curves, _plot)
@@ -220,8 +201,6 @@ def _outcome(curves: Curves) -> Any:
 
 def _agents(curves: Curves) -> Any:
     """Each agent's return, time in play and who tagged whom."""
-    import rerun.blueprint as rrb
-
     unit = "apples" if "collective_return" in curves.metrics else "sum of rewards"
     tags = rrb.TensorView(name="Who tagged whom", origin="/tags")
     return row(
@@ -256,7 +235,6 @@ def _speed(curves: Curves) -> Any:
 
 
 def _recipe(curves: Curves | None = None) -> Any:
-    import rerun.blueprint as rrb
 
     return rrb.TextDocumentView(name="Recipe", origin="/recipe")
 
@@ -284,8 +262,6 @@ def _social(curves: Curves, name: str, metric: str, *, share: bool = False) -> A
 def _plot(name: str, *entities: str, share: bool = False) -> Any:
     """A plot over the whole run, without a legend, which would hide its lines: they are named where the
     pointer is, and `header` says which is which. The axis of a share is 0..1."""
-    import rerun.blueprint as rrb
-
     return rrb.TimeSeriesView(
         name=name,
         contents=[f"+ /{entity}" for entity in entities],
@@ -297,9 +273,6 @@ def _plot(name: str, *entities: str, share: bool = False) -> Any:
 
 def _whole() -> Any:
     """A time axis of the whole run; Rerun's default is a thousand steps around the cursor."""
-    import rerun as rr
-    import rerun.blueprint as rrb
-
     boundary = rrb.TimeRangeBoundary
     return rrb.TimeAxis(view_range=rr.TimeRange(start=boundary.infinite(), end=boundary.infinite()))
 

@@ -14,9 +14,6 @@ from rich.console import Console
 from tensordict import TensorDictBase
 from torchrl.envs import EnvBase
 
-from cprl.arguments import object_of
-from cprl.arguments import path as path_of
-from cprl.checks import NONE, TEXT, check_nesting, checked, count, either
 from cprl.envs.unwrap import agent_names, commons_of
 from cprl.measuring.episodes import Episode
 from cprl.measuring.recent import Recent
@@ -77,8 +74,6 @@ class Plots:
     with a running mean, all else as it is.
 
     Args:
-        logger: where they are logged.
-        curves: what is plotted.
         episodes: of the run; determines the window of running means.
     """
 
@@ -110,11 +105,9 @@ class Plots:
             self._logger.log_scalar(f"{RANDOM_PLAY}/{name}", mean)
 
     def state_dict(self) -> dict[str, Any]:
-        """The last values of each running mean."""
         return {name: recent.state_dict() for name, recent in self._recent.items()}
 
     def load_state_dict(self, state: Mapping[str, Any]) -> None:
-        """Continues from a state that `state_dict` returned."""
         for name, own in state.items():
             self._recent.setdefault(name, Recent(self.window)).load_state_dict(own)
 
@@ -126,12 +119,7 @@ OVER: Final = 5
 
 
 class Tags:
-    """Sums the tags of the last episodes, over all replicas.
-
-    Args:
-        logger: where the matrices are logged.
-        agents: the number of agents N.
-    """
+    """Sums the tags of the last episodes, over all replicas."""
 
     def __init__(self, logger: RerunLogger, agents: int) -> None:
         self._logger = logger
@@ -148,11 +136,9 @@ class Tags:
             self._last = [*self._last[1 - OVER :], np.zeros_like(self._last[0])]
 
     def state_dict(self) -> list[Any]:
-        """The matrices that are summed."""
         return [own.tolist() for own in self._last]
 
     def load_state_dict(self, state: list[Any]) -> None:
-        """Continues from a state that `state_dict` returned."""
         self._last = list(np.array(state, np.float64))
 
 
@@ -175,9 +161,7 @@ class ViewerCallback:
         run: the run's directory, where the recording is written. If there is one already, the new file is
             `run-2.rrd` and so on; the viewer shows them as one recording.
         env: a world for each replica, with transforms or without; the first is shown.
-        title: the title in the viewer.
         episodes: the number of episodes of the run; determines how often frames are recorded.
-        recipe: the recipe that the viewer shows.
         live: "serve" or "spawn", see `cprl.viewer.streams`; None for the file alone.
         exhibited: what is exhibited live: the present policy and one world for it, see
             `cprl.viewer.exhibition`.
@@ -200,12 +184,6 @@ class ViewerCallback:
         is_replay: bool = False,
         console: Console | None = None,
     ) -> None:
-        checked("title", title, TEXT)
-        object_of("recipe", recipe, Mapping | None, "a table, or None")
-        checked("episodes", episodes, count(1))
-        checked("file_name", file_name, either(TEXT, NONE))
-        check_nesting(recipe, "recipe")
-        run = path_of("run", run)
         self.env = env
         self._agents, reported = agent_names(env), reported_by(env)
         curves, commons = curves_of(env, self._agents, reported, episodes=episodes), commons_of(env)
@@ -368,7 +346,6 @@ class ViewerCallback:
         self.logger.flush()
 
     def state_dict(self) -> dict[str, Any]:
-        """The counters, events and pending numbers; frames are sent first."""
         self.flush()
         return {
             "step": self._step,
@@ -382,7 +359,6 @@ class ViewerCallback:
         }
 
     def load_state_dict(self, state: Mapping[str, Any]) -> None:
-        """Continues from a state that `state_dict` returned."""
         self._step = self._rate_step = int(state["step"])
         self._episode = int(state["episode"])
         self.filming.load_state_dict(state, episode=self._episode)
@@ -404,10 +380,7 @@ class ViewerCallback:
         return self
 
     def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        traceback: TracebackType | None,
+        self, kind: type[BaseException] | None, error: BaseException | None, traceback: TracebackType | None
     ) -> None:
         self._stop_notice()
         if self.exhibition is not None:

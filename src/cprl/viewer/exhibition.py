@@ -9,6 +9,8 @@ from threading import Event
 from typing import Any, Final, Protocol
 
 import numpy as np
+import pyarrow as pa
+import rerun as rr
 from numpy.typing import NDArray
 from tensordict import TensorDictBase
 from torchrl.envs import EnvBase, TransformedEnv
@@ -69,7 +71,6 @@ def ragged(form: Any, counts: NDArray[np.integer[Any]], values: NDArray[Any]) ->
 
 
 def _entries(form: Any, values: NDArray[Any]) -> Any:
-    import pyarrow as pa
 
     if values.ndim == 1:
         return pa.Array.from_buffers(form, len(values), [None, pa.py_buffer(values)])
@@ -82,7 +83,6 @@ def _entries(form: Any, values: NDArray[Any]) -> Any:
 
 
 def _listed(form: Any, ends: NDArray[np.int32], entries: Any) -> Any:
-    import pyarrow as pa
 
     return pa.Array.from_buffers(form, len(ends) - 1, [None, pa.py_buffer(ends)], children=[entries])
 
@@ -102,8 +102,6 @@ def send_fixed(recording: Any, *, scene: Scene) -> None:
     The format of the image is not among it, but in each frame: a viewer that gets it after a frame, for the
     first time or again, shows no board until the next frame.
     """
-    import rerun as rr
-
     picture = rr.SegmentationImage.from_fields(opacity=1.0, draw_order=-10.0)
     recording.log(_BOARD, _classes(len(scene.agents)), picture, static=True)
     low = scene.height + 2 * RIM_CELLS + _ROOM_CELLS
@@ -117,8 +115,6 @@ def send_fixed(recording: Any, *, scene: Scene) -> None:
 
 def _classes(agents: int) -> Any:
     """Names and colours of the classes on the exhibited board."""
-    import rerun as rr
-
     known = {kind: (class_name(kind), picture_colour(kind)) for kind in range(FIRST_AGENT + agents)}
     known[BEAM] = "beam", _lit(GROUND)
     known[_LIT_APPLE] = "apple under a beam", _lit(APPLE)
@@ -140,13 +136,9 @@ class LiveBoard:
     Whatever is done here in Python keeps the training from going on. So a frame is an image, with classes of
     their own for cells under a beam, and lines in one column; rows are made once for all frames, and Rerun's
     native part sends them. Squares of agents out of play have no labels, unlike in a recording.
-
-    Args:
-        scene: the contents of the board.
     """
 
     def __init__(self, scene: Scene) -> None:
-        import rerun as rr
 
         self._scene, agents = scene, len(scene.agents)
         hues = np.array([_packed(agent_colour(agent)) for agent in range(agents)], np.uint32)
@@ -175,25 +167,15 @@ class LiveBoard:
         self._forms = {kind.component.partition(":")[2]: (kind, form) for kind, form in kept.items()}
 
     def send(
-        self,
-        recording: Any,
-        *,
-        frames: Frames,
-        caption: str,
-        wait: Callable[[float], bool],
-        lasting_s: float,
+        self, recording: Any, *, frames: Frames, caption: str, wait: Callable[[float], bool], lasting_s: float
     ) -> None:
         """Sends frames one by one.
 
         Args:
-            recording: the stream.
             frames: of `FrameRecorder.take`, [T, ...].
-            caption: the text below the board.
             wait: waits so many seconds; returns whether to leave out the rest.
             lasting_s: seconds over which they are spread.
         """
-        import rerun as rr
-
         text = rr.Points2D.columns(labels=np.array([caption]))
         send_chunk(recording, "exhibition/caption", {}, components(text))
         rows = rows_made(_BOARD, self.columns(frames))
@@ -287,17 +269,11 @@ class Exhibition:
     training continues without it.
 
     Args:
-        policy: the agents.
         env: one world that no training or evaluation plays, with the transforms of the training.
         trained: the environment of the training; what its transforms learn is taken over.
-        scene: the contents of the board.
-        live: what viewers are sent.
         clock: seconds of wall time.
         wait: waits so many seconds between two frames, in the thread that sends them; returns whether to
             leave out the rest. By default until `close`.
-
-    Raises:
-        ValueError: for another number of worlds than one, or a game without a board.
     """
 
     def __init__(

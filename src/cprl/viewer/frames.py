@@ -48,9 +48,7 @@ class FrameBuffer:
     """A buffer of frames, allocated once: `add` copies a frame, `take` returns all frames.
 
     Args:
-        capacity: the largest number of frames.
         board: (H, W).
-        sites: the number of sites K.
         windows: (N, C, X, Y).
     """
 
@@ -109,9 +107,7 @@ class FrameRecorder:
     Windows show the observations of the `CommonsEnv` itself, without transforms.
 
     Args:
-        env: the environment without its transforms.
         episodes: the number of episodes of the run; determines how often frames are recorded.
-        scene: the contents of the board.
         capacity: the largest number of frames to keep; by default an episode, at most 5,000.
         has_windows: whether frames have the agents' windows; else these are empty.
     """
@@ -220,7 +216,6 @@ class Filming:
 
     Args:
         env: the environment without its transforms; None for no frames.
-        logger: where frames are logged.
         scene: the contents of the board; None for no frames.
         episodes: the number of episodes of the run; determines how often frames are recorded.
     """
@@ -269,11 +264,9 @@ class Filming:
             self._logger.log_frames(frames)
 
     def state_dict(self) -> dict[str, Any]:
-        """What is to be recorded, and the number of frames so far; those that wait are sent first."""
         self.send()
         return {"shows_next": self.shows_next, "frames": self._logger.frames}
 
     def load_state_dict(self, state: Mapping[str, Any], *, episode: int) -> None:
-        """Continues from these entries, in the episode that runs."""
         self.shows_next, self._logger.frames = bool(state["shows_next"]), int(state["frames"])
         self.choose(episode)

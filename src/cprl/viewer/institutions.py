@@ -3,6 +3,8 @@
 from collections.abc import Callable, Sequence
 from typing import Any, Final
 
+import rerun as rr
+
 from cprl.commons.colours import agent_colour
 from cprl.measuring.names import OF_INSTITUTIONS
 from cprl.measuring.series import OF_AGENTS
@@ -45,12 +47,7 @@ def has_institutions(curves: Curves) -> bool:
 
 
 def tabs(curves: Curves, plot: Plot) -> list[Any]:
-    """The tabs of a game with institutions: what each agent pays, gets and breaks; shares and decisions.
-
-    Args:
-        curves: what is plotted.
-        plot: makes a plot of a name and entities.
-    """
+    """The tabs of a game with institutions: what each agent pays, gets and breaks; shares and decisions."""
     if not has_institutions(curves):
         return []
     there = [name for name in OF_AGENTS if name in curves.institutions]
@@ -81,8 +78,6 @@ def _entities(names: Sequence[str], curves: Curves) -> list[str]:
 
 def lines(curves: Curves) -> dict[str, Any]:
     """The names, colours and widths of the lines, by entity; none for a game without institutions."""
-    import rerun as rr
-
     styles = {
         f"institutions/{name}": running(
             OF_INSTITUTIONS[name][0], COLOURS.get(name, _GREY), curves.replicas, alone=name in SHARES

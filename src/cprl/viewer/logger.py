@@ -9,15 +9,14 @@ from pathlib import Path
 from typing import Any, Final, TypeAlias
 
 import numpy as np
+import rerun as rr
 import torch
 from numpy.typing import NDArray
 from rich.console import Console
 from torch import Tensor
 from torchrl.record.loggers import Logger
 
-from cprl.arguments import object_of
-from cprl.arguments import path as path_of
-from cprl.checks import NONE, TEXT, check_nesting, checked, either, shown
+from cprl.checks import shown
 from cprl.runs.directory import FILE_NAME as RECIPE_FILE
 from cprl.runs.files import read_json
 from cprl.system.compat import send_chunk
@@ -112,18 +111,12 @@ def numbers_in(data: Any) -> NDArray[Any]:
 
 def histogram_of(numbers: NDArray[Any], *, bins: int) -> Any:
     """A `rerun.BarChart` of numbers, [n], in equal bins."""
-    import rerun as rr
-
     counts, edges = np.histogram(numbers, bins=bins)
     return rr.BarChart(counts, abscissa=(edges[:-1] + edges[1:]) / 2)
 
 
 def images_of(video: Tensor) -> NDArray[np.uint8]:
-    """The images of a video, uint8 [T, H, W, C].
-
-    Raises:
-        ValueError: for a video that is not [T, C, H, W] or [1, T, C, H, W].
-    """
+    """The images of a video, uint8 [T, H, W, C]."""
     clip = torch.as_tensor(video).cpu()
     clip = clip[0] if clip.ndim == 5 else clip
     if clip.ndim != 4:
@@ -134,8 +127,6 @@ def images_of(video: Tensor) -> NDArray[np.uint8]:
 
 def format_of(images: NDArray[np.uint8]) -> Any:
     """The `rerun.components.ImageFormat` of images, [T, H, W, C]."""
-    import rerun as rr
-
     return rr.components.ImageFormat(
         width=images.shape[2],
         height=images.shape[1],
@@ -152,8 +143,6 @@ Numbers: TypeAlias = "Sequence[int] | NDArray[np.integer[Any]]"
 
 def times(steps: Numbers, episodes: Numbers, frames: Numbers) -> list[Any]:
     """The timelines of each row."""
-    import rerun as rr
-
     return [
         rr.TimeColumn(name, sequence=np.asarray(numbers, np.int64))
         for name, numbers in zip(TIMELINES, (steps, episodes, frames), strict=True)
@@ -206,15 +195,11 @@ def send_text(recording: Any, name: str, text: str) -> None:
 
     A server sends it before the history, so who connects late never reads an old one as the present.
     """
-    import rerun as rr
-
     send_chunk(recording, name, {}, components(rr.TextDocument.columns(text=[text])))
 
 
 def _columns(values: Sequence[Any]) -> Any:
     """Markdown texts, or equally many numbers in each row."""
-    import rerun as rr
-
     if isinstance(values[0], str):
         return rr.TextDocument.columns(text=list(values))
     return rr.Scalars.columns(scalars=np.concatenate(values)).partition([len(own) for own in values])
@@ -235,14 +220,12 @@ class RerunLogger(Logger):
     one fails, the logger warns once, drops it and continues with the other.
 
     Args:
-        exp_name: the name that the viewer shows.
         log_dir: the run's directory, where the recording is written.
         scene: the contents of the board; needed to log frames.
         curves: the numbers that are plotted, if there is no scene, which has them too.
         live: "serve" or "spawn", see `cprl.viewer.streams.open_live`; None for the file alone. The recording
             and the page of the web viewer are served on 127.0.0.1 only.
         exhibits: whether viewers are sent an exhibition too, see `cprl.viewer.exhibition`.
-        file_name: the name of the recording.
         recording_id: the viewer shows files with the same id as one recording; by default a new id.
         console: the console for the addresses; by default standard output.
 
@@ -263,14 +246,6 @@ class RerunLogger(Logger):
         recording_id: str | None = None,
         console: Console | None = None,
     ) -> None:
-        checked("exp_name", exp_name, TEXT)
-        checked("file_name", file_name, TEXT)
-        checked("live", live, either(TEXT, NONE))
-        checked("recording_id", recording_id, either(TEXT, NONE))
-        object_of("scene", scene, Scene | None, "a Scene, or None")
-        object_of("curves", curves, Curves | None, "Curves, or None")
-        object_of("console", console, Console | None, "a Console of rich, or None")
-        log_dir = path_of("log_dir", log_dir)
         self.scene = scene
         self.curves = scene or curves or Curves(agents=())
         self.recording_id = recording_id or f"{exp_name}-{time.time_ns()}"
@@ -385,16 +360,12 @@ class RerunLogger(Logger):
 
     def log_states(self, name: str, states: Mapping[int, str], *, live_only: bool = False) -> None:
         """Logs states by the episode from which they hold; their step is the one set by `at`."""
-        import rerun as rr
-
         episodes = list(states)
         at = times([self._now[0]] * len(episodes), episodes, [self.frames] * len(episodes))
         self._send(name, at, rr.StateChange.columns(state=list(states.values())), live_only=live_only)
 
     def log_matrix(self, name: str, matrix: NDArray[Any], dims: Sequence[str]) -> None:
         """Logs a matrix of numbers, float32 [rows, columns], with the names of its two axes."""
-        import rerun as rr
-
         values = np.array(matrix, np.float32)  # a copy, because a viewer gets it later
         self.log_row(name, rr.Tensor(values, dim_names=list(dims)))
 
@@ -413,16 +384,11 @@ class RerunLogger(Logger):
 
     def log_text(self, text: str, level: str = "INFO") -> None:
         """Logs an event at the time set by `at`."""
-        import rerun as rr
-
         at = times([self._now[0]], [self._now[1]], [self.frames])
         self._send("log", at, rr.TextLog.columns(text=[text], level=[level]))
 
     def log_hparams(self, cfg: Any) -> None:
         """Logs a mapping, as a table, or a Markdown text, as the recipe of the run."""
-        import rerun as rr
-
-        check_nesting(cfg, "cfg")
         text = cfg if isinstance(cfg, str) else as_table(dict(cfg))
         self.log_static("recipe", rr.TextDocument(text, media_type=rr.MediaType.MARKDOWN))
 
@@ -432,8 +398,6 @@ class RerunLogger(Logger):
         Starts after the last image of an earlier clip with the same name, because TorchRL's recorders pass
         the number of the clip as its step.
         """
-        import rerun as rr
-
         images = images_of(video)
         first = max(self._now[0] if step is None else int(step), self._clips_end.get(name, 0))
         self._clips_end[name] = first + len(images)

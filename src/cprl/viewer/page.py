@@ -113,8 +113,6 @@ class LocalHandler(BaseHTTPRequestHandler):
         """Sends the headers of a file.
 
         Args:
-            kind: its type.
-            size: its bytes.
             may: what the browser lets it load, a Content-Security-Policy; None for anything.
         """
         self.send_response(200)
@@ -171,11 +169,7 @@ _ONE_AT_A_TIME: Final = Lock()
 
 
 def _viewer_file(name: str) -> tuple[str, mmap.mmap] | None:
-    """The type and the content of a file of the web viewer, read when it is first asked for; None of others.
-
-    Raises:
-        OSError, TimeoutError: as of `web_viewer`.
-    """
+    """The type and content of a file of the web viewer, read when it is first asked for; None of others."""
     if name not in _FILES:
         return None
     with _ONE_AT_A_TIME:
@@ -187,10 +181,6 @@ def web_viewer() -> Mapping[str, mmap.mmap]:
     """The files of the web viewer of the installed Rerun, by name, in a temporary file without a name.
 
     Rerun's command has them built in, and only hands them out as a server, which is started for a second.
-
-    Raises:
-        OSError: if it cannot be started, or the disk is full.
-        TimeoutError: if it does not answer in time.
     """
     port = free_port()
     command = [str(viewer_binary()), "--serve-web", "--bind", LOCALHOST, "--port", str(free_port())]
@@ -250,3 +240,18 @@ def has_display() -> bool:
     if not sys.platform.startswith("linux"):
         return True
     return bool(os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY"))
+
+
+def viewer() -> str:
+    """The command of Rerun's native viewer: the one next to this Python, if there is one, else that of the
+    shell, else that of the package, which is neither where packages are installed into a folder of their own.
+    """
+    beside = Path(sys.executable).with_name("rerun")
+    if beside.exists():
+        return str(beside)
+    return "rerun" if shutil.which("rerun") else str(viewer_binary())
+
+
+def to_watch(*recordings: Path) -> list[str]:
+    """Return the command line that opens recordings in the native viewer, whatever their names begin with."""
+    return [viewer(), *(f"./{path}" if str(path).startswith("-") else str(path) for path in recordings)]

@@ -5,6 +5,8 @@ from math import ceil
 from typing import Any, Final
 
 import numpy as np
+import rerun as rr
+import rerun.blueprint as rrb
 from numpy.typing import NDArray
 
 from cprl.commons.decoding import UNSEEN
@@ -21,7 +23,6 @@ def window_corners(
     """The top-left corner (row, col) of each agent's window in a mosaic with cells as large as possible.
 
     Args:
-        agents: the number of agents N.
         window: (X, Y).
         wide: the width of the viewer's area, divided by its height.
     """
@@ -73,7 +74,6 @@ class Panels:
     """The places of equal boards in one image.
 
     Args:
-        count: the number of boards.
         size: the rows and columns of a board, in pixels.
         columns: how many stand side by side; by default so many that they are as large as possible.
     """
@@ -110,8 +110,6 @@ class Panels:
 
     def labels(self) -> Any:
         """The points at which texts stand, as Rerun's static part of `Points2D`; their labels vary."""
-        import rerun as rr
-
         tops = self.corners[:, ::-1] + (self.size[1] / 2, 0.1 - self._label)
         return rr.Points2D.from_fields(
             positions=tops.astype(np.float32), radii=[0.0], colors=[(220, 220, 220)], show_labels=True
@@ -119,8 +117,6 @@ class Panels:
 
     def frames(self, colours: Sequence[tuple[int, int, int]] = ()) -> Any:
         """A frame around each board, as Rerun's static part of `Boxes2D`, without colours where they vary."""
-        import rerun as rr
-
         return rr.Boxes2D.from_fields(
             centers=(self.corners[:, ::-1] + np.array(self.size[::-1]) / 2).astype(np.float32),
             half_sizes=np.tile(np.array(self.size[::-1], np.float32) / 2, (len(self.corners), 1)),
@@ -138,8 +134,6 @@ def decision_panels(agents: int, actions: int, window: tuple[int, int]) -> Panel
 
 def row(name: str, *views: Any) -> Any:
     """The views that are there side by side, as a tab; None if there is none."""
-    import rerun.blueprint as rrb
-
     there = [view for view in views if view is not None]
     return rrb.Horizontal(*there, name=name) if there else None
 
@@ -154,13 +148,7 @@ _GREY, _FAINT, _TEXT = (120, 120, 120), (50, 52, 58), (200, 200, 200)
 
 
 class Axes:
-    """Two axes from 0 on, with their ticks; the view's name says what the vertical one is.
-
-    Args:
-        x: the name and unit of the horizontal axis.
-        x_end: the largest number on the horizontal axis.
-        y_end: the largest number on the vertical axis.
-    """
+    """Two axes from 0 on, with their ticks; the view's name says what the vertical one is."""
 
     def __init__(self, x: str, *, x_end: float, y_end: float) -> None:
         self.name = x
@@ -174,8 +162,6 @@ class Axes:
 
     def drawn(self) -> tuple[Any, Any]:
         """The axes with lines at their ticks, and the texts, as Rerun's archetypes."""
-        import rerun as rr
-
         ticks = [_ticks(float(end)) for end in self.ends]
         upright = [self.placed([tick, tick], [0, self.ends[1]]) for tick in ticks[0]]
         level = [self.placed([0, self.ends[0]], [tick, tick]) for tick in ticks[1]]

@@ -4,6 +4,7 @@ from collections.abc import Mapping, Sequence
 from typing import Any, Final
 
 import numpy as np
+import rerun as rr
 from numpy.typing import NDArray
 from tensordict import TensorDictBase
 from torch import nn
@@ -47,10 +48,6 @@ class Decisions:
     that have neither, scripted ones and those at random, say so.
 
     Args:
-        logger: of the replay, whose frames are all recorded.
-        policies: the agents.
-        actions: the names of the actions.
-        names: the names of the agents.
         window: (X, Y) of a window.
     """
 
@@ -96,8 +93,6 @@ class Decisions:
 
     def on_episode(self, episode: Episode, learning: Mapping[str, float]) -> None:
         """Sends the rows of the episode."""
-        import rerun as rr
-
         if not self._rows:
             return
         values, taken = (np.stack(part) for part in zip(*self._rows, strict=True))
@@ -148,8 +143,6 @@ class Decisions:
 
     def _fixed(self) -> dict[str, list[Any]]:
         """The form of the image, the classes of its bars, and the names of actions."""
-        import rerun as rr
-
         rows, columns = self._panels.shape
         kind = rr.ChannelDatatype.U16 if self._dtype is np.uint16 else rr.ChannelDatatype.U8
         form = rr.components.ImageFormat(width=columns, height=rows, channel_datatype=kind)
@@ -203,15 +196,9 @@ _RADIUS_CELLS: Final = 0.06
 class Offences:
     """Logs a white diamond around each agent in the frame of the turn in which it broke a rule, and lines of
     fines and transfers per turn; a callback of `cprl.training`.
-
-    Args:
-        logger: of the replay, whose frames are all recorded.
-        env: its world, without transforms.
-        names: the names of the agents.
     """
 
     def __init__(self, logger: RerunLogger, env: CommonsEnv, *, names: Sequence[str]) -> None:
-        import rerun as rr
 
         self._logger, self._env, self._names = logger, env, tuple(names)
         self._paid: list[NDArray[np.float64]] = []
@@ -241,8 +228,6 @@ class Offences:
 
     def on_episode(self, episode: Episode, learning: Mapping[str, float]) -> None:
         """Sends the rows of the episode."""
-        import rerun as rr
-
         turns, frames = len(self._paid), len(self._marked)
         if not frames:
             return

@@ -5,6 +5,7 @@ from dataclasses import dataclass
 from typing import Any, Final
 
 import numpy as np
+import rerun as rr
 from torchrl.envs import EnvBase
 
 from cprl.commons.colours import (
@@ -128,7 +129,6 @@ def window_classes(curves: Curves) -> Any:
 
 
 def _classes(curves: Curves, colour_of: Callable[[int], Colour]) -> Any:
-    import rerun as rr
 
     known = [
         rr.AnnotationInfo(id=kind, label=class_name(kind), color=colour_of(kind))
@@ -139,8 +139,6 @@ def _classes(curves: Curves, colour_of: Callable[[int], Colour]) -> Any:
 
 def lines(curves: Curves) -> dict[str, Any]:
     """The names, colours and widths of each plot's lines, by entity."""
-    import rerun as rr
-
     styles = {
         entity: running(name, colour, curves.replicas)
         for entity, (name, colour) in SOCIAL.items()
@@ -164,8 +162,6 @@ def lines(curves: Curves) -> dict[str, Any]:
 def running(name: str, colour: tuple[int, int, int], replicas: int, *, alone: bool = False) -> Any:
     """Thin, dark lines for each of several replicas, a faint one for their mean, and on top a bold one for
     its running mean; `alone` shows that one alone, where others share the plot."""
-    import rerun as rr
-
     singles = replicas if replicas > 1 else 0
     raw = name if replicas == 1 else f"{name}, mean"
     return rr.SeriesLines(
@@ -182,8 +178,6 @@ def _darker(colour: tuple[int, int, int], share: float) -> tuple[int, ...]:
 
 def state_colours(curves: Curves) -> dict[str, Any]:
     """The colours of live labels and phases, by entity."""
-    import rerun as rr
-
     packed = [red << 24 | green << 16 | blue << 8 | 255 for red, green, blue in STATES.values()]
     names = list(STATES)
     configuration = rr.StateConfiguration(values=names, labels=names, colors=np.array(packed, np.uint32))
@@ -204,14 +198,7 @@ _SHOWN: Final[Mapping[str, tuple[str, ...]]] = {
 
 
 def curves_of(env: EnvBase, agents: tuple[str, ...], reported: Sequence[str], *, episodes: int) -> Curves:
-    """The numbers of an environment that are plotted.
-
-    Args:
-        env: a world for each replica.
-        agents: their names.
-        reported: the optional entries that the game reports.
-        episodes: of the run.
-    """
+    """The numbers of an environment that are plotted."""
     metrics = available({**METRICS, "stock_left": FIELDS["stock_left"]}, reported)
     metrics += () if yield_of(env)["sustainable_yield"] is None else ("yield_share",)
     return Curves(

@@ -6,6 +6,7 @@ from functools import cache
 from typing import Any, Final
 
 import numpy as np
+import rerun as rr
 from numpy.typing import NDArray
 
 from cprl.commons.colours import APPLE, BEAM, FIRST_AGENT, GROUND, WALL, agent_colour, agent_mark
@@ -163,16 +164,12 @@ Frames = Mapping[str, NDArray[Any]]
 
 def image_form(size: tuple[int, int]) -> Any:
     """The format of an image of classes with so many rows and columns."""
-    import rerun as rr
-
     return rr.components.ImageFormat(width=size[1], height=size[0], channel_datatype=rr.ChannelDatatype.U8)
 
 
 def fixed(curves: Curves) -> dict[str, list[Any]]:
     """The static parts of a recording, by entity: names and colours of what it shows, and of a `Scene` also
     sizes of images and the agents' frames."""
-    import rerun as rr
-
     styles = lines(curves) | state_colours(curves)
     header = rr.TextDocument.from_fields(media_type=rr.MediaType.MARKDOWN)
     parts = {"/": [classes(curves)], **{entity: [own] for entity, own in styles.items()}, "header": [header]}
@@ -180,7 +177,6 @@ def fixed(curves: Curves) -> dict[str, list[Any]]:
 
 
 def _fixed_on_board(scene: Scene) -> dict[str, list[Any]]:
-    import rerun as rr
 
     form, image = image_form, rr.SegmentationImage.from_fields
     board = form((scene.height + 2 * RIM_CELLS, scene.width + 2 * RIM_CELLS))
@@ -216,13 +212,8 @@ def columns(scene: Scene, frames: Frames) -> dict[str, tuple[NDArray[np.intp], A
 
     Beams and the marks of agents out of play have rows only for the first frame and where they change.
     """
-    import rerun as rr
-
     everywhere = np.arange(len(frames["step"]))
-    shown = {
-        **board_columns(scene, frames),
-        "windows": (everywhere, _pictures(mosaic(frames["windows"]))),
-    }
+    shown = {**board_columns(scene, frames), "windows": (everywhere, _pictures(mosaic(frames["windows"])))}
     if scene.is_replay:
         stock = frames["stock"].sum(1, dtype=np.float64)
         shown["turn/stock"] = everywhere, rr.Scalars.columns(scalars=stock)
@@ -250,8 +241,6 @@ def board_columns(scene: Scene, frames: Frames) -> dict[str, tuple[NDArray[np.in
 
 def _pictures(images: Bytes) -> Any:
     """Images of classes, uint8 [T, rows, columns], as columns."""
-    import rerun as rr
-
     return rr.SegmentationImage.columns(buffer=images.reshape(len(images), -1))
 
 
@@ -284,8 +273,6 @@ def _with_rim(pictures: Bytes, kind: int) -> Bytes:
 
 def _lines(strokes: Strokes, frames: Frames) -> Any:
     """Lines of the agents in play."""
-    import rerun as rr
-
     lines, counts = strokes.placed(centres_of(frames), frames["heading"], frames["in_play"])
     return rr.LineStrips2D.columns(strips=lines).partition(counts)
 
@@ -295,8 +282,6 @@ def _out(frames: Frames) -> dict[str, tuple[NDArray[np.intp], Any]]:
 
     The squares have labels that name who tagged the agent; the viewer shows them on request.
     """
-    import rerun as rr
-
     out, by, alone = ~frames["in_play"], frames["tagged_by"], alone_of(frames)
     places = [np.where(out, frames[name], 0) for name in ("row", "col")]
     changed = _changes(np.concatenate([out, np.where(out, by, 0), alone, *places], 1))

@@ -78,9 +78,6 @@ class Header:
 
         Args:
             episode: its number, from 1 on.
-            label: of `cprl.measuring.now`.
-            mean: the running mean that the label judges.
-            random_play: the mean of random play, if it is known.
             died: boards that died early in the episode; None or NaN for a game that reports no stock.
         """
         beside = "" if random_play is None else f" (random play {_number(random_play)})"
@@ -110,7 +107,6 @@ class Header:
         """How to read the lines of plots.
 
         Args:
-            window: episodes of the bold lines' running mean.
             of_mean: episodes of the mean in the line above, if it has one.
         """
         one = "one episode's mean over replicas" if self.replicas > 1 else "one episode"
@@ -182,11 +178,9 @@ class EventDetector:
         return smoothed
 
     def state_dict(self) -> dict[str, Any]:
-        """The means and the best so far."""
         return {"means": [list(own) for own in self._means], "best": self._best}
 
     def load_state_dict(self, state: Mapping[str, Any]) -> None:
-        """Continues from a state that `state_dict` returned."""
         self._means = [list(own) for own in state["means"]]
         self._best = float(state["best"])
 
@@ -201,9 +195,6 @@ class Story:
     """Logs what people read first: where the run is, what the group does, and what came of it.
 
     Args:
-        logger: where it is logged.
-        curves: what is plotted.
-        episodes: of the run.
         window: episodes of the plots' running means, which the header names.
         game: the game, if it is one of cprl's; the published one has the study's phases beside those found.
     """
@@ -338,7 +329,6 @@ class Story:
         )
 
     def state_dict(self) -> dict[str, Any]:
-        """The label and the events so far."""
         return {
             "now": self._now.state_dict(),
             "ended": self._ended,
@@ -346,7 +336,6 @@ class Story:
         }
 
     def load_state_dict(self, state: Mapping[str, Any]) -> None:
-        """Continues from a state that `state_dict` returned."""
         if self._detector is not None and state["events"]:
             self._detector.load_state_dict(state["events"])
         self._now.load_state_dict(state["now"])

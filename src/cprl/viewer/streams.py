@@ -3,7 +3,6 @@
 import atexit
 import shutil
 import subprocess
-import sys
 import time
 import warnings
 from collections.abc import Callable, Iterator
@@ -15,10 +14,13 @@ from queue import Full, Queue
 from threading import Thread
 from typing import Any, Final, TypeAlias, TypeVar
 
+import rerun as rr
+
 from cprl import arguments
 from cprl.system.compat import end_recordings, keep_native
 from cprl.system.output import printed
-from cprl.viewer.page import LOCALHOST, Page, free_port, has_display, viewer_binary
+from cprl.viewer.page import LOCALHOST, Page, free_port, has_display, viewer
+from cprl.viewer.watching import SERVED
 
 T = TypeVar("T")
 
@@ -36,12 +38,7 @@ _ABANDONED: Final[list[object]] = []
 
 
 def within(seconds: float, what: Callable[[], T]) -> T:
-    """The result of a function, called in a thread that nothing waits for after the deadline.
-
-    Raises:
-        TimeoutError: if there is none after so many seconds; the thread goes on by itself.
-        Exception: what the function raises.
-    """
+    """The result of a function, called in a thread that nothing waits for after the deadline."""
     results: list[T] = []
     errors: list[Exception] = []
 
@@ -76,12 +73,7 @@ class Sender:
         return self._queue.qsize()
 
     def put(self, what: Callable[[], object] | None) -> None:
-        """Queues a call; waits at most `STALL_S`.
-
-        Raises:
-            TimeoutError: if the queue is full.
-            Exception: what an earlier call raised; the thread has then ended.
-        """
+        """Queues a call; waits at most `STALL_S`."""
         if self._error is not None:
             raise self._error
         try:
@@ -90,12 +82,7 @@ class Sender:
             raise TimeoutError(f"it has taken no data for {STALL_S:g} s and the queue is full") from None
 
     def close(self) -> None:
-        """Ends the thread when all calls are done; waits at most `CLOSE_S`.
-
-        Raises:
-            TimeoutError: if they are not done by then.
-            Exception: what a call raised.
-        """
+        """Ends the thread when all calls are done; waits at most `CLOSE_S`."""
         ends = time.monotonic() + CLOSE_S
         self.put(None)
         self._thread.join(max(0.0, ends - time.monotonic()))
@@ -129,7 +116,6 @@ def abandon(recording: object) -> None:
 @cache
 def exit_in_time() -> None:
     """Gives Rerun's own last flush, when the interpreter exits, a deadline; it has none of itself."""
-    import rerun as rr
 
     def shutdown() -> None:
         with suppress(TimeoutError):
@@ -160,8 +146,6 @@ class Stream:
     """One recording stream. If it fails, it warns once, and the run continues without it.
 
     Args:
-        name: the name in warnings.
-        recording: a `rerun.RecordingStream`.
         period_s: seconds between two batches of buffered numbers.
     """
 
@@ -307,21 +291,6 @@ EXHIBITION_MEMORY: Final = "1MB"
 NEEDED_BYTES: Final = 2_000_000
 """The free disk space needed to start a recording; its layout and static parts take a tenth."""
 
-_LIVE: Final = "serve", "spawn"
-
-
-def check_watch(watch: str, *, can_be_off: bool = True) -> None:
-    """Checks a recipe's `watch` before the run starts.
-
-    Args:
-        watch: "file", or live as well, see `open_live`; "off" for no recording.
-        can_be_off: whether "off" is allowed.
-
-    Raises:
-        ValueError: if the value is not allowed; names it and the allowed values.
-    """
-    arguments.choice("watch", watch, ("file", *(("off",) if can_be_off else ()), *_LIVE))
-
 
 @dataclass(frozen=True)
 class Live:
@@ -375,16 +344,10 @@ def open_live(
     Args:
         live: "serve": serves the recording on free ports of 127.0.0.1; viewers can connect at any time and
             get the history. "spawn": the same, and starts Rerun's native viewer.
-        recording_id: the id of the recording.
-        blueprint: its layout.
         period_s: seconds between two batches of buffered numbers.
-        application: the application id, `RUN` or `REPLAY`.
         exhibits: whether there is an exhibition.
-
-    Raises:
-        ValueError: if `live` is anything else.
     """
-    arguments.choice("live", live, _LIVE)
+    arguments.choice("live", live, SERVED)
     recording = _recording(application, recording_id)
     stream, *grpc = _serve("live view", recording, blueprint, period_s, SERVER_MEMORY)
     exhibition = None
@@ -400,8 +363,6 @@ def open_live(
 
 def _serve(name: str, recording: Any, blueprint: Any, period_s: float, memory: str) -> tuple[Stream, str]:
     """A stream served on a free port of 127.0.0.1, and its address."""
-    import rerun as rr
-
     exit_in_time()
     port = free_port()
     recording.set_sinks(
@@ -426,27 +387,11 @@ def _spawn(grpc: list[str]) -> None:
         _warn_of("viewer cannot be started", error)
 
 
-def viewer() -> str:
-    """The command of Rerun's native viewer: the one next to this Python, if there is one, else that of the
-    shell, else that of the package, which is neither where packages are installed into a folder of their own.
-    """
-    beside = Path(sys.executable).with_name("rerun")
-    if beside.exists():
-        return str(beside)
-    return "rerun" if shutil.which("rerun") else str(viewer_binary())
-
-
-def to_watch(*recordings: Path) -> list[str]:
-    """Return the command line that opens recordings in the native viewer, whatever their names begin with."""
-    return [viewer(), *(f"./{path}" if str(path).startswith("-") else str(path) for path in recordings)]
-
-
 def _warn_of(what: str, why: object) -> None:
     warnings.warn(f"the Rerun {what}: {why}; the run continues without it", RuntimeWarning, stacklevel=3)
 
 
 def _recording(application: str, recording_id: str, *, send_properties: bool = True) -> Any:
-    import rerun as rr
 
     recording = rr.RecordingStream(
         application,

@@ -10,6 +10,7 @@ from math import ceil, gcd
 from typing import Any, Final, TypeAlias
 
 import numpy as np
+import rerun as rr
 from numpy.typing import NDArray
 
 from cprl.commons.colours import GROUND, PALETTE, WALL, agent_colour
@@ -36,7 +37,6 @@ class Looks:
     training runs out of cold caches.
 
     Args:
-        env: the worlds.
         names: the arrays, by their names in `cprl.commons.world.Worlds`.
     """
 
@@ -85,14 +85,10 @@ class Wall:
     because no apple was left.
 
     Args:
-        env: the worlds, one for each replica R.
-        logger: where they are logged.
-        scene: the contents of a board.
         recorded_steps: the steps of the run whose frames are recorded, about; determines the stride.
     """
 
     def __init__(self, env: CommonsEnv, logger: RerunLogger, *, scene: Scene, recorded_steps: int) -> None:
-        import rerun as rr
 
         self._env, self._logger, self._scene = env, logger, scene
         self._panels = Panels(scene.replicas, (scene.height + 2, scene.width + 2))
@@ -143,20 +139,16 @@ class Wall:
         self._logger.do(partial(_send_rows, rows=rows), live_only=live_only)
 
     def state_dict(self) -> list[bool]:
-        """Whether each replica's last episode died; rows are sent first."""
         self.send()
         died: list[bool] = self._died.tolist()
         return died
 
     def load_state_dict(self, state: list[bool]) -> None:
-        """Continues from a state that `state_dict` returned."""
         self._died = np.array(state, np.bool_)
 
 
 def _send_rows(recording: Any, *, rows: list[_Row]) -> None:
     """Sends rows, for viewers in the thread that sends."""
-    import rerun as rr
-
     steps, episodes, frames, images, labels, outlines = zip(*rows, strict=True)
     at, replicas = timelines(times(steps, episodes, frames)), [len(labels[0])] * len(rows)
     parts = {
@@ -179,11 +171,6 @@ class Visits:
 
     The image has a map for each agent: hue the agent, brightness the time it spent on the cell while in play,
     by its square root, as a share of the longest time that any agent spent on one cell.
-
-    Args:
-        env: the worlds; the first is counted.
-        logger: where the maps are logged, as `visits`.
-        scene: the contents of the board.
     """
 
     def __init__(self, env: CommonsEnv, logger: RerunLogger, *, scene: Scene) -> None:
@@ -221,8 +208,6 @@ class Visits:
 
     def log(self) -> None:
         """Logs the maps at the logger's time, and counts from zero."""
-        import rerun as rr
-
         image = self._panels.joined(self.maps(), PALETTE[GROUND])
         self._logger.log_row("visits", rr.Image(image))
         first, last = self._logged + 1, max(self._ended, self._logged + 1)
@@ -244,12 +229,10 @@ class Visits:
         return whole.round().astype(np.uint8)
 
     def state_dict(self) -> dict[str, Any]:
-        """The counts [N x H x W], and the episodes ended and logged."""
         self._count()
         return {"counts": self._counts.tolist(), "ended": self._ended, "logged": self._logged}
 
     def load_state_dict(self, state: Mapping[str, Any]) -> None:
-        """Continues from a state that `state_dict` returned."""
         self._looks.take()
         self._counts[:] = state["counts"]
         self._ended, self._logged = int(state["ended"]), int(state["logged"])
@@ -264,10 +247,6 @@ _TEXT: Final = (200, 200, 200)
 class Turns:
     """Logs the apples on the board over the turns of each replica's last episode, grey where the board lived
     until the time was up, in the colour of a tragedy where it died.
-
-    Args:
-        env: the worlds, one for each replica R.
-        logger: where the lines are logged, as `turn/lines`.
     """
 
     def __init__(self, env: CommonsEnv, logger: RerunLogger) -> None:
@@ -281,9 +260,7 @@ class Turns:
         self._ended: list[list[tuple[float, float]]] = [[] for _ in range(replicas)]
         self._died = [False] * replicas
         self._axes = Axes(
-            "turn of the episode",
-            x_end=game.rules.episode_steps,
-            y_end=max(1, len(game.map.sites)),
+            "turn of the episode", x_end=game.rules.episode_steps, y_end=max(1, len(game.map.sites))
         )
         lines, texts = self._axes.drawn()
         logger.log_static("turn/axes", lines)
@@ -315,8 +292,6 @@ class Turns:
 
     def log(self) -> None:
         """Logs the lines at the logger's time."""
-        import rerun as rr
-
         shown = [replica for replica, line in enumerate(self._ended) if len(line) > 1]
         if not shown:
             return
@@ -329,12 +304,10 @@ class Turns:
         self._logger.log_row("turn/title", title)
 
     def state_dict(self) -> dict[str, Any]:
-        """The points of the running and of the last episodes."""
         self._place()
         return {"playing": self._playing.tolist(), "ended": self._ended, "died": self._died}
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
-        """Continues from a state that `state_dict` returned."""
         self._looks.take()
         self._playing[:] = state["playing"]
         self._ended = [[(turn, stock) for turn, stock in line] for line in state["ended"]]
@@ -367,10 +340,6 @@ class Lorenz:
 
     The mean is over episodes, so its Gini coefficient is 1 minus their mean equality; episodes without a
     harvest have no curve and are left out.
-
-    Args:
-        logger: where the curves are logged, as `lorenz`.
-        agents: the number of agents N.
     """
 
     def __init__(self, logger: RerunLogger, agents: int) -> None:
@@ -390,8 +359,6 @@ class Lorenz:
 
     def log(self, first: int, last: int) -> None:
         """Logs the curve of these episodes, counted from 1, at the logger's time, if any had a harvest."""
-        import rerun as rr
-
         taken = [self._sums.pop(episode) for episode in sorted(self._sums) if episode < last]
         if not taken:
             return
@@ -413,12 +380,10 @@ class Lorenz:
         self._logger.log_row("lorenz/title", title)
 
     def state_dict(self) -> dict[str, Any]:
-        """The sums of curves and their numbers, by episode, and the first curve."""
         sums = [[episode, *row.tolist()] for episode, row in self._sums.items()]
         return {"sums": sums, "first": self._first}
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
-        """Continues from a state that `state_dict` returned."""
         self._sums = {int(episode): np.array(row) for episode, *row in state["sums"]}
         first = state["first"]
         self._first = None if first is None else (list(first[0]), str(first[1]))
@@ -441,13 +406,7 @@ def institution_views(logger: RerunLogger, env: CommonsEnv | None) -> "Instituti
 
 
 class InstitutionViews:
-    """Logs what a recording shows of institutions besides the numbers of episodes; made for games with them.
-
-    Args:
-        logger: of the recording.
-        curves: what is plotted; a `Scene` if there is a board.
-        regions: of a game with `Boundaries`, see `regions_of`.
-    """
+    """Logs what a recording shows of institutions besides the numbers of episodes."""
 
     def __init__(self, logger: RerunLogger, curves: Curves, *, regions: Regions) -> None:
         self._logger, self._curves = logger, curves
@@ -493,8 +452,6 @@ def regions_of(env: CommonsEnv) -> Regions:
 
 def borders(regions: Regions) -> Any:
     """The borders of regions in the hue of their owner, or grey where several share one, as lines."""
-    import rerun as rr
-
     strips, colours = [], []
     for owners, cells in regions:
         found = _borders(cells)
@@ -536,9 +493,6 @@ class Views:
 
     Args:
         env: the worlds, one for each replica; None without boards.
-        logger: where the views are logged.
-        curves: what the game reports.
-        episodes: the number of episodes of the run.
         every: episodes from one with recorded frames to the next; 0 without frames.
     """
 
@@ -609,12 +563,10 @@ class Views:
         return {name: view for name, view in views.items() if view is not None}
 
     def state_dict(self) -> dict[str, Any]:
-        """What each view has added up."""
         views = {name: view.state_dict() for name, view in self._there().items()}
         return {"logged": self._logged, "ended": self._ended, **views}
 
     def load_state_dict(self, state: Mapping[str, Any]) -> None:
-        """Continues from a state that `state_dict` returned; views that it lacks begin anew."""
         self._logged = int(state["logged"])
         self._ended = int(state["ended"])
         for name, view in self._there().items():

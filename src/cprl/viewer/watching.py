@@ -1,25 +1,34 @@
-"""Lingering: a finished run's recording stays served until the process is asked to end."""
+"""How a run is watched: what its `watch` may say, and that a finished run stays served until Ctrl-C."""
 
 import signal
 from collections.abc import Callable
 from threading import Event, current_thread, main_thread
 from types import FrameType
-from typing import Final
+from typing import TYPE_CHECKING, Final
 
+from cprl import arguments
 from cprl.system.output import console
-from cprl.viewer.logger import RerunLogger
+
+if TYPE_CHECKING:
+    from cprl.viewer.logger import RerunLogger
 
 _SIGNALS: Final = (signal.SIGINT, signal.SIGTERM)
-_SERVED: Final = ("serve", "spawn")
+SERVED: Final = ("serve", "spawn")
+
+
+def check_watch(watch: str, *, can_be_off: bool = True) -> None:
+    """Checks a recipe's `watch` before the run starts.
+
+    Args:
+        watch: "file", or live as well, see `open_live`; "off" for no recording.
+        can_be_off: whether "off" is allowed.
+    """
+    arguments.choice("watch", watch, ("file", *(("off",) if can_be_off else ()), *SERVED))
 
 
 def check_linger(linger: bool, watch: str) -> None:
-    """Refuses to linger where nothing is served, before the run starts.
-
-    Raises:
-        ValueError: names what was asked for and what is allowed.
-    """
-    if linger and watch not in _SERVED:
+    """Refuses to linger where nothing is served, before the run starts."""
+    if linger and watch not in SERVED:
         raise ValueError(
             f'linger is True, but watch is "{watch}", which serves nothing; allowed: watch "serve" or "spawn"'
         )
@@ -27,12 +36,11 @@ def check_linger(linger: bool, watch: str) -> None:
         raise ValueError("linger is True in another thread than the main one, which alone gets signals")
 
 
-def linger(logger: RerunLogger, play_on: Callable[[Event], None] | None = None) -> None:
+def linger(logger: "RerunLogger", play_on: Callable[[Event], None] | None = None) -> None:
     """Says where the recording stays served, waits for Ctrl-C (SIGINT) or SIGTERM, and closes the recording;
     a second signal in the meantime changes nothing.
 
     Args:
-        logger: whose recording is served.
         play_on: called meanwhile; returns when the event is set, or when there is nothing to play.
     """
     if not logger.is_served:
