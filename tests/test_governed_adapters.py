@@ -171,10 +171,10 @@ def test_decisions_are_those_of_the_reset_in_pettingzoo_and_an_unnamed_agent_tak
     for decisions, rate in (({"agent_0": 2, "agent_2": 1}, 0.5), ({"agent_1": 2}, 0.0), ({}, 0.0)):
         adapter.reset(options={"decisions": decisions})
         adapter.step(dict.fromkeys(game.agent_names, 0))
-        assert adapter.world.payments.in_force.tolist() == [[rate]]
+        assert adapter.payments.in_force.tolist() == [[rate]]
     adapter.reset()
     adapter.step(dict.fromkeys(game.agent_names, 0))
-    assert adapter.world.payments.in_force.tolist() == [[0.0]]
+    assert adapter.payments.in_force.tolist() == [[0.0]]
 
 
 def test_the_lean_step_and_maybe_reset_equals_torchrls_own_and_keeps_decisions():

@@ -213,10 +213,10 @@ def test_wrong_decisions_of_a_reset_are_refused_and_the_episode_goes_on(decision
     adapter = parallel_env(EVERYTHING, 3)
     adapter.reset()
     adapter.step(dict.fromkeys(EVERYTHING.agent_names, 0))
-    before = adapter.world.batch.state()
+    before = adapter.batch.state()
     with pytest.raises(ValueError, match=message):
         adapter.reset(options={"decisions": decisions})
-    assert all(np.array_equal(before[name], array) for name, array in adapter.world.batch.state().items())
+    assert all(np.array_equal(before[name], array) for name, array in adapter.batch.state().items())
 
 
 def test_decisions_where_nothing_is_decided_are_refused():

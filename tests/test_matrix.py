@@ -270,7 +270,7 @@ def test_tables_that_no_game_can_pay_are_refused(payoffs, message):
 
 
 def test_a_chance_to_continue_needs_several_turns():
-    with pytest.raises(ValueError, match=r"MatrixGame.continue_prob is 0.5; allowed in a game of one turn"):
+    with pytest.raises(ValueError, match=r"MatrixGame.continue_prob is 0.5"):
         prisoners_dilemma(continue_prob=0.5)
 
 

@@ -12,7 +12,7 @@ Modules, in the order in which one reads them:
     recurrent_states  the states of recurrent networks where an episode begins
     state            the state of an environment and its transforms, for checkpoints
     pettingzoo_env   parallel_env and env, one world
-    gymnasium_env    one world of one agent
+    gymnasium_env    one world of one agent, played by the parallel_env
 """
 
 from cprl.envs.commons_env import CommonsEnv

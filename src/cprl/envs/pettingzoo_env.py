@@ -1,19 +1,27 @@
 """Adapters for PettingZoo: all agents at once (`parallel_env`), or one after the other (`env`)."""
 
-from collections.abc import Mapping
-from typing import Any, ClassVar
+from collections.abc import Mapping, Sequence
+from typing import Any, ClassVar, Final
 
 import numpy as np
 from gymnasium import spaces
+from numpy.typing import NDArray
 from pettingzoo import AECEnv, ParallelEnv
 from pettingzoo.utils import parallel_to_aec
 
 from cprl import arguments
 from cprl.checks import shown
+from cprl.commons.batch import Batch, Output, turn_of
 from cprl.commons.game import Game
-from cprl.commons.world import Bytes
-from cprl.envs.one_world import RENDER_FPS, RENDER_MODES, Observed, OneWorld
+from cprl.commons.picture import world_image
+from cprl.commons.world import Bytes, GovernedOutput
+from cprl.envs.drivers import drawn_seed
+from cprl.institutions.memory import Payments
 
+RENDER_MODES: Final = ("rgb_array",)
+RENDER_FPS: Final = 15
+
+Observed = NDArray[Any] | dict[str, NDArray[Any]]
 Infos = dict[str, dict[str, Any]]
 
 
@@ -30,9 +38,6 @@ class CommonsParallelEnv(ParallelEnv[str, Any, int]):
         seed: The seed of all random numbers, 0 to 2**64 - 1; `reset(seed=...)` restarts with another one.
             None draws one from torch's generator, another for each environment, as `CommonsEnv` does.
         render_mode: "rgb_array" or None.
-
-    Raises:
-        ValueError: If the seed or the render mode is not allowed.
     """
 
     metadata: ClassVar[dict[str, Any]] = {
@@ -43,27 +48,46 @@ class CommonsParallelEnv(ParallelEnv[str, Any, int]):
     }
 
     def __init__(self, game: Game, *, seed: int | None = None, render_mode: str | None = None) -> None:
-        arguments.object_of("game", game, Game, "a cprl.Game")
+        if render_mode is not None:
+            arguments.choice("render_mode", render_mode, RENDER_MODES)
         self.game, self.render_mode = game, render_mode
-        self.world = OneWorld(game, seed=seed, render_mode=render_mode)
+        self.batch = Batch(game, 1, seed=drawn_seed() if seed is None else seed)
+        self._show_in(self.batch.new_output())
+        self._decisions = np.zeros((1, game.agents), np.int64)
         self.possible_agents = list(game.agent_names)
         self.agents: list[str] = []
-        self.observation_spaces = {name: self.world.observation_space() for name in self.possible_agents}
+        self.observation_spaces = {name: self._observation_space() for name in self.possible_agents}
         self.action_spaces = {name: spaces.Discrete(len(game.actions)) for name in self.possible_agents}
         self.state_space = spaces.Box(0, 255, (3, game.map.height, game.map.width), np.uint8)
 
+    def __repr__(self) -> str:
+        return f"{type(self).__name__}({self.game!r})"
+
+    def _show_in(self, output: Output) -> None:
+        self._whole, self.output = output, turn_of(output)
+
+    @property
+    def payments(self) -> Payments | None:
+        """What institutions output in the last turn; None for a game without any."""
+        return self._whole.payments if isinstance(self._whole, GovernedOutput) else None
+
+    def _observation_space(self) -> spaces.Space[Any]:
+        """A Box of uint8 [C, X, Y]; with a scoreboard or stock gauge, a Dict with it as "observation"."""
+        game = self.game
+        seen = spaces.Box(0, game.observation_highest, game.observation_shape, np.uint8)
+        highest = {"scoreboard": game.rules.episode_steps, "stock_gauge": 1}
+        vectors: dict[str, spaces.Space[Any]] = {
+            name: spaces.Box(0, highest[name], (size,), np.float32) for name, size in game.spaces.vectors
+        }
+        return spaces.Dict({"observation": seen, **vectors}) if vectors else seen
+
     def observation_space(self, agent: str) -> spaces.Space[Any]:
         """A Box of uint8 [C, X, Y], or a Dict that holds it as "observation"; always the same object."""
-        arguments.choice("agent", agent, self.possible_agents)
         return self.observation_spaces[agent]
 
     def action_space(self, agent: str) -> spaces.Space[Any]:
         """A Discrete space, the indices of `Game.actions`; always the same object."""
-        arguments.choice("agent", agent, self.possible_agents)
         return self.action_spaces[agent]
-
-    def __repr__(self) -> str:
-        return f"{type(self).__name__}({self.game!r})"
 
     def reset(
         self, seed: int | None = None, options: dict[str, Any] | None = None
@@ -75,9 +99,25 @@ class CommonsParallelEnv(ParallelEnv[str, Any, int]):
             options: "decisions", a dict by agent, is what agents decide in this episode where institutions
                 ask them (`Game.decisions` options, the first one by default); others are ignored.
         """
-        self.world.begin(seed, (options or {}).get("decisions"))
+        decided = self._decided((options or {}).get("decisions") or {})
+        if seed is not None:
+            self.batch.set_seed(seed)
+        self._decisions = decided
+        self._show_in(self.batch.begin(self.batch.new_output()))
         self.agents = list(self.possible_agents)
         return self._observations(), self._infos()
+
+    def _decided(self, decisions: Any) -> NDArray[np.int64]:
+        """Decisions by name as int64 [1, N]; the first option of an agent that is not named."""
+        arguments.object_of("decisions", decisions, Mapping, "a dict of decisions by the names of agents")
+        options, decided = self.game.decisions, np.zeros((1, self.game.agents), np.int64)
+        if decisions and not options:
+            raise arguments.refusal("decisions", decisions, "None: agents decide nothing in this game")
+        for name, decision in decisions.items():
+            arguments.choice("the agent of a decision", name, self.possible_agents)
+            agent = self.possible_agents.index(name)
+            decided[0, agent] = arguments.integer(f"the decision of {name}", decision, 0, options - 1)
+        return decided
 
     def step(
         self, actions: dict[str, int]
@@ -88,38 +128,96 @@ class CommonsParallelEnv(ParallelEnv[str, Any, int]):
             ValueError: If an action is missing, superfluous, no integer or out of range, or the episode has
                 not begun or has ended; the world is unchanged.
         """
-        arguments.object_of("actions", actions, Mapping, "a dict with an action for each agent")
-        self.world.check_begun("the first step")
+        self._check_begun("the first step")
         if not self.agents:
             raise ValueError("the episode has ended; allowed: reset() before the next step")
         if set(actions) != set(self.agents):
             raise ValueError(f"actions has the agents {shown(list(actions))}; allowed: exactly {self.agents}")
-        self.world.play([actions[name] for name in self.agents])
-        rewards = {name: self.world.reward(i) for i, name in enumerate(self.agents)}
-        terminations = dict.fromkeys(self.agents, self.world.terminated)
-        truncations = dict.fromkeys(self.agents, self.world.truncated)
+        self.play([actions[name] for name in self.agents])
+        rewards = {name: self.reward(i) for i, name in enumerate(self.agents)}
+        terminations = dict.fromkeys(self.agents, self.terminated)
+        truncations = dict.fromkeys(self.agents, self.truncated)
         output = self._observations(), rewards, terminations, truncations, self._infos()
-        if self.world.terminated or self.world.truncated:
+        if self.terminated or self.truncated:
             self.agents = []
         return output
 
+    def play(self, actions: Sequence[Any]) -> None:
+        """Plays one turn with one action per agent, in their order; see `step`. An ended world stays as it
+        is."""
+        self._check_begun("the first step")
+        last = len(self.game.actions) - 1
+        row = [
+            arguments.integer(f"the action of {name}", action, 0, last)
+            for name, action in zip(self.possible_agents, actions, strict=True)
+        ]
+        output, decisions = self.batch.new_output(), self._decisions if self.game.decisions else None
+        self._show_in(self.batch.play_checked(np.array([row], np.int64), output, decisions))
+
+    def observation(self, agent: int) -> Observed:
+        """The observation of an agent, an element of its `observation_space`."""
+        seen = self.output.observation[0, agent]
+        vectors = {name: getattr(self.output, name)[0, agent] for name, _ in self.game.spaces.vectors}
+        return {"observation": seen, **vectors} if vectors else seen
+
+    def reward(self, agent: int) -> float:
+        """The reward of an agent in the last turn: its harvest, less fines and plus transfers."""
+        payments = self.payments
+        return float((self.output.harvest if payments is None else payments.reward)[0, agent])
+
+    def info(self, agent: int) -> dict[str, Any]:
+        """What `infos` holds of an agent after the last turn."""
+        output, payments = self.output, self.payments
+        info: dict[str, Any] = {
+            "harvest": float(output.harvest[0, agent]),
+            "in_play": bool(output.in_play[0, agent]),
+            "fired": bool(output.fired[0, agent]),
+            "tagged": bool(output.tagged_by[0, agent].any()),
+        }
+        if payments is not None:
+            info["fines"], info["transfers"] = (
+                float(paid[0, agent]) for paid in (payments.fines, payments.transfers)
+            )
+            info["violated"] = bool(payments.violated[0, agent])
+        return info
+
+    @property
+    def terminated(self) -> bool:
+        """Whether no apple is left and none can grow."""
+        return bool(self.output.terminated[0, 0])
+
+    @property
+    def truncated(self) -> bool:
+        """Whether the episode ran out of time."""
+        return bool(self.output.truncated[0, 0])
+
+    def _check_begun(self, what: str) -> None:
+        """Raise a ValueError where no episode has begun; `what` would be done in it."""
+        if not self.batch.has_begun:
+            raise ValueError(f"the episode has not begun; allowed: reset() before {what}")
+
     def state(self) -> Bytes:
         """The whole board in RGB: uint8 [3, H, W]."""
-        return self.world.state()
+        self._check_begun("state()")
+        board = self.game.palette[self.batch.boards(self.output)[0]]
+        return np.ascontiguousarray(board.transpose(2, 0, 1))
 
     def render(self) -> Bytes:
         """Return an image, uint8 [rows, columns, 3].
 
         Raises:
-            ValueError: If there is no render mode.
+            ValueError: If there is no render mode, or the episode has not begun.
         """
-        return self.world.render()
+        if self.render_mode is None:
+            raise ValueError('render_mode is None, so there is no render(); allowed: "rgb_array", when made')
+        self._check_begun("render()")
+        return world_image(self.game.map, self.batch.show(self.output))
 
     def _observations(self) -> dict[str, Observed]:
-        return {name: self.world.observation(i) for i, name in enumerate(self.agents)}
+        return {name: self.observation(i) for i, name in enumerate(self.agents)}
 
     def _infos(self) -> Infos:
-        return {name: self.world.info(i) for i, name in enumerate(self.agents)}
+        return {name: self.info(i) for i, name in enumerate(self.agents)}
 
 
 def parallel_env(
