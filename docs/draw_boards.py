@@ -5,10 +5,11 @@ python docs/draw_boards.py
 
 from pathlib import Path
 
+import numpy as np
 from matplotlib.image import imsave
 
-from cprl import Game, Rules, maps, presets
-from cprl.commons.picture import first_image
+from cprl import Map, maps, presets
+from cprl.commons.picture import board_image
 
 FOLDER = Path(__file__).parent / "boards"
 SMALL_CELL_PIXELS = 12
@@ -21,14 +22,19 @@ BY_RULE = {
 }
 
 
+def first_image(board: Map, cell_pixels: int = 24) -> np.ndarray:
+    """The board at the start of an episode, full of apples."""
+    full = np.ones(len(board.sites), np.uint8)
+    return board_image(board, full, *np.array(board.starts).T, cell_pixels=cell_pixels)
+
+
 def main() -> None:
     """Writes a PNG for each published board, and for some that are made by rule."""
     FOLDER.mkdir(exist_ok=True)
     for name in presets.BOARDS:
-        imsave(FOLDER / f"{name}.png", first_image(presets.game(name)))
+        imsave(FOLDER / f"{name}.png", first_image(presets.game(name).map))
     for name, board in BY_RULE.items():
-        image = first_image(Game(map=board, rules=Rules()), cell_pixels=SMALL_CELL_PIXELS)
-        imsave(FOLDER / f"{name}.png", image)
+        imsave(FOLDER / f"{name}.png", first_image(board, SMALL_CELL_PIXELS))
     for path in sorted(FOLDER.glob("*.png")):
         print(path)
 

@@ -31,7 +31,7 @@ RLLIB = [
 
 def game_of(env):
     """The seed and the number of the episode that a world plays: all that its chance depends on."""
-    world = env.world.batch.now
+    world = env.batch.now
     return int(world.seed[0, 0]), int(world.episode[0, 0])
 
 

@@ -11,12 +11,12 @@ from boards import random_actions
 from governed import EVERYTHING, random_decisions
 from gymnasium.utils.env_checker import check_env
 from pettingzoo.test import api_test, parallel_api_test, parallel_seed_test, seed_test
+from restorable import assert_restorable
 from torchrl.envs import EnvBase, ParallelEnv, RewardSum, SerialEnv, StepCounter, TransformedEnv
 from torchrl.envs.utils import check_env_specs
 
 from cprl import CommonsEnv, Game, Observation, Rules, keys, maps
 from cprl.envs import CommonsGymnasiumEnv, env, make_env, parallel_env
-from cprl.envs.state import check_restorable
 from cprl.institutions import COUNTS, Boundaries, Monitoring, Quota, Tax, Vote
 
 RICH = replace(
@@ -213,8 +213,8 @@ def test_a_reset_of_some_worlds_keeps_what_others_were_paid():
 
 
 def test_what_was_kept_is_restored_whole():
-    check_restorable(lambda: CommonsEnv(EVERYTHING, 3, seed=4))
-    check_restorable(lambda: make_env(RICH, worlds=2, seed=4, transforms=[StepCounter()]))
+    assert_restorable(lambda: CommonsEnv(EVERYTHING, 3, seed=4))
+    assert_restorable(lambda: make_env(RICH, worlds=2, seed=4, transforms=[StepCounter()]))
 
 
 def of_workers(kind, turns, decisions):

@@ -12,7 +12,7 @@ from torchrl.envs import StepCounter, TransformedEnv
 from torchrl.envs.utils import RandomPolicy
 
 from cprl import CommonsEnv, Game, Observation, Rules, maps
-from cprl.commons.institution_entries import KINDS
+from cprl.commons.institution_tables import KINDS
 from cprl.institutions import (
     COUNTS,
     Boundaries,

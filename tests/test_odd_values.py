@@ -6,14 +6,11 @@ from functools import partial
 import numpy as np
 import pytest
 import torch
-from tensordict import TensorDict
 
 from cprl import CommonsEnv, Game, Map, Observation, Rules, maps, presets
 from cprl.commons.batch import Batch
 from cprl.commons.near import neighbours
-from cprl.commons.picture import first_image
-from cprl.envs import CommonsGymnasiumEnv, make_env, parallel_env
-from cprl.envs.state import load_env_state
+from cprl.envs import CommonsGymnasiumEnv, parallel_env
 from cprl.evaluation import crossplay, scenarios_of
 from cprl.evaluation.film import film
 from cprl.measuring import phases, published, statistics
@@ -46,7 +43,6 @@ def with_regrowth(*probabilities):
         (lambda: BOARD(height=2.0), "Map.height is 2.0; allowed: an integer from 1"),
         (lambda: BOARD(width=10**6), "Map.width is 1000000; allowed: an integer from 1 to 10,000"),
         (lambda: BOARD(height=9999, width=9999), "Map has 9,999 x 9,999 = .*; allowed: at most 1,048,576"),
-        (lambda: maps.parse(3), "drawing is 3; allowed: text"),
         (lambda: maps.named([]), r"name is \[\]; allowed: single_basic"),
         (lambda: maps.random(9, 9, agents=1, density=0.5, seed=1.9), "seed is 1.9; allowed: "),
         (lambda: maps.random(9, 9, agents=1, density=NAN), "density is nan; allowed: "),
@@ -61,20 +57,11 @@ def with_regrowth(*probabilities):
         (lambda: presets.game("commons", variant=None), "variant is None; allowed: 'published'"),
         (lambda: Batch(GAME, 2, threads=10**6), "threads is 1000000; allowed: an integer from 1 to 1024"),
         (lambda: Batch(GAME, 2, first_world=-1), "first_world is -1; allowed: "),
-        (lambda: CommonsEnv(3), "game is 3; allowed: a cprl.Game"),
         (lambda: CommonsEnv(GAME, seed=1.9), r"seed is 1.9; allowed: an integer from 0 to 2\*\*64 - 1"),
         (lambda: CommonsEnv(GAME, seed=2**64), "seed is 18446744073709551616; allowed: "),
         (lambda: CommonsEnv(GAME, 0), "worlds is 0; allowed: an integer from 1"),
-        (lambda: CommonsEnv(GAME, 1.5), "worlds is 1.5; allowed: an integer from 1"),
         (lambda: CommonsEnv(GAME, device="x"), "device is 'x'; allowed: "),
-        (lambda: CommonsEnv(GAME, 2).load(3), "state is 3; allowed: "),
-        (lambda: load_env_state(CommonsEnv(GAME, 2), {}), r"state\['worlds'\] is None; allowed: a table"),
-        (lambda: make_env(3), "game is 3; allowed: a cprl.Game, or a game with"),
-        (lambda: make_env(GAME, transforms=[3]), "a transform is 3; allowed: a TorchRL transform"),
-        (lambda: parallel_env(3), "game is 3; allowed: a cprl.Game"),
-        (lambda: parallel_env(GAME).observation_space("x"), "agent is 'x'; allowed: agent_0"),
         (lambda: CommonsGymnasiumEnv(GAME).step(0), r"has not begun; allowed: reset\(\) before"),
-        (lambda: first_image(GAME, cell_pixels=9.5), "cell_pixels is 9.5; allowed: an integer from 8"),
         (lambda: scripted_lanes("gredy", GAME, seeds=[(0,)], agents=1), "policy is 'gredy'; allowed: random"),
         (lambda: ScriptedActor("greedy", 3, seeds=[(0,)], agents=1), "game is 3; allowed: a cprl.Game"),
         (lambda: random_lanes(7, seeds=[(0,)], agents=2), "1 seeds for 2 agents; allowed: "),
@@ -168,7 +155,7 @@ def test_a_reset_mask_of_another_form_is_refused():
     env = CommonsEnv(GAME, 2)
     env.reset()
     for mask in (torch.ones(2, 1, dtype=torch.int64), torch.ones(2, 3, dtype=torch.bool)):
-        with pytest.raises(ValueError, match=r'"_reset" is .*; allowed: bool \[2, 1\]'):
+        with pytest.raises(ValueError, match=r"which is .*; allowed: bool \[2\]"):
             env._begin(mask)
     assert env.worlds.now.episode.tolist() == [[0], [0]]
 
@@ -211,13 +198,6 @@ def test_actions_of_other_integers_play_the_same(dtype):
     action = torch.tensor([[3], [2]])
     exact, other = (stepped(CommonsEnv(GAME, 2, seed=0), own, "step") for own in (action, action.to(dtype)))
     assert torch.equal(exact["next", "agents", "observation"], other["next", "agents", "observation"])
-
-
-def test_batches_of_another_size_are_refused():
-    env = CommonsEnv(GAME, 2)
-    for wrong in (None, 3, TensorDict({}, [3])):
-        with pytest.raises(ValueError, match=r"tensordict is .*; allowed: a TensorDict"):
-            env.step(wrong)
 
 
 @pytest.mark.parametrize("action", [0.5, 1.0, "3", None, True, NAN, np.float32(1), np.ones(1, int), -1, 7])

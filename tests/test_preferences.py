@@ -9,13 +9,13 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 from matrix_game import MatrixGame, tit_for_tat
+from restorable import assert_restorable
 from torchrl.envs import TransformedEnv
 from torchrl.envs.utils import check_env_specs
 
 from cprl import CommonsEnv, Game, Rules, maps
 from cprl.envs import make_env, parallel_env
 from cprl.envs.state import (
-    check_restorable,
     env_state,
     load_env_state,
     load_transforms_state,
@@ -313,7 +313,7 @@ class TestAdapters:
             CommonsEnv(MEADOW, 2, seed=1), PreferenceTransform([AVERSE, "team", FAIR])
         )
         check_env_specs(make())
-        check_restorable(make)
+        assert_restorable(make)
         one, other = make(), make()
         carried = one.reset()
         for _ in range(9):

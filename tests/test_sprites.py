@@ -4,8 +4,7 @@ import numpy as np
 import pytest
 
 from cprl import maps
-from cprl.commons.picture import board_image
-from cprl.commons.sprites import BODY, INK, MARKED, agent_sprite, number_pixels
+from cprl.commons.picture import BODY, INK, MARKED, agent_sprite, board_image, number_pixels
 from cprl.viewer.stage import marks, numbers, numbers_and_headings
 
 

@@ -129,7 +129,6 @@ _MODULES: Final = {
     "crossplay": "cprl.evaluation",
     "evaluate_run": "cprl.evaluation",
     "load": "cprl.training.stored",
-    "maps": "cprl.commons",
     "recipe_main": "cprl.commands.recipe",
     "run": "cprl.training.running",
     "run_study": "cprl.studies",
@@ -145,6 +144,8 @@ def __getattr__(name: str) -> Any:
         return version("cprl")
     if name not in __all__:
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    if name == "maps":
+        return import_module("cprl.commons.maps")
     if name in _MODULES:
         return getattr(import_module(_MODULES[name]), name)
     return import_module(f"cprl.{name}")

@@ -25,15 +25,12 @@ In reading order:
     batch        Batch: B worlds, played a turn at a time
     playing      harvests: a whole episode in every world of a batch
     decoding     observations back to classes of cells
-    sprites      agents as they are drawn: number, heading and second mark
-    picture      an image of the board for people
+    picture      an image of the board for people, in which agents have number, heading and second mark
 
 Of games with institutions (`cprl.institutions`):
 
     yields               what a map can bear
-    institution_checks   that they fit each other and the game
-    institution_entries  which entries they show agents
-    institution_tables   institutions as lookup tables for the compiled rules
-    institution_views    what they add to observations, on one world
-    institution_turn     the order of a turn with institutions, on one world
+    institution_tables  that they fit each other and the game, which entries they show agents, and their
+                        lookup tables for the compiled rules
+    institution_turn    the order of a turn with institutions and what they add to observations, on one world
 """

@@ -83,7 +83,6 @@ class Batch:
         threads: int | None = None,
         driver: Driver | None = None,
     ) -> None:
-        arguments.object_of("game", game, Game, "a cprl.Game")
         worlds = arguments.integer("worlds", worlds, 1, 2**32)
         first_world = arguments.integer("first_world", first_world, 0, 2**32 - 1)
         if first_world + worlds > 2**32:

@@ -4,7 +4,6 @@ from typing import Final
 
 import numpy as np
 
-from cprl.arguments import object_of, refusal
 from cprl.commons.game import Game
 from cprl.commons.observation import classes_shown
 from cprl.commons.world import Bytes
@@ -22,14 +21,7 @@ def classes_seen(game: Game, windows: Bytes) -> Bytes:
 
     Returns:
         uint8 [T, N, X, Y].
-
-    Raises:
-        ValueError: If the observations are not of this game.
     """
-    object_of("game", game, Game, "a cprl.Game")
-    shape = game.observation_shape
-    if getattr(windows, "ndim", 0) != 5 or windows.shape[2:] != shape or windows.dtype != np.uint8:
-        raise refusal("windows", getattr(windows, "shape", windows), f"uint8 [T, N, {shape}]")
     windows = windows[:, :, : len(game.cell_channels)]
     if game.observation.encoding == "one_hot":
         shown = classes_shown(game.observation, agents=game.agents, hides=game.rules.walls_block_sight)

@@ -11,9 +11,12 @@ import numpy as np
 
 from cprl.arguments import object_of, objects
 from cprl.commons.colours import FIRST_AGENT, MAX_AGENTS_APART, class_colour
-from cprl.commons.institution_checks import check_institutions
-from cprl.commons.institution_entries import entries_shown, shows_places
-from cprl.commons.institution_tables import build_institution_tables
+from cprl.commons.institution_tables import (
+    build_institution_tables,
+    check_institutions,
+    entries_shown,
+    shows_places,
+)
 from cprl.commons.maps import Map
 from cprl.commons.observation import Observation, channel_names
 from cprl.commons.reach import why_out_of_reach
@@ -98,7 +101,7 @@ class Game:
     @property
     def channels(self) -> tuple[str, ...]:
         """The name of each channel of an observation: "red", "green", "blue", or the classes of cells, then
-        those of institutions, see `cprl.commons.institution_views`."""
+        those of institutions, see `cprl.commons.institution_turn`."""
         return *self.cell_channels, *self._institution_channels
 
     @property

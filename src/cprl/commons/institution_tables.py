@@ -1,16 +1,16 @@
-"""The institutions of a game as lookup tables for the compiled rules."""
+"""The institutions of a game: that they fit, what they show agents, and their lookup tables."""
 
 import math
 import warnings
-from collections.abc import Sequence
-from typing import Any
+from collections.abc import Callable, Sequence
+from typing import Any, Final
 
 import numpy as np
 
 from cprl.commons.chance import threshold
-from cprl.commons.institution_entries import entries_shown, shows_places
 from cprl.commons.maps import Map
 from cprl.commons.near import neighbours
+from cprl.commons.observation import Observation
 from cprl.commons.rules import Rules
 from cprl.commons.tables import Tables
 from cprl.commons.world import Bools, Ints
@@ -29,10 +29,13 @@ from cprl.institutions import (
     Tax,
     Vote,
 )
+from cprl.institutions import memory as shows
+from cprl.institutions.base import MOST_INSTITUTIONS
 from cprl.institutions.boundaries import OPEN
-from cprl.institutions.choice import Ballot, ballots, is_decided
+from cprl.institutions.choice import MOST_DECISIONS, Ballot, ballots, decision_options, is_decided
 from cprl.institutions.limits import ROUNDING
 from cprl.institutions.memory import InstitutionTables
+from cprl.institutions.monitoring import ELECTED
 
 
 def build_institution_tables(
@@ -275,3 +278,137 @@ def _firing_tables(
         "may_fire": _bools([not named or agent in named[0] for agent in range(agents)]),
         "fire_ballot": _ballot_called(voted, "who may fire"),
     }
+
+
+_ABOUT_PLACES: Final = (Boundaries, ClosedPatches)
+
+
+def shows_places(institutions: Sequence[Institution]) -> bool:
+    """Whether agents see where bites are forbidden."""
+    return any(isinstance(own, _ABOUT_PLACES) and own.observed for own in institutions)
+
+
+def entries_shown(institutions: Sequence[Institution], agents: int) -> list[tuple[int, int]]:
+    """(what, which one) of each entry that institutions show agents; see `cprl.institutions.showing`."""
+    entries: list[tuple[int, int]] = []
+    quotas, seasons, ballot = 0, 0, 0
+    for own in institutions:
+        if own.observed or isinstance(own, Vote):  # what is voted on has an "observed" of its own
+            entries += _SHOWN_BY[type(own)](own, quotas, seasons, ballot, agents)
+        quotas += isinstance(own, Quota) or (isinstance(own, Vote) and isinstance(own.on, Quota))
+        seasons += isinstance(own, ClosedSeason)
+        ballot += is_decided(own)
+    return entries
+
+
+_Entries = list[tuple[int, int]]
+
+
+def _shown_by_quota(own: Any, quotas: int, seasons: int, ballot: int, agents: int) -> _Entries:
+    return [(shows.QUOTA_LEFT, quotas), (shows.QUOTA_TIME, quotas)]
+
+
+def _shown_by_season(own: Any, quotas: int, seasons: int, ballot: int, agents: int) -> _Entries:
+    return [(shows.CLOSED, seasons), (shows.SEASON_TIME, seasons)]
+
+
+def _shown_by_vote(own: Any, quotas: int, seasons: int, ballot: int, agents: int) -> _Entries:
+    also = _shown_by_quota(own.on, quotas, seasons, ballot, agents) if isinstance(own.on, Quota) else []
+    return [*([(shows.IN_FORCE, ballot)] if own.observed else []), *(also if own.on.observed else [])]
+
+
+def _shown_by_monitoring(own: Any, quotas: int, seasons: int, ballot: int, agents: int) -> _Entries:
+    return [(shows.DETECTED, 0), *([(shows.IS_ELECTED, ballot)] if own.monitor == ELECTED else [])]
+
+
+_SHOWN_BY: Final[dict[type[Any], Callable[..., _Entries]]] = {
+    Boundaries: lambda *_: [],
+    ClosedPatches: lambda *_: [],
+    Quota: _shown_by_quota,
+    ClosedSeason: _shown_by_season,
+    Tax: lambda *_: [],
+    Levies: lambda *_: [],
+    Vote: _shown_by_vote,
+    Monitoring: _shown_by_monitoring,
+    GraduatedSanctions: lambda *_: [(shows.LEVEL, 0)],
+    Mediation: lambda *rest: [(shows.MARK, agent) for agent in range(rest[-1])],
+    Sanctioner: lambda *_: [(shows.MAY_FIRE, 0)],
+}
+
+KINDS: Final = tuple(_SHOWN_BY)
+"""All kinds of institutions that a game can have."""
+
+
+def check_institutions(institutions: tuple[Any, ...], board: Map, rules: Rules, form: Observation) -> None:
+    """Checks that institutions fit each other, the map, the rules and the observation.
+
+    Raises:
+        ValueError: If not; names the institution and says what is allowed.
+    """
+    if len(institutions) > MOST_INSTITUTIONS:
+        raise ValueError(
+            f"Game.institutions has {len(institutions)} entries; allowed: at most {MOST_INSTITUTIONS}"
+        )
+    for own in institutions:
+        kind = type(own)
+        if kind not in KINDS:
+            raise ValueError(
+                f"Game.institutions has a {kind.__name__}; allowed: "
+                f"{', '.join(known.__name__ for known in KINDS)}; an institution of your own is a "
+                "TorchRL transform, see docs/institutions.md"
+            )
+        of_kind = sum(type(other) is kind for other in institutions)
+        if kind.at_most is not None and of_kind > kind.at_most:
+            raise ValueError(
+                f"Game.institutions has {of_kind} of {kind.__name__}; allowed: at most {kind.at_most}"
+            )
+        own.check_board(agents=board.agents, height=board.height, width=board.width)
+        _check_observation(own, form)
+        needs_tags = isinstance(own, Sanctioner | Mediation) or (
+            isinstance(own, GraduatedSanctions) and own.on == "tags"
+        )
+        if needs_tags and not rules.may_fire:
+            raise ValueError(
+                f"Game.institutions has a {kind.__name__} and Rules.may_fire is False; allowed: a game in "
+                "which agents may fire"
+            )
+        _check_effect(own, institutions, rules)
+    options = decision_options(institutions, board.agents)
+    if options > MOST_DECISIONS:
+        raise ValueError(
+            f"Game.institutions lets agents choose from {options:,} options; allowed: at most "
+            f"{MOST_DECISIONS:,}"
+        )
+
+
+def _check_effect(own: Institution, institutions: tuple[Any, ...], rules: Rules) -> None:
+    """Refuses what pursues violations of rules where there is no rule that can be broken."""
+    if any(_can_be_broken(other) for other in institutions):
+        return
+    name, allowed = (
+        type(own).__name__,
+        "a Boundaries, Quota or the like with a fine, or a Mediation, beside it",
+    )
+    if isinstance(own, Monitoring) and own.cost == 0:
+        raise ValueError(f"{name} has no violation to detect; allowed: {allowed}, or a cost above 0")
+    if isinstance(own, GraduatedSanctions) and (own.on == "violations" or not rules.may_fire):
+        raise ValueError(f'{name} with on="{own.on}" has no offence to sanction; allowed: {allowed}')
+
+
+def _can_be_broken(own: Any) -> bool:
+    """Whether an institution is a rule that agents can break."""
+    own = own.on if isinstance(own, Vote) else own
+    if isinstance(own, Boundaries):
+        return own.bite_fine is not None or own.step_fine is not None
+    if isinstance(own, Quota | ClosedSeason | ClosedPatches):
+        return own.fine is not None
+    return isinstance(own, Mediation)
+
+
+def _check_observation(own: Institution, form: Observation) -> None:
+    lacking = [name for name in type(own).needs if own.observed and not getattr(form, name)]
+    if lacking:
+        raise ValueError(
+            f"{type(own).__name__}.observed is True and Observation.{lacking[0]} is False; allowed: "
+            f"Observation({lacking[0]}=True), or {type(own).__name__}(observed=False)"
+        )

@@ -1,6 +1,12 @@
 """The order of a turn of a game with institutions, on one world.
 
 The parts are those of `turn`; where institutions decide, this module asks their rules (`cprl.institutions`).
+
+Institutions add planes to agents' observations, after the channels of cells. A plane "forbidden" is 255 on
+the cells of the window where a bite of the agent would break a rule about places. Planes "institutions" hold
+what `cprl.institutions.showing` lists, in 0..255: with S entries, cell n of the planes, row by row, shows
+entry n modulo S. So a single entry fills a plane evenly, as is usual for numbers that convolutions read
+beside a board.
 """
 
 import numpy as np
@@ -8,7 +14,6 @@ import numpy as np
 from cprl.commons.apples import draw, find_sprouts, grow, remove_apple
 from cprl.commons.beam import count_hit, find_hits, take_out, take_out_of_play
 from cprl.commons.chance import BALLOT, DETECTION
-from cprl.commons.institution_views import draw_institutions
 from cprl.commons.moves import (
     act,
     cell_of,
@@ -27,12 +32,13 @@ from cprl.commons.turn import (
     refresh_output,
     write_state,
 )
-from cprl.commons.world import PLAYING, Actions, Scratch, StepOutput, Worlds
+from cprl.commons.world import PLAYING, Actions, Bytes, Scratch, StepOutput, Worlds
 from cprl.institutions.deciding import appoint, hold_ballot, is_due
 from cprl.institutions.limits import (
     add_to_patch,
     close_patches,
     count_patches,
+    is_known_forbidden,
     note_bite,
     note_step,
     open_windows,
@@ -49,6 +55,7 @@ from cprl.institutions.paying import (
     recover,
     time_out,
 )
+from cprl.institutions.showing import shown_entry
 
 
 def play_governed_turn(
@@ -270,3 +277,51 @@ def write_payments(
     for ballot in range(payments.in_force.shape[0]):
         payments.in_force[ballot] = memory.in_force[ballot]
         payments.ballots_due[ballot] = world.step[0] == 0 and is_due(rules, ballot, world.episode[0])
+
+
+HIGHEST = 255
+
+
+def is_shown_forbidden(
+    world: Worlds, memory: Memory, tables: Tables, rules: InstitutionTables, i: int, window_cell: int
+) -> bool:
+    """Whether agent i sees that a bite on a cell of its window would break a rule about places."""
+    own = 0 if tables.sees_all else cell_of(world.row[i], world.col[i], tables)
+    heading = world.heading[i]
+    if tables.walls_block_sight and not tables.in_sight[own, heading, window_cell]:
+        return False
+    cell = own + tables.window_cells[heading, window_cell]
+    return is_known_forbidden(memory, rules, i, cell, tables.site_at[cell])
+
+
+def draw_forbidden(
+    world: Worlds, memory: Memory, tables: Tables, rules: InstitutionTables, i: int, plane: Bytes
+) -> None:
+    """Draws where bites of agent i are forbidden; `plane`: uint8 [X * Y]."""
+    for n in range(plane.shape[0]):
+        plane[n] = HIGHEST if is_shown_forbidden(world, memory, tables, rules, i, n) else 0
+
+
+def draw_entries(memory: Memory, rules: InstitutionTables, i: int, turn: int, planes: Bytes) -> None:
+    """Writes the entries shown to agent i, each into every S-th cell; `planes`: uint8 [cells]."""
+    entries = rules.shown_kind.shape[0]
+    for entry in range(entries):
+        level = shown_entry(memory, rules, i, entry, turn)
+        value = int(HIGHEST * min(1.0, max(0.0, level)) + 0.5)
+        for n in range(entry, planes.shape[0], entries):
+            planes[n] = value
+
+
+def draw_institutions(
+    world: Worlds, memory: Memory, tables: Tables, rules: InstitutionTables, observation: Bytes
+) -> None:
+    """Writes what institutions show each agent; `observation`: uint8 [N, C, X, Y]."""
+    cells = tables.window_cells.shape[1]
+    for i in range(world.row.shape[0]):
+        planes = observation[i].reshape(-1)
+        first = cells * rules.first_plane
+        if rules.shows_places:
+            draw_forbidden(world, memory, tables, rules, i, planes[first : first + cells])
+            first += cells
+        if rules.shown_kind.shape[0] > 0:
+            draw_entries(memory, rules, i, world.step[0], planes[first:])

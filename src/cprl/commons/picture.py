@@ -1,16 +1,20 @@
-"""An image of the board for people: apples, walls, and agents in their hues with number and heading."""
+"""An image of the board for people: apples, walls, and agents in their hues with number, heading and mark.
 
-from typing import Any, Final
+Digits are paths on a grid of three by five points, so that a picture can fill them as pixels and the viewer
+can draw them as lines, neither with a font.
+"""
+
+from functools import cache
+from itertools import pairwise
+from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
 
-from cprl.arguments import floats, integer, object_of, refusal
-from cprl.commons.colours import APPLE, BEAM, GROUND, PALETTE, WALL, agent_colour
-from cprl.commons.game import Game
+from cprl.arguments import integer
+from cprl.commons.colours import APPLE, BEAM, GROUND, PALETTE, WALL, Colour, agent_colour, agent_mark
 from cprl.commons.maps import Map
-from cprl.commons.sprites import BODY, INK, INK_COLOUR, MARK_COLOUR, MARKED, agent_sprite
-from cprl.commons.world import ROW_STEP, Bools, Bytes, Ints, Shown
+from cprl.commons.world import Bools, Bytes, Ints, Shown
 from cprl.system.memory import check_memory
 
 LARGEST_CELL_PIXELS: Final = 1000
@@ -46,18 +50,10 @@ def board_image(
         uint8 [H * cell_pixels + 1, W * cell_pixels + 1, 3], RGB.
 
     Raises:
-        ValueError: If `cell_pixels` is no integer or below 8, or an array does not fit the map.
+        ValueError: If `cell_pixels` is out of range.
         MemoryError: If the image does not fit into memory.
     """
-    object_of("board", board, Map, "a cprl.Map")
     size = integer("cell_pixels", cell_pixels, 8, LARGEST_CELL_PIXELS)
-    stock = _numbers("stock", stock, (len(board.sites),), 1)
-    agents = floats("row", row).shape[:1]
-    row = _numbers("row", row, agents, board.height - 1)
-    col = _numbers("col", col, agents, board.width - 1)
-    heading = _numbers("heading", heading, agents, len(ROW_STEP) - 1)
-    in_play = None if in_play is None else _numbers("in_play", in_play, agents, 1)
-    beams = None if beams is None else _numbers("beams", beams, (board.height, board.width), 1)
     pixels = (board.height * size + 1) * (board.width * size + 1)
     check_memory(f"cell_pixels is {size}: the pixels", 3 * pixels, "fewer pixels")
     image = np.empty((board.height * size + 1, board.width * size + 1, 3), np.uint8)
@@ -91,26 +87,6 @@ def world_image(board: Map, shown: Shown, *, cell_pixels: int = 24) -> Bytes:
     )
 
 
-def first_image(game: Game, *, cell_pixels: int = 24) -> Bytes:
-    """An image of the board at the start of an episode; see `board_image`."""
-    object_of("game", game, Game, "a cprl.Game")
-    starts = np.array(game.map.starts, np.int32)
-    full = np.ones(len(game.map.sites), np.uint8)
-    return board_image(game.map, full, *starts.T, cell_pixels=cell_pixels)
-
-
-def _numbers(name: str, values: Any, shape: tuple[int, ...], highest: int) -> NDArray[Any]:
-    """An array of integers or bools of a shape, 0 to `highest`; raises a ValueError for anything else."""
-    try:
-        found = np.asarray(values)
-    except (TypeError, ValueError, RuntimeError):
-        found = np.empty(0, object)
-    fits = found.dtype.kind in "biu" and found.shape == shape and found.ndim > 0
-    if not fits or (found.astype(np.int64) < 0).any() or (found > highest).any():
-        raise refusal(name, values, f"integers {list(shape)} from 0 to {highest}")
-    return found
-
-
 def _fill(image: Bytes, r: int, c: int, size: int, inset: int, colour: tuple[int, int, int]) -> None:
     top, left = r * size + 1 + inset, c * size + 1 + inset
     image[top : (r + 1) * size - inset, left : (c + 1) * size - inset] = colour
@@ -122,3 +98,117 @@ def _draw_agent(image: Bytes, r: int, c: int, heading: int, size: int, agent: in
     cell = image[r * size + 1 : (r + 1) * size, c * size + 1 : (c + 1) * size]
     for part, colour in ((BODY, agent_colour(agent)), (INK, INK_COLOUR), (MARKED, MARK_COLOUR)):
         cell[sprite == part] = colour
+
+
+NOTHING, BODY, INK, MARKED = range(4)
+"""The parts of a sprite: around the agent, its hue, the number and triangle, the second mark."""
+
+INK_COLOUR: Final[Colour] = (16, 18, 22)
+MARK_COLOUR: Final[Colour] = (255, 255, 255)
+
+DIGIT_HIGH, DIGIT_WIDE = 5, 3
+_DIGIT_APART: Final = DIGIT_WIDE + 1
+_PATHS: Final = (
+    ((0, 0), (2, 0), (2, 4), (0, 4), (0, 0)),
+    ((0, 0), (1, 0), (1, 4), (0, 4), (2, 4)),
+    ((0, 0), (2, 0), (2, 2), (0, 2), (0, 4), (2, 4)),
+    ((0, 0), (2, 0), (2, 2), (1, 2), (2, 2), (2, 4), (0, 4)),
+    ((0, 0), (0, 2), (2, 2), (2, 0), (2, 4)),
+    ((2, 0), (0, 0), (0, 2), (2, 2), (2, 4), (0, 4)),
+    ((2, 0), (0, 0), (0, 4), (2, 4), (2, 2), (0, 2)),
+    ((0, 0), (2, 0), (2, 4)),
+    ((0, 2), (0, 0), (2, 0), (2, 4), (0, 4), (0, 2), (2, 2)),
+    ((2, 2), (0, 2), (0, 0), (2, 0), (2, 4), (0, 4)),
+)
+"""The path of each digit: its corners (column, row), joined by upright and level lines."""
+POINTS: Final = max(map(len, _PATHS))
+"""The corners of the longest path; shorter paths repeat their last corner."""
+
+
+def number_paths(number: int) -> NDArray[np.float32]:
+    """The paths of a number's digits around (0, 0), in points of the grid.
+
+    Returns:
+        float32 [digits, POINTS, 2], column and row of each corner.
+    """
+    digits = str(number)
+    paths = np.empty((len(digits), POINTS, 2), np.float32)
+    for place, digit in enumerate(digits):
+        path = np.array(_PATHS[int(digit)])
+        paths[place, : len(path)], paths[place, len(path) :] = path, path[-1]
+        paths[place, :, 0] += place * _DIGIT_APART
+    wide = _DIGIT_APART * len(digits) - 1
+    return paths - np.array([(wide - 1) / 2, (DIGIT_HIGH - 1) / 2], np.float32)
+
+
+def number_pixels(number: int) -> NDArray[np.bool_]:
+    """A number as pixels: bool [5, 4 * digits - 1]."""
+    digits = str(number)
+    pixels = np.zeros((DIGIT_HIGH, _DIGIT_APART * len(digits) - 1), np.bool_)
+    for place, digit in enumerate(digits):
+        path, left = _PATHS[int(digit)], place * _DIGIT_APART
+        for (col, row), (next_col, next_row) in pairwise(path):
+            (top, bottom), (first, last) = sorted((row, next_row)), sorted((col, next_col))
+            pixels[top : bottom + 1, left + first : left + last + 1] = True
+    return pixels
+
+
+@cache
+def agent_sprite(agent: int, heading: int, size: int) -> NDArray[np.uint8]:
+    """An agent in a cell: uint8 [size, size], `NOTHING`, `BODY`, `INK` or `MARKED`.
+
+    A number too large for the cell is left out; from eleven pixels on, numbers below 100 fit.
+
+    Args:
+        agent: its index.
+        heading: 0 up, 1 right, 2 down, 3 left.
+        size: The size of a cell in pixels, without lines between cells.
+    """
+    mark = agent_mark(agent)
+    edge = 1 if size > 14 else 0
+    body = size - 2 * edge
+    mark_wide, deep = max(1, body // 10), max(1, body // 5)
+    rim = mark_wide if mark == "ring" else 0
+    tip = rim + edge
+    sprite = np.full((body, body), BODY, np.uint8)
+    _draw_mark(sprite, mark, mark_wide)
+    for row in range(deep):
+        sprite[tip + row, body // 2 - row : (body + 1) // 2 + row] = INK
+    sprite = np.rot90(sprite, -heading).copy()
+    back = mark_wide if mark in ("ring", "stripe") else edge
+    _draw_number(sprite, agent, heading, front=tip + deep, back=back, side=rim)
+    whole = np.pad(sprite, edge, constant_values=NOTHING)
+    whole.flags.writeable = False
+    return whole
+
+
+def _draw_mark(sprite: NDArray[np.uint8], mark: str, wide: int) -> None:
+    """Draws the mark of an agent that is headed up."""
+    if mark == "ring":
+        sprite[:wide] = sprite[-wide:] = sprite[:, :wide] = sprite[:, -wide:] = MARKED
+    elif mark == "stripe":
+        sprite[-wide:] = MARKED
+    elif mark == "corners":
+        for rows in (slice(2 * wide), slice(-2 * wide, None)):
+            sprite[rows, : 2 * wide] = sprite[rows, -2 * wide :] = MARKED
+
+
+def _draw_number(
+    sprite: NDArray[np.uint8], agent: int, heading: int, *, front: int, back: int, side: int
+) -> None:
+    """Draws the number as large as it fits behind the triangle, whatever the heading."""
+    pixels = number_pixels(agent)
+    body = len(sprite)
+    deep, broad = body - front - back, body - 2 * side
+    scale = min(deep - (len(pixels) == max(pixels.shape)), broad) // max(pixels.shape)
+    if scale < 1:
+        return
+    pixels = pixels.repeat(scale, 0).repeat(scale, 1)
+    behind = (front + 1 - back) // 2
+    down, right = ((1, 0), (0, -1), (-1, 0), (0, 1))[heading]
+    shift_down, shift_right = behind * down, behind * right
+    top = (body - pixels.shape[0]) // 2 + shift_down
+    left = (body - pixels.shape[1]) // 2 + shift_right
+    top = min(max(top, 0), body - pixels.shape[0])
+    left = min(max(left, 0), body - pixels.shape[1])
+    sprite[top : top + pixels.shape[0], left : left + pixels.shape[1]][pixels] = INK

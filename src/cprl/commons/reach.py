@@ -3,8 +3,7 @@
 from collections.abc import Iterable, Sequence
 from collections.abc import Set as AbstractSet
 
-from cprl.commons.maps import Map
-from cprl.commons.maps.board import Cell
+from cprl.commons.maps import Cell, Map
 from cprl.commons.world import COL_STEP, ROW_STEP
 from cprl.institutions import Boundaries, Institution
 from cprl.institutions.boundaries import OPEN

@@ -6,7 +6,7 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
-from cprl.arguments import array, object_of
+from cprl.arguments import array
 from cprl.checks import shown
 from cprl.commons.game import Game
 from cprl.commons.world import COL_STEP, PLAYING, ROW_STEP, TRUNCATED, Worlds, empty_worlds
@@ -49,7 +49,6 @@ def checked(state: Mapping[str, Any], *, worlds: int, game: Game) -> State:
     if game.institutions:
         memory = empty_memory(game.governed_tables.institutions, worlds=worlds)
         expected |= {name: getattr(memory, name) for name in REMEMBERED}
-    object_of("state", state, Mapping, f"a table of arrays by the names {sorted(expected)}")
     if set(state) != set(expected):
         missing = sorted(set(expected) - set(state))
         unknown = sorted(map(str, set(state) - set(expected)))

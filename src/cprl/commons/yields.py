@@ -3,7 +3,6 @@
 import numpy as np
 from numpy.typing import NDArray
 
-from cprl import arguments
 from cprl.commons.maps import Map
 from cprl.commons.near import neighbours
 from cprl.commons.rules import Rules
@@ -25,12 +24,7 @@ def sustainable_yield(board: Map, rules: Rules) -> float:
 
     Returns:
         Apples per turn of all agents together; 0 where nothing grows.
-
-    Raises:
-        ValueError: for anything else.
     """
-    arguments.object_of("board", board, Map, "a Map")
-    arguments.object_of("rules", rules, Rules, "Rules")
     first, near = neighbours(board, rules)
     probs = np.array(rules.regrow_prob)
     most = int(np.diff(first).max())

@@ -3,11 +3,9 @@
 Modules, in the order in which one reads them:
     make_env         make_env, the one place where an environment is assembled; spaces_of
     commons_env      CommonsEnv, TorchRL: B worlds at once
-    commons_specs    what it takes and gives
     stage_games      what games share in which all act at once: specs, clock, memory, steps
     matrix           MatrixGame, MatrixEnv: payoff tables, played once or several times
     taking           TakingGame, TakingEnv: how much to take of what is shared, once or several times
-    rendering        images of the worlds, for `CommonsEnv.render`
     drivers          where the worlds run: CPU threads or a GPU
     recurrent_states  the states of recurrent networks where an episode begins
     state            the state of an environment and its transforms, for checkpoints

@@ -9,18 +9,21 @@ import torch
 from numpy.typing import NDArray
 from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
+from torchrl.data import Bounded, Categorical, Composite, Unbounded
 
 from cprl import arguments, keys
-from cprl.checks import shown
 from cprl.commons.batch import Batch, Output, output_of, turn_of
 from cprl.commons.game import Game, output_forms
+from cprl.commons.picture import world_image
 from cprl.commons.world import PLAYING, Bytes, StepOutput
-from cprl.envs.commons_specs import DONE_ENTRIES, WORLD_ENTRIES, specs_of
 from cprl.envs.drivers import device_of, drawn_seed, driver_for
 from cprl.envs.recurrent_states import begin_states
-from cprl.envs.rendering import images
-from cprl.system.compat import LeanStepEnv, put_all, unchecked_tensordict
+from cprl.institutions import COUNTS
+from cprl.system.compat import LeanStepEnv, flag_spec, put_all, unchecked_tensordict
+from cprl.system.memory import check_memory
 
+WORLD_ENTRIES = ("stock", "regrown")
+DONE_ENTRIES = ("done", "terminated", "truncated")
 _AGENT_ENTRIES = ("observation", "harvest", "in_play", "fired", "hit_by", "tagged_by")
 _WHOLE_NUMBERS = (torch.int64, torch.int32, torch.int16, torch.int8, torch.uint8)
 """The dtypes of actions that convert to int64 without a change of any number."""
@@ -55,10 +58,10 @@ class CommonsEnv(LeanStepEnv):
         state: whether outputs include the whole board as "state", uint8 [B, 3, H, W].
 
     Raises:
-        ValueError: if an argument is not allowed, and, in `step`, for actions that are missing, unknown or
-            of another form (int64 [B, N]; other integers are converted); then nothing changes.
+        ValueError: if a number is out of range, for the device "cuda" if torch or Numba finds no GPU, and, in
+            `step`, for actions that are missing, unknown or of another form (int64 [B, N]; other integers are
+            converted); then nothing changes.
         MemoryError: if the worlds do not fit into memory.
-        ValueError: for the device "cuda" if torch or Numba finds no GPU.
     """
 
     batch_locked = True
@@ -74,12 +77,7 @@ class CommonsEnv(LeanStepEnv):
         first_world: int = 0,
         state: bool = False,
     ) -> None:
-        arguments.object_of("game", game, Game, "a cprl.Game; `cprl.envs.make_env` plays other games")
-        worlds = arguments.integer("worlds", worlds, 1, 2**32)
-        arguments.switch("state", state)
         device = device_of(device)
-        if seed is not None:
-            arguments.seed(seed)
         driver, as_array = driver_for(game, worlds, device, threads)
         super().__init__(device=device, batch_size=torch.Size([worlds]))
         self.game, self._as_array = game, as_array
@@ -105,9 +103,49 @@ class CommonsEnv(LeanStepEnv):
         self.output: StepOutput
         self._whole: Output
         self._show_in(*self._fresh())
-        specs = specs_of(game, worlds, state=state)
-        self.action_spec, self.observation_spec = specs.action, specs.observation
-        self.reward_spec, self.done_spec = specs.reward, specs.done
+        self._make_specs()
+
+    def _make_specs(self) -> None:
+        game, worlds, per_agent = self.game, self._size, (self._size, self.game.agents)
+
+        def group(**specs: Any) -> Composite:
+            return Composite(agents=Composite(**specs, shape=per_agent), shape=(worlds,))
+
+        self.action_spec = group(
+            action=Categorical(len(game.actions), shape=per_agent, dtype=torch.int64),
+            **({"decision": Categorical(game.decisions, shape=per_agent)} if self._decides else {}),
+        )
+        observation = group(
+            observation=Bounded(
+                0, game.observation_highest, shape=(*per_agent, *game.observation_shape), dtype=torch.uint8
+            ),
+            harvest=Bounded(0, 1, shape=per_agent, dtype=torch.float32),
+            in_play=flag_spec(*per_agent),
+            fired=flag_spec(*per_agent),
+            hit_by=flag_spec(*per_agent, game.agents),
+            tagged_by=flag_spec(*per_agent, game.agents),
+        )
+        highest = {"scoreboard": float(game.rules.episode_steps), "stock_gauge": 1.0}
+        for name, size in game.spaces.vectors:
+            vector = Bounded(0, highest[name], shape=(*per_agent, size), dtype=torch.float32)
+            observation[keys.AGENTS, name] = vector
+        if self._is_governed:
+            for key in (keys.FINES, keys.TRANSFERS):
+                observation[key] = Unbounded(shape=per_agent, dtype=torch.float32)
+            observation[keys.VIOLATED] = flag_spec(*per_agent)
+            observation[keys.COUNTS] = Unbounded(shape=(*per_agent, len(COUNTS)), dtype=torch.int32)
+        if game.ballots:
+            of_ballots = worlds, len(game.ballots)
+            observation[keys.IN_FORCE] = Unbounded(shape=of_ballots, dtype=torch.float32)
+            observation[keys.BALLOTS_DUE] = flag_spec(*of_ballots)
+        for name in WORLD_ENTRIES:
+            observation[name] = Bounded(0, len(game.map.sites), shape=(worlds, 1), dtype=torch.int64)
+        if self._with_state:
+            board = worlds, 3, game.map.height, game.map.width
+            observation[keys.STATE] = Bounded(0, 255, shape=board, dtype=torch.uint8)
+        self.observation_spec = observation
+        self.reward_spec = group(reward=Unbounded(shape=(*per_agent, 1), dtype=torch.float32))
+        self.done_spec = Composite({name: flag_spec(worlds, 1) for name in DONE_ENTRIES}, shape=(worlds,))
 
     def __repr__(self) -> str:
         return f"CommonsEnv({self.game!r}, worlds={self._size}, device={str(self.device)!r})"
@@ -149,28 +187,10 @@ class CommonsEnv(LeanStepEnv):
         entries[keys.AGENTS] = unchecked_tensordict(agents, self._agents_size, self.device)
         return unchecked_tensordict(entries, self.batch_size, self.device)
 
-    def step(self, tensordict: TensorDictBase) -> TensorDictBase:
-        """Plays one turn of every world; see `EnvBase.step`."""
-        self._check_batch(tensordict)
-        return super().step(tensordict)
-
-    def reset(self, tensordict: TensorDictBase | None = None, **kwargs: Any) -> TensorDictBase:
-        """Begins the next episode of all worlds, or those in "_reset", bool [B, 1]; see `EnvBase.reset`."""
-        if tensordict is not None:
-            self._check_batch(tensordict)
-        return super().reset(tensordict, **kwargs)
-
     def set_seed(self, seed: int | None = None, static_seed: bool = False) -> int | None:
         """Restarts from a seed, 0 to 2**64 - 1; see `EnvBase.set_seed`."""
         following: int | None = super().set_seed(None if seed is None else arguments.seed(seed), static_seed)
         return following
-
-    def _check_batch(self, tensordict: TensorDictBase) -> None:
-        if not isinstance(tensordict, TensorDictBase) or tensordict.batch_size != self.batch_size:
-            found = getattr(tensordict, "batch_size", tensordict)
-            raise arguments.refusal(
-                "tensordict", found, f"a TensorDict of batch size {list(self.batch_size)}"
-            )
 
     def _set_seed(self, seed: int | None) -> None:
         self.worlds.set_seed(drawn_seed() if seed is None else seed)
@@ -184,11 +204,6 @@ class CommonsEnv(LeanStepEnv):
 
     def _begin(self, which: Tensor | None) -> dict[str, Tensor]:
         """Starts the next episode of the marked worlds (bool [B, 1]; None for all), in new tensors."""
-        if which is not None and (
-            not isinstance(which, Tensor) or which.dtype != torch.bool or which.numel() != self._size
-        ):
-            kind = f"{which.dtype} {list(which.shape)}" if isinstance(which, Tensor) else shown(which)
-            raise ValueError(f'"_reset" is {kind}; allowed: bool [{self._size}, 1]')
         before = self._tensors
         self._show_in(*self._fresh())
         if which is None:
@@ -223,7 +238,20 @@ class CommonsEnv(LeanStepEnv):
         Returns:
             A numpy array, uint8 [B, rows, columns, 3] in RGB; of one `world` uint8 [rows, columns, 3].
         """
-        return images(self.worlds, self.output, world=world, cell_pixels=cell_pixels)
+        batch = self.worlds
+        if not batch.has_begun:
+            raise ValueError(
+                "the worlds have not begun; allowed: reset() or load() before the first render()"
+            )
+        board = batch.game.map
+        if world is not None:
+            return world_image(board, batch.show(self.output, world=world), cell_pixels=cell_pixels)
+        pixels = batch.size * (board.height * cell_pixels + 1) * (board.width * cell_pixels + 1)
+        check_memory(
+            f"images of {batch.size:,} worlds", 6 * pixels, "one world (world=0) or fewer cell_pixels"
+        )
+        shown = (batch.show(self.output, world=number) for number in range(batch.size))
+        return np.stack([world_image(board, one, cell_pixels=cell_pixels) for one in shown])
 
     def _step(self, tensordict: TensorDictBase) -> TensorDict:
         actions = self._as_array(self._chosen(tensordict, "action").contiguous())

@@ -1,13 +1,11 @@
 """make_env: the one place where an environment is put together, whatever it is for."""
 
 from collections.abc import Iterable, Mapping
-from copy import deepcopy
-from typing import Any, Final, Protocol, runtime_checkable
+from typing import Any, Protocol, runtime_checkable
 
 import torch
-from torch import Tensor
 from torchrl.data import Bounded, Categorical
-from torchrl.envs import Compose, EnvBase, Transform, TransformedEnv
+from torchrl.envs import Compose, EnvBase, TransformedEnv
 
 from cprl import arguments, keys
 from cprl.commons.game import Game
@@ -15,7 +13,6 @@ from cprl.commons.spaces import Spaces
 from cprl.custom import Custom, made
 from cprl.envs.commons_env import CommonsEnv
 from cprl.envs.matrix import MatrixGame
-from cprl.envs.state import env_state, load_env_state
 from cprl.envs.taking import TakingGame
 from cprl.envs.unwrap import commons_of
 
@@ -39,9 +36,6 @@ class PlayableGame(Protocol):
 
     def make(self, worlds: int, seed: int, device: Any) -> Any:
         """An `EnvBase` of so many worlds side by side, whose chance follows from the seed."""
-
-
-_TRANSFORMS: Final = "a sequence of TorchRL transforms"
 
 
 def make_env(
@@ -68,8 +62,6 @@ def make_env(
         ValueError: where the environment or a transform does not fit; says what does.
     """
     playable: Any = made(game)
-    worlds = arguments.integer("worlds", worlds, 1, 2**32)
-    seed, first_world = arguments.seed(seed), arguments.integer("first_world", first_world, 0, 2**32 - 1)
     env: EnvBase
     if isinstance(playable, Game):
         env = CommonsEnv(playable, worlds, seed=seed, device=device, first_world=first_world)
@@ -79,11 +71,9 @@ def make_env(
         env = playable.make(worlds, arguments.seed(seed + first_world, "seed + first_world"), device)
     else:
         raise arguments.refusal("game", playable, "a cprl.Game, or a game with agents, to_config and make")
-    listed = [made(transform) for transform in arguments.listed("transforms", transforms, _TRANSFORMS)]
-    for transform in listed:
-        arguments.object_of("a transform", transform, Transform, "a TorchRL transform")
-    if listed:
-        env = TransformedEnv(env, Compose(*listed))
+    chain = [made(transform) for transform in transforms]
+    if chain:
+        env = TransformedEnv(env, Compose(*chain))
     check_env(env, worlds)
     return env
 
@@ -94,7 +84,6 @@ def spaces_of(env: EnvBase) -> Spaces:
     Raises:
         ValueError: for specs that agents cannot read, e.g. actions that are not categorical.
     """
-    arguments.object_of("env", env, EnvBase, "a TorchRL environment")
     observation, action = _spec(env, "observation"), _spec(env, "action")
     if not isinstance(action, Categorical) or action.ndim != 2:
         raise ValueError(
@@ -106,11 +95,7 @@ def spaces_of(env: EnvBase) -> Spaces:
         raise ValueError(
             f'("agents", "observation") is {list(observation.shape)}; allowed: [{worlds}, {agents}, ...]'
         )
-    shape, dtype = observation.shape, observation.dtype
-    if isinstance(env, TransformedEnv):  # some transforms change observations and not their spec
-        seen = _first_observation(env)
-        shape, dtype = seen.shape, seen.dtype
-    is_float = dtype.is_floating_point
+    is_float = observation.dtype.is_floating_point
     highest = float(observation.high.max()) if isinstance(observation, Bounded) and not is_float else 1.0
     commons = commons_of(env)
     known = () if commons is None else commons.game.spaces.vectors
@@ -119,21 +104,12 @@ def spaces_of(env: EnvBase) -> Spaces:
     )
     return Spaces(
         agents=agents,
-        observation_shape=tuple(shape[2:]),
-        observation_dtype=str(dtype).removeprefix("torch."),
+        observation_shape=tuple(observation.shape[2:]),
+        observation_dtype=str(observation.dtype).removeprefix("torch."),
         observation_scale=highest,
         actions=int(action.n),
         vectors=vectors,
     )
-
-
-def _first_observation(env: EnvBase) -> Tensor:
-    """("agents", "observation") after a reset, of which the environment keeps nothing."""
-    with torch.random.fork_rng(devices=[]):
-        before = deepcopy(env_state(env))
-        seen: Tensor = env.reset().get(keys.OBSERVATION)
-        load_env_state(env, before)
-    return seen
 
 
 def check_env(env: EnvBase, worlds: int) -> None:

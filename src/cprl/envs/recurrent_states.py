@@ -4,8 +4,7 @@ import torch
 from tensordict import TensorDictBase
 from torch import Tensor
 
-from cprl import arguments, keys
-from cprl.checks import shown
+from cprl import keys
 
 _NAME = keys.RECURRENT_STATE[1]
 
@@ -21,20 +20,13 @@ def begin_states(
         before: a TensorDict that may have it, [B, N, M].
         began: the worlds whose episode begins, bool [B, 1], or a turn with which their last one has ended;
             None for all.
-
-    Raises:
-        ValueError: for anything else.
     """
-    arguments.object_of("carried", carried, TensorDictBase, "a TensorDict")
-    arguments.object_of("before", before, TensorDictBase, "a TensorDict")
     agents = before.get(keys.AGENTS, None)
     states = agents.get(_NAME, None) if isinstance(agents, TensorDictBase) else None
     if states is None:
         return
     if isinstance(began, TensorDictBase):
         began = began["next"][keys.DONE]
-    if began is not None and (not isinstance(began, Tensor) or began.numel() != len(states)):
-        raise ValueError(f"began is {shown(began)}; allowed: bool [{len(states)}, 1], a turn, or None")
     none = torch.zeros_like(states)
     kept = none if began is None else torch.where(began.reshape(-1, 1, 1), none, states)
     keys.put(keys.entry(carried, keys.AGENTS), _NAME, kept)

@@ -1,8 +1,7 @@
 """The whole state of an environment and of its transforms, for checkpoints."""
 
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from copy import deepcopy
-from itertools import chain
 from typing import Any, Final
 
 import numpy as np
@@ -13,7 +12,6 @@ from torch import Tensor
 from torch.nn.parameter import is_lazy
 from torchrl.envs import Compose, EnvBase, TransformedEnv
 
-from cprl.arguments import object_of
 from cprl.envs.unwrap import base_env, commons_of
 
 
@@ -34,9 +32,6 @@ def load_env_state(env: EnvBase, state: Mapping[str, Any]) -> None:
     Raises:
         ValueError: if the state is of another form, or a commons or a transform cannot be in it.
     """
-    object_of("state", state, Mapping, "a value of env_state")
-    for name in ("worlds", "transforms"):
-        object_of(f"state[{name!r}]", state.get(name), Mapping, "a table")
     commons = commons_of(env)
     if commons is None:
         base_env(env).load_state_dict(state["worlds"])
@@ -44,71 +39,6 @@ def load_env_state(env: EnvBase, state: Mapping[str, Any]) -> None:
         commons.load({name: _array(name, tensor) for name, tensor in state["worlds"].items()})
     if isinstance(env, TransformedEnv):
         _load(env, dict(state["transforms"]))
-
-
-STEPS_TRIED: Final = 40
-"""Steps before and after a trial of `check_restorable`."""
-
-
-def check_restorable(make: Callable[[], EnvBase]) -> None:
-    """That an environment, put where another one was, plays on as that one does.
-
-    Tried with random actions on two new environments, since a game of the user's own may keep something
-    beside its `state_dict`, and a training that was stopped would then resume wrongly, unnoticed.
-
-    Args:
-        make: makes the environment, always with the same arguments.
-
-    Raises:
-        ValueError: where it plays on differently.
-    """
-    with torch.random.fork_rng(devices=[]):
-        torch.manual_seed(0)
-        first, second = make(), make()
-        carried = _played(first, first.reset(), STEPS_TRIED)[-1][1]
-        fresh = second.reset()
-        load_env_state(second, env_state(first))
-        copied = load_carried(fresh, carried_state(carried))
-        torch.manual_seed(1)
-        expected = _played(first, carried, STEPS_TRIED)
-        torch.manual_seed(1)
-        found = _played(second, copied, STEPS_TRIED)
-    pairs = zip(chain(*found), chain(*expected), strict=True)
-    if not all(_equal(one, other) for one, other in pairs):
-        raise ValueError(
-            f"the state_dict of {_at_fault(first)} does not hold all of its state: put back where it was, it "
-            "plays on differently, so a run that is stopped could not be resumed; register what it keeps as "
-            "buffers (register_buffer), or define state_dict and load_state_dict"
-        )
-
-
-def _at_fault(env: EnvBase) -> str:
-    """What may keep something beside its state: a commons does not, so its transforms do."""
-    if commons_of(env) is None or not isinstance(env, TransformedEnv):
-        return type(base_env(env)).__name__
-    return " or ".join(_kinds(env))
-
-
-def _kinds(env: TransformedEnv) -> list[str]:
-    """The types of the transforms."""
-    listed = env.transform if isinstance(env.transform, Compose) else [env.transform]
-    return [type(own).__name__ for own in listed]
-
-
-def _played(env: EnvBase, carried: TensorDictBase, steps: int) -> list[tuple[TensorDictBase, TensorDictBase]]:
-    """So many steps of random actions, rewards included, and what is carried after each."""
-    found = []
-    for _ in range(steps):
-        step, carried = env.step_and_maybe_reset(env.rand_action(carried.clone()))
-        found.append((step["next"].clone(), carried.clone()))
-    return found
-
-
-def _equal(one: TensorDictBase, other: TensorDictBase) -> bool:
-    mine, theirs = (dict(own.items(True, True)) for own in (one, other))
-    return mine.keys() == theirs.keys() and all(
-        torch.equal(torch.nan_to_num(mine[name]), torch.nan_to_num(theirs[name])) for name in mine
-    )
 
 
 _FRAMES: Final = "_cat_buffers"
@@ -156,7 +86,8 @@ def _all_of_transforms(env: EnvBase) -> dict[str, Any]:
 
 def _load(env: TransformedEnv, state: dict[str, Any]) -> None:
     """Loads a copy of the state of transforms; what they keep of the worlds may be missing."""
-    kinds = ", ".join(_kinds(env))
+    transforms = env.transform if isinstance(env.transform, Compose) else [env.transform]
+    kinds = ", ".join(type(transform).__name__ for transform in transforms)
     try:  # a copy, since some transforms keep the very tensors that they are given
         missing, unexpected = env.transform.load_state_dict(deepcopy(state), strict=False)
     except (KeyError, RuntimeError, TypeError) as error:

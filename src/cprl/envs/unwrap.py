@@ -3,13 +3,11 @@
 from torchrl.envs import EnvBase, TransformedEnv
 
 from cprl import keys
-from cprl.arguments import object_of
 from cprl.envs.commons_env import CommonsEnv
 
 
 def base_env(env: EnvBase) -> EnvBase:
-    """The environment without its transforms; raises a ValueError if it is none."""
-    object_of("env", env, EnvBase, "a TorchRL environment")
+    """The environment without its transforms."""
     while isinstance(env, TransformedEnv):
         env = env.base_env
     return env
@@ -27,7 +25,6 @@ def agent_count(env: EnvBase) -> int:
     Raises:
         ValueError: where the environment has another batch size, or no reward [B, N, 1] of the agents.
     """
-    base_env(env)
     size = tuple(env.batch_size)
     if len(size) != 1:
         raise ValueError(f"the environment has batch size {list(size)}; allowed: [B], B worlds")

@@ -17,7 +17,7 @@ from torchrl.envs import EnvBase
 from cprl import arguments, keys
 from cprl.commons.colours import APPLE, BEAM, PALETTE, WALL, Colour, agent_colour
 from cprl.commons.game import Game
-from cprl.commons.maps.board import SIGN_OF_HEADING
+from cprl.commons.maps import SIGN_OF_HEADING
 from cprl.commons.world import Shown
 from cprl.envs.make_env import make_env
 from cprl.envs.unwrap import commons_of

@@ -26,7 +26,7 @@ class Institution:
     """
 
     observed: bool = True
-    """Whether agents observe what this institution shows them, see `cprl.commons.institution_views`."""
+    """Whether agents observe what this institution shows them, see `cprl.commons.institution_turn`."""
 
     principle: ClassVar[str] = ""
     """Of the eight design principles of Ostrom, "Governing the Commons" (1990), table 3.1."""

@@ -4,7 +4,7 @@ from dataclasses import dataclass
 from string import ascii_lowercase, digits
 from typing import Any, ClassVar, Final
 
-from cprl.checks import Check, check_fields, checked, count, shown
+from cprl.checks import Check, check_fields, shown
 from cprl.institutions.base import FINE, OBSERVED, Institution
 
 OPEN: Final = "."
@@ -13,7 +13,6 @@ NOBODY: Final = "-"
 """The sign of a cell that nobody may use: a reserve."""
 SIGNS: Final = digits + ascii_lowercase
 """The signs of the regions of agents 0, 1, ..., where `owners` is None."""
-_COUNT: Final = count(1)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -61,9 +60,7 @@ class Boundaries(Institution):
         Raises:
             ValueError: If there are more agents than columns or signs.
         """
-        for name, value in (("height", height), ("width", width), ("agents", agents)):
-            checked(name, value, _COUNT)
-        if agents > min(width, len(SIGNS)):
+        if not 1 <= agents <= min(width, len(SIGNS)):
             raise ValueError(f"agents is {agents}; allowed: 1 to {min(width, len(SIGNS))}")
         row = "".join(SIGNS[col * agents // width] for col in range(width))
         return cls(regions=(row,) * height, **fields)
@@ -75,7 +72,6 @@ class Boundaries(Institution):
         return SIGNS[agent] if agent < len(SIGNS) else ""
 
     def check_board(self, *, agents: int, height: int, width: int) -> None:
-        """See `Institution.check_board`."""
         size = len(self.regions), len(self.regions[0])
         if size != (height, width):
             raise ValueError(

@@ -89,7 +89,6 @@ class Sanctioner(Institution):
             check_no_election(self, "agents is None, so that they are elected")
 
     def check_board(self, *, agents: int, height: int, width: int) -> None:
-        """See `Institution.check_board`."""
         check_agent_indices("Sanctioner.agents", self.agents or (), agents)
 
 

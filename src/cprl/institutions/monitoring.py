@@ -50,7 +50,6 @@ class Monitoring(Institution):
             check_no_election(self, f'monitor is "{ELECTED}"')
 
     def check_board(self, *, agents: int, height: int, width: int) -> None:
-        """See `Institution.check_board`."""
         if isinstance(self.monitor, int):
             check_agent_indices("Monitoring.monitor", (self.monitor,), agents)
 

@@ -53,7 +53,6 @@ class GraduatedSanctions(Institution):
         return isinstance(self.freeze_steps[0], tuple)
 
     def check_board(self, *, agents: int, height: int, width: int) -> None:
-        """See `Institution.check_board`."""
         if self.is_table and len(self.freeze_steps) != agents:
             raise ValueError(
                 f"GraduatedSanctions.freeze_steps has {len(self.freeze_steps)} rows; allowed: {agents}, one "

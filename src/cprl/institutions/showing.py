@@ -1,6 +1,6 @@
 """What institutions show agents as part of their observations, on one world; each entry is in 0..1.
 
-`cprl.commons.institution_entries` lists the entries of a game in the order of its institutions:
+`cprl.commons.institution_tables` lists the entries of a game in the order of its institutions:
 - `Quota`: apples left of the window's quota, relative to the most that it can be; the part of the window that
   is left;
 - `ClosedSeason`: 1 if the coming turn is closed; the part of a period until that changes;
@@ -11,7 +11,7 @@
 - `Sanctioner`: 1 if the agent may fire;
 - `Vote`: the value in force, relative to the highest choice.
 
-`Boundaries` and `ClosedPatches` show where bites are forbidden, see `cprl.commons.institution_views`.
+`Boundaries` and `ClosedPatches` show where bites are forbidden, see `cprl.commons.institution_turn`.
 """
 
 from cprl.institutions.limits import is_season_closed

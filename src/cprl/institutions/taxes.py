@@ -72,7 +72,6 @@ class Levies(Institution):
             )
 
     def check_board(self, *, agents: int, height: int, width: int) -> None:
-        """See `Institution.check_board`."""
         members = sorted(agent for group in self.groups for agent in group)
         check_agent_indices("Levies.groups", members, agents)
         if members != list(range(agents)):

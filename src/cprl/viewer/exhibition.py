@@ -28,7 +28,7 @@ from cprl.commons.colours import (
     picture_colour,
 )
 from cprl.commons.game import Game
-from cprl.commons.sprites import INK_COLOUR, MARK_COLOUR
+from cprl.commons.picture import INK_COLOUR, MARK_COLOUR
 from cprl.commons.world import Bytes
 from cprl.envs.recurrent_states import begin_states
 from cprl.envs.state import load_transforms_state, transforms_state

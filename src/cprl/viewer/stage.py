@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from cprl.commons.colours import APPLE, BEAM, FIRST_AGENT, GROUND, WALL, agent_colour, agent_mark
 from cprl.commons.decoding import UNSEEN
-from cprl.commons.sprites import DIGIT_HIGH, INK_COLOUR, MARK_COLOUR, POINTS, number_paths
+from cprl.commons.picture import DIGIT_HIGH, INK_COLOUR, MARK_COLOUR, POINTS, number_paths
 from cprl.commons.world import Bools, Bytes
 from cprl.viewer.panels import mosaic, mosaic_size, window_corners
 from cprl.viewer.scenery import Curves, Scene, classes, lines, state_colours, window_classes

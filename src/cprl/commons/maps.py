@@ -1,0 +1,475 @@
+"""Boards: a Map is drawn (`parse`), known by name (`named`), or generated (`crosses`, `rooms`, `random`).
+
+A drawing is rows of signs: `A` an apple site, `.` open ground, `#` an inner wall, `> ^ < v` an agent with its
+heading. Everything outside the board is wall.
+"""
+
+from bisect import bisect_left, insort
+from collections.abc import Iterable, Sequence
+from contextlib import suppress
+from dataclasses import dataclass
+from inspect import cleandoc
+from itertools import chain
+from typing import Any, Final, Literal, get_args
+
+import numpy as np
+from numpy.typing import NDArray
+
+from cprl import arguments
+from cprl.arguments import as_integer, choice, integer, listed, refusal
+from cprl.commons.world import DOWN, LEFT, RIGHT, UP
+
+Cell = tuple[int, int]
+Start = tuple[int, int, int]
+
+SIGN_OF_HEADING: Final = {UP: "^", RIGHT: ">", DOWN: "v", LEFT: "<"}
+HEADING_OF_SIGN: Final = {sign: heading for heading, sign in SIGN_OF_HEADING.items()}
+SITE, GROUND, WALL = "A", ".", "#"
+
+LONGEST_SIDE_CELLS: Final = 10_000
+LARGEST_BOARD_CELLS: Final = 2**20
+"""The largest number of cells: on a board this large, tables and working memory take some 100 MB."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Map:
+    """A board with its walls, its apple sites and the starts of the agents. Every cell outside it is wall.
+
+    Raises:
+        ValueError: If the board cannot be played; the message names the row and column.
+    """
+
+    height: int
+    """The number of rows H, 1..10,000; H x W is at most 2**20."""
+    width: int
+    """The number of columns W, 1..10,000."""
+    sites: tuple[Cell, ...]
+    """(row, col) of each of the K sites, the cells that can hold an apple; all do when an episode begins."""
+    starts: tuple[Start, ...]
+    """(row, col, heading) of each of the N agents, agent 0 first; heading 0 up, 1 right, 2 down, 3 left."""
+    walls: tuple[Cell, ...] = ()
+    """(row, col) of each inner wall."""
+
+    def __post_init__(self) -> None:
+        for name in ("height", "width"):
+            object.__setattr__(self, name, integer(f"Map.{name}", getattr(self, name), 1, LONGEST_SIDE_CELLS))
+        check_cells("Map", self.height, self.width)
+        for name in ("sites", "starts", "walls"):
+            entry = CELL if name != "starts" else START
+            cells = cells_of(f"Map.{name}", getattr(self, name), entry)
+            object.__setattr__(self, name, cells)
+        _check_entries(self)
+        _check_cells(self)
+
+    def __repr__(self) -> str:
+        return f"Map({self.height} x {self.width}, {len(self.sites)} sites, {self.agents} agents)"
+
+    @property
+    def agents(self) -> int:
+        """The number of agents N."""
+        return len(self.starts)
+
+    def drawing(self) -> str:
+        """The board as a drawing for `parse`. An agent hides a site on its cell; its index is not shown."""
+        signs = [[GROUND] * self.width for _ in range(self.height)]
+        for row, col in self.sites:
+            signs[row][col] = SITE
+        for row, col in self.walls:
+            signs[row][col] = WALL
+        for row, col, heading in self.starts:
+            signs[row][col] = SIGN_OF_HEADING[heading]
+        return "\n".join("".join(row) for row in signs)
+
+
+CELL: Final = ("row", "col")
+START: Final = ("row", "col", "heading")
+
+
+def check_cells(name: str, height: int, width: int) -> None:
+    """Checks the number of cells of a board.
+
+    Raises:
+        ValueError: If there are too many.
+    """
+    if height * width > LARGEST_BOARD_CELLS:
+        raise ValueError(
+            f"{name} has {height:,} x {width:,} = {height * width:,} cells; allowed: at most "
+            f"{LARGEST_BOARD_CELLS:,}"
+        )
+
+
+def cells_of(name: str, entries: Any, form: tuple[str, ...] = CELL) -> tuple[Any, ...]:
+    """Cells or starts as tuples of ints; nothing is rounded.
+
+    Args:
+        name: Their name in messages.
+        entries: A sequence of them.
+        form: What the numbers of an entry are.
+
+    Raises:
+        ValueError: If they are anything else; the message names the entry.
+    """
+    allowed = f"({', '.join(form)}), integers"
+    if not isinstance(entries, type) and callable(getattr(entries, "tolist", None)):
+        with suppress(NotImplementedError):  # of a tensor without data, which is refused below
+            entries = entries.tolist()
+    found = []
+    for place, entry in enumerate(listed(name, entries, f"a sequence of {allowed} each")):
+        numbers = tuple(map(as_integer, listed(f"{name}[{place}]", entry, allowed)))
+        if len(numbers) != len(form) or None in numbers:
+            raise refusal(f"{name}[{place}]", entry, allowed)
+        found.append(numbers)
+    return tuple(found)
+
+
+def _check_entries(board: Map) -> None:
+    for name, cells in (("sites", board.sites), ("starts", board.starts)):
+        if not cells:
+            raise ValueError(f"Map.{name} is empty; allowed: at least one entry")
+    for row, col, heading in board.starts:
+        if heading not in SIGN_OF_HEADING:
+            raise ValueError(
+                f"the start at row {row}, column {col} has heading {heading}; allowed: 0, 1, 2, 3"
+            )
+
+
+def _check_cells(board: Map) -> None:
+    starts = [(row, col) for row, col, _ in board.starts]
+    for name, cells in (("site", board.sites), ("start", starts), ("wall", board.walls)):
+        for row, col in cells:
+            if not (0 <= row < board.height and 0 <= col < board.width):
+                raise ValueError(
+                    f"the {name} at row {row}, column {col} lies outside the board of "
+                    f"{board.height} rows and {board.width} columns; allowed: rows 0 to {board.height - 1}, "
+                    f"columns 0 to {board.width - 1}"
+                )
+        for row, col in _duplicates(cells):
+            raise ValueError(f"two {name}s at row {row}, column {col}; allowed: one per cell")
+    for name, cells in (("site", board.sites), ("start", starts)):
+        for row, col in sorted(set(cells) & set(board.walls)):
+            raise ValueError(f"the {name} at row {row}, column {col} is on a wall; allowed: open ground")
+
+
+def _duplicates(cells: Iterable[Cell]) -> Iterable[Cell]:
+    seen: set[Cell] = set()
+    for cell in cells:
+        if cell in seen:
+            yield cell
+        seen.add(cell)
+
+
+def parse(drawing: str) -> Map:
+    """Reads a drawing of any size; agents are numbered in reading order, rows and columns from 0.
+
+    Common indentation and empty lines around the drawing are ignored.
+
+    Raises:
+        ValueError: If rows differ in length, a sign is unknown, or there is no site or no agent; the message
+            names the row and column.
+    """
+    rows = [row.rstrip() for row in cleandoc(drawing).splitlines()]
+    if not rows:
+        raise ValueError("the drawing is empty; allowed: at least one row of signs")
+    _check_drawing(rows)
+    cells = [(r, c, sign) for r, row in enumerate(rows) for c, sign in enumerate(row)]
+    return Map(
+        height=len(rows),
+        width=len(rows[0]),
+        sites=tuple((r, c) for r, c, sign in cells if sign == SITE),
+        starts=tuple((r, c, HEADING_OF_SIGN[sign]) for r, c, sign in cells if sign in HEADING_OF_SIGN),
+        walls=tuple((r, c) for r, c, sign in cells if sign == WALL),
+    )
+
+
+def _check_drawing(rows: list[str]) -> None:
+    known = f"{SITE} {GROUND} {WALL} " + " ".join(HEADING_OF_SIGN)
+    width = len(rows[0])
+    for r, row in enumerate(rows):
+        for c, sign in enumerate(row):
+            if sign not in known or sign == " ":
+                raise ValueError(f"unknown sign {sign!r} at row {r}, column {c}; allowed: {known}")
+        if len(row) != width:
+            raise ValueError(
+                f"row {r} ends after column {len(row) - 1}, row 0 after column {width - 1}; "
+                "all rows of a drawing must have the same length"
+            )
+    last = f"searched up to row {len(rows) - 1}, column {width - 1}"
+    signs = set(chain.from_iterable(rows))
+    if SITE not in signs:
+        raise ValueError(f"no apple site ({SITE}) in the drawing; {last}")
+    if not signs & set(HEADING_OF_SIGN):
+        raise ValueError(f"no agent ({' '.join(HEADING_OF_SIGN)}) in the drawing; {last}")
+
+
+_DRAWINGS: Final = {
+    "single_basic": """
+        ........................
+        ...........A............
+        ..........AAA...........
+        .>.......AAAAA..........
+        ..........AAA...........
+        ...........A............
+        ........................
+    """,
+    "single_complex": """
+        ..A....A....A....A....A.
+        .AAA..AAA..AAA..AAA..AAA
+        ..A....A....A....A....A.
+        .>......................
+        ....A....A....A....A....
+        ...AAA..AAA..AAA..AAA...
+        ....A....A....A....A....
+    """,
+    "two_complex": """
+        ..A....A....A....A....A.
+        .AAA..AAA..AAA..AAA..AAA
+        ..A....A....A....A....A.
+        .>......................
+        ....A....A....A....A....
+        ...AAA..AAA..AAA..AAA..^
+        ....A....A....A....A....
+    """,
+    "commons": """
+        .>>.........A.........AA
+        ...v....A...AA.........A
+        ..v..A.AAA.........A....
+        .A..AAA.A.......A.AAA...
+        AAA..A.A....A..AAA.A..AA
+        .A.A..AAA..AAA..A.A....A
+        ..AAA..A....A.A..AAA....
+        ...A.........AAA..A.....
+        ..AAA....A....A.........
+        ...A..A.AAA....A..A.AAA.
+        ..A..AAA......A..AAA.A..
+        ..AA..A......A.A..A.A...
+    """,
+}
+
+_NUMBERED_STARTS: Final[dict[str, tuple[Start, ...]]] = {
+    "commons": ((0, 1, RIGHT), (2, 2, DOWN), (1, 3, DOWN), (0, 2, RIGHT)),
+}
+"""Starts of boards on which the published program does not number its agents in reading order."""
+
+NAMES: Final = tuple(_DRAWINGS)
+"""The four published boards, after [W]."""
+
+
+def named(name: str) -> Map:
+    """A published board, by its name in `NAMES`.
+
+    Raises:
+        ValueError: If there is no board of this name.
+    """
+    choice("name", name, NAMES)
+    board = parse(_DRAWINGS[name])
+    starts = _NUMBERED_STARTS.get(name, board.starts)
+    return Map(height=board.height, width=board.width, sites=board.sites, starts=starts, walls=board.walls)
+
+
+Entrances = Literal["single", "multiple", "none", "unequal"]
+
+ROOMS_HEIGHT: Final = 19
+ROOMS_WIDTH: Final = 53
+
+_FAR_CENTRES: Final = (2, 7, 12, 17, 22, 30, 35, 40, 45, 50)
+_NEAR_CENTRES: Final = (5, 10, 15, 20, 32, 37, 42, 47)
+_CENTRES: Final = (
+    *((row, col) for row in (1, 17) for col in _FAR_CENTRES),
+    *((row, col) for row in (5, 13) for col in _NEAR_CENTRES),
+)
+_CLOSE_CENTRES: Final = (*((1, col) for col in (2, 6, 10, 14, 18)), *((3, col) for col in (4, 8, 12, 16)))
+"""Centres of the crosses in the north-west room of the unequal board."""
+
+_NORTH_WALLS: Final[dict[Sequence[int], tuple[Sequence[int], ...]]] = {
+    range(5): ((24, 28),),
+    (5,): ((22, 24), range(28, 31)),
+    (6,): ((22, 24),),
+    (7,): (range(23), (24,), range(28, 53)),
+}
+"""Columns of wall by rows of the upper half; the lower half is the upper one rotated by 180 degrees."""
+
+_OPENINGS: Final = ((1, 24), (3, 28), (7, 1), (7, 8), (7, 40), (7, 48))
+"""Openings in the walls of the upper half under "multiple"; the lower half likewise."""
+
+_NORTH_STARTS: Final = ((3, 6), (3, 46), (3, 10), (3, 42), (3, 14), (3, 38))
+
+ROOM_NAMES: Final = ("north-west", "north-east", "south-east", "south-west")
+_ROOMS: Final = tuple(
+    (slice(*rows), slice(*columns))
+    for rows, columns in (
+        ((0, 7), (0, 24)),
+        ((0, 7), (29, 53)),
+        ((12, 19), (29, 53)),
+        ((12, 19), (0, 24)),
+    )
+)
+"""Rows and columns of each room; all else is corridor or wall."""
+
+
+def crosses(
+    *,
+    height: int,
+    width: int,
+    centres: Iterable[Cell],
+    starts: Iterable[Start],
+    walls: Iterable[Cell] = (),
+) -> Map:
+    """A board whose sites form crosses: each centre and its four neighbours.
+
+    Args:
+        height: The number of rows H.
+        width: The number of columns W.
+        centres: (row, col) of the centre of each cross; a cell in two crosses is one site.
+        starts: (row, col, heading) of each agent.
+        walls: (row, col) of each inner wall.
+
+    Raises:
+        ValueError: If a site or start lies outside the board or on a wall; the message names row and column.
+    """
+    sites = {
+        (row + down, col + right)
+        for row, col in cells_of("centres", centres)
+        for down, right in ((0, 0), (-1, 0), (0, 1), (1, 0), (0, -1))
+    }
+    return Map(
+        height=height,
+        width=width,
+        sites=tuple(sorted(sites)),
+        starts=cells_of("starts", starts, START),
+        walls=cells_of("walls", walls),
+    )
+
+
+def rooms(entrances: Entrances = "single", *, agents: int = 12) -> Map:
+    """Four rooms around a plus-shaped corridor, 19 x 53, after Perolat et al. (2017).
+
+    There are 36 crosses with 180 sites. "single" gives each room one entrance with a bend, "multiple"
+    several; "none" removes all walls; "unequal" is "single" with the crosses of the north-west room closer
+    together.
+    The starts are ours: up to three agents per room, assigned in turn to the north-west, north-east,
+    south-east and south-west room.
+
+    Args:
+        entrances: The board: "single", "multiple", "none" or "unequal".
+        agents: The number of agents N, 1 to 12.
+
+    Raises:
+        ValueError: If `entrances` or `agents` is not allowed.
+    """
+    choice("entrances", entrances, get_args(Entrances))
+    agents = integer("agents", agents, 1, 2 * len(_NORTH_STARTS))
+    centres: tuple[Cell, ...] = _CENTRES
+    if entrances == "unequal":
+        in_corner = {(row, col) for row, col in _CENTRES if row < 7 and col < 24}
+        centres = (*_CLOSE_CENTRES, *(cell for cell in _CENTRES if cell not in in_corner))
+    return crosses(
+        height=ROOMS_HEIGHT,
+        width=ROOMS_WIDTH,
+        centres=centres,
+        starts=_room_starts()[:agents],
+        walls=_room_walls(entrances),
+    )
+
+
+def room_cells() -> NDArray[np.bool_]:
+    """The cells of each room of `rooms`, bool [4, 19, 53], in the order of `ROOM_NAMES`.
+
+    Those of the corridor are in no room. They are the same without walls. Agent i begins in room i % 4.
+    """
+    cells = np.zeros((len(_ROOMS), ROOMS_HEIGHT, ROOMS_WIDTH), np.bool_)
+    for room, (rows, columns) in enumerate(_ROOMS):
+        cells[room, rows, columns] = True
+    return cells
+
+
+def _turned(cell: Cell) -> Cell:
+    """The position of a cell after the board is rotated by 180 degrees."""
+    return ROOMS_HEIGHT - 1 - cell[0], ROOMS_WIDTH - 1 - cell[1]
+
+
+def _room_walls(entrances: Entrances) -> list[Cell]:
+    if entrances == "none":
+        return []
+    north = {
+        (row, col)
+        for rows, columns in _NORTH_WALLS.items()
+        for row in rows
+        for some in columns
+        for col in some
+    }
+    if entrances == "multiple":
+        north -= set(_OPENINGS)
+    return sorted(north | set(map(_turned, north)))
+
+
+def _room_starts() -> list[Start]:
+    """The starts of all 12 agents, facing the corridor."""
+    starts: list[Start] = []
+    for west, east in zip(_NORTH_STARTS[::2], _NORTH_STARTS[1::2], strict=True):
+        north = [(*cell, DOWN) for cell in (west, east)]
+        starts += [*north, *((*_turned(cell), UP) for cell in (west, east))]
+    return starts
+
+
+def random(
+    height: int, width: int, *, agents: int, density: float, clustering: float = 0.0, seed: int = 0
+) -> Map:
+    """A board with random sites and no walls; agents start on random cells without a site.
+
+    Sites are placed one by one: with probability `clustering` on a free cell next to an existing site,
+    otherwise on any free cell. At 0 they are independent; near 1 they form a single patch.
+
+    Args:
+        height: The number of rows H, see `Map`.
+        width: The number of columns W.
+        agents: The number of agents N, at least 1.
+        density: Sites per cell, above 0, at most 1. The number of sites is density x H x W, rounded, at
+            least 1.
+        clustering: A probability, 0..1.
+        seed: The seed of the random numbers.
+
+    Raises:
+        ValueError: If an argument is out of range, or sites and agents do not fit on the board.
+    """
+    height = integer("height", height, 1, LONGEST_SIDE_CELLS)
+    width = integer("width", width, 1, LONGEST_SIDE_CELLS)
+    check_cells("the board", height, width)
+    agents = integer("agents", agents, 1, LARGEST_BOARD_CELLS)
+    density = arguments.number("density", density, low=0, high=1, above=True, allowed="above 0, at most 1")
+    clustering = arguments.number("clustering", clustering, low=0, high=1, allowed="0..1")
+    rng = np.random.default_rng(arguments.seed(seed))
+    cells = height * width
+    count = max(1, round(density * cells))
+    if count + agents > cells:
+        raise ValueError(
+            f"{count} sites and {agents} agents do not fit on {cells} cells; allowed: a lower density, or "
+            "fewer agents"
+        )
+    free: list[int] = list(range(cells))
+    beside: list[int] = []  # free cells next to a site, ascending as well
+    is_beside, is_site = bytearray(cells), bytearray(cells)
+    for _ in range(count):
+        near = beside and rng.random() < clustering
+        choices = beside if near else free
+        cell = choices[int(rng.integers(len(choices)))]
+        del free[bisect_left(free, cell)]
+        if is_beside[cell]:
+            del beside[bisect_left(beside, cell)]
+        is_site[cell] = True
+        row, col = divmod(cell, width)
+        for inside, neighbour in (
+            (row > 0, cell - width),
+            (row < height - 1, cell + width),
+            (col > 0, cell - 1),
+            (col < width - 1, cell + 1),
+        ):
+            if inside and not is_site[neighbour] and not is_beside[neighbour]:
+                insort(beside, neighbour)
+                is_beside[neighbour] = True
+    places = np.array(free)
+    chosen = places[rng.choice(len(places), agents, replace=False)].tolist()
+    starts = [(*divmod(cell, width), int(rng.integers(4))) for cell in chosen]
+    sites = np.setdiff1d(np.arange(cells), places).tolist()
+    return Map(
+        height=height, width=width, sites=tuple(divmod(cell, width) for cell in sites), starts=tuple(starts)
+    )
