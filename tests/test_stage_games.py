@@ -5,7 +5,6 @@ from dataclasses import replace
 
 import pytest
 import torch
-from cprl.evaluation.same_game import differences
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from restorable import assert_restorable
@@ -20,6 +19,7 @@ from cprl.commands.recipe import parse
 from cprl.envs import make_env, spaces_of
 from cprl.envs.matrix import MatrixEnv, MatrixGame, chicken, prisoners_dilemma, stag_hunt
 from cprl.envs.taking import TakingEnv, TakingGame
+from cprl.evaluation.evaluate import differences
 from cprl.experiment import changes
 from cprl.population import Learning, Scripted
 from cprl.reporting import write_report

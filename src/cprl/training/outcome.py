@@ -4,7 +4,6 @@ import random as random_of_python
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import AbstractContextManager, contextmanager, nullcontext
 from dataclasses import dataclass, replace
-from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
@@ -16,7 +15,7 @@ from cprl.arguments import object_of
 from cprl.custom import Custom, made
 from cprl.envs.games import OF_CPRL
 from cprl.envs.make_env import make_env
-from cprl.envs.state import check_restorable, load_transforms_state, transforms_state
+from cprl.envs.state import load_transforms_state, transforms_state
 from cprl.envs.unwrap import agent_names, commons_of
 from cprl.experiment import Experiment
 from cprl.measuring.episodes import Episode
@@ -201,17 +200,13 @@ def make_parts(
             is resumed reads its own.
         weights: those that `Frozen` agents play with, see `Population`.
     """
-    make = partial(
-        make_env,
+    env = make_env(
         experiment.game,
         worlds=experiment.replicas,
         seed=experiment.seed,
         device=experiment.device,
         transforms=experiment.transforms,
     )
-    env = make()
-    if commons_of(env) is None or experiment.transforms:
-        check_restorable(make)
     population = Population(
         env,
         experiment.agents,
