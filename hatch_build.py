@@ -1,6 +1,6 @@
 """Writes into a wheel, and into a source distribution, from which commit it is built, where git knows it.
 
-`cprl.runs.source` reads it, since an installed wheel has no git. An editable installation asks git itself.
+`cprl.runs.recipe` reads it, since an installed wheel has no git. An editable installation asks git itself.
 """
 
 import json

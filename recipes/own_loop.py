@@ -35,16 +35,16 @@ from cprl.networks.mlp import MLPNetwork
 from cprl.policies.assignment import AgentPolicies
 from cprl.policies.single import RandomActor
 from cprl.population import Learning, exploration_steps
-from cprl.runs.directory import start_run
 from cprl.runs.episodes import EpisodeTable
+from cprl.runs.recipe import start_run
 from cprl.runs.weights import BestWeights, restore_weights, save_weights
 from cprl.system.output import printed, say
 from cprl.system.shipped import cprl_here
 from cprl.terminal.figures import training_curve
 from cprl.terminal.progress import ProgressBar
 from cprl.terminal.summary import summarise
-from cprl.training.callbacks import Callback
 from cprl.training.collectors import StepCollector
+from cprl.training.training import Callback
 from cprl.viewer.callback import ViewerCallback
 from cprl.viewer.watching import check_watch
 

@@ -10,8 +10,8 @@ from cprl import Game, Rules, maps, presets
 from cprl.algorithms import DQN
 from cprl.measuring import Episode, social
 from cprl.population import Learning
-from cprl.runs.directory import start_run
 from cprl.runs.episodes import EpisodeTable
+from cprl.runs.recipe import start_run
 from cprl.studies.trials import trials_of
 
 EXPERIMENT = cprl.Experiment(

@@ -37,10 +37,8 @@ from cprl.measuring.replicas import agents_without_harvest, social_measures
 from cprl.measuring.reported import FIELDS, METRICS, OPTIONAL, available, left_out, reported_by
 from cprl.policies.assignment import AgentPolicies
 from cprl.policies.single import RandomActor
-from cprl.runs.columns import COLUMNS, LEFT_OUT
 from cprl.runs.curves import curves_of
-from cprl.runs.episodes import EpisodeTable, as_table, read_episodes
-from cprl.runs.labelled import labelled
+from cprl.runs.episodes import COLUMNS, LEFT_OUT, EpisodeTable, as_table, labelled, read_episodes
 from cprl.terminal.figures import training_curve
 from cprl.terminal.progress import ProgressBar
 from cprl.terminal.summary import summarise

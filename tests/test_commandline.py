@@ -15,14 +15,13 @@ import cprl
 from cprl import Experiment, presets
 from cprl.algorithms import DQN, PPO, QMIX, DQNSettings, RolloutSettings
 from cprl.commands import main as cli
-from cprl.commands.flags import applied, docs, flags_of
-from cprl.commands.recipe import RunOptions, parse, recipe_main
+from cprl.commands.recipe import RunOptions, applied, docs, flags_of, parse, recipe_main
 from cprl.custom import Custom
 from cprl.institutions import GraduatedSanctions, Quota
 from cprl.networks import MLP
 from cprl.population import Learning, Scripted, Team
 from cprl.preferences import Exchange
-from cprl.runs.directory import start_run
+from cprl.runs.recipe import start_run
 
 ROOT = Path(__file__).parents[1]
 RECIPES = sorted(

@@ -6,7 +6,7 @@ from cprl.algorithms import DQN, VDN, DQNSettings
 from cprl.institutions import Quota, Sanctioner
 from cprl.networks import MLP
 from cprl.population import Learning, Scripted, Team
-from cprl.studies.naming import level_text, named, short_names
+from cprl.studies.study import level_text, named, short_names
 
 LEARNER = DQN(settings=DQNSettings())
 

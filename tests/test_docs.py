@@ -16,7 +16,7 @@ from test_rerun_logger import trained
 from cprl.commands import main as cli
 from cprl.measuring import institutions, names
 from cprl.measuring.series import OF_AGENTS
-from cprl.runs.columns import OF_INSTITUTIONS
+from cprl.runs.episodes import OF_INSTITUTIONS
 
 ROOT = Path(__file__).parents[1]
 INTERVAL = r"-?[\d.,]+ \[[^\]]*\d[^\]]*\]"

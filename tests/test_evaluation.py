@@ -33,11 +33,11 @@ from cprl.policies.assignment import AgentPolicies
 from cprl.policies.lanes import LaneActor, random_agents
 from cprl.population import Frozen, Learning, Scripted
 from cprl.runs.checkpoints import Checkpointer
-from cprl.runs.directory import start_run
+from cprl.runs.recipe import start_run
 from cprl.system.process import one_thread
 from cprl.training import train
 from cprl.training.agents import Population
-from cprl.training.stored_agents import StoredAgent, stored_policies
+from cprl.training.stored import StoredAgent, stored_policies
 
 CORRIDORS = Game(
     map=maps.parse(

@@ -20,12 +20,11 @@ from cprl.learners.buffer.storage import storage_bytes
 from cprl.population import Learning, Scripted
 from cprl.runs.checkpoints import Checkpointer
 from cprl.studies import InProcess, Processes, Ray, run_study
-from cprl.studies.directory import STATUS
-from cprl.studies.executors import memory, on_ray, processes
-from cprl.studies.executors.memory import BASE_BYTES, MemoryNeeds, estimated_bytes
-from cprl.studies.executors.stopping import Stopping
-from cprl.studies.status import Status
-from cprl.studies.trials import run_task, task_of, trials_of
+from cprl.studies.executors import on_ray, processes
+from cprl.studies.executors.on_ray import BASE_BYTES, MemoryNeeds, estimated_bytes
+from cprl.studies.executors.processes import Stopping
+from cprl.studies.study import STATUS
+from cprl.studies.trials import Status, run_task, task_of, trials_of
 
 STUDY = Study(TINY, {FREEZE: [2, 5]})
 TESTS = Path(__file__).parent
@@ -304,4 +303,4 @@ def test_a_trial_asks_for_what_its_buffers_take_until_another_has_finished(tmp_p
     Status(Path(small.status), small.name).path.write_text(json.dumps({"peak_bytes": taken}))
     needs = MemoryNeeds([small, big])
     assert needs.of(big) == round(1.1 * 2 * (BASE_BYTES + buffers))
-    assert memory.MemoryNeeds([big]).of(big) == round(1.1 * (BASE_BYTES + buffers))
+    assert on_ray.MemoryNeeds([big]).of(big) == round(1.1 * (BASE_BYTES + buffers))

@@ -9,8 +9,7 @@ from tiny_study import FREEZE, TINY
 
 from cprl import Custom, Study, run_study
 from cprl.runs.episodes import read_table
-from cprl.studies.extending import begin_from_shorter
-from cprl.studies.trials import trials_of
+from cprl.studies.trials import begin_from_shorter, trials_of
 
 pytestmark = pytest.mark.integration
 

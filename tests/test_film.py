@@ -20,7 +20,7 @@ from cprl.evaluation.film import film, film_video, fresh_episode
 from cprl.evaluation.film_pictures import EpisodePicture, nice
 from cprl.institutions import Monitoring, Quota
 from cprl.population import Scripted
-from cprl.runs.directory import start_run
+from cprl.runs.recipe import start_run
 from cprl.runs.weights import save_weights
 
 CORRIDORS = Game(

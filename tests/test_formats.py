@@ -9,12 +9,17 @@ import torch
 
 import cprl
 from cprl.experiment import Experiment
-from cprl.runs import formats
 from cprl.runs.checkpoints import read_checkpoint
-from cprl.runs.directory import read_recipe
 from cprl.runs.episodes import read_episodes
-from cprl.runs.files import checksum
-from cprl.runs.manifest import verify
+from cprl.runs.files import (
+    MANIFEST_FORMAT,
+    RECIPE_FORMAT,
+    STUDY_FORMAT,
+    TRAINING_STATE_FORMAT,
+    checksum,
+    verify,
+)
+from cprl.runs.recipe import read_recipe
 from cprl.studies import Study, read_study
 
 RESULTS = Path(__file__).parents[1] / "docs" / "results"
@@ -66,7 +71,7 @@ REFUSED = r"has the format {0}, and cprl \S+ reads up to {1}: a newer cprl wrote
 
 @pytest.mark.parametrize("read", [read_recipe, cprl.load, read_episodes])
 def test_a_recipe_of_a_newer_cprl_is_refused_by_name(read, newer):
-    run = newer("recipe.json", format=formats.RECIPE + 1)
+    run = newer("recipe.json", format=RECIPE_FORMAT + 1)
     with pytest.raises(ValueError, match=r"recipe\.json " + REFUSED.format(3, 2)):
         read(run)
 
@@ -78,14 +83,14 @@ def test_a_newer_recipe_is_refused_even_without_what_this_version_looks_for(tmp_
 
 
 def test_what_a_newer_cprl_lists_in_the_manifest_is_refused_by_name(newer):
-    run = newer("manifest.json", format=formats.MANIFEST + 1, files={})
+    run = newer("manifest.json", format=MANIFEST_FORMAT + 1, files={})
     with pytest.raises(ValueError, match=r"manifest\.json " + REFUSED.format(2, 1)):
         read_episodes(run)
 
 
 def test_a_checkpoint_of_a_newer_cprl_is_refused_by_name(tmp_path):
     written = tmp_path / "written.pt"
-    torch.save({"format": formats.TRAINING_STATE + 1}, written)
+    torch.save({"format": TRAINING_STATE_FORMAT + 1}, written)
     path = written.rename(tmp_path / f"training-{20:012d}-{checksum(written)}.pt")
     with pytest.raises(ValueError, match=r"training-\S+\.pt " + REFUSED.format(3, 2)):
         read_checkpoint(path)
@@ -94,7 +99,7 @@ def test_a_checkpoint_of_a_newer_cprl_is_refused_by_name(tmp_path):
 def test_a_study_of_a_newer_cprl_is_refused_by_name():
     table = read_study(STUDIES[0]).to_config()
     with pytest.raises(ValueError, match="the study " + REFUSED.format(2, 1)):
-        Study.from_config({**table, "format": formats.STUDY + 1})
+        Study.from_config({**table, "format": STUDY_FORMAT + 1})
 
 
 def test_a_field_that_another_cprl_wrote_is_refused_with_its_version(newer):

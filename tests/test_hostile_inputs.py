@@ -25,8 +25,7 @@ from cprl.config import KINDS, custom_targets, from_config, to_config
 from cprl.envs.matrix import prisoners_dilemma
 from cprl.envs.taking import TakingGame
 from cprl.runs.episodes import read_episodes, read_table
-from cprl.runs.files import read_json
-from cprl.runs.lock import RunLock
+from cprl.runs.files import RunLock, read_json
 
 LONGEST_S = 10.0
 STORED = Path(__file__).parent / "stored" / "run"

@@ -33,8 +33,8 @@ from cprl.measuring.replicas import institution_measures, social_measures
 from cprl.measuring.reported import OF_INSTITUTIONS, OPTIONAL, left_out
 from cprl.measuring.series import numbers_of
 from cprl.policies.lanes import random_agents
-from cprl.runs.columns import OF_INSTITUTIONS as COLUMNS
 from cprl.runs.curves import as_curves
+from cprl.runs.episodes import OF_INSTITUTIONS as COLUMNS
 from cprl.runs.episodes import EpisodeTable, as_table, read_episodes
 from cprl.training import train
 

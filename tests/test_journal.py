@@ -8,8 +8,8 @@ import pytest
 from test_results import an_episode
 
 from cprl.runs.episodes import EpisodeTable, read_episodes, read_table
+from cprl.runs.files import enlist, unlist, verify, write_listed
 from cprl.runs.journal import Journal, read_journal
-from cprl.runs.manifest import enlist, unlist, verify, write_listed
 
 SCHEMA = pa.schema({"replica": pa.int32(), "ended": pa.bool_(), "equality": pa.float64()})
 

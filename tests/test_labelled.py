@@ -5,7 +5,7 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
 
-from cprl.runs.labelled import write_table
+from cprl.runs.episodes import write_table
 
 ROWS = 20_000
 

@@ -20,11 +20,10 @@ from cprl.algorithms import DQN
 from cprl.commands import main as cli
 from cprl.population import Frozen, Learning, Scripted
 from cprl.runs.checkpoints import Checkpointer, checkpoints_in, is_ending, read_checkpoint
-from cprl.runs.directory import start_run
 from cprl.runs.episodes import read_episodes, read_table
 from cprl.runs.export import export_results
-from cprl.runs.files import checksum, refuse_to_write_over
-from cprl.runs.lock import RunLock, RunLockedError
+from cprl.runs.files import RunLock, RunLockedError, checksum, refuse_to_write_over
+from cprl.runs.recipe import start_run
 from cprl.runs.weights import load_weights, save_weights
 from cprl.system.shipped import cprl_here
 from cprl.training import running

@@ -12,8 +12,8 @@ from cprl.measuring.evaluate import evaluate, mean_return
 from cprl.networks.mlp import MLPNetwork
 from cprl.policies.assignment import AgentPolicies
 from cprl.policies.single import QActor, RandomActor
-from cprl.runs.directory import read_recipe
 from cprl.runs.episodes import read_episodes
+from cprl.runs.recipe import read_recipe
 from cprl.runs.weights import load_weights, restore_weights
 from cprl.system.shipped import cprl_here
 

@@ -13,7 +13,7 @@ from cprl.evaluation.play import Session, board_text, help_of, open_session, pla
 from cprl.measuring.episodes import EpisodeTracker
 from cprl.measuring.replicas import social_metrics
 from cprl.population import Scripted
-from cprl.runs.directory import start_run
+from cprl.runs.recipe import start_run
 from cprl.runs.weights import save_weights
 
 DRAWING = """

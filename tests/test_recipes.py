@@ -24,7 +24,7 @@ from cprl.runs.checkpoints import Checkpointer, checkpoints_in, read_checkpoint
 from cprl.runs.episodes import EpisodeTable, read_episodes
 from cprl.runs.weights import load_weights, save_weights
 from cprl.studies import StudyTable
-from cprl.studies.conditions import Condition
+from cprl.studies.study import Condition
 from cprl.studies.tables.sources import design_of
 from cprl.training import train
 from cprl.training.agents import Population

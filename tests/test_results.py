@@ -18,10 +18,8 @@ import pytest
 import torch
 
 from cprl.measuring import Episode, social
-from cprl.runs.columns import COLUMNS
-from cprl.runs.directory import start_run
-from cprl.runs.episodes import EpisodeTable, read_episodes
-from cprl.runs.source import git_state
+from cprl.runs.episodes import COLUMNS, EpisodeTable, read_episodes
+from cprl.runs.recipe import git_state, start_run
 
 
 def an_episode(number: int = 0, *, world: int = 0, **metrics: float) -> Episode:

@@ -13,8 +13,8 @@ from cprl.algorithms import DQN
 from cprl.custom import Custom
 from cprl.experiment import Experiment
 from cprl.population import Frozen, Learning
-from cprl.runs.directory import read_recipe, refuse_another_run, resume_command, start_run
-from cprl.studies.paths import changed
+from cprl.runs.recipe import read_recipe, refuse_another_run, resume_command, start_run
+from cprl.studies.factors import changed
 from cprl.system.shipped import cprl_here
 
 AGENT = Learning(DQN(settings=presets.dqn_settings("commons")))

@@ -18,7 +18,7 @@ from cprl.evaluation import scenarios as module
 from cprl.evaluation.lanes import Source, play, policies_of
 from cprl.evaluation.scenarios import estimates, scenario_tables
 from cprl.population import Frozen, Learning, Scripted
-from cprl.runs.directory import read_recipe
+from cprl.runs.recipe import read_recipe
 
 THREE_CORRIDORS = replace(
     CORRIDORS,

@@ -15,8 +15,7 @@ from cprl.population import Learning
 from cprl.runs.curves import as_curves, curves_of
 from cprl.runs.episodes import read_table
 from cprl.studies import Integers, LogUniform, Search, Uniform, read_study, run_search
-from cprl.studies.points import value_of
-from cprl.studies.search import FILE_NAME, JOURNAL
+from cprl.studies.search import FILE_NAME, JOURNAL, value_of
 from cprl.studies.trials import Outcome, trials_of
 
 optuna = pytest.importorskip("optuna")

@@ -62,8 +62,8 @@ from cprl.networks.specification import new_network
 from cprl.policies.rng import LaneRng
 from cprl.population import Frozen, Learning, Scripted, Team, specs_by_agent
 from cprl.preferences import Exchange, InequityAversion, SocialValueOrientation
-from cprl.runs.directory import read_recipe
 from cprl.runs.files import read_json
+from cprl.runs.recipe import read_recipe
 from cprl.system.memory import TooLargeError
 from cprl.theory import PowerWorth, appropriation, herders
 from cprl.training.collectors import stock_collector

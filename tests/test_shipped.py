@@ -11,7 +11,7 @@ import pytest
 
 import cprl
 from cprl.commands import main as cli
-from cprl.runs.directory import resume_command, start_run
+from cprl.runs.recipe import resume_command, start_run
 from cprl.system import shipped
 from cprl.system.shipped import (
     command_of,

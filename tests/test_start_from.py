@@ -146,7 +146,7 @@ def test_a_training_that_starts_from_another_is_run_stopped_and_resumed_without_
     begun = experiment((spec, Scripted(), Scripted(), Scripted()), episodes=4)
     whole = cprl.run(begun, "runs/whole", watch="off")
     assert cprl.load(whole).experiment == begun
-    recipe = cprl.runs.directory.read_recipe(whole)
+    recipe = cprl.runs.recipe.read_recipe(whole)
     assert recipe["experiment"]["agents"][0]["start_from"]["run"] == "../../alone"
     monkeypatch.setenv("STOP_AT_STEP", "20")
     stopping = replace(begun, callbacks=(cprl.Custom("test_start_from:Stops"),))

@@ -19,9 +19,8 @@ from cprl.experiment import MOST_SEED, Experiment
 from cprl.learners.settings import RolloutSettings
 from cprl.population import Frozen, Learning, Scripted, Team, stored_of
 from cprl.studies import Integers, LogUniform, Uniform
-from cprl.studies.conditions import FORMAT, Condition, apart
-from cprl.studies.factors import drawn
-from cprl.studies.paths import changed, values_at
+from cprl.studies.factors import changed, drawn, values_at
+from cprl.studies.study import CONDITION_FORMAT, Condition, apart
 from cprl.studies.trials import trials_of
 
 
@@ -172,10 +171,10 @@ def test_fields_that_have_their_default_do_not_count():
 
 
 def test_the_defaults_of_the_checksums_format_have_not_changed():
-    """Where a default has another value, count `conditions.FORMAT` up, and write its defaults anew."""
+    """Where a default has another value, count `CONDITION_FORMAT` up, and write its defaults anew."""
     kept = json.loads((Path(__file__).parent / "condition_defaults.json").read_text())
     found = {name: defaults_of(kind) for name, kind in {**KINDS, "Experiment": Experiment}.items()}
-    assert kept["format"] == FORMAT
+    assert kept["format"] == CONDITION_FORMAT
     for name, defaults in kept["defaults"].items():
         assert {field: found[name].get(field, "gone") for field in defaults} == defaults, name
     assert kept["defaults"].keys() == found.keys()  # of a new kind or field add its defaults

@@ -17,7 +17,7 @@ from tiny_study import FREEZE, TINY
 from cprl import Study
 from cprl.runs.checkpoints import Checkpointer
 from cprl.studies import InProcess, Processes, Ray, run_study, study_table
-from cprl.studies.directory import STATUS
+from cprl.studies.study import STATUS
 from cprl.studies.trials import run_task
 
 STUDY = Study(replace(TINY, episodes=80), {FREEZE: [2, 5]})

@@ -11,11 +11,9 @@ from tiny_study import FREEZE, TINY
 
 from cprl import Study, run_study
 from cprl.runs.files import write_json
-from cprl.studies import overview
-from cprl.studies.overview import Overview
-from cprl.studies.progress import Progress, table_of
-from cprl.studies.status import Status
-from cprl.studies.trials import Outcome, trials_of
+from cprl.studies import progress
+from cprl.studies.progress import Overview, Progress, table_of
+from cprl.studies.trials import Outcome, Status, trials_of
 
 STUDY = Study(replace(TINY, episodes=10, replicas=2), {FREEZE: [2, 5, 9]})
 
@@ -75,7 +73,7 @@ def test_a_trial_runs_while_it_says_something_new_whatever_the_clock_says(looked
     assert row(own.look(), trials[0]).state == "missing", "perhaps the last words of a dead process"
     says(0, beat=501, episodes=4, steps=9)
     assert row(own.look(), trials[0]).state == "running"
-    monkeypatch.setattr(overview, "SILENT_S", 0.0)
+    monkeypatch.setattr(progress, "SILENT_S", 0.0)
     assert row(own.look(), trials[0]).state == "missing"
 
 

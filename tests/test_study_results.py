@@ -13,20 +13,25 @@ from cprl import Study
 from cprl.commands import main as cli
 from cprl.measuring.statistics import difference, estimate
 from cprl.studies.factors import Uniform
-from cprl.studies.figures import by_factor as by_factor_module
 from cprl.studies.figures import courses as courses_module
 from cprl.studies.figures import diagrams
-from cprl.studies.figures.by_condition import by_condition
-from cprl.studies.figures.by_factor import _Axis, by_factor
+from cprl.studies.figures import levels as by_factor_module
 from cprl.studies.figures.courses import courses
 from cprl.studies.figures.diagrams import grids, heat_map, phase_diagram
-from cprl.studies.figures.panels import is_logarithmic, is_numeric, is_one, replicas_text, with_counts
+from cprl.studies.figures.levels import (
+    _Axis,
+    by_condition,
+    by_factor,
+    is_logarithmic,
+    is_numeric,
+    is_one,
+    replicas_text,
+    with_counts,
+)
 from cprl.studies.results import write_results
-from cprl.studies.tables.comparing import compare, metrics_of
-from cprl.studies.tables.outcomes import ending, endings
-from cprl.studies.tables.sources import design_of, sources_of
+from cprl.studies.tables.comparing import Cells, cells, compare, markdown, metrics_of
+from cprl.studies.tables.sources import design_of, ending, endings, sources_of
 from cprl.studies.tables.table import StudyTable, study_table
-from cprl.studies.tables.texts import Cells, cells, markdown
 from cprl.studies.trials import trials_of
 
 SEES = "game.rules.window_rows"

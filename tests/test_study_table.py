@@ -11,13 +11,11 @@ import pytest
 from study_runs import EXPERIMENT, TIME_OUT, with_seed, write_run, write_study
 
 from cprl import Study
-from cprl.runs.directory import runs_in, write_changed_circumstances
-from cprl.studies.status import Status
-from cprl.studies.tables.circumstances import circumstances_of
+from cprl.runs.recipe import runs_in, write_changed_circumstances
 from cprl.studies.tables.pooled import pooled_table
 from cprl.studies.tables.sources import design_of
-from cprl.studies.tables.table import METADATA, StudyTable, study_table
-from cprl.studies.trials import trials_of
+from cprl.studies.tables.table import METADATA, StudyTable, circumstances_of, study_table
+from cprl.studies.trials import Status, trials_of
 
 STUDY = Study(EXPERIMENT, {TIME_OUT: [5, 25]}, name="small", replicas=3, block=2)
 NAN = float("nan")
@@ -209,7 +207,7 @@ def test_a_recipe_records_each_time_it_is_resumed_under_other_circumstances(tmp_
     )
     for versions in ("2.1", "2.1", "2.2"):
         now = {"versions": {"torch": versions}, "git": None, "cpu": "Xeon"}
-        monkeypatch.setattr("cprl.runs.directory._circumstances", lambda recipe, now=now: now)
+        monkeypatch.setattr("cprl.runs.recipe._circumstances", lambda recipe, now=now: now)
         write_changed_circumstances(run)
     resumed = json.loads((run / "recipe.json").read_text())["resumed"]
     assert [own["versions"]["torch"] for own in resumed] == ["2.1", "2.2"]

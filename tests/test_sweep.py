@@ -16,13 +16,12 @@ from tiny_study import FREEZE, GAMMA, TINY
 import cprl
 from cprl import Study
 from cprl.commands import main as cli
-from cprl.commands.studies import recipe_of, study_main
+from cprl.commands.studies import StudyOptions, carry_out, executor_of, recipe_of, study_main
 from cprl.commands.studies import sweep as sweep_words
-from cprl.commands.studies_options import StudyOptions, carry_out, executor_of
-from cprl.runs.directory import start_run
-from cprl.runs.lock import RunLockedError
+from cprl.runs.files import RunLockedError
+from cprl.runs.recipe import start_run
 from cprl.studies import InProcess, Processes, Ray, read_study
-from cprl.studies.driver import as_driver
+from cprl.studies.run import as_driver
 from cprl.studies.trials import trials_of
 from cprl.system.shipped import cprl_here
 
@@ -405,7 +404,7 @@ def test_who_shares_a_study_keeps_another_one_out_when_the_first_has_left(tmp_pa
 
 
 def test_where_nothing_can_be_locked_nobody_else_is_said_to_run_a_study(tmp_path, monkeypatch):
-    monkeypatch.setattr("cprl.runs.lock.fcntl", None)
+    monkeypatch.setattr("cprl.runs.files.fcntl", None)
     with driven(Study(TINY, {FREEZE: [2, 5]}, name="short"), tmp_path) as driver:
         assert not driver.others
 

@@ -20,15 +20,13 @@ from tiny_study import FREEZE, TINY
 import cprl
 from cprl import Custom, Study, run_study
 from cprl.runs.checkpoints import FOLDER as CHECKPOINTS
-from cprl.runs.directory import changed_circumstances, start_run
 from cprl.runs.episodes import read_episodes
-from cprl.runs.lock import FILE_NAME as LOCK
-from cprl.runs.lock import RunLock, RunLockedError
+from cprl.runs.files import LOCK_FILE, RunLock, RunLockedError
+from cprl.runs.recipe import changed_circumstances, start_run
 from cprl.studies import read_study, trials
-from cprl.studies.execution import trials_with
 from cprl.studies.results import write_results
-from cprl.studies.status import Status
-from cprl.studies.trials import Outcome, run_task, state_of, task_of, trials_of
+from cprl.studies.run import trials_with
+from cprl.studies.trials import Outcome, Status, run_task, state_of, task_of, trials_of
 
 STUDY = Study(TINY, {FREEZE: [5, 25]})
 
@@ -82,7 +80,7 @@ def test_what_a_killed_process_left_before_its_recipe_is_no_obstacle(tmp_path, u
     own = task(tmp_path)
     own.directory.mkdir(parents=True)
     (own.directory / "recipe.json.0123abcd.partial").write_text("{")
-    (own.directory / LOCK).write_text("")
+    (own.directory / LOCK_FILE).write_text("")
     assert run_task(own).state == "finished"
     assert_same(own.directory, undisturbed)
 
@@ -213,7 +211,7 @@ def test_the_lock_of_another_host_is_taken_over_once_its_trial_is_silent(tmp_pat
     own.directory.mkdir(parents=True)
     shutil.copy(undisturbed / "recipe.json", own.directory)
     holder = {"host": "a-node-that-died", "pid": 1, "started": "2026-01-01T00:00:00+00:00"}
-    (own.directory / LOCK).write_text(json.dumps(holder))
+    (own.directory / LOCK_FILE).write_text(json.dumps(holder))
     monkeypatch.setattr(trials, "PATIENCE_S", 0.3)
     monkeypatch.setattr(trials, "_POLL_S", 0.05)
     silent_since, said = [], []

@@ -30,8 +30,7 @@ from cprl.measuring.episodes import EpisodeTracker
 from cprl.population import Frozen, Learning, Scripted, Team
 from cprl.preferences import Exchange, InequityAversion, SocialValueOrientation, WantedRewards
 from cprl.runs.checkpoints import Checkpointer, checkpoints_in
-from cprl.runs.columns import rows_of, schema_of
-from cprl.runs.episodes import EpisodeTable, read_episodes
+from cprl.runs.episodes import EpisodeTable, read_episodes, rows_of, schema_of
 from cprl.training import Training, train
 from cprl.training.agents import Population
 

@@ -10,7 +10,7 @@ from tiny_study import FREEZE, GAMMA, MIXED, TINY
 from cprl.algorithms import PPO, RolloutSettings
 from cprl.population import Learning
 from cprl.studies import Integers, LogUniform, Uniform
-from cprl.studies.words import factors_of
+from cprl.studies.factors import factors_of
 
 SETTINGS = "agents.*.algorithm.settings"
 FINITE = st.floats(allow_nan=False, allow_infinity=False, allow_subnormal=False)

@@ -8,10 +8,10 @@ from pathlib import Path
 import tyro
 
 import cprl
-from cprl.commands.parts import check_files
+from cprl.commands.play_stored import check_files
 from cprl.commands.recipe import in_a_sentence
 from cprl.evaluation import draw_gains
-from cprl.runs.labelled import write_table
+from cprl.runs.episodes import write_table
 from cprl.studies.trials import trials_of
 
 

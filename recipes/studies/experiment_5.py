@@ -17,7 +17,7 @@ from dataclasses import replace
 from base import PUBLISHED
 
 import cprl
-from cprl.studies.paths import changed
+from cprl.studies.factors import changed
 
 BY = "agents.*.algorithm"
 

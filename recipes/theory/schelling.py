@@ -25,7 +25,7 @@ from cprl.institutions import GraduatedSanctions, Quota, Tax
 from cprl.measuring.statistics import estimate
 from cprl.policies.scripted import SCRIPTED_POLICIES
 from cprl.reporting.markdown import table
-from cprl.runs.directory import FILE_NAME
+from cprl.runs.recipe import FILE_NAME
 from cprl.system.output import say
 from cprl.terminal.style import check_picture
 

@@ -61,7 +61,7 @@ class Taken:
         self.gains: list[Any] = []
 
     def on_step(self, batch: TensorDictBase) -> None:
-        """See `cprl.training.callbacks.Callback`."""
+        """See `cprl.training.training.Callback`."""
         self.totals.append(self.amounts[batch.get((keys.AGENTS, "action")).numpy()].sum(-1))
         paid = batch.get(("next", keys.AGENTS, "reward")).double().numpy()
         self.gains.append(paid.sum((1, 2)) - self.payments)

@@ -36,8 +36,8 @@ from cprl.population import (
     with_run_moved,
 )
 from cprl.preferences.values import check_preference
-from cprl.runs import formats
-from cprl.runs.recipes import FORMAT, recipe_config
+from cprl.runs.files import written_by_another
+from cprl.runs.recipe import RECIPE_FORMAT, recipe_config
 from cprl.system.memory import DEVICE
 
 LoggerName = Literal["tensorboard", "wandb"]
@@ -123,13 +123,13 @@ class Experiment:
         return read if not isinstance(read.game, Custom) else replace(read, game=game_of(read.game))
 
     def to_recipe(self, directory: str | Path | None = None) -> dict[str, Any]:
-        """What `recipe.json` says of it; `cprl.runs.directory.start_run` adds when and from what it was run.
+        """What `recipe.json` says of it; `cprl.runs.recipe.start_run` adds when and from what it was run.
 
         Args:
             directory: where the recipe is kept: runs of `Frozen` are then given relative to it.
         """
         stored = self if directory is None else frozen_relative_to(self, directory)
-        return {"format": FORMAT, "recipe": self.name, "experiment": stored.to_config()}
+        return {"format": RECIPE_FORMAT, "recipe": self.name, "experiment": stored.to_config()}
 
     @classmethod
     def from_recipe(
@@ -152,7 +152,7 @@ class Experiment:
         try:
             experiment = cls.from_config(recipe_config(recipe), allow=allow)
         except ValueError as error:
-            raise ValueError(f"{error}{formats.written_by_another(recipe)}") from error
+            raise ValueError(f"{error}{written_by_another(recipe)}") from error
         return experiment if directory is None else frozen_from(experiment, directory)
 
     def __eq__(self, other: object) -> bool:

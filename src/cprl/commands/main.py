@@ -16,17 +16,23 @@ import tyro
 
 from cprl.arguments import PLAY_SEED, SEED
 from cprl.commands.docs import docs
-from cprl.commands.egta import egta
-from cprl.commands.evaluation import crossplay, evaluate, film, schelling, visits
-from cprl.commands.exploit import exploit
-from cprl.commands.parts import check_runs
+from cprl.commands.play_stored import (
+    check_runs,
+    crossplay,
+    egta,
+    evaluate,
+    exploit,
+    film,
+    scenarios,
+    schelling,
+    visits,
+)
 from cprl.commands.recipe import TAKES_NOTHING_OVER, Allow, ended_by_sigterm, in_a_sentence, make_importable
 from cprl.commands.recipes import recipe as print_recipe
 from cprl.commands.recipes import refuse_unknown, run_by_name
-from cprl.commands.scenarios import scenarios
 from cprl.commands.studies import runs_table, sweep
 from cprl.presets import Variant, check_board
-from cprl.runs.directory import read_recipe
+from cprl.runs.recipe import read_recipe
 from cprl.system.output import keep_output, printed, say
 from cprl.system.process import prepare_process
 from cprl.viewer.page import Page, has_display, headers_of

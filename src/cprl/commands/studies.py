@@ -4,7 +4,9 @@ import importlib.util
 import inspect
 import os
 import sys
-from collections.abc import Callable, Sequence
+import time
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass, fields, replace
 from itertools import pairwise
 from pathlib import Path
@@ -12,18 +14,21 @@ from typing import TYPE_CHECKING, Annotated, Any, Final, Literal
 
 import tyro
 
-from cprl.arguments import BLOCK, LAST, WINDOW, object_of, texts
-from cprl.commands.recipe import in_a_sentence, parse_with
-from cprl.commands.studies_options import StudyOptions, carry_out
-from cprl.runs.directory import read_recipe, runs_in
+from cprl.arguments import BLOCK, LAST, WINDOW, integer, object_of, texts
+from cprl.commands.recipe import ended_by_sigterm, in_a_sentence, parse_with
 from cprl.runs.files import refuse_to_write_over, write_atomically
-from cprl.system.output import OUT, console, keep_output, printed, say
-from cprl.system.shipped import is_shipped, program_of, recipe_named
+from cprl.runs.recipe import read_recipe, runs_in, without_directories, without_options
+from cprl.system.output import OUT, RESUMES, console, keep_output, printed, say
+from cprl.system.shipped import command_of, is_shipped, named_command, program_of, recipe_named
 
 if TYPE_CHECKING:
     from cprl.experiment import Experiment
     from cprl.studies import Search, Study, StudyTable
-    from cprl.studies.tables.texts import Cells
+    from cprl.studies.tables.comparing import Cells
+if TYPE_CHECKING:
+    from cprl.studies import Search, SearchResult, Study, StudyResult
+    from cprl.studies.executors import Executor
+    from cprl.studies.trials import Outcome, Trial
 
 PROGRAM: Final = "cprl sweep"
 _RECIPE: Final = (
@@ -42,6 +47,38 @@ _NOTE: Final = (
     "uniform(LOW,HIGH), loguniform(LOW,HIGH) or integers(LOW,HIGH). Every other flag below is the same in "
     "all conditions; --replicas are those of each condition."
 )
+
+
+@dataclass(frozen=True, kw_only=True)
+class StudyOptions:
+    """How a study is run and compared; nothing of it changes a run."""
+
+    out: Path | None = None
+    """The study's directory; by default studies/NAME. The same line continues a study that was stopped, and
+    runs what is new in one that was changed."""
+    runs: Path | None = None
+    """The directory of the runs, which several studies may share; by default runs/ in the study's."""
+    jobs: int | None = None
+    """Trials that run at the same time."""
+    only: tyro.conf.UseAppendAction[tuple[str, ...]] = ()
+    """Run a condition alone, or those with some levels: "gamma=0.9", "gamma=0.9, freeze_steps=5"; may be
+    repeated. The others stay as they are, so that several machines can share a study."""
+    keep_checkpoints: bool = False
+    """Keep the state of each training, buffers included (an agent's takes as much as its buffer), so that the
+    same study with more --episodes goes on from there."""
+    on: Literal["here", "processes", "ray"] | None = None
+    """Where trials are run: one after the other in this process, in processes on this machine, or by Ray
+    (extra "ray"); by default here, and in processes with more than one of --jobs."""
+    address: str | None = None
+    """Of a Ray cluster: "auto", or HOST:PORT; with --on ray."""
+    figures: bool = True
+    """Write the table, summary and figures at the end."""
+    last: int = LAST
+    """Episodes at the end of the training that these compare; of long trainings rather 500."""
+    dry_run: bool = False
+    """List all conditions, trials and their states; run and write nothing."""
+    allow: tyro.conf.UseAppendAction[tuple[str, ...]] = ()
+    """A class of somebody's own that stored runs may import, "module:Class"; may be repeated."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -180,8 +217,7 @@ def wanted(experiment: "Experiment", options: SweepOptions) -> "Study | Search":
         ValueError: for options that contradict each other, and for whatever the study refuses.
     """
     from cprl.studies import Search, Study
-    from cprl.studies.factors import Distribution
-    from cprl.studies.words import factors_of
+    from cprl.studies.factors import Distribution, factors_of
 
     if not options.vary:
         raise ValueError("nothing is varied; allowed: --vary PATH=VALUE,VALUE..., at least once")
@@ -306,8 +342,8 @@ def runs_table(
         )
     runs_in(runs)
 
+    from cprl.studies.tables.comparing import rich_table
     from cprl.studies.tables.pooled import pooled_table
-    from cprl.studies.tables.texts import rich_table
 
     found = pooled_table(runs, by=by, window=window, reference=reference, allow=allow)
     compared = _compared(found, metric, part, LAST if last is None else last)
@@ -322,8 +358,7 @@ def runs_table(
 
 def _compared(found: "StudyTable", metrics: Sequence[str], part: Part, last: int) -> "list[Cells]":
     """Levels, and differences where there is more than one condition."""
-    from cprl.studies.tables.comparing import compare, metrics_of
-    from cprl.studies.tables.texts import cells
+    from cprl.studies.tables.comparing import cells, compare, metrics_of
 
     chosen = metrics_of(found, metrics)
     if not chosen:
@@ -337,7 +372,7 @@ def _write(found: "StudyTable", compared: "Sequence[Cells]", out: Path) -> None:
     if out.suffix == ".parquet":
         found.write(out)
         return
-    from cprl.studies.tables.texts import markdown
+    from cprl.studies.tables.comparing import markdown
 
     lines = [line for own in compared for line in (own.heading, "", *markdown(own))]
     content = "\n".join([*lines, *str(found).split("\n"), ""]).encode()
@@ -357,3 +392,146 @@ _LISTED: Final = 20
 _CONFIG: Final = (tyro.conf.HelptextFromCommentsOff,)
 _DEFAULTS: Final = SweepOptions()
 _OF_SEARCH: Final = ("over", "sampler", "at_once")
+
+
+_BEST: Final = 10
+"""Points of a search that are printed."""
+
+
+def executor_of(options: StudyOptions) -> "Executor":
+    """Where trials are run.
+
+    Raises:
+        ValueError: for options that contradict each other.
+    """
+    from cprl.studies.executors import InProcess, Processes, Ray
+
+    jobs, on = options.jobs, options.on
+    if jobs is not None:
+        integer("--jobs", jobs, 1, 4096)
+    on = on or ("processes" if (jobs or 1) > 1 else "here")
+    if options.address is not None and on != "ray":
+        raise ValueError(f"--address is for --on ray, and this is --on {on}; allowed: one with the other")
+    if on == "here":
+        if (jobs or 1) > 1:
+            raise ValueError(f"--jobs is {jobs} with --on here; allowed: 1, or --on processes")
+        return InProcess()
+    if on == "ray":
+        return Ray(options.address, jobs=jobs)
+    cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+    return Processes(jobs or cores)
+
+
+def carry_out(what: "Study | Search", options: StudyOptions, command: Sequence[str]) -> Path:
+    """Runs a study or a search as the command line asks for it, and says what came of it.
+
+    Args:
+        what: the study or search.
+        options: how it is run.
+        command: the command line, script first, which is said where it can be used again.
+
+    Returns:
+        The study's directory.
+
+    Raises:
+        ValueError: for whatever does not fit, before anything is written.
+        SystemExit: with code 1 where trials have failed, and 130 or 143 where it was interrupted.
+    """
+    from cprl.studies import Search, run_search, run_study
+
+    executor, again = executor_of(options), printed(command_of(command))
+    if isinstance(what, Search):
+        for flag, value in {"--only": options.only, "--keep-checkpoints": options.keep_checkpoints}.items():
+            if value:
+                raise ValueError(
+                    f"{flag} is for studies, and this is a search; allowed: one without the other"
+                )
+    if options.dry_run:
+        return _list(what, options)
+    names = ("runs", "allow", "last")
+    how: dict[str, Any] = {"on": executor, **{own: getattr(options, own) for own in names}}
+    program, *words = named_command(command)
+    whole = without_options(words, ["--only"])  # what a part of a study lacks, it lacks
+    how |= {"results": options.figures, "again": printed([without_directories(program), *whole])}
+    with _interruptible(again):
+        result: StudyResult | SearchResult
+        if isinstance(what, Search):
+            result = run_search(what, options.out, **how)
+            _say_best(result)
+        else:
+            how |= {"only": options.only, "keep_checkpoints": options.keep_checkpoints}
+            result = run_study(what, options.out, **how)
+    say(result.out)
+    if result.failed:
+        _say_failed(result, again)
+        sys.exit(1)
+    return result.out
+
+
+def _list(what: "Study | Search", options: StudyOptions) -> Path:
+    """Prints all trials and their states."""
+    from cprl.studies import Search, Study
+    from cprl.studies.progress import Overview, table_of
+    from cprl.studies.run import trials_with
+    from cprl.studies.study import RUNS, STATUS, directory_of
+    from cprl.studies.trials import BEAT_S, trials_of
+
+    study = Study(what.experiment, name=what.name) if isinstance(what, Search) else what
+    out = directory_of(study, options.out)
+    if isinstance(what, Search):
+        factors = ", ".join(f"{name}: {own}" for name, own in what.factors.items())
+        say(f"{what.points} points of {factors}, found one after the other, in {out}; nothing was written")
+        return out
+    trials = trials_with(trials_of(study), options.only)
+    runs = out / RUNS if options.runs is None else options.runs
+    overview = Overview(trials, runs=runs, status=out / STATUS)
+    now = overview.look()
+    if now.counts["unfinished"]:  # those that run say something new within a second
+        time.sleep(1.5 * BEAT_S)
+        now = overview.look()
+    console(width=None if sys.stdout.isatty() else 160).print(table_of(now, title=study.name))
+    names = ", ".join(study.columns)
+    say(
+        f"{len(study.all_conditions)} conditions ({names}), {study.replicas} replicas each, in {runs}; "
+        "nothing was written"
+    )
+    return out
+
+
+def _say_best(result: "SearchResult") -> None:
+    search = result.search
+    words = {"maximise": "highest", "minimise": "lowest"}[search.direction]
+    say(f"{search.name}: {len(result.points)} points; the {words} {search.metric}, means over replicas:")
+    for point in result.ranked[:_BEST]:
+        say(f"  {point.value:10.6g}  {point.name}")
+    refused = [own for own in result.points if own.reason]
+    if refused:
+        say(f"  {len(refused)} points were refused, e.g. {refused[0].name}: {refused[0].reason}")
+
+
+def _say_failed(result: "StudyResult | SearchResult", again: str) -> None:
+    """Lists the trials that failed, where to look, and what to do."""
+    from cprl.studies.progress import label_of
+    from cprl.studies.study import STATUS
+    from cprl.studies.trials import Status
+
+    trials: dict[str, Trial] = {trial.name: trial for trial in result.trials}
+    outcomes: dict[str, Outcome] = {own.name: own for own in result.failed}
+    lines = [f"{len(outcomes)} of {len(trials)} trials failed; the others are kept:"]
+    for name, outcome in outcomes.items():
+        status = Status(result.out / STATUS, name)
+        where = status.failed if status.failed.exists() else status.log
+        lines += [f"  {label_of(trials[name])}: {outcome.reason}", f"    {where}"]
+    say("\n".join([*lines, f"To try them again: {again}"]))
+
+
+@contextmanager
+def _interruptible(again: str) -> Iterator[None]:
+    """Says what is kept, and what continues, where the block is ended by Ctrl-C (SIGINT) or SIGTERM."""
+    try:
+        with ended_by_sigterm():
+            yield
+    except (KeyboardInterrupt, SystemExit) as error:
+        kept = [note for note in getattr(error, "__notes__", []) if not note.startswith(RESUMES)]
+        say("\n".join(["Interrupted.", *kept, f"To continue: {again}"]))
+        sys.exit(130 if isinstance(error, KeyboardInterrupt) else error.code)

@@ -25,7 +25,7 @@ from cprl.evaluation.cross_play import CrossPlay, named_runs
 from cprl.evaluation.evaluate import SEED, check, check_same_game, chosen_replicas
 from cprl.evaluation.lanes import Played, Source, play, policies_of
 from cprl.measuring.episodes import Episode
-from cprl.runs.labelled import labelled
+from cprl.runs.episodes import labelled
 from cprl.theory.evolution import MOST_PROFILES
 from cprl.theory.payoff_table import PayoffTable, compositions
 from cprl.training.stored import LoadedRun

@@ -25,7 +25,7 @@ from cprl.measuring.replicas import (
 )
 from cprl.measuring.reported import left_out
 from cprl.measuring.series import OF_AGENTS
-from cprl.runs.labelled import labelled
+from cprl.runs.episodes import labelled
 from cprl.training.stored import LoadedRun, load
 
 _LONGEST: Final = 40

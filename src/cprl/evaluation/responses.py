@@ -32,7 +32,7 @@ from cprl.evaluation.lanes import Played
 from cprl.evaluation.populations import play_population
 from cprl.measuring.statistics import Estimate, difference, estimate
 from cprl.population import Frozen
-from cprl.runs.labelled import labelled
+from cprl.runs.episodes import labelled
 from cprl.training.stored import LoadedRun, load
 
 

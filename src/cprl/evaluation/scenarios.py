@@ -46,11 +46,10 @@ from cprl.measuring.replicas import Measured, institution_measures, over_replica
 from cprl.measuring.statistics import Estimate, difference
 from cprl.policies.assignment import AgentPolicies
 from cprl.population import Frozen, Scripted
-from cprl.runs.labelled import labelled
+from cprl.runs.episodes import labelled
 from cprl.terminal.style import MARK, MEAN, SMALL_PT, head, picture_path, save
 from cprl.training.agents import check_scripted
-from cprl.training.stored import LoadedRun, load
-from cprl.training.stored_agents import StoredAgent, stored_policies
+from cprl.training.stored import LoadedRun, StoredAgent, load, stored_policies
 
 Focal: TypeAlias = Literal["majority", "minority"]
 """How many agents are focal: "majority", all but one; "minority", one."""

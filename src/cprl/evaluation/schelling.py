@@ -30,7 +30,7 @@ from cprl.measuring.dilemmas import Dilemma, dilemma
 from cprl.measuring.replicas import Measured, social_measures
 from cprl.measuring.statistics import estimate
 from cprl.policies.scripted import SCRIPTED_POLICIES
-from cprl.runs.labelled import labelled
+from cprl.runs.episodes import labelled
 from cprl.terminal import style
 
 _ALIKE_WITHOUT_A_BEAM: Final = {"greedy", "territorial"}

@@ -16,7 +16,7 @@ from cprl.measuring.movement import Trace, overlap, rounds, shooting_distance, t
 from cprl.measuring.published import SMOOTHED_EPISODES
 from cprl.policies.assignment import AgentPolicies
 from cprl.runs.curves import curves_of, running_mean
-from cprl.runs.kept import lacks_weights
+from cprl.runs.weights import lacks_weights
 from cprl.training.stored import LoadedRun, load
 
 Values = NDArray[np.float64]

@@ -10,8 +10,8 @@ import numpy as np
 from cprl.evaluation.evaluate import SEED
 from cprl.reporting.measures import Measures, measures, of_training
 from cprl.reporting.result import Result, Values
-from cprl.runs.kept import lacks_weights
-from cprl.studies.conditions import UNNAMED, Condition
+from cprl.runs.weights import lacks_weights
+from cprl.studies.study import UNNAMED, Condition
 
 _LONGEST_NAME: Final = 80
 """Of a pool; figures are named after it."""

@@ -19,9 +19,9 @@ from cprl.measuring.published import SMOOTHED_EPISODES, PublishedExperiment, pub
 from cprl.population import Learning, Scripted, Team, exploration_steps
 from cprl.reporting.measures import Measures, measures
 from cprl.runs.curves import Phases, as_curves, curves_of, episode_of_step, phases_of, running_mean
-from cprl.runs.directory import read_recipe
 from cprl.runs.episodes import read_episodes
 from cprl.runs.files import read_json
+from cprl.runs.recipe import read_recipe
 
 Values = NDArray[np.float64]
 

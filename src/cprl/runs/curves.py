@@ -14,8 +14,7 @@ from cprl.institutions import COUNTS
 from cprl.measuring import phases, social
 from cprl.measuring.institutions import summary
 from cprl.measuring.published import SMOOTHED_EPISODES
-from cprl.runs.columns import OF_INSTITUTIONS
-from cprl.runs.episodes import read_episodes
+from cprl.runs.episodes import OF_INSTITUTIONS, read_episodes
 
 Values = NDArray[np.float64]
 Phases = tuple[list[phases.ChangePoint], list[phases.Phase]]

@@ -6,11 +6,14 @@ During a run every episode is appended at once to a journal, `episodes.arrows`, 
 
 import os
 from collections.abc import Iterable, Iterator, Mapping, Sequence
+from dataclasses import replace
 from errno import EIO, ENOENT
+from functools import partial
+from io import BytesIO
 from itertools import pairwise
 from pathlib import Path
 from types import TracebackType
-from typing import BinaryIO, Final, Self
+from typing import Any, BinaryIO, Final, Self
 
 import numpy as np
 import pyarrow as pa
@@ -18,12 +21,20 @@ import pyarrow.parquet as pq
 from tensordict import TensorDictBase
 
 from cprl.arguments import path as path_of
-from cprl.measuring import Episode
-from cprl.runs import formats
-from cprl.runs.columns import rows_of, schema_of, whole_schema
-from cprl.runs.files import read_json, refuse_special
+from cprl.institutions import COUNTS
+from cprl.measuring import Episode, social
+from cprl.measuring.reported import left_out
+from cprl.runs.files import (
+    RECIPE_FORMAT,
+    read_json,
+    refuse_newer,
+    refuse_special,
+    refuse_to_write_over,
+    verify,
+    write_atomically,
+    write_listed,
+)
 from cprl.runs.journal import Content, Journal, read_journal, write_journal
-from cprl.runs.manifest import verify, write_listed
 
 FILE_NAME: Final = "episodes.parquet"
 
@@ -167,12 +178,12 @@ def read_episodes(run_directory: str | os.PathLike[str]) -> pa.Table:
 
     Raises:
         FileNotFoundError: if there are none.
-        ValueError: if the file is damaged, see `cprl.runs.manifest`, or a newer cprl wrote it.
+        ValueError: if the file is damaged, see `cprl.runs.files`, or a newer cprl wrote it.
     """
     path = path_of("run_directory", run_directory) / FILE_NAME
     recipe = path.with_name("recipe.json")  # with the format of the journal, which has none of its own
     if recipe.is_file():
-        formats.refuse_newer(recipe, read_json(recipe), formats.RECIPE)
+        refuse_newer(recipe, read_json(recipe), RECIPE_FORMAT)
     try:
         # The journal first: while it exists it holds every row, and a merge does not change it.
         return _as_table(read_journal(_journal_of(path)))
@@ -249,3 +260,189 @@ def _large_tables(batches: Iterable[pa.RecordBatch]) -> Iterator[pa.Table]:
             group, rows = [], 0
     if group:
         yield pa.Table.from_batches(group)
+
+
+COLUMNS: Final = {
+    "replica": pa.int32(),
+    "episode": pa.int32(),
+    "agent": pa.int32(),
+    "return": pa.float32(),
+    "wanted_return": pa.float32(),
+    "harvest": pa.float32(),
+    "steps": pa.int32(),
+    "in_play_steps": pa.int32(),
+    "shots": pa.int32(),
+    "hits": pa.int32(),
+    "tagged": pa.int32(),
+    "stock_left": pa.int32(),
+    "depletion_step": pa.int32(),
+    "terminated": pa.bool_(),
+}
+"""The columns of a table, as in `Episode`; the metrics follow, float64, NaN where undefined.
+
+Values of the whole episode are repeated in the row of each agent. Values that the game does not report have
+no column; nor has the wanted return outside of a training. It is null for agents that do not learn."""
+
+_WANTED: Final = "wanted_return"
+_LATER: Final = {_WANTED, "yield_share"}
+"""Columns that tables of earlier versions lack."""
+
+OF_INSTITUTIONS: Final = {
+    "decision": pa.int32(),
+    "fines": pa.float64(),
+    "transfers": pa.float64(),
+    "violations": pa.int32(),
+    **{name: pa.int32() for name in COUNTS if name != "violations"},
+}
+"""The columns of a game with institutions, between those of `COLUMNS` and the metrics; those of counts only
+where `cprl.measuring.institutions.counts_for` has them. One for each decision in force follows, `in_force_0`
+and so on, float64."""
+
+LEFT_OUT: Final = b"left_out"
+"""The key of the schema's metadata whose value says which columns are left out, and why, if any are."""
+
+
+def whole_schema() -> pa.Schema:
+    """All columns and metrics, for a table without an episode."""
+    return _schema(COLUMNS, (), (*social.METRICS, "yield_share"))
+
+
+def _schema(columns: Iterable[str], more: Iterable[str], metrics: Iterable[str]) -> pa.Schema:
+    return pa.schema(
+        {name: COLUMNS[name] for name in columns}
+        | {name: OF_INSTITUTIONS.get(name, pa.float64()) for name in more}
+        | dict.fromkeys(metrics, pa.float64())
+    )
+
+
+def schema_of(episode: Episode) -> pa.Schema:
+    """The columns that an episode has; the schema's metadata names those that it lacks."""
+    schema = _schema(_columns_of(episode), _of_institutions(episode), episode.metrics)
+    missing = left_out(episode.reported)
+    return schema.with_metadata({LEFT_OUT: missing}) if missing else schema
+
+
+def _columns_of(episode: Episode) -> list[str]:
+    return [name for name in COLUMNS if getattr(episode, name, "") is not None]
+
+
+def _of_institutions(episode: Episode) -> dict[str, Any]:
+    """The values of the columns of institutions, [N] or a number; none for a game without them."""
+    payments = {"fines": episode.fines, "transfers": episode.transfers, "violations": episode.violations}
+    payments["decision"] = episode.decision
+    found = {**(episode.counts or {}), **{name: own for name, own in payments.items() if own is not None}}
+    in_force: list[float] = [] if episode.in_force is None else episode.in_force.tolist()
+    return {
+        **{name: found[name] for name in OF_INSTITUTIONS if name in found},
+        **{f"in_force_{nth}": value for nth, value in enumerate(in_force)},
+    }
+
+
+def rows_of(episodes: Sequence[Episode], replica: int | None, schema: pa.Schema) -> pa.RecordBatch:
+    """A row for each episode and agent.
+
+    Args:
+        episodes: at least one.
+        replica: the index of their replica; None for each episode's world.
+        schema: what `schema_of` gave for the first episode of the table.
+
+    Raises:
+        ValueError: if an episode has other columns.
+    """
+    of_each = [_cells(episode, episode.world if replica is None else replica) for episode in episodes]
+    for cells in of_each:
+        for name in _LATER - set(schema.names):  # a table that an earlier cprl began goes on without it
+            cells.pop(name, None)
+        if cells.keys() != set(schema.names):
+            more, lacks = cells.keys() - set(schema.names), set(schema.names) - cells.keys()
+            raise ValueError(
+                f"the episode has the extra columns {sorted(more)} and lacks {sorted(lacks)}; allowed: the "
+                "columns of the table's first episode"
+            )
+    return pa.record_batch(
+        [
+            pa.array(
+                np.concatenate([cells[column.name] for cells in of_each]),
+                column.type,
+                from_pandas=column.name == _WANTED,  # no number, of agents that do not learn, is null
+            )
+            for column in schema
+        ],
+        schema=schema,
+    )
+
+
+def _cells(episode: Episode, replica: int) -> dict[str, Any]:
+    """The values of each column, [N]."""
+    own = {name: getattr(episode, name, None) for name in _columns_of(episode)}
+    agents = np.arange(len(episode.return_))
+    cells: dict[str, Any] = {
+        **own,
+        "replica": replica,
+        "agent": agents,
+        "return": episode.return_,
+        **_of_institutions(episode),
+        **episode.metrics,
+    }
+    return {name: np.broadcast_to(cell, agents.shape) for name, cell in cells.items()}
+
+
+_COMPRESSED: Final = {"compression": "zstd", "compression_level": 19}
+
+Label = Mapping[str, str | int]
+"""The values of the first columns, by name."""
+
+
+def labelled(parts: Iterable[tuple[Label, int, Sequence[Episode]]]) -> pa.Table:
+    """A table like `episodes.parquet`, with label columns first.
+
+    Args:
+        parts: labels, all with the same names; the index of a replica; and its episodes, numbered from 0.
+    """
+    tables = []
+    for label, replica, episodes in parts:
+        table = as_table([replace(episode, episode=nth) for nth, episode in enumerate(episodes)], replica)
+        for place, (name, value) in enumerate(label.items()):
+            kind = pa.string() if isinstance(value, str) else pa.int32()
+            table = table.add_column(place, pa.field(name, kind), pa.array([value] * len(table), kind))
+        tables.append(table)
+    return pa.concat_tables(tables)
+
+
+def write_table(path: Path, table: pa.Table, *, over: bool = False) -> None:
+    """Writes a parquet file atomically, in little room.
+
+    Args:
+        path: the file.
+        table: what it holds.
+        over: whether a file that exists is replaced.
+
+    Raises:
+        FileExistsError: if the file exists and is not to be replaced.
+    """
+    if not over:
+        refuse_to_write_over(path)
+    path.parent.mkdir(parents=True, exist_ok=True)
+    how = small(table)
+    write_atomically(path, lambda file: pq.write_table(table, file, **how))
+
+
+def small(table: pa.Table) -> dict[str, Any]:
+    """How parquet holds a table in little room: each column by dictionary, split into bytes, or as it is,
+    whichever is smallest."""
+    chosen: dict[str, list[str]] = {"use_dictionary": [], "use_byte_stream_split": []}
+    for field in table.schema:
+        ways: list[dict[str, Any]] = [{"use_dictionary": True}, {"use_dictionary": False}]
+        if pa.types.is_integer(field.type) or pa.types.is_floating(field.type):
+            ways.append({"use_dictionary": False, "use_byte_stream_split": True})
+        best = min(ways, key=partial(_size, table.select([field.name])))
+        for way, columns in chosen.items():
+            if best.get(way):
+                columns.append(field.name)
+    return {**_COMPRESSED, **chosen}
+
+
+def _size(column: pa.Table, how: Mapping[str, Any]) -> int:
+    written = BytesIO()
+    pq.write_table(column, written, compression="zstd", compression_level=3, **how)  # which is quick
+    return written.tell()

@@ -12,14 +12,11 @@ import pyarrow.parquet as pq
 from cprl.arguments import path as path_of
 from cprl.arguments import switch
 from cprl.config import differences
-from cprl.runs.directory import FILE_NAME as RECIPE
-from cprl.runs.directory import read_recipe
-from cprl.runs.episodes import FILE_NAME, read_episodes, read_table
-from cprl.runs.files import refuse_links
-from cprl.runs.labelled import small
-from cprl.runs.manifest import refuse_missing, unlist, verify, write_listed
-from cprl.runs.partners import FIELD as FROZEN
+from cprl.runs.episodes import FILE_NAME, read_episodes, read_table, small
+from cprl.runs.files import refuse_links, refuse_missing, unlist, verify, write_listed
+from cprl.runs.recipe import RECIPE_FILE, read_recipe
 from cprl.runs.weights import DECISIONS, TRANSFORMS
+from cprl.runs.weights import FIELD as FROZEN
 
 _IF_ANY = tuple(f"checkpoints/{name}" for name in (TRANSFORMS, DECISIONS))
 _WHOLE = ("recipe.json", "report.json")
@@ -72,7 +69,7 @@ def export_results(run: Path, folder: Path, *, weights: bool = True) -> Path:
         moved[FROZEN] = {os.path.relpath(run / own, folder): digest for own, digest in recipe[FROZEN].items()}
     if moved != recipe:
         content = (json.dumps(moved, indent=2) + "\n").encode()
-        write_listed(folder, RECIPE, lambda file: file.write(content))
+        write_listed(folder, RECIPE_FILE, lambda file: file.write(content))
     _write(read_episodes(run), folder, FILE_NAME)
     for path in sorted((run / "evaluation").glob("*.parquet")):
         _write(read_table(path), folder, f"evaluation/{path.name}")
@@ -95,7 +92,7 @@ def _refuse_another(folder: Path, run: Path, recipe: Mapping[str, Any]) -> None:
     for pattern in _OF_RUNS:
         for path in folder.glob(pattern):
             raise ValueError(f"folder is {folder}, a run of its own: it has {path.name}; {allowed}")
-    if (folder / RECIPE).exists():
+    if (folder / RECIPE_FILE).exists():
         there = _with_frozen_moved(read_recipe(folder), folder, run)
         differ = differences(_experiment(there), _experiment(recipe), "experiment")
         if differ:

@@ -7,20 +7,15 @@ from typing import Final
 
 from cprl.arguments import object_of
 from cprl.arguments import path as path_of
-from cprl.runs.extension import REPORT
+from cprl.runs.checkpoints import REPORT
 from cprl.runs.files import read_json, refuse_links, write_atomically
-from cprl.studies.figures.by_condition import by_condition
-from cprl.studies.figures.by_factor import by_factor
 from cprl.studies.figures.courses import courses
 from cprl.studies.figures.diagrams import grids, heat_map, phase_diagram
-from cprl.studies.figures.panels import MOST_CONDITIONS, is_numeric
+from cprl.studies.figures.levels import MOST_CONDITIONS, by_condition, by_factor, is_numeric
 from cprl.studies.study import Study
-from cprl.studies.tables.comparing import LAST, compare, metrics_of
-from cprl.studies.tables.outcomes import Endings, endings
-from cprl.studies.tables.sources import Source, sources_of
+from cprl.studies.tables.comparing import LAST, cells, compare, markdown, metric_title, metrics_of
+from cprl.studies.tables.sources import EVALUATION, RANDOM, TRAINING, Endings, Source, endings, sources_of
 from cprl.studies.tables.table import WINDOW, StudyTable, study_table
-from cprl.studies.tables.texts import cells, markdown, metric_title
-from cprl.studies.tables.windows import EVALUATION, RANDOM, TRAINING
 
 TABLE: Final = "table.parquet"
 SUMMARY: Final = "summary.md"

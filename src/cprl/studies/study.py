@@ -1,22 +1,27 @@
 """Study: one experiment under several conditions, each repeated by the same replicas; a value."""
 
+import hashlib
+import json
 import os
-from collections.abc import Iterable, Iterator, Mapping
-from dataclasses import dataclass, field
+from collections.abc import Container, Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field, fields, is_dataclass, replace
 from functools import cached_property, partial
+from itertools import chain, count
 from pathlib import Path
 from typing import Any, Final
 
-from cprl.arguments import BLOCK, integer, object_of, refusal
+from cprl.arguments import BLOCK, integer, object_of, path, refusal, texts
 from cprl.checks import DIRECTORY_NAME, check_nesting, checked, instance, shown
+from cprl.config import without_defaults
 from cprl.experiment import MOST_SEED, Experiment, frozen_from, frozen_relative_to
 from cprl.population import stored_of
-from cprl.runs import formats
-from cprl.studies.conditions import Condition, apart, experiment_at
+from cprl.runs.files import STUDY_FORMAT, read_json, refuse_newer, write_json
+from cprl.runs.recipe import RECIPE_FILE
 from cprl.studies.factors import (
     MOST_CONDITIONS,
     Factor,
     Level,
+    changed,
     changes_from_config,
     changes_to_config,
     checked_factors,
@@ -25,14 +30,76 @@ from cprl.studies.factors import (
     factor_to_config,
     grid,
 )
-from cprl.studies.naming import named, short_names
 
-FORMAT: Final = formats.STUDY
-"""Of `Study.to_config`."""
 _TRIES: Final = 20
 """Draws for each one that is kept, at most."""
 SEEDS_APART: Final = 1000
 """Between the seeds of two blocks of replicas; evaluation plays worlds of the next seed."""
+
+
+CONDITION_FORMAT: Final = 1
+"""Of checksums: counted up when a default of any value of `cprl.config.KINDS`, or of `Experiment`, changes,
+so that the same checksum never means two things."""
+
+
+UNNAMED: Final = ("name", "seed", "replicas", "on_nan")
+"""Fields of an experiment that its checksum leaves out: what it is called, which repetitions of it a run
+holds, and what happens where a number is not finite."""
+
+
+@dataclass(frozen=True, eq=False)
+class Condition:
+    """One experiment of a study.
+
+    Args:
+        experiment: what is trained; its seed and replicas are those of the study.
+        levels: the level of each factor, by factor: a value, or the name of a level.
+        name: what it is called, unique in its study.
+    """
+
+    experiment: Experiment
+    levels: Mapping[str, Any] = field(default_factory=dict)
+    name: str = ""
+
+    @cached_property
+    def checksum(self) -> str:
+        """Of all that decides its numbers but the seed: 12 hexadecimal digits.
+
+        Fields that have their default are left out, so that a later version, which has further ones, gives
+        the same.
+        """
+        table = {name: own for name, own in self.experiment.to_config().items() if name not in UNNAMED}
+        kept = {"format": CONDITION_FORMAT, "experiment": without_defaults(table, Experiment)}
+        return hashlib.blake2b(json.dumps(kept, sort_keys=True).encode(), digest_size=6).hexdigest()
+
+
+def experiment_at(experiment: Experiment, levels: Mapping[str, Level]) -> Experiment:
+    """An experiment with what a level of each factor changes.
+
+    Raises:
+        ValueError: for two factors that change the same field, for a field that the study itself decides,
+            and for what does not fit, see `cprl.studies.factors.changed`.
+    """
+    changes = {path: value for own in levels.values() for path, value in own.changes.items()}
+    twice = sum(len(own.changes) for own in levels.values()) - len(changes)
+    if twice:
+        raise ValueError(f"two factors change the same field, of {', '.join(changes)}; allowed: one each")
+    refused = [path for path in changes if path in ("seed", "replicas", "name")]
+    if refused:
+        raise ValueError(f"a factor is {refused[0]}, which the study itself decides; allowed: other fields")
+    return changed(experiment, changes) if changes else experiment
+
+
+def apart(conditions: Iterable[Condition]) -> tuple[Condition, ...]:
+    """Conditions with a number after their name where others have the same, e.g. of unlike agents."""
+    conditions = tuple(conditions)
+    taken = {own.name for own in conditions}
+    found: dict[str, Condition] = {}
+    for own in conditions:
+        name = unlike(own.name, taken) if own.name in found else own.name
+        taken.add(name)
+        found[name] = own if name == own.name else replace(own, name=name)
+    return tuple(found.values())
 
 
 @dataclass(frozen=True, eq=False)
@@ -41,7 +108,7 @@ class Study:
 
     Args:
         experiment: what every condition is, but for what it changes.
-        factors: by the path of a field (see `cprl.studies.paths`), its values; or by a name of your own, a
+        factors: by the path of a field (see `cprl.studies.factors`), its values; or by a name of your own, a
             table of levels, each a table of values by path; or a distribution, with `draws`.
         conditions: named ones instead of factors, each a table of values by path; `{}` changes nothing.
         draws: so many random combinations of the factors' levels instead of their grid.
@@ -188,7 +255,7 @@ class Study:
         place = _no_change if directory is None else partial(os.path.relpath, start=directory)
         stored = self.experiment if directory is None else frozen_relative_to(self.experiment, directory)
         return {
-            "format": FORMAT,
+            "format": STUDY_FORMAT,
             "experiment": stored.to_config(),
             "factors": [[name, factor_to_config(name, own, place)] for name, own in self.factors.items()],
             "conditions": [[name, changes_to_config(own, place)] for name, own in self.conditions.items()],
@@ -215,12 +282,12 @@ class Study:
         """
         checked("the study", table, instance(Mapping, "a table"))
         check_nesting(table, "the study")
-        formats.refuse_newer("the study", table, FORMAT)
+        refuse_newer("the study", table, STUDY_FORMAT)
         lacks = [name for name in ("experiment", "factors", "conditions", *_PLAIN) if name not in table]
-        if table.get("format") != FORMAT or lacks:
+        if table.get("format") != STUDY_FORMAT or lacks:
             raise ValueError(
                 f"the study has the format {shown(table.get('format'))}"
-                f"{' and lacks ' + ', '.join(lacks) if lacks else ''}; allowed: {FORMAT}, complete"
+                f"{' and lacks ' + ', '.join(lacks) if lacks else ''}; allowed: {STUDY_FORMAT}, complete"
             )
         if table.get("pairing") is False:
             raise ValueError("the study has pairing false; allowed: true")
@@ -286,3 +353,104 @@ def _checked_conditions(conditions: object) -> dict[str, dict[str, Any]]:
         if not isinstance(name, str) or not name or not isinstance(own, Mapping):
             raise refusal(f"conditions[{name!r}]", own, allowed)
     return {name: dict(own) for name, own in conditions.items()}
+
+
+BETWEEN = ", "
+"""Between the levels in the name of a condition."""
+
+
+def named(levels: Mapping[str, Any]) -> str:
+    """The name of a condition, e.g. "freeze_steps=5, gamma=0.9"."""
+    return BETWEEN.join(f"{name}={level_text(value)}" for name, value in levels.items())
+
+
+def unlike(name: str, taken: Container[str]) -> str:
+    """A name; with the lowest number from 2 on that is free where it is taken."""
+    numbered = (f"{name} #{nth}" for nth in count(2))
+    return next(own for own in chain([name], numbered) if own not in taken)
+
+
+def levels_in(name: str) -> list[str]:
+    """The levels in the name of a condition; those of a tuple or an agent, in brackets, are not apart."""
+    found: list[str] = []
+    depth = 0
+    for part in name.split(BETWEEN):
+        if depth:
+            found[-1] += BETWEEN + part
+        else:
+            found.append(part)
+        depth = max(0, depth + sum((own in "([{") - (own in ")]}") for own in part))
+    return found
+
+
+def level_text(value: Any) -> str:
+    """A level in a few words, for names and figures."""
+    if isinstance(value, float):
+        return f"{value:.6g}"
+    if isinstance(value, tuple):
+        return f"({', '.join(map(level_text, value))})"
+    if is_dataclass(value) and not isinstance(value, type):
+        return _value_text(value)
+    return value if isinstance(value, str) else shown(value)
+
+
+def _value_text(value: Any) -> str:
+    """A dataclass by its class and its first field that is no switch, if that says more: "Learning(DQN)",
+    "MLP((8, 8))"."""
+    kind = type(value).__name__
+    each = (getattr(value, own.name) for own in fields(value))
+    first = next((own for own in each if not isinstance(own, bool)), "")
+    inner = type(first).__name__ if is_dataclass(first) else level_text(first)
+    says_no_more = first is None or not inner or inner.startswith(kind)  # as DQNSettings of DQN
+    return kind if says_no_more else f"{kind}({inner})"
+
+
+def short_names(factors: Iterable[str]) -> dict[str, str]:
+    """The last word of each path, or the whole path where it is a number or several factors share it."""
+    last = {own: own.rpartition(".")[2] for own in factors}
+    shared = {word for word in last.values() if word.isdigit() or list(last.values()).count(word) > 1}
+    return {own: own if word in shared else word for own, word in last.items()}
+
+
+FILE_NAME: Final = "study.json"
+RUNS, STATUS = "runs", "status"
+"""Folders of a study's directory."""
+
+
+def directory_of(study: Study, out: Path | str | None) -> Path:
+    """The directory of a study, by default `studies/<name>`.
+
+    Raises:
+        ValueError: for a file, and for the directory of a run.
+    """
+    found = Path("studies") / study.name if out is None else path("out", out)
+    allowed = "a new directory, or that of an earlier study"
+    if found.exists() and not found.is_dir():
+        raise ValueError(f"out is {found}, a file; allowed: {allowed}")
+    if (found / RECIPE_FILE).exists():
+        raise ValueError(f"out is {found}, the directory of a run; allowed: {allowed}")
+    return found
+
+
+def write_study(study: Study, out: Path) -> None:
+    """Writes what a study is into its directory."""
+    write_json(out / FILE_NAME, study.to_config(out))
+
+
+def read_study(out: Path | str, *, allow: Sequence[str] = ()) -> Study:
+    """The study of a directory.
+
+    Args:
+        out: the directory.
+        allow: the user's own code, "module:Class", that it may import.
+
+    Raises:
+        ValueError: where there is none, and for what is not allowed.
+    """
+    out = path("out", out)
+    texts("allow", allow)
+    try:
+        table = read_json(out / FILE_NAME)
+    except (OSError, ValueError) as error:
+        raise ValueError(f"{out / FILE_NAME} is not the file of a study: {error!r}") from error
+    return Study.from_config(table, allow=allow, directory=out)

@@ -4,39 +4,80 @@ The truth of a study lies in these directories. `run_task` makes of any of them 
 there: nothing, a run that was killed at any moment, or a finished one, of which it does nothing.
 """
 
+import json
 import os
 import shutil
+import socket
 import sys
 import time
 import traceback
 from collections.abc import Iterator, Mapping, Sequence
-from contextlib import contextmanager, redirect_stderr, redirect_stdout
+from contextlib import contextmanager, redirect_stderr, redirect_stdout, suppress
 from dataclasses import dataclass, replace
 from functools import partial
 from itertools import count
 from pathlib import Path
-from typing import Any, Final, Literal, NamedTuple
+from threading import Event, Thread
+from types import TracebackType
+from typing import Any, Final, Literal, NamedTuple, Self
+
+import psutil
+from tensordict import TensorDictBase
 
 from cprl.config import custom_targets, differences
 from cprl.experiment import Experiment
+from cprl.measuring.episodes import Episode
 from cprl.population import Frozen, with_stored
-from cprl.runs.directory import FILE_NAME as RECIPE
-from cprl.runs.directory import changed_code, read_recipe
-from cprl.runs.extension import REPORT
-from cprl.runs.files import remove_partial
-from cprl.runs.lock import FILE_NAME as LOCK
-from cprl.runs.lock import RunLock, RunLockedError
-from cprl.runs.manifest import refuse_missing
-from cprl.runs.recipes import recipe_config
-from cprl.studies.conditions import Condition
-from cprl.studies.extending import begin_from_shorter
-from cprl.studies.status import Status, StatusCallback, StatusFile, is_silent
-from cprl.studies.study import Block, Study
+from cprl.runs.checkpoints import FOLDER, REPORT, checkpoints_in, depends_on_episodes, is_ending
+from cprl.runs.files import LOCK_FILE, RunLock, RunLockedError, refuse_missing, remove_partial, write_json
+from cprl.runs.recipe import RECIPE_FILE, changed_code, read_recipe, recipe_config
+from cprl.studies.study import Block, Condition, Study
+from cprl.system.compile_clock import CLOCK
+from cprl.system.process import cpu
+from cprl.training import Training
 
 State = Literal["missing", "unfinished", "finished", "refused"]
 PATIENCE_S: Final = 60.0
 """Seconds without a sign of life after which a trial is taken over that another host has locked."""
 _POLL_S: Final = 1.0
+
+
+class Status:
+    """The files in which a trial says how far it is.
+
+    Args:
+        folder: in which they are; made by whoever writes first.
+        name: of the trial.
+    """
+
+    def __init__(self, folder: Path, name: str) -> None:
+        self.folder, self.name = folder, name
+        self.path, self.log = folder / f"{name}.json", folder / f"{name}.log"
+        self.failed = folder / f"{name}.failed.txt"
+
+    def read(self) -> dict[str, Any]:
+        """What the trial said last; empty if it has said nothing."""
+        try:
+            found = json.loads(self.path.read_bytes())
+        except (OSError, ValueError):
+            return {}
+        return found if isinstance(found, dict) else {}
+
+    def fail(self, reason: str, trace: str) -> None:
+        """Notes why the trial failed."""
+        self.failed.write_text(f"{reason}\n\n{trace}", encoding="utf-8", errors="replace")
+
+    def failure(self) -> str | None:
+        """The error of the last attempt in a line; None if it did not fail."""
+        try:
+            return self.failed.read_text(encoding="utf-8").partition("\n")[0]
+        except (OSError, ValueError):
+            return None
+
+    def tidy_up(self) -> None:
+        """Forgets earlier failures."""
+        with suppress(OSError):
+            self.failed.unlink(missing_ok=True)
 
 
 @dataclass(frozen=True, eq=False)
@@ -138,7 +179,7 @@ def move_aside(run: Path) -> Path | None:
         taken = {path.name for path in earlier.iterdir()}
         aside = earlier / next(name for n in count(1) if (name := f"{run.name}-{n}") not in taken)
         shutil.move(run, aside)
-    (aside / LOCK).unlink(missing_ok=True)
+    (aside / LOCK_FILE).unlink(missing_ok=True)
     return aside
 
 
@@ -146,7 +187,7 @@ def state_of(run: Path) -> State:
     """What the directory of a run holds; a finished run has a report."""
     if (run / REPORT).exists():
         return "finished"
-    return "unfinished" if (run / RECIPE).exists() else "missing"
+    return "unfinished" if (run / RECIPE_FILE).exists() else "missing"
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -222,7 +263,7 @@ def run_task(task: Task) -> Outcome:
     """Makes a trial a finished one; may be called any number of times, anywhere.
 
     What is there is kept: a finished trial is left as it is, an unfinished one is resumed, and one that is
-    not there goes on from a shorter one if that can be, see `cprl.studies.extending`; a run of another
+    not there goes on from a shorter one if that can be, see `cprl.studies.trials`; a run of another
     experiment, or one that lost results, is a failure. For what happens while another process runs it see
     `Task.waits`.
 
@@ -281,7 +322,7 @@ def _run(task: Task, run: Path, status: Status) -> bool:
                     callbacks=(StatusCallback(shown),),
                 )
         except (RunLockedError, FileExistsError):  # somebody else began it
-            if state_of(run) == "missing" and not (run / LOCK).exists():
+            if state_of(run) == "missing" and not (run / LOCK_FILE).exists():
                 raise
             if not task.waits:
                 return False
@@ -306,3 +347,169 @@ def _printing_into(log: Path) -> Iterator[None]:
         redirect_stderr(file),
     ):
         yield
+
+
+BEAT_S: Final = 1.0
+"""Seconds between two signs of life."""
+
+
+class StatusFile:
+    """Writes the status of a trial every second; a context manager.
+
+    Args:
+        status: where to.
+        experiment: what is run.
+    """
+
+    def __init__(self, status: Status, experiment: Experiment) -> None:
+        self._status = status
+        self.said: dict[str, Any] = {
+            "pid": os.getpid(),
+            "host": socket.gethostname(),
+            "cpu": cpu(),
+            "episodes": 0,
+            "of": experiment.episodes * experiment.replicas,
+            "steps": 0,
+        }
+        self._began, self._compiled_s = time.monotonic(), CLOCK.total_s
+        self._beat, self._is_over = 0, Event()
+        self._thread = Thread(target=self._write_on, daemon=True)
+
+    def _write_on(self) -> None:
+        while not self._is_over.wait(BEAT_S):
+            self._write()
+
+    def _write(self) -> None:
+        self._beat += 1
+        now = {
+            "beat": self._beat,
+            "running_s": round(time.monotonic() - self._began, 1),
+            "compiling_s": round(CLOCK.total_s - self._compiled_s, 1),
+            "is_compiling": CLOCK.is_running,
+            "peak_bytes": peak_bytes(),
+        }
+        with suppress(OSError):  # of a full disk the run itself says more
+            write_json(self._status.path, {**self.said, **now})
+
+    def __enter__(self) -> Self:
+        self._write()
+        self._thread.start()
+        return self
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        traceback: TracebackType | None,
+    ) -> None:
+        self._is_over.set()
+        self._thread.join()
+        self._write()
+
+
+class StatusCallback:
+    """Counts the steps and episodes of a training for its `StatusFile`; a callback of `cprl.training`."""
+
+    is_extendable = True
+
+    def __init__(self, file: StatusFile) -> None:
+        self._said = file.said
+
+    def on_start(self, training: Training) -> None:
+        """Continues counting where the training does."""
+        self._said.update(steps=training.steps, episodes=training.episodes_played)
+
+    def on_step(self, batch: TensorDictBase) -> None:
+        """Counts a step of every world."""
+        self._said["steps"] += 1
+
+    def on_episode(self, episode: Episode, learning: Mapping[str, float]) -> None:
+        """Counts an episode."""
+        self._said["episodes"] += 1
+
+
+def is_silent(status: Status, patience_s: float) -> Iterator[bool]:
+    """Whether a trial has given no sign of life for so many seconds, each time it is asked.
+
+    Other hosts' clocks may differ from this one's, so what counts is whether the status changes.
+    """
+    last, since = status.read(), time.monotonic()
+    while True:
+        now = status.read()
+        if now != last:
+            last, since = now, time.monotonic()
+        yield time.monotonic() - since >= patience_s
+
+
+def peak_bytes() -> int:
+    """The largest memory that this process has had, in bytes."""
+    if sys.platform == "win32":
+        return int(psutil.Process().memory_info().peak_wset)
+    import resource
+
+    peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+    return peak if sys.platform == "darwin" else 1024 * peak
+
+
+_FREE_TO_EXTEND: Final = {"episodes": 0, "name": "", "on_nan": ""}
+"""What may differ: how long it is, and what changes no number."""
+
+
+def begin_from_shorter(run: Path, experiment: Experiment, recipe: Mapping[str, Any]) -> Path | None:
+    """Makes a run that is not there of the longest finished one beside it that has fewer episodes, keeps the
+    state of its training and is the same otherwise; it is then to be resumed with its own episodes.
+
+    The other run stays as it is. A copy that was interrupted is made anew.
+
+    Args:
+        run: the directory that is not there.
+        experiment: what is to be run; one with callbacks that may depend on the number of episodes goes on
+            from nothing.
+        recipe: what `Experiment.to_recipe` gave for it.
+
+    Returns:
+        The run that was copied; None if there is none such.
+    """
+    callbacks = [own.resolve() for own in experiment.callbacks]
+    if any(not isinstance(own, type) or depends_on_episodes(own) for own in callbacks):
+        return None
+    wanted = recipe["experiment"]
+    found: list[tuple[int, Path]] = []
+    for other in sorted(run.parent.glob(f"*/{RECIPE_FILE}")):
+        own = _experiment_of(other.parent)
+        if (
+            own is not None
+            and own["episodes"] < wanted["episodes"]
+            and not differences(
+                {**own, **_FREE_TO_EXTEND}, {**wanted, **_FREE_TO_EXTEND}, "experiment", Experiment
+            )
+            and any(map(is_ending, checkpoints_in(other.parent / FOLDER)))
+        ):
+            found.append((own["episodes"], other.parent))
+    if not found:
+        return None
+    _, shorter = max(found)
+    copying = run.with_name(f".{run.name}.copying-{os.getpid()}")
+    shutil.rmtree(copying, ignore_errors=True)
+    try:
+        shutil.copytree(shorter, copying, ignore=shutil.ignore_patterns(REPORT, LOCK_FILE))
+        copying.rename(run)
+    except OSError:
+        if not run.exists():  # else somebody else has begun it meanwhile
+            raise
+        return None
+    finally:
+        shutil.rmtree(copying, ignore_errors=True)
+    return shorter
+
+
+def _experiment_of(run: Path) -> dict[str, Any] | None:
+    """The experiment of a finished run; None for any other directory, and one made with other code."""
+    if not (run / REPORT).exists():
+        return None
+    try:
+        recipe = read_recipe(run)
+        found: dict[str, Any] = recipe["experiment"]
+        return found if isinstance(found["episodes"], int) and not changed_code(recipe) else None
+    except (OSError, ValueError, KeyError, TypeError):
+        return None

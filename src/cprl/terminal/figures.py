@@ -21,8 +21,7 @@ from cprl.measuring.phases import PHASES, Phase
 from cprl.measuring.published import PHASED_RECIPE, PHASES_BEGIN, SMOOTHED_EPISODES
 from cprl.measuring.replicas import institution_metrics
 from cprl.runs.curves import centres, curves_of, episode_of_step, phases_of, running_mean
-from cprl.runs.directory import FILE_NAME as RECIPE
-from cprl.runs.directory import read_recipe
+from cprl.runs.recipe import RECIPE_FILE, read_recipe
 from cprl.terminal import style
 from cprl.terminal.style import MARK, SMALL_PT, WIDTH_IN
 
@@ -275,7 +274,7 @@ def _note(window: int, *, is_over: bool) -> str:
 def _is_published(run: Path) -> bool:
     """Whether a run repeats the experiment whose phases the study draws: by the name of its recipe, on the
     study's map, which has the number of agents."""
-    if not (run / RECIPE).exists():
+    if not (run / RECIPE_FILE).exists():
         return False
     recipe = read_recipe(run)
     game = (recipe.get("experiment") or {}).get("game") or {}

@@ -21,9 +21,9 @@ from cprl.experiment import Experiment
 from cprl.measuring.episodes import Episode
 from cprl.measuring.evaluate import evaluate
 from cprl.policies.present import PresentPolicy
-from cprl.runs.directory import read_recipe
 from cprl.runs.episodes import EpisodeTable
 from cprl.runs.loggers import LoggerCallback, make_logger
+from cprl.runs.recipe import read_recipe
 from cprl.training.agents import Population
 
 if TYPE_CHECKING:

@@ -16,9 +16,12 @@ from cprl.envs.state import transforms_state
 from cprl.experiment import Experiment
 from cprl.measuring.episodes import Episode
 from cprl.population import Frozen, exploration_steps
-from cprl.runs.checkpoints import FOLDER, Checkpointer, checkpoints_in
-from cprl.runs.directory import FILE_NAME as RECIPE
-from cprl.runs.directory import (
+from cprl.runs.checkpoints import FOLDER, REPORT, Checkpointer, checkpoints_in, extend, refuse_to_extend
+from cprl.runs.episodes import EpisodeTable
+from cprl.runs.files import LOCK_FILE, RunLockedError, refuse_missing, write_json
+from cprl.runs.loggers import check_logger
+from cprl.runs.recipe import (
+    RECIPE_FILE,
     changed_circumstances,
     read_recipe,
     refuse_another_run,
@@ -28,15 +31,7 @@ from cprl.runs.directory import (
     write_changed_circumstances,
     write_on_nan,
 )
-from cprl.runs.episodes import EpisodeTable
-from cprl.runs.extension import REPORT, extend, refuse_to_extend
-from cprl.runs.files import write_json
-from cprl.runs.lock import FILE_NAME as LOCK
-from cprl.runs.lock import RunLockedError
-from cprl.runs.loggers import check_logger
-from cprl.runs.manifest import refuse_missing
-from cprl.runs.partners import partners_of, weights_of
-from cprl.runs.weights import save_decisions, save_transforms, save_weights
+from cprl.runs.weights import partners_of, save_decisions, save_transforms, save_weights, weights_of
 from cprl.system.compile_clock import cleared_up, free_earlier
 from cprl.system.output import OUT, RESUMES, console, say
 from cprl.system.process import prepare_process
@@ -45,7 +40,6 @@ from cprl.terminal.figures import training_curve
 from cprl.terminal.progress import ProgressBar
 from cprl.terminal.summary import summarise
 from cprl.training import Training, train
-from cprl.training.callbacks import check_callbacks
 from cprl.training.finite import summary
 from cprl.training.outcome import (
     Parts,
@@ -58,6 +52,7 @@ from cprl.training.outcome import (
     title_of,
     write_evaluation,
 )
+from cprl.training.training import check_callbacks
 from cprl.viewer.watching import check_linger, check_watch
 from cprl.viewer.watching import linger as stay_served
 
@@ -111,7 +106,7 @@ def run(
         allow: the user's own code, "module:Class", that stored runs of `Frozen` agents may import.
         command: the command line that began the run, script first, which the recipe keeps and the line that
             resumes is made of; by default the run is resumed by `cprl run`.
-        callbacks: further callbacks of this process (see `cprl.training.callbacks`), which the recipe does
+        callbacks: further callbacks of this process (see `cprl.training.training`), which the recipe does
             not hold; they may look, and change nothing.
         figures: whether the training curve is drawn; a study draws its own.
         at_end: called with the directory of a run that has just finished, when all is written and said.
@@ -208,7 +203,7 @@ def _partners(experiment: Experiment) -> list[str]:
 def _partners_then(experiment: Experiment, run: Path) -> dict[str, str]:
     """The names of the weights of `Frozen` agents that played when a run began, by their run."""
     partners = _partners(experiment)
-    recipe = read_recipe(run) if partners and (run / RECIPE).exists() else {}
+    recipe = read_recipe(run) if partners and (run / RECIPE_FILE).exists() else {}
     names = {partner: weights_of(recipe, run, partner) for partner in partners}
     return {partner: name for partner, name in names.items() if name is not None}
 
@@ -318,7 +313,7 @@ def tidy_up(finished: Path, *, keep_checkpoint: bool, take_over: bool) -> None:
         ValueError: if a file that its manifest lists is not there.
     """
     refuse_missing(finished)
-    if (finished / LOCK).exists():
+    if (finished / LOCK_FILE).exists():
         with Checkpointer(finished, keep_ending=keep_checkpoint, take_over=take_over) as left:
             left.done()
     console().print(f"{finished} is finished; with more --episodes it is extended", soft_wrap=True)

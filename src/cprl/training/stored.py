@@ -1,6 +1,6 @@
 """load: a run as its directory keeps it."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
@@ -20,18 +20,37 @@ from cprl.custom import made
 from cprl.envs.make_env import make_env, spaces_of
 from cprl.envs.state import load_transforms_state
 from cprl.experiment import Experiment
-from cprl.learners.lanes import lane_name
+from cprl.learners.decisions import stored_decisions
+from cprl.learners.lanes import EVALUATION, lane_name, lane_seeds
 from cprl.networks.agent import acting_part
 from cprl.networks.finite import all_finite
-from cprl.policies.assignment import AgentPolicies
+from cprl.networks.recurrent import state_cells_of
+from cprl.networks.stacked import stack_lanes
+from cprl.policies.assignment import AgentIndices, AgentPolicies
 from cprl.policies.decisions import ballot_sizes
+from cprl.policies.recurrent import actor_of_lanes
+from cprl.policies.scripted import scripted_lanes
 from cprl.population import AgentSpec, Frozen, Learning, Scripted, Team, specs_by_agent
 from cprl.runs.checkpoints import FOLDER
-from cprl.runs.directory import FILE_NAME, changed_code, read_recipe, say_changes
 from cprl.runs.episodes import read_episodes
-from cprl.runs.kept import kept_of
-from cprl.runs.partners import weights_of
-from cprl.training.stored_agents import StoredAgent, stored_policies
+from cprl.runs.recipe import RECIPE_FILE, changed_code, read_recipe, say_changes
+from cprl.runs.weights import kept_of, weights_of
+
+
+@dataclass(frozen=True, eq=False)
+class StoredAgent:
+    """An agent of a stored run: how it acts, and its network if it has one."""
+
+    kind: tuple[Any, ...]
+    """("scripted", policy), or ("trained", stochastic, epsilon, algorithm); agents of one kind can be lanes
+    of one actor."""
+    network: nn.Module | None = None
+    decisions: Tensor | None = None
+    """The values of its choices on all ballots, float64 [C]; None if it decides by chance, or nothing."""
+
+    def __repr__(self) -> str:
+        acts = ", ".join(str(value) for value in self.kind[:3])
+        return f"StoredAgent({acts}, network={type(self.network).__name__})"
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -182,7 +201,7 @@ def load(run: str | Path, *, weights: str | None = None, allow: Sequence[str] = 
     try:
         experiment = Experiment.from_recipe(recipe, directory=run, allow=allow)
     except ValueError as error:
-        raise ValueError(f"{run / FILE_NAME}: {error}") from error
+        raise ValueError(f"{run / RECIPE_FILE}: {error}") from error
     say_changes(run, [f"the text of {module}, which its recipe keeps" for module in changed_code(recipe)])
     kept = kept_of(run, weights)
     loaded = LoadedRun(
@@ -203,7 +222,7 @@ def load(run: str | Path, *, weights: str | None = None, allow: Sequence[str] = 
 def _networks(path: Path, weights: Any, run: LoadedRun) -> dict[str, nn.Module]:
     networks = {}
     recipe, lacking = (
-        f"{run.path / FILE_NAME}: a network cannot be made",
+        f"{run.path / RECIPE_FILE}: a network cannot be made",
         f"{path} holds no weights of this run",
     )
     reason = lacking
@@ -229,3 +248,91 @@ def _networks(path: Path, weights: Any, run: LoadedRun) -> dict[str, nn.Module]:
 
 def _is_finite(network: nn.Module) -> bool:
     return all_finite(network.state_dict().values())
+
+
+def stored_policies(
+    agents: Sequence[Sequence[StoredAgent]],
+    playing: Game | Spaces,
+    *,
+    replicas: Sequence[int],
+    worlds: int,
+    seed: int,
+) -> AgentPolicies:
+    """Stored agents as the policies of all agents of some replicas, agents of one kind as lanes of one actor.
+
+    Args:
+        agents: by agent and replica.
+        playing: the game; its spaces where it is not one of cprl's.
+        replicas: their numbers.
+        worlds: how many worlds of each replica are played side by side.
+        seed: what random numbers follow from, with the replica and the agent.
+    """
+    alike: dict[Any, list[int]] = {}
+    for agent, of_replicas in enumerate(agents):
+        alike.setdefault(of_replicas[0].kind, []).append(agent)
+    actors: dict[AgentIndices, nn.Module] = {}
+    for same in alike.values():
+        seeds = lane_seeds(seed, replicas=replicas, agents=same, purpose=EVALUATION)
+        lanes = [agents[agent][place] for place in range(len(replicas)) for agent in same]
+        how: dict[str, Any] = {"seeds": seeds, "agents": len(same), "worlds": worlds}
+        actors[tuple(same)] = stored_actor(lanes, playing, stacks=True, **how)
+    values = [[own.decisions for own in of_replicas] for of_replicas in agents]
+    decisions = (
+        stored_decisions(values, playing, replicas=replicas, worlds=worlds, seed=seed)
+        if isinstance(playing, Game)
+        else None
+    )
+    return AgentPolicies(actors, decisions=decisions)
+
+
+def stored_actor(
+    lanes: Sequence[StoredAgent],
+    playing: Game | Spaces,
+    *,
+    seeds: Sequence[Sequence[int]],
+    agents: int,
+    worlds: int,
+    stacks: bool = False,
+) -> nn.Module:
+    """One actor for stored agents of one kind; the one place where an actor is made of a stored agent.
+
+    Args:
+        lanes: an agent for each lane, lane = replica x agents + agent.
+        playing: the game; its spaces where it is not one of cprl's.
+        seeds: of each lane's random numbers.
+        agents: how many agents of a replica it controls.
+        worlds: how many worlds of each replica are played side by side.
+        stacks: whether lanes of one and the same network are stacked too, so that its values are, to the last
+            bit, those that it has among others.
+    """
+    kind = lanes[0].kind
+    if kind[0] == "scripted":
+        return scripted_lanes(kind[1], playing, seeds=seeds, agents=agents, worlds=worlds)
+    _, stochastic, epsilon, _ = kind
+    spaces = playing.spaces if isinstance(playing, Game) else playing
+    networks: list[Any] = [lane.network for lane in lanes]
+    actor = actor_of_lanes(
+        _side_by_side(networks, stacks=stacks),
+        spaces,
+        seeds=seeds,
+        agents=agents,
+        worlds=worlds,
+        stochastic=stochastic,
+        state_cells=state_cells_of(networks[0]),
+    )
+    actor.epsilon = epsilon
+    return actor
+
+
+def _side_by_side(networks: Sequence[nn.Module], *, stacks: bool) -> Callable[..., Any]:
+    """What all networks give for what their lanes see, [L, k, ...] to [L, k, A]; of recurrent ones also their
+    states."""
+    first = networks[0]
+    if not stacks and all(network is first for network in networks):
+        first.requires_grad_(False)
+        return lambda *seen: first(*seen)
+    try:
+        stack = stack_lanes(networks)
+    except ValueError:  # of a form that does not stack, e.g. a network of the user's own
+        return lambda seen: torch.stack([network(own) for network, own in zip(networks, seen, strict=True)])
+    return lambda *seen: stack(*seen)

@@ -3,7 +3,7 @@
 import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
-from typing import Any, Final
+from typing import Any, Final, Protocol, runtime_checkable
 
 import numpy as np
 import torch
@@ -13,7 +13,8 @@ from torch import Tensor, nn
 from torchrl.collectors import BaseCollector
 from torchrl.envs import EnvBase
 
-from cprl.arguments import callable_of, object_of
+from cprl.arguments import callable_of, object_of, objects
+from cprl.checks import shown
 from cprl.envs.make_env import check_env, spaces_of
 from cprl.envs.state import carried_state, env_state, load_carried, load_env_state
 from cprl.envs.unwrap import commons_of
@@ -31,15 +32,25 @@ from cprl.measuring.episodes import Episode
 from cprl.measuring.tracking import tracker_of
 from cprl.policies.assignment import AgentIndices, AgentPolicies, agent_indices
 from cprl.policies.decisions import Decider
-from cprl.runs import formats
+from cprl.runs.files import TRAINING_STATE_FORMAT
 from cprl.system.times import Times
-from cprl.training.callbacks import SavesTraining, check_callbacks
 from cprl.training.collectors import StepCollector
 from cprl.training.finite import EVERY_STEPS, FiniteCheck
 
 MakeCollector = Callable[[EnvBase, nn.Module], BaseCollector]
 """A collector out of an environment and a policy; it yields batches [R], or [R, T] of T turns."""
 _FINISH_THERE: Final = "finish the run with the version that began it (its recipe.json has the commit)"
+
+
+@runtime_checkable
+class SavesTraining(Protocol):
+    """What saves the state of a training, as `cprl.runs.Checkpointer` does."""
+
+    def restore(self, training: Any) -> None:
+        """Puts a new training where the last one was."""
+
+    def after_step(self, training: Any) -> None:
+        """Saves the state, if it is time to."""
 
 
 class Training:
@@ -219,7 +230,7 @@ class Training:
         self.finite.check_weights(self.steps)
         self.finite.saved_step = self.steps
         return {
-            "format": formats.TRAINING_STATE,
+            "format": TRAINING_STATE_FORMAT,
             "steps": self.steps,
             **self.times.state_dict(),
             "played": list(self._played),
@@ -262,10 +273,10 @@ class Training:
         Raises:
             ValueError: for the state of a training of another version of cprl.
         """
-        if state.get("format", 1) != formats.TRAINING_STATE:
+        if state.get("format", 1) != TRAINING_STATE_FORMAT:
             raise ValueError(
                 f"the state has the format {state.get('format', 1)}, this version resumes "
-                f"{formats.TRAINING_STATE}; {_FINISH_THERE}"
+                f"{TRAINING_STATE_FORMAT}; {_FINISH_THERE}"
             )
         if len(state["others"]) != len(self.others):
             raise ValueError(
@@ -357,3 +368,38 @@ def train(
         if checkpointer is not None:
             checkpointer.after_step(training)
     return training
+
+
+class Callback(Protocol):
+    """What is called while a training runs; each method may be missing.
+
+    With `state_dict` and `load_state_dict` its state is part of the training's checkpoints.
+    """
+
+    def on_start(self, training: Any) -> None:
+        """The `Training` is about to take its first step, or the first after a checkpoint."""
+
+    def on_step(self, batch: TensorDictBase) -> None:
+        """One turn of every world, as the collector yields it, [R]."""
+
+    def on_episode(self, episode: Episode, learning: dict[str, float]) -> None:
+        """An episode has ended; what was learned in it: `agent_0/loss`, `agent_0/epsilon`, ...
+
+        A number that is written into `learning` under a name of one's own is logged with the others, by the
+        loggers and the viewer of a run, and by callbacks that come later in a `Training`.
+        """
+
+
+HOOKS: Final = ("on_start", "on_step", "on_episode")
+
+
+def check_callbacks(callbacks: Sequence[Any]) -> tuple[Any, ...]:
+    """The callbacks; refuses one that nothing would call."""
+    found = objects("callbacks", callbacks, object, "callbacks")
+    for callback in found:
+        if not any(hasattr(callback, hook) for hook in HOOKS):
+            raise ValueError(
+                f"the callback {shown(callback)} has none of the methods {', '.join(HOOKS)}: nothing would "
+                "call it"
+            )
+    return found

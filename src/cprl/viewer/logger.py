@@ -17,8 +17,8 @@ from torch import Tensor
 from torchrl.record.loggers import Logger
 
 from cprl.checks import shown
-from cprl.runs.directory import FILE_NAME as RECIPE_FILE
 from cprl.runs.files import read_json
+from cprl.runs.recipe import RECIPE_FILE
 from cprl.system.compat import send_chunk
 from cprl.system.output import console as safe_console
 from cprl.viewer.blueprint import layout

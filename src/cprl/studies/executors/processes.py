@@ -4,27 +4,136 @@ import multiprocessing
 import os
 import signal
 import sys
+import traceback
 from collections import Counter, deque
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, wait
 from concurrent.futures.process import BrokenProcessPool
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from multiprocessing import resource_tracker
 from multiprocessing.connection import Connection
-from threading import Thread
-from types import ModuleType
-from typing import ClassVar, Final
+from pathlib import Path
+from threading import Thread, current_thread, main_thread
+from types import FrameType, ModuleType, TracebackType
+from typing import Any, ClassVar, Final, NoReturn, Protocol, Self, runtime_checkable
 
 from cprl.arguments import integer
-from cprl.studies.executors.attempts import ATTEMPTS, Work, attempt, given_up
-from cprl.studies.executors.stopping import Stopping
-from cprl.studies.trials import Outcome, Task, run_task
+from cprl.runs.checkpoints import interruption
+from cprl.studies.trials import Outcome, Status, Task, run_task
+from cprl.system.output import console
 
 MOST_JOBS: Final = 4096
 _LOOK_S: Final = 0.2
 """Seconds between two looks at whether this process was asked to stop."""
 _SPAWN: Final = multiprocessing.get_context("spawn")
+
+
+ATTEMPTS: Final = 5
+"""How often a trial is tried whose worker dies."""
+
+
+Work = Callable[[Task], Outcome]
+"""`cprl.studies.trials.run_task`, or a function of tests that calls it; importable by name."""
+
+
+def attempt(work: Work, task: Task) -> Outcome | None:
+    """Runs a task in a worker; None if the worker was asked to stop, and has saved a checkpoint.
+
+    What `run_task` does not catch, e.g. that its log cannot be written, is a failure of this trial, not of
+    the study.
+    """
+    try:
+        return work(task)
+    except (SystemExit, KeyboardInterrupt):
+        return None
+    except Exception as error:
+        return failed(task, f"{type(error).__name__}: {error}", traceback.format_exc())
+
+
+def given_up(task: Task, why: str) -> Outcome:
+    """The outcome of a task whose workers died at every attempt."""
+    reason = f"{why}, {ATTEMPTS} times; a process that is killed is often one for which memory was short"
+    return failed(task, reason, f"What it printed is in {task.name}.log.")
+
+
+def failed(task: Task, reason: str, trace: str) -> Outcome:
+    """The outcome of a task that could not say itself why it failed; noted beside its status."""
+    status = Status(Path(task.status), task.name)
+    try:
+        status.folder.mkdir(parents=True, exist_ok=True)
+        status.fail(reason, trace)
+    except OSError as error:  # then the reason is in the outcome alone
+        reason += f" ({error})"
+    return Outcome(task.name, "failed", reason, True)
+
+
+@runtime_checkable
+class Executor(Protocol):
+    """Runs tasks; an outcome is yielded as soon as a task has ended, in whatever order.
+
+    It stops what it started when its iterator is closed. At the first SIGINT or SIGTERM of the process that
+    iterates, every running trial finishes its step and saves a checkpoint, and `KeyboardInterrupt` or
+    `SystemExit` with code 143 is raised; the same line again continues.
+    """
+
+    def run(self, tasks: Sequence[Task]) -> Iterator[Outcome]:
+        """Runs every task."""
+
+
+@dataclass(frozen=True)
+class InProcess:
+    """One trial after the other, in this process."""
+
+    def run(self, tasks: Sequence[Task]) -> Iterator[Outcome]:
+        """Runs every task, in order."""
+        for task in tasks:
+            yield run_task(task)
+
+
+_SIGNALS: Final = (signal.SIGINT, signal.SIGTERM)
+
+
+class Stopping:
+    """Counts how often this process was asked to stop; a context manager.
+
+    The handlers only count: what is done about it is up to the loop that looks at `asked`. Python handles
+    signals in the main thread only; in other threads handlers stay as they are.
+    """
+
+    def __init__(self) -> None:
+        self.asked = 0
+        self._number: int = signal.SIGINT
+        self._usual: dict[int, Any] = {}
+
+    def __enter__(self) -> Self:
+        for number in _SIGNALS if current_thread() is main_thread() else ():
+            self._usual[number] = signal.signal(number, self._ask)
+        return self
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        traceback: TracebackType | None,
+    ) -> None:
+        for number, usual in self._usual.items() if current_thread() is main_thread() else ():
+            signal.signal(number, usual)
+
+    def _ask(self, number: int, frame: FrameType | None) -> None:
+        self.asked += 1
+        self._number = number
+        if self.asked == 1:
+            console().print(
+                "Stopping: each trial finishes its step and saves a checkpoint; signal again to kill them.",
+                soft_wrap=True,
+            )
+
+    def end(self, left: int) -> NoReturn:
+        """Say how many trials are left, and raise what `interruption` makes of the signal."""
+        trials = "1 trial is" if left == 1 else f"{left} trials are"
+        console().print(f"Stopped; {trials} left. The same line again continues the study.", soft_wrap=True)
+        raise interruption(self._number)
 
 
 @dataclass(frozen=True)

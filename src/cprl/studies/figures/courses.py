@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from cprl.measuring.published import SMOOTHED_EPISODES
 from cprl.measuring.statistics import curve_interval
 from cprl.runs.curves import running_mean
-from cprl.studies.figures.panels import (
+from cprl.studies.figures.levels import (
     MOST_CONDITIONS,
     colours_of,
     is_one,
@@ -22,10 +22,9 @@ from cprl.studies.figures.panels import (
     short,
     with_counts,
 )
-from cprl.studies.tables.comparing import compare, metrics_of
+from cprl.studies.tables.comparing import compare, metric_title, metrics_of
+from cprl.studies.tables.sources import RANDOM, TRAINING
 from cprl.studies.tables.table import StudyTable
-from cprl.studies.tables.texts import metric_title
-from cprl.studies.tables.windows import RANDOM, TRAINING
 from cprl.terminal.style import RANDOM_LINE, SMALL_PT, head, picture_path, save
 
 METRICS: Final = ("collective_return", "survival_steps")

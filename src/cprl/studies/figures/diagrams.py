@@ -13,7 +13,7 @@ from matplotlib.patches import Rectangle
 from matplotlib.ticker import MaxNLocator
 
 from cprl.arguments import object_of, refusal
-from cprl.studies.figures.panels import (
+from cprl.studies.figures.levels import (
     MOST_CONDITIONS,
     legend,
     levels_note,
@@ -23,12 +23,9 @@ from cprl.studies.figures.panels import (
     title_of,
     with_counts,
 )
-from cprl.studies.tables.comparing import LAST, Comparison, compare
-from cprl.studies.tables.outcomes import COLOURS, Endings
-from cprl.studies.tables.sources import Design
+from cprl.studies.tables.comparing import LAST, Comparison, compare, digits_for
+from cprl.studies.tables.sources import COLOURS, TRAINING, Design, Endings
 from cprl.studies.tables.table import StudyTable
-from cprl.studies.tables.texts import digits_for
-from cprl.studies.tables.windows import TRAINING
 from cprl.terminal.style import EMPTY, SHADES, SMALL_PT, draw_cell, head, picture_path, save, wrapped
 
 _VALUES, _DIFFERENCES = "viridis", "RdBu"
@@ -120,7 +117,7 @@ def phase_diagram(
 
     Args:
         table: the table.
-        found: see `cprl.studies.tables.outcomes.endings`.
+        found: see `cprl.studies.tables.sources.endings`.
         path: the PNG.
         factors: two factors; None for bars, of at most `MOST_CONDITIONS` conditions.
 

@@ -9,10 +9,9 @@ from typing import Any, Final
 from cprl.arguments import refusal, texts
 from cprl.config import differences, to_config
 from cprl.experiment import Experiment
-from cprl.runs.directory import read_recipe, runs_in
-from cprl.studies.conditions import UNNAMED, Condition
-from cprl.studies.naming import named, short_names
-from cprl.studies.paths import ALL, normalised, values_at
+from cprl.runs.recipe import read_recipe, runs_in
+from cprl.studies.factors import ALL, normalised, values_at
+from cprl.studies.study import UNNAMED, Condition, named, short_names
 from cprl.studies.tables.sources import REASONS, Design, Lacking, Source, plain_level
 from cprl.studies.tables.table import WINDOW, StudyTable, table_of
 from cprl.studies.trials import state_of
@@ -36,8 +35,8 @@ def pooled_table(
 
     Args:
         runs: directories of runs, or of directories that hold them; results that `cprl export` made too.
-        by: paths of fields of an experiment, see `cprl.studies.paths`, e.g. "game.rules.freeze_steps"; a path
-            with `*` stands for all values there, "name" for what the run's recipe is called.
+        by: paths of fields of an experiment, see `cprl.studies.factors`, e.g. "game.rules.freeze_steps"; a
+            path with `*` stands for all values there, "name" for what the run's recipe is called.
         window: see `cprl.studies.tables.table.study_table`.
         reference: the name of the condition that others are compared with; by default the first.
         allow: the user's own code, "module:Class", that a run's recipe may name.

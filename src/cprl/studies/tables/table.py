@@ -2,7 +2,7 @@
 
 Columns:
     condition        its name
-    checksum         of the condition, see `cprl.studies.conditions`
+    checksum         of the condition, see `cprl.studies.study`
     (each factor)    its level: numbers where all levels are, else texts
     run              the directory of the run
     marks            what of its versions, git commit and processor differs from most runs'; "" if nothing
@@ -19,6 +19,7 @@ A factor with the name of another column is called "factor NAME".
 """
 
 import json
+from collections import Counter
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from functools import cached_property
@@ -34,18 +35,28 @@ from numpy.typing import NDArray
 from cprl.arguments import WINDOW as WINDOW
 from cprl.arguments import integer, object_of
 from cprl.arguments import path as path_of
-from cprl.runs import formats
-from cprl.runs.directory import versions
-from cprl.runs.labelled import write_table
+from cprl.runs.episodes import write_table
+from cprl.runs.files import STUDY_TABLE_FORMAT, refuse_newer
+from cprl.runs.recipe import read_recipe, versions
 from cprl.studies.study import Study
-from cprl.studies.tables.circumstances import Circumstances, circumstances_of, marks, sentences
-from cprl.studies.tables.rows import rows_of
-from cprl.studies.tables.sources import Design, Lacking, Source, design_of, sources_of
-from cprl.studies.tables.windows import Windows, windows_of
+from cprl.studies.tables.sources import (
+    Design,
+    Lacking,
+    Source,
+    Windows,
+    design_of,
+    rows_of,
+    sources_of,
+    windows_of,
+)
 
-FORMAT: Final = formats.STUDY_TABLE
 METADATA: Final = b"cprl"
 """The key of the metadata: the study, its conditions, how the runs were made, and what is lacking."""
+
+
+Circumstances = Mapping[str, str]
+"""The version of each package, the checksum of each module of the user's own, the git commit and the type of
+processor, by name. Where a run was resumed under others, all of them in order, with " then " between them."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -163,9 +174,9 @@ class StudyTable:
             held = json.loads((rows.schema.metadata or {})[METADATA])
         except (pa.ArrowException, OSError, KeyError, ValueError) as error:
             raise ValueError(f"{path} is not the table of a study: {error!r}") from error
-        formats.refuse_newer(path, held, FORMAT)
-        if held.get("format") != FORMAT:
-            raise ValueError(f"{path} has the format {held.get('format')}; allowed: {FORMAT}")
+        refuse_newer(path, held, STUDY_TABLE_FORMAT)
+        if held.get("format") != STUDY_TABLE_FORMAT:
+            raise ValueError(f"{path} has the format {held.get('format')}; allowed: {STUDY_TABLE_FORMAT}")
         design = held["design"]
         return cls(
             design=Design(
@@ -191,7 +202,7 @@ def study_table(
         study: the study.
         runs: the directory of its runs.
         window: episodes of a window of training; 1 for episodes one by one, of the evaluation too.
-        status: where its trials say why they failed, see `cprl.studies.status`.
+        status: where its trials say why they failed, see `cprl.studies.trials`.
 
     Raises:
         ValueError: for what does not fit. A run that is damaged is listed as lacking.
@@ -229,7 +240,7 @@ def table_of(
             )
     rows = rows_of(design, found, marks(made))
     held = {
-        "format": FORMAT,
+        "format": STUDY_TABLE_FORMAT,
         "design": {
             "name": design.name,
             "conditions": [[name, dict(levels)] for name, levels in design.conditions.items()],
@@ -246,3 +257,82 @@ def table_of(
     }
     rows = rows.replace_schema_metadata({METADATA: json.dumps(held, sort_keys=False)})
     return StudyTable(design=design, rows=rows, window=window, lacking=tuple(out), made=made)
+
+
+UNKNOWN: Final = "not recorded"
+WORDS: Final = {"git": "git commit", "cpu": "processor"}
+_NAMED: Final = 4
+"""The largest number of runs that a sentence names."""
+
+
+def circumstances_of(run: Path) -> Circumstances:
+    """What the recipe of a run says of how it was made."""
+    recipe = read_recipe(run)
+    every = [_of(recipe), *(_of(own) for own in (*recipe.get("extended", ()), *recipe.get("resumed", ())))]
+    names = dict.fromkeys(name for own in every for name in own)
+    return {name: _joined([own.get(name, UNKNOWN) for own in every]) for name in names}
+
+
+def marks(made: Mapping[str, Circumstances]) -> dict[str, str]:
+    """What of each run's circumstances differs from those of most runs, e.g. "torch, git commit", or "".
+
+    Of circumstances that equally many runs have, the first run's count as those of most.
+
+    Args:
+        made: the circumstances by run, in the order of the table.
+    """
+    usual = {name: _counted(made, name).most_common(1)[0][0] for name in _names(made)}
+    return {
+        run: ", ".join(
+            WORDS.get(name, name) for name, value in usual.items() if own.get(name, UNKNOWN) != value
+        )
+        for run, own in made.items()
+    }
+
+
+def sentences(made: Mapping[str, Circumstances]) -> list[str]:
+    """How the runs of a table were made in different circumstances, a sentence for each."""
+    found = []
+    for name in _names(made):
+        counted = _counted(made, name)
+        if len(counted) == 1:
+            continue
+        parts = []
+        for nth, (value, number) in enumerate(counted.most_common()):
+            runs = [run for run, own in made.items() if own.get(name, UNKNOWN) == value]
+            named = f" ({_some(runs)})" if nth else ""
+            parts.append(f"{value} in {number} run{'s' * (number != 1)}{named}")
+        found.append(
+            f"The runs were made under more than one {WORDS.get(name, f'version of {name}')}: "
+            f"{'; '.join(parts)}."
+        )
+    return found
+
+
+def _of(recipe: Mapping[str, Any]) -> dict[str, str]:
+    found = {name: str(own) for name, own in (recipe.get("versions") or {}).items() if own is not None}
+    found |= {module: str(digest)[:12] for module, digest in (recipe.get("code") or {}).items()}
+    git = recipe.get("git")
+    if isinstance(git, Mapping):
+        found["git"] = f"{str(git.get('commit'))[:12]}{' with changes' if git.get('dirty') else ''}"
+    if recipe.get("cpu"):
+        found["cpu"] = str(recipe["cpu"])
+    return found
+
+
+def _joined(values: list[str]) -> str:
+    """Values in order, without one that follows itself."""
+    return " then ".join(own for nth, own in enumerate(values) if not nth or own != values[nth - 1])
+
+
+def _names(made: Mapping[str, Circumstances]) -> list[str]:
+    return list(dict.fromkeys(name for own in made.values() for name in own))
+
+
+def _counted(made: Mapping[str, Circumstances], name: str) -> Counter[str]:
+    return Counter(own.get(name, UNKNOWN) for own in made.values())
+
+
+def _some(runs: list[str]) -> str:
+    more = f" and {len(runs) - _NAMED} more" if len(runs) > _NAMED else ""
+    return f"{', '.join(runs[:_NAMED])}{more}"

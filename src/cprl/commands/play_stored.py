@@ -1,13 +1,19 @@
-"""`cprl film`, `evaluate`, `visits`, `crossplay`, `schelling`: agents that do not learn, in fresh worlds."""
+"""What plays stored agents, none of which learns, in fresh worlds: `cprl film`, `evaluate`, `egta` ..."""
 
+import sys
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
-from cprl.arguments import FILM_SEED, FILM_SUFFIXES, SEED, Diagonal
-from cprl.commands.parts import check_files, check_runs, print_tables, runs_by_name, tell_files
+from rich.table import Table
+
+from cprl.arguments import EGTA_RESAMPLES, FILM_SEED, FILM_SUFFIXES, SEED, Diagonal
 from cprl.commands.recipe import Allow, make_importable
+from cprl.commands.studies import StudyOptions, carry_out, executor_of
 from cprl.presets import Variant, check_board
-from cprl.system.output import printed, say
+from cprl.runs.files import refuse_to_write_over
+from cprl.runs.recipe import read_recipe
+from cprl.system.output import OUT, console, printed, say
 from cprl.system.process import prepare_process
 
 
@@ -102,7 +108,7 @@ def evaluate(
     check_runs(run)
 
     from cprl.evaluation.evaluate import evaluate_run, run_table
-    from cprl.runs.labelled import write_table
+    from cprl.runs.episodes import write_table
 
     prepare_process(seed)
     evaluation = evaluate_run(
@@ -190,7 +196,7 @@ def crossplay(
 
     from cprl.evaluation.cross_play import agents_table, draw_gains, gains_tables, heading, matrices
     from cprl.evaluation.cross_play import crossplay as play_each_other
-    from cprl.runs.labelled import write_table
+    from cprl.runs.episodes import write_table
 
     prepare_process(seed)
     played = play_each_other(
@@ -247,7 +253,7 @@ def schelling(
     from cprl.evaluation.populations import board_named
     from cprl.evaluation.schelling import draw_schelling, schelling_tables
     from cprl.evaluation.schelling import schelling as play_all_mixes
-    from cprl.runs.labelled import write_table
+    from cprl.runs.episodes import write_table
 
     prepare_process(seed)
     game, run = board_named(board, variant, allow=allow)
@@ -264,3 +270,246 @@ def schelling(
         write_table(out, found.table())
     print_tables(*schelling_tables(found))
     tell_files(out, figure, lambda path: draw_schelling(found, path))
+
+
+def egta(
+    runs: tuple[str, ...],
+    /,
+    *,
+    episodes: int = 5,
+    pairwise: bool = False,
+    resamples: int = EGTA_RESAMPLES,
+    greedy: bool = False,
+    seed: int = SEED,
+    replicas: tuple[int, ...] = (),
+    out: Path | None = None,
+    figure: Path | None = None,
+    allow: Allow = (),
+) -> None:
+    """Lets agents of runs play in all compositions, and prints which runs last: equilibria, alpha-rank,
+    replicator dynamics (extra "theory").
+
+    Args:
+        runs: directories of runs of the same game, or their results; NAME=PATH gives one another name.
+        episodes: of each replica and choice of who plays where.
+        pairwise: play one agent of each run among those of each other, as `cprl crossplay` does: cheaper,
+            and a reduction where there are more than two agents.
+        resamples: of the replicas, for intervals.
+        greedy: whether agents play what they hold best, without exploring or drawing.
+        seed: of the worlds and all chance; the same one gives the same numbers.
+        replicas: their numbers; by default all that every run has.
+        out: a parquet file to be, with every episode.
+        figure: a PNG to be: the dynamics, and the shares by alpha-rank.
+        allow: code of your own, module:Class, that the run may import; see docs/experiments.md.
+    """
+    make_importable(allow)
+    check_files(out, figure)
+    named, chosen = runs_by_name(runs), list(replicas)
+    check_runs(*(named.values() if isinstance(named, dict) else named))
+
+    from cprl.evaluation.cross_play import crossplay
+    from cprl.evaluation.egta import analyse, draw_egta, egta_heading, egta_tables
+    from cprl.evaluation.empirical_game import pairwise_game, play_empirical_game
+    from cprl.runs.episodes import write_table
+    from cprl.theory.extras import check_extras
+
+    check_extras()
+    prepare_process(seed)
+    if pairwise:
+        game = pairwise_game(
+            crossplay(named, episodes=episodes, greedy=greedy, seed=seed, replicas=chosen, allow=allow)
+        )
+    else:
+        game = play_empirical_game(
+            named, episodes=episodes, greedy=greedy, seed=seed, replicas=chosen, allow=allow
+        )
+    if out is not None:
+        write_table(out, game.episodes_table)
+    found = analyse(game, resamples=resamples)
+    say(egta_heading(game))
+    print_tables(*egta_tables(found))
+    tell_files(out, figure, lambda path: draw_egta(found, path))
+
+
+def scenarios(
+    run: Path,
+    /,
+    *,
+    scenarios: tuple[str, ...] = (),
+    episodes: int = 5,
+    greedy: bool = False,
+    seed: int = SEED,
+    replicas: tuple[int, ...] = (),
+    out: Path | None = None,
+    figure: Path | None = None,
+    allow: Allow = (),
+) -> None:
+    """Lets a run's agents play among agents that they never met, and prints how they fare beside random and
+    greedy agents in their places.
+
+    Args:
+        run: the run's directory, or its results; of one that has not ended the newest checkpoint plays.
+        scenarios: their names, e.g. minority_among_greedy; by default all of the run's game.
+        episodes: of each replica in each placement.
+        greedy: whether stored agents play what they hold best, without exploring or drawing.
+        seed: of the worlds and all chance; the same one gives the same numbers.
+        replicas: their numbers; by default all.
+        out: a parquet file to be, with every episode.
+        figure: a PNG to be: the returns in each scenario.
+        allow: code of your own, module:Class, that the run may import; see docs/experiments.md.
+    """
+    make_importable(allow)
+    check_files(out, figure)
+    check_runs(run)
+
+    from cprl.evaluation.scenarios import draw_scenarios, heading, run_scenarios, scenario_tables
+    from cprl.runs.episodes import write_table
+
+    prepare_process(seed)
+    scores = run_scenarios(
+        run,
+        scenarios=scenarios,
+        episodes=episodes,
+        greedy=greedy,
+        seed=seed,
+        replicas=replicas,
+        allow=allow,
+    )
+    if out is not None:
+        write_table(out, scores.table())
+    say(heading(scores))
+    print_tables(*scenario_tables(scores))
+    say(f"Weights: {scores.run.weights_from}")
+    tell_files(out, figure, lambda path: draw_scenarios(scores, path))
+
+
+def exploit(
+    run: Path,
+    /,
+    *,
+    agents: tuple[int, ...] = (0,),
+    algorithms: tuple[str, ...] = (),
+    seeds: int = 3,
+    training_episodes: int | None = None,
+    replicas: int | None = None,
+    episodes: int = 20,
+    seed: int = SEED,
+    device: str = "cpu",
+    out: Path | None = None,
+    jobs: int | None = None,
+    dry_run: bool = False,
+    allow: Allow = (),
+) -> None:
+    """Trains best responses to the agents of a run, and prints what they gain: how exploitable the run is.
+
+    May be stopped; the same line continues, and plays again what is trained.
+
+    Args:
+        run: the directory of a run that has ended, or its results.
+        agents: indices of the agents that are replaced, one at a time; each costs as many trainings.
+        algorithms: what responses learn by: own, the algorithm of the replaced agent, DQN, PPO; by default
+            own and PPO, or DQN if that is PPO; see docs/exploitability.md.
+        seeds: trainings by each algorithm.
+        training_episodes: of each; by default a quarter of those of the run.
+        replicas: how many of the run's replicas are responded to, the first ones; by default all.
+        episodes: fresh episodes of each replica to choose a response by, and as many to tell its gain by.
+        seed: of the worlds of the latter; the former have the next one.
+        device: where responses learn, e.g. cpu or cuda:0.
+        out: the directory of trainings and results; by default exploit/NAME.
+        jobs: processes that train at the same time, one for each place and algorithm.
+        dry_run: list all trainings and their states; run and write nothing.
+        allow: code of your own, module:Class, that the run may import; see docs/experiments.md.
+    """
+    make_importable(allow)
+    check_runs(run)
+
+    from cprl.evaluation.exploit import TABLE, measure, plan_responses
+    from cprl.evaluation.responses import exploitability_tables
+    from cprl.studies.study import directory_of
+
+    prepare_process(seed)
+    plan = plan_responses(
+        run,
+        agents=agents,
+        algorithms=algorithms,
+        seeds=seeds,
+        training_episodes=training_episodes,
+        replicas=replicas,
+        episodes=episodes,
+        seed=seed,
+        device=device,
+        allow=allow,
+    )
+    folder = directory_of(plan.study, plan.out if out is None else out)
+    options = StudyOptions(out=folder, jobs=jobs, dry_run=dry_run, figures=False, allow=tuple(allow))
+    executor_of(options)
+    if not dry_run:
+        plan.claim(folder)
+    carry_out(plan.study, options, ["cprl", *sys.argv[1:]])
+    if dry_run:
+        return
+    print_tables(*exploitability_tables(measure(plan, folder, allow=allow)))
+    say(f"Episodes: {folder / TABLE}")
+
+
+def check_files(out: Path | None = None, figure: Path | None = None) -> None:
+    """Checks what `--out` and `--figure` name before hours of work.
+
+    Raises:
+        FileExistsError: if a file exists.
+        ValueError: if the name of the figure does not end in .png.
+    """
+    if out is not None:
+        refuse_to_write_over(out)
+    if figure is not None:
+        from cprl.terminal.style import check_picture
+
+        check_picture(figure, "--figure")
+
+
+def check_runs(*runs: Path | str) -> None:
+    """Checks that runs are there, before what plays their agents is imported, which takes seconds.
+
+    Raises:
+        ValueError: for a path that is no run.
+    """
+    for run in runs:
+        read_recipe(Path(run))
+
+
+def tell_files(out: Path | None, figure: Path | None, draw: Callable[[Path], Path]) -> None:
+    """Says where the episodes are, and draws the figure."""
+    if out is not None:
+        say(f"Episodes: {out}")
+    if figure is not None:
+        say(f"Figure: {draw(figure)}")
+
+
+def runs_by_name(words: Sequence[str]) -> list[str] | dict[str, str]:
+    """Runs as `crossplay` takes them: paths, or a table where one has a name, NAME=PATH.
+
+    Raises:
+        ValueError: if two have one name.
+    """
+    pairs = [_name_and_path(word) for word in words]
+    if not any(name for name, _ in pairs):
+        return [path for _, path in pairs]
+    named = [(name or Path(path).resolve().name, path) for name, path in pairs]
+    names = [name for name, _ in named]
+    for name in names:
+        if names.count(name) > 1:
+            raise ValueError(f"{name} names {names.count(name)} runs; allowed: each its own, NAME=PATH")
+    return dict(named)
+
+
+def _name_and_path(word: str) -> tuple[str, str]:
+    """The parts of NAME=PATH; a path that is there may have "=" itself."""
+    name, equals, path = word.partition("=")
+    return (name, path) if equals and name and "/" not in name and not Path(word).exists() else ("", word)
+
+
+def print_tables(*tables: Table) -> None:
+    """Prints tables; into a file or pipe as wide as they are."""
+    shown = console(width=None if OUT.isatty() else 250)
+    for table in tables:
+        shown.print(table)

@@ -1,8 +1,10 @@
 """The directory of a run; its `recipe.json` holds the experiment, versions, start time, git commit and
 the type of processor."""
 
+import os
 import platform
 import shlex
+import subprocess
 import sys
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from contextlib import suppress
@@ -14,18 +16,14 @@ from typing import Any, Final
 
 from cprl.arguments import callable_of, listed, refusal, texts
 from cprl.arguments import path as path_of
-from cprl.checks import TEXT, checked, shown
+from cprl.checks import TEXT, check_nesting, checked, instance, shown
 from cprl.custom import source_of
-from cprl.runs import formats
-from cprl.runs.files import digest_of, read_json, write_json
-from cprl.runs.lock import FILE_NAME as LOCK_NAME
-from cprl.runs.lock import RunLock
-from cprl.runs.source import git_state
+from cprl.runs.files import LOCK_FILE, RECIPE_FORMAT, RunLock, digest_of, read_json, refuse_newer, write_json
 from cprl.system.output import ERR, console, printed
 from cprl.system.process import cpu
 from cprl.system.shipped import PROGRAM, command_of, cprl_here
 
-FILE_NAME: Final = "recipe.json"
+RECIPE_FILE: Final = "recipe.json"
 
 _RESUMES: Final = ("--resume", "--no-resume", "--take-over", "--no-take-over")
 _DIRECTORIES: Final = ("--out", "--runs")
@@ -55,7 +53,7 @@ def start_run(
 
     Returns:
         The directory. Its `recipe.json` holds the recipe, versions, the git commit of the code of cprl (see
-        `cprl.runs.source.git_state`), the type of processor, the time, and the command without `--out` and
+        `cprl.runs.recipe.git_state`), the type of processor, the time, and the command without `--out` and
         without the directory of the script.
 
     Raises:
@@ -83,7 +81,7 @@ def start_run(
                 "started": started.isoformat(timespec="seconds"),
                 "command": _command(sys.argv if command is None else command),
             }
-            write_json(directory / FILE_NAME, recipe)
+            write_json(directory / RECIPE_FILE, recipe)
     except BaseException:
         if is_new:
             with suppress(OSError):  # not where another process has begun a run there
@@ -144,7 +142,7 @@ def write_more_episodes(run: Path, episodes: int) -> None:
     recipe |= _code_text(recipe)
     recipe["experiment"]["episodes"] = episodes
     recipe["extended"] = [*recipe.get("extended", []), earlier]
-    write_json(run / FILE_NAME, recipe)
+    write_json(run / RECIPE_FILE, recipe)
 
 
 def write_on_nan(run: Path, on_nan: str) -> None:
@@ -152,7 +150,7 @@ def write_on_nan(run: Path, on_nan: str) -> None:
     recipe = read_recipe(run)
     if recipe["experiment"].get("on_nan") != on_nan:
         recipe["experiment"]["on_nan"] = on_nan
-        write_json(run / FILE_NAME, recipe)
+        write_json(run / RECIPE_FILE, recipe)
 
 
 def changed_circumstances(run: Path) -> list[str]:
@@ -182,7 +180,7 @@ def write_changed_circumstances(run: Path) -> None:
     if any(before[-1].get(name) != now[name] for name in now):
         recipe["resumed"] = [*recipe.get("resumed", []), now]
         recipe |= _code_text(recipe)
-        write_json(run / FILE_NAME, recipe)
+        write_json(run / RECIPE_FILE, recipe)
 
 
 def say_changes(run: Path, changes: Sequence[str]) -> None:
@@ -243,7 +241,7 @@ def resume_command(run: Path, command: Sequence[str] | None = None) -> str:
     if command is None:
         from cprl.config import custom_targets
 
-        path = run / FILE_NAME
+        path = run / RECIPE_FILE
         targets = custom_targets(read_json(path).get("experiment")) if path.exists() else []
         allow = [word for target in targets for word in ("--allow", target)]
         return printed([*cprl_here(), "run", str(run), "--resume", *allow])
@@ -294,16 +292,16 @@ def read_recipe(run: Path) -> dict[str, Any]:
         ValueError: if there is no run, its recipe cannot be read, or a newer cprl wrote it; names file and
             reason.
     """
-    path = Path(run) if Path(run).is_file() else Path(run) / FILE_NAME
+    path = Path(run) if Path(run).is_file() else Path(run) / RECIPE_FILE
     try:
         recipe = read_json(path)
-        is_newer = isinstance(recipe.get("format"), int) and recipe["format"] > formats.RECIPE
+        is_newer = isinstance(recipe.get("format"), int) and recipe["format"] > RECIPE_FORMAT
         if not is_newer and not isinstance(recipe.get("experiment"), dict):
             raise TypeError('no table "experiment"')
     except (OSError, ValueError, TypeError) as error:
         name = path if len(str(path)) <= LONGEST_PATH else shown(str(path))
         raise ValueError(f"{name} is not the recipe of a run: {error!r}") from error
-    formats.refuse_newer(path, recipe, formats.RECIPE)
+    refuse_newer(path, recipe, RECIPE_FORMAT)
     return recipe
 
 
@@ -316,8 +314,8 @@ def runs_in(paths: Iterable[Path | str]) -> list[Path]:
     runs: list[Path] = []
     for path in listed("runs", paths, "directories of runs"):
         folder = path_of("runs", path)
-        is_run = (folder / FILE_NAME).exists()
-        inside = [folder] if is_run else sorted(recipe.parent for recipe in folder.glob(f"*/{FILE_NAME}"))
+        is_run = (folder / RECIPE_FILE).exists()
+        inside = [folder] if is_run else sorted(recipe.parent for recipe in folder.glob(f"*/{RECIPE_FILE}"))
         if not inside:
             raise ValueError(f"{folder} is no run; allowed: directories of runs, or one that holds some")
         runs += inside
@@ -362,5 +360,66 @@ def _made_directory(directory: Path) -> Path:
 
 
 def _refuse_contents(directory: Path) -> None:
-    if any(path.name != LOCK_NAME for path in directory.iterdir()):
+    if any(path.name != LOCK_FILE for path in directory.iterdir()):
         raise FileExistsError(f"{directory} is not empty; allowed: a new or empty directory")
+
+
+def recipe_config(recipe: Mapping[str, Any]) -> dict[str, Any]:
+    """The experiment of a recipe, as `Experiment.to_config` gives it.
+
+    Raises:
+        ValueError: for another format.
+    """
+    checked("the recipe", recipe, instance(Mapping, "a table"))
+    check_nesting(recipe, "the recipe")
+    refuse_newer("the recipe", recipe, RECIPE_FORMAT)
+    if recipe.get("format") != RECIPE_FORMAT or not isinstance(recipe.get("experiment"), Mapping):
+        raise ValueError(
+            f"the recipe has the format {shown(recipe.get('format'))}; allowed: {RECIPE_FORMAT}, with "
+            'a table "experiment"'
+        )
+    return dict(recipe["experiment"])
+
+
+BUILT_FROM: Final = "commit.json"
+"""The file of the package that says from which commit a wheel was built; `hatch_build.py` writes it."""
+
+_PACKAGE: Final = Path(__file__).parents[1]
+_OF_ANOTHER: Final = ("GIT_DIR", "GIT_WORK_TREE", "GIT_INDEX_FILE")
+"""Variables that lead git to another checkout than that of the folder, as in a hook."""
+
+
+def git_state(package: Path = _PACKAGE) -> dict[str, str | bool] | None:
+    """The commit of the code of cprl, and whether a tracked file differed from it.
+
+    Where this process stands does not count: the git folder of somebody's own project says nothing of cprl.
+
+    Args:
+        package: the folder of the package.
+
+    Returns:
+        {"commit": 40 hexadecimal digits, "dirty": whether a tracked file was changed}; None where no commit
+        is known: of a wheel that was built outside a checkout, or of files that git does not track.
+    """
+    written = package / BUILT_FROM
+    if written.is_file():
+        built = read_json(written)
+        return {"commit": str(built["commit"]), "dirty": bool(built["dirty"])}
+    if _git(package, "ls-files", "--error-unmatch", "__init__.py") is None:
+        return None
+    commit = _git(package, "rev-parse", "HEAD")
+    changes = _git(package, "status", "--porcelain", "--untracked-files=no")
+    if commit is None or changes is None:
+        return None
+    return {"commit": commit, "dirty": changes != ""}
+
+
+def _git(folder: Path, *arguments: str) -> str | None:
+    """The output of git in a folder; None if there is no git, no checkout or no commit."""
+    own = {name: value for name, value in os.environ.items() if name not in _OF_ANOTHER}
+    words = ["git", "-C", str(folder), *arguments]
+    try:
+        done = subprocess.run(words, capture_output=True, text=True, check=True, timeout=10, env=own)
+    except (OSError, subprocess.SubprocessError):
+        return None
+    return done.stdout.strip()
