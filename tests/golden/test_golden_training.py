@@ -2,6 +2,7 @@
 
 import pytest
 from golden import IS_X86, assert_held, in_a_process
+from trainings import COMPILED
 
 FAMILIES = ("dqn", "off-policy", "on-policy", "recurrent", "teams", "opponent-aware", "mixed")
 pytestmark = [
@@ -17,3 +18,10 @@ def test_a_family_of_algorithms_learns_what_it_did(family, tmp_path):
         name: [] for name in found
     }
     assert_held("training", found)
+
+
+@pytest.mark.parametrize("family", COMPILED)
+def test_compiled_updates_learn_what_eager_ones_do(family, tmp_path):
+    found = in_a_process("trainings.py", family, "compiled", folder=tmp_path)
+    assert set(found) == set(COMPILED[family])
+    assert {name: distance for name, distance in found.items() if not distance < 1e-5} == {}

@@ -1,6 +1,7 @@
 """Short trainings of every algorithm.
 
-python tests/golden/trainings.py FAMILY FOLDER      writes what the trainings of a family gave to found.json
+python tests/golden/trainings.py FAMILY FOLDER               writes to found.json what the trainings gave
+python tests/golden/trainings.py FAMILY compiled FOLDER      ... how far compiled ones end from eager ones
 """
 
 import hashlib
@@ -201,6 +202,37 @@ def train(experiment: object, out: Path) -> dict[str, object]:
     return {**whole, "differs after a stop": differing}
 
 
+COMPILED = {
+    "dqn": ("as run", "n_steps"),
+    "off-policy": ("cql", "c51", "sac", "iql", "pr2"),
+    "on-policy": ("ppo", "a2c", "reinforce"),
+    "recurrent": ("dqn, gru",),
+    "teams": ("vdn", "qmix", "mappo", "ippo", "maddpg"),
+}
+"""One training of each algorithm that can be compiled, by family."""
+
+
+def distances(family: str, folder: Path) -> dict[str, float]:
+    """The largest difference of a weight between a compiled and an eager training of one episode."""
+    import cprl
+
+    found = {}
+    for name in COMPILED[family]:
+        ends = []
+        for engine in ("compiled", "eager"):
+            experiment = replace(experiments()[family][name], engine=engine, episodes=1)
+            out = folder / engine / name.replace(" ", "_").replace(",", "")
+            cprl.run(experiment, out, watch="off", figures=False)
+            ends.append(cprl.load(out).networks)
+        compiled, eager = ({lane: network.state_dict() for lane, network in end.items()} for end in ends)
+        found[name] = max(
+            float((weights - eager[lane][layer]).abs().max())
+            for lane, layers in compiled.items()
+            for layer, weights in layers.items()
+        )
+    return found
+
+
 def main(family: str, folder: Path) -> Mapping[str, object]:
     found = {}
     for name, experiment in experiments()[family].items():
@@ -211,4 +243,6 @@ def main(family: str, folder: Path) -> Mapping[str, object]:
 
 
 if __name__ == "__main__":
-    Path(sys.argv[2], "found.json").write_text(json.dumps(main(sys.argv[1], Path(sys.argv[2]))))
+    measure = distances if "compiled" in sys.argv else main
+    folder = Path(sys.argv[-1])
+    (folder / "found.json").write_text(json.dumps(measure(sys.argv[1], folder)))

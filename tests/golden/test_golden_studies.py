@@ -1,0 +1,35 @@
+"""The summaries of the committed studies come out of their tables line by line."""
+
+from pathlib import Path
+
+import pytest
+
+import cprl
+from cprl.studies import StudyTable
+from cprl.studies.tables.comparing import compare, metrics_of
+from cprl.studies.tables.texts import cells, markdown
+
+RESULTS = Path(cprl.__file__).parents[2] / "docs" / "results"
+STUDIES = sorted(path.parent for path in RESULTS.rglob("summary.md"))
+
+
+def name_of(study):
+    return study.name if study.parent.name == "studies" else f"{study.parent.name}/{study.name}"
+
+
+def last_of(summary):
+    """The episodes at the end of the training that a summary compares."""
+    [heading] = {line.split()[2] for line in summary if line.startswith("The last ") and "; means" in line}
+    return int(heading)
+
+
+@pytest.mark.parametrize("study", STUDIES, ids=name_of)
+def test_a_summary_holds_what_its_table_gives(study):
+    summary = (study / "summary.md").read_text().splitlines()
+    table = StudyTable.read(study / "table.parquet")
+    for part in ("training", "evaluation", "random"):
+        compared = [compare(table, metric, part=part, last=last_of(summary)) for metric in metrics_of(table)]
+        for kind in ("levels", "differences") if part != "random" else ("levels",):
+            lines = markdown(cells(compared, kind))
+            assert len(lines) > 3
+            assert set(lines) <= set(summary), (part, kind)
