@@ -6,8 +6,7 @@ import pytest
 
 import cprl
 from cprl.studies import StudyTable
-from cprl.studies.tables.comparing import compare, metrics_of
-from cprl.studies.tables.texts import cells, markdown
+from cprl.studies.tables.comparing import cells, compare, markdown, metrics_of
 
 RESULTS = Path(cprl.__file__).parents[2] / "docs" / "results"
 STUDIES = sorted(path.parent for path in RESULTS.rglob("summary.md"))
