@@ -85,7 +85,7 @@ def test_the_wall_shows_each_replica_with_the_frame_of_the_same_step(run):
 
 def test_the_line_of_a_replica_is_its_stock_turn_by_turn(run):
     path, viewer, seen = run
-    turns = viewer._views.turns
+    turns = viewer._views["turns"]
     (last,) = (own for own in seen.episodes if own.world == 0 and own.episode == 5)
     steps = sum(own.steps for own in seen.episodes if own.world == 0 and own.episode < 5)
     stocks = [int(stock[0]) for stock in seen.stocks[steps : steps + last.steps - 1]]
@@ -99,7 +99,7 @@ def test_the_line_of_a_replica_is_its_stock_turn_by_turn(run):
 
 def test_maps_show_where_agents_were_in_their_hues(run):
     path, viewer, _ = run
-    visits = viewer._views.visits
+    visits = viewer._views["visits"]
     visits._counts[:] = 0
     assert (visits.maps()[:, 1, 1:-1] == PALETTE[GROUND]).all()
     assert (visits.maps()[:, 2, 3] == PALETTE[WALL]).all()
@@ -128,7 +128,7 @@ def test_a_resumed_recording_goes_on_counting(tmp_path):
     viewer, _ = recorded(tmp_path / "a", episodes=2)
     views = viewer._views
     for episode in (3, 4):
-        views.lorenz.on_episode(
+        views["lorenz"].on_episode(
             Episode(
                 world=0,
                 episode=episode,
@@ -139,12 +139,12 @@ def test_a_resumed_recording_goes_on_counting(tmp_path):
                 harvest=np.array([1.0, episode]),
             )
         )
-    views.visits._counts[3] = 7
-    views.wall._died[1] = True
-    state = views.state_dict()
+    views["visits"]._counts[3] = 7
+    views["wall"]._died[1] = True
+    state = viewer.state_dict()
     other, _ = recorded(tmp_path / "b", episodes=2)
-    other._views.load_state_dict(state)
-    assert repr(other._views.state_dict()) == repr(state)
+    other.load_state_dict(state)
+    assert repr(other.state_dict()["views"]) == repr(state["views"])
 
 
 def test_the_wall_marks_a_board_that_has_died(run):

@@ -2,6 +2,7 @@
 
 import time
 from collections.abc import Callable, Mapping, Sequence
+from math import gcd
 from pathlib import Path
 from statistics import fmean
 from threading import Event, Thread
@@ -26,7 +27,7 @@ from cprl.viewer.frames import Filming, scene_of
 from cprl.viewer.logger import FILE_NAME, RerunLogger, free_name, recording_id
 from cprl.viewer.scenery import RANDOM_PLAY, Curves, curves_of, missing_in
 from cprl.viewer.story import Story, has_died
-from cprl.viewer.views import Views, institution_views
+from cprl.viewer.views import SAMPLED_EVERY, Turns, institution_views, views_of
 
 _PERIOD_S: Final = 1.0
 
@@ -142,6 +143,10 @@ class Tags:
         self._last = list(np.array(state, np.float64))
 
 
+LONGEST: Final = 50
+"""Episodes from one image of visits, stock and Lorenz curve to the next, at most."""
+_IMAGES: Final = 20
+"""The images of a short run, about."""
 _DIED: Final = "died"
 """Among an episode's numbers, whether the board died early."""
 
@@ -213,16 +218,17 @@ class ViewerCallback:
             if is_replay
             else Story(self.logger, curves, episodes=episodes, window=self.plots.window, game=game)
         )
-        self._views = Views(
-            commons,
-            self.logger,
-            curves if scene is None else scene,
-            episodes=episodes,
-            every=self.filming.every,
+        self._views = views_of(
+            commons, self.logger, scene or curves, episodes=episodes, every=self.filming.every
         )
+        self._every = max(1, min(LONGEST, episodes // _IMAGES))
+        """Episodes from one image of the views to the next."""
+        self._ended = self._logged = 0
         self._institutions = institution_views(self.logger, commons)
         has_tags = curves.has_tags and len(self._agents) > 1
-        self._sampled = self._views.sampled
+        turns = self._views.get("turns")
+        self._sampled = gcd(SAMPLED_EVERY, turns.stride) if isinstance(turns, Turns) else 1
+        """Steps from one look at the worlds to the next where no frame is recorded."""
         self._tags = Tags(self.logger, len(self._agents)) if has_tags else None
         self._step = self._episode = 0
         self._has_died = False
@@ -251,19 +257,22 @@ class ViewerCallback:
         if self.exhibition is not None:
             self.exhibition.on_step(episode=self._episode)
         frame = self.filming.add(batch, step=self._step, episode=self._episode)
-        self._views.on_step(self._step, self._episode, frame)
+        if frame is not None or self._step % self._sampled == 0:
+            for view in self._views.values():
+                view.on_step(self._step, self._episode, frame)
 
     def on_episode(self, episode: Episode, learning: Mapping[str, float]) -> None:
         """Logs the numbers of an episode, and its events, once all replicas have ended it."""
         if episode.world == 0:
             self._log_death(episode)
-            if self._institutions is not None and episode.episode % self._views.every == 0:
+            if self._institutions is not None and episode.episode % self._every == 0:
                 self.logger.at(step=self._step, episode=episode.episode)
                 self._institutions.on_episode(episode)
             self._episode, self.filming.shows_next = episode.episode + 1, False
         if self._tags is not None and episode.tagged_by is not None:
             self._tags.add(episode.tagged_by)
-        self._views.on_episode(episode)
+        for view in self._views.values():
+            view.on_episode(episode)
         numbers = numbers_of(episode, learning, self._agents)
         died = has_died(episode)
         of_all = self._series.add(
@@ -291,7 +300,9 @@ class ViewerCallback:
     def _log(self, episode: int, of_all: dict[str, Values]) -> None:
         now, died = time.perf_counter(), of_all.pop(_DIED, None)
         self.plots.on_episode(of_all)
-        self._views.on_all(episode)
+        self._ended = episode + 1
+        if self._ended % self._every == 0:
+            self._log_views()
         steps = (self._step - self._rate_step) * self._series.replicas
         if steps:
             self.logger.log_scalar("time/env_steps_per_s", steps / (now - self._rate_at))
@@ -301,6 +312,17 @@ class ViewerCallback:
             self.filming.shows_next |= any(event.startswith("new best") for event in events)
         if self._tags is not None:
             self._tags.on_episode(episode)
+
+    def _log_views(self) -> None:
+        if self._ended > self._logged:
+            for view in self._views.values():
+                view.log(self._logged + 1, self._ended)
+            self._logged = self._ended
+
+    def _close_views(self) -> None:
+        self._log_views()
+        for view in self._views.values():
+            view.close()
 
     def log_status(self, status: str) -> None:
         """Says in the header what happens before the first episode has ended, e.g. "compiling, 12 s so far";
@@ -326,7 +348,7 @@ class ViewerCallback:
             played: the episodes of its evaluation, "trained" and "random".
         """
         self.filming.send()
-        self._views.close()
+        self._close_views()
         if self.story is not None:
             self.story.finished(played["trained"], played["random"])
         self.logger.close_file()
@@ -353,7 +375,11 @@ class ViewerCallback:
             **self.filming.state_dict(),
             "series": self._series.state_dict(),
             "plots": self.plots.state_dict(),
-            "views": self._views.state_dict(),
+            "views": {
+                "logged": self._logged,
+                "ended": self._ended,
+                **{name: view.state_dict() for name, view in self._views.items()},
+            },
             "story": None if self.story is None else self.story.state_dict(),
             "tags": None if self._tags is None else self._tags.state_dict(),
         }
@@ -364,7 +390,9 @@ class ViewerCallback:
         self.filming.load_state_dict(state, episode=self._episode)
         self._series.load_state_dict(state["series"])
         self.plots.load_state_dict(state["plots"])
-        self._views.load_state_dict(state["views"])
+        self._logged, self._ended = (int(state["views"][name]) for name in ("logged", "ended"))
+        for name, view in self._views.items():
+            view.load_state_dict(state["views"][name])
         self.logger.at(step=self._step, episode=self._episode)
         if self.story is not None:
             self.story.load_state_dict(state["story"] or {})
@@ -386,7 +414,7 @@ class ViewerCallback:
         if self.exhibition is not None:
             self.exhibition.close()
         self.filming.send()
-        self._views.close()
+        self._close_views()
         if self.story is not None:
             self.story.close()
         self.logger.shutdown()

@@ -6,7 +6,7 @@ import time
 from collections.abc import Mapping, Sequence
 from functools import partial
 from itertools import chain
-from math import ceil, gcd
+from math import ceil
 from typing import Any, Final, TypeAlias
 
 import numpy as np
@@ -25,6 +25,27 @@ from cprl.viewer.panels import TITLE, Axes, Panels
 from cprl.viewer.scenery import BACKGROUND, STATES, Curves, Scene, has_lorenz, has_wall
 from cprl.viewer.stage import RIM_CELLS, boards, image_form
 from cprl.viewer.story import has_died
+
+
+class View:
+    """What a recording shows of a training besides its lines; each does what it needs of the following."""
+
+    def on_step(self, step: int, episode: int, frame: int | None) -> None:
+        """Look at the worlds after a step of the run; `frame` is the number of the recorded one, if any."""
+
+    def on_episode(self, episode: Episode) -> None:
+        """Add an episode of a replica."""
+
+    def log(self, first: int, last: int) -> None:
+        """Log these episodes, counted from 1, which all replicas have ended, at the logger's time."""
+
+    def close(self) -> None:
+        """Send what is left."""
+
+    def state_dict(self) -> Any: ...
+
+    def load_state_dict(self, state: Any) -> None: ...
+
 
 ROOM: Final = 100
 """Looks that are kept, at most."""
@@ -77,7 +98,7 @@ _Row = tuple[int, int, int, Any, list[str], Any]
 """A step, episode and frame, the image, and the label and outline of each board."""
 
 
-class Wall:
+class Wall(View):
     """Logs the boards of all replicas: same rules, as many fates.
 
     Viewers get them every two seconds, after hours more rarely; the file gets every `stride`-th step of the
@@ -117,10 +138,9 @@ class Wall:
         """Notes whether the replica's board has died, and sends the rows of the episode."""
         self._died[episode.world] = bool(has_died(episode))
         if episode.world == 0:
-            self.send()
+            self.close()
 
-    def send(self) -> None:
-        """Sends the rows that wait for the file."""
+    def close(self) -> None:
         if self._rows:
             self._send(self._rows)
             self._rows = []
@@ -139,7 +159,7 @@ class Wall:
         self._logger.do(partial(_send_rows, rows=rows), live_only=live_only)
 
     def state_dict(self) -> list[bool]:
-        self.send()
+        self.close()
         died: list[bool] = self._died.tolist()
         return died
 
@@ -166,7 +186,7 @@ _DARKEST: Final = 0.35
 """The brightness of a cell that was visited once; 1 is the cell with the longest stay."""
 
 
-class Visits:
+class Visits(View):
     """Counts the agents' cells in the first replica, the one that is shown, every `SAMPLED_EVERY` steps.
 
     The image has a map for each agent: hue the agent, brightness the time it spent on the cell while in play,
@@ -187,8 +207,7 @@ class Visits:
         self._ended = self._logged = 0
         logger.log_static("visits/labels", self._panels.labels())
 
-    def on_step(self, step: int) -> None:
-        """Notes where the agents are, if it is time."""
+    def on_step(self, step: int, episode: int, frame: int | None) -> None:
         if step % SAMPLED_EVERY:
             return
         self._looks.add()
@@ -202,12 +221,10 @@ class Visits:
         self._counts += np.bincount(cells[in_play], minlength=len(self._counts))
 
     def on_episode(self, episode: Episode) -> None:
-        """Notes how many episodes the first replica has ended."""
         if episode.world == 0:
             self._ended = episode.episode + 1
 
-    def log(self) -> None:
-        """Logs the maps at the logger's time, and counts from zero."""
+    def log(self, first: int, last: int) -> None:
         image = self._panels.joined(self.maps(), PALETTE[GROUND])
         self._logger.log_row("visits", rr.Image(image))
         first, last = self._logged + 1, max(self._ended, self._logged + 1)
@@ -244,7 +261,7 @@ _LIVED: Final = (150, 150, 150)
 _TEXT: Final = (200, 200, 200)
 
 
-class Turns:
+class Turns(View):
     """Logs the apples on the board over the turns of each replica's last episode, grey where the board lived
     until the time was up, in the colour of a tragedy where it died.
     """
@@ -266,8 +283,7 @@ class Turns:
         logger.log_static("turn/axes", lines)
         logger.log_static("turn/axes/texts", texts)
 
-    def on_step(self, step: int) -> None:
-        """Notes the stock of every replica, each at its own turn, if it is time."""
+    def on_step(self, step: int, episode: int, frame: int | None) -> None:
         if step % self.stride:
             return
         self._looks.add()
@@ -281,7 +297,6 @@ class Turns:
         self._playing[(*point, 0)], self._playing[(*point, 1)] = turn, stock
 
     def on_episode(self, episode: Episode) -> None:
-        """Ends the line of a replica."""
         self._place()
         playing = self._playing[episode.world]
         points = playing[playing[:, 0] < episode.steps]
@@ -290,8 +305,7 @@ class Turns:
         self._died[episode.world] = bool(has_died(episode))
         playing[1:] = np.nan  # the first point is already that of the next episode, which begins alike
 
-    def log(self) -> None:
-        """Logs the lines at the logger's time."""
+    def log(self, first: int, last: int) -> None:
         shown = [replica for replica, line in enumerate(self._ended) if len(line) > 1]
         if not shown:
             return
@@ -335,7 +349,7 @@ def gini(curve: NDArray[np.float64]) -> float:
     return float(1 - (curve[1:] + curve[:-1]).sum() / (len(curve) - 1))
 
 
-class Lorenz:
+class Lorenz(View):
     """Logs the mean Lorenz curve of the episodes of all replicas since the last one, beside the first one.
 
     The mean is over episodes, so its Gini coefficient is 1 minus their mean equality; episodes without a
@@ -352,7 +366,6 @@ class Lorenz:
         logger.log_static("lorenz/axes/texts", texts)
 
     def on_episode(self, episode: Episode) -> None:
-        """Adds an episode of a replica."""
         if episode.harvest is not None and episode.harvest.sum() > 0:
             row = np.append(lorenz_curve(episode.harvest), 1.0)
             self._sums[episode.episode] = self._sums.get(episode.episode, 0.0) + row
@@ -482,93 +495,23 @@ def _borders(cells: NDArray[np.bool_]) -> list[list[tuple[float, float]]]:
     return strips
 
 
-LONGEST: Final = 50
-"""Episodes from one image of visits, stock and Lorenz curve to the next, at most."""
-_IMAGES: Final = 20
-"""The images of a short run, about."""
-
-
-class Views:
-    """Those of the views that the game has: without a board there is none of it, without a harvest no curve.
+def views_of(
+    env: CommonsEnv | None, logger: RerunLogger, curves: Curves, *, episodes: int, every: int
+) -> dict[str, View]:
+    """Return those of the views that the game has: without a board none of it, without a harvest no curve.
 
     Args:
         env: the worlds, one for each replica; None without boards.
         every: episodes from one with recorded frames to the next; 0 without frames.
     """
-
-    def __init__(
-        self, env: CommonsEnv | None, logger: RerunLogger, curves: Curves, *, episodes: int, every: int
-    ) -> None:
-        self._logger = logger
-        self.every = max(1, min(LONGEST, episodes // _IMAGES))
-        """Episodes from one image to the next."""
-        self.wall: Wall | None = None
-        self.visits: Visits | None = None
-        self.turns: Turns | None = None
-        if env is not None and isinstance(curves, Scene) and not curves.is_replay:
-            if has_wall(curves):
-                recorded = env.game.rules.episode_steps * (episodes // max(1, every) + 1)
-                self.wall = Wall(env, logger, scene=curves, recorded_steps=recorded)
-            self.visits = Visits(env, logger, scene=curves)
-            self.turns = Turns(env, logger)
-        replayed = isinstance(curves, Scene) and curves.is_replay
-        self.lorenz = Lorenz(logger, len(curves.agents)) if has_lorenz(curves) and not replayed else None
-        self.sampled = 1 if self.turns is None else gcd(SAMPLED_EVERY, self.turns.stride)
-        """Steps from one look at the worlds to the next where no frame is recorded."""
-        self._logged = 0
-        self._ended = 0
-
-    def on_step(self, step: int, episode: int, frame: int | None) -> None:
-        """Looks at the worlds after a step, if a view is due; `frame` is the number of the recorded one."""
-        if frame is None and step % self.sampled:
-            return
-        if self.wall is not None:
-            self.wall.on_step(step, episode, frame)
-        if self.visits is not None and self.turns is not None:
-            self.visits.on_step(step)
-            self.turns.on_step(step)
-
-    def on_episode(self, episode: Episode) -> None:
-        """Adds an episode of a replica."""
-        for view in (self.wall, self.visits, self.turns, self.lorenz):
-            if view is not None:
-                view.on_episode(episode)
-
-    def on_all(self, episode: int) -> None:
-        """Logs the images if they are due after an episode, counted from 0, that all replicas have ended; the
-        logger's time is set."""
-        self._ended = episode + 1
-        if self._ended % self.every == 0:
-            self.log()
-
-    def log(self) -> None:
-        """Logs the images of the episodes since the last ones, if there are any."""
-        if self._ended == self._logged:
-            return
-        if self.visits is not None and self.turns is not None:
-            self.visits.log()
-            self.turns.log()
-        if self.lorenz is not None:
-            self.lorenz.log(self._logged + 1, self._ended)
-        self._logged = self._ended
-
-    def close(self) -> None:
-        """Sends what is left."""
-        self.log()
-        if self.wall is not None:
-            self.wall.send()
-
-    def _there(self) -> dict[str, Any]:
-        views = {"wall": self.wall, "visits": self.visits, "turns": self.turns, "lorenz": self.lorenz}
-        return {name: view for name, view in views.items() if view is not None}
-
-    def state_dict(self) -> dict[str, Any]:
-        views = {name: view.state_dict() for name, view in self._there().items()}
-        return {"logged": self._logged, "ended": self._ended, **views}
-
-    def load_state_dict(self, state: Mapping[str, Any]) -> None:
-        self._logged = int(state["logged"])
-        self._ended = int(state["ended"])
-        for name, view in self._there().items():
-            if name in state:
-                view.load_state_dict(state[name])
+    views: dict[str, View] = {}
+    is_replay = isinstance(curves, Scene) and curves.is_replay
+    if env is not None and isinstance(curves, Scene) and not is_replay:
+        if has_wall(curves):
+            recorded = env.game.rules.episode_steps * (episodes // max(1, every) + 1)
+            views["wall"] = Wall(env, logger, scene=curves, recorded_steps=recorded)
+        views["visits"] = Visits(env, logger, scene=curves)
+        views["turns"] = Turns(env, logger)
+    if has_lorenz(curves) and not is_replay:
+        views["lorenz"] = Lorenz(logger, len(curves.agents))
+    return views
