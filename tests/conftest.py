@@ -27,3 +27,17 @@ def shorter_episodes(monkeypatch, request):
         return replace(whole, rules=replace(whole.rules, episode_steps=60))
 
     monkeypatch.setattr(presets, "game", shorter)
+
+
+@pytest.fixture(scope="session")
+def corridors(tmp_path_factory):
+    """Runs on `stored_runs.CORRIDORS` by the policy of both agents."""
+    from stored_runs import CORRIDORS, ran
+
+    from cprl.population import Scripted
+
+    folder = tmp_path_factory.mktemp("corridors")
+    return {
+        policy: ran(folder / policy, CORRIDORS, [Scripted(policy)] * 2, replicas=2)
+        for policy in ("greedy", "sustainable")
+    }

@@ -12,9 +12,9 @@ import pyarrow.parquet as pq
 import pytest
 import torch
 from matrix_game import MatrixGame, tit_for_tat
+from recordings import column
 from rerun.chunk import RrdReader
 from rich.console import Console
-from test_rerun_logger import column
 from test_torchrl_logs import Corridor
 from torchrl.data import Bounded
 from torchrl.envs import (

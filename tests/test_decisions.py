@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 import torch
-from test_rerun_logger import column
+from recordings import column
 
 from cprl import CommonsEnv, Game, Rules, maps
 from cprl.policies.assignment import AgentPolicies

@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from matplotlib.image import imread
-from test_evaluation import CORRIDORS, MEADOW, SEED, command, ran
+from stored_runs import MEADOW, SEED, command, ran
 
 import cprl
 from cprl import Game, Rules, maps
@@ -31,11 +31,6 @@ def scripted_runs(folder, game, *policies, replicas=2):
     return {
         name: ran(folder / name, game, [Scripted(name)] * game.agents, replicas=replicas) for name in policies
     }
-
-
-@pytest.fixture(scope="module")
-def corridors(tmp_path_factory):
-    return scripted_runs(tmp_path_factory.mktemp("corridors"), CORRIDORS, "greedy", "sustainable")
 
 
 @pytest.fixture(scope="module")

@@ -9,6 +9,7 @@ import pytest
 import torch
 from imageio_ffmpeg import get_ffmpeg_exe
 from PIL import Image
+from stored_runs import CORRIDORS
 
 from cprl import Experiment, Game, Rules, load, maps
 from cprl.commands import main as cli
@@ -23,19 +24,6 @@ from cprl.population import Scripted
 from cprl.runs.recipe import start_run
 from cprl.runs.weights import save_weights
 
-CORRIDORS = Game(
-    map=maps.parse(
-        """
-        >A.A.
-        #####
-        #AAA<
-        """
-    ),
-    rules=Rules(
-        regrow_prob=(0.0,), window_rows=4, window_columns=3, episode_steps=9, may_fire=False, freeze_steps=0
-    ),
-)
-"""Greedy agents bite in turns 1, 2 and 3, and nothing grows again: the board is dead after turn 3 of 9."""
 LEFT = [5, 3, 2, 0]
 """Apples on the board at the start and after each turn."""
 

@@ -8,11 +8,11 @@ import numpy as np
 import pytest
 from matplotlib.image import imread
 from paying_game import Charges
+from recordings import column, static
 from rerun.chunk import RrdReader
 from rich.console import Console
 from rich.table import Table
 from test_film import frames_of
-from test_rerun_logger import column, static
 from torchrl.envs import TransformedEnv
 
 import cprl

@@ -1,9 +1,6 @@
 """What an experiment names works everywhere: training, stop, resume, evaluation, film, from its recipe."""
 
 import signal
-import subprocess
-import sys
-import time
 from dataclasses import replace
 from pathlib import Path
 
@@ -123,31 +120,6 @@ def test_no_command_imports_what_is_not_allowed(in_one_go, monkeypatch, capsys):
             cli.main()
     with pytest.raises(ValueError, match="one_road_parts:Fatigue"):
         cprl.load(in_one_go, allow=ALLOW[:1])
-
-
-@pytest.mark.slow
-def test_it_survives_sigkill(in_one_go, tmp_path):
-    run = tmp_path / "run"
-    script = (
-        "import sys, functools, cprl.training.running as r, test_one_road as t\n"
-        "r.Checkpointer = functools.partial(r.Checkpointer, every_s=1e-9)\n"
-        f"r.run(t.MEADOW, {str(run)!r}, watch='off', resume='--resume' in sys.argv)\n"
-    )
-    for kill in range(4):
-        words = ["--resume"] if kill else []
-        process = subprocess.Popen([sys.executable, "-c", script, *words], cwd=HERE)
-        seen = {path.name for path in checkpoints_in(run / "checkpoints")}
-        deadline = time.monotonic() + 120
-        while process.poll() is None and time.monotonic() < deadline:
-            if {path.name for path in checkpoints_in(run / "checkpoints")} - seen:
-                time.sleep(0.02 * kill)
-                process.kill()
-                break
-            time.sleep(0.005)
-        process.wait()
-    if not (run / "report.json").exists():
-        subprocess.run([sys.executable, "-c", script, "--resume"], cwd=HERE, check=True)
-    assert_same_run(run, in_one_go)
 
 
 DILEMMA = Experiment(

@@ -6,12 +6,11 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
+from recordings import GAME, column
 from rerun.chunk import RrdReader
-from test_rerun_logger import column
 from torchrl.envs import Transform
 
 import cprl
-from cprl import Game, Rules, maps
 from cprl.algorithms import DQN
 from cprl.custom import Custom
 from cprl.envs.state import load_transforms_state, transforms_state
@@ -21,10 +20,6 @@ from cprl.population import Learning, Scripted
 from cprl.runs.episodes import read_table
 from cprl.training.outcome import evaluate_population, fresh_env, is_same_later, make_parts, random_play
 
-GAME = Game(
-    map=maps.parse(".A>.A\n.A.A.\n..<.A"),
-    rules=Rules(regrow_prob=(0.0, 0.1), window_rows=3, window_columns=5, episode_steps=20),
-)
 SETTINGS = DQNSettings(buffer_size=200, learning_rate=1e-3, hidden_cells=(8,))
 EXPERIMENT = cprl.Experiment(
     name="small",

@@ -15,7 +15,8 @@ HERE = Path(__file__).parent
 TRAINS = f"""
 import sys; sys.path.insert(0, {str(HERE)!r})
 from pathlib import Path
-from test_watch import GAME, SETTINGS
+from recordings import GAME
+from test_watch import SETTINGS
 import cprl
 from cprl import Experiment, run
 from cprl.population import Learning

@@ -9,8 +9,8 @@ from urllib.parse import parse_qs, urlsplit
 
 import psutil
 import pytest
+from recordings import SCENE, column, frames
 from rerun.chunk import RrdReader
-from test_rerun_logger import SCENE, column, frames
 from test_story import headers
 
 from cprl.commands import main as cli

@@ -1,7 +1,7 @@
 """Agents that do not learn, in any mix, in fresh worlds."""
 
 import pytest
-from test_evaluation import CORRIDORS, DQN, MEADOW, SEED, ran
+from stored_runs import CORRIDORS, DQN, MEADOW, SEED, ran
 
 import cprl
 from cprl.envs.matrix import stag_hunt

@@ -16,8 +16,8 @@ import numpy as np
 import pyarrow as pa
 import pytest
 import torch
+from recordings import column
 from rerun.chunk import RrdReader
-from test_rerun_logger import column
 
 import cprl
 from cprl import presets

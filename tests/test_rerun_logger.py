@@ -8,10 +8,11 @@ import numpy as np
 import pytest
 import rerun as rr
 import torch
+from recordings import GAME, SCENE, column, frames, static, strict_rerun
 from rerun.chunk import RrdReader
 from tensordict import TensorDict
 
-from cprl import CommonsEnv, Game, Observation, Rules, maps
+from cprl import CommonsEnv, Observation
 from cprl.algorithms import DQN
 from cprl.commons.colours import APPLE, BEAM, COLOURS, FIRST_AGENT, GROUND, OTHER, PALETTE, SELF, WALL
 from cprl.commons.decoding import UNSEEN, classes_seen
@@ -19,68 +20,12 @@ from cprl.learners.settings import DQNSettings
 from cprl.policies.single import RandomActor
 from cprl.training import train
 from cprl.viewer.callback import ViewerCallback
-from cprl.viewer.frames import Frame, FrameBuffer
 from cprl.viewer.logger import RerunLogger
 from cprl.viewer.panels import mosaic, window_corners
 from cprl.viewer.scenery import Scene
 from cprl.viewer.stage import boards
 
-GAME = Game(
-    map=maps.parse(".A>.A\n.A.A.\n..<.A"),
-    rules=Rules(regrow_prob=(0.0, 0.1), window_rows=3, window_columns=5, episode_steps=20),
-)
-SCENE = Scene(height=3, width=5, walls=(), sites=GAME.map.sites, agents=GAME.agent_names, window=(3, 5))
-
-
-@pytest.fixture(autouse=True)
-def strict_rerun():
-    rr.set_strict_mode(True)
-    yield
-    rr.set_strict_mode(False)
-
-
-def column(path, entity, component, timeline="step"):
-    """The times and values of one column of a recording."""
-    times, values = [], []
-    for chunk in RrdReader(path).stream().filter(content=f"/{entity}"):
-        batch = chunk.to_record_batch()
-        if component in batch.schema.names and timeline in batch.schema.names:
-            times += batch.column(timeline).to_pylist()
-            values += batch.column(component).to_pylist()
-    return times, values
-
-
-def static(path, entity, component):
-    """The static value of one component."""
-    for chunk in RrdReader(path).stream().filter(content=f"/{entity}"):
-        batch = chunk.to_record_batch()
-        if component in batch.schema.names:
-            return batch.column(component).to_pylist()[0]
-    return None
-
-
-def frames(count, *, first_step=1):
-    """So many frames of two agents, each frame another."""
-    random = np.random.default_rng(0)
-    sites = len(GAME.map.sites)
-    buffer = FrameBuffer(count, board=(3, 5), sites=sites, windows=(2, 3, 3, 5))
-    shown = []
-    for step in range(count):
-        frame = Frame(
-            beams=np.arange(15).reshape(3, 5) < step // 2,
-            stock=random.integers(0, 2, sites).astype(np.uint8),
-            windows=GAME.palette[random.integers(0, len(COLOURS), (2, 3, 5))].transpose(0, 3, 1, 2),
-            row=np.array([0, step % 3], np.int32),
-            col=np.array([step % 5, 4], np.int32),
-            heading=np.array([step % 4, 1], np.int32),
-            in_play=np.array([True, step < 2]),
-            tagged_by=np.array([-1, 0 if step > 3 else -1], np.int32),
-            harvested=np.array([step, 0], np.int32),
-        )
-        buffer.add(first_step + step, 7, frame)
-        shown.append(frame)
-    taken = buffer.take()
-    return {**taken, "windows": classes_seen(GAME, taken["windows"])}, shown
+__all__ = ["strict_rerun"]
 
 
 def test_numbers_are_read_back_under_their_names_with_all_three_timelines(tmp_path):
@@ -221,26 +166,12 @@ def test_frames_without_a_scene_are_refused(tmp_path):
         logger.log_frames(frames(1)[0])
 
 
-def test_a_full_buffer_says_so():
-    buffer = FrameBuffer(1, board=(3, 5), sites=len(GAME.map.sites), windows=(2, 3, 3, 5))
-    _, (frame,) = frames(1)
-    buffer.add(0, 0, frame)
-    with pytest.raises(ValueError, match="already has 1 frames"):
-        buffer.add(1, 0, frame)
-    assert buffer.take()["step"].tolist() == [0]
-    assert buffer.size == 0
-
-
 def test_mosaics_put_low_windows_below_each_other_and_high_ones_side_by_side():
     low = np.array([[[[SELF, BEAM, WALL]], [[GROUND, APPLE, OTHER]]]], np.uint8)
     assert mosaic(low).tolist() == [[[SELF, BEAM, WALL], [UNSEEN] * 3, [GROUND, APPLE, OTHER]]]
+    assert window_corners(4, (7, 15)) == [(0, 0), (0, 16), (8, 0), (8, 16)]
     high = np.array([[[[SELF], [BEAM], [WALL]], [[GROUND], [APPLE], [OTHER]]]], np.uint8)
     assert mosaic(high).tolist() == [[[SELF, UNSEEN, GROUND], [BEAM, UNSEEN, APPLE], [WALL, UNSEEN, OTHER]]]
-
-
-def test_four_windows_make_two_rows_of_two():
-    assert window_corners(4, (7, 15)) == [(0, 0), (0, 16), (8, 0), (8, 16)]
-    assert window_corners(1, (7, 15)) == [(0, 0)]
 
 
 def test_classes_are_known_from_colours_and_foreign_colours_are_marked():

@@ -8,7 +8,7 @@ from pathlib import Path
 import pyarrow.parquet as pq
 import pytest
 from PIL import Image
-from test_evaluation import CORRIDORS, DQN, MEADOW, SEED, command, ran
+from stored_runs import CORRIDORS, DQN, MEADOW, SEED, command, ran
 
 import cprl
 from cprl import Experiment, Observation, maps, presets

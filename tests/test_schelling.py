@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from matplotlib.image import imread
-from test_evaluation import CORRIDORS, DQN, MEADOW, SEED, command, ran
+from stored_runs import CORRIDORS, DQN, MEADOW, SEED, command, ran
 
 import cprl
 from cprl import Game, Rules, maps, presets

@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 import rerun as rr
+from recordings import GAME, SCENE, column, static, strict_rerun
 from rerun.chunk import RrdReader
-from test_rerun_logger import GAME, SCENE, column, static, strict_rerun
 from test_watch import fake
 
 from cprl import CommonsEnv, presets
@@ -20,48 +20,12 @@ from cprl.viewer.story import Header, played, published_phases
 from cprl.viewer.streams import LiveStream, Stream
 
 __all__ = ["strict_rerun"]
-HEADER = Header(episodes=4800, replicas=8, unit="apples")
 
 
 def headers(path):
     """The first line of each header, with its episode."""
     episodes, texts = column(path, "header", "TextDocument:text", "episode")
     return [(episode, text[0].splitlines()[0]) for episode, text in zip(episodes, texts, strict=True)]
-
-
-def test_the_header_says_where_a_run_is():
-    line = HEADER.line(episode=640, label="tragedy", mean=436.4, random_play=282.1, died=2.0)
-    assert (
-        line == "# Episode 640 of 4,800 · tragedy · 436 apples (random play 282) · 2 of 8 boards died early"
-    )
-
-
-@pytest.mark.parametrize("died", [None, float("nan")])
-def test_a_game_without_harvest_or_stock_has_a_return_and_no_boards(died):
-    header = Header(episodes=200, replicas=1, unit="return")
-    line = header.line(episode=1, label="harvesting", mean=4.25, random_play=None, died=died)
-    assert line == "# Episode 1 of 200 · harvesting · return 4.25"
-
-
-def test_a_single_board_is_not_counted():
-    header = Header(episodes=200, replicas=1, unit="apples")
-    say = {"episode": 7, "label": "tragedy", "mean": 12.0, "random_play": None}
-    assert header.line(**say, died=1.0).endswith("· 12 apples · the board died early")
-    assert header.line(**say, died=0.0).endswith("· 12 apples")
-
-
-def test_the_notes_name_every_kind_of_line():
-    notes = HEADER.notes(window=96, of_mean=64)
-    for words in (
-        "last 64 episodes",
-        "bold",
-        "last 96 episodes",
-        "faint",
-        "thin, each of 8 replicas",
-        "grey",
-    ):
-        assert words in notes
-    assert "replicas" not in Header(episodes=9, replicas=1, unit="apples").notes(window=10)
 
 
 def test_the_header_goes_from_the_beginning_to_the_end(tmp_path):
@@ -258,3 +222,17 @@ def test_the_numbers_of_an_evaluation_are_means_with_their_error():
     own = played(episodes)
     assert (own.mean, own.error, own.died, own.episodes) == (12.0, 2.0, 2, 2)
     assert np.isnan(played(episodes[:1]).error)
+
+
+def test_the_header_says_where_a_run_is_and_how_to_read_its_plots():
+    header = Header(episodes=4800, replicas=8, unit="apples")
+    line = header.line(episode=640, label="tragedy", mean=436.4, random_play=282.1, died=2.0)
+    assert all(word in line for word in ("640", "4,800", "tragedy", "436", "282", "2 of 8"))
+    notes = header.notes(window=96, of_mean=64)
+    assert all(word in notes for word in ("64 episodes", "96 episodes", "8 replicas"))
+    alone = Header(episodes=200, replicas=1, unit="return")
+    assert "replicas" not in alone.notes(window=10)
+    for died in (None, float("nan"), 0.0):
+        line = alone.line(episode=1, label="harvesting", mean=4.25, random_play=None, died=died)
+        assert "return 4.25" in line
+        assert "died" not in line

@@ -4,8 +4,8 @@ import gymnasium
 import numpy as np
 import pytest
 import torch
+from recordings import column
 from tensordict.nn import TensorDictModule, TensorDictSequential
-from test_rerun_logger import column
 from torchrl.collectors import Collector
 from torchrl.envs import GymWrapper, TransformedEnv
 from torchrl.modules import EGreedyModule, QValueModule

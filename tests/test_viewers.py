@@ -15,14 +15,13 @@ import pytest
 from PIL import Image
 from test_exhibition import ALONE, population_of
 from test_story import headers
-from viewers import browser, free_port, native_viewer, steady_picture, wait_until
+from viewers import browser, native_viewer, wait_until
 
 from cprl.commons.colours import APPLE, PALETTE, agent_colour
 from cprl.training.outcome import exhibited
 from cprl.viewer.callback import ViewerCallback
-from cprl.viewer.logger import RerunLogger
 from cprl.viewer.page import Page
-from cprl.viewer.scenery import SOCIAL, Scene
+from cprl.viewer.scenery import SOCIAL
 
 pytestmark = pytest.mark.viewer
 
@@ -36,8 +35,6 @@ PLACES = {
     "social/survival_steps": (0.34, 0.64, 0.666, 0.96),
     "social/equality": (0.67, 0.64, 1.0, 0.96),
 }
-EVERYTHING = ["apples", *(f"agent_{n} on the board" for n in range(AGENTS))]
-EVERYTHING += [f"line of {name}" for name in PLACES]
 LIMIT_S = 900.0
 """The longest wait, on a machine with much other work; as a rule it takes seconds."""
 
@@ -224,39 +221,3 @@ def test_the_web_viewer_shows_a_recording_that_is_served_from_its_file(tmp_path)
             tmp_path / "replay.png",
         )
     page.close()
-
-
-def test_an_empty_viewer_lacks_everything():
-    with native_viewer() as client:
-        assert missing(steady_picture(client)) == EVERYTHING
-
-
-def test_a_browser_without_a_recording_lacks_everything(training):
-    _, addresses = training
-    page = addresses["browser"].split("?")[0]
-    nobody = f"rerun%2Bhttp%3A%2F%2F127.0.0.1%3A{free_port()}%2Fproxy"
-    with browser(f"{page}?url={nobody}&renderer=webgl&persist=0&theme=dark") as take_picture:
-        wait_until(lambda: is_drawn(take_picture()), LIMIT_S, "the viewer is not drawn", every_s=1.0)
-        assert missing(take_picture()) == EVERYTHING
-
-
-def is_drawn(picture):
-    """Whether the web viewer has loaded: before, there is a line of text on one colour."""
-    return len(np.unique(part(picture, (0.0, 0.0, 1.0, 1.0)).reshape(-1, 3), axis=0)) > 300
-
-
-def test_names_in_the_layout_without_any_data_are_no_lines(tmp_path):
-    agents = tuple(f"agent_{agent}" for agent in range(AGENTS))
-    scene = Scene(height=12, width=24, walls=(), sites=(), agents=agents, window=(6, 13))
-    with RerunLogger("run", tmp_path, scene=scene) as logger:
-        for name in PLACES:
-            logger.log_scalar(name, 1.0, step=7)
-    with native_viewer() as client:
-        client.open(str(tmp_path / "run.rrd"))
-        wait_until(lambda: has_loaded(client), LIMIT_S, "the recording is not loaded")
-        assert missing(steady_picture(client)) == EVERYTHING, "one value has a legend, and makes no line"
-
-
-def has_loaded(client):
-    state = client.get_state()
-    return not state.loading and len(state.recordings) == 1

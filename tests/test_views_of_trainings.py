@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 import torch
-from test_rerun_logger import column, static
+from recordings import column, static
 
 from cprl import CommonsEnv, Game, Rules, maps
 from cprl.commons.colours import APPLE, FIRST_AGENT, GROUND, PALETTE, WALL, agent_colour

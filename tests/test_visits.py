@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 from matplotlib.image import imread
-from test_evaluation import CORRIDORS, MEADOW, SEED, command, ran
+from stored_runs import MEADOW, SEED, command, ran
 from test_population import ALGORITHMS
 
 import cprl
@@ -14,12 +14,6 @@ from cprl.population import Learning, Scripted
 
 
 @pytest.fixture(scope="module")
-def corridors(tmp_path_factory):
-    """Two greedy agents, each in a corridor of its own."""
-    return ran(tmp_path_factory.mktemp("runs") / "greedy", CORRIDORS, [Scripted("greedy")] * 2, replicas=2)
-
-
-@pytest.fixture(scope="module")
 def meadow(tmp_path_factory):
     """Two agents that learned a little, on a board without walls and with a beam."""
     dqn = Learning(ALGORITHMS["DQN"])
@@ -27,7 +21,7 @@ def meadow(tmp_path_factory):
 
 
 def test_agents_in_corridors_of_their_own_exclude_each_other(corridors):
-    found = territory_of(corridors, episodes=4)
+    found = territory_of(corridors["greedy"], episodes=4)
     measured = found.trained.measures()
     assert measured[EXCLUSION].value == measured[VISITORS].value == 1
     assert measured[OVERLAP].value == measured[TAGS].value == 0
@@ -64,7 +58,7 @@ def test_a_replica_alone_stays_where_it_stays_among_all(meadow):
 
 
 def test_the_maps_show_where_each_agent_was_and_are_not_written_over(corridors, tmp_path):
-    found = territory_of(corridors, episodes=2)
+    found = territory_of(corridors["greedy"], episodes=2)
     path = draw_visits(found, tmp_path / "new" / "visits.png", replica=1)
     picture = (imread(path)[..., :3] * 255).round()
     for agent, colour in ((0, (86, 180, 233)), (1, (230, 97, 0))):
@@ -82,7 +76,7 @@ def test_the_maps_show_where_each_agent_was_and_are_not_written_over(corridors, 
     ],
 )
 def test_what_cannot_be_drawn_is_refused(more, message, corridors, tmp_path):
-    found = territory_of(corridors, episodes=1)
+    found = territory_of(corridors["greedy"], episodes=1)
     with pytest.raises(ValueError, match=message):
         draw_visits(found, **{"path": tmp_path / "visits.png", **more})
     assert not list(tmp_path.iterdir())

@@ -6,7 +6,6 @@ import re
 import shutil
 import signal
 import subprocess
-import sys
 import time
 import warnings
 from contextlib import contextmanager
@@ -19,10 +18,10 @@ import pytest
 import rerun as rr
 import rerun_cli
 import torch
+from recordings import GAME, column, static
 from rerun.chunk import RrdReader
-from test_rerun_logger import column, static
 
-from cprl import CommonsEnv, Game, Rules, maps
+from cprl import CommonsEnv
 from cprl.learners.replay import ReplayLearner
 from cprl.learners.settings import DQNSettings
 from cprl.measuring import Episode, social
@@ -30,10 +29,6 @@ from cprl.training import train
 from cprl.viewer.callback import ViewerCallback
 from cprl.viewer.page import free_port, to_watch
 
-GAME = Game(
-    map=maps.parse(".A>.A\n.A.A.\n..<.A"),
-    rules=Rules(regrow_prob=(0.0, 0.1), window_rows=3, window_columns=5, episode_steps=20),
-)
 SETTINGS = DQNSettings(buffer_size=200, learning_rate=1e-3, hidden_cells=(8,), epsilon_hold_steps=5)
 VIEWER = Path(rerun_cli.__path__[0]) / "rerun"
 
@@ -293,18 +288,3 @@ def test_the_file_of_a_run_that_goes_on_holds_all_up_to_its_last_flush(tmp_path)
     course(tmp_path, others=[Doing(150, lambda: shutil.copy(tmp_path / "run.rrd", left))])
     see_the_first_episode(left)
     assert left.stat().st_size < (tmp_path / "run.rrd").stat().st_size
-
-
-@pytest.mark.slow
-def test_a_killed_run_leaves_a_recording_up_to_its_last_flush(tmp_path):
-    script = f"""
-import sys; sys.path.insert(0, {str(Path(__file__).parent)!r})
-from pathlib import Path
-from test_watch import course, Doing
-course(Path({str(tmp_path)!r}), episodes=10**6, others=[Doing(150, lambda: print("going", flush=True))])
-"""
-    process = subprocess.Popen([sys.executable, "-c", script], stdout=subprocess.PIPE, text=True)
-    assert any(line == "going\n" for line in process.stdout)
-    process.kill()
-    process.communicate()
-    see_the_first_episode(tmp_path / "run.rrd")

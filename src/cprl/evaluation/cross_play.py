@@ -38,6 +38,7 @@ from cprl.evaluation.evaluate import (
     how_they_play,
     opened,
     says_nothing,
+    table_of,
     unit_of_rewards,
 )
 from cprl.evaluation.lanes import Played, Source, play, policies_of, pooled
@@ -367,49 +368,39 @@ def matrices(played: CrossPlay) -> Iterator[Table]:
     rewards = unit_of_cells(played)
     for name in next(iter(cells.values())):
         of_name = [measured[name] for measured in cells.values()]
-        if says_nothing(name, of_name) or _repeats(name, cells.values()):
-            continue
-        table = Table(title=with_unit(name, rewards=rewards), title_justify="left")
-        table.add_column("focal \\ background")
-        for background in played.runs:
-            table.add_column(background, justify="right")
-        for focal in played.runs:
-            table.add_row(focal, *(str(cells[focal, background][name]) for background in played.runs))
-        yield table
+        if not (says_nothing(name, of_name) or _repeats(name, cells.values())):
+            texts = {at: str(measured[name]) for at, measured in cells.items()}
+            yield _matrix(with_unit(name, rewards=rewards), played, texts)
+
+
+def _matrix(title: str, played: CrossPlay, texts: Mapping[tuple[str, str], str]) -> Table:
+    """A text for each pair of runs, "" where there is none."""
+    rows = [(focal, *(texts.get((focal, other), "") for other in played.runs)) for focal in played.runs]
+    return table_of(title, ["focal \\ background", *played.runs], rows)
 
 
 def gains_tables(played: CrossPlay) -> Iterator[Table]:
     """A matrix of what focal agents gain, and one of what background agents do; see `gains`."""
-    found = gains(played)
-    rewards = unit_of_cells(played)
+    found, rewards = gains(played), unit_of_cells(played)
     for whose, beside in (("focal", "the agent whose place it takes"), ("background", "the diagonal")):
         title = with_unit(f"{whose}/return", rewards=rewards)
-        table = Table(
-            title=f"{title}, difference from {beside}, paired by replica [95 % interval by Student's t]",
-            title_justify="left",
+        yield _matrix(
+            f"{title}, difference from {beside}, paired by replica [95 % interval by Student's t]",
+            played,
+            {at: str(getattr(gain, whose)) for at, gain in found.items()},
         )
-        table.add_column("focal \\ background")
-        for background in played.runs:
-            table.add_column(background, justify="right")
-        for focal in played.runs:
-            own = (found.get((focal, background)) for background in played.runs)
-            table.add_row(focal, *("" if gain is None else str(getattr(gain, whose)) for gain in own))
-        yield table
 
 
 def agents_table(played: CrossPlay) -> Table:
     """The returns of each cell by the index of the focal agent."""
-    table = Table(title="returns by the focal agent's index", title_justify="left")
-    for heading in ("focal", "background", "focal agent"):
-        table.add_column(heading)
     names, rewards = ("focal/return", "background/return", "group/return"), unit_of_cells(played)
-    for name in names:
-        table.add_column(with_unit(name, rewards=rewards), justify="right")
+    headings = ["focal", "background", "focal agent", *(with_unit(name, rewards=rewards) for name in names)]
+    rows = []
     for (focal, background), cell in played.cells.items():
         for agent in cell.by_agent:
             measured = cell.measures(agent)
-            table.add_row(focal, background, str(agent), *(str(measured[name]) for name in names))
-    return table
+            rows.append((focal, background, str(agent), *(str(measured[name]) for name in names)))
+    return table_of("returns by the focal agent's index", headings, rows, texts=3)
 
 
 def _repeats(name: str, cells: Iterable[Mapping[str, Measured]]) -> bool:

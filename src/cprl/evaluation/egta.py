@@ -21,7 +21,7 @@ from rich.table import Table
 
 from cprl import arguments
 from cprl.evaluation.empirical_game import EmpiricalGame
-from cprl.evaluation.evaluate import how_they_play
+from cprl.evaluation.evaluate import how_they_play, table_of
 from cprl.measuring.statistics import CONFIDENCE, Estimate, estimate
 from cprl.terminal import style
 from cprl.theory.equilibria import MOST_STRATEGIES, Equilibrium, equilibria
@@ -153,66 +153,61 @@ def egta_tables(found: Analysis) -> Iterator[Table]:
 
 def _pairs(game: EmpiricalGame) -> Table:
     others = "the other" if game.of_agents == 2 else f"all other {game.of_agents - 1}"
-    title = f"return of an agent, by its run and that of {others}"
-    table = Table(title=title, title_justify="left")
-    table.add_column("an agent \\ others")
-    for name in game.names:
-        table.add_column(name, justify="right")
     pairs = np.array([game.table([place]).pairs for place in range(len(game.payoffs))])
-    for place, name in enumerate(game.names):
-        table.add_row(name, *(str(estimate(pairs[:, place, other])) for other in range(len(game.names))))
-    return table
+    rows = [
+        (name, *(str(estimate(pairs[:, place, other])) for other in range(len(game.names))))
+        for place, name in enumerate(game.names)
+    ]
+    title = f"return of an agent, by its run and that of {others}"
+    return table_of(title, ["an agent \\ others", *game.names], rows)
 
 
 def _compositions(game: EmpiricalGame) -> Table:
+    rows = [
+        (
+            composition_text(counts, game.names),
+            *(
+                str(estimate(game.payoffs[:, place, run])) if count else ""
+                for run, count in enumerate(counts)
+            ),
+        )
+        for place, counts in enumerate(compositions(game.agents, len(game.names)).tolist())
+    ]
     title = "return of an agent of each run, by how many agents play as each"
-    table = Table(title=title, title_justify="left")
-    table.add_column("agents")
-    for name in game.names:
-        table.add_column(name, justify="right")
-    for row, counts in enumerate(compositions(game.agents, len(game.names)).tolist()):
-        own = (str(estimate(game.payoffs[:, row, run])) if count else "" for run, count in enumerate(counts))
-        table.add_row(composition_text(counts, game.names), *own)
-    return table
+    return table_of(title, ["agents", *game.names], rows)
 
 
 def _runs(found: Analysis) -> Table:
     title = "alpha-rank at the limit of infinite alpha: share of the agents in the long run"
     if found.resamples:
         title += f" [95 % interval, {found.resamples} resamples of the replicas]"
-    table = Table(title=title, title_justify="left")
-    table.add_column("run")
-    table.add_column("share", justify="right")
-    is_told = not np.isnan(found.in_support).any()
-    if is_told:
-        table.add_column("resamples in which a symmetric equilibrium plays it", justify="right")
-    for name, share, certain in zip(found.game.names, found.shares, found.in_support, strict=True):
-        table.add_row(name, _share(share), *([f"{certain:.0%}"] if is_told else []))
-    return table
+    is_certain = not np.isnan(found.in_support).any()
+    columns = ["run", "share", *["resamples in which a symmetric equilibrium plays it"] * is_certain]
+    rows = [
+        (name, _share(share), *[f"{certain:.0%}"] * is_certain)
+        for name, share, certain in zip(found.game.names, found.shares, found.in_support, strict=True)
+    ]
+    return table_of(title, columns, rows)
 
 
 def _equilibria_table(found: Analysis) -> Table:
-    game = found.game
-    table = Table(title="equilibria", title_justify="left")
-    table.add_column("")
-    table.add_column("what is played")
-    table.add_column("how certain", justify="right")
+    names, rows = found.game.names, []
     for counts, certain in found.pure.items():
-        told = "" if isnan(certain) else f"in {certain:.0%} of the resamples"
-        table.add_row("no agent gains by another run", composition_text(counts, game.names), told)
+        resamples = "" if isnan(certain) else f"in {certain:.0%} of the resamples"
+        rows.append(("no agent gains by another run", composition_text(counts, names), resamples))
     if not found.pure:
-        table.add_row("no agent gains by another run", "no composition", "")
-    of_pair = "Nash equilibrium (nashpy)" if game.agents == 2 else "Nash equilibrium of pairs (nashpy)"
-    for own in found.equilibria:
-        both = [mixture_text(side, game.names) for side in (own.first, own.second)]
-        table.add_row(of_pair, both[0] if own.is_symmetric else " against ".join(both), "")
+        rows.append(("no agent gains by another run", "no composition", ""))
+    of_pair = "Nash equilibrium (nashpy)" if found.game.agents == 2 else "Nash equilibrium of pairs (nashpy)"
+    for equilibrium in found.equilibria:
+        both = [mixture_text(side, names) for side in (equilibrium.first, equilibrium.second)]
+        rows.append((of_pair, both[0] if equilibrium.is_symmetric else " against ".join(both), ""))
     for mixture, share in zip(found.ends.mixtures, found.ends.shares, strict=True):
-        told = f"from {share:.0%} of the starts"
-        table.add_row("end of replicator dynamics", mixture_text(mixture, game.names), told)
+        starts = f"from {share:.0%} of the starts"
+        rows.append(("end of replicator dynamics", mixture_text(mixture, names), starts))
     if found.ends.unsettled > 0:
-        told = f"from {found.ends.unsettled:.0%} of the starts"
-        table.add_row("end of replicator dynamics", "none, or a late one", told)
-    return table
+        starts = f"from {found.ends.unsettled:.0%} of the starts"
+        rows.append(("end of replicator dynamics", "none, or a late one", starts))
+    return table_of("equilibria", ["", "what is played", "how certain"], rows, texts=2)
 
 
 def composition_text(counts: Sequence[int], names: Sequence[str]) -> str:

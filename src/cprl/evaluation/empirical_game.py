@@ -78,7 +78,7 @@ class EmpiricalGame:
         Args:
             replicas: their places in `payoffs`, e.g. a resample; by default all once.
         """
-        places = range(len(self.payoffs)) if replicas is None else replicas
+        places = list(range(len(self.payoffs)) if replicas is None else replicas)
         if not places:
             raise ValueError("replicas is empty; allowed: at least one place")
         return PayoffTable(agents=self.agents, payoffs=self.payoffs[places].mean(0))

@@ -204,34 +204,44 @@ def check(*, episodes: int, seed: int, greedy: bool, runs: Sequence[LoadedRun]) 
 INTERVALS: Final = "mean over replicas [95 % interval by Student's t]"
 
 
+def table_of(title: str, columns: Sequence[str], rows: Iterable[Sequence[str]], *, texts: int = 1) -> Table:
+    """Return a table for the terminal whose first columns are texts and all others numbers."""
+    table = Table(title=title, title_justify="left")
+    for place, column in enumerate(columns):
+        table.add_column(column, justify="left" if place < texts else "right")
+    for row in rows:
+        table.add_row(*row)
+    return table
+
+
 def run_table(evaluation: Evaluation) -> Table:
     """A row for each metric: mean over replicas and 95 % interval, of the run's agents and random agents.
 
     Metrics of institutions that are undefined everywhere, since the game has other institutions, have none.
     """
-    replicas = len(evaluation.trained)
-    episodes = len(next(iter(evaluation.trained.values())))
-    table = Table(
-        title=f"{evaluation.run.path.name}: {replicas} replicas, {episodes} episodes each, "
-        f"seed {evaluation.seed}\n{INTERVALS}"
-    )
-    table.add_column()
-    table.add_column(f"run's agents{how_they_play([evaluation.run], evaluation.greedy)}", justify="right")
-    table.add_column("random", justify="right")
     trained, random = evaluation.measures("trained"), evaluation.measures("random")
     rewards = unit_of_rewards(evaluation.trained)
-    for name, measured in trained.items():
-        if says_nothing(name, [measured, random[name]]):
-            continue
-        table.add_row(with_unit(name, rewards=rewards), str(measured), str(random[name]))
+    rows = [
+        (with_unit(name, rewards=rewards), str(measured), str(random[name]))
+        for name, measured in trained.items()
+        if not says_nothing(name, [measured, random[name]])
+    ]
     without = [agents_without_harvest(played) for played in (evaluation.trained, evaluation.random)]
     if None not in without:
-        table.add_row(
-            "agents without a harvest, not in sustainability",
-            *(f"{own[0]} of {own[1]}" for own in without if own),
-        )
+        counts = (f"{own[0]} of {own[1]}" for own in without if own)
+        rows.append(("agents without a harvest, not in sustainability", *counts))
+    episodes = len(next(iter(evaluation.trained.values())))
+    title = played_in_words(evaluation.run, len(evaluation.trained), episodes, evaluation.seed)
+    agents = f"run's agents{how_they_play([evaluation.run], evaluation.greedy)}"
+    table = table_of(f"{title}\n{INTERVALS}", ["", agents, "random"], rows)
     table.caption = left_out(next(iter(evaluation.trained.values()))[0].reported) or None
     return table
+
+
+def played_in_words(run: LoadedRun, replicas: int, episodes: int, seed: int) -> str:
+    """What was played, e.g. "commons: 8 replicas, 20 episodes each, seed 30011"."""
+    several = "s" * (replicas != 1)
+    return f"{run.path.name}: {replicas} replica{several}, {episodes} episodes each, seed {seed}"
 
 
 def says_nothing(name: str, measured: Iterable[Measured]) -> bool:

@@ -2,23 +2,21 @@
 
 import sys
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from math import isnan
 from typing import Final
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
 from rich.text import Text
 from tensordict import TensorDictBase
-from torch import Tensor
 from torchrl.envs import EnvBase
 
 from cprl import arguments, keys
 from cprl.commons.colours import APPLE, BEAM, PALETTE, WALL, Colour, agent_colour
 from cprl.commons.game import Game
 from cprl.commons.maps import SIGN_OF_HEADING
-from cprl.commons.world import Shown
+from cprl.commons.world import Shown, StepOutput
 from cprl.envs.make_env import make_env
 from cprl.envs.unwrap import commons_of
 from cprl.evaluation.lanes import Policy, Turns
@@ -31,49 +29,24 @@ from cprl.presets import Variant
 from cprl.system.output import OUT, console, say
 from cprl.training.agents import Population
 
-LETTERS: Final = {
-    "w": "forward",
-    "s": "backward",
-    "a": "left",
-    "d": "right",
-    "q": "turn_left",
-    "e": "turn_right",
-    "f": "beam",
-    ".": "stay",
+KEYS: Final = {
+    "w": ("forward", "step forward"),
+    "s": ("backward", "step back"),
+    "a": ("left", "step left"),
+    "d": ("right", "step right"),
+    "q": ("turn_left", "turn left"),
+    "e": ("turn_right", "turn right"),
+    "f": ("beam", "fire the beam"),
+    ".": ("stay", "stay"),
 }
-
-ACTION_NAMES: Final = {
-    "forward": "step forward",
-    "backward": "step back",
-    "left": "step left",
-    "right": "step right",
-    "turn_left": "turn left",
-    "turn_right": "turn right",
-    "beam": "fire the beam",
-    "stay": "stay",
-}
-
-
-def keys_of(game: Game) -> dict[str, str]:
-    """The letters that a game knows, and their actions."""
-    return {letter: action for letter, action in LETTERS.items() if action in game.actions}
+"""The action of each key, and what it is called."""
+QUIT: Final = "quit"
+_PROMPT: Final = "keys> "
 
 
 def help_of(game: Game) -> str:
-    """All letters in a line: "w step forward, s step back, ..."."""
-    return ", ".join(f"{letter} {ACTION_NAMES[action]}" for letter, action in keys_of(game).items())
-
-
-@dataclass(frozen=True, kw_only=True, eq=False)
-class TurnPlayed:
-    """What one turn brought."""
-
-    harvest: NDArray[np.float32]
-    """float32 [N], apples that each agent harvested in this turn."""
-    fired: NDArray[np.bool_]
-    """bool [N], who fired."""
-    tagged_by: NDArray[np.bool_]
-    """bool [N, N]; row: the agent tagged out, column: by whom."""
+    """Return all keys of a game in a line: "w step forward, s step back, ..."."""
+    return ", ".join(f"{key} {words}" for key, (action, words) in KEYS.items() if action in game.actions)
 
 
 class Session:
@@ -82,7 +55,7 @@ class Session:
     Args:
         env: one world of a `CommonsEnv`, with or without transforms; it is reset.
         others: writes the actions of all agents; that of the person's agent is replaced.
-        decision: what it decides, see `Game.decisions`; None for what `others` write.
+        decision: what the person decides, see `Game.decisions`; None for what `others` write.
     """
 
     def __init__(self, env: EnvBase, others: Policy, *, agent: int = 0, decision: int | None = None) -> None:
@@ -93,11 +66,13 @@ class Session:
         self.game: Game = commons.game
         self.agent = arguments.integer("agent", agent, 0, self.game.agents - 1)
         """The index of the person's agent."""
-        self._decision = None if decision is None else self._decided(decision)
-        self._action = 0
+        if decision is not None:
+            if not self.game.decisions:
+                raise arguments.refusal("decision", decision, "None: agents decide nothing in this game")
+            arguments.integer("decision", decision, 0, self.game.decisions - 1)
+        self._decision, self._action = decision, 0
         self._turns = Turns(env, self._choose)
-        self._harvests: list[Tensor] = []
-        self._in_play: list[Tensor] = []
+        self._played: list[TensorDictBase] = []
         self.moments: list[Shown] = [self._now()]
         """The board as the episode began, then after each turn."""
 
@@ -112,11 +87,6 @@ class Session:
         return self._turns.has_ended
 
     @property
-    def is_in_play(self) -> bool:
-        """Whether the person's next action will count: a tagged agent is out of play for some turns."""
-        return bool(self.moments[-1].in_play[self.agent])
-
-    @property
     def harvested(self) -> list[int]:
         """Apples that each agent has harvested so far."""
         return [int(apples) for apples in self.moments[-1].harvested]
@@ -126,102 +96,82 @@ class Session:
         """Apples on the board."""
         return int(self.moments[-1].stock.sum(dtype=np.int64))
 
-    def act(self, action: str) -> TurnPlayed:
-        """Plays a turn: the person's agent takes this action, the others choose theirs."""
+    def act(self, action: str) -> StepOutput:
+        """Play a turn: the person's agent takes this action, the others choose theirs.
+
+        Returns:
+            What the turn brought, overwritten by the next one.
+        """
         arguments.choice("action", action, self.game.actions)
         self._action = self.game.actions.index(action)
-        batch = self._turns.play()
-        following = batch["next"]
-        self._harvests.append(following[keys.HARVEST])
-        self._in_play.append(batch[keys.IN_PLAY])
+        self._played.append(self._turns.play())
         self.moments.append(self._now())
-        output = self._commons.output
-        return TurnPlayed(
-            harvest=output.harvest[0].copy(),
-            fired=output.fired[0].copy(),
-            tagged_by=output.tagged_by[0].copy(),
-        )
+        return self._commons.output
 
     def metrics(self) -> dict[str, float]:
-        """The social metrics of the turns played so far, those of `cprl.measuring.social.summary` and
-        stock_left; NaN where undefined, empty before the first turn."""
-        if not self._harvests:
+        """Return the metrics of `cprl.measuring.social.summary` of the turns played so far, and stock_left;
+        NaN where undefined, empty before the first turn."""
+        if not self._played:
             return {}
-        measured = social.summary(torch.cat(self._harvests), torch.cat(self._in_play))
+        harvest = torch.cat([batch["next"][keys.HARVEST] for batch in self._played])
+        measured = social.summary(harvest, torch.cat([batch[keys.IN_PLAY] for batch in self._played]))
         return {**{name: float(value) for name, value in measured.items()}, "stock_left": float(self.stock)}
 
     def _choose(self, moment: TensorDictBase) -> TensorDictBase:
         chosen = self._others(moment)
-        actions = chosen[keys.ACTION].clone()
-        actions[0, self.agent] = self._action
-        chosen[keys.ACTION] = actions
-        if self._decision is not None:
-            decisions = chosen[keys.DECISION].clone()
-            decisions[0, self.agent] = self._decision
-            chosen[keys.DECISION] = decisions
+        for key, value in ((keys.ACTION, self._action), (keys.DECISION, self._decision)):
+            if value is not None:
+                values = chosen[key].clone()
+                values[0, self.agent] = value
+                chosen[key] = values
         return chosen
 
-    def _decided(self, decision: int) -> int:
-        options = self.game.decisions
-        if not options:
-            raise arguments.refusal("decision", decision, "None: agents decide nothing in this game")
-        return arguments.integer("decision", decision, 0, options - 1)
-
     def _now(self) -> Shown:
-        """The board, without what agents observe."""
+        """Return the board, without what agents observe."""
         shown = self._commons.worlds.show(self._commons.output)
         return shown._replace(observation=shown.observation[:0])
 
 
 def state(session: Session) -> str:
-    """The turn, the apples on the board, and everybody's score."""
+    """Return the turn, the apples on the board, and everybody's score in a line."""
     scores = [
-        f"{apples} by {'you' if agent == session.agent else f'agent {agent}'}{_out(session, agent)}"
+        f"{apples} by {'you' if agent == session.agent else f'agent {agent}'}"
+        + ("" if session.moments[-1].in_play[agent] else " (out of play)")
         for agent, apples in enumerate(session.harvested)
     ]
     of_steps = f"turn {session.turn:,} of {session.game.rules.episode_steps:,}"
     return f"{of_steps}; {session.stock} apples on the board; harvested: {', '.join(scores)}"
 
 
-def _out(session: Session, agent: int) -> str:
-    return "" if session.moments[-1].in_play[agent] else " (out of play)"
-
-
-def happened(session: Session, turn: TurnPlayed) -> Iterator[str]:
-    """What a turn brought the person, and who tagged whom."""
-    me = session.agent
-    if turn.harvest[me]:
+def happened(session: Session, turn: StepOutput) -> Iterator[str]:
+    """Yield what a turn brought the person, and who tagged whom."""
+    me, tagged_by = session.agent, turn.tagged_by[0]
+    if turn.harvest[0, me]:
         yield "you harvest an apple"
-    if turn.fired[me] and not turn.tagged_by[:, me].any():
+    if turn.fired[0, me] and not tagged_by[:, me].any():
         yield "your beam tags nobody out"
-    for tagged, by in zip(*turn.tagged_by.nonzero(), strict=True):
+    for tagged, by in zip(*tagged_by.nonzero(), strict=True):
         whom = "you out" if tagged == me else f"agent {tagged} out"
         yield f"you tag {whom}" if by == me else f"agent {by} tags {whom}"
 
 
-def ending(session: Session) -> str:
-    """Why it is over, if it is."""
+def _ending(session: Session) -> str:
     if not session.has_ended:
         return f"stopped after turn {session.turn:,}"
     return "no apple is left" if session.stock == 0 else "time is over"
 
 
-def results_text(session: Session) -> str:
+def _results(session: Session) -> str:
     """Return the social metrics of the turns played, a line each: name, value, words and unit."""
-    lines = [f"{name:17s} {_number(value):>9s}  {title(name)}" for name, value in session.metrics().items()]
+    numbers = {
+        name: "undefined" if isnan(value) else f"{value:.4g}" for name, value in session.metrics().items()
+    }
+    lines = [f"{name:17s} {number:>9s}  {title(name)}" for name, number in numbers.items()]
     return "\n".join(lines) or "No turn was played, so there is nothing to measure."
 
 
-def _number(value: float) -> str:
-    return "undefined" if isnan(value) else f"{value:.4g}"
-
-
-QUIT: Final = "quit"
-_PROMPT: Final = "keys> "
-
-
 def play_in_terminal(session: Session, read_line: Callable[[], str] | None = None) -> None:
-    """Plays the episode: a line of keys is played key by key; `quit`, Ctrl-C or the end of input ends it.
+    """Play the episode: a line of keys is played key by key; `quit`, Ctrl-C or the end of input ends it.
 
     Args:
         read_line: returns a line with its newline, or "" at the end; by default that of standard input.
@@ -235,42 +185,35 @@ def play_in_terminal(session: Session, read_line: Callable[[], str] | None = Non
         say(state(session))
         if session.has_ended or not _ask_and_play(session, read_line):
             break
-    say(f"The end: {ending(session)}.")
-    say(results_text(session))
+    say(f"The end: {_ending(session)}.")
+    say(_results(session))
 
 
 def _ask_and_play(session: Session, read_line: Callable[[], str]) -> bool:
-    """Plays the next line whose keys are known; False where the person leaves."""
+    """Play the next line whose keys are known; False where the person leaves."""
     while True:
-        line = _ask(read_line)
-        if line is None or line.strip() == QUIT:
+        OUT.write(_PROMPT)
+        OUT.flush()
+        try:
+            line = read_line()
+        except KeyboardInterrupt:
+            line = ""
+        if not sys.stdin.isatty() or not line:
+            say(line.rstrip("\n"))
+        if not line or line.strip() == QUIT:
             return False
         if _play_line(session, line.strip() or "."):
             return True
 
 
-def _ask(read_line: Callable[[], str]) -> str | None:
-    """The next line of the input, which is shown where no terminal does; None at its end and for Ctrl-C."""
-    OUT.write(_PROMPT)
-    OUT.flush()
-    try:
-        line = read_line()
-    except KeyboardInterrupt:
-        line = ""
-    if not sys.stdin.isatty() or not line:
-        say(line.rstrip("\n"))
-    return line or None
-
-
 def _play_line(session: Session, line: str) -> bool:
-    """Plays a line of keys, or none of it where one is unknown; whether it was played."""
-    actions = keys_of(session.game)
-    unknown = next((key for key in line if key not in actions), None)
-    if unknown is not None:
-        say(f"key is {unknown!r}; allowed: {help_of(session.game)}, or {QUIT}; nothing was played")
-        return False
+    """Play a line of keys, or none of it where one is unknown; whether it was played."""
     for key in line:
-        for event in happened(session, session.act(actions[key])):
+        if key not in KEYS or KEYS[key][0] not in session.game.actions:
+            say(f"key is {key!r}; allowed: {help_of(session.game)}, or {QUIT}; nothing was played")
+            return False
+    for key in line:
+        for event in happened(session, session.act(KEYS[key][0])):
             say(f"turn {session.turn:,}: {event}")
         if session.has_ended:
             break
@@ -297,9 +240,6 @@ def board_text(session: Session) -> Text:
             text.append(sign if is_last else sign.ljust(wide), f"rgb({red},{green},{blue})")
         text.append("\n" if row < board.height - 1 else "")
     return text
-
-
-DEFAULT_OTHERS: Final = "greedy"
 
 
 def open_session(
@@ -330,7 +270,7 @@ def open_session(
         steps = arguments.integer("steps", steps, 1)
         game = replace(game, rules=replace(game.rules, episode_steps=steps))
     agent = arguments.integer("agent", agent, 0, game.agents - 1)
-    others = others if others is not None else DEFAULT_OTHERS if run is None else board
+    others = others if others is not None else "greedy" if run is None else board
     if replica and others in SCRIPTED_POLICIES:
         raise ValueError(f'replica is {replica}, and others is "{others}"; allowed: with the agents of a run')
     specs = [agent_named(others, index, replica=replica) for index in range(game.agents)]

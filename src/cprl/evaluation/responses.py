@@ -27,7 +27,16 @@ from rich.table import Table
 
 from cprl import arguments
 from cprl.evaluation.cross_play import Gain
-from cprl.evaluation.evaluate import SEED, check, check_same_game, how_they_play, opened
+from cprl.evaluation.evaluate import (
+    INTERVALS,
+    SEED,
+    check,
+    check_same_game,
+    how_they_play,
+    opened,
+    played_in_words,
+    table_of,
+)
 from cprl.evaluation.lanes import Played
 from cprl.evaluation.populations import play_population
 from cprl.measuring.statistics import Estimate, difference, estimate
@@ -294,36 +303,32 @@ def exploitability_tables(found: Exploitability) -> Iterator[Table]:
 
 
 def _gains(found: Exploitability) -> Table:
-    count = found.replicas
-    how = how_they_play([found.run], greedy=False)
-    table = Table(
-        title=f"{found.run.path.name}: {count} replica{'s' * (count != 1)}, {found.episodes} episodes each, "
-        f"seed {found.seed}{how}\nWhat trained responses gain is a lower bound of what can be gained.\n"
-        "mean over replicas [95 % interval by Student's t]; gain and change paired by replica",
-        title_justify="left",
-    )
+    title = played_in_words(found.run, found.replicas, found.episodes, found.seed)
     headings = ("return of the agent", "of the best response", "gain", "change of the others, mean")
-    table.add_column("agent")
-    for heading in headings:
-        table.add_column(heading, justify="right")
-    table.add_column("chosen in replicas")
+    rows = []
     for agent in found.responses:
         gain, returns = found.gain_of(agent), found.returns(agent)
-        means = (str(estimate(values)) for values in returns)
         chosen = Counter(response.name for response in found.chosen(agent))
         names = "\n".join(f"{name}: {times}" for name, times in chosen.most_common())
-        table.add_row(str(agent), *means, str(gain.focal), str(gain.background), names)
+        means = (str(estimate(values)) for values in returns)
+        rows.append((str(agent), *means, str(gain.focal), str(gain.background), names))
     if len(found.responses) > 1:
-        table.add_row("mean", "", "", str(found.gain.focal), str(found.gain.background), "")
+        rows.append(("mean", "", "", str(found.gain.focal), str(found.gain.background), ""))
+    table = table_of(
+        f"{title}{how_they_play([found.run], greedy=False)}\n"
+        "What trained responses gain is a lower bound of what can be gained.\n"
+        f"{INTERVALS}; gain and change paired by replica",
+        ["agent", *headings, "chosen in replicas"],
+        rows,
+    )
+    table.columns[-1].justify = "left"
     return table
 
 
 def _responses(found: Exploitability) -> Table:
-    table = Table(title="each training, chosen or not", title_justify="left")
-    for heading in ("agent", "response"):
-        table.add_column(heading)
-    table.add_column("gain", justify="right")
-    for agent, responses in found.responses.items():
-        for response in responses:
-            table.add_row(str(agent), response.name, str(found.gain_of_response(response).focal))
-    return table
+    rows = [
+        (str(agent), response.name, str(found.gain_of_response(response).focal))
+        for agent, responses in found.responses.items()
+        for response in responses
+    ]
+    return table_of("each training, chosen or not", ["agent", "response", "gain"], rows, texts=2)

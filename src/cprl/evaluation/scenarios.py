@@ -38,6 +38,7 @@ from cprl.evaluation.evaluate import (
     differences,
     how_they_play,
     opened,
+    table_of,
     transform_differences,
 )
 from cprl.evaluation.lanes import Played, play, pooled
@@ -486,32 +487,25 @@ def scenario_tables(scores: Scores) -> Iterator[Table]:
 
 
 def _returns_table(scores: Scores) -> Table:
-    table = Table(title="return per agent (apples)", title_justify="left")
-    table.add_column("scenario")
-    for name in (
-        *("focal: the run's agents", "random in their place", "greedy in their place"),
-        *("run's - random's, paired", "run's - greedy's, paired", "background"),
-    ):
-        table.add_column(name, justify="right")
+    columns = ["scenario", "focal: the run's agents", "random in their place", "greedy in their place"]
+    columns += ["run's - random's, paired", "run's - greedy's, paired", "background"]
+    rows = []
     for name, score in scores.by_scenario.items():
         focal = [str(score.measures(who)["focal/return"]) for who in FOCAL_AGENTS]
         ahead = [str(score.advantage(who)) for who in ("random", "greedy")]
-        table.add_row(name, *focal, *ahead, str(score.measures()["background/return"]))
+        rows.append((name, *focal, *ahead, str(score.measures()["background/return"])))
+    table = table_of("return per agent (apples)", columns, rows)
     table.caption = f"Left out: {scores.left_out}." if scores.left_out else None
     return table
 
 
 def _social_table(scores: Scores) -> Table:
-    table = Table(
-        title="all agents together, with the run's agents in the focal places", title_justify="left"
-    )
-    table.add_column("scenario")
-    for name in SOCIAL:
-        table.add_column(with_unit(name), justify="right")
+    title = "all agents together, with the run's agents in the focal places"
+    rows = []
     for name, score in scores.by_scenario.items():
         measures = score.measures()
-        table.add_row(name, *(str(measures[metric]) for metric in SOCIAL))
-    return table
+        rows.append((name, *(str(measures[metric]) for metric in SOCIAL)))
+    return table_of(title, ["scenario", *map(with_unit, SOCIAL)], rows)
 
 
 def estimates(scores: Scores) -> pa.Table:

@@ -23,7 +23,7 @@ from numpy.typing import NDArray
 from rich.table import Table
 
 from cprl.commons.game import Game
-from cprl.evaluation.evaluate import INTERVALS, SEED
+from cprl.evaluation.evaluate import INTERVALS, SEED, table_of
 from cprl.evaluation.lanes import Played, pooled
 from cprl.evaluation.populations import agent_named, place_of, play_population
 from cprl.measuring.dilemmas import Dilemma, dilemma
@@ -225,26 +225,30 @@ def schelling_tables(found: SchellingDiagram) -> Iterator[Table]:
         f"{found.replicas} replicas, {found.episodes} episodes each for each choice of restrained agents, "
         f"seed {found.seed}\n{INTERVALS}"
     )
-    payoffs = Table(title=title, title_justify="left")
-    for heading in (
-        f"restrained among the other {found.agents - 1}",
-        f"return of {found.restrained} (restrained)",
-        f"return of {found.greedy} (greedy)",
-    ):
-        payoffs.add_column(heading, justify="right")
-    for count in range(found.agents):
-        own = (of_kind[:, count] for of_kind in (found.restrained_payoffs, found.greedy_payoffs))
-        payoffs.add_row(str(count), *(str(estimate(values)) for values in own))
-    yield payoffs
+    yield table_of(
+        title,
+        [
+            f"restrained among the other {found.agents - 1}",
+            f"return of {found.restrained} (restrained)",
+            f"return of {found.greedy} (greedy)",
+        ],
+        [
+            (str(count), str(estimate(restrained)), str(estimate(greedy)))
+            for count, (restrained, greedy) in enumerate(
+                zip(found.restrained_payoffs.T, found.greedy_payoffs.T, strict=True)
+            )
+        ],
+        texts=0,
+    )
     dilemma, last = found.dilemma(), found.agents - 1
-    margins = Table(title=f"{dilemma.name}, by returns", title_justify="left")
-    margins.add_column()
-    margins.add_column("difference, paired by replica", justify="right")
-    for name, margin in (
-        (f"restraint of all instead of none, R({last}) - G(0)", dilemma.restraint),
-        (f"company of the restrained, R({last}) - R(0)", dilemma.company),
-        ("fear, G(0) - R(0)", dilemma.fear),
-        (f"greed, G({last}) - R({last})", dilemma.greed),
-    ):
-        margins.add_row(name, str(margin))
-    yield margins
+    margins = {
+        f"restraint of all instead of none, R({last}) - G(0)": dilemma.restraint,
+        f"company of the restrained, R({last}) - R(0)": dilemma.company,
+        "fear, G(0) - R(0)": dilemma.fear,
+        f"greed, G({last}) - R({last})": dilemma.greed,
+    }
+    yield table_of(
+        f"{dilemma.name}, by returns",
+        ["", "difference, paired by replica"],
+        [(name, str(margin)) for name, margin in margins.items()],
+    )

@@ -18,7 +18,16 @@ from cprl import arguments
 from cprl.commons.colours import APPLE, GROUND, PALETTE, WALL, agent_colour
 from cprl.commons.game import Game
 from cprl.commons.maps import Map
-from cprl.evaluation.evaluate import INTERVALS, SEED, check, chosen_replicas, how_they_play, opened
+from cprl.evaluation.evaluate import (
+    INTERVALS,
+    SEED,
+    check,
+    chosen_replicas,
+    how_they_play,
+    opened,
+    played_in_words,
+    table_of,
+)
 from cprl.evaluation.lanes import Source, fresh_worlds, policies_of, random_policies
 from cprl.measuring import territory
 from cprl.measuring.movement import Trace, overlap, trace, visits
@@ -276,15 +285,11 @@ def _owners(panel: Axes, board: Map, shares: Array) -> None:
 def territory_table(found: Territory) -> Table:
     """A row for each measure of territory: mean over replicas and 95 % interval, of the run's agents and of
     random ones; a dash where it is undefined in all."""
-    count = len(found.replicas)
-    table = Table(
-        title=f"{found.run.path.name}: {count} replica{'s' * (count != 1)}, {found.episodes} episodes each, "
-        f"seed {found.seed}\n{INTERVALS}"
-    )
-    table.add_column()
-    table.add_column(f"run's agents{how_they_play([found.run], found.greedy)}", justify="right")
-    table.add_column("random", justify="right")
+    title = played_in_words(found.run, len(found.replicas), found.episodes, found.seed)
+    agents = f"run's agents{how_they_play([found.run], found.greedy)}"
     trained, random = found.trained.measures(), found.random.measures()
-    for name in found.trained.by_replica:
-        table.add_row(name, *(str(own.get(name, "-")) for own in (trained, random)))
-    return table
+    rows = [
+        (name, *(str(of_policy.get(name, "-")) for of_policy in (trained, random)))
+        for name in found.trained.by_replica
+    ]
+    return table_of(f"{title}\n{INTERVALS}", ["", agents, "random"], rows)

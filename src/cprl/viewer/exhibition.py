@@ -36,7 +36,7 @@ from cprl.envs.unwrap import commons_of
 from cprl.system.compat import rows_made, send_chunk, send_made
 from cprl.viewer.frames import FrameRecorder
 from cprl.viewer.logger import components
-from cprl.viewer.scenery import BACKGROUND, Scene
+from cprl.viewer.scenery import BACKGROUND, Scene, packed
 from cprl.viewer.stage import (
     BEAM_OPACITY,
     OUT_STROKE_CELLS,
@@ -141,8 +141,8 @@ class LiveBoard:
     def __init__(self, scene: Scene) -> None:
 
         self._scene, agents = scene, len(scene.agents)
-        hues = np.array([_packed(agent_colour(agent)) for agent in range(agents)], np.uint32)
-        ink, mark = (np.full(agents, _packed(colour), np.uint32) for colour in (INK_COLOUR, MARK_COLOUR))
+        hues = np.array([packed(agent_colour(agent)) for agent in range(agents)], np.uint32)
+        ink, mark = (np.full(agents, packed(colour), np.uint32) for colour in (INK_COLOUR, MARK_COLOUR))
         kinds = (
             (numbers_and_headings(agents), 0, ink, RADIUS_CELLS),
             (marks(agents), 0, mark, RADIUS_CELLS),
@@ -217,12 +217,6 @@ class LiveBoard:
         drawn = np.stack([in_play, ~in_play, alone & ~in_play])[self._when, :, owner].T
         lines, counts = self._strokes.placed_lines(centres_of(frames), frames["heading"], drawn)
         return lines, np.nonzero(drawn)[1], counts
-
-
-def _packed(colour: Colour) -> int:
-    """An opaque colour as Rerun's 0xRRGGBBAA."""
-    red, green, blue = colour
-    return red << 24 | green << 16 | blue << 8 | 255
 
 
 BATCH_S: Final = 2.0
@@ -390,19 +384,15 @@ def caption_of(policy: Exhibited, episode: int) -> str:
 
 def _before_the_first_step(game: Game) -> dict[str, NDArray[Any]]:
     """The frame of the board as an episode begins, drawn from the map."""
-    board, agents = game.map, game.agents
+    board = game.map
     row, col, heading = np.array(board.starts, np.int32).T
     one = {
         "step": np.zeros((), np.int64),
-        "episode": np.zeros((), np.int64),
         "beams": np.zeros((board.height, board.width), np.bool_),
         "stock": np.ones(len(board.sites), np.uint8),
-        "windows": np.zeros((agents, *game.observation_shape[1:]), np.uint8),
         "row": row,
         "col": col,
         "heading": heading,
-        "in_play": np.ones(agents, np.bool_),
-        "tagged_by": np.full(agents, -1, np.int32),
-        "harvested": np.zeros(agents, np.int32),
+        "in_play": np.ones(game.agents, np.bool_),
     }
     return {name: array[None] for name, array in one.items()}

@@ -2,7 +2,6 @@
 
 import time
 from collections.abc import Mapping
-from dataclasses import dataclass, fields
 from math import ceil
 from typing import Any, Final
 
@@ -13,90 +12,16 @@ from tensordict import TensorDictBase
 from cprl import keys
 from cprl.commons.colours import BEAM
 from cprl.commons.decoding import classes_seen
-from cprl.commons.world import Bools, Bytes, Ints
+from cprl.commons.game import Game
 from cprl.envs.commons_env import CommonsEnv
 from cprl.viewer.logger import RerunLogger
 from cprl.viewer.panels import mosaic_size
 from cprl.viewer.scenery import Curves, Scene
 
-
-@dataclass(frozen=True, kw_only=True)
-class Frame:
-    """One world after one step."""
-
-    beams: Bools
-    """bool [H, W], the cells that a beam covers."""
-    stock: Bytes
-    """uint8 [K], 1 for a site with an apple."""
-    windows: Bytes
-    """uint8 [N, C, X, Y], what each agent observes."""
-    row: Ints
-    """int32 [N]."""
-    col: Ints
-    """int32 [N]."""
-    heading: Ints
-    """int32 [N], 0 up, 1 right, 2 down, 3 left."""
-    in_play: Bools
-    """bool [N]."""
-    tagged_by: Ints
-    """int32 [N], the agent that tagged this one last; -1 if unknown."""
-    harvested: Ints
-    """int32 [N], apples harvested in this episode."""
-
-
-class FrameBuffer:
-    """A buffer of frames, allocated once: `add` copies a frame, `take` returns all frames.
-
-    Args:
-        board: (H, W).
-        windows: (N, C, X, Y).
-    """
-
-    def __init__(
-        self, capacity: int, *, board: tuple[int, int], sites: int, windows: tuple[int, int, int, int]
-    ) -> None:
-        agents = windows[0]
-        self.capacity, self.size = capacity, 0
-        self._arrays: dict[str, NDArray[Any]] = {
-            "step": np.zeros(capacity, np.int64),
-            "episode": np.zeros(capacity, np.int64),
-            "beams": np.zeros((capacity, *board), np.bool_),
-            "stock": np.zeros((capacity, sites), np.uint8),
-            "windows": np.zeros((capacity, *windows), np.uint8),
-            "in_play": np.zeros((capacity, agents), np.bool_),
-            **{
-                name: np.zeros((capacity, agents), np.int32)
-                for name in ("row", "col", "heading", "tagged_by", "harvested")
-            },
-        }
-
-    @property
-    def is_full(self) -> bool:
-        """Whether the buffer is full."""
-        return self.size == self.capacity
-
-    def add(self, step: int, episode: int, frame: Frame) -> None:
-        """Copies a frame; `step` counts environment steps of the whole run."""
-        if self.is_full:
-            raise ValueError(f"the buffer already has {self.capacity} frames; call take() before add()")
-        arrays, at = self._arrays, self.size
-        arrays["step"][at], arrays["episode"][at] = step, episode
-        for field in fields(Frame):
-            arrays[field.name][at] = getattr(frame, field.name)
-        self.size += 1
-
-    def take(self) -> dict[str, NDArray[Any]]:
-        """Copies of all frames as columns, [T, ...] each; the buffer is empty afterwards."""
-        taken = {name: array[: self.size].copy() for name, array in self._arrays.items()}
-        self.size = 0
-        return taken
-
-
 FRAMES_BYTES: Final = 45_000_000
 """The target size of a file's regular frames, about; the frames after new bests come on top."""
 
 _PERIOD_S: Final = 1.0
-_NO_WINDOWS: Final = np.zeros((0, 0, 0), np.uint8)
 _FEWEST_FRAMES: Final = 50
 """Frames are sent when an episode ends, or after a second if there are this many: each chunk has overhead."""
 
@@ -126,12 +51,13 @@ class FrameRecorder:
         self.env = env
         self.every = max(1, ceil(episodes * steps * frame_bytes(scene) / FRAMES_BYTES))
         """Episodes from one with frames to the next."""
-        self._buffer = FrameBuffer(
-            capacity or min(steps + 1, 5000),
-            board=(game.map.height, game.map.width),
-            sites=len(game.map.sites),
-            windows=(game.agents, *(game.observation_shape if has_windows else (0, 0, 0))),
-        )
+        self._capacity = capacity or min(steps + 1, 5000)
+        self._arrays: dict[str, NDArray[Any]] = {
+            name: np.zeros((self._capacity, *shape), dtype)
+            for name, (shape, dtype) in _columns(game, has_windows=has_windows).items()
+        }
+        self.pending = 0
+        """Frames that wait to be sent."""
         self._has_windows = has_windows
         self._has_tags = scene.has_tags
         self._tagged_by = np.full(game.agents, -1, np.int32)
@@ -141,29 +67,34 @@ class FrameRecorder:
     def is_due(self) -> bool:
         """Whether there are frames to be sent now."""
         waited = time.perf_counter() - self._sent
-        return self._buffer.is_full or (waited > _PERIOD_S and self._buffer.size >= _FEWEST_FRAMES)
-
-    @property
-    def pending(self) -> int:
-        """Frames that wait to be sent."""
-        return self._buffer.size
+        return self.pending == self._capacity or (waited > _PERIOD_S and self.pending >= _FEWEST_FRAMES)
 
     def add(self, batch: TensorDictBase, *, step: int, episode: int) -> None:
-        """Copies a frame; `batch` is the latest step."""
+        """Copy a frame; `batch` is the latest step, and `step` counts those of the whole run."""
         if self._has_tags:
             self._remember_tags(batch)
-        self._buffer.add(step, episode, self._frame())
+        self.add_board(step=step, episode=episode)
 
     def add_board(self, *, step: int = 0, episode: int = 0) -> None:
-        """Copies a frame of the board as it is, e.g. when an episode begins."""
-        self._buffer.add(step, episode, self._frame())
+        """Copy a frame of the board as it is, e.g. when an episode begins."""
+        shown = self.env.worlds.show(self.env.output)
+        frame = {"step": step, "episode": episode, "beams": shown.board == BEAM, "tagged_by": self._tagged_by}
+        if self._has_windows:
+            frame["windows"] = shown.observation
+        for name in ("stock", "row", "col", "heading", "in_play", "harvested"):
+            frame[name] = getattr(shown, name)
+        for name, value in frame.items():
+            self._arrays[name][self.pending] = value
+        self.pending += 1
 
     def take(self) -> Mapping[str, NDArray[Any]] | None:
-        """The buffered frames, for `RerunLogger.log_frames`; None if there are none."""
+        """Return copies of all frames as columns, [T, ...] each, for `RerunLogger.log_frames`;
+        None if there are none."""
         self._sent = time.perf_counter()
-        if not self._buffer.size:
+        if not self.pending:
             return None
-        frames = self._buffer.take()
+        frames = {name: array[: self.pending].copy() for name, array in self._arrays.items()}
+        self.pending = 0
         if self._has_windows:
             frames["windows"] = classes_seen(self.env.game, frames["windows"])
         return frames
@@ -174,19 +105,19 @@ class FrameRecorder:
         tagged = tagged_by.any(1)
         self._tagged_by[tagged] = tagged_by.argmax(1)[tagged]
 
-    def _frame(self) -> Frame:
-        shown = self.env.worlds.show(self.env.output)
-        return Frame(
-            beams=shown.board == BEAM,
-            stock=shown.stock,
-            windows=shown.observation if self._has_windows else _NO_WINDOWS,
-            row=shown.row,
-            col=shown.col,
-            heading=shown.heading,
-            in_play=shown.in_play,
-            tagged_by=self._tagged_by,
-            harvested=shown.harvested,
-        )
+
+def _columns(game: Game, *, has_windows: bool) -> dict[str, tuple[tuple[int, ...], Any]]:
+    """Return the shape and dtype of each part of a frame."""
+    return {
+        "step": ((), np.int64),
+        "episode": ((), np.int64),
+        "beams": ((game.map.height, game.map.width), np.bool_),  # the cells that a beam covers
+        "stock": ((len(game.map.sites),), np.uint8),  # 1 for a site with an apple
+        "windows": ((game.agents, *(game.observation_shape if has_windows else (0, 0, 0))), np.uint8),
+        "in_play": ((game.agents,), np.bool_),
+        "tagged_by": ((game.agents,), np.int32),  # who tagged the agent last; -1 if unknown
+        **dict.fromkeys(("row", "col", "heading", "harvested"), ((game.agents,), np.int32)),
+    }
 
 
 def scene_of(env: CommonsEnv, curves: Curves, *, is_replay: bool) -> Scene:

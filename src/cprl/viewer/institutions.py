@@ -9,18 +9,18 @@ from cprl.commons.colours import agent_colour
 from cprl.measuring.names import OF_INSTITUTIONS
 from cprl.measuring.series import OF_AGENTS
 from cprl.viewer.panels import row
-from cprl.viewer.scenery import RANDOM_PLAY, Curves, running
+from cprl.viewer.scenery import BLUE, GREEN, GREY, ORANGE, PURPLE, RANDOM_PLAY, VERMILION, Curves, running
 
 COLOURS: Final = {
-    "violations": (213, 94, 0),
-    "violations_per_step": (213, 94, 0),
-    "own_share_of_bites": (0, 158, 115),
-    "detection_rate": (230, 160, 0),
-    "recidivism": (204, 121, 167),
-    "unjust_share_of_tags": (86, 180, 233),
-    "net_equality": (86, 180, 233),
-    "net_equality_within": (0, 158, 115),
-    "net_equality_between": (230, 160, 0),
+    "violations": VERMILION,
+    "violations_per_step": VERMILION,
+    "own_share_of_bites": GREEN,
+    "detection_rate": ORANGE,
+    "recidivism": PURPLE,
+    "unjust_share_of_tags": BLUE,
+    "net_equality": BLUE,
+    "net_equality_within": GREEN,
+    "net_equality_between": ORANGE,
 }
 """The colours of lines; those that no tab shows have a grey."""
 SHARES: Final = (
@@ -32,9 +32,8 @@ SHARES: Final = (
 )
 """The metrics that share a plot; only their running means are shown there."""
 EQUALITIES: Final = tuple(name for name in COLOURS if "equality" in name)
-IN_FORCE: Final = ((230, 160, 0), (86, 180, 233), (0, 158, 115), (204, 121, 167))
+IN_FORCE: Final = (ORANGE, BLUE, GREEN, PURPLE)
 """The colours of decisions."""
-_GREY: Final = (150, 150, 150)
 PAID, GIVEN = "paid", "given"
 """The lines of each agent in a replay: what institutions take in a turn, downwards, and give, upwards."""
 
@@ -80,7 +79,7 @@ def lines(curves: Curves) -> dict[str, Any]:
     """The names, colours and widths of the lines, by entity; none for a game without institutions."""
     styles = {
         f"institutions/{name}": running(
-            OF_INSTITUTIONS[name][0], COLOURS.get(name, _GREY), curves.replicas, alone=name in SHARES
+            OF_INSTITUTIONS[name][0], COLOURS.get(name, GREY), curves.replicas, alone=name in SHARES
         )
         for name in curves.institutions
     }
@@ -89,7 +88,7 @@ def lines(curves: Curves) -> dict[str, Any]:
         styles[f"institutions/in_force_{nth}"] = running(title, colour, curves.replicas)
     for name in curves.institutions:
         styles[f"{RANDOM_PLAY}/institutions/{name}"] = rr.SeriesLines(
-            names=["random play"], colors=[_GREY], widths=[1.0]
+            names=["random play"], colors=[GREY], widths=[1.0]
         )
     for agent, called in enumerate(curves.agents):
         for name in OF_AGENTS:

@@ -31,7 +31,6 @@ from cprl.viewer.streams import (
     Live,
     LiveStream,
     Stream,
-    Streams,
     open_file,
     open_live,
     release,
@@ -109,12 +108,6 @@ def numbers_in(data: Any) -> NDArray[Any]:
     return np.asarray(data.detach().cpu() if isinstance(data, Tensor) else data).reshape(-1)
 
 
-def histogram_of(numbers: NDArray[Any], *, bins: int) -> Any:
-    """A `rerun.BarChart` of numbers, [n], in equal bins."""
-    counts, edges = np.histogram(numbers, bins=bins)
-    return rr.BarChart(counts, abscissa=(edges[:-1] + edges[1:]) / 2)
-
-
 def images_of(video: Tensor) -> NDArray[np.uint8]:
     """The images of a video, uint8 [T, H, W, C]."""
     clip = torch.as_tensor(video).cpu()
@@ -123,16 +116,6 @@ def images_of(video: Tensor) -> NDArray[np.uint8]:
         raise ValueError(f"the video is {list(video.shape)}; allowed: [T, C, H, W] or [1, T, C, H, W]")
     images: NDArray[np.uint8] = clip.permute(0, 2, 3, 1).to(torch.uint8).numpy()
     return images
-
-
-def format_of(images: NDArray[np.uint8]) -> Any:
-    """The `rerun.components.ImageFormat` of images, [T, H, W, C]."""
-    return rr.components.ImageFormat(
-        width=images.shape[2],
-        height=images.shape[1],
-        color_model="L" if images.shape[3] == 1 else "RGB",
-        channel_datatype=rr.ChannelDatatype.U8,
-    )
 
 
 TIMELINES: Final = ("step", "episode", "frame")
@@ -257,8 +240,7 @@ class RerunLogger(Logger):
         self.live = Live()
         """What viewers are sent; nothing where the recording is written to a file alone."""
         self._live, self._exhibits, self._console = live, exhibits, console or safe_console()
-        self._application = REPLAY if isinstance(self.curves, Scene) and self.curves.is_replay else RUN
-        self._streams = Streams()
+        self._streams: list[Stream] = []
         self.frames = 0
         """Frames recorded so far, including those in earlier files of the recording."""
         self._now = (0, 0)
@@ -268,34 +250,26 @@ class RerunLogger(Logger):
     def _create_experiment(self) -> list[Any]:
         recording_id = self.recording_id
         Path(self.log_dir).mkdir(parents=True, exist_ok=True)
-        file = open_file(
-            recording_id,
-            self.path,
-            layout(self.curves),
-            period_s=_FILE_PERIOD_S,
-            application=self._application,
-        )
-        self._streams.add(file)
+        application = REPLAY if isinstance(self.curves, Scene) and self.curves.is_replay else RUN
+        streams = [open_file(recording_id, self.path, layout(self.curves), _FILE_PERIOD_S, application)]
         if self._live:
-            self._go_live(recording_id, layout(self.curves, live=True))
+            self.live = open_live(
+                self._live,
+                recording_id,
+                layout(self.curves, live=True),
+                _LIVE_PERIOD_S,
+                application,
+                exhibits=self._exhibits,
+            )
+            streams.append(self.live.stream)
+            for where, address in self.addresses.items():
+                self._console.print(f"Watch live ({where}): {address}", soft_wrap=True, highlight=False)
+        self._streams = [stream for stream in streams if stream is not None]
         self.do(lambda recording: recording.send_recording_name(self.exp_name))
         for entity, parts in fixed(self.curves).items():
             self.log_static(entity, *parts)
         self.do(lambda recording: recording.flush(timeout_sec=FLUSH_TIMEOUT_S))
-        return self._streams.recordings
-
-    def _go_live(self, recording_id: str, blueprint: Any) -> None:
-        self.live = open_live(
-            self._live or "",
-            recording_id,
-            blueprint,
-            period_s=_LIVE_PERIOD_S,
-            application=self._application,
-            exhibits=self._exhibits,
-        )
-        self._streams.add(self.live.stream)
-        for where, address in self.addresses.items():
-            self._console.print(f"Watch live ({where}): {address}", soft_wrap=True, highlight=False)
+        return [stream.recording for stream in self._streams]
 
     @property
     def addresses(self) -> dict[str, str]:
@@ -304,7 +278,9 @@ class RerunLogger(Logger):
 
     def do(self, what: Callable[[Any], object], *, live_only: bool = False) -> None:
         """Calls a function with each recording, or with that to viewers alone, in the thread that sends."""
-        self._streams.do(what, live_only=live_only)
+        for stream in self._streams:
+            if isinstance(stream, LiveStream) or not live_only:
+                stream.do(what)
 
     def log_static(self, entity: str, *what: Any) -> None:
         """Logs archetypes that hold at all times."""
@@ -316,7 +292,7 @@ class RerunLogger(Logger):
     @property
     def is_live(self) -> bool:
         """Whether there is a stream to viewers."""
-        return self._streams.is_live
+        return any(isinstance(stream, LiveStream) for stream in self._streams)
 
     def log_row(self, name: str, what: Any) -> None:
         """Logs an archetype at the time set by `at`."""
@@ -355,8 +331,10 @@ class RerunLogger(Logger):
         self.do(lambda recording: send_text(recording, name, text), live_only=True)
 
     def _wait(self, name: str, step: int, values: list[float] | str) -> None:
-        for each in self._streams.hold(name, (step, self._now[1], self.frames, values)):
-            send_waiting(each)
+        for stream in self._streams:
+            stream.waiting.setdefault(name, []).append((step, self._now[1], self.frames, values))
+            if stream.is_due:
+                send_waiting(stream)
 
     def log_states(self, name: str, states: Mapping[int, str], *, live_only: bool = False) -> None:
         """Logs states by the episode from which they hold; their step is the one set by `at`."""
@@ -370,7 +348,7 @@ class RerunLogger(Logger):
         self.log_row(name, rr.Tensor(values, dim_names=list(dims)))
 
     def log_frames(self, frames: Mapping[str, NDArray[Any]]) -> None:
-        """Logs frames of `FrameBuffer.take`, with windows of `classes_seen`; see `stage.columns`."""
+        """Logs frames of `FrameRecorder.take`; see `stage.columns`."""
         if self.scene is None:
             raise ValueError("the logger has no scene; pass scene to log frames")
         count = len(frames["step"])
@@ -403,15 +381,22 @@ class RerunLogger(Logger):
         self._clips_end[name] = first + len(images)
         count = len(images)
         at = times(range(first, first + count), [self._now[1]] * count, [self.frames] * count)
+        form = rr.components.ImageFormat(
+            width=images.shape[2],
+            height=images.shape[1],
+            color_model="L" if images.shape[3] == 1 else "RGB",
+            channel_datatype=rr.ChannelDatatype.U8,
+        )
         buffer = images.reshape(count, -1).copy()
-        self._send(name, at, rr.Image.columns(buffer=buffer, format=[format_of(images)] * count))
+        self._send(name, at, rr.Image.columns(buffer=buffer, format=[form] * count))
 
     def log_histogram(
         self, name: str, data: Any, *, bins: int = 30, step: int | None = None, **kwargs: Any
     ) -> None:
         """Logs a histogram of values in equal bins, as bars."""
         now = self._now[0] if step is None else int(step), self._now[1], self.frames
-        bars = histogram_of(numbers_in(data), bins=bins)
+        counts, edges = np.histogram(numbers_in(data), bins=bins)
+        bars = rr.BarChart(counts, abscissa=(edges[:-1] + edges[1:]) / 2)
         self.do(lambda recording: log_now(recording, name, bars, now))
 
     def flush(self) -> None:
@@ -428,17 +413,20 @@ class RerunLogger(Logger):
     @property
     def is_served(self) -> bool:
         """Whether viewers can still connect: the live stream is open and served."""
-        return bool(self.addresses) and self._streams.is_open_live
+        return any(isinstance(own, LiveStream) and own.recording is not None for own in self._streams)
 
     def close_file(self) -> None:
         """Flushes and closes the file, which gets its footer; the live stream goes on."""
         self.flush()
-        self._streams.close(live=False)
+        for stream in self._streams:
+            if not isinstance(stream, LiveStream):
+                stream.close()
 
     def shutdown(self) -> None:
         """Flushes and closes the recording; the file gets its footer. A second call does nothing."""
         self.flush()
-        self._streams.close()
+        for stream in self._streams:
+            stream.close()
         self.live.close()
         self.experiment.clear()
         release()

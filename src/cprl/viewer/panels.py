@@ -177,6 +177,11 @@ class Axes:
         return lines, rr.Points2D(points, labels=texts, colors=_TEXT, radii=0.0, show_labels=True)
 
 
+def titled(text: str) -> Any:
+    """A title above a plot, as Rerun's archetype."""
+    return rr.Points2D([TITLE], labels=[text], radii=0.0, colors=_TEXT, show_labels=True)
+
+
 def _ticks(end: float) -> list[float]:
     """Four or five round numbers from 0 on."""
     size = 10 ** np.floor(np.log10(end))

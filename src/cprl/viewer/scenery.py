@@ -23,21 +23,25 @@ from cprl.measuring import institutional, now, phases
 from cprl.measuring.reported import FIELDS, METRICS, available, left_out
 from cprl.measuring.yields import yield_of
 
+ORANGE, BLUE, GREEN = (230, 160, 0), (86, 180, 233), (0, 158, 115)
+VERMILION, PURPLE, GREY = (213, 94, 0), (204, 121, 167), (150, 150, 150)
+"""M. Okabe and K. Ito's colours, which are apart for the colour-blind too, and a grey."""
+
 SOCIAL: Final = {
-    "social/collective_return": ("collective return", (230, 160, 0)),
-    "social/efficiency": ("apples per step", (230, 160, 0)),
-    "social/equality": ("equality", (86, 180, 233)),
-    "social/sustainability": ("sustainability", (0, 158, 115)),
+    "social/collective_return": ("collective return", ORANGE),
+    "social/efficiency": ("apples per step", ORANGE),
+    "social/equality": ("equality", BLUE),
+    "social/sustainability": ("sustainability", GREEN),
     "social/survival_steps": ("survival", (230, 120, 0)),
-    "social/peace": ("peace", (204, 121, 167)),
-    "social/peacefulness": ("peacefulness", (204, 121, 167)),
+    "social/peace": ("peace", PURPLE),
+    "social/peacefulness": ("peacefulness", PURPLE),
     "social/stock_left": ("apples left", PALETTE[APPLE]),
-    "social/yield_share": ("yield share of the steps played", (0, 158, 115)),
+    "social/yield_share": ("yield share of the steps played", GREEN),
 }
 """The name and colour of each line, because viewers assign different colours; agents have their own."""
 OTHERS: Final = {
-    "time/env_steps_per_s": ("steps per second", (150, 150, 150)),
-    "evaluation/greedy_return": ("greedy, evaluated", (230, 160, 0)),
+    "time/env_steps_per_s": ("steps per second", GREY),
+    "evaluation/greedy_return": ("greedy, evaluated", ORANGE),
     "turn/stock": ("apples", PALETTE[APPLE]),
 }
 OF_AGENTS: Final = ("return", "loss", "epsilon", "q", "harvested")
@@ -48,16 +52,16 @@ ANOTHER: Final = "another"
 BACKGROUND: Final = (24, 26, 32)
 """The background of boards and windows, which sets their dark cells apart from the viewer's own colour."""
 STATES: Final = {
-    "exploration": (86, 180, 233),
-    "tragedy": (213, 94, 0),
-    "combat": (204, 121, 167),
-    "cultivation": (0, 158, 115),
+    "exploration": BLUE,
+    "tragedy": VERMILION,
+    "combat": PURPLE,
+    "cultivation": GREEN,
     ANOTHER: (120, 120, 120),
     now.BEGINS: (80, 80, 80),
-    now.EXPLORING: (86, 180, 233),
-    now.HARVESTING: (150, 150, 150),
-    now.DECLINE: (213, 94, 0),
-    now.RECOVERY: (0, 158, 115),
+    now.EXPLORING: BLUE,
+    now.HARVESTING: GREY,
+    now.DECLINE: VERMILION,
+    now.RECOVERY: GREEN,
 }
 """The colours of phases and live labels, which share one where they mean the same."""
 STRIPS: Final = ("now", "phase/found", "phase/as_published")
@@ -66,7 +70,6 @@ STRIPS: Final = ("now", "phase/found", "phase/as_published")
 _RUNNING_WIDTH, _RAW_WIDTH, _SINGLE_WIDTH, _THIN_WIDTH = 2.5, 1.0, 0.7, 1.0
 _RAW_SHARE, _SINGLE_SHARE = 0.6, 0.35
 """Of a line's colour, in that of its raw values, and of single replicas."""
-_GREY: Final = (150, 150, 150)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -146,7 +149,7 @@ def lines(curves: Curves) -> dict[str, Any]:
     }
     for metric in curves.metrics:
         styles[f"{RANDOM_PLAY}/{metric}"] = rr.SeriesLines(
-            names=["random play"], colors=[_GREY], widths=[_THIN_WIDTH]
+            names=["random play"], colors=[GREY], widths=[_THIN_WIDTH]
         )
     for entity, (name, colour) in OTHERS.items():
         styles[entity] = rr.SeriesLines(names=[name], colors=[colour])
@@ -176,11 +179,16 @@ def _darker(colour: tuple[int, int, int], share: float) -> tuple[int, ...]:
     return tuple(round(share * part) for part in colour)
 
 
+def packed(colour: Colour) -> int:
+    """An opaque colour as Rerun's 0xRRGGBBAA."""
+    red, green, blue = colour
+    return red << 24 | green << 16 | blue << 8 | 255
+
+
 def state_colours(curves: Curves) -> dict[str, Any]:
     """The colours of live labels and phases, by entity."""
-    packed = [red << 24 | green << 16 | blue << 8 | 255 for red, green, blue in STATES.values()]
-    names = list(STATES)
-    configuration = rr.StateConfiguration(values=names, labels=names, colors=np.array(packed, np.uint32))
+    names, colours = list(STATES), np.array([packed(colour) for colour in STATES.values()], np.uint32)
+    configuration = rr.StateConfiguration(values=names, labels=names, colors=colours)
     strips = STRIPS if curves.has_phases else STRIPS[:1]
     return dict.fromkeys(strips, configuration)
 

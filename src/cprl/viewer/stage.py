@@ -159,7 +159,7 @@ RIM_CELLS: Final = 1
 BEAM_OPACITY: Final = 0.7
 
 Frames = Mapping[str, NDArray[Any]]
-"""Columns of `FrameBuffer.take`, [T, ...] each, with windows as classes of `classes_seen`."""
+"""Columns of `FrameRecorder.take`, [T, ...] each, with windows as classes of `classes_seen`."""
 
 
 def image_form(size: tuple[int, int]) -> Any:

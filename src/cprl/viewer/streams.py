@@ -5,7 +5,7 @@ import shutil
 import subprocess
 import time
 import warnings
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from contextlib import suppress
 from dataclasses import dataclass, field
 from functools import cache, partial
@@ -108,11 +108,6 @@ def release() -> None:
         within(CLOSE_S, end_recordings)
 
 
-def abandon(recording: object) -> None:
-    """Keeps a recording whose viewer does not answer, so that nothing disconnects it and waits."""
-    _ABANDONED.append(recording)
-
-
 @cache
 def exit_in_time() -> None:
     """Gives Rerun's own last flush, when the interpreter exits, a deadline; it has none of itself."""
@@ -138,9 +133,6 @@ _KEEPS_UP: Final = 1
 Row: TypeAlias = tuple[int, int, int, list[float] | str]
 """Step, episode, frame, and a number for each line or a Markdown text."""
 
-Waiting: TypeAlias = dict[str, list[Row]]
-"""Numbers and texts by entity."""
-
 
 class Stream:
     """One recording stream. If it fails, it warns once, and the run continues without it.
@@ -151,8 +143,8 @@ class Stream:
 
     def __init__(self, name: str, recording: Any, *, period_s: float) -> None:
         self.name, self.recording, self.period_s = name, recording, period_s
-        self.waiting: Waiting = {}
-        """Numbers that have not been sent."""
+        self.waiting: dict[str, list[Row]] = {}
+        """Numbers and texts that have not been sent, by entity."""
         self._sent = time.perf_counter()
 
     @property
@@ -165,7 +157,7 @@ class Stream:
         """Whether the buffered numbers should be sent now."""
         return time.perf_counter() - self._sent > self.period_s
 
-    def take(self) -> Waiting:
+    def take(self) -> dict[str, list[Row]]:
         """The buffered numbers; the buffer is empty afterwards."""
         taken, self.waiting = self.waiting, {}
         self._sent = time.perf_counter()
@@ -227,55 +219,8 @@ class LiveStream(Stream):
         self._sender.close()
 
     def _fail(self, error: Exception) -> None:
-        abandon(self.recording)
+        _ABANDONED.append(self.recording)
         super()._fail(error)
-
-
-class Streams:
-    """Those of one recording: to its file, and to viewers."""
-
-    def __init__(self) -> None:
-        self._each: list[Stream] = []
-
-    def add(self, stream: Stream | None) -> None:
-        """Adds a stream; None adds nothing."""
-        self._each += [] if stream is None else [stream]
-
-    def __iter__(self) -> Iterator[Stream]:
-        return iter(self._each)
-
-    @property
-    def recordings(self) -> list[Any]:
-        """The `rerun.RecordingStream` of each."""
-        return [each.recording for each in self._each]
-
-    @property
-    def is_live(self) -> bool:
-        """Whether there is a stream to viewers."""
-        return any(isinstance(each, LiveStream) for each in self._each)
-
-    @property
-    def is_open_live(self) -> bool:
-        """Whether a stream to viewers is neither closed nor failed."""
-        return any(isinstance(each, LiveStream) and each.recording is not None for each in self._each)
-
-    def do(self, what: Callable[[Any], object], *, live_only: bool = False) -> None:
-        """Calls a function with each recording, or with that to viewers alone, in the thread that sends."""
-        for each in self._each:
-            if isinstance(each, LiveStream) or not live_only:
-                each.do(what)
-
-    def hold(self, name: str, row: Row) -> list[Stream]:
-        """Buffers a row of an entity; returns the streams whose buffers are to be sent now."""
-        for each in self._each:
-            each.waiting.setdefault(name, []).append(row)
-        return [each for each in self._each if each.is_due]
-
-    def close(self, *, live: bool = True) -> None:
-        """Closes all, or all but those to viewers."""
-        for each in self._each:
-            if live or not isinstance(each, LiveStream):
-                each.close()
 
 
 RUN, REPLAY = "cprl", "cprl replay"
@@ -315,7 +260,7 @@ class Live:
 
 
 def open_file(
-    recording_id: str, path: Path, blueprint: Any, *, period_s: float, application: str = RUN
+    recording_id: str, path: Path, blueprint: Any, period_s: float, application: str = RUN
 ) -> Stream | None:
     """A stream to a new file; None, with a warning, if the disk is almost full.
 
@@ -334,9 +279,9 @@ def open_live(
     live: str,
     recording_id: str,
     blueprint: Any,
-    *,
     period_s: float,
     application: str = RUN,
+    *,
     exhibits: bool = False,
 ) -> Live:
     """A live stream, one for the exhibition if there is any, and how to watch them.
@@ -392,7 +337,6 @@ def _warn_of(what: str, why: object) -> None:
 
 
 def _recording(application: str, recording_id: str, *, send_properties: bool = True) -> Any:
-
     recording = rr.RecordingStream(
         application,
         recording_id=recording_id,

@@ -21,8 +21,8 @@ from cprl.measuring.episodes import Episode
 from cprl.system.compat import send_chunk
 from cprl.viewer.institutions import has_institutions, lines
 from cprl.viewer.logger import RerunLogger, components, timelines, times
-from cprl.viewer.panels import TITLE, Axes, Panels
-from cprl.viewer.scenery import BACKGROUND, STATES, Curves, Scene, has_lorenz, has_wall
+from cprl.viewer.panels import Axes, Panels, titled
+from cprl.viewer.scenery import BACKGROUND, GREEN, GREY, ORANGE, STATES, Curves, Scene, has_lorenz, has_wall
 from cprl.viewer.stage import RIM_CELLS, boards, image_form
 from cprl.viewer.story import has_died
 
@@ -257,8 +257,6 @@ class Visits(View):
 
 POINTS: Final = 100
 """The points of a line, at most."""
-_LIVED: Final = (150, 150, 150)
-_TEXT: Final = (200, 200, 200)
 
 
 class Turns(View):
@@ -310,12 +308,11 @@ class Turns(View):
         if not shown:
             return
         strips = [self._axes.placed(*np.array(self._ended[replica]).T) for replica in shown]
-        colours = [STATES["tragedy"] if self._died[replica] else _LIVED for replica in shown]
+        colours = [STATES["tragedy"] if self._died[replica] else GREY for replica in shown]
         self._logger.log_row("turn/lines", rr.LineStrips2D(strips, colors=colours, radii=0.5))
         died = sum(self._died)
         text = f"last episode of each replica: {died} of {len(shown)} boards died (orange)"
-        title = rr.Points2D([TITLE], labels=[text], radii=0.0, colors=_TEXT, show_labels=True)
-        self._logger.log_row("turn/title", title)
+        self._logger.log_row("turn/title", titled(text))
 
     def state_dict(self) -> dict[str, Any]:
         self._place()
@@ -326,11 +323,6 @@ class Turns(View):
         self._playing[:] = state["playing"]
         self._ended = [[(turn, stock) for turn, stock in line] for line in state["ended"]]
         self._died = list(state["died"])
-
-
-_EVEN: Final = (150, 150, 150)
-_FIRST: Final = (0, 158, 115)
-_LAST: Final = (230, 160, 0)
 
 
 def lorenz_curve(harvest: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -383,14 +375,13 @@ class Lorenz(View):
         share = np.linspace(0, 100, self._agents + 1)
         curves = share / 100, earliest, curve
         strips = [self._axes.placed(share, 100 * own) for own in curves]
-        lines = rr.LineStrips2D(strips, colors=[_EVEN, _FIRST, _LAST], radii=[0.3, 0.5, 1.0])
+        lines = rr.LineStrips2D(strips, colors=[GREY, GREEN, ORANGE], radii=[0.3, 0.5, 1.0])
         self._logger.log_row("lorenz", lines)
         text = (
             f"Gini {gini(curve):.2f}: {episodes}, {count:.0f} with a harvest "
             f"(green: {began}, {gini(earliest):.2f}; grey: equal shares)"
         )
-        title = rr.Points2D([TITLE], labels=[text], radii=0.0, colors=_TEXT, show_labels=True)
-        self._logger.log_row("lorenz/title", title)
+        self._logger.log_row("lorenz/title", titled(text))
 
     def state_dict(self) -> dict[str, Any]:
         sums = [[episode, *row.tolist()] for episode, row in self._sums.items()]
@@ -405,8 +396,6 @@ class Lorenz(View):
 Regions: TypeAlias = list[tuple[list[int], NDArray[np.bool_]]]
 """The owners of each region, and its cells, bool [H, W]."""
 
-_SHARED: Final = (150, 150, 150)
-"""The colour of regions of several agents."""
 _OPACITY: Final = 170
 _INSET_CELLS, _BORDER_CELLS = 0.08, 0.04
 
@@ -469,7 +458,7 @@ def borders(regions: Regions) -> Any:
     for owners, cells in regions:
         found = _borders(cells)
         strips += found
-        hue = agent_colour(owners[0]) if len(owners) == 1 else _SHARED
+        hue = agent_colour(owners[0]) if len(owners) == 1 else GREY
         colours += [(*hue, _OPACITY)] * len(found)
     return rr.LineStrips2D(strips, colors=colours, radii=_BORDER_CELLS, draw_order=-4.0)
 

@@ -1,0 +1,71 @@
+"""Helpers of the tests: recordings of a small game, read back by Rerun's own reader."""
+
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+import rerun as rr
+from rerun.chunk import RrdReader
+
+from cprl import Game, Rules, maps
+from cprl.commons.colours import COLOURS
+from cprl.commons.decoding import classes_seen
+from cprl.viewer.scenery import Scene
+
+GAME = Game(
+    map=maps.parse(".A>.A\n.A.A.\n..<.A"),
+    rules=Rules(regrow_prob=(0.0, 0.1), window_rows=3, window_columns=5, episode_steps=20),
+)
+
+SCENE = Scene(height=3, width=5, walls=(), sites=GAME.map.sites, agents=GAME.agent_names, window=(3, 5))
+
+
+@pytest.fixture(autouse=True)
+def strict_rerun():
+    rr.set_strict_mode(True)
+    yield
+    rr.set_strict_mode(False)
+
+
+def column(path, entity, component, timeline="step"):
+    """The times and values of one column of a recording."""
+    times, values = [], []
+    for chunk in RrdReader(path).stream().filter(content=f"/{entity}"):
+        batch = chunk.to_record_batch()
+        if component in batch.schema.names and timeline in batch.schema.names:
+            times += batch.column(timeline).to_pylist()
+            values += batch.column(component).to_pylist()
+    return times, values
+
+
+def static(path, entity, component):
+    """The static value of one component."""
+    for chunk in RrdReader(path).stream().filter(content=f"/{entity}"):
+        batch = chunk.to_record_batch()
+        if component in batch.schema.names:
+            return batch.column(component).to_pylist()[0]
+    return None
+
+
+def frames(count, *, first_step=1):
+    """So many frames of two agents, each frame another."""
+    random = np.random.default_rng(0)
+    sites = len(GAME.map.sites)
+    shown = []
+    for step in range(count):
+        frame = SimpleNamespace(
+            step=first_step + step,
+            episode=7,
+            beams=np.arange(15).reshape(3, 5) < step // 2,
+            stock=random.integers(0, 2, sites).astype(np.uint8),
+            windows=GAME.palette[random.integers(0, len(COLOURS), (2, 3, 5))].transpose(0, 3, 1, 2),
+            row=np.array([0, step % 3], np.int32),
+            col=np.array([step % 5, 4], np.int32),
+            heading=np.array([step % 4, 1], np.int32),
+            in_play=np.array([True, step < 2]),
+            tagged_by=np.array([-1, 0 if step > 3 else -1], np.int32),
+            harvested=np.array([step, 0], np.int32),
+        )
+        shown.append(frame)
+    taken = {name: np.stack([vars(frame)[name] for frame in shown]) for name in vars(shown[0])}
+    return {**taken, "windows": classes_seen(GAME, taken["windows"])}, shown

@@ -1,0 +1,71 @@
+"""Helpers of the tests: small games, runs on them, and commands that read these."""
+
+from test_population import ALGORITHMS
+
+import cprl
+from cprl import Experiment, Game, Rules, maps
+from cprl.commands import main as cli
+from cprl.population import Learning
+
+CORRIDORS = Game(
+    map=maps.parse(
+        """
+        >A.A.
+        #####
+        #AAA<
+        """
+    ),
+    rules=Rules(
+        regrow_prob=(0.0,), window_rows=4, window_columns=3, episode_steps=9, may_fire=False, freeze_steps=0
+    ),
+)
+"""A greedy agent 0 bites at steps 1 and 3, a greedy agent 1 at steps 1, 2 and 3; nothing grows again, so that
+then the episode is over. A sustainable agent leaves them all: near none of them hang three others."""
+
+MEADOW = Game(
+    map=maps.parse(
+        """
+        .A>.A.A
+        A.A...A
+        ..<.A.A
+        """
+    ),
+    rules=Rules(regrow_prob=(0.0, 0.2), window_rows=3, window_columns=5, episode_steps=15, freeze_steps=2),
+)
+
+DQN, PPO, SAC, C51 = (Learning(ALGORITHMS[name]) for name in ("DQN", "PPO", "SAC", "C51"))
+
+SEED = 77
+
+
+def an_experiment(name, game, members, *, replicas=3):
+    return Experiment(
+        name=name,
+        game=game,
+        agents=members,
+        replicas=replicas,
+        episodes=3,
+        seed=3,
+        evaluation_episodes=1,
+        engine="eager",
+    )
+
+
+def ran(folder, game, members, **how):
+    return cprl.run(an_experiment(folder.name, game, members, **how), folder, watch="off")
+
+
+def values(measures):
+    """Numbers by name; None where undefined in all episodes."""
+    return {name: one.estimate and one.estimate.value for name, one in measures.items()}
+
+
+def told(episodes):
+    """What tells episodes apart."""
+    return [(one.steps, one.return_.tolist(), one.shots.tolist(), one.stock_left) for one in episodes]
+
+
+def command(monkeypatch, capsys, *words):
+    monkeypatch.setattr("sys.argv", ["cprl", *map(str, words)])
+    cli.main()
+    return capsys.readouterr().out
