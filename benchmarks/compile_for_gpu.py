@@ -25,9 +25,9 @@ from cprl import Game, presets
 from cprl.commons.batch import output_of
 from cprl.commons.cuda import kernels
 from cprl.commons.game import output_forms
-from cprl.commons.world import Governed, Scratch, StepOutput, Worlds, empty_scratch, empty_worlds
+from cprl.commons.world import Scratch, StepOutput, Worlds, empty_scratch, empty_worlds
 from cprl.institutions import Tax
-from cprl.institutions.memory import Memory, empty_memory
+from cprl.institutions.memory import Law, Memory, empty_memory
 
 
 def arguments(game: Game, worlds: int = 4) -> dict[str, tuple[Any, ...]]:
@@ -43,16 +43,15 @@ def arguments(game: Game, worlds: int = 4) -> dict[str, tuple[Any, ...]]:
     on_gpu = Worlds(*map(np.asfortranarray, state))
     loops = {"play_worlds": actions, "begin_worlds": marks, "refresh_worlds": marks, "show_worlds": boards}
     ruled = replace(game, institutions=(Tax(),))
-    memory = empty_memory(ruled.governed_tables.institutions, worlds=worlds)
-    governed = Governed(on_gpu, Memory(*map(np.asfortranarray, memory)), actions)
+    memory = empty_memory(ruled.institution_tables, worlds=worlds)
     paid = output_of([np.zeros(*form) for form in output_forms(ruled, worlds).values()])
-    of_governed = {
-        f"{name[:-6]}governed_worlds": what for name, what in loops.items() if name != "show_worlds"
-    }
+    law = Law(ruled.institution_tables, Memory(*map(np.asfortranarray, memory)), actions, paid.payments)
     return {
         **{name: (on_gpu, tables, what, told, scratch) for name, what in loops.items()},
         **{
-            name: (governed, ruled.governed_tables, what, paid, scratch) for name, what in of_governed.items()
+            f"governed {name}": (on_gpu, ruled.tables, what, paid.turn, scratch, law)
+            for name, what in loops.items()
+            if name != "show_worlds"
         },
         "find_unknown": (actions, len(game.actions), np.zeros(1, np.int64)),
     }

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 import torch
 from boards import random_actions
+from governed import EVERYTHING, random_decisions
 from gymnasium.utils.env_checker import check_env
 from pettingzoo import ParallelEnv
 from pettingzoo.test import api_test, parallel_api_test, parallel_seed_test, render_test, seed_test
@@ -17,22 +18,41 @@ from torchrl.envs.utils import check_env_specs
 from cprl import CommonsEnv, Game, Observation, Rules, keys, maps, presets
 from cprl.commons.colours import BEAM, PALETTE
 from cprl.envs import CommonsGymnasiumEnv, env, parallel_env
+from cprl.institutions import Boundaries, Monitoring, Quota, Tax, Vote
 
 SHORT = Game(
     map=maps.parse(".A>.A\n.A.A.\n..<.A"),
     rules=Rules(regrow_prob=(0.0, 0.1), window_rows=3, window_columns=5, episode_steps=30, freeze_steps=3),
 )
 RICH = Observation(encoding="one_hot", agents_apart=True, scoreboard=True, stock_gauge=True)
-GAMES = [SHORT, replace(SHORT, observation=RICH), presets.game("commons", variant="as_run")]
-SINGLE = [presets.game("single_basic"), replace(presets.game("single_complex"), observation=RICH)]
+ALONE = Game(
+    map=maps.parse(">AA.\nA.A."),
+    rules=Rules(regrow_prob=(0.1, 0.5), may_fire=False, window_rows=3, window_columns=3, episode_steps=20),
+    institutions=(
+        Vote(on=Tax(redistribution="none", period_steps=3), choices=(0.0, 0.25, 0.5)),
+        Quota(share=0.5, window_steps=5, fine=1),
+        Boundaries.drawn("..-.\n....", owners=("",), step_fine=0.5, bite_fine=0.25),
+        Monitoring(prob=0.5, cost=0.1),
+    ),
+)
+RULED = replace(EVERYTHING, observation=RICH)
+GAMES = [
+    SHORT,
+    replace(SHORT, observation=RICH),
+    presets.game("commons", variant="as_run"),
+    EVERYTHING,
+    RULED,
+]
+IDS = ["short", "rich", "commons", "institutions", "institutions, rich"]
+SINGLE = [presets.game("single_basic"), replace(presets.game("single_complex"), observation=RICH), ALONE]
 
 
-@pytest.mark.parametrize("game", GAMES, ids=["short", "rich", "commons"])
+@pytest.mark.parametrize("game", GAMES, ids=IDS)
 def test_the_parallel_env_passes_pettingzoos_api_test(game):
     parallel_api_test(parallel_env(game), num_cycles=100)
 
 
-@pytest.mark.parametrize("game", [GAMES[0], GAMES[2]], ids=["short", "commons"])
+@pytest.mark.parametrize("game", [GAMES[0], GAMES[2], EVERYTHING], ids=["short", "commons", "institutions"])
 def test_the_aec_env_passes_pettingzoos_api_test(game):
     api_test(env(game), num_cycles=200)
 
@@ -49,7 +69,7 @@ def test_with_vectors_pettingzoos_api_test_warns_only_that_observations_are_not_
     assert messages
 
 
-@pytest.mark.parametrize("game", GAMES, ids=["short", "rich", "commons"])
+@pytest.mark.parametrize("game", GAMES, ids=IDS)
 def test_both_envs_pass_pettingzoos_seed_tests(game):
     parallel_seed_test(lambda: parallel_env(game), num_cycles=60)
     seed_test(lambda: env(game), num_cycles=60)
@@ -59,9 +79,10 @@ def test_the_aec_env_passes_pettingzoos_render_test():
     render_test(lambda render_mode: env(SHORT, render_mode="rgb_array"))  # it also asks for "human"
 
 
-@pytest.mark.parametrize("game", SINGLE, ids=["single_basic", "rich"])
+@pytest.mark.parametrize("game", SINGLE, ids=["single_basic", "rich", "institutions"])
 def test_the_gymnasium_env_passes_gymnasiums_check(game):
-    check_env(gymnasium.make("cprl/Commons-v0", game=game).unwrapped)
+    made = gymnasium.make("cprl/Commons-v0", game=game).unwrapped
+    check_env(made, skip_render_check=bool(game.institutions))
 
 
 @pytest.mark.parametrize("name", ["SingleBasic", "SingleComplex"])
@@ -80,15 +101,25 @@ def test_torchrls_pettingzoo_wrapper_accepts_the_parallel_env():
     assert steps["agent", "observation"].shape == (20, 4, 3, 7, 15)
 
 
-def played_by_torchrl(game, turns):
-    """Everything that the agents receive in each turn; a new episode begins when one has ended."""
-    adapter = CommonsEnv(game, seed=5)
+PAID = ("fines", "transfers", "violated")
+
+
+def played_by_torchrl(game, turns, decisions):
+    """What the agents receive in each turn; when an episode has ended, the next begins with the next
+    decisions."""
+    adapter, episode = CommonsEnv(game, seed=5), 0
     moment = adapter.reset()
     for turn in turns:
-        now, moment = adapter.step_and_maybe_reset(moment.set(keys.ACTION, torch.as_tensor(turn[None])))
+        moment.set(keys.ACTION, torch.as_tensor(turn[None]))
+        if game.decisions:
+            moment.set(keys.DECISION, torch.as_tensor(decisions[episode][None]))
+        now, moment = adapter.step_and_maybe_reset(moment)
         after = now["next"]
         agents = after["agents"][0]
-        flags = zip(agents["in_play"], agents["fired"], agents["tagged_by"].any(-1), strict=True)
+        episode += bool(after["done"])
+        infos = {
+            name: agents[name].tolist() for name in ("harvest", "in_play", "fired", *PAID) if name in agents
+        }
         yield {
             **{
                 (name, entry): agents[i][entry].numpy()
@@ -97,7 +128,8 @@ def played_by_torchrl(game, turns):
                 if entry in agents
             },
             "rewards": agents["reward"][:, 0].tolist(),
-            "infos": [tuple(map(bool, flag)) for flag in flags],
+            **infos,
+            "tagged": agents["tagged_by"].any(-1).tolist(),
             "end": (bool(after["terminated"]), bool(after["truncated"])),
         }
 
@@ -109,17 +141,19 @@ def step_output(names, observe, rewards, infos, end):
         seen = observe(name)
         for entry, array in (seen if isinstance(seen, dict) else {"observation": seen}).items():
             entries[name, entry] = array
-    return {
-        **entries,
-        "rewards": [rewards[name] for name in names],
-        "infos": [(infos[name]["in_play"], infos[name]["fired"], infos[name]["tagged"]) for name in names],
-        "end": end,
-    }
+    told = {entry: [infos[name][entry] for name in names] for entry in infos[names[0]]}
+    return {**entries, "rewards": [rewards[name] for name in names], **told, "end": end}
 
 
-def played_in_parallel(game, turns):
-    adapter, names = parallel_env(game, 5), game.agent_names
-    adapter.reset()
+def options(game, decided):
+    """What agents decide, as `reset` takes it."""
+    decisions = dict(zip(game.agent_names, map(int, decided), strict=True))
+    return {"decisions": decisions if game.decisions else {}}
+
+
+def played_in_parallel(game, turns, decisions):
+    adapter, names, episode = parallel_env(game, 5), game.agent_names, 0
+    adapter.reset(options=options(game, decisions[0]))
     for turn in turns:
         seen, rewards, terminated, truncated, infos = adapter.step(
             dict(zip(names, turn.tolist(), strict=True))
@@ -129,12 +163,13 @@ def played_in_parallel(game, turns):
         yield step_output(names, seen.get, rewards, infos, end := ends.pop())
         assert adapter.agents == ([] if any(end) else list(names))
         if any(end):
-            adapter.reset()
+            episode += 1
+            adapter.reset(options=options(game, decisions[episode]))
 
 
-def played_turn_by_turn(game, turns):
-    adapter, names = env(game, 5), game.agent_names
-    adapter.reset()
+def played_turn_by_turn(game, turns, decisions):
+    adapter, names, episode = env(game, 5), game.agent_names, 0
+    adapter.reset(options=options(game, decisions[0]))
     for turn in turns:
         for name, action in zip(names, turn.tolist(), strict=True):
             assert adapter.agent_selection == name
@@ -142,45 +177,75 @@ def played_turn_by_turn(game, turns):
         end = adapter.terminations[names[0]], adapter.truncations[names[0]]
         yield step_output(names, adapter.observe, adapter.rewards, adapter.infos, end)
         if any(end):
-            adapter.reset()
+            episode += 1
+            adapter.reset(options=options(game, decisions[episode]))
 
 
-def played_alone(game, turns):
-    adapter = CommonsGymnasiumEnv(game, seed=5)
-    adapter.reset()
+def played_alone(game, turns, decisions):
+    adapter, episode = CommonsGymnasiumEnv(game, seed=5), 0
+    adapter.reset(options=options(game, decisions[0]))
     for turn in turns:
         seen, reward, *end, info = adapter.step(int(turn[0]))
         one = {"agent_0": reward}
         yield step_output(["agent_0"], {"agent_0": seen}.get, one, {"agent_0": info}, tuple(end))
         if any(end):
-            adapter.reset()
+            episode += 1
+            adapter.reset(options=options(game, decisions[episode]))
 
 
-@pytest.mark.parametrize("board", presets.BOARDS)
-@pytest.mark.parametrize("form", [Observation(), RICH], ids=["rgb", "rich"])
-def test_all_adapters_play_the_same_game_for_the_same_seed(board, form):
-    game = presets.game(board)
-    game = replace(game, rules=replace(game.rules, episode_steps=130), observation=form)
+SHORTER = {
+    f"{board}, {name}": replace(
+        (game := presets.game(board)), rules=replace(game.rules, episode_steps=130), observation=form
+    )
+    for board in presets.BOARDS
+    for name, form in (("rgb", Observation()), ("rich", RICH))
+}
+
+
+@pytest.mark.parametrize(
+    "game",
+    [*SHORTER.values(), EVERYTHING, RULED, ALONE],
+    ids=[*SHORTER, "institutions", "institutions, rich", "institutions, alone"],
+)
+def test_all_adapters_play_the_same_game_for_the_same_seed(game):
     turns = random_actions(300, 1, game, seed=1)[:, 0]
+    decisions = random_decisions(99, 1, game, seed=2)[:, 0]
     adapters = [played_in_parallel, played_turn_by_turn, *([played_alone] if game.agents == 1 else [])]
-    ends = 0
+    ends, paid = 0, set()
     for number, outputs in enumerate(
-        zip(played_by_torchrl(game, turns), *(adapter(game, turns) for adapter in adapters), strict=True)
+        zip(*(play(game, turns, decisions) for play in (played_by_torchrl, *adapters)), strict=True)
     ):
         for other in outputs[1:]:
             assert set(other) == set(outputs[0])
             for entry, value in outputs[0].items():
                 assert np.array_equal(other[entry], value), (number, entry)
         ends += any(outputs[0]["end"])
+        paid |= set(outputs[0]["rewards"])
     assert number == 299
     assert ends >= 2
+    assert not game.institutions or len(paid) > 5
+
+
+def test_decisions_are_those_of_the_reset_in_pettingzoo_and_an_unnamed_agent_takes_the_first_option():
+    game = replace(EVERYTHING, institutions=(Vote(on=Tax(redistribution="none"), choices=(0.0, 0.5, 1.0)),))
+    adapter = parallel_env(game)
+    for decisions, rate in (
+        ({"agent_0": 2, "agent_2": 1}, 0.5),
+        ({"agent_1": 2}, 0.0),
+        ({}, 0.0),
+        (None, 0.0),
+    ):
+        adapter.reset(options=None if decisions is None else {"decisions": decisions})
+        adapter.step(dict.fromkeys(game.agent_names, 0))
+        assert adapter.payments.in_force.tolist() == [[rate]]
 
 
 @pytest.mark.parametrize("play", [played_in_parallel, played_turn_by_turn])
 def test_the_same_seed_repeats_whole_episodes(play):
     game = presets.game("commons")
     turns = random_actions(300, 1, game, seed=3)[:, 0]
-    for one, other in zip(play(game, turns), play(game, turns), strict=True):
+    decisions = random_decisions(9, 1, game)[:, 0]
+    for one, other in zip(play(game, turns, decisions), play(game, turns, decisions), strict=True):
         assert all(np.array_equal(other[entry], value) for entry, value in one.items())
 
 

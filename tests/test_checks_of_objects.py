@@ -8,7 +8,7 @@ import torch
 
 import cprl
 from cprl import CommonsEnv, Map, presets
-from cprl.arguments import callable_of, object_of, objects, path, texts
+from cprl.arguments import path, texts
 from cprl.checks import plain
 from cprl.learners.lanes import weights_to_start
 from cprl.measuring.evaluate import evaluate
@@ -38,19 +38,6 @@ def test_a_single_text_is_no_list_of_texts():
             texts("allow", given)
     with pytest.raises(ValueError, match="argv is "):
         texts("argv", [], 1)
-
-
-def test_objects_are_checked_by_their_class_and_left_as_they_are():
-    one = torch.zeros(2)
-    assert objects("values", iter([one]), torch.Tensor, "tensors") == (one,)
-    with pytest.raises(ValueError, match=r"values\[1\] is 3; allowed: tensors"):
-        objects("values", [one, 3], torch.Tensor, "tensors")
-    with pytest.raises(ValueError, match="values is 3; allowed: a list of tensors"):
-        objects("values", 3, torch.Tensor, "tensors")
-    with pytest.raises(ValueError, match="env is 'x'; allowed: an environment"):
-        object_of("env", "x", torch.Tensor, "an environment")
-    with pytest.raises(ValueError, match="make is 3; allowed: a function"):
-        callable_of("make", 3, "a function")
 
 
 @pytest.mark.parametrize("empty", [torch.zeros(3, device="meta"), torch.eye(3).to_sparse()])
@@ -83,11 +70,6 @@ def test_a_text_of_another_class_becomes_a_plain_one():
         pass
 
     assert type(Scripted(Text("random")).policy) is str
-
-
-def test_a_tensor_without_a_dimension_is_no_list():
-    with pytest.raises(ValueError, match=r"^values is .*; allowed: a list of tensors"):
-        objects("values", torch.tensor(3), torch.Tensor, "tensors")
 
 
 def test_what_is_nested_too_deeply_for_python_is_printed_all_the_same(capsys):

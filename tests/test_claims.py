@@ -12,12 +12,7 @@ from cprl.measuring.published import curve, published_experiment
 from cprl.population import Learning, Scripted
 from cprl.reporting import claims, curves
 from cprl.reporting.appendix import appendix
-from cprl.reporting.claims_alone import (
-    of_experiment_1,
-    of_experiment_2,
-    of_experiment_3,
-    of_experiment_4,
-)
+from cprl.reporting.claims_alone import of_experiment_1, of_experiment_2, of_experiment_3, of_experiment_4
 from cprl.reporting.claims_many import combat_section, of_experiment_5
 from cprl.reporting.measures import of_training
 from cprl.reporting.random_play import returns_by_chance

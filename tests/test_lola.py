@@ -6,15 +6,7 @@ import numpy as np
 import pytest
 import torch
 from matrix_game import MatrixGame as SmallGame
-from test_population import (
-    GAME,
-    Returns,
-    assert_goes_on_bit_for_bit,
-    population,
-    ran,
-    trained,
-    weights,
-)
+from test_population import GAME, Returns, assert_goes_on_bit_for_bit, population, ran, trained, weights
 
 import cprl
 from cprl import Custom, Experiment

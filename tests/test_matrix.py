@@ -11,13 +11,7 @@ import cprl
 from cprl import Custom
 from cprl.algorithms import DQN
 from cprl.envs import make_env
-from cprl.envs.matrix import (
-    MatrixGame,
-    chicken,
-    matching_pennies,
-    prisoners_dilemma,
-    stag_hunt,
-)
+from cprl.envs.matrix import MatrixGame, chicken, matching_pennies, prisoners_dilemma, stag_hunt
 from cprl.population import Learning
 
 C, D = 0, 1

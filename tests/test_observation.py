@@ -23,15 +23,6 @@ FORMS = [
 ]
 
 
-@pytest.mark.parametrize(
-    ("field", "value"),
-    [("area", "all"), ("encoding", "grey"), ("agents_apart", 1), ("scoreboard", None), ("stock_gauge", "no")],
-)
-def test_a_value_that_is_not_allowed_is_refused(field, value):
-    with pytest.raises(ValueError, match=rf"Observation\.{field} is .*; allowed: "):
-        Observation(**{field: value})
-
-
 @pytest.mark.parametrize("encoding", ["rgb", "one_hot"])
 def test_a_full_observation_shows_the_whole_board_with_the_observer_as_self(encoding):
     play = Play(BOARD, observation=Observation(area="full", encoding=encoding))

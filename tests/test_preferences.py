@@ -15,12 +15,7 @@ from torchrl.envs.utils import check_env_specs
 
 from cprl import CommonsEnv, Game, Rules, maps
 from cprl.envs import make_env, parallel_env
-from cprl.envs.state import (
-    env_state,
-    load_env_state,
-    load_transforms_state,
-    transforms_state,
-)
+from cprl.envs.state import env_state, load_env_state, load_transforms_state, transforms_state
 from cprl.policies.assignment import AgentPolicies
 from cprl.policies.lanes import random_agents
 from cprl.preferences import (

@@ -6,41 +6,22 @@ import numpy as np
 import pytest
 
 from cprl import Rules, presets
-from cprl.commons.rules import _CHECKS
 
 WRONG = {
-    "regrow_prob": [(), (0.5, 1.5), 0.1, (float("nan"),), ("a",)],
-    "regrow_radius_cells": [-1, float("inf"), "2", None],
-    "regrow_norm": ["l2", None],
-    "beam_length_cells": [0, 2.5, (1, 2, 3), (1, 2, 3, 0), True],
-    "beam_width_cells": [0, 2, 3.0],
-    "hits_to_tag": [0, -1, 1.0],
-    "freeze_steps": [-1, 2.5, ((1, 2), (3,)), (1, 2), ()],
-    "may_fire": [1, (), (True, 0), (True, False)],
-    "window_rows": [0, 1.5, "6"],
-    "window_columns": [0, 12, -3],
-    "episode_steps": [0, 1e3, None],
-    "walls_block_sight": [1, "yes"],
-    "pairwise_clashes": [0, None, "yes"],
-    "regrow_before_bites": [1],
-    "freeze_counts_tag_turn": [1],
-    "ends_one_turn_late": [1],
-    "picture_shows_old_stock": [1],
-    "paint_over": [1],
-    "mark_behind_if_vertical": [1],
-    "self_paint_stays": [1],
-    "agent_1_right_moves_agent_0": [1, "yes"],
-    "shuffle_starts": [1],
+    "regrow_prob": [(), (0.5, 1.5), (float("nan"),), (1e-10,)],
+    "regrow_radius_cells": [-1, float("inf")],
+    "beam_length_cells": [0, (1, 2, 3), (1, 2, 3, 0)],
+    "beam_width_cells": [0, 2],
+    "hits_to_tag": [0],
+    "freeze_steps": [-1],
+    "window_rows": [0, 2**31 - 1],
+    "window_columns": [0, 12],
+    "episode_steps": [0],
 }
 
 
-def test_every_field_has_a_check_and_wrong_values_in_this_file():
-    names = [field.name for field in fields(Rules)]
-    assert sorted(_CHECKS) == sorted(names) == sorted(WRONG)
-
-
 @pytest.mark.parametrize(("name", "value"), [(name, value) for name in WRONG for value in WRONG[name]])
-def test_a_wrong_value_is_refused_with_field_value_and_what_is_allowed(name, value):
+def test_a_number_out_of_range_is_refused(name, value):
     with pytest.raises(ValueError, match=rf"Rules\.{name} is .*; allowed: "):
         Rules(**{name: value})
 
@@ -50,11 +31,6 @@ def test_lists_and_arrays_become_tuples_so_that_rules_compare_and_hash():
     same = Rules(regrow_prob=(0, 0.5), beam_length_cells=(1, 2, 3, 4), may_fire=False)
     assert given == same
     assert hash(given) == hash(same)
-
-
-def test_replace_checks_the_new_values():
-    with pytest.raises(ValueError, match="window_columns is 4"):
-        replace(Rules(), window_columns=4)
 
 
 def test_every_quirk_is_off_as_published_and_on_as_run():

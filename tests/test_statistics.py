@@ -3,11 +3,7 @@
 import numpy as np
 import pytest
 
-from cprl.measuring.statistics import (
-    curve_interval,
-    difference,
-    estimate,
-)
+from cprl.measuring.statistics import curve_interval, difference, estimate
 
 
 def test_intervals_are_by_student():

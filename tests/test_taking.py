@@ -11,14 +11,7 @@ from test_stage_games import HERDERS, LAB, PAIR, ROLLOUTS, SMALL, own_game, rewa
 
 import cprl
 from cprl import Custom, Experiment
-from cprl.algorithms import (
-    DQN,
-    LOLA,
-    PPO,
-    LOLASettings,
-    Tabular,
-    TabularSettings,
-)
+from cprl.algorithms import DQN, LOLA, PPO, LOLASettings, Tabular, TabularSettings
 from cprl.envs import make_env
 from cprl.envs.taking import TakingGame
 from cprl.population import Learning, Team

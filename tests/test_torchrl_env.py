@@ -1,12 +1,15 @@
 """CommonsEnv keeps TorchRL's contracts, and plays the very game of `cprl.commons`."""
 
 from copy import deepcopy
+from dataclasses import replace
 from functools import partial
 
 import numpy as np
 import pytest
 import torch
 from boards import random_actions
+from governed import EVERYTHING as GOVERNED
+from governed import random_decisions
 from restorable import assert_restorable
 from tensordict import TensorDict, assert_close
 from tensordict.nn import TensorDictModuleBase
@@ -24,14 +27,19 @@ from torchrl.envs import (
 )
 from torchrl.envs.utils import check_env_specs
 
-from cprl import CommonsEnv, Game, Rules, keys, maps, presets
+from cprl import CommonsEnv, Game, Observation, Rules, keys, maps, presets
 from cprl.commons.batch import Batch
 from cprl.envs import make_env
 from cprl.envs.state import env_state, load_env_state, load_transforms_state, transforms_state
+from cprl.institutions import COUNTS
 
 SHORT = Game(
     map=maps.parse(".A>.A\n.A.A.\n..<.A"),
     rules=Rules(regrow_prob=(0.0, 0.1), window_rows=3, window_columns=5, episode_steps=9),
+)
+RICH = replace(
+    GOVERNED,
+    observation=Observation(encoding="one_hot", agents_apart=True, scoreboard=True, stock_gauge=True),
 )
 EVERYTHING = {  # key -> shape without B, dtype
     keys.OBSERVATION: ((4, 3, 7, 15), torch.uint8),
@@ -47,6 +55,9 @@ EVERYTHING = {  # key -> shape without B, dtype
     keys.TERMINATED: ((1,), torch.bool),
     keys.TRUNCATED: ((1,), torch.bool),
 }
+
+
+CHOSEN = (keys.ACTION, keys.DECISION)
 
 
 class ByWindow(TensorDictModuleBase):
@@ -164,8 +175,9 @@ def test_unknown_actions_raise_and_change_nothing(bad):
     assert_close(moment.exclude(keys.ACTION), kept)
 
 
-def test_what_was_returned_never_changes_later():
-    env = CommonsEnv(SHORT, worlds=3)
+@pytest.mark.parametrize("game", [SHORT, GOVERNED], ids=["plain", "institutions"])
+def test_what_was_returned_never_changes_later(game):
+    env = CommonsEnv(game, worlds=3)
     kept, copies, moment = [], [], env.reset()
     for _ in range(25):
         env.rand_action(moment)
@@ -174,18 +186,22 @@ def test_what_was_returned_never_changes_later():
         copies += [now.clone(), moment.clone()]
     for entry, copy in zip(kept, copies, strict=True):
         # The policy's action is written into the carried entry by design.
-        assert_close(entry.exclude(keys.ACTION, "next"), copy.exclude(keys.ACTION, "next"))
+        assert_close(entry.exclude(*CHOSEN, "next"), copy.exclude(*CHOSEN, "next"))
         if "next" in copy:
             assert_close(entry["next"], copy["next"])
 
 
-def test_the_lean_step_and_maybe_reset_equals_torchrls_own():
-    lean, stock = (CommonsEnv(SHORT, worlds=4, seed=2, state=True) for _ in range(2))
+@pytest.mark.parametrize("game", [SHORT, GOVERNED], ids=["plain", "institutions"])
+def test_the_lean_step_and_maybe_reset_equals_torchrls_own(game):
+    lean, stock = (CommonsEnv(game, worlds=4, seed=2, state=True) for _ in range(2))
     moment, other_moment = lean.reset(), stock.reset()
     ends = 0
-    for turn in torch.as_tensor(random_actions(60, 4, SHORT)):
+    actions, decisions = random_actions(60, 4, game), random_decisions(60, 4, game)
+    for turn, decided in zip(map(torch.as_tensor, actions), map(torch.as_tensor, decisions), strict=True):
         for entry in (moment, other_moment):
             entry[keys.ACTION] = turn
+            if game.decisions:
+                entry[keys.DECISION] = decided
             entry[keys.AGENTS, "value"], entry["note"] = turn.float(), turn.sum(-1)
         now, moment = lean.step_and_maybe_reset(moment)
         other_now, other_moment = EnvBase._step_and_maybe_reset(stock, other_moment)
@@ -236,6 +252,75 @@ def test_set_seed_starts_the_same_game_again():
     assert runs[0].sum() > 0
     assert torch.equal(runs[0], runs[1])
     assert not torch.equal(runs[0], runs[2])
+
+
+@pytest.mark.parametrize("game", [GOVERNED, RICH], ids=["rgb", "rich"])
+def test_with_institutions_the_specs_are_kept_and_agents_are_paid(game):
+    check_env_specs(CommonsEnv(game, 3, state=True))
+    decided = CommonsEnv(game, 3).rollout(30, break_when_any_done=False)
+    assert decided[keys.DECISION].shape == (3, 30, 3)
+    assert decided["next", *keys.COUNTS].shape == (3, 30, 3, len(COUNTS))
+    assert decided["next", keys.IN_FORCE].shape == (3, 30, 4)
+    assert decided["next", *keys.FINES].any()
+    shown = decided["next", *keys.HARVEST] - decided["next", *keys.FINES] + decided["next", *keys.TRANSFERS]
+    torch.testing.assert_close(decided["next", *keys.REWARD].squeeze(-1), shown, atol=1e-5, rtol=1e-5)
+
+
+def test_a_game_without_institutions_has_none_of_their_entries():
+    steps = CommonsEnv(replace(GOVERNED, institutions=()), 2).rollout(3)
+    names = {key if isinstance(key, str) else key[-1] for key in steps.keys(True, True)}
+    assert not names & {"fines", "transfers", "violated", "counts", "decision", "in_force"}
+
+
+def test_a_reset_of_some_worlds_keeps_what_others_were_paid():
+    adapter = CommonsEnv(GOVERNED, worlds=3, seed=2)
+    last = adapter.rollout(9, break_when_any_done=False)[:, -1]["next"]
+    which = torch.tensor([[True], [False], [False]])
+    after = adapter.reset(last.clone().set("_reset", which))
+    for key in (keys.FINES, keys.TRANSFERS, keys.VIOLATED, keys.COUNTS, keys.IN_FORCE, keys.OBSERVATION):
+        assert torch.equal(after[key][1:], last[key][1:]), key
+    assert not after[keys.COUNTS][0].any()
+    assert last[keys.COUNTS][0].any()
+
+
+def test_what_was_kept_is_restored_whole():
+    assert_restorable(lambda: CommonsEnv(GOVERNED, 3, seed=4))
+    assert_restorable(lambda: make_env(RICH, worlds=2, seed=4, transforms=[StepCounter()]))
+
+
+def of_workers(kind, turns, decisions):
+    """What two workers of three worlds each play."""
+    vec = kind(2, [partial(CommonsEnv, GOVERNED, 3, seed=seed) for seed in (1, 2)])
+    try:
+        moment, found = vec.reset(), []
+        for turn, decided in zip(turns, decisions, strict=True):
+            moment[keys.ACTION], moment[keys.DECISION] = turn, decided
+            now, moment = vec.step_and_maybe_reset(moment)
+            found.append(now["next"].clone())
+        return found
+    finally:
+        vec.close()
+
+
+# Forked, as in test_torchrl_env.py.
+@pytest.mark.filterwarnings("ignore:.*fork:DeprecationWarning")
+@pytest.mark.parametrize(
+    "kind",
+    [pytest.param(partial(ParallelEnv, mp_start_method="fork"), marks=pytest.mark.slow), SerialEnv],
+    ids=["ParallelEnv", "SerialEnv"],
+)
+def test_torchrls_vectors_of_envs_play_the_same(kind):
+    turns = torch.as_tensor(random_actions(40, 6, GOVERNED)).view(40, 2, 3, 3)
+    decisions = torch.as_tensor(random_decisions(40, 6, GOVERNED)).view(40, 2, 3, 3)
+    played = of_workers(kind, turns, decisions)
+    for worker, seed in enumerate((1, 2)):
+        adapter = CommonsEnv(GOVERNED, 3, seed=seed)
+        moment = adapter.reset()
+        for turn, decided, found in zip(turns[:, worker], decisions[:, worker], played, strict=True):
+            moment[keys.ACTION], moment[keys.DECISION] = turn, decided
+            now, moment = adapter.step_and_maybe_reset(moment)
+            for key in now["next"].keys(True, True):
+                assert torch.equal(now["next"][key], found[worker][key]), key
 
 
 def regrown_by_worker(vec_env, seed=None, **how):

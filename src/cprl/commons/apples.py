@@ -17,6 +17,8 @@ from cprl.commons.chance import (
 from cprl.commons.moves import cell_of
 from cprl.commons.tables import Tables
 from cprl.commons.world import Scratch, Worlds
+from cprl.institutions.limits import note_bite, note_step, stops_bite
+from cprl.institutions.memory import Law
 
 
 def fill(world: Worlds, tables: Tables) -> None:
@@ -114,16 +116,29 @@ def grow(world: Worlds, tables: Tables, scratch: Scratch, sprouts: int) -> None:
         add_apple(world, tables, scratch.sprouts[s])
 
 
-def bite(world: Worlds, tables: Tables, harvest: NDArray[np.float32]) -> None:
-    """Each agent in play harvests the apple on its cell; `harvest`: float32 [N], 0 or 1.
+def bite(world: Worlds, tables: Tables, law: Law | None, harvest: NDArray[np.float32]) -> None:
+    """Each agent in play harvests the apple on its cell, unless an institution stops it, which notes what the
+    agent breaks; `harvest`: float32 [N], 0 or 1.
 
-    Two agents share a cell only under `pairwise_clashes`: the lower index gets the apple.
+    Two agents share a cell only under `pairwise_clashes`: the lower index that may gets the apple.
     """
     for i in range(world.row.shape[0]):
         harvest[i] = 0.0
         if world.in_play[i]:
-            k = tables.site_at[cell_of(world.row[i], world.col[i], tables)]
-            if k >= 0 and world.stock[k] == 1:
+            cell = cell_of(world.row[i], world.col[i], tables)
+            if law is not None:
+                note_step(law.memory, law.rules, i, cell)
+            k = tables.site_at[cell]
+            if k >= 0 and world.stock[k] == 1 and may_bite(law, i, cell, k, world.step[0]):
                 remove_apple(world, tables, k)
                 harvest[i] = 1.0
                 world.harvested[i] += 1
+                if law is not None:
+                    note_bite(law.memory, law.rules, i, cell, k, world.step[0])
+
+
+def may_bite(law: Law | None, i: int, cell: int, k: int, step: int) -> bool:
+    """Whether no institution stops agent i from harvesting site k."""
+    if law is None:
+        return True
+    return not stops_bite(law.memory, law.rules, i, cell, k, step)

@@ -1,7 +1,7 @@
 """Batch: B worlds of a game, played a turn at a time by a driver (CPU threads or a GPU)."""
 
 from collections.abc import Iterable, Mapping
-from typing import Any, Final, Protocol, TypeAlias
+from typing import Any, Protocol, TypeAlias
 
 import numpy as np
 from numpy.typing import DTypeLike, NDArray
@@ -16,29 +16,23 @@ from cprl.commons.world import (
     Arrays,
     Bools,
     Bytes,
-    Governed,
     GovernedOutput,
     Shown,
     StepOutput,
     Worlds,
     empty_worlds,
 )
-from cprl.institutions.memory import REMEMBERED, Memory, Payments, empty_memory
+from cprl.institutions.memory import REMEMBERED, Law, Payments, empty_memory
 
 Output: TypeAlias = StepOutput | GovernedOutput
 """`GovernedOutput` for a game with institutions."""
-
-_GOVERNED: Final[dict[Loop, Loop]] = {
-    "play_worlds": "play_governed_worlds",
-    "begin_worlds": "begin_governed_worlds",
-    "refresh_worlds": "refresh_governed_worlds",
-}
 
 
 class Driver(Protocol):
     """Runs the rules on B worlds: `CpuThreads` or `cprl.commons.cuda.CudaThreads`."""
 
     threads: int
+    rules: Any
 
     def place(self, arrays: Arrays) -> Arrays: ...
     def empty(self, shape: tuple[int, ...], dtype: DTypeLike) -> NDArray[Any]: ...
@@ -48,9 +42,10 @@ class Driver(Protocol):
     def run(
         self,
         loop: Loop,
-        worlds: Worlds | Governed,
+        worlds: Worlds,
         argument: NDArray[Any],
-        output: Output,
+        output: StepOutput,
+        law: Law | None = None,
         *,
         checked: bool = False,
     ) -> None: ...
@@ -101,12 +96,12 @@ class Batch:
         host.number[:, 0] = np.arange(first_world, first_world + worlds, dtype=np.uint64)
         self.now: Worlds = self.driver.place(host)
         """The current state of the worlds, in the driver's arrays."""
-        self.memory: Memory | None = None
+        self.memory: Any = None
         """What institutions remember, likewise; None for a game without any."""
         if game.institutions:
             self._no_decisions: Actions = self.driver.empty((worlds, game.agents), np.int64)
             self.driver.write(self._no_decisions, np.zeros((worlds, game.agents), np.int64))
-            self.memory = self.driver.place(empty_memory(game.governed_tables.institutions, worlds=worlds))
+            self.memory = self.driver.place(empty_memory(game.institution_tables, worlds=worlds))
         self._all_worlds = self._selection(np.ones(worlds, np.bool_))
         self.set_seed(seed)
 
@@ -140,12 +135,12 @@ class Batch:
         checked: bool = False,
     ) -> None:
         """Runs a loop of the game, with its institutions if it has any."""
-        if self.memory is None:
+        if isinstance(output, StepOutput):
             self.driver.run(loop, self.now, argument, output, checked=checked)
-        else:
-            decided = self._no_decisions if decisions is None else decisions
-            governed = Governed(self.now, self.memory, decided)
-            self.driver.run(_GOVERNED[loop], governed, argument, output, checked=checked)
+            return
+        decided = self._no_decisions if decisions is None else decisions
+        law = Law(self.driver.rules, self.memory, decided, output.payments)
+        self.driver.run(loop, self.now, argument, output.turn, law, checked=checked)
 
     def begin(self, output: Output, which: Bools | None = None) -> Output:
         """Begins the next episode of some worlds and writes their rows of `output`.

@@ -161,21 +161,21 @@ def rules_for_cpu() -> Compiled:
         return compiled(ENTRIES, partial(_jit_for_cpu, on_disk=on_disk))
 
 
-_entries: dict[str, Callable[..., None]] = {}
+_entries: dict[tuple[str, bool], Callable[..., None]] = {}
 
 
-def entry_for_cpu(loop: str, *arguments: Any) -> Callable[..., None]:
-    """The machine code of a loop, for direct calls with arguments of the same types as these.
+def entry_for_cpu(loop: str, *arguments: Any, governed: bool) -> Callable[..., None]:
+    """The machine code of a loop, with institutions or without, for direct calls with arguments like these.
 
     Numba's dispatcher inspects the types of about sixty arrays on every call, which takes seven of the eight
     microseconds that one world needs. A direct call inspects nothing, so the caller must check the arguments.
     The types are the same in every game: the fields of `Worlds`, `Tables`, `StepOutput` and `Scratch` have
     fixed types.
     """
-    if loop not in _entries:
+    if (loop, governed) not in _entries:
         with CLOCK.running():
-            _entries[loop] = machine_code(rules_for_cpu()[loop], *arguments)
-    return _entries[loop]
+            _entries[loop, governed] = machine_code(rules_for_cpu()[loop], *arguments)
+    return _entries[loop, governed]
 
 
 def _can_write(folder: Path) -> bool:

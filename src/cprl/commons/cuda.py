@@ -16,18 +16,9 @@ from numpy.typing import DTypeLike, NDArray
 from cprl.commons.compiled import compiled
 from cprl.commons.game import Game, check_worlds_fit
 from cprl.commons.loops import ENTRIES, LOOPS, Loop, one_scratch
-from cprl.commons.tables import GovernedTables, Tables
-from cprl.commons.world import (
-    Actions,
-    Arrays,
-    Governed,
-    GovernedOutput,
-    Scratch,
-    StepOutput,
-    Worlds,
-    empty_scratch,
-)
-from cprl.institutions.memory import InstitutionTables
+from cprl.commons.tables import Tables
+from cprl.commons.world import Actions, Arrays, Scratch, StepOutput, Worlds, empty_scratch
+from cprl.institutions.memory import InstitutionTables, Law
 
 cuda: Any = numba.cuda
 
@@ -61,12 +52,9 @@ class CudaThreads:
         check_worlds_fit(game, worlds, free=_free_bytes())
         self.threads = worlds
         self.tables = Tables(*(_constant(entry) for entry in game.tables))
-        self.governed_tables: GovernedTables | None = None
+        self.rules: InstitutionTables | None = None
         if game.institutions:
-            own = game.governed_tables.institutions
-            self.governed_tables = GovernedTables(
-                self.tables, InstitutionTables(*(_constant(entry) for entry in own))
-            )
+            self.rules = InstitutionTables(*(_constant(entry) for entry in game.institution_tables))
         scratch = empty_scratch(
             agents=game.agents,
             sites=len(game.map.sites),
@@ -108,46 +96,59 @@ class CudaThreads:
     def run(
         self,
         loop: Loop,
-        worlds: Worlds | Governed,
+        worlds: Worlds,
         argument: NDArray[Any],
-        output: StepOutput | GovernedOutput,
+        output: StepOutput,
+        law: Law | None = None,
         *,
         checked: bool = False,
     ) -> None:
-        """Starts a loop over all worlds on the default stream and returns before it has finished.
-
-        Args:
-            loop: The loop.
-            worlds: The state of the worlds; `Governed` for the loops of games with institutions.
-            argument: The loop's own argument.
-            output: The arrays that the loop writes.
-            checked: Ignored; see `CpuThreads.run`.
-        """
-        kernel = kernels()[loop][_blocks(len(argument)), THREADS_PER_BLOCK]
-        tables = self.governed_tables if isinstance(worlds, Governed) else self.tables
-        kernel(worlds, tables, argument, output, self._scratch)
+        """Starts a loop over all worlds on the default stream and returns before it has finished. Arguments
+        are those of `CpuThreads.run`; nothing is checked."""
+        launch = _blocks(len(argument)), THREADS_PER_BLOCK
+        arguments = worlds, self.tables, argument, output, self._scratch
+        if law is None:
+            kernels()[loop][launch](*arguments)
+        else:
+            kernels()[f"governed {loop}"][launch](*arguments, law)
 
 
 @cache
 def kernels() -> dict[str, Any]:
-    """The kernels by name: one for each loop, and `find_unknown`; compiled at their first launch."""
+    """The kernels by name: for each loop one without institutions and one with them, and `find_unknown`;
+    compiled at their first launch."""
     rules = compiled((*ENTRIES, one_scratch), _jit_for_gpu)
-    launched: dict[str, Any] = {loop: _kernel(rules[loop], rules["one_scratch"]) for loop in LOOPS}
-    return {**launched, "find_unknown": _find_unknown(rules["first_unknown"])}
+    cut = rules[one_scratch.__name__]
+    plain: dict[str, Any] = {loop: _kernel(rules[loop], cut) for loop in LOOPS}
+    governed = {f"governed {loop}": _governed_kernel(rules[loop], cut) for loop in LOOPS}
+    return {**plain, **governed, "find_unknown": _find_unknown(rules["first_unknown"])}
 
 
 def _jit_for_gpu(function: FunctionType) -> Callable[..., Any]:
     return cuda.jit(device=True)(function)
 
 
-def _kernel(loop: Callable[..., None], one_scratch: Callable[..., Scratch]) -> Callable[..., Any]:
-    """Thread b runs the loop on world b alone."""
+def _kernel(loop: Callable[..., None], cut: Callable[..., Scratch]) -> Callable[..., Any]:
+    """Thread b runs the loop on world b alone, without institutions: a kernel takes no None, a loop does."""
 
     @cuda.jit
     def kernel(worlds, tables, argument, output, scratch):  # type: ignore[no-untyped-def]
         b = cuda.grid(1)
         if b < argument.shape[0]:
-            loop(worlds, tables, argument, output, one_scratch(scratch, b), b, b + 1)
+            loop(worlds, tables, argument, output, None, cut(scratch, b), b, b + 1)
+
+    launched: Callable[..., Any] = kernel
+    return launched
+
+
+def _governed_kernel(loop: Callable[..., None], cut: Callable[..., Scratch]) -> Callable[..., Any]:
+    """Thread b runs the loop on world b alone, with institutions."""
+
+    @cuda.jit
+    def kernel(worlds, tables, argument, output, scratch, law):  # type: ignore[no-untyped-def]
+        b = cuda.grid(1)
+        if b < argument.shape[0]:
+            loop(worlds, tables, argument, output, law, cut(scratch, b), b, b + 1)
 
     launched: Callable[..., Any] = kernel
     return launched

@@ -8,6 +8,7 @@ from math import prod
 from typing import Any, Final
 
 import numpy as np
+from numpy.typing import NDArray
 
 from cprl.arguments import object_of, objects
 from cprl.commons.colours import FIRST_AGENT, MAX_AGENTS_APART, class_colour
@@ -22,12 +23,12 @@ from cprl.commons.observation import Observation, channel_names
 from cprl.commons.reach import why_out_of_reach
 from cprl.commons.rules import Rules
 from cprl.commons.spaces import Spaces
-from cprl.commons.tables import GovernedTables, Tables, build_tables, check_sizes
+from cprl.commons.tables import Tables, build_tables, check_sizes
 from cprl.commons.world import Bytes, StepOutput, empty_worlds
 from cprl.institutions import COUNTS, Institution
 from cprl.institutions.arrays import Form, forms_of
 from cprl.institutions.choice import Ballot, ballots, decision_options
-from cprl.institutions.memory import SHOWN, Payments, empty_memory
+from cprl.institutions.memory import SHOWN, InstitutionTables, Payments, empty_memory
 from cprl.system.memory import check_memory
 
 
@@ -196,13 +197,11 @@ class Game:
         return build_tables(self.map, self.rules, self.observation, highest=self.observation_highest)
 
     @cached_property
-    def governed_tables(self) -> GovernedTables:
-        """The lookup tables of the game and of its institutions; computed once and cached."""
-        planes = len(self.cell_channels)
-        own = build_institution_tables(
-            self.institutions, self.map, self.rules, self.tables, first_plane=planes
+    def institution_tables(self) -> InstitutionTables:
+        """The lookup tables of the game's institutions; computed once and cached."""
+        return build_institution_tables(
+            self.institutions, self.map, self.rules, self.tables, first_plane=len(self.cell_channels)
         )
-        return GovernedTables(self.tables, own)
 
     def __getstate__(self) -> dict[str, object]:
         return {own.name: getattr(self, own.name) for own in fields(self)}
@@ -226,9 +225,9 @@ OUTPUTS_HELD: Final = 3
 
 def bytes_of_worlds(game: Game, worlds: int) -> int:
     """The bytes that B worlds take at least: their state, and `OUTPUTS_HELD` step outputs."""
-    state = [*empty_worlds(worlds=1, agents=game.agents, sites=len(game.map.sites))]
+    state: list[NDArray[Any]] = [*empty_worlds(worlds=1, agents=game.agents, sites=len(game.map.sites))]
     if game.institutions:
-        state += empty_memory(game.governed_tables.institutions, worlds=1)
+        state += empty_memory(game.institution_tables, worlds=1)
     outputs = sum(prod(shape) * np.dtype(dtype).itemsize for shape, dtype in output_forms(game, 1).values())
     return worlds * (sum(array.nbytes for array in state) + OUTPUTS_HELD * outputs)
 

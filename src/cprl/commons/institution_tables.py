@@ -2,7 +2,7 @@
 
 import math
 import warnings
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from typing import Any, Final
 
 import numpy as np
@@ -292,50 +292,34 @@ def entries_shown(institutions: Sequence[Institution], agents: int) -> list[tupl
     """(what, which one) of each entry that institutions show agents; see `cprl.institutions.showing`."""
     entries: list[tuple[int, int]] = []
     quotas, seasons, ballot = 0, 0, 0
-    for own in institutions:
-        if own.observed or isinstance(own, Vote):  # what is voted on has an "observed" of its own
-            entries += _SHOWN_BY[type(own)](own, quotas, seasons, ballot, agents)
-        quotas += isinstance(own, Quota) or (isinstance(own, Vote) and isinstance(own.on, Quota))
-        seasons += isinstance(own, ClosedSeason)
-        ballot += is_decided(own)
+    for institution in institutions:
+        rule: Any = institution.on if isinstance(institution, Vote) else institution
+        if isinstance(institution, Vote) and institution.observed:
+            entries.append((shows.IN_FORCE, ballot))
+        if isinstance(rule, Quota) and rule.observed:  # what is voted on has an "observed" of its own
+            entries += [(shows.QUOTA_LEFT, quotas), (shows.QUOTA_TIME, quotas)]
+        elif isinstance(rule, ClosedSeason) and rule.observed:
+            entries += [(shows.CLOSED, seasons), (shows.SEASON_TIME, seasons)]
+        elif isinstance(rule, Monitoring) and rule.observed:
+            entries.append((shows.DETECTED, 0))
+            if rule.monitor == ELECTED:
+                entries.append((shows.IS_ELECTED, ballot))
+        elif isinstance(rule, GraduatedSanctions) and rule.observed:
+            entries.append((shows.LEVEL, 0))
+        elif isinstance(rule, Mediation) and rule.observed:
+            entries += [(shows.MARK, agent) for agent in range(agents)]
+        elif isinstance(rule, Sanctioner) and rule.observed:
+            entries.append((shows.MAY_FIRE, 0))
+        quotas += isinstance(rule, Quota)
+        seasons += isinstance(rule, ClosedSeason)
+        ballot += is_decided(institution)
     return entries
 
 
-_Entries = list[tuple[int, int]]
-
-
-def _shown_by_quota(own: Any, quotas: int, seasons: int, ballot: int, agents: int) -> _Entries:
-    return [(shows.QUOTA_LEFT, quotas), (shows.QUOTA_TIME, quotas)]
-
-
-def _shown_by_season(own: Any, quotas: int, seasons: int, ballot: int, agents: int) -> _Entries:
-    return [(shows.CLOSED, seasons), (shows.SEASON_TIME, seasons)]
-
-
-def _shown_by_vote(own: Any, quotas: int, seasons: int, ballot: int, agents: int) -> _Entries:
-    also = _shown_by_quota(own.on, quotas, seasons, ballot, agents) if isinstance(own.on, Quota) else []
-    return [*([(shows.IN_FORCE, ballot)] if own.observed else []), *(also if own.on.observed else [])]
-
-
-def _shown_by_monitoring(own: Any, quotas: int, seasons: int, ballot: int, agents: int) -> _Entries:
-    return [(shows.DETECTED, 0), *([(shows.IS_ELECTED, ballot)] if own.monitor == ELECTED else [])]
-
-
-_SHOWN_BY: Final[dict[type[Any], Callable[..., _Entries]]] = {
-    Boundaries: lambda *_: [],
-    ClosedPatches: lambda *_: [],
-    Quota: _shown_by_quota,
-    ClosedSeason: _shown_by_season,
-    Tax: lambda *_: [],
-    Levies: lambda *_: [],
-    Vote: _shown_by_vote,
-    Monitoring: _shown_by_monitoring,
-    GraduatedSanctions: lambda *_: [(shows.LEVEL, 0)],
-    Mediation: lambda *rest: [(shows.MARK, agent) for agent in range(rest[-1])],
-    Sanctioner: lambda *_: [(shows.MAY_FIRE, 0)],
-}
-
-KINDS: Final = tuple(_SHOWN_BY)
+KINDS: Final = (
+    *(Boundaries, ClosedPatches, Quota, ClosedSeason, Tax, Levies, Vote),
+    *(Monitoring, GraduatedSanctions, Mediation, Sanctioner),
+)
 """All kinds of institutions that a game can have."""
 
 

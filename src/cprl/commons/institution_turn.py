@@ -11,151 +11,61 @@ beside a board.
 
 import numpy as np
 
-from cprl.commons.apples import draw, find_sprouts, grow, remove_apple
-from cprl.commons.beam import count_hit, find_hits, take_out, take_out_of_play
+from cprl.commons.apples import draw
+from cprl.commons.beam import take_out
 from cprl.commons.chance import BALLOT, DETECTION
-from cprl.commons.moves import (
-    act,
-    cell_of,
-    count_down,
-    note_moved_shooters,
-    return_to_play,
-    settle_clashes,
-    settle_pairwise,
-)
+from cprl.commons.moves import cell_of
 from cprl.commons.tables import Tables
-from cprl.commons.turn import (
-    begin_episode,
-    check_end,
-    clear_events,
-    keep_old_stock,
-    refresh_output,
-    write_state,
-)
-from cprl.commons.world import PLAYING, Actions, Bytes, Scratch, StepOutput, Worlds
+from cprl.commons.world import Bytes, Scratch, StepOutput, Worlds
 from cprl.institutions.deciding import appoint, hold_ballot, is_due
 from cprl.institutions.limits import (
     add_to_patch,
     close_patches,
     count_patches,
     is_known_forbidden,
-    note_bite,
-    note_step,
     open_windows,
-    stops_bite,
 )
-from cprl.institutions.memory import SANCTIONS, InstitutionTables, Memory, Payments
-from cprl.institutions.paying import (
-    charge,
-    collect_taxes,
-    mediate,
-    note_violation,
-    offend,
-    pay_monitor,
-    recover,
-    time_out,
-)
+from cprl.institutions.memory import SANCTIONS, InstitutionTables, Law, Memory
+from cprl.institutions.paying import charge, note_violation, offend, time_out
 from cprl.institutions.showing import shown_entry
 
 
-def play_governed_turn(
-    world: Worlds,
-    memory: Memory,
-    tables: Tables,
-    rules: InstitutionTables,
-    actions: Actions,
-    decisions: Actions,
-    output: StepOutput,
-    payments: Payments,
-    scratch: Scratch,
-) -> None:
-    """Plays one turn; `actions`, `decisions`: int64 [N]. See `cprl.commons.turn.play_turn`."""
-    if world.ended[0] != PLAYING:
-        clear_events(output)
-        write_state(world, tables, output, scratch)
-        clear_turn(memory)
-        write_payments(world, memory, tables, rules, output, payments)
-        return
-    began_empty = world.stock_left[0] == 0
-    keep_old_stock(world, tables)
-    world.step[0] += 1
-    clear_turn(memory)
+def begin_turn(world: Worlds, law: Law) -> None:
+    """Clears the notes of the last turn; in the first one of an episode agents decide, and quotas begin."""
+    clear_turn(law.memory)
     if world.step[0] == 1:
-        decide(world, memory, rules, decisions)
-        open_windows(memory, rules, 1, stock_share(world))
-    count_down(world)
-    act(world, tables, actions, scratch)
+        decide(world, law)
+        open_windows(law.memory, law.rules, 1, stock_share(world))
+
+
+def hold_fire(world: Worlds, memory: Memory) -> None:
+    """Takes back the shots of agents that may not fire."""
     for i in range(world.row.shape[0]):
         world.fired[i] = world.fired[i] and memory.may_fire[i]
-    if tables.pairwise_clashes:
-        settle_pairwise(world, scratch)
-    else:
-        settle_clashes(world, scratch)
-    note_moved_shooters(world, tables, scratch)
-    sprouts = find_sprouts(world, tables, scratch)
-    if tables.regrow_before_bites:
-        grow(world, tables, scratch, sprouts)
-        bite_by_rules(world, memory, tables, rules, output)
-    else:
-        bite_by_rules(world, memory, tables, rules, output)
-        grow(world, tables, scratch, sprouts)
-    output.regrown[0] = sprouts
-    find_hits(world, tables, output.hit_by)
-    tag_by_rules(world, memory, tables, rules, output)
-    pursue_violations(world, memory, tables, rules)
-    recover(memory, rules, world.step[0])
-    check_end(world, tables, began_empty)
-    pay_monitor(memory, rules)
-    collect_taxes(memory, rules, world.step[0], world.ended[0] != PLAYING)
-    for i in range(world.row.shape[0]):
-        output.fired[i] = world.fired[i]
-        world.on_board[i] = world.in_play[i]
-    return_to_play(world, tables, scratch)
-    write_state(world, tables, output, scratch)
-    open_windows(memory, rules, world.step[0] + 1, stock_share(world))
+
+
+def end_turn(world: Worlds, law: Law, scratch: Scratch, sprouts: int) -> None:
+    """Writes what quotas allow and which patches are closed in the coming turn; `sprouts`: apples grown."""
+    open_windows(law.memory, law.rules, world.step[0] + 1, stock_share(world))
     for s in range(sprouts):
-        add_to_patch(memory, rules, scratch.sprouts[s], 1)
-    close_patches(memory, rules)
-    write_payments(world, memory, tables, rules, output, payments)
+        add_to_patch(law.memory, law.rules, scratch.sprouts[s], 1)
+    close_patches(law.memory, law.rules)
 
 
-def begin_governed_episode(
-    world: Worlds,
-    memory: Memory,
-    tables: Tables,
-    rules: InstitutionTables,
-    output: StepOutput,
-    payments: Payments,
-    scratch: Scratch,
-) -> None:
-    """Starts the next episode; institutions forget the last one, but for what votes put in force."""
-    begin_episode(world, tables, output, scratch)
-    forget(memory)
-    begin_ballots(world, memory, rules)
-    appoint(memory, rules)
-    open_windows(memory, rules, 1, stock_share(world))
-    count_patches(memory, rules, world.stock)
-    close_patches(memory, rules)
-    clear_turn(memory)
-    write_payments(world, memory, tables, rules, output, payments)
+def begin_institutions(world: Worlds, law: Law) -> None:
+    """Begins an episode: all is forgotten but what votes put in force."""
+    forget(law.memory)
+    begin_ballots(world, law.memory, law.rules)
+    open_windows(law.memory, law.rules, 1, stock_share(world))
+    refresh_institutions(world, law)
 
 
-def refresh_governed_output(
-    world: Worlds,
-    memory: Memory,
-    tables: Tables,
-    rules: InstitutionTables,
-    output: StepOutput,
-    payments: Payments,
-    scratch: Scratch,
-) -> None:
-    """Writes the output for a state that was set from outside, with no events and no payments."""
-    refresh_output(world, tables, output, scratch)
-    appoint(memory, rules)
-    count_patches(memory, rules, world.stock)
-    close_patches(memory, rules)
-    clear_turn(memory)
-    write_payments(world, memory, tables, rules, output, payments)
+def refresh_institutions(world: Worlds, law: Law) -> None:
+    """Writes what follows from the rest of the memory and from the stock, without events."""
+    appoint(law.memory, law.rules)
+    count_patches(law.memory, law.rules, world.stock)
+    close_patches(law.memory, law.rules)
+    clear_turn(law.memory)
 
 
 def stock_share(world: Worlds) -> float:
@@ -194,56 +104,17 @@ def clear_turn(memory: Memory) -> None:
         memory.transfers[i] = 0.0
 
 
-def decide(world: Worlds, memory: Memory, rules: InstitutionTables, decisions: Actions) -> None:
-    """Holds the ballots that are due in this episode; `decisions`: int64 [N]."""
-    for ballot in range(rules.ballot_options.shape[0]):
-        if is_due(rules, ballot, world.episode[0]):
-            hold_ballot(memory, rules, ballot, decisions, draw(world, BALLOT + ballot))
-    appoint(memory, rules)
+def decide(world: Worlds, law: Law) -> None:
+    """Holds the ballots that are due in this episode."""
+    for ballot in range(law.rules.ballot_options.shape[0]):
+        if is_due(law.rules, ballot, world.episode[0]):
+            hold_ballot(law.memory, law.rules, ballot, law.decisions, draw(world, BALLOT + ballot))
+    appoint(law.memory, law.rules)
 
 
-def bite_by_rules(
-    world: Worlds, memory: Memory, tables: Tables, rules: InstitutionTables, output: StepOutput
-) -> None:
-    """Each agent in play harvests the apple on its cell, unless a rule stops it; notes what it breaks.
-
-    Two agents share a cell only under `pairwise_clashes`: the lower index that may gets the apple.
-    """
-    for i in range(world.row.shape[0]):
-        output.harvest[i] = 0.0
-        if world.in_play[i]:
-            cell = cell_of(world.row[i], world.col[i], tables)
-            note_step(memory, rules, i, cell)
-            k = tables.site_at[cell]
-            if k >= 0 and world.stock[k] == 1 and not stops_bite(memory, rules, i, cell, k, world.step[0]):
-                remove_apple(world, tables, k)
-                output.harvest[i] = 1.0
-                world.harvested[i] += 1
-                note_bite(memory, rules, i, cell, k, world.step[0])
-
-
-def tag_by_rules(
-    world: Worlds, memory: Memory, tables: Tables, rules: InstitutionTables, output: StepOutput
-) -> None:
-    """Tags agents as `tag` does; time-outs and fines are those of institutions, unjust tags are refunded."""
-    agents = world.row.shape[0]
-    for i in range(agents):
-        if count_hit(world, tables, output.hit_by, output.tagged_by, i):
-            steps = tables.freeze_steps
-            if rules.sanctions_tags:
-                steps = 0
-                for j in range(agents):
-                    if output.tagged_by[i, j]:
-                        steps = max(steps, time_out(memory, rules, j, i))
-                offend(memory, rules, i, world.step[0])
-            take_out_of_play(world, tables, i, steps)
-    if rules.mediation_turns > 0:
-        for i in range(agents):
-            mediate(memory, rules, output.tagged_by, i, world.step[0])
-
-
-def pursue_violations(world: Worlds, memory: Memory, tables: Tables, rules: InstitutionTables) -> None:
+def pursue_violations(world: Worlds, tables: Tables, law: Law) -> None:
     """Detects violations of this turn, or not, and lets those who are found out pay and miss turns."""
+    memory, rules = law.memory, law.rules
     for i in range(world.row.shape[0]):
         memory.detected[i] = False
         if note_violation(memory, i, world.step[0]):
@@ -257,15 +128,9 @@ def pursue_violations(world: Worlds, memory: Memory, tables: Tables, rules: Inst
                     offend(memory, rules, i, world.step[0])
 
 
-def write_payments(
-    world: Worlds,
-    memory: Memory,
-    tables: Tables,
-    rules: InstitutionTables,
-    output: StepOutput,
-    payments: Payments,
-) -> None:
+def write_payments(world: Worlds, tables: Tables, law: Law, output: StepOutput) -> None:
     """Writes what institutions took, gave and counted in this turn, the reward, and what agents are shown."""
+    memory, rules, payments = law.memory, law.rules, law.payments
     draw_institutions(world, memory, tables, rules, output.observation)
     for i in range(world.row.shape[0]):
         payments.fines[i] = memory.fines[i]

@@ -1,26 +1,26 @@
-"""The loops over worlds that a thread runs, on the CPU or the GPU. Each rule works on one world."""
+"""The loops over worlds that a thread runs, on the CPU or the GPU. Each rule works on one world.
 
-from typing import Final, Literal, get_args
+`law` is what institutions need, None without any.
+"""
 
-from cprl.commons.institution_turn import begin_governed_episode, play_governed_turn, refresh_governed_output
-from cprl.commons.tables import GovernedTables, Tables
+from typing import Any, Final, Literal, get_args
+
+from cprl.commons.tables import Tables
 from cprl.commons.turn import begin_episode, play_turn, refresh_output
 from cprl.commons.views import draw_board
-from cprl.commons.world import (
-    Actions,
-    Bools,
-    Bytes,
-    Governed,
-    GovernedOutput,
-    Scratch,
-    StepOutput,
-    Worlds,
-)
+from cprl.commons.world import Actions, Bools, Bytes, Scratch, StepOutput, Worlds
 from cprl.institutions.arrays import slicer
-from cprl.institutions.memory import Memory, Payments
+from cprl.institutions.memory import Law, Memory, Payments
 
 one_world, one_output, one_scratch = slicer(Worlds), slicer(StepOutput), slicer(Scratch)
 one_memory, one_payments = slicer(Memory), slicer(Payments)
+
+
+def one_law(law: Law | None, b: int) -> Any:
+    """What institutions need in world b, without the axis B; shares memory."""
+    if law is None:
+        return None
+    return Law(law.rules, one_memory(law.memory, b), law.decisions[b], one_payments(law.payments, b))
 
 
 def play_worlds(
@@ -28,13 +28,14 @@ def play_worlds(
     tables: Tables,
     actions: Actions,
     output: StepOutput,
+    law: Law | None,
     scratch: Scratch,
     first: int,
     last: int,
 ) -> None:
     """Plays one turn of the worlds first .. last - 1; `actions`: int64 [B, N]."""
     for b in range(first, last):
-        play_turn(one_world(worlds, b), tables, actions[b], one_output(output, b), scratch)
+        play_turn(one_world(worlds, b), tables, actions[b], one_output(output, b), one_law(law, b), scratch)
 
 
 def begin_worlds(
@@ -42,6 +43,7 @@ def begin_worlds(
     tables: Tables,
     which: Bools,
     output: StepOutput,
+    law: Law | None,
     scratch: Scratch,
     first: int,
     last: int,
@@ -49,21 +51,7 @@ def begin_worlds(
     """Begins the next episode of the worlds among first .. last - 1 where `which`, bool [B], is true."""
     for b in range(first, last):
         if which[b]:
-            begin_episode(one_world(worlds, b), tables, one_output(output, b), scratch)
-
-
-def show_worlds(
-    worlds: Worlds,
-    tables: Tables,
-    boards: Bytes,
-    output: StepOutput,
-    scratch: Scratch,
-    first: int,
-    last: int,
-) -> None:
-    """Draws the boards of the worlds first .. last - 1; `boards`: uint8 [B, H, W], classes of cells."""
-    for b in range(first, last):
-        draw_board(one_world(worlds, b), tables, scratch, boards[b])
+            begin_episode(one_world(worlds, b), tables, one_output(output, b), one_law(law, b), scratch)
 
 
 def refresh_worlds(
@@ -71,6 +59,7 @@ def refresh_worlds(
     tables: Tables,
     which: Bools,
     output: StepOutput,
+    law: Law | None,
     scratch: Scratch,
     first: int,
     last: int,
@@ -79,77 +68,22 @@ def refresh_worlds(
     bool [B], is true."""
     for b in range(first, last):
         if which[b]:
-            refresh_output(one_world(worlds, b), tables, one_output(output, b), scratch)
+            refresh_output(one_world(worlds, b), tables, one_output(output, b), one_law(law, b), scratch)
 
 
-def play_governed_worlds(
-    worlds: Governed,
-    tables: GovernedTables,
-    actions: Actions,
-    output: GovernedOutput,
+def show_worlds(
+    worlds: Worlds,
+    tables: Tables,
+    boards: Bytes,
+    output: StepOutput,
+    law: Law | None,
     scratch: Scratch,
     first: int,
     last: int,
 ) -> None:
-    """`play_worlds` of a game with institutions."""
+    """Draws the boards of the worlds first .. last - 1; `boards`: uint8 [B, H, W], classes of cells."""
     for b in range(first, last):
-        play_governed_turn(
-            one_world(worlds.worlds, b),
-            one_memory(worlds.memory, b),
-            tables.game,
-            tables.institutions,
-            actions[b],
-            worlds.decisions[b],
-            one_output(output.turn, b),
-            one_payments(output.payments, b),
-            scratch,
-        )
-
-
-def begin_governed_worlds(
-    worlds: Governed,
-    tables: GovernedTables,
-    which: Bools,
-    output: GovernedOutput,
-    scratch: Scratch,
-    first: int,
-    last: int,
-) -> None:
-    """`begin_worlds` of a game with institutions."""
-    for b in range(first, last):
-        if which[b]:
-            begin_governed_episode(
-                one_world(worlds.worlds, b),
-                one_memory(worlds.memory, b),
-                tables.game,
-                tables.institutions,
-                one_output(output.turn, b),
-                one_payments(output.payments, b),
-                scratch,
-            )
-
-
-def refresh_governed_worlds(
-    worlds: Governed,
-    tables: GovernedTables,
-    which: Bools,
-    output: GovernedOutput,
-    scratch: Scratch,
-    first: int,
-    last: int,
-) -> None:
-    """`refresh_worlds` of a game with institutions."""
-    for b in range(first, last):
-        if which[b]:
-            refresh_governed_output(
-                one_world(worlds.worlds, b),
-                one_memory(worlds.memory, b),
-                tables.game,
-                tables.institutions,
-                one_output(output.turn, b),
-                one_payments(output.payments, b),
-                scratch,
-            )
+        draw_board(one_world(worlds, b), tables, scratch, boards[b])
 
 
 def first_unknown(actions: Actions, known: int) -> int:
@@ -160,15 +94,7 @@ def first_unknown(actions: Actions, known: int) -> int:
     return -1
 
 
-Loop = Literal[
-    "play_worlds",
-    "begin_worlds",
-    "show_worlds",
-    "refresh_worlds",
-    "play_governed_worlds",
-    "begin_governed_worlds",
-    "refresh_governed_worlds",
-]
+Loop = Literal["play_worlds", "begin_worlds", "refresh_worlds", "show_worlds"]
 LOOPS: Final[tuple[Loop, ...]] = get_args(Loop)
 """The loops that drivers run; all have the same parameters except the third."""
 ENTRIES: Final = (*(globals()[loop] for loop in LOOPS), first_unknown)

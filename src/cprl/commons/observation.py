@@ -14,11 +14,7 @@ RGB_NAMES: Final = ("red", "green", "blue")
 
 @dataclass(frozen=True, kw_only=True)
 class Observation:
-    """The form of every agent's observation; defaults are those of both studies.
-
-    Raises:
-        ValueError: If a value is not allowed; the message names the field, the value and what is allowed.
-    """
+    """The form of every agent's observation; defaults are those of both studies."""
 
     area: Area = "window"
     """"window": the cells ahead, `Rules.window_rows` x `Rules.window_columns`, rotated with the agent;

@@ -27,9 +27,6 @@ class Rules:
 
     Defaults are those of `published`: every quirk of the study as run is off. Lists and arrays are stored as
     tuples, so that rules can be compared, hashed and printed.
-
-    Raises:
-        ValueError: If a value is not allowed; the message names the field, the value and what is allowed.
     """
 
     regrow_prob: tuple[float, ...] = (0.0, 0.01, 0.01, 0.05, 0.05, 0.1)
@@ -149,19 +146,7 @@ def _are_beam_lengths(value: Any) -> bool:
     return is_count(value, 1)
 
 
-_SWITCHES: Final = (
-    "walls_block_sight",
-    "shuffle_starts",
-    "pairwise_clashes",
-    "regrow_before_bites",
-    "freeze_counts_tag_turn",
-    "ends_one_turn_late",
-    "picture_shows_old_stock",
-    "paint_over",
-    "mark_behind_if_vertical",
-    "self_paint_stays",
-    "agent_1_right_moves_agent_0",
-)
+_SWITCHES: Final = tuple(field.name for field in fields(Rules) if field.default is False)
 _CHECKS: Final[dict[str, Check]] = {
     "regrow_prob": Check(_are_probabilities, "one or more numbers, each 0 or 2**-32 (2.3e-10) to 1"),
     "regrow_radius_cells": Check(lambda value: is_number(value, 0, 1000), "a number in 0..1000"),

@@ -17,9 +17,6 @@ class Spaces:
 
     `Game.spaces` gives those of a game, `cprl.envs.spaces_of(env)` those of an environment with its
     transforms.
-
-    Raises:
-        ValueError: if a value is not allowed; names it and says what is.
     """
 
     agents: int

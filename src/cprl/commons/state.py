@@ -47,7 +47,7 @@ def checked(state: Mapping[str, Any], *, worlds: int, game: Game) -> State:
     empty = empty_worlds(worlds=worlds, agents=game.agents, sites=len(game.map.sites))
     expected = {name: getattr(empty, name) for name in names(game)}
     if game.institutions:
-        memory = empty_memory(game.governed_tables.institutions, worlds=worlds)
+        memory = empty_memory(game.institution_tables, worlds=worlds)
         expected |= {name: getattr(memory, name) for name in REMEMBERED}
     if set(state) != set(expected):
         missing = sorted(set(expected) - set(state))

@@ -1,6 +1,6 @@
 """A game as lookup tables for the compiled rules."""
 
-from typing import Final, NamedTuple
+from typing import Any, Final, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -12,7 +12,6 @@ from cprl.commons.near import neighbours
 from cprl.commons.observation import Observation, classes_shown
 from cprl.commons.rules import Rules
 from cprl.commons.world import COL_STEP, ROW_STEP, Bools, Indices, Ints
-from cprl.institutions.memory import InstitutionTables
 
 CLASS_SHIFT: Final = 24
 """A paint is a colour in 24 bits, and its class from this bit on."""
@@ -86,13 +85,6 @@ class Tables(NamedTuple):
     mark_behind_if_vertical: bool
     self_paint_stays: bool
     agent_1_right_moves_agent_0: bool
-
-
-class GovernedTables(NamedTuple):
-    """A game with institutions as arrays."""
-
-    game: Tables
-    institutions: InstitutionTables
 
 
 def check_sizes(board: Map, rules: Rules) -> None:
@@ -229,6 +221,7 @@ def build_tables(board: Map, rules: Rules, observation: Observation, *, highest:
     max_near = int(np.diff(near_first).max())
     probs = [rules.regrow_prob[min(n, len(rules.regrow_prob) - 1)] for n in range(max_near + 1)]
     below = np.array([threshold(p) for p in probs], np.int64)
+    of_rules: dict[str, Any] = {name: getattr(rules, name) for name in Tables._fields if hasattr(rules, name)}
     return Tables(
         background=background.reshape(-1),
         site_cell=np.array(cells(board.sites), np.uint32),
@@ -246,24 +239,11 @@ def build_tables(board: Map, rules: Rules, observation: Observation, *, highest:
         rim=rim,
         stride=stride,
         beam_half_width=half_width,
-        hits_to_tag=int(rules.hits_to_tag),
-        freeze_steps=int(rules.freeze_steps),
-        episode_steps=int(rules.episode_steps),
         has_beam=rules.may_fire,
         agents_apart=observation.agents_apart,
         one_hot=observation.encoding == "one_hot",
         one_hot_value=highest,
         sees_all=sees_all,
-        walls_block_sight=rules.walls_block_sight,
-        shuffle_starts=rules.shuffle_starts,
         never_from_nothing=rules.regrow_prob[0] == 0,
-        pairwise_clashes=rules.pairwise_clashes,
-        regrow_before_bites=rules.regrow_before_bites,
-        freeze_counts_tag_turn=rules.freeze_counts_tag_turn,
-        ends_one_turn_late=rules.ends_one_turn_late,
-        picture_shows_old_stock=rules.picture_shows_old_stock,
-        paint_over=rules.paint_over,
-        mark_behind_if_vertical=rules.mark_behind_if_vertical,
-        self_paint_stays=rules.self_paint_stays,
-        agent_1_right_moves_agent_0=rules.agent_1_right_moves_agent_0,
+        **of_rules,
     )

@@ -12,17 +12,9 @@ from cprl import arguments
 from cprl.commons.compiled import entry_for_cpu, rules_for_cpu
 from cprl.commons.game import Game, output_forms
 from cprl.commons.loops import Loop
-from cprl.commons.tables import GovernedTables, Tables
-from cprl.commons.world import (
-    Actions,
-    Arrays,
-    Governed,
-    GovernedOutput,
-    StepOutput,
-    Worlds,
-    arrays_of,
-    empty_scratch,
-)
+from cprl.commons.tables import Tables
+from cprl.commons.world import Actions, Arrays, StepOutput, Worlds, empty_scratch
+from cprl.institutions.memory import Law
 
 MOST_THREADS: Final = 1024
 """The largest number of threads; no machine has that many cores."""
@@ -55,9 +47,9 @@ class CpuThreads:
         limit = threads or os.cpu_count() or 1
         self.threads = min(limit, worlds if threads else -(-worlds // WORLDS_PER_THREAD))
         self.tables: Tables = game.tables
-        self.governed_tables: GovernedTables | None = game.governed_tables if game.institutions else None
+        self.rules = game.institution_tables if game.institutions else None
         self._expected = tuple(output_forms(game, worlds).values())
-        self._output: StepOutput | GovernedOutput | None = None
+        self._output: StepOutput | None = None
         self._scratch = [
             empty_scratch(
                 agents=game.agents,
@@ -91,9 +83,10 @@ class CpuThreads:
     def run(
         self,
         loop: Loop,
-        worlds: Worlds | Governed,
+        worlds: Worlds,
         argument: NDArray[Any],
-        output: StepOutput | GovernedOutput,
+        output: StepOutput,
+        law: Law | None = None,
         *,
         checked: bool = False,
     ) -> None:
@@ -101,9 +94,10 @@ class CpuThreads:
 
         Args:
             loop: The loop.
-            worlds: The state of the worlds; `Governed` for the loops of games with institutions.
+            worlds: The state of the worlds.
             argument: The loop's own argument.
             output: The arrays that the loop writes.
+            law: What the institutions of the game need, arrays that are written included.
             checked: Whether the caller has checked the form of `argument` and `output`.
 
         Raises:
@@ -111,13 +105,12 @@ class CpuThreads:
         """
         if not checked:
             _check_contiguous(argument)
-            if isinstance(worlds, Governed):
-                _check_contiguous(worlds.decisions)
-            self._check(output)
+            if law is not None:
+                _check_contiguous(law.decisions)
+            self._check(output, law)
         size = len(argument)
-        tables = self.governed_tables if isinstance(worlds, Governed) else self.tables
-        arguments = worlds, tables, argument, output
-        entry = entry_for_cpu(loop, *arguments, self._scratch[0], 0, size)
+        arguments = worlds, self.tables, argument, output, law
+        entry = entry_for_cpu(loop, *arguments, self._scratch[0], 0, size, governed=law is not None)
         if self.threads == 1:
             entry(*arguments, self._scratch[0], 0, size)
             return
@@ -129,13 +122,11 @@ class CpuThreads:
         for share in shares:
             share.result()
 
-    def _check(self, output: StepOutput | GovernedOutput) -> None:
+    def _check(self, output: StepOutput, law: Law | None) -> None:
         """Checks the arrays of an output, because the compiled loops do not; see `entry_for_cpu`."""
         if output is self._output:
             return
-        kind = GovernedOutput if self.governed_tables else StepOutput
-        arguments.object_of("output", output, kind, f"a {kind.__name__}, made by new_output()")
-        arrays: dict[str, NDArray[Any]] = arrays_of(output)
+        arrays: dict[str, NDArray[Any]] = output._asdict() | ({} if law is None else law.payments._asdict())
         for (name, array), (shape, dtype) in zip(arrays.items(), self._expected, strict=True):
             arguments.array(f"output.{name}", array, shape, dtype)
             if not array.flags.carray:

@@ -5,6 +5,16 @@ import numpy as np
 from cprl.commons.apples import bite, draw, fill, find_sprouts, grow, recount
 from cprl.commons.beam import find_hits, tag
 from cprl.commons.chance import STARTS
+from cprl.commons.institution_turn import (
+    begin_institutions,
+    begin_turn,
+    clear_turn,
+    end_turn,
+    hold_fire,
+    pursue_violations,
+    refresh_institutions,
+    write_payments,
+)
 from cprl.commons.moves import (
     act,
     count_down,
@@ -17,19 +27,33 @@ from cprl.commons.moves import (
 from cprl.commons.tables import Tables
 from cprl.commons.views import draw_windows
 from cprl.commons.world import PLAYING, TERMINATED, TRUNCATED, Actions, Scratch, StepOutput, Worlds
+from cprl.institutions.memory import Law
+from cprl.institutions.paying import collect_taxes, pay_monitor, recover
 
 
-def play_turn(world: Worlds, tables: Tables, actions: Actions, output: StepOutput, scratch: Scratch) -> None:
-    """Plays one turn; `actions`: int64 [N]. A world that has ended does not change and pays nothing."""
+def play_turn(
+    world: Worlds, tables: Tables, actions: Actions, output: StepOutput, law: Law | None, scratch: Scratch
+) -> None:
+    """Plays one turn; `actions`: int64 [N]. A world that has ended does not change and pays nothing.
+
+    `law` is what institutions need; without any it is None, and Numba compiles nothing of what it asks for.
+    """
     if world.ended[0] != PLAYING:
         clear_events(output)
         write_state(world, tables, output, scratch)
+        if law is not None:
+            clear_turn(law.memory)
+            write_payments(world, tables, law, output)
         return
     began_empty = world.stock_left[0] == 0
     keep_old_stock(world, tables)
     world.step[0] += 1
+    if law is not None:
+        begin_turn(world, law)
     count_down(world)
     act(world, tables, actions, scratch)
+    if law is not None:
+        hold_fire(world, law.memory)
     if tables.pairwise_clashes:
         settle_pairwise(world, scratch)
     else:
@@ -38,19 +62,28 @@ def play_turn(world: Worlds, tables: Tables, actions: Actions, output: StepOutpu
     sprouts = find_sprouts(world, tables, scratch)
     if tables.regrow_before_bites:
         grow(world, tables, scratch, sprouts)
-        bite(world, tables, output.harvest)
+        bite(world, tables, law, output.harvest)
     else:
-        bite(world, tables, output.harvest)
+        bite(world, tables, law, output.harvest)
         grow(world, tables, scratch, sprouts)
     output.regrown[0] = sprouts
     find_hits(world, tables, output.hit_by)
-    tag(world, tables, output.hit_by, output.tagged_by)
+    tag(world, tables, law, output.hit_by, output.tagged_by)
+    if law is not None:
+        pursue_violations(world, tables, law)
+        recover(law.memory, law.rules, world.step[0])
     check_end(world, tables, began_empty)
+    if law is not None:
+        pay_monitor(law.memory, law.rules)
+        collect_taxes(law.memory, law.rules, world.step[0], world.ended[0] != PLAYING)
     for i in range(world.row.shape[0]):
         output.fired[i] = world.fired[i]
         world.on_board[i] = world.in_play[i]
     return_to_play(world, tables, scratch)
     write_state(world, tables, output, scratch)
+    if law is not None:
+        end_turn(world, law, scratch, sprouts)
+        write_payments(world, tables, law, output)
 
 
 def shuffle_starts(world: Worlds) -> None:
@@ -64,8 +97,11 @@ def shuffle_starts(world: Worlds) -> None:
         world.heading[i], world.heading[j] = world.heading[j], world.heading[i]
 
 
-def begin_episode(world: Worlds, tables: Tables, output: StepOutput, scratch: Scratch) -> None:
-    """Starts the next episode: all sites hold an apple, all agents are at their starts."""
+def begin_episode(
+    world: Worlds, tables: Tables, output: StepOutput, law: Law | None, scratch: Scratch
+) -> None:
+    """Starts the next episode: all sites hold an apple, all agents are at their starts; institutions forget
+    the last one, but for what votes put in force."""
     world.episode[0] += 1
     world.step[0] = 0
     world.ended[0] = PLAYING
@@ -75,13 +111,22 @@ def begin_episode(world: Worlds, tables: Tables, output: StepOutput, scratch: Sc
         shuffle_starts(world)
     clear_events(output)
     write_state(world, tables, output, scratch)
+    if law is not None:
+        begin_institutions(world, law)
+        write_payments(world, tables, law, output)
 
 
-def refresh_output(world: Worlds, tables: Tables, output: StepOutput, scratch: Scratch) -> None:
-    """Writes the output for a state that was set from outside, with no harvest, shots, hits or growth."""
+def refresh_output(
+    world: Worlds, tables: Tables, output: StepOutput, law: Law | None, scratch: Scratch
+) -> None:
+    """Writes the output for a state that was set from outside, with no harvest, shots, hits, growth or
+    payments."""
     recount(world, tables)
     clear_events(output)
     write_state(world, tables, output, scratch)
+    if law is not None:
+        refresh_institutions(world, law)
+        write_payments(world, tables, law, output)
 
 
 def keep_old_stock(world: Worlds, tables: Tables) -> None:

@@ -117,23 +117,7 @@ class GovernedOutput(NamedTuple):
     payments: Payments
 
 
-def arrays_of(output: StepOutput | GovernedOutput) -> dict[str, NDArray[Any]]:
-    """All arrays of an output by name."""
-    if isinstance(output, StepOutput):
-        return output._asdict()
-    return output.turn._asdict() | output.payments._asdict()
-
-
 Arrays = TypeVar("Arrays", "Worlds", Memory)
-
-
-class Governed(NamedTuple):
-    """The state of B worlds with institutions, and what their agents decide."""
-
-    worlds: Worlds
-    memory: Memory
-    decisions: Actions
-    """int64 [B, N], read in the first turn of an episode."""
 
 
 class Scratch(NamedTuple):
@@ -191,6 +175,7 @@ def empty_scratch(*, agents: int, sites: int, cells: int, window: int) -> Scratc
     """The working memory of one thread; `window`: cells X * Y of a window."""
     words = 4 * -(-sites // SITES_PER_DRAW)
     forms = forms_of(Scratch, N=agents, K=sites, words=words, cells=cells, window=window)
-    return Scratch(
-        *(np.zeros(length + CACHE_LINE_BYTES, dtype)[:length] for (length,), dtype in forms.values())
-    )
+    arrays: list[Any] = [
+        np.zeros(length + CACHE_LINE_BYTES, dtype)[:length] for (length,), dtype in forms.values()
+    ]
+    return Scratch(*arrays)

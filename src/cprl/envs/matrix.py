@@ -25,9 +25,6 @@ _MOST_PAYOFFS: Final = 2**16
 class MatrixGame(StageGame):
     """A game of N agents who choose among A actions each, at once, and are paid by a table; where it is
     played for several turns, agents observe the last joint actions. When it ends, see `StageGame`.
-
-    Raises:
-        ValueError: names the field, what came and what is allowed.
     """
 
     payoffs: Any

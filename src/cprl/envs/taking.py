@@ -31,9 +31,6 @@ class TakingGame(StageGame):
 
     A recipe holds games whose worth is a `PowerWorth`. A worth of your own, e.g. a `CallableWorth`, can be
     played; in an experiment the game is then a `Custom` of a function that makes it.
-
-    Raises:
-        ValueError: names the field, what came and what is allowed.
     """
 
     sharing: SharingGame

@@ -6,11 +6,11 @@ allocates it says, or a number. Where there is an axis B, it is the first one, o
 
 from collections.abc import Callable, Mapping
 from functools import cache
-from typing import Any, NamedTuple, TypeVar, get_args, get_type_hints
+from typing import Any, TypeVar, cast, get_args, get_type_hints
 
 import numpy as np
 
-Tuple = TypeVar("Tuple", bound=NamedTuple)
+Tuple = TypeVar("Tuple", bound=tuple[Any, ...])
 Form = tuple[tuple[int, ...], type[np.generic]]
 """The shape and dtype of an array."""
 
@@ -34,7 +34,9 @@ def forms_of(kind: Any, **sizes: int) -> dict[str, Form]:
 
 def zeros(kind: type[Tuple], **sizes: int) -> Tuple:
     """Allocate a tuple of arrays, all zero; `sizes`: see `forms_of`."""
-    return kind(*(np.zeros(shape, dtype) for shape, dtype in forms_of(kind, **sizes).values()))
+    arrays = [np.zeros(shape, dtype) for shape, dtype in forms_of(kind, **sizes).values()]
+    made: Tuple = cast(Any, kind)(*arrays)
+    return made
 
 
 def slicer(kind: type[Tuple]) -> Callable[[Tuple, int], Tuple]:
@@ -43,8 +45,8 @@ def slicer(kind: type[Tuple]) -> Callable[[Tuple, int], Tuple]:
     It is written out field by field, so that the rules can call it: Numba compiles no loop over a tuple whose
     arrays differ in type.
     """
-    names = {"__name__": __name__, "kind": kind}
-    entries = ", ".join(f"arrays.{name}[b]" for name in kind._fields)
+    names: dict[str, Any] = {"__name__": __name__, "kind": kind}
+    entries = ", ".join(f"arrays.{name}[b]" for name in _annotations(kind))
     exec(f"def one_{kind.__name__.lower()}(arrays, b):\n    return kind({entries})\n", names)
     function: Callable[[Tuple, int], Tuple] = names[f"one_{kind.__name__.lower()}"]
     return function

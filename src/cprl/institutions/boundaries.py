@@ -21,9 +21,6 @@ class Boundaries(Institution):
     1, clearly defined boundaries).
 
     Agents observe, for each cell of their window, whether a bite there would break a rule.
-
-    Raises:
-        ValueError: If a value is not allowed, or the regions do not fit the board.
     """
 
     regions: tuple[str, ...]

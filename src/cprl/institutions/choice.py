@@ -6,13 +6,7 @@ from math import prod
 from typing import Any, ClassVar, Final, NamedTuple
 
 from cprl.checks import Check, check_fields, count, instance, is_count, is_number
-from cprl.institutions.base import (
-    OBSERVED,
-    PROBABILITY,
-    Institution,
-    check_agent_indices,
-    check_no_election,
-)
+from cprl.institutions.base import OBSERVED, PROBABILITY, Institution, check_agent_indices, check_no_election
 from cprl.institutions.monitoring import ELECTED, Monitoring
 from cprl.institutions.quotas import Quota
 from cprl.institutions.taxes import Tax
@@ -27,9 +21,6 @@ class Vote(Institution):
 
     Each agent's decision is the index of a choice; the median of the N decisions counts, of two middle ones
     the lower. Agents observe the value in force.
-
-    Raises:
-        ValueError: If a value is not allowed.
     """
 
     on: Tax | Quota
@@ -65,9 +56,6 @@ class Sanctioner(Institution):
 
     In an election each agent's decision is the index of an agent; most votes win, ties are drawn by the
     game's chance. Agents observe whether they may fire.
-
-    Raises:
-        ValueError: If a value is not allowed.
     """
 
     agents: tuple[int, ...] | None = None

@@ -249,6 +249,16 @@ class InstitutionTables(NamedTuple):
     """The channel of observations that is the first one of institutions."""
 
 
+class Law(NamedTuple):
+    """What the institutions of a game need in a turn of B worlds, beside the worlds."""
+
+    rules: InstitutionTables
+    memory: Memory
+    decisions: Longs
+    """int64 [B, N], read in the first turn of an episode."""
+    payments: Payments
+
+
 def empty_memory(tables: InstitutionTables, *, worlds: int) -> Memory:
     """Memory for B worlds, all zero, except that the first choice of each ballot is in force."""
     empty = zeros(

@@ -23,9 +23,6 @@ class Monitoring(Institution):
     Each turn in which an agent violates a rule is detected with probability `prob`, by the game's own
     counters; only then fines and sanctions follow. Without Monitoring every violation is detected. Agents
     observe whether they were detected in the last turn.
-
-    Raises:
-        ValueError: If a value is not allowed.
     """
 
     prob: float = 0.5

@@ -52,6 +52,21 @@ def mediate(memory: Memory, tables: InstitutionTables, tagged_by: Bools, i: int,
             memory.unjust[j] = True
 
 
+def sanction_tag(
+    memory: Memory, tables: InstitutionTables, tagged_by: Bools, i: int, turn: int, freeze: int
+) -> int:
+    """Lets agent i pay for being tagged, where that is an offence; returns the turns that it misses, `freeze`
+    where it is none."""
+    if not tables.sanctions_tags:
+        return freeze
+    steps = 0
+    for j in range(tagged_by.shape[0]):
+        if tagged_by[i, j]:
+            steps = max(steps, time_out(memory, tables, j, i))
+    offend(memory, tables, i, turn)
+    return steps
+
+
 def note_violation(memory: Memory, i: int, turn: int) -> bool:
     """Counts a turn in which agent i violated a rule; returns whether it did."""
     memory.broke[i] = memory.broke[i] or memory.unjust[i]

@@ -15,9 +15,6 @@ class Quota(Institution):
     Windows follow one another from the first turn of an episode. In each, an agent may harvest up to
     share x yield x window_steps / N apples, where the yield is `cprl.commons.yields.sustainable_yield`, a
     proven lower bound. Agents observe the part of their quota that is left and the time left in the window.
-
-    Raises:
-        ValueError: If a value is not allowed.
     """
 
     share: float = 1.0
@@ -46,9 +43,6 @@ class ClosedSeason(Institution):
 
     Each period of `period_steps` turns, from the first turn of an episode, ends with `closed_steps` turns in
     which bites are forbidden. Agents observe whether the season is closed, and how long it stays so.
-
-    Raises:
-        ValueError: If a value is not allowed, or a period is shorter than its closed part.
     """
 
     period_steps: int = 100
@@ -79,9 +73,6 @@ class ClosedPatches(Institution):
     A patch is a set of sites that are connected by being near each other (`Rules.regrow_radius_cells`). It is
     closed in every turn that begins with fewer than `below` apples on it. Agents observe, for each cell of
     their window, whether a bite there would break a rule.
-
-    Raises:
-        ValueError: If a value is not allowed.
     """
 
     below: int = 2

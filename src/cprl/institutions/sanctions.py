@@ -16,9 +16,6 @@ class GraduatedSanctions(Institution):
 
     An offence is to be tagged by another agent, a detected violation, or either. The first offence is at
     level 0; each one raises the level of the next. Agents observe their level, 0..1.
-
-    Raises:
-        ValueError: If a value is not allowed, or a table of time-outs does not fit the agents.
     """
 
     freeze_steps: tuple[int, ...] | tuple[tuple[int, ...], ...] = (5, 25, 100, 100)
@@ -69,9 +66,6 @@ class Mediation(Institution):
     a violation by each agent that tagged; together they pay `refund` to the tagged one, detected or not.
     Agents observe which agents have violated a rule in the last `turns`, their own mark first, then those of
     the following indices, cyclically; to know them apart they need `Observation.agents_apart`.
-
-    Raises:
-        ValueError: If a value is not allowed.
     """
 
     turns: int = 10

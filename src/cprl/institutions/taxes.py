@@ -16,9 +16,6 @@ class Tax(Institution):
     The base is the apples harvested in the period, before all fines and other taxes, so several taxes are
     independent of their order. What is collected counts as a fine, what is paid out as a transfer. Agents
     observe nothing of a fixed tax.
-
-    Raises:
-        ValueError: If a value is not allowed.
     """
 
     rate: float = 0.1
@@ -47,9 +44,6 @@ class Levies(Institution):
 
     Every turn `local_rate` of each harvest is divided equally within the agent's group, and `joint_rate` of
     it equally among all agents.
-
-    Raises:
-        ValueError: If a value is not allowed, or an agent is in no group or in two.
     """
 
     groups: tuple[tuple[int, ...], ...]
