@@ -129,18 +129,19 @@ class Batch:
         self,
         loop: Loop,
         argument: NDArray[Any],
-        output: Output,
+        output: Any,
         decisions: Actions | None = None,
         *,
         checked: bool = False,
     ) -> None:
         """Runs a loop of the game, with its institutions if it has any."""
-        if isinstance(output, StepOutput):
+        if self.memory is None:
             self.driver.run(loop, self.now, argument, output, checked=checked)
             return
+        turn, payments = output
         decided = self._no_decisions if decisions is None else decisions
-        law = Law(self.driver.rules, self.memory, decided, output.payments)
-        self.driver.run(loop, self.now, argument, output.turn, law, checked=checked)
+        law = Law(self.driver.rules, self.memory, decided, payments)
+        self.driver.run(loop, self.now, argument, turn, law, checked=checked)
 
     def begin(self, output: Output, which: Bools | None = None) -> Output:
         """Begins the next episode of some worlds and writes their rows of `output`.

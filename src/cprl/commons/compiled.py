@@ -161,10 +161,11 @@ def rules_for_cpu() -> Compiled:
         return compiled(ENTRIES, partial(_jit_for_cpu, on_disk=on_disk))
 
 
-_entries: dict[tuple[str, bool], Callable[..., None]] = {}
+_entries: dict[str, Callable[..., None]] = {}
+_governed_entries: dict[str, Callable[..., None]] = {}
 
 
-def entry_for_cpu(loop: str, *arguments: Any, governed: bool) -> Callable[..., None]:
+def entry_for_cpu(loop: str, arguments: tuple[Any, ...]) -> Callable[..., None]:
     """The machine code of a loop, with institutions or without, for direct calls with arguments like these.
 
     Numba's dispatcher inspects the types of about sixty arrays on every call, which takes seven of the eight
@@ -172,10 +173,11 @@ def entry_for_cpu(loop: str, *arguments: Any, governed: bool) -> Callable[..., N
     The types are the same in every game: the fields of `Worlds`, `Tables`, `StepOutput` and `Scratch` have
     fixed types.
     """
-    if (loop, governed) not in _entries:
+    entries = _entries if arguments[4] is None else _governed_entries  # the law
+    if loop not in entries:
         with CLOCK.running():
-            _entries[loop, governed] = machine_code(rules_for_cpu()[loop], *arguments)
-    return _entries[loop, governed]
+            entries[loop] = machine_code(rules_for_cpu()[loop], *arguments)
+    return entries[loop]
 
 
 def _can_write(folder: Path) -> bool:

@@ -110,9 +110,10 @@ class CpuThreads:
             self._check(output, law)
         size = len(argument)
         arguments = worlds, self.tables, argument, output, law
-        entry = entry_for_cpu(loop, *arguments, self._scratch[0], 0, size, governed=law is not None)
+        whole = *arguments, self._scratch[0], 0, size
+        entry = entry_for_cpu(loop, whole)
         if self.threads == 1:
-            entry(*arguments, self._scratch[0], 0, size)
+            entry(*whole)
             return
         bounds = [size * t // self.threads for t in range(self.threads + 1)]
         *others, own = zip(self._scratch, bounds, bounds[1:], strict=False)
