@@ -216,9 +216,6 @@ def film_video(
             not, all play the same fresh world.
         titles: of the run and those beside it, one each; by default the institutions of each, or the names of
             their experiments.
-        episode: the index of the fresh episode; equal indices give equal episodes.
-        seed: of the worlds and all chance. The world is that of `evaluate_run` with the same seed, of number
-            replica x episodes + episode there; what agents draw is their own.
         every: turns from one picture to the next; by default 1 for an .mp4, and for a .gif as many as
             it takes for 300 pictures.
         fps: pictures per second, above 0, at most 50; in a .gif rounded to hundredths of a second a picture.
