@@ -96,7 +96,7 @@ class Cell:
         values: dict[int, list[float]] = {}
         for agent in agents or self.by_agent:
             for replica, episodes in self.by_agent[agent].items():
-                own = (float(_WHOSE[whose](one.return_, agent)) for one in episodes)
+                own = (float(_WHOSE[whose](episode.return_, agent)) for episode in episodes)
                 values.setdefault(replica, []).extend(own)
         return values
 
@@ -405,7 +405,7 @@ def agents_table(played: CrossPlay) -> Table:
 
 def _repeats(name: str, cells: Iterable[Mapping[str, Measured]]) -> bool:
     """Whether group/return says the same: a reward is an apple but for what institutions take and give."""
-    return name == "collective_return" and not any("institutions/fines" in own for own in cells)
+    return name == "collective_return" and not any("institutions/fines" in cell for cell in cells)
 
 
 def unit_of_cells(played: CrossPlay) -> str:

@@ -261,9 +261,14 @@ def _draw_line(axes: Axes, found: Analysis) -> None:
     tables = [found.game.table([place]) for place in range(len(found.game.payoffs))]
     curves = np.array([[_gain(table, share) for share in shares] for table in tables])
     means = [estimate(own) for own in curves.T]
-    middle = np.array([own.value for own in means])
+    middle = np.array([mean.value for mean in means])
     axes.fill_between(
-        shares, [own.low for own in means], [own.high for own in means], color=style.REPLICA, alpha=0.35, lw=0
+        shares,
+        [mean.low for mean in means],
+        [mean.high for mean in means],
+        color=style.REPLICA,
+        alpha=0.35,
+        lw=0,
     )
     axes.plot(shares, middle, color=style.MEAN)
     axes.axhline(0, color=style.RAW, lw=1, zorder=1)
@@ -365,7 +370,7 @@ def _draw_deviations(axes: Axes, found: Analysis) -> None:
 def _draw_rank(axes: Axes, found: Analysis) -> None:
     """The share of each run in the long run of alpha-rank, with its interval."""
     places = np.arange(len(found.shares))
-    values = np.array([own.value for own in found.shares])
+    values = np.array([share.value for share in found.shares])
     axes.barh(places, values, color=style.REPLICA, height=0.6)
     for place, own in enumerate(found.shares):
         if not isnan(own.low):

@@ -155,7 +155,7 @@ def pairwise_game(played: CrossPlay) -> EmpiricalGame:
         runs=played.runs,
         agents=2,
         of_agents=next(iter(played.runs.values())).game.agents,
-        payoffs=np.array([PayoffTable.of_pairs(own).payoffs for own in matrices]),
+        payoffs=np.array([PayoffTable.of_pairs(matrix).payoffs for matrix in matrices]),
         replicas=played.replicas,
         episodes=played.episodes,
         seed=played.seed,

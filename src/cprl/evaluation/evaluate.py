@@ -56,7 +56,10 @@ def differences(game: Any, other: Any) -> list[str]:
     pairs = (game.map, other.map), (game.rules, other.rules), (game.observation, other.observation)
     found = [line for mine, theirs in pairs for line in _field_differences(mine, theirs)]
     if game.institutions != other.institutions:
-        names = (", ".join(type(own).__name__ for own in of.institutions) or "none" for of in (game, other))
+        names = (
+            ", ".join(type(institution).__name__ for institution in of.institutions) or "none"
+            for of in (game, other)
+        )
         found.append(f"institutions {' and '.join(names)}, or their values")
     return found
 

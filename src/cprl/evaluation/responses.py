@@ -81,7 +81,7 @@ def check_seeds(seed: int, episodes: int, runs: Sequence[LoadedRun]) -> int:
 
 def check_agents(agents: Sequence[Any], run: LoadedRun) -> tuple[int, ...]:
     """Indices of agents of a run's game, at least one and each once."""
-    found = [arguments.integer("an agent", own, 0, run.game.agents - 1) for own in agents]
+    found = [arguments.integer("an agent", agent, 0, run.game.agents - 1) for agent in agents]
     if not found or len(set(found)) < len(found):
         raise arguments.refusal("agents", list(agents), "indices of agents, at least one and each once")
     return tuple(found)
@@ -181,7 +181,7 @@ class Exploitability:
     def _chosen(self) -> dict[int, list[Response]]:
         found = {}
         for agent, responses in self.responses.items():
-            returns = np.stack([_focal(own.choosing, agent) for own in responses])
+            returns = np.stack([_focal(response.choosing, agent) for response in responses])
             found[agent] = [responses[place] for place in returns.argmax(0)]
         return found
 

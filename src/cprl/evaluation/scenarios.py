@@ -578,7 +578,7 @@ def _draw_rows(axes: Axes, scores: Scores) -> None:
         rows = [row + _BAND * (place - (len(_LOOKS) - 1) / 2) for row in range(len(names))]
         values = [own for own in found if own is not None]  # a return is always defined
         axes.plot(
-            [own.value for own in values], rows, marker, color=colour, markersize=6, label=label, zorder=3
+            [value.value for value in values], rows, marker, color=colour, markersize=6, label=label, zorder=3
         )
         for row, own in zip(rows, values, strict=True):
             _draw_interval(axes, row, own, colour)

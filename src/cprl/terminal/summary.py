@@ -146,10 +146,10 @@ def _add_returns(
 ) -> None:
     """Adds the mean of a return with its standard error, and how many times the baseline's it is."""
     values = {policy: [of(episode) for episode in own] for policy, own in played.items()}
-    table.add_row(name, *(_with_error(own) for own in values.values()))
+    table.add_row(name, *(_with_error(value) for value in values.values()))
     if len(played) == 1:
         return
-    baseline, means = next(iter(played)), [fmean(own) for own in values.values()]
+    baseline, means = next(iter(played)), [fmean(value) for value in values.values()]
     times = [f"{mean / means[0]:.1f}" if means[0] > 0 else UNDEFINED for mean in means]
     table.add_row(f"  times that of {_who(baseline)}", *times)
 

@@ -88,8 +88,11 @@ class Plots:
     def random_play(self, episodes: Sequence[Episode]) -> None:
         """Sets the lines of random play: the mean of each metric in these episodes, where it is defined."""
         metrics = [{**social_metrics(episode), **_of_institutions(episode)} for episode in episodes]
-        for name in (*self._curves.metrics, *(f"institutions/{own}" for own in self._curves.institutions)):
-            defined = [own[name] for own in metrics if name in own and own[name] == own[name]]
+        for name in (
+            *self._curves.metrics,
+            *(f"institutions/{institution}" for institution in self._curves.institutions),
+        ):
+            defined = [metric[name] for metric in metrics if name in metric and metric[name] == metric[name]]
             if defined:
                 self._random[name] = fmean(defined)
 

@@ -134,7 +134,7 @@ def times(steps: Numbers, episodes: Numbers, frames: Numbers) -> list[Any]:
 
 def components(columns: Iterable[Any]) -> dict[Any, Any]:
     """Columns of an archetype as `cprl.system.compat.send_chunk` takes them."""
-    return {own.component_descriptor(): own.as_arrow_array() for own in columns}
+    return {column.component_descriptor(): column.as_arrow_array() for column in columns}
 
 
 def timelines(at: Iterable[Any]) -> dict[str, Any]:
@@ -185,7 +185,7 @@ def _columns(values: Sequence[Any]) -> Any:
     """Markdown texts, or equally many numbers in each row."""
     if isinstance(values[0], str):
         return rr.TextDocument.columns(text=list(values))
-    return rr.Scalars.columns(scalars=np.concatenate(values)).partition([len(own) for own in values])
+    return rr.Scalars.columns(scalars=np.concatenate(values)).partition([len(value) for value in values])
 
 
 _LIVE_PERIOD_S: Final = 4.0
@@ -401,8 +401,8 @@ class RerunLogger(Logger):
 
     def flush(self) -> None:
         """Sends all buffered numbers to the file and to the viewer."""
-        for each in self._streams:
-            send_waiting(each)
+        for stream in self._streams:
+            send_waiting(stream)
 
     def show_end(self) -> None:
         """Gives the live view the layout of a run that has ended, with its phases."""
@@ -413,7 +413,9 @@ class RerunLogger(Logger):
     @property
     def is_served(self) -> bool:
         """Whether viewers can still connect: the live stream is open and served."""
-        return any(isinstance(own, LiveStream) and own.recording is not None for own in self._streams)
+        return any(
+            isinstance(stream, LiveStream) and stream.recording is not None for stream in self._streams
+        )
 
     def close_file(self) -> None:
         """Flushes and closes the file, which gets its footer; the live stream goes on."""

@@ -47,7 +47,7 @@ class Page:
     """
 
     def __init__(self, recordings: Sequence[Path] = ()) -> None:
-        self._recordings = [Path(own) for own in recordings]
+        self._recordings = [Path(recording) for recording in recordings]
         handler = type("Handler", (_Handler,), {"recordings": self._recordings})
         self._server = _Server((LOCALHOST, 0), handler)
         self.port = int(self._server.server_address[1])

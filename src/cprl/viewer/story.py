@@ -146,7 +146,7 @@ class EventDetector:
     @property
     def returns(self) -> list[float]:
         """The collective return of each episode so far."""
-        return [own[0] for own in self._means]
+        return [mean[0] for mean in self._means]
 
     def add(self, means: Mapping[str, float]) -> list[str]:
         """Adds the means of an episode; returns new events as text."""
@@ -178,7 +178,7 @@ class EventDetector:
         return smoothed
 
     def state_dict(self) -> dict[str, Any]:
-        return {"means": [list(own) for own in self._means], "best": self._best}
+        return {"means": [list(mean) for mean in self._means], "best": self._best}
 
     def load_state_dict(self, state: Mapping[str, Any]) -> None:
         self._means = [list(own) for own in state["means"]]
@@ -306,7 +306,7 @@ class Story:
     def _tell_phases(self) -> None:
         if self._detector is None or not self._curves.has_phases:
             return
-        found = {round(one.first): one.label or ANOTHER for one in self._detector.phases()}
+        found = {round(phase.first): phase.label or ANOTHER for phase in self._detector.phases()}
         self._logger.log_states(_FOUND, found)
         published = published_phases(self._game)
         within = {first: label for first, label in published.items() if first < self._ended}

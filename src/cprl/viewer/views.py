@@ -442,10 +442,10 @@ def in_words(episode: Episode, curves: Curves) -> str:
 def regions_of(env: CommonsEnv) -> Regions:
     """The regions of all `Boundaries` of a game; those that are open to all are none."""
     found: Regions = []
-    for own in env.game.institutions:
-        if isinstance(own, Boundaries):
-            signs = np.array([list(line) for line in own.regions])
-            of_agents = [own.signs_of(agent) for agent in range(env.game.agents)]
+    for institution in env.game.institutions:
+        if isinstance(institution, Boundaries):
+            signs = np.array([list(line) for line in institution.regions])
+            of_agents = [institution.signs_of(agent) for agent in range(env.game.agents)]
             for sign in sorted(set("".join(of_agents))):
                 owners = [agent for agent, ours in enumerate(of_agents) if sign in ours]
                 found.append((owners, signs == sign))
