@@ -1,11 +1,15 @@
 """A training is watched without being harmed: by no viewer, one that dies or stands still, a full disk."""
 
 import contextlib
+import json
 import os
 import re
 import shutil
 import signal
+import socket
 import subprocess
+import sys
+import threading
 import time
 import warnings
 from contextlib import contextmanager
@@ -20,14 +24,20 @@ import rerun_cli
 import torch
 from recordings import GAME, column, static
 from rerun.chunk import RrdReader
+from test_outcome import EXPERIMENT
 
+import cprl
 from cprl import CommonsEnv
+from cprl.commands.recipe import parse
 from cprl.learners.replay import ReplayLearner
 from cprl.learners.settings import DQNSettings
 from cprl.measuring import Episode, social
 from cprl.training import train
+from cprl.viewer import streams
 from cprl.viewer.callback import ViewerCallback
 from cprl.viewer.page import free_port, to_watch
+from cprl.viewer.streams import Sender, within
+from cprl.viewer.watching import check_linger
 
 SETTINGS = DQNSettings(buffer_size=200, learning_rate=1e-3, hidden_cells=(8,), epsilon_hold_steps=5)
 VIEWER = Path(rerun_cli.__path__[0]) / "rerun"
@@ -288,3 +298,174 @@ def test_the_file_of_a_run_that_goes_on_holds_all_up_to_its_last_flush(tmp_path)
     course(tmp_path, others=[Doing(150, lambda: shutil.copy(tmp_path / "run.rrd", left))])
     see_the_first_episode(left)
     assert left.stat().st_size < (tmp_path / "run.rrd").stat().st_size
+
+
+@pytest.fixture
+def short(monkeypatch):
+    """Deadlines of a third of a second."""
+    for name in ("STALL_S", "CLOSE_S"):
+        monkeypatch.setattr(streams, name, 0.3)
+
+
+def test_what_takes_too_long_is_not_waited_for():
+    started = time.monotonic()
+    with pytest.raises(TimeoutError, match=r"no answer within 0\.05 s"):
+        within(0.05, threading.Event().wait)
+    assert time.monotonic() - started < 1
+    assert within(1, lambda: 3) == 3
+    with pytest.raises(ZeroDivisionError):
+        within(1, lambda: 1 / 0)
+
+
+def test_calls_are_made_in_their_order_and_all_before_the_end():
+    made, sender = [], Sender()
+    for number in range(3 * streams.QUEUED_CALLS):
+        sender.put(lambda number=number: made.append(number))
+    sender.close()
+    assert made == list(range(3 * streams.QUEUED_CALLS))
+
+
+def fill(sender):
+    """More calls that never return than the queue holds."""
+    for _ in range(streams.QUEUED_CALLS + 2):
+        sender.put(threading.Event().wait)
+
+
+def test_a_queue_that_stays_full_is_refused_and_the_end_has_a_deadline(short):
+    sender, started = Sender(), time.monotonic()
+    with pytest.raises(TimeoutError, match=r"taken no data for 0\.3 s and the queue is full"):
+        fill(sender)
+    sender = Sender()
+    sender.put(threading.Event().wait)
+    with pytest.raises(TimeoutError, match=r"has not taken the last data within 0\.3 s"):
+        sender.close()
+    assert time.monotonic() - started < 2
+
+
+SERVES = """
+import sys, time
+from pathlib import Path
+import numpy as np
+from cprl.viewer.logger import RerunLogger
+logger = RerunLogger("run", Path(sys.argv[1]), live="serve")
+print(logger.addresses["native"].split()[-1], flush=True)
+sys.stdin.readline()
+slowest, random = 0.0, np.random.default_rng(0)
+for step in range(700):  # 700 MB: more than the server and its connections hold
+    logger.at(step=step, episode=step)
+    started = time.monotonic()
+    logger.log_matrix("m", random.random((500, 500), np.float32), ("a", "b"))
+    slowest = max(slowest, time.monotonic() - started)
+started = time.monotonic()
+if sys.argv[2] == "closes": logger.close()
+print(slowest, time.monotonic() - started, flush=True)
+"""
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("end", ["closes", "leaves"])
+def test_a_served_recording_does_not_wait_for_a_viewer_that_stands_still(end, tmp_path):
+    """Rerun's own receiver connects as a viewer does, and is stopped."""
+    pipe = subprocess.PIPE
+    with subprocess.Popen(
+        [sys.executable, "-c", SERVES, tmp_path, end], stdin=pipe, stdout=pipe, stderr=pipe, text=True
+    ) as process:
+        lines = iter(process.stdout.readline, "")
+        address = next(line for line in lines if line.startswith("rerun+http")).strip()
+        viewer = connected(address, tmp_path)
+        try:
+            time.sleep(1)
+            os.kill(viewer.pid, signal.SIGSTOP)
+            process.stdin.write("\n")
+            process.stdin.flush()
+            slowest, closing = map(float, next(lines).split())
+            started = time.monotonic()
+            _, errors = process.communicate(timeout=60)
+            assert slowest < streams.STALL_S + 1
+            assert closing < streams.CLOSE_S + 1
+            assert time.monotonic() - started < streams.CLOSE_S + streams.STALL_S + 1
+            assert process.returncode == 0
+            if end == "closes":
+                assert errors.count("live view failed, the run continues without it") == 1
+        finally:
+            process.kill()
+            viewer.kill()
+            viewer.wait()
+
+
+SCRIPT = f"""
+import sys; sys.path.insert(0, {str(Path(__file__).parent)!r})
+import cprl
+from test_outcome import EXPERIMENT
+cprl.run(EXPERIMENT, sys.argv[1], watch="serve", linger=True)
+print("it ends", flush=True)
+"""
+
+
+@pytest.fixture
+def lingering(tmp_path):
+    """A run that is finished and stays served, its process and the port of its page."""
+    run = tmp_path / "run"
+    process = subprocess.Popen(
+        [sys.executable, "-u", "-c", SCRIPT, run], stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
+    )
+    try:
+        heard = []
+        for line in process.stdout:
+            heard.append(line)
+            if line.startswith("The recording stays served at "):
+                break
+        assert heard, process.stderr.read()
+        yield run, process, heard
+    finally:
+        process.kill()
+        process.communicate()
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_a_finished_run_stays_served_until_it_is_asked_to_end(lingering, number):
+    run, process, heard = lingering
+    assert heard[-1].endswith(" until Ctrl-C\n")
+    assert json.loads((run / "report.json").read_text())["episodes"] == 3, "it is finished already"
+    assert not (run / "run.lock").exists()
+    RrdReader(run / "run.rrd").store()  # the file is whole
+    native = next(line for line in heard if "(native)" in line)
+    for port in (re.search(r"http://127.0.0.1:(\d+)/", heard[-1])[1], re.search(r":(\d+)/proxy", native)[1]):
+        socket.create_connection(("127.0.0.1", int(port)), timeout=5).close()
+    process.send_signal(number)
+    process.send_signal(number)  # as by a hand in a hurry, or a shell that passes it on
+    out, errors = process.communicate(timeout=60)
+    assert process.returncode == 0
+    assert out == "it ends\n", "cprl.run returns"
+    assert "Traceback" not in errors
+
+
+@pytest.mark.parametrize("watch", ["off", "file"])
+def test_lingering_without_anything_served_is_refused_before_anything_is_written(watch, tmp_path):
+    with pytest.raises(ValueError, match=f'linger is True, but watch is "{re.escape(watch)}", which serves'):
+        cprl.run(EXPERIMENT, tmp_path / "run", watch=watch, linger=True)
+    assert not (tmp_path / "run").exists()
+
+
+def test_lingering_in_a_thread_that_gets_no_signals_is_refused():
+    refusals = []
+
+    def ask():
+        try:
+            check_linger(True, "serve")
+        except ValueError as error:
+            refusals.append(str(error))
+
+    thread = threading.Thread(target=ask)
+    thread.start()
+    thread.join()
+    assert refusals == ["linger is True in another thread than the main one, which alone gets signals"]
+    check_linger(True, "serve")
+
+
+def test_linger_is_a_flag_of_every_recipe():
+    _, options = parse(lambda: EXPERIMENT, ["recipe.py", "--watch", "serve", "--linger"])
+    assert options.linger
+    _, options = parse(lambda: EXPERIMENT, ["recipe.py"])
+    assert not options.linger

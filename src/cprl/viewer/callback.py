@@ -88,11 +88,10 @@ class Plots:
     def random_play(self, episodes: Sequence[Episode]) -> None:
         """Sets the lines of random play: the mean of each metric in these episodes, where it is defined."""
         metrics = [{**social_metrics(episode), **_of_institutions(episode)} for episode in episodes]
-        for name in (
-            *self._curves.metrics,
-            *(f"institutions/{institution}" for institution in self._curves.institutions),
-        ):
-            defined = [metric[name] for metric in metrics if name in metric and metric[name] == metric[name]]
+        of_institutions = (f"institutions/{metric}" for metric in self._curves.institutions)
+        for name in (*self._curves.metrics, *of_institutions):
+            values = [numbers[name] for numbers in metrics if name in numbers]
+            defined = [value for value in values if value == value]
             if defined:
                 self._random[name] = fmean(defined)
 
