@@ -224,7 +224,7 @@ def run_table(evaluation: Evaluation) -> Table:
     """
     trained, random = evaluation.measures("trained"), evaluation.measures("random")
     rewards = unit_of_rewards(evaluation.trained)
-    rows = [
+    rows: list[tuple[str, ...]] = [
         (with_unit(name, rewards=rewards), str(measured), str(random[name]))
         for name, measured in trained.items()
         if not says_nothing(name, [measured, random[name]])
