@@ -5,7 +5,10 @@ from dataclasses import replace
 import pytest
 import torch
 
+import cprl
 from cprl import presets
+from cprl.algorithms import DQN
+from cprl.population import Learning, Scripted
 
 
 @pytest.fixture(autouse=True)
@@ -41,3 +44,20 @@ def corridors(tmp_path_factory):
         policy: ran(folder / policy, CORRIDORS, [Scripted(policy)] * 2, replicas=2)
         for policy in ("greedy", "sustainable")
     }
+
+
+@pytest.fixture(scope="module")
+def run(tmp_path_factory):
+    """A run of experiment 4 in miniature: 2 replicas of 12 episodes of 40 steps."""
+    game = presets.game("two_complex", variant="as_run")
+    learner = Learning(DQN(settings=presets.dqn_settings("two_complex", variant="as_run")))
+    experiment = cprl.Experiment(
+        name="two_against_random",
+        game=replace(game, rules=replace(game.rules, episode_steps=40)),
+        agents=(learner, Scripted("random")),
+        replicas=2,
+        episodes=12,
+        evaluation_episodes=2,
+        engine="eager",
+    )
+    return cprl.run(experiment, tmp_path_factory.mktemp("runs") / "four")

@@ -1,39 +1,37 @@
 """Figures: everything drawn is in the legend, which lies beside the data; phases only in long trainings."""
 
-import json
 from pathlib import Path
 from types import SimpleNamespace
 
+import figures as reported
 import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
+from figures import published_bands
 from matplotlib.collections import PolyCollection
 from matplotlib.image import imread
 from matplotlib.text import Text
 from PIL import Image
+from published import published_experiment
+from results import Result
 from test_phases import CORNERS, society
 from test_results import an_episode
 
 import cprl
 from cprl import Game, Rules, maps, presets
 from cprl.algorithms import DQN, IQL, MADDPG, PPO, PR2, SAC
-from cprl.config import to_config
 from cprl.learners.settings import DQNSettings, RolloutSettings
 from cprl.measuring import phases
 from cprl.measuring.phases import PHASES
-from cprl.measuring.published import published_experiment
 from cprl.population import Learning, Scripted, Team, exploration_steps
-from cprl.reporting import figures as reported
-from cprl.reporting.result import Result
 from cprl.runs.curves import centres, episode_of_step, phases_of
 from cprl.terminal import style
-from cprl.terminal.figures import UNNAMED, bands_of, published_bands, training_curve
+from cprl.terminal.figures import UNNAMED, bands_of, training_curve
 
 
-def a_run(folder, metrics, *, recipe=None, board="commons"):
-    """A run of two agents who share what is harvested; metrics are [R, E] by name. Its recipe says that it
-    was played on a board of the study."""
+def a_run(folder, metrics):
+    """A run of two agents who share what is harvested; metrics are [R, E] by name."""
     replicas, episodes = next(iter(metrics.values())).shape
     shape = replicas, episodes, 2
     replica, episode, agent = (axis.ravel() for axis in np.indices(shape))
@@ -42,9 +40,6 @@ def a_run(folder, metrics, *, recipe=None, board="commons"):
     columns["return"] = np.repeat(metrics["collective_return"].ravel() / 2, 2)
     folder.mkdir(parents=True, exist_ok=True)
     pq.write_table(pa.table(columns), folder / "episodes.parquet")
-    if recipe:
-        experiment = {"game": to_config(presets.game(board))}
-        (folder / "recipe.json").write_text(json.dumps({"recipe": recipe, "experiment": experiment}))
     return folder
 
 
@@ -144,28 +139,15 @@ def test_what_is_not_over_by_the_last_episode_is_said(tmp_path, drawn):
 
 @pytest.mark.parametrize(("episodes", "has_bands"), [(999, False), (1000, True)])
 def test_phases_are_drawn_from_a_thousand_episodes_on(episodes, has_bands, tmp_path, drawn):
-    run = a_run(tmp_path / "run", the_tragedy(2, episodes), recipe="commons")
+    run = a_run(tmp_path / "run", the_tragedy(2, episodes))
     training_curve(run, title="commons")
     (figure,) = drawn
     strips = [axes for axes in figure.axes if axes not in curves_panels(figure)]
     assert bool(strips) == has_bands
-    assert ("phase: tragedy" in labels(figure)) == has_bands
+    assert (f"phase: {UNNAMED}" in labels(figure)) == has_bands
     see_that_the_legend_is_whole(figure)
     if has_bands:
-        rows = [label.get_text() for label in strips[0].get_yticklabels()]
-        assert rows == ["published", "this run"]
-        assert "phase: exploration" in labels(figure)
-
-
-def test_a_run_of_another_experiment_has_no_published_phases(tmp_path, drawn):
-    training_curve(a_run(tmp_path / "run", the_tragedy(1, 1000), recipe="mixed"), title="mixed")
-    assert [label.get_text() for label in drawn[0].axes[0].get_yticklabels()] == ["this run"]
-
-
-def test_a_run_that_only_has_the_name_of_the_studys_has_no_published_phases(tmp_path, drawn):
-    run = a_run(tmp_path / "run", the_tragedy(1, 1000), recipe="commons", board="two_complex")
-    training_curve(run, title="commons")
-    assert [label.get_text() for label in drawn[0].axes[0].get_yticklabels()] == ["this run"]
+        assert [label.get_text() for label in strips[0].get_yticklabels()] == ["this run"]
 
 
 def test_phases_need_a_group_and_numbers_in_every_window():

@@ -13,7 +13,7 @@ from cprl.commons.near import neighbours
 from cprl.envs import CommonsGymnasiumEnv, parallel_env
 from cprl.evaluation import crossplay, scenarios_of
 from cprl.evaluation.film import film
-from cprl.measuring import phases, published, statistics
+from cprl.measuring import phases, statistics
 from cprl.measuring.episodes import EpisodeTracker
 from cprl.measuring.replicas import over_replicas
 from cprl.measuring.series import Series
@@ -63,7 +63,6 @@ INF, NAN = float("inf"), float("nan")
         (lambda: scenarios_of(3), "game is 3; allowed: a cprl.Game, because scripted"),
         (lambda: film("run", replica=1.5), "replica is 1.5; allowed: an integer >= 0"),
         (lambda: film("run", episode=2**32), "episode is 4294967296; allowed: an integer from 0"),
-        (lambda: published.curve("exp9"), "name is 'exp9'; allowed: exp1/return"),
         (lambda: over_replicas({0: ["a"]}), r"values\[0\] is 'a'; allowed: "),
         (lambda: Series(2).add(0, 2, {}), "replica is 2; allowed: an integer from 0 to 1"),
         (lambda: EpisodeTracker(1, 1.5), "agents is 1.5; allowed: "),

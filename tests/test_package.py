@@ -19,7 +19,7 @@ from cprl.learners.replay import ReplayLearner
 PACKAGES = (
     *("algorithms", "commons", "envs", "evaluation", "institutions", "keys"),
     *("learners", "measuring", "networks", "objectives", "policies", "population", "preferences", "presets"),
-    *("reporting", "studies", "theory", "training", "viewer"),
+    *("studies", "theory", "training", "viewer"),
 )
 """What users import."""
 TAKES_SECONDS = ("torch", "numba", "pyarrow", "scipy", "matplotlib", "rerun")

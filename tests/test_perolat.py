@@ -1,4 +1,4 @@
-"""The recipes of recipes/perolat run, in miniature, and their claims are read off what they leave."""
+"""The recipes of recipes/study/perolat run, in miniature, and their claims are read off what they leave."""
 
 from dataclasses import replace
 from importlib import import_module
@@ -22,7 +22,7 @@ SMALL = {"episodes": 2, "evaluation_episodes": 2, "engine": "eager", "replicas":
 def recipes():
     """The modules of the folder by name."""
     with pytest.MonkeyPatch.context() as patch:
-        patch.syspath_prepend(RECIPES / "perolat")
+        patch.syspath_prepend(RECIPES / "study" / "perolat")
         return {name: import_module(name) for name in ("perolat_base", *STUDIES, "perolat_claims")}
 
 

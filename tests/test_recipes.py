@@ -43,8 +43,8 @@ def recipe(name, folder=RECIPES):
 
 @pytest.mark.parametrize("board", ["two_complex", "commons"])
 def test_every_way_to_learn_has_four_candidates_of_its_own(board, monkeypatch):
-    monkeypatch.syspath_prepend(str(RECIPES / "learners"))
-    study = recipe(f"tuning_{board}", RECIPES / "learners").STUDY
+    monkeypatch.syspath_prepend(str(RECIPES / "study" / "learners"))
+    study = recipe(f"tuning_{board}", RECIPES / "study" / "learners").STUDY
     ways = Counter(condition.name.partition(":")[0] for condition in study.all_conditions)
     assert ways == dict.fromkeys(("DQN", "PPO", "IPPO", "VDN", "QMIX", "MAPPO", "MADDPG", "PR2", "LOLA"), 4)
     assert len({condition.checksum for condition in study.all_conditions}) == 36
@@ -67,8 +67,8 @@ def tuned(study, values):
 
 
 def test_the_comparison_of_learners_takes_the_candidates_that_got_most(monkeypatch):
-    monkeypatch.syspath_prepend(str(RECIPES / "learners"))
-    ways = recipe("ways", RECIPES / "learners")
+    monkeypatch.syspath_prepend(str(RECIPES / "study" / "learners"))
+    ways = recipe("ways", RECIPES / "study" / "learners")
     study = ways.tuning("two_complex")
     names = [condition.name for condition in study.all_conditions]
     chosen = ways.winners(tuned(study, {name: -nth % 5 for nth, name in enumerate(names)}))
@@ -88,8 +88,8 @@ def test_the_comparison_of_learners_takes_the_candidates_that_got_most(monkeypat
 
 
 def test_candidates_that_were_not_trained_are_not_chosen(monkeypatch, capsys):
-    monkeypatch.syspath_prepend(str(RECIPES / "learners"))
-    ways = recipe("ways", RECIPES / "learners")
+    monkeypatch.syspath_prepend(str(RECIPES / "study" / "learners"))
+    ways = recipe("ways", RECIPES / "study" / "learners")
     study = ways.tuning("two_complex")
     first, *others = [condition.name for condition in study.all_conditions]
     assert ways.winners(tuned(study, {first: 3})) == {"DQN": first.removeprefix("DQN: ")}
@@ -99,15 +99,15 @@ def test_candidates_that_were_not_trained_are_not_chosen(monkeypatch, capsys):
 
 @pytest.mark.integration
 def test_agents_of_a_study_of_learners_meet_in_a_cross_play(tmp_path, monkeypatch, capsys):
-    monkeypatch.syspath_prepend(str(RECIPES / "learners"))
-    ways = recipe("ways", RECIPES / "learners")
+    monkeypatch.syspath_prepend(str(RECIPES / "study" / "learners"))
+    ways = recipe("ways", RECIPES / "study" / "learners")
     few = {name: ways.WAYS[name].candidates(1000) for name in ("DQN", "MAPPO")}
     algorithms = {name: next(iter(own.values())) for name, own in few.items()}
     how = {"episodes": 2, "evaluation_episodes": 1, "replicas": 2}
     study = ways.study("two_complex", algorithms, name="few", question="", expectation="", **how)
     eager = replace(study, experiment=replace(study.experiment, engine="eager"))
     cprl.run_study(eager, tmp_path / "few", results=False, progress=False)
-    cross_play = recipe("cross_play", RECIPES / "learners")
+    cross_play = recipe("cross_play", RECIPES / "study" / "learners")
     cross_play.main(tmp_path / "few", episodes=1)
     rows = pq.read_table(tmp_path / "few" / "cross_play.parquet").to_pydict()
     assert set(rows["focal"]) == {"DQN", "MAPPO"} == set(rows["background"])
@@ -119,7 +119,7 @@ def test_agents_of_a_study_of_learners_meet_in_a_cross_play(tmp_path, monkeypatc
 
 def test_the_study_of_experiment_3_has_the_two_programs_and_each_difference_alone():
     conditions = {
-        own.name: own.experiment for own in recipe("experiment_3", RECIPES / "studies").STUDY.all_conditions
+        own.name: own.experiment for own in recipe("experiment_3", RECIPES / "study").STUDY.all_conditions
     }
     assert list(conditions) == ["as run", "gamma 0.999", "the fault", "10 April: both"]
     of = {
@@ -152,7 +152,7 @@ def run_in_miniature(tmp_path, capsys, **arguments):
 @pytest.mark.parametrize(("kind", "herd"), [("herders", 2), ("appropriation", 8)])
 @pytest.mark.parametrize("learner", ["tables", "PPO"])
 def test_those_who_share_learn_alone_and_know_nothing_of_each_other(kind, herd, learner):
-    own = recipe("sharing", RECIPES / "theory").experiment(
+    own = recipe("sharing", RECIPES / "study" / "theory").experiment(
         kind=kind, herd=herd, learner=learner, wants="team"
     )
     assert own.game.agents == herd
@@ -161,8 +161,8 @@ def test_those_who_share_learn_alone_and_know_nothing_of_each_other(kind, herd, 
 
 
 def test_the_table_of_where_learners_end_follows_from_what_was_measured(monkeypatch, capsys):
-    monkeypatch.syspath_prepend(str(RECIPES / "theory"))
-    own = recipe("where_learners_end", RECIPES / "theory")
+    monkeypatch.syspath_prepend(str(RECIPES / "study" / "theory"))
+    own = recipe("where_learners_end", RECIPES / "study" / "theory")
     measured = pq.read_table(RECIPES.parent / "docs" / "results" / "theory" / "taken.parquet")
     for condition in own.CONDITIONS:
         found = own.of_condition(measured, condition)
@@ -221,8 +221,8 @@ def test_recipes_of_replicas_leave_a_run_directory(name, variant, tmp_path, caps
 
 @pytest.mark.integration
 def test_a_version_of_the_program_on_the_command_line_is_a_condition_of_the_studies(monkeypatch):
-    monkeypatch.syspath_prepend(str(RECIPES / "studies"))
-    study = recipe("experiment_5", RECIPES / "studies").STUDY
+    monkeypatch.syspath_prepend(str(RECIPES / "study"))
+    study = recipe("experiment_5", RECIPES / "study").STUDY
     sys.modules.pop("base")
     line = "commons.py --variant as_run --gamma 0.997 --episodes 2600 --target-every-episodes 10"
     words = f"{line} --optimizer keras_rmsprop --loss-function log_cosh".split()

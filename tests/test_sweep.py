@@ -304,7 +304,7 @@ def test_ray_is_asked_for_by_name():
     ("command", "typed", "published"),
     [
         (["cprl", "sweep", "mine.py"], "/bin/py -m cprl sweep mine.py", "cprl sweep mine.py"),
-        (["cprl run studies/time_out"], "/bin/py -m cprl run studies/time_out", "cprl run studies/time_out"),
+        (["cprl run study/time_out"], "/bin/py -m cprl run study/time_out", "cprl run study/time_out"),
         (["my study.py"], "/bin/py 'my study.py'", "py 'my study.py'"),
     ],
 )

@@ -118,7 +118,7 @@ def run(bare):
 
 COMMANDS = {
     "run": ("run {run} --resume --episodes 3", "Training curve:"),
-    "recipe": ("recipe", "studies/time_out"),
+    "recipe": ("recipe", "study/time_out"),
     "film": ("film {run} --out film.gif", "film.gif"),
     "export": ("export {run} exported", "exported"),
     "evaluate": ("evaluate {run} --episodes 1", "collective_return"),
@@ -129,7 +129,6 @@ COMMANDS = {
     "exploit": ("exploit {run} --algorithms own --seeds 1 --training-episodes 1 --episodes 1", "Episodes:"),
     "sweep": (f"sweep two_complex --vary game.rules.freeze-steps=2,5 {SHORT} --replicas 1", "two_complex"),
     "table": ("table one two --by engine", "engine"),
-    "report": ("report one", "report"),
 }
 """A miniature of each command, and a word of what it prints; the others have tests of their own."""
 
@@ -201,17 +200,19 @@ def test_the_line_that_resumes_a_recipe_can_be_typed(bare, run):
     assert "is finished" in told or "Training curve:" in told
 
 
-@pytest.mark.parametrize("name", ["commons", "swap_the_loss", "theory/sharing"])
+@pytest.mark.parametrize("name", ["commons", "swap_the_loss", "study/theory/sharing"])
 def test_a_printed_recipe_of_an_experiment_runs_anywhere(name, bare, tmp_path):
     (tmp_path / "mine.py").write_text(bare.cprl(f"recipe {name}"))
     line = "--engine eager --episodes 1 --replicas 1 --evaluation-episodes 1 --watch off --out run"
-    if name != "theory/sharing":
+    if name != "study/theory/sharing":
         line += " --game.rules.episode-steps 20"
     bare.python("mine.py", *line.split(), cwd=tmp_path)
     assert (tmp_path / "run" / "report.json").exists()
 
 
-@pytest.mark.parametrize("name", ["studies/time_out", "learners/tuning_commons", "perolat/perolat_walls"])
+@pytest.mark.parametrize(
+    "name", ["study/time_out", "study/learners/tuning_commons", "study/perolat/perolat_walls"]
+)
 def test_a_printed_recipe_of_a_study_finds_what_it_imports(name, bare, tmp_path):
     (tmp_path / "mine.py").write_text(bare.cprl(f"recipe {name}"))
     assert "0 of" in bare.python("mine.py", "--dry-run", cwd=tmp_path)

@@ -37,7 +37,6 @@ REFERENCE: Final = {
     "viewer": "recordings for the Rerun viewer",
     "evaluation": "stored agents in fresh worlds and among each other",
     "studies": "one experiment under many conditions",
-    "reporting": "runs beside the published study",
     "config": "values as JSON tables, and back",
 }
 """A page each, in reading order, and what it is about."""

@@ -27,7 +27,6 @@ A package imports only from those above it:
     training     the loop: act, store, update, measure, record; run, load
     studies      one experiment under many conditions: factors, trials, tables, figures
     evaluation   stored agents in fresh worlds: alone, among each other and people, against best responses
-    reporting    finished runs beside the published study
     commands     the command line
 """
 
@@ -53,7 +52,6 @@ if TYPE_CHECKING:
         population,
         preferences,
         presets,
-        reporting,
         studies,
         theory,
         training,
@@ -106,7 +104,6 @@ __all__ = [
     "preferences",
     "presets",
     "recipe_main",
-    "reporting",
     "run",
     "run_study",
     "studies",

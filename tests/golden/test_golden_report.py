@@ -8,7 +8,8 @@ from pathlib import Path
 import pytest
 from golden import IS_X86, LIKE_EVERY_MACHINE
 
-RESULTS = Path(__file__).parents[2] / "docs" / "results"
+ROOT = Path(__file__).parents[2]
+RESULTS = ROOT / "docs" / "results"
 COMMONS, TARGETS_10 = "commons", "commons_targets_10"
 REPORTS = {
     "studies/experiment_3/report": [f"studies/experiment_3/runs/{name}" for name in ("as_run", "both")],
@@ -41,7 +42,7 @@ pytestmark = [
 def test_a_report_of_stored_runs_is_the_committed_one(folder, tmp_path):
     runs = [RESULTS / run for run in REPORTS[folder]]
     subprocess.run(
-        [sys.executable, "-m", "cprl", "report", *runs, "--out", tmp_path],
+        [sys.executable, ROOT / "recipes" / "study" / "report.py", *runs, "--out", tmp_path],
         env={**os.environ, **LIKE_EVERY_MACHINE},
         check=True,
         stdout=subprocess.DEVNULL,

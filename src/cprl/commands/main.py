@@ -14,7 +14,7 @@ from typing import Final
 
 import tyro
 
-from cprl.arguments import PLAY_SEED, SEED
+from cprl.arguments import PLAY_SEED
 from cprl.commands.docs import docs
 from cprl.commands.play_stored import (
     check_runs,
@@ -95,29 +95,6 @@ def run(
         command=sys.argv,
     )
     say(done)
-
-
-def report(
-    runs: tuple[Path, ...], /, *, out: Path = Path("report"), pool: bool = False, allow: Allow = ()
-) -> None:
-    """Writes tables and figures of finished runs beside the published study.
-
-    Args:
-        runs: directories of runs, or of results.
-        out: where to: tables.md, figures.md and figures/.
-        pool: runs whose experiments differ in nothing but name, seed, replicas and on_nan are one, of all
-            their replicas.
-        allow: code of your own, module:Class, that a run may import; see docs/experiments.md.
-    """
-    if not runs:
-        raise ValueError("cprl report wants at least one run: cprl report RUN...")
-    make_importable(allow)
-    check_runs(*runs)
-
-    from cprl.reporting import write_report
-
-    prepare_process(SEED)
-    say(write_report(runs, out, pool=pool, allow=allow))
 
 
 def play(
@@ -229,7 +206,6 @@ COMMANDS: Final[Mapping[str, Callable[..., None]]] = {
     "docs": docs,
     "film": film,
     "play": play,
-    "report": report,
     "export": export,
     "evaluate": evaluate,
     "visits": visits,

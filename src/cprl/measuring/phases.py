@@ -23,6 +23,8 @@ Values = NDArray[np.float64]
 
 PHASES: Final = ("exploration", "tragedy", "combat", "cultivation")
 """The study's names of phases, in its order."""
+PHASES_BEGIN: Final = (450, 1500, 2400)
+"""The episodes at which tragedy, combat and cultivation begin in the study's figures of experiment 5."""
 METRICS: Final = ("collective_return", "equality", "survival_steps", "peacefulness")
 """The metrics that the labels of phases depend on."""
 GRID: Final = 50

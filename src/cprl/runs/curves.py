@@ -1,7 +1,7 @@
 """The episodes of a run as curves: a number for each replica and episode, smoothed as in the study."""
 
 from pathlib import Path
-from typing import Any
+from typing import Any, Final
 
 import numpy as np
 import pyarrow as pa
@@ -13,11 +13,13 @@ from cprl.checks import checked, count
 from cprl.institutions import COUNTS
 from cprl.measuring import phases, social
 from cprl.measuring.institutions import summary
-from cprl.measuring.published import SMOOTHED_EPISODES
 from cprl.runs.episodes import OF_INSTITUTIONS, read_episodes
 
 Values = NDArray[np.float64]
 Phases = tuple[list[phases.ChangePoint], list[phases.Phase]]
+
+SMOOTHED_EPISODES: Final = 100
+"""The window of running means in episodes, where nothing else is asked for."""
 
 
 def curves_of(run: Path) -> dict[str, Values]:

@@ -38,8 +38,8 @@ def export_results(run: Path, folder: Path, *, weights: bool = True) -> Path:
     moved finds them where it would find a run beside it.
 
     Returns:
-        The folder, which `cprl.load`, `read_episodes` and `cprl report` accept like the run itself. Metrics
-        and returns are float32, and rows are sorted by replica, episode and agent.
+        The folder, which `cprl.load`, `read_episodes` and a report accept like the run itself. Metrics and
+        returns are float32, and rows are sorted by replica, episode and agent.
 
     Raises:
         ValueError: if there is no run, a file of it is damaged or lost, or the folder holds another run.

@@ -1,6 +1,6 @@
 """The recipes that come with cprl: at the top of a checkout, or in the package that a wheel installs.
 
-A recipe is named by its path without ".py": `commons`, `studies/time_out`.
+A recipe is named by its path without ".py": `commons`, `study/time_out`.
 """
 
 import ast
@@ -26,7 +26,7 @@ class Recipe:
     """A recipe that comes with cprl, or a module that recipes share."""
 
     name: str
-    """Its path without ".py", e.g. "studies/time_out"."""
+    """Its path without ".py", e.g. "study/time_out"."""
     path: Path
     about: str
     """The first line of its docstring."""

@@ -2,7 +2,6 @@
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from itertools import pairwise
 from pathlib import Path
 from statistics import fmean
 from typing import Any, Final
@@ -12,16 +11,12 @@ from matplotlib.axes import Axes
 from matplotlib.patches import Rectangle
 from numpy.typing import NDArray
 
-from cprl import presets
-from cprl.config import to_config
 from cprl.measuring.episodes import Episode
 from cprl.measuring.names import title as metric_title
 from cprl.measuring.names import unit
-from cprl.measuring.phases import PHASES, Phase
-from cprl.measuring.published import PHASED_RECIPE, PHASES_BEGIN, SMOOTHED_EPISODES
+from cprl.measuring.phases import Phase
 from cprl.measuring.replicas import institution_metrics
-from cprl.runs.curves import centres, curves_of, episode_of_step, phases_of, running_mean
-from cprl.runs.recipe import RECIPE_FILE, read_recipe
+from cprl.runs.curves import SMOOTHED_EPISODES, centres, curves_of, episode_of_step, phases_of, running_mean
 from cprl.terminal import style
 from cprl.terminal.style import MARK, SMALL_PT, WIDTH_IN
 
@@ -45,12 +40,6 @@ _CHARACTER_IN: Final = 0.075
 def bands_of(phases: Sequence[Phase]) -> Bands:
     """Bands of phases that were found."""
     return [(phase.first, phase.last, phase.label or UNNAMED) for phase in phases]
-
-
-def published_bands(episodes: float) -> Bands:
-    """The study's phases of experiment 5, up to so many episodes."""
-    bounds = [0.0, *(begin for begin in PHASES_BEGIN if begin < episodes), float(episodes)]
-    return [(first, last, name) for (first, last), name in zip(pairwise(bounds), PHASES, strict=False)]
 
 
 def draw_bands(panel: Axes, bands: Bands) -> None:
@@ -145,9 +134,9 @@ def training_curve(
     """Plots the collective return in each episode of a run, and survival below it.
 
     Every episode and replica is faint, the mean over replicas and its highest point bold. Running means are
-    centred. Trainings of 1,000 to 100,000 episodes have their phases as bands behind the curves; those of the
-    published curves stand above if the run repeats their experiment. A game without a harvest has one panel,
-    the return of all its agents. Games with institutions have two more, violations and fines of all agents.
+    centred. Trainings of 1,000 to 100,000 episodes have their phases as bands behind the curves. A game
+    without a harvest has one panel, the return of all its agents. Games with institutions have two more,
+    violations and fines of all agents.
 
     Args:
         random: episodes of the random policy, whose means are dashed lines.
@@ -165,8 +154,7 @@ def training_curve(
     window = min(smoothed, max(1, episodes // PARTS))
     found = phases_of(curves, centred=True, resamples=1)
     ours = bands_of(found[1]) if found else []
-    strips = {"published": published_bands(episodes)} if ours and _is_published(run) else {}
-    strips |= {"this run": ours} if ours else {}
+    strips = {"this run": ours} if ours else {}
 
     heights = [STRIP_IN * len(strips)] * bool(strips) + list(HEIGHTS_IN[: len(panels)])
     figure, every = style.new_figure(heights, title=title)
@@ -269,14 +257,3 @@ def _mark_peak(axes: Axes, panel: _Panel, window: int) -> None:
 def _note(window: int, *, is_over: bool) -> str:
     note = f"Running means are over {window} episodes, centred." if window > 1 else "Nothing is smoothed."
     return note if is_over else f"{note} Exploration was not over at the last episode."
-
-
-def _is_published(run: Path) -> bool:
-    """Whether a run repeats the experiment whose phases the study draws: by the name of its recipe, on the
-    study's map, which has the number of agents."""
-    if not (run / RECIPE_FILE).exists():
-        return False
-    recipe = read_recipe(run)
-    game = (recipe.get("experiment") or {}).get("game") or {}
-    is_same: bool = game.get("map") == to_config(presets.game("commons").map)
-    return is_same and recipe["recipe"] == PHASED_RECIPE

@@ -5,9 +5,6 @@ Modules, in the order in which one reads them:
     worth         what a unit is worth when so many are taken in all
     sharing       SharingGame: equilibrium, optimum, price of anarchy; the herders' game, and appropriation
     growth        yield_bounds: what the apples of any map can bear, from below and from above
-    yields        exact_yield: what those of a small map can bear, by value iteration
-    planner       planned_harvest: what a planner that sees all gets for the group, and its rules in
-                  planner_rules
     payoff_table  PayoffTable: a symmetric game with a few strategies, by how many agents play each
     equilibria    Nash equilibria of two agents, by nashpy
     evolution     alpha-rank and replicator dynamics, by OpenSpiel
@@ -18,10 +15,8 @@ from cprl.theory.equilibria import Equilibrium, equilibria
 from cprl.theory.evolution import AlphaRank, Ends, alpha_rank, replicator, replicator_ends
 from cprl.theory.growth import YieldBounds, yield_bounds
 from cprl.theory.payoff_table import PayoffTable, compositions, sharing_table
-from cprl.theory.planner import Planner, best_planner, planned_harvest
 from cprl.theory.sharing import SharingGame, appropriation, herders
 from cprl.theory.worth import CallableWorth, PowerWorth, Worth
-from cprl.theory.yields import exact_yield
 
 __all__ = [
     "AlphaRank",
@@ -29,19 +24,15 @@ __all__ = [
     "Ends",
     "Equilibrium",
     "PayoffTable",
-    "Planner",
     "PowerWorth",
     "SharingGame",
     "Worth",
     "YieldBounds",
     "alpha_rank",
     "appropriation",
-    "best_planner",
     "compositions",
     "equilibria",
-    "exact_yield",
     "herders",
-    "planned_harvest",
     "replicator",
     "replicator_ends",
     "sharing_table",

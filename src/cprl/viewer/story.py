@@ -14,8 +14,7 @@ from cprl.commons.game import Game
 from cprl.measuring import phases
 from cprl.measuring.episodes import Episode
 from cprl.measuring.now import BEGINS, EXPLORING, Now
-from cprl.measuring.phases import METRICS, PHASES
-from cprl.measuring.published import PHASES_BEGIN
+from cprl.measuring.phases import METRICS, PHASES, PHASES_BEGIN
 from cprl.measuring.series import Values, mean_of
 from cprl.runs.curves import running_mean
 from cprl.viewer.logger import RerunLogger

@@ -9,9 +9,8 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
-from cprl.measuring.published import SMOOTHED_EPISODES
 from cprl.measuring.statistics import curve_interval
-from cprl.runs.curves import running_mean
+from cprl.runs.curves import SMOOTHED_EPISODES, running_mean
 from cprl.studies.figures.levels import (
     MOST_CONDITIONS,
     colours_of,
