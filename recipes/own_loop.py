@@ -150,7 +150,7 @@ def learn(
     adam = torch.optim.Adam(loss.parameters(), lr=settings.learning_rate, eps=settings.adam_eps, fused=True)
     # HardUpdate copies at every (interval + 1)-th step, and once when it is made.
     target = HardUpdate(loss, value_network_update_interval=settings.target_every_episodes - 1)
-    tracker = EpisodeTracker(1, env.game.agents, env.game.rules.episode_steps)
+    tracker = EpisodeTracker(1, env.game.agents)
     losses = []
     for step, turn in enumerate(StepCollector(env, policy), start=1):
         buffer.extend(transitions_of(0, turn))

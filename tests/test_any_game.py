@@ -33,8 +33,8 @@ from cprl.envs import spaces_of
 from cprl.evaluation.evaluate import run_table
 from cprl.measuring import EpisodeTracker, social
 from cprl.measuring.evaluate import evaluate
-from cprl.measuring.replicas import agents_without_harvest, social_measures
-from cprl.measuring.reported import FIELDS, METRICS, OPTIONAL, available, left_out, reported_by
+from cprl.measuring.metrics import FIELDS, METRICS, OPTIONAL, available, left_out, reported_by
+from cprl.measuring.statistics import agents_without_harvest, social_measures
 from cprl.policies.assignment import AgentPolicies
 from cprl.policies.single import RandomActor
 from cprl.runs.curves import curves_of
@@ -136,14 +136,6 @@ def test_a_game_with_a_harvest_has_the_metrics_of_harvest():
     assert left_out(OPTIONAL) == ""
 
 
-def test_the_longest_episode_need_not_be_known():
-    env = MatrixGame(2, steps=700, with_harvest=True)
-    known = EpisodeTracker(2, 2, 701)
-    expected = told(play(env, tit_for_tat, 701, tracker=known))
-    assert len(expected) == 2
-    assert told(play(MatrixGame(2, steps=700, with_harvest=True), tit_for_tat, 701)) == expected
-
-
 @pytest.mark.parametrize("with_harvest", [False, True])
 def test_a_tracker_goes_on_exactly_from_its_state(with_harvest, tmp_path):
     batches, env = [], MatrixGame(2, steps=300, with_harvest=with_harvest)
@@ -183,8 +175,6 @@ def test_what_the_first_batch_reported_is_wanted_of_all():
         EpisodeTracker(1, 2).add(bare.exclude("done"))
     with pytest.raises(ValueError, match="yield_share needs a harvest"):
         EpisodeTracker(1, 2, sustainable_yield=1.0, first_stock=1.0).add(bare)
-    with pytest.raises(ValueError, match="world 0 has not ended after 3 steps"):
-        play(MatrixGame(1), tit_for_tat, 5, tracker=EpisodeTracker(1, 2, 3))
 
 
 def test_its_table_has_the_columns_that_there_are_and_says_what_is_left_out(tmp_path):

@@ -73,7 +73,7 @@ def all_written_out(tracker, batches):
 
 
 def test_an_episode_is_what_we_work_out_by_hand():
-    tracker = EpisodeTracker(1, 2, 10)
+    tracker = EpisodeTracker(1, 2)
     # Agent 0 fires twice; the first beam crosses agent 1, which is tagged and misses one turn.
     first = turn(
         reward=[[[1.0], [0.5]]],
@@ -123,19 +123,19 @@ def test_an_episode_is_what_we_work_out_by_hand():
 
 def test_tagged_by_two_at_once_is_tagged_once():
     both = [[[False] * 3, [False] * 3, [True, True, False]]]
-    (episode,) = EpisodeTracker(1, 3, 5).add(turn(agents=3, hit_by=both, tagged_by=both, done=[[True]]))
+    (episode,) = EpisodeTracker(1, 3).add(turn(agents=3, hit_by=both, tagged_by=both, done=[[True]]))
     assert episode.tagged.tolist() == [0, 0, 1]
     assert episode.hits.tolist() == [1, 1, 0]
     assert episode.tagged_by.tolist() == [[0, 0, 0], [0, 0, 0], [1, 1, 0]]
 
 
 def test_a_stock_that_never_ran_out_has_no_depletion_step():
-    (episode,) = EpisodeTracker(1, 2, 5).add(turn(done=[[True]], truncated=[[True]], stock=[[7]]))
+    (episode,) = EpisodeTracker(1, 2).add(turn(done=[[True]], truncated=[[True]], stock=[[7]]))
     assert (episode.depletion_step, episode.stock_left, episode.terminated) == (-1, 7, False)
 
 
 def test_each_world_counts_its_own_episodes_and_starts_anew():
-    tracker = EpisodeTracker(2, 2, 5)
+    tracker = EpisodeTracker(2, 2)
     ended = []
     for done in ([[True], [False]], [[True], [True]], [[False], [True]]):
         ended += tracker.add(turn(worlds=2, harvest=[[1, 0], [0, 1]], done=done))
@@ -148,7 +148,7 @@ def test_each_world_counts_its_own_episodes_and_starts_anew():
 
 
 def test_a_world_that_had_ended_ends_no_second_time():
-    tracker = EpisodeTracker(1, 2, 5)
+    tracker = EpisodeTracker(1, 2)
     assert len(tracker.add(turn(done=[[True]]))) == 1
     assert tracker.add(turn(done=[[True]], had_ended=[[True]])) == []
     (episode,) = tracker.add(turn(done=[[True]]))
@@ -157,7 +157,7 @@ def test_a_world_that_had_ended_ends_no_second_time():
 
 def test_what_a_collector_yields_is_measured_as_the_whole_episodes_would_be():
     (batch,) = collected(worlds=3, turns=60)
-    episodes = EpisodeTracker(3, 3, 9).add(batch)
+    episodes = EpisodeTracker(3, 3).add(batch)
     assert len(episodes) >= 3 * 6
     assert any(episode.terminated for episode in episodes)
     first_step = dict.fromkeys(range(3), 0)
@@ -179,47 +179,39 @@ def test_what_a_collector_yields_is_measured_as_the_whole_episodes_would_be():
 def test_episodes_do_not_depend_on_how_the_turns_are_cut_into_batches(turns):
     (whole,) = collected(worlds=2, turns=60)
     pieces = list(whole.split(turns, dim=1))
-    expected = all_written_out(EpisodeTracker(2, 3, 9), [whole])
-    assert all_written_out(EpisodeTracker(2, 3, 9), pieces) == expected
+    expected = all_written_out(EpisodeTracker(2, 3), [whole])
+    assert all_written_out(EpisodeTracker(2, 3), pieces) == expected
 
 
 def test_a_batch_of_one_turn_needs_no_time_axis():
     (whole,) = collected(worlds=2, turns=60)
-    expected = all_written_out(EpisodeTracker(2, 3, 9), [whole])
-    assert all_written_out(EpisodeTracker(2, 3, 9), whole.unbind(1)) == expected
-
-
-def test_more_worlds_than_are_measured_at_once_all_come_out():
-    done = [[True]] * 150
-    harvest = [[world % 7, 1] for world in range(150)]
-    episodes = EpisodeTracker(150, 2, 5).add(turn(worlds=150, harvest=harvest, done=done))
-    assert [episode.world for episode in episodes] == list(range(150))
-    assert [episode.metrics["collective_return"] for episode in episodes] == [sum(row) for row in harvest]
+    expected = all_written_out(EpisodeTracker(2, 3), [whole])
+    assert all_written_out(EpisodeTracker(2, 3), whole.unbind(1)) == expected
 
 
 def test_a_tracker_goes_on_exactly_from_its_state(tmp_path):
     first, second = collected(worlds=2, turns=30)
-    tracker = EpisodeTracker(2, 3, 9)
+    tracker = EpisodeTracker(2, 3)
     tracker.add(first[:, :25])
     torch.save(tracker.state_dict(), tmp_path / "tracker.pt")
     expected = all_written_out(tracker, [first[:, 25:], second])
-    other = EpisodeTracker(2, 3, 9)
+    other = EpisodeTracker(2, 3)
     other.add(second[:, :4])
     other.load_state_dict(torch.load(tmp_path / "tracker.pt"))
     assert all_written_out(other, [first[:, 25:], second]) == expected
 
 
 def test_a_state_is_a_copy():
-    tracker = EpisodeTracker(1, 2, 5)
+    tracker = EpisodeTracker(1, 2)
     tracker.add(turn(harvest=[[1, 0]]))
     state = tracker.state_dict()
     tracker.add(turn(harvest=[[1, 0]]))
     assert state["steps"].tolist() == [1]
-    assert state["harvest"].tolist() == [[[1, 0]]]
+    assert state["harvest"].tolist() == [[1, 0]]
 
 
 def test_an_episode_does_not_change_when_the_next_one_is_played():
-    tracker = EpisodeTracker(1, 2, 5)
+    tracker = EpisodeTracker(1, 2)
     (episode,) = tracker.add(turn(harvest=[[1, 0]], reward=[[[1.0], [0.0]]], done=[[True]]))
     before = written_out(episode)
     tracker.add(turn(harvest=[[1, 1]], reward=[[[1.0], [1.0]]], fired=[[True, True]]))
@@ -227,32 +219,17 @@ def test_an_episode_does_not_change_when_the_next_one_is_played():
 
 
 def test_a_yield_adds_its_share_to_the_metrics():
-    tracker = EpisodeTracker(1, 2, 5, sustainable_yield=1.5, first_stock=2.5)
+    tracker = EpisodeTracker(1, 2, sustainable_yield=1.5, first_stock=2.5)
     (episode,) = tracker.add(turn(harvest=[[1, 1]], done=[[True]]))
     assert episode.metrics["yield_share"] == 0.5
     assert list(episode.metrics) == [*social.METRICS, "yield_share"]
 
 
-def test_an_episode_longer_than_max_steps_is_refused():
-    tracker = EpisodeTracker(2, 2, 3)
-    for done in ([[True], [False]], [[False], [False]], [[False], [False]]):
-        tracker.add(turn(worlds=2, done=done))
-    with pytest.raises(ValueError, match="the episode of world 1 has not ended after 3 steps"):
-        tracker.add(turn(worlds=2))
-
-
 def test_what_does_not_fit_is_named():
-    tracker = EpisodeTracker(2, 2, 3)
+    tracker = EpisodeTracker(2, 2)
     with pytest.raises(ValueError, match=r"the batch is \[1\]; allowed: \[2\] or \[2, T\]"):
         tracker.add(turn(worlds=1))
     with pytest.raises(ValueError, match=r'"reward" of the batch is \[2, 3, 1\]; allowed: \[2, 2, 1\]'):
         tracker.add(turn(worlds=2, agents=3))
-    with pytest.raises(ValueError, match="max_steps is 0"):
-        EpisodeTracker(1, 2, 0)
     with pytest.raises(ValueError, match='"episode" of the state'):
-        tracker.load_state_dict(EpisodeTracker(3, 2, 3).state_dict())
-    longer = EpisodeTracker(2, 2, 9)
-    for _ in range(4):
-        longer.add(turn(worlds=2))
-    with pytest.raises(ValueError, match="the state has 4 steps; allowed: up to max_steps, 3"):
-        tracker.load_state_dict(longer.state_dict())
+        tracker.load_state_dict(EpisodeTracker(3, 2).state_dict())

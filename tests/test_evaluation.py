@@ -25,9 +25,9 @@ from cprl.evaluation.film import film
 from cprl.evaluation.lanes import Source, Turns, policies_of
 from cprl.learners.lanes import EVALUATION, lane_seeds
 from cprl.measuring.evaluate import evaluate
+from cprl.measuring.metrics import with_unit
 from cprl.measuring.movement import trace
-from cprl.measuring.names import with_unit
-from cprl.measuring.replicas import agents_without_harvest, over_replicas, social_measures
+from cprl.measuring.statistics import agents_without_harvest, over_replicas, social_measures
 from cprl.networks.mlp import MLPNetwork
 from cprl.policies.assignment import AgentPolicies
 from cprl.policies.lanes import LaneActor, random_agents

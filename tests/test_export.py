@@ -11,8 +11,8 @@ import numpy as np
 import pyarrow as pa
 import pytest
 import torch
+from recordings import column
 from rerun.chunk import RrdReader
-from test_rerun_logger import column
 
 import cprl
 from cprl.evaluation.film import film
@@ -129,7 +129,7 @@ def test_watch_waits_for_the_viewer_on_windows_where_no_program_replaces_another
     (tmp_path / "run.rrd").touch()
     monkeypatch.setattr(sys, "platform", "win32")
     monkeypatch.setattr(cli.subprocess, "call", call)
-    monkeypatch.setattr("cprl.viewer.streams.viewer", lambda: "rerun")
+    monkeypatch.setattr("cprl.viewer.page.viewer", lambda: "rerun")
     with pytest.raises(SystemExit) as ended:
         cli.watch(tmp_path)
     assert ended.value.code == 3

@@ -22,7 +22,7 @@ from cprl.evaluation.evaluate import run_table
 from cprl.evaluation.film import film, film_video
 from cprl.evaluation.film_pictures import EpisodePicture
 from cprl.institutions import Boundaries, GraduatedSanctions, Monitoring, Sanctioner, Tax, Vote
-from cprl.measuring.reported import reported_by
+from cprl.measuring.metrics import reported_by
 from cprl.policies.lanes import random_agents
 from cprl.population import Scripted
 from cprl.runs.episodes import read_episodes

@@ -3,18 +3,11 @@
 import numpy as np
 import pytest
 import torch
+from results import distance_to_nearest, rounds, shooting_distance
 from tensordict.nn import TensorDictModuleBase
 
 from cprl import CommonsEnv, Game, Rules, keys, maps
-from cprl.measuring.movement import (
-    Trace,
-    distance_to_nearest,
-    overlap,
-    rounds,
-    shooting_distance,
-    trace,
-    visits,
-)
+from cprl.measuring.movement import Trace, overlap, trace, visits
 
 FORWARD, LEFT, RIGHT, TURN_RIGHT, BEAM, STAY = 0, 2, 3, 5, 6, 7
 

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from cprl.measuring.now import Now
-from cprl.measuring.recent import Recent
+from cprl.measuring.series import Recent
 from cprl.runs.curves import curves_of
 
 RANDOM = 282.0

@@ -13,10 +13,8 @@ from cprl.commons.near import neighbours
 from cprl.envs import CommonsGymnasiumEnv, parallel_env
 from cprl.evaluation import crossplay, scenarios_of
 from cprl.evaluation.film import film
-from cprl.measuring import phases, statistics
+from cprl.measuring import phases
 from cprl.measuring.episodes import EpisodeTracker
-from cprl.measuring.replicas import over_replicas
-from cprl.measuring.series import Series
 from cprl.policies.assignment import AgentPolicies
 from cprl.policies.lanes import random_lanes
 from cprl.policies.scripted import ScriptedActor, scripted_lanes
@@ -52,19 +50,12 @@ INF, NAN = float("inf"), float("nan")
         (lambda: RandomActor(3, seed=-1), "seed is -1; allowed: "),
         (lambda: QTables(2.5, 3, max_states=9), "lanes is 2.5; allowed: "),
         (lambda: AgentPolicies([3]), "the actor of 0 is 3; allowed: a torch module"),
-        (lambda: statistics.estimate("12"), "values is '12'; allowed: an array of numbers"),
-        (lambda: statistics.curve_interval([[1, INF]]), "curves holds infinity; allowed: "),
-        (lambda: statistics.curve_interval([[1.0]], confidence=2), "confidence is 2; allowed: "),
-        (lambda: phases.change_points([3, 2, 1], {"a": [1, 2, 3]}), "episodes is .*; allowed: .* increasing"),
-        (lambda: phases.phases([1, 2], {}, []), "metrics is empty; allowed: "),
         (lambda: phases.find_phases([0, 1e9], {"a": [1, 2]}), "episodes are 0 to 1e.09; allowed: at most"),
         (lambda: crossplay(["a", "b"], diagonal="selfplay"), "diagonal is 'selfplay'; allowed: self, cross_"),
         (lambda: crossplay([]), "the number of runs is 0; allowed: at least two"),
         (lambda: scenarios_of(3), "game is 3; allowed: a cprl.Game, because scripted"),
         (lambda: film("run", replica=1.5), "replica is 1.5; allowed: an integer >= 0"),
         (lambda: film("run", episode=2**32), "episode is 4294967296; allowed: an integer from 0"),
-        (lambda: over_replicas({0: ["a"]}), r"values\[0\] is 'a'; allowed: "),
-        (lambda: Series(2).add(0, 2, {}), "replica is 2; allowed: an integer from 0 to 1"),
         (lambda: EpisodeTracker(1, 1.5), "agents is 1.5; allowed: "),
         (lambda: EpisodeTracker(1, 1).load_state_dict({}), "the state has .*; allowed: at least "),
     ],
@@ -78,8 +69,6 @@ def test_worlds_that_do_not_fit_into_memory_are_refused_before_they_are_allocate
     for make in (Batch, CommonsEnv):
         with pytest.raises(MemoryError, match=r"worlds is 4,000,000,000: .* GiB are free: use fewer"):
             make(GAME, 4_000_000_000)
-    with pytest.raises(MemoryError, match="worlds is 4,000,000,000: the histories"):
-        EpisodeTracker(4_000_000_000, 4)
 
 
 def test_a_beam_wider_than_the_board_is_as_wide_as_the_board():
@@ -200,20 +189,3 @@ def test_one_world_takes_integers_of_any_library(action):
     world.reset()
     world.step(action)
     assert world.world.batch.now.step.sum() == 1
-
-
-@pytest.mark.integration
-def test_the_histories_of_long_episodes_grow_with_them():
-    rules = Rules(may_fire=False, regrow_prob=(0.5,), episode_steps=5000)
-    env = CommonsEnv(Game(map=GAME.map, rules=rules), 1)
-    tracker = EpisodeTracker(1, 1, 2**31 - 1)
-    exact = EpisodeTracker(1, 1, 5000)
-    action = torch.zeros(1, 1, dtype=torch.int64)
-    moment, episodes = env.reset(), []
-    while not episodes:
-        batch, moment = env.step_and_maybe_reset(moment.set(("agents", "action"), action))
-        episodes, others = tracker.add(batch), exact.add(batch)
-    assert episodes[0].steps == 5000
-    assert tracker._histories["harvest"].shape == (1, 8192, 1)
-    assert exact._histories["harvest"].shape == (1, 5000, 1)
-    assert episodes[0].metrics == others[0].metrics

@@ -11,7 +11,7 @@ from cprl import Experiment, Game, Rules, maps, presets
 from cprl.commands import main as cli
 from cprl.evaluation.play import Session, board_text, help_of, open_session, play_in_terminal
 from cprl.measuring.episodes import EpisodeTracker
-from cprl.measuring.replicas import social_metrics
+from cprl.measuring.statistics import social_metrics
 from cprl.population import Scripted
 from cprl.runs.recipe import start_run
 from cprl.runs.weights import save_weights
@@ -64,7 +64,7 @@ def test_the_same_seed_and_keys_play_the_same_again(run):
 
 
 def test_the_metrics_are_those_of_an_episode(run):
-    session, tracker, ended = open_session(str(run), others="greedy", seed=2), EpisodeTracker(1, 2, 6), []
+    session, tracker, ended = open_session(str(run), others="greedy", seed=2), EpisodeTracker(1, 2), []
     play = session._turns.play
 
     def watched():

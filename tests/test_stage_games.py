@@ -7,6 +7,7 @@ import pytest
 import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from report import write_report
 from restorable import assert_restorable
 from tensordict import TensorDict
 from torchrl.envs import EnvBase
@@ -22,7 +23,6 @@ from cprl.envs.taking import TakingEnv, TakingGame
 from cprl.evaluation.evaluate import differences
 from cprl.experiment import changes
 from cprl.population import Learning, Scripted
-from cprl.reporting import write_report
 from cprl.runs.episodes import read_episodes
 from cprl.runs.weights import load_weights
 from cprl.studies.trials import trials_of

@@ -8,8 +8,8 @@ from rerun.chunk import RrdReader
 from test_watch import fake
 
 from cprl import CommonsEnv, presets
+from cprl.measuring.metrics import reported_by
 from cprl.measuring.phases import LONGEST, PHASES_BEGIN
-from cprl.measuring.reported import reported_by
 from cprl.viewer import callback
 from cprl.viewer.blueprint import layout
 from cprl.viewer.callback import ViewerCallback

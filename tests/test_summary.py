@@ -14,8 +14,8 @@ from test_results import an_episode
 from torch import nn
 
 from cprl import CommonsEnv, Game, Rules, maps
-from cprl.measuring.names import NAMES, title, with_unit
-from cprl.measuring.replicas import over_replicas
+from cprl.measuring.metrics import NAMES, title, with_unit
+from cprl.measuring.statistics import over_replicas
 from cprl.runs.weights import BestWeights
 from cprl.terminal.summary import summarise
 

@@ -6,7 +6,7 @@ from test_movement import BEAM, FORWARD, STAY, Doing, drawn
 
 from cprl import CommonsEnv, Game, Rules, maps
 from cprl.measuring.movement import trace, visits
-from cprl.measuring.territory import defence, exclusion, owners, tagged_where, taggings, time_within, visitors
+from cprl.measuring.territory import defence, exclusion, owners, tagged_where, taggings, visitors
 
 APART = [[[0.5, 0.5, 0, 0]], [[0, 0, 1.0, 0]]]
 """Two agents on a board of one row and four columns, each in cells of its own."""
@@ -65,12 +65,6 @@ def test_the_owner_of_a_cell_spends_the_largest_share_there():
     assert owners(ALIKE).tolist() == [[0, 0, -1, -1]], "of equal ones the first"
 
 
-def test_time_within_is_the_share_of_each_agent_in_its_own_region():
-    left = np.array([[True, True, False, False]])
-    assert time_within(HALF, np.stack([left, ~left])).tolist() == [1.0, 0.5]
-    assert np.isnan(time_within([*HALF[:1], [[0, 0, 0, 0]]], np.stack([left, left]))[1])
-
-
 def test_a_trace_has_every_tag_with_who_fired():
     game = Game(
         map=maps.parse("A...A\n>...<\n....."),
@@ -100,21 +94,3 @@ def test_to_defend_is_to_tag_whom_one_finds_in_ones_own_cells():
     nowhere = np.zeros((2, 3, 4))
     assert defence(at_home, nowhere).tolist() == [0.5], "neither is at home"
     assert np.isnan(defence(shot([], cells), nowhere)).all()
-
-
-@pytest.mark.parametrize(
-    ("call", "message"),
-    [
-        (lambda: exclusion([[0.5, 0.5]]), r"visits is \[1, 2\]"),
-        (lambda: exclusion([[[0.5, 0.2]]]), "visits holds .* do not sum to 1"),
-        (lambda: owners([[[1.5, -0.5]]]), "visits holds negative numbers"),
-        (lambda: visitors([[[np.nan, 1]]]), "visits holds negative numbers, NaN"),
-        (lambda: time_within(HALF, np.ones((1, 4), bool)), r"regions is bool \[1, 4\]"),
-        (lambda: time_within(HALF, np.ones((2, 1, 4))), "regions is float64"),
-        (lambda: taggings(HALF), "trace is .*"),
-        (lambda: defence(shot([], [[(0, 0)]]), HALF), r"visits is \[2, 1, 4\]"),
-    ],
-)
-def test_what_is_no_visits_is_refused(call, message):
-    with pytest.raises(ValueError, match=message):
-        call()

@@ -12,7 +12,7 @@ from published import PHASED_RECIPE, curve
 from results import Result, Values, returns_by_chance
 from verdicts import curve_prediction
 
-from cprl.measuring.names import title, unit
+from cprl.measuring.metrics import title, unit
 from cprl.measuring.phases import PHASES, PHASES_BEGIN
 from cprl.runs.curves import running_mean
 from cprl.terminal import style

@@ -16,7 +16,7 @@ from results import Result, table
 
 from cprl import presets
 from cprl.commons.game import Game
-from cprl.measuring.yields import yield_of_game
+from cprl.measuring.episodes import yield_of_game
 from cprl.system.output import say
 from cprl.theory.growth import yield_bounds
 

@@ -23,7 +23,7 @@ from results import PooledResult, Result, pooled, read_result, table, told
 from tragedies import combat_section
 
 from cprl.arguments import SEED
-from cprl.commands.parts import check_runs
+from cprl.commands.play_stored import check_runs
 from cprl.commands.recipe import Allow, in_a_sentence, make_importable
 from cprl.runs.files import write_atomically
 from cprl.system.output import say

@@ -26,7 +26,7 @@ from cprl.commons.playing import harvests
 from cprl.evaluation.evaluate import SEED
 from cprl.evaluation.lanes import Source, fresh_worlds, policies_of, random_policies
 from cprl.experiment import Experiment
-from cprl.measuring.movement import Trace, overlap, rounds, shooting_distance, trace
+from cprl.measuring.movement import Trace, overlap, trace
 from cprl.policies.assignment import AgentPolicies
 from cprl.population import Learning, Scripted, Team, exploration_steps
 from cprl.runs.curves import (
@@ -38,9 +38,9 @@ from cprl.runs.curves import (
     phases_of,
     running_mean,
 )
-from cprl.runs.recipe import read_recipe
 from cprl.runs.episodes import read_episodes
 from cprl.runs.files import read_json
+from cprl.runs.recipe import read_recipe
 from cprl.runs.weights import lacks_weights
 from cprl.studies.study import UNNAMED, Condition
 from cprl.training.stored import LoadedRun, load
@@ -194,6 +194,60 @@ def of_play(played: Trace, replicas: int) -> dict[str, Values]:
             near, usual = shooting_distance(played, agent=agent)
             found[f"{NEARNESS}, agent {agent}"] = mean(near) / mean(usual)
     return found
+
+
+def rounds(trace: Trace) -> Values:
+    """Rounds of each agent about the centre of the board per 1000 steps, clockwise positive, float64 [B, N].
+
+    They are the changes of the agent's angle, as seen from the centre, summed over its steps.
+    """
+    height, width = trace.board
+    down, right = trace.row - (height - 1) / 2, trace.col - (width - 1) / 2
+    turned = np.diff(np.arctan2(down, right), axis=0)
+    turned = (turned + np.pi) % (2 * np.pi) - np.pi
+    here = trace.played[1:, :, None] & trace.in_play[1:] & trace.in_play[:-1]
+    steps = np.maximum(here.sum(0), 1)
+    gone: Values = (turned * here).sum(0) / (2 * np.pi) / steps * 1000
+    return gone
+
+
+def distance_to_nearest(trace: Trace) -> Values:
+    """The distance from each agent to the nearest other agent in play, in steps: rows plus columns.
+
+    Returns:
+        float64 [T, B, N]; NaN where the agent, or every other agent, is out of play.
+    """
+    apart = np.abs(trace.row[..., :, None] - trace.row[..., None, :]) + np.abs(
+        trace.col[..., :, None] - trace.col[..., None, :]
+    ).astype(np.float64)
+    both = trace.in_play[..., :, None] & trace.in_play[..., None, :]
+    both &= ~np.eye(trace.row.shape[-1], dtype=bool)
+    nearest: Values = np.where(both, apart, np.inf).min(-1)
+    nearest[~np.isfinite(nearest)] = np.nan
+    return nearest
+
+
+def shooting_distance(trace: Trace, *, agent: int | None = None) -> tuple[Values, Values]:
+    """The mean distance to the nearest other agent when an agent fires, and in all steps, float64 [B] each.
+
+    NaN where no agent fired while another was in play.
+
+    Args:
+        trace: the played episodes.
+        agent: the index of the agent whose distances are counted; None for all agents.
+    """
+    nearest = distance_to_nearest(trace)
+    counted = np.isfinite(nearest) & trace.played[..., None]
+    if agent is not None:
+        counted &= np.arange(nearest.shape[-1]) == agent
+
+    def mean_of(which: Values) -> Values:
+        number = which.sum((0, 2))
+        with np.errstate(invalid="ignore"):
+            means: Values = np.where(which, nearest, 0.0).sum((0, 2)) / number
+        return means
+
+    return mean_of(counted & trace.fired), mean_of(counted)
 
 
 def _share(part: Values, whole: Values) -> Values:

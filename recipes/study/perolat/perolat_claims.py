@@ -26,7 +26,6 @@ from cprl import Study, maps
 from cprl.commands.recipe import in_a_sentence
 from cprl.evaluation.territory import DEFENCE, EXCLUSION, OVERLAP, TAGS, Territory, territory_of
 from cprl.measuring.statistics import Estimate, difference, estimate
-from cprl.measuring.territory import time_within
 from cprl.runs.curves import as_curves
 from cprl.runs.episodes import read_table
 from cprl.studies.tables.sources import sources_of
@@ -73,7 +72,8 @@ def in_own_room(run: Path, policy: str) -> Values:
     visits = played(run).of(policy).visits
     cells = maps.room_cells()
     own = np.stack([cells[agent % len(cells)] for agent in range(visits.shape[1])])
-    shares: Values = time_within(visits, own).mean(1)
+    inside = (visits * own).sum((-2, -1))
+    shares: Values = np.where(visits.any((-2, -1)), inside, np.nan).mean(1)
     return shares
 
 

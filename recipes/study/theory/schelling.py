@@ -24,7 +24,7 @@ from cprl.evaluation import SchellingDiagram, draw_schelling, schelling
 from cprl.institutions import GraduatedSanctions, Quota, Tax
 from cprl.measuring.statistics import estimate
 from cprl.policies.scripted import SCRIPTED_POLICIES
-from cprl.runs.recipe import FILE_NAME
+from cprl.runs.recipe import RECIPE_FILE
 from cprl.system.output import say
 from cprl.terminal.style import check_picture
 
@@ -87,7 +87,7 @@ def diagrams(trained: Path) -> Iterator[tuple[str, str, str]]:
             yield from ((board, rules, who) for who in greedy)
             if rules == "as run":
                 run = trained / board
-                if (run / FILE_NAME).exists():
+                if (run / RECIPE_FILE).exists():
                     yield board, rules, str(run)
                 else:
                     say(f"{run} holds no run; the diagram of {board} with trained agents is left out")

@@ -42,9 +42,15 @@ from cprl.evaluation.evaluate import (
     unit_of_rewards,
 )
 from cprl.evaluation.lanes import Played, Source, play, policies_of, pooled
-from cprl.measuring.names import with_unit
-from cprl.measuring.replicas import Measured, institution_measures, over_replicas, social_measures
-from cprl.measuring.statistics import Estimate, difference
+from cprl.measuring.metrics import with_unit
+from cprl.measuring.statistics import (
+    Estimate,
+    Measured,
+    difference,
+    institution_measures,
+    over_replicas,
+    social_measures,
+)
 from cprl.runs.episodes import labelled
 from cprl.terminal.style import EMPTY, SHADES, SMALL_PT, draw_cell, head, picture_path, save, wrapped
 from cprl.training.stored import LoadedRun

@@ -15,16 +15,15 @@ from cprl.arguments import SEED as SEED
 from cprl.commons.game import Game
 from cprl.envs.unwrap import agent_names
 from cprl.evaluation.lanes import Played, Source, play, policies_of, random_policies
-from cprl.measuring.names import with_unit
-from cprl.measuring.replicas import (
+from cprl.measuring.metrics import left_out, with_unit
+from cprl.measuring.series import OF_AGENTS
+from cprl.measuring.statistics import (
     Measured,
     agents_without_harvest,
     institution_measures,
     over_replicas,
     social_measures,
 )
-from cprl.measuring.reported import left_out
-from cprl.measuring.series import OF_AGENTS
 from cprl.runs.episodes import labelled
 from cprl.training.stored import LoadedRun, load
 

@@ -27,8 +27,7 @@ from cprl.evaluation.film_pictures import (
     write_mp4,
 )
 from cprl.evaluation.lanes import Turns
-from cprl.measuring.episodes import Episode
-from cprl.measuring.tracking import tracker_of
+from cprl.measuring.episodes import Episode, tracker_of
 from cprl.policies.assignment import AgentPolicies
 from cprl.runs.files import refuse_to_write_over
 from cprl.system.memory import check_memory
@@ -356,8 +355,7 @@ def _play(fresh: FreshEpisode) -> tuple[list[Shown], list[set[int]], Episode]:
         shown = commons.worlds.show(commons.output)
         return shown._replace(observation=shown.observation[:0])
 
-    longest = commons.game.rules.episode_steps
-    tracker = tracker_of(env, longest)
+    tracker = tracker_of(env)
     turns = Turns(env, fresh.policies)
     moments, violators = [now()], [set[int]()]
     while True:

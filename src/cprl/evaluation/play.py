@@ -22,7 +22,7 @@ from cprl.envs.unwrap import commons_of
 from cprl.evaluation.lanes import Policy, Turns
 from cprl.evaluation.populations import agent_named, board_named
 from cprl.measuring import social
-from cprl.measuring.names import title
+from cprl.measuring.metrics import title
 from cprl.policies.scripted import SCRIPTED_POLICIES
 from cprl.population import Scripted
 from cprl.presets import Variant

@@ -42,9 +42,15 @@ from cprl.evaluation.evaluate import (
     transform_differences,
 )
 from cprl.evaluation.lanes import Played, play, pooled
-from cprl.measuring.names import with_unit
-from cprl.measuring.replicas import Measured, institution_measures, over_replicas, social_measures
-from cprl.measuring.statistics import Estimate, difference
+from cprl.measuring.metrics import with_unit
+from cprl.measuring.statistics import (
+    Estimate,
+    Measured,
+    difference,
+    institution_measures,
+    over_replicas,
+    social_measures,
+)
 from cprl.policies.assignment import AgentPolicies
 from cprl.population import Frozen, Scripted
 from cprl.runs.episodes import labelled

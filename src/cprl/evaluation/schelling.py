@@ -27,8 +27,7 @@ from cprl.evaluation.evaluate import INTERVALS, SEED, table_of
 from cprl.evaluation.lanes import Played, pooled
 from cprl.evaluation.populations import agent_named, place_of, play_population
 from cprl.measuring.dilemmas import Dilemma, dilemma
-from cprl.measuring.replicas import Measured, social_measures
-from cprl.measuring.statistics import estimate
+from cprl.measuring.statistics import Measured, estimate, social_measures
 from cprl.policies.scripted import SCRIPTED_POLICIES
 from cprl.runs.episodes import labelled
 from cprl.terminal import style

@@ -20,10 +20,12 @@ from itertools import product
 from math import isnan
 from typing import Final
 
-from numpy.typing import ArrayLike
+import numpy as np
+from numpy.typing import NDArray
 
-from cprl import arguments
 from cprl.measuring.statistics import Estimate, difference
+
+Values = NDArray[np.float64]
 
 NONE: Final = "no dilemma"
 UNTOLD: Final = "cannot be told"
@@ -57,7 +59,7 @@ class Dilemma:
         return " or ".join(self.candidates) if len(self.candidates) < _ALL else UNTOLD
 
 
-def dilemma(restrained: ArrayLike, greedy: ArrayLike) -> Dilemma:
+def dilemma(restrained: Values, greedy: Values) -> Dilemma:
     """Which dilemma payoffs make.
 
     Args:
@@ -65,19 +67,18 @@ def dilemma(restrained: ArrayLike, greedy: ArrayLike) -> Dilemma:
         greedy: G(k), likewise. Replicas are paired.
 
     Raises:
-        ValueError: for other shapes, a single agent, and numbers that are not finite.
+        ValueError: for other shapes, and a single agent.
     """
-    own, other = arguments.floats("restrained", restrained), arguments.floats("greedy", greedy)
-    if own.ndim != 2 or own.shape != other.shape or own.shape[1] < 2:
+    if restrained.ndim != 2 or restrained.shape != greedy.shape or restrained.shape[1] < 2:
         raise ValueError(
-            f"restrained is {list(own.shape)} and greedy {list(other.shape)}; allowed: [R, N] both, at least "
-            "2 agents"
+            f"restrained is {list(restrained.shape)} and greedy {list(greedy.shape)}; allowed: [R, N] both, "
+            "at least 2 agents"
         )
     pairs = {
-        "restraint": (own[:, -1], other[:, 0]),
-        "company": (own[:, -1], own[:, 0]),
-        "fear": (other[:, 0], own[:, 0]),
-        "greed": (other[:, -1], own[:, -1]),
+        "restraint": (restrained[:, -1], greedy[:, 0]),
+        "company": (restrained[:, -1], restrained[:, 0]),
+        "fear": (greedy[:, 0], restrained[:, 0]),
+        "greed": (greedy[:, -1], restrained[:, -1]),
     }
     return Dilemma(**{name: difference(*pair, paired=True) for name, pair in pairs.items()})
 

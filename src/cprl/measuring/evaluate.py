@@ -8,10 +8,8 @@ from tensordict import TensorDictBase
 from torchrl.envs import EnvBase
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 
-from cprl import arguments
 from cprl.envs.commons_env import CommonsEnv
-from cprl.measuring.episodes import Episode
-from cprl.measuring.tracking import tracker_of
+from cprl.measuring.episodes import Episode, tracker_of
 from cprl.system.process import one_thread
 
 Policy = Callable[[TensorDictBase], TensorDictBase]
@@ -34,12 +32,8 @@ def evaluate(env: EnvBase, policy: Policy, *, explore: bool = False) -> list[Epi
         ValueError: if the environment's batches lack entries or have wrong shapes, see `EpisodeTracker`.
     """
     worlds = env.batch_size.numel()
-    if not callable(policy):
-        raise arguments.refusal("policy", policy, "a function that writes the actions of all agents")
-    arguments.switch("explore", explore)
     is_commons = isinstance(env, CommonsEnv)
-    longest = env.game.rules.episode_steps if is_commons else None
-    tracker = tracker_of(env, longest)
+    tracker = tracker_of(env)
     exploration = ExplorationType.RANDOM if explore else ExplorationType.DETERMINISTIC
     episodes: dict[int, Episode] = {}
     with torch.no_grad(), one_thread(), set_exploration_type(exploration):
@@ -68,14 +62,7 @@ def _again_and_again(env: EnvBase, policy: Policy) -> Iterator[TensorDictBase]:
 
 
 def mean_return(episodes: list[Episode]) -> tuple[float, float]:
-    """The mean over episodes of the agents' summed return, and its standard error; NaN for one episode.
-
-    Raises:
-        ValueError: if there are no episodes.
-    """
-    episodes = list(arguments.listed("episodes", episodes, "a list of episodes"))
-    if not episodes or not all(isinstance(episode, Episode) for episode in episodes):
-        raise arguments.refusal("episodes", episodes, "at least one Episode")
+    """The mean over episodes of the agents' summed return, and its standard error; NaN for one episode."""
     returns = [float(episode.return_.sum()) for episode in episodes]
     error = stdev(returns) / len(returns) ** 0.5 if len(returns) > 1 else float("nan")
     return fmean(returns), error

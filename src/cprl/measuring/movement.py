@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from tensordict import TensorDictBase
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 
-from cprl import arguments, keys
+from cprl import keys
 from cprl.envs.commons_env import CommonsEnv
 from cprl.system.process import one_thread
 
@@ -81,7 +81,6 @@ def trace(
 
 def visits(trace: Trace) -> Array:
     """The share of its steps in play that each agent spent in each cell, float64 [B, N, H, W]."""
-    arguments.object_of("trace", trace, Trace, "a value of trace()")
     steps, worlds, agents = trace.row.shape
     counts = np.zeros((worlds, agents, *trace.board))
     here = trace.in_play & trace.played[..., None]
@@ -108,57 +107,3 @@ def overlap(trace: Trace) -> Array:
         for b in range(a + 1, agents)
     ]
     return np.mean(pairs, axis=0) if pairs else np.full(len(shares), np.nan)
-
-
-def rounds(trace: Trace) -> Array:
-    """Rounds of each agent about the centre of the board per 1000 steps, clockwise positive, float64 [B, N].
-
-    They are the changes of the agent's angle, as seen from the centre, summed over its steps.
-    """
-    height, width = trace.board
-    down, right = trace.row - (height - 1) / 2, trace.col - (width - 1) / 2
-    turned = np.diff(np.arctan2(down, right), axis=0)
-    turned = (turned + np.pi) % (2 * np.pi) - np.pi
-    here = trace.played[1:, :, None] & trace.in_play[1:] & trace.in_play[:-1]
-    steps = np.maximum(here.sum(0), 1)
-    gone: Array = (turned * here).sum(0) / (2 * np.pi) / steps * 1000
-    return gone
-
-
-def distance_to_nearest(trace: Trace) -> Array:
-    """The distance from each agent to the nearest other agent in play, in steps: rows plus columns.
-
-    Returns:
-        float64 [T, B, N]; NaN where the agent, or every other agent, is out of play.
-    """
-    apart = np.abs(trace.row[..., :, None] - trace.row[..., None, :]) + np.abs(
-        trace.col[..., :, None] - trace.col[..., None, :]
-    ).astype(np.float64)
-    both = trace.in_play[..., :, None] & trace.in_play[..., None, :]
-    both &= ~np.eye(trace.row.shape[-1], dtype=bool)
-    nearest: Array = np.where(both, apart, np.inf).min(-1)
-    nearest[~np.isfinite(nearest)] = np.nan
-    return nearest
-
-
-def shooting_distance(trace: Trace, *, agent: int | None = None) -> tuple[Array, Array]:
-    """The mean distance to the nearest other agent when an agent fires, and in all steps, float64 [B] each.
-
-    NaN where no agent fired while another was in play.
-
-    Args:
-        trace: the played episodes.
-        agent: the index of the agent whose distances are counted; None for all agents.
-    """
-    nearest = distance_to_nearest(trace)
-    counted = np.isfinite(nearest) & trace.played[..., None]
-    if agent is not None:
-        counted &= np.arange(nearest.shape[-1]) == agent
-
-    def mean_of(which: Array) -> Array:
-        number = which.sum((0, 2))
-        with np.errstate(invalid="ignore"):
-            means: Array = np.where(which, nearest, 0.0).sum((0, 2)) / number
-        return means
-
-    return mean_of(counted & trace.fired), mean_of(counted)

@@ -9,7 +9,7 @@ from math import isfinite
 from typing import Any, Final
 
 from cprl import arguments
-from cprl.measuring.recent import Recent
+from cprl.measuring.series import Recent
 
 BEGINS: Final = "begins"
 EXPLORING: Final = "exploring"
@@ -52,13 +52,10 @@ class Now:
     Args:
         agents: the number of agents of the group.
         random_play: r, in the unit of the values; None for the first running mean instead.
-
-    Raises:
-        ValueError: if a number is out of range.
     """
 
     def __init__(self, *, agents: int, random_play: float | None = None) -> None:
-        self._loss = TRAGEDY if arguments.integer("agents", agents, 1) > 1 else DECLINE
+        self._loss = TRAGEDY if agents > 1 else DECLINE
         self.random_play = random_play
         self.label = BEGINS
         self.mean = float("nan")

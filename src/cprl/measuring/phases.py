@@ -3,21 +3,16 @@
 In a phase every metric follows a straight line over the episodes; the lines of adjacent phases need not meet.
 The change points minimise the squared error summed over all metrics, each in units of its own standard
 deviation. Dynamic programming finds the exact minimum (C. Truong et al., "Selective review of offline change
-point detection methods" (2020), and their library ruptures).
+point detection methods" (2020)).
 """
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from itertools import pairwise
-from typing import Any, Final
+from typing import Final
 
 import numpy as np
-import ruptures
 from numpy.typing import ArrayLike, NDArray
-from ruptures.base import BaseCost
-
-from cprl import arguments
-from cprl.arguments import objects
 
 Values = NDArray[np.float64]
 
@@ -38,6 +33,10 @@ FEWEST_EPISODES: Final = 1_000
 """Phases are found in trainings of at least so many episodes; in shorter ones they would be noise."""
 EPISODES: Final = range(FEWEST_EPISODES, LONGEST + 1)
 """The numbers of episodes of trainings that have phases."""
+_JUMP: Final = 5
+"""Points of the grid between candidates for change points; the grid has `_JUMP` points in `GRID` episodes."""
+_LEAST: Final = SHORTEST * _JUMP // GRID
+"""The minimum length of a phase in points of the grid."""
 CHANGE: Final = 0.25
 """The share of its range by which a metric's line must rise or fall to count as rising or falling."""
 
@@ -84,19 +83,13 @@ def change_points(
         seed: The seed of the resampling.
 
     Raises:
-        ValueError: If there are too few or too many episodes, a metric has another shape or is NaN in some
-            episode of all replicas, or an argument is out of range.
+        ValueError: If there are too few or too many episodes, or a metric is NaN in some episode of all
+            replicas.
     """
-    at, by_name = _checked(episodes, metrics)
-    number, resamples = arguments.integer("number", number, 1), arguments.integer("resamples", resamples, 1)
-    seed = arguments.seed(seed)
-    shapes = {name: curve.shape for name, curve in by_name.items()}
-    if len(set(shapes.values())) > 1:
-        raise ValueError(f"metrics are {shapes}; allowed: the same shape for all")
-    curves = np.stack(list(by_name.values()))
+    at, curves = np.asarray(episodes, np.float64), np.stack(list(_curves(metrics).values()))
     if at[-1] - at[0] > LONGEST:
         raise ValueError(f"episodes are {at[0]:g} to {at[-1]:g}; allowed: at most {LONGEST:,} episodes")
-    grid = np.arange(at[0], at[-1] + 1e-9, GRID / 5)
+    grid = np.arange(at[0], at[-1] + 1e-9, GRID / _JUMP)
     if (grid[-1] - grid[0]) < (number + 1) * SHORTEST:
         raise ValueError(
             f"episodes {at[0]:g} to {at[-1]:g} are too few for {number + 1} phases of at least {SHORTEST}"
@@ -121,7 +114,6 @@ def find_phases(
     episodes: ArrayLike, metrics: Mapping[str, ArrayLike], *, number: int = 3, resamples: int = 200
 ) -> tuple[list[ChangePoint], list[Phase]]:
     """Finds `number` change points and the phases between them; see `change_points` and `phases`."""
-    number, resamples = arguments.integer("number", number, 0), arguments.integer("resamples", resamples, 1)
     changes = change_points(episodes, metrics, number=number, resamples=resamples) if number else []
     return changes, phases(episodes, metrics, changes)
 
@@ -144,15 +136,11 @@ def phases(
         changes: The change points, see `change_points`.
 
     Raises:
-        ValueError: If a metric is missing or has another shape, or a phase has fewer than two episodes.
+        ValueError: If a phase has fewer than two episodes.
     """
-    points = objects("changes", changes, ChangePoint, "change points")
-    at, by_name = _checked(episodes, metrics)
-    missing = [name for name in METRICS if name not in by_name]
-    if missing:
-        raise ValueError(f"metrics lack {missing}; allowed: at least {list(METRICS)}")
+    at, by_name = np.asarray(episodes, np.float64), _curves(metrics)
     means = {name: _over_replicas(by_name[name]) for name in METRICS}
-    bounds = [at[0], *(change.episode for change in points), at[-1]]
+    bounds = [at[0], *(change.episode for change in changes), at[-1]]
     found: list[Phase] = []
     for first, last in pairwise(bounds):
         inside = (at >= first) & (at <= last)
@@ -172,26 +160,9 @@ def phases(
     return found
 
 
-def _checked(episodes: ArrayLike, metrics: Mapping[str, ArrayLike]) -> tuple[Values, dict[str, Values]]:
-    """The episodes, [E], and each metric, [R, E], after checking their form."""
-    at = arguments.floats("episodes", episodes)
-    if at.ndim != 1 or len(at) < 2 or not (np.diff(at) > 0).all() or not np.isfinite(at[[0, -1]]).all():
-        raise arguments.refusal("episodes", episodes, "[E], at least two, finite and increasing")
-    arguments.object_of("metrics", metrics, Mapping, "a table of at least one metric, [E] or [R, E]")
-    curves = {
-        name: np.atleast_2d(arguments.floats(f"metrics[{name!r}]", own)) for name, own in metrics.items()
-    }
-    if not curves:
-        raise ValueError("metrics is empty; allowed: at least one metric, [E] or [R, E]")
-    for name, curve in curves.items():
-        if curve.ndim != 2 or curve.shape[1] != len(at) or not len(curve):
-            raise ValueError(
-                f"metrics[{name!r}] is {list(curve.shape)}; allowed: [{len(at)}] or [R, {len(at)}], as there "
-                f"are {len(at)} episodes"
-            )
-        if np.isinf(curve).any():
-            raise ValueError(f"metrics[{name!r}] holds infinity; allowed: finite numbers, and NaN")
-    return at, curves
+def _curves(metrics: Mapping[str, ArrayLike]) -> dict[str, Values]:
+    """Each metric, [R, E]."""
+    return {name: np.atleast_2d(np.asarray(curve, np.float64)) for name, curve in metrics.items()}
 
 
 def _label(change: Mapping[str, float], before: Sequence[str | None]) -> str | None:
@@ -215,29 +186,12 @@ def _over_replicas(curves: Values) -> Values:
     return means
 
 
-class _LineCost(BaseCost):
-    """The squared error of the best straight line over a segment, summed over metrics."""
+def _found(grid: Values, at: Values, means: Values, number: int) -> Values:
+    """The change points of one set of curves, [M, E] for M metrics.
 
-    model = "line"
-    min_size = int(SHORTEST // (GRID / 5))
-
-    def fit(self, signal: Values) -> "_LineCost":
-        self.signal = signal
-        place = np.arange(len(signal))[:, None]
-        sums = np.stack([signal, signal * place, signal**2]).cumsum(1)
-        self._sums = np.concatenate([np.zeros_like(sums[:, :1]), sums], 1)
-        return self
-
-    def error(self, start: int, end: int) -> float:
-        size, middle = end - start, (start + end - 1) / 2
-        total, by_place, squares = self._sums[:, end] - self._sums[:, start]
-        places = size * (size**2 - 1) / 12  # the sum of (place - middle)**2
-        slopes = (by_place - middle * total) ** 2 / places
-        return float((squares - total**2 / size - slopes).sum())
-
-
-def _found(grid: Values, at: Values, means: Values, number: int) -> Any:
-    """The change points of one set of curves, [M, E] for M metrics."""
+    Points of the grid are candidates at every `GRID` episodes, and the cost of a segment is the squared error
+    of its best straight lines.
+    """
     on_grid = np.stack([np.interp(grid, at, curve) for curve in means], axis=1)
     if not np.isfinite(on_grid).all():
         raise ValueError(
@@ -246,5 +200,35 @@ def _found(grid: Values, at: Values, means: Values, number: int) -> Any:
         )
     spread = on_grid.std(0)
     signal = (on_grid - on_grid.mean(0)) / np.where(spread > 0, spread, 1.0)
-    search = ruptures.Dynp(custom_cost=_LineCost(), min_size=_LineCost.min_size, jump=5).fit(signal)
-    return grid[np.array(search.predict(number)[:-1]) - 1]
+    ends = np.array([*range(0, len(signal), _JUMP), len(signal)])
+    if ends[-1] == ends[-2]:
+        ends = ends[:-1]
+    costs = _costs_of_lines(signal, ends)
+    # best[e]: the least cost of k + 1 segments up to ends[e]; before[k][e]: where the last of them begins.
+    best, before = costs[0], []
+    for _ in range(number):
+        totals = best[:, None] + costs
+        before.append(totals.argmin(0))
+        best = totals.min(0)
+    place, found = len(ends) - 1, []
+    for of_last in reversed(before):
+        place = of_last[place]
+        found.append(grid[ends[place] - 1])
+    return np.array(found[::-1])
+
+
+def _costs_of_lines(signal: Values, ends: NDArray[np.int64]) -> Values:
+    """The squared error of the best straight lines from ends[i] to ends[j] of a signal [G, M], summed over
+    metrics, [P, P] for P ends; infinite for segments shorter than `SHORTEST`."""
+    place = np.arange(len(signal))[:, None]
+    sums = np.stack([signal, signal * place, signal**2]).cumsum(1)
+    sums = np.concatenate([np.zeros_like(sums[:, :1]), sums], 1)[:, ends]
+    costs = np.full((len(ends), len(ends)), np.inf)
+    for last, end in enumerate(ends):
+        starts = ends[ends <= end - _LEAST]
+        size, middle = (end - starts)[:, None], ((starts + end - 1) / 2)[:, None]
+        total, by_place, squares = sums[:, last, None] - sums[:, : len(starts)]
+        places = size * (size**2 - 1) / 12  # the sum of (place - middle)**2
+        slopes = (by_place - middle * total) ** 2 / places
+        costs[: len(starts), last] = (squares - total**2 / size - slopes).sum(1)
+    return costs

@@ -1,6 +1,9 @@
-"""Joins the numbers of each episode over all replicas, once every replica has ended it."""
+"""Numbers that come episode by episode: of all replicas once each has ended it, and their recent mean."""
 
+from collections import deque
 from collections.abc import Mapping, Sequence
+from math import ceil, isnan
+from statistics import fmean
 from typing import Any, Final
 
 import numpy as np
@@ -8,7 +11,7 @@ from numpy.typing import NDArray
 
 from cprl import arguments
 from cprl.measuring.episodes import Episode
-from cprl.measuring.replicas import institution_metrics, social_metrics
+from cprl.measuring.statistics import institution_metrics, social_metrics
 
 Values = NDArray[np.float64]
 
@@ -50,13 +53,10 @@ class Series:
 
     Args:
         replicas: the number of replicas R.
-
-    Raises:
-        ValueError: if a number is out of range.
     """
 
     def __init__(self, replicas: int) -> None:
-        self.replicas = arguments.integer("replicas", replicas, 1)
+        self.replicas = replicas
         self._waiting: dict[int, dict[int, dict[str, float]]] = {}
 
     def add(self, episode: int, replica: int, numbers: Mapping[str, float]) -> dict[str, Values] | None:
@@ -66,10 +66,7 @@ class Series:
             Its numbers, [R] by name, NaN where a replica has none, if all replicas have ended the episode;
             else None.
         """
-        episode = arguments.integer("episode", episode, 0)
-        replica = arguments.integer("replica", replica, 0, self.replicas - 1)
         of_episode = self._waiting.setdefault(episode, {})
-        arguments.object_of("numbers", numbers, Mapping, "numbers by name")
         of_episode[replica] = dict(numbers)
         if len(of_episode) < self.replicas:
             return None
@@ -90,6 +87,44 @@ class Series:
 
 def mean_of(values: Values) -> float:
     """The mean of the defined values; NaN if none is defined."""
-    values = arguments.floats("values", values)
     defined = values[~np.isnan(values)]
     return float(defined.mean()) if len(defined) else float("nan")
+
+
+class Recent:
+    """The mean of the last values: of a share of those so far, but of `least` at least.
+
+    Args:
+        least: how many values at least; with fewer, the mean is that of all.
+        share: of the values so far, 0..1; 0 for a window of always `least`.
+    """
+
+    def __init__(self, least: int, *, share: float = 0.0) -> None:
+        self.least = least
+        self.share = share
+        self.count = 0
+        """Values so far."""
+        self._last: deque[float] = deque()
+
+    @property
+    def window(self) -> int:
+        """How many values the mean is of, at most."""
+        return max(self.least, ceil(self.share * self.count))
+
+    def add(self, value: float) -> float:
+        """Adds a value; returns the mean of the last ones that are defined, NaN if none is."""
+        self.count += 1
+        self._last.append(float(value))
+        while len(self._last) > self.window:
+            self._last.popleft()
+        defined = [own for own in self._last if not isnan(own)]
+        return fmean(defined) if defined else float("nan")
+
+    def state_dict(self) -> dict[str, Any]:
+        """The values in the window, and how many came."""
+        return {"last": list(self._last), "count": self.count}
+
+    def load_state_dict(self, state: dict[str, Any]) -> None:
+        """Continues from a state that `state_dict` returned."""
+        last: Sequence[float] = state["last"]
+        self._last, self.count = deque(last), int(state["count"])

@@ -1,4 +1,4 @@
-"""Statistics over replicas: means, differences, and their intervals by Student's t.
+"""Statistics over replicas: means, differences, and their intervals by Student's t; metrics of episodes.
 
 A replica is one independent repetition of a whole training. Episodes and agents within a replica depend on
 each other, so that values are float64 [R], one number per replica. Intervals by t of means over several
@@ -6,20 +6,20 @@ samples have the degrees of freedom of B. L. Welch, "The generalization of 'Stud
 different population variances are involved" (1947).
 """
 
-from collections.abc import Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+from math import isnan
+from statistics import fmean
 from typing import Final
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from cprl import arguments
-from cprl.checks import shown
+from cprl.measuring.episodes import Episode
 
 Values = NDArray[np.float64]
 
 CONFIDENCE: Final = 0.95
-_BELOW_ONE: Final = np.nextafter(1.0, 0.0).item()
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -40,30 +40,25 @@ class Estimate:
 
 
 def estimate(values: ArrayLike, *, confidence: float = CONFIDENCE) -> Estimate:
-    """The mean over replicas with its interval by Student's t.
+    """Return the mean over replicas with its interval by Student's t.
 
     Args:
         values: float [R].
         confidence: The confidence of the interval, between 0 and 1, exclusive.
 
     Raises:
-        ValueError: If there are no replicas, a value is not finite, or an argument is out of range.
+        ValueError: If there are no replicas, or a value is not finite.
     """
-    sample = _checked(values)
-    _check_confidence(confidence)
+    sample = _sample(values)
     low, high = _t_interval([sample], [1.0], confidence)
     # + 0.0, so that none is -0.0
     return Estimate(value=float(sample.mean()) + 0.0, low=low, high=high, replicas=len(sample))
 
 
 def difference(
-    values: ArrayLike,
-    reference: ArrayLike,
-    *,
-    paired: bool,
-    confidence: float = CONFIDENCE,
+    values: ArrayLike, reference: ArrayLike, *, paired: bool, confidence: float = CONFIDENCE
 ) -> Estimate:
-    """The difference between two means over replicas, with its interval.
+    """Return the difference between two means over replicas, with its interval.
 
     Args:
         values: float [R].
@@ -73,9 +68,9 @@ def difference(
         confidence: The confidence of the interval, between 0 and 1, exclusive.
 
     Raises:
-        ValueError: See `estimate`; for pairs of unequal numbers of replicas.
+        ValueError: If there are no replicas, a value is not finite, or pairs have unequal numbers of them.
     """
-    samples = [_checked(values), _checked(reference)]
+    samples = [_sample(values), _sample(reference)]
     if paired:
         if len(samples[0]) != len(samples[1]):
             raise ValueError(
@@ -83,14 +78,13 @@ def difference(
                 "as many"
             )
         return estimate(samples[0] - samples[1], confidence=confidence)
-    _check_confidence(confidence)
     low, high = _t_interval(samples, [1.0, -1.0], confidence)
     value = float(samples[0].mean() - samples[1].mean())
     return Estimate(value=value, low=low, high=high, replicas=sum(map(len, samples)))
 
 
 def curve_interval(curves: ArrayLike, *, confidence: float = CONFIDENCE) -> tuple[Values, Values, Values]:
-    """The mean of several curves and its interval by Student's t at each episode.
+    """Return the mean of several curves and its interval by Student's t at each episode.
 
     Args:
         curves: float [R, E], a curve of E episodes per replica; NaN where undefined.
@@ -99,24 +93,15 @@ def curve_interval(curves: ArrayLike, *, confidence: float = CONFIDENCE) -> tupl
     Returns:
         Mean, low and high, float64 [E]; NaN where no replica has a value, for low and high also where only
         one has.
-
-    Raises:
-        ValueError: If `curves` is not [R, E] with at least one replica and without infinity, or an argument
-            is out of range.
     """
     from scipy import stats
 
-    all_curves = arguments.floats("curves", curves)
-    if all_curves.ndim != 2 or not len(all_curves):
-        raise ValueError(f"curves is {list(all_curves.shape)}; allowed: [R, E], a curve per replica")
-    if np.isinf(all_curves).any():
-        raise ValueError("curves holds infinity; allowed: finite numbers, and NaN where undefined")
-    _check_confidence(confidence)
-    defined = ~np.isnan(all_curves)
+    curves = np.asarray(curves, np.float64)
+    defined = ~np.isnan(curves)
     replicas = defined.sum(0)
     with np.errstate(invalid="ignore", divide="ignore"):  # NaN of none, and of one its interval
-        middle = np.where(defined, all_curves, 0.0).sum(0) / replicas
-        squares = np.where(defined, all_curves - middle, 0.0) ** 2
+        middle = np.where(defined, curves, 0.0).sum(0) / replicas
+        squares = np.where(defined, curves - middle, 0.0) ** 2
         error = np.sqrt(squares.sum(0) / (replicas - 1) / replicas)
     reach = stats.t.ppf((1 + confidence) / 2, replicas - 1) * error
     return middle, middle - reach, middle + reach
@@ -152,14 +137,121 @@ def _t_interval(
     return middle - reach, middle + reach
 
 
-def _check_confidence(confidence: float) -> None:
-    arguments.number("confidence", confidence, low=0, high=_BELOW_ONE, above=True, allowed="above 0, below 1")
+def _sample(values: ArrayLike) -> Values:
+    sample = np.asarray(values, np.float64)
+    if sample.ndim != 1 or not len(sample) or not np.isfinite(sample).all():
+        raise ValueError(f"values is {sample.tolist()}; allowed: [R], a finite number for each replica")
+    return sample
 
 
-def _checked(values: ArrayLike) -> Values:
-    checked = arguments.floats("values", values)
-    if checked.ndim != 1 or not len(checked):
-        raise ValueError(f"values is {list(checked.shape)}; allowed: [R], one number per replica")
-    if not np.isfinite(checked).all():
-        raise ValueError(f"values is {shown(checked.tolist())}; allowed: finite numbers")
-    return checked
+@dataclass(frozen=True, kw_only=True)
+class Measured:
+    """A metric with one value per episode, over the episodes of several replicas."""
+
+    estimate: Estimate | None
+    """The estimate over replicas of each replica's mean over the episodes in which the metric is defined.
+    Replicas without such an episode are left out; None if no replica has one."""
+    undefined: int
+    """Episodes of all replicas in which the metric is undefined; they are not part of a mean."""
+    episodes: int
+    """Episodes of all replicas."""
+
+    def __str__(self) -> str:
+        if self.estimate is None:
+            return f"undefined in all {self.episodes}"
+        value = f"{self.estimate}"
+        return f"{value}, undefined in {self.undefined} of {self.episodes}" if self.undefined else value
+
+
+def over_replicas(values: Mapping[int, Sequence[float]]) -> Measured:
+    """Estimates a metric from its values by replica, one per episode, NaN where undefined.
+
+    Args:
+        values: the values by replica.
+
+    Raises:
+        ValueError: if there are no replicas, or a replica has no episodes.
+    """
+    if not values or not all(map(len, values.values())):
+        counts = {replica: len(own) for replica, own in values.items()}
+        raise ValueError(f"episodes by replica are {counts}; allowed: at least one replica, each at least 1")
+    defined = [[value for value in own if not isnan(value)] for own in values.values()]
+    means = [fmean(own) for own in defined if own]
+    episodes = sum(map(len, values.values()))
+    return Measured(
+        estimate=estimate(means) if means else None,
+        undefined=episodes - sum(map(len, defined)),
+        episodes=episodes,
+    )
+
+
+def social_metrics(episode: Episode) -> dict[str, float]:
+    """Each of "Social metrics" in docs/metrics.md by name, NaN where undefined.
+
+    Metrics that need entries that the game does not report are left out.
+    """
+    if episode.stock_left is None:
+        return dict(episode.metrics)
+    return {**episode.metrics, "stock_left": float(episode.stock_left)}
+
+
+def institution_metrics(episode: Episode) -> dict[str, float]:
+    """Each of "Institutions" in docs/metrics.md by name, NaN where undefined: `Episode.institutions`, and
+    what was decided, `in_force_0` and so on. Empty for a game without institutions."""
+    in_force: list[float] = [] if episode.in_force is None else episode.in_force.tolist()
+    return {**episode.institutions, **{f"in_force_{nth}": value for nth, value in enumerate(in_force)}}
+
+
+def institution_measures(played: Mapping[int, Sequence[Episode]]) -> dict[str, Measured]:
+    """Return `institution_metrics` over replicas, by name, as `institutions/fines` and so on.
+
+    Empty for a game without institutions.
+
+    Args:
+        played: episodes by replica.
+    """
+    measures = _measures(played, institution_metrics)
+    return {f"institutions/{name}": measured for name, measured in measures.items()}
+
+
+def social_measures(played: Mapping[int, Sequence[Episode]]) -> dict[str, Measured]:
+    """Return `social_metrics` over replicas, by name.
+
+    Args:
+        played: episodes by replica.
+
+    Raises:
+        ValueError: if there are no replicas, or a replica has no episodes.
+    """
+    return _measures(played, social_metrics)
+
+
+def _measures(
+    played: Mapping[int, Sequence[Episode]], metrics_of: Callable[[Episode], dict[str, float]]
+) -> dict[str, Measured]:
+    if not played or not all(played.values()):
+        counts = {replica: len(episodes) for replica, episodes in played.items()}
+        raise ValueError(f"episodes by replica are {counts}; allowed: at least one replica, each at least 1")
+    by_replica = {
+        replica: [metrics_of(episode) for episode in episodes] for replica, episodes in played.items()
+    }
+    names = next(iter(by_replica.values()))[0]
+    return {
+        name: over_replicas(
+            {replica: [metrics[name] for metrics in episodes] for replica, episodes in by_replica.items()}
+        )
+        for name in names
+    }
+
+
+def agents_without_harvest(played: Mapping[int, Sequence[Episode]]) -> tuple[int, int] | None:
+    """Counts the agents of all episodes without a harvest, which sustainability leaves out, and all agents.
+
+    None if the game reports no harvest.
+    """
+    harvests: list[float] = []
+    for episode in (episode for episodes in played.values() for episode in episodes):
+        if episode.harvest is None:
+            return None
+        harvests += episode.harvest.tolist()
+    return sum(apples == 0 for apples in harvests), len(harvests)

@@ -14,12 +14,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from cprl import arguments
 from cprl.measuring.movement import Trace
 
 Array = NDArray[Any]
-
-_SUM_TOLERANCE = 1e-6
 
 
 def visitors(visits: ArrayLike) -> Array:
@@ -33,7 +30,8 @@ def visitors(visits: ArrayLike) -> Array:
     Args:
         visits: shares [..., N, H, W].
     """
-    shares, agents = _checked(visits)
+    shares = np.asarray(visits, np.float64)
+    agents = _in_play(shares)
     within = shares.sum(-3, keepdims=True)
     odds = np.divide(shares, within, out=np.zeros_like(shares), where=within > 0)
     logs = np.log(odds, out=np.zeros_like(odds), where=odds > 0)
@@ -53,7 +51,7 @@ def exclusion(visits: ArrayLike) -> Array:
     Args:
         visits: shares [..., N, H, W].
     """
-    _, agents = _checked(visits)
+    agents = _in_play(visits)
     found = np.full(agents.shape, np.nan)
     several = agents > 1
     found[several] = 1 - np.log(visitors(visits)[several]) / np.log(agents[several])
@@ -68,31 +66,9 @@ def owners(visits: ArrayLike) -> Array:
     Args:
         visits: shares [..., N, H, W].
     """
-    shares, _ = _checked(visits)
+    shares = np.asarray(visits, np.float64)
     found: Array = np.where(shares.any(-3), shares.argmax(-3), -1)
     return found
-
-
-def time_within(visits: ArrayLike, regions: ArrayLike) -> Array:
-    """The share of its time that each agent spends in a region of its own, float64 [..., N]; NaN for an agent
-    that was never in play.
-
-    Args:
-        visits: shares [..., N, H, W].
-        regions: bool [N, H, W], the cells of each agent's region.
-
-    Raises:
-        ValueError: if regions has another shape.
-    """
-    shares, _ = _checked(visits)
-    own = np.asarray(regions)
-    if own.dtype != np.bool_ or own.shape != shares.shape[-3:]:
-        raise ValueError(
-            f"regions is {own.dtype} {list(own.shape)}; allowed: bool {list(shares.shape[-3:])}, the cells "
-            "of each agent's region"
-        )
-    inside = (shares * own).sum((-2, -1))
-    return np.where(shares.any((-2, -1)), inside, np.nan)
 
 
 def taggings(trace: Trace) -> Array:
@@ -100,7 +76,6 @@ def taggings(trace: Trace) -> Array:
 
     An agent that several beams hit at once is counted for each of those who fired.
     """
-    arguments.object_of("trace", trace, Trace, "a value of trace()")
     _, worlds, agents = trace.row.shape
     counts = np.zeros((worlds, agents, agents), np.int64)
     np.add.at(counts, tuple(trace.tags[:, 1:].T), 1)
@@ -113,7 +88,6 @@ def tagged_where(trace: Trace) -> Array:
     The cell is that at the start of the step, before the agent moved in it. An agent that several beams hit
     at once is counted once.
     """
-    arguments.object_of("trace", trace, Trace, "a value of trace()")
     _, worlds, agents = trace.row.shape
     counts = np.zeros((worlds, agents, *trace.board), np.int64)
     step, world, tagged = np.unique(trace.tags[:, :3], axis=0).T
@@ -133,14 +107,8 @@ def defence(trace: Trace, visits: ArrayLike) -> Array:
         trace: played episodes.
         visits: shares [N, H, W], or [B, N, H, W].
     """
-    arguments.object_of("trace", trace, Trace, "a value of trace()")
-    shares, _ = _checked(visits)
-    worlds, wanted = trace.row.shape[1], (trace.row.shape[2], *trace.board)
-    if shares.shape not in (wanted, (worlds, *wanted)):
-        raise ValueError(
-            f"visits is {list(shares.shape)}; allowed: {list(wanted)} or {[worlds, *wanted]}, as in the trace"
-        )
-    shares = np.broadcast_to(shares, (worlds, *wanted))
+    worlds = trace.row.shape[1]
+    shares = np.broadcast_to(np.asarray(visits), (worlds, trace.row.shape[2], *trace.board))
     step, world, tagged, by = trace.tags.T
     cell = trace.row[step, world, tagged], trace.col[step, world, tagged]
     more = np.sign(shares[world, by, *cell] - shares[world, tagged, *cell])
@@ -150,16 +118,6 @@ def defence(trace: Trace, visits: ArrayLike) -> Array:
     return found
 
 
-def _checked(visits: ArrayLike) -> tuple[Array, Array]:
-    """Visits as float64 [..., N, H, W], and of how many agents they are, int64 [...]."""
-    shares = arguments.floats("visits", visits)
-    if shares.ndim < 3:
-        raise ValueError(f"visits is {list(shares.shape)}; allowed: [..., N, H, W]")
-    sums = shares.sum((-2, -1))
-    is_one, is_zero = np.abs(sums - 1) < _SUM_TOLERANCE, sums == 0
-    if not (shares >= 0).all() or not (is_one | is_zero).all():
-        raise ValueError(
-            "visits holds negative numbers, NaN, or agents whose shares do not sum to 1; allowed: shares of "
-            "the time of each agent"
-        )
-    return shares, is_one.sum(-1)
+def _in_play(visits: ArrayLike) -> Array:
+    """How many agents were ever in play, int64 [...]."""
+    return np.asarray(np.asarray(visits).any((-2, -1)).sum(-1))

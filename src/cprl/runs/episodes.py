@@ -23,7 +23,7 @@ from tensordict import TensorDictBase
 from cprl.arguments import path as path_of
 from cprl.institutions import COUNTS
 from cprl.measuring import Episode, social
-from cprl.measuring.reported import left_out
+from cprl.measuring.metrics import left_out
 from cprl.runs.files import (
     RECIPE_FORMAT,
     read_json,

@@ -76,7 +76,7 @@ class LoggerCallback:
     from 0. An episode is written once all replicas have ended it: the mean over replicas as
     `social/equality`, and with several replicas the metrics and returns of each as
     `replica_0/social/equality`. Undefined values are not written, nor metrics that the game does not report,
-    see `cprl.measuring.reported`.
+    see `cprl.measuring.metrics`.
 
     After a resume, loggers get the episodes after the checkpoint again, with the same steps.
 

@@ -12,10 +12,10 @@ from matplotlib.patches import Rectangle
 from numpy.typing import NDArray
 
 from cprl.measuring.episodes import Episode
-from cprl.measuring.names import title as metric_title
-from cprl.measuring.names import unit
+from cprl.measuring.metrics import title as metric_title
+from cprl.measuring.metrics import unit
 from cprl.measuring.phases import Phase
-from cprl.measuring.replicas import institution_metrics
+from cprl.measuring.statistics import institution_metrics
 from cprl.runs.curves import SMOOTHED_EPISODES, centres, curves_of, episode_of_step, phases_of, running_mean
 from cprl.terminal import style
 from cprl.terminal.style import MARK, SMALL_PT, WIDTH_IN

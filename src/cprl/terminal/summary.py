@@ -10,9 +10,9 @@ from rich.console import Console
 from rich.table import Table
 
 from cprl.measuring.episodes import Episode
-from cprl.measuring.names import title as metric_title
-from cprl.measuring.replicas import institution_metrics, social_metrics
-from cprl.measuring.reported import INSTITUTIONAL, left_out
+from cprl.measuring.metrics import INSTITUTIONAL, left_out
+from cprl.measuring.metrics import title as metric_title
+from cprl.measuring.statistics import institution_metrics, social_metrics
 from cprl.system.output import console as safe_console
 from cprl.system.output import printed
 from cprl.viewer.page import to_watch

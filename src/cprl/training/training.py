@@ -28,8 +28,7 @@ from cprl.learners.base import (
     check_numbers,
     learned_in,
 )
-from cprl.measuring.episodes import Episode
-from cprl.measuring.tracking import tracker_of
+from cprl.measuring.episodes import Episode, tracker_of
 from cprl.policies.assignment import AgentIndices, AgentPolicies, agent_indices
 from cprl.policies.decisions import Decider
 from cprl.runs.files import TRAINING_STATE_FORMAT
@@ -109,8 +108,7 @@ class Training:
         self.decisions = decisions
         self._collector = make_collector(env, AgentPolicies({**actors, **self.others}, decisions=decisions))
         self._turns = iter(self._collector)
-        longest = None if commons is None else commons.game.rules.episode_steps
-        self._tracker = tracker_of(env, longest)
+        self._tracker = tracker_of(env)
         self._losses = {agents: LaneLosses(replicas, agents) for agents in self.learners}
         self._wanted = WantedReturns(replicas, spaces.agents, self.learners)
         for learner in self.learners.values():

@@ -17,10 +17,9 @@ from torchrl.envs import EnvBase
 
 from cprl.envs.unwrap import agent_names, commons_of
 from cprl.measuring.episodes import Episode
-from cprl.measuring.recent import Recent
-from cprl.measuring.replicas import social_metrics
-from cprl.measuring.reported import reported_by
-from cprl.measuring.series import OF_AGENTS, Series, Values, mean_of, numbers_of
+from cprl.measuring.metrics import reported_by
+from cprl.measuring.series import OF_AGENTS, Recent, Series, Values, mean_of, numbers_of
+from cprl.measuring.statistics import social_metrics
 from cprl.system.compile_clock import CLOCK
 from cprl.viewer.exhibition import Exhibited, Exhibition
 from cprl.viewer.frames import Filming, scene_of
@@ -157,7 +156,7 @@ class ViewerCallback:
     """Logs the metrics of every episode, and the frames of the first world in some episodes.
 
     Views that need what the game does not report are left out: a game without a board has no frames; for
-    metrics see `cprl.measuring.reported`. One event of the recording names them. With transforms, windows
+    metrics see `cprl.measuring.metrics`. One event of the recording names them. With transforms, windows
     show the observations of the `CommonsEnv` itself.
 
     Frames are recorded for every k-th episode, including the first and the last, and for the episode after

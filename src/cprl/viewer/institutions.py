@@ -6,7 +6,7 @@ from typing import Any, Final
 import rerun as rr
 
 from cprl.commons.colours import agent_colour
-from cprl.measuring.names import OF_INSTITUTIONS
+from cprl.measuring.metrics import INSTITUTION_NAMES
 from cprl.measuring.series import OF_AGENTS
 from cprl.viewer.panels import row
 from cprl.viewer.scenery import BLUE, GREEN, GREY, ORANGE, PURPLE, RANDOM_PLAY, VERMILION, Curves, running
@@ -79,7 +79,7 @@ def lines(curves: Curves) -> dict[str, Any]:
     """The names, colours and widths of the lines, by entity; none for a game without institutions."""
     styles = {
         f"institutions/{name}": running(
-            OF_INSTITUTIONS[name][0], COLOURS.get(name, GREY), curves.replicas, alone=name in SHARES
+            INSTITUTION_NAMES[name][0], COLOURS.get(name, GREY), curves.replicas, alone=name in SHARES
         )
         for name in curves.institutions
     }

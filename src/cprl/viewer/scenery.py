@@ -19,9 +19,9 @@ from cprl.commons.colours import (
     picture_colour,
 )
 from cprl.commons.decoding import UNSEEN
-from cprl.measuring import institutional, now, phases
-from cprl.measuring.reported import FIELDS, METRICS, available, left_out
-from cprl.measuring.yields import yield_of
+from cprl.measuring import now, phases
+from cprl.measuring.episodes import decisions_of, metrics_of, yield_of
+from cprl.measuring.metrics import FIELDS, METRICS, available, left_out
 
 ORANGE, BLUE, GREEN = (230, 160, 0), (86, 180, 233), (0, 158, 115)
 VERMILION, PURPLE, GREY = (213, 94, 0), (204, 121, 167), (150, 150, 150)
@@ -215,8 +215,8 @@ def curves_of(env: EnvBase, agents: tuple[str, ...], reported: Sequence[str], *,
         metrics=metrics,
         has_phases=episodes in phases.EPISODES and set(phases.METRICS) <= set(metrics),
         has_tags="tagged_by" in reported,
-        institutions=institutional.metrics_of(env, reported),
-        in_force=institutional.decisions_of(env) if "in_force" in reported else (),
+        institutions=metrics_of(env, reported),
+        in_force=decisions_of(env) if "in_force" in reported else (),
     )
 
 

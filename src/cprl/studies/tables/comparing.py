@@ -14,7 +14,7 @@ from rich.text import Text
 
 from cprl.arguments import LAST as LAST
 from cprl.arguments import choice, integer, object_of, refusal
-from cprl.measuring.names import title
+from cprl.measuring.metrics import title
 from cprl.measuring.statistics import CONFIDENCE, Estimate, difference, estimate
 from cprl.studies.tables.sources import NET, PARTS, TRAINING
 from cprl.studies.tables.table import StudyTable

@@ -1,4 +1,4 @@
-"""The entries that a game may not report, and the numbers that are then left out, by name.
+"""The names, words and units of metrics, and what is left out where a game does not report an entry.
 
 Every game reports rewards and how episodes end. It may lack the entries of `OPTIONAL`. The entries that each
 number needs are named in `cprl.measuring.social.NEEDS` for metrics, and here for the other fields of an
@@ -13,8 +13,66 @@ from tensordict import TensorDictBase
 from torchrl.envs import EnvBase
 
 from cprl import keys
-from cprl.arguments import listed, object_of
 from cprl.measuring import social
+
+SHARE: Final = "0 to 1"
+NAMES: Final = {
+    "collective_return": ("collective return", "apples"),
+    "efficiency": ("efficiency", "apples per step"),
+    "equality": ("equality (1 - Gini)", SHARE),
+    "sustainability": ("sustainability", "steps"),
+    "survival_steps": ("survival", "steps"),
+    "peace": ("peace", "agents"),
+    "peacefulness": ("peacefulness", "steps in play per agent"),
+    "stock_left": ("stock left at the end", "apples"),
+    "yield_share": ("yield share of the steps played", "ratio"),
+}
+"""The words and the unit of each metric of an episode."""
+INSTITUTION_NAMES: Final = {
+    "fines": ("fines of all", "apples"),
+    "transfers": ("transfers to all", "apples"),
+    "violations": ("violations", "turns"),
+    "violations_per_step": ("violations per turn in play", SHARE),
+    "trespasses": ("trespasses", "turns"),
+    "excess_bites": ("taken above a quota", "bites"),
+    "closed_bites": ("taken in closed seasons and patches", "bites"),
+    "own_share_of_bites": ("bites where one may bite", SHARE),
+    "detection_rate": ("violations detected", SHARE),
+    "recidivism": ("violations after a sanction", SHARE),
+    "sanctions_per_violation": ("sanctions per violation", "ratio"),
+    "unjust_share_of_tags": ("unjust tags", SHARE),
+    "net_equality": ("equality of net incomes", SHARE),
+    "equality_within": ("equality within groups", SHARE),
+    "equality_between": ("equality between groups", SHARE),
+    "net_equality_within": ("equality of net incomes within groups", SHARE),
+    "net_equality_between": ("equality of net incomes between groups", SHARE),
+}
+"""The same of the metrics of institutions, without the prefix `institutions/`."""
+_WORDS: Final = {**NAMES, **{f"institutions/{name}": words for name, words in INSTITUTION_NAMES.items()}}
+
+
+def title(name: str) -> str:
+    """Words and unit of a metric, e.g. "survival, steps"; the name itself if it is none."""
+    return ", ".join(_WORDS[name]) if name in _WORDS else name
+
+
+def unit(name: str) -> str:
+    """The unit after a value, e.g. "steps"; "" where a range stands for one. A single agent's return is in
+    apples."""
+    found = "apples" if name.startswith("return_") else _WORDS.get(name, ("", ""))[1]
+    return "" if found == SHARE else found
+
+
+def with_unit(name: str, *, rewards: str = "") -> str:
+    """The name of a metric in code with its unit, e.g. "survival_steps (steps)".
+
+    Args:
+        name: of a metric, or of what an agent gets or pays: ".../return", ".../fines", ".../transfers".
+        rewards: the unit of rewards; "" if the game does not say.
+    """
+    own = rewards if name.endswith(("/return", "/fines", "/transfers")) else _WORDS.get(name, ("", ""))[1]
+    return f"{name} ({own})" if own else name
+
 
 OPTIONAL: Final = ("harvest", "in_play", "fired", "hit_by", "tagged_by", "stock")
 """The optional entries, by the last part of their keys in `cprl.keys`; all but "stock" are in "agents"."""
@@ -56,7 +114,6 @@ INSTITUTIONAL: Final[Mapping[str, str]] = MappingProxyType(
 
 def reported_by(env: EnvBase) -> tuple[str, ...]:
     """The entries of `OPTIONAL` and `OF_INSTITUTIONS` in the specs of an environment, transforms included."""
-    object_of("env", env, EnvBase, "a TorchRL environment")
     found = set(env.observation_spec.keys(include_nested=True))
     return tuple(name for name in (*OPTIONAL, *OF_INSTITUTIONS) if {name, (keys.AGENTS, name)} & found)
 
@@ -64,7 +121,6 @@ def reported_by(env: EnvBase) -> tuple[str, ...]:
 def reported_in(tensordict: TensorDictBase) -> tuple[str, ...]:
     """The entries of `OPTIONAL` and `OF_INSTITUTIONS` in a batch: in_play at the root, the others under
     "next"."""
-    object_of("tensordict", tensordict, TensorDictBase, "a TensorDict")
     places: dict[str, Any] = {name: ("next", keys.AGENTS, name) for name in (*OPTIONAL, *OF_INSTITUTIONS)}
     places |= {"in_play": keys.IN_PLAY, "stock": ("next", keys.STOCK), "in_force": ("next", keys.IN_FORCE)}
     return tuple(name for name, place in places.items() if tensordict.get(place, None) is not None)
@@ -77,8 +133,6 @@ def available(needs: Mapping[str, tuple[str, ...]], reported: Collection[str]) -
         needs: the entries by name, e.g. `FIELDS`.
         reported: the entries of `OPTIONAL` that the game reports.
     """
-    object_of("needs", needs, Mapping, "the entries by name, e.g. FIELDS")
-    reported = listed("reported", reported, "names of entries")
     return tuple(name for name, entries in needs.items() if set(entries) <= set(reported))
 
 
@@ -89,7 +143,6 @@ def left_out(reported: Collection[str], *, more: Mapping[str, tuple[str, ...]] |
         reported: the entries of `OPTIONAL` that the game reports.
         more: further names and the entries that they need; other words say what else the game lacks.
     """
-    reported = listed("reported", reported, "names of entries")
     lacking: dict[str, list[str]] = {}
     for name, entries in {**METRICS, **FIELDS, **(more or {})}.items():
         missing = " and no ".join(entry for entry in entries if entry not in reported)
