@@ -64,6 +64,11 @@ class Play:
         self.batch.play(actions, self.whole, decided)
         return self
 
+    def shown(self, count: int) -> list[list[int]]:
+        """What institutions show each agent, 0..255, after the plane of forbidden cells."""
+        first = len(self.game.cell_channels) + ("forbidden" in self.game.channels)
+        return [seen[first:].reshape(-1)[:count].tolist() for seen in self.output.observation[0]]
+
     def again(self) -> "Play":
         """Begins the next episode."""
         self.batch.begin(self.whole)

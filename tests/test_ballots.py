@@ -188,18 +188,12 @@ def test_an_elected_monitor_and_an_elected_sanctioner_are_two_elections():
     assert play.fines == [0, 0, 0.5]
 
 
-def shown(play, count):
-    """What institutions show each agent, 0..255."""
-    first = len(play.game.cell_channels)
-    return [seen[first:].reshape(-1)[:count].tolist() for seen in play.output.observation[0]]
-
-
 def test_agents_see_what_is_in_force_and_whether_they_may_fire():
     both = [Vote(on=LOST, choices=(0.0, 0.2, 0.8)), Sanctioner()]
     play = Play(THREE, institutions=both, observation=Observation(encoding="one_hot"))
-    assert shown(play, 2) == [[0, 255], [0, 0], [0, 0]], "before an election agent 0 is in office"
+    assert play.shown(2) == [[0, 255], [0, 0], [0, 0]], "before an election agent 0 is in office"
     # 1 + 3 x 2; 0.2 of at most 0.8 is a quarter: 63.75.
-    assert shown(play.turn("stay", decisions=(7, 7, 7)), 2) == [[64, 0], [64, 0], [64, 255]]
+    assert play.turn("stay", decisions=(7, 7, 7)).shown(2) == [[64, 0], [64, 0], [64, 255]]
     hidden = [Vote(on=LOST, choices=CHOICES, observed=False), Sanctioner(observed=False)]
     assert Play(THREE, institutions=hidden).game.channels == ("red", "green", "blue")
 
@@ -210,7 +204,7 @@ def test_a_vote_on_a_quota_shows_the_quota_relative_to_the_largest_choice():
     play = Play(THREE, institutions=[vote], regrow_prob=(1.0,))
     play.turn("stay", decisions=(0, 0, 0))
     # In force 0.4 / 4, left 1 / 10, and the whole window.
-    assert shown(play, 3) == [[26, 26, 255]] * 3
+    assert play.shown(3) == [[26, 26, 255]] * 3
     hidden = Vote(on=Quota(observed=False), choices=(0.4, 4))
     play = Play(THREE, institutions=[hidden], regrow_prob=(1.0,)).turn("stay", decisions=(0, 0, 0))
-    assert shown(play, 3) == [[26, 26, 26]] * 3, "in force alone"
+    assert play.shown(3) == [[26, 26, 26]] * 3, "in force alone"

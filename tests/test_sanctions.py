@@ -63,19 +63,13 @@ def test_who_monitors_pays_the_cost_of_every_turn(monitor, fines):
     assert not any(play.violated)
 
 
-def shown(play, count):
-    """What institutions show each agent, 0..255, after the plane of forbidden cells."""
-    first = len(play.game.cell_channels) + ("forbidden" in play.game.channels)
-    return [seen[first:].reshape(-1)[:count].tolist() for seen in play.output.observation[0]]
-
-
 def test_agents_see_that_they_were_detected_and_that_they_monitor():
     play = Play(BOARD, institutions=[OUTSIDE, Monitoring(prob=1.0, monitor="elected")])
-    assert shown(play, 2) == [[0, 255], [0, 0]], "agent 0 is in office before the election"
+    assert play.shown(2) == [[0, 255], [0, 0]], "agent 0 is in office before the election"
     play.turn("stay", decisions=(1, 1))
-    assert shown(play, 2) == [[0, 0], [255, 255]]
+    assert play.shown(2) == [[0, 0], [255, 255]]
     play.turn("stay", "right")
-    assert shown(play, 2) == [[0, 0], [0, 255]], "of the last turn alone"
+    assert play.shown(2) == [[0, 0], [0, 255]], "of the last turn alone"
 
 
 def missed(play):
@@ -165,9 +159,9 @@ def test_agents_see_their_level():
     sanctions = GraduatedSanctions(freeze_steps=(0, 0, 0), fines=(0,), recovery_steps=2, on="violations")
     play = Play(BOARD, institutions=[OUTSIDE, sanctions])
     # Of the last level, 2: 0, 1/2, 1, 1, then falling.
-    seen = [shown(play, 1)[1][0], *(shown(play.turn("stay"), 1)[1][0] for _ in range(3))]
+    seen = [play.shown(1)[1][0], *(play.turn("stay").shown(1)[1][0] for _ in range(3))]
     assert seen == [0, 128, 255, 255]
-    seen = [shown(play.turn("stay", action), 1)[1][0] for action in ("right", "stay", "stay", "stay")]
+    seen = [play.turn("stay", action).shown(1)[1][0] for action in ("right", "stay", "stay", "stay")]
     assert seen == [255, 255, 255, 128], "from level 3 to 2 after two turns, and to 1 after two more"
 
 
@@ -284,9 +278,9 @@ def test_an_unjust_shooter_is_sanctioned():
 
 def test_agents_see_who_violated_a_rule_of_late_their_own_mark_first():
     play = mediated("A....\n>..^.", turns=2)
-    assert shown(play, 2) == [[0, 0], [0, 0]]
-    assert shown(play.turn("beam", "stay"), 2) == [[255, 0], [0, 255]], "agent 0 did, in the last turn"
-    assert shown(play.turn("stay"), 2) == [[0, 0], [0, 0]], "a tag in the coming turn would be unjust"
+    assert play.shown(2) == [[0, 0], [0, 0]]
+    assert play.turn("beam", "stay").shown(2) == [[255, 0], [0, 255]], "agent 0 did, in the last turn"
+    assert play.turn("stay").shown(2) == [[0, 0], [0, 0]], "a tag in the coming turn would be unjust"
 
 
 def test_as_run_everything_follows_in_the_same_way():

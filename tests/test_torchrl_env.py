@@ -160,21 +160,6 @@ def test_a_mask_resets_only_the_marked_worlds():
     assert env.worlds.now.step[:, 0].tolist() == [5, 0, 5]
 
 
-@pytest.mark.parametrize("bad", [-1, 8])
-def test_unknown_actions_raise_and_change_nothing(bad):
-    env = CommonsEnv(SHORT, worlds=2)
-    moment = env.reset()
-    kept = moment.clone()
-    moment[keys.ACTION] = torch.tensor([[0, 0], [0, bad]])
-    for step in (env.step, env.step_and_maybe_reset):
-        with pytest.raises(
-            ValueError, match=f"action {bad} of agent 1 in world 1 is unknown; allowed: 0 to 7"
-        ):
-            step(moment.clone())
-    assert env.worlds.now.step.sum() == 0
-    assert_close(moment.exclude(keys.ACTION), kept)
-
-
 @pytest.mark.parametrize("game", [SHORT, GOVERNED], ids=["plain", "institutions"])
 def test_what_was_returned_never_changes_later(game):
     env = CommonsEnv(game, worlds=3)

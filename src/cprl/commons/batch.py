@@ -243,38 +243,25 @@ class Batch:
         return output
 
     def check(self, actions: Actions) -> None:
-        """Checks actions for `play`.
-
-        Raises:
-            ValueError: If `actions` is not int64 [B, N], an action is out of range, or the worlds have not
-                begun.
-        """
+        """Checks actions for `play`."""
         arguments.array("actions", actions, (self.size, self.game.agents), np.int64)
         if not self._has_begun:
             raise ValueError("the worlds have not begun; allowed: reset() or load() before the first step")
-        known = len(self.game.actions)
-        at = self.driver.first_unknown(actions, known)
-        if at >= 0:
-            world, agent = divmod(at, self.game.agents)
-            raise ValueError(
-                f"action {self.driver.read(actions)[world, agent]} of agent {agent} in world {world} is "
-                f"unknown; allowed: 0 to {known - 1} ({', '.join(self.game.actions)})"
-            )
+        self._check_known("action", actions, len(self.game.actions), self.game.actions)
 
     def check_decisions(self, decisions: Actions) -> None:
-        """Checks decisions for `play`.
-
-        Raises:
-            ValueError: If they are not int64 [B, N], or one is out of range.
-        """
+        """Checks decisions for `play`."""
         arguments.array("decisions", decisions, (self.size, self.game.agents), np.int64)
-        options = self.game.decisions
-        at = self.driver.first_unknown(decisions, max(1, options))
+        self._check_known("decision", decisions, max(1, self.game.decisions))
+
+    def _check_known(self, what: str, chosen: Actions, known: int, names: tuple[str, ...] = ()) -> None:
+        at = self.driver.first_unknown(chosen, known)
         if at >= 0:
             world, agent = divmod(at, self.game.agents)
+            came = self.driver.read(chosen)[world, agent]
+            allowed = f"0 to {known - 1}" + (f" ({', '.join(names)})" if names else "")
             raise ValueError(
-                f"decision {self.driver.read(decisions)[world, agent]} of agent {agent} in world {world} is "
-                f"unknown; allowed: 0 to {max(1, options) - 1}"
+                f"{what} {came} of agent {agent} in world {world} is unknown; allowed: {allowed}"
             )
 
 

@@ -53,10 +53,6 @@ def kept_on_disk(function: FunctionType, **options: Any) -> Any:
 
     Of processes that lack it at the same time one compiles it, and the others wait and read it. Where it
     cannot be kept or read, e.g. on a full disk, each compiles it.
-
-    Args:
-        function: a plain function.
-        options: of `numba.njit`.
     """
     try:
         made: Any = numba.njit(**options, cache=True)(function)

@@ -34,10 +34,6 @@ class CudaThreads:
     Worlds and scratch memory are stored with the axis B innermost, so that neighbouring threads read
     neighbouring words. Step outputs are stored row-major, as in torch.
 
-    Args:
-        game: The game.
-        worlds: The number of worlds B.
-
     Raises:
         ValueError: If Numba finds no GPU.
         MemoryError: If the worlds do not fit into its memory.

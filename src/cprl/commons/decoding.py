@@ -13,11 +13,8 @@ UNSEEN: Final = 255
 
 
 def classes_seen(game: Game, windows: Bytes) -> Bytes:
-    """The class of each observed cell (`cprl.commons.colours`); UNSEEN for a colour the game does not use.
-
-    Args:
-        game: The game, which defines the form of the observations.
-        windows: uint8 [T, N, C, X, Y], observations.
+    """The class of each cell (`cprl.commons.colours`) of a game's observations, uint8 [T, N, C, X, Y]; UNSEEN
+    for a colour that the game does not use.
 
     Returns:
         uint8 [T, N, X, Y].

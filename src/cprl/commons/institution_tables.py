@@ -46,15 +46,7 @@ def build_institution_tables(
     *,
     first_plane: int,
 ) -> InstitutionTables:
-    """Builds the tables of a game's institutions.
-
-    Args:
-        institutions: Those of the game.
-        board: Its map.
-        rules: Its rules.
-        tables: Those of the game itself.
-        first_plane: The number of channels of observations before those of institutions.
-    """
+    """Builds the tables of a game's institutions."""
     voted = ballots(institutions, board.agents)
     entries = entries_shown(institutions, board.agents)
     return InstitutionTables(
@@ -324,11 +316,7 @@ KINDS: Final = (
 
 
 def check_institutions(institutions: tuple[Any, ...], board: Map, rules: Rules, form: Observation) -> None:
-    """Checks that institutions fit each other, the map, the rules and the observation.
-
-    Raises:
-        ValueError: If not; names the institution and says what is allowed.
-    """
+    """Checks that institutions fit each other, the map, the rules and the observation."""
     if len(institutions) > MOST_INSTITUTIONS:
         raise ValueError(
             f"Game.institutions has {len(institutions)} entries; allowed: at most {MOST_INSTITUTIONS}"

@@ -1,6 +1,5 @@
-"""The order of a turn of a game with institutions, on one world.
-
-The parts are those of `turn`; where institutions decide, this module asks their rules (`cprl.institutions`).
+"""What institutions do in a turn, on one world: `cprl.commons.turn` calls this, and it asks their rules in
+`cprl.institutions`.
 
 Institutions add planes to agents' observations, after the channels of cells. A plane "forbidden" is 255 on
 the cells of the window where a bite of the agent would break a rule about places. Planes "institutions" hold

@@ -86,11 +86,7 @@ START: Final = ("row", "col", "heading")
 
 
 def check_cells(name: str, height: int, width: int) -> None:
-    """Checks the number of cells of a board.
-
-    Raises:
-        ValueError: If there are too many.
-    """
+    """Checks the number of cells of a board."""
     if height * width > LARGEST_BOARD_CELLS:
         raise ValueError(
             f"{name} has {height:,} x {width:,} = {height * width:,} cells; allowed: at most "
@@ -105,9 +101,6 @@ def cells_of(name: str, entries: Any, form: tuple[str, ...] = CELL) -> tuple[Any
         name: Their name in messages.
         entries: A sequence of them.
         form: What the numbers of an entry are.
-
-    Raises:
-        ValueError: If they are anything else; the message names the entry.
     """
     allowed = f"({', '.join(form)}), integers"
     if not isinstance(entries, type) and callable(getattr(entries, "tolist", None)):
@@ -255,11 +248,7 @@ NAMES: Final = tuple(_DRAWINGS)
 
 
 def named(name: str) -> Map:
-    """A published board, by its name in `NAMES`.
-
-    Raises:
-        ValueError: If there is no board of this name.
-    """
+    """A published board, by its name in `NAMES`."""
     choice("name", name, NAMES)
     board = parse(_DRAWINGS[name])
     starts = _NUMBERED_STARTS.get(name, board.starts)
@@ -322,9 +311,6 @@ def crosses(
         centres: (row, col) of the centre of each cross; a cell in two crosses is one site.
         starts: (row, col, heading) of each agent.
         walls: (row, col) of each inner wall.
-
-    Raises:
-        ValueError: If a site or start lies outside the board or on a wall; the message names row and column.
     """
     sites = {
         (row + down, col + right)
@@ -352,9 +338,6 @@ def rooms(entrances: Entrances = "single", *, agents: int = 12) -> Map:
     Args:
         entrances: The board: "single", "multiple", "none" or "unequal".
         agents: The number of agents N, 1 to 12.
-
-    Raises:
-        ValueError: If `entrances` or `agents` is not allowed.
     """
     choice("entrances", entrances, get_args(Entrances))
     agents = integer("agents", agents, 1, 2 * len(_NORTH_STARTS))

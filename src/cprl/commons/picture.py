@@ -48,10 +48,6 @@ def board_image(
 
     Returns:
         uint8 [H * cell_pixels + 1, W * cell_pixels + 1, 3], RGB.
-
-    Raises:
-        ValueError: If `cell_pixels` is out of range.
-        MemoryError: If the image does not fit into memory.
     """
     size = integer("cell_pixels", cell_pixels, 8, LARGEST_CELL_PIXELS)
     pixels = (board.height * size + 1) * (board.width * size + 1)

@@ -15,15 +15,11 @@ _STARTS_NAMED = 3
 def why_out_of_reach(
     board: Map, institutions: Sequence[Institution] = (), *, shuffle_starts: bool = False
 ) -> str | None:
-    """A sentence that says why no agent can harvest any site of a map; None if one can.
+    """A sentence that says why no agent can harvest any site of a map; None if one can. With `shuffle_starts`
+    any agent may start at any start.
 
     Agents walk over all cells but walls, also through each other's, since others may move away. `Boundaries`
     without a fine stop bites, not steps.
-
-    Args:
-        board: the map.
-        institutions: those of the game.
-        shuffle_starts: whether any agent may start at any start.
     """
     stops = [own for own in institutions if isinstance(own, Boundaries) and own.bite_fine is None]
     if not board.walls and not stops:

@@ -35,11 +35,6 @@ def names(game: Game) -> tuple[str, ...]:
 def checked(state: Mapping[str, Any], *, worlds: int, game: Game) -> State:
     """Returns a state as arrays, after checking that the game can be in it.
 
-    Args:
-        state: Arrays by the `names` of the game, with the shapes and dtypes of `Worlds`.
-        worlds: The number of worlds B.
-        game: The game.
-
     Raises:
         ValueError: If the game cannot be in this state; the message names the entry, its value and what is
             allowed.

@@ -88,11 +88,7 @@ class Tables(NamedTuple):
 
 
 def check_sizes(board: Map, rules: Rules) -> None:
-    """Checks the sizes of the two largest tables, before they are built.
-
-    Raises:
-        ValueError: If a table would be too large; the message says what to change.
-    """
+    """Checks the sizes of the two largest tables, before they are built."""
     reach, sites = int(rules.regrow_radius_cells), len(board.sites)
     around = (2 * min(reach, board.height) + 1) * (2 * min(reach, board.width) + 1) - 1
     pairs = sites * min(sites - 1, around)
@@ -160,15 +156,12 @@ def _board_cells(board: Map, rim: int, stride: int) -> Ints:
 
 
 def cells_between(rows: int, cols: int) -> list[tuple[int, int]]:
-    """The cells whose interior the straight line between two cell centres crosses, without the two ends.
+    """The cells whose interior the straight line between two cell centres crosses, without the two ends; the
+    second one lies so many rows and columns from the first.
 
     A line that only touches a corner of a cell does not cross the cell: agents see through the gap between
     two diagonal walls. The line crosses the interior of the unit square around (r, c) if
     abs(rows c - cols r) < (abs(rows) + abs(cols)) / 2.
-
-    Args:
-        rows: The rows from the first cell to the second.
-        cols: The columns from the first cell to the second.
 
     Returns:
         (row, col) of each cell, relative to the first.

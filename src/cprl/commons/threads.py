@@ -35,9 +35,6 @@ class CpuThreads:
         game: The game.
         worlds: The number of worlds B.
         threads: The number of threads that share the worlds; None uses all cores where that is faster.
-
-    Raises:
-        ValueError: If `threads` is not allowed.
     """
 
     def __init__(self, game: Game, worlds: int, *, threads: int | None = None) -> None:
@@ -99,9 +96,6 @@ class CpuThreads:
             output: The arrays that the loop writes.
             law: What the institutions of the game need, arrays that are written included.
             checked: Whether the caller has checked the form of `argument` and `output`.
-
-        Raises:
-            ValueError: If an array has the wrong form.
         """
         if not checked:
             _check_contiguous(argument)

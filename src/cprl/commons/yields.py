@@ -18,10 +18,6 @@ def sustainable_yield(board: Map, rules: Rules) -> float:
     found by a greedy search, so more may be possible. An isolated cross under the published probabilities
     has two harvested sites with three apples near each: 0.1 apples a turn as run.
 
-    Args:
-        board: The map.
-        rules: Its rules.
-
     Returns:
         Apples per turn of all agents together; 0 where nothing grows.
     """

@@ -36,19 +36,11 @@ class Institution:
     """The switches of `Observation` without which agents cannot use what this institution shows them."""
 
     def check_board(self, *, agents: int, height: int, width: int) -> None:
-        """Checks that it fits a board with N agents.
-
-        Raises:
-            ValueError: If not; says what is allowed.
-        """
+        """Checks that it fits a board with N agents."""
 
 
 def check_agent_indices(name: str, indices: Sequence[int], agents: int) -> None:
-    """Checks that all indices are of agents of the game.
-
-    Raises:
-        ValueError: For the first that is not.
-    """
+    """Checks that all indices are of agents of the game."""
     for agent in indices:
         if agent >= agents:
             raise ValueError(f"{name} has agent {agent}; allowed on this map: 0 to {agents - 1}")
@@ -64,9 +56,6 @@ def check_no_election(own: Institution, elects: str) -> None:
     Args:
         own: the institution.
         elects: what it would have to be for an election, in words.
-
-    Raises:
-        ValueError: For the first field of `OF_ELECTIONS` that does not have its default.
     """
     for field in fields(own):
         if field.name in OF_ELECTIONS and (value := getattr(own, field.name)) != field.default:

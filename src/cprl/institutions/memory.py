@@ -18,33 +18,15 @@ Numbers: TypeAlias = NDArray[np.float64]
 Longs: TypeAlias = NDArray[np.int64]
 
 COUNTS: Final = (
-    "own_bites",
-    "foreign_bites",
-    "trespasses",
-    "excess_bites",
-    "closed_bites",
-    "unjust_tags",
-    "violations",
-    "detections",
-    "sanctions",
-    "returns_to_violation",
+    *("own_bites", "foreign_bites", "trespasses", "excess_bites", "closed_bites"),
+    *("unjust_tags", "violations", "detections", "sanctions", "returns_to_violation"),
 )
 """What is counted in an episode for each agent: bites where it may bite and in others' regions; turns in
 others' regions; bites above a quota, and in a closed season or patch; unjust tags of its own; turns with a
 violation; those that were detected; sanctions (of `GraduatedSanctions`); turns with a violation
 later than a sanction."""
-(
-    OWN_BITES,
-    FOREIGN_BITES,
-    TRESPASSES,
-    EXCESS_BITES,
-    CLOSED_BITES,
-    UNJUST_TAGS,
-    VIOLATIONS,
-    DETECTIONS,
-    SANCTIONS,
-    RETURNS,
-) = range(len(COUNTS))
+OWN_BITES, FOREIGN_BITES, TRESPASSES, EXCESS_BITES, CLOSED_BITES = range(5)
+UNJUST_TAGS, VIOLATIONS, DETECTIONS, SANCTIONS, RETURNS = range(5, 10)
 
 
 class Memory(NamedTuple):
@@ -118,30 +100,12 @@ class Payments(NamedTuple):
 
 
 SHOWN: Final = (
-    "quota left",
-    "quota time",
-    "season closed",
-    "season time",
-    "sanction level",
-    "detected",
-    "violator",
-    "may fire",
-    "in force",
-    "elected",
+    *("quota left", "quota time", "season closed", "season time", "sanction level"),
+    *("detected", "violator", "may fire", "in force", "elected"),
 )
 """What an entry shows agents; see `cprl.institutions.showing`."""
-(
-    QUOTA_LEFT,
-    QUOTA_TIME,
-    CLOSED,
-    SEASON_TIME,
-    LEVEL,
-    DETECTED,
-    MARK,
-    MAY_FIRE,
-    IN_FORCE,
-    IS_ELECTED,
-) = range(len(SHOWN))
+QUOTA_LEFT, QUOTA_TIME, CLOSED, SEASON_TIME, LEVEL = range(5)
+DETECTED, MARK, MAY_FIRE, IN_FORCE, IS_ELECTED = range(5, 10)
 
 
 class InstitutionTables(NamedTuple):
