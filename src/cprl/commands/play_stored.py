@@ -311,7 +311,7 @@ def egta(
     from cprl.evaluation.egta import analyse, draw_egta, egta_heading, egta_tables
     from cprl.evaluation.empirical_game import pairwise_game, play_empirical_game
     from cprl.runs.episodes import write_table
-    from cprl.theory.extras import check_extras
+    from cprl.theory.solutions import check_extras
 
     check_extras()
     prepare_process(seed)

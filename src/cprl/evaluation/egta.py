@@ -24,9 +24,17 @@ from cprl.evaluation.empirical_game import EmpiricalGame
 from cprl.evaluation.evaluate import how_they_play, table_of
 from cprl.measuring.statistics import CONFIDENCE, Estimate, estimate
 from cprl.terminal import style
-from cprl.theory.equilibria import MOST_STRATEGIES, Equilibrium, equilibria
-from cprl.theory.evolution import AlphaRank, Ends, alpha_rank, replicator, replicator_ends
 from cprl.theory.payoff_table import PayoffTable, Values, compositions
+from cprl.theory.solutions import (
+    MOST_STRATEGIES,
+    AlphaRank,
+    Ends,
+    Equilibrium,
+    alpha_rank,
+    equilibria,
+    replicator,
+    replicator_ends,
+)
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)

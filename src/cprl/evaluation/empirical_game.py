@@ -26,8 +26,8 @@ from cprl.evaluation.evaluate import SEED, check, check_same_game, chosen_replic
 from cprl.evaluation.lanes import Played, Source, play, policies_of
 from cprl.measuring.episodes import Episode
 from cprl.runs.episodes import labelled
-from cprl.theory.evolution import MOST_PROFILES
 from cprl.theory.payoff_table import PayoffTable, compositions
+from cprl.theory.solutions import MOST_PROFILES
 from cprl.training.stored import LoadedRun
 
 Values = NDArray[np.float64]

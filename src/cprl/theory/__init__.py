@@ -2,21 +2,25 @@
 measured amount to.
 
 Modules, in the order in which one reads them:
-    worth         what a unit is worth when so many are taken in all
-    sharing       SharingGame: equilibrium, optimum, price of anarchy; the herders' game, and appropriation
+    sharing       SharingGame: equilibrium, optimum, price of anarchy; the herders' game, and appropriation;
+                  Worth, what a unit is worth when so many are taken in all
     growth        yield_bounds: what the apples of any map can bear, from below and from above
     payoff_table  PayoffTable: a symmetric game with a few strategies, by how many agents play each
-    equilibria    Nash equilibria of two agents, by nashpy
-    evolution     alpha-rank and replicator dynamics, by OpenSpiel
-    extras        the packages of the extra "theory"
+    solutions     Nash equilibria of two agents, alpha-rank and replicator dynamics, by nashpy and OpenSpiel
 """
 
-from cprl.theory.equilibria import Equilibrium, equilibria
-from cprl.theory.evolution import AlphaRank, Ends, alpha_rank, replicator, replicator_ends
 from cprl.theory.growth import YieldBounds, yield_bounds
 from cprl.theory.payoff_table import PayoffTable, compositions, sharing_table
-from cprl.theory.sharing import SharingGame, appropriation, herders
-from cprl.theory.worth import CallableWorth, PowerWorth, Worth
+from cprl.theory.sharing import CallableWorth, PowerWorth, SharingGame, Worth, appropriation, herders
+from cprl.theory.solutions import (
+    AlphaRank,
+    Ends,
+    Equilibrium,
+    alpha_rank,
+    equilibria,
+    replicator,
+    replicator_ends,
+)
 
 __all__ = [
     "AlphaRank",

@@ -18,7 +18,6 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from cprl import arguments
 from cprl.commons.maps import Map
 from cprl.commons.near import neighbours
 from cprl.commons.rules import Rules
@@ -57,13 +56,7 @@ def yield_bounds(board: Map, rules: Rules, *, nodes: int = NODES) -> YieldBounds
         rules: its rules.
         nodes: how long the search goes on: more bring the bounds together. The result follows from it alone,
             not from the machine's speed.
-
-    Raises:
-        ValueError: for anything else.
     """
-    arguments.object_of("board", board, Map, "a Map")
-    arguments.object_of("rules", rules, Rules, "Rules")
-    nodes = arguments.integer("nodes", nodes, 1, 2**31 - 1)
     first, near = neighbours(board, rules)
     around = [near[first[k] : first[k + 1]].astype(np.int64) for k in range(len(first) - 1)]
     probs = np.array(rules.regrow_prob, np.float64)

@@ -38,10 +38,8 @@ def compositions(agents: int, strategies: int) -> Counts:
     them play strategy 0, the last one the last strategy.
 
     Raises:
-        ValueError: for numbers out of range, and for more than 100,000 rows.
+        ValueError: for more than 100,000 rows.
     """
-    agents = arguments.integer("agents", agents, 1, 1000)
-    strategies = arguments.integer("strategies", strategies, 1, 1000)
     rows = comb(agents + strategies - 1, agents)
     if rows > MOST_COMPOSITIONS:
         raise ValueError(
@@ -70,7 +68,7 @@ class PayoffTable:
 
     def __post_init__(self) -> None:
         agents = arguments.integer("agents", self.agents, 2, 1000)
-        given = arguments.floats("payoffs", self.payoffs)
+        given = np.asarray(self.payoffs, np.float64)
         strategies = given.shape[1] if given.ndim == 2 else 0
         rows = comb(agents + strategies - 1, agents) if strategies > 1 else 0
         if given.ndim != 2 or strategies < 2 or len(given) != rows:
@@ -90,7 +88,7 @@ class PayoffTable:
         Raises:
             ValueError: if it is not float [S, S].
         """
-        given = arguments.floats("matrix", matrix)
+        given = np.asarray(matrix, np.float64)
         if given.ndim != 2 or given.shape[0] != given.shape[1] or len(given) < 2:
             raise ValueError(f"matrix is {list(given.shape)}; allowed: [S, S], of 2 or more strategies")
         counts = compositions(2, len(given))
@@ -210,12 +208,9 @@ def sharing_table(game: SharingGame, levels: ArrayLike) -> PayoffTable:
         levels: float [S], what an agent may take.
 
     Raises:
-        ValueError: for levels that cannot be taken, or are fewer than two.
+        ValueError: for levels that cannot be taken.
     """
-    arguments.object_of("game", game, SharingGame, "a SharingGame, e.g. herders(2)")
-    taken = arguments.floats("levels", levels)
-    if taken.ndim != 1 or len(taken) < 2:
-        raise ValueError(f"levels is {list(taken.shape)}; allowed: [S], of 2 or more levels")
+    taken = np.asarray(levels, np.float64)
     counts = compositions(game.agents, len(taken))
     payoffs = np.zeros(counts.shape)
     for row, own in enumerate(counts):
@@ -230,7 +225,7 @@ def mixture_of(mixture: ArrayLike, strategies: int) -> Values:
     Raises:
         ValueError: for anything else.
     """
-    shares = arguments.floats("mixture", mixture)
+    shares = np.asarray(mixture, np.float64)
     is_mixture = shares.shape == (strategies,) and (shares >= 0).all() and abs(shares.sum() - 1) < _SUM
     if not is_mixture:
         allowed = f"[{strategies}] of shares from 0 to 1 that sum to 1"

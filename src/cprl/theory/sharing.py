@@ -10,14 +10,12 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cached_property
 from math import inf
-from typing import Final
+from typing import Final, Protocol, runtime_checkable
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from cprl import arguments
 from cprl.checks import (
-    MOST_NUMBER,
     NONE,
     Check,
     check_arguments,
@@ -28,9 +26,150 @@ from cprl.checks import (
     is_number,
     number,
 )
-from cprl.theory.worth import PowerWorth, Worth
 
+_STEP: Final = 1e-6
+"""Of the numerical slope, as a share of the range."""
+_TRIED: Final = 64
+"""Totals at which a function of the user's own is tried."""
+_ROUNDING: Final = 1e-9
+_NOTHING: Final = 1e-3
+"""What a unit may still be worth at `most`, as a share of the highest value."""
 _HALVINGS: Final = 200
+_MOST: Final = 1e12
+_POSITIVE: Final = Check(
+    lambda value: is_number(value, 0, _MOST) and value > 0, f"a number above 0, up to {_MOST:g}"
+)
+_FUNCTION: Final = Check(callable, "a function of the total")
+_OF_POWER: Final[dict[str, Check]] = {
+    "top": _POSITIVE,
+    "factor": _POSITIVE,
+    "power": Check(lambda value: is_number(value, 1, 64), "a number in 1..64"),
+}
+_OF_CALLABLE: Final[dict[str, Check]] = {
+    "function": _FUNCTION,
+    "most": _POSITIVE,
+    "derivative": either(NONE, _FUNCTION),
+}
+
+
+@runtime_checkable
+class Worth(Protocol):
+    """What a unit is worth, as a function of the total A: positive below `most`, 0 from there on, falling,
+    and ever more steeply (v' < 0, v'' < 0; a straight line is allowed too)."""
+
+    @property
+    def most(self) -> float:
+        """The total from which on a unit is worth nothing."""
+        ...
+
+    def at(self, total: float) -> float:
+        """v(A)."""
+        ...
+
+    def slope(self, total: float) -> float:
+        """v'(A), below `most`."""
+        ...
+
+
+@dataclass(frozen=True, kw_only=True)
+class PowerWorth:
+    """v(A) = top - factor A^power, and 0 where that is negative.
+
+    Raises:
+        ValueError: names the field, what came and what is allowed.
+    """
+
+    top: float = 10.0
+    """v(0), above 0."""
+    factor: float = 1.0
+    """Above 0."""
+    power: float = 2.0
+    """At least 1; with 1 it is a straight line."""
+
+    def __post_init__(self) -> None:
+        check_fields(self, _OF_POWER)
+
+    @property
+    def most(self) -> float:
+        """The total from which on a unit is worth nothing."""
+        return float((self.top / self.factor) ** (1 / self.power))
+
+    def at(self, total: float) -> float:
+        """v(A)."""
+        return float(max(self.top - self.factor * total**self.power, 0.0))
+
+    def slope(self, total: float) -> float:
+        """v'(A), below `most`."""
+        return float(-self.factor * self.power * total ** (self.power - 1))
+
+    def balance(self, cost: float, share: float) -> float:
+        """The total A with v(A) + share A v'(A) = cost, in closed form; 0 where v(0) is below the cost."""
+        return float(
+            (max(self.top - cost, 0.0) / (self.factor * (1 + share * self.power))) ** (1 / self.power)
+        )
+
+
+@dataclass(frozen=True, kw_only=True)
+class CallableWorth:
+    """A function of your own: positive below `most`, falling there to 0, and never less steeply.
+
+    Raises:
+        ValueError: names the field, what came and what is allowed; also where the function, at one of 64
+            totals, fails, rises, becomes less steep or is not positive, where it is not 0 at `most`, to a
+            thousandth of its highest value, and where the derivative is none of this function.
+    """
+
+    function: Callable[[float], float]
+    """v(A), from a total to what a unit is worth."""
+    most: float
+    """The total from which on a unit is worth nothing."""
+    derivative: Callable[[float], float] | None = None
+    """v'(A); by default from differences of the function."""
+
+    def __post_init__(self) -> None:
+        check_fields(self, _OF_CALLABLE)
+        totals = np.linspace(0.0, self.most, _TRIED + 1)
+        values = self._tried("function", totals)
+        chords = np.diff(values) / totals[1]
+        margin = _ROUNDING * np.abs(chords).max()
+        allowed = "positive below `most`, falling there to 0, ever more steeply or in a straight line"
+        if (
+            not values[:-1].min() > 0
+            or not chords.max() < margin
+            or not np.diff(chords).max() <= margin
+            or abs(values[-1]) > _NOTHING * values.max()
+        ):
+            raise ValueError(f"CallableWorth.function is {values[:2]} .. {values[-2:]}; allowed: {allowed}")
+        if self.derivative is None:
+            return
+        # That of a function which falls ever more steeply lies between the slopes of the chords beside it.
+        slopes, before = self._tried("derivative", totals[:-1]), np.array([0.0, *chords[:-1]])
+        if not ((chords - margin <= slopes) & (slopes <= before + margin)).all():
+            raise ValueError("CallableWorth.derivative is none of the function; allowed: v', or None")
+
+    def _tried(self, field: str, totals: NDArray[np.float64]) -> NDArray[np.float64]:
+        """What a function of the user's own gives for totals."""
+        function = getattr(self, field)
+        try:
+            values = np.array([float(function(float(total))) for total in totals])
+        except Exception as error:
+            failed = f"{type(error).__name__}: {error}"
+            raise ValueError(f"CallableWorth.{field} fails ({failed}); allowed: a number") from error
+        if not np.isfinite(values).all():
+            raise ValueError(f"CallableWorth.{field} gives NaN or infinity; allowed: a finite number")
+        return values
+
+    def at(self, total: float) -> float:
+        """v(A)."""
+        return float(self.function(total)) if total < self.most else 0.0
+
+    def slope(self, total: float) -> float:
+        """v'(A), below `most`."""
+        if self.derivative is not None:
+            return float(self.derivative(total))
+        step = _STEP * self.most
+        low, high = max(total - step, 0.0), min(total + step, self.most)
+        return (float(self.function(high)) - float(self.function(low))) / (high - low)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -66,20 +205,19 @@ class SharingGame:
         Raises:
             ValueError: for another shape, and for numbers that cannot be taken.
         """
-        own = arguments.floats("taken", taken)
-        if own.ndim == 0 or own.shape[-1] != self.agents:
-            raise ValueError(f"taken is {list(own.shape)}; allowed: [..., {self.agents}], a number per agent")
-        if not ((own >= 0) & (own <= self._limit) & np.isfinite(own)).all():
+        amounts = np.asarray(taken, np.float64)
+        if amounts.ndim == 0 or amounts.shape[-1] != self.agents:
+            raise ValueError(f"taken is {list(amounts.shape)}; allowed: [..., {self.agents}], one per agent")
+        if not ((amounts >= 0) & (amounts <= self._limit) & np.isfinite(amounts)).all():
             raise ValueError(
-                f"taken has numbers from {own.min():g} to {own.max():g}; allowed: 0 to {self._limit:g}"
+                f"taken is from {amounts.min():g} to {amounts.max():g}; allowed: 0 to {self._limit:g}"
             )
-        values = np.vectorize(self.worth.at, otypes=[np.float64])(own.sum(-1))
-        paid: NDArray[np.float64] = own * (values - self.cost)[..., None] + self.payment
+        values = np.vectorize(self.worth.at, otypes=[np.float64])(amounts.sum(-1))
+        paid: NDArray[np.float64] = amounts * (values - self.cost)[..., None] + self.payment
         return paid
 
     def surplus(self, total: float) -> float:
         """What all agents together gain when they take so much in all: X (v(X) - c), without payments."""
-        total = _total(total, "total")
         return total * (self.worth.at(total) - self.cost)
 
     @cached_property
@@ -115,7 +253,7 @@ class SharingGame:
 
         It solves v(x + O) + x v'(x + O) = c, where O is what the others take.
         """
-        others, worth = _total(others, "others"), self.worth
+        worth = self.worth
 
         def gain(own: float) -> float:
             return worth.at(own + others) + own * worth.slope(own + others) - self.cost
@@ -205,14 +343,6 @@ def _root(falling: Callable[[float], float], most: float) -> float:
     return (low + high) / 2
 
 
-def _total(value: float, name: str) -> float:
-    return arguments.number(name, value, low=0, high=MOST_NUMBER, allowed="a number >= 0")
-
-
-_MOST: Final = 1e12
-_POSITIVE: Final = Check(
-    lambda value: is_number(value, 0, _MOST) and value > 0, f"a number above 0, up to {_MOST:g}"
-)
 _CHECKS: Final[dict[str, Check]] = {
     "agents": count(1),
     "worth": instance(

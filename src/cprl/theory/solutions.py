@@ -1,4 +1,6 @@
-"""Which strategies last where they compete: alpha-rank and replicator dynamics, by OpenSpiel.
+"""What a payoff table amounts to: Nash equilibria by nashpy, alpha-rank and replicator dynamics by OpenSpiel.
+
+Both packages come with the extra "theory", and are imported where they are used.
 
 Alpha-rank: each of the N agents stands for a population that plays one strategy. Now and then a mutant turns
 up in one of them, and takes it over the more probably, the more it gets beside what it replaces while the
@@ -15,15 +17,20 @@ infinite alpha.
 """
 
 from dataclasses import dataclass
+from importlib import import_module
+from importlib.util import find_spec
 from typing import Any, Final
 
 import numpy as np
 from numpy.typing import ArrayLike
 
-from cprl import arguments
-from cprl.theory.extras import extra
 from cprl.theory.payoff_table import PayoffTable, Values, mixture_of
 
+_PACKAGES: Final = {"open_spiel": "alpha-rank and replicator dynamics", "nashpy": "equilibria"}
+MOST_STRATEGIES: Final = 6
+"""With more, nashpy takes minutes."""
+_SAME: Final = 1e-6
+"""Shares that differ by less are the same."""
 MOST_PROFILES: Final = 256
 """S^N, e.g. 4 agents with 4 strategies; with more, OpenSpiel takes seconds."""
 STARTS: Final = 40
@@ -34,7 +41,55 @@ _STEPS: Final = 1500
 _AT_REST: Final = 1e-6
 _NO_GAIN: Final = 1e-5
 """By how much a strategy may get more than the mean at rest, as a share of the range of the payoffs."""
-_SAME: Final = 0.01
+_SAME_END: Final = 0.01
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Equilibrium:
+    """What two agents play, so that neither gains if it alone plays anything else."""
+
+    first: Values
+    """float64 [S], the shares of the strategies that one agent plays."""
+    second: Values
+    """float64 [S], those of the other."""
+
+    @property
+    def is_symmetric(self) -> bool:
+        """Whether both play the same."""
+        return bool(np.allclose(self.first, self.second, atol=_SAME))
+
+    @property
+    def support(self) -> tuple[int, ...]:
+        """The strategies that an agent plays, ascending."""
+        return tuple(np.flatnonzero((self.first > _SAME) | (self.second > _SAME)).tolist())
+
+
+def equilibria(table: PayoffTable) -> tuple[Equilibrium, ...]:
+    """The equilibria of a symmetric game of two agents, by nashpy's enumeration of vertices.
+
+    They are all of them, unless the game is degenerate: where strategies are equally good, there may be
+    infinitely many, and these are the corners. An equilibrium in which the agents play differently is there
+    once, not once for either agent.
+
+    Args:
+        table: of two agents and up to 6 strategies; of a game of more agents its `reduced`.
+
+    Raises:
+        ValueError: for other tables.
+        ModuleNotFoundError: if nashpy is not installed.
+    """
+    if table.agents != 2:
+        raise ValueError(f"table is of {table.agents} agents; allowed: 2, e.g. table.reduced")
+    if table.strategies > MOST_STRATEGIES:
+        raise ValueError(f"table has {table.strategies} strategies; allowed: at most {MOST_STRATEGIES}")
+    nashpy = extra("nashpy")
+    own = table.normalised.pairs + 1.0  # above 0, or the polytopes have no end
+    found: dict[tuple[float, ...], Equilibrium] = {}
+    for first, second in nashpy.Game(own, own.T).vertex_enumeration():
+        sides = sorted((tuple(np.round(side, 6) + 0.0) for side in (first, second)), reverse=True)
+        key = (*sides[0], *sides[1])
+        found.setdefault(key, Equilibrium(first=np.array(sides[0]), second=np.array(sides[1])))
+    return tuple(found[key] for key in sorted(found, reverse=True))
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -61,7 +116,6 @@ def alpha_rank(table: PayoffTable) -> AlphaRank:
         ValueError: for a larger table.
         ModuleNotFoundError: if OpenSpiel is not installed.
     """
-    arguments.object_of("table", table, PayoffTable, "a PayoffTable")
     profiles = table.strategies**table.agents
     if profiles > MOST_PROFILES:
         raise ValueError(
@@ -114,7 +168,6 @@ def replicator(table: PayoffTable, mixture: ArrayLike) -> Values:
         ValueError: for shares that do not.
         ModuleNotFoundError: if OpenSpiel is not installed.
     """
-    arguments.object_of("table", table, PayoffTable, "a PayoffTable")
     shares = mixture_of(mixture, table.strategies)
     found = extra("open_spiel.python.egt.dynamics").replicator(shares, table.against(shares))
     return np.asarray(found, dtype=np.float64)
@@ -141,17 +194,14 @@ def replicator_ends(table: PayoffTable, *, starts: int = STARTS, seed: int = 0) 
         seed: the seed of these draws.
 
     Raises:
-        ValueError: for numbers out of range.
         ModuleNotFoundError: if OpenSpiel is not installed.
     """
-    arguments.object_of("table", table, PayoffTable, "a PayoffTable")
-    starts = arguments.integer("starts", starts, 1, 10_000)
-    rng = np.random.default_rng(arguments.seed(seed))
+    rng = np.random.default_rng(seed)
     reached = [_end(table, own) for own in rng.dirichlet(np.ones(table.strategies), starts)]
     settled = [own for own in reached if own is not None]
     groups: list[list[Values]] = []
     for own in settled:
-        near = [group for group in groups if np.abs(group[0] - own).max() < _SAME]
+        near = [group for group in groups if np.abs(group[0] - own).max() < _SAME_END]
         if near:
             near[0].append(own)
         else:
@@ -196,3 +246,26 @@ def _end(table: PayoffTable, start: Values) -> Values | None:
             return None
         solver.step()
     return None
+
+
+def check_extras() -> None:
+    """Raises a ModuleNotFoundError, which says how to install it, if OpenSpiel or nashpy is missing."""
+    for package in _PACKAGES:
+        _check(package)
+
+
+def extra(module: str) -> Any:
+    """A module of OpenSpiel or nashpy.
+
+    Raises:
+        ModuleNotFoundError: if its package is not installed; says how to install it.
+    """
+    _check(module.partition(".")[0])
+    return import_module(module)
+
+
+def _check(package: str) -> None:
+    if find_spec(package) is None:
+        raise ModuleNotFoundError(
+            f'{_PACKAGES[package]} need {package}, which is not installed; run pip install "cprl[theory]"'
+        )
