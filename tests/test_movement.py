@@ -1,4 +1,4 @@
-"""Measures of where agents go and when they fire, on boards small enough to count by hand."""
+"""Where agents go, when they fire, who keeps to which cells: on boards small enough to count by hand."""
 
 import numpy as np
 import pytest
@@ -7,7 +7,18 @@ from results import distance_to_nearest, rounds, shooting_distance
 from tensordict.nn import TensorDictModuleBase
 
 from cprl import CommonsEnv, Game, Rules, keys, maps
-from cprl.measuring.movement import Trace, overlap, trace, visits
+from cprl.measuring.movement import (
+    Trace,
+    defence,
+    exclusion,
+    overlap,
+    owners,
+    tagged_where,
+    taggings,
+    trace,
+    visitors,
+    visits,
+)
 
 FORWARD, LEFT, RIGHT, TURN_RIGHT, BEAM, STAY = 0, 2, 3, 5, 6, 7
 
@@ -104,3 +115,91 @@ def test_shooting_distance_compares_steps_with_a_shot_to_all_steps():
     assert fired.tolist() == [(1.0 + 5.0) / 2]
     assert always.tolist() == [(1 + 1 + 4 + 5 + 5) / 5]
     assert np.isnan(shooting_distance(drawn(cells))[0]).all(), "no agent fired"
+
+
+APART = [[[0.5, 0.5, 0, 0]], [[0, 0, 1.0, 0]]]
+"""Two agents on a board of one row and four columns, each in cells of its own."""
+ALIKE = [[[0.5, 0.5, 0, 0]]] * 2
+HALF = [[[0.5, 0.5, 0, 0]], [[0, 0.5, 0.5, 0]]]
+"""They share the second cell: of the four halves of their time, two are spent where nobody else comes."""
+
+
+def shot(tags, cells, **more):
+    """A trace with these tags: (step, world, tagged, by) each."""
+    played = drawn(cells, **more)
+    return type(played)(**{**vars(played), "tags": np.array(tags, np.int64).reshape(-1, 4)})
+
+
+def test_agents_apart_exclude_each_other_and_agents_alike_do_not():
+    assert exclusion(APART) == 1
+    assert visitors(APART) == 1
+    assert exclusion(ALIKE) == 0
+    assert visitors(ALIKE) == pytest.approx(2)
+    # In half of their time the cell says who it is, in the other half it is either: H = 1/2 log 2.
+    assert exclusion(HALF) == pytest.approx(0.5)
+    assert visitors(HALF) == pytest.approx(2**0.5)
+
+
+def test_exclusion_is_the_divergence_of_distributions_of_unequal_shares():
+    # p = (3/4, 1/4) and q = (1/4, 3/4), their mean (1/2, 1/2):
+    # 3/4 log(3/2) + 1/4 log(1/2) = log 2 - H(1/4) = (1 - 0.8113) log 2.
+    unequal = [[[0.75, 0.25]], [[0.25, 0.75]]]
+    assert exclusion(unequal) == pytest.approx(1 - 0.811278, abs=1e-6)
+
+
+def test_three_agents_of_whom_two_share_all_cells():
+    # H(agent | cell) = 2/3 log 2, of log 3.
+    three = [[[1.0, 0]], [[1.0, 0]], [[0, 1.0]]]
+    assert exclusion(three) == pytest.approx(1 - 2 / 3 * np.log(2) / np.log(3))
+    assert visitors(three) == pytest.approx(2 ** (2 / 3))
+
+
+def test_an_agent_that_was_never_in_play_does_not_count():
+    absent = [*APART, [[0, 0, 0, 0]]]
+    assert exclusion(absent) == 1
+    assert exclusion([*HALF, [[0, 0, 0, 0]]]) == pytest.approx(0.5)
+    assert np.isnan(exclusion(APART[:1]))
+    assert visitors(APART[:1]) == 1
+    assert np.isnan(visitors(np.zeros((2, 1, 4))))
+
+
+def test_measures_of_several_worlds_are_those_of_each():
+    both = np.array([APART, HALF])
+    np.testing.assert_allclose(exclusion(both), [1, 0.5])
+    assert exclusion(both).shape == (2,)
+
+
+def test_the_owner_of_a_cell_spends_the_largest_share_there():
+    assert owners([[[0.75, 0.25, 0]], [[0.25, 0.75, 0]]]).tolist() == [[0, 1, -1]]
+    assert owners(ALIKE).tolist() == [[0, 0, -1, -1]], "of equal ones the first"
+
+
+def test_a_trace_has_every_tag_with_who_fired():
+    game = Game(
+        map=maps.parse("A...A\n>...<\n....."),
+        rules=Rules(regrow_prob=(0.0,), episode_steps=4, window_rows=3, window_columns=5, freeze_steps=9),
+    )
+    played = trace(CommonsEnv(game), Doing([(FORWARD, STAY), (BEAM, FORWARD), (STAY, STAY), (STAY, STAY)]))
+    assert played.tags.tolist() == [[1, 0, 1, 0]], "agent 1 in step 1, by agent 0"
+    assert taggings(played)[0].tolist() == [[0, 0], [1, 0]]
+    where = np.argwhere(tagged_where(played))
+    assert where.tolist() == [[0, 1, 1, 4]], "world 0, agent 1, at the cell from which it walked"
+
+
+def test_two_beams_at_once_count_for_both_who_fired_and_once_for_the_tagged():
+    played = shot([(0, 0, 2, 0), (0, 0, 2, 1), (1, 0, 0, 1)], [[(0, 0), (0, 3), (2, 2)]] * 2)
+    assert taggings(played)[0].tolist() == [[0, 1, 0], [0, 0, 0], [1, 1, 0]]
+    assert tagged_where(played).sum((0, 2, 3)).tolist() == [1, 0, 1]
+    assert tagged_where(played)[0, 2, 2, 2] == 1
+
+
+def test_to_defend_is_to_tag_whom_one_finds_in_ones_own_cells():
+    # Agent 1 comes into (0, 0) in the last of four steps, where agent 0 was in three of its four.
+    cells = [[(0, 0), (2, 3)], [(0, 0), (2, 3)], [(0, 0), (2, 3)], [(0, 1), (0, 0)]]
+    at_home = shot([(3, 0, 1, 0)], cells)
+    assert defence(at_home, visits(at_home)).tolist() == [1.0]
+    intruding = shot([(3, 0, 1, 0), (0, 0, 1, 0)], cells)
+    assert defence(intruding, visits(intruding)).tolist() == [0.5], "the second one at (2, 3), the other's"
+    nowhere = np.zeros((2, 3, 4))
+    assert defence(at_home, nowhere).tolist() == [0.5], "neither is at home"
+    assert np.isnan(defence(shot([], cells), nowhere)).all()

@@ -177,30 +177,23 @@ def test_a_pool_has_what_its_runs_have_replica_by_replica(run, other):
 
 
 @pytest.mark.integration
-def test_a_pool_of_which_a_run_has_no_weights_is_of_trainings_alone(run, other, tmp_path):
-    light = export_results(other, tmp_path / "light", weights=False)
-    text = write_report([run, light], tmp_path / "report", pool=True).read_text()
+def test_a_pool_is_named_so_that_its_figures_can_be_written_and_plays_where_all_can(run, other, tmp_path):
+    one = export_results(run, tmp_path / ("a" * 100))
+    light = export_results(other, tmp_path / ("b" * 100), weights=False)
+    (both,) = pooled([read_result(one), read_result(light)])
+    assert both.name == "a" * 100 + "+1 more"
+    text = write_report([one, light], tmp_path / "report", pool=True).read_text()
     assert "Exported without weights, some of the runs: nobody could play" in text
     assert "shots per 1000 steps" not in text
 
 
 @pytest.mark.integration
-def test_a_pool_is_named_so_that_its_figures_can_be_written(run, other, tmp_path):
-    one, two = export_results(run, tmp_path / ("a" * 100)), export_results(other, tmp_path / ("b" * 100))
-    (both,) = pooled([read_result(one), read_result(two)])
-    assert both.name == "a" * 100 + "+1 more"
-    four = export_results(run, tmp_path / "four+other")
+def test_runs_of_one_name_or_of_the_same_replicas_are_not_pooled(run, other, tmp_path):
+    again, four = (export_results(run, tmp_path / name) for name in ("again", "four+other"))
     with_field(four, "experiment", lambda experiment: {**experiment, "update_every": 2})
-    with pytest.raises(ValueError, match=r"both named 'four\+other'"):
-        write_report([run, other, four], tmp_path / "report", pool=True)
-    assert not (tmp_path / "report").exists()
-
-
-@pytest.mark.integration
-def test_runs_of_the_same_replicas_are_not_pooled(run, tmp_path):
-    again = export_results(run, tmp_path / "again")
-    with pytest.raises(ValueError, match=r"both of seed 0, which have the same replicas; allowed in a pool"):
-        write_report([run, again], tmp_path / "report", pool=True)
+    for runs, reason in (((run, other, four), "both named"), ((run, again), "same replicas")):
+        with pytest.raises(ValueError, match=reason):
+            write_report(runs, tmp_path / "report", pool=True)
     assert not (tmp_path / "report").exists()
     with_field(again, "recipe", lambda name: "mine")
     assert len(pooled([read_result(run), read_result(again)])) == 2, "one repeats experiment 4, by its name"
@@ -680,19 +673,23 @@ def test_a_number_is_contradicted_outside_the_prediction_interval():
     assert verdicts.of_number(7.0, values, runs=2) == CONTRADICTED
 
 
-def test_a_claim_of_a_direction_is_judged_by_the_side_of_the_interval():
-    assert verdicts.of_claim(0.1, 2.0, above=0, replicas=8) == NOT_CONTRADICTED
-    assert verdicts.of_claim(-2.0, -0.1, above=0, replicas=8) == CONTRADICTED
-    assert verdicts.of_claim(-2.0, -0.1, below=0, replicas=8) == NOT_CONTRADICTED
-    assert verdicts.of_claim(0.5, 0.9, below=0.4, replicas=8) == CONTRADICTED
-    assert verdicts.of_claim(-1.0, 1.0, above=0, replicas=8) == "cannot be told with 8 runs"
-    assert verdicts.of_claim(0.1, 2.0, above=0, replicas=3) == "cannot be told with 3 runs"
-
-
-def test_a_claim_of_likeness_is_judged_by_where_the_interval_lies():
-    assert verdicts.of_likeness(0.9, 1.1, within=(0.8, 1.2), replicas=8) == NOT_CONTRADICTED
-    assert verdicts.of_likeness(1.3, 1.5, within=(0.8, 1.2), replicas=8) == CONTRADICTED
-    assert verdicts.of_likeness(1.1, 1.3, within=(0.8, 1.2), replicas=8) == "cannot be told with 8 runs"
+@pytest.mark.parametrize(
+    ("interval", "bound", "replicas", "verdict"),
+    [
+        ((0.1, 2.0), {"above": 0}, 8, NOT_CONTRADICTED),
+        ((-2.0, -0.1), {"above": 0}, 8, CONTRADICTED),
+        ((-2.0, -0.1), {"below": 0}, 8, NOT_CONTRADICTED),
+        ((0.5, 0.9), {"below": 0.4}, 8, CONTRADICTED),
+        ((-1.0, 1.0), {"above": 0}, 8, "cannot be told with 8 runs"),
+        ((0.1, 2.0), {"above": 0}, 3, "cannot be told with 3 runs"),
+        ((0.9, 1.1), {"within": (0.8, 1.2)}, 8, NOT_CONTRADICTED),
+        ((1.3, 1.5), {"within": (0.8, 1.2)}, 8, CONTRADICTED),
+        ((1.1, 1.3), {"within": (0.8, 1.2)}, 8, "cannot be told with 8 runs"),
+    ],
+)
+def test_a_claim_is_judged_by_where_its_interval_lies(interval, bound, replicas, verdict):
+    judge = verdicts.of_likeness if "within" in bound else verdicts.of_claim
+    assert judge(*interval, **bound, replicas=replicas) == verdict
 
 
 def test_what_runs_show_as_a_rule_is_judged_by_the_share_that_do():

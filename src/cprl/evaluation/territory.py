@@ -29,10 +29,9 @@ from cprl.evaluation.evaluate import (
     table_of,
 )
 from cprl.evaluation.lanes import Source, fresh_worlds, policies_of, random_policies
-from cprl.measuring import territory
-from cprl.measuring.movement import Trace, overlap, trace, visits
+from cprl.measuring import movement
+from cprl.measuring.movement import Trace, overlap, owners, trace, visits
 from cprl.measuring.statistics import Estimate, estimate
-from cprl.measuring.territory import owners
 from cprl.policies.assignment import AgentPolicies
 from cprl.terminal import style
 from cprl.training.stored import LoadedRun
@@ -158,17 +157,17 @@ _OF_WORLDS: Final = ("row", "col", "in_play", "fired", "played")
 def _of_replica(played: Trace) -> dict[str, Any]:
     """The arrays and measures of the worlds of one replica."""
     shares = visits(played).mean(0)  # every agent is in play as an episode begins
-    taggings = territory.taggings(played)
+    taggings = movement.taggings(played)
     tags = taggings.sum((1, 2))
-    driven_out = np.where(tags > 0, territory.defence(played, shares), 0.0)
+    driven_out = np.where(tags > 0, movement.defence(played, shares), 0.0)
     with np.errstate(invalid="ignore"):
         defence = (driven_out * tags).sum() / np.float64(tags.sum())
     return {
         "visits": shares,
         "taggings": taggings.sum(0),
-        "tagged_where": territory.tagged_where(played).sum(0),
-        EXCLUSION: territory.exclusion(shares),
-        VISITORS: territory.visitors(shares),
+        "tagged_where": movement.tagged_where(played).sum(0),
+        EXCLUSION: movement.exclusion(shares),
+        VISITORS: movement.visitors(shares),
         OVERLAP: overlap(played).mean(),
         TAGS: 1000 * tags.sum() / played.played.sum(),
         DEFENCE: defence,

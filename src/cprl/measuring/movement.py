@@ -1,10 +1,16 @@
-"""Where agents go and when they fire: measures for the study's claims about trained policies.
+"""Where agents go: a trace of played episodes, whose cells agents share or keep, and who tags whom where.
 
 Arrays of a played episode with T steps, B worlds and N agents, at the start of each step:
     row, col    int [T, B, N], the cell of each agent
     in_play     bool [T, B, N], whether the agent acts in this step
     fired       bool [T, B, N], whether the agent fires in this step
     played      bool [T, B], True until the world's episode has ended
+
+Visits are shares [..., N, H, W], float64, as `visits` returns them: for each agent the share of its steps in
+play that it spent in each cell. They sum to 1, or to 0 for an agent that was never in play, which then counts
+in none of the measures of visits. Shares of few steps look more exclusive than they are, since agents that
+visit many cells seldom have hit the same ones by chance: average the visits of many episodes first, and
+compare with other agents, such as random ones, over as many steps from the same starts.
 """
 
 from collections.abc import Callable
@@ -13,7 +19,7 @@ from typing import Any
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 from tensordict import TensorDictBase
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 
@@ -107,3 +113,107 @@ def overlap(trace: Trace) -> Array:
         for b in range(a + 1, agents)
     ]
     return np.mean(pairs, axis=0) if pairs else np.full(len(shares), np.nan)
+
+
+def visitors(visits: ArrayLike) -> Array:
+    """How many agents share a cell, float64 [...], 1..N: 1 if each has cells of its own, N if all spend equal
+    shares of their time in each cell.
+
+    It is exp H(agent | cell): with p(i, c) = visits[i, c] / N, of the N agents that were in play, the entropy
+    of who it is that one meets in a cell, mean over the cells by how often one meets somebody there. NaN
+    without agents.
+
+    Args:
+        visits: shares [..., N, H, W].
+    """
+    shares = np.asarray(visits, np.float64)
+    agents = _in_play(shares)
+    within = shares.sum(-3, keepdims=True)
+    odds = np.divide(shares, within, out=np.zeros_like(shares), where=within > 0)
+    logs = np.log(odds, out=np.zeros_like(odds), where=odds > 0)
+    with np.errstate(invalid="ignore"):
+        found: Array = np.exp(-(shares * logs).sum((-3, -2, -1)) / agents)
+    return np.where(agents > 0, found, np.nan)
+
+
+def exclusion(visits: ArrayLike) -> Array:
+    """How far agents keep each other out of cells, float64 [...], 0..1: 1 if no cell has two visitors, 0 if
+    all agents spend equal shares of their time in each cell; NaN for fewer than two agents.
+
+    It is 1 - H(agent | cell) / log N, or the information about who an agent is that its cell gives, as a
+    share of all that there is; equal to the Jensen-Shannon divergence of the N distributions over cells,
+    divided by log N (J. Lin, "Divergence measures based on the Shannon entropy", 1991).
+
+    Args:
+        visits: shares [..., N, H, W].
+    """
+    agents = _in_play(visits)
+    found = np.full(agents.shape, np.nan)
+    several = agents > 1
+    found[several] = 1 - np.log(visitors(visits)[several]) / np.log(agents[several])
+    inside: Array = np.clip(found, 0, 1)
+    return inside
+
+
+def owners(visits: ArrayLike) -> Array:
+    """The agent that spends the largest share of its time in each cell, int64 [..., H, W]; of equal ones the
+    first, and -1 where nobody was.
+
+    Args:
+        visits: shares [..., N, H, W].
+    """
+    shares = np.asarray(visits, np.float64)
+    found: Array = np.where(shares.any(-3), shares.argmax(-3), -1)
+    return found
+
+
+def taggings(trace: Trace) -> Array:
+    """How often each agent was tagged by each, int64 [B, N, N]: row the tagged, column who tagged it.
+
+    An agent that several beams hit at once is counted for each of those who fired.
+    """
+    _, worlds, agents = trace.row.shape
+    counts = np.zeros((worlds, agents, agents), np.int64)
+    np.add.at(counts, tuple(trace.tags[:, 1:].T), 1)
+    return counts
+
+
+def tagged_where(trace: Trace) -> Array:
+    """How often each agent was tagged in each cell, int64 [B, N, H, W].
+
+    The cell is that at the start of the step, before the agent moved in it. An agent that several beams hit
+    at once is counted once.
+    """
+    _, worlds, agents = trace.row.shape
+    counts = np.zeros((worlds, agents, *trace.board), np.int64)
+    step, world, tagged = np.unique(trace.tags[:, :3], axis=0).T
+    cell = trace.row[step, world, tagged], trace.col[step, world, tagged]
+    np.add.at(counts, (world, tagged, *cell), 1)
+    return counts
+
+
+def defence(trace: Trace, visits: ArrayLike) -> Array:
+    """The share of tags with which an agent drives another one out of its own territory, float64 [B], 0..1.
+
+    A tag counts as 1 if the one who fired spends a larger share of its time in the cell of the tagged, as in
+    `tagged_where`, than the tagged itself, 0 if a smaller one, and 1/2 if they are equal. NaN where no agent
+    was tagged.
+
+    Args:
+        trace: played episodes.
+        visits: shares [N, H, W], or [B, N, H, W].
+    """
+    worlds = trace.row.shape[1]
+    shares = np.broadcast_to(np.asarray(visits), (worlds, trace.row.shape[2], *trace.board))
+    step, world, tagged, by = trace.tags.T
+    cell = trace.row[step, world, tagged], trace.col[step, world, tagged]
+    more = np.sign(shares[world, by, *cell] - shares[world, tagged, *cell])
+    sums = np.bincount(world, (1 + more) / 2, minlength=worlds)
+    with np.errstate(invalid="ignore"):
+        found: Array = sums / np.bincount(world, minlength=worlds)
+    return found
+
+
+def _in_play(visits: ArrayLike) -> Array:
+    """How many agents were ever in play, int64 [...]."""
+    return np.asarray(np.asarray(visits).any((-2, -1)).sum(-1))
