@@ -24,16 +24,15 @@ from claims import (
     of_experiment_5,
     undefined_in,
 )
-from curves import appendix, turning_points_of
+from curves import appendix
 from planner import Planner, planned_harvest
 from possible import KNOWN, computed, possible
-from published import EXPERIMENTS, agreement, curve, estimate_window, published_experiment
+from published import agreement, curve, estimate_window, published_experiment
 from report import write_report
 from results import (
     ROUNDS,
     Result,
     dip_depth,
-    measures,
     of_play,
     of_training,
     pooled,
@@ -52,7 +51,7 @@ from cprl.institutions import Tax
 from cprl.measuring.movement import Trace
 from cprl.measuring.statistics import estimate
 from cprl.population import Learning, Scripted
-from cprl.runs.curves import as_curves, running_mean
+from cprl.runs.curves import as_curves
 from cprl.runs.episodes import read_episodes
 from cprl.runs.export import export_results
 from cprl.theory import yield_bounds
@@ -327,40 +326,6 @@ def test_agents_at_play_are_measured_replica_by_replica():
     np.testing.assert_array_equal(nearness, [1.0, np.nan], "in replica 1 nobody fired")
 
 
-def test_the_random_walker_beside_a_learner_moves_as_the_random_policy_does(run):
-    """Chance of its own in every replica and world, whatever plays beside it."""
-    found, name = measures(run), ROUNDS.format(agent=1)
-    assert found.trained[name].mean() == pytest.approx(found.random[name].mean(), rel=0.2)
-
-
-def test_turning_points_are_those_of_the_mean_of_replicas(tmp_path):
-    """300 episodes, with a peak at 160 and a survival that gives way at 200."""
-    episodes = np.arange(300)
-    returns = np.where(episodes < 160, episodes * 1.0, 320.0 - episodes)
-    survival = np.where(episodes < 200, 1000.0, 600.0)
-    result = Result(
-        path=tmp_path / "five",
-        recipe={},
-        experiment=None,
-        report={},
-        curves={
-            "collective_return": np.stack([returns, returns]),
-            "survival_steps": np.stack([survival, survival]),
-        },
-        study=published_experiment("commons"),
-    )
-    published, ours = turning_points_of([result])[-3:-1]
-    assert published == "| published curves | 572 | 364 | 339 | 1395 | 564 | 612 |  |"
-    smoothed = running_mean(returns, 30)
-    top = int(smoothed.argmax())
-    first = int((running_mean(survival, 30) < 990).argmax())
-    assert ours == (
-        f"| five | {smoothed[top]:.0f} | {top} | {smoothed[-1]:.0f} | 270 | {first} | 600 | 600 to 600 |"
-    )
-    assert first == 171, "the first mean of which one of thirty episodes is short"
-    assert turning_points_of([]) == []
-
-
 def recipe(name):
     spec = importlib.util.spec_from_file_location(name, RECIPES / f"{name}.py")
     module = importlib.util.module_from_spec(spec)
@@ -426,34 +391,25 @@ def test_reproduce_refuses_a_finished_run_of_another_recipe_with_the_words_of_it
         reproduce.run("single_basic", [], runs=tmp_path, results=tmp_path / "results")
 
 
-def test_reproduce_begins_nothing_more_once_an_experiment_has_failed(tmp_path, monkeypatch):
+@pytest.mark.parametrize("reason", [ChildProcessError, KeyboardInterrupt])
+def test_reproduce_begins_nothing_more_once_an_experiment_has_failed_or_after_ctrl_c(
+    reason, tmp_path, monkeypatch
+):
     begun = []
 
-    def fail(name, common, **where):
+    def ended(name, common, **where):
         begun.append(name)
-        raise ChildProcessError(name)
-
-    monkeypatch.setattr(reproduce, "run", fail)
-    where = {"runs": tmp_path, "results": tmp_path}
-    with pytest.raises(ChildProcessError, match="commons"):
-        reproduce.run_all(["commons", "single_basic", "two_complex"], [], processes=1, **where)
-    assert begun == ["commons"]
-
-
-def test_reproduce_begins_nothing_more_after_ctrl_c(tmp_path, monkeypatch):
-    begun = []
-
-    def interrupted(name, common, **where):
-        begun.append(name)
+        if reason is ChildProcessError:
+            raise reason(name)
         signal.pthread_kill(threading.main_thread().ident, signal.SIGINT)
         time.sleep(0.2)  # as a training that saves its state
 
-    monkeypatch.setattr(reproduce, "run", interrupted)
-    where = {"runs": tmp_path, "results": tmp_path}
+    monkeypatch.setattr(reproduce, "run", ended)
+    names = ["commons", "single_basic", "two_complex"]
     before = signal.signal(signal.SIGINT, signal.default_int_handler)  # a shell's background jobs ignore it
     try:
-        with pytest.raises(KeyboardInterrupt):
-            reproduce.run_all(["commons", "single_basic", "two_complex"], [], processes=1, **where)
+        with pytest.raises(reason):
+            reproduce.run_all(names, [], runs=tmp_path, results=tmp_path, processes=1)
     finally:
         signal.signal(signal.SIGINT, before)
     assert begun == ["commons"]
@@ -462,6 +418,7 @@ def test_reproduce_begins_nothing_more_after_ctrl_c(tmp_path, monkeypatch):
 def test_every_published_experiment_is_reproduced():
     named = {arguments[0] for arguments in reproduce.EXPERIMENTS.values()}
     assert {published_experiment(name).number for name in named} == {1, 2, 3, 4, 5}
+    assert published_experiment("my_own") is None
 
 
 def a_result(tmp_path, recipe, metrics, *, name="made_up", algorithm=None):
@@ -710,15 +667,6 @@ def replicas(course, *, number=20, noise=25.0, seed=0):
     return dict.fromkeys(METRICS, level + wandering)
 
 
-def test_the_published_curves_show_tragedy_and_combat():
-    study = published_experiment("commons")
-    at = np.arange(0.0, 4740.0)
-    found = combat({name: np.interp(at, *curve(study.curves[name]))[None] for name in METRICS})
-    assert found.tragedy.tolist() == found.combat.tolist() == [True]
-    assert found.fall[0] == pytest.approx(0.34, abs=0.01)
-    assert found.rise[0] == pytest.approx(0.57, abs=0.01)
-
-
 RECOVERED = [(0, 300), (600, 560), (1500, 340), (2600, 470), (4799, 470)]
 
 
@@ -814,29 +762,6 @@ def test_the_windows_of_made_up_curves_are_found(window, wandering):
         for seed in range(10)
     ]
     assert found == [window] * 30
-
-
-def test_the_windows_of_the_published_curves_are_found():
-    for study in EXPERIMENTS:
-        for name in study.curves.values():
-            found = estimate_window(*curve(name))
-            assert found.window_episodes == study.window_episodes, name
-            assert found.nats[100] > 50, name
-            assert 0 < found.better_by_nats <= min(found.nats[100], found.nats[200]), name
-
-
-def test_every_experiment_has_a_recipe_and_curves():
-    assert [one.number for one in EXPERIMENTS] == [1, 2, 3, 4, 5]
-    assert sum(len(one.curves) for one in EXPERIMENTS) == 10
-    for one in EXPERIMENTS:
-        assert one.recipe in (*presets.BOARDS, "two_against_random")
-        for name in one.curves.values():
-            episodes, values = curve(name)
-            assert len(episodes) == len(values) > 700
-            assert (np.diff(episodes) >= 0).all()
-            assert episodes[-1] <= one.episodes
-    assert published_experiment("commons").trained == 491.17
-    assert published_experiment("my_own") is None
 
 
 def test_the_curves_have_known_points_of_the_figures():
