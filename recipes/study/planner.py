@@ -9,6 +9,7 @@ It is a rule of thumb, not an optimum: nobody has shown that more cannot be got;
 `cprl.theory.yield_bounds`.
 """
 
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import cache
 from typing import Any, Final, NamedTuple
@@ -17,17 +18,31 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cprl.checks import Check, check_fields, is_number
-from cprl.commons.batch import Batch
+from cprl.commons.batch import Batch, turn_of
 from cprl.commons.compiled import kept_on_disk
 from cprl.commons.game import Game
 from cprl.commons.moves import WALK_TURN
 from cprl.commons.near import neighbours
-from cprl.commons.playing import harvests
 from cprl.commons.world import COL_STEP, ROW_STEP
 
 Array = NDArray[Any]
 
 FAR: Final = 1 << 30
+
+
+def harvests(batch: Batch, choose: Callable[[Batch], Array]) -> NDArray[np.float64]:
+    """The collective harvest of the next episode of each world, float64 [B], in apples.
+
+    Args:
+        batch: B worlds, without institutions, since these are paid for actions.
+        choose: the actions of all agents, int64 [B, N], asked for in each turn until all worlds have ended.
+    """
+    output = batch.begin(batch.new_output())
+    total = np.zeros(batch.size)
+    while not turn_of(output).done.all():
+        output = batch.play(choose(batch), output)
+        total += turn_of(output).harvest.sum(1, dtype=np.float64)
+    return total
 
 
 def _jit(function: Any) -> Any:

@@ -16,13 +16,13 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 from numpy.typing import NDArray
+from planner import harvests
 from published import PublishedExperiment, published_experiment
 
 from cprl import presets
 from cprl.algorithms import DQN
 from cprl.commons.batch import Batch
 from cprl.commons.game import Game
-from cprl.commons.playing import harvests
 from cprl.evaluation.evaluate import SEED
 from cprl.evaluation.lanes import Source, fresh_worlds, policies_of, random_policies
 from cprl.experiment import Experiment

@@ -22,8 +22,7 @@ from cprl.checks import (
 from cprl.commons.game import Game
 from cprl.config import custom_targets, differences, fields_from_config, fields_to_config
 from cprl.custom import Custom
-from cprl.envs.games import game_of, is_playable, stored_game
-from cprl.envs.make_env import PlayableGame
+from cprl.envs.make_env import PlayableGame, game_of, is_playable, stored_game
 from cprl.population import (
     SPEC,
     AgentSpec,

@@ -23,7 +23,6 @@ In reading order:
     cuda         CudaThreads: runs the loops on a GPU
     state        reads, checks and restores the state of B worlds
     batch        Batch: B worlds, played a turn at a time
-    playing      harvests: a whole episode in every world of a batch
     decoding     observations back to classes of cells
     picture      an image of the board for people, in which agents have number, heading and second mark
 

@@ -1,7 +1,7 @@
 """Adapters of the same game: TorchRL, PettingZoo, Gymnasium.
 
 Modules, in the order in which one reads them:
-    make_env         make_env, the one place where an environment is assembled; spaces_of
+    make_env         where an environment is put together; spaces_of; games as recipes hold them
     commons_env      CommonsEnv, TorchRL: B worlds at once
     stage_games      what games share in which all act at once: specs, clock, memory, steps
     matrix           MatrixGame, MatrixEnv: payoff tables, played once or several times

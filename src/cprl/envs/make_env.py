@@ -1,7 +1,7 @@
-"""make_env: the one place where an environment is put together, whatever it is for."""
+"""make_env, the one place where an environment is put together, and games of the user's own in recipes."""
 
 from collections.abc import Iterable, Mapping
-from typing import Any, Protocol, runtime_checkable
+from typing import Any, Final, Protocol, runtime_checkable
 
 import torch
 from torchrl.data import Bounded, Categorical
@@ -15,6 +15,7 @@ from cprl.envs.commons_env import CommonsEnv
 from cprl.envs.matrix import MatrixGame
 from cprl.envs.taking import TakingGame
 from cprl.envs.unwrap import commons_of
+from cprl.theory import PowerWorth
 
 
 @runtime_checkable
@@ -134,3 +135,51 @@ def _spec(env: EnvBase, name: str) -> Any:
     if spec is None:
         raise ValueError(f'("agents", "{name}") is missing in the environment; allowed: games that have it')
     return spec
+
+
+OF_CPRL: Final[tuple[type[Any], ...]] = (Game, MatrixGame, TakingGame)
+"""Games that a recipe holds as values, and whose chance follows from the seed alone."""
+
+
+def stored_game(game: object) -> object:
+    """As a recipe holds it: a game of the user's by the name of its class.
+
+    Raises:
+        ValueError: for a game that a recipe cannot hold; says what it can.
+    """
+    if isinstance(game, TakingGame) and not isinstance(game.sharing.worth, PowerWorth):
+        raise ValueError(
+            f"experiment.game.sharing.worth is a {type(game.sharing.worth).__name__}, which a recipe cannot "
+            'hold; allowed: a PowerWorth, or as the game Custom("module:function"), a function of yours that '
+            "makes it"
+        )
+    if type(game) in OF_CPRL or isinstance(game, Game | Custom) or not isinstance(game, PlayableGame):
+        return game
+    kind = type(game)
+    if "<" in kind.__qualname__:
+        raise ValueError(
+            f"experiment.game is a {kind.__qualname__}, which no recipe can name; allowed: a class at the "
+            "top of a module"
+        )
+    return Custom(f"{kind.__module__}:{kind.__qualname__}", arguments=game.to_config())
+
+
+def game_of(stored: Custom) -> Custom | PlayableGame:
+    """The game whose class and arguments these are; the same where they only make one."""
+    kind = stored.resolve()
+    if not (isinstance(kind, type) and hasattr(kind, "to_config") and hasattr(kind, "make")):
+        return stored
+    try:
+        game = kind(**{name: _tuples(value) for name, value in stored.arguments.items()})
+    except (TypeError, ValueError) as error:
+        raise ValueError(f"experiment.game: {stored.target} does not take its arguments: {error}") from error
+    return game if isinstance(game, PlayableGame) and stored_game(game) == stored else stored
+
+
+def _tuples(value: Any) -> Any:
+    return tuple(map(_tuples, value)) if isinstance(value, list) else value
+
+
+def is_playable(value: Any) -> bool:
+    """Whether it is a game, of cprl or of the user's own, or the `Custom` that makes one."""
+    return isinstance(value, Game | Custom | PlayableGame) and not isinstance(value, type)

@@ -12,8 +12,7 @@ from cprl.commons import maps
 from cprl.commons.game import Game
 from cprl.commons.rules import Rules
 from cprl.custom import made
-from cprl.envs.games import is_playable
-from cprl.envs.make_env import make_env
+from cprl.envs.make_env import is_playable, make_env
 from cprl.evaluation.evaluate import SEED, check
 from cprl.evaluation.lanes import Place, Played, play
 from cprl.policies.scripted import SCRIPTED_POLICIES

@@ -23,7 +23,7 @@ from cprl.commons import maps
 from cprl.commons.maps import Map
 from cprl.config import fits, from_config, to_config, type_text
 from cprl.custom import Custom
-from cprl.envs.games import game_of, stored_game
+from cprl.envs.make_env import game_of, stored_game
 from cprl.experiment import Experiment
 from cprl.population import Learning, Team, with_run_moved
 

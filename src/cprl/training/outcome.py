@@ -13,8 +13,7 @@ from torchrl.envs import EnvBase
 
 from cprl.arguments import object_of
 from cprl.custom import Custom, made
-from cprl.envs.games import OF_CPRL
-from cprl.envs.make_env import make_env
+from cprl.envs.make_env import OF_CPRL, make_env
 from cprl.envs.state import load_transforms_state, transforms_state
 from cprl.envs.unwrap import agent_names, commons_of
 from cprl.experiment import Experiment
