@@ -18,12 +18,10 @@ import torch
 import tyro
 from rich.console import Console
 from rich.table import Table
-from torchrl.data.replay_buffers import ReplayBuffer
 
-from cprl.learners.buffer.sampler import lane_buffer
-from cprl.learners.engine.base import Engine, ListEngine
-from cprl.learners.engine.compiled import FunctionalEngine
-from cprl.learners.single import dqn_loss
+from cprl.algorithms import DQN, DQNSettings
+from cprl.learners.engine import Engine, FunctionalEngine, ListEngine
+from cprl.learners.ring import Ring
 from cprl.networks.mlp import MLPNetwork
 
 SHAPE, ACTIONS, BATCH, TRANSITIONS = (3, 7, 15), 8, 8, 4096
@@ -43,23 +41,25 @@ MEASURED_BEFORE = {  # on such a machine, before this library was begun
 LANES = (1, 4, 16, 64)
 
 
-def filled(lanes: int) -> ReplayBuffer:
+def filled(lanes: int) -> Ring:
     """A full buffer of noise."""
-    buffer = lane_buffer(
+    ring = Ring(
         seeds=[(0, lane) for lane in range(lanes)],
         transitions=TRANSITIONS,
         batch_size=BATCH,
         observation_shape=SHAPE,
     )
-    state = buffer.storage.state_dict()
+    kept = ring.state_dict()
+    state = kept["storage"]
     state["observation"] = torch.randint(256, (lanes, TRANSITIONS + 1, *SHAPE), dtype=torch.uint8)
     state["action"] = torch.randint(ACTIONS, (TRANSITIONS, lanes))
     state["reward"] = torch.rand(TRANSITIONS, lanes)
     state["done"] = state["terminated"] = torch.rand(TRANSITIONS, lanes) < 0.001
     state["row"] = torch.arange(TRANSITIONS)[:, None].repeat(1, lanes)
     state["next_row"] = torch.full((lanes,), TRANSITIONS)
-    buffer.storage.load_state_dict({**state, "written": TRANSITIONS})
-    return buffer
+    state["written"] = TRANSITIONS
+    ring.load_state_dict(kept)
+    return ring
 
 
 def update_us(engine: str, lanes: int, repeats: int) -> float:
@@ -68,7 +68,7 @@ def update_us(engine: str, lanes: int, repeats: int) -> float:
     torch.set_flush_denormal(True)
     torch.manual_seed(0)
     networks = [MLPNetwork(SHAPE, ACTIONS) for _ in range(lanes)]
-    update = WAYS[engine](networks, partial(dqn_loss, gamma=0.995), learning_rate=1e-5)
+    update = WAYS[engine](networks, DQN(settings=DQNSettings(gamma=0.995)).make_loss, learning_rate=1e-5)
     buffer, best = filled(lanes), float("inf")
     for _ in range(20):
         update.update(buffer)

@@ -20,18 +20,14 @@ from rich.table import Table
 from tensordict import TensorDict
 
 from cprl import presets
-from cprl.algorithms.actor_critic import IQL, SAC
 from cprl.algorithms.base import Algorithm, OffPolicy, TeamAlgorithm
-from cprl.algorithms.dqn import CQL, DQN, DistributionalDQN
-from cprl.algorithms.maddpg import MADDPG
+from cprl.algorithms.off_policy import CQL, DQN, IQL, PR2, SAC, DistributionalDQN
 from cprl.algorithms.on_policy import A2C, PPO, Reinforce
-from cprl.algorithms.pr2 import PR2
-from cprl.algorithms.teams import IPPO, MAPPO, QMIX, VDN
-from cprl.learners.engine.choice import TRIAL_LANES, fitting_engine, make_engine, trial_batch
-from cprl.learners.lanes import WEIGHTS, Lanes
+from cprl.algorithms.teams import IPPO, MADDPG, MAPPO, QMIX, VDN
+from cprl.learners.lanes import WEIGHTS, Lanes, Teams
 from cprl.learners.rollouts import trial_rollout
 from cprl.learners.settings import DQNSettings, RolloutSettings
-from cprl.learners.teams import Teams
+from cprl.learners.trial import TRIAL_LANES, fitting_engine, make_engine, trial_batch
 
 REPLAY, ROLLOUTS = DQNSettings(), RolloutSettings()
 ALGORITHMS = {

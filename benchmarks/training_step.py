@@ -25,6 +25,7 @@ from rich.console import Console
 from rich.table import Table
 
 from cprl import CommonsEnv, presets
+from cprl.algorithms.off_policy import DQN
 from cprl.learners.replay import ReplayLearner
 from cprl.measuring.episodes import EpisodeTracker
 from cprl.policies.assignment import AgentPolicies
@@ -75,7 +76,7 @@ def measure(board: presets.Board, agents: int, replicas: int, repeats: int) -> d
     game = presets.game(board)
     settings = replace(presets.dqn_settings(board), buffer_size=20_000)
     agents = tuple(range(agents))
-    learner = ReplayLearner(game.spaces, agents=agents, replicas=replicas, settings=settings)
+    learner = DQN(settings=settings).make_learner(game.spaces, agents=agents, replicas=replicas)
     training = Training(CommonsEnv(game, replicas, seed=0), {agents: learner}, episodes=10**9)
     while training.steps < 500:
         training.step()

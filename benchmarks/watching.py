@@ -30,7 +30,7 @@ from rich.table import Table
 from tensordict import TensorDict, TensorDictBase
 
 from cprl import CommonsEnv, presets
-from cprl.learners.replay import ReplayLearner
+from cprl.algorithms.off_policy import DQN
 from cprl.measuring import Episode
 from cprl.policies.lanes import random_agents
 from cprl.policies.present import PresentPolicy
@@ -84,7 +84,7 @@ def cost(run: Path, repeats: int) -> Cost:
     prepare_process(0)
     game = presets.game("commons")
     settings = replace(presets.dqn_settings("commons"), buffer_size=20_000)
-    learner = ReplayLearner(game.spaces, agents=AGENTS, replicas=REPLICAS, settings=settings)
+    learner = DQN(settings=settings).make_learner(game.spaces, agents=AGENTS, replicas=REPLICAS)
     env = CommonsEnv(game, REPLICAS, seed=0)
     training = Training(env, {AGENTS: learner}, episodes=10**9)
     steps = game.rules.episode_steps

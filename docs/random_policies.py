@@ -10,7 +10,7 @@ import tyro
 from cprl import CommonsEnv, presets
 from cprl.measuring.evaluate import evaluate
 from cprl.policies.assignment import AgentPolicies
-from cprl.policies.single import RandomActor
+from cprl.policies.lanes import RandomActor
 
 APPENDIX_A = {
     "single_basic": (1, 32.47),

@@ -33,7 +33,7 @@ from cprl.measuring.episodes import EpisodeTracker
 from cprl.measuring.evaluate import evaluate
 from cprl.networks.mlp import MLPNetwork
 from cprl.policies.assignment import AgentPolicies
-from cprl.policies.single import RandomActor
+from cprl.policies.lanes import RandomActor
 from cprl.population import Learning, exploration_steps
 from cprl.runs.episodes import EpisodeTable
 from cprl.runs.recipe import start_run

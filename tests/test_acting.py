@@ -3,12 +3,11 @@
 import pytest
 import torch
 from tensordict import TensorDict
-from torchrl.envs.utils import ExplorationType, set_exploration_type
 
 from cprl import CommonsEnv, keys, presets
 from cprl.networks.mlp import MLPNetwork
 from cprl.policies.assignment import AgentPolicies
-from cprl.policies.single import QActor, RandomActor
+from cprl.policies.lanes import RandomActor
 
 
 def seen(*worlds):
@@ -33,24 +32,6 @@ def test_the_study_as_run_has_relu_on_the_values_and_glorot_weights():
     bound = (6 / (60 + 32)) ** 0.5
     assert first.weight.abs().max() <= bound
     assert first.weight.abs().max() > 0.95 * bound, "wider than torch's default bound of 0.13"
-
-
-def test_a_greedy_actor_takes_the_action_of_the_highest_value():
-    actor = QActor(MLPNetwork((3, 4, 5), 7), 7)
-    actor.epsilon = 1.0
-    with set_exploration_type(ExplorationType.DETERMINISTIC):
-        told = actor(seen(50))
-    assert torch.equal(told["action"], told["action_value"].argmax(-1))
-
-
-def test_an_exploring_actor_takes_random_actions_as_often_as_epsilon_says():
-    actor = QActor(MLPNetwork((3, 4, 5), 7), 7)
-    actor.epsilon = 0.4
-    assert actor.epsilon == pytest.approx(0.4)
-    with set_exploration_type(ExplorationType.RANDOM):
-        told = actor(seen(20_000))
-    changed = (told["action"] != told["action_value"].argmax(-1)).float().mean()
-    assert changed == pytest.approx(0.4 * 6 / 7, abs=0.015)
 
 
 def test_a_random_actor_uses_every_action_and_its_own_seed():

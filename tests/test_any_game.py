@@ -36,7 +36,7 @@ from cprl.measuring.evaluate import evaluate
 from cprl.measuring.metrics import FIELDS, METRICS, OPTIONAL, available, left_out, reported_by
 from cprl.measuring.statistics import agents_without_harvest, social_measures
 from cprl.policies.assignment import AgentPolicies
-from cprl.policies.single import RandomActor
+from cprl.policies.lanes import RandomActor
 from cprl.runs.curves import curves_of
 from cprl.runs.episodes import COLUMNS, LEFT_OUT, EpisodeTable, as_table, labelled, read_episodes
 from cprl.terminal.figures import training_curve

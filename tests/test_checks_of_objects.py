@@ -10,7 +10,6 @@ import cprl
 from cprl import CommonsEnv, Map, presets
 from cprl.arguments import path, texts
 from cprl.checks import plain
-from cprl.learners.lanes import weights_to_start
 from cprl.measuring.evaluate import evaluate
 from cprl.population import Scripted
 from cprl.runs.episodes import read_episodes
@@ -55,7 +54,6 @@ def test_a_tensor_without_values_stays_as_it_is(empty):
         (lambda: cprl.run(3), "experiment is 3"),
         (lambda: StepCollector(3, print), "env is 3"),
         (lambda: evaluate(CommonsEnv(COMMONS), print, explore=torch.zeros(0)), "explore is "),
-        (lambda: weights_to_start(True), "start_from is True"),
         (lambda: Map(height=1, width=9, sites=np.float32, starts=()), "Map.sites is "),
         (lambda: Map(height=np.float32, width=9, sites=(), starts=()), "Map.height is "),
     ],

@@ -18,9 +18,9 @@ from cprl.commands import main as cli
 from cprl.commands.recipe import RunOptions, applied, docs, flags_of, parse, recipe_main
 from cprl.custom import Custom
 from cprl.institutions import GraduatedSanctions, Quota
+from cprl.learners.preferences import Exchange
 from cprl.networks import MLP
 from cprl.population import Learning, Scripted, Team
-from cprl.preferences import Exchange
 from cprl.runs.recipe import start_run
 
 ROOT = Path(__file__).parents[1]

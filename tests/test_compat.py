@@ -28,7 +28,7 @@ from torchrl.objectives import DiscreteCQLLoss, DQNLoss, SoftUpdate, ValueEstima
 
 from cprl import CommonsEnv, Game, Rules, keys, maps
 from cprl.commons import compiled
-from cprl.learners.engine.functional import FunctionalLoss, total, weights_of
+from cprl.learners.engine import FunctionalLoss, total, weights_of
 from cprl.system import compat
 from cprl.system.compat import LaneCategorical, losses, recordings
 from cprl.system.libraries import fitting_versions, relying_on, require
@@ -519,6 +519,7 @@ import sys, time
 from pathlib import Path
 import numpy as np
 from cprl.commons import compiled
+from cprl.system import compat
 
 def doubled(values):
     return values * 2

@@ -50,11 +50,11 @@ from cprl.institutions import (
     Vote,
 )
 from cprl.learners.decisions import Bandit
+from cprl.learners.preferences import Exchange, InequityAversion, SocialValueOrientation
 from cprl.learners.settings import Optimizer
 from cprl.networks import GRU, LSTM, MLP, Conv
-from cprl.objectives.log_cosh import DISTANCES
+from cprl.objectives.td import DISTANCES
 from cprl.population import Frozen, Learning, Scripted, Team
-from cprl.preferences import Exchange, InequityAversion, SocialValueOrientation
 from cprl.theory import appropriation, herders
 
 SHARES = st.floats(1e-9, 1, allow_subnormal=False)

@@ -214,14 +214,6 @@ def test_a_replica_decides_the_same_alone_as_beside_others():
 
 def test_what_does_not_fit_is_refused():
     one = {"seeds": [(0,)], "agents": 1}
-    with pytest.raises(ValueError, match=r"sizes is \(\); allowed: the number of choices"):
-        Decider((), **one)
-    with pytest.raises(
-        ValueError, match=r"values is float64 \[1, 1, 2\]; allowed: None, or float64 \[1, 1, 3"
-    ):
-        Decider((3,), values=np.zeros((1, 1, 2)), **one)
-    with pytest.raises(ValueError, match=r'"ballots_due" is \[2, 1\]; allowed: bool \[1, 1\]'):
-        Decider((3,), **one).decide(due([True], [True]))
     with pytest.raises(ValueError, match=r"Bandit.step_size is 0; allowed: a number in 1e-06..1"):
         Bandit(step_size=0)
     with pytest.raises(ValueError, match="3 actors, and decisions of 1 agents"):

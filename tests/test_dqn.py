@@ -79,12 +79,13 @@ def test_the_transitions_of_an_agent_are_its_own_under_torchrls_default_keys():
 def test_the_clock_running_out_is_no_end_for_the_target_but_depletion_is(ending, bootstraps):
     # target = r + gamma max_a Q'(s', a), without the second term behind a terminal state;
     # loss = mean (Q - target)^2
-    parts, batch = learner().stock.each[0], transitions(8, reward=1.0, **ending)
+    engine, batch = learner().engine, transitions(8, reward=1.0, **ending)
+    (loss,), (network,) = engine.losses, engine.parts[0]
     with torch.no_grad():
-        value = parts.network(batch["observation"]).gather(-1, batch["action"][:, None])[:, 0]
-        best = parts.network(batch["next", "observation"]).amax(-1)
+        value = network(batch["observation"]).gather(-1, batch["action"][:, None])[:, 0]
+        best = network(batch["next", "observation"]).amax(-1)
         by_hand = ((value - (1.0 + bootstraps * 0.995 * best)) ** 2).mean()
-    assert parts.loss(batch)["loss"].item() == pytest.approx(by_hand.item(), rel=1e-5)
+    assert loss(batch)["loss"].item() == pytest.approx(by_hand.item(), rel=1e-5)
 
 
 def test_learning_starts_at_the_stored_transitions_of_the_settings():
@@ -106,12 +107,12 @@ def test_as_run_the_loss_is_averaged_over_all_outputs():
 
 
 def target_weights(agent):
-    weights = agent.stock.each[0].loss.target_value_network_params
+    weights = agent.engine.losses[0].target_value_network_params
     return torch.cat([weight.data.flatten() for weight in weights.values(True, True)])
 
 
 def own_weights(agent):
-    weights = agent.stock.each[0].loss.value_network_params
+    weights = agent.engine.losses[0].value_network_params
     return torch.cat([weight.data.flatten() for weight in weights.values(True, True)])
 
 
@@ -150,7 +151,7 @@ def test_the_actor_follows_the_learner_and_epsilon_its_steps():
     for _ in range(50):
         agent.update()
     assert not torch.equal(before, chosen())
-    best = agent.stock.each[0].network(seen[:, 0]).argmax(-1)
+    best = agent.engine.parts[0][0](seen[:, 0]).argmax(-1)
     assert torch.equal(chosen()[:, 0], best)
 
 

@@ -4,15 +4,14 @@ import warnings
 
 import pytest
 import torch
+from dqn_parts import dqn_learner, dqn_loss
 from torch import nn
 from torchrl.modules import QValueActor
 from torchrl.objectives import DQNLoss, LossModule
 
 from cprl import Game, Rules, maps
-from cprl.learners.engine.choice import fitting_engine, trial_batch
-from cprl.learners.replay import ReplayLearner
 from cprl.learners.settings import DQNSettings
-from cprl.learners.single import dqn_loss
+from cprl.learners.trial import fitting_engine, trial_batch
 from cprl.networks.mlp import MLPNetwork
 
 SHAPE, ACTIONS = (3, 3, 5), 8
@@ -90,14 +89,10 @@ def test_a_loss_that_cannot_be_vmapped_runs_as_a_list_and_a_warning_says_why():
 def test_a_learner_finds_its_engine():
     game = Game(map=maps.parse(".A>\n..<"), rules=Rules(window_rows=3, window_columns=5))
     how = {"agents": (0, 1), "settings": DQNSettings(buffer_size=50), "compile": False}
-    found = ReplayLearner(game.spaces, replicas=2, **how)
-    named = ReplayLearner(game.spaces, replicas=2, engine="lane_axis", **how)
+    found = dqn_learner(game.spaces, replicas=2, **how)
+    named = dqn_learner(game.spaces, replicas=2, engine="lane_axis", **how)
     assert type(found.engine) is type(named.engine)
     assert found.networks().keys() == named.networks().keys()
     for name, network in found.networks().items():
         for mine, theirs in zip(network.parameters(), named.networks()[name].parameters(), strict=True):
             assert torch.equal(mine, theirs), "a trial changes nothing"
-    with pytest.raises(
-        ValueError, match="engine is 'quick'; allowed: lane_axis, lane_axis_flat, vmapped, list"
-    ):
-        ReplayLearner(game.spaces, replicas=2, engine="quick", **how)

@@ -7,6 +7,7 @@ from functools import partial
 
 import pytest
 import torch
+from dqn_parts import dqn_learner, dqn_loss, write
 from test_lanes import ENGINES, SHAPE, filled, networks, row, transition
 from torchrl.envs.transforms import MultiStepTransform, RewardScaling
 from torchrl.objectives import HardUpdate, SoftUpdate
@@ -14,12 +15,9 @@ from torchrl.objectives import HardUpdate, SoftUpdate
 from cprl import CommonsEnv, Game, Rules, maps
 from cprl.algorithms import CQL, DQN, IQL, MADDPG, PR2, QMIX, SAC, VDN, DistributionalDQN
 from cprl.custom import Custom
-from cprl.learners.buffer.gather import Horizon
-from cprl.learners.buffer.sampler import lane_buffer
-from cprl.learners.engine.compiled import FunctionalEngine
-from cprl.learners.replay import ReplayLearner
+from cprl.learners.engine import FunctionalEngine
+from cprl.learners.ring import Horizon, Ring
 from cprl.learners.settings import DQNSettings, RolloutSettings
-from cprl.learners.single import dqn_loss
 from cprl.training import train
 
 GAME = Game(
@@ -129,7 +127,7 @@ def test_an_engine_continues_from_its_state_with_every_optimiser(engine, optimiz
     first, second, buffer, same = new(), new(), filled([0, 1]), filled([0, 1])
     for _ in range(5):
         first.update(buffer)
-        same.sampler.draw(same.storage)
+        same.draw()
     second.load_state_dict(deepcopy(first.state_dict()))
     for _ in range(5):
         assert torch.equal(first.update(buffer), second.update(same))
@@ -151,7 +149,7 @@ def played(learner, steps=40):
 
 def learner(settings=SETTINGS, **how):
     how = {"replicas": 2, "compile": False, **how}
-    return ReplayLearner(GAME.spaces, agents=(0, 1), settings=settings, **how)
+    return dqn_learner(GAME.spaces, agents=(0, 1), settings=settings, **how)
 
 
 def test_several_updates_a_step_are_each_from_a_sample_of_their_own():
@@ -162,7 +160,7 @@ def test_several_updates_a_step_are_each_from_a_sample_of_their_own():
     assert three.engine.steps == 9
     assert one.engine.steps == 3
     assert losses[15].shape == (2, 2)
-    assert three.buffer.sampler.rng.state_dict().keys() == one.buffer.sampler.rng.state_dict().keys()
+    assert three.buffer.rng.state_dict().keys() == one.buffer.rng.state_dict().keys()
 
 
 def test_several_steps_an_update_are_counted_from_the_first_possible_one():
@@ -218,7 +216,7 @@ def by_hand(lane, start, steps, *, n_steps, gamma):
 )
 def test_returns_of_several_steps_are_what_one_works_out_by_hand(lanes, n_steps):
     gamma, transitions = 0.9, 30
-    buffer = lane_buffer(
+    buffer = Ring(
         seeds=[(7, lane) for lane in lanes],
         transitions=transitions,
         batch_size=16,
@@ -227,12 +225,12 @@ def test_returns_of_several_steps_are_what_one_works_out_by_hand(lanes, n_steps)
     )
     shorter, terminal = 0, 0
     for step in range(100):
-        buffer.extend(row(lanes, step)[None])
-        oldest, written = buffer.storage.oldest()
+        write(buffer, row(lanes, step))
+        oldest, written = buffer.oldest()
         if written < n_steps:
             continue
-        index = buffer.sampler.draw(buffer.storage)
-        batch = buffer.storage.get(index)
+        index = buffer.draw()
+        batch = buffer.get(index)
         for place, lane in enumerate(lanes):
             for drawn, found in zip(index[place].tolist(), batch[place], strict=True):
                 newest = written - 1 - (written - 1 - drawn) % transitions
@@ -253,13 +251,13 @@ def test_returns_of_several_steps_are_those_of_torchrls_multi_step_transform():
     """But that it leaves "done" and "terminated" those of the first step."""
     gamma, n_steps, lanes = 0.9, 4, [0, 1]
     ours = filled(lanes, steps=0, transitions=40)
-    ours.storage.horizon = Horizon(n_steps, gamma)
+    ours.horizon = Horizon(n_steps, gamma)
     rows = [row(lanes, step) for step in range(36)]
     for one in rows:
-        ours.extend(one[None])
+        write(ours, one)
     whole = MultiStepTransform(n_steps, gamma)._inv_call(torch.stack(rows, 1))
     index = torch.arange(whole.shape[1]).expand(2, -1)
-    got = ours.storage.get(index)
+    got = ours.get(index)
     assert whole.shape[1] == 36 - n_steps, "the newest are held back"
     torch.testing.assert_close(got["next", "reward"], whole["next", "reward"])
     assert torch.equal(got["next", "observation"], whole["next", "observation"])
@@ -270,7 +268,7 @@ def test_a_target_bootstraps_by_the_discount_of_its_steps():
     """target = sum of r + gamma**steps max Q'(s'), without the last term behind a terminal state."""
     n_steps, gamma = 3, 0.9
     buffer = filled([0, 1], steps=40)
-    buffer.storage.horizon = Horizon(n_steps, gamma)
+    buffer.horizon = Horizon(n_steps, gamma)
     batch = buffer.sample()
     made = networks([0, 1])
     update = FunctionalEngine(
@@ -329,9 +327,6 @@ def test_an_agent_that_was_stopped_continues_bit_for_bit_with_all_of_these():
     settings = replace(
         SETTINGS,
         **{"n_steps": 3, "tau": 0.05, "updates_per_step": 2, "optimizer": "rmsprop"},
-        replay_transforms=(
-            Custom("torchrl.envs:RewardScaling", {"loc": 0, "scale": 2, "in_keys": [["next", "reward"]]}),
-        ),
     )
     first, second = learner(settings), learner(settings)
     played(first)
@@ -352,36 +347,33 @@ class Counting(RewardScaling):
         return super().forward(tensordict)
 
 
-@pytest.mark.parametrize("engine", [None, "list", "vmapped"])
-@pytest.mark.parametrize("appended", [False, True], ids=["by the settings", "appended"])
-def test_transforms_of_the_replay_buffer_run(engine, appended):
-    own = (Custom("test_engine_options:Counting"),)
-    made = learner(SETTINGS if appended else replace(SETTINGS, replay_transforms=own), engine=engine)
-    if appended:
-        made.buffer.append_transform(Counting())
-    plain = learner(engine=engine)
+def torchrl_learner(**settings):
+    algorithm = DQN(settings=replace(SETTINGS, **settings))
+    return algorithm.make_learner(GAME.spaces, agents=(0, 1), replicas=2, engine="torchrl")
+
+
+def test_transforms_of_the_replay_buffer_run():
+    transforms = (Custom("test_engine_options:Counting"),)
+    made, plain = torchrl_learner(replay_transforms=transforms), torchrl_learner()
     losses, plain_losses = played(made, 24), played(plain, 24)
-    assert int(made.buffer.transform[0].calls) == 24 - SETTINGS.learning_starts + 1
-    assert made.buffer.storage.fields["reward"].max() == 1.0, "what is stored stays as it was"
+    (counting,) = made.buffer.each[0].transform
+    assert int(counting.calls) == 24 - SETTINGS.learning_starts + 1
+    assert made.buffer.each[0].storage[:]["next", "reward"].max() == 1.0, "what is stored stays as it was"
     assert not torch.equal(losses[-1], plain_losses[-1])
-    other = learner(SETTINGS if appended else replace(SETTINGS, replay_transforms=own), engine=engine)
-    if appended:
-        other.buffer.append_transform(Counting())
+    other = torchrl_learner(replay_transforms=transforms)
     other.load_state_dict(made.state_dict())
-    assert int(other.buffer.transform[0].calls) == int(made.buffer.transform[0].calls)
-
-
-def test_what_is_stored_passes_through_the_inverse_of_a_transform():
-    made = learner()
-    made.buffer.append_transform(RewardScaling(0.0, 10.0, in_keys=[("next", "reward")]), invert=True)
-    played(made, 30)
-    assert made.buffer.storage.fields["reward"].max() == 10.0
+    assert int(other.buffer.each[0].transform[0].calls) == int(counting.calls)
 
 
 def test_a_transform_that_does_not_fit_is_refused_by_name():
     wrong = Custom("torchrl.envs:RewardScaling", {"loc": 0.0, "scale": 2.0})
     with pytest.raises(ValueError, match=r"torchrl.envs:RewardScaling cannot transform .*'reward' not found"):
-        learner(replace(SETTINGS, replay_transforms=(wrong,)))
+        torchrl_learner(replay_transforms=(wrong,))
+
+
+def test_the_fast_engine_refuses_transforms_by_name():
+    with pytest.raises(ValueError, match=r'replay_transforms is .*engine="torchrl"'):
+        learner(replace(SETTINGS, replay_transforms=(Custom("test_engine_options:Counting"),)))
 
 
 @pytest.mark.parametrize(

@@ -7,6 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
+from dqn_parts import dqn_learner
 from matrix_game import MatrixGame
 from torchrl.envs import Transform, TransformedEnv
 
@@ -34,8 +35,8 @@ from cprl.algorithms import (
 from cprl.commands.recipe import parse
 from cprl.envs.make_env import spaces_of
 from cprl.learners.base import LaneLosses
-from cprl.learners.engine.base import ListEngine
-from cprl.learners.lola.networks import LOLANetworks
+from cprl.learners.engine import ListEngine
+from cprl.learners.lola import LOLANetworks
 from cprl.learners.replay import ReplayLearner
 from cprl.networks.finite import all_finite, finite_lanes
 from cprl.population import Learning
@@ -94,9 +95,8 @@ def tensors_of(learner, replica, agent):
     if hasattr(learner, "tables"):
         lane = replica * len(learner.agents) + agent
         return [torch.from_numpy(learner.tables.values)[list(learner.tables.rows[lane].values())[-1]]]
-    lane = replica * learner._lanes.of_replica + (agent if learner._lanes.of_replica > 1 else 0)
-    if hasattr(learner, "stock"):
-        return [own.data for own in learner.stock.each[lane].loss.parameters()]
+    of_replica = len(learner._lanes) // learner.replicas
+    lane = replica * of_replica + (agent if of_replica > 1 else 0)
     if isinstance(learner.engine, ListEngine):
         return [own.data for own in learner.engine.losses[lane].parameters()]
     if isinstance(learner.engine, LOLANetworks):
@@ -356,7 +356,9 @@ def test_a_learner_of_somebodys_own_that_refuses_nan_is_explained():
                 raise RuntimeError("probability tensor contains either `inf`, `nan` or element < 0")
             return losses
 
-    learner = Refuses(GAME.spaces, agents=(0, 1), replicas=REPLICAS, settings=REPLAY, compile=False)
+    learner = dqn_learner(
+        GAME.spaces, kind=Refuses, agents=(0, 1), replicas=REPLICAS, settings=REPLAY, compile=False
+    )
     with pytest.raises(NotFiniteError, match="at step 6 the weights of agent 0 in replica 1 are") as caught:
         play(learner, breaks=Breaks(learner, step=5))
     assert "probability tensor" in str(caught.value.__context__)

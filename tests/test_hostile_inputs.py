@@ -20,10 +20,11 @@ from hypothesis import strategies as st
 from tiny_study import GAME, LEARNING, TINY
 
 import cprl
-from cprl import Experiment, algorithms, institutions, population, preferences, theory
+from cprl import Experiment, algorithms, institutions, population, theory
 from cprl.config import KINDS, custom_targets, from_config, to_config
 from cprl.envs.matrix import prisoners_dilemma
 from cprl.envs.taking import TakingGame
+from cprl.learners import preferences
 from cprl.runs.episodes import read_episodes, read_table
 from cprl.runs.files import RunLock, read_json
 
@@ -262,7 +263,7 @@ def test_the_gate_closes(tmp_path, monkeypatch):
         accepted(lambda: {}["a"])
     with pytest.raises(AssertionError, match="Hung"):
         accepted(lambda: time.sleep(60), longest_s=0.05)
-    monkeypatch.setattr("cprl.algorithms.dqn.DQN.__post_init__", lambda dqn: None)
+    monkeypatch.setattr("cprl.algorithms.off_policy.DQN.__post_init__", lambda dqn: None)
     with pytest.raises(AssertionError, match="neither"):
         holds_of_a_change(("DQN", "double", "yes"))
     monkeypatch.setattr("cprl.runs.episodes.verify", lambda path: None)

@@ -5,17 +5,13 @@ from functools import partial
 import numpy as np
 import pytest
 import torch
+from dqn_parts import dqn_loss, write
 from tensordict import TensorDict, assert_close
 from torch import nn
-from torchrl.data.replay_buffers import ReplayBuffer
 from torchrl.objectives import DQNLoss
 
-from cprl.learners.buffer.sampler import LaneSampler, lane_buffer
-from cprl.learners.buffer.storage import storage_bytes
-from cprl.learners.engine import compiled as fused
-from cprl.learners.engine.base import ListEngine
-from cprl.learners.engine.compiled import FunctionalEngine
-from cprl.learners.single import dqn_loss
+from cprl.learners.engine import FunctionalEngine, ListEngine
+from cprl.learners.ring import Ring, storage_bytes
 from cprl.networks.mlp import MLPNetwork
 from cprl.networks.stacked import StackedMLP
 
@@ -69,11 +65,11 @@ def row(lanes, step):
 
 
 def filled(lanes, *, steps=60, transitions=40):
-    buffer = lane_buffer(
+    buffer = Ring(
         seeds=[(7, lane) for lane in lanes], transitions=transitions, batch_size=4, observation_shape=SHAPE
     )
     for step in range(steps):
-        buffer.extend(row(lanes, step)[None])
+        write(buffer, row(lanes, step))
     return buffer
 
 
@@ -238,7 +234,7 @@ def test_a_users_own_network_is_vmapped():
             torch.testing.assert_close(mine, theirs, rtol=1e-4, atol=1e-6)
 
 
-def test_it_is_torchrls_loss_and_torchrls_buffer(monkeypatch):
+def test_it_is_torchrls_loss(monkeypatch):
     calls = []
     forward = DQNLoss.forward
     monkeypatch.setattr(DQNLoss, "forward", lambda *given: calls.append(given[0]) or forward(*given))
@@ -246,7 +242,6 @@ def test_it_is_torchrls_loss_and_torchrls_buffer(monkeypatch):
     assert len(calls) == 3
     assert all(call is update.loss.module for call in calls)
     assert type(update.loss.module) is DQNLoss
-    assert isinstance(filled([0]), ReplayBuffer)
 
 
 def test_a_failing_compile_falls_back_with_one_warning(monkeypatch):
@@ -256,7 +251,7 @@ def test_a_failing_compile_falls_back_with_one_warning(monkeypatch):
 
         return run
 
-    monkeypatch.setattr(fused.torch, "compile", broken)
+    monkeypatch.setattr(torch, "compile", broken)
     engine = COMPILED["lane_axis, compiled"]
     with pytest.warns(RuntimeWarning, match="torch.compile failed, updates run uncompiled.*no C") as caught:
         update, _ = trained(engine, [0, 1], steps=20)
@@ -282,9 +277,9 @@ class Remembered:
 def test_every_transition_kept_is_what_came_and_the_last_ones_are_kept(lanes):
     buffer, remembered = filled(lanes, steps=0, transitions=30), Remembered(lanes, 30)
     for step in range(100):
-        buffer.extend(row(lanes, step)[None])
+        write(buffer, row(lanes, step))
         remembered.add(step)
-        oldest, written = buffer.storage.oldest()
+        oldest, written = buffer.oldest()
         assert written == step + 1
         for place in range(len(lanes)):
             kept = remembered.rows[place]
@@ -293,7 +288,7 @@ def test_every_transition_kept_is_what_came_and_the_last_ones_are_kept(lanes):
             numbers = torch.arange(int(oldest[place]), written)
             assert len(numbers) >= min(len(kept), 24)
             index = (numbers % 30).expand(len(lanes), -1)
-            got = buffer.storage.get(index)[place]
+            got = buffer.get(index)[place]
             for one, expected in zip(got, kept[-len(numbers) :], strict=True):
                 for key in ("observation", "action", ("next", "observation")):
                     assert torch.equal(one[key], expected[key]), (step, key)
@@ -303,50 +298,43 @@ def test_every_transition_kept_is_what_came_and_the_last_ones_are_kept(lanes):
 
 def test_lanes_draw_for_themselves_and_uniformly():
     buffer = filled([0, 1, 2], steps=30, transitions=20)
-    drawn = torch.stack([buffer.sampler.draw(buffer.storage) for _ in range(3000)])
+    drawn = torch.stack([buffer.draw() for _ in range(3000)])
     assert not torch.equal(drawn[:, 0], drawn[:, 1])
     counts = torch.stack([torch.bincount(drawn[:, lane].flatten(), minlength=20) for lane in range(3)])
     assert (counts - 600).abs().max() < 6 * 600**0.5
     alone = filled([1], steps=30, transitions=20)
-    again = torch.stack([alone.sampler.draw(alone.storage) for _ in range(3000)])
+    again = torch.stack([alone.draw() for _ in range(3000)])
     assert torch.equal(again[:, 0], drawn[:, 1])
 
 
 def test_a_sample_of_the_buffer_is_what_the_fast_step_gathers():
     buffer, same = filled([0, 1, 2]), filled([0, 1, 2])
-    index = same.sampler.draw(same.storage)
-    assert_close(buffer.sample(), same.storage.get(index))
+    index = same.draw()
+    assert_close(buffer.sample(), same.get(index))
 
 
 def test_a_buffer_goes_on_as_it_was_from_its_state():
     lanes = [0, 1, 2]
     buffer, other = filled(lanes, steps=73), filled(lanes, steps=5)
     other.load_state_dict(buffer.state_dict())
-    other.sampler.load_state_dict(buffer.sampler.state_dict())
     for step in range(73, 120):
         assert_close(buffer.sample(), other.sample())
         for one in (buffer, other):
-            one.extend(row(lanes, step)[None])
+            write(one, row(lanes, step))
 
 
 def test_what_it_takes_is_told_before_and_what_cannot_fit_is_refused(caplog):
     assert storage_bytes(20, 100_000, (3, 7, 15)) < 0.8e9
     with caplog.at_level("INFO", logger="cprl"):
-        lane_buffer(seeds=[(0,), (1,)], transitions=10_000, batch_size=8, observation_shape=SHAPE)
+        Ring(seeds=[(0,), (1,)], transitions=10_000, batch_size=8, observation_shape=SHAPE)
     assert "Replay buffers of 2 learners x 10,000 transitions: 0.00 GiB of " in caplog.text
     buffer = filled([0, 1])
-    storage = buffer.storage
-    taken = sum(field.numel() * field.element_size() for field in storage.fields.values())
+    taken = sum(field.numel() * field.element_size() for field in buffer.fields.values())
     assert taken == storage_bytes(2, 40, SHAPE)
     with pytest.raises(MemoryError, match=r"200 learners x 10,000,000 .* take [\d.]+ GiB; .* are free"):
-        lane_buffer(
+        Ring(
             seeds=[(lane,) for lane in range(200)],
             transitions=10_000_000,
             batch_size=8,
             observation_shape=SHAPE,
         )
-
-
-def test_another_batch_size_than_the_samplers_is_refused():
-    with pytest.raises(ValueError, match="batch_size is 5; allowed: that of the sampler, 8"):
-        LaneSampler([(0,)], 8).sample(filled([0]).storage, 5)

@@ -14,7 +14,7 @@ from tensordict.nn import TensorDictModule
 from torch import nn
 from torchrl.modules import ProbabilisticActor
 
-from cprl.learners.engine.functional import FunctionalLoss, weights_of
+from cprl.learners.engine import FunctionalLoss, weights_of
 from cprl.objectives import (
     LOLADiCELoss,
     LOLALoss,

@@ -17,12 +17,11 @@ from torchrl.objectives import DQNLoss, SoftUpdate, ValueEstimators
 import cprl
 from cprl import CommonsEnv
 from cprl.algorithms import DQN, MADDPG, DQNSettings
-from cprl.algorithms.dqn import q_actor
+from cprl.algorithms.base import q_actor
 from cprl.envs import make_env
 from cprl.envs.matrix import MatrixGame
 from cprl.evaluation import evaluate_run
-from cprl.learners.buffer.gather import Horizon
-from cprl.learners.buffer.sampler import lane_buffer
+from cprl.learners.ring import Horizon, Ring
 from cprl.learners.transitions import LaneTurn
 from cprl.networks import MLP
 from cprl.objectives import MADDPGLoss
@@ -249,7 +248,7 @@ def learner_of(specs, **how):
 def test_members_are_paid_what_each_wants_also_with_others_outside_the_team(reward, paid):
     _, learner = learner_of([Scripted(), Team(TEAM, (1, 2), reward=reward), Scripted()])
     learner.store(first_turn(2))
-    fields = learner.buffer.storage.fields
+    fields = learner.buffer.fields
     assert fields["reward"][0].tolist() == [paid, paid]
     assert fields["action"][0].tolist() == [[1, 2], [1, 2]]
     assert learner.engine.weights(0)["critic_network_params:module.heads.members.weights.0"].shape == (
@@ -289,7 +288,7 @@ def test_the_layers_of_critics_are_those_of_the_settings_or_of_the_network(netwo
 
 def test_returns_of_several_steps_are_those_of_each_member():
     """Rewards 1, 2, 4, 8 .. of member 0, ten times that of member 1; the episode ends with the third turn."""
-    buffer = lane_buffer(
+    buffer = Ring(
         seeds=[(0,), (1,)],
         transitions=10,
         batch_size=4,
@@ -306,7 +305,7 @@ def test_returns_of_several_steps_are_those_of_each_member():
         )
         paid = (2.0**step * torch.tensor([[1.0, 10.0], [3.0, 30.0]])).numpy()
         buffer.write(LaneTurn(see, act, see, paid, ends, ends))
-    got = buffer.storage.get(torch.tensor([[0, 1, 3], [0, 2, 3]]))
+    got = buffer.get(torch.tensor([[0, 1, 3], [0, 2, 3]]))
     # 1 + 2/2 + 4/4 = 3; 2 + 4/2 = 4, since the episode ends; 4; 8 + 16/2 + 32/4 = 24.
     wanted = [[[3, 30], [4, 40], [24, 240]], [[9, 90], [12, 120], [72, 720]]]
     assert got["next", "reward"].squeeze(-1).tolist() == wanted

@@ -5,6 +5,7 @@ from functools import partial
 
 import pytest
 import torch
+from dqn_parts import dqn_learner
 from tensordict import TensorDict
 from torch import nn
 
@@ -30,11 +31,8 @@ from cprl.algorithms import (
 )
 from cprl.commons.spaces import Spaces
 from cprl.custom import Custom
-from cprl.learners.engine import choice
-from cprl.learners.engine.base import ListEngine
-from cprl.learners.engine.compiled import FunctionalEngine
-from cprl.learners.engine.functional import own_targets
-from cprl.learners.replay import ReplayLearner
+from cprl.learners import trial
+from cprl.learners.engine import FunctionalEngine, ListEngine, own_targets
 from cprl.networks import MLP, Conv, ConvNetwork, MLPNetwork
 from cprl.networks.specification import new_network
 from cprl.networks.stacked import stack_lanes
@@ -175,7 +173,7 @@ def test_lanes_learn_with_any_network_what_each_would_alone(kind, network, monke
     ends = []
     for engine in (FunctionalEngine, ListEngine):
         if engine is ListEngine:
-            monkeypatch.setattr(choice, "fitting_engine", lambda *_: "list")
+            monkeypatch.setattr(trial, "fitting_engine", lambda *_: "list")
         _, learner = learner_of(kind, network)
         assert isinstance(learner.engine, engine)
         played(learner, 30)
@@ -209,7 +207,7 @@ def test_a_network_whose_buffers_do_not_stack_is_vmapped():
 
     with pytest.raises(ValueError, match="a Normalised has buffers; allowed: parameters alone"):
         stack_lanes([Normalised(), Normalised()])
-    learner = ReplayLearner(
+    learner = dqn_learner(
         SPACES, agents=(0, 1), replicas=1, settings=REPLAY, make_network=Normalised, compile=False
     )
     assert learner.engine._vmapped
@@ -227,15 +225,6 @@ def test_the_central_critic_reads_the_observations_of_all_members(network):
     other[:, 2] = 255 - other[:, 2]
     assert (team["critic"](other) != value).all()
     assert torch.equal(team["actor"](other)[:, :2], team["actor"](seen)[:, :2])
-
-
-@pytest.mark.integration
-def test_a_learner_with_convolutions_continues_bit_for_bit():
-    (_, first), (_, second) = learner_of(DQN, CONV), learner_of(DQN, CONV)
-    played(first)
-    second.load_state_dict(first.state_dict())
-    for mine, theirs in zip(played(first), played(second), strict=True):
-        assert torch.equal(mine, theirs)
 
 
 class Windows(nn.Linear):

@@ -15,9 +15,6 @@ from cprl.evaluation import crossplay
 from cprl.evaluation.film import film
 from cprl.measuring import phases
 from cprl.measuring.episodes import EpisodeTracker
-from cprl.policies.lanes import random_lanes
-from cprl.policies.scripted import scripted_lanes
-from cprl.policies.single import RandomActor
 
 GAME = Game(map=maps.parse(">A.\n.A."), rules=Rules(may_fire=False))
 BOARD = partial(Map, height=3, width=3, sites=((0, 0),), starts=((1, 1, 0),))
@@ -39,11 +36,6 @@ INF, NAN = float("inf"), float("nan")
         (lambda: CommonsEnv(GAME, 0), "worlds is 0; allowed: an integer from 1"),
         (lambda: CommonsEnv(GAME, device="x"), "device is 'x'; allowed: "),
         (lambda: CommonsGymnasiumEnv(GAME).step(0), r"has not begun; allowed: reset\(\) before"),
-        (lambda: scripted_lanes("gredy", GAME, seeds=[(0,)], agents=1), "policy is 'gredy'; allowed: random"),
-        (lambda: random_lanes(7, seeds=[(0,)], agents=2), "1 seeds for 2 agents; allowed: "),
-        (lambda: random_lanes(7, seeds=[(0,)], agents=0), "agents is 0; allowed: "),
-        (lambda: setattr(random_lanes(7, seeds=[(0,)], agents=1), "epsilon", 2.0), "epsilon is 2.0"),
-        (lambda: RandomActor(3, seed=-1), "seed is -1; allowed: "),
         (lambda: phases.find_phases([0, 1e9], {"a": [1, 2]}), "episodes are 0 to 1e.09; allowed: at most"),
         (lambda: crossplay(["a", "b"], diagonal="selfplay"), "diagonal is 'selfplay'; allowed: self, cross_"),
         (lambda: crossplay([]), "the number of runs is 0; allowed: at least two"),

@@ -5,8 +5,7 @@ from statistics import fmean
 import pytest
 
 from cprl import CommonsEnv, Game, Rules, maps
-from cprl.algorithms.actor_critic import IQL, SAC
-from cprl.algorithms.dqn import CQL, DQN, DistributionalDQN
+from cprl.algorithms.off_policy import CQL, DQN, IQL, SAC, DistributionalDQN
 from cprl.algorithms.on_policy import A2C, PPO, Reinforce
 from cprl.learners.settings import DQNSettings, RolloutSettings
 from cprl.measuring.evaluate import evaluate

@@ -8,10 +8,11 @@ from pathlib import Path
 import pytest
 
 from cprl import CommonsEnv, Experiment, presets
+from cprl.algorithms.base import q_actor
 from cprl.measuring.evaluate import evaluate, mean_return
 from cprl.networks.mlp import MLPNetwork
 from cprl.policies.assignment import AgentPolicies
-from cprl.policies.single import QActor, RandomActor
+from cprl.policies.lanes import RandomActor
 from cprl.runs.episodes import read_episodes
 from cprl.runs.recipe import read_recipe
 from cprl.runs.weights import load_weights, restore_weights
@@ -75,6 +76,6 @@ def test_the_short_schedule_earns_three_times_what_chance_does(tmp_path):
     network = MLPNetwork(game.observation_shape, 7, highest=game.observation.highest)
     restore_weights(run / "checkpoints" / "best.pt", {"agent_0": network})
     fresh = CommonsEnv(game, 100, seed=1234)
-    greedy, _ = mean_return(evaluate(fresh, AgentPolicies([QActor(network, 7)])))
+    greedy, _ = mean_return(evaluate(fresh, AgentPolicies([q_actor(network)])))
     chance, _ = mean_return(evaluate(fresh, AgentPolicies([RandomActor(7)])))
     assert greedy >= 3 * chance

@@ -6,6 +6,7 @@ from importlib.metadata import version
 from importlib.resources import files
 
 import pytest
+from dqn_parts import dqn_learner
 from tiny_study import FREEZE, SETTINGS, TINY
 from torchrl.envs import StepCounter, TransformedEnv
 
@@ -14,11 +15,10 @@ from cprl import presets
 from cprl.commands import main as cli
 from cprl.envs import CommonsGymnasiumEnv, parallel_env
 from cprl.envs.matrix import MatrixEnv, stag_hunt
-from cprl.learners.replay import ReplayLearner
 
 PACKAGES = (
     *("algorithms", "commons", "envs", "evaluation", "institutions", "keys"),
-    *("learners", "measuring", "networks", "objectives", "policies", "population", "preferences", "presets"),
+    *("learners", "measuring", "networks", "objectives", "policies", "population", "presets"),
     *("studies", "theory", "training", "viewer"),
 )
 """What users import."""
@@ -78,7 +78,7 @@ def test_what_is_printed_says_in_a_line_what_one_asks_first():
     assert is_short(game.map, "12 x 24", "89 sites", "4 agents")
     assert is_short(TINY, "'tiny'", "2 episodes", "1 replicas")
     assert is_short(cprl.Study(TINY, {FREEZE: [5, 25]}, name="both"), "'both'", "2 conditions")
-    learner = ReplayLearner(game.spaces, agents=(0, 1), replicas=2, settings=SETTINGS, seed=0, compile=False)
+    learner = dqn_learner(game.spaces, agents=(0, 1), replicas=2, settings=SETTINGS, seed=0, compile=False)
     assert is_short(learner, "agents=(0, 1)", "replicas=2")
 
 

@@ -5,24 +5,22 @@ from typing import ClassVar
 
 import pytest
 import torch
+from dqn_parts import q_table
 from torchrl.objectives import ClipPPOLoss
 
 import cprl
 from cprl import CommonsEnv, Experiment, Game, Observation, Rules, maps
-from cprl.algorithms.actor_critic import IQL, SAC
 from cprl.algorithms.base import OffPolicy
-from cprl.algorithms.dqn import CQL, DQN, DistributionalDQN
+from cprl.algorithms.off_policy import CQL, DQN, IQL, PR2, SAC, DistributionalDQN, Tabular
 from cprl.algorithms.on_policy import A2C, PPO, Reinforce
-from cprl.algorithms.pr2 import PR2
-from cprl.algorithms.tabular import Tabular
 from cprl.evaluation import evaluate_run
+from cprl.learners.preferences import WantedRewards
 from cprl.learners.replay import ReplayLearner
 from cprl.learners.rollouts import RolloutLearner
 from cprl.learners.settings import DQNSettings, RolloutSettings, TabularSettings
 from cprl.learners.transitions import lane_turn, wanted_in
 from cprl.networks.agent import acting_part
 from cprl.population import Frozen, Learning, Scripted
-from cprl.preferences import WantedRewards
 from cprl.runs.checkpoints import Checkpointer, checkpoints_in
 from cprl.training import train
 from cprl.training.agents import Population
@@ -393,7 +391,7 @@ def test_a_tabular_agent_is_a_member_like_any_other(tmp_path, capsys):
     assert loaded.specs[2].algorithm == algorithm
     agents = population(members)
     trained(agents, episodes=4)
-    table = agents.learners[0, 2].q_table(3)
+    table = q_table(agents.learners[0, 2], 3)
     assert len(table["visits"]) > 10
     seen, network = torch.from_numpy(table["observation"]), loaded.networks["replica_1/agent_2"]
     assert torch.equal(network(seen.unsqueeze(0))[0], torch.from_numpy(table["values"]))
@@ -436,7 +434,7 @@ def test_a_tabular_agent_is_paid_for_itself_or_for_the_group(reward_kind):
     train(CommonsEnv(GAME, 2), agents.learners, others=agents.others, episodes=10, callbacks=[witness])
     values = {}
     for replica in range(2):
-        table = agents.learners[1,].q_table(replica)
+        table = q_table(agents.learners[1,], replica)
         for seen, of_actions, visits in zip(
             table["observation"], table["values"], table["visits"], strict=True
         ):

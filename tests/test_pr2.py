@@ -17,9 +17,9 @@ from cprl.algorithms import DQN, PR2, VDN, DQNSettings
 from cprl.envs import make_env
 from cprl.envs.matrix import MatrixGame, stag_hunt
 from cprl.evaluation import crossplay, evaluate_run
-from cprl.learners.engine.compiled import FunctionalEngine
+from cprl.learners.engine import FunctionalEngine
 from cprl.learners.transitions import joint_actions
-from cprl.networks.joint import chosen, conditional, marginal, soft_value
+from cprl.networks.agent import chosen, conditional, marginal, soft_value
 from cprl.objectives import PR2Loss
 from cprl.population import Frozen, Learning, Scripted
 from cprl.training import train
@@ -186,7 +186,7 @@ def test_a_lane_stores_its_own_action_first_then_those_of_the_others_by_their_in
     turn = env.step(moment)
     assert joint_actions((0, 2), turn).tolist() == [[0, 1, 2], [2, 0, 1], [3, 4, 5], [5, 3, 4]]
     learner.store(turn)
-    assert learner.buffer.storage.fields["action"][0].tolist() == [[0, 1, 2], [2, 0, 1], [3, 4, 5], [5, 3, 4]]
+    assert learner.buffer.fields["action"][0].tolist() == [[0, 1, 2], [2, 0, 1], [3, 4, 5], [5, 3, 4]]
 
 
 def test_agents_act_on_what_they_see_themselves_by_the_policy_of_their_joint_values():

@@ -15,10 +15,13 @@ from torchrl.envs.utils import check_env_specs
 
 from cprl import CommonsEnv, Game, Rules, maps
 from cprl.envs import make_env, parallel_env
-from cprl.envs.state import env_state, load_env_state, load_transforms_state, transforms_state
-from cprl.policies.assignment import AgentPolicies
-from cprl.policies.lanes import random_agents
-from cprl.preferences import (
+from cprl.envs.state import (
+    env_state,
+    load_env_state,
+    load_transforms_state,
+    transforms_state,
+)
+from cprl.learners.preferences import (
     Exchange,
     InequityAversion,
     PreferenceTransform,
@@ -27,6 +30,8 @@ from cprl.preferences import (
     WantedRewards,
     wanted_rewards,
 )
+from cprl.policies.assignment import AgentPolicies
+from cprl.policies.lanes import random_agents
 from cprl.training.collectors import StepCollector
 
 AVERSE = InequityAversion(alpha=5, beta=0.05, smoothing=0.9)

@@ -13,11 +13,10 @@ from torchrl.objectives import DQNLoss, ValueEstimators
 
 from cprl import presets
 from cprl.algorithms import CQL, DQN, IQL, MADDPG, PR2, SAC, DQNSettings, RolloutSettings
-from cprl.learners.engine.optimizers import change_weights, torch_optimizer
-from cprl.learners.torchrl.agents import make_optimizer
-from cprl.networks.joint import JointNetwork, JointValues
+from cprl.learners.engine import change_weights, torch_optimizer
+from cprl.networks.agent import JointNetwork, JointValues
 from cprl.objectives import LogCoshDQNLoss, PR2Loss, log_cosh
-from cprl.objectives.log_cosh import DISTANCES, distance
+from cprl.objectives.td import DISTANCES, distance
 from cprl.system.compat import promise_targets
 
 # Two steps of Keras's RMSprop with rho 0.9, learning rate 0.1 and, to see where it stands, epsilon 0.5, from
@@ -28,13 +27,9 @@ from cprl.system.compat import promise_targets
 GRADIENTS, WEIGHTS, SQUARES = (2.0, -1.0), (0.8233926, 0.9082655), (0.4, 0.46)
 
 
-@pytest.mark.parametrize("make", [torch_optimizer, make_optimizer])
-def test_torchs_optimiser_takes_the_steps_of_keras(make):
+def test_torchs_optimiser_takes_the_steps_of_keras():
     weight = nn.Parameter(torch.ones(1, dtype=torch.float64))
-    if make is torch_optimizer:
-        optimizer = make("keras_rmsprop", [weight], learning_rate=0.1, eps=0.5)
-    else:
-        optimizer = make([weight], "keras_rmsprop", learning_rate=0.1, eps=0.5)
+    optimizer = torch_optimizer("keras_rmsprop", [weight], learning_rate=0.1, eps=0.5)
     assert type(optimizer) is torch.optim.RMSprop
     for gradient, after, square in zip(GRADIENTS, WEIGHTS, SQUARES, strict=True):
         weight.grad = torch.full_like(weight, gradient)
@@ -236,18 +231,19 @@ def test_as_run_the_loss_is_that_of_keras_over_all_outputs():
     algorithm = DQN(settings=settings, loss_function="log_cosh")
     spaces = presets.game("two_complex", variant="as_run").spaces
     learner = algorithm.make_learner(spaces, agents=(0,), replicas=1, engine="torchrl")
-    agent, chance = learner.stock.each[0], torch.Generator().manual_seed(1)
+    engine, chance = learner.engine, torch.Generator().manual_seed(1)
+    (loss,), (network,) = engine.losses, engine.parts[0]
     seen, seen_next = torch.randint(256, (2, 8, *spaces.observation_shape), generator=chance).to(torch.uint8)
     action, reward = torch.arange(8) % spaces.actions, torch.rand(8, 1, generator=chance)
     ends = torch.zeros(8, 1, dtype=torch.bool)
     after = {"observation": seen_next, "reward": reward, "done": ends, "terminated": ends}
     batch = TensorDict({"observation": seen, "action": action, "next": TensorDict(after, [8])}, [8])
-    with agent.loss.target_value_network_params.to_module(agent.loss.value_network):
-        following = agent.loss.value_network(batch["next"].select("observation"))["action_value"].amax(-1)
-    outputs = agent.network(seen).detach()
+    with loss.target_value_network_params.to_module(loss.value_network):
+        following = loss.value_network(batch["next"].select("observation"))["action_value"].amax(-1)
+    outputs = network(seen).detach()
     targets = outputs.clone()
     targets[range(8), action] = reward.squeeze(-1) + settings.gamma * following
-    assert agent.update(batch).item() == pytest.approx(log_cosh(outputs - targets).mean().item(), rel=1e-5)
+    assert engine.learn(0, batch).item() == pytest.approx(log_cosh(outputs - targets).mean().item(), rel=1e-5)
 
 
 def test_pr2_takes_log_cosh_too():
@@ -297,8 +293,8 @@ def test_the_learners_of_the_programs_versions_are_one_line_away():
     )
     of_torch = version.make_loss(version.make_network(presets.game("commons").spaces))
     assert isinstance(of_torch, LogCoshDQNLoss)
-    optimizer = make_optimizer(
-        of_torch.parameters(), version.settings.optimizer, learning_rate=1e-5, eps=version.settings.adam_eps
+    optimizer = torch_optimizer(
+        version.settings.optimizer, of_torch.parameters(), learning_rate=1e-5, eps=version.settings.adam_eps
     )
     group = optimizer.param_groups[0]
     assert (group["alpha"], group["eps"], group["momentum"], group["centered"]) == (0.9, 1e-7, 0, False)

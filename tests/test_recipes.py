@@ -11,13 +11,13 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
 import torch
+from dqn_parts import dqn_learner
 from rerun.chunk import RrdReader
 
 import cprl
 from cprl import CommonsEnv, presets
 from cprl.algorithms import DQN, PPO
 from cprl.commands.recipe import parse
-from cprl.learners.replay import ReplayLearner
 from cprl.measuring.evaluate import evaluate
 from cprl.population import Learning, Scripted
 from cprl.runs.checkpoints import Checkpointer, checkpoints_in, read_checkpoint
@@ -213,7 +213,7 @@ def test_recipes_of_replicas_leave_a_run_directory(name, variant, tmp_path, caps
     assert json.loads((run / "report.json").read_text())["training_s"] > 0
     if name == "commons":
         game, settings = presets.game("commons"), presets.dqn_settings("commons", variant=variant)
-        network = ReplayLearner(
+        network = dqn_learner(
             game.spaces, agents=[0], replicas=1, settings=settings, compile=False
         ).networks()
         restore_weights_of(network["replica_0/agent_0"], weights["replica_1/agent_2"])
@@ -306,7 +306,7 @@ def test_fifty_episodes_of_commons_in_eight_replicas_are_those_of_each_alone(tmp
     weights = load_weights(run / "checkpoints" / "final.pt")
     game, settings = presets.game("commons"), presets.dqn_settings("commons")
     for replica in (0, 5):
-        alone = ReplayLearner(
+        alone = dqn_learner(
             game.spaces, agents=range(4), replicas=1, first_replica=replica, settings=settings, seed=5
         )
         env = CommonsEnv(game, 1, seed=5, first_world=replica)

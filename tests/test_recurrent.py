@@ -449,10 +449,6 @@ def test_what_an_agent_does_depends_on_what_it_saw(ran):
     seen = torch.zeros(1, 2, *GAME.observation_shape, dtype=torch.uint8)
     once, twice = torch.zeros(1, 2, 5), torch.ones(1, 2, 5)
     assert not torch.equal(actor.preferences(seen, once), actor.preferences(seen, twice))
-    with pytest.raises(ValueError, match="state is None; allowed for recurrent networks"):
-        actor.preferences(seen)
-    with pytest.raises(ValueError, match="needs a state; allowed: choose_with"):
-        actor.choose(seen)
 
 
 def test_states_of_other_policies_are_refused(ran):

@@ -5,6 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
+from dqn_parts import dqn_learner
 from recall_game import Recall
 from test_population import (
     GAME,
@@ -20,7 +21,6 @@ import cprl
 from cprl import CommonsEnv, Custom, Experiment
 from cprl.algorithms import DQN, PPO, SAC, VDN, DQNSettings, RolloutSettings
 from cprl.envs import make_env, spaces_of
-from cprl.learners.replay import ReplayLearner
 from cprl.networks import GRU, LSTM, MLP, Conv
 from cprl.policies.assignment import AgentPolicies
 from cprl.population import Learning, Scripted, Team
@@ -109,8 +109,8 @@ def test_a_sequence_is_what_was_played_from_some_turn_on(steps):
 def test_every_turn_is_sampled_once_enough_follow_it():
     learner = made(DQNS["GRU"], replicas=1)
     play(learner, 100)
-    oldest, written = learner.buffer.storage.oldest()
-    drawn = torch.cat([learner.buffer.sampler.draw(learner.buffer.storage) for _ in range(200)], 1)
+    oldest, written = learner.buffer.oldest()
+    drawn = torch.cat([learner.buffer.draw() for _ in range(200)], 1)
     places = {int(place) % 60 for place in range(int(oldest[0]), written - 5)}
     assert set(drawn.flatten().tolist()) == places
 
@@ -157,7 +157,7 @@ def test_every_engine_learns_what_a_list_of_losses_does(name, engine):
     algorithm = DQNS[name]
 
     def learned(kind):
-        learner = ReplayLearner(
+        learner = dqn_learner(
             GAME.spaces,
             agents=FOUR,
             replicas=2,

@@ -5,6 +5,7 @@ from functools import partial
 
 import pytest
 import torch
+from dqn_parts import dqn_learner, dqn_loss, write
 from tensordict import TensorDict
 from tensordict.nn import TensorDictModule
 from test_networks import GAME, REPLAY, ROLLOUTS, SPACES, played
@@ -13,15 +14,13 @@ from torchrl.objectives import ClipPPOLoss, DQNLoss, HardUpdate, KLPENPPOLoss, S
 
 from cprl import CommonsEnv, Observation
 from cprl.algorithms import A2C, DQN, PPO, QMIX
-from cprl.algorithms.actor_critic import policy
-from cprl.learners.buffer.sampler import lane_buffer
-from cprl.learners.engine.base import ListEngine
-from cprl.learners.replay import ReplayLearner
+from cprl.algorithms.base import policy
+from cprl.learners.engine import ListEngine
+from cprl.learners.reference import TorchRLRolloutLearner
+from cprl.learners.ring import Ring
 from cprl.learners.rollouts import RolloutLearner
 from cprl.learners.settings import TabularSettings
-from cprl.learners.single import dqn_loss
 from cprl.learners.tabular import TabularLearner
-from cprl.learners.torchrl.rollouts import TorchRLRolloutLearner
 
 FLOATS = replace(SPACES, observation_dtype="float32", observation_scale=1.0)
 
@@ -40,27 +39,27 @@ def test_floats_are_not_rounded_into_bytes_and_are_learned_from_where_the_spaces
         algorithm = DQN(settings=REPLAY) if kind == "replay" else PPO(settings=ROLLOUTS)
         return algorithm.make_learner(spaces, agents=(0, 1), replicas=1, engine="eager")
 
-    with pytest.raises(ValueError, match=r"observations are float32.*Spaces.observation_dtype"):
+    with pytest.raises(ValueError, match=r"observations are .*float32.*Spaces.observation_dtype"):
         new(SPACES).store(float_turn())
-    with pytest.raises(ValueError, match=r"observations are uint8"):
+    with pytest.raises(ValueError, match=r"observations are .*uint8"):
         new(FLOATS).store(CommonsEnv(GAME, 1).rollout(1)[:, 0])
     learner, turn = new(FLOATS), float_turn()
     learner.store(turn)
     if kind == "replay":
-        kept = learner.buffer.storage.get(torch.zeros(2, 1, dtype=torch.int64))["observation"][:, 0]
+        kept = learner.buffer.get(torch.zeros(2, 1, dtype=torch.int64))["observation"][:, 0]
     else:
         kept = learner._rollout["observation"][0]
     assert torch.equal(kept, turn["agents", "observation"][0])
 
 
 def test_a_buffer_refuses_floats_too():
-    buffer = lane_buffer(seeds=[(0,)], transitions=20, batch_size=2, observation_shape=(2,))
+    buffer = Ring(seeds=[(0,)], transitions=20, batch_size=2, observation_shape=(2,))
     turn = {"observation": torch.zeros(1, 2), "action": torch.zeros(1, dtype=torch.int64)}
 
     flags = {name: torch.zeros(1, 1, dtype=torch.bool) for name in ("done", "terminated")}
     following = {"observation": torch.zeros(1, 2), "reward": torch.zeros(1, 1), **flags}
-    with pytest.raises(ValueError, match="observations are float32 and float32; allowed: uint8"):
-        buffer.extend(TensorDict({**turn, "next": TensorDict(following, [1])}, [1])[None])
+    with pytest.raises(ValueError, match="observations are float32; allowed: uint8"):
+        write(buffer, TensorDict({**turn, "next": TensorDict(following, [1])}, [1]))
 
 
 @pytest.mark.parametrize("updater", [partial(SoftUpdate, tau=0.1), HardUpdate], ids=["soft", "hard"])
@@ -76,7 +75,7 @@ def test_a_target_updater_of_torchrls_that_would_have_no_effect_is_refused(updat
     with pytest.raises(
         ValueError, match=r"a SoftUpdate or HardUpdate was built on the DQNLoss; .* set tau or"
     ):
-        ReplayLearner(SPACES, agents=(0,), replicas=1, settings=REPLAY, make_loss=make_loss, engine=engine)
+        dqn_learner(SPACES, agents=(0,), replicas=1, settings=REPLAY, make_loss=make_loss, engine=engine)
 
 
 def test_a_target_updater_on_the_loss_of_an_engine_is_refused():
@@ -135,7 +134,7 @@ def test_a_loss_that_reads_steps_in_a_row_is_refused_with_replay():
         return loss
 
     with pytest.raises(ValueError, match=r"DQNLoss has the value estimator ValueEstimators.TDLambda"):
-        ReplayLearner(SPACES, agents=(0,), replicas=1, settings=REPLAY, make_loss=make_loss)
+        dqn_learner(SPACES, agents=(0,), replicas=1, settings=REPLAY, make_loss=make_loss)
 
 
 def kl_loss(network):

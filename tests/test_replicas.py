@@ -5,19 +5,18 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
+from dqn_parts import dqn_learner
 from tensordict import TensorDict, assert_close
 from test_torchrl_env import ByWindow
 from torchrl.collectors import Collector
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 
 from cprl import CommonsEnv, Game, Rules, keys, maps
-from cprl.learners.replay import ReplayLearner
 from cprl.learners.settings import DQNSettings
 from cprl.learners.transitions import lane_turn, transitions_of
 from cprl.measuring.evaluate import evaluate
 from cprl.policies.assignment import AgentPolicies
-from cprl.policies.lanes import LaneActor, random_lanes
-from cprl.policies.single import RandomActor
+from cprl.policies.lanes import LaneActor, RandomActor, random_lanes
 from cprl.runs.episodes import EpisodeTable, read_episodes
 from cprl.training import train
 from cprl.training.collectors import StepCollector
@@ -59,7 +58,7 @@ class Witness:
 
 
 def learner(engine="lane_axis", *, game=GAME, agents=(0, 1), settings=SETTINGS, **how):
-    return ReplayLearner(game.spaces, agents=agents, settings=settings, engine=engine, compile=False, **how)
+    return dqn_learner(game.spaces, agents=agents, settings=settings, engine=engine, compile=False, **how)
 
 
 def trained(engine, *, replicas, first=0, episodes=12, agents=(0, 1), settings=SETTINGS):
@@ -254,13 +253,6 @@ def test_learners_that_do_not_fit_are_refused(learners, others, message):
         others = {1: RandomActor(8)}
     with pytest.raises(ValueError, match=message):
         train(CommonsEnv(GAME, 2), made, others=others, episodes=1)
-
-
-def test_an_unknown_engine_is_refused():
-    with pytest.raises(
-        ValueError, match="engine is 'loop'; allowed: lane_axis, lane_axis_flat, vmapped, list"
-    ):
-        learner("loop", replicas=1)
 
 
 def test_seats_take_every_agent_once():

@@ -17,7 +17,7 @@ from cprl.algorithms import DQN
 from cprl.commons.colours import APPLE, BEAM, COLOURS, FIRST_AGENT, GROUND, OTHER, PALETTE, SELF, WALL
 from cprl.commons.decoding import UNSEEN, classes_seen
 from cprl.learners.settings import DQNSettings
-from cprl.policies.single import RandomActor
+from cprl.policies.lanes import RandomActor
 from cprl.training import train
 from cprl.viewer.callback import ViewerCallback
 from cprl.viewer.logger import RerunLogger

@@ -276,24 +276,7 @@ def test_an_actor_continues_from_the_state_of_another():
     assert all(map(torch.equal, *ahead))
 
 
-@pytest.mark.parametrize(
-    ("policy", "how", "message"),
-    [
-        ("grim", {}, "policy is 'grim'; allowed: random, greedy"),
-        ("greedy", {"area": "full"}, "Observation.area is 'full'; allowed with scripted policies: 'window'"),
-        ("greedy", {"agents": 2}, "there are 3 seeds for 2 agents; allowed: one seed per lane"),
-        ("greedy", {"worlds": 0}, "worlds is 0; allowed: an integer from 1 to"),
-        ("sustainable", {"spare": 0}, "spare is 0; allowed: an integer from 1"),
-    ],
-)
-def test_arguments_that_are_not_allowed_are_refused(policy, how, message):
-    how = {"agents": 1, "area": "window", **how}
-    game = replace(presets.game("commons"), observation=Observation(area=how.pop("area")))
-    with pytest.raises(ValueError, match=message):
-        ScriptedActor(policy, game, seeds=[(lane,) for lane in range(3)], **how)
-
-
-def test_observations_of_another_game_are_refused():
-    actor = ScriptedActor("greedy", presets.game("commons"), seeds=[(0,)], agents=1)
-    with pytest.raises(ValueError, match=r"is \[1, 1, 3, 6, 13\]; allowed: \[1, 1, 3, 7, 15\]"):
-        actor.choose(windows(presets.game("single_basic"), 1))
+def test_a_game_whose_observations_are_no_windows_is_refused():
+    game = replace(presets.game("commons"), observation=Observation(area="full"))
+    with pytest.raises(ValueError, match=r"Observation\.area is 'full'; allowed with scripted policies"):
+        ScriptedActor("greedy", game, seeds=[(0,)], agents=1)

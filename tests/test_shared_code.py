@@ -60,7 +60,7 @@ def digest(learner):
     """Of all weights, targets, moments and stored transitions, to the bit."""
     engine = learner.engine
     tensors = [*engine.own.values(), *engine.fixed.values(), *engine._mean.values(), *engine._square.values()]
-    tensors += learner.buffer.storage.fields.values()
+    tensors += learner.buffer.fields.values()
     whole = hashlib.sha256()
     for tensor in tensors:
         whole.update(tensor.detach().contiguous().numpy().tobytes())

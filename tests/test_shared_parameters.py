@@ -21,9 +21,9 @@ import cprl
 from cprl import CommonsEnv, Custom, Experiment
 from cprl.algorithms import DQN, PPO, Tabular, TabularSettings
 from cprl.algorithms.base import TeamAlgorithm
-from cprl.learners.engine.choice import trial_batch
-from cprl.learners.engine.shared import SharedEngine
+from cprl.learners.engine import SharedEngine
 from cprl.learners.settings import DEFAULT_HIDDEN_CELLS
+from cprl.learners.trial import trial_batch
 from cprl.networks import Conv
 from cprl.population import Frozen, Learning, Scripted, Team
 from cprl.training.agents import Population
@@ -93,7 +93,7 @@ def test_a_member_acts_on_what_it_sees_itself_and_is_paid_for_itself():
     agents = population([shared(DQN(settings=REPLAY), (1, 2)), Scripted(), Scripted()])
     (learner,) = agents.learners.values()
     learner.store(first_turn(2))
-    assert learner.buffer.storage.fields["reward"][0].tolist() == [1.0, 2.0, 1.0, 2.0]
+    assert learner.buffer.fields["reward"][0].tolist() == [1.0, 2.0, 1.0, 2.0]
     seen = CommonsEnv(GAME, 2, seed=9).reset()["agents", "observation"][:, 1:3]
     actor = learner.evaluation_actor(1)
     actor.epsilon = 0.0

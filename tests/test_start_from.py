@@ -112,7 +112,7 @@ def test_targets_start_with_the_same_weights_and_the_optimiser_and_exploration_a
     spec = Learning(DQN(settings=settings), start_from=Frozen(f"{stored}/alone", 0))
     (learner,) = population([spec, *[Scripted()] * 3], engine=engine).learners.values()
     weights = (
-        dict(learner.stock.each[0].loss.state_dict()) if engine == "torchrl" else learner.engine.weights(0)
+        dict(learner.engine.losses[0].state_dict()) if engine == "torchrl" else learner.engine.weights(0)
     )
     targets = [own for name, own in weights.items() if name.startswith("target_")]
     trained = [own for name, own in weights.items() if not name.startswith("target_")]

@@ -7,6 +7,7 @@ from math import dist
 import numpy as np
 import pytest
 import torch
+from dqn_parts import q_table
 
 from cprl import CommonsEnv, Game, Observation, Rules, maps
 from cprl.envs import make_env, spaces_of
@@ -164,9 +165,8 @@ def learned(game, settings, *, episodes, replicas=2, seed=0):
 
 def table_by_state(learner, lane, model, rows):
     """The learned values of each state of the model, [states, A]."""
-    table, seen_in = learner.q_table(lane), {state: seen for state, seen, *_ in rows}
-    cells = zip(table["observation"], table["stock_gauge"], table["values"], strict=True)
-    values = {seen.tobytes() + gauge.tobytes(): of_actions for seen, gauge, of_actions in cells}
+    table, seen_in = q_table(learner, lane), {state: seen for state, seen, *_ in rows}
+    values = dict(zip(table["state"], table["values"], strict=True))
     return np.array([values[seen_in[state]] for state in model.states])
 
 
@@ -237,7 +237,7 @@ def taught(learner, *names):
 
 
 def value_at_the_start(learner, name):
-    return learner.q_table(0)["values"][0, learner.game.actions.index(name)]
+    return q_table(learner, 0)["values"][0, learner.game.actions.index(name)]
 
 
 def test_what_comes_after_the_clock_counts_and_nothing_after_the_last_apple():
@@ -287,8 +287,9 @@ def test_an_agents_course_does_not_depend_on_other_replicas():
         training = Training(env, {(0, 1): learner}, episodes=100)
         for _ in range(300):
             training.step()
-        tables.append(learner.q_table(3 if replicas == 3 else 1))  # agent 1 of replica 1
-    assert tables[0]["scoreboard"].max() > 0
+        tables.append(q_table(learner, 3 if replicas == 3 else 1))  # agent 1 of replica 1
+    scoreboards = [np.frombuffer(state, np.float32, 2, offset=len(state) - 8) for state in tables[0]["state"]]
+    assert np.max(scoreboards) > 0
     for name, array in tables[0].items():
         assert np.array_equal(array, tables[1][name]), name
 
@@ -347,7 +348,7 @@ def test_the_table_of_an_agent_that_observes_floating_point_numbers_is_kept_as_a
         spaces_of(env), agents=(0, 1), replicas=2, settings=TabularSettings(gamma=0.0, learning_rate=1.0)
     )
     train(env, {(0, 1): learner}, episodes=20)
-    table, network = learner.q_table(0), learner.networks()["replica_0/agent_0"]
+    table, network = q_table(learner, 0), learner.networks()["replica_0/agent_0"]
     seen = torch.from_numpy(table["observation"])
     assert seen.dtype == torch.float32
     assert sorted(seen.argmax(-1).tolist()) == [0, 1, 2, 3, 4], "four joint actions, and none yet"
@@ -360,7 +361,7 @@ def test_more_states_than_are_allowed_are_refused():
     learner = learner_of(ONCE, agents=[0], replicas=1, settings=TabularSettings(max_states=3))
     with pytest.raises(MemoryError, match="lane 0 has met 3 states, as many as max_states allows"):
         taught(learner, "turn_left", "turn_left", "turn_left", "turn_left", "forward")
-    assert len(learner.q_table(0)["values"]) == 3
+    assert len(q_table(learner, 0)["values"]) == 3
 
 
 def test_tables_grow_and_keep_what_they_hold():

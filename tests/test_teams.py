@@ -20,16 +20,14 @@ from test_population import (
 
 import cprl
 from cprl import CommonsEnv, Game, Rules, maps, presets
-from cprl.algorithms.dqn import DQN
-from cprl.algorithms.maddpg import MADDPG
-from cprl.algorithms.teams import IPPO, MAPPO, QMIX, VDN
-from cprl.learners.engine.choice import trial_batch
-from cprl.learners.engine.compiled import FunctionalEngine
-from cprl.learners.replay import ReplayLearner
+from cprl.algorithms.off_policy import DQN
+from cprl.algorithms.teams import IPPO, MADDPG, MAPPO, QMIX, VDN
+from cprl.learners.engine import FunctionalEngine
 from cprl.learners.settings import DQNSettings
+from cprl.learners.trial import trial_batch
 from cprl.measuring.evaluate import evaluate
 from cprl.networks.agent import acting_part
-from cprl.networks.team import Mixing, TeamNetwork
+from cprl.networks.team import Mixing
 from cprl.population import Frozen, Learning, Scripted, Team
 from cprl.training import train
 from cprl.training.agents import Population
@@ -166,7 +164,7 @@ def test_a_team_is_paid_for_all_agents_also_those_who_are_not_of_it():
     ((agents, learner),) = agents.learners.items()
     assert agents == (1, 2)
     learner.store(first_turn(2))
-    fields = learner.buffer.storage.fields
+    fields = learner.buffer.fields
     assert fields["reward"][0].tolist() == [6.0, 6.0]
     assert fields["action"][0].tolist() == [[1, 2], [1, 2]]
 
@@ -251,10 +249,6 @@ def test_what_is_no_team_is_refused_and_says_what_fits():
         ValueError, match=r"Team\.algorithm is a DQN; allowed: a TeamAlgorithm of cprl\.algorithms"
     ):
         Team(DQN(settings=REPLAY), FOUR)
-    with pytest.raises(
-        ValueError, match='reward is "individual"; allowed for a team that learns from replay: "team"'
-    ):
-        ReplayLearner(GAME.spaces, agents=FOUR, replicas=2, settings=REPLAY, make_team=TeamNetwork)
     with pytest.raises(ValueError, match=r"QMIX\.settings is a RolloutSettings; allowed: a DQNSettings"):
         population([Team(QMIX(settings=ROLLOUTS), FOUR)])
     for agents, message in [((1, 0), "ascending agent indices"), ((), "at least one"), ((0, 0), "ascending")]:

@@ -46,12 +46,11 @@ from cprl.algorithms import (
     TabularSettings,
 )
 from cprl.custom import Custom
-from cprl.learners.engine.functional import total
+from cprl.learners.engine import total
+from cprl.learners.reference import TorchRLReplayLearner, TorchRLRolloutLearner
 from cprl.learners.replay import ReplayLearner
-from cprl.learners.torchrl import TorchRLReplayLearner, TorchRLRolloutLearner
 from cprl.objectives import LogCoshDQNLoss, PR2Loss
 from cprl.policies.lanes import LaneActor
-from cprl.training import Training
 
 GAME = Game(
     map=maps.parse(".A>.A\n.A.A.\n..<.A"),
@@ -163,15 +162,15 @@ def both(algorithm):
     samplers = [Replayed() for _ in range(4)]
     stock = algorithm.make_learner(SPACES, engine="torchrl", make_sampler=samplers.__getitem__, **HOW)
     if isinstance(algorithm.settings, DQNSettings):
-        draw = fast.buffer.sampler.draw
+        draw = fast.buffer.draw
 
-        def recorded(storage):
-            places = draw(storage)
+        def recorded():
+            places = draw()
             for sampler, own in zip(samplers, places, strict=True):
                 sampler.places.append(own)
             return places
 
-        fast.buffer.sampler.draw = recorded
+        fast.buffer.draw = recorded
     else:
         following, size = fast.rng.next, algorithm.settings.minibatch_size
 
@@ -244,19 +243,19 @@ def test_every_part_is_torchrls_or_torchs_own(name):
     learner = algorithm.make_learner(SPACES, engine="torchrl", **HOW)
     on_policy = name in ON_POLICY
     assert type(learner) is (TorchRLRolloutLearner if on_policy else TorchRLReplayLearner)
-    assert len(learner.buffers) == len(learner.stock) == 4
-    for buffer in learner.buffers:
+    buffers = learner.buffers if on_policy else learner.buffer.each
+    assert len(buffers) == len(learner.engine.losses) == 4
+    for buffer in buffers:
         assert type(buffer) is TensorDictReplayBuffer
         assert type(buffer.storage) is LazyTensorStorage
         assert type(buffer.sampler) is (SamplerWithoutReplacement if on_policy else RandomSampler)
         assert isinstance(buffer.writer, RoundRobinWriter)
-    for agent in learner.stock.each:
-        assert isinstance(agent.loss, LOSSES[name])
-        assert type(agent.optimizer) is torch.optim.Adam
+    assert all(isinstance(loss, LOSSES[name]) for loss in learner.engine.losses)
+    assert all(type(optimizer) is torch.optim.Adam for optimizer in learner.engine.optimizers)
     if on_policy:
         assert all(type(estimator) is GAE for estimator in learner.estimators)
     else:
-        assert all(type(updater) is HardUpdate for updater in learner.updaters)
+        assert all(type(updater) is HardUpdate for updater in learner.engine.updaters)
 
 
 def resumable(algorithm, **how):
@@ -326,37 +325,6 @@ def test_a_stopped_learner_continues_bit_for_bit(name, steps):
 
 
 @pytest.mark.integration
-def test_a_stopped_training_continues_bit_for_bit_from_what_a_checkpoint_keeps():
-    def training():
-        groups = {(0,): (DQN, REPLAY), (1,): (PPO, ROLLOUT)}
-        learners = {
-            agents: kind(settings=settings).make_learner(
-                SPACES, agents=agents, replicas=2, seed=1, engine="torchrl"
-            )
-            for agents, (kind, settings) in groups.items()
-        }
-        return Training(CommonsEnv(GAME, 2, seed=1), learners, episodes=5)
-
-    whole, stopped, again = training(), training(), training()
-    for _ in range(47):
-        whole.step()
-        stopped.step()
-    kept = BytesIO()
-    torch.save(stopped.state_dict(), kept)
-    kept.seek(0)
-    again.load_state_dict(torch.load(kept, weights_only=True))
-    while not whole.is_over:
-        whole.step()
-        again.step()
-    assert again.is_over
-    for agents, learner in whole.learners.items():
-        other = again.learners[agents].networks()
-        for name, network in learner.networks().items():
-            for mine, theirs in zip(network.parameters(), other[name].parameters(), strict=True):
-                assert torch.equal(mine, theirs)
-
-
-@pytest.mark.integration
 @pytest.mark.parametrize("name", ["published DQN", pytest.param("PPO", marks=pytest.mark.slow)])
 def test_a_replica_learns_the_same_whichever_others_are_trained_with_it(name):
     algorithm = {**OFF_POLICY, **ON_POLICY}[name]
@@ -388,12 +356,12 @@ def test_hard_targets_are_copied_after_every_third_episode_of_each_replica():
             all(
                 torch.equal(own, target)
                 for own, target in zip(
-                    agent.loss.value_network_params.values(True, True),
-                    agent.loss.target_value_network_params.values(True, True),
+                    loss.value_network_params.values(True, True),
+                    loss.target_value_network_params.values(True, True),
                     strict=True,
                 )
             )
-            for agent in learner.stock.each
+            for loss in learner.engine.losses
         ]
 
     for episode in range(1, 4):
@@ -408,12 +376,12 @@ def test_soft_targets_move_by_tau_after_every_update_and_not_at_the_end_of_episo
     played = turns(learner.actor)
     for _ in range(16):
         learner.store(next(played))
-    agent = learner.stock.each[0]
+    loss = learner.engine.losses[0]
 
     def weights(group):
-        return torch.cat([own.data.flatten() for own in getattr(agent.loss, group).values(True, True)])
+        return torch.cat([own.data.flatten() for own in getattr(loss, group).values(True, True)])
 
-    assert type(learner.updaters[0]) is SoftUpdate
+    assert type(learner.engine.updaters[0]) is SoftUpdate
     before = weights("target_value_network_params")
     learner.update()
     wanted = before + 0.25 * (weights("value_network_params") - before)
@@ -428,13 +396,13 @@ def test_n_steps_sum_the_rewards_of_an_episode_and_keep_its_last_flags():
     # observation after the last step that it sums, and the flags of that step.
     settings = changed(REPLAY, n_steps=3, gamma=0.5, buffer_size=100)
     learner = resumable(DQN(settings=settings))
-    assert isinstance(learner.buffers[0].transform[0], MultiStepTransform)
+    assert isinstance(learner.buffer.each[0].transform[0], MultiStepTransform)
     played = turns(learner.actor)
     came = [next(played).clone() for _ in range(60)]
     for turn in came:
         learner.store(turn)
     for replica, agent in ((0, 1), (1, 0)):
-        buffer = learner.buffers[2 * replica + agent]
+        buffer = learner.buffer.each[2 * replica + agent]
         kept = buffer.storage[:]
         assert len(kept) == 60 - 3
         for step in range(len(kept)):
@@ -463,7 +431,7 @@ def test_what_follows_n_steps_is_discounted_by_as_many(name):
     played = turns(learner.actor)
     for _ in range(30):
         take(learner, next(played))
-    batch, loss = learner.buffers[0].sample(), learner.stock.each[0].loss
+    batch, loss = learner.buffer.each[0].sample(), learner.engine.losses[0]
 
     def with_steps(steps):
         changed = batch.clone().set("steps_to_next_obs", torch.full_like(batch["steps_to_next_obs"], steps))
@@ -487,7 +455,7 @@ def test_a_loss_of_each_transition_learns_as_their_mean():
         learner = replay_learner_of(partial(made, reduction=reduction))
         played = turns(learner.actor)
         losses = [take(learner, next(played)) for _ in range(20)]
-        return losses[-1], learner.stock.network_state(0)
+        return losses[-1], learner.engine.network_state(0)
 
     def made(network, *, reduction):
         loss = DQN(settings=REPLAY).make_loss(network)
@@ -537,7 +505,7 @@ def test_replay_transforms_change_what_is_sampled():
     played = turns(learner.actor)
     for _ in range(40):
         learner.store(next(played))
-    buffer = learner.buffers[0]
+    buffer = learner.buffer.each[0]
     assert [type(own) for own in buffer.transform] == [RewardScaling]
     sampled = buffer.sample()
     assert sampled["next", "reward"].max() > 0
@@ -555,7 +523,7 @@ def test_updates_per_step_and_the_optimiser_are_those_of_the_settings():
     }
     for name, kind in kinds.items():
         learner = resumable(DQN(settings=changed(REPLAY, optimizer=name, updates_per_step=3)))
-        optimizer = learner.stock.each[0].optimizer
+        optimizer = learner.engine.optimizers[0]
         assert type(optimizer) is kind
         assert optimizer.param_groups[0]["lr"] == REPLAY.learning_rate
         assert optimizer.param_groups[0].get("eps", REPLAY.adam_eps) == REPLAY.adam_eps
@@ -598,16 +566,7 @@ def test_teams_and_tables_are_refused_by_name(team):
         team.make_learner(SPACES, engine="torchrl", reward_kind="team", **HOW)
 
 
-def test_other_engines_settings_and_networks_are_refused():
-    with pytest.raises(ValueError, match="engine is 'quick'; allowed: 'compiled', 'eager', 'torchrl'"):
-        DQN(settings=REPLAY).make_learner(SPACES, engine="quick", **HOW)
-    with pytest.raises(
-        ValueError, match="optimizer is 'lion'; allowed: 'adam', 'adamw', 'rmsprop', 'keras_rmsprop', 'sgd'"
-    ):
-        resumable(DQN(settings=changed(REPLAY, optimizer="lion")))
-    for name in ("updates_per_step", "n_steps", "target_every_episodes"):
-        with pytest.raises(ValueError, match=f"{name} is 0; allowed: an integer in 1"):
-            resumable(DQN(settings=changed(REPLAY, **{name: 0})))
+def test_other_losses_networks_and_sizes_are_refused():
     with pytest.raises(ValueError, match="ClipPPOLoss is on-policy and cannot learn from a replay buffer"):
         TorchRLReplayLearner(
             SPACES,
@@ -651,7 +610,7 @@ def test_targets_are_refused_for_a_loss_that_has_none(kind):
             **HOW,
         )
 
-    assert getattr(make(), "updaters", [None] * 4) == [None] * 4
+    assert getattr(make().engine, "updaters", [None] * 4) == [None] * 4
     with pytest.raises(ValueError, match=r"tau is 0\.1; allowed: None, because DQNLoss has no targets"):
         make(tau=0.1)
     with pytest.raises(ValueError, match="own_target_weights is True; allowed: False, because DQNL"):

@@ -6,6 +6,7 @@ from functools import partial
 import numpy as np
 import pytest
 import torch
+from dqn_parts import dqn_learner
 
 from cprl import CommonsEnv, Game, Rules, maps
 from cprl.algorithms import DQN, LOLA, PPO, LOLASettings, RolloutSettings
@@ -14,8 +15,7 @@ from cprl.learners.settings import DEFAULT_HIDDEN_CELLS, DQNSettings
 from cprl.measuring.evaluate import evaluate, mean_return
 from cprl.networks import GRU
 from cprl.policies.assignment import AgentPolicies
-from cprl.policies.lanes import random_lanes
-from cprl.policies.single import RandomActor
+from cprl.policies.lanes import RandomActor, random_lanes
 from cprl.runs.checkpoints import Checkpointer
 from cprl.runs.episodes import EpisodeTable, read_episodes
 from cprl.training import Training, train
@@ -62,7 +62,7 @@ def test_observers_see_every_turn_and_every_episode_and_the_learner_learns_once_
 def test_two_learners_sit_side_by_side_and_each_stores_its_own_turns():
     learners = {(0,): learner(0), (1,): learner(1)}
     train(CommonsEnv(GAME), learners, episodes=2)
-    first, second = (own.buffers[0][:]["observation"] for own in learners.values())
+    first, second = (own.buffer.each[0][:]["observation"] for own in learners.values())
     assert len(first) == len(second) == learners[0,].steps
     assert not torch.equal(first, second)
 
@@ -109,7 +109,8 @@ def test_learning_may_wait_for_several_steps_and_then_catches_up():
 
     told = []
     settings = replace(SETTINGS, learning_starts=1)
-    agents = Counting(GAME.spaces, agents=(0, 1), replicas=2, settings=settings, compile=False)
+    how = {"agents": (0, 1), "replicas": 2, "compile": False}
+    agents = dqn_learner(GAME.spaces, kind=Counting, settings=settings, **how)
     training = train(CommonsEnv(GAME, 2), {(0, 1): agents}, episodes=2, update_every=3)
     bouts = training.steps // 3
     assert told == [3 * (bout + 1) for bout in range(bouts) for _ in range(3)]
@@ -118,9 +119,7 @@ def test_learning_may_wait_for_several_steps_and_then_catches_up():
 def test_torchrls_own_collector_trains_the_same():
     def course(**how):
         witness = Witness()
-        agents = ReplayLearner(
-            GAME.spaces, agents=(0, 1), replicas=2, settings=SETTINGS, seed=3, compile=False
-        )
+        agents = dqn_learner(GAME.spaces, agents=(0, 1), replicas=2, settings=SETTINGS, seed=3, compile=False)
         train(CommonsEnv(GAME, 2, seed=3), {(0, 1): agents}, episodes=4, callbacks=[witness], **how)
         losses = [learning["agent_1/loss"] for learning in witness.learning]
         weights = agents.networks()["replica_1/agent_0"].state_dict().values()
@@ -139,7 +138,7 @@ def test_torchrls_own_collector_trains_the_same():
 def test_checkpoints_of_what_keeps_no_state_are_refused_before_anything_is_played(tmp_path):
     env, witness = CommonsEnv(GAME), Witness()
     how = {"episodes": 1, "checkpointer": Checkpointer(tmp_path), "callbacks": [witness]}
-    agents = ReplayLearner(GAME.spaces, agents=(0, 1), replicas=1, settings=SETTINGS, compile=False)
+    agents = dqn_learner(GAME.spaces, agents=(0, 1), replicas=1, settings=SETTINGS, compile=False)
     with pytest.raises(
         ValueError, match="a Collector has no state to resume from; train with a StepCollector"
     ):
@@ -197,9 +196,9 @@ def test_what_a_second_training_stores_does_not_follow_the_last_turn_of_the_firs
         done[len(first) - 1] = True
         places = torch.arange(len(came) - steps)
         if engine == "eager":
-            kept = agents.buffer.storage.get(places.expand(6, -1))[lane]
+            kept = agents.buffer.get(places.expand(6, -1))[lane]
         else:
-            kept = agents.buffers[lane].storage[:][: len(places)]
+            kept = agents.buffer.each[lane].storage[:][: len(places)]
         for place in places.tolist():
             rewards, last = 0.0, place
             for ahead in range(steps):
@@ -286,7 +285,7 @@ def test_two_callbacks_of_one_class_each_have_their_own_state():
             self.count = state["count"]
 
     def training(*firsts):
-        agents = ReplayLearner(GAME.spaces, agents=(0, 1), replicas=1, settings=SETTINGS, compile=False)
+        agents = dqn_learner(GAME.spaces, agents=(0, 1), replicas=1, settings=SETTINGS, compile=False)
         counts = [Counts(first) for first in firsts]
         return Training(CommonsEnv(GAME, seed=0), {(0, 1): agents}, episodes=1, callbacks=counts)
 

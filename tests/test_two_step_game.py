@@ -20,7 +20,7 @@ from tensordict import TensorDict
 
 from cprl import CommonsEnv, Game, Rules, maps
 from cprl.algorithms.base import TeamAlgorithm
-from cprl.algorithms.dqn import DQN
+from cprl.algorithms.off_policy import DQN
 from cprl.algorithms.teams import QMIX, VDN
 from cprl.learners.settings import DQNSettings
 from cprl.population import Learning, Team

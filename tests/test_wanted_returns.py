@@ -26,9 +26,9 @@ from cprl.algorithms import (
 from cprl.commands.recipe import parse
 from cprl.envs import spaces_of
 from cprl.institutions import Tax
+from cprl.learners.preferences import Exchange, InequityAversion, SocialValueOrientation, WantedRewards
 from cprl.measuring.episodes import EpisodeTracker
 from cprl.population import Frozen, Learning, Scripted, Team
-from cprl.preferences import Exchange, InequityAversion, SocialValueOrientation, WantedRewards
 from cprl.runs.checkpoints import Checkpointer, checkpoints_in
 from cprl.runs.episodes import EpisodeTable, read_episodes, rows_of, schema_of
 from cprl.training import Training, train
@@ -92,12 +92,10 @@ def on_paper(preference, found):
 def stored(name, learner, turns):
     """The rewards that a learner holds, [T, L]."""
     if name == "replay":
-        return learner.buffer.storage.fields["reward"][:turns].numpy()
+        return learner.buffer.fields["reward"][:turns].numpy()
     if name == "replay of torchrl":
-        own = [buffer.storage.get(slice(0, turns))["next", "reward"][:, 0] for buffer in learner.buffers]
+        own = [buffer.storage[:turns]["next", "reward"][:, 0] for buffer in learner.buffer.each]
         return torch.stack(own, 1).numpy()
-    if name == "rollouts of torchrl":
-        return torch.stack([turn["next", "reward"][:, 0] for turn in learner._rollout]).numpy()
     if name == "tables":
         return np.stack([turn["reward"] for turn in learner._turns])
     if name == "look ahead":
@@ -142,17 +140,6 @@ def test_a_learner_remembers_where_its_state_was_taken(name):
     for batch in found[8:]:
         then.store(batch)
     assert np.array_equal(stored(name, then, 17), stored(name, whole, 17))
-
-
-@pytest.mark.parametrize("name", LEARNERS)
-def test_a_state_of_before_there_were_preferences_is_still_read(name):
-    learner, other = learner_of(name, "team"), learner_of(name, "team")
-    for batch in batches(3):
-        learner.store(batch)
-    state = dict(learner.state_dict())
-    del state["wants"]
-    other.load_state_dict(state)
-    assert np.array_equal(stored(name, other, 3), stored(name, learner, 3))
 
 
 class Kept:

@@ -22,6 +22,7 @@ import pytest
 import rerun as rr
 import rerun_cli
 import torch
+from dqn_parts import dqn_learner
 from recordings import GAME, column, static
 from rerun.chunk import RrdReader
 from test_outcome import EXPERIMENT
@@ -29,7 +30,6 @@ from test_outcome import EXPERIMENT
 import cprl
 from cprl import CommonsEnv
 from cprl.commands.recipe import parse
-from cprl.learners.replay import ReplayLearner
 from cprl.learners.settings import DQNSettings
 from cprl.measuring import Episode, social
 from cprl.training import train
@@ -61,7 +61,7 @@ class Doing:
 def course(run=None, *, live=None, episodes=8, others=()):
     """Weights, torch's generator and returns after a training of two replicas, watched if a run is given."""
     torch.manual_seed(1)
-    agents = ReplayLearner(GAME.spaces, agents=(0, 1), replicas=2, settings=SETTINGS, seed=1, compile=False)
+    agents = dqn_learner(GAME.spaces, agents=(0, 1), replicas=2, settings=SETTINGS, seed=1, compile=False)
     env, returns = CommonsEnv(GAME, 2, seed=1), []
 
     class Keeping(Doing):

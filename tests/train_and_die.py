@@ -6,8 +6,9 @@ python tests/train_and_die.py RUN [seconds from one checkpoint to the next]
 import sys
 from pathlib import Path
 
+from dqn_parts import dqn_learner
+
 from cprl import CommonsEnv, Game, Rules, maps
-from cprl.learners.replay import ReplayLearner
 from cprl.learners.settings import DQNSettings
 from cprl.policies.lanes import random_lanes
 from cprl.runs.checkpoints import Checkpointer
@@ -36,7 +37,7 @@ def main(
 ) -> None:
     """Trains agent 0 of three replicas beside a random one."""
     prepare_process(3)
-    learner = ReplayLearner(
+    learner = dqn_learner(
         GAME.spaces, agents=[0], replicas=3, settings=SETTINGS, seed=3, engine=engine, compile=False
     )
     walker = random_lanes(8, seeds=[(3, replica, 1) for replica in range(3)], agents=1)

@@ -10,7 +10,6 @@ A package imports only from those above it:
     commons      the game: maps, rules, turns; numpy and numba alone
     theory       games with a known answer: herders, appropriation, what apples can bear; numpy alone
     envs         TorchRL, PettingZoo, Gymnasium; make_env, where environments are put together
-    preferences  what agents want: the reward that each learns from
     networks     from observations to numbers
     objectives   losses that TorchRL lacks: log-cosh, MADDPG, PR2, LOLA
     policies     from observations to actions: learned, tabular and scripted agents
@@ -50,7 +49,6 @@ if TYPE_CHECKING:
         objectives,
         policies,
         population,
-        preferences,
         presets,
         studies,
         theory,
@@ -101,7 +99,6 @@ __all__ = [
     "objectives",
     "policies",
     "population",
-    "preferences",
     "presets",
     "recipe_main",
     "run",

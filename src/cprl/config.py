@@ -57,9 +57,9 @@ from cprl.institutions import (
     Vote,
 )
 from cprl.learners.decisions import Bandit
+from cprl.learners.preferences import Exchange, InequityAversion, SocialValueOrientation
 from cprl.networks import GRU, LSTM, MLP, Conv
 from cprl.population import Frozen, Learning, Scripted, Team
-from cprl.preferences import Exchange, InequityAversion, SocialValueOrientation
 from cprl.theory import PowerWorth, SharingGame
 
 _OF_CPRL: Final[tuple[type[Any], ...]] = (

@@ -23,6 +23,7 @@ from cprl.commons.game import Game
 from cprl.config import custom_targets, differences, fields_from_config, fields_to_config
 from cprl.custom import Custom
 from cprl.envs.make_env import PlayableGame, game_of, is_playable, stored_game
+from cprl.learners.preferences import check_preference
 from cprl.population import (
     SPEC,
     AgentSpec,
@@ -34,7 +35,6 @@ from cprl.population import (
     stored_of,
     with_run_moved,
 )
-from cprl.preferences.values import check_preference
 from cprl.runs.files import written_by_another
 from cprl.runs.recipe import RECIPE_FORMAT, recipe_config
 from cprl.system.memory import DEVICE

@@ -27,9 +27,9 @@ from cprl.checks import (
 )
 from cprl.custom import Custom
 from cprl.learners.decisions import Bandit
+from cprl.learners.preferences import PREFERENCE, Preference
 from cprl.learners.settings import Exploring
 from cprl.policies.scripted import SCRIPTED_POLICIES, ScriptedPolicy
-from cprl.preferences.values import PREFERENCE, Preference
 
 
 def _algorithm(kind: type[Algorithm]) -> Check:
@@ -113,7 +113,7 @@ class Learning:
     Args:
         algorithm: e.g. `cprl.algorithms.DQN(settings=...)`.
         reward: what it wants: "individual", its own reward; "team", the sum of the rewards of all agents of
-            the game; or a value of `cprl.preferences`, e.g. `Exchange(0.5)`.
+            the game; or a value of `cprl.learners.preferences`, e.g. `Exchange(0.5)`.
         start_from: the agent whose weights its acting network, and the target of it, start with; None for
             new ones. The optimiser, critics, exploration and decisions begin anew.
         decisions: how it learns what it decides, in a game with votes or elections; None for `Bandit()`.

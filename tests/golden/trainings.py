@@ -43,9 +43,9 @@ def experiments() -> dict[str, dict[str, object]]:
         TabularSettings,
     )
     from cprl.institutions import Monitoring, Quota, Sanctioner, Tax, Vote
+    from cprl.learners.preferences import Exchange, InequityAversion, SocialValueOrientation
     from cprl.networks import GRU, LSTM, Conv
     from cprl.population import Learning, Scripted, Team
-    from cprl.preferences import Exchange, InequityAversion, SocialValueOrientation
 
     def board(variant: str) -> Game:
         rules = presets.game("commons", variant=variant).rules

@@ -12,17 +12,11 @@ Modules, in the order in which one reads them:
     tabular       tabular Q-learning
 """
 
-from cprl.algorithms.actor_critic import IQL, SAC
 from cprl.algorithms.base import Algorithm, OffPolicy, OnPolicy, TeamAlgorithm
-from cprl.algorithms.dqn import CQL, DQN, DistributionalDQN
-from cprl.algorithms.lola import LOLA
-from cprl.algorithms.maddpg import MADDPG
+from cprl.algorithms.off_policy import CQL, DQN, IQL, PR2, SAC, DistributionalDQN, Tabular
 from cprl.algorithms.on_policy import A2C, PPO, Reinforce
-from cprl.algorithms.pr2 import PR2
-from cprl.algorithms.tabular import Tabular
-from cprl.algorithms.teams import IPPO, MAPPO, QMIX, VDN
-from cprl.learners.lola.settings import LOLASettings
-from cprl.learners.settings import DQNSettings, RolloutSettings, TabularSettings
+from cprl.algorithms.teams import IPPO, LOLA, MADDPG, MAPPO, QMIX, VDN
+from cprl.learners.settings import DQNSettings, LOLASettings, RolloutSettings, TabularSettings
 
 __all__ = [
     "A2C",

@@ -5,30 +5,35 @@ define `make_network` and `make_loss`; docs/algorithms.md has an example of twen
 """
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 from inspect import get_annotations
-from typing import Any, ClassVar, Final, Literal, TypeAlias, get_args
+from typing import Any, ClassVar, Final, Literal, TypeAlias
 
+from tensordict.nn import ProbabilisticTensorDictSequential, TensorDictModule
 from torch import nn
+from torchrl.modules import ProbabilisticActor, QValueActor
 from torchrl.objectives import LossModule
 
 from cprl.checks import NONE, SWITCH, Check, check_fields, checked, count, either, instance, number, one_of
 from cprl.commons.spaces import Spaces
 from cprl.custom import Custom
 from cprl.learners.base import Learner
+from cprl.learners.preferences import Preference, named
+from cprl.learners.reference import TorchRLReplayLearner, TorchRLRolloutLearner
 from cprl.learners.replay import ReplayLearner
 from cprl.learners.rollouts import RolloutLearner
-from cprl.learners.settings import DQNSettings, RolloutSettings
-from cprl.learners.torchrl import TorchRLReplayLearner, TorchRLRolloutLearner
-from cprl.networks.mlp import MOST_CELLS
-from cprl.networks.recurrent import Recurrent
-from cprl.networks.specification import Network
-from cprl.objectives.log_cosh import TORCHRL_DISTANCES
-from cprl.preferences.values import Preference, named
+from cprl.learners.settings import DEFAULT_HIDDEN_CELLS, DQNSettings, LOLASettings, RolloutSettings
+from cprl.networks.agent import AgentNetworks
+from cprl.networks.mlp import MLP, MOST_CELLS
+from cprl.networks.recurrent import Recurrent, state_shape_of
+from cprl.networks.specification import Network, new_network
+from cprl.objectives.td import TORCHRL_DISTANCES
+from cprl.system.compat.losses import LaneCategorical
 
 TrainingEngine: TypeAlias = Literal["compiled", "eager", "torchrl"]
 """How agents are updated. "compiled": all together, in one update that torch compiles; "eager": the same
 update, uncompiled; "torchrl": by TorchRL's stock parts, one agent after the other, see
-`cprl.learners.torchrl`."""
+`cprl.learners.reference`."""
 
 
 _WEIGHT: Final = number(0, 1e6)
@@ -77,10 +82,11 @@ class Algorithm:
     """Whether agents of a team can share one network, see `cprl.population.Team`."""
     can_be_recurrent: ClassVar[bool] = False
     """Whether its networks can be recurrent: its loss must pass on the states of sequences, see
-    `cprl.algorithms.dqn.module_of`."""
+    `cprl.algorithms.base.module_of`."""
 
     def __post_init__(self) -> None:
-        self._check_settings()
+        kind = self.settings_kind
+        checked(f"{type(self).__name__}.settings", self.settings, instance(kind, f"a {kind.__name__}"))
         of_cprl = {
             name
             for kind in type(self).__mro__
@@ -126,18 +132,14 @@ class Algorithm:
         raise NotImplementedError(f"{type(self).__name__} must define make_learner")
 
     def _refuse_torchrl(self, engine: TrainingEngine) -> None:
-        _check_engine(engine)
         if engine == "torchrl":
             raise ValueError(
                 f'{type(self).__name__} does not support engine="torchrl", which trains independent agents '
                 'one after the other; allowed: engine="compiled" or "eager"'
             )
 
-    def _check_settings(self) -> None:
-        kind = self.settings_kind
-        checked(f"{type(self).__name__}.settings", self.settings, instance(kind, f"a {kind.__name__}"))
 
-
+@dataclass(frozen=True, kw_only=True)
 class OffPolicy(Algorithm):
     """Learns from a replay buffer.
 
@@ -146,6 +148,8 @@ class OffPolicy(Algorithm):
     """
 
     settings: DQNSettings
+    network: Network | Custom | None = None
+    """The architecture of the networks; None for fully connected layers of `settings.hidden_cells`."""
     settings_kind: ClassVar[type[Any]] = DQNSettings
     can_share_parameters: ClassVar[bool] = True
     sees_peers_actions: ClassVar[bool] = False
@@ -156,12 +160,12 @@ class OffPolicy(Algorithm):
     sample by: the entry "noise", float32 [.., noise_numbers] or [.., S, noise_numbers]. A loss that samples
     by torch's generator instead would make replicas depend on each other."""
 
+    def make_network(self, spaces: Spaces) -> nn.Module:
+        return q_network_of(spaces, self.settings, self.network)
+
     def make_learner(
         self, spaces: Spaces, *, agents: Sequence[int], engine: TrainingEngine = "compiled", **how: Any
     ) -> Learner:
-        """See `Algorithm`."""
-        self._check_settings()
-        _check_engine(engine)
         how |= {
             "agents": agents,
             "settings": self.settings,
@@ -177,6 +181,7 @@ class OffPolicy(Algorithm):
         return ReplayLearner(spaces, compile=engine == "compiled", **how)
 
 
+@dataclass(frozen=True, kw_only=True)
 class OnPolicy(Algorithm):
     """Learns from rollouts of the current policy.
 
@@ -185,16 +190,18 @@ class OnPolicy(Algorithm):
     """
 
     settings: RolloutSettings
+    network: Network | Custom | None = None
+    """The architecture of the networks; None for fully connected layers of `settings.hidden_cells`."""
     settings_kind: ClassVar[type[Any]] = RolloutSettings
     stochastic: ClassVar[bool] = True
     can_share_parameters: ClassVar[bool] = True
 
+    def make_network(self, spaces: Spaces) -> nn.Module:
+        return actor_and_critic(spaces, self.settings, self.network)
+
     def make_learner(
         self, spaces: Spaces, *, agents: Sequence[int], engine: TrainingEngine = "compiled", **how: Any
     ) -> Learner:
-        """See `Algorithm`."""
-        self._check_settings()
-        _check_engine(engine)
         how |= {
             "agents": agents,
             "settings": self.settings,
@@ -228,7 +235,6 @@ class TeamAlgorithm(Algorithm):
     def make_learner(
         self, spaces: Spaces, *, agents: Sequence[int], engine: TrainingEngine = "compiled", **how: Any
     ) -> Learner:
-        """See `Algorithm`."""
         self._refuse_torchrl(engine)
         self._check_team(len(agents), how.get("reward_kind", "individual"))
         if isinstance(self, OffPolicy):
@@ -262,5 +268,87 @@ def _refuse_sharing(how: dict[str, Any]) -> None:
         )
 
 
-def _check_engine(engine: str) -> None:
-    checked("engine", engine, one_of(*get_args(TrainingEngine)))
+def network_of(
+    spaces: Spaces,
+    settings: DQNSettings | RolloutSettings | LOLASettings,
+    network: Network | Custom | None,
+    *,
+    outputs: int,
+    **how: Any,
+) -> nn.Module:
+    """A new network of one agent.
+
+    Args:
+        spaces: what agents observe.
+        settings: the hyperparameters.
+        network: the architecture; None for fully connected layers of `settings.hidden_cells`.
+        outputs: the number of outputs.
+        how: see `new_network`.
+
+    Raises:
+        ValueError: if `settings.hidden_cells` is set together with a network; and see `new_network`.
+    """
+    if network is not None and settings.hidden_cells != DEFAULT_HIDDEN_CELLS:
+        raise ValueError(
+            f"settings.hidden_cells is {settings.hidden_cells}; allowed: the default, because the algorithm "
+            "has a network; set the layers in the network"
+        )
+    made = MLP(hidden_cells=settings.hidden_cells) if network is None else network
+    glorot_uniform = isinstance(settings, DQNSettings) and settings.glorot_uniform
+    return new_network(made, spaces, outputs, glorot_uniform=glorot_uniform, **how)
+
+
+def q_network_of(spaces: Spaces, settings: DQNSettings, network: Network | Custom | None) -> nn.Module:
+    """A new network of one agent, which outputs the value of each action."""
+    relu = settings.relu_on_outputs
+    return network_of(spaces, settings, network, outputs=spaces.actions, relu_on_outputs=relu)
+
+
+def actor_and_critic(
+    spaces: Spaces, settings: RolloutSettings | LOLASettings, network: Network | Custom | None
+) -> AgentNetworks:
+    """New networks of one agent: "actor" and "critic"."""
+    sizes = {"actor": spaces.actions, "critic": 1}
+    return AgentNetworks(
+        {name: network_of(spaces, settings, network, outputs=size) for name, size in sizes.items()}
+    )
+
+
+def refuse_relu(name: str, settings: DQNSettings) -> None:
+    """Raises a ValueError for `relu_on_outputs` of an algorithm without Q values to act by."""
+    if settings.relu_on_outputs:
+        raise ValueError(
+            f"settings.relu_on_outputs is True; allowed for {name}, whose acting network does not output Q "
+            "values: False"
+        )
+
+
+def module_of(network: nn.Module, name: str, *, state: str = "recurrent_state") -> TensorDictModule:
+    """A network as a TensorDict module.
+
+    Args:
+        network: reads "observation".
+        name: the entry of its outputs.
+        state: the entry of the states before each step, of a recurrent network.
+    """
+    if state_shape_of(network) is None:
+        return TensorDictModule(network, ["observation"], [name])
+    return TensorDictModule(network, ["observation", state, "is_init"], [name, f"{state}_after"])
+
+
+def q_actor(network: nn.Module) -> QValueActor:
+    """TorchRL's `QValueActor` with a network's outputs as action values; for recurrent ones see
+    `module_of`."""
+    return QValueActor(module_of(network, "action_value"), spec=None, action_space="categorical")
+
+
+def policy(network: nn.Module) -> ProbabilisticTensorDictSequential:
+    """TorchRL's categorical policy with a network's outputs as logits; a recurrent network also reads
+    "recurrent_state" and "is_init", as `cprl.networks.recurrent` says."""
+    return ProbabilisticActor(
+        module_of(network, "logits", state="recurrent_state"),
+        in_keys=["logits"],
+        out_keys=["action"],
+        distribution_class=LaneCategorical,
+        return_log_prob=True,
+    )

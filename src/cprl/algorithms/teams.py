@@ -5,7 +5,8 @@ A lane is then a team. VDN, QMIX and MAPPO change the social dilemma: their agen
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any, ClassVar
+from math import prod
+from typing import Any, ClassVar, Literal
 
 from tensordict.nn import TensorDictModule
 from torch import nn
@@ -13,15 +14,30 @@ from torchrl.modules import VDNMixer
 from torchrl.objectives import LossModule, ValueEstimators
 from torchrl.objectives.multiagent import IPPOLoss, MAPPOLoss, QMixerLoss
 
-from cprl.algorithms.base import OffPolicy, OnPolicy, TeamAlgorithm
-from cprl.algorithms.dqn import network_of, q_actor, q_network_of
-from cprl.algorithms.on_policy import actor_and_critic, clipped_loss
+from cprl.algorithms.base import (
+    OffPolicy,
+    OnPolicy,
+    TeamAlgorithm,
+    TrainingEngine,
+    actor_and_critic,
+    network_of,
+    policy,
+    q_actor,
+)
+from cprl.algorithms.on_policy import clipped_loss
 from cprl.commons.spaces import Spaces
 from cprl.custom import Custom
-from cprl.learners.settings import DQNSettings, RolloutSettings
+from cprl.learners.base import Learner
+from cprl.learners.lola import LOLALearner
+from cprl.learners.preferences import Preference
+from cprl.learners.settings import DQNSettings, LOLASettings
 from cprl.networks.agent import AgentNetworks
+from cprl.networks.mlp import MLP, MLPNetwork
 from cprl.networks.specification import Network
-from cprl.networks.team import CentralCritic, Mixing, team_network
+from cprl.networks.team import CentralCritic, JointCritics, Mixing, team_network
+from cprl.objectives import LOLADiCELoss, LOLALoss
+from cprl.objectives.maddpg import NUMBERS, MADDPGLoss
+from cprl.objectives.td import DISTANCES
 
 _CHOSEN, _OF_TEAM = "chosen_action_value", "team_value"
 
@@ -33,21 +49,11 @@ class VDN(TeamAlgorithm, OffPolicy):
     Source: Sunehag et al., "Value-Decomposition Networks For Cooperative Multi-Agent Learning" (2017).
     """
 
-    settings: DQNSettings
-    network: Network | Custom | None = None
-    """The architecture of the networks; None for fully connected layers of `settings.hidden_cells`."""
-
-    def make_network(self, spaces: Spaces) -> nn.Module:
-        """See `Algorithm`."""
-        return q_network_of(spaces, self.settings, self.network)
-
     def make_team(self, members: Sequence[nn.Module], spaces: Spaces) -> nn.Module:
-        """See `Algorithm`."""
         mixer = VDNMixer(len(members), device="cpu")
         return AgentNetworks({"actor": _team(members, spaces), "mixer": mixer})
 
     def make_loss(self, network: nn.Module) -> LossModule:
-        """See `Algorithm`."""
         return _mixed(network, [_CHOSEN], self.settings)
 
 
@@ -60,19 +66,11 @@ class QMIX(TeamAlgorithm, OffPolicy):
     unless `Team.share_parameters` says so, and their networks are not recurrent.
     """
 
-    settings: DQNSettings
     mixing_cells: int = 32
     """Units of the mixing layer."""
-    network: Network | Custom | None = None
-    """The architecture of the networks; None for fully connected layers of `settings.hidden_cells`."""
     fewest_members: ClassVar[int] = 2
 
-    def make_network(self, spaces: Spaces) -> nn.Module:
-        """See `Algorithm`."""
-        return q_network_of(spaces, self.settings, self.network)
-
     def make_team(self, members: Sequence[nn.Module], spaces: Spaces) -> nn.Module:
-        """See `Algorithm`."""
         mixer = Mixing(
             spaces.observation_shape,
             members=len(members),
@@ -82,7 +80,6 @@ class QMIX(TeamAlgorithm, OffPolicy):
         return AgentNetworks({"actor": _team(members, spaces), "mixer": mixer})
 
     def make_loss(self, network: nn.Module) -> LossModule:
-        """See `Algorithm`."""
         return _mixed(network, [_CHOSEN, "observation"], self.settings)
 
 
@@ -94,27 +91,21 @@ class MAPPO(TeamAlgorithm, OnPolicy):
     without value normalisation, and members share no weights, unless `Team.share_parameters` says so.
     """
 
-    settings: RolloutSettings
     clip_epsilon: float = 0.2
     """The largest change of an action's probability, as a ratio minus 1; 1e-6..0.999."""
     entropy_coeff: float = 0.01
     critic_coeff: float = 0.5
-    network: Network | Custom | None = None
-    """The architecture of the networks; None for fully connected layers of `settings.hidden_cells`."""
     can_be_recurrent: ClassVar[bool] = True
 
     def make_network(self, spaces: Spaces) -> nn.Module:
-        """See `Algorithm`."""
         return network_of(spaces, self.settings, self.network, outputs=spaces.actions)
 
     def make_team(self, members: Sequence[nn.Module], spaces: Spaces) -> nn.Module:
-        """See `Algorithm`."""
         everything = len(members), *spaces.observation_shape
         critic = network_of(spaces, self.settings, self.network, outputs=1, shape=everything)
         return AgentNetworks({"actor": _team(members, spaces), "critic": CentralCritic(critic, len(members))})
 
     def make_loss(self, network: nn.Module) -> LossModule:
-        """See `Algorithm`."""
         return clipped_loss(network, MAPPOLoss, self)
 
 
@@ -127,29 +118,20 @@ class IPPO(TeamAlgorithm, OnPolicy):
     StarCraft Multi-Agent Challenge?" (2020).
     """
 
-    settings: RolloutSettings
     clip_epsilon: float = 0.2
     """The largest change of an action's probability, as a ratio minus 1; 1e-6..0.999."""
     entropy_coeff: float = 0.01
     critic_coeff: float = 0.5
-    network: Network | Custom | None = None
-    """The architecture of the networks; None for fully connected layers of `settings.hidden_cells`."""
     can_be_recurrent: ClassVar[bool] = True
     shares_reward: ClassVar[bool] = False
 
-    def make_network(self, spaces: Spaces) -> nn.Module:
-        """See `Algorithm`."""
-        return actor_and_critic(spaces, self.settings, self.network)
-
     def make_team(self, members: Sequence[nn.Module], spaces: Spaces) -> nn.Module:
-        """See `Algorithm`."""
         of_each: Sequence[Any] = members
         return AgentNetworks(
             {name: _team([own[name] for own in of_each], spaces) for name in ("actor", "critic")}
         )
 
     def make_loss(self, network: nn.Module) -> LossModule:
-        """See `Algorithm`."""
         return clipped_loss(network, IPPOLoss, self)
 
 
@@ -169,3 +151,145 @@ def _mixed(network: nn.Module, seen_by_mixer: Sequence[str], settings: DQNSettin
     loss.set_keys(action="action", action_value="action_value", local_value=_CHOSEN, global_value=_OF_TEAM)
     loss.make_value_estimator(ValueEstimators.TD0, gamma=settings.gamma)
     return loss
+
+
+@dataclass(frozen=True, kw_only=True)
+class MADDPG(TeamAlgorithm, OffPolicy):
+    """Multi-agent deep deterministic policy gradient for discrete actions, `cprl.objectives.MADDPGLoss`.
+
+    Each member has a policy of what it observes itself and a critic of what all members observe and do, and
+    learns from its own reward: members may cooperate, compete or both. Agents outside the team are part of
+    the environment: critics see nothing of them. Members sample their actions from their policies, in
+    training and in evaluation.
+
+    Source: Lowe et al., "Multi-Agent Actor-Critic for Mixed Cooperative-Competitive Environments" (2017); how
+    this differs is listed in docs/algorithms.md.
+    """
+
+    logit_penalty: float = 1e-3
+    """The weight of the mean squared logit in the actors' loss, 0..1e6; 1e-3 in the published program."""
+    loss_function: str = "l2"
+    """The loss of the critics' temporal-difference errors, as `DQN.loss_function`."""
+    network: Network | Custom | None = None
+    """The architecture of the networks; None for fully connected layers of `settings.hidden_cells`. The
+    critics' fully connected layers read observations and actions side by side. Another network maps the
+    observations of all members to as many features as the last of `settings.hidden_cells` has units, and one
+    more layer of that size joins them with the actions."""
+    shares_reward: ClassVar[bool] = False
+    fewest_members: ClassVar[int] = 2
+    stochastic: ClassVar[bool] = True
+    noise_numbers: ClassVar[int] = NUMBERS
+    loss_functions: ClassVar[tuple[str, ...]] = DISTANCES
+
+    def make_network(self, spaces: Spaces) -> nn.Module:
+        return network_of(spaces, self.settings, self.network, outputs=spaces.actions)
+
+    def make_team(self, members: Sequence[nn.Module], spaces: Spaces) -> nn.Module:
+        dims = len(spaces.observation_shape)
+        actors = team_network(members, observation_dims=dims)
+        return AgentNetworks({"actor": actors, "critic": self._critics(len(members), spaces)})
+
+    def _critics(self, members: int, spaces: Spaces) -> JointCritics:
+        everything = members, *spaces.observation_shape
+        dims, joint = len(everything), members * spaces.actions
+        cells, encoders, features = self.settings.hidden_cells, None, prod(everything)
+        if isinstance(self.network, MLP):
+            cells = self.network.hidden_cells
+        elif self.network is not None:
+            features, cells = cells[-1], cells[-1:]
+            each = [
+                network_of(spaces, self.settings, self.network, outputs=features, shape=everything)
+                for _ in range(members)
+            ]
+            encoders = team_network(each, observation_dims=dims)
+        names = "relu_on_outputs", "glorot_uniform"
+        how = {name: getattr(self.settings, name) for name in names}
+        heads = [
+            MLPNetwork((features + joint,), 1, hidden_cells=cells, highest=1.0, **how) for _ in range(members)
+        ]
+        return JointCritics(
+            team_network(heads, observation_dims=1),
+            encoders,
+            observation_dims=dims - 1,
+            highest=spaces.observation_scale,
+        )
+
+    def make_loss(self, network: nn.Module) -> LossModule:
+        assert isinstance(network, AgentNetworks)
+        loss = MADDPGLoss(
+            TensorDictModule(network["actor"], ["observation"], ["logits"]),
+            TensorDictModule(network["critic"], ["observation", "joint_action"], ["state_action_value"]),
+            loss_function=self.loss_function,
+            logit_penalty=self.logit_penalty,
+        )
+        loss.make_value_estimator(ValueEstimators.TD0, gamma=self.settings.gamma)
+        return loss
+
+
+@dataclass(frozen=True, kw_only=True)
+class LOLA(TeamAlgorithm):
+    """Learning with opponent-learning awareness: each member expects the others to take a naive learning
+    step, which depends on what it does, and learns what is good for it after that step.
+
+    Members read each other's weights when they learn; they act on their own observations. Meant for rewards
+    of their own, `Team(LOLA(...), agents=(0, 1), reward="individual")`. With more than two members the terms
+    of all pairs are summed. Losses: `cprl.objectives.LOLALoss`, `LOLADiCELoss`. The engine "compiled"
+    compiles acting alone.
+
+    Source: Foerster et al., "Learning with Opponent-Learning Awareness" (2018), and "DiCE: The Infinitely
+    Differentiable Monte Carlo Estimator" (2018); docs/algorithms.md lists the departures.
+    """
+
+    settings: LOLASettings
+    estimator: Literal["policy_gradient", "dice"] = "policy_gradient"
+    """How the others' step is judged: "policy_gradient", to first order, from two rollouts of the present
+    weights; "dice", by a rollout for each member in which the others act as after their step. All rollouts
+    are turns of the training's own episodes; evaluation always has the present weights."""
+    entropy_coeff: float = 0.0
+    network: Network | Custom | None = None
+    """The architecture of the networks; None for fully connected layers of `settings.hidden_cells`."""
+    settings_kind: ClassVar[type[Any]] = LOLASettings
+    stochastic: ClassVar[bool] = True
+    shares_reward: ClassVar[bool] = False
+    fewest_members: ClassVar[int] = 2
+
+    def make_network(self, spaces: Spaces) -> nn.Module:
+        """New networks of one member: "actor" and "critic"."""
+        return actor_and_critic(spaces, self.settings, self.network)
+
+    def make_team(self, members: Sequence[nn.Module], spaces: Spaces) -> nn.Module:
+        """The members' networks in a row, as `make_loss` reads them."""
+        return nn.ModuleList(members)
+
+    def make_loss(self, network: nn.Module) -> LossModule:
+        """The loss of a team, from `make_team`."""
+        of_members: Any = network
+        actors = [policy(own["actor"]) for own in of_members]
+        how: dict[str, Any] = {
+            "look_ahead_rate": self.settings.look_ahead_rate,
+            "gamma": self.settings.gamma,
+            "entropy_coeff": self.entropy_coeff,
+        }
+        return LOLADiCELoss(actors, **how) if self.estimator == "dice" else LOLALoss(actors, **how)
+
+    def make_learner(
+        self,
+        spaces: Spaces,
+        *,
+        agents: Sequence[int],
+        engine: TrainingEngine = "compiled",
+        reward_kind: Preference = "individual",
+        **how: Any,
+    ) -> Learner:
+        self._refuse_torchrl(engine)
+        self._check_team(len(agents), reward_kind)
+        return LOLALearner(
+            spaces,
+            agents=agents,
+            settings=self.settings,
+            make_network=lambda: self.make_network(spaces),
+            make_loss=self.make_loss,
+            reward_kind=reward_kind,
+            compile=engine == "compiled",
+            **how,
+        )

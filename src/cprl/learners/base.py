@@ -1,8 +1,8 @@
 """The interface between the training loop and a learner."""
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from math import nan
-from typing import Any, Protocol
+from typing import Any, Final, Protocol
 
 import numpy as np
 import torch
@@ -10,11 +10,15 @@ from numpy.typing import NDArray
 from tensordict import TensorDictBase
 from torch import Tensor, nn
 
-from cprl.arguments import object_of
 from cprl.checks import checked, count
+from cprl.commons.spaces import Spaces
+from cprl.learners.preferences import Preference, WantedRewards, check_preference
 from cprl.policies.assignment import AgentIndices, agent_indices
 from cprl.policies.decisions import Decider
-from cprl.preferences.wanted import WantedRewards
+from cprl.system.memory import check_memory
+
+_LEAST_BYTES: Final = 4096
+"""Of a lane, whatever it learns by: its name, seeds and random number generators."""
 
 
 class Learner(Protocol):
@@ -29,9 +33,9 @@ class Learner(Protocol):
     settings: Any
     """The hyperparameters.
 
-    A learner may also have `wants`, a `cprl.preferences.WantedRewards`: what its agents want. And `begin()`,
-    which a training calls before its first turn: whatever the learner has stored of an earlier training, the
-    next turn begins new episodes.
+    A learner may also have `wants`, a `cprl.learners.preferences.WantedRewards`: what its agents want. And
+    `begin()`, which a training calls before its first turn: whatever the learner has stored of an earlier
+    training, the next turn begins new episodes.
     """
 
     def store(self, batch: TensorDictBase) -> None:
@@ -62,6 +66,51 @@ class Learner(Protocol):
 
     def load_state_dict(self, state: Mapping[str, Any]) -> None:
         """Continues from a state that `state_dict` returned."""
+
+
+class BaseLearner:
+    """What learners of S agents of each of R replicas have in common.
+
+    Args:
+        spaces: the shape and dtype of observations, and the number of actions A.
+        settings: the hyperparameters.
+        agents: the indices of the agents that learn.
+        replicas: the number of replicas R; each is one world of the environment.
+        seed: the seed of the run.
+        reward_kind: what they want, see `cprl.learners.preferences`.
+
+    Raises:
+        ValueError: for agents that the spaces do not have, a number of replicas that there cannot be, and a
+            preference that compares an agent with others in a game of one.
+        TooLargeError: for more replicas than there is memory for, whatever they learn by.
+    """
+
+    def __init__(
+        self,
+        spaces: Spaces,
+        settings: Any,
+        *,
+        agents: Sequence[int],
+        replicas: int,
+        seed: int,
+        reward_kind: Preference,
+    ) -> None:
+        check_preference("reward_kind", reward_kind, spaces.agents)
+        if not agents or len(set(agents)) < len(agents) or not set(agents) <= set(range(spaces.agents)):
+            allowed = f"one or more of the agents 0 to {spaces.agents - 1}, each once"
+            raise ValueError(f"agents is {agents}; allowed: {allowed}")
+        checked("replicas", replicas, count(1, 2**20))
+        lanes = len(agents) * replicas
+        check_memory(f"{replicas} replicas of {len(agents)} agents", lanes * _LEAST_BYTES, "fewer replicas")
+        self.spaces, self.settings, self.agents = spaces, settings, tuple(agents)
+        self.replicas, self.seed, self.wants = replicas, seed, WantedRewards(reward_kind)
+        self.steps = 0
+
+    def __repr__(self) -> str:
+        return f"{type(self).__name__}(agents={self.agents}, replicas={self.replicas})"
+
+    def end_episode(self, ended: Tensor) -> None:
+        """Does nothing where an episode has ended in the marked replicas, bool [R]."""
 
 
 class LaneLosses:
@@ -138,9 +187,8 @@ class WantedReturns:
         return {"returns": torch.tensor(self.returns)}
 
     def load_state_dict(self, state: Mapping[str, Tensor]) -> None:
-        """Continues from the sums of a state; those of an earlier version, which had none, are 0."""
-        if state:
-            self.returns[:] = state["returns"].numpy()
+        """Continues from the sums of a state."""
+        self.returns[:] = state["returns"].numpy()
 
 
 def learned_in(
@@ -181,9 +229,8 @@ def check_agents(
             )
 
 
-def check_decisions(decisions: object, options: int) -> None:
+def check_decisions(decisions: Decider | None, options: int) -> None:
     """Raises a ValueError unless there is a Decider where agents have so many options, and none for 0."""
-    object_of("decisions", decisions, Decider | None, "a cprl.policies.decisions.Decider, or None")
     if options and decisions is None:
         raise ValueError(
             "decisions is None; allowed for a game whose agents vote or elect: a Decider, e.g. "

@@ -10,16 +10,15 @@ from tensordict import TensorDictBase
 from torch import Tensor, nn
 
 from cprl import keys
-from cprl.arguments import object_of
 from cprl.commons.spaces import Spaces
-from cprl.learners.checks import check_networks
-from cprl.learners.engine.shared import is_list
+from cprl.learners.base import BaseLearner
+from cprl.learners.engine import Engine, SharedEngine, is_list
 from cprl.learners.transitions import LaneTurn, array_of, joint_actions, lane_turn, seen_next
 from cprl.networks.agent import acting_part
 from cprl.networks.recurrent import state_cells_of
 from cprl.networks.specification import refuse_unseen
-from cprl.policies.lanes import LaneActor
-from cprl.policies.recurrent import actor_of_lanes
+from cprl.policies.lanes import LaneActor, actor_of_lanes
+from cprl.system.memory import check_memory
 
 WEIGHTS, TARGET_WEIGHTS, EXPLORATION, SAMPLING, EVALUATION, EXHIBITION, NOISE = range(7)
 """The purposes of a lane's random numbers; each has its own seed."""
@@ -27,6 +26,14 @@ WEIGHTS, TARGET_WEIGHTS, EXPLORATION, SAMPLING, EVALUATION, EXHIBITION, NOISE = 
 StartFrom: TypeAlias = Mapping[str, Mapping[str, Tensor]]
 """The state dict of the acting network with which each lane starts, by the lane's name."""
 
+MakeTeam = Callable[[Sequence[nn.Module]], nn.Module]
+"""Makes the networks of a team from those of its members: `AgentNetworks`, that of `team_network` first.
+Members that share parameters are one and the same network."""
+
+_SHARED: Final = 1
+"""The last number of the seed of the parts that a team adds to its members' networks."""
+_COPIES: Final = 6
+"""Of a lane's weights while it trains: as made, stacked, target, gradient and two of the optimiser."""
 _LARGEST_SEED: Final = 2**63 - 1
 
 
@@ -47,27 +54,14 @@ def lane_names(*, replicas: Sequence[int], agents: Sequence[int]) -> list[str]:
     return [lane_name(replica, agent) for replica in replicas for agent in agents]
 
 
-Outputs = Callable[..., Any]
-"""The outputs of acting networks: [l, k, ...] to [l, k, ...] for l lanes; of recurrent ones also states."""
-
-
 class Acts(Protocol):
     """Evaluates the current networks of many lanes; an `Engine` does."""
 
-    def outputs(self, observation: Tensor, *, part: int = 0) -> Any:
+    def outputs(self, observation: Tensor, *recurrent: Tensor, part: int = 0) -> Any:
         """The outputs of the networks: [L, k, ...] to [L, k, ...]; recurrent ones read and give states."""
-
-    def first(self, lanes: int) -> Outputs:
-        """`outputs` of the first l lanes alone, with their weights as they are at each call."""
 
     def network_state(self, lane: int) -> dict[str, Tensor]:
         """Copies of the current weights of one lane, as the state dict of its acting network."""
-
-
-def weights_to_start(start_from: StartFrom | None) -> StartFrom:
-    """The weights to start from, none as an empty table; refuses what is no table."""
-    object_of("start_from", start_from, Mapping | None, "weights by the name of the lane, or None")
-    return start_from or {}
 
 
 class Lanes:
@@ -75,7 +69,7 @@ class Lanes:
 
     Args:
         spaces: the shape and dtype of observations, and the number of actions A.
-        agents: the indices of the agents.
+        agents: the indices of the agents, each once.
         replicas: the number of replicas R.
         seed: the seed of the run.
         first_replica: the index of the first replica.
@@ -89,6 +83,9 @@ class Lanes:
     Raises:
         ValueError: if agents observe entries that networks do not read.
     """
+
+    member_shape: tuple[int, ...] = ()
+    """The axes of the members of a lane: none, since it is one agent."""
 
     def __init__(
         self,
@@ -108,7 +105,7 @@ class Lanes:
         self.spaces, self.agents, self.replicas, self.seed = spaces, tuple(agents), replicas, seed
         self._numbers = range(first_replica, first_replica + replicas)
         self.make_network, self.stochastic = make_network, stochastic
-        self._start_from, self.sees_peers = weights_to_start(start_from), sees_peers
+        self._start_from, self.sees_peers = start_from or {}, sees_peers
         self.sharing = len(self.agents) if share_parameters else 1
         """The number of agents that share a network."""
         self.state_cells = 0
@@ -120,33 +117,23 @@ class Lanes:
 
     @property
     def names(self) -> list[str]:
-        """See `lane_names`."""
+        """The name of each agent's networks, see `lane_names`."""
         return lane_names(replicas=self._numbers, agents=self.agents)
 
     @property
     def observation_shape(self) -> tuple[int, ...]:
-        """The shape of a lane's observation: (C, X, Y)."""
-        return self.spaces.observation_shape
+        """The shape of a lane's observation: (C, X, Y), (S, C, X, Y) of a team."""
+        return *self.member_shape, *self.spaces.observation_shape
 
     @property
     def action_shape(self) -> tuple[int, ...]:
-        """The shape of a lane's stored action: (), or (N,) if it sees those of peers."""
-        return (self.spaces.agents,) if self.sees_peers else ()
-
-    @property
-    def member_shape(self) -> tuple[int, ...]:
-        """The axes of the members of a lane: none, since it is one agent."""
-        return ()
+        """The shape of a lane's stored action: (), or (N,) if it sees those of peers; (S,) of a team."""
+        return (*self.member_shape, self.spaces.agents) if self.sees_peers else self.member_shape
 
     @property
     def reward_shape(self) -> tuple[int, ...]:
-        """The shape of a lane's reward in a replay buffer."""
+        """The shape of a lane's reward in a replay buffer: (S,) if members of a team have their own."""
         return ()
-
-    @property
-    def of_replica(self) -> int:
-        """The number of lanes of a replica."""
-        return len(self.agents)
 
     def turn(self, batch: TensorDictBase, rewards: Any) -> LaneTurn:
         """One transition of every lane, as a replay buffer stores it; see `lane_turn`."""
@@ -164,13 +151,14 @@ class Lanes:
         return lane_turn(self.agents, batch, rewards)
 
     def seen_next(self, batch: TensorDictBase) -> Tensor:
-        """The observations of lanes after a turn, uint8 [L, 1, C, X, Y]."""
+        """The observations of lanes after a turn, uint8 [L, 1, *observation_shape]."""
         return seen_next(batch)[:, list(self.agents)].flatten(0, 1).unsqueeze(1)
 
     def recurrent_state(
         self, batch: TensorDictBase, entry: tuple[str, str] = keys.RECURRENT_STATE_BEFORE
     ) -> Tensor:
-        """The states that lanes had before a turn, or by another entry after it, float32 [L, H]."""
+        """The states that lanes had before a turn, or by another entry after it, float32 [L, H], of teams
+        [L, S, H]."""
         states: Tensor = batch.get(entry)
         return states[:, list(self.agents), : self.state_cells].flatten(0, 1)
 
@@ -178,9 +166,17 @@ class Lanes:
         """Values of lanes, [L], as values of the agents of each replica, [R, S]."""
         return losses.view(self.replicas, len(self.agents))
 
-    def seeds(self, purpose: int) -> list[tuple[int, int, int, int]]:
-        """See `lane_seeds`."""
+    def of_replicas(self, marked: Tensor) -> Tensor:
+        """Flags of replicas, [R], as flags of lanes, [L]."""
+        return marked.repeat_interleave(len(self) // self.replicas)
+
+    def agent_seeds(self, purpose: int) -> list[tuple[int, int, int, int]]:
+        """The seed of each agent of each replica, see `lane_seeds`."""
         return lane_seeds(self.seed, replicas=self._numbers, agents=self.agents, purpose=purpose)
+
+    def seeds(self, purpose: int) -> list[tuple[int, int, int, int]]:
+        """The seed of each lane; that of a team is its first member's."""
+        return self.agent_seeds(purpose)
 
     def new_networks(self, purpose: int, device: str | torch.device) -> list[nn.Module]:
         """New networks for each lane, or for each replica whose agents share one; the acting ones with the
@@ -190,17 +186,17 @@ class Lanes:
             TooLargeError: if the device has less memory than training all of them takes.
             ValueError: if agents that share a network would start from different weights.
         """
-        first, *others = self.seeds(purpose)[:: self.sharing]
+        first, *others = self.agent_seeds(purpose)[:: self.sharing]
         networks = [init_network(self.make_network, first)]
-        check_networks(networks[0], 1 + len(others), device)
+        _check_networks(networks[0], 1 + len(others), device)
         self.state_cells = state_cells_of(acting_part(networks[0]))
-        networks += [init_network(self.make_network, own) for own in others]
+        networks += [init_network(self.make_network, seed) for seed in others]
         for place, network in enumerate(networks):
             start, *same = (
                 self._start_from.get(name, {})
                 for name in self.names[place * self.sharing : (place + 1) * self.sharing]
             )
-            if any(not _equal(start, own) for own in same):
+            if any(not _equal(start, weights) for weights in same):
                 raise ValueError(
                     f"the agents {list(self.agents)} would start from different weights; allowed for agents "
                     "that share parameters: a run in which they shared them too"
@@ -209,44 +205,225 @@ class Lanes:
                 acting_part(network).load_state_dict(start)
         return [network.to(device) for network in networks]
 
+    def by_lane(self, engine: Engine) -> Engine:
+        """An engine of the lanes, from that of their networks."""
+        return SharedEngine(engine, self.sharing) if self.sharing > 1 else engine
+
+    def by_member(self, engine: Acts) -> Acts:
+        """The networks of all agents, from those of the lanes."""
+        return engine
+
     def actor(self, engine: Acts, *, compile: bool) -> LaneActor:
-        """The actor of training: the current weights, and random numbers of its own for each lane."""
-        return actor_of_lanes(
-            engine.outputs,
-            self.spaces,
-            seeds=self.seeds(EXPLORATION),
-            agents=len(self.agents),
-            stochastic=self.stochastic,
-            state_cells=self.state_cells,
-            compile=compile and not is_list(engine),
-        )
+        """The actor of training: the current weights, and random numbers of its own for each agent."""
+        compile = compile and not is_list(engine)
+        return self._actor(self.by_member(engine), EXPLORATION, compile=compile)
 
     def evaluation_actor(self, engine: Acts, worlds: int, *, epsilon: float) -> LaneActor:
         """The actor of evaluation: the current weights, for `worlds` worlds of each replica."""
-        actor = actor_of_lanes(
-            engine.outputs,
+        actor = self._actor(self.by_member(engine), EVALUATION, worlds=worlds)
+        actor.epsilon = epsilon
+        return actor
+
+    def _actor(self, members: Acts, purpose: int, *, worlds: int = 1, compile: bool = False) -> LaneActor:
+        return actor_of_lanes(
+            members.outputs,
             self.spaces,
-            seeds=self.seeds(EVALUATION),
+            seeds=self.agent_seeds(purpose),
             agents=len(self.agents),
             worlds=worlds,
             stochastic=self.stochastic,
             state_cells=self.state_cells,
-            first=partial(engine.first, len(self.agents)),
+            compile=compile,
         )
-        actor.epsilon = epsilon
-        return actor
 
     def states(self, engine: Acts) -> dict[str, dict[str, Tensor]]:
-        """The state dict of each lane's acting network, by the lane's name."""
-        return {name: engine.network_state(lane) for lane, name in enumerate(self.names)}
+        """The state dict of each agent's acting network, by "replica_0/agent_0" and so on."""
+        members = self.by_member(engine)
+        return {name: members.network_state(lane) for lane, name in enumerate(self.names)}
 
     def networks(self, engine: Acts) -> dict[str, nn.Module]:
-        """A copy of each lane's current acting network, by the lane's name."""
+        """A copy of each agent's current acting network, by "replica_0/agent_0" and so on."""
         made = {}
         for name, weights in self.states(engine).items():
             made[name] = acting_part(self.make_network())
             made[name].load_state_dict(weights)
         return made
+
+
+class Teams(Lanes):
+    """Lanes that hold all members of a team instead of one agent: lane r is the team of replica r.
+
+    Each member has the seeds of initial weights and exploration that it would have as an independent agent.
+
+    Args:
+        spaces: as of `Lanes`, with the following ones.
+        make_team: makes a team's networks from those of its members. Parts that it adds are initialised from
+            torch's generator, which is seeded for each team.
+        own_rewards: whether a replay buffer stores what each member wants; else one reward of the team.
+    """
+
+    def __init__(self, spaces: Spaces, *, make_team: MakeTeam, own_rewards: bool = False, **how: Any) -> None:
+        super().__init__(spaces, **how)
+        if self.sees_peers:
+            raise ValueError(
+                "sees_peers is True; allowed for a team: False; its members' actions are stored together"
+            )
+        self._make_team, self._own_rewards = make_team, own_rewards
+        self.member_shape = (len(self.agents),)
+        form = init_network(
+            lambda: make_team(self._shared([self.make_network() for _ in range(self._networks)])),
+            self.seeds(0)[0],
+        )
+        self._acting: Any = acting_part(form)
+
+    def __len__(self) -> int:
+        return self.replicas
+
+    @property
+    def _networks(self) -> int:
+        """The number of networks of a team's members."""
+        return len(self.agents) // self.sharing
+
+    def _shared(self, networks: Sequence[nn.Module]) -> list[nn.Module]:
+        """The network of each member, from the different ones."""
+        return [network for network in networks for _ in range(self.sharing)]
+
+    @property
+    def reward_shape(self) -> tuple[int, ...]:
+        return self.member_shape if self._own_rewards else ()
+
+    def seeds(self, purpose: int) -> list[tuple[int, int, int, int]]:
+        return self.agent_seeds(purpose)[:: len(self.agents)]
+
+    def new_networks(self, purpose: int, device: str | torch.device) -> list[nn.Module]:
+        """New networks for each team."""
+        members, size = super().new_networks(purpose, device), self._networks
+        made = []
+        for replica, seed in enumerate(self.seeds(purpose)):
+            of_team = self._shared(members[replica * size : (replica + 1) * size])
+            made.append(init_network(partial(self._make_team, of_team), (*seed, _SHARED)).to(device))
+        return made
+
+    def turn(self, batch: TensorDictBase, rewards: Any) -> LaneTurn:
+        """One transition of every team, as a replay buffer stores it: observations [R, S, C, X, Y], actions
+        [R, S] and team rewards [R], or with `own_rewards` those of each member, [R, S].
+
+        Args:
+            batch: see `lane_turn`.
+            rewards: of all agents, [R, N]; those of a team without `own_rewards` all the same.
+        """
+        turn = self.rollout_turn(batch, rewards)
+        return turn if self._own_rewards else turn._replace(reward=turn.reward[:, 0])
+
+    def rollout_turn(self, batch: TensorDictBase, rewards: Any) -> LaneTurn:
+        """One transition of every team, as a rollout stores it: as `turn`, with rewards [R, S]."""
+        turn, size = super().rollout_turn(batch, rewards), (len(self), len(self.agents))
+        of_members = {
+            name: getattr(turn, name).reshape(*size, *getattr(turn, name).shape[1:])
+            for name in ("observation", "action", "next_observation", "reward")
+        }
+        flags = {name: getattr(turn, name).reshape(size)[:, 0] for name in ("done", "terminated")}
+        return turn._replace(**of_members, **flags)
+
+    def seen_next(self, batch: TensorDictBase) -> Tensor:
+        return seen_next(batch)[:, list(self.agents)].unsqueeze(1)
+
+    def recurrent_state(
+        self, batch: TensorDictBase, entry: tuple[str, str] = keys.RECURRENT_STATE_BEFORE
+    ) -> Tensor:
+        return super().recurrent_state(batch, entry).view(len(self), *self.member_shape, -1)
+
+    def by_agent(self, losses: Tensor) -> Tensor:
+        """Values of teams, [R], repeated for each of their members, [R, S]."""
+        return losses[:, None].expand(-1, len(self.agents))
+
+    def by_lane(self, engine: Engine) -> Engine:
+        return engine
+
+    def by_member(self, engine: Acts) -> Acts:
+        return _Members(engine, self._acting, len(self.agents))
+
+
+class LaneLearner(BaseLearner):
+    """What learners have in common whose lanes are updated together by an engine."""
+
+    engine: Any
+    actor: LaneActor
+    _lanes: Lanes
+
+    @property
+    def lanes(self) -> int:
+        """The number of lanes L = R x S, or of teams, R."""
+        return len(self._lanes)
+
+    @property
+    def present(self) -> Acts:
+        """The present weights."""
+        acts: Acts = self.engine
+        return acts
+
+    def evaluation_actor(self, worlds: int) -> LaneActor:
+        """An actor with the current weights, for `worlds` worlds of each replica."""
+        return self._lanes.evaluation_actor(self.present, worlds, epsilon=0.0)
+
+    def networks(self) -> dict[str, nn.Module]:
+        """A copy of each lane's current acting network, by "replica_0/agent_0" and so on."""
+        return self._lanes.networks(self.present)
+
+    def finite(self) -> Tensor:
+        """Whether the weights, targets and optimiser state of each agent are finite, bool [R, S]."""
+        return self._lanes.by_agent(self.engine.finite())
+
+    def state_dict(self) -> dict[str, Any]:
+        """The full state of all lanes; the tensors themselves, not copies.
+
+        The entry "networks" repeats the weights of "update" in the form that `cprl.load` reads.
+        """
+        return {
+            "networks": self._lanes.states(self.present),
+            "update": self.engine.state_dict(),
+            "exploration": self.actor.rng.state_dict(),
+            "steps": self.steps,
+            "wants": self.wants.state_dict(),
+        }
+
+    def load_state_dict(self, state: Mapping[str, Any]) -> None:
+        """Continues from the state of a learner made with the same arguments."""
+        self.engine.load_state_dict(state["update"])
+        self.actor.rng.load_state_dict(state["exploration"])
+        self.steps = int(state["steps"])
+        self.wants.load_state_dict(state["wants"])
+
+
+class _Members:
+    """Presents an engine of teams as one of their members, with lane = replica x S + member.
+
+    Args:
+        engine: the engine whose lanes are teams.
+        form: the acting network of a team, of which architecture alone matters.
+        members: the number of members S.
+    """
+
+    def __init__(self, engine: Acts, form: Any, members: int) -> None:
+        self._engine, self._form, self._members = engine, form, members
+
+    def outputs(self, observation: Tensor, *recurrent: Tensor, part: int = 0) -> Any:
+        """[R x S, k, C, X, Y] to [R x S, k, A], through networks of [R, k, S, ...]; of recurrent ones also
+        states, likewise."""
+        inputs = (
+            seen.view(-1, self._members, *seen.shape[1:]).transpose(1, 2)
+            for seen in (observation, *recurrent)
+        )
+        given = self._engine.outputs(*inputs, part=part)
+        if isinstance(given, tuple):
+            return tuple(output.transpose(1, 2).flatten(0, 1) for output in given)
+        return given.transpose(1, 2).flatten(0, 1)
+
+    def network_state(self, lane: int) -> dict[str, Tensor]:
+        """The weights of one member."""
+        replica, member = divmod(lane, self._members)
+        state: dict[str, Tensor] = self._form.member_state(self._engine.network_state(replica), member)
+        return state
 
 
 def _equal(weights: Mapping[str, Tensor], others: Mapping[str, Tensor]) -> bool:
@@ -255,8 +432,24 @@ def _equal(weights: Mapping[str, Tensor], others: Mapping[str, Tensor]) -> bool:
     )
 
 
+def _check_networks(network: nn.Module, lanes: int, device: str | torch.device) -> None:
+    """Raises a TooLargeError if a device has too little memory to train a network like this for each lane."""
+    size = sum(value.numel() * value.element_size() for value in network.parameters())
+    check_memory(
+        f"the networks of {lanes} learners, {size / 2**20:,.1f} MiB each, with targets and optimisers",
+        lanes * size * _COPIES,
+        "smaller networks or fewer replicas",
+        device=device,
+    )
+
+
 def init_network(make_network: Callable[[], nn.Module], seed: Sequence[int]) -> nn.Module:
     """A network whose initial weights depend on a seed alone; torch's generator is left unchanged."""
     with torch.random.fork_rng(devices=[]):
-        torch.manual_seed(int(np.random.SeedSequence(seed).generate_state(1, np.uint64)[0] & _LARGEST_SEED))
+        torch.manual_seed(seed_of(seed))
         return make_network()
+
+
+def seed_of(seed: Sequence[int]) -> int:
+    """The seed of a lane as one for a generator of torch."""
+    return int(np.random.SeedSequence(seed).generate_state(1, np.uint64)[0] & _LARGEST_SEED)

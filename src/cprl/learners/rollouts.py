@@ -2,63 +2,193 @@
 
 from collections.abc import Callable, Mapping, Sequence
 from copy import deepcopy
-from typing import Any
+from math import prod
+from typing import Any, Final, NamedTuple
 
 import torch
 from tensordict import TensorDict, TensorDictBase
 from torch import Tensor, nn
+from torchrl.objectives.value.functional import generalized_advantage_estimate
 
 from cprl.commons.spaces import Spaces
-from cprl.learners.advantages import advantages
-from cprl.learners.buffer.rollout import refuse_full, rollout_fields, write_turn
-from cprl.learners.buffer.sampler import steps_ahead
-from cprl.learners.checks import check_learner, refuse_other_parts
-from cprl.learners.engine.base import Engine
-from cprl.learners.engine.choice import TRIAL_LANES, EngineName, make_engine, trial_batch, trial_rollout
-from cprl.learners.engine.functional import MakeLoss
-from cprl.learners.engine.refusals import reads, refuse_other_advantages
-from cprl.learners.engine.shared import SharedEngine
-from cprl.learners.lanes import SAMPLING, WEIGHTS, StartFrom
-from cprl.learners.recurrent import ACTOR, COMPILED_STEPS, CRITIC, Evaluated, States, states_in
+from cprl.learners.engine import COMPILED_STEPS, Engine, MakeLoss
+from cprl.learners.lanes import SAMPLING, WEIGHTS, LaneLearner, Lanes, MakeTeam, StartFrom, Teams
+from cprl.learners.preferences import Preference
+from cprl.learners.ring import steps_ahead, torch_dtype
 from cprl.learners.settings import RolloutSettings
-from cprl.learners.teams import MakeTeam, lanes_of
-from cprl.learners.transitions import wanted_in
-from cprl.policies.lanes import LaneActor
+from cprl.learners.transitions import LaneTurn, refuse_other_dtype, wanted_in
+from cprl.learners.trial import (
+    TRIAL_LANES,
+    EngineName,
+    make_engine,
+    reads,
+    refuse_other_advantages,
+    trial_batch,
+    trial_rollout,
+)
+from cprl.networks.agent import AgentNetworks, parts_of
+from cprl.networks.recurrent import state_shape_of
 from cprl.policies.rng import LaneRng
-from cprl.preferences.values import Preference
-from cprl.preferences.wanted import WantedRewards
+from cprl.system.memory import check_memory
+
+ACTOR, CRITIC = range(2)
+"""Positions of the actor and the critic among an agent's networks."""
+
+NAMES = "recurrent_state", "critic_recurrent_state"
+"""The entries of the states before each step, of the actor and the critic, in the batches of losses."""
+
+_SMALL: Final = 1e-8
 
 
-class RolloutLearner:
+def states_in(network: nn.Module) -> dict[str, tuple[int, ...]]:
+    """The shapes of the states of an agent's actor and critic by their entries; empty for networks without.
+
+    Raises:
+        ValueError: if one of them is recurrent and the other one is not.
+    """
+    parts = list(parts_of(network).items())[:2]
+    shapes = [state_shape_of(part) for _, part in parts]
+    if all(shape is None for shape in shapes):
+        return {}
+    for (name, _), shape in zip(parts, shapes, strict=True):
+        if shape is None:
+            raise ValueError(
+                f'the "{name}" is not recurrent; allowed beside a network that is: a GRU or an LSTM'
+            )
+    return {name: shape for name, shape in zip(NAMES, shapes, strict=True) if shape is not None}
+
+
+class Evaluated(NamedTuple):
+    """What the networks give for the turns of a rollout, [L, T, ...]."""
+
+    logits: Tensor
+    value: Tensor
+    next_value: Tensor
+    entries: dict[str, Tensor]
+    """Entries for losses: the states before each turn, and "is_init"."""
+
+
+class States:
+    """The states of recurrent actors and critics of L lanes, from one rollout to the next.
+
+    Turns are evaluated in order. The actor's first state of a rollout is the one by which it acted; that of
+    the critic, which does not act, is what it had after the rollout before. Gradients run through the
+    `sequence` turns of a minibatch, which begin with the states that the rollout had there, as of stored
+    states in Kapturowski et al., "Recurrent Experience Replay in Distributed Reinforcement Learning" (2019).
+
+    Args:
+        shapes: of the states of one lane, see `states_in`.
+        lanes: the lanes.
+        sequence: turns T' of a minibatch.
+        device: where.
+    """
+
+    def __init__(
+        self, shapes: Mapping[str, tuple[int, ...]], lanes: Lanes, *, sequence: int, device: Any
+    ) -> None:
+        self._lanes, self._sequence = lanes, sequence
+        self._first = {name: torch.zeros(len(lanes), *shape, device=device) for name, shape in shapes.items()}
+        self._ended = torch.ones(len(lanes), dtype=torch.bool, device=device)
+        """Whether the episode of a lane ended with the last turn of the rollout before."""
+
+    def forget(self) -> None:
+        """The next rollout begins with new episodes."""
+        self._ended.fill_(True)
+
+    def begin(self, batch: TensorDictBase) -> None:
+        """Notes by which states agents act in the first turn of a rollout."""
+        self._first[NAMES[ACTOR]].copy_(self._lanes.recurrent_state(batch))
+
+    def evaluate(self, engine: Engine, columns: Mapping[str, Tensor]) -> Evaluated:
+        """Evaluates a full rollout, and keeps the critic's states for the next one.
+
+        Args:
+            engine: the networks.
+            columns: the fields of the rollout, [L, T, ...].
+        """
+        began, states = self._began(columns["done"]), {}
+        logits, states[NAMES[ACTOR]], _ = self._in_order(engine, columns, began, ACTOR)
+        value, states[NAMES[CRITIC]], after = self._in_order(engine, columns, began, CRITIC)
+        next_value, _ = engine.outputs(columns["next_observation"], after, part=CRITIC)
+        self._first[NAMES[CRITIC]].copy_(after[:, -1])
+        self._ended.copy_(columns["done"][:, -1])
+        is_init = began.clone()
+        is_init[:, :: self._sequence] = True
+        return Evaluated(logits, value, next_value, {**states, "is_init": is_init})
+
+    def value_next(
+        self, engine: Engine, columns: Mapping[str, Tensor], size: int, seen_next: Tensor
+    ) -> Tensor:
+        """The value of the state after the latest turn.
+
+        Args:
+            engine: the networks.
+            columns: the fields of the rollout, [L, T, ...].
+            size: the turns that it has so far; 0 directly after a rollout.
+            seen_next: the observations after the latest turn, [L, 1, ...].
+        """
+        after = self._first[NAMES[CRITIC]].unsqueeze(1)
+        if size:
+            so_far = {name: column[:, :size] for name, column in columns.items()}
+            _, _, each = self._in_order(engine, so_far, self._began(so_far["done"]), CRITIC)
+            after = each[:, -1:]
+        value: Tensor = engine.outputs(seen_next, after, part=CRITIC)[0]
+        return value
+
+    def _began(self, done: Tensor) -> Tensor:
+        """Whether an episode begins with a turn, bool [L, T]."""
+        return torch.cat([self._ended[:, None], done[:, :-1]], 1)
+
+    def _in_order(
+        self, engine: Engine, columns: Mapping[str, Tensor], began: Tensor, part: int
+    ) -> tuple[Tensor, Tensor, Tensor]:
+        """The outputs of a network, its states before each turn, and those after each, [L, T, ...]."""
+        observation, first = columns["observation"], self._first[NAMES[part]]
+        given = first.new_zeros(*observation.shape[:2], *first.shape[1:])
+        given[:, 0] = torch.where(_like(began[:, 0], first), 0.0, first)
+        is_init = began.clone()
+        is_init[:, 0] = True
+        outputs, after = engine.outputs(observation, given, is_init, part=part)
+        before = torch.cat(
+            [given[:, :1], torch.where(_like(began[:, 1:], after[:, 1:]), 0.0, after[:, :-1])], 1
+        )
+        return outputs, before, after
+
+    def minibatches(self, numbers: Tensor) -> Tensor:
+        """The turns of an epoch's minibatches, int64 [minibatches, L, T'], from random numbers [L, T]."""
+        order = numbers[:, :: self._sequence].argsort(-1).T
+        return order.unsqueeze(-1) * self._sequence + torch.arange(self._sequence)
+
+    def state_dict(self) -> dict[str, Tensor]:
+        """The tensors themselves, not copies."""
+        return {**self._first, "ended": self._ended}
+
+    def load_state_dict(self, state: Mapping[str, Tensor]) -> None:
+        """Continues from a state."""
+        for name, own in self.state_dict().items():
+            own.copy_(state[name])
+
+
+class RolloutLearner(LaneLearner):
     """R x S independent agents that learn from the latest steps of their current policies.
 
     After every `rollout_steps` steps the learner estimates advantages with TorchRL's GAE and updates for
     `epochs` epochs. Each lane shuffles its own minibatches, and learns exactly as it would alone. Minibatches
     of recurrent networks are consecutive steps, and the update of more than `COMPILED_STEPS` is not compiled.
 
+    Arguments that are not listed are those of `ReplayLearner`.
+
     Args:
-        spaces: the shape and dtype of observations, and the number of actions A.
-        agents: the indices of the agents that learn.
-        replicas: the number of replicas R; each is one world of the environment.
-        settings: the hyperparameters.
         make_network: makes an agent's "actor" and "critic", see `cprl.algorithms.on_policy`.
-        make_loss: makes an agent's loss from them.
         make_team: for agents that learn as a team: makes its "actor" and "critic" from the networks of its
             members, see `cprl.algorithms.teams`; a lane is then the team of a replica.
-        seed: the seed of the run.
-        first_replica: the index of the first replica, so that replica r can be trained alone.
-        reward_kind: what they want, see `cprl.preferences`.
-        engine: how lanes are updated; None picks the fastest that works, see `cprl.learners.engine.choice`.
-        compile: whether torch compiles acting and the update; the engine "list" is never compiled.
-        start_from: the weights with which acting networks, and their targets, start, by the lane's name; the
-            others, such as critics, are new.
-        share_parameters: whether the agents of a replica share one network, which learns from all of them.
-        device: the torch device of networks, buffers and updates.
 
     Raises:
         ValueError: if the networks are not "actor" and "critic".
         TooLargeError: if the device has less memory than rollouts and networks take.
     """
+
+    settings: RolloutSettings
 
     def __init__(
         self,
@@ -79,86 +209,72 @@ class RolloutLearner:
         share_parameters: bool = False,
         device: str | torch.device = "cpu",
     ) -> None:
-        check_learner(spaces, settings, RolloutSettings, agents, replicas, first_replica, seed, reward_kind)
-        self.spaces, self.settings, self.agents = spaces, settings, tuple(agents)
-        self.replicas, self.seed, self.wants = replicas, seed, WantedRewards(reward_kind)
-        self._lanes = lanes_of(
-            spaces,
-            agents=agents,
-            replicas=replicas,
-            seed=seed,
-            first_replica=first_replica,
-            make_network=make_network,
-            make_team=make_team,
-            stochastic=True,
-            start_from=start_from,
-            share_parameters=share_parameters,
+        super().__init__(
+            spaces, settings, agents=agents, replicas=replicas, seed=seed, reward_kind=reward_kind
         )
-        self.engine = self._make_engine(engine, make_loss, compile=compile, device=device)
-        self.actor = self._lanes.actor(self.engine, compile=compile)
-        steps = settings.rollout_steps
-        self.rng = LaneRng(self._lanes.seeds(SAMPLING), steps, ahead=steps_ahead(steps))
-        size = (settings.rollout_steps,)
-        self._rollout = rollout_fields(spaces, self._lanes, size, torch.device(device))
-        self._size = 0
-        self.steps = 0
-
-    def __repr__(self) -> str:
-        return f"RolloutLearner(agents={self.agents}, replicas={self.replicas})"
-
-    def _make_engine(
-        self, name: EngineName | None, make_loss: MakeLoss, *, compile: bool, device: str | torch.device
-    ) -> Engine:
-        """The engine of all lanes, with new networks."""
-        settings = self.settings
+        how: dict[str, Any] = {
+            "agents": agents,
+            "replicas": replicas,
+            "seed": seed,
+            "first_replica": first_replica,
+            "make_network": make_network,
+            "stochastic": True,
+            "start_from": start_from,
+            "share_parameters": share_parameters,
+        }
+        self._lanes = Teams(spaces, make_team=make_team, **how) if make_team else Lanes(spaces, **how)
+        self._device = torch.device(device)
         networks = self._lanes.new_networks(WEIGHTS, device)
         refuse_other_parts(networks[0])
         shapes = states_in(networks[0])
         sequence = settings.minibatch_size
         self._states = States(shapes, self._lanes, sequence=sequence, device=device) if shapes else None
+        self.engine = self._make_engine(networks, make_loss, name=engine, compile=compile)
+        self.actor = self._lanes.actor(self.engine, compile=compile)
+        steps = settings.rollout_steps
+        self.rng = LaneRng(self._lanes.seeds(SAMPLING), steps, ahead=steps_ahead(steps))
+        self._rollout = rollout_fields(spaces, self._lanes, (steps,), self._device)
+        self._size = 0
+
+    def _make_engine(
+        self, networks: Sequence[nn.Module], make_loss: MakeLoss, *, name: EngineName | None, compile: bool
+    ) -> Engine:
+        """The engine of all lanes."""
+        settings, shapes = self.settings, states_in(networks[0])
         loss = make_loss(deepcopy(networks[0]))
         refuse_other_advantages(loss, settings)
         self._reads_logits = reads(loss, "logits")
-        trial = trial_batch(
-            min(len(networks), TRIAL_LANES),
+        trial = trial_rollout(
+            self._trial(min(len(networks), TRIAL_LANES)),
+            actions=self.spaces.actions if self._reads_logits else None,
+            states=shapes,
+        )
+        is_short = not shapes or settings.minibatch_size <= COMPILED_STEPS
+        engine = make_engine(
+            name, networks, make_loss, compile=compile and is_short, trial=trial, **self._of_engine()
+        )
+        return self._lanes.by_lane(engine)
+
+    def _of_engine(self) -> dict[str, Any]:
+        """The arguments of an engine that the settings say."""
+        names = "optimizer", "learning_rate", "adam_eps", "max_grad_norm"
+        return {name: getattr(self.settings, name) for name in names}
+
+    def _trial(self, lanes: int) -> TensorDict:
+        """Synthetic transitions of so many lanes."""
+        return trial_batch(
+            lanes,
             self._lanes.observation_shape,
             self.spaces.actions,
             action_shape=self._lanes.action_shape,
             observation_dtype=self.spaces.observation_dtype,
-            device=device,
+            device=self._device,
         )
-        engine = make_engine(
-            name,
-            networks,
-            make_loss,
-            optimizer=settings.optimizer,
-            learning_rate=settings.learning_rate,
-            adam_eps=settings.adam_eps,
-            max_grad_norm=settings.max_grad_norm,
-            compile=compile and (not shapes or sequence <= COMPILED_STEPS),
-            trial=trial_rollout(
-                trial, actions=self.spaces.actions if self._reads_logits else None, states=shapes
-            ),
-        )
-        return SharedEngine(engine, self._lanes.sharing) if self._lanes.sharing > 1 else engine
-
-    @property
-    def lanes(self) -> int:
-        """The number of lanes L = R x S, or of teams, R."""
-        return len(self._lanes)
 
     @property
     def rollout_steps(self) -> int:
         """The length of a rollout, in steps."""
         return self.settings.rollout_steps
-
-    def evaluation_actor(self, worlds: int) -> LaneActor:
-        """An actor with the current weights, for `worlds` worlds of each replica."""
-        return self._lanes.evaluation_actor(self.engine, worlds, epsilon=0.0)
-
-    def networks(self) -> dict[str, nn.Module]:
-        """A copy of each lane's current acting network, by "replica_0/agent_0" and so on."""
-        return self._lanes.networks(self.engine)
 
     def begin(self) -> None:
         """Drops the rollout that an earlier training left unfinished; see `Learner`."""
@@ -177,7 +293,7 @@ class RolloutLearner:
         if self._states is not None and not self._size:
             self._states.begin(batch)
         turn = self._lanes.rollout_turn(batch, wanted_in(self.wants, batch))
-        write_turn(self._rollout, (self._size,), turn, self.spaces)
+        write_turn(self._rollout, (self._size,), turn)
         self._size += 1
         self.steps += 1
 
@@ -237,13 +353,6 @@ class RolloutLearner:
         """The fields of the rollout, [L, T, ...]."""
         return {name: field.transpose(0, 1) for name, field in self._rollout.items()}
 
-    def end_episode(self, ended: Tensor) -> None:
-        """Does nothing: a rollout continues into the next episode; advantages do not cross the boundary."""
-
-    def finite(self) -> Tensor:
-        """Whether the weights, targets and optimiser state of each agent are finite, bool [R, S]."""
-        return self._lanes.by_agent(self.engine.finite())
-
     def values(self, batch: TensorDictBase) -> Tensor:
         """The value that each agent's critic gives to the state after a turn, [R, S]."""
         with torch.no_grad():
@@ -255,30 +364,128 @@ class RolloutLearner:
         return expected.reshape(self.replicas, len(self.agents))
 
     def state_dict(self) -> dict[str, Any]:
-        """The full state of all lanes; the tensors themselves, not copies.
-
-        The entry "networks" repeats the weights of "update" in the form that `cprl.load` reads.
-        """
         return {
-            "networks": self._lanes.states(self.engine),
-            "update": self.engine.state_dict(),
+            **super().state_dict(),
             "rollout": self._rollout,
             "size": self._size,
             "draws": self.rng.state_dict(),
-            "exploration": self.actor.rng.state_dict(),
-            "steps": self.steps,
-            "wants": self.wants.state_dict(),
             **({} if self._states is None else {"recurrent": self._states.state_dict()}),
         }
 
     def load_state_dict(self, state: Mapping[str, Any]) -> None:
-        """Continues from the state of a learner made with the same arguments."""
-        self.engine.load_state_dict(state["update"])
+        super().load_state_dict(state)
         for name, field in self._rollout.items():
             field.copy_(state["rollout"][name])
         self.rng.load_state_dict(state["draws"])
-        self.actor.rng.load_state_dict(state["exploration"])
-        self._size, self.steps = int(state["size"]), int(state["steps"])
-        self.wants.load_state_dict(state.get("wants", {}))
+        self._size = int(state["size"])
         if self._states is not None:
             self._states.load_state_dict(state["recurrent"])
+
+
+def advantages(
+    columns: Mapping[str, Tensor], value: Tensor, next_value: Tensor, *, settings: RolloutSettings
+) -> tuple[Tensor, Tensor]:
+    """The advantage of each step, and the target of its value.
+
+    Args:
+        columns: "reward", "done" and "terminated", of lanes [L, T], or of members of teams [L, T, S].
+        value: of the states before each step, [L, T, ..., 1].
+        next_value: of the states after it.
+        settings: the discount, lambda, and whether advantages are normalised within each lane.
+
+    Returns:
+        Both of the shape of `value`.
+    """
+    advantage, target = generalized_advantage_estimate(
+        settings.gamma,
+        settings.gae_lambda,
+        value,
+        next_value,
+        *(_like(columns[name], value).expand_as(value) for name in ("reward", "done", "terminated")),
+        time_dim=1,
+    )
+    if settings.normalize_advantage:
+        of_lane = tuple(range(1, advantage.ndim))
+        spread = advantage.std(of_lane, keepdim=True)
+        advantage = (advantage - advantage.mean(of_lane, keepdim=True)) / (spread + _SMALL)
+    return advantage, target
+
+
+def _like(column: Tensor, value: Tensor) -> Tensor:
+    """A field of lanes [L, ...] with axes of size 1 for those of values [L, ..., H] that it lacks."""
+    return column.reshape(*column.shape, *[1] * (value.ndim - column.ndim))
+
+
+def rollout_fields(
+    spaces: Spaces, lanes: Lanes, size: tuple[int, ...], device: torch.device
+) -> dict[str, Tensor]:
+    """The fields of a `LaneTurn` for so many steps, zeros [*size, L, ...] each.
+
+    Args:
+        spaces: the dtype of observations.
+        lanes: the shapes of the fields of one lane.
+        size: the number of steps; with several rollouts, their number first.
+        device: where.
+
+    Raises:
+        TooLargeError: if the device has less memory than they take.
+    """
+    shape, dtype = lanes.observation_shape, torch_dtype(spaces.observation_dtype)
+    check_rollouts((prod(size), len(lanes)), shape, dtype, device)
+    forms: dict[str, tuple[tuple[int, ...], torch.dtype]] = {
+        "observation": (shape, dtype),
+        "action": (lanes.action_shape, torch.int64),
+        "next_observation": (shape, dtype),
+        "reward": (lanes.member_shape, torch.float32),
+        "done": ((), torch.bool),
+        "terminated": ((), torch.bool),
+    }
+    return {
+        name: torch.zeros((*size, len(lanes), *of_one), dtype=kind, device=device)
+        for name, (of_one, kind) in forms.items()
+    }
+
+
+def refuse_full(stored: int, steps: int) -> None:
+    """Raises a ValueError if all steps of a rollout are stored already."""
+    if stored == steps:
+        raise ValueError(f"the rollout already has {steps} steps; call update() before store()")
+
+
+def write_turn(fields: Mapping[str, Tensor], at: tuple[int, ...], turn: LaneTurn) -> None:
+    """Writes a step of all lanes at a place of `rollout_fields`.
+
+    Raises:
+        ValueError: if the dtype of observations is not that of the fields.
+    """
+    for name, field in fields.items():
+        column = torch.as_tensor(getattr(turn, name))
+        if name in ("observation", "next_observation"):
+            refuse_other_dtype(column.dtype, field.dtype)
+        field[at] = column
+
+
+def check_rollouts(
+    size: tuple[int, int], shape: Sequence[int], dtype: torch.dtype, device: str | torch.device
+) -> None:
+    """Raises a TooLargeError if a device has too little memory for rollouts.
+
+    Args:
+        size: the number of steps T and of lanes L.
+        shape: the shape of an observation.
+        dtype: its dtype; updates read it as float32.
+        device: the device of rollouts and updates.
+    """
+    check_memory(
+        f"the rollouts of {size[1]} learners x {size[0]:,} steps",
+        prod(size) * (2 * prod(shape) * (dtype.itemsize + 4) + 64),
+        "fewer rollout_steps or fewer replicas",
+        device=device,
+    )
+
+
+def refuse_other_parts(network: nn.Module) -> None:
+    """Raises a ValueError if the networks of an agent are not "actor" and "critic"."""
+    parts = list(parts_of(network))
+    if not isinstance(network, AgentNetworks) or parts[:2] != ["actor", "critic"]:
+        raise ValueError(f'an agent has the networks {parts}; allowed: "actor" and "critic"')

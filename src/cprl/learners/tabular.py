@@ -23,32 +23,25 @@ from torch import Tensor, nn
 
 from cprl import keys
 from cprl.commons.spaces import Spaces
-from cprl.learners.checks import check_learner
-from cprl.learners.lanes import EVALUATION, EXPLORATION, StartFrom, lane_names, lane_seeds, weights_to_start
+from cprl.learners.base import BaseLearner
+from cprl.learners.lanes import EVALUATION, EXPLORATION, StartFrom, lane_names, lane_seeds
+from cprl.learners.preferences import Preference
 from cprl.learners.settings import TabularSettings
 from cprl.learners.transitions import lane_turn, wanted_in
 from cprl.policies.tabular import NEVER_MET, QTables, TableNetwork, TabularActor, observed_entries, states_of
-from cprl.preferences.values import Preference
-from cprl.preferences.wanted import WantedRewards
 
 
-class TabularLearner:
+class TabularLearner(BaseLearner):
     """R x S independent tabular agents: S agents of each of R replicas, each with its own table.
 
     A `cprl.learners.base.Learner`; its tables are in the CPU's memory.
 
+    Arguments that are not listed are those of `ReplayLearner`.
+
     Args:
-        spaces: the shape and dtype of observations, and the number of actions A.
-        agents: the indices of the agents that learn.
-        replicas: the number of replicas R; each is one world of the environment.
-        settings: the hyperparameters.
-        seed: the seed of the run.
-        first_replica: the index of the first replica, so that replica r can be trained alone.
-        reward_kind: what they want, see `cprl.preferences`.
         start_from: the tables with which lanes start, by the lane's name; each value counts as never updated.
 
     Raises:
-        ValueError: for agents, replicas or a seed that there cannot be.
         MemoryError: from `store`, if an agent visits more than `settings.max_states` states.
     """
 
@@ -64,22 +57,18 @@ class TabularLearner:
         reward_kind: Preference = "individual",
         start_from: StartFrom | None = None,
     ) -> None:
-        check_learner(spaces, settings, TabularSettings, agents, replicas, first_replica, seed, reward_kind)
-        self.spaces, self.settings, self.seed, self.agents = spaces, settings, seed, tuple(agents)
-        self.wants, start = WantedRewards(reward_kind), weights_to_start(start_from)
-        self.replicas, self._numbers = replicas, range(first_replica, first_replica + replicas)
+        super().__init__(
+            spaces, settings, agents=agents, replicas=replicas, seed=seed, reward_kind=reward_kind
+        )
+        start, self._numbers = start_from or {}, range(first_replica, first_replica + replicas)
         self.tables = QTables(self.lanes, spaces.actions, max_states=settings.max_states)
         for lane, name in enumerate(lane_names(replicas=self._numbers, agents=self.agents)):
             if name in start:
                 self.tables.add_lane(lane, *(start[name][own].numpy() for own in ("states", "values")))
         self.actor = self._actor(EXPLORATION, worlds=1)
         self.actor.epsilon = settings.epsilon(0)
-        self.steps = 0
         self._observed, self._every_lane = observed_entries(spaces), range(self.lanes)
         self._turns: deque[dict[str, NDArray[Any]]] = deque()
-
-    def __repr__(self) -> str:
-        return f"TabularLearner(agents={self.agents}, replicas={self.replicas})"
 
     @property
     def lanes(self) -> int:
@@ -130,9 +119,6 @@ class TabularLearner:
         values[place] += self.settings.rates(self.tables.visits[place]) * error
         return torch.from_numpy(error**2).view(self.replicas, len(self.agents))
 
-    def end_episode(self, ended: Tensor) -> None:
-        """Does nothing at the end of an episode."""
-
     def finite(self) -> Tensor:
         """Whether the values of each agent's table are finite, bool [R, S]."""
         sound = np.ones(self.lanes, np.bool_)
@@ -145,24 +131,6 @@ class TabularLearner:
         after = keys.entry(keys.entry(batch, "next"), keys.AGENTS)
         rows = self.tables.find(states_of(after, self._observed, self.agents), self._every_lane)
         return torch.from_numpy(self.tables.values[rows].max(1)).view(self.replicas, len(self.agents))
-
-    def q_table(self, lane: int) -> dict[str, NDArray[Any]]:
-        """The table of a lane, with one row for each of the n states that it has visited; for display.
-
-        Returns:
-            "observation" [n, C, X, Y] in its own dtype, "stock_gauge" float32 [n, 1] and "scoreboard" float32
-            [n, N] if the game has them, "values" float64 [n, A] and "visits" int64 [n, A].
-        """
-        flat, values, visits = self.tables.of_lane(lane)
-        sizes = dict(self.spaces.vectors)
-        shape, dtype = self.spaces.observation_shape, np.dtype(self.spaces.observation_dtype)
-        split = int(np.prod(shape)) * dtype.itemsize
-        seen = np.ascontiguousarray(flat[:, :split]).view(dtype)
-        table: dict[str, NDArray[Any]] = {"observation": seen.reshape(len(flat), *shape)}
-        vectors = np.ascontiguousarray(flat[:, split:]).view(np.float32)
-        for name in self._observed[1:]:
-            table[name], vectors = vectors[:, : sizes[name]], vectors[:, sizes[name] :]
-        return {**table, "values": values, "visits": visits}
 
     def networks(self) -> dict[str, nn.Module]:
         """A copy of each lane's current table as a network, by "replica_0/agent_0" and so on.
@@ -209,7 +177,7 @@ class TabularLearner:
         self._turns = deque(
             {name: own.numpy().copy() for name, own in turn.items()} for turn in state["turns"]
         )
-        self.wants.load_state_dict(state.get("wants", {}))
+        self.wants.load_state_dict(state["wants"])
 
 
 def table_network(spaces: Spaces) -> TableNetwork:

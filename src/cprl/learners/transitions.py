@@ -3,14 +3,11 @@
 from typing import Any, NamedTuple
 
 import numpy as np
-import torch
 from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
 
 from cprl import keys
-from cprl.arguments import object_of
-from cprl.checks import checked, count
-from cprl.preferences.wanted import WantedRewards
+from cprl.learners.preferences import WantedRewards
 
 
 class LaneTurn(NamedTuple):
@@ -128,17 +125,8 @@ def transitions_of(agent: int, batch: TensorDictBase) -> TensorDict:
         A flat TensorDict [transitions] of "observation" uint8 [.., 3, X, Y], "action" int64 [..] and "next":
         "observation", "reward" float32 [.., 1], "done", "terminated", "truncated" bool [.., 1].
         Turns that the agent spends out of play are included, with the action that it chose.
-
-    Raises:
-        ValueError: for an agent that the batch does not have, and for anything but such a batch.
     """
-    object_of("batch", batch, TensorDictBase, "a TensorDict as a collector yields it")
-    before, after = batch.get(keys.AGENTS, None), batch.get("next", None)
-    if before is None or after is None or after.get(keys.AGENTS, None) is None:
-        raise ValueError(
-            'batch lacks "agents", at its root or under "next"; allowed: what a collector yields'
-        )
-    checked("agent", agent, count(0, before.get("action").shape[-1] - 1))
+    before, after = batch.get(keys.AGENTS), batch.get("next")
     agents_after = after.get(keys.AGENTS)
     dim = len(batch.batch_size)
     following = TensorDict(
@@ -159,24 +147,10 @@ def transitions_of(agent: int, batch: TensorDictBase) -> TensorDict:
     ).reshape(-1)
 
 
-def turn_of(transitions: TensorDictBase) -> LaneTurn:
-    """The transitions of lanes, [L], under TorchRL's default keys, as a `LaneTurn`."""
-    following = transitions.get("next")
-    flags = (following.get(name).reshape(len(transitions)) for name in ("done", "terminated"))
-    reward = following.get("reward").squeeze(-1)
-    before = transitions.get("observation"), transitions.get("action")
-    turn = *before, following.get("observation"), reward, *flags
-    states = (own.get("recurrent_state", None) for own in (transitions, following))
-    return LaneTurn(*map(array_of, turn), *(None if own is None else array_of(own) for own in states))
-
-
-def transitions_in(turn: LaneTurn) -> TensorDict:
-    """`turn_of`, the other way round."""
-    given = {name: value for name, value in turn._asdict().items() if value is not None}
-    entries = {name: torch.as_tensor(value) for name, value in given.items()}
-    lanes = [len(entries["done"])]
-    following = {name: entries.pop(name).unsqueeze(-1) for name in ("reward", "done", "terminated")}
-    for name in ("observation", "recurrent_state"):
-        if f"next_{name}" in entries:
-            following[name] = entries.pop(f"next_{name}")
-    return TensorDict({**entries, "next": TensorDict(following, lanes)}, lanes)
+def refuse_other_dtype(found: Any, allowed: Any) -> None:
+    """Raises a ValueError for observations of another dtype than learners store; they would be rounded."""
+    if found != allowed:
+        raise ValueError(
+            f"observations are {found}; allowed: {allowed}, from Spaces.observation_dtype: make the learner "
+            "with the Spaces of the transformed environment"
+        )

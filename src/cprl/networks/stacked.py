@@ -7,9 +7,7 @@ from typing import Any, Final
 import torch
 from torch import Tensor, nn
 
-from cprl.networks.agent import AgentNetworks
-from cprl.networks.distributional import AtomNetwork
-from cprl.networks.joint import JointNetwork
+from cprl.networks.agent import AgentNetworks, AtomNetwork, JointNetwork
 from cprl.networks.mlp import MLPNetwork
 
 _OVER_ANOTHER: Final = AtomNetwork, JointNetwork

@@ -11,13 +11,20 @@ Modules, in the order in which one reads them:
     iterated          the exact values of policies that remember one turn of a repeated matrix game
 """
 
-from cprl.objectives.dice import dice_objective, loaded_dice, magic_box
-from cprl.objectives.iterated import iterated_value
-from cprl.objectives.log_cosh import LogCoshDQNLoss, log_cosh
-from cprl.objectives.lola import lola_gradients, look_ahead_losses, looked_ahead
-from cprl.objectives.lola_losses import LOLADiCELoss, LOLALoss
+from cprl.objectives.lola import (
+    LOLADiCELoss,
+    LOLALoss,
+    dice_objective,
+    iterated_value,
+    loaded_dice,
+    lola_gradients,
+    look_ahead_losses,
+    looked_ahead,
+    magic_box,
+)
 from cprl.objectives.maddpg import MADDPGLoss
 from cprl.objectives.pr2 import PR2Loss
+from cprl.objectives.td import LogCoshDQNLoss, log_cosh
 
 __all__ = [
     "LOLADiCELoss",

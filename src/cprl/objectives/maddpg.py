@@ -13,7 +13,7 @@ from torchrl.objectives.utils import dispatch_value_estimator
 
 from cprl.arguments import object_of
 from cprl.checks import checked, number, one_of
-from cprl.objectives.log_cosh import DISTANCES, distance
+from cprl.objectives.td import DISTANCES, distance
 
 ActionSpace: TypeAlias = Literal["categorical", "one-hot"]
 

@@ -11,9 +11,8 @@ from tensordict.utils import NestedKey
 from torch import Tensor, nn
 
 from cprl.arguments import choice, number, object_of, switch
-from cprl.networks.joint import chosen, marginal, soft_value
-from cprl.objectives.log_cosh import DISTANCES, distance
-from cprl.objectives.td_loss import TDLoss
+from cprl.networks.agent import chosen, marginal, soft_value
+from cprl.objectives.td import DISTANCES, TDLoss, distance
 
 _VALUES: Final = "joint_action_value"
 _LOWEST_TEMPERATURE: Final = 1e-6
@@ -26,7 +25,7 @@ class PR2Loss(TDLoss):
     value of a joint action is their sum. With temperature T the peers' expected answer is
     rho(b | s, a) ~ exp(q_j(s, a, b) / T), the value of an own action Q(s, a) = T log sum exp(Q(s, a, others)
     / T) over the others' joint actions, and the policy pi(a | s) ~ exp(Q(s, a) / T); see
-    `cprl.networks.joint`. The loss is the squared difference between the value of the joint action taken and
+    `cprl.networks.agent`. The loss is the squared difference between the value of the joint action taken and
     r + gamma V(s'), where V is the soft value of the target network, T log sum exp(Q(s', a) / T).
 
     The model of the peers is optimistic: they are expected to do what the agent values, whatever they value.

@@ -8,10 +8,9 @@ from tensordict import TensorDictBase
 from tensordict.nn import TensorDictModuleBase
 from torch import Tensor, nn
 
-from cprl import arguments, keys
+from cprl import keys
 from cprl.policies.decisions import Decider
-from cprl.policies.lanes import LaneActor
-from cprl.policies.recurrent import RecurrentLaneActor
+from cprl.policies.lanes import LaneActor, RecurrentLaneActor
 from cprl.system.compat import unchecked_tensordict
 
 AgentIndices: TypeAlias = int | tuple[int, ...]
@@ -27,8 +26,8 @@ class AgentPolicies(TensorDictModuleBase):
     """Passes each actor the observations of its agents, and combines the actions.
 
     Args:
-        actors: one for each agent, agent 0 first, see `cprl.policies.single`; or a mapping from the agents
-            that each controls: an index for an actor of one agent, a tuple for an actor of several, e.g. a
+        actors: one for each agent, agent 0 first, e.g. a `RandomActor`; or a mapping from the agents that
+            each controls: an index for an actor of one agent, a tuple for an actor of several, e.g. a
             `LaneActor`.
         decisions: what the agents decide, where a game asks them (`Game.decisions`); None in other games.
 
@@ -52,17 +51,9 @@ class AgentPolicies(TensorDictModuleBase):
         decisions: Decider | None = None,
     ) -> None:
         super().__init__()
-        arguments.object_of("decisions", decisions, Decider | None, "a Decider, or None")
-        allowed = "an actor for each agent, or a mapping from agents to actors"
-        by_agents: dict[AgentIndices, nn.Module] = (
-            dict(actors)
-            if isinstance(actors, Mapping)
-            else dict(enumerate(arguments.listed("actors", actors, allowed)))
+        by_agents: dict[AgentIndices, nn.Module] = dict(
+            actors if isinstance(actors, Mapping) else enumerate(actors)
         )
-        for indices, actor in by_agents.items():
-            arguments.object_of(f"the actor of {indices}", actor, nn.Module, "a torch module")
-            for agent in agent_indices(indices):
-                arguments.integer("an agent", agent, 0)
         taken = sorted(agent for indices in by_agents for agent in agent_indices(indices))
         if not taken or taken != list(range(len(taken))):
             raise ValueError(f"actors control the agents {taken}; allowed: 0, 1 and so on, each exactly once")

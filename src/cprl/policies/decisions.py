@@ -13,10 +13,7 @@ from numpy.typing import NDArray
 from torch import Tensor, nn
 from torchrl.envs.utils import ExplorationType, exploration_type
 
-from cprl import arguments
-from cprl.checks import shown
 from cprl.commons.game import Game
-from cprl.policies.rng import check_lanes
 
 Longs = NDArray[np.int64]
 Doubles = NDArray[np.float64]
@@ -27,7 +24,6 @@ UNTRIED = -np.inf
 
 def ballot_sizes(game: Game) -> tuple[int, ...]:
     """The number of choices of each ballot of a game."""
-    arguments.object_of("game", game, Game, "a cprl.Game")
     return tuple(len(ballot.choices) for ballot in game.ballots)
 
 
@@ -62,9 +58,6 @@ class Decider(nn.Module):
             chance.
         epsilon: float64 [R, N], 0..1, likewise; None for 0.
         by_chance: bool [N]; None for nobody.
-
-    Raises:
-        ValueError: for arrays of another shape, numbers below 1, or another number of seeds.
     """
 
     def __init__(
@@ -79,15 +72,12 @@ class Decider(nn.Module):
         by_chance: Sequence[bool] | None = None,
     ) -> None:
         super().__init__()
-        listed = arguments.listed("sizes", sizes, "the number of choices of each ballot, at least one")
-        self.sizes = tuple(arguments.integer("a size", size, 1) for size in listed)
-        if not self.sizes:
-            raise arguments.refusal("sizes", sizes, "the number of choices of each ballot, at least one")
-        self.agents, self.worlds, self.replicas = check_lanes(seeds, agents=agents, worlds=worlds)
+        self.sizes = tuple(sizes)
+        self.agents, self.worlds, self.replicas = agents, worlds, len(seeds) // agents
         self._seeds = [tuple(seed) for seed in seeds]
         of_agents = self.replicas, self.agents
-        self.values = _given("values", values, (*of_agents, sum(self.sizes)))
-        self.epsilon = _given("epsilon", epsilon, of_agents)
+        self.values = np.zeros((*of_agents, sum(self.sizes))) if values is None else values
+        self.epsilon = np.zeros(of_agents) if epsilon is None else epsilon
         self.by_chance = np.full(self.agents, values is None)
         if by_chance is not None:
             self.by_chance |= np.array(by_chance, np.bool_)
@@ -101,13 +91,7 @@ class Decider(nn.Module):
 
         Args:
             due: bool [R x k, V], which ballots are held in the coming turn, `cprl.keys.BALLOTS_DUE`.
-
-        Raises:
-            ValueError: for another number of worlds or ballots.
         """
-        expected = len(self._choices), len(self.sizes)
-        if tuple(due.shape) != expected:
-            raise arguments.refusal('"ballots_due"', list(due.shape), f"bool {list(expected)}")
         held = due.numpy(force=True)
         if self._held is None or np.count_nonzero(held):
             self._choose(held)
@@ -159,7 +143,7 @@ class Decider(nn.Module):
         return {"choices": torch.tensor(self._choices), "decided": torch.tensor(self._decided)}
 
     def set_extra_state(self, state: Mapping[str, Any]) -> None:
-        """See `get_extra_state`."""
+        """Continues from that state."""
         self._choices[:] = state["choices"].numpy(force=True)
         self._decided[:] = state["decided"].numpy(force=True)
         held = self._held
@@ -167,17 +151,6 @@ class Decider(nn.Module):
             device = "cpu" if held is None else held.device
             decisions = torch.from_numpy(decision_of(self._choices, self.sizes)).to(device)
             object.__setattr__(self, "_held", decisions)
-
-
-def _given(name: str, array: Doubles | None, shape: tuple[int, ...]) -> Doubles:
-    """An array of this shape; zeros in place of None."""
-    if array is None:
-        return np.zeros(shape)
-    if not isinstance(array, np.ndarray) or array.shape != shape or array.dtype != np.float64:
-        is_array = isinstance(array, np.ndarray)
-        found = f"{array.dtype} {list(array.shape)}" if is_array else shown(array)
-        raise ValueError(f"{name} is {found}; allowed: None, or float64 {list(shape)}")
-    return array
 
 
 def decider_by_chance(game: Game, seeds: Sequence[Sequence[int]], *, worlds: int = 1) -> Decider | None:

@@ -9,9 +9,8 @@ from tensordict.nn import TensorDictModuleBase
 from torch import Tensor, nn
 from torchrl.envs.utils import ExplorationType, exploration_type
 
-from cprl import arguments
 from cprl.commons.spaces import Spaces
-from cprl.policies.rng import MOST_LANES, LaneRng, check_lanes
+from cprl.policies.rng import LaneRng
 from cprl.system.compiling import Compiled
 
 
@@ -29,12 +28,7 @@ class LaneActor(TensorDictModuleBase):
         seeds: the exploration seed of each lane.
         agents: the number of agents S of each replica.
         worlds: the number of worlds k of each replica that are played at once, consecutive in the batch.
-        first: makes the function `values` of the first replica's lanes alone, [S, k, ...] to [S, k, A].
         compile: whether torch compiles exploration; if that fails, the actor warns once and runs uncompiled.
-
-    Raises:
-        ValueError: if a number is no integer or below 1, or there is not one seed per lane; for an `epsilon`
-            outside 0..1.
     """
 
     in_keys: tuple[str, ...] = ("observation",)
@@ -51,18 +45,15 @@ class LaneActor(TensorDictModuleBase):
         agents: int,
         worlds: int = 1,
         stochastic: bool = False,
-        first: Callable[[], Callable[..., Any]] | None = None,
         compile: bool = False,
     ) -> None:
         super().__init__()
-        arguments.switch("stochastic", stochastic)
-        self.values, self.stochastic = values, stochastic
-        self.actions = arguments.integer("actions", actions, 1)
-        self.agents, self.worlds, self.replicas = check_lanes(seeds, agents=agents, worlds=worlds)
+        self.values, self.stochastic, self.actions = values, stochastic, actions
+        self.agents, self.worlds, self.replicas = agents, worlds, len(seeds) // agents
         # A tensor, because compiled code treats other numbers as constants.
         self._chance = 0.0 if stochastic else 1.0
         self._epsilon = torch.tensor(self._chance, dtype=torch.float64)
-        self._seeds, self._first = seeds, first
+        self._seeds = seeds
         self.rng = LaneRng(seeds, 2 * self.worlds)
         self._explore = Compiled(type(self)._explored, what="agents act", enabled=compile)
 
@@ -77,24 +68,27 @@ class LaneActor(TensorDictModuleBase):
 
     def explore_with(self, chance: float) -> None:
         """Sets `epsilon` of agents that have one; faster than through attributes of a module."""
-        if type(chance) is not float:
-            chance = arguments.number("epsilon", chance, low=0, high=1, allowed="0..1")
         if chance != self._chance and not self.stochastic:
-            arguments.number("epsilon", chance, low=0, high=1, allowed="0..1")
             self._epsilon.fill_(chance)
-            object.__setattr__(self, "_chance", chance)
+            object.__setattr__(self, "_chance", float(chance))
 
-    def of_first_replica(self) -> "LaneActor | None":
+    def of_first_replica(self) -> "LaneActor":
         """An actor of the first replica's agents alone, with the same weights and exploration, and their own
-        random numbers from the start; None where `values` are not known for them alone."""
-        if self._first is None:
-            return None
-        lanes = {"seeds": self._seeds[: self.agents], "agents": self.agents, "worlds": self.worlds}
-        actor = self._alike(self._first(), **lanes)
+        random numbers from the start."""
+        values, replicas, agents = self.values, self.replicas, self.agents
+
+        def of_first(*seen: Tensor) -> Any:
+            """What the first of all replicas chooses by, if all see the same."""
+            assert values is not None
+            given = values(*(each.repeat(replicas, *[1] * (each.ndim - 1)) for each in seen))
+            return tuple(each[:agents] for each in given) if isinstance(given, tuple) else given[:agents]
+
+        lanes = {"seeds": self._seeds[:agents], "agents": agents, "worlds": self.worlds}
+        actor = self._alike(None if values is None else of_first, **lanes)
         actor.epsilon = self.epsilon
         return actor
 
-    def _alike(self, values: Callable[..., Any], **lanes: Any) -> "LaneActor":
+    def _alike(self, values: Callable[..., Any] | None, **lanes: Any) -> "LaneActor":
         """An actor for other lanes that chooses as this one does."""
         return LaneActor(values, self.actions, stochastic=self.stochastic, **lanes)
 
@@ -150,7 +144,7 @@ class LaneActor(TensorDictModuleBase):
         return self.rng.state_dict()
 
     def set_extra_state(self, state: dict[str, Any]) -> None:
-        """See `get_extra_state`."""
+        """Continues from that state."""
         self.rng.load_state_dict(state)
 
     def _best(self, observation: Tensor) -> Tensor:
@@ -182,9 +176,6 @@ def random_agents(
     spaces: Spaces, agents: tuple[int, ...], *, replicas: int, seed: int, worlds: int = 1
 ) -> dict[int | tuple[int, ...], nn.Module]:
     """Uniformly random actors of some agents of every replica, by the indices of the agents."""
-    arguments.object_of("spaces", spaces, Spaces, "a cprl.commons.spaces.Spaces")
-    agents = arguments.listed("agents", agents, "the indices of agents")
-    replicas, seed = arguments.integer("replicas", replicas, 1, MOST_LANES), arguments.seed(seed)
     seeds = [(seed, replica, agent) for replica in range(replicas) for agent in agents]
     return {agents: random_lanes(spaces, seeds=seeds, agents=len(agents), worlds=worlds)}
 
@@ -195,3 +186,106 @@ def random_lanes(
     """An actor of agents that act uniformly at random, given how many actions there are or the spaces."""
     count = actions.actions if isinstance(actions, Spaces) else actions
     return LaneActor(None, count, seeds=seeds, agents=agents, worlds=worlds)
+
+
+class RecurrentLaneActor(LaneActor):
+    """Chooses actions by recurrent networks; other arguments are those of `LaneActor`.
+
+    Args:
+        values: maps observations [L, k, ...] and states [L, k, H] to logits or action values [L, k, A] and
+            the states afterwards.
+        actions: the number of actions A.
+        state_cells: the numbers H of a state.
+
+    Reads "observation" and "recurrent_state", float32 [R x k, S, H]; writes "action" and "recurrent_state".
+    """
+
+    in_keys = ("observation", "recurrent_state")
+    out_keys = ("action", "recurrent_state")
+
+    def __init__(self, values: Callable[..., Any], actions: int, *, state_cells: int, **how: Any) -> None:
+        super().__init__(values, actions, **how)
+        self.state_cells = state_cells
+        is_compiled = bool(how.get("compile", False))
+        self._explore = Compiled(type(self)._explored_with, what="agents act", enabled=is_compiled)
+
+    def _alike(self, values: Callable[..., Any] | None, **lanes: Any) -> LaneActor:
+        assert values is not None
+        how: dict[str, Any] = {"state_cells": self.state_cells, "stochastic": self.stochastic}
+        return RecurrentLaneActor(values, self.actions, **how, **lanes)
+
+    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
+        """Writes "action", int64 [R x k, S], and "recurrent_state", from the turn's entries."""
+        chosen, after = self.choose_with(tensordict.get("observation"), tensordict.get("recurrent_state"))
+        return tensordict.set("action", chosen).set("recurrent_state", after)
+
+    def choose_with(self, observation: Tensor, state: Tensor) -> tuple[Tensor, Tensor]:
+        """Actions, int64 [R x k, S], and states afterwards, float32 [R x k, S, H].
+
+        Args:
+            observation: [R x k, S, ...].
+            state: before this turn, [R x k, S, H].
+        """
+        if exploration_type() not in (ExplorationType.RANDOM, None):
+            values, after = self._step(observation, state)
+            return self._by_replica(values.argmax(-1)), after
+        device = observation.device
+        given = observation, state, self.rng.next().to(device), self._epsilon.to(device)
+        form = observation.shape, observation.dtype, state.shape
+        chosen, after = self._explore(form, self, *given)
+        return chosen, after
+
+    def preferences(self, observation: Tensor, state: Tensor | None = None) -> Tensor | None:
+        """As of `LaneActor`, with the states before the turn, [R x k, S, H]."""
+        assert state is not None
+        values = self._by_replica(self._step(observation, state)[0])
+        return values.softmax(-1) if self.stochastic else values
+
+    def _explored_with(
+        self, observation: Tensor, state: Tensor, numbers: Tensor, epsilon: Tensor
+    ) -> list[Tensor]:
+        """Exploring actions, and the states afterwards."""
+        values, after = self._step(observation, state)
+        return [self._by_replica(self._chosen(values, numbers, epsilon)), after]
+
+    def _step(self, observation: Tensor, state: Tensor) -> tuple[Tensor, Tensor]:
+        """Outputs of each lane's network [L, k, A], and the states afterwards [R x k, S, H]."""
+        assert self.values is not None
+        with torch.no_grad():
+            values, after = self.values(self._by_lane(observation), self._by_lane(state))
+        return values, self._by_replica(after)
+
+
+def actor_of_lanes(
+    values: Callable[..., Any] | None, spaces: Spaces, *, state_cells: int = 0, **how: Any
+) -> LaneActor:
+    """The actor for networks with states of so many numbers, or without: a `RecurrentLaneActor` or a
+    `LaneActor`."""
+    if not state_cells or values is None:
+        return LaneActor(values, spaces.actions, **how)
+    return RecurrentLaneActor(values, spaces.actions, state_cells=state_cells, **how)
+
+
+class RandomActor(TensorDictModuleBase):
+    """Chooses uniformly random actions for one agent, from "observation" [..., C, X, Y].
+
+    Args:
+        actions: the number of actions A.
+        device: the device of the actions.
+        seed: the seed of its own generator.
+    """
+
+    in_keys = ("observation",)
+    out_keys = ("action",)
+
+    def __init__(self, actions: int, *, device: str | torch.device = "cpu", seed: int = 0) -> None:
+        super().__init__()
+        self.actions = actions
+        self.generator = torch.Generator(device).manual_seed(seed)
+
+    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
+        """Writes "action", int64 with the TensorDict's batch size."""
+        chosen = torch.randint(
+            self.actions, tensordict.batch_size, generator=self.generator, device=self.generator.device
+        )
+        return tensordict.set("action", chosen)

@@ -73,9 +73,10 @@ class PresentPolicy:
         first: dict[AgentIndices, nn.Module] = {}
         pairs: list[tuple[Any, Any]] = []
         for agents, (own, training) in learned.items():
-            alone = own.of_first_replica() if isinstance(own, LaneActor) and own.worlds == 1 else None
-            first[agents] = FirstReplica(own, replicas) if alone is None else alone
-            pairs.append((own if alone is None else alone, training))
+            if isinstance(own, LaneActor):
+                own = own.of_first_replica()
+            first[agents] = own if isinstance(own, LaneActor) else FirstReplica(own, replicas)
+            pairs.append((own, training))
         self._policy = AgentPolicies({**first, **others}, decisions=own_decisions)
         self._pairs = [pair for pair in pairs if _has_epsilon(pair[0])]
         self._evaluation = [own.epsilon for own, _ in self._pairs]

@@ -7,36 +7,10 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from cprl import arguments
 from cprl.system.memory import check_memory
 
 DRAWN_AHEAD: Final = 1024
 """Steps whose numbers are generated at once."""
-MOST_LANES: Final = 2**20
-"""The largest number of agents, of replicas and of lanes."""
-_SEEDS: Final = "a sequence of integers >= 0 for each lane"
-
-
-def check_lanes(seeds: Any, *, agents: int, worlds: int) -> tuple[int, int, int]:
-    """Checks the numbers of lanes, and returns agents S, worlds k and replicas R.
-
-    Args:
-        seeds: the seeds of each lane, lane = replica x S + agent.
-        agents: the number of agents S of each replica.
-        worlds: the number of worlds k of each replica.
-
-    Raises:
-        ValueError: if a number is no integer or below 1, or there is not one seed per lane.
-    """
-    agents = arguments.integer("agents", agents, 1, MOST_LANES)
-    worlds = arguments.integer("worlds", worlds, 1, 2**32)
-    lanes = len(arguments.listed("seeds", seeds, _SEEDS))
-    if not lanes or lanes % agents:
-        raise ValueError(
-            f"there are {lanes} seeds for {agents} agents; allowed: one seed per lane, that is, a multiple "
-            "of the number of agents"
-        )
-    return agents, worlds, lanes // agents
 
 
 class LaneRng:
@@ -48,20 +22,17 @@ class LaneRng:
         ahead: steps whose numbers are generated at once; it changes no number.
 
     Raises:
-        ValueError: if a seed is no sequence of integers of at least 0.
         TooLargeError: if there is less memory than those take that are generated ahead.
     """
 
     def __init__(self, seeds: Sequence[Sequence[int]], count: int, *, ahead: int = DRAWN_AHEAD) -> None:
-        own = [_seed(lane, seed) for lane, seed in enumerate(arguments.listed("seeds", seeds, _SEEDS))]
-        self.lanes, self.count = len(own), arguments.integer("count", count, 1, 2**40)
-        self._ahead = arguments.integer("ahead", ahead, 1, DRAWN_AHEAD)
+        self.lanes, self.count, self._ahead = len(seeds), count, ahead
         check_memory(
             f"random numbers of {self.lanes:,} agents, {self.count:,} a step and {self._ahead} steps ahead,",
             8 * 2 * self._ahead * self.lanes * self.count,
             "smaller batches or rollouts, fewer evaluation episodes or fewer replicas",
         )
-        self._chance = [np.random.Generator(np.random.Philox(np.random.SeedSequence(seed))) for seed in own]
+        self._chance = [np.random.Generator(np.random.Philox(np.random.SeedSequence(seed))) for seed in seeds]
         self._numbers = torch.empty((0, self.lanes, count), dtype=torch.float64)
         self._used = 0
 
@@ -86,12 +57,6 @@ class LaneRng:
         for chance, own in zip(self._chance, state["chance"], strict=True):
             chance.bit_generator.state = _arrays(own)
         self._numbers, self._used = state["numbers"].clone(), int(state["used"])
-
-
-def _seed(lane: int, seed: Any) -> list[int]:
-    """The seed of a lane as ints."""
-    parts = arguments.listed(f"seeds[{lane}]", seed, "a sequence of integers >= 0")
-    return [arguments.integer(f"seeds[{lane}]", part, 0) for part in parts]
 
 
 def _plain(state: Any) -> Any:

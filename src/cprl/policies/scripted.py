@@ -44,7 +44,6 @@ from tensordict.nn import TensorDictModuleBase
 from torch import Tensor, nn
 from torchrl.envs.utils import ExplorationType, exploration_type
 
-from cprl import arguments
 from cprl.commons import colours
 from cprl.commons.compiled import CPU_OPTIONS, compiled, kept_on_disk
 from cprl.commons.decoding import UNSEEN, classes_seen
@@ -52,11 +51,10 @@ from cprl.commons.game import Game
 from cprl.commons.near import distance
 from cprl.commons.spaces import Spaces
 from cprl.commons.world import Bytes
-from cprl.policies import paths, scripted_rules
+from cprl.policies import scripted_rules
 from cprl.policies.lanes import random_lanes
-from cprl.policies.paths import AGENT, APPLE, OPEN, UNKNOWN, WALL, Frame, Scratch
-from cprl.policies.rng import LaneRng, check_lanes
-from cprl.policies.scripted_rules import NUMBERS, Settings
+from cprl.policies.rng import LaneRng
+from cprl.policies.scripted_rules import AGENT, APPLE, NUMBERS, OPEN, UNKNOWN, WALL, Frame, Scratch, Settings
 
 ScriptedPolicy = Literal["random", "greedy", "sustainable", "territorial", "aggressive", "pacifist"]
 SCRIPTED_POLICIES: Final[tuple[ScriptedPolicy, ...]] = get_args(ScriptedPolicy)
@@ -87,8 +85,7 @@ class ScriptedActor(TensorDictModuleBase):
     exploration types it has no effect.
 
     Raises:
-        ValueError: If the policy is unknown, the observations are not windows, the number of seeds is not a
-            multiple of `agents`, or a number is below 1.
+        ValueError: If the observations are not windows.
     """
 
     in_keys = ("observation",)
@@ -105,11 +102,14 @@ class ScriptedActor(TensorDictModuleBase):
         spare: int = SPARE,
     ) -> None:
         super().__init__()
-        _check(policy, game)
+        if game.observation.area != "window":
+            raise ValueError(
+                f"Observation.area is {game.observation.area!r}; allowed with scripted policies: 'window', "
+                "because they rely on the agent's position in it"
+            )
         self.policy, self.game, self.epsilon = policy, game, 0.0
-        self.agents, self.worlds, self.replicas = check_lanes(seeds, agents=agents, worlds=worlds)
+        self.agents, self.worlds, self.replicas = agents, worlds, len(seeds) // agents
         self.rng = LaneRng(seeds, NUMBERS * self.worlds)
-        spare = arguments.integer("spare", spare, 1, 2**31 - 1)
         self._settings, self._role_of_class = _settings(game, spare), _roles()
         self._rim, self._frame = _frame(game)
         size = self._frame.stride * (game.observation_shape[1] + 2 * self._rim)
@@ -120,17 +120,7 @@ class ScriptedActor(TensorDictModuleBase):
         return tensordict.set("action", self.choose(tensordict.get("observation")))
 
     def choose(self, observation: Tensor) -> Tensor:
-        """Chooses actions, int64 [replicas x k, S], for observations, uint8 [replicas x k, S, C, X, Y].
-
-        Raises:
-            ValueError: If the observations have another shape.
-        """
-        expected = (self.replicas * self.worlds, self.agents, *self.game.observation_shape)
-        if not isinstance(observation, Tensor) or observation.dtype != torch.uint8:
-            found = getattr(observation, "dtype", observation)
-            raise arguments.refusal("observation", found, f"a uint8 tensor {list(expected)}")
-        if observation.shape != expected:
-            raise ValueError(f"observation is {list(observation.shape)}; allowed: {list(expected)}")
+        """Chooses actions, int64 [replicas x k, S], for observations, uint8 [replicas x k, S, C, X, Y]."""
         explores = exploration_type() in (ExplorationType.RANDOM, None)
         chosen = np.empty(observation.shape[:2], np.int64)
         _choose_all()(
@@ -164,7 +154,7 @@ class ScriptedActor(TensorDictModuleBase):
         return self.rng.state_dict()
 
     def set_extra_state(self, state: dict[str, Any]) -> None:
-        """Restores the state of the random numbers; see `get_extra_state`."""
+        """Continues from that state."""
         self.rng.load_state_dict(state)
 
 
@@ -184,8 +174,6 @@ def scripted_lanes(
     Raises:
         ValueError: for another policy than "random" in a game that is not a `Game`.
     """
-    arguments.choice("policy", policy, SCRIPTED_POLICIES)
-    arguments.object_of("playing", playing, (Game, Spaces), "a cprl.Game, or the Spaces of another game")
     if policy == "random":
         spaces = playing if isinstance(playing, Spaces) else playing.spaces
         return random_lanes(spaces, seeds=seeds, agents=agents, worlds=worlds)
@@ -195,16 +183,6 @@ def scripted_lanes(
             "'random'"
         )
     return ScriptedActor(policy, playing, seeds=seeds, agents=agents, worlds=worlds)
-
-
-def _check(policy: str, game: Game) -> None:
-    arguments.choice("policy", policy, SCRIPTED_POLICIES)
-    arguments.object_of("game", game, Game, "a cprl.Game")
-    if game.observation.area != "window":
-        raise ValueError(
-            f"Observation.area is {game.observation.area!r}; allowed with scripted policies: 'window', "
-            "because they rely on the agent's position in it"
-        )
 
 
 def _settings(game: Game, spare: int) -> Settings:
@@ -251,8 +229,8 @@ def _roles() -> Bytes:
 
 @cache
 def _choose_all() -> Callable[..., None]:
-    """`scripted_rules.choose_all`, compiled, and cached on disk under a hash of the source of its modules."""
-    text = b"".join(Path(str(module.__file__)).read_bytes() for module in (scripted_rules, paths))
+    """`scripted_rules.choose_all`, compiled, and cached on disk under a hash of the source of its module."""
+    text = Path(scripted_rules.__file__).read_bytes()
     name = f"choose_all_{hashlib.sha256(text).hexdigest()[:16]}"
 
     def jit(function: FunctionType) -> Any:

@@ -12,16 +12,12 @@ from tensordict.nn import TensorDictModuleBase
 from torch import Tensor, nn
 from torchrl.envs.utils import ExplorationType, exploration_type
 
-from cprl import arguments
-from cprl.checks import checked, one_of
-from cprl.commons.spaces import DTYPES, Spaces
-from cprl.policies.rng import MOST_LANES, LaneRng, check_lanes
+from cprl.commons.spaces import Spaces
+from cprl.policies.rng import LaneRng
 
 NEVER_MET = 0
 """The row of states that are in no table; its values stay 0."""
 _FIRST_ROWS = 1024
-MOST_ACTIONS = 2**16
-"""The largest number of actions."""
 
 
 class QTables:
@@ -31,15 +27,10 @@ class QTables:
         lanes: The number of tables L.
         actions: The number of actions A.
         max_states: The largest number of states per lane.
-
-    Raises:
-        ValueError: If a number is no integer or below 1.
     """
 
     def __init__(self, lanes: int, actions: int, *, max_states: int) -> None:
-        lanes = arguments.integer("lanes", lanes, 1, MOST_LANES)
-        actions = arguments.integer("actions", actions, 1, MOST_ACTIONS)
-        self.max_states = arguments.integer("max_states", max_states, 1)
+        self.max_states = max_states
         self.rows: list[dict[bytes, int]] = [{} for _ in range(lanes)]
         """For each lane, the row of each state it has met."""
         self.values = np.zeros((_FIRST_ROWS, actions), np.float64)
@@ -159,12 +150,6 @@ class TableNetwork(nn.Module):
         self, observation_shape: Sequence[int], actions: int, *, observation_dtype: str = "uint8"
     ) -> None:
         super().__init__()
-        lengths = arguments.listed(
-            "observation_shape", observation_shape, "the lengths of an observation's axes"
-        )
-        observation_shape = [arguments.integer("observation_shape", own, 1, 2**31 - 1) for own in lengths]
-        actions = arguments.integer("actions", actions, 1, MOST_ACTIONS)
-        checked("observation_dtype", observation_dtype, one_of(*DTYPES))
         self.observation_dims = len(observation_shape)
         size = prod(observation_shape) * getattr(torch, observation_dtype).itemsize
         self.register_buffer("states", torch.zeros((0, size), dtype=torch.uint8))
@@ -220,10 +205,9 @@ class TabularActor(TensorDictModuleBase):
         self, tables: QTables, spaces: Spaces, *, seeds: Sequence[Sequence[int]], agents: int, worlds: int = 1
     ) -> None:
         super().__init__()
-        arguments.object_of("spaces", spaces, Spaces, "a cprl.commons.spaces.Spaces")
         self.in_keys = observed_entries(spaces)
         self.tables, self.actions, self.epsilon = tables, spaces.actions, 1.0
-        self.agents, self.worlds, self.replicas = check_lanes(seeds, agents=agents, worlds=worlds)
+        self.agents, self.worlds, self.replicas = agents, worlds, len(seeds) // agents
         self.rng = LaneRng(seeds, 2 * worlds)
         lanes = np.arange(self.rng.lanes).reshape(self.replicas, 1, agents)
         self._lanes = np.broadcast_to(lanes, (self.replicas, worlds, agents)).reshape(-1).tolist()
@@ -244,5 +228,5 @@ class TabularActor(TensorDictModuleBase):
         return self.rng.state_dict()
 
     def set_extra_state(self, state: dict[str, Any]) -> None:
-        """Restores the state of the random numbers; see `get_extra_state`."""
+        """Continues from that state."""
         self.rng.load_state_dict(state)

@@ -19,6 +19,7 @@ from cprl.envs.unwrap import commons_of
 from cprl.learners.base import Learner
 from cprl.learners.decisions import Bandit, BanditDecider
 from cprl.learners.lanes import EVALUATION, EXHIBITION, EXPLORATION, lane_name, lane_seeds
+from cprl.learners.preferences import named
 from cprl.networks.agent import acting_part
 from cprl.policies.assignment import AgentIndices, AgentPolicies
 from cprl.policies.decisions import ballot_sizes, decider_by_chance
@@ -35,7 +36,6 @@ from cprl.population import (
     refuse_sharing,
     refuse_undecided,
 )
-from cprl.preferences.values import named
 from cprl.training.stored import LoadedRun, StoredAgent, load, stored_actor
 
 

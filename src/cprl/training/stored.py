@@ -28,7 +28,7 @@ from cprl.networks.recurrent import state_cells_of
 from cprl.networks.stacked import stack_lanes
 from cprl.policies.assignment import AgentIndices, AgentPolicies
 from cprl.policies.decisions import ballot_sizes
-from cprl.policies.recurrent import actor_of_lanes
+from cprl.policies.lanes import actor_of_lanes
 from cprl.policies.scripted import scripted_lanes
 from cprl.population import AgentSpec, Frozen, Learning, Scripted, Team, specs_by_agent
 from cprl.runs.checkpoints import FOLDER

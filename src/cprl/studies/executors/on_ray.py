@@ -16,7 +16,7 @@ from cprl.commons.game import Game
 from cprl.commons.spaces import Spaces
 from cprl.envs.make_env import make_env, spaces_of
 from cprl.experiment import Experiment
-from cprl.learners.buffer.storage import storage_bytes, torch_dtype
+from cprl.learners.ring import storage_bytes, torch_dtype
 from cprl.population import Learning, Team
 from cprl.studies.executors.processes import ATTEMPTS, MOST_JOBS, Stopping, Work, attempt, failed, given_up
 from cprl.studies.trials import Outcome, Status, Task, run_task, state_of

@@ -8,21 +8,30 @@
 """
 
 import warnings
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from copy import deepcopy
 from typing import Any, Final, Literal, get_args
 
 import torch
 from tensordict import TensorDict
 from torch import Tensor, nn
+from torchrl.objectives import A2CLoss, LossModule, PPOLoss, ReinforceLoss, ValueEstimators
+from torchrl.objectives.value import GAE, TD0Estimator, ValueEstimatorBase
 
-from cprl.learners.buffer.gather import Horizon
-from cprl.learners.buffer.sampler import lane_buffer
-from cprl.learners.buffer.storage import torch_dtype
-from cprl.learners.engine.base import Engine, ListEngine
-from cprl.learners.engine.compiled import FunctionalEngine
-from cprl.learners.engine.functional import MakeLoss, groups_of, own_targets
+from cprl.learners.engine import (
+    Engine,
+    FunctionalEngine,
+    ListEngine,
+    MakeLoss,
+    groups_of,
+    own_targets,
+    targets_of,
+    total,
+)
+from cprl.learners.ring import STATE, Horizon, Ring
+from cprl.learners.settings import DQNSettings, RolloutSettings
 from cprl.learners.transitions import LaneTurn, array_of
+from cprl.system.compat import promise_targets
 from cprl.system.compiling import TOLERANCE
 
 EngineName = Literal["lane_axis", "lane_axis_flat", "vmapped", "list"]
@@ -54,14 +63,8 @@ def make_engine(
         compile: whether torch compiles the update; ignored for "list".
         trial: a synthetic batch for the first `TRIAL_LANES` lanes, see `trial_batch`.
         how: the other arguments of `FunctionalEngine`.
-
-    Raises:
-        ValueError: if the engine is unknown.
     """
-    if name is None:
-        name = fitting_engine(networks[:TRIAL_LANES], make_loss, trial)
-    if name not in get_args(EngineName):
-        raise ValueError(f"engine is {name!r}; allowed: {', '.join(get_args(EngineName))}")
+    name = name or fitting_engine(networks[:TRIAL_LANES], make_loss, trial)
     return _make(name, networks, make_loss, compile=compile, **how)
 
 
@@ -139,50 +142,30 @@ def _agree_in_double(
     return _agree(results, reference)
 
 
-def trial_batch(
-    lanes: int,
-    observation_shape: Sequence[int],
-    actions: int,
-    *,
-    action_shape: Sequence[int] = (),
-    reward_shape: Sequence[int] = (),
-    noise_shape: Sequence[int] = (),
-    observation_dtype: str = "uint8",
-    horizon: Horizon | None = None,
-    state_cells: int = 0,
-    sequence_steps: int = 1,
-    device: str | torch.device = "cpu",
-) -> TensorDict:
+def trial_batch(lanes: int, observation_shape: Sequence[int], actions: int, **shapes: Any) -> TensorDict:
     """Synthetic transitions [lanes, 8], or sequences, always the same; an episode ends with every eighth
-    turn. For the arguments see `lane_buffer`."""
-    transitions = TRIAL_TRANSITIONS + (horizon.steps if horizon else sequence_steps) - 1
-    buffer = lane_buffer(
+    turn. The other arguments are those of a `Ring`."""
+    horizon: Horizon | None = shapes.get("horizon")
+    ahead = horizon.steps if horizon else shapes.get("sequence_steps", 1)
+    ring = Ring(
         seeds=[(lane,) for lane in range(lanes)],
-        transitions=transitions,
+        transitions=TRIAL_TRANSITIONS + ahead - 1,
         batch_size=8,
         observation_shape=observation_shape,
-        action_shape=action_shape,
-        reward_shape=reward_shape,
-        noise_shape=noise_shape,
-        observation_dtype=observation_dtype,
-        horizon=horizon,
-        state_cells=state_cells,
-        sequence_steps=sequence_steps,
-        device=device,
+        **shapes,
     )
-    chance = torch.Generator().manual_seed(0)
-    for step in range(transitions):
+    fields, chance = ring.fields, torch.Generator().manual_seed(0)
+    for step in range(ring.capacity):
         seen = torch.randint(256, (2, lanes, *observation_shape), generator=chance).to(torch.uint8)
-        if observation_dtype != "uint8":
-            seen = (seen > 127).to(torch_dtype(observation_dtype))
-        action = torch.randint(actions, (lanes, *action_shape), generator=chance)
+        if fields["observation"].dtype != torch.uint8:
+            seen = (seen > 127).to(fields["observation"].dtype)
+        action = torch.randint(actions, fields["action"].shape[1:], generator=chance)
         ends = torch.full((lanes,), step % 8 == 7)
-        reward = torch.rand((lanes, *reward_shape), generator=chance)
-        states = torch.rand((2, lanes, state_cells), generator=chance) if state_cells else ()
+        reward = torch.rand(fields["reward"].shape[1:], generator=chance)
+        states = torch.rand((2, lanes, fields[STATE].shape[-1]), generator=chance) if STATE in fields else ()
         turn = seen[0], action, seen[1], reward, ends, ends, *states
-        buffer.storage.write(LaneTurn(*(array_of(entry.to(device)) for entry in turn)))
-    batch: TensorDict = buffer.sample()
-    return batch
+        ring.write(LaneTurn(*(array_of(entry.to(ring.device)) for entry in turn)))
+    return ring.sample()
 
 
 def trial_rollout(
@@ -243,3 +226,129 @@ def _tried(
         acting = [value for _, value in sorted(engine.network_state(lane).items())]
         results += [*acting, everything.sum(), everything.square().sum()]
     return results
+
+
+_OF_ONE_STEP: Final = (None, ValueEstimators.TD0, TD0Estimator)
+_OF_ROLLOUTS: Final = (None, ValueEstimators.GAE, ValueEstimators.MAGAE)
+
+
+def refuse_for_replay(loss: LossModule, settings: DQNSettings, batch: TensorDict) -> None:
+    """Raises a ValueError if a loss cannot learn from a replay buffer with these settings.
+
+    Args:
+        loss: the loss of one lane; it is called if `n_steps` is above 1.
+        settings: the hyperparameters.
+        batch: synthetic transitions of one lane, [b].
+    """
+    refuse_on_policy(loss)
+    _refuse_without_targets(loss, settings)
+    name = type(loss).__name__
+    if settings.n_steps == 1:
+        return
+    for owner in (loss, *_estimators(loss)):
+        gamma = getattr(owner, "gamma", settings.gamma)
+        if abs(float(gamma) - settings.gamma) > 1e-6:
+            raise ValueError(
+                f"{name} has gamma {float(gamma):g} and the settings have gamma {settings.gamma:g}; with "
+                "n_steps above 1 they must be equal"
+            )
+    own_targets(loss)
+    if _ignores_steps(loss, batch):
+        raise ValueError(
+            f'n_steps is {settings.n_steps}; allowed: 1, because {name} does not read "steps_to_next_obs" '
+            "and would discount the bootstrap value by one step"
+        )
+
+
+def refuse_on_policy(loss: LossModule) -> None:
+    """Raises a ValueError if a loss needs consecutive steps, or steps of the current policy."""
+    name = type(loss).__name__
+    if isinstance(loss, A2CLoss | PPOLoss | ReinforceLoss):
+        raise ValueError(
+            f"{name} is on-policy and cannot learn from a replay buffer; use RolloutLearner, or "
+            "cprl.algorithms.PPO, A2C or Reinforce in a population"
+        )
+    if loss.value_type not in _OF_ONE_STEP:
+        raise ValueError(
+            f"{name} has the value estimator {_name(loss.value_type)}, which reads consecutive steps; a "
+            "replay buffer samples single transitions; allowed: ValueEstimators.TD0, with n_steps for longer "
+            "returns"
+        )
+
+
+def _refuse_without_targets(loss: LossModule, settings: DQNSettings) -> None:
+    """Raises a ValueError for settings of targets, if a loss has none."""
+    for name, default in (("tau", None), ("own_target_weights", False)):
+        if getattr(settings, name) != default and not targets_of(loss):
+            raise ValueError(
+                f"{name} is {getattr(settings, name)}; allowed: {default}, because {type(loss).__name__} has "
+                "no targets"
+            )
+
+
+def refuse_other_advantages(loss: LossModule, settings: RolloutSettings) -> None:
+    """Raises a ValueError if a loss needs other advantages than those of `RolloutLearner`."""
+    name = type(loss).__name__
+    if loss.value_type not in _OF_ROLLOUTS and not _is_gae(loss.value_type):
+        raise ValueError(
+            f"{name} has the value estimator {_name(loss.value_type)}; allowed: GAE, which RolloutLearner "
+            "computes: leave make_value_estimator out, and set gamma and gae_lambda in the settings"
+        )
+    for estimator in _estimators(loss):
+        for of_loss, of_settings in (("gamma", "gamma"), ("lmbda", "gae_lambda")):
+            theirs, ours = float(getattr(estimator, of_loss)), getattr(settings, of_settings)
+            if abs(theirs - ours) > 1e-6:
+                raise ValueError(
+                    f"{name} has a value estimator with {of_loss}={theirs:g}; the settings have "
+                    f"{of_settings}={ours:g}, which RolloutLearner uses: leave make_value_estimator out"
+                )
+
+
+def refuse_other_outputs(loss: LossModule, batch: TensorDict) -> None:
+    """Raises a ValueError if a loss returns no entry that is a loss.
+
+    Args:
+        loss: the loss of one lane; it is called.
+        batch: a synthetic batch of one lane, [b].
+    """
+    promise_targets(loss)
+    with torch.no_grad(), torch.random.fork_rng(devices=[]):
+        total(loss(batch.clone()), loss)
+
+
+def reads(loss: LossModule, key: str) -> bool:
+    """Whether an entry is among the keys that a loss reads."""
+    try:
+        listed: Iterable[object] = getattr(loss, "in_keys", None) or ()
+    except NotImplementedError:
+        return False
+    return key in listed
+
+
+def _estimators(loss: LossModule) -> list[ValueEstimatorBase]:
+    """The value estimator that a loss was constructed with, if any."""
+    return [child for child in loss.children() if isinstance(child, ValueEstimatorBase)]
+
+
+def _is_gae(kind: object) -> bool:
+    return isinstance(kind, type) and issubclass(kind, GAE)
+
+
+def _name(kind: object) -> str:
+    return kind.__name__ if isinstance(kind, type) else str(kind)
+
+
+def _ignores_steps(loss: LossModule, batch: TensorDict) -> bool:
+    """Whether a loss bootstraps with a discount that does not depend on the steps of a return."""
+
+    def of(steps: int, *, ends: bool) -> Tensor:
+        tried = batch.clone()
+        tried["steps_to_next_obs"] = torch.full_like(tried["steps_to_next_obs"], steps)
+        tried["next", "terminated"] = torch.full_like(tried["next", "terminated"], ends)
+        with torch.no_grad(), torch.random.fork_rng(devices=[]):
+            torch.manual_seed(0)
+            value: Tensor = total(loss(tried), loss).mean()
+        return value
+
+    bootstraps = not torch.equal(of(1, ends=False), of(1, ends=True))
+    return bootstraps and torch.equal(of(1, ends=False), of(99, ends=False))

@@ -1,1 +1,0 @@
-"""What a replay buffer of many lanes is made of."""

@@ -1,0 +1,764 @@
+"""Engines: one update step for many independent learners, each with a TorchRL loss module.
+
+`FunctionalEngine` updates all lanes together in one compiled step: it stacks networks along a lane axis if it
+can, else it applies `torch.vmap` to the loss. `ListEngine` runs a plain list of loss modules. It is the
+reference, and the fallback for losses that work with neither. `SharedEngine` is for agents that share a
+network. `cprl.learners.trial` chooses.
+"""
+
+from abc import ABC, abstractmethod
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from contextlib import suppress
+from copy import deepcopy
+from functools import partial
+from math import prod
+from typing import Any, Final, NamedTuple
+
+import torch
+from tensordict import TensorDict, TensorDictBase, is_tensor_collection
+from tensordict.nn import TensorDictParams
+from torch import Tensor, nn
+from torchrl.objectives import LossModule
+
+from cprl.learners.ring import FIELDS, Horizon, Ring, sampled
+from cprl.learners.settings import Optimizer
+from cprl.networks.agent import parts_of
+from cprl.networks.finite import all_finite, finite_lanes
+from cprl.networks.stacked import lane_state, stack_lanes
+from cprl.system.compat import forget_cached_weights, promise_targets, refuse_updaters, updated_weights
+from cprl.system.compiling import Compiled
+
+MakeLoss = Callable[[nn.Module], LossModule]
+"""Makes one agent's loss from its network."""
+
+Weights = dict[str, Tensor]
+
+COMPILED_STEPS: Final = 16
+"""The longest sequences whose update is compiled: torch unrolls their turns, and takes seconds for each."""
+
+_NO_UPDATER: Final = (
+    "a SoftUpdate or HardUpdate was built on the {}; the engine has weights of its own, which it would not "
+    "change: leave it out, and set tau or target_every_episodes"
+)
+
+
+class FunctionalLoss:
+    """A TorchRL loss module as a function of its weights that returns one loss per transition.
+
+    TorchRL stores the weights of a loss in `TensorDictParams` of the module. During a call plain TensorDicts
+    replace them, which both `torch.func` and `torch.compile` accept.
+
+    Args:
+        loss: the module; its own weights are removed from it.
+    """
+
+    def __init__(self, loss: LossModule) -> None:
+        loss.reduction = "none"
+        if hasattr(loss, "scalar_output_mode"):
+            loss.scalar_output_mode = "exclude"  # drops scalars that are not losses of transitions
+        # Created lazily at first access, which a compiler would see as a change; a loss may have neither.
+        getattr(loss, "in_keys", None)
+        with suppress(NotImplementedError):
+            getattr(loss, "value_estimator", None)
+        self._groups = {name: group.batch_size for name, group in groups_of(loss).items()}
+        self._singles = tuple(_single_weights(loss))
+        for name in (*self._groups, *self._singles):
+            delattr(loss, name)
+            setattr(loss, name, None)
+        refuse_updaters(loss, _NO_UPDATER.format(type(loss).__name__))
+        self.module = loss
+
+    def __call__(self, own: Weights, fixed: Weights, batch: TensorDict) -> Tensor:
+        """The loss of each transition, [L, b], or [b] under vmap; a single number if the loss reduces it."""
+        flat = {**own, **fixed}
+        for name, size in self._groups.items():
+            mine = f"{name}:"
+            group = {key.removeprefix(mine): flat[key] for key in flat if key.startswith(mine)}
+            setattr(self.module, name, TensorDict(group, size).unflatten_keys("."))
+        for name in self._singles:
+            setattr(self.module, name, own[name])
+        if not torch.compiler.is_compiling():
+            forget_cached_weights(self.module)
+        losses = total(self.module(batch), self.module)
+        for name in (*self._groups, *self._singles):
+            setattr(self.module, name, None)
+        return losses
+
+
+def own_targets(loss: LossModule) -> None:
+    """Marks the targets of a loss as updated, by the engine, so that TorchRL does not warn.
+
+    Raises:
+        ValueError: if the loss already has a `SoftUpdate` or `HardUpdate`, which would have no effect.
+    """
+    if any(f"target_{name}_params" in groups_of(loss) for name in updated_weights(loss)):
+        raise ValueError(_NO_UPDATER.format(type(loss).__name__))
+    promise_targets(loss)
+
+
+def total(out: Any, loss: LossModule) -> Tensor:
+    """The sum of all entries that TorchRL calls a loss.
+
+    Args:
+        out: what the loss returned.
+        loss: named in the error.
+
+    Raises:
+        ValueError: if it is no TensorDict, or has no such entry.
+    """
+    entries = dict(out.items()) if is_tensor_collection(out) else {}
+    losses = [value for name, value in entries.items() if name.startswith("loss")]
+    if not losses:
+        kind = type(loss)
+        has = f" with the entries {sorted(entries)}" if entries else ""
+        raise ValueError(
+            f"the loss {kind.__module__}:{kind.__qualname__} returns a {type(out).__name__}{has}; allowed: "
+            'a TensorDict with entries whose names begin with "loss"'
+        )
+    summed: Tensor = sum(losses[1:], losses[0])
+    return summed
+
+
+def groups_of(loss: LossModule) -> dict[str, TensorDictParams]:
+    """The groups of weights of a loss by name, including targets."""
+    named = loss.named_modules(remove_duplicate=False)
+    return {name: own for name, own in named if isinstance(own, TensorDictParams) and "." not in name}
+
+
+def _single_weights(loss: LossModule) -> dict[str, nn.Parameter]:
+    """The weights of a loss that are in no group, by name; `LossModule.named_parameters` omits some."""
+    return dict(nn.Module.named_parameters(loss, recurse=False, remove_duplicate=False))
+
+
+def targets_of(loss: LossModule) -> dict[str, TensorDictParams]:
+    """The groups of weights that have targets, by name."""
+    groups = groups_of(loss)
+    return {name: group for name, group in groups.items() if f"target_{name}" in groups}
+
+
+def _named(loss: LossModule) -> Weights:
+    """All weights of a loss, not copied, by "group:name"; weights in no group by their name."""
+    grouped = {
+        f"{group}:{key}": value
+        for group, weights in groups_of(loss).items()
+        for key, value in weights.flatten_keys(".").items()
+    }
+    return {**grouped, **_single_weights(loss)}
+
+
+def weights_of(loss: LossModule) -> Weights:
+    """Copies of all weights of a loss, including targets, by name."""
+    return {name: value.detach().clone() for name, value in _named(loss).items()}
+
+
+class Stacked(NamedTuple):
+    """A loss of many lanes and its weights by name, with the lane axis first."""
+
+    loss: LossModule
+    own: Weights
+    """The trained weights."""
+    fixed: Weights
+    """Tensors that gradients do not change: target weights and buffers."""
+    names: Mapping[str, str]
+    """The names in the loss of those parameters of the network that are among its weights."""
+
+
+def stacked(networks: Sequence[nn.Module], make_loss: MakeLoss, *, lane_axis: bool) -> Stacked:
+    """One loss for the networks of all lanes; the weights are copied.
+
+    Raises:
+        ValueError: with a lane axis: if the networks cannot be stacked, if the loss has weights of its own,
+            which all lanes would share, or if the loss adds an axis of its own before the lane axis.
+    """
+    made = [stack_lanes(networks)] if lane_axis else list(networks)
+    losses = [make_loss(network) for network in made]
+    if lane_axis and (shared := _single_weights(losses[0])):
+        raise ValueError(f"all agents would share the weights {', '.join(shared)} of the loss")
+    if lane_axis and any(group.batch_size for group in groups_of(losses[0]).values()):
+        raise ValueError("the loss stacks networks along an axis before the lane axis")
+    for loss in losses:
+        own_targets(loss)
+    named = _named(losses[0])
+    where = {value.data_ptr(): name for name, value in named.items()}
+    names = {
+        name: where[weight.data_ptr()]
+        for name, weight in made[0].named_parameters()
+        if weight.data_ptr() in where
+    }
+    learns = [name for name, value in named.items() if value.requires_grad]
+    each = [weights_of(loss) for loss in losses]
+    weights = each[0] if lane_axis else {name: torch.stack([one[name] for one in each]) for name in each[0]}
+    return Stacked(
+        losses[0],
+        {name: weights[name] for name in learns},
+        {name: value for name, value in weights.items() if name not in learns},
+        names,
+    )
+
+
+def vmapped(network: nn.Module, weights: Weights, *inputs: Tensor) -> Any:
+    """The outputs of a network with the weights of each lane."""
+
+    def output(own: Weights, *seen: Tensor) -> Any:
+        return torch.func.functional_call(network, own, seen)
+
+    return torch.vmap(output)(weights, *inputs)
+
+
+BETA_1, BETA_2 = 0.9, 0.999
+"""Adam's decay rates (Kingma and Ba 2015, torch's defaults)."""
+ADAMW_DECAY: Final = 0.01
+"""AdamW's weight decay (Loshchilov and Hutter 2019, torch's default)."""
+RMSPROP_ALPHAS: Final = {"rmsprop": 0.99, "keras_rmsprop": 0.9}
+"""RMSprop's decay rate: torch's default, and that of Keras 2.2.4."""
+
+WITH_MEAN: Final = ("adam", "adamw")
+"""Optimisers with a running mean of gradients."""
+WITH_SQUARE: Final = ("adam", "adamw", *RMSPROP_ALPHAS)
+"""Optimisers with a running mean of squared gradients."""
+
+
+def torch_optimizer(
+    name: Optimizer,
+    parameters: Iterable[Tensor],
+    *,
+    learning_rate: float,
+    eps: float,
+    fused: bool | None = True,
+) -> torch.optim.Optimizer:
+    """The optimiser of one lane; `fused` where torch has such a form of it, None for torch's default."""
+    if name in RMSPROP_ALPHAS:
+        return torch.optim.RMSprop(parameters, lr=learning_rate, eps=eps, alpha=RMSPROP_ALPHAS[name])
+    if name == "sgd":
+        return torch.optim.SGD(parameters, lr=learning_rate, fused=fused)
+    kind = torch.optim.Adam if name == "adam" else torch.optim.AdamW
+    return kind(parameters, lr=learning_rate, eps=eps, fused=fused)
+
+
+def change_weights(
+    name: Optimizer,
+    weights: Sequence[Tensor],
+    gradients: Sequence[Tensor],
+    means: Sequence[Tensor],
+    squares: Sequence[Tensor],
+    *,
+    step_size: Tensor,
+    scale: Tensor,
+    learning_rate: float,
+    eps: float,
+) -> None:
+    """One step of all lanes, in place.
+
+    Args:
+        name: the optimiser.
+        weights: [L, ...] each.
+        gradients: of each weight.
+        means: running means of gradients; empty if the optimiser has none.
+        squares: running means of squared gradients, likewise.
+        step_size: Adam's learning rate with bias correction.
+        scale: the bias correction of the root of Adam's `squares`.
+        learning_rate: the learning rate of the settings.
+        eps: added to denominators.
+    """
+    if name in WITH_MEAN:
+        for weight, slope, mean, square in zip(weights, gradients, means, squares, strict=True):
+            if name == "adamw":
+                weight.mul_(1 - learning_rate * ADAMW_DECAY)
+            mean.mul_(BETA_1).add_(slope, alpha=1 - BETA_1)
+            square.mul_(BETA_2).addcmul_(slope, slope, value=1 - BETA_2)
+            weight.sub_(step_size * mean / (square.sqrt() * scale + eps))
+    elif name in RMSPROP_ALPHAS:
+        alpha = RMSPROP_ALPHAS[name]
+        for weight, slope, square in zip(weights, gradients, squares, strict=True):
+            square.mul_(alpha).addcmul_(slope, slope, value=1 - alpha)
+            weight.sub_(learning_rate * slope / (square.sqrt() + eps))
+    else:
+        for weight, slope in zip(weights, gradients, strict=True):
+            weight.sub_(slope, alpha=learning_rate)
+
+
+def shortened(gradients: Sequence[Tensor], longest: float) -> list[Tensor]:
+    """Gradients [L, ...] of all weights, scaled down for lanes whose gradient norm exceeds `longest`."""
+    squares = [slope.reshape(len(slope), -1).square().sum(1) for slope in gradients]
+    norms = torch.stack(squares).sum(0).sqrt()
+    scales = (longest / (norms + 1e-6)).clamp(max=1.0)
+    return [slope * scales.reshape(-1, *[1] * (slope.ndim - 1)) for slope in gradients]
+
+
+class Engine(ABC):
+    """Updates L lanes at once."""
+
+    def update(self, ring: Ring) -> Tensor:
+        """Samples from a ring, updates every lane once and returns their losses, float [L]."""
+        return self.update_from(ring.sample())
+
+    @abstractmethod
+    def update_from(self, batch: TensorDict) -> Tensor:
+        """Updates every lane once from a batch, [L, b], and returns their losses, float [L]."""
+
+    @abstractmethod
+    def copy_to_targets(self, which: Tensor) -> None:
+        """Copies the weights of the marked lanes, bool [L], to their targets."""
+
+    @abstractmethod
+    def outputs(self, observation: Tensor, *recurrent: Tensor, part: int = 0) -> Any:
+        """The outputs of the networks with their current weights: [L, k, ...] to [L, k, ...]; of recurrent
+        ones also their states.
+
+        Args:
+            observation: k observations of each lane.
+            recurrent: what recurrent networks read besides, likewise: see `cprl.networks.recurrent`.
+            part: which of an agent's networks, see `cprl.networks.agent.parts_of`; the first one acts.
+        """
+
+    @abstractmethod
+    def network_state(self, lane: int) -> Weights:
+        """Copies of the current weights of one lane, as the state dict of its acting network."""
+
+    @abstractmethod
+    def weights(self, lane: int) -> Weights:
+        """Copies of all weights of one lane, including targets, by their names in the loss."""
+
+    @abstractmethod
+    def finite(self) -> Tensor:
+        """Whether the weights, targets and optimiser state of each lane are finite, bool [L] on the CPU."""
+
+    @abstractmethod
+    def state_dict(self) -> dict[str, Any]:
+        """The full state except the buffer; the tensors themselves, not copies."""
+
+    @abstractmethod
+    def load_state_dict(self, state: Mapping[str, Any]) -> None:
+        """Continues from a state that `state_dict` returned."""
+
+
+class ListEngine(Engine):
+    """A TorchRL loss module and a `torch.optim` optimiser for each lane; lanes are updated one by one.
+
+    Args:
+        networks: the lanes' networks; they are trained in place.
+        make_loss: makes a lane's loss from its network.
+        target_networks: networks with the initial target weights; by default targets start as copies.
+        optimizer: the name of the optimiser of `torch.optim`.
+        learning_rate: its step size.
+        adam_eps: its epsilon, if it has one.
+        tau: the fraction by which targets move towards the weights after each update; None for hard updates
+            by `copy_to_targets` alone.
+        loss_share: a factor of each loss.
+        max_grad_norm: the norm to which each lane's gradient is clipped; None for no clipping.
+    """
+
+    def __init__(
+        self,
+        networks: Sequence[nn.Module],
+        make_loss: MakeLoss,
+        *,
+        target_networks: Sequence[nn.Module] | None = None,
+        optimizer: Optimizer = "adam",
+        learning_rate: float,
+        adam_eps: float = 1e-8,
+        loss_share: float = 1.0,
+        max_grad_norm: float | None = None,
+        tau: float | None = None,
+    ) -> None:
+        self._tau = tau
+        self.parts = [list(parts_of(network).values()) for network in networks]
+        self._max_norm = max_grad_norm
+        self.losses = [make_loss(network) for network in networks]
+        for loss in self.losses:
+            own_targets(loss)
+        self._share = loss_share
+        self._start_targets(target_networks or (), make_loss)
+        self.optimizers = [
+            torch_optimizer(optimizer, loss.parameters(), learning_rate=learning_rate, eps=adam_eps)
+            for loss in self.losses
+        ]
+
+    def _start_targets(self, networks: Sequence[nn.Module], make_loss: MakeLoss) -> None:
+        """Gives targets the weights of other networks."""
+        for loss, network in zip(self.losses, networks, strict=False):
+            for name, values in targets_of(make_loss(network)).items():
+                getattr(loss, f"target_{name}").data.copy_(values.data)
+
+    def update_from(self, batch: TensorDict) -> Tensor:
+        return torch.stack([self.learn(lane, batch[lane]) for lane in range(len(self.losses))])
+
+    def learn(self, lane: int, batch: TensorDictBase) -> Tensor:
+        """One step of an optimiser on a batch of one lane, [b]; returns the loss, 0-d."""
+        loss = total(self.losses[lane](batch), self.losses[lane]).mean() * self._share
+        self.optimizers[lane].zero_grad()
+        loss.backward()  # type: ignore[no-untyped-call]
+        if self._max_norm is not None:
+            torch.nn.utils.clip_grad_norm_(self.losses[lane].parameters(), self._max_norm)
+        self.optimizers[lane].step()
+        if self._tau is not None:
+            for weight, target in _with_targets(self.losses[lane]):
+                target.data.lerp_(weight.data, self._tau)
+        return loss.detach()
+
+    def outputs(self, observation: Tensor, *recurrent: Tensor, part: int = 0) -> Any:
+        return stacked_outputs([parts[part] for parts in self.parts], observation, *recurrent)
+
+    def copy_to_targets(self, which: Tensor) -> None:
+        for lane in which.nonzero().flatten().tolist():
+            for weight, target in _with_targets(self.losses[lane]):
+                target.data.copy_(weight.data)
+
+    def network_state(self, lane: int) -> Weights:
+        return {name: value.detach().clone() for name, value in self.parts[lane][0].state_dict().items()}
+
+    def weights(self, lane: int) -> Weights:
+        return weights_of(self.losses[lane])
+
+    def finite(self) -> Tensor:
+        pairs = zip(self.losses, self.optimizers, strict=True)
+        return torch.tensor([is_finite(loss, optimizer) for loss, optimizer in pairs])
+
+    def state_dict(self) -> dict[str, Any]:
+        return {
+            "losses": [dict(loss.state_dict()) for loss in self.losses],
+            "adams": [optimizer.state_dict() for optimizer in self.optimizers],
+        }
+
+    def load_state_dict(self, state: Mapping[str, Any]) -> None:
+        for loss, own in zip(self.losses, state["losses"], strict=True):
+            loss.load_state_dict(own)
+        for optimizer, own in zip(self.optimizers, state["adams"], strict=True):
+            optimizer.load_state_dict(own)
+
+
+def stacked_outputs(networks: Sequence[nn.Module], *inputs: Tensor) -> Any:
+    """The outputs of several networks: [l, k, ...] to [l, k, ...]; of recurrent ones also their states."""
+    given = [own(*seen) for own, *seen in zip(networks, *inputs, strict=True)]
+    if isinstance(given[0], tuple):
+        return tuple(torch.stack(each) for each in zip(*given, strict=True))
+    return torch.stack(given)
+
+
+def is_finite(loss: LossModule, optimizer: torch.optim.Optimizer) -> bool:
+    """Whether all weights of a loss, including targets, and its optimiser's state are finite."""
+    kept = [value for state in optimizer.state.values() for value in state.values()]
+    weights: list[Any] = list(loss.state_dict().values())
+    return all_finite(value for value in (*weights, *kept) if isinstance(value, Tensor))
+
+
+def _with_targets(loss: LossModule) -> list[tuple[TensorDictParams, TensorDictParams]]:
+    """The groups of weights of a loss that have targets, each paired with its targets."""
+    return [(values, getattr(loss, f"target_{name}")) for name, values in targets_of(loss).items()]
+
+
+class FunctionalEngine(Engine):
+    """Updates all lanes in one step: gathering a batch, TorchRL's loss, its gradient and the optimiser.
+
+    With a lane axis the loss returns one number per transition. These are averaged over the batch and summed
+    over lanes, so that each lane's gradient depends on its own loss alone.
+
+    Args:
+        networks: the lanes' networks, of one architecture; their weights are copied.
+        make_loss: makes a lane's loss from its network.
+        target_networks: networks with the initial target weights; by default targets start as copies.
+        optimizer: the name of the optimiser of `torch.optim`.
+        learning_rate: its step size.
+        adam_eps: its epsilon, if it has one.
+        loss_share: a factor of each loss.
+        max_grad_norm: the norm to which each lane's gradient is clipped; None for no clipping.
+        tau: the fraction by which targets move towards the weights after each update; None for hard updates
+            by `copy_to_targets` alone.
+        lane_axis: whether the networks are stacked along a lane axis; else the loss is vmapped.
+        flat: with a lane axis, whether the loss gets the transitions of all lanes flat, [L x b].
+        compile: whether torch compiles the step. If compilation fails, the engine warns once and runs the
+            step uncompiled.
+    """
+
+    def __init__(
+        self,
+        networks: Sequence[nn.Module],
+        make_loss: MakeLoss,
+        *,
+        target_networks: Sequence[nn.Module] | None = None,
+        optimizer: Optimizer = "adam",
+        learning_rate: float,
+        adam_eps: float = 1e-8,
+        loss_share: float = 1.0,
+        max_grad_norm: float | None = None,
+        tau: float | None = None,
+        lane_axis: bool,
+        flat: bool = False,
+        compile: bool = True,
+    ) -> None:
+        loss, self.own, self.fixed, names = stacked(networks, make_loss, lane_axis=lane_axis)
+        if target_networks is not None:
+            others = stacked(target_networks, make_loss, lane_axis=lane_axis).own
+            self.fixed |= {name: others[_source(name)] for name in self.fixed if _source(name) in others}
+        self._mean, self._square = (
+            {name: torch.zeros_like(value) for name, value in self.own.items() if optimizer in kept_by}
+            for kept_by in (WITH_MEAN, WITH_SQUARE)
+        )
+        self.loss = FunctionalLoss(loss)
+        network = stack_lanes(networks) if lane_axis else deepcopy(networks[0])
+        self._parts = list(parts_of(network).items())
+        self._shared = {name: self.own[key] for name, key in names.items() if key in self.own}
+        if lane_axis:  # acts with the same tensors that updates change
+            for name, parameter in network.named_parameters():
+                if name in self._shared:
+                    parameter.requires_grad_(False).data = self._shared[name]
+        self._names, self._fixed_names = tuple(self.own), tuple(self.fixed)
+        groups = self.own, self.fixed, self._mean, self._square
+        self._tensors = [list(group.values()) for group in groups]
+        self.steps = 0
+        kind = next(iter(self.own.values()))
+        self._scalars = kind.new_zeros(()), kind.new_zeros(())
+        self._optimizer, self._tau = optimizer, tau
+        self._learning_rate, self._adam_eps, self._share = learning_rate, adam_eps, loss_share
+        self._max_norm = max_grad_norm
+        self._vmapped, self._flat = not lane_axis, flat
+        self._is_warm = not compile
+        self._compiled = Compiled(FunctionalEngine._step, what="updates run", changes=(7,), enabled=compile)
+        self._compiled_on = Compiled(
+            FunctionalEngine._step_on, what="updates run", changes=(6,), enabled=compile
+        )
+
+    def update(self, ring: Ring) -> Tensor:
+        if ring.sequence_steps > 1:
+            return self.update_from(ring.sample())
+        index = ring.draw()
+        self.steps += 1
+        noise = None if ring.noise is None else ring.noise.next()
+        if not self._is_warm:
+            self._warm_up(sampled(ring.fields, index, ring.rows, ring.horizon, noise))
+        fields, form = [*ring.fields.values()], _form(ring, index, noise)
+        arguments = fields, ring.rows, ring.horizon, index, *self._adam_scalars(), self._tensors, noise
+        losses: Tensor = self._compiled(form, self, *arguments)
+        return losses
+
+    def update_from(self, batch: TensorDict) -> Tensor:
+        self.steps += 1
+        if not self._is_warm:
+            self._warm_up(batch.clone())
+        entries = sorted(batch.items(True, True), key=lambda entry: str(entry[0]))
+        names, columns = tuple(name for name, _ in entries), [column for _, column in entries]
+        form = names, batch.batch_size, *((column.shape, column.dtype) for column in columns)
+        arguments = names, tuple(batch.batch_size), columns, *self._adam_scalars()
+        losses: Tensor = self._compiled_on(form, self, *arguments, self._tensors)
+        return losses
+
+    def _warm_up(self, batch: TensorDict) -> None:
+        """Calls TensorDict once before compilation: it fills a cache at first use, which compiled code would
+        refill at each call."""
+        self._gradients(self._tensors[0], self._tensors[1], batch)
+        self._is_warm = True
+
+    def _adam_scalars(self) -> tuple[Tensor, Tensor]:
+        """Adam's two bias corrections, computed once here instead of once per weight in the graph."""
+        size, scale = self._scalars
+        size.fill_(self._learning_rate / (1 - BETA_1**self.steps))
+        scale.fill_((1 - BETA_2**self.steps) ** -0.5)
+        return size, scale
+
+    def _step(
+        self,
+        fields: list[Tensor],
+        rows: int,
+        horizon: Horizon | None,
+        index: Tensor,
+        step_size: Tensor,
+        scale: Tensor,
+        tensors: list[list[Tensor]],
+        noise: Tensor | None,
+    ) -> Tensor:
+        """One step. Tensors are passed in lists: the guards of compiled code find a dict's entry by counting
+        through its keys, which takes longer than all computation of one lane."""
+        batch = sampled(dict(zip(FIELDS, fields, strict=True)), index, rows, horizon, noise)
+        return self._change(batch, step_size, scale, tensors)
+
+    def _step_on(
+        self,
+        names: tuple[Any, ...],
+        size: tuple[int, ...],
+        columns: list[Tensor],
+        step_size: Tensor,
+        scale: Tensor,
+        tensors: list[list[Tensor]],
+    ) -> Tensor:
+        """One step on a batch; its entries are in the order of their names."""
+        batch = TensorDict({}, batch_size=size)
+        for name, column in zip(names, columns, strict=True):
+            batch.set(name, column)
+        return self._change(batch, step_size, scale, tensors)
+
+    def _change(
+        self, batch: TensorDict, step_size: Tensor, scale: Tensor, tensors: list[list[Tensor]]
+    ) -> Tensor:
+        """Computes gradients, changes the weights in place and returns each lane's loss."""
+        own, fixed, means, squares = tensors
+        gradients, losses = self._gradients(own, fixed, batch)
+        if self._max_norm is not None:
+            gradients = shortened(gradients, self._max_norm)
+        change_weights(
+            self._optimizer,
+            own,
+            gradients,
+            means,
+            squares,
+            step_size=step_size,
+            scale=scale,
+            learning_rate=self._learning_rate,
+            eps=self._adam_eps,
+        )
+        if self._tau is not None:
+            for name, target in zip(self._fixed_names, fixed, strict=True):
+                if _source(name) in self._names:
+                    target.lerp_(own[self._names.index(_source(name))], self._tau)
+        return losses
+
+    def _gradients(
+        self, own: list[Tensor], fixed: list[Tensor], batch: TensorDict
+    ) -> tuple[list[Tensor], Tensor]:
+        """The gradients of the trained weights, and each lane's loss."""
+        gradient = torch.func.grad(self._lane_losses, has_aux=True)
+        if self._vmapped:
+            gradient = torch.vmap(gradient)
+        gradients, losses = gradient(own, fixed, batch)
+        return gradients, losses
+
+    def _lane_losses(
+        self, own: list[Tensor], fixed: list[Tensor], batch: TensorDict
+    ) -> tuple[Tensor, Tensor]:
+        """The sum of the losses of all lanes, to differentiate, and each lane's loss; under vmap there is one
+        lane."""
+        by_name = (
+            dict(zip(self._names, own, strict=True)),
+            dict(zip(self._fixed_names, fixed, strict=True)),
+        )
+        each = self.loss(*by_name, batch.reshape(-1) if self._flat else batch)
+        if self._flat:
+            each = each.reshape(batch.batch_size)
+        losses = (each.mean() if self._vmapped else each.flatten(1).mean(-1)) * self._share
+        return losses.sum(), losses
+
+    def outputs(self, observation: Tensor, *recurrent: Tensor, part: int = 0) -> Any:
+        name, network = self._parts[part]
+        if not self._vmapped:
+            return network(observation, *recurrent)
+        return vmapped(network, self._of_part(name), observation, *recurrent)
+
+    def _of_part(self, name: str) -> Weights:
+        """The weights of one of an agent's networks, by their names in that network."""
+        mine = f"{name}." if name else ""
+        return {key.removeprefix(mine): value for key, value in self._shared.items() if key.startswith(mine)}
+
+    def copy_to_targets(self, which: Tensor) -> None:
+        for name, fixed in self.fixed.items():
+            if _source(name) in self.own:
+                fixed[which] = self.own[_source(name)][which]
+
+    def network_state(self, lane: int) -> Weights:
+        name, network = self._parts[0]
+        if not self._vmapped:
+            return lane_state(network, lane)
+        buffers = {key: value.clone() for key, value in network.named_buffers()}
+        return {**{key: value[lane].clone() for key, value in self._of_part(name).items()}, **buffers}
+
+    def weights(self, lane: int) -> Weights:
+        everything = {**self.own, **self.fixed}
+        return {
+            name: (value[lane] if self._vmapped or _source(name) in self.own else value).clone()
+            for name, value in everything.items()
+        }
+
+    def finite(self) -> Tensor:
+        lanes, every = len(self._tensors[0][0]), [value for group in self._tensors for value in group]
+        return finite_lanes([value for value in every if value.ndim and len(value) == lanes])
+
+    def state_dict(self) -> dict[str, Any]:
+        return {
+            "own": self.own,
+            "targets": self.fixed,
+            "mean": self._mean,
+            "square": self._square,
+            "steps": self.steps,
+        }
+
+    def load_state_dict(self, state: Mapping[str, Any]) -> None:
+        # Copies into the existing tensors, which the compiled step refers to.
+        groups = {"own": self.own, "targets": self.fixed, "mean": self._mean, "square": self._square}
+        for group, tensors in groups.items():
+            if set(state[group]) != set(tensors):
+                raise ValueError(
+                    f"the state has the weights {sorted(state[group])}; allowed: {sorted(tensors)}"
+                )
+            for name, tensor in tensors.items():
+                tensor.copy_(state[group][name])
+        self.steps = int(state["steps"])
+
+
+def _source(name: str) -> str:
+    """The name of the weight that a target copies."""
+    return name.removeprefix("target_")
+
+
+def _form(ring: Ring, index: Tensor, noise: Tensor | None) -> tuple[object, ...]:
+    """The shapes and dtypes for which a step is compiled; the engine's own tensors never change theirs."""
+    sizes = ring.rows, ring.horizon, index.shape, None if noise is None else noise.shape
+    return (*sizes, *((field.shape, field.dtype) for field in ring.fields.values()))
+
+
+class SharedEngine(Engine):
+    """Presents an engine of R networks, each shared by S agents, as an engine of L = R x S lanes.
+
+    A network learns from the transitions of all its agents in one batch, S x b of them. The loss of a lane is
+    that of its network.
+
+    Args:
+        engine: the engine of the R networks.
+        agents: the number of agents S that share a network.
+    """
+
+    def __init__(self, engine: Engine, agents: int) -> None:
+        self.engine, self._agents = engine, agents
+
+    def update_from(self, batch: TensorDict) -> Tensor:
+        lanes, *sizes = batch.batch_size
+        if "is_init" in batch:  # each sequence stays one
+            *sequences, steps = sizes
+            sizes = [prod(sequences), steps]
+        together = batch.reshape(lanes // self._agents, self._agents * sizes[0], *sizes[1:])
+        return self.engine.update_from(together).repeat_interleave(self._agents)
+
+    def copy_to_targets(self, which: Tensor) -> None:
+        # Agents that share a network are marked together.
+        self.engine.copy_to_targets(which.view(-1, self._agents)[:, 0])
+
+    def outputs(self, observation: Tensor, *recurrent: Tensor, part: int = 0) -> Any:
+        return self._by_network(partial(self.engine.outputs, part=part), observation, *recurrent)
+
+    def network_state(self, lane: int) -> Weights:
+        return self.engine.network_state(lane // self._agents)
+
+    def weights(self, lane: int) -> Weights:
+        return self.engine.weights(lane // self._agents)
+
+    def finite(self) -> Tensor:
+        return self.engine.finite().repeat_interleave(self._agents)
+
+    def state_dict(self) -> dict[str, Any]:
+        return self.engine.state_dict()
+
+    def load_state_dict(self, state: Mapping[str, Any]) -> None:
+        self.engine.load_state_dict(state)
+
+    def _by_network(self, outputs: Callable[..., Any], observation: Tensor, *recurrent: Tensor) -> Any:
+        """[L, k, ...] to [L, k, ...], through a function of [R, S x k, ...], or of recurrent networks of
+        [R, S, k, ...]."""
+        if recurrent:
+            inputs = [own.reshape(-1, self._agents, *own.shape[1:]) for own in (observation, *recurrent)]
+            return tuple(own.flatten(0, 1) for own in outputs(*inputs))
+        lanes, size = observation.shape[:2]
+        by_network = observation.reshape(lanes // self._agents, self._agents * size, *observation.shape[2:])
+        given: Tensor = outputs(by_network)
+        return given.reshape(lanes, size, *given.shape[2:])
+
+
+def is_list(engine: object) -> bool:
+    """Whether an engine updates one loss after the other, uncompiled."""
+    return isinstance(engine.engine if isinstance(engine, SharedEngine) else engine, ListEngine)

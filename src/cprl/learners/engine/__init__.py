@@ -1,1 +1,0 @@
-"""Engines: one update step for many independent learners."""

@@ -1,0 +1,492 @@
+"""Preferences as values of a recipe.
+
+In each, N is the number of agents, r_i the reward that the environment gives agent i in a turn (apples, less
+fines, plus transfers), and r'_i the reward that agent i wants and learns from.
+"""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from math import pi
+from typing import Any, ClassVar, Final, Literal, TypeAlias
+
+import numpy as np
+import torch
+from pettingzoo import ParallelEnv
+from pettingzoo.utils import BaseParallelWrapper
+from tensordict import TensorDictBase
+from tensordict.utils import NestedKey
+from torch import Tensor
+from torchrl.data import Composite, TensorSpec, Unbounded
+from torchrl.envs import Transform
+
+from cprl import keys
+from cprl.arguments import object_of
+from cprl.checks import TEXT, Check, check_fields, checked, either, instance, number, one_of, shown, tuple_of
+
+_WEIGHT: Final = number(0, 1e6)
+_SHARE: Final = number(0, 1)
+_ANGLE: Final = Check(number(-pi, pi).fits, "radians in -pi..pi, e.g. math.radians(45)")
+
+
+@dataclass(frozen=True, kw_only=True)
+class InequityAversion:
+    """Dislikes having less than others, and having more.
+
+    r'_i = r_i - alpha / (N - 1) sum_j max(e_j - e_i, 0) - beta / (N - 1) sum_j max(e_i - e_j, 0), over the
+    others j, with smoothed rewards e_i = smoothing x (e_i of the turn before) + r_i, zero before an episode's
+    first turn.
+
+    Source: Hughes et al., "Inequity aversion improves cooperation in intertemporal social dilemmas" (2018),
+    after Fehr and Schmidt (1999).
+
+    Args:
+        alpha: the dislike of being behind (disadvantageous inequity), 0..1e6; 5 is usual.
+        beta: the dislike of being ahead (advantageous inequity), 0..1e6; 0.05 is usual.
+        smoothing: the share of smoothed rewards that lasts into the next turn, 0..1; gamma x lambda of the
+            source. With 0 only the rewards of the turn are compared, with 1 the returns so far.
+
+    Raises:
+        ValueError: for a number outside its range, in particular a negative dislike.
+    """
+
+    alpha: float
+    beta: float
+    smoothing: float
+
+    def __post_init__(self) -> None:
+        check_fields(self, {"alpha": _WEIGHT, "beta": _WEIGHT, "smoothing": _SHARE})
+
+
+@dataclass(frozen=True, kw_only=True)
+class SocialValueOrientation:
+    """Dislikes turns in which rewards are shared in another proportion than it likes.
+
+    r'_i = r_i - weight x |angle - theta_i|, with theta_i = atan2(mean of the others' rewards, r_i), in
+    radians. The difference is the shorter way around the circle, 0..pi. In a turn in which r_i and the mean
+    of the others are both 0, no angle is defined, and r'_i = r_i = 0.
+
+    Source: McKee et al., "Social Diversity and Social Preferences in Mixed-Motive Reinforcement Learning"
+    (2020), where rewards are never negative, so that the shorter way is the plain difference.
+
+    Args:
+        angle: the proportion that it likes, radians in -pi..pi: 0 is for itself alone, pi / 4 for both
+            alike, pi / 2 for others alone, negative against others.
+        weight: reward lost per radian, 0..1e6.
+
+    Raises:
+        ValueError: for a number outside its range, e.g. an angle in degrees.
+    """
+
+    angle: float
+    weight: float
+
+    def __post_init__(self) -> None:
+        check_fields(self, {"angle": _ANGLE, "weight": _WEIGHT})
+
+
+@dataclass(frozen=True)
+class Exchange:
+    """Gives a share of its reward away, and gets one of each other's: r'_i = (1 - share) r_i + share x mean
+    of the others' rewards.
+
+    If all agents do, with the same share, the sum of their rewards stays.
+
+    Source: the reward transfers of Willis et al., "Resolving social dilemmas with minimal reward transfer"
+    (2024), in which 1 - share is the self-interest level.
+
+    Args:
+        share: 0..1: 0 is the agent's own reward, 1 that of the others alone.
+
+    Raises:
+        ValueError: for a number outside its range.
+    """
+
+    share: float
+
+    def __post_init__(self) -> None:
+        check_fields(self, {"share": _SHARE})
+
+
+Preference: TypeAlias = Literal["individual", "team"] | InequityAversion | SocialValueOrientation | Exchange
+"""What an agent wants: "individual", its own reward; "team", the sum over all agents; or a comparison of its
+own with those of others."""
+
+PREFERENCE: Final = either(
+    one_of("individual", "team"),
+    instance(
+        InequityAversion | SocialValueOrientation | Exchange,
+        "InequityAversion, SocialValueOrientation, Exchange of cprl.learners.preferences",
+    ),
+)
+
+
+def check_preference(name: str, preference: Any, agents: int) -> None:
+    """Refuses what is no preference, or none for a game of so few agents.
+
+    Args:
+        name: what it is called in messages.
+        preference: a value of `Preference`.
+        agents: the number of agents N of the game.
+
+    Raises:
+        ValueError: says what came and what is allowed.
+    """
+    checked(name, preference, PREFERENCE)
+    if agents < 2 and not isinstance(preference, str):
+        raise ValueError(
+            f"{name} is {named(preference)}, which compares an agent with others, in a game of {agents} "
+            "agent; allowed there: 'individual', 'team'"
+        )
+
+
+def named(preference: object) -> str:
+    """A preference as messages name it: "team" in quotes, a value by its class."""
+    return f'"{preference}"' if isinstance(preference, str) else type(preference).__name__
+
+
+Array = Any
+"""A numpy array, or a tensor; what is computed from it is of the same kind, on the same device."""
+
+_REWARDS: Final = "numbers [worlds, agents], an array or tensor"
+_WHOLE: Final = (torch.uint8, torch.int8, torch.int16, torch.int32, torch.int64)
+
+
+def wanted_rewards(
+    preference: Preference, rewards: Array, smoothed: Array | None = None
+) -> tuple[Array, Array | None]:
+    """The rewards that agents want who all have the same preference, in one turn; a pure function.
+
+    Args:
+        preference: what they want.
+        rewards: float [B, N], what the environment gives each of N agents in each of B worlds.
+        smoothed: float64 [B, N], what the turn before left to remember; None at an episode's first turn.
+
+    Returns:
+        The wanted rewards, [B, N]: "individual" those given, as they are; else float32, computed in float64.
+        And what is to be remembered, float64 [B, N], for `InequityAversion`; None for all others.
+
+    Raises:
+        ValueError: for what is no preference, rewards of another shape, and a comparison with others where
+            there are none.
+    """
+    _check("rewards", rewards)
+    check_preference("preference", preference, rewards.shape[1])
+    if smoothed is not None:
+        _check("smoothed", smoothed)
+        if smoothed.shape != rewards.shape or _of_kind(smoothed) is not _of_kind(rewards):
+            raise ValueError(
+                f"smoothed is {list(smoothed.shape)}; allowed: as rewards, {list(rewards.shape)}"
+            )
+    with np.errstate(all="ignore"):  # rewards that are not finite are found and named elsewhere
+        return _wanted(preference, rewards, smoothed)
+
+
+def _wanted(preference: Preference, rewards: Array, smoothed: Array | None) -> tuple[Array, Array | None]:
+    if preference == "individual":
+        return rewards, None
+    if preference == "team":
+        return _of_kind(rewards).ones_like(rewards) * rewards.sum(-1)[:, None], None
+    own = _double(rewards)
+    if isinstance(preference, InequityAversion):
+        now = own if smoothed is None else preference.smoothing * smoothed + own
+        return _single(own - _dislike(preference, now)), now
+    of_others = (own.sum(-1)[:, None] - own) / (own.shape[1] - 1)
+    if isinstance(preference, SocialValueOrientation):
+        return _single(own - preference.weight * _off(preference.angle, own, of_others)), None
+    assert isinstance(preference, Exchange)
+    return _single((1 - preference.share) * own + preference.share * of_others), None
+
+
+def _dislike(preference: InequityAversion, smoothed: Array) -> Array:
+    """What each agent loses by inequity, [B, N]."""
+    difference = smoothed[:, None, :] - smoothed[:, :, None]  # [B, own, other]: above 0 where own is behind
+    behind, ahead = difference.clip(min=0).sum(-1), (-difference).clip(min=0).sum(-1)
+    loss: Array = (preference.alpha * behind + preference.beta * ahead) / (smoothed.shape[1] - 1)
+    return loss
+
+
+def _off(angle: float, own: Array, of_others: Array) -> Array:
+    """How far each agent's share is from the one it likes, radians [B, N]; 0 where nobody gets anything."""
+    kind = _of_kind(own)
+    plain = abs(kind.arctan2(of_others, own) - angle)
+    shorter = kind.where(plain > pi, 2 * pi - plain, plain)
+    return kind.where((own == 0) & (of_others == 0), kind.zeros_like(own), shorter)
+
+
+def _check(name: str, array: Array) -> None:
+    """Refuses what are no numbers [B, N]."""
+    if isinstance(array, Tensor):
+        fits = array.ndim == 2 and (array.is_floating_point() or array.dtype in _WHOLE)
+    else:
+        fits = isinstance(array, np.ndarray) and array.ndim == 2 and array.dtype.kind in "fiu"
+    if not fits:
+        raise ValueError(f"{name} is {shown(array)}; allowed: {_REWARDS}")
+
+
+def _of_kind(array: Array) -> Any:
+    return torch if isinstance(array, Tensor) else np
+
+
+def _double(array: Array) -> Array:
+    """A copy in float64."""
+    return array.to(torch.float64, copy=True) if isinstance(array, Tensor) else array.astype(np.float64)
+
+
+def _single(array: Array) -> Array:
+    return array.float() if isinstance(array, Tensor) else array.astype(np.float32, copy=False)
+
+
+def _like(array: Array, other: Array) -> Array:
+    """The same values as the kind of array that another one is, on its device."""
+    if isinstance(other, Tensor):
+        return torch.as_tensor(array, device=other.device)
+    return array.numpy(force=True) if isinstance(array, Tensor) else array
+
+
+class WantedRewards:
+    """The rewards that agents want, turn by turn, with what they remember of the running episodes.
+
+    Args:
+        preferences: what all agents want; or a preference for each of the N agents.
+
+    Raises:
+        ValueError: for what is no preference.
+    """
+
+    def __init__(self, preferences: Preference | Sequence[Preference]) -> None:
+        self.preferences = preferences
+        listed = tuple(preferences) if isinstance(preferences, list | tuple) else None
+        for place, own in enumerate(listed or ()):
+            checked(f"preferences[{place}]", own, PREFERENCE)
+        if not listed:
+            checked("preferences", preferences, PREFERENCE)
+        self._listed = listed
+        kinds: Any = dict.fromkeys(listed) if listed else [preferences]
+        self._columns = {
+            own: [agent for agent, other in enumerate(listed or ()) if other == own] for own in kinds
+        }
+        self._smoothed: dict[Preference, Array] = {}
+        self._agents: int | None = None
+        self.now: Array | None = None
+        """[B, N], the wanted rewards of the latest turn; None before the first."""
+
+    def check_agents(self, agents: int) -> None:
+        """Raises a ValueError if these cannot be the preferences of N agents."""
+        if self._listed and len(self._listed) != agents:
+            raise ValueError(
+                f"preferences has {len(self._listed)} entries; allowed: one preference for all agents, "
+                f"or one for each of {agents}"
+            )
+        for own in self._columns:
+            check_preference("preferences", own, agents)
+        self._agents = agents
+
+    def add(self, rewards: Array, ended: Array) -> Array:
+        """The rewards wanted in the next turn of all worlds.
+
+        Args:
+            rewards: float [B, N], what the environment gives.
+            ended: bool [B], the worlds whose episode ends with this turn; they remember nothing of it.
+
+        Returns:
+            The wanted rewards, [B, N], a numpy array or a tensor as `rewards`.
+
+        Raises:
+            ValueError: for another number of agents, or of worlds than before.
+        """
+        _check("rewards", rewards)
+        if rewards.shape[1] != self._agents:
+            self.check_agents(rewards.shape[1])
+        wanted = None
+        for preference, columns in self._columns.items():
+            before = self._before(preference, rewards)
+            with np.errstate(all="ignore"):
+                own, after = _wanted(preference, rewards, before)
+            if after is not None:
+                after[ended] = 0
+                self._smoothed[preference] = after
+            if not self._listed:
+                wanted = own
+            else:
+                wanted = _of_kind(own).zeros_like(_single(rewards)) if wanted is None else wanted
+                wanted[:, columns] = _single(own)[:, columns]
+        self.now = wanted
+        return wanted
+
+    def _before(self, preference: Preference, rewards: Array) -> Array | None:
+        """What is remembered, as the same kind of array as rewards."""
+        kept = self._smoothed.get(preference)
+        if kept is None:
+            return None
+        if kept.shape != rewards.shape:
+            raise ValueError(
+                f"rewards is {list(rewards.shape)}; allowed: {list(kept.shape)}, as in the turn before, "
+                "or clear() before"
+            )
+        return _like(kept, rewards)
+
+    def clear(self, worlds: Array | None = None) -> None:
+        """Forgets the episodes of the marked worlds, bool [B]; by default of all."""
+        self.now = None
+        if worlds is None:
+            self._smoothed = {}
+            return
+        for preference, kept in self._smoothed.items():
+            left = kept.clone() if isinstance(kept, Tensor) else kept.copy()
+            left[_like(worlds, kept)] = 0
+            self._smoothed[preference] = left
+
+    def state_dict(self) -> dict[str, Tensor]:
+        """What is remembered: "smoothed" float64 [K, B, N], for each of the K preferences that remember, in
+        the order of their first agents; empty if nothing is."""
+        kept = [torch.as_tensor(self._smoothed[own]) for own in self._columns if own in self._smoothed]
+        return {"smoothed": torch.stack(kept)} if kept else {}
+
+    def load_state_dict(self, state: Mapping[str, Tensor]) -> None:
+        """Continues from a state that `state_dict` returned.
+
+        Raises:
+            ValueError: if it is that of other preferences.
+        """
+        object_of("state", state, Mapping, "a value of state_dict()")
+        remember = [own for own in self._columns if isinstance(own, InequityAversion)]
+        kept = state.get("smoothed")
+        if kept is not None and (kept.ndim != 3 or len(kept) != len(remember)):
+            raise ValueError(
+                f'"smoothed" of the state is {list(kept.shape)}; allowed: [{len(remember)}, worlds, agents], '
+                "a table for each preference that remembers"
+            )
+        self.now = None
+        self._smoothed = {} if kept is None else dict(zip(remember, kept.clone(), strict=True))
+
+
+_KEY: Final = either(TEXT, tuple_of(TEXT, at_least=1))
+
+
+class PreferenceTransform(Transform):
+    """Rewrites the rewards of a group of agents as they want them, or adds an entry with them.
+
+    In an `Experiment` say `Learning(algorithm, reward=...)` instead: the table of episodes then still has the
+    returns of the environment. Here they are those that this transform writes.
+
+    What agents remember of an episode is cleared where it ends and where the environment is reset, world by
+    world, and is in the `state_dict`.
+
+    Args:
+        preferences: what all agents want; or a preference for each of the N agents.
+        in_key: the environment's rewards, float [..., N, 1].
+        out_key: where the wanted ones are written, float32 [..., N, 1]; by default in their place.
+
+    Raises:
+        ValueError: for what is no preference, and once it is in an environment, for rewards of another shape
+            and preferences that its number of agents does not allow.
+    """
+
+    remembers_worlds: ClassVar[bool] = True
+    """That its extra state is of the worlds that are played, so that no other worlds begin with it."""
+
+    def __init__(
+        self,
+        preferences: Preference | Sequence[Preference],
+        *,
+        in_key: NestedKey = keys.REWARD,
+        out_key: NestedKey | None = None,
+    ) -> None:
+        out_key = in_key if out_key is None else out_key
+        for name, key in (("in_key", in_key), ("out_key", out_key)):
+            checked(name, key, _KEY)
+        wants = WantedRewards(preferences)
+        super().__init__(in_keys=[in_key], out_keys=[out_key])
+        self.wants = wants
+
+    def _step(self, tensordict: TensorDictBase, next_tensordict: TensorDictBase) -> TensorDictBase:
+        given = next_tensordict.get(self.in_keys[0])
+        rewards = given.reshape(-1, given.shape[-2])
+        done = next_tensordict.get(keys.DONE, None)
+        ended = torch.zeros(len(rewards), dtype=torch.bool) if done is None else done.reshape(-1)
+        wanted = self.wants.add(rewards, ended.to(rewards.device))
+        next_tensordict.set(self.out_keys[0], wanted.reshape(given.shape).clone())
+        return next_tensordict
+
+    def _reset(self, tensordict: TensorDictBase, tensordict_reset: TensorDictBase) -> TensorDictBase:
+        marked = None if tensordict is None else tensordict.get("_reset", None)
+        self.wants.clear(None if marked is None or marked.all() else marked.reshape(-1))
+        return tensordict_reset
+
+    def transform_reward_spec(self, reward_spec: TensorSpec) -> TensorSpec:
+        """The rewards may be any number."""
+        given = reward_spec[self.in_keys[0]] if isinstance(reward_spec, Composite) else None
+        if given is None or len(given.shape) < 2 or given.shape[-1] != 1:
+            found = None if given is None else list(given.shape)
+            raise ValueError(f"the rewards are {found}; allowed: [..., agents, 1], at {self.in_keys[0]!r}")
+        self.wants.check_agents(given.shape[-2])
+        reward_spec[self.out_keys[0]] = Unbounded(shape=given.shape, dtype=torch.float32, device=given.device)
+        return reward_spec
+
+    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
+        """Not for replay buffers, whose turns need not follow each other.
+
+        Raises:
+            ValueError: always.
+        """
+        raise ValueError(
+            "PreferenceTransform is called outside an environment; allowed: TransformedEnv(env, "
+            "PreferenceTransform(...)), where every turn follows the one before"
+        )
+
+    def get_extra_state(self) -> Tensor:
+        """What agents remember, float64 [K, worlds, N], as `WantedRewards.state_dict`; else empty."""
+        return self.wants.state_dict().get("smoothed", torch.zeros(0))
+
+    def set_extra_state(self, state: Tensor) -> None:
+        """Continues from it."""
+        self.wants.load_state_dict({"smoothed": state} if state.numel() else {})
+
+
+class PreferenceWrapper(BaseParallelWrapper[str, Any, Any]):
+    """A PettingZoo `ParallelEnv` whose agents get the rewards that they want.
+
+    The environment's own reward is in `infos`, as "env_reward". An agent that has left the game counts with a
+    reward of 0.
+
+    Args:
+        env: the environment, e.g. `cprl.envs.parallel_env(game)`.
+        preferences: what all agents want; or a preference for each of `env.possible_agents`.
+
+    Raises:
+        ValueError: for what is no parallel environment or no preference, and for preferences that the number
+            of agents does not allow.
+    """
+
+    def __init__(
+        self, env: ParallelEnv[str, Any, Any], preferences: Preference | Sequence[Preference]
+    ) -> None:
+        object_of("env", env, ParallelEnv, "a ParallelEnv of PettingZoo")
+        super().__init__(env)
+        self.wants = WantedRewards(preferences)
+        self.wants.check_agents(len(env.possible_agents))
+
+    def __repr__(self) -> str:
+        return f"PreferenceWrapper({self.env!r})"
+
+    def reset(
+        self, seed: int | None = None, options: dict[str, Any] | None = None
+    ) -> tuple[dict[str, Any], dict[str, dict[str, Any]]]:
+        """Begins the next episode; nothing is remembered of the last one."""
+        self.wants.clear()
+        first: tuple[dict[str, Any], dict[str, dict[str, Any]]] = self.env.reset(seed=seed, options=options)
+        return first
+
+    def step(
+        self, actions: dict[str, Any]
+    ) -> tuple[dict[str, Any], dict[str, float], dict[str, bool], dict[str, bool], dict[str, dict[str, Any]]]:
+        """Plays one turn."""
+        seen, given, terminations, truncations, infos = self.env.step(actions)
+        everyone = self.env.possible_agents
+        of_turn = np.array([[given.get(agent, 0.0) for agent in everyone]], np.float32)
+        wanted = self.wants.add(of_turn, np.zeros(1, np.bool_))[0]
+        infos = {
+            agent: {**infos.get(agent, {}), "env_reward": float(reward)} for agent, reward in given.items()
+        }
+        rewards = {agent: float(own) for agent, own in zip(everyone, wanted, strict=True) if agent in given}
+        return seen, rewards, terminations, truncations, infos

@@ -1,0 +1,438 @@
+"""The replay buffer of many lanes, a ring that stores each observation once; each lane samples for itself.
+
+A lane is one agent of one replica. All lanes step together, so a transition is a row [L]. The observation
+after a transition is also the one before the next transition, and is stored once. Only at the end of an
+episode it takes an extra row. What is read are transitions, returns of several steps, or sequences, as
+TensorDicts with the keys that TorchRL's losses read.
+"""
+
+import logging
+from collections.abc import Mapping, Sequence
+from math import prod
+from typing import Any, Final, NamedTuple
+
+import numpy as np
+import torch
+from tensordict import TensorDict
+from torch import Tensor
+
+from cprl.learners.transitions import LaneTurn, array_of, refuse_other_dtype
+from cprl.policies.rng import DRAWN_AHEAD, LaneRng
+from cprl.system.memory import check_memory, free_bytes
+
+FIELDS: Final = ("observation", "action", "reward", "done", "terminated", "row")
+"""What a ring holds, in the order in which it holds it."""
+
+STATE: Final = "recurrent_state"
+"""What a ring for sequences holds besides."""
+
+Fields = dict[str, Tensor]
+
+
+class Horizon(NamedTuple):
+    """Returns of several steps: how many rewards they sum, and by which discount."""
+
+    steps: int
+    gamma: float
+
+
+def gather(fields: Fields, index: Tensor, rows: int, horizon: Horizon | None = None) -> TensorDict:
+    """Transitions at places [L, b] of a `Ring`, as TorchRL's losses read them; changes nothing.
+
+    With a horizon of n steps "reward" is the discounted sum of the rewards from there on: of n, or of those
+    until the episode ends. What is "next" is that of the last of these steps, and "steps_to_next_obs", int64
+    [L, b, 1], is their number, by which losses of TorchRL discount what they bootstrap from. The n - 1 steps
+    that follow each place must have been written. TorchRL's `MultiStepTransform` gives the same, but for the
+    flags "done" and "terminated", which it leaves those of the first step, so that it bootstraps from the
+    observations at which episodes terminate.
+    """
+    lanes, size = index.shape
+    lane = torch.arange(lanes, device=index.device)[:, None]
+    row = fields["row"][index, lane]
+    windows = fields["observation"]
+    shape = lanes, size, *windows.shape[1:]
+
+    def seen(at: Tensor) -> Tensor:
+        return windows.index_select(0, (lane * rows + at % rows).reshape(-1)).reshape(shape)
+
+    def field(name: str, place: Tensor) -> Tensor:
+        return fields[name][place, lane].unsqueeze(-1)
+
+    last, last_row, reward = index, row, field("reward", index)
+    more = {}
+    if horizon is not None:
+        last, reward, steps = _returns(fields, index, lane, horizon)
+        last_row = fields["row"][last, lane]
+        more["steps_to_next_obs"] = steps.unsqueeze(-1)
+    following = TensorDict(
+        {
+            "observation": seen(last_row + 1),
+            "reward": reward,
+            "done": field("done", last),
+            "terminated": field("terminated", last),
+        },
+        [lanes, size],
+    )
+    entries = {"observation": seen(row), "action": fields["action"][index, lane], "next": following}
+    return TensorDict({**entries, **more}, [lanes, size])
+
+
+def sequences(fields: Fields, index: Tensor, rows: int, steps: int) -> TensorDict:
+    """Sequences [L, b, T] of T turns from places [L, b] of a `Ring` on, for recurrent networks.
+
+    Entries are those of `gather`, the states with which agents acted, "recurrent_state", float32
+    [L, b, T, K], and "is_init", bool [L, b, T], as `cprl.networks.recurrent` says: where a sequence or an
+    episode begins. Those of "next" are of the turns after; where a sequence begins, the turn after its first
+    one does so too. The T - 1 turns that follow each place must have been written.
+    """
+    lanes, size = index.shape
+    ahead = torch.arange(steps, device=index.device)
+    places = ((index.unsqueeze(-1) + ahead) % len(fields["done"])).reshape(lanes, -1)
+    batch = gather(fields, places, rows)
+    lane = torch.arange(lanes, device=index.device)[:, None]
+    row, states = fields["row"][places, lane], fields[STATE]
+    for owner, at in ((batch, row), (batch["next"], row + 1)):
+        found = states.index_select(0, (lane * rows + at % rows).reshape(-1))
+        owner.set(STATE, found.reshape(*places.shape, *states.shape[1:]))
+    turns: TensorDict = batch.reshape(lanes, size, steps)
+    ends = (turns["next", "done"] | turns["next", "terminated"]).squeeze(-1)
+    is_init = torch.cat([torch.ones_like(ends[..., :1]), ends[..., :-1]], -1)
+    return turns.set("is_init", is_init).set(("next", "is_init"), is_init.clone())
+
+
+def sampled(
+    fields: Fields, index: Tensor, rows: int, horizon: Horizon | None, noise: Tensor | None
+) -> TensorDict:
+    """`gather`, with uniform numbers [L, b, ...] as the entry "noise" for losses that sample, or without."""
+    batch = gather(fields, index, rows, horizon)
+    if noise is not None:
+        batch.set("noise", noise)
+    return batch
+
+
+def _returns(fields: Fields, index: Tensor, lane: Tensor, horizon: Horizon) -> tuple[Tensor, Tensor, Tensor]:
+    """From each place: the last place of its return [L, b], the return [L, b, 1], or [L, b, S, 1] of the
+    members of a team, and its steps [L, b]."""
+    places = len(fields["done"])
+
+    def goes_on(place: Tensor) -> Tensor:
+        return ~(fields["done"][place, lane] | fields["terminated"][place, lane])
+
+    last, steps, going = index, torch.ones_like(index), goes_on(index)
+    total = fields["reward"][index, lane]
+    of_members = (...,) + (None,) * (total.ndim - index.ndim)  # a world ends for all members of a team
+    for step in range(1, horizon.steps):
+        place = (index + step) % places
+        total = total + going[of_members] * horizon.gamma**step * fields["reward"][place, lane]
+        last = torch.where(going, place, last)
+        steps = steps + going
+        going = going & goes_on(place)
+    return last, total.unsqueeze(-1), steps
+
+
+ENDS_PER_TRANSITION: Final = 0.02
+"""Extra rows for the last observations of episodes: one per fifty transitions. With episodes shorter than 50
+steps the buffer holds fewer transitions; those that it holds are always correct."""
+
+LOOKS_EVERY: Final = 32
+"""Steps between checks for transitions whose observations are about to be overwritten."""
+
+NUMBERS_AHEAD: Final = 2**14
+"""About as many numbers for losses that sample, or for an epoch, are generated at once for each lane."""
+
+
+def torch_dtype(name: str) -> torch.dtype:
+    """The torch dtype of a name that numpy and torch share, e.g. "uint8"."""
+    dtype: torch.dtype = getattr(torch, name)
+    return dtype
+
+
+def storage_bytes(
+    lanes: int,
+    transitions: int,
+    observation_shape: Sequence[int],
+    *,
+    action_shape: Sequence[int] = (),
+    reward_shape: Sequence[int] = (),
+    item_bytes: int = 1,
+    state_cells: int = 0,
+) -> int:
+    """Bytes that a `Ring` allocates, with `item_bytes` for one number of an observation; else as `Ring`."""
+    windows = _rows(transitions) * (prod(observation_shape) * item_bytes + 4 * state_cells)
+    return lanes * (windows + transitions * (8 * prod(action_shape) + 4 * prod(reward_shape) + 8 + 1 + 1))
+
+
+def _rows(transitions: int) -> int:
+    """Observation rows per lane: one per transition, those for the ends of episodes, and at most two per step
+    until the next check for overwritten rows."""
+    return transitions + max(8, round(transitions * ENDS_PER_TRANSITION)) + 2 * LOOKS_EVERY + 2
+
+
+def steps_ahead(count: int) -> int:
+    """Steps whose numbers are generated at once, `count` for each: they are part of every checkpoint."""
+    return min(DRAWN_AHEAD, max(1, NUMBERS_AHEAD // count))
+
+
+class Noise:
+    """Uniform numbers in 0..1 for losses that sample: a batch of them for each update and lane.
+
+    Args:
+        seeds: the seed of each of the L lanes; a lane's numbers depend on it alone.
+        batch_size: transitions b of a lane's batch.
+        shape: of the numbers of a transition.
+        device: the device of the batches.
+    """
+
+    def __init__(
+        self, seeds: Sequence[Sequence[int]], batch_size: int, shape: Sequence[int], device: torch.device
+    ) -> None:
+        self._size, self._device = (len(seeds), batch_size, *shape), device
+        count = batch_size * prod(shape)
+        self.rng = LaneRng(seeds, count, ahead=steps_ahead(count))
+
+    def next(self) -> Tensor:
+        """The numbers of the next batch, float32 [L, b, *shape]."""
+        return self.rng.next().view(self._size).to(self._device, torch.float32)
+
+
+class Ring:
+    """Stores up to T transitions of each of L lanes, those of recurrent agents with their states, and samples
+    uniformly from them, with a random number generator for each lane.
+
+    Args:
+        seeds: the sampling seed of each of the L lanes; a lane's samples depend on it alone.
+        transitions: the capacity per lane, T.
+        batch_size: transitions b sampled per lane, or sequences.
+        observation_shape: (C, X, Y); (S, C, X, Y) if a lane is a team of S agents.
+        action_shape: the shape of a lane's action: () for one agent, (S,) for a team.
+        reward_shape: the shape of a lane's reward: (S,) for a team whose members have their own, else ().
+        noise_shape: of the uniform numbers that the loss reads with each transition: the entry "noise",
+            float32 [L, b, *noise_shape]; () for none.
+        noise_seeds: the seed of the numbers of each lane; by default `seeds`.
+        observation_dtype: see `Spaces.observation_dtype`.
+        horizon: steps and discount of n-step returns, sampled in place of rewards; None for single steps.
+        state_cells: the numbers K of the state of a lane's recurrent network; 0 for one without.
+        sequence_steps: turns of sampled sequences; 1 for transitions.
+        device: the device of the tensors.
+
+    The size is logged before allocation, under "cprl", if it is a mebibyte or more.
+
+    Raises:
+        TooLargeError: if the device has less free memory than needed; raised before anything is allocated.
+    """
+
+    def __init__(
+        self,
+        *,
+        seeds: Sequence[Sequence[int]],
+        transitions: int,
+        batch_size: int,
+        observation_shape: Sequence[int],
+        action_shape: Sequence[int] = (),
+        reward_shape: Sequence[int] = (),
+        noise_shape: Sequence[int] = (),
+        noise_seeds: Sequence[Sequence[int]] | None = None,
+        observation_dtype: str = "uint8",
+        horizon: Horizon | None = None,
+        state_cells: int = 0,
+        sequence_steps: int = 1,
+        device: str | torch.device = "cpu",
+    ) -> None:
+        self.horizon, self.sequence_steps, self.capacity = horizon, sequence_steps, transitions
+        self.lanes, self.rows, self.device = len(seeds), _rows(transitions), torch.device(device)
+        lanes, dtype = self.lanes, torch_dtype(observation_dtype)
+        needed = storage_bytes(
+            lanes,
+            transitions,
+            observation_shape,
+            action_shape=action_shape,
+            reward_shape=reward_shape,
+            item_bytes=dtype.itemsize,
+            state_cells=state_cells,
+        )
+        windows = lanes * batch_size * sequence_steps * 2
+        _check_memory(needed, windows * prod(observation_shape) * (dtype.itemsize + 4), self)
+
+        def allocate(*shape: int, kind: torch.dtype) -> Tensor:
+            if self.device.type != "cpu":
+                return torch.zeros(shape, dtype=kind, device=self.device)
+            # numpy leaves it to the system to clear pages when they are first written; torch writes them all
+            # at once, for a gigabyte in a second or more.
+            return torch.from_numpy(np.zeros(shape, array_of(torch.empty(0, dtype=kind)).dtype))
+
+        self.fields: Fields = {
+            "observation": allocate(lanes * self.rows, *observation_shape, kind=dtype),
+            "action": allocate(transitions, lanes, *action_shape, kind=torch.int64),
+            "reward": allocate(transitions, lanes, *reward_shape, kind=torch.float32),
+            "done": allocate(transitions, lanes, kind=torch.bool),
+            "terminated": allocate(transitions, lanes, kind=torch.bool),
+            "row": allocate(transitions, lanes, kind=torch.int64),
+        }
+        """Observations [L x rows, ...], actions and rewards [T, L, ...], the rest [T, L]; `row` counts the
+        observations that a lane has written. A state [L x rows, K] stands in the row of the observation that
+        the lane saw next."""
+        if state_cells:
+            self.fields[STATE] = allocate(lanes * self.rows, state_cells, kind=torch.float32)
+        self._of_rows = [name for name in self.fields if name in ("observation", STATE)]
+        # Steps are written with numpy on the CPU: for so few numbers torch takes five times as long.
+        self._arrays = {name: array_of(field) for name, field in self.fields.items()}
+        self._lane = array_of(torch.arange(lanes, device=self.device))
+        self._base = self._lane * self.rows
+        zeros = torch.zeros(lanes, dtype=torch.int64, device=self.device)
+        self._next_row, self._oldest = array_of(zeros), array_of(zeros.clone())
+        self._begins, self._any_begins = array_of(zeros == 0), True
+        self._written = 0
+        self.rng = LaneRng(seeds, batch_size)
+        self.noise = (
+            Noise(noise_seeds or seeds, batch_size, noise_shape, self.device) if noise_shape else None
+        )
+
+    def __len__(self) -> int:
+        """Transitions stored in the fullest lane."""
+        return min(self._written, self.capacity)
+
+    def oldest(self) -> tuple[Any, int]:
+        """The number of each lane's oldest complete transition, int64 [L], a numpy array if the ring is on
+        the CPU; and the number of the next transition to be written."""
+        return _at_least(self._oldest, self._written - self.capacity), self._written
+
+    def write(self, turn: LaneTurn) -> None:
+        """Writes the next transition of every lane, numpy arrays if the ring is on the CPU.
+
+        Raises:
+            ValueError: if observations have another dtype than the ring; they would be rounded.
+        """
+        arrays, place, row = self._arrays, self._written % self.capacity, self._next_row
+        for seen in (turn.observation, turn.next_observation):
+            refuse_other_dtype(seen.dtype, arrays["observation"].dtype)
+        for name in self._of_rows:
+            if self._any_begins:
+                first = self._begins
+                arrays[name][(self._base + row % self.rows)[first]] = getattr(turn, name)[first]
+            arrays[name][self._base + (row + 1) % self.rows] = getattr(turn, f"next_{name}")
+        arrays["action"][place] = turn.action
+        arrays["reward"][place] = turn.reward
+        arrays["done"][place] = turn.done
+        arrays["terminated"][place] = turn.terminated
+        arrays["row"][place] = row
+        self._begins = turn.done | turn.terminated
+        self._any_begins = _any(self._begins)
+        self._next_row = row + 1 + self._begins if self._any_begins else row + 1
+        self._written += 1
+        if self._written % LOOKS_EVERY == 0:
+            self._forget()
+
+    def cut(self) -> None:
+        """Ends the running episodes, as a time limit would: what is written next does not follow them."""
+        if self._written:
+            self._arrays["done"][(self._written - 1) % self.capacity] = True
+            self._next_row = self._next_row + ~self._begins
+            self._begins, self._any_begins = self._begins | True, True
+
+    def _forget(self) -> None:
+        """Excludes transitions whose observations are about to be overwritten from sampling."""
+        oldest = _at_least(self._oldest, self._written - self.capacity)
+        soon = self._next_row - self.rows + 2 * LOOKS_EVERY + 1
+        while True:
+            lost = self._arrays["row"][oldest % self.capacity, self._lane] <= soon
+            lost &= oldest < self._written
+            if not lost.any():
+                break
+            oldest += lost
+        self._oldest = oldest
+
+    def draw(self) -> Tensor:
+        """The places of a sample, int64 [L, b]."""
+        oldest, written = self.oldest()
+        # The newest transitions have no full return or sequence yet.
+        written -= (self.sequence_steps if self.horizon is None else self.horizon.steps) - 1
+        shares = array_of(self.rng.next().to(self.device)) * (written - oldest)[:, None]
+        # numpy on the CPU: for so few numbers torch takes three times as long.
+        numbers = shares.astype(np.int64) if isinstance(shares, np.ndarray) else shares.long()
+        return torch.as_tensor((oldest[:, None] + numbers) % self.capacity)
+
+    def get(self, index: Tensor) -> TensorDict:
+        """The transitions at places [L, b], or the sequences that begin there."""
+        if self.sequence_steps > 1:
+            return sequences(self.fields, index, self.rows, self.sequence_steps)
+        return gather(self.fields, index, self.rows, self.horizon)
+
+    def sample(self) -> TensorDict:
+        """The next sample: transitions [L, b], or sequences, with the entry "noise" if the loss samples."""
+        batch = self.get(self.draw())
+        if self.noise is not None:
+            batch.set("noise", self.noise.next())
+        return batch
+
+    def state_dict(self) -> dict[str, Any]:
+        """The written part of all fields, and the states of random numbers; once the ring is full, the
+        tensors themselves, not copies."""
+        kept = len(self)
+        used = min(self.rows, int(self._next_row.max()) + 1)
+        stored = {
+            **{name: _part(array, array[:kept]) for name, array in self.fields.items()},
+            **{name: _part(rows, rows[:, :used]) for name, rows in self._by_row().items()},
+            "next_row": torch.as_tensor(self._next_row),
+            "begins": torch.as_tensor(self._begins),
+            "oldest": torch.as_tensor(self._oldest),
+            "written": self._written,
+        }
+        noise = {} if self.noise is None else {"noise": self.noise.rng.state_dict()}
+        return {"storage": stored, "sampler": self.rng.state_dict(), **noise}
+
+    def load_state_dict(self, state: Mapping[str, Any]) -> None:
+        """Continues from the state of a ring with the same sizes."""
+        self.rng.load_state_dict(state["sampler"])
+        if self.noise is not None:
+            self.noise.rng.load_state_dict(state["noise"])
+        by_row, stored = self._by_row(), state["storage"]
+        given, shape = stored["observation"].shape, by_row["observation"].shape
+        if given[0] != self.lanes or given[1] > self.rows or given[2:] != shape[2:]:
+            allowed = [self.lanes, f"up to {self.rows}", *shape[2:]]
+            raise ValueError(f"the state's observations are {list(given)}; allowed: {allowed}")
+        for name, rows in by_row.items():
+            rows[:, : stored[name].shape[1]] = stored[name]
+        for name, array in self.fields.items():
+            if name not in by_row:
+                array[: len(stored[name])] = stored[name]
+        self._next_row, self._begins, self._oldest = (
+            array_of(stored[name].to(self.device, copy=True)) for name in ("next_row", "begins", "oldest")
+        )
+        self._written, self._any_begins = int(stored["written"]), bool(self._begins.any())
+
+    def _by_row(self) -> Fields:
+        """The fields of rows, [L, rows, ...]."""
+        fields = {name: self.fields[name] for name in self._of_rows}
+        return {name: field.view(self.lanes, self.rows, *field.shape[1:]) for name, field in fields.items()}
+
+
+def _check_memory(needed: int, sampled: int, ring: Ring) -> None:
+    """Raises a TooLargeError if there is too little memory for a ring and its samples; logs what it takes."""
+    check_memory(
+        f"the replay buffers of {ring.lanes} learners x {ring.capacity:,} transitions",
+        needed + sampled,
+        "a smaller buffer_size or batch_size, or fewer replicas",
+        device=ring.device,
+    )
+    if needed >= 2**20:
+        logging.getLogger("cprl").info(
+            "Replay buffers of %d learners x %s transitions: %.2f GiB of %.1f GiB free",
+            ring.lanes,
+            f"{ring.capacity:,}",
+            needed / 2**30,
+            free_bytes(ring.device) / 2**30,
+        )
+
+
+def _at_least(numbers: Any, lowest: int) -> Any:
+    """`clip` from below; numpy's `clip` checks the limits of the dtype, which takes five times as long."""
+    return np.maximum(numbers, lowest) if isinstance(numbers, np.ndarray) else numbers.clip(min=lowest)
+
+
+def _any(flags: Any) -> bool:
+    return bool(np.count_nonzero(flags) if isinstance(flags, np.ndarray) else flags.any())
+
+
+def _part(whole: Tensor, part: Tensor) -> Tensor:
+    """A copy of the part, because saving a view would write the whole tensor behind it."""
+    return whole if part.shape == whole.shape else part.clone()

@@ -1,0 +1,42 @@
+"""Learners of plain DQN, and its loss over one network, for tests of learners and engines."""
+
+from functools import partial
+
+import numpy as np
+
+from cprl.algorithms import DQN, DQNSettings
+from cprl.learners.replay import ReplayLearner
+from cprl.learners.transitions import LaneTurn
+
+
+def dqn_learner(spaces, *, settings, kind=ReplayLearner, **how):
+    algorithm = DQN(settings=settings)
+    parts = {"make_network": partial(algorithm.make_network, spaces), "make_loss": algorithm.make_loss}
+    return kind(spaces, settings=settings, **{**parts, **how})
+
+
+def dqn_loss(network, *, gamma):
+    return DQN(settings=DQNSettings(gamma=gamma)).make_loss(network)
+
+
+def write(ring, transitions):
+    """Writes a transition of every lane, [L], under TorchRL's default keys."""
+    after = transitions["next"]
+    flags = (after[name].flatten().numpy() for name in ("done", "terminated"))
+    before = (transitions[name].numpy() for name in ("observation", "action"))
+    ring.write(LaneTurn(*before, after["observation"].numpy(), after["reward"].squeeze(-1).numpy(), *flags))
+
+
+def q_table(learner, lane):
+    """The table of a lane of a `TabularLearner`, a row a state it has met: the bytes of all that it observed,
+    the window, and of each action its value and its visits."""
+    states, values, visits = learner.tables.of_lane(lane)
+    size = np.prod(learner.spaces.observation_shape) * np.dtype(learner.spaces.observation_dtype).itemsize
+    seen = np.ascontiguousarray(states[:, :size]).view(learner.spaces.observation_dtype)
+    seen = seen.reshape(len(states), *learner.spaces.observation_shape)
+    return {
+        "state": [state.tobytes() for state in states],
+        "observation": seen,
+        "values": values,
+        "visits": visits,
+    }
