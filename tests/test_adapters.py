@@ -240,15 +240,6 @@ def test_decisions_are_those_of_the_reset_in_pettingzoo_and_an_unnamed_agent_tak
         assert adapter.payments.in_force.tolist() == [[rate]]
 
 
-@pytest.mark.parametrize("play", [played_in_parallel, played_turn_by_turn])
-def test_the_same_seed_repeats_whole_episodes(play):
-    game = presets.game("commons")
-    turns = random_actions(300, 1, game, seed=3)[:, 0]
-    decisions = random_decisions(9, 1, game)[:, 0]
-    for one, other in zip(play(game, turns, decisions), play(game, turns, decisions), strict=True):
-        assert all(np.array_equal(other[entry], value) for entry, value in one.items())
-
-
 @pytest.mark.parametrize("adapter", [parallel_env, CommonsGymnasiumEnv])
 def test_reset_with_a_seed_restarts_and_without_one_begins_the_next_episode(adapter):
     game = presets.game("single_complex")

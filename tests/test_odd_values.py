@@ -30,8 +30,6 @@ INF, NAN = float("inf"), float("nan")
         (lambda: BOARD(height=9999, width=9999), "Map has 9,999 x 9,999 = .*; allowed: at most 1,048,576"),
         (lambda: maps.random(9, 9, agents=1, density=NAN), "density is nan; allowed: "),
         (lambda: Rules(hits_to_tag=10**5000), r"hits_to_tag is .*; allowed: "),
-        (lambda: Batch(GAME, 2, threads=10**6), "threads is 1000000; allowed: an integer from 1 to 1024"),
-        (lambda: Batch(GAME, 2, first_world=-1), "first_world is -1; allowed: "),
         (lambda: CommonsEnv(GAME, seed=2**64), "seed is 18446744073709551616; allowed: "),
         (lambda: CommonsEnv(GAME, 0), "worlds is 0; allowed: an integer from 1"),
         (lambda: CommonsEnv(GAME, device="x"), "device is 'x'; allowed: "),
@@ -103,15 +101,6 @@ def test_a_mask_of_another_form_is_refused_before_the_kernel_reads_it(which):
     with pytest.raises(ValueError, match=r"which is .*; allowed: bool \[2\]"):
         batch.begin(output, which)
     assert batch.now.episode.tolist() == [[0], [0]]
-
-
-def test_a_reset_mask_of_another_form_is_refused():
-    env = CommonsEnv(GAME, 2)
-    env.reset()
-    for mask in (torch.ones(2, 1, dtype=torch.int64), torch.ones(2, 3, dtype=torch.bool)):
-        with pytest.raises(ValueError, match=r"which is .*; allowed: bool \[2\]"):
-            env._begin(mask)
-    assert env.worlds.now.episode.tolist() == [[0], [0]]
 
 
 def test_worlds_that_have_not_begun_are_not_played():
