@@ -219,10 +219,10 @@ class Batch:
 
     def _state_arrays(self) -> dict[str, NDArray[Any]]:
         """The driver's arrays of a state by name."""
-        found = {name: getattr(self.now, name) for name in states.names(self.game)}
+        arrays = {name: getattr(self.now, name) for name in states.names(self.game)}
         if self.memory is not None:
-            found |= {name: getattr(self.memory, name) for name in REMEMBERED}
-        return found
+            arrays |= {name: getattr(self.memory, name) for name in REMEMBERED}
+        return arrays
 
     def load(self, state: Mapping[str, NDArray[Any]], output: Output) -> Output:
         """Sets the state of the worlds and writes it into `output`, with no harvest, shots, hits or growth,
@@ -272,7 +272,7 @@ def turn_of(output: Output) -> StepOutput:
 
 def output_of(arrays: Iterable[Any]) -> Output:
     """An output out of its arrays, in the order of `output_forms`."""
-    found = list(arrays)
-    turn = StepOutput(*found[: len(StepOutput._fields)])
-    rest = found[len(StepOutput._fields) :]
+    in_order = list(arrays)
+    turn = StepOutput(*in_order[: len(StepOutput._fields)])
+    rest = in_order[len(StepOutput._fields) :]
     return GovernedOutput(turn, Payments(*rest)) if rest else turn

@@ -204,7 +204,7 @@ class Game:
         )
 
     def __getstate__(self) -> dict[str, object]:
-        return {own.name: getattr(self, own.name) for own in fields(self)}
+        return {field.name: getattr(self, field.name) for field in fields(self)}
 
 
 def output_forms(game: Game, worlds: int) -> dict[str, Form]:

@@ -67,7 +67,7 @@ def build_institution_tables(
 
 
 def _of(kind: Any, institutions: Sequence[Institution]) -> list[Any]:
-    return [own for own in institutions if isinstance(own, kind)]
+    return [institution for institution in institutions if isinstance(institution, kind)]
 
 
 def _floats(values: Sequence[float]) -> Any:
@@ -88,32 +88,32 @@ def _fine(value: float | None) -> float:
 
 def _voted(institutions: Sequence[Institution], kind: type[Any]) -> list[tuple[Any, int]]:
     """Institutions of a kind, each with the index of the ballot that decides its value, or -1."""
-    found, ballot = [], 0
-    for own in institutions:
-        if isinstance(own, kind):
-            found.append((own, -1))
-        elif isinstance(own, Vote) and isinstance(own.on, kind):
-            found.append((own.on, ballot))
-        ballot += is_decided(own)
-    return found
+    voted_on, ballot = [], 0
+    for institution in institutions:
+        if isinstance(institution, kind):
+            voted_on.append((institution, -1))
+        elif isinstance(institution, Vote) and isinstance(institution.on, kind):
+            voted_on.append((institution.on, ballot))
+        ballot += is_decided(institution)
+    return voted_on
 
 
 def _boundary_tables(institutions: Sequence[Institution], board: Map, tables: Tables) -> dict[str, Any]:
-    found = _of(Boundaries, institutions)
+    boundaries = _of(Boundaries, institutions)
     rows = tables.background.size // tables.stride
-    own = np.ones((len(found), board.agents, rows, tables.stride), np.bool_)
+    may_use = np.ones((len(boundaries), board.agents, rows, tables.stride), np.bool_)
     inside = slice(tables.rim, tables.rim + board.height), slice(tables.rim, tables.rim + board.width)
-    for nth, boundary in enumerate(found):
+    for number, boundary in enumerate(boundaries):
         signs = np.array([list(row) for row in boundary.regions])
         for agent in range(board.agents):
-            own[(nth, agent, *inside)] = np.isin(signs, [OPEN, *boundary.signs_of(agent)])
+            may_use[(number, agent, *inside)] = np.isin(signs, [OPEN, *boundary.signs_of(agent)])
     return {
-        "own": own.reshape(len(found), board.agents, tables.background.size),
-        "bite_stopped": _bools([boundary.bite_fine is None for boundary in found]),
-        "bite_fine": _floats([_fine(boundary.bite_fine) for boundary in found]),
-        "step_is_violation": _bools([boundary.step_fine is not None for boundary in found]),
-        "step_fine": _floats([_fine(boundary.step_fine) for boundary in found]),
-        "own_shown": _bools([boundary.observed for boundary in found]),
+        "own": may_use.reshape(len(boundaries), board.agents, tables.background.size),
+        "bite_stopped": _bools([boundary.bite_fine is None for boundary in boundaries]),
+        "bite_fine": _floats([_fine(boundary.bite_fine) for boundary in boundaries]),
+        "step_is_violation": _bools([boundary.step_fine is not None for boundary in boundaries]),
+        "step_fine": _floats([_fine(boundary.step_fine) for boundary in boundaries]),
+        "own_shown": _bools([boundary.observed for boundary in boundaries]),
     }
 
 
@@ -124,21 +124,21 @@ def _most(quota: Quota, ballot: int, voted: Sequence[Ballot]) -> float:
 
 def _quota_tables(institutions: Sequence[Institution], board: Map, rules: Rules) -> dict[str, Any]:
     voted = ballots(institutions, board.agents)
-    found = _voted(institutions, Quota)
-    of_agent = sustainable_yield(board, rules) / board.agents if found else 0.0
-    for quota, ballot in found:
+    quotas = _voted(institutions, Quota)
+    of_agent = sustainable_yield(board, rules) / board.agents if quotas else 0.0
+    for quota, ballot in quotas:
         _warn_of_less_than_an_apple(quota, of_agent * _most(quota, ballot, voted))
     return {
-        "quota_unit": _floats([of_agent * quota.window_steps for quota, _ in found]),
+        "quota_unit": _floats([of_agent * quota.window_steps for quota, _ in quotas]),
         "quota_full": _floats(
-            [of_agent * quota.window_steps * _most(quota, ballot, voted) for quota, ballot in found]
+            [of_agent * quota.window_steps * _most(quota, ballot, voted) for quota, ballot in quotas]
         ),
-        "quota_share": _floats([quota.share for quota, _ in found]),
-        "quota_ballot": _ints([ballot for _, ballot in found]),
-        "quota_steps": _ints([quota.window_steps for quota, _ in found]),
-        "quota_by_stock": _bools([quota.by_stock for quota, _ in found]),
-        "quota_stopped": _bools([quota.fine is None for quota, _ in found]),
-        "quota_fine": _floats([_fine(quota.fine) for quota, _ in found]),
+        "quota_share": _floats([quota.share for quota, _ in quotas]),
+        "quota_ballot": _ints([ballot for _, ballot in quotas]),
+        "quota_steps": _ints([quota.window_steps for quota, _ in quotas]),
+        "quota_by_stock": _bools([quota.by_stock for quota, _ in quotas]),
+        "quota_stopped": _bools([quota.fine is None for quota, _ in quotas]),
+        "quota_fine": _floats([_fine(quota.fine) for quota, _ in quotas]),
     }
 
 
@@ -156,12 +156,12 @@ def _warn_of_less_than_an_apple(quota: Quota, apples_a_turn: float) -> None:
 
 
 def _season_tables(institutions: Sequence[Institution]) -> dict[str, Any]:
-    found = _of(ClosedSeason, institutions)
+    seasons = _of(ClosedSeason, institutions)
     return {
-        "season_steps": _ints([season.period_steps for season in found]),
-        "season_open": _ints([season.period_steps - season.closed_steps for season in found]),
-        "season_stopped": _bools([season.fine is None for season in found]),
-        "season_fine": _floats([_fine(season.fine) for season in found]),
+        "season_steps": _ints([season.period_steps for season in seasons]),
+        "season_open": _ints([season.period_steps - season.closed_steps for season in seasons]),
+        "season_stopped": _bools([season.fine is None for season in seasons]),
+        "season_fine": _floats([_fine(season.fine) for season in seasons]),
     }
 
 
@@ -182,15 +182,15 @@ def patches_of(board: Map, rules: Rules) -> Ints:
 
 
 def _patch_tables(institutions: Sequence[Institution], board: Map, rules: Rules) -> dict[str, Any]:
-    found = _of(ClosedPatches, institutions)
-    patch = patches_of(board, rules) if found else np.zeros(len(board.sites), np.int32)
+    closures = _of(ClosedPatches, institutions)
+    patch = patches_of(board, rules) if closures else np.zeros(len(board.sites), np.int32)
     return {
         "patch_of": patch,
-        "patch_sites": np.bincount(patch).astype(np.int32) if found else _ints([]),
-        "patch_below": int(found[0].below) if found else 0,
-        "patch_stopped": bool(found and found[0].fine is None),
-        "patch_fine": _fine(found[0].fine) if found else 0.0,
-        "patch_shown": bool(found and found[0].observed),
+        "patch_sites": np.bincount(patch).astype(np.int32) if closures else _ints([]),
+        "patch_below": int(closures[0].below) if closures else 0,
+        "patch_stopped": bool(closures and closures[0].fine is None),
+        "patch_fine": _fine(closures[0].fine) if closures else 0.0,
+        "patch_shown": bool(closures and closures[0].observed),
     }
 
 
@@ -204,9 +204,9 @@ def _tax_tables(institutions: Sequence[Institution], agents: int) -> dict[str, A
         rows.append((-1, 1, (0,) * agents, ((0.0, levies.joint_rate),)))
     most = max((len(brackets) for *_, brackets in rows), default=1)
     from_, rate = np.full((len(rows), most), np.inf), np.zeros((len(rows), most))
-    for nth, (*_, brackets) in enumerate(rows):
-        from_[nth, : len(brackets)] = [start for start, _ in brackets]
-        rate[nth, : len(brackets)] = [own for _, own in brackets]
+    for row_number, (*_, brackets) in enumerate(rows):
+        from_[row_number, : len(brackets)] = [start for start, _ in brackets]
+        rate[row_number, : len(brackets)] = [share for _, share in brackets]
     return {
         "tax_from": from_,
         "tax_rate": rate,
@@ -218,8 +218,8 @@ def _tax_tables(institutions: Sequence[Institution], agents: int) -> dict[str, A
 
 def _ballot_tables(voted: Sequence[Ballot]) -> dict[str, Any]:
     choices = np.zeros((len(voted), max((len(ballot.choices) for ballot in voted), default=1)))
-    for nth, ballot in enumerate(voted):
-        choices[nth, : len(ballot.choices)] = ballot.choices
+    for number, ballot in enumerate(voted):
+        choices[number, : len(ballot.choices)] = ballot.choices
     return {
         "ballot_options": _ints([len(ballot.choices) for ballot in voted]),
         "ballot_choice": choices,
@@ -230,12 +230,12 @@ def _ballot_tables(voted: Sequence[Ballot]) -> dict[str, Any]:
 
 
 def _ballot_called(voted: Sequence[Ballot], title: str) -> int:
-    return next((nth for nth, ballot in enumerate(voted) if ballot.title == title), -1)
+    return next((number for number, ballot in enumerate(voted) if ballot.title == title), -1)
 
 
 def _monitoring_tables(institutions: Sequence[Institution], voted: Sequence[Ballot]) -> dict[str, Any]:
-    found = _of(Monitoring, institutions)
-    monitoring = found[0] if found else Monitoring(prob=1.0)
+    monitorings = _of(Monitoring, institutions)
+    monitoring = monitorings[0] if monitorings else Monitoring(prob=1.0)
     return {
         "detected_below": threshold(monitoring.prob),
         "monitor_cost": float(monitoring.cost),
@@ -245,16 +245,18 @@ def _monitoring_tables(institutions: Sequence[Institution], voted: Sequence[Ball
 
 
 def _sanction_tables(institutions: Sequence[Institution], agents: int) -> dict[str, Any]:
-    found, mediated = _of(GraduatedSanctions, institutions), _of(Mediation, institutions)
+    sanctions, mediated = _of(GraduatedSanctions, institutions), _of(Mediation, institutions)
     steps = np.zeros((agents, 0), np.int32)
-    if found:
-        row = found[0].freeze_steps
-        steps = np.broadcast_to(np.array(row, np.int32), (agents, len(row[0] if found[0].is_table else row)))
-    on = found[0].on if found else ""
+    if sanctions:
+        row = sanctions[0].freeze_steps
+        steps = np.broadcast_to(
+            np.array(row, np.int32), (agents, len(row[0] if sanctions[0].is_table else row))
+        )
+    on = sanctions[0].on if sanctions else ""
     return {
         "sanction_steps": np.ascontiguousarray(steps),
-        "sanction_fine": _floats(found[0].fines if found else ()),
-        "sanction_recovery": int(found[0].recovery_steps or 0) if found else 0,
+        "sanction_fine": _floats(sanctions[0].fines if sanctions else ()),
+        "sanction_recovery": int(sanctions[0].recovery_steps or 0) if sanctions else 0,
         "sanctions_tags": on in ("tags", "both"),
         "sanctions_violations": on in ("violations", "both"),
         "mediation_turns": int(mediated[0].turns) if mediated else 0,
@@ -265,7 +267,9 @@ def _sanction_tables(institutions: Sequence[Institution], agents: int) -> dict[s
 def _firing_tables(
     institutions: Sequence[Institution], voted: Sequence[Ballot], agents: int
 ) -> dict[str, Any]:
-    named = [own.agents for own in _of(Sanctioner, institutions) if own.agents is not None]
+    named = [
+        sanctioner.agents for sanctioner in _of(Sanctioner, institutions) if sanctioner.agents is not None
+    ]
     return {
         "may_fire": _bools([not named or agent in named[0] for agent in range(agents)]),
         "fire_ballot": _ballot_called(voted, "who may fire"),
@@ -277,7 +281,9 @@ _ABOUT_PLACES: Final = (Boundaries, ClosedPatches)
 
 def shows_places(institutions: Sequence[Institution]) -> bool:
     """Whether agents see where bites are forbidden."""
-    return any(isinstance(own, _ABOUT_PLACES) and own.observed for own in institutions)
+    return any(
+        isinstance(institution, _ABOUT_PLACES) and institution.observed for institution in institutions
+    )
 
 
 def entries_shown(institutions: Sequence[Institution], agents: int) -> list[tuple[int, int]]:
@@ -321,8 +327,8 @@ def check_institutions(institutions: tuple[Any, ...], board: Map, rules: Rules, 
         raise ValueError(
             f"Game.institutions has {len(institutions)} entries; allowed: at most {MOST_INSTITUTIONS}"
         )
-    for own in institutions:
-        kind = type(own)
+    for institution in institutions:
+        kind = type(institution)
         if kind not in KINDS:
             raise ValueError(
                 f"Game.institutions has a {kind.__name__}; allowed: "
@@ -334,17 +340,17 @@ def check_institutions(institutions: tuple[Any, ...], board: Map, rules: Rules, 
             raise ValueError(
                 f"Game.institutions has {of_kind} of {kind.__name__}; allowed: at most {kind.at_most}"
             )
-        own.check_board(agents=board.agents, height=board.height, width=board.width)
-        _check_observation(own, form)
-        needs_tags = isinstance(own, Sanctioner | Mediation) or (
-            isinstance(own, GraduatedSanctions) and own.on == "tags"
+        institution.check_board(agents=board.agents, height=board.height, width=board.width)
+        _check_observation(institution, form)
+        needs_tags = isinstance(institution, Sanctioner | Mediation) or (
+            isinstance(institution, GraduatedSanctions) and institution.on == "tags"
         )
         if needs_tags and not rules.may_fire:
             raise ValueError(
                 f"Game.institutions has a {kind.__name__} and Rules.may_fire is False; allowed: a game in "
                 "which agents may fire"
             )
-        _check_effect(own, institutions, rules)
+        _check_effect(institution, institutions, rules)
     options = decision_options(institutions, board.agents)
     if options > MOST_DECISIONS:
         raise ValueError(
@@ -353,34 +359,34 @@ def check_institutions(institutions: tuple[Any, ...], board: Map, rules: Rules, 
         )
 
 
-def _check_effect(own: Institution, institutions: tuple[Any, ...], rules: Rules) -> None:
+def _check_effect(institution: Institution, institutions: tuple[Any, ...], rules: Rules) -> None:
     """Refuses what pursues violations of rules where there is no rule that can be broken."""
     if any(_can_be_broken(other) for other in institutions):
         return
     name, allowed = (
-        type(own).__name__,
+        type(institution).__name__,
         "a Boundaries, Quota or the like with a fine, or a Mediation, beside it",
     )
-    if isinstance(own, Monitoring) and own.cost == 0:
+    if isinstance(institution, Monitoring) and institution.cost == 0:
         raise ValueError(f"{name} has no violation to detect; allowed: {allowed}, or a cost above 0")
-    if isinstance(own, GraduatedSanctions) and (own.on == "violations" or not rules.may_fire):
-        raise ValueError(f'{name} with on="{own.on}" has no offence to sanction; allowed: {allowed}')
+    if isinstance(institution, GraduatedSanctions) and (institution.on == "violations" or not rules.may_fire):
+        raise ValueError(f'{name} with on="{institution.on}" has no offence to sanction; allowed: {allowed}')
 
 
-def _can_be_broken(own: Any) -> bool:
+def _can_be_broken(institution: Any) -> bool:
     """Whether an institution is a rule that agents can break."""
-    own = own.on if isinstance(own, Vote) else own
-    if isinstance(own, Boundaries):
-        return own.bite_fine is not None or own.step_fine is not None
-    if isinstance(own, Quota | ClosedSeason | ClosedPatches):
-        return own.fine is not None
-    return isinstance(own, Mediation)
+    institution = institution.on if isinstance(institution, Vote) else institution
+    if isinstance(institution, Boundaries):
+        return institution.bite_fine is not None or institution.step_fine is not None
+    if isinstance(institution, Quota | ClosedSeason | ClosedPatches):
+        return institution.fine is not None
+    return isinstance(institution, Mediation)
 
 
-def _check_observation(own: Institution, form: Observation) -> None:
-    lacking = [name for name in type(own).needs if own.observed and not getattr(form, name)]
+def _check_observation(institution: Institution, form: Observation) -> None:
+    lacking = [name for name in type(institution).needs if institution.observed and not getattr(form, name)]
     if lacking:
         raise ValueError(
-            f"{type(own).__name__}.observed is True and Observation.{lacking[0]} is False; allowed: "
-            f"Observation({lacking[0]}=True), or {type(own).__name__}(observed=False)"
+            f"{type(institution).__name__}.observed is True and Observation.{lacking[0]} is False; allowed: "
+            f"Observation({lacking[0]}=True), or {type(institution).__name__}(observed=False)"
         )

@@ -106,13 +106,13 @@ def cells_of(name: str, entries: Any, form: tuple[str, ...] = CELL) -> tuple[Any
     if not isinstance(entries, type) and callable(getattr(entries, "tolist", None)):
         with suppress(NotImplementedError):  # of a tensor without data, which is refused below
             entries = entries.tolist()
-    found = []
+    cells = []
     for place, entry in enumerate(listed(name, entries, f"a sequence of {allowed} each")):
         numbers = tuple(map(as_integer, listed(f"{name}[{place}]", entry, allowed)))
         if len(numbers) != len(form) or None in numbers:
             raise refusal(f"{name}[{place}]", entry, allowed)
-        found.append(numbers)
-    return tuple(found)
+        cells.append(numbers)
+    return tuple(cells)
 
 
 def _check_entries(board: Map) -> None:

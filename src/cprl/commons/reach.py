@@ -21,18 +21,22 @@ def why_out_of_reach(
     Agents walk over all cells but walls, also through each other's, since others may move away. `Boundaries`
     without a fine stop bites, not steps.
     """
-    stops = [own for own in institutions if isinstance(own, Boundaries) and own.bite_fine is None]
+    stops = [
+        boundaries
+        for boundaries in institutions
+        if isinstance(boundaries, Boundaries) and boundaries.bite_fine is None
+    ]
     if not board.walls and not stops:
         return None
     starts, walls = [(row, col) for row, col, _ in board.starts], set(board.walls)
     if not stops:
-        found = _reaches(board, walls, starts, set(board.sites))
+        is_reached = _reaches(board, walls, starts, set(board.sites))
     else:
-        found = any(
+        is_reached = any(
             _reaches(board, walls, starts if shuffle_starts else [starts[agent]], _own(board, stops, agent))
             for agent in range(board.agents)
         )
-    if found:
+    if is_reached:
         return None
     named = "; ".join(f"row {row}, column {col}" for row, col in starts[:_STARTS_NAMED])
     more = "; ..." if len(starts) > _STARTS_NAMED else ""
@@ -48,7 +52,7 @@ def _own(board: Map, stops: Sequence[Boundaries], agent: int) -> set[Cell]:
     return {
         (row, col)
         for row, col in board.sites
-        if all(own.regions[row][col] in OPEN + own.signs_of(agent) for own in stops)
+        if all(boundaries.regions[row][col] in OPEN + boundaries.signs_of(agent) for boundaries in stops)
     }
 
 

@@ -103,9 +103,9 @@ def _check_memory(arrays: State, game: Game) -> None:
     for name in ("allowed", "income"):
         wrong = ~(np.isfinite(arrays[name]) & (arrays[name] >= 0))
         _refuse(arrays, name, wrong, "a number of at least 0")
-    for nth, ballot in enumerate(game.ballots):
+    for number, ballot in enumerate(game.ballots):
         wrong = np.zeros(arrays["in_force"].shape, np.bool_)
-        wrong[:, nth] = ~np.isin(arrays["in_force"][:, nth], ballot.choices)
+        wrong[:, number] = ~np.isin(arrays["in_force"][:, number], ballot.choices)
         _refuse(arrays, "in_force", wrong, f"one of {list(ballot.choices)}")
 
 

@@ -110,10 +110,10 @@ class CpuThreads:
             entry(*whole)
             return
         bounds = [size * t // self.threads for t in range(self.threads + 1)]
-        *others, own = zip(self._scratch, bounds, bounds[1:], strict=False)
+        *others, last_share = zip(self._scratch, bounds, bounds[1:], strict=False)
         pool = _pool(os.getpid(), self.threads - 1)
         shares = [pool.submit(entry, *arguments, *share) for share in others]
-        entry(*arguments, *own)
+        entry(*arguments, *last_share)
         for share in shares:
             share.result()
 

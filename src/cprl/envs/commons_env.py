@@ -156,8 +156,8 @@ class CommonsEnv(LeanStepEnv):
             names, blocks = list(self._forms), [self._block(*form) for form in self._forms.values()]
             tensors = zip(*(block.unbind() for block in blocks), strict=True)
             arrays = zip(*(self._turns_of(block) for block in blocks), strict=True)
-            for own, output in zip(tensors, arrays, strict=True):
-                self._ahead.append((dict(zip(names, own, strict=True)), output_of(output)))
+            for turn, output in zip(tensors, arrays, strict=True):
+                self._ahead.append((dict(zip(names, turn, strict=True)), output_of(output)))
         return self._ahead.pop()
 
     def _show_in(self, tensors: dict[str, Tensor], output: Output) -> None:

@@ -120,13 +120,13 @@ def check_env(env: EnvBase, worlds: int) -> None:
     spaces = spaces_of(env)
     reward = env.full_reward_spec.get(keys.REWARD, None)
     if reward is None or tuple(reward.shape) != (worlds, spaces.agents, 1):
-        found = None if reward is None else list(reward.shape)
-        raise ValueError(f'("agents", "reward") is {found}; allowed: [{worlds}, {spaces.agents}, 1]')
+        shape = None if reward is None else list(reward.shape)
+        raise ValueError(f'("agents", "reward") is {shape}; allowed: [{worlds}, {spaces.agents}, 1]')
     for name in (keys.DONE, keys.TERMINATED, keys.TRUNCATED):
         done = env.full_done_spec.get(name, None)
         if done is None or tuple(done.shape) != (worlds, 1):
-            found = None if done is None else list(done.shape)
-            raise ValueError(f'"{name}" at the root is {found}; allowed: [{worlds}, 1]')
+            shape = None if done is None else list(done.shape)
+            raise ValueError(f'"{name}" at the root is {shape}; allowed: [{worlds}, 1]')
 
 
 def _spec(env: EnvBase, name: str) -> Any:

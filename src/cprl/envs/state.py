@@ -20,10 +20,10 @@ def env_state(env: EnvBase) -> dict[str, Any]:
     tensors, numbers, lists and tables."""
     commons = commons_of(env)
     if commons is None:
-        own = dict(base_env(env).state_dict())
+        worlds = dict(base_env(env).state_dict())
     else:
-        own = {name: _tensor(array) for name, array in commons.worlds.state().items()}
-    return {"worlds": own, "transforms": _all_of_transforms(env)}
+        worlds = {name: _tensor(array) for name, array in commons.worlds.state().items()}
+    return {"worlds": worlds, "transforms": _all_of_transforms(env)}
 
 
 def load_env_state(env: EnvBase, state: Mapping[str, Any]) -> None:
@@ -81,7 +81,7 @@ def _all_of_transforms(env: EnvBase) -> dict[str, Any]:
         return {}
     kept = env.transform.state_dict(keep_vars=True)
     sound = {name: value for name, value in kept.items() if not is_lazy(value)}
-    return {name: own.detach() if isinstance(own, Tensor) else own for name, own in sound.items()}
+    return {name: value.detach() if isinstance(value, Tensor) else value for name, value in sound.items()}
 
 
 def _load(env: TransformedEnv, state: dict[str, Any]) -> None:

@@ -90,7 +90,7 @@ class TakingGame(StageGame):
 
     def to_config(self) -> dict[str, Any]:
         """Its fields."""
-        return {own.name: getattr(self, own.name) for own in fields(self)}
+        return {field.name: getattr(self, field.name) for field in fields(self)}
 
     def make(self, worlds: int, seed: int, device: Any, *, first_world: int = 0) -> "TakingEnv":
         """Its environment, so many worlds; see `TakingEnv`."""

@@ -31,8 +31,8 @@ def agent_count(env: EnvBase) -> int:
     reward = env.full_reward_spec.get(keys.REWARD, None)
     shape = None if reward is None else tuple(reward.shape)
     if shape is None or len(shape) != 3 or shape[::2] != (*size, 1):
-        found = None if shape is None else list(shape)
-        raise ValueError(f'("agents", "reward") is {found}; allowed: [{size[0]}, N, 1]')
+        came = None if shape is None else list(shape)
+        raise ValueError(f'("agents", "reward") is {came}; allowed: [{size[0]}, N, 1]')
     return int(shape[1])
 
 

@@ -50,16 +50,16 @@ OF_ELECTIONS: Final = ("period_episodes", "override_prob")
 """The fields that say how an election is held."""
 
 
-def check_no_election(own: Institution, elects: str) -> None:
+def check_no_election(institution: Institution, elects: str) -> None:
     """Checks that an institution without an election says nothing about how one is held.
 
     Args:
-        own: the institution.
+        institution: the institution.
         elects: what it would have to be for an election, in words.
     """
-    for field in fields(own):
-        if field.name in OF_ELECTIONS and (value := getattr(own, field.name)) != field.default:
+    for field in fields(institution):
+        if field.name in OF_ELECTIONS and (value := getattr(institution, field.name)) != field.default:
             raise ValueError(
-                f"{type(own).__name__}.{field.name} is {value!r} and nobody is elected; allowed: "
+                f"{type(institution).__name__}.{field.name} is {value!r} and nobody is elected; allowed: "
                 f"{field.default!r}, or others where {elects}"
             )

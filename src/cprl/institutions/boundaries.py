@@ -101,7 +101,7 @@ def _are_owners(value: Any) -> bool:
     return value is None or (
         isinstance(value, tuple)
         and bool(value)
-        and all(isinstance(own, str) and OPEN not in own and NOBODY not in own for own in value)
+        and all(isinstance(signs, str) and OPEN not in signs and NOBODY not in signs for signs in value)
     )
 
 

@@ -93,9 +93,9 @@ class Ballot(NamedTuple):
     override_prob: float
 
 
-def is_decided(own: Institution) -> bool:
+def is_decided(institution: Institution) -> bool:
     """Whether agents decide something about this institution, so that it has a ballot."""
-    return bool(ballots((own,), agents=1))
+    return bool(ballots((institution,), agents=1))
 
 
 def ballots(institutions: Sequence[Institution], agents: int) -> tuple[Ballot, ...]:
@@ -104,17 +104,23 @@ def ballots(institutions: Sequence[Institution], agents: int) -> tuple[Ballot, .
     A decision is one number for all ballots: the choice of the first one plus its number of choices times the
     choice of the second one, and so on.
     """
-    found = []
+    held = []
     everyone = tuple(float(agent) for agent in range(agents))
-    for own in institutions:
-        if isinstance(own, Vote):
-            title = "the tax rate" if isinstance(own.on, Tax) else "the quota's share"
-            found.append(Ballot(title, own.choices, False, own.period_episodes, own.override_prob))
-        elif isinstance(own, Sanctioner) and own.agents is None:
-            found.append(Ballot("who may fire", everyone, True, own.period_episodes, own.override_prob))
-        elif isinstance(own, Monitoring) and own.monitor == ELECTED:
-            found.append(Ballot("who monitors", everyone, True, own.period_episodes, 0.0))
-    return tuple(found)
+    for institution in institutions:
+        if isinstance(institution, Vote):
+            title = "the tax rate" if isinstance(institution.on, Tax) else "the quota's share"
+            held.append(
+                Ballot(
+                    title, institution.choices, False, institution.period_episodes, institution.override_prob
+                )
+            )
+        elif isinstance(institution, Sanctioner) and institution.agents is None:
+            held.append(
+                Ballot("who may fire", everyone, True, institution.period_episodes, institution.override_prob)
+            )
+        elif isinstance(institution, Monitoring) and institution.monitor == ELECTED:
+            held.append(Ballot("who monitors", everyone, True, institution.period_episodes, 0.0))
+    return tuple(held)
 
 
 def decision_options(institutions: Sequence[Institution], agents: int) -> int:
@@ -127,7 +133,7 @@ def _are_choices(value: Any) -> bool:
     return (
         isinstance(value, tuple)
         and len(value) >= 2
-        and all(is_number(own, 0, 1e6) for own in value)
+        and all(is_number(choice, 0, 1e6) for choice in value)
         and list(value) == sorted(set(value))
     )
 

@@ -76,14 +76,16 @@ class Levies(Institution):
     @property
     def group_of(self) -> tuple[int, ...]:
         """The index of each agent's group: [N]."""
-        by_agent = {agent: nth for nth, group in enumerate(self.groups) for agent in group}
+        by_agent = {agent: number for number, group in enumerate(self.groups) for agent in group}
         return tuple(by_agent[agent] for agent in sorted(by_agent))
 
 
 def _are_brackets(value: Any) -> bool:
-    if not isinstance(value, tuple) or not all(isinstance(own, tuple) and len(own) == 2 for own in value):
+    if not isinstance(value, tuple) or not all(
+        isinstance(bracket, tuple) and len(bracket) == 2 for bracket in value
+    ):
         return False
-    starts = [own[0] for own in value]
+    starts = [bracket[0] for bracket in value]
     return (
         all(is_number(start, 0, 1e6) and is_number(rate, 0, 1) for start, rate in value)
         and starts == sorted(set(starts))
