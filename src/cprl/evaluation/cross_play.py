@@ -13,11 +13,10 @@ with the background agents.
 
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
-from functools import partial
 from itertools import product
 from pathlib import Path
 from statistics import fmean
-from typing import Final, Literal, TypeAlias, get_args
+from typing import Any, Final, Literal, TypeAlias, get_args
 
 import matplotlib
 import numpy as np
@@ -41,7 +40,7 @@ from cprl.evaluation.evaluate import (
     table_of,
     unit_of_rewards,
 )
-from cprl.evaluation.lanes import Played, Source, play, policies_of, pooled
+from cprl.evaluation.lanes import Played, Source, play_sources, pooled
 from cprl.measuring.metrics import with_unit
 from cprl.measuring.statistics import (
     Estimate,
@@ -182,17 +181,23 @@ def crossplay(
     if diagonal == "cross_seed" and len(numbers) < 2:
         raise ValueError(f"the replicas are {numbers}; allowed for cross_seed: at least 2")
     following = dict(zip(numbers, [*numbers[1:], numbers[0]], strict=True))
-    among = partial(_played_among, replicas=numbers, episodes=episodes, seed=seed, explore=not greedy)
+    how: dict[str, Any] = {"episodes": episodes, "seed": seed, "explore": not greedy}
     cells = {}
     for focal, background in product(named, repeat=2):
-        is_self_play = focal == background and diagonal == "self"
-        of_replicas = following if focal == background and not is_self_play else None
-        focal_source = None if is_self_play else Source(named[focal], of_replicas)
+        where, is_self_play = named[background], focal == background and diagonal == "self"
+        themselves, agents = [Source(where)] * first.game.agents, range(first.game.agents)
+        if is_self_play:
+            by_agent = dict.fromkeys(agents, play_sources(where, themselves, numbers, **how))
+        else:
+            visitor = Source(named[focal], following if focal == background else None)
+            by_agent = {
+                agent: play_sources(
+                    where, [*themselves[:agent], visitor, *themselves[agent + 1 :]], numbers, **how
+                )
+                for agent in agents
+            }
         cells[focal, background] = Cell(
-            focal=focal,
-            background=background,
-            by_agent=among(focal_source, named[background]),
-            is_self_play=is_self_play,
+            focal=focal, background=background, by_agent=by_agent, is_self_play=is_self_play
         )
     return CrossPlay(
         runs=named,
@@ -203,28 +208,6 @@ def crossplay(
         greedy=greedy,
         diagonal=diagonal,
     )
-
-
-def _played_among(
-    focal_source: Source | None,
-    background: LoadedRun,
-    *,
-    replicas: Sequence[int],
-    episodes: int,
-    seed: int,
-    explore: bool,
-) -> dict[int, Played]:
-    """The episodes by the focal agent's index; without focal agents, self-play runs once for all indices."""
-
-    def played(sources: Sequence[Source]) -> Played:
-        who = partial(policies_of, sources, worlds=episodes, seed=seed)
-        return play(background, who, replicas, episodes=episodes, seed=seed, explore=explore)
-
-    agents = range(background.game.agents)
-    own = [Source(background)] * len(agents)
-    if focal_source is None:
-        return dict.fromkeys(agents, played(own))
-    return {agent: played([*own[:agent], focal_source, *own[agent + 1 :]]) for agent in agents}
 
 
 def named_runs(

@@ -14,7 +14,6 @@ in which one run is played are those of the whole game, the others need not be.
 
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -23,7 +22,7 @@ from numpy.typing import NDArray
 
 from cprl.evaluation.cross_play import CrossPlay, named_runs
 from cprl.evaluation.evaluate import SEED, check, check_same_game, chosen_replicas
-from cprl.evaluation.lanes import Played, Source, play, policies_of
+from cprl.evaluation.lanes import Played, Source, play_sources
 from cprl.measuring.episodes import Episode
 from cprl.runs.episodes import labelled
 from cprl.theory.payoff_table import PayoffTable, compositions
@@ -120,9 +119,8 @@ def play_empirical_game(
     for own in counts.tolist():
         for who in _choices(own):
             sources = [Source(list(named.values())[run]) for run in who]
-            policies = partial(policies_of, sources, worlds=episodes, seed=seed)
-            played[who] = play(
-                sources[0].run, policies, numbers, episodes=episodes, seed=seed, explore=not greedy
+            played[who] = play_sources(
+                sources[0].run, sources, numbers, episodes=episodes, seed=seed, explore=not greedy
             )
     return EmpiricalGame(
         runs=named,

@@ -14,7 +14,7 @@ from cprl import arguments
 from cprl.arguments import SEED as SEED
 from cprl.commons.game import Game
 from cprl.envs.unwrap import agent_names
-from cprl.evaluation.lanes import Played, Source, play, policies_of, random_policies
+from cprl.evaluation.lanes import Played, Source, play, play_sources, random_policies
 from cprl.measuring.metrics import left_out, with_unit
 from cprl.measuring.series import OF_AGENTS
 from cprl.measuring.statistics import (
@@ -158,13 +158,12 @@ def evaluate_run(
     check(episodes=episodes, seed=seed, greedy=greedy, runs=[loaded])
     numbers = chosen_replicas({str(loaded.path): loaded}, replicas)
     sources, common = [Source(loaded)] * loaded.game.agents, {"episodes": episodes, "seed": seed}
-    agents = partial(policies_of, sources, worlds=episodes, seed=seed)
     by_chance = partial(random_policies, loaded, worlds=episodes, seed=seed)
     return Evaluation(
         run=loaded,
         seed=seed,
         greedy=greedy,
-        trained=play(loaded, agents, numbers, explore=not greedy, **common),
+        trained=play_sources(loaded, sources, numbers, explore=not greedy, **common),
         random=play(loaded, by_chance, numbers, explore=True, **common),
     )
 

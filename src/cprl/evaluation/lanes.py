@@ -6,6 +6,7 @@ replica, agent) alone.
 
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from functools import partial
 from typing import Any, Protocol, TypeAlias
 
 import torch
@@ -79,6 +80,20 @@ def play(
         for place, replica in enumerate(group):
             played[replica] = found[place * episodes : (place + 1) * episodes]
     return played
+
+
+def play_sources(
+    where: Place,
+    sources: Sequence[Source],
+    replicas: Sequence[int],
+    *,
+    episodes: int,
+    seed: int,
+    explore: bool,
+) -> Played:
+    """`play` by agents of stored runs: the sources of agent 0, 1 and so on."""
+    policies = partial(policies_of, sources, worlds=episodes, seed=seed)
+    return play(where, policies, replicas, episodes=episodes, seed=seed, explore=explore)
 
 
 def fresh_worlds(
