@@ -93,14 +93,9 @@ class Dilemma:
 
     steps: int = 5
     agents: int = 2
-    hides_state: bool = False
 
     def to_config(self) -> dict[str, Any]:
         return asdict(self)
 
     def make(self, worlds, seed, device):
-        env = MatrixGame(worlds, steps=self.steps)
-        if self.hides_state:
-            env.state_dict = dict
-            env.load_state_dict = lambda state: None
-        return env
+        return MatrixGame(worlds, steps=self.steps)

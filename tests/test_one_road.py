@@ -215,12 +215,6 @@ def test_normalised_observations_are_floats_from_the_environment_to_the_stored_p
         assert cprl.evaluate_run(loaded, episodes=1).trained
 
 
-def test_a_game_that_hides_its_state_is_refused_before_anything_is_written(tmp_path):
-    with pytest.raises(ValueError, match="does not hold all of its state"):
-        cprl.run(replace(DILEMMA, game=Dilemma(hides_state=True)), tmp_path / "run", watch="off")
-    assert not (tmp_path / "run").exists()
-
-
 @pytest.mark.integration
 def test_an_experiment_with_torchrls_own_engine_is_stopped_loaded_and_resumed(tmp_path, monkeypatch, capsys):
     experiment = replace(

@@ -1,9 +1,11 @@
 """make_env, the one place where an environment is put together, and games of the user's own in recipes."""
 
 from collections.abc import Iterable, Mapping
+from copy import deepcopy
 from typing import Any, Final, Protocol, runtime_checkable
 
 import torch
+from torch import Tensor
 from torchrl.data import Bounded, Categorical
 from torchrl.envs import Compose, EnvBase, TransformedEnv
 
@@ -13,6 +15,7 @@ from cprl.commons.spaces import Spaces
 from cprl.custom import Custom, made
 from cprl.envs.commons_env import CommonsEnv
 from cprl.envs.matrix import MatrixGame
+from cprl.envs.state import env_state, load_env_state
 from cprl.envs.taking import TakingGame
 from cprl.envs.unwrap import commons_of
 from cprl.theory import PowerWorth
@@ -96,7 +99,11 @@ def spaces_of(env: EnvBase) -> Spaces:
         raise ValueError(
             f'("agents", "observation") is {list(observation.shape)}; allowed: [{worlds}, {agents}, ...]'
         )
-    is_float = observation.dtype.is_floating_point
+    shape, dtype = observation.shape, observation.dtype
+    if isinstance(env, TransformedEnv):  # some transforms change observations and not their spec
+        seen = _first_observation(env)
+        shape, dtype = seen.shape, seen.dtype
+    is_float = dtype.is_floating_point
     highest = float(observation.high.max()) if isinstance(observation, Bounded) and not is_float else 1.0
     commons = commons_of(env)
     known = () if commons is None else commons.game.spaces.vectors
@@ -105,12 +112,21 @@ def spaces_of(env: EnvBase) -> Spaces:
     )
     return Spaces(
         agents=agents,
-        observation_shape=tuple(observation.shape[2:]),
-        observation_dtype=str(observation.dtype).removeprefix("torch."),
+        observation_shape=tuple(shape[2:]),
+        observation_dtype=str(dtype).removeprefix("torch."),
         observation_scale=highest,
         actions=int(action.n),
         vectors=vectors,
     )
+
+
+def _first_observation(env: EnvBase) -> Tensor:
+    """("agents", "observation") after a reset, of which the environment keeps nothing."""
+    with torch.random.fork_rng(devices=[]):
+        before = deepcopy(env_state(env))
+        seen: Tensor = env.reset().get(keys.OBSERVATION)
+        load_env_state(env, before)
+    return seen
 
 
 def check_env(env: EnvBase, worlds: int) -> None:
