@@ -4,6 +4,16 @@
 
 It needs only exported results (`cprl.runs.export`), so that anyone can reproduce it. Runs that repeat none of
 the study's experiments have tables of their own, without columns for what was published.
+
+The modules of the report, in the order in which one reads them:
+    results     the files of a run that a report needs; runs of one experiment as one; random play
+    published   the published numbers and curves, and the windows of their running means
+    verdicts    when a number, a curve or a claim is contradicted
+    curves      published numbers and curves beside ours
+    claims      the study's claims on its five experiments
+    tragedies   tragedy and combat, replica by replica
+    possible    what share of the possible runs got; planner and exact_yields say what is possible
+    figures     a metric of a run beside the published curve
 """
 
 import shlex

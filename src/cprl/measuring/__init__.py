@@ -1,4 +1,17 @@
-"""From what happened to what it meant: the social metrics, and whole episodes out of collected batches."""
+"""From what happened to what it meant: the social metrics, and whole episodes out of collected batches.
+
+Modules, in the order in which one reads them:
+    social        the social metrics, from the totals of an episode
+    institutions  metrics of institutions, likewise
+    metrics       their names, words and units, and what is left out where a game does not report an entry
+    episodes      Episode, and EpisodeTracker, which makes them of batches of turns
+    evaluate      one fresh episode in every world, without learning
+    statistics    estimates over replicas, with intervals by Student's t
+    series, now   numbers while a training runs, and what a group is doing at the moment
+    phases        change points of a whole training, and the phases between them
+    movement      where agents go, which cells they share or keep, and who tags whom
+    dilemmas      which social dilemma payoffs make
+"""
 
 from cprl.measuring import social
 from cprl.measuring.episodes import Episode, EpisodeTracker
