@@ -36,7 +36,6 @@ from cprl.arguments import callable_of, texts
 from cprl.checks import checked, instance
 from cprl.commons import maps
 from cprl.commons.maps import Map
-from cprl.config import fits
 from cprl.custom import Custom
 from cprl.system.output import RESUMES, say
 from cprl.system.shipped import program_of
@@ -347,6 +346,8 @@ def _flag(value: Any, hint: Any, all_agents: bool) -> tuple[Any, Any] | None:
         return flags_of(value, all_agents=all_agents)
     if _are_dataclasses(value):
         return _flags_of_all(value, all_agents)
+    from cprl.config import fits  # takes as long as torch
+
     simple = _simple(hint)
     return None if simple in (None, NoneType) or not fits(value, simple) else (simple, value)
 
