@@ -30,7 +30,7 @@ from torchrl.envs.utils import check_env_specs
 from cprl import CommonsEnv, Game, Observation, Rules, keys, maps, presets
 from cprl.commons.batch import Batch
 from cprl.envs import make_env
-from cprl.envs.state import env_state, load_env_state, load_transforms_state, transforms_state
+from cprl.envs.state import load_transforms_state, transforms_state
 from cprl.institutions import COUNTS
 
 SHORT = Game(
@@ -424,11 +424,8 @@ def test_transforms_that_learn_are_put_back_and_share_nothing():
 
 def test_a_transform_that_cannot_be_put_back_is_named():
     pool = TimeMaxPool(in_keys=[keys.OBSERVATION], T=2)
-    env = make_env(SHORT, worlds=2, transforms=[as_floats(), pool])
-    before = env_state(env)
-    env.reset()
     with pytest.raises(ValueError, match=r"the transforms DTypeCastTransform, TimeMaxPool .*; allowed: "):
-        load_env_state(env, before)
+        make_env(SHORT, worlds=2, transforms=[as_floats(), pool])
 
 
 def as_floats():

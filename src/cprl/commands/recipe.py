@@ -351,7 +351,6 @@ def _flag(value: Any, hint: Any, all_agents: bool) -> tuple[Any, Any] | None:
     from cprl.config import fits  # takes as long as torch
 
     simple = _simple(hint)
-    from cprl.config import fits  # brings torch, which `cprl --help` need not wait for
 
     return None if simple in (None, NoneType) or not fits(value, simple) else (simple, value)
 
