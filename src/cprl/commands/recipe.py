@@ -348,7 +348,6 @@ def _flag(value: Any, hint: Any, all_agents: bool) -> tuple[Any, Any] | None:
         return flags_of(value, all_agents=all_agents)
     if _are_dataclasses(value):
         return _flags_of_all(value, all_agents)
-    from cprl.config import fits  # takes as long as torch
 
     simple = _simple(hint)
 
