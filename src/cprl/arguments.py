@@ -58,11 +58,7 @@ def as_integer(value: Any) -> int | None:
 
 
 def integer(name: str, value: Any, low: int, high: int | None = None, *, allowed: str = "") -> int:
-    """An integer from `low` to `high`, both included; no number is rounded.
-
-    Raises:
-        ValueError: For anything else.
-    """
+    """An integer from `low` to `high`, both included; no number is rounded."""
     found = as_integer(value)
     if found is None or found < low or (high is not None and found > high):
         limits = f"an integer >= {low}" if high is None else f"an integer from {low} to {high:,}"
@@ -76,11 +72,7 @@ def seed(value: Any, name: str = "seed") -> int:
 
 
 def number(name: str, value: Any, *, low: float, high: float, above: bool = False, allowed: str) -> float:
-    """A finite number from `low` to `high`; `above`: without `low` itself.
-
-    Raises:
-        ValueError: For anything else.
-    """
+    """A finite number from `low` to `high`; `above`: without `low` itself."""
     found = plain(value)
     if not is_number(found, low, high) or (above and found <= low):
         raise refusal(name, value, allowed)
@@ -107,11 +99,7 @@ def object_of(name: str, value: Any, kind: Any, allowed: str) -> None:
 
 
 def listed(name: str, value: Any, allowed: str) -> tuple[Any, ...]:
-    """The items of a sequence, set, array or iterator as a tuple; text is none.
-
-    Raises:
-        ValueError: For anything else.
-    """
+    """The items of a sequence, set, array or iterator as a tuple; text is none."""
     if isinstance(value, str | bytes):
         raise refusal(name, value, allowed)
     try:
@@ -129,11 +117,7 @@ def array(name: str, value: Any, shape: Sequence[int], dtype: Any) -> None:
 
 
 def floats(name: str, values: Any) -> NDArray[np.float64]:
-    """Numbers as a float64 array; text, which numpy reads as numbers, is refused.
-
-    Raises:
-        ValueError: If they are anything else, or nested lists of unequal lengths.
-    """
+    """Numbers as a float64 array; text, which numpy reads as numbers, is refused."""
     try:
         found = np.asarray(values)
         if found.dtype.kind in "biuf":

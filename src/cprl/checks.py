@@ -45,11 +45,7 @@ class Check(NamedTuple):
 
 
 def checked(name: str, value: Any, check: Check) -> Any:
-    """A value as `plain` gives it, if it fits.
-
-    Raises:
-        ValueError: if not; says the name, the value and what is allowed.
-    """
+    """A value as `plain` gives it, if it fits."""
     value = plain(value)
     if not check.fits(value):
         raise ValueError(f"{name} is {shown(value)}; allowed: {check.allowed}")
@@ -57,11 +53,7 @@ def checked(name: str, value: Any, check: Check) -> Any:
 
 
 def check_arguments(checks: Mapping[str, Check], **arguments: Any) -> None:
-    """Checks arguments of a function by name.
-
-    Raises:
-        ValueError: see `checked`.
-    """
+    """Checks arguments of a function by name."""
     for name, value in arguments.items():
         checked(name, value, checks[name])
 
@@ -73,9 +65,6 @@ def check_fields(value: Any, checks: Mapping[str, Check], where: str = "") -> No
         value: the dataclass.
         checks: by field. A field without one, of a subclass of the user's own, is left as it is.
         where: what the dataclass is called in messages; by default its class.
-
-    Raises:
-        ValueError: for the first field that does not fit, as "Class.field is ...; allowed: ...".
     """
     where = where or type(value).__name__
     for field in fields(value):
@@ -108,11 +97,7 @@ def shown(value: object) -> str:
 
 
 def check_nesting(value: object, where: str) -> None:
-    """Refuses tables and lists that are nested too deeply, or hold too much, to be read one in the other.
-
-    Raises:
-        ValueError: says how deep they may be; also for a list or table that holds itself.
-    """
+    """Refuses tables and lists that are nested too deeply, or hold too much, to be read one in the other."""
     level, entries = {id(value): (value, 1)}, 0  # each once, with how often it stands at this depth
     for _ in range(MOST_NESTED):
         inner: dict[int, tuple[object, int]] = {}

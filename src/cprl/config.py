@@ -85,9 +85,6 @@ def to_config(value: object, where: str = "value") -> Any:
     Args:
         value: a value of `KINDS`, tuples of them, or what JSON has.
         where: what the value is called in messages.
-
-    Raises:
-        ValueError: for anything else, by the place where it stands; says what to write instead.
     """
     check_nesting(value, where)
     return _config(value, where)
@@ -122,9 +119,6 @@ def fields_to_config(
         value: the dataclass.
         where: what it is called in messages.
         instead: values of fields by name, in place of its own.
-
-    Raises:
-        ValueError: see `to_config`.
     """
     hints, table = _hints(type(value)), {}
     for name in hints:
@@ -141,10 +135,6 @@ def from_config(table: object, where: str = "value", *, allow: Iterable[str] = (
         table: what JSON held.
         where: what it is called in messages.
         allow: the targets of `Custom` that it may hold, "module:Class" each.
-
-    Raises:
-        ValueError: for a kind or field that is not known, a value that does not fit, and for a target that
-            is not allowed; by the place where it stands.
     """
     check_nesting(table, where)
     refuse_targets(table, allow)
@@ -152,11 +142,7 @@ def from_config(table: object, where: str = "value", *, allow: Iterable[str] = (
 
 
 def fields_from_config(kind: type[T], table: object, where: str, *, allow: Iterable[str] = ()) -> T:
-    """A dataclass out of the table of its fields; see `from_config`. Missing ones take their defaults.
-
-    Raises:
-        ValueError: see `from_config`.
-    """
+    """A dataclass out of the table of its fields; see `from_config`. Missing ones take their defaults."""
     check_nesting(table, where)
     refuse_targets(table, allow)
     return _built(kind, table, where)
@@ -169,11 +155,7 @@ def custom_targets(table: object) -> list[str]:
 
 
 def refuse_targets(table: object, allow: Iterable[str]) -> None:
-    """Refuses a table that would import what is not allowed.
-
-    Raises:
-        ValueError: names each target and says how it is allowed.
-    """
+    """Refuses a table that would import what is not allowed."""
     allowed = set(objects("allow", allow, str, 'texts, "module:Class" each'))
     refused = [target for target in custom_targets(table) if target not in allowed]
     if refused:

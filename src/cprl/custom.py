@@ -31,9 +31,6 @@ class Custom:
         arguments: its keyword arguments; strings, numbers, booleans, None, and lists and tables of them. A
             list of strings within a list becomes a tuple, so that nested TensorDict keys can be said:
             `{"in_keys": [["agents", "reward"]]}`.
-
-    Raises:
-        ValueError: for a target of another form, and for arguments that JSON cannot hold.
     """
 
     target: str
@@ -56,11 +53,7 @@ class Custom:
         return hash((self.target, json.dumps(self.arguments, sort_keys=True)))
 
     def resolve(self) -> Any:
-        """What the target names, imported.
-
-        Raises:
-            ValueError: where there is no such module or name.
-        """
+        """What the target names, imported."""
         module, _, name = self.target.partition(":")
         try:
             found: Any = importlib.import_module(module)
@@ -74,11 +67,7 @@ class Custom:
         return found
 
     def make(self, *positional: Any) -> Any:
-        """Calls the target with these arguments.
-
-        Raises:
-            ValueError: where it cannot be imported, or does not take the arguments.
-        """
+        """Calls the target with these arguments."""
         target = self.resolve()
         try:
             return target(*positional, **{name: _with_keys(value) for name, value in self.arguments.items()})

@@ -52,9 +52,6 @@ class Experiment:
     """What is trained and how; equals what `recipe.json` holds.
 
     Lists become tuples, though type checkers ask for tuples. Two are equal where their recipes are.
-
-    Raises:
-        ValueError: names the field, what came and what is allowed.
     """
 
     name: str
@@ -114,9 +111,6 @@ class Experiment:
         Args:
             table: its fields.
             allow: the targets of `Custom` that it may hold, "module:Class" each.
-
-        Raises:
-            ValueError: for what is not known, does not fit or is not allowed; by the place where it stands.
         """
         read = fields_from_config(cls, table, "experiment", allow=allow)
         return read if not isinstance(read.game, Custom) else replace(read, game=game_of(read.game))
@@ -144,9 +138,6 @@ class Experiment:
             recipe: what `recipe.json` holds.
             allow: the targets of `Custom` that it may hold, "module:Class" each.
             directory: where the recipe is kept; runs of `Frozen` are then relative to where we stand.
-
-        Raises:
-            ValueError: see `from_config`; for another format. Says so where another cprl wrote the recipe.
         """
         try:
             experiment = cls.from_config(recipe_config(recipe), allow=allow)

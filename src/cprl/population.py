@@ -87,11 +87,7 @@ class Frozen:
         object.__setattr__(self, "run", normpath(self.run))  # of "runs/x/" and "runs/x", the same checksum
 
     def replica_for(self, replica: int) -> int:
-        """The replica of that run for a replica here.
-
-        Raises:
-            ValueError: where each replica has one, and this has none.
-        """
+        """The replica of that run for a replica here."""
         if not isinstance(self.replica, tuple):
             return replica if self.replica is None else self.replica
         if replica >= len(self.replica):
@@ -193,11 +189,7 @@ SPEC: Final = instance(AgentSpec, "Learning, Team, Scripted, Frozen of cprl.popu
 
 
 def specs_by_agent(specs: Sequence[AgentSpec], agents: int) -> list[AgentSpec]:
-    """The specification of each of N agents; that of a team for each of its members.
-
-    Raises:
-        ValueError: where agents remain without a specification, or have two.
-    """
+    """The specification of each of N agents; that of a team for each of its members."""
     by_agent: dict[int, AgentSpec] = {}
     specs = checked("specs", specs, instance(tuple, "a tuple, one for each agent"))
     for place, spec in enumerate(specs):
@@ -232,9 +224,6 @@ def refuse_undecided(specs: Sequence[AgentSpec], ballots: int) -> None:
 def grouped(specs: Sequence[AgentSpec], agents: int) -> list[tuple[AgentSpec, tuple[int, ...]]]:
     """Each specification with the indices of its agents: equal ones together, each team by itself, in the
     order of their first agents.
-
-    Raises:
-        ValueError: see `specs_by_agent`.
     """
     by_agent = specs_by_agent(specs, agents)
     groups: list[tuple[AgentSpec, tuple[int, ...]]] = []
@@ -254,9 +243,6 @@ def exploration_steps(specs: Sequence[AgentSpec]) -> int | None:
 
     None if no agent explores by epsilon, or only by an algorithm of the user's own. Agents that draw from a
     policy do not, though the settings of those that learn from replay have an epsilon.
-
-    Raises:
-        ValueError: for anything else.
     """
     specs = arguments.listed("specs", specs, "a sequence of specifications of agents")
     for place, spec in enumerate(specs):

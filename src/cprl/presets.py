@@ -60,21 +60,13 @@ GAMES: Final[tuple[tuple[Board, Variant], ...]] = tuple(_BOARD_RULES)
 
 
 def check_board(board: object) -> None:
-    """Refuse a word that names neither a published board nor a run's directory nor a file.
-
-    Raises:
-        ValueError: Names the boards.
-    """
+    """Refuse a word that names neither a published board nor a run's directory nor a file."""
     if board not in BOARDS and not path("board", board).exists():
         raise refusal("board", board, f"{', '.join(BOARDS)}, a run's directory, or a file with a drawing")
 
 
 def game(board: Board, *, variant: Variant = "published") -> Game:
-    """A published board with its rules, in one of `VARIANTS`.
-
-    Raises:
-        ValueError: if the board or variant is unknown, or the board has no such variant.
-    """
+    """A published board with its rules, in one of `VARIANTS`."""
     _check(board, variant)
     quirks = {} if variant == "published" else _AS_RUN
     return Game(map=maps.named(board), rules=Rules(**quirks, **_BOARD_RULES[board, variant]))
@@ -83,11 +75,7 @@ def game(board: Board, *, variant: Variant = "published") -> Game:
 def gymnasium_env(
     board: Board, *, variant: Variant = "published", seed: int | None = None, render_mode: str | None = None
 ) -> "CommonsGymnasiumEnv":
-    """A published board for one agent as a Gymnasium environment, for `gymnasium.make`.
-
-    Raises:
-        ValueError: if the board or variant is unknown, or the board has several agents.
-    """
+    """A published board for one agent as a Gymnasium environment, for `gymnasium.make`."""
     from cprl.envs.gymnasium_env import CommonsGymnasiumEnv
 
     return CommonsGymnasiumEnv(game(board, variant=variant), seed=seed, render_mode=render_mode)
@@ -100,9 +88,6 @@ def dqn_settings(board: Board, *, variant: Variant = "published") -> "DQNSetting
     500,000, 1,000,000 and, the last one, 5,000,000. All variants use the value of the text. Versions of the
     program also had other discounts, optimisers and losses: `replace(dqn_settings("commons",
     variant="as_run"), gamma=0.997, optimizer="keras_rmsprop")` with `DQN(..., loss_function="log_cosh")`.
-
-    Raises:
-        ValueError: if the board or variant is unknown, or the board has no such variant.
     """
     from cprl.learners.settings import DQNSettings
 

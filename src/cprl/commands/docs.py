@@ -102,9 +102,6 @@ def docs(*, port: int | None = None, browser: bool = True) -> None:
     Args:
         port: of 127.0.0.1; by default 8765, or any that is free where that one is taken.
         browser: open it; without a display only the address is printed.
-
-    Raises:
-        ValueError: if the documentation has not been built, or the port cannot be had.
     """
     if port is not None and not 0 <= port < 65536:
         raise ValueError(f"--port is {port}; it must be 0 to 65535")

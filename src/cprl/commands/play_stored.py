@@ -468,11 +468,7 @@ def check_files(out: Path | None = None, figure: Path | None = None) -> None:
 
 
 def check_runs(*runs: Path | str) -> None:
-    """Checks that runs are there, before what plays their agents is imported, which takes seconds.
-
-    Raises:
-        ValueError: for a path that is no run.
-    """
+    """Checks that runs are there, before what plays their agents is imported, which takes seconds."""
     for run in runs:
         read_recipe(Path(run))
 
@@ -486,11 +482,7 @@ def tell_files(out: Path | None, figure: Path | None, draw: Callable[[Path], Pat
 
 
 def runs_by_name(words: Sequence[str]) -> list[str] | dict[str, str]:
-    """Runs as `crossplay` takes them: paths, or a table where one has a name, NAME=PATH.
-
-    Raises:
-        ValueError: if two have one name.
-    """
+    """Runs as `crossplay` takes them: paths, or a table where one has a name, NAME=PATH."""
     pairs = [_name_and_path(word) for word in words]
     if not any(name for name, _ in pairs):
         return [path for _, path in pairs]

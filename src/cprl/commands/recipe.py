@@ -287,11 +287,7 @@ def flags_of(value: Any, *, all_agents: bool = True) -> tuple[Any, Any]:
 
 
 def applied(value: Any, flags: Any) -> Any:
-    """A value with what the flags of `flags_of` say.
-
-    Raises:
-        ValueError: where it refuses what they say.
-    """
+    """A value with what the flags of `flags_of` say."""
     if isinstance(value, Map):
         return value if flags == _DRAWN else maps.named(flags)
     if _are_dataclasses(flags):

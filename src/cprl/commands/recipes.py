@@ -46,11 +46,7 @@ def run_by_name() -> bool:
 
 
 def refuse_unknown(path: Path) -> None:
-    """Refuses what is no file or directory and so was meant as the name of a recipe, and a Python file.
-
-    Raises:
-        ValueError: says what to type instead.
-    """
+    """Refuses what is no file or directory and so was meant as the name of a recipe, and a Python file."""
     if path.suffix == ".py" and path.is_file():
         raise ValueError(
             f"{path} is a recipe of your own, which Python runs: {printed(['python', str(path)])}"

@@ -155,11 +155,7 @@ def study_main(study: "Study", argv: Sequence[str] | None = None) -> Path:
 
 
 def _of_episodes(study: "Study", episodes: int) -> "Study":
-    """A study with other episodes than its own.
-
-    Raises:
-        ValueError: if it varies the episodes.
-    """
+    """A study with other episodes than its own."""
     shorter = replace(study, experiment=replace(study.experiment, episodes=episodes))
     for own in shorter.all_conditions:
         if own.experiment.episodes != episodes:
@@ -211,11 +207,7 @@ def _refuse_arguments(vary: Sequence[str], make_experiment: "Callable[..., Exper
 
 
 def wanted(experiment: "Experiment", options: SweepOptions) -> "Study | Search":
-    """The study or search that a sweep is.
-
-    Raises:
-        ValueError: for options that contradict each other, and for whatever the study refuses.
-    """
+    """The study or search that a sweep is."""
     from cprl.studies import Search, Study
     from cprl.studies.factors import Distribution, factors_of
 
@@ -267,9 +259,6 @@ def recipe_of(source: Path, allow: Sequence[str] = ()) -> "Callable[..., Experim
         source: a Python file with a function `experiment`, which is imported and not run; a recipe.json; or
             the directory of a run.
         allow: the user's own code, "module:Class", that a recipe.json may import.
-
-    Raises:
-        ValueError: where it is none of them.
     """
     if source.suffix != ".py" or source.is_dir():
         directory, kept = source if source.is_dir() else source.parent, read_recipe(source)
@@ -399,11 +388,7 @@ _BEST: Final = 10
 
 
 def executor_of(options: StudyOptions) -> "Executor":
-    """Where trials are run.
-
-    Raises:
-        ValueError: for options that contradict each other.
-    """
+    """Where trials are run."""
     from cprl.studies.executors import InProcess, Processes, Ray
 
     jobs, on = options.jobs, options.on

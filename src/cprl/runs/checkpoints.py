@@ -102,11 +102,7 @@ class Checkpointer:
         self._usual: dict[int, Any] = {}
 
     def restore(self, training: HasState) -> None:
-        """Restores the newest readable checkpoint, if there is one.
-
-        Raises:
-            ValueError: if there are checkpoints but none can be restored; names each with its reason.
-        """
+        """Restores the newest readable checkpoint, if there is one."""
         reasons: list[str] = []
         cause: Exception | None = None
         for path in reversed(checkpoints_in(self.folder)):
@@ -259,12 +255,7 @@ def is_ending(path: Path) -> bool:
 
 
 def read_checkpoint(path: Path) -> dict[str, Any]:
-    """The state in a checkpoint; runs no code of the file.
-
-    Raises:
-        ValueError: if the file is not a checkpoint, is truncated or was changed, or a newer cprl wrote it;
-            names file and reason.
-    """
+    """The state in a checkpoint; runs no code of the file."""
     name = _NAME.fullmatch(path.name)
     if name is None:
         raise ValueError(f"{path} is not a checkpoint; allowed: a name like training-<steps>-<checksum>.pt")
@@ -302,9 +293,6 @@ def refuse_to_extend(run: Path, episodes: int, callbacks: Iterable[Any]) -> None
         episodes: how many it has so far.
         callbacks: those of the training; one with `on_start` sees the number of episodes, and may depend on
             it unless it has a true `is_extendable`.
-
-    Raises:
-        ValueError: if it would not, or lacks a file that its manifest lists; says why.
     """
     refuse_missing(run)
     for callback in callbacks:

@@ -88,9 +88,6 @@ def running_mean(values: Values, window: int = SMOOTHED_EPISODES) -> Values:
     """Means over `window` consecutive values, each at the position of the first, [..., len - window + 1].
 
     With fewer values, the mean of all. Undefined values are skipped; NaN where no value is defined.
-
-    Raises:
-        ValueError: if the values are no array of numbers with an axis, or the window is no positive integer.
     """
     values = arguments.floats("values", values)
     if not values.ndim:

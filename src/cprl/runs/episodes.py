@@ -83,11 +83,7 @@ class EpisodeTable:
         return {"rows": self._rows}
 
     def load_state_dict(self, state: Mapping[str, int]) -> None:
-        """Continues after the given number of rows of its journal; later rows are dropped.
-
-        Raises:
-            ValueError: if the journal is damaged, has fewer rows, or no episode ends there.
-        """
+        """Continues after the given number of rows of its journal; later rows are dropped."""
         rows, found, batches = int(state["rows"]), 0, 0
         content = read_journal(self.journal) if rows else _EMPTY
         for batch in content.batches:
@@ -345,9 +341,6 @@ def rows_of(episodes: Sequence[Episode], replica: int | None, schema: pa.Schema)
         episodes: at least one.
         replica: the index of their replica; None for each episode's world.
         schema: what `schema_of` gave for the first episode of the table.
-
-    Raises:
-        ValueError: if an episode has other columns.
     """
     of_each = [_cells(episode, episode.world if replica is None else replica) for episode in episodes]
     for cells in of_each:

@@ -81,11 +81,7 @@ _OF_RUNS: Final = ("run.lock", "run.rrd", "episodes.arrows", "logs", "checkpoint
 
 
 def _refuse_another(folder: Path, run: Path, recipe: Mapping[str, Any]) -> None:
-    """Refuses to write over what is no earlier copy of such a run.
-
-    Raises:
-        ValueError: for the run itself, another run, and a copy of another experiment; says what is allowed.
-    """
+    """Refuses to write over what is no earlier copy of such a run."""
     allowed = "allowed: a new folder, or one with an earlier export of the same experiment"
     if folder.exists() and folder.resolve() == run.resolve():
         raise ValueError(f"folder is {folder}, the run itself; {allowed}")

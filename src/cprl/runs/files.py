@@ -123,9 +123,6 @@ def refuse_links(folder: Path) -> None:
     """Refuses the directory of a run or study if a symbolic link leads out of it, to what would be written.
 
     The directory itself may be reached through a link.
-
-    Raises:
-        ValueError: names the link.
     """
     place = Path(os.path.realpath(folder))
     for parent, folders, names in os.walk(folder):
@@ -192,9 +189,6 @@ def refuse_newer(what: object, table: Mapping[str, Any], newest: int) -> None:
         what: the file, or what it holds, for the message.
         table: its content, with the number as "format".
         newest: the highest format that this version reads.
-
-    Raises:
-        ValueError: names file, format and version, and says what to do.
     """
     found = table.get("format")
     if isinstance(found, int) and not isinstance(found, bool) and found > newest:
@@ -453,9 +447,6 @@ def verify(path: Path) -> None:
 
     Args:
         path: a file in a run's directory, or in a folder of it.
-
-    Raises:
-        ValueError: if the content is not the one that was written, or the manifest cannot be read.
     """
     for run in (path.parent, path.parent.parent):
         if (run / MANIFEST_FILE).exists():

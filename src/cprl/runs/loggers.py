@@ -26,10 +26,6 @@ def check_logger(logger: object) -> None:
 
     Args:
         logger: a name in `PACKAGES`; other objects are not checked.
-
-    Raises:
-        ValueError: if the name is unknown.
-        ModuleNotFoundError: if its package is not installed; says what to install.
     """
     if not isinstance(logger, str):
         return
@@ -52,9 +48,6 @@ def make_logger(logger: str | Logger, run: str | Path) -> Logger:
     Args:
         logger: one of `PACKAGES`, or a logger.
         run: the run's directory.
-
-    Raises:
-        ValueError, ModuleNotFoundError: see `check_logger`.
     """
     if not isinstance(logger, str):
         return logger
@@ -85,9 +78,6 @@ class LoggerCallback:
             block ends, also by an error.
         replicas: the number of replicas R.
         agents: the names of the agents; by default agent_0 and so on.
-
-    Raises:
-        TypeError: if `logger` is not a logger.
     """
 
     def __init__(self, logger: Logger, *, replicas: int = 1, agents: Sequence[str] | None = None) -> None:

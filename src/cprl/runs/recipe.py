@@ -104,10 +104,6 @@ def refuse_another_run(
 
     Returns:
         The number of episodes of the run so far, below that of the recipe if it is to be extended.
-
-    Raises:
-        ValueError: if there is nothing to resume, or the run was started with another recipe; names the
-            differences.
     """
     if out is None:
         raise ValueError("resume requires the directory of the run as out")
@@ -287,10 +283,6 @@ def read_recipe(run: Path) -> dict[str, Any]:
 
     Args:
         run: the run's directory, or the file itself.
-
-    Raises:
-        ValueError: if there is no run, its recipe cannot be read, or a newer cprl wrote it; names file and
-            reason.
     """
     path = Path(run) if Path(run).is_file() else Path(run) / RECIPE_FILE
     try:
@@ -306,11 +298,7 @@ def read_recipe(run: Path) -> dict[str, Any]:
 
 
 def runs_in(paths: Iterable[Path | str]) -> list[Path]:
-    """The runs among paths: each is a run's directory, or one that holds runs, in order.
-
-    Raises:
-        ValueError: for a path that is neither, and for one that is there twice.
-    """
+    """The runs among paths: each is a run's directory, or one that holds runs, in order."""
     runs: list[Path] = []
     for path in listed("runs", paths, "directories of runs"):
         folder = path_of("runs", path)
@@ -365,11 +353,7 @@ def _refuse_contents(directory: Path) -> None:
 
 
 def recipe_config(recipe: Mapping[str, Any]) -> dict[str, Any]:
-    """The experiment of a recipe, as `Experiment.to_config` gives it.
-
-    Raises:
-        ValueError: for another format.
-    """
+    """The experiment of a recipe, as `Experiment.to_config` gives it."""
     checked("the recipe", recipe, instance(Mapping, "a table"))
     check_nesting(recipe, "the recipe")
     refuse_newer("the recipe", recipe, RECIPE_FORMAT)

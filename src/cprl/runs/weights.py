@@ -127,11 +127,7 @@ class BestWeights:
 
 
 def restore_weights(path: Path, networks: Mapping[str, nn.Module]) -> None:
-    """Loads saved weights into the networks of the same agents.
-
-    Raises:
-        ValueError: if the file is missing, damaged or foreign, or holds the weights of other networks.
-    """
+    """Loads saved weights into the networks of the same agents."""
     _check_networks(networks)
     kept = load_weights(path_of("path", path))
     if set(kept) != set(networks):
@@ -153,9 +149,6 @@ def _check_networks(networks: Mapping[str, nn.Module]) -> None:
 def load_weights(path: Path) -> dict[str, Any]:
     """The state dict of each agent's network, or the state of each transform; loads tensors only, and runs no
     code of the file.
-
-    Raises:
-        ValueError: if the file is missing, damaged or foreign; names it and the reason.
     """
     refuse_special(path)
     if path.exists():
@@ -189,10 +182,6 @@ def kept_of(run: Path, name: str | None = None) -> Kept:
         run: its directory.
         name: of a file in its `checkpoints/`, without suffix; None for the final one, or the newest readable
             checkpoint of a run that has not ended.
-
-    Raises:
-        ValueError: if a file that the manifest lists is not there, or nothing is readable; names each file
-            with its reason.
     """
     refuse_missing(run)
     folder = run / FOLDER
@@ -212,11 +201,7 @@ def _beside(path: Path, name: str | None) -> dict[str, Any]:
 
 
 def lacks_weights(run: Path) -> bool:
-    """Whether a run has ended and keeps no weights, since its results were exported without them.
-
-    Raises:
-        ValueError: if the run had them: its manifest lists a file that is not there.
-    """
+    """Whether a run has ended and keeps no weights, since its results were exported without them."""
     if not (run / REPORT).exists() or (run / FOLDER / "final.pt").exists():
         return False
     refuse_missing(run)
@@ -269,9 +254,6 @@ def weights_of(recipe: Mapping[str, Any], run: Path, partner: str) -> str | None
         recipe: that of the run.
         run: its directory.
         partner: the directory of the other run.
-
-    Raises:
-        ValueError: if the other run no longer has the weights that played.
     """
     wanted = (recipe.get(FIELD) or {}).get(os.path.relpath(partner, run))
     if wanted is None:

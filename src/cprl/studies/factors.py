@@ -256,10 +256,6 @@ def changed(experiment: Experiment, changes: Mapping[str, Any]) -> Experiment:
     Args:
         experiment: as it is.
         changes: the new values by path; lists become tuples, and a board may be given by its name.
-
-    Raises:
-        ValueError: for a path that matches nothing, a value of another type, and for whatever the experiment
-            refuses; names the path.
     """
     tree: dict[Any, Any] = {}
     for path, value in changes.items():
@@ -277,11 +273,7 @@ def changed(experiment: Experiment, changes: Mapping[str, Any]) -> Experiment:
 
 
 def values_at(experiment: Experiment, path: str) -> list[Any]:
-    """The values in the places that a path names, at least one.
-
-    Raises:
-        ValueError: for a path that matches nothing.
-    """
+    """The values in the places that a path names, at least one."""
     return [value for value, _ in _found(experiment, normalised(path).split("."), (), Experiment)]
 
 
@@ -400,10 +392,6 @@ def factors_of(experiment: Experiment, words: Iterable[str]) -> dict[str, Factor
     Args:
         experiment: whose fields the paths name.
         words: "PATH=VALUES" each; values with commas between them, or a distribution with its range.
-
-    Raises:
-        ValueError: for a path that matches nothing or stands twice, and for values that the field cannot
-            have or that a command line cannot say.
     """
     found: dict[str, Factor] = {}
     for word in words:

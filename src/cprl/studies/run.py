@@ -100,11 +100,7 @@ def run_study(
 
 
 def trials_with(trials: Sequence[Trial], only: Sequence[str]) -> list[Trial]:
-    """The trials of conditions that have one of some names, or its levels; without any, all of them.
-
-    Raises:
-        ValueError: for what is in no name; says which names there are.
-    """
+    """The trials of conditions that have one of some names, or its levels; without any, all of them."""
     wanted = [set(levels_in(levels)) for levels in texts("only", only)]
     names = list(dict.fromkeys(trial.condition.name for trial in trials))
     for levels, text in zip(wanted, only, strict=True):

@@ -68,9 +68,6 @@ class Search:
         replicas: see `Study`.
         block: see `Study`.
         name: by default that of the experiment.
-
-    Raises:
-        ValueError: for whatever does not fit.
     """
 
     experiment: Experiment
@@ -248,10 +245,6 @@ def run_search(
         results: see `cprl.studies.run_study`.
         last: see `cprl.studies.run_study`; what the search itself looks at is in `Search`.
         again: see `cprl.studies.run_study`.
-
-    Raises:
-        ModuleNotFoundError: where Optuna is not installed.
-        ValueError: for whatever does not fit, before anything is written.
     """
     object_of("search", search, Search, "a Search")
     check_executor(on)
@@ -293,11 +286,7 @@ class _Asked:
         """By checksum, the first point that has it."""
 
     def first_batch(self) -> list[Point]:
-        """The first points of which one fits.
-
-        Raises:
-            ValueError: where the experiment refuses every point of the search.
-        """
+        """The first points of which one fits."""
         while batch := self.next_batch():
             if not all(own.reason for own in batch):
                 return batch

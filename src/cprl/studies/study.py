@@ -74,12 +74,7 @@ class Condition:
 
 
 def experiment_at(experiment: Experiment, levels: Mapping[str, Level]) -> Experiment:
-    """An experiment with what a level of each factor changes.
-
-    Raises:
-        ValueError: for two factors that change the same field, for a field that the study itself decides,
-            and for what does not fit, see `cprl.studies.factors.changed`.
-    """
+    """An experiment with what a level of each factor changes."""
     changes = {path: value for own in levels.values() for path, value in own.changes.items()}
     twice = sum(len(own.changes) for own in levels.values()) - len(changes)
     if twice:
@@ -119,10 +114,6 @@ class Study:
         name: by default that of the experiment.
         question: what the study asks, for its report.
         expectation: what was expected before it was run, for its report.
-
-    Raises:
-        ValueError: for a path that matches nothing, a value that does not fit, and two equal conditions; for
-            whatever else does not fit.
     """
 
     experiment: Experiment
@@ -276,9 +267,6 @@ class Study:
             table: what JSON held.
             allow: the targets of `Custom` that it may hold, "module:Class" each.
             directory: where it is kept; runs of `Frozen` agents are then relative to where we stand.
-
-        Raises:
-            ValueError: for another format, and for what does not fit, see `Experiment.from_config`.
         """
         checked("the study", table, instance(Mapping, "a table"))
         check_nesting(table, "the study")
@@ -418,11 +406,7 @@ RUNS, STATUS = "runs", "status"
 
 
 def directory_of(study: Study, out: Path | str | None) -> Path:
-    """The directory of a study, by default `studies/<name>`.
-
-    Raises:
-        ValueError: for a file, and for the directory of a run.
-    """
+    """The directory of a study, by default `studies/<name>`."""
     found = Path("studies") / study.name if out is None else path("out", out)
     allowed = "a new directory, or that of an earlier study"
     if found.exists() and not found.is_dir():
@@ -443,9 +427,6 @@ def read_study(out: Path | str, *, allow: Sequence[str] = ()) -> Study:
     Args:
         out: the directory.
         allow: the user's own code, "module:Class", that it may import.
-
-    Raises:
-        ValueError: where there is none, and for what is not allowed.
     """
     out = path("out", out)
     texts("allow", allow)

@@ -141,9 +141,6 @@ def refuse_another(run: Path, recipe: Mapping[str, Any]) -> None:
     Args:
         run: the directory of the trial.
         recipe: what `Experiment.to_recipe` gives for the trial and this directory.
-
-    Raises:
-        ValueError: if its recipe is another; names the first difference.
     """
     stored, trial = recipe_config(read_recipe(run)), recipe["experiment"]
     differ = differences({**stored, **_FREE}, {**trial, **_FREE}, "experiment", Experiment)

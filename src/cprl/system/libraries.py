@@ -16,9 +16,6 @@ def require(library: str, holder: object, *parts: str) -> None:
         library: the name of its distribution.
         holder: the class or module.
         parts: the names of attributes.
-
-    Raises:
-        ImportError: if one is missing.
     """
     for part in parts:
         if not hasattr(holder, part):
@@ -31,9 +28,6 @@ def relying_on(library: str, part: str) -> Iterator[None]:
     """While it is open, a part that cannot be imported or found is said to be missing from a library.
 
     Only the look-up of the part belongs inside.
-
-    Raises:
-        ImportError: in place of an ImportError or AttributeError.
     """
     try:
         yield

@@ -56,9 +56,6 @@ def check_memory(
         instead: what to use in its place.
         device: where it would be allocated.
         free: how many bytes are free; None to ask the device.
-
-    Raises:
-        TooLargeError: says how much it takes, how much is free, and what to use instead.
     """
     if needed <= _SMALL:
         return

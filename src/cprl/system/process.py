@@ -31,9 +31,6 @@ def prepare_process(seed: int) -> None:
 
     The networks are so small that a second thread slows them down, up to a hundredfold on a busy machine.
     Denormal numbers in Adam's moments of dead weights slow a long run by a factor of up to 1.9.
-
-    Raises:
-        ValueError: for a seed that is no integer from 0 to 2**64 - 1.
     """
     checked("seed", seed, count(0, MOST_SEED))
     keep_output()

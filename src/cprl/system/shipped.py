@@ -83,11 +83,7 @@ def shipped_recipes() -> dict[str, Recipe]:
 
 
 def recipe_named(name: str) -> Recipe:
-    """A recipe by its name.
-
-    Raises:
-        ValueError: if there is none; lists those that there are.
-    """
+    """A recipe by its name."""
     checked("name", name, TEXT)
     recipes = shipped_recipes()
     if name not in recipes:
@@ -115,9 +111,6 @@ def run_shipped(name: str, words: Sequence[str]) -> None:
     Args:
         name: of the recipe.
         words: its command line, without the program.
-
-    Raises:
-        ValueError: if there is no such recipe, or it is a module that recipes share.
     """
     recipe = recipe_named(name)
     if not recipe.runs:
@@ -139,9 +132,6 @@ def import_from(folder: str) -> None:
 
     Args:
         folder: e.g. "studies". Modules beside the script that runs come first.
-
-    Raises:
-        ValueError: if there is no such folder.
     """
     checked("folder", folder, TEXT)
     folders = sorted({recipe.folder for recipe in shipped_recipes().values()} - {""})

@@ -53,9 +53,6 @@ class Population:
             which has later ones.
         weights: the names of the weights that `Frozen` agents play with, see `cprl.load`, by their run; of
             runs that are not in it the final ones.
-
-    Raises:
-        ValueError: for specifications that do not fit the environment or each other; says what does.
     """
 
     def __init__(
@@ -225,9 +222,6 @@ def check_scripted(groups: Sequence[tuple[AgentSpec, Any]], spaces: Spaces, game
         groups: specifications, and the agent indices of each.
         spaces: what agents observe, transforms included.
         game: what is played; None for a game that is not a `Game`.
-
-    Raises:
-        ValueError: names the agents and their policy.
     """
     for spec, agents in groups:
         is_reading = isinstance(spec, Scripted) and spec.policy != "random"
@@ -260,9 +254,6 @@ def frozen_agents(
         allow: what the stored runs may import.
         replicas: the numbers of the replicas.
         weights: the names of the weights, by run; of others the final ones.
-
-    Raises:
-        ValueError: where it was trained for other observations, actions or ballots, or is not kept.
     """
     specs = tuple(specs)
     runs = {
@@ -331,9 +322,6 @@ def start_weights(
         game: the game, if it is one of cprl's.
         replicas: the numbers of the replicas.
         allow: what the stored run may import.
-
-    Raises:
-        ValueError: where the stored run has no such agent, or its network is another one; says how.
     """
     source = spec.start_from
     if source is None:

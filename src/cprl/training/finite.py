@@ -71,9 +71,6 @@ class FiniteCheck:
         learners: by the indices of their agents.
         spaces: what agents observe; entries of integers are not looked at.
         on_nan: see `OnNan`.
-
-    Raises:
-        ValueError: if `on_nan` is unknown.
     """
 
     def __init__(

@@ -71,9 +71,6 @@ def random_play(experiment: Experiment, population: Population) -> list[Episode]
 
     Returns:
         `evaluation_episodes` episodes for each replica.
-
-    Raises:
-        ValueError: for anything but an experiment and a population.
     """
     _check(experiment, population)
     with _generators_kept(experiment.device):

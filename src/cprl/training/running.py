@@ -307,11 +307,7 @@ def _now() -> str:
 
 
 def tidy_up(finished: Path, *, keep_checkpoint: bool, take_over: bool) -> None:
-    """Says that a run is finished, and tidies up if its process died before it had.
-
-    Raises:
-        ValueError: if a file that its manifest lists is not there.
-    """
+    """Says that a run is finished, and tidies up if its process died before it had."""
     refuse_missing(finished)
     if (finished / LOCK_FILE).exists():
         with Checkpointer(finished, keep_ending=keep_checkpoint, take_over=take_over) as left:

@@ -114,11 +114,7 @@ class LoadedRun:
         return env
 
     def agent(self, agent: int, *, replica: int = 0) -> StoredAgent:
-        """An agent of a replica.
-
-        Raises:
-            ValueError: where the run keeps no network of it; says which it keeps.
-        """
+        """An agent of a replica."""
         if not 0 <= agent < self.game.agents:
             raise ValueError(f"agent is {agent}; {self.path} has the agents 0 to {self.game.agents - 1}")
         spec = self.specs[agent]
@@ -156,9 +152,6 @@ class LoadedRun:
     def policy(self, replica: int = 0, *, worlds: int = 1, seed: int = 0) -> AgentPolicies:
         """The agents of a replica in so many worlds side by side; those that learned explore as in evaluation
         where asked to, by random numbers that follow from the seed.
-
-        Raises:
-            ValueError: where the run keeps no network of an agent; says which it keeps.
         """
         found = [[self.agent(agent, replica=replica)] for agent in range(self.game.agents)]
         return stored_policies(found, self._playing, replicas=[replica], worlds=worlds, seed=seed)
@@ -186,10 +179,6 @@ def load(run: str | Path, *, weights: str | None = None, allow: Sequence[str] = 
             "final-4800" of a run that was extended from so many episodes; by default the final ones, or those
             of the newest readable checkpoint where the run has not ended.
         allow: the targets, "module:Class", of the user's own code that the run may import.
-
-    Raises:
-        ValueError: for a file that is missing, truncated, changed or foreign, naming it and the reason; for
-            code of the user's own that is not allowed, naming it.
     """
     run = path_of("run", run)
     texts("allow", allow)

@@ -69,11 +69,6 @@ class Training:
         make_collector: `StepCollector`, or for TorchRL's own `cprl.training.collectors.stock_collector`.
         on_nan: whether the training stops where a loss, weight, reward or observation is not finite, see
             `cprl.training.finite`.
-
-    Raises:
-        ValueError: for agents without a learner or actor, or with two; another number of worlds than the
-            learners have replicas; numbers below 1; a callback without any of the methods of `Callback`;
-            decisions that are missing in a game that asks for them, or given in another.
     """
 
     def __init__(
@@ -266,11 +261,7 @@ class Training:
         return self._collector
 
     def load_state_dict(self, state: Mapping[str, Any]) -> None:
-        """Resumes exactly where the training of that state was, which was made with the same arguments.
-
-        Raises:
-            ValueError: for the state of a training of another version of cprl.
-        """
+        """Resumes exactly where the training of that state was, which was made with the same arguments."""
         if state.get("format", 1) != TRAINING_STATE_FORMAT:
             raise ValueError(
                 f"the state has the format {state.get('format', 1)}, this version resumes "

@@ -48,10 +48,6 @@ class Ray:
         jobs: how many trials run at a time, at most; None for one per core.
         memory_bytes: what each trial asks for; None for what finished trials of the study have taken, and
             before there are any for an estimate.
-
-    Raises:
-        ValueError: for what does not fit.
-        ModuleNotFoundError: where Ray is not installed.
     """
 
     address: str | None = None

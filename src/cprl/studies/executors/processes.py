@@ -146,9 +146,6 @@ class Processes:
 
     Args:
         jobs: how many trials run at a time, 1 to 4,096; as many cores and the memory of as many runs.
-
-    Raises:
-        ValueError: for any other number.
     """
 
     jobs: int

@@ -47,10 +47,6 @@ def courses(table: StudyTable, path: Path | str, *, metrics: Sequence[str] = ())
         table: the table.
         path: the PNG.
         metrics: by default the collective return and survival; else the first that the table has.
-
-    Raises:
-        ValueError: for metrics that the table lacks, more than `MOST_CONDITIONS` conditions, and another
-            ending than .png.
     """
     path, design = picture_path(path), table.design
     chosen = metrics_of(table, metrics or [own for own in METRICS if own in table.metrics])[

@@ -76,9 +76,6 @@ def heat_map(
         metric: one of its metrics.
         part: see `cprl.studies.tables.comparing.compare`.
         last: likewise.
-
-    Raises:
-        ValueError: for what are no two factors of a grid, and another ending than .png.
     """
     path, design = picture_path(path), table.design
     grid, fixed = _checked(design, factors)
@@ -120,10 +117,6 @@ def phase_diagram(
         found: see `cprl.studies.tables.sources.endings`.
         path: the PNG.
         factors: two factors; None for bars, of at most `MOST_CONDITIONS` conditions.
-
-    Raises:
-        ValueError: for what are no two factors of a grid, for too many conditions, and another ending than
-            .png.
     """
     path, design = picture_path(path), table.design
     object_of("found", found, Endings, "what endings() gave")

@@ -53,10 +53,6 @@ def by_factor(
         metrics: by default those of `cprl.studies.tables.comparing.METRICS` that it has.
         part: see `cprl.studies.tables.comparing.compare`.
         last: likewise.
-
-    Raises:
-        ValueError: for a factor whose levels are not numbers, another ending than .png, and for what does
-            not fit.
     """
     design, path = table.design, picture_path(path)
     numeric = [own for own in design.factors if is_numeric([at[own] for at in design.conditions.values()])]
@@ -348,9 +344,6 @@ def by_condition(
         metrics: see `by_factor`.
         part: see `cprl.studies.tables.comparing.compare`.
         last: likewise.
-
-    Raises:
-        ValueError: for too many conditions, another ending than .png, and for what does not fit.
     """
     choice("kind", kind, ("levels", "differences"))
     design, path = table.design, picture_path(path)

@@ -116,10 +116,6 @@ def compare(
         metric: one of its metrics.
         part: "training", "evaluation" or "random".
         last: of training: episodes at its end; those of whole windows.
-
-    Raises:
-        ValueError: for a metric that the table lacks, for fewer episodes than a window, and for what does not
-            fit.
     """
     object_of("table", table, StudyTable, "a StudyTable")
     if metric not in table.metrics:
@@ -167,11 +163,7 @@ def _compared(table: StudyTable, metric: str, part: str, last: int) -> Compariso
 
 
 def metrics_of(table: StudyTable, metrics: Sequence[str] = ()) -> tuple[str, ...]:
-    """The metrics asked for, by default those of `METRICS` that a table has.
-
-    Raises:
-        ValueError: for one that the table lacks.
-    """
+    """The metrics asked for, by default those of `METRICS` that a table has."""
     for own in metrics:
         if own not in table.metrics:
             raise refusal("metric", own, ", ".join(table.metrics))

@@ -40,10 +40,6 @@ def pooled_table(
         window: see `cprl.studies.tables.table.study_table`.
         reference: the name of the condition that others are compared with; by default the first.
         allow: the user's own code, "module:Class", that a run's recipe may name.
-
-    Raises:
-        ValueError: for a path that is no run or matches nothing, a seed that repeats in a condition, and
-            whatever else does not fit.
     """
     fields = [normalised(own) for own in texts("by", tuple(by), 1)]
     for own in fields:

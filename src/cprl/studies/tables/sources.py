@@ -266,9 +266,6 @@ def rows_of(design: Design, found: list[tuple[Source, list[Windows]]], marked: M
         design: the conditions.
         found: runs, and what was measured in them.
         marked: the marks of each run by its name.
-
-    Raises:
-        ValueError: if a replica of a condition is there twice.
     """
     names = list(design.conditions)
     is_net_known = not any(own.metric == "collective_return" for _, every in found for own in every)
@@ -387,11 +384,7 @@ class Endings:
 
 
 def endings(sources: list[Source]) -> Endings:
-    """The phases in which the replicas of finished runs end.
-
-    Raises:
-        ValueError: for a damaged file; runs that a table holds are whole.
-    """
+    """The phases in which the replicas of finished runs end."""
     labels: dict[str, dict[int, str]] = {}
     rules: dict[str, None] = {}
     for source in sources:

@@ -203,9 +203,6 @@ def study_table(
         runs: the directory of its runs.
         window: episodes of a window of training; 1 for episodes one by one, of the evaluation too.
         status: where its trials say why they failed, see `cprl.studies.trials`.
-
-    Raises:
-        ValueError: for what does not fit. A run that is damaged is listed as lacking.
     """
     object_of("study", study, Study, "a Study")
     folder = path_of("runs", runs)
