@@ -113,7 +113,6 @@ def phases_of(curves: dict[str, Values], *, centred: bool = False, resamples: in
     """Change points and phases of a training, of running means over `SMOOTHED_EPISODES`.
 
     Args:
-        curves: see `curves_of`.
         centred: whether an episode is the centre of its running mean; else its first, as in the study.
         resamples: of the replicas, for the intervals of the change points.
 

@@ -18,7 +18,6 @@ from contextlib import suppress
 from datetime import datetime
 from importlib.metadata import version
 from pathlib import Path
-from types import TracebackType
 from typing import Any, BinaryIO, Final, Self
 
 from cprl.checks import check_nesting, shown
@@ -287,12 +286,7 @@ class RunLock:
             f"{socket.gethostname()}; if that process has ended: --take-over (in Python take_over=True)"
         )
 
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        traceback: TracebackType | None,
-    ) -> None:
+    def __exit__(self, kind: object, error: object, traceback: object) -> None:
         if self._file is None:
             return
         if self._is_still_there(self._file):  # nobody else's, where the directory was deleted and made again

@@ -98,7 +98,6 @@ def refuse_another_run(
 
     Args:
         out: the directory of the stopped run.
-        to_recipe: see `start_run`.
         kind: the dataclass of what the recipe holds, `cprl.Experiment`; fields that an earlier version did
             not know are then no differences while they have their defaults.
 

@@ -43,7 +43,6 @@ def write_results(
         study: the study, finished or not.
         out: its directory.
         runs: the directory of its runs.
-        window: see `cprl.studies.tables.table.study_table`.
         last: episodes at the end of the training that are compared.
         again: the command line that runs what is lacking, for the summary.
 

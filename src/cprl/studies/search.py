@@ -65,8 +65,6 @@ class Search:
             points, so it does not depend on the number of jobs.
         sampler: "tpe", "random" or "gp" (wants scipy and torch, which are there), or a function that makes
             a sampler of Optuna from a seed.
-        replicas: see `Study`.
-        block: see `Study`.
         name: by default that of the experiment.
     """
 
@@ -237,14 +235,7 @@ def run_search(
 
     Args:
         search: what is searched.
-        out: see `cprl.studies.run_study`.
-        on: see `cprl.studies.run_study`.
-        runs: see `cprl.studies.run_study`.
-        allow: see `cprl.studies.run_study`.
-        progress: see `cprl.studies.run_study`.
-        results: see `cprl.studies.run_study`.
         last: see `cprl.studies.run_study`; what the search itself looks at is in `Search`.
-        again: see `cprl.studies.run_study`.
     """
     object_of("search", search, Search, "a Search")
     check_executor(on)

@@ -18,7 +18,6 @@ from functools import partial
 from itertools import count
 from pathlib import Path
 from threading import Event, Thread
-from types import TracebackType
 from typing import Any, Final, Literal, NamedTuple, Self
 
 import psutil
@@ -393,12 +392,7 @@ class StatusFile:
         self._thread.start()
         return self
 
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        traceback: TracebackType | None,
-    ) -> None:
+    def __exit__(self, kind: object, error: object, traceback: object) -> None:
         self._is_over.set()
         self._thread.join()
         self._write()

@@ -70,7 +70,6 @@ class FiniteCheck:
     Args:
         learners: by the indices of their agents.
         spaces: what agents observe; entries of integers are not looked at.
-        on_nan: see `OnNan`.
     """
 
     def __init__(

@@ -191,7 +191,6 @@ def make_parts(
 
     Args:
         experiment: what they are made of.
-        allow: see `cprl.run`.
         starts: whether agents start with the weights of stored ones, where they ask for it; a training that
             is resumed reads its own.
         weights: those that `Frozen` agents play with, see `Population`.

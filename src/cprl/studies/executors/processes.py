@@ -15,7 +15,7 @@ from multiprocessing import resource_tracker
 from multiprocessing.connection import Connection
 from pathlib import Path
 from threading import Thread, current_thread, main_thread
-from types import FrameType, ModuleType, TracebackType
+from types import FrameType, ModuleType
 from typing import Any, ClassVar, Final, NoReturn, Protocol, Self, runtime_checkable
 
 from cprl.arguments import integer
@@ -111,12 +111,7 @@ class Stopping:
             self._usual[number] = signal.signal(number, self._ask)
         return self
 
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        traceback: TracebackType | None,
-    ) -> None:
+    def __exit__(self, kind: object, error: object, traceback: object) -> None:
         for number, usual in self._usual.items() if current_thread() is main_thread() else ():
             signal.signal(number, usual)
 

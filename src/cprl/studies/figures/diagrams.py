@@ -74,8 +74,6 @@ def heat_map(
         factors: two of its factors; any others are at the levels of the reference.
         path: the PNG.
         metric: one of its metrics.
-        part: see `cprl.studies.tables.comparing.compare`.
-        last: likewise.
     """
     path, design = picture_path(path), table.design
     grid, fixed = _checked(design, factors)
@@ -114,7 +112,6 @@ def phase_diagram(
 
     Args:
         table: the table.
-        found: see `cprl.studies.tables.sources.endings`.
         path: the PNG.
         factors: two factors; None for bars, of at most `MOST_CONDITIONS` conditions.
     """

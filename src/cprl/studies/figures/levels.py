@@ -51,8 +51,6 @@ def by_factor(
         factor: one of its factors.
         path: the PNG.
         metrics: by default those of `cprl.studies.tables.comparing.METRICS` that it has.
-        part: see `cprl.studies.tables.comparing.compare`.
-        last: likewise.
     """
     design, path = table.design, picture_path(path)
     numeric = [own for own in design.factors if is_numeric([at[own] for at in design.conditions.values()])]
@@ -341,9 +339,6 @@ def by_condition(
         table: the table, of at most `MOST_CONDITIONS` conditions.
         path: the PNG.
         kind: "levels", with random play as dashes; or "differences", with a dashed line at 0.
-        metrics: see `by_factor`.
-        part: see `cprl.studies.tables.comparing.compare`.
-        last: likewise.
     """
     choice("kind", kind, ("levels", "differences"))
     design, path = table.design, picture_path(path)

@@ -219,7 +219,6 @@ def table_of(
         design: the conditions that are compared.
         sources: the runs; what is damaged of them is listed as lacking.
         lacking: other runs, which are listed.
-        window: see `study_table`.
     """
     integer("window", window, 1)
     found: list[tuple[Source, list[Windows]]] = []
