@@ -13,12 +13,12 @@ VIEWER_PACKAGES := mesa-vulkan-drivers libvulkan1 chromium chromium-driver
 run: $(INSTALLED)
 	$(BIN)/python recipes/tragedy.py --watch serve --linger --no-keep-checkpoint
 
-# The site of docs/*.md with the reference, warnings as errors; docs-serve opens it, PORT takes another port.
+# The site of docs/*.md with the reference, warnings as errors; docs-serve serves it on 127.0.0.1, PORT takes another port.
 docs: $(DOCS_INSTALLED)
 	cd docs && ../$(BIN)/python -m website.build
 
 docs-serve: docs
-	@$(BIN)/cprl docs $(if $(PORT),--port $(PORT))
+	$(BIN)/python -m http.server --bind 127.0.0.1 --directory build/site $(or $(PORT),8765)
 
 # ARGS="tests/test_lanes.py" runs a part of the tests.
 PYTEST := python -m pytest -n auto --dist worksteal
@@ -63,8 +63,7 @@ viewer-packages:
 	sh tests/install_viewers.sh $(VIEWER_PACKAGES)
 
 # The wheel, in a bare environment outside the checkout; pip fetches what it needs.
-# The site of the docs travels in the wheel.
-test-wheel: docs
+test-wheel: $(INSTALLED)
 	$(BIN)/python -m pytest -m network tests/test_wheel.py
 
 lint: $(INSTALLED)

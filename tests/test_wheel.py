@@ -1,6 +1,6 @@
 """The wheel works outside the checkout, where pip installs it into a bare environment.
 
-`make test-wheel`, which builds the docs first; it needs the network, some minutes and about 2.5 GB of disk
+`make test-wheel`; it needs the network, some minutes and about 2.5 GB of disk
 for a while.
 """
 
@@ -135,7 +135,7 @@ COMMANDS = {
 
 def test_every_command_has_a_miniature(bare):
     listed = re.search(r"\{([a-z,\s]+)\}", bare.cprl("--help"))
-    assert set("".join(listed[1].split()).split(",")) == {*COMMANDS, "watch", "docs", "play", "egta"}
+    assert set("".join(listed[1].split()).split(",")) == {*COMMANDS, "watch", "play", "egta"}
 
 
 @pytest.mark.parametrize("name", list(COMMANDS))
@@ -172,11 +172,6 @@ def test_a_recording_is_served(bare, run):
     told, page = serving(bare, "watch", run, "--serve", lines=3)
     assert told[0].startswith("Watch (browser): ")
     assert "rerun" in page.lower()
-
-
-def test_the_docs_are_in_the_wheel_and_served(bare):
-    _, page = serving(bare, "docs", "--no-browser", "--port", "0", lines=1)
-    assert "The first hour" in page
 
 
 def test_the_wheel_holds_how_to_cite_it_and_what_has_changed(bare):

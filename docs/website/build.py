@@ -17,10 +17,10 @@ from website.navigation import sections
 from website.pages import ROOT, stage_pages
 from website.reference import stage_reference
 from website.replays import PAGE as REPLAYS
-from website.replays import stage_replays
+from website.replays import VIEWER, copy_viewer, stage_replays
 
 HERE: Final = Path(__file__).parent
-SITE: Final = ROOT / "src" / "cprl" / "docs_site"
+SITE: Final = ROOT / "build" / "site"
 STAGED: Final = ROOT / "build" / "docs"
 
 
@@ -36,9 +36,10 @@ def main() -> None:
     config = STAGED / "mkdocs.yml"
     config.write_text(_config(pages, navigation), encoding="utf-8")
     _build(config)
+    copy_viewer(SITE / VIEWER)
     files = [path.stat().st_size for path in SITE.rglob("*") if path.is_file()]
     print(f"{SITE.relative_to(ROOT)} has {len(files)} files, {sum(files) / 1e6:.1f} MB")
-    print("cprl docs opens it, with its replays; or open its index.html from the disk")
+    print("make docs-serve serves it, with its replays; or open its index.html from the disk")
 
 
 def _navigation(reference: dict[str, str]) -> list[Any]:

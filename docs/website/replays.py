@@ -1,7 +1,4 @@
-"""The recordings of docs/results, and the page that plays them in Rerun's web viewer.
-
-The viewer itself is not copied: `cprl docs` serves that of the installed rerun-sdk beside the pages.
-"""
+"""The recordings of docs/results, and the page that plays them in Rerun's web viewer, that of rerun-sdk."""
 
 import shutil
 from functools import cache
@@ -13,6 +10,7 @@ from urllib.parse import quote
 RESULTS: Final = Path(__file__).parents[1] / "results"
 PAGE: Final = "replays.md"
 FOLDER: Final = "recordings"
+VIEWER: Final = "viewer"
 
 _TEMPLATE: Final = Path(__file__).parent / "replays.md"
 """The page, with {links} where they go."""
@@ -41,3 +39,12 @@ def stage_replays(folder: Path) -> None:
     )
     text = _TEMPLATE.read_text(encoding="utf-8").replace("{links}", links)
     (folder / PAGE).write_text(text, encoding="utf-8")
+
+
+def copy_viewer(folder: Path) -> None:
+    """Writes the web viewer of the installed rerun-sdk, 43 MB, beside the pages."""
+    from cprl.viewer.page import web_viewer
+
+    folder.mkdir(parents=True, exist_ok=True)
+    for name, content in web_viewer().items():
+        (folder / name).write_bytes(content)

@@ -6,5 +6,4 @@ Modules, in the order in which one reads them:
     play_stored  cprl film, evaluate, visits, crossplay, schelling, egta, scenarios and exploit
     studies      cprl sweep and cprl table; study_main: the command line of a recipe of a study
     recipes      cprl recipe, and recipes that cprl run takes by name
-    docs         cprl docs
 """

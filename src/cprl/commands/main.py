@@ -15,7 +15,6 @@ from typing import Final
 import tyro
 
 from cprl.arguments import PLAY_SEED
-from cprl.commands.docs import docs
 from cprl.commands.play_stored import (
     check_runs,
     crossplay,
@@ -33,7 +32,7 @@ from cprl.commands.recipes import refuse_unknown, run_by_name
 from cprl.commands.studies import runs_table, sweep
 from cprl.presets import Variant, check_board
 from cprl.runs.recipe import read_recipe
-from cprl.system.output import keep_output, printed, say
+from cprl.system.output import printed, say
 from cprl.system.process import prepare_process
 from cprl.viewer.page import Page, has_display, headers_of
 
@@ -203,7 +202,6 @@ COMMANDS: Final[Mapping[str, Callable[..., None]]] = {
     "run": run,
     "recipe": print_recipe,
     "watch": watch,
-    "docs": docs,
     "film": film,
     "play": play,
     "export": export,
@@ -222,7 +220,6 @@ COMMANDS: Final[Mapping[str, Callable[..., None]]] = {
 
 def main() -> None:
     """The command line; what cannot be done is said in a line, and ends with exit code 1."""
-    keep_output()
     if sys.argv[1:] == ["--version"]:
         say(f"cprl {version('cprl')}")
         return

@@ -2,9 +2,11 @@
 
 import sys
 from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Annotated, Any, Final, Literal
 
+import tyro
 from rich.table import Table
 
 from cprl.arguments import EGTA_RESAMPLES, FILM_SEED, FILM_SUFFIXES, SEED, Diagonal
@@ -15,6 +17,32 @@ from cprl.runs.files import refuse_to_write_over
 from cprl.runs.recipe import read_recipe
 from cprl.system.output import OUT, console, printed, say
 from cprl.system.process import prepare_process
+
+if TYPE_CHECKING:
+    import pyarrow as pa
+
+Policy = Literal["trained", "random"]
+
+
+@dataclass(frozen=True, kw_only=True)
+class Fresh:
+    """How stored agents play fresh worlds."""
+
+    episodes: int
+    """Of each replica, in each choice of who plays where."""
+    greedy: bool = False
+    """Whether stored agents play what they hold best, without exploring or drawing."""
+    seed: int = SEED
+    """Of the worlds and all chance; the same one gives the same numbers."""
+    replicas: tuple[int, ...] = ()
+    """Their numbers; by default all that every run has."""
+    allow: Allow = ()
+    """Code of your own, module:Class, that a run may import; see docs/experiments.md."""
+
+
+FreshFlags = Annotated[Fresh, tyro.conf.arg(name="")]
+_TWENTY: Final = Fresh(episodes=20)
+_FIVE: Final = Fresh(episodes=5)
 
 
 def film(
@@ -81,72 +109,43 @@ def film(
         say(f"Watch: {printed(to_watch(path))}")
 
 
-def evaluate(
-    run: Path,
-    /,
-    *,
-    episodes: int = 20,
-    greedy: bool = False,
-    seed: int = SEED,
-    replicas: tuple[int, ...] = (),
-    out: Path | None = None,
-    allow: Allow = (),
-) -> None:
+def evaluate(run: Path, /, *, fresh: FreshFlags = _TWENTY, out: Path | None = None) -> None:
     """Lets all replicas of a run play fresh worlds, and prints the social metrics beside the random policy's.
 
     Args:
         run: the run's directory, or its results; of one that has not ended the newest checkpoint plays.
-        episodes: of each replica.
-        greedy: whether agents play what they hold best, without exploring or drawing.
-        seed: of the worlds and all chance; the same one gives the same numbers.
-        replicas: their numbers; by default all.
         out: a parquet file to be, with every episode.
-        allow: code of your own, module:Class, that the run may import; see docs/experiments.md.
     """
-    make_importable(allow)
+    make_importable(fresh.allow)
     check_files(out)
     check_runs(run)
 
     from cprl.evaluation.evaluate import evaluate_run, run_table
-    from cprl.runs.episodes import write_table
 
-    prepare_process(seed)
-    evaluation = evaluate_run(
-        run, episodes=episodes, greedy=greedy, seed=seed, replicas=replicas, allow=allow
-    )
-    if out is not None:
-        write_table(out, evaluation.table())
+    prepare_process(fresh.seed)
+    evaluation = evaluate_run(run, **vars(fresh))
+    _keep(evaluation.table, out)
     print_tables(run_table(evaluation))
     say(f"Weights: {evaluation.run.weights_from}")
-    if out is not None:
-        say(f"Episodes: {out}")
+    tell_files(out)
 
 
 def visits(
     run: Path,
     /,
     *,
-    episodes: int = 20,
-    greedy: bool = False,
-    seed: int = SEED,
-    replicas: tuple[int, ...] = (),
+    fresh: FreshFlags = _TWENTY,
     figure: Path | None = None,
     random: bool = False,
-    allow: Allow = (),
 ) -> None:
     """Lets all replicas of a run play fresh worlds, and prints how far agents keep to cells of their own.
 
     Args:
         run: the run's directory, or its results; of one that has not ended the newest checkpoint plays.
-        episodes: of each replica.
-        greedy: whether agents play what they hold best, without exploring or drawing.
-        seed: of the worlds and all chance; the same one gives the same numbers.
-        replicas: their numbers; by default all. The first one is drawn.
-        figure: a PNG to be: a map for each agent of where it spends its time.
+        figure: a PNG to be: a map for each agent of where it spends its time, in the first of the replicas.
         random: draw random agents in the same worlds instead.
-        allow: code of your own, module:Class, that the run may import; see docs/experiments.md.
     """
-    make_importable(allow)
+    make_importable(fresh.allow)
     if random and figure is None:
         raise ValueError("--random says who is drawn; allowed: with --figure FILE.png")
     check_files(figure=figure)
@@ -154,62 +153,40 @@ def visits(
 
     from cprl.evaluation.territory import draw_visits, territory_of, territory_table
 
-    prepare_process(seed)
-    found = territory_of(run, episodes=episodes, greedy=greedy, seed=seed, replicas=replicas, allow=allow)
+    prepare_process(fresh.seed)
+    found = territory_of(run, **vars(fresh))
     print_tables(territory_table(found))
     say(f"Weights: {found.run.weights_from}")
-    if figure is not None:
-        say(f"Figure: {draw_visits(found, figure, policy='random' if random else 'trained')}")
+    policy: Policy = "random" if random else "trained"
+    tell_files(None, figure, lambda path: draw_visits(found, path, policy=policy))
 
 
 def crossplay(
     runs: tuple[str, ...],
     /,
     *,
-    episodes: int = 20,
-    greedy: bool = False,
-    seed: int = SEED,
-    replicas: tuple[int, ...] = (),
+    fresh: FreshFlags = _TWENTY,
     diagonal: Diagonal = "self",
     out: Path | None = None,
     figure: Path | None = None,
-    allow: Allow = (),
 ) -> None:
     """Lets agents of each run play among those of each other run, and prints how all fare.
 
     Args:
         runs: directories of runs of the same game, or their results; NAME=PATH gives one another name.
-        episodes: of each replica with each focal agent.
-        greedy: whether agents play what they hold best, without exploring or drawing.
-        seed: of the worlds and all chance; the same one gives the same numbers.
-        replicas: their numbers; by default all that every run has.
         diagonal: whom a run's agents meet there: "self", those they were trained with, or "cross_seed", those
             of the run's next replica.
         out: a parquet file to be, with every episode.
         figure: a PNG to be: what focal agents gain, and what it costs the background agents.
-        allow: code of your own, module:Class, that the run may import; see docs/experiments.md.
     """
-    make_importable(allow)
-    check_files(out, figure)
-    named = runs_by_name(runs)
-    check_runs(*(named.values() if isinstance(named, dict) else named))
+    named = _named_runs(runs, fresh, out, figure)
 
     from cprl.evaluation.cross_play import agents_table, draw_gains, gains_tables, heading, matrices
     from cprl.evaluation.cross_play import crossplay as play_each_other
-    from cprl.runs.episodes import write_table
 
-    prepare_process(seed)
-    played = play_each_other(
-        named,
-        episodes=episodes,
-        greedy=greedy,
-        seed=seed,
-        replicas=replicas,
-        diagonal=diagonal,
-        allow=allow,
-    )
-    if out is not None:
-        write_table(out, played.table())
+    prepare_process(fresh.seed)
+    played = play_each_other(named, diagonal=diagonal, **vars(fresh))
+    _keep(played.table, out)
     say(heading(played))
     print_tables(*matrices(played), *gains_tables(played), agents_table(played))
     tell_files(out, figure, lambda path: draw_gains(played, path))
@@ -253,7 +230,6 @@ def schelling(
     from cprl.evaluation.populations import board_named
     from cprl.evaluation.schelling import draw_schelling, schelling_tables
     from cprl.evaluation.schelling import schelling as play_all_mixes
-    from cprl.runs.episodes import write_table
 
     prepare_process(seed)
     game, run = board_named(board, variant, allow=allow)
@@ -266,8 +242,7 @@ def schelling(
         seed=seed,
         allow=allow,
     )
-    if out is not None:
-        write_table(out, found.table())
+    _keep(found.table, out)
     print_tables(*schelling_tables(found))
     tell_files(out, figure, lambda path: draw_schelling(found, path))
 
@@ -276,55 +251,35 @@ def egta(
     runs: tuple[str, ...],
     /,
     *,
-    episodes: int = 5,
+    fresh: FreshFlags = _FIVE,
     pairwise: bool = False,
     resamples: int = EGTA_RESAMPLES,
-    greedy: bool = False,
-    seed: int = SEED,
-    replicas: tuple[int, ...] = (),
     out: Path | None = None,
     figure: Path | None = None,
-    allow: Allow = (),
 ) -> None:
     """Lets agents of runs play in all compositions, and prints which runs last: equilibria, alpha-rank,
     replicator dynamics (extra "theory").
 
     Args:
         runs: directories of runs of the same game, or their results; NAME=PATH gives one another name.
-        episodes: of each replica and choice of who plays where.
         pairwise: play one agent of each run among those of each other, as `cprl crossplay` does: cheaper,
             and a reduction where there are more than two agents.
         resamples: of the replicas, for intervals.
-        greedy: whether agents play what they hold best, without exploring or drawing.
-        seed: of the worlds and all chance; the same one gives the same numbers.
-        replicas: their numbers; by default all that every run has.
         out: a parquet file to be, with every episode.
         figure: a PNG to be: the dynamics, and the shares by alpha-rank.
-        allow: code of your own, module:Class, that the run may import; see docs/experiments.md.
     """
-    make_importable(allow)
-    check_files(out, figure)
-    named, chosen = runs_by_name(runs), list(replicas)
-    check_runs(*(named.values() if isinstance(named, dict) else named))
+    named = _named_runs(runs, fresh, out, figure)
 
     from cprl.evaluation.cross_play import crossplay
     from cprl.evaluation.egta import analyse, draw_egta, egta_heading, egta_tables
     from cprl.evaluation.empirical_game import pairwise_game, play_empirical_game
-    from cprl.runs.episodes import write_table
     from cprl.theory.solutions import check_extras
 
     check_extras()
-    prepare_process(seed)
-    if pairwise:
-        game = pairwise_game(
-            crossplay(named, episodes=episodes, greedy=greedy, seed=seed, replicas=chosen, allow=allow)
-        )
-    else:
-        game = play_empirical_game(
-            named, episodes=episodes, greedy=greedy, seed=seed, replicas=chosen, allow=allow
-        )
-    if out is not None:
-        write_table(out, game.episodes_table)
+    prepare_process(fresh.seed)
+    how = vars(fresh)
+    game = pairwise_game(crossplay(named, **how)) if pairwise else play_empirical_game(named, **how)
+    _keep(lambda: game.episodes_table, out)
     found = analyse(game, resamples=resamples)
     say(egta_heading(game))
     print_tables(*egta_tables(found))
@@ -336,13 +291,9 @@ def scenarios(
     /,
     *,
     scenarios: tuple[str, ...] = (),
-    episodes: int = 5,
-    greedy: bool = False,
-    seed: int = SEED,
-    replicas: tuple[int, ...] = (),
+    fresh: FreshFlags = _FIVE,
     out: Path | None = None,
     figure: Path | None = None,
-    allow: Allow = (),
 ) -> None:
     """Lets a run's agents play among agents that they never met, and prints how they fare beside random and
     greedy agents in their places.
@@ -350,33 +301,18 @@ def scenarios(
     Args:
         run: the run's directory, or its results; of one that has not ended the newest checkpoint plays.
         scenarios: their names, e.g. minority_among_greedy; by default all of the run's game.
-        episodes: of each replica in each placement.
-        greedy: whether stored agents play what they hold best, without exploring or drawing.
-        seed: of the worlds and all chance; the same one gives the same numbers.
-        replicas: their numbers; by default all.
         out: a parquet file to be, with every episode.
         figure: a PNG to be: the returns in each scenario.
-        allow: code of your own, module:Class, that the run may import; see docs/experiments.md.
     """
-    make_importable(allow)
+    make_importable(fresh.allow)
     check_files(out, figure)
     check_runs(run)
 
     from cprl.evaluation.scenarios import draw_scenarios, heading, run_scenarios, scenario_tables
-    from cprl.runs.episodes import write_table
 
-    prepare_process(seed)
-    scores = run_scenarios(
-        run,
-        scenarios=scenarios,
-        episodes=episodes,
-        greedy=greedy,
-        seed=seed,
-        replicas=replicas,
-        allow=allow,
-    )
-    if out is not None:
-        write_table(out, scores.table())
+    prepare_process(fresh.seed)
+    scores = run_scenarios(run, scenarios=scenarios, **vars(fresh))
+    _keep(scores.table, out)
     say(heading(scores))
     print_tables(*scenario_tables(scores))
     say(f"Weights: {scores.run.weights_from}")
@@ -452,6 +388,25 @@ def exploit(
     say(f"Episodes: {folder / TABLE}")
 
 
+def _named_runs(
+    runs: Sequence[str], fresh: Fresh, out: Path | None, figure: Path | None
+) -> list[str] | dict[str, str]:
+    """The runs that words name, once they and the files to be are checked."""
+    make_importable(fresh.allow)
+    check_files(out, figure)
+    named = runs_by_name(runs)
+    check_runs(*(named.values() if isinstance(named, dict) else named))
+    return named
+
+
+def _keep(table: "Callable[[], pa.Table]", out: Path | None) -> None:
+    """Writes a table of episodes where `--out` says so."""
+    if out is not None:
+        from cprl.runs.episodes import write_table
+
+        write_table(out, table())
+
+
 def check_files(out: Path | None = None, figure: Path | None = None) -> None:
     """Checks what `--out` and `--figure` name before hours of work.
 
@@ -473,17 +428,25 @@ def check_runs(*runs: Path | str) -> None:
         read_recipe(Path(run))
 
 
-def tell_files(out: Path | None, figure: Path | None, draw: Callable[[Path], Path]) -> None:
+def tell_files(
+    out: Path | None, figure: Path | None = None, draw: Callable[[Path], Path] | None = None
+) -> None:
     """Says where the episodes are, and draws the figure."""
     if out is not None:
         say(f"Episodes: {out}")
-    if figure is not None:
+    if figure is not None and draw is not None:
         say(f"Figure: {draw(figure)}")
 
 
 def runs_by_name(words: Sequence[str]) -> list[str] | dict[str, str]:
     """Runs as `crossplay` takes them: paths, or a table where one has a name, NAME=PATH."""
-    pairs = [_name_and_path(word) for word in words]
+    pairs = []
+    for word in words:
+        name, equals, path = word.partition("=")
+        is_named = (
+            equals and name and "/" not in name and not Path(word).exists()
+        )  # a path may have "=" itself
+        pairs.append((name, path) if is_named else ("", word))
     if not any(name for name, _ in pairs):
         return [path for _, path in pairs]
     named = [(name or Path(path).resolve().name, path) for name, path in pairs]
@@ -492,12 +455,6 @@ def runs_by_name(words: Sequence[str]) -> list[str] | dict[str, str]:
         if names.count(name) > 1:
             raise ValueError(f"{name} names {names.count(name)} runs; allowed: each its own, NAME=PATH")
     return dict(named)
-
-
-def _name_and_path(word: str) -> tuple[str, str]:
-    """The parts of NAME=PATH; a path that is there may have "=" itself."""
-    name, equals, path = word.partition("=")
-    return (name, path) if equals and name and "/" not in name and not Path(word).exists() else ("", word)
 
 
 def print_tables(*tables: Table) -> None:

@@ -190,7 +190,6 @@ def parse_with(
         program: what stands before these words, for messages.
         note: what `--help` says after the recipe's own text.
     """
-    from cprl.commands.recipe import applied, flags_of
     from cprl.experiment import Experiment
 
     callable_of("make_experiment", make_experiment, "a function that gives an Experiment")

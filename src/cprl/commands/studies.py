@@ -18,7 +18,7 @@ from cprl.arguments import BLOCK, LAST, WINDOW, integer, object_of, texts
 from cprl.commands.recipe import ended_by_sigterm, in_a_sentence, parse_with
 from cprl.runs.files import refuse_to_write_over, write_atomically
 from cprl.runs.recipe import read_recipe, runs_in, without_directories, without_options
-from cprl.system.output import OUT, RESUMES, console, keep_output, printed, say
+from cprl.system.output import OUT, RESUMES, console, printed, say
 from cprl.system.shipped import command_of, is_shipped, named_command, program_of, recipe_named
 
 if TYPE_CHECKING:
@@ -138,7 +138,6 @@ def study_main(study: "Study", argv: Sequence[str] | None = None) -> Path:
 
     object_of("study", study, Study, "a Study")
     command = list(texts("argv", sys.argv if argv is None else argv, 1))
-    keep_output()
     script = program_of(command[0])
 
     def read(options: Annotated[MainOptions, tyro.conf.arg(name="")] = MainOptions()) -> MainOptions:

@@ -6,7 +6,7 @@ Modules:
     compile_clock  whether code is being compiled, for how long, and what it leaves in memory
     compiling      functions compiled by torch
     memory         devices, and what would not fit into their memory
-    output         text for the terminal, which may close
+    output         text for the terminal
     process        settings of the process that trains, and where compiled code is kept
     shipped        the recipes that come with cprl, and how a command is typed again
     times          where the time of a training and of a run goes

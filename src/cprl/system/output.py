@@ -1,15 +1,10 @@
-"""Text for the terminal: a closed standard output or one of another encoding never ends a training."""
+"""Text for the terminal, in whatever encoding it has."""
 
-import atexit
-import contextlib
 import io
-import os
 import shlex
 import subprocess
 import sys
 from collections.abc import Callable, Sequence
-from functools import cache
-from pathlib import Path
 from typing import Final, TextIO, cast
 
 from rich.console import Console
@@ -25,36 +20,25 @@ RESUMES: Final = "To resume: "
 """What stands before the command line that resumes a run."""
 
 
-class Output(io.TextIOBase):
-    """The standard output of the moment. What can no longer be written is dropped, which is said once.
-
-    The file descriptor then leads to the null device, so that nothing else that prints fails either, nor the
-    interpreter when it exits.
+class Output:
+    """The standard output of the moment, which may be missing, in characters that it has.
 
     Args:
         stream: gives the stream, or None where there is none.
     """
 
     def __init__(self, stream: Callable[[], TextIO | None]) -> None:
-        self._stream, self._told = stream, False
-        self.run: Path | None = None
-        """The run that goes on without the output, for the sentence that says so."""
-
-    def __del__(self) -> None:
-        """Flushes nothing: since Python 3.13 `sys` may be gone by then, and `keep_output` has flushed."""
+        self._stream = stream
 
     @property
-    def encoding(self) -> str:  # type: ignore[override]
+    def encoding(self) -> str:
         """That of the stream."""
         return getattr(self._stream(), "encoding", None) or "utf-8"
 
     def isatty(self) -> bool:
         """Whether the stream is a terminal."""
-        try:
-            stream = self._stream()
-            return stream is not None and stream.isatty()
-        except ValueError:  # it was closed
-            return False
+        stream = self._stream()
+        return stream is not None and not stream.closed and stream.isatty()
 
     def fileno(self) -> int:
         """The file descriptor of the stream."""
@@ -63,45 +47,22 @@ class Output(io.TextIOBase):
             raise io.UnsupportedOperation("fileno")
         return stream.fileno()
 
-    def writable(self) -> bool:
-        """Yes."""
-        return True
-
     def write(self, text: str) -> int:
         """Writes, in plainer characters where the stream does not have these."""
         stream = self._stream()
         if stream is not None:
             try:
-                try:
-                    stream.write(text)
-                except UnicodeEncodeError:
-                    encoding = self.encoding
-                    stream.write(text.translate(PLAIN).encode(encoding, "replace").decode(encoding))
-            except (OSError, ValueError) as error:
-                self._close(stream, error)
+                stream.write(text)
+            except UnicodeEncodeError:
+                encoding = self.encoding
+                stream.write(text.translate(PLAIN).encode(encoding, "replace").decode(encoding))
         return len(text)
 
     def flush(self) -> None:
         """Flushes the stream."""
         stream = self._stream()
         if stream is not None:
-            try:
-                stream.flush()
-            except (OSError, ValueError) as error:
-                self._close(stream, error)
-
-    def _close(self, stream: TextIO, error: Exception) -> None:
-        with contextlib.suppress(OSError, ValueError):
-            null = os.open(os.devnull, os.O_WRONLY)
-            os.dup2(null, stream.fileno())
-            os.close(null)
-        if self._told or self is ERR:
-            return
-        self._told = True
-        where = f" The run continues; it is in {self.run}." if self.run else ""
-        why = getattr(error, "strerror", None) or error
-        ERR.write(f"Standard output was closed ({why}); nothing more is printed.{where}\n")
-        ERR.flush()
+            stream.flush()
 
 
 def _behind(stream: TextIO | None) -> TextIO | None:
@@ -114,7 +75,7 @@ ERR: Final = Output(lambda: _behind(sys.stderr))
 
 
 def console(output: Output = OUT, *, width: int | None = None) -> Console:
-    """A console that no closed output and no encoding can stop, by default on standard output.
+    """A console that no encoding can stop, by default on standard output.
 
     Square brackets and colons in texts are shown as they are: they may be those of a path or a name. What is
     to have a style is a `rich.text.Text`.
@@ -138,21 +99,3 @@ def _text(value: object) -> str:
         return str(value)
     except Exception:  # of whatever kind a user's object raises; one that holds itself, a RecursionError
         return shown(value)
-
-
-@cache
-def keep_output() -> None:
-    """Prepares this process for an output that is closed, from the beginning or at any time.
-
-    Standard streams that are closed already lead to the null device, so that no file of the run gets their
-    number. When the interpreter exits, what is left in their buffers is dropped where it cannot be written.
-    """
-    for number in (0, 1, 2):
-        try:
-            os.fstat(number)
-        except OSError:
-            null = os.open(os.devnull, os.O_RDWR)  # gets the lowest free number, which is this one
-            if null != number:
-                os.close(null)
-    for output in (ERR, OUT):
-        atexit.register(output.flush)

@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import Final
 
 from cprl.checks import MOST_SEED, checked, count
-from cprl.system.output import OUT, keep_output
+from cprl.system.output import OUT
 
 _M_TRIM_THRESHOLD: Final = -1
 _M_MMAP_THRESHOLD: Final = -3
@@ -24,16 +24,14 @@ _MAX_THRESHOLD_BYTES: Final = 32 * 2**20
 def prepare_process(seed: int) -> None:
     """Prepares the process for a training.
 
-    Prepares the standard streams for being closed (`cprl.system.output`), seeds torch's global generator,
-    limits torch to one thread, flushes denormal numbers to zero, makes glibc reuse freed memory, keeps what
-    torch compiles in `cache_folder` unless $TORCHINDUCTOR_CACHE_DIR says where, and logs warnings of TorchRL
-    and messages of cprl.
+    Seeds torch's global generator, limits torch to one thread, flushes denormal numbers to zero, makes glibc
+    reuse freed memory, keeps what torch compiles in `cache_folder` unless $TORCHINDUCTOR_CACHE_DIR says
+    where, and logs warnings of TorchRL and messages of cprl.
 
     The networks are so small that a second thread slows them down, up to a hundredfold on a busy machine.
     Denormal numbers in Adam's moments of dead weights slow a long run by a factor of up to 1.9.
     """
     checked("seed", seed, count(0, MOST_SEED))
-    keep_output()
 
     import torch
 

@@ -33,7 +33,7 @@ from cprl.runs.recipe import (
 )
 from cprl.runs.weights import partners_of, save_decisions, save_transforms, save_weights, weights_of
 from cprl.system.compile_clock import cleared_up, free_earlier
-from cprl.system.output import OUT, RESUMES, console, say
+from cprl.system.output import RESUMES, console, say
 from cprl.system.process import prepare_process
 from cprl.system.times import RunTimes
 from cprl.terminal.figures import training_curve
@@ -153,7 +153,6 @@ def run(
         directory = out
     else:
         directory = start_run(out, experiment.name, partial(_recipe_of, experiment), command=command)
-    OUT.run = directory
     checkpointer = Checkpointer(
         directory,
         keep_ending=keep_checkpoint,
