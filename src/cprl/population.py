@@ -10,7 +10,6 @@ from dataclasses import dataclass, replace
 from posixpath import normpath
 from typing import Any, Final, TypeAlias
 
-from cprl import arguments
 from cprl.algorithms.base import Algorithm, TeamAlgorithm
 from cprl.checks import (
     NONE,
@@ -244,7 +243,7 @@ def exploration_steps(specs: Sequence[AgentSpec]) -> int | None:
     None if no agent explores by epsilon, or only by an algorithm of the user's own. Agents that draw from a
     policy do not, though the settings of those that learn from replay have an epsilon.
     """
-    specs = arguments.listed("specs", specs, "a sequence of specifications of agents")
+    specs = tuple(specs)
     for place, spec in enumerate(specs):
         checked(f"specs[{place}]", spec, SPEC)
     algorithms = [spec.algorithm for spec in specs if isinstance(spec, Learning | Team)]

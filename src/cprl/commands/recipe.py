@@ -32,7 +32,6 @@ from typing import (
 
 import tyro
 
-from cprl.arguments import callable_of, texts
 from cprl.checks import checked, instance
 from cprl.commons import maps
 from cprl.commons.maps import Map
@@ -101,7 +100,7 @@ def recipe_main(
         SystemExit: where the command line or an experiment is refused, with the reason; with code 130 or 143
             where SIGINT (Ctrl-C) or SIGTERM interrupted the run.
     """
-    command = list(texts("argv", sys.argv if argv is None else argv, 1))
+    command = list(sys.argv if argv is None else argv)
     with in_a_sentence(program_of(command[0])):
         experiment, options = parse(make_experiment, command)
         if options.take_over and not options.resume:
@@ -192,7 +191,6 @@ def parse_with(
     """
     from cprl.experiment import Experiment
 
-    callable_of("make_experiment", make_experiment, "a function that gives an Experiment")
     given = list(words)
     _check_names(make_experiment, options)
     made, _ = tyro.cli(

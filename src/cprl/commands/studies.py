@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Final, Literal
 
 import tyro
 
-from cprl.arguments import BLOCK, LAST, WINDOW, integer, object_of, texts
+from cprl.arguments import BLOCK, LAST, WINDOW, integer
 from cprl.commands.recipe import ended_by_sigterm, in_a_sentence, parse_with
 from cprl.runs.files import refuse_to_write_over, write_atomically
 from cprl.runs.recipe import read_recipe, runs_in, without_directories, without_options
@@ -134,10 +134,8 @@ def study_main(study: "Study", argv: Sequence[str] | None = None) -> Path:
         SystemExit: where the command line is refused, with the reason; with code 1 where trials failed, and
             130 or 143 where SIGINT (Ctrl-C) or SIGTERM interrupted it.
     """
-    from cprl.studies import Study
 
-    object_of("study", study, Study, "a Study")
-    command = list(texts("argv", sys.argv if argv is None else argv, 1))
+    command = list(sys.argv if argv is None else argv)
     script = program_of(command[0])
 
     def read(options: Annotated[MainOptions, tyro.conf.arg(name="")] = MainOptions()) -> MainOptions:

@@ -19,7 +19,6 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 from tensordict import TensorDictBase
 
-from cprl.arguments import path as path_of
 from cprl.institutions import COUNTS
 from cprl.measuring import Episode, social
 from cprl.measuring.metrics import left_out
@@ -62,9 +61,9 @@ class EpisodeTable:
     def __init__(
         self, path: str | os.PathLike[str], *, resumable: bool = False, run: Path | None = None
     ) -> None:
-        self.path = path_of("path", path)
+        self.path = Path(path)
         self.journal = _journal_of(self.path)
-        self._run = self.path.parent if run is None else path_of("run", run)
+        self._run = self.path.parent if run is None else Path(run)
         self._resumable = resumable
         for table in () if resumable else (self.path, self.journal):
             if table.exists():
@@ -170,7 +169,7 @@ def read_episodes(run_directory: str | os.PathLike[str]) -> pa.Table:
         FileNotFoundError: if there are none.
         ValueError: if the file is damaged, see `cprl.runs.files`, or a newer cprl wrote it.
     """
-    path = path_of("run_directory", run_directory) / FILE_NAME
+    path = Path(run_directory) / FILE_NAME
     recipe = path.with_name("recipe.json")  # with the format of the journal, which has none of its own
     if recipe.is_file():
         refuse_newer(recipe, read_json(recipe), RECIPE_FORMAT)
@@ -190,7 +189,7 @@ def read_table(path: str | os.PathLike[str]) -> pa.Table:
         FileNotFoundError: if there is no such file.
         ValueError: if it is damaged or no parquet file; names it.
     """
-    path = path_of("path", path)
+    path = Path(path)
     refuse_special(path)
     verify(path)
     try:

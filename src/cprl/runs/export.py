@@ -9,8 +9,6 @@ from typing import Any, Final
 import pyarrow as pa
 import pyarrow.parquet as pq
 
-from cprl.arguments import path as path_of
-from cprl.arguments import switch
 from cprl.config import differences
 from cprl.runs.episodes import FILE_NAME, read_episodes, read_table, small
 from cprl.runs.files import refuse_links, refuse_missing, unlist, verify, write_listed
@@ -45,8 +43,7 @@ def export_results(run: Path, folder: Path, *, weights: bool = True) -> Path:
         ValueError: if there is no run, a file of it is damaged or lost, or the folder holds another run.
         FileNotFoundError: if the run has not ended.
     """
-    run, folder = path_of("run", run), path_of("folder", folder)
-    switch("weights", weights)
+    run, folder = Path(run), Path(folder)
     recipe = read_recipe(run)
     _refuse_another(folder, run, recipe)
     refuse_links(folder)

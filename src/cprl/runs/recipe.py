@@ -14,9 +14,8 @@ from itertools import count
 from pathlib import Path
 from typing import Any, Final
 
-from cprl.arguments import callable_of, listed, refusal, texts
-from cprl.arguments import path as path_of
-from cprl.checks import TEXT, check_nesting, checked, instance, shown
+from cprl.arguments import refusal
+from cprl.checks import shown
 from cprl.custom import source_of
 from cprl.runs.files import LOCK_FILE, RECIPE_FORMAT, RunLock, digest_of, read_json, refuse_newer, write_json
 from cprl.system.output import ERR, console, printed
@@ -61,12 +60,9 @@ def start_run(
         RunLockedError: if another process is just starting a run there.
         ValueError: if the name cannot be that of a directory.
     """
-    checked("name", name, TEXT)
     if Path(name).name != name or "\0" in name:
         raise ValueError(f"name is {shown(name)}; allowed: the name of a directory, without slashes")
-    callable_of("to_recipe", to_recipe, "a function that makes the recipe for a directory")
-    out = None if out is None else path_of("out", out)
-    command = None if command is None else texts("command", command, 1)
+    out = None if out is None else Path(out)
     started = datetime.now().astimezone()
     is_new = out is None or not out.exists()
     directory = _new_directory(name, started) if out is None else _made_directory(out)
@@ -240,7 +236,7 @@ def resume_command(run: Path, command: Sequence[str] | None = None) -> str:
         targets = custom_targets(read_json(path).get("experiment")) if path.exists() else []
         allow = [word for target in targets for word in ("--allow", target)]
         return printed([*cprl_here(), "run", str(run), "--resume", *allow])
-    kept = [word for word in _without_out(command) if word.replace("_", "-") not in _RESUMES]
+    kept = [word for word in without_options(command, _DIRECTORIES) if word.replace("_", "-") not in _RESUMES]
     return printed([*command_of(kept), "--out", str(run), "--resume"])
 
 
@@ -248,7 +244,7 @@ def _command(words: Sequence[str]) -> str:
     """A command line without local directories, because recipes are published: the script relative to the
     working directory, or its name alone, no `--out` and no `--runs`."""
     first = words[0].split(" ") if words[0].startswith(PROGRAM) else [without_directories(words[0])]
-    return shlex.join([*first, *_without_out(words[1:])])
+    return shlex.join([*first, *without_options(words[1:], _DIRECTORIES)])
 
 
 def without_directories(program: str) -> str:
@@ -258,11 +254,6 @@ def without_directories(program: str) -> str:
     if path.is_absolute():
         path = path.relative_to(here) if path.is_relative_to(here) else Path(path.name)
     return str(path)
-
-
-def _without_out(words: Sequence[str]) -> list[str]:
-    """The words of a command line without `--out DIRECTORY`, and `--runs DIRECTORY` of a study."""
-    return without_options(words, _DIRECTORIES)
 
 
 def without_options(words: Sequence[str], options: Sequence[str]) -> list[str]:
@@ -299,8 +290,8 @@ def read_recipe(run: Path) -> dict[str, Any]:
 def runs_in(paths: Iterable[Path | str]) -> list[Path]:
     """The runs among paths: each is a run's directory, or one that holds runs, in order."""
     runs: list[Path] = []
-    for path in listed("runs", paths, "directories of runs"):
-        folder = path_of("runs", path)
+    for path in paths:
+        folder = Path(path)
         is_run = (folder / RECIPE_FILE).exists()
         inside = [folder] if is_run else sorted(recipe.parent for recipe in folder.glob(f"*/{RECIPE_FILE}"))
         if not inside:
@@ -353,8 +344,6 @@ def _refuse_contents(directory: Path) -> None:
 
 def recipe_config(recipe: Mapping[str, Any]) -> dict[str, Any]:
     """The experiment of a recipe, as `Experiment.to_config` gives it."""
-    checked("the recipe", recipe, instance(Mapping, "a table"))
-    check_nesting(recipe, "the recipe")
     refuse_newer("the recipe", recipe, RECIPE_FORMAT)
     if recipe.get("format") != RECIPE_FORMAT or not isinstance(recipe.get("experiment"), Mapping):
         raise ValueError(

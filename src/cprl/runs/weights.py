@@ -10,9 +10,7 @@ from tensordict import TensorDictBase
 from torch import Tensor, nn
 from torchrl.record.loggers import Logger
 
-from cprl.arguments import callable_of, object_of
-from cprl.arguments import path as path_of
-from cprl.checks import TEXT, checked, count, shown
+from cprl.checks import checked, count, shown
 from cprl.envs.commons_env import CommonsEnv
 from cprl.measuring.episodes import Episode
 from cprl.measuring.evaluate import evaluate, mean_return
@@ -31,10 +29,9 @@ def save_weights(run: Path, networks: Mapping[str, nn.Module], *, name: str = "f
     Returns:
         `checkpoints/<name>.pt` of the run, which `load_weights` reads.
     """
-    _check_networks(networks)
     if not isinstance(name, str) or not name or Path(name).name != name or "\0" in name:
         raise ValueError(f"name is {shown(name)}; allowed: the name of a file, without slashes and suffix")
-    run = path_of("run", run)
+    run = Path(run)
     weights = {agent: network.state_dict() for agent, network in networks.items()}
     return write_listed(run, f"checkpoints/{name}.pt", lambda file: torch.save(weights, file))
 
@@ -60,11 +57,7 @@ def save_decisions(run: Path, values: Mapping[str, Tensor]) -> None:
         run: the run's directory.
         values: float64 [C] by the agent's name, see `cprl.learners.decisions.BanditDecider.learned`.
     """
-    run = path_of("run", run)
-    object_of("values", values, Mapping, "values by the agent's name")
-    for name, own in values.items():
-        checked("values", name, TEXT)
-        object_of(f"values[{name!r}]", own, Tensor, "a tensor")
+    run = Path(run)
     if values:
         write_listed(run, f"checkpoints/{DECISIONS}", lambda file: torch.save(dict(values), file))
 
@@ -95,11 +88,8 @@ class BestWeights:
         every: int = 10,
         logger: Logger | None = None,
     ) -> None:
-        _check_networks(networks)
-        callable_of("policy", policy, "a function that writes the actions of all agents")
-        object_of("env", env, CommonsEnv, "a CommonsEnv")
         checked("every", every, count(1))
-        self.run, self.networks, self.policy, self.env = path_of("run", run), networks, policy, env
+        self.run, self.networks, self.policy, self.env = Path(run), networks, policy, env
         self.every, self.logger = every, logger
         self.seed = int(env.worlds.now.seed[0, 0])
         self.path: Path | None = None
@@ -128,8 +118,7 @@ class BestWeights:
 
 def restore_weights(path: Path, networks: Mapping[str, nn.Module]) -> None:
     """Loads saved weights into the networks of the same agents."""
-    _check_networks(networks)
-    kept = load_weights(path_of("path", path))
+    kept = load_weights(Path(path))
     if set(kept) != set(networks):
         raise ValueError(f"{path} holds the weights of {sorted(kept)}; allowed: {sorted(networks)}")
     for agent, network in networks.items():
@@ -137,13 +126,6 @@ def restore_weights(path: Path, networks: Mapping[str, nn.Module]) -> None:
             network.load_state_dict(kept[agent])
         except (RuntimeError, TypeError, AttributeError) as error:
             raise ValueError(f"{path} holds no weights of this network of {agent}: {error}") from error
-
-
-def _check_networks(networks: Mapping[str, nn.Module]) -> None:
-    object_of("networks", networks, Mapping, "networks by the agent's name")
-    for name, network in networks.items():
-        checked("networks", name, TEXT)
-        object_of(f"networks[{name!r}]", network, nn.Module, "a network of torch")
 
 
 def load_weights(path: Path) -> dict[str, Any]:

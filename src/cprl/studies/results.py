@@ -5,8 +5,6 @@ from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Final
 
-from cprl.arguments import object_of
-from cprl.arguments import path as path_of
 from cprl.runs.checkpoints import REPORT
 from cprl.runs.files import read_json, refuse_links, write_atomically
 from cprl.studies.figures.courses import courses
@@ -53,9 +51,7 @@ def write_results(
         ValueError: for what does not fit, before anything is written.
         OSError: where it cannot be written; each file is then whole, an old one or a new one.
     """
-    object_of("study", study, Study, "a Study")
-    out, folder = path_of("out", out), path_of("runs", runs)
-    object_of("again", again, str, "a command line")
+    out, folder = Path(out), Path(runs)
     refuse_links(out)
     status = out / _STATUS
     table = study_table(study, folder, window=window, status=status if status.exists() else None)

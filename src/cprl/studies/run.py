@@ -8,7 +8,7 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
-from cprl.arguments import integer, object_of, path, refusal, switch, texts
+from cprl.arguments import integer, path, refusal
 from cprl.runs.files import LOCK_FILE, StudyLock, remove_partial
 from cprl.studies.executors import Executor, InProcess
 from cprl.studies.progress import Progress
@@ -75,14 +75,11 @@ def run_study(
             what is kept.
         SystemExit: with code 143 after SIGTERM, likewise.
     """
-    object_of("study", study, Study, "a Study")
     out = directory_of(study, out)
     folder = out / RUNS if runs is None else path("runs", runs)
     trials = trials_of(study)
     chosen = trials_with(trials, only)
     check_executor(on)
-    switch("results", results)
-    switch("keep_checkpoints", keep_checkpoints)
     check_comparison(last)
     with as_driver(
         study,
@@ -101,7 +98,7 @@ def run_study(
 
 def trials_with(trials: Sequence[Trial], only: Sequence[str]) -> list[Trial]:
     """The trials of conditions that have one of some names, or its levels; without any, all of them."""
-    wanted = [set(levels_in(levels)) for levels in texts("only", only)]
+    wanted = [set(levels_in(levels)) for levels in only]
     names = list(dict.fromkeys(trial.condition.name for trial in trials))
     for levels, text in zip(wanted, only, strict=True):
         if not any(levels <= set(levels_in(name)) for name in names):
@@ -225,8 +222,6 @@ def as_driver(
         ValueError: for whatever does not fit, before anything is written; `RunLockedError` where another
             study is run there.
     """
-    switch("progress", progress)
-    texts("allow", allow)
     tasks_of(trials, runs=runs, status=out / STATUS, allow=allow)
     driver = Driver(
         out, runs, allow=allow, progress=progress, title=study.name, keep_checkpoints=keep_checkpoints

@@ -17,8 +17,7 @@ from typing import Any, Final, Literal
 
 import numpy as np
 
-from cprl.arguments import BLOCK, integer, object_of, refusal, switch
-from cprl.arguments import path as path_of
+from cprl.arguments import BLOCK, integer, object_of, refusal
 from cprl.commons.game import Game
 from cprl.experiment import Experiment
 from cprl.measuring import social
@@ -239,14 +238,13 @@ def run_search(
     """
     object_of("search", search, Search, "a Search")
     check_executor(on)
-    switch("results", results)
     check_comparison(last)
     optuna = _optuna()
     asked = _Asked(search, optuna)
     batch = asked.first_batch()
     study = search.study_of(batch)
     out = directory_of(study, out)
-    folder = out / RUNS if runs is None else path_of("runs", runs)
+    folder = out / RUNS if runs is None else Path(runs)
     failed: list[Outcome] = []
     with as_driver(study, trials_of(study), out, folder, allow=allow, progress=progress) as driver:
         while batch:

@@ -10,7 +10,7 @@ from itertools import chain, count
 from pathlib import Path
 from typing import Any, Final
 
-from cprl.arguments import BLOCK, integer, object_of, path, refusal, texts
+from cprl.arguments import BLOCK, integer, object_of, path, refusal
 from cprl.checks import DIRECTORY_NAME, check_nesting, checked, instance, shown
 from cprl.config import without_defaults
 from cprl.experiment import MOST_SEED, Experiment, frozen_from, frozen_relative_to
@@ -429,7 +429,6 @@ def read_study(out: Path | str, *, allow: Sequence[str] = ()) -> Study:
         allow: the user's own code, "module:Class", that it may import.
     """
     out = path("out", out)
-    texts("allow", allow)
     try:
         table = read_json(out / FILE_NAME)
     except (OSError, ValueError) as error:

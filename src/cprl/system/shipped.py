@@ -13,7 +13,7 @@ from shutil import which
 from types import ModuleType
 from typing import Final
 
-from cprl.checks import TEXT, checked, shown
+from cprl.checks import shown
 
 PROGRAM: Final = "cprl run "
 """How the program of a shipped recipe begins, where a script has its path."""
@@ -84,7 +84,6 @@ def shipped_recipes() -> dict[str, Recipe]:
 
 def recipe_named(name: str) -> Recipe:
     """A recipe by its name."""
-    checked("name", name, TEXT)
     recipes = shipped_recipes()
     if name not in recipes:
         raise ValueError(f"there is no recipe {shown(name)}; allowed: {recipe_names()}")
@@ -133,7 +132,6 @@ def import_from(folder: str) -> None:
     Args:
         folder: e.g. "studies". Modules beside the script that runs come first.
     """
-    checked("folder", folder, TEXT)
     folders = sorted({recipe.folder for recipe in shipped_recipes().values()} - {""})
     if folder not in folders:
         raise ValueError(f"folder is {shown(folder)}; allowed: {', '.join(folders)}")

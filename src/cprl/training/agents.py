@@ -9,8 +9,6 @@ from torch import Tensor, nn
 from torchrl.envs import EnvBase
 
 from cprl.algorithms.base import Algorithm, TeamAlgorithm
-from cprl.arguments import object_of, objects, texts
-from cprl.checks import MOST_SEED, checked, count
 from cprl.commons.game import Game
 from cprl.commons.spaces import Spaces
 from cprl.custom import Custom, made
@@ -67,11 +65,7 @@ class Population:
         starts: bool = True,
         weights: Mapping[str, str] | None = None,
     ) -> None:
-        specs = objects("specs", specs, AgentSpec, "Learning, Team, Scripted or Frozen")
-        checked("seed", seed, count(0, MOST_SEED))
-        checked("first_replica", first_replica, count(0))
-        texts("allow", allow)
-        self.spaces, self.specs = spaces_of(env), specs
+        self.spaces, self.specs = spaces_of(env), tuple(specs)
         self.replicas, self.seed, self._first = env.batch_size.numel(), seed, first_replica
         commons = commons_of(env)
         self._game = None if commons is None else commons.game
@@ -81,7 +75,6 @@ class Population:
         numbers = range(first_replica, first_replica + self.replicas)
         frozen = (spec for spec, _ in self._groups if isinstance(spec, Frozen))
         named_weights = {} if weights is None else weights
-        object_of("weights", named_weights, Mapping, "the names of weights by run")
         self._frozen = frozen_agents(frozen, self.spaces, self._game, allow, numbers, named_weights)
         self._acting = _acting_together(self._groups, self._frozen)
         who = {

@@ -12,8 +12,6 @@ from torchrl.collectors import BaseCollector, Collector
 from torchrl.envs import EnvBase
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 
-from cprl.arguments import callable_of, object_of
-from cprl.checks import checked, count
 from cprl.envs.recurrent_states import begin_states
 
 
@@ -29,8 +27,6 @@ class StepCollector(BaseCollector):
     """
 
     def __init__(self, env: EnvBase, policy: nn.Module) -> None:
-        object_of("env", env, EnvBase, "an EnvBase of TorchRL")
-        callable_of("policy", policy, "a function that writes the actions")
         super().__init__()
         self.env, self.policy = env, policy
         self.frames_per_batch = env.batch_size.numel()
@@ -78,7 +74,6 @@ def stock_collector(env: EnvBase, policy: nn.Module, *, steps: int = 1) -> Colle
         policy: writes the actions.
         steps: steps per batch; agents explore in all of them with the epsilon of the first.
     """
-    steps = checked("steps", steps, count(1))
     before = deepcopy(policy.state_dict())
     collector = Collector(
         env,

@@ -11,17 +11,15 @@ import numpy as np
 import torch
 from torchrl.envs import EnvBase
 
-from cprl.arguments import object_of
-from cprl.custom import Custom, made
+from cprl.custom import made
 from cprl.envs.make_env import OF_CPRL, make_env
 from cprl.envs.state import load_transforms_state, transforms_state
-from cprl.envs.unwrap import agent_names, commons_of
+from cprl.envs.unwrap import commons_of
 from cprl.experiment import Experiment
 from cprl.measuring.episodes import Episode
 from cprl.measuring.evaluate import evaluate
 from cprl.policies.present import PresentPolicy
 from cprl.runs.episodes import EpisodeTable
-from cprl.runs.loggers import LoggerCallback, make_logger
 from cprl.runs.recipe import read_recipe
 from cprl.training.agents import Population
 
@@ -63,23 +61,10 @@ def exhibited(
 
 def random_play(experiment: Experiment, population: Population) -> list[Episode]:
     """Lets agents who take every action with equal probability play the worlds of the evaluation, before the
-    training: what it is compared with while it runs. No generator moves.
-
-    Args:
-        experiment: what will be trained.
-        population: the agents.
-
-    Returns:
-        `evaluation_episodes` episodes for each replica.
-    """
-    _check(experiment, population)
+    training: what it is compared with while it runs, `evaluation_episodes` for each replica. No generator
+    moves."""
     with _generators_kept(experiment.device):
         return evaluate(fresh_env(experiment), population.random_policy(experiment.evaluation_episodes))
-
-
-def _check(experiment: object, population: object) -> None:
-    object_of("experiment", experiment, Experiment, "an Experiment")
-    object_of("population", population, Population, "a Population of the same experiment")
 
 
 @contextmanager
@@ -99,7 +84,6 @@ def _generators_kept(device: str) -> Iterator[None]:
 def is_same_later(experiment: Experiment) -> bool:
     """Whether random play is the same before and after a training: the game is one of cprl's, whose chance
     depends on seeds alone, and has no transforms, which may learn in between."""
-    object_of("experiment", experiment, Experiment, "an Experiment")
     return isinstance(experiment.game, OF_CPRL) and not experiment.transforms
 
 
@@ -216,12 +200,6 @@ def make_parts(
         population.random_policy(experiment.evaluation_episodes)
         population.policy(experiment.evaluation_episodes)
     return Parts(env=env, population=population, callbacks=[made(own) for own in experiment.callbacks])
-
-
-def make_logger_callback(logger: str | Custom, directory: Path, env: EnvBase) -> LoggerCallback:
-    return LoggerCallback(
-        make_logger(made(logger), directory), replicas=env.batch_size.numel(), agents=agent_names(env)
-    )
 
 
 def make_viewer(

@@ -1,25 +1,23 @@
 """run: one experiment from its learners to its report: train, save, evaluate in fresh worlds, summarise."""
 
 import shutil
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from contextlib import ExitStack, suppress
 from dataclasses import asdict
 from datetime import datetime
-from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from cprl.arguments import callable_of, object_of, path, texts
-from cprl.checks import SWITCH, checked
-from cprl.custom import Custom
+from cprl.custom import Custom, made
 from cprl.envs.state import transforms_state
+from cprl.envs.unwrap import agent_names
 from cprl.experiment import Experiment
 from cprl.measuring.episodes import Episode
 from cprl.population import Frozen, exploration_steps
 from cprl.runs.checkpoints import FOLDER, REPORT, Checkpointer, checkpoints_in, extend, refuse_to_extend
 from cprl.runs.episodes import EpisodeTable
 from cprl.runs.files import LOCK_FILE, RunLockedError, refuse_missing, write_json
-from cprl.runs.loggers import check_logger
+from cprl.runs.loggers import LoggerCallback, check_logger, make_logger
 from cprl.runs.recipe import (
     RECIPE_FILE,
     changed_circumstances,
@@ -45,7 +43,6 @@ from cprl.training.outcome import (
     Parts,
     evaluate_population,
     heading,
-    make_logger_callback,
     make_parts,
     make_viewer,
     random_play,
@@ -116,8 +113,7 @@ def run(
         `evaluation/`, `figures/`, `manifest.json` with their checksums, and `report.json`.
 
     Raises:
-        ValueError: for whatever does not fit, before anything is written; `RunLockedError` where another
-            process writes the run.
+        RunLockedError: where another process writes the run.
         KeyboardInterrupt: after the first SIGINT (Ctrl-C), when the state is saved and the line that resumes
             is said; the second ends the process at once.
         SystemExit: with code 143 after SIGTERM, likewise.
@@ -125,18 +121,17 @@ def run(
         OSError: for a full disk or a deleted directory; the message names it. What was written before is
             intact, and the run can be resumed.
     """
+
+    def recipe_in(directory: Path) -> dict[str, Any]:
+        return {**experiment.to_recipe(directory), **partners_of(directory, _partners(experiment))}
+
     times = RunTimes()
     free_earlier()
-    out = None if out is None else path("out", out)
-    command = None if command is None else texts("command", command, 1)
-    switches = {
-        "resume": resume,
-        "take_over": take_over,
-        "keep_checkpoint": keep_checkpoint,
-        "linger": linger,
-        "figures": figures,
-    }
-    _check(experiment, switches, allow=allow, watch=watch, at_end=at_end)
+    out = None if out is None else Path(out)
+    check_watch(watch)
+    check_linger(linger, watch)
+    for logger in experiment.loggers:
+        check_logger(logger.resolve() if isinstance(logger, Custom) else logger)
     prepare_process(experiment.seed)
     is_begun = resume and out is not None and bool(checkpoints_in(out / FOLDER))
     weights = _partners_then(experiment, out) if resume and out is not None else {}
@@ -152,7 +147,7 @@ def run(
             return out
         directory = out
     else:
-        directory = start_run(out, experiment.name, partial(_recipe_of, experiment), command=command)
+        directory = start_run(out, experiment.name, recipe_in, command=command)
     checkpointer = Checkpointer(
         directory,
         keep_ending=keep_checkpoint,
@@ -189,11 +184,6 @@ def run(
     return directory
 
 
-def _recipe_of(experiment: Experiment, directory: Path) -> dict[str, Any]:
-    """What `recipe.json` says of a run that begins."""
-    return {**experiment.to_recipe(directory), **partners_of(directory, _partners(experiment))}
-
-
 def _partners(experiment: Experiment) -> list[str]:
     """The runs whose agents play."""
     return sorted({spec.run for spec in experiment.agents if isinstance(spec, Frozen)})
@@ -205,22 +195,6 @@ def _partners_then(experiment: Experiment, run: Path) -> dict[str, str]:
     recipe = read_recipe(run) if partners and (run / RECIPE_FILE).exists() else {}
     names = {partner: weights_of(recipe, run, partner) for partner in partners}
     return {partner: name for partner, name in names.items() if name is not None}
-
-
-def _check(
-    experiment: Experiment, switches: Mapping[str, bool], *, allow: Sequence[str], watch: str, at_end: object
-) -> None:
-    """Refuses arguments of `run` that do not fit."""
-    object_of("experiment", experiment, Experiment, "an Experiment")
-    for name, switch in switches.items():
-        checked(name, switch, SWITCH)
-    texts("allow", allow)
-    check_watch(watch)
-    check_linger(switches["linger"], watch)
-    if at_end is not None:
-        callable_of("at_end", at_end, "a function of the run's directory, or None")
-    for logger in experiment.loggers:
-        check_logger(logger.resolve() if isinstance(logger, Custom) else logger)
 
 
 def _train_and_evaluate(
@@ -246,7 +220,11 @@ def _train_and_evaluate(
         ends = exploration_steps(experiment.agents)
         figure = training_curve(directory, title=title, random=played["random"], exploration_steps=ends)
     broken = training.finite.found
-    report = {**times.report(training.times), "steps": training.steps, "finished": _now()}
+    report = {
+        **times.report(training.times),
+        "steps": training.steps,
+        "finished": datetime.now().astimezone().isoformat(timespec="seconds"),
+    }
     also = {"not_finite": [asdict(one) for one in broken]} if broken else {}
     write_json(directory / REPORT, {**report, "episodes": experiment.episodes, **also})
     columns = {"random": played["random"], heading(own.population): played["trained"]}
@@ -273,7 +251,13 @@ def _train(
             ProgressBar(own.env, episodes=experiment.episodes, replicas=experiment.replicas)
         )
         loggers = [
-            stack.enter_context(make_logger_callback(logger, directory, own.env))
+            stack.enter_context(
+                LoggerCallback(
+                    make_logger(made(logger), directory),
+                    replicas=experiment.replicas,
+                    agents=agent_names(own.env),
+                )
+            )
             for logger in experiment.loggers
         ]
         before = None
@@ -299,10 +283,6 @@ def _train(
     if viewer is not None:
         viewer.flush()
     return training, before
-
-
-def _now() -> str:
-    return datetime.now().astimezone().isoformat(timespec="seconds")
 
 
 def tidy_up(finished: Path, *, keep_checkpoint: bool, take_over: bool) -> None:

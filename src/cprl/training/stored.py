@@ -11,8 +11,6 @@ import torch
 from torch import Tensor, nn
 from torchrl.envs import EnvBase
 
-from cprl.arguments import path as path_of
-from cprl.arguments import texts
 from cprl.checks import shown
 from cprl.commons.game import Game
 from cprl.commons.spaces import Spaces
@@ -180,8 +178,7 @@ def load(run: str | Path, *, weights: str | None = None, allow: Sequence[str] = 
             of the newest readable checkpoint where the run has not ended.
         allow: the targets, "module:Class", of the user's own code that the run may import.
     """
-    run = path_of("run", run)
-    texts("allow", allow)
+    run = Path(run)
     if weights is not None and (
         not isinstance(weights, str) or Path(weights).name != weights or weights in ("", "..")
     ):

@@ -13,7 +13,6 @@ from torch import Tensor, nn
 from torchrl.collectors import BaseCollector
 from torchrl.envs import EnvBase
 
-from cprl.arguments import callable_of, object_of, objects
 from cprl.checks import shown
 from cprl.envs.make_env import check_env, spaces_of
 from cprl.envs.state import carried_state, env_state, load_carried, load_env_state
@@ -86,9 +85,6 @@ class Training:
     ) -> None:
         spaces = spaces_of(env)
         replicas = env.batch_size.numel()
-        object_of("learners", learners, Mapping, "learners by the indices of their agents")
-        object_of("others", others, Mapping | None, "actors by the indices of their agents, or None")
-        callable_of("make_collector", make_collector, "a function that makes a collector")
         check_env(env, replicas)
         self.env, self.episodes, self.callbacks = env, episodes, list(check_callbacks(callbacks))
         self.update_every = update_every
@@ -348,7 +344,6 @@ def train(
         on_nan=on_nan,
     )
     if checkpointer is not None:
-        object_of("checkpointer", checkpointer, SavesTraining, "None, or what has `restore` and `after_step`")
         training.state_dict()  # what cannot be saved is refused now, not when the first checkpoint is due
         checkpointer.restore(training)
     training.start()
@@ -384,7 +379,7 @@ HOOKS: Final = ("on_start", "on_step", "on_episode")
 
 def check_callbacks(callbacks: Sequence[Any]) -> tuple[Any, ...]:
     """The callbacks; refuses one that nothing would call."""
-    found = objects("callbacks", callbacks, object, "callbacks")
+    found = tuple(callbacks)
     for callback in found:
         if not any(hasattr(callback, hook) for hook in HOOKS):
             raise ValueError(

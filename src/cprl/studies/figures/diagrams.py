@@ -12,7 +12,7 @@ from matplotlib.figure import Figure
 from matplotlib.patches import Rectangle
 from matplotlib.ticker import MaxNLocator
 
-from cprl.arguments import object_of, refusal
+from cprl.arguments import refusal
 from cprl.studies.figures.levels import (
     MOST_CONDITIONS,
     legend,
@@ -116,7 +116,6 @@ def phase_diagram(
         factors: two factors; None for bars, of at most `MOST_CONDITIONS` conditions.
     """
     path, design = picture_path(path), table.design
-    object_of("found", found, Endings, "what endings() gave")
     if factors is None:
         figure, fixed = _bars(table, found), ""
     else:

@@ -13,7 +13,7 @@ from rich.table import Table
 from rich.text import Text
 
 from cprl.arguments import LAST as LAST
-from cprl.arguments import choice, integer, object_of, refusal
+from cprl.arguments import choice, integer, refusal
 from cprl.measuring.metrics import title
 from cprl.measuring.statistics import CONFIDENCE, Estimate, difference, estimate
 from cprl.studies.tables.sources import NET, PARTS, TRAINING
@@ -117,7 +117,6 @@ def compare(
         part: "training", "evaluation" or "random".
         last: of training: episodes at its end; those of whole windows.
     """
-    object_of("table", table, StudyTable, "a StudyTable")
     if metric not in table.metrics:
         raise refusal("metric", metric, ", ".join(table.metrics) or "none, as the table has no finished run")
     choice("part", part, PARTS)

@@ -6,7 +6,7 @@ from itertools import combinations
 from pathlib import Path
 from typing import Any, Final
 
-from cprl.arguments import refusal, texts
+from cprl.arguments import refusal
 from cprl.config import differences, to_config
 from cprl.experiment import Experiment
 from cprl.runs.recipe import read_recipe, runs_in
@@ -40,7 +40,7 @@ def pooled_table(
         reference: the name of the condition that others are compared with; by default the first.
         allow: the user's own code, "module:Class", that a run's recipe may name.
     """
-    fields = [normalised(own) for own in texts("by", tuple(by), 1)]
+    fields = [normalised(own) for own in by]
     for own in fields:
         if own in ("seed", "replicas") or fields.count(own) > 1:
             raise refusal("by", own, "other fields than seed and replicas, each once")

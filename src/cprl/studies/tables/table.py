@@ -33,8 +33,7 @@ import pyarrow.parquet as pq
 from numpy.typing import NDArray
 
 from cprl.arguments import WINDOW as WINDOW
-from cprl.arguments import integer, object_of
-from cprl.arguments import path as path_of
+from cprl.arguments import integer
 from cprl.runs.episodes import write_table
 from cprl.runs.files import STUDY_TABLE_FORMAT, refuse_newer
 from cprl.runs.recipe import read_recipe, versions
@@ -161,14 +160,14 @@ class StudyTable:
 
     def write(self, path: Path | str) -> Path:
         """Writes a parquet file atomically, which `read` gives back; replaces an older one."""
-        path = path_of("path", path)
+        path = Path(path)
         write_table(path, self.rows, over=True)
         return path
 
     @classmethod
     def read(cls, path: Path | str) -> "StudyTable":
         """The table of a file that `write` wrote; raises a ValueError for any other."""
-        path = path_of("path", path)
+        path = Path(path)
         try:
             rows = pq.read_table(path)
             held = json.loads((rows.schema.metadata or {})[METADATA])
@@ -204,9 +203,8 @@ def study_table(
         window: episodes of a window of training; 1 for episodes one by one, of the evaluation too.
         status: where its trials say why they failed, see `cprl.studies.trials`.
     """
-    object_of("study", study, Study, "a Study")
-    folder = path_of("runs", runs)
-    finished, lacking = sources_of(study, folder, None if status is None else path_of("status", status))
+    folder = Path(runs)
+    finished, lacking = sources_of(study, folder, None if status is None else Path(status))
     return table_of(design_of(study), finished, lacking, window=window)
 
 
