@@ -2,13 +2,14 @@
 
 import hashlib
 import json
-from collections.abc import Iterator, Sequence
+from collections import Counter
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
-from cprl.arguments import integer, path, refusal
+from cprl.arguments import integer, refusal
 from cprl.runs.files import LOCK_FILE, StudyLock, remove_partial
 from cprl.studies.executors import Executor, InProcess
 from cprl.studies.progress import Progress
@@ -70,13 +71,12 @@ def run_study(
         again: the command line that runs what is lacking, for the summary.
 
     Raises:
-        ValueError: for whatever does not fit, before anything is written.
         KeyboardInterrupt: after SIGINT (Ctrl-C), when every trial that runs has saved its state; a note says
             what is kept.
         SystemExit: with code 143 after SIGTERM, likewise.
     """
     out = directory_of(study, out)
-    folder = out / RUNS if runs is None else path("runs", runs)
+    folder = out / RUNS if runs is None else Path(runs)
     trials = trials_of(study)
     chosen = trials_with(trials, only)
     check_executor(on)
@@ -130,24 +130,18 @@ def check_executor(on: object) -> None:
         raise refusal("on", on, "InProcess(), Processes(jobs), Ray(), another Executor, or None")
 
 
+@dataclass(kw_only=True)
 class Driver:
     """What runs trials of a study whose directory is there; made by `as_driver`."""
 
-    def __init__(
-        self,
-        out: Path,
-        runs: Path,
-        *,
-        allow: Sequence[str],
-        progress: bool,
-        title: str,
-        keep_checkpoints: bool = False,
-    ) -> None:
-        self._out, self._runs = out, runs
-        self._how: dict[str, Any] = {"allow": allow, "keep_checkpoint": keep_checkpoints}
-        self._progress, self._title = progress, title
-        self.others = ""
-        """Who runs the study too, in a sentence."""
+    status: Path
+    runs: Path
+    title: str
+    progress: bool
+    how: Mapping[str, Any]
+    """Of the tasks, see `task_of`."""
+    others: str = ""
+    """Who runs the study too, in a sentence."""
 
     def run(
         self, trials: Sequence[Trial], executor: Executor, *, title: str | None = None
@@ -161,13 +155,13 @@ class Driver:
             RunLockedError: where another process runs such a trial.
         """
         failed: list[Outcome] = []
-        moved = [aside for trial in trials if (aside := move_aside(self._runs / trial.name)) is not None]
+        moved = [aside for trial in trials if (aside := move_aside(self.runs / trial.name)) is not None]
         shown = Progress(
             trials,
-            runs=self._runs,
-            status=self._out / STATUS,
-            title=title or self._title,
-            is_shown=self._progress,
+            runs=self.runs,
+            status=self.status,
+            title=title or self.title,
+            is_shown=self.progress,
         )
         if self.others:
             shown.say(self.others)
@@ -175,7 +169,7 @@ class Driver:
             kept = f"{moved[0]}{f' and {len(moved) - 1} more' if moved[1:] else ''}"
             anew = f"{len(moved)} of {len(trials)} trials are run anew, as the user's own code has changed"
             shown.say(f"{anew}; what was there is kept: {kept}")
-        tasks = tasks_of(trials, runs=self._runs, status=self._out / STATUS, **self._how)
+        tasks = [task_of(trial, runs=self.runs, status=self.status, **self.how) for trial in trials]
         with shown:
             try:
                 for waits in (False, True):
@@ -186,7 +180,11 @@ class Driver:
                         break
                     tasks = [task for task in tasks if task.name in elsewhere]
             except BaseException as error:
-                error.add_note(_kept(trials, self._runs))
+                states = Counter(trial.state(self.runs) for trial in trials)
+                error.add_note(
+                    f"{states['finished']} of {len(trials)} trials are finished and {states['unfinished']} "
+                    f"begun; all of it is kept in {self.runs}, and the same study continues from there"
+                )
                 raise
         return tuple(failed)
 
@@ -219,13 +217,12 @@ def as_driver(
     study.
 
     Raises:
-        ValueError: for whatever does not fit, before anything is written; `RunLockedError` where another
-            study is run there.
+        RunLockedError: where another study is run there.
     """
-    tasks_of(trials, runs=runs, status=out / STATUS, allow=allow)
-    driver = Driver(
-        out, runs, allow=allow, progress=progress, title=study.name, keep_checkpoints=keep_checkpoints
-    )
+    how = {"allow": allow, "keep_checkpoint": keep_checkpoints}
+    driver = Driver(status=out / STATUS, runs=runs, title=study.name, progress=progress, how=how)
+    for trial in trials:
+        task_of(trial, runs=runs, status=driver.status, allow=allow)
     out.mkdir(parents=True, exist_ok=True)
     with ExitStack() as stack:
         content = json.dumps(study.to_config(out), sort_keys=True).encode()
@@ -239,11 +236,6 @@ def as_driver(
         yield driver
 
 
-def tasks_of(trials: Sequence[Trial], *, runs: Path, status: Path, **how: Any) -> list[Task]:
-    """The task of each trial; for other arguments see `task_of`."""
-    return [task_of(trial, runs=runs, status=status, **how) for trial in trials]
-
-
 def _others(out: Path) -> str:
     """Who runs a study too."""
     holder = {}
@@ -253,12 +245,4 @@ def _others(out: Path) -> str:
     return (
         f"{out} is run by somebody else too{who}, or was when its host went down: each trial is run by "
         "whoever begins it first, the other goes on with the rest"
-    )
-
-
-def _kept(trials: Sequence[Trial], runs: Path) -> str:
-    states = [trial.state(runs) for trial in trials]
-    return (
-        f"{states.count('finished')} of {len(trials)} trials are finished and {states.count('unfinished')} "
-        f"begun; all of it is kept in {runs}, and the same study continues from there"
     )

@@ -17,7 +17,8 @@ from typing import Any, Final, Literal
 
 import numpy as np
 
-from cprl.arguments import BLOCK, integer, object_of, refusal
+from cprl.arguments import BLOCK, integer, refusal
+from cprl.checks import checked, instance
 from cprl.commons.game import Game
 from cprl.experiment import Experiment
 from cprl.measuring import social
@@ -81,7 +82,7 @@ class Search:
     name: str = field(default="", kw_only=True)
 
     def __post_init__(self) -> None:
-        object_of("experiment", self.experiment, Experiment, "an Experiment")
+        checked("experiment", self.experiment, instance(Experiment, "an Experiment"))
         for own, most in (("points", 100_000), ("last", 2**31 - 1), ("at_once", 4096)):
             integer(own, getattr(self, own), 1, most)
         allowed_of = {"direction": ("maximise", "minimise"), "over": ("evaluation", "training")}

@@ -10,8 +10,8 @@ from itertools import chain, count
 from pathlib import Path
 from typing import Any, Final
 
-from cprl.arguments import BLOCK, integer, object_of, path, refusal
-from cprl.checks import DIRECTORY_NAME, check_nesting, checked, instance, shown
+from cprl.arguments import BLOCK, integer, refusal
+from cprl.checks import DIRECTORY_NAME, TEXT, checked, instance, shown
 from cprl.config import without_defaults
 from cprl.experiment import MOST_SEED, Experiment, frozen_from, frozen_relative_to
 from cprl.population import stored_of
@@ -133,7 +133,7 @@ class Study:
         )
 
     def __post_init__(self) -> None:
-        object_of("experiment", self.experiment, Experiment, "an Experiment")
+        checked("experiment", self.experiment, instance(Experiment, "an Experiment"))
         keep = object.__setattr__
         keep(self, "factors", checked_factors(self.factors))
         keep(self, "conditions", _checked_conditions(self.conditions))
@@ -143,7 +143,7 @@ class Study:
         integer("replicas", self.replicas, 1, 2**20)
         integer("block", self.block, 1, 2**20)
         for own in ("question", "expectation"):
-            object_of(own, getattr(self, own), str, "a text")
+            checked(own, getattr(self, own), TEXT)
         if self.factors and self.conditions:
             raise ValueError("a study has factors and conditions; allowed: one of them")
         if self.draws is not None:
@@ -268,8 +268,6 @@ class Study:
             allow: the targets of `Custom` that it may hold, "module:Class" each.
             directory: where it is kept; runs of `Frozen` agents are then relative to where we stand.
         """
-        checked("the study", table, instance(Mapping, "a table"))
-        check_nesting(table, "the study")
         refuse_newer("the study", table, STUDY_FORMAT)
         lacks = [name for name in ("experiment", "factors", "conditions", *_PLAIN) if name not in table]
         if table.get("format") != STUDY_FORMAT or lacks:
@@ -407,7 +405,7 @@ RUNS, STATUS = "runs", "status"
 
 def directory_of(study: Study, out: Path | str | None) -> Path:
     """The directory of a study, by default `studies/<name>`."""
-    found = Path("studies") / study.name if out is None else path("out", out)
+    found = Path("studies") / study.name if out is None else Path(out)
     allowed = "a new directory, or that of an earlier study"
     if found.exists() and not found.is_dir():
         raise ValueError(f"out is {found}, a file; allowed: {allowed}")
@@ -428,7 +426,7 @@ def read_study(out: Path | str, *, allow: Sequence[str] = ()) -> Study:
         out: the directory.
         allow: the user's own code, "module:Class", that it may import.
     """
-    out = path("out", out)
+    out = Path(out)
     try:
         table = read_json(out / FILE_NAME)
     except (OSError, ValueError) as error:

@@ -46,7 +46,7 @@ class Source:
     """That each replica trains."""
 
 
-@dataclass(frozen=True, kw_only=True)
+@dataclass(frozen=True)
 class Lacking:
     """A run that is not part of a table, and why."""
 
@@ -106,13 +106,7 @@ def design_of(study: Study) -> Design:
 
 
 def sources_of(study: Study, runs: Path, status: Path | None = None) -> tuple[list[Source], list[Lacking]]:
-    """The finished runs of a study, and the others.
-
-    Args:
-        study: the study.
-        runs: the directory of its runs.
-        status: where its trials say why they failed, if it is there.
-    """
+    """The finished runs of a study, and the others; `status` is where its trials say why they failed."""
     finished, lacking = [], []
     for trial in trials_of(study):
         state, of = trial.state(runs), trial.condition
@@ -130,14 +124,7 @@ def sources_of(study: Study, runs: Path, status: Path | None = None) -> tuple[li
         else:
             failure = None if status is None else Status(status, trial.name).failure()
             reason = REASONS[state] if failure is None else f"failed: {failure}"
-            lacking.append(
-                Lacking(
-                    name=trial.name,
-                    condition=of.name,
-                    replicas=trial.block.replicas,
-                    reason=reason,
-                )
-            )
+            lacking.append(Lacking(trial.name, of.name, trial.block.replicas, reason))
     return finished, lacking
 
 

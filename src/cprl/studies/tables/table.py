@@ -21,7 +21,7 @@ A factor with the name of another column is called "factor NAME".
 import json
 from collections import Counter
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import asdict, dataclass, field
 from functools import cached_property
 from importlib.util import find_spec
 from pathlib import Path
@@ -33,7 +33,6 @@ import pyarrow.parquet as pq
 from numpy.typing import NDArray
 
 from cprl.arguments import WINDOW as WINDOW
-from cprl.arguments import integer
 from cprl.runs.episodes import write_table
 from cprl.runs.files import STUDY_TABLE_FORMAT, refuse_newer
 from cprl.runs.recipe import read_recipe, versions
@@ -179,11 +178,7 @@ class StudyTable:
         design = held["design"]
         return cls(
             design=Design(
-                **{
-                    **design,
-                    "conditions": {name: dict(levels) for name, levels in design["conditions"]},
-                    "notes": tuple(design["notes"]),
-                }
+                **{**design, "conditions": dict(design["conditions"]), "notes": tuple(design["notes"])}
             ),
             rows=rows,
             window=held["window"],
@@ -218,7 +213,6 @@ def table_of(
         sources: the runs; what is damaged of them is listed as lacking.
         lacking: other runs, which are listed.
     """
-    integer("window", window, 1)
     found: list[tuple[Source, list[Windows]]] = []
     made: dict[str, Circumstances] = {}
     out = list(lacking)
@@ -229,20 +223,11 @@ def table_of(
         except (ValueError, OSError, KeyError) as error:
             found = [own for own in found if own[0] is not source]
             reason = f"is damaged: {error}"
-            out.append(
-                Lacking(name=source.name, condition=source.condition, replicas=source.replicas, reason=reason)
-            )
+            out.append(Lacking(source.name, source.condition, source.replicas, reason))
     rows = rows_of(design, found, marks(made))
     held = {
         "format": STUDY_TABLE_FORMAT,
-        "design": {
-            "name": design.name,
-            "conditions": [[name, dict(levels)] for name, levels in design.conditions.items()],
-            "reference": design.reference,
-            "is_paired": design.is_paired,
-            "is_grid": design.is_grid,
-            "notes": list(design.notes),
-        },
+        "design": {**asdict(design), "conditions": [[*pair] for pair in design.conditions.items()]},
         "window": window,
         "versions": versions(),
         "lacking": [vars(own) for own in out],
