@@ -204,7 +204,7 @@ def test_it_saves_at_its_interval_and_not_before(tmp_path):
         seldom.after_step(State(steps))
     assert len(checkpoints_in(tmp_path / "a" / "checkpoints")) == 2
     assert checkpoints_in(tmp_path / "b" / "checkpoints") == []
-    with pytest.raises(ValueError, match="every_s is 0; allowed: a number above 0"):
+    with pytest.raises(ValueError, match="every_s is 0"):
         quiet(tmp_path, every_s=0)
 
 

@@ -128,9 +128,7 @@ def test_a_state_in_which_somebody_was_moved_who_had_not_fired_is_refused():
         if fits:
             batch.load(state, output)
             continue
-        with pytest.raises(
-            ValueError, match=r"state\['moved_after_firing'\]\[0, 0\] is True; allowed: False"
-        ):
+        with pytest.raises(ValueError, match=r"state\['moved_after_firing'\]\[0, 0\] is True"):
             batch.load(state, output)
 
 

@@ -365,7 +365,7 @@ def test_a_learner_of_somebodys_own_that_refuses_nan_is_explained():
 
 
 def test_on_nan_is_stop_or_continue():
-    with pytest.raises(ValueError, match="on_nan is 'go on'; allowed: 'stop', 'continue'"):
+    with pytest.raises(ValueError, match="on_nan is 'go on'"):
         play(make_learner("DQN"), on_nan="go on")
 
 
@@ -389,7 +389,7 @@ def test_an_experiment_says_what_happens_and_its_summary_names_who_is_broken(
     found = json.loads((directory / "report.json").read_text())["not_finite"]
     assert found[0] == {"what": "loss", "replica": 1, "agent": 0, "step": 6}
     assert Experiment.from_config(continuing.to_config(), allow=["test_finite:Breaking"]) == continuing
-    with pytest.raises(ValueError, match=r"experiment\.on_nan is 'no'; allowed: 'stop', 'continue'"):
+    with pytest.raises(ValueError, match=r"experiment\.on_nan is 'no'"):
         experiment(on_nan="no")
 
 

@@ -172,7 +172,7 @@ def test_a_search_begins_with_the_first_points_that_fit_and_is_refused_where_non
 def test_a_search_is_refused_only_where_no_levels_fit_together():
     for seed in range(4):
         Search(replace(PPO_ONE, seed=seed), {"update_every": [3], STEPS: [20, 30]}, points=1)
-    with pytest.raises(ValueError, match="update_every is 3; it must divide"):
+    with pytest.raises(ValueError, match="update_every is 3"):
         Search(PPO_ONE, {"update_every": [3], STEPS: [20]}, points=1)
 
 
@@ -243,11 +243,11 @@ def test_a_value_is_the_mean_over_replicas_of_the_episodes_asked_for(tmp_path):
     ("how", "message"),
     [
         ({"points": 0}, "points is 0"),
-        ({"metric": "luck"}, "metric is 'luck'; allowed: collective_return"),
+        ({"metric": "luck"}, "metric is 'luck'"),
         ({"metric": "return_2"}, "metric is 'return_2'"),
-        ({"direction": "up"}, "direction is 'up'; allowed: 'maximise' or 'minimise'"),
+        ({"direction": "up"}, "direction is 'up'"),
         ({"over": "all"}, "over is 'all'"),
-        ({"sampler": "magic"}, "sampler is 'magic'; allowed: tpe, random, gp"),
+        ({"sampler": "magic"}, "sampler is 'magic'"),
         ({"at_once": 0}, "at_once is 0"),
         ({"replicas": 0}, "replicas is 0"),
         ({"factors": {"game.rules.freeze": [1]}}, "matches nothing"),

@@ -190,8 +190,8 @@ def test_a_file_or_a_run_of_that_name_comes_first_but_not_the_folder_of_a_study(
         ),
         ("run --episodes 2 commons", r"stands first, its flags behind it: cprl run commons \[FLAGS\]"),
         ("run study/base", "study/base runs nothing: other recipes import it; cprl recipe study/base"),
-        ("run mine.py", r"mine\.py is a recipe of your own, which Python runs: python mine\.py"),
-        ("recipe comons", "there is no recipe 'comons'; allowed: commons, "),
+        ("run mine.py", r"mine\.py is a recipe of your own"),
+        ("recipe comons", "there is no recipe 'comons'"),
         ("run commons --watch telepathy", "watch is 'telepathy'"),
     ],
 )
@@ -203,11 +203,9 @@ def test_what_cannot_be_run_is_refused_in_a_sentence(line, message, elsewhere, m
 
 
 def test_what_shipped_recipes_are_asked_for_in_python_is_checked():
-    with pytest.raises(ValueError, match="there is no recipe 'x'; allowed: commons"):
+    with pytest.raises(ValueError, match="there is no recipe 'x'"):
         run_shipped("x", [])
-    with pytest.raises(
-        ValueError, match="folder is 'x'; allowed: study, study/learners, study/perolat, study/theory"
-    ):
+    with pytest.raises(ValueError, match="folder is 'x'"):
         import_from("x")
 
 

@@ -29,10 +29,7 @@ ALONE = (
     Learning(Tabular(settings=TabularSettings())),
     Learning(SAC(settings=REPLAY)),
 )
-TEAMS = (
-    Team(VDN(settings=REPLAY), agents=(0, 2)),
-    Team(MAPPO(settings=ROLLOUT), agents=(1, 3)),
-)
+TEAMS = (Team(VDN(settings=REPLAY), agents=(0, 2)), Team(MAPPO(settings=ROLLOUT), agents=(1, 3)))
 
 
 def experiment(agents, **changes):

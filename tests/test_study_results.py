@@ -86,12 +86,7 @@ def test_a_paired_difference_is_far_narrower_than_one_of_two_samples():
 
 @pytest.mark.parametrize(
     ("call", "message"),
-    [
-        (
-            lambda: difference([1, 2], [1], paired=True),
-            "values has 2 replicas and reference 1; allowed in pairs",
-        ),
-    ],
+    [(lambda: difference([1, 2], [1], paired=True), "values has 2 replicas and reference 1")],
 )
 def test_statistics_that_do_not_fit_are_refused(call, message):
     with pytest.raises(ValueError, match=message):
@@ -148,9 +143,9 @@ def test_a_table_in_markdown_has_replicas_intervals_and_differences_that_exclude
 @pytest.mark.parametrize(
     ("how", "message"),
     [
-        ({"metric": "wealth"}, "metric is 'wealth'; allowed: collective_return, "),
-        ({"part": "sleep"}, "part is 'sleep'; allowed: training, evaluation, random"),
-        ({"last": 5}, "last is 5; allowed: at least 10, the episodes of a window"),
+        ({"metric": "wealth"}, "metric is 'wealth'"),
+        ({"part": "sleep"}, "part is 'sleep'"),
+        ({"last": 5}, "last is 5"),
     ],
 )
 def test_comparisons_that_do_not_fit_are_refused(pairs, how, message):
@@ -234,7 +229,7 @@ def test_figures_of_a_grid_are_drawn_with_a_condition_that_has_no_run(grid_runs,
     }.items():
         width, height = size(draw(tmp_path / f"{name}.png"))
         assert min(width, height) > 300
-        with pytest.raises(ValueError, match=r"path is '.*\.pdf'; allowed: a file whose name ends in \.png"):
+        with pytest.raises(ValueError, match=r"path is '.*\.pdf'"):
             draw(tmp_path / f"{name}.pdf")
 
 
@@ -376,7 +371,7 @@ def test_levels_that_are_too_close_for_their_names_stand_at_equal_distances():
 def test_a_factor_with_names_is_refused_as_an_axis_of_numbers(tmp_path):
     study = Study(EXPERIMENT, {"word": {"a": {TIME_OUT: 5}, "b": {TIME_OUT: 25}}}, name="words")
     table = study_table(study, write_study(study, tmp_path / "runs", lambda *_: 1))
-    with pytest.raises(ValueError, match="factor is 'word'; allowed: none, as no factor has levels"):
+    with pytest.raises(ValueError, match="factor is 'word'"):
         by_factor(table, "word", tmp_path / "word.png")
 
 

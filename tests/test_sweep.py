@@ -92,7 +92,7 @@ def test_the_end_of_the_training_that_is_compared_may_be_longer(here):
     assert "95% intervals over replicas by Student's t" in Path("here/summary.md").read_text()
     assert "as that of about one in twenty would by chance" in Path("here/summary.md").read_text()
     assert before == {path: path.stat().st_mtime_ns for path in Path("here/runs").rglob("*")}
-    with pytest.raises(ValueError, match="last is 9; allowed: an integer >= 10, the episodes of a window"):
+    with pytest.raises(ValueError, match="last is 9"):
         sweep(f"{line.replace('here', 'elsewhere')} --last 9")
     assert not Path("elsewhere").exists()
 
@@ -123,7 +123,7 @@ def test_a_part_of_a_study_is_run_by_the_levels_that_its_conditions_have(here, c
     assert len(states) == 4
     again = f"This line runs what is lacking: `cprl sweep {shlex.join(shlex.split(line))}`"
     assert again in Path("here/summary.md").read_text()
-    with pytest.raises(ValueError, match=r"only is 'gamma=0.9'; allowed: a condition or levels of some: fr"):
+    with pytest.raises(ValueError, match=r"only is 'gamma=0.9'"):
         sweep(f"{line.replace('here', 'elsewhere')} --only gamma=0.9")
     assert not Path("elsewhere").exists()
 
@@ -159,25 +159,25 @@ def test_a_failed_condition_does_not_end_the_study_and_is_listed_with_what_tries
 @pytest.mark.parametrize(
     ("line", "message"),
     [
-        ("mine.py", "nothing is varied; allowed: --vary"),
-        ("--vary x=1", "the first word after cprl sweep is --vary; allowed: a recipe"),
-        ("nowhere.py --vary x=1", "the recipe is nowhere.py; allowed: a Python file"),
+        ("mine.py", "nothing is varied"),
+        ("--vary x=1", "the first word after cprl sweep is --vary"),
+        ("nowhere.py --vary x=1", "the recipe is nowhere.py"),
         ("nowhere --vary x=1", "is not the recipe of a run"),
-        (f"mine.py --vary {FREEZE}=2,2", "are equal; allowed: each once"),
+        (f"mine.py --vary {FREEZE}=2,2", "are equal"),
         (f"mine.py --vary {FREEZE}=2,-1", "Rules.freeze_steps is -1"),
         ("mine.py --vary turns=5,10", "turns is an argument of the recipe, the same in all conditions"),
         ("mine.py --vary seed=1,2", "which the study itself decides"),
         ("mine.py --vary game.rules.freeze-step=1", "did you mean 'freeze_steps'"),
-        (f"mine.py --vary {FREEZE}=integers(1,9)", "has a range; allowed: values, or a range"),
+        (f"mine.py --vary {FREEZE}=integers(1,9)", "has a range"),
         (f"mine.py --vary {FREEZE}=2 --maximise peace", "--maximise is for a search"),
         (f"mine.py --vary {FREEZE}=2 --at-once 2", "--at-once is for a search"),
         (f"mine.py --vary {FREEZE}=2 --search 3 --draws 3", "--draws is not for a search"),
         (f"mine.py --vary {FREEZE}=2 --search 3 --maximise peace --minimise peace", "allowed: one of them"),
-        (f"mine.py --vary {FREEZE}=2 --search 3 --maximise luck", "metric is 'luck'; allowed: "),
+        (f"mine.py --vary {FREEZE}=2 --search 3 --maximise luck", "metric is 'luck'"),
         (f"mine.py --vary {FREEZE}=2 --search 3 --only freeze_steps=2", "--only is for studies"),
         (f"mine.py --vary {FREEZE}=2 --search 3 --keep-checkpoints", "--keep-checkpoints is for studies"),
-        (f"mine.py --vary {FREEZE}=2 --reference best", "reference is 'best'; allowed: the name of"),
-        (f"mine.py --vary {FREEZE}=2 --jobs 0", "--jobs is 0; allowed"),
+        (f"mine.py --vary {FREEZE}=2 --reference best", "reference is 'best'"),
+        (f"mine.py --vary {FREEZE}=2 --jobs 0", "--jobs is 0"),
         (f"mine.py --vary {FREEZE}=2 --jobs 2 --on here", "--jobs is 2 with --on here"),
         (f"mine.py --vary {FREEZE}=2 --address auto", "--address is for --on ray"),
     ],
@@ -220,7 +220,7 @@ def test_a_stored_recipe_is_varied_too(tmp_path, capsys):
 
 def test_a_recipe_of_a_study_is_not_swept():
     Path("study.py").write_text("STUDY = 1")
-    with pytest.raises(ValueError, match=r"describes a study, which is run by itself: python study\.py"):
+    with pytest.raises(ValueError, match=r"describes a study"):
         sweep(f"study.py --vary {FREEZE}=1")
 
 
@@ -261,7 +261,7 @@ def test_a_study_is_run_with_fewer_episodes_unless_they_are_what_it_varies():
     assert read_study(out).experiment.episodes == 1
     assert [own.experiment.episodes for own in read_study(out).all_conditions] == [1, 1]
     varied = Study(TINY, {"episodes": [2, 3]}, name="tiny_study")
-    with pytest.raises(SystemExit, match=r"--episodes is 1, and the study's condition .* says 2; allowed: "):
+    with pytest.raises(SystemExit, match=r"--episodes is 1, and the study's condition .* says 2"):
         study_main(varied, ["recipes/mine.py", "--episodes", "1", "--out", "varied"])
     assert not Path("varied").exists()
 
@@ -277,7 +277,7 @@ def test_help_of_a_study_says_what_it_asks_and_expects(capsys):
 
 
 def test_what_a_study_refuses_is_said_in_a_line():
-    with pytest.raises(SystemExit, match=r"^mine\.py: replicas is 0; allowed: an integer from 1"):
+    with pytest.raises(SystemExit, match=r"^mine\.py: replicas is 0"):
         study_main(STUDY, ["recipes/mine.py", "--replicas", "0"])
 
 

@@ -141,16 +141,10 @@ def _is_directory_name(value: Any) -> bool:
     """Whether a text can be a part of a directory's name, wherever the run is copied to."""
     if not isinstance(value, str) or not value or not value.isprintable() or set(value) & set("/\\"):
         return False
-    if value.upper().partition(".")[0] in _OF_WINDOWS:
-        return False
     return len(value.encode()) <= _MOST_NAME and value == value.strip(" ").rstrip(".")
 
 
 _MOST_NAME: Final = 200
-_OF_WINDOWS: Final = (
-    *("CON", "PRN", "AUX", "NUL"),
-    *(f"{port}{number}" for port in ("COM", "LPT") for number in range(10)),
-)
 DIRECTORY_NAME: Final = Check(
     _is_directory_name,
     f"the name of a directory, up to {_MOST_NAME} bytes of printable text, without slashes",

@@ -8,17 +8,7 @@ from typing import Any, Final, Literal, get_args
 
 from cprl.algorithms import Tabular
 from cprl.algorithms.base import TeamAlgorithm, TrainingEngine
-from cprl.checks import (
-    DIRECTORY_NAME,
-    Check,
-    check_fields,
-    checked,
-    count,
-    instance,
-    is_count,
-    one_of,
-    shown,
-)
+from cprl.checks import DIRECTORY_NAME, Check, check_fields, checked, count, instance, is_count, one_of, shown
 from cprl.commons.game import Game
 from cprl.config import custom_targets, differences, fields_from_config, fields_to_config
 from cprl.custom import Custom
@@ -126,11 +116,7 @@ class Experiment:
 
     @classmethod
     def from_recipe(
-        cls,
-        recipe: Mapping[str, Any],
-        *,
-        allow: Iterable[str] = (),
-        directory: str | Path | None = None,
+        cls, recipe: Mapping[str, Any], *, allow: Iterable[str] = (), directory: str | Path | None = None
     ) -> "Experiment":
         """The experiment of a recipe.
 

@@ -131,12 +131,7 @@ def evaluate(run: Path, /, *, fresh: FreshFlags = _TWENTY, out: Path | None = No
 
 
 def visits(
-    run: Path,
-    /,
-    *,
-    fresh: FreshFlags = _TWENTY,
-    figure: Path | None = None,
-    random: bool = False,
+    run: Path, /, *, fresh: FreshFlags = _TWENTY, figure: Path | None = None, random: bool = False
 ) -> None:
     """Lets all replicas of a run play fresh worlds, and prints how far agents keep to cells of their own.
 

@@ -135,12 +135,7 @@ class Overview:
     """
 
     def __init__(
-        self,
-        trials: Sequence[Trial],
-        *,
-        runs: Path,
-        status: Path,
-        failures: Mapping[str, str] | None = None,
+        self, trials: Sequence[Trial], *, runs: Path, status: Path, failures: Mapping[str, str] | None = None
     ) -> None:
         self._trials, self._runs, self._failures = trials, runs, failures
         self._status = {trial.name: Status(status, trial.name) for trial in trials}
@@ -238,13 +233,7 @@ class Progress:
     """
 
     def __init__(
-        self,
-        trials: Sequence[Trial],
-        *,
-        runs: Path,
-        status: Path,
-        title: str,
-        is_shown: bool = True,
+        self, trials: Sequence[Trial], *, runs: Path, status: Path, title: str, is_shown: bool = True
     ) -> None:
         stream = getattr(sys.stdout, "rich_proxied_file", sys.stdout)  # trials replace sys.stdout
         self._console = console(Output(lambda: stream))

@@ -108,12 +108,7 @@ def _remove_stale(folder: Path, drawn: Sequence[str]) -> None:
 
 
 def _summary(
-    study: Study,
-    table: StudyTable,
-    found: Endings,
-    figures: Sequence[Drawn],
-    last: int,
-    again: str,
+    study: Study, table: StudyTable, found: Endings, figures: Sequence[Drawn], last: int, again: str
 ) -> list[str]:
     """The lines of the summary."""
     lines = [f"# {study.name}", ""]

@@ -82,13 +82,7 @@ def run_study(
     check_executor(on)
     check_comparison(last)
     with as_driver(
-        study,
-        trials,
-        out,
-        folder,
-        allow=allow,
-        keep_checkpoints=keep_checkpoints,
-        progress=progress,
+        study, trials, out, folder, allow=allow, keep_checkpoints=keep_checkpoints, progress=progress
     ) as driver:
         failed = driver.run(chosen, on or InProcess())
         how: Any = {"last": last, "again": again}
@@ -157,11 +151,7 @@ class Driver:
         failed: list[Outcome] = []
         moved = [aside for trial in trials if (aside := move_aside(self.runs / trial.name)) is not None]
         shown = Progress(
-            trials,
-            runs=self.runs,
-            status=self.status,
-            title=title or self.title,
-            is_shown=self.progress,
+            trials, runs=self.runs, status=self.status, title=title or self.title, is_shown=self.progress
         )
         if self.others:
             shown.say(self.others)

@@ -237,7 +237,6 @@ def run_search(
         search: what is searched.
         last: see `cprl.studies.run_study`; what the search itself looks at is in `Search`.
     """
-    object_of("search", search, Search, "a Search")
     check_executor(on)
     check_comparison(last)
     optuna = _optuna()

@@ -255,11 +255,7 @@ class Study:
 
     @classmethod
     def from_config(
-        cls,
-        table: Mapping[str, Any],
-        *,
-        allow: Iterable[str] = (),
-        directory: str | Path | None = None,
+        cls, table: Mapping[str, Any], *, allow: Iterable[str] = (), directory: str | Path | None = None
     ) -> "Study":
         """The study that `to_config` gave.
 
@@ -312,10 +308,7 @@ class Block:
     """Of the run."""
 
 
-_PLAIN: Final = (
-    *("name", "question", "expectation"),
-    *("draws", "replicas", "block", "reference"),
-)
+_PLAIN: Final = (*("name", "question", "expectation"), *("draws", "replicas", "block", "reference"))
 """Fields that JSON can hold as they are."""
 CONDITION: Final = "condition"
 """The column of named conditions."""

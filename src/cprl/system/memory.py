@@ -41,12 +41,7 @@ def free_bytes(device: "str | torch.device" = "cpu") -> int:
 
 
 def check_memory(
-    what: str,
-    needed: int,
-    instead: str,
-    *,
-    device: "str | torch.device" = "cpu",
-    free: int | None = None,
+    what: str, needed: int, instead: str, *, device: "str | torch.device" = "cpu", free: int | None = None
 ) -> None:
     """Refuses what would not fit.
 

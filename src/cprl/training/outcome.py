@@ -94,11 +94,7 @@ def _keeps_decisions(env: EnvBase) -> bool:
 
 
 def evaluate_population(
-    experiment: Experiment,
-    trained: EnvBase,
-    population: Population,
-    *,
-    random: list[Episode] | None = None,
+    experiment: Experiment, trained: EnvBase, population: Population, *, random: list[Episode] | None = None
 ) -> dict[str, list[Episode]]:
     """Lets the agents play fresh episodes, so many of each replica.
 

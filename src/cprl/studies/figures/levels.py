@@ -180,16 +180,7 @@ def _draw_line(
     means = [np.nan if own.estimate is None else own.estimate.value for own in found]
     label = name or "mean and interval"
     line = "-" if joined and len(set(at)) == len(at) else "none"
-    axes.plot(
-        at,
-        means,
-        marker="o",
-        linestyle=line,
-        color=colour,
-        linewidth=1.4,
-        label=label,
-        zorder=4,
-    )
+    axes.plot(at, means, marker="o", linestyle=line, color=colour, linewidth=1.4, label=label, zorder=4)
 
 
 def _is_same(random: Iterable[Compared], factor: str) -> bool:

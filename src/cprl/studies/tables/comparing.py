@@ -19,14 +19,7 @@ from cprl.measuring.statistics import CONFIDENCE, Estimate, difference, estimate
 from cprl.studies.tables.sources import NET, PARTS, TRAINING
 from cprl.studies.tables.table import StudyTable
 
-METRICS: Final = (
-    "collective_return",
-    NET,
-    "equality",
-    "sustainability",
-    "survival_steps",
-    "peacefulness",
-)
+METRICS: Final = ("collective_return", NET, "equality", "sustainability", "survival_steps", "peacefulness")
 """Metrics that are compared, unless others are asked for, where a table has them."""
 
 Values = NDArray[np.float64]
@@ -102,13 +95,7 @@ class Comparison:
         return f"{CONFIDENCE:.0%} intervals over replicas by Student's t"
 
 
-def compare(
-    table: StudyTable,
-    metric: str,
-    *,
-    part: str = TRAINING,
-    last: int = LAST,
-) -> Comparison:
+def compare(table: StudyTable, metric: str, *, part: str = TRAINING, last: int = LAST) -> Comparison:
     """A metric under every condition, with intervals over replicas.
 
     Args:
