@@ -62,7 +62,6 @@ def check_fields(value: Any, checks: Mapping[str, Check], where: str = "") -> No
     """Checks the fields of a frozen dataclass, and stores each as `plain` gives it.
 
     Args:
-        value: the dataclass.
         checks: by field. A field without one, of a subclass of the user's own, is left as it is.
         where: what the dataclass is called in messages; by default its class.
     """

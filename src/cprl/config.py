@@ -83,7 +83,6 @@ def to_config(value: object, where: str = "value") -> Any:
 
     Args:
         value: a value of `KINDS`, tuples of them, or what JSON has.
-        where: what the value is called in messages.
     """
     check_nesting(value, where)
     return _config(value, where)
@@ -115,8 +114,6 @@ def fields_to_config(
     """The fields of a dataclass, each as `to_config` gives it and of the type that it says.
 
     Args:
-        value: the dataclass.
-        where: what it is called in messages.
         instead: values of fields by name, in place of its own.
     """
     hints, table = _hints(type(value)), {}
@@ -131,8 +128,6 @@ def from_config(table: object, where: str = "value", *, allow: Iterable[str] = (
     """The value that `to_config` gave; lists become tuples. Nothing is imported.
 
     Args:
-        table: what JSON held.
-        where: what it is called in messages.
         allow: the targets of `Custom` that it may hold, "module:Class" each.
     """
     check_nesting(table, where)
@@ -306,9 +301,6 @@ def differences(before: object, now: object, where: str, kind: Any = None) -> li
     that did not know the field did what its default says.
 
     Args:
-        before: the earlier table.
-        now: the later one.
-        where: what they are of, in words.
         kind: the dataclass that they are of, where they do not say it themselves.
     """
     if isinstance(before, Mapping) and isinstance(now, Mapping):

@@ -99,7 +99,6 @@ class Experiment:
         """The experiment that `to_config` gave; of the modules that it names only a game's is imported.
 
         Args:
-            table: its fields.
             allow: the targets of `Custom` that it may hold, "module:Class" each.
         """
         read = fields_from_config(cls, table, "experiment", allow=allow)

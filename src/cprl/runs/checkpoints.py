@@ -284,7 +284,6 @@ def refuse_to_extend(run: Path, episodes: int, callbacks: Iterable[Any]) -> None
     """Checks that a run of more episodes would equal one that had been begun with so many.
 
     Args:
-        run: its directory.
         episodes: how many it has so far.
         callbacks: those of the training; one with `on_start` sees the number of episodes, and may depend on
             it unless it has a true `is_extendable`.

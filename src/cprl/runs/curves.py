@@ -28,9 +28,6 @@ def curves_of(run: Path) -> dict[str, Values]:
     Those of institutions are there as `institutions/fines` and so on, but for the share of unjust tags, since
     a table does not say who tagged, and for groups.
 
-    Args:
-        run: the run's directory.
-
     Returns:
         float64 [R, E] by name, for R replicas and the E episodes that all of them have ended; NaN where a
         metric is undefined.

@@ -97,7 +97,6 @@ class EpisodeTable:
         """Appends episodes; the first one of a table determines the columns and metrics of all.
 
         Args:
-            episodes: the episodes.
             replica: the index of their replica; by default each episode's world.
         """
         if not episodes:
@@ -397,11 +396,6 @@ def labelled(parts: Iterable[tuple[Label, int, Sequence[Episode]]]) -> pa.Table:
 
 def write_table(path: Path, table: pa.Table, *, over: bool = False) -> None:
     """Writes a parquet file atomically, in little room.
-
-    Args:
-        path: the file.
-        table: what it holds.
-        over: whether a file that exists is replaced.
 
     Raises:
         FileExistsError: if the file exists and is not to be replaced.

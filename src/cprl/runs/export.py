@@ -25,7 +25,6 @@ def export_results(run: Path, folder: Path, *, weights: bool = True) -> Path:
     """Copies the files of a finished run that a report needs: recipe, episodes, evaluation, weights.
 
     Args:
-        run: the run's directory.
         folder: the target, new, empty, or with an earlier copy of a run of the same experiment, whose files
             are replaced.
         weights: whether trained weights are copied, which are most of a short run. Without them a report has

@@ -41,7 +41,6 @@ def write_atomically(path: Path, write: Callable[[BinaryIO], object]) -> None:
 
     Args:
         path: the file; an existing file is replaced.
-        write: writes the content.
     """
     place_atomically(path, write, lambda partial: path)
 
@@ -51,7 +50,6 @@ def place_atomically(path: Path, write: Callable[[BinaryIO], object], name: Call
 
     Args:
         path: names the temporary file, to which each writer adds letters of its own.
-        write: writes the content.
         name: returns the final name, given the complete temporary file.
 
     Returns:
@@ -185,8 +183,6 @@ def refuse_newer(what: object, table: Mapping[str, Any], newest: int) -> None:
     """Refuses what a newer cprl wrote; any other format is left to the reader.
 
     Args:
-        what: the file, or what it holds, for the message.
-        table: its content, with the number as "format".
         newest: the highest format that this version reads.
     """
     found = table.get("format")
@@ -389,7 +385,6 @@ def write_listed(run: Path, name: str, write: Callable[[BinaryIO], object]) -> P
     Args:
         run: the run's directory, which exists.
         name: the file's path in it, e.g. "checkpoints/final.pt"; its folder is made.
-        write: writes the content.
 
     Returns:
         The file.

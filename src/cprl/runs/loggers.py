@@ -46,7 +46,6 @@ def make_logger(logger: str | Logger, run: str | Path) -> Logger:
 
     Args:
         logger: one of `PACKAGES`, or a logger.
-        run: the run's directory.
     """
     if not isinstance(logger, str):
         return logger

@@ -46,7 +46,6 @@ def start_run(
 
     Args:
         out: the directory, new or empty; None for `runs/<name>-<YYYYmmdd-HHMMSS>` in the working directory.
-        name: the name of the run.
         to_recipe: makes the recipe for a directory, e.g. `cprl.Experiment.to_recipe`.
         command: the command line, script first; by default that of this process.
 
@@ -225,7 +224,6 @@ def resume_command(run: Path, command: Sequence[str] | None = None) -> str:
     """The command line that resumes a run.
 
     Args:
-        run: the run's directory.
         command: the command line that started or resumed it, script first; None for a run that was started
             from Python without one, which `cprl run` resumes.
     """
@@ -365,9 +363,6 @@ def git_state(package: Path = _PACKAGE) -> dict[str, str | bool] | None:
     """The commit of the code of cprl, and whether a tracked file differed from it.
 
     Where this process stands does not count: the git folder of somebody's own project says nothing of cprl.
-
-    Args:
-        package: the folder of the package.
 
     Returns:
         {"commit": 40 hexadecimal digits, "dirty": whether a tracked file was changed}; None where no commit

@@ -22,7 +22,6 @@ def save_weights(run: Path, networks: Mapping[str, nn.Module], *, name: str = "f
     """Writes the weights of each agent's network atomically, and lists them in the run's manifest.
 
     Args:
-        run: the run's directory.
         networks: the networks by the agent's name.
         name: the name of the file, without suffix.
 
@@ -54,7 +53,6 @@ def save_decisions(run: Path, values: Mapping[str, Tensor]) -> None:
     """Writes the values of agents' decisions atomically; writes no file if they learn none.
 
     Args:
-        run: the run's directory.
         values: float64 [C] by the agent's name, see `cprl.learners.decisions.BanditDecider.learned`.
     """
     run = Path(run)
@@ -70,10 +68,8 @@ class BestWeights:
     one harvests something `path` is None and `best_episode` is -1.
 
     Args:
-        run: the run's directory.
         networks: the networks by the agent's name.
         policy: the policy of all agents, e.g. `cprl.policies.assignment.AgentPolicies`.
-        env: the worlds to evaluate in.
         every: episodes between evaluations.
         logger: gets each `evaluation/greedy_return`.
     """
@@ -161,7 +157,6 @@ def kept_of(run: Path, name: str | None = None) -> Kept:
     """What a run keeps of its agents.
 
     Args:
-        run: its directory.
         name: of a file in its `checkpoints/`, without suffix; None for the final one, or the newest readable
             checkpoint of a run that has not ended.
     """
@@ -222,7 +217,6 @@ def partners_of(run: Path, partners: Iterable[str]) -> dict[str, dict[str, str]]
 
     Args:
         run: the directory of the run that begins.
-        partners: the directories of the others.
     """
     final = {own: Path(own) / FOLDER / "final.pt" for own in partners}
     found = {os.path.relpath(own, run): checksum(path) for own, path in final.items() if path.exists()}
@@ -230,13 +224,7 @@ def partners_of(run: Path, partners: Iterable[str]) -> dict[str, dict[str, str]]
 
 
 def weights_of(recipe: Mapping[str, Any], run: Path, partner: str) -> str | None:
-    """The name of the weights of another run that play in a run; None for the final ones it has now.
-
-    Args:
-        recipe: that of the run.
-        run: its directory.
-        partner: the directory of the other run.
-    """
+    """The name of the weights of another run that play in a run; None for the final ones it has now."""
     wanted = (recipe.get(FIELD) or {}).get(os.path.relpath(partner, run))
     if wanted is None:
         return None

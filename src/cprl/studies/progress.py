@@ -127,9 +127,6 @@ class Overview:
     Nobody's clock is compared with anybody else's: a trial runs if what it says changes between two looks.
 
     Args:
-        trials: the study's.
-        runs: the directory of its runs.
-        status: the directory in which they say how far they are.
         failures: the reasons of those that failed, by trial; may grow between two looks. None: those that
             are noted in `status`.
     """
@@ -225,10 +222,6 @@ class Progress:
     elsewhere: the output is that of the moment in which the block begins.
 
     Args:
-        trials: all that are shown.
-        runs: the directory of their runs.
-        status: the directory in which they say how far they are.
-        title: what the study is called.
         is_shown: whether anything is printed.
     """
 

@@ -38,9 +38,6 @@ def write_results(
     """Writes `table.parquet`, `summary.md` and `figures/`; again over what an earlier call wrote.
 
     Args:
-        study: the study, finished or not.
-        out: its directory.
-        runs: the directory of its runs.
         last: episodes at the end of the training that are compared.
         again: the command line that runs what is lacking, for the summary.
 

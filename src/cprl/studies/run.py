@@ -54,7 +54,6 @@ def run_study(
     Another study in the same directory is refused until they end.
 
     Args:
-        study: what is run.
         out: the study's directory, new or that of an earlier call; by default `studies/<name>`. A study that
             was changed keeps the runs that are there.
         on: where trials are run, see `cprl.studies.executors`; by default in this process.

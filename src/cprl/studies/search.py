@@ -234,7 +234,6 @@ def run_search(
     """Runs a search; may be stopped at any moment, and called again, with more points too.
 
     Args:
-        search: what is searched.
         last: see `cprl.studies.run_study`; what the search itself looks at is in `Search`.
     """
     check_executor(on)

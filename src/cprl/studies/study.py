@@ -260,7 +260,6 @@ class Study:
         """The study that `to_config` gave.
 
         Args:
-            table: what JSON held.
             allow: the targets of `Custom` that it may hold, "module:Class" each.
             directory: where it is kept; runs of `Frozen` agents are then relative to where we stand.
         """
@@ -416,7 +415,6 @@ def read_study(out: Path | str, *, allow: Sequence[str] = ()) -> Study:
     """The study of a directory.
 
     Args:
-        out: the directory.
         allow: the user's own code, "module:Class", that it may import.
     """
     out = Path(out)

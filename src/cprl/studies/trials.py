@@ -46,7 +46,6 @@ class Status:
 
     Args:
         folder: in which they are; made by whoever writes first.
-        name: of the trial.
     """
 
     def __init__(self, folder: Path, name: str) -> None:
@@ -138,7 +137,6 @@ def refuse_another(run: Path, recipe: Mapping[str, Any]) -> None:
     """Refuses a finished run that is not the trial whose name its directory has, e.g. since it was renamed.
 
     Args:
-        run: the directory of the trial.
         recipe: what `Experiment.to_recipe` gives for the trial and this directory.
     """
     stored, trial = recipe_config(read_recipe(run)), recipe["experiment"]
@@ -235,9 +233,7 @@ def task_of(
     Classes of the user's own that the experiment itself has are allowed: it was made with them.
 
     Args:
-        trial: what is run.
         runs: the directory in which its own is.
-        status: the directory in which it says how far it is.
         allow: further targets of `Custom`, those of stored runs that agents come from.
         keep_checkpoint: whether its run keeps the state of its training.
     """
@@ -350,12 +346,7 @@ BEAT_S: Final = 1.0
 
 
 class StatusFile:
-    """Writes the status of a trial every second; a context manager.
-
-    Args:
-        status: where to.
-        experiment: what is run.
-    """
+    """Writes the status of a trial every second; a context manager."""
 
     def __init__(self, status: Status, experiment: Experiment) -> None:
         self._status = status

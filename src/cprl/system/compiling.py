@@ -83,7 +83,6 @@ class Compiled:
 
         Args:
             form: all that may change about the arguments except tensor values: shapes, dtypes, numbers.
-            arguments: the arguments of the function.
         """
         if not self.enabled:
             return self._plain(*arguments)

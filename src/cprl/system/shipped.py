@@ -105,12 +105,7 @@ def is_shipped(word: str) -> bool:
 
 
 def run_shipped(name: str, words: Sequence[str]) -> None:
-    """Runs a recipe as `python RECIPE.py` does, as the main module of this process.
-
-    Args:
-        name: of the recipe.
-        words: its command line, without the program.
-    """
+    """Runs a recipe as `python RECIPE.py` does, as the main module of this process."""
     recipe = recipe_named(name)
     if not recipe.runs:
         raise ValueError(f"{name} runs nothing: other recipes import it; cprl recipe {name} prints it")

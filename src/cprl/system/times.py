@@ -52,11 +52,7 @@ class RunTimes:
         self._began, self._compiled_s = time.monotonic(), CLOCK.total_s
 
     def report(self, training: Times) -> dict[str, float]:
-        """The entries of `report.json`; of a run that was resumed with what the training took before.
-
-        Args:
-            training: the times of its training.
-        """
+        """The entries of `report.json`; of a run that was resumed with what the training took before."""
         wall_s = time.monotonic() - self._began + training._before["spent_s"]
         compiling_s = CLOCK.total_s - self._compiled_s + training._before["compiling_s"]
         return {

@@ -241,11 +241,7 @@ def frozen_agents(
     """The stored agent of each replica, by specification; each run is read once.
 
     Args:
-        specs: the specifications.
         spaces: what agents observe and may do here.
-        game: the game, if it is one of cprl's.
-        allow: what the stored runs may import.
-        replicas: the numbers of the replicas.
         weights: the names of the weights, by run; of others the final ones.
     """
     specs = tuple(specs)
@@ -309,12 +305,7 @@ def start_weights(
     empty where they start anew.
 
     Args:
-        spec: how the agents are specified.
-        agents: their indices.
         spaces: what they observe and may do.
-        game: the game, if it is one of cprl's.
-        replicas: the numbers of the replicas.
-        allow: what the stored run may import.
     """
     source = spec.start_from
     if source is None:

@@ -23,7 +23,6 @@ class StepCollector(BaseCollector):
 
     Args:
         env: B worlds, whose steps return new tensors.
-        policy: writes the actions.
     """
 
     def __init__(self, env: EnvBase, policy: nn.Module) -> None:
@@ -71,7 +70,6 @@ def stock_collector(env: EnvBase, policy: nn.Module, *, steps: int = 1) -> Colle
 
     Args:
         env: B worlds.
-        policy: writes the actions.
         steps: steps per batch; agents explore in all of them with the epsilon of the first.
     """
     before = deepcopy(policy.state_dict())

@@ -68,7 +68,6 @@ class FiniteCheck:
     """Checks the numbers of a training; `Training` calls it.
 
     Args:
-        learners: by the indices of their agents.
         spaces: what agents observe; entries of integers are not looked at.
     """
 
@@ -126,7 +125,6 @@ class FiniteCheck:
             losses: by the indices of their agents.
             returns: the return of each agent in the running episode of each replica, or in the one that has
                 just ended, [R, N].
-            step: of the training.
 
         Raises:
             NotFiniteError: with "stop", see `OnNan`.

@@ -101,7 +101,6 @@ def evaluate_population(
     Args:
         experiment: what was trained.
         trained: the environment of the training; what its transforms have learned is used.
-        population: the agents.
         random: the episodes of `random_play`, which are not played again if they are the same now.
 
     Returns:
@@ -123,7 +122,6 @@ def write_evaluation(run: Path, played: Mapping[str, Sequence[Episode]], *, of_r
     """Writes `evaluation/<policy>.parquet` of a run; again where one is there.
 
     Args:
-        run: the run's directory.
         played: the episodes by policy.
         of_replica: how many of them each replica has.
     """

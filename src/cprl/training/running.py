@@ -88,7 +88,6 @@ def run(
     A run that ends before its training has begun leaves nothing behind; later, all that it produced.
 
     Args:
-        experiment: what is run.
         out: the directory of the run, new or empty; by default `runs/<name>-<time>`.
         resume: whether the run in `out`, which was stopped, is resumed from its newest checkpoint, or a run
             of fewer episodes, stopped or finished, is extended. Either equals a run that was not interrupted,

@@ -172,7 +172,6 @@ def load(run: str | Path, *, weights: str | None = None, allow: Sequence[str] = 
     which may lead anywhere, e.g. "../other". They are read when such an agent is asked for, without code.
 
     Args:
-        run: its directory.
         weights: which of those in its `checkpoints/`: "final", "best" where the recipe keeps them, or
             "final-4800" of a run that was extended from so many episodes; by default the final ones, or those
             of the newest readable checkpoint where the run has not ended.
@@ -248,9 +247,6 @@ def stored_policies(
 
     Args:
         agents: by agent and replica.
-        playing: the game; its spaces where it is not one of cprl's.
-        replicas: their numbers.
-        worlds: how many worlds of each replica are played side by side.
         seed: what random numbers follow from, with the replica and the agent.
     """
     alike: dict[Any, list[int]] = {}
@@ -284,10 +280,7 @@ def stored_actor(
 
     Args:
         lanes: an agent for each lane, lane = replica x agents + agent.
-        playing: the game; its spaces where it is not one of cprl's.
-        seeds: of each lane's random numbers.
         agents: how many agents of a replica it controls.
-        worlds: how many worlds of each replica are played side by side.
         stacks: whether lanes of one and the same network are stacked too, so that its values are, to the last
             bit, those that it has among others.
     """

@@ -315,7 +315,6 @@ def train(
 
     Args:
         env: see `Training`, also for all that is not said here.
-        learners: by the indices of their agents.
         episodes: how many to play.
         others: the actors of the agents that do not learn.
         decisions: what all agents decide, where the game asks them.

@@ -44,8 +44,6 @@ def courses(table: StudyTable, path: Path | str, *, metrics: Sequence[str] = ())
     the reference beside it in grey. Running means are over whole windows of the table and centred.
 
     Args:
-        table: the table.
-        path: the PNG.
         metrics: by default the collective return and survival; else the first that the table has.
     """
     path, design = picture_path(path), table.design

@@ -70,10 +70,7 @@ def heat_map(
     excludes 0 have a star.
 
     Args:
-        table: the table.
         factors: two of its factors; any others are at the levels of the reference.
-        path: the PNG.
-        metric: one of its metrics.
     """
     path, design = picture_path(path), table.design
     grid, fixed = _checked(design, factors)
@@ -111,8 +108,6 @@ def phase_diagram(
     """Draws in which phase most replicas end: over two factors, or a bar for each condition.
 
     Args:
-        table: the table.
-        path: the PNG.
         factors: two factors; None for bars, of at most `MOST_CONDITIONS` conditions.
     """
     path, design = picture_path(path), table.design

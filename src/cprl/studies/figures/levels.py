@@ -47,9 +47,6 @@ def by_factor(
     each condition; there are none where it differs and points stand alone that have the same level.
 
     Args:
-        table: the table.
-        factor: one of its factors.
-        path: the PNG.
         metrics: by default those of `cprl.studies.tables.comparing.METRICS` that it has.
     """
     design, path = table.design, picture_path(path)
@@ -328,7 +325,6 @@ def by_condition(
 
     Args:
         table: the table, of at most `MOST_CONDITIONS` conditions.
-        path: the PNG.
         kind: "levels", with random play as dashes; or "differences", with a dashed line at 0.
     """
     choice("kind", kind, ("levels", "differences"))

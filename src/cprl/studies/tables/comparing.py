@@ -99,8 +99,6 @@ def compare(table: StudyTable, metric: str, *, part: str = TRAINING, last: int =
     """A metric under every condition, with intervals over replicas.
 
     Args:
-        table: the table.
-        metric: one of its metrics.
         part: "training", "evaluation" or "random".
         last: of training: episodes at its end; those of whole windows.
     """

@@ -37,7 +37,6 @@ def pooled_table(
         runs: directories of runs, or of directories that hold them; results that `cprl export` made too.
         by: paths of fields of an experiment, see `cprl.studies.factors`, e.g. "game.rules.freeze_steps"; a
             path with `*` stands for all values there, "name" for what the run's recipe is called.
-        reference: the name of the condition that others are compared with; by default the first.
         allow: the user's own code, "module:Class", that a run's recipe may name.
     """
     fields = [normalised(own) for own in by]

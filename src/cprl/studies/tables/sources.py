@@ -250,7 +250,6 @@ def rows_of(design: Design, found: list[tuple[Source, list[Windows]]], marked: M
     """The sorted rows of a table, with the columns that `cprl.studies.tables.table` lists.
 
     Args:
-        design: the conditions.
         found: runs, and what was measured in them.
         marked: the marks of each run by its name.
     """

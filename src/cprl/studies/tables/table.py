@@ -33,6 +33,7 @@ import pyarrow.parquet as pq
 from numpy.typing import NDArray
 
 from cprl.arguments import WINDOW as WINDOW
+from cprl.arguments import integer
 from cprl.runs.episodes import write_table
 from cprl.runs.files import STUDY_TABLE_FORMAT, refuse_newer
 from cprl.runs.recipe import read_recipe, versions
@@ -193,8 +194,6 @@ def study_table(
     """The table of the finished runs of a study.
 
     Args:
-        study: the study.
-        runs: the directory of its runs.
         window: episodes of a window of training; 1 for episodes one by one, of the evaluation too.
         status: where its trials say why they failed, see `cprl.studies.trials`.
     """
@@ -213,6 +212,7 @@ def table_of(
         sources: the runs; what is damaged of them is listed as lacking.
         lacking: other runs, which are listed.
     """
+    integer("window", window, 1)
     found: list[tuple[Source, list[Windows]]] = []
     made: dict[str, Circumstances] = {}
     out = list(lacking)
