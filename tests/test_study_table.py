@@ -316,7 +316,6 @@ def test_runs_that_have_not_ended_are_named_there_too(tmp_path):
 @pytest.mark.parametrize(
     ("how", "message"),
     [
-        ({"by": []}, "by is"),
         ({"by": ["game.rules.freez_steps"]}, "did you mean 'freeze_steps'"),
         ({"by": ["seed"]}, "by is 'seed'"),
         ({"by": ["name", "name"]}, "allowed: other fields than seed and replicas, each once"),

@@ -25,8 +25,8 @@ from cprl.population import (
     stored_of,
     with_run_moved,
 )
-from cprl.runs.files import written_by_another
-from cprl.runs.recipe import RECIPE_FORMAT, recipe_config
+from cprl.runs.files import RECIPE_FORMAT, written_by_another
+from cprl.runs.recipe import recipe_config
 from cprl.system.memory import DEVICE
 
 LoggerName = Literal["tensorboard", "wandb"]

@@ -322,6 +322,10 @@ def runs_table(
         raise ValueError(f"--last counts episodes of the training; allowed: without --part {part}")
     if not runs:
         raise ValueError("cprl table wants at least one run: cprl table RUN... --by FIELD")
+    if not by:
+        raise ValueError(
+            "cprl table wants a field that tells runs apart: cprl table RUN... --by game.rules.freeze-steps"
+        )
     runs_in(runs)
 
     from cprl.studies.tables.comparing import rich_table

@@ -40,8 +40,6 @@ def pooled_table(
         allow: the user's own code, "module:Class", that a run's recipe may name.
     """
     fields = [normalised(own) for own in by]
-    if not fields:
-        raise refusal("by", by, "a field that tells runs apart, e.g. game.rules.freeze_steps")
     for own in fields:
         if own in ("seed", "replicas") or fields.count(own) > 1:
             raise refusal("by", own, "other fields than seed and replicas, each once")
