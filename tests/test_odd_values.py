@@ -18,7 +18,7 @@ from cprl.measuring.episodes import EpisodeTracker
 
 GAME = Game(map=maps.parse(">A.\n.A."), rules=Rules(may_fire=False))
 BOARD = partial(Map, height=3, width=3, sites=((0, 0),), starts=((1, 1, 0),))
-INF, NAN = float("inf"), float("nan")
+NAN = float("nan")
 
 
 @pytest.mark.parametrize(
