@@ -1,7 +1,9 @@
-"""Preferences as values of a recipe.
+"""What agents want: the reward that an agent learns from, out of the rewards of everybody.
 
-In each, N is the number of agents, r_i the reward that the environment gives agent i in a turn (apples, less
-fines, plus transfers), and r'_i the reward that agent i wants and learns from.
+In each preference, N is the number of agents, r_i the reward that the environment gives agent i in a turn
+(apples, less fines, plus transfers), and r'_i the reward that agent i wants and learns from. First come the
+values of a recipe, then `wanted_rewards`, a pure function, and `WantedRewards`, which holds its memory; last
+`PreferenceTransform` and `PreferenceWrapper`, for TorchRL programs of one's own and for PettingZoo.
 """
 
 from collections.abc import Mapping, Sequence
@@ -20,8 +22,7 @@ from torchrl.data import Composite, TensorSpec, Unbounded
 from torchrl.envs import Transform
 
 from cprl import keys
-from cprl.arguments import object_of
-from cprl.checks import TEXT, Check, check_fields, checked, either, instance, number, one_of, shown, tuple_of
+from cprl.checks import Check, check_fields, checked, either, instance, number, one_of
 
 _WEIGHT: Final = number(0, 1e6)
 _SHARE: Final = number(0, 1)
@@ -147,9 +148,6 @@ def named(preference: object) -> str:
 Array = Any
 """A numpy array, or a tensor; what is computed from it is of the same kind, on the same device."""
 
-_REWARDS: Final = "numbers [worlds, agents], an array or tensor"
-_WHOLE: Final = (torch.uint8, torch.int8, torch.int16, torch.int32, torch.int64)
-
 
 def wanted_rewards(
     preference: Preference, rewards: Array, smoothed: Array | None = None
@@ -166,17 +164,9 @@ def wanted_rewards(
         And what is to be remembered, float64 [B, N], for `InequityAversion`; None for all others.
 
     Raises:
-        ValueError: for what is no preference, rewards of another shape, and a comparison with others where
-            there are none.
+        ValueError: for a comparison with others where there are none.
     """
-    _check("rewards", rewards)
     check_preference("preference", preference, rewards.shape[1])
-    if smoothed is not None:
-        _check("smoothed", smoothed)
-        if smoothed.shape != rewards.shape or _of_kind(smoothed) is not _of_kind(rewards):
-            raise ValueError(
-                f"smoothed is {list(smoothed.shape)}; allowed: as rewards, {list(rewards.shape)}"
-            )
     with np.errstate(all="ignore"):  # rewards that are not finite are found and named elsewhere
         return _wanted(preference, rewards, smoothed)
 
@@ -211,16 +201,6 @@ def _off(angle: float, own: Array, of_others: Array) -> Array:
     plain = abs(kind.arctan2(of_others, own) - angle)
     shorter = kind.where(plain > pi, 2 * pi - plain, plain)
     return kind.where((own == 0) & (of_others == 0), kind.zeros_like(own), shorter)
-
-
-def _check(name: str, array: Array) -> None:
-    """Refuses what are no numbers [B, N]."""
-    if isinstance(array, Tensor):
-        fits = array.ndim == 2 and (array.is_floating_point() or array.dtype in _WHOLE)
-    else:
-        fits = isinstance(array, np.ndarray) and array.ndim == 2 and array.dtype.kind in "fiu"
-    if not fits:
-        raise ValueError(f"{name} is {shown(array)}; allowed: {_REWARDS}")
 
 
 def _of_kind(array: Array) -> Any:
@@ -294,7 +274,6 @@ class WantedRewards:
         Raises:
             ValueError: for another number of agents, or of worlds than before.
         """
-        _check("rewards", rewards)
         if rewards.shape[1] != self._agents:
             self.check_agents(rewards.shape[1])
         wanted = None
@@ -348,7 +327,6 @@ class WantedRewards:
         Raises:
             ValueError: if it is that of other preferences.
         """
-        object_of("state", state, Mapping, "a value of state_dict()")
         remember = [own for own in self._columns if isinstance(own, InequityAversion)]
         kept = state.get("smoothed")
         if kept is not None and (kept.ndim != 3 or len(kept) != len(remember)):
@@ -358,9 +336,6 @@ class WantedRewards:
             )
         self.now = None
         self._smoothed = {} if kept is None else dict(zip(remember, kept.clone(), strict=True))
-
-
-_KEY: Final = either(TEXT, tuple_of(TEXT, at_least=1))
 
 
 class PreferenceTransform(Transform):
@@ -393,11 +368,8 @@ class PreferenceTransform(Transform):
         out_key: NestedKey | None = None,
     ) -> None:
         out_key = in_key if out_key is None else out_key
-        for name, key in (("in_key", in_key), ("out_key", out_key)):
-            checked(name, key, _KEY)
-        wants = WantedRewards(preferences)
         super().__init__(in_keys=[in_key], out_keys=[out_key])
-        self.wants = wants
+        self.wants = WantedRewards(preferences)
 
     def _step(self, tensordict: TensorDictBase, next_tensordict: TensorDictBase) -> TensorDictBase:
         given = next_tensordict.get(self.in_keys[0])
@@ -454,14 +426,12 @@ class PreferenceWrapper(BaseParallelWrapper[str, Any, Any]):
         preferences: what all agents want; or a preference for each of `env.possible_agents`.
 
     Raises:
-        ValueError: for what is no parallel environment or no preference, and for preferences that the number
-            of agents does not allow.
+        ValueError: for what is no preference, and for preferences that the number of agents does not allow.
     """
 
     def __init__(
         self, env: ParallelEnv[str, Any, Any], preferences: Preference | Sequence[Preference]
     ) -> None:
-        object_of("env", env, ParallelEnv, "a ParallelEnv of PettingZoo")
         super().__init__(env)
         self.wants = WantedRewards(preferences)
         self.wants.check_agents(len(env.possible_agents))

@@ -9,9 +9,9 @@ from typing import Any, Final
 from torch import Tensor, nn
 from torchrl import modules
 
-from cprl.checks import Check, check_arguments, check_fields, count, is_count, tuple_of
+from cprl.checks import Check, check_fields, is_count
 from cprl.commons.spaces import Spaces
-from cprl.networks.mlp import LAYERS, NETWORK_CHECKS, check_size, glorot_uniform_, layers
+from cprl.networks.mlp import LAYERS, check_size, glorot_uniform_, layers
 
 _CHECKS: Final[dict[str, Check]] = {
     "channels": layers(1),
@@ -22,11 +22,7 @@ _CHECKS: Final[dict[str, Check]] = {
 
 @dataclass(frozen=True, kw_only=True)
 class Conv:
-    """Convolutions that keep the size of the window, then fully connected layers; ReLU after each.
-
-    Raises:
-        ValueError: if a value is not allowed; names it and says what is.
-    """
+    """Convolutions that keep the size of the window, then fully connected layers; ReLU after each."""
 
     channels: tuple[int, ...] = (16, 16)
     """Channels of each convolution."""
@@ -47,7 +43,7 @@ class Conv:
         glorot_uniform: bool = False,
         shape: Sequence[int] | None = None,
     ) -> "ConvNetwork":
-        """A new network; see `cprl.networks.specification.new_network`.
+        """A new network.
 
         Raises:
             ValueError: if observations have no rows and columns.
@@ -85,7 +81,6 @@ class ConvNetwork(nn.Module):
             default.
 
     Raises:
-        ValueError: if an argument is not allowed; names it and says what is.
         TooLargeError: if there is too little memory for the weights.
     """
 
@@ -102,17 +97,6 @@ class ConvNetwork(nn.Module):
         glorot_uniform: bool = False,
     ) -> None:
         super().__init__()
-        check_arguments(
-            {**NETWORK_CHECKS, **_CHECKS, "observation_shape": tuple_of(count(1), at_least=3)},
-            observation_shape=observation_shape,
-            outputs=outputs,
-            channels=channels,
-            kernel_cells=kernel_cells,
-            hidden_cells=hidden_cells,
-            highest=highest,
-            relu_on_outputs=relu_on_outputs,
-            glorot_uniform=glorot_uniform,
-        )
         self.highest, self.outputs, self.observation_dims = highest, outputs, len(observation_shape)
         *planes, rows, columns = observation_shape
         check_size(

@@ -9,7 +9,7 @@ from typing import Final
 from torch import Tensor, nn
 from torchrl import modules
 
-from cprl.checks import SWITCH, Check, check_arguments, check_fields, count, is_count, number, tuple_of
+from cprl.checks import Check, check_fields, is_count
 from cprl.commons.spaces import Spaces
 from cprl.system.memory import check_memory
 
@@ -41,27 +41,13 @@ def check_size(sizes: Sequence[int], more: int = 0) -> None:
     check_memory(f"the {weights:,} weights of a network", 4 * weights, "smaller layers")
 
 
-NETWORK_CHECKS: Final[dict[str, Check]] = {
-    "observation_shape": tuple_of(count(1), at_least=1),
-    "outputs": count(1),
-    "highest": number(1e-30, 2**64),
-    "relu_on_outputs": SWITCH,
-    "glorot_uniform": SWITCH,
-}
-"""Of the arguments that every network has."""
-
-
 LAYERS: Final = layers(0)
 """Units of each hidden layer; none is a linear network."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class MLP:
-    """Fully connected layers with ReLU.
-
-    Raises:
-        ValueError: if a value is not allowed; names it and says what is.
-    """
+    """Fully connected layers with ReLU."""
 
     hidden_cells: tuple[int, ...] = (32, 32)
     """Units of each hidden layer."""
@@ -78,7 +64,6 @@ class MLP:
         glorot_uniform: bool = False,
         shape: Sequence[int] | None = None,
     ) -> "MLPNetwork":
-        """A new network; see `cprl.networks.specification.new_network`."""
         return MLPNetwork(
             spaces.observation_shape if shape is None else shape,
             outputs,
@@ -102,7 +87,6 @@ class MLPNetwork(nn.Module):
             of the study; else torch's default.
 
     Raises:
-        ValueError: if an argument is not allowed; names it and says what is.
         TooLargeError: if there is too little memory for the weights.
     """
 
@@ -117,15 +101,6 @@ class MLPNetwork(nn.Module):
         glorot_uniform: bool = False,
     ) -> None:
         super().__init__()
-        check_arguments(
-            {**NETWORK_CHECKS, "hidden_cells": LAYERS},
-            observation_shape=observation_shape,
-            outputs=actions,
-            hidden_cells=hidden_cells,
-            highest=highest,
-            relu_on_outputs=relu_on_outputs,
-            glorot_uniform=glorot_uniform,
-        )
         check_size((prod(observation_shape), *hidden_cells, actions))
         self.highest, self.relu_on_outputs = highest, relu_on_outputs
         self.observation_dims, self.outputs = len(observation_shape), actions

@@ -54,7 +54,7 @@ class Recurrent:
         glorot_uniform: bool = False,
         shape: Sequence[int] | None = None,
     ) -> "RecurrentNetwork":
-        """A new network; see `cprl.networks.specification.new_network`.
+        """A new network.
 
         Raises:
             ValueError: if the encoder cannot read observations, and for `relu_on_outputs` or
@@ -75,9 +75,6 @@ class GRU(Recurrent):
 
     Source: Cho et al., "Learning Phrase Representations using RNN Encoder-Decoder for Statistical Machine
     Translation" (2014), in the form of `torch.nn.GRU`.
-
-    Raises:
-        ValueError: if a value is not allowed; names it and says what is.
     """
 
     kind: ClassVar[Kind] = "GRU"
@@ -89,9 +86,6 @@ class LSTM(Recurrent):
 
     Source: Hochreiter and Schmidhuber, "Long Short-Term Memory" (1997), with the forget gate of Gers et al.,
     "Learning to Forget" (2000), in the form of `torch.nn.LSTM`.
-
-    Raises:
-        ValueError: if a value is not allowed; names it and says what is.
     """
 
     kind: ClassVar[Kind] = "LSTM"

@@ -7,7 +7,6 @@ from typing import Any, TypeAlias
 import torch
 from torch import nn
 
-from cprl.checks import checked, instance
 from cprl.commons.spaces import Spaces
 from cprl.custom import Custom
 from cprl.networks.convolutional import Conv
@@ -44,7 +43,6 @@ def new_network(
         ValueError: if agents observe entries that networks do not read, if the network cannot read the
             observation, or if it does not support `relu_on_outputs` or `glorot_uniform`.
     """
-    checked("network", network, instance(Network | Custom, 'MLP, Conv, GRU, LSTM, Custom("module:Class")'))
     refuse_unseen(spaces)
     if not isinstance(network, Custom):
         return network.make(
@@ -77,7 +75,6 @@ def _made(network: Custom, name: str, spaces: Spaces, outputs: int) -> Any:
 
 def refuse_unseen(spaces: Spaces) -> None:
     """Raises a ValueError if agents observe entries other than "observation", which networks do not read."""
-    checked("spaces", spaces, instance(Spaces, "a Spaces, e.g. Game.spaces"))
     if spaces.vectors:
         names = " and ".join(f'("agents", "{name}")' for name, _ in spaces.vectors)
         raise ValueError(

@@ -121,7 +121,6 @@ class SharedTeam(nn.Module):
         return given
 
     def member_state(self, state: dict[str, Tensor], member: int) -> dict[str, Tensor]:
-        """See `TeamNetwork`."""
         return {name.removeprefix("network."): value for name, value in state.items()}
 
     def stacked(self, teams: Sequence["SharedTeam"]) -> "SharedTeam":
@@ -153,7 +152,6 @@ class ModuleTeam(nn.Module):
         return torch.stack([member(own) for member, own in zip(self.members, seen, strict=True)], -2)
 
     def member_state(self, state: dict[str, Tensor], member: int) -> dict[str, Tensor]:
-        """See `TeamNetwork`."""
         mine = f"members.{member}."
         return {name.removeprefix(mine): value for name, value in state.items() if name.startswith(mine)}
 

@@ -11,7 +11,7 @@ Whiteson, "DiCE: The Infinitely Differentiable Monte Carlo Estimator" (2018), se
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import Any, Final, Literal, NamedTuple, TypeAlias, get_args
+from typing import Any, Literal, NamedTuple, TypeAlias
 
 import torch
 from tensordict import TensorDict, TensorDictBase, TensorDictParams
@@ -19,9 +19,6 @@ from tensordict.nn import ProbabilisticTensorDictSequential
 from tensordict.utils import NestedKey
 from torch import Tensor, nn
 from torchrl.objectives import LossModule
-
-from cprl.arguments import callable_of, integer, listed, number, object_of, objects, refusal
-from cprl.checks import checked, one_of
 
 Parameters: TypeAlias = Sequence[Sequence[Tensor]]
 """For each of N agents the tensors that it learns, of any shapes."""
@@ -34,10 +31,6 @@ the others alone, as in the paper; "both", also the factor by which their step m
 _Flat: TypeAlias = tuple[Tensor, ...]
 _Slopes: TypeAlias = dict[tuple[int, int], Tensor]
 """The gradient of the loss of an agent by a tensor, by the place of each."""
-
-_OBJECTIVE: Final = "a function of the parameters of N agents to their losses"
-_HIGHEST: Final = 1e12
-_MOST_STEPS: Final = 1000
 
 
 def lola_gradients(
@@ -60,14 +53,7 @@ def lola_gradients(
         Gradients of the shapes of `parameters`, and the mean of the losses of the objectives, [.., N],
         without a gradient. Where losses have axes before the agents', the gradients are those of the sums
         over them.
-
-    Raises:
-        ValueError: for a rate that is not allowed, another factor, no objective, and losses of another number
-            of agents.
     """
-    checked_rate(rate)
-    checked_factor(factor)
-    objectives = _functions("objectives", objectives)
     flat, owners = _flat(parameters)
     flat = tuple(value.detach() for value in flat)
     agents = range(len(parameters))
@@ -100,16 +86,8 @@ def looked_ahead(
         rate: the step size, 0..1e12.
         steps: how many steps, 1..1000.
         still: the index of an agent that does not move.
-
-    Raises:
-        ValueError: for what is not allowed, and losses of another number of agents.
     """
-    checked_rate(rate)
-    integer("steps", steps, 1, _MOST_STEPS)
-    callable_of("objective", objective, _OBJECTIVE)
     flat, owners = _flat(parameters)
-    if still is not None:
-        integer("still", still, 0, owners[-1])
     followed = [(i, p) for p, i in enumerate(owners) if i != still]
     for _ in range(steps):
         slopes = dict(zip(followed, _slopes(objective, owners, followed)(*flat)[0], strict=True))
@@ -139,34 +117,13 @@ def look_ahead_losses(
         parameters: of N agents.
         rate: the step size of the others, 0..1e12.
         steps: how many steps they take, 1..1000.
-
-    Raises:
-        ValueError: for what is not allowed, and losses of another number of agents.
     """
-    callable_of("inner", inner, _OBJECTIVE)
-    outer = _functions("outer", outer)
-    _flat(parameters)
-    if len(outer) != len(parameters):
-        raise ValueError(
-            f"outer has {len(outer)} objectives; allowed: one for each of {len(parameters)} agents"
-        )
     losses = []
     for i, own in enumerate(outer):
         mine = [list(of) if j == i else [value.detach() for value in of] for j, of in enumerate(parameters)]
         ahead = looked_ahead(inner, mine, rate=rate, steps=steps, still=i)
-        losses.append(_of_agents(own(ahead), len(parameters))[..., i])
+        losses.append(own(ahead)[..., i])
     return torch.stack(losses, -1)
-
-
-def checked_rate(rate: Any) -> float:
-    """The rate; raises a ValueError for anything but a number in 0..1e12."""
-    return number("rate", rate, low=0, high=_HIGHEST, allowed=f"0..{_HIGHEST:g}")
-
-
-def checked_factor(factor: Any) -> Factor:
-    """The factor; raises a ValueError for anything else."""
-    known: Factor = checked("factor", factor, one_of(*get_args(Factor)))
-    return known
 
 
 def _slopes(
@@ -179,7 +136,7 @@ def _slopes(
         agents = owners[-1] + 1
 
         def losses_of(*values: Tensor) -> Tensor:
-            return _of_agents(objective(_by_agent(values, owners)), agents)
+            return objective(_by_agent(values, owners))
 
         losses: Tensor
         losses, pull = torch.func.vjp(losses_of, *flat)[:2]
@@ -209,36 +166,13 @@ def _weights(
     return tuple(weight(j, p) for j, p in followed)
 
 
-def _functions(name: str, given: Any) -> tuple[Objective, ...]:
-    """One or more objectives; raises a ValueError for anything else."""
-    found = listed(name, given, f"a list of functions, each {_OBJECTIVE}")
-    for place, own in enumerate(found):
-        callable_of(f"{name}[{place}]", own, _OBJECTIVE)
-    if not found:
-        raise ValueError(f"{name} is empty; allowed: one or more")
-    return found
-
-
-def _of_agents(losses: Tensor, agents: int) -> Tensor:
-    object_of("what an objective gives", losses, Tensor, f"losses [.., {agents}]")
-    if not losses.ndim or losses.shape[-1] != agents:
-        raise ValueError(f"an objective gives losses {list(losses.shape)}; allowed: [.., {agents}]")
-    return losses
-
-
 def _mean(values: Sequence[Tensor]) -> Tensor:
     return values[0] if len(values) == 1 else torch.stack(list(values)).mean(0)
 
 
 def _flat(parameters: Parameters) -> tuple[_Flat, list[int]]:
     """All tensors, and the agent of each."""
-    by_agent = [
-        objects(f"parameters[{agent}]", of, Tensor, "tensors")
-        for agent, of in enumerate(listed("parameters", parameters, "a list of lists of tensors"))
-    ]
-    if not by_agent or not all(by_agent):
-        raise ValueError("parameters lack those of an agent; allowed: one tensor or more for each agent")
-    pairs = [(value, agent) for agent, of in enumerate(by_agent) for value in of]
+    pairs = [(value, agent) for agent, of in enumerate(parameters) for value in of]
     return tuple(value for value, _ in pairs), [agent for _, agent in pairs]
 
 
@@ -251,7 +185,6 @@ def _by_agent(values: Sequence[Tensor], owners: list[int]) -> list[list[Tensor]]
 
 def magic_box(log_prob: Tensor) -> Tensor:
     """1, with the derivatives of probabilities relative to what they are: exp(x - stop_gradient(x))."""
-    object_of("log_prob", log_prob, Tensor, "a tensor of floats")
     return (log_prob - log_prob.detach()).exp()
 
 
@@ -274,15 +207,10 @@ def dice_objective(
             may depend on all that was there before the step's actions. It changes no expected derivative of
             any order, and the variance of all: DiCE's own, which serves the first order, has the term
             (1 - box of the step) here, which is (boxes up to the step before - boxes up to the step).
-
-    Raises:
-        ValueError: for a discount out of range, and for shapes that do not fit.
     """
-    _same("reward", reward, log_prob)
     steps = _steps(log_prob, gamma, done)
     paid = steps.so_far * reward
     if baseline is not None:
-        _same("baseline", baseline, log_prob)
         paid = paid + (steps.before - steps.so_far) * baseline.detach()
     return (steps.discount * paid).sum(-2) / steps.pieces
 
@@ -297,11 +225,7 @@ def loaded_dice(log_prob: Tensor, advantage: Tensor, *, gamma: float, done: Tens
             value; what bootstraps, as generalised advantage estimates do, has less variance and a bias.
         gamma: the discount per step, 0..1.
         done: whether a piece ends with this step, bool [.., T, 1]; by default none does before the last.
-
-    Raises:
-        ValueError: for a discount out of range, and for shapes that do not fit.
     """
-    _same("advantage", advantage, log_prob)
     steps = _steps(log_prob, gamma, done)
     gained = steps.discount * (steps.so_far - steps.before) * advantage.detach()
     return gained.sum(-2) / steps.pieces
@@ -321,13 +245,9 @@ class _Steps(NamedTuple):
 
 
 def _steps(log_prob: Tensor, gamma: float, done: Tensor | None) -> _Steps:
-    number("gamma", gamma, low=0, high=1, allowed="0..1")
-    object_of("done", done, Tensor | None, "a tensor of bool, or None")
     joint = log_prob.sum(-1, keepdim=True)
     if done is None:
         done = torch.zeros_like(joint, dtype=torch.bool)
-    elif done.shape != joint.shape or done.dtype != torch.bool:
-        raise ValueError(f"done is {done.dtype} {list(done.shape)}; allowed: bool {list(joint.shape)}")
     begins = torch.cat([torch.ones_like(done[..., :1, :]), done[..., :-1, :]], -2)
     index = torch.arange(joint.shape[-2], device=joint.device).unsqueeze(-1).expand_as(begins)
     first = torch.where(begins, index, 0).cummax(-2).values
@@ -336,20 +256,6 @@ def _steps(log_prob: Tensor, gamma: float, done: Tensor | None) -> _Steps:
     discount = torch.as_tensor(gamma, dtype=joint.dtype, device=joint.device) ** (index - first)
     pieces = begins.sum(-2).to(joint.dtype)
     return _Steps(magic_box(total - earlier), magic_box(total - joint - earlier), discount, pieces)
-
-
-def _same(name: str, given: Tensor, log_prob: Tensor) -> None:
-    for named, value in ((name, given), ("log_prob", log_prob)):
-        object_of(named, value, Tensor, "a tensor of floats")
-        if not value.is_floating_point():
-            raise ValueError(f"{named} is {value.dtype}; allowed: a tensor of floats")
-    if given.shape != log_prob.shape or given.ndim < 2:
-        raise ValueError(
-            f"{name} is {list(given.shape)}, log_prob {list(log_prob.shape)}; allowed: [.., T, N] for both"
-        )
-
-
-_MOST_WEIGHT: Final = 1e6
 
 
 class _OfPolicies(LossModule):
@@ -376,21 +282,12 @@ class _OfPolicies(LossModule):
         self,
         actors: Sequence[ProbabilisticTensorDictSequential],
         *,
-        look_ahead_rate: float,
-        gamma: float,
+        look_ahead_rate: float = 1.0,
+        gamma: float = 0.99,
         entropy_coeff: float = 0.0,
     ) -> None:
         super().__init__()
-        actors = objects(
-            "actors", actors, ProbabilisticTensorDictSequential, "policies, e.g. ProbabilisticActor"
-        )
-        if len(actors) < 2:
-            raise ValueError(f"there are {len(actors)} actors; allowed: two or more, one for each agent")
-        self.look_ahead_rate = checked_rate(look_ahead_rate)
-        self.gamma = number("gamma", gamma, low=0, high=1, allowed="0..1")
-        self.entropy_coeff = number(
-            "entropy_coeff", entropy_coeff, low=0, high=_MOST_WEIGHT, allowed=f"0..{_MOST_WEIGHT:g}"
-        )
+        self.look_ahead_rate, self.gamma, self.entropy_coeff = look_ahead_rate, gamma, entropy_coeff
         self.convert_to_functional(nn.ModuleList(actors), "actors")
         self._learned = [
             [key for key, value in self._table(agent).items(True, True) if isinstance(value, nn.Parameter)]
@@ -483,7 +380,7 @@ class LOLALoss(_OfPolicies):
     of first order only; "loss_entropy"; and "entropy" [.., N], in nats, without a gradient.
 
     Raises:
-        ValueError: if an argument is not allowed, or B is odd; names it and says what is.
+        ValueError: if B is odd.
     """
 
     def __init__(
@@ -496,10 +393,9 @@ class LOLALoss(_OfPolicies):
         factor: Factor = "detached",
     ) -> None:
         super().__init__(actors, look_ahead_rate=look_ahead_rate, gamma=gamma, entropy_coeff=entropy_coeff)
-        self.factor = checked_factor(factor)
+        self.factor = factor
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
-        """See the class."""
         if tensordict.batch_dims < 2 or tensordict.shape[-2] % 2:
             raise ValueError(
                 f"the rollouts are {list(tensordict.shape)}; allowed: [.., B, T] with an even B, whose "
@@ -537,18 +433,8 @@ class LOLADiCELoss(_OfPolicies):
     gradient of "loss_objective" is here a derivative that can be taken again.
 
     Raises:
-        ValueError: if an argument is not allowed, or there are other rollouts; names it and says what is.
+        ValueError: if there are other rollouts.
     """
-
-    def __init__(
-        self,
-        actors: Sequence[ProbabilisticTensorDictSequential],
-        *,
-        look_ahead_rate: float = 1.0,
-        gamma: float = 0.99,
-        entropy_coeff: float = 0.0,
-    ) -> None:
-        super().__init__(actors, look_ahead_rate=look_ahead_rate, gamma=gamma, entropy_coeff=entropy_coeff)
 
     def look_ahead(self, rollouts: TensorDictBase) -> list[TensorDict]:
         """The parameters of each agent after a naive step, from rollouts [.., B, T] of the present policies;
@@ -564,7 +450,6 @@ class LOLADiCELoss(_OfPolicies):
         ]
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
-        """See the class."""
         wanted = 1 + len(self._learned)
         if tensordict.batch_dims < 3 or tensordict.shape[-3] != wanted:
             raise ValueError(f"the rollouts are {list(tensordict.shape)}; allowed: [.., {wanted}, B, T]")
@@ -591,26 +476,10 @@ def iterated_value(probabilities: Tensor, payoffs: Tensor | Sequence[Any], *, ga
         payoffs: of the joint actions, [A, .., A, N]; nested tuples or a tensor.
         gamma: the discount per turn, 0 or more and below 1.
 
-    Raises:
-        ValueError: for a discount out of range, and for shapes that do not fit.
-
     Source: Foerster et al., "Learning with Opponent-Learning Awareness" (2018), whose exact learners use it.
     """
-    number("gamma", gamma, low=0, high=1 - 1e-9, allowed="0 or more, below 1")
-    object_of("probabilities", probabilities, Tensor, "a tensor of floats")
-    try:
-        paid = torch.as_tensor(payoffs, dtype=probabilities.dtype, device=probabilities.device)
-    except (TypeError, ValueError, RuntimeError):
-        raise refusal("payoffs", payoffs, "numbers [A, .., A, N]") from None
-    agents, actions = max(0, paid.ndim - 1), paid.shape[0] if paid.ndim else 0
-    joint = actions**agents
-    wanted = (agents, joint + 1, actions)
-    is_game = agents > 0 < actions and paid.shape == (*[actions] * agents, agents)
-    if not is_game or not probabilities.is_floating_point() or probabilities.shape[-3:] != wanted:
-        raise ValueError(
-            f"payoffs are {list(paid.shape)}, probabilities {list(probabilities.shape)}; allowed: "
-            "[A, .., A, N] and [.., N, A**N + 1, A]"
-        )
+    paid = torch.as_tensor(payoffs, dtype=probabilities.dtype, device=probabilities.device)
+    agents, joint = paid.ndim - 1, paid.shape[0] ** (paid.ndim - 1)
     chances = probabilities[..., 0, :, :]
     for agent in range(1, agents):
         chances = (chances.unsqueeze(-1) * probabilities[..., agent, :, None, :]).flatten(-2)

@@ -1,19 +1,15 @@
 """MADDPGLoss: actors with centralised critics, for discrete actions."""
 
 from dataclasses import dataclass
-from typing import Any, Final, Literal, TypeAlias, get_args
+from typing import Final, Literal, TypeAlias
 
 import torch
 from tensordict import TensorDict, TensorDictBase, TensorDictParams
-from tensordict.nn import TensorDictModule, TensorDictModuleBase, dispatch
+from tensordict.nn import TensorDictModule, dispatch
 from tensordict.utils import NestedKey, unravel_key
 from torch import Tensor
-from torchrl.objectives import LossModule, ValueEstimators
-from torchrl.objectives.utils import dispatch_value_estimator
 
-from cprl.arguments import object_of
-from cprl.checks import checked, number, one_of
-from cprl.objectives.td import DISTANCES, distance
+from cprl.objectives.td import TDLoss, distance
 
 ActionSpace: TypeAlias = Literal["categorical", "one-hot"]
 
@@ -22,7 +18,7 @@ NUMBERS: Final = 2
 from its target policy, the other its action for the actor's loss."""
 
 
-class MADDPGLoss(LossModule):
+class MADDPGLoss(TDLoss):
     """MADDPG for discrete actions: S agents, the members, each with a policy of its own observations and a
     critic that also sees the observations and actions of all others; each learns from its own reward.
 
@@ -57,9 +53,6 @@ class MADDPGLoss(LossModule):
     generator. It writes nothing into the batch, and returns, summed over members and then reduced,
     "loss_actor" and "loss_value", and without gradients "entropy", in nats, "pred_value", "target_value" and
     "td_error", float [.., S, 1], squared.
-
-    Raises:
-        ValueError: if an argument is not allowed; names it and says what is.
     """
 
     @dataclass
@@ -75,7 +68,6 @@ class MADDPGLoss(LossModule):
         noise: NestedKey = "noise"
 
     default_keys = _AcceptedKeys
-    default_value_estimator = ValueEstimators.TD0
     out_keys = ("loss_actor", "loss_value", "entropy", "pred_value", "target_value", "td_error")
 
     actor_network: TensorDictModule
@@ -95,14 +87,7 @@ class MADDPGLoss(LossModule):
         action_space: ActionSpace = "categorical",
         reduction: str = "mean",
     ) -> None:
-        checked("loss_function", loss_function, one_of(*DISTANCES))
-        checked("logit_penalty", logit_penalty, number(0, 1e6))
-        checked("action_space", action_space, one_of(*get_args(ActionSpace)))
-        checked("reduction", reduction, one_of("mean", "sum", "none"))
-        for name, network in (("actor_network", actor_network), ("critic_network", critic_network)):
-            object_of(name, network, TensorDictModuleBase, "a TensorDictModule")
         super().__init__()
-        self._in_keys: list[NestedKey] | None = None
         self.convert_to_functional(actor_network, "actor_network", create_target_params=True)
         self.convert_to_functional(
             critic_network,
@@ -113,44 +98,17 @@ class MADDPGLoss(LossModule):
         self.loss_function, self.logit_penalty = loss_function, logit_penalty
         self.action_space, self.reduction = action_space, reduction
 
-    @property
-    def in_keys(self) -> list[NestedKey]:
-        """What `forward` must find in a batch."""
-        if self._in_keys is None:
-            keys = self.tensor_keys
-            seen = {*self.actor_network.in_keys, *self.critic_network.in_keys} - {keys.joint_action}
-            after = {keys.reward, keys.done, keys.terminated, *seen}
-            every = {keys.action, *seen, *(("next", key) for key in after)}
-            self._in_keys = sorted(map(unravel_key, every), key=str)
-        return self._in_keys
-
-    @in_keys.setter
-    def in_keys(self, keys: list[NestedKey]) -> None:
-        self._in_keys = keys
-
-    def _forward_value_estimator_keys(self, **_: Any) -> None:
-        if self._value_estimator is not None:
-            self._value_estimator.set_keys(**self._estimator_keys())
-        self._in_keys = None
+    def _reads(self) -> list[NestedKey]:
+        keys = self.tensor_keys
+        seen = {*self.actor_network.in_keys, *self.critic_network.in_keys} - {keys.joint_action}
+        after = {keys.reward, keys.done, keys.terminated, *seen}
+        every = {keys.action, *seen, *(("next", key) for key in after)}
+        return sorted(map(unravel_key, every), key=str)
 
     def _estimator_keys(self) -> dict[str, NestedKey]:
         keys = self.tensor_keys
         names = ("reward", "done", "terminated", "steps_to_next_obs")
         return {"value": keys.state_action_value, **{name: getattr(keys, name) for name in names}}
-
-    def make_value_estimator(self, value_type: Any = None, **hyperparams: Any) -> "MADDPGLoss":
-        """Chooses how targets bootstrap: `ValueEstimators.TD0` with `gamma`; see `LossModule`."""
-        value_type, given = self._prepare_value_estimator_kwargs(value_type, **hyperparams)
-        if value_type is not None:
-            dispatch_value_estimator(
-                self,
-                value_type,
-                supported=(ValueEstimators.TD0,),
-                tensor_keys=self._estimator_keys(),
-                value_network=None,
-                **given,
-            )
-        return self
 
     @dispatch
     def forward(self, tensordict: TensorDictBase) -> TensorDict:

@@ -10,12 +10,10 @@ from tensordict.nn import TensorDictModule, TensorDictParams
 from tensordict.utils import NestedKey
 from torch import Tensor, nn
 
-from cprl.arguments import choice, number, object_of, switch
 from cprl.networks.agent import chosen, marginal, soft_value
-from cprl.objectives.td import DISTANCES, TDLoss, distance
+from cprl.objectives.td import TDLoss, distance
 
 _VALUES: Final = "joint_action_value"
-_LOWEST_TEMPERATURE: Final = 1e-6
 
 
 class PR2Loss(TDLoss):
@@ -48,9 +46,6 @@ class PR2Loss(TDLoss):
 
     Reads the observation, "action" int64 [..., N], the agent's own first, and under "next" the observation,
     "reward" [..., 1], "done" and "terminated"; writes "td_error", the squared error [..., 1].
-
-    Raises:
-        ValueError: if an argument is not allowed; names it and says what is.
     """
 
     @dataclass
@@ -85,30 +80,17 @@ class PR2Loss(TDLoss):
         reduction: str = "mean",
     ) -> None:
         super().__init__()
-        self._in_keys: list[NestedKey] | None = None
-        object_of("value_network", value_network, nn.Module, "a TensorDictModule or a torch.nn.Module")
-        switch("entropy_bonus", entropy_bonus)
-        switch("delay_value", delay_value)
-        choice("loss_function", loss_function, DISTANCES)
-        choice("reduction", reduction, ("none", "mean", "sum"))
-        self.temperature = number(
-            "temperature", temperature, low=_LOWEST_TEMPERATURE, high=1e6, allowed="1e-6..1e6"
-        )
+        self.temperature = temperature
         self.entropy_bonus, self.loss_function, self.reduction = entropy_bonus, loss_function, reduction
         self.delay_value = delay_value
         if not isinstance(value_network, TensorDictModule):
             value_network = TensorDictModule(value_network, ["observation"], [_VALUES])
         self.convert_to_functional(value_network, "value_network", create_target_params=delay_value)
 
-    @property
-    def in_keys(self) -> list[NestedKey]:
-        """The entries that the loss reads."""
-        if self._in_keys is None:
-            keys = self.tensor_keys
-            own = list(self.value_network.in_keys)
-            after = [*own, keys.reward, keys.done, keys.terminated]
-            self._in_keys = [keys.action, *own, *(("next", *_path(key)) for key in after)]
-        return self._in_keys
+    def _reads(self) -> list[NestedKey]:
+        keys, seen = self.tensor_keys, list(self.value_network.in_keys)
+        after = [*seen, keys.reward, keys.done, keys.terminated]
+        return [keys.action, *seen, *(("next", *_path(key)) for key in after)]
 
     def _estimator_keys(self) -> dict[str, NestedKey]:
         keys = self.tensor_keys

@@ -10,7 +10,6 @@ from torchrl.modules import QValueActor
 from torchrl.objectives import DQNLoss, LossModule, ValueEstimators
 from torchrl.objectives.utils import dispatch_value_estimator, distance_loss
 
-from cprl.arguments import choice, object_of, switch
 from cprl.system.compat import ReshapedLoss
 
 LOG_COSH: Final = "log_cosh"
@@ -29,11 +28,7 @@ def log_cosh(error: Tensor) -> Tensor:
     derivative is not.
 
     Source: the loss "logcosh" of Keras 2.2.4 (`keras/losses.py`).
-
-    Raises:
-        ValueError: for what is no tensor.
     """
-    object_of("error", error, Tensor, "a tensor")
     return error + softplus(-2.0 * error) - log(2)
 
 
@@ -56,9 +51,6 @@ class LogCoshDQNLoss(ReshapedLoss, DQNLoss):
         double_dqn: whether the network itself chooses the action whose value bootstraps.
         action_space: "categorical" for actions as integers, or "one-hot".
         reduction: "mean", "sum" or "none".
-
-    Raises:
-        ValueError: for a value that is not allowed.
     """
 
     def __init__(
@@ -70,11 +62,6 @@ class LogCoshDQNLoss(ReshapedLoss, DQNLoss):
         action_space: str = "categorical",
         reduction: str = "mean",
     ) -> None:
-        object_of("value_network", value_network, nn.Module, "a QValueActor or a torch.nn.Module")
-        switch("delay_value", delay_value)
-        switch("double_dqn", double_dqn)
-        choice("action_space", action_space, ("categorical", "one-hot"))
-        choice("reduction", reduction, ("mean", "sum", "none"))
         super().__init__(
             value_network,
             loss_function="l1",
@@ -85,7 +72,6 @@ class LogCoshDQNLoss(ReshapedLoss, DQNLoss):
         )
 
     def reshape_each(self, losses: Tensor) -> Tensor:
-        """See `ReshapedLoss`."""
         return log_cosh(losses)
 
 
@@ -95,8 +81,27 @@ class TDLoss(LossModule):
     default_value_estimator = ValueEstimators.TD0
     _in_keys: list[NestedKey] | None
 
+    def __init__(self) -> None:
+        super().__init__()
+        self._in_keys = None
+
+    def _reads(self) -> list[NestedKey]:
+        """The entries that `forward` must find in a batch."""
+        raise NotImplementedError
+
     def _estimator_keys(self) -> dict[str, NestedKey]:
         raise NotImplementedError
+
+    @property
+    def in_keys(self) -> list[NestedKey]:
+        """The entries that `forward` must find in a batch."""
+        if self._in_keys is None:
+            self._in_keys = self._reads()
+        return self._in_keys
+
+    @in_keys.setter
+    def in_keys(self, keys: list[NestedKey]) -> None:
+        self._in_keys = keys
 
     def _forward_value_estimator_keys(self, **_: Any) -> None:
         self._in_keys = None
