@@ -273,20 +273,6 @@ def test_a_loss_computes_with_whatever_weights_are_put_in_now(make_loss):
             torch.testing.assert_close(function(weights[turn], {}, batch.clone()), wanted[turn])
 
 
-@pytest.mark.parametrize(("every", "copied"), [(1, [1, 1, 1, 1]), (3, [0, 0, 1, 0, 0, 1])])
-def test_targets_are_replaced_at_every_so_many_steps(every, copied):
-    loss, came = q_loss(), []
-    compat.promise_targets(loss)
-    own, target = layer(loss.value_network_params)[0], layer(loss.target_value_network_params)[0]
-    with relies_on("HardUpdate, which counts one step more than its interval,", used_by="compat.hard_update"):
-        updater = compat.hard_update(loss, every=every)
-        for _ in copied:
-            own += 1
-            updater.step()
-            came.append(int(torch.equal(own, target)))
-        assert came == copied
-
-
 def test_conservative_q_learning_bootstraps_from_its_target():
     # loss = half the mean of (Q - (r + gamma max_a Q'(s', a)))^2, with r = 1 and gamma = 0.5
     loss, batch = conservative_loss(), transitions(6)

@@ -1,6 +1,5 @@
 """Agents that decide: a bandit for each ballot, worked by hand; a vote that is learned; every road."""
 
-import copy
 from dataclasses import replace
 from functools import partial
 
@@ -30,7 +29,6 @@ from cprl.policies.lanes import random_agents
 from cprl.population import Frozen, Learning, Scripted, Team
 from cprl.runs.episodes import read_episodes
 from cprl.runs.export import export_results
-from cprl.runs.weights import load_weights
 from cprl.training import Training, train
 from cprl.training.agents import Population
 from cprl.training.collectors import stock_collector
@@ -285,62 +283,12 @@ def test_a_majority_finds_the_tax_that_pays_it_more(board, majority, choice):
 # ---- stop and resume
 
 
-@pytest.mark.integration
-def test_a_training_that_is_stopped_decides_and_learns_on_bit_for_bit():
-    def made():
-        env = make_env(MEADOW, worlds=2, seed=4)
-        return env, Population(env, OWN.agents, seed=6)
-
-    whole_env, whole = made()
-    first = trained_for(31, whole, whole_env)
-    state = copy.deepcopy(first.state_dict())
-    for _ in range(40):
-        first.step()
-    env, again = made()
-    noting = Noting()
-    second = Training(
-        env,
-        again.learners,
-        others=again.others,
-        decisions=again.decisions,
-        episodes=1000,
-        callbacks=[noting],
-    )
-    second.load_state_dict(state)
-    for _ in range(40):
-        second.step()
-    assert np.array_equal(whole.decisions.values, again.decisions.values)
-    assert repr(first.state_dict()["decisions"]) == repr(second.state_dict()["decisions"])
-    assert noting.episodes
+# ---- every road
 
 
 @pytest.fixture(scope="module")
 def in_one_go(tmp_path_factory):
     return cprl.run(OWN, tmp_path_factory.mktemp("whole") / "run", watch="off")
-
-
-@pytest.mark.integration
-def test_a_run_that_is_killed_and_resumed_is_the_same(in_one_go, tmp_path, monkeypatch):
-    run = tmp_path / "run"
-    monkeypatch.setenv("STOP_AT_STEP", "41")
-    with pytest.raises(SystemExit):
-        cprl.run(OWN, run, watch="off")
-    early = cprl.load(run, allow=ALLOW)
-    assert early.decisions.keys() == cprl.load(in_one_go, allow=ALLOW).decisions.keys()
-    assert cprl.evaluate_run(early, episodes=2).trained[0][0].decision is not None
-    monkeypatch.delenv("STOP_AT_STEP")
-    cprl.run(OWN, run, resume=True, watch="off")
-    assert read_episodes(run).equals(read_episodes(in_one_go))
-    for name in ("final", "decisions"):
-        mine, theirs = (load_weights(one / "checkpoints" / f"{name}.pt") for one in (run, in_one_go))
-        assert repr(mine) == repr(theirs), name
-    cprl.run(replace(OWN, episodes=14), run, resume=True, watch="off")
-    longer = cprl.load(run, allow=ALLOW)
-    assert repr(longer.decisions) != repr(theirs)
-    assert repr(cprl.load(run, weights="final-12", allow=ALLOW).decisions) == repr(theirs)
-
-
-# ---- every road
 
 
 def test_the_table_of_episodes_says_what_each_agent_decided(in_one_go):

@@ -4,7 +4,6 @@ from dataclasses import replace
 
 import pytest
 import torch
-from boards import random_actions
 from tensordict import TensorDict
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 
@@ -153,23 +152,6 @@ def test_the_actor_follows_the_learner_and_epsilon_its_steps():
     assert not torch.equal(before, chosen())
     best = agent.engine.parts[0][0](seen[:, 0]).argmax(-1)
     assert torch.equal(chosen()[:, 0], best)
-
-
-@pytest.mark.integration
-def test_the_same_seed_learns_the_same():
-    def weights(seed):
-        agent = learner(SHORT.spaces, seed=seed)
-        env = CommonsEnv(SHORT, 1, seed=seed)
-        moment = env.reset()
-        for turn in torch.as_tensor(random_actions(40, 1, SHORT)):
-            now, moment = env.step_and_maybe_reset(moment.set(keys.ACTION, turn))
-            agent.store(now)
-            agent.update()
-            torch.rand(1)  # whoever else draws from torch's generator
-        return own_weights(agent)
-
-    assert torch.equal(weights(0), weights(0))
-    assert not torch.equal(weights(0), weights(1))
 
 
 def test_the_published_learner_learns_from_presets():

@@ -129,17 +129,6 @@ def test_the_compiled_step_ends_there_too():
     assert_same_course(update, reference, range(3), range(3), 1e-5)
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("dtype", PRECISION, ids=str)
-@pytest.mark.parametrize("engine", COMPILED)
-def test_every_compiled_engine_in_both_precisions(engine, dtype):
-    lanes = [0, 1, 2, 3]
-    reference, _ = trained(ListEngine, lanes, dtype=dtype)
-    update, _ = trained(COMPILED[engine], lanes, dtype=dtype)
-    assert update._compiled.enabled
-    assert_same_course(update, reference, range(4), range(4), PRECISION[dtype])
-
-
 @pytest.mark.integration
 @pytest.mark.parametrize(
     "dtype", [torch.float64, pytest.param(torch.float32, marks=pytest.mark.slow)], ids=str

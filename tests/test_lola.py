@@ -6,17 +6,17 @@ import numpy as np
 import pytest
 import torch
 from matrix_game import MatrixGame as SmallGame
-from test_population import GAME, Returns, assert_goes_on_bit_for_bit, population, ran, trained, weights
+from test_population import GAME, Returns, population, trained, weights
 
 import cprl
 from cprl import Custom, Experiment
-from cprl.algorithms import DQN, LOLA, DQNSettings, LOLASettings
+from cprl.algorithms import LOLA, LOLASettings
 from cprl.envs.make_env import make_env, spaces_of
 from cprl.envs.matrix import prisoners_dilemma
 from cprl.evaluation import crossplay
 from cprl.networks import MLP, Conv
 from cprl.objectives import loaded_dice, lola_gradients, look_ahead_losses, looked_ahead
-from cprl.population import Frozen, Learning, Scripted, Team
+from cprl.population import Scripted, Team
 from cprl.training import train
 from cprl.training.agents import Population
 
@@ -33,23 +33,6 @@ def lola(estimator="policy_gradient", **changes):
 
 def team(estimator="policy_gradient", agents=FOUR, **changes):
     return Team(lola(estimator, **changes), agents, reward="individual")
-
-
-@pytest.mark.integration
-@pytest.mark.parametrize("estimator", ESTIMATORS)
-def test_each_team_moves_every_members_weights_and_no_replica_knows_of_the_others(estimator):
-    together = population([team(estimator)], replicas=3)
-    alone = population([team(estimator)], replicas=1, first_replica=2)
-    before = weights(together)
-    _, returns = trained(together, episodes=12)
-    _, returns_alone = trained(alone, first=2, episodes=12)
-    assert returns[2] == returns_alone[0]
-    after, after_alone = weights(together), weights(alone)
-    assert len(together.networks()) == 12
-    for key, value in after.items():
-        assert not torch.equal(value, before[key]), f"{key} has not moved"
-    for key, value in after_alone.items():
-        torch.testing.assert_close(value, after[key], rtol=1e-4, atol=1e-5)
 
 
 def learner_of(estimator, replicas=2, algorithm=None, **changes):
@@ -220,37 +203,6 @@ def test_critics_learn_and_advantages_are_normalised_where_asked_and_gradients_c
 
 
 @pytest.mark.integration
-@pytest.mark.parametrize("estimator", ESTIMATORS)
-def test_a_team_that_was_stopped_goes_on_bit_for_bit(estimator, tmp_path):
-    members = [
-        team(estimator, (0, 1, 2), rollout_steps=10),
-        Learning(DQN(settings=DQNSettings(buffer_size=60))),
-    ]
-    assert_goes_on_bit_for_bit(members, tmp_path, episodes=8)
-
-
-@pytest.mark.integration
-def test_a_run_is_built_again_evaluated_and_its_members_play_on_frozen_and_start_others(
-    tmp_path, monkeypatch
-):
-    monkeypatch.chdir(tmp_path)
-    members = [team("dice", (0, 1)), team("policy_gradient", (2, 3))]
-    run, networks = ran(tmp_path, members)
-    loaded = cprl.load(run)
-    assert list(loaded.experiment.agents) == members
-    assert len(networks) == 8
-    frozen = population([Frozen(run, 1, replica=1), Frozen(run, 3), *[Scripted()] * 2])
-    assert len(frozen.others) == 3
-    begun = population([replace(members[0], start_from=Frozen(run, 2, replica=1)), *[Scripted()] * 2])
-    for agent, theirs in ((0, 2), (1, 3)):
-        own = begun.networks()[f"replica_0/agent_{agent}"].state_dict()
-        assert all(
-            torch.equal(own[name], value)
-            for name, value in networks[f"replica_1/agent_{theirs}"].state_dict().items()
-        )
-
-
-@pytest.mark.integration
 def test_lola_plays_a_matrix_game_in_an_experiment_and_meets_naive_learners_by_cross_play(tmp_path):
     runs = []
     for rate in (0.0, 1.0):
@@ -285,28 +237,12 @@ def test_any_network_learns(estimator, network):
         assert not torch.equal(value, before[key]), f"{key} has not moved"
 
 
-@pytest.mark.slow
-def test_compiled_acting_plays_the_same_game():
-    ends = []
-    for engine in ("eager", "compiled"):
-        env = make_env(prisoners_dilemma(turns=10), worlds=2, seed=0)
-        agents = Population(env, (team("dice", (0, 1)),), seed=3, engine=engine)
-        train(env, agents.learners, episodes=12)
-        ends.append(weights(agents))
-    for key, value in ends[0].items():
-        torch.testing.assert_close(ends[1][key], value, rtol=1e-4, atol=1e-5)
-
-
 def test_what_does_not_fit_is_refused_and_says_what_does():
     for make, message in [
-        (lambda: LOLA(settings=DQNSettings()), r"LOLA\.settings is a DQNSettings; allowed: a LOLASettings"),
-        (lambda: lola("reinforce"), r"LOLA\.estimator is 'reinforce'; allowed: "),
-        (lambda: lola(look_ahead_rate=-1), r"LOLASettings\.look_ahead_rate is -1; allowed: "),
         (
             lambda: lola(normalize_advantage=True, rollout_steps=1),
             r"LOLASettings\.rollout_steps is 1; allowed with normalize_advantage: 2 or more",
         ),
-        (lambda: Learning(lola()), r"LOLA is learned by a team: Team\(LOLA\(\.\.\.\), agents=\(0, 1\)\)"),
         (
             lambda: population([team("dice", (0,)), *[Scripted()] * 3]),
             r"the team has 1 agents; allowed for LOLA: at least 2",

@@ -428,49 +428,9 @@ def test_entropy_draws_policies_towards_chance_and_entries_can_be_renamed():
     torch.testing.assert_close(loss(nested)["loss_entropy"], found["loss_entropy"])
 
 
-def test_what_does_not_fit_is_refused_and_says_what_does():
+def test_rollouts_that_do_not_fit_are_refused():
     actors = [actor(), actor()]
-    for make, message in [
-        (lambda: lola_gradients([], POINT, rate=1.0), "objectives is empty; allowed: one or more"),
-        (lambda: lola_gradients([tandem], POINT, rate=-1.0), r"rate is -1\.0; allowed: 0\.\.1e\+12"),
-        (lambda: lola_gradients([listed], POINT, rate=1.0, factor="none"), "factor is 'none'; allowed: "),
-        (
-            lambda: lola_gradients([lambda _: torch.zeros(3)], POINT, rate=1.0),
-            r"losses \[3\]; allowed: \[\.\., 2\]",
-        ),
-        (lambda: looked_ahead(listed, POINT, rate=1.0, steps=0), "steps is 0; allowed: "),
-        (lambda: looked_ahead(listed, POINT, rate=1.0, still=2), "still is 2; allowed: "),
-        (lambda: looked_ahead(listed, [[], []], rate=1.0), "parameters lack those of an agent"),
-        (
-            lambda: look_ahead_losses(listed, [listed], POINT, rate=1.0),
-            "outer has 1 objectives; allowed: one for",
-        ),
-        (
-            lambda: iterated_value(policies(POINT), DILEMMA, gamma=1.0),
-            "gamma is 1.0; allowed: 0 or more, below",
-        ),
-        (
-            lambda: iterated_value(torch.ones(2, 4, 2), DILEMMA, gamma=0.9),
-            r"probabilities \[2, 4, 2\]; allowed",
-        ),
-        (
-            lambda: dice_objective(torch.ones(3, 2), torch.ones(3, 1), gamma=0.9),
-            r"reward is \[3, 1\], log_prob",
-        ),
-        (
-            lambda: loaded_dice(torch.ones(3, 2), torch.ones(3, 2), gamma=0.9, done=torch.ones(3, 1)),
-            r"done is torch.float32 \[3, 1\]; allowed: bool \[3, 1\]",
-        ),
-        (lambda: LOLALoss(actors[:1]), "there are 1 actors; allowed: two or more"),
-        (lambda: LOLALoss(actors, gamma=2.0), r"gamma is 2\.0; allowed: 0\.\.1"),
-        (
-            lambda: LOLALoss(actors)(batch(3, 4)),
-            r"rollouts are \[3, 4\]; allowed: \[\.\., B, T\] with an even B",
-        ),
-        (
-            lambda: LOLADiCELoss(actors)(batch(2, 1, 4)),
-            r"rollouts are \[2, 1, 4\]; allowed: \[\.\., 3, B, T\]",
-        ),
-    ]:
-        with pytest.raises(ValueError, match=message):
-            make()
+    with pytest.raises(ValueError, match=r"rollouts are \[3, 4\]"):
+        LOLALoss(actors)(batch(3, 4))
+    with pytest.raises(ValueError, match=r"rollouts are \[2, 1, 4\]"):
+        LOLADiCELoss(actors)(batch(2, 1, 4))

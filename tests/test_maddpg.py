@@ -8,25 +8,22 @@ import pytest
 import torch
 from tensordict import TensorDict
 from tensordict.nn import TensorDictModule
-from test_population import GAME, REPLAY, assert_goes_on_bit_for_bit, population, ran, trained, weights
+from test_population import GAME, REPLAY, population, trained
 from test_teams import first_turn
 from torch import nn
 from torchrl.data import LazyTensorStorage, TensorDictReplayBuffer
 from torchrl.objectives import DQNLoss, SoftUpdate, ValueEstimators
 
-import cprl
-from cprl import CommonsEnv
 from cprl.algorithms import DQN, MADDPG, DQNSettings
 from cprl.algorithms.base import q_actor
 from cprl.envs import make_env
 from cprl.envs.matrix import MatrixGame
-from cprl.evaluation import evaluate_run
 from cprl.learners.ring import Horizon, Ring
 from cprl.learners.transitions import LaneTurn
 from cprl.networks import MLP
 from cprl.objectives import MADDPGLoss
 from cprl.objectives.maddpg import sampled_one_hot, straight_through
-from cprl.population import Frozen, Learning, Scripted, Team
+from cprl.population import Learning, Scripted, Team
 from cprl.training.agents import Population
 
 pytestmark = pytest.mark.filterwarnings("ignore:No target network updater:UserWarning")
@@ -221,15 +218,7 @@ def test_the_loss_works_with_torchrl_alone(action_space):
     assert ("next", "agents", "reward") in loss.in_keys
 
 
-def test_what_the_loss_does_not_take_is_refused_by_name():
-    for how, message in [
-        ({"logit_penalty": -1.0}, "logit_penalty is -1.0; allowed: "),
-        ({"loss_function": "l3"}, "loss_function is 'l3'; allowed: "),
-        ({"action_space": "binary"}, "action_space is 'binary'; allowed: "),
-        ({"reduction": "max"}, "reduction is 'max'; allowed: "),
-    ]:
-        with pytest.raises(ValueError, match=message):
-            loss_of(Linear(*SURE), LinearCritics(*VALUES), **how)
+def test_another_estimator_than_td0_is_refused():
     loss = loss_of(Linear(*SURE), LinearCritics(*VALUES))
     with pytest.raises(NotImplementedError, match="TDLambda"):
         loss.make_value_estimator(ValueEstimators.TDLambda)
@@ -312,57 +301,11 @@ def test_returns_of_several_steps_are_those_of_each_member():
     assert got["steps_to_next_obs"].squeeze(-1).tolist() == [[3, 2, 3], [3, 1, 3]]
 
 
-@pytest.mark.integration
-def test_a_team_that_was_stopped_goes_on_bit_for_bit_and_its_samples_too(tmp_path):
-    members = [Team(TEAM, (0, 2, 3), reward="individual"), Learning(DQN(settings=REPLAY))]
-    assert_goes_on_bit_for_bit(members, tmp_path, episodes=5)
-
-
-@pytest.mark.integration
-def test_a_run_is_built_again_is_evaluated_and_its_members_play_on_frozen(tmp_path, monkeypatch):
-    monkeypatch.chdir(tmp_path)
-    run, networks = ran(tmp_path, [Team(TEAM, (0, 1), reward="individual"), *[Scripted()] * 2])
-    loaded = cprl.load(run)
-    assert loaded.specs[0] == Team(TEAM, (0, 1), reward="individual")
-    assert len(networks) == 4
-    assert loaded.policy(1, worlds=2)(loaded.env(2).reset())["agents", "action"].shape == (2, 4)
-    assert evaluate_run(run, episodes=2) is not None
-    frozen = population([Frozen(run, 1, replica=1), Scripted(), Scripted(), Scripted()])
-    own = CommonsEnv(GAME, 2, seed=9).reset()["agents", "observation"][:, :1]
-    wanted = networks["replica_1/agent_1"](own).softmax(-1)
-    torch.testing.assert_close(frozen.others[0,].preferences(own), wanted)
-
-
-def test_what_is_no_team_of_maddpg_is_refused():
-    with pytest.raises(ValueError, match=r"the team has 1 agents; allowed for MADDPG: at least 2"):
-        population([Team(TEAM, (0,), reward="individual"), *[Scripted()] * 3])
-    with pytest.raises(ValueError, match=r'MADDPG does not support engine="torchrl"'):
-        TEAM.make_learner(GAME.spaces, agents=(0, 1), replicas=1, engine="torchrl")
-    with pytest.raises(ValueError, match=r"MADDPG is learned by a team"):
-        Learning(TEAM)
-
-
 def test_the_fastest_way_is_found_for_teams_of_two_and_of_four():
     for members in (FOUR, (1, 3)):
         others = [Scripted()] * (4 - len(members))
         _, learner = learner_of([Team(TEAM, members, reward="individual"), *others])
         assert not learner.engine._vmapped, "networks have a lane axis"
-
-
-@pytest.mark.slow
-def test_the_compiled_update_is_the_uncompiled_one():
-    ends = []
-    for engine in ("eager", "compiled"):
-        how = {"agents": FOUR, "replicas": 2, "reward_kind": "individual", "seed": 3}
-        learner = TEAM.make_learner(GAME.spaces, engine=engine, **how)
-        agents = population([Scripted()] * 4)
-        agents.learners, agents.others = {FOUR: learner}, {}
-        trained(agents, episodes=2)
-        ends.append([own.state_dict() for own in learner.networks().values()])
-    assert learner.engine._compiled.enabled
-    for eager, compiled in zip(*ends, strict=True):
-        for name, value in eager.items():
-            torch.testing.assert_close(compiled[name], value, rtol=1e-3, atol=1e-5)
 
 
 # ---- noise, for any algorithm that samples
@@ -416,12 +359,6 @@ def test_each_lane_has_uniform_numbers_of_its_own_whatever_trains_beside_it(engi
     assert len(numbers.unique()) > 0.99 * len(numbers)
     assert 0.45 < float(numbers.mean()) < 0.55
     assert ((numbers >= 0) & (numbers <= 1)).all()
-
-
-def test_weights_of_two_replicas_differ_and_those_of_a_replica_are_its_own():
-    agents, _ = learner_of([Team(TEAM, FOUR, reward="individual")])
-    trained(agents, episodes=2)
-    assert len({float(value.sum()) for value in weights(agents).values() if value.ndim == 2}) == 16
 
 
 # ---- games with known answers

@@ -1,7 +1,6 @@
 """Which network an agent has: fully connected, convolutional, or one of your own."""
 
 from dataclasses import replace
-from functools import partial
 
 import pytest
 import torch
@@ -183,17 +182,6 @@ def test_lanes_learn_with_any_network_what_each_would_alone(kind, network, monke
             torch.testing.assert_close(fast[name], value, rtol=1e-3, atol=1e-5)
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("kind", [DQN, PPO])
-def test_the_compiled_update_has_convolutions_too(kind):
-    _, compiled = learner_of(kind, CONV, engine="compiled")
-    _, plain = learner_of(kind, CONV)
-    losses, wanted = played(compiled), played(plain)
-    assert compiled.engine._compiled.enabled
-    assert compiled.engine._compiled_on.enabled
-    torch.testing.assert_close(torch.stack(losses), torch.stack(wanted), rtol=1e-3, atol=1e-5)
-
-
 def test_a_network_whose_buffers_do_not_stack_is_vmapped():
     class Normalised(Own):
         def __init__(self):
@@ -277,21 +265,6 @@ def test_what_a_network_cannot_do_is_refused_by_name():
     flat = Custom("torch.nn:Linear")
     with pytest.raises(ValueError, match=r"torch.nn:Linear"):
         DQN(settings=REPLAY, network=flat).make_network(SPACES)
-
-
-@pytest.mark.parametrize(
-    ("make", "message"),
-    [
-        (partial(Conv, channels=()), r"Conv.channels is \(\); allowed: 1 to 64 layers"),
-        (partial(Conv, channels=(4, 0)), r"Conv.channels is \(4, 0\)"),
-        (partial(Conv, kernel_cells=2), "Conv.kernel_cells is 2; allowed: 1, 3, 5"),
-        (partial(Conv, hidden_cells=(0,)), r"Conv.hidden_cells is \(0,\)"),
-        (partial(MLP, hidden_cells=(0,)), r"MLP.hidden_cells is \(0,\)"),
-    ],
-)
-def test_sizes_out_of_range_are_refused(make, message):
-    with pytest.raises(ValueError, match=message):
-        make()
 
 
 def test_networks_are_made_without_hidden_layers_too():

@@ -125,18 +125,6 @@ def assert_all_weights_move_and_replicas_learn_apart(together, alone):
         torch.testing.assert_close(value, after[key], rtol=1e-4, atol=1e-5)
 
 
-@pytest.mark.integration
-@pytest.mark.parametrize("name", ALGORITHMS)
-def test_each_loss_moves_every_agents_weights_and_no_replica_knows_of_the_others(name):
-    members = [Learning(ALGORITHMS[name])] * 4
-    together, alone = population(members, replicas=3), population(members, replicas=1, first_replica=2)
-    (learner,) = together.learners.values()
-    assert_all_weights_move_and_replicas_learn_apart(together, alone)
-    assert len(together.networks()) == 12
-    made = [learner.engine.network_state(lane) for lane in range(12)]
-    assert len({float(sum(value.sum() for value in state.values())) for state in made}) == 12, "lanes differ"
-
-
 @pytest.mark.slow
 @pytest.mark.parametrize("name", ALGORITHMS)
 def test_each_loss_takes_the_fastest_way_that_agrees_with_a_list_of_torchrls_losses(name):
@@ -260,13 +248,6 @@ def assert_goes_on_bit_for_bit(members, tmp_path, *, episodes):
     run("stopped", stop_at=47)
     for key, value in run("stopped").items():
         assert torch.equal(value, whole[key]), key
-
-
-@pytest.mark.integration
-@pytest.mark.parametrize("kind", ["PPO", pytest.param("SAC", marks=pytest.mark.slow), "DQN"])
-def test_a_mixed_training_that_was_stopped_goes_on_bit_for_bit(kind, tmp_path):
-    members = [Learning(ALGORITHMS[kind]), Learning(ALGORITHMS["CQL"]), Scripted("greedy"), Scripted()]
-    assert_goes_on_bit_for_bit(members, tmp_path, episodes=7)
 
 
 def ran(tmp_path, members, name="run"):

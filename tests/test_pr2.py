@@ -1,6 +1,6 @@
 """PR2: joint values, the peers' expected answers, the soft target, and agents who see what their peers do."""
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from itertools import product
 from typing import ClassVar
 
@@ -11,17 +11,15 @@ from torch import nn
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 from torchrl.objectives import SoftUpdate, ValueEstimators
 
-import cprl
-from cprl import CommonsEnv, Experiment, Game, Rules, keys, maps
-from cprl.algorithms import DQN, PR2, VDN, DQNSettings
+from cprl import CommonsEnv, Game, Rules, keys, maps
+from cprl.algorithms import PR2, VDN, DQNSettings
 from cprl.envs import make_env
 from cprl.envs.matrix import MatrixGame, stag_hunt
-from cprl.evaluation import crossplay, evaluate_run
 from cprl.learners.engine import FunctionalEngine
 from cprl.learners.transitions import joint_actions
 from cprl.networks.agent import chosen, conditional, marginal, soft_value
 from cprl.objectives import PR2Loss
-from cprl.population import Frozen, Learning, Scripted
+from cprl.population import Learning, Scripted
 from cprl.training import train
 from cprl.training.agents import Population
 
@@ -146,25 +144,6 @@ def test_the_loss_has_no_gradient_for_its_targets_and_takes_other_keys():
     assert loss.target_value_network_params["module", "values"].grad is None
 
 
-@pytest.mark.parametrize(
-    ("how", "message"),
-    [
-        ({"temperature": 0.0}, r"^temperature is 0\.0; allowed: 1e-6\.\.1e6"),
-        ({"temperature": float("nan")}, r"^temperature is nan; allowed"),
-        ({"entropy_bonus": 1}, r"^entropy_bonus is 1; allowed: True or False"),
-        ({"loss_function": "l3"}, r"^loss_function is 'l3'; allowed: l1, l2, smooth_l1, log_cosh"),
-        ({"reduction": "all"}, r"^reduction is 'all'; allowed: none, mean, sum"),
-    ],
-)
-def test_the_loss_refuses_what_it_cannot_be(how, message):
-    with pytest.raises(ValueError, match=message):
-        PR2Loss(Table(OPTIMISM), **{"temperature": 1.0, **how})
-    with pytest.raises(ValueError, match=r"^value_network is 3; allowed: a TensorDictModule or"):
-        PR2Loss(3, temperature=1.0)
-    with pytest.raises(NotImplementedError, match="TDLambda"):
-        loss_of(OPTIMISM).make_value_estimator(ValueEstimators.TDLambda)
-
-
 def population(agents, *, replicas=2, first_replica=0, game=GAME, **how):
     env = CommonsEnv(game, replicas, seed=3)
     how = {"engine": "eager", "seed": 3, **how}
@@ -203,56 +182,6 @@ def test_agents_act_on_what_they_see_themselves_by_the_policy_of_their_joint_val
     torch.testing.assert_close(logits[5, 0], network(seen[1, 2]))
     with set_exploration_type(ExplorationType.RANDOM):
         assert learner.actor.choose(seen).shape == (2, 3)
-
-
-@pytest.mark.integration
-@pytest.mark.parametrize("engine", ["eager", "torchrl"])
-@pytest.mark.parametrize("n_steps", [1, 3])
-def test_a_replica_learns_among_others_what_it_learns_alone(engine, n_steps):
-    learning = Learning(PR2(settings=replace(SETTINGS, n_steps=n_steps), temperature=1.0))
-    agents = (learning, Scripted("greedy"), learning)
-    together, alone = (
-        trained(population(agents, replicas=replicas, first_replica=first, engine=engine), first=first)
-        for replicas, first in ((3, 0), (1, 2))
-    )
-    for name, network in alone.networks().items():
-        same = together.networks()[name]
-        for key, value in network.state_dict().items():
-            torch.testing.assert_close(value, same.state_dict()[key], rtol=1e-4, atol=1e-5)
-
-
-@pytest.mark.integration
-def test_pr2_learns_beside_any_others_is_stored_plays_frozen_and_is_started_from(tmp_path, monkeypatch):
-    monkeypatch.chdir(tmp_path)
-
-    def experiment(agents, name):
-        made = Experiment(
-            name=name,
-            game=GAME,
-            agents=agents,
-            replicas=2,
-            episodes=2,
-            evaluation_episodes=1,
-            engine="eager",
-            seed=4,
-        )
-        return cprl.run(made, name, watch="off")
-
-    dqn = Learning(DQN(settings=SETTINGS))
-    first = experiment((PR2S, dqn, PR2S), "first")
-    loaded = cprl.load(first)
-    assert loaded.experiment.agents == (PR2S, dqn, PR2S)
-    seen = torch.randint(256, (4, *GAME.observation_shape), dtype=torch.uint8)
-    network = loaded.networks["replica_1/agent_2"]
-    assert network(seen).shape == (4, 8)
-    assert evaluate_run(first, episodes=1).measures()
-    frozen = Frozen(str(first), 2, replica=1)
-    second = experiment((frozen, replace(PR2S, start_from=frozen), Scripted("greedy")), "second")
-    assert set(cprl.load(second).networks) == {"replica_0/agent_1", "replica_1/agent_1"}
-    crossplay([first, second], episodes=1)
-
-    started = population((dqn, replace(PR2S, start_from=frozen), dqn))
-    torch.testing.assert_close(started.networks()["replica_0/agent_1"](seen), network(seen))
 
 
 def test_a_game_of_one_agent_has_no_peers_and_is_refused():

@@ -6,7 +6,6 @@ from dataclasses import replace
 import pytest
 import torch
 from tensordict import TensorDict
-from test_lanes import ACTIONS, COMPILED, ENGINES, assert_same_course, filled, networks
 from torch import nn
 from torchrl.modules import QValueActor
 from torchrl.objectives import DQNLoss, ValueEstimators
@@ -157,71 +156,8 @@ def test_the_loss_is_torchrls_in_all_else():
     assert loss(weighed)["loss"].item() == pytest.approx(0.75 * 0.4337808)
 
 
-@pytest.mark.parametrize(
-    ("how", "message"),
-    [
-        ({"value_network": 3}, "^value_network is 3; allowed: a QValueActor or a torch.nn.Module"),
-        ({"double_dqn": 1}, "^double_dqn is 1; allowed: True or False"),
-        ({"delay_value": None}, "^delay_value is None; allowed: True or False"),
-        ({"action_space": "any"}, "^action_space is 'any'; allowed: categorical, one-hot"),
-        ({"reduction": "all"}, "^reduction is 'all'; allowed: mean, sum, none"),
-    ],
-)
-def test_the_loss_refuses_what_it_cannot_be(how, message):
-    with pytest.raises(ValueError, match=message):
-        LogCoshDQNLoss(**{"value_network": nn.Linear(1, 2), **how})
-    with pytest.raises(ValueError, match=r"^error is 1\.0; allowed: a tensor"):
-        log_cosh(1.0)
-
-
 def make_loss(network):
     return DQN(settings=DQNSettings(gamma=0.9), loss_function="log_cosh").make_loss(network)
-
-
-def course(engine, lanes, *, dtype=torch.float64, steps=60):
-    update = engine(
-        networks(lanes, dtype),
-        make_loss,
-        learning_rate=1e-3,
-        optimizer="keras_rmsprop",
-        adam_eps=1e-7,
-        loss_share=1 / ACTIONS,
-    )
-    buffer, losses = filled(lanes), []
-    for step in range(steps):
-        losses.append(update.update(buffer))
-        update.copy_to_targets(torch.tensor([step % 20 == lane for lane in lanes]))
-    return update, torch.stack(losses)
-
-
-@pytest.mark.integration
-@pytest.mark.parametrize("engine", ["vmapped", "lane_axis"])
-def test_the_fast_engines_end_where_a_list_of_losses_ends(engine):
-    lanes = [0, 1, 2]
-    reference, losses = course(ENGINES["list"], lanes)
-    update, their_losses = course(ENGINES[engine], lanes)
-    torch.testing.assert_close(their_losses, losses, rtol=1e-9, atol=1e-12)
-    assert_same_course(update, reference, lanes, lanes, 1e-9)
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("engine", COMPILED)
-def test_the_compiled_engines_end_there_too(engine):
-    lanes = [0, 1, 2]
-    reference, losses = course(ENGINES["list"], lanes, dtype=torch.float32)
-    update, their_losses = course(COMPILED[engine], lanes, dtype=torch.float32)
-    assert update._compiled.enabled
-    torch.testing.assert_close(their_losses, losses, rtol=1e-4, atol=1e-6)
-    assert_same_course(update, reference, lanes, lanes, 1e-4)
-
-
-@pytest.mark.integration
-@pytest.mark.parametrize("engine", ENGINES)
-def test_a_lane_learns_as_it_would_alone(engine):
-    many, losses = course(ENGINES[engine], [2, 0, 1])
-    alone, own = course(ENGINES[engine], [1])
-    torch.testing.assert_close(losses[:, 2:], own, rtol=1e-9, atol=1e-12)
-    assert_same_course(alone, many, [0], [2], 1e-9)
 
 
 def test_as_run_the_loss_is_that_of_keras_over_all_outputs():

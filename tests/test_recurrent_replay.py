@@ -10,8 +10,6 @@ from recall_game import Recall
 from test_population import (
     GAME,
     Returns,
-    assert_all_weights_move_and_replicas_learn_apart,
-    assert_goes_on_bit_for_bit,
     population,
     trained,
     weights,
@@ -19,11 +17,11 @@ from test_population import (
 
 import cprl
 from cprl import CommonsEnv, Custom, Experiment
-from cprl.algorithms import DQN, PPO, SAC, VDN, DQNSettings, RolloutSettings
+from cprl.algorithms import DQN, DQNSettings
 from cprl.envs import make_env, spaces_of
 from cprl.networks import GRU, LSTM, MLP, Conv
 from cprl.policies.assignment import AgentPolicies
-from cprl.population import Learning, Scripted, Team
+from cprl.population import Learning, Team
 from cprl.training import train
 from cprl.training.collectors import StepCollector
 
@@ -186,38 +184,6 @@ def test_the_fastest_engine_is_chosen_without_a_warning(name, recwarn):
 
 
 @pytest.mark.integration
-@pytest.mark.parametrize("name", DQNS)
-def test_all_weights_move_and_no_replica_knows_of_the_others(name):
-    members = [Learning(DQNS[name])] * 4
-    together, alone = population(members, replicas=3), population(members, replicas=1, first_replica=2)
-    assert_all_weights_move_and_replicas_learn_apart(together, alone)
-
-
-FEW_TURNS = {
-    "DQN": DQN(settings=replace(SETTINGS, sequence_steps=3), network=SMALL),
-    "PPO": PPO(settings=RolloutSettings(rollout_steps=20, minibatch_size=4, epochs=1), network=SMALL),
-}
-
-
-@pytest.mark.integration
-@pytest.mark.parametrize("name", ["DQN", pytest.param("PPO", marks=pytest.mark.slow)])
-def test_the_compiled_update_learns_what_the_eager_one_does(name):
-    """Sequences of up to `COMPILED_STEPS` are compiled."""
-    learners = [
-        FEW_TURNS[name].make_learner(GAME.spaces, agents=FOUR, replicas=1, engine=engine)
-        for engine in ("compiled", "eager")
-    ]
-    for learner in learners:
-        play(learner, 20)
-        for _ in range(2):
-            learner.update()
-    one, other = (learner.networks() for learner in learners)
-    for lane, network in one.items():
-        for key, value in network.state_dict().items():
-            torch.testing.assert_close(value, other[lane].state_dict()[key], rtol=1e-4, atol=1e-5)
-
-
-@pytest.mark.integration
 def test_agents_that_share_a_network_learn_from_the_sequences_of_all():
     members = [Team(DQNS["GRU"], FOUR, share_parameters=True)]
     agents = population(members)
@@ -241,36 +207,6 @@ def test_the_value_after_a_turn_knows_the_turns_before():
     torch.testing.assert_close(learner.values(played[-1])[0, 2], expected.max())
 
 
-@pytest.mark.integration
-def test_a_training_that_was_stopped_goes_on_bit_for_bit(tmp_path):
-    members = [
-        Learning(DQNS["GRU"]),
-        Learning(DQNS["LSTM, double, log-cosh"]),
-        Scripted("greedy"),
-        Scripted(),
-    ]
-    assert_goes_on_bit_for_bit(members, tmp_path, episodes=7)
-
-
-@pytest.mark.integration
-def test_a_run_is_stored_loaded_and_evaluated(tmp_path):
-    agents = [Learning(DQNS["GRU"])] * 2 + [Learning(DQNS["LSTM, double, log-cosh"]), Scripted("greedy")]
-    experiment = Experiment(
-        name="remembers",
-        game=GAME,
-        agents=agents,
-        replicas=2,
-        episodes=3,
-        evaluation_episodes=2,
-        engine="eager",
-    )
-    run = cprl.run(experiment, tmp_path / "run", watch="off")
-    loaded = cprl.load(run)
-    assert loaded.experiment == experiment
-    assert loaded.policy().actors[0].state_cells == 5
-    assert len(cprl.evaluate_run(run, episodes=3).trained[1]) == 3
-
-
 SEQUENCES = {"sequence_steps": 4}
 
 
@@ -285,17 +221,8 @@ SEQUENCES = {"sequence_steps": 4}
             lambda: made(DQN(settings=DQNSettings(**SEQUENCES))),
             "sequence_steps is 4; allowed with no recurrent network: 1",
         ),
-        (
-            lambda: made(SAC(settings=DQNSettings(**SEQUENCES))),
-            "sequence_steps is 4; allowed with no recurrent network: 1",
-        ),
-        (
-            lambda: population([Team(VDN(settings=DQNSettings(**SEQUENCES)), FOUR, reward="team")]),
-            "sequence_steps is 4; allowed with no recurrent network: 1",
-        ),
         (lambda: DQNSettings(sequence_steps=4, n_steps=2), "sequence_steps is 4; allowed with n_steps 2: 1"),
         (lambda: DQNSettings(sequence_steps=17), "sequence_steps is 17; allowed: up to learning_starts, 16"),
-        (lambda: DQNSettings(sequence_steps=0), "sequence_steps is 0"),
         (
             lambda: DQNSettings(**SEQUENCES, replay_transforms=(Custom("torchrl.envs:RewardScaling"),)),
             "sequence_steps is 4; allowed with replay_transforms: 1",

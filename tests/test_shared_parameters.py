@@ -9,7 +9,6 @@ from test_population import (
     GAME,
     REPLAY,
     ROLLOUTS,
-    assert_goes_on_bit_for_bit,
     population,
     ran,
     trained,
@@ -109,13 +108,6 @@ def test_members_explore_each_by_random_numbers_of_its_own():
     chosen = [next(iter(own.learners.values())).actor.choose(seen) for own in (alone, team)]
     assert torch.equal(*chosen), "epsilon is 1 at first"
     assert len(set(chosen[1][0].tolist())) > 1
-
-
-@pytest.mark.integration
-@pytest.mark.parametrize("name", ["DQN", "PPO", "IPPO"])
-def test_who_was_stopped_continues_bit_for_bit(name, tmp_path):
-    members = [shared(EVERY[name], (0, 1, 2)), Learning(DQN(settings=REPLAY))]
-    assert_goes_on_bit_for_bit(members, tmp_path, episodes=4)
 
 
 @pytest.mark.integration

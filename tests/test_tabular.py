@@ -16,9 +16,7 @@ from cprl.learners.settings import TabularSettings
 from cprl.learners.tabular import TabularLearner
 from cprl.measuring.evaluate import evaluate
 from cprl.policies.assignment import AgentPolicies
-from cprl.policies.scripted import ScriptedActor
 from cprl.policies.tabular import NEVER_MET, QTables
-from cprl.runs.checkpoints import Checkpointer, checkpoints_in, read_checkpoint
 from cprl.training import Training, train
 
 SEES_ALL = {"window_rows": 4, "window_columns": 7, "may_fire": False}
@@ -294,54 +292,6 @@ def test_an_agents_course_does_not_depend_on_other_replicas():
         assert np.array_equal(array, tables[1][name]), name
 
 
-class Dying:
-    """Ends the training after so many turns."""
-
-    def __init__(self, turns):
-        self.left = turns
-
-    def on_step(self, batch):
-        self.left -= 1
-        if self.left == 0:
-            raise ZeroDivisionError
-
-    def on_episode(self, episode, learning):
-        """Nothing."""
-
-
-@pytest.mark.parametrize("update_every", [1, 3])
-def test_a_training_beside_a_scripted_agent_goes_on_from_its_checkpoint(tmp_path, update_every):
-    def trained(run, callbacks=()):
-        settings = TabularSettings(epsilon_hold_steps=10, epsilon_decay_steps=200)
-        learner = TabularLearner(PAIR.spaces, agents=[0], replicas=2, settings=settings)
-        other = ScriptedActor("territorial", PAIR, seeds=[(1, r) for r in range(2)], agents=1)
-        run.mkdir(exist_ok=True)
-        with Checkpointer(run, every_s=1e-9 if callbacks else 1000.0) as checkpoints:
-            train(
-                CommonsEnv(PAIR, 2, seed=0),
-                {(0,): learner},
-                others={(1,): other},
-                episodes=5,
-                callbacks=callbacks,
-                checkpointer=checkpoints,
-                update_every=update_every,
-            )
-        return learner
-
-    whole = trained(tmp_path / "whole")
-    with pytest.raises(ZeroDivisionError):
-        trained(tmp_path / "parts", [Dying(36)])
-    kept = read_checkpoint(checkpoints_in(tmp_path / "parts" / "checkpoints")[-1])
-    assert (kept["steps"], len(kept["learners"][0]["turns"])) == (35, 35 % update_every)
-    parts = trained(tmp_path / "parts")
-    assert whole.steps == parts.steps > 50
-    assert whole.tables.visits.sum() == 2 * (whole.steps - whole.steps % update_every)
-    assert whole.tables.rows == parts.tables.rows
-    size = whole.tables.size
-    assert np.array_equal(whole.tables.values[:size], parts.tables.values[:size])
-    assert np.array_equal(whole.tables.visits[:size], parts.tables.visits[:size])
-
-
 def test_the_table_of_an_agent_that_observes_floating_point_numbers_is_kept_as_a_network():
     env = make_env(prisoners_dilemma(turns=5), worlds=2)
     learner = TabularLearner(
@@ -372,17 +322,3 @@ def test_tables_grow_and_keep_what_they_hold():
     tables.find_or_add(states, [1] * 4000)
     assert np.array_equal(tables.values[tables.find(states[:10], [0] * 10)], np.arange(30).reshape(10, 3))
     assert tables.find(states[10:12], [0, 1])[0] == NEVER_MET < tables.find(states[10:12], [0, 1])[1]
-
-
-@pytest.mark.parametrize(
-    ("how", "message"),
-    [
-        ({"gamma": 1.5}, r"gamma is 1.5; allowed: a number in 0..1"),
-        ({"learning_rate": "1/n"}, r"learning_rate is '1/n'; allowed: a number in 0..1 or '1/visits'"),
-        ({"max_states": 0}, "max_states is 0; allowed: an integer in 1"),
-        ({"epsilon_decay_steps": 0}, "epsilon_decay_steps is 0; allowed: an integer in 1"),
-    ],
-)
-def test_settings_that_cannot_be_are_refused(how, message):
-    with pytest.raises(ValueError, match=message):
-        replace(TabularSettings(), **how)

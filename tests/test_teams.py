@@ -11,14 +11,10 @@ from test_population import (
     GAME,
     REPLAY,
     ROLLOUTS,
-    assert_goes_on_bit_for_bit,
     population,
-    ran,
-    trained,
     weights,
 )
 
-import cprl
 from cprl import CommonsEnv, Game, Rules, maps, presets
 from cprl.algorithms.off_policy import DQN
 from cprl.algorithms.teams import IPPO, MADDPG, MAPPO, QMIX, VDN
@@ -26,9 +22,8 @@ from cprl.learners.engine import FunctionalEngine
 from cprl.learners.settings import DQNSettings
 from cprl.learners.trial import trial_batch
 from cprl.measuring.evaluate import evaluate
-from cprl.networks.agent import acting_part
 from cprl.networks.team import Mixing
-from cprl.population import Frozen, Learning, Scripted, Team
+from cprl.population import Learning, Scripted, Team
 from cprl.training import train
 from cprl.training.agents import Population
 
@@ -47,28 +42,6 @@ def team_of(name, **how):
     agents = population([Team(TEAMS[name], FOUR)], **how)
     (learner,) = agents.learners.values()
     return agents, learner
-
-
-@pytest.mark.integration
-@pytest.mark.parametrize("name", TEAMS)
-def test_each_team_moves_every_members_weights_and_no_replica_knows_of_the_others(name):
-    together, learner = team_of(name, replicas=3)
-    alone, _ = team_of(name, replicas=1, first_replica=2)
-    before = weights(together)
-    _, returns = trained(together, episodes=4)
-    _, returns_alone = trained(alone, first=2, episodes=4)
-    assert returns[2] == returns_alone[0]
-    after, after_alone = weights(together), weights(alone)
-    assert learner.lanes == 3, "a lane is a team"
-    assert len(together.networks()) == 12
-    for key, value in after.items():
-        assert not torch.equal(value, before[key]), f"{key} has not moved"
-    for key, value in after_alone.items():
-        torch.testing.assert_close(value, after[key], rtol=1e-4, atol=1e-5)
-    made = [acting_part(network).linears[0].weight for network in together.networks().values()]
-    assert len({float(weight.detach().sum()) for weight in made}) == 12, (
-        "each member has a network of its own"
-    )
 
 
 @pytest.mark.integration
@@ -206,32 +179,6 @@ def test_the_teams_value_grows_with_each_members_value():
     assert (raw < 0).any(), "without the absolute value it would not"
     doubled = mixing(chosen, (state // 2).to(torch.uint8))
     assert not torch.equal(doubled, mixing(chosen, state)), "how it mixes depends on what is seen"
-
-
-@pytest.mark.integration
-@pytest.mark.parametrize("name", ["QMIX", "MAPPO"])
-def test_a_team_that_was_stopped_goes_on_bit_for_bit(name, tmp_path):
-    members = [Team(TEAMS[name], (0, 1, 2)), Learning(DQN(settings=REPLAY))]
-    assert_goes_on_bit_for_bit(members, tmp_path, episodes=4)
-
-
-@pytest.mark.integration
-def test_a_teams_run_is_built_again_and_its_members_play_on_frozen(tmp_path, monkeypatch, capsys):
-    monkeypatch.chdir(tmp_path)
-    members = [Team(TEAMS["QMIX"], (0, 1)), Team(TEAMS["IPPO"], (2, 3), reward="individual")]
-    run, networks = ran(tmp_path, members)
-    told = capsys.readouterr().out
-    assert "trained, epsilon" in told
-    assert " 0.05 ┃" in told
-    loaded = cprl.load(run)
-    assert [spec.algorithm for spec in loaded.specs] == [*[TEAMS["QMIX"]] * 2, *[TEAMS["IPPO"]] * 2]
-    assert len(networks) == 8
-    assert loaded.policy(1, worlds=2)(loaded.env(2).reset())["agents", "action"].shape == (2, 4)
-    frozen = population([Frozen(run, 1, replica=1), Frozen(run, 3), *[Scripted()] * 2])
-    actor = frozen.others[0,]
-    actor.epsilon = 0.0
-    own = CommonsEnv(GAME, 2, seed=9).reset()["agents", "observation"][:, :1]
-    assert torch.equal(actor.choose(own), networks["replica_1/agent_1"](own).argmax(-1))
 
 
 @pytest.mark.parametrize("name", ["VDN", "QMIX", "MAPPO"])

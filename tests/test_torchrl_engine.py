@@ -9,7 +9,7 @@ import pytest
 import torch
 from torchrl.data import LazyTensorStorage, TensorDictReplayBuffer
 from torchrl.data.replay_buffers import RandomSampler, RoundRobinWriter, Sampler, SamplerWithoutReplacement
-from torchrl.envs.transforms import MultiStepTransform, RewardScaling
+from torchrl.envs.transforms import MultiStepTransform
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 from torchrl.objectives import (
     A2CLoss,
@@ -324,26 +324,6 @@ def test_a_stopped_learner_continues_bit_for_bit(name, steps):
         assert torch.equal(own, other) if isinstance(own, torch.Tensor) else own == other, where
 
 
-@pytest.mark.integration
-@pytest.mark.parametrize("name", ["published DQN", pytest.param("PPO", marks=pytest.mark.slow)])
-def test_a_replica_learns_the_same_whichever_others_are_trained_with_it(name):
-    algorithm = {**OFF_POLICY, **ON_POLICY}[name]
-    together = algorithm.make_learner(SPACES, engine="torchrl", **HOW)
-    alone = algorithm.make_learner(
-        SPACES, engine="torchrl", agents=(0, 1), replicas=1, first_replica=1, seed=HOW["seed"]
-    )
-    played = turns(together.actor)
-    for _ in range(90):
-        turn = next(played)
-        take(together, turn)
-        torch.rand(1)  # whoever else draws
-        take(alone, turn[1:])
-    for name, network in alone.networks().items():
-        assert name.startswith("replica_1/")
-        for mine, theirs in zip(network.parameters(), together.networks()[name].parameters(), strict=True):
-            assert torch.equal(mine, theirs)
-
-
 def test_hard_targets_are_copied_after_every_third_episode_of_each_replica():
     learner = resumable(DQN(settings=changed(REPLAY, own_target_weights=True)))
     played = turns(learner.actor)
@@ -465,51 +445,6 @@ def test_a_loss_of_each_transition_learns_as_their_mean():
     (of_each, weights), (of_mean, expected) = of("none"), of("mean")
     assert of_each.tolist() == of_mean.tolist()
     assert all(weights[name].equal(expected[name]) for name in expected)
-
-
-class OneStepLoss(DQNLoss):
-    """Discounts the value behind a return by one step, however many rewards were summed."""
-
-    def forward(self, tensordict):
-        return super().forward(tensordict.exclude("steps_to_next_obs"))
-
-
-def test_n_steps_are_refused_for_a_loss_that_takes_no_notice_of_them():
-    with pytest.raises(ValueError, match=r"n_steps is 3; allowed: 1, because DiscreteIQLLoss does not read"):
-        resumable(IQL(settings=changed(REPLAY, n_steps=3)))
-
-    def one_step(network):
-        actor = DQN(settings=REPLAY).make_loss(network).value_network
-        loss = OneStepLoss(actor, delay_value=True, loss_function="l2", action_space="categorical")
-        loss.make_value_estimator(gamma=REPLAY.gamma)
-        return loss
-
-    replay_learner_of(one_step)
-    with pytest.raises(ValueError, match=r"n_steps is 3; allowed: 1, because OneStepLoss does not read"):
-        replay_learner_of(one_step, n_steps=3)
-
-
-def test_returns_of_several_steps_need_the_gamma_that_the_loss_bootstraps_with():
-    make_loss = DQN(settings=changed(REPLAY, gamma=0.5)).make_loss
-    replay_learner_of(make_loss, n_steps=1)
-    replay_learner_of(make_loss, n_steps=3, gamma=0.5)
-    with pytest.raises(ValueError, match=r"DQNLoss has gamma 0\.5 and the settings have gamma 0\.995"):
-        replay_learner_of(make_loss, n_steps=3)
-
-
-def test_replay_transforms_change_what_is_sampled():
-    scale = Custom(
-        "torchrl.envs.transforms:RewardScaling", {"loc": 0.0, "scale": 10.0, "in_keys": [["next", "reward"]]}
-    )
-    learner = resumable(DQN(settings=changed(REPLAY, replay_transforms=(scale,), batch_size=200)))
-    played = turns(learner.actor)
-    for _ in range(40):
-        learner.store(next(played))
-    buffer = learner.buffer.each[0]
-    assert [type(own) for own in buffer.transform] == [RewardScaling]
-    sampled = buffer.sample()
-    assert sampled["next", "reward"].max() > 0
-    assert torch.equal(sampled["next", "reward"], 10 * buffer.storage[:]["next", "reward"][sampled["index"]])
 
 
 @pytest.mark.integration

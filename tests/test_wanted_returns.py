@@ -29,8 +29,7 @@ from cprl.institutions import Tax
 from cprl.learners.preferences import Exchange, InequityAversion, SocialValueOrientation, WantedRewards
 from cprl.measuring.episodes import EpisodeTracker
 from cprl.population import Frozen, Learning, Scripted, Team
-from cprl.runs.checkpoints import Checkpointer, checkpoints_in
-from cprl.runs.episodes import EpisodeTable, read_episodes, rows_of, schema_of
+from cprl.runs.episodes import read_episodes
 from cprl.training import Training, train
 from cprl.training.agents import Population
 
@@ -161,12 +160,6 @@ class StoppedError(Exception):
     """A training is stopped."""
 
 
-class Early(Checkpointer):
-    def after_step(self, training):
-        if training.steps in (6, 16):
-            self.save(training)
-
-
 def population(specs, env, **how):
     return Population(env, specs, seed=3, engine="eager", **how)
 
@@ -203,48 +196,6 @@ def test_what_is_wanted_is_made_of_what_is_left_after_fines_and_transfers():
     wanted = sum(episode.wanted_return[0] for episode in kept.episodes)
     assert wanted == pytest.approx(harvest - fines + transfers, abs=1e-4)
     assert wanted == pytest.approx(sum(episode.return_.sum() for episode in kept.episodes), abs=1e-4)
-
-
-@pytest.mark.integration
-@pytest.mark.parametrize("update_every", [1, 2])
-@pytest.mark.parametrize("name", ["replay", "rollouts", "replay of torchrl", "team"])
-def test_a_training_that_was_stopped_wants_on_bit_for_bit(name, update_every, tmp_path):
-    algorithm, engine = LEARNERS[name]
-    spec = (Team if name == "team" else Learning)(
-        algorithm, **({"agents": (0, 1)} if name == "team" else {}), reward=AVERSE
-    )
-
-    def run(folder, stop_at=None):
-        env = MatrixGame(2)
-        agents = Population(env, [spec] if name == "team" else [spec] * 2, seed=3, engine=engine)
-        kept = Kept(stop_at)
-        (tmp_path / folder).mkdir(exist_ok=True)
-        with (
-            Early(tmp_path / folder) as checkpoints,
-            EpisodeTable(tmp_path / folder / "episodes.parquet", resumable=True) as table,
-        ):
-            try:
-                train(
-                    env,
-                    agents.learners,
-                    episodes=7,
-                    callbacks=[table, kept],
-                    checkpointer=checkpoints,
-                    update_every=update_every,
-                )
-            except StoppedError:
-                assert checkpoints_in(tmp_path / folder / "checkpoints")
-                return None
-        return {key: value for own in agents.networks().values() for key, value in own.state_dict().items()}
-
-    whole = run("whole")
-    run("stopped", stop_at=19)
-    resumed = run("stopped")
-    for key, value in whole.items():
-        assert torch.equal(resumed[key], value), key
-    rows, theirs = read_episodes(tmp_path / "stopped"), read_episodes(tmp_path / "whole")
-    assert rows.equals(theirs)
-    assert rows["wanted_return"].to_pylist() != rows["return"].to_pylist()
 
 
 def test_a_second_training_begins_without_what_the_first_remembered():
@@ -310,16 +261,6 @@ def test_preferences_are_flags_by_their_place():
     )
     assert given.agents[0].reward == replace(AVERSE, alpha=2.0)
     assert given.agents[1].reward == "team"
-
-
-def test_a_table_that_an_earlier_version_began_goes_on_without_the_column():
-    env, kept = MatrixGame(2), Kept()
-    agents = population([Learning(DQN(settings=REPLAY))] * 2, env)
-    train(env, agents.learners, episodes=1, callbacks=[kept])
-    schema = schema_of(kept.episodes[0])
-    assert "wanted_return" in schema.names
-    before = schema.remove(schema.get_field_index("wanted_return"))
-    assert rows_of(kept.episodes, None, before).schema.names == before.names
 
 
 @dataclass(frozen=True)

@@ -19,6 +19,7 @@ from cprl.learners.decisions import Bandit, BanditDecider
 from cprl.learners.lanes import EVALUATION, EXHIBITION, EXPLORATION, lane_name, lane_seeds
 from cprl.learners.preferences import named
 from cprl.networks.agent import acting_part
+from cprl.networks.recurrent import state_shape_of
 from cprl.policies.assignment import AgentIndices, AgentPolicies
 from cprl.policies.decisions import ballot_sizes, decider_by_chance
 from cprl.policies.lanes import random_agents
@@ -356,7 +357,12 @@ def _weights(stored: StoredAgent, algorithm: Algorithm, spaces: Spaces, where: s
         torch.manual_seed(0)
         seen = torch.rand(8, *spaces.observation_shape) * spaces.observation_scale
         seen = seen.to(getattr(torch, spaces.observation_dtype))
-        if not torch.equal(network(seen), stored.network(seen)):
+        shape = state_shape_of(network)
+        state = () if shape is None else (torch.zeros(8, *shape),)
+        ours, theirs = network(seen, *state), stored.network(seen, *state)
+        if not all(
+            torch.equal(*pair) for pair in (zip(ours, theirs, strict=True) if state else [(ours, theirs)])
+        ):
             raise ValueError(
                 f"{where} has another network than {name} here: with the same weights the outputs differ"
             )

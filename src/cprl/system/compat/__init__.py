@@ -34,7 +34,6 @@ from cprl.system.compat.losses import LaneCategorical as LaneCategorical
 from cprl.system.compat.losses import ReshapedLoss as ReshapedLoss
 from cprl.system.compat.losses import bootstrap_from_target as bootstrap_from_target
 from cprl.system.compat.losses import forget_cached_weights as forget_cached_weights
-from cprl.system.compat.losses import hard_update as hard_update
 from cprl.system.compat.losses import promise_targets as promise_targets
 from cprl.system.compat.losses import refuse_updaters as refuse_updaters
 from cprl.system.compat.losses import updated_weights as updated_weights

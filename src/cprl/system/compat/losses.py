@@ -5,7 +5,7 @@ from typing import Any
 
 import torch
 from tensordict import TensorDictBase
-from torchrl.objectives import HardUpdate, LossModule
+from torchrl.objectives import LossModule
 from torchrl.objectives.value import ValueEstimatorBase
 
 from cprl.system.libraries import relying_on, require
@@ -90,14 +90,6 @@ def _targets_of(loss: LossModule) -> dict[str, bool]:
 def forget_cached_weights(loss: LossModule) -> None:
     """Clears the detached weights that some losses cache at a call, so that they can be replaced."""
     loss.__dict__.pop("_cache", None)
-
-
-def hard_update(loss: LossModule, *, every: int) -> HardUpdate:
-    """A `HardUpdate` that copies to targets at every `every`-th call of `step`, at least 1.
-
-    TorchRL counts one call more: with an interval of 2 it copies at every third call.
-    """
-    return HardUpdate(loss, value_network_update_interval=every - 1)
 
 
 def bootstrap_from_target(estimator: ValueEstimatorBase) -> None:

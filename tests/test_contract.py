@@ -1,0 +1,87 @@
+"""What every algorithm keeps: each agent learns, each replica as it would alone, and a run of it is stored,
+loaded and evaluated, and its agents play on frozen and start others. That a stopped training goes on as if it
+had not been stopped, and the numbers of each, are in tests/golden."""
+
+from dataclasses import replace
+
+import pytest
+import torch
+from test_lola import ESTIMATORS
+from test_lola import team as lola_team
+from test_population import (
+    ALGORITHMS,
+    FOUR,
+    GAME,
+    assert_all_weights_move_and_replicas_learn_apart,
+    population,
+    weights,
+)
+from test_recurrent import ON_POLICY as RECURRENT
+from test_recurrent import specs as recurrent_specs
+from test_recurrent_replay import DQNS
+from test_teams import TEAMS
+
+import cprl
+from cprl import Experiment
+from cprl.evaluation import crossplay, evaluate_run
+from cprl.population import Frozen, Learning, Scripted, Team
+
+GROUPS = {
+    **{name: [Learning(algorithm)] * 4 for name, algorithm in ALGORITHMS.items()},
+    **{name: [Team(algorithm, FOUR, reward="team")] for name, algorithm in TEAMS.items()},
+    **{f"LOLA, {estimator}": [lola_team(estimator)] for estimator in ESTIMATORS},
+    **{f"recurrent {name}": recurrent_specs(name) for name in RECURRENT},
+    **{f"recurrent DQN, {name}": [Learning(algorithm)] * 4 for name, algorithm in DQNS.items()},
+}
+STORED = (
+    "DQN",
+    "PR2",
+    "PPO",
+    "QMIX",
+    "IPPO",
+    "MADDPG",
+    "LOLA, dice",
+    "recurrent MAPPO",
+    "recurrent DQN, GRU",
+)
+
+
+@pytest.mark.integration
+@pytest.mark.parametrize("name", GROUPS)
+def test_all_weights_of_every_agent_move_and_no_replica_knows_of_the_others(name):
+    agents = GROUPS[name]
+    together, alone = population(agents, replicas=3), population(agents, replicas=1, first_replica=2)
+    assert len(together.networks()) == 12
+    assert_all_weights_move_and_replicas_learn_apart(together, alone)
+    sums = dict.fromkeys(together.networks(), 0.0)
+    for name, value in weights(together).items():
+        sums[name.rsplit("/", 1)[0]] += float(value.sum())
+    assert len(set(sums.values())) == 12, "every agent has a network of its own"
+
+
+@pytest.mark.integration
+@pytest.mark.parametrize("name", STORED)
+def test_a_run_is_stored_loaded_and_evaluated_plays_frozen_and_others_start_from_it(
+    name, tmp_path, monkeypatch
+):
+    monkeypatch.chdir(tmp_path)
+
+    def run(agents, folder):
+        experiment = Experiment(
+            name=folder, game=GAME, agents=agents, replicas=2, episodes=3, evaluation_episodes=1
+        )
+        return experiment, cprl.run(replace(experiment, engine="eager"), folder, watch="off")
+
+    experiment, first = run(GROUPS[name], "first")
+    loaded = cprl.load(first)
+    assert loaded.experiment == replace(experiment, engine="eager")
+    assert len(loaded.networks) == 8
+    assert len(evaluate_run(first, episodes=3).trained[1]) == 3
+    frozen = population([Frozen(str(first), 1, replica=1), *[Scripted()] * 3])
+    assert len(frozen.others) == 2
+    begun = population([replace(one, start_from=Frozen(str(first), 0, replica=1)) for one in GROUPS[name]])
+    ours = begun.networks()["replica_0/agent_0"].state_dict()
+    theirs = loaded.networks["replica_1/agent_0"].state_dict()
+    assert all(torch.equal(ours[key], value) for key, value in theirs.items())
+    _, second = run([Frozen(str(first), 2, replica=1), *[Scripted("greedy")] * 3], "second")
+    crossplay([first, second], episodes=1)
