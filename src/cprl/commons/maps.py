@@ -5,11 +5,12 @@ heading. Everything outside the board is wall.
 """
 
 from bisect import bisect_left, insort
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
 from inspect import cleandoc
 from itertools import chain
+from math import isqrt
 from typing import Any, Final, Literal, get_args
 
 import numpy as np
@@ -428,17 +429,13 @@ def random(
             f"{count} sites and {agents} agents do not fit on {cells} cells; allowed: a lower density, or "
             "fewer agents"
         )
-    free: list[int] = list(range(cells))
-    beside: list[int] = []  # free cells next to a site, ascending as well
-    is_beside, is_site = bytearray(cells), bytearray(cells)
-    for _ in range(count):
-        near = beside and rng.random() < clustering
+    free, beside = _Cells(cells, full=True), _Cells(cells)
+    while cells - free.count < count:
+        near = beside.count and rng.random() < clustering
         choices = beside if near else free
-        cell = choices[int(rng.integers(len(choices)))]
-        del free[bisect_left(free, cell)]
-        if is_beside[cell]:
-            del beside[bisect_left(beside, cell)]
-        is_site[cell] = True
+        cell = choices.at(int(rng.integers(choices.count)))
+        free.discard(cell)
+        beside.discard(cell)
         row, col = divmod(cell, width)
         for inside, neighbour in (
             (row > 0, cell - width),
@@ -446,13 +443,58 @@ def random(
             (col > 0, cell - 1),
             (col < width - 1, cell + 1),
         ):
-            if inside and not is_site[neighbour] and not is_beside[neighbour]:
-                insort(beside, neighbour)
-                is_beside[neighbour] = True
-    places = np.array(free)
+            if inside and neighbour in free:
+                beside.add(neighbour)
+    places = np.fromiter(free, np.int64)
     chosen = places[rng.choice(len(places), agents, replace=False)].tolist()
     starts = [(*divmod(cell, width), int(rng.integers(4))) for cell in chosen]
     sites = np.setdiff1d(np.arange(cells), places).tolist()
     return Map(
         height=height, width=width, sites=tuple(divmod(cell, width) for cell in sites), starts=tuple(starts)
     )
+
+
+class _Cells:
+    """A set of cells, 0 .. cells - 1, that knows the n-th smallest in about 10 microseconds: ascending cells
+    in blocks of about the square root of their largest number."""
+
+    def __init__(self, cells: int, *, full: bool = False) -> None:
+        self.count = cells if full else 0
+        self._size = isqrt(cells) + 1
+        self._is_in = bytearray([full]) * cells
+        firsts = range(0, cells, self._size)
+        self._blocks = [
+            list(range(first, min(first + self._size, cells))) if full else [] for first in firsts
+        ]
+        self._lengths = np.array(list(map(len, self._blocks)))
+
+    def __contains__(self, cell: int) -> bool:
+        return bool(self._is_in[cell])
+
+    def __iter__(self) -> Iterator[int]:
+        return chain.from_iterable(self._blocks)
+
+    def at(self, place: int) -> int:
+        """The cell at a place in ascending order."""
+        ends = self._lengths.cumsum()
+        block = int(ends.searchsorted(place, side="right"))
+        return self._blocks[block][place - int(ends[block])]
+
+    def add(self, cell: int) -> None:
+        """Adds a cell, if it is not there."""
+        if not self._is_in[cell]:
+            self._is_in[cell] = True
+            block = cell // self._size
+            insort(self._blocks[block], cell)
+            self._lengths[block] += 1
+            self.count += 1
+
+    def discard(self, cell: int) -> None:
+        """Removes a cell, if it is there."""
+        if self._is_in[cell]:
+            self._is_in[cell] = False
+            block = cell // self._size
+            cells = self._blocks[block]
+            del cells[bisect_left(cells, cell)]
+            self._lengths[block] -= 1
+            self.count -= 1
