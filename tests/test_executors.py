@@ -16,22 +16,23 @@ from tiny_study import FREEZE, LEARNING, TINY
 
 from cprl import Study
 from cprl.algorithms import DQN
-from cprl.learners.ring import storage_bytes
+from cprl.learners.buffer.storage import storage_bytes
 from cprl.population import Learning, Scripted
 from cprl.runs.checkpoints import Checkpointer
-from cprl.studies import InProcess, Processes, Ray, run_study
+from cprl.studies import InProcess, Processes, Ray, run_study, study_table
 from cprl.studies.executors import on_ray, processes
 from cprl.studies.executors.on_ray import BASE_BYTES, MemoryNeeds, estimated_bytes
 from cprl.studies.executors.processes import Stopping
 from cprl.studies.study import STATUS
 from cprl.studies.trials import Status, run_task, task_of, trials_of
 
-STUDY = Study(TINY, {FREEZE: [2, 5]})
+STUDY = Study(replace(TINY, episodes=80), {FREEZE: [2, 5]})
+SHORT = Study(TINY, {FREEZE: [2, 5]})
 TESTS = Path(__file__).parent
 
 
 def tasks_in(folder, study=STUDY):
-    return [task_of(own, runs=folder / "runs", status=folder / STATUS) for own in trials_of(study)]
+    return [task_of(trial, runs=folder / "runs", status=folder / STATUS) for trial in trials_of(study)]
 
 
 def attempts_of(task):
@@ -40,41 +41,57 @@ def attempts_of(task):
     return path.read_text().split() if path.exists() else []
 
 
+def is_first(task):
+    return task.recipe["experiment"]["game"]["rules"]["freeze_steps"] == 2
+
+
 def note_attempt(task):
     Path(task.status).mkdir(parents=True, exist_ok=True)
     with open(Path(task.status) / f"{task.name}.attempts", "a") as file:
         file.write(f"{os.getpid()}\n")
 
 
+def run_often_saved(task):
+    Checkpointer.__init__.__kwdefaults__["every_s"] = 0.05
+    return run_task(task)
+
+
 def run_or_die_once(task):
     """A worker that is killed in the study's first training, when a checkpoint is there."""
     note_attempt(task)
-    saved = Checkpointer.save
+    save = Checkpointer.save
 
     def save_and_die(self, *arguments, **how):
-        path = saved(self, *arguments, **how)
-        if task.recipe["experiment"]["game"]["rules"]["freeze_steps"] == 2 and len(attempts_of(task)) == 1:
+        path = save(self, *arguments, **how)
+        if is_first(task) and len(attempts_of(task)) == 1:
             os.kill(os.getpid(), signal.SIGKILL)
         return path
 
-    Checkpointer.__init__.__kwdefaults__["every_s"] = 1e-6
     Checkpointer.save = save_and_die
     try:
-        return run_task(task)
+        return run_often_saved(task)
     finally:
-        Checkpointer.save = saved
+        Checkpointer.save = save
 
 
 def die_or_run(task):
     """A worker that always dies of the study's first trial."""
     note_attempt(task)
-    if task.recipe["experiment"]["game"]["rules"]["freeze_steps"] == 2:
+    if is_first(task):
         os.kill(os.getpid(), signal.SIGKILL)
     return run_task(task)
 
 
 def break_at_start(task):
     raise OSError("no such disk")
+
+
+class OftenSaved(Processes):
+    work = staticmethod(run_often_saved)
+
+
+class OftenSavedOnRay(Ray):
+    work = staticmethod(run_often_saved)
 
 
 class Dying(Processes):
@@ -99,25 +116,31 @@ class Broken(Processes):
 
 @pytest.fixture(scope="session")
 def undisturbed(tmp_path_factory):
-    """The study of one process that nobody killed."""
+    """The runs of a study of one process that nobody killed."""
     folder = tmp_path_factory.mktemp("undisturbed")
     assert run_study(STUDY, folder, on=InProcess(), results=False).failed == ()
     return folder / "runs"
 
 
-def assert_same_runs(folder, undisturbed):
-    runs = sorted(own.name for own in undisturbed.iterdir())
-    assert sorted(own.name for own in folder.iterdir()) == runs
-    assert {name: differences(folder / name, undisturbed / name) for name in runs} == {
-        name: [] for name in runs
+def assert_same_study(runs, undisturbed):
+    names = sorted(path.name for path in undisturbed.iterdir())
+    assert sorted(path.name for path in runs.iterdir()) == names
+    assert {name: differences(runs / name, undisturbed / name) for name in names} == {
+        name: [] for name in names
     }
+    # Marks say under which commit a run was made, which others may change meanwhile.
+    tables = [study_table(STUDY, folder).rows.drop_columns(["marks"]) for folder in (runs, undisturbed)]
+    assert repr(tables[0].to_pylist()) == repr(tables[1].to_pylist())
+
+
+# Workers that die
 
 
 @pytest.mark.integration
 def test_a_worker_process_that_is_killed_is_replaced_and_its_trial_ends_the_same(tmp_path, undisturbed):
     result = run_study(STUDY, tmp_path, on=Dying(1), results=False)
     assert result.failed == ()
-    assert_same_runs(result.runs, undisturbed)
+    assert_same_study(result.runs, undisturbed)
     killed, other = map(attempts_of, tasks_in(tmp_path))
     assert len(set(killed)) == 2
     assert len(other) == 1
@@ -129,9 +152,8 @@ def test_a_trial_whose_processes_always_die_fails_alone_and_its_neighbour_keeps_
 ):
     monkeypatch.setattr(processes, "ATTEMPTS", 3)
     study = Study(TINY, {FREEZE: [2, 5, 10]})
-    result = run_study(study, tmp_path, on=Hopeless(2), results=False)
+    (failed,) = run_study(study, tmp_path, on=Hopeless(2), results=False).failed
     dead, *others = tasks_in(tmp_path, study)
-    (failed,) = result.failed
     assert failed.name == dead.name
     assert "the process that ran it died" in failed.reason
     assert Status(tmp_path / STATUS, dead.name).failure() == failed.reason
@@ -141,65 +163,133 @@ def test_a_trial_whose_processes_always_die_fails_alone_and_its_neighbour_keeps_
 
 @pytest.mark.slow
 def test_what_a_worker_cannot_even_begin_is_the_trials_failure(tmp_path):
-    result = run_study(STUDY, tmp_path, on=Broken(1), results=False)
-    assert [own.reason for own in result.failed] == ["OSError: no such disk"] * 2
+    result = run_study(SHORT, tmp_path, on=Broken(1), results=False)
+    assert [outcome.reason for outcome in result.failed] == ["OSError: no such disk"] * 2
+
+
+@pytest.mark.slow
+@pytest.mark.filterwarnings("ignore::ResourceWarning")
+def test_tasks_of_ray_whose_workers_are_killed_make_the_same_runs(tmp_path, undisturbed, monkeypatch):
+    monkeypatch.chdir(TESTS)  # Ray's workers import this module from there
+    import ray
+
+    result = run_study(STUDY, tmp_path / "study", on=DyingOnRay(jobs=2), results=False)
+    assert result.failed == ()
+    assert_same_study(result.runs, undisturbed)
+    assert not ray.is_initialized()
+    monkeypatch.setattr(on_ray, "ATTEMPTS", 2)
+    (failed,) = run_study(SHORT, tmp_path / "hopeless", on=HopelessOnRay(jobs=2), results=False).failed
+    assert failed.name == tasks_in(tmp_path / "hopeless", SHORT)[0].name
+    assert "its worker or node died (WorkerCrashedError)" in failed.reason
+
+
+# A driver in a process of its own
 
 
 SCRIPT = """
-import sys
 from dataclasses import replace
-sys.path[:0] = [{tests!r}]
+from test_executors import OftenSaved, OftenSavedOnRay
 from tiny_study import FREEZE, TINY
-from cprl.studies import Processes, Ray, Study, run_study
-{more}
+from cprl.studies import Study, run_study
 # No `if __name__ == "__main__"`, which a user may forget.
-run_study(Study(replace(TINY, episodes={episodes}), {{FREEZE: [2, 5]}}), {out!r}, on={on}, results=False)
-print("whole")
+study = Study(replace(TINY, episodes={episodes}), {{FREEZE: [2, 5]}})
+failed = run_study(study, {out!r}, on={on}, results=False).failed
+print("failed" if failed else "whole")
 """
+ON = ("OftenSaved(2)", "OftenSavedOnRay(jobs=2)")
+ENDED_WITHIN_S = {ON[0]: 2.0, ON[1]: 30.0}
 
 
-def started(out, on, *, episodes, more=""):
+def started(out, on, *, episodes=80):
     """A process that runs the tiny study, of so many episodes."""
-    script = SCRIPT.format(tests=str(TESTS), out=str(out), on=on, episodes=episodes, more=more)
-    path = out.with_suffix(".py")
-    path.write_text(script)
-    return subprocess.Popen(
-        [sys.executable, str(path)], stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True
-    )
+    script = out.with_suffix(".py")
+    script.write_text(SCRIPT.format(out=str(out), on=on, episodes=episodes))
+    paths = os.pathsep.join([str(TESTS), os.environ.get("PYTHONPATH", "")])
+    with open(out.with_suffix(".out"), "ab") as output:
+        return subprocess.Popen(
+            [sys.executable, str(script)],
+            env={**os.environ, "PYTHONPATH": paths},
+            stdout=output,
+            stderr=output,
+        )
 
 
-def wait_until_both_train(out, process):
-    """The processes that run the two trials."""
+def printed(out):
+    return out.with_suffix(".out").read_text()
+
+
+def training(out, driver, *, count=1):
+    """The processes of this driver that train a trial, as soon as there are so many."""
     last = time.monotonic() + 300
-    while time.monotonic() < last and process.poll() is None:
-        said = [json.loads(own.read_text()) for own in (out / STATUS).glob("*.json")]
-        if len(said) == 2 and all(own["steps"] > 20 for own in said):
-            return [psutil.Process(own["pid"]) for own in said]
-        time.sleep(0.1)
-    raise AssertionError(f"the trials do not train: {process.poll()}")
+    while time.monotonic() < last and driver.poll() is None:
+        family = {child.pid: child for child in psutil.Process(driver.pid).children(recursive=True)}
+        reports = [json.loads(path.read_text()) for path in (out / STATUS).glob("*.json")]
+        workers = [family[each["pid"]] for each in reports if each["steps"] > 40 and each["pid"] in family]
+        if len(workers) >= count:
+            return workers
+        time.sleep(0.02)
+    raise AssertionError(f"no trial trains: {driver.poll()}, {printed(out)[-2000:]}")
+
+
+def assert_ends_the_same_after_kills(out, on, victims, undisturbed, *, ended_within_s=60.0):
+    """Kill a driver or a worker of the study in turn, and let it end."""
+    driver = started(out, on)
+    for victim in victims:
+        workers = training(out, driver)
+        if victim == "worker":
+            workers[0].send_signal(signal.SIGKILL)
+            assert still_alive(workers[:1], 30) == []
+        else:
+            driver.kill()
+            driver.wait()
+            assert still_alive(workers, ended_within_s) == []
+            driver = started(out, on)
+    assert driver.wait(300) == 0, printed(out)[-2000:]
+    assert "\nwhole\n" in printed(out)
+    assert_same_study(out / "runs", undisturbed)
+
+
+@pytest.mark.integration
+@pytest.mark.parametrize("victim", ["driver", "worker"])
+def test_a_study_is_the_same_after_one_kill(victim, tmp_path, undisturbed):
+    assert_ends_the_same_after_kills(tmp_path / "study", ON[0], [victim], undisturbed)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("on", ON)
+def test_a_study_is_the_same_after_kills_and_workers_end_soon_after_their_driver(on, tmp_path, undisturbed):
+    victims, within_s = ["driver", "worker", "driver"], ENDED_WITHIN_S[on]
+    assert_ends_the_same_after_kills(tmp_path / "study", on, victims, undisturbed, ended_within_s=within_s)
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
-@pytest.mark.parametrize("on", ["Processes(2)", "Ray(jobs=2)"])
+@pytest.mark.parametrize("on", ON)
 def test_a_study_that_is_asked_to_stop_saves_and_the_same_line_continues_it(tmp_path, on, number):
     out = tmp_path / "study"
-    with started(out, on, episodes=100_000) as process:
-        workers = wait_until_both_train(out, process)
-        process.send_signal(number)
-        said, _ = process.communicate(timeout=60)
+    driver = started(out, on, episodes=100_000)
+    workers = training(out, driver, count=2)
+    driver.send_signal(number)
     # An unhandled KeyboardInterrupt ends Python by SIGINT, or with 1 where TorchRL is imported.
     allowed = {signal.SIGTERM: (143,), signal.SIGINT: (-number, 1)}[number]
-    assert process.returncode in allowed, said
-    assert "Stopping: each trial finishes its step and saves a checkpoint" in said
-    assert "Stopped; 2 trials are left. The same line again continues the study." in said
-    assert ("Traceback" in said) == (number == signal.SIGINT), "of a KeyboardInterrupt, by Python"
+    assert driver.wait(60) in allowed, printed(out)
+    assert "Stopping: each trial finishes its step and saves a checkpoint" in printed(out)
+    assert "Stopped; 2 trials are left. The same line again continues the study." in printed(out)
+    assert ("Traceback" in printed(out)) == (number == signal.SIGINT), "of a KeyboardInterrupt, by Python"
     assert still_alive(workers, 5) == []
     for run in (out / "runs").iterdir():
-        assert list((run / "checkpoints").glob("training-*.pt")), said
+        assert list((run / "checkpoints").glob("training-*.pt")), printed(out)
         assert not (run / "run.lock").exists()
     for log in (out / STATUS).glob("*.log"):
         assert "Stopped; everything up to step" in log.read_text()
+
+
+@pytest.mark.slow
+def test_a_script_without_a_guard_runs_its_study_once(tmp_path):
+    out = tmp_path / "study"
+    assert started(out, "OftenSaved(2)", episodes=1).wait(120) == 0, printed(out)
+    assert printed(out).count("whole") == 1
+    assert "Traceback" not in printed(out)
 
 
 @pytest.mark.parametrize(
@@ -218,65 +308,28 @@ def test_a_study_stopped_in_worker_processes_ends_as_its_signal_says(number, kin
     assert "2 trials are left" in capsys.readouterr().out
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize(("on", "within_s"), [("Processes(2)", 2.0), ("Ray(jobs=2)", 30.0)])
-def test_workers_end_when_the_process_that_runs_the_study_is_killed(tmp_path, on, within_s):
-    out = tmp_path / "study"
-    with started(out, on, episodes=100_000) as process:
-        workers = wait_until_both_train(out, process)
-        process.kill()
-        began = time.monotonic()
-        assert still_alive(workers, within_s) == []
-        print(f"{on}: {time.monotonic() - began:.2f} s")
-
-
-@pytest.mark.slow
-def test_a_script_without_a_guard_runs_its_study_once(tmp_path):
-    with started(tmp_path / "study", "Processes(2)", episodes=1) as process:
-        said, _ = process.communicate(timeout=120)
-    assert process.returncode == 0, said
-    assert said.count("whole") == 1
-    assert "Traceback" not in said
-
-
-@pytest.mark.slow
-@pytest.mark.filterwarnings("ignore::ResourceWarning")
-def test_tasks_of_ray_whose_workers_are_killed_make_the_same_runs(tmp_path, undisturbed, monkeypatch):
-    monkeypatch.chdir(TESTS)  # Ray's workers import this module from there
-    import ray
-
-    result = run_study(STUDY, tmp_path / "study", on=DyingOnRay(jobs=2), results=False)
-    assert result.failed == ()
-    assert_same_runs(result.runs, undisturbed)
-    assert not ray.is_initialized()
-    monkeypatch.setattr(on_ray, "ATTEMPTS", 2)
-    result = run_study(STUDY, tmp_path / "hopeless", on=HopelessOnRay(jobs=2), results=False)
-    (failed,) = result.failed
-    assert failed.name == tasks_in(tmp_path / "hopeless")[0].name
-    assert "its worker or node died (WorkerCrashedError)" in failed.reason
+# Values
 
 
 @pytest.mark.parametrize(
-    ("make", "message"),
+    ("kind", "how", "name"),
     [
-        (lambda: Processes(0), "Processes.jobs is 0"),
-        (lambda: Processes(2.0), "Processes.jobs is 2.0"),
-        (lambda: Processes(True), "Processes.jobs is True"),
-        (lambda: Ray(""), "Ray.address is ''"),
-        (lambda: Ray(7), "Ray.address is 7"),
-        (lambda: Ray(jobs=0), "Ray.jobs is 0"),
-        (lambda: Ray(memory_bytes=0), "Ray.memory_bytes is 0"),
+        (Processes, {"jobs": 0}, "Processes.jobs is 0"),
+        (Processes, {"jobs": 2.0}, "Processes.jobs is 2.0"),
+        (Ray, {"address": ""}, "Ray.address is ''"),
+        (Ray, {"jobs": 0}, "Ray.jobs is 0"),
+        (Ray, {"memory_bytes": 0}, "Ray.memory_bytes is 0"),
     ],
 )
-def test_an_executor_refuses_what_does_not_fit(make, message):
-    with pytest.raises(ValueError, match=message):
-        make()
+def test_an_executor_refuses_what_does_not_fit(kind, how, name):
+    with pytest.raises(ValueError, match=name):
+        kind(**how)
 
 
-@pytest.mark.parametrize("on", ["processes", 2, Processes, run_task])
+@pytest.mark.parametrize("on", ["processes", Processes])
 def test_a_study_runs_on_an_executor_and_on_nothing_else(tmp_path, on):
-    with pytest.raises(ValueError, match=r"on is .*"):
-        run_study(STUDY, tmp_path / "study", on=on)
+    with pytest.raises(ValueError, match="on is "):
+        run_study(SHORT, tmp_path / "study", on=on)
     assert not (tmp_path / "study").exists()
 
 
@@ -286,7 +339,7 @@ def test_where_ray_is_missing_a_sentence_says_how_to_install_it(monkeypatch):
         Ray()
 
 
-def test_a_trial_asks_for_what_its_buffers_take_until_another_has_finished(tmp_path, undisturbed):
+def test_a_trial_asks_for_what_its_buffers_take_until_another_has_finished(tmp_path):
     large = replace(LEARNING.algorithm.settings, buffer_size=100_000)
     agents = (Learning(DQN(settings=large)), Scripted("greedy"))
     study = Study(replace(TINY, replicas=3), {"agents": [TINY.agents, agents]})
@@ -301,6 +354,5 @@ def test_a_trial_asks_for_what_its_buffers_take_until_another_has_finished(tmp_p
     Path(small.status).mkdir()
     taken = 2 * estimated_bytes(small)  # twice what was expected
     Status(Path(small.status), small.name).path.write_text(json.dumps({"peak_bytes": taken}))
-    needs = MemoryNeeds([small, big])
-    assert needs.of(big) == round(1.1 * 2 * (BASE_BYTES + buffers))
-    assert on_ray.MemoryNeeds([big]).of(big) == round(1.1 * (BASE_BYTES + buffers))
+    assert MemoryNeeds([small, big]).of(big) == round(1.1 * 2 * (BASE_BYTES + buffers))
+    assert MemoryNeeds([big]).of(big) == round(1.1 * (BASE_BYTES + buffers))

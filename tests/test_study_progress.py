@@ -15,90 +15,88 @@ from cprl.studies import progress
 from cprl.studies.progress import Overview, Progress, table_of
 from cprl.studies.trials import Outcome, Status, trials_of
 
-STUDY = Study(replace(TINY, episodes=10, replicas=2), {FREEZE: [2, 5, 9]})
+TRIALS = trials_of(Study(replace(TINY, episodes=10, replicas=2), {FREEZE: [2, 5, 9]}))
 
 
 @pytest.fixture
-def looked(tmp_path):
-    """The trials of a study, how they say how far they are, and who looks."""
-    trials = trials_of(STUDY)
+def says(tmp_path):
+    """Writes what a trial says of itself, by its place."""
     folder = tmp_path / "status"
     folder.mkdir()
 
-    def says(nth, **what):
-        write_json(Status(folder, trials[nth].name).path, {"pid": 7, "host": "here", "of": 20, **what})
+    def write(place, **status):
+        path = Status(folder, TRIALS[place].name).path
+        write_json(path, {"pid": 7, "host": "here", "of": 20, **status})
 
-    return trials, says, Overview(trials, runs=tmp_path / "runs", status=folder)
-
-
-def row(snapshot, trial):
-    return next(own for own in snapshot.rows if own.trial is trial)
+    return write
 
 
-def test_speed_is_measured_without_compiling_and_gives_the_time_left(looked):
-    trials, says, own = looked
+@pytest.fixture
+def look(tmp_path, says):
+    """Looks at all trials; gives the snapshot, and its row of a trial."""
+    overview = Overview(TRIALS, runs=tmp_path / "runs", status=tmp_path / "status")
+
+    def look(place=0):
+        snapshot = overview.look()
+        return snapshot, next(row for row in snapshot.rows if row.trial is TRIALS[place])
+
+    return look
+
+
+def test_speed_is_measured_without_compiling_and_gives_the_time_left(says, look):
     says(0, beat=1, episodes=0, steps=0, running_s=0.1, compiling_s=0.0)
     says(1, beat=1, episodes=0, steps=0, running_s=0.1, compiling_s=0.0)
-    own.look()
+    look()
     says(0, beat=9, episodes=0, steps=3, running_s=31.0, compiling_s=30.0)
     says(1, beat=9, episodes=0, steps=0, running_s=31.0, compiling_s=31.0, is_compiling=True)
-    now = own.look()
-    assert (row(now, trials[0]).state, row(now, trials[1]).state) == ("running", "compiling")
-    assert row(now, trials[1]).note == "for 31 s"
-    assert now.left_s is None, "nothing is known yet"
+    snapshot, row = look(1)
+    assert (row.state, row.note) == ("compiling", "for 31 s")
+    assert snapshot.left_s is None, "nothing is known yet"
     says(0, beat=19, episodes=5, steps=99, running_s=41.0, compiling_s=30.0)
-    now = own.look()
+    snapshot, row = look(0)
     # 5 episodes in 10 s; 15 of this trial are left, and with those of the other two 55
-    assert row(now, trials[0]).left_s == pytest.approx(30.0)
-    assert row(now, trials[0]).note == "30 s left"
-    assert now.left_s == pytest.approx(110.0)
-    assert now.line == (
+    assert (row.state, row.note) == ("running", "30 s left")
+    assert (row.left_s, snapshot.left_s) == pytest.approx((30.0, 110.0))
+    assert snapshot.line == (
         "0 of 3 trials finished, 2 running, 5 of 60 episodes, 1 compiling, 2 min left"
     )  # 110 s in words
 
 
-def test_what_a_resumed_trial_had_done_before_is_not_its_speed(looked):
-    trials, says, own = looked
-    says(0, beat=1, episodes=0, steps=0, running_s=0.0, compiling_s=0.0)
-    own.look()
-    says(0, beat=2, episodes=10, steps=200, running_s=2.0, compiling_s=0.0)
-    own.look()
-    says(0, beat=4, episodes=12, steps=240, running_s=4.0, compiling_s=0.0)
-    assert row(own.look(), trials[0]).left_s == pytest.approx(8.0)  # 8 episodes at 1 a second
+def test_what_a_resumed_trial_had_done_before_is_not_its_speed(says, look):
+    for beat, episodes, running_s in ((1, 0, 0.0), (2, 10, 2.0), (4, 12, 4.0)):
+        says(0, beat=beat, episodes=episodes, steps=20 * episodes, running_s=running_s, compiling_s=0.0)
+        _, row = look()
+    assert row.left_s == pytest.approx(8.0)  # 8 episodes at 1 a second
 
 
-def test_a_trial_runs_while_it_says_something_new_whatever_the_clock_says(looked, monkeypatch):
-    trials, says, own = looked
+def test_a_trial_runs_while_it_says_something_new_whatever_the_clock_says(says, look, monkeypatch):
     says(0, beat=500, episodes=4, steps=9)
-    assert row(own.look(), trials[0]).state == "missing", "perhaps the last words of a dead process"
+    assert look()[1].state == "missing", "perhaps the last words of a dead process"
     says(0, beat=501, episodes=4, steps=9)
-    assert row(own.look(), trials[0]).state == "running"
+    assert look()[1].state == "running"
     monkeypatch.setattr(progress, "SILENT_S", 0.0)
-    assert row(own.look(), trials[0]).state == "missing"
+    assert look()[1].state == "missing"
 
 
-def test_all_episodes_played_is_not_finished_yet(looked):
-    trials, says, own = looked
+def test_all_episodes_played_is_not_finished_yet(says, look):
     says(0, beat=1, episodes=20, steps=9)
-    assert row(own.look(), trials[0]).state == "evaluating"
+    assert look()[1].state == "evaluating"
 
 
-def test_failures_have_their_reason(looked, tmp_path):
-    trials, _, own = looked
-    Status(tmp_path / "status", trials[2].name).fail("ValueError: of | chance", "trace")
-    now = own.look()
-    assert now.rows[0].trial is trials[2], "failed ones stand before those that are missing"
-    assert now.rows[0].reason == "ValueError: of | chance"
+def test_failures_have_their_reason_and_stand_before_those_that_are_missing(look, tmp_path):
+    Status(tmp_path / "status", TRIALS[2].name).fail("ValueError: of | chance", "trace")
+    snapshot, row = look(2)
+    assert snapshot.rows[0] is row
+    assert row.reason == "ValueError: of | chance"
 
 
 @pytest.mark.integration
 def test_a_table_is_never_higher_than_a_screen_and_counts_the_rest(tmp_path):
-    study = Study(TINY, {FREEZE: range(1, 101)})
-    trials = trials_of(study)
+    trials = trials_of(Study(TINY, {FREEZE: range(1, 101)}))
     failures = {trials[77].name: "ValueError: no"}
-    own = Overview(trials, runs=tmp_path, status=tmp_path, failures=failures)
+    snapshot = Overview(trials, runs=tmp_path, status=tmp_path, failures=failures).look()
     screen = Console(file=io.StringIO(), width=80, height=24)
-    screen.print(table_of(own.look(), title="mine", most=16))
+    screen.print(table_of(snapshot, title="mine", most=16))
     lines = screen.file.getvalue().splitlines()
     assert len(lines) == 19
     assert lines[2].split() == ["freeze_steps=78,", "replica", "0", "failed", "0/2", "ValueError:", "no"]
@@ -107,15 +105,13 @@ def test_a_table_is_never_higher_than_a_screen_and_counts_the_rest(tmp_path):
 
 
 def test_what_trials_print_does_not_disturb_it(tmp_path, capsys, monkeypatch):
-    trials = trials_of(STUDY)
-    shown = Progress(trials, runs=tmp_path, status=tmp_path, title="mine")
-    stolen = io.StringIO()
-    with shown:
-        monkeypatch.setattr(sys, "stdout", stolen)
+    printed = io.StringIO()
+    with Progress(TRIALS, runs=tmp_path, status=tmp_path, title="mine") as shown:
+        monkeypatch.setattr(sys, "stdout", printed)
         print("noise")
-        shown.ended(Outcome(trials[0].name, "failed", "ValueError: no", True))
-        shown.ended(Outcome(trials[1].name, "finished"))
-    assert stolen.getvalue() == "noise\n"
+        shown.ended(Outcome(TRIALS[0].name, "failed", "ValueError: no", True))
+        shown.ended(Outcome(TRIALS[1].name, "finished"))
+    assert printed.getvalue() == "noise\n"
     assert capsys.readouterr().out.splitlines() == [
         "mine: 0 of 3 trials finished, 0 of 60 episodes",
         "mine: freeze_steps=2, replicas 0-1 failed: ValueError: no (1 of 3)",
@@ -126,13 +122,16 @@ def test_what_trials_print_does_not_disturb_it(tmp_path, capsys, monkeypatch):
 def test_lines_come_while_trials_run(tmp_path, capsys, monkeypatch):
     monkeypatch.setattr("cprl.studies.progress._TABLE_PERIOD_S", 0.01)
     monkeypatch.setattr("cprl.studies.progress._LINE_PERIOD_S", 0.05)
-    with Progress(trials_of(STUDY), runs=tmp_path, status=tmp_path, title="mine"):
+    with Progress(TRIALS, runs=tmp_path, status=tmp_path, title="mine"):
         time.sleep(0.5)
     assert 3 <= len(capsys.readouterr().out.splitlines()) <= 14
 
 
 @pytest.mark.integration
-def test_in_a_terminal_one_table_is_drawn_again_and_again(tmp_path, monkeypatch):
+@pytest.mark.parametrize("wanted", [True, False])
+def test_in_a_terminal_one_table_is_drawn_again_and_again_where_progress_is_wanted(
+    wanted, tmp_path, monkeypatch
+):
     class Terminal(io.StringIO):
         def isatty(self):
             return True
@@ -140,19 +139,12 @@ def test_in_a_terminal_one_table_is_drawn_again_and_again(tmp_path, monkeypatch)
     screen = Terminal()
     monkeypatch.setattr(sys, "stdout", screen)
     monkeypatch.setenv("TERM", "xterm")
-    run_study(Study(replace(TINY, episodes=1), {FREEZE: [2]}), tmp_path / "out", results=False)
-    said = screen.getvalue()
-    assert "\x1b[" in said
-    assert "freeze_steps=2, replica 0" in said
-    assert "1 of 1 trials finished, 1 of 1 episodes" in said.splitlines()[-2]
-
-
-@pytest.mark.integration
-def test_nothing_is_printed_where_no_progress_is_wanted(tmp_path, capsys):
-    run_study(
-        Study(replace(TINY, episodes=1), {FREEZE: [2]}), tmp_path / "out", progress=False, results=False
-    )
-    assert capsys.readouterr().out == ""
-    with pytest.raises(ValueError, match="progress is 'no'"):
-        run_study(STUDY, tmp_path / "other", progress="no")
-    assert not (tmp_path / "other").exists()
+    study = Study(replace(TINY, episodes=1), {FREEZE: [2]})
+    run_study(study, tmp_path / "out", results=False, progress=wanted)
+    printed = screen.getvalue()
+    if wanted:
+        assert "\x1b[" in printed
+        assert "freeze_steps=2, replica 0" in printed
+        assert "1 of 1 trials finished, 1 of 1 episodes" in printed.splitlines()[-2]
+    else:
+        assert printed == ""
