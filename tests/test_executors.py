@@ -16,7 +16,7 @@ from tiny_study import FREEZE, LEARNING, TINY
 
 from cprl import Study
 from cprl.algorithms import DQN
-from cprl.learners.buffer.storage import storage_bytes
+from cprl.learners.ring import storage_bytes
 from cprl.population import Learning, Scripted
 from cprl.runs.checkpoints import Checkpointer
 from cprl.studies import InProcess, Processes, Ray, run_study, study_table
