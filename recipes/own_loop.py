@@ -10,7 +10,7 @@ examples/single_agent.py.
 """
 
 import logging
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from math import nan
 from pathlib import Path
@@ -18,10 +18,13 @@ from statistics import fmean
 
 import torch
 import tyro
+from tensordict import TensorDictBase
 from tensordict.nn import TensorDictSequential
+from torch import nn
 from torchrl.data import Categorical, LazyTensorStorage, TensorDictReplayBuffer
 from torchrl.modules import EGreedyModule, QValueActor
 from torchrl.objectives import DQNLoss, HardUpdate
+from torchrl.record.loggers import Logger
 
 import cprl
 from cprl import CommonsEnv, presets
@@ -29,15 +32,15 @@ from cprl.algorithms import DQN
 from cprl.commands.recipe import in_a_sentence
 from cprl.learners.settings import DQNSettings
 from cprl.learners.transitions import transitions_of
-from cprl.measuring.episodes import EpisodeTracker
-from cprl.measuring.evaluate import evaluate
+from cprl.measuring.episodes import Episode, EpisodeTracker
+from cprl.measuring.evaluate import evaluate, mean_return
 from cprl.networks.mlp import MLPNetwork
 from cprl.policies.assignment import AgentPolicies
 from cprl.policies.lanes import RandomActor
 from cprl.population import Learning, exploration_steps
 from cprl.runs.episodes import EpisodeTable
 from cprl.runs.recipe import start_run
-from cprl.runs.weights import BestWeights, restore_weights, save_weights
+from cprl.runs.weights import load_weights, save_weights
 from cprl.system.output import printed, say
 from cprl.system.shipped import cprl_here
 from cprl.terminal.figures import training_curve
@@ -51,6 +54,51 @@ from cprl.viewer.watching import check_watch
 SHORT = {"epsilon_decay_steps": 30_000, "batch_size": 64, "learning_rate": 3e-4, "target_every_episodes": 1}
 """What differs from the published schedule, besides the number of episodes: it has to learn from 1/50 of the
 steps."""
+
+
+class BestWeights:
+    """Evaluates the greedy policy every `every` episodes, and saves the best weights so far.
+
+    A callback of `cprl.training`. It evaluates in the same worlds every time, so measure the saved weights
+    in other worlds. A policy that harvests nothing is never the best, where the game reports harvests; until
+    one harvests something `path` is None and `best_episode` is -1.
+    """
+
+    def __init__(
+        self,
+        run: Path,
+        networks: Mapping[str, nn.Module],
+        *,
+        policy: nn.Module,
+        env: CommonsEnv,
+        every: int = 10,
+        logger: Logger | None = None,
+    ) -> None:
+        self.run, self.networks, self.policy, self.env = run, networks, policy, env
+        self.every, self.logger = every, logger
+        self.seed = int(env.worlds.now.seed[0, 0])
+        self.path: Path | None = None
+        self.best_return, self.best_episode, self._episodes = float("-inf"), -1, 0
+
+    def on_step(self, batch: TensorDictBase) -> None:
+        """Does nothing within an episode."""
+
+    def on_episode(self, episode: Episode, learning: Mapping[str, float]) -> None:
+        """Counts an episode; every `every` episodes evaluates, and saves the weights if they are better."""
+        self._episodes += 1
+        if self._episodes % self.every:
+            return
+        self.env.set_seed(self.seed)
+        played = evaluate(self.env, self.policy)
+        reached, _ = mean_return(played)
+        if self.logger is not None:
+            self.logger.log_scalar("evaluation/greedy_return", reached)
+        harvests = [episode.harvest for episode in played if episode.harvest is not None]
+        if harvests and not any(harvest.any() for harvest in harvests):
+            return
+        if reached > self.best_return:
+            self.best_return, self.best_episode = reached, self._episodes
+            self.path = save_weights(self.run, self.networks, name="best")
 
 
 def main(
@@ -123,7 +171,7 @@ def main(
     played = {"random": evaluate(fresh, AgentPolicies([RandomActor(len(game.actions), seed=seed)]))}
     played["greedy, last"] = evaluate(fresh, policy)
     if best.path:
-        restore_weights(best.path, networks)
+        network.load_state_dict(load_weights(best.path)["agent_0"])
         played[f"greedy, best (episode {best.best_episode})"] = evaluate(fresh, policy)
     ends = exploration_steps(experiment.agents)
     figure = training_curve(run, title=title, random=played["random"], exploration_steps=ends)

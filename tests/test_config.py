@@ -1,15 +1,16 @@
 """Values become tables and come back the same; what is not known is refused by the place where it stands."""
 
 import json
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 from typing import get_args
 
 import pytest
 import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from test_settings import GAME, VALUES
 
-from cprl import Game, Observation, Rules, maps, presets
+from cprl import Game, Observation, Rules, maps
 from cprl.algorithms import (
     A2C,
     CQL,
@@ -34,8 +35,7 @@ from cprl.algorithms import (
 )
 from cprl.config import KINDS, custom_targets, differences, from_config, to_config
 from cprl.custom import Custom
-from cprl.envs.matrix import MatrixGame, prisoners_dilemma
-from cprl.envs.taking import TakingGame
+from cprl.envs.matrix import MatrixGame
 from cprl.institutions import (
     Boundaries,
     ClosedPatches,
@@ -55,7 +55,6 @@ from cprl.learners.settings import Optimizer
 from cprl.networks import GRU, LSTM, MLP, Conv
 from cprl.objectives.td import DISTANCES
 from cprl.population import Frozen, Learning, Scripted, Team
-from cprl.theory import appropriation, herders
 
 SHARES = st.floats(1e-9, 1, allow_subnormal=False)
 POSITIVE = st.floats(1e-6, 100, allow_subnormal=False)
@@ -188,34 +187,15 @@ def test_a_value_comes_back_from_its_table_as_it_was(value):
     assert to_config(back) == json.loads(text)
 
 
-def test_every_kind_comes_back():
-    made = {
-        "Game": presets.game("two_complex"),
-        "Map": BOARD,
-        "MatrixGame": prisoners_dilemma(),
-        "SharingGame": appropriation(),
-        "TakingGame": TakingGame(herders(5), levels=9, turns=9, continue_prob=0.5),
-        "Learning": Learning(DQN(settings=DQNSettings())),
-        "Team": Team(QMIX(settings=DQNSettings()), agents=(0, 1)),
-        "Frozen": Frozen("runs/earlier", 1),
-        "InequityAversion": InequityAversion(alpha=5, beta=0.05, smoothing=0.9),
-        "SocialValueOrientation": SocialValueOrientation(angle=0.5, weight=1.0),
-        "Exchange": Exchange(0.5),
-        "Boundaries": Boundaries(regions=("0.",)),
-        "Levies": Levies(groups=((0,),)),
-        "Vote": Vote(on=Quota()),
-        "Custom": Custom("a:b", arguments={"keys": [["agents", "reward"]]}),
-    }
-    of_settings = {"settings": DQNSettings}
-    of_settings |= dict.fromkeys(("PPO", "A2C", "Reinforce", "MAPPO", "IPPO"), RolloutSettings)
-    of_settings |= {"Tabular": TabularSettings, "LOLA": LOLASettings}
-    for name, kind in KINDS.items():
-        if "settings" in [field.name for field in fields(kind)]:
-            made[name] = kind(settings=of_settings.get(name, DQNSettings)())
-        value = made.get(name) or kind()
-        table = json.loads(json.dumps(to_config(value)))
-        assert table["kind"] == name
-        assert from_config(table, allow=custom_targets(table)) == value
+@pytest.mark.parametrize(
+    "value",
+    [value for value in (*VALUES, GAME, BOARD) if type(value) in KINDS.values()],
+    ids=lambda value: type(value).__name__,
+)
+def test_every_kind_comes_back(value):
+    table = json.loads(json.dumps(to_config(value)))
+    assert KINDS[table["kind"]] is type(value)
+    assert from_config(table, allow=custom_targets(table)) == value
 
 
 def test_what_a_table_leaves_out_takes_its_default():

@@ -6,8 +6,10 @@ import shlex
 from pathlib import Path
 
 import pytest
+import torch
+from torch import nn
 
-from cprl import CommonsEnv, Experiment, presets
+from cprl import CommonsEnv, Experiment, Game, Rules, maps, presets
 from cprl.algorithms.base import q_actor
 from cprl.measuring.evaluate import evaluate, mean_return
 from cprl.networks.mlp import MLPNetwork
@@ -15,7 +17,7 @@ from cprl.policies.assignment import AgentPolicies
 from cprl.policies.lanes import RandomActor
 from cprl.runs.episodes import read_episodes
 from cprl.runs.recipe import read_recipe
-from cprl.runs.weights import load_weights, restore_weights
+from cprl.runs.weights import load_weights
 from cprl.system.shipped import cprl_here
 
 _SPEC = importlib.util.spec_from_file_location(
@@ -74,8 +76,24 @@ def test_the_short_schedule_earns_three_times_what_chance_does(tmp_path):
     run = LOOP.main(out=tmp_path / "run")
     game = presets.game("single_basic")
     network = MLPNetwork(game.observation_shape, 7, highest=game.observation.highest)
-    restore_weights(run / "checkpoints" / "best.pt", {"agent_0": network})
+    network.load_state_dict(load_weights(run / "checkpoints" / "best.pt")["agent_0"])
     fresh = CommonsEnv(game, 100, seed=1234)
     greedy, _ = mean_return(evaluate(fresh, AgentPolicies([q_actor(network)])))
     chance, _ = mean_return(evaluate(fresh, AgentPolicies([RandomActor(7)])))
     assert greedy >= 3 * chance
+
+
+def test_weights_that_harvest_nothing_are_never_the_best(tmp_path):
+    env = CommonsEnv(Game(map=maps.parse("..>AA..\n......."), rules=Rules(episode_steps=3)), 2, seed=1)
+    stay, forward = 7, 0
+
+    def always(action):
+        return lambda batch: batch.set(("agents", "action"), torch.full((2, 1), action))
+
+    best = LOOP.BestWeights(tmp_path, {"agent_0": nn.Linear(1, 1)}, policy=always(stay), env=env, every=1)
+    best.on_episode(None, {})
+    assert (best.path, best.best_episode) == (None, -1)
+    best.policy = always(forward)
+    best.on_episode(None, {})
+    assert best.best_episode == 2
+    assert best.path.exists()

@@ -8,15 +8,11 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-import torch
 from rich.console import Console
 from test_results import an_episode
-from torch import nn
 
-from cprl import CommonsEnv, Game, Rules, maps
 from cprl.measuring.metrics import NAMES, title, with_unit
 from cprl.measuring.statistics import over_replicas
-from cprl.runs.weights import BestWeights
 from cprl.terminal.summary import summarise
 
 
@@ -93,22 +89,6 @@ def test_rewards_that_are_no_apples_have_a_row_of_their_own(tmp_path):
     rows, _ = told_of(tmp_path, random=[fined])
     assert rows["collective return, apples"] == ["4.0"]
     assert rows["return of all agents together, rewards"] == ["0.0"]
-
-
-def test_weights_that_harvest_nothing_are_never_the_best(tmp_path):
-    env = CommonsEnv(Game(map=maps.parse("..>AA..\n......."), rules=Rules(episode_steps=3)), 2, seed=1)
-    stay, forward = 7, 0
-
-    def always(action):
-        return lambda batch: batch.set(("agents", "action"), torch.full((2, 1), action))
-
-    best = BestWeights(tmp_path, {"agent_0": nn.Linear(1, 1)}, policy=always(stay), env=env, every=1)
-    best.on_episode(episode(0, [0, 0]), {})
-    assert (best.path, best.best_episode) == (None, -1)
-    best.policy = always(forward)
-    best.on_episode(episode(1, [0, 0]), {})
-    assert best.best_episode == 2
-    assert best.path.exists()
 
 
 def test_an_estimate_of_one_replica_is_printed_without_an_interval():

@@ -341,9 +341,7 @@ def _flag(value: Any, hint: Any, all_agents: bool) -> tuple[Any, Any] | None:
         return flags_of(value, all_agents=all_agents)
     if _are_dataclasses(value):
         return _flags_of_all(value, all_agents)
-
     simple = _simple(hint)
-
     return None if simple in (None, NoneType) or not fits(value, simple) else (simple, value)
 
 

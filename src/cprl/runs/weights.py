@@ -6,14 +6,9 @@ from pathlib import Path
 from typing import Any, Final, NamedTuple
 
 import torch
-from tensordict import TensorDictBase
 from torch import Tensor, nn
-from torchrl.record.loggers import Logger
 
-from cprl.checks import checked, count, shown
-from cprl.envs.commons_env import CommonsEnv
-from cprl.measuring.episodes import Episode
-from cprl.measuring.evaluate import evaluate, mean_return
+from cprl.checks import shown
 from cprl.runs.checkpoints import FOLDER, REPORT, checkpoints_in, read_checkpoint
 from cprl.runs.files import checksum, refuse_missing, refuse_special, verify, write_listed
 
@@ -60,74 +55,9 @@ def save_decisions(run: Path, values: Mapping[str, Tensor]) -> None:
         write_listed(run, f"checkpoints/{DECISIONS}", lambda file: torch.save(dict(values), file))
 
 
-class BestWeights:
-    """Evaluates the greedy policy every `every` episodes, and saves the best weights so far.
-
-    A callback of `cprl.training`. It evaluates in the same worlds every time, so measure the saved weights
-    in other worlds. A policy that harvests nothing is never the best, where the game reports harvests; until
-    one harvests something `path` is None and `best_episode` is -1.
-
-    Args:
-        networks: the networks by the agent's name.
-        policy: the policy of all agents, e.g. `cprl.policies.assignment.AgentPolicies`.
-        every: episodes between evaluations.
-        logger: gets each `evaluation/greedy_return`.
-    """
-
-    def __init__(
-        self,
-        run: Path,
-        networks: Mapping[str, nn.Module],
-        *,
-        policy: nn.Module,
-        env: CommonsEnv,
-        every: int = 10,
-        logger: Logger | None = None,
-    ) -> None:
-        checked("every", every, count(1))
-        self.run, self.networks, self.policy, self.env = Path(run), networks, policy, env
-        self.every, self.logger = every, logger
-        self.seed = int(env.worlds.now.seed[0, 0])
-        self.path: Path | None = None
-        self.best_return, self.best_episode, self._episodes = float("-inf"), -1, 0
-
-    def on_step(self, batch: TensorDictBase) -> None:
-        """Does nothing within an episode."""
-
-    def on_episode(self, episode: Episode, learning: Mapping[str, float]) -> None:
-        """Counts an episode; every `every` episodes evaluates, and saves the weights if they are better."""
-        self._episodes += 1
-        if self._episodes % self.every:
-            return
-        self.env.set_seed(self.seed)
-        played = evaluate(self.env, self.policy)
-        reached, _ = mean_return(played)
-        if self.logger is not None:
-            self.logger.log_scalar("evaluation/greedy_return", reached)
-        harvests = [episode.harvest for episode in played if episode.harvest is not None]
-        if harvests and not any(harvest.any() for harvest in harvests):
-            return
-        if reached > self.best_return:
-            self.best_return, self.best_episode = reached, self._episodes
-            self.path = save_weights(self.run, self.networks, name="best")
-
-
-def restore_weights(path: Path, networks: Mapping[str, nn.Module]) -> None:
-    """Loads saved weights into the networks of the same agents."""
-    kept = load_weights(Path(path))
-    if set(kept) != set(networks):
-        raise ValueError(f"{path} holds the weights of {sorted(kept)}; allowed: {sorted(networks)}")
-    for agent, network in networks.items():
-        try:
-            network.load_state_dict(kept[agent])
-        except (RuntimeError, TypeError, AttributeError) as error:
-            raise ValueError(f"{path} holds no weights of this network of {agent}: {error}") from error
-
-
 def load_weights(path: Path) -> dict[str, Any]:
     """The state dict of each agent's network, or the state of each transform; loads tensors only, and runs no
-    code of the file.
-    """
+    code of the file."""
     refuse_special(path)
     if path.exists():
         verify(path)
