@@ -7,7 +7,7 @@ import pytest
 import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from test_episodes import all_written_out, turn, written_out
+from test_episodes import all_written_out, turn
 from torchrl.envs import StepCounter, TransformedEnv
 from torchrl.envs.utils import RandomPolicy
 
@@ -363,15 +363,6 @@ def test_undefined_numbers_are_counted_apart():
     found = institution_measures({0: [first, second]})
     assert str(found["institutions/detection_rate"]) == "0.5, undefined in 1 of 2"
     assert not any(name.startswith("institutions") for name in social_measures({0: [first]}))
-
-
-def test_an_episode_does_not_change_when_the_next_one_is_played():
-    tracker = EpisodeTracker(1, 2)
-    (episode,) = [own for batch in an_episode() for own in tracker.add(batch)]
-    before = written_out(episode)
-    for batch in an_episode():
-        tracker.add(batch)
-    assert written_out(episode) == before
 
 
 MANY = (
