@@ -21,7 +21,6 @@ from cprl.learners.settings import DQNSettings, RolloutSettings, TabularSettings
 from cprl.learners.transitions import lane_turn, wanted_in
 from cprl.networks.agent import acting_part
 from cprl.population import Frozen, Learning, Scripted
-from cprl.runs.checkpoints import Checkpointer, checkpoints_in
 from cprl.training import train
 from cprl.training.agents import Population
 
@@ -201,53 +200,6 @@ def test_paid_for_the_group_is_another_learner_than_paid_for_itself():
     algorithm = ALGORITHMS["DQN"]
     members = [Learning(algorithm), Learning(algorithm, reward="team"), *[Scripted()] * 2]
     assert list(population(members).learners) == [(0,), (1,)]
-
-
-class AtSteps(Checkpointer):
-    def after_step(self, training):
-        if training.steps in (20, 45):
-            self.save(training)
-
-
-def assert_goes_on_bit_for_bit(members, tmp_path, *, episodes):
-    """A training that is stopped at its 47th turn and gone on with ends where one in one go does."""
-
-    class StopError(Exception):
-        pass
-
-    class Stopping(Returns):
-        turns = 0
-
-        def __init__(self, at):
-            super().__init__()
-            self.at = at
-
-        def on_step(self, batch):
-            self.turns += 1
-            if self.turns == self.at:
-                raise StopError
-
-    def run(name, *, stop_at=None):
-        agents = population(members)
-        (tmp_path / name).mkdir(exist_ok=True)
-        with AtSteps(tmp_path / name) as checkpoints:
-            try:
-                train(
-                    CommonsEnv(GAME, 2, seed=3),
-                    agents.learners,
-                    others=agents.others,
-                    episodes=episodes,
-                    callbacks=[Stopping(stop_at)],
-                    checkpointer=checkpoints,
-                )
-            except StopError:
-                assert checkpoints_in(tmp_path / name / "checkpoints")
-        return weights(agents)
-
-    whole = run("whole")
-    run("stopped", stop_at=47)
-    for key, value in run("stopped").items():
-        assert torch.equal(value, whole[key]), key
 
 
 def ran(tmp_path, members, name="run"):

@@ -2,14 +2,9 @@
 
 Modules, in the order in which one reads them:
     base          Algorithm, OffPolicy, OnPolicy, TeamAlgorithm: the base classes, also for your own
-    dqn           DQN and its variants, C51, CQL
-    actor_critic  SAC, IQL
-    pr2           PR2, which sees the actions of its peers
+    off_policy    DQN and its variants, C51, CQL, SAC, IQL; PR2, which sees the actions of its peers; tables
     on_policy     PPO, A2C, REINFORCE
-    teams         VDN, QMIX, MAPPO, IPPO
-    lola          LOLA, by policy gradients or DiCE
-    maddpg        MADDPG
-    tabular       tabular Q-learning
+    teams         VDN, QMIX, MAPPO, IPPO, MADDPG, LOLA
 """
 
 from cprl.algorithms.base import Algorithm, OffPolicy, OnPolicy, TeamAlgorithm

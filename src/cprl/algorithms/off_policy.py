@@ -1,4 +1,4 @@
-"""Algorithms that learn action values from replay: DQN and its variants, C51, CQL."""
+"""Algorithms that learn from replay: DQN, C51, CQL, SAC, IQL, PR2; and tabular Q-learning."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -282,7 +282,7 @@ class PR2(OffPolicy):
         super().__post_init__()
 
     def make_network(self, spaces: Spaces) -> nn.Module:
-        """See `Algorithm`.
+        """New networks of one agent.
 
         Raises:
             ValueError: for a game of one agent.

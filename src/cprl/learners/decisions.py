@@ -113,7 +113,7 @@ class BanditDecider(Decider):
         return decision_seeds(self._seed, replicas=numbers, agents=agents, purpose=purpose)
 
     def learn(self, replica: int, decision: Longs, returns: Doubles) -> None:
-        """See `Decider.learn`. A return that is not finite is left out."""
+        """Learns from an episode of a replica; a return that is not finite is left out."""
         firsts = np.cumsum([0, *self.sizes[:-1]])
         for agent, made in enumerate(choices_of(decision, self.sizes) + firsts):
             bandit = self.bandits[agent]
@@ -164,7 +164,6 @@ class BanditDecider(Decider):
         return {**super().get_extra_state(), **copies, "learned": self.learned()}
 
     def set_extra_state(self, state: Mapping[str, Any]) -> None:
-        """See `get_extra_state`."""
         super().set_extra_state(state)
         for name in ("values", "times", "episodes"):
             getattr(self, name)[:] = state[name].numpy(force=True)

@@ -5,12 +5,10 @@ Modules, in the order in which one reads them:
     convolutional  Conv: convolutions over rows and columns
     recurrent      GRU, LSTM: a state that is kept from turn to turn
     specification  Network: which of them an algorithm has; networks of your own
-    agent          several networks of one agent that learn together
-    distributional distributions of returns
-    joint          values of the actions of several agents together
+    agent          several networks of one agent, distributions of returns, values of joint actions
     team           the networks of a team
-    recurrent_team the same for recurrent ones
     stacked        the networks of many lanes as one
+    finite         whether weights are numbers
 """
 
 from cprl.networks.agent import AgentNetworks

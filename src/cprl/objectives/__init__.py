@@ -1,14 +1,10 @@
 """Losses that TorchRL lacks: each a `torchrl.objectives.LossModule` that works without the rest of cprl.
 
 Modules, in the order in which one reads them:
-    maddpg            MADDPGLoss: an actor and a centralised critic for each of several agents
-    log_cosh          ln cosh of an error, and TorchRL's DQN loss with it
-    td_loss           what losses share whose targets bootstrap by one step
-    pr2               probabilistic recursive reasoning: joint action values, the peers' expected answers
-    lola              gradients and losses that look one learning step of the others ahead
-    dice              what rollouts say of returns, differentiable any number of times
-    lola_losses       LOLALoss, LOLADiCELoss: the two put together for policies
-    iterated          the exact values of policies that remember one turn of a repeated matrix game
+    td       ln cosh of an error, and TorchRL's DQN loss with it; losses whose targets bootstrap by one step
+    maddpg   MADDPGLoss: an actor and a centralised critic for each of several agents
+    pr2      probabilistic recursive reasoning: joint action values, the peers' expected answers
+    lola     losses that look one learning step of the others ahead, by policy gradients and by DiCE
 """
 
 from cprl.objectives.lola import (

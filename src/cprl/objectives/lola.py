@@ -7,6 +7,12 @@ Sources: Foerster, Chen, Al-Shedivat, Whiteson, Abbeel and Mordatch, "Learning w
 Awareness" (2018), section 4, for `lola_gradients`; Foerster, Farquhar, Al-Shedivat, Rocktäschel, Xing and
 Whiteson, "DiCE: The Infinitely Differentiable Monte Carlo Estimator" (2018), section 5, for
 `look_ahead_losses`. Both treat two agents; with more, the terms of all others are summed.
+
+DiCE says of rollouts what returns are as numbers whose derivatives of any order are unbiased estimates. With
+advantages: Farquhar, Whiteson and Foerster, "Loaded DiCE: Trading off Bias and Variance in Any-Order Score
+Function Gradient Estimators for Reinforcement Learning" (2019). A rollout of T steps may hold several
+episodes, each a piece of it. Pieces do not influence each other, and the discount of a step counts from the
+begin of its piece.
 """
 
 from collections.abc import Callable, Sequence

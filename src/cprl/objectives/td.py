@@ -1,4 +1,5 @@
-"""The logarithm of the hyperbolic cosine of an error, which neither torch nor TorchRL has as a loss."""
+"""Losses by one step of temporal differences: ln cosh of the error, which neither torch nor TorchRL has, and
+what losses of our own share whose targets bootstrap so."""
 
 from math import log
 from typing import Any, Final, Self

@@ -2,9 +2,7 @@
 
 Modules, in the order in which one reads them:
     lanes           LaneActor: many agents at once, by the values or logits of their networks
-    recurrent       the same for networks with a state that is kept from turn to turn
-    single          one agent by TorchRL's modules
-    scripted        agents that follow a rule; scripted_rules and paths are compiled for them
+    scripted        agents that follow a rule; scripted_rules is compiled for them
     tabular         agents that look actions up in tables
     decisions       Decider: what agents decide at an episode's begin, where a game asks them
     assignment      AgentPolicies: which policy controls which agents
