@@ -4,16 +4,14 @@ Each raises a ValueError for what does not fit; none rounds. The defaults are th
 command line share, which answers without importing the functions.
 """
 
-import os
 from collections.abc import Iterable, Mapping, Sequence
 from operator import index
-from pathlib import Path
 from typing import Any, Final, Literal
 
 import numpy as np
 from numpy.typing import NDArray
 
-from cprl.checks import TEXT, checked, is_number, plain, shown, tuple_of
+from cprl.checks import is_number, plain, shown
 
 HIGHEST_SEED: Final = 2**64 - 1
 
@@ -86,12 +84,6 @@ def choice(name: str, value: Any, allowed: Iterable[str]) -> None:
         raise refusal(name, value, ", ".join(names))
 
 
-def switch(name: str, value: Any) -> None:
-    """Raises a ValueError unless a value is True or False."""
-    if not isinstance(value, bool):
-        raise refusal(name, value, "True or False")
-
-
 def object_of(name: str, value: Any, kind: Any, allowed: str) -> None:
     """Raises a ValueError unless a value is an instance of a class, or of one of several."""
     if not isinstance(value, kind):
@@ -125,25 +117,6 @@ def floats(name: str, values: Any) -> NDArray[np.float64]:
     except (TypeError, ValueError, OverflowError, RuntimeError):
         pass
     raise refusal(name, values, "an array of numbers")
-
-
-def path(name: str, value: Any) -> Path:
-    """A text or another path as a `Path`; raises a ValueError for anything else, and for a text with NUL."""
-    if not isinstance(value, str | os.PathLike) or "\0" in os.fspath(value):
-        raise refusal(name, value, "a path, without NUL")
-    return Path(value)
-
-
-def texts(name: str, value: Any, at_least: int = 0) -> tuple[str, ...]:
-    """Texts, at least so many; raises a ValueError for anything else, a single text included."""
-    found: tuple[str, ...] = checked(name, value, tuple_of(TEXT, at_least))
-    return found
-
-
-def callable_of(name: str, value: Any, allowed: str) -> None:
-    """Raises a ValueError for what cannot be called."""
-    if not callable(value):
-        raise refusal(name, value, allowed)
 
 
 def objects(name: str, value: Any, kind: Any, allowed: str) -> tuple[Any, ...]:

@@ -5,9 +5,10 @@ its appendix A, and the parameters and behaviour of the study's program.
 """
 
 from dataclasses import replace
+from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final, Literal, get_args
 
-from cprl.arguments import path, refusal
+from cprl.arguments import refusal
 from cprl.checks import checked, one_of
 from cprl.commons import maps
 from cprl.commons.game import Game
@@ -61,7 +62,7 @@ GAMES: Final[tuple[tuple[Board, Variant], ...]] = tuple(_BOARD_RULES)
 
 def check_board(board: object) -> None:
     """Refuse a word that names neither a published board nor a run's directory nor a file."""
-    if board not in BOARDS and not path("board", board).exists():
+    if board not in BOARDS and not Path(board).exists():
         raise refusal("board", board, f"{', '.join(BOARDS)}, a run's directory, or a file with a drawing")
 
 

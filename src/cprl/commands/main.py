@@ -186,7 +186,6 @@ def export(run: Path, folder: Path, /, *, weights: bool = True) -> None:
     """Copies what a report needs of a finished run, small enough to be committed.
 
     Args:
-        run: the run's directory.
         folder: where to.
         weights: also the trained weights. Without them a report tells of the training alone, and nothing can
             play the agents.

@@ -266,7 +266,6 @@ def flags_of(value: Any, *, all_agents: bool = True) -> tuple[Any, Any]:
     """The type of a dataclass of the flags of a dataclass, and its default, which says the same.
 
     Args:
-        value: the dataclass.
         all_agents: whether values of a tuple that equal one before have flags; for `--help` they have none.
     """
     kind, help_of = type(value), docs(type(value))

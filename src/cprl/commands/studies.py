@@ -123,7 +123,6 @@ def study_main(study: "Study", argv: Sequence[str] | None = None) -> Path:
     """Runs a study as the command line asks for it; a recipe of a study ends with it.
 
     Args:
-        study: what is run.
         argv: the command line, script first; by default that of this process.
 
     Returns:
@@ -408,8 +407,6 @@ def carry_out(what: "Study | Search", options: StudyOptions, command: Sequence[s
     """Runs a study or a search as the command line asks for it, and says what came of it.
 
     Args:
-        what: the study or search.
-        options: how it is run.
         command: the command line, script first, which is said where it can be used again.
 
     Returns:
