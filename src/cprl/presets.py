@@ -60,7 +60,7 @@ GAMES: Final[tuple[tuple[Board, Variant], ...]] = tuple(_BOARD_RULES)
 """Every board with each of its variants."""
 
 
-def check_board(board: object) -> None:
+def check_board(board: str) -> None:
     """Refuse a word that names neither a published board nor a run's directory nor a file."""
     if board not in BOARDS and not Path(board).exists():
         raise refusal("board", board, f"{', '.join(BOARDS)}, a run's directory, or a file with a drawing")
