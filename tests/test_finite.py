@@ -74,8 +74,8 @@ LEARNERS = {
     "Tabular": (Tabular(settings=TabularSettings()), {}),
     "VDN": (VDN(settings=REPLAY), {"reward_kind": "team"}),
     "QMIX": (QMIX(settings=REPLAY), {"reward_kind": "team"}),
-    "IPPO": (IPPO(settings=ROLLOUT), {"reward_kind": "individual"}),
-    "MADDPG": (MADDPG(settings=REPLAY), {"reward_kind": "individual"}),
+    "IPPO": (IPPO(settings=ROLLOUT), {}),
+    "MADDPG": (MADDPG(settings=REPLAY), {}),
     "MAPPO": (MAPPO(settings=ROLLOUT), {"reward_kind": "team"}),
     "LOLA": (LOLA(settings=LOOK), {}),
     "LOLA by DiCE": (LOLA(settings=LOOK, estimator="dice"), {}),
@@ -84,10 +84,10 @@ REPLICAS, BROKEN = 3, (1, 0)
 """The replica and the agent that break."""
 
 
-def make_learner(name, *, replicas=REPLICAS):
+def make_learner(name, **changes):
     algorithm, how = LEARNERS[name]
-    how = {"engine": "eager", "reward_kind": "individual", **how}
-    return algorithm.make_learner(GAME.spaces, agents=(0, 1), replicas=replicas, seed=5, **how)
+    how = {"engine": "eager", "reward_kind": "individual", "replicas": REPLICAS, **how, **changes}
+    return algorithm.make_learner(GAME.spaces, agents=(0, 1), seed=5, **how)
 
 
 def tensors_of(learner, replica, agent):
@@ -106,16 +106,19 @@ def tensors_of(learner, replica, agent):
 
 
 class Breaks:
-    """Makes the weights of a lane NaN, or whatever it is told to, at a step."""
+    """Makes the weights of a lane NaN at a step."""
 
-    def __init__(self, learner, *, step, value=torch.nan):
-        self.learner, self.step, self.value, self.steps = learner, step, value, 0
+    def __init__(self, step):
+        self.step, self.steps = step, 0
+
+    def on_start(self, training):
+        (self.learner,) = training.learners.values()
 
     def on_step(self, batch):
         self.steps += 1
         if self.steps == self.step:
             for tensor in tensors_of(self.learner, *BROKEN):
-                tensor.fill_(self.value)
+                tensor.fill_(torch.nan)
 
 
 class Witness:
@@ -129,11 +132,14 @@ class Witness:
         self.returns.setdefault(episode.world, []).append(episode.return_.tolist())
 
 
-def play(learner, *, breaks=None, episodes=3, seed=2, **how):
+def play(learner, *callbacks, episodes=3, **how):
+    """The training, and what was seen of it."""
     witness = Witness()
-    callbacks = [witness, *([breaks] if breaks else [])]
-    env = CommonsEnv(GAME, learner.replicas, seed=seed)
-    return train(env, {learner.agents: learner}, episodes=episodes, callbacks=callbacks, **how), witness
+    env = CommonsEnv(GAME, learner.replicas, seed=2)
+    training = train(
+        env, {learner.agents: learner}, episodes=episodes, callbacks=[witness, *callbacks], **how
+    )
+    return training, witness
 
 
 @pytest.mark.integration
@@ -143,31 +149,36 @@ def test_a_lane_that_breaks_stops_the_training_and_is_named(name):
     of_team = name in ("VDN", "QMIX", "IPPO", "MAPPO", "MADDPG") or name.startswith("LOLA")
     agents = r"agents 0, 1" if of_team else "agent 0"
     with pytest.raises(NotFiniteError, match=rf"^at step \d+ .*the weights of {agents} in replica 1 are not"):
-        play(learner, breaks=Breaks(learner, step=14))
+        play(learner, Breaks(14))
     assert learner.finite()[[0, 2]].all()
     assert not learner.finite()[BROKEN]
 
 
 FEW = ("PPO", "Tabular", "VDN")
-CONTINUING = [name if name in FEW else pytest.param(name, marks=pytest.mark.slow) for name in LEARNERS]
+CONTINUING = [
+    *(pytest.param(name, {}, marks=() if name in FEW else pytest.mark.slow) for name in LEARNERS),
+    *(
+        pytest.param(name, {"engine": "compiled"}, marks=pytest.mark.slow)
+        for name in ("DQN", "PPO", "VDN", "MAPPO")
+    ),
+]
 
 
 @pytest.mark.integration
-@pytest.mark.parametrize("name", CONTINUING)
-def test_with_continue_a_broken_lane_is_named_once_and_other_replicas_learn_as_without_it(name):
-    whole, sound = make_learner(name), make_learner(name)
+@pytest.mark.parametrize(("name", "engine"), CONTINUING)
+def test_with_continue_a_broken_lane_is_named_once_and_other_replicas_learn_as_without_it(name, engine):
+    whole, sound = make_learner(name, **engine), make_learner(name, **engine)
     with pytest.warns(RuntimeWarning, match=r"replica 1 .*not finite.*; the others train on") as warned:
-        training, seen = play(whole, breaks=Breaks(whole, step=14), episodes=4, on_nan="continue")
-    named = [str(one.message) for one in warned if "not finite" in str(one.message)]
-    assert len(named) == 1
+        training, seen = play(whole, Breaks(14), episodes=4, on_nan="continue")
+    assert sum("not finite" in str(warning.message) for warning in warned) == 1
     _, wanted = play(sound, episodes=4)
     for replica in (0, 2):
         assert seen.returns[replica] == wanted.returns[replica]
         for agent in (0, 1):
             lane = f"replica_{replica}/agent_{agent}"
-            mine, theirs = (own.networks()[lane].state_dict() for own in (whole, sound))
-            assert all(torch.equal(mine[key], theirs[key]) for key in theirs)
-    assert {one.replica for one in training.finite.found} == {1}
+            weights, sound_weights = (each.networks()[lane].state_dict() for each in (whole, sound))
+            assert all(torch.equal(weights[key], value) for key, value in sound_weights.items())
+    assert {each.replica for each in training.finite.found} == {1}
     assert all(0 <= int(action) < GAME.spaces.actions for turn in seen.actions for action in turn.flatten())
 
 
@@ -249,33 +260,38 @@ class Poison(Transform):
         return tensordict_reset
 
 
+def poisoned(entry, *, step, learning_starts=4, steps=5, **how):
+    """A training in a game that makes an entry NaN, of world 2 and agent 1, from a step on."""
+    env = TransformedEnv(MatrixGame(3, steps=steps), Poison(entry, world=2, agent=1, step=step, **how))
+    algorithm = DQN(settings=replace(REPLAY, learning_starts=learning_starts))
+    learner = algorithm.make_learner(spaces_of(env), agents=(0, 1), replicas=3, engine="eager")
+    return Training(env, {(0, 1): learner}, episodes=3)
+
+
+def step(training, steps):
+    for _ in range(steps):
+        training.step()
+
+
 @pytest.mark.parametrize(
-    ("poison", "message"),
+    ("entry", "poison", "message"),
     [
-        ({"name": "reward", "step": 4}, "at step 4 .*the reward"),
-        ({"name": "observation", "step": 3}, "at step 3 the observation"),
-        ({"name": "observation", "step": 99, "reset": True}, "at step 1 the observation"),
+        ("reward", {"step": 4}, "at step 4 .*the reward"),
+        ("observation", {"step": 3}, "at step 3 the observation"),
+        ("observation", {"step": 99, "reset": True}, "at step 1 the observation"),
     ],
 )
 def test_rewards_and_observations_that_are_not_finite_are_blamed_on_the_environment(
-    poison, message, looks_every_step
+    entry, poison, message, looks_every_step
 ):
-    env = TransformedEnv(MatrixGame(3), Poison(world=2, agent=1, **poison))
-    learner = DQN(settings=REPLAY).make_learner(spaces_of(env), agents=(0, 1), replicas=3, engine="eager")
-    match = (
-        f"^{message} of agent 1 in replica 2(,| is).* not finite.*it comes from the environment.* transforms"
-    )
-    with pytest.raises(NotFiniteError, match=match):
-        train(env, {(0, 1): learner}, episodes=3)
+    whose = r"of agent 1 in replica 2(,| is).* not finite.*it comes from the environment.* transforms"
+    with pytest.raises(NotFiniteError, match=f"^{message} {whose}"):
+        step(poisoned(entry, **poison), 12)
 
 
 def test_rewards_are_looked_at_every_sixteen_steps_and_when_episodes_end():
-    env = TransformedEnv(MatrixGame(3, steps=20), Poison("reward", world=2, agent=1, step=2))
-    algorithm = DQN(settings=replace(REPLAY, learning_starts=90))
-    learner = algorithm.make_learner(spaces_of(env), agents=(0, 1), replicas=3, engine="eager")
-    training = Training(env, {(0, 1): learner}, episodes=3)
-    for _ in range(15):
-        training.step()
+    training = poisoned("reward", step=2, steps=20, learning_starts=90)
+    step(training, 15)
     with pytest.raises(NotFiniteError, match=r"^at step 16 the reward of agent 1 in replica 2 is not finite"):
         training.step()
 
@@ -284,64 +300,61 @@ def test_on_a_gpu_observations_are_looked_at_when_episodes_end():
     class OnGpu(FiniteCheck):
         is_on_cpu = staticmethod(lambda tensor: False)
 
-    env = TransformedEnv(MatrixGame(3), Poison("observation", world=2, agent=1, step=2))
-    algorithm = DQN(settings=replace(REPLAY, learning_starts=9))
-    learner = algorithm.make_learner(spaces_of(env), agents=(0, 1), replicas=3, engine="eager")
-    training = Training(env, {(0, 1): learner}, episodes=3)
-    training.finite = OnGpu(training.learners, spaces_of(env), on_nan="continue")
-    for _ in range(4):
-        training.step()
+    training = poisoned("observation", step=2, learning_starts=9)
+    training.finite = OnGpu(training.learners, training.learners[0, 1].spaces, on_nan="continue")
+    step(training, 4)
     with pytest.warns(RuntimeWarning, match=r"at step 5 .*the observation of agent 1 in replica 2"):
         training.step()
-    assert {one.place for one in training.finite.found} >= {("observation", 2, 1)}
+    assert {each.place for each in training.finite.found} >= {("observation", 2, 1)}
+
+
+def a_training(**how):
+    learner = make_learner("DQN")
+    return Training(CommonsEnv(GAME, REPLICAS, seed=2), {(0, 1): learner}, episodes=9, **how)
 
 
 def test_no_checkpoint_holds_what_is_not_finite_and_the_last_one_is_kept(tmp_path):
-    learner = make_learner("DQN")
-    training = Training(CommonsEnv(GAME, REPLICAS, seed=2), {(0, 1): learner}, episodes=9)
+    training, again = a_training(), a_training()
     with Checkpointer(tmp_path) as checkpointer:
-        for _ in range(9):
-            training.step()
+        step(training, 9)
         checkpointer.save(training)
         kept = checkpoints_in(tmp_path / "checkpoints")
-        tensors_of(learner, *BROKEN)[1].fill_(-torch.inf)
+        tensors_of(training.learners[0, 1], *BROKEN)[1].fill_(-torch.inf)
         match = r"at step 9 the weights of agent 0 in replica 1 are .*; what was saved at step 9 is finite$"
         with pytest.raises(NotFiniteError, match=match):
             checkpointer.save(training)
         assert checkpoints_in(tmp_path / "checkpoints") == kept
-        again = Training(CommonsEnv(GAME, REPLICAS, seed=2), {(0, 1): make_learner("DQN")}, episodes=9)
         checkpointer.restore(again)
         assert again.steps == 9
         assert again.learners[0, 1].finite().all()
 
 
 def test_with_continue_the_last_sound_checkpoint_is_kept_beside_the_others(tmp_path):
-    learner = make_learner("DQN")
-    how = {"episodes": 9, "on_nan": "continue"}
-    training = Training(CommonsEnv(GAME, REPLICAS, seed=2), {(0, 1): learner}, **how)
+    training, again = a_training(on_nan="continue"), a_training(on_nan="continue")
+    folder = tmp_path / "checkpoints"
     with Checkpointer(tmp_path) as checkpointer:
-        for _ in range(3):
-            training.step()
-            checkpointer.save(training)
-        (sound,) = checkpoints_in(tmp_path / "checkpoints")[-1:]
-        tensors_of(learner, *BROKEN)[0].fill_(torch.nan)
+
+        def step_and_save(training, steps):
+            for _ in range(steps):
+                training.step()
+                checkpointer.save(training)
+
+        step_and_save(training, 3)
+        sound = checkpoints_in(folder)[-1]
+        tensors_of(training.learners[0, 1], *BROKEN)[0].fill_(torch.nan)
         with pytest.warns(RuntimeWarning, match="weights of agent 0 in replica 1"):
             checkpointer.save(training)
-        for _ in range(4):
-            training.step()
-            checkpointer.save(training)
-        kept = tmp_path / "checkpoints" / f"sound-{sound.name}"
+        step_and_save(training, 4)
+        kept = folder / f"sound-{sound.name}"
         assert kept.exists()
-        assert sound not in checkpoints_in(tmp_path / "checkpoints")
-        again = Training(CommonsEnv(GAME, REPLICAS, seed=2), {(0, 1): make_learner("DQN")}, **how)
+        assert sound not in checkpoints_in(folder)
         checkpointer.restore(again)
         with warnings.catch_warnings():
             warnings.simplefilter("error")
-            again.step()
-            checkpointer.save(again)
+            step_and_save(again, 1)
         assert not again.is_sound
         kept.rename(sound)
-        for path in checkpoints_in(tmp_path / "checkpoints"):
+        for path in checkpoints_in(folder):
             if path != sound:
                 path.unlink()
         checkpointer.restore(again)
@@ -360,13 +373,8 @@ def test_a_learner_of_somebodys_own_that_refuses_nan_is_explained():
         GAME.spaces, kind=Refuses, agents=(0, 1), replicas=REPLICAS, settings=REPLAY, compile=False
     )
     with pytest.raises(NotFiniteError, match="at step 6 the weights of agent 0 in replica 1 are") as caught:
-        play(learner, breaks=Breaks(learner, step=5))
+        play(learner, Breaks(5))
     assert "probability tensor" in str(caught.value.__context__)
-
-
-def test_on_nan_is_stop_or_continue():
-    with pytest.raises(ValueError, match="on_nan is 'go on'"):
-        play(make_learner("DQN"), on_nan="go on")
 
 
 def experiment(**changes):
@@ -374,77 +382,33 @@ def experiment(**changes):
     return Experiment(name="breaks", game=GAME, agents=(Learning(DQN(settings=REPLAY)),) * 2, **how)
 
 
-@pytest.mark.integration
-def test_an_experiment_says_what_happens_and_its_summary_names_who_is_broken(
-    tmp_path, capsys, looks_every_step
-):
-    poison = Custom("test_finite:Breaking", arguments={"step": 5})
-    with pytest.raises(NotFiniteError, match=r"at step 6 .*agent 0 in replica 1"):
-        run(experiment(callbacks=(poison,)), tmp_path / "stops", watch="off")
-    continuing = experiment(callbacks=(poison,), on_nan="continue")
-    with pytest.warns(RuntimeWarning, match=r"at step 6 .*agent 0 in replica 1"):
-        directory = run(continuing, tmp_path / "continues", watch="off")
-    told = capsys.readouterr().out
-    assert "From step 6 on the loss of agent 0 in replica 1, and the weights of agent 0 in replica 1" in told
-    found = json.loads((directory / "report.json").read_text())["not_finite"]
-    assert found[0] == {"what": "loss", "replica": 1, "agent": 0, "step": 6}
-    assert Experiment.from_config(continuing.to_config(), allow=["test_finite:Breaking"]) == continuing
-    with pytest.raises(ValueError, match=r"experiment\.on_nan is 'no'"):
-        experiment(on_nan="no")
-
-
-def test_the_command_line_says_it_too():
+def test_on_nan_is_stop_or_continue_and_the_command_line_says_it_too():
+    for refused in (lambda: play(make_learner("DQN"), on_nan="no"), lambda: experiment(on_nan="no")):
+        with pytest.raises(ValueError, match="on_nan is 'no'"):
+            refused()
     assert parse(experiment, ["recipe.py"])[0].on_nan == "stop"
     assert parse(experiment, ["recipe.py", "--on-nan", "continue"])[0].on_nan == "continue"
 
 
-class Breaking:
-    """Makes the weights of the first lane's neighbour NaN at a step."""
-
-    def __init__(self, step):
-        self.step = step
-
-    def on_start(self, training):
-        (learner,) = training.learners.values()
-        self.breaks = Breaks(learner, step=self.step)
-
-    def on_step(self, batch):
-        self.breaks.on_step(batch)
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("name", ["DQN", "PPO", "VDN", "MAPPO"])
-def test_compiled_lanes_learn_on_beside_a_broken_one(name):
-    algorithm, how = LEARNERS[name]
-    how = {"reward_kind": "individual", **how, "engine": "compiled"}
-    whole, sound = (
-        algorithm.make_learner(GAME.spaces, agents=(0, 1), replicas=REPLICAS, seed=5, **how) for _ in range(2)
-    )
-    with pytest.warns(RuntimeWarning, match=r"replica 1 .*not finite.*; the others train on"):
-        _, seen = play(whole, breaks=Breaks(whole, step=14), episodes=4, on_nan="continue")
-    _, wanted = play(sound, episodes=4)
-    for replica in (0, 2):
-        assert seen.returns[replica] == wanted.returns[replica]
-        for agent in (0, 1):
-            lane = f"replica_{replica}/agent_{agent}"
-            mine, theirs = (own.networks()[lane].state_dict() for own in (whole, sound))
-            assert all(torch.equal(mine[key], theirs[key]) for key in theirs)
-
-
 @pytest.mark.integration
-def test_a_training_that_stopped_is_resumed_with_continue(tmp_path, looks_every_step):
+def test_a_run_that_stopped_is_resumed_with_continue_and_its_summary_names_who_is_broken(
+    tmp_path, capsys, looks_every_step
+):
+    stopping = experiment(callbacks=(Custom("test_finite:Breaks", arguments={"step": 5}),))
     with pytest.raises(NotFiniteError, match=r"at step 6 .*agent 0 in replica 1") as stopped:
-        run(
-            experiment(callbacks=(Custom("test_finite:Breaking", arguments={"step": 5}),)),
-            tmp_path / "run",
-            watch="off",
-        )
+        run(stopping, tmp_path / "run", watch="off")
     assert any("To resume:" in note for note in stopped.value.__notes__)
-    again = experiment(callbacks=(Custom("test_finite:Breaking", arguments={"step": 5}),), on_nan="continue")
-    with pytest.warns(RuntimeWarning, match=r"at step 6 .*; the others train on"):
-        run(again, tmp_path / "run", watch="off", resume=True)
-    loaded = load(tmp_path / "run", allow=["test_finite:Breaking"])
-    assert loaded.experiment == again
+    continuing = replace(stopping, on_nan="continue")
+    with pytest.warns(RuntimeWarning, match=r"at step 6 .*agent 0 in replica 1.*; the others train on"):
+        directory = run(continuing, tmp_path / "run", watch="off", resume=True)
+    printed = capsys.readouterr().out
+    assert (
+        "From step 6 on the loss of agent 0 in replica 1, and the weights of agent 0 in replica 1" in printed
+    )
+    found = json.loads((directory / "report.json").read_text())["not_finite"]
+    assert found[0] == {"what": "loss", "replica": 1, "agent": 0, "step": 6}
+    loaded = load(directory, allow=["test_finite:Breaks"])
+    assert loaded.experiment == continuing
     assert loaded.agent(0, replica=0).network is not None
     with pytest.raises(ValueError, match="weights of replica_1/agent_0 are NaN or infinite"):
         loaded.agent(0, replica=1)

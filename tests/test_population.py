@@ -6,7 +6,6 @@ from typing import ClassVar
 import pytest
 import torch
 from dqn_parts import q_table
-from torchrl.objectives import ClipPPOLoss
 
 import cprl
 from cprl import CommonsEnv, Experiment, Game, Observation, Rules, maps
@@ -58,20 +57,8 @@ ALGORITHMS = {
     "A2C": A2C(settings=replace(ROLLOUTS, epochs=1)),
     "REINFORCE": Reinforce(settings=replace(ROLLOUTS, epochs=1)),
 }
-WAYS = {
-    "DQN": "lane_axis",
-    "double DQN": "lane_axis",
-    "Huber DQN": "lane_axis",
-    "log-cosh DQN": "lane_axis",
-    "C51": "lane_axis_flat",
-    "CQL": "lane_axis",
-    "SAC": "vmapped",
-    "IQL": "vmapped",
-    "PR2": "lane_axis",
-    "PPO": "lane_axis",
-    "A2C": "lane_axis",
-    "REINFORCE": "lane_axis",
-}
+WAYS = dict.fromkeys(ALGORITHMS, "lane_axis")
+WAYS |= {"C51": "lane_axis_flat", "SAC": "vmapped", "IQL": "vmapped"}
 FOUR = tuple(range(4))
 
 
@@ -128,30 +115,28 @@ def assert_all_weights_move_and_replicas_learn_apart(together, alone):
 @pytest.mark.parametrize("name", ALGORITHMS)
 def test_each_loss_takes_the_fastest_way_that_agrees_with_a_list_of_torchrls_losses(name):
     algorithm = ALGORITHMS[name]
-    members = [Learning(algorithm)] * 4
-    found = population(members, replicas=1)
-    (learner,) = found.learners.values()
-    kind, common = type(learner), {"agents": FOUR, "replicas": 1, "settings": algorithm.settings, "seed": 3}
-    common |= {
+    (learner,) = population([Learning(algorithm)] * 4, replicas=1).learners.values()
+    how = {
+        "agents": FOUR,
+        "replicas": 1,
+        "settings": algorithm.settings,
+        "seed": 3,
         "make_network": lambda: algorithm.make_network(GAME.spaces),
         "make_loss": algorithm.make_loss,
         "compile": False,
     }
-    if kind is ReplayLearner:
-        common |= {"stochastic": algorithm.stochastic, "sees_peers": algorithm.sees_peers_actions}
-    by_list, named = (
-        kind(GAME.spaces, engine="list", **common),
-        kind(GAME.spaces, engine=WAYS[name], **common),
-    )
-    ends = []
-    for one in (learner, named, by_list):
-        env = CommonsEnv(GAME, 1, seed=3)
-        train(env, {FOUR: one}, episodes=5)
-        ends.append([one.engine.network_state(lane) for lane in range(4)])
-    for mine, theirs, reference in zip(*ends, strict=True):
+    if type(learner) is ReplayLearner:
+        how |= {"stochastic": algorithm.stochastic, "sees_peers": algorithm.sees_peers_actions}
+    named, by_list = (type(learner)(GAME.spaces, engine=way, **how) for way in (WAYS[name], "list"))
+    for each in (learner, named, by_list):
+        train(CommonsEnv(GAME, 1, seed=3), {FOUR: each}, episodes=5)
+    for lane in range(4):
+        state, state_by_name, reference = (
+            each.engine.network_state(lane) for each in (learner, named, by_list)
+        )
         for key, value in reference.items():
-            assert torch.equal(mine[key], theirs[key]), "this is the way that is found"
-            torch.testing.assert_close(mine[key], value, rtol=1e-3, atol=1e-5)
+            assert torch.equal(state[key], state_by_name[key]), "this is the way that is found"
+            torch.testing.assert_close(state[key], value, rtol=1e-3, atol=1e-5)
 
 
 def test_unlike_agents_sit_side_by_side_in_one_training_and_like_ones_are_lanes():
@@ -170,50 +155,41 @@ def test_unlike_agents_sit_side_by_side_in_one_training_and_like_ones_are_lanes(
         assert not torch.equal(value, before[key])
 
 
-def test_equal_learners_are_lanes_even_if_they_were_written_down_twice():
-    twice = population([Learning(DQN(settings=REPLAY)) for _ in range(4)])
-    assert list(twice.learners) == [FOUR]
-    unequal = [Learning(DQN(settings=replace(REPLAY, gamma=gamma))) for gamma in (0.9, 0.9, 0.5, 0.5)]
-    assert list(population(unequal).learners) == [(0, 1), (2, 3)]
+def of_gamma(gamma):
+    return Learning(DQN(settings=replace(REPLAY, gamma=gamma)))
+
+
+@pytest.mark.parametrize(
+    ("members", "lanes"),
+    [
+        ([of_gamma(0.9) for _ in range(4)], [FOUR]),
+        ([of_gamma(gamma) for gamma in (0.9, 0.9, 0.5, 0.5)], [(0, 1), (2, 3)]),
+        ([of_gamma(0.9), replace(of_gamma(0.9), reward="team"), *[Scripted()] * 2], [(0,), (1,)]),
+    ],
+)
+def test_equal_learners_are_lanes_and_those_of_another_value_or_reward_are_not(members, lanes):
+    assert list(population(members).learners) == lanes
 
 
 def test_who_is_paid_for_the_group_gets_the_sum_of_all_rewards():
     env = CommonsEnv(GAME, 2, seed=1)
     policy = population([Scripted("greedy")] * 4).policy(1)
     moment = env.step(policy(env.reset()))
-    rewards = moment["next", "agents", "reward"].squeeze(-1)
-    for _ in range(8):
+    while not moment["next", "agents", "reward"].any():
         moment = env.step(policy(moment["next"].exclude(("agents", "reward"))))
-        rewards = moment["next", "agents", "reward"].squeeze(-1)
-        if rewards.sum():
-            break
-    assert rewards.sum() > 0
-    own, group = (
+    rewards = moment["next", "agents", "reward"].squeeze(-1)
+    alone, group = (
         lane_turn((1, 3), moment, wanted_in(WantedRewards(preference), moment)).reward
         for preference in ("individual", "team")
     )
-    assert own.tolist() == rewards[:, [1, 3]].flatten().tolist()
+    assert alone.tolist() == rewards[:, [1, 3]].flatten().tolist()
     assert group.tolist() == rewards.sum(1).repeat_interleave(2).tolist()
-
-
-def test_paid_for_the_group_is_another_learner_than_paid_for_itself():
-    algorithm = ALGORITHMS["DQN"]
-    members = [Learning(algorithm), Learning(algorithm, reward="team"), *[Scripted()] * 2]
-    assert list(population(members).learners) == [(0,), (1,)]
 
 
 def ran(tmp_path, members, name="run"):
     """A whole run of these agents, and its networks."""
-    experiment = Experiment(
-        name="mixed",
-        game=GAME,
-        agents=members,
-        replicas=2,
-        episodes=4,
-        seed=3,
-        evaluation_episodes=2,
-        engine="eager",
-    )
+    how = {"replicas": 2, "episodes": 4, "seed": 3, "evaluation_episodes": 2, "engine": "eager"}
+    experiment = Experiment(name="mixed", game=GAME, agents=members, **how)
     run = cprl.run(experiment, tmp_path / name, watch="off")
     return run, cprl.load(run).networks
 
@@ -243,34 +219,50 @@ def test_a_mixed_run_is_kept_evaluated_and_built_again_from_its_directory(tmp_pa
     assert actions.shape == (2, 4)
 
 
-@pytest.mark.integration
-def test_a_frozen_agent_plays_what_it_learned_and_changes_no_more(tmp_path, monkeypatch, capsys):
-    monkeypatch.chdir(tmp_path)
-    run, earlier = ran(tmp_path, [Learning(ALGORITHMS["DQN"])] * 4)
-    frozen = population([Frozen(run, 2, replica=1), *[Learning(ALGORITHMS["DQN"])] * 3])
-    (agents, actor), *rest = frozen.others.items()
-    assert (agents, rest) == ((0,), [])
+@pytest.fixture(scope="module")
+def earlier(tmp_path_factory):
+    """A run of three agents by DQN and one by PPO, and its networks."""
+    members = [Learning(ALGORITHMS["DQN"])] * 3 + [Learning(ALGORITHMS["PPO"])]
+    return ran(tmp_path_factory.mktemp("earlier"), members)
+
+
+@pytest.fixture
+def windows():
+    """What all agents see at first in two worlds."""
+    return CommonsEnv(GAME, 2, seed=9).reset()["agents", "observation"]
+
+
+def first_of(spec):
+    """The actor of an agent beside three that play by chance; it does not explore."""
+    actor = population([spec, *[Scripted()] * 3]).others[0,]
     actor.epsilon = 0.0
-    seen = CommonsEnv(GAME, 2, seed=9).reset()["agents", "observation"][:, :1]
-    network = earlier["replica_1/agent_2"]
-    assert torch.equal(actor.choose(seen), network(seen).argmax(-1))
+    return actor
+
+
+@pytest.mark.integration
+def test_a_frozen_agent_plays_what_it_learned_and_changes_no_more(earlier, windows, tmp_path, monkeypatch):
+    run, networks = earlier
+    monkeypatch.chdir(run.parent)
+    seen, network = windows[:, :1], networks["replica_1/agent_2"]
+    assert torch.equal(first_of(Frozen(run, 2, replica=1)).choose(seen), network(seen).argmax(-1))
+    frozen = population([Frozen(run, 2, replica=1), *[Learning(ALGORITHMS["DQN"])] * 3])
+    assert list(frozen.others) == [(0,)]
     before = frozen.others[0,].values(seen).clone()
     trained(frozen)
     assert torch.equal(frozen.others[0,].values(seen), before)
     assert sorted({name.split("/")[1] for name in frozen.networks()}) == ["agent_1", "agent_2", "agent_3"]
     again, _ = ran(tmp_path, [Frozen("run", 2), *[Scripted()] * 3], name="again")
     assert cprl.load(again).specs[0] == Frozen("run", 2)
-    assert str(tmp_path) not in (again / "recipe.json").read_text().split('"command"')[0]
-    monkeypatch.chdir(tmp_path.parent)
+    assert str(run.parent) not in (again / "recipe.json").read_text().split('"command"')[0]
+    monkeypatch.chdir(run.parent.parent)
     moved = cprl.load(again)
-    assert moved.specs[0] == Frozen(f"{tmp_path.name}/run", 2)
-    assert torch.equal(moved.agent(0).network(seen), earlier["replica_0/agent_2"](seen))
+    assert moved.specs[0] == Frozen(f"{run.parent.name}/run", 2)
+    assert torch.equal(moved.agent(0).network(seen), networks["replica_0/agent_2"](seen))
 
 
 @pytest.mark.integration
-def test_frozen_agents_of_one_run_act_as_lanes_of_one_actor_and_as_alone(tmp_path, monkeypatch, capsys):
-    monkeypatch.chdir(tmp_path)
-    run, _ = ran(tmp_path, [Learning(ALGORITHMS["DQN"])] * 3 + [Learning(ALGORITHMS["PPO"])])
+def test_frozen_agents_of_one_run_act_as_lanes_of_one_actor_and_as_alone(earlier, windows):
+    run, _ = earlier
     specs = [
         Frozen(run, 2, replica=1),
         Frozen(run, 0, replica=None),
@@ -279,38 +271,34 @@ def test_frozen_agents_of_one_run_act_as_lanes_of_one_actor_and_as_alone(tmp_pat
     ]
     together = population(specs).others
     assert list(together) == [(0, 1, 3), (2,)], "agents of one kind"
-    seen = CommonsEnv(GAME, 2, seed=9).reset()["agents", "observation"]
-    chosen = torch.stack([together[0, 1, 3].choose(seen[:, [0, 1, 3]]) for _ in range(20)])
+    chosen = torch.stack([together[0, 1, 3].choose(windows[:, [0, 1, 3]]) for _ in range(20)])
     for place, agent in enumerate((0, 1, 3)):
         members = [Scripted()] * 4
         members[agent] = specs[agent]
         alone = population(members).others[agent,]
         for turn in chosen:
-            assert torch.equal(turn[:, place], alone.choose(seen[:, [agent]])[:, 0])
+            assert torch.equal(turn[:, place], alone.choose(windows[:, [agent]])[:, 0])
 
 
 @pytest.mark.integration
-def test_each_replica_can_have_a_frozen_agent_of_its_own(tmp_path, monkeypatch, capsys):
-    monkeypatch.chdir(tmp_path)
-    run, earlier = ran(tmp_path, [Learning(ALGORITHMS["DQN"])] * 4)
-    spec = Frozen(run, 2, replica=[1, 0])
+def test_each_replica_can_have_a_frozen_agent_of_its_own(earlier, windows, tmp_path, monkeypatch):
+    run, networks = earlier
+    monkeypatch.chdir(run.parent)
+    spec, seen = Frozen("run", 2, replica=[1, 0]), windows[:, :1]
     assert spec.replica == (1, 0)
-    actor = population([spec, *[Scripted()] * 3]).others[0,]
-    actor.epsilon = 0.0
-    seen = CommonsEnv(GAME, 2, seed=9).reset()["agents", "observation"][:, :1]
     learned = [
-        earlier[f"replica_{replica}/agent_2"](own).argmax(-1)
-        for replica, own in zip((1, 0), seen, strict=True)
+        networks[f"replica_{replica}/agent_2"](window).argmax(-1)
+        for replica, window in zip((1, 0), seen, strict=True)
     ]
-    assert torch.equal(actor.choose(seen), torch.stack(learned))
-    again, _ = ran(tmp_path, [Frozen("run", 2, replica=(1, 0)), *[Scripted()] * 3], name="again")
+    assert torch.equal(first_of(spec).choose(seen), torch.stack(learned))
+    again, _ = ran(tmp_path, [spec, *[Scripted()] * 3], name="again")
     loaded = cprl.load(again)
-    assert loaded.specs[0] == Frozen("run", 2, replica=(1, 0))
-    assert torch.equal(loaded.agent(0, replica=1).network(seen), earlier["replica_0/agent_2"](seen))
+    assert loaded.specs[0] == spec
+    assert torch.equal(loaded.agent(0, replica=1).network(seen), networks["replica_0/agent_2"](seen))
     with pytest.raises(ValueError, match=r"agents\[0\].replica is \(1,\), of 1 numbers"):
         ran(tmp_path, [Frozen("run", 2, replica=(1,)), *[Scripted()] * 3], name="too_few")
     assert not (tmp_path / "too_few").exists()
-    for wrong in ((), (0, -1), "0"):
+    for wrong in ((), (0, -1)):
         with pytest.raises(ValueError, match="replica"):
             Frozen("run", 2, replica=wrong)
 
@@ -331,9 +319,7 @@ def test_a_tabular_agent_is_a_member_like_any_other(tmp_path, capsys):
     assert not network(torch.full_like(seen, 7)).any(), "of what was never met"
     assert set(evaluate_run(run, episodes=2).trained) == {0, 1}
 
-    frozen = population([Frozen(run, 2, replica=1), *[Scripted()] * 3]).others[0,]
-    frozen.epsilon = 0.0
-    chosen = frozen.choose(seen[:2].unsqueeze(1))
+    chosen = first_of(Frozen(run, 2, replica=1)).choose(seen[:2].unsqueeze(1))
     assert chosen[:, 0].tolist() == table["values"][:2].argmax(1).tolist()
 
     told = replace(GAME, observation=Observation(scoreboard=True))
@@ -389,35 +375,36 @@ class PPOFromReplay(OffPolicy):
         return ALGORITHMS["PPO"].make_loss(network)
 
 
-@pytest.mark.integration
-def test_what_does_not_fit_is_refused_before_training_and_says_what_fits(tmp_path, capsys):
-    dqn = Learning(ALGORITHMS["DQN"])
+def test_learners_that_do_not_fit_are_refused_before_training_and_the_refusal_says_what_fits():
+    dqn, ppo = Learning(ALGORITHMS["DQN"]), ALGORITHMS["PPO"]
     with pytest.raises(ValueError, match="reward is 'group'"):
         Learning(ALGORITHMS["DQN"], reward="group")
     with pytest.raises(ValueError, match="3 agents are specified for a game of 4 agents"):
         population([dqn] * 3)
-    assert isinstance(ALGORITHMS["PPO"].make_loss(ALGORITHMS["PPO"].make_network(GAME.spaces)), ClipPPOLoss)
-    with pytest.raises(
-        ValueError, match=r"ClipPPOLoss is on-policy and cannot learn from a replay buffer; use"
-    ):
+    with pytest.raises(ValueError, match="ClipPPOLoss is on-policy and cannot learn from a replay buffer"):
         population([Learning(PPOFromReplay(settings=REPLAY))] * 4)
-    with pytest.raises(ValueError, match=r"an agent has the networks .*"):
+    with pytest.raises(ValueError, match="an agent has the networks "):
         RolloutLearner(
             GAME.spaces,
             agents=[0],
             replicas=1,
             settings=ROLLOUTS,
-            make_network=lambda: acting_part(ALGORITHMS["PPO"].make_network(GAME.spaces)),
-            make_loss=ALGORITHMS["PPO"].make_loss,
+            make_network=lambda: acting_part(ppo.make_network(GAME.spaces)),
+            make_loss=ppo.make_loss,
         )
-    with pytest.raises(ValueError, match=r"update_every is 7"):
-        trained(population([Learning(ALGORITHMS["PPO"])] * 4), update_every=7)
-    run, _ = ran(tmp_path, [dqn] * 4)
-    larger = Game(map=GAME.map, rules=replace(GAME.rules, window_rows=4))
-    with pytest.raises(ValueError, match=r"have observations \(3, 3, 5\); this game has \(3, 4, 5\)"):
-        population([Frozen(run, 0), dqn, dqn, dqn], game=larger)
-    other = Game(map=GAME.map, rules=GAME.rules, observation=Observation(agents_apart=True))
-    with pytest.raises(ValueError, match=r"have a form of observation .* this game has"):
-        population([Frozen(run, 0), dqn, dqn, dqn], game=other)
-    with pytest.raises(ValueError, match=r"keeps no network of replica_9/agent_0; kept are"):
-        population([Frozen(run, 0, replica=9), dqn, dqn, dqn])
+    with pytest.raises(ValueError, match="update_every is 7"):
+        trained(population([Learning(ppo)] * 4), update_every=7)
+
+
+@pytest.mark.integration
+@pytest.mark.parametrize(
+    ("replica", "game", "message"),
+    [
+        (0, {"rules": replace(GAME.rules, window_rows=4)}, r"observations \(3, 3, 5\).*has \(3, 4, 5\)"),
+        (0, {"observation": Observation(agents_apart=True)}, r"a form of observation .* this game has"),
+        (9, {}, "keeps no network of replica_9/agent_0; kept are"),
+    ],
+)
+def test_a_frozen_agent_that_does_not_fit_is_refused(earlier, replica, game, message):
+    with pytest.raises(ValueError, match=message):
+        population([Frozen(earlier[0], 0, replica=replica), *[Scripted()] * 3], game=replace(GAME, **game))
