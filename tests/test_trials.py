@@ -38,9 +38,9 @@ def task(tmp_path, study=STUDY, nth=0):
 @pytest.fixture(scope="module")
 def undisturbed(tmp_path_factory):
     """The run of the first trial."""
-    own = task(tmp_path_factory.mktemp("undisturbed"))
-    assert run_task(own).worked
-    return own.directory
+    first = task(tmp_path_factory.mktemp("undisturbed"))
+    assert run_task(first).worked
+    return first.directory
 
 
 def assert_same(run, other):
@@ -50,51 +50,61 @@ def assert_same(run, other):
         assert (run / path).read_bytes() == (other / path).read_bytes()
 
 
-@pytest.mark.integration
-def test_a_missing_trial_is_run_and_a_finished_one_left_as_it_is(tmp_path):
-    own = task(tmp_path)
-    assert state_of(own.directory) == "missing"
-    done = run_task(own)
-    assert (done.name, done.state, done.worked) == (own.name, "finished", True)
-    before = {path: path.stat().st_mtime_ns for path in own.directory.rglob("*")}
-    again = run_task(own)
-    assert (again.state, again.worked) == ("finished", False)
-    assert {path: path.stat().st_mtime_ns for path in own.directory.rglob("*")} == before
+def written_at(folder):
+    """When all files of a folder were written."""
+    return {path: path.stat().st_mtime_ns for path in folder.rglob("*")}
+
+
+@pytest.fixture
+def first(tmp_path):
+    """The first trial, whose directory is there."""
+    first = task(tmp_path)
+    first.directory.mkdir(parents=True)
+    return first
+
+
+@pytest.fixture
+def status(first):
+    """Where the first trial says how far it is."""
+    status = Status(Path(first.status), first.name)
+    status.folder.mkdir(parents=True)
+    return status
 
 
 @pytest.mark.integration
-def test_a_trial_prints_into_its_log_and_says_how_far_it_is(tmp_path, capsys):
-    own = task(tmp_path)
-    run_task(own)
+def test_a_missing_trial_is_run_and_says_how_far_it_is_and_a_finished_one_is_left_as_it_is(tmp_path, capsys):
+    missing = task(tmp_path)
+    assert state_of(missing.directory) == "missing"
+    done = run_task(missing)
+    assert (done.name, done.state, done.worked) == (missing.name, "finished", True)
     assert capsys.readouterr().out == ""
-    status = Status(Path(own.status), own.name)
+    status = Status(Path(missing.status), missing.name)
     assert "tiny, 1 replicas, 2 episodes" in status.log.read_text()
     said = status.read()
     assert (said["episodes"], said["of"], said["steps"], said["pid"]) == (2, 2, 40, os.getpid())
     assert said["peak_bytes"] > 10**7
     assert not list(tmp_path.rglob("*.partial"))
+    before = written_at(missing.directory)
+    again = run_task(missing)
+    assert (again.state, again.worked) == ("finished", False)
+    assert written_at(missing.directory) == before
 
 
 @pytest.mark.integration
-def test_what_a_killed_process_left_before_its_recipe_is_no_obstacle(tmp_path, undisturbed):
-    own = task(tmp_path)
-    own.directory.mkdir(parents=True)
-    (own.directory / "recipe.json.0123abcd.partial").write_text("{")
-    (own.directory / LOCK_FILE).write_text("")
-    assert run_task(own).state == "finished"
-    assert_same(own.directory, undisturbed)
+def test_what_a_killed_process_left_before_its_recipe_is_no_obstacle(first, undisturbed):
+    (first.directory / "recipe.json.0123abcd.partial").write_text("{")
+    (first.directory / LOCK_FILE).write_text("")
+    assert run_task(first).state == "finished"
+    assert_same(first.directory, undisturbed)
 
 
 @pytest.mark.integration
-def test_a_trial_that_was_killed_before_its_first_checkpoint_starts_over(tmp_path, undisturbed):
-    own = task(tmp_path)
-    shutil.copytree(undisturbed, own.directory)
-    for name in ("report.json", "manifest.json", "episodes.parquet", CHECKPOINTS, "evaluation"):
-        path = own.directory / name
-        shutil.rmtree(path) if path.is_dir() else path.unlink()
-    assert state_of(own.directory) == "unfinished"
-    assert run_task(own).state == "finished"
-    assert_same(own.directory, undisturbed)
+def test_a_trial_that_was_killed_before_its_first_checkpoint_starts_over(first, undisturbed):
+    ended = ("report.json", "manifest.json", "episodes.parquet", CHECKPOINTS, "evaluation")
+    shutil.copytree(undisturbed, first.directory, ignore=shutil.ignore_patterns(*ended), dirs_exist_ok=True)
+    assert state_of(first.directory) == "unfinished"
+    assert run_task(first).state == "finished"
+    assert_same(first.directory, undisturbed)
 
 
 KILLED = """
@@ -111,78 +121,73 @@ run_task(task(Path({folder!r})))
 
 @pytest.mark.integration
 def test_a_trial_that_is_killed_in_its_training_is_resumed_bit_for_bit(tmp_path, undisturbed):
-    own = task(tmp_path)
+    killed = task(tmp_path)
     code = KILLED.format(tests=str(Path(__file__).parent), folder=str(tmp_path))
     process = subprocess.Popen([sys.executable, "-W", "ignore", "-c", code])
-    kept = own.directory / CHECKPOINTS
+    checkpoints = killed.directory / CHECKPOINTS
     until = time.monotonic() + 60
-    while not (kept.exists() and any(kept.glob("training-*.pt"))) and time.monotonic() < until:
+    while not any(checkpoints.glob("training-*.pt")) and time.monotonic() < until:
         time.sleep(0.002)
     process.send_signal(signal.SIGKILL)
     process.wait()
-    assert state_of(own.directory) == "unfinished"
-    assert any(kept.glob("training-*.pt"))
-    assert run_task(own).worked
-    assert "Resuming from step" in Status(Path(own.status), own.name).log.read_text()
-    assert_same(own.directory, undisturbed)
+    assert state_of(killed.directory) == "unfinished"
+    assert any(checkpoints.glob("training-*.pt"))
+    assert run_task(killed).worked
+    assert "Resuming from step" in Status(Path(killed.status), killed.name).log.read_text()
+    assert_same(killed.directory, undisturbed)
 
 
 @pytest.mark.integration
-def test_a_failure_is_noted_with_its_reason_and_forgotten_when_it_is_mended(tmp_path, monkeypatch):
-    own = task(tmp_path)
-    status = Status(Path(own.status), own.name)
+def test_a_failure_is_noted_with_its_reason_and_forgotten_when_it_is_mended(first, status, monkeypatch):
     with monkeypatch.context() as patched:
         patched.setattr("cprl.training.running.evaluate_population", lambda *_, **__: 1 / 0)
-        failed = run_task(own)
+        failed = run_task(first)
     assert (failed.state, failed.reason) == ("failed", "ZeroDivisionError: division by zero")
     assert status.failure() == "ZeroDivisionError: division by zero"
     assert "evaluate_population" in status.failed.read_text()
-    assert run_task(own).state == "finished"
+    assert run_task(first).state == "finished"
     assert status.failure() is None
 
 
+SAID = {"episodes": 3, "of": 4}
+"""What the process says that runs a trial."""
+
+
 @pytest.mark.parametrize("is_begun", [False, True])
-def test_a_trial_waits_while_another_process_runs_it(tmp_path, undisturbed, monkeypatch, is_begun):
-    own = task(tmp_path)
-    own.directory.mkdir(parents=True)
+def test_a_trial_waits_while_another_process_runs_it(first, status, undisturbed, monkeypatch, is_begun):
     if is_begun:
-        shutil.copy(undisturbed / "recipe.json", own.directory)
-    lock = RunLock(own.directory)
+        shutil.copy(undisturbed / "recipe.json", first.directory)
+    lock = RunLock(first.directory)
     lock.__enter__()
     waited = []
-    status = Status(Path(own.status), own.name)
-    status.folder.mkdir(parents=True, exist_ok=True)
-    status.path.write_text('{"episodes": 3, "of": 4}')
+    status.path.write_text(json.dumps(SAID))
 
     def finished_elsewhere(seconds):
         waited.append(seconds)
-        assert status.read() == {"episodes": 3, "of": 4}, "what the one says that runs it"
+        assert status.read() == SAID
         lock.__exit__(None, None, None)
-        shutil.copytree(undisturbed, own.directory, dirs_exist_ok=True)
+        shutil.copytree(undisturbed, first.directory, dirs_exist_ok=True)
 
     monkeypatch.setattr(trials.time, "sleep", finished_elsewhere)
-    assert run_task(own).state == "finished"
+    assert run_task(first).state == "finished"
     assert len(waited) == 1
 
 
 @pytest.mark.integration
 @pytest.mark.parametrize("is_begun", [False, True])
 def test_a_task_that_does_not_wait_leaves_a_trial_to_the_process_that_runs_it(
-    tmp_path, undisturbed, is_begun
+    first, status, undisturbed, is_begun
 ):
-    own = replace(task(tmp_path), waits=False)
-    own.directory.mkdir(parents=True)
+    impatient = replace(first, waits=False)
     if is_begun:
-        shutil.copy(undisturbed / "recipe.json", own.directory)
-    status = Status(Path(own.status), own.name)
-    status.folder.mkdir(parents=True, exist_ok=True)
-    status.path.write_text('{"episodes": 3, "of": 4}')
-    with RunLock(own.directory):
-        before = sorted(own.directory.iterdir())
-        assert run_task(own) == Outcome(own.name, "elsewhere")
-        assert sorted(own.directory.iterdir()) == before
-    assert status.read() == {"episodes": 3, "of": 4}
-    assert run_task(own).worked, "as soon as nobody else runs it"
+        shutil.copy(undisturbed / "recipe.json", first.directory)
+    status.path.write_text(json.dumps(SAID))
+    with RunLock(first.directory):
+        before = sorted(first.directory.iterdir())
+        assert run_task(impatient) == Outcome(first.name, "elsewhere")
+        assert sorted(first.directory.iterdir()) == before
+    assert status.read() == SAID
+    assert run_task(impatient).worked, "as soon as nobody else runs it"
 
 
 @pytest.mark.integration
@@ -193,6 +198,8 @@ def test_a_trial_that_another_process_runs_does_not_hold_up_the_others(tmp_path,
     lock.__enter__()
 
     class Clock:
+        monotonic = time.monotonic
+
         @staticmethod
         def sleep(_):
             assert state_of(tmp_path / "runs" / second) == "finished", "before it waits for the first"
@@ -206,40 +213,35 @@ def test_a_trial_that_another_process_runs_does_not_hold_up_the_others(tmp_path,
 
 
 @pytest.mark.integration
-def test_the_lock_of_another_host_is_taken_over_once_its_trial_is_silent(tmp_path, undisturbed, monkeypatch):
-    own = task(tmp_path)
-    own.directory.mkdir(parents=True)
-    shutil.copy(undisturbed / "recipe.json", own.directory)
+def test_the_lock_of_another_host_is_taken_over_once_its_trial_is_silent(first, undisturbed, monkeypatch):
+    shutil.copy(undisturbed / "recipe.json", first.directory)
     holder = {"host": "a-node-that-died", "pid": 1, "started": "2026-01-01T00:00:00+00:00"}
-    (own.directory / LOCK_FILE).write_text(json.dumps(holder))
+    (first.directory / LOCK_FILE).write_text(json.dumps(holder))
     monkeypatch.setattr(trials, "PATIENCE_S", 0.3)
     monkeypatch.setattr(trials, "_POLL_S", 0.05)
-    silent_since, said = [], []
+    looks = []
     before = trials.is_silent
 
     def watched(status, patience_s):
         for is_silent in before(status, patience_s):
-            said.append(status.read())
-            silent_since.append(is_silent)
+            looks.append((is_silent, status.read()))
             yield is_silent
 
     monkeypatch.setattr(trials, "is_silent", watched)
     began = time.monotonic()
-    assert run_task(own).state == "finished"
+    assert run_task(first).state == "finished"
     assert time.monotonic() - began > 0.3
-    assert silent_since[-1]
-    assert not any(silent_since[:-1])
-    assert said == [{}] * len(said), "who waits says nothing"
-    assert_same(own.directory, undisturbed)
+    assert looks == [*[(False, {})] * (len(looks) - 1), (True, {})], "who waits says nothing"
+    assert_same(first.directory, undisturbed)
 
 
 @pytest.mark.integration
 def test_a_run_that_another_study_began_under_another_name_is_gone_on_with(tmp_path, undisturbed):
-    own = task(tmp_path, Study(replace(TINY, name="other"), {FREEZE: [5]}))
-    own.directory.mkdir(parents=True)
-    shutil.copy(undisturbed / "recipe.json", own.directory)
-    assert run_task(own).state == "finished"
-    assert json.loads((own.directory / "recipe.json").read_text())["recipe"] == "tiny"
+    other = task(tmp_path, Study(replace(TINY, name="other"), {FREEZE: [5]}))
+    other.directory.mkdir(parents=True)
+    shutil.copy(undisturbed / "recipe.json", other.directory)
+    assert run_task(other).state == "finished"
+    assert json.loads((other.directory / "recipe.json").read_text())["recipe"] == "tiny"
 
 
 def test_a_trial_in_the_directory_of_another_is_a_failure_by_name_and_stays_as_it_is(tmp_path):
@@ -305,6 +307,15 @@ class Written:
             yield Outcome(task.name, "finished")
 
 
+def only_name(study):
+    """The name of the only trial of a study."""
+    (trial,) = trials_of(study)
+    return trial.name
+
+
+OWN_CODE = replace(EXPERIMENT, callbacks=(Custom("own_callback:Callback"),))
+
+
 @pytest.fixture
 def write_module(tmp_path, monkeypatch):
     """Writes a module `own_callback`, which is then imported anew, as in another process."""
@@ -322,11 +333,10 @@ def write_module(tmp_path, monkeypatch):
 def test_a_study_runs_anew_what_was_made_with_other_code_and_keeps_what_was_there(
     tmp_path, write_module, capsys
 ):
-    study = Study(replace(EXPERIMENT, callbacks=(Custom("own_callback:Callback"),)))
-    (trial,) = trials_of(study)
+    study = Study(OWN_CODE)
     write_module("class Callback: ...")
     first = run_study(study, tmp_path / "study", on=Written(study, 1.0), results=False)
-    kept = read_episodes(first.runs / trial.name)
+    kept = read_episodes(first.runs / only_name(study))
     same = Written(study, 2.0)
     write_module("class Callback: ...")
     run_study(study, tmp_path / "study", on=same, results=False)
@@ -335,7 +345,7 @@ def test_a_study_runs_anew_what_was_made_with_other_code_and_keeps_what_was_ther
     write_module("class Callback: apples = 2")
     capsys.readouterr()
     table = run_study(study, tmp_path / "study", on=edited).table
-    assert edited.names == [trial.name]
+    assert edited.names == [only_name(study)]
     rows = table.rows.filter(pc.field("metric") == "collective_return")
     assert set(rows["value"].to_pylist()) == {2.0, 4.0}, "4 of random play"
     (earlier,) = (tmp_path / "study" / "runs-earlier").iterdir()
@@ -346,20 +356,18 @@ def test_a_study_runs_anew_what_was_made_with_other_code_and_keeps_what_was_ther
 def test_a_trial_that_another_process_makes_with_other_code_is_refused_by_its_directory(
     tmp_path, write_module
 ):
-    study = Study(replace(EXPERIMENT, callbacks=(Custom("own_callback:Callback"),)))
-    (trial,) = trials_of(study)
+    study = Study(OWN_CODE)
     write_module("class Callback: ...")
-    run = write_run(tmp_path / "runs" / trial.name, trial.experiment, lambda *_: 1.0, is_finished=False)
+    run = write_run(tmp_path / "runs" / only_name(study), study.experiment, lambda *_: 1.0, is_finished=False)
     write_module("class Callback: apples = 2")
-    with RunLock(run), pytest.raises(RunLockedError, match=trial.name):
+    with RunLock(run), pytest.raises(RunLockedError, match=only_name(study)):
         run_study(study, tmp_path, progress=False)
 
 
 def test_a_recipe_without_a_checksum_of_code_is_taken_as_it_is(tmp_path, write_module):
-    study = Study(replace(EXPERIMENT, callbacks=(Custom("own_callback:Callback"),)))
-    (trial,) = trials_of(study)
+    study = Study(OWN_CODE)
     write_module("class Callback: ...")
-    run = write_run(tmp_path / "runs" / trial.name, trial.experiment, lambda *_: 1.0, code=None)
+    run = write_run(tmp_path / "runs" / only_name(study), study.experiment, lambda *_: 1.0, code=None)
     assert changed_circumstances(run) == []
     executor = Written(study, 2.0)
     run_study(study, tmp_path, on=executor, progress=False, results=False)
@@ -367,11 +375,10 @@ def test_a_recipe_without_a_checksum_of_code_is_taken_as_it_is(tmp_path, write_m
 
 
 def test_code_that_was_edited_and_not_imported_again_is_what_a_recipe_keeps(tmp_path, write_module):
-    experiment = replace(EXPERIMENT, callbacks=(Custom("own_callback:Callback"),))
     write_module("class Callback: ...")
-    experiment.callbacks[0].resolve()
+    OWN_CODE.callbacks[0].resolve()
     (tmp_path / "own_callback.py").write_text("class Callback: apples = 2")
-    run = start_run(tmp_path / "run", "run", experiment.to_recipe)
+    run = start_run(tmp_path / "run", "run", OWN_CODE.to_recipe)
     assert [*json.loads((run / "recipe.json").read_text())["code_text"].values()] == ["class Callback: ..."]
 
 
@@ -400,23 +407,16 @@ def test_loading_evaluating_and_resuming_warn_of_other_code_and_the_recipe_keeps
     assert recipe["code_text"][recipe["extended"][0]["code"]["own_callback"]] == text + "# edited\n"
 
 
-def written_at(run):
-    return (run / "report.json").stat().st_mtime_ns
-
-
 @pytest.mark.integration
 def test_a_study_runs_what_is_missing_and_an_edited_one_keeps_what_is_there(tmp_path):
     first = run_study(STUDY, tmp_path, results=False)
     assert first.failed == ()
     assert read_study(tmp_path) == STUDY
-    kept = {
-        own.name: (tmp_path / "runs" / own.name / "report.json").stat().st_mtime_ns for own in first.trials
-    }
+    reports = [tmp_path / "runs" / trial.name / "report.json" for trial in first.trials]
+    before = [report.stat().st_mtime_ns for report in reports]
     edited = Study(TINY, {FREEZE: [5, 25, 50]}, name="edited")
-    second = run_study(edited, tmp_path, results=False)
-    assert len(second.trials) == 3
-    for name, at in kept.items():
-        assert written_at(tmp_path / "runs" / name) == at
+    assert len(run_study(edited, tmp_path, results=False).trials) == 3
+    assert [report.stat().st_mtime_ns for report in reports] == before
     assert read_study(tmp_path) == edited
 
 
