@@ -35,8 +35,7 @@ from cprl.system.libraries import fitting_versions, relying_on, require
 
 SOURCE = Path(compat.__file__).parents[1]
 SHORT = Game(
-    map=maps.parse(".A>.A\n.A.A.\n..<.A"),
-    rules=Rules(window_rows=3, window_columns=5, episode_steps=9),
+    map=maps.parse(".A>.A\n.A.A.\n..<.A"), rules=Rules(window_rows=3, window_columns=5, episode_steps=9)
 )
 
 
@@ -113,7 +112,7 @@ TORCH, RERUN = r"torch \S+ has no torch\.", r"rerun-sdk \S+ has no rerun_binding
 )
 def test_a_part_that_an_upgrade_took_away_is_named_where_it_is_used(module, part, use, message, monkeypatch):
     monkeypatch.delattr(importlib.import_module(module), part)
-    with pytest.raises(ImportError, match=rf"{message}.*, on which cprl \S+ relies; allowed: "):
+    with pytest.raises(ImportError, match=rf"{message}.*, on which cprl \S+ relies"):
         use()
 
 

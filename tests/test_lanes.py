@@ -187,7 +187,7 @@ def test_the_stacked_networks_give_what_each_gives():
     expected = torch.stack([network(seen) for network, seen in zip(each, windows, strict=True)])
     torch.testing.assert_close(stacked(windows), expected)
     torch.testing.assert_close(stacked(windows[:, 0]), expected[:, 0])
-    with pytest.raises(ValueError, match="2 architectures; allowed: 1"):
+    with pytest.raises(ValueError, match="2 architectures"):
         StackedMLP([each[0], MLPNetwork(SHAPE, ACTIONS, hidden_cells=(8,))])
 
 

@@ -113,7 +113,7 @@ def test_without_a_network_the_settings_say_the_hidden_layers():
         made = DQN(settings=replace(REPLAY, hidden_cells=cells), network=network).make_network(SPACES)
         assert isinstance(made, MLPNetwork)
         assert [layer.out_features for layer in made.linears] == [16, 9, 8]
-    with pytest.raises(ValueError, match=r"settings.hidden_cells is \(16,\); allowed: the default"):
+    with pytest.raises(ValueError, match=r"settings.hidden_cells is \(16,\)"):
         DQN(settings=replace(REPLAY, hidden_cells=(16,)), network=CONV).make_network(SPACES)
 
 
@@ -193,7 +193,7 @@ def test_a_network_whose_buffers_do_not_stack_is_vmapped():
         def forward(self, observation):
             return super().forward(observation + self.shift)
 
-    with pytest.raises(ValueError, match="a Normalised has buffers; allowed: parameters alone"):
+    with pytest.raises(ValueError, match="a Normalised has buffers"):
         stack_lanes([Normalised(), Normalised()])
     learner = dqn_learner(
         SPACES, agents=(0, 1), replicas=1, settings=REPLAY, make_network=Normalised, compile=False
@@ -246,9 +246,7 @@ class Narrow(nn.Module):
 
 
 def test_what_a_network_cannot_do_is_refused_by_name():
-    with pytest.raises(
-        ValueError, match=r"the shape \[6\]; allowed for Conv: channels, rows and columns; use MLP"
-    ):
+    with pytest.raises(ValueError, match=r"the shape \[6\]"):
         DQN(settings=REPLAY, network=Conv()).make_network(VECTORS)
     assert new_network(MLP(), VECTORS, 3)(torch.zeros(2, 6)).shape == (2, 3)
     for name in ("relu_on_outputs", "glorot_uniform"):

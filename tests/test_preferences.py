@@ -15,12 +15,7 @@ from torchrl.envs.utils import check_env_specs
 
 from cprl import CommonsEnv, Game, Rules, maps
 from cprl.envs import make_env, parallel_env
-from cprl.envs.state import (
-    env_state,
-    load_env_state,
-    load_transforms_state,
-    transforms_state,
-)
+from cprl.envs.state import env_state, load_env_state, load_transforms_state, transforms_state
 from cprl.learners.preferences import (
     Exchange,
     InequityAversion,
@@ -235,12 +230,12 @@ class TestRefusals:
     @pytest.mark.parametrize(
         ("make", "message"),
         [
-            (lambda: SocialValueOrientation(angle=45, weight=1), r"angle is 45; allowed: radians in -pi..pi"),
-            (lambda: WantedRewards("selfish"), r"preferences is 'selfish'; allowed: 'individual', 'team'"),
+            (lambda: SocialValueOrientation(angle=45, weight=1), "angle is 45"),
+            (lambda: WantedRewards("selfish"), "preferences is 'selfish'"),
             (lambda: WantedRewards(["team", 3]), r"preferences\[1\] is 3"),
             (
                 lambda: WantedRewards(["team"] * 3).add(np.zeros((1, 2)), np.array([False])),
-                "preferences has 3 entries; allowed: one preference for all agents, or one for each of 2",
+                "preferences has 3 entries",
             ),
             (lambda: PreferenceTransform(AVERSE)(torch.zeros(1)), "called outside an environment"),
         ],
@@ -252,11 +247,11 @@ class TestRefusals:
     def test_other_worlds_than_before_are_refused_until_what_is_remembered_is_cleared(self):
         wants = WantedRewards(AVERSE)
         wants.add(np.zeros((2, 3)), np.zeros(2, np.bool_))
-        with pytest.raises(ValueError, match=r"rewards is \[4, 3\]; allowed: \[2, 3\]"):
+        with pytest.raises(ValueError, match=r"rewards is \[4, 3\]"):
             wants.add(np.zeros((4, 3)), np.zeros(4, np.bool_))
         wants.clear()
         wants.add(np.zeros((4, 3)), np.zeros(4, np.bool_))
-        with pytest.raises(ValueError, match=r"of the state is \[1, 4, 3\]; allowed: \[0, worlds, agents\]"):
+        with pytest.raises(ValueError, match=r"of the state is \[1, 4, 3\]"):
             WantedRewards("team").load_state_dict(wants.state_dict())
 
 

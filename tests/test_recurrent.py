@@ -8,13 +8,7 @@ import pytest
 import torch
 from recall_game import Recall
 from test_networks import VECTORS
-from test_population import (
-    GAME,
-    Returns,
-    population,
-    trained,
-    weights,
-)
+from test_population import GAME, Returns, population, trained, weights
 from torch import nn
 from torchrl.envs import RewardScaling
 from torchrl.envs.utils import ExplorationType, set_exploration_type
@@ -190,7 +184,7 @@ def test_a_lane_of_a_stack_gives_and_learns_what_its_network_does_alone(network)
 def test_networks_of_two_kinds_do_not_stack():
     """Four gates of three units are as many numbers as three gates of four."""
     kinds = GRU(recurrent_cells=4), LSTM(recurrent_cells=3)
-    with pytest.raises(ValueError, match="the networks of the lanes have 2 architectures; allowed: 1"):
+    with pytest.raises(ValueError, match="the networks of the lanes have 2 architectures"):
         stack_lanes([kind.make(GAME.spaces, 8) for kind in kinds])
 
 
@@ -430,7 +424,7 @@ def test_states_of_other_policies_are_refused(ran):
     policy = cprl.load(ran[1]).policy()
     moment = cprl.load(ran[1]).env().reset()
     moment["agents", "recurrent_state"] = torch.zeros(1, 4, 5)
-    with pytest.raises(ValueError, match=r"is \[1, 4, 5\]; allowed: \[1, 4, 14\]"):
+    with pytest.raises(ValueError, match=r"is \[1, 4, 5\]"):
         policy(moment)
 
 
@@ -449,13 +443,13 @@ def test_algorithms_that_learn_from_single_transitions_are_refused_by_name(kind,
 
 
 def test_other_wrong_values_are_refused_by_name(tmp_path):
-    with pytest.raises(ValueError, match=r"GRU.encoder is a MLP; allowed: MLP or Conv, with at least one of"):
+    with pytest.raises(ValueError, match=r"GRU.encoder is a MLP"):
         GRU(encoder=MLP(hidden_cells=()))
     with pytest.raises(ValueError, match=r"GRU.encoder is a GRU"):
         GRU(encoder=SMALL)
-    with pytest.raises(ValueError, match=r"the shape \[6\]; allowed for Conv"):
+    with pytest.raises(ValueError, match=r"the shape \[6\]"):
         CONV.make(VECTORS, 3)
-    with pytest.raises(ValueError, match="relu_on_outputs is True; allowed with a recurrent network: False"):
+    with pytest.raises(ValueError, match="relu_on_outputs is True"):
         SMALL.make(VECTORS, 3, relu_on_outputs=True)
     stock = Experiment(
         name="stock",
@@ -465,14 +459,13 @@ def test_other_wrong_values_are_refused_by_name(tmp_path):
         episodes=1,
         engine="torchrl",
     )
-    with pytest.raises(ValueError, match='recurrent; allowed with engine="torchrl"'):
+    with pytest.raises(ValueError, match="recurrent"):
         cprl.run(stock, tmp_path / "never", watch="off")
     assert not (tmp_path / "never").exists()
 
 
 STACKED = Custom(
-    "torchrl.envs.transforms:CatFrames",
-    arguments={"N": 3, "dim": -3, "in_keys": [["agents", "observation"]]},
+    "torchrl.envs.transforms:CatFrames", arguments={"N": 3, "dim": -3, "in_keys": [["agents", "observation"]]}
 )
 
 

@@ -278,5 +278,5 @@ def test_an_actor_continues_from_the_state_of_another():
 
 def test_a_game_whose_observations_are_no_windows_is_refused():
     game = replace(presets.game("commons"), observation=Observation(area="full"))
-    with pytest.raises(ValueError, match=r"Observation\.area is 'full'; allowed with scripted policies"):
+    with pytest.raises(ValueError, match=r"Observation\.area is 'full'"):
         ScriptedActor("greedy", game, seeds=[(0,)], agents=1)

