@@ -48,16 +48,6 @@ def relies_on(part, *, used_by):
         pytest.fail(f"{part} is not what it was, and {used_by} relies on it: {error!r}")
 
 
-def test_a_failure_says_what_broke():
-    with (
-        pytest.raises(
-            pytest.fail.Exception, match=r"TensorDict\._no_more is not what it was, and put relies"
-        ),
-        relies_on("TensorDict._no_more", used_by="put"),
-    ):
-        TensorDict({}, [])._no_more()
-
-
 def test_every_part_of_compat_has_a_test_that_names_it():
     shown = {name for name in vars(compat) if not name.startswith("_")}
     modules = {path.stem for path in (SOURCE / "compat").glob("*.py")}

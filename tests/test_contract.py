@@ -1,6 +1,6 @@
-"""What every algorithm keeps: each agent learns, each replica as it would alone, and a run of it is stored,
-loaded and evaluated, and its agents play on frozen and start others. That a stopped training goes on as if it
-had not been stopped, and the numbers of each, are in tests/golden."""
+"""What every algorithm keeps: each agent learns, each replica as it would alone, by any engine, and stopped
+as in one go; a run of it is stored, loaded and evaluated, and its agents play on frozen and start others.
+The numbers of each are in tests/golden."""
 
 from dataclasses import replace
 
@@ -13,7 +13,9 @@ from test_population import (
     FOUR,
     GAME,
     assert_all_weights_move_and_replicas_learn_apart,
+    assert_goes_on_bit_for_bit,
     population,
+    trained,
     weights,
 )
 from test_recurrent import ON_POLICY as RECURRENT
@@ -24,7 +26,13 @@ from test_teams import TEAMS
 import cprl
 from cprl import Experiment
 from cprl.evaluation import crossplay, evaluate_run
+from cprl.learners import trial
 from cprl.population import Frozen, Learning, Scripted, Team
+
+
+def shared(algorithm, agents=FOUR):
+    return Team(algorithm, agents, reward="individual", share_parameters=True)
+
 
 GROUPS = {
     **{name: [Learning(algorithm)] * 4 for name, algorithm in ALGORITHMS.items()},
@@ -33,17 +41,11 @@ GROUPS = {
     **{f"recurrent {name}": recurrent_specs(name) for name in RECURRENT},
     **{f"recurrent DQN, {name}": [Learning(algorithm)] * 4 for name, algorithm in DQNS.items()},
 }
-STORED = (
-    "DQN",
-    "PR2",
-    "PPO",
-    "QMIX",
-    "IPPO",
-    "MADDPG",
-    "LOLA, dice",
-    "recurrent MAPPO",
-    "recurrent DQN, GRU",
-)
+STORED = {
+    **{name: GROUPS[name] for name in ("DQN", "PR2", "PPO", "QMIX", "IPPO", "MADDPG", "LOLA, dice")},
+    **{name: GROUPS[name] for name in ("recurrent MAPPO", "recurrent DQN, GRU")},
+    "shared DQN": [shared(ALGORITHMS["DQN"])],
+}
 
 
 @pytest.mark.integration
@@ -72,16 +74,64 @@ def test_a_run_is_stored_loaded_and_evaluated_plays_frozen_and_others_start_from
         )
         return experiment, cprl.run(replace(experiment, engine="eager"), folder, watch="off")
 
-    experiment, first = run(GROUPS[name], "first")
+    experiment, first = run(STORED[name], "first")
     loaded = cprl.load(first)
     assert loaded.experiment == replace(experiment, engine="eager")
     assert len(loaded.networks) == 8
     assert len(evaluate_run(first, episodes=3).trained[1]) == 3
     frozen = population([Frozen(str(first), 1, replica=1), *[Scripted()] * 3])
     assert len(frozen.others) == 2
-    begun = population([replace(one, start_from=Frozen(str(first), 0, replica=1)) for one in GROUPS[name]])
+    begun = population([replace(one, start_from=Frozen(str(first), 0, replica=1)) for one in STORED[name]])
     ours = begun.networks()["replica_0/agent_0"].state_dict()
     theirs = loaded.networks["replica_1/agent_0"].state_dict()
     assert all(torch.equal(ours[key], value) for key, value in theirs.items())
     _, second = run([Frozen(str(first), 2, replica=1), *[Scripted("greedy")] * 3], "second")
     crossplay([first, second], episodes=1)
+
+
+WAYS = {
+    "VDN": ("vmapped",),
+    "QMIX": ("vmapped",),
+    **dict.fromkeys(("MAPPO", "IPPO", "MADDPG", "recurrent IPPO"), ("lane_axis",)),
+    "recurrent PPO": ("lane_axis", "lane_axis_flat"),
+    "recurrent PPO, LSTM": ("lane_axis_flat",),
+    **{f"recurrent DQN, {name}": ("lane_axis", "lane_axis_flat", "vmapped") for name in DQNS},
+}
+
+
+@pytest.mark.integration
+@pytest.mark.parametrize(("name", "way"), [(name, way) for name, ways in WAYS.items() for way in ways])
+def test_every_engine_learns_what_a_list_of_torchrls_losses_does(name, way, monkeypatch):
+    found, fitting = [], trial.fitting_engine
+
+    def learned(engine):
+        monkeypatch.setattr(trial, "fitting_engine", engine)
+        agents = population(GROUPS[name])
+        trained(agents, episodes=3)
+        return weights(agents)
+
+    ours = learned(lambda *given: found.append(fitting(*given)) or way)
+    for key, value in learned(lambda *_: "list").items():
+        torch.testing.assert_close(ours[key], value, rtol=1e-3, atol=1e-5, msg=key)
+    assert found == [way] or name not in TEAMS, "this is the way that is found"
+
+
+BESIDE = Learning(ALGORITHMS["DQN"])
+ALONE = [Scripted("greedy"), Scripted()]
+STOPPED = {
+    "GRU and LSTM by rollouts": [Learning(RECURRENT["PPO"]), Learning(RECURRENT["PPO, LSTM"]), *ALONE],
+    "GRU and LSTM by replay": [Learning(DQNS["GRU"]), Learning(DQNS["LSTM, double, log-cosh"]), *ALONE],
+    "team of GRUs": [Team(RECURRENT["MAPPO"], (0, 1), reward="team"), *ALONE],
+    **{name: [Team(TEAMS[name], (0, 1, 2), reward="team"), BESIDE] for name in ("QMIX", "MAPPO", "MADDPG")},
+    **{f"shared {name}": [shared(ALGORITHMS[name], (0, 1, 2)), BESIDE] for name in ("DQN", "PPO")},
+    **{
+        f"LOLA, {estimator}": [lola_team(estimator, (0, 1, 2), rollout_steps=10), BESIDE]
+        for estimator in ESTIMATORS
+    },
+}
+
+
+@pytest.mark.integration
+@pytest.mark.parametrize("name", STOPPED)
+def test_a_training_that_was_stopped_within_an_episode_and_a_rollout_goes_on_bit_for_bit(name, tmp_path):
+    assert_goes_on_bit_for_bit(STOPPED[name], tmp_path, episodes=7)

@@ -7,7 +7,7 @@ import torch
 from tensordict import TensorDict
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 
-from cprl import CommonsEnv, Game, Rules, keys, maps, presets
+from cprl import CommonsEnv, Game, Rules, keys, maps
 from cprl.algorithms import DQN
 from cprl.commons.spaces import Spaces
 from cprl.learners.settings import DQNSettings
@@ -87,24 +87,6 @@ def test_the_clock_running_out_is_no_end_for_the_target_but_depletion_is(ending,
     assert loss(batch)["loss"].item() == pytest.approx(by_hand.item(), rel=1e-5)
 
 
-def test_learning_starts_at_the_stored_transitions_of_the_settings():
-    agent = learner(learning_starts=16)
-    store(agent, 15)
-    assert agent.update() is None
-    store(agent, 1)
-    assert agent.update() > 0
-
-
-def test_as_run_the_loss_is_averaged_over_all_outputs():
-    losses = []
-    for over_all in (False, True):
-        torch.manual_seed(1)
-        agent = learner(mean_over_all_outputs=over_all)
-        store(agent, 16, reward=1.0)
-        losses.append(agent.update().item())
-    assert losses[1] == pytest.approx(losses[0] / 4)
-
-
 def target_weights(agent):
     weights = agent.engine.losses[0].target_value_network_params
     return torch.cat([weight.data.flatten() for weight in weights.values(True, True)])
@@ -120,18 +102,6 @@ def test_the_target_network_starts_as_a_copy_and_as_run_with_weights_of_its_own(
     assert torch.equal(target_weights(copy), own_weights(copy))
     own = learner(own_target_weights=True)
     assert not torch.equal(target_weights(own), own_weights(own))
-
-
-@pytest.mark.parametrize("own_target_weights", [False, True])
-def test_the_target_network_is_replaced_after_every_third_episode(own_target_weights):
-    agent = learner(target_every_episodes=3, own_target_weights=own_target_weights)
-    store(agent, 16, reward=1.0)
-    copied = []
-    for _ in range(7):
-        agent.update()
-        agent.end_episode(torch.tensor([True]))
-        copied.append(torch.equal(target_weights(agent), own_weights(agent)))
-    assert copied == [False, False, True, False, False, True, False]
 
 
 def test_the_actor_follows_the_learner_and_epsilon_its_steps():
@@ -152,13 +122,3 @@ def test_the_actor_follows_the_learner_and_epsilon_its_steps():
     assert not torch.equal(before, chosen())
     best = agent.engine.parts[0][0](seen[:, 0]).argmax(-1)
     assert torch.equal(chosen()[:, 0], best)
-
-
-def test_the_published_learner_learns_from_presets():
-    game = presets.game("single_basic", variant="as_run")
-    settings = replace(presets.dqn_settings("single_basic", variant="as_run"), buffer_size=100)
-    how = {"agents": (0,), "replicas": 1, "engine": "torchrl"}
-    agent = DQN(settings=settings).make_learner(game.spaces, **how)
-    (network,) = agent.networks().values()
-    assert network(torch.zeros(1, *game.observation_shape, dtype=torch.uint8)).shape == (1, 7)
-    assert network.relu_on_outputs

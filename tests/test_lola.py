@@ -8,12 +8,10 @@ import torch
 from matrix_game import MatrixGame as SmallGame
 from test_population import GAME, Returns, population, trained, weights
 
-import cprl
 from cprl import Custom, Experiment
 from cprl.algorithms import LOLA, LOLASettings
 from cprl.envs.make_env import make_env, spaces_of
 from cprl.envs.matrix import prisoners_dilemma
-from cprl.evaluation import crossplay
 from cprl.networks import MLP, Conv
 from cprl.objectives import loaded_dice, lola_gradients, look_ahead_losses, looked_ahead
 from cprl.population import Scripted, Team
@@ -200,25 +198,6 @@ def test_critics_learn_and_advantages_are_normalised_where_asked_and_gradients_c
         moved = torch.cat([(b - a).flatten(1) for a, b in zip(was, now, strict=True)], 1).norm(dim=1)
         assert (moved < 1.01e-3).all()
         assert (moved > 0.9e-3).all()
-
-
-@pytest.mark.integration
-def test_lola_plays_a_matrix_game_in_an_experiment_and_meets_naive_learners_by_cross_play(tmp_path):
-    runs = []
-    for rate in (0.0, 1.0):
-        pair = team("policy_gradient", (0, 1), rollout_steps=10, look_ahead_rate=rate, hidden_cells=())
-        experiment = Experiment(
-            name=f"rate_{rate}".replace(".", "_"),
-            game=prisoners_dilemma(turns=10),
-            agents=(pair,),
-            episodes=8,
-            replicas=2,
-            evaluation_episodes=1,
-            engine="eager",
-        )
-        runs.append(cprl.run(experiment, tmp_path / experiment.name, watch="off"))
-    met = crossplay(runs, episodes=1)
-    assert met is not None
 
 
 @pytest.mark.integration

@@ -150,12 +150,6 @@ def population(agents, *, replicas=2, first_replica=0, game=GAME, **how):
     return Population(env, agents, first_replica=first_replica, **how)
 
 
-def trained(agents, *, episodes=6, first=0):
-    env = CommonsEnv(GAME, agents.replicas, seed=agents.seed, first_world=first)
-    train(env, agents.learners, others=agents.others, episodes=episodes)
-    return agents
-
-
 def test_a_lane_stores_its_own_action_first_then_those_of_the_others_by_their_indices():
     agents = population((PR2S, Scripted("greedy"), PR2S))
     (learner,) = agents.learners.values()

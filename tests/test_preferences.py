@@ -25,8 +25,6 @@ from cprl.learners.preferences import (
     WantedRewards,
     wanted_rewards,
 )
-from cprl.policies.assignment import AgentPolicies
-from cprl.policies.lanes import random_agents
 from cprl.training.collectors import StepCollector
 
 AVERSE = InequityAversion(alpha=5, beta=0.05, smoothing=0.9)
@@ -66,16 +64,10 @@ def close(*numbers):
 
 
 class TestWorkedNumbers:
-    def test_an_agent_that_is_ahead_loses_beta_times_its_lead(self):
-        # own 3, other 0: 3 - 0.05 x (3 - 0) = 2.85; the other is behind, which costs it alpha = 0
-        assert wanted(InequityAversion(alpha=0, beta=0.05, smoothing=0), 3, 0) == close(2.85, 0)
-
-    def test_an_agent_that_is_behind_loses_alpha_times_its_lag(self):
-        # own 0, other 3: 0 - 5 x (3 - 0) = -15
-        assert wanted(InequityAversion(alpha=5, beta=0, smoothing=0), 0, 3) == close(-15, 3)
-
-    def test_alpha_is_for_being_behind_and_beta_for_being_ahead(self):
+    def test_an_agent_that_is_ahead_loses_beta_times_its_lead_and_one_behind_alpha_times_its_lag(self):
+        # own 3, other 0: 3 - 0.05 x (3 - 0) = 2.85; own 0, other 3: 0 - 5 x (3 - 0) = -15
         assert wanted(InequityAversion(alpha=5, beta=0.05, smoothing=0), 3, 0) == close(2.85, -15)
+        assert wanted(InequityAversion(alpha=0, beta=0.05, smoothing=0), 3, 0) == close(2.85, 0)
 
     def test_inequity_is_a_mean_over_the_others(self):
         # of 4, 1, 1: the first leads by 3 and 3: 4 - 0.5 x (3 + 3) / 2 = 2.5; the others lag by 3 behind one
@@ -259,10 +251,6 @@ def played(env, policy, turns):
     """Batches of so many turns."""
     collected = iter(StepCollector(env, policy))
     return [next(collected).clone() for _ in range(turns)]
-
-
-def at_random(worlds):
-    return AgentPolicies(random_agents(MEADOW.spaces, (0, 1, 2), replicas=worlds, seed=5))
 
 
 class TestAdapters:

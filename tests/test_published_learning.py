@@ -11,7 +11,7 @@ from torchrl.modules import QValueActor
 from torchrl.objectives import DQNLoss, ValueEstimators
 
 from cprl import presets
-from cprl.algorithms import CQL, DQN, IQL, MADDPG, PR2, SAC, DQNSettings, RolloutSettings
+from cprl.algorithms import CQL, DQN, IQL, MADDPG, PR2, SAC, DQNSettings
 from cprl.learners.engine import change_weights, torch_optimizer
 from cprl.networks.agent import JointNetwork, JointValues
 from cprl.objectives import LogCoshDQNLoss, PR2Loss, log_cosh
@@ -54,15 +54,6 @@ def test_many_lanes_take_the_steps_of_keras():
         )
         assert weight[:, 0].tolist() == pytest.approx([WEIGHTS[nth], 1.0], abs=1e-7)
         assert square[:, 0].tolist() == pytest.approx([SQUARES[nth], 0.0])
-
-
-def test_both_kinds_of_rmsprop_differ_in_their_decay_alone():
-    of_torch, of_keras = (
-        torch_optimizer(name, [nn.Parameter(torch.ones(1))], learning_rate=0.1, eps=0.5).param_groups[0]
-        for name in ("rmsprop", "keras_rmsprop")
-    )
-    differ = {name for name in of_torch if name != "params" and of_torch[name] != of_keras[name]}
-    assert (differ, of_torch["alpha"], of_keras["alpha"]) == ({"alpha"}, 0.99, 0.9)
 
 
 def test_log_cosh_and_its_derivative_are_those_worked_by_hand():
@@ -220,18 +211,3 @@ def test_an_unknown_loss_function_is_refused_with_those_that_are_there(kind):
     message = "loss_function is 'logcosh'.*"
     with pytest.raises(ValueError, match=message):
         kind(settings=DQNSettings(), loss_function="logcosh")
-
-
-def test_the_learners_of_the_programs_versions_are_one_line_away():
-    settings = presets.dqn_settings("commons", variant="as_run")
-    version = DQN(
-        settings=replace(settings, gamma=0.997, optimizer="keras_rmsprop"), loss_function="log_cosh"
-    )
-    of_torch = version.make_loss(version.make_network(presets.game("commons").spaces))
-    assert isinstance(of_torch, LogCoshDQNLoss)
-    optimizer = torch_optimizer(
-        version.settings.optimizer, of_torch.parameters(), learning_rate=1e-5, eps=version.settings.adam_eps
-    )
-    group = optimizer.param_groups[0]
-    assert (group["alpha"], group["eps"], group["momentum"], group["centered"]) == (0.9, 1e-7, 0, False)
-    assert RolloutSettings(optimizer="keras_rmsprop").optimizer == "keras_rmsprop"

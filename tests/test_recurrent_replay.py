@@ -2,21 +2,14 @@
 
 from dataclasses import replace
 
-import numpy as np
 import pytest
 import torch
-from dqn_parts import dqn_learner
-from recall_game import Recall
-from test_population import GAME, Returns, population, trained, weights
+from test_population import GAME
 
-import cprl
-from cprl import CommonsEnv, Custom, Experiment
+from cprl import CommonsEnv, Custom
 from cprl.algorithms import DQN, DQNSettings
-from cprl.envs import make_env, spaces_of
 from cprl.networks import GRU, LSTM, MLP, Conv
 from cprl.policies.assignment import AgentPolicies
-from cprl.population import Learning, Team
-from cprl.training import train
 from cprl.training.collectors import StepCollector
 
 SMALL = GRU(encoder=MLP(hidden_cells=(6,)), recurrent_cells=5)
@@ -40,8 +33,8 @@ DQNS = {
 FOUR = (0, 1, 2, 3)
 
 
-def made(algorithm, *, replicas=2, **how):
-    return algorithm.make_learner(GAME.spaces, agents=FOUR, replicas=replicas, engine="eager", **how)
+def made(algorithm, *, replicas=2, engine="eager"):
+    return algorithm.make_learner(GAME.spaces, agents=FOUR, replicas=replicas, engine=engine)
 
 
 def play(learner, steps):
@@ -142,51 +135,10 @@ def test_the_loss_is_that_of_a_network_that_goes_through_the_turns_by_itself(dou
     torch.testing.assert_close(found, torch.stack(wanted).detach())
 
 
-@pytest.mark.integration
-@pytest.mark.parametrize("name", DQNS)
-@pytest.mark.parametrize("engine", ["lane_axis", "lane_axis_flat", "vmapped"])
-def test_every_engine_learns_what_a_list_of_losses_does(name, engine):
-    algorithm = DQNS[name]
-
-    def learned(kind):
-        learner = dqn_learner(
-            GAME.spaces,
-            agents=FOUR,
-            replicas=2,
-            settings=algorithm.settings,
-            make_network=lambda: algorithm.make_network(GAME.spaces),
-            make_loss=algorithm.make_loss,
-            engine=kind,
-            compile=False,
-        )
-        play(learner, 30)
-        for _ in range(3):
-            learner.update()
-        return learner
-
-    one, other = learned(engine), learned("list")
-    for lane in range(one.lanes):
-        for key, value in one.engine.network_state(lane).items():
-            expected = other.engine.network_state(lane)[key]
-            torch.testing.assert_close(value, expected, rtol=1e-4, atol=1e-5, msg=key)
-
-
 @pytest.mark.parametrize("name", DQNS)
 def test_the_fastest_engine_is_chosen_without_a_warning(name, recwarn):
     assert type(made(DQNS[name]).engine).__name__ == "FunctionalEngine"
     assert not recwarn.list
-
-
-@pytest.mark.integration
-def test_agents_that_share_a_network_learn_from_the_sequences_of_all():
-    members = [Team(DQNS["GRU"], FOUR, share_parameters=True)]
-    agents = population(members)
-    before = weights(agents)
-    trained(agents)
-    for key, value in weights(agents).items():
-        replica, _, name = key.split("/")
-        assert torch.equal(value, weights(agents)[f"{replica}/agent_0/{name}"])
-        assert not torch.equal(value, before[key])
 
 
 def test_the_value_after_a_turn_knows_the_turns_before():
@@ -209,6 +161,7 @@ SEQUENCES = {"sequence_steps": 4}
     [
         (lambda: made(DQN(settings=DQNSettings(), network=SMALL)), "sequence_steps is 1"),
         (lambda: made(DQN(settings=DQNSettings(**SEQUENCES))), "sequence_steps is 4"),
+        (lambda: made(DQNS["GRU"], engine="torchrl"), "sequence_steps is 6"),
         (lambda: DQNSettings(sequence_steps=4, n_steps=2), "sequence_steps is 4"),
         (lambda: DQNSettings(sequence_steps=17), "sequence_steps is 17"),
         (
@@ -220,48 +173,3 @@ SEQUENCES = {"sequence_steps": 4}
 def test_what_does_not_fit_is_refused_by_name(wrong, message):
     with pytest.raises(ValueError, match=message):
         wrong()
-
-
-@pytest.mark.parametrize(
-    ("agent", "engine", "message"),
-    [
-        (DQN(settings=DQNSettings(), network=SMALL), "eager", "sequence_steps is 1"),
-        (DQNS["GRU"], "torchrl", "sequence_steps is 6"),
-    ],
-)
-def test_a_run_that_is_refused_leaves_nothing(agent, engine, message, tmp_path):
-    agents = [Learning(agent)] * 4
-    wrong = Experiment(name="never", game=GAME, agents=agents, replicas=1, episodes=1, engine=engine)
-    with pytest.raises(ValueError, match=message):
-        cprl.run(wrong, tmp_path / "never", watch="off")
-    assert not (tmp_path / "never").exists()
-
-
-@pytest.mark.slow
-def test_memory_is_what_a_game_of_recall_needs():
-    """The cue of the first of four turns says which of two actions pays in the last: 1, blindly 0.5."""
-
-    def reached(network, steps):
-        env = make_env(Recall(turns=4), worlds=8)
-        settings = DQNSettings(
-            sequence_steps=steps,
-            batch_size=16,
-            learning_rate=3e-3,
-            gamma=0.9,
-            buffer_size=4000,
-            learning_starts=64,
-            epsilon_hold_steps=0,
-            epsilon_decay_steps=1000,
-            epsilon_end=0.02,
-            target_every_episodes=10,
-        )
-        algorithm = DQN(settings=settings, network=network)
-        learner = algorithm.make_learner(spaces_of(env), agents=(0,), replicas=8, engine="eager")
-        returns = Returns()
-        train(env, {(0,): learner}, episodes=600, callbacks=[returns])
-        return [float(np.mean(own[-100:])) for own in returns.of.values()]
-
-    for kind in (GRU, LSTM):
-        remembering = reached(kind(encoder=MLP(hidden_cells=(8,)), recurrent_cells=8), 6)
-        assert sorted(remembering)[1] > 0.9, (kind, remembering)
-    assert max(reached(MLP(hidden_cells=(16,)), 1)) < 0.7

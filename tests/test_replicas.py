@@ -14,9 +14,8 @@ from torchrl.envs.utils import ExplorationType, set_exploration_type
 from cprl import CommonsEnv, Game, Rules, keys, maps
 from cprl.learners.settings import DQNSettings
 from cprl.learners.transitions import lane_turn, transitions_of
-from cprl.measuring.evaluate import evaluate
 from cprl.policies.assignment import AgentPolicies
-from cprl.policies.lanes import LaneActor, RandomActor, random_lanes
+from cprl.policies.lanes import LaneActor, RandomActor
 from cprl.runs.episodes import EpisodeTable, read_episodes
 from cprl.training import train
 from cprl.training.collectors import StepCollector
@@ -59,42 +58,6 @@ class Witness:
 
 def learner(engine="lane_axis", *, game=GAME, agents=(0, 1), settings=SETTINGS, **how):
     return dqn_learner(game.spaces, agents=agents, settings=settings, engine=engine, compile=False, **how)
-
-
-def trained(engine, *, replicas, first=0, episodes=12, agents=(0, 1), settings=SETTINGS):
-    made = learner(engine, agents=agents, replicas=replicas, first_replica=first, seed=3, settings=settings)
-    witness = Witness()
-    others = {}
-    if len(agents) == 1:
-        seeds = [(3, first + replica, 1) for replica in range(replicas)]
-        others = {(1,): random_lanes(8, seeds=seeds, agents=1)}
-    env = CommonsEnv(GAME, replicas, seed=3, first_world=first)
-    train(env, {tuple(agents): made}, others=others, episodes=episodes, callbacks=[witness])
-    return made, witness
-
-
-@pytest.mark.integration
-@pytest.mark.parametrize(
-    "engine", [*(pytest.param(name, marks=pytest.mark.slow) for name in ENGINES[:2]), "lane_axis"]
-)
-@pytest.mark.parametrize("agents", [(0, 1), (0,)], ids=["two learn", "one learns beside a random one"])
-def test_each_replica_is_trained_as_it_would_be_alone(engine, agents):
-    _, together = trained(engine, replicas=3, agents=agents)
-    courses = [together.course(replica) for replica in range(3)]
-    assert courses[0] != courses[1] != courses[2]
-    for replica in (0, 2):
-        _, alone = trained(engine, replicas=1, first=replica, agents=agents)
-        returns, losses = alone.course(0)
-        assert courses[replica][0] == returns
-        np.testing.assert_allclose(courses[replica][1], losses, rtol=1e-4, equal_nan=True)
-
-
-@pytest.mark.integration
-def test_all_engines_take_the_same_course():
-    courses = [trained(engine, replicas=2)[1].course(1) for engine in ENGINES]
-    for returns, losses in courses[1:]:
-        assert returns == courses[0][0]
-        np.testing.assert_allclose(losses, courses[0][1], rtol=1e-4, equal_nan=True)
 
 
 def test_as_run_targets_start_from_weights_of_their_own_and_the_loss_is_shared_over_outputs():
@@ -228,15 +191,6 @@ def test_the_first_replica_alone_acts_with_the_weights_of_the_moment(engine):
     with set_exploration_type(ExplorationType.RANDOM):
         for _ in range(20):
             assert torch.equal(alone.choose(windows[:1]), of_all.choose(windows)[:1])
-
-
-@pytest.mark.integration
-def test_trained_replicas_are_evaluated_side_by_side_on_fresh_worlds():
-    agents, _ = trained("lane_axis", replicas=2)
-    env = CommonsEnv(GAME, 2 * 5, seed=9)
-    episodes = evaluate(env, AgentPolicies({(0, 1): agents.evaluation_actor(5)}), explore=True)
-    assert len(episodes) == 10
-    assert agents.evaluation_actor(5).epsilon == 0.05
 
 
 @pytest.mark.parametrize(

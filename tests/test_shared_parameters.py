@@ -4,10 +4,11 @@ from dataclasses import replace
 
 import pytest
 import torch
-from test_population import ALGORITHMS, GAME, REPLAY, ROLLOUTS, population, ran, trained, weights
+from test_population import ALGORITHMS, GAME, REPLAY, ROLLOUTS, population, ran, trained
+from test_recurrent import ON_POLICY as RECURRENT
+from test_recurrent_replay import DQNS
 from test_teams import TEAMS, first_turn
 
-import cprl
 from cprl import CommonsEnv, Custom, Experiment
 from cprl.algorithms import DQN, PPO, Tabular, TabularSettings
 from cprl.algorithms.base import TeamAlgorithm
@@ -22,6 +23,9 @@ FOUR = tuple(range(4))
 EVERY = {
     **ALGORITHMS,
     **TEAMS,
+    "recurrent PPO": RECURRENT["PPO"],
+    "recurrent MAPPO": RECURRENT["MAPPO"],
+    "recurrent DQN": DQNS["GRU"],
     "DQN, convolutions": DQN(
         settings=replace(REPLAY, hidden_cells=DEFAULT_HIDDEN_CELLS), network=Conv(channels=(2,))
     ),
@@ -99,27 +103,6 @@ def test_members_explore_each_by_random_numbers_of_its_own():
     chosen = [next(iter(own.learners.values())).actor.choose(seen) for own in (alone, team)]
     assert torch.equal(*chosen), "epsilon is 1 at first"
     assert len(set(chosen[1][0].tolist())) > 1
-
-
-@pytest.mark.integration
-def test_a_run_is_built_again_plays_frozen_and_others_start_from_it(tmp_path, monkeypatch):
-    monkeypatch.chdir(tmp_path)
-    members = [shared(DQN(settings=REPLAY), (0, 1)), shared(TEAMS["IPPO"], (2, 3), reward="individual")]
-    run, networks = ran(tmp_path, members)
-    loaded = cprl.load(run)
-    assert [spec.share_parameters for spec in loaded.specs] == [True] * 4
-    for replica in range(2):
-        mine, yours = (networks[f"replica_{replica}/agent_{agent}"].state_dict() for agent in (2, 3))
-        assert all(torch.equal(value, yours[name]) for name, value in mine.items())
-    frozen = population([Frozen(run, 1, replica=1), Frozen(run, 3), Scripted(), Scripted()])
-    actor = frozen.others[0,]
-    actor.epsilon = 0.0
-    seen = CommonsEnv(GAME, 2, seed=9).reset()["agents", "observation"][:, :1]
-    assert torch.equal(actor.choose(seen), networks["replica_1/agent_0"](seen).argmax(-1))
-    again = population([replace(members[0], start_from=Frozen(run, 1, replica=None)), Scripted(), Scripted()])
-    for name, value in weights(again).items():
-        lane, key = name.rsplit("/", 1)
-        assert torch.equal(value, networks[lane].state_dict()[key])
 
 
 @pytest.mark.integration

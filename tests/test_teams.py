@@ -28,7 +28,6 @@ TEAMS = {
     "IPPO": IPPO(settings=ROLLOUTS),
     "MADDPG": MADDPG(settings=REPLAY),
 }
-WAYS = {"VDN": "vmapped", "QMIX": "vmapped", "MAPPO": "lane_axis", "IPPO": "lane_axis", "MADDPG": "lane_axis"}
 FOUR = tuple(range(4))
 
 
@@ -36,36 +35,6 @@ def team_of(name, **how):
     agents = population([Team(TEAMS[name], FOUR)], **how)
     (learner,) = agents.learners.values()
     return agents, learner
-
-
-@pytest.mark.integration
-@pytest.mark.parametrize("name", TEAMS)
-def test_each_team_takes_the_way_that_agrees_with_a_list_of_torchrls_losses(name):
-    algorithm = TEAMS[name]
-    _, found = team_of(name)
-    common = {"agents": FOUR, "replicas": 2, "settings": algorithm.settings, "seed": 3}
-    common |= {"reward_kind": "team"}
-    if name == "MADDPG":
-        common |= {"own_rewards": True, "noise_numbers": 2, "stochastic": True}
-    common |= {
-        "make_network": lambda: algorithm.make_network(GAME.spaces),
-        "make_loss": algorithm.make_loss,
-        "compile": False,
-    }
-    common |= {"make_team": lambda members: algorithm.make_team(members, GAME.spaces)}
-    kind = type(found)
-    ends = []
-    for one in (
-        found,
-        kind(GAME.spaces, engine=WAYS[name], **common),
-        kind(GAME.spaces, engine="list", **common),
-    ):
-        train(CommonsEnv(GAME, 2, seed=3), {FOUR: one}, episodes=3)
-        ends.append([network.state_dict() for network in one.networks().values()])
-    for mine, named, by_list in zip(*ends, strict=True):
-        for key, value in by_list.items():
-            assert torch.equal(mine[key], named[key]), "this is the way that is found"
-            torch.testing.assert_close(mine[key], value, rtol=1e-3, atol=1e-5)
 
 
 def test_qmix_over_many_observations_is_not_slowed_by_what_the_trial_rounds():

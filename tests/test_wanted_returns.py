@@ -280,20 +280,11 @@ class Deaf(DQN):
             [Learning(Deaf(settings=REPLAY), reward=AVERSE)] * 2,
             "reward is InequityAversion, which the learner of Deaf does not have as its `wants`",
         ),
-        (
-            [Learning(Custom("test_wanted_returns:deaf"), reward=AVERSE)] * 2,
-            "which the learner of test_wanted_returns:deaf does not have",
-        ),
     ],
 )
 def test_where_it_cannot_be_wanted_it_is_refused_by_name(specs, message):
     with pytest.raises(ValueError, match=message):
         population(specs, MatrixGame(2))
-
-
-def deaf():
-    """As a recipe names it."""
-    return Deaf(settings=REPLAY)
 
 
 def test_agents_without_others_are_refused_before_anything_is_written(tmp_path):
