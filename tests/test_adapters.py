@@ -48,29 +48,15 @@ SINGLE = [presets.game("single_basic"), replace(presets.game("single_complex"), 
 
 
 @pytest.mark.parametrize("game", GAMES, ids=IDS)
-def test_the_parallel_env_passes_pettingzoos_api_test(game):
+def test_both_envs_pass_pettingzoos_tests_of_their_interface_and_seeds(game):
     parallel_api_test(parallel_env(game), num_cycles=100)
-
-
-@pytest.mark.parametrize("game", [GAMES[0], GAMES[2], EVERYTHING], ids=["short", "commons", "institutions"])
-def test_the_aec_env_passes_pettingzoos_api_test(game):
-    api_test(env(game), num_cycles=200)
-
-
-def test_with_vectors_pettingzoos_api_test_warns_only_that_observations_are_not_a_box():
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always")
-        api_test(env(GAMES[1]), num_cycles=200)
+        api_test(env(game), num_cycles=200)
     messages = {str(warning.message) for warning in caught}
-    assert all(
-        "Observation is not a NumPy array" in text or "probably should be gymnasium.spaces.box" in text
-        for text in messages
-    )
-    assert messages
-
-
-@pytest.mark.parametrize("game", GAMES, ids=IDS)
-def test_both_envs_pass_pettingzoos_seed_tests(game):
+    not_a_box = ("Observation is not a NumPy array", "probably should be gymnasium.spaces.box")
+    assert all(any(words in message for words in not_a_box) for message in messages)
+    assert bool(messages) == game.observation.scoreboard, "observations with vectors are not a box"
     parallel_seed_test(lambda: parallel_env(game), num_cycles=60)
     seed_test(lambda: env(game), num_cycles=60)
 
@@ -85,12 +71,13 @@ def test_the_gymnasium_env_passes_gymnasiums_check(game):
     check_env(made, skip_render_check=bool(game.institutions))
 
 
-@pytest.mark.parametrize("name", ["SingleBasic", "SingleComplex"])
-def test_single_boards_are_registered_in_both_variants(name):
-    for variant in ("published", "as_run"):
-        made = gymnasium.make(f"cprl/{name}-v0", variant=variant)
-        board = {"SingleBasic": "single_basic", "SingleComplex": "single_complex"}[name]
-        assert made.unwrapped.game == presets.game(board, variant=variant)
+@pytest.mark.parametrize(
+    ("name", "board"), [("SingleBasic", "single_basic"), ("SingleComplex", "single_complex")]
+)
+@pytest.mark.parametrize("variant", ["published", "as_run"])
+def test_single_boards_are_registered_in_both_variants(name, board, variant):
+    made = gymnasium.make(f"cprl/{name}-v0", variant=variant)
+    assert made.unwrapped.game == presets.game(board, variant=variant)
 
 
 @pytest.mark.filterwarnings("ignore:PettingZoo in TorchRL is tested using version:UserWarning")
@@ -101,7 +88,7 @@ def test_torchrls_pettingzoo_wrapper_accepts_the_parallel_env():
     assert steps["agent", "observation"].shape == (20, 4, 3, 7, 15)
 
 
-PAID = ("fines", "transfers", "violated")
+INFOS = ("harvest", "in_play", "fired", "fines", "transfers", "violated")
 
 
 def played_by_torchrl(game, turns, decisions):
@@ -117,9 +104,6 @@ def played_by_torchrl(game, turns, decisions):
         after = now["next"]
         agents = after["agents"][0]
         episode += bool(after["done"])
-        infos = {
-            name: agents[name].tolist() for name in ("harvest", "in_play", "fired", *PAID) if name in agents
-        }
         yield {
             **{
                 (name, entry): agents[i][entry].numpy()
@@ -127,8 +111,8 @@ def played_by_torchrl(game, turns, decisions):
                 for entry in ("observation", "scoreboard", "stock_gauge")
                 if entry in agents
             },
+            **{name: agents[name].tolist() for name in INFOS if name in agents},
             "rewards": agents["reward"][:, 0].tolist(),
-            **infos,
             "tagged": agents["tagged_by"].any(-1).tolist(),
             "end": (bool(after["terminated"]), bool(after["truncated"])),
         }
@@ -139,10 +123,10 @@ def step_output(names, observe, rewards, infos, end):
     entries = {}
     for name in names:
         seen = observe(name)
-        for entry, array in (seen if isinstance(seen, dict) else {"observation": seen}).items():
-            entries[name, entry] = array
-    told = {entry: [infos[name][entry] for name in names] for entry in infos[names[0]]}
-    return {**entries, "rewards": [rewards[name] for name in names], **told, "end": end}
+        seen = seen if isinstance(seen, dict) else {"observation": seen}
+        entries |= {(name, entry): array for entry, array in seen.items()}
+    entries |= {entry: [infos[name][entry] for name in names] for entry in infos[names[0]]}
+    return {**entries, "rewards": [rewards[name] for name in names], "end": end}
 
 
 def options(game, decided):
@@ -278,7 +262,7 @@ def test_the_image_shows_each_agent_in_play_in_its_own_colour():
 @pytest.mark.parametrize(
     ("actions", "message"),
     [
-        ({"agent_0": 0}, r"actions has the agents \['agent_0'\]; allowed: exactly \['agent_0', 'agent_1'\]"),
+        ({"agent_0": 0}, r"actions has the agents \['agent_0'\]; allowed: exactly "),
         ({"agent_0": 0, "agent_1": 0, "agent_2": 0}, "allowed: exactly "),
         ({"agent_0": 0, "agent_1": 8}, "the action of agent_1 is 8; allowed: an integer from 0 to 7"),
     ],
@@ -293,19 +277,16 @@ def test_wrong_actions_are_refused_and_change_nothing(actions, message):
     assert world.batch.now.step[0, 0] == 0
 
 
-def test_a_step_after_the_end_of_an_episode_asks_for_reset():
-    world = parallel_env(replace(SHORT, rules=replace(SHORT.rules, episode_steps=1)))
+@pytest.mark.parametrize("actions", [{"agent_0": 0, "agent_1": 0}, {}])
+def test_before_the_first_episode_and_after_each_a_reset_is_asked_for(actions):
+    world = parallel_env(replace(SHORT, rules=replace(SHORT.rules, episode_steps=1)), render_mode="rgb_array")
+    for attempt in (lambda: world.step(actions), world.render, world.state):
+        with pytest.raises(ValueError, match=r"has not begun; allowed: reset\(\)"):
+            attempt()
     world.reset()
     world.step({"agent_0": 0, "agent_1": 0})
-    for actions in ({"agent_0": 0, "agent_1": 0}, {}):
-        with pytest.raises(ValueError, match=r"has ended; allowed: reset\(\)"):
-            world.step(actions)
-
-
-@pytest.mark.parametrize("actions", [{"agent_0": 0, "agent_1": 0}, {}])
-def test_a_step_before_the_first_episode_asks_for_reset(actions):
-    with pytest.raises(ValueError, match=r"has not begun; allowed: reset\(\)"):
-        parallel_env(SHORT).step(actions)
+    with pytest.raises(ValueError, match=r"has ended; allowed: reset\(\)"):
+        world.step(actions)
 
 
 def test_gymnasium_refuses_games_of_several_agents():
@@ -327,10 +308,3 @@ def test_without_a_seed_two_environments_play_different_worlds():
     for make in (lambda: parallel_env(SHORT), lambda: CommonsGymnasiumEnv(SINGLE[0]).world):
         first, second = (make().batch.state()["seed"].item() for _ in range(2))
         assert first != second
-
-
-def test_what_has_not_begun_cannot_be_shown():
-    world = parallel_env(SHORT, render_mode="rgb_array")
-    for show in (world.render, world.state):
-        with pytest.raises(ValueError, match=r"has not begun; allowed: reset\(\) before"):
-            show()

@@ -2,11 +2,9 @@
 
 import io
 import re
-from dataclasses import replace
 from itertools import chain, combinations
 from pathlib import Path
 
-import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
@@ -76,7 +74,7 @@ def told(episodes):
     return [repr({**vars(episode), "world": None, "episode": None}) for episode in episodes]
 
 
-def test_the_matrix_game_is_a_game_of_torchrl():
+def test_what_a_game_of_torchrl_reports_is_read_from_its_specs():
     check_env_specs(MatrixGame(2, with_harvest=True))
     assert reported_by(MatrixGame(2)) == ()
     assert reported_by(MatrixGame(2, with_harvest=True)) == ("harvest",)
@@ -151,20 +149,20 @@ def test_what_the_first_batch_reported_is_wanted_of_all():
     whole, bare = (
         next(iter(StepCollector(MatrixGame(1, with_harvest=has), tit_for_tat))) for has in (True, False)
     )
-    tracker = EpisodeTracker(1, 2)
+    tracker, other = EpisodeTracker(1, 2), EpisodeTracker(1, 2)
     tracker.add(whole)
-    with pytest.raises(ValueError, match=r"the batch lacks \(next, agents, harvest\)"):
-        tracker.add(bare)
-    other = EpisodeTracker(1, 2)
     other.add(bare)
     with pytest.raises(ValueError, match=r"a game that reports \['harvest'\]"):
         other.load_state_dict(tracker.state_dict())
-    with pytest.raises(ValueError, match=r"lacks \(next, agents, reward\)"):
-        EpisodeTracker(1, 2).add(bare.exclude(("next", "agents", "reward")))
-    with pytest.raises(ValueError, match=r"lacks \(done\)"):
-        EpisodeTracker(1, 2).add(bare.exclude("done"))
-    with pytest.raises(ValueError, match="yield_share needs a harvest"):
-        EpisodeTracker(1, 2, sustainable_yield=1.0, first_stock=1.0).add(bare)
+    yielding = EpisodeTracker(1, 2, sustainable_yield=1.0, first_stock=1.0)
+    for each, batch, message in (
+        (tracker, bare, r"the batch lacks \(next, agents, harvest\)"),
+        (EpisodeTracker(1, 2), bare.exclude(("next", "agents", "reward")), r"\(next, agents, reward\)"),
+        (EpisodeTracker(1, 2), bare.exclude("done"), r"lacks \(done\)"),
+        (yielding, bare, "yield_share needs a harvest"),
+    ):
+        with pytest.raises(ValueError, match=message):
+            each.add(batch)
 
 
 def test_its_table_has_the_columns_that_there_are_and_says_what_is_left_out(tmp_path):
@@ -178,6 +176,7 @@ def test_its_table_has_the_columns_that_there_are_and_says_what_is_left_out(tmp_
     columns = ["replica", "episode", "agent", "return", "steps", "terminated", "survival_steps"]
     assert kept.column_names == columns
     assert kept.equals(going_on)
+    assert pq.read_table(tmp_path / "episodes.parquet").equals(kept)
     assert kept.schema.metadata[LEFT_OUT].decode() == left_out(())
     assert kept["return"].to_pylist() == [4.0, 8.5, 5.0, 9.5, 4.0, 8.5, 5.0, 9.5]
     curves = curves_of(tmp_path)
@@ -197,11 +196,8 @@ def test_the_table_of_a_commons_has_all_columns():
 
 def test_a_game_that_must_not_be_stepped_when_it_has_ended_is_evaluated():
     episodes = evaluate(MatrixGame(3), tit_for_tat)
-    assert [(episode.world, episode.episode, episode.steps) for episode in episodes] == [
-        (0, 0, 5),
-        (1, 0, 6),
-        (2, 0, 7),
-    ]
+    ends = [(episode.world, episode.episode, episode.steps) for episode in episodes]
+    assert ends == [(0, 0, 5), (1, 0, 6), (2, 0, 7)]
     measures = social_measures({0: episodes})
     assert list(measures) == ["survival_steps"]
     assert measures["survival_steps"].estimate.value == 6.0
@@ -229,17 +225,15 @@ def transformed(worlds):
 
 
 def test_transforms_change_nothing_that_is_evaluated():
-    assert told(evaluate(transformed(5), greedy_right)) == told(
-        evaluate(CommonsEnv(GAME, 5, seed=3), greedy_right)
-    )
+    plain = evaluate(CommonsEnv(GAME, 5, seed=3), greedy_right)
+    assert told(evaluate(transformed(5), greedy_right)) == told(plain)
     sums = []
 
     def summing(tensordict):
         sums.append(tensordict["agents", "paid"][:, :, 0].clone())
         return greedy_right(tensordict)
 
-    env = transformed(1)
-    (episode,) = evaluate(env, summing)
+    (episode,) = evaluate(transformed(1), summing)
     assert torch.stack(sums).diff(dim=0).ge(0).all()
     assert len(sums) == episode.steps
     assert sums[-1].sum() > 0, "RewardSum goes on from step to step"
@@ -250,16 +244,14 @@ def test_a_clock_of_a_transform_ends_episodes():
     assert [episode.steps for episode in evaluate(env, tit_for_tat)] == [7, 7]
 
 
-def entities(path):
-    return {chunk.entity_path.strip("/") for chunk in RrdReader(path).stream()}
-
-
-def test_a_recording_of_it_has_metrics_and_returns_and_says_what_is_left_out(tmp_path):
+def test_a_recording_of_it_names_its_agents_has_metrics_and_returns_and_says_what_is_left_out(tmp_path):
     env = MatrixGame(2)
-    with ViewerCallback(tmp_path, env, title="matrix", episodes=2) as viewer:
-        play(env, tit_for_tat, 5, callbacks=[viewer])
+    env.group_map = {"agents": ["row", "column"]}
+    wrapped = TransformedEnv(env, StepCounter())
+    with ViewerCallback(tmp_path, wrapped, title="matrix", episodes=2) as viewer:
+        play(wrapped, tit_for_tat, 6, callbacks=[viewer])
         state = viewer.state_dict()
-    with ViewerCallback(tmp_path, env, title="matrix", episodes=2) as second:
+    with ViewerCallback(tmp_path, wrapped, title="matrix", episodes=2) as second:
         second.load_state_dict(state)
     path = tmp_path / "run.rrd"
     events = [text[0] for text in column(path, "log", "TextLog:text")[1]]
@@ -269,23 +261,12 @@ def test_a_recording_of_it_has_metrics_and_returns_and_says_what_is_left_out(tmp
     assert "phases and new bests (the game reports no harvest and no in_play)" in line
     assert "who tagged whom" in line
     assert line.endswith("the board and what agents see (the game reports no board)")
-    logged = entities(path)
+    logged = {chunk.entity_path.strip("/") for chunk in RrdReader(path).stream()}
     assert not {name for name in logged if name.startswith(("world", "windows", "phase", "tags"))}
-    social_ones = {name for name in logged if name.startswith("social/")}
-    assert social_ones == {"social/survival_steps"}
-
-
-def test_a_recording_names_agents_as_the_environment_does(tmp_path):
-    env = MatrixGame(2)
-    env.group_map = {"agents": ["row", "column"]}
-    wrapped = TransformedEnv(env, StepCounter())
-    with ViewerCallback(tmp_path, wrapped, title="matrix", episodes=2) as viewer:
-        play(wrapped, tit_for_tat, 6, callbacks=[viewer])
-    path = tmp_path / "run.rrd"
+    assert {name for name in logged if name.startswith("social/")} == {"social/survival_steps"}
     assert column(path, "row/return", "Scalars:scalars", "episode") == ([0], [[4.5, 4.5]])
     assert column(path, "row/loss", "Scalars:scalars")[1] == [[0.5]]
-    _, survival = column(path, "social/survival_steps", "Scalars:scalars")
-    assert survival == [[5.0, 6.0, 5.5, 5.5]]
+    assert column(path, "social/survival_steps", "Scalars:scalars")[1] == [[5.0, 6.0, 5.5, 5.5]]
 
 
 def test_under_transforms_windows_show_what_the_agents_of_the_game_observe(tmp_path):
@@ -341,19 +322,8 @@ def test_the_table_of_an_evaluation_says_what_is_left_out():
 
 
 def test_bars_know_the_clock_of_a_game_or_of_its_environment():
-    clocks = [
-        ProgressBar(played, episodes=1)._clock
-        for played in (GAME, CommonsEnv(GAME, 1), transformed(1), MatrixGame(1), None)
-    ]
-    assert clocks == [20, 20, 20, None, None]
-
-
-def test_parquet_readers_of_others_read_the_table(tmp_path):
-    with EpisodeTable(tmp_path / "episodes.parquet") as table:
-        for episode in play(MatrixGame(1), tit_for_tat, 5):
-            table.add(replace(episode, episode=7), replica=3)
-    assert pq.read_table(tmp_path / "episodes.parquet")["replica"].to_pylist() == [3, 3]
-    assert np.array_equal(read_episodes(tmp_path)["episode"], [7, 7])
+    games = (GAME, CommonsEnv(GAME, 1), transformed(1), MatrixGame(1), None)
+    assert [ProgressBar(game, episodes=1)._clock for game in games] == [20, 20, 20, None, None]
 
 
 def test_actions_of_numbers_are_refused_by_the_name_of_their_entry():

@@ -47,16 +47,16 @@ TRANSFERS = torch.tensor([0.0, 1.0, 0.0, 2.0])
 IN_PLAY = torch.tensor([10, 10, 8, 4])
 TAGS = torch.tensor([2, 1, 1, 0])
 COUNTED = {
-    "own_bites": [5, 2, 3, 0],
-    "foreign_bites": [1, 0, 1, 0],
-    "trespasses": [2, 0, 3, 0],
-    "excess_bites": [1, 0, 0, 0],
-    "closed_bites": [0, 0, 2, 0],
-    "unjust_tags": [1, 0, 0, 0],
-    "violations": [3, 0, 5, 0],
-    "detections": [2, 0, 2, 0],
-    "sanctions": [2, 0, 1, 0],
-    "returns_to_violation": [1, 0, 3, 0],
+    "own_bites": torch.tensor([5, 2, 3, 0]),
+    "foreign_bites": torch.tensor([1, 0, 1, 0]),
+    "trespasses": torch.tensor([2, 0, 3, 0]),
+    "excess_bites": torch.tensor([1, 0, 0, 0]),
+    "closed_bites": torch.tensor([0, 0, 2, 0]),
+    "unjust_tags": torch.tensor([1, 0, 0, 0]),
+    "violations": torch.tensor([3, 0, 5, 0]),
+    "detections": torch.tensor([2, 0, 2, 0]),
+    "sanctions": torch.tensor([2, 0, 1, 0]),
+    "returns_to_violation": torch.tensor([1, 0, 3, 0]),
 }
 BY_HAND = {
     "fines": 3.0,
@@ -82,66 +82,43 @@ BY_HAND = {
 }
 
 
-def counts(**own):
-    return {name: torch.tensor(own.get(name, COUNTED[name])) for name in COUNTS}
-
-
-def whole(**own):
+def whole(**changes):
     given = {
         "harvest": HARVEST,
         "fines": FINES,
         "transfers": TRANSFERS,
-        "violations": counts()["violations"],
-        "counts": counts(),
+        "violations": COUNTED["violations"],
+        "counts": COUNTED,
         "in_play_steps": IN_PLAY,
         "tags": TAGS,
         "groups": GROUPS,
     }
-    return institutions.summary(**{**given, **own})
-
-
-def values(metrics):
-    return {name: value.item() for name, value in metrics.items()}
+    return institutions.summary(**{**given, **changes})
 
 
 def test_each_metric_is_what_we_work_out_by_hand():
-    assert values(whole()) == pytest.approx(BY_HAND, rel=1e-15)
-    assert list(whole()) == list(NEEDS) == list(BY_HAND)
-    assert all(value.dtype == torch.float64 and value.shape == () for value in whole().values())
+    metrics = whole()
+    assert {name: value.item() for name, value in metrics.items()} == pytest.approx(BY_HAND, rel=1e-15)
+    assert list(metrics) == list(NEEDS) == list(BY_HAND)
+    assert all(value.dtype == torch.float64 and value.shape == () for value in metrics.values())
 
 
 def test_batch_axes_come_through():
-    twice = {
-        "harvest": torch.stack([HARVEST, 2 * HARVEST]),
-        "fines": torch.stack([FINES, FINES]),
-        "transfers": torch.stack([TRANSFERS, TRANSFERS]),
-        "violations": None,
-        "in_play_steps": None,
-        "counts": None,
-        "tags": None,
-    }
-    found = whole(**twice)
+    twice = {"harvest": torch.stack([HARVEST, 2 * HARVEST]), "fines": torch.stack([FINES, FINES])}
+    twice["transfers"] = torch.stack([TRANSFERS, TRANSFERS])
+    found = whole(**twice, **dict.fromkeys(("violations", "in_play_steps", "counts", "tags")))
     assert {value.shape for value in found.values()} == {(2,)}
     assert found["net_equality"][0].item() == BY_HAND["net_equality"]
     assert found["equality_within"].tolist() == pytest.approx([0.625, 0.625]), "no matter in which unit"
 
 
 def test_where_nothing_happened_shares_are_undefined_and_totals_are_zero():
+    entries = ("harvest", "fines", "transfers", "violations", "in_play_steps", "tags")
     nothing = torch.zeros(4)
-    found = values(
-        whole(
-            harvest=nothing,
-            fines=nothing,
-            transfers=nothing,
-            violations=nothing,
-            in_play_steps=nothing,
-            tags=nothing,
-            counts=dict.fromkeys(COUNTS, nothing),
-        )
-    )
+    found = whole(**dict.fromkeys(entries, nothing), counts=dict.fromkeys(COUNTS, nothing))
     totals = {"fines", "transfers", "violations", "trespasses", "excess_bites", "closed_bites"}
     assert {name for name, value in found.items() if value == 0} == totals
-    assert all(np.isnan(value) for name, value in found.items() if name not in totals)
+    assert all(value.isnan() for name, value in found.items() if name not in totals)
 
 
 def test_a_group_without_income_is_left_out_of_the_mean_within():
@@ -283,32 +260,25 @@ def test_a_tracker_goes_on_exactly_from_its_state(tmp_path):
         assert all_written_out(other, [second, third, *an_episode()]) == expected
 
 
-def test_a_state_of_another_game_is_refused():
-    tracker = EpisodeTracker(1, 2)
-    tracker.add(an_episode()[0])
-    without = EpisodeTracker(1, 2)
+def test_a_batch_or_a_state_of_another_game_is_refused():
+    tracker, without, two_votes = (EpisodeTracker(1, 2) for _ in range(3))
+    tracker.add(paying(in_force=[[1]]))
     without.add(turn())
+    two_votes.add(paying(in_force=[[1, 2]]))
     with pytest.raises(ValueError, match="the state is from a game that reports"):
         without.load_state_dict(tracker.state_dict())
-    two_votes = EpisodeTracker(1, 2)
-    two_votes.add(paying(in_force=[[1, 2]]))
     with pytest.raises(ValueError, match=r'"in_force" of the state is \[1, 1\]; allowed: \[1, 2\]'):
         two_votes.load_state_dict(tracker.state_dict())
-
-
-def test_entries_that_do_not_fit_are_named():
-    wrong = paying()
-    wrong["next", "agents", "counts"] = torch.zeros(1, 2, 3, dtype=torch.int32)
-    with pytest.raises(ValueError, match='"counts" of the batch has 3 columns; allowed: 10, own_bites, '):
-        EpisodeTracker(1, 2).add(wrong)
-    tracker = EpisodeTracker(1, 2)
-    tracker.add(paying(in_force=[[1]]))
     with pytest.raises(ValueError, match=r"the batch lacks \(next, in_force\)"):
         tracker.add(paying())
     lacks = paying(in_force=[[1]])
     del lacks["next", "agents", "fines"]
     with pytest.raises(ValueError, match=r"the batch lacks \(next, agents, fines\)"):
         tracker.add(lacks)
+    wrong = paying()
+    wrong["next", "agents", "counts"] = torch.zeros(1, 2, 3, dtype=torch.int32)
+    with pytest.raises(ValueError, match='"counts" of the batch has 3 columns; allowed: 10'):
+        EpisodeTracker(1, 2).add(wrong)
 
 
 def test_a_game_that_pays_without_counting_has_the_metrics_of_payments():
@@ -330,13 +300,10 @@ def test_the_table_has_a_column_for_each_number_and_keeps_it(tmp_path):
     expected = ["terminated", *of_this, "in_force_0", "collective_return"]
     first = kept.column_names.index("terminated")
     assert kept.column_names[first : first + len(expected)] == expected
-    assert kept["fines"].to_pylist() == [0.5, 1.5]
-    assert kept["violations"].to_pylist() == [0, 2]
-    assert kept["own_bites"].to_pylist() == [2, 0]
-    assert kept["in_force_0"].to_pylist() == [0.25, 0.25]
-    assert set(kept.column_names) - set(expected) <= set(
-        as_table(played(turn(done=[[True]])), 0).column_names
-    )
+    numbers = {"fines": [0.5, 1.5], "violations": [0, 2], "own_bites": [2, 0], "in_force_0": [0.25, 0.25]}
+    assert kept.select(list(numbers)).to_pydict() == numbers
+    without = as_table(played(turn(done=[[True]])), 0)
+    assert set(kept.column_names) - set(expected) <= set(without.column_names)
 
 
 def test_curves_have_the_metrics_of_the_table():

@@ -2,6 +2,8 @@
 
 import json
 from dataclasses import replace
+from itertools import product
+from operator import attrgetter
 
 import pytest
 import torch
@@ -41,6 +43,9 @@ CHANCY = TakingGame(herders(3), turns=4, memory=2, continue_prob=0.6)
 STEEP = CallableWorth(function=lambda total: 8 - total**3, most=2)
 
 
+EITHER_GAME = pytest.mark.parametrize("game", [IPD, PAIR], ids=["matrix", "taking"])
+
+
 def own_game():
     """A game of the user's own function, for `Custom`."""
     return TakingGame(SharingGame(agents=2, worth=STEEP, cost=1.0), levels=3, turns=2)
@@ -52,14 +57,7 @@ def step(env, carried, *actions):
     return env.step_and_maybe_reset(carried)
 
 
-def rewards(game, *actions):
-    """What joint actions pay, one in each world, [B][N]."""
-    env = make_env(game, worlds=len(actions))
-    now, _ = step(env, env.reset(), *actions)
-    return now["next", "agents", "reward"][..., 0].tolist()
-
-
-@pytest.mark.parametrize("game", [IPD, PAIR])
+@EITHER_GAME
 def test_a_game_of_one_turn_shows_the_number_one_and_terminates(game):
     env = make_env(replace(game, turns=1), worlds=2)
     now, moment = step(env, env.reset(), (0, 1), (1, 1))
@@ -69,7 +67,7 @@ def test_a_game_of_one_turn_shows_the_number_one_and_terminates(game):
     assert make_env(replace(game, memory=0)).reset()["agents", "observation"].shape == (1, 2, 1)
 
 
-@pytest.mark.parametrize("game", [IPD, PAIR])
+@EITHER_GAME
 def test_a_repeated_game_is_truncated_by_its_clock_and_begins_again(game):
     env = make_env(game)
     moment, found = env.reset(), []
@@ -113,21 +111,14 @@ def test_the_lean_step_equals_torchrls_own(kind, game):
         _step_and_maybe_reset = EnvBase._step_and_maybe_reset
 
     assert kind._step_and_maybe_reset is LeanStepEnv._step_and_maybe_reset
-    envs = [made(game, 4, seed=3) for made in (kind, Stock)]
-    moments, kept = [env.reset() for env in envs], []
-    for turn in range(30):
-        torch.manual_seed(turn)
-        action = envs[0].action_spec["agents", "action"].rand()
-        steps = [
-            env.step_and_maybe_reset(moment.set(("agents", "action"), action))
-            for env, moment in zip(envs, moments, strict=True)
-        ]
-        nows, moments = zip(*steps, strict=True)
-        assert_equal(*nows)
-        assert_equal(*(moment.exclude(("agents", "action")) for moment in moments))  # which is overwritten
-        kept.append((nows[0], nows[0].clone()))
-    for now, then in kept:
-        assert_equal(now, then)  # what was returned never changes
+    lean, stock = (made(game, 4, seed=3) for made in (kind, Stock))
+    torch.manual_seed(0)
+    actions = [lean.action_spec["agents", "action"].rand() for _ in range(30)]
+    steps, copies = rolled(lean, actions)
+    others, _ = rolled(stock, actions)
+    for step, copy, other in zip(steps, copies, others, strict=True):
+        assert_equal(step, other)
+        assert_equal(step, copy)  # what was returned never changes
 
 
 def assert_equal(one, other):
@@ -137,28 +128,31 @@ def assert_equal(one, other):
         assert torch.equal(entries[name], others[name]), name
 
 
-@pytest.mark.parametrize("game", [IPD, PAIR])
+@EITHER_GAME
 @settings(max_examples=15, deadline=None)
 @given(worlds=st.integers(2, 5), world=st.integers(0, 4), seed=st.integers(0, 2**32 - 1))
 def test_a_world_does_not_notice_its_neighbours(game, worlds, world, seed):
     world %= worlds
     game = replace(game, turns=5, continue_prob=0.7, memory=2)
     actions = torch.randint(2, (8, worlds, 2), generator=torch.Generator().manual_seed(seed))
-    many = rolled(make_env(game, worlds=worlds, seed=seed), actions)
-    alone = rolled(make_env(game, seed=seed, first_world=world), actions[:, world : world + 1])
+    many, _ = rolled(make_env(game, worlds=worlds, seed=seed), actions)
+    alone, _ = rolled(make_env(game, seed=seed, first_world=world), actions[:, world : world + 1])
     for moment, lone in zip(many, alone, strict=True):
         assert_equal(moment[world : world + 1], lone)
 
 
 def rolled(env, actions):
-    moment, found = env.reset(), []
+    """What each step returned, and was then; the last entry is what would be carried on."""
+    moment, steps, copies = env.reset(), [], []
     for joint in actions:
-        now, moment = env.step_and_maybe_reset(moment.set(("agents", "action"), joint))
-        found.append(now)
-    return found
+        step, moment = env.step_and_maybe_reset(moment.set(("agents", "action"), joint))
+        steps.append(step)
+        copies.append(step.clone())
+    last = moment.exclude(("agents", "action"))  # which is overwritten
+    return [*steps, last], [*copies, last.clone()]
 
 
-@pytest.mark.parametrize("game", [IPD, PAIR])
+@EITHER_GAME
 def test_a_chance_to_continue_needs_several_turns(game):
     with pytest.raises(ValueError, match=rf"{type(game).__name__}.continue_prob is 0.5"):
         replace(game, turns=1, continue_prob=0.5)
@@ -174,7 +168,7 @@ def test_a_chance_to_continue_needs_several_turns(game):
         (None, r"is missing"),
     ],
 )
-@pytest.mark.parametrize("game", [IPD, PAIR])
+@EITHER_GAME
 def test_actions_that_nobody_can_take_are_refused_and_change_nothing(game, action, message):
     env = make_env(game)
     group = env.reset()["agents"]
@@ -206,7 +200,16 @@ HERDERS = replace(
     agents=[Learning(DQN(settings=SMALL)), Learning(PPO(settings=ROLLOUTS), reward="team")],
 )
 DEARER = replace(HERDERS, game=replace(HERDERS.game, sharing=herders(2, cost=2.0)))
-BOTH = pytest.mark.parametrize("experiment", [DILEMMA, HERDERS], ids=["matrix", "taking"])
+
+
+SHARING = {
+    "kind": "SharingGame",
+    "agents": 2,
+    "worth": {"kind": "PowerWorth", "top": 10, "factor": 1, "power": 2},
+    "cost": 1,
+    "most_each": None,
+    "payment": 0,
+}
 
 
 @pytest.mark.parametrize(
@@ -220,19 +223,7 @@ BOTH = pytest.mark.parametrize("experiment", [DILEMMA, HERDERS], ids=["matrix", 
         ),
         (
             HERDERS,
-            {
-                "kind": "TakingGame",
-                "sharing": {
-                    "kind": "SharingGame",
-                    "agents": 2,
-                    "worth": {"kind": "PowerWorth", "top": 10, "factor": 1, "power": 2},
-                    "cost": 1,
-                    "most_each": None,
-                    "payment": 0,
-                },
-                "levels": 5,
-                "most": 2,
-            },
+            {"kind": "TakingGame", "sharing": SHARING, "levels": 5, "most": 2},
             DEARER,
             "experiment.game.sharing.cost was 1.0, is 2.0",
         ),
@@ -244,8 +235,7 @@ def test_its_recipe_holds_it_and_gives_it_back_without_importing_anything(experi
     assert recipe["experiment"]["game"] == {**table, "turns": 5, "memory": None, "continue_prob": 1}
     back = Experiment.from_recipe(recipe)
     assert back == experiment
-    assert back.game == experiment.game
-    assert hash(back.game) == hash(experiment.game)
+    assert (back.game, hash(back.game)) == (experiment.game, hash(experiment.game))
     assert changes(experiment, other) == [change]
 
 
@@ -287,21 +277,23 @@ def test_a_population_trains_stops_resumes_loads_and_meets_another(
         cprl.crossplay([loaded, other_game], episodes=2)
 
 
-@pytest.mark.parametrize("game", [IPD, PAIR])
+@EITHER_GAME
 def test_two_games_differ_in_the_fields_that_differ(game):
     assert differences(game, replace(game, turns=4)) == [f"{type(game).__name__}.turns 3 and 4"]
 
 
-def test_a_study_varies_payoffs_turns_costs_and_levels():
-    tables = [DILEMMA.game.payoffs, stag_hunt().payoffs]
-    study = Study(DILEMMA, {"game.turns": [1, 5], "game.payoffs": tables})
-    games = [trial.experiment.game for trial in trials_of(study)]
-    assert {(game.turns, game.payoffs) for game in games} == {(n, table) for n in (1, 5) for table in tables}
-    study = Study(HERDERS, {"game.sharing.cost": [1.0, 2.0], "game.levels": [5, 9]})
-    games = [trial.experiment.game for trial in trials_of(study)]
-    assert {(game.sharing.cost, game.levels) for game in games} == {
-        (c, n) for c in (1.0, 2.0) for n in (5, 9)
-    }
+@pytest.mark.parametrize(
+    ("experiment", "factors"),
+    [
+        (DILEMMA, {"game.turns": [1, 5], "game.payoffs": [DILEMMA.game.payoffs, stag_hunt().payoffs]}),
+        (HERDERS, {"game.sharing.cost": [1.0, 2.0], "game.levels": [5, 9]}),
+    ],
+    ids=["matrix", "taking"],
+)
+def test_a_study_varies_payoffs_turns_costs_and_levels(experiment, factors):
+    games = [trial.experiment.game for trial in trials_of(Study(experiment, factors))]
+    fields = [attrgetter(name.removeprefix("game.")) for name in factors]
+    assert {tuple(field(game) for field in fields) for game in games} == set(product(*factors.values()))
 
 
 def test_their_numbers_are_flags_of_a_command_line():
@@ -314,7 +306,7 @@ def test_their_numbers_are_flags_of_a_command_line():
     assert experiment.game == replace(HERDERS.game, turns=7, sharing=sharing)
 
 
-@BOTH
+@pytest.mark.parametrize("experiment", [DILEMMA, HERDERS], ids=["matrix", "taking"])
 def test_scripted_policies_that_read_a_window_are_refused(experiment):
     with pytest.raises(ValueError, match=r"Scripted\('greedy'\) reads the window of a cprl.Game"):
         cprl.run(replace(experiment, agents=[Scripted("greedy"), Scripted()]), "never")

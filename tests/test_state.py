@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 import torch
 from boards import random_actions
+from governed import EVERYTHING
 from test_worlds import assert_same, copied
 
 from cprl import CommonsEnv, Game, Observation, Rules, keys, maps, presets
@@ -92,41 +93,62 @@ def test_loading_the_state_from_before_a_rollout_undoes_the_rollout():
 
 
 @pytest.mark.parametrize(
-    ("change", "message"),
+    ("game", "change", "message"),
     [
-        ({"row": 3}, r"state\['row'\]\[0, 0\] is 3 .*; allowed: 0 to 2"),
-        ({"col": -1}, r"state\['col'\]\[0, 0\] is -1; allowed: 0 to 4"),
-        ({"heading": 4}, r"state\['heading'\]\[0, 0\] is 4; allowed: 0 to 3"),
-        ({"stock": 2}, r"state\['stock'\]\[0, 0\] is 2; allowed: 0 to 1"),
-        ({"out_steps": -1}, r"state\['out_steps'\]\[0, 0\] is -1; allowed: 0 to"),
-        ({"out_steps": 2}, r"state\['in_play'\]\[0, 0\] is True; allowed: False while out_steps is above 0"),
-        ({"hits": 1}, r"state\['hits'\]\[0, 0\] is 1; allowed: 0 to 0"),
-        ({"step": 51}, r"state\['step'\]\[0, 0\] is 51; allowed: 0 to 50"),
-        ({"ended": 3}, r"state\['ended'\]\[0, 0\] is 3; allowed: 0 to 2"),
-        ({"row": 1, "col": 1}, r"state\['row'\]\[0, 0\] is 1 \(column 1\); allowed: a cell without a wall"),
-        ({"row": 2, "col": 2}, r"state\['row'\]\[0, 0\] is 2 .*; allowed: a cell without another agent"),
+        (GAME, {"row": 3}, r"state\['row'\]\[0, 0\] is 3 .*; allowed: 0 to 2"),
+        (GAME, {"col": -1}, r"state\['col'\]\[0, 0\] is -1; allowed: 0 to 4"),
+        (GAME, {"heading": 4}, r"state\['heading'\]\[0, 0\] is 4; allowed: 0 to 3"),
+        (GAME, {"stock": 2}, r"state\['stock'\]\[0, 0\] is 2; allowed: 0 to 1"),
+        (GAME, {"out_steps": -1}, r"state\['out_steps'\]\[0, 0\] is -1; allowed: 0 to"),
+        (GAME, {"out_steps": 2}, r"state\['in_play'\]\[0, 0\] is True; allowed: False"),
+        (GAME, {"hits": 1}, r"state\['hits'\]\[0, 0\] is 1; allowed: 0 to 0"),
+        (GAME, {"step": 51}, r"state\['step'\]\[0, 0\] is 51; allowed: 0 to 50"),
+        (GAME, {"ended": 3}, r"state\['ended'\]\[0, 0\] is 3; allowed: 0 to 2"),
+        (GAME, {"row": 1, "col": 1}, r"state\['row'\]\[0, 0\] .* a cell without a wall"),
+        (GAME, {"row": 2, "col": 2}, r"state\['row'\]\[0, 0\] .* a cell without another agent"),
+        (EVERYTHING, {"taken": -1}, r"state\['taken'\]\[0, 0, 0\] is -1; allowed: 0 to 25"),
+        (EVERYTHING, {"taken": 26}, r"state\['taken'\]\[0, 0, 0\] is 26; allowed: 0 to 25"),
+        (EVERYTHING, {"level": -1}, r"state\['level'\]\[0, 0\] is -1"),
+        (EVERYTHING, {"offence_step": 26}, r"state\['offence_step'\]\[0, 0\] is 26; allowed: 0 to 25"),
+        (EVERYTHING, {"violation_step": -2}, r"state\['violation_step'\]\[0, 0\] is -2; allowed: 0 to 25"),
+        (EVERYTHING, {"counts": -1}, r"state\['counts'\]\[0, 0, 0\] is -1"),
+        (EVERYTHING, {"allowed": np.nan}, r"state\['allowed'\]\[0, 0\] is nan"),
+        (EVERYTHING, {"income": np.inf}, r"state\['income'\]\[0, 0, 0\] is inf"),
+        (EVERYTHING, {"in_force": 0.7}, r"state\['in_force'\]\[0, 0\] is 0\.7; .*\[0\.5, 1, 2\]"),
     ],
 )
-def test_an_impossible_state_is_refused_and_changes_nothing(change, message):
-    batch = Batch(GAME, 2)
+def test_an_impossible_state_is_refused_and_changes_nothing(game, change, message):
+    batch = Batch(game, 2)
     output = batch.begin(batch.new_output())
-    state, before = batch.state(), copied(batch.now)
+    state, before, worlds = batch.state(), batch.state(), copied(batch.now)
     for name, value in change.items():
-        state[name][0, 0] = value
+        state[name].reshape(-1)[0] = value
     with pytest.raises(ValueError, match=message):
         batch.load(state, output)
-    assert_same(batch.now, before)
+    assert all(np.array_equal(array, before[name]) for name, array in batch.state().items())
+    assert_same(batch.now, worlds)
+
+
+def test_a_state_from_before_the_first_episode_can_be_put_back():
+    batch, other = Batch(EVERYTHING, 2), Batch(EVERYTHING, 2)
+    other.load(batch.state(), other.new_output())
+    assert all(np.array_equal(array, other.state()[name]) for name, array in batch.state().items())
 
 
 def test_a_state_with_other_names_shapes_or_dtypes_is_refused():
-    batch = Batch(GAME, 2)
+    batch, governed = Batch(GAME, 2), Batch(EVERYTHING, 2)
     output, state = batch.begin(batch.new_output()), batch.state()
-    with pytest.raises(ValueError, match=r"lacks \['row'\] and has the unknown entries \['line'\]"):
-        batch.load({"line" if name == "row" else name: array for name, array in state.items()}, output)
-    with pytest.raises(ValueError, match=r"state\['row'\] is int64 \[2, 2\]; allowed: int32 \[2, 2\]"):
-        batch.load({**state, "row": state["row"].astype(np.int64)}, output)
-    with pytest.raises(ValueError, match=r"is uint64 \[2, 1\]; allowed: uint64 \[3, 1\]"):
-        Batch(GAME, 3).load(state, output)
+    for name, wrong, message in (
+        ("line", state["row"], r"lacks \[\] and has the unknown entries \['line'\]"),
+        ("row", state["row"].astype(np.int64), r"state\['row'\] is int64 \[2, 2\]; allowed: int32 \[2, 2\]"),
+        ("row", state["row"][:1], r"state\['row'\] is int32 \[1, 2\]; allowed: int32 \[2, 2\]"),
+    ):
+        with pytest.raises(ValueError, match=message):
+            batch.load({**state, name: wrong}, output)
+    with pytest.raises(ValueError, match=r"has the unknown entries \['allowed', 'counts'"):
+        batch.load(governed.state(), output)
+    with pytest.raises(ValueError, match=r"the state lacks \['allowed', 'counts'"):
+        governed.load(state, governed.new_output())
 
 
 def test_as_run_a_state_may_have_two_agents_on_a_cell():
@@ -138,23 +160,17 @@ def test_as_run_a_state_may_have_two_agents_on_a_cell():
     assert batch.now.row.tolist() == [[3, 3]]
 
 
-@pytest.mark.parametrize(
-    "spoil",
-    [
-        lambda output: output._replace(harvest=output.harvest.astype(np.float64)),
-        lambda output: output._replace(stock=output.stock[:1]),
-        lambda output: output._replace(observation=np.asfortranarray(output.observation)),
-    ],
-)
-def test_output_arrays_of_the_wrong_form_are_refused(spoil):
+def test_arrays_of_the_wrong_form_are_refused():
     batch = Batch(GAME, 2)
-    with pytest.raises(ValueError, match=r"output\.\w+ is .*; allowed: "):
-        batch.begin(spoil(batch.new_output()))
-
-
-def test_actions_that_are_not_contiguous_are_refused():
-    batch = Batch(GAME, 2)
-    output = batch.begin(batch.new_output())
+    output = batch.new_output()
+    for wrong in (
+        {"harvest": output.harvest.astype(np.float64)},
+        {"stock": output.stock[:1]},
+        {"observation": np.asfortranarray(output.observation)},
+    ):
+        with pytest.raises(ValueError, match=r"output\.\w+ is .*; allowed: "):
+            batch.begin(output._replace(**wrong))
+    batch.begin(output)
     with pytest.raises(ValueError, match=r"int64 \[2, 2\] is not contiguous"):
         batch.play(np.zeros((2, 4), np.int64)[:, ::2], output)
     assert batch.now.step.sum() == 0

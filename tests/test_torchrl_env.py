@@ -28,7 +28,6 @@ from torchrl.envs import (
 from torchrl.envs.utils import check_env_specs
 
 from cprl import CommonsEnv, Game, Observation, Rules, keys, maps, presets
-from cprl.commons.batch import Batch
 from cprl.envs import make_env
 from cprl.envs.state import load_transforms_state, transforms_state
 from cprl.institutions import COUNTS
@@ -60,6 +59,18 @@ EVERYTHING = {  # key -> shape without B, dtype
 CHOSEN = (keys.ACTION, keys.DECISION)
 
 
+VECTORS = pytest.mark.parametrize(
+    "kind",
+    [pytest.param(partial(ParallelEnv, mp_start_method="fork"), marks=pytest.mark.slow), SerialEnv],
+    ids=["ParallelEnv", "SerialEnv"],
+)
+
+
+def as_floats():
+    """Observations as normalisations want them."""
+    return DTypeCastTransform(torch.uint8, torch.float32, in_keys=[keys.OBSERVATION])
+
+
 class ByWindow(TensorDictModuleBase):
     """A policy that follows from the window alone, and leaves entries of its own, as networks do."""
 
@@ -84,14 +95,20 @@ def test_the_specs_are_kept(board, state):
 
 
 @pytest.mark.parametrize("worlds", [1, 3])
-def test_each_spec_is_there_for_a_single_world_too(worlds):
+def test_entries_have_the_shapes_and_types_of_the_house_and_each_spec_is_there_for_a_single_world(worlds):
     env = CommonsEnv(presets.game("commons"), worlds=worlds, state=True)
+    assert env.group_map == {"agents": ["agent_0", "agent_1", "agent_2", "agent_3"]}
+    assert env.full_action_spec[keys.ACTION].n == 8
+    first = env.reset()
+    after = env.step(env.rand_action(first.clone()))["next"]
+    assert first[keys.AGENTS].batch_size == (worlds, 4)
     observation = env.observation_spec_unbatched
     for key, (shape, dtype) in EVERYTHING.items():
-        if key in env.done_keys:
-            continue
-        assert observation[key].shape == shape, key
-        assert observation[key].dtype == dtype, key
+        for moment in (first, after):
+            assert (moment[key].shape, moment[key].dtype) == ((worlds, *shape), dtype), key
+        if key not in env.done_keys:
+            assert (observation[key].shape, observation[key].dtype) == (shape, dtype), key
+    assert (after[keys.REWARD].shape, after[keys.REWARD].dtype) == ((worlds, 4, 1), torch.float32)
     for kind in ("action", "observation", "reward", "done"):
         one, all_of_them = (getattr(env, f"full_{kind}_spec{end}") for end in ("_unbatched", ""))
         assert set(one.keys(True, True)) == set(all_of_them.keys(True, True))
@@ -110,20 +127,6 @@ def test_flags_are_drawn_as_both_values():
         assert 0.3 < drawn[key].float().mean() < 0.7, key
 
 
-def test_entries_have_the_shapes_and_types_of_the_house():
-    env = CommonsEnv(presets.game("commons"), worlds=5, state=True)
-    first = env.reset()
-    after = env.step(env.rand_action(first.clone()))["next"]
-    for moment in (first, after):
-        for key, (shape, dtype) in EVERYTHING.items():
-            assert moment[key].shape == (5, *shape), key
-            assert moment[key].dtype == dtype, key
-    assert after[keys.REWARD].shape == (5, 4, 1)
-    assert after[keys.REWARD].dtype == torch.float32
-    assert env.group_map == {"agents": ["agent_0", "agent_1", "agent_2", "agent_3"]}
-    assert env.full_action_spec[keys.ACTION].n == 8
-
-
 def test_the_reward_is_the_harvest_and_changing_it_leaves_the_harvest_alone():
     env = CommonsEnv(SHORT, worlds=4)
     steps = env.rollout(9, break_when_any_done=False)["next"]
@@ -134,30 +137,25 @@ def test_the_reward_is_the_harvest_and_changing_it_leaves_the_harvest_alone():
     assert torch.equal(steps[keys.HARVEST], harvest)
 
 
-def test_it_plays_the_game_of_the_batch():
-    actions = random_actions(50, 6, SHORT)
-    env, batch = CommonsEnv(SHORT, worlds=6, seed=4), Batch(SHORT, 6, seed=4)
-    moment, told = env.reset(), batch.begin(batch.new_output())
-    for turn in actions:
-        moment[keys.ACTION] = torch.as_tensor(turn)
-        moment = env.step(moment)["next"]
-        batch.play(turn, told)
-        assert np.array_equal(moment[keys.OBSERVATION], told.observation)
-        assert np.array_equal(moment[keys.TAGGED_BY], told.tagged_by)
-        assert np.array_equal(moment[keys.STOCK], told.stock)
-        assert np.array_equal(moment[keys.TRUNCATED], told.truncated)
-        moment = moment.exclude(keys.REWARD)
-
-
-def test_a_mask_resets_only_the_marked_worlds():
-    env = CommonsEnv(SHORT, worlds=3)
-    played = env.rollout(5)[:, -1]["next"].exclude(keys.REWARD)
+@pytest.mark.parametrize("game", [SHORT, GOVERNED], ids=["plain", "institutions"])
+def test_a_mask_resets_only_the_marked_worlds(game):
+    env = CommonsEnv(game, worlds=3, seed=2)
+    played = env.rollout(8)[:, -1]["next"].exclude(keys.REWARD)
+    before = env.worlds.state()
     begun = env.reset(played.clone().set("_reset", torch.tensor([[False], [True], [False]])))
-    for key in EVERYTHING:
-        if key != keys.STATE:
+    after = env.worlds.state()
+    for key in begun.keys(True, True):
+        if key != "_reset":
             assert torch.equal(begun[key][[0, 2]], played[key][[0, 2]]), key
-    assert begun[keys.STOCK][1] == len(SHORT.map.sites)
-    assert env.worlds.now.step[:, 0].tolist() == [5, 0, 5]
+    for name, array in after.items():
+        assert np.array_equal(array[[0, 2]], before[name][[0, 2]]), name
+    assert begun[keys.STOCK][1] == len(game.map.sites)
+    assert after["step"][:, 0].tolist() == [8, 0, 8]
+    assert after["episode"][:, 0].tolist() == [0, 1, 0]
+    if game.institutions:
+        for key in (keys.FINES, keys.TRANSFERS, keys.VIOLATED, keys.COUNTS):
+            assert not begun[key][1].any(), key
+        assert played[keys.COUNTS][1].any()
 
 
 @pytest.mark.parametrize("game", [SHORT, GOVERNED], ids=["plain", "institutions"])
@@ -223,22 +221,6 @@ def test_transforms_wrap_it():
     assert torch.equal(total[..., 0], steps["next", "agents", "harvest"].sum(1))
 
 
-def test_set_seed_starts_the_same_game_again():
-    env = CommonsEnv(presets.game("commons"), worlds=3)
-    actions = torch.as_tensor(random_actions(150, 3, env.game))
-    runs = []
-    for seed in (7, 7, 8):
-        env.set_seed(seed)
-        moment, grown = env.reset(), []
-        for turn in actions:
-            _, moment = env.step_and_maybe_reset(moment.set(keys.ACTION, turn))
-            grown.append(moment["regrown"])
-        runs.append(torch.stack(grown))
-    assert runs[0].sum() > 0
-    assert torch.equal(runs[0], runs[1])
-    assert not torch.equal(runs[0], runs[2])
-
-
 @pytest.mark.parametrize("game", [GOVERNED, RICH], ids=["rgb", "rich"])
 def test_with_institutions_the_specs_are_kept_and_agents_are_paid(game):
     check_env_specs(CommonsEnv(game, 3, state=True))
@@ -257,61 +239,42 @@ def test_a_game_without_institutions_has_none_of_their_entries():
     assert not names & {"fines", "transfers", "violated", "counts", "decision", "in_force"}
 
 
-def test_a_reset_of_some_worlds_keeps_what_others_were_paid():
-    adapter = CommonsEnv(GOVERNED, worlds=3, seed=2)
-    last = adapter.rollout(9, break_when_any_done=False)[:, -1]["next"]
-    which = torch.tensor([[True], [False], [False]])
-    after = adapter.reset(last.clone().set("_reset", which))
-    for key in (keys.FINES, keys.TRANSFERS, keys.VIOLATED, keys.COUNTS, keys.IN_FORCE, keys.OBSERVATION):
-        assert torch.equal(after[key][1:], last[key][1:]), key
-    assert not after[keys.COUNTS][0].any()
-    assert last[keys.COUNTS][0].any()
-
-
 def test_what_was_kept_is_restored_whole():
     assert_restorable(lambda: CommonsEnv(GOVERNED, 3, seed=4))
     assert_restorable(lambda: make_env(RICH, worlds=2, seed=4, transforms=[StepCounter()]))
 
 
-def of_workers(kind, turns, decisions):
-    """What two workers of three worlds each play."""
-    vec = kind(2, [partial(CommonsEnv, GOVERNED, 3, seed=seed) for seed in (1, 2)])
-    try:
-        moment, found = vec.reset(), []
-        for turn, decided in zip(turns, decisions, strict=True):
-            moment[keys.ACTION], moment[keys.DECISION] = turn, decided
-            now, moment = vec.step_and_maybe_reset(moment)
-            found.append(now["next"].clone())
-        return found
-    finally:
-        vec.close()
+def steps_of(env, turns, decisions):
+    """What an environment returns for actions and decisions, turn by turn."""
+    moment, steps = env.reset(), []
+    for turn, decided in zip(turns, decisions, strict=True):
+        moment[keys.ACTION], moment[keys.DECISION] = turn, decided
+        step, moment = env.step_and_maybe_reset(moment)
+        steps.append(step["next"].clone())
+    return torch.stack(steps, -1)
 
 
-# Forked, as in test_torchrl_env.py.
-@pytest.mark.filterwarnings("ignore:.*fork:DeprecationWarning")
-@pytest.mark.parametrize(
-    "kind",
-    [pytest.param(partial(ParallelEnv, mp_start_method="fork"), marks=pytest.mark.slow), SerialEnv],
-    ids=["ParallelEnv", "SerialEnv"],
-)
+# Forked, since the lambda of a test cannot be pickled; TorchRL warns that it makes one in this process too.
+@pytest.mark.filterwarnings("ignore:A lambda function was passed", "ignore:.*fork:DeprecationWarning")
+@VECTORS
 def test_torchrls_vectors_of_envs_play_the_same(kind):
     turns = torch.as_tensor(random_actions(40, 6, GOVERNED)).view(40, 2, 3, 3)
     decisions = torch.as_tensor(random_decisions(40, 6, GOVERNED)).view(40, 2, 3, 3)
-    played = of_workers(kind, turns, decisions)
+    vector = kind(2, [partial(CommonsEnv, GOVERNED, 3, seed=seed) for seed in (1, 2)])
+    try:
+        together = steps_of(vector, turns, decisions)
+    finally:
+        vector.close()
     for worker, seed in enumerate((1, 2)):
-        adapter = CommonsEnv(GOVERNED, 3, seed=seed)
-        moment = adapter.reset()
-        for turn, decided, found in zip(turns[:, worker], decisions[:, worker], played, strict=True):
-            moment[keys.ACTION], moment[keys.DECISION] = turn, decided
-            now, moment = adapter.step_and_maybe_reset(moment)
-            for key in now["next"].keys(True, True):
-                assert torch.equal(now["next"][key], found[worker][key]), key
+        alone = steps_of(CommonsEnv(GOVERNED, 3, seed=seed), turns[:, worker], decisions[:, worker])
+        for key in alone.keys(True, True):
+            assert torch.equal(alone[key], together[key][worker]), key
 
 
-def regrown_by_worker(vec_env, seed=None, **how):
+def regrown_by_worker(vec_env, seed=None, **options):
     """What grew in each of two environments, int64 [2, 200], when both are played by the same actions."""
     if seed is not None:
-        vec_env.set_seed(seed, **how)
+        vec_env.set_seed(seed, **options)
     try:
         moment, grown = vec_env.reset(), []
         for turn in torch.as_tensor(random_actions(200, 1, presets.game("commons"))):
@@ -323,24 +286,19 @@ def regrown_by_worker(vec_env, seed=None, **how):
         vec_env.close()
 
 
-# Forked, since the lambda of a test cannot be pickled; TorchRL warns that it makes one in this process too.
 @pytest.mark.filterwarnings("ignore:A lambda function was passed", "ignore:.*fork:DeprecationWarning")
-@pytest.mark.parametrize(
-    "kind",
-    [pytest.param(partial(ParallelEnv, mp_start_method="fork"), marks=pytest.mark.slow), SerialEnv],
-    ids=["ParallelEnv", "SerialEnv"],
-)
+@VECTORS
 def test_workers_of_one_call_play_different_worlds(kind):
-    def grown(*how, **more):
-        return regrown_by_worker(kind(2, lambda: CommonsEnv(presets.game("commons"))), *how, **more)
+    def grown(*seed, **options):
+        return regrown_by_worker(kind(2, lambda: CommonsEnv(presets.game("commons"))), *seed, **options)
 
-    unasked, seeded, again = grown(), grown(5), grown(5)
+    unasked, seeded = grown(), grown(5)
     assert unasked.sum(1).min() > 0
     assert not torch.equal(*unasked), "no seed was given, and both workers play the same worlds"
     assert not torch.equal(*seeded), "set_seed gave both workers the same worlds"
-    assert torch.equal(seeded, again)
-    same = grown(5, static_seed=True)
-    assert torch.equal(*same), "asked for by static_seed"
+    assert torch.equal(seeded, grown(5))
+    assert not torch.equal(seeded, grown(6))
+    assert torch.equal(*grown(5, static_seed=True)), "asked for by static_seed"
 
 
 def test_without_a_seed_torchs_generator_decides():
@@ -374,18 +332,9 @@ def test_devices_that_are_not_there_are_refused():
         CommonsEnv(SHORT, device="meta")
     with pytest.raises(ValueError, match="threads is 2; allowed: None on a GPU"):
         CommonsEnv(SHORT, device="cuda", threads=2)
-
-
-@pytest.mark.skipif(torch.cuda.is_available(), reason="there is a GPU")
-def test_without_a_gpu_the_device_cuda_is_refused():
-    with pytest.raises(ValueError, match='device is "cuda"; allowed: "cpu", because torch finds no GPU'):
-        CommonsEnv(SHORT, device="cuda")
-
-
-def test_agents_with_entries_of_their_own_batch_size_keep_it():
-    env = CommonsEnv(SHORT, worlds=2)
-    assert isinstance(env.reset()[keys.AGENTS], TensorDict)
-    assert env.reset()[keys.AGENTS].batch_size == (2, 2)
+    if not torch.cuda.is_available():
+        with pytest.raises(ValueError, match='device is "cuda"; allowed: "cpu"'):
+            CommonsEnv(SHORT, device="cuda")
 
 
 def test_a_step_that_leaves_out_a_world_that_is_playing_is_refused():
@@ -412,11 +361,15 @@ def test_a_board_with_a_rim_of_walls_is_played_under_transforms():
 
 @pytest.mark.filterwarnings("ignore:Support of VecNormV2 for containers:UserWarning")  # TorchRL's own
 def test_transforms_that_learn_are_put_back_and_share_nothing():
-    assert_restorable(lambda: make_env(SHORT, worlds=2, transforms=[as_floats(), normalised(VecNormV2)]))
-    first, second = (make_env(SHORT, worlds=2, transforms=[as_floats(), normalised(VecNormV2)]) for _ in "ab")
+    def made():
+        transforms = [as_floats(), VecNormV2(in_keys=[keys.OBSERVATION])]
+        return make_env(SHORT, worlds=2, transforms=transforms)
+
+    assert_restorable(made)
+    first, second = made(), made()
     first.rollout(3)
     load_transforms_state(second, transforms_state(first))
-    before = {name: deepcopy(value) for name, value in transforms_state(first).items()}
+    before = deepcopy(transforms_state(first))
     second.rollout(9, break_when_any_done=False)
     assert str(transforms_state(first)) == str(before)
     assert str(transforms_state(second)) != str(before)
@@ -426,12 +379,3 @@ def test_a_transform_that_cannot_be_put_back_is_named():
     pool = TimeMaxPool(in_keys=[keys.OBSERVATION], T=2)
     with pytest.raises(ValueError, match=r"the transforms DTypeCastTransform, TimeMaxPool .*; allowed: "):
         make_env(SHORT, worlds=2, transforms=[as_floats(), pool])
-
-
-def as_floats():
-    """Observations as normalisations want them."""
-    return DTypeCastTransform(torch.uint8, torch.float32, in_keys=[keys.OBSERVATION])
-
-
-def normalised(kind):
-    return kind(in_keys=[keys.OBSERVATION])
