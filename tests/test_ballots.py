@@ -59,28 +59,27 @@ def test_before_its_first_vote_a_world_has_the_first_choice_and_then_the_last_re
     assert in_force(play) == [0.25], "a new seed begins anew"
 
 
-def test_a_vote_of_every_third_episode_holds_for_three():
-    play = Play(THREE, institutions=[Vote(on=LOST, choices=CHOICES, period_episodes=3)])
+@pytest.mark.parametrize(
+    ("period", "decisions", "rates"),
+    [
+        # Votes in the episodes 0, 3 and 6 decide 2; in 1 and 2 the decisions 1 and 0 are not counted.
+        (3, (2, 1, 0, 2, 1, 0, 2), [1.0] * 7),
+        # Votes in the episodes 0, 2 and 4 decide 0, 2 and 1.
+        (2, (0, 1, 2, 0, 1), [0.0, 0.0, 1.0, 1.0, 0.5]),
+    ],
+)
+def test_a_vote_of_every_so_many_episodes_holds_until_the_next(period, decisions, rates):
+    play = Play(THREE, institutions=[Vote(on=LOST, choices=CHOICES, period_episodes=period)])
     found = []
-    for episode in range(7):
-        play.turn("stay", decisions=[(2 - episode) % 3] * 3)
-        found += in_force(play)
+    for decision in decisions:
+        found += in_force(play.turn("stay", decisions=[decision] * 3))
         play.again()
-    # Votes in the episodes 0, 3 and 6 decide 2, 2 and 2; in 1 and 2 the decisions 1 and 0 are not counted.
-    assert found == [1.0] * 7
-    play = Play(THREE, institutions=[Vote(on=LOST, choices=CHOICES, period_episodes=2)])
-    found = []
-    for episode in range(5):
-        play.turn("stay", decisions=[episode % 3] * 3)
-        found += in_force(play)
-        play.again()
-    # Votes in the episodes 0, 2 and 4 decide 0, 2 and 1.
-    assert found == [0.0, 0.0, 1.0, 1.0, 0.5]
+    assert found == rates
 
 
-def episodes(institutions, *, count, decisions, seed=0):
+def episodes(institutions, *, count, decisions, seed=0, board=THREE):
     """What is in force in each of so many episodes."""
-    play, found = Play(THREE, institutions=institutions, seed=seed), []
+    play, found = Play(board, institutions=institutions, seed=seed), []
     for _ in range(count):
         found += in_force(play.turn("stay", decisions=decisions))
         play.again()
@@ -162,10 +161,7 @@ def test_a_tied_election_is_drawn_by_the_games_chance_among_the_tied():
     assert all(20 <= found.count(agent) <= 60 for agent in range(3))
     assert found == episodes([Sanctioner()], count=120, decisions=(0, 2, 1))
     assert found != episodes([Sanctioner()], count=120, decisions=(0, 2, 1), seed=3)
-    play, winners = Play(BOARD, institutions=[Sanctioner()]), []
-    for _ in range(60):
-        winners += in_force(play.turn("stay", decisions=(3, 1, 1, 3)))
-        play.again()
+    winners = episodes([Sanctioner()], count=60, decisions=(3, 1, 1, 3), board=BOARD)
     # Only agents 1 and 3: 30 each, standard deviation 3.9.
     assert set(winners) == {1, 3}
     assert 14 <= winners.count(1) <= 46

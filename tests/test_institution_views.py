@@ -6,12 +6,12 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import rerun.blueprint as rrb
 from matplotlib.image import imread
 from paying_game import Charges
 from recordings import column, static
 from rerun.chunk import RrdReader
 from rich.console import Console
-from rich.table import Table
 from test_film import frames_of
 from torchrl.envs import TransformedEnv
 
@@ -32,6 +32,7 @@ from cprl.training import train
 from cprl.viewer.blueprint import layout
 from cprl.viewer.callback import ViewerCallback
 from cprl.viewer.institutions import has_institutions, lines, tabs
+from cprl.viewer.replay import Offences
 from cprl.viewer.scenery import Curves, curves_of
 from cprl.viewer.views import borders, in_words, regions_of
 
@@ -40,61 +41,55 @@ GAME = Game(
     rules=Rules(regrow_prob=(0.02, 0.1), window_rows=5, window_columns=5, episode_steps=30),
 )
 AGENTS = 4
+ALLOW = ("paying_game:Charges",)
 
 
 class Remembers:
-    """The episodes, and who broke a rule in each turn of the first world."""
+    """The episodes, and who broke a rule where in each turn of the first world."""
 
     def __init__(self, env):
-        self.env, self.episodes, self.turns = env, [], []
+        self.env, self.episodes, self.violators = env, [], []
 
     def on_step(self, batch):
-        agents = batch["next", "agents"]
+        violated = batch["next", "agents", "violated"][0].numpy()
         now = self.env.worlds.show(self.env.output)
-        self.turns.append(
-            {
-                "violated": np.flatnonzero(agents["violated"][0].numpy()).tolist(),
-                "fines": agents["fines"][0].tolist(),
-                "transfers": agents["transfers"][0].tolist(),
-                "at": [(int(row), int(col)) for row, col in zip(now.row, now.col, strict=True)],
-            }
-        )
+        self.violators.append([(now.row[agent], now.col[agent]) for agent in np.flatnonzero(violated)])
 
     def on_episode(self, episode, learning):
         self.episodes.append(episode)
 
 
-def recorded(run, *, replicas=2, episodes=4):
-    env = TransformedEnv(CommonsEnv(GAME, replicas, seed=1), Charges())
-    seen = Remembers(env.base_env)
-    with ViewerCallback(run, env, title="run", episodes=episodes) as viewer:
-        others = random_agents(GAME.spaces, tuple(range(AGENTS)), replicas=replicas, seed=1)
-        train(env, {}, others=others, episodes=episodes, callbacks=[seen, viewer])
-    return viewer, seen
+def recorded(folder, env, *, replicas=1, episodes=2, callbacks=(), **options):
+    """Trains random agents under the eyes of a viewer, which is returned."""
+    others = random_agents(GAME.spaces, tuple(range(AGENTS)), replicas=replicas, seed=1)
+    with ViewerCallback(folder, env, title="run", episodes=episodes, **options) as viewer:
+        watching = [made(viewer) if callable(made) else made for made in callbacks]
+        train(env, {}, others=others, episodes=episodes, callbacks=[*watching[:1], viewer, *watching[1:]])
+    return viewer
 
 
 @pytest.fixture(scope="module")
 def run(tmp_path_factory):
     folder = tmp_path_factory.mktemp("recorded")
-    return folder / "run.rrd", *recorded(folder)
+    env = TransformedEnv(CommonsEnv(GAME, 2, seed=1), Charges())
+    seen = Remembers(env.base_env)
+    viewer = recorded(folder, env, replicas=2, episodes=4, callbacks=[seen])
+    return folder / "run.rrd", viewer, seen
 
 
 @pytest.fixture(scope="module")
 def whole(tmp_path_factory):
     """A run of scripted agents under institutions, from its recipe."""
-    out = tmp_path_factory.mktemp("whole") / "run"
-    agents = tuple(Scripted(own) for own in ("greedy", "random", "random", "greedy"))
     experiment = Experiment(
         name="own",
         game=GAME,
-        agents=agents,
+        agents=tuple(Scripted(policy) for policy in ("greedy", "random", "random", "greedy")),
         episodes=6,
         replicas=2,
         transforms=(Custom("paying_game:Charges"),),
         evaluation_episodes=2,
     )
-    cprl.run(experiment, out=out, allow=("paying_game:Charges",))
-    return out
+    return cprl.run(experiment, out=tmp_path_factory.mktemp("whole") / "run", allow=ALLOW)
 
 
 def entities(path):
@@ -105,12 +100,14 @@ def test_the_lines_of_institutions_are_each_replica_their_mean_and_its_running_m
     path, _, seen = run
     _, logged = column(path, "institutions/violations", "Scalars:scalars", "episode")
     for number, line in enumerate(logged):
-        own = sorted((one for one in seen.episodes if one.episode == number), key=lambda one: one.world)
-        each = [one.institutions["violations"] for one in own]
+        episodes = [episode for episode in seen.episodes if episode.episode == number]
+        each = [episode.institutions["violations"] for episode in sorted(episodes, key=lambda one: one.world)]
         assert line[:3] == [*each, np.mean(each)]
     assert len(logged[0]) == 4
     names = static(path, "institutions/violations", "SeriesLines:names")
     assert list(names) == ["replica 0", "replica 1", "violations, mean", "violations, running mean"]
+    _, in_force = column(path, "institutions/in_force_0", "Scalars:scalars", "episode")
+    assert [line[0] for line in in_force] == [0.5] * 4
 
 
 def test_each_agent_has_lines_of_what_it_paid_got_and_broke(run):
@@ -123,12 +120,6 @@ def test_each_agent_has_lines_of_what_it_paid_got_and_broke(run):
                 for number in range(4)
             ]
             assert [line[0] for line in logged] == pytest.approx(means)
-
-
-def test_what_is_in_force_is_a_line(run):
-    path, _, _ = run
-    _, logged = column(path, "institutions/in_force_0", "Scalars:scalars", "episode")
-    assert [line[0] for line in logged] == [0.5] * 4
 
 
 def test_an_event_says_what_was_decided_broken_and_paid(run):
@@ -159,8 +150,6 @@ def test_only_games_with_institutions_have_their_tabs(run):
     titles = []
 
     def plot(name, *shown, share=False):
-        import rerun.blueprint as rrb
-
         titles.append(name)
         return rrb.TimeSeriesView(name=name, contents=[f"+ /{entity}" for entity in shown])
 
@@ -180,17 +169,14 @@ def test_only_games_with_institutions_have_their_tabs(run):
 
 
 def test_a_recording_without_institutions_has_nothing_of_them(tmp_path):
-    env = CommonsEnv(GAME, 1, seed=1)
-    others = random_agents(GAME.spaces, tuple(range(AGENTS)), replicas=1, seed=1)
-    with ViewerCallback(tmp_path, env, title="run", episodes=2) as viewer:
-        train(env, {}, others=others, episodes=2, callbacks=[viewer])
+    recorded(tmp_path, CommonsEnv(GAME, 1, seed=1))
     words = ("institutions", "fines", "transfers", "violat", "regions", "paid", "given")
     assert not [name for name in entities(tmp_path / "run.rrd") if any(word in name for word in words)]
 
 
 @pytest.mark.integration
 def test_a_replay_marks_who_breaks_a_rule_in_its_turn_and_shows_payments(whole, tmp_path):
-    path, episode = film(whole, tmp_path / "replay.rrd", allow=("paying_game:Charges",))
+    path, episode = film(whole, tmp_path / "replay.rrd", allow=ALLOW)
     frames, marks = column(path, "world/violators", "LineStrips2D:strips", "frame")
     assert frames == list(range(episode.steps - 1)), "the last turn has no frame"
     _, texts = column(path, "log", "TextLog:text", "step")
@@ -208,29 +194,24 @@ def test_a_replay_marks_who_breaks_a_rule_in_its_turn_and_shows_payments(whole, 
 
 
 def test_a_mark_is_a_diamond_around_the_agent(tmp_path):
-    from cprl.viewer.replay import Offences
-
     env = TransformedEnv(CommonsEnv(GAME, 1, seed=1), Charges())
     seen = Remembers(env.base_env)
-    with ViewerCallback(tmp_path, env, title="replay", episodes=1, is_replay=True) as viewer:
-        marking = Offences(viewer.logger, env.base_env, names=viewer.logger.scene.agents)
-        others = random_agents(GAME.spaces, tuple(range(AGENTS)), replicas=1, seed=1)
-        train(env, {}, others=others, episodes=1, callbacks=[seen, viewer, marking])
+
+    def marking(viewer):
+        return Offences(viewer.logger, env.base_env, names=viewer.logger.scene.agents)
+
+    recorded(tmp_path, env, episodes=1, is_replay=True, callbacks=[seen, marking])
     _, marks = column(tmp_path / "run.rrd", "world/violators", "LineStrips2D:strips", "frame")
-    found = 0
-    for turn, own in zip(seen.turns, marks, strict=False):
-        assert len(own) == len(turn["violated"])
-        for agent, diamond in zip(turn["violated"], own, strict=True):
-            middle = np.mean(np.array(diamond)[:4], 0)
-            row, col = turn["at"][agent]
-            assert middle.tolist() == pytest.approx([col + 1.5, row + 1.5], abs=1e-5), "(x, y), with a rim"
-            found += 1
-    assert found > 3
+    for violators, diamonds in zip(seen.violators, marks, strict=False):
+        middles = [np.mean(np.array(diamond)[:4], 0).tolist() for diamond in diamonds]
+        assert middles == [pytest.approx([col + 1.5, row + 1.5], abs=1e-5) for row, col in violators], (
+            "(x, y), with a rim"
+        )
+    assert sum(map(len, marks)) > 3
 
 
 def test_a_film_marks_who_broke_a_rule_since_its_last_picture(whole, tmp_path):
-    allow = ("paying_game:Charges",)
-    path, (episode,) = film_video(whole, tmp_path / "film.gif", width=400, every=1, allow=allow)
+    path, (episode,) = film_video(whole, tmp_path / "film.gif", width=400, every=1, allow=ALLOW)
     assert episode.violations.sum() > 0
     pictures, _ = frames_of(path)
     picture = EpisodePicture(GAME.map, steps=30, width=400)
@@ -273,55 +254,56 @@ def printed(what):
     return console.export_text()
 
 
-def test_the_summary_has_a_table_of_institutions(whole):
-    found = evaluate_run(whole, episodes=2, allow=("paying_game:Charges",))
-    played = {"random": found.random[0], "trained": found.trained[0]}
-    table = institutions_table(played)
-    assert isinstance(table, Table)
-    text = printed(table)
-    paid = [np.mean([one.fines.sum() for one in own]) for own in played.values()]
+@pytest.fixture(scope="module")
+def evaluation(whole):
+    return evaluate_run(whole, episodes=2, allow=ALLOW)
+
+
+def test_the_summary_has_a_table_of_institutions(evaluation):
+    played = {"random": evaluation.random[0], "trained": evaluation.trained[0]}
+    text = printed(institutions_table(played))
+    paid = [np.mean([episode.fines.sum() for episode in episodes]) for episodes in played.values()]
     row = next(line for line in text.splitlines() if "fines of all, apples" in line)
     assert [float(cell) for cell in row.replace("│", " ").split()[-2:]] == pytest.approx(paid, abs=0.01)
     agent = next(line for line in text.splitlines() if "agent 1" in line)
-    own = played["trained"]
-    fined, broke = (np.mean([getattr(one, name)[1] for one in own]) for name in ("fines", "violations"))
+    fined, broke = (
+        np.mean([getattr(episode, name)[1] for episode in played["trained"]])
+        for name in ("fines", "violations")
+    )
     assert f"{fined:.1f} / " in agent
     assert f" / {broke:.1f} " in agent
     assert "in force: decision 0" in text
     assert "where one may bite" not in text, "nothing counted a bite"
     nothing = dict.fromkeys(("fines", "transfers", "violations", "counts", "in_force"))
-    without = {"trained": [replace(one, **nothing) for one in found.trained[0]]}
+    without = {"trained": [replace(episode, **nothing) for episode in evaluation.trained[0]]}
     assert institutions_table(without) is None
 
 
-def test_what_is_printed_at_the_end_says_it_too(whole):
-    found = evaluate_run(whole, episodes=1, allow=("paying_game:Charges",))
+def test_what_is_printed_at_the_end_says_it_too(whole, evaluation):
     console = Console(width=110, record=True, file=StringIO())
-    summarise(whole, title="own", played={"trained": found.trained[0]}, console=console)
+    summarise(whole, title="own", played={"trained": evaluation.trained[0]}, console=console)
     text = console.export_text()
     assert "violations per turn in play, 0 to 1" in text
     assert "of each agent: fined / given / violations" in text
 
 
-def test_an_evaluation_reports_institutions(whole):
-    found = evaluate_run(whole, episodes=2, allow=("paying_game:Charges",))
-    measures = found.measures("random")
+def test_an_evaluation_reports_institutions(evaluation):
+    measures = evaluation.measures("random")
     assert measures["institutions/detection_rate"].estimate.value == 1.0
-    paid = np.mean([one.fines[2] for own in found.random.values() for one in own])
+    paid = np.mean([episode.fines[2] for episodes in evaluation.random.values() for episode in episodes])
     assert measures["agent_2/fines"].estimate.value == pytest.approx(paid)
-    text = printed(run_table(found))
+    text = printed(run_table(evaluation))
     assert "institutions/net_equality" in text or measures["institutions/net_equality"].estimate is None
     assert "agent_2/fines (apples)" in text
     assert "institutions/own_share_of_bites" not in text, "undefined everywhere"
-    assert {"fines", "violations", "own_bites", "in_force_0"} <= set(found.table().column_names)
+    assert {"fines", "violations", "own_bites", "in_force_0"} <= set(evaluation.table().column_names)
 
 
 def test_the_run_keeps_them_and_the_training_curve_shows_them(whole):
     table = read_episodes(whole)
     assert table["fines"].to_numpy().sum() > 0
     assert table["violations"].to_numpy().max() > 0
-    evaluation = whole / "evaluation" / "trained.parquet"
-    assert evaluation.exists()
+    assert (whole / "evaluation" / "trained.parquet").exists()
     high, wide = imread(training_curve(whole, title="own")).shape[:2]
     assert high > wide, "four panels"
 
@@ -341,10 +323,7 @@ GOVERNED = replace(
 def governed(tmp_path_factory):
     """The recording of random agents in a game with cprl's own institutions."""
     folder = tmp_path_factory.mktemp("governed")
-    env = CommonsEnv(GOVERNED, 2, seed=1)
-    others = random_agents(GOVERNED.spaces, tuple(range(AGENTS)), replicas=2, seed=1)
-    with ViewerCallback(folder, env, title="run", episodes=3) as viewer:
-        train(env, {}, others=others, episodes=3, callbacks=[viewer])
+    recorded(folder, CommonsEnv(GOVERNED, 2, seed=1), replicas=2, episodes=3)
     return folder / "run.rrd"
 
 
@@ -357,13 +336,8 @@ def test_every_name_that_is_logged_of_institutions_is_in_the_docs(governed):
 
 
 def test_the_board_shows_whose_the_regions_are(governed):
-    env = CommonsEnv(GOVERNED, 1)
-    assert [(owners, cells.sum()) for owners, cells in regions_of(env)] == [
-        ([0], 6),
-        ([1], 4),
-        ([2], 2),
-        ([3], 3),
-    ]
+    regions = [(owners, cells.sum()) for owners, cells in regions_of(CommonsEnv(GOVERNED, 1))]
+    assert regions == [([0], 6), ([1], 4), ([2], 2), ([3], 3)]
     strips = static(governed, "world/regions", "LineStrips2D:strips")
     # the sides of 3 x 2, 2 x 2, 2 x 1 and 1 x 3 cells, one line for each
     assert len(strips) == 10 + 8 + 6 + 8
@@ -375,9 +349,7 @@ def test_regions_that_several_agents_share_are_drawn_once():
     assert [owners for owners, _ in regions_of(env)] == [[0, 1, 3], [2, 3]]
 
 
-def test_decisions_have_the_names_of_their_ballots(tmp_path):
-    game = replace(GAME, institutions=(Vote(on=Tax(), choices=(0.0, 0.5)), Sanctioner()))
-    curves = curves_of(
-        CommonsEnv(game, 1), ("a", "b", "c", "d"), reported_by(CommonsEnv(game, 1)), episodes=1
-    )
+def test_decisions_have_the_names_of_their_ballots():
+    env = CommonsEnv(replace(GAME, institutions=(Vote(on=Tax(), choices=(0.0, 0.5)), Sanctioner())), 1)
+    curves = curves_of(env, ("a", "b", "c", "d"), reported_by(env), episodes=1)
     assert curves.in_force == ("the tax rate", "who may fire")

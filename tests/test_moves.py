@@ -3,7 +3,8 @@
 from collections import Counter
 from dataclasses import replace
 
-from boards import Play, drawn
+import pytest
+from boards import Play
 
 from cprl.commons.batch import Batch
 
@@ -51,49 +52,29 @@ def test_turning_left_and_right_turns_the_heading_by_a_quarter():
     assert play.turn("turn_right").turn("turn_right").board == ".A.\n.>."
 
 
-def test_edges_and_inner_walls_stop_a_move():
-    play = Play("#A..\n>#..\n....")
-    assert play.turn("forward").places == [(1, 0)]
-    assert play.turn("left").places == [(1, 0)]
-    assert play.turn("backward").places == [(1, 0)]
+@pytest.mark.parametrize("action", ["forward", "left", "backward"])
+def test_edges_and_inner_walls_stop_a_move(action):
+    assert Play("#A..\n>#..\n....").turn(action).places == [(1, 0)]
 
 
-def test_agents_who_want_the_same_cell_both_stay():
-    play = Play(
-        """
-        A......
-        ..>.<..
-        """
-    )
-    assert play.turn("forward").board == drawn(
-        """
-        A......
-        ..>.<..
-        """
-    )
+CLASHES = {
+    "agents who want the same cell both stay": ("A......\n..>.<..", "A......\n..>.<.."),
+    "an agent enters a cell that another leaves": ("A....\n.>>..", "A....\n..>>."),
+    "two agents cannot swap cells": ("A...\n.><.", "A...\n.><."),
+    "four in a ring all move": ("A....\n.>v..\n.^<..", "A....\n.^>..\n.<v.."),
+    # The two on the right want the cell between them; each of the others wants the cell of the next.
+    "a cancelled move cancels those behind it": ("A.......\n.>>>.<..", "A.......\n.>>>.<.."),
+}
+
+
+@pytest.mark.parametrize("rule", CLASHES)
+def test_when_all_go_forward(rule):
+    before, after = CLASHES[rule]
+    assert Play(before).turn("forward").board == after
 
 
 def test_no_agent_enters_a_cell_that_another_keeps():
     assert Play("A....\n.>>..").turn("forward", "stay").places == [(1, 1), (1, 2)]
-
-
-def test_an_agent_enters_a_cell_that_another_leaves():
-    assert Play("A....\n.>>..").turn("forward").places == [(1, 2), (1, 3)]
-
-
-def test_two_agents_cannot_swap_cells():
-    assert Play("A...\n.><.").turn("forward").places == [(1, 1), (1, 2)]
-
-
-def test_three_in_a_ring_all_move():
-    play = Play("A....\n.>v..\n.^<..")
-    assert play.turn("forward").places == [(1, 2), (2, 2), (1, 1), (2, 1)]
-
-
-def test_a_cancelled_move_cancels_those_behind_it():
-    # Agents 2 and 3 want the cell between them; 1 wants 2's cell, 0 wants 1's.
-    play = Play("A.......\n.>>>.<..")
-    assert play.turn("forward").places == [(1, 1), (1, 2), (1, 3), (1, 5)]
 
 
 def test_clashes_do_not_depend_on_agent_indices():

@@ -26,12 +26,11 @@ BOARD = maps.parse("A>..<.A\n.......\nA.....A")
 
 
 @pytest.fixture(params=["licence"])
-def licence(request, tmp_path_factory, monkeypatch):
+def licence(request, tmp_path, monkeypatch):
     """A module of the page, where a user would have it."""
     (code,) = re.findall(rf"```python\n(# {request.param}\.py\n.*?)```", PAGE.read_text(), re.DOTALL)
-    folder = tmp_path_factory.mktemp("own")
-    (folder / f"{request.param}.py").write_text(code)
-    monkeypatch.syspath_prepend(folder)
+    (tmp_path / f"{request.param}.py").write_text(code)
+    monkeypatch.syspath_prepend(tmp_path)
     importlib.invalidate_caches()
     yield importlib.import_module(request.param)
     del sys.modules[request.param]
@@ -64,11 +63,11 @@ def test_the_first_shot_of_each_episode_is_charged_and_the_price_rises_with_ever
     assert torch.equal(steps["reward"][..., 0], steps["harvest"] - steps["fines"] + steps["transfers"])
 
 
-def experiment():
+def experiment(**changes):
     settings = DQNSettings(
         buffer_size=300, batch_size=4, hidden_cells=(8,), epsilon_hold_steps=10, epsilon_decay_steps=200
     )
-    return Experiment(
+    licensed = Experiment(
         name="licensed",
         game=game(),
         agents=[Learning(DQN(settings=settings))] * 2,
@@ -80,6 +79,7 @@ def experiment():
         callbacks=[Custom("one_road_parts:Stopping")],
         engine="eager",
     )
+    return replace(licensed, **changes)
 
 
 @pytest.mark.integration
@@ -110,18 +110,13 @@ def test_a_run_that_is_stopped_and_resumed_equals_the_undisturbed_one_bit_for_bi
 @pytest.mark.parametrize("licence", ["reserve"], indirect=True)
 @pytest.mark.parametrize("engine", ["eager", "torchrl"])
 def test_a_transform_stops_bites_in_a_training_by_putting_apples_back(licence, engine, tmp_path):
-    ungoverned = replace(game(regrow_prob=(0.0,), episode_steps=40, may_fire=False), institutions=())
-    experiment = Experiment(
-        name="reserve",
-        game=ungoverned,
-        agents=(Learning(DQN(settings=DQNSettings(buffer_size=100, learning_starts=4, batch_size=2))),) * 2,
-        episodes=4,
-        replicas=2,
-        evaluation_episodes=4,
-        transforms=(Custom("reserve:Reserve", arguments={"least": 3}),),
+    reserved = experiment(
+        game=replace(game(regrow_prob=(0.0,), episode_steps=40, may_fire=False), institutions=()),
+        transforms=[Custom("reserve:Reserve", arguments={"least": 3})],
+        callbacks=(),
         engine=engine,
     )
-    run = cprl.run(experiment, tmp_path / "run", watch="off", allow=["reserve:Reserve"])
+    run = cprl.run(reserved, tmp_path / "run", watch="off", allow=["reserve:Reserve"])
     table = read_episodes(run)
     assert table["return"].to_pylist() == table["harvest"].to_pylist()
     assert min(table["stock_left"].to_pylist()) == 3, "some episode came down to what is kept, none below"

@@ -7,7 +7,7 @@ at once bears an apple every second turn, a yield of 1/2.
 import pytest
 from boards import Play
 
-from cprl import Game, Observation, Rules, maps
+from cprl import Observation, Rules, maps
 from cprl.commons.institution_tables import patches_of
 from cprl.institutions import ClosedPatches, ClosedSeason, Quota
 
@@ -43,15 +43,11 @@ def test_a_quota_with_a_fine_lets_bites_happen_and_charges_those_above_it():
 
 def test_a_part_of_an_apple_is_none():
     # 0.9 x 1 apple in a window of 1 turn: nobody may harvest.
-    with pytest.warns(
-        UserWarning, match=r"window_steps is 1: .* take 0\.9 apples at most, .* windows of 2 turns"
-    ):
+    with pytest.warns(UserWarning, match=r"window_steps is 1: .* 0\.9 apples at most, .* 2 turns"):
         play = Play(BOARD, institutions=[Quota(share=0.9, window_steps=1)], **SURE)
     assert play.turn("forward").harvest == [0, 0]
-    assert Play(BOARD, institutions=[Quota(share=1, window_steps=1)], **SURE).turn("forward").harvest == [
-        1,
-        1,
-    ]
+    play = Play(BOARD, institutions=[Quota(share=1, window_steps=1)], **SURE)
+    assert play.turn("forward").harvest == [1, 1]
     assert Play(BOARD, institutions=[Quota(share=0)], **SURE).turn("forward").harvest == [0, 0]
 
 
@@ -83,31 +79,23 @@ def test_two_quotas_both_hold():
     assert play.turn("stay").harvest == [1, 1]
 
 
-def entries(play, agent, count):
-    """What institutions show an agent, 0..255; the planes repeat it."""
-    seen = play.output.observation[0, agent]
-    planes = seen[len(play.game.cell_channels) :].reshape(-1).tolist()
-    assert all(value == planes[n % count] for n, value in enumerate(planes))
-    return planes[:count]
-
-
 def test_agents_see_what_is_left_of_their_quota_and_of_the_window():
     play = Play(BOARD, institutions=[Quota(share=1, window_steps=4)], **SURE)
     # 4 apples in 4 turns; 255 x 3/4 = 191.25.
-    assert entries(play, 0, 2) == [255, 255]
-    assert entries(play.turn("forward", "stay"), 0, 2) == [191, 191]
-    assert entries(play, 1, 2) == [255, 191]
+    assert play.shown(2)[0] == [255, 255]
+    assert play.turn("forward", "stay").shown(2) == [[191, 191], [255, 191]]
+    assert play.shown(78)[1] == [255, 191] * 39, "the planes repeat them"
     play.turn("stay").turn("stay").turn("forward", "stay")
-    assert entries(play, 0, 2) == [255, 255], "what they see is of the coming turn, in a new window"
+    assert play.shown(2)[0] == [255, 255], "what they see is of the coming turn, in a new window"
 
 
 def test_what_is_shown_is_relative_to_the_largest_quota():
     play = Play(BOARD, institutions=[Quota(share=2, window_steps=1)], **SURE)
     # 2 apples, of which 1 is taken: 1/2 x 255 = 127.5.
-    assert entries(play, 0, 2) == [255, 255]
+    assert play.shown(2)[0] == [255, 255]
     stocked = Quota(share=1, window_steps=2, by_stock=True)
     play = Play(BOARD, institutions=[stocked], **SURE).turn("forward").turn("forward")
-    assert entries(play, 0, 2) == [128, 255], "half of the sites are empty, so half of the quota"
+    assert play.shown(2)[0] == [128, 255], "half of the sites are empty, so half of the quota"
 
 
 def test_a_closed_season_stops_bites_or_charges_them():
@@ -130,10 +118,9 @@ def test_a_closed_season_stops_bites_or_charges_them():
 
 
 def test_agents_see_whether_the_season_is_closed_and_until_when():
-    season = ClosedSeason(period_steps=4, closed_steps=1)
-    play = Play(BOARD, institutions=[season])
+    play = Play(BOARD, institutions=[ClosedSeason(period_steps=4, closed_steps=1)])
     # Open for turns 1 to 3 of 4: 3/4, 2/4, 1/4 of a period until it closes, then 1/4 until it opens.
-    seen = [entries(play, 0, 2), *(entries(play.turn("stay"), 0, 2) for _ in range(4))]
+    seen = [play.shown(2)[0], *(play.turn("stay").shown(2)[0] for _ in range(4))]
     assert seen == [[0, 191], [0, 128], [0, 64], [255, 64], [0, 191]]
 
 
@@ -190,26 +177,14 @@ def test_quota_season_and_patch_break_one_rule_each_and_all_fines_are_due():
     assert play.counts("violations") == [1, 0]
 
 
-def test_planes_hold_as_many_entries_as_needed_in_every_form_of_observation():
+@pytest.mark.parametrize("encoding", ["rgb", "one_hot"])
+def test_planes_hold_as_many_entries_as_needed_in_every_form_of_observation(encoding):
     # Nine quotas have 18 entries; a window of 3 x 3 cells holds 9 of them, so they take two planes.
     many = tuple(Quota(window_steps=9 + n) for n in range(9))
-    for encoding in ("rgb", "one_hot"):
-        game = Game(
-            map=maps.parse(BOARD),
-            rules=Rules(window_rows=3, window_columns=3, **SURE),
-            observation=Observation(encoding=encoding),
-            institutions=many,
-        )
-        assert game.channels == (*game.cell_channels, "institutions", "institutions")
-        play = Play(
-            BOARD,
-            institutions=many,
-            observation=Observation(encoding=encoding),
-            window_rows=3,
-            window_columns=3,
-            **SURE,
-        )
-        assert entries(play, 0, 18) == [255] * 18
-        # After a turn 8/9 of the first window is left, 9/10 of the second: 226.7, 229.5, ...
-        times = [int(255 * (8 + n) / (9 + n) + 0.5) for n in range(9)]
-        assert entries(play.turn("stay"), 0, 18)[1::2] == times
+    rules = {"window_rows": 3, "window_columns": 3, **SURE}
+    play = Play(BOARD, institutions=many, observation=Observation(encoding=encoding), **rules)
+    assert play.game.channels == (*play.game.cell_channels, "institutions", "institutions")
+    assert play.shown(18)[0] == [255] * 18
+    # After a turn 8/9 of the first window is left, 9/10 of the second: 226.7, 229.5, ...
+    times = [int(255 * (8 + n) / (9 + n) + 0.5) for n in range(9)]
+    assert play.turn("stay").shown(18)[0][1::2] == times

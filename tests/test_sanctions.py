@@ -109,15 +109,11 @@ def test_violations_are_sanctioned_where_they_are_detected():
 
 
 def test_tags_keep_the_freeze_of_the_rules_where_violations_alone_are_offences():
-    sanctions = GraduatedSanctions(freeze_steps=(0,), on="violations")
+    sanctions = GraduatedSanctions(freeze_steps=(0,), fines=(2,), on="violations")
     play = Play(BOARD, institutions=[Quota(fine=1), sanctions], freeze_steps=4).turn("beam", "stay")
     assert (missed(play), play.counts("sanctions")) == (4, [0, 0])
-
-
-def test_a_sanction_of_no_turns_leaves_an_offender_in_play():
-    sanctions = GraduatedSanctions(freeze_steps=(0,), fines=(2,), on="violations")
     play = Play(BOARD, institutions=[OUTSIDE, sanctions]).turn("stay")
-    assert (play.fines, play.in_play) == ([0, 3], [True, True])
+    assert (play.fines, play.in_play) == ([0, 3], [True, True]), "a sanction of no turns"
 
 
 def test_a_tag_and_a_violation_of_one_turn_are_two_offences():
