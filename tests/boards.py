@@ -2,6 +2,7 @@
 
 from collections.abc import Sequence
 from dataclasses import replace
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -9,9 +10,9 @@ from cprl import Game, Map, Observation, Rules, maps
 from cprl.commons.batch import Batch, turn_of
 from cprl.commons.colours import CLASS_NAMES, FIRST_AGENT, class_colour
 from cprl.commons.maps import SIGN_OF_HEADING
-from cprl.commons.world import StepOutput
+from cprl.commons.world import StepOutput, Worlds
 from cprl.institutions import COUNTS, Institution
-from cprl.institutions.memory import Payments
+from cprl.institutions.memory import DERIVED, REMEMBERED, Memory, Payments
 
 RGB_SIGN = {
     (10, 10, 10): ".",
@@ -151,3 +152,52 @@ def random_actions(steps: int, worlds: int, game: Game, *, seed: int = 0) -> np.
     """int64 [steps, worlds, N], every action equally likely."""
     shape = steps, worlds, game.agents
     return np.random.default_rng(seed).integers(0, len(game.actions), shape)
+
+
+class Moment(NamedTuple):
+    """Copies of all arrays after a turn; `memory` and `payments` are those of institutions, if any."""
+
+    worlds: Worlds
+    turn: StepOutput
+    memory: Memory | None = None
+    payments: Payments | None = None
+
+
+def copied(record: Any) -> Any:
+    """A record of arrays with copies of them."""
+    return type(record)(*(array.copy() for array in record))
+
+
+def kept(batch: Batch, output: Any) -> Moment:
+    """The moment after the last turn."""
+    records = [batch.now, turn_of(output)]
+    if batch.memory is not None:
+        records += [batch.memory, output.payments]
+    return Moment(*map(copied, records))
+
+
+def play_on(batch: Batch, output: Any, actions: Any, decisions: Any = None) -> list[Moment]:
+    """The moments after each turn."""
+    moments = []
+    for number, turn in enumerate(actions):
+        batch.play(turn, output, None if decisions is None else decisions[number])
+        moments.append(kept(batch, output))
+    return moments
+
+
+def played(game: Game, actions: Any, decisions: Any = None, **options) -> list[Moment]:
+    """The moments before the first turn and after each."""
+    batch = Batch(game, actions.shape[1], **options)
+    output = batch.begin(batch.new_output())
+    return [kept(batch, output), *play_on(batch, output, actions, decisions)]
+
+
+def assert_same(record: Any, other: Any, *, rows: Any = slice(None), other_rows: Any = slice(None)) -> None:
+    """All that lasts in records of arrays, or in records of records, is equal in the given worlds."""
+    names = (*REMEMBERED, *DERIVED) if isinstance(record, Memory) else record._fields
+    for name in names:
+        one, two = getattr(record, name), getattr(other, name)
+        if isinstance(one, tuple):
+            assert_same(one, two, rows=rows, other_rows=other_rows)
+        elif one is not None:
+            assert np.array_equal(one[rows], two[other_rows]), name

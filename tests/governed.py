@@ -1,16 +1,13 @@
 """Helpers of the tests of institutions: random games with institutions, and how they are played."""
 
 from dataclasses import replace
-from typing import NamedTuple
 
 import numpy as np
-from boards import random_actions
+from boards import played, random_actions
 from hypothesis import strategies as st
-from test_worlds import copied, games
+from test_worlds import games
 
 from cprl import Game, Observation, Rules, maps
-from cprl.commons.batch import Batch
-from cprl.commons.world import StepOutput, Worlds
 from cprl.institutions import (
     Boundaries,
     ClosedPatches,
@@ -24,7 +21,6 @@ from cprl.institutions import (
     Tax,
     Vote,
 )
-from cprl.institutions.memory import DERIVED, REMEMBERED, Memory, Payments
 
 EVERYTHING = Game(
     map=maps.parse(
@@ -153,48 +149,13 @@ def governed_games(draw, *, harmless=False, ballots=True, **fixed):
     return replace(game, observation=Observation(agents_apart=True), institutions=tuple(order))
 
 
-class Moment(NamedTuple):
-    """Copies of all arrays after a turn."""
-
-    worlds: Worlds
-    memory: Memory
-    turn: StepOutput
-    payments: Payments
-
-
-def kept(batch, output):
-    return Moment(copied(batch.now), copied(batch.memory), copied(output.turn), copied(output.payments))
-
-
 def random_decisions(steps, worlds, game, *, seed=0):
     """int64 [steps, worlds, N], every option equally likely."""
     shape = steps, worlds, game.agents
     return np.random.default_rng(seed + 1000).integers(0, max(1, game.decisions), shape)
 
 
-def play_on(batch, output, actions, decisions):
-    """The moments after each turn."""
-    found = []
-    for turn, decided in zip(actions, decisions, strict=True):
-        batch.play(turn, output, decided)
-        found.append(kept(batch, output))
-    return found
-
-
-def played(game, *, turns=40, worlds=2, seed=0, threads=1):
+def random_play(game, *, turns=40, worlds=2, seed=0, **options):
     """The moments of random play, from the begin on."""
-    batch = Batch(game, worlds, seed=seed, threads=threads)
-    output = batch.begin(batch.new_output())
-    actions = random_actions(turns, worlds, game, seed=seed)
-    decisions = random_decisions(turns, worlds, game, seed=seed)
-    return [kept(batch, output), *play_on(batch, output, actions, decisions)]
-
-
-def assert_same_moments(one, other, *, rows=slice(None), other_rows=slice(None)):
-    """All that lasts, and all outputs, are equal in the given worlds."""
-    for mine, theirs in zip(one, other, strict=True):
-        names = mine._fields
-        if isinstance(mine, Memory):
-            names = (*REMEMBERED, *DERIVED)
-        for name in names:
-            assert np.array_equal(getattr(mine, name)[rows], getattr(theirs, name)[other_rows]), name
+    choices = [draw(turns, worlds, game, seed=seed) for draw in (random_actions, random_decisions)]
+    return played(game, *choices, seed=seed, **options)

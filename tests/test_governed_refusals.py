@@ -5,7 +5,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 import pytest
 import torch
-from governed import EVERYTHING, assert_same_moments, kept
+from boards import assert_same, kept
+from governed import EVERYTHING
 
 from cprl import CommonsEnv, Game, Rules, keys, maps
 from cprl.commons.batch import Batch
@@ -125,7 +126,7 @@ def test_wrong_decisions_are_refused_and_nothing_has_changed(game, decisions, me
     before = kept(batch, output)
     with pytest.raises(ValueError, match=message):
         batch.play(np.zeros((2, game.agents), np.int64), output, decisions)
-    assert_same_moments(before, kept(batch, output))
+    assert_same(before, kept(batch, output))
 
 
 def test_the_env_wants_a_decision_that_fits_in_every_turn():

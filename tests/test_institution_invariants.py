@@ -5,25 +5,22 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from boards import random_actions
+from boards import assert_same, kept, play_on, random_actions
+from boards import played as played_without
 from governed import (
     EVERYTHING,
     FINES,
     MEDIATIONS,
-    assert_same_moments,
     boundaries,
     governed_games,
-    kept,
     levies,
-    play_on,
-    played,
     random_decisions,
+    random_play,
     taxes,
 )
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from test_worlds import games
-from test_worlds import played as played_without
 
 from cprl import Observation, presets
 from cprl.commons.batch import Batch
@@ -61,8 +58,8 @@ def check_untouched(game, seed):
     plain = replace(game, institutions=())
     actions = random_actions(30, 2, game, seed=seed)
     cells = len(game.cell_channels)
-    for moment, (worlds, turn) in zip(
-        played(game, turns=30, seed=seed), played_without(plain, actions, seed=seed), strict=True
+    for moment, (worlds, turn, *_) in zip(
+        random_play(game, turns=30, seed=seed), played_without(plain, actions, seed=seed), strict=True
     ):
         for name, array in worlds._asdict().items():
             assert np.array_equal(array, getattr(moment.worlds, name)), name
@@ -83,7 +80,7 @@ def test_payments_alone_leave_the_game_as_it_is_bit_for_bit(game, seed):
 @given(game=governed_games(), seed=SEEDS)
 def test_the_reward_is_the_harvest_less_fines_plus_transfers_and_an_ended_world_pays_nothing(game, seed):
     ended = np.zeros(2, bool)
-    for moment in played(game, seed=seed):
+    for moment in random_play(game, seed=seed):
         turn, paid = moment.turn, moment.payments
         expected = turn.harvest.astype(np.float64) - paid.fines + paid.transfers
         np.testing.assert_allclose(paid.reward, expected, rtol=1e-5, atol=1e-6)
@@ -98,7 +95,7 @@ def test_the_reward_is_the_harvest_less_fines_plus_transfers_and_an_ended_world_
 @QUICK
 @given(game=governed_games(), seed=SEEDS)
 def test_counts_add_up(game, seed):
-    moments = [moment.payments for moment in played(game, seed=seed)]
+    moments = [moment.payments for moment in random_play(game, seed=seed)]
     for before, moment in itertools.pairwise(moments):
         grown = moment.counts - before.counts
         assert (grown >= 0).all()
@@ -121,7 +118,7 @@ def with_one(strategy):
 
 def sums(game, seed):
     """Of each turn: harvest, fines and transfers [T, B, N] of a whole episode, and the last counts."""
-    moments = played(game, turns=game.rules.episode_steps, seed=seed)[1:]
+    moments = random_play(game, turns=game.rules.episode_steps, seed=seed)[1:]
     assert (moments[-1].worlds.ended != PLAYING).all()
     harvest = np.array([moment.turn.harvest for moment in moments], np.float64)
     fines, transfers = (
@@ -214,7 +211,7 @@ def test_nobody_harvests_more_than_a_quota_in_a_window(game, seed, share, window
 @given(game=with_one(lambda game: boundaries(game.map, st.none(), st.none())), seed=SEEDS)
 def test_nobody_harvests_in_the_region_of_others(game, seed):
     (own,) = game.institutions
-    for moment in played(game, seed=seed)[1:]:
+    for moment in random_play(game, seed=seed)[1:]:
         for world, agent in np.argwhere(moment.turn.harvest > 0):
             row, col = moment.worlds.row[world, agent], moment.worlds.col[world, agent]
             assert own.regions[row][col] in ("." + own.signs_of(agent))
@@ -226,7 +223,7 @@ def test_nobody_harvests_in_the_region_of_others(game, seed):
 def test_inspection_costs_the_same_in_every_turn_until_the_end(game, seed, cost, monitor):
     never_broken = Quota(share=1e6, fine=0)
     game = replace(game, institutions=(Monitoring(cost=cost, monitor=monitor), never_broken))
-    for before, moment in zip(*(played(game, seed=seed)[n:] for n in (0, 1)), strict=False):
+    for before, moment in zip(*(random_play(game, seed=seed)[n:] for n in (0, 1)), strict=False):
         is_playing = before.worlds.ended[:, 0] == PLAYING
         close(moment.payments.fines.sum(-1), cost * is_playing)
 
@@ -246,7 +243,7 @@ def test_fines_without_recovery_are_those_of_so_many_sanctions(game, seed):
 @given(game=games(), seed=SEEDS)
 def test_only_the_sanctioner_fires(game, seed):
     game = replace(game, institutions=(Sanctioner(agents=(0,)),))
-    for moment in played(game, seed=seed):
+    for moment in random_play(game, seed=seed):
         assert not moment.turn.fired[:, 1:].any()
 
 
@@ -257,7 +254,7 @@ def test_the_order_of_institutions_changes_no_move_and_no_payment(game, seed, or
     shuffled = list(game.institutions)
     order.shuffle(shuffled)
     other = replace(game, institutions=tuple(shuffled))
-    for one, two in zip(played(game, seed=seed), played(other, seed=seed), strict=True):
+    for one, two in zip(random_play(game, seed=seed), random_play(other, seed=seed), strict=True):
         for name, array in one.worlds._asdict().items():
             assert np.array_equal(array, getattr(two.worlds, name)), name
         for name in ("fines", "transfers", "reward", "violated", "counts"):
@@ -291,7 +288,7 @@ def test_an_episode_does_not_know_what_was_done_in_the_one_before(game, seed):
         batch.begin(output)
         second_episodes.append([kept(batch, output), *play_on(batch, output, actions, decisions)])
     for one, other in zip(*second_episodes, strict=True):
-        assert_same_moments(one, other)
+        assert_same(one, other)
 
 
 @pytest.mark.integration
@@ -324,7 +321,7 @@ def test_a_state_that_is_loaded_plays_on_bit_for_bit(game, seed, turns):
         assert np.array_equal(getattr(shown.payments, name), getattr(output.payments, name)), name
     rest = actions[turns:], decisions[turns:]
     for one, two in zip(play_on(batch, output, *rest), play_on(other, shown, *rest), strict=True):
-        assert_same_moments(one, two)
+        assert_same(one, two)
 
 
 @pytest.mark.integration
@@ -337,18 +334,18 @@ def test_a_world_of_a_batch_plays_as_it_would_alone(game, seed):
     its_choices = actions[:, 2:].copy(), decisions[:, 2:].copy()
     single = play_on(alone, alone.begin(alone.new_output()), *its_choices)
     for one, other in zip(whole, single, strict=True):
-        assert_same_moments(one, other, rows=slice(2, 3))
+        assert_same(one, other, rows=slice(2, 3))
 
 
 @pytest.mark.parametrize("threads", [2, 3])
 def test_the_number_of_threads_changes_nothing(threads):
-    one, other = (played(EVERYTHING, worlds=7, turns=60, seed=4, threads=n) for n in (1, threads))
+    one, other = (random_play(EVERYTHING, worlds=7, turns=60, seed=4, threads=n) for n in (1, threads))
     for moment, threaded in zip(one, other, strict=True):
-        assert_same_moments(moment, threaded)
+        assert_same(moment, threaded)
 
 
 def test_everything_at_once_happens_somewhere():
-    moments = played(EVERYTHING, worlds=20, turns=24, seed=1)
+    moments = random_play(EVERYTHING, worlds=20, turns=24, seed=1)
     counts = np.max([moment.payments.counts for moment in moments], (0, 1, 2))
     assert all(counts), dict(zip(COUNTS, counts.tolist(), strict=True))
     assert any(moment.payments.transfers.any() for moment in moments)

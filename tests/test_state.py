@@ -3,9 +3,8 @@
 import numpy as np
 import pytest
 import torch
-from boards import random_actions
+from boards import assert_same, copied, random_actions
 from governed import EVERYTHING
-from test_worlds import assert_same, copied
 
 from cprl import CommonsEnv, Game, Observation, Rules, keys, maps, presets
 from cprl.commons.batch import Batch
