@@ -1,6 +1,5 @@
 """Boundaries: who may harvest and stand where, and what it costs."""
 
-import pytest
 from boards import Play, drawn
 
 from cprl.institutions import Boundaries, ClosedPatches
@@ -44,8 +43,7 @@ def test_a_bite_with_a_fine_happens_and_is_paid():
 
 
 def test_a_fine_of_zero_is_a_violation_that_costs_nothing():
-    play = Play(BOARD, institutions=[Boundaries.drawn(REGIONS, bite_fine=0)])
-    play.turn("forward").turn("forward")
+    play = Play(BOARD, institutions=[Boundaries.drawn(REGIONS, bite_fine=0)]).turn("forward").turn("forward")
     assert (play.harvest, play.fines, play.violated) == ([1, 1], [0, 0], [True, True])
 
 
@@ -72,14 +70,10 @@ def test_step_and_bite_fines_of_one_turn_add_up_to_one_violation():
 
 def test_an_agent_that_is_out_of_play_is_not_fined_for_where_it_lies():
     # Agent 1 stands in the region of agent 0, and is tagged there in the first turn.
-    play = Play(
-        "A....\n>..^.",
-        institutions=[Boundaries.drawn(".....\n...0.", step_fine=1)],
-        freeze_steps=2,
-    )
+    boundaries = Boundaries.drawn(".....\n...0.", step_fine=1)
+    play = Play("A....\n>..^.", institutions=[boundaries], freeze_steps=2)
     assert play.turn("beam", "stay").fines == [0, 1], "it was in play in this turn"
-    assert play.turn("stay").fines == [0, 0]
-    assert play.turn("stay").fines == [0, 0]
+    assert [play.turn("stay").fines for _ in range(2)] == [[0, 0], [0, 0]]
     assert play.in_play == [True, True]
     assert play.turn("stay").fines == [0, 1]
 
@@ -124,8 +118,6 @@ def test_drawings_may_be_indented_and_strips_are_as_wide_as_can_be():
     # Column 2 of 5 is left of the middle 2.5, so it is in the first of two strips.
     assert Boundaries.strips(height=2, width=5, agents=2).regions == ("00011", "00011")
     assert Boundaries.strips(height=1, width=4, agents=4, step_fine=1).regions == ("0123",)
-    with pytest.raises(ValueError, match=r"agents is 4; allowed: 1 to 3"):
-        Boundaries.strips(height=2, width=3, agents=4)
 
 
 def plane(play, agent):

@@ -306,7 +306,7 @@ def test_the_table_has_a_column_for_each_number_and_keeps_it(tmp_path):
     assert set(kept.column_names) - set(expected) <= set(without.column_names)
 
 
-def test_curves_have_the_metrics_of_the_table():
+def test_curves_and_logged_numbers_are_those_of_the_episode():
     (episode,) = played(*an_episode())
     curves = as_curves(as_table([episode], 0))
     for name, value in episode.institutions.items():
@@ -314,10 +314,6 @@ def test_curves_have_the_metrics_of_the_table():
             np.testing.assert_allclose(curves[f"institutions/{name}"], [[value]], err_msg=name)
     assert curves["institutions/in_force_0"].tolist() == [[0.25]]
     assert not any("inst" in name for name in as_curves(as_table(played(turn(done=[[True]])), 0)))
-
-
-def test_the_logged_numbers_are_those_of_the_episode():
-    (episode,) = played(*an_episode())
     numbers = numbers_of(episode, {}, ["ann", "bob"])
     assert numbers["institutions/detection_rate"] == 0.5
     assert numbers["institutions/in_force_0"] == 0.25
@@ -387,29 +383,26 @@ def test_what_a_game_pays_and_counts_is_what_an_episode_has():
 def test_a_game_with_all_institutions_has_all_metrics_and_others_those_that_concern_them():
     (episode, *_), _ = play(GAME, episodes=1)
     assert list(episode.institutions) == list(NEEDS)
-    always = ["fines", "transfers", "violations", "violations_per_step", "net_equality"]
+    always = {"fines", "transfers", "violations", "violations_per_step", "net_equality"}
     kinds = {
-        "Boundaries": ["trespasses", "own_share_of_bites"],
-        "Quota": ["excess_bites"],
-        "ClosedSeason": ["closed_bites"],
-        "Levies": list(OF_GROUPS),
-        "Vote": [],
-        "Monitoring": ["detection_rate"],
-        "GraduatedSanctions": ["recidivism", "sanctions_per_violation"],
-        "Mediation": ["unjust_share_of_tags"],
+        Boundaries: {"trespasses", "own_share_of_bites"},
+        Quota: {"excess_bites"},
+        ClosedSeason: {"closed_bites"},
+        Levies: set(OF_GROUPS),
+        Vote: set(),
+        Monitoring: {"detection_rate"},
+        GraduatedSanctions: {"recidivism", "sanctions_per_violation"},
+        Mediation: {"unjust_share_of_tags"},
     }
-    for own in MANY:
-        assert set(institutions.metrics_for([own])) == {*always, *kinds[type(own).__name__]}
+    for institution in MANY:
+        assert set(institutions.metrics_for([institution])) == always | kinds[type(institution)]
     assert "excess_bites" in institutions.metrics_for([Vote(on=Quota(), choices=(0.5, 1.0))])
     (taxed, *_), _ = play(dataclasses.replace(GAME, institutions=(Tax(rate=0.5),)), episodes=1)
-    assert set(taxed.institutions) == set(always)
+    assert set(taxed.institutions) == always
     assert taxed.fines.sum() == pytest.approx(taxed.harvest.sum() / 2)
     assert taxed.in_force is None
-
-
-def test_every_kind_of_institution_has_metrics_or_is_measured_by_those_of_all():
     concerned = {kind for kinds in institutions.KINDS.values() for kind in kinds}
-    assert concerned | {Tax, Vote, Sanctioner} == set(KINDS)
+    assert concerned | {Tax, Vote, Sanctioner} == set(KINDS), "all others are measured by those of all"
     assert set(institutions.KINDS) < set(NEEDS)
 
 

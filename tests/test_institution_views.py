@@ -144,16 +144,14 @@ def test_events_are_in_words():
 
 def test_only_games_with_institutions_have_their_tabs(run):
     _, viewer, _ = run
-    curves = viewer.logger.curves
-    made = [own.name for own in tabs(curves, lambda name, *entities, share=False: None)]
-    assert made == []
-    titles = []
+    curves, titles = viewer.logger.curves, []
 
-    def plot(name, *shown, share=False):
+    def plot(name, *entities, share=False):
         titles.append(name)
-        return rrb.TimeSeriesView(name=name, contents=[f"+ /{entity}" for entity in shown])
+        return rrb.TimeSeriesView(name=name, contents=[f"+ /{entity}" for entity in entities])
 
-    assert [own.name for own in tabs(curves, plot)] == ["Institutions", "Rules kept"]
+    assert tabs(curves, lambda name, *entities, share=False: None) == []
+    assert [tab.name for tab in tabs(curves, plot)] == ["Institutions", "Rules kept"]
     assert titles == [
         "Violations of each, turns",
         "Fines of each, apples",
